@@ -1,0 +1,58 @@
+# Every target prepares what it needs in .venv and does so once: a stamp says which extra is installed.
+PYTHON ?= python3
+ARGS ?=
+
+BIN := .venv/bin
+PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
+
+.DEFAULT_GOAL := help
+.DELETE_ON_ERROR:
+.NOTPARALLEL:
+.PHONY: help run test lint bench docs clean
+
+help: ## Show this list.
+	@sed -n 's/^\([a-z]*\):.*## \(.*\)/  make \1|\2/p' Makefile | awk -F'|' '{ printf "%-14s %s\n", $$1, $$2 }'
+	@echo 'Variables: PYTHON=python3.12 (the interpreter .venv is made with), ARGS="..." (more arguments).'
+
+run: .venv/.installed-core ## Simulate and reconstruct the example experiment into runs/.
+	@$(BIN)/thincam run configs/fza_superresolution.yaml --out runs/fza_superresolution $(ARGS)
+
+test: .venv/.installed-test ## Run the tests, e.g. make test ARGS="tests/test_units.py -k angle".
+	@$(BIN)/python -m pytest -n 2 --dist loadfile $(ARGS)
+
+lint: .venv/.installed-dev ## Check the style, the formatting and the types.
+	@$(BIN)/ruff check .
+	@$(BIN)/ruff format --check .
+	@$(BIN)/pyright --pythonpath $(BIN)/python
+
+bench: .venv/.installed-bench ## Measure speed and accuracy.
+	@$(BIN)/python -m pytest benchmarks --benchmark-only --benchmark-columns=min,median,stddev,rounds $(ARGS)
+
+# MkDocs refuses an output folder inside its input folder, hence the move.
+docs: .venv/.installed-docs ## Build the documentation into docs/_build.
+	@rm -rf .docs-build
+	@$(BIN)/mkdocs build --quiet --strict --site-dir .docs-build
+	@rm -rf docs/_build && mv .docs-build docs/_build
+	@echo 'Documentation: docs/_build/index.html'
+
+clean: ## Remove build outputs and caches; .venv and runs/ stay.
+	@rm -rf build dist .docs-build docs/_build .pytest_cache .ruff_cache .hypothesis .benchmarks
+	@find . -name __pycache__ -type d -not -path './.venv/*' -not -path './.git/*' -prune -exec rm -rf {} +
+
+.venv/.made:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || { \
+	    echo 'thincam_jax needs Python 3.11 or newer, and $(PYTHON) is not: make PYTHON=python3.11 ...' >&2; exit 1; }
+	@echo 'Making .venv'
+	@$(PYTHON) -m venv .venv
+	@touch $@
+
+# Written only after pip has succeeded. Versions come from requirements.lock, as constraints.
+.venv/.installed-core: pyproject.toml requirements.lock | .venv/.made
+	@echo 'Installing thincam_jax'
+	@$(PIP) -c requirements.lock -e .
+	@touch $@
+
+.venv/.installed-%: pyproject.toml requirements.lock | .venv/.made
+	@echo 'Installing thincam_jax[$*]'
+	@$(PIP) -c requirements.lock -e '.[$*]'
+	@touch $@

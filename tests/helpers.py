@@ -1,0 +1,93 @@
+"""Tools shared by the tests: data, trace counting, gradients by differences, relative errors."""
+
+import functools
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+def shared_data(name: str) -> Path:
+    """The path of a data set that lies beside the checkout, `../shared/data/<name>`.
+
+    The data are too large for the repository: where they are absent the test is skipped.
+    """
+    path = ROOT.parent / "shared" / "data" / name
+    if not path.exists():
+        pytest.skip(f"needs the data set {name} at ../shared/data/{name}, beside the checkout")
+    return path
+
+
+def count_traces(function: Callable) -> Callable:
+    """Wrap a function so that `wrapped.traces` says how often its Python body ran.
+
+    Wrap first, compile second: under jit the body runs once a trace, so the count is the number of
+    compilations that the calls caused::
+
+        counted = count_traces(lambda beta: psf_of(beta))
+        compiled = jax.jit(counted)
+        compiled(jnp.asarray(25.0)), compiled(jnp.asarray(26.0))
+        assert counted.traces == 1
+
+    Wrapping a function that is already compiled counts its calls, not its traces.
+    """
+
+    @functools.wraps(function)
+    def counted(*args, **kwargs):
+        counted.traces += 1
+        return function(*args, **kwargs)
+
+    counted.traces = 0
+    return counted
+
+
+def finite_difference(function: Callable, x: Any, direction: Any, step: float) -> Any:
+    """The derivative of `function` at `x` along `direction`, by differences of fourth order.
+
+    `x` is a float64 array or a pytree of them, `direction` has its structure; the result has that
+    of `function(x)`. Two central differences D are extrapolated (Richardson):
+
+        (4 D(step/2) - D(step)) / 3  =  f' - step^4 f^(5) / 480 + O(step^6)
+
+    **Choosing the step.** It is counted in multiples of `direction`. Optical fields oscillate: let
+    `rate` be the largest change of phase per unit of step, in radians (for the curvature β of a
+    zone plate it is r², 16 rad per rad/mm² at the corner of a plate 5.6 mm wide), and `phase` the
+    largest phase itself, whose rounding error is phase·eps. The relative error is then about
+
+        (rate·step)^4 / 480  +  2 max(1, phase)·eps / (rate·step)
+
+    smallest at rate·step = (240 max(1, phase)·eps)^(1/5). So take step = 0.003 / rate where the
+    phases are small (error about 1e-13) and 0.015 / rate at phases of 1e4 rad (about 3e-10). A
+    step with rate·step near 1 or above measures the fringes, not the slope. What oscillates slowly,
+    a loss for one, stands larger steps. Check the step by halving it: the result must not move.
+    """
+    leaves = [jnp.asarray(leaf) for leaf in jax.tree.leaves((x, direction))]
+    if any(leaf.dtype not in (jnp.float64, jnp.complex128) for leaf in leaves):
+        found = ", ".join(sorted({str(leaf.dtype) for leaf in leaves}))
+        raise ValueError(f"differences need float64 in x and in direction, not {found}")
+
+    def at(offset: float) -> Any:
+        return function(jax.tree.map(lambda a, v: a + offset * v, x, direction))
+
+    def central(h: float) -> Any:
+        return jax.tree.map(lambda high, low: (high - low) / (2.0 * h), at(h), at(-h))
+
+    half, full = central(step / 2), central(step)
+    return jax.tree.map(lambda fine, coarse: (4.0 * fine - coarse) / 3.0, half, full)
+
+
+def relative_l2(value: Any, reference: Any) -> float:
+    """‖value − reference‖₂ / ‖reference‖₂ over all elements; shapes must agree exactly."""
+    value, reference = np.asarray(value), np.asarray(reference)
+    if value.shape != reference.shape:
+        raise ValueError(f"value has shape {value.shape}, reference has {reference.shape}")
+    scale = np.linalg.norm(reference.ravel())
+    if not scale > 0.0:
+        raise ValueError("a reference that is zero or not a number has no relative error")
+    return float(np.linalg.norm((value - reference).ravel()) / scale)

@@ -1,0 +1,90 @@
+"""Eager checks of arguments: one line that says what was given, what is allowed and what to do.
+
+Traced values cannot be looked at and pass; they were checked when the object was built.
+"""
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+
+def _known(value: Any) -> np.ndarray | None:
+    """The value as a NumPy array, or None while it is traced."""
+    if isinstance(value, jax.core.Tracer):
+        return None
+    return np.asarray(value)
+
+
+def real(name: str, value: Any, unit: str, *, shape: tuple[int, ...] = ()) -> Array:
+    """A floating array of that shape, or TypeError/ValueError naming the argument."""
+    known = _known(value)
+    if known is not None:
+        if known.dtype.kind not in "fiu":
+            raise TypeError(f"{name} = {value!r} is not a real number; give it in {unit}")
+        if np.isnan(known).any():
+            raise ValueError(f"{name} is NaN; give a number in {unit}")
+    array = jnp.asarray(value)
+    if not jnp.issubdtype(array.dtype, jnp.floating):
+        array = array.astype(float)
+    if known is None or isinstance(value, jax.Array | np.ndarray | np.generic):
+        pass  # an array keeps its precision
+    else:
+        array = array.astype(jnp.result_type(float))
+    if array.shape != shape:
+        wanted = "one number" if shape == () else f"an array of shape {shape}"
+        raise ValueError(f"{name} has shape {array.shape}; give {wanted} in {unit}")
+    return array
+
+
+def finite(name: str, value: Any, unit: str, *, shape: tuple[int, ...] = ()) -> Array:
+    array = real(name, value, unit, shape=shape)
+    known = _known(array)
+    if known is not None and not np.isfinite(known).all():
+        raise ValueError(f"{name} = {known} {unit} is not finite; give a finite number in {unit}")
+    return array
+
+
+def positive(name: str, value: Any, unit: str, *, allow_infinity: bool = False) -> Array:
+    array = real(name, value, unit)
+    known = _known(array)
+    if known is not None:
+        if not (known > 0).all():
+            raise ValueError(f"{name} = {known} {unit} is not positive; give {name} > 0 in {unit}")
+        if not allow_infinity and not np.isfinite(known).all():
+            raise ValueError(f"{name} is infinite; give a finite number in {unit}")
+    return array
+
+
+def fraction(name: str, value: Any) -> Array:
+    """A number above 0 and at most 1."""
+    array = real(name, value, "parts of one")
+    known = _known(array)
+    if known is not None and not (0 < known <= 1):
+        raise ValueError(f"{name} = {known} is out of range; give 0 < {name} <= 1")
+    return array
+
+
+def choice(name: str, value: Any, options: Iterable[str]) -> str:
+    options = tuple(options)
+    if value not in options:
+        listed = ", ".join(repr(o) for o in options)
+        raise ValueError(f"{name} = {value!r} is unknown; choose one of {listed}")
+    return value
+
+
+def shape2d(name: str, value: Sequence[int]) -> tuple[int, int]:
+    """A pair (y, x) of pixel counts, each at least 1."""
+    try:
+        rows, columns = (int(v) for v in value)
+        whole = all(int(v) == v for v in value)
+    except (TypeError, ValueError):
+        raise ValueError(f"{name} = {value!r} is not a pair (rows, columns) of pixels") from None
+    if not whole or rows < 1 or columns < 1:
+        raise ValueError(
+            f"{name} = {value!r}: give two whole numbers (rows, columns) of at least 1"
+        )
+    return rows, columns

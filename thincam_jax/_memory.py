@@ -1,0 +1,37 @@
+"""Memory that an evaluation needs, estimated before it starts."""
+
+import os
+
+import jax
+
+
+def available_bytes() -> int | None:
+    """Free memory of the default device (or of the machine, on a CPU); None if it cannot be told."""
+    device = jax.devices()[0]
+    if device.platform == "cpu":
+        try:
+            return os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+        except (ValueError, OSError, AttributeError):
+            return None
+    statistics = device.memory_stats() or {}
+    if "bytes_limit" not in statistics:
+        return None
+    return statistics["bytes_limit"] - statistics.get("bytes_in_use", 0)
+
+
+def refuse_if_too_large(what: str, needed: int, advice: str) -> None:
+    """MemoryError, one line with the estimate, where `needed` bytes cannot be had."""
+    available = available_bytes()
+    if available is not None and needed > available:
+        raise MemoryError(
+            f"{what} needs about {_readable(needed)}, {_readable(available)} are free; {advice}"
+        )
+
+
+def _readable(count: int) -> str:
+    value = float(count)
+    for unit in ("bytes", "KiB", "MiB", "GiB", "TiB", "PiB"):
+        if value < 1024 or unit == "PiB":
+            return f"{value:.0f} {unit}" if unit == "bytes" else f"{value:.1f} {unit}"
+        value /= 1024
+    raise AssertionError

@@ -1,0 +1,31 @@
+"""The lensless camera: a mask at a distance before a sensor."""
+
+import equinox as eqx
+from jaxtyping import Array, Float
+
+from thincam_jax import _checks
+from thincam_jax.masks.base import AbstractMask
+from thincam_jax.propagation.path import Path
+from thincam_jax.sensor import Sensor
+
+
+class LenslessCamera(eqx.Module):
+    """A coded mask in the plane z = 0 and a sensor at z = `distance`; objects at z < 0.
+
+    - `mask`: any mask; see `thincam_jax.masks`.
+    - `sensor`: shape and pitch of the pixels.
+    - `distance`: mask-sensor distance d, mm, > 0.
+    """
+
+    mask: AbstractMask
+    sensor: Sensor
+    distance: Float[Array, ""]
+
+    def __init__(self, mask, sensor, distance):
+        self.mask = mask
+        self.sensor = sensor
+        self.distance = _checks.positive("distance", distance, "mm")
+
+    def path(self, wavelength, object_distance) -> Path:
+        """The way of the light from a point at `object_distance` (mm) in front of the mask."""
+        return Path(wavelength, self.distance, object_distance)

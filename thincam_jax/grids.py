@@ -1,0 +1,82 @@
+"""Sampling grids: where the samples of a plane lie, and their spatial frequencies."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from thincam_jax import _checks
+
+
+class Grid(eqx.Module):
+    """A rectangular grid centred on the optical axis.
+
+    Sample i of n lies at (i − (n−1)/2)·pitch: +x to the right, +y down. The shape is static, the
+    pitch a differentiable array.
+
+    - `shape`: (rows, columns).
+    - `pitch`: distance of neighbouring samples, mm, the same in y and x.
+    """
+
+    shape: tuple[int, int] = eqx.field(static=True)
+    pitch: Float[Array, ""]
+
+    def __init__(self, shape, pitch):
+        self.shape = _checks.shape2d("shape", shape)
+        self.pitch = _checks.positive("pitch", pitch, "mm")
+
+    @property
+    def y(self) -> Float[Array, " rows"]:
+        """Coordinates of the rows, mm."""
+        return centred_indices(self.shape[0], self.pitch.dtype) * self.pitch
+
+    @property
+    def x(self) -> Float[Array, " columns"]:
+        """Coordinates of the columns, mm."""
+        return centred_indices(self.shape[1], self.pitch.dtype) * self.pitch
+
+    @property
+    def v(self) -> Float[Array, " rows"]:
+        """Spatial frequencies of the centred DFT along y, cycles/mm, ascending."""
+        return centred_frequencies(self.shape[0], self.pitch)
+
+    @property
+    def u(self) -> Float[Array, " columns"]:
+        """Spatial frequencies of the centred DFT along x, cycles/mm, ascending."""
+        return centred_frequencies(self.shape[1], self.pitch)
+
+    def with_shape(self, shape: tuple[int, int]) -> "Grid":
+        """The same pitch over another number of samples."""
+        return Grid(shape, self.pitch)
+
+
+def centred_indices(count: int, dtype) -> Float[Array, " count"]:
+    """i − (n−1)/2 for i = 0 … n−1: whole or half numbers, exact in every precision."""
+    return jnp.arange(count, dtype=dtype) - (count - 1) / 2
+
+
+def centred_frequencies(count: int, pitch: Float[Array, ""]) -> Float[Array, " count"]:
+    """Frequencies of a DFT of `count` samples, zero at index count//2, in cycles/mm."""
+    return (jnp.arange(count, dtype=pitch.dtype) - count // 2) / (count * pitch)
+
+
+def centre_pad(image: Array, shape: tuple[int, int]) -> Array:
+    """Zeros around the last two axes so that the centre stays the centre.
+
+    Sizes of different parity have their centres half a sample apart; those are refused.
+    """
+    return jnp.pad(image, [(0, 0)] * (image.ndim - 2) + _margins(image.shape[-2:], shape))
+
+
+def centre_crop(image: Array, shape: tuple[int, int]) -> Array:
+    """The middle of the last two axes; the inverse of `centre_pad`."""
+    (top, _), (left, _) = _margins(shape, image.shape[-2:])
+    return image[..., top : top + shape[0], left : left + shape[1]]
+
+
+def _margins(small, large) -> list[tuple[int, int]]:
+    if any(s > n or (n - s) % 2 for s, n in zip(small, large, strict=True)):
+        raise ValueError(
+            f"shapes {tuple(small)} and {tuple(large)} do not share a centre: the second must be "
+            "larger by an even number of samples along each axis"
+        )
+    return [((n - s) // 2, (n - s) // 2) for s, n in zip(small, large, strict=True)]

@@ -1,0 +1,49 @@
+"""The way of the light: point source, mask, sensor."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from thincam_jax import _checks
+
+
+class Path(eqx.Module):
+    """A point source on the axis at distance t before the mask, a sensor at d behind it.
+
+    In the Fresnel approximation a spherical wave from t over d acts like a plane wave over d/M,
+    magnified by M = (t+d)/t (thesis Eq 3.2): PSF(x; t, d) = PSF(x/M; ∞, d/M).
+
+    - `wavelength`: λ, mm.
+    - `distance`: d, mm, > 0.
+    - `object_distance`: t, mm, > 0; infinity is a plane wave.
+    """
+
+    wavelength: Float[Array, ""]
+    distance: Float[Array, ""]
+    object_distance: Float[Array, ""]
+
+    def __init__(self, wavelength, distance, object_distance=jnp.inf):
+        self.wavelength = _checks.positive("wavelength", wavelength, "mm")
+        self.distance = _checks.positive("distance", distance, "mm")
+        self.object_distance = _checks.positive(
+            "object_distance", object_distance, "mm", allow_infinity=True
+        )
+
+    @property
+    def magnification(self) -> Float[Array, ""]:
+        """M = 1 + d/t: the shadow's size over the mask's."""
+        return 1 + self.distance / self.object_distance
+
+    @property
+    def fresnel_curvature(self) -> Float[Array, ""]:
+        """b = π/(λd), rad/mm²."""
+        return jnp.pi / (self.wavelength * self.distance)
+
+    @property
+    def source_curvature(self) -> Float[Array, ""]:
+        """π/(λt), rad/mm²: the spherical wave's curvature at the mask."""
+        return jnp.pi / (self.wavelength * self.object_distance)
+
+    def epsilon(self, beta: Float[Array, ""]) -> Float[Array, ""]:
+        """ε = βλd/(πM), the strength of diffraction; at ε = 1 the order −1 focuses on the sensor."""
+        return beta * self.wavelength * self.distance / (jnp.pi * self.magnification)

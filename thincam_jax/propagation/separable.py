@@ -1,0 +1,77 @@
+r"""`separable`: the exact Fresnel field of a square aperture, in closed form."""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Complex, Float
+from numpy.polynomial.legendre import leggauss
+
+from thincam_jax._phase import as_complex, phasor
+from thincam_jax.chirp import chirp_integral
+from thincam_jax.grids import Grid
+from thincam_jax.masks.base import AbstractMask, ZoneOrders
+from thincam_jax.propagation.orders import pairs, require_zone_orders
+from thincam_jax.propagation.path import Path
+from thincam_jax.propagation.separable_sum import SeparableSum
+
+# Gauss-Legendre nodes a pixel for the pixel average: the fringes of the far edge turn by up to
+# about 10 cycles over a 5.5 µm pixel at d = 6.5 mm, at a few parts in 1000 of the amplitude.
+_PIXEL_NODES = 8
+
+
+def axis_fields(zones: ZoneOrders, path: Path, x: Float[Array, " n"]) -> Complex[Array, "order n"]:
+    r"""One-dimensional factor of every order's field, relative to the open aperture.
+
+    .. math::
+        A_k(x) = \sqrt{\frac{M}{j\lambda d}} \int e^{jk\beta\xi^2 + j\pi\xi^2/(\lambda t)
+        + j\pi(x-\xi)^2/(\lambda d)}\,d\xi
+
+    over the open part of the aperture: Fresnel integrals (`chirp_integral`). The order with
+    kβ + π/(λt) + π/(λd) = 0 focuses on the sensor and is a sinc.
+    """
+    k = jnp.asarray(zones.orders, dtype=x.dtype)[:, None, None]
+    b, source = path.fresnel_curvature, path.source_curvature
+    x = x[None, :, None]
+    if zones.sites is None:
+        field = chirp_integral(k * zones.beta + source, b, x, zones.lower, zones.upper)
+        field = field.sum(axis=-1)
+    else:
+        # A display pixel has one phase for each order and is a plain slit for the light.
+        cells = chirp_integral(source, b, x, zones.lower, zones.upper)[0]
+        values = phasor(k[:, 0] * zones.beta * zones.sites**2)
+        field = values @ cells.T
+    return field * as_complex(jnp.sqrt(path.magnification / (path.wavelength * path.distance)))
+
+
+def separable(
+    mask: AbstractMask, grid: Grid, path: Path, *, pixel_integration: bool = False
+) -> SeparableSum:
+    r"""PSF of a mask with separable zone orders behind its square aperture.
+
+    .. math::
+        h = \Big|\sum_k c_k A_k(x) A_k(y)\Big|^2
+          = \sum_k |c_k|^2 |A_k|^2|A_k|^2
+          + 2\,\mathrm{Re} \sum_{k<l} c_k c_l^* (A_k A_l^*)(x)\,(A_k A_l^*)(y)
+
+    exact within the Fresnel approximation: no sampling condition, any grid, any distance. The
+    paraxial phase that is left out is about πλ³dν⁴/4 at the spatial frequency ν of the field.
+    Nine real separable terms for the cosine profile, (harmonics + 2)² for the binary one.
+
+    `pixel_integration` averages each axis over the pixel by Gauss-Legendre quadrature: the average
+    of a separable term is separable.
+    """
+    zones = require_zone_orders(mask, "separable")
+    shift = path.magnification * mask.centre
+    lower, upper, weights = pairs(zones)
+
+    def products(x):
+        if not pixel_integration:
+            fields = axis_fields(zones, path, x)
+            return fields[lower, :] * jnp.conj(fields[upper, :])
+        nodes, node_weights = leggauss(_PIXEL_NODES)
+        offsets = jnp.asarray(nodes, dtype=x.dtype)[:, None] * grid.pitch / 2
+        fields = axis_fields(zones, path, (x + offsets).ravel())
+        fields = fields.reshape(len(zones.orders), _PIXEL_NODES, -1)
+        average = jnp.asarray(node_weights / 2, dtype=x.dtype)[:, None]
+        return jnp.sum(fields[lower, :] * jnp.conj(fields[upper, :]) * as_complex(average), axis=1)
+
+    rows, columns = products(grid.y - shift[0]), products(grid.x - shift[1])
+    return SeparableSum(weights[:, None] * rows, columns, grid)

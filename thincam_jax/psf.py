@@ -1,0 +1,218 @@
+"""From a camera to its point spread function and optical transfer function."""
+
+import math
+from typing import Literal, get_args
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Complex, Float
+
+from thincam_jax import _checks
+from thincam_jax._memory import refuse_if_too_large
+from thincam_jax._phase import as_complex
+from thincam_jax.camera import LenslessCamera
+from thincam_jax.grids import Grid
+from thincam_jax.masks.base import AbstractMask
+from thincam_jax.propagation.angular_spectrum import angular_spectrum, padded_shape
+from thincam_jax.propagation.chirps import ChirpSum
+from thincam_jax.propagation.closed_form import closed_form, focus_distance
+from thincam_jax.propagation.geometric import geometric
+from thincam_jax.propagation.paraxial import paraxial
+from thincam_jax.propagation.path import Path
+from thincam_jax.propagation.rayleigh_sommerfeld import rayleigh_sommerfeld
+from thincam_jax.propagation.separable import separable
+from thincam_jax.propagation.separable_sum import SeparableSum, centre_phase
+
+Model = Literal[
+    "geometric",
+    "paraxial",
+    "closed_form",
+    "separable",
+    "angular_spectrum",
+    "rayleigh_sommerfeld",
+]
+MODELS: tuple[Model, ...] = get_args(Model)
+_UNBOUNDED = ("paraxial", "closed_form")
+_SAMPLED = ("angular_spectrum", "rayleigh_sommerfeld")
+
+
+def psf(
+    camera: LenslessCamera,
+    *,
+    wavelength,
+    object_distance=math.inf,
+    model: Model = "separable",
+    pixel_integration: bool = False,
+    grid: Grid | None = None,
+    oversampling: int | None = None,
+) -> Float[Array, "y x"]:
+    """Point spread function on the sensor: irradiance relative to the open aperture.
+
+    **Arguments**
+
+    - `wavelength`: λ, mm.
+    - `object_distance`: t, mm; the point lies on the axis. Infinity is a plane wave.
+    - `model`: "geometric", "paraxial", "closed_form", "separable", "angular_spectrum" or
+      "rayleigh_sommerfeld"; each is documented in `thincam_jax.propagation`.
+    - `pixel_integration`: average over each pixel in place of the value at its centre.
+    - `grid`: where to evaluate; the sensor's pixels by default.
+    - `oversampling`: samples per pixel of the sampled models (odd; default 1, and 3 for pixel
+      averages); the others are closed forms and take none.
+
+    **Returns** (y, x), dimensionless. Differentiable in every number of `camera` and in
+    `wavelength` and `object_distance`.
+
+    **Errors**: ValueError for what is out of range and for unknown models, TypeError for a mask
+    that the model cannot take, MemoryError (before any work, with the estimate) for a size that
+    does not fit.
+    """
+    path, grid = _prepare(camera, wavelength, object_distance, model, grid)
+    shape, oversampling = _sampling(camera, grid, model, pixel_integration, oversampling)
+    _check_memory(grid, model, shape, oversampling)
+    return _psf(camera.mask, grid, path, model, pixel_integration, shape, oversampling)
+
+
+def otf(
+    camera: LenslessCamera,
+    *,
+    wavelength,
+    object_distance=math.inf,
+    model: Model = "separable",
+    pixel_integration: bool = False,
+    grid: Grid | None = None,
+    oversampling: int | None = None,
+) -> Complex[Array, "v u"]:
+    """Optical transfer function H(u,v) = ∬ h e^{−2πj(ux+vy)} dx dy, zero frequency at n//2, mm².
+
+    Arguments as for `psf`. For the models with an edge it is the transform of the PSF on the grid
+    (sum times pitch²). For "paraxial" and "closed_form", whose PSF has no end, it is the
+    analytic transform, without pixel average: a δ at zero frequency is one over the area of a
+    frequency cell.
+    """
+    path, grid = _prepare(camera, wavelength, object_distance, model, grid)
+    shape, oversampling = _sampling(camera, grid, model, pixel_integration, oversampling)
+    _check_memory(grid, model, shape, oversampling)
+    return _otf(camera.mask, grid, path, model, pixel_integration, shape, oversampling)
+
+
+def irradiance(
+    mask: AbstractMask,
+    grid: Grid,
+    path: Path,
+    model: Model,
+    *,
+    pixel_integration: bool = False,
+    mask_shape: tuple[int, int] | None = None,
+    oversampling: int = 1,
+) -> SeparableSum | ChirpSum | Float[Array, "y x"]:
+    """The PSF in the form in which the model has it: terms where there are terms, else an image."""
+    if model == "geometric":
+        return geometric(mask, grid, path, pixel_integration=pixel_integration)
+    if model == "paraxial":
+        return paraxial(mask, path)
+    if model == "closed_form":
+        return closed_form(_unfocused(mask, path), path)
+    if model == "separable":
+        return separable(mask, grid, path, pixel_integration=pixel_integration)
+    sampled = angular_spectrum if model == "angular_spectrum" else rayleigh_sommerfeld
+    return sampled(
+        mask,
+        grid,
+        path,
+        mask_shape=mask_shape,
+        oversampling=oversampling,
+        pixel_integration=pixel_integration,
+    )
+
+
+_STATIC = ("model", "pixel_integration", "mask_shape", "oversampling")
+
+
+@jax.jit(static_argnames=_STATIC)
+def _psf(mask, grid, path, model, pixel_integration, mask_shape, oversampling):
+    h = irradiance(
+        mask,
+        grid,
+        path,
+        model,
+        pixel_integration=pixel_integration,
+        mask_shape=mask_shape,
+        oversampling=oversampling,
+    )
+    if isinstance(h, ChirpSum):
+        h = h.sample(grid, pixel_integration=pixel_integration)
+    return h.image() if isinstance(h, SeparableSum) else h
+
+
+@jax.jit(static_argnames=_STATIC)
+def _otf(mask, grid, path, model, pixel_integration, mask_shape, oversampling):
+    h = irradiance(
+        mask,
+        grid,
+        path,
+        model,
+        pixel_integration=pixel_integration,
+        mask_shape=mask_shape,
+        oversampling=oversampling,
+    )
+    if isinstance(h, ChirpSum):
+        return h.transform(grid)
+    if isinstance(h, SeparableSum):
+        return h.transform()
+    spectrum = jnp.fft.fftshift(jnp.fft.fft2(h)) * as_complex(grid.pitch**2)
+    rows, columns = (centre_phase(n, grid.pitch.dtype) for n in grid.shape)
+    return spectrum * rows[:, None] * columns
+
+
+def _prepare(camera, wavelength, object_distance, model, grid) -> tuple[Path, Grid]:
+    _checks.choice("model", model, MODELS)
+    return camera.path(wavelength, object_distance), grid or camera.sensor.grid
+
+
+def _sampling(camera, grid, model, pixel_integration, oversampling):
+    """Mask plane in pixels and samples per pixel, for the models that sample."""
+    if model not in _SAMPLED:
+        if oversampling is not None:
+            raise ValueError(f"model {model!r} is a closed form: leave oversampling out")
+        return None, 1
+    oversampling = oversampling or (3 if pixel_integration else 1)
+    sizes = [*camera.mask.extent, grid.pitch, camera.mask.centre]
+    if any(isinstance(s, jax.core.Tracer) for s in sizes):
+        return None, oversampling  # the size cannot be looked at: the sensor's, checked when run
+    height, width, pitch, centre = (np.asarray(s) for s in sizes)
+    reach = (np.array([height, width]) + 2 * np.abs(centre)) / pitch
+    rows, columns = (max(1, math.ceil(r - 1e-4)) for r in reach)
+    return (rows, columns), oversampling
+
+
+def _check_memory(grid: Grid, model: Model, mask_shape, oversampling: int) -> None:
+    size = 2 * jnp.dtype(grid.pitch.dtype).itemsize  # a complex sample
+    rows, columns = grid.shape
+    # Images that live at once, counted in complex samples; 64 is the direct sum's batch.
+    needed = rows * columns * size
+    plane = mask_shape or grid.shape
+    if model == "angular_spectrum":
+        window = padded_shape(
+            (plane[0] * oversampling, plane[1] * oversampling),
+            (rows * oversampling, columns * oversampling),
+            2.0,
+        )
+        needed += 4 * window[0] * window[1] * size
+    elif model == "rayleigh_sommerfeld":
+        needed += 3 * 64 * plane[0] * plane[1] * oversampling**2 * size
+    refuse_if_too_large(
+        f"a PSF of {rows}×{columns} pixels by model {model!r}",
+        needed,
+        "use a smaller grid, less oversampling or the model 'separable'",
+    )
+
+
+def _unfocused(mask: AbstractMask, path: Path) -> AbstractMask:
+    return eqx.error_if(
+        mask,
+        focus_distance(mask, path) < 1e-6,
+        "model 'closed_form' has no PSF where an order focuses on the sensor (k·ε = −1); "
+        "use 'separable'",
+    )
