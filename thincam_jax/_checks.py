@@ -59,6 +59,15 @@ def positive(name: str, value: Any, unit: str, *, allow_infinity: bool = False) 
     return array
 
 
+def positive_all(name: str, value: Array, unit: str) -> Array:
+    """An array of any shape with finite positive entries."""
+    array = finite(name, value, unit, shape=value.shape)
+    known = _known(array)
+    if known is not None and not (known > 0).all():
+        raise ValueError(f"{name} = {known} {unit} must be positive; give {name} > 0 in {unit}")
+    return array
+
+
 def fraction(name: str, value: Any) -> Array:
     """A number above 0 and at most 1."""
     array = real(name, value, "parts of one")

@@ -6,7 +6,7 @@ import jax
 
 
 def available_bytes() -> int | None:
-    """Free memory of the default device (or of the machine, on a CPU); None if it cannot be told."""
+    """Free memory of the default device (of the machine, on a CPU); None if it cannot be told."""
     device = jax.devices()[0]
     if device.platform == "cpu":
         try:

@@ -1,0 +1,70 @@
+"""Coordinates and frequencies of grids, padding and cropping, with sizes odd, even and one."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from thincam_jax.grids import Grid, centre_crop, centre_pad
+
+SHAPES = [(1, 1), (1, 6), (5, 1), (4, 7)]
+
+
+def test_samples_lie_about_the_axis():
+    grid = Grid((2, 3), 0.5)
+    np.testing.assert_array_equal(grid.y, [-0.25, 0.25])
+    np.testing.assert_array_equal(grid.x, [-0.5, 0.0, 0.5])
+    assert grid.with_shape((3, 2)).y[0] == -0.5
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_frequencies_are_the_centred_dft(shape):
+    grid = Grid(shape, 0.02)
+    np.testing.assert_allclose(grid.v, np.fft.fftshift(np.fft.fftfreq(shape[0], 0.02)), atol=1e-12)
+    np.testing.assert_allclose(grid.u, np.fft.fftshift(np.fft.fftfreq(shape[1], 0.02)), atol=1e-12)
+
+
+def test_coordinates_keep_the_precision_of_the_pitch():
+    """Whole and half numbers times the pitch: no rounding but the last, in single precision too."""
+    grid = Grid((1024, 1023), jnp.float32(5.5e-3))
+    assert grid.y.dtype == grid.u.dtype == jnp.float32
+    np.testing.assert_array_equal(grid.y, np.float32(5.5e-3) * np.float32(np.arange(1024) - 511.5))
+    assert grid.x[511] == 0.0
+
+
+def test_pitch_is_differentiable():
+    slope = jax.grad(lambda p: Grid((3, 4), p).x[3] + 10.0 * Grid((3, 4), p).y[0])(jnp.asarray(0.1))
+    assert slope == 1.5 - 10.0
+
+
+def test_padding_keeps_the_centre():
+    image = jnp.arange(6.0).reshape(2, 3)
+    padded = centre_pad(image, (4, 7))
+    assert padded.shape == (4, 7) and padded.sum() == image.sum()
+    np.testing.assert_array_equal(padded[1:3, 2:5], image)
+    np.testing.assert_array_equal(centre_crop(padded, (2, 3)), image)
+    batch = centre_pad(jnp.stack([image, -image]), (4, 5))
+    np.testing.assert_array_equal(centre_crop(batch, (2, 3))[1], -image)
+
+
+@pytest.mark.parametrize("shape", [(3, 3), (1, 3), (2, 4)])
+def test_padding_refuses_half_samples_and_smaller_shapes(shape):
+    with pytest.raises(ValueError, match=r"\(2, 3\).*do not share a centre"):
+        centre_pad(jnp.ones((2, 3)), shape)
+
+
+@pytest.mark.parametrize("shape", [(0, 3), (2, -1), (2.5, 3), (3,), 4, "ab"])
+def test_impossible_shapes(shape):
+    with pytest.raises(ValueError, match="shape ="):
+        Grid(shape, 0.1)
+
+
+@pytest.mark.parametrize("pitch", [0.0, -0.1, float("nan"), float("inf")])
+def test_impossible_pitch(pitch):
+    with pytest.raises(ValueError, match=r"pitch .*mm"):
+        Grid((2, 3), pitch)
+
+
+def test_pitch_that_is_no_number():
+    with pytest.raises(TypeError, match="pitch = '5.5 um' is not a real number; give it in mm"):
+        Grid((2, 3), "5.5 um")
