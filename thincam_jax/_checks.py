@@ -3,7 +3,7 @@
 Traced values cannot be looked at and pass; they were checked when the object was built.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import Any
 
 import jax
@@ -85,7 +85,7 @@ def choice(name: str, value: Any, options: Iterable[str]) -> str:
     return value
 
 
-def shape2d(name: str, value: Sequence[int]) -> tuple[int, int]:
+def shape2d(name: str, value: Any) -> tuple[int, int]:
     """A pair (y, x) of pixel counts, each at least 1."""
     try:
         rows, columns = (int(v) for v in value)

@@ -56,10 +56,10 @@ def psf(y, x, *, phase=0.0, centre=(0.0, 0.0), orders=None, **geometry):
 
 
 def chirp_by_quadrature(g, b, x, lower, upper):
-    """The chirp integral by Gauss-Legendre quadrature in mpmath, in pieces of some 20 rad."""
+    """The chirp integral by Gauss-Legendre quadrature in mpmath, in pieces of some 10 rad."""
     span = abs(g + b) * (upper - lower) ** 2 / 4
     span += abs(g * (lower + upper) + b * (lower + upper - 2 * x)) * (upper - lower)
-    pieces = math.ceil(span / 20) + 1
+    pieces = math.ceil(span / 10) + 1
     with mpmath.workdps(20):
         g, b, x, lower, upper = (mpmath.mpf(v) for v in (g, b, x, lower, upper))
         return complex(

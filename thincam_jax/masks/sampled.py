@@ -13,7 +13,7 @@ class SampledMask(AbstractMask):
 
     **Arguments**
 
-    - `amplitude`: amplitude transmittance of each cell, (y, x), modulus at most 1 for a passive mask.
+    - `amplitude`: amplitude transmittance of each cell, (y, x); at most 1 for a passive mask.
     - `pitch`: side of a cell, mm.
     - `centre`: (y, x) of the mask's centre, mm.
     """

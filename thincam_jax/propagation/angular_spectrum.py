@@ -55,8 +55,8 @@ def propagate(
 ) -> Complex[Array, "y x"]:
     r"""A field after the distance d of `path`, on the same (already padded) window.
 
-    Multiplies the spectrum with :math:`\exp\{j\tfrac{2\pi d}{\lambda}(\sqrt{1-\lambda^2\rho^2}-1)\}`;
-    the piston is dropped, √(1−s)−1 is formed as −s/(1+√(1−s)), and the phase is reduced in turns.
+    Multiplies the spectrum with
+    :math:`\exp\{j\tfrac{2\pi d}{\lambda}(\sqrt{1-\lambda^2\rho^2}-1)\}`; the piston is dropped, √(1−s)−1 is formed as −s/(1+√(1−s)), and the phase is reduced in turns.
     Evanescent waves and frequencies above the window's band limit are removed.
     """
     v = jnp.fft.ifftshift(centred_frequencies(field.shape[0], pitch))[:, None]

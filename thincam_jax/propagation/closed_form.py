@@ -17,7 +17,8 @@ def closed_form(mask: AbstractMask, path: Path) -> ChirpSum:
 
     .. math::
         \tfrac14 + \tfrac{a_+^2 + a_-^2}{16} + \tfrac{a_+}4\cos(\beta_+ r^2+\varphi)
-        + \tfrac{a_-}4\cos(\beta_- r^2+\varphi) + \tfrac{a_+a_-}8\cos((\beta_++\beta_-)r^2+2\varphi),
+        + \tfrac{a_-}4\cos(\beta_- r^2+\varphi)
+        + \tfrac{a_+a_-}8\cos((\beta_++\beta_-)r^2+2\varphi),
 
     a± = 1/(1±ε), β± = β a±. Holds in the interior of the shadow, some √(λd) from the edge of every
     order's image. Singular where an order focuses on the sensor (ε = 1 for the cosine profile): the

@@ -45,5 +45,5 @@ class Path(eqx.Module):
         return jnp.pi / (self.wavelength * self.object_distance)
 
     def epsilon(self, beta: Float[Array, ""]) -> Float[Array, ""]:
-        """ε = βλd/(πM), the strength of diffraction; at ε = 1 the order −1 focuses on the sensor."""
+        """ε = βλd/(πM), the strength of diffraction; at ε = 1 order −1 focuses on the sensor."""
         return beta * self.wavelength * self.distance / (jnp.pi * self.magnification)

@@ -11,8 +11,9 @@ from thincam_jax.camera import LenslessCamera
 from thincam_jax.psf import Model
 from thincam_jax.reconstruct.fringe_scanning import FringeScanning
 from thincam_jax.reconstruct.result import Reconstruction
+from thincam_jax.reconstruct.spectra import Prior
 from thincam_jax.reconstruct.synthesis import separate
-from thincam_jax.reconstruct.wiener import Prior, WienerSynthesis
+from thincam_jax.reconstruct.wiener import WienerSynthesis
 
 Method = Literal["wiener", "fringe_scanning"]
 METHODS: tuple[Method, ...] = get_args(Method)

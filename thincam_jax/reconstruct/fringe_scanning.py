@@ -15,6 +15,7 @@ from thincam_jax._phase import phasor
 from thincam_jax.camera import LenslessCamera
 from thincam_jax.grids import Grid
 from thincam_jax.masks.fza import FresnelZoneAperture
+from thincam_jax.reconstruct.registration import same_parity
 from thincam_jax.reconstruct.result import Reconstruction
 
 
@@ -49,14 +50,9 @@ class FringeScanning(eqx.Module):
         beta, camera = _check_phases(cameras), cameras[0]
         sensor = camera.sensor.grid
         self.sensor_shape = sensor.shape
-        self.field_shape = _checks.shape2d("field_shape", field_shape or sensor.shape)
-        self.field_shape = tuple(
-            f + (f - s) % 2 for f, s in zip(self.field_shape, sensor.shape, strict=True)
-        )
-        padded = tuple(
-            next_fast_len(s + max(s, f))
-            for s, f in zip(sensor.shape, self.field_shape, strict=True)
-        )
+        self.field_shape = same_parity(field_shape or sensor.shape, sensor.shape)
+        sizes = zip(sensor.shape, self.field_shape, strict=True)
+        padded = _checks.shape2d("padded", [next_fast_len(s + max(s, f)) for s, f in sizes])
         grid = Grid(padded, sensor.pitch)
         magnification = 1 + camera.distance / object_distance
         beta = beta / magnification**2

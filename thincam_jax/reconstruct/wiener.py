@@ -16,7 +16,7 @@ from thincam_jax.camera import LenslessCamera
 from thincam_jax.grids import Grid
 from thincam_jax.operators import CropConvolution, kernel_grid, kernel_shape
 from thincam_jax.psf import Model, psf
-from thincam_jax.reconstruct.registration import register, registered_shape
+from thincam_jax.reconstruct.registration import register, registered_shape, same_parity
 from thincam_jax.reconstruct.result import Reconstruction
 from thincam_jax.reconstruct.spectra import (
     Prior,
@@ -91,7 +91,7 @@ class WienerSynthesis(eqx.Module):
         _check_synthesis(synthesis, cameras, capture_ratios)
         sensor = cameras[0].sensor.grid
         self.sensor_shape = sensor.shape
-        self.field_shape = _same_parity(field_shape or sensor.shape, sensor.shape)
+        self.field_shape = same_parity(field_shape or sensor.shape, sensor.shape)
         self.ratios = tuple(
             next(r for w, r in zip(row, capture_ratios, strict=True) if w) for row in synthesis
         )
@@ -204,12 +204,6 @@ def _check_synthesis(synthesis: np.ndarray, cameras, ratios) -> None:
     grids = {(c.sensor.shape, float(c.sensor.pitch)) for c in cameras}
     if len(grids) > 1:
         raise ValueError(f"cameras have different sensors {sorted(grids)}; use one sensor")
-
-
-def _same_parity(shape, sensor_shape) -> tuple[int, int]:
-    shape = _checks.shape2d("field_shape", shape)
-    rows, columns = (n + (n - s) % 2 for n, s in zip(shape, sensor_shape, strict=True))
-    return rows, columns
 
 
 def _own_field(field_shape, ratio: float) -> tuple[int, int]:
