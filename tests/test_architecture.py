@@ -20,7 +20,8 @@ PACKAGE = "thincam_jax"
 ORDER = (
     *("units", "_checks", "_memory", "_phase", "grids", "chirp", "targets", "scene", "masks"),
     *("sensor", "camera", "propagation", "psf", "waveguide", "operators", "capture", "reconstruct"),
-    *("metrics", "design", "calibrate", "config", "study", "report", "doctor", "cli", "hardware"),
+    *("metrics", "design", "calibrate", "config", "study", "report", "doctor", "run", "cli"),
+    "hardware",
 )
 ENTRY = ("__init__", "__main__")  # they stand right of everything but `hardware`
 MAX_LINES = 500

@@ -9,14 +9,18 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array
+
+
+def is_traced(value: Any) -> bool:
+    """Whether the value is not known yet: an argument of a function under jit, grad or vmap."""
+    return isinstance(value, Tracer)
 
 
 def _known(value: Any) -> np.ndarray | None:
     """The value as a NumPy array, or None while it is traced."""
-    if isinstance(value, jax.core.Tracer):
-        return None
-    return np.asarray(value)
+    return None if is_traced(value) else np.asarray(value)
 
 
 def real(name: str, value: Any, unit: str, *, shape: tuple[int, ...] = ()) -> Array:

@@ -1,12 +1,15 @@
 """From a scene to what the camera captures."""
 
+import functools
 import math
+import operator
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from thincam_jax import _checks
 from thincam_jax._memory import refuse_if_too_large
 from thincam_jax.camera import LenslessCamera
 from thincam_jax.grids import Grid
@@ -42,13 +45,13 @@ def capture(
 
     **Returns** (*batch, y, x) in units of radiance × mm².
     """
-    image = sum(
+    spectrum = scene.spectrum
+    parts = (
         weight * expose(camera, plane, wavelength, model, pixel_integration)
         for plane in scene.planes
-        for wavelength, weight in zip(
-            scene.spectrum.wavelengths, scene.spectrum.weights, strict=True
-        )
+        for wavelength, weight in zip(spectrum.wavelengths, spectrum.weights, strict=True)
     )
+    image = functools.reduce(operator.add, parts)
     return read_out(camera.sensor, image, noise=noise, key=key)
 
 
@@ -95,7 +98,7 @@ def imaging_operator(
 def projected_shape(camera: LenslessCamera, plane: ImagePlane) -> tuple[int, int]:
     """Pixels that the plane's image covers on the sensor's pitch; needs untraced numbers."""
     scale = camera.distance / plane.distance / camera.sensor.pitch
-    if isinstance(scale * plane.width, jax.core.Tracer):
+    if _checks.is_traced(scale * plane.width):
         raise TypeError(
             "capture needs the plane's width and distance and the camera's distance and pitch as "
             "known numbers, because they set array sizes; use imaging_operator inside jit or grad"

@@ -3,6 +3,7 @@
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
+from scipy.fft import next_fast_len
 
 from thincam_jax import _checks
 
@@ -57,6 +58,12 @@ def centred_indices(count: int, dtype) -> Float[Array, " count"]:
 def centred_frequencies(count: int, pitch: Float[Array, ""]) -> Float[Array, " count"]:
     """Frequencies of a DFT of `count` samples, zero at index count//2, in cycles/mm."""
     return (jnp.arange(count, dtype=pitch.dtype) - count // 2) / (count * pitch)
+
+
+def fast_shape(shape: tuple[int, int], *, real: bool = False) -> tuple[int, int]:
+    """The smallest shape that holds `shape` and transforms fast."""
+    rows, columns = (int(next_fast_len(n, real=real) or n) for n in shape)
+    return rows, columns
 
 
 def centre_pad(image: Array, shape: tuple[int, int]) -> Array:

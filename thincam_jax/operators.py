@@ -3,9 +3,8 @@
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
-from scipy.fft import next_fast_len
 
-from thincam_jax.grids import Grid
+from thincam_jax.grids import Grid, fast_shape
 
 
 class CropConvolution(eqx.Module):
@@ -37,12 +36,13 @@ class CropConvolution(eqx.Module):
                 f"kernel has shape {kernel.shape}; a sensor of {self.sensor_shape} and a field of "
                 f"{self.field_shape} need the PSF on {expected} samples (see kernel_grid)"
             )
-        self.padded = tuple(next_fast_len(n, real=True) for n in expected)
+        self.padded = fast_shape(expected, real=True)
         scaled = kernel * jnp.asarray(pitch, dtype=kernel.dtype) ** 2
         self.spectrum = jnp.fft.rfft2(scaled, s=self.padded)
 
     def __call__(self, field: Float[Array, "*batch m n"]) -> Float[Array, "*batch y x"]:
         """The capture of a field."""
+        _require_shape("field", field, self.field_shape)
         product = jnp.fft.rfft2(field, s=self.padded) * self.spectrum
         full = jnp.fft.irfft2(product, s=self.padded)
         top, left = (n - 1 for n in self.field_shape)
@@ -51,6 +51,7 @@ class CropConvolution(eqx.Module):
 
     def adjoint(self, capture: Float[Array, "*batch y x"]) -> Float[Array, "*batch m n"]:
         """The transposed operator: correlation of a capture with the PSF."""
+        _require_shape("capture", capture, self.sensor_shape)
         margins = [
             (n - 1, p - s - n + 1)
             for n, s, p in zip(self.field_shape, self.sensor_shape, self.padded, strict=True)
@@ -59,6 +60,12 @@ class CropConvolution(eqx.Module):
         product = jnp.fft.rfft2(padded) * self.spectrum.conj()
         full = jnp.fft.irfft2(product, s=self.padded)
         return full[..., : self.field_shape[0], : self.field_shape[1]]
+
+
+def _require_shape(name: str, image: Array, shape: tuple[int, int]) -> None:
+    """A larger image would be cut and a smaller one shifted, without a word."""
+    if image.shape[-2:] != shape:
+        raise ValueError(f"{name} has shape {image.shape}; the operator takes (…, y, x) = {shape}")
 
 
 def kernel_shape(sensor_shape: tuple[int, int], field_shape: tuple[int, int]) -> tuple[int, int]:

@@ -15,7 +15,7 @@ from thincam_jax._phase import as_complex
 from thincam_jax.camera import LenslessCamera
 from thincam_jax.grids import Grid
 from thincam_jax.masks.base import AbstractMask
-from thincam_jax.propagation.angular_spectrum import angular_spectrum, padded_shape
+from thincam_jax.propagation.angular_spectrum import angular_spectrum, padded_shape, require_odd
 from thincam_jax.propagation.chirps import ChirpSum
 from thincam_jax.propagation.closed_form import closed_form, focus_distance
 from thincam_jax.propagation.geometric import geometric
@@ -177,9 +177,11 @@ def _sampling(camera, grid, model, pixel_integration, oversampling):
         if oversampling is not None:
             raise ValueError(f"model {model!r} is a closed form: leave oversampling out")
         return None, 1
-    oversampling = oversampling or (3 if pixel_integration else 1)
+    if oversampling is None:
+        oversampling = 3 if pixel_integration else 1
+    require_odd(oversampling)
     sizes = [*camera.mask.extent, grid.pitch, camera.mask.centre]
-    if any(isinstance(s, jax.core.Tracer) for s in sizes):
+    if any(_checks.is_traced(s) for s in sizes):
         return None, oversampling  # the size cannot be looked at: the sensor's, checked when run
     height, width, pitch, centre = (np.asarray(s) for s in sizes)
     reach = (np.array([height, width]) + 2 * np.abs(centre)) / pitch

@@ -1,6 +1,7 @@
 """What the camera looks at: flat images at distances, and the light they send."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -29,6 +30,9 @@ class ImagePlane(eqx.Module):
             raise ValueError(
                 f"image has shape {self.image.shape}; give a non-empty (…, y, x) array"
             )
+        traced = isinstance(self.image, jax.core.Tracer)
+        if not traced and not np.isfinite(np.asarray(self.image)).all():
+            raise ValueError("image holds NaN or infinity; give finite radiances")
         self.distance = _checks.positive("distance", distance, "mm")
         self.width = _checks.positive("width", width, "mm")
 
@@ -37,7 +41,9 @@ class ImagePlane(eqx.Module):
         """Physical height, mm."""
         return self.width * (self.image.shape[-2] / self.image.shape[-1])
 
-    def sample(self, grid: Grid, *, magnification=-1.0) -> Float[Array, "*batch y x"]:
+    def sample(
+        self, grid: Grid, *, magnification: float | Float[Array, ""] = -1.0
+    ) -> Float[Array, "*batch y x"]:
         """The image, scaled by `magnification`, averaged over the cells of a grid.
 
         The image's pixels are taken as uniform squares, so that the average is exact and totals are
@@ -80,6 +86,8 @@ class Spectrum(eqx.Module):
         self.weights = _checks.finite("weights", weights, "parts of one", shape=(count,))
         if count == 0:
             raise ValueError("wavelengths is empty; give at least one wavelength in mm")
+        if not isinstance(self.weights, jax.core.Tracer) and (np.asarray(self.weights) < 0).any():
+            raise ValueError(f"weights = {self.weights} has a negative share; give weights >= 0")
 
 
 class Scene(eqx.Module):

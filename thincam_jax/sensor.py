@@ -61,6 +61,14 @@ class AbstractNoise(eqx.Module):
     ) -> Float[Array, "*batch y x"]:
         """The noisy image. `electrons` is the number per unit of the image; None if unknown."""
 
+    @abc.abstractmethod
+    def variance(
+        self,
+        image: Float[Array, "*batch y x"],
+        electrons: Float[Array, "*batch 1 1"] | None = None,
+    ) -> Float[Array, "*batch"]:
+        """Noise variance of a pixel, averaged over each image, in the image's unit squared."""
+
 
 class GaussianNoise(AbstractNoise):
     r"""White Gaussian noise at a signal-to-noise ratio, the same for every image of a batch.
@@ -80,8 +88,7 @@ class GaussianNoise(AbstractNoise):
             "signal_power", signal_power, ("total", "without_mean")
         )
 
-    def variance(self, image: Float[Array, "*batch y x"]) -> Float[Array, "*batch"]:
-        """σ² for every image."""
+    def variance(self, image, electrons=None):
         if self.signal_power == "total":
             power = jnp.mean(image**2, axis=(-2, -1))
         else:
@@ -106,6 +113,13 @@ class PoissonGaussianNoise(AbstractNoise):
     def __init__(self, read_noise=8.0):
         self.read_noise = _checks.positive("read_noise", read_noise, "electrons")
 
+    def variance(self, image, electrons=None):
+        if electrons is None:
+            raise ValueError("PoissonGaussianNoise counts electrons: give their number")
+        mean = jnp.mean(jnp.maximum(image * electrons, 0.0), axis=(-2, -1))
+        read = self.read_noise.astype(image.dtype) ** 2
+        return (mean + read) / electrons[..., 0, 0] ** 2
+
     def add(self, key, image, electrons):
         if electrons is None:
             raise ValueError(
@@ -118,6 +132,17 @@ class PoissonGaussianNoise(AbstractNoise):
             read_key, image.shape, image.dtype
         )
         return (counts + read) / electrons
+
+
+def electrons_per_unit(
+    sensor: Sensor, image: Float[Array, "*batch y x"]
+) -> Float[Array, "*batch 1 1"] | None:
+    """Electrons per unit of each image at the sensor's exposure; None for an ideal sensor."""
+    if sensor.exposure is None:
+        return None
+    brightest = jnp.max(image, axis=(-2, -1), keepdims=True)
+    wanted = (sensor.exposure * sensor.full_well).astype(image.dtype)
+    return wanted / jnp.where(brightest > 0, brightest, 1.0)
 
 
 def read_out(
@@ -136,11 +161,7 @@ def read_out(
     """
     if noise is not None and key is None:
         raise ValueError("noise needs a key: pass key=jax.random.key(seed)")
-    electrons = None
-    if sensor.exposure is not None:
-        brightest = jnp.max(image, axis=(-2, -1), keepdims=True)
-        wanted = (sensor.exposure * sensor.full_well).astype(image.dtype)
-        electrons = wanted / jnp.where(brightest > 0, brightest, 1.0)
+    electrons = electrons_per_unit(sensor, image)
     if noise is not None and key is not None:
         image = noise.add(key, image, electrons)
     if electrons is None:

@@ -6,10 +6,9 @@ from typing import NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Complex, Float
-from scipy.fft import next_fast_len
 
 from thincam_jax._phase import turn_phasor
-from thincam_jax.grids import Grid, centred_frequencies
+from thincam_jax.grids import Grid, centred_frequencies, fast_shape
 from thincam_jax.masks.base import AbstractMask
 from thincam_jax.propagation.path import Path
 from thincam_jax.propagation.plane import block_average, lit_mask
@@ -56,7 +55,8 @@ def propagate(
     r"""A field after the distance d of `path`, on the same (already padded) window.
 
     Multiplies the spectrum with
-    :math:`\exp\{j\tfrac{2\pi d}{\lambda}(\sqrt{1-\lambda^2\rho^2}-1)\}`; the piston is dropped, √(1−s)−1 is formed as −s/(1+√(1−s)), and the phase is reduced in turns.
+    :math:`\exp\{j\tfrac{2\pi d}{\lambda}(\sqrt{1-\lambda^2\rho^2}-1)\}`; the piston is dropped,
+    √(1−s)−1 is formed as −s/(1+√(1−s)), and the phase is reduced in turns.
     Evanescent waves and frequencies above the window's band limit are removed.
     """
     v = jnp.fft.ifftshift(centred_frequencies(field.shape[0], pitch))[:, None]
@@ -96,7 +96,7 @@ def angular_spectrum(
     - `pixel_integration`: average the oversampled irradiance over each pixel.
     """
     plane, sensor = planes(grid, mask_shape, oversampling)
-    field = lit_mask(_within(mask, plane), plane, path)
+    field = lit_mask(within(mask, plane), plane, path)
     window = padded_shape(plane.shape, sensor.shape, padding)
     field = jnp.pad(field, [(0, n - m) for n, m in zip(window, field.shape, strict=True)])
     field = propagate(field, sensor.pitch, path)
@@ -112,10 +112,7 @@ def angular_spectrum(
 
 def planes(grid: Grid, mask_shape: tuple[int, int] | None, oversampling: int) -> tuple[Grid, Grid]:
     """The mask's and the sensor's oversampled grids, of equal parity so that samples coincide."""
-    if oversampling < 1 or oversampling % 2 == 0:
-        raise ValueError(
-            f"oversampling = {oversampling}: give an odd number, so that pixel centres are samples"
-        )
+    require_odd(oversampling)
     shape = mask_shape or grid.shape
     shape = tuple(m + (m - s) % 2 for m, s in zip(shape, grid.shape, strict=True))
     fine = grid.pitch / oversampling
@@ -125,18 +122,24 @@ def planes(grid: Grid, mask_shape: tuple[int, int] | None, oversampling: int) ->
     )
 
 
+def require_odd(oversampling: int) -> None:
+    if oversampling < 1 or oversampling % 2 == 0:
+        raise ValueError(
+            f"oversampling = {oversampling}: give an odd number, so that pixel centres are samples"
+        )
+
+
 def padded_shape(
     mask_shape: tuple[int, int], sensor_shape: tuple[int, int], padding: float
 ) -> tuple[int, int]:
     """The window: `padding` times mask and sensor side by side, at a size that transforms fast."""
     rows, columns = (
-        next_fast_len(math.ceil(padding * (m + s)))
-        for m, s in zip(mask_shape, sensor_shape, strict=True)
+        math.ceil(padding * (m + s)) for m, s in zip(mask_shape, sensor_shape, strict=True)
     )
-    return rows, columns
+    return fast_shape((rows, columns))
 
 
-def _within(mask: AbstractMask, plane: Grid) -> AbstractMask:
+def within(mask: AbstractMask, plane: Grid) -> AbstractMask:
     """The mask, checked (inside jit too) to lie in the plane that samples it."""
     offset = jnp.abs(mask.centre)
     reach = jnp.stack([offset[i] + mask.extent[i] / 2 for i in range(2)])

@@ -7,7 +7,7 @@ from jaxtyping import Array, Complex, Float
 from thincam_jax._phase import turn_phasor
 from thincam_jax.grids import Grid
 from thincam_jax.masks.base import AbstractMask
-from thincam_jax.propagation.angular_spectrum import planes
+from thincam_jax.propagation.angular_spectrum import planes, within
 from thincam_jax.propagation.path import Path
 from thincam_jax.propagation.plane import block_average, lit_mask
 
@@ -61,6 +61,8 @@ def rayleigh_sommerfeld(
     """
     plane, fine = planes(grid, mask_shape, oversampling)
     sensor = fine if pixel_integration else grid
-    field = rayleigh_sommerfeld_field(lit_mask(mask, plane, path), plane, sensor, path)
+    field = rayleigh_sommerfeld_field(
+        lit_mask(within(mask, plane), plane, path), plane, sensor, path
+    )
     irradiance = (field.real**2 + field.imag**2) * path.magnification**2
     return block_average(irradiance, oversampling) if pixel_integration else irradiance

@@ -8,12 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
-from scipy.fft import next_fast_len
 
-from thincam_jax import _checks
-from thincam_jax._phase import phasor
+from thincam_jax._phase import phasor, turn_phasor
 from thincam_jax.camera import LenslessCamera
-from thincam_jax.grids import Grid
+from thincam_jax.grids import Grid, fast_shape
 from thincam_jax.masks.fza import FresnelZoneAperture
 from thincam_jax.reconstruct.registration import same_parity
 from thincam_jax.reconstruct.result import Reconstruction
@@ -52,8 +50,10 @@ class FringeScanning(eqx.Module):
         self.sensor_shape = sensor.shape
         self.field_shape = same_parity(field_shape or sensor.shape, sensor.shape)
         sizes = zip(sensor.shape, self.field_shape, strict=True)
-        padded = _checks.shape2d("padded", [next_fast_len(s + max(s, f)) for s, f in sizes])
+        rows, columns = (s + max(s, f) for s, f in sizes)
+        padded = fast_shape((rows, columns))
         grid = Grid(padded, sensor.pitch)
+        object_distance = _checks.positive("object_distance", object_distance, "mm")
         magnification = 1 + camera.distance / object_distance
         beta = beta / magnification**2
         v, u = jnp.fft.ifftshift(grid.v)[:, None], jnp.fft.ifftshift(grid.u)
@@ -62,7 +62,9 @@ class FringeScanning(eqx.Module):
         )
         gain = jnp.where(sampled, beta / jnp.pi, 0.0)
         filtered = phasor(-(jnp.pi**2) * (u**2 + v**2) / beta)
-        self.inverse = gain.astype(filtered.dtype) * filtered
+        # A mask beside the axis shifts the shadow by M times its centre.
+        down, right = magnification * camera.mask.centre
+        self.inverse = gain.astype(filtered.dtype) * filtered * turn_phasor(v * down + u * right)
         self.object_pitch = sensor.pitch * object_distance / camera.distance
 
     def __call__(self, captures: Float[Array, "capture *batch y x"]) -> Reconstruction:
@@ -93,8 +95,8 @@ class FringeScanning(eqx.Module):
 
 
 def _check_phases(cameras: Sequence[LenslessCamera]) -> Float[Array, ""]:
-    masks = [c.mask for c in cameras]
-    if len(cameras) != 4 or not all(isinstance(m, FresnelZoneAperture) for m in masks):
+    masks = [c.mask for c in cameras if isinstance(c.mask, FresnelZoneAperture)]
+    if len(cameras) != 4 or len(masks) != 4:
         raise ValueError(
             f"fringe scanning takes four cameras with a FresnelZoneAperture; got {len(cameras)}"
         )
@@ -104,7 +106,17 @@ def _check_phases(cameras: Sequence[LenslessCamera]) -> Float[Array, ""]:
         raise ValueError(
             f"phases are {np.round(phases, 4).tolist()} rad; give 0, π/2, π, 3π/2 in this order"
         )
-    settings = {(float(c.distance), float(c.mask.beta), c.sensor.shape) for c in cameras}
+    settings = {
+        (float(c.distance), c.sensor.shape, float(c.sensor.pitch)) + _fixed_numbers(m)
+        for c, m in zip(cameras, masks, strict=True)
+    }
     if len(settings) > 1:
-        raise ValueError("the four cameras differ in distance, beta or sensor; make them equal")
-    return cameras[0].mask.beta
+        raise ValueError(
+            "the four cameras differ in distance, sensor, beta, width or centre; make them equal "
+            "in all but the phase"
+        )
+    return masks[0].beta
+
+
+def _fixed_numbers(mask: FresnelZoneAperture) -> tuple[float, ...]:
+    return float(mask.beta), float(mask.width), *(float(c) for c in mask.centre)

@@ -33,7 +33,8 @@ def register(image: Float[Array, "*batch y x"], ratio: float) -> Float[Array, "*
         raise ValueError(f"ratio = {ratio:g}: captures are enlarged, give a ratio of at least 1")
     if ratio == 1:
         return image
-    shape = registered_shape(image.shape[-2:], ratio)
+    rows, columns = image.shape[-2:]
+    shape = registered_shape((rows, columns), ratio)
     scale = jnp.full(2, ratio, dtype=image.dtype)
     offsets = [(m - n * ratio) / 2 for m, n in zip(shape, image.shape[-2:], strict=True)]
     enlarged = jax.image.scale_and_translate(

@@ -4,16 +4,14 @@ import math
 from collections.abc import Sequence
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
-from scipy.fft import next_fast_len
 
 from thincam_jax import _checks
 from thincam_jax._phase import as_complex
 from thincam_jax.camera import LenslessCamera
-from thincam_jax.grids import Grid
+from thincam_jax.grids import Grid, fast_shape
 from thincam_jax.operators import CropConvolution, kernel_grid, kernel_shape
 from thincam_jax.psf import Model, psf
 from thincam_jax.reconstruct.registration import register, registered_shape, same_parity
@@ -107,11 +105,12 @@ class WienerSynthesis(eqx.Module):
             uniform.append(convolution(jnp.ones(own_field, h.dtype)))
         self.uniform = jnp.stack(uniform)
         self.padded = _padded(sensor.shape, self.field_shape, max(self.ratios))
+        area = (sensor.pitch.astype(self.uniform.dtype)) ** 2
         self.spectra = jnp.stack(
             [
                 # Enlarged, a kernel spreads the same light over ratio² of its area.
                 _embedded_spectrum(register(_combine(row, kernels), ratio), self.padded)
-                * as_complex((sensor.pitch.astype(h.dtype) / ratio) ** 2)
+                * as_complex(area / ratio**2)
                 for row, ratio in zip(synthesis, self.ratios, strict=True)
             ]
         )
@@ -178,7 +177,7 @@ class WienerSynthesis(eqx.Module):
 
 
 def _distance_ratios(cameras: Sequence[LenslessCamera]) -> list[float]:
-    if any(isinstance(c.distance, jax.core.Tracer) for c in cameras):
+    if any(_checks.is_traced(c.distance) for c in cameras):
         raise TypeError(
             "the cameras' distances are traced, but set array sizes: give them as known numbers"
         )
@@ -215,12 +214,12 @@ def _own_field(field_shape, ratio: float) -> tuple[int, int]:
 def _padded(sensor_shape, field_shape, ratio: float) -> tuple[int, int]:
     """A window in which neither the enlarged captures nor the enlarged kernels wrap round."""
     largest = registered_shape(kernel_shape(sensor_shape, _own_field(field_shape, ratio)), ratio)
-    rows, columns = (next_fast_len(n, real=True) for n in largest)
-    return rows, columns
+    return fast_shape(largest, real=True)
 
 
 def _combine(row: np.ndarray, kernels: list[Array]) -> Array:
-    return sum(float(weight) * k for weight, k in zip(row, kernels, strict=True) if weight)
+    used = [float(weight) * k for weight, k in zip(row, kernels, strict=True) if weight]
+    return jnp.sum(jnp.stack(used), axis=0)
 
 
 def _embedded_spectrum(image: Float[Array, "y x"], padded) -> Complex[Array, "v u"]:

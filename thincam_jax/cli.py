@@ -1,0 +1,129 @@
+"""The command `thincam`."""
+
+import sys
+from pathlib import Path
+from typing import Annotated, NoReturn
+
+import rich.console
+import rich.progress
+import rich.table
+import typer
+
+from thincam_jax import doctor as doctoring
+from thincam_jax.config import ConfigError, load_config
+from thincam_jax.run import run_study, steps
+from thincam_jax.study import RunFolder
+
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    help="Simulate and reconstruct thin computational cameras.",
+)
+_console = rich.console.Console()
+_errors = rich.console.Console(stderr=True)
+
+# What a user can put right; anything else is a defect and keeps its traceback.
+_USER_ERRORS = (ConfigError, FileNotFoundError, IsADirectoryError, PermissionError, MemoryError)
+
+
+def _fail(error: BaseException) -> NoReturn:
+    for line in str(error).splitlines():
+        _errors.print(f"thincam: {line}", highlight=False, markup=False, soft_wrap=True)
+    raise typer.Exit(2)
+
+
+@app.command()
+def run(
+    config: Annotated[Path, typer.Argument(help="Experiment file (YAML); see configs/.")],
+    out: Annotated[
+        Path | None, typer.Option(help="Run folder; default runs/NAME of the study.")
+    ] = None,
+    set_: Annotated[
+        list[str] | None,
+        typer.Option("--set", help="Change a value: a.b=value, list entries by number."),
+    ] = None,
+) -> None:
+    """Run a study: captures, reconstructions, metrics.json, figures and report.html.
+
+    Ctrl-C keeps what is finished; the same command goes on from there.
+    """
+    try:
+        study = load_config(config, tuple(set_ or ()))
+        folder = RunFolder(out or Path("runs") / study.name)
+        folder.claim(study)
+    except _USER_ERRORS as error:
+        _fail(error)
+    columns = (
+        rich.progress.TextColumn("{task.description}"),
+        rich.progress.BarColumn(),
+        rich.progress.MofNCompleteColumn(),
+        rich.progress.TimeElapsedColumn(),
+        rich.progress.TextColumn("left"),
+        rich.progress.TimeRemainingColumn(),
+    )
+    try:
+        with rich.progress.Progress(*columns, console=_console) as bar:
+            task = bar.add_task(study.name, total=steps(study))
+            metrics = run_study(
+                study, folder, lambda text: bar.update(task, advance=1, description=text)
+            )
+    except _USER_ERRORS as error:
+        _fail(error)
+    except KeyboardInterrupt:
+        finished = [t.name for t in study.targets if folder.finished(t.name) is not None]
+        done = ", ".join(finished) if finished else "no target yet"
+        _errors.print(
+            f"thincam: interrupted; finished: {done}. The same command goes on from there.",
+            highlight=False,
+            soft_wrap=True,
+        )
+        raise typer.Exit(130) from None
+    _print_results(metrics)
+    _console.print(f"report: {folder.path / 'report.html'}", highlight=False, soft_wrap=True)
+
+
+def _print_results(metrics: dict) -> None:
+    table = rich.table.Table("method")
+    headings = ("PSNR dB", "published", "resolved mm", "published", "cut-off /mm")
+    for heading in headings:
+        table.add_column(heading, justify="right")
+    for name, method in metrics["methods"].items():
+        resolved = [t["resolved"] for t in method["targets"].values() if t["resolved"]]
+        published = method["published"]
+        table.add_row(
+            name,
+            _number(method["mean_psnr_of_pictures_db"], 1),
+            _number(published["psnr_db"], 1),
+            _number(resolved[0]["object_mm"] if resolved else None, 2),
+            _number(published["resolved_object_mm"], 2),
+            _number(method["limits"]["cut_off_cycles_per_mm"], 1),
+        )
+    _console.print(table)
+
+
+def _number(value: float | None, digits: int) -> str:
+    return "–" if value is None else f"{value:.{digits}f}"
+
+
+@app.command()
+def doctor() -> None:
+    """Print versions, devices, supported precisions and missing optional parts."""
+    found = doctoring.environment()
+    _console.print(f"Python {found['python']} on {found['platform']}", highlight=False)
+    _console.print("devices: " + ", ".join(found["devices"]), highlight=False)
+    for name, support in doctoring.dtype_support().items():
+        _console.print(f"  {name}: {support}", highlight=False)
+    for name, version in found["versions"].items():
+        _console.print(f"{name} {version or 'NOT INSTALLED'}", highlight=False)
+    for name, purpose in doctoring.missing_parts().items():
+        _console.print(f"optional {name} is missing: {purpose}", highlight=False)
+
+
+def main() -> None:
+    """Entry point of the command `thincam`."""
+    app()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

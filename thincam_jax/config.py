@@ -1,0 +1,314 @@
+"""Typed experiment files: YAML with units, checked before anything runs."""
+
+import math
+from pathlib import Path
+from typing import Annotated, Any, Literal, get_args
+
+import pydantic
+import yaml
+from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, PlainSerializer
+
+from thincam_jax.psf import Model
+from thincam_jax.reconstruct.spectra import Prior
+from thincam_jax.targets import sample_images
+from thincam_jax.units import parse_quantity
+
+
+class ConfigError(ValueError):
+    """An experiment file that cannot be used; the message has a line for every fault."""
+
+
+def _positive(value: float) -> float:
+    if not value > 0:
+        raise ValueError(f"{value:g} is not positive; give a value above zero")
+    return value
+
+
+def _quantity(kind: str, unit: str):
+    # A resolved file is read back, so it is written in the unit of the package, with every digit.
+    return (
+        BeforeValidator(lambda text: parse_quantity(text, kind)),
+        PlainSerializer(lambda value: f"{value!r} {unit}"),
+    )
+
+
+Length = Annotated[float, *_quantity("length", "mm"), AfterValidator(_positive)]
+Curvature = Annotated[float, *_quantity("curvature", "rad/mm^2"), AfterValidator(_positive)]
+Angle = Annotated[float, *_quantity("angle", "rad")]
+Name = Annotated[str, Field(min_length=1, max_length=60, pattern=r"^[\w .,()=+\-]+$")]
+
+
+class _Section(pydantic.BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class SensorConfig(_Section):
+    """`thincam_jax.Sensor`."""
+
+    shape: tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]]
+    pitch: Length
+    full_well: Annotated[float, Field(gt=0)] = 13_500.0
+    exposure: Annotated[float, Field(gt=0)] | None = None
+    bit_depth: Annotated[int, Field(ge=1, le=24)] | None = None
+
+
+class MaskConfig(_Section):
+    """What all the study's Fresnel zone apertures share."""
+
+    width: Length
+    profile: Literal["cosine", "binary"] = "cosine"
+    harmonics: Annotated[int, Field(ge=1, le=99)] = 9
+    pixel_pitch: Length | None = None
+    fill_factor: Annotated[float, Field(gt=0, le=1)] = 1.0
+
+
+class ObjectConfig(_Section):
+    """Where the targets stand and how wide they are."""
+
+    distance: Length
+    width: Length
+
+
+class NoiseConfig(_Section):
+    """Gaussian noise at an SNR, or shot noise with a read noise in electrons."""
+
+    snr_db: float | None = None
+    signal_power: Literal["total", "without_mean"] = "total"
+    read_noise: Annotated[float, Field(gt=0)] | None = None
+
+    @pydantic.model_validator(mode="after")
+    def _one(self):
+        if (self.snr_db is None) == (self.read_noise is None):
+            raise ValueError("give either snr_db (Gaussian noise) or read_noise (shot noise too)")
+        return self
+
+
+class ShotConfig(_Section):
+    """One setting of the camera; the phases of the synthesis are taken at each."""
+
+    beta: Curvature
+    distance: Length
+    wavelength: Length | None = None
+
+
+class PublishedConfig(_Section):
+    """Figures that a publication gives for a method, shown beside the study's own."""
+
+    psnr_db: float | None = None
+    resolved: Length | None = None
+    limit_cycles_per_mm: Annotated[float, Field(gt=0)] | None = None
+
+
+class MethodConfig(_Section):
+    """A reconstruction and the captures that it takes."""
+
+    name: Name
+    kind: Literal["fringe_scanning", "wiener"]
+    synthesis: Literal["fringe_scanning", "phase_pairs", "separate"] = "fringe_scanning"
+    shots: Annotated[tuple[ShotConfig, ...], Field(min_length=1)]
+    phases: tuple[Angle, ...] = (0.0,)
+    published: PublishedConfig = PublishedConfig()
+
+    @pydantic.model_validator(mode="after")
+    def _fits(self):
+        if self.kind == "fringe_scanning" and (
+            len(self.shots) != 1 or self.synthesis != "fringe_scanning"
+        ):
+            raise ValueError("kind fringe_scanning takes one shot and its own synthesis")
+        if self.synthesis != "separate" and self.phases != (0.0,):
+            raise ValueError(f"synthesis {self.synthesis} sets the phases itself; drop 'phases'")
+        return self
+
+    def shot_phases(self) -> tuple[float, ...]:
+        """The mask phases taken at each shot, rad."""
+        if self.synthesis == "fringe_scanning":
+            return (0.0, math.pi / 2, math.pi, 3 * math.pi / 2)
+        return (0.0, 3 * math.pi / 2) if self.synthesis == "phase_pairs" else self.phases
+
+
+class TargetConfig(_Section):
+    """A scene: the drawn USAF-1951 chart, a photograph of scikit-image, or an image file."""
+
+    name: Name
+    kind: Literal["usaf1951", "photograph", "file"]
+    image: str | None = None
+    path: str | None = None
+    pixels: Annotated[int, Field(ge=8, le=8192)] = 1700
+
+    @pydantic.model_validator(mode="after")
+    def _fits(self):
+        needed = {"usaf1951": None, "photograph": "image", "file": "path"}[self.kind]
+        for key in ("image", "path"):
+            if (getattr(self, key) is None) == (key == needed):
+                verb = "needs" if key == needed else "takes no"
+                raise ValueError(f"kind {self.kind} {verb} '{key}'")
+        if self.image is not None and self.image not in sample_images():
+            listed = ", ".join(sample_images())
+            raise ValueError(f"image {self.image!r} is unknown; choose one of {listed}")
+        return self
+
+
+class StudyConfig(_Section):
+    """A whole study: one camera family, several methods, several targets."""
+
+    name: Name
+    title: str = ""
+    seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
+    wavelength: Length
+    model: Model = "separable"
+    pixel_integration: bool = True
+    prior: Prior = "inverse_square"
+    sensor: SensorConfig
+    mask: MaskConfig
+    object: ObjectConfig
+    noise: NoiseConfig | None = None
+    methods: Annotated[tuple[MethodConfig, ...], Field(min_length=1)]
+    targets: Annotated[tuple[TargetConfig, ...], Field(min_length=1)]
+    notes: tuple[str, ...] = ()
+
+    @pydantic.model_validator(mode="after")
+    def _distinct(self):
+        for what in ("methods", "targets"):
+            names = [entry.name for entry in getattr(self, what)]
+            twice = sorted({n for n in names if names.count(n) > 1})
+            if twice:
+                raise ValueError(f"{what} have the same name {twice[0]!r}; give each its own")
+        if self.noise is None and any(m.kind == "wiener" for m in self.methods):
+            raise ValueError("kind wiener weighs noise against signal; give a 'noise' section")
+        if self.noise and self.noise.read_noise and self.sensor.exposure is None:
+            raise ValueError("noise.read_noise counts electrons; give sensor.exposure, such as 0.9")
+        return self
+
+
+def load_config(path: str | Path, overrides: tuple[str, ...] = ()) -> StudyConfig:
+    """Read and check a study; `overrides` are "a.b=value" texts, list entries by number.
+
+    **Errors**: ConfigError with one line for each fault: file and line, field, what was given,
+    what is allowed. FileNotFoundError where there is no such file.
+    """
+    path = Path(path)
+    if not path.is_file():
+        what = "a folder" if path.is_dir() else "missing"
+        raise FileNotFoundError(f"{path} is {what}; give the path of a YAML experiment file")
+    try:
+        text = path.read_text(encoding="utf-8")
+        node = yaml.compose(text, Loader=yaml.SafeLoader)
+        raw = yaml.safe_load(text)
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{path}: not a text file in UTF-8 ({error.reason})") from None
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        line = f":{mark.line + 1}" if mark else ""
+        problem = getattr(error, "problem", None) or "not YAML"
+        raise ConfigError(f"{path}{line}: not valid YAML: {problem}") from None
+    if not isinstance(raw, dict):
+        raise ConfigError(f"{path}:1: give a mapping of 'key: value' lines, beginning with 'name:'")
+    places = {location: f"{path}:{line}" for location, line in _lines(node)}
+    asked = {_override(raw, override): f"--set {override}" for override in overrides}
+    try:
+        return StudyConfig.model_validate(raw)
+    except pydantic.ValidationError as error:
+        faults = [_fault(e, places, asked, str(path)) for e in error.errors()]
+        raise ConfigError("\n".join(faults)) from None
+
+
+def dump_config(config: StudyConfig) -> str:
+    """The resolved study as YAML that `load_config` reads back to the same values."""
+    data = config.model_dump(mode="json", exclude_none=True)
+    return yaml.safe_dump(data, sort_keys=False, allow_unicode=True, width=100)
+
+
+def _lines(node, location: tuple = ()):
+    """(location, line) of every entry of a composed YAML document."""
+    if node is None:
+        return
+    yield location, node.start_mark.line + 1
+    if isinstance(node, yaml.MappingNode):
+        for key, value in node.value:
+            yield (*location, key.value, "(key)"), key.start_mark.line + 1
+            for where, line in _lines(value, (*location, key.value)):
+                # A mapping's own line is its key's: there a reader looks for it.
+                yield where, key.start_mark.line + 1 if where[:-1] == location else line
+    elif isinstance(node, yaml.SequenceNode):
+        for index, value in enumerate(node.value):
+            yield from _lines(value, (*location, index))
+
+
+def _override(raw: Any, text: str) -> tuple:
+    """Set one value in the raw data; the path may name what is not there yet."""
+    path, equals, value = text.partition("=")
+    keys = [int(k) if k.isdigit() else k for k in path.strip().split(".")]
+    if not equals or not all(str(k) for k in keys):
+        raise ConfigError(f"--set {text}: write it as a.b=value, such as mask.width=5.632mm")
+    here = raw
+    for depth, key in enumerate(keys):
+        known = (isinstance(here, list) and isinstance(key, int) and key < len(here)) or isinstance(
+            here, dict
+        )
+        if not known:
+            parent = ".".join(str(k) for k in keys[:depth]) or "the file"
+            raise ConfigError(f"--set {text}: {parent} has no entry {key!r}")
+        if depth == len(keys) - 1:
+            here[key] = yaml.safe_load(value)
+        else:
+            here = here.setdefault(key, {}) if isinstance(here, dict) else here[key]
+    return tuple(keys)
+
+
+def _place(location: tuple, places: dict, asked: dict, path: str) -> str:
+    """The override or the file's line that holds a location, or what is nearest to it."""
+    for end in range(len(location), 0, -1):
+        if location[:end] in asked:
+            return asked[location[:end]]
+        for known in ((*location[:end], "(key)"), location[:end]):
+            if known in places:
+                return places[known]
+    return f"{path}:1"
+
+
+def _fault(error: Any, places: dict, asked: dict, path: str) -> str:
+    """One line: place, field, what is wrong and what is allowed."""
+    location = tuple(error["loc"])
+    field = _dotted(location) or "the file"
+    place = _place(location, places, asked, path)
+    given = error.get("input")
+    message = error["msg"].removeprefix("Value error, ")
+    if error["type"] == "extra_forbidden":
+        message = f"unknown key; allowed here: {', '.join(_allowed(location[:-1]))}"
+    elif error["type"] == "missing":
+        entry = isinstance(location[-1], int)
+        message = "missing; the list needs this entry" if entry else "missing; this key is needed"
+    elif error["type"] == "model_type":
+        message = f"{given!r} is not a section; give lines of 'key: value'"
+    elif error["type"] == "literal_error":
+        message = f"{given!r} is unknown; choose one of {error['ctx']['expected']}"
+    elif error["type"] != "value_error":
+        message = f"{given!r}: {message[0].lower()}{message[1:]}"
+    return f"{place}: {field}: {message}"
+
+
+def _dotted(location: tuple) -> str:
+    text = ""
+    for part in location:
+        text += f"[{part}]" if isinstance(part, int) else f".{part}" if text else str(part)
+    return text
+
+
+def _allowed(location: tuple) -> list[str]:
+    """Keys of the section at a location."""
+    section: Any = StudyConfig
+    for part in location:
+        if isinstance(part, int):
+            continue
+        section = _section_of(section.model_fields[part].annotation)
+    return list(section.model_fields)
+
+
+def _section_of(annotation: Any) -> Any:
+    if isinstance(annotation, type) and issubclass(annotation, pydantic.BaseModel):
+        return annotation
+    for inner in get_args(annotation):
+        found = _section_of(inner)
+        if found is not None:
+            return found
+    return None

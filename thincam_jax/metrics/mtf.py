@@ -1,0 +1,71 @@
+"""Limits of resolution read off a transfer function.
+
+Eager NumPy functions of a response sampled on ascending frequencies ≥ 0.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+# Frequencies, as a part of the highest, that count as low.
+_LOW = 0.05
+
+
+def low_frequency_value(frequency: np.ndarray, response: np.ndarray) -> float:
+    """Root mean square of the response over the lowest 5 % of the frequencies, without zero.
+
+    The mean, because the response of a finite mask ripples, and that of a phase pair oscillates;
+    without zero, where a lensless camera has its bias.
+    """
+    low = (frequency > 0) & (frequency <= _LOW * frequency[-1])
+    if not low.any():
+        raise ValueError(
+            f"no frequency in (0, {_LOW * frequency[-1]:g}]: sample the response more finely"
+        )
+    return float(np.sqrt(np.mean(np.abs(response[low]) ** 2)))
+
+
+def cut_off(frequency: np.ndarray, response: np.ndarray, part: float = 0.05) -> float:
+    """Frequency above which the response stays under `part` of its low-frequency value.
+
+    Linear interpolation between samples; the highest frequency if it never falls so low.
+    """
+    magnitude = np.abs(response)
+    level = part * low_frequency_value(frequency, response)
+    above = np.flatnonzero(magnitude > level)
+    last = int(above[-1])
+    if last + 1 == len(frequency):
+        return float(frequency[-1])
+    fall = (magnitude[last] - level) / (magnitude[last] - magnitude[last + 1])
+    return float(frequency[last] + fall * (frequency[last + 1] - frequency[last]))
+
+
+def zero_crossings(frequency: np.ndarray, response: np.ndarray) -> np.ndarray:
+    """All frequencies where a real response changes sign, by linear interpolation."""
+    before, after = response[:-1], response[1:]
+    change = np.flatnonzero((before != 0) & (np.sign(before) != np.sign(after)))
+    step = np.diff(frequency)[change]
+    return frequency[change] + step * before[change] / (before[change] - after[change])
+
+
+def first_common_zero(
+    frequency: np.ndarray, responses: Sequence[np.ndarray], depth: float = 0.15
+) -> float | None:
+    """Lowest frequency that none of the real responses carries; None where there is none.
+
+    For one response it is its first zero crossing that is followed by a revival. Several captures
+    miss a frequency together only if all cross zero within a frequency step of each other and their
+    root sum of squares there is under `depth` of its low-frequency value; the end of the band,
+    after which nothing rises to twice that again, is the cut-off and no zero.
+    """
+    total = np.sqrt(np.sum(np.square(responses), axis=0))
+    level = depth * low_frequency_value(frequency, total)
+    step = float(np.max(np.diff(frequency)))
+    crossings = [zero_crossings(frequency, r) for r in responses]
+    for candidate in crossings[0]:
+        together = all(c.size and np.min(np.abs(c - candidate)) <= step for c in crossings[1:])
+        missing = np.interp(candidate, frequency, total) <= level
+        revived = total[frequency > candidate].max(initial=0.0) > 2 * level
+        if together and missing and revived:
+            return float(candidate)
+    return None

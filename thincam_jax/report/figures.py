@@ -1,0 +1,184 @@
+"""The pictures of a run, as PNG files in its folder."""
+
+import io
+import math
+
+import numpy as np
+import skimage.io
+from matplotlib.figure import Figure
+
+from thincam_jax.config import StudyConfig, TargetConfig
+from thincam_jax.psf import psf
+from thincam_jax.study.build import all_settings, build_camera
+from thincam_jax.study.evaluate import Evaluation
+from thincam_jax.study.folder import RunFolder, slug
+from thincam_jax.study.response import Response
+
+# Told apart by dash and marker as well as by colour, so that they read in grey.
+_LINES = (
+    {"color": "#9a9a9a", "linestyle": "-", "marker": "o"},
+    {"color": "#d08020", "linestyle": "--", "marker": "s"},
+    {"color": "#1060a0", "linestyle": "-", "marker": "^"},
+    {"color": "#000000", "linestyle": ":", "marker": "D"},
+    {"color": "#7030a0", "linestyle": "-.", "marker": "v"},
+)
+
+
+def _line(index: int) -> dict:
+    return dict(_LINES[index % len(_LINES)])
+
+
+def _save(folder: RunFolder, name: str, figure: Figure) -> None:
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=110)
+    folder.write(f"figures/{name}.png", buffer.getvalue())
+
+
+def save_image(folder: RunFolder, name: str, image: np.ndarray) -> None:
+    """An image of values 0…1 as an 8-bit PNG."""
+    pixels = np.round(np.clip(image, 0.0, 1.0) * 255).astype(np.uint8)
+    path = folder.path / "images" / f"{name}.png"
+    skimage.io.imsave(path, pixels, check_contrast=False)
+
+
+def save_target(
+    folder: RunFolder,
+    config: StudyConfig,
+    target: TargetConfig,
+    capture: np.ndarray,
+    evaluations: dict[str, Evaluation],
+) -> None:
+    """A target's scene, one raw capture and all reconstructions, whole and enlarged."""
+    truth = list(evaluations.values())[-1].truth
+    save_image(folder, f"{slug(target.name)}--scene", truth)
+    raw = np.moveaxis(capture, 0, -1)
+    raw = raw[..., 0] if raw.shape[-1] == 1 else raw
+    panels = [("scene", truth, "")]
+    for name, evaluation in evaluations.items():
+        save_image(folder, f"{slug(target.name)}--{slug(name)}", evaluation.image)
+        panels.append((name, evaluation.image, _caption(evaluation)))
+    columns = len(panels) + 1
+    aspect = truth.shape[0] / truth.shape[1]
+    figure = Figure(figsize=(2.75 * columns, 2.75 * (aspect + 1) + 1.25), layout="constrained")
+    axes = figure.subplots(2, columns, gridspec_kw={"height_ratios": (aspect, 1)})
+    for ax in axes.ravel():
+        ax.set_xticks([])
+        ax.set_yticks([])
+    _show(axes[0, 0], raw / raw.max(), "first raw capture")
+    _show_detail_of_capture(axes[1, 0], raw / raw.max(), config)
+    for ax, detail, (name, image, caption) in zip(axes[0, 1:], axes[1, 1:], panels, strict=True):
+        _show(ax, image, f"{name}\n{caption}" if caption else name)
+        _show(detail, _middle(image), "")
+        detail.set_xlabel(f"middle {config.object.width / 3:.0f} mm", fontsize=9)
+    _save(folder, slug(target.name), figure)
+
+
+def _caption(evaluation: Evaluation) -> str:
+    metrics = evaluation.metrics
+    text = f"{metrics['psnr_db']:.1f} dB, SSIM {metrics['ssim']:.2f}"
+    if metrics["resolved"]:
+        text += f"\nresolves {metrics['resolved']['object_mm']:.2f} mm"
+    return text
+
+
+def _show(ax, image: np.ndarray, title: str) -> None:
+    ax.imshow(np.clip(image, 0, 1), cmap="gray", vmin=0, vmax=1, interpolation="nearest")
+    if title:
+        ax.set_title(title, fontsize=9)
+
+
+def _show_detail_of_capture(ax, raw: np.ndarray, config: StudyConfig) -> None:
+    detail = _middle(raw)
+    low, high = detail.min(), detail.max()
+    _show(ax, (detail - low) / (high - low if high > low else 1), "")
+    width = config.sensor.shape[1] * config.sensor.pitch / 3
+    ax.set_xlabel(f"middle {width:.2g} mm of the sensor,\nstretched", fontsize=9)
+
+
+def _middle(image: np.ndarray) -> np.ndarray:
+    """The central square whose side is a third of the width."""
+    rows, columns = image.shape[:2]
+    half = max(1, min(columns // 6, rows // 2))
+    return image[
+        rows // 2 - half : rows // 2 + half or None,
+        columns // 2 - half : columns // 2 + half or None,
+    ]
+
+
+def save_responses(folder: RunFolder, config: StudyConfig, responses: dict[str, Response]) -> None:
+    """Transfer functions of all methods, with their limits."""
+    figure = Figure(figsize=(8.5, 2.1 * len(responses) + 0.8), layout="constrained")
+    axes = np.atleast_1d(figure.subplots(len(responses), 1, sharex=True))
+    end = max(r.metrics["cut_off_cycles_per_mm"] for r in responses.values()) * 1.4
+    for index, (ax, (name, response)) in enumerate(zip(axes, responses.items(), strict=True)):
+        low = (response.frequency > 0) & (response.frequency < 0.05 * response.frequency[-1])
+        level = math.sqrt(np.mean(response.magnitude[low] ** 2))
+        style = _line(index) | {"marker": "", "linestyle": "-"}
+        ax.plot(response.frequency[1:], response.magnitude[1:] / level, linewidth=1.1, **style)
+        limits = response.metrics
+        zero, cut = limits["first_zero_cycles_per_mm"], limits["cut_off_cycles_per_mm"]
+        if zero is not None:
+            ax.axvline(zero, color="black", linestyle=":", linewidth=1)
+            ax.text(zero, 1.52, f" first zero {zero:.1f}", fontsize=8, va="top")
+        ax.axvline(cut, color="black", linestyle="--", linewidth=1)
+        ax.text(cut, 1.34, f" cut-off {cut:.1f}", fontsize=8, va="top")
+        ax.set_ylim(0, 1.6)
+        ax.set_xlim(0, min(end, response.frequency[-1]))
+        ax.set_ylabel("relative MTF")
+        ax.set_title(name, fontsize=10, loc="left")
+    axes[-1].set_xlabel("spatial frequency u on the reference sensor plane (cycles/mm), v = 0")
+    _save(folder, "mtf", figure)
+
+
+def save_contrasts(folder: RunFolder, config: StudyConfig, contrasts: dict[str, list]) -> None:
+    """Contrast of every chart element against its period, for each method."""
+    figure = Figure(figsize=(8.5, 4.2), layout="constrained")
+    ax = figure.subplots()
+    for index, (name, records) in enumerate(contrasts.items()):
+        periods = sorted({period for period, _, _ in records}, reverse=True)
+        worst = [min(c for p, _, c in records if p == period) for period in periods]
+        ax.plot(periods, worst, label=name, markersize=4, linewidth=1.2, **_line(index))
+    ax.axhline(0, color="black", linewidth=0.8)
+    ax.set_xscale("log")
+    ax.invert_xaxis()
+    ticks = [10, 5, 2, 1, 0.5, 0.2]
+    ax.set_xticks(ticks, [f"{t:g}" for t in ticks])
+    ax.minorticks_off()
+    ax.set_ylim(-1.05, 1.1)
+    ax.set_xlabel("line pair on the object (mm)")
+    ax.set_ylabel("contrast of the three bars,\nworse direction")
+    ax.legend(fontsize=9, loc="lower left")
+    ax.grid(alpha=0.3)
+    _save(folder, "contrast", figure)
+
+
+def save_psf(folder: RunFolder, config: StudyConfig) -> None:
+    """The first exposure's PSF: the image, and a line through its middle."""
+    setting = all_settings(config)[0]
+    camera = build_camera(config, setting)
+    h = np.asarray(
+        psf(
+            camera,
+            wavelength=setting.wavelength,
+            object_distance=config.object.distance,
+            model=config.model,
+            pixel_integration=config.pixel_integration,
+        )
+    )
+    figure = Figure(figsize=(8.5, 3.4), layout="constrained")
+    image, line = figure.subplots(1, 2, gridspec_kw={"width_ratios": (1, 1.6)})
+    x, y = np.asarray(camera.sensor.grid.x), np.asarray(camera.sensor.grid.y)
+    half = config.sensor.pitch / 2
+    extent = (x[0] - half, x[-1] + half, y[-1] + half, y[0] - half)
+    shown = image.imshow(h, cmap="gray", extent=extent)
+    figure.colorbar(shown, ax=image, label="irradiance / open aperture")
+    image.set_xlabel("x (mm)")
+    image.set_ylabel("y (mm)")
+    line.plot(x, h[h.shape[0] // 2], color="black", linewidth=0.7)
+    line.set_xlabel("x (mm), through the middle")
+    line.set_ylabel("irradiance / open aperture")
+    line.set_title(
+        f"β = {setting.beta:g} rad/mm², φ = {setting.phase:.2f} rad, d = {setting.distance:g} mm",
+        fontsize=9,
+    )
+    _save(folder, "psf", figure)

@@ -1,0 +1,157 @@
+"""From a study's configuration to cameras, scenes and reconstructions."""
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from thincam_jax.camera import LenslessCamera
+from thincam_jax.capture import capture
+from thincam_jax.config import MethodConfig, StudyConfig, TargetConfig
+from thincam_jax.masks.fza import FresnelZoneAperture
+from thincam_jax.reconstruct import FringeScanning, Reconstruction, WienerSynthesis
+from thincam_jax.reconstruct import synthesis as syntheses
+from thincam_jax.scene import ImagePlane, Scene
+from thincam_jax.sensor import (
+    AbstractNoise,
+    GaussianNoise,
+    PoissonGaussianNoise,
+    Sensor,
+    electrons_per_unit,
+)
+from thincam_jax.targets import load_image, sample_image, usaf1951
+
+
+class Setting(NamedTuple):
+    """One exposure: what a capture is identified by."""
+
+    beta: float
+    phase: float
+    distance: float
+    wavelength: float
+
+
+def settings(config: StudyConfig, method: MethodConfig) -> list[Setting]:
+    """The exposures of a method, in the order of its synthesis."""
+    return [
+        Setting(shot.beta, phase, shot.distance, shot.wavelength or config.wavelength)
+        for shot in method.shots
+        for phase in method.shot_phases()
+    ]
+
+
+def all_settings(config: StudyConfig) -> list[Setting]:
+    """Every exposure of the study once, in order of first use."""
+    return list(dict.fromkeys(s for m in config.methods for s in settings(config, m)))
+
+
+def build_camera(config: StudyConfig, setting: Setting) -> LenslessCamera:
+    mask = FresnelZoneAperture(
+        setting.beta,
+        setting.phase,
+        width=config.mask.width,
+        profile=config.mask.profile,
+        harmonics=config.mask.harmonics,
+        pixel_pitch=config.mask.pixel_pitch,
+        fill_factor=config.mask.fill_factor,
+    )
+    sensor = Sensor(
+        config.sensor.shape,
+        config.sensor.pitch,
+        full_well=config.sensor.full_well,
+        exposure=config.sensor.exposure,
+        bit_depth=config.sensor.bit_depth,
+    )
+    return LenslessCamera(mask, sensor, setting.distance)
+
+
+def build_noise(config: StudyConfig) -> AbstractNoise | None:
+    if config.noise is None:
+        return None
+    if config.noise.snr_db is not None:
+        return GaussianNoise(config.noise.snr_db, config.noise.signal_power)
+    return PoissonGaussianNoise(config.noise.read_noise)
+
+
+def build_plane(config: StudyConfig, target: TargetConfig) -> ImagePlane:
+    """The target in front of the camera, with its colour channels as a batch: (channel, y, x)."""
+    if target.kind == "usaf1951":
+        image = usaf1951((target.pixels, target.pixels))
+    elif target.kind == "photograph":
+        image = sample_image(target.image or "")
+    else:
+        image = load_image(target.path or "")
+    image = np.moveaxis(np.atleast_3d(image), -1, 0)
+    return ImagePlane(image.astype(np.float32), config.object.distance, config.object.width)
+
+
+def take(config: StudyConfig, setting: Setting, plane: ImagePlane, key: Array) -> Array:
+    """One capture (channel, y, x) of a target."""
+    return capture(
+        build_camera(config, setting),
+        Scene(plane, setting.wavelength),
+        key=key,
+        noise=build_noise(config),
+        model=config.model,
+        pixel_integration=config.pixel_integration,
+    )
+
+
+def capture_key(config: StudyConfig, target: int, exposure: int) -> Array:
+    """The random key of one capture: the same however the study is interrupted."""
+    return jax.random.fold_in(jax.random.fold_in(jax.random.key(config.seed), target), exposure)
+
+
+def synthesis_matrix(method: MethodConfig) -> np.ndarray:
+    shots = len(method.shots)
+    if method.synthesis == "fringe_scanning":
+        return syntheses.fringe_scanning(shots)
+    if method.synthesis == "phase_pairs":
+        return syntheses.phase_pairs(shots)
+    return syntheses.separate(shots * len(method.phases))
+
+
+def reference_distance(method: MethodConfig) -> float:
+    """The largest mask-sensor distance, on whose scale a method reconstructs, mm."""
+    return max(shot.distance for shot in method.shots)
+
+
+def field_shape(config: StudyConfig, method: MethodConfig, plane: ImagePlane) -> tuple[int, int]:
+    """Pixels of the reconstruction: what covers the target at the object pitch."""
+    scale = reference_distance(method) / config.object.distance / config.sensor.pitch
+    rows, columns = (
+        max(1, math.ceil(float(size) * scale - 1e-3)) for size in (plane.height, plane.width)
+    )
+    return rows, columns
+
+
+def build_reconstructor(
+    config: StudyConfig, method: MethodConfig, shape: tuple[int, int]
+) -> Callable[[Array], Reconstruction]:
+    """A function of the method's captures (capture, channel, y, x)."""
+    used = settings(config, method)
+    cameras = [build_camera(config, s) for s in used]
+    if method.kind == "fringe_scanning":
+        return FringeScanning(cameras, object_distance=config.object.distance, field_shape=shape)
+    noise = build_noise(config)
+    assert noise is not None  # the configuration demands it for this kind
+    synthesis = WienerSynthesis(
+        cameras,
+        wavelength=[s.wavelength for s in used],
+        object_distance=config.object.distance,
+        synthesis=synthesis_matrix(method),
+        field_shape=shape,
+        prior=config.prior,
+        model=config.model,
+        pixel_integration=config.pixel_integration,
+    )
+
+    def reconstruct(captures: Array) -> Reconstruction:
+        electrons = electrons_per_unit(cameras[0].sensor, captures)
+        return synthesis(captures, jnp.asarray(noise.variance(captures, electrons)))
+
+    return reconstruct

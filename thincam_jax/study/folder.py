@@ -1,0 +1,69 @@
+"""The run folder: what is in it, and how an interrupted study goes on."""
+
+import json
+import os
+import re
+from pathlib import Path
+from typing import Any
+
+from thincam_jax.config import ConfigError, StudyConfig, dump_config
+
+
+class RunFolder:
+    """Files of one run. Every file is written whole or not at all.
+
+    - `config.yaml`: the resolved configuration.
+    - `targets/NAME.json`: the metrics of a finished target; an interrupted study skips these.
+    - `images/`: reconstructions and scenes, `figures/`: the report's pictures.
+    - `metrics.json`, `environment.json`, `report.html`: written at the end.
+    """
+
+    def __init__(self, path: str | Path):
+        self.path = Path(path)
+        for name in ("targets", "images", "figures"):
+            try:
+                (self.path / name).mkdir(parents=True, exist_ok=True)
+            except OSError as error:
+                raise ConfigError(
+                    f"--out {path}: cannot be made a folder ({error.strerror})"
+                ) from None
+
+    def claim(self, config: StudyConfig) -> None:
+        """Write the configuration, or refuse a folder that holds another study's results."""
+        held = self.path / "config.yaml"
+        text = dump_config(config)
+        if held.exists() and held.read_text(encoding="utf-8") != text:
+            raise ConfigError(
+                f"--out {self.path}: holds a run of another configuration (see {held}); "
+                "give another folder or delete this one"
+            )
+        self.write("config.yaml", text)
+
+    def finished(self, target: str) -> dict[str, Any] | None:
+        """The stored results of a target, or None if it has not been finished."""
+        path = self.path / "targets" / f"{slug(target)}.json"
+        try:
+            return json.loads(path.read_text(encoding="utf-8"))
+        except (OSError, json.JSONDecodeError):
+            return None
+
+    def finish(self, target: str, results: dict[str, Any]) -> None:
+        self.write(f"targets/{slug(target)}.json", to_json(results))
+
+    def write(self, name: str, content: str | bytes) -> Path:
+        """Write a file by way of a neighbour that is renamed."""
+        path = self.path / name
+        partial = path.with_name(path.name + ".partial")
+        data = content.encode("utf-8") if isinstance(content, str) else content
+        partial.write_bytes(data)
+        os.replace(partial, path)
+        return path
+
+
+def slug(name: str) -> str:
+    """A name as a file name."""
+    return re.sub(r"[^a-z0-9.]+", "-", name.lower()).strip("-.") or "unnamed"
+
+
+def to_json(data: Any) -> str:
+    return json.dumps(data, indent=2, ensure_ascii=False, allow_nan=False) + "\n"

@@ -1,0 +1,104 @@
+r"""Transfer functions of whole methods: what a synthesis of captures carries of each frequency."""
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from thincam_jax.config import MethodConfig, ShotConfig, StudyConfig
+from thincam_jax.metrics import cut_off, first_common_zero
+from thincam_jax.psf import otf
+from thincam_jax.study.build import (
+    Setting,
+    build_camera,
+    reference_distance,
+    settings,
+    synthesis_matrix,
+)
+
+
+class Response(NamedTuple):
+    """A method's transfer function along u, v = 0, on its reference plane.
+
+    - `frequency`: cycles/mm, ≥ 0.
+    - `magnitude`: root of the mean over the shots of Σ|H|² of a shot's channels, mm².
+    - `metrics`: its two limits, for metrics.json.
+    """
+
+    frequency: np.ndarray
+    magnitude: np.ndarray
+    metrics: dict[str, Any]
+
+
+def method_response(config: StudyConfig, method: MethodConfig) -> Response:
+    """The response with the finite mask, for a point on the axis, and its limits.
+
+    - First zero crossing: the lowest frequency that no shot of the method carries. A fringe-scanned
+      response is real once its carrier e^{jX} is taken off; a phase pair's is real as it is.
+    - Cut-off: where the magnitude stays under 5 % of its low-frequency value.
+    """
+    reference = reference_distance(method)
+    frequency, signed, powers = None, [], []
+    for index, shot in enumerate(method.shots):
+        own, channels = _shot_channels(config, method, index)
+        ratio = reference / shot.distance
+        if frequency is None:
+            frequency = own
+        # A frequency on the reference plane is ratio times higher on this shot's sensor.
+        power = np.sum(np.abs(channels) ** 2, axis=0)
+        powers.append(np.interp(frequency * ratio, own, power, right=0.0))
+        for response in _signed(config, method, shot, own, channels):
+            signed.append(np.interp(frequency * ratio, own, response, right=0.0))
+    assert frequency is not None
+    magnitude = np.sqrt(np.mean(powers, axis=0))
+    limit = cut_off(frequency, magnitude)
+    zero = first_common_zero(frequency, signed)
+    magnification = config.object.distance / reference
+    return Response(
+        frequency,
+        magnitude,
+        {
+            "first_zero_cycles_per_mm": None if zero is None else round(zero, 3),
+            "first_zero_object_mm": None if zero is None else round(magnification / zero, 3),
+            "cut_off_cycles_per_mm": round(limit, 3),
+            "cut_off_object_mm": round(magnification / limit, 3),
+        },
+    )
+
+
+def _shot_channels(config: StudyConfig, method: MethodConfig, shot: int):
+    """Frequencies ≥ 0 and the responses (channel, u) of the channels of one shot."""
+    phases = len(method.shot_phases())
+    used = settings(config, method)[shot * phases : (shot + 1) * phases]
+    frequency, responses = None, []
+    for setting in used:
+        frequency, response = _profile(config, setting)
+        responses.append(response)
+    single = method.model_copy(update={"shots": (method.shots[shot],)})
+    return frequency, synthesis_matrix(single) @ np.stack(responses)
+
+
+def _profile(config: StudyConfig, setting: Setting) -> tuple[np.ndarray, np.ndarray]:
+    camera = build_camera(config, setting)
+    response = otf(
+        camera,
+        wavelength=setting.wavelength,
+        object_distance=config.object.distance,
+        model=config.model,
+        pixel_integration=config.pixel_integration,
+    )
+    rows, columns = config.sensor.shape
+    line = np.asarray(response[rows // 2, columns // 2 :])
+    return np.asarray(camera.sensor.grid.u[columns // 2 :], dtype=float), line
+
+
+def _signed(
+    config: StudyConfig, method: MethodConfig, shot: ShotConfig, u: np.ndarray, channels
+) -> list[np.ndarray]:
+    """Real responses whose sign shows the zeros."""
+    if method.synthesis != "fringe_scanning":
+        return [channel.real for channel in channels]
+    magnification = 1 + shot.distance / config.object.distance
+    beta = shot.beta / magnification**2
+    scanned = channels[0] + 1j * channels[1]
+    return [(scanned * np.exp(-1j * math.pi**2 * u**2 / beta)).real]
