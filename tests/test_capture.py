@@ -1,5 +1,6 @@
 """From scene to capture: where points go, what adds up, noise, odd sensors, gradients, refusals."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -183,11 +184,18 @@ def test_gradients_of_camera_and_scene():
     small = tc.Sensor((24, 29), 40 * um)
     image, weights = photograph((9, 12)), photograph((24, 29), 2) - 0.5
 
-    @jax.jit
+    fixed, view = camera(sensor=small), tc.Scene(tc.ImagePlane(image, OBJECT_DISTANCE, 16.0), 5e-4)
+
+    @jax.jit  # sizes are those of the objects from outside
     def loss(numbers):
-        own = camera(beta=numbers["beta"], width=numbers["width"], sensor=small)
-        radiance = image * numbers["gain"] ** 2
-        scene = tc.Scene(tc.ImagePlane(radiance, OBJECT_DISTANCE, 16.0), numbers["wavelength"])
+        own = eqx.tree_at(
+            lambda c: (c.mask.beta, c.mask.width), fixed, (numbers["beta"], numbers["width"])
+        )
+        scene = eqx.tree_at(
+            lambda s: (s.planes[0].image, s.spectrum.wavelengths),
+            view,
+            (image * numbers["gain"] ** 2, numbers["wavelength"][None]),
+        )
         return jnp.sum(weights * tc.capture(own, scene, pixel_integration=False))
 
     at = {"beta": 25.0, "width": 2.4, "gain": 1.1, "wavelength": 5e-4}

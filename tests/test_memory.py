@@ -7,7 +7,9 @@ from thincam_jax import _memory
 
 def test_refuses_with_both_numbers(monkeypatch):
     monkeypatch.setattr(_memory, "available_bytes", lambda: 3 * 2**30)
-    with pytest.raises(MemoryError, match=r"^a cube needs about 4.5 GiB, 3.0 GiB are free; halve it$"):
+    with pytest.raises(
+        MemoryError, match=r"^a cube needs about 4.5 GiB, 3.0 GiB are free; halve it$"
+    ):
         _memory.refuse_if_too_large("a cube", int(4.5 * 2**30), "halve it")
     _memory.refuse_if_too_large("a cube", 3 * 2**30, "halve it")
 
@@ -25,8 +27,13 @@ def test_free_memory_of_this_machine():
 
 @pytest.mark.parametrize(
     ("count", "text"),
-    [(0, "0 bytes"), (1023, "1023 bytes"), (1024, "1.0 KiB"), (3 * 2**39, "1.5 TiB"),
-     (2**70, "1048576.0 PiB")],
+    [
+        (0, "0 bytes"),
+        (1023, "1023 bytes"),
+        (1024, "1.0 KiB"),
+        (3 * 2**39, "1.5 TiB"),
+        (2**70, "1048576.0 PiB"),
+    ],
 )
 def test_readable(count, text):
     assert _memory._readable(count) == text

@@ -21,7 +21,9 @@ def ramp(shape=(300, 401), mean=0.7):
 def test_gaussian_noise_has_the_stated_snr(key, power, snr_db):
     """120,000 pixels measure σ² to 0.4 %, 0.02 dB: within 0.1 dB."""
     image = ramp()
-    noisy = read_out(tc.Sensor(image.shape, 0.01), image, noise=tc.GaussianNoise(snr_db, power), key=key)
+    noisy = read_out(
+        tc.Sensor(image.shape, 0.01), image, noise=tc.GaussianNoise(snr_db, power), key=key
+    )
     noise = np.asarray(noisy - image)
     signal = np.mean(image**2) if power == "total" else np.var(image)
     assert abs(10 * np.log10(signal / noise.var()) - snr_db) < 0.1
@@ -121,10 +123,19 @@ def test_differentiable_through_the_noise(key):
         (lambda: tc.Sensor((4, 5), 1.0, bit_depth=8), "bit_depth needs an exposure"),
         (lambda: tc.GaussianNoise(np.nan), "snr_db is NaN; give a number in dB"),
         (lambda: tc.PoissonGaussianNoise(-1.0), "read_noise = -1.0 electrons"),
-        (lambda: read_out(tc.Sensor((1, 1), 1.0), jnp.ones((1, 1)), noise=tc.GaussianNoise(9.0)),
-         r"noise needs a key: pass key=jax.random.key\(seed\)"),
-        (lambda: read_out(tc.Sensor((1, 1), 1.0), jnp.ones((1, 1)), noise=tc.PoissonGaussianNoise(),
-                          key=jax.random.key(0)), "give the Sensor an exposure"),
+        (
+            lambda: read_out(tc.Sensor((1, 1), 1.0), jnp.ones((1, 1)), noise=tc.GaussianNoise(9.0)),
+            r"noise needs a key: pass key=jax.random.key\(seed\)",
+        ),
+        (
+            lambda: read_out(
+                tc.Sensor((1, 1), 1.0),
+                jnp.ones((1, 1)),
+                noise=tc.PoissonGaussianNoise(),
+                key=jax.random.key(0),
+            ),
+            "give the Sensor an exposure",
+        ),
     ],
 )
 def test_refusals(build, message):
@@ -135,5 +146,7 @@ def test_refusals(build, message):
 def test_unknown_signal_power(monkeypatch):
     """As a user meets it, without the type checks of the tests."""
     monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
-    with pytest.raises(ValueError, match="'peak' is unknown; choose one of 'total', 'without_mean'"):
+    with pytest.raises(
+        ValueError, match="'peak' is unknown; choose one of 'total', 'without_mean'"
+    ):
         tc.GaussianNoise(20.0, "peak")

@@ -34,10 +34,8 @@ def real(name: str, value: Any, unit: str, *, shape: tuple[int, ...] = ()) -> Ar
     array = jnp.asarray(value)
     if not jnp.issubdtype(array.dtype, jnp.floating):
         array = array.astype(float)
-    if known is None or isinstance(value, jax.Array | np.ndarray | np.generic):
-        pass  # an array keeps its precision
-    else:
-        array = array.astype(jnp.result_type(float))
+    # An array keeps its precision; a weak type goes, because it would be compiled for once more.
+    array = jax.lax.convert_element_type(array, array.dtype)
     if array.shape != shape:
         wanted = "one number" if shape == () else f"an array of shape {shape}"
         raise ValueError(f"{name} has shape {array.shape}; give {wanted} in {unit}")

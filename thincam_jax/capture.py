@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from thincam_jax import _checks
 from thincam_jax._memory import refuse_if_too_large
 from thincam_jax.camera import LenslessCamera
-from thincam_jax.grids import Grid
+from thincam_jax.grids import Grid, same_parity
 from thincam_jax.operators import CropConvolution, kernel_grid, kernel_shape
 from thincam_jax.psf import Model, psf
 from thincam_jax.scene import ImagePlane, Scene
@@ -97,15 +97,19 @@ def imaging_operator(
 
 def projected_shape(camera: LenslessCamera, plane: ImagePlane) -> tuple[int, int]:
     """Pixels that the plane's image covers on the sensor's pitch; needs untraced numbers."""
-    scale = camera.distance / plane.distance / camera.sensor.pitch
-    if _checks.is_traced(scale * plane.width):
+    numbers = (camera.distance, plane.distance, camera.sensor.pitch, plane.width)
+    if any(_checks.is_traced(n) for n in numbers):
         raise TypeError(
             "capture needs the plane's width and distance and the camera's distance and pitch as "
-            "known numbers, because they set array sizes; use imaging_operator inside jit or grad"
+            "known numbers, because they set array sizes; build them outside of jit and grad, or "
+            "use imaging_operator"
         )
-    size = np.asarray(scale) * np.array([np.asarray(plane.height), np.asarray(plane.width)])
+    # In NumPy: inside jit, JAX would trace the product of known numbers too.
+    distance, object_distance, pitch, width = (np.asarray(n) for n in numbers)
+    aspect = plane.image.shape[-2] / plane.image.shape[-1]
+    size = distance / object_distance / pitch * width * np.array([aspect, 1.0])
     rows, columns = (max(1, math.ceil(n - 1e-3)) for n in size)
-    return rows, columns
+    return same_parity((rows, columns), camera.sensor.shape)
 
 
 @jax.jit

@@ -10,9 +10,9 @@ import rich.table
 import typer
 
 from thincam_jax import doctor as doctoring
-from thincam_jax.config import ConfigError, load_config
+from thincam_jax.config import ConfigError, load_config, slug
 from thincam_jax.run import run_study, steps
-from thincam_jax.study import RunFolder
+from thincam_jax.study import RunFolder, check_study
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -50,8 +50,8 @@ def run(
     """
     try:
         study = load_config(config, tuple(set_ or ()))
-        folder = RunFolder(out or Path("runs") / study.name)
-        folder.claim(study)
+        check_study(study)
+        folder = RunFolder(out or Path("runs") / slug(study.name))
     except _USER_ERRORS as error:
         _fail(error)
     columns = (

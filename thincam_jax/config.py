@@ -1,12 +1,14 @@
 """Typed experiment files: YAML with units, checked before anything runs."""
 
 import math
+import re
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
 import pydantic
 import yaml
 from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, PlainSerializer
+from pydantic_core import PydanticCustomError
 
 from thincam_jax.psf import Model
 from thincam_jax.reconstruct.spectra import Prior
@@ -16,6 +18,16 @@ from thincam_jax.units import parse_quantity
 
 class ConfigError(ValueError):
     """An experiment file that cannot be used; the message has a line for every fault."""
+
+
+def slug(name: str) -> str:
+    """A name as a file name."""
+    return re.sub(r"[^a-z0-9.]+", "-", name.lower()).strip("-.") or "unnamed"
+
+
+def _misfit(message: str, *place: str | int) -> PydanticCustomError:
+    """A fault between entries, reported at one of them."""
+    return PydanticCustomError("misfit", "{message}", {"message": message, "place": place})
 
 
 def _positive(value: float) -> float:
@@ -106,7 +118,7 @@ class MethodConfig(_Section):
     kind: Literal["fringe_scanning", "wiener"]
     synthesis: Literal["fringe_scanning", "phase_pairs", "separate"] = "fringe_scanning"
     shots: Annotated[tuple[ShotConfig, ...], Field(min_length=1)]
-    phases: tuple[Angle, ...] = (0.0,)
+    phases: Annotated[tuple[Angle, ...], Field(min_length=1)] = (0.0,)
     published: PublishedConfig = PublishedConfig()
 
     @pydantic.model_validator(mode="after")
@@ -117,6 +129,11 @@ class MethodConfig(_Section):
             raise ValueError("kind fringe_scanning takes one shot and its own synthesis")
         if self.synthesis != "separate" and self.phases != (0.0,):
             raise ValueError(f"synthesis {self.synthesis} sets the phases itself; drop 'phases'")
+        # A capture that is used twice would count its noise as two independent ones.
+        for what in ("shots", "phases"):
+            entries = getattr(self, what)
+            if len(set(entries)) < len(entries):
+                raise ValueError(f"{what} hold an entry twice; give each once")
         return self
 
     def shot_phases(self) -> tuple[float, ...]:
@@ -170,13 +187,27 @@ class StudyConfig(_Section):
     def _distinct(self):
         for what in ("methods", "targets"):
             names = [entry.name for entry in getattr(self, what)]
-            twice = sorted({n for n in names if names.count(n) > 1})
-            if twice:
-                raise ValueError(f"{what} have the same name {twice[0]!r}; give each its own")
-        if self.noise is None and any(m.kind == "wiener" for m in self.methods):
-            raise ValueError("kind wiener weighs noise against signal; give a 'noise' section")
+            # Files are named after them, without capitals and signs.
+            files = [slug(name) for name in names]
+            for index, file in enumerate(files):
+                first = files.index(file)
+                if first < index:
+                    message = (
+                        f"{names[index]!r} and {names[first]!r} of {what}[{first}] "
+                        f"give the same file name {file!r}; choose another name"
+                    )
+                    raise _misfit(message, what, index, "name")
+        return self
+
+    @pydantic.model_validator(mode="after")
+    def _noise_fits(self):
+        for index, method in enumerate(self.methods):
+            if self.noise is None and method.kind == "wiener":
+                message = "wiener weighs noise against signal; give a 'noise' section"
+                raise _misfit(message, "methods", index, "kind")
         if self.noise and self.noise.read_noise and self.sensor.exposure is None:
-            raise ValueError("noise.read_noise counts electrons; give sensor.exposure, such as 0.9")
+            message = "read_noise counts electrons; give sensor.exposure, such as 0.9"
+            raise _misfit(message, "noise", "read_noise")
         return self
 
 
@@ -190,25 +221,12 @@ def load_config(path: str | Path, overrides: tuple[str, ...] = ()) -> StudyConfi
     if not path.is_file():
         what = "a folder" if path.is_dir() else "missing"
         raise FileNotFoundError(f"{path} is {what}; give the path of a YAML experiment file")
-    try:
-        text = path.read_text(encoding="utf-8")
-        node = yaml.compose(text, Loader=yaml.SafeLoader)
-        raw = yaml.safe_load(text)
-    except UnicodeDecodeError as error:
-        raise ConfigError(f"{path}: not a text file in UTF-8 ({error.reason})") from None
-    except yaml.YAMLError as error:
-        mark = getattr(error, "problem_mark", None)
-        line = f":{mark.line + 1}" if mark else ""
-        problem = getattr(error, "problem", None) or "not YAML"
-        raise ConfigError(f"{path}{line}: not valid YAML: {problem}") from None
-    if not isinstance(raw, dict):
-        raise ConfigError(f"{path}:1: give a mapping of 'key: value' lines, beginning with 'name:'")
-    places = {location: f"{path}:{line}" for location, line in _lines(node)}
+    raw, places = _read(path)
     asked = {_override(raw, override): f"--set {override}" for override in overrides}
     try:
         return StudyConfig.model_validate(raw)
     except pydantic.ValidationError as error:
-        faults = [_fault(e, places, asked, str(path)) for e in error.errors()]
+        faults = [_fault(e, places, asked, f"{path}:1") for e in error.errors()]
         raise ConfigError("\n".join(faults)) from None
 
 
@@ -216,6 +234,56 @@ def dump_config(config: StudyConfig) -> str:
     """The resolved study as YAML that `load_config` reads back to the same values."""
     data = config.model_dump(mode="json", exclude_none=True)
     return yaml.safe_dump(data, sort_keys=False, allow_unicode=True, width=100)
+
+
+def _read(path: Path) -> tuple[dict, dict[tuple, str]]:
+    """The raw data of a YAML file, and the file and line of every entry."""
+    try:
+        text = path.read_text(encoding="utf-8")
+        node = yaml.compose(text, Loader=yaml.SafeLoader)
+        raw = yaml.safe_load(text)
+        places = {location: f"{path}:{line}" for location, line in _lines(node)}
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{path}: not a text file in UTF-8 ({error.reason})") from None
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        line = f":{mark.line + 1}" if mark else ""
+        problem = getattr(error, "problem", None) or "not YAML"
+        raise ConfigError(f"{path}{line}: not valid YAML: {problem}") from None
+    except ValueError as error:  # such as a date that does not exist
+        raise ConfigError(f"{path}: not valid YAML: {error}; put texts in quotes") from None
+    except RecursionError:
+        raise ConfigError(f"{path}: nested too deeply, or an alias inside its anchor") from None
+    if not isinstance(raw, dict):
+        raise ConfigError(f"{path}:1: give a mapping of 'key: value' lines, beginning with 'name:'")
+    twice = [f"{path}:{line}: {message}" for line, message in _repeated_keys(node)]
+    if twice:
+        raise ConfigError("\n".join(twice))
+    return raw, places
+
+
+def _repeated_keys(node) -> list[tuple[int, str]]:
+    """Keys that stand twice in one mapping; PyYAML takes the last without a word."""
+    # An aliased part is reported once.
+    return sorted({entry for mapping in _mappings(node) for entry in _repeated_in(mapping)})
+
+
+def _mappings(node):
+    if isinstance(node, yaml.MappingNode):
+        yield node
+    if isinstance(node, yaml.CollectionNode):
+        for entry in node.value:
+            yield from _mappings(entry[1] if isinstance(entry, tuple) else entry)
+
+
+def _repeated_in(mapping: yaml.MappingNode):
+    first: dict[str, int] = {}
+    for key, _ in mapping.value:
+        line = key.start_mark.line + 1
+        if key.value in first:
+            before = f"first in line {first[key.value]}"
+            yield line, f"{key.value}: this key stands twice ({before}); keep one"
+        first.setdefault(key.value, line)
 
 
 def _lines(node, location: tuple = ()):
@@ -237,7 +305,7 @@ def _lines(node, location: tuple = ()):
 def _override(raw: Any, text: str) -> tuple:
     """Set one value in the raw data; the path may name what is not there yet."""
     path, equals, value = text.partition("=")
-    keys = [int(k) if k.isdigit() else k for k in path.strip().split(".")]
+    keys = [int(k) if k.isdecimal() else k for k in path.strip().split(".")]
     if not equals or not all(str(k) for k in keys):
         raise ConfigError(f"--set {text}: write it as a.b=value, such as mask.width=5.632mm")
     here = raw
@@ -249,28 +317,43 @@ def _override(raw: Any, text: str) -> tuple:
             parent = ".".join(str(k) for k in keys[:depth]) or "the file"
             raise ConfigError(f"--set {text}: {parent} has no entry {key!r}")
         if depth == len(keys) - 1:
-            here[key] = yaml.safe_load(value)
+            here[key] = _override_value(text, value)
         else:
             here = here.setdefault(key, {}) if isinstance(here, dict) else here[key]
     return tuple(keys)
 
 
-def _place(location: tuple, places: dict, asked: dict, path: str) -> str:
+def _override_value(text: str, value: str) -> Any:
+    try:
+        return yaml.safe_load(value)
+    except (yaml.YAMLError, ValueError):
+        raise ConfigError(
+            f"--set {text}: {value!r} is not valid YAML; put texts in quotes"
+        ) from None
+
+
+def _place(location: tuple, places: dict, asked: dict, top: str) -> str:
     """The override or the file's line that holds a location, or what is nearest to it."""
-    for end in range(len(location), 0, -1):
-        if location[:end] in asked:
-            return asked[location[:end]]
-        for known in ((*location[:end], "(key)"), location[:end]):
+    parts = [location[:end] for end in range(len(location), 0, -1)]
+    for part in parts:  # an override stands in for whatever the file has there
+        if part in asked:
+            return asked[part]
+    if location not in places:
+        for path, override in asked.items():
+            if location and path[: len(location)] == location:
+                return override
+    for part in parts:
+        for known in ((*part, "(key)"), part):
             if known in places:
                 return places[known]
-    return f"{path}:1"
+    return top
 
 
-def _fault(error: Any, places: dict, asked: dict, path: str) -> str:
+def _fault(error: Any, places: dict, asked: dict, top: str) -> str:
     """One line: place, field, what is wrong and what is allowed."""
-    location = tuple(error["loc"])
+    location = (*error["loc"], *error.get("ctx", {}).get("place", ()))
     field = _dotted(location) or "the file"
-    place = _place(location, places, asked, path)
+    place = _place(location, places, asked, top)
     given = error.get("input")
     message = error["msg"].removeprefix("Value error, ")
     if error["type"] == "extra_forbidden":
@@ -282,7 +365,7 @@ def _fault(error: Any, places: dict, asked: dict, path: str) -> str:
         message = f"{given!r} is not a section; give lines of 'key: value'"
     elif error["type"] == "literal_error":
         message = f"{given!r} is unknown; choose one of {error['ctx']['expected']}"
-    elif error["type"] != "value_error":
+    elif error["type"] not in ("value_error", "misfit"):
         message = f"{given!r}: {message[0].lower()}{message[1:]}"
     return f"{place}: {field}: {message}"
 

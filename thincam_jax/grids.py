@@ -66,6 +66,13 @@ def fast_shape(shape: tuple[int, int], *, real: bool = False) -> tuple[int, int]
     return rows, columns
 
 
+def same_parity(shape, sensor_shape) -> tuple[int, int]:
+    """A field's shape, enlarged by at most one pixel to share its centre with the sensor."""
+    shape = _checks.shape2d("field_shape", shape)
+    rows, columns = (n + (n - s) % 2 for n, s in zip(shape, sensor_shape, strict=True))
+    return rows, columns
+
+
 def centre_pad(image: Array, shape: tuple[int, int]) -> Array:
     """Zeros around the last two axes so that the centre stays the centre.
 

@@ -1,6 +1,9 @@
 """Linear operators of a camera, with their adjoints."""
 
+import functools
+
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
 
@@ -37,8 +40,7 @@ class CropConvolution(eqx.Module):
                 f"{self.field_shape} need the PSF on {expected} samples (see kernel_grid)"
             )
         self.padded = fast_shape(expected, real=True)
-        scaled = kernel * jnp.asarray(pitch, dtype=kernel.dtype) ** 2
-        self.spectrum = jnp.fft.rfft2(scaled, s=self.padded)
+        self.spectrum = _spectrum(kernel, pitch, self.padded)
 
     def __call__(self, field: Float[Array, "*batch m n"]) -> Float[Array, "*batch y x"]:
         """The capture of a field."""
@@ -66,6 +68,11 @@ def _require_shape(name: str, image: Array, shape: tuple[int, int]) -> None:
     """A larger image would be cut and a smaller one shifted, without a word."""
     if image.shape[-2:] != shape:
         raise ValueError(f"{name} has shape {image.shape}; the operator takes (…, y, x) = {shape}")
+
+
+@functools.partial(jax.jit, static_argnames="padded")
+def _spectrum(kernel, pitch, padded):
+    return jnp.fft.rfft2(kernel * jnp.asarray(pitch, dtype=kernel.dtype) ** 2, s=padded)
 
 
 def kernel_shape(sensor_shape: tuple[int, int], field_shape: tuple[int, int]) -> tuple[int, int]:

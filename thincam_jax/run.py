@@ -123,6 +123,7 @@ def _write_report(config, folder, metrics, responses, contrasts, seconds) -> Non
         figures.save_contrasts(folder, config, contrasts)
     figures.save_psf(folder, config)
     surroundings = environment(seconds)
-    folder.write("metrics.json", to_json(metrics))
     folder.write("environment.json", to_json({**surroundings, "seed": config.seed}))
     folder.write("report.html", render(config, folder, metrics, surroundings))
+    # Last: it marks the run as complete.
+    folder.write("metrics.json", to_json(metrics))

@@ -1,7 +1,6 @@
 """What the camera looks at: flat images at distances, and the light they send."""
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -30,8 +29,7 @@ class ImagePlane(eqx.Module):
             raise ValueError(
                 f"image has shape {self.image.shape}; give a non-empty (…, y, x) array"
             )
-        traced = isinstance(self.image, jax.core.Tracer)
-        if not traced and not np.isfinite(np.asarray(self.image)).all():
+        if not _checks.is_traced(self.image) and not np.isfinite(np.asarray(self.image)).all():
             raise ValueError("image holds NaN or infinity; give finite radiances")
         self.distance = _checks.positive("distance", distance, "mm")
         self.width = _checks.positive("width", width, "mm")
@@ -86,7 +84,7 @@ class Spectrum(eqx.Module):
         self.weights = _checks.finite("weights", weights, "parts of one", shape=(count,))
         if count == 0:
             raise ValueError("wavelengths is empty; give at least one wavelength in mm")
-        if not isinstance(self.weights, jax.core.Tracer) and (np.asarray(self.weights) < 0).any():
+        if not _checks.is_traced(self.weights) and (np.asarray(self.weights) < 0).any():
             raise ValueError(f"weights = {self.weights} has a negative share; give weights >= 0")
 
 

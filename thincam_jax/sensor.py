@@ -161,6 +161,11 @@ def read_out(
     """
     if noise is not None and key is None:
         raise ValueError("noise needs a key: pass key=jax.random.key(seed)")
+    return _read_out(sensor, image, noise, key)
+
+
+@eqx.filter_jit
+def _read_out(sensor: Sensor, image, noise: AbstractNoise | None, key):
     electrons = electrons_per_unit(sensor, image)
     if noise is not None and key is not None:
         image = noise.add(key, image, electrons)

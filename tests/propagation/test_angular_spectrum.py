@@ -4,10 +4,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from propagation import reference
 
 import thincam_jax as tc
 from helpers import relative_l2
-from propagation import reference
 from thincam_jax.propagation import (
     Path,
     angular_spectrum,
@@ -45,18 +45,18 @@ def test_converges_to_separable(capsys):
             ),
             expected,
         )
-        for padding in (1.0, 2.0, 4.0)
+        for padding in (1.0, 2.0)
         for oversampling in (1, 3, 9)
     }
     with capsys.disabled():
         print("\nangular_spectrum against separable, relative L2, 60×76 pixels of 10 µm at 20 mm")
         print("oversampling      1        3        9")
-        for padding in (1.0, 2.0, 4.0):
+        for padding in (1.0, 2.0):
             print(f"padding {padding:.0f}  ", *(f"{error[padding, q]:9.1e}" for q in (1, 3, 9)))
-    for padding in (1.0, 2.0, 4.0):
+    for padding in (1.0, 2.0):
         assert error[padding, 1] > error[padding, 3] > error[padding, 9]
-    assert error[1.0, 9] > 3 * error[2.0, 9] > 3 * error[4.0, 9]
-    assert error[2.0, 1] < 0.03 and error[2.0, 3] < 4e-3 and error[4.0, 9] < 1.1e-3
+    assert error[1.0, 9] > 3 * error[2.0, 9]
+    assert error[2.0, 1] < 0.03 and error[2.0, 3] < 4e-3 and error[2.0, 9] < 1.5e-3
 
 
 def test_finite_object_distance():
@@ -78,9 +78,9 @@ def test_steep_edge_waves_are_beyond_fresnel():
     the direct sum over the same samples, of which `angular_spectrum` is a few parts in 10,000."""
     mask = tc.FresnelZoneAperture(200.0, 0.3, width=0.3)
     grid, path = tc.Grid((12, 15), 0.03), Path(WAVELENGTH, 2.0)
-    direct = jax.jit(
-        lambda *a: rayleigh_sommerfeld(*a, mask_shape=(10, 11), oversampling=31)
-    )(mask, grid, path)
+    direct = jax.jit(lambda *a: rayleigh_sommerfeld(*a, mask_shape=(10, 11), oversampling=31))(
+        mask, grid, path
+    )
     fourier = sampled(mask, grid, path, mask_shape=(10, 11), oversampling=31)
     fresnel = exact(mask, grid, path)
     assert 0.01 < relative_l2(fresnel, direct) < 0.05

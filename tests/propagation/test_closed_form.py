@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
+from propagation import reference
 
 import thincam_jax as tc
 from helpers import relative_l2
-from propagation import reference
 
 WAVELENGTH = 500e-6
 

@@ -3,9 +3,9 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from propagation import reference
 
 import thincam_jax as tc
-from propagation import reference
 from thincam_jax.propagation import paraxial_response
 
 BETA, PHASE = 25.0, 0.8

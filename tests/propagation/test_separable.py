@@ -5,10 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.integrate
+from propagation import reference
 
 import thincam_jax as tc
 from helpers import relative_l2
-from propagation import reference
 from thincam_jax.propagation import Path, separable
 
 INF = float("inf")
@@ -41,7 +41,13 @@ def coordinates(shape, pitch):
     ("shape", "pitch", "object_distance", "phase", "centre"),
     [
         ((1000, 1024), PITCH, 250.0, 0.0, (0.0, 0.0)),  # the thesis' sensor, edges included
-        ((96, 128), 0.065, 250.0, 0.7, (0.31, -0.52)),  # a coarse one that sees all round the shadow
+        (
+            (96, 128),
+            0.065,
+            250.0,
+            0.7,
+            (0.31, -0.52),
+        ),  # a coarse one that sees all round the shadow
         ((96, 128), 0.065, INF, -2.0, (-0.2, 0.1)),
         ((1, 129), 0.045, 250.0, 4.712, (0.0, 0.0)),
         ((1, 1), 0.045, 250.0, 0.0, (0.4, 0.3)),
@@ -169,7 +175,9 @@ def test_energy(object_distance):
     magnification = 1 + SMALL["distance"] / object_distance
     arrived = value.sum() * pitch**2 / magnification**2
     x = reference.centred(4000, SMALL["width"] / 4000)
-    passed = np.mean(np.cos((200.0 * (x[:, None] ** 2 + x**2) + 0.3) / 2) ** 4) * SMALL["width"] ** 2
+    passed = (
+        np.mean(np.cos((200.0 * (x[:, None] ** 2 + x**2) + 0.3) / 2) ** 4) * SMALL["width"] ** 2
+    )
     assert 0 < 1 - arrived / passed < 1.8e-3
 
 

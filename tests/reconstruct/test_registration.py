@@ -4,7 +4,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from thincam_jax.reconstruct.registration import register, registered_shape, same_parity
+from thincam_jax.grids import same_parity
+from thincam_jax.reconstruct.registration import register, registered_shape
 
 
 def blob(y, x):
@@ -18,8 +19,7 @@ def pixels(shape):
     return y[:, None], x[None, :]
 
 
-@pytest.mark.parametrize("shape", [(38, 47), (41, 36)])
-@pytest.mark.parametrize("ratio", [1.3, 1.031])
+@pytest.mark.parametrize(("shape", "ratio"), [((38, 47), 1.3), ((41, 36), 1.031)])
 def test_the_picture_is_enlarged_about_its_centre(shape, ratio):
     """A smooth function of (y, x) becomes that of (y, x)/ratio; off the sensor's rim."""
     value = register(jnp.asarray(blob(*pixels(shape))), ratio)

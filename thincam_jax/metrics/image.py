@@ -8,7 +8,7 @@ import numpy as np
 import skimage.metrics
 from jaxtyping import ArrayLike, Float64, Num
 
-_SSIM_WINDOW = 7  # pixels; scikit-image's uniform window
+SSIM_WINDOW = 7  # pixels; scikit-image's uniform window
 _ROUNDING = 1e-14  # relative to the data range: an error this small is rounding
 
 
@@ -81,17 +81,17 @@ def ssim(
     """
     image, reference = _pair(image, reference)
     _check_range(data_range)
-    if min(image.shape[:2]) < _SSIM_WINDOW:
+    if min(image.shape[:2]) < SSIM_WINDOW:
         raise ValueError(
             f"images of shape {image.shape} are smaller than the SSIM window; give at least "
-            f"{_SSIM_WINDOW} by {_SSIM_WINDOW} pixels"
+            f"{SSIM_WINDOW} by {SSIM_WINDOW} pixels"
         )
     if aligned:
         image = align(image, reference)[0]
     similarity = skimage.metrics.structural_similarity(
         reference,
         image,
-        win_size=_SSIM_WINDOW,
+        win_size=SSIM_WINDOW,
         data_range=data_range,
         channel_axis=-1 if image.ndim == 3 else None,
     )

@@ -10,6 +10,9 @@ import numpy as np
 # Frequencies, as a part of the highest, that count as low.
 _LOW = 0.05
 
+# A sensor's columns from which on there is a frequency among those: (columns / 2)·_LOW ≥ 1.
+MINIMUM_COLUMNS = round(2 / _LOW)
+
 
 def low_frequency_value(frequency: np.ndarray, response: np.ndarray) -> float:
     """Root mean square of the response over the lowest 5 % of the frequencies, without zero.
@@ -17,12 +20,25 @@ def low_frequency_value(frequency: np.ndarray, response: np.ndarray) -> float:
     The mean, because the response of a finite mask ripples, and that of a phase pair oscillates;
     without zero, where a lensless camera has its bias.
     """
-    low = (frequency > 0) & (frequency <= _LOW * frequency[-1])
+    _check(frequency, response)
+    low = (frequency > 0) & (frequency <= _LOW * frequency[-1] * (1 + 1e-9))
     if not low.any():
         raise ValueError(
             f"no frequency in (0, {_LOW * frequency[-1]:g}]: sample the response more finely"
         )
     return float(np.sqrt(np.mean(np.abs(response[low]) ** 2)))
+
+
+def _check(frequency: np.ndarray, *responses: np.ndarray) -> None:
+    """Frequencies ascend from zero or above, and every response has a finite value at each."""
+    shapes = {np.shape(array) for array in (frequency, *responses)}
+    if len(shapes) > 1 or np.ndim(frequency) != 1 or not np.size(frequency):
+        listed = ", ".join(str(np.shape(array)) for array in (frequency, *responses))
+        raise ValueError(f"frequency and response have shapes {listed}; give equal lengths (n,)")
+    if not (np.diff(frequency) > 0).all() or frequency[0] < 0:
+        raise ValueError("frequency must ascend from zero or above; sort it and drop repeats")
+    if not all(np.isfinite(array).all() for array in (frequency, *responses)):
+        raise ValueError("frequency or response holds NaN or infinity; give finite numbers")
 
 
 def cut_off(frequency: np.ndarray, response: np.ndarray, part: float = 0.05) -> float:
@@ -32,6 +48,8 @@ def cut_off(frequency: np.ndarray, response: np.ndarray, part: float = 0.05) -> 
     """
     magnitude = np.abs(response)
     level = part * low_frequency_value(frequency, response)
+    if not level > 0:
+        raise ValueError("the response is zero at low frequencies: it has no cut-off")
     above = np.flatnonzero(magnitude > level)
     last = int(above[-1])
     if last + 1 == len(frequency):
@@ -49,22 +67,25 @@ def zero_crossings(frequency: np.ndarray, response: np.ndarray) -> np.ndarray:
 
 
 def first_common_zero(
-    frequency: np.ndarray, responses: Sequence[np.ndarray], depth: float = 0.15
+    frequency: np.ndarray, responses: Sequence[np.ndarray], depth: float = 0.05
 ) -> float | None:
     """Lowest frequency that none of the real responses carries; None where there is none.
 
-    For one response it is its first zero crossing that is followed by a revival. Several captures
-    miss a frequency together only if all cross zero within a frequency step of each other and their
-    root sum of squares there is under `depth` of its low-frequency value; the end of the band,
-    after which nothing rises to twice that again, is the cut-off and no zero.
+    For one response it is its first zero crossing. Several captures miss a frequency together only
+    if all cross zero within a frequency step of each other and their root sum of squares there is
+    under `depth` of its low-frequency value. Either must be followed by a revival to twice that:
+    the end of the band is the cut-off and no zero.
     """
+    if not responses:
+        raise ValueError("responses is empty; give at least one")
+    _check(frequency, *responses)
     total = np.sqrt(np.sum(np.square(responses), axis=0))
     level = depth * low_frequency_value(frequency, total)
     step = float(np.max(np.diff(frequency)))
     crossings = [zero_crossings(frequency, r) for r in responses]
     for candidate in crossings[0]:
         together = all(c.size and np.min(np.abs(c - candidate)) <= step for c in crossings[1:])
-        missing = np.interp(candidate, frequency, total) <= level
+        missing = len(responses) == 1 or np.interp(candidate, frequency, total) <= level
         revived = total[frequency > candidate].max(initial=0.0) > 2 * level
         if together and missing and revived:
             return float(candidate)

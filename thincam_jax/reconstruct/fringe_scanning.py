@@ -9,11 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
+from thincam_jax import _checks
 from thincam_jax._phase import phasor, turn_phasor
 from thincam_jax.camera import LenslessCamera
-from thincam_jax.grids import Grid, fast_shape
+from thincam_jax.grids import Grid, fast_shape, same_parity
 from thincam_jax.masks.fza import FresnelZoneAperture
-from thincam_jax.reconstruct.registration import same_parity
 from thincam_jax.reconstruct.result import Reconstruction
 
 
@@ -69,6 +69,7 @@ class FringeScanning(eqx.Module):
 
     def __call__(self, captures: Float[Array, "capture *batch y x"]) -> Reconstruction:
         """The reconstruction of captures (4, *batch, y, x), in the order of the phases."""
+        captures = jnp.asarray(captures, dtype=self.object_pitch.dtype)
         if captures.shape[0] != 4 or captures.shape[-2:] != self.sensor_shape:
             raise ValueError(
                 f"captures have shape {captures.shape}; give (4, …, {self.sensor_shape[0]}, "

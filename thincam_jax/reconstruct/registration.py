@@ -7,15 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from thincam_jax import _checks
-
-
-def same_parity(shape, sensor_shape) -> tuple[int, int]:
-    """A field's shape, enlarged by at most one pixel to share its centre with the sensor."""
-    shape = _checks.shape2d("field_shape", shape)
-    rows, columns = (n + (n - s) % 2 for n, s in zip(shape, sensor_shape, strict=True))
-    return rows, columns
-
 
 def registered_shape(shape: tuple[int, int], ratio: float) -> tuple[int, int]:
     """Pixels of a capture enlarged by `ratio` ≥ 1: enough for it, of the same parity."""

@@ -3,6 +3,7 @@
 from typing import Literal
 
 import equinox as eqx
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 
@@ -11,9 +12,12 @@ class Reconstruction(eqx.Module):
 
     - `image`: radiance, (*batch, y, x), in the scene's unit.
     - `pitch`: distance of its pixels on the object, mm.
-    - `status`: "ok", or "non_finite" where the image holds NaN or infinity.
+    - `status`: "ok", or "non_finite" where the image holds NaN or infinity; not known inside jit.
     """
 
     image: Float[Array, "*batch y x"]
     pitch: Float[Array, ""]
-    status: Literal["ok", "non_finite"] = eqx.field(static=True, default="ok")
+
+    @property
+    def status(self) -> Literal["ok", "non_finite"]:
+        return "ok" if bool(jnp.isfinite(self.image).all()) else "non_finite"

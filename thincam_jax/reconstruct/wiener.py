@@ -11,10 +11,10 @@ from jaxtyping import Array, Complex, Float
 from thincam_jax import _checks
 from thincam_jax._phase import as_complex
 from thincam_jax.camera import LenslessCamera
-from thincam_jax.grids import Grid, fast_shape
+from thincam_jax.grids import Grid, fast_shape, same_parity
 from thincam_jax.operators import CropConvolution, kernel_grid, kernel_shape
 from thincam_jax.psf import Model, psf
-from thincam_jax.reconstruct.registration import register, registered_shape, same_parity
+from thincam_jax.reconstruct.registration import register, registered_shape
 from thincam_jax.reconstruct.result import Reconstruction
 from thincam_jax.reconstruct.spectra import (
     Prior,
@@ -94,7 +94,7 @@ class WienerSynthesis(eqx.Module):
             next(r for w, r in zip(row, capture_ratios, strict=True) if w) for row in synthesis
         )
         how = {"model": model, "pixel_integration": pixel_integration}
-        wavelengths = np.broadcast_to(np.asarray(wavelength), (len(cameras),))
+        wavelengths = jnp.broadcast_to(jnp.asarray(wavelength), (len(cameras),))
         kernels, uniform = [], []
         for camera, w, ratio in zip(cameras, wavelengths, capture_ratios, strict=True):
             own_field = _own_field(self.field_shape, ratio)
@@ -102,7 +102,8 @@ class WienerSynthesis(eqx.Module):
             h = psf(camera, wavelength=w, object_distance=object_distance, grid=grid, **how)
             kernels.append(h)
             convolution = CropConvolution(h, sensor.pitch, sensor.shape, own_field)
-            uniform.append(convolution(jnp.ones(own_field, h.dtype)))
+            cover = _coverage(own_field, self.field_shape, ratio)
+            uniform.append(convolution(jnp.asarray(cover, dtype=h.dtype)))
         self.uniform = jnp.stack(uniform)
         self.padded = _padded(sensor.shape, self.field_shape, max(self.ratios))
         area = (sensor.pitch.astype(self.uniform.dtype)) ** 2
@@ -127,6 +128,7 @@ class WienerSynthesis(eqx.Module):
 
         `noise_variance`: of a pixel, one number, one for each capture or (capture, *batch); > 0.
         """
+        captures = jnp.asarray(captures, dtype=self.uniform.dtype)
         count, *batch, rows, columns = captures.shape
         if (rows, columns) != self.sensor_shape or count != self.uniform.shape[0]:
             raise ValueError(
@@ -134,6 +136,11 @@ class WienerSynthesis(eqx.Module):
                 f"{self.sensor_shape[0]}, {self.sensor_shape[1]})"
             )
         variance = _checks.positive_all("noise_variance", jnp.asarray(noise_variance), "units²")
+        if variance.shape != (count, *batch)[: variance.ndim]:
+            raise ValueError(
+                f"noise_variance has shape {variance.shape}; give one number, {count} (one for "
+                f"each capture) or {(count, *batch)}"
+            )
         variance = variance.astype(captures.dtype)
         variance = variance.reshape(variance.shape + (1,) * (1 + len(batch) - variance.ndim))
         variance = jnp.broadcast_to(variance, (count, *batch)).reshape(count, -1)
@@ -209,6 +216,15 @@ def _own_field(field_shape, ratio: float) -> tuple[int, int]:
     """The field in samples of a camera's own scale, ratio times coarser; parity as the field's."""
     rows, columns = (n - 2 * math.floor((n - n / ratio) / 2 + 1e-6) for n in field_shape)
     return rows, columns
+
+
+def _coverage(own_field, field_shape, ratio: float) -> np.ndarray:
+    """How much of each own sample the field covers: the outermost ones lie partly outside."""
+    sides = []
+    for count, whole in zip(own_field, field_shape, strict=True):
+        distance = np.abs(np.arange(count) - (count - 1) / 2)
+        sides.append(np.clip(whole / ratio / 2 - distance + 0.5, 0.0, 1.0))
+    return np.outer(*sides)
 
 
 def _padded(sensor_shape, field_shape, ratio: float) -> tuple[int, int]:

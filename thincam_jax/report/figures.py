@@ -1,17 +1,18 @@
 """The pictures of a run, as PNG files in its folder."""
 
 import io
-import math
+import os
 
 import numpy as np
 import skimage.io
 from matplotlib.figure import Figure
 
-from thincam_jax.config import StudyConfig, TargetConfig
+from thincam_jax.config import StudyConfig, TargetConfig, slug
+from thincam_jax.metrics import low_frequency_value
 from thincam_jax.psf import psf
 from thincam_jax.study.build import all_settings, build_camera
 from thincam_jax.study.evaluate import Evaluation
-from thincam_jax.study.folder import RunFolder, slug
+from thincam_jax.study.folder import RunFolder
 from thincam_jax.study.response import Response
 
 # Told apart by dash and marker as well as by colour, so that they read in grey.
@@ -38,7 +39,9 @@ def save_image(folder: RunFolder, name: str, image: np.ndarray) -> None:
     """An image of values 0…1 as an 8-bit PNG."""
     pixels = np.round(np.clip(image, 0.0, 1.0) * 255).astype(np.uint8)
     path = folder.path / "images" / f"{name}.png"
-    skimage.io.imsave(path, pixels, check_contrast=False)
+    partial = path.with_name(f"{name}.partial.png")
+    skimage.io.imsave(partial, pixels, check_contrast=False)
+    os.replace(partial, path)
 
 
 def save_target(
@@ -70,7 +73,8 @@ def save_target(
         _show(ax, image, f"{name}\n{caption}" if caption else name)
         _show(detail, _middle(image), "")
         detail.set_xlabel(f"middle {config.object.width / 3:.0f} mm", fontsize=9)
-    _save(folder, slug(target.name), figure)
+    # No target's name can be taken for one of the study's own figures.
+    _save(folder, f"target-{slug(target.name)}", figure)
 
 
 def _caption(evaluation: Evaluation) -> str:
@@ -111,8 +115,7 @@ def save_responses(folder: RunFolder, config: StudyConfig, responses: dict[str, 
     axes = np.atleast_1d(figure.subplots(len(responses), 1, sharex=True))
     end = max(r.metrics["cut_off_cycles_per_mm"] for r in responses.values()) * 1.4
     for index, (ax, (name, response)) in enumerate(zip(axes, responses.items(), strict=True)):
-        low = (response.frequency > 0) & (response.frequency < 0.05 * response.frequency[-1])
-        level = math.sqrt(np.mean(response.magnitude[low] ** 2))
+        level = low_frequency_value(response.frequency, response.magnitude)
         style = _line(index) | {"marker": "", "linestyle": "-"}
         ax.plot(response.frequency[1:], response.magnitude[1:] / level, linewidth=1.1, **style)
         limits = response.metrics

@@ -6,8 +6,8 @@ from typing import Any
 
 import jinja2
 
-from thincam_jax.config import StudyConfig, dump_config
-from thincam_jax.study.folder import RunFolder, slug
+from thincam_jax.config import StudyConfig, dump_config, slug
+from thincam_jax.study.folder import RunFolder
 
 
 def render(

@@ -2,6 +2,7 @@
 
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import numpy as np
 
 from thincam_jax.config import MethodConfig, StudyConfig, TargetConfig
@@ -39,7 +40,7 @@ def evaluate(
     image = np.asarray(reconstruction.image, dtype=float)
     rows, columns = image.shape[-2:]
     grid = Grid((rows, columns), reconstruction.pitch)
-    truth = np.asarray(plane.sample(grid, magnification=1.0), dtype=float)
+    truth = np.asarray(_sample(plane, grid), dtype=float)
     image, truth = (_as_picture(i) for i in (image, truth))
     metrics: dict[str, Any] = {
         "psnr_db": round(psnr(image, truth), 4),
@@ -51,6 +52,11 @@ def evaluate(
     if target.kind == "usaf1951":
         metrics["resolved"], contrast = _resolution(config, method, image, float(grid.pitch))
     return Evaluation(align(image, truth)[0], truth, metrics, contrast)
+
+
+@eqx.filter_jit
+def _sample(plane: ImagePlane, grid: Grid):
+    return plane.sample(grid, magnification=1.0)
 
 
 def _as_picture(image: np.ndarray) -> np.ndarray:

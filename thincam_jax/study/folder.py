@@ -2,11 +2,10 @@
 
 import json
 import os
-import re
 from pathlib import Path
 from typing import Any
 
-from thincam_jax.config import ConfigError, StudyConfig, dump_config
+from thincam_jax.config import ConfigError, StudyConfig, dump_config, slug
 
 
 class RunFolder:
@@ -29,14 +28,21 @@ class RunFolder:
                 ) from None
 
     def claim(self, config: StudyConfig) -> None:
-        """Write the configuration, or refuse a folder that holds another study's results."""
+        """Write the configuration, or refuse a folder that holds another study's results.
+
+        An interrupted run of the same configuration goes on; a complete one is done anew.
+        """
         held = self.path / "config.yaml"
         text = dump_config(config)
-        if held.exists() and held.read_text(encoding="utf-8") != text:
+        if held.exists() and held.read_bytes() != text.encode("utf-8"):
             raise ConfigError(
                 f"--out {self.path}: holds a run of another configuration (see {held}); "
                 "give another folder or delete this one"
             )
+        if (self.path / "metrics.json").exists():
+            for result in (self.path / "targets").glob("*.json"):
+                result.unlink()
+            (self.path / "metrics.json").unlink()
         self.write("config.yaml", text)
 
     def finished(self, target: str) -> dict[str, Any] | None:
@@ -58,11 +64,6 @@ class RunFolder:
         partial.write_bytes(data)
         os.replace(partial, path)
         return path
-
-
-def slug(name: str) -> str:
-    """A name as a file name."""
-    return re.sub(r"[^a-z0-9.]+", "-", name.lower()).strip("-.") or "unnamed"
 
 
 def to_json(data: Any) -> str:

@@ -1,0 +1,64 @@
+"""What a study's file alone cannot tell, found before the first capture."""
+
+import jax
+
+from thincam_jax.config import ConfigError, StudyConfig, TargetConfig
+from thincam_jax.metrics.image import SSIM_WINDOW
+from thincam_jax.metrics.mtf import MINIMUM_COLUMNS
+from thincam_jax.psf import psf
+from thincam_jax.study.build import all_settings, build_camera, build_plane, field_shape
+
+
+def check_study(config: StudyConfig) -> None:
+    """Refuse cameras that cannot be built, images that cannot be read, and too few pixels.
+
+    **Errors**: ConfigError, one line for each fault, beginning with the field.
+    """
+    faults = _camera_faults(config)
+    for index, target in enumerate(config.targets):
+        faults += [f"targets[{index}]: {fault}" for fault in _target_faults(config, target)]
+    if faults:
+        raise ConfigError("\n".join(faults))
+
+
+def _camera_faults(config: StudyConfig) -> list[str]:
+    columns = config.sensor.shape[1]
+    if columns < MINIMUM_COLUMNS:
+        return [
+            f"sensor.shape: {columns} columns are too few for a transfer function; "
+            f"give at least {MINIMUM_COLUMNS}"
+        ]
+    try:
+        for setting in all_settings(config):
+            camera = build_camera(config, setting)
+        # Traced only: whether the model takes this mask at all.
+        jax.eval_shape(
+            lambda: psf(
+                camera,
+                wavelength=setting.wavelength,
+                object_distance=config.object.distance,
+                model=config.model,
+                pixel_integration=config.pixel_integration,
+            )
+        )
+    except (ValueError, TypeError) as error:
+        return [f"mask, sensor or model: {error}"]
+    return []
+
+
+def _target_faults(config: StudyConfig, target: TargetConfig) -> list[str]:
+    try:
+        plane = build_plane(config, target)
+    except (ValueError, FileNotFoundError) as error:
+        return [str(error)]
+    if plane.image.min() == plane.image.max():
+        return ["the image is uniform: there is nothing to reconstruct; give another one"]
+    for method in config.methods:
+        shape = field_shape(config, method, plane)
+        if min(shape) < SSIM_WINDOW:
+            return [
+                f"{method.name!r} reconstructs it on {shape[0]}×{shape[1]} pixels, at least "
+                f"{SSIM_WINDOW}×{SSIM_WINDOW} are needed; give a larger object.width or a "
+                "smaller sensor.pitch"
+            ]
+    return []
