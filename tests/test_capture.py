@@ -5,9 +5,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import finite_difference, relative_l2
 
 import thincam_jax as tc
+from helpers import finite_difference, relative_l2
 from thincam_jax.capture import imaging_operator, projected_shape
 from thincam_jax.operators import kernel_grid
 from thincam_jax.units import nm, um
@@ -27,30 +27,48 @@ def plane(image, distance=OBJECT_DISTANCE, pixel=OBJECT_PITCH):
     return tc.ImagePlane(image, distance, pixel * np.shape(image)[-1])
 
 
-def photograph(shape=(31, 40), seed=0):
+def photograph(shape=(30, 40), seed=0):
     return np.random.default_rng(seed).uniform(0.1, 1.0, shape)
 
 
-@pytest.mark.parametrize("shape", [(31, 40), (22, 17)])
-@pytest.mark.parametrize("pixel_integration", [True, False])
-def test_a_point_at_m_gives_the_psf_at_minus_m_d_over_t(shape, pixel_integration):
-    """Against the PSF of a mask that is moved instead; whole and half pixels, by the parities."""
-    row, column = 3, shape[1] - 3
+def shifted_psf(own, shadow, **how):
+    """The PSF about another place, (y, x) in mm: that of a camera whose mask is moved instead."""
+    centre = np.asarray(shadow) / (1 + DISTANCE / OBJECT_DISTANCE)
+    moved = tc.LenslessCamera(
+        tc.FresnelZoneAperture(25.0, 0.4, width=2.4, centre=centre), own.sensor, DISTANCE
+    )
+    return tc.psf(moved, wavelength=500 * nm, object_distance=OBJECT_DISTANCE, **how)
+
+
+@pytest.mark.parametrize(
+    ("sensor", "shape", "how"),
+    [
+        ((80, 96), (30, 40), {"model": "separable", "pixel_integration": True}),
+        ((81, 96), (23, 16), {"model": "closed_form", "pixel_integration": False}),
+    ],
+)
+def test_a_point_at_m_gives_the_psf_at_minus_m_d_over_t(sensor, shape, how):
+    own = camera(sensor=tc.Sensor(sensor, 20 * um))
+    row, column = 3, shape[1] - 2
     image = np.zeros(shape)
     image[row, column] = 2.0
-    value = tc.capture(
-        camera(), tc.Scene(plane(image), 500 * nm), pixel_integration=pixel_integration
-    )
+    value = tc.capture(own, tc.Scene(plane(image), 500 * nm), **how)
     point = np.array([row - (shape[0] - 1) / 2, column - (shape[1] - 1) / 2]) * OBJECT_PITCH
     shadow = -DISTANCE / OBJECT_DISTANCE * point  # above and to the right: below and to the left
     assert shadow[0] > 0.1 and shadow[1] < -0.1
-    moved = camera(centre=shadow / (1 + DISTANCE / OBJECT_DISTANCE))
-    h = tc.psf(
-        moved,
-        wavelength=500 * nm,
-        object_distance=OBJECT_DISTANCE,
-        pixel_integration=pixel_integration,
-    )
+    h = shifted_psf(own, shadow, **how)
+    assert relative_l2(value, 2.0 * (20 * um) ** 2 * h) < 1e-10
+
+
+def test_a_point_between_two_rows_lights_both():
+    """31 rows on a sensor of 80: their centres lie on the borders of the sensor's pixels."""
+    own, image = camera(), np.zeros((31, 40))
+    image[4, 30] = 2.0
+    how = {"model": "closed_form", "pixel_integration": False}
+    value = tc.capture(own, tc.Scene(plane(image), 500 * nm), **how)
+    shadow = -np.array([4 - 15, 30 - 19.5]) * 20 * um
+    half = np.array([10 * um, 0.0])
+    h = (shifted_psf(own, shadow - half, **how) + shifted_psf(own, shadow + half, **how)) / 2
     assert relative_l2(value, 2.0 * (20 * um) ** 2 * h) < 1e-10
 
 
@@ -74,7 +92,7 @@ def test_a_source_between_the_pixels_moves_the_centroid():
 
 def test_planes_and_wavelengths_add_with_their_weights():
     near, far = plane(photograph(), 80.0), plane(photograph((20, 27), 1), 150.0)
-    how = {"pixel_integration": False}
+    how = {"model": "closed_form"}
     colours, weights = [450 * nm, 2000 * nm], [0.3, 1.2]
     whole = tc.capture(camera(), tc.Scene([near, far], tc.Spectrum(colours, weights)), **how)
     parts = [
@@ -90,14 +108,14 @@ def test_planes_and_wavelengths_add_with_their_weights():
 
 def test_a_nearer_plane_is_larger_on_the_sensor():
     """Its width on the sensor is (d/t)·width, and the shadow of each point M times the mask."""
-    image = photograph()
-    assert projected_shape(camera(), plane(image, 100.0)) == (31, 40)
-    assert projected_shape(camera(), plane(image, 50.0)) == (62, 80)
-    assert projected_shape(camera(), plane(image, 103.0)) == (31, 39)  # 30.1, 38.8
+    image = photograph((30, 40))
+    assert projected_shape(camera(), plane(image, 100.0)) == (30, 40)
+    assert projected_shape(camera(), plane(image, 50.0)) == (60, 80)
+    assert projected_shape(camera(), plane(image, 106.0)) == (30, 38)  # 28.3 and 37.7, made even
 
 
 def test_batches_go_image_by_image():
-    images = photograph((3, 31, 40))
+    images = photograph((3, 30, 40))
     whole = tc.capture(camera(), tc.Scene(plane(images), 500 * nm))
     assert whole.shape == (3, 80, 96)
     single = tc.capture(camera(), tc.Scene(plane(images[1]), 500 * nm))
@@ -118,10 +136,6 @@ def test_energy():
     radiance = image.sum() * (OBJECT_PITCH * DISTANCE / OBJECT_DISTANCE) ** 2
     total = value.sum() * (20 * um) ** 2
     np.testing.assert_allclose(total, radiance * integral, rtol=1e-10)
-    # wave optics spreads it a little and loses what leaves the sensor
-    spread = tc.capture(own, tc.Scene(plane(image), 500 * nm)).sum() * (20 * um) ** 2
-    np.testing.assert_allclose(spread, radiance * integral, rtol=5e-3)
-    assert spread < total * 1.001
 
 
 def test_noise_is_reproducible_by_its_key(key):
@@ -137,7 +151,7 @@ def test_noise_is_reproducible_by_its_key(key):
 @pytest.mark.parametrize("signal_power", ["total", "without_mean"])
 def test_the_stated_snr_is_measured(key, signal_power):
     """Of each image of a batch by its own power; 7680 pixels measure 0.07 dB."""
-    images = photograph((2, 31, 40)) * np.array([1.0, 1e-3])[:, None, None]
+    images = photograph((2, 30, 40)) * np.array([1.0, 1e-3])[:, None, None]
     scene = tc.Scene(plane(images), 500 * nm)
     noise = tc.GaussianNoise(snr_db=20.0, signal_power=signal_power)
     clean = np.asarray(tc.capture(camera(), scene))
@@ -155,13 +169,14 @@ def test_noise_without_a_key():
         )
 
 
-@pytest.mark.parametrize("shape", [(1, 1), (1, 9), (8, 1)])
+@pytest.mark.parametrize("shape", [(1, 1), (1, 9)])
 def test_single_pixels_and_lines(shape):
     """Every pixel is the sum of the PSF times the turned scene, written out."""
-    image = photograph((6, 7))
+    field = (5 + (shape[0] + 1) % 2, 7 + (shape[1] + 1) % 2)
+    image = photograph(field)
     own = camera(sensor=tc.Sensor(shape, 20 * um))
     value = tc.capture(own, tc.Scene(plane(image), 500 * nm))
-    grid = kernel_grid(own.sensor.grid, (6, 7))
+    grid = kernel_grid(own.sensor.grid, field)
     h = tc.psf(
         own,
         wavelength=500 * nm,
@@ -169,43 +184,38 @@ def test_single_pixels_and_lines(shape):
         pixel_integration=True,
         grid=grid,
     )
-    windows = np.lib.stride_tricks.sliding_window_view(np.asarray(h), (6, 7))
+    windows = np.lib.stride_tricks.sliding_window_view(np.asarray(h), field)
     # the turn of the pinhole and that of the convolution cancel
     expected = (20 * um) ** 2 * np.sum(windows * image, axis=(2, 3))
     np.testing.assert_allclose(value, expected, rtol=1e-10)
 
 
 def test_gradients_of_camera_and_scene():
-    """In β, the mask's width, the radiance and λ; the step is chosen for the fastest phase.
+    """In β, the mask's width and the radiance, of the shadow averaged over the pixels.
 
-    That is 2β(width/2)² = 72 rad, 2.9 rad per rad/mm², for β; for the width and λ the fringes of
-    the edge, π(width/2 + sensor/2 + field/2)²/(λd) = 10⁴ rad: 7000 rad/mm and 2·10⁷ rad/mm.
+    The fastest phase is 2β(width/2)² = 72 rad, 2.9 rad per rad/mm²; in the width the averages are
+    smooth until an edge passes the border of a pixel, 0.01 mm away.
     """
     small = tc.Sensor((24, 29), 40 * um)
-    image, weights = photograph((9, 12)), photograph((24, 29), 2) - 0.5
+    image, weights = photograph((10, 13)), photograph((24, 29), 2) - 0.5
+    fixed = camera(width=1.18, sensor=small)
+    view = tc.Scene(tc.ImagePlane(image, OBJECT_DISTANCE, 17.0), 5e-4)
 
-    fixed, view = camera(sensor=small), tc.Scene(tc.ImagePlane(image, OBJECT_DISTANCE, 16.0), 5e-4)
-
-    @jax.jit  # sizes are those of the objects from outside
+    # sizes are those of the objects from outside
     def loss(numbers):
         own = eqx.tree_at(
             lambda c: (c.mask.beta, c.mask.width), fixed, (numbers["beta"], numbers["width"])
         )
-        scene = eqx.tree_at(
-            lambda s: (s.planes[0].image, s.spectrum.wavelengths),
-            view,
-            (image * numbers["gain"] ** 2, numbers["wavelength"][None]),
-        )
-        return jnp.sum(weights * tc.capture(own, scene, pixel_integration=False))
+        scene = eqx.tree_at(lambda s: s.planes[0].image, view, image * numbers["gain"] ** 2)
+        return jnp.sum(weights * tc.capture(own, scene, model="geometric"))
 
-    at = {"beta": 25.0, "width": 2.4, "gain": 1.1, "wavelength": 5e-4}
-    at = {name: jnp.asarray(value) for name, value in at.items()}
-    slopes = jax.grad(loss)(at)
-    steps = {"beta": 3e-3, "width": 2e-6, "gain": 1e-2, "wavelength": 7e-10}
-    for name, step in steps.items():
+    at = {"beta": jnp.asarray(25.0), "width": jnp.asarray(1.18), "gain": jnp.asarray(1.1)}
+    both = jax.jit(jax.value_and_grad(loss))
+    slopes = both(at)[1]
+    for name, step in {"beta": 1e-3, "width": 1e-4, "gain": 1e-2}.items():
         direction = {other: jnp.asarray(float(other == name)) for other in at}
-        expected = finite_difference(loss, at, direction, step)
-        np.testing.assert_allclose(slopes[name], expected, rtol=1e-6, err_msg=name)
+        expected = finite_difference(lambda x: both(x)[0], at, direction, step)
+        np.testing.assert_allclose(slopes[name], expected, rtol=1e-7, err_msg=name)
 
 
 def test_sizes_must_be_known_numbers():
@@ -229,14 +239,19 @@ def test_the_operator_inside_jit_is_differentiable_in_the_distance():
     def loss(distance):
         own = tc.LenslessCamera(mask=mask, sensor=sensor, distance=distance)
         convolution = imaging_operator(
-            own, 500 * nm, OBJECT_DISTANCE, field_shape=(9, 12), pixel_integration=False
+            own,
+            500 * nm,
+            OBJECT_DISTANCE,
+            field_shape=(9, 12),
+            model="closed_form",
+            pixel_integration=False,
         )
         return jnp.sum(weights * convolution(field))
 
-    # the edge's fringes turn by π·(width/2 + sensor/2 + field/2)²/(λd²), about 2600 rad/mm
+    # β/(1 ± ε) turns by βr²·ε/d: 25·5 rad (the corner of the kernel's grid)·0.012/3, slowly
     at, one = jnp.asarray(DISTANCE), jnp.asarray(1.0)
     np.testing.assert_allclose(
-        jax.grad(loss)(at), finite_difference(loss, at, one, 5e-6), rtol=1e-6
+        jax.grad(loss)(at), finite_difference(loss, at, one, 1e-2), rtol=1e-7
     )
 
 
@@ -244,11 +259,11 @@ def test_sizes_beyond_the_memory_are_refused_with_an_estimate(monkeypatch):
     scene = tc.Scene(plane(photograph()), 500 * nm)
     monkeypatch.setattr("thincam_jax._memory.available_bytes", lambda: 300_000)
     with pytest.raises(
-        MemoryError, match=r"80×96 pixels.*31×40 needs about \d+\.\d KiB, 293.0 KiB are free"
+        MemoryError, match=r"80×96 pixels.*30×40 needs about \d+\.\d KiB, 293.0 KiB are free"
     ):
         tc.capture(camera(), scene)
     # a batch of 100 needs more than a single image
     monkeypatch.setattr("thincam_jax._memory.available_bytes", lambda: 2_000_000)
     tc.capture(camera(), scene)
     with pytest.raises(MemoryError, match="fewer images"):
-        tc.capture(camera(), tc.Scene(plane(photograph((100, 31, 40))), 500 * nm))
+        tc.capture(camera(), tc.Scene(plane(photograph((100, 30, 40))), 500 * nm))

@@ -24,7 +24,7 @@ def points():
     rng = np.random.default_rng(7)
     for width in np.geomspace(0.01, 5.6, 9):
         middle = rng.uniform(-0.3, 0.3) * width
-        b = rng.uniform(0.5, 1.0) * min(B, 250 / width**2)  # bounds the cost of the quadrature
+        b = rng.uniform(0.5, 1.0) * min(B, 150 / width**2)  # bounds the cost of the quadrature
         g = rng.uniform(-2.5, 2.5) * b
         yield g, b, rng.uniform(-1, 1) * width, middle - width / 2, middle + width / 2
     b = 150.0
@@ -92,7 +92,7 @@ values = at_64_points(weighted)
 
 @pytest.mark.parametrize("x", [0.0, 0.21])
 def test_smooth_through_focus(x):
-    """Value and gradient do not feel a = 0, and the slope there is that of differences across it."""
+    """Value and gradient do not feel a = 0; the slope there is that of differences across it."""
     b, ends = 150.0, (-0.4, 0.6)
     a = np.array([0.0, 1e-13, -1e-13, 1e-9, -1e-9, 1e-7, -1e-7])
 

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.signal
-from helpers import count_traces, finite_difference
 
+from helpers import count_traces, finite_difference
 from thincam_jax.grids import Grid
 from thincam_jax.operators import CropConvolution, kernel_grid, kernel_shape
 
@@ -55,7 +55,9 @@ def test_it_is_the_integral_over_the_field(sensor, field):
 def test_it_is_a_valid_convolution(sensor, field):
     kernel, f = numbers(kernel_shape(sensor, field)), numbers(field, 1)
     expected = PITCH**2 * scipy.signal.convolve(kernel, f, mode="valid", method="direct")
-    np.testing.assert_allclose(operator(kernel, sensor, field)(jnp.asarray(f)), expected, atol=1e-15)
+    np.testing.assert_allclose(
+        operator(kernel, sensor, field)(jnp.asarray(f)), expected, atol=1e-15
+    )
 
 
 @pytest.mark.parametrize(("sensor", "field"), SHAPES)
@@ -99,7 +101,10 @@ def test_energy():
 def test_batches_go_one_by_one():
     sensor, field = (6, 9), (3, 4)
     convolution = operator(numbers(kernel_shape(sensor, field)), sensor, field)
-    fields, captures = jnp.asarray(numbers((2, 3, *field))), jnp.asarray(numbers((2, 3, *sensor), 1))
+    fields, captures = (
+        jnp.asarray(numbers((2, 3, *field))),
+        jnp.asarray(numbers((2, 3, *sensor), 1)),
+    )
     for function, batch in ((convolution, fields), (convolution.adjoint, captures)):
         whole = function(batch)
         assert whole.shape[:2] == (2, 3)

@@ -27,10 +27,10 @@ def camera_of(shape=(20, 27), pitch=0.03, *, beta=200.0, phase=0.3, width=0.5, d
 @pytest.mark.parametrize(
     ("model", "shape"),
     [
-        ("separable", (20, 27)),
-        ("separable", (1, 8)),
+        ("geometric", (20, 27)),  # a sum of separable terms, as "separable" is
+        ("geometric", (1, 8)),
+        ("separable", (9, 12)),
         ("angular_spectrum", (21, 8)),
-        ("angular_spectrum", (20, 27)),
         ("angular_spectrum", (1, 1)),
     ],
 )
@@ -162,12 +162,12 @@ def weighted(p, model, pixel_integration=False, transform=False):
         distance=p["distance"],
         centre=(0.02, -0.03),
     )
-    arguments = dict(
-        wavelength=p["wavelength"],
-        object_distance=p["object_distance"],
-        model=model,
-        pixel_integration=pixel_integration,
-    )
+    arguments = {
+        "wavelength": p["wavelength"],
+        "object_distance": p["object_distance"],
+        "model": model,
+        "pixel_integration": pixel_integration,
+    }
     h = tc.otf(camera, **arguments).real if transform else tc.psf(camera, **arguments)
     return jnp.sum(h * WEIGHT)
 
@@ -226,7 +226,7 @@ def test_gradients_of_the_sampled_models(model):
 
 
 def test_gradient_of_pixel_averages():
-    """In the direction in which every parameter moves by its own step, forward: quick to compile."""
+    """Where every parameter moves by its own step, in forward mode: quick to compile."""
     function = jax.jit(lambda p: weighted(p, "separable", pixel_integration=True))
     direction = {k: jnp.asarray(v) for k, v in steps(POINT).items()}
     slope = jax.jit(lambda p, v: jax.jvp(function, (p,), (v,))[1])(POINT, direction)
@@ -242,7 +242,7 @@ def test_gradients_of_the_otf(model, zero):
 # --- jit, vmap and compilation --------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("model", ["separable", "paraxial"])
+@pytest.mark.parametrize("model", ["separable", "geometric"])
 def test_vmap_is_one_by_one(model):
     betas = jnp.array([150.0, 200.0, 320.0])
 
@@ -286,16 +286,16 @@ def test_changing_a_value_compiles_nothing():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (dict(wavelength=0.0), r"wavelength = 0.0 mm is not positive; give wavelength > 0 in mm"),
-        (dict(wavelength=-5e-4), "wavelength = -0.0005 mm"),
-        (dict(wavelength=float("nan")), "wavelength is NaN; give a number in mm"),
-        (dict(wavelength=INF), "wavelength is infinite"),
-        (dict(object_distance=0.0), "object_distance = 0.0 mm is not positive"),
-        (dict(object_distance=float("nan")), "object_distance is NaN"),
-        (dict(oversampling=3), "'separable' is a closed form: leave oversampling out"),
-        (dict(oversampling=4, model="angular_spectrum"), "oversampling = 4: give an odd number"),
-        (dict(oversampling=0, model="angular_spectrum"), "oversampling = 0: give an odd number"),
-        (dict(oversampling=-1, model="rayleigh_sommerfeld"), "oversampling = -1: give an odd"),
+        ({"wavelength": 0.0}, r"wavelength = 0.0 mm is not positive; give wavelength > 0 in mm"),
+        ({"wavelength": -5e-4}, "wavelength = -0.0005 mm"),
+        ({"wavelength": float("nan")}, "wavelength is NaN; give a number in mm"),
+        ({"wavelength": INF}, "wavelength is infinite"),
+        ({"object_distance": 0.0}, "object_distance = 0.0 mm is not positive"),
+        ({"object_distance": float("nan")}, "object_distance is NaN"),
+        ({"oversampling": 3}, "'separable' is a closed form: leave oversampling out"),
+        ({"oversampling": 4, "model": "angular_spectrum"}, "oversampling = 4: give an odd number"),
+        ({"oversampling": 0, "model": "angular_spectrum"}, "oversampling = 0: give an odd number"),
+        ({"oversampling": -1, "model": "rayleigh_sommerfeld"}, "oversampling = -1: give an odd"),
     ],
 )
 def test_refusals(arguments, message):
@@ -329,7 +329,7 @@ def test_text_for_a_length():
 
 
 @pytest.mark.parametrize("model", ["geometric", "paraxial", "closed_form", "separable"])
-@pytest.mark.parametrize("shape", [(1, 1), (1, 7), (5, 1)])
+@pytest.mark.parametrize("shape", [(1, 1), (1, 7)])
 def test_thin_sensors_are_cuts_of_wide_ones(model, shape):
     wide = tc.psf(camera_of((5, 7)), wavelength=WAVELENGTH, model=model)
     thin = tc.psf(camera_of(shape), wavelength=WAVELENGTH, model=model)
@@ -339,7 +339,7 @@ def test_thin_sensors_are_cuts_of_wide_ones(model, shape):
 
 
 def test_mask_wider_than_its_plane_inside_jit():
-    """A traced width cannot choose the plane: it is the sensor's, and too wide a mask is refused."""
+    """A traced width cannot choose the plane: that is the sensor's, too small for this mask."""
 
     def energy(width):
         camera = camera_of(width=width)
@@ -396,8 +396,8 @@ def test_display_pixels_need_an_edge():
 
 def test_grid_replaces_the_sensor():
     grid = tc.Grid((3, 4), 0.05)
-    elsewhere = tc.psf(camera_of(), wavelength=WAVELENGTH, grid=grid)
-    same = tc.psf(camera_of((3, 4), 0.05), wavelength=WAVELENGTH)
+    elsewhere = tc.psf(camera_of(), wavelength=WAVELENGTH, model="geometric", grid=grid)
+    same = tc.psf(camera_of((3, 4), 0.05), wavelength=WAVELENGTH, model="geometric")
     np.testing.assert_array_equal(elsewhere, same)
 
 

@@ -10,7 +10,7 @@ import thincam_jax as tc
 from thincam_jax.sensor import read_out
 
 
-def ramp(shape=(300, 401), mean=0.7):
+def ramp(shape=(200, 301), mean=0.7):
     """An image with a mean and a variance that differ."""
     x = np.linspace(-0.5, 0.5, shape[1])
     return jnp.asarray(mean + np.broadcast_to(x, shape) * 0.6)
@@ -19,7 +19,7 @@ def ramp(shape=(300, 401), mean=0.7):
 @pytest.mark.parametrize("snr_db", [10.0, 30.0])
 @pytest.mark.parametrize("power", ["total", "without_mean"])
 def test_gaussian_noise_has_the_stated_snr(key, power, snr_db):
-    """120,000 pixels measure σ² to 0.4 %, 0.02 dB: within 0.1 dB."""
+    """60,000 pixels measure σ² to 0.6 %, 0.03 dB: within 0.1 dB."""
     image = ramp()
     noisy = read_out(
         tc.Sensor(image.shape, 0.01), image, noise=tc.GaussianNoise(snr_db, power), key=key
@@ -32,7 +32,7 @@ def test_gaussian_noise_has_the_stated_snr(key, power, snr_db):
 
 
 def test_every_image_of_a_batch_has_its_own_noise(key):
-    image = ramp((200, 301))
+    image = ramp()
     batch = jnp.stack([image, 3.0 * image, image])
     noisy = read_out(tc.Sensor((200, 301), 0.01), batch, noise=tc.GaussianNoise(20.0), key=key)
     noise = np.asarray(noisy - batch)
@@ -52,11 +52,11 @@ def test_shot_noise_variance_is_its_mean(key):
 
 
 def test_read_noise_adds_its_variance(key):
-    levels = jnp.repeat(jnp.array([[0.04, 1.0]]), 60_000, axis=0)
+    levels = jnp.repeat(jnp.array([[0.04, 0.5, 1.0]]), 60_000, axis=0)
     sensor = tc.Sensor(levels.shape, 0.01, full_well=1000.0, exposure=0.5)
     noisy = read_out(sensor, levels, noise=tc.PoissonGaussianNoise(12.0), key=key)
     # The dark level would reach below zero, where the sensor clips: compare the bright one.
-    variance = np.var(np.asarray(noisy)[:, 1] * 500.0)
+    variance = np.var(np.asarray(noisy)[:, 2] * 500.0)
     np.testing.assert_allclose(variance, 500.0 + 144.0, rtol=0.03)
 
 
@@ -87,7 +87,7 @@ def test_quantisation():
 
 
 def test_the_key_decides(key):
-    image, sensor, noise = ramp((20, 31)), tc.Sensor((20, 31), 0.01), tc.GaussianNoise(20.0)
+    image, sensor, noise = ramp(), tc.Sensor((200, 301), 0.01), tc.GaussianNoise(20.0)
     first, again = (read_out(sensor, image, noise=noise, key=key) for _ in range(2))
     np.testing.assert_array_equal(first, again)
     other = read_out(sensor, image, noise=noise, key=jax.random.fold_in(key, 1))

@@ -226,7 +226,7 @@ def load_config(path: str | Path, overrides: tuple[str, ...] = ()) -> StudyConfi
     try:
         return StudyConfig.model_validate(raw)
     except pydantic.ValidationError as error:
-        faults = [_fault(e, places, asked, f"{path}:1") for e in error.errors()]
+        faults = [_fault(e, places, asked, f"{path}:1") for e in _own(error.errors())]
         raise ConfigError("\n".join(faults)) from None
 
 
@@ -349,25 +349,53 @@ def _place(location: tuple, places: dict, asked: dict, top: str) -> str:
     return top
 
 
+def _own(errors: list[Any]) -> list[Any]:
+    """Without the lists that pydantic calls too short because it dropped a faulty entry."""
+    return [
+        error
+        for error in errors
+        if error["type"] != "too_short"
+        or not any(e["loc"][:-1][: len(error["loc"])] == error["loc"] for e in errors)
+    ]
+
+
 def _fault(error: Any, places: dict, asked: dict, top: str) -> str:
     """One line: place, field, what is wrong and what is allowed."""
     location = (*error["loc"], *error.get("ctx", {}).get("place", ()))
+    if error["type"] == "invalid_key":
+        location = (*location[:-1], str(location[-1]))
     field = _dotted(location) or "the file"
     place = _place(location, places, asked, top)
-    given = error.get("input")
+    return f"{place}: {field}: {_message(error, location)}"
+
+
+def _message(error: Any, location: tuple) -> str:
+    """What is wrong and what is allowed, in the words of an experiment file."""
+    kind, given, context = error["type"], error.get("input"), error.get("ctx", {})
+    if kind == "extra_forbidden":
+        return f"unknown key; allowed here: {', '.join(_allowed(location[:-1]))}"
+    if kind == "missing" and isinstance(location[-1], int):
+        return "missing; the list needs this entry"
+    if kind == "literal_error":
+        return f"{given!r} is unknown; choose one of {context['expected']}"
+    if kind in ("too_short", "too_long"):
+        limit = context.get("min_length", context.get("max_length"))
+        word = "at least" if kind == "too_short" else "at most"
+        return f"{given!r} has {len(given)} entries; give {word} {limit}"
+    if kind in _WORDS:
+        return _WORDS[kind].format(given=given)
     message = error["msg"].removeprefix("Value error, ")
-    if error["type"] == "extra_forbidden":
-        message = f"unknown key; allowed here: {', '.join(_allowed(location[:-1]))}"
-    elif error["type"] == "missing":
-        entry = isinstance(location[-1], int)
-        message = "missing; the list needs this entry" if entry else "missing; this key is needed"
-    elif error["type"] == "model_type":
-        message = f"{given!r} is not a section; give lines of 'key: value'"
-    elif error["type"] == "literal_error":
-        message = f"{given!r} is unknown; choose one of {error['ctx']['expected']}"
-    elif error["type"] not in ("value_error", "misfit"):
-        message = f"{given!r}: {message[0].lower()}{message[1:]}"
-    return f"{place}: {field}: {message}"
+    if kind in ("value_error", "misfit"):
+        return message
+    return f"{given!r}: {message[0].lower()}{message[1:]}"
+
+
+_WORDS = {
+    "missing": "missing; this key is needed",
+    "model_type": "{given!r} is not a section; give lines of 'key: value'",
+    "tuple_type": "{given!r} is not a list; write it as [a, b] or as lines beginning with '- '",
+    "invalid_key": "a key must be a text; put it in quotes",
+}
 
 
 def _dotted(location: tuple) -> str:

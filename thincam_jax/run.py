@@ -4,10 +4,8 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 
 from thincam_jax.config import MethodConfig, StudyConfig, TargetConfig
 from thincam_jax.doctor import environment
@@ -67,11 +65,11 @@ def _run_target(
 ) -> dict[str, Any]:
     """Captures, reconstructions and figures of one target."""
     plane = build.build_plane(config, target)
-    captures: dict[build.Setting, Array] = {}
+    captures: dict[build.Setting, np.ndarray] = {}
     for number, setting in enumerate(build.all_settings(config)):
         progress(f"{target.name}: capture {number + 1}")
         key = build.capture_key(config, index, number)
-        captures[setting] = jax.block_until_ready(build.take(config, setting, plane, key))
+        captures[setting] = np.asarray(build.take(config, setting, plane, key))
     evaluations: dict[str, Evaluation] = {}
     for method in config.methods:
         progress(f"{target.name}: {method.name}")
@@ -80,10 +78,10 @@ def _run_target(
         if reconstructor is None:
             reconstructor = build.build_reconstructor(config, method, shape)
             reconstructors[method.name, shape] = reconstructor
-        used = jnp.stack([captures[s] for s in build.settings(config, method)])
+        used = jnp.asarray(np.stack([captures[s] for s in build.settings(config, method)]))
         evaluations[method.name] = evaluate(config, method, target, plane, reconstructor(used))
     first = captures[build.all_settings(config)[0]]
-    figures.save_target(folder, config, target, np.asarray(first), evaluations)
+    figures.save_target(folder, config, target, first, evaluations)
     contrasts = {m: e.contrast for m, e in evaluations.items() if e.contrast is not None}
     return {"metrics": {m: e.metrics for m, e in evaluations.items()}, "contrasts": contrasts}
 

@@ -45,7 +45,7 @@ def test_is_the_middle_of_the_finite_aperture(profile):
     4·√(λd)/(π·width) bounds it. Measured: 3.1, 1.7, 0.6 and 0.3 % at 2, 4, 8 and 16 mm."""
     errors = []
     for width in (2.0, 4.0, 8.0, 16.0):
-        mask = dict(phase=0.8, profile=profile, width=width, harmonics=3, t=250.0)
+        mask = {"phase": 0.8, "profile": profile, "width": width, "harmonics": 3, "t": 250.0}
         finite = psf_of(25.0, 6.5, "separable", **mask)
         errors.append(relative_l2(finite, psf_of(25.0, 6.5, "closed_form", **mask)))
         assert errors[-1] < 4 * np.sqrt(WAVELENGTH * 6.5) / (np.pi * width)

@@ -13,7 +13,7 @@ BETA, PHASE, CENTRE = 30.0, 0.6, (0.05, -0.12)
 
 
 def psf_of(shape, pitch, *, model="geometric", wavelength=500e-6, average=False, t=20.0, **mask):
-    mask = dict(width=1.0, centre=CENTRE) | mask
+    mask = {"width": 1.0, "centre": CENTRE} | mask
     camera = tc.LenslessCamera(
         tc.FresnelZoneAperture(BETA, PHASE, **mask), tc.Sensor(shape, pitch), 5.0
     )
@@ -94,7 +94,7 @@ def test_display_pixels():
     pixel, fill, m = 0.1, 0.49, 1.25
     sites = reference.centred(10, pixel)
     shown = (0.5 * (1 + np.cos(BETA * (sites[:, None] ** 2 + sites**2) + PHASE))) ** 2
-    mask = dict(pixel_pitch=pixel, fill_factor=fill, centre=(0.0, 0.0))
+    mask = {"pixel_pitch": pixel, "fill_factor": fill, "centre": (0.0, 0.0)}
     at_sites = psf_of((10, 10), pixel * m, **mask)
     np.testing.assert_allclose(at_sites, shown, rtol=0, atol=1e-13)
     averages = psf_of((10, 10), pixel * m, average=True, **mask)

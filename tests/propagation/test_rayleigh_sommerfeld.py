@@ -51,13 +51,13 @@ def test_against_quadrature():
             kernel = d / r * (1 / r - 1j * k) * np.exp(1j * k * r) / r / (2 * np.pi)
             wave = np.einsum("ij,i,j", field * kernel, weights, weights) * width**2 / 4
             expected[i, j] = abs(wave) ** 2 * (1 + d / t) ** 2
-    # Samples of λ/15: the midpoint sum is off by some (k·pitch)²/24 = 0.7 %, less where it is bright.
+    # Samples of λ/15: the midpoint sum is off by up to (k·pitch)²/24 = 0.7 %.
     np.testing.assert_allclose(value[:, 1], expected[:, 1], rtol=2e-3)
     np.testing.assert_allclose(value[:, ::2], expected[:, ::2], rtol=2e-2)
 
 
 def test_pixel_average_of_both_planes():
-    """A small aperture, so that few samples do; the average is 10 % from the value at the centre."""
+    """A small aperture, so that few samples do; the average is 10 % off the centre."""
     mask = tc.FresnelZoneAperture(2000.0, 0.3, width=0.11)
     grid, path = tc.Grid((4, 5), 0.04), Path(WAVELENGTH, 5.0)
     value = direct(mask, grid, path, mask_shape=(4, 5), oversampling=11, pixel_integration=True)

@@ -12,8 +12,8 @@ from helpers import relative_l2
 from thincam_jax.propagation import Path, separable
 
 INF = float("inf")
-THESIS = dict(beta=25.0, width=5.632, distance=6.5, wavelength=500e-6)
-SMALL = dict(beta=200.0, width=0.5, distance=20.0, wavelength=500e-6)
+THESIS = {"beta": 25.0, "width": 5.632, "distance": 6.5, "wavelength": 500e-6}
+SMALL = {"beta": 200.0, "width": 0.5, "distance": 20.0, "wavelength": 500e-6}
 PITCH = 5.5e-3
 
 
@@ -67,7 +67,7 @@ def test_against_scipy(shape, pitch, object_distance, phase, centre):
 
 
 def test_single_precision():
-    """Relative L2 within 3e-5 at the thesis' size, where edge waves turn by 1e4 rad; measured 1e-5."""
+    """Within 3e-5 at the thesis' size, where edge waves turn by 1e4 rad; measured 7e-6."""
     exact = psf_of((1000, 1024), PITCH, THESIS, 250.0)
     camera = camera_of((1000, 1024), PITCH, THESIS)
     camera = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), camera)
@@ -84,7 +84,7 @@ def test_where_an_order_focuses(detune):
     """
     t, wavelength, beta = 100.0, 500e-6, 200.0
     distance = np.pi / wavelength / (beta - np.pi / (wavelength * t)) * (1 + detune)
-    geometry = dict(beta=beta, width=0.5, distance=distance, wavelength=wavelength)
+    geometry = {"beta": beta, "width": 0.5, "distance": distance, "wavelength": wavelength}
     value = psf_of((4, 5), 0.11, geometry, t, phase=0.9)
     expected = reference.psf_by_quadrature(
         *coordinates((4, 5), 0.11), phase=0.9, object_distance=t, **geometry
@@ -94,7 +94,7 @@ def test_where_an_order_focuses(detune):
 
 def test_display_pixels():
     """A display 12 pixels wide, 70 % filled: the double sum over its slits, without zone orders."""
-    geometry = dict(beta=150.0, width=0.36, distance=8.0, wavelength=633e-6)
+    geometry = {"beta": 150.0, "width": 0.36, "distance": 8.0, "wavelength": 633e-6}
     t, phase, centre, fill = 90.0, 0.4, (0.013, -0.05), 0.7
     value = psf_of(
         (20, 27), 0.03, geometry, t, phase=phase, centre=centre, pixel_pitch=0.03, fill_factor=fill
@@ -129,7 +129,12 @@ def test_binary_profile():
     ("geometry", "pitch", "centre", "tolerance"),
     [
         (SMALL, 0.03, (0.04, -0.1), 1e-8),
-        (dict(beta=25.0, width=2.0, distance=6.5, wavelength=500e-6), PITCH, (0.9, 0.2), 5e-5),
+        (
+            {"beta": 25.0, "width": 2.0, "distance": 6.5, "wavelength": 500e-6},
+            PITCH,
+            (0.9, 0.2),
+            5e-5,
+        ),
     ],
 )
 def test_pixel_average(geometry, pitch, centre, tolerance):
@@ -169,12 +174,12 @@ def test_energy(object_distance):
     aperture; the zones at the edge are brighter by up to 1/⟨t²⟩ = 8/3 than the mean, so the bound
     is 2·(8/3)·3.4e-4 = 1.8e-3.
     """
-    half, pitch = 6.0, 0.0175
+    half, pitch = 6.0, 0.0182
     shape = (int(2 * half / pitch), int(2 * half / pitch) + 1)
     value = psf_of(shape, pitch, SMALL, object_distance, phase=0.3)
     magnification = 1 + SMALL["distance"] / object_distance
     arrived = value.sum() * pitch**2 / magnification**2
-    x = reference.centred(4000, SMALL["width"] / 4000)
+    x = reference.centred(1000, SMALL["width"] / 1000)
     passed = (
         np.mean(np.cos((200.0 * (x[:, None] ** 2 + x**2) + 0.3) / 2) ** 4) * SMALL["width"] ** 2
     )

@@ -61,8 +61,9 @@ def centroid(reconstruction, reach=3):
     """Place of the brightest spot, (y, x) in mm on the object, to a fraction of a pixel."""
     image = np.asarray(reconstruction.image)
     row, column = np.unravel_index(np.argmax(image), image.shape)
-    rows, columns = np.arange(row - reach, row + reach + 1), np.arange(
-        column - reach, column + reach + 1
+    rows, columns = (
+        np.arange(row - reach, row + reach + 1),
+        np.arange(column - reach, column + reach + 1),
     )
     spot = np.maximum(image[np.ix_(rows, columns)] - 0.2 * image.max(), 0.0)
     y, x = (rows - (image.shape[0] - 1) / 2), (columns - (image.shape[1] - 1) / 2)

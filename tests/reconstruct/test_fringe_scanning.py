@@ -5,10 +5,10 @@ import math
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import count_traces, relative_l2
 from reconstruct import rig
 
 import thincam_jax as tc
+from helpers import count_traces, relative_l2
 from thincam_jax.units import nm, um
 
 
@@ -77,7 +77,6 @@ def test_diffraction_takes_the_zero_of_the_cosine_away(distance, wavelength):
     zero = 1 / math.sqrt(2 * wavelength * distance * (1 + distance / rig.OBJECT_DISTANCE))
     after = np.argmax(mean < 0)
     crossing = np.interp(0.0, -mean[after - 1 : after + 1], rings[after - 1 : after + 1])
-    print(crossing, zero, mean)
     assert abs(crossing / zero - 1) < 0.06
     assert (mean[rings < zero - 1.0] > 0.15).all()
     assert (mean[(rings > zero + 1.0) & (rings < 1.5 * zero)] < -0.15).all()

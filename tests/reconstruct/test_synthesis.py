@@ -4,9 +4,9 @@ import math
 
 import numpy as np
 import pytest
-from helpers import relative_l2
 
 import thincam_jax as tc
+from helpers import relative_l2
 from thincam_jax.propagation.paraxial import paraxial_response
 from thincam_jax.reconstruct import fringe_scanning, phase_pairs, separate
 from thincam_jax.units import nm, um
@@ -78,7 +78,6 @@ def test_the_paraxial_model_has_these_responses(distance):
     error = relative_l2(real + 1j * imaginary, scanned(distance=distance))
     (value,) = np.tensordot(phase_pairs(1), model(PAIR, distance), axes=1)
     other = relative_l2(value, paired(distance=distance))
-    print(epsilon, error, other)
     assert error < 3 * epsilon and other < 3 * epsilon
     assert angles(distance=distance)[1].max() > math.pi / 2
 

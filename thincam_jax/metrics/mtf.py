@@ -10,8 +10,8 @@ import numpy as np
 # Frequencies, as a part of the highest, that count as low.
 _LOW = 0.05
 
-# A sensor's columns from which on there is a frequency among those: (columns / 2)·_LOW ≥ 1.
-MINIMUM_COLUMNS = round(2 / _LOW)
+# The columns of a sensor from which on one is among those: columns/2 − 1 frequencies above zero.
+MINIMUM_COLUMNS = round(2 / _LOW) + 2
 
 
 def low_frequency_value(frequency: np.ndarray, response: np.ndarray) -> float:

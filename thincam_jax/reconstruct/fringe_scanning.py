@@ -52,19 +52,10 @@ class FringeScanning(eqx.Module):
         sizes = zip(sensor.shape, self.field_shape, strict=True)
         rows, columns = (s + max(s, f) for s, f in sizes)
         padded = fast_shape((rows, columns))
-        grid = Grid(padded, sensor.pitch)
         object_distance = _checks.positive("object_distance", object_distance, "mm")
         magnification = 1 + camera.distance / object_distance
-        beta = beta / magnification**2
-        v, u = jnp.fft.ifftshift(grid.v)[:, None], jnp.fft.ifftshift(grid.u)
-        sampled = (jnp.abs(v) < beta * padded[0] * grid.pitch / (2 * jnp.pi)) & (
-            jnp.abs(u) < beta * padded[1] * grid.pitch / (2 * jnp.pi)
-        )
-        gain = jnp.where(sampled, beta / jnp.pi, 0.0)
-        filtered = phasor(-(jnp.pi**2) * (u**2 + v**2) / beta)
-        # A mask beside the axis shifts the shadow by M times its centre.
-        down, right = magnification * camera.mask.centre
-        self.inverse = gain.astype(filtered.dtype) * filtered * turn_phasor(v * down + u * right)
+        grid = Grid(padded, sensor.pitch)
+        self.inverse = _inverse_filter(grid, beta, magnification, camera.mask.centre)
         self.object_pitch = sensor.pitch * object_distance / camera.distance
 
     def __call__(self, captures: Float[Array, "capture *batch y x"]) -> Reconstruction:
@@ -93,6 +84,21 @@ class FringeScanning(eqx.Module):
         shift = [(f - s) // 2 for f, s in zip(self.field_shape, self.sensor_shape, strict=True)]
         field = jnp.roll(full, shift, axis=(0, 1))[: self.field_shape[0], : self.field_shape[1]]
         return field[::-1, ::-1]
+
+
+@jax.jit
+def _inverse_filter(grid: Grid, beta, magnification, centre) -> Complex[Array, "v u"]:
+    """(β'/π)·exp(−jπ²ρ²/β') where the window samples it, zero elsewhere."""
+    beta = beta / magnification**2
+    v, u = jnp.fft.ifftshift(grid.v)[:, None], jnp.fft.ifftshift(grid.u)
+    sampled = (jnp.abs(v) < beta * grid.shape[0] * grid.pitch / (2 * jnp.pi)) & (
+        jnp.abs(u) < beta * grid.shape[1] * grid.pitch / (2 * jnp.pi)
+    )
+    gain = jnp.where(sampled, beta / jnp.pi, 0.0)
+    filtered = phasor(-(jnp.pi**2) * (u**2 + v**2) / beta)
+    # A mask beside the axis shifts the shadow by M times its centre.
+    down, right = magnification * centre
+    return gain.astype(filtered.dtype) * filtered * turn_phasor(v * down + u * right)
 
 
 def _check_phases(cameras: Sequence[LenslessCamera]) -> Float[Array, ""]:

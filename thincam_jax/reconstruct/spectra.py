@@ -4,8 +4,10 @@ All are per sample: a white image of variance σ² has the spectrum σ² at ever
 the half plane of a real DFT of the padded window.
 """
 
+import functools
 from typing import Literal
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -15,6 +17,7 @@ from thincam_jax.grids import Grid
 Prior = Literal["inverse_square", "flat"]
 
 
+@functools.partial(jax.jit, static_argnames=("prior", "field_shape"))
 def prior_spectrum(prior: Prior, grid: Grid, field_shape) -> Float[Array, "v u"]:
     """Scene spectrum with a mean of 1 over all frequencies."""
     v = jnp.fft.ifftshift(grid.v)[:, None]

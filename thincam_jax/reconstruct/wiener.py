@@ -1,9 +1,11 @@
 r"""Wiener synthesis of K captures into one image (thesis Eq 3.44, corrected)."""
 
+import functools
 import math
 from collections.abc import Sequence
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
@@ -101,17 +103,15 @@ class WienerSynthesis(eqx.Module):
             grid = kernel_grid(sensor, own_field)
             h = psf(camera, wavelength=w, object_distance=object_distance, grid=grid, **how)
             kernels.append(h)
-            convolution = CropConvolution(h, sensor.pitch, sensor.shape, own_field)
-            cover = _coverage(own_field, self.field_shape, ratio)
-            uniform.append(convolution(jnp.asarray(cover, dtype=h.dtype)))
+            cover = jnp.asarray(_coverage(own_field, self.field_shape, ratio), dtype=h.dtype)
+            uniform.append(
+                _convolve(CropConvolution(h, sensor.pitch, sensor.shape, own_field), cover)
+            )
         self.uniform = jnp.stack(uniform)
         self.padded = _padded(sensor.shape, self.field_shape, max(self.ratios))
-        area = (sensor.pitch.astype(self.uniform.dtype)) ** 2
         self.spectra = jnp.stack(
             [
-                # Enlarged, a kernel spreads the same light over ratio² of its area.
-                _embedded_spectrum(register(_combine(row, kernels), ratio), self.padded)
-                * as_complex(area / ratio**2)
+                _channel_spectrum(*_used(row, kernels), sensor.pitch, ratio, self.padded)
                 for row, ratio in zip(synthesis, self.ratios, strict=True)
             ]
         )
@@ -233,9 +233,25 @@ def _padded(sensor_shape, field_shape, ratio: float) -> tuple[int, int]:
     return fast_shape(largest, real=True)
 
 
-def _combine(row: np.ndarray, kernels: list[Array]) -> Array:
-    used = [float(weight) * k for weight, k in zip(row, kernels, strict=True) if weight]
-    return jnp.sum(jnp.stack(used), axis=0)
+def _used(row: np.ndarray, kernels: list[Array]) -> tuple[Array, Array]:
+    """The kernels that a channel uses, and their weights."""
+    used = [(w, k) for w, k in zip(row, kernels, strict=True) if w]
+    stacked = jnp.stack([k for _, k in used])
+    return jnp.asarray([w for w, _ in used], dtype=stacked.dtype), stacked
+
+
+@eqx.filter_jit
+def _convolve(convolution: CropConvolution, field: Float[Array, "m n"]) -> Float[Array, "y x"]:
+    return convolution(field)
+
+
+@functools.partial(jax.jit, static_argnames=("ratio", "padded"))
+def _channel_spectrum(weights, kernels, pitch, ratio: float, padded: tuple[int, int]):
+    """Response of a channel on the reference scale."""
+    kernel = register(jnp.tensordot(weights, kernels, axes=1), ratio)
+    # Enlarged, a kernel spreads the same light over ratio² of its area.
+    area = pitch.astype(kernel.dtype) ** 2 / ratio**2
+    return _embedded_spectrum(kernel, padded) * as_complex(area)
 
 
 def _embedded_spectrum(image: Float[Array, "y x"], padded) -> Complex[Array, "v u"]:

@@ -8,6 +8,9 @@ from thincam_jax.metrics.mtf import MINIMUM_COLUMNS
 from thincam_jax.psf import psf
 from thincam_jax.study.build import all_settings, build_camera, build_plane, field_shape
 
+# The scene's power is read off frequencies above three cycles a sensor (`spectra.inner_band`).
+_MINIMUM_ROWS = 7
+
 
 def check_study(config: StudyConfig) -> None:
     """Refuse cameras that cannot be built, images that cannot be read, and too few pixels.
@@ -22,11 +25,11 @@ def check_study(config: StudyConfig) -> None:
 
 
 def _camera_faults(config: StudyConfig) -> list[str]:
-    columns = config.sensor.shape[1]
-    if columns < MINIMUM_COLUMNS:
+    rows, columns = config.sensor.shape
+    if rows < _MINIMUM_ROWS or columns < MINIMUM_COLUMNS:
         return [
-            f"sensor.shape: {columns} columns are too few for a transfer function; "
-            f"give at least {MINIMUM_COLUMNS}"
+            f"sensor.shape: {rows}×{columns} pixels are too few for a study; "
+            f"give at least {_MINIMUM_ROWS}×{MINIMUM_COLUMNS}"
         ]
     try:
         for setting in all_settings(config):

@@ -34,7 +34,9 @@ def method_response(config: StudyConfig, method: MethodConfig) -> Response:
     """The response with the finite mask, for a point on the axis, and its limits.
 
     - First zero crossing: the lowest frequency that no shot of the method carries. A fringe-scanned
-      response is real once its carrier e^{jX} is taken off; a phase pair's is real as it is.
+      response is real once its carrier e^{jX} is taken off. Every other response swings with its
+      carrier, sin X − cos X for a phase pair: its notches are narrower than the sensor can tell
+      apart, no frequency band is missing, and there is no first zero (None).
     - Cut-off: where the magnitude stays under 5 % of its low-frequency value.
     """
     reference = reference_distance(method)
@@ -47,12 +49,13 @@ def method_response(config: StudyConfig, method: MethodConfig) -> Response:
         # A frequency on the reference plane is ratio times higher on this shot's sensor.
         power = np.sum(np.abs(channels) ** 2, axis=0)
         powers.append(np.interp(frequency * ratio, own, power, right=0.0))
-        for response in _signed(config, method, shot, own, channels):
+        if method.synthesis == "fringe_scanning":
+            response = _without_carrier(config, shot, own, channels)
             signed.append(np.interp(frequency * ratio, own, response, right=0.0))
     assert frequency is not None
     magnitude = np.sqrt(np.mean(powers, axis=0))
     limit = cut_off(frequency, magnitude)
-    zero = first_common_zero(frequency, signed)
+    zero = first_common_zero(frequency, signed) if signed else None
     magnification = config.object.distance / reference
     return Response(
         frequency,
@@ -92,13 +95,11 @@ def _profile(config: StudyConfig, setting: Setting) -> tuple[np.ndarray, np.ndar
     return np.asarray(camera.sensor.grid.u[columns // 2 :], dtype=float), line
 
 
-def _signed(
-    config: StudyConfig, method: MethodConfig, shot: ShotConfig, u: np.ndarray, channels
-) -> list[np.ndarray]:
-    """Real responses whose sign shows the zeros."""
-    if method.synthesis != "fringe_scanning":
-        return [channel.real for channel in channels]
+def _without_carrier(
+    config: StudyConfig, shot: ShotConfig, u: np.ndarray, channels: np.ndarray
+) -> np.ndarray:
+    """A fringe-scanned response over e^{jX}, X = π²u²/β on the sensor: real, cos(πλdu²)."""
     magnification = 1 + shot.distance / config.object.distance
     beta = shot.beta / magnification**2
     scanned = channels[0] + 1j * channels[1]
-    return [(scanned * np.exp(-1j * math.pi**2 * u**2 / beta)).real]
+    return (scanned * np.exp(-1j * math.pi**2 * u**2 / beta)).real
