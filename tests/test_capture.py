@@ -263,7 +263,7 @@ def test_sizes_beyond_the_memory_are_refused_with_an_estimate(monkeypatch):
     ):
         tc.capture(camera(), scene)
     # a batch of 100 needs more than a single image
-    monkeypatch.setattr("thincam_jax._memory.available_bytes", lambda: 2_000_000)
+    monkeypatch.setattr("thincam_jax._memory.available_bytes", lambda: 3_000_000)
     tc.capture(camera(), scene)
     with pytest.raises(MemoryError, match="fewer images"):
         tc.capture(camera(), tc.Scene(plane(photograph((100, 30, 40))), 500 * nm))

@@ -5,10 +5,10 @@ import subprocess
 import sys
 
 import pytest
+from study import tiny
 from typer.testing import CliRunner
 
 from helpers import ROOT
-from study import tiny
 from thincam_jax import cli, doctor
 
 runner = CliRunner()

@@ -201,6 +201,14 @@ FAULTS = {
         *("snr_db: 30", "snr_db: 30\n  read_noise: 2", "noise"),
         ["give either snr_db", "or read_noise"],
     ),
+    "negative read noise": (
+        *("snr_db: 30", "read_noise: -1", "noise.read_noise"),
+        ["-1: ", "greater than or equal to 0"],
+    ),
+    "shot noise alone without exposure": (
+        *("snr_db: 30", "read_noise: 0", "noise.read_noise"),
+        ["give sensor.exposure"],
+    ),
     "electrons without exposure": (
         *("snr_db: 30", "read_noise: 2", "noise.read_noise"),
         ["give sensor.exposure, such as 0.9"],

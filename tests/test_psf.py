@@ -376,7 +376,8 @@ def test_estimate_grows_with_what_is_sampled(monkeypatch):
     module = importlib.import_module("thincam_jax.psf")
     monkeypatch.setattr(module, "refuse_if_too_large", lambda what, n, advice: needed.append(n))
     grid = tc.Grid((100, 150), 0.01)
-    module._check_memory(grid, "angular_spectrum", (50, 50), 1)
+    mask = tc.FresnelZoneAperture(25.0, width=0.5)
+    module._check_memory(mask, grid, "angular_spectrum", (50, 50), 1)
     assert 1.0 <= (needed[0] - 16 * 15000) / (4 * 300 * 400 * 16) < 1.1
 
 

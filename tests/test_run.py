@@ -7,8 +7,8 @@ import jax
 import numpy as np
 import pytest
 import skimage.io
-
 from study import tiny
+
 from thincam_jax.config import ConfigError, load_config
 from thincam_jax.run import run_study, steps
 from thincam_jax.study import RunFolder, build, check_study, method_response

@@ -61,6 +61,14 @@ def positive(name: str, value: Any, unit: str, *, allow_infinity: bool = False) 
     return array
 
 
+def non_negative(name: str, value: Any, unit: str) -> Array:
+    array = finite(name, value, unit)
+    known = _known(array)
+    if known is not None and known < 0:
+        raise ValueError(f"{name} = {known} {unit} is negative; give {name} >= 0 in {unit}")
+    return array
+
+
 def positive_all(name: str, value: Array, unit: str) -> Array:
     """An array of any shape with finite positive entries."""
     array = finite(name, value, unit, shape=value.shape)

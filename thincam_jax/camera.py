@@ -1,6 +1,9 @@
 """The lensless camera: a mask at a distance before a sensor."""
 
+import functools
+
 import equinox as eqx
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from thincam_jax import _checks
@@ -28,4 +31,9 @@ class LenslessCamera(eqx.Module):
 
     def path(self, wavelength, object_distance) -> Path:
         """The way of the light from a point at `object_distance` (mm) in front of the mask."""
+        # Plain numbers take the camera's precision, so that float32 cameras stay float32.
+        like = functools.partial(jnp.asarray, dtype=self.distance.dtype)
+        wavelength = like(wavelength) if isinstance(wavelength, int | float) else wavelength
+        if isinstance(object_distance, int | float):
+            object_distance = like(object_distance)
         return Path(wavelength, self.distance, object_distance)

@@ -22,7 +22,7 @@ from thincam_jax._phase import as_complex, phasor
 # Edge terms diverge like 1/phase as the interval's phase goes to zero and then cancel; at 3 rad the
 # cancellation costs under a digit and 16 Gauss-Legendre nodes are exact to 1e-16.
 _SLOW_PHASE = 3.0
-_SLOW_NODES = 16
+SLOW_NODES = 16
 
 # Beyond |z| = 5 the asymptotic series of the auxiliary Fresnel functions (DLMF 7.12.2, 7.12.3) is
 # exact to 1e-15 with these numbers of terms; it stays regular where z itself overflows.
@@ -77,7 +77,7 @@ def chirp_integral(
 
 def _by_quadrature(g, b, x, middle, half, used) -> Complex[Array, "..."]:
     """Gauss-Legendre, for intervals over which the phase hardly turns."""
-    nodes, weights = leggauss(_SLOW_NODES)
+    nodes, weights = leggauss(SLOW_NODES)
     nodes, weights = (jnp.asarray(v, dtype=x.dtype)[:, None] for v in (nodes, weights))
     # Where this form is not used its phase may be anything: keep it, and its gradient, finite.
     half_used = jnp.where(used, half, 0.0).ravel()
@@ -115,7 +115,9 @@ def _by_edges(g, b, x, lower, upper, unused) -> Complex[Array, "..."]:
         wave_far = -phasor(phase) * jax.lax.complex(h / (2 * slope_far), f / (2 * slope_far))
 
         side = jnp.where(far, sign * jnp.sign(slope), 0.0)
-        return jnp.where(near, wave_near, jnp.where(far, wave_far, 0.0)), side
+        wave = jnp.where(near, wave_near, jnp.where(far, wave_far, 0.0))
+        # Kept apart: fused, the compiler evaluates an end's Fresnel integrals more than once.
+        return jax.lax.optimization_barrier((wave, side))
 
     wave_lower, side_lower = edge(lower)
     wave_upper, side_upper = edge(upper)

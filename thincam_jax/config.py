@@ -86,7 +86,7 @@ class NoiseConfig(_Section):
 
     snr_db: float | None = None
     signal_power: Literal["total", "without_mean"] = "total"
-    read_noise: Annotated[float, Field(gt=0)] | None = None
+    read_noise: Annotated[float, Field(ge=0)] | None = None
 
     @pydantic.model_validator(mode="after")
     def _one(self):
@@ -205,7 +205,7 @@ class StudyConfig(_Section):
             if self.noise is None and method.kind == "wiener":
                 message = "wiener weighs noise against signal; give a 'noise' section"
                 raise _misfit(message, "methods", index, "kind")
-        if self.noise and self.noise.read_noise and self.sensor.exposure is None:
+        if self.noise and self.noise.read_noise is not None and self.sensor.exposure is None:
             message = "read_noise counts electrons; give sensor.exposure, such as 0.9"
             raise _misfit(message, "noise", "read_noise")
         return self
@@ -293,10 +293,9 @@ def _lines(node, location: tuple = ()):
     yield location, node.start_mark.line + 1
     if isinstance(node, yaml.MappingNode):
         for key, value in node.value:
+            # Of a section, a reader looks for the line of its key.
             yield (*location, key.value, "(key)"), key.start_mark.line + 1
-            for where, line in _lines(value, (*location, key.value)):
-                # A mapping's own line is its key's: there a reader looks for it.
-                yield where, key.start_mark.line + 1 if where[:-1] == location else line
+            yield from _lines(value, (*location, key.value))
     elif isinstance(node, yaml.SequenceNode):
         for index, value in enumerate(node.value):
             yield from _lines(value, (*location, index))
@@ -305,10 +304,10 @@ def _lines(node, location: tuple = ()):
 def _override(raw: Any, text: str) -> tuple:
     """Set one value in the raw data; the path may name what is not there yet."""
     path, equals, value = text.partition("=")
-    keys = [int(k) if k.isdecimal() else k for k in path.strip().split(".")]
+    keys: list[Any] = [int(k) if k.isdecimal() else k for k in path.strip().split(".")]
     if not equals or not all(str(k) for k in keys):
         raise ConfigError(f"--set {text}: write it as a.b=value, such as mask.width=5.632mm")
-    here = raw
+    here: Any = raw
     for depth, key in enumerate(keys):
         known = (isinstance(here, list) and isinstance(key, int) and key < len(here)) or isinstance(
             here, dict

@@ -42,7 +42,7 @@ def dtype_support() -> dict[str, str]:
     """Which precisions the default device computes in, tried out."""
     support = {}
     for name in ("float32", "complex64", "float64", "complex128"):
-        if name in ("float64", "complex128") and not jax.config.jax_enable_x64:
+        if name in ("float64", "complex128") and not jax.config.read("jax_enable_x64"):
             support[name] = "off; set JAX_ENABLE_X64=1"
             continue
         try:

@@ -13,6 +13,7 @@ from thincam_jax import _checks
 from thincam_jax._memory import refuse_if_too_large
 from thincam_jax._phase import as_complex
 from thincam_jax.camera import LenslessCamera
+from thincam_jax.chirp import SLOW_NODES
 from thincam_jax.grids import Grid
 from thincam_jax.masks.base import AbstractMask
 from thincam_jax.propagation.angular_spectrum import angular_spectrum, padded_shape, require_odd
@@ -22,7 +23,7 @@ from thincam_jax.propagation.geometric import geometric
 from thincam_jax.propagation.paraxial import paraxial
 from thincam_jax.propagation.path import Path
 from thincam_jax.propagation.rayleigh_sommerfeld import rayleigh_sommerfeld
-from thincam_jax.propagation.separable import separable
+from thincam_jax.propagation.separable import PIXEL_NODES, separable
 from thincam_jax.propagation.separable_sum import SeparableSum, centre_phase
 
 Model = Literal[
@@ -70,7 +71,7 @@ def psf(
     """
     path, grid = _prepare(camera, wavelength, object_distance, model, grid)
     shape, oversampling = _sampling(camera, grid, model, pixel_integration, oversampling)
-    _check_memory(grid, model, shape, oversampling)
+    _check_memory(camera.mask, grid, model, shape, oversampling)
     return _psf(camera.mask, grid, path, model, pixel_integration, shape, oversampling)
 
 
@@ -93,7 +94,7 @@ def otf(
     """
     path, grid = _prepare(camera, wavelength, object_distance, model, grid)
     shape, oversampling = _sampling(camera, grid, model, pixel_integration, oversampling)
-    _check_memory(grid, model, shape, oversampling)
+    _check_memory(camera.mask, grid, model, shape, oversampling)
     return _otf(camera.mask, grid, path, model, pixel_integration, shape, oversampling)
 
 
@@ -189,12 +190,18 @@ def _sampling(camera, grid, model, pixel_integration, oversampling):
     return (rows, columns), oversampling
 
 
-def _check_memory(grid: Grid, model: Model, mask_shape, oversampling: int) -> None:
+def _check_memory(
+    mask: AbstractMask, grid: Grid, model: Model, mask_shape, oversampling: int
+) -> None:
     size = 2 * jnp.dtype(grid.pitch.dtype).itemsize  # a complex sample
     rows, columns = grid.shape
     # Images that live at once, counted in complex samples; 64 is the direct sum's batch.
     needed = rows * columns * size
     plane = mask_shape or grid.shape
+    if model == "separable":
+        # Every display pixel is a chirp integral at every coordinate and pixel node.
+        cells = getattr(mask, "pixels", None) or 1
+        needed += 3 * SLOW_NODES * PIXEL_NODES * cells * max(rows, columns) * size
     if model == "angular_spectrum":
         window = padded_shape(
             (plane[0] * oversampling, plane[1] * oversampling),

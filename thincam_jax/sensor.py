@@ -103,7 +103,7 @@ class GaussianNoise(AbstractNoise):
 class PoissonGaussianNoise(AbstractNoise):
     """Shot noise of the photo-electrons and Gaussian read noise.
 
-    - `read_noise`: standard deviation in electrons.
+    - `read_noise`: standard deviation in electrons, ≥ 0.
 
     The number of electrons follows from the sensor's full well and exposure.
     """
@@ -111,7 +111,7 @@ class PoissonGaussianNoise(AbstractNoise):
     read_noise: Float[Array, ""]
 
     def __init__(self, read_noise=8.0):
-        self.read_noise = _checks.positive("read_noise", read_noise, "electrons")
+        self.read_noise = _checks.non_negative("read_noise", read_noise, "electrons")
 
     def variance(self, image, electrons=None):
         if electrons is None:

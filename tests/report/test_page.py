@@ -7,8 +7,8 @@ import re
 
 import pytest
 import skimage.io
-
 from study import tiny
+
 from thincam_jax.doctor import environment
 from thincam_jax.report.page import findings, render
 from thincam_jax.run import run_study

@@ -3,8 +3,8 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
-
 from study import tiny
+
 from thincam_jax.grids import Grid
 from thincam_jax.reconstruct import Reconstruction
 from thincam_jax.study import build

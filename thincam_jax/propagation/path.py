@@ -1,5 +1,7 @@
 """The way of the light: point source, mask, sensor."""
 
+from typing import Any
+
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -22,7 +24,7 @@ class Path(eqx.Module):
     distance: Float[Array, ""]
     object_distance: Float[Array, ""]
 
-    def __init__(self, wavelength, distance, object_distance=jnp.inf):
+    def __init__(self, wavelength, distance, object_distance: Any = jnp.inf):
         self.wavelength = _checks.positive("wavelength", wavelength, "mm")
         self.distance = _checks.positive("distance", distance, "mm")
         self.object_distance = _checks.positive(

@@ -72,9 +72,9 @@ def build_camera(config: StudyConfig, setting: Setting) -> LenslessCamera:
 def build_noise(config: StudyConfig) -> AbstractNoise | None:
     if config.noise is None:
         return None
-    if config.noise.snr_db is not None:
-        return GaussianNoise(config.noise.snr_db, config.noise.signal_power)
-    return PoissonGaussianNoise(config.noise.read_noise)
+    if config.noise.read_noise is not None:
+        return PoissonGaussianNoise(config.noise.read_noise)
+    return GaussianNoise(config.noise.snr_db, config.noise.signal_power)
 
 
 def build_plane(config: StudyConfig, target: TargetConfig) -> ImagePlane:

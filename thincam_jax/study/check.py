@@ -32,13 +32,12 @@ def _camera_faults(config: StudyConfig) -> list[str]:
             f"give at least {_MINIMUM_ROWS}×{MINIMUM_COLUMNS}"
         ]
     try:
-        for setting in all_settings(config):
-            camera = build_camera(config, setting)
+        cameras = [build_camera(config, setting) for setting in all_settings(config)]
         # Traced only: whether the model takes this mask at all.
         jax.eval_shape(
             lambda: psf(
-                camera,
-                wavelength=setting.wavelength,
+                cameras[0],
+                wavelength=config.wavelength,
                 object_distance=config.object.distance,
                 model=config.model,
                 pixel_integration=config.pixel_integration,

@@ -40,19 +40,17 @@ def method_response(config: StudyConfig, method: MethodConfig) -> Response:
     - Cut-off: where the magnitude stays under 5 % of its low-frequency value.
     """
     reference = reference_distance(method)
-    frequency, signed, powers = None, [], []
+    frequency = _frequencies(config)
+    signed, powers = [], []
     for index, shot in enumerate(method.shots):
-        own, channels = _shot_channels(config, method, index)
+        channels = _shot_channels(config, method, index)
         ratio = reference / shot.distance
-        if frequency is None:
-            frequency = own
         # A frequency on the reference plane is ratio times higher on this shot's sensor.
         power = np.sum(np.abs(channels) ** 2, axis=0)
-        powers.append(np.interp(frequency * ratio, own, power, right=0.0))
+        powers.append(np.interp(frequency * ratio, frequency, power, right=0.0))
         if method.synthesis == "fringe_scanning":
-            response = _without_carrier(config, shot, own, channels)
-            signed.append(np.interp(frequency * ratio, own, response, right=0.0))
-    assert frequency is not None
+            response = _without_carrier(config, shot, frequency, channels)
+            signed.append(np.interp(frequency * ratio, frequency, response, right=0.0))
     magnitude = np.sqrt(np.mean(powers, axis=0))
     limit = cut_off(frequency, magnitude)
     zero = first_common_zero(frequency, signed) if signed else None
@@ -69,30 +67,31 @@ def method_response(config: StudyConfig, method: MethodConfig) -> Response:
     )
 
 
-def _shot_channels(config: StudyConfig, method: MethodConfig, shot: int):
-    """Frequencies ≥ 0 and the responses (channel, u) of the channels of one shot."""
+def _frequencies(config: StudyConfig) -> np.ndarray:
+    """Frequencies ≥ 0 of the sensor's columns, cycles/mm."""
+    columns = config.sensor.shape[1]
+    return np.arange(columns - columns // 2) / (columns * config.sensor.pitch)
+
+
+def _shot_channels(config: StudyConfig, method: MethodConfig, shot: int) -> np.ndarray:
+    """Responses (channel, u) of the channels of one shot."""
     phases = len(method.shot_phases())
     used = settings(config, method)[shot * phases : (shot + 1) * phases]
-    frequency, responses = None, []
-    for setting in used:
-        frequency, response = _profile(config, setting)
-        responses.append(response)
     single = method.model_copy(update={"shots": (method.shots[shot],)})
-    return frequency, synthesis_matrix(single) @ np.stack(responses)
+    return synthesis_matrix(single) @ np.stack([_profile(config, s) for s in used])
 
 
-def _profile(config: StudyConfig, setting: Setting) -> tuple[np.ndarray, np.ndarray]:
-    camera = build_camera(config, setting)
+def _profile(config: StudyConfig, setting: Setting) -> np.ndarray:
+    """The OTF of one exposure along u ≥ 0, v = 0."""
     response = otf(
-        camera,
+        build_camera(config, setting),
         wavelength=setting.wavelength,
         object_distance=config.object.distance,
         model=config.model,
         pixel_integration=config.pixel_integration,
     )
     rows, columns = config.sensor.shape
-    line = np.asarray(response[rows // 2, columns // 2 :])
-    return np.asarray(camera.sensor.grid.u[columns // 2 :], dtype=float), line
+    return np.asarray(response[rows // 2, columns // 2 :])
 
 
 def _without_carrier(
