@@ -198,7 +198,7 @@ BROKEN = [
     (imports_against_the_order, "masks/fza.py", "from ..camera import x", "masks imports camera"),
     (imports_against_the_order, "masks/__init__.py", "from .. import psf", "masks imports psf"),
     (imports_against_the_order, "grids.py", "def f():\n    from .psf import psf", "grids.py:2: "),
-    (imports_against_the_order, "waveguide/trace.py", "from ..operators import x", "right of it"),
+    (imports_against_the_order, "waveguide/trace.py", "from ..reconstruct import x", "right of it"),
     (imports_against_the_order, "psf.py", "import thincam_jax as tc", "from the top"),
     (imports_against_the_order, "psf.py", "from . import Sensor", "from the top"),
     (imports_against_the_order, "cli.py", "from .hardware import x", "nothing may import"),
