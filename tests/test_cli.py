@@ -98,7 +98,7 @@ class TestExitCode2:
     def test_image_that_is_missing(self, file, tmp_path):
         out = tmp_path / "out"
         line = one_line(call("run", file, "--out", out, "--set", "targets.1.path=no.png"))
-        assert line.startswith("targets[1]: 'no.png' does not exist")
+        assert line.startswith(f"targets[1]: '{tmp_path / 'no.png'}' does not exist")
         assert not out.exists()
 
     def test_out_is_a_file(self, file, tmp_path):

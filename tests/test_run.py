@@ -204,7 +204,8 @@ class TestCheck:
 
     def test_missing_image(self, tmp_path):
         config = tiny.study(tmp_path, "targets.1.path=nowhere.png")
-        assert self.line(config).startswith("targets[1]: 'nowhere.png' does not exist")
+        missing = tmp_path / "nowhere.png"  # beside the experiment file
+        assert self.line(config).startswith(f"targets[1]: '{missing}' does not exist")
 
     # Some decoders leave a damaged file open for the collector.
     @pytest.mark.filterwarnings("ignore::ResourceWarning")

@@ -48,22 +48,12 @@ def run(
 
     Ctrl-C keeps what is finished; the same command goes on from there.
     """
+    folder, study = None, None
     try:
         study = load_config(config, tuple(set_ or ()))
         check_study(study)
         folder = RunFolder(out or Path("runs") / slug(study.name))
-    except _USER_ERRORS as error:
-        _fail(error)
-    columns = (
-        rich.progress.TextColumn("{task.description}"),
-        rich.progress.BarColumn(),
-        rich.progress.MofNCompleteColumn(),
-        rich.progress.TimeElapsedColumn(),
-        rich.progress.TextColumn("left"),
-        rich.progress.TimeRemainingColumn(),
-    )
-    try:
-        with rich.progress.Progress(*columns, console=_console) as bar:
+        with rich.progress.Progress(*_columns(), console=_console) as bar:
             task = bar.add_task(study.name, total=steps(study))
             metrics = run_study(
                 study, folder, lambda text: bar.update(task, advance=1, description=text)
@@ -71,7 +61,8 @@ def run(
     except _USER_ERRORS as error:
         _fail(error)
     except KeyboardInterrupt:
-        finished = [t.name for t in study.targets if folder.finished(t.name) is not None]
+        targets = study.targets if study and folder else ()
+        finished = [t.name for t in targets if folder and folder.finished(t.name) is not None]
         done = ", ".join(finished) if finished else "no target yet"
         _errors.print(
             f"thincam: interrupted; finished: {done}. The same command goes on from there.",
@@ -81,6 +72,17 @@ def run(
         raise typer.Exit(130) from None
     _print_results(metrics)
     _console.print(f"report: {folder.path / 'report.html'}", highlight=False, soft_wrap=True)
+
+
+def _columns() -> tuple[rich.progress.ProgressColumn, ...]:
+    return (
+        rich.progress.TextColumn("{task.description}"),
+        rich.progress.BarColumn(),
+        rich.progress.MofNCompleteColumn(),
+        rich.progress.TimeElapsedColumn(),
+        rich.progress.TextColumn("left"),
+        rich.progress.TimeRemainingColumn(),
+    )
 
 
 def _print_results(metrics: dict) -> None:

@@ -224,10 +224,19 @@ def load_config(path: str | Path, overrides: tuple[str, ...] = ()) -> StudyConfi
     raw, places = _read(path)
     asked = {_override(raw, override): f"--set {override}" for override in overrides}
     try:
-        return StudyConfig.model_validate(raw)
+        return _from_folder(StudyConfig.model_validate(raw), path.resolve().parent)
     except pydantic.ValidationError as error:
         faults = [_fault(e, places, asked, f"{path}:1") for e in _own(error.errors())]
         raise ConfigError("\n".join(faults)) from None
+
+
+def _from_folder(config: StudyConfig, folder: Path) -> StudyConfig:
+    """The study with its image files named from the folder of the experiment file."""
+    targets = tuple(
+        target.model_copy(update={"path": str(folder / target.path)}) if target.path else target
+        for target in config.targets
+    )
+    return config.model_copy(update={"targets": targets})
 
 
 def dump_config(config: StudyConfig) -> str:

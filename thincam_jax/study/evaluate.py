@@ -1,5 +1,6 @@
 """How good a reconstruction is: agreement with the scene, and what it resolves."""
 
+import math
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -43,7 +44,7 @@ def evaluate(
     truth = np.asarray(_sample(plane, grid), dtype=float)
     image, truth = (_as_picture(i) for i in (image, truth))
     metrics: dict[str, Any] = {
-        "psnr_db": round(psnr(image, truth), 4),
+        "psnr_db": _finite(round(psnr(image, truth), 4)),
         "ssim": round(ssim(image, truth), 5),
         "object_pixel_mm": round(float(reconstruction.pitch), 6),
         "resolved": None,
@@ -52,6 +53,11 @@ def evaluate(
     if target.kind == "usaf1951":
         metrics["resolved"], contrast = _resolution(config, method, image, float(grid.pitch))
     return Evaluation(align(image, truth)[0], truth, metrics, contrast)
+
+
+def _finite(value: float) -> float | None:
+    """JSON has no infinity: an exact reconstruction has no PSNR."""
+    return value if math.isfinite(value) else None
 
 
 @eqx.filter_jit
