@@ -93,8 +93,8 @@ def _show(ax, image: np.ndarray, title: str) -> None:
 
 def _show_detail_of_capture(ax, raw: np.ndarray, config: StudyConfig) -> None:
     detail = _middle(raw)
-    low, high = detail.min(), detail.max()
-    _show(ax, (detail - low) / (high - low if high > low else 1), "")
+    low, high = detail.min(axis=(0, 1)), detail.max(axis=(0, 1))
+    _show(ax, (detail - low) / np.where(high > low, high - low, 1), "")
     width = config.sensor.shape[1] * config.sensor.pitch / 3
     ax.set_xlabel(f"middle {width:.2g} mm of the sensor,\nstretched", fontsize=9)
 
@@ -116,16 +116,17 @@ def save_responses(folder: RunFolder, config: StudyConfig, responses: dict[str, 
     end = max(r.metrics["cut_off_cycles_per_mm"] for r in responses.values()) * 1.4
     for index, (ax, (name, response)) in enumerate(zip(axes, responses.items(), strict=True)):
         level = low_frequency_value(response.frequency, response.magnitude)
+        top = max(1.3, 1.05 * float(response.magnitude[1:].max()) / level)
         style = _line(index) | {"marker": "", "linestyle": "-"}
         ax.plot(response.frequency[1:], response.magnitude[1:] / level, linewidth=1.1, **style)
         limits = response.metrics
         zero, cut = limits["first_zero_cycles_per_mm"], limits["cut_off_cycles_per_mm"]
         if zero is not None:
             ax.axvline(zero, color="black", linestyle=":", linewidth=1)
-            ax.text(zero, 1.52, f" first zero {zero:.1f}", fontsize=8, va="top")
+            ax.text(zero, 0.95 * top, f" first zero {zero:.1f}", fontsize=8, va="top")
         ax.axvline(cut, color="black", linestyle="--", linewidth=1)
-        ax.text(cut, 1.34, f" cut-off {cut:.1f}", fontsize=8, va="top")
-        ax.set_ylim(0, 1.6)
+        ax.text(cut, 0.84 * top, f" cut-off {cut:.1f}", fontsize=8, va="top")
+        ax.set_ylim(0, top)
         ax.set_xlim(0, min(end, response.frequency[-1]))
         ax.set_ylabel("relative MTF")
         ax.set_title(name, fontsize=10, loc="left")
