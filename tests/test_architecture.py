@@ -19,7 +19,17 @@ PACKAGE = "thincam_jax"
 # where it may use everything up to the capture. A new module goes where its imports allow.
 ORDER = (
     *("units", "_checks", "_memory", "_phase", "grids", "chirp", "targets", "scene", "masks"),
-    *("sensor", "propagation", "camera", "psf", "operators", "capture", "waveguide", "reconstruct"),
+    *(
+        "sensor",
+        "propagation",
+        "camera",
+        "psf",
+        "responses",
+        "operators",
+        "capture",
+        "waveguide",
+        "reconstruct",
+    ),
     *("metrics", "design", "calibrate", "config", "study", "report", "doctor", "run", "cli"),
     "hardware",
 )

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from thincam_jax.grids import Grid, centre_crop, centre_pad
+from thincam_jax.grids import Grid, fast_shape, same_parity
 
 SHAPES = [(1, 1), (1, 6), (5, 1), (4, 7)]
 
@@ -37,20 +37,17 @@ def test_pitch_is_differentiable():
     assert slope == 1.5 - 10.0
 
 
-def test_padding_keeps_the_centre():
-    image = jnp.arange(6.0).reshape(2, 3)
-    padded = centre_pad(image, (4, 7))
-    assert padded.shape == (4, 7) and padded.sum() == image.sum()
-    np.testing.assert_array_equal(padded[1:3, 2:5], image)
-    np.testing.assert_array_equal(centre_crop(padded, (2, 3)), image)
-    batch = centre_pad(jnp.stack([image, -image]), (4, 5))
-    np.testing.assert_array_equal(centre_crop(batch, (2, 3))[1], -image)
+@pytest.mark.parametrize(
+    ("shape", "sensor", "expected"),
+    [((40, 46), (96, 85), (40, 47)), ((41, 47), (96, 85), (42, 47)), ((1, 1), (1, 1), (1, 1))],
+)
+def test_same_parity(shape, sensor, expected):
+    assert same_parity(shape, sensor) == expected
 
 
-@pytest.mark.parametrize("shape", [(3, 3), (1, 3), (2, 4)])
-def test_padding_refuses_half_samples_and_smaller_shapes(shape):
-    with pytest.raises(ValueError, match=r"\(2, 3\).*do not share a centre"):
-        centre_pad(jnp.ones((2, 3)), shape)
+def test_fast_shape_holds_the_shape():
+    assert fast_shape((1023, 2)) == (1024, 2)
+    assert fast_shape((1874, 7), real=True) == (1875, 8)
 
 
 @pytest.mark.parametrize("shape", [(0, 3), (2, -1), (2.5, 3), (3,), 4, "ab"])

@@ -11,6 +11,8 @@ from thincam_jax.psf import psf as psf
 from thincam_jax.reconstruct import FringeScanning as FringeScanning
 from thincam_jax.reconstruct import WienerSynthesis as WienerSynthesis
 from thincam_jax.reconstruct import reconstruct as reconstruct
+from thincam_jax.responses import fringe_scanned_otf as fringe_scanned_otf
+from thincam_jax.responses import phase_pair_otf as phase_pair_otf
 from thincam_jax.scene import ImagePlane as ImagePlane
 from thincam_jax.scene import Scene as Scene
 from thincam_jax.scene import Spectrum as Spectrum

@@ -144,17 +144,20 @@ class MethodConfig(_Section):
 
 
 class TargetConfig(_Section):
-    """A scene: the drawn USAF-1951 chart, a photograph of scikit-image, or an image file."""
+    """A scene: a drawn chart or pattern, a photograph of scikit-image, or an image file.
+
+    Charts and patterns are squares of `pixels` × `pixels`.
+    """
 
     name: Name
-    kind: Literal["usaf1951", "photograph", "file"]
+    kind: Literal["usaf1951", "slanted_edge", "siemens_star", "point_grid", "photograph", "file"]
     image: str | None = None
     path: str | None = None
     pixels: Annotated[int, Field(ge=8, le=8192)] = 1700
 
     @pydantic.model_validator(mode="after")
     def _fits(self):
-        needed = {"usaf1951": None, "photograph": "image", "file": "path"}[self.kind]
+        needed = {"photograph": "image", "file": "path"}.get(self.kind)
         for key in ("image", "path"):
             if (getattr(self, key) is None) == (key == needed):
                 verb = "needs" if key == needed else "takes no"

@@ -71,26 +71,3 @@ def same_parity(shape, sensor_shape) -> tuple[int, int]:
     shape = _checks.shape2d("field_shape", shape)
     rows, columns = (n + (n - s) % 2 for n, s in zip(shape, sensor_shape, strict=True))
     return rows, columns
-
-
-def centre_pad(image: Array, shape: tuple[int, int]) -> Array:
-    """Zeros around the last two axes so that the centre stays the centre.
-
-    Sizes of different parity have their centres half a sample apart; those are refused.
-    """
-    return jnp.pad(image, [(0, 0)] * (image.ndim - 2) + _margins(image.shape[-2:], shape))
-
-
-def centre_crop(image: Array, shape: tuple[int, int]) -> Array:
-    """The middle of the last two axes; the inverse of `centre_pad`."""
-    (top, _), (left, _) = _margins(shape, image.shape[-2:])
-    return image[..., top : top + shape[0], left : left + shape[1]]
-
-
-def _margins(small, large) -> list[tuple[int, int]]:
-    if any(s > n or (n - s) % 2 for s, n in zip(small, large, strict=True)):
-        raise ValueError(
-            f"shapes {tuple(small)} and {tuple(large)} do not share a centre: the second must be "
-            "larger by an even number of samples along each axis"
-        )
-    return [((n - s) // 2, (n - s) // 2) for s, n in zip(small, large, strict=True)]

@@ -92,7 +92,9 @@ def _collect(
     methods = {}
     for method in config.methods:
         photographs = [
-            results[t.name][method.name]["psnr_db"] for t in config.targets if t.kind != "usaf1951"
+            results[t.name][method.name]["psnr_db"]
+            for t in config.targets
+            if t.kind in ("photograph", "file")
         ]
         methods[method.name] = {
             "captures": len(build.settings(config, method)),

@@ -4,7 +4,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from thincam_jax.grids import same_parity
 from thincam_jax.reconstruct.registration import register, registered_shape
 
 
@@ -47,14 +46,6 @@ def test_batches_and_the_ratio_of_one():
 def test_registered_shape_holds_the_enlarged_picture_and_its_parity(shape, ratio):
     for new, old in zip(registered_shape(shape, ratio), shape, strict=True):
         assert ratio * old - 1e-5 <= new < ratio * old + 2 and (new - old) % 2 == 0
-
-
-def test_same_parity():
-    assert same_parity((40, 46), (96, 85)) == (40, 47)
-    assert same_parity((41, 47), (96, 85)) == (42, 47)
-    assert same_parity((1, 1), (1, 1)) == (1, 1)
-    with pytest.raises(ValueError, match=r"field_shape = \(0, 3\)"):
-        same_parity((0, 3), (96, 85))
 
 
 def test_captures_are_never_made_smaller():

@@ -1,5 +1,6 @@
 """From a study's configuration to cameras, scenes and reconstructions."""
 
+import functools
 import math
 from collections.abc import Callable
 from typing import NamedTuple
@@ -23,7 +24,21 @@ from thincam_jax.sensor import (
     Sensor,
     electrons_per_unit,
 )
-from thincam_jax.targets import load_image, sample_image, usaf1951
+from thincam_jax.targets import (
+    load_image,
+    point_grid,
+    sample_image,
+    siemens_star,
+    slanted_edge,
+    usaf1951,
+)
+
+_DRAWN: dict[str, Callable] = {
+    "usaf1951": usaf1951,
+    "slanted_edge": slanted_edge,
+    "siemens_star": siemens_star,
+    "point_grid": functools.partial(point_grid, count=(9, 9)),
+}
 
 
 class Setting(NamedTuple):
@@ -79,8 +94,8 @@ def build_noise(config: StudyConfig) -> AbstractNoise | None:
 
 def build_plane(config: StudyConfig, target: TargetConfig) -> ImagePlane:
     """The target in front of the camera, with its colour channels as a batch: (channel, y, x)."""
-    if target.kind == "usaf1951":
-        image = usaf1951((target.pixels, target.pixels))
+    if target.kind in _DRAWN:
+        image = _DRAWN[target.kind]((target.pixels, target.pixels))
     elif target.kind == "photograph":
         image = sample_image(target.image or "")
     else:
