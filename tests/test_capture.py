@@ -267,3 +267,19 @@ def test_sizes_beyond_the_memory_are_refused_with_an_estimate(monkeypatch):
     tc.capture(camera(), scene)
     with pytest.raises(MemoryError, match="fewer images"):
         tc.capture(camera(), tc.Scene(plane(photograph((100, 30, 40))), 500 * nm))
+
+
+def test_camera_built_inside_jit():
+    """Plain numbers stay known there, so that sizes can depend on them."""
+
+    @jax.jit
+    def total(beta, image):
+        mask = tc.FresnelZoneAperture(beta, 0.3, width=2.0)
+        built = tc.LenslessCamera(mask, tc.Sensor((30, 41), 0.04), 6.5)
+        return tc.capture(built, tc.Scene(tc.ImagePlane(image, 250.0, 30.0), 500 * nm)).sum()
+
+    image = photograph()
+    mask = tc.FresnelZoneAperture(25.0, 0.3, width=2.0)
+    built = tc.LenslessCamera(mask, tc.Sensor((30, 41), 0.04), 6.5)
+    eager = tc.capture(built, tc.Scene(tc.ImagePlane(image, 250.0, 30.0), 500 * nm)).sum()
+    assert total(jnp.asarray(25.0), jnp.asarray(image)) == pytest.approx(float(eager), rel=1e-12)

@@ -31,15 +31,27 @@ def real(name: str, value: Any, unit: str, *, shape: tuple[int, ...] = ()) -> Ar
             raise TypeError(f"{name} = {value!r} is not a real number; give it in {unit}")
         if np.isnan(known).any():
             raise ValueError(f"{name} is NaN; give a number in {unit}")
-    array = jnp.asarray(value)
-    if not jnp.issubdtype(array.dtype, jnp.floating):
-        array = array.astype(float)
-    # An array keeps its precision; a weak type goes, because it would be compiled for once more.
-    array = jax.lax.convert_element_type(array, array.dtype)
+    if known is None:
+        array = _floating(value)
+    else:
+        # A plain number stays known inside jit, so that sizes can depend on it.
+        with jax.ensure_compile_time_eval():
+            array = _floating(value)
     if array.shape != shape:
         wanted = "one number" if shape == () else f"an array of shape {shape}"
         raise ValueError(f"{name} has shape {array.shape}; give {wanted} in {unit}")
     return array
+
+
+def _floating(value: Any) -> Array:
+    """A floating array of the value's precision, without the weak type of a plain number.
+
+    A weak type would be compiled for once more.
+    """
+    array = jnp.asarray(value)
+    if not jnp.issubdtype(array.dtype, jnp.floating):
+        array = array.astype(float)
+    return jax.lax.convert_element_type(array, array.dtype)
 
 
 def finite(name: str, value: Any, unit: str, *, shape: tuple[int, ...] = ()) -> Array:

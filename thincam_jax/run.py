@@ -96,6 +96,7 @@ def _collect(
             for t in config.targets
             if t.kind in ("photograph", "file")
         ]
+        photographs = [p for p in photographs if p is not None]  # exact ones have no PSNR
         methods[method.name] = {
             "captures": len(build.settings(config, method)),
             "mean_psnr_of_pictures_db": (

@@ -79,7 +79,8 @@ def save_target(
 
 def _caption(evaluation: Evaluation) -> str:
     metrics = evaluation.metrics
-    text = f"{metrics['psnr_db']:.1f} dB, SSIM {metrics['ssim']:.2f}"
+    exact = metrics["psnr_db"] is None
+    text = "exact" if exact else f"{metrics['psnr_db']:.1f} dB, SSIM {metrics['ssim']:.2f}"
     if metrics["resolved"]:
         text += f"\nresolves {metrics['resolved']['object_mm']:.2f} mm"
     return text
