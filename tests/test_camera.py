@@ -54,3 +54,12 @@ def test_a_camera_is_a_tree_of_its_numbers():
     assert float(slopes.mask.width) == pytest.approx(1.026)
     assert float(slopes.distance) == pytest.approx(5.632 / 250)
     assert float(slopes.mask.beta) == 0.0 and float(slopes.sensor.pitch) == 0.0
+
+
+def test_swapped_arguments_are_refused():
+    mask = tc.FresnelZoneAperture(25.0, width=1.0)
+    sensor = tc.Sensor((3, 4), 0.1)
+    with pytest.raises(TypeError, match="mask is a Sensor; give a mask of thincam_jax.masks"):
+        tc.LenslessCamera(sensor, mask, 5.0)
+    with pytest.raises(TypeError, match="sensor is a NoneType; give a thincam_jax.Sensor"):
+        tc.LenslessCamera(mask, None, 5.0)

@@ -84,9 +84,7 @@ class TestExitCode2:
         assert result.exit_code == 2
         first, second = result.stderr.splitlines()
         # Long lines are not broken: a terminal wraps them, a log keeps them whole.
-        assert first == "thincam: --set seed=x: seed: 'x': input should be a valid integer, " + (
-            "unable to parse string as an integer"
-        )
+        assert first == "thincam: --set seed=x: seed: 'x': input should be a valid integer"
         assert second.startswith("thincam: --set mask.width=2: mask.width: 2 has no unit")
 
     def test_markup_in_a_message_is_shown_as_it_is(self, file):
@@ -145,6 +143,7 @@ def test_defect_keeps_its_traceback(file, monkeypatch, tmp_path):
 @pytest.mark.parametrize(("done", "hint"), [([], "no target yet"), (["chart"], "chart")])
 def test_interrupt(file, monkeypatch, tmp_path, done, hint):
     def interrupted(config, folder, progress):
+        folder.claim(config)
         for name in done:
             folder.finish(name, {"metrics": {}, "contrasts": {}})
         progress("picture: capture 1")

@@ -168,12 +168,12 @@ FAULTS = {
     ),
     "the same shot twice": (
         *("{beta: 21 rad/mm^2, distance: 3 mm}", "{beta: 25 /mm^2, distance: 0.3 cm}"),
-        *("methods[1]", ["shots hold an entry twice"]),
+        *("methods[1].shots", ["shots hold an entry twice"]),
     ),
     "the same phase twice": (
         "[0 rad, 270 deg]",
         "[0 rad, 0 deg]",
-        *("methods[1]", ["phases hold an entry twice"]),
+        *("methods[1].phases", ["phases hold an entry twice"]),
     ),
     "path for a photograph": (
         *("image: coffee", "path: coffee.png"),
@@ -224,8 +224,8 @@ LINES = {
     "unknown photograph": "- name: picture",
     "phases given to fringe scanning": "- name: wiener",
     "synthesis given to fringe scanning": "- name: scan",
-    "the same shot twice": "- name: wiener",
-    "the same phase twice": "- name: wiener",
+    "the same shot twice": "synthesis: separate\n    shots:",
+    "the same phase twice": "phases: [0 rad",
     "path for a photograph": "- name: picture",
     "file without a path": "- name: picture",
     "image for the chart": "- name: chart",
@@ -494,10 +494,13 @@ def test_shipped_files_round_trip(name, tmp_path):
 
 
 LENGTHS = st.floats(1e-7, 1e7)
+WAVELENGTHS = st.floats(1e-5, 1.0)
 
 
 @settings(max_examples=40, deadline=None)
-@given(LENGTHS, LENGTHS, LENGTHS, st.floats(-100, 100), st.text("aÄ#:'\"\\{[ \n%-", max_size=150))
+@given(
+    WAVELENGTHS, LENGTHS, LENGTHS, st.floats(-100, 100), st.text("aÄ#:'\"\\{[ \n%-", max_size=150)
+)
 def test_dump_round_trips_to_the_last_bit(tmp_path_factory, wavelength, pitch, beta, phase, note):
     folder = tmp_path_factory.mktemp("dump")
     raw = load(folder, BASE).model_dump(mode="json", exclude_none=True)
@@ -524,3 +527,21 @@ def test_dump_round_trips_to_the_last_bit(tmp_path_factory, wavelength, pitch, b
 )
 def test_slug(name, file):
     assert slug(name) == file
+
+
+def test_shot_repeated_by_way_of_the_study_wavelength(tmp_path):
+    """The same capture under two descriptions would count its noise as two independent ones."""
+    text = changed(
+        "{beta: 21 rad/mm^2, distance: 3 mm}",
+        "{beta: 25 rad/mm^2, distance: 3 mm, wavelength: 500 nm}",
+    )
+    (line,) = faults(tmp_path, text)
+    assert "methods[1].shots: shots hold an entry twice" in line
+
+
+@pytest.mark.parametrize("override", ["wavelength=500 m", "wavelength=1e-30 nm"])
+def test_wavelengths_are_those_of_light(tmp_path, override):
+    path = tmp_path / "study.yaml"
+    path.write_text(BASE, encoding="utf-8")
+    with pytest.raises(ConfigError, match="is no wavelength of light; give 10 nm to 1 mm"):
+        load_config(path, (override,))

@@ -406,3 +406,14 @@ def test_leaves_are_arrays():
     """Every number of the camera is a leaf that can be differentiated, none is frozen."""
     leaves = jax.tree.leaves(eqx.filter(camera_of(), eqx.is_inexact_array))
     assert len(leaves) == len(jax.tree.leaves(camera_of())) == 8
+
+
+def test_mask_wider_than_the_sensor_inside_jit():
+    """Its plane's size must be given there; it is then the eager result."""
+    camera = tc.LenslessCamera(
+        tc.FresnelZoneAperture(25.0, 0.3, width=0.4), tc.Sensor((8, 7), 0.01), 6.5
+    )
+    how = {"wavelength": WAVELENGTH, "model": "angular_spectrum"}
+    expected = tc.psf(camera, **how)
+    found = jax.jit(lambda c: tc.psf(c, mask_shape=(40, 41), **how))(camera)
+    np.testing.assert_allclose(found, expected, rtol=1e-10)

@@ -183,8 +183,21 @@ def test_folder_of_another_study_is_refused(whole, home):
     assert (whole[1] / "metrics.json").read_bytes() == before
 
 
+def test_folder_with_other_files_is_refused_untouched(home, whole):
+    foreign = home / "foreign"
+    (foreign / "targets").mkdir(parents=True)
+    for name in ("metrics.json", "report.html", "targets/mine.json"):
+        (foreign / name).write_text("mine", encoding="utf-8")
+    before = sorted(foreign.rglob("*"))
+    with pytest.raises(ConfigError, match="not empty and holds no run; give a new folder"):
+        run_study(whole[0], RunFolder(foreign), tiny.ignore)
+    assert sorted(foreign.rglob("*")) == before
+    assert all(p.read_text("utf-8") == "mine" for p in before if p.is_file())
+
+
 def test_folder_whose_configuration_is_no_text_is_refused(home, whole):
     folder = RunFolder(home / "binary")
+    folder.path.mkdir()
     (folder.path / "config.yaml").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(ConfigError, match="another configuration"):
         folder.claim(whole[0])
@@ -276,5 +289,6 @@ def test_smallest_sensor_that_is_let_through_gives_finite_results(tmp_path):
     reconstruct = build.build_reconstructor(
         config, method, build.field_shape(config, method, plane)
     )
-    assert reconstruct(jax.numpy.stack(captures)).status == "ok"
+    images, variances = (jax.numpy.stack(values) for values in zip(*captures, strict=True))
+    assert reconstruct(images, variances).status == "ok"
     assert np.isfinite(method_response(config, method).metrics["cut_off_cycles_per_mm"])

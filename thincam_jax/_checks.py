@@ -112,7 +112,7 @@ def shape2d(name: str, value: Any) -> tuple[int, int]:
     try:
         rows, columns = (int(v) for v in value)
         whole = all(int(v) == v for v in value)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise ValueError(f"{name} = {value!r} is not a pair (rows, columns) of pixels") from None
     if not whole or rows < 1 or columns < 1:
         raise ValueError(

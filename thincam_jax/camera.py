@@ -25,6 +25,10 @@ class LenslessCamera(eqx.Module):
     distance: Float[Array, ""]
 
     def __init__(self, mask, sensor, distance):
+        if not isinstance(mask, AbstractMask):
+            raise TypeError(f"mask is a {type(mask).__name__}; give a mask of thincam_jax.masks")
+        if not isinstance(sensor, Sensor):
+            raise TypeError(f"sensor is a {type(sensor).__name__}; give a thincam_jax.Sensor")
         self.mask = mask
         self.sensor = sensor
         self.distance = _checks.positive("distance", distance, "mm")

@@ -1,5 +1,6 @@
 """The command `thincam`."""
 
+import os
 import sys
 from pathlib import Path
 from typing import Annotated, NoReturn
@@ -22,6 +23,8 @@ app = typer.Typer(
 )
 _console = rich.console.Console()
 _errors = rich.console.Console(stderr=True)
+
+_INTERRUPTED = 130  # the shells' exit code after Ctrl-C
 
 # What a user can put right; anything else is a defect and keeps its traceback.
 _USER_ERRORS = (ConfigError, FileNotFoundError, IsADirectoryError, PermissionError, MemoryError)
@@ -69,7 +72,7 @@ def run(
             highlight=False,
             soft_wrap=True,
         )
-        raise typer.Exit(130) from None
+        raise typer.Exit(_INTERRUPTED) from None
     _print_results(metrics)
     _console.print(f"report: {folder.path / 'report.html'}", highlight=False, soft_wrap=True)
 
@@ -124,7 +127,15 @@ def doctor() -> None:
 
 def main() -> None:
     """Entry point of the command `thincam`."""
-    app()
+    try:
+        app()
+    except SystemExit as end:
+        if end.code == _INTERRUPTED:
+            # Not by way of the interpreter's end: threads that still compile may crash there.
+            sys.stdout.flush()
+            sys.stderr.flush()
+            os._exit(_INTERRUPTED)
+        raise
 
 
 if __name__ == "__main__":

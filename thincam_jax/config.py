@@ -36,6 +36,12 @@ def _positive(value: float) -> float:
     return value
 
 
+def _optical(value: float) -> float:
+    if not 1e-5 <= value <= 1:
+        raise ValueError(f"{value:g} mm is no wavelength of light; give 10 nm to 1 mm")
+    return value
+
+
 def _quantity(kind: str, unit: str):
     # A resolved file is read back, so it is written in the unit of the package, with every digit.
     return (
@@ -45,6 +51,7 @@ def _quantity(kind: str, unit: str):
 
 
 Length = Annotated[float, *_quantity("length", "mm"), AfterValidator(_positive)]
+Wavelength = Annotated[float, *_quantity("length", "mm"), AfterValidator(_optical)]
 Curvature = Annotated[float, *_quantity("curvature", "rad/mm^2"), AfterValidator(_positive)]
 Angle = Annotated[float, *_quantity("angle", "rad")]
 Name = Annotated[str, Field(min_length=1, max_length=60, pattern=r"^[\w .,()=+\-]+$")]
@@ -84,7 +91,7 @@ class ObjectConfig(_Section):
 class NoiseConfig(_Section):
     """Gaussian noise at an SNR, or shot noise with a read noise in electrons."""
 
-    snr_db: float | None = None
+    snr_db: Annotated[float, Field(ge=-60, le=200)] | None = None
     signal_power: Literal["total", "without_mean"] = "total"
     read_noise: Annotated[float, Field(ge=0)] | None = None
 
@@ -100,7 +107,7 @@ class ShotConfig(_Section):
 
     beta: Curvature
     distance: Length
-    wavelength: Length | None = None
+    wavelength: Wavelength | None = None
 
 
 class PublishedConfig(_Section):
@@ -129,11 +136,6 @@ class MethodConfig(_Section):
             raise ValueError("kind fringe_scanning takes one shot and its own synthesis")
         if self.synthesis != "separate" and self.phases != (0.0,):
             raise ValueError(f"synthesis {self.synthesis} sets the phases itself; drop 'phases'")
-        # A capture that is used twice would count its noise as two independent ones.
-        for what in ("shots", "phases"):
-            entries = getattr(self, what)
-            if len(set(entries)) < len(entries):
-                raise ValueError(f"{what} hold an entry twice; give each once")
         return self
 
     def shot_phases(self) -> tuple[float, ...]:
@@ -173,8 +175,8 @@ class StudyConfig(_Section):
 
     name: Name
     title: str = ""
-    seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
-    wavelength: Length
+    seed: Annotated[int, Field(ge=0, lt=2**32, strict=True)] = 0
+    wavelength: Wavelength
     model: Model = "separable"
     pixel_integration: bool = True
     prior: Prior = "inverse_square"
@@ -200,6 +202,17 @@ class StudyConfig(_Section):
                         f"give the same file name {file!r}; choose another name"
                     )
                     raise _misfit(message, what, index, "name")
+        return self
+
+    @pydantic.model_validator(mode="after")
+    def _captures_differ(self):
+        # A capture that is used twice would count its noise as two independent ones.
+        for index, method in enumerate(self.methods):
+            shots = [(s.beta, s.distance, s.wavelength or self.wavelength) for s in method.shots]
+            for what, entries in (("shots", shots), ("phases", method.phases)):
+                if len(set(entries)) < len(entries):
+                    message = f"{what} hold an entry twice; give each once"
+                    raise _misfit(message, "methods", index, what)
         return self
 
     @pydantic.model_validator(mode="after")

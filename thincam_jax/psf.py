@@ -48,6 +48,7 @@ def psf(
     pixel_integration: bool = False,
     grid: Grid | None = None,
     oversampling: int | None = None,
+    mask_shape: tuple[int, int] | None = None,
 ) -> Float[Array, "y x"]:
     """Point spread function on the sensor: irradiance relative to the open aperture.
 
@@ -61,6 +62,9 @@ def psf(
     - `grid`: where to evaluate; the sensor's pixels by default.
     - `oversampling`: samples per pixel of the sampled models (odd; default 1, and 3 for pixel
       averages); the others are closed forms and take none.
+    - `mask_shape`: pixels of the plane on which the sampled models hold the mask; by default the
+      smallest that does. Inside jit and grad, where the mask's size is not known, it is the
+      sensor's: give it there if the mask is wider than the sensor.
 
     **Returns** (y, x), dimensionless. Differentiable in every number of `camera` and in
     `wavelength` and `object_distance`.
@@ -70,7 +74,9 @@ def psf(
     does not fit.
     """
     path, grid = _prepare(camera, wavelength, object_distance, model, grid)
-    shape, oversampling = _sampling(camera, grid, model, pixel_integration, oversampling)
+    shape, oversampling = _sampling(
+        camera, grid, model, pixel_integration, oversampling, mask_shape
+    )
     _check_memory(camera.mask, grid, model, shape, oversampling)
     return _psf(camera.mask, grid, path, model, pixel_integration, shape, oversampling)
 
@@ -84,6 +90,7 @@ def otf(
     pixel_integration: bool = False,
     grid: Grid | None = None,
     oversampling: int | None = None,
+    mask_shape: tuple[int, int] | None = None,
 ) -> Complex[Array, "v u"]:
     """Optical transfer function H(u,v) = ∬ h e^{−2πj(ux+vy)} dx dy, zero frequency at n//2, mm².
 
@@ -93,7 +100,9 @@ def otf(
     frequency cell.
     """
     path, grid = _prepare(camera, wavelength, object_distance, model, grid)
-    shape, oversampling = _sampling(camera, grid, model, pixel_integration, oversampling)
+    shape, oversampling = _sampling(
+        camera, grid, model, pixel_integration, oversampling, mask_shape
+    )
     _check_memory(camera.mask, grid, model, shape, oversampling)
     return _otf(camera.mask, grid, path, model, pixel_integration, shape, oversampling)
 
@@ -172,15 +181,19 @@ def _prepare(camera, wavelength, object_distance, model, grid) -> tuple[Path, Gr
     return camera.path(wavelength, object_distance), grid or camera.sensor.grid
 
 
-def _sampling(camera, grid, model, pixel_integration, oversampling):
+def _sampling(camera, grid, model, pixel_integration, oversampling, mask_shape):
     """Mask plane in pixels and samples per pixel, for the models that sample."""
     if model not in _SAMPLED:
-        if oversampling is not None:
-            raise ValueError(f"model {model!r} is a closed form: leave oversampling out")
+        if oversampling is not None or mask_shape is not None:
+            raise ValueError(
+                f"model {model!r} is a closed form: leave oversampling and mask_shape out"
+            )
         return None, 1
     if oversampling is None:
         oversampling = 3 if pixel_integration else 1
     require_odd(oversampling)
+    if mask_shape is not None:
+        return _checks.shape2d("mask_shape", mask_shape), oversampling
     sizes = [*camera.mask.extent, grid.pitch, camera.mask.centre]
     if any(_checks.is_traced(s) for s in sizes):
         return None, oversampling  # the size cannot be looked at: the sensor's, checked when run
@@ -214,7 +227,8 @@ def _check_memory(
     refuse_if_too_large(
         f"a PSF of {rows}×{columns} pixels by model {model!r}",
         needed,
-        "use a smaller grid, less oversampling or the model 'separable'",
+        "use a smaller grid"
+        + ("" if model == "separable" else ", less oversampling or the model 'separable'"),
     )
 
 

@@ -65,11 +65,11 @@ def _run_target(
 ) -> dict[str, Any]:
     """Captures, reconstructions and figures of one target."""
     plane = build.build_plane(config, target)
-    captures: dict[build.Setting, np.ndarray] = {}
+    captures: dict[build.Setting, build.Exposure] = {}
     for number, setting in enumerate(build.all_settings(config)):
         progress(f"{target.name}: capture {number + 1}")
         key = build.capture_key(config, index, number)
-        captures[setting] = np.asarray(build.take(config, setting, plane, key))
+        captures[setting] = build.take(config, setting, plane, key)
     evaluations: dict[str, Evaluation] = {}
     for method in config.methods:
         progress(f"{target.name}: {method.name}")
@@ -78,9 +78,13 @@ def _run_target(
         if reconstructor is None:
             reconstructor = build.build_reconstructor(config, method, shape)
             reconstructors[method.name, shape] = reconstructor
-        used = jnp.asarray(np.stack([captures[s] for s in build.settings(config, method)]))
-        evaluations[method.name] = evaluate(config, method, target, plane, reconstructor(used))
-    first = captures[build.all_settings(config)[0]]
+        used = [captures[s] for s in build.settings(config, method)]
+        reconstruction = reconstructor(
+            jnp.asarray(np.stack([exposure.image for exposure in used])),
+            jnp.asarray(np.stack([exposure.variance for exposure in used])),
+        )
+        evaluations[method.name] = evaluate(config, method, target, plane, reconstruction)
+    first = captures[build.all_settings(config)[0]].image
     figures.save_target(folder, config, target, first, evaluations)
     contrasts = {m: e.contrast for m, e in evaluations.items() if e.contrast is not None}
     return {"metrics": {m: e.metrics for m, e in evaluations.items()}, "contrasts": contrasts}

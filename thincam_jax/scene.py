@@ -22,6 +22,8 @@ class ImagePlane(eqx.Module):
     width: Float[Array, ""]
 
     def __init__(self, image, distance, width):
+        if not _checks.is_traced(image) and np.asarray(image).dtype.kind not in "fiub":
+            raise TypeError(f"image is a {type(image).__name__}; give an array of real radiances")
         self.image = jnp.asarray(image)
         if not jnp.issubdtype(self.image.dtype, jnp.floating):
             self.image = self.image.astype(float)
@@ -76,6 +78,8 @@ class Spectrum(eqx.Module):
     weights: Float[Array, " n"]
 
     def __init__(self, wavelengths, weights=None):
+        if np.ndim(wavelengths) > 1:
+            raise ValueError(f"wavelengths has shape {np.shape(wavelengths)}; give a list of them")
         count = np.size(wavelengths)
         wavelengths = jnp.atleast_1d(jnp.asarray(wavelengths))
         self.wavelengths = _checks.positive_all("wavelengths", wavelengths, "mm")

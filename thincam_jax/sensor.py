@@ -83,7 +83,7 @@ class GaussianNoise(AbstractNoise):
     signal_power: Literal["total", "without_mean"] = eqx.field(static=True)
 
     def __init__(self, snr_db, signal_power: Literal["total", "without_mean"] = "total"):
-        self.snr_db = _checks.real("snr_db", snr_db, "dB")
+        self.snr_db = _checks.finite("snr_db", snr_db, "dB")
         self.signal_power = _checks.choice(  # pyright: ignore[reportAttributeAccessIssue]
             "signal_power", signal_power, ("total", "without_mean")
         )

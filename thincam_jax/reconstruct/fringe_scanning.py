@@ -119,11 +119,12 @@ def _check_phases(cameras: Sequence[LenslessCamera]) -> Float[Array, ""]:
     }
     if len(settings) > 1:
         raise ValueError(
-            "the four cameras differ in distance, sensor, beta, width or centre; make them equal "
+            "the four cameras differ in distance, sensor or mask; make them equal "
             "in all but the phase"
         )
     return masks[0].beta
 
 
-def _fixed_numbers(mask: FresnelZoneAperture) -> tuple[float, ...]:
-    return float(mask.beta), float(mask.width), *(float(c) for c in mask.centre)
+def _fixed_numbers(mask: FresnelZoneAperture) -> tuple:
+    numbers = mask.beta, mask.width, mask.fill_factor, *mask.centre
+    return *(float(n) for n in numbers), mask.profile, mask.harmonics, mask.pixels

@@ -126,9 +126,11 @@ def save_responses(folder: RunFolder, config: StudyConfig, responses: dict[str, 
             ax.axvline(zero, color="black", linestyle=":", linewidth=1)
             ax.text(zero, 0.95 * top, f" first zero {zero:.1f}", fontsize=8, va="top")
         ax.axvline(cut, color="black", linestyle="--", linewidth=1)
-        ax.text(cut, 0.84 * top, f" cut-off {cut:.1f}", fontsize=8, va="top")
+        end = min(end, response.frequency[-1])
+        side = "right" if cut > 0.85 * end else "left"
+        ax.text(cut, 0.84 * top, f" cut-off {cut:.1f} ", fontsize=8, va="top", ha=side)
         ax.set_ylim(0, top)
-        ax.set_xlim(0, min(end, response.frequency[-1]))
+        ax.set_xlim(0, end)
         ax.set_ylabel("relative MTF")
         ax.set_title(name, fontsize=10, loc="left")
     axes[-1].set_xlabel("spatial frequency u on the reference sensor plane (cycles/mm), v = 0")

@@ -6,7 +6,6 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
@@ -23,6 +22,7 @@ from thincam_jax.sensor import (
     PoissonGaussianNoise,
     Sensor,
     electrons_per_unit,
+    read_out,
 )
 from thincam_jax.targets import (
     load_image,
@@ -104,13 +104,34 @@ def build_plane(config: StudyConfig, target: TargetConfig) -> ImagePlane:
     return ImagePlane(image.astype(np.float32), config.object.distance, config.object.width)
 
 
-def take(config: StudyConfig, setting: Setting, plane: ImagePlane, key: Array) -> Array:
-    """One capture (channel, y, x) of a target."""
+class Exposure(NamedTuple):
+    """A capture (channel, y, x) and the variance of each channel's noise (channel,)."""
+
+    image: np.ndarray
+    variance: np.ndarray
+
+
+def take(config: StudyConfig, setting: Setting, plane: ImagePlane, key: Array) -> Exposure:
+    """One capture of a target; its noise is that of the noise-free image."""
+    camera, noise = build_camera(config, setting), build_noise(config)
+    clean = imaging(config, camera, setting, plane)
+    if noise is None:
+        variance = np.zeros(clean.shape[0], clean.dtype)
+    else:
+        variance = np.asarray(noise.variance(clean, electrons_per_unit(camera.sensor, clean)))
+    return Exposure(np.asarray(read_out(camera.sensor, clean, noise=noise, key=key)), variance)
+
+
+def imaging(
+    config: StudyConfig, camera: LenslessCamera, setting: Setting, plane: ImagePlane
+) -> Array:
+    """What falls on the sensor, (channel, y, x)."""
+    ideal = LenslessCamera(
+        camera.mask, Sensor(config.sensor.shape, config.sensor.pitch), camera.distance
+    )
     return capture(
-        build_camera(config, setting),
+        ideal,
         Scene(plane, setting.wavelength),
-        key=key,
-        noise=build_noise(config),
         model=config.model,
         pixel_integration=config.pixel_integration,
     )
@@ -146,15 +167,16 @@ def field_shape(config: StudyConfig, method: MethodConfig, plane: ImagePlane) ->
 
 def build_reconstructor(
     config: StudyConfig, method: MethodConfig, shape: tuple[int, int]
-) -> Callable[[Array], Reconstruction]:
-    """A function of the method's captures (capture, channel, y, x)."""
+) -> Callable[[Array, Array], Reconstruction]:
+    """A function of the captures (capture, channel, y, x) and variances (capture, channel)."""
     used = settings(config, method)
     cameras = [build_camera(config, s) for s in used]
     if method.kind == "fringe_scanning":
-        return FringeScanning(cameras, object_distance=config.object.distance, field_shape=shape)
-    noise = build_noise(config)
-    assert noise is not None  # the configuration demands it for this kind
-    synthesis = WienerSynthesis(
+        scanning = FringeScanning(
+            cameras, object_distance=config.object.distance, field_shape=shape
+        )
+        return lambda captures, variances: scanning(captures)
+    return WienerSynthesis(
         cameras,
         wavelength=[s.wavelength for s in used],
         object_distance=config.object.distance,
@@ -164,9 +186,3 @@ def build_reconstructor(
         model=config.model,
         pixel_integration=config.pixel_integration,
     )
-
-    def reconstruct(captures: Array) -> Reconstruction:
-        electrons = electrons_per_unit(cameras[0].sensor, captures)
-        return synthesis(captures, jnp.asarray(noise.variance(captures, electrons)))
-
-    return reconstruct

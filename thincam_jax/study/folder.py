@@ -19,26 +19,31 @@ class RunFolder:
 
     def __init__(self, path: str | Path):
         self.path = Path(path)
-        for name in ("targets", "images", "figures"):
-            try:
-                (self.path / name).mkdir(parents=True, exist_ok=True)
-            except OSError as error:
-                raise ConfigError(
-                    f"--out {path}: cannot be made a folder ({error.strerror})"
-                ) from None
 
     def claim(self, config: StudyConfig) -> None:
-        """Write the configuration, or refuse a folder that holds another study's results.
+        """Make the folder and write the configuration; refuse a folder that holds anything else.
 
         An interrupted run of the same configuration goes on; a complete one is done anew.
         """
         held = self.path / "config.yaml"
         text = dump_config(config)
-        if held.exists() and held.read_bytes() != text.encode("utf-8"):
+        try:
+            if held.exists():
+                if held.read_bytes() != text.encode("utf-8"):
+                    raise ConfigError(
+                        f"--out {self.path}: holds a run of another configuration (see {held}); "
+                        "give another folder or delete this one"
+                    )
+            elif self.path.exists() and any(self.path.iterdir()):
+                raise ConfigError(
+                    f"--out {self.path}: is not empty and holds no run; give a new folder"
+                )
+            for name in ("targets", "images", "figures"):
+                (self.path / name).mkdir(parents=True, exist_ok=True)
+        except OSError as error:
             raise ConfigError(
-                f"--out {self.path}: holds a run of another configuration (see {held}); "
-                "give another folder or delete this one"
-            )
+                f"--out {self.path}: cannot be made a folder ({error.strerror})"
+            ) from None
         if (self.path / "metrics.json").exists():
             for result in (self.path / "targets").glob("*.json"):
                 result.unlink()
