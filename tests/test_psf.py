@@ -292,7 +292,7 @@ def test_changing_a_value_compiles_nothing():
         ({"wavelength": INF}, "wavelength is infinite"),
         ({"object_distance": 0.0}, "object_distance = 0.0 mm is not positive"),
         ({"object_distance": float("nan")}, "object_distance is NaN"),
-        ({"oversampling": 3}, "'separable' is a closed form: leave oversampling out"),
+        ({"oversampling": 3}, "'separable' is a closed form: leave oversampling"),
         ({"oversampling": 4, "model": "angular_spectrum"}, "oversampling = 4: give an odd number"),
         ({"oversampling": 0, "model": "angular_spectrum"}, "oversampling = 0: give an odd number"),
         ({"oversampling": -1, "model": "rayleigh_sommerfeld"}, "oversampling = -1: give an odd"),
