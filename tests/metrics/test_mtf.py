@@ -329,3 +329,13 @@ def test_rows_belong_to_the_response():
     (strip,) = responses(1e6, (CONVENTIONAL_5,), **{"sensor.shape": "[64, 1024]"})
     key = "first_zero_cycles_per_mm"
     assert abs(whole.metrics[key] - strip.metrics[key]) > 0.2
+
+
+def test_both_cut_offs_of_an_object_at_350_mm():
+    """Far enough for the sensor to pass most of the magnified shadow, near enough for it to cut the
+    tail of the aperture's edge: method A ends at βR/π and method B above 42 in one set-up.
+    """
+    method_a, method_b = responses(350, (METHOD_A, METHOD_B))
+    print(f"object at 350 mm: {method_a.metrics}, {method_b.metrics}")
+    assert method_a.metrics["cut_off_cycles_per_mm"] == pytest.approx(22.4, abs=1.0)
+    assert method_b.metrics["cut_off_cycles_per_mm"] >= 42
