@@ -71,3 +71,16 @@ def same_parity(shape, sensor_shape) -> tuple[int, int]:
     shape = _checks.shape2d("field_shape", shape)
     rows, columns = (n + (n - s) % 2 for n, s in zip(shape, sensor_shape, strict=True))
     return rows, columns
+
+
+def cell_overlap(
+    x: Float[Array, " n"],
+    pitch: Float[Array, ""],
+    lower: Float[Array, " cell"],
+    upper: Float[Array, " cell"],
+) -> Float[Array, "n cell"]:
+    """Length of each [x − pitch/2, x + pitch/2] that lies in each [lower, upper]."""
+    x = x[:, None]
+    above = jnp.minimum(x + pitch / 2, upper)
+    below = jnp.maximum(x - pitch / 2, lower)
+    return jnp.maximum(above - below, 0.0)

@@ -107,15 +107,14 @@ def otf(
     return _otf(camera.mask, grid, path, model, pixel_integration, shape, oversampling)
 
 
-def irradiance(
+def _irradiance(
     mask: AbstractMask,
     grid: Grid,
     path: Path,
     model: Model,
-    *,
-    pixel_integration: bool = False,
-    mask_shape: tuple[int, int] | None = None,
-    oversampling: int = 1,
+    pixel_integration: bool,
+    mask_shape: tuple[int, int] | None,
+    oversampling: int,
 ) -> SeparableSum | ChirpSum | Float[Array, "y x"]:
     """The PSF in the form in which the model has it: terms where there are terms, else an image."""
     if model == "geometric":
@@ -142,15 +141,7 @@ _STATIC = ("model", "pixel_integration", "mask_shape", "oversampling")
 
 @jax.jit(static_argnames=_STATIC)
 def _psf(mask, grid, path, model, pixel_integration, mask_shape, oversampling):
-    h = irradiance(
-        mask,
-        grid,
-        path,
-        model,
-        pixel_integration=pixel_integration,
-        mask_shape=mask_shape,
-        oversampling=oversampling,
-    )
+    h = _irradiance(mask, grid, path, model, pixel_integration, mask_shape, oversampling)
     if isinstance(h, ChirpSum):
         h = h.sample(grid, pixel_integration=pixel_integration)
     return h.image() if isinstance(h, SeparableSum) else h
@@ -158,15 +149,7 @@ def _psf(mask, grid, path, model, pixel_integration, mask_shape, oversampling):
 
 @jax.jit(static_argnames=_STATIC)
 def _otf(mask, grid, path, model, pixel_integration, mask_shape, oversampling):
-    h = irradiance(
-        mask,
-        grid,
-        path,
-        model,
-        pixel_integration=pixel_integration,
-        mask_shape=mask_shape,
-        oversampling=oversampling,
-    )
+    h = _irradiance(mask, grid, path, model, pixel_integration, mask_shape, oversampling)
     if isinstance(h, ChirpSum):
         return h.transform(grid)
     if isinstance(h, SeparableSum):

@@ -32,18 +32,11 @@ def fringe_scanned_otf(
     Arguments and errors as for `otf`; TypeError for masks that have no phase.
     """
 
-    def at(turns: float):
-        return otf(
-            _with_phase(camera, turns),
-            wavelength=wavelength,
-            object_distance=object_distance,
-            model=model,
-            pixel_integration=pixel_integration,
-            grid=grid,
-        )
-
-    quadrature = at(0.0) - at(0.5)
-    return (at(0.75) - at(0.25)) + jnp.asarray(1j, dtype=quadrature.dtype) * quadrature
+    h = _otfs(
+        camera, (0.0, 0.25, 0.5, 0.75), wavelength, object_distance, model, pixel_integration, grid
+    )
+    quadrature = h[0] - h[2]
+    return (h[3] - h[1]) + jnp.asarray(1j, dtype=quadrature.dtype) * quadrature
 
 
 def phase_pair_otf(
@@ -64,7 +57,23 @@ def phase_pair_otf(
     (thesis Eq 3.49, corrected): the constant cancels, the second harmonic stays. Arguments and
     errors as for `fringe_scanned_otf`.
     """
-    first, second = (
+    first, second = _otfs(
+        camera, (0.0, 0.75), wavelength, object_distance, model, pixel_integration, grid
+    )
+    return first - second
+
+
+def _otfs(
+    camera: LenslessCamera,
+    phases: tuple[float, ...],
+    wavelength,
+    object_distance,
+    model: Model,
+    pixel_integration: bool,
+    grid: Grid | None,
+) -> list[Complex[Array, "v u"]]:
+    """The camera's OTF at several phases of its mask, in turns."""
+    return [
         otf(
             _with_phase(camera, turns),
             wavelength=wavelength,
@@ -73,9 +82,8 @@ def phase_pair_otf(
             pixel_integration=pixel_integration,
             grid=grid,
         )
-        for turns in (0.0, 0.75)
-    )
-    return first - second
+        for turns in phases
+    ]
 
 
 def _with_phase(camera: LenslessCamera, turns: float) -> LenslessCamera:

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from thincam_jax import _checks
-from thincam_jax.grids import Grid
+from thincam_jax.grids import Grid, cell_overlap
 
 
 class ImagePlane(eqx.Module):
@@ -62,9 +62,7 @@ class ImagePlane(eqx.Module):
 def _cell_average(x, pitch, count: int, width) -> Float[Array, "n count"]:
     """Weights of `count` pixels that span `width` in the averages over cells of `pitch` at x."""
     edges = (jnp.arange(count + 1, dtype=x.dtype) / count - 0.5) * width
-    upper = jnp.minimum(x[:, None] + pitch / 2, edges[1:])
-    lower = jnp.maximum(x[:, None] - pitch / 2, edges[:-1])
-    return jnp.maximum(upper - lower, 0.0) / pitch
+    return cell_overlap(x, pitch, edges[:-1], edges[1:]) / pitch
 
 
 class Spectrum(eqx.Module):

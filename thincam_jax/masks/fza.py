@@ -9,7 +9,7 @@ from jaxtyping import Array, Complex, Float
 
 from thincam_jax import _checks
 from thincam_jax._phase import as_complex, phasor
-from thincam_jax.grids import Grid, centred_indices
+from thincam_jax.grids import Grid, cell_overlap, centred_indices
 from thincam_jax.masks.base import AbstractMask, ZoneOrders
 
 _HIGHEST_HARMONIC = 99
@@ -114,18 +114,10 @@ def _series(profile: str, harmonics: int) -> tuple[tuple[int, ...], tuple[float,
 def _axis_samples(zones: ZoneOrders, x: Float[Array, " n"], pitch) -> Complex[Array, "order n"]:
     """Each order's one-dimensional factor, weighted by the open part of every sample's cell."""
     k = jnp.asarray(zones.orders, dtype=x.dtype)[:, None]
-    open_part = _overlap(x, pitch, zones.lower, zones.upper) / pitch
+    open_part = cell_overlap(x, pitch, zones.lower, zones.upper) / pitch
     if zones.sites is None:
         return phasor(k * zones.beta * x**2) * as_complex(open_part[:, 0])
     return phasor(k * zones.beta * zones.sites**2) @ as_complex(open_part.T)
-
-
-def _overlap(x, pitch, lower, upper) -> Float[Array, "n cell"]:
-    """Length of [x − pitch/2, x + pitch/2] that lies in [lower, upper]."""
-    x = x[:, None]
-    above = jnp.minimum(x + pitch / 2, upper)
-    below = jnp.maximum(x - pitch / 2, lower)
-    return jnp.maximum(above - below, 0.0)
 
 
 def _whole_pixels(width, pixel_pitch) -> int:

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
 
 from thincam_jax import _checks
-from thincam_jax.grids import Grid, centred_indices
+from thincam_jax.grids import Grid, cell_overlap, centred_indices
 from thincam_jax.masks.base import AbstractMask
 
 
@@ -49,6 +49,4 @@ class SampledMask(AbstractMask):
 def _coverage(x, pitch, cells: int, cell_pitch) -> Float[Array, "n cell"]:
     """Part of each sample's cell that each mask cell covers."""
     centres = centred_indices(cells, x.dtype) * cell_pitch
-    upper = jnp.minimum(x[:, None] + pitch / 2, centres + cell_pitch / 2)
-    lower = jnp.maximum(x[:, None] - pitch / 2, centres - cell_pitch / 2)
-    return jnp.maximum(upper - lower, 0.0) / pitch
+    return cell_overlap(x, pitch, centres - cell_pitch / 2, centres + cell_pitch / 2) / pitch
