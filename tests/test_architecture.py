@@ -18,12 +18,25 @@ PACKAGE = "thincam_jax"
 # A module imports only from the modules to its left, or from its own package. `waveguide` stands
 # where it may use everything up to the capture. A new module goes where its imports allow.
 ORDER = (
-    *("units", "_checks", "_memory", "_phase", "grids", "chirp", "targets", "scene", "masks"),
+    *(
+        "units",
+        "_checks",
+        "_memory",
+        "_phase",
+        "_precision",
+        "grids",
+        "chirp",
+        "targets",
+        "scene",
+        "masks",
+    ),
     *(
         "sensor",
         "propagation",
         "camera",
+        "cost",
         "psf",
+        "selection",
         "responses",
         "operators",
         "capture",

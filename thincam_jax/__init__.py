@@ -16,6 +16,9 @@ from thincam_jax.responses import phase_pair_otf as phase_pair_otf
 from thincam_jax.scene import ImagePlane as ImagePlane
 from thincam_jax.scene import Scene as Scene
 from thincam_jax.scene import Spectrum as Spectrum
+from thincam_jax.selection import Selection as Selection
+from thincam_jax.selection import predict_error as predict_error
+from thincam_jax.selection import select_model as select_model
 from thincam_jax.sensor import GaussianNoise as GaussianNoise
 from thincam_jax.sensor import PoissonGaussianNoise as PoissonGaussianNoise
 from thincam_jax.sensor import Sensor as Sensor

@@ -12,18 +12,19 @@ from jaxtyping import Array, Complex, Float
 from thincam_jax import _checks
 from thincam_jax._memory import refuse_if_too_large
 from thincam_jax._phase import as_complex
+from thincam_jax._precision import PRECISIONS, Precision, allow, cast, precision_of
 from thincam_jax.camera import LenslessCamera
-from thincam_jax.chirp import SLOW_NODES
+from thincam_jax.cost import psf_cost
 from thincam_jax.grids import Grid
 from thincam_jax.masks.base import AbstractMask
-from thincam_jax.propagation.angular_spectrum import angular_spectrum, padded_shape, require_odd
+from thincam_jax.propagation.angular_spectrum import angular_spectrum, require_odd
 from thincam_jax.propagation.chirps import ChirpSum
 from thincam_jax.propagation.closed_form import closed_form, focus_distance
 from thincam_jax.propagation.geometric import geometric
 from thincam_jax.propagation.paraxial import paraxial
 from thincam_jax.propagation.path import Path
 from thincam_jax.propagation.rayleigh_sommerfeld import rayleigh_sommerfeld
-from thincam_jax.propagation.separable import PIXEL_NODES, separable
+from thincam_jax.propagation.separable import separable
 from thincam_jax.propagation.separable_sum import SeparableSum, centre_phase
 
 Model = Literal[
@@ -49,6 +50,7 @@ def psf(
     grid: Grid | None = None,
     oversampling: int | None = None,
     mask_shape: tuple[int, int] | None = None,
+    precision: Precision | None = None,
 ) -> Float[Array, "y x"]:
     """Point spread function on the sensor: irradiance relative to the open aperture.
 
@@ -65,6 +67,8 @@ def psf(
     - `mask_shape`: pixels of the plane on which the sampled models hold the mask; by default the
       smallest that does. Inside jit and grad, where the mask's size is not known, it is the
       sensor's: give it there if the mask is wider than the sensor.
+    - `precision`: "float32" or "float64", in which to compute; the result comes back in the
+      camera's own, which is also the default. Double precision needs no setting of JAX's.
 
     **Returns** (y, x), dimensionless. Differentiable in every number of `camera` and in
     `wavelength` and `object_distance`.
@@ -74,11 +78,8 @@ def psf(
     does not fit.
     """
     path, grid = _prepare(camera, wavelength, object_distance, model, grid)
-    shape, oversampling = _sampling(
-        camera, grid, model, pixel_integration, oversampling, mask_shape
-    )
-    _check_memory(camera.mask, grid, model, shape, oversampling)
-    return _psf(camera.mask, grid, path, model, pixel_integration, shape, oversampling)
+    sampling = sampling_of(camera, grid, model, pixel_integration, oversampling, mask_shape)
+    return _evaluate(_psf, camera.mask, grid, path, model, pixel_integration, sampling, precision)
 
 
 def otf(
@@ -91,6 +92,7 @@ def otf(
     grid: Grid | None = None,
     oversampling: int | None = None,
     mask_shape: tuple[int, int] | None = None,
+    precision: Precision | None = None,
 ) -> Complex[Array, "v u"]:
     """Optical transfer function H(u,v) = ∬ h e^{−2πj(ux+vy)} dx dy, zero frequency at n//2, mm².
 
@@ -100,11 +102,8 @@ def otf(
     frequency cell.
     """
     path, grid = _prepare(camera, wavelength, object_distance, model, grid)
-    shape, oversampling = _sampling(
-        camera, grid, model, pixel_integration, oversampling, mask_shape
-    )
-    _check_memory(camera.mask, grid, model, shape, oversampling)
-    return _otf(camera.mask, grid, path, model, pixel_integration, shape, oversampling)
+    sampling = sampling_of(camera, grid, model, pixel_integration, oversampling, mask_shape)
+    return _evaluate(_otf, camera.mask, grid, path, model, pixel_integration, sampling, precision)
 
 
 def _irradiance(
@@ -164,7 +163,20 @@ def _prepare(camera, wavelength, object_distance, model, grid) -> tuple[Path, Gr
     return camera.path(wavelength, object_distance), grid or camera.sensor.grid
 
 
-def _sampling(camera, grid, model, pixel_integration, oversampling, mask_shape):
+def _evaluate(function, mask, grid, path, model, pixel_integration, sampling, precision):
+    """In the precision asked for; the result comes back in the camera's."""
+    own = precision_of(grid.pitch)
+    precision = own if precision is None else precision
+    _checks.choice("precision", precision, PRECISIONS)
+    with allow(precision, mask, grid, path):
+        if precision != own:
+            mask, grid, path = cast((mask, grid, path), precision)
+        _check_memory(mask, grid, model, pixel_integration, *sampling)
+        result = function(mask, grid, path, model, pixel_integration, *sampling)
+    return result if precision == own else cast(result, own)
+
+
+def sampling_of(camera, grid, model, pixel_integration, oversampling, mask_shape):
     """Mask plane in pixels and samples per pixel, for the models that sample."""
     if model not in _SAMPLED:
         if oversampling is not None or mask_shape is not None:
@@ -186,30 +198,20 @@ def _sampling(camera, grid, model, pixel_integration, oversampling, mask_shape):
     return (rows, columns), oversampling
 
 
-def _check_memory(
-    mask: AbstractMask, grid: Grid, model: Model, mask_shape, oversampling: int
-) -> None:
-    size = 2 * jnp.dtype(grid.pitch.dtype).itemsize  # a complex sample
+def _check_memory(mask, grid: Grid, model: Model, pixel_integration, mask_shape, oversampling):
     rows, columns = grid.shape
-    # Images that live at once, counted in complex samples; 64 is the direct sum's batch.
-    needed = rows * columns * size
-    plane = mask_shape or grid.shape
-    if model == "separable":
-        # Every display pixel is a chirp integral at every coordinate and pixel node.
-        cells = getattr(mask, "pixels", None) or 1
-        needed += 3 * SLOW_NODES * PIXEL_NODES * cells * max(rows, columns) * size
-    if model == "angular_spectrum":
-        window = padded_shape(
-            (plane[0] * oversampling, plane[1] * oversampling),
-            (rows * oversampling, columns * oversampling),
-            2.0,
-        )
-        needed += 4 * window[0] * window[1] * size
-    elif model == "rayleigh_sommerfeld":
-        needed += 3 * 64 * plane[0] * plane[1] * oversampling**2 * size
+    cost = psf_cost(
+        mask,
+        grid,
+        model,
+        pixel_integration=pixel_integration,
+        mask_shape=mask_shape,
+        oversampling=oversampling,
+        itemsize=jnp.dtype(grid.pitch.dtype).itemsize,
+    )
     refuse_if_too_large(
         f"a PSF of {rows}×{columns} pixels by model {model!r}",
-        needed,
+        cost.bytes,
         "use a smaller grid"
         + ("" if model == "separable" else ", less oversampling or the model 'separable'"),
     )

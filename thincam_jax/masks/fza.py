@@ -82,6 +82,11 @@ class FresnelZoneAperture(AbstractMask):
     def extent(self) -> tuple[Float[Array, ""], Float[Array, ""]]:
         return self.width, self.width
 
+    @property
+    def orders(self) -> tuple[int, ...]:
+        """The diffraction orders k of the profile, without their weights."""
+        return _series(self.profile, self.harmonics)[0]
+
     def zone_orders(self) -> ZoneOrders:
         """The mask as separable chirps: what the closed-form models work with."""
         orders, weights = _series(self.profile, self.harmonics)
@@ -98,8 +103,8 @@ class FresnelZoneAperture(AbstractMask):
 
     def sample(self, grid: Grid) -> Float[Array, "y x"]:
         zones = self.zone_orders()
-        rows = _axis_samples(zones, grid.y - self.centre[0], grid.pitch)
-        columns = _axis_samples(zones, grid.x - self.centre[1], grid.pitch)
+        rows = axis_samples(zones, grid.y - self.centre[0], grid.pitch)
+        columns = axis_samples(zones, grid.x - self.centre[1], grid.pitch)
         return jnp.real((zones.coefficients[:, None] * rows).T @ columns)
 
 
@@ -111,7 +116,7 @@ def _series(profile: str, harmonics: int) -> tuple[tuple[int, ...], tuple[float,
     return (0, *odd), (0.5, *(float(np.sin(k * np.pi / 2) / (k * np.pi)) for k in odd))
 
 
-def _axis_samples(zones: ZoneOrders, x: Float[Array, " n"], pitch) -> Complex[Array, "order n"]:
+def axis_samples(zones: ZoneOrders, x: Float[Array, " n"], pitch) -> Complex[Array, "order n"]:
     """Each order's one-dimensional factor, weighted by the open part of every sample's cell."""
     k = jnp.asarray(zones.orders, dtype=x.dtype)[:, None]
     open_part = cell_overlap(x, pitch, zones.lower, zones.upper) / pitch

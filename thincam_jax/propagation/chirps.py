@@ -3,7 +3,8 @@ r"""Sums of unbounded chirps, exactly: the PSFs and OTFs of masks without an edg
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Complex, Float
+import numpy as np
+from jaxtyping import Array, Bool, Complex, Float
 
 from thincam_jax._phase import as_complex, phasor, turn_phasor
 from thincam_jax.chirp import chirp_integral
@@ -64,6 +65,20 @@ def axis_averages(curvatures, x: Float[Array, " n"], pitch) -> Complex[Array, "t
     zero = jnp.zeros_like(x)
     lower, upper = x - pitch / 2, x + pitch / 2
     return chirp_integral(curvatures[:, None], zero, zero, lower, upper) * as_complex(1 / pitch)
+
+
+def gather_constants(
+    constant: Bool[np.ndarray, " pair"],
+    weights: Complex[Array, " pair"],
+    curvatures: Float[Array, " pair"],
+) -> tuple[Complex[Array, " term"], Float[Array, " term"]]:
+    """One term for all pairs of an order with itself, which have no fringes."""
+    total = jnp.sum(weights[constant], keepdims=True)
+    none = jnp.zeros(1, curvatures.dtype)
+    return (
+        jnp.concatenate([total, weights[~constant]]),
+        jnp.concatenate([none, curvatures[~constant]]),
+    )
 
 
 def require_continuous(zones: ZoneOrders, model: str) -> ZoneOrders:

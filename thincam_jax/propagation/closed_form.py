@@ -4,7 +4,7 @@ import jax.numpy as jnp
 
 from thincam_jax._phase import as_complex
 from thincam_jax.masks.base import AbstractMask
-from thincam_jax.propagation.chirps import ChirpSum, require_continuous
+from thincam_jax.propagation.chirps import ChirpSum, gather_constants, require_continuous
 from thincam_jax.propagation.orders import pairs, require_zone_orders
 from thincam_jax.propagation.path import Path
 
@@ -33,6 +33,7 @@ def closed_form(mask: AbstractMask, path: Path) -> ChirpSum:
     curvatures = zones.beta * (k[first] - k[second]) * gain[first] * gain[second]
     scale = path.magnification
     amplitudes = weights * as_complex(gain[first] * gain[second])
+    amplitudes, curvatures = gather_constants(first == second, amplitudes, curvatures)
     return ChirpSum(amplitudes, curvatures / scale**2, scale * mask.centre)
 
 

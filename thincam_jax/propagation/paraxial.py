@@ -3,7 +3,7 @@ r"""`paraxial`: the thesis' approximation for weak diffraction, ε = λβd/π �
 import jax.numpy as jnp
 
 from thincam_jax.masks.base import AbstractMask
-from thincam_jax.propagation.chirps import ChirpSum, require_continuous
+from thincam_jax.propagation.chirps import ChirpSum, gather_constants, require_continuous
 from thincam_jax.propagation.orders import pairs, require_zone_orders
 from thincam_jax.propagation.path import Path
 
@@ -32,6 +32,7 @@ def paraxial(mask: AbstractMask, path: Path) -> ChirpSum:
     first, second, weights = pairs(zones)
     difference, total = k[first] - k[second], k[first] + k[second]
     curvatures = zones.beta * difference * (1 - total * epsilon)
+    weights, curvatures = gather_constants(first == second, weights, curvatures)
     scale = path.magnification
     return ChirpSum(weights, curvatures / scale**2, scale * mask.centre)
 

@@ -11,14 +11,18 @@ from thincam_jax.propagation.path import Path
 
 def lit_mask(mask: AbstractMask, plane: Grid, path: Path) -> Complex[Array, "y x"]:
     """Field just behind the mask under the exact spherical wave, 1 on the axis, piston dropped."""
+    lit = spherical_wave(plane, path)
+    return lit * mask.sample(plane).astype(lit.dtype)
+
+
+def spherical_wave(plane: Grid, path: Path) -> Complex[Array, "y x"]:
+    """The wave of the point at t in the mask's plane, 1 on the axis, piston dropped."""
     rho2 = plane.y[:, None] ** 2 + plane.x**2
     nearness = 1 / path.object_distance  # zero for a plane wave
     stretch = jnp.sqrt(1 + rho2 * nearness**2)
     # sqrt(t² + ρ²) − t without cancellation.
     detour = rho2 * nearness / (1 + stretch)
-    lit = turn_phasor(detour / path.wavelength) * as_complex(1 / stretch)
-    transmittance = mask.sample(plane)
-    return lit * transmittance.astype(lit.dtype)
+    return turn_phasor(detour / path.wavelength) * as_complex(1 / stretch)
 
 
 def block_average(image: Float[Array, "y x"], factor: int) -> Float[Array, "v u"]:

@@ -1,0 +1,52 @@
+"""Evaluating in another precision than the one the numbers are kept in."""
+
+import contextlib
+from collections.abc import Iterator
+from typing import Any, Literal, get_args
+
+import jax
+import jax.numpy as jnp
+
+from thincam_jax import _checks
+
+Precision = Literal["float32", "float64"]
+PRECISIONS: tuple[Precision, ...] = get_args(Precision)
+
+
+def precision_of(array: Any) -> Precision:
+    """The precision of a floating array."""
+    return "float64" if array.dtype == jnp.float64 else "float32"
+
+
+@contextlib.contextmanager
+def allow(precision: Precision, *numbers: Any) -> Iterator[None]:
+    """Makes float64 available inside, also where JAX is set to float32 only.
+
+    JAX cannot change that setting while it traces `numbers`: ValueError.
+    """
+    if precision == "float32" or jax.config.read("jax_enable_x64"):
+        yield
+        return
+    if any(_checks.is_traced(leaf) for leaf in jax.tree.leaves(numbers)):
+        raise ValueError(
+            "precision 'float64' inside jit or grad needs double precision switched on: call "
+            "jax.config.update('jax_enable_x64', True) at the start of the program"
+        )
+    with jax.enable_x64(True):
+        yield
+
+
+def cast(tree: Any, precision: Precision) -> Any:
+    """The pytree with all its floating arrays, and plain floats, in one precision."""
+    wanted = jnp.dtype(precision)
+
+    def convert(leaf):
+        if isinstance(leaf, bool | int | str) or leaf is None:
+            return leaf
+        if isinstance(leaf, float):
+            return jnp.asarray(leaf, wanted)
+        if jnp.issubdtype(leaf.dtype, jnp.complexfloating):
+            return leaf.astype(jnp.complex128 if precision == "float64" else jnp.complex64)
+        return leaf.astype(wanted) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf
+
+    return jax.tree.map(convert, tree)
