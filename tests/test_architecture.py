@@ -39,6 +39,8 @@ ORDER = (
         "selection",
         "responses",
         "operators",
+        "imaging",
+        "planning",
         "capture",
         "waveguide",
         "reconstruct",

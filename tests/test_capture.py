@@ -8,7 +8,7 @@ import pytest
 
 import thincam_jax as tc
 from helpers import finite_difference, relative_l2
-from thincam_jax.capture import imaging_operator, projected_shape
+from thincam_jax.imaging import imaging_operator, projected_shape
 from thincam_jax.operators import kernel_grid
 from thincam_jax.units import nm, um
 

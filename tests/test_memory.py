@@ -35,5 +35,5 @@ def test_free_memory_of_this_machine():
         (2**70, "1048576.0 PiB"),
     ],
 )
-def test_readable(count, text):
-    assert _memory._readable(count) == text
+def testreadable(count, text):
+    assert _memory.readable(count) == text

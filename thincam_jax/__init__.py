@@ -5,6 +5,8 @@ from thincam_jax.capture import capture as capture
 from thincam_jax.grids import Grid as Grid
 from thincam_jax.masks.fza import FresnelZoneAperture as FresnelZoneAperture
 from thincam_jax.masks.sampled import SampledMask as SampledMask
+from thincam_jax.planning import Plan as Plan
+from thincam_jax.planning import plan as plan
 from thincam_jax.psf import MODELS as MODELS
 from thincam_jax.psf import otf as otf
 from thincam_jax.psf import psf as psf

@@ -24,11 +24,11 @@ def refuse_if_too_large(what: str, needed: int, advice: str) -> None:
     available = available_bytes()
     if available is not None and needed > available:
         raise MemoryError(
-            f"{what} needs about {_readable(needed)}, {_readable(available)} are free; {advice}"
+            f"{what} needs about {readable(needed)}, {readable(available)} are free; {advice}"
         )
 
 
-def _readable(count: int) -> str:
+def readable(count: int) -> str:
     value = float(count)
     for unit in ("bytes", "KiB", "MiB", "GiB", "TiB", "PiB"):
         if value < 1024 or unit == "PiB":

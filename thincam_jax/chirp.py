@@ -63,8 +63,23 @@ def chirp_integral(
 
     **Returns** the complex integral, mm. Differentiable in every argument.
     """
-    g, b, x, lower, upper = jnp.broadcast_arrays(g, b, x, lower, upper)
-    middle, half = 0.5 * (lower + upper), 0.5 * (upper - lower)
+    return _integral(g, b, x, 0.5 * (lower + upper), 0.5 * (upper - lower), lower, upper)
+
+
+def chirp_average(
+    g: Float[Array, "..."], middle: Float[Array, "..."], half: Float[Array, "..."]
+) -> Complex[Array, "..."]:
+    r"""Integral of :math:`e^{jg\xi^2}` over ``middle`` ± ``half``, in mm.
+
+    As `chirp_integral` without propagation, for intervals that are short against their distance
+    from the axis, such as pixels: their width is not formed as a difference of their ends.
+    """
+    none = jnp.zeros_like(middle)
+    return _integral(g, none, none, middle, half, middle - half, middle + half)
+
+
+def _integral(g, b, x, middle, half, lower, upper) -> Complex[Array, "..."]:
+    g, b, x, middle, half, lower, upper = jnp.broadcast_arrays(g, b, x, middle, half, lower, upper)
     slope = g * middle + b * (middle - x)
     slow = jnp.abs(g + b) * half**2 + 2 * jnp.abs(slope * half) < _SLOW_PHASE
     edges = _by_edges(g, b, x, lower, upper, slow)

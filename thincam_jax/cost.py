@@ -77,7 +77,7 @@ def _separable_sum(mask, shape, model, pixel_integration, itemsize) -> tuple[flo
         held = rows * (height + 2 * width + 2 * columns) + columns * width
         return 4.0 * products, float(held)
     double = itemsize == 8
-    length, longest = sum(shape), max(shape)
+    length = sum(shape)
     cells = getattr(mask, "pixels", None) or 1
     count = len(orders)
     pairs = count * (count + 1) // 2
@@ -85,16 +85,13 @@ def _separable_sum(mask, shape, model, pixel_integration, itemsize) -> tuple[flo
         nodes = PIXEL_NODES if pixel_integration else 1
         integrals = length * nodes * (count if cells == 1 else cells)
         flops = _CHIRP * integrals + 4 * count * cells * length * nodes * (cells > 1)
-        per_integral = (12.2, 5.6) if double else (7.7, 1.6)
-        share = nodes * (count if cells == 1 else cells)
-        held = share * (per_integral[0] * longest + per_integral[1] * (length - longest))
-        held = max(held, 2.2 * pairs * length)
+        held = max((12.2 if double else 7.4) * integrals, 5.2 * pairs * length)
         terms = pairs
     else:
         terms = pairs - count + 1 if model != "geometric" else _harmonics(orders)
         work = _CHIRP if pixel_integration else _PHASOR
-        flops = work * terms * length * (cells if cells > 1 else 1)
-        per_factor = (10.0 if double else 5.0) if pixel_integration else 2.1
+        flops = work * terms * length * cells
+        per_factor = (9.2 if double else 4.6) if pixel_integration else 2.1
         held = per_factor * terms * length + (2.5 * cells * length if cells > 1 else 0)
     return float(flops + 4 * terms * math.prod(shape)), float(held)
 

@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from thincam_jax import _checks
+from thincam_jax._precision import product
 from thincam_jax.grids import Grid, cell_overlap
 
 
@@ -56,7 +57,7 @@ class ImagePlane(eqx.Module):
         across = _cell_average(grid.x, grid.pitch, columns, self.width * scale)
         image = self.image.astype(down.dtype)
         turned = jnp.where(jnp.asarray(magnification) < 0, image[..., ::-1, ::-1], image)
-        return down @ turned @ across.T
+        return product(product(down, turned), across.T)
 
 
 def _cell_average(x, pitch, count: int, width) -> Float[Array, "n count"]:

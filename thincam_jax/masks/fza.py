@@ -9,6 +9,7 @@ from jaxtyping import Array, Complex, Float
 
 from thincam_jax import _checks
 from thincam_jax._phase import as_complex, phasor
+from thincam_jax._precision import product
 from thincam_jax.grids import Grid, cell_overlap, centred_indices
 from thincam_jax.masks.base import AbstractMask, ZoneOrders
 
@@ -105,7 +106,7 @@ class FresnelZoneAperture(AbstractMask):
         zones = self.zone_orders()
         rows = axis_samples(zones, grid.y - self.centre[0], grid.pitch)
         columns = axis_samples(zones, grid.x - self.centre[1], grid.pitch)
-        return jnp.real((zones.coefficients[:, None] * rows).T @ columns)
+        return jnp.real(product((zones.coefficients[:, None] * rows).T, columns))
 
 
 def _series(profile: str, harmonics: int) -> tuple[tuple[int, ...], tuple[float, ...]]:
@@ -122,7 +123,7 @@ def axis_samples(zones: ZoneOrders, x: Float[Array, " n"], pitch) -> Complex[Arr
     open_part = cell_overlap(x, pitch, zones.lower, zones.upper) / pitch
     if zones.sites is None:
         return phasor(k * zones.beta * x**2) * as_complex(open_part[:, 0])
-    return phasor(k * zones.beta * zones.sites**2) @ as_complex(open_part.T)
+    return product(phasor(k * zones.beta * zones.sites**2), as_complex(open_part.T))
 
 
 def _whole_pixels(width, pixel_pitch) -> int:

@@ -4,6 +4,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
 
 from thincam_jax import _checks
+from thincam_jax._precision import product
 from thincam_jax.grids import Grid, cell_overlap, centred_indices
 from thincam_jax.masks.base import AbstractMask
 
@@ -43,7 +44,7 @@ class SampledMask(AbstractMask):
         dtype = self.amplitude.dtype
         down = _coverage(grid.y - self.centre[0], grid.pitch, rows, self.pitch).astype(dtype)
         across = _coverage(grid.x - self.centre[1], grid.pitch, columns, self.pitch).astype(dtype)
-        return down @ self.amplitude @ across.T
+        return product(product(down, self.amplitude), across.T)
 
 
 def _coverage(x, pitch, cells: int, cell_pitch) -> Float[Array, "n cell"]:

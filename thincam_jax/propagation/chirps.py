@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
 
 from thincam_jax._phase import as_complex, phasor, turn_phasor
-from thincam_jax.chirp import chirp_integral
+from thincam_jax.chirp import chirp_average
 from thincam_jax.grids import Grid
 from thincam_jax.masks.base import ZoneOrders
 from thincam_jax.propagation.separable_sum import SeparableSum
@@ -28,8 +28,10 @@ class ChirpSum(eqx.Module):
     def sample(self, grid: Grid, *, pixel_integration: bool) -> SeparableSum:
         """On a grid: at the pixel centres, or averaged over the pixels (Fresnel integrals)."""
         factor = axis_averages if pixel_integration else axis_values
-        rows = factor(self.curvatures, grid.y - self.centre[0], grid.pitch)
-        columns = factor(self.curvatures, grid.x - self.centre[1], grid.pitch)
+        # Both axes at once: half as much to compile.
+        points = jnp.concatenate([grid.y - self.centre[0], grid.x - self.centre[1]])
+        both = factor(self.curvatures, points, grid.pitch)
+        rows, columns = jnp.split(both, [grid.shape[0]], axis=-1)
         return SeparableSum(self.weights[:, None] * rows, columns, grid)
 
     def transform(self, grid: Grid) -> Complex[Array, "v u"]:
@@ -62,9 +64,7 @@ def axis_values(curvatures, x: Float[Array, " n"], pitch=None) -> Complex[Array,
 
 def axis_averages(curvatures, x: Float[Array, " n"], pitch) -> Complex[Array, "term n"]:
     """e^{jγx²} averaged over [x − pitch/2, x + pitch/2], exactly."""
-    zero = jnp.zeros_like(x)
-    lower, upper = x - pitch / 2, x + pitch / 2
-    return chirp_integral(curvatures[:, None], zero, zero, lower, upper) * as_complex(1 / pitch)
+    return chirp_average(curvatures[:, None], x, pitch / 2) * as_complex(1 / pitch)
 
 
 def gather_constants(

@@ -38,13 +38,8 @@ class Path(eqx.Module):
 
     @property
     def fresnel_curvature(self) -> Float[Array, ""]:
-        """b = π/(λd), rad/mm²."""
-        return jnp.pi / (self.wavelength * self.distance)
-
-    @property
-    def source_curvature(self) -> Float[Array, ""]:
-        """π/(λt), rad/mm²: the spherical wave's curvature at the mask."""
-        return jnp.pi / (self.wavelength * self.object_distance)
+        """b = πM/(λd), rad/mm²: of the plane wave over d/M that acts like the spherical one."""
+        return jnp.pi * self.magnification / self.wavelength / self.distance
 
     def epsilon(self, beta: Float[Array, ""]) -> Float[Array, ""]:
         """ε = βλd/(πM), the strength of diffraction; at ε = 1 order −1 focuses on the sensor."""

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
 
 from thincam_jax._phase import as_complex, turn_phasor
+from thincam_jax._precision import product
 from thincam_jax.grids import Grid
 
 
@@ -26,20 +27,19 @@ class SeparableSum(eqx.Module):
 
     def image(self) -> Float[Array, "y x"]:
         """The image on the grid."""
-        rows, columns = self._real_factors()
-        # Said, because an accelerator's default multiplies float32 with fewer digits.
-        return jnp.matmul(rows.T, columns, precision="highest")
+        rows, columns = self.real_factors()
+        return product(rows.T, columns)
 
     def transform(self) -> Complex[Array, "v u"]:
         """Fourier transform ∬ h e^{−2πj(ux+vy)} dx dy on the grid's centred frequencies, mm².
 
         The integral over the sampled area, as the sum of the samples times pitch².
         """
-        rows, columns = (_centred_dft(factor) for factor in self._real_factors())
-        product = jnp.matmul(rows.T, columns, precision="highest")
-        return product * as_complex(self.grid.pitch**2)
+        rows, columns = (_centred_dft(factor) for factor in self.real_factors())
+        return product(rows.T, columns) * as_complex(self.grid.pitch**2)
 
-    def _real_factors(self) -> tuple[Float[Array, "factor y"], Float[Array, "factor x"]]:
+    def real_factors(self) -> tuple[Float[Array, "factor y"], Float[Array, "factor x"]]:
+        """Real Y_f and X_f with h = Σ_f Y_f(y) X_f(x), twice as many as there are terms."""
         # Re{YX} = Re Y Re X − Im Y Im X: one real product in place of a complex one.
         rows = jnp.concatenate([self.rows.real, -self.rows.imag])
         return rows, jnp.concatenate([self.columns.real, self.columns.imag])

@@ -1,5 +1,6 @@
 """What each model gives on a few rows and columns, and how far that is from the best model."""
 
+import functools
 import math
 from typing import NamedTuple
 
@@ -12,19 +13,16 @@ from thincam_jax._precision import PRECISIONS, Precision, allow, cast
 from thincam_jax.grids import Grid
 from thincam_jax.masks.base import AbstractMask
 from thincam_jax.propagation.angular_spectrum import planes
-from thincam_jax.propagation.chirps import ChirpSum
-from thincam_jax.propagation.closed_form import closed_form, focus_distance
-from thincam_jax.propagation.geometric import geometric
+from thincam_jax.propagation.closed_form import focus_distance
 from thincam_jax.propagation.orders import pairs, require_zone_orders
-from thincam_jax.propagation.paraxial import paraxial
 from thincam_jax.propagation.path import Path
 from thincam_jax.propagation.plane import block_average, lit_mask
 from thincam_jax.propagation.rayleigh_sommerfeld import rayleigh_sommerfeld_field
-from thincam_jax.propagation.separable import separable
 from thincam_jax.propagation.separable_sum import SeparableSum
 from thincam_jax.selection.norms import Factors, distance, factors, norm, rounding_distance
 from thincam_jax.selection.points import Points, chosen
 from thincam_jax.selection.sampled import angular_spectrum_terms, fine_fields
+from thincam_jax.selection.terms import closed_terms
 
 # Samples of the line on which the exact phases are compared with Fresnel's.
 _FINE_SAMPLES = 2**16
@@ -77,18 +75,6 @@ def lines_of(mask: AbstractMask, grid: Grid, path: Path) -> Lines:
     return Lines(rows, columns, row_weights, column_weights)
 
 
-@jax.jit(static_argnames=("model", "pixel_integration"))
-def _terms(mask, points: Points, path: Path, model: str, pixel_integration: bool) -> SeparableSum:
-    if model == "geometric":
-        shadow = geometric(mask, points, path, pixel_integration=pixel_integration)
-        assert isinstance(shadow, SeparableSum)  # of a mask with zone orders
-        return shadow
-    if model == "separable":
-        return separable(mask, points, path, pixel_integration=pixel_integration)
-    unbounded: ChirpSum = (paraxial if model == "paraxial" else closed_form)(mask, path)
-    return unbounded.sample(points, pixel_integration=pixel_integration)
-
-
 @jax.jit(static_argnames=("shape", "pixel_integration", "mask_shape", "oversampling"))
 def _direct_sum(
     mask, points: Points, path: Path, *, shape, pixel_integration, mask_shape, oversampling
@@ -125,15 +111,20 @@ class ZoneProbe:
         with allow("float64", mask, grid, path):
             self.given = {p: cast((mask, grid.pitch, path), p) for p in PRECISIONS}
         self._cache: dict[tuple[str, Precision], Factors] = {}
-        # Where no light falls on the sensor, errors are counted as they are.
-        self.scale = norm(self.closed("separable", "float64")) or 1.0
+
+    @functools.cached_property
+    def scale(self) -> float:
+        """‖h‖₂ of the reference; where no light falls on the sensor, errors count as they are."""
+        return norm(self.closed("separable", "float64")) or 1.0
 
     def closed(self, model: str, precision: Precision) -> Factors:
         """Factors of one of the closed forms."""
         if (model, precision) not in self._cache:
             with allow(precision):
                 mask, pitch, path = self.given[precision]
-                terms = _terms(mask, self.lines.points(pitch), path, model, self.pixel_integration)
+                terms = closed_terms(
+                    mask, self.lines.points(pitch), path, model, self.pixel_integration
+                )
                 self._cache[model, precision] = self._factors(terms)
         return self._cache[model, precision]
 
@@ -179,7 +170,7 @@ class ZoneProbe:
         with allow("float64"):
             mask, pitch, path = self.given["float64"]
             points = Points(few[0], few[1], pitch)
-            exact = _terms(mask, points, path, "separable", self.pixel_integration).image()
+            exact = closed_terms(mask, points, path, "separable", self.pixel_integration).image()
             exact = np.asarray(exact)
         with allow(precision):
             mask, pitch, path = self.given[precision]
@@ -236,7 +227,7 @@ class ZoneProbe:
             half_mask = jnp.max(jnp.stack(mask.extent)) / 2 + jnp.max(jnp.abs(mask.centre))
             reach = jnp.maximum(half_sensor, half_mask * path.magnification)
             fields = [
-                np.asarray(fine_fields(mask, path, reach, samples=_FINE_SAMPLES, exact=exact))
+                np.asarray(fine_fields(mask, path, reach, jnp.asarray(exact), _FINE_SAMPLES))
                 for exact in (True, False)
             ]
             zones = require_zone_orders(mask, "separable")

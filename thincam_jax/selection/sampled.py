@@ -9,7 +9,7 @@ import functools
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Array, Bool, Complex, Float
 
 from thincam_jax._phase import as_complex, turn_phasor
 from thincam_jax.grids import Grid, centred_frequencies, centred_indices
@@ -66,9 +66,9 @@ def _by_transform(lit, pitch, path: Path, size: int, fine) -> Complex[Array, "or
     return window[:, position]
 
 
-@functools.partial(jax.jit, static_argnames=("samples", "exact"))
+@functools.partial(jax.jit, static_argnames="samples")
 def fine_fields(
-    mask: AbstractMask, path: Path, reach: Float[Array, ""], *, samples: int, exact: bool
+    mask: AbstractMask, path: Path, reach: Float[Array, ""], exact: Bool[Array, ""], samples: int
 ) -> Complex[Array, "order n"]:
     r"""Fields of the orders on a line, finely sampled, over ±`reach` about the axis.
 
@@ -80,14 +80,12 @@ def fine_fields(
     pitch = 4 * reach / samples  # as much again on both sides, so that nothing wraps round
     x = centred_indices(samples, pitch.dtype) * pitch
     values = axis_samples(zones, x, pitch)
-    if exact:
-        wave = spherical_wave(Grid((1, samples), pitch), path)[0]
-    else:
-        wave = turn_phasor(x**2 / (2 * path.wavelength * path.object_distance))
+    parabolic = turn_phasor(x**2 / (2 * path.wavelength * path.object_distance))
+    wave = jnp.where(exact, spherical_wave(Grid((1, samples), pitch), path)[0], parabolic)
     u = jnp.fft.ifftshift(centred_frequencies(samples, pitch))
     s = (path.wavelength * u) ** 2
     carried = s < 1
-    bent = 1 + jnp.sqrt(jnp.where(carried, 1 - s, 1.0)) if exact else jnp.full_like(s, 2.0)
+    bent = 1 + jnp.where(exact, jnp.sqrt(jnp.where(carried, 1 - s, 1.0)), 1.0)
     turns = -(path.distance / path.wavelength) * jnp.where(carried, s, 0.0) / bent
     transfer = jnp.where(carried, turn_phasor(turns), 0.0)
     fields = jnp.fft.ifft(jnp.fft.fft(values * wave, axis=-1) * transfer, axis=-1)

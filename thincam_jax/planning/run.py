@@ -1,0 +1,58 @@
+"""Carrying out a plan."""
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from thincam_jax._precision import allow, cast, precision_of
+from thincam_jax.camera import LenslessCamera
+from thincam_jax.imaging import check_memory, project, spectral_psf
+from thincam_jax.operators import CropConvolution, kernel_grid
+from thincam_jax.planning.plan import Plan
+from thincam_jax.scene import Scene
+
+
+def run_plan(plan: Plan, camera: LenslessCamera, scene: Scene) -> Float[Array, "*batch y x"]:
+    """The noise-free capture: planes mixed, convolved with the planned PSFs, and added up."""
+    _require_same_scene(plan, scene)
+    own = precision_of(camera.sensor.pitch)
+    images = [p.image.shape[:-2] for p in scene.planes]
+    check_memory(camera.sensor, plan.field_shape, images[0])
+    with allow(plan.precision, camera, scene):
+        camera, scene = cast((camera, scene), plan.precision)
+        fields = jnp.stack([project(camera, p, plan.field_shape) for p in scene.planes])
+        mixed = jnp.tensordot(jnp.asarray(plan.mixing, fields.dtype), fields, axes=1)
+        light = tuple(zip(plan.wavelengths, plan.weights, strict=True))
+        grid = kernel_grid(camera.sensor.grid, plan.field_shape)
+        total = jnp.zeros((), fields.dtype)
+        for distance, field in zip(plan.distances, mixed, strict=True):
+            kernel = spectral_psf(
+                camera,
+                light,
+                distance,
+                model=plan.model,
+                pixel_integration=plan.pixel_integration,
+                grid=grid,
+            )
+            shapes = camera.sensor.shape, plan.field_shape
+            total = total + CropConvolution(kernel, grid.pitch, *shapes)(field)
+    return cast(total, own)
+
+
+def _require_same_scene(plan: Plan, scene: Scene) -> None:
+    distances = [p.distance for p in scene.planes]
+    if len(distances) != len(plan.scene_distances) or not np.allclose(
+        np.asarray(distances, float), plan.scene_distances, rtol=1e-6
+    ):
+        raise ValueError(
+            f"the plan is for {len(plan.scene_distances)} planes at given distances, the scene has "
+            "others: make a plan for it"
+        )
+    wavelengths = np.asarray(scene.spectrum.wavelengths, float)
+    if len(wavelengths) != len(plan.scene_wavelengths) or not np.allclose(
+        wavelengths, plan.scene_wavelengths, rtol=1e-6
+    ):
+        raise ValueError(
+            f"the plan is for {len(plan.scene_wavelengths)} given wavelengths, the scene has "
+            "others: make a plan for it"
+        )
