@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 # Rings of frequencies, and frequencies in each.
-_RINGS, _IN_RING = 32, 8
+_RINGS, _IN_RING = 32, 16
 
 
 class Frequencies(NamedTuple):

@@ -1,0 +1,70 @@
+"""The ways of computing a PSF that are compared, and why some are not run."""
+
+from typing import NamedTuple
+
+from thincam_jax._memory import available_bytes, readable
+from thincam_jax._precision import PRECISIONS, Precision
+from thincam_jax.bench.cameras import Conditions
+from thincam_jax.camera import LenslessCamera
+from thincam_jax.cost import Cost, psf_cost
+from thincam_jax.propagation.closed_form import focus_distance
+from thincam_jax.psf import MODELS, Model, sampling_of
+
+SAMPLED = ("angular_spectrum", "rayleigh_sommerfeld")
+OVERSAMPLINGS = (1, 3)
+# Operations of a direct sum that take some seconds; it is not run beyond.
+DIRECT_SUM_LIMIT = 2e10
+
+
+class Way(NamedTuple):
+    """One way of computing a PSF.
+
+    - `model`, `precision`, `oversampling`, `mask_shape`: as `psf` takes them; the last two are None
+      for the closed forms.
+    - `cost`: predicted operations and memory.
+    """
+
+    model: Model
+    precision: Precision
+    oversampling: int | None
+    mask_shape: tuple[int, int] | None
+    cost: Cost
+
+
+def all_ways(camera: LenslessCamera, pixel_integration: bool) -> list[Way]:
+    """Every model in both precisions, the sampled ones at each oversampling."""
+    grid = camera.sensor.grid
+    found = []
+    for model in MODELS:
+        for oversampling in OVERSAMPLINGS if model in SAMPLED else (None,):
+            shape, samples = sampling_of(camera, grid, model, pixel_integration, oversampling, None)
+            for precision in PRECISIONS:
+                cost = psf_cost(
+                    camera.mask,
+                    grid,
+                    model,
+                    pixel_integration=pixel_integration,
+                    mask_shape=shape,
+                    oversampling=samples,
+                    itemsize=8 if precision == "float64" else 4,
+                )
+                found.append(Way(model, precision, oversampling, shape, cost))
+    return found
+
+
+def why_not(model: Model, cost: Cost, given: Conditions) -> str | None:
+    """Why a model is not run under given conditions; None where it is."""
+    if model == "rayleigh_sommerfeld" and cost.flops > DIRECT_SUM_LIMIT:
+        return f"a direct sum of {cost.flops:.1e} operations, above {DIRECT_SUM_LIMIT:.0e}"
+    free = available_bytes()
+    if free is not None and cost.bytes > free:
+        return f"needs about {readable(cost.bytes)}, {readable(free)} are free"
+    if model == "closed_form" and _in_focus(given):
+        return "has no PSF: an order of the mask focuses on the sensor"
+    return None
+
+
+def _in_focus(given: Conditions) -> bool:
+    """Where `psf` refuses the model "closed_form"."""
+    path = given.camera.path(given.wavelength, given.object_distance)
+    return float(focus_distance(given.camera.mask, path)) < 1e-6

@@ -1,0 +1,121 @@
+"""A scene as a camera sees it, at a few hundred frequencies."""
+
+import functools
+import math
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Complex, Float
+
+from thincam_jax._precision import Precision
+from thincam_jax.camera import LenslessCamera
+from thincam_jax.cost import Cost, convolution_cost, psf_cost
+from thincam_jax.imaging import project, projected_shape
+from thincam_jax.operators import kernel_grid, kernel_shape
+from thincam_jax.planning.crop import crop_factor
+from thincam_jax.planning.spectrum import image_spectrum, sample_frequencies
+from thincam_jax.planning.transfer import TransferProbe
+from thincam_jax.psf import Model
+from thincam_jax.scene import Scene
+
+# Predictions come from some hundred random frequencies: what they are multiplied with.
+_MARGIN = 1.5
+# Members of a batch of images that are looked at.
+_MEMBERS = 3
+
+
+class Way(NamedTuple):
+    """One way of computing a PSF."""
+
+    model: Model
+    precision: Precision
+    pixel_integration: bool
+
+    @property
+    def itemsize(self) -> int:
+        return 8 if self.precision == "float64" else 4
+
+
+FULL = Way("separable", "float64", True)
+
+
+class View:
+    """A scene as the sensor sees it, at a few frequencies."""
+
+    def __init__(self, camera: LenslessCamera, scene: Scene, tolerance: float) -> None:
+        self.camera, self.tolerance = camera, tolerance
+        shapes = [projected_shape(camera, p) for p in scene.planes]
+        self.field_shape = (max(s[0] for s in shapes), max(s[1] for s in shapes))
+        self.distances = tuple(float(p.distance) for p in scene.planes)
+        self.wavelengths = tuple(float(w) for w in scene.spectrum.wavelengths)
+        self.weights = np.asarray(scene.spectrum.weights, float)
+        self.batch = math.prod(scene.planes[0].image.shape[:-2])
+        shape = kernel_shape(camera.sensor.shape, self.field_shape)
+        self.frequencies = sample_frequencies(max(shape))
+        self.probe = TransferProbe(camera, shape, self.frequencies)
+        members = np.unique(np.linspace(0, self.batch - 1, min(self.batch, _MEMBERS)).astype(int))
+        fields = [
+            np.asarray(project(camera, p, self.field_shape), float).reshape(-1, *self.field_shape)[
+                members
+            ]
+            for p in scene.planes
+        ]
+        # (plane, member, frequency)
+        self.spectra = np.stack([image_spectrum(f, self.frequencies) for f in fields])
+        total = np.sum(fields, axis=0)
+        self.crop = crop_factor(camera, min(self.distances), total)
+
+    @functools.cached_property
+    def power(self) -> Float[np.ndarray, " k"]:
+        """Of the whole scene, times the area of each frequency."""
+        light = np.sum(np.abs(self.spectra.sum(axis=0)) ** 2, axis=0)
+        return light * self.frequencies.weights
+
+    @functools.cached_property
+    def corners(self) -> list[tuple[float, float]]:
+        """Nearest and farthest plane at the shortest and longest wavelength."""
+        colours = {min(self.wavelengths), max(self.wavelengths)}
+        planes = {min(self.distances), max(self.distances)}
+        return [(w, t) for t in sorted(planes) for w in sorted(colours)]
+
+    @functools.cached_property
+    def references(self) -> list[Complex[np.ndarray, " k"]]:
+        return [
+            self.probe.exact(w, t, FULL.model, FULL.precision, FULL.pixel_integration)
+            for w, t in self.corners
+        ]
+
+    def relative(self, error: Complex[np.ndarray, "*member k"]) -> float:
+        """Norm of an image given by its spectrum, relative to that of the capture."""
+        energy = np.sum(self.frequencies.weights * np.abs(error) ** 2)
+        return _MARGIN * self.crop * math.sqrt(energy / self.capture_energy)
+
+    @functools.cached_property
+    def capture_energy(self) -> float:
+        """Of the capture, taking the PSF of one corner for all; the smallest of them."""
+        light = self.weights.sum() ** 2
+        energies = [light * float(np.sum(self.power * np.abs(h) ** 2)) for h in self.references]
+        return min(energies) or 1.0
+
+    def psf_cost(self, way: Way) -> Cost:
+        return psf_cost(
+            self.camera.mask,
+            kernel_grid(self.camera.sensor.grid, self.field_shape),
+            way.model,
+            pixel_integration=way.pixel_integration,
+            itemsize=way.itemsize,
+        )
+
+    def cost(self, way: Way, planes: int, colours: int) -> Cost:
+        """Of a capture from so many PSFs, for all planes of the scene."""
+        one = self.psf_cost(way)
+        convolution = convolution_cost(
+            self.camera.sensor.shape, self.field_shape, self.batch, way.itemsize
+        )
+        samples = math.prod(self.field_shape) * self.batch
+        projection = 2 * sum(self.field_shape) * samples
+        return Cost(
+            planes * (colours * one.flops + convolution.flops)
+            + len(self.distances) * (projection + 2 * planes * samples),
+            one.bytes + convolution.bytes + (len(self.distances) + planes) * samples * way.itemsize,
+        )
