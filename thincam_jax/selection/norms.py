@@ -7,7 +7,7 @@ With real factors R (term × row) and C (term × column) the image is RᵀC and
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Complex, Float
 
 from thincam_jax.propagation.separable_sum import SeparableSum
 
@@ -28,8 +28,22 @@ def factors(
     column_weights: Float[np.ndarray, " column"],
 ) -> Factors:
     """The factors of a separable sum whose samples stand for `weights` samples each."""
-    rows = np.asarray(terms.rows, complex) * np.sqrt(row_weights)
-    columns = np.asarray(terms.columns, complex) * np.sqrt(column_weights)
+    return weighted(
+        np.asarray(terms.rows, complex),
+        np.asarray(terms.columns, complex),
+        row_weights,
+        column_weights,
+    )
+
+
+def weighted(
+    rows: Complex[np.ndarray, "term row"],
+    columns: Complex[np.ndarray, "term column"],
+    row_weights: Float[np.ndarray, " row"],
+    column_weights: Float[np.ndarray, " column"],
+) -> Factors:
+    """The same from the complex factors of Σ Re{Y X}."""
+    rows, columns = rows * np.sqrt(row_weights), columns * np.sqrt(column_weights)
     # Re{YX} = Re Y Re X − Im Y Im X.
     return Factors(
         np.concatenate([np.real(rows), -np.imag(rows)]),

@@ -19,7 +19,14 @@ from thincam_jax.propagation.path import Path
 from thincam_jax.propagation.plane import block_average, lit_mask
 from thincam_jax.propagation.rayleigh_sommerfeld import rayleigh_sommerfeld_field
 from thincam_jax.propagation.separable_sum import SeparableSum
-from thincam_jax.selection.norms import Factors, distance, factors, norm, rounding_distance
+from thincam_jax.selection.norms import (
+    Factors,
+    distance,
+    factors,
+    norm,
+    rounding_distance,
+    weighted,
+)
 from thincam_jax.selection.points import Points, chosen
 from thincam_jax.selection.sampled import angular_spectrum_terms, fine_fields
 from thincam_jax.selection.terms import closed_terms
@@ -252,5 +259,7 @@ class ZoneProbe:
             first = np.clip(position - half, 0, count - 1)
             last = np.clip(position + half, 0, count - 1) + 1
             picked.append((running[:, last] - running[:, first]) / (last - first))
-        terms = SeparableSum(weights[:, None] * picked[0], picked[1], None)  # pyright: ignore
-        return self._factors(terms)
+        lines = self.lines
+        return weighted(
+            weights[:, None] * picked[0], picked[1], lines.row_weights, lines.column_weights
+        )
