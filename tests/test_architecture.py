@@ -35,6 +35,7 @@ ORDER = (
         "propagation",
         "camera",
         "cost",
+        "digits",
         "psf",
         "selection",
         "responses",
@@ -45,7 +46,8 @@ ORDER = (
         "waveguide",
         "reconstruct",
     ),
-    *("metrics", "design", "calibrate", "config", "study", "report", "doctor", "run", "cli"),
+    *("metrics", "design", "calibrate", "config", "study", "report"),
+    *("bench", "doctor", "run", "cli"),
     "hardware",
 )
 ENTRY = ("__init__", "__main__")  # they stand right of everything but `hardware`
@@ -53,7 +55,7 @@ MAX_LINES = 500
 
 JAXOPT_FILES = ("reconstruct/_jaxopt.py", "design/_jaxopt.py")
 FRONT_END_LIBRARIES = ("matplotlib", "pydantic", "typer", "rich", "jinja2")
-FRONT_END = ("config", "study", "report", "doctor", "cli")
+FRONT_END = ("config", "study", "report", "bench", "doctor", "cli")
 
 
 @dataclass(frozen=True)

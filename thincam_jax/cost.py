@@ -17,6 +17,8 @@ from thincam_jax.propagation.separable import PIXEL_NODES
 # their phasors), of one phasor, of one sample of a propagated field besides its transforms, and of
 # one summand of the Rayleigh-Sommerfeld integral.
 _CHIRP, _PHASOR, _WAVE, _SUMMAND = 1200, 40, 100, 60
+# What any evaluation holds beside its arrays: its arguments and constants.
+_BASE = 4096
 # Samples of the sensor that the direct sum does at a time.
 _BATCH = 64
 
@@ -52,7 +54,7 @@ def psf_cost(
         flops, numbers = _sampled(grid.shape, model, mask_shape, oversampling, pixel_integration)
     else:
         flops, numbers = _separable_sum(mask, grid.shape, model, pixel_integration, itemsize)
-    return Cost(float(flops), itemsize * (int(numbers) + rows * columns))
+    return Cost(float(flops), _BASE + itemsize * (int(numbers) + rows * columns))
 
 
 def _sampled(shape, model, mask_shape, oversampling, pixel_integration) -> tuple[float, float]:

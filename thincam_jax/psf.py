@@ -15,6 +15,7 @@ from thincam_jax._phase import as_complex
 from thincam_jax._precision import PRECISIONS, Precision, allow, cast, precision_of
 from thincam_jax.camera import LenslessCamera
 from thincam_jax.cost import psf_cost
+from thincam_jax.digits import require_digits
 from thincam_jax.grids import Grid
 from thincam_jax.masks.base import AbstractMask
 from thincam_jax.propagation.angular_spectrum import angular_spectrum, require_odd
@@ -73,7 +74,8 @@ def psf(
     **Returns** (y, x), dimensionless. Differentiable in every number of `camera` and in
     `wavelength` and `object_distance`.
 
-    **Errors**: ValueError for what is out of range and for unknown models, TypeError for a mask
+    **Errors**: ValueError for what is out of range, for unknown models and for phases that float32
+    does not hold (see `thincam_jax.digits`), TypeError for a mask
     that the model cannot take, MemoryError (before any work, with the estimate) for a size that
     does not fit.
     """
@@ -171,6 +173,8 @@ def _evaluate(function, mask, grid, path, model, pixel_integration, sampling, pr
     with allow(precision, mask, grid, path):
         if precision != own:
             mask, grid, path = cast((mask, grid, path), precision)
+        if precision == "float32":
+            require_digits(mask, grid, path, model)
         _check_memory(mask, grid, model, pixel_integration, *sampling)
         result = function(mask, grid, path, model, pixel_integration, *sampling)
     return result if precision == own else cast(result, own)

@@ -18,6 +18,7 @@ from thincam_jax.propagation.orders import pairs, require_zone_orders
 from thincam_jax.propagation.path import Path
 from thincam_jax.propagation.plane import block_average, lit_mask
 from thincam_jax.propagation.rayleigh_sommerfeld import rayleigh_sommerfeld_field
+from thincam_jax.propagation.separable import PIXEL_NODES
 from thincam_jax.propagation.separable_sum import SeparableSum
 from thincam_jax.selection.norms import (
     Factors,
@@ -33,6 +34,10 @@ from thincam_jax.selection.terms import closed_terms
 
 # Samples of the line on which the exact phases are compared with Fresnel's.
 _FINE_SAMPLES = 2**16
+# Nodes of the reference's pixel average: few different ones, each is compiled.
+_NODES = (2 * PIXEL_NODES, 128, 320)
+# Samples across a pixel for its average there.
+_IN_PIXEL = 33
 # Rows and columns of pixels at which the direct sum is tried.
 _FEW = 14
 # What a product of two float32 factors and the sum of a few leave, relative to the image.
@@ -117,26 +122,53 @@ class ZoneProbe:
         self.given: dict[Precision, tuple[AbstractMask, Array, Path]]
         with allow("float64", mask, grid, path):
             self.given = {p: cast((mask, grid.pitch, path), p) for p in PRECISIONS}
-        self._cache: dict[tuple[str, Precision], Factors] = {}
+        self._cache: dict[tuple[str, Precision, int], Factors] = {}
 
     @functools.cached_property
     def scale(self) -> float:
         """‖h‖₂ of the reference; where no light falls on the sensor, errors count as they are."""
-        return norm(self.closed("separable", "float64")) or 1.0
+        return norm(self.reference) or 1.0
 
-    def closed(self, model: str, precision: Precision) -> Factors:
+    def closed(self, model: str, precision: Precision, nodes: int = PIXEL_NODES) -> Factors:
         """Factors of one of the closed forms."""
-        if (model, precision) not in self._cache:
+        key = model, precision, nodes
+        if key not in self._cache:
             with allow(precision):
                 mask, pitch, path = self.given[precision]
-                terms = closed_terms(
-                    mask, self.lines.points(pitch), path, model, self.pixel_integration
-                )
-                self._cache[model, precision] = self._factors(terms)
-        return self._cache[model, precision]
+                points = self.lines.points(pitch)
+                terms = closed_terms(mask, points, path, model, self.pixel_integration, nodes)
+                self._cache[key] = self._factors(terms)
+        return self._cache[key]
+
+    @property
+    def reference(self) -> Factors:
+        """`separable` in double precision, pixels averaged with as many nodes as the fringes ask.
+
+        Where a pixel holds more than some ten fringes of the far edge, those of `psf` alias them.
+        """
+        return self.closed("separable", "float64", self._nodes)
+
+    @functools.cached_property
+    def _nodes(self) -> int:
+        if not self.pixel_integration:
+            return PIXEL_NODES
+        with allow("float64"):
+            mask, pitch, path = self.given["float64"]
+            # The irradiance's band ends at width/(λd).
+            width = max(float(extent) for extent in mask.extent)
+            fringes = float(pitch) * width / float(path.wavelength * path.distance)
+        enough = [n for n in _NODES if n >= fringes * math.pi / 2 + 10]
+        return enough[0] if enough else _NODES[-1]
 
     def _factors(self, terms: SeparableSum) -> Factors:
         return factors(terms, self.lines.row_weights, self.lines.column_weights)
+
+    def model_error(self, model: str) -> float:
+        """Relative distance of a closed form from the reference, without rounding."""
+        found = self.closed(model, "float64")
+        if model == "separable":
+            return rounding_distance(found, self.reference) / self.scale
+        return distance(found, self.reference) / self.scale
 
     def difference(self, model: str, other: str) -> float:
         """Relative distance of two closed forms, without rounding."""
@@ -149,6 +181,9 @@ class ZoneProbe:
         measured = rounding_distance(single, double) / self.scale
         size = norm(double) / self.scale
         scaled = measured * _EPSILON[precision] / _EPSILON["float32"]
+        if precision == "float64":
+            # Phases that float32 has lost altogether cost it no more than their waves' amplitude.
+            scaled *= max(1.0, 3 * self.numbers().largest_phase * _EPSILON["float32"])
         return scaled + size * _PRODUCT_ROUNDING[precision]
 
     def angular_spectrum(
@@ -167,7 +202,7 @@ class ZoneProbe:
                 oversampling=oversampling,
             )
             found = self._factors(terms)
-        return distance(found, self.closed("separable", "float64")) / self.scale
+        return distance(found, self.reference) / self.scale
 
     def rayleigh_sommerfeld(
         self, precision: Precision, mask_shape: tuple[int, int], oversampling: int
@@ -205,7 +240,7 @@ class ZoneProbe:
             radius = max(float(extent) for extent in mask.extent) / 2
             order = max(abs(k) for k in zones.orders)
             phase = order * float(zones.beta) * radius**2
-            reach = max(self.shape) * float(pitch) / 2 + radius
+            reach = max(self.shape) * float(pitch) / 2 / float(path.magnification) + radius
             return Numbers(
                 epsilon=epsilon,
                 first_order=epsilon * phase,
@@ -250,15 +285,13 @@ class ZoneProbe:
         """Pair products of a fine line's fields at the chosen pixels, averaged if pixels are."""
         count = field.shape[-1]
         step = 2 * reach / count
-        half = int(round(pitch / step / 2)) if self.pixel_integration else 0
-        products = field[lower] * field[upper].conj()
-        running = np.cumsum(np.pad(products, ((0, 0), (1, 0))), axis=-1)
+        half = round(pitch / step / 2) if self.pixel_integration else 0
+        inside = np.unique(np.linspace(-half, half, _IN_PIXEL).round()).astype(int)
         picked = []
         for indices in (self.lines.rows, self.lines.columns):
             position = np.round(indices * pitch / step + (count - 1) / 2).astype(int)
-            first = np.clip(position - half, 0, count - 1)
-            last = np.clip(position + half, 0, count - 1) + 1
-            picked.append((running[:, last] - running[:, first]) / (last - first))
+            found = field[:, np.clip(position[:, None] + inside, 0, count - 1)]
+            picked.append(np.mean(found[lower] * found[upper].conj(), axis=-1))
         lines = self.lines
         return weighted(
             weights[:, None] * picked[0], picked[1], lines.row_weights, lines.column_weights

@@ -1,6 +1,7 @@
 """What a model leaves out, in words and numbers."""
 
 from thincam_jax._precision import Precision
+from thincam_jax.propagation.separable import PIXEL_NODES
 from thincam_jax.selection.probe import ZoneProbe
 
 
@@ -9,14 +10,17 @@ def optics_left_out(probe: ZoneProbe, model: str) -> list[str]:
     numbers = probe.numbers()
     zone = f"an edge zone of √(λd/M) = {numbers.edge_zone * 1e3:.3g} µm"
     if model == "geometric":
-        size = probe.difference("geometric", "separable")
+        size = probe.model_error("geometric")
         return [
             f"diffraction is left out (ε = {numbers.epsilon:.2g}, up to {numbers.first_order:.2g} "
             f"rad at the mask's edge; {zone}): {size:.1e}"
         ]
     if model == "separable":
-        return []
-    edge = probe.difference("closed_form", "separable")
+        if not probe.pixel_integration:
+            return []
+        size = probe.model_error("separable")
+        return [f"a pixel's average is taken at {PIXEL_NODES} points an axis: {size:.1e}"]
+    edge = probe.model_error("closed_form")
     told = [f"the aperture's edge is left out ({zone}): {edge:.1e}"]
     if model == "paraxial":
         second = probe.difference("paraxial", "closed_form")

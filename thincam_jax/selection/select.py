@@ -7,7 +7,7 @@ import jax
 
 from thincam_jax import _checks
 from thincam_jax._memory import available_bytes
-from thincam_jax._precision import PRECISIONS, Precision
+from thincam_jax._precision import PRECISIONS, Precision, precision_of
 from thincam_jax.camera import LenslessCamera
 from thincam_jax.cost import Cost, psf_cost
 from thincam_jax.grids import Grid
@@ -20,8 +20,8 @@ from thincam_jax.selection.probe import ZoneProbe
 # are multiplied with so that they stay above the true error, found over 500 random cameras.
 _MARGIN = {"angular_spectrum": 1.4, "rayleigh_sommerfeld": 1.8}
 _MARGIN_CLOSED = 1.25
-# Operations of a direct sum that nobody would wait for; it is not offered beyond.
-_DIRECT_SUM_LIMIT = 1e13
+# Operations that fit into the time of going to another precision and back, some 0.4 ms.
+_CONVERSION = 1e7
 
 
 class Prediction(NamedTuple):
@@ -131,7 +131,7 @@ def predict_error(
     probe = probe_of(camera, wavelength, object_distance, pixel_integration, grid)
     grid = grid or camera.sensor.grid
     if precision is None:
-        precision = "float64" if grid.pitch.dtype.itemsize == 8 else "float32"
+        precision = precision_of(grid.pitch)
     _checks.choice("precision", precision, PRECISIONS)
     shape, samples = sampling_of(camera, grid, model, pixel_integration, oversampling, None)
     cost = _cost(camera, grid, model, pixel_integration, shape, samples, precision)
@@ -157,19 +157,29 @@ def probe_of(camera, wavelength, object_distance, pixel_integration, grid) -> Zo
 
 
 def ways(camera: LenslessCamera, grid: Grid, pixel_integration: bool):
-    """All (model, precision, oversampling, cost) that fit into memory, cheapest first."""
+    """The (model, precision, oversampling, cost) that fit into memory, cheapest first.
+
+    They end with the reference, than which nothing is closer to itself.
+    """
     found = []
     free = available_bytes()
+    own = precision_of(grid.pitch)
+
+    def time(way) -> float:
+        # An operation in double precision takes about two in single.
+        operations = way[3].flops * (2.0 if way[1] == "float64" else 1.0)
+        return operations + (0.0 if way[1] == own else _CONVERSION)
+
     for model in MODELS:
         shape, samples = sampling_of(camera, grid, model, pixel_integration, None, None)
         for precision in PRECISIONS:
             cost = _cost(camera, grid, model, pixel_integration, shape, samples, precision)
-            slow = model == "rayleigh_sommerfeld" and cost.flops > _DIRECT_SUM_LIMIT
-            if slow or (free is not None and cost.bytes > free):
-                continue
-            found.append((model, precision, None if shape is None else samples, cost))
-    # An operation in double precision takes about two in single.
-    return sorted(found, key=lambda way: way[3].flops * (2.0 if way[1] == "float64" else 1.0))
+            if free is None or cost.bytes <= free:
+                found.append((model, precision, None if shape is None else samples, cost))
+    found.sort(key=time)
+    names = [way[:2] for way in found]
+    reference = ("separable", "float64")
+    return found[: names.index(reference) + 1] if reference in names else found
 
 
 def predicted_error(
@@ -184,9 +194,7 @@ def predicted_error(
     if oversampling is None:
         if model == "closed_form" and probe.focus() < 1e-6:
             return math.inf  # `psf` refuses it
-        return _MARGIN_CLOSED * (
-            probe.difference(model, "separable") + probe.rounding(model, precision)
-        )
+        return _MARGIN_CLOSED * (probe.model_error(model) + probe.rounding(model, precision))
     shape, _ = sampling_of(camera, grid, model, probe.pixel_integration, oversampling, None)
     assert shape is not None  # the model samples, and nothing is traced
     measure = probe.angular_spectrum if model == "angular_spectrum" else probe.rayleigh_sommerfeld
