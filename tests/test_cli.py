@@ -129,6 +129,96 @@ class TestExitCode2:
         assert "No such option" in call("run", file, "--ouput", "x").stderr
 
 
+class TestBenchAccuracy:
+    def test_prints_the_results_and_where_the_figure_is(self, file, tmp_path, monkeypatch):
+        monkeypatch.setattr(cli.benches, "run_accuracy", lambda *_: RESULTS)
+        result = call("bench", "accuracy", file, "--out", tmp_path / "out", "--size", 32)
+        assert result.exit_code == 0, result.output
+        row = next(line for line in result.stdout.splitlines() if "separable" in line)
+        assert "reference" in row
+        assert "a PSF error of 1 % costs pairs 0.2500 dB by a wrong β" in result.stdout
+        assert f"figure: {tmp_path / 'out' / 'accuracy.png'}" in result.stdout
+
+    def test_default_folder_and_options(self, file, tmp_path, monkeypatch):
+        monkeypatch.chdir(tmp_path)
+        seen = []
+        monkeypatch.setattr(
+            cli.benches, "run_accuracy", lambda *given: seen.append(given[1:3]) or RESULTS
+        )
+        options = ("--size", 64, "--size", 32, "--capture-size", 48, "--set", "name=Other")
+        assert call("bench", "accuracy", file, *options).exit_code == 0
+        ((plan, folder),) = seen
+        assert (plan.sizes, plan.capture_size) == ((32, 64), 48)
+        assert folder.path.as_posix() == "runs/other-accuracy"
+
+    def test_fault_in_the_file(self, file):
+        line = one_line(call("bench", "accuracy", file, "--set", "mask.width=5"))
+        assert line.startswith("--set mask.width=5: mask.width: 5 has no unit")
+
+    @pytest.mark.parametrize("option", ["--size", "--capture-size"])
+    @pytest.mark.parametrize(("size", "hint"), [(0, "above zero"), (65, "give at most 64")])
+    def test_size(self, file, tmp_path, option, size, hint):
+        out = tmp_path / "out"
+        line = one_line(call("bench", "accuracy", file, "--out", out, option, size))
+        assert line.startswith(f"{option} {size}: ")
+        assert line.endswith(hint) or hint in line
+        assert not out.exists()
+
+    def test_folder_of_somebody_else(self, file, tmp_path):
+        (tmp_path / "file").write_text("mine")
+        for out, hint in ((tmp_path, "is not empty"), (tmp_path / "file", "cannot be written")):
+            assert hint in one_line(call("bench", "accuracy", file, "--out", out))
+        assert (tmp_path / "file").read_text() == "mine"
+
+    def test_interrupt(self, file, tmp_path, monkeypatch):
+        def interrupted(config, plan, folder, progress):
+            progress("64 pixels")
+            raise KeyboardInterrupt
+
+        monkeypatch.setattr(cli.benches, "run_accuracy", interrupted)
+        result = call("bench", "accuracy", file, "--out", tmp_path / "out")
+        assert result.exit_code == 130
+        assert result.stderr.splitlines() == ["thincam: interrupted; nothing is kept."]
+
+
+# As little as the command prints from.
+RESULTS = {
+    "settings": {"capture_shape": [48, 64], "target": "picture"},
+    "psfs": [
+        {
+            "shape": [24, 32],
+            "model": "separable",
+            "precision": "float64",
+            "oversampling": None,
+            "status": "run",
+            "true_error": 0.0,
+            "predicted_error": 1e-15,
+            "seconds": 0.01,
+            "compile_seconds": 1.0,
+            "worth_choosing": True,
+        }
+    ],
+    "captures": [{"model": "rayleigh_sommerfeld", "status": "not run", "reason": "slow"}],
+    "reconstructions": {
+        "method": "pairs",
+        "skipped": None,
+        "models": [],
+        "controlled": [
+            {
+                "wrong": "beta",
+                "level": 0.01,
+                "status": "run",
+                "change": 1e-4,
+                "psf_error": 0.01,
+                "capture_error": 1e-4,
+                "capture_contrast_error": 1e-3,
+                "psnr_lost_db": 0.25,
+            }
+        ],
+    },
+}
+
+
 def test_defect_keeps_its_traceback(file, monkeypatch, tmp_path):
     """Only what a user can put right is made a line of."""
 
@@ -180,6 +270,7 @@ def test_doctor_tells_what_is_missing(monkeypatch):
     [
         (("--help",), ("run", "doctor", "thin computational cameras")),
         (("run", "--help"), ("--out", "--set", "a.b=value", "Ctrl-C", "Experiment file")),
+        (("bench", "accuracy", "--help"), ("--size", "--capture-size", "--out", "PSNR")),
         (("doctor", "--help"), ("versions", "devices")),
     ],
 )

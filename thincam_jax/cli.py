@@ -10,7 +10,9 @@ import rich.progress
 import rich.table
 import typer
 
+from thincam_jax import bench as benches
 from thincam_jax import doctor as doctoring
+from thincam_jax.bench.console import accuracy_table, cost_table, verdict
 from thincam_jax.config import ConfigError, load_config, slug
 from thincam_jax.run import run_study, steps
 from thincam_jax.study import RunFolder, check_study
@@ -21,6 +23,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     help="Simulate and reconstruct thin computational cameras.",
 )
+bench = typer.Typer(no_args_is_help=True, help="Measure what the models of a study cost.")
+app.add_typer(bench, name="bench")
 _console = rich.console.Console()
 _errors = rich.console.Console(stderr=True)
 
@@ -109,6 +113,48 @@ def _print_results(metrics: dict) -> None:
 
 def _number(value: float | None, digits: int) -> str:
     return "–" if value is None else f"{value:.{digits}f}"
+
+
+@bench.command()
+def accuracy(
+    config: Annotated[Path, typer.Argument(help="Experiment file (YAML); see configs/.")],
+    out: Annotated[
+        Path | None, typer.Option(help="Folder of the results; default runs/NAME-accuracy.")
+    ] = None,
+    size: Annotated[
+        list[int] | None,
+        typer.Option(help="Pixels along the sensor's longer side; give it once for each size."),
+    ] = None,
+    capture_size: Annotated[
+        int | None, typer.Option(help="The same for captures and reconstructions; default 256.")
+    ] = None,
+    set_: Annotated[
+        list[str] | None,
+        typer.Option("--set", help="Change a value: a.b=value, list entries by number."),
+    ] = None,
+) -> None:
+    """Every model's error and time, and what an error of the PSF costs in PSNR.
+
+    Writes accuracy.json and accuracy.png.
+    """
+    try:
+        study = load_config(config, tuple(set_ or ()))
+        plan = benches.check(study, benches.Options(tuple(size or ()), capture_size))
+        folder = benches.BenchFolder(out or Path("runs") / f"{slug(study.name)}-accuracy")
+        with rich.progress.Progress(*_columns(), console=_console) as bar:
+            task = bar.add_task(study.name, total=benches.steps(study, plan))
+            results = benches.run_accuracy(
+                study, plan, folder, lambda text: bar.update(task, advance=1, description=text)
+            )
+    except _USER_ERRORS as error:
+        _fail(error)
+    except KeyboardInterrupt:
+        _errors.print("thincam: interrupted; nothing is kept.", highlight=False, soft_wrap=True)
+        raise typer.Exit(_INTERRUPTED) from None
+    _console.print(accuracy_table(results))
+    _console.print(cost_table(results))
+    for line in (*verdict(results), f"figure: {folder.path / 'accuracy.png'}"):
+        _console.print(line, highlight=False, soft_wrap=True)
 
 
 @app.command()

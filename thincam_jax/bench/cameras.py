@@ -51,7 +51,7 @@ def psf_of(
         h = psf(
             camera,
             wavelength=wavelength,
-            object_distance=distance,
+            object_distance=float(distance),
             model=model,
             pixel_integration=config.pixel_integration,
             grid=Grid(shape, grid.pitch) if shape else grid,

@@ -9,6 +9,7 @@ import numpy as np
 from thincam_jax._precision import Precision, allow, cast
 from thincam_jax.bench.cameras import conditions_of, psf_of
 from thincam_jax.bench.norms import contrast_error, relative_error
+from thincam_jax.bench.psfs import words
 from thincam_jax.bench.rig import Rig
 from thincam_jax.bench.ways import why_not
 from thincam_jax.cost import psf_cost
@@ -34,7 +35,7 @@ def capture_rows(rig: Rig, progress: Callable[[str], None]) -> list[dict[str, An
     exact = [psf_of(rig.config, setting, shape=shape) for shape in (None, reach)]
     rows = []
     for model in MODELS:
-        progress(f"capture: {model.replace('_', ' ')}")
+        progress(f"capture: {words(model)}")
         reason = kernel_reason(rig, setting, model)
         row: dict[str, Any] = {"model": model, "status": "not run", "reason": reason}
         if reason is None:

@@ -14,9 +14,12 @@ from thincam_jax.study.build import settings
 # What is wrong: the mask's curvature β, or its distance d from the sensor.
 QUANTITIES = ("beta", "distance")
 LEVELS = (0.003, 0.01, 0.03, 0.1)  # relative errors of the PSF
-_TOLERANCE = 0.02  # of the level, within which it is met
-# Relative changes between which the camera is looked for.
-_SMALLEST, _LARGEST = 1e-7, 0.5
+_TOLERANCE = 0.01  # of the level, within which it is met
+# The largest relative change that is looked at, and the one to begin with.
+_LARGEST, _FIRST = 0.5, 1e-5
+# Relative changes come in these steps: distances of few digits then keep their ratio to the last
+# bit in float32, and no reconstruction is compiled anew.
+_STEP = 2.0**-20
 
 
 def changed(method: MethodConfig, quantity: str, part: float) -> MethodConfig:
@@ -36,8 +39,8 @@ def psfs_of(config: StudyConfig, method: MethodConfig) -> np.ndarray:
 def solve(config: StudyConfig, method: MethodConfig, quantity: str, level: float) -> float | None:
     """The relative change of a quantity that makes the method's PSFs wrong by `level`.
 
-    By bisection in its logarithm (Brent's method), to 2 % of the level. None where no change of up
-    to a half does it.
+    By a bracketed search in its logarithm (Brent's), to 1 % of the level. None where no change of
+    up to a half does it.
     """
     reference = psfs_of(config, method)
 
@@ -48,20 +51,24 @@ def solve(config: StudyConfig, method: MethodConfig, quantity: str, level: float
     bracket = _bracket(excess)
     if bracket is None:
         return None
-    # An error of the PSF changes no faster than in proportion to what is wrong.
-    root = scipy.optimize.brentq(excess, *bracket, xtol=_TOLERANCE / 2, rtol=1e-12)
-    return math.exp(root)
+    found = scipy.optimize.root_scalar(
+        excess, bracket=bracket, method="brentq", xtol=_TOLERANCE / 2, rtol=1e-9
+    )
+    return max(1, round(math.exp(found.root) / _STEP)) * _STEP
 
 
 def _bracket(excess: Callable[[float], float]) -> tuple[float, float] | None:
     """Logarithms of a change that is too small and of one that is too large."""
-    lower = math.log(_SMALLEST)
-    step, end = math.log(10.0), math.log(_LARGEST)
-    if excess(lower) > 0:
-        return None
-    while lower < end:
-        upper = min(lower + step, end)
-        if excess(upper) > 0:
-            return lower, upper
-        lower = upper
+    guess, end = math.log(_FIRST), math.log(_LARGEST)
+    # Small errors grow in proportion to what is wrong.
+    guess = min(guess - excess(guess), end)
+    step = math.log(1.3) if excess(guess) < 0 else -math.log(1.3)
+    last = guess
+    while last < end or step < 0:
+        following = min(last + step, end)
+        if (excess(following) < 0) != (step > 0):
+            return min(last, following), max(last, following)
+        last, step = following, 2 * step
+        if step < -100:
+            break
     return None

@@ -10,6 +10,7 @@ from thincam_jax.bench.cameras import psf_of
 from thincam_jax.bench.captures import clean_capture, kernel_reason
 from thincam_jax.bench.norms import contrast_error, relative_error
 from thincam_jax.bench.perturb import LEVELS, QUANTITIES, changed, psfs_of, solve
+from thincam_jax.bench.psfs import words
 from thincam_jax.bench.rig import Rig
 from thincam_jax.config import MethodConfig
 from thincam_jax.metrics import psnr
@@ -68,7 +69,7 @@ def model_rows(
     """
     rows = []
     for model in MODELS:
-        progress(f"reconstruction: {model.replace('_', ' ')}")
+        progress(f"reconstruction: {words(model)}")
         reasons = [kernel_reason(rig, s, model) for s in rig.settings]
         reason = next((r for r in reasons if r), None)
         row: dict[str, Any] = {"model": model, "status": "not run", "reason": reason}
@@ -87,29 +88,40 @@ def controlled_rows(
     """What a PSF error of 0.3 %, 1 %, 3 % and 10 % costs: rows for a wrong β and a wrong d.
 
     The reconstruction assumes the exact model of a slightly wrong camera. The scale of the object
-    is the true one, so that only the PSF is wrong.
+    is the true one, so that only the PSF is wrong. `psnr_lost_db` is the worse of a change up and
+    down: by chance, one of them can gain a little.
     """
-    setting, rows = rig.settings[0], []
-    reference = clean_capture(rig, setting)
+    reference = clean_capture(rig, rig.settings[0])
+    rows = []
     for quantity in QUANTITIES:
         for level in LEVELS:
-            progress(f"a PSF error of {level:.1%} by a wrong {quantity}")
-            row: dict[str, Any] = {"wrong": quantity, "level": level, "status": "not run"}
+            progress(f"a PSF error of {100 * level:g} % by a wrong {quantity}")
             part = solve(rig.config, rig.method, quantity, level)
+            row: dict[str, Any] = {"wrong": quantity, "level": level}
             if part is None:
-                row["reason"] = f"no change of {quantity} up to a half gives this error"
+                reason = f"no change of {quantity} of up to a half gives this error"
+                rows.append(row | {"status": "not run", "reason": reason})
             else:
-                method = changed(rig.method, quantity, part)
-                assumed = build.settings(rig.config, method)[0]
-                wrong = clean_capture(rig, setting, assumed=assumed)
-                found = _reconstruct(rig, experiment, method, "separable")
                 row |= {"status": "run", "reason": None, "change": part}
-                row["psf_error"] = relative_error(psfs_of(rig.config, method), experiment.psfs)
-                row["capture_error"] = relative_error(wrong, reference)
-                row["capture_contrast_error"] = contrast_error(wrong, reference)
-                row |= _lost(rig, experiment, found)
-            rows.append(row)
+                rows.append(row | _controlled(rig, experiment, reference, quantity, part))
     return rows
+
+
+def _controlled(rig: Rig, experiment: Experiment, reference, quantity: str, part: float) -> dict:
+    """PSF and capture error of a change, and the PSNR lost by it in the worse direction."""
+    up, down = (changed(rig.method, quantity, p) for p in (part, -part))
+    assumed = build.settings(rig.config, up)[0]
+    wrong = clean_capture(rig, rig.settings[0], assumed=assumed)
+    both = [
+        _lost(rig, experiment, _reconstruct(rig, experiment, m, "separable")) for m in (up, down)
+    ]
+    worse = max(both, key=lambda lost: lost["psnr_lost_db"])
+    return {
+        "psf_error": relative_error(psfs_of(rig.config, up), experiment.psfs),
+        "capture_error": relative_error(wrong, reference),
+        "capture_contrast_error": contrast_error(wrong, reference),
+        **worse,
+    }
 
 
 def _lost(rig: Rig, experiment: Experiment, found: Reconstruction) -> dict[str, float]:
