@@ -6,9 +6,8 @@ smallest on which nothing wraps round. Errors are relative L2:
 
 - `error_separable`: from `separable` in double precision, the exact Fresnel PSF;
 - `error_fine`: from `angular_spectrum` in double precision with 3×3 samples a pixel and half as
-  large a window again, the best sampled PSF that an ordinary machine holds. It is itself 1.4 % from
-  the exact PSF: hard edges converge slowly. For a slit of this width, which can be sampled at λ/8,
-  the Fresnel model is 5e-4 from the exact scalar one: what separates the two is the sampling.
+  large a window again, the best sampled PSF that an ordinary machine holds. It is 1.4 % from the
+  exact Fresnel PSF: in the fringes far from the edges, where Fresnel's phases are wrong by radians.
 
 Gradients are those of a weighted sum of the PSF with respect to β and d. Any such gradient is an
 inner product with the images ∂h/∂β and ∂h/∂d, so the errors are of these: the sum itself may be as

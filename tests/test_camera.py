@@ -19,7 +19,7 @@ def test_path_of_the_thesis_camera():
     path = camera().path(500 * nm, 250.0)
     assert float(path.magnification) == pytest.approx(1.026)
     assert float(path.epsilon(jnp.asarray(25.0))) == pytest.approx(0.025862 / 1.026, rel=1e-4)
-    assert float(path.fresnel_curvature) == pytest.approx(np.pi / (5e-4 * 6.5))
+    assert float(path.fresnel_curvature) == pytest.approx(np.pi * 1.026 / (5e-4 * 6.5))
     assert float(camera().path(500 * nm, jnp.inf).magnification) == 1.0
 
 

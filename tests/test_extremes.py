@@ -349,14 +349,11 @@ def test_choice_of_precision(name):
 
 
 def test_predicted_error_where_the_nodes_of_an_average_fail():
-    """Too low: some 60 fringes a pixel are more than the prediction's own nodes follow.
-
-    Measured: 5.9e-5 predicted, 5.1e-4 true, in double precision as well.
-    """
+    """Some 60 fringes a pixel are more than 24 nodes follow, in either precision: it is told."""
     camera, conditions = choice_of("d = 1 mm, pixel average")
     predicted = tc.predict_error(camera, model="separable", precision="float32", **conditions)
     true = error_in_single("d = 1 mm, pixel average")
-    assert predicted.predicted_error < true / 5
+    assert true <= predicted.predicted_error <= 10 * true
     assert error(find("d = 1 mm, pixel average"), np.float64) > true / 2
 
 

@@ -134,6 +134,10 @@ def test_a_plan_is_not_run_on_another_scene():
         tc.capture(camera(), scene(3, 2), plan=plan)
     with pytest.raises(ValueError, match=r"for 2 given wavelengths.*make a plan"):
         tc.capture(camera(), scene(2, 3), plan=plan)
+    other = tc.FresnelZoneAperture(26.0, width=3.6, centre=(0.1, -0.2))
+    other = tc.LenslessCamera(other, camera().sensor, 7.0)
+    with pytest.raises(ValueError, match=r"another camera \(distance, mask.beta differ\): make"):
+        tc.capture(other, scene(2, 2), plan=plan)
     with pytest.raises(ValueError, match="a plan chooses model and pixel_integration"):
         tc.capture(camera(), scene(2, 2), plan=plan, model="geometric")
 

@@ -55,6 +55,7 @@ def plan(camera: LenslessCamera, scene: Scene, *, tolerance: float) -> Plan:
     shares = {"model": model_error, "wavelengths": colour_error, "planes": plane_error}
     window = fast_shape(kernel_shape(camera.sensor.shape, view.field_shape), real=True)
     return Plan(
+        camera=camera,
         tolerance=tolerance,
         predicted_error=sum(shares.values()),
         model=way.model,

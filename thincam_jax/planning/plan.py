@@ -7,6 +7,7 @@ from jaxtyping import Float
 
 from thincam_jax._memory import readable
 from thincam_jax._precision import Precision
+from thincam_jax.camera import LenslessCamera
 from thincam_jax.cost import Cost
 from thincam_jax.psf import Model
 
@@ -27,8 +28,10 @@ class Plan(NamedTuple):
     """How `capture` computes a scene within a tolerance; made by `thincam_jax.plan`.
 
     Print it for a table. It holds for scenes with the same planes and wavelengths as the one that
-    it was made for, and for images like its.
+    it was made for and images like its, and for cameras within 1 % of its own, at any phase of the
+    mask.
 
+    - `camera`: that it was made for.
     - `tolerance`, `predicted_error`: relative L2 error of the noise-free capture.
     - `model`, `precision`, `pixel_integration`: arguments of `psf`.
     - `distances`: object distances in mm whose PSFs are computed, out of the scene's.
@@ -43,6 +46,7 @@ class Plan(NamedTuple):
     - `effects`: what the capture holds and what it does not.
     """
 
+    camera: LenslessCamera
     tolerance: float
     predicted_error: float
     model: Model
