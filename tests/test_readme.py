@@ -31,3 +31,22 @@ def test_documentation(capsys):
     status, decibels = capsys.readouterr().out.split()
     assert status == "ok"
     assert float(decibels) > 20
+
+
+def test_accuracy_page(capsys):
+    """The printed choice stands in the page, and the plan is within its tolerance."""
+    names = run_examples("docs/accuracy.md")
+    printed = capsys.readouterr().out
+    page = (ROOT / "docs/accuracy.md").read_text("utf-8")
+    choice = names["choice"]
+    assert f"{choice.model} {choice.precision} {choice.predicted_error:.4f}" in page
+    *told, rounding, fresnel = choice.reasons
+    assert all(sentence in page and sentence in printed for sentence in (*told, fresnel))
+    assert rounding in printed  # its last digit depends on the precision of the camera's numbers
+    full = names["tc"].capture(names["small"], names["scene"])
+    assert str(names["plan"]) in printed
+    assert (
+        str(names["plan"]).splitlines()[2:5]
+        == re.findall(r"\n(depth planes.*\n.*\n.*)", page)[0].splitlines()
+    )
+    assert np.linalg.norm(names["image"] - full) < 1e-2 * np.linalg.norm(full)
