@@ -61,7 +61,7 @@ def choose_wavelengths(view: View, way: Way, tolerance: float):
     )
     power = np.tile(np.sqrt(view.power), len(some))[:, None]
     target = columns @ view.weights
-    order = order_of_columns(columns * power)
+    order = order_of_columns((columns * power)[::2])
     total = np.tile(view.spectra.sum(axis=0), len(some))
     for few in range(1, count):
         picked = sorted(order[:few])
@@ -95,7 +95,7 @@ def choose_planes(view: View, way: Way, colours, weights, tolerance: float):
     )
     area = np.sqrt(view.frequencies.weights)
     light = np.sqrt(np.sum(np.abs(view.spectra) ** 2, axis=1)).T * area[:, None]
-    order = order_of_columns(columns * light)
+    order = order_of_columns((columns * light)[::2])
     for few in range(1, count):
         picked = sorted(order[:few])
         chosen = columns[:, picked]

@@ -66,9 +66,9 @@ def image_spectrum(
     images: Float[np.ndarray, "batch m n"], frequencies: Frequencies
 ) -> Complex[np.ndarray, "batch k"]:
     """F(v, u) = Σ f e^{−2πj(vy+ux)} of images about their centres."""
-    rows, columns = images.shape[-2:]
-    down = np.exp(-2j * np.pi * np.outer(centred(rows), frequencies.v))
-    across = np.exp(-2j * np.pi * np.outer(centred(columns), frequencies.u))
-    # Two real products cost half of a complex one.
-    half = images @ np.real(across) + 1j * (images @ np.imag(across))
-    return np.einsum("bmk,mk->bk", half, down)
+    rows, columns = (centred(n) for n in images.shape[-2:])
+    # cos and −sin side by side: one real product, at half the cost of a complex one.
+    half = images @ waves(frequencies.u, columns, len(columns))
+    cosine, sine = np.split(half, 2, axis=-1)
+    down = np.exp(-2j * np.pi * np.outer(rows, frequencies.v))
+    return np.einsum("bmk,mk->bk", cosine + 1j * sine, down)
