@@ -10,6 +10,8 @@ import jax.numpy as jnp
 from thincam_jax import _checks
 
 Precision = Literal["float32", "float64"]
+# Relative L2 error of an image that is rounded to a precision.
+RESULT_ROUNDING: dict[Precision, float] = {"float32": 3e-8, "float64": 1e-16}
 PRECISIONS: tuple[Precision, ...] = get_args(Precision)
 
 

@@ -21,19 +21,23 @@ def require_digits(mask: AbstractMask, grid: Grid, path: Path, model: str) -> No
     sensor; rounding leaves it 2⁻²⁴ of itself uncertain. Refused is what is beyond 0.05 rad, where
     single precision is off by several per cent. Numbers that are traced cannot be looked at.
     """
-    orders = getattr(mask, "orders", None)
-    numbers = jax.tree.leaves((mask, grid, path))
-    if orders is None or any(_checks.is_traced(n) for n in numbers):
-        return
-    phase = largest_phase(mask, grid, path, orders, model)
-    if phase > _LARGEST:
+    if not held_in_single(mask, grid, path, model):
+        phase = largest_phase(mask, grid, path, model)
         raise ValueError(
             f"float32 holds the zones' phase of {phase:.1e} rad on this sensor only to "
             f"{phase * 2.0**-24:.1g} rad; pass precision='float64'"
         )
 
 
-def largest_phase(mask, grid: Grid, path: Path, orders: tuple[int, ...], model: str) -> float:
+def held_in_single(mask: AbstractMask, grid: Grid, path: Path, model: str) -> bool:
+    """Whether float32 holds the zones' phases; where numbers are traced, it is taken to."""
+    numbers = jax.tree.leaves((mask, grid, path))
+    if not hasattr(mask, "orders") or any(_checks.is_traced(n) for n in numbers):
+        return True
+    return largest_phase(mask, grid, path, model) <= _LARGEST
+
+
+def largest_phase(mask, grid: Grid, path: Path, model: str) -> float:
     """Of the orders' fringes where they have their full strength and light falls, rad."""
     scale = float(path.magnification)
     beta, half_mask = float(mask.beta), float(mask.extent[0]) / 2
@@ -43,7 +47,7 @@ def largest_phase(mask, grid: Grid, path: Path, orders: tuple[int, ...], model: 
     ]
     epsilon = float(path.epsilon(mask.beta)) if model != "geometric" else 0.0
     found = 0.0
-    for k in orders:
+    for k in mask.orders:
         gain = abs(1 + k * epsilon)
         if k == 0 or gain == 0 or gain > 2:  # beyond, the order is spread out and weak
             continue

@@ -326,7 +326,7 @@ def test_unknown_model():
 
 def test_single_precision_cameras_without_the_switch():
     """The same choice where JAX knows float32 only: its numbers themselves are rounded then, so
-    that predictions of rounding differ somewhat."""
+    that predictions of rounding differ somewhat, and results come back rounded."""
     expected = select(camera_of(), 1e-7)
     with jax.enable_x64(False):
         choice = select(camera_of(), 1e-7)
@@ -336,4 +336,40 @@ def test_single_precision_cameras_without_the_switch():
     for ours in choice.considered:
         theirs = known.get(ours[:2], ours)
         assert ours.cost == theirs.cost
-        assert ours.predicted_error == pytest.approx(theirs.predicted_error, rel=0.5)
+        assert ours.predicted_error == pytest.approx(theirs.predicted_error, rel=0.5, abs=4e-8)
+
+
+def test_displays_are_chosen_among_the_models_that_hold_pixels():
+    camera = camera_of(pitch=0.1, pixel_pitch=0.176)
+    for tolerance in (0.3, 1e-4):
+        choice = select(camera, tolerance)
+        assert choice.meets_tolerance
+        tried = {p.model for p in choice.considered}
+        assert tried.isdisjoint({"paraxial", "closed_form"})
+        given = {"wavelength": 500e-6, "object_distance": 250.0}
+        exact = tc.psf(camera, model="separable", **given)
+        found = tc.psf(camera, model=choice.model, precision=choice.precision, **given)
+        assert relative_l2(np.asarray(found), np.asarray(exact)) <= choice.predicted_error
+
+
+def test_phases_beyond_float32_choose_float64():
+    """`psf` refuses float32 there, and so does the choice."""
+    camera = camera_of((48, 80), 1.0, 0.65, 1000.0, width=100.0)
+    with pytest.raises(ValueError, match="float32 holds the zones' phase of .* only to"):
+        tc.psf(camera, wavelength=500e-6, object_distance=250.0, precision="float32")
+    single = tc.predict_error(
+        camera,
+        wavelength=500e-6,
+        object_distance=250.0,
+        model="separable",
+        precision="float32",
+    )
+    assert single.predicted_error == math.inf
+    assert select(camera, 0.5).precision == "float64"
+
+
+def test_numbers_in_other_units_are_refused():
+    with pytest.raises(ValueError, match="wavelength = 500 mm is no light: give it in mm, such as"):
+        tc.psf(camera_of(), wavelength=500.0)
+    with pytest.raises(ValueError, match=r"tolerance = 5 is relative: give at most 1"):
+        select(camera_of(), 5.0)

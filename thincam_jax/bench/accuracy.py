@@ -12,7 +12,7 @@ from thincam_jax.bench.psfs import psf_rows, way_count
 from thincam_jax.bench.reconstructions import controlled_rows, make_experiment, model_rows
 from thincam_jax.bench.rig import Rig, make_rig
 from thincam_jax.bench.sizes import capture_size_of, sizes_of
-from thincam_jax.config import StudyConfig, dump_config
+from thincam_jax.config import ConfigError, StudyConfig, dump_config
 from thincam_jax.psf import MODELS
 from thincam_jax.study import build
 from thincam_jax.study.check import check_study
@@ -41,6 +41,11 @@ class Plan(NamedTuple):
 
 def check(config: StudyConfig, options: Options) -> Plan:
     """Refuse what cannot be run, before anything is; ConfigError, one line for each fault."""
+    if config.mask.pixel_pitch is not None:
+        raise ConfigError(
+            "mask.pixel_pitch: the benchmark compares models that have no display pixels; leave it "
+            "out of the file"
+        )
     sizes = sizes_of(config, options.sizes)
     capture_size = capture_size_of(config, options.capture_size)
     check_study(config)

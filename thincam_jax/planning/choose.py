@@ -7,11 +7,12 @@ import numpy as np
 from thincam_jax.planning.compress import fit, order_of_columns
 from thincam_jax.planning.view import FULL, View, Way
 from thincam_jax.propagation.separable import PIXEL_NODES
-from thincam_jax.selection.terms import CLOSED
 
-# Nodes of the pixel average where PSFs are compared with each other, at tolerances down to `_FINE`:
-# the fringes of the far edges, which need more, are a few parts in a thousand of a PSF.
-_FEW_NODES, _FINE = 6, 1e-3
+# Nodes of the pixel average where PSFs are compared with each other, and how far the tolerance must
+# be above the far edge's wave, √(λd)/(πw) of the light, whose fringes these nodes do not follow.
+_FEW_NODES, _ABOVE_EDGES = 6, 2.5
+# What float32's convolution leaves of a capture.
+_CONVOLUTION_ROUNDING = 1.5e-6
 # Below this tolerance nearly every PSF is needed, and finding which costs more than it saves.
 _EVERYTHING = 3e-5
 
@@ -19,7 +20,12 @@ _EVERYTHING = 3e-5
 def choose_way(view: View, tolerance: float) -> tuple[Way, float]:
     """The cheapest model, precision and pixel average within the tolerance at the corners."""
     # Double precision is for where single cannot serve: a cheaper model would not help there.
-    ways = [Way(model, "float32", average) for model in CLOSED for average in (False, True)]
+    ways = [
+        Way(model, "float32", average)
+        for model in view.models
+        for average in (False, True)
+        if view.held_in_single(model)
+    ]
     ways += [Way("separable", "float64", average) for average in (False, True)]
     if _way_error(view, Way("separable", "float32", False)) > max(tolerance, 1e-3):
         ways = [way for way in ways if way.pixel_integration]
@@ -39,15 +45,15 @@ def _speed(view: View, way: Way) -> float:
 def _way_error(view: View, way: Way) -> float:
     if way == FULL:
         return 0.0
-    total = view.spectra.sum(axis=0) * view.weights.sum()
     worst = 0.0
     for (wavelength, distance), exact in zip(view.corners, view.references, strict=True):
         found = view.probe.exact(
             wavelength, distance, way.model, way.precision, way.pixel_integration
         )
-        error = view.relative((found - exact) * total)
+        error = view.relative_of_all((found - exact) * view.weights.sum())
         worst = max(worst, error if math.isfinite(error) else math.inf)
-    return worst
+    rounding = _CONVOLUTION_ROUNDING * view.crop if way.precision == "float32" else 0.0
+    return worst + rounding
 
 
 def choose_wavelengths(view: View, way: Way, tolerance: float):
@@ -62,19 +68,19 @@ def choose_wavelengths(view: View, way: Way, tolerance: float):
     power = np.tile(np.sqrt(view.power), len(some))[:, None]
     target = columns @ view.weights
     order = order_of_columns((columns * power)[::2])
-    total = np.tile(view.spectra.sum(axis=0), len(some))
     for few in range(1, count):
         picked = sorted(order[:few])
         weights = fit((columns[:, picked] * power)[::2], (target * power[:, 0])[::2])
-        error = (columns[:, picked] @ weights - target) * total
-        size = max(view.relative(part) for part in np.split(error, len(some), axis=-1))
+        error = columns[:, picked] @ weights - target
+        size = max(view.relative_of_all(part) for part in np.split(error, len(some)))
         if size <= tolerance:
             return picked, weights, size
     return list(range(count)), view.weights, 0.0
 
 
 def _quick(view: View, way: Way, wavelength: float, distance: float):
-    nodes = _FEW_NODES if view.tolerance >= _FINE else PIXEL_NODES
+    few = view.tolerance > _ABOVE_EDGES * view.edge_wave
+    nodes = _FEW_NODES if few else PIXEL_NODES
     return view.probe.quick(wavelength, distance, way.model, way.pixel_integration, nodes)
 
 

@@ -16,6 +16,7 @@ def crop_factor(
 ) -> float:
     """‖g‖₂ of the whole image over that of its part on the sensor, at least 1.
 
+    Infinite where no light falls on the sensor but what is diffracted there.
     Errors are known for the whole image; this bounds them on the sensor. The mask's shadow without
     its fringes, a box, stands for the PSF: its convolution is a difference of running sums.
     """
@@ -28,7 +29,7 @@ def crop_factor(
     low = [max(o - b / 2, -k / 2) for o, b, k in zip(offset, box, kernel, strict=True)]
     high = [min(o + b / 2, k / 2) for o, b, k in zip(offset, box, kernel, strict=True)]
     if any(top <= bottom for bottom, top in zip(low, high, strict=True)):
-        return 1.0
+        return math.inf
     running = np.pad(images.cumsum(axis=-1).cumsum(axis=-2), ((0, 0), (1, 0), (1, 0)))
     sizes = images.shape[-2:]
     whole = [
@@ -37,7 +38,7 @@ def crop_factor(
     ]
     sensor = [np.linspace(-n / 2, n / 2, _POINTS) for n in camera.sensor.shape]
     energies = [_energy(running, points, low, high) for points in (whole, sensor)]
-    return max(1.0, math.sqrt(energies[0] / energies[1])) if energies[1] > 0 else 1.0
+    return max(1.0, math.sqrt(energies[0] / energies[1])) if energies[1] > 0 else math.inf
 
 
 def _energy(running, points, low, high) -> float:

@@ -3,7 +3,7 @@
 import jax
 
 from thincam_jax import _checks
-from thincam_jax._precision import Precision, precision_of
+from thincam_jax._precision import RESULT_ROUNDING, precision_of
 from thincam_jax.camera import LenslessCamera
 from thincam_jax.grids import fast_shape
 from thincam_jax.operators import kernel_shape
@@ -11,15 +11,12 @@ from thincam_jax.planning.choose import choose_planes, choose_wavelengths, choos
 from thincam_jax.planning.effects import effects_of
 from thincam_jax.planning.plan import Plan
 from thincam_jax.planning.view import FULL, View
-from thincam_jax.propagation.orders import require_zone_orders
 from thincam_jax.scene import Scene
-from thincam_jax.selection.select import tolerance_of
+from thincam_jax.selection.select import require_camera, tolerance_of
 
 # Parts of the tolerance that the decisions may use, in the order in which they are taken. What one
 # leaves over is the next one's.
 _MODEL_SHARE, _WAVELENGTH_SHARE = 0.35, 0.6
-# What the result's own precision leaves.
-_RESULT_ROUNDING: dict[Precision, float] = {"float32": 3e-8, "float64": 1e-16}
 
 
 def plan(camera: LenslessCamera, scene: Scene, *, tolerance: float) -> Plan:
@@ -42,12 +39,14 @@ def plan(camera: LenslessCamera, scene: Scene, *, tolerance: float) -> Plan:
     orders, and for traced numbers.
     """
     tolerance = tolerance_of(tolerance)
-    require_zone_orders(camera.mask, "plan")
+    require_camera(camera, "plan")
+    if not isinstance(scene, Scene):
+        raise TypeError(f"scene is a {type(scene).__name__}; give a thincam_jax.Scene")
     if any(_checks.is_traced(leaf) for leaf in jax.tree.leaves((camera, scene))):
         raise TypeError("plan needs known numbers: call it outside of jit and grad")
     view = View(camera, scene, tolerance)
     way, model_error = choose_way(view, tolerance * _MODEL_SHARE)
-    model_error += _RESULT_ROUNDING[precision_of(camera.sensor.pitch)]
+    model_error += RESULT_ROUNDING[precision_of(camera.sensor.pitch)]
     left = max(tolerance - model_error, 0.0)
     colours, weights, colour_error = choose_wavelengths(view, way, left * _WAVELENGTH_SHARE)
     left = max(tolerance - model_error - colour_error, 0.0)
@@ -67,6 +66,7 @@ def plan(camera: LenslessCamera, scene: Scene, *, tolerance: float) -> Plan:
         weights=tuple(float(w) for w in weights),
         scene_distances=view.distances,
         scene_wavelengths=view.wavelengths,
+        scene_weights=tuple(float(w) for w in view.weights),
         field_shape=view.field_shape,
         padded_shape=window,
         cost=view.cost(way, len(planes), len(colours)),

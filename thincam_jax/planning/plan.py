@@ -1,5 +1,6 @@
 """The plan of a capture: what is computed, what is left out, and what that costs."""
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -24,7 +25,8 @@ class Effect(NamedTuple):
     note: str
 
 
-class Plan(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Plan:
     """How `capture` computes a scene within a tolerance; made by `thincam_jax.plan`.
 
     Print it for a table. It holds for scenes with the same planes and wavelengths as the one that
@@ -32,13 +34,15 @@ class Plan(NamedTuple):
     mask.
 
     - `camera`: that it was made for.
-    - `tolerance`, `predicted_error`: relative L2 error of the noise-free capture.
+    - `tolerance`, `predicted_error`: relative L2 error of the noise-free capture, of a
+      batch as a whole.
     - `model`, `precision`, `pixel_integration`: arguments of `psf`.
     - `distances`: object distances in mm whose PSFs are computed, out of the scene's.
     - `mixing`: (distance, plane) weights: the PSF of a plane is this sum of the computed ones, so
       that planes are merged before they are convolved.
     - `wavelengths`, `weights`: wavelengths in mm that are computed, and their shares of the light.
-    - `scene_distances`, `scene_wavelengths`: of the scene that the plan was made for.
+    - `scene_distances`, `scene_wavelengths`, `scene_weights`: of the
+      scene that the plan was made for.
     - `field_shape`: samples of the largest projected plane on the sensor's pitch.
     - `padded_shape`: window of the convolutions.
     - `cost`, `full_cost`: of the plan and of computing every plane and wavelength.
@@ -58,6 +62,7 @@ class Plan(NamedTuple):
     weights: tuple[float, ...]
     scene_distances: tuple[float, ...]
     scene_wavelengths: tuple[float, ...]
+    scene_weights: tuple[float, ...]
     field_shape: tuple[int, int]
     padded_shape: tuple[int, int]
     cost: Cost

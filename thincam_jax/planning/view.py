@@ -10,6 +10,7 @@ from jaxtyping import Complex, Float
 from thincam_jax._precision import Precision
 from thincam_jax.camera import LenslessCamera
 from thincam_jax.cost import Cost, convolution_cost, psf_cost
+from thincam_jax.digits import held_in_single
 from thincam_jax.imaging import project, projected_shape
 from thincam_jax.operators import kernel_grid, kernel_shape
 from thincam_jax.planning.crop import crop_factor
@@ -17,11 +18,12 @@ from thincam_jax.planning.spectrum import image_spectrum, sample_frequencies
 from thincam_jax.planning.transfer import TransferProbe
 from thincam_jax.psf import Model
 from thincam_jax.scene import Scene
+from thincam_jax.selection.terms import CLOSED, UNBOUNDED
 
 # Predictions come from some hundred random frequencies: what they are multiplied with.
 _MARGIN = 1.5
-# Members of a batch of images that are looked at.
-_MEMBERS = 3
+# Nodes of the pixel average for the capture's energy, which fringes hardly change.
+_ENERGY_NODES = 6
 
 
 class Way(NamedTuple):
@@ -53,11 +55,8 @@ class View:
         shape = kernel_shape(camera.sensor.shape, self.field_shape)
         self.frequencies = sample_frequencies(max(shape))
         self.probe = TransferProbe(camera, shape, self.frequencies)
-        members = np.unique(np.linspace(0, self.batch - 1, min(self.batch, _MEMBERS)).astype(int))
         fields = [
-            np.asarray(project(camera, p, self.field_shape), float).reshape(-1, *self.field_shape)[
-                members
-            ]
+            np.asarray(project(camera, p, self.field_shape), float).reshape(-1, *self.field_shape)
             for p in scene.planes
         ]
         # (plane, member, frequency)
@@ -87,15 +86,50 @@ class View:
 
     def relative(self, error: Complex[np.ndarray, "*member k"]) -> float:
         """Norm of an image given by its spectrum, relative to that of the capture."""
-        energy = np.sum(self.frequencies.weights * np.abs(error) ** 2)
+        energy = float(np.sum(self.frequencies.weights * np.abs(error) ** 2))
+        if energy == 0.0:
+            return 0.0
+        if self.capture_energy == 0.0 or math.isinf(self.crop):
+            return math.inf  # the error is all there is
         return _MARGIN * self.crop * math.sqrt(energy / self.capture_energy)
+
+    def relative_of_all(self, error: Complex[np.ndarray, " k"]) -> float:
+        """The same for an error of the PSF that all planes share.
+
+        They add up, or, where they cancel, may do so no longer: the larger of the two.
+        """
+        apart = np.sqrt(np.sum(np.abs(self.spectra) ** 2, axis=(0, 1)))
+        return max(self.relative(error * self.spectra.sum(axis=0)), self.relative(error * apart))
 
     @functools.cached_property
     def capture_energy(self) -> float:
-        """Of the capture, taking the PSF of one corner for all; the smallest of them."""
+        """Of the capture, at the wavelength in the middle of the light."""
+        middle = float(np.quantile(self.wavelengths, 0.5, method="nearest"))
+        capture = sum(
+            self.probe.quick(middle, distance, "separable", True, _ENERGY_NODES) * spectrum
+            for distance, spectrum in zip(self.distances, self.spectra, strict=True)
+        )
         light = self.weights.sum() ** 2
-        energies = [light * float(np.sum(self.power * np.abs(h) ** 2)) for h in self.references]
-        return min(energies) or 1.0
+        return light * float(np.sum(self.frequencies.weights * np.abs(capture) ** 2))
+
+    @property
+    def models(self) -> tuple[Model, ...]:
+        """Closed forms that can hold the mask."""
+        displayed = getattr(self.camera.mask, "pixels", None) is not None
+        return tuple(m for m in CLOSED if not displayed or m not in UNBOUNDED)
+
+    def held_in_single(self, model: str) -> bool:
+        """Whether float32 holds the zones' phases, on the kernel's grid, for every plane."""
+        grid = kernel_grid(self.camera.sensor.grid, self.field_shape)
+        path = self.camera.path(min(self.wavelengths), max(self.distances))
+        return held_in_single(self.camera.mask, grid, path, model)
+
+    @property
+    def edge_wave(self) -> float:
+        """Amplitude of one edge's wave at the other, √(λd)/(πw)."""
+        width = min(float(extent) for extent in self.camera.mask.extent)
+        zone = math.sqrt(max(self.wavelengths) * float(self.camera.distance))
+        return zone / (math.pi * width)
 
     def psf_cost(self, way: Way) -> Cost:
         return psf_cost(

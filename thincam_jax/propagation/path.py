@@ -8,6 +8,9 @@ from jaxtyping import Array, Float
 
 from thincam_jax import _checks
 
+# No optics beyond: a wavelength above 0.1 mm was meant in nanometres or micrometres.
+_LONGEST = 0.1
+
 
 class Path(eqx.Module):
     """A point source on the axis at distance t before the mask, a sensor at d behind it.
@@ -26,6 +29,11 @@ class Path(eqx.Module):
 
     def __init__(self, wavelength, distance, object_distance: Any = jnp.inf):
         self.wavelength = _checks.positive("wavelength", wavelength, "mm")
+        if not _checks.is_traced(self.wavelength) and float(self.wavelength) > _LONGEST:
+            raise ValueError(
+                f"wavelength = {float(self.wavelength):g} mm is no light: give it in mm, "
+                "such as 500 * nm"
+            )
         self.distance = _checks.positive("distance", distance, "mm")
         self.object_distance = _checks.positive(
             "object_distance", object_distance, "mm", allow_infinity=True

@@ -117,7 +117,7 @@ class ZoneProbe:
     def __init__(
         self, mask: AbstractMask, grid: Grid, path: Path, *, pixel_integration: bool
     ) -> None:
-        self.shape, self.pixel_integration = grid.shape, pixel_integration
+        self.shape, self.pixel_integration, self.path = grid.shape, pixel_integration, path
         self.lines = lines_of(mask, grid, path)
         self.given: dict[Precision, tuple[AbstractMask, Array, Path]]
         with allow("float64", mask, grid, path):

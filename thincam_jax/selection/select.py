@@ -7,14 +7,15 @@ import jax
 
 from thincam_jax import _checks
 from thincam_jax._memory import available_bytes
-from thincam_jax._precision import PRECISIONS, Precision, precision_of
+from thincam_jax._precision import PRECISIONS, RESULT_ROUNDING, Precision, precision_of
 from thincam_jax.camera import LenslessCamera
 from thincam_jax.cost import Cost, psf_cost
+from thincam_jax.digits import held_in_single
 from thincam_jax.grids import Grid
-from thincam_jax.propagation.orders import require_zone_orders
 from thincam_jax.psf import MODELS, Model, sampling_of
 from thincam_jax.selection import reasons as words
 from thincam_jax.selection.probe import ZoneProbe
+from thincam_jax.selection.terms import UNBOUNDED
 
 # Predictions are estimates from some rows and columns (or pixels, for the direct sum): what they
 # are multiplied with so that they stay above the true error, found over 500 random cameras.
@@ -141,12 +142,28 @@ def predict_error(
 
 
 def tolerance_of(tolerance: float) -> float:
-    return float(_checks.positive("tolerance", tolerance, "parts of one"))
+    """A relative error, at most 1."""
+    tolerance = float(_checks.positive("tolerance", tolerance, "parts of one"))
+    if tolerance > 1:
+        raise ValueError(f"tolerance = {tolerance:g} is relative: give at most 1 (0.01 is 1 %)")
+    return tolerance
+
+
+def require_camera(camera: LenslessCamera, function: str) -> None:
+    """A camera with a mask of zone orders, whose fields have one-dimensional factors."""
+    if not isinstance(camera, LenslessCamera):
+        raise TypeError(f"camera is a {type(camera).__name__}; give a thincam_jax.LenslessCamera")
+    if not hasattr(camera.mask, "zone_orders"):
+        raise TypeError(
+            f"{function} needs a mask made of zone orders, such as FresnelZoneAperture; for a "
+            f"{type(camera.mask).__name__} choose 'angular_spectrum' or 'rayleigh_sommerfeld' "
+            "and their oversampling yourself"
+        )
 
 
 def probe_of(camera, wavelength, object_distance, pixel_integration, grid) -> ZoneProbe:
     """The probe of a camera whose numbers are known."""
-    require_zone_orders(camera.mask, "select_model")
+    require_camera(camera, "select_model")
     path = camera.path(wavelength, object_distance)
     grid = grid or camera.sensor.grid
     if any(_checks.is_traced(leaf) for leaf in jax.tree.leaves((camera, path, grid))):
@@ -170,7 +187,9 @@ def ways(camera: LenslessCamera, grid: Grid, pixel_integration: bool):
         operations = way[3].flops * (2.0 if way[1] == "float64" else 1.0)
         return operations + (0.0 if way[1] == own else _CONVERSION)
 
-    for model in MODELS:
+    displayed = getattr(camera.mask, "pixels", None) is not None
+    models = [m for m in MODELS if not displayed or m not in UNBOUNDED]
+    for model in models:
         shape, samples = sampling_of(camera, grid, model, pixel_integration, None, None)
         for precision in PRECISIONS:
             cost = _cost(camera, grid, model, pixel_integration, shape, samples, precision)
@@ -191,10 +210,14 @@ def predicted_error(
     oversampling: int | None,
 ) -> float:
     """Relative L2 error of one model, with the margin that keeps it above the true one."""
+    if precision == "float32" and not held_in_single(camera.mask, grid, probe.path, model):
+        return math.inf  # `psf` refuses it
+    result = RESULT_ROUNDING[precision_of(grid.pitch)]
     if oversampling is None:
         if model == "closed_form" and probe.focus() < 1e-6:
             return math.inf  # `psf` refuses it
-        return _MARGIN_CLOSED * (probe.model_error(model) + probe.rounding(model, precision))
+        error = probe.model_error(model) + probe.rounding(model, precision)
+        return _MARGIN_CLOSED * error + result
     shape, _ = sampling_of(camera, grid, model, probe.pixel_integration, oversampling, None)
     assert shape is not None  # the model samples, and nothing is traced
     measure = probe.angular_spectrum if model == "angular_spectrum" else probe.rayleigh_sommerfeld
