@@ -44,6 +44,8 @@ def capture(
     if plan is not None:
         if model is not None or pixel_integration is not None:
             raise ValueError("a plan chooses model and pixel_integration: leave them out")
+        if not isinstance(plan, Plan):
+            raise TypeError(f"plan is a {type(plan).__name__}; give what thincam_jax.plan returns")
         image = run_plan(plan, camera, scene)
     else:
         whole = True if pixel_integration is None else pixel_integration

@@ -16,8 +16,6 @@ _NEAR = 0.01
 
 def require_fits(plan: Plan, camera: LenslessCamera, scene: Scene) -> None:
     """ValueError where camera or scene are not the plan's. Traced numbers cannot be looked at."""
-    if not isinstance(plan, Plan):
-        raise TypeError(f"plan is a {type(plan).__name__}; give what thincam_jax.plan returns")
     other = _other_numbers(plan.camera, camera)
     if other:
         raise ValueError(
