@@ -234,7 +234,7 @@ def test_odd_scenes_stay_within_their_prediction(name, tolerance):
 
 def test_phases_that_float32_does_not_hold_are_planned_in_float64():
     mask = tc.FresnelZoneAperture(1e3, width=100.0)
-    own = tc.LenslessCamera(mask, tc.Sensor((64, 72), 1.0), 6.5)
+    own = tc.LenslessCamera(mask, tc.Sensor((64, 72), 1.0), 0.65)
     one = tc.Scene(flat([500.0], 0.3), 500 * nm)
     plan = tc.plan(own, one, tolerance=0.3)
     assert plan.precision == "float64"
