@@ -38,6 +38,7 @@ def test_accuracy_page(capsys):
     names = run_examples("docs/accuracy.md")
     printed = capsys.readouterr().out
     page = (ROOT / "docs/accuracy.md").read_text("utf-8")
+    assert not re.findall(r"\b[A-Z]{7,}\b", page)  # no figure left to be filled in
     choice = names["choice"]
     assert f"{choice.model} {choice.precision} {choice.predicted_error:.4f}" in page
     *told, rounding, fresnel = choice.reasons

@@ -82,9 +82,12 @@ def separable(
         average = jnp.asarray(node_weights / 2, dtype=x.dtype)[:, None]
         return jnp.sum(fields[lower, :] * jnp.conj(fields[upper, :]) * as_complex(average), axis=1)
 
-    # Both axes at once: half as much to compile.
-    both = products(
-        jnp.concatenate([grid.y / scale - mask.centre[0], grid.x / scale - mask.centre[1]])
-    )
-    rows, columns = jnp.split(both, [grid.shape[0]], axis=-1)
+    y, x = grid.y / scale - mask.centre[0], grid.x / scale - mask.centre[1]
+    if pixel_integration:
+        # Both axes at once: half as much to compile, and as fast.
+        both = products(jnp.concatenate([y, x]))
+        rows, columns = jnp.split(both, [grid.shape[0]], axis=-1)
+    else:
+        # One axis a core: a quarter faster.
+        rows, columns = products(y), products(x)
     return SeparableSum(weights[:, None] * rows, columns, grid)
