@@ -28,16 +28,15 @@ class TransferProbe:
     def __init__(
         self, camera: LenslessCamera, kernel_shape: tuple[int, int], frequencies: Frequencies
     ) -> None:
-        self.camera, self.count = camera, len(frequencies.weights)
+        self.camera = camera
         lengths = [_rounded_up(n) for n in kernel_shape]
-        self.indices = [centred(n) for n in kernel_shape]
+        indices = [centred(n) for n in kernel_shape]
         self.places = [
-            np.concatenate([i, np.zeros(n - len(i))])
-            for i, n in zip(self.indices, lengths, strict=True)
+            np.concatenate([i, np.zeros(n - len(i))]) for i, n in zip(indices, lengths, strict=True)
         ]
         self.waves = [
             waves(f, i, n)
-            for f, i, n in zip((frequencies.v, frequencies.u), self.indices, lengths, strict=True)
+            for f, i, n in zip((frequencies.v, frequencies.u), indices, lengths, strict=True)
         ]
 
     def exact(
@@ -45,10 +44,19 @@ class TransferProbe:
     ) -> Complex[np.ndarray, " k"]:
         """H with factors in that precision, transformed in double precision."""
         with allow("float64"):
-            waves_of = tuple(jnp.asarray(w) for w in self.waves)
             return self._transfer(
-                waves_of, precision, wavelength, distance, model, pixel_integration, PIXEL_NODES
+                self._double_waves,
+                precision,
+                wavelength,
+                distance,
+                model,
+                pixel_integration,
+                PIXEL_NODES,
             )
+
+    @functools.cached_property
+    def _double_waves(self) -> tuple[Float[Array, "n k2"], ...]:
+        return tuple(jnp.asarray(w) for w in self.waves)
 
     @functools.cached_property
     def _single_waves(self) -> tuple[Float[Array, "n k2"], ...]:
@@ -75,7 +83,7 @@ class TransferProbe:
         mask, pitch, path = cast((self.camera.mask, self.camera.sensor.pitch, path), precision)
         points = Points(self.places[0], self.places[1], pitch)
         transfer = _transfer(mask, points, path, *waves_of, model, pixel_integration, nodes)
-        return np.asarray(transfer).view(transfer.dtype).astype(complex)
+        return np.asarray(transfer, complex)
 
 
 @jax.jit(static_argnames=("model", "pixel_integration", "nodes"))

@@ -103,6 +103,7 @@ def select_model(
             break
     best = min(considered, key=lambda p: p.predicted_error)
     chosen = considered[-1] if considered[-1].predicted_error <= tolerance else best
+    paraxial_error = probe.paraxial_error()
     return Selection(
         model=chosen.model,
         precision=chosen.precision,
@@ -110,8 +111,8 @@ def select_model(
         predicted_error=chosen.predicted_error,
         meets_tolerance=chosen.predicted_error <= tolerance,
         cost=chosen.cost,
-        paraxial_error=probe.paraxial_error(),
-        reasons=_reasons(probe, chosen),
+        paraxial_error=paraxial_error,
+        reasons=(*_left_out(probe, chosen), words.fresnel(paraxial_error)),
         considered=tuple(considered),
     )
 
@@ -236,10 +237,8 @@ def _cost(camera, grid, model, pixel_integration, mask_shape, oversampling, prec
     )
 
 
-def _reasons(probe: ZoneProbe, chosen: Prediction) -> tuple[str, ...]:
-    if chosen.oversampling is None:
-        told = words.optics_left_out(probe, chosen.model)
-        told.append(words.rounding(probe, chosen.model, chosen.precision))
-    else:
-        told = [words.sampling(chosen.oversampling, chosen.predicted_error)]
-    return (*told, words.fresnel(probe.paraxial_error()))
+def _left_out(probe: ZoneProbe, chosen: Prediction) -> list[str]:
+    if chosen.oversampling is not None:
+        return [words.sampling(chosen.oversampling, chosen.predicted_error)]
+    told = words.optics_left_out(probe, chosen.model)
+    return [*told, words.rounding(probe, chosen.model, chosen.precision)]
