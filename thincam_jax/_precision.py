@@ -20,6 +20,11 @@ def precision_of(array: Any) -> Precision:
     return "float64" if array.dtype == jnp.float64 else "float32"
 
 
+def itemsize_of(precision: Precision) -> int:
+    """Bytes of a real number."""
+    return jnp.dtype(precision).itemsize
+
+
 @contextlib.contextmanager
 def allow(precision: Precision, *numbers: Any) -> Iterator[None]:
     """Makes float64 available inside, also where JAX is set to float32 only.

@@ -20,7 +20,7 @@ from thincam_jax.grids import Grid
 from thincam_jax.masks.base import AbstractMask
 from thincam_jax.propagation.angular_spectrum import angular_spectrum, require_odd
 from thincam_jax.propagation.chirps import ChirpSum
-from thincam_jax.propagation.closed_form import closed_form, focus_distance
+from thincam_jax.propagation.closed_form import closed_form, in_focus
 from thincam_jax.propagation.geometric import geometric
 from thincam_jax.propagation.paraxial import paraxial
 from thincam_jax.propagation.path import Path
@@ -37,8 +37,10 @@ Model = Literal[
     "rayleigh_sommerfeld",
 ]
 MODELS: tuple[Model, ...] = get_args(Model)
-_UNBOUNDED = ("paraxial", "closed_form")
-_SAMPLED = ("angular_spectrum", "rayleigh_sommerfeld")
+# Those of unbounded chirps, which cannot hold an edge or the pixels of a display; and those that
+# sample the mask.
+UNBOUNDED: tuple[Model, ...] = ("paraxial", "closed_form")
+SAMPLED: tuple[Model, ...] = ("angular_spectrum", "rayleigh_sommerfeld")
 
 
 def psf(
@@ -182,7 +184,7 @@ def _evaluate(function, mask, grid, path, model, pixel_integration, sampling, pr
 
 def sampling_of(camera, grid, model, pixel_integration, oversampling, mask_shape):
     """Mask plane in pixels and samples per pixel, for the models that sample."""
-    if model not in _SAMPLED:
+    if model not in SAMPLED:
         if oversampling is not None or mask_shape is not None:
             raise ValueError(
                 f"model {model!r} is a closed form: leave oversampling and mask_shape out"
@@ -224,7 +226,7 @@ def _check_memory(mask, grid: Grid, model: Model, pixel_integration, mask_shape,
 def _unfocused(mask: AbstractMask, path: Path) -> AbstractMask:
     return eqx.error_if(
         mask,
-        focus_distance(mask, path) < 1e-6,
+        in_focus(mask, path),
         "model 'closed_form' has no PSF where an order focuses on the sensor (k·ε = −1); "
         "use 'separable'",
     )

@@ -3,14 +3,13 @@
 from typing import NamedTuple
 
 from thincam_jax._memory import available_bytes, readable
-from thincam_jax._precision import PRECISIONS, Precision
+from thincam_jax._precision import PRECISIONS, Precision, itemsize_of
 from thincam_jax.bench.cameras import Conditions
 from thincam_jax.camera import LenslessCamera
 from thincam_jax.cost import Cost, psf_cost
-from thincam_jax.propagation.closed_form import focus_distance
-from thincam_jax.psf import MODELS, Model, sampling_of
+from thincam_jax.propagation.closed_form import in_focus
+from thincam_jax.psf import MODELS, SAMPLED, Model, sampling_of
 
-SAMPLED = ("angular_spectrum", "rayleigh_sommerfeld")
 OVERSAMPLINGS = (1, 3)
 # Operations of a direct sum that take some seconds; it is not run beyond.
 DIRECT_SUM_LIMIT = 2e10
@@ -46,7 +45,7 @@ def all_ways(camera: LenslessCamera, pixel_integration: bool) -> list[Way]:
                     pixel_integration=pixel_integration,
                     mask_shape=shape,
                     oversampling=samples,
-                    itemsize=8 if precision == "float64" else 4,
+                    itemsize=itemsize_of(precision),
                 )
                 found.append(Way(model, precision, oversampling, shape, cost))
     return found
@@ -59,12 +58,7 @@ def why_not(model: Model, cost: Cost, given: Conditions) -> str | None:
     free = available_bytes()
     if free is not None and cost.bytes > free:
         return f"needs about {readable(cost.bytes)}, {readable(free)} are free"
-    if model == "closed_form" and _in_focus(given):
+    path = given.camera.path(given.wavelength, given.object_distance)
+    if model == "closed_form" and in_focus(given.camera.mask, path):
         return "has no PSF: an order of the mask focuses on the sensor"
     return None
-
-
-def _in_focus(given: Conditions) -> bool:
-    """Where `psf` refuses the model "closed_form"."""
-    path = given.camera.path(given.wavelength, given.object_distance)
-    return float(focus_distance(given.camera.mask, path)) < 1e-6

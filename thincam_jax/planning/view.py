@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Complex, Float
 
-from thincam_jax._precision import Precision
+from thincam_jax._precision import Precision, itemsize_of
 from thincam_jax.camera import LenslessCamera
 from thincam_jax.cost import Cost, convolution_cost, psf_cost
 from thincam_jax.digits import held_in_single
@@ -16,9 +16,9 @@ from thincam_jax.operators import kernel_grid, kernel_shape
 from thincam_jax.planning.crop import crop_factor
 from thincam_jax.planning.spectrum import image_spectrum, sample_frequencies
 from thincam_jax.planning.transfer import TransferProbe
-from thincam_jax.psf import Model
+from thincam_jax.psf import UNBOUNDED, Model
 from thincam_jax.scene import Scene
-from thincam_jax.selection.terms import CLOSED, UNBOUNDED
+from thincam_jax.selection.terms import CLOSED
 
 # Predictions come from some hundred random frequencies: what they are multiplied with.
 _MARGIN = 1.5
@@ -35,7 +35,7 @@ class Way(NamedTuple):
 
     @property
     def itemsize(self) -> int:
-        return 8 if self.precision == "float64" else 4
+        return itemsize_of(self.precision)
 
 
 FULL = Way("separable", "float64", True)

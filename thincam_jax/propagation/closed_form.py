@@ -1,6 +1,7 @@
 r"""`closed_form`: the exact Fresnel field of a zone aperture without an edge."""
 
 import jax.numpy as jnp
+from jaxtyping import Array, Bool
 
 from thincam_jax._phase import as_complex
 from thincam_jax.masks.base import AbstractMask
@@ -37,8 +38,8 @@ def closed_form(mask: AbstractMask, path: Path) -> ChirpSum:
     return ChirpSum(amplitudes, curvatures / scale**2, scale * mask.centre)
 
 
-def focus_distance(mask: AbstractMask, path: Path):
-    """Smallest |1 + kε| over the orders: 0 where an order focuses on the sensor."""
+def in_focus(mask: AbstractMask, path: Path) -> Bool[Array, ""]:
+    """Whether an order focuses on the sensor, 1 + kε = 0: the unbounded mask has no PSF there."""
     zones = require_zone_orders(mask, "closed_form")
     k = jnp.asarray(zones.orders, dtype=zones.beta.dtype)
-    return jnp.min(jnp.abs(1 + k * path.epsilon(zones.beta)))
+    return jnp.min(jnp.abs(1 + k * path.epsilon(zones.beta))) < 1e-6

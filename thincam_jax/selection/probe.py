@@ -13,7 +13,7 @@ from thincam_jax._precision import PRECISIONS, Precision, allow, cast
 from thincam_jax.grids import Grid
 from thincam_jax.masks.base import AbstractMask
 from thincam_jax.propagation.angular_spectrum import planes
-from thincam_jax.propagation.closed_form import focus_distance
+from thincam_jax.propagation.closed_form import in_focus
 from thincam_jax.propagation.orders import pairs, require_zone_orders
 from thincam_jax.propagation.path import Path
 from thincam_jax.propagation.plane import block_average, lit_mask
@@ -251,11 +251,11 @@ class ZoneProbe:
                 largest_phase=max(2 * phase, float(path.fresnel_curvature) * reach**2),
             )
 
-    def focus(self) -> float:
-        """Smallest |1 + kε|: how far the nearest order is from being in focus on the sensor."""
+    def in_focus(self) -> bool:
+        """Whether an order focuses on the sensor, where `psf` refuses the closed form."""
         with allow("float64"):
             mask, _, path = self.given["float64"]
-            return float(focus_distance(mask, path))
+            return bool(in_focus(mask, path))
 
     def paraxial_error(self) -> float:
         """Relative distance of the Fresnel approximation from exact scalar diffraction.

@@ -7,15 +7,14 @@ import jax
 
 from thincam_jax import _checks
 from thincam_jax._memory import available_bytes
-from thincam_jax._precision import PRECISIONS, RESULT_ROUNDING, Precision, precision_of
+from thincam_jax._precision import PRECISIONS, RESULT_ROUNDING, Precision, itemsize_of, precision_of
 from thincam_jax.camera import LenslessCamera
 from thincam_jax.cost import Cost, psf_cost
 from thincam_jax.digits import held_in_single
 from thincam_jax.grids import Grid
-from thincam_jax.psf import MODELS, Model, sampling_of
+from thincam_jax.psf import MODELS, UNBOUNDED, Model, sampling_of
 from thincam_jax.selection import reasons as words
 from thincam_jax.selection.probe import ZoneProbe
-from thincam_jax.selection.terms import UNBOUNDED
 
 # Predictions are estimates from some rows and columns (or pixels, for the direct sum): what they
 # are multiplied with so that they stay above the true error, found over 500 random cameras.
@@ -215,7 +214,7 @@ def predicted_error(
         return math.inf  # `psf` refuses it
     result = RESULT_ROUNDING[precision_of(grid.pitch)]
     if oversampling is None:
-        if model == "closed_form" and probe.focus() < 1e-6:
+        if model == "closed_form" and probe.in_focus():
             return math.inf  # `psf` refuses it
         error = probe.model_error(model) + probe.rounding(model, precision)
         return _MARGIN_CLOSED * error + result
@@ -233,7 +232,7 @@ def _cost(camera, grid, model, pixel_integration, mask_shape, oversampling, prec
         pixel_integration=pixel_integration,
         mask_shape=mask_shape,
         oversampling=oversampling,
-        itemsize=8 if precision == "float64" else 4,
+        itemsize=itemsize_of(precision),
     )
 
 

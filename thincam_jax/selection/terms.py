@@ -11,11 +11,9 @@ from thincam_jax.propagation.paraxial import paraxial
 from thincam_jax.propagation.path import Path
 from thincam_jax.propagation.separable import PIXEL_NODES, separable
 from thincam_jax.propagation.separable_sum import SeparableSum
-from thincam_jax.psf import Model
+from thincam_jax.psf import MODELS, SAMPLED, Model
 
-CLOSED: tuple[Model, ...] = ("geometric", "paraxial", "closed_form", "separable")
-# Those of unbounded chirps, which cannot hold an edge or the pixels of a display.
-UNBOUNDED: tuple[Model, ...] = ("paraxial", "closed_form")
+CLOSED: tuple[Model, ...] = tuple(model for model in MODELS if model not in SAMPLED)
 
 
 @jax.jit(static_argnames=("model", "pixel_integration", "nodes"))
