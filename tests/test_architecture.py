@@ -21,6 +21,7 @@ ORDER = (
     *(
         "units",
         "_checks",
+        "_files",
         "_memory",
         "_phase",
         "_precision",
@@ -46,7 +47,7 @@ ORDER = (
         "waveguide",
         "reconstruct",
     ),
-    *("metrics", "design", "calibrate", "config", "study", "report"),
+    *("metrics", "design", "calibrate", "measured", "config", "study", "report"),
     *("bench", "doctor", "run", "cli"),
     "hardware",
 )

@@ -1,10 +1,10 @@
 """The folder of a benchmark: its two files, and nothing of anybody else."""
 
 import json
-import os
 from pathlib import Path
 from typing import Any
 
+from thincam_jax._files import write_whole
 from thincam_jax.config import ConfigError
 from thincam_jax.study.folder import to_json
 
@@ -50,8 +50,8 @@ class BenchFolder:
 
     def finish(self, results: dict[str, Any], figure: bytes) -> None:
         """Write both files; the table last, because it marks the benchmark as complete."""
-        self._write("accuracy.png", figure)
-        self._write("accuracy.json", to_json(results).encode("utf-8"))
+        write_whole(self.path / "accuracy.png", figure)
+        write_whole(self.path / "accuracy.json", to_json(results))
 
     def _own(self) -> list[str]:
         return [name + end for name in _FILES for end in ("", ".partial")]
@@ -68,8 +68,3 @@ class BenchFolder:
         except (OSError, ValueError):
             return None
         return held if isinstance(held, dict) else None
-
-    def _write(self, name: str, data: bytes) -> None:
-        partial = self.path / (name + ".partial")
-        partial.write_bytes(data)
-        os.replace(partial, self.path / name)

@@ -1,11 +1,18 @@
 """From captures back to an image: one entry point, one file a method."""
 
+from thincam_jax.reconstruct.build import camera_problem as camera_problem
+from thincam_jax.reconstruct.build import psf_problem as psf_problem
+from thincam_jax.reconstruct.drive import Progress as Progress
 from thincam_jax.reconstruct.entry import METHODS as METHODS
 from thincam_jax.reconstruct.entry import reconstruct as reconstruct
+from thincam_jax.reconstruct.fixed_point import FixedPoint as FixedPoint
+from thincam_jax.reconstruct.fixed_point import solve_fixed_point as solve_fixed_point
 from thincam_jax.reconstruct.fringe_scanning import FringeScanning as FringeScanning
+from thincam_jax.reconstruct.problem import Deconvolution as Deconvolution
 from thincam_jax.reconstruct.registration import register as register
 from thincam_jax.reconstruct.result import Reconstruction as Reconstruction
 from thincam_jax.reconstruct.synthesis import fringe_scanning as fringe_scanning
 from thincam_jax.reconstruct.synthesis import phase_pairs as phase_pairs
 from thincam_jax.reconstruct.synthesis import separate as separate
+from thincam_jax.reconstruct.total_variation import TotalVariation as TotalVariation
 from thincam_jax.reconstruct.wiener import WienerSynthesis as WienerSynthesis

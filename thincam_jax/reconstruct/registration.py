@@ -1,11 +1,15 @@
 """Bringing captures at different mask-sensor distances to one scale."""
 
 import math
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+
+from thincam_jax import _checks
+from thincam_jax.camera import LenslessCamera
 
 
 def registered_shape(shape: tuple[int, int], ratio: float) -> tuple[int, int]:
@@ -38,3 +42,19 @@ def register(image: Float[Array, "*batch y x"], ratio: float) -> Float[Array, "*
         antialias=False,
     )
     return enlarged
+
+
+def distance_ratios(cameras: Sequence[LenslessCamera]) -> list[float]:
+    """How much each camera's captures are enlarged: largest distance over its own."""
+    if any(_checks.is_traced(c.distance) for c in cameras):
+        raise TypeError(
+            "the cameras' distances are traced, but set array sizes: give them as known numbers"
+        )
+    distances = [float(c.distance) for c in cameras]
+    return [max(distances) / d for d in distances]
+
+
+def own_field(field_shape, ratio: float) -> tuple[int, int]:
+    """The field in samples of a camera's own scale, ratio times coarser; parity as the field's."""
+    rows, columns = (n - 2 * math.floor((n - n / ratio) / 2 + 1e-6) for n in field_shape)
+    return rows, columns

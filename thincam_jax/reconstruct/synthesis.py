@@ -5,7 +5,11 @@ A synthesis is a real matrix W (channel × capture): the channel c is Σ_k W_ck 
 two real channels here, so that results are real without a projection and noise is counted right.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
+
+from thincam_jax.camera import LenslessCamera
 
 
 def separate(count: int) -> np.ndarray:
@@ -28,3 +32,26 @@ def phase_pairs(groups: int) -> np.ndarray:
     The constant cancels; the second harmonic, and with it twice the aperture's cut-off, stays.
     """
     return np.kron(np.eye(groups), np.array([[1.0, -1.0]]))
+
+
+def check_synthesis(
+    synthesis: np.ndarray, cameras: Sequence[LenslessCamera], ratios: Sequence[float]
+) -> None:
+    """Refuse what does not add captures of one scale, or counts noise twice."""
+    if synthesis.ndim != 2 or synthesis.shape[1] != len(cameras):
+        raise ValueError(
+            f"synthesis has shape {synthesis.shape}; give (channels, {len(cameras)}), "
+            "one column for each camera"
+        )
+    if not np.any(synthesis, axis=1).all():
+        raise ValueError("synthesis has a row of zeros: every channel needs a capture")
+    for row in synthesis:
+        used = {r for w, r in zip(row, ratios, strict=True) if w}
+        if len(used) > 1:
+            raise ValueError("a channel combines captures at different distances; make them two")
+    gram = synthesis @ synthesis.T
+    if np.abs(gram - np.diag(np.diag(gram))).max() > 1e-9 * np.abs(gram).max():
+        raise ValueError("channels share noise: make the rows of synthesis orthogonal")
+    grids = {(c.sensor.shape, float(c.sensor.pitch)) for c in cameras}
+    if len(grids) > 1:
+        raise ValueError(f"cameras have different sensors {sorted(grids)}; use one sensor")

@@ -1,7 +1,6 @@
 r"""Wiener synthesis of K captures into one image (thesis Eq 3.44, corrected)."""
 
 import functools
-import math
 from collections.abc import Sequence
 
 import equinox as eqx
@@ -16,7 +15,12 @@ from thincam_jax.camera import LenslessCamera
 from thincam_jax.grids import Grid, fast_shape, same_parity
 from thincam_jax.operators import CropConvolution, kernel_grid, kernel_shape
 from thincam_jax.psf import Model, psf
-from thincam_jax.reconstruct.registration import register, registered_shape
+from thincam_jax.reconstruct.registration import (
+    distance_ratios,
+    own_field,
+    register,
+    registered_shape,
+)
 from thincam_jax.reconstruct.result import Reconstruction
 from thincam_jax.reconstruct.spectra import (
     Prior,
@@ -25,6 +29,7 @@ from thincam_jax.reconstruct.spectra import (
     prior_spectrum,
     scene_power,
 )
+from thincam_jax.reconstruct.synthesis import check_synthesis
 
 
 class WienerSynthesis(eqx.Module):
@@ -87,8 +92,8 @@ class WienerSynthesis(eqx.Module):
     ):
         _checks.choice("prior", prior, ("inverse_square", "flat"))
         synthesis = np.asarray(synthesis, dtype=float)
-        capture_ratios = _distance_ratios(cameras)
-        _check_synthesis(synthesis, cameras, capture_ratios)
+        capture_ratios = distance_ratios(cameras)
+        check_synthesis(synthesis, cameras, capture_ratios)
         sensor = cameras[0].sensor.grid
         self.sensor_shape = sensor.shape
         self.field_shape = same_parity(field_shape or sensor.shape, sensor.shape)
@@ -99,14 +104,12 @@ class WienerSynthesis(eqx.Module):
         wavelengths = jnp.broadcast_to(jnp.asarray(wavelength), (len(cameras),))
         kernels, uniform = [], []
         for camera, w, ratio in zip(cameras, wavelengths, capture_ratios, strict=True):
-            own_field = _own_field(self.field_shape, ratio)
-            grid = kernel_grid(sensor, own_field)
+            own = own_field(self.field_shape, ratio)
+            grid = kernel_grid(sensor, own)
             h = psf(camera, wavelength=w, object_distance=object_distance, grid=grid, **how)
             kernels.append(h)
-            cover = jnp.asarray(_coverage(own_field, self.field_shape, ratio), dtype=h.dtype)
-            uniform.append(
-                _convolve(CropConvolution(h, sensor.pitch, sensor.shape, own_field), cover)
-            )
+            cover = jnp.asarray(_coverage(own, self.field_shape, ratio), dtype=h.dtype)
+            uniform.append(_convolve(CropConvolution(h, sensor.pitch, sensor.shape, own), cover))
         self.uniform = jnp.stack(uniform)
         self.padded = _padded(sensor.shape, self.field_shape, max(self.ratios))
         self.spectra = jnp.stack(
@@ -185,41 +188,6 @@ class WienerSynthesis(eqx.Module):
         return density, scene
 
 
-def _distance_ratios(cameras: Sequence[LenslessCamera]) -> list[float]:
-    if any(_checks.is_traced(c.distance) for c in cameras):
-        raise TypeError(
-            "the cameras' distances are traced, but set array sizes: give them as known numbers"
-        )
-    distances = [float(c.distance) for c in cameras]
-    return [max(distances) / d for d in distances]
-
-
-def _check_synthesis(synthesis: np.ndarray, cameras, ratios) -> None:
-    if synthesis.ndim != 2 or synthesis.shape[1] != len(cameras):
-        raise ValueError(
-            f"synthesis has shape {synthesis.shape}; give (channels, {len(cameras)}), "
-            "one column for each camera"
-        )
-    if not np.any(synthesis, axis=1).all():
-        raise ValueError("synthesis has a row of zeros: every channel needs a capture")
-    for row in synthesis:
-        used = {r for w, r in zip(row, ratios, strict=True) if w}
-        if len(used) > 1:
-            raise ValueError("a channel combines captures at different distances; make them two")
-    gram = synthesis @ synthesis.T
-    if np.abs(gram - np.diag(np.diag(gram))).max() > 1e-9 * np.abs(gram).max():
-        raise ValueError("channels share noise: make the rows of synthesis orthogonal")
-    grids = {(c.sensor.shape, float(c.sensor.pitch)) for c in cameras}
-    if len(grids) > 1:
-        raise ValueError(f"cameras have different sensors {sorted(grids)}; use one sensor")
-
-
-def _own_field(field_shape, ratio: float) -> tuple[int, int]:
-    """The field in samples of a camera's own scale, ratio times coarser; parity as the field's."""
-    rows, columns = (n - 2 * math.floor((n - n / ratio) / 2 + 1e-6) for n in field_shape)
-    return rows, columns
-
-
 def _coverage(own_field, field_shape, ratio: float) -> np.ndarray:
     """How much of each own sample the field covers: the outermost ones lie partly outside."""
     sides = []
@@ -231,7 +199,7 @@ def _coverage(own_field, field_shape, ratio: float) -> np.ndarray:
 
 def _padded(sensor_shape, field_shape, ratio: float) -> tuple[int, int]:
     """A window in which neither the enlarged captures nor the enlarged kernels wrap round."""
-    largest = registered_shape(kernel_shape(sensor_shape, _own_field(field_shape, ratio)), ratio)
+    largest = registered_shape(kernel_shape(sensor_shape, own_field(field_shape, ratio)), ratio)
     return fast_shape(largest, real=True)
 
 

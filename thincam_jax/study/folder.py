@@ -1,10 +1,10 @@
 """The run folder: what is in it, and how an interrupted study goes on."""
 
 import json
-import os
 from pathlib import Path
 from typing import Any
 
+from thincam_jax._files import write_whole
 from thincam_jax.config import ConfigError, StudyConfig, dump_config, slug
 
 
@@ -62,13 +62,8 @@ class RunFolder:
         self.write(f"targets/{slug(target)}.json", to_json(results))
 
     def write(self, name: str, content: str | bytes) -> Path:
-        """Write a file by way of a neighbour that is renamed."""
-        path = self.path / name
-        partial = path.with_name(path.name + ".partial")
-        data = content.encode("utf-8") if isinstance(content, str) else content
-        partial.write_bytes(data)
-        os.replace(partial, path)
-        return path
+        """Write a file of the folder, whole or not at all."""
+        return write_whole(self.path / name, content)
 
 
 def to_json(data: Any) -> str:

@@ -1,0 +1,283 @@
+"""The whole preparation against the same steps written out in float64."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+from thincam_jax.measured import MeasurementError, Preparation, Raw, log_text, prepare
+
+ROWS, COLUMNS = 24, 36
+
+
+def measured(*channels, bits=12, seed=11, shape=(ROWS, COLUMNS)):
+    """Counts of an image with a dark corner, well below full scale."""
+    generator = np.random.default_rng(seed)
+    counts = generator.integers(60, 0.8 * 2**bits, (*shape, *channels))
+    counts[:16, :16] = generator.integers(40, 60, (16, 16, *channels))
+    return counts.astype(np.uint16)
+
+
+def blocks(image, n):
+    """Means of n × n blocks of (y, x), one slice of the rows and columns at a time."""
+    return sum(image[i::n, j::n] for i in range(n) for j in range(n)) / n**2
+
+
+def unit_sum(psf):
+    return psf / psf.sum()
+
+
+def test_one_channel_with_the_corner_as_background():
+    psf, capture = measured(), measured(seed=12)
+    found = prepare(Raw(psf, 12), Raw(capture, 12), options=Preparation(downsample=4))
+    level = psf[5:15, 5:15].astype(float).mean()
+    light = blocks(np.maximum(psf - level, 0), 4)
+    image = blocks(np.maximum(capture - level, 0), 4) / 4095
+    np.testing.assert_allclose(found.psf[0], unit_sum(light), rtol=1e-5, atol=1e-9)
+    np.testing.assert_allclose(found.capture[0], image / image.max(), rtol=1e-5, atol=1e-7)
+    np.testing.assert_allclose(found.log["scaling"]["capture_divisor"], image.max(), rtol=1e-6)
+    assert found.psf.dtype == found.capture.dtype == np.float32
+    assert found.valid.all() and found.valid.shape == (1, 6, 9)
+    told = found.log["background"]["capture"]
+    np.testing.assert_allclose(told["level"], [level / 4095], rtol=1e-6)
+    clipped = [int((a < level).sum()) for a in (psf, capture)]
+    assert [found.log["clipping"][n] for n in ("psf", "capture")] == clipped
+    assert min(clipped) > 0
+
+
+def test_dark_frames_and_numbers():
+    psf, capture, dark = measured(), measured(seed=12), measured(seed=13) // 8
+    options = Preparation(capture_scale="none")
+    found = prepare(Raw(psf, 12), Raw(capture, 12), Raw(dark, 12), options)
+    expected = np.maximum(capture.astype(float) - dark, 0) / 4095
+    np.testing.assert_allclose(found.capture[0], expected, rtol=1e-5, atol=1e-7)
+    light = np.maximum(psf.astype(float) - dark, 0)
+    np.testing.assert_allclose(found.psf[0], unit_sum(light), rtol=1e-5, atol=1e-9)
+    found = prepare(Raw(psf, 12), Raw(capture, 12), 50, options, psf_background=0)
+    expected = np.maximum(capture.astype(float) - 50, 0) / 4095
+    np.testing.assert_allclose(found.capture[0], expected, rtol=1e-5, atol=1e-7)
+    np.testing.assert_allclose(found.psf[0], unit_sum(psf.astype(float)), rtol=1e-5)
+    assert found.log["background"]["psf"] == {"kind": "number", "level": [0.0]}
+
+
+def test_raw_data_are_left_as_they_were():
+    psf, capture = measured(3), measured(3, seed=12)
+    kept = psf.copy(), capture.copy()
+    first, second = (prepare(Raw(psf, 12), Raw(capture, 12), None) for _ in range(2))
+    np.testing.assert_array_equal(psf, kept[0])
+    np.testing.assert_array_equal(capture, kept[1])
+    np.testing.assert_array_equal(first.capture, second.capture)
+
+
+@pytest.mark.parametrize("psf_sum", ["each", "joint"])
+def test_colours_keep_their_places_and_sums(psf_sum):
+    psf, capture = measured(3), measured(3, seed=12)
+    options = Preparation(psf_sum=psf_sum, capture_scale="norm", downsample=2)
+    found = prepare(Raw(psf, 12), Raw(capture, 12), 40, options)
+    light = np.stack([blocks(psf[..., c] - 40.0, 2) for c in range(3)])
+    image = np.stack([blocks(capture[..., c] - 40.0, 2) for c in range(3)])
+    sums = light.sum(axis=(1, 2), keepdims=True)
+    light = light / (sums if psf_sum == "each" else sums.mean())
+    np.testing.assert_allclose(found.psf, light, rtol=1e-5)
+    np.testing.assert_allclose(found.capture, image / math.sqrt((image**2).sum()), rtol=1e-5)
+
+
+def test_one_psf_for_all_channels():
+    psf, capture = measured(3), measured(3, seed=12)
+    found = prepare(Raw(psf, 12), Raw(capture, 12), 0, Preparation(psf_channels="mean"))
+    mean = psf.astype(float).mean(axis=2)
+    np.testing.assert_allclose(found.psf, unit_sum(mean)[None], rtol=1e-5)
+    assert found.capture.shape == (3, ROWS, COLUMNS)
+    grey = prepare(Raw(psf[..., 0], 12), Raw(capture, 12))
+    assert grey.psf.shape == (1, ROWS, COLUMNS) and grey.capture.shape[0] == 3
+    averaged = prepare(Raw(psf, 12), Raw(capture[..., 0], 12), 0, Preparation(psf_channels="mean"))
+    np.testing.assert_array_equal(averaged.psf, found.psf)
+
+
+def test_bayer_superpixel_and_blocks_are_plain_means():
+    psf, capture = measured(), measured(seed=12)
+    options = Preparation(
+        bayer="GRBG", demosaicing="superpixel", downsample=3, capture_scale="none"
+    )
+    found = prepare(Raw(psf, 12), Raw(capture, 12), 40, options)
+    image = (capture - 40.0) / 4095
+    red, blue = image[::2, 1::2], image[1::2, ::2]
+    green = (image[::2, ::2] + image[1::2, 1::2]) / 2
+    expected = np.stack([blocks(c, 3) for c in (red, green, blue)])
+    np.testing.assert_allclose(found.capture, expected, rtol=1e-5)
+    assert found.psf.shape == (3, 4, 6)
+
+
+def test_bayer_bilinear_keeps_a_ramp():
+    y, x = np.mgrid[:ROWS, :COLUMNS]
+    ramp = (100 + 8 * y + 4 * x).astype(np.uint16)
+    options = Preparation(bayer="BGGR", capture_scale="none")
+    found = prepare(Raw(ramp, 12), Raw(ramp, 12), 0, options)
+    inside = found.capture[:, 1:-1, 1:-1] * 4095
+    np.testing.assert_allclose(inside, np.broadcast_to(ramp[1:-1, 1:-1], inside.shape), rtol=1e-6)
+
+
+def test_saturated_pixels_spoil_all_that_they_enter():
+    psf, capture = measured(), measured(seed=12)
+    capture[5, 9] = 4095
+    found = prepare(Raw(psf, 12), Raw(capture, 12), options=Preparation(downsample=4))
+    assert np.argwhere(~found.valid).tolist() == [[0, 1, 2]]
+    found = prepare(Raw(psf, 12), Raw(capture, 12), options=Preparation(bayer="RGGB"))
+    expected = np.zeros((3, ROWS, COLUMNS), bool)  # (5, 9) is blue
+    expected[2, 4:7, 8:11] = True
+    np.testing.assert_array_equal(~found.valid, expected)
+    assert found.log["validity"]["capture"]["saturated"] == 1
+    np.testing.assert_allclose(found.log["validity"]["valid_share"], 1 - 9 / expected.size)
+
+
+def test_saturation_below_full_scale_and_of_floats():
+    psf, capture = measured(), measured(seed=12) & 0xFFFE
+    level = capture.max() / 4095
+    for given, saturated in ((None, 0), (level, (capture == capture.max()).sum())):
+        options = Preparation(saturation=given)
+        found = prepare(Raw(psf, 12), Raw(capture, 12), options=options)
+        assert (~found.valid).sum() == saturated
+    bright = capture.astype(np.float32)  # of unknown scale: nothing is known to be full
+    assert prepare(Raw(psf.astype(np.float32)), Raw(bright)).valid.all()
+
+
+def test_dead_pixels_are_left_out_of_means():
+    psf, capture = measured(), measured(seed=12)
+    dead = np.zeros((ROWS, COLUMNS), bool)
+    dead[4, 8] = True
+    dead[8:12, 20:24] = True  # a whole block
+    capture[dead] = 4000
+    options = Preparation(downsample=4, capture_scale="none")
+    found = prepare(Raw(psf, 12), Raw(capture, 12), 0, options, dead=dead)
+    assert np.argwhere(~found.valid).tolist() == [[0, 2, 5]]
+    block = capture[4:8, 8:12].astype(float)
+    np.testing.assert_allclose(found.capture[0, 1, 2] * 4095, (block.sum() - 4000) / 15, rtol=1e-6)
+    # The block that nobody measured is a copy of one of its four neighbours.
+    neighbours = [found.capture[0, *place] for place in ((1, 5), (3, 5), (2, 4), (2, 6))]
+    assert found.capture[0, 2, 5] in neighbours
+    assert found.log["validity"]["capture"]["dead"] == 17
+    assert found.psf[0, 2, 5] in [found.psf[0, *p] for p in ((1, 5), (3, 5), (2, 4), (2, 6))]
+
+
+def test_odd_sides_are_cropped_centrally():
+    psf, capture = measured(shape=(27, 38)), measured(shape=(27, 38), seed=12)
+    options = Preparation(downsample=4, capture_scale="none")
+    found = prepare(Raw(psf, 12), Raw(capture, 12), 0, options)
+    expected = blocks(capture[1:25, 1:37].astype(float), 4) / 4095
+    np.testing.assert_allclose(found.capture[0], expected, rtol=1e-5)
+    told = found.log["downsampling"]
+    assert told["first_pixel"] == [1, 1] and told["cropped_to"] == [24, 36]
+
+
+def test_noise_of_the_corner_sets_the_threshold():
+    generator = np.random.default_rng(14)
+    psf = np.zeros((96, 120))
+    psf[50:60, 70:90] = 0.5
+    psf += generator.normal(0.1, 0.01, psf.shape)
+    options = Preparation(downsample=2, noise_threshold=5, corner=(0, 40))
+    found = prepare(Raw(psf), Raw(psf), options=options)
+    # Of 1600 samples: 2 % standard error.
+    np.testing.assert_allclose(found.log["clean_up"]["noise"], [0.005], rtol=0.08)
+    assert np.argwhere(found.psf[0]).min(axis=0).tolist() == [25, 35]
+    assert np.count_nonzero(found.psf) == 5 * 10
+    # A mosaic's colours may differ in level without that being noise.
+    psf[::2, ::2] += 0.2
+    mosaic = prepare(
+        Raw(psf), Raw(psf), 0, Preparation(bayer="RGGB", noise_threshold=5, corner=(0, 40))
+    )
+    np.testing.assert_allclose(mosaic.log["clean_up"]["noise"], [0.01], rtol=0.08)
+
+
+def test_centring_shifts_all_channels_alike():
+    psf = np.full((ROWS, COLUMNS, 3), 10, np.uint16)
+    psf[18, 20], psf[19, 20, 2] = 3000, 3500
+    capture = measured(3, seed=12)
+    found = prepare(Raw(psf, 12), Raw(capture, 12), 10, Preparation(centre="peak"))
+    assert found.log["centring"]["shift"] == [-6, -2]
+    assert np.argwhere(found.psf[0]).tolist() == [[12, 18]]
+    assert np.argwhere(found.psf[2]).tolist() == [[12, 18], [13, 18]]
+
+
+def test_a_shifted_psf_shifts_the_reconstruction_the_other_way():
+    """What the option `centre` says, by an inverse filter without noise."""
+    generator = np.random.default_rng(15)
+    scene, psf = generator.random((12, 17)), generator.random((12, 17)) ** 8
+    capture = np.fft.ifft2(np.fft.fft2(scene) * np.fft.fft2(psf))
+    moved = np.roll(psf, (2, -3), axis=(0, 1))
+    image = np.fft.ifft2(np.fft.fft2(capture) / np.fft.fft2(moved)).real
+    np.testing.assert_allclose(image, np.roll(scene, (-2, 3), axis=(0, 1)), atol=1e-9)
+
+
+def test_the_log_names_every_step_and_is_plain_json():
+    psf, capture = measured(3), measured(3, seed=12)
+    options = Preparation(centre="centroid", threshold=0.01, downsample=2)
+    log = prepare(Raw(psf, 12), Raw(capture, 12), options=options).log
+    assert set(log) == {"options", "order", *log["order"]}
+    assert log["order"][:4] == ["full_scale", "background", "clipping", "validity"]
+    assert log["order"][-1] == "scaling" and len(log["order"]) == 10
+    assert json.loads(json.dumps(log, allow_nan=False)) == json.loads(log_text(log))
+    at_maximum = log["full_scale"]["psf"]["pixels_at_maximum"]
+    assert at_maximum == (psf == psf.max()).sum()
+
+
+def refused(message, psf, capture, *arguments, **keywords):
+    with pytest.raises(MeasurementError, match=message) as caught:
+        prepare(psf, capture, *arguments, **keywords)
+    assert "\n" not in str(caught.value)
+
+
+def test_images_that_do_not_belong_together():
+    grey, colour = Raw(measured(), 12), Raw(measured(3), 12)
+    small = Raw(measured()[:20], 12)
+    refused("the PSF .* has 20×36 pixels and the capture .* 24×36", small, grey)
+    refused("the PSF .* has 3 channels and the capture .* 1;", colour, grey)
+    pair = Raw(measured(2), 12)
+    refused("the PSF .* has 2 channels and the capture .* 3;", pair, colour)
+    refused("capture .* has 3 channels, so it is no mosaic", grey, colour, None, bayer("RGGB"))
+    tiny = Raw(measured()[:10, :10], 12)
+    refused(r"corner = \(5, 15\) lies outside of the PSF of 10×10", tiny, tiny)
+    dead = np.zeros((3, 4), bool)
+    refused("dead pixels has 3×4 pixels and the capture 24×36", grey, grey, dead=dead)
+    odd = Raw(measured()[:-1], 12)
+    refused("'superpixel' joins 2×2 pixels and the PSF has 23×36", odd, odd, 0, bayer("GBRG"))
+    refused("downsample = 30 is larger", grey, grey, 0, Preparation(downsample=30))
+
+
+def bayer(pattern):
+    return Preparation(bayer=pattern, demosaicing="superpixel")
+
+
+def test_backgrounds_that_do_not_belong():
+    grey, colour = Raw(measured(), 12), Raw(measured(3), 12)
+    refused(r"dark frame .* has shape \(20, 36\)", grey, grey, Raw(measured()[:20], 12))
+    refused("dark frame .* has 16 bit and the psf 12 bit", grey, grey, Raw(measured()))
+    floats = Raw(measured().astype(float))
+    refused("PSF has an unknown full scale and the capture 12 bit.*same `bits`", floats, grey)
+    options = Preparation(psf_channels="mean")
+    refused("corner of a PSF of 3 channels is no background", colour, grey, None, options)
+    refused("background = nan: give a finite number", grey, grey, math.nan)
+
+
+def test_black_images():
+    grey, black = Raw(measured(), 12), Raw(np.zeros((ROWS, COLUMNS), np.uint16), 12)
+    refused("the PSF is black in channel 0", black, grey, 0)
+    refused("the capture is black", grey, black)
+    refused("the PSF is black", grey, grey, 4095)
+    dead = np.ones((ROWS, COLUMNS), bool)
+    refused("the PSF has a channel of dead pixels only", grey, grey, dead=dead)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"downsample": 0}, "downsample = 0: give a whole number"),
+        ({"corner": (5, 5)}, r"corner = \(5, 5\): give two whole numbers"),
+        ({"saturation": 0.0}, "saturation = 0.0: give a number above 0, up to 1"),
+        ({"threshold": 1.5}, "threshold = 1.5: give a number above 0, up to 1"),
+        ({"noise_threshold": math.nan}, "noise_threshold = nan"),
+    ],
+)
+def test_options_out_of_range(options, message):
+    with pytest.raises(MeasurementError, match=message):
+        Preparation(**options)

@@ -1,0 +1,22 @@
+"""Files that are written whole or not at all."""
+
+import os
+from pathlib import Path
+
+
+def write_whole(path: str | os.PathLike[str], content: bytes | str) -> Path:
+    """Write a file by way of a neighbour, `NAME.partial`, that is renamed; text as UTF-8.
+
+    An error or Ctrl-C in between leaves what stood there before, and no neighbour.
+    """
+    path = Path(path)
+    partial = path.with_name(path.name + ".partial")
+    data = content.encode("utf-8") if isinstance(content, str) else content
+    try:
+        partial.write_bytes(data)
+        os.replace(partial, path)
+    except BaseException:
+        if not partial.is_dir():
+            partial.unlink(missing_ok=True)
+        raise
+    return path

@@ -1,0 +1,173 @@
+r"""Finding a zone plate's fringes in an image without a close guess: a matched filter.
+
+Ten per cent of β are tens of turns of the fringes at the edge of a sensor: least squares started
+there settles in the wrong turn. A chirp, however, has one sharp peak in the plane of curvature and
+place. The fringes of a zone aperture (thesis Eq 3.22, corrected) are, seen from their centre,
+
+.. math::
+    \mathrm{Re}\, w\, T(r), \qquad
+    T = a_+ e^{j\gamma_+ r^2} + a_- e^{j\gamma_- r^2}, \qquad
+    a_\pm = \frac1{1\pm\epsilon}, \quad \gamma_\pm = \gamma a_\pm
+
+with γ = β/M² and ε = βλd/(πM). For every γ, ε and centre the complex w, whose angle is the phase φ,
+follows in closed form; what is left to search is the correlation :math:`|\langle T, h\rangle|/|T|`.
+Taking off a chirp of the expected curvature makes the image slow, so that it may be averaged over
+blocks of pixels first, and chirps are separable, so that a correlation is two matrix products.
+
+NumPy: a search of a few hundredths of a second, once a fit.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+# Of π/R² and π/(2γR), the curvature and the shift that turn the outermost fringe by half a cycle.
+_STEP = 0.5
+_WEAK = 0.5  # ε above which order −1 is too near its focus for this picture of the fringes
+
+
+class Chirp(NamedTuple):
+    """The fringes' numbers on the sensor.
+
+    - `curvature`: γ = β/M², rad/mm².
+    - `epsilon`: ε, the strength of diffraction.
+    - `centre`: (y, x), mm.
+    - `phase`: φ, rad.
+    """
+
+    curvature: float
+    epsilon: float
+    centre: np.ndarray
+    phase: float
+
+
+class Ranges(NamedTuple):
+    """How far from the guess to look: γ and ε in parts of one, the centre in mm; 0 is known."""
+
+    curvature: float
+    epsilon: float
+    centre: float
+
+
+def find_chirp(image: np.ndarray, pitch: float, guess: Chirp, ranges: Ranges) -> Chirp:
+    """The fringes nearest to the guess that correlate best with the image (y, x).
+
+    The guess' phase is not used. Where ε is above 0.5 the guess comes back: there the mask nearly
+    focuses, and its picture is not two chirps.
+    """
+    if guess.epsilon * (1 + ranges.epsilon) > _WEAK:
+        return guess
+    blocks = _Blocks(image, pitch, guess, ranges)
+    gammas = _curvatures(blocks.reach, guess, ranges)
+    places = _axis(ranges.centre, _STEP * math.pi / (2 * guess.curvature * blocks.reach))
+    maps = np.abs(blocks.correlate(gammas, guess.centre, places))
+    _, row, column = np.unravel_index(np.argmax(maps), maps.shape)
+    found = guess._replace(centre=guess.centre + np.array([places[row], places[column]]))
+    half = np.array([ranges.curvature, ranges.epsilon]) * (guess.curvature, guess.epsilon)
+    fine = 0.2 * math.pi / blocks.reach**2
+    found = _curvature_and_epsilon(blocks, found, half, fine)
+    if ranges.centre > 0:
+        # Once more around the peak, now with both chirps, ten times finer.
+        places = _axis(places[1] - places[0], (places[1] - places[0]) / 10)
+        peak = np.abs(blocks.match(found, places))
+        row, column = np.unravel_index(np.argmax(peak), peak.shape)
+        found = found._replace(centre=found.centre + np.array([places[row], places[column]]))
+        ahead = guess._replace(centre=found.centre)
+        found = _curvature_and_epsilon(blocks, ahead, half, fine)
+    around = np.minimum(half, (fine, fine / guess.curvature))
+    found = _curvature_and_epsilon(blocks, found, around, fine / 20)
+    return found._replace(phase=float(np.angle(blocks.match(found, np.zeros(1))[0, 0])))
+
+
+class _Blocks:
+    """The image without the expected chirp, averaged over blocks of pixels."""
+
+    def __init__(self, image, pitch: float, guess: Chirp, ranges: Ranges):
+        rows, columns = image.shape
+        self.reach = max(rows, columns) * pitch / 2
+        # What is left of the fringes' frequency, and twice that for what the guess leaves open.
+        lowest, highest = _bounds(guess, ranges)
+        spread = max(highest - guess.curvature, guess.curvature - lowest)
+        rate = (spread * self.reach + guess.curvature * ranges.centre) / math.pi
+        size = max(1, min(min(image.shape) // 16, math.floor(1 / (4 * rate * pitch))))
+        self.reference = guess.curvature
+        y, x = ((np.arange(n) - (n - 1) / 2) * pitch for n in image.shape)
+        y0, x0 = guess.centre
+        slow = (image - image.mean()) * np.exp(-1j * self.reference * (x - x0) ** 2)
+        slow = slow * np.exp(-1j * self.reference * (y - y0) ** 2)[:, None]
+        self.values = _averages(_averages(slow, size).T, size).T
+        self.y, self.x = _averages(y, size), _averages(x, size)
+        self.origin = guess.centre
+
+    def correlate(self, gammas: np.ndarray, centre, places) -> np.ndarray:
+        """Σ h e^{−jγ|r−r₀|²} for each γ, for r₀ at `centre` plus each pair of `places`."""
+        (y0, x0), (y_ref, x_ref) = centre, self.origin
+
+        def waves(r, r0, r_ref):
+            shifted = gammas[:, None, None] * (r - r0 - places[:, None]) ** 2
+            return np.exp(-1j * (shifted - self.reference * (r - r_ref) ** 2))
+
+        # One large product and one without BLAS: many small ones wait for its threads.
+        rows = waves(self.y, y0, y_ref).reshape(-1, len(self.y)) @ self.values
+        rows = rows.reshape(len(gammas), len(places), -1)
+        return np.einsum("gik,gjk->gij", rows, waves(self.x, x0, x_ref))
+
+    def match(self, chirp: Chirp, places) -> np.ndarray:
+        """⟨T, h⟩ around the chirp's centre."""
+        gains = np.array(_gains(chirp.epsilon))
+        waves = self.correlate(chirp.curvature * gains, chirp.centre, places)
+        return np.tensordot(gains, waves, axes=1)
+
+    def overlap(self, gamma, centre) -> np.ndarray:
+        """Σ e^{jγ|r−r₀|²} for each γ: what two chirps of that difference have in common."""
+        y, x = (r - r0 for r, r0 in zip((self.y, self.x), centre, strict=True))
+        sums = (np.exp(1j * gamma[..., None] * r**2).sum(axis=-1) for r in (y, x))
+        return math.prod(sums)
+
+
+def _curvature_and_epsilon(blocks: _Blocks, chirp: Chirp, half, fine: float) -> Chirp:
+    """γ and ε with the largest |⟨T, h⟩|/‖T‖ for the centre given, within `half`, in steps `fine`."""
+    gammas = _axis(half[0], fine) + chirp.curvature
+    epsilons = _axis(half[1], fine / chirp.curvature) + chirp.epsilon
+    lowest, highest = gammas[0] / (1 + epsilons[-1]), gammas[-1] / (1 - epsilons[-1])
+    table = np.linspace(lowest, highest, 2 + math.ceil((highest - lowest) / (fine / 2)))
+    values = blocks.correlate(table, chirp.centre, np.zeros(1))[:, 0, 0]
+    gains = [g[None, :] for g in _gains(epsilons)]
+    matched = sum(a * np.interp(gammas[:, None] * a, table, values) for a in gains)
+    beat = blocks.overlap(gammas[:, None] * (gains[1] - gains[0]), chirp.centre).real
+    power = blocks.values.size * (gains[0] ** 2 + gains[1] ** 2) + 2 * gains[0] * gains[1] * beat
+    score = np.abs(matched) ** 2 / power
+    row, column = np.unravel_index(np.argmax(score), score.shape)
+    return chirp._replace(curvature=float(gammas[row]), epsilon=float(epsilons[column]))
+
+
+def _gains(epsilon):
+    return 1 / (1 + epsilon), 1 / (1 - epsilon)
+
+
+def _bounds(guess: Chirp, ranges: Ranges) -> tuple[float, float]:
+    """The smallest and the largest curvature that the fringes can have."""
+    epsilon = guess.epsilon * (1 + ranges.epsilon)
+    low, high = (guess.curvature * (1 + s * ranges.curvature) for s in (-1, 1))
+    return low / (1 + epsilon), high / (1 - epsilon)
+
+
+def _curvatures(reach: float, guess: Chirp, ranges: Ranges) -> np.ndarray:
+    lowest, highest = _bounds(guess, ranges)
+    step = _STEP * math.pi / reach**2
+    return np.linspace(lowest, highest, 2 + math.ceil((highest - lowest) / step))
+
+
+def _axis(half_range: float, step: float) -> np.ndarray:
+    """−half_range … half_range with 0 among them."""
+    count = math.ceil(half_range / step)
+    return np.arange(-count, count + 1) * step
+
+
+def _averages(values: np.ndarray, size: int) -> np.ndarray:
+    """Averages of `size` neighbours along the last axis; what is left over is dropped evenly."""
+    count = values.shape[-1] // size
+    first = (values.shape[-1] - count * size) // 2
+    kept = values[..., first : first + count * size]
+    return kept.reshape(*values.shape[:-1], count, size).mean(axis=-1)

@@ -1,0 +1,93 @@
+"""What is to be done with a measured PSF and capture before a reconstruction."""
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from thincam_jax import _checks
+from thincam_jax.measured.bayer import METHODS, PATTERNS, Demosaicing, Pattern
+from thincam_jax.measured.raw import MeasurementError
+
+Centre = Literal["centroid", "peak", "symmetry"]
+CENTRES = ("centroid", "peak", "symmetry")
+
+
+@dataclass(frozen=True)
+class Preparation:
+    """The options of `prepare`; all but the background, which is data.
+
+    - `bayer`: the pattern of a mosaic, "RGGB", "BGGR", "GRBG" or "GBRG"; None: no mosaic.
+    - `demosaicing`: "bilinear" or "superpixel" (half the size); see `demosaic`.
+    - `downsample`: side of the blocks that are averaged, pixels of the demosaiced image.
+    - `corner`: first row and column, and those after the last, of the square in the upper left
+      corner of the PSF whose mean is the background "corner" and whose spread is its noise.
+    - `saturation`: pixels from this part of full scale on are saturated. None: full scale itself,
+      and none in float images of unknown scale. A converter whose bits stand at the upper end of
+      16 is full below 1: 12 bit at 0.9997.
+    - `threshold`: values of the PSF below this part of each channel's maximum become 0.
+    - `noise_threshold`: values of the PSF below this many standard deviations of its noise become
+      0: of the corner's pixels, divided by `downsample`, as white noise is by block means.
+    - `centre`: shift the PSF by whole pixels so that its "centroid", its "peak" or its centre of
+      "symmetry" (the peak of its convolution with itself is at twice that) comes to the middle of
+      the array, to sample n//2 for a single bright pixel. One shift for all channels. None, the
+      default, leaves it: with the PSF shifted by s the reconstruction is the same picture shifted
+      by −s, and light pushed over the edge is lost. Shift it where pictures of several PSFs are to
+      be compared, or the field around the optical axis is to be cut out.
+    - `psf_channels`: "each" keeps the PSF of each channel, "mean" makes one for all.
+    - `psf_sum`: "each" channel's PSF sums to 1: white is then what the light source of the PSF was;
+      "joint" divides all by one number, so that the sum is 1 in the mean of the channels and the
+      reconstruction keeps the sensor's colour balance.
+    - `capture_scale`: what the capture is divided by: its "maximum" over all channels, its
+      Euclidean "norm", or "none": parts of full scale.
+
+    **Errors**: MeasurementError for values that are out of range.
+    """
+
+    bayer: Pattern | None = None
+    demosaicing: Demosaicing = "bilinear"
+    downsample: int = 1
+    corner: tuple[int, int] = (5, 15)
+    saturation: float | int | None = None
+    threshold: float | int | None = None
+    noise_threshold: float | int | None = None
+    centre: Centre | None = None
+    psf_channels: Literal["each", "mean"] = "each"
+    psf_sum: Literal["each", "joint"] = "each"
+    capture_scale: Literal["maximum", "norm", "none"] = "maximum"
+
+    def __post_init__(self):
+        if self.bayer is not None:
+            _choose("bayer", self.bayer, PATTERNS)
+        _choose("demosaicing", self.demosaicing, METHODS)
+        if self.centre is not None:
+            _choose("centre", self.centre, CENTRES)
+        _choose("psf_channels", self.psf_channels, ("each", "mean"))
+        _choose("psf_sum", self.psf_sum, ("each", "joint"))
+        _choose("capture_scale", self.capture_scale, ("maximum", "norm", "none"))
+        if not _whole(self.downsample) or self.downsample < 1:
+            raise MeasurementError(
+                f"downsample = {self.downsample!r}: give a whole number of at least 1"
+            )
+        start, stop = self.corner
+        if not (_whole(start) and _whole(stop) and 0 <= start < stop):
+            raise MeasurementError(
+                f"corner = {self.corner!r}: give two whole numbers, 0 <= first < last, as (5, 15)"
+            )
+        _in_range("saturation", self.saturation, 0.0, 1.0)
+        _in_range("threshold", self.threshold, 0.0, 1.0)
+        _in_range("noise_threshold", self.noise_threshold, 0.0, 1e6)
+
+
+def _choose(name: str, value: Any, options: tuple[str, ...]) -> None:
+    try:
+        _checks.choice(name, value, options)
+    except ValueError as error:
+        raise MeasurementError(str(error)) from None
+
+
+def _whole(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool)
+
+
+def _in_range(name: str, value: float | int | None, low: float, high: float) -> None:
+    if value is not None and not low < value <= high:
+        raise MeasurementError(f"{name} = {value!r}: give a number above {low:g}, up to {high:g}")

@@ -1,0 +1,296 @@
+"""From the files of a measured PSF and a capture to what a reconstruction takes."""
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import scipy.ndimage
+from jaxtyping import Bool, Float32
+
+from thincam_jax.measured.bayer import demosaic, demosaic_mask
+from thincam_jax.measured.blocks import block_any, block_mean, crop_to_blocks
+from thincam_jax.measured.clean import centre_psf, clean
+from thincam_jax.measured.match import check_match
+from thincam_jax.measured.options import Preparation
+from thincam_jax.measured.raw import MeasurementError, Raw
+
+Background = Raw | float | int | Literal["corner"]
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """A PSF and a capture, linear, on the same pixels.
+
+    - `psf`: one channel for all of the capture's, or one for each; sums to 1 (`psf_sum`).
+    - `capture`: divided by `log["scaling"]["capture_divisor"]`: times that it is in parts of full
+      scale.
+    - `valid`: False where the capture says nothing about the light: saturated or dead.
+    - `log`: what was done, in plain numbers for a JSON file; `log["order"]` lists its steps.
+    """
+
+    psf: Float32[np.ndarray, "psf_channel y x"]
+    capture: Float32[np.ndarray, "channel y x"]
+    valid: Bool[np.ndarray, "channel y x"]
+    log: dict[str, Any]
+
+
+@dataclass(frozen=True, eq=False)
+class _Frame:
+    """An image on its way, in parts of full scale."""
+
+    values: np.ndarray  # (channel, y, x) float32
+    saturated: np.ndarray  # bool
+    known: np.ndarray  # bool; False where only dead pixels contribute
+
+
+def prepare(
+    psf: Raw,
+    capture: Raw,
+    background: Background | None = None,
+    options: Preparation | None = None,
+    *,
+    psf_background: Background | None = None,
+    dead: Bool[np.ndarray, "y x"] | None = None,
+) -> Prepared:
+    """Bring a measured PSF and a capture into linear units, clean and of the wanted size.
+
+    The steps, each recorded in the result's `log`:
+
+    1. `full_scale`: counts to parts of full scale, float32.
+    2. `background`: subtract it. A dark frame (as long exposed as the image), a number in counts,
+       or "corner", the default: the mean of a square in the PSF's upper left corner, for both
+       images, because a lensless capture has no dark place. 0 subtracts nothing.
+       `psf_background` is that of the PSF where it is another one.
+    3. `clipping`: what is then negative becomes 0.
+    4. `validity`: saturated pixels (before the subtraction) and `dead` ones, True in a map (y, x)
+       of the sensor (`read_mask`).
+    5. `demosaicing`, if the options name a Bayer pattern.
+    6. `downsampling`: exact means of square blocks; sides that do not divide are cropped centrally.
+    7. `clean_up` and 8. `centring` of the PSF, if asked for.
+    9. `channels`: one PSF for all, if asked for.
+    10. `scaling`: the PSF to unit sum, the capture as asked for; both divisors are recorded.
+
+    In 5 and 6 a dead pixel is left out of the means, for it is missing by chance; a value is
+    invalid where nothing is left, and is then copied from the nearest good one. A saturated pixel
+    makes every value it enters invalid, for it is missing because it is bright: the mean of the
+    others would be too dark. The PSF has no such mask; its saturated pixels are counted in the log,
+    and call for a PSF of shorter exposure.
+
+    **Errors**: MeasurementError, one line: sizes, channels or bit depths that do not fit together,
+    a black PSF or capture.
+    """
+    options = options or Preparation()
+    background = "corner" if background is None else background
+    backgrounds: dict[str, Background] = {
+        "psf": background if psf_background is None else psf_background,
+        "capture": background,
+    }
+    raws = {"psf": psf, "capture": capture}
+    check_match(psf, capture, backgrounds, dead, options)
+    log: dict[str, Any] = {"options": dataclasses.asdict(options), "order": []}
+    record = _Recorder(log)
+    record("full_scale", {name: _facts(raw) for name, raw in raws.items()})
+    planes = {name: _in_full_scale(raw) for name, raw in raws.items()}
+    saturated = {name: _saturated(raw, planes[name], options) for name, raw in raws.items()}
+    corner = _corner(planes["psf"], options)
+    levels = {n: _level(b, raws[n], corner) for n, b in backgrounds.items()}
+    noise = _noise(planes["psf"] - levels["psf"], options)
+    record("background", {n: _told(b, levels[n]) for n, b in backgrounds.items()})
+    planes = {n: planes[n] - levels[n] for n in planes}
+    record("clipping", {n: int(np.count_nonzero(p < 0)) for n, p in planes.items()})
+    known = ~(np.zeros(capture.pixels.shape[:2], bool) if dead is None else dead)
+    frames = {
+        n: _Frame(np.maximum(p, 0), saturated[n], np.broadcast_to(known, p.shape))
+        for n, p in planes.items()
+    }
+    record("validity", {n: _counts(f, raws[n]) for n, f in frames.items()})
+    if options.bayer is not None:
+        frames = {n: _demosaiced(f, options) for n, f in frames.items()}
+    how = options.demosaicing if options.bayer else None
+    record("demosaicing", {"pattern": options.bayer, "method": how})
+    crop = crop_to_blocks(frames["psf"].values.shape[1:], options.downsample)
+    frames = {n: _downsampled(f, crop, options.downsample) for n, f in frames.items()}
+    record("downsampling", _crop_told(crop, options.downsample, frames["psf"]))
+    light = _prepared_psf(_filled(frames["psf"], "PSF"), noise, options, record)
+    image = _filled(frames["capture"], "capture")
+    light, image = _scaled(light, image, options, record)
+    valid = frames["capture"].known & ~frames["capture"].saturated
+    log["validity"]["valid_share"] = float(valid.mean())
+    return Prepared(light, image, valid, log)
+
+
+class _Recorder:
+    """Writes a step into the log."""
+
+    def __init__(self, log: dict[str, Any]):
+        self.log = log
+
+    def __call__(self, step: str, facts: dict[str, Any]) -> None:
+        self.log["order"].append(step)
+        self.log[step] = facts
+
+
+def _facts(raw: Raw) -> dict[str, Any]:
+    maximum = raw.pixels.max()
+    return {
+        "name": raw.name,
+        "format": raw.format,
+        "shape": list(raw.pixels.shape),
+        "bits": raw.bits,
+        "full_scale": raw.full_scale,
+        "minimum": float(raw.pixels.min()),
+        "maximum": float(maximum),
+        # Many pixels at one maximum have saturated, at whatever level the converter stopped.
+        "pixels_at_maximum": int(np.count_nonzero(raw.pixels == maximum)),
+    }
+
+
+def _in_full_scale(raw: Raw) -> np.ndarray:
+    """(channel, y, x) float32."""
+    pixels = raw.pixels[..., None] if raw.pixels.ndim == 2 else raw.pixels
+    planes = np.moveaxis(pixels, -1, 0).astype(np.float32)
+    return planes / np.float32(raw.full_scale)
+
+
+def _saturated(raw: Raw, planes: np.ndarray, options: Preparation) -> np.ndarray:
+    if raw.bits is None and options.saturation is None:
+        return np.zeros(planes.shape, bool)
+    return planes >= np.float32(options.saturation or 1.0)
+
+
+def _corner(psf: np.ndarray, options: Preparation) -> np.ndarray:
+    """The mean of each channel in the corner, (channel, 1, 1)."""
+    part = _corner_part(psf, options)
+    return part.mean(axis=(1, 2), keepdims=True, dtype=np.float64).astype(np.float32)
+
+
+def _corner_part(psf: np.ndarray, options: Preparation) -> np.ndarray:
+    box = slice(*options.corner)
+    return psf[:, box, box]
+
+
+def _noise(psf: np.ndarray, options: Preparation) -> np.ndarray:
+    """Standard deviation of a pixel after block means, one a channel, from the corner."""
+    part = _corner_part(psf, options).astype(np.float64)
+    if options.bayer is None:
+        spread = part.std(axis=(1, 2))
+    else:  # of each colour's own pixels: their means may differ
+        variances = [part[0, i::2, j::2].var() for i in range(2) for j in range(2)]
+        spread = np.sqrt(np.mean(variances, keepdims=True))
+    return spread / options.downsample
+
+
+def _level(background: Background, raw: Raw, corner: np.ndarray) -> np.ndarray:
+    """What is subtracted, in parts of full scale."""
+    if isinstance(background, Raw):
+        return _in_full_scale(background)
+    if isinstance(background, str):
+        return corner
+    return np.full((1, 1, 1), background / raw.full_scale, np.float32)
+
+
+def _told(background: Background, level: np.ndarray) -> dict[str, Any]:
+    kind = background if isinstance(background, str) else "number"
+    if isinstance(background, Raw):
+        kind = f"dark frame {background.name}"
+    return {"kind": kind, "level": level.mean(axis=(1, 2), dtype=np.float64).tolist()}
+
+
+def _counts(frame: _Frame, raw: Raw) -> dict[str, int]:
+    return {
+        "saturated": int(np.count_nonzero(frame.saturated)),
+        "dead": int(np.count_nonzero(~frame.known)) // raw.channels,
+    }
+
+
+def _demosaiced(frame: _Frame, options: Preparation) -> _Frame:
+    pattern, method = options.bayer, options.demosaicing
+    assert pattern is not None
+    known = None if frame.known.all() else frame.known[0]
+    colours = demosaic(frame.values[0], pattern, method, known)
+    nothing = np.zeros(colours.shape, bool)
+    saturated = nothing
+    if frame.saturated.any():
+        saturated = demosaic_mask(frame.saturated[0], pattern, method)
+    has = ~nothing if known is None else demosaic_mask(known, pattern, method)
+    return _Frame(*(np.moveaxis(plane, -1, 0) for plane in (colours, saturated, has)))
+
+
+def _downsampled(frame: _Frame, crop: tuple[slice, slice], factor: int) -> _Frame:
+    values, saturated, known = (
+        plane[:, *crop] for plane in (frame.values, frame.saturated, frame.known)
+    )
+    if factor == 1:
+        return _Frame(values, saturated, known)
+    means = block_mean(values, factor, None if known.all() else known)
+    return _Frame(means, block_any(saturated, factor), block_any(known, factor))
+
+
+def _crop_told(crop: tuple[slice, slice], factor: int, frame: _Frame) -> dict[str, Any]:
+    return {
+        "factor": factor,
+        "first_pixel": [part.start for part in crop],
+        "cropped_to": [part.stop - part.start for part in crop],
+        "shape": list(frame.values.shape[1:]),
+    }
+
+
+def _filled(frame: _Frame, name: str) -> np.ndarray:
+    """Values nobody measured, from the nearest that somebody did."""
+    if frame.known.all():
+        return frame.values
+    if not frame.known.any(axis=(1, 2)).all():
+        raise MeasurementError(
+            f"the {name} has a channel of dead pixels only; check the map `dead`"
+        )
+    planes = []
+    for values, known in zip(frame.values, frame.known, strict=True):
+        nearest = scipy.ndimage.distance_transform_edt(
+            ~known, return_distances=False, return_indices=True
+        )
+        planes.append(values[tuple(nearest)])  # pyright: ignore[reportArgumentType]
+    return np.stack(planes)
+
+
+def _prepared_psf(
+    psf: np.ndarray, noise: np.ndarray, options: Preparation, record: _Recorder
+) -> np.ndarray:
+    """Cleaned, centred and averaged as asked for."""
+    psf, cleaned = clean(psf, noise, options.threshold, options.noise_threshold)
+    record("clean_up", {**cleaned, "noise": noise.tolist()})
+    centred = {"by": None, "shift": [0, 0]}
+    if options.centre is not None:
+        psf, centred = centre_psf(psf, options.centre)
+    record("centring", centred)
+    before = psf.shape[0]
+    if options.psf_channels == "mean":
+        psf = psf.mean(axis=0, keepdims=True, dtype=np.float64).astype(np.float32)
+    record("channels", {"psf": options.psf_channels, "before": before, "after": psf.shape[0]})
+    return psf
+
+
+def _scaled(
+    psf: np.ndarray, capture: np.ndarray, options: Preparation, record: _Recorder
+) -> tuple[np.ndarray, np.ndarray]:
+    sums = psf.sum(axis=(1, 2), dtype=np.float64)
+    if not (sums > 0).all():
+        raise MeasurementError(
+            f"the PSF is black in channel {int(np.argmin(sums))} once the background is subtracted "
+            "and small values removed; give a lower background, threshold or noise_threshold"
+        )
+    if options.psf_sum == "joint":
+        sums = np.full_like(sums, sums.mean())
+    precise = capture.astype(np.float64)
+    divisor = {
+        "maximum": float(precise.max()),
+        "norm": float(np.linalg.norm(precise)),
+        "none": 1.0,
+    }[options.capture_scale]
+    if not precise.max() > 0:
+        raise MeasurementError(
+            "the capture is black once the background is subtracted; give a lower background"
+        )
+    record("scaling", {"psf_divisor": sums.tolist(), "capture_divisor": divisor})
+    scaled = psf / sums[:, None, None], precise / divisor
+    return scaled[0].astype(np.float32), scaled[1].astype(np.float32)

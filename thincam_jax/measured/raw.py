@@ -1,0 +1,123 @@
+"""A measured image as the camera stored it: its counts, its bit depth, and what is refused."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+MAX_CHANNELS = 4
+
+
+class MeasurementError(ValueError):
+    """A measurement that cannot be used; one line says what was given and what to do."""
+
+
+class CaptureFileError(MeasurementError):
+    """An image file that cannot be read as a measurement."""
+
+
+@dataclass(frozen=True, eq=False)
+class Raw:
+    """One measured image, unscaled: counts are those of the file.
+
+    - `pixels`: (y, x) or (y, x, channel) with at most 4 channels; uint8, uint16 or float.
+    - `bits`: 8 to 16, of the camera; a pixel is full at 2^bits − 1. None (the default) means that
+      of the integer type (8 or 16), and for floats that the scale is unknown: full is then 1.
+      10, 12 and 14 bit cameras fill the low bits of 16: give `bits`, or full scale is taken 16 bit.
+    - `format`: "tiff", "png", "npy", or "array".
+    - `name`: what messages call it: the path of the file.
+
+    **Errors**: MeasurementError for another shape or type, for an empty image, for values that are
+    not finite and for values above 2^bits − 1. Signed integers are refused, negative floats are
+    not: a dark frame may have been subtracted already.
+    """
+
+    pixels: np.ndarray = field(repr=False)
+    bits: int | None = None
+    format: str = "array"
+    name: str = "the array"
+
+    def __post_init__(self):
+        pixels = np.asarray(self.pixels)
+        _check_shape(self.name, pixels)
+        _check_type(self.name, pixels)
+        bits = 8 * pixels.dtype.itemsize if self.bits is None and pixels.dtype.kind == "u" else None
+        if self.bits is not None:
+            bits = _announced(self.name, self.bits, pixels)
+        if pixels.dtype.kind == "f" and not np.isfinite(pixels).all():
+            bad = np.count_nonzero(~np.isfinite(pixels))
+            raise MeasurementError(
+                f"{self.name}: {bad} of {pixels.size} values are NaN or infinite; give finite ones"
+            )
+        if bits is not None:
+            _check_range(self.name, pixels, bits)
+        native = pixels.astype(pixels.dtype.newbyteorder("="), copy=False)
+        object.__setattr__(self, "pixels", native)
+        object.__setattr__(self, "bits", bits)
+
+    @property
+    def full_scale(self) -> float:
+        """The count of a full pixel: 2^bits − 1, or 1 for floats of unknown scale."""
+        return 1.0 if self.bits is None else float(2**self.bits - 1)
+
+    @property
+    def channels(self) -> int:
+        """1 for a (y, x) image."""
+        return 1 if self.pixels.ndim == 2 else self.pixels.shape[2]
+
+
+def _check_shape(name: str, pixels: np.ndarray) -> None:
+    if pixels.size == 0:
+        raise MeasurementError(f"{name}: is empty (shape {pixels.shape}); give an image")
+    if pixels.ndim not in (2, 3):
+        raise MeasurementError(
+            f"{name}: has shape {pixels.shape}; give an image (y, x) or (y, x, channel)"
+        )
+    if pixels.ndim == 3 and pixels.shape[2] > MAX_CHANNELS:
+        raise MeasurementError(
+            f"{name}: has shape {pixels.shape}, {pixels.shape[2]} channels, where 1 to "
+            f"{MAX_CHANNELS} are allowed; the channel is the last axis, (y, x, channel)"
+        )
+
+
+def _check_type(name: str, pixels: np.ndarray) -> None:
+    kind, size = pixels.dtype.kind, pixels.dtype.itemsize
+    if (kind == "u" and size <= 2) or (kind == "f" and size <= 8):
+        return
+    advice = {
+        "b": "it is a mask, not an image",
+        "c": "a sensor measures real numbers: give its magnitude or real part",
+        "i": "counts have no sign: save them as uint16, or as float if they may be negative",
+        "u": "8 to 16 bit are read: save it as uint16, or as float",
+    }.get(kind, "")
+    raise MeasurementError(
+        f"{name}: holds {pixels.dtype} values; give uint8, uint16 or float"
+        + (f" ({advice})" if advice else "")
+    )
+
+
+def _announced(name: str, bits, pixels: np.ndarray) -> int:
+    if isinstance(bits, bool) or not isinstance(bits, int | np.integer) or not 8 <= bits <= 16:
+        raise MeasurementError(f"bits = {bits!r}: give a whole number from 8 to 16")
+    held = 8 * pixels.dtype.itemsize
+    if pixels.dtype.kind == "u" and bits > held:
+        raise MeasurementError(
+            f"{name}: holds {held}-bit data, announced as {bits} bit; leave `bits` out, or save "
+            "the capture with all its bits"
+        )
+    return int(bits)
+
+
+def _check_range(name: str, pixels: np.ndarray, bits: int) -> None:
+    largest = pixels.max()
+    if largest > 2**bits - 1:
+        shifted = 2 ** (16 - bits)
+        left = pixels.dtype == np.uint16 and not np.bitwise_or.reduce(pixels, axis=None) % shifted
+        raise MeasurementError(
+            f"{name}: holds values up to {largest}, above the {2**bits - 1} of {bits} bit; "
+            + (
+                f"all are multiples of {shifted}, so the bits are stored at the upper end: divide "
+                f"by {shifted}, or read it as 16 bit"
+                if left
+                else "give the bit depth of the file"
+            )
+        )

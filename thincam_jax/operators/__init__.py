@@ -1,0 +1,8 @@
+"""Linear operators of a camera, with their adjoints: one file a structure."""
+
+from thincam_jax.operators.base import AbstractOperator as AbstractOperator
+from thincam_jax.operators.base import adjoint_error as adjoint_error
+from thincam_jax.operators.crop_convolution import CropConvolution as CropConvolution
+from thincam_jax.operators.crop_convolution import kernel_grid as kernel_grid
+from thincam_jax.operators.crop_convolution import kernel_shape as kernel_shape
+from thincam_jax.operators.crop_convolution import window_shape as window_shape

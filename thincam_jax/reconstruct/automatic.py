@@ -1,0 +1,65 @@
+"""Which method suits a set of captures, and why."""
+
+from collections.abc import Sequence
+
+import jax.numpy as jnp
+import numpy as np
+
+from thincam_jax.camera import LenslessCamera
+from thincam_jax.reconstruct.noise import estimate_noise
+
+# Contrast of a channel over its noise from which a filter leaves nothing that an edge-preserving
+# prior could add: in the study of configs/fza_superresolution.yaml total variation gains 0.5 to
+# 2 dB where the channels' contrast is 1 to 3 times the noise.
+_CLEAN = 30.0
+
+
+def choose_method(captures, cameras, synthesis, noise_variance) -> tuple[str, str]:
+    """A method and a sentence that says why.
+
+    What decides is what the fast filter cannot do: see the crop of the sensor, which matters where
+    the captures keep a bright background or a PSF is as large as the sensor, and tell noise from
+    edges.
+    """
+    if not are_cameras(cameras):
+        return "admm_tv", "PSFs were measured: light falls beside the sensor, which it models"
+    matrix = np.eye(len(cameras)) if synthesis is None else np.asarray(synthesis, dtype=float)
+    biased = np.abs(matrix.sum(axis=1)) > 1e-6
+    if biased.any():
+        return "admm_tv", (
+            f"{int(biased.sum())} of {len(matrix)} channels keep the bright background of their "
+            "captures, which the sensor crops; a filter would ring at its borders"
+        )
+    contrast = _contrast(captures, matrix, noise_variance)
+    if contrast < _CLEAN:
+        return "admm_tv", (
+            f"the channels' contrast is {contrast:.2g} times their noise; total variation tells "
+            "edges from noise where a filter cannot"
+        )
+    return "wiener", (
+        f"no channel keeps a background and their contrast is {contrast:.2g} times the noise: the "
+        "Wiener synthesis is as good, in closed form"
+    )
+
+
+def are_cameras(cameras) -> bool:
+    """Whether these are camera models, and not an array of measured PSFs."""
+    return isinstance(cameras, Sequence) and all(isinstance(c, LenslessCamera) for c in cameras)
+
+
+def _contrast(captures, matrix: np.ndarray, noise_variance) -> float:
+    """Root mean square of the channels over their noise, of the clearest one."""
+    flat = captures.reshape(captures.shape[0], -1, *captures.shape[-2:])
+    if noise_variance is None:
+        variances = jnp.mean(estimate_noise(flat) ** 2, axis=1)
+    else:
+        given = jnp.asarray(noise_variance, flat.dtype)
+        given = given.reshape(given.shape[0], -1).mean(axis=1) if given.ndim else given
+        variances = jnp.broadcast_to(given, (flat.shape[0],))
+    ratios = []
+    for row in matrix:
+        channel = jnp.tensordot(jnp.asarray(row, flat.dtype), flat, axes=1)
+        noise = jnp.sum(jnp.asarray(row**2, flat.dtype) * variances)
+        power = jnp.maximum(jnp.mean(channel**2) - noise, 0)
+        ratios.append(float(jnp.sqrt(power / noise)) if noise > 0 else float("inf"))
+    return max(ratios)

@@ -1,0 +1,243 @@
+"""From captures, with cameras or measured PSFs, to a `Deconvolution`."""
+
+from collections.abc import Sequence
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from thincam_jax import _checks
+from thincam_jax.camera import LenslessCamera
+from thincam_jax.grids import same_parity
+from thincam_jax.operators import CropConvolution, kernel_grid, kernel_shape, window_shape
+from thincam_jax.psf import Model, psf
+from thincam_jax.reconstruct.noise import estimate_noise
+from thincam_jax.reconstruct.problem import Deconvolution
+from thincam_jax.reconstruct.registration import distance_ratios, own_field, register
+from thincam_jax.reconstruct.synthesis import check_synthesis, separate
+from thincam_jax.reconstruct.total_variation import TotalVariation
+
+
+def camera_problem(
+    captures: Float[Array, "capture *batch y x"],
+    cameras: Sequence[LenslessCamera],
+    *,
+    wavelength,
+    object_distance,
+    tau=2.0,
+    noise_variance=None,
+    synthesis=None,
+    field_shape: tuple[int, int] | None = None,
+    valid=None,
+    variation: TotalVariation | None = None,
+    nonnegative: bool = True,
+    model: Model = "separable",
+    pixel_integration: bool = True,
+) -> Deconvolution:
+    """The problem of captures by cameras that are known.
+
+    Captures at several distances are enlarged to the scale of the largest (`register`), and their
+    PSFs with them, as in `WienerSynthesis`; the field is sampled on that scale.
+
+    **Arguments**: as in `thincam_jax.reconstruct`, and
+
+    - `object_distance`: t, mm; several make as many planes, each seen in its own projection, so that
+      pixels of the planes that are behind each other lie on one ray through the mask.
+    - `tau`: see `absolute_tau`.
+    - `synthesis`: real matrix (channel × capture) of sums of captures that are reconstructed in place
+      of the captures; default: the captures. Without its bias, a capture of a zone aperture
+      converges in a tenth of the iterations.
+    """
+    captures = jnp.asarray(captures)
+    matrix = separate(len(cameras)) if synthesis is None else np.asarray(synthesis, dtype=float)
+    ratios = distance_ratios(cameras)
+    check_synthesis(matrix, cameras, ratios)
+    sensor = cameras[0].sensor.grid
+    field = same_parity(field_shape or sensor.shape, sensor.shape)
+    distances = np.atleast_1d(np.asarray(object_distance, dtype=object))
+    wavelengths = jnp.broadcast_to(jnp.asarray(wavelength), (len(cameras),))
+    kernels = [
+        jnp.stack(
+            [
+                _kernel(camera, light, t, own_field(field, ratio), ratio, model, pixel_integration)
+                for t in distances
+            ]
+        )
+        for camera, light, ratio in zip(cameras, wavelengths, ratios, strict=True)
+    ]
+    valid = None if valid is None else jnp.broadcast_to(jnp.asarray(valid), captures.shape)
+    sums = [_Sum(row, kernels, captures, valid, ratios) for row in matrix]
+    variances = [
+        _variance(row, noise_variance, captures) * ratio**2
+        for row, ratio in zip(matrix, (s.ratio for s in sums), strict=True)
+    ]
+    return _assemble(
+        [s.kernel for s in sums],
+        [s.capture for s in sums],
+        [s.valid for s in sums],
+        variances,
+        pitch=sensor.pitch,
+        field_shape=field,
+        tau=tau,
+        variation=variation,
+        nonnegative=nonnegative,
+    )
+
+
+def psf_problem(
+    captures: Float[Array, "capture *batch y x"],
+    psfs: Float[Array, "capture *planes k l"],
+    *,
+    tau=2.0,
+    noise_variance=None,
+    field_shape: tuple[int, int] | None = None,
+    valid=None,
+    variation: TotalVariation | None = None,
+    nonnegative: bool = True,
+) -> Deconvolution:
+    """The problem of captures with measured PSFs on the same pixels.
+
+    `psfs`: (capture, k, l), (capture, channel, k, l) or (capture, channel, plane, k, l), the channel
+    axis of length 1 or that of the captures. The field is, if not given, all that sends light to the
+    sensor: sensor + PSF − 1 samples.
+    """
+    captures, psfs = jnp.asarray(captures), jnp.asarray(psfs)
+    if not 3 <= psfs.ndim <= 5 or psfs.shape[0] != captures.shape[0]:
+        raise ValueError(
+            f"PSFs have shape {psfs.shape} for {captures.shape[0]} captures; give (capture, k, l), "
+            "(capture, channel, k, l) or (capture, channel, plane, k, l)"
+        )
+    shape = (*psfs.shape[:-2], *(1,) * (5 - psfs.ndim), *psfs.shape[-2:])
+    kernels = psfs.reshape(shape).astype(captures.dtype)
+    sensor, kernel = captures.shape[-2:], kernels.shape[-2:]
+    rows, columns = field_shape or (s + k - 1 for s, k in zip(sensor, kernel, strict=True))
+    field = _fitting_field((rows, columns), sensor, kernel)
+    variances = [_variance(row, noise_variance, captures) for row in np.eye(captures.shape[0])]
+    masks = (
+        [None] * len(kernels)
+        if valid is None
+        else list(jnp.broadcast_to(jnp.asarray(valid), captures.shape))
+    )
+    return _assemble(
+        list(kernels),
+        list(captures),
+        masks,
+        variances,
+        pitch=jnp.ones((), captures.dtype),
+        field_shape=field,
+        tau=tau,
+        variation=variation,
+        nonnegative=nonnegative,
+    )
+
+
+def object_pitch(cameras: Sequence[LenslessCamera], object_distance) -> Float[Array, "*plane"]:
+    """Distance of the field's pixels on the object, mm: p·t/d of the largest d, of each plane."""
+    furthest = max(cameras, key=lambda c: float(c.distance))
+    return furthest.sensor.pitch * jnp.asarray(object_distance) / furthest.distance
+
+
+def absolute_tau(tau, operators, variances) -> Float[Array, ""]:
+    r"""τ of a `Deconvolution` whose weights are 1/variance, from a number that is about 1.
+
+    :math:`\tau = \tau_{rel}\,(\sum_k \mathrm{mean}|H_k|^2/\sigma_k^2)^{1/2}`: the standard deviation
+    of a pixel of the back-projected noise, Σ Hᵀn/σ². A step between two pixels costs what noise
+    alone would pay for it if τ_rel were 1; 1 to 3 suit most scenes, whatever the camera.
+    """
+    total = sum(
+        jnp.mean(o.spectrum.real**2 + o.spectrum.imag**2) * o.spectrum.shape[-3] / v
+        for o, v in zip(operators, variances, strict=True)
+    )
+    return jnp.asarray(tau, total.dtype) * jnp.sqrt(total)
+
+
+class _Sum:
+    """One row of a synthesis: its kernel, its capture, and where this is to be trusted."""
+
+    def __init__(self, row: np.ndarray, kernels, captures, valid, ratios):
+        used = [(float(w), k) for k, w in enumerate(row) if w]
+        self.ratio = ratios[used[0][1]]
+        self.kernel = sum(w * kernels[k] for w, k in used)
+        self.capture = register(sum(w * captures[k] for w, k in used), self.ratio)
+        self.valid = None
+        if valid is not None:
+            both = jnp.all(jnp.stack([valid[k] for _, k in used]), axis=0)
+            # A pixel that an invalid one has been interpolated into is not trusted either.
+            seen = register(both.astype(captures.dtype), self.ratio)
+            self.valid = seen > 0.99
+
+
+def _kernel(camera, wavelength, distance, field, ratio: float, model, pixel_integration):
+    """PSF of a camera on the reference scale; enlarged, it spreads its light over ratio²."""
+    grid = kernel_grid(camera.sensor.grid, field)
+    own = psf(
+        camera,
+        wavelength=wavelength,
+        object_distance=distance,
+        grid=grid,
+        model=model,
+        pixel_integration=pixel_integration,
+    )
+    return register(own, ratio) / ratio**2
+
+
+def _variance(row: np.ndarray, noise_variance, captures) -> Float[Array, ""]:
+    """Variance of a sum of captures: as given, or estimated; 1 where there is none."""
+    count = captures.shape[0]
+    if noise_variance is None:
+        each = estimate_noise(captures) ** 2
+    else:
+        each = jnp.asarray(noise_variance, captures.dtype)
+        if each.ndim and each.shape[0] != count:
+            raise ValueError(
+                f"noise_variance has shape {each.shape}; give one number or one for each of the "
+                f"{count} captures"
+            )
+        each = jnp.broadcast_to(each.reshape(each.shape or (1,)), (count, *each.shape[1:]))
+    each = jnp.mean(each.reshape(count, -1), axis=1)
+    total = jnp.sum(jnp.asarray(row**2, captures.dtype) * each)
+    return jnp.where(total > 0, total, 1)
+
+
+def _assemble(
+    kernels, captures, valid, variances, *, pitch, field_shape, tau, variation, nonnegative
+) -> Deconvolution:
+    """Operators on one window, and their weights."""
+    captures = [c[None] if c.ndim == 2 else c for c in captures]
+    kernels = [k if k.ndim == 4 else k[None] for k in kernels]
+    windows = [
+        window_shape(c.shape[-2:], field_shape, _reach(k, c, field_shape))
+        for k, c in zip(kernels, captures, strict=True)
+    ]
+    window = (max(w[0] for w in windows), max(w[1] for w in windows))
+    operators = [
+        CropConvolution(k, pitch, c.shape[-2:], field_shape, summed=1, window=window)
+        for k, c in zip(kernels, captures, strict=True)
+    ]
+    weights = [
+        (1.0 if m is None else m.astype(c.dtype)) / v
+        for m, v, c in zip(valid, variances, captures, strict=True)
+    ]
+    return Deconvolution(
+        operators,
+        captures,
+        tau=absolute_tau(_checks.non_negative("tau", tau, "parts of one"), operators, variances),
+        weights=weights,
+        variation=variation,
+        nonnegative=nonnegative,
+    )
+
+
+def _reach(kernel, capture, field_shape) -> tuple[int, int]:
+    """What of a kernel can send light from the field to the sensor."""
+    most = kernel_shape(capture.shape[-2:], field_shape)
+    rows, columns = (min(k, m) for k, m in zip(kernel.shape[-2:], most, strict=True))
+    return rows, columns
+
+
+def _fitting_field(field_shape, sensor, kernel) -> tuple[int, int]:
+    """A field whose centre fits the sensor's and the PSF's samples: smaller by one if need be."""
+    shape = _checks.shape2d("field_shape", field_shape)
+    sizes = zip(shape, sensor, kernel, strict=True)
+    rows, columns = (max(f - (s + f - 1 - k) % 2, 1) for f, s, k in sizes)
+    return rows, columns

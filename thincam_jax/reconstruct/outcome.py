@@ -1,0 +1,38 @@
+"""The `Outcome` of a method that runs to its end in one piece, without looking up."""
+
+import time
+from collections.abc import Callable
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from thincam_jax.reconstruct.drive import Outcome, Progress, Status
+
+
+def concluded(
+    start: Float[Array, "*batch channel plane y x"],
+    image: Float[Array, "*batch channel plane y x"],
+    objective: Callable[[Array], Array],
+    *,
+    converged: bool,
+    iterations: int,
+    began: float,
+) -> Outcome:
+    """What `drive` would say: the objective before and after, the start where the end is no number.
+
+    - `began`: `time.perf_counter()` at the start.
+    """
+    before, after = (_progress(n, objective(x)) for n, x in ((0, start), (iterations, image)))
+    finite = bool(jnp.isfinite(image).all())
+    status: Status = "converged" if converged else "iterations_exhausted"
+    return Outcome(
+        image if finite else start,
+        status if finite else "non_finite",
+        (before, after),
+        iterations,
+        time.perf_counter() - began,
+    )
+
+
+def _progress(iteration: int, value: Float[Array, "..."]) -> Progress:
+    return Progress(iteration, float(jnp.sum(value)), float("nan"), float("nan"))

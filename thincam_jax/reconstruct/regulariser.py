@@ -1,0 +1,99 @@
+r"""What is asked of an image besides its captures: R(f) = φ(Kf), and its proximal map."""
+
+import abc
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+Parts = tuple[Float[Array, "..."], ...]
+
+
+class AbstractRegulariser(eqx.Module):
+    r"""R(f) = φ(K f) of images (*batch, channel, plane, y, x), K linear, φ a norm or a seminorm.
+
+    - `orthonormal`: whether KᵀK = KKᵀ = 1, which gives a proximal map in closed form.
+    """
+
+    orthonormal: eqx.AbstractClassVar[bool]
+
+    @abc.abstractmethod
+    def __call__(self, image: Float[Array, "*batch channel plane y x"]) -> Float[Array, "*batch"]:
+        """R of each member of the batch."""
+
+    @abc.abstractmethod
+    def analyse(self, image: Float[Array, "*batch channel plane y x"]) -> Parts:
+        """K f."""
+
+    @abc.abstractmethod
+    def synthesise(self, parts: Parts) -> Float[Array, "*batch channel plane y x"]:
+        """Kᵀ of parts."""
+
+    @abc.abstractmethod
+    def shrink(self, parts: Parts, step) -> Parts:
+        """The parts u that minimise step·φ(u) + ½‖u − parts‖²."""
+
+    @abc.abstractmethod
+    def squared_norm(self, dtype) -> Float[Array, ""]:
+        """A bound of ‖K‖²."""
+
+
+def no_dual(regulariser: AbstractRegulariser, image) -> Parts:
+    """The dual of an image that is left as it is, to start `prox` with."""
+    shapes = jax.eval_shape(regulariser.analyse, image)
+    return tuple(jnp.zeros(s.shape, s.dtype) for s in shapes)
+
+
+def prox(
+    regulariser: AbstractRegulariser,
+    image: Float[Array, "*batch channel plane y x"],
+    step,
+    dual: Parts,
+    *,
+    nonnegative: bool,
+    iterations: int,
+) -> tuple[Float[Array, "*batch channel plane y x"], Parts]:
+    r"""The x that minimises step·R(x) + ½‖x − image‖², with x ≥ 0 where asked, and its dual.
+
+    In closed form, x = Kᵀ shrink(K image), if K is orthonormal and no sign is asked. Shrinking and
+    cutting off what is negative do not commute, so that together there is no closed form. As for
+    total variation, the dual problem then is solved, whose solution gives that of both at once,
+
+    .. math:: x = P(v - K^T p),\qquad
+        p = \arg\min_{\varphi^*(p / step) \le 1} \tfrac12\|P(v - K^T p)\|^2 + \dots
+
+    by accelerated projected gradients, with P the projection on what is allowed (Beck and Teboulle,
+    IEEE Trans. Image Process. 18, 2419, 2009, algorithm FGP). The projection of p is what
+    `shrink` takes away (Moreau).
+
+    After a fixed number of `iterations` x is inexact. Within an outer iteration hand the `dual`
+    of the last call back in: the inner problems change little, and the error goes to zero.
+    """
+    if regulariser.orthonormal and not nonnegative:
+        return regulariser.synthesise(regulariser.shrink(regulariser.analyse(image), step)), dual
+    rate = 1 / regulariser.squared_norm(image.dtype)
+
+    def allowed(parts):
+        rest = image - regulariser.synthesise(parts)
+        return jnp.maximum(rest, 0) if nonnegative else rest
+
+    def body(_, carry):
+        before, lead, t = carry
+        slopes = regulariser.analyse(allowed(lead))
+        moved = tuple(p + rate * s for p, s in zip(lead, slopes, strict=True))
+        shrunk = regulariser.shrink(moved, step)
+        after = tuple(m - s for m, s in zip(moved, shrunk, strict=True))
+        next_t = momentum(t)
+        speed = (t - 1) / next_t
+        lead = tuple(a + speed * (a - b) for a, b in zip(after, before, strict=True))
+        return after, lead, next_t
+
+    start = (dual, dual, jnp.ones((), image.dtype))
+    dual, _, _ = jax.lax.fori_loop(0, iterations, body, start)
+    return allowed(dual), dual
+
+
+def momentum(t: Float[Array, "..."]) -> Float[Array, "..."]:
+    """The next t of Nesterov's and Beck and Teboulle's sequence."""
+    return (1 + jnp.sqrt(1 + 4 * t**2)) / 2
