@@ -123,11 +123,11 @@ class _Blocks:
         """Σ e^{jγ|r−r₀|²} for each γ: what two chirps of that difference have in common."""
         y, x = (r - r0 for r, r0 in zip((self.y, self.x), centre, strict=True))
         sums = (np.exp(1j * gamma[..., None] * r**2).sum(axis=-1) for r in (y, x))
-        return math.prod(sums)
+        return np.prod(np.array(list(sums)), axis=0)
 
 
 def _curvature_and_epsilon(blocks: _Blocks, chirp: Chirp, half, fine: float) -> Chirp:
-    """γ and ε with the largest |⟨T, h⟩|/‖T‖ for the centre given, within `half`, in steps `fine`."""
+    """γ and ε with the largest |⟨T, h⟩|/‖T‖ at the centre given, within `half` in steps `fine`."""
     gammas = _axis(half[0], fine) + chirp.curvature
     epsilons = _axis(half[1], fine / chirp.curvature) + chirp.epsilon
     lowest, highest = gammas[0] / (1 + epsilons[-1]), gammas[-1] / (1 - epsilons[-1])
@@ -135,7 +135,7 @@ def _curvature_and_epsilon(blocks: _Blocks, chirp: Chirp, half, fine: float) -> 
     values = blocks.correlate(table, chirp.centre, np.zeros(1))[:, 0, 0]
     gains = [g[None, :] for g in _gains(epsilons)]
     matched = sum(a * np.interp(gammas[:, None] * a, table, values) for a in gains)
-    beat = blocks.overlap(gammas[:, None] * (gains[1] - gains[0]), chirp.centre).real
+    beat = blocks.overlap(gammas[:, None] * (gains[1] - gains[0]), chirp.centre).real  # pyright: ignore
     power = blocks.values.size * (gains[0] ** 2 + gains[1] ** 2) + 2 * gains[0] * gains[1] * beat
     score = np.abs(matched) ** 2 / power
     row, column = np.unravel_index(np.argmax(score), score.shape)

@@ -17,24 +17,35 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy import optimize
 
-from thincam_jax.calibrate.covariance import Covariance, covariance
-from thincam_jax.calibrate.problem import WHERE, Setting, model, unknown_names, with_fringes_held
+from thincam_jax.calibrate.covariance import Covariance, covariance, of_values
+from thincam_jax.calibrate.problem import (
+    SEEN,
+    WHERE,
+    Setting,
+    model,
+    seen_by_steps,
+    unknown_names,
+    with_fringes_held,
+)
 from thincam_jax.grids import Grid
 
 _BLOCK = 0.35  # of √(λd): the side of a coarse pixel
 _FEWEST = 48  # coarse pixels along a side
 _TRIALS = 5  # on either side of the best so far
 _ROUNDS = 2  # each with a fifth of the steps of the one before
-_EVALUATIONS = 12  # of least squares at each width of the differences
+_EVALUATIONS = 8  # of least squares at each width of the differences
 _WIDE, _NARROWER, _NARROWEST = 0.02, 0.25, 1e-6  # widths, in parts of one
-_AGAINST_ERROR = 3.0  # widths this many times the standard error still describe it
+_NARROW_ENOUGH = 2e-4  # for a start
+# Only widths above this many standard errors are narrowed: the next, a quarter as wide, is then
+# still three of them, so that the bottom of the bowl lies within it.
+_AGAINST_ERROR = 12.0
 _FRINGE = 0.02  # rad, at the rim: differences of what moves the fringes
 # What the waves of the rims depend on, and so is differenced widely.
-_RIMS = ("width", "distance", "object_distance", "wavelength")
+_RIMS = ("width", "wavelength")
 
 
 class View(NamedTuple):
-    """An image and where its samples lie: a grid with its middle `offset` (y, x, mm) off the axis."""
+    """An image and its grid, whose middle is `offset` (y, x, mm) off the axis."""
 
     image: np.ndarray
     grid: Grid
@@ -48,30 +59,36 @@ class View(NamedTuple):
 
 
 def descend(
-    image: np.ndarray, guess: Setting, start: Setting, parameters: Sequence[str], search: float
+    image: np.ndarray,
+    guess: Setting,
+    start: Setting,
+    parameters: Sequence[str],
+    search: float,
+    pixel_integration: bool,
 ) -> Setting:
     """The setting that fits the image best on coarse pixels, from one whose fringes are right.
 
     `guess` is what was given, `start` what the fringes say. Only `parameters` change.
     """
-    view = coarse_view(image, guess)
+    view = coarse_view(image, guess, pixel_integration)
     best = _best_by_trial(view, guess, start, parameters, search)
     best = _with_linear(view, best, parameters)
     names = unknown_names(tuple(parameters))
     width = _WIDE
     while True:
-        widths = difference_widths(best, names, width)
+        widths = difference_widths(best, width)
         step = optimize.least_squares(
             _residual,
             np.zeros(len(names)),
-            jac=_slopes,
+            jac=_slopes,  # pyright: ignore[reportArgumentType]
             x_scale="jac",
             max_nfev=_EVALUATIONS,
             args=(view, best, names, widths),
         )
+        known = _errors(step.jac, 2 * step.cost)
+        turned = np.asarray(seen_by_steps(best, names, step.x))
         best = best.moved(names, jnp.asarray(step.x))
-        errors = _errors(step.jac, 2 * step.cost).standard_errors
-        if width < _NARROWEST or _too_narrow(names, errors, widths):
+        if width < _NARROW_ENOUGH or _too_narrow(known, turned, widths):
             return best
         width = width * _NARROWER
 
@@ -82,49 +99,48 @@ def honest_covariance(view: View, found: Setting, names) -> Covariance:
     By differences over steps that are wide against the errors which they give, narrowed as long as
     they are: derivatives would count on waves of the rims that the noise may well hide.
     """
-    residual = _residual(np.zeros(len(names)), view, found, names, None)
-    squares, width = float(residual @ residual), _WIDE
-    jacobian = None
+    none = np.zeros(len(names))
+    residual = _residual(none, view, found, names, None)
+    squares, width, seen = float(residual @ residual), _WIDE, None
+    turned = np.asarray(seen_by_steps(found, names, none))
     while True:
-        widths = difference_widths(found, names, width)
-        jacobian = _slopes(np.zeros(len(names)), view, found, names, widths, jacobian)
-        known = _errors(jacobian, squares)
-        if width < _NARROWEST or _too_narrow(names, known.standard_errors, widths):
+        widths = difference_widths(found, width)
+        seen = _seen_slopes(view, found, turned, widths, seen)
+        known = _errors(seen @ turned, squares)
+        if width < _NARROWEST or _too_narrow(known, turned, widths):
             return known
         width = width * _NARROWER
 
 
 def slope_norms(view: View, setting: Setting, names) -> np.ndarray:
     """How far the image moves for a step of each unknown."""
-    widths = difference_widths(setting, names, _WIDE * _NARROWER)
+    widths = difference_widths(setting, _WIDE * _NARROWER)
     norms = np.linalg.norm(_slopes(np.zeros(len(names)), view, setting, names, widths), axis=0)
     return np.where(norms > 0, norms, 1.0)
 
 
-def difference_widths(setting: Setting, names: tuple[str, ...], width: float) -> np.ndarray:
-    """Half the step over which each unknown is differenced; `width` is that of the rims' unknowns."""
+def difference_widths(setting: Setting, width: float) -> np.ndarray:
+    """Half the step over which each of `SEEN` is differenced; `width` is that of λdM."""
     camera = setting.camera
-    reach = max(camera.sensor.shape) * float(camera.sensor.pitch) / 2
-    curvature = float(camera.mask.beta) / float(setting.magnification) ** 2
-    zone = math.sqrt(float(setting.wavelength) * float(camera.distance))
     pixel = float(camera.sensor.pitch)
+    reach = max(camera.sensor.shape) * pixel / 2
+    curvature = float(setting.mask.beta) / float(setting.magnification) ** 2
+    zone = math.sqrt(float(setting.wavelength) * float(camera.distance))
     every = {
         "beta": _FRINGE / (curvature * reach**2),
-        "phase": _FRINGE,
         "centre_y": _FRINGE / (2 * curvature * reach * pixel),
         "centre_x": _FRINGE / (2 * curvature * reach * pixel),
         # A rim moves by a few parts in 100 of a Fresnel zone for `width` of 2 %.
-        "width": 2 * width * zone / float(camera.mask.width),
-        "object_distance": 2 * width * zone / float(camera.mask.width),
-        "distance": width,
+        "width": 2 * width * zone / float(setting.mask.width),
         "wavelength": width,
     }
-    return np.array([every.get(name, _FRINGE) for name in names])
+    return np.array([every.get(name, _FRINGE) for name in SEEN])
 
 
-def _too_narrow(names, errors, widths) -> bool:
-    """Whether a rims' unknown is known no better than by the width of its differences."""
-    rims = [name in _RIMS for name in names]
+def _too_narrow(known: Covariance, turned: np.ndarray, widths: np.ndarray) -> bool:
+    """Whether what the rims tell is known no better than by the width of its differences."""
+    errors = of_values(known, turned).standard_errors
+    rims = [name in _RIMS and bool(np.any(row)) for name, row in zip(SEEN, turned, strict=True)]
     return not any(rims) or bool(np.any((_AGAINST_ERROR * errors > widths)[rims]))
 
 
@@ -137,19 +153,27 @@ def _residual(steps, view: View, start: Setting, names, widths) -> np.ndarray:
     return view.model(start, names, steps) - view.image.ravel()
 
 
-def _slopes(steps, view: View, start: Setting, names, widths, known=None) -> np.ndarray:
-    """∂model/∂steps by central differences; of `known` slopes only the rims' are made again."""
-    slopes = []
-    for i, name in enumerate(names):
+def _slopes(steps, view: View, start: Setting, names, widths) -> np.ndarray:
+    """∂model/∂steps, through what the image depends on."""
+    turned = np.asarray(seen_by_steps(start, names, steps))
+    return _seen_slopes(view, start.moved(names, jnp.asarray(steps)), turned, widths) @ turned
+
+
+def _seen_slopes(view: View, here: Setting, turned, widths, known=None) -> np.ndarray:
+    """By central differences in each of `SEEN`, 0 for what `turned` has no use for.
+
+    Of `known` slopes only the rims' are made again.
+    """
+    slopes = np.zeros((view.image.size, len(SEEN)))
+    for i, name in enumerate(SEEN):
         if known is not None and name not in _RIMS:
-            slopes.append(known[:, i])
-            continue
-        there, back = np.array(steps), np.array(steps)
-        there[i] += widths[i]
-        back[i] -= widths[i]
-        change = view.model(start, names, there) - view.model(start, names, back)
-        slopes.append(change / (2 * widths[i]))
-    return np.stack(slopes, axis=1)
+            slopes[:, i] = known[:, i]
+        elif np.any(turned[i]):
+            step = np.zeros(len(SEEN))
+            step[i] = widths[i]
+            change = view.model(here, SEEN, step) - view.model(here, SEEN, -step)
+            slopes[:, i] = change / (2 * widths[i])
+    return slopes
 
 
 def _best_by_trial(
@@ -181,7 +205,7 @@ def _trials(name: str, reach: float, guess: Setting) -> np.ndarray:
     count = _TRIALS
     if name == "width":
         zone = math.sqrt(float(guess.wavelength) * float(guess.camera.distance))
-        count = max(count, math.ceil(reach * float(guess.camera.mask.width) / zone))
+        count = max(count, math.ceil(reach * float(guess.mask.width) / zone))
     return 1 + reach * np.arange(-count, count + 1) / count
 
 
@@ -195,7 +219,7 @@ def full_view(image: np.ndarray, setting: Setting, pixel_integration: bool) -> V
     return View(image, setting.camera.sensor.grid, jnp.zeros(2), pixel_integration)
 
 
-def coarse_view(image: np.ndarray, guess: Setting) -> View:
+def coarse_view(image: np.ndarray, guess: Setting, pixel_integration: bool) -> View:
     """The image averaged over blocks about a third of a Fresnel zone wide; rests are dropped.
 
     The model is exact for these pixels as well.
@@ -209,7 +233,12 @@ def coarse_view(image: np.ndarray, guess: Setting) -> View:
     averages = kept.reshape(rows, size, columns, size).mean(axis=(1, 3))
     middles = np.array([top + rows * size / 2, left + columns * size / 2])
     offset = (middles - np.array(image.shape) / 2) * pitch
-    return View(averages, Grid((rows, columns), pitch * size), jnp.asarray(offset), True)
+    return View(
+        averages,
+        Grid((rows, columns), pitch * size),
+        jnp.asarray(offset),
+        size > 1 or pixel_integration,
+    )
 
 
 def _with_linear(view: View, setting: Setting, parameters: Sequence[str]) -> Setting:

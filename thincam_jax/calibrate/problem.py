@@ -1,7 +1,7 @@
 """The least-squares problem of a PSF fit: unknowns, model, residual and its Jacobian."""
 
 import operator
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import equinox as eqx
 import jax
@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 
 from thincam_jax.camera import LenslessCamera
 from thincam_jax.grids import Grid
+from thincam_jax.masks.fza import FresnelZoneAperture
 from thincam_jax.psf import psf
 
 # What a fit may be asked for, in the order of the result's tables.
@@ -28,8 +29,8 @@ PARAMETERS = (
 # How far a scaled step of 1 moves the image, in parts of its contrast. The solver's damping starts
 # at 1; from a start within a fraction of a fringe that would be slow, 1/STEP² is not.
 STEP = 30.0
-# Of the scaled steps, and of the weighted residual in any pixel. A million pixels at 30 dB determine
-# a scaled step to some 1e-6.
+# Of the scaled steps, and of the weighted residual in any pixel. A million pixels at 30 dB
+# determine a scaled step to some 1e-6.
 _TOLERANCE = 1e-7
 
 
@@ -55,6 +56,10 @@ class Setting(eqx.Module):
     gain: Float[Array, ""]
 
     @property
+    def mask(self) -> FresnelZoneAperture:
+        return cast(FresnelZoneAperture, self.camera.mask)
+
+    @property
     def magnification(self) -> Float[Array, ""]:
         """M = 1 + d/t."""
         return 1 + self.camera.distance * self.nearness
@@ -64,7 +69,7 @@ class Setting(eqx.Module):
         h = psf(
             self.camera,
             wavelength=self.wavelength,
-            object_distance=1 / self.nearness,
+            object_distance=1 / self.nearness,  # pyright: ignore[reportArgumentType]
             model="separable",
             pixel_integration=pixel_integration,
             grid=grid,
@@ -79,7 +84,7 @@ class Setting(eqx.Module):
         fringes stay: what is left of d and t are diffraction and the size of the shadow.
         """
         s = dict(zip(names, steps, strict=True))
-        mask, pitch = self.camera.mask, self.camera.sensor.pitch
+        mask, pitch = self.mask, self.camera.sensor.pitch
         none = jnp.zeros_like(steps[0])
         nearness = self.nearness
         if "object_distance" in s:  # else untouched: t(1/t) has no derivative at 0
@@ -105,7 +110,7 @@ class Setting(eqx.Module):
 
     def values(self, names: tuple[str, ...]) -> Float[Array, " unknown"]:
         """The named numbers: mm, rad/mm², rad; for object_distance 1/t in 1/mm."""
-        mask = self.camera.mask
+        mask = self.mask
         every = {
             "beta": mask.beta,
             "phase": mask.phase,
@@ -130,7 +135,7 @@ WHERE = {
 
 
 def _numbers(setting: Setting):
-    mask = setting.camera.mask
+    mask = setting.mask
     return (
         mask.beta,
         mask.phase,
@@ -150,7 +155,7 @@ def with_fringes_held(setting: Setting, name: str, value: float, hold: bool) -> 
     if not hold:
         return there
     ratio = there.magnification / setting.magnification
-    return eqx.tree_at(lambda s: s.camera.mask.beta, there, there.camera.mask.beta * ratio**2)
+    return eqx.tree_at(lambda s: s.camera.mask.beta, there, there.mask.beta * ratio**2)
 
 
 class Problem(eqx.Module):
@@ -193,12 +198,49 @@ def residual(scaled: Float[Array, " unknown"], problem: Problem) -> Float[Array,
 
 @eqx.filter_jit
 def model(steps, start: Setting, names: tuple[str, ...], pixel_integration, grid: Grid, offset):
-    """The image after the steps, on a grid whose middle lies `offset` (y, x, mm) off the sensor's."""
+    """The image after the steps, on a grid whose middle is `offset` (y, x, mm) off the sensor's."""
     setting = start.moved(names, steps)
     # The grid's middle is its origin: the mask moves the other way.
     centre = setting.camera.mask.centre - offset / setting.magnification
     setting = eqx.tree_at(lambda s: s.camera.mask.centre, setting, centre)
     return setting.image(pixel_integration, grid)
+
+
+# What the image depends on, each moved by its own step: β/M², φ, M·centre, M·width, λdM, and what
+# is linear. d and t act through M and λdM only, so that λ's step stands for that of λdM.
+SEEN = (
+    "beta",
+    "phase",
+    "centre_y",
+    "centre_x",
+    "width",
+    "wavelength",
+    "background",
+    "gain",
+)
+
+
+@eqx.filter_jit
+def seen_by_steps(start: Setting, names: tuple[str, ...], steps) -> Float[Array, "seen step"]:
+    """How far each of `SEEN` moves with each step: exact, also where steps cannot be told apart."""
+    return jax.jacfwd(_seen)(steps, start, names)
+
+
+def _seen(steps, start: Setting, names):
+    there = start.moved(names, steps)
+    mask, scale = there.mask, there.magnification
+    centre = mask.centre * scale / jax.lax.stop_gradient(scale) / there.camera.sensor.pitch
+    numbers = (
+        jnp.log(mask.beta / scale**2),
+        mask.phase,
+        centre[0],
+        centre[1],
+        jnp.log(mask.width * scale),
+        jnp.log(there.wavelength * there.camera.distance * scale),
+        there.background,
+        there.gain,
+    )
+    return jnp.stack(numbers)
 
 
 @eqx.filter_jit

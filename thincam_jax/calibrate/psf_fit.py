@@ -144,7 +144,7 @@ def fit_psf(
     with allow("float64", camera):
         guess = given(cast(camera, "float64"), object_distance, wavelength, parameters)
         check_fringes(guess)
-        start = start_near(image, guess, parameters, ranges, float(search))
+        start = start_near(image, guess, parameters, ranges, float(search), pixel_integration)
         names = unknown_names(parameters)
         return _fit(
             image, start, names, pixel_integration, max_steps, precision_of(camera.distance)
@@ -173,13 +173,8 @@ def _check_image(image, camera: LenslessCamera) -> np.ndarray:
 
 
 def _fit(image, start: Setting, names, pixel_integration, max_steps, precision) -> PsfFit:
-    problem = _problem(image, start, names, True)
+    problem = _problem(image, start, names, pixel_integration)
     solution = solve(problem, max_steps)
-    if not pixel_integration:
-        # The sampled model's aliased waves leave it no way to go but the last fraction of a turn.
-        start = setting_and_residual(solution.scaled, problem)[0]
-        problem = _problem(image, start, names, False)
-        solution = solve(problem, max_steps)
     return _report(problem, solution, precision)
 
 
@@ -208,18 +203,21 @@ def _report(problem: Problem, solution: Solution, precision: Precision) -> PsfFi
         errors["object_distance"] = errors["object_distance"] * distance**2
     explained = 1 - float(jnp.sum((residual * problem.weight) ** 2))
     status, reasons = _status(solution, explained, alike)
-    numbers = (
-        found.camera,
-        jnp.asarray(distance),
-        found.wavelength,
-        found.background,
-        found.gain,
-        {name: jnp.asarray(value) for name, value in values.items()},
-        {name: jnp.asarray(error) for name, error in errors.items()},
-        jnp.asarray(known.correlation),
-        residual,
+    return PsfFit(
+        cast(found.camera, precision),
+        cast(jnp.asarray(distance), precision),
+        cast(found.wavelength, precision),
+        cast(found.background, precision),
+        cast(found.gain, precision),
+        cast({name: jnp.asarray(value) for name, value in values.items()}, precision),
+        cast({name: jnp.asarray(error) for name, error in errors.items()}, precision),
+        cast(jnp.asarray(known.correlation), precision),
+        cast(residual, precision),
+        names,
+        status,
+        reasons,
+        solution.iterations,
     )
-    return PsfFit(*cast(numbers, precision), names, status, reasons, solution.iterations)
 
 
 def _slopes_of_values(found: Setting, names) -> np.ndarray:

@@ -23,6 +23,7 @@ _SMALLEST = 32  # pixels a side: less leaves nothing between the margins
 _BLOCK = 24  # pixels a side of the blocks whose errors count as independent
 _LEAST_CORRELATION = 0.5
 _TOLERANCE = 1e-6  # pixels
+_WEIGHT = 1e3  # of residuals: the solver starts with a damping of 1, which is to be weak
 
 
 class Registration(eqx.Module):
@@ -104,12 +105,13 @@ def estimate_registration(
         raise ValueError(f"search = {search:g} is too wide; give at most 0.5")
     smoothing = float(_checks.non_negative("smoothing", smoothing, "pixels"))
     block = max(1, min(capture.shape) // _COARSE)
-    small = [_averages(image, block) for image in (capture, reference)]
+    small, other = _averages(capture, block), _averages(reference, block)
     with allow("float64"):
-        start = _phase_correlation(*small, scale, search)
-        start, _ = _fit(*small, start, 1.0, max_steps)
+        start = _phase_correlation(small, other, scale, search)
+        start, _ = _fit(small, other, start, 1.0, max_steps)
         start = Place(start.scale, start.shift * block)
-        return _report(capture, reference, *_fit(capture, reference, start, smoothing, max_steps))
+        place, fit = _fit(capture, reference, start, smoothing, max_steps)
+        return _report(capture, reference, place, fit)
 
 
 def _averages(image: np.ndarray, size: int) -> np.ndarray:
@@ -174,12 +176,12 @@ def _fit(capture, reference, start: Place, smoothing: float, max_steps: int) -> 
         scipy.ndimage.gaussian_filter(image, sigma, mode="nearest")
         for image, sigma in ((capture, smoothing * start.scale), (reference, smoothing))
     ]
-    smooth = [jnp.asarray((image - image.mean()) / image.std()) for image in smooth]
+    first, second = (jnp.asarray((image - image.mean()) / image.std()) for image in smooth)
     scale, shift = jnp.asarray(start.scale, jnp.float64), jnp.asarray(start.shift, jnp.float64)
     margin = LOBES + math.ceil(3 * smoothing * max(1.0, start.scale))
     margin = min(margin, min(capture.shape) // 6)
     weights = covered(capture.shape, scale, shift, margin)
-    pair = Pair(*smooth, weights / capture.size**0.5, scale, shift)
+    pair = Pair(first, second, weights * (_WEIGHT / capture.size**0.5), scale, shift)
     solution = _least_squares(pair, max_steps)
     converged = bool(solution.result == optx.RESULTS.successful)
     scale, shift = _place(solution.value, pair)

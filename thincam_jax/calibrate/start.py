@@ -51,7 +51,7 @@ def search_ranges(
 
 def check_fringes(guess: Setting) -> None:
     """Refuse a sensor, or a shadow on it, that holds less than one fringe."""
-    mask, sensor = guess.camera.mask, guess.camera.sensor
+    mask, sensor = guess.mask, guess.camera.sensor
     scale = float(guess.magnification)
     halves = [
         min(n * float(sensor.pitch) / scale, float(mask.width)) / 2  # on the mask's scale
@@ -66,7 +66,12 @@ def check_fringes(guess: Setting) -> None:
 
 
 def start_near(
-    image: np.ndarray, guess: Setting, parameters: Sequence[str], ranges: Ranges, search: float
+    image: np.ndarray,
+    guess: Setting,
+    parameters: Sequence[str],
+    ranges: Ranges,
+    search: float,
+    pixel_integration: bool,
 ) -> Setting:
     """The setting whose fringes correlate best with the image, with the best background and gain.
 
@@ -75,15 +80,15 @@ def start_near(
     pitch = float(guess.camera.sensor.pitch)
     found = find_chirp(image, pitch, _fringes(guess), ranges)
     near = _with_fringes(guess, found, parameters, search)
-    return descend(image, guess, near, parameters, search)
+    return descend(image, guess, near, parameters, search, pixel_integration)
 
 
 def _fringes(setting: Setting) -> Chirp:
     camera, scale = setting.camera, float(setting.magnification)
-    beta = float(camera.mask.beta)
+    beta = float(setting.mask.beta)
     epsilon = beta * float(setting.wavelength) * float(camera.distance) / (math.pi * scale)
-    centre = np.asarray(camera.mask.centre) * scale
-    return Chirp(beta / scale**2, epsilon, centre, float(camera.mask.phase))
+    centre = np.asarray(setting.mask.centre) * scale
+    return Chirp(beta / scale**2, epsilon, centre, float(setting.mask.phase))
 
 
 def _with_fringes(
@@ -94,8 +99,9 @@ def _with_fringes(
     Weak diffraction says little of ε: d and λ stay within `search` of the guess.
     """
     camera = guess.camera
-    beta, distance = float(camera.mask.beta), float(camera.distance)
+    beta, distance = float(guess.mask.beta), float(camera.distance)
     wavelength, nearness = float(guess.wavelength), float(guess.nearness)
+    scale = 1 + distance * nearness
     for _ in range(5):  # β and d depend on each other through M, by parts of d/t
         scale = 1 + distance * nearness
         if "beta" in parameters:
@@ -109,7 +115,7 @@ def _with_fringes(
     if "beta" not in parameters and "object_distance" in parameters:
         scale = max(math.sqrt(beta / fringes.curvature), 1 + _FARTHEST)
         nearness = (scale - 1) / distance
-    mask = camera.mask
+    mask = guess.mask
     centre = fringes.centre / scale if "centre" in parameters else np.asarray(mask.centre)
     phase = float(mask.phase)
     if "phase" in parameters:
@@ -123,7 +129,7 @@ def _within(value: float, guess, search: float) -> float:
 
 
 def _searched(setting: Setting):
-    camera, mask = setting.camera, setting.camera.mask
+    camera, mask = setting.camera, setting.mask
     return (
         mask.beta,
         mask.phase,

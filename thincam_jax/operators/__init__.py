@@ -6,3 +6,9 @@ from thincam_jax.operators.crop_convolution import CropConvolution as CropConvol
 from thincam_jax.operators.crop_convolution import kernel_grid as kernel_grid
 from thincam_jax.operators.crop_convolution import kernel_shape as kernel_shape
 from thincam_jax.operators.crop_convolution import window_shape as window_shape
+from thincam_jax.operators.masked import Masked as Masked
+from thincam_jax.operators.masked import Scaled as Scaled
+from thincam_jax.operators.matrix import Matrix as Matrix
+from thincam_jax.operators.separable import Separable as Separable
+from thincam_jax.operators.sparse import Sparse as Sparse
+from thincam_jax.operators.stacked import Stacked as Stacked

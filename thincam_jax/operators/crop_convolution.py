@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
 
+from thincam_jax import _checks
 from thincam_jax.grids import Grid, fast_shape
 from thincam_jax.operators.base import AbstractOperator
 
@@ -31,7 +32,8 @@ class CropConvolution(AbstractOperator):
     - `pitch`: Δ, mm.
     - `sensor_shape`, `field_shape`: (rows, columns).
     - `summed`: how many axes of the kernel before its last two are summed over. Those before
-      them are channels: each of the field's convolved with its own.
+      them are channels: each of the field's convolved with its own. A channel axis of length 1
+      is one PSF for any number of channels.
     - `window`: shape of the transforms, at least `window_shape(…)`, the default.
 
     Field and sensor lie in the middle of the window: their first samples at `field_corner` and
@@ -54,8 +56,11 @@ class CropConvolution(AbstractOperator):
         summed: int = 0,
         window: tuple[int, int] | None = None,
     ):
-        self.sensor_shape, self.field_shape = tuple(sensor_shape), tuple(field_shape)
+        self.sensor_shape = _checks.shape2d("sensor_shape", sensor_shape)
+        self.field_shape = _checks.shape2d("field_shape", field_shape)
         self.summed = summed
+        if kernel.ndim < 2:
+            raise ValueError(f"kernel has shape {kernel.shape}; give rows and columns of a PSF")
         if not 0 <= summed <= kernel.ndim - 2:
             raise ValueError(
                 f"summed is {summed}, but the kernel has {kernel.ndim - 2} axes before its rows; "
@@ -63,7 +68,7 @@ class CropConvolution(AbstractOperator):
             )
         kernel = _fit(kernel, kernel_shape(self.sensor_shape, self.field_shape))
         smallest = window_shape(self.sensor_shape, self.field_shape, kernel.shape[-2:])
-        self.window = smallest if window is None else tuple(window)
+        self.window = smallest if window is None else _checks.shape2d("window", window)
         if any(w < s for w, s in zip(self.window, smallest, strict=True)):
             raise ValueError(
                 f"window is {self.window}; in fewer than {smallest} samples light wraps round"
@@ -97,7 +102,7 @@ class CropConvolution(AbstractOperator):
 
     def __call__(self, field: Float[Array, "*batch m n"]) -> Float[Array, "*channels y x"]:
         """The capture of a field (*batch, *channel, *summed, m, n)."""
-        _require_shape("field", field, self.field_shape)
+        _require_shape("field", field, self.in_shape, self.summed)
         # Where the field lies in the window matters to nobody but a phase, which the corner undoes.
         padded = place(field, self.field_corner, self.window)
         product = self.combine(jnp.fft.rfft2(padded))
@@ -105,7 +110,7 @@ class CropConvolution(AbstractOperator):
 
     def adjoint(self, capture: Float[Array, "*channels y x"]) -> Float[Array, "*batch m n"]:
         """The transposed operator: correlation of a capture with the PSF."""
-        _require_shape("capture", capture, self.sensor_shape)
+        _require_shape("capture", capture, self.out_shape, 0)
         padded = place(capture, self.sensor_corner, self.window)
         product = self.spread(jnp.fft.rfft2(padded))
         return cut(jnp.fft.irfft2(product, s=self.window), self.field_corner, self.field_shape)
@@ -153,10 +158,18 @@ def _fit(kernel: Float[Array, "*planes k l"], shape: tuple[int, int]):
     return cut(kernel, surplus, sizes)
 
 
-def _require_shape(name: str, image: Array, shape: tuple[int, int]) -> None:
-    """A larger image would be cut and a smaller one shifted, without a word."""
-    if image.shape[-2:] != shape:
-        raise ValueError(f"{name} has shape {image.shape}; the operator takes (…, y, x) = {shape}")
+def _require_shape(name: str, image: Array, shape: tuple[int, ...], summed: int) -> None:
+    """One line for an image that would be cut, shifted or repeated without a word.
+
+    A channel axis of length 1 is one PSF for any number of channels.
+    """
+    given = image.shape[max(0, image.ndim - len(shape)) :]
+    exact = 2 + summed
+    channels = zip(given[:-exact], shape[:-exact], strict=False)
+    fits = len(given) == len(shape) and all(s in (1, n) for n, s in channels)
+    if not fits or given[-exact:] != shape[-exact:]:
+        axes = ", ".join(["…", *["plane"] * (len(shape) - 2), "y", "x"])
+        raise ValueError(f"{name} has shape {image.shape}; the operator takes ({axes}) = {shape}")
 
 
 @functools.partial(jax.jit, static_argnames=("window", "shift"))
