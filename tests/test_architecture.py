@@ -47,8 +47,10 @@ ORDER = (
         "waveguide",
         "reconstruct",
     ),
-    *("metrics", "design", "calibrate", "measured", "config", "study", "report"),
-    *("bench", "doctor", "run", "cli"),
+    *("metrics", "depth", "design", "calibrate", "measured"),
+    *("config", "config_refocus", "study", "report"),
+    *("bench", "doctor", "run", "run_refocus", "reconstruction_run"),
+    *("terminal", "cli_reconstruct", "cli_refocus", "cli"),
     "hardware",
 )
 ENTRY = ("__init__", "__main__")  # they stand right of everything but `hardware`
@@ -56,7 +58,10 @@ MAX_LINES = 500
 
 JAXOPT_FILES = ("reconstruct/_jaxopt.py", "design/_jaxopt.py")
 FRONT_END_LIBRARIES = ("matplotlib", "pydantic", "typer", "rich", "jinja2")
-FRONT_END = ("config", "study", "report", "bench", "doctor", "cli")
+FRONT_END = (
+    *("config", "config_refocus", "study", "report", "bench", "doctor"),
+    *("terminal", "cli_reconstruct", "cli_refocus", "cli"),
+)
 
 
 @dataclass(frozen=True)

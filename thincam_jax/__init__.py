@@ -1,5 +1,6 @@
 """thincam_jax: simulate, reconstruct and design thin computational cameras, in JAX."""
 
+from thincam_jax.calibrate import fit_psf as fit_psf
 from thincam_jax.camera import LenslessCamera as LenslessCamera
 from thincam_jax.capture import capture as capture
 from thincam_jax.grids import Grid as Grid
@@ -11,8 +12,10 @@ from thincam_jax.psf import MODELS as MODELS
 from thincam_jax.psf import otf as otf
 from thincam_jax.psf import psf as psf
 from thincam_jax.reconstruct import FringeScanning as FringeScanning
+from thincam_jax.reconstruct import TotalVariation as TotalVariation
 from thincam_jax.reconstruct import WienerSynthesis as WienerSynthesis
 from thincam_jax.reconstruct import reconstruct as reconstruct
+from thincam_jax.reconstruct import solve_fixed_point as solve_fixed_point
 from thincam_jax.responses import fringe_scanned_otf as fringe_scanned_otf
 from thincam_jax.responses import phase_pair_otf as phase_pair_otf
 from thincam_jax.scene import ImagePlane as ImagePlane

@@ -3,9 +3,8 @@
 import os
 import sys
 from pathlib import Path
-from typing import Annotated, NoReturn
+from typing import Annotated
 
-import rich.console
 import rich.progress
 import rich.table
 import typer
@@ -13,9 +12,13 @@ import typer
 from thincam_jax import bench as benches
 from thincam_jax import doctor as doctoring
 from thincam_jax.bench.console import accuracy_table, cost_table, verdict
-from thincam_jax.config import ConfigError, load_config, slug
+from thincam_jax.cli_reconstruct import reconstruct
+from thincam_jax.cli_refocus import refocus
+from thincam_jax.config import ConfigError, StudyConfig, load_config, slug
+from thincam_jax.config_refocus import RefocusConfig, load_experiment
 from thincam_jax.run import run_study, steps
 from thincam_jax.study import RunFolder, check_study
+from thincam_jax.terminal import INTERRUPTED, columns, console, fail, tell
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -25,31 +28,25 @@ app = typer.Typer(
 )
 bench = typer.Typer(no_args_is_help=True, help="Measure what the models of a study cost.")
 app.add_typer(bench, name="bench")
-_console = rich.console.Console()
-_errors = rich.console.Console(stderr=True)
+app.command()(reconstruct)
 
-_INTERRUPTED = 130  # the shells' exit code after Ctrl-C
+ConfigFile = Annotated[Path, typer.Argument(help="Experiment file (YAML); see configs/.")]
+Overrides = Annotated[
+    list[str] | None,
+    typer.Option("--set", help="Change a value: a.b=value, list entries by number."),
+]
 
 # What a user can put right; anything else is a defect and keeps its traceback.
 _USER_ERRORS = (ConfigError, FileNotFoundError, IsADirectoryError, PermissionError, MemoryError)
 
 
-def _fail(error: BaseException) -> NoReturn:
-    for line in str(error).splitlines():
-        _errors.print(f"thincam: {line}", highlight=False, markup=False, soft_wrap=True)
-    raise typer.Exit(2)
-
-
 @app.command()
 def run(
-    config: Annotated[Path, typer.Argument(help="Experiment file (YAML); see configs/.")],
+    config: ConfigFile,
     out: Annotated[
         Path | None, typer.Option(help="Run folder; default runs/NAME of the study.")
     ] = None,
-    set_: Annotated[
-        list[str] | None,
-        typer.Option("--set", help="Change a value: a.b=value, list entries by number."),
-    ] = None,
+    set_: Overrides = None,
 ) -> None:
     """Run a study: captures, reconstructions, metrics.json, figures and report.html.
 
@@ -57,39 +54,27 @@ def run(
     """
     folder, study = None, None
     try:
-        study = load_config(config, tuple(set_ or ()))
+        study = load_experiment(config, tuple(set_ or ()))
+        if isinstance(study, RefocusConfig):
+            refocus(study, RunFolder(out or Path("runs") / slug(study.name)))
+            return
         check_study(study)
         folder = RunFolder(out or Path("runs") / slug(study.name))
-        with rich.progress.Progress(*_columns(), console=_console) as bar:
+        with rich.progress.Progress(*columns(), console=console) as bar:
             task = bar.add_task(study.name, total=steps(study))
             metrics = run_study(
                 study, folder, lambda text: bar.update(task, advance=1, description=text)
             )
     except _USER_ERRORS as error:
-        _fail(error)
+        fail(error)
     except KeyboardInterrupt:
-        targets = study.targets if study and folder else ()
+        targets = study.targets if isinstance(study, StudyConfig) and folder else ()
         finished = [t.name for t in targets if folder and folder.finished(t.name) is not None]
         done = ", ".join(finished) if finished else "no target yet"
-        _errors.print(
-            f"thincam: interrupted; finished: {done}. The same command goes on from there.",
-            highlight=False,
-            soft_wrap=True,
-        )
-        raise typer.Exit(_INTERRUPTED) from None
+        tell(f"interrupted; finished: {done}. The same command goes on from there.")
+        raise typer.Exit(INTERRUPTED) from None
     _print_results(metrics)
-    _console.print(f"report: {folder.path / 'report.html'}", highlight=False, soft_wrap=True)
-
-
-def _columns() -> tuple[rich.progress.ProgressColumn, ...]:
-    return (
-        rich.progress.TextColumn("{task.description}"),
-        rich.progress.BarColumn(),
-        rich.progress.MofNCompleteColumn(),
-        rich.progress.TimeElapsedColumn(),
-        rich.progress.TextColumn("left"),
-        rich.progress.TimeRemainingColumn(),
-    )
+    console.print(f"report: {folder.path / 'report.html'}", highlight=False, soft_wrap=True)
 
 
 def _print_results(metrics: dict) -> None:
@@ -108,7 +93,7 @@ def _print_results(metrics: dict) -> None:
             _number(published["resolved_object_mm"], 2),
             _number(method["limits"]["cut_off_cycles_per_mm"], 1),
         )
-    _console.print(table)
+    console.print(table)
 
 
 def _number(value: float | None, digits: int) -> str:
@@ -117,7 +102,7 @@ def _number(value: float | None, digits: int) -> str:
 
 @bench.command()
 def accuracy(
-    config: Annotated[Path, typer.Argument(help="Experiment file (YAML); see configs/.")],
+    config: ConfigFile,
     out: Annotated[
         Path | None, typer.Option(help="Folder of the results; default runs/NAME-accuracy.")
     ] = None,
@@ -128,10 +113,7 @@ def accuracy(
     capture_size: Annotated[
         int | None, typer.Option(help="The same for captures and reconstructions; default 256.")
     ] = None,
-    set_: Annotated[
-        list[str] | None,
-        typer.Option("--set", help="Change a value: a.b=value, list entries by number."),
-    ] = None,
+    set_: Overrides = None,
 ) -> None:
     """Every model's error and time, and what an error of the PSF costs in PSNR.
 
@@ -141,34 +123,34 @@ def accuracy(
         study = load_config(config, tuple(set_ or ()))
         plan = benches.check(study, benches.Options(tuple(size or ()), capture_size))
         folder = benches.BenchFolder(out or Path("runs") / f"{slug(study.name)}-accuracy")
-        with rich.progress.Progress(*_columns(), console=_console) as bar:
+        with rich.progress.Progress(*columns(), console=console) as bar:
             task = bar.add_task(study.name, total=benches.steps(study, plan))
             results = benches.run_accuracy(
                 study, plan, folder, lambda text: bar.update(task, advance=1, description=text)
             )
     except _USER_ERRORS as error:
-        _fail(error)
+        fail(error)
     except KeyboardInterrupt:
-        _errors.print("thincam: interrupted; nothing is kept.", highlight=False, soft_wrap=True)
-        raise typer.Exit(_INTERRUPTED) from None
-    _console.print(accuracy_table(results))
-    _console.print(cost_table(results))
+        tell("interrupted; nothing is kept.")
+        raise typer.Exit(INTERRUPTED) from None
+    console.print(accuracy_table(results))
+    console.print(cost_table(results))
     for line in (*verdict(results), f"figure: {folder.path / 'accuracy.png'}"):
-        _console.print(line, highlight=False, soft_wrap=True)
+        console.print(line, highlight=False, soft_wrap=True)
 
 
 @app.command()
 def doctor() -> None:
     """Print versions, devices, supported precisions and missing optional parts."""
     found = doctoring.environment()
-    _console.print(f"Python {found['python']} on {found['platform']}", highlight=False)
-    _console.print("devices: " + ", ".join(found["devices"]), highlight=False)
+    console.print(f"Python {found['python']} on {found['platform']}", highlight=False)
+    console.print("devices: " + ", ".join(found["devices"]), highlight=False)
     for name, support in doctoring.dtype_support().items():
-        _console.print(f"  {name}: {support}", highlight=False)
+        console.print(f"  {name}: {support}", highlight=False)
     for name, version in found["versions"].items():
-        _console.print(f"{name} {version or 'NOT INSTALLED'}", highlight=False)
+        console.print(f"{name} {version or 'NOT INSTALLED'}", highlight=False)
     for name, purpose in doctoring.missing_parts().items():
-        _console.print(f"optional {name} is missing: {purpose}", highlight=False)
+        console.print(f"optional {name} is missing: {purpose}", highlight=False)
 
 
 def main() -> None:
@@ -176,11 +158,11 @@ def main() -> None:
     try:
         app()
     except SystemExit as end:
-        if end.code == _INTERRUPTED:
+        if end.code == INTERRUPTED:
             # Not by way of the interpreter's end: threads that still compile may crash there.
             sys.stdout.flush()
             sys.stderr.flush()
-            os._exit(_INTERRUPTED)
+            os._exit(INTERRUPTED)
         raise
 
 

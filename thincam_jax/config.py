@@ -3,7 +3,7 @@
 import math
 import re
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Literal, TypeVar, get_args
 
 import pydantic
 import yaml
@@ -25,7 +25,7 @@ def slug(name: str) -> str:
     return re.sub(r"[^a-z0-9.]+", "-", name.lower()).strip("-.") or "unnamed"
 
 
-def _misfit(message: str, *place: str | int) -> PydanticCustomError:
+def misfit(message: str, *place: str | int) -> PydanticCustomError:
     """A fault between entries, reported at one of them."""
     return PydanticCustomError("misfit", "{message}", {"message": message, "place": place})
 
@@ -42,7 +42,7 @@ def _optical(value: float) -> float:
     return value
 
 
-def _quantity(kind: str, unit: str):
+def quantity(kind: str, unit: str):
     # A resolved file is read back, so it is written in the unit of the package, with every digit.
     return (
         BeforeValidator(lambda text: parse_quantity(text, kind)),
@@ -50,18 +50,20 @@ def _quantity(kind: str, unit: str):
     )
 
 
-Length = Annotated[float, *_quantity("length", "mm"), AfterValidator(_positive)]
-Wavelength = Annotated[float, *_quantity("length", "mm"), AfterValidator(_optical)]
-Curvature = Annotated[float, *_quantity("curvature", "rad/mm^2"), AfterValidator(_positive)]
-Angle = Annotated[float, *_quantity("angle", "rad")]
+Length = Annotated[float, *quantity("length", "mm"), AfterValidator(_positive)]
+Wavelength = Annotated[float, *quantity("length", "mm"), AfterValidator(_optical)]
+Curvature = Annotated[float, *quantity("curvature", "rad/mm^2"), AfterValidator(_positive)]
+Angle = Annotated[float, *quantity("angle", "rad")]
 Name = Annotated[str, Field(min_length=1, max_length=60, pattern=r"^[\w .,()=+\-]+$")]
 
 
-class _Section(pydantic.BaseModel):
+class Section(pydantic.BaseModel):
+    """A part of an experiment file: unknown keys are refused."""
+
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
-class SensorConfig(_Section):
+class SensorConfig(Section):
     """`thincam_jax.Sensor`."""
 
     shape: tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]]
@@ -71,7 +73,7 @@ class SensorConfig(_Section):
     bit_depth: Annotated[int, Field(ge=1, le=24)] | None = None
 
 
-class MaskConfig(_Section):
+class MaskConfig(Section):
     """What all the study's Fresnel zone apertures share."""
 
     width: Length
@@ -81,14 +83,14 @@ class MaskConfig(_Section):
     fill_factor: Annotated[float, Field(gt=0, le=1)] = 1.0
 
 
-class ObjectConfig(_Section):
+class ObjectConfig(Section):
     """Where the targets stand and how wide they are."""
 
     distance: Length
     width: Length
 
 
-class NoiseConfig(_Section):
+class NoiseConfig(Section):
     """Gaussian noise at an SNR, or shot noise with a read noise in electrons."""
 
     snr_db: Annotated[float, Field(ge=-60, le=200)] | None = None
@@ -102,7 +104,7 @@ class NoiseConfig(_Section):
         return self
 
 
-class ShotConfig(_Section):
+class ShotConfig(Section):
     """One setting of the camera; the phases of the synthesis are taken at each."""
 
     beta: Curvature
@@ -110,7 +112,7 @@ class ShotConfig(_Section):
     wavelength: Wavelength | None = None
 
 
-class PublishedConfig(_Section):
+class PublishedConfig(Section):
     """Figures that a publication gives for a method, shown beside the study's own."""
 
     psnr_db: float | None = None
@@ -118,11 +120,28 @@ class PublishedConfig(_Section):
     limit_cycles_per_mm: Annotated[float, Field(gt=0)] | None = None
 
 
-class MethodConfig(_Section):
+class VariationConfig(Section):
+    """Total variation of an admm_tv method; see `thincam_jax.reconstruct`."""
+
+    tau: Annotated[float, Field(ge=0)] = 1.5
+    iterations: Annotated[int, Field(ge=1, le=100_000)] = 100
+    kind: Literal["isotropic", "anisotropic"] = "isotropic"
+    coupling: Literal["none", "joint", "opponent"] | None = None
+    chroma_weight: Annotated[float, Field(ge=0)] = 2.0
+
+    def coupling_of(self, channels: int) -> Literal["none", "joint", "opponent"]:
+        """As given; else what suits the number of colour channels."""
+        if channels == 1:
+            return "none"
+        return self.coupling or ("opponent" if channels == 3 else "joint")
+
+
+class MethodConfig(Section):
     """A reconstruction and the captures that it takes."""
 
     name: Name
-    kind: Literal["fringe_scanning", "wiener"]
+    kind: Literal["fringe_scanning", "wiener", "admm_tv"]
+    variation: VariationConfig | None = None
     synthesis: Literal["fringe_scanning", "phase_pairs", "separate"] = "fringe_scanning"
     shots: Annotated[tuple[ShotConfig, ...], Field(min_length=1)]
     phases: Annotated[tuple[Angle, ...], Field(min_length=1)] = (0.0,)
@@ -134,6 +153,8 @@ class MethodConfig(_Section):
             len(self.shots) != 1 or self.synthesis != "fringe_scanning"
         ):
             raise ValueError("kind fringe_scanning takes one shot and its own synthesis")
+        if self.variation is not None and self.kind != "admm_tv":
+            raise ValueError(f"kind {self.kind} has no total variation; drop 'variation'")
         if self.synthesis != "separate" and self.phases != (0.0,):
             raise ValueError(f"synthesis {self.synthesis} sets the phases itself; drop 'phases'")
         return self
@@ -145,7 +166,7 @@ class MethodConfig(_Section):
         return (0.0, 3 * math.pi / 2) if self.synthesis == "phase_pairs" else self.phases
 
 
-class TargetConfig(_Section):
+class TargetConfig(Section):
     """A scene: a drawn chart or pattern, a photograph of scikit-image, or an image file.
 
     Charts and patterns are squares of `pixels` × `pixels`.
@@ -170,7 +191,7 @@ class TargetConfig(_Section):
         return self
 
 
-class StudyConfig(_Section):
+class StudyConfig(Section):
     """A whole study: one camera family, several methods, several targets."""
 
     name: Name
@@ -189,42 +210,44 @@ class StudyConfig(_Section):
     notes: tuple[str, ...] = ()
 
     @pydantic.model_validator(mode="after")
-    def _distinct(self):
-        for what in ("methods", "targets"):
-            names = [entry.name for entry in getattr(self, what)]
-            # Files are named after them, without capitals and signs.
-            files = [slug(name) for name in names]
-            for index, file in enumerate(files):
-                first = files.index(file)
-                if first < index:
-                    message = (
-                        f"{names[index]!r} and {names[first]!r} of {what}[{first}] "
-                        f"give the same file name {file!r}; choose another name"
-                    )
-                    raise _misfit(message, what, index, "name")
+    def _fits(self):
+        check_names(self, "methods", "targets")
+        check_methods(self)
         return self
 
-    @pydantic.model_validator(mode="after")
-    def _captures_differ(self):
-        # A capture that is used twice would count its noise as two independent ones.
-        for index, method in enumerate(self.methods):
-            shots = [(s.beta, s.distance, s.wavelength or self.wavelength) for s in method.shots]
-            for what, entries in (("shots", shots), ("phases", method.phases)):
-                if len(set(entries)) < len(entries):
-                    message = f"{what} hold an entry twice; give each once"
-                    raise _misfit(message, "methods", index, what)
-        return self
 
-    @pydantic.model_validator(mode="after")
-    def _noise_fits(self):
-        for index, method in enumerate(self.methods):
-            if self.noise is None and method.kind == "wiener":
-                message = "wiener weighs noise against signal; give a 'noise' section"
-                raise _misfit(message, "methods", index, "kind")
-        if self.noise and self.noise.read_noise is not None and self.sensor.exposure is None:
-            message = "read_noise counts electrons; give sensor.exposure, such as 0.9"
-            raise _misfit(message, "noise", "read_noise")
-        return self
+def check_names(config: Any, *lists: str) -> None:
+    """Refuse two entries of a list whose names give one file name."""
+    for what in lists:
+        names = [entry.name for entry in getattr(config, what)]
+        # Files are named after them, without capitals and signs.
+        files = [slug(name) for name in names]
+        for index, file in enumerate(files):
+            first = files.index(file)
+            if first < index:
+                message = (
+                    f"{names[index]!r} and {names[first]!r} of {what}[{first}] "
+                    f"give the same file name {file!r}; choose another name"
+                )
+                raise misfit(message, what, index, "name")
+
+
+def check_methods(config: Any) -> None:
+    """Refuse methods whose captures or noise do not fit."""
+    # A capture that is used twice would count its noise as two independent ones.
+    for index, method in enumerate(config.methods):
+        shots = [(s.beta, s.distance, s.wavelength or config.wavelength) for s in method.shots]
+        for what, entries in (("shots", shots), ("phases", method.phases)):
+            if len(set(entries)) < len(entries):
+                message = f"{what} hold an entry twice; give each once"
+                raise misfit(message, "methods", index, what)
+    for index, method in enumerate(config.methods):
+        if config.noise is None and method.kind == "wiener":
+            message = "wiener weighs noise against signal; give a 'noise' section"
+            raise misfit(message, "methods", index, "kind")
+    if config.noise and config.noise.read_noise is not None and config.sensor.exposure is None:
+        message = "read_noise counts electrons; give sensor.exposure, such as 0.9"
+        raise misfit(message, "noise", "read_noise")
 
 
 def load_config(path: str | Path, overrides: tuple[str, ...] = ()) -> StudyConfig:
@@ -233,36 +256,45 @@ def load_config(path: str | Path, overrides: tuple[str, ...] = ()) -> StudyConfi
     **Errors**: ConfigError with one line for each fault: file and line, field, what was given,
     what is allowed. FileNotFoundError where there is no such file.
     """
+    return in_folder(load_as(StudyConfig, path, overrides), path, "targets")
+
+
+Config = TypeVar("Config", bound=pydantic.BaseModel)
+
+
+def load_as(model: type[Config], path: str | Path, overrides: tuple[str, ...] = ()) -> Config:
+    """Read an experiment file of the given sections, as `load_config` does a study."""
     path = Path(path)
-    if not path.is_file():
-        what = "a folder" if path.is_dir() else "missing"
-        raise FileNotFoundError(f"{path} is {what}; give the path of a YAML experiment file")
-    raw, places = _read(path)
+    raw, places = read_raw(path)
     asked = {_override(raw, override): f"--set {override}" for override in overrides}
     try:
-        return _from_folder(StudyConfig.model_validate(raw), path.resolve().parent)
+        return model.model_validate(raw)
     except pydantic.ValidationError as error:
-        faults = [_fault(e, places, asked, f"{path}:1") for e in _own(error.errors())]
+        faults = [_fault(e, places, asked, f"{path}:1", model) for e in _own(error.errors())]
         raise ConfigError("\n".join(faults)) from None
 
 
-def _from_folder(config: StudyConfig, folder: Path) -> StudyConfig:
-    """The study with its image files named from the folder of the experiment file."""
-    targets = tuple(
-        target.model_copy(update={"path": str(folder / target.path)}) if target.path else target
-        for target in config.targets
+def in_folder(config: Config, path: str | Path, entries: str) -> Config:
+    """The configuration with its image files named from the folder of the experiment file."""
+    folder = Path(path).resolve().parent
+    named = tuple(
+        entry.model_copy(update={"path": str(folder / entry.path)}) if entry.path else entry
+        for entry in getattr(config, entries)
     )
-    return config.model_copy(update={"targets": targets})
+    return config.model_copy(update={entries: named})
 
 
-def dump_config(config: StudyConfig) -> str:
+def dump_config(config: pydantic.BaseModel) -> str:
     """The resolved study as YAML that `load_config` reads back to the same values."""
     data = config.model_dump(mode="json", exclude_none=True)
     return yaml.safe_dump(data, sort_keys=False, allow_unicode=True, width=100)
 
 
-def _read(path: Path) -> tuple[dict, dict[tuple, str]]:
+def read_raw(path: Path) -> tuple[dict, dict[tuple, str]]:
     """The raw data of a YAML file, and the file and line of every entry."""
+    if not path.is_file():
+        what = "a folder" if path.is_dir() else "missing"
+        raise FileNotFoundError(f"{path} is {what}; give the path of a YAML experiment file")
     try:
         text = path.read_text(encoding="utf-8")
         node = yaml.compose(text, Loader=yaml.SafeLoader)
@@ -383,21 +415,21 @@ def _own(errors: list[Any]) -> list[Any]:
     ]
 
 
-def _fault(error: Any, places: dict, asked: dict, top: str) -> str:
+def _fault(error: Any, places: dict, asked: dict, top: str, model: Any) -> str:
     """One line: place, field, what is wrong and what is allowed."""
     location = (*error["loc"], *error.get("ctx", {}).get("place", ()))
     if error["type"] == "invalid_key":
         location = (*location[:-1], str(location[-1]))
     field = _dotted(location) or "the file"
     place = _place(location, places, asked, top)
-    return f"{place}: {field}: {_message(error, location)}"
+    return f"{place}: {field}: {_message(error, location, model)}"
 
 
-def _message(error: Any, location: tuple) -> str:
+def _message(error: Any, location: tuple, model: Any) -> str:
     """What is wrong and what is allowed, in the words of an experiment file."""
     kind, given, context = error["type"], error.get("input"), error.get("ctx", {})
     if kind == "extra_forbidden":
-        return f"unknown key; allowed here: {', '.join(_allowed(location[:-1]))}"
+        return f"unknown key; allowed here: {', '.join(_allowed(location[:-1], model))}"
     if kind == "missing" and isinstance(location[-1], int):
         return "missing; the list needs this entry"
     if kind == "literal_error":
@@ -429,9 +461,9 @@ def _dotted(location: tuple) -> str:
     return text
 
 
-def _allowed(location: tuple) -> list[str]:
+def _allowed(location: tuple, model: Any) -> list[str]:
     """Keys of the section at a location."""
-    section: Any = StudyConfig
+    section: Any = model
     for part in location:
         if isinstance(part, int):
             continue

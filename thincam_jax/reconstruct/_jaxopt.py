@@ -14,7 +14,7 @@ from thincam_jax.reconstruct.fista import ProximalStep, relative_length
 from thincam_jax.reconstruct.problem import Deconvolution, misfit
 from thincam_jax.reconstruct.proximal_minimiser import total_misfit
 from thincam_jax.reconstruct.regulariser import AbstractRegulariser, no_dual, prox
-from thincam_jax.reconstruct.scaled import Scaled
+from thincam_jax.reconstruct.scaled import ScaledProblem
 
 
 class JaxoptState(eqx.Module):
@@ -24,14 +24,6 @@ class JaxoptState(eqx.Module):
     inside: Any  # jaxopt.ProxGradState, which is not public
 
 
-class _ProximalGradient(jaxopt.ProximalGradient):
-    """jaxopt's, with the momentum's t of the image's precision instead of the default one."""
-
-    def init_state(self, init_params, hyperparams_prox, *args, **kwargs):
-        state = super().init_state(init_params, hyperparams_prox, *args, **kwargs)
-        return state._replace(t=jnp.ones((), init_params.dtype))
-
-
 class JaxoptGradient(AbstractMethod[JaxoptState]):
     """`jaxopt.ProximalGradient`, one update an iteration.
 
@@ -39,7 +31,7 @@ class JaxoptGradient(AbstractMethod[JaxoptState]):
     """
 
     problem: Deconvolution
-    scaled: Scaled
+    scaled: ScaledProblem
     step: ProximalStep
 
     def start(self, image):
@@ -60,14 +52,14 @@ class JaxoptGradient(AbstractMethod[JaxoptState]):
         return after, Residuals(moved, moved)
 
 
-@functools.partial(jax.jit, static_argnames=("iterations", "inner"))
+@functools.partial(jax.jit, static_argnames=("iterations", "tolerance", "inner"))
 def implicit_minimiser(
     problem: Deconvolution,
     regulariser: AbstractRegulariser,
     image: Float[Array, "*batch channel plane y x"],
     *,
     iterations: int = 500,
-    tolerance=1e-8,
+    tolerance: float = 1e-8,
     inner: int = 50,
 ) -> Float[Array, "*batch channel plane y x"]:
     r"""The minimiser of misfit + τR as a differentiable function of the problem.
@@ -80,38 +72,43 @@ def implicit_minimiser(
     - `image`: to start from.
     - `tolerance`: length of the last step, in units in which captures are about 1.
     """
-    scaled = Scaled(problem)
+    scaled = ScaledProblem(problem)
     solver = _solver(problem.nonnegative, inner, iterations, tolerance)
     start = jax.lax.stop_gradient(image / scaled.image_unit)
     found = solver.run(start, (regulariser, scaled.problem.tau), scaled.problem)
     return found.params * scaled.image_unit
 
 
-def _solver(nonnegative: bool, inner: int, iterations: int = 1, tolerance=0.0):
-    return _ProximalGradient(
+def _solver(nonnegative: bool, inner: int, iterations: int = 1, tolerance: float = 0.0):
+    solver = jaxopt.ProximalGradient(
         fun=total_misfit,
         prox=functools.partial(_prox, nonnegative, inner),
-        stepsize=1.0,  # of a `Scaled` problem
+        stepsize=1.0,  # of a `ScaledProblem`
         maxiter=iterations,
         tol=tolerance,
     )
+    solver.init_state = functools.partial(_init_state, solver.init_state)  # type: ignore
+    return solver
+
+
+def _init_state(given, image, hyperparameters, problem):
+    """jaxopt's, with the momentum's t of the image's precision instead of the default one."""
+    return given(image, hyperparameters, problem)._replace(t=jnp.ones((), image.dtype))
 
 
 def _prox(nonnegative: bool, inner: int, image, hyperparameters, scale=1.0):
     regulariser, tau = hyperparameters
     dual = no_dual(regulariser, image)
-    return prox(
-        regulariser, image, scale * tau, dual, nonnegative=nonnegative, iterations=inner
-    )[0]
+    return prox(regulariser, image, scale * tau, dual, nonnegative=nonnegative, iterations=inner)[0]
 
 
 @jax.jit
-def _start(scaled: Scaled, step: ProximalStep, image) -> JaxoptState:
+def _start(scaled: ScaledProblem, step: ProximalStep, image) -> JaxoptState:
     solver = _solver(step.nonnegative, step.inner)
     return JaxoptState(image, solver.init_state(image, None, scaled.problem))
 
 
-def _update(scaled: Scaled, step: ProximalStep, state: JaxoptState) -> JaxoptState:
+def _update(scaled: ScaledProblem, step: ProximalStep, state: JaxoptState) -> JaxoptState:
     solver = _solver(step.nonnegative, step.inner)
     return JaxoptState(
         *solver.update(state.image, state.inside, (step.regulariser, step.tau), scaled.problem)

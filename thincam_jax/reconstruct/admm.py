@@ -27,7 +27,7 @@ from jaxtyping import Array, Float
 
 from thincam_jax.operators import CropConvolution
 from thincam_jax.operators.crop_convolution import cut, place
-from thincam_jax.reconstruct.normal import NormalInverse, squared_modulus
+from thincam_jax.reconstruct.normal import NormalInverse, mean_power, squared_modulus
 from thincam_jax.reconstruct.problem import Deconvolution
 from thincam_jax.reconstruct.total_variation import (
     TotalVariation,
@@ -79,7 +79,7 @@ class Splitting(eqx.Module):
         largest = [_or_one(stop(jnp.max(w))) for w in problem.weights]
         roots = [jnp.sqrt(w) for w in largest]
         operator_unit = stop(_operator_unit(problem.operators, largest))
-        sizes = [w * jnp.mean(c**2) for w, c in zip(largest, problem.captures, strict=True)]
+        sizes = [jnp.mean(w * c**2) for w, c in zip(problem.weights, problem.captures, strict=True)]
         capture_unit = stop(_or_one(jnp.sqrt(sum(sizes) / len(sizes))))
         self.operators = problem.operators
         self.gains = tuple(r / operator_unit for r in roots)
@@ -192,9 +192,9 @@ def default_penalties(splitting: Splitting) -> Penalties:
     r"""Penalties that suit the operators' spectrum.
 
     Where one low frequency is far stronger than the rest, as the light of a bright background is,
-    the splits that it does not concern must weigh more: by the ratio of the largest to the root mean
-    square, μ₂ = μ₃ = max|H|/rms|H|. μ₁ = 1 puts the split data on a par with the data. Found by
-    trial over diffuser and zone-aperture captures; `balance` adapts them.
+    the splits that it does not concern must weigh more: by the ratio of the largest to the root
+    mean square, μ₂ = μ₃ = max|H|/rms|H|. μ₁ = 1 puts the split data on a par with the data. Found
+    by trial over diffuser and zone-aperture captures; `AdmmTotalVariation.adapt` adapts them.
     """
     strongest = jnp.sqrt(
         jnp.max(
@@ -204,7 +204,7 @@ def default_penalties(splitting: Splitting) -> Penalties:
             )
         )
     )
-    strongest = jax.lax.stop_gradient(strongest)
+    strongest = jax.lax.stop_gradient(_or_one(strongest))
     return Penalties(jnp.ones_like(strongest), strongest, strongest)
 
 
@@ -212,14 +212,8 @@ def _operator_unit(operators, weights) -> Float[Array, ""]:
     """Root mean square of the operators' weighted spectra, over the whole plane."""
     total = 0.0
     for operator, weight in zip(operators, weights, strict=True):
-        power = squared_modulus(operator.spectrum)
-        # The half plane of a real transform leaves out the mirror images of its inner columns.
-        columns = operator.window[1]
-        doubled = 2 * jnp.sum(power, axis=-1) - power[..., 0]
-        if columns % 2 == 0:
-            doubled = doubled - power[..., -1]
         planes = operator.spectrum.shape[-3]
-        total = total + weight * planes * jnp.mean(doubled) / columns
+        total = total + weight * planes * mean_power(operator)
     return jnp.sqrt(_or_one(total))
 
 

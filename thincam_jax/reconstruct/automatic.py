@@ -1,12 +1,13 @@
 """Which method suits a set of captures, and why."""
 
 from collections.abc import Sequence
+from typing import TypeGuard
 
 import jax.numpy as jnp
 import numpy as np
 
 from thincam_jax.camera import LenslessCamera
-from thincam_jax.reconstruct.noise import estimate_noise
+from thincam_jax.reconstruct.noise import estimate_variance
 
 # Contrast of a channel over its noise from which a filter leaves nothing that an edge-preserving
 # prior could add: in the study of configs/fza_superresolution.yaml total variation gains 0.5 to
@@ -42,7 +43,7 @@ def choose_method(captures, cameras, synthesis, noise_variance) -> tuple[str, st
     )
 
 
-def are_cameras(cameras) -> bool:
+def are_cameras(cameras) -> TypeGuard[Sequence[LenslessCamera]]:
     """Whether these are camera models, and not an array of measured PSFs."""
     return isinstance(cameras, Sequence) and all(isinstance(c, LenslessCamera) for c in cameras)
 
@@ -51,7 +52,7 @@ def _contrast(captures, matrix: np.ndarray, noise_variance) -> float:
     """Root mean square of the channels over their noise, of the clearest one."""
     flat = captures.reshape(captures.shape[0], -1, *captures.shape[-2:])
     if noise_variance is None:
-        variances = jnp.mean(estimate_noise(flat) ** 2, axis=1)
+        variances = estimate_variance(flat)
     else:
         given = jnp.asarray(noise_variance, flat.dtype)
         given = given.reshape(given.shape[0], -1).mean(axis=1) if given.ndim else given

@@ -1,5 +1,7 @@
 """From captures, with cameras or measured PSFs, to a `Deconvolution`."""
 
+import functools
+import operator
 from collections.abc import Sequence
 
 import jax.numpy as jnp
@@ -11,7 +13,8 @@ from thincam_jax.camera import LenslessCamera
 from thincam_jax.grids import same_parity
 from thincam_jax.operators import CropConvolution, kernel_grid, kernel_shape, window_shape
 from thincam_jax.psf import Model, psf
-from thincam_jax.reconstruct.noise import estimate_noise
+from thincam_jax.reconstruct.noise import estimate_variance
+from thincam_jax.reconstruct.normal import mean_power
 from thincam_jax.reconstruct.problem import Deconvolution
 from thincam_jax.reconstruct.registration import distance_ratios, own_field, register
 from thincam_jax.reconstruct.synthesis import check_synthesis, separate
@@ -41,14 +44,14 @@ def camera_problem(
 
     **Arguments**: as in `thincam_jax.reconstruct`, and
 
-    - `object_distance`: t, mm; several make as many planes, each seen in its own projection, so that
-      pixels of the planes that are behind each other lie on one ray through the mask.
+    - `object_distance`: t, mm; several make as many planes, each seen in its own projection, so
+      that pixels of the planes that are behind each other lie on one ray through the mask.
     - `tau`: see `absolute_tau`.
-    - `synthesis`: real matrix (channel × capture) of sums of captures that are reconstructed in place
-      of the captures; default: the captures. Without its bias, a capture of a zone aperture
+    - `synthesis`: real matrix (channel × capture) of sums of captures that are reconstructed in
+      place of the captures; default: the captures. Without its bias, a capture of a zone aperture
       converges in a tenth of the iterations.
     """
-    captures = jnp.asarray(captures)
+    captures, valid = _trusted(jnp.asarray(captures), valid)
     matrix = separate(len(cameras)) if synthesis is None else np.asarray(synthesis, dtype=float)
     ratios = distance_ratios(cameras)
     check_synthesis(matrix, cameras, ratios)
@@ -65,7 +68,6 @@ def camera_problem(
         )
         for camera, light, ratio in zip(cameras, wavelengths, ratios, strict=True)
     ]
-    valid = None if valid is None else jnp.broadcast_to(jnp.asarray(valid), captures.shape)
     sums = [_Sum(row, kernels, captures, valid, ratios) for row in matrix]
     variances = [
         _variance(row, noise_variance, captures) * ratio**2
@@ -97,11 +99,12 @@ def psf_problem(
 ) -> Deconvolution:
     """The problem of captures with measured PSFs on the same pixels.
 
-    `psfs`: (capture, k, l), (capture, channel, k, l) or (capture, channel, plane, k, l), the channel
-    axis of length 1 or that of the captures. The field is, if not given, all that sends light to the
-    sensor: sensor + PSF − 1 samples.
+    `psfs`: (capture, k, l), (capture, channel, k, l) or (capture, channel, plane, k, l), the
+    channel axis of length 1 or that of the captures. The field is, if not given, all that sends
+    light to the sensor: sensor + PSF − 1 samples.
     """
-    captures, psfs = jnp.asarray(captures), jnp.asarray(psfs)
+    captures, valid = _trusted(jnp.asarray(captures), valid)
+    psfs = jnp.asarray(psfs)
     if not 3 <= psfs.ndim <= 5 or psfs.shape[0] != captures.shape[0]:
         raise ValueError(
             f"PSFs have shape {psfs.shape} for {captures.shape[0]} captures; give (capture, k, l), "
@@ -113,11 +116,7 @@ def psf_problem(
     rows, columns = field_shape or (s + k - 1 for s, k in zip(sensor, kernel, strict=True))
     field = _fitting_field((rows, columns), sensor, kernel)
     variances = [_variance(row, noise_variance, captures) for row in np.eye(captures.shape[0])]
-    masks = (
-        [None] * len(kernels)
-        if valid is None
-        else list(jnp.broadcast_to(jnp.asarray(valid), captures.shape))
-    )
+    masks = [None] * len(kernels) if valid is None else list(valid)
     return _assemble(
         list(kernels),
         list(captures),
@@ -140,14 +139,13 @@ def object_pitch(cameras: Sequence[LenslessCamera], object_distance) -> Float[Ar
 def absolute_tau(tau, operators, variances) -> Float[Array, ""]:
     r"""τ of a `Deconvolution` whose weights are 1/variance, from a number that is about 1.
 
-    :math:`\tau = \tau_{rel}\,(\sum_k \mathrm{mean}|H_k|^2/\sigma_k^2)^{1/2}`: the standard deviation
-    of a pixel of the back-projected noise, Σ Hᵀn/σ². A step between two pixels costs what noise
-    alone would pay for it if τ_rel were 1; 1 to 3 suit most scenes, whatever the camera.
+    :math:`\tau = \tau_{rel}\,(\sum_k \mathrm{mean}|H_k|^2/\sigma_k^2)^{1/2}`: the standard
+    deviation of a pixel of the back-projected noise, Σ Hᵀn/σ², on average over planes. A step
+    between two pixels costs what noise alone would pay for it if τ_rel were 1; 1 to 3 suit most
+    scenes, whatever the camera.
     """
-    total = sum(
-        jnp.mean(o.spectrum.real**2 + o.spectrum.imag**2) * o.spectrum.shape[-3] / v
-        for o, v in zip(operators, variances, strict=True)
-    )
+    parts = [mean_power(o) / v for o, v in zip(operators, variances, strict=True)]
+    total = functools.reduce(operator.add, parts)
     return jnp.asarray(tau, total.dtype) * jnp.sqrt(total)
 
 
@@ -157,14 +155,18 @@ class _Sum:
     def __init__(self, row: np.ndarray, kernels, captures, valid, ratios):
         used = [(float(w), k) for k, w in enumerate(row) if w]
         self.ratio = ratios[used[0][1]]
-        self.kernel = sum(w * kernels[k] for w, k in used)
-        self.capture = register(sum(w * captures[k] for w, k in used), self.ratio)
+        self.kernel = functools.reduce(operator.add, [w * kernels[k] for w, k in used])
+        whole = functools.reduce(operator.add, [w * captures[k] for w, k in used])
+        self.capture = register(whole, self.ratio)
         self.valid = None
-        if valid is not None:
-            both = jnp.all(jnp.stack([valid[k] for _, k in used]), axis=0)
-            # A pixel that an invalid one has been interpolated into is not trusted either.
+        if valid is not None or self.ratio > 1:
+            both = jnp.ones(captures.shape[1:], bool)
+            if valid is not None:
+                both = jnp.all(jnp.stack([valid[k] for _, k in used]), axis=0)
+            # A pixel that an invalid one, or the dark beyond the sensor, has been interpolated into
+            # is not trusted either; the interpolation overshoots, too.
             seen = register(both.astype(captures.dtype), self.ratio)
-            self.valid = seen > 0.99
+            self.valid = jnp.abs(seen - 1) < 0.01
 
 
 def _kernel(camera, wavelength, distance, field, ratio: float, model, pixel_integration):
@@ -181,22 +183,30 @@ def _kernel(camera, wavelength, distance, field, ratio: float, model, pixel_inte
     return register(own, ratio) / ratio**2
 
 
+def _trusted(captures, valid):
+    """Captures and the mask of their pixels; what is neither valid nor a number becomes 0."""
+    if valid is None:
+        return captures, None
+    valid = jnp.broadcast_to(jnp.asarray(valid, bool), captures.shape)
+    return jnp.where(valid | jnp.isfinite(captures), captures, 0), valid
+
+
 def _variance(row: np.ndarray, noise_variance, captures) -> Float[Array, ""]:
-    """Variance of a sum of captures: as given, or estimated; 1 where there is none."""
+    """Variance of a sum of captures: as given, or estimated where that is nothing or zero."""
     count = captures.shape[0]
+    square = jnp.asarray(row**2, captures.dtype)
+    estimated = jnp.sum(square * estimate_variance(captures))
     if noise_variance is None:
-        each = estimate_noise(captures) ** 2
-    else:
-        each = jnp.asarray(noise_variance, captures.dtype)
-        if each.ndim and each.shape[0] != count:
-            raise ValueError(
-                f"noise_variance has shape {each.shape}; give one number or one for each of the "
-                f"{count} captures"
-            )
-        each = jnp.broadcast_to(each.reshape(each.shape or (1,)), (count, *each.shape[1:]))
-    each = jnp.mean(each.reshape(count, -1), axis=1)
-    total = jnp.sum(jnp.asarray(row**2, captures.dtype) * each)
-    return jnp.where(total > 0, total, 1)
+        return estimated
+    each = jnp.asarray(noise_variance, captures.dtype)
+    if each.ndim and each.shape[0] != count:
+        raise ValueError(
+            f"noise_variance has shape {each.shape}; give one number or one for each of the "
+            f"{count} captures"
+        )
+    each = jnp.broadcast_to(each.reshape(each.shape or (1,)), (count, *each.shape[1:]))
+    total = jnp.sum(square * jnp.mean(each.reshape(count, -1), axis=1))
+    return jnp.where(total > 0, total, estimated)
 
 
 def _assemble(
@@ -204,14 +214,15 @@ def _assemble(
 ) -> Deconvolution:
     """Operators on one window, and their weights."""
     captures = [c[None] if c.ndim == 2 else c for c in captures]
-    kernels = [k if k.ndim == 4 else k[None] for k in kernels]
+    dtype = captures[0].dtype
+    kernels = [(k if k.ndim == 4 else k[None]).astype(dtype) for k in kernels]
     windows = [
         window_shape(c.shape[-2:], field_shape, _reach(k, c, field_shape))
         for k, c in zip(kernels, captures, strict=True)
     ]
     window = (max(w[0] for w in windows), max(w[1] for w in windows))
     operators = [
-        CropConvolution(k, pitch, c.shape[-2:], field_shape, summed=1, window=window)
+        CropConvolution(k, pitch.astype(dtype), c.shape[-2:], field_shape, summed=1, window=window)
         for k, c in zip(kernels, captures, strict=True)
     ]
     weights = [

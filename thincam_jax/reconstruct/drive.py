@@ -1,8 +1,8 @@
 """Running an iterative method: from chunk to chunk, looking up in between.
 
-An iteration is compiled; what stands between two chunks of iterations is not, so that it can report,
-stop early, adapt and be interrupted. Chunks are unrolled: on a CPU, XLA runs the transforms of a
-compiled loop on one core and those of a straight program on all (docs/reconstruction.md has
+An iteration is compiled; what stands between two chunks of iterations is not, so that it can
+report, stop early, adapt and be interrupted. Chunks are unrolled: on a CPU, XLA runs the transforms
+of a compiled loop on one core and those of a straight program on all (docs/reconstruction.md has
 the comparison).
 """
 
@@ -86,7 +86,9 @@ class AbstractMethod(eqx.Module, Generic[Method_State]):
 
 Callback = Callable[[Progress], object]
 
-CHUNK = 5
+# With the iteration that is looked at, ten. Each run of a program gets its memory anew, whose pages
+# cost half an iteration at 2048² samples: shared by nine they do not matter.
+CHUNK = 9
 
 
 def drive(

@@ -1,7 +1,7 @@
 """`reconstruct`: the one entry point."""
 
 from collections.abc import Sequence
-from typing import Literal, get_args
+from typing import Literal, cast, get_args
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -13,14 +13,15 @@ from thincam_jax.reconstruct.automatic import are_cameras, choose_method
 from thincam_jax.reconstruct.build import camera_problem, object_pitch, psf_problem
 from thincam_jax.reconstruct.drive import Callback, Outcome
 from thincam_jax.reconstruct.fringe_scanning import FringeScanning
-from thincam_jax.reconstruct.regularised import Options, middle, minimise
+from thincam_jax.reconstruct.noise import estimate_variance
+from thincam_jax.reconstruct.regularised import Iterative, Options, TauRule, middle, minimise
 from thincam_jax.reconstruct.result import Reconstruction
 from thincam_jax.reconstruct.spectra import Prior
 from thincam_jax.reconstruct.synthesis import separate
 from thincam_jax.reconstruct.total_variation import TotalVariation
 from thincam_jax.reconstruct.wiener import WienerSynthesis
 
-Method = Literal["auto", "wiener", "fringe_scanning", "admm_tv"]
+Method = Literal["auto", "wiener", "fringe_scanning", "admm_tv", "fista", "twist"]
 METHODS: tuple[Method, ...] = get_args(Method)
 
 
@@ -41,8 +42,8 @@ def reconstruct(
     valid=None,
     iterations: int = 100,
     tolerance: float = 1e-4,
-    relaxation: float = 1.5,
-    start: Float[Array, "*batch y x"] | None = None,
+    relaxation: float = 1.8,
+    start: Float[Array, "*image rows columns"] | None = None,
     callback: Callback | None = None,
     model: Model = "separable",
     pixel_integration: bool = True,
@@ -57,22 +58,25 @@ def reconstruct(
       (capture, channel, k, l) or (capture, channel, plane, k, l).
     - `method`: "wiener" (see `WienerSynthesis`, which needs `wavelength` and `noise_variance`),
       "fringe_scanning" (see `FringeScanning`, which uses neither), "admm_tv" (total variation by
-      ADMM, which models the crop of the sensor; see `thincam_jax.reconstruct.admm`) or "auto",
-      which picks one and gives its `reason`.
+      ADMM, which models the crop of the sensor; see `thincam_jax.reconstruct.admm`), "fista" or
+      "twist" (the same minimiser by proximal gradients, which have no penalties to choose and are
+      slower), or "auto", which picks one and gives its `reason`.
     - `object_distance`: t, mm, on which to focus; several (admm_tv) give a plane each.
     - `noise_variance`: one number, or one for each capture; admm_tv estimates it where it is not
       given.
-    - `synthesis`: sums of captures, default each by itself; see `thincam_jax.reconstruct.synthesis`.
-    - `field_shape`, `prior`, `model`, `pixel_integration`: see `WienerSynthesis`. With PSFs the field
-      is by default all that sends light to the sensor, and the image the part in front of it.
+    - `synthesis`: sums of captures, default each by itself; see
+      `thincam_jax.reconstruct.synthesis`.
+    - `field_shape`, `prior`, `model`, `pixel_integration`: see `WienerSynthesis`. With PSFs the
+      field is by default all that sends light to the sensor, and the image the part in front of it.
 
-    For admm_tv:
+    For admm_tv, fista and twist:
 
     - `tau`: weight of the variation relative to the noise, about 1 to 3; see `absolute_tau`.
+      "discrepancy" or "sure" find it, in some ten times the time; see `choose_tau`.
     - `variation`: its kind and coupling, see `TotalVariation`.
     - `nonnegative`: ask for f ≥ 0. `valid`: mask of the pixels to trust, (capture, *batch, y, x).
     - `iterations`: at most; `tolerance`: on the relative primal and dual residuals.
-    - `relaxation`: 0 < α < 2. `start`: a first image, such as an earlier result.
+    - `relaxation`: of admm_tv, 0 < α < 2. `start`: a first image, such as an earlier result.
     - `callback`: called with `Progress` every tenth iteration; a true answer stops the run. Ctrl-C
       returns the best image so far, with status "interrupted".
 
@@ -84,13 +88,20 @@ def reconstruct(
     methods, models and priors.
     """
     _checks.choice("method", method, METHODS)
+    cameras = cameras if are_cameras(cameras) else jnp.asarray(cameras)
     captures = _captures(captures, len(cameras))
     reason = ""
     if method == "auto":
-        method, reason = choose_method(captures, cameras, synthesis, noise_variance)
-    if method == "admm_tv":
-        how = Options(iterations, tolerance, relaxation, start, callback)
-        if not are_cameras(cameras):
+        chosen, reason = choose_method(captures, cameras, synthesis, noise_variance)
+        method = cast(Method, chosen)
+        if method == "wiener" and noise_variance is None:
+            noise_variance = estimate_variance(captures)
+    if method not in ("wiener", "fringe_scanning"):
+        rule = cast(TauRule, tau) if isinstance(tau, str) else None
+        tau = 2.0 if isinstance(tau, str) else tau
+        chosen = cast(Iterative, method)
+        how = Options(chosen, iterations, tolerance, relaxation, start, callback, rule)
+        if not isinstance(cameras, Sequence):
             problem = psf_problem(
                 captures,
                 cameras,
@@ -103,7 +114,7 @@ def reconstruct(
             )
             shape = captures.shape[-2:] if field_shape is None else problem.field_shape
             outcome = minimise(problem, how, even_start=False)
-            return _result(outcome, captures, shape, None, reason)
+            return _result(outcome, captures, shape, None, method, reason)
         _require(method, object_distance=object_distance, wavelength=wavelength)
         problem = camera_problem(
             captures,
@@ -123,8 +134,8 @@ def reconstruct(
         turned = None if start is None else jnp.asarray(start)[..., ::-1, ::-1]
         outcome = minimise(problem, how._replace(start=turned), even_start=True)
         pitch = object_pitch(cameras, object_distance)
-        return _result(outcome, captures, problem.field_shape, pitch, reason)
-    if not are_cameras(cameras):
+        return _result(outcome, captures, problem.field_shape, pitch, method, reason)
+    if not isinstance(cameras, Sequence):
         raise ValueError(f"method {method!r} needs cameras; with measured PSFs use 'admm_tv'")
     _require(method, object_distance=object_distance)
     if method == "fringe_scanning":
@@ -168,7 +179,7 @@ def _named(result: Reconstruction, method: str, reason: str) -> Reconstruction:
     return Reconstruction(result.image, result.pitch, method, reason)
 
 
-def _result(outcome: Outcome, captures, shape, pitch, reason: str) -> Reconstruction:
+def _result(outcome: Outcome, captures, shape, pitch, method: str, reason: str) -> Reconstruction:
     """The image with the axes of the captures; upright if cameras turned it over."""
     image = middle(outcome.image, shape)
     image = image if pitch is None else image[..., ::-1, ::-1]
@@ -178,7 +189,7 @@ def _result(outcome: Outcome, captures, shape, pitch, reason: str) -> Reconstruc
     return Reconstruction(
         image,
         pitch,
-        "admm_tv",
+        method,
         reason,
         outcome.status,
         outcome.history,

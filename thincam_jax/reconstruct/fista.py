@@ -7,9 +7,10 @@ from jaxtyping import Array, Float
 from thincam_jax.reconstruct.regulariser import (
     AbstractRegulariser,
     Parts,
-    momentum,
+    first_t,
     no_dual,
     prox,
+    run_on,
 )
 
 
@@ -34,10 +35,8 @@ class ProximalStep(eqx.Module):
     - `length`: s, at most 1/L; with momentum nothing longer converges.
     - `tau`: weight of the regulariser.
     - `inner`: iterations of a proximal map without closed form.
-    - `accelerate`: Nesterov's momentum (FISTA: Beck and Teboulle, SIAM J. Imaging Sci. 2, 183, 2009).
-    - `restart`: start the momentum anew where it points uphill, ⟨y − x⁺, x⁺ − x⟩ > 0, the gradient
-      scheme of O'Donoghue and Candès (Found. Comput. Math. 15, 715, 2015). Near the minimum, where
-      the objective is about quadratic, this makes convergence linear at the best rate.
+    - `accelerate`: Nesterov's momentum (FISTA).
+    - `restart`: start the momentum anew where it points uphill, see `regulariser.run_on`.
     """
 
     regulariser: AbstractRegulariser
@@ -49,8 +48,7 @@ class ProximalStep(eqx.Module):
     restart: bool = eqx.field(static=True)
 
     def start(self, image: Float[Array, "*batch channel plane y x"]) -> Course:
-        t = jnp.ones((*image.shape[:-4], 1, 1, 1, 1), image.dtype)
-        return Course(image, image, t, no_dual(self.regulariser, image))
+        return Course(image, image, first_t(image), no_dual(self.regulariser, image))
 
     def __call__(
         self, course: Course, gradient: Float[Array, "*batch channel plane y x"]
@@ -66,15 +64,10 @@ class ProximalStep(eqx.Module):
         )
         if not self.accelerate:
             return Course(image, image, course.t, dual)
-        moved = image - course.image
-        t = course.t
-        speed = (t - 1) / momentum(t)
-        t = momentum(t)
-        if self.restart:
-            product = (course.lead - image) * moved
-            uphill = jnp.sum(product, axis=(-4, -3, -2, -1), keepdims=True) > 0
-            speed, t = jnp.where(uphill, 0, speed), jnp.where(uphill, 1, t)
-        return Course(image, image + speed * moved, t, dual)
+        (lead,), t = run_on(
+            (course.image,), (course.lead,), (image,), course.t, restart=self.restart
+        )
+        return Course(image, lead, t, dual)
 
 
 def relative_length(difference, reference) -> Float[Array, ""]:

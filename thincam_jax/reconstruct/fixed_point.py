@@ -39,9 +39,9 @@ class FixedPoint(NamedTuple):
 class NeumannSeries(lx.AbstractLinearSolver):
     r"""Solves (J − 1) w = v by w ← J w − v, for the Jacobian of a fixed-point iteration.
 
-    It is to an averaged map what conjugate gradients are to a symmetric one: it needs one vector, and
-    converges also where 1 − J is singular in directions on which nothing depends (the forces
-    of constraints that hold exactly), if only as fast as the iteration.
+    It is to an averaged map what conjugate gradients are to a symmetric one: it needs one vector,
+    and converges also where 1 − J is singular in directions on which nothing depends (the forces of
+    constraints that hold exactly), if only as fast as the iteration.
 
     - `tolerance`: on the change of w, relative to w, both in the root mean square.
     - `max_steps`: when to give up; the sum so far is returned.
@@ -85,23 +85,23 @@ def solve_fixed_point(
     problem: Deconvolution,
     image: Float[Array, "*batch channel plane y x"],
     *,
-    iterations: int = 200,
-    tolerance: float = 1e-5,
-    relaxation=1.0,
+    iterations: int = 500,
+    tolerance: float = 1e-6,
+    relaxation=1.8,
     penalties: Penalties | None = None,
     adjoint: lx.AbstractLinearSolver | None = None,
 ) -> FixedPoint:
     """The minimiser of a `Deconvolution` from a first image, for use under jit, grad and vmap.
 
-    Differentiable in captures, PSFs (and so in what they were computed from: β, d, λ), τ and weights.
-    The gradient is that of the minimiser, not of the iteration: with few iterations, or a loose
-    tolerance, it is as far from differences of results as these are from the minimum. The
+    Differentiable in captures, PSFs (and so in what they were computed from: β, d, λ), τ and
+    weights. The gradient is that of the minimiser, not of the iteration: with few iterations, or a
+    loose tolerance, it is as far from differences of results as these are from the minimum. The
     penalties and the first image move the minimiser nowhere, and have no gradient.
 
     **Arguments**
 
-    - `iterations`: at most; `tolerance`: on the change of the state, relative to its size, both in
-      the root mean square.
+    - `iterations`: at most; `tolerance`: on the change of the state in one iteration, root mean
+      square, in units in which captures are about 1.
     - `relaxation`: α of `thincam_jax.reconstruct.admm`.
     - `adjoint`: the linear solver of the gradient, default `NeumannSeries()`.
     """
@@ -111,7 +111,7 @@ def solve_fixed_point(
     first = jax.lax.stop_gradient(start(splitting, image))
     solution = optx.fixed_point(
         _next_state,
-        optx.FixedPointIteration(rtol=0.0, atol=tolerance, norm=optx.rms_norm),
+        optx.FixedPointIteration(rtol=0.0, atol=tolerance, norm=_root_mean_square),
         first,
         args=(splitting, penalties, jnp.asarray(relaxation, dtype)),
         max_steps=iterations,
@@ -129,6 +129,11 @@ def _next_state(state, args):
     """The map T, at module level so that a new problem of old shape is not compiled anew."""
     splitting, penalties, relaxation = args
     return step(splitting, penalties, relaxation, state)
+
+
+def _root_mean_square(tree: PyTree[Array]) -> Float[Array, ""]:
+    """In the default precision, which optimistix compares it with."""
+    return optx.rms_norm(tree).astype(float)
 
 
 def _norm(tree: PyTree[Array]) -> Float[Array, ""]:

@@ -1,10 +1,14 @@
 r"""The linear step of ADMM: (KᵀMK)⁻¹ in the Fourier domain, for one plane and for several."""
 
+import functools
+import operator
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
+from thincam_jax._phase import as_complex
 from thincam_jax.operators import CropConvolution
 
 
@@ -13,9 +17,9 @@ class NormalInverse(eqx.Module):
 
     At each frequency the unknowns are the planes of the image. H_k is the vector of their transfer
     functions to the capture k, Λ the symbol of the differences along y and x, and D takes
-    differences between planes. One plane: a division. Several: the cosine transform over the
-    planes makes DᵀD diagonal, and each capture adds a term of rank one, which the formula of Sherman
-    and Morrison inverts one after the other; nothing of the size planes² is kept.
+    differences between planes. One plane: a division. Several: the cosine transform over the planes
+    makes DᵀD diagonal, and each capture adds a term of rank one, which the formula of Sherman and
+    Morrison inverts one after the other; nothing of the size planes² is kept.
 
     - `power`: Σ_k |H_k|², of one plane; None with several.
     - `depth_weight`: δ.
@@ -31,8 +35,9 @@ class NormalInverse(eqx.Module):
         self.depth_weight = depth_weight
         if operators[0].spectrum.shape[-3] == 1:
             self.spectra = ()
-            self.power = sum(
-                g**2 * squared_modulus(o.spectrum) for o, g in zip(operators, gains, strict=True)
+            self.power = functools.reduce(
+                operator.add,
+                [g**2 * squared_modulus(o.spectrum) for o, g in zip(operators, gains, strict=True)],
             )
         else:
             self.spectra = tuple(
@@ -46,10 +51,12 @@ class NormalInverse(eqx.Module):
     ) -> Complex[Array, "*batch channel plane v u"]:
         smooth = penalties.variation * difference_symbol(self.window, spectrum.real.dtype)
         if self.power is not None:
-            return spectrum * (1 / (penalties.data * self.power + smooth + penalties.image))
+            inverse = 1 / (penalties.data * self.power + smooth + penalties.image)
+            return spectrum * as_complex(inverse)
         planes = spectrum.shape[-3]
         depth = penalties.variation * self._depth_symbol(planes, smooth.dtype)
         inverse = 1 / (smooth + depth[:, None, None] + penalties.image)
+        inverse = as_complex(inverse)
         return _from_modes(self._rank_ones(_to_modes(spectrum), inverse, penalties.data))
 
     def _depth_symbol(self, planes: int, dtype):
@@ -77,6 +84,17 @@ class NormalInverse(eqx.Module):
 
 def squared_modulus(spectrum: Complex[Array, "..."]) -> Float[Array, "..."]:
     return spectrum.real**2 + spectrum.imag**2
+
+
+def mean_power(operator: CropConvolution) -> Float[Array, ""]:
+    """Mean of |H|² over the whole plane of frequencies, the channels and the planes."""
+    power = squared_modulus(operator.spectrum)
+    # The half plane of a real transform leaves out the mirror images of its inner columns.
+    columns = operator.window[1]
+    whole = 2 * jnp.sum(power, axis=-1) - power[..., 0]
+    if columns % 2 == 0:
+        whole = whole - power[..., -1]
+    return jnp.mean(whole) / columns
 
 
 def difference_symbol(window: tuple[int, int], dtype) -> Float[Array, "v u"]:

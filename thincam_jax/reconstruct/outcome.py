@@ -1,5 +1,6 @@
 """The `Outcome` of a method that runs to its end in one piece, without looking up."""
 
+import math
 import time
 from collections.abc import Callable
 
@@ -23,7 +24,8 @@ def concluded(
     - `began`: `time.perf_counter()` at the start.
     """
     before, after = (_progress(n, objective(x)) for n, x in ((0, start), (iterations, image)))
-    finite = bool(jnp.isfinite(image).all())
+    # Of captures that hold no number a linear solver may return a clean zero.
+    finite = bool(jnp.isfinite(image).all()) and math.isfinite(after.objective)
     status: Status = "converged" if converged else "iterations_exhausted"
     return Outcome(
         image if finite else start,

@@ -47,9 +47,13 @@ class Deconvolution(eqx.Module):
         nonnegative: bool = True,
     ):
         self.operators = tuple(operators)
-        self.captures = tuple(jnp.asarray(c) for c in captures)
+        self.captures = tuple(_floating(c) for c in captures)
         _check_operators(self.operators, self.captures)
-        given = [1.0] * len(self.captures) if weights is None else weights
+        given = [1.0] * len(self.captures) if weights is None else list(weights)
+        if len(given) != len(self.captures):
+            raise ValueError(
+                f"{len(given)} weights for {len(self.captures)} captures; give one for each"
+            )
         self.weights = tuple(
             jnp.asarray(w, dtype=c.dtype) for w, c in zip(given, self.captures, strict=True)
         )
@@ -112,6 +116,12 @@ def uniform_level(problem: Deconvolution) -> Float[Array, "*batch channel"]:
     return jnp.where(light > 0, seen / jnp.where(light > 0, light, 1), 0)
 
 
+def _floating(capture) -> Array:
+    """Raw counts are taken as they are, but as real numbers."""
+    capture = jnp.asarray(capture)
+    return capture if jnp.issubdtype(capture.dtype, jnp.floating) else capture.astype(float)
+
+
 def _check_operators(operators, captures) -> None:
     if not operators or len(operators) != len(captures):
         raise ValueError(
@@ -122,6 +132,11 @@ def _check_operators(operators, captures) -> None:
         raise ValueError(
             "operators differ in window, field or planes; give CropConvolutions of kernels "
             "(channel, plane, k, l) with summed=1 and one window"
+        )
+    leading = {capture.shape[:-2] for capture in captures}
+    if len(leading) > 1:
+        raise ValueError(
+            f"captures differ in batch or channels: {sorted(leading)}; they show one image"
         )
     for operator, capture in zip(operators, captures, strict=True):
         channels = operator.spectrum.shape[0] if operator.spectrum.ndim == 4 else 0

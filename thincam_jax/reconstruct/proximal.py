@@ -23,7 +23,7 @@ from thincam_jax.reconstruct.outcome import concluded
 from thincam_jax.reconstruct.problem import Deconvolution, misfit
 from thincam_jax.reconstruct.proximal_minimiser import AcceleratedProximal, total_misfit
 from thincam_jax.reconstruct.regulariser import AbstractRegulariser
-from thincam_jax.reconstruct.scaled import Scaled, gradient, scaled_problem, start_image
+from thincam_jax.reconstruct.scaled import ScaledProblem, gradient, scaled_problem, start_image
 from thincam_jax.reconstruct.tv_prox import VariationRegulariser
 
 Backend = Literal["own", "jaxopt", "optimistix"]
@@ -41,7 +41,7 @@ class ProximalGradient(AbstractMethod[Course]):
     """
 
     problem: Deconvolution
-    scaled: Scaled
+    scaled: ScaledProblem
     step: ProximalStep
 
     def __init__(
@@ -107,7 +107,7 @@ def solve_proximal(
     - `backend`: "own"; "optimistix", the same steps in one compiled loop of
       `optimistix.minimise`, which nobody can look into; or "jaxopt", `jaxopt.ProximalGradient`:
       FISTA without restart, and with a proximal map that starts anew each time, so that it wants
-      some 50 `inner` iterations.
+      100 and more `inner` iterations.
     - `look_every`, `callback`: see `drive`; not with "optimistix".
     """
     _checks.choice("backend", backend, ("own", "jaxopt", "optimistix"))
@@ -170,7 +170,7 @@ def composite(
     return misfit(problem, image) + problem.tau * regulariser(image)
 
 
-def forward_backward(scaled: Scaled, step: ProximalStep, course: Course) -> Course:
+def forward_backward(scaled: ScaledProblem, step: ProximalStep, course: Course) -> Course:
     return step(course, gradient(scaled.problem, course.lead))
 
 

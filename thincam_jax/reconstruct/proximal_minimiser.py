@@ -22,16 +22,17 @@ class AcceleratedProximal(optimistix.AbstractMinimiser):
 
     The function given to `minimise` is the smooth part alone; its gradient must be Lipschitz
     with 1/`step.length`. R, τ and f ≥ 0 are in `step`. It ends when
-    ‖x⁺ − y‖ ≤ atol + rtol·‖x⁺‖.
+    neither the step ‖x⁺ − y‖ nor the move ‖x⁺ − x‖ is longer than atol + rtol·‖x⁺‖.
 
-    Pass `adjoint=optimistix.RecursiveCheckpointAdjoint()` to differentiate the solution. The default
-    `ImplicitAdjoint` takes the gradient of the smooth part to be zero, which it is not; its
+    To differentiate the solution pass `adjoint=optimistix.RecursiveCheckpointAdjoint()`. The
+    default `ImplicitAdjoint` takes the gradient of the smooth part to be zero, which it is not: its
     derivatives would be wrong. For implicit differentiation see `_jaxopt.implicit_minimiser`.
     """
 
     step_map: ProximalStep
-    rtol: Float[Array, ""]
-    atol: Float[Array, ""]
+    # Arrays, so that another tolerance is not compiled anew.
+    rtol: Any
+    atol: Any
     norm: Callable[[PyTree], Float[Array, ""]] = eqx.field(static=True)
 
     def __init__(self, step: ProximalStep, *, rtol, atol, norm=optimistix.two_norm):
@@ -44,9 +45,11 @@ class AcceleratedProximal(optimistix.AbstractMinimiser):
     def step(self, fn, y, args, options, state, tags) -> tuple[Array, _State, Any]:
         (_, aux), gradient = eqx.filter_value_and_grad(fn, has_aux=True)(state.course.lead, args)
         course = self.step_map(state.course, gradient)
-        size, moved = self.norm(course.image), self.norm(course.image - state.course.lead)
+        size = self.norm(course.image)
+        stepped = self.norm(course.image - state.course.lead)
+        moved = self.norm(course.image - state.course.image)
         limit = self.atol.astype(size.dtype) + self.rtol.astype(size.dtype) * size
-        return course.image, _State(course, moved <= limit), aux
+        return course.image, _State(course, jnp.maximum(stepped, moved) <= limit), aux
 
     def terminate(self, fn, y, args, options, state, tags):
         return state.done, optimistix.RESULTS.successful

@@ -1,42 +1,65 @@
 """The iterative methods behind `reconstruct`: from a problem to a `Reconstruction`."""
 
-from typing import NamedTuple
+from typing import Literal, NamedTuple, get_args
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from thincam_jax import _checks
 from thincam_jax.operators.crop_convolution import cut, place
+from thincam_jax.reconstruct.choose_tau import discrepancy_tau, sure_tau
 from thincam_jax.reconstruct.drive import Callback, Outcome, drive
 from thincam_jax.reconstruct.problem import Deconvolution, uniform_level
+from thincam_jax.reconstruct.proximal import solve_proximal
 from thincam_jax.reconstruct.tv_method import AdmmTotalVariation
+from thincam_jax.reconstruct.two_step import solve_two_step
+
+TauRule = Literal["discrepancy", "sure"]
+Iterative = Literal["admm_tv", "fista", "twist"]
 
 
 class Options(NamedTuple):
-    """How to iterate; see `reconstruct`."""
+    """How to iterate; see `reconstruct`. `rule` finds τ, None takes the problem's."""
 
+    method: Iterative
     iterations: int
     tolerance: float
     relaxation: float
     start: Float[Array, "*batch y x"] | None
     callback: Callback | None
+    rule: TauRule | None = None
 
 
 def minimise(problem: Deconvolution, options: Options, *, even_start: bool) -> Outcome:
-    """ADMM-TV from the image given, an even one, or zero.
+    """The minimiser, from the image given, an even one, or zero.
 
     An even image explains the bright background of a zone aperture's capture at once, which would
     else take hundreds of iterations; a field that is mostly dark is nearer to zero.
     """
     _check(options)
     image = _first(problem, options.start, even_start)
-    method = AdmmTotalVariation(problem, relaxation=options.relaxation)
-    return drive(
-        method,
-        image,
+    if problem.nonnegative:  # the best image so far may be this one
+        image = jnp.maximum(image, 0)
+    if options.rule == "discrepancy":
+        problem, image, _ = discrepancy_tau(problem, image)
+    elif options.rule == "sure":
+        problem, image, _ = sure_tau(problem, image, jax.random.key(0))
+    if options.method == "admm_tv":
+        return drive(
+            AdmmTotalVariation(problem, relaxation=options.relaxation),
+            image,
+            iterations=options.iterations,
+            tolerance=options.tolerance,
+            adapt_until=options.iterations // 2,
+            callback=options.callback,
+        )
+    solve = solve_proximal if options.method == "fista" else solve_two_step
+    return solve(
+        problem,
+        image=image,
         iterations=options.iterations,
         tolerance=options.tolerance,
-        adapt_until=options.iterations // 2,
         callback=options.callback,
     )
 
@@ -74,6 +97,8 @@ def middle(image: Float[Array, "*batch y x"], shape) -> Float[Array, "*batch v u
 
 
 def _check(options: Options) -> None:
+    if options.rule is not None:
+        _checks.choice("tau", options.rule, get_args(TauRule))
     if options.iterations < 1:
         raise ValueError(f"iterations = {options.iterations}; give at least 1")
     _checks.non_negative("tolerance", options.tolerance, "parts of one")

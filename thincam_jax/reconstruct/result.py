@@ -11,7 +11,8 @@ class Reconstruction(eqx.Module):
     """A reconstructed image; with cameras upright as the scene is, with PSFs as the captures are.
 
     - `image`: radiance, (*batch, y, x), in the scene's unit; (*batch, plane, y, x) with planes.
-    - `pitch`: distance of its pixels on the object, mm (of each plane); None if only PSFs are known.
+    - `pitch`: distance of its pixels on the object, mm (of each plane); None if only PSFs are
+      known.
     - `method`, `reason`: how it was made, and why so if that was left to "auto".
     - `ending`: how an iteration ended: "converged", "iterations_exhausted", "stopped" by the
       callback, "interrupted" by Ctrl-C or "non_finite"; None for methods in closed form.

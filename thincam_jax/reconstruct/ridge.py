@@ -15,6 +15,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import lineax
+import optimistix
 from jaxtyping import Array, Float
 
 from thincam_jax import _checks
@@ -23,7 +24,7 @@ from thincam_jax.reconstruct.drive import Outcome
 from thincam_jax.reconstruct.normal import squared_modulus
 from thincam_jax.reconstruct.outcome import concluded
 from thincam_jax.reconstruct.problem import Deconvolution, misfit, residuals
-from thincam_jax.reconstruct.scaled import Scaled, pulled_back, start_image
+from thincam_jax.reconstruct.scaled import ScaledProblem, pulled_back, start_image
 
 
 def solve_ridge(
@@ -76,14 +77,15 @@ def ridge_objective(
 
 
 class _Normal(eqx.Module):
-    """Σ HᵀwH + ρ."""
+    """Σ HᵀwH + ρ, times a factor."""
 
     problem: Deconvolution
     ridge: Float[Array, ""]
+    factor: Float[Array, ""]
 
     def __call__(self, image):
         seen = tuple(operator(image) for operator in self.problem.operators)
-        return pulled_back(self.problem, seen) + self.ridge * image
+        return self.factor * (pulled_back(self.problem, seen) + self.ridge * image)
 
 
 class _Preconditioner(eqx.Module):
@@ -110,21 +112,33 @@ class _Preconditioner(eqx.Module):
 
 @functools.partial(jax.jit, static_argnames="iterations")
 def _solve(problem: Deconvolution, ridge, mean, tolerance, iterations: int):
-    scaled = Scaled(problem)
+    scaled = ScaledProblem(problem)
     inside, rho = scaled.problem, ridge / scaled.curvature
     mean = mean / scaled.image_unit
     target = -pulled_back(inside, residuals(inside, mean))
-    structure = jax.eval_shape(lambda: target)
+    factor = curvature_scale(target)
+    structure = jax.ShapeDtypeStruct(target.shape, target.dtype)
     tags = lineax.positive_semidefinite_tag
-    operator = lineax.FunctionLinearOperator(_Normal(inside, rho), structure, tags)
+    operator = lineax.FunctionLinearOperator(_Normal(inside, rho, factor), structure, tags)
     preconditioner = lineax.FunctionLinearOperator(_Preconditioner(inside, rho), structure, tags)
     size = jnp.sqrt(jnp.mean(target**2))
+    solver = lineax.CG(
+        rtol=tolerance, atol=tolerance * size, norm=optimistix.rms_norm, max_steps=iterations
+    )
     solution = lineax.linear_solve(
-        operator,
-        target,
-        lineax.CG(rtol=tolerance, atol=tolerance * size, norm=lineax.rms_norm, max_steps=iterations),
-        options={"preconditioner": preconditioner},
-        throw=False,
+        operator, target, solver, options={"preconditioner": preconditioner}, throw=False
     )
     done = solution.result == lineax.RESULTS.successful
-    return (mean + solution.value) * scaled.image_unit, done, solution.stats["num_steps"]
+    image = (mean + factor * solution.value) * scaled.image_unit
+    return image, done, solution.stats["num_steps"]
+
+
+def curvature_scale(image: Float[Array, "..."]) -> Float[Array, ""]:
+    """A factor for quadratic forms that `lineax.CG` is to minimise over images like this.
+
+    lineax takes a curvature pᵀAp/‖r‖² below 100·eps·(number of unknowns) for a breakdown, whatever
+    the size of A. In float32 that is 3 for 512² pixels: more than any A of norm 1 has. A is
+    therefore multiplied by what leaves room for eigenvalues down to 1e-6.
+    """
+    eps = float(jnp.finfo(image.dtype).eps)
+    return jnp.asarray(max(1.0, 1e8 * eps * image.size), image.dtype)

@@ -33,10 +33,11 @@ class Seen(AbstractOperator):
 
     def adjoint(self, capture):
         parts = zip(self.problem.operators, self.problem.weights, capture, strict=True)
-        return sum(operator.adjoint(jnp.sqrt(w) * c) for operator, w, c in parts)
+        first, *others = [operator.adjoint(jnp.sqrt(w) * c) for operator, w, c in parts]
+        return sum(others, start=first)
 
 
-class Scaled(eqx.Module):
+class ScaledProblem(eqx.Module):
     r"""A problem with captures of about 1, weights of at most 1, and :math:`\|\sqrt{w}H\| \le 1`.
 
     The gradient of its misfit then changes by at most as much as the image does (L = 1). τ is
@@ -70,10 +71,11 @@ def gradient(problem: Deconvolution, image: Float[Array, "*batch channel plane y
     return pulled_back(problem, residuals(problem, image))
 
 
-def pulled_back(problem: Deconvolution, differences):
+def pulled_back(problem: Deconvolution, differences) -> Float[Array, "*batch channel plane y x"]:
     r""":math:`\sum_k H_k^T w_k d_k`."""
     parts = zip(problem.operators, problem.weights, differences, strict=True)
-    return sum(operator.adjoint(w * d) for operator, w, d in parts)
+    first, *others = [operator.adjoint(w * d) for operator, w, d in parts]
+    return sum(others, start=first)
 
 
 def even_image(problem: Deconvolution) -> Float[Array, "*batch channel plane y x"]:
@@ -102,9 +104,7 @@ def _divided(problem: Deconvolution, operator_unit, capture_unit, weight_unit) -
     weights = tuple(w / weight_unit for w in problem.weights)
     tau = problem.tau / weight_unit / operator_unit / capture_unit
     problem = eqx.tree_at(lambda p: [o.spectrum for o in p.operators], problem, spectra)
-    return eqx.tree_at(
-        lambda p: (p.captures, p.weights, p.tau), problem, (captures, weights, tau)
-    )
+    return eqx.tree_at(lambda p: (p.captures, p.weights, p.tau), problem, (captures, weights, tau))
 
 
 def _norm(problem: Deconvolution) -> Float[Array, ""]:
@@ -131,4 +131,4 @@ def _or_one(value):
 
 
 _even_image = jax.jit(even_image)
-scaled_problem = jax.jit(Scaled)
+scaled_problem = jax.jit(ScaledProblem)

@@ -1,7 +1,5 @@
 r"""Sparsity in an orthonormal basis as a regulariser: few wavelets, or few cosines."""
 
-from typing import ClassVar
-
 import equinox as eqx
 import jax.numpy as jnp
 import jax.scipy.fft
@@ -38,10 +36,13 @@ class Sparsity(AbstractRegulariser):
     """
 
     basis: Wavelet | Cosines
-    orthonormal: ClassVar[bool] = True
 
     def __init__(self, basis: Wavelet | Cosines | None = None):
         self.basis = Wavelet() if basis is None else basis
+
+    @property
+    def orthonormal(self):
+        return True
 
     def __call__(self, image):
         (details,) = self.analyse(image)

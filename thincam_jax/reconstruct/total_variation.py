@@ -61,7 +61,7 @@ class TotalVariation(eqx.Module):
         shape = image.shape[-2:]
         slopes = differences(image, self.depth_weight)
         rotated = self._rotate(within_field(slopes, field_masks(shape, shape)))
-        lengths = self._length(rotated) * self._channel_weights(image.dtype, image.shape[-4])
+        lengths = self._length(rotated) * self._channel_weights(image.dtype)
         axes = (-4, -3, -2, -1)
         return jnp.sum(lengths, axis=axes)
 
@@ -70,7 +70,7 @@ class TotalVariation(eqx.Module):
     ) -> tuple[Float[Array, "*batch channel plane y x"], ...]:
         """The slopes u that minimise step·TV + ½‖u − slopes‖²: each vector shortened by `step`."""
         rotated = self._rotate(slopes)
-        weights = self._channel_weights(slopes[0].dtype, slopes[0].shape[-4])
+        weights = self._channel_weights(slopes[0].dtype)
         if self.kind == "anisotropic" and self.coupling != "joint":
             shrunk = tuple(s * _kept(jnp.abs(s), step * weights) for s in rotated)
         elif self.kind == "anisotropic":
@@ -90,17 +90,18 @@ class TotalVariation(eqx.Module):
     def _rotate(self, slopes, *, back: bool = False):
         if self.coupling != "opponent":
             return slopes
-        matrix = jnp.asarray(OPPONENT.T if back else OPPONENT, dtype=slopes[0].dtype)
-        return tuple(jnp.einsum("dc,...czyx->...dzyx", matrix, s) for s in slopes)
-
-    def _channel_weights(self, dtype, channels: int):
-        if self.coupling != "opponent":
-            return jnp.ones((1, 1, 1, 1), dtype)
+        channels = slopes[0].shape[-4]
         if channels != 3:
             raise ValueError(
                 f'coupling "opponent" is for 3 colour channels, the image has {channels}; '
                 'use "joint" or "none"'
             )
+        matrix = jnp.asarray(OPPONENT.T if back else OPPONENT, dtype=slopes[0].dtype)
+        return tuple(jnp.einsum("dc,...czyx->...dzyx", matrix, s) for s in slopes)
+
+    def _channel_weights(self, dtype):
+        if self.coupling != "opponent":
+            return jnp.ones((1, 1, 1, 1), dtype)
         chroma = self.chroma_weight.astype(dtype)
         return jnp.stack([jnp.ones((), dtype), chroma, chroma])[:, None, None, None]
 

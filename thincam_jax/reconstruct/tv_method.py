@@ -131,6 +131,6 @@ def _consensus(splitting, penalties, state: State) -> State:
 def _sizes(state: State) -> list[Float[Array, ""]]:
     """Squared norms of the three splits."""
     return [
-        sum((jnp.sum(x**2) for x in jax.tree.leaves(part)), start=jnp.zeros(()))
+        jnp.asarray(sum(jnp.sum(x**2) for x in jax.tree.leaves(part)))
         for part in (state.data, state.slopes, state.image)
     ]

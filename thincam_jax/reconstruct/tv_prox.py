@@ -1,7 +1,6 @@
 """Total variation as a regulariser of gradient methods: its proximal map, by the dual."""
 
 import functools
-from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +20,10 @@ class VariationRegulariser(AbstractRegulariser):
     """R = TV: K takes the differences inside of the image, φ sums the lengths of their vectors."""
 
     variation: TotalVariation
-    orthonormal: ClassVar[bool] = False
+
+    @property
+    def orthonormal(self):
+        return False
 
     def __call__(self, image):
         return self.variation(image)
@@ -61,9 +63,7 @@ def tv_prox(
 def _tv_prox(image, step, variation, nonnegative: bool, iterations: int):
     regulariser = VariationRegulariser(variation)
     dual = no_dual(regulariser, image)
-    return prox(
-        regulariser, image, step, dual, nonnegative=nonnegative, iterations=iterations
-    )[0]
+    return prox(regulariser, image, step, dual, nonnegative=nonnegative, iterations=iterations)[0]
 
 
 def _inside(slopes):

@@ -27,7 +27,7 @@ from thincam_jax.reconstruct.fista import relative_length
 from thincam_jax.reconstruct.problem import Deconvolution, residuals
 from thincam_jax.reconstruct.proximal import composite, regulariser_of
 from thincam_jax.reconstruct.regulariser import AbstractRegulariser, Parts, no_dual, prox
-from thincam_jax.reconstruct.scaled import Scaled, pulled_back, scaled_problem, start_image
+from thincam_jax.reconstruct.scaled import ScaledProblem, pulled_back, scaled_problem, start_image
 
 
 class TwoStepState(eqx.Module):
@@ -35,7 +35,7 @@ class TwoStepState(eqx.Module):
 
     image: Float[Array, "*batch channel plane y x"]
     before: Float[Array, "*batch channel plane y x"]
-    differences: tuple[Float[Array, "*batch channel y x"], ...]
+    differences: tuple[Float[Array, "*batch channel v u"], ...]
     value: Float[Array, "*batch"]
     dual: Parts
 
@@ -48,7 +48,7 @@ class TwoStep(AbstractMethod[TwoStepState]):
     """
 
     problem: Deconvolution
-    scaled: Scaled
+    scaled: ScaledProblem
     regulariser: AbstractRegulariser
     smallest: Float[Array, ""]
     inner: int = eqx.field(static=True)
@@ -58,7 +58,7 @@ class TwoStep(AbstractMethod[TwoStepState]):
         problem: Deconvolution,
         *,
         regulariser: AbstractRegulariser | None = None,
-        smallest_eigenvalue=1e-3,
+        smallest_eigenvalue=1e-4,
         inner: int = 10,
     ):
         smallest = _checks.fraction("smallest_eigenvalue", smallest_eigenvalue)
@@ -93,7 +93,7 @@ def solve_two_step(
     image: Float[Array, "..."] | None = None,
     iterations: int = 500,
     tolerance: float = 1e-5,
-    smallest_eigenvalue=1e-3,
+    smallest_eigenvalue=1e-4,
     inner: int = 10,
     look_every: int = 10,
     callback: Callback | None = None,
@@ -105,8 +105,8 @@ def solve_two_step(
     - `regulariser`: R; default the problem's total variation.
     - `image`: to start from; default the even image that explains the captures best.
     - `tolerance`: relative length of a step at which to end.
-    - `smallest_eigenvalue`: ξ, of what the captures tell of, relative to the largest eigenvalue. The
-      paper advises 1e-4 for a badly conditioned H, 1e-2 for a mildly bad one; a wrong one costs
+    - `smallest_eigenvalue`: ξ, of what the captures tell of, relative to the largest one. The paper
+      advises 1e-4 for a badly conditioned H, 1e-2 for a mildly bad one; a wrong one costs
       iterations, not accuracy.
     - `inner`: iterations of the proximal map where it has no closed form.
     - `look_every`, `callback`: see `drive`.
@@ -144,8 +144,8 @@ def two_step(method: TwoStep, state: TwoStepState):
     )
     alpha, beta = weights(method.smallest)
     # The rest of the two images is formed from differences: no cancellation near the end.
-    wanted = state.image + (alpha - 1) * (state.image - state.before) + beta * (
-        pulled - state.image
+    wanted = (
+        state.image + (alpha - 1) * (state.image - state.before) + beta * (pulled - state.image)
     )
     if problem.nonnegative:
         wanted = jnp.maximum(wanted, 0)

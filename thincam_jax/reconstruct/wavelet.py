@@ -11,10 +11,12 @@ whole line is orthonormal for every length. Lines and columns are split in turn;
 coarse quarter again.
 """
 
+import functools
 import math
 from typing import Literal
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -65,30 +67,45 @@ class Wavelet(eqx.Module):
 
     def analyse(self, image: Float[Array, "*batch y x"]) -> Float[Array, "*batch y x"]:
         """The coefficients of an image."""
-        result = image
-        for rows, columns in self._shapes(image.shape[-2:]):
-            coarse = _split(_split(result[..., :rows, :columns], self.family, -2), self.family, -1)
-            result = result.at[..., :rows, :columns].set(coarse)
-        return result
+        return _analyse(image, self.family, self._shapes(_size(image)))
 
     def synthesise(self, coefficients: Float[Array, "*batch y x"]) -> Float[Array, "*batch y x"]:
         """The image of coefficients: the transpose and inverse of `analyse`."""
-        result = coefficients
-        for rows, columns in reversed(self._shapes(coefficients.shape[-2:])):
-            fine = _join(_join(result[..., :rows, :columns], self.family, -1), self.family, -2)
-            result = result.at[..., :rows, :columns].set(fine)
-        return result
+        return _synthesise(coefficients, self.family, self._shapes(_size(coefficients)))
 
     def coarse_shape(self, shape: tuple[int, int]) -> tuple[int, int]:
         """Size of the coarse part that is left in the end."""
         return _half(self._shapes(shape)[-1])
 
-    def _shapes(self, shape: tuple[int, int]) -> list[tuple[int, int]]:
+    def _shapes(self, shape: tuple[int, int]) -> tuple[tuple[int, int], ...]:
         """Sizes of the coarse part before each split."""
         shapes = [shape]
         for _ in range(self.levels - 1):
             shapes.append(_half(shapes[-1]))
-        return shapes
+        return tuple(shapes)
+
+
+@functools.partial(jax.jit, static_argnames=("family", "shapes"))
+def _analyse(image, family: str, shapes):
+    result = image
+    for rows, columns in shapes:
+        coarse = _split(_split(result[..., :rows, :columns], family, -2), family, -1)
+        result = result.at[..., :rows, :columns].set(coarse)
+    return result
+
+
+@functools.partial(jax.jit, static_argnames=("family", "shapes"))
+def _synthesise(coefficients, family: str, shapes):
+    result = coefficients
+    for rows, columns in reversed(shapes):
+        fine = _join(_join(result[..., :rows, :columns], family, -1), family, -2)
+        result = result.at[..., :rows, :columns].set(fine)
+    return result
+
+
+def _size(image: Array) -> tuple[int, int]:
+    rows, columns = image.shape[-2:]
+    return rows, columns
 
 
 def _half(shape: tuple[int, int]) -> tuple[int, int]:

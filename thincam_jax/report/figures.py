@@ -25,11 +25,13 @@ _LINES = (
 )
 
 
-def _line(index: int) -> dict:
+def line_style(index: int) -> dict:
+    """Colour, dash and marker of the curve of that number."""
     return dict(_LINES[index % len(_LINES)])
 
 
-def _save(folder: RunFolder, name: str, figure: Figure) -> None:
+def save_figure(folder: RunFolder, name: str, figure: Figure) -> None:
+    """A figure as figures/NAME.png."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=110)
     folder.write(f"figures/{name}.png", buffer.getvalue())
@@ -74,7 +76,7 @@ def save_target(
         _show(detail, _middle(image), "")
         detail.set_xlabel(f"middle {config.object.width / 3:.0f} mm", fontsize=9)
     # No target's name can be taken for one of the study's own figures.
-    _save(folder, f"target-{slug(target.name)}", figure)
+    save_figure(folder, f"target-{slug(target.name)}", figure)
 
 
 def _caption(evaluation: Evaluation) -> str:
@@ -118,7 +120,7 @@ def save_responses(folder: RunFolder, config: StudyConfig, responses: dict[str, 
     for index, (ax, (name, response)) in enumerate(zip(axes, responses.items(), strict=True)):
         level = low_frequency_value(response.frequency, response.magnitude)
         top = max(1.3, 1.05 * float(response.magnitude[1:].max()) / level)
-        style = _line(index) | {"marker": "", "linestyle": "-"}
+        style = line_style(index) | {"marker": "", "linestyle": "-"}
         ax.plot(response.frequency[1:], response.magnitude[1:] / level, linewidth=1.1, **style)
         limits = response.metrics
         zero, cut = limits["first_zero_cycles_per_mm"], limits["cut_off_cycles_per_mm"]
@@ -134,7 +136,7 @@ def save_responses(folder: RunFolder, config: StudyConfig, responses: dict[str, 
         ax.set_ylabel("relative MTF")
         ax.set_title(name, fontsize=10, loc="left")
     axes[-1].set_xlabel("spatial frequency u on the reference sensor plane (cycles/mm), v = 0")
-    _save(folder, "mtf", figure)
+    save_figure(folder, "mtf", figure)
 
 
 def save_contrasts(folder: RunFolder, config: StudyConfig, contrasts: dict[str, list]) -> None:
@@ -144,7 +146,7 @@ def save_contrasts(folder: RunFolder, config: StudyConfig, contrasts: dict[str, 
     for index, (name, records) in enumerate(contrasts.items()):
         periods = sorted({period for period, _, _ in records}, reverse=True)
         worst = [min(c for p, _, c in records if p == period) for period in periods]
-        ax.plot(periods, worst, label=name, markersize=4, linewidth=1.2, **_line(index))
+        ax.plot(periods, worst, label=name, markersize=4, linewidth=1.2, **line_style(index))
     ax.axhline(0, color="black", linewidth=0.8)
     ax.set_xscale("log")
     ax.invert_xaxis()
@@ -156,7 +158,7 @@ def save_contrasts(folder: RunFolder, config: StudyConfig, contrasts: dict[str, 
     ax.set_ylabel("contrast of the three bars,\nworse direction")
     ax.legend(fontsize=9, loc="lower left")
     ax.grid(alpha=0.3)
-    _save(folder, "contrast", figure)
+    save_figure(folder, "contrast", figure)
 
 
 def save_psf(folder: RunFolder, config: StudyConfig) -> None:
@@ -188,4 +190,4 @@ def save_psf(folder: RunFolder, config: StudyConfig) -> None:
         f"β = {setting.beta:g} rad/mm², φ = {setting.phase:.2f} rad, d = {setting.distance:g} mm",
         fontsize=9,
     )
-    _save(folder, "psf", figure)
+    save_figure(folder, "psf", figure)

@@ -56,6 +56,7 @@ def findings(config: StudyConfig, metrics: dict[str, Any]) -> list[str]:
                 f"{name}: resolves a line pair of {resolved:.2f} mm on the object, published "
                 f"{stated:.2f} mm: {word}."
             )
+    sentences += _gains(config, metrics)
     ranked = sorted(
         (r, name) for name, m in metrics["methods"].items() if (r := _resolved(m)) is not None
     )
@@ -70,3 +71,25 @@ def _resolved(method: dict[str, Any]) -> float | None:
         if target["resolved"] is not None:
             return target["resolved"]["object_mm"]
     return None
+
+
+def _gains(config: StudyConfig, metrics: dict[str, Any]) -> list[str]:
+    """What total variation adds to the Wiener synthesis of the same captures."""
+    sentences = []
+    for method in (m for m in config.methods if m.kind == "admm_tv"):
+        for other in (m for m in config.methods if m.kind == "wiener"):
+            if (other.shots, other.synthesis, other.phases) != (
+                method.shots,
+                method.synthesis,
+                method.phases,
+            ):
+                continue
+            pairs = (
+                (t.name, *(metrics["methods"][m.name]["targets"][t.name]["psnr_db"] for m in pair))
+                for t in config.targets
+                for pair in [(method, other)]
+            )
+            gains = [f"{a - b:+.1f} dB on {t}" for t, a, b in pairs if None not in (a, b)]
+            if gains:
+                sentences.append(f"{method.name}: {', '.join(gains)} over {other.name}.")
+    return sentences

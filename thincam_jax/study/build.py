@@ -11,9 +11,15 @@ from jaxtyping import Array
 
 from thincam_jax.camera import LenslessCamera
 from thincam_jax.capture import capture
-from thincam_jax.config import MethodConfig, StudyConfig, TargetConfig
+from thincam_jax.config import MethodConfig, StudyConfig, TargetConfig, VariationConfig
 from thincam_jax.masks.fza import FresnelZoneAperture
-from thincam_jax.reconstruct import FringeScanning, Reconstruction, WienerSynthesis
+from thincam_jax.reconstruct import (
+    FringeScanning,
+    Reconstruction,
+    TotalVariation,
+    WienerSynthesis,
+    reconstruct,
+)
 from thincam_jax.reconstruct import synthesis as syntheses
 from thincam_jax.scene import ImagePlane, Scene
 from thincam_jax.sensor import (
@@ -176,6 +182,8 @@ def build_reconstructor(
             cameras, object_distance=config.object.distance, field_shape=shape
         )
         return lambda captures, variances: scanning(captures)
+    if method.kind == "admm_tv":
+        return functools.partial(_admm_tv, config, method, cameras, shape)
     return WienerSynthesis(
         cameras,
         wavelength=[s.wavelength for s in used],
@@ -183,6 +191,38 @@ def build_reconstructor(
         synthesis=synthesis_matrix(method),
         field_shape=shape,
         prior=config.prior,
+        model=config.model,
+        pixel_integration=config.pixel_integration,
+    )
+
+
+def _admm_tv(
+    config: StudyConfig,
+    method: MethodConfig,
+    cameras: list[LenslessCamera],
+    shape: tuple[int, int],
+    captures: Array,
+    variances: Array,
+) -> Reconstruction:
+    """Total variation on the crop model; without noise in the study it is estimated."""
+    options = method.variation or VariationConfig()
+    variation = TotalVariation(
+        options.kind,
+        options.coupling_of(captures.shape[1]),
+        chroma_weight=options.chroma_weight,
+    )
+    return reconstruct(
+        captures,
+        cameras,
+        method="admm_tv",
+        object_distance=config.object.distance,
+        wavelength=[s.wavelength for s in settings(config, method)],
+        noise_variance=None if config.noise is None else variances,
+        synthesis=synthesis_matrix(method),
+        field_shape=shape,
+        tau=options.tau,
+        variation=variation,
+        iterations=options.iterations,
         model=config.model,
         pixel_integration=config.pixel_integration,
     )

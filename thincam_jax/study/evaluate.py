@@ -40,19 +40,25 @@ def evaluate(
     """PSNR and SSIM after alignment, over the target's area; the resolved element of a chart."""
     image = np.asarray(reconstruction.image, dtype=float)
     rows, columns = image.shape[-2:]
-    grid = Grid((rows, columns), reconstruction.pitch)
+    grid = Grid((rows, columns), _known_pitch(reconstruction))
     truth = np.asarray(_sample(plane, grid), dtype=float)
     image, truth = (_as_picture(i) for i in (image, truth))
     metrics: dict[str, Any] = {
         "psnr_db": _finite(round(psnr(image, truth), 4)),
         "ssim": round(ssim(image, truth), 5),
-        "object_pixel_mm": round(float(reconstruction.pitch), 6),
+        "object_pixel_mm": round(float(grid.pitch), 6),
         "resolved": None,
     }
     contrast = None
     if target.kind == "usaf1951":
         metrics["resolved"], contrast = _resolution(config, method, image, float(grid.pitch))
     return Evaluation(align(image, truth)[0], truth, metrics, contrast)
+
+
+def _known_pitch(reconstruction: Reconstruction):
+    if reconstruction.pitch is None:
+        raise ValueError("a reconstruction from PSFs alone has no pitch on the object")
+    return reconstruction.pitch
 
 
 def _finite(value: float) -> float | None:

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from thincam_jax._files import write_whole
-from thincam_jax.config import ConfigError, StudyConfig, dump_config, slug
+from thincam_jax.config import ConfigError, Section, dump_config, slug
 
 
 class RunFolder:
@@ -20,7 +20,7 @@ class RunFolder:
     def __init__(self, path: str | Path):
         self.path = Path(path)
 
-    def claim(self, config: StudyConfig) -> None:
+    def claim(self, config: Section) -> None:
         """Make the folder and write the configuration; refuse a folder that holds anything else.
 
         An interrupted run of the same configuration goes on; a complete one is done anew.

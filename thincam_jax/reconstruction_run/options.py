@@ -1,0 +1,104 @@
+"""What a run is asked for: its files, its method, and what it writes."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from thincam_jax import _checks
+from thincam_jax.measured import MeasurementError, Preparation
+from thincam_jax.measured.display import WhiteBalance
+from thincam_jax.reconstruct import METHODS
+
+# They are computed from a model of the camera, not from a measured PSF.
+NEEDS_CAMERAS = ("wiener", "fringe_scanning")
+PSF_METHODS = tuple(method for method in METHODS if method not in NEEDS_CAMERAS)
+
+# Far beyond any use; its product with the captures' units stays within float32.
+_LARGEST_TAU = 1e6
+
+Background = Path | float | int | None
+
+
+@dataclass(frozen=True)
+class Sources:
+    """What all captures of a run share; see `measured.prepare`.
+
+    - `psf`, `dead`: files. `background`, `psf_background`: a dark frame's file, a number of counts,
+      or None for the default.
+    - `bits`: bit depth of the camera where its files do not tell it.
+    """
+
+    psf: Path
+    background: Background = None
+    psf_background: Background = None
+    dead: Path | None = None
+    bits: int | None = None
+    preparation: Preparation = Preparation()
+
+    def paths(self) -> list[Path]:
+        """Every file that is read."""
+        given = (self.psf, self.background, self.psf_background, self.dead)
+        return [path for path in given if isinstance(path, Path)]
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """How to reconstruct; see `thincam_jax.reconstruct`.
+
+    - `method`: one of `PSF_METHODS`.
+    - `tau`: weight of the variation relative to the noise. `iterations`: at most.
+    - `coupling`: of colours; None: "joint" for several channels.
+    - `field`: "sensor" keeps the part of the image in front of the sensor, "full" all that sends
+      light to it.
+    - `flip`: turn the image by 180°.
+
+    **Errors**: MeasurementError for what is unknown or out of range.
+    """
+
+    method: str = "admm_tv"
+    tau: float | int = 2.0
+    iterations: int = 100
+    coupling: Literal["none", "joint", "opponent"] | None = None
+    field: Literal["sensor", "full"] = "sensor"
+    flip: bool = False
+
+    def __post_init__(self):
+        if self.method in NEEDS_CAMERAS:
+            raise MeasurementError(
+                f"method {self.method!r} needs a model of the camera; with a measured PSF choose "
+                f"one of {', '.join(repr(m) for m in PSF_METHODS)}"
+            )
+        try:
+            _checks.choice("method", self.method, PSF_METHODS)
+            _checks.choice("coupling", self.coupling or "none", ("none", "joint", "opponent"))
+            _checks.choice("field", self.field, ("sensor", "full"))
+            _checks.non_negative("tau", self.tau, "parts of one")
+        except ValueError as error:
+            raise MeasurementError(str(error)) from None
+        if self.tau > _LARGEST_TAU:
+            raise MeasurementError(
+                f"tau = {self.tau:g}: give about 1 to 3, at most {_LARGEST_TAU:g}"
+            )
+        if self.iterations < 1:
+            raise MeasurementError(f"iterations = {self.iterations}: give at least 1")
+
+
+@dataclass(frozen=True)
+class Output:
+    """Where and how results are written.
+
+    - `path`: an image file; or a folder, in which each result has the name of its capture.
+    - `linear`: format of the float image beside a PNG, "npy" or "tif"; "none" for none.
+    - `gamma`, `white_balance`: of the PNG; see `measured.to_display`.
+    """
+
+    path: Path
+    linear: Literal["npy", "tif", "none"] = "npy"
+    gamma: float | int = 2.2
+    white_balance: WhiteBalance = None
+
+    def __post_init__(self):
+        try:
+            _checks.choice("linear", self.linear, ("npy", "tif", "none"))
+        except ValueError as error:
+            raise MeasurementError(str(error)) from None
