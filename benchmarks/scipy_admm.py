@@ -4,10 +4,12 @@ The same problem and the same iteration as `thincam_jax.reconstruct.admm`, in si
 can be computed once is, arrays are reused, transforms are real and run on all cores.
 """
 
+import os
+
 import numpy as np
 import scipy.fft
 
-WORKERS = 2
+WORKERS = os.cpu_count()
 
 
 class ScipyAdmm:
@@ -79,11 +81,11 @@ class ScipyAdmm:
         fitted = scipy.fft.irfft2(spectrum, s=self.window, workers=WORKERS, overwrite_x=True)
         projected = scipy.fft.irfft2(other, s=self.window, workers=WORKERS, overwrite_x=True)
         self._update(data, z_data, projected)
-        self._update(image, z_image, fitted.copy())
         self._difference(fitted, length, axis=-2)
         self._update(down, z_down, length)
         self._difference(fitted, length, axis=-1)
         self._update(right, z_right, length)
+        self._update(image, z_image, fitted)
 
     def _update(self, q, z, k):
         k -= z

@@ -33,7 +33,7 @@ def lengths(table, kind, joint):
 
 
 def objective(image, parts, tau, psi, kind, joint):
-    hessian = sum(np.einsum("cps,cp,cpt->cst", a, w, a) for a, _, w in parts)
+    """E of an image (channel, sample); parts: matrices (channel, pixel, sample), data, weights."""
     misfit = sum(
         0.5 * (w * (np.einsum("cps,cs->cp", a, image) - g) ** 2).sum() for a, g, w in parts
     )

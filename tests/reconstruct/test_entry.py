@@ -62,7 +62,7 @@ def test_status_tells_of_what_is_not_a_number():
 def test_what_is_refused():
     cameras = rig.pair()
     captures = jnp.ones((2, *rig.SENSOR.shape))
-    assert METHODS == ("auto", "wiener", "fringe_scanning", "admm_tv")
+    assert METHODS[:4] == ("auto", "wiener", "fringe_scanning", "admm_tv")
     with rig.unchecked():
         for name, message in (
             ("method", "method = 'x' is unknown; choose one of 'auto', 'wiener'"),

@@ -104,9 +104,8 @@ def test_differences_and_their_transpose(planes):
         back = np.asarray(differences_adjoint(tuple(slopes), 0.3)).reshape(size, size)
         block = forward[:, direction * size : (direction + 1) * size]
         np.testing.assert_allclose(back, block.T, atol=1e-15)
-    with np.errstate(all="raise"):
-        image = np.zeros(shape)
-        image[0, 2, 4] = 1.0  # a corner: its neighbours lie round the window's end
+    image = np.zeros(shape)
+    image[0, 2, 4] = 1.0  # a corner: its neighbours lie round the window's end
     down, right, *behind = (np.asarray(s) for s in differences(jnp.asarray(image), 0.3))
     assert down[0, 1, 4] == 1 and down[0, 2, 4] == -1 and right[0, 2, 3] == 1
     assert not behind or (behind[0][0, 2, 4] == -0.3 and not behind[0][-1].any())

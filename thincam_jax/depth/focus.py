@@ -66,7 +66,12 @@ def focus_measure(
 def gaussian_average(
     image: Float[Array, "*batch y x"], width: float | int
 ) -> Float[Array, "*batch y x"]:
-    """Gaussian average around each pixel; at the border over the pixels there are."""
+    """Gaussian average around each pixel; at the border over the pixels there are.
+
+    A `width` of 0 leaves the image as it is.
+    """
+    if not _width("width", width):
+        return image
     down, across = (jnp.asarray(_weights(n, width), image.dtype) for n in image.shape[-2:])
     return product(product(down, image), across.T)
 

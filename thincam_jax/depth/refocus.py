@@ -12,6 +12,7 @@ from thincam_jax.camera import LenslessCamera
 from thincam_jax.psf import Model
 from thincam_jax.reconstruct import TotalVariation, reconstruct
 from thincam_jax.reconstruct.entry import Method
+from thincam_jax.reconstruct.noise import estimate_variance
 from thincam_jax.reconstruct.spectra import Prior
 
 _LEAST = 3  # a maximum inside of the sweep needs two neighbours
@@ -79,6 +80,13 @@ def refocus_sweep(
     **Errors**: ValueError, one line, for distances that are not positive and increasing.
     """
     focus = _increasing(distances)
+    if isinstance(tau, str):
+        raise ValueError(
+            f"tau = {tau!r} would be another number at each distance, whose images then do not "
+            "compare; give a number"
+        )
+    if noise_variance is None:
+        noise_variance = estimate_variance(jnp.asarray(captures))
     images, pitch = [], None
     for index, distance in enumerate(focus):
         result = reconstruct(

@@ -193,8 +193,8 @@ def default_penalties(splitting: Splitting) -> Penalties:
 
     Where one low frequency is far stronger than the rest, as the light of a bright background is,
     the splits that it does not concern must weigh more: by the ratio of the largest to the root
-    mean square, μ₂ = μ₃ = max|H|/rms|H|. μ₁ = 1 puts the split data on a par with the data. Found
-    by trial over diffuser and zone-aperture captures; `AdmmTotalVariation.adapt` adapts them.
+    mean square, μ₂ = μ₃ = max|H|/rms|H|. μ₁ = 1 puts the split data on a par with the data. A rule
+    of thumb, which `AdmmTotalVariation.adapt` corrects.
     """
     strongest = jnp.sqrt(
         jnp.max(

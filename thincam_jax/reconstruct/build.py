@@ -48,8 +48,8 @@ def camera_problem(
       that pixels of the planes that are behind each other lie on one ray through the mask.
     - `tau`: see `absolute_tau`.
     - `synthesis`: real matrix (channel × capture) of sums of captures that are reconstructed in
-      place of the captures; default: the captures. Without its bias, a capture of a zone aperture
-      converges in a tenth of the iterations.
+      place of the captures; default: the captures. Sums in which the bright background cancels
+      converge much faster.
     """
     captures, valid = _trusted(jnp.asarray(captures), valid)
     matrix = separate(len(cameras)) if synthesis is None else np.asarray(synthesis, dtype=float)
@@ -70,7 +70,7 @@ def camera_problem(
     ]
     sums = [_Sum(row, kernels, captures, valid, ratios) for row in matrix]
     variances = [
-        _variance(row, noise_variance, captures) * ratio**2
+        _variance(row, noise_variance, captures, valid) * ratio**2
         for row, ratio in zip(matrix, (s.ratio for s in sums), strict=True)
     ]
     return _assemble(
@@ -115,7 +115,9 @@ def psf_problem(
     sensor, kernel = captures.shape[-2:], kernels.shape[-2:]
     rows, columns = field_shape or (s + k - 1 for s, k in zip(sensor, kernel, strict=True))
     field = _fitting_field((rows, columns), sensor, kernel)
-    variances = [_variance(row, noise_variance, captures) for row in np.eye(captures.shape[0])]
+    variances = [
+        _variance(row, noise_variance, captures, valid) for row in np.eye(captures.shape[0])
+    ]
     masks = [None] * len(kernels) if valid is None else list(valid)
     return _assemble(
         list(kernels),
@@ -187,18 +189,29 @@ def _trusted(captures, valid):
     """Captures and the mask of their pixels; what is neither valid nor a number becomes 0."""
     if valid is None:
         return captures, None
-    valid = jnp.broadcast_to(jnp.asarray(valid, bool), captures.shape)
+    valid = jnp.asarray(valid, bool)
+    try:
+        valid = jnp.broadcast_to(valid, captures.shape)
+    except ValueError:
+        raise ValueError(
+            f"valid has shape {valid.shape}; give a mask of the captures, {captures.shape}"
+        ) from None
     return jnp.where(valid | jnp.isfinite(captures), captures, 0), valid
 
 
-def _variance(row: np.ndarray, noise_variance, captures) -> Float[Array, ""]:
+def _variance(row: np.ndarray, noise_variance, captures, valid) -> Float[Array, ""]:
     """Variance of a sum of captures: as given, or estimated where that is nothing or zero."""
     count = captures.shape[0]
     square = jnp.asarray(row**2, captures.dtype)
-    estimated = jnp.sum(square * estimate_variance(captures))
+    estimated = jnp.sum(square * estimate_variance(captures, valid))
     if noise_variance is None:
         return estimated
     each = jnp.asarray(noise_variance, captures.dtype)
+    if not _checks.is_traced(each) and not bool(jnp.all((each >= 0) & jnp.isfinite(each))):
+        raise ValueError(
+            f"noise_variance = {noise_variance} is negative or not finite; give variances in the "
+            "captures' units squared, or none to have them estimated"
+        )
     if each.ndim and each.shape[0] != count:
         raise ValueError(
             f"noise_variance has shape {each.shape}; give one number or one for each of the "

@@ -166,9 +166,20 @@ def _full(problem: Deconvolution):
     return [jnp.broadcast_to(w, c.shape) for w, c in pairs]
 
 
+class SearchInterrupted(KeyboardInterrupt):
+    """Ctrl-C during a search; holds the best image of the solve that it ended."""
+
+    def __init__(self, image):
+        super().__init__()
+        self.image = image
+
+
 def _solve(problem: Deconvolution, image, iterations: int):
     method = AdmmTotalVariation(problem, relaxation=1.5)
-    return drive(method, image, iterations=iterations, tolerance=1e-5).image
+    outcome = drive(method, image, iterations=iterations, tolerance=1e-5)
+    if outcome.status == "interrupted":
+        raise SearchInterrupted(outcome.image)
+    return outcome.image
 
 
 def _probes(problem: Deconvolution, key: PRNGKeyArray):

@@ -86,8 +86,8 @@ class AbstractMethod(eqx.Module, Generic[Method_State]):
 
 Callback = Callable[[Progress], object]
 
-# With the iteration that is looked at, ten. Each run of a program gets its memory anew, whose pages
-# cost half an iteration at 2048² samples: shared by nine they do not matter.
+# With the iteration that is looked at, ten. Each run of a program gets its memory anew from the
+# system, which takes time for large windows: shared by nine iterations it does not matter.
 CHUNK = 9
 
 

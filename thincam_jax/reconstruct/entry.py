@@ -8,13 +8,20 @@ from jaxtyping import Array, Float
 
 from thincam_jax import _checks
 from thincam_jax.camera import LenslessCamera
-from thincam_jax.psf import Model
+from thincam_jax.psf import MODELS, Model
 from thincam_jax.reconstruct.automatic import are_cameras, choose_method
 from thincam_jax.reconstruct.build import camera_problem, object_pitch, psf_problem
-from thincam_jax.reconstruct.drive import Callback, Outcome
+from thincam_jax.reconstruct.drive import Callback
 from thincam_jax.reconstruct.fringe_scanning import FringeScanning
 from thincam_jax.reconstruct.noise import estimate_variance
-from thincam_jax.reconstruct.regularised import Iterative, Options, TauRule, middle, minimise
+from thincam_jax.reconstruct.regularised import (
+    Iterative,
+    Options,
+    Solved,
+    TauRule,
+    middle,
+    minimise,
+)
 from thincam_jax.reconstruct.result import Reconstruction
 from thincam_jax.reconstruct.spectra import Prior
 from thincam_jax.reconstruct.synthesis import separate
@@ -88,20 +95,35 @@ def reconstruct(
     methods, models and priors.
     """
     _checks.choice("method", method, METHODS)
-    cameras = cameras if are_cameras(cameras) else jnp.asarray(cameras)
+    cameras = _cameras_or_psfs(cameras)
     captures = _captures(captures, len(cameras))
     reason = ""
     if method == "auto":
-        chosen, reason = choose_method(captures, cameras, synthesis, noise_variance)
+        chosen, reason = choose_method(
+            captures,
+            cameras,
+            synthesis,
+            noise_variance,
+            valid=valid,
+            object_distance=object_distance,
+        )
         method = cast(Method, chosen)
         if method == "wiener" and noise_variance is None:
             noise_variance = estimate_variance(captures)
+    _checks.choice("prior", prior, get_args(Prior))
+    _checks.choice("model", model, MODELS)
     if method not in ("wiener", "fringe_scanning"):
         rule = cast(TauRule, tau) if isinstance(tau, str) else None
         tau = 2.0 if isinstance(tau, str) else tau
         chosen = cast(Iterative, method)
         how = Options(chosen, iterations, tolerance, relaxation, start, callback, rule)
         if not isinstance(cameras, Sequence):
+            _refuse(
+                "measured PSFs",
+                object_distance=object_distance,
+                wavelength=wavelength,
+                synthesis=synthesis,
+            )
             problem = psf_problem(
                 captures,
                 cameras,
@@ -114,7 +136,7 @@ def reconstruct(
             )
             shape = captures.shape[-2:] if field_shape is None else problem.field_shape
             outcome = minimise(problem, how, even_start=False)
-            return _result(outcome, captures, shape, None, method, reason)
+            return _result(outcome, captures, shape, None, method, reason, tau)
         _require(method, object_distance=object_distance, wavelength=wavelength)
         problem = camera_problem(
             captures,
@@ -134,9 +156,12 @@ def reconstruct(
         turned = None if start is None else jnp.asarray(start)[..., ::-1, ::-1]
         outcome = minimise(problem, how._replace(start=turned), even_start=True)
         pitch = object_pitch(cameras, object_distance)
-        return _result(outcome, captures, problem.field_shape, pitch, method, reason)
+        return _result(outcome, captures, problem.field_shape, pitch, method, reason, tau)
     if not isinstance(cameras, Sequence):
-        raise ValueError(f"method {method!r} needs cameras; with measured PSFs use 'admm_tv'")
+        raise ValueError(
+            f"method {method!r} needs cameras; with measured PSFs use 'admm_tv', 'fista' or 'twist'"
+        )
+    _refuse(f"method {method!r}", valid=valid, variation=variation, start=start, callback=callback)
     _require(method, object_distance=object_distance)
     if method == "fringe_scanning":
         scanning = FringeScanning(cameras, object_distance=object_distance, field_shape=field_shape)
@@ -156,6 +181,26 @@ def reconstruct(
 
 
 _UNITS = {"object_distance": "mm", "wavelength": "mm", "noise_variance": "units²"}
+
+
+def _cameras_or_psfs(cameras) -> Sequence[LenslessCamera] | Array:
+    if isinstance(cameras, LenslessCamera):
+        raise TypeError("cameras is one camera; give a list, [camera], one for each capture")
+    if are_cameras(cameras):
+        return cameras
+    psfs = jnp.asarray(cameras)
+    if psfs.ndim < 3:
+        raise ValueError(
+            f"PSFs have shape {psfs.shape}; give (capture, k, l), such as psf[None] for one"
+        )
+    return psfs
+
+
+def _refuse(what: str, **given) -> None:
+    """The answer would be to another question than was asked."""
+    unused = [name for name, value in given.items() if value is not None]
+    if unused:
+        raise ValueError(f"{what} cannot use {' and '.join(unused)}; leave out, or use 'admm_tv'")
 
 
 def _require(method: str, **given) -> None:
@@ -179,8 +224,11 @@ def _named(result: Reconstruction, method: str, reason: str) -> Reconstruction:
     return Reconstruction(result.image, result.pitch, method, reason)
 
 
-def _result(outcome: Outcome, captures, shape, pitch, method: str, reason: str) -> Reconstruction:
+def _result(
+    solved: Solved, captures, shape, pitch, method: str, reason: str, tau
+) -> Reconstruction:
     """The image with the axes of the captures; upright if cameras turned it over."""
+    outcome = solved.outcome
     image = middle(outcome.image, shape)
     image = image if pitch is None else image[..., ::-1, ::-1]
     planes = image.shape[-3]
@@ -195,4 +243,5 @@ def _result(outcome: Outcome, captures, shape, pitch, method: str, reason: str) 
         outcome.history,
         outcome.iterations,
         outcome.seconds,
+        float(tau) * solved.tau_factor,
     )

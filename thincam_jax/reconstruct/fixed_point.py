@@ -44,11 +44,12 @@ class NeumannSeries(lx.AbstractLinearSolver):
     constraints that hold exactly), if only as fast as the iteration.
 
     - `tolerance`: on the change of w, relative to w, both in the root mean square.
-    - `max_steps`: when to give up; the sum so far is returned.
+    - `max_steps`: when to give up; the sum so far is returned, without a sign of it, and may be
+      some ten per cent short where the iteration itself converges slowly. Compare another number.
     """
 
     tolerance: float = 1e-6
-    max_steps: int = 1000
+    max_steps: int = 5000
 
     def init(self, operator: lx.AbstractLinearOperator, options: dict[str, Any]):
         return lx.linearise(operator)

@@ -1,5 +1,6 @@
 """The iterative methods behind `reconstruct`: from a problem to a `Reconstruction`."""
 
+import time
 from typing import Literal, NamedTuple, get_args
 
 import jax
@@ -8,7 +9,7 @@ from jaxtyping import Array, Float
 
 from thincam_jax import _checks
 from thincam_jax.operators.crop_convolution import cut, place
-from thincam_jax.reconstruct.choose_tau import discrepancy_tau, sure_tau
+from thincam_jax.reconstruct.choose_tau import SearchInterrupted, discrepancy_tau, sure_tau
 from thincam_jax.reconstruct.drive import Callback, Outcome, drive
 from thincam_jax.reconstruct.problem import Deconvolution, uniform_level
 from thincam_jax.reconstruct.proximal import solve_proximal
@@ -31,7 +32,14 @@ class Options(NamedTuple):
     rule: TauRule | None = None
 
 
-def minimise(problem: Deconvolution, options: Options, *, even_start: bool) -> Outcome:
+class Solved(NamedTuple):
+    """An outcome, and what a search multiplied the problem's τ by."""
+
+    outcome: Outcome
+    tau_factor: float = 1.0
+
+
+def minimise(problem: Deconvolution, options: Options, *, even_start: bool) -> Solved:
     """The minimiser, from the image given, an even one, or zero.
 
     An even image explains the bright background of a zone aperture's capture at once, which would
@@ -41,10 +49,24 @@ def minimise(problem: Deconvolution, options: Options, *, even_start: bool) -> O
     image = _first(problem, options.start, even_start)
     if problem.nonnegative:  # the best image so far may be this one
         image = jnp.maximum(image, 0)
-    if options.rule == "discrepancy":
-        problem, image, _ = discrepancy_tau(problem, image)
-    elif options.rule == "sure":
-        problem, image, _ = sure_tau(problem, image, jax.random.key(0))
+    if options.rule is None:
+        return Solved(_iterate(problem, image, options))
+    began = time.perf_counter()
+    try:
+        if options.rule == "discrepancy":
+            found = discrepancy_tau(problem, image)
+        else:
+            found = sure_tau(problem, image, jax.random.key(0))
+    except SearchInterrupted as end:
+        seconds = time.perf_counter() - began
+        return Solved(Outcome(end.image, "interrupted", (), 0, seconds))
+    outcome = _iterate(found.problem, found.image, options)
+    outcome = outcome._replace(seconds=time.perf_counter() - began)
+    return Solved(outcome, float(found.problem.tau / problem.tau))
+
+
+def _iterate(problem: Deconvolution, image, options: Options) -> Outcome:
+    """The method asked for."""
     if options.method == "admm_tv":
         return drive(
             AdmmTotalVariation(problem, relaxation=options.relaxation),
@@ -99,8 +121,8 @@ def middle(image: Float[Array, "*batch y x"], shape) -> Float[Array, "*batch v u
 def _check(options: Options) -> None:
     if options.rule is not None:
         _checks.choice("tau", options.rule, get_args(TauRule))
-    if options.iterations < 1:
-        raise ValueError(f"iterations = {options.iterations}; give at least 1")
+    if not isinstance(options.iterations, int) or options.iterations < 1:
+        raise ValueError(f"iterations = {options.iterations}; give a whole number of at least 1")
     _checks.non_negative("tolerance", options.tolerance, "parts of one")
-    if not 0 < options.relaxation < 2:
+    if options.method == "admm_tv" and not 0 < options.relaxation < 2:
         raise ValueError(f"relaxation = {options.relaxation:g} is out of range; give 0 < α < 2")

@@ -18,6 +18,7 @@ class Reconstruction(eqx.Module):
       callback, "interrupted" by Ctrl-C or "non_finite"; None for methods in closed form.
     - `history`: objective and residuals along the way; see `Progress`.
     - `iterations`, `seconds`: done and taken; compilation is part of the time.
+    - `tau`: the relative τ used, as given or found; None for methods without.
     """
 
     image: Float[Array, "*batch y x"]
@@ -28,6 +29,7 @@ class Reconstruction(eqx.Module):
     history: tuple[Progress, ...] = eqx.field(static=True, default=())
     iterations: int = eqx.field(static=True, default=0)
     seconds: float = eqx.field(static=True, default=0.0)
+    tau: float | None = eqx.field(static=True, default=None)
 
     @property
     def status(self) -> str:
