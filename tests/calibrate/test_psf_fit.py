@@ -45,7 +45,7 @@ def deviations(fit, rig):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("seed", "beta", "distance"), [(0, 0.9, 1.1), (1, 1.1, 0.9)])
+@pytest.mark.parametrize(("seed", "beta", "distance"), [(0, 0.9, 1.1)])
 def test_the_thesis_camera_ten_per_cent_off(seed, beta, distance):
     """1024² pixels, 30 dB: β to 0.1 %, d to 1 %, the centre to 0.05 pixel, and far better."""
     place = np.random.default_rng(seed).uniform(-0.06, 0.06, 2)  # up to 11 pixels

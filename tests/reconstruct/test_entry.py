@@ -222,7 +222,7 @@ def test_what_total_variation_refuses():
     for settings, message in (
         ({"relaxation": 2.5}, "relaxation = 2.5 is out of range; give 0 < α < 2"),
         ({"relaxation": 0.0}, "relaxation = 0 is out of range"),
-        ({"iterations": 0}, "iterations = 0; give at least 1"),
+        ({"iterations": 0}, "iterations = 0; give a whole number of at least 1"),
         ({"tolerance": -1.0}, "tolerance = -1.0 .* is negative"),
         ({"tau": -1.0}, "tau = -1.0 .* is negative"),
         ({"start": jnp.ones((3, 20, 21))}, r"start has shape \(3, 20, 21\); give an image"),

@@ -14,7 +14,7 @@ SIZES = [(1, 1), (2, 7), (13, 16)]
 def matrix(basis, shape):
     """The transform, dense: (coefficient, pixel)."""
     pixels = jnp.eye(shape[0] * shape[1]).reshape(-1, *shape)
-    return np.asarray(basis.analyse(pixels)).reshape(len(pixels), -1).T
+    return np.asarray(jax.jit(type(basis).analyse)(basis, pixels)).reshape(len(pixels), -1).T
 
 
 @pytest.mark.parametrize("shape", SIZES)
@@ -25,7 +25,9 @@ def test_it_is_orthonormal_and_synthesis_undoes_it(basis, shape):
     dense = matrix(basis, shape)
     np.testing.assert_allclose(dense @ dense.T, np.eye(len(dense)), atol=1e-12)
     image = jnp.asarray(np.random.default_rng(1).normal(size=(2, *shape)))
-    np.testing.assert_allclose(basis.synthesise(basis.analyse(image)), image, atol=1e-12)
+    there = jax.jit(type(basis).analyse)(basis, image)
+    back = jax.jit(type(basis).synthesise)(basis, there)
+    np.testing.assert_allclose(back, image, atol=1e-12)
 
 
 def test_haar_of_two_by_two_pixels_by_hand():
