@@ -67,6 +67,7 @@ def test_the_thesis_camera_ten_per_cent_off(seed, beta, distance):
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.thorough
 def test_values_are_right_within_their_errors(seed):
     fit = fit_psf(picture(TRUE, seed), START, **LIGHT)
     assert (fit.status, fit.reasons) == ("ok", ())
@@ -85,6 +86,7 @@ def test_errors_grow_with_the_noise():
     np.testing.assert_allclose(ratio, 10 ** (18 / 20), rtol=0.1)
 
 
+@pytest.mark.thorough
 def test_wavelength_and_distance_of_a_plane_wave_are_one():
     light = {"object_distance": math.inf, "wavelength": 500 * nm}
     fit = fit_psf(

@@ -28,6 +28,7 @@ def noisy(image, part, seed):
 @pytest.mark.parametrize(
     ("scale", "shift"), [(1.08, (3.3, -2.7)), (0.91, (-13.3, 7.7)), (1.0, (0.5, 0.0))]
 )
+@pytest.mark.thorough
 def test_scale_and_shift(scale, shift):
     """30 dB: the scale to 1e-4, the shift to 0.05 pixel, and within the errors claimed."""
     capture = noisy(5.0 + 2.0 * blobs(scale, shift), 0.03, 1)

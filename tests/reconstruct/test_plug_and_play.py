@@ -75,6 +75,7 @@ def clipped(image):
 
 
 @pytest.mark.parametrize("scheme", SCHEMES)
+@pytest.mark.thorough
 def test_it_stands_extremes(scheme):
     solve = functools.partial(
         solve_plug_and_play, denoiser=Smoother(jnp.asarray(0.3)), scheme=scheme, iterations=10

@@ -123,6 +123,7 @@ def test_it_beats_least_squares_at_three_counts_a_pixel(seed):
     assert min(likely) < 0.92 * min(squares)
 
 
+@pytest.mark.thorough
 def test_links_and_methods_agree_on_the_minimum():
     problem, _ = photons(mean=30.0, sensor=(13, 12), field=(9, 10))
     tau = weighing(problem, 0.02)
@@ -167,6 +168,7 @@ def test_newton_ends_where_no_image_beside_is_better(residual):
     ],
     ids=["l-bfgs", "newton"],
 )
+@pytest.mark.thorough
 def test_it_stands_extremes(solve):
     extremes.check_shapes(solve, noise=0.0)
     # Without a count the image is of at most what would have given about one.

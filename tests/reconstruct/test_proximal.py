@@ -75,6 +75,7 @@ def test_restart_reaches_in_150_iterations_what_takes_500_without():
 
 @pytest.mark.parametrize("nonnegative", [False, True])
 @pytest.mark.parametrize("basis", [Cosines(), Wavelet("haar", 2)], ids=["cosines", "haar"])
+@pytest.mark.thorough
 def test_no_image_beside_a_sparse_minimum_is_better(basis, nonnegative):
     problem, _ = scenes.problem(kernel=scenes.spots, tau=3e-2, nonnegative=nonnegative)
     regulariser = Sparsity(basis)
@@ -106,6 +107,7 @@ def test_the_backends_do_the_same():
     assert solve_proximal(problem, backend="optimistix", tolerance=1e-4).status == "converged"
 
 
+@pytest.mark.thorough
 def test_optimistix_drives_the_minimiser_and_differentiates_through_it():
     """dE*/dτ = R(f*), the envelope theorem, by the derivative of the solution."""
     problem, _ = scenes.problem((9, 8), (6, 7), kernel=scenes.spots, captures=1, nonnegative=False)
@@ -157,6 +159,7 @@ def test_new_values_are_not_compiled_anew():
 
 
 @pytest.mark.parametrize("backend", ["own", "optimistix", "jaxopt"])
+@pytest.mark.thorough
 def test_it_stands_extremes(backend):
     solve = functools.partial(few, backend=backend)
     extremes.check_darkness(solve)

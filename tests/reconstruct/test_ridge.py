@@ -67,6 +67,7 @@ def test_float32_of_many_pixels_does_not_break_down():
     assert relative_l2(found.image, double.image) < 1e-2
 
 
+@pytest.mark.thorough
 def test_it_stands_extremes():
     extremes.check_darkness(few)
     extremes.check_scale(few)

@@ -66,6 +66,7 @@ def test_it_finds_the_minimum_of_another_method():
         assert float(one.image.min()) >= 0
 
 
+@pytest.mark.thorough
 def test_it_stands_extremes():
     extremes.check_darkness(few)
     extremes.check_scale(few)

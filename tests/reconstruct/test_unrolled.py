@@ -72,6 +72,7 @@ def test_the_gradient_is_that_of_differences():
     np.testing.assert_allclose(found, wanted, rtol=1e-3)
 
 
+@pytest.mark.thorough
 def test_each_member_of_a_batch_is_as_if_alone():
     """However bright the others are."""
     problem, _ = pairs(3, 7)
@@ -84,6 +85,7 @@ def test_each_member_of_a_batch_is_as_if_alone():
         np.testing.assert_allclose(model(alone), together[n], rtol=1e-9, atol=1e-12)
 
 
+@pytest.mark.thorough
 def test_it_stands_extremes_and_tells_its_course():
     def solve(problem):
         return solve_unrolled(problem, UnrolledAdmm(problem, 3))
