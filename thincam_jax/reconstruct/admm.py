@@ -27,7 +27,7 @@ from jaxtyping import Array, Float
 
 from thincam_jax.operators import CropConvolution
 from thincam_jax.operators.crop_convolution import cut, place
-from thincam_jax.reconstruct.normal import NormalInverse, mean_power, squared_modulus
+from thincam_jax.reconstruct.normal import NormalInverse, mean_power, or_one, squared_modulus
 from thincam_jax.reconstruct.problem import Deconvolution
 from thincam_jax.reconstruct.total_variation import (
     TotalVariation,
@@ -76,11 +76,11 @@ class Splitting(eqx.Module):
 
     def __init__(self, problem: Deconvolution):
         stop = jax.lax.stop_gradient
-        largest = [_or_one(stop(jnp.max(w))) for w in problem.weights]
+        largest = [or_one(stop(jnp.max(w))) for w in problem.weights]
         roots = [jnp.sqrt(w) for w in largest]
         operator_unit = stop(_operator_unit(problem.operators, largest))
         sizes = [jnp.mean(w * c**2) for w, c in zip(problem.weights, problem.captures, strict=True)]
-        capture_unit = stop(_or_one(jnp.sqrt(sum(sizes) / len(sizes))))
+        capture_unit = stop(or_one(jnp.sqrt(sum(sizes) / len(sizes))))
         self.operators = problem.operators
         self.gains = tuple(r / operator_unit for r in roots)
         self.captures = tuple(
@@ -204,18 +204,14 @@ def default_penalties(splitting: Splitting) -> Penalties:
             )
         )
     )
-    strongest = jax.lax.stop_gradient(_or_one(strongest))
+    strongest = jax.lax.stop_gradient(or_one(strongest))
     return Penalties(jnp.ones_like(strongest), strongest, strongest)
 
 
 def _operator_unit(operators, weights) -> Float[Array, ""]:
     """Root mean square of the operators' weighted spectra, over the whole plane."""
-    total = 0.0
+    total = jnp.zeros((), weights[0].dtype)
     for operator, weight in zip(operators, weights, strict=True):
         planes = operator.spectrum.shape[-3]
         total = total + weight * planes * mean_power(operator)
-    return jnp.sqrt(_or_one(total))
-
-
-def _or_one(value):
-    return jnp.where(value > 0, value, 1)
+    return jnp.sqrt(or_one(total))

@@ -70,8 +70,10 @@ def camera_problem(
     ]
     sums = [_Sum(row, kernels, captures, valid, ratios) for row in matrix]
     variances = [
-        _variance(row, noise_variance, captures, valid) * ratio**2
-        for row, ratio in zip(matrix, (s.ratio for s in sums), strict=True)
+        variance * s.ratio**2
+        for variance, s in zip(
+            _variances(matrix, noise_variance, captures, valid), sums, strict=True
+        )
     ]
     return _assemble(
         [s.kernel for s in sums],
@@ -115,9 +117,7 @@ def psf_problem(
     sensor, kernel = captures.shape[-2:], kernels.shape[-2:]
     rows, columns = field_shape or (s + k - 1 for s, k in zip(sensor, kernel, strict=True))
     field = _fitting_field((rows, columns), sensor, kernel)
-    variances = [
-        _variance(row, noise_variance, captures, valid) for row in np.eye(captures.shape[0])
-    ]
+    variances = _variances(np.eye(captures.shape[0]), noise_variance, captures, valid)
     masks = [None] * len(kernels) if valid is None else list(valid)
     return _assemble(
         list(kernels),
@@ -199,13 +199,26 @@ def _trusted(captures, valid):
     return jnp.where(valid | jnp.isfinite(captures), captures, 0), valid
 
 
-def _variance(row: np.ndarray, noise_variance, captures, valid) -> Float[Array, ""]:
-    """Variance of a sum of captures: as given, or estimated where that is nothing or zero."""
-    count = captures.shape[0]
-    square = jnp.asarray(row**2, captures.dtype)
-    estimated = jnp.sum(square * estimate_variance(captures, valid))
+def _variances(matrix: np.ndarray, noise_variance, captures, valid) -> list[Float[Array, ""]]:
+    """Variances of sums of captures: as given, or estimated where that is nothing or zero."""
+    squares = [jnp.asarray(row**2, captures.dtype) for row in matrix]
     if noise_variance is None:
-        return estimated
+        each = estimate_variance(captures, valid)
+        return [jnp.sum(square * each) for square in squares]
+    given = _given(noise_variance, captures)
+    totals = [jnp.sum(square * given) for square in squares]
+    if all(not _checks.is_traced(total) and bool(total > 0) for total in totals):
+        return totals
+    each = estimate_variance(captures, valid)
+    return [
+        jnp.where(total > 0, total, jnp.sum(square * each))
+        for total, square in zip(totals, squares, strict=True)
+    ]
+
+
+def _given(noise_variance, captures) -> Float[Array, " capture"]:
+    """The variance given, of each capture, averaged over its batch."""
+    count = captures.shape[0]
     each = jnp.asarray(noise_variance, captures.dtype)
     if not _checks.is_traced(each) and not bool(jnp.all((each >= 0) & jnp.isfinite(each))):
         raise ValueError(
@@ -218,8 +231,7 @@ def _variance(row: np.ndarray, noise_variance, captures, valid) -> Float[Array, 
             f"{count} captures"
         )
     each = jnp.broadcast_to(each.reshape(each.shape or (1,)), (count, *each.shape[1:]))
-    total = jnp.sum(square * jnp.mean(each.reshape(count, -1), axis=1))
-    return jnp.where(total > 0, total, estimated)
+    return jnp.mean(each.reshape(count, -1), axis=1)
 
 
 def _assemble(

@@ -82,6 +82,11 @@ class NormalInverse(eqx.Module):
         return apply(spectrum, columns)
 
 
+def or_one(value: Float[Array, "..."]) -> Float[Array, "..."]:
+    """A divisor: the value where it is positive, else 1."""
+    return jnp.where(value > 0, value, 1)
+
+
 def squared_modulus(spectrum: Complex[Array, "..."]) -> Float[Array, "..."]:
     return spectrum.real**2 + spectrum.imag**2
 

@@ -1,5 +1,6 @@
 """The iterative methods behind `reconstruct`: from a problem to a `Reconstruction`."""
 
+import math
 import time
 from typing import Literal, NamedTuple, get_args
 
@@ -89,13 +90,10 @@ def _iterate(problem: Deconvolution, image, options: Options) -> Outcome:
 def _first(problem: Deconvolution, start, even: bool) -> Float[Array, "*batch channel plane y x"]:
     shape, dtype = problem.image_shape, problem.captures[0].dtype
     if start is None:
-        level = uniform_level(problem)[..., None, None, None] if even else jnp.zeros((), dtype)
+        level = _uniform_level(problem)[..., None, None, None] if even else jnp.zeros((), dtype)
         return jnp.broadcast_to(level, shape)
     start = jnp.asarray(start, dtype)
-    size = 1
-    for n in shape[:-2]:
-        size *= n
-    if start.size != size * start.shape[-1] * start.shape[-2]:
+    if start.size != math.prod((*shape[:-2], *start.shape[-2:])):
         raise ValueError(
             f"start has shape {start.shape}; give an image of the result's batch and planes, "
             f"{shape[:-2]}, and its rows and columns"
@@ -116,6 +114,9 @@ def middle(image: Float[Array, "*batch y x"], shape) -> Float[Array, "*batch v u
     """The middle of an image."""
     corner = [(n - s) // 2 for n, s in zip(image.shape[-2:], shape, strict=True)]
     return cut(image, corner, shape)
+
+
+_uniform_level = jax.jit(uniform_level)
 
 
 def _check(options: Options) -> None:

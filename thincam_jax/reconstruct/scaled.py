@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from thincam_jax.operators.base import AbstractOperator
-from thincam_jax.reconstruct.normal import squared_modulus
+from thincam_jax.reconstruct.normal import or_one, squared_modulus
 from thincam_jax.reconstruct.problem import Deconvolution, residuals, uniform_level
 
 # The power method approaches the largest singular value from below.
@@ -55,9 +55,9 @@ class ScaledProblem(eqx.Module):
     def __init__(self, problem: Deconvolution):
         # A minimiser does not depend on the units it is sought in, nor its derivatives on theirs.
         fixed = jax.lax.stop_gradient(problem)
-        heaviest = _or_one(jnp.stack([jnp.max(w) for w in fixed.weights]).max())
+        heaviest = or_one(jnp.stack([jnp.max(w) for w in fixed.weights]).max())
         spectra = [jnp.max(jnp.abs(o.spectrum)) for o in fixed.operators]
-        strongest = _or_one(jnp.stack(spectra).max())
+        strongest = or_one(jnp.stack(spectra).max())
         captured = _root_mean_square(fixed.captures)
         norm = _norm(_divided(fixed, strongest, captured, heaviest))
         operator_unit = strongest * norm
@@ -116,18 +116,14 @@ def _norm(problem: Deconvolution) -> Float[Array, ""]:
         jnp.max(w) * jnp.sum(squared_modulus(o.spectrum), axis=-3)
         for o, w in zip(problem.operators, problem.weights, strict=True)
     )
-    return _or_one(jnp.minimum(found, jnp.sqrt(jnp.max(power))))
+    return or_one(jnp.minimum(found, jnp.sqrt(jnp.max(power))))
 
 
 def _root_mean_square(arrays) -> Float[Array, ""]:
     """Of all numbers, without squares of very large or very small ones."""
-    largest = _or_one(jnp.stack([jnp.max(jnp.abs(a)) for a in arrays]).max())
+    largest = or_one(jnp.stack([jnp.max(jnp.abs(a)) for a in arrays]).max())
     means = [jnp.mean((a / largest) ** 2) for a in arrays]
-    return _or_one(largest * jnp.sqrt(sum(means) / len(means)))
-
-
-def _or_one(value):
-    return jnp.where(value > 0, value, 1)
+    return or_one(largest * jnp.sqrt(sum(means) / len(means)))
 
 
 _even_image = jax.jit(even_image)

@@ -39,8 +39,8 @@ class AdmmTotalVariation(AbstractMethod[State]):
         self, problem: Deconvolution, *, penalties: Penalties | None = None, relaxation=1.0
     ):
         self.problem = problem
-        self.splitting = jax.jit(Splitting)(problem)
-        self.penalties = default_penalties(self.splitting) if penalties is None else penalties
+        self.splitting = _split(problem)
+        self.penalties = _default_penalties(self.splitting) if penalties is None else penalties
         self.relaxation = jnp.asarray(relaxation, problem.captures[0].dtype)
 
     def start(self, image):
@@ -86,6 +86,8 @@ def _ratio(primal: float, dual: float) -> float:
     return min(9.0, max(1 / 9.0, primal / dual))
 
 
+_split = jax.jit(Splitting)
+_default_penalties = jax.jit(default_penalties)
 _start = jax.jit(start)
 _image = jax.jit(image_of)
 _objective = jax.jit(objective)

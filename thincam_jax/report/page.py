@@ -1,12 +1,9 @@
 """The report: one HTML page that stands alone."""
 
-import base64
-from importlib import resources
 from typing import Any
 
-import jinja2
-
 from thincam_jax.config import StudyConfig, dump_config, slug
+from thincam_jax.report.template import data_url, load_template
 from thincam_jax.study.folder import RunFolder
 
 
@@ -14,11 +11,7 @@ def render(
     config: StudyConfig, folder: RunFolder, metrics: dict[str, Any], environment: dict[str, Any]
 ) -> str:
     """The page, with its pictures inside."""
-    template = resources.files("thincam_jax.report").joinpath("page.html.jinja")
-    engine = jinja2.Environment(
-        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    return engine.from_string(template.read_text(encoding="utf-8")).render(
+    return load_template("page.html.jinja").render(
         config=config,
         methods=metrics["methods"],
         seed=metrics["seed"],
@@ -34,7 +27,7 @@ def _data_url(folder: RunFolder, name: str) -> str | None:
     path = folder.path / "figures" / f"{name}.png"
     if not path.exists():
         return None
-    return "data:image/png;base64," + base64.b64encode(path.read_bytes()).decode("ascii")
+    return data_url(path)
 
 
 def findings(config: StudyConfig, metrics: dict[str, Any]) -> list[str]:

@@ -1,13 +1,10 @@
 """The report of a refocus run: one HTML page that stands alone."""
 
-import base64
-from importlib import resources
 from typing import Any
-
-import jinja2
 
 from thincam_jax.config import dump_config
 from thincam_jax.config_refocus import RefocusConfig
+from thincam_jax.report.template import data_url, load_template
 from thincam_jax.study.folder import RunFolder
 
 
@@ -15,24 +12,14 @@ def render(
     config: RefocusConfig, folder: RunFolder, metrics: dict[str, Any], environment: dict[str, Any]
 ) -> str:
     """The page, with its pictures inside."""
-    template = resources.files("thincam_jax.report").joinpath("refocus.html.jinja")
-    engine = jinja2.Environment(
-        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    return engine.from_string(template.read_text(encoding="utf-8")).render(
+    return load_template("refocus.html.jinja").render(
         config=config,
         metrics=metrics,
         findings=findings(config, metrics),
         environment=environment,
         yaml=dump_config(config),
-        picture=lambda name: _data_url(folder, name),
+        picture=lambda name: data_url(folder.path / "figures" / name),
     )
-
-
-def _data_url(folder: RunFolder, name: str) -> str:
-    kind = name.rpartition(".")[2]
-    content = (folder.path / "figures" / name).read_bytes()
-    return f"data:image/{kind};base64," + base64.b64encode(content).decode("ascii")
 
 
 def findings(config: RefocusConfig, metrics: dict[str, Any]) -> list[str]:
