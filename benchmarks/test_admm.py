@@ -22,7 +22,9 @@ sys.path.insert(0, str(Path(__file__).parent))
 from scipy_admm import ScipyAdmm
 
 from thincam_jax.reconstruct import psf_problem
+from thincam_jax.reconstruct.apart import Apart
 from thincam_jax.reconstruct.drive import CHUNK
+from thincam_jax.reconstruct.regularised import admm_method
 from thincam_jax.reconstruct.tv_method import AdmmTotalVariation
 
 DATA = Path(__file__).parents[2] / "shared" / "data" / "diffusercam-hand"
@@ -66,8 +68,7 @@ def _frequencies(count):
     return np.fft.fftfreq(count), np.fft.rfftfreq(count)
 
 
-def ours(problem, relaxation=1.8):
-    return AdmmTotalVariation(problem, relaxation=relaxation)
+RELAXATION = 1.8
 
 
 def run(method, state, iterations):
@@ -118,9 +119,9 @@ def tutorial_penalties(method):
     return 1e-6, 1e-5 * samples, 4e-5 * samples
 
 
-def iterations_to(method, goal, most=400):
+def iterations_to(method, problem, goal, most=400):
     """The first multiple of the chunk after which the objective is no worse."""
-    state = method.start(zeros(method.problem))
+    state = method.start(zeros(problem))
     for done in range(CHUNK, most, CHUNK):
         state = method.advance(state, CHUNK)
         if float(jnp.sum(method.objective(method.image(state)))) <= goal:
@@ -149,16 +150,17 @@ def transforms_time(problem, rounds):
 def test_admm(benchmark, capsys, case):
     captures, psfs, count = case()
     problem = psf_problem(jnp.asarray(captures), jnp.asarray(psfs), tau=2.0)
-    method = ours(problem)
+    method = admm_method(problem, RELAXATION)
+    whole = AdmmTotalVariation(problem, relaxation=RELAXATION)
     rounds = 5
-    own = [float(p) for p in jax.tree.leaves(method.penalties)]
+    own = [float(p) for p in jax.tree.leaves(whole.penalties)]
     lines = []
     for name, penalties, relaxation in (
-        ("tutorial's penalties", tutorial_penalties(method), 1.0),
+        ("tutorial's penalties", tutorial_penalties(whole), 1.0),
         ("our penalties, plain", own, 1.0),
-        ("our penalties and relaxation", own, 1.8),
+        ("our penalties and relaxation", own, RELAXATION),
     ):
-        solver = scipy_of(method, penalties, relaxation)
+        solver = scipy_of(whole, penalties, relaxation)
 
         def theirs(solver=solver):
             restart(solver)
@@ -166,9 +168,9 @@ def test_admm(benchmark, capsys, case):
 
         # NumPy compiles nothing, and half a minute needs no second try.
         slow = median_time(theirs, rounds if case is hand else 1, warm_up=case is hand)
-        image = solver.image() * float(method.splitting.image_unit)
+        image = solver.image() * float(whole.splitting.image_unit)
         goal = float(jnp.sum(method.objective(jnp.asarray(image)[:, None])))
-        needed = iterations_to(method, goal * (1 + 1e-6))
+        needed = iterations_to(method, problem, goal * (1 + 1e-6))
         assert needed is not None, f"never as good as SciPy with {name}"
         fast = median_time(lambda n=needed: run(method, method.start(zeros(problem)), n), rounds)
         lines.append(
@@ -183,7 +185,9 @@ def test_admm(benchmark, capsys, case):
         f"  an iteration {one * 1e3:.1f} ms, {one / transforms:.2f} times its transforms "
         f"({transforms * 1e3:.1f} ms)"
     )
-    lines.append(memory_line(method))
+    lines.append(memory_line(whole))
+    if isinstance(method, Apart):
+        lines.append(apart_line(whole, problem, one))
     if case is hand:
         lines.append(batch_line(captures, psfs, one))
     benchmark.pedantic(lambda: run(method, method.start(zeros(problem)), CHUNK), rounds=3)
@@ -209,11 +213,16 @@ def memory_line(method):
     return f"  memory: {peak / 1e6:.0f} MB at most, {peak / held:.2f} times what it must hold"
 
 
+def apart_line(whole, problem, one):
+    together = median_time(lambda: run(whole, whole.start(zeros(problem)), CHUNK), 3) / CHUNK
+    return f"  all parts in one program: an iteration {together / one:.2f} times as long"
+
+
 def batch_line(captures, psfs, one):
     eight = psf_problem(
         jnp.asarray(np.repeat(captures[:, None], 8, axis=1)), jnp.asarray(psfs), tau=2.0
     )
-    method = ours(eight)
+    method = admm_method(eight, RELAXATION)
     run(method, method.start(zeros(eight)), CHUNK)
     time_of_eight = median_time(lambda: run(method, method.start(zeros(eight)), 5 * CHUNK), 5) / (
         5 * CHUNK

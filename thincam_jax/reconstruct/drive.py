@@ -24,11 +24,13 @@ class Residuals(NamedTuple):
     """How far an iteration is from its end, each relative to what it is a residual of.
 
     - `parts`: the same of each of several splits, for methods that weigh them.
+    - `members`: the same of each of several problems that are iterated apart.
     """
 
     primal: float
     dual: float
     parts: tuple[tuple[float, float], ...] = ()
+    members: tuple["Residuals", ...] = ()
 
 
 class Progress(NamedTuple):

@@ -10,8 +10,9 @@ from jaxtyping import Array, Float
 
 from thincam_jax import _checks
 from thincam_jax.operators.crop_convolution import cut, place
+from thincam_jax.reconstruct.apart import Apart, worth_taking_apart
 from thincam_jax.reconstruct.choose_tau import SearchInterrupted, discrepancy_tau, sure_tau
-from thincam_jax.reconstruct.drive import Callback, Outcome, drive
+from thincam_jax.reconstruct.drive import AbstractMethod, Callback, Outcome, drive
 from thincam_jax.reconstruct.problem import Deconvolution, uniform_level
 from thincam_jax.reconstruct.proximal import solve_proximal
 from thincam_jax.reconstruct.tv_method import AdmmTotalVariation
@@ -70,7 +71,7 @@ def _iterate(problem: Deconvolution, image, options: Options) -> Outcome:
     """The method asked for."""
     if options.method == "admm_tv":
         return drive(
-            AdmmTotalVariation(problem, relaxation=options.relaxation),
+            admm_method(problem, options.relaxation),
             image,
             iterations=options.iterations,
             tolerance=options.tolerance,
@@ -85,6 +86,15 @@ def _iterate(problem: Deconvolution, image, options: Options) -> Outcome:
         tolerance=options.tolerance,
         callback=options.callback,
     )
+
+
+def admm_method(problem: Deconvolution, relaxation: float) -> AbstractMethod:
+    """ADMM for a problem, or for each of its parts."""
+
+    def method(part: Deconvolution) -> AbstractMethod:
+        return AdmmTotalVariation(part, relaxation=relaxation)
+
+    return Apart(problem, method) if worth_taking_apart(problem) else method(problem)
 
 
 def _first(problem: Deconvolution, start, even: bool) -> Float[Array, "*batch channel plane y x"]:
