@@ -52,6 +52,11 @@ targets:
     image: coffee
 """
 
+ONE_SHOT = """synthesis: contrasts
+    shots:
+      - {beta: 25 rad/mm^2, distance: 3 mm}
+"""
+
 
 def load(folder, text, *overrides):
     path = folder / "study.yaml"
@@ -125,7 +130,7 @@ FAULTS = {
     ),
     "unknown synthesis": (
         *("synthesis: separate", "synthesis: pairs", "methods[1].synthesis"),
-        ["'pairs'", "'fringe_scanning', 'phase_pairs' or 'separate'"],
+        ["'pairs'", "'fringe_scanning', 'phase_pairs', 'contrasts' or 'separate'"],
     ),
     "unknown photograph": (
         *("image: coffee", "image: coffe", "targets[1]"),
@@ -161,6 +166,15 @@ FAULTS = {
     "phases given to fringe scanning": (
         *("synthesis: separate", "synthesis: fringe_scanning", "methods[1]"),
         ["synthesis fringe_scanning sets the phases itself; drop 'phases'"],
+    ),
+    "contrasts of one capture": (
+        *(BASE[BASE.index("synthesis: separate") : BASE.index("targets:")], ONE_SHOT, "methods[1]"),
+        ["contrasts compares captures; give two phases or shots"],
+    ),
+    "contrasts of two distances": (
+        BASE[BASE.index("synthesis: separate") : BASE.index("targets:")],
+        ONE_SHOT + "      - {beta: 25 rad/mm^2, distance: 4 mm}\n",
+        *("methods[1]", ["needs shots at one distance", "use phase_pairs or fringe_scanning"]),
     ),
     "synthesis given to fringe scanning": (
         *("kind: fringe_scanning", "kind: fringe_scanning\n    synthesis: separate"),
@@ -219,6 +233,8 @@ FAULTS = {
 LINES = {
     "unknown photograph": "- name: picture",
     "phases given to fringe scanning": "- name: wiener",
+    "contrasts of one capture": "- name: wiener",
+    "contrasts of two distances": "- name: wiener",
     "synthesis given to fringe scanning": "- name: scan",
     "the same phase twice": "phases: [0 rad",
     "path for a photograph": "- name: picture",

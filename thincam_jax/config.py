@@ -142,7 +142,9 @@ class MethodConfig(Section):
     name: Name
     kind: Literal["fringe_scanning", "wiener", "admm_tv"]
     variation: VariationConfig | None = None
-    synthesis: Literal["fringe_scanning", "phase_pairs", "separate"] = "fringe_scanning"
+    synthesis: Literal["fringe_scanning", "phase_pairs", "contrasts", "separate"] = (
+        "fringe_scanning"
+    )
     shots: Annotated[tuple[ShotConfig, ...], Field(min_length=1)]
     phases: Annotated[tuple[Angle, ...], Field(min_length=1)] = (0.0,)
     published: PublishedConfig = PublishedConfig()
@@ -155,9 +157,20 @@ class MethodConfig(Section):
             raise ValueError("kind fringe_scanning takes one shot and its own synthesis")
         if self.variation is not None and self.kind != "admm_tv":
             raise ValueError(f"kind {self.kind} has no total variation; drop 'variation'")
-        if self.synthesis != "separate" and self.phases != (0.0,):
+        if self.synthesis not in ("contrasts", "separate") and self.phases != (0.0,):
             raise ValueError(f"synthesis {self.synthesis} sets the phases itself; drop 'phases'")
+        if self.synthesis == "contrasts":
+            self._check_contrasts()
         return self
+
+    def _check_contrasts(self) -> None:
+        if len(self.shots) * len(self.phases) < 2:
+            raise ValueError("synthesis contrasts compares captures; give two phases or shots")
+        if len({shot.distance for shot in self.shots}) > 1:
+            raise ValueError(
+                "synthesis contrasts needs shots at one distance, where they share a background; "
+                "use phase_pairs or fringe_scanning"
+            )
 
     def shot_phases(self) -> tuple[float, ...]:
         """The mask phases taken at each shot, rad."""

@@ -8,7 +8,7 @@ import pytest
 import thincam_jax as tc
 from helpers import relative_l2
 from thincam_jax.propagation.paraxial import paraxial_response
-from thincam_jax.reconstruct import fringe_scanning, phase_pairs, separate
+from thincam_jax.reconstruct import contrasts, fringe_scanning, phase_pairs, separate
 from thincam_jax.units import nm, um
 
 BETA, DISTANCE, WAVELENGTH = 25.0, 6.5, 500 * nm
@@ -117,3 +117,33 @@ def test_noise_of_the_channels_is_uncorrelated():
     """Rows orthogonal; the differences of two captures carry the noise of two."""
     for matrix, power in ((separate(3), 1.0), (fringe_scanning(2), 2.0), (phase_pairs(3), 2.0)):
         np.testing.assert_array_equal(matrix @ matrix.T, power * np.eye(len(matrix)))
+
+
+@pytest.mark.parametrize("count", [2, 3, 7])
+def test_contrasts_say_all_beside_the_common_background(count):
+    """Orthonormal, and with the even row a whole basis: nothing but the mean is left out."""
+    matrix = contrasts(count)
+    even = np.full((1, count), count**-0.5)
+    whole = np.concatenate([matrix, even])
+    np.testing.assert_allclose(whole @ whole.T, np.eye(count), atol=1e-14)
+
+
+def test_contrasts_keep_a_channel_that_pairs_lose():
+    """Of two β at phases 0 and 3π/2: both pairs, and (g₁ + g₂) − (g₃ + g₄) with fringes like them.
+
+    Away from the finest and the coarsest zones all three carry the same power; the background,
+    16 times a fringe here, is in none of them.
+    """
+    responses = np.concatenate([formula(PAIR), formula(PAIR, beta=21.0)])
+    third = np.array([[0.5, 0.5, -0.5, -0.5]])
+    known = np.concatenate([phase_pairs(2) / math.sqrt(2), third])
+    assert np.linalg.matrix_rank(np.concatenate([contrasts(4), known])) == 3
+    power = np.mean(np.abs(np.tensordot(known, responses, axes=1)) ** 2, axis=(1, 2))
+    assert power[2] == pytest.approx(np.mean(power[:2]), rel=0.25)
+    flat = np.ones((4, 3, 5))
+    np.testing.assert_allclose(np.tensordot(contrasts(4), flat, axes=1), 0, atol=1e-14)
+
+
+def test_a_single_capture_has_no_contrasts():
+    with pytest.raises(ValueError, match="contrasts of 1 captures; give at least 2"):
+        contrasts(1)

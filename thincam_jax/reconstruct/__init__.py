@@ -16,6 +16,7 @@ from thincam_jax.reconstruct.proximal import solve_proximal as solve_proximal
 from thincam_jax.reconstruct.registration import register as register
 from thincam_jax.reconstruct.result import Reconstruction as Reconstruction
 from thincam_jax.reconstruct.ridge import solve_ridge as solve_ridge
+from thincam_jax.reconstruct.synthesis import contrasts as contrasts
 from thincam_jax.reconstruct.synthesis import fringe_scanning as fringe_scanning
 from thincam_jax.reconstruct.synthesis import phase_pairs as phase_pairs
 from thincam_jax.reconstruct.synthesis import separate as separate

@@ -8,6 +8,7 @@ two real channels here, so that results are real without a projection and noise 
 from collections.abc import Sequence
 
 import numpy as np
+import scipy.linalg
 
 from thincam_jax.camera import LenslessCamera
 
@@ -32,6 +33,19 @@ def phase_pairs(groups: int) -> np.ndarray:
     The constant cancels; the second harmonic, and with it twice the aperture's cut-off, stays.
     """
     return np.kron(np.eye(groups), np.array([[1.0, -1.0]]))
+
+
+def contrasts(count: int) -> np.ndarray:
+    """All that captures say beside their common background: count − 1 orthonormal sums.
+
+    Masks of one width at one distance cast the same background, whatever their β and phase, so
+    that it cancels wherever the weights of a row add up to zero. Pairs of two β leave one such sum
+    unused, (g₁ + g₂) − (g₃ + g₄), which has fringes as strong as theirs. Rows are those of
+    Helmert's matrix; any other orthonormal ones give the same image.
+    """
+    if count < 2:
+        raise ValueError(f"contrasts of {count} captures; give at least 2")
+    return scipy.linalg.helmert(count)
 
 
 def check_synthesis(

@@ -154,6 +154,8 @@ def synthesis_matrix(method: MethodConfig) -> np.ndarray:
         return syntheses.fringe_scanning(shots)
     if method.synthesis == "phase_pairs":
         return syntheses.phase_pairs(shots)
+    if method.synthesis == "contrasts":
+        return syntheses.contrasts(shots * len(method.phases))
     return syntheses.separate(shots * len(method.phases))
 
 
