@@ -97,6 +97,19 @@ def test_flip_full_field_and_a_linear_image_alone(grey, tmp_path):
     assert record_of(out)["display"] is None
 
 
+def test_ridge(grey, tmp_path):
+    """Without total variation: its record says so, and what was used in its place."""
+    out = tmp_path / "image.npy"
+    more = ("--bits", 12, "--background", grey["dark"], "--method", "ridge", "--ridge", 0.5)
+    result = call(grey, out, *more)
+    assert result.exit_code == 0, result.output
+    assert simulated.correlation(np.load(out), simulated.scene()[1]) > 0.9
+    done = record_of(out)["reconstruction"]
+    assert (done["method"], done["ridge"], done["nonnegative"]) == ("ridge", 0.5, False)
+    assert done["tau"] is done["absolute_tau"] is done["variation"] is None
+    assert 0 < done["iterations"] <= 100 and done["relative_data_residual"] < 0.05
+
+
 @pytest.mark.parametrize(("psf", "coupling"), [("psf", "joint"), ("grey_psf", "opponent")])
 def test_colours(tmp_path, psf, coupling):
     """8-bit PNG with a PSF of one and of three channels; colours are joined by default."""
@@ -205,6 +218,11 @@ class TestExitCode2:
             (("--downsample", 100), "downsample = 100 is larger than the image of 60×76 pixels"),
             (("--method", "magic"), "method = 'magic' is unknown; choose one of 'auto'"),
             (("--method", "wiener"), "method 'wiener' needs a model of the camera"),
+            (("--method", "poisson"), "method 'poisson' needs raw counts"),
+            (("--method", "ridge", "--tau", 2), "method 'ridge' cannot use tau; leave out, or use"),
+            (("--method", "ridge", "--coupling", "joint"), "method 'ridge' cannot use coupling"),
+            (("--method", "ridge", "--ridge", 0), "ridge = 0.0 parts of one is not positive"),
+            (("--ridge", 1), "method 'admm_tv' cannot use ridge; leave out, or use 'ridge'"),
             (("--tau", -1), "tau = -1.0 parts of one is negative"),
             (("--tau", "nan"), "tau is NaN"),
             (("--tau", 1e30), "tau = 1e+30: give about 1 to 3, at most 1e+06"),

@@ -51,8 +51,13 @@ def reconstruct(
     ] = "each",
     method: Annotated[str, Option(help=f"One of {_METHODS}.")] = "admm-tv",
     tau: Annotated[
-        float, Option(help="Weight of total variation relative to noise, about 1 to 3.")
-    ] = 2.0,
+        float | None,
+        Option(help="Weight of total variation relative to noise, about 1 to 3. Default: 2."),
+    ] = None,
+    ridge: Annotated[
+        float | None,
+        Option(help="Of ridge: noise over image variance, in parts of the expected. Default: 1."),
+    ] = None,
     iterations: Annotated[int, Option(help="At most.")] = 100,
     coupling: Annotated[
         Literal["none", "joint", "opponent"] | None,
@@ -91,7 +96,8 @@ def reconstruct(
                 psf_channels=psf_channels,
             ),
         )
-        recipe = runs.Recipe(method.replace("-", "_"), tau, iterations, coupling, field, flip)
+        how = (method.replace("-", "_"), tau, iterations, coupling, field, flip, ridge)
+        recipe = runs.Recipe(*how)
         output = runs.Output(out, linear, gamma, _white_balance(white_balance))
         end = _run(runs.plan_jobs(capture, sources, output), sources, recipe, output)
     except (MeasurementError, MemoryError, OSError) as error:

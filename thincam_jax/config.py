@@ -123,7 +123,7 @@ class PublishedConfig(Section):
 class VariationConfig(Section):
     """Total variation of an admm_tv method; see `thincam_jax.reconstruct`."""
 
-    tau: Annotated[float, Field(ge=0)] = 1.5
+    tau: Annotated[float, Field(ge=0)] = 2.0
     iterations: Annotated[int, Field(ge=1, le=100_000)] = 100
     kind: Literal["isotropic", "anisotropic"] = "isotropic"
     coupling: Literal["none", "joint", "opponent"] | None = None

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from thincam_jax.camera import LenslessCamera
 from thincam_jax.psf import Model
 from thincam_jax.reconstruct import TotalVariation, reconstruct
-from thincam_jax.reconstruct.entry import Method
+from thincam_jax.reconstruct.arguments import FILTERS, Method
 from thincam_jax.reconstruct.noise import estimate_variance
 from thincam_jax.reconstruct.spectra import Prior
 
@@ -53,10 +53,10 @@ def refocus_sweep(
     synthesis=None,
     field_shape: tuple[int, int] | None = None,
     prior: Prior = "inverse_square",
-    tau=2.0,
+    tau=None,
     variation: TotalVariation | None = None,
-    iterations: int = 100,
-    tolerance: float = 1e-4,
+    iterations: int | None = None,
+    tolerance: float | None = None,
     model: Model = "separable",
     pixel_integration: bool = True,
     callback: Callable[[int], object] | None = None,
@@ -85,7 +85,7 @@ def refocus_sweep(
             f"tau = {tau!r} would be another number at each distance, whose images then do not "
             "compare; give a number"
         )
-    if noise_variance is None:
+    if noise_variance is None and method != "poisson":
         noise_variance = estimate_variance(jnp.asarray(captures))
     images, pitch = [], None
     for index, distance in enumerate(focus):
@@ -108,8 +108,10 @@ def refocus_sweep(
         )
         images.append(result.image)
         pitch = result.pitch
-        # "auto" chooses once: images of two methods do not compare.
-        method = cast(Method, result.method)
+        if method == "auto":  # chooses once: images of two methods do not compare
+            method = cast(Method, result.method)
+            if method in FILTERS:  # they refuse what the choice has left aside
+                tau = variation = iterations = tolerance = None
         if callback is not None:
             callback(index + 1)
     stack = jnp.stack(images)

@@ -13,6 +13,9 @@ from thincam_jax.reconstruct.noise import estimate_variance
 # gains 0.5 to 2.5 dB at 1 to 3 (configs/fza_admm_tv.yaml), and next to nothing without noise.
 _CLEAN = 30.0
 
+# The methods that may be chosen.
+CANDIDATES = ("wiener", "admm_tv")
+
 
 def choose_method(
     captures, cameras, synthesis, noise_variance, *, valid=None, object_distance=None

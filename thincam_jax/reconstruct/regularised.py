@@ -10,20 +10,31 @@ from jaxtyping import Array, Float
 
 from thincam_jax import _checks
 from thincam_jax.operators.crop_convolution import cut, place
+from thincam_jax.reconstruct._jaxopt import AndersonAdmm
 from thincam_jax.reconstruct.apart import Apart, worth_taking_apart
 from thincam_jax.reconstruct.choose_tau import SearchInterrupted, discrepancy_tau, sure_tau
 from thincam_jax.reconstruct.drive import AbstractMethod, Callback, Outcome, drive
 from thincam_jax.reconstruct.problem import Deconvolution, uniform_level
 from thincam_jax.reconstruct.proximal import solve_proximal
+from thincam_jax.reconstruct.regulariser import AbstractRegulariser
 from thincam_jax.reconstruct.tv_method import AdmmTotalVariation
 from thincam_jax.reconstruct.two_step import solve_two_step
 
 TauRule = Literal["discrepancy", "sure"]
 Iterative = Literal["admm_tv", "fista", "twist"]
+Acceleration = Literal["none", "anderson"]
+
+# Penalties that go on changing make the objective jump: on the captures of tests/reconstruct/
+# test_acceleration.py ADMM then needs 1.4 to twice the iterations.
+_BALANCED = 30
 
 
 class Options(NamedTuple):
-    """How to iterate; see `reconstruct`. `rule` finds τ, None takes the problem's."""
+    """How to iterate; see `reconstruct`. `rule` finds τ, None takes the problem's.
+
+    `regulariser`: of proximal gradients; None takes the problem's total variation. `acceleration`:
+    of ADMM.
+    """
 
     method: Iterative
     iterations: int
@@ -32,6 +43,8 @@ class Options(NamedTuple):
     start: Float[Array, "*batch y x"] | None
     callback: Callback | None
     rule: TauRule | None = None
+    regulariser: AbstractRegulariser | None = None
+    acceleration: Acceleration = "none"
 
 
 class Solved(NamedTuple):
@@ -48,7 +61,7 @@ def minimise(problem: Deconvolution, options: Options, *, even_start: bool) -> S
     else take hundreds of iterations; a field that is mostly dark is nearer to zero.
     """
     _check(options)
-    image = _first(problem, options.start, even_start)
+    image = first_image(problem, options.start, even=even_start)
     if problem.nonnegative:  # the best image so far may be this one
         image = jnp.maximum(image, 0)
     if options.rule is None:
@@ -71,16 +84,17 @@ def _iterate(problem: Deconvolution, image, options: Options) -> Outcome:
     """The method asked for."""
     if options.method == "admm_tv":
         return drive(
-            admm_method(problem, options.relaxation),
+            admm_method(problem, options.relaxation, options.acceleration),
             image,
             iterations=options.iterations,
             tolerance=options.tolerance,
-            adapt_until=options.iterations // 2,
+            adapt_until=min(_BALANCED, options.iterations // 2),
             callback=options.callback,
         )
     solve = solve_proximal if options.method == "fista" else solve_two_step
     return solve(
         problem,
+        regulariser=options.regulariser,
         image=image,
         iterations=options.iterations,
         tolerance=options.tolerance,
@@ -88,19 +102,25 @@ def _iterate(problem: Deconvolution, image, options: Options) -> Outcome:
     )
 
 
-def admm_method(problem: Deconvolution, relaxation: float) -> AbstractMethod:
+def admm_method(
+    problem: Deconvolution, relaxation: float, acceleration: Acceleration = "none"
+) -> AbstractMethod:
     """ADMM for a problem, or for each of its parts."""
+    kind = AndersonAdmm if acceleration == "anderson" else AdmmTotalVariation
 
     def method(part: Deconvolution) -> AbstractMethod:
-        return AdmmTotalVariation(part, relaxation=relaxation)
+        return kind(part, relaxation=relaxation)
 
     return Apart(problem, method) if worth_taking_apart(problem) else method(problem)
 
 
-def _first(problem: Deconvolution, start, even: bool) -> Float[Array, "*batch channel plane y x"]:
+def first_image(
+    problem: Deconvolution, start, *, even: bool
+) -> Float[Array, "*batch channel plane y x"]:
+    """The start given, amid zeros where it is smaller than the field; else an even one, or zero."""
     shape, dtype = problem.image_shape, problem.captures[0].dtype
     if start is None:
-        level = _uniform_level(problem)[..., None, None, None] if even else jnp.zeros((), dtype)
+        level = even_level(problem)[..., None, None, None] if even else jnp.zeros((), dtype)
         return jnp.broadcast_to(level, shape)
     start = jnp.asarray(start, dtype)
     if start.size != math.prod((*shape[:-2], *start.shape[-2:])):
@@ -126,14 +146,20 @@ def middle(image: Float[Array, "*batch y x"], shape) -> Float[Array, "*batch v u
     return cut(image, corner, shape)
 
 
-_uniform_level = jax.jit(uniform_level)
+even_level = jax.jit(uniform_level)
 
 
 def _check(options: Options) -> None:
     if options.rule is not None:
         _checks.choice("tau", options.rule, get_args(TauRule))
-    if not isinstance(options.iterations, int) or options.iterations < 1:
-        raise ValueError(f"iterations = {options.iterations}; give a whole number of at least 1")
-    _checks.non_negative("tolerance", options.tolerance, "parts of one")
+    _checks.choice("acceleration", options.acceleration, get_args(Acceleration))
+    check_limits(options.iterations, options.tolerance)
     if options.method == "admm_tv" and not 0 < options.relaxation < 2:
         raise ValueError(f"relaxation = {options.relaxation:g} is out of range; give 0 < α < 2")
+
+
+def check_limits(iterations: int, tolerance: float) -> None:
+    """When to end."""
+    if not isinstance(iterations, int) or iterations < 1:
+        raise ValueError(f"iterations = {iterations}; give a whole number of at least 1")
+    _checks.non_negative("tolerance", tolerance, "parts of one")

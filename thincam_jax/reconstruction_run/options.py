@@ -8,10 +8,13 @@ from thincam_jax import _checks
 from thincam_jax.measured import MeasurementError, Preparation
 from thincam_jax.measured.display import WhiteBalance
 from thincam_jax.reconstruct import METHODS
+from thincam_jax.reconstruct.arguments import DEFAULT_RIDGE, DEFAULT_TAU, refuse_unused
 
 # They are computed from a model of the camera, not from a measured PSF.
 NEEDS_CAMERAS = ("wiener", "fringe_scanning")
-PSF_METHODS = tuple(method for method in METHODS if method not in NEEDS_CAMERAS)
+# Its captures are raw counts; prepared ones have their background taken away and a maximum of 1.
+NEEDS_COUNTS = ("poisson",)
+PSF_METHODS = tuple(m for m in METHODS if m not in (*NEEDS_CAMERAS, *NEEDS_COUNTS))
 
 # Far beyond any use; its product with the captures' units stays within float32.
 _LARGEST_TAU = 1e6
@@ -46,41 +49,71 @@ class Recipe:
     """How to reconstruct; see `thincam_jax.reconstruct`.
 
     - `method`: one of `PSF_METHODS`.
-    - `tau`: weight of the variation relative to the noise. `iterations`: at most.
+    - `tau`: weight of the variation relative to the noise; None: 2. `iterations`: at most.
     - `coupling`: of colours; None: "joint" for several channels.
     - `field`: "sensor" keeps the part of the image in front of the sensor, "full" all that sends
       light to it.
     - `flip`: turn the image by 180°.
+    - `ridge`: of the method "ridge", which has neither tau nor coupling; None: 1.
 
     **Errors**: MeasurementError for what is unknown or out of range.
     """
 
     method: str = "admm_tv"
-    tau: float | int = 2.0
+    tau: float | int | None = None
     iterations: int = 100
     coupling: Literal["none", "joint", "opponent"] | None = None
     field: Literal["sensor", "full"] = "sensor"
     flip: bool = False
+    ridge: float | int | None = None
 
     def __post_init__(self):
-        if self.method in NEEDS_CAMERAS:
-            raise MeasurementError(
-                f"method {self.method!r} needs a model of the camera; with a measured PSF choose "
-                f"one of {', '.join(repr(m) for m in PSF_METHODS)}"
-            )
+        self._check_method()
         try:
-            _checks.choice("method", self.method, PSF_METHODS)
             _checks.choice("coupling", self.coupling or "none", ("none", "joint", "opponent"))
             _checks.choice("field", self.field, ("sensor", "full"))
-            _checks.non_negative("tau", self.tau, "parts of one")
+            _checks.non_negative("tau", self.relative_tau, "parts of one")
+            if self.ridge is not None:
+                _checks.positive("ridge", self.ridge, "parts of one")
         except ValueError as error:
             raise MeasurementError(str(error)) from None
-        if self.tau > _LARGEST_TAU:
+        if self.relative_tau > _LARGEST_TAU:
             raise MeasurementError(
-                f"tau = {self.tau:g}: give about 1 to 3, at most {_LARGEST_TAU:g}"
+                f"tau = {self.relative_tau:g}: give about 1 to 3, at most {_LARGEST_TAU:g}"
             )
         if self.iterations < 1:
             raise MeasurementError(f"iterations = {self.iterations}: give at least 1")
+
+    @property
+    def is_ridge(self) -> bool:
+        return self.method == "ridge"
+
+    @property
+    def relative_tau(self) -> float | int:
+        return DEFAULT_TAU if self.tau is None else self.tau
+
+    @property
+    def relative_ridge(self) -> float | int:
+        return DEFAULT_RIDGE if self.ridge is None else self.ridge
+
+    def _check_method(self) -> None:
+        """Whether it is one, works from prepared captures, and uses what is given."""
+        able = f"choose one of {', '.join(repr(m) for m in PSF_METHODS)}"
+        if self.method in NEEDS_CAMERAS:
+            raise MeasurementError(
+                f"method {self.method!r} needs a model of the camera; with a measured PSF {able}"
+            )
+        if self.method in NEEDS_COUNTS:
+            raise MeasurementError(
+                f"method {self.method!r} needs raw counts, which prepared captures are not; {able}"
+            )
+        try:
+            _checks.choice("method", self.method, PSF_METHODS)
+            given = {"variation": self.coupling, "tau": self.tau, "ridge": self.ridge}
+            refuse_unused(self.method, **given)
+        except ValueError as error:
+            text = str(error).replace("variation", "coupling")
+            raise MeasurementError(text) from None
 
 
 @dataclass(frozen=True)

@@ -160,24 +160,31 @@ def _reconstruct(
         method=cast(Method, recipe.method),
         field_shape=field,
         tau=recipe.tau,
-        variation=variation,
+        ridge=recipe.ridge,
+        variation=None if recipe.is_ridge else variation,
         valid=valid,
         iterations=recipe.iterations,
-        callback=None if told is None else _Teller(told, job.capture.name),
+        # Conjugate gradients run in one piece: there is nothing to tell of before the end.
+        callback=None if told is None or recipe.is_ridge else _Teller(told, job.capture.name),
     )
     if found.status == "non_finite":
-        raise MeasurementError(
-            f"{job.capture}: the image became NaN or infinite after {found.iterations} iterations; "
-            f"give a tau (now {recipe.tau:g}) that is nearer to 1"
-        )
+        raise MeasurementError(_lost(job, found, recipe))
     if found.status == "interrupted" and not found.iterations:
         raise KeyboardInterrupt
     problem = psf_problem(
-        capture, psf, tau=recipe.tau, field_shape=field, valid=valid, variation=variation
+        capture, psf, tau=recipe.relative_tau, field_shape=field, valid=valid, variation=variation
     )
     image = found.image if recipe.field == "full" else middle(found.image, sensor)
     image = np.asarray(image, dtype=np.float32)
     return image[:, ::-1, ::-1] if recipe.flip else image, _facts(found, problem, recipe)
+
+
+def _lost(job: Job, found: Reconstruction, recipe: Recipe) -> str:
+    now = ("ridge", recipe.relative_ridge) if recipe.is_ridge else ("tau", recipe.relative_tau)
+    return (
+        f"{job.capture}: the image became NaN or infinite after {found.iterations} iterations; "
+        f"give a {now[0]} (now {now[1]:g}) that is nearer to 1"
+    )
 
 
 class _Teller:
@@ -191,16 +198,19 @@ class _Teller:
 
 
 def _facts(found: Reconstruction, problem: Deconvolution, recipe: Recipe) -> dict[str, Any]:
+    variation = {"kind": problem.variation.kind, "coupling": problem.variation.coupling}
+    is_ridge = recipe.is_ridge
     return {
         "method": found.method,
         "asked_for": recipe.method,
         "reason": found.reason,
-        "tau": recipe.tau,
-        "absolute_tau": problem.tau,
+        "tau": None if is_ridge else recipe.relative_tau,
+        "absolute_tau": None if is_ridge else problem.tau,
+        "ridge": recipe.relative_ridge if is_ridge else None,
         # The weight of a trusted pixel is 1/σ².
         "noise_standard_deviation": 1 / jnp.sqrt(jnp.max(problem.weights[0])),
-        "variation": {"kind": problem.variation.kind, "coupling": problem.variation.coupling},
-        "nonnegative": problem.nonnegative,
+        "variation": None if is_ridge else variation,
+        "nonnegative": problem.nonnegative and not is_ridge,
         "field_shape": problem.field_shape,
         "iterations_at_most": recipe.iterations,
         "iterations": found.iterations,
