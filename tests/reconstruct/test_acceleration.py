@@ -8,6 +8,7 @@ import pytest
 import tifffile
 from reconstruct import extremes, scenes
 
+import thincam_jax as tc
 from helpers import relative_l2, shared_data
 from thincam_jax.reconstruct import _jaxopt, psf_problem
 from thincam_jax.reconstruct._jaxopt import AndersonAdmm, Mixing
@@ -74,6 +75,20 @@ def test_what_500_plain_iterations_reach_in_a_quarter_of_them(bin_by, accelerati
     how = Options("admm_tv", 150, 0.0, 1.8, None, None, acceleration=acceleration)
     outcome = minimise(problem, how, even_start=False).outcome
     assert needed(outcome, of_500_plain_iterations(problem)) <= most
+
+
+def test_it_is_an_option_of_reconstruct():
+    """Another way to the same image: the same to the first look, before any point is mixed."""
+    problem, truth = scenes.problem(captures=1)
+    kernel = jnp.asarray(scenes.zone_plate((25, 27)))[None]
+    how = {"method": "admm_tv", "relaxation": 1.0, "iterations": 60, "tolerance": 0.0}
+    plain, mixed = (
+        tc.reconstruct(problem.captures[0][0][None], kernel, acceleration=a, **how)
+        for a in ("none", "anderson")
+    )
+    assert mixed.history[1].objective == pytest.approx(plain.history[1].objective, rel=1e-9)
+    assert mixed.history[-1].objective != plain.history[-1].objective
+    assert mixed.history[-1].objective < plain.history[-1].objective * (1 + 1e-3)
 
 
 @pytest.mark.thorough

@@ -61,7 +61,7 @@ def test_one_psf_for_all_colours_and_weights_that_broadcast():
     problem, _ = scenes.problem(batch=(2,), channels=3)
     shared = [jax.tree.map(lambda s: s[:1], o) for o in problem.operators]
     row = jnp.linspace(0.5, 1.5, problem.captures[0].shape[-1])
-    whole = Deconvolution(shared, problem.captures, tau=0.1, weights=[row[None, None], 2.0])
+    whole = Deconvolution(shared, problem.captures, tau=0.1, weights=[row, 2.0])
     image = jnp.asarray(np.random.default_rng(1).uniform(size=whole.image_shape))
     apart = Apart(whole, admm)
     np.testing.assert_allclose(apart.objective(image), objective(whole, image), rtol=1e-12)
@@ -93,7 +93,7 @@ def test_the_worst_part_counts():
     assert len({r.primal for r in found.members}) == 2
 
 
-def test_an_image_does_not_depend_on_its_batch():
+def test_units_and_penalties_do_not_depend_on_the_batch():
     """Through the entry point: the same captures alone and beside a bright one."""
     cameras = rig.pair()
     captures = rig.captures(cameras, rig.picture())
@@ -119,6 +119,25 @@ def test_precision_of_the_calling_thread():
         found = _together(lambda x: (jnp.asarray(x).dtype, threading.get_ident()), [1.5] * 4)
     assert {dtype for dtype, _ in found} == {np.dtype("float32")}
     assert threading.get_ident() not in {thread for _, thread in found}
+
+
+def test_other_settings_of_the_calling_thread():
+    with jax.debug_nans(True), pytest.raises(FloatingPointError):
+        _together(lambda x: jax.block_until_ready(jnp.log(jnp.asarray(x))), [-1.0, -2.0])
+    with jax.numpy_dtype_promotion("standard"):
+        mixed = _together(lambda x: jnp.asarray(x, "float32") + jnp.ones(2), [1.0, 2.0])
+    assert all(m.dtype == jnp.float64 for m in mixed)
+
+
+def test_operators_are_not_copied():
+    """Every part refers to the same spectrum, however many images there are."""
+    problem, _ = scenes.problem(batch=(5,))
+    apart = Apart(problem, admm)
+    for n in range(2):
+        spectra = [m.splitting.operators[n].spectrum for m in apart.methods]
+        assert {s.unsafe_buffer_pointer() for s in spectra} == {
+            problem.operators[n].spectrum.unsafe_buffer_pointer()
+        }
 
 
 def test_an_error_of_a_part_is_not_lost():

@@ -24,6 +24,7 @@ GIVEN = {
     "iterations": 100,
     "tolerance": 1e-4,
     "relaxation": 1.8,
+    "acceleration": "none",
     "start": jnp.ones(rig.FIELD),
     "callback": print,
 }
@@ -33,10 +34,10 @@ BY_VARIATION = (
     "callback",
 )
 USED = {
-    "auto": (*BY_VARIATION, "relaxation"),
+    "auto": (*BY_VARIATION, "relaxation", "acceleration"),
     "wiener": BY_FILTERS,
     "fringe_scanning": BY_FILTERS,
-    "admm_tv": (*BY_VARIATION, "relaxation"),
+    "admm_tv": (*BY_VARIATION, "relaxation", "acceleration"),
     "fista": (*BY_VARIATION, "regulariser"),
     "twist": (*BY_VARIATION, "regulariser"),
     "ridge": ("ridge", "valid", "iterations", "tolerance"),
@@ -77,7 +78,7 @@ def test_poisson_knows_its_noise_and_takes_no_sums():
     captures = jnp.ones((2, *rig.SENSOR.shape))
     for name, value in (("noise_variance", 1.0), ("synthesis", np.eye(2))):
         told = refused(captures, rig.pair(), method="poisson", **CAMERAS, **{name: value})
-        assert told == f"method 'poisson' cannot use {name}; leave out, or use 'wiener'"
+        assert told == f"method 'poisson' cannot use {name}; leave out, or use 'admm_tv'"
 
 
 @pytest.mark.parametrize(
@@ -97,6 +98,21 @@ def test_poisson_knows_its_noise_and_takes_no_sums():
         ({"method": "poisson", "tolerance": -1.0}, "tolerance = -1.0 .* is negative"),
         ({"method": "poisson", "background": [1.0, 2.0]}, "2 backgrounds for 1 captures"),
         ({"method": "poisson", "background": jnp.ones((1, 3))}, r"background has shape \(3,\)"),
+        ({"method": "poisson", "background": ["dark"]}, "background 'dark' is no number"),
+        ({"method": "poisson", "background": jnp.ones((4, 3))}, r"such as \[frame\] for one"),
+        ({"method": "auto", "iterations": 0}, "iterations = 0; give a whole number"),
+        ({"method": "auto", "relaxation": 7.0}, "relaxation = 7 is out of range"),
+        ({"method": "auto", "acceleration": "fast"}, "choose one of 'none', 'anderson'"),
+        ({"method": "auto", "tau": "best"}, "choose one of 'discrepancy', 'sure'"),
+        (
+            {"method": "auto", "variation": Sparsity()},
+            "variation is a Sparsity; give a TotalVariation",
+        ),
+        (
+            {"method": "fista", "regulariser": TotalVariation()},
+            "regulariser is a TotalVariation; give a Regulariser",
+        ),
+        ({"method": "admm_tv", "start": jnp.ones(7)}, r"start has shape \(7,\)"),
         ({"method": "poisson", "background": -1.0}, "background is negative"),
         ({"method": "admm_tv", "wavelength": 5e-4}, "measured PSFs cannot use wavelength"),
         (

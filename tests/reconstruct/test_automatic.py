@@ -31,6 +31,24 @@ def test_a_background_that_is_kept_needs_the_crop(synthesis, count):
     assert method == "admm_tv" and reason.startswith(f"{count} channels keep the bright background")
 
 
+def test_backgrounds_of_unlike_apertures_do_not_cancel():
+    cameras = [rig.camera(0.0), rig.camera(0.0, width=1.4)]
+    method, reason = choose_method(captures(0.001), cameras, PAIR, None)
+    assert method == "admm_tv" and reason.startswith("1 of 1 channels keep the bright background")
+
+
+@pytest.mark.parametrize(
+    ("synthesis", "variance", "message"),
+    [
+        (np.ones((1, 3)), None, r"synthesis has shape \(1, 3\); give \(channels, 2\)"),
+        (PAIR, jnp.ones(3), r"noise_variance has shape \(3,\); give one number or one for each"),
+    ],
+)
+def test_what_does_not_fit_is_told_before_the_choice(synthesis, variance, message):
+    with pytest.raises(ValueError, match=message):
+        choose_method(captures(0.001), rig.pair(), synthesis, variance)
+
+
 @pytest.mark.parametrize("known", [True, False])
 def test_contrast_over_noise_decides_else(known):
     """The difference has a contrast of 2 over a noise of √2 σ: √2/σ, whether σ is told or not."""

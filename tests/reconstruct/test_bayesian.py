@@ -1,5 +1,6 @@
 """Ridge and Poisson through the entry point: what their weights mean, against other formulas."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -89,7 +90,9 @@ def test_ridge_has_no_units():
 
 def test_small_brightness_keeps_its_square():
     level = jnp.asarray([1e-25, 3e-25], jnp.float32)
-    assert float(absolute_ridge(2.0, level)) == pytest.approx(2.0 / 5e-50, rel=1e-6)
+    for wide in (True, False):
+        with jax.enable_x64(wide):
+            assert float(absolute_ridge(2.0, level)) == pytest.approx(2.0 / 5e-50, rel=1e-6)
     assert float(absolute_ridge(2.0, jnp.zeros(3))) == 2.0
 
 

@@ -17,8 +17,7 @@ from thincam_jax.reconstruct.problem import Deconvolution, misfit
 from thincam_jax.reconstruct.proximal_minimiser import total_misfit
 from thincam_jax.reconstruct.regulariser import AbstractRegulariser, no_dual, prox
 from thincam_jax.reconstruct.scaled import ScaledProblem
-from thincam_jax.reconstruct.tv_method import AdmmTotalVariation
-from thincam_jax.reconstruct.tv_method import _look as _step_and_residuals
+from thincam_jax.reconstruct.tv_method import AdmmTotalVariation, step_and_residuals
 
 
 class JaxoptState(eqx.Module):
@@ -94,6 +93,8 @@ class AndersonAdmm(AbstractMethod[AndersonState]):
 
     Penalties adapt as those of `AdmmTotalVariation`; as T changes with them, mixing begins anew. It
     pays to let them adapt early (`adapt_until` = 30 of 150 iterations) and mix from then on.
+
+    The history holds 2m copies of the state.
 
     - `penalties`, `relaxation`: see `AdmmTotalVariation`.
     """
@@ -289,7 +290,7 @@ def _next(weighed: State, t: AdmmMap) -> State:
 
 
 def _next_and_residuals(weighed: State, t: AdmmMap):
-    after, *residuals = _step_and_residuals(*t, _divided(t.penalties, weighed))
+    after, *residuals = step_and_residuals(*t, _divided(t.penalties, weighed))
     return _times(jax.tree.map(jnp.sqrt, t.penalties), after), residuals
 
 

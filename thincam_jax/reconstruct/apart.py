@@ -3,9 +3,10 @@
 The images of a batch have only the operator in common, and so do colours whose variations are not
 coupled. On a CPU a part by itself stays in the cache, and cores that one part leaves idle between
 its transforms serve another (docs/reconstruction.md has the comparison). Each part then has units
-and penalties of its own, so that an image does not depend on what else is in its batch.
+and penalties of its own.
 """
 
+import contextlib
 import math
 import os
 from collections.abc import Callable
@@ -15,7 +16,6 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from thincam_jax.operators import CropConvolution
@@ -115,6 +115,7 @@ def _weights_of_parts(weight, capture, count: int, colours: int):
     """Each part's; one weight for all stays one number."""
     if weight.ndim == 0:
         return [weight] * count
+    weight = weight.reshape((1,) * (capture.ndim - weight.ndim) + weight.shape)
     leading = jnp.broadcast_shapes(weight.shape[:-2], capture.shape[:-2])
     whole = jnp.broadcast_to(weight, (*leading, *weight.shape[-2:]))
     return whole.reshape(count, leading[-1] // colours, *weight.shape[-2:])
@@ -123,22 +124,39 @@ def _weights_of_parts(weight, capture, count: int, colours: int):
 def _together(function: Callable, *sequences) -> list:
     """The function of each part, of as many at a time as there are cores.
 
-    Ctrl-C drops what has not begun. A precision chosen for this thread holds in the others too.
+    Ctrl-C drops what has not begun. What JAX is told for this thread holds in the others too.
     """
-    wide = _is_wide()
+    wanted = _settings_of_thread()
 
     def run(*arguments):
-        if _is_wide() == wide:
-            return function(*arguments)
-        with jax.enable_x64(wide):
+        with contextlib.ExitStack() as stack:
+            here = _settings_of_thread()
+            for name, value in wanted.items():
+                if here[name] != value:
+                    stack.enter_context(_SETTINGS[name](value))
             return function(*arguments)
 
-    with ThreadPoolExecutor(min(len(sequences[0]), _THREADS)) as pool:
+    with ThreadPoolExecutor(min(len(sequences[0]), _cores())) as pool:
         return list(pool.map(run, *sequences))
 
 
-def _is_wide() -> bool:
-    return jax.dtypes.canonicalize_dtype(np.float64) == np.float64
+_SETTINGS = {
+    "jax_enable_x64": jax.enable_x64,
+    "jax_default_device": jax.default_device,
+    "jax_default_matmul_precision": jax.default_matmul_precision,
+    "jax_numpy_dtype_promotion": jax.numpy_dtype_promotion,
+    "jax_debug_nans": jax.debug_nans,
+    "jax_disable_jit": jax.disable_jit,
+}
 
 
-_THREADS = os.cpu_count() or 1
+def _settings_of_thread() -> dict[str, Any]:
+    values = {name: getattr(jax.config, name) for name in _SETTINGS}
+    return {name: getattr(value, "value", value) for name, value in values.items()}
+
+
+def _cores() -> int:
+    """Those that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1

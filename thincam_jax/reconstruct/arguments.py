@@ -6,10 +6,16 @@ from typing import Any, Literal, NamedTuple, get_args
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from thincam_jax import _checks
 from thincam_jax.camera import LenslessCamera
 from thincam_jax.reconstruct.automatic import CANDIDATES, are_cameras
 from thincam_jax.reconstruct.drive import Callback
-from thincam_jax.reconstruct.regularised import Acceleration
+from thincam_jax.reconstruct.regularised import (
+    Acceleration,
+    TauRule,
+    check_limits,
+    check_relaxation,
+)
 from thincam_jax.reconstruct.regulariser import AbstractRegulariser
 from thincam_jax.reconstruct.total_variation import TotalVariation
 
@@ -86,6 +92,7 @@ def check_settings(method: str, settings: Settings, **more) -> None:
     `more`: other arguments of `USES`.
     """
     refuse_unused(method, **settings._asdict(), **more)
+    _check_values(settings)
     if settings.regulariser is not None and settings.variation is not None:
         raise ValueError(
             "regulariser and variation are given; the regulariser takes the place of total "
@@ -98,13 +105,32 @@ def check_settings(method: str, settings: Settings, **more) -> None:
         )
 
 
+def _check_values(settings: Settings) -> None:
+    """Each by itself, whatever method will use it."""
+    kinds = (("variation", TotalVariation), ("regulariser", AbstractRegulariser))
+    for name, kind in kinds:
+        value = getattr(settings, name)
+        if value is not None and not isinstance(value, kind):
+            wanted = kind.__name__.removeprefix("Abstract")
+            raise ValueError(f"{name} is a {type(value).__name__}; give a {wanted}")
+    if settings.rule is not None:
+        _checks.choice("tau", settings.rule, get_args(TauRule))
+    check_limits(settings.at_most(1), settings.limit)
+    if settings.relaxation is not None:
+        check_relaxation(settings.relaxation)
+    if settings.acceleration is not None:
+        _checks.choice("acceleration", settings.acceleration, get_args(Acceleration))
+
+
 def refuse_unused(method: str, **given) -> None:
     """One line on what is given and not used by a method."""
     names = [name for name, value in given.items() if value is not None]
     unused = [name for name in names if name not in USES[method]]
     if not unused:
         return
-    able = [m for m in METHODS if m != "auto" and all(name in USES[m] for name in unused)]
+    # First those that take measured PSFs too.
+    methods = (*(m for m in METHODS if m not in ("auto", *FILTERS)), *FILTERS)
+    able = [m for m in methods if all(name in USES[m] for name in unused)]
     other = f", or use {able[0]!r}" if able else ""
     raise ValueError(f"method {method!r} cannot use {' and '.join(unused)}; leave out{other}")
 
@@ -120,6 +146,8 @@ def cameras_or_psfs(cameras) -> Sequence[LenslessCamera] | Array:
     """Camera models as they are, anything else as an array of PSFs."""
     if isinstance(cameras, LenslessCamera):
         raise TypeError("cameras is one camera; give a list, [camera], one for each capture")
+    if isinstance(cameras, Sequence) and not cameras:
+        raise ValueError("cameras is empty; give one camera, or one PSF, for each capture")
     if are_cameras(cameras):
         return cameras
     psfs = jnp.asarray(cameras)

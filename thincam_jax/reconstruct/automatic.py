@@ -7,7 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from thincam_jax.camera import LenslessCamera
-from thincam_jax.reconstruct.noise import estimate_variance
+from thincam_jax.reconstruct.noise import estimate_variance, given_variances
+from thincam_jax.reconstruct.registration import distance_ratios
+from thincam_jax.reconstruct.synthesis import check_synthesis
 
 # Contrast of a channel over its noise from which a filter is trusted. A judgement: total variation
 # gains 0.5 to 2.5 dB at 1 to 3 (configs/fza_admm_tv.yaml), and next to nothing without noise.
@@ -33,7 +35,9 @@ def choose_method(
     if object_distance is not None and np.ndim(object_distance) > 0:
         return "admm_tv", "several planes are asked for, which a filter does not tell apart"
     matrix = np.eye(len(cameras)) if synthesis is None else np.asarray(synthesis, dtype=float)
+    check_synthesis(matrix, cameras, distance_ratios(cameras))
     biased = np.abs(matrix.sum(axis=1)) > 1e-6
+    biased |= np.array([_backgrounds_differ(row, cameras) for row in matrix])
     if biased.any():
         return "admm_tv", (
             f"{int(biased.sum())} of {len(matrix)} channels keep the bright background of their "
@@ -51,6 +55,12 @@ def choose_method(
     )
 
 
+def _backgrounds_differ(row: np.ndarray, cameras: Sequence[LenslessCamera]) -> bool:
+    """Apertures of unlike widths let unlike light through, which no difference takes away."""
+    used = [camera.mask for weight, camera in zip(row, cameras, strict=True) if weight]
+    return len({float(getattr(mask, "width", 0)) for mask in used}) > 1
+
+
 def are_cameras(cameras) -> TypeGuard[Sequence[LenslessCamera]]:
     """Whether these are camera models, and not an array of measured PSFs."""
     return isinstance(cameras, Sequence) and all(isinstance(c, LenslessCamera) for c in cameras)
@@ -62,9 +72,7 @@ def _contrast(captures, matrix: np.ndarray, noise_variance) -> float:
     if noise_variance is None:
         variances = estimate_variance(flat)
     else:
-        given = jnp.asarray(noise_variance, flat.dtype)
-        given = given.reshape(given.shape[0], -1).mean(axis=1) if given.ndim else given
-        variances = jnp.broadcast_to(given, (flat.shape[0],))
+        variances = given_variances(noise_variance, flat)
     ratios = []
     for row in matrix:
         channel = jnp.tensordot(jnp.asarray(row, flat.dtype), flat, axes=1)

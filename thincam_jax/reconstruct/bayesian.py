@@ -61,13 +61,13 @@ def ridge_outcome(
     )
 
 
-def absolute_ridge(ridge, level: Float[Array, "..."]) -> Float[Array, ""]:
+def absolute_ridge(ridge, level: Float[Array, "..."]) -> float:
     """ρ of `solve_ridge` for weights 1/variance, from a number that is about 1.
 
     1 is the Bayes choice for pixels that vary independently by as much as their mean. More draws
     the image to its mean, less lets more noise into it.
     """
-    relative = _checks.positive("ridge", ridge, "parts of noise variance / image variance")
+    relative = float(_checks.positive("ridge", ridge, "parts of noise variance / image variance"))
     # In double precision of NumPy: squares of small brightnesses leave float32.
     variance = float(np.mean(np.asarray(level, dtype=np.float64) ** 2))
     return relative / (variance if variance > 0 else 1.0)
@@ -134,15 +134,22 @@ def _backgrounds(background, problem: Deconvolution) -> list[Float[Array, "..."]
     if background is None:
         return None
     count = len(problem.captures)
-    each = [background] * count if np.ndim(background) == 0 else list(background)
+    several = isinstance(background, list | tuple) or np.ndim(background) > 0
+    each = list(background) if several else [background] * count
     if len(each) != count:
-        raise ValueError(f"{len(each)} backgrounds for {count} captures; give one for each")
+        raise ValueError(
+            f"{len(each)} backgrounds for {count} captures; give one for each, such as [frame] for "
+            "one"
+        )
     check = functools.partial(_checked_background, problem.captures[0].dtype)
     return [check(b, c.shape) for b, c in zip(each, problem.captures, strict=True)]
 
 
 def _checked_background(dtype, background, shape) -> Float[Array, "..."]:
-    known = jnp.asarray(background, dtype)
+    try:
+        known = jnp.asarray(background, dtype)
+    except (TypeError, ValueError):
+        raise ValueError(f"background {background!r} is no number; give dark counts") from None
     try:
         fits = jnp.broadcast_shapes(known.shape, shape) == shape
     except ValueError:

@@ -13,7 +13,7 @@ from thincam_jax.camera import LenslessCamera
 from thincam_jax.grids import same_parity
 from thincam_jax.operators import CropConvolution, kernel_grid, kernel_shape, window_shape
 from thincam_jax.psf import Model, psf
-from thincam_jax.reconstruct.noise import estimate_variance
+from thincam_jax.reconstruct.noise import estimate_variance, given_variances
 from thincam_jax.reconstruct.normal import mean_power
 from thincam_jax.reconstruct.problem import Deconvolution
 from thincam_jax.reconstruct.registration import distance_ratios, own_field, register
@@ -205,7 +205,7 @@ def _variances(matrix: np.ndarray, noise_variance, captures, valid) -> list[Floa
     if noise_variance is None:
         each = estimate_variance(captures, valid)
         return [jnp.sum(square * each) for square in squares]
-    given = _given(noise_variance, captures)
+    given = given_variances(noise_variance, captures)
     totals = [jnp.sum(square * given) for square in squares]
     if all(not _checks.is_traced(total) and bool(total > 0) for total in totals):
         return totals
@@ -214,24 +214,6 @@ def _variances(matrix: np.ndarray, noise_variance, captures, valid) -> list[Floa
         jnp.where(total > 0, total, jnp.sum(square * each))
         for total, square in zip(totals, squares, strict=True)
     ]
-
-
-def _given(noise_variance, captures) -> Float[Array, " capture"]:
-    """The variance given, of each capture, averaged over its batch."""
-    count = captures.shape[0]
-    each = jnp.asarray(noise_variance, captures.dtype)
-    if not _checks.is_traced(each) and not bool(jnp.all((each >= 0) & jnp.isfinite(each))):
-        raise ValueError(
-            f"noise_variance = {noise_variance} is negative or not finite; give variances in the "
-            "captures' units squared, or none to have them estimated"
-        )
-    if each.ndim and each.shape[0] != count:
-        raise ValueError(
-            f"noise_variance has shape {each.shape}; give one number or one for each of the "
-            f"{count} captures"
-        )
-    each = jnp.broadcast_to(each.reshape(each.shape or (1,)), (count, *each.shape[1:]))
-    return jnp.mean(each.reshape(count, -1), axis=1)
 
 
 def _assemble(

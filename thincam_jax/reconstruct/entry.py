@@ -60,7 +60,7 @@ def reconstruct(
 
     **Arguments**
 
-    - `captures`: (capture, *batch, y, x), one for each camera. With total variation the last batch
+    - `captures`: (capture, *batch, y, x), one for each camera. But for the filters the last batch
       axis is the colour channel.
     - `cameras`: what took them; or measured PSFs on the same pixels, an array (capture, k, l),
       (capture, channel, k, l) or (capture, channel, plane, k, l).
@@ -80,6 +80,7 @@ def reconstruct(
       field is by default all that sends light to the sensor, and the image the part in front of it.
 
     The rest is refused where the method cannot use it; "auto" takes what one of its methods uses.
+    What describes camera and scene (the arguments above) is not: it may serve several methods.
 
     - `tau` (admm_tv, fista, twist, poisson): weight of the variation relative to the noise, about 1
       to 3, default 2; see `absolute_tau`. For poisson the noise is that of the mean count.
@@ -97,8 +98,8 @@ def reconstruct(
     - `iterations` (the same): at most, default 100; 300 for ridge and poisson. `tolerance`: on the
       relative residuals or steps of the method, default 1e-4.
     - `relaxation` (admm_tv): 0 < α < 2, default 1.8. `acceleration` (admm_tv): "none", the default,
-      or "anderson", which mixes earlier points in; fewer iterations without relaxation, but each
-      takes several times as long.
+      or "anderson", which mixes the last five points; fewer iterations where nothing is relaxed,
+      but each takes several times as long, and ten copies of the state are kept.
     - `start` (admm_tv, fista, twist, poisson): a first image, such as an earlier result.
     - `callback` (admm_tv, fista, twist): called with `Progress` every tenth iteration; a true
       answer stops the run. Ctrl-C returns the best image so far, with status "interrupted".

@@ -3,6 +3,8 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from thincam_jax import _checks
+
 
 def estimate_noise(
     capture: Float[Array, "*batch y x"], valid: Bool[Array, "*batch y x"] | None = None
@@ -47,3 +49,21 @@ def estimate_variance(
     found = jnp.mean(estimate_noise(captures, valid).reshape(count, -1) ** 2, axis=1)
     least = 1e-6 * jnp.mean(captures**2)
     return jnp.where(found > 0, found, jnp.where(least > 0, least, 1))
+
+
+def given_variances(noise_variance, captures) -> Float[Array, " capture"]:
+    """The variance given, of each capture, averaged over its batch."""
+    count = captures.shape[0]
+    each = jnp.asarray(noise_variance, captures.dtype)
+    if not _checks.is_traced(each) and not bool(jnp.all((each >= 0) & jnp.isfinite(each))):
+        raise ValueError(
+            f"noise_variance = {noise_variance} is negative or not finite; give variances in the "
+            "captures' units squared, or none to have them estimated"
+        )
+    if each.ndim and each.shape[0] != count:
+        raise ValueError(
+            f"noise_variance has shape {each.shape}; give one number or one for each of the "
+            f"{count} captures"
+        )
+    each = jnp.broadcast_to(each.reshape(each.shape or (1,)), (count, *each.shape[1:]))
+    return jnp.mean(each.reshape(count, -1), axis=1)

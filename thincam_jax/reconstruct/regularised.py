@@ -123,7 +123,7 @@ def first_image(
         level = even_level(problem)[..., None, None, None] if even else jnp.zeros((), dtype)
         return jnp.broadcast_to(level, shape)
     start = jnp.asarray(start, dtype)
-    if start.size != math.prod((*shape[:-2], *start.shape[-2:])):
+    if start.ndim < 2 or start.size != math.prod((*shape[:-2], *start.shape[-2:])):
         raise ValueError(
             f"start has shape {start.shape}; give an image of the result's batch and planes, "
             f"{shape[:-2]}, and its rows and columns"
@@ -154,8 +154,15 @@ def _check(options: Options) -> None:
         _checks.choice("tau", options.rule, get_args(TauRule))
     _checks.choice("acceleration", options.acceleration, get_args(Acceleration))
     check_limits(options.iterations, options.tolerance)
-    if options.method == "admm_tv" and not 0 < options.relaxation < 2:
-        raise ValueError(f"relaxation = {options.relaxation:g} is out of range; give 0 < α < 2")
+    if options.method == "admm_tv":
+        check_relaxation(options.relaxation)
+
+
+def check_relaxation(relaxation) -> None:
+    """Whether ADMM converges with it."""
+    value = float(_checks.finite("relaxation", relaxation, "parts of one"))
+    if not 0 < value < 2:
+        raise ValueError(f"relaxation = {value:g} is out of range; give 0 < α < 2")
 
 
 def check_limits(iterations: int, tolerance: float) -> None:

@@ -41,7 +41,7 @@ def contrasts(count: int) -> np.ndarray:
     Masks of one width at one distance cast the same background, whatever their β and phase, so
     that it cancels wherever the weights of a row add up to zero. Pairs of two β leave one such sum
     unused, (g₁ + g₂) − (g₃ + g₄), which has fringes as strong as theirs. Rows are those of
-    Helmert's matrix; any other orthonormal ones give the same image.
+    Helmert's matrix; for captures of equal noise any other orthonormal ones say the same.
     """
     if count < 2:
         raise ValueError(f"contrasts of {count} captures; give at least 2")

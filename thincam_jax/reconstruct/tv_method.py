@@ -39,7 +39,8 @@ class AdmmTotalVariation(AbstractMethod[State]):
         self, problem: Deconvolution, *, penalties: Penalties | None = None, relaxation=1.0
     ):
         self.problem = problem
-        self.splitting = _split(problem)
+        # The operators as they are: what comes out of a compiled function is a copy.
+        self.splitting = eqx.tree_at(lambda s: s.operators, _split(problem), problem.operators)
         self.penalties = _default_penalties(self.splitting) if penalties is None else penalties
         self.relaxation = jnp.asarray(relaxation, problem.captures[0].dtype)
 
@@ -56,7 +57,7 @@ class AdmmTotalVariation(AbstractMethod[State]):
         return _objective(self.problem, image)
 
     def look(self, state):
-        state, *numbers = _look(self.splitting, self.penalties, self.relaxation, state)
+        state, *numbers = step_and_residuals(self.splitting, self.penalties, self.relaxation, state)
         primal, dual, parts = jax.device_get(numbers)
         return state, Residuals(
             float(primal), float(dual), tuple((float(p), float(d)) for p, d in parts)
@@ -102,7 +103,7 @@ def _advance(splitting, penalties, relaxation, state, count: int):
 
 
 @jax.jit
-def _look(splitting: Splitting, penalties: Penalties, relaxation, state: State):
+def step_and_residuals(splitting: Splitting, penalties: Penalties, relaxation, state: State):
     """A step, and its residuals: overall, and those of the three splits."""
     after = step(splitting, penalties, relaxation, state)
     old, new = (_consensus(splitting, penalties, s) for s in (state, after))
