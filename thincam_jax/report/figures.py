@@ -1,6 +1,7 @@
 """The pictures of a run, as PNG files in its folder."""
 
 import io
+import math
 import os
 
 import numpy as np
@@ -62,21 +63,35 @@ def save_target(
     for name, evaluation in evaluations.items():
         save_image(folder, f"{slug(target.name)}--{slug(name)}", evaluation.image)
         panels.append((name, evaluation.image, _caption(evaluation)))
-    columns = len(panels) + 1
-    aspect = truth.shape[0] / truth.shape[1]
-    figure = Figure(figsize=(2.75 * columns, 2.75 * (aspect + 1) + 1.25), layout="constrained")
-    axes = figure.subplots(2, columns, gridspec_kw={"height_ratios": (aspect, 1)})
-    for ax in axes.ravel():
-        ax.set_xticks([])
-        ax.set_yticks([])
-    _show(axes[0, 0], raw / raw.max(), "first raw capture")
-    _show_detail_of_capture(axes[1, 0], raw / raw.max(), config)
-    for ax, detail, (name, image, caption) in zip(axes[0, 1:], axes[1, 1:], panels, strict=True):
+    figure, wholes, details = _pairs_of_axes(len(panels) + 1, truth.shape[0] / truth.shape[1])
+    _show(wholes[0], raw / raw.max(), "first raw capture")
+    _show_detail_of_capture(details[0], raw / raw.max(), config)
+    for ax, detail, (name, image, caption) in zip(wholes[1:], details[1:], panels, strict=True):
         _show(ax, image, f"{name}\n{caption}" if caption else name)
         _show(detail, _middle(image), "")
         detail.set_xlabel(f"middle {config.object.width / 3:.0f} mm", fontsize=9)
     # No target's name can be taken for one of the study's own figures.
     save_figure(folder, f"target-{slug(target.name)}", figure)
+
+
+# More beside each other are too small to be read on a page.
+_BESIDE = 6
+
+
+def _pairs_of_axes(count: int, aspect: float):
+    """A figure with `count` places for a picture and, below each, its detail."""
+    bands = math.ceil(count / _BESIDE)
+    columns = math.ceil(count / bands)
+    size = (2.75 * columns, bands * (2.75 * (aspect + 1) + 1.25))
+    figure = Figure(figsize=size, layout="constrained")
+    axes = figure.subplots(2 * bands, columns, gridspec_kw={"height_ratios": (aspect, 1) * bands})
+    wholes, details = axes[::2].ravel(), axes[1::2].ravel()
+    for ax in axes.ravel():
+        ax.set_xticks([])
+        ax.set_yticks([])
+    for ax in (*wholes[count:], *details[count:]):
+        ax.set_axis_off()
+    return figure, wholes[:count], details[:count]
 
 
 def _caption(evaluation: Evaluation) -> str:
@@ -113,11 +128,12 @@ def _middle(image: np.ndarray) -> np.ndarray:
 
 
 def save_responses(folder: RunFolder, config: StudyConfig, responses: dict[str, Response]) -> None:
-    """Transfer functions of all methods, with their limits."""
-    figure = Figure(figsize=(8.5, 2.1 * len(responses) + 0.8), layout="constrained")
-    axes = np.atleast_1d(figure.subplots(len(responses), 1, sharex=True))
+    """Transfer functions of all methods, with their limits; methods of one synthesis share one."""
+    panels = _by_synthesis(config, responses)
+    figure = Figure(figsize=(8.5, 2.1 * len(panels) + 0.8), layout="constrained")
+    axes = np.atleast_1d(figure.subplots(len(panels), 1, sharex=True))
     end = max(r.metrics["cut_off_cycles_per_mm"] for r in responses.values()) * 1.4
-    for index, (ax, (name, response)) in enumerate(zip(axes, responses.items(), strict=True)):
+    for index, (ax, (name, response)) in enumerate(zip(axes, panels, strict=True)):
         level = low_frequency_value(response.frequency, response.magnitude)
         top = max(1.3, 1.05 * float(response.magnitude[1:].max()) / level)
         style = line_style(index) | {"marker": "", "linestyle": "-"}
@@ -137,6 +153,17 @@ def save_responses(folder: RunFolder, config: StudyConfig, responses: dict[str, 
         ax.set_title(name, fontsize=10, loc="left")
     axes[-1].set_xlabel("spatial frequency u on the reference sensor plane (cycles/mm), v = 0")
     save_figure(folder, "mtf", figure)
+
+
+def _by_synthesis(
+    config: StudyConfig, responses: dict[str, Response]
+) -> list[tuple[str, Response]]:
+    """Titles and responses: the methods that take the same captures and sums of them as one."""
+    names: dict[tuple, list[str]] = {}
+    for method in config.methods:
+        key = (method.shots, method.synthesis, method.shot_phases())
+        names.setdefault(key, []).append(method.name)
+    return [("; ".join(group), responses[group[0]]) for group in names.values()]
 
 
 def save_contrasts(folder: RunFolder, config: StudyConfig, contrasts: dict[str, list]) -> None:

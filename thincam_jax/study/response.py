@@ -21,7 +21,8 @@ class Response(NamedTuple):
     """A method's transfer function along u, v = 0, on its reference plane.
 
     - `frequency`: cycles/mm, ≥ 0.
-    - `magnitude`: root of the mean over the shots of Σ|H|² of a shot's channels, mm².
+    - `magnitude`: root of the mean over the shots of Σ|H|² of a shot's channels, mm²; contrasts
+      belong to all shots together.
     - `metrics`: its two limits, for metrics.json.
     """
 
@@ -42,8 +43,7 @@ def method_response(config: StudyConfig, method: MethodConfig) -> Response:
     reference = reference_distance(method)
     frequency = _frequencies(config)
     signed, powers = [], []
-    for index, shot in enumerate(method.shots):
-        channels = _shot_channels(config, method, index)
+    for shot, channels in _groups(config, method):
         ratio = reference / shot.distance
         # A frequency on the reference plane is ratio times higher on this shot's sensor.
         power = np.sum(np.abs(channels) ** 2, axis=0)
@@ -73,12 +73,17 @@ def _frequencies(config: StudyConfig) -> np.ndarray:
     return np.arange(columns - columns // 2) / (columns * config.sensor.pitch)
 
 
-def _shot_channels(config: StudyConfig, method: MethodConfig, shot: int) -> np.ndarray:
-    """Responses (channel, u) of the channels of one shot."""
+def _groups(config: StudyConfig, method: MethodConfig) -> list[tuple[ShotConfig, np.ndarray]]:
+    """Shots with the responses (channel, u) of their channels; one distance is one group."""
+    profiles = np.stack([_profile(config, s) for s in settings(config, method)])
+    if method.synthesis == "contrasts":
+        return [(method.shots[0], synthesis_matrix(method) @ profiles)]
     phases = len(method.shot_phases())
-    used = settings(config, method)[shot * phases : (shot + 1) * phases]
-    single = method.model_copy(update={"shots": (method.shots[shot],)})
-    return synthesis_matrix(single) @ np.stack([_profile(config, s) for s in used])
+    single = synthesis_matrix(method.model_copy(update={"shots": method.shots[:1]}))
+    return [
+        (shot, single @ profiles[index * phases : (index + 1) * phases])
+        for index, shot in enumerate(method.shots)
+    ]
 
 
 def _profile(config: StudyConfig, setting: Setting) -> np.ndarray:
