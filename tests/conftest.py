@@ -1,6 +1,8 @@
 """What every test runs with: float64, strict dtype promotion, checked types, no display."""
 
+import gc
 import os
+from pathlib import Path
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")  # set it to run the tests on another device
 os.environ["MPLBACKEND"] = "Agg"
@@ -20,3 +22,17 @@ jaxtyping.install_import_hook("thincam_jax", "beartype.beartype")
 def key() -> jax.Array:
     """A PRNG key, the same in every run; split it for more."""
     return jax.random.key(20260)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def few_programs():
+    """Drops the compiled programs of the modules before, once there are many.
+
+    Each is mapped into memory several times; Linux allows a process 65530 mappings, beyond which
+    the compiler crashes.
+    """
+    yield
+    mappings = Path("/proc/self/maps")
+    if mappings.exists() and mappings.read_bytes().count(b"\n") > 15_000:
+        jax.clear_caches()
+        gc.collect()

@@ -123,7 +123,7 @@ def test_its_fixed_point_is_the_minimiser_of_plain_admm():
     assert mixed.iterations < 0.8 * plain.iterations
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_before_the_history_is_full_it_is_admm():
     """And the residuals told are those of ADMM."""
     problem, _ = scenes.problem()
@@ -195,7 +195,7 @@ def test_new_values_are_not_compiled_anew():
     assert [program._cache_size() for program in programs] == sizes
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_single_precision_stays_and_is_near_to_double():
     problem, _ = scenes.problem()
     value, expected = few(scenes.single(problem)), few(problem)

@@ -89,6 +89,7 @@ def test_the_risk_estimate_finds_the_least_true_risk_on_the_sensor(key):
     assert estimate == pytest.approx(risk(tau), abs=0.15 * SENSOR[0] * SENSOR[1])
 
 
+@pytest.mark.thorough
 def test_learning_finds_the_least_error_of_known_images():
     pairs = [posed(seed, tau=0.3) for seed in (0, 1)]
     problems, truths = zip(*pairs, strict=True)

@@ -145,6 +145,19 @@ def test_it_adapts_until_it_is_told_not_to():
     assert [p.objective for p in outcome.history] == [100, 50, 49, 48, 47, 47]
 
 
+def test_it_does_not_adapt_where_the_objective_has_risen():
+    class Counted(Walk):
+        def adapt(self, state, residuals):
+            adapted.append(int(state))
+            return self, state
+
+    adapted = []
+    path = jnp.asarray([0.0, 50, 60, 40, 45, 30, 30])
+    first = jnp.full((1, 1, 1, 1), 100.0)
+    drive(Counted(path), first, iterations=6, tolerance=0.0, look_every=1, adapt_until=6)
+    assert adapted == [1, 3, 5, 6]
+
+
 def test_a_batch_is_judged_by_its_sum():
     class Batch(Walk):
         def image(self, state):

@@ -106,8 +106,9 @@ def drive(
     """Iterate until both residuals are below `tolerance`, or `iterations` are done.
 
     Every `look_every` iterations the objective and the residuals are taken, `callback` is called
-    (a true answer stops the run) and, up to iteration `adapt_until`, the method may adapt. Ctrl-C
-    ends the run with what was best until then.
+    (a true answer stops the run) and, up to iteration `adapt_until`, the method may adapt as long
+    as the objective falls: parameters that follow misleading residuals would spoil it. Ctrl-C ends
+    the run with what was best until then.
     """
     began = time.perf_counter()
     best, history, done = image, [_look_at(method, image)], 0
@@ -123,7 +124,8 @@ def drive(
             if not math.isfinite(progress.objective):
                 status = "non_finite"
                 break
-            if progress.objective <= min(p.objective for p in history):
+            falling = progress.objective <= min(p.objective for p in history)
+            if falling:
                 best = current
             history.append(progress)
             if max(progress.primal, progress.dual) < tolerance:
@@ -132,7 +134,7 @@ def drive(
             if callback is not None and callback(progress):
                 status = "stopped"
                 break
-            if done <= adapt_until:
+            if done <= adapt_until and falling:
                 method, state = method.adapt(state, residuals)
     except KeyboardInterrupt:
         status = "interrupted"
