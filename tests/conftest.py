@@ -33,6 +33,6 @@ def few_programs():
     """
     yield
     mappings = Path("/proc/self/maps")
-    if mappings.exists() and mappings.read_bytes().count(b"\n") > 15_000:
+    if mappings.exists() and mappings.read_bytes().count(b"\n") > 25_000:
         jax.clear_caches()
         gc.collect()

@@ -77,6 +77,7 @@ def test_values_are_right_within_their_errors(seed):
     np.testing.assert_allclose(np.std(fit.residual), noise, rtol=0.03)
 
 
+@pytest.mark.thorough
 def test_errors_grow_with_the_noise():
     """Seven unknowns, 10 dB: the errors claimed still cover those made."""
     fit = fit_psf(picture(TRUE, 3, snr_db=12.0), START, **LIGHT)

@@ -111,7 +111,7 @@ def test_with_balance_it_needs_a_fifth_on_a_zone_plate_in_colour():
     assert needed(outcome, goal) <= 100
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_its_fixed_point_is_the_minimiser_of_plain_admm():
     problem, _ = scenes.problem((9, 12), (7, 8), kernel=scenes.spots, tau=3e-3)
     plain, mixed = (
@@ -152,6 +152,7 @@ def test_a_mixture_that_is_worse_is_thrown_away():
     assert int(again.inside.iter_num) == 0
 
 
+@pytest.mark.thorough
 def test_a_history_begins_anew_with_other_penalties_and_keeps_the_image():
     problem, _ = scenes.problem()
     method = AndersonAdmm(problem)

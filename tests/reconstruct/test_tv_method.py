@@ -131,9 +131,9 @@ def test_single_precision_and_no_new_compilation():
     assert value.image.dtype == jnp.float32
     assert relative_l2(value.image, expected.image) < 1e-4
     assert all(np.isfinite(p[1:]).all() for p in value.history[1:])
-    sizes = tv_method._advance._cache_size(), tv_method._look._cache_size()
+    sizes = tv_method._advance._cache_size(), tv_method.step_and_residuals._cache_size()
     solve(scenes.rescaled(problem, 3.0), iterations=30, tolerance=0.0, relaxation=1.1)
-    assert sizes == (tv_method._advance._cache_size(), tv_method._look._cache_size())
+    assert sizes == (tv_method._advance._cache_size(), tv_method.step_and_residuals._cache_size())
     assert rig.correlation(expected.image, value.image) > 0.999
 
 

@@ -56,6 +56,7 @@ def test_the_objective_never_rises_and_two_steps_are_faster_than_one():
     assert np.all(np.array(values[-1]) < 0.5 * np.array(state.value))
 
 
+@pytest.mark.thorough
 def test_it_finds_the_minimum_of_another_method():
     problem, _ = scenes.problem(kernel=scenes.spots, tau=3e-3)
     for regulariser in (None, Sparsity(Wavelet("haar", 2))):

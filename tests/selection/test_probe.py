@@ -42,7 +42,10 @@ def value(case, model, **arguments):
         case_of((48, 80), 5.5e-3),  # the middle of the shadow
         case_of((75, 120), 0.07, centre=(0.3, -0.9)),  # all of it, and round it
         case_of((75, 120), 0.07, profile="binary"),
-        case_of((256, 100), 0.02, average=True, object_distance=20.0),
+        pytest.param(
+            case_of((256, 100), 0.02, average=True, object_distance=20.0),
+            marks=pytest.mark.thorough,
+        ),
     ],
     ids=["middle", "whole", "binary", "average"],
 )
@@ -79,7 +82,11 @@ def test_large_images_are_estimated(pitch, distance, average):
 
 @pytest.mark.parametrize(
     ("precision", "average", "oversampling"),
-    [("float32", False, 1), ("float64", False, 3), ("float32", True, 3)],
+    [
+        ("float32", False, 1),
+        ("float64", False, 3),
+        pytest.param("float32", True, 3, marks=pytest.mark.thorough),
+    ],
 )
 def test_sampled_models(precision, average, oversampling):
     """The angular spectrum's error within 5 % from one-dimensional transforms; the direct sum's

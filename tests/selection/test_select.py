@@ -43,11 +43,11 @@ def sampled_models(case):
     return found + (["rayleigh_sommerfeld"] if mask**2 * math.prod(fine) < SUMMANDS else [])
 
 
-@pytest.fixture(scope="module")
-def errors():
-    """(predicted, true) of all models for 500 random cameras, by (model, precision)."""
+@pytest.fixture(scope="module", params=[150, pytest.param(500, marks=pytest.mark.thorough)])
+def errors(request):
+    """(predicted, true) of all models for as many random cameras, by (model, precision)."""
     found = {}
-    for number, case in enumerate(cameras.random_cases(500, seed=7)):
+    for number, case in enumerate(cameras.random_cases(request.param, seed=7)):
         expected = cameras.expected(case)
         ways = [(model, "float32") for model in (*CLOSED, *sampled_models(case))]
         ways += [("separable", "float64")] if number < 60 else []
@@ -68,10 +68,10 @@ def errors():
 @pytest.mark.parametrize(
     ("model", "precision", "count"),
     [
-        *((model, "float32", 499) for model in CLOSED),
+        *((model, "float32", 149) for model in CLOSED),
         ("separable", "float64", 60),
-        ("angular_spectrum", "float32", 40),
-        ("rayleigh_sommerfeld", "float32", 20),
+        ("angular_spectrum", "float32", 10),
+        ("rayleigh_sommerfeld", "float32", 5),
     ],
 )
 def test_predictions_hold_over_random_cameras(errors, capsys, model, precision, count):
