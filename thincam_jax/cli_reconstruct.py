@@ -96,8 +96,15 @@ def reconstruct(
                 psf_channels=psf_channels,
             ),
         )
-        how = (method.replace("-", "_"), tau, iterations, coupling, field, flip, ridge)
-        recipe = runs.Recipe(*how)
+        recipe = runs.Recipe(
+            method=method.replace("-", "_"),
+            tau=tau,
+            iterations=iterations,
+            coupling=coupling,
+            field=field,
+            flip=flip,
+            ridge=ridge,
+        )
         output = runs.Output(out, linear, gamma, _white_balance(white_balance))
         end = _run(runs.plan_jobs(capture, sources, output), sources, recipe, output)
     except (MeasurementError, MemoryError, OSError) as error:

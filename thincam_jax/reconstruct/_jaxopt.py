@@ -17,7 +17,7 @@ from thincam_jax.reconstruct.problem import Deconvolution, misfit
 from thincam_jax.reconstruct.proximal_minimiser import total_misfit
 from thincam_jax.reconstruct.regulariser import AbstractRegulariser, no_dual, prox
 from thincam_jax.reconstruct.scaled import ScaledProblem
-from thincam_jax.reconstruct.tv_method import AdmmTotalVariation, step_and_residuals
+from thincam_jax.reconstruct.tv_method import AdmmTotalVariation, as_residuals, step_and_residuals
 
 
 class JaxoptState(eqx.Module):
@@ -128,10 +128,7 @@ class AndersonAdmm(AbstractMethod[AndersonState]):
     def look(self, state):
         """Its residuals are those of ADMM at the mixture."""
         state, numbers = _look_mixing(self.mixing, self._map(), state)
-        primal, dual, parts = jax.device_get(numbers)
-        return state, Residuals(
-            float(primal), float(dual), tuple((float(p), float(d)) for p, d in parts)
-        )
+        return state, as_residuals(numbers)
 
     def adapt(self, state, residuals):
         point = _point(self.plain.penalties, state)

@@ -10,12 +10,7 @@ from thincam_jax import _checks
 from thincam_jax.camera import LenslessCamera
 from thincam_jax.reconstruct.automatic import CANDIDATES, are_cameras
 from thincam_jax.reconstruct.drive import Callback
-from thincam_jax.reconstruct.regularised import (
-    Acceleration,
-    TauRule,
-    check_limits,
-    check_relaxation,
-)
+from thincam_jax.reconstruct.regularised import Acceleration, TauRule
 from thincam_jax.reconstruct.regulariser import AbstractRegulariser
 from thincam_jax.reconstruct.total_variation import TotalVariation
 
@@ -23,6 +18,7 @@ Method = Literal[
     "auto", "wiener", "fringe_scanning", "admm_tv", "fista", "twist", "ridge", "poisson"
 ]
 METHODS: tuple[Method, ...] = get_args(Method)
+# Computed from a model of the camera, not from a measured PSF.
 FILTERS = ("wiener", "fringe_scanning")
 
 _VARIATION = (
@@ -115,11 +111,25 @@ def _check_values(settings: Settings) -> None:
             raise ValueError(f"{name} is a {type(value).__name__}; give a {wanted}")
     if settings.rule is not None:
         _checks.choice("tau", settings.rule, get_args(TauRule))
-    check_limits(settings.at_most(1), settings.limit)
+    _check_limits(settings.at_most(1), settings.limit)
     if settings.relaxation is not None:
-        check_relaxation(settings.relaxation)
+        _check_relaxation(settings.relaxation)
     if settings.acceleration is not None:
         _checks.choice("acceleration", settings.acceleration, get_args(Acceleration))
+
+
+def _check_relaxation(relaxation) -> None:
+    """Whether ADMM converges with it."""
+    value = float(_checks.finite("relaxation", relaxation, "parts of one"))
+    if not 0 < value < 2:
+        raise ValueError(f"relaxation = {value:g} is out of range; give 0 < α < 2")
+
+
+def _check_limits(iterations: int, tolerance: float) -> None:
+    """When to end."""
+    if not isinstance(iterations, int) or iterations < 1:
+        raise ValueError(f"iterations = {iterations}; give a whole number of at least 1")
+    _checks.non_negative("tolerance", tolerance, "parts of one")
 
 
 def refuse_unused(method: str, **given) -> None:

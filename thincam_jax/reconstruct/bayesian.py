@@ -28,7 +28,7 @@ from thincam_jax.reconstruct.drive import Outcome
 from thincam_jax.reconstruct.poisson import solve_poisson
 from thincam_jax.reconstruct.problem import Deconvolution
 from thincam_jax.reconstruct.registration import distance_ratios
-from thincam_jax.reconstruct.regularised import check_limits, first_image
+from thincam_jax.reconstruct.regularised import first_image
 from thincam_jax.reconstruct.ridge import solve_ridge
 
 # Of the variation, in parts of the mean brightness. At 0.01 many counts are smoothed visibly more
@@ -49,7 +49,6 @@ def ridge_outcome(
     - `level`: brightness of the even image that explains the captures.
     - `ridge`: ρ_rel, see `absolute_ridge`.
     """
-    check_limits(iterations, tolerance)
     known = jnp.where(jnp.isfinite(level), level, 0)  # else the captures say what is wrong
     even = jnp.maximum(known, 0)[..., None, None, None]
     return solve_ridge(
@@ -81,7 +80,6 @@ def poisson_outcome(
     - `problem`: with the counts as captures and any noise variance.
     - `tau`: relative, see `counts_problem`.
     """
-    check_limits(iterations, tolerance)
     counts = counts_problem(problem, tau)
     return solve_poisson(
         counts,

@@ -74,15 +74,15 @@ def regularised(method: Iterative, recording: Recording, settings: Settings) -> 
     problem = problem_of(method, recording, settings)
     relaxation = settings.relaxation
     options = Options(
-        method,
-        settings.at_most(100),
-        settings.limit,
-        DEFAULT_RELAXATION if relaxation is None else relaxation,
-        upright(recording, settings.start),
-        settings.callback,
-        cast(TauRule | None, settings.rule),  # checked where it is used
-        settings.regulariser,
-        "none" if settings.acceleration is None else settings.acceleration,
+        method=method,
+        iterations=settings.at_most(100),
+        tolerance=settings.limit,
+        relaxation=DEFAULT_RELAXATION if relaxation is None else relaxation,
+        start=upright(recording, settings.start),
+        callback=settings.callback,
+        rule=cast(TauRule | None, settings.rule),  # checked with the settings
+        regulariser=settings.regulariser,
+        acceleration="none" if settings.acceleration is None else settings.acceleration,
     )
     solved = minimise(problem, options, even_start=recording.has_cameras)
     return reconstruction(recording, problem, solved, method, settings.number)

@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable
 
 import jax.numpy as jnp
+import optimistix
 from jaxtyping import Array, Float
 
 from thincam_jax.reconstruct.drive import Outcome, Progress, Status
@@ -33,6 +34,25 @@ def concluded(
         (before, after),
         iterations,
         time.perf_counter() - began,
+    )
+
+
+def concluded_by(
+    solution: optimistix.Solution,
+    start: Float[Array, "*batch channel plane y x"],
+    image: Float[Array, "*batch channel plane y x"],
+    objective: Callable[[Array], Array],
+    *,
+    began: float,
+) -> Outcome:
+    """The same of a solution of optimistix, which knows how it ended."""
+    return concluded(
+        start,
+        image,
+        objective,
+        converged=bool(solution.result == optimistix.RESULTS.successful),
+        iterations=int(solution.stats["num_steps"]),
+        began=began,
     )
 
 

@@ -25,7 +25,7 @@ from jaxtyping import Array, Float
 
 from thincam_jax import _checks
 from thincam_jax.reconstruct.drive import Outcome
-from thincam_jax.reconstruct.outcome import concluded
+from thincam_jax.reconstruct.outcome import concluded_by
 from thincam_jax.reconstruct.problem import Deconvolution, uniform_level
 from thincam_jax.reconstruct.scaled import start_image
 from thincam_jax.reconstruct.total_variation import TotalVariation
@@ -126,12 +126,11 @@ def solve_poisson(
         max_steps=iterations,
         throw=False,
     )
-    return concluded(
+    return concluded_by(
+        solution,
         start,
         counts.image(solution.value),
         eqx.Partial(poisson_objective, counts),
-        converged=bool(solution.result == optimistix.RESULTS.successful),
-        iterations=int(solution.stats["num_steps"]),
         began=began,
     )
 

@@ -25,7 +25,7 @@ from jaxtyping import Array, Float
 
 from thincam_jax import _checks
 from thincam_jax.reconstruct.drive import Outcome
-from thincam_jax.reconstruct.outcome import concluded
+from thincam_jax.reconstruct.outcome import concluded_by
 from thincam_jax.reconstruct.poisson import Counts, Link, even_start, mean_counts
 from thincam_jax.reconstruct.problem import Deconvolution
 from thincam_jax.reconstruct.ridge import curvature_scale
@@ -92,12 +92,11 @@ def solve_poisson_newton(
         max_steps=iterations,
         throw=False,
     )
-    return concluded(
+    return concluded_by(
+        solution,
         start,
         counts.image(solution.value),
         eqx.Partial(newton_objective, weighed),
-        converged=bool(solution.result == optimistix.RESULTS.successful),
-        iterations=int(solution.stats["num_steps"]),
         began=began,
     )
 

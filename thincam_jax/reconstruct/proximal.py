@@ -19,7 +19,7 @@ from thincam_jax import _checks
 from thincam_jax.reconstruct import _jaxopt
 from thincam_jax.reconstruct.drive import AbstractMethod, Callback, Outcome, Residuals, drive
 from thincam_jax.reconstruct.fista import Course, ProximalStep, relative_length
-from thincam_jax.reconstruct.outcome import concluded
+from thincam_jax.reconstruct.outcome import concluded_by
 from thincam_jax.reconstruct.problem import Deconvolution, misfit
 from thincam_jax.reconstruct.proximal_minimiser import AcceleratedProximal, total_misfit
 from thincam_jax.reconstruct.regulariser import AbstractRegulariser
@@ -143,12 +143,11 @@ def _in_one_run(method: ProximalGradient, start, iterations: int, tolerance: flo
         throw=False,
         adjoint=optimistix.RecursiveCheckpointAdjoint(),
     )
-    return concluded(
+    return concluded_by(
+        solution,
         start,
         solution.value * method.scaled.image_unit,
         method.objective,
-        converged=bool(solution.result == optimistix.RESULTS.successful),
-        iterations=int(solution.stats["num_steps"]),
         began=began,
     )
 

@@ -2,13 +2,12 @@
 
 import math
 import time
-from typing import Literal, NamedTuple, get_args
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from thincam_jax import _checks
 from thincam_jax.operators.crop_convolution import cut, place
 from thincam_jax.reconstruct._jaxopt import AndersonAdmm
 from thincam_jax.reconstruct.apart import Apart, worth_taking_apart
@@ -60,7 +59,6 @@ def minimise(problem: Deconvolution, options: Options, *, even_start: bool) -> S
     An even image explains the bright background of a zone aperture's capture at once, which would
     else take hundreds of iterations; a field that is mostly dark is nearer to zero.
     """
-    _check(options)
     image = first_image(problem, options.start, even=even_start)
     if problem.nonnegative:  # the best image so far may be this one
         image = jnp.maximum(image, 0)
@@ -147,26 +145,3 @@ def middle(image: Float[Array, "*batch y x"], shape) -> Float[Array, "*batch v u
 
 
 even_level = jax.jit(uniform_level)
-
-
-def _check(options: Options) -> None:
-    if options.rule is not None:
-        _checks.choice("tau", options.rule, get_args(TauRule))
-    _checks.choice("acceleration", options.acceleration, get_args(Acceleration))
-    check_limits(options.iterations, options.tolerance)
-    if options.method == "admm_tv":
-        check_relaxation(options.relaxation)
-
-
-def check_relaxation(relaxation) -> None:
-    """Whether ADMM converges with it."""
-    value = float(_checks.finite("relaxation", relaxation, "parts of one"))
-    if not 0 < value < 2:
-        raise ValueError(f"relaxation = {value:g} is out of range; give 0 < α < 2")
-
-
-def check_limits(iterations: int, tolerance: float) -> None:
-    """When to end."""
-    if not isinstance(iterations, int) or iterations < 1:
-        raise ValueError(f"iterations = {iterations}; give a whole number of at least 1")
-    _checks.non_negative("tolerance", tolerance, "parts of one")

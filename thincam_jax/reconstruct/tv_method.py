@@ -58,10 +58,7 @@ class AdmmTotalVariation(AbstractMethod[State]):
 
     def look(self, state):
         state, *numbers = step_and_residuals(self.splitting, self.penalties, self.relaxation, state)
-        primal, dual, parts = jax.device_get(numbers)
-        return state, Residuals(
-            float(primal), float(dual), tuple((float(p), float(d)) for p, d in parts)
-        )
+        return state, as_residuals(numbers)
 
     def adapt(self, state, residuals):
         """Residual balancing: μ ← μ·√(primal/dual) of each split, by at most 3 at a time.
@@ -79,6 +76,12 @@ class AdmmTotalVariation(AbstractMethod[State]):
 
 
 _ENOUGH = 1.2
+
+
+def as_residuals(numbers) -> Residuals:
+    """What `step_and_residuals` gives beside the state, as plain numbers."""
+    primal, dual, parts = jax.device_get(numbers)
+    return Residuals(float(primal), float(dual), tuple((float(p), float(d)) for p, d in parts))
 
 
 def _ratio(primal: float, dual: float) -> float:

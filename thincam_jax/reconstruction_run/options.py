@@ -8,13 +8,11 @@ from thincam_jax import _checks
 from thincam_jax.measured import MeasurementError, Preparation
 from thincam_jax.measured.display import WhiteBalance
 from thincam_jax.reconstruct import METHODS
-from thincam_jax.reconstruct.arguments import DEFAULT_RIDGE, DEFAULT_TAU, refuse_unused
+from thincam_jax.reconstruct.arguments import DEFAULT_RIDGE, DEFAULT_TAU, FILTERS, refuse_unused
 
-# They are computed from a model of the camera, not from a measured PSF.
-NEEDS_CAMERAS = ("wiener", "fringe_scanning")
 # Its captures are raw counts; prepared ones have their background taken away and a maximum of 1.
 NEEDS_COUNTS = ("poisson",)
-PSF_METHODS = tuple(m for m in METHODS if m not in (*NEEDS_CAMERAS, *NEEDS_COUNTS))
+PSF_METHODS = tuple(m for m in METHODS if m not in (*FILTERS, *NEEDS_COUNTS))
 
 # Far beyond any use; its product with the captures' units stays within float32.
 _LARGEST_TAU = 1e6
@@ -99,7 +97,7 @@ class Recipe:
     def _check_method(self) -> None:
         """Whether it is one, works from prepared captures, and uses what is given."""
         able = f"choose one of {', '.join(repr(m) for m in PSF_METHODS)}"
-        if self.method in NEEDS_CAMERAS:
+        if self.method in FILTERS:
             raise MeasurementError(
                 f"method {self.method!r} needs a model of the camera; with a measured PSF {able}"
             )
