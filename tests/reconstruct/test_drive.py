@@ -72,6 +72,20 @@ def test_the_first_image_is_kept_if_none_is_better():
     np.testing.assert_array_equal(outcome.image, 100.0)
 
 
+def test_it_counts_on_from_a_run_before():
+    """Of nine iterations four are done already."""
+    outcome = drive(
+        Walk(jnp.arange(30.0)),
+        jnp.full((1, 1, 1, 1), 100.0),
+        iterations=9,
+        tolerance=0.0,
+        look_every=3,
+        done=4,
+    )
+    assert [p.iteration for p in outcome.history] == [4, 7, 9]
+    assert [p.objective for p in outcome.history] == [100, 3, 5] and outcome.iterations == 9
+
+
 @pytest.mark.parametrize("iterations", [1, 2, 3, 11, 25])
 def test_the_count_is_exact(iterations):
     """Whatever it is divided into."""

@@ -91,6 +91,7 @@ Callback = Callable[[Progress], object]
 # With the iteration that is looked at, ten. Each run of a program gets its memory anew from the
 # system, which takes time for large windows: shared by nine iterations it does not matter.
 CHUNK = 9
+LOOK_EVERY = CHUNK + 1
 
 
 def drive(
@@ -99,19 +100,20 @@ def drive(
     *,
     iterations: int,
     tolerance: float,
-    look_every: int = 10,
+    look_every: int = LOOK_EVERY,
     adapt_until: int = 0,
     callback: Callback | None = None,
+    done: int = 0,
 ) -> Outcome:
     """Iterate until both residuals are below `tolerance`, or `iterations` are done.
 
     Every `look_every` iterations the objective and the residuals are taken, `callback` is called
     (a true answer stops the run) and, up to iteration `adapt_until`, the method may adapt as long
     as the objective falls: parameters that follow misleading residuals would spoil it. Ctrl-C ends
-    the run with what was best until then.
+    the run with what was best until then. Iterations count from `done`, those of a run before.
     """
     began = time.perf_counter()
-    best, history, done = image, [_look_at(method, image)], 0
+    best, history = image, [_look_at(method, image, done)]
     status: Status = "iterations_exhausted"
     try:
         state = method.start(image)
@@ -147,6 +149,6 @@ def _advance(method: AbstractMethod, state, count: int):
     return state
 
 
-def _look_at(method: AbstractMethod, image) -> Progress:
+def _look_at(method: AbstractMethod, image, done: int) -> Progress:
     nan = math.nan
-    return Progress(0, float(jnp.sum(method.objective(image))), nan, nan)
+    return Progress(done, float(jnp.sum(method.objective(image))), nan, nan)

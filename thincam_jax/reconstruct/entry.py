@@ -100,7 +100,9 @@ def reconstruct(
     - `relaxation` (admm_tv): 0 < α < 2, default 1.8. `acceleration` (admm_tv): "none", the default,
       or "anderson", which mixes the last five points; fewer iterations where nothing is relaxed,
       but each takes several times as long, and ten copies of the state are kept.
-    - `start` (admm_tv, fista, twist, poisson): a first image, such as an earlier result.
+    - `start` (admm_tv, fista, twist, poisson): a first image, such as an earlier result. By default
+      an even one with cameras and for poisson, else a black one. Where it is given admm_tv has no
+      first part without the even light, see docs/reconstruction.md.
     - `callback` (admm_tv, fista, twist): called with `Progress` every tenth iteration; a true
       answer stops the run. Ctrl-C returns the best image so far, with status "interrupted".
 

@@ -12,7 +12,8 @@ from thincam_jax.operators.crop_convolution import cut, place
 from thincam_jax.reconstruct._jaxopt import AndersonAdmm
 from thincam_jax.reconstruct.apart import Apart, worth_taking_apart
 from thincam_jax.reconstruct.choose_tau import SearchInterrupted, discrepancy_tau, sure_tau
-from thincam_jax.reconstruct.drive import AbstractMethod, Callback, Outcome, drive
+from thincam_jax.reconstruct.drive import LOOK_EVERY, AbstractMethod, Callback, Outcome, drive
+from thincam_jax.reconstruct.high_pass import Judged, high_passed, levelled
 from thincam_jax.reconstruct.problem import Deconvolution, uniform_level
 from thincam_jax.reconstruct.proximal import solve_proximal
 from thincam_jax.reconstruct.regulariser import AbstractRegulariser
@@ -26,6 +27,8 @@ Acceleration = Literal["none", "anderson"]
 # Penalties that go on changing make the objective jump: on the captures of tests/reconstruct/
 # test_acceleration.py ADMM then needs 1.4 to twice the iterations.
 _BALANCED = 30
+# Of the iterations for a biased camera, those without its even light.
+_FIRST_PART = 0.4
 
 
 class Options(NamedTuple):
@@ -63,6 +66,8 @@ def minimise(problem: Deconvolution, options: Options, *, even_start: bool) -> S
     if problem.nonnegative:  # the best image so far may be this one
         image = jnp.maximum(image, 0)
     if options.rule is None:
+        if even_start and options.start is None and options.method == "admm_tv":
+            return Solved(_by_admm_in_two(problem, image, options))
         return Solved(_iterate(problem, image, options))
     began = time.perf_counter()
     try:
@@ -81,14 +86,7 @@ def minimise(problem: Deconvolution, options: Options, *, even_start: bool) -> S
 def _iterate(problem: Deconvolution, image, options: Options) -> Outcome:
     """The method asked for."""
     if options.method == "admm_tv":
-        return drive(
-            admm_method(problem, options.relaxation, options.acceleration),
-            image,
-            iterations=options.iterations,
-            tolerance=options.tolerance,
-            adapt_until=min(_BALANCED, options.iterations // 2),
-            callback=options.callback,
-        )
+        return _by_admm(problem, image, options)
     solve = solve_proximal if options.method == "fista" else solve_two_step
     return solve(
         problem,
@@ -98,6 +96,54 @@ def _iterate(problem: Deconvolution, image, options: Options) -> Outcome:
         tolerance=options.tolerance,
         callback=options.callback,
     )
+
+
+def _by_admm(problem: Deconvolution, image, options: Options, done: int = 0) -> Outcome:
+    return drive(
+        admm_method(problem, options.relaxation, options.acceleration),
+        image,
+        iterations=options.iterations,
+        tolerance=options.tolerance,
+        adapt_until=done + min(_BALANCED, (options.iterations - done) // 2),
+        callback=options.callback,
+        done=done,
+    )
+
+
+def _by_admm_in_two(problem: Deconvolution, image, options: Options) -> Outcome:
+    """First without the even light, then with all of the data from the image so found."""
+    first = _without_even_light(problem, image, options)
+    if first is None:
+        return _by_admm(problem, image, options)
+    if first.status in ("stopped", "interrupted", "non_finite"):
+        return first
+    try:
+        second = _by_admm(problem, first.image, options, first.iterations)
+    except KeyboardInterrupt:  # before its iterations, which keep their own best image
+        return first._replace(status="interrupted")
+    return second._replace(
+        history=first.history + second.history[1:], seconds=first.seconds + second.seconds
+    )
+
+
+def _without_even_light(problem: Deconvolution, image, options: Options) -> Outcome | None:
+    """The first part of the iterations, levelled; None if the camera or their number asks for none.
+
+    Whole chunks between two looks, so that a callback sees every tenth iteration throughout.
+    """
+    count = LOOK_EVERY * round(_FIRST_PART * options.iterations / LOOK_EVERY)
+    easier = high_passed(problem) if count else None
+    if easier is None:
+        return None
+    outcome = drive(
+        Judged(admm_method(easier, options.relaxation, options.acceleration), problem),
+        image,
+        iterations=count,
+        tolerance=options.tolerance,
+        adapt_until=min(_BALANCED, count // 2),
+        callback=options.callback,
+    )
+    return outcome._replace(image=levelled(problem, outcome.image))
 
 
 def admm_method(
