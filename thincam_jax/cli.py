@@ -14,6 +14,7 @@ from thincam_jax import doctor as doctoring
 from thincam_jax.bench.console import accuracy_table, cost_table, verdict
 from thincam_jax.cli_reconstruct import reconstruct
 from thincam_jax.cli_refocus import refocus
+from thincam_jax.cli_sweep import sweep
 from thincam_jax.config import ConfigError, StudyConfig, load_config, slug
 from thincam_jax.config_refocus import RefocusConfig, load_experiment
 from thincam_jax.run import run_study, steps
@@ -29,6 +30,7 @@ app = typer.Typer(
 bench = typer.Typer(no_args_is_help=True, help="Measure what the models of a study cost.")
 app.add_typer(bench, name="bench")
 app.command()(reconstruct)
+app.command()(sweep)
 
 ConfigFile = Annotated[Path, typer.Argument(help="Experiment file (YAML); see configs/.")]
 Overrides = Annotated[

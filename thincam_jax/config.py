@@ -10,14 +10,12 @@ import yaml
 from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, PlainSerializer
 from pydantic_core import PydanticCustomError
 
+from thincam_jax.config_file import ConfigError as ConfigError
+from thincam_jax.config_file import override, read_raw
 from thincam_jax.psf import Model
 from thincam_jax.reconstruct.spectra import Prior
 from thincam_jax.targets import sample_images
 from thincam_jax.units import parse_quantity
-
-
-class ConfigError(ValueError):
-    """An experiment file that cannot be used; the message has a line for every fault."""
 
 
 def slug(name: str) -> str:
@@ -279,11 +277,21 @@ def load_as(model: type[Config], path: str | Path, overrides: tuple[str, ...] = 
     """Read an experiment file of the given sections, as `load_config` does a study."""
     path = Path(path)
     raw, places = read_raw(path)
-    asked = {_override(raw, override): f"--set {override}" for override in overrides}
+    asked = {override(raw, text): f"--set {text}" for text in overrides}
+    return check_as(model, raw, places, asked, f"{path}:1")
+
+
+def check_as(
+    model: type[Config], raw: dict, places: dict[tuple, str], asked: dict[tuple, str], top: str
+) -> Config:
+    """Check raw data; a fault names the setting that asked for it, else the place in the file.
+
+    `places` and `asked` are by location; `top` is the place of what has none.
+    """
     try:
         return model.model_validate(raw)
     except pydantic.ValidationError as error:
-        faults = [_fault(e, places, asked, f"{path}:1", model) for e in _own(error.errors())]
+        faults = [_fault(e, places, asked, top, model) for e in _own(error.errors())]
         raise ConfigError("\n".join(faults)) from None
 
 
@@ -301,104 +309,6 @@ def dump_config(config: pydantic.BaseModel) -> str:
     """The resolved study as YAML that `load_config` reads back to the same values."""
     data = config.model_dump(mode="json", exclude_none=True)
     return yaml.safe_dump(data, sort_keys=False, allow_unicode=True, width=100)
-
-
-def read_raw(path: Path) -> tuple[dict, dict[tuple, str]]:
-    """The raw data of a YAML file, and the file and line of every entry."""
-    if not path.is_file():
-        what = "a folder" if path.is_dir() else "missing"
-        raise FileNotFoundError(f"{path} is {what}; give the path of a YAML experiment file")
-    try:
-        text = path.read_text(encoding="utf-8")
-        node = yaml.compose(text, Loader=yaml.SafeLoader)
-        raw = yaml.safe_load(text)
-        places = {location: f"{path}:{line}" for location, line in _lines(node)}
-    except UnicodeDecodeError as error:
-        raise ConfigError(f"{path}: not a text file in UTF-8 ({error.reason})") from None
-    except yaml.YAMLError as error:
-        mark = getattr(error, "problem_mark", None)
-        line = f":{mark.line + 1}" if mark else ""
-        problem = getattr(error, "problem", None) or "not YAML"
-        raise ConfigError(f"{path}{line}: not valid YAML: {problem}") from None
-    except ValueError as error:  # such as a date that does not exist
-        raise ConfigError(f"{path}: not valid YAML: {error}; put texts in quotes") from None
-    except RecursionError:
-        raise ConfigError(f"{path}: nested too deeply, or an alias inside its anchor") from None
-    if not isinstance(raw, dict):
-        raise ConfigError(f"{path}:1: give a mapping of 'key: value' lines, beginning with 'name:'")
-    twice = [f"{path}:{line}: {message}" for line, message in _repeated_keys(node)]
-    if twice:
-        raise ConfigError("\n".join(twice))
-    return raw, places
-
-
-def _repeated_keys(node) -> list[tuple[int, str]]:
-    """Keys that stand twice in one mapping; PyYAML takes the last without a word."""
-    # An aliased part is reported once.
-    return sorted({entry for mapping in _mappings(node) for entry in _repeated_in(mapping)})
-
-
-def _mappings(node):
-    if isinstance(node, yaml.MappingNode):
-        yield node
-    if isinstance(node, yaml.CollectionNode):
-        for entry in node.value:
-            yield from _mappings(entry[1] if isinstance(entry, tuple) else entry)
-
-
-def _repeated_in(mapping: yaml.MappingNode):
-    first: dict[str, int] = {}
-    for key, _ in mapping.value:
-        line = key.start_mark.line + 1
-        if key.value in first:
-            before = f"first in line {first[key.value]}"
-            yield line, f"{key.value}: this key stands twice ({before}); keep one"
-        first.setdefault(key.value, line)
-
-
-def _lines(node, location: tuple = ()):
-    """(location, line) of every entry of a composed YAML document."""
-    if node is None:
-        return
-    yield location, node.start_mark.line + 1
-    if isinstance(node, yaml.MappingNode):
-        for key, value in node.value:
-            # Of a section, a reader looks for the line of its key.
-            yield (*location, key.value, "(key)"), key.start_mark.line + 1
-            yield from _lines(value, (*location, key.value))
-    elif isinstance(node, yaml.SequenceNode):
-        for index, value in enumerate(node.value):
-            yield from _lines(value, (*location, index))
-
-
-def _override(raw: Any, text: str) -> tuple:
-    """Set one value in the raw data; the path may name what is not there yet."""
-    path, equals, value = text.partition("=")
-    keys: list[Any] = [int(k) if k.isdecimal() else k for k in path.strip().split(".")]
-    if not equals or not all(str(k) for k in keys):
-        raise ConfigError(f"--set {text}: write it as a.b=value, such as mask.width=5.632mm")
-    here: Any = raw
-    for depth, key in enumerate(keys):
-        known = (isinstance(here, list) and isinstance(key, int) and key < len(here)) or isinstance(
-            here, dict
-        )
-        if not known:
-            parent = ".".join(str(k) for k in keys[:depth]) or "the file"
-            raise ConfigError(f"--set {text}: {parent} has no entry {key!r}")
-        if depth == len(keys) - 1:
-            here[key] = _override_value(text, value)
-        else:
-            here = here.setdefault(key, {}) if isinstance(here, dict) else here[key]
-    return tuple(keys)
-
-
-def _override_value(text: str, value: str) -> Any:
-    try:
-        return yaml.safe_load(value)
-    except (yaml.YAMLError, ValueError):
-        raise ConfigError(
-            f"--set {text}: {value!r} is not valid YAML; put texts in quotes"
-        ) from None
 
 
 def _place(location: tuple, places: dict, asked: dict, top: str) -> str:

@@ -26,8 +26,8 @@ from thincam_jax.config import (
     load_config,
     misfit,
     quantity,
-    read_raw,
 )
+from thincam_jax.config_file import read_raw
 from thincam_jax.depth.focus import Measure
 from thincam_jax.psf import Model
 from thincam_jax.reconstruct.spectra import Prior

@@ -16,6 +16,9 @@ OPTIONAL = {
     "pytest-benchmark": "benchmarks (make bench)",
     "mpmath": "tests",
     "hypothesis": "tests",
+    "dask": "sweeps (thincam sweep)",
+    "distributed": "sweeps (thincam sweep)",
+    "pyarrow": "sweeps (thincam sweep)",
 }
 
 

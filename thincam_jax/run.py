@@ -4,19 +4,14 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-import jax.numpy as jnp
-import numpy as np
-
 from thincam_jax.config import MethodConfig, StudyConfig, TargetConfig
 from thincam_jax.doctor import environment
 from thincam_jax.report import figures
 from thincam_jax.report.page import render
 from thincam_jax.study import build
-from thincam_jax.study.evaluate import Evaluation, evaluate
 from thincam_jax.study.folder import RunFolder, to_json
 from thincam_jax.study.response import Response, method_response
-
-Progress = Callable[[str], None]
+from thincam_jax.study.target import Progress, examine_target, mean_psnr_of_pictures
 
 
 def steps(config: StudyConfig) -> int:
@@ -64,27 +59,7 @@ def _run_target(
     progress: Progress,
 ) -> dict[str, Any]:
     """Captures, reconstructions and figures of one target."""
-    plane = build.build_plane(config, target)
-    captures: dict[build.Setting, build.Exposure] = {}
-    for number, setting in enumerate(build.all_settings(config)):
-        progress(f"{target.name}: capture {number + 1}")
-        key = build.capture_key(config, index, number)
-        captures[setting] = build.take(config, setting, plane, key)
-    evaluations: dict[str, Evaluation] = {}
-    for method in config.methods:
-        progress(f"{target.name}: {method.name}")
-        shape = build.field_shape(config, method, plane)
-        reconstructor = reconstructors.get((method.name, shape))
-        if reconstructor is None:
-            reconstructor = build.build_reconstructor(config, method, shape)
-            reconstructors[method.name, shape] = reconstructor
-        used = [captures[s] for s in build.settings(config, method)]
-        reconstruction = reconstructor(
-            jnp.asarray(np.stack([exposure.image for exposure in used])),
-            jnp.asarray(np.stack([exposure.variance for exposure in used])),
-        )
-        evaluations[method.name] = evaluate(config, method, target, plane, reconstruction)
-    first = captures[build.all_settings(config)[0]].image
+    first, evaluations = examine_target(config, index, target, reconstructors, progress)
     figures.save_target(folder, config, target, first, evaluations)
     contrasts = {m: e.contrast for m, e in evaluations.items() if e.contrast is not None}
     return {"metrics": {m: e.metrics for m, e in evaluations.items()}, "contrasts": contrasts}
@@ -95,17 +70,10 @@ def _collect(
 ) -> dict[str, Any]:
     methods = {}
     for method in config.methods:
-        photographs = [
-            results[t.name][method.name]["psnr_db"]
-            for t in config.targets
-            if t.kind in ("photograph", "file")
-        ]
-        photographs = [p for p in photographs if p is not None]  # exact ones have no PSNR
+        psnr_db = {t.name: results[t.name][method.name]["psnr_db"] for t in config.targets}
         methods[method.name] = {
             "captures": len(build.settings(config, method)),
-            "mean_psnr_of_pictures_db": (
-                round(float(np.mean(photographs)), 4) if photographs else None
-            ),
+            "mean_psnr_of_pictures_db": mean_psnr_of_pictures(config, psnr_db),
             "limits": responses[method.name].metrics,
             "targets": {t.name: results[t.name][method.name] for t in config.targets},
             "published": _published(config, method),

@@ -1,6 +1,7 @@
 """The run folder: what is in it, and how an interrupted study goes on."""
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,30 +26,12 @@ class RunFolder:
 
         An interrupted run of the same configuration goes on; a complete one is done anew.
         """
-        held = self.path / "config.yaml"
         text = dump_config(config)
-        try:
-            if held.exists():
-                if held.read_bytes() != text.encode("utf-8"):
-                    raise ConfigError(
-                        f"--out {self.path}: holds a run of another configuration (see {held}); "
-                        "give another folder or delete this one"
-                    )
-            elif self.path.exists() and any(self.path.iterdir()):
-                raise ConfigError(
-                    f"--out {self.path}: is not empty and holds no run; give a new folder"
-                )
-            for name in ("targets", "images", "figures"):
-                (self.path / name).mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise ConfigError(
-                f"--out {self.path}: cannot be made a folder ({error.strerror})"
-            ) from None
+        claim_folder(self.path, "config.yaml", text, "run", ("targets", "images", "figures"))
         if (self.path / "metrics.json").exists():
             for result in (self.path / "targets").glob("*.json"):
                 result.unlink()
             (self.path / "metrics.json").unlink()
-        self.write("config.yaml", text)
 
     def finished(self, target: str) -> dict[str, Any] | None:
         """The stored results of a target, or None if it has not been finished."""
@@ -64,6 +47,33 @@ class RunFolder:
     def write(self, name: str, content: str | bytes) -> Path:
         """Write a file of the folder, whole or not at all."""
         return write_whole(self.path / name, content)
+
+
+def claim_folder(path: Path, name: str, text: str, kind: str, folders: Sequence[str] = ()) -> None:
+    """Make a folder with `folders` in it, and write the file `name` that says what it holds.
+
+    `kind` is a word for what it holds. A folder that holds the same already is taken as it is.
+
+    **Errors**: ConfigError where it holds anything else, or cannot be made.
+    """
+    held = path / name
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        # A neighbour is all that is there where the first start was killed.
+        foreign = any(p.name != f"{name}.partial" for p in path.iterdir())
+        if held.exists():
+            if held.read_bytes() != text.encode("utf-8"):
+                raise ConfigError(
+                    f"--out {path}: holds a {kind} of another configuration (see {held}); "
+                    "give another folder or delete this one"
+                )
+        elif foreign:
+            raise ConfigError(f"--out {path}: is not empty and holds no {kind}; give a new folder")
+        write_whole(held, text)
+        for folder in folders:
+            (path / folder).mkdir(exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"--out {path}: cannot be made a folder ({error.strerror})") from None
 
 
 def to_json(data: Any) -> str:

@@ -1,0 +1,121 @@
+"""The text of an experiment file: YAML read with the lines of its entries, values set by path."""
+
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+
+class ConfigError(ValueError):
+    """An experiment file that cannot be used; the message has a line for every fault."""
+
+
+def read_raw(path: Path) -> tuple[dict, dict[tuple, str]]:
+    """The raw data of a YAML file, and the file and line of every entry."""
+    if not path.is_file():
+        what = "a folder" if path.is_dir() else "missing"
+        raise FileNotFoundError(f"{path} is {what}; give the path of a YAML experiment file")
+    try:
+        text = path.read_text(encoding="utf-8")
+        node = yaml.compose(text, Loader=yaml.SafeLoader)
+        raw = yaml.safe_load(text)
+        places = {location: f"{path}:{line}" for location, line in _lines(node)}
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{path}: not a text file in UTF-8 ({error.reason})") from None
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        line = f":{mark.line + 1}" if mark else ""
+        problem = getattr(error, "problem", None) or "not YAML"
+        raise ConfigError(f"{path}{line}: not valid YAML: {problem}") from None
+    except ValueError as error:  # such as a date that does not exist
+        raise ConfigError(f"{path}: not valid YAML: {error}; put texts in quotes") from None
+    except RecursionError:
+        raise ConfigError(f"{path}: nested too deeply, or an alias inside its anchor") from None
+    if not isinstance(raw, dict):
+        raise ConfigError(f"{path}:1: give a mapping of 'key: value' lines, beginning with 'name:'")
+    twice = [f"{path}:{line}: {message}" for line, message in _repeated_keys(node)]
+    if twice:
+        raise ConfigError("\n".join(twice))
+    return raw, places
+
+
+def _repeated_keys(node) -> list[tuple[int, str]]:
+    """Keys that stand twice in one mapping; PyYAML takes the last without a word."""
+    # An aliased part is reported once.
+    return sorted({entry for mapping in _mappings(node) for entry in _repeated_in(mapping)})
+
+
+def _mappings(node):
+    if isinstance(node, yaml.MappingNode):
+        yield node
+    if isinstance(node, yaml.CollectionNode):
+        for entry in node.value:
+            yield from _mappings(entry[1] if isinstance(entry, tuple) else entry)
+
+
+def _repeated_in(mapping: yaml.MappingNode):
+    first: dict[str, int] = {}
+    for key, _ in mapping.value:
+        line = key.start_mark.line + 1
+        if key.value in first:
+            before = f"first in line {first[key.value]}"
+            yield line, f"{key.value}: this key stands twice ({before}); keep one"
+        first.setdefault(key.value, line)
+
+
+def _lines(node, location: tuple = ()):
+    """(location, line) of every entry of a composed YAML document."""
+    if node is None:
+        return
+    yield location, node.start_mark.line + 1
+    if isinstance(node, yaml.MappingNode):
+        for key, value in node.value:
+            # Of a section, a reader looks for the line of its key.
+            yield (*location, key.value, "(key)"), key.start_mark.line + 1
+            yield from _lines(value, (*location, key.value))
+    elif isinstance(node, yaml.SequenceNode):
+        for index, value in enumerate(node.value):
+            yield from _lines(value, (*location, index))
+
+
+def override(raw: Any, text: str) -> tuple:
+    """Set one value in the raw data, by "a.b=value"; returns the path's keys.
+
+    The path may name what is not there yet.
+    """
+    path, equals, value = text.partition("=")
+    keys = path_keys(path)
+    if not equals or keys is None:
+        raise ConfigError(f"--set {text}: write it as a.b=value, such as mask.width=5.632mm")
+    set_entry(raw, keys, read_value(value, f"--set {text}"), f"--set {text}")
+    return keys
+
+
+def path_keys(path: str) -> tuple[str | int, ...] | None:
+    """The keys of a dotted path, list entries as numbers; None where one is empty."""
+    keys = path.strip().split(".")
+    return tuple(int(k) if k.isdecimal() else k for k in keys) if all(keys) else None
+
+
+def set_entry(raw: Any, keys: tuple, value: Any, asked: str) -> None:
+    """Set the entry at a path; `asked` is how the user asked for it, for the message."""
+    here: Any = raw
+    for depth, key in enumerate(keys):
+        known = (isinstance(here, list) and isinstance(key, int) and key < len(here)) or isinstance(
+            here, dict
+        )
+        if not known:
+            parent = ".".join(str(k) for k in keys[:depth]) or "the file"
+            raise ConfigError(f"{asked}: {parent} has no entry {key!r}")
+        if depth == len(keys) - 1:
+            here[key] = value
+        else:
+            here = here.setdefault(key, {}) if isinstance(here, dict) else here[key]
+
+
+def read_value(text: str, asked: str) -> Any:
+    """A value as YAML has it; `asked` is how the user asked for it, for the message."""
+    try:
+        return yaml.safe_load(text)
+    except (yaml.YAMLError, ValueError):
+        raise ConfigError(f"{asked}: {text!r} is not valid YAML; put texts in quotes") from None

@@ -1,0 +1,1 @@
+"""Sweeps: a study at every point of a grid, on worker processes, into a table."""
