@@ -102,7 +102,7 @@ def test_traced_numbers_need_the_switch(transform):
     assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize("transform", [jax.jit, jax.grad])
+@pytest.mark.parametrize("transform", [jax.jit, pytest.param(jax.grad, marks=pytest.mark.thorough)])
 def test_traced_numbers_with_the_switch(transform):
     """In float64 inside, in float32 outside; closer to the float64 result than float32 is."""
     single, double = single_camera()

@@ -111,7 +111,15 @@ def along(name: str) -> Parameters:
     return zero._replace(**{name: direction})
 
 
-@pytest.mark.parametrize("name", ["log_tau", "beta", "distance", "capture"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "log_tau",
+        "beta",
+        pytest.param("distance", marks=pytest.mark.thorough),
+        pytest.param("capture", marks=pytest.mark.thorough),
+    ],
+)
 def test_the_gradient_of_a_psnr_by_differences(name):
     """τ, β, d and the capture, through at most 200 iterations, to one part in a thousand.
 

@@ -178,7 +178,7 @@ def kill_half_way(file: Path, out: Path, grid: str, half: int) -> None:
     assert not alive
 
 
-def check_200(path: Path, wanted: list[int]) -> None:
+def check(path: Path, wanted: list[int]) -> None:
     assert [row["seed"] for row in rows(path)] == wanted
     assert len({row["point"] for row in rows(path)}) == len(wanted)
     psnr = [row["psnr_db/single/star"] for row in rows(path)]
@@ -186,29 +186,34 @@ def check_200(path: Path, wanted: list[int]) -> None:
     assert all(5 < value < 30 for value in psnr)
 
 
-def test_sweep_of_200_points_that_is_killed_half_way(tmp_path):
-    """It goes on with what is missing; with one point that always fails it has 199 rows."""
+@pytest.mark.parametrize("count", [24, pytest.param(200, marks=pytest.mark.thorough)])
+def test_sweep_that_is_killed_half_way(tmp_path, count):
+    """It goes on with what is missing; with one point that always fails it has one row less."""
     file, out = mini.write(tmp_path), tmp_path / "out"
-    kill_half_way(file, out, "seed=0:199:200", 100)
+    kill_half_way(file, out, f"seed=0:{count - 1}:{count}", count // 2)
     written = {part: part.stat().st_mtime_ns for part in out.glob("points/*.parquet")}
-    assert 100 <= len(written) < 200
+    assert count // 2 <= len(written) < count
     assert not (out / "results.parquet").exists()
-    done = finish(file, out, "seed=0:199:200")
+    done = finish(file, out, f"seed=0:{count - 1}:{count}")
     assert done.returncode == 0, done.stderr
     assert done.stderr == ""
-    assert f"200 of 200 points: {out / 'results.parquet'}" in done.stdout
-    check_200(out, list(range(200)))
+    assert f"{count} of {count} points: {out / 'results.parquet'}" in done.stdout
+    check(out, list(range(count)))
     assert {part: part.stat().st_mtime_ns for part in written} == written
     assert not (out / "failures.jsonl").exists()
 
     with jax.enable_x64(False):  # the precision of a user
-        done = call("sweep", file, "--out", out, "--grid", "seed=-1:198:200")
+        done = call("sweep", file, "--out", out, "--grid", f"seed=-1:{count - 2}:{count}")
     assert done.exit_code == 0
-    check_200(out, list(range(199)))
-    reason = "--grid seed=-1:198:200: seed: -1: input should be greater than or equal to 0"
+    check(out, list(range(count - 1)))
+    reason = (
+        f"--grid seed=-1:{count - 2}:{count}: seed: -1: input should be greater than or equal to 0"
+    )
     assert failures(out) == {(-1,): reason}
     (line,) = done.stderr.splitlines()
-    assert line.startswith(f"thincam: 1 of 200 points failed; the first (seed=-1): {reason}; all")
+    assert line.startswith(
+        f"thincam: 1 of {count} points failed; the first (seed=-1): {reason}; all"
+    )
 
 
 @pytest.mark.thorough
