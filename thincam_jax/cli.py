@@ -12,6 +12,7 @@ import typer
 from thincam_jax import bench as benches
 from thincam_jax import doctor as doctoring
 from thincam_jax.bench.console import accuracy_table, cost_table, verdict
+from thincam_jax.cli_design import design
 from thincam_jax.cli_reconstruct import reconstruct
 from thincam_jax.cli_refocus import refocus
 from thincam_jax.cli_sweep import sweep
@@ -31,6 +32,7 @@ bench = typer.Typer(no_args_is_help=True, help="Measure what the models of a stu
 app.add_typer(bench, name="bench")
 app.command()(reconstruct)
 app.command()(sweep)
+app.command()(design)
 
 ConfigFile = Annotated[Path, typer.Argument(help="Experiment file (YAML); see configs/.")]
 Overrides = Annotated[

@@ -307,7 +307,7 @@ def in_folder(config: Config, path: str | Path, entries: str) -> Config:
 
 def dump_config(config: pydantic.BaseModel) -> str:
     """The resolved study as YAML that `load_config` reads back to the same values."""
-    data = config.model_dump(mode="json", exclude_none=True)
+    data = config.model_dump(mode="json", exclude_none=True, by_alias=True)
     return yaml.safe_dump(data, sort_keys=False, allow_unicode=True, width=100)
 
 
@@ -390,8 +390,13 @@ def _allowed(location: tuple, model: Any) -> list[str]:
     for part in location:
         if isinstance(part, int):
             continue
-        section = _section_of(section.model_fields[part].annotation)
-    return list(section.model_fields)
+        section = _section_of(_keys(section)[part].annotation)
+    return list(_keys(section))
+
+
+def _keys(section: Any) -> dict[str, Any]:
+    """The fields of a section by what they are called in a file."""
+    return {field.alias or name: field for name, field in section.model_fields.items()}
 
 
 def _section_of(annotation: Any) -> Any:

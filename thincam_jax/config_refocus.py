@@ -132,6 +132,8 @@ def load_experiment(
     kind = read_raw(Path(path))[0].get("kind")
     if kind is None:
         return load_config(path, overrides)
+    if kind == "design":
+        raise ConfigError(f"{path}: kind: is a design; give it to 'thincam design'")
     if kind != "refocus":
         raise ConfigError(
             f"{path}: kind: {kind!r} is unknown; write 'kind: refocus', or leave it out for a study"

@@ -42,6 +42,7 @@ def test_scale_and_shift(scale, shift):
     assert float(found.shift_error.max()) < 0.02
 
 
+@pytest.mark.thorough
 def test_the_registered_reference_lies_on_the_capture():
     capture = blobs(1.05, (2.0, -3.0))
     found = estimate_registration(capture, blobs())

@@ -174,6 +174,7 @@ def test_it_is_the_minimiser_of_the_other_methods(name):
     assert int(cut_short[1]) == 7 and not bool(cut_short[2])
 
 
+@pytest.mark.thorough
 def test_a_batch_of_captures_by_vmap():
     """Values and gradients are those of each capture alone."""
     problem, _ = scenes.problem(captures=1, tau=0.05)

@@ -340,6 +340,7 @@ def test_what_has_no_first_part(wide_capture, monkeypatch):
     assert len(asked) == 1
 
 
+@pytest.mark.thorough
 def test_a_batch_is_iterated_apart(wide_capture):
     """Each of its images as if it stood elsewhere."""
     camera, image, variance, valid = wide_capture

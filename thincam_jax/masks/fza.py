@@ -1,6 +1,6 @@
 r"""The Fresnel zone aperture (FZA), thesis Eq 3.1."""
 
-from typing import Literal
+from typing import Any, Literal
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -57,7 +57,7 @@ class FresnelZoneAperture(AbstractMask):
     def __init__(
         self,
         beta,
-        phase=0.0,
+        phase: Any = 0.0,
         *,
         width,
         profile: Literal["cosine", "binary"] = "cosine",

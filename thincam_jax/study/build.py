@@ -119,8 +119,13 @@ class Exposure(NamedTuple):
 
 def take(config: StudyConfig, setting: Setting, plane: ImagePlane, key: Array) -> Exposure:
     """One capture of a target; its noise is that of the noise-free image."""
-    camera, noise = build_camera(config, setting), build_noise(config)
-    clean = imaging(config, camera, setting, plane)
+    camera = build_camera(config, setting)
+    return expose(config, camera, imaging(config, camera, setting, plane), key)
+
+
+def expose(config: StudyConfig, camera: LenslessCamera, clean: Array, key: Array) -> Exposure:
+    """What the sensor reads out of a noise-free image (channel, y, x)."""
+    noise = build_noise(config)
     if noise is None:
         variance = np.zeros(clean.shape[0], clean.dtype)
     else:

@@ -1,0 +1,253 @@
+"""The end-to-end objective against dense linear algebra and against differences."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import thincam_jax as tc
+from thincam_jax.design import (
+    Design,
+    DesignSpace,
+    PhotonNoise,
+    PowerLaw,
+    Setup,
+    SignalNoise,
+    Training,
+    Variable,
+    drawn_error,
+    end_to_end_error,
+    restore,
+    stochastic_descent,
+)
+from thincam_jax.grids import Grid
+from thincam_jax.reconstruct.synthesis import phase_pairs
+
+SENSOR, IMAGE = (20, 24), 14
+PAIR = (0.0, 1.5 * np.pi)
+
+
+def setup(noise=None):
+    return Setup(
+        pitch=0.08,
+        sensor_width=1.92,
+        object_distance=100.0,
+        object_width=20.0,
+        noise=noise or SignalNoise(30.0),
+        prior=PowerLaw(2.5),
+        contrast=0.4,
+    )
+
+
+def pictures(count=2):
+    rng = np.random.default_rng(3)
+    rough = rng.normal(size=(count, IMAGE, IMAGE)).cumsum(1).cumsum(2)
+    return 1 + 0.5 * rough / np.abs(rough).max(axis=(1, 2), keepdims=True)
+
+
+def training(noise=None, synthesis=None, **settings):
+    return Training(
+        pictures(),
+        setup(noise),
+        phase_pairs(2) if synthesis is None else synthesis,
+        sensor_shape=SENSOR,
+        longest_distance=7.0,
+        key=jax.random.key(5),
+        **{"tolerance": 1e-12, "steps": 600, **settings},
+    )
+
+
+def design(beta=(9.0, 7.0), distance=(5.03, 6.41), wavelength=5e-4, width=1.83):
+    pairs = [jnp.repeat(jnp.asarray(x), 2) for x in (beta, distance)]
+    return Design(pairs[0], jnp.asarray(PAIR * 2), pairs[1], wavelength=wavelength, width=width)
+
+
+def dense(chosen, given):
+    """Every linear map as a matrix, made one basis image at a time from `tc.psf` and sums."""
+    pitch = 1.92 / max(SENSOR)
+    sensor = tc.Sensor(SENSOR, pitch)
+    rows, columns = given.field_shape
+    grid = Grid((SENSOR[0] + rows - 1, SENSOR[1] + columns - 1), jnp.asarray(pitch))
+    maps = []
+    for k in range(4):
+        camera = tc.LenslessCamera(
+            tc.FresnelZoneAperture(chosen.beta[k], PAIR[k % 2], width=chosen.width),
+            sensor,
+            chosen.distance[k],
+        )
+        kernel = tc.psf(
+            camera,
+            wavelength=chosen.wavelength[k],
+            object_distance=100.0,
+            grid=grid,
+            pixel_integration=True,
+        )
+        kernel = np.asarray(kernel)[::-1, ::-1] * pitch**2
+        project = [
+            _overlaps(n, pitch, 20.0 * float(chosen.distance[k]) / 100.0) for n in (rows, columns)
+        ]
+        matrix = np.empty((*SENSOR, IMAGE, IMAGE))
+        for y in range(SENSOR[0]):
+            for x in range(SENSOR[1]):
+                y0, x0 = SENSOR[0] - 1 - y, SENSOR[1] - 1 - x
+                seen = kernel[y0 : y0 + rows, x0 : x0 + columns]
+                matrix[y, x] = project[0].T @ seen @ project[1]
+        maps.append(matrix.reshape(-1, IMAGE**2))
+    return maps
+
+
+def _overlaps(cells, pitch, width):
+    """Averages over cells of an image of IMAGE pixels that is `width` wide."""
+    lower = (np.arange(cells) - cells / 2) * pitch
+    edges = (np.arange(IMAGE + 1) / IMAGE - 0.5) * width
+    low = np.maximum(lower[:, None], edges[:-1])
+    high = np.minimum(lower[:, None] + pitch, edges[1:])
+    return np.maximum(high - low, 0) / pitch
+
+
+def prior_matrix():
+    """Covariance of the prior, from its spectrum, by the two-dimensional transform's matrix."""
+    step = 100.0 / 20.0
+    k = np.fft.fftfreq(IMAGE) * IMAGE * step
+    power = ((k[:, None] ** 2 + k**2) / step**2 + 1) ** -1.25
+    power = 0.4**2 * power / power.mean()
+    waves = np.fft.fft(np.eye(IMAGE), norm="ortho")
+    both = np.kron(waves, waves)
+    return np.real(both.conj().T @ np.diag(power.ravel()) @ both)
+
+
+@pytest.mark.parametrize(
+    "noise",
+    [pytest.param(SignalNoise(25.0), marks=pytest.mark.thorough), PhotonNoise(3000.0, 5.0)],
+)
+def test_restored_are_the_best_linear_estimates(noise):
+    given, chosen = training(noise), design()
+    maps = dense(chosen, given)
+    covariance = prior_matrix()
+    found = np.asarray(restore(chosen, given))
+    for image, drawn, restored in zip(given.images, given.noise, found, strict=True):
+        flat = np.asarray(image).ravel()
+        pairs = [maps[0] - maps[1], maps[2] - maps[3]]
+        precision, right = np.linalg.inv(covariance), 0.0
+        for c, pair in enumerate(pairs):
+            clean = [m @ flat for m in maps[2 * c : 2 * c + 2]]
+            variance = sum(float(noise.variance(g.mean(), g.var(), 1.0)) for g in clean)
+            captured = pair @ flat + np.sqrt(variance) * np.asarray(drawn[c]).ravel()
+            precision = precision + pair.T @ pair / variance
+            right = right + pair.T @ captured / variance
+        expected = np.linalg.solve(precision, right).reshape(IMAGE, IMAGE)
+        np.testing.assert_allclose(restored, expected, rtol=0, atol=1e-7)
+    images = np.asarray(given.images)
+    error = np.mean((found - images) ** 2, axis=(1, 2)) / np.var(images, axis=(1, 2))
+    assert float(end_to_end_error(chosen, given)) == pytest.approx(error.mean(), rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    "noise",
+    [SignalNoise(30.0), pytest.param(PhotonNoise(3000.0, 5.0), marks=pytest.mark.thorough)],
+)
+def test_gradient_through_the_solver_by_differences(noise):
+    given = training(noise)
+    place = jnp.array([9.0, 7.0, 5.03, 6.41, 5e-4, 1.83])
+
+    @jax.jit
+    def error(x):
+        return end_to_end_error(design(x[:2], x[2:4], x[4], x[5]), given)
+
+    slope = jax.grad(error)(place)
+    for index, value in enumerate(place):
+        # The projection averages over pixels whose borders pass each other: steps are short.
+        step = jnp.zeros(6).at[index].set(1e-6 * value)
+        difference = (error(place + step) - error(place - step)) / (2e-6 * value)
+        assert float(slope[index] / difference) == pytest.approx(1, abs=1e-4)
+
+
+@pytest.mark.thorough
+def test_more_noise_and_less_light_restore_less():
+    chosen = design()
+    errors = [float(end_to_end_error(chosen, training(SignalNoise(s)))) for s in (40.0, 20.0, 0.0)]
+    assert 0 < errors[0] < errors[1] < errors[2]
+    few, many = (training(PhotonNoise(e, 5.0)) for e in (300.0, 30_000.0))
+    assert float(end_to_end_error(chosen, few)) > float(end_to_end_error(chosen, many))
+
+
+def test_too_few_steps_are_told():
+    assert jnp.isnan(end_to_end_error(design(), training(steps=2)))
+
+
+def test_new_values_are_not_traced_again():
+    traces = []
+
+    @eqx.filter_jit
+    def error(chosen, given):
+        traces.append(1)
+        return end_to_end_error(chosen, given)
+
+    error(design(), training())
+    error(design((11.0, 8.0)), training(SignalNoise(20.0)))
+    assert len(traces) == 1
+
+
+def test_errors():
+    with pytest.raises(ValueError, match="square ones"):
+        Training(
+            np.ones((1, 4, 5)),
+            setup(),
+            phase_pairs(1),
+            sensor_shape=SENSOR,
+            longest_distance=7.0,
+            key=jax.random.key(0),
+        )
+    with pytest.raises(ValueError, match="adds 2 captures and the design takes 4"):
+        end_to_end_error(design(), training(synthesis=phase_pairs(1)))
+    with pytest.raises(ValueError, match="rows of zeros"):
+        training(synthesis=np.zeros((1, 4)))
+
+
+def quadratic(chosen, target, key):
+    """A bowl around a β of 10 and 14, shaken."""
+    shaken = target + 0.3 * jax.random.normal(key, target.shape)
+    return jnp.sum((chosen.beta[::2] - shaken) ** 2)
+
+
+def free_betas():
+    return DesignSpace(
+        design(), (Variable("beta", 5.0, 20.0, (0, 1)), Variable("beta", 5.0, 20.0, (2, 3)))
+    )
+
+
+def test_a_stochastic_descent_finds_the_mean():
+    target = jnp.array([10.0, 14.0])
+    found = stochastic_descent(
+        quadratic, free_betas(), target, jnp.array([0.9, 0.1]), key=jax.random.key(1), steps=400
+    )
+    np.testing.assert_allclose(found.values, target, atol=0.3)
+    assert found.skipped == 0 and found.history.shape == (400,)
+    assert float(jnp.mean(found.history[-50:])) < 0.05 * float(found.history[0])
+    np.testing.assert_allclose(found.design.beta, jnp.repeat(found.values, 2))
+
+
+def sometimes_nothing(chosen, target, key):
+    value = quadratic(chosen, target, key)
+    return jnp.where(jax.random.bernoulli(key, 0.2), jnp.nan, value)
+
+
+def test_steps_without_a_number_are_skipped_and_counted():
+    target = jnp.array([10.0, 14.0])
+    found = stochastic_descent(
+        sometimes_nothing,
+        free_betas(),
+        target,
+        jnp.array([0.5, 0.5]),
+        key=jax.random.key(1),
+        steps=200,
+    )
+    assert found.skipped == int(jnp.sum(jnp.isnan(found.history))) > 10
+    np.testing.assert_allclose(found.values, target, atol=0.4)
+
+
+def test_drawn_noise_is_other_noise_and_of_the_key():
+    given, chosen = training(), design()
+    errors = [float(drawn_error(chosen, given, jax.random.key(k))) for k in (0, 0, 1)]
+    assert errors[0] == errors[1] != errors[2]

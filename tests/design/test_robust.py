@@ -1,0 +1,140 @@
+"""Robust errors against samples of the errors they stand for."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from thincam_jax.design import (
+    Design,
+    Polar,
+    PowerLaw,
+    Setup,
+    SignalNoise,
+    Tolerances,
+    bayes_error,
+    channels,
+    mismatch_error,
+    robust_error,
+    shots,
+)
+from thincam_jax.reconstruct.synthesis import phase_pairs
+
+SETUP = Setup(
+    pitch=5.5e-3,
+    sensor_width=5.632,
+    object_distance=250.0,
+    object_width=180.0,
+    noise=SignalNoise(30.0),
+    prior=PowerLaw(2.8),
+)
+FREQUENCIES = Polar(jnp.asarray(200.0), 400, 2)
+PAIRS = jnp.asarray(phase_pairs(2))
+DESIGN = shots(jnp.array([25.0, 21.0]), 6.5, (0.0, 1.5 * np.pi), wavelength=5e-4, width=5.632)
+
+
+def known(design: Design, setup=SETUP):
+    return channels(design, setup, PAIRS, FREQUENCIES)
+
+
+def robust(tolerances, how="mean", design=DESIGN):
+    return float(robust_error(design, SETUP, PAIRS, FREQUENCIES, tolerances, how=how))
+
+
+def test_without_tolerances_it_is_the_bayes_error():
+    assert robust(Tolerances()) == float(bayes_error(known(DESIGN)))
+
+
+@pytest.mark.parametrize(
+    "name, size", [pytest.param("beta", 2e-4, marks=pytest.mark.thorough), ("distance", 2e-3)]
+)
+def test_the_mean_is_that_of_samples(name, size):
+    """Errors of this size cost a few per cent of the error, where the second order is good."""
+    rng = np.random.default_rng(2)
+    nominal = known(DESIGN)
+
+    @jax.jit
+    def of(shift):
+        moved = [DESIGN.beta, DESIGN.distance]
+        index = ["beta", "distance"].index(name)
+        moved[index] = moved[index] * (1 + shift) if name == "beta" else moved[index] + shift
+        other = Design(moved[0], DESIGN.phase, moved[1], wavelength=5e-4, width=5.632)
+        return mismatch_error(nominal, known(other))
+
+    # Both signs of each: what is odd in the errors cancels.
+    draws = size * rng.normal(size=(100, 4))
+    pairs = [(float(of(jnp.asarray(d))) + float(of(jnp.asarray(-d)))) / 2 for d in draws]
+    exact = float(bayes_error(nominal))
+    rise = robust(Tolerances(**{name: size})) - exact
+    spread = np.std(pairs) / np.sqrt(len(pairs))
+    assert rise > 5 * spread
+    assert rise == pytest.approx(np.mean(pairs) - exact, rel=0.05, abs=3 * spread)
+
+
+@pytest.mark.parametrize(
+    "tolerances",
+    [
+        pytest.param(Tolerances(beta=1e-3), marks=pytest.mark.thorough),
+        Tolerances(distance=0.02),
+        pytest.param(Tolerances(wavelength=5e-6), marks=pytest.mark.thorough),
+        pytest.param(Tolerances(object_distance=5.0), marks=pytest.mark.thorough),
+        Tolerances(tilt=0.01),
+    ],
+)
+def test_every_tolerance_costs_and_more_of_it_costs_more(tolerances):
+    exact = robust(Tolerances())
+    once, twice = robust(tolerances), robust(Tolerances(*(2 * t for t in tolerances)))
+    assert exact < once < twice
+
+
+def test_the_worst_is_above_each_and_near_the_largest():
+    tolerances = Tolerances(distance=0.02, wavelength=2e-6)
+    nominal, errors = known(DESIGN), []
+    for sign in (-1, 1):
+        for k in range(4):
+            moved = DESIGN.distance.at[k].add(sign * 0.02)
+            other = Design(DESIGN.beta, DESIGN.phase, moved, wavelength=5e-4, width=5.632)
+            errors.append(float(mismatch_error(nominal, known(other))))
+        other = Design(
+            DESIGN.beta, DESIGN.phase, DESIGN.distance, wavelength=5e-4 + sign * 2e-6, width=5.632
+        )
+        errors.append(float(mismatch_error(nominal, known(other))))
+    worst = robust(tolerances, "worst")
+    assert max(errors) <= worst <= max(errors) + 0.04 * robust(Tolerances())
+
+
+def test_a_tilt_counts_as_a_distance():
+    tilt = 0.01
+    depth = tilt * 5.632 / np.sqrt(12)
+    nominal, errors = known(DESIGN), []
+    for sign in (-1, 1):
+        other = Design(
+            DESIGN.beta, DESIGN.phase, DESIGN.distance + sign * depth, wavelength=5e-4, width=5.632
+        )
+        errors.append(float(mismatch_error(nominal, known(other))))
+    assert robust(Tolerances(tilt=tilt)) == pytest.approx(np.mean(errors), rel=1e-9)
+
+
+@pytest.mark.parametrize("how", ["worst", pytest.param("mean", marks=pytest.mark.thorough)])
+def test_gradient_by_differences(how):
+    tolerances = Tolerances(
+        beta=5e-4, distance=5e-3, wavelength=2e-6, object_distance=2.0, tilt=2e-3
+    )
+
+    @jax.jit
+    def error(x):
+        pairs = [jnp.repeat(v, 2) for v in (x[:2], x[2:4])]
+        chosen = Design(pairs[0], DESIGN.phase, pairs[1], wavelength=x[4], width=x[5])
+        return robust_error(chosen, SETUP, PAIRS, FREQUENCIES, tolerances, how=how)
+
+    place = jnp.array([25.0, 21.0, 6.3, 6.45, 5e-4, 5.6])
+    slope = jax.grad(error)(place)
+    for index, value in enumerate(place):
+        step = jnp.zeros(6).at[index].set(1e-6 * value)
+        difference = (error(place + step) - error(place - step)) / (2e-6 * value)
+        assert float(slope[index] / difference) == pytest.approx(1, abs=1e-4)
+
+
+def test_other_ways_are_refused():
+    with pytest.raises(Exception, match="median"):
+        robust(Tolerances(), how="median")

@@ -1,0 +1,135 @@
+"""What of a design is free: limits are kept at every point, and refused with their names."""
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from design.setting import thesis_design, two_betas
+
+from helpers import count_traces
+from thincam_jax.design import Design, DesignSpace, Limits, Variable, shots
+from thincam_jax.design.space import active_limits
+
+BASE = thesis_design()
+BETA = Variable("beta", 8.0, 36.0, (0, 1))
+LENGTH = Variable("distance", 2.0, 9.0, (0, 1, 2, 3))
+WIDE = Variable("width", 3.0, 8.0)
+
+
+def test_corners():
+    space = DesignSpace(BASE, (BETA, LENGTH), Limits(thickness=7.0))
+    low, high = space.design(jnp.zeros(2)), space.design(jnp.ones(2))
+    np.testing.assert_allclose(low.beta, [8, 8, 21, 21])
+    np.testing.assert_allclose(low.distance, 2.0)
+    np.testing.assert_allclose(high.beta, [36, 36, 21, 21])
+    np.testing.assert_allclose(high.distance, 7.0)
+    np.testing.assert_array_equal(high.phase, BASE.phase)
+    assert space.size == 2
+
+
+def test_mask_pixels_hold_for_every_width():
+    """β·width ≤ π/pixel at 500 random points of three variables and at the corners."""
+    pixel = 0.02
+    other = Variable("beta", 9.0, 60.0, (2, 3))
+    space = DesignSpace(BASE, (BETA, other, WIDE), Limits(mask_pixel=pixel))
+    assert [v.name for v in space.variables] == ["width", "beta", "beta"]
+    corners = np.stack(np.meshgrid(*[[0.0, 1.0]] * 3), axis=-1).reshape(-1, 3)
+    points = np.concatenate([np.random.default_rng(1).uniform(size=(500, 3)), corners])
+    designs = jax.jit(jax.vmap(space.design))(jnp.asarray(points))
+    finest = np.asarray(designs.beta * designs.width[:, None])
+    assert np.all(finest[:, [0, 2]] <= math.pi / pixel * (1 + 1e-12))
+    np.testing.assert_allclose(finest[:, [0, 2]].max(), math.pi / pixel, rtol=1e-12)
+    assert np.all((designs.width >= 3) & (designs.width <= 8))
+    assert np.all(designs.beta[:, 0] >= 8.0 - 1e-12)
+    assert np.all(designs.beta[:, 0] <= 36.0 + 1e-12)
+
+
+def test_mask_pixels_with_a_given_width():
+    space = DesignSpace(BASE, (BETA,), Limits(mask_pixel=0.02))
+    np.testing.assert_allclose(space.values(jnp.ones(1)), math.pi / 0.02 / 5.632)
+
+
+def test_mapped_and_compiled_once():
+    space = two_betas()
+    counted = count_traces(lambda space, points: jax.vmap(space.design)(points))
+    compiled = jax.jit(counted)
+    points = jnp.asarray([[0.0, 1.0], [0.5, 0.25], [1.0, 0.0]])
+    designs = compiled(space, points)
+    np.testing.assert_allclose(designs.beta[1], [22, 22, 15, 15])
+    assert designs.width.shape == (3,)
+    base = shots([24.0, 20.0], 6.0, (0.0, 1.0), wavelength=510e-6, width=5.0)
+    compiled(DesignSpace(base, space.variables), points)
+    assert counted.traces == 1
+
+
+def test_active_limits_in_words():
+    space = DesignSpace(BASE, (BETA, LENGTH, Variable("phase", -1.0, 1.0, (3,))), Limits(0.02, 7.0))
+    words = active_limits(space, jnp.asarray([1.0, 0.9999, 0.0]))
+    assert words == (
+        "beta of capture 1, 2 ≤ 27.8906 rad/mm^2 (mask pixels of 0.02 mm)",
+        "distance of capture 1, 2, 3, 4 ≤ 6.9995 mm (thickness of 7 mm)",
+        "phase of capture 4 ≥ -1 rad",
+    )
+    assert active_limits(space, jnp.full(3, 0.5)) == ()
+    assert active_limits(DesignSpace(BASE, (BETA,)), jnp.ones(1)) == (
+        "beta of capture 1, 2 ≤ 36 rad/mm^2",
+    )
+
+
+@pytest.mark.parametrize(
+    ("variables", "limits", "message"),
+    [
+        ((), None, "no variable is free"),
+        ((Variable("focus", 1.0, 2.0, (0,)),), None, "'focus' is unknown; choose one of beta"),  # pyright: ignore[reportArgumentType]
+        ((Variable("beta", 9.0, 8.0, (0,)),), None, "bounds of beta of capture 1 cross: 9 to 8"),
+        ((Variable("beta", 1.0, math.inf, (0,)),), None, "cross: 1 to inf"),
+        ((Variable("distance", 0.0, 8.0, (1,)),), None, "begin at 0 mm; give a lower bound above"),
+        ((Variable("width", 1.0, 8.0, (1,)),), None, "all captures share the width"),
+        ((Variable("beta", 1.0, 8.0),), None, "needs the captures it belongs to"),
+        ((Variable("beta", 1.0, 8.0, (4,)),), None, "the design has captures 1 to 4"),
+        ((BETA, Variable("beta", 1.0, 8.0, (1, 2))), None, "beta of capture 2, 3 is free twice"),
+        ((WIDE, WIDE), None, "width is free twice"),
+        ((BETA,), Limits(captures=3), "takes 4 captures, and the budget is 3"),
+        ((BETA,), Limits(thickness=6.0), "distance of capture 1 ≥ 6.5 mm conflicts with a thick"),
+        (
+            (Variable("distance", 6.1, 9.0, (0, 1, 2, 3)),),
+            Limits(thickness=6.0),
+            "distance of capture 1, 2, 3, 4 ≥ 6.1 mm conflicts with a thickness of at most 6 mm",
+        ),
+        (
+            (BETA,),
+            Limits(mask_pixel=0.03),
+            "beta of capture 3 ≥ 21 rad/mm.2 conflicts with mask pixels of 0.03 mm, which over a "
+            "width of 5.632 mm show at most 18.59",
+        ),
+        (
+            (WIDE,),
+            Limits(mask_pixel=0.02),
+            "width ≤ 8 mm conflicts with beta ≥ 25 rad/mm.2 on mask pixels of 0.02 mm; give a "
+            "width of at most 6.283 mm",
+        ),
+    ],
+)
+def test_refused(variables, limits, message):
+    with pytest.raises(ValueError, match=message):
+        DesignSpace(BASE, variables, limits)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"beta": [25.0, -1.0]}, "beta"),
+        ({"distance": [6.5, 0.0]}, "distance"),
+        ({"phase": math.nan}, "phase"),
+        ({"exposure": [1.0, 0.0]}, "exposure"),
+        ({"beta": [25.0] * 9}, "give 1 to 8"),
+    ],
+)
+def test_designs_refused(change, message):
+    numbers = {"beta": 25.0, "phase": 0.0, "distance": 6.5, "wavelength": 500e-6, "width": 5.6}
+    numbers |= change
+    positional = [numbers.pop(n) for n in ("beta", "phase", "distance")]
+    with pytest.raises(ValueError, match=message):
+        Design(*positional, **numbers)

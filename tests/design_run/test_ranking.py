@@ -1,0 +1,198 @@
+"""What surrounds a search: goals, ranking, tolerances, landscape."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from design_run import tiny
+
+from thincam_jax.config import ConfigError
+from thincam_jax.design import Quadrant, bayes_error, channels, limit, unevenness
+from thincam_jax.design.search import Found, Search
+from thincam_jax.design_run import Goal, broken_limits, build_problem, find, ranking
+
+
+@dataclasses.dataclass(frozen=True)
+class Bowl(Goal):
+    """1 + (β₁ − 20)² + 2 (β₂ − 15)² + d₁ of pairs; exactly with 0.3 (β₁ − 16)² more."""
+
+    def __call__(self, design, data):
+        first, second = design.beta[0], design.beta[2]
+        value = 1 + (first - 20) ** 2 + 2 * (second - 15) ** 2 + design.distance[0]
+        return value + (0.3 * (first - 16) ** 2 if isinstance(data.frequencies, Quadrant) else 0)
+
+
+BOWL = Bowl("bayes_error")
+
+
+@pytest.fixture(scope="module")
+def config(tmp_path_factory):
+    return tiny.design(tmp_path_factory.mktemp("find"))
+
+
+def bowl(config):
+    """A problem whose goal is known in closed form."""
+    return build_problem(config)._replace(goal=BOWL)
+
+
+def found_at(problem, *values) -> Found:
+    space = problem.space
+    point = (jnp.asarray(values) - space.lower) / (space.upper - space.lower)
+    design = space.design(point)
+    value = float(problem.goal(design, problem.data))
+    return Found(design, space.values(point), value, "converged", ("a",), point)
+
+
+@pytest.fixture
+def scored(monkeypatch):
+    """Scores by the goal alone: without responses there are no rings."""
+
+    def score(problem, design):
+        values = (float(problem.goal(design, data)) for data in (problem.data, problem.exact))
+        return *values, np.ones(64)
+
+    monkeypatch.setattr(ranking, "_score", score)
+
+
+def test_the_setup_is_that_of_the_file(config):
+    problem = build_problem(config)
+    setup, synthesis, frequencies = problem.exact
+    assert float(setup.sensor_width) == pytest.approx(48 * 0.04)  # the shorter side
+    assert float(setup.noise.snr_db) == 30
+    assert float(setup.prior.exponent) == 2.5
+    assert not setup.pixel_integration
+    assert synthesis.shape == (2, 4)
+    # Half of the pixels' Nyquist frequency, 12.5 cycles/mm, at 3 mm.
+    assert float(frequencies.highest) == pytest.approx(3.0 * 12.5 / 2)
+    assert float(problem.data.frequencies.highest) == pytest.approx(3.0 * 12.5 / 2)
+
+
+def test_measured_prior_and_photon_noise(tmp_path):
+    noise = "noise={read_noise: 4, electrons: 900}"
+    setup = build_problem(tiny.design(tmp_path, "prior={measured: true}", noise)).data.setup
+    assert 2.6 < float(setup.prior.exponent) < 9  # smooth blobs fall off faster than photographs
+    assert (float(setup.noise.electrons), float(setup.noise.read_noise)) == (900, 4)
+
+
+def test_goals_are_made_small_and_told_as_they_are(config):
+    problem, band = build_problem(config), (0.1, 0.6)
+    data, design = problem.data, problem.space.base
+    known = channels(design, data.setup, data.synthesis, data.frequencies)
+    error, edge, uneven, ratio = (
+        Goal(name, band) for name in ("bayes_error", "limit", "unevenness", "worst_ratio")
+    )
+    value = float(error(design, data))
+    assert value == pytest.approx(float(bayes_error(known)))
+    assert error.told(value) == pytest.approx(10 * np.log10(value))
+    assert error.gain(0.2, 0.1) == pytest.approx(3.0103, abs=1e-4)
+    assert error.rise(0.2) == pytest.approx(0.002)
+    value = float(edge(design, data))
+    assert value == pytest.approx(-float(limit(known, data.frequencies)))
+    expected = float(unevenness(known, data.frequencies, band))
+    assert float(uneven(design, data)) == pytest.approx(expected)
+    assert edge.told(value) == -value
+    assert value < 0
+    assert edge.gain(-10.0, -12.0) == pytest.approx(2.0)
+    assert uneven.gain(3.0, 2.0) == pytest.approx(1.0)
+    assert ratio.gain(-10.0, -12.0) == pytest.approx(2.0)
+    assert ratio.rise(40.0) == pytest.approx(10 * np.log10(1.01), abs=1e-4)
+    assert hash(error) == hash(Goal("bayes_error", band))  # compiled once
+    assert error == Goal("bayes_error", band) != edge
+
+
+def test_ranked_by_the_exact_value_and_orders_of_shots_are_one(config, scored):
+    problem = bowl(config)
+    betas = [(20.0, 15.0), (15.1, 19.9), (18.0, 15.0), (24.0, 15.0)]
+    found, best = ranking._rescore(problem, tuple(found_at(problem, *b) for b in betas), 2)
+    # Exactly: 4 + 4.8, 8 + 1.2, 20 + 19.2; 15.1, 19.9 is the first with its shots exchanged.
+    assert [[s.beta for s in one.shots] for one in found] == [
+        *(pytest.approx(b) for b in ((20, 15), (18, 15), (24, 15)))
+    ]
+    assert [one.exact for one in found] == pytest.approx([8.8, 9.2, 39.2])
+    assert [one.searched for one in found] == pytest.approx([4, 8, 20])
+    assert [one.name for one in found] == ["found 1", "found 2", "found 3"]
+    assert found[0].active == ("a",)
+    np.testing.assert_allclose(best.beta, [20, 20, 15, 15])
+    second, _ = ranking._rescore(
+        problem, (found_at(problem, 18.0, 15.0), found_at(problem, 20.0, 15.0)), 2
+    )
+    assert second[0].shots[0].beta == pytest.approx(20)  # the exact value counts
+
+
+def test_tolerance_is_a_change_of_one_per_cent(config, scored):
+    """At (20, 15) the goal is 4: one hundredth is 0.04 = δ₁² = 2 δ₂²."""
+    problem = bowl(config)
+    (one,), _ = ranking._rescore(problem, (found_at(problem, 20.0, 15.0),), 2)
+    first, second = one.values
+    assert (first.variable, first.shots, second.shots) == ("beta", (1,), (2,))
+    assert (first.value, second.value) == pytest.approx((20, 15))
+    assert first.tolerance == pytest.approx(0.2)
+    assert second.tolerance == pytest.approx(np.sqrt(0.02))
+    # Beside the optimum, where the goal is 5, the slope of 2 counts, too: 2 δ + δ² = 0.05.
+    (one,), _ = ranking._rescore(problem, (found_at(problem, 21.0, 15.0),), 2)
+    assert one.values[0].tolerance == pytest.approx(np.sqrt(1.05) - 1)
+
+
+@pytest.mark.parametrize(
+    ("slope", "curve", "rise", "change"),
+    [(0.0, 2.0, 0.01, 0.1), (2.0, 0.0, 0.01, 0.005), (-3.0, 8.0, 1.0, 0.25)],
+)
+def test_change_that_costs_a_rise(slope, curve, rise, change):
+    assert ranking._change(slope, curve, rise) == pytest.approx(change)
+
+
+def test_where_no_change_costs_anything():
+    assert ranking._change(0.0, 0.0, 1.0) is None
+    assert ranking._change(0.0, -1.0, 1.0) is None
+
+
+def test_landscape_of_two_variables(config):
+    problem = bowl(config)
+    around = ranking._landscape(problem, problem.space.base, 5, 2)
+    assert around.variables == (("beta", (1,)), ("beta", (2,)))
+    np.testing.assert_allclose(around.axes, [[12, 16.5, 21, 25.5, 30]] * 2)
+    assert around.goal.shape == (5, 5)
+    # Along the first axis the first variable: 1 + 3.5² + 2 · 10.5² + 3.
+    assert around.goal[1, 3] == pytest.approx(1 + 3.5**2 + 2 * 10.5**2 + 3)
+
+
+def test_landscape_of_one_and_of_three_variables(tmp_path):
+    """One is a line; of more, the first two, the others as in the best design."""
+    one = "{variable: beta, bounds: [12 /mm^2, 30 /mm^2], shared: true}"
+    moved = "reference.shots.1.distance=2.5 mm"
+    problem = bowl(tiny.design(tmp_path, f"search.free=[{one}]", moved))
+    line = ranking._landscape(problem, problem.space.base, 3, 2)
+    assert line.variables == (("beta", (1, 2)),)
+    np.testing.assert_allclose(
+        line.goal, [1 + (b - 20) ** 2 + 2 * (b - 15) ** 2 + 3 for b in (12, 21, 30)]
+    )
+    two = one.replace(", shared: true", "")
+    distance = "{variable: distance, bounds: [2 mm, 3 mm], shared: true}"
+    problem = bowl(tiny.design(tmp_path, f"search.free=[{two}, {distance}]"))
+    best = found_at(problem, 20.0, 17.0, 2.2).design
+    around = ranking._landscape(problem, best, 3, 2)
+    assert around.goal[0, -1] == pytest.approx(1 + 8**2 + 2 * 15**2 + 2.2)
+
+
+def test_limits_narrow_the_landscape(tmp_path):
+    """π / (0.08 mm · 2 mm) = 19.6 rad/mm²; at a thickness of 2 mm no room is left."""
+    config = tiny.design(tmp_path, "search.limits.mask_pixel=80 um")
+    problem = bowl(config)
+    around = ranking._landscape(problem, found_at(problem, 13.0, 13.0).design, 3, 2)
+    assert around.axes[0][-1] == pytest.approx(np.pi / 0.08 / 2)
+    assert [why[:12] for why in broken_limits(config)] == ["β of shot 1,", "β of shot 2,"]
+    config = tiny.design(
+        tmp_path,
+        "search.free=[{variable: distance, bounds: [2 mm, 3 mm]}]",
+        "search.limits.thickness=2 mm",
+    )
+    problem = bowl(config)
+    assert ranking._landscape(problem, problem.space.base, 3, 2) is None
+    assert len(broken_limits(config)) == 2
+
+
+def test_an_objective_that_is_no_number_is_refused(config, monkeypatch):
+    monkeypatch.setattr(ranking, "search", lambda *_, **__: Search((), 3, 3))
+    with pytest.raises(ConfigError, match="no number at any start"):
+        find(config, tiny.ignore)

@@ -1,0 +1,312 @@
+"""Experiment files of `kind: design`: what is free, what is wanted, and the design to beat."""
+
+import math
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import pydantic
+from pydantic import Field
+
+from thincam_jax.config import (
+    ConfigError,
+    Length,
+    MethodConfig,
+    Name,
+    ObjectConfig,
+    Section,
+    ShotConfig,
+    TargetConfig,
+    Wavelength,
+    check_names,
+    in_folder,
+    load_as,
+    misfit,
+    slug,
+)
+from thincam_jax.config_file import read_raw
+from thincam_jax.design import Design, DesignSpace, Limits, Variable, shots
+from thincam_jax.psf import Model
+from thincam_jax.units import parse_quantity
+
+Objective = Literal["bayes_error", "worst_ratio", "limit", "unevenness"]
+Part = Annotated[float, Field(ge=0, le=1)]
+_KINDS = {"beta": ("curvature", "rad/mm^2"), "distance": ("length", "mm")}
+# A band has to hold some of the 64 rings that the objectives average over.
+_NARROWEST_BAND = 1 / 16
+
+
+class PixelsConfig(Section):
+    """The sensor; of its two sides the search takes the shorter one."""
+
+    shape: tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]]
+    pitch: Length
+
+    @property
+    def width(self) -> float:
+        """Of the shorter side, mm."""
+        return min(self.shape) * self.pitch
+
+
+class ApertureConfig(Section):
+    """What all masks share."""
+
+    width: Length
+    profile: Literal["cosine", "binary"] = "cosine"
+
+
+class DesignNoiseConfig(Section):
+    """Gaussian noise at an SNR of the captures' variance, or shot and read noise.
+
+    `electrons` are those of a pixel from each mm² of open aperture, before a white scene.
+    """
+
+    snr_db: Annotated[float, Field(ge=-60, le=200)] | None = None
+    read_noise: Annotated[float, Field(ge=0)] | None = None
+    electrons: Annotated[float, Field(gt=0)] | None = None
+
+    @pydantic.model_validator(mode="after")
+    def _one(self):
+        if (self.snr_db is None) == (self.read_noise is None):
+            raise ValueError("give either snr_db (Gaussian noise) or read_noise (shot noise too)")
+        if (self.read_noise is None) != (self.electrons is None):
+            raise ValueError("read_noise and electrons belong together; give both, or snr_db")
+        return self
+
+
+class PriorConfig(Section):
+    """The scene's spectrum: a power law, its exponent given or measured on the photographs.
+
+    `contrast`: standard deviation of the scene over its mean; shot noise depends on it.
+    """
+
+    exponent: Annotated[float, Field(ge=0, le=6)] | None = None
+    measured: bool = False
+    contrast: Annotated[float, Field(gt=0, le=10)] = 0.5
+
+    @pydantic.model_validator(mode="after")
+    def _one(self):
+        if (self.exponent is None) != self.measured:
+            raise ValueError("give either exponent, such as 2.8, or measured: true")
+        return self
+
+
+class ReferenceConfig(Section):
+    """The design to beat; found designs take as many shots, with the same synthesis."""
+
+    name: Name = "reference"
+    synthesis: Literal["phase_pairs", "fringe_scanning"]
+    shots: Annotated[tuple[ShotConfig, ...], Field(min_length=1)]
+
+    def method(self) -> MethodConfig:
+        """The same as a method of a study."""
+        return MethodConfig(
+            name=self.name, kind="wiener", synthesis=self.synthesis, shots=self.shots
+        )
+
+
+class FreeConfig(Section):
+    """One variable that is free, at every shot for itself, or as one number that they share.
+
+    `shots`: at which of them, counted from 1; default all.
+    """
+
+    variable: Literal["beta", "distance"]
+    bounds: tuple[float, float]
+    shared: bool = False
+    shots: Annotated[tuple[Annotated[int, Field(ge=1)], ...], Field(min_length=1)] | None = None
+
+    @pydantic.field_validator("bounds", mode="before")
+    @classmethod
+    def _read(cls, given: Any, info: Any) -> Any:
+        if "variable" not in info.data:  # told by itself; of which kind these are is not known
+            return (1.0, 1.0)
+        if not isinstance(given, list | tuple) or len(given) != 2:
+            raise ValueError(f"{given!r} is no pair; give [lowest, highest]")
+        kind, unit = _KINDS[info.data["variable"]]
+        lower, upper = (parse_quantity(text, kind) for text in given)
+        if not (math.isfinite(lower) and math.isfinite(upper) and lower > 0):
+            raise ValueError(f"{lower:g} to {upper:g} {unit}; give bounds above zero")
+        if not lower < upper:
+            raise ValueError(f"bounds cross: {lower:g} to {upper:g} {unit}; give the lower first")
+        return (lower, upper)
+
+    @pydantic.field_serializer("bounds")
+    def _write(self, bounds: tuple[float, float]) -> list[str]:
+        return [f"{value!r} {_KINDS[self.variable][1]}" for value in bounds]
+
+
+class LimitsConfig(Section):
+    """`thincam_jax.design.Limits`."""
+
+    mask_pixel: Length | None = None
+    thickness: Length | None = None
+    captures: Annotated[int, Field(ge=1, le=8)] = 8
+
+
+class FrequenciesConfig(Section):
+    """How finely responses are sampled: radii and directions of the search, the exact square.
+
+    `exact`: along each axis; default as many as the responses' fringes need.
+    """
+
+    radii: Annotated[int, Field(ge=64, le=8192)] = 1024
+    directions: Annotated[int, Field(ge=1, le=16)] = 3
+    exact: Annotated[int, Field(ge=64, le=4096)] | None = None
+
+
+class SearchConfig(Section):
+    """What is free, within which limits, what is wanted, and how long to search.
+
+    `band`: of `worst_ratio` and `unevenness`, as parts of half of the pixels' Nyquist frequency.
+    `grid`: points along each side of the landscape.
+    """
+
+    free: Annotated[tuple[FreeConfig, ...], Field(min_length=1)]
+    limits: LimitsConfig = LimitsConfig()
+    objective: Objective = "bayes_error"
+    band: tuple[Part, Part] | None = None
+    starts: Annotated[int, Field(ge=1, le=1000)] = 16
+    samples: Annotated[int, Field(ge=1, le=100_000)] = 256
+    steps: Annotated[int, Field(ge=1, le=1000)] = 60
+    solver: Literal["bfgs", "lbfgsb"] = "bfgs"
+    grid: Annotated[int, Field(ge=5, le=501)] = 61
+    frequencies: FrequenciesConfig = FrequenciesConfig()
+
+    @pydantic.model_validator(mode="after")
+    def _band(self):
+        if self.objective not in ("worst_ratio", "unevenness"):
+            if self.band is not None:
+                raise ValueError(f"objective {self.objective} has no band; drop 'band'")
+        elif self.band is not None and not self.band[1] - self.band[0] >= _NARROWEST_BAND:
+            raise ValueError(
+                f"band {self.band[0]:g} to {self.band[1]:g} is too narrow; give the lower first "
+                f"and one at least {_NARROWEST_BAND:g} wide"
+            )
+        return self
+
+
+class ValidateConfig(Section):
+    """The full simulation: how many of the found designs, and noise from how many seeds."""
+
+    seeds: Annotated[int, Field(ge=1, le=100)] = 5
+    best: Annotated[int, Field(ge=1, le=10)] = 3
+
+
+class DesignConfig(Section):
+    """A search for the best design, and its simulation beside the design to beat."""
+
+    name: Name
+    kind: Literal["design"]
+    title: str = ""
+    seed: Annotated[int, Field(ge=0, lt=2**32, strict=True)] = 0
+    wavelength: Wavelength
+    model: Model = "separable"
+    pixel_integration: bool = True
+    sensor: PixelsConfig
+    mask: ApertureConfig
+    object: ObjectConfig
+    noise: DesignNoiseConfig
+    prior: PriorConfig = PriorConfig(measured=True)
+    reference: ReferenceConfig
+    search: SearchConfig
+    targets: Annotated[tuple[TargetConfig, ...], Field(min_length=1)]
+    # Not `validate`, which pydantic has for itself.
+    validation: ValidateConfig = Field(default=ValidateConfig(), alias="validate")
+    notes: tuple[str, ...] = ()
+
+    @pydantic.model_validator(mode="after")
+    def _fits(self):
+        check_names(self, "targets")
+        _check_reference(self)
+        if self.prior.measured and not self.pictures():
+            message = "measured needs a photograph among the targets; give prior.exponent instead"
+            raise misfit(message, "prior", "measured")
+        try:
+            self.space()
+        except ValueError as error:
+            raise misfit(str(error), "search", _blamed(str(error))) from None
+        return self
+
+    def pictures(self) -> tuple[TargetConfig, ...]:
+        """The targets that are photographs or image files."""
+        return tuple(t for t in self.targets if t.kind in ("photograph", "file"))
+
+    def reference_design(self) -> Design:
+        """The design to beat."""
+        method = self.reference.method()
+        return shots(
+            [s.beta for s in method.shots],
+            [s.distance for s in method.shots],
+            method.shot_phases(),
+            wavelength=self.wavelength,
+            width=self.mask.width,
+            profile=self.mask.profile,
+        )
+
+    def space(self) -> DesignSpace:
+        """What is searched; ValueError where no design keeps the limits."""
+        limits = Limits(**dict(self.search.limits))
+        return DesignSpace(self.reference_design(), tuple(_variables(self)), limits)
+
+    def nearest(self) -> float:
+        """The shortest distance of mask and sensor that is looked at, mm."""
+        reference = min(s.distance for s in self.reference.shots)
+        bounds = [f.bounds[0] for f in self.search.free if f.variable == "distance"]
+        return min(reference, *bounds, math.inf)
+
+    def farthest(self) -> float:
+        """The longest distance of mask and sensor that is looked at, mm."""
+        reference = max(s.distance for s in self.reference.shots)
+        bounds = [f.bounds[1] for f in self.search.free if f.variable == "distance"]
+        limit = self.search.limits.thickness or math.inf
+        return max(reference, *(min(b, limit) for b in bounds), 0.0)
+
+
+def found_name(rank: int) -> str:
+    """What the found design of a rank, from 1, is called."""
+    return f"found {rank}"
+
+
+def _variables(config: DesignConfig):
+    """The free numbers, each with the captures it belongs to."""
+    phases = len(config.reference.method().shot_phases())
+    for free in config.search.free:
+        chosen = free.shots or tuple(range(1, len(config.reference.shots) + 1))
+        groups = [tuple((s - 1) * phases + p for p in range(phases)) for s in chosen]
+        if free.shared:
+            groups = [tuple(c for group in groups for c in group)]
+        for group in groups:
+            yield Variable(free.variable, *free.bounds, group)
+
+
+def _check_reference(config: DesignConfig) -> None:
+    shots = [(s.beta, s.distance) for s in config.reference.shots]
+    if len(set(shots)) < len(shots):
+        raise misfit("shots hold an entry twice; give each once", "reference", "shots")
+    for index, shot in enumerate(config.reference.shots):
+        if shot.wavelength not in (None, config.wavelength):
+            message = "a design has one wavelength; drop this one"
+            raise misfit(message, "reference", "shots", index, "wavelength")
+    taken = [slug(found_name(rank)) for rank in range(1, config.validation.best + 1)]
+    if slug(config.reference.name) in taken:
+        message = f"{config.reference.name!r} is what found designs are called; choose another name"
+        raise misfit(message, "reference", "name")
+
+
+def _blamed(message: str) -> str:
+    """The entry of `search` that a message of the space is about."""
+    if "conflicts" in message or "feasible" in message:
+        return "limits"
+    return "free"
+
+
+def load_design(path: str | Path, overrides: tuple[str, ...] = ()) -> DesignConfig:
+    """Read and check a design's file; errors as of `thincam_jax.config.load_config`."""
+    kind = read_raw(Path(path))[0].get("kind")
+    if kind != "design":
+        told = "is a study" if kind is None else f"is of kind {kind!r}"
+        raise ConfigError(
+            f"{path}: kind: {told}, for 'thincam run'; a file for 'thincam design' has "
+            "'kind: design'"
+        )
+    return in_folder(load_as(DesignConfig, path, overrides), path, "targets")

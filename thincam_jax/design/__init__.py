@@ -1,0 +1,29 @@
+"""Finding the best camera by gradient: objectives, what is free, and the search."""
+
+from thincam_jax.design.design import Design as Design
+from thincam_jax.design.design import shots as shots
+from thincam_jax.design.end_to_end import Training as Training
+from thincam_jax.design.end_to_end import drawn_error as drawn_error
+from thincam_jax.design.end_to_end import end_to_end_error as end_to_end_error
+from thincam_jax.design.end_to_end import restore as restore
+from thincam_jax.design.frequencies import Polar as Polar
+from thincam_jax.design.frequencies import Quadrant as Quadrant
+from thincam_jax.design.objectives import bayes_error as bayes_error
+from thincam_jax.design.objectives import channels as channels
+from thincam_jax.design.objectives import limit as limit
+from thincam_jax.design.objectives import mismatch_error as mismatch_error
+from thincam_jax.design.objectives import unevenness as unevenness
+from thincam_jax.design.objectives import worst_ratio_db as worst_ratio_db
+from thincam_jax.design.prior import PowerLaw as PowerLaw
+from thincam_jax.design.prior import fit_power_law as fit_power_law
+from thincam_jax.design.robust import Tolerances as Tolerances
+from thincam_jax.design.robust import robust_error as robust_error
+from thincam_jax.design.search import landscape as landscape
+from thincam_jax.design.search import search as search
+from thincam_jax.design.setup import PhotonNoise as PhotonNoise
+from thincam_jax.design.setup import Setup as Setup
+from thincam_jax.design.setup import SignalNoise as SignalNoise
+from thincam_jax.design.space import DesignSpace as DesignSpace
+from thincam_jax.design.space import Limits as Limits
+from thincam_jax.design.space import Variable as Variable
+from thincam_jax.design.stochastic import stochastic_descent as stochastic_descent

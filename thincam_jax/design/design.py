@@ -1,0 +1,102 @@
+"""What a design chooses: the captures of a lensless camera."""
+
+from typing import Literal
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from thincam_jax import _checks
+from thincam_jax.camera import LenslessCamera
+from thincam_jax.masks.fza import FresnelZoneAperture
+from thincam_jax.sensor import Sensor
+
+MOST_CAPTURES = 8
+
+
+class Design(eqx.Module):
+    """Captures with Fresnel zone apertures; every number may be searched for.
+
+    - `beta`: β of each capture's mask, rad/mm².
+    - `phase`: its initial phase, rad.
+    - `distance`: mask to sensor, mm.
+    - `wavelength`: mm.
+    - `exposure`: its share of the exposure time, relative to the others.
+    - `width`: of all masks, mm.
+    """
+
+    beta: Float[Array, " capture"]
+    phase: Float[Array, " capture"]
+    distance: Float[Array, " capture"]
+    wavelength: Float[Array, " capture"]
+    exposure: Float[Array, " capture"]
+    width: Float[Array, ""]
+    profile: Literal["cosine", "binary"] = eqx.field(static=True)
+
+    def __init__(
+        self,
+        beta,
+        phase,
+        distance,
+        *,
+        wavelength,
+        width,
+        exposure=1.0,
+        profile: Literal["cosine", "binary"] = "cosine",
+    ):
+        """Numbers, or one for each capture: they are broadcast against each other.
+
+        **Errors**: ValueError for no capture, more than eight, or a number out of range.
+        """
+        given = (
+            _checks.positive_all("beta", jnp.asarray(beta, float), "rad/mm^2"),
+            _finite("phase", jnp.asarray(phase, float), "rad"),
+            _checks.positive_all("distance", jnp.asarray(distance, float), "mm"),
+            _checks.positive_all("wavelength", jnp.asarray(wavelength, float), "mm"),
+            _checks.positive_all("exposure", jnp.asarray(exposure, float), "shares"),
+        )
+        shape = jnp.broadcast_shapes((1,), *(g.shape for g in given))
+        if len(shape) != 1 or not 1 <= shape[0] <= MOST_CAPTURES:
+            raise ValueError(
+                f"a design of {shape} captures; give 1 to {MOST_CAPTURES}, each number one for "
+                "all or one for each"
+            )
+        numbers = [jnp.broadcast_to(g, shape) for g in given]
+        self.beta, self.phase, self.distance, self.wavelength, self.exposure = numbers
+        self.width = _checks.positive("width", width, "mm")
+        self.profile = _checks.choice("profile", profile, ("cosine", "binary"))  # pyright: ignore
+
+    @property
+    def captures(self) -> int:
+        return self.beta.shape[0]
+
+    def cameras(self, sensor: Sensor) -> list[LenslessCamera]:
+        """The camera of each capture."""
+        return [
+            LenslessCamera(
+                FresnelZoneAperture(b, p, width=self.width, profile=self.profile), sensor, d
+            )
+            for b, p, d in zip(self.beta, self.phase, self.distance, strict=True)
+        ]
+
+
+def _finite(name: str, value: Array, unit: str) -> Array:
+    return _checks.finite(name, value, unit, shape=value.shape)
+
+
+def shots(
+    beta,
+    distance,
+    phases,
+    *,
+    wavelength,
+    width,
+    profile: Literal["cosine", "binary"] = "cosine",
+) -> Design:
+    """Each setting (β, d) with each of the phases, in the order of a study's captures."""
+    settings = jnp.broadcast_arrays(jnp.atleast_1d(jnp.asarray(beta, float)), jnp.asarray(distance))
+    repeated = [jnp.repeat(s, len(phases)) for s in settings]
+    every = jnp.tile(jnp.asarray(phases, float), settings[0].shape[0])
+    return Design(
+        repeated[0], every, repeated[1], wavelength=wavelength, width=width, profile=profile
+    )

@@ -1,0 +1,99 @@
+r"""Where a response is looked at: points and weights of an integral over angular frequencies.
+
+Angular frequencies ν, in cycles/rad, belong to the object and are the same for captures at every
+distance d: on a sensor at d they are ν/d cycles/mm.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+from numpy.polynomial.legendre import leggauss
+
+
+class Quadrant(eqx.Module):
+    r"""A square of frequencies ν_x, ν_y ≥ 0 that stands for the whole plane.
+
+    The response of a centred zone aperture is even in both, so that n² samples are those of a
+    (2n − 1)² image. Samples must be closer than half the inverse of the mask's width as seen from
+    the sensor, d/(2·width): else the even light falls between them and its variance is missed.
+
+    - `axis`: ν from zero up, cycles/rad, along either axis.
+    - `weight`: of each point, so that Σ w g is ∬ g dν_x dν_y over the plane.
+    """
+
+    axis: Float[Array, " n"]
+    weight: Float[Array, "n n"]
+
+    def __init__(self, highest, count: int = 512):
+        """`highest`: the band's end along an axis, cycles/rad; `count`: samples along it."""
+        if count < 2:
+            raise ValueError(f"count = {count}: give at least 2 frequencies")
+        highest = jnp.asarray(highest)
+        self.axis = highest * jnp.linspace(0.0, 1.0, count, dtype=highest.dtype)
+        along = jnp.full(count, 2.0, self.axis.dtype).at[0].set(1.0)
+        self.weight = along[:, None] * along * (self.axis[1] - self.axis[0]) ** 2
+
+    @property
+    def squared(self) -> Float[Array, "n n"]:
+        """|ν|² at each point."""
+        return self.axis[:, None] ** 2 + self.axis**2
+
+    @property
+    def highest(self) -> Float[Array, ""]:
+        """The end of the band, cycles/rad."""
+        return self.axis[-1]
+
+    def ring(self, rings: int) -> Int[np.ndarray, " point"]:
+        """Which of `rings` rings up to the highest each point lies in; `rings` for the corners."""
+        place = np.arange(len(self.axis)) / (len(self.axis) - 1)
+        radius = np.hypot(place[:, None], place).ravel()
+        return np.where(radius < 1, np.minimum(radius * rings, rings - 1), rings).astype(int)
+
+
+class Polar(eqx.Module):
+    r"""Radii and directions: a response whose fringes are rings needs few directions.
+
+    Directions are Gauss-Legendre nodes of an octant, which stands for all eight.
+
+    - `radius`: |ν|, cycles/rad; `cosine`, `sine`: of each direction.
+    - `weight`: so that Σ w g is ∬ g dν_x dν_y over the disc.
+    """
+
+    radius: Float[Array, " n"]
+    cosine: Float[Array, " m"]
+    sine: Float[Array, " m"]
+    weight: Float[Array, "m n"]
+
+    def __init__(self, highest, count: int = 2048, directions: int = 4):
+        """`highest`: the disc's radius, cycles/rad; `count`: radii, at the middles of rings."""
+        if count < 2 or directions < 1:
+            raise ValueError(
+                f"count = {count}, directions = {directions}: give at least 2 radii, 1 direction"
+            )
+        highest = jnp.asarray(highest)
+        nodes, weights = leggauss(directions)
+        angle = np.pi / 8 * (nodes + 1)
+        self.cosine = jnp.asarray(np.cos(angle), highest.dtype)
+        self.sine = jnp.asarray(np.sin(angle), highest.dtype)
+        self.radius = highest * (jnp.arange(count, dtype=highest.dtype) + 0.5) / count
+        rings = 2 * jnp.pi * self.radius * (highest / count)
+        self.weight = jnp.asarray(weights / 2, highest.dtype)[:, None] * rings
+
+    @property
+    def squared(self) -> Float[Array, "m n"]:
+        """|ν|² at each point."""
+        return jnp.broadcast_to(self.radius**2, self.weight.shape)
+
+    @property
+    def highest(self) -> Float[Array, ""]:
+        """The end of the band, cycles/rad."""
+        return self.radius[-1] + 0.5 * (self.radius[1] - self.radius[0])
+
+    def ring(self, rings: int) -> Int[np.ndarray, " point"]:
+        """Which of `rings` rings up to the highest each point lies in."""
+        place = (np.arange(len(self.radius)) + 0.5) / len(self.radius)
+        return np.tile((place * rings).astype(int), len(self.cosine))
+
+
+Frequencies = Quadrant | Polar

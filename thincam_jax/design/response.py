@@ -1,0 +1,163 @@
+r"""Responses of a design's captures at the frequencies of the object, and what the sensor sees.
+
+Two models, both within the Fresnel approximation:
+
+- on a `Quadrant`, exact: the closed form of the square aperture (`overlaps_of`);
+- on `Polar` frequencies, by stationary phase: each pair of orders k > l of the unbounded mask is a
+  ring pattern in closed form,
+
+  .. math:: 2\,\mathrm{Re}\Big\{ c_k c_l^*\, \frac{j\pi M^2}{(k-l)\beta}\,
+      e^{j\phi(\rho)} \Big\},\qquad
+      \phi = \frac{(k-l)\beta s^2}{4} - \frac{[(k+l)\beta s + 2\pi M\rho]^2}{4(k-l)\beta},
+      \quad s = \lambda d\rho
+
+  cut off along either axis where the point of the mask that sends light there lies beyond the
+  aperture, the edge smoothed over one zone. The even light is left out: it is a peak at zero.
+
+**Crop.** Light of the frequency u of a pair of orders comes from one point of the mask,
+M ζ(u) from the shadow's centre, and reaches the sensor for a part q(u) of the object's points only.
+What is seen of it is q H; what is cut off, q(1 − q) |H|² η_f, is noise to a reconstruction that is
+the same for every point of the object. It is what makes small β worse than their response promises.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Complex, Float
+
+from thincam_jax._phase import as_complex, phasor
+from thincam_jax.design.design import Design
+from thincam_jax.design.frequencies import Frequencies, Polar, Quadrant
+from thincam_jax.design.setup import Setup
+from thincam_jax.masks.base import ZoneOrders
+from thincam_jax.masks.fza import FresnelZoneAperture
+from thincam_jax.propagation.orders import pairs
+from thincam_jax.propagation.path import Path
+from thincam_jax.propagation.separable_transfer import TransferFactors, overlaps_of
+
+
+class Responses(NamedTuple):
+    """Of each capture at each frequency, mm².
+
+    - `whole`: H(ν/d), of a sensor without end.
+    - `seen`: q H, what falls on the sensor on average over the object.
+    """
+
+    whole: Float[Array, "capture *point"]
+    seen: Float[Array, "capture *point"]
+
+
+def responses(design: Design, setup: Setup, frequencies: Frequencies) -> Responses:
+    """Real, for the masks are centred."""
+
+    def one(beta, phase, distance, wavelength, factors):
+        mask = FresnelZoneAperture(beta, phase, width=design.width, profile=design.profile)
+        path = Path(wavelength, distance, setup.object_distance)
+        if isinstance(frequencies, Quadrant):
+            return _exact(mask.zone_orders(), path, setup, frequencies, factors)
+        return _rings(mask.zone_orders(), path, setup, frequencies)
+
+    factors = _factors(design, setup, frequencies) if isinstance(frequencies, Quadrant) else None
+    return jax.vmap(one)(design.beta, design.phase, design.distance, design.wavelength, factors)
+
+
+def _factors(
+    design: Design, setup: Setup, frequencies: Quadrant
+) -> Complex[Array, "capture pair n"]:
+    """Of all captures at once: under `vmap` both ways of `chirp_integral` would be computed."""
+    mask = FresnelZoneAperture(
+        design.beta[0], design.phase[0], width=design.width, profile=design.profile
+    )
+    u = frequencies.axis / design.distance[:, None]
+    shift = design.wavelength[:, None] * frequencies.axis
+    magnification = (1 + design.distance / setup.object_distance)[:, None]
+    factors = overlaps_of(
+        mask.zone_orders().orders, design.beta[:, None], design.width, shift, magnification * u
+    )
+    if setup.pixel_integration:
+        magnification = magnification * jnp.sinc(setup.pitch * u)
+    factors = jnp.moveaxis(factors * as_complex(magnification), 0, 1)
+    # Kept apart: fused into each of the products, they would be computed for each.
+    return jax.lax.optimization_barrier(factors)
+
+
+def _exact(
+    zones: ZoneOrders,
+    path: Path,
+    setup: Setup,
+    frequencies: Quadrant,
+    factors: Complex[Array, "pair n"],
+) -> Responses:
+    u = frequencies.axis / path.distance
+    first, second, weights = pairs(zones)
+    whole = _product(weights, factors)
+    if not setup.crop:
+        return Responses(whole, whole)
+    parts = [
+        jnp.ones_like(u) if k == m else seen_part(_place(zones, k, m, path, u), path, setup)
+        for k, m in ((zones.orders[i], zones.orders[j]) for i, j in zip(first, second, strict=True))
+    ]
+    return Responses(whole, _product(weights, factors * as_complex(jnp.stack(parts))))
+
+
+def _product(weights, factors: Complex[Array, "pair n"]) -> Float[Array, "n n"]:
+    return TransferFactors(weights[:, None] * factors, factors).response()
+
+
+def _rings(zones: ZoneOrders, path: Path, setup: Setup, frequencies: Polar) -> Responses:
+    rho = frequencies.radius / path.distance
+    along = [jnp.abs(f[:, None] * rho) for f in (frequencies.sine, frequencies.cosine)]
+    whole = seen = jnp.zeros(along[0].shape, rho.dtype)
+    for i, j in zip(*pairs(zones)[:2], strict=True):
+        k, m = zones.orders[i], zones.orders[j]
+        if k == m:
+            continue
+        rings = _ring(zones, int(i), int(j), path, rho)
+        places = [_place(zones, k, m, path, u) for u in along]
+        for u, place in zip(along, places, strict=True):
+            rings = rings * _open(zones, k, m, path, u, place)
+        whole = whole + rings
+        if setup.crop:
+            for place in places:
+                rings = rings * seen_part(place, path, setup)
+            seen = seen + rings
+    if setup.pixel_integration:
+        average = jnp.sinc(setup.pitch * along[0]) * jnp.sinc(setup.pitch * along[1])
+        whole, seen = whole * average, seen * average
+    return Responses(whole, seen if setup.crop else whole)
+
+
+def _ring(zones: ZoneOrders, i: int, j: int, path: Path, rho) -> Float[Array, " n"]:
+    """The ring pattern of two orders without an edge."""
+    k, m = zones.orders[i], zones.orders[j]
+    curvature = (k - m) * zones.beta
+    s = path.wavelength * path.distance
+    tilt = (k + m) * zones.beta * s + 2 * jnp.pi * path.magnification
+    phase = (curvature * s**2 / 4 - tilt**2 / (4 * curvature)) * rho**2
+    wave = zones.coefficients[i] * zones.coefficients[j].conj() * phasor(phase)
+    # 2 Re{j w π M²/a} = −2 π M²/a · Im w
+    return -2 * jnp.pi * path.magnification**2 / curvature * jnp.imag(wave)
+
+
+def _place(zones: ZoneOrders, k: int, m: int, path: Path, u):
+    """ζ(u): where on the mask, mm from its centre, the light of frequency u ≥ 0 comes from."""
+    s = path.wavelength * path.distance * u
+    tilt = (k + m) * zones.beta * s + 2 * jnp.pi * path.magnification * u
+    return jnp.abs(tilt / (2 * (k - m) * zones.beta))
+
+
+def _open(zones: ZoneOrders, k: int, m: int, path: Path, u, place):
+    """1 where that point lies in the aperture's overlap with itself, 0 beyond, over one zone."""
+    half = (zones.upper[0] - zones.lower[0] - path.wavelength * path.distance * u) / 2
+    zone = jnp.sqrt(jnp.pi / (abs(k - m) * zones.beta)) / 4
+    return jax.nn.sigmoid((half - place) / zone)
+
+
+def seen_part(place, path: Path, setup: Setup):
+    """q: the part of the object's width from which that light falls on the sensor."""
+    middle = path.magnification * place
+    shadow = setup.field * path.distance
+    upper = jnp.minimum(setup.sensor_width / 2, middle + shadow / 2)
+    lower = jnp.maximum(-setup.sensor_width / 2, middle - shadow / 2)
+    return jnp.clip((upper - lower) / shadow, 0.0, 1.0)

@@ -1,0 +1,97 @@
+r"""What a design is judged in: sensor, scene and noise."""
+
+import equinox as eqx
+from jaxtyping import Array, Float
+
+from thincam_jax import _checks
+from thincam_jax.design.prior import PowerLaw
+
+
+class SignalNoise(eqx.Module):
+    """Gaussian noise at a signal-to-noise ratio, whatever the light.
+
+    - `snr_db`: ratio of the capture's variance over the sensor to the noise's, dB. Dividing the
+      exposure among captures does not change it.
+    """
+
+    snr_db: Float[Array, ""]
+
+    def __init__(self, snr_db=30.0):
+        self.snr_db = _checks.finite("snr_db", snr_db, "dB")
+
+    def variance(self, light, signal, exposure):
+        """Of a pixel, mm⁴: from the capture's mean (mm²), its variance, the share of exposure."""
+        return signal * 10 ** (-self.snr_db / 10)
+
+
+class PhotonNoise(eqx.Module):
+    """Shot noise of the design's own light, and read noise.
+
+    - `electrons`: of a pixel, from each mm² of open aperture, in the whole exposure time: what
+      the mask lets through is the design's own.
+    - `read_noise`: standard deviation, electrons, of each capture.
+    """
+
+    electrons: Float[Array, ""]
+    read_noise: Float[Array, ""]
+
+    def __init__(self, electrons=2_000.0, read_noise=8.0):
+        self.electrons = _checks.positive("electrons", electrons, "electrons")
+        self.read_noise = _checks.non_negative("read_noise", read_noise, "electrons")
+
+    def variance(self, light, signal, exposure):
+        """Of a pixel, mm⁴: from the capture's mean (mm²), its variance, the share of exposure."""
+        counted = self.electrons * exposure
+        return light / counted + (self.read_noise / counted) ** 2
+
+
+class Setup(eqx.Module):
+    """A sensor before a scene of mean 1 and the variance `contrast`².
+
+    - `pitch`: of the sensor's pixels, mm; `sensor_width`: mm.
+    - `object_distance`: t, mm; `object_width`: mm.
+    - `noise`: `SignalNoise` or `PhotonNoise`.
+    - `prior`: the scene's spectrum.
+    - `contrast`: standard deviation of the scene over its mean.
+    - `pixel_integration`: average over the pixels' area.
+    - `crop`: count what the sensor does not see of an object's shadow; see
+      `thincam_jax.design.response`.
+    """
+
+    pitch: Float[Array, ""]
+    sensor_width: Float[Array, ""]
+    object_distance: Float[Array, ""]
+    object_width: Float[Array, ""]
+    contrast: Float[Array, ""]
+    noise: SignalNoise | PhotonNoise
+    prior: PowerLaw
+    pixel_integration: bool = eqx.field(static=True)
+    crop: bool = eqx.field(static=True)
+
+    def __init__(
+        self,
+        *,
+        pitch,
+        sensor_width,
+        object_distance,
+        object_width,
+        noise: SignalNoise | PhotonNoise | None = None,
+        prior: PowerLaw | None = None,
+        contrast=0.5,
+        pixel_integration: bool = True,
+        crop: bool = True,
+    ):
+        self.pitch = _checks.positive("pitch", pitch, "mm")
+        self.sensor_width = _checks.positive("sensor_width", sensor_width, "mm")
+        self.object_distance = _checks.positive("object_distance", object_distance, "mm")
+        self.object_width = _checks.positive("object_width", object_width, "mm")
+        self.contrast = _checks.positive("contrast", contrast, "parts of the mean")
+        self.noise = SignalNoise() if noise is None else noise
+        self.prior = PowerLaw() if prior is None else prior
+        self.pixel_integration = pixel_integration
+        self.crop = crop
+
+    @property
+    def field(self) -> Float[Array, ""]:
+        """Width of the object as seen from the mask, rad (small angles)."""
+        return self.object_width / self.object_distance

@@ -1,0 +1,219 @@
+r"""What of a design is free, and within which limits.
+
+A search happens in the unit cube: `DesignSpace.design` maps each point of it to a design that keeps
+every limit, those that tie two variables together too, so that no solver has to know them.
+"""
+
+import math
+from typing import Literal, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from thincam_jax.design.design import MOST_CAPTURES, Design
+
+Name = Literal["beta", "phase", "distance", "wavelength", "exposure", "width"]
+UNITS: dict[str, str] = {
+    "beta": "rad/mm^2",
+    "phase": "rad",
+    "distance": "mm",
+    "wavelength": "mm",
+    "exposure": "shares",
+    "width": "mm",
+}
+
+
+class Variable(NamedTuple):
+    """One free number of a design.
+
+    - `name`: of the numbers of `Design`.
+    - `lower`, `upper`: its bounds, in the design's units.
+    - `captures`: which captures share it; for the width, which all share, nothing.
+    """
+
+    name: Name
+    lower: float
+    upper: float
+    captures: tuple[int, ...] = ()
+
+    def label(self) -> str:
+        """Its name, with the captures that it belongs to."""
+        listed = ", ".join(str(c + 1) for c in self.captures)
+        return f"{self.name} of capture {listed}" if self.captures else self.name
+
+
+class Limits(NamedTuple):
+    """What a rig can do, beside the bounds of single variables.
+
+    - `mask_pixel`: of the display or printer, mm: the zones at the mask's edge keep a period of two
+      of them, β·width ≤ π/mask_pixel.
+    - `thickness`: the longest distance of mask and sensor, mm.
+    - `captures`: how many at most.
+    """
+
+    mask_pixel: float | None = None
+    thickness: float | None = None
+    captures: int = MOST_CAPTURES
+
+
+class DesignSpace(eqx.Module):
+    """Designs with some numbers free, the others as in `base`.
+
+    **Errors**: ValueError for bounds that cross, for a number that is free twice, for captures
+    that do not exist, and for limits that no design keeps, with the two that conflict.
+    """
+
+    base: Design
+    lower: Float[Array, " variable"]
+    upper: Float[Array, " variable"]
+    variables: tuple[Variable, ...] = eqx.field(static=True)
+    limits: Limits = eqx.field(static=True)
+
+    def __init__(self, base: Design, variables: tuple[Variable, ...], limits: Limits | None = None):
+        self.base = base
+        self.limits = Limits() if limits is None else limits
+        # The width comes first: the bounds of β depend on it.
+        self.variables = tuple(sorted(variables, key=lambda v: v.name != "width"))
+        _check_variables(base, self.variables)
+        _check_limits(base, self.variables, self.limits)
+        dtype = base.beta.dtype
+        self.lower = jnp.asarray([v.lower for v in self.variables], dtype)
+        upper = [self._upper(v) for v in self.variables]
+        self.upper = jnp.asarray(upper, dtype)
+
+    def _upper(self, variable: Variable) -> float:
+        if variable.name == "distance" and self.limits.thickness is not None:
+            return min(variable.upper, self.limits.thickness)
+        return variable.upper
+
+    @property
+    def size(self) -> int:
+        """How many numbers are free."""
+        return len(self.variables)
+
+    def design(self, point: Float[Array, " variable"]) -> Design:
+        """The design of a point of the unit cube."""
+        return self._with_values(self.values(point))
+
+    def values(self, point: Float[Array, " variable"]) -> Float[Array, " variable"]:
+        """The free numbers of a point, in the order of `variables`."""
+        upper = self.upper
+        if self.limits.mask_pixel is not None:
+            width = self.base.width
+            if self.variables[0].name == "width":
+                # No wider than the lowest β allows, and β no higher than that width does.
+                width = self.lower[0] + point[0] * (upper[0] - self.lower[0])
+            finest = math.pi / self.limits.mask_pixel / width
+            is_beta = jnp.asarray([v.name == "beta" for v in self.variables])
+            upper = jnp.where(is_beta, jnp.minimum(upper, finest), upper)
+        return self.lower + point * (upper - self.lower)
+
+    def _with_values(self, values: Float[Array, " variable"]) -> Design:
+        design = self.base
+        for variable, value in zip(self.variables, values, strict=True):
+            number = getattr(design, variable.name)
+            changed = value
+            if variable.captures:
+                changed = number.at[jnp.asarray(variable.captures)].set(value)
+            design = eqx.tree_at(lambda d, n=variable.name: getattr(d, n), design, changed)
+        return design
+
+
+def active_limits(space: DesignSpace, point, *, within: float = 1e-3) -> tuple[str, ...]:
+    """What a point of the unit cube lies against, in words."""
+    words = []
+    values = space.values(jnp.asarray(point))
+    for variable, place, value in zip(space.variables, jax.device_get(point), values, strict=True):
+        unit = UNITS[variable.name]
+        if place <= within:
+            words.append(f"{variable.label()} ≥ {float(value):.6g} {unit}")
+        elif place >= 1 - within:
+            reason = _reason(space, variable, value, within)
+            words.append(f"{variable.label()} ≤ {float(value):.6g} {unit}{reason}")
+    return tuple(words)
+
+
+def _reason(space: DesignSpace, variable: Variable, value, within: float) -> str:
+    # As near to its own bound as what calls it active: no limit is needed to explain it.
+    if float(value) >= variable.upper - (within + 1e-6) * (variable.upper - variable.lower):
+        return ""
+    if variable.name == "distance":
+        return f" (thickness of {space.limits.thickness:g} mm)"
+    return f" (mask pixels of {space.limits.mask_pixel:g} mm)"
+
+
+def _check_variables(base: Design, variables: tuple[Variable, ...]) -> None:
+    if not variables:
+        raise ValueError("no variable is free; give at least one to search for")
+    taken: set[tuple[str, int]] = set()
+    for v in variables:
+        if v.name not in UNITS:
+            raise ValueError(f"variable {v.name!r} is unknown; choose one of {', '.join(UNITS)}")
+        if not (math.isfinite(v.lower) and math.isfinite(v.upper) and v.lower <= v.upper):
+            raise ValueError(
+                f"bounds of {v.label()} cross: {v.lower:g} to {v.upper:g} {UNITS[v.name]}; "
+                "give the lower one first"
+            )
+        if v.lower <= 0 and v.name != "phase":
+            raise ValueError(
+                f"bounds of {v.label()} begin at {v.lower:g} {UNITS[v.name]}; give a lower bound "
+                "above 0"
+            )
+        if bool(v.captures) == (v.name == "width"):
+            raise ValueError(
+                f"{v.label()}: all captures share the width, and any other variable needs the "
+                "captures it belongs to"
+            )
+        if any(not 0 <= c < base.captures for c in v.captures):
+            raise ValueError(f"{v.label()}: the design has captures 1 to {base.captures}")
+        keys = {(v.name, c) for c in v.captures or (-1,)}
+        if keys & taken:
+            raise ValueError(f"{v.label()} is free twice; let each number be free once")
+        taken |= keys
+
+
+def _check_limits(base: Design, variables: tuple[Variable, ...], limits: Limits) -> None:
+    """Refuse limits that exclude each other, naming the two."""
+    if base.captures > limits.captures:
+        raise ValueError(
+            f"no design is feasible: it takes {base.captures} captures, and the budget is "
+            f"{limits.captures}; allow more, or drop captures"
+        )
+    if limits.thickness is not None:
+        for shortest, label in _lowest(base, variables, "distance"):
+            if shortest > limits.thickness:
+                raise ValueError(
+                    f"no design is feasible: {label} ≥ {shortest:g} mm conflicts with a thickness "
+                    f"of at most {limits.thickness:g} mm"
+                )
+    if limits.mask_pixel is not None:
+        widths = [v for v in variables if v.name == "width"]
+        widest = widths[0].upper if widths else float(base.width)
+        width = widths[0].lower if widths else widest
+        finest = math.pi / limits.mask_pixel / width
+        for lowest, label in _lowest(base, variables, "beta"):
+            if lowest > finest * (1 + 1e-6):
+                raise ValueError(
+                    f"no design is feasible: {label} ≥ {lowest:g} rad/mm^2 conflicts with mask "
+                    f"pixels of {limits.mask_pixel:g} mm, which over a width of {width:g} mm show "
+                    f"at most {finest:.4g} rad/mm^2"
+                )
+        reach = max(low for low, _ in _lowest(base, variables, "beta"))
+        if widest > math.pi / limits.mask_pixel / reach * (1 + 1e-6):
+            raise ValueError(
+                f"width ≤ {widest:g} mm conflicts with beta ≥ {reach:g} rad/mm^2 on mask pixels of "
+                f"{limits.mask_pixel:g} mm; give a width of at most "
+                f"{math.pi / limits.mask_pixel / reach:.4g} mm"
+            )
+
+
+def _lowest(base: Design, variables: tuple[Variable, ...], name: str):
+    """The lowest value each capture's number may take: (value, words)."""
+    free = {c: v for v in variables if v.name == name for c in v.captures}
+    for capture in range(base.captures):
+        if capture in free:
+            yield free[capture].lower, free[capture].label()
+        else:
+            yield float(getattr(base, name)[capture]), f"{name} of capture {capture + 1}"

@@ -1,0 +1,83 @@
+"""Search with an objective that is drawn anew at every step: Adam, by optax."""
+
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from thincam_jax.design.design import Design
+from thincam_jax.design.search import on_cube
+from thincam_jax.design.space import DesignSpace
+
+StochasticObjective = Callable[[Design, Any, PRNGKeyArray], Float[Array, ""]]
+
+
+class Descent(NamedTuple):
+    """Where a stochastic descent ended.
+
+    - `design`, `values`, `point`: of the mean of the second half of the steps, in the cube.
+    - `history`: the objective, as drawn, at every step.
+    - `skipped`: steps whose objective or gradient was no number; they changed nothing.
+    """
+
+    design: Design
+    values: Float[Array, " variable"]
+    point: Float[Array, " variable"]
+    history: Float[Array, " step"]
+    skipped: int
+
+
+def stochastic_descent(
+    objective: StochasticObjective,
+    space: DesignSpace,
+    data: Any,
+    point: Float[Array, " variable"],
+    *,
+    key: PRNGKeyArray,
+    steps: int = 100,
+    rate: float = 0.03,
+) -> Descent:
+    """Adam from a point of the unit cube, with the rate falling to zero as a cosine.
+
+    `objective`: (design, data, key) → a number, at module level. `rate`: of the angle that sin²
+    maps onto the cube; the cube's side is π/2 of it.
+    """
+    if steps < 2 or not rate > 0:
+        raise ValueError(
+            f"steps = {steps}, rate = {rate}: give at least 2 steps and a rate above 0"
+        )
+    inner = jnp.clip(point, 1e-3, 1 - 1e-3)
+    mean, history, skipped = _descend(objective, space, data, inner, key, steps, rate)
+    return Descent(space.design(mean), space.values(mean), mean, history, int(skipped))
+
+
+@functools.partial(jax.jit, static_argnames=("objective", "steps"))
+def _descend(objective, space, data, point, key, steps: int, rate):
+    adam = optax.scale_by_adam()
+    rates = rate * 0.5 * (1 + jnp.cos(jnp.pi * jnp.linspace(0.0, 1.0, steps, dtype=point.dtype)))
+
+    def loss(y, step_key):
+        return objective(space.design(on_cube(y)), data, step_key)
+
+    def step(carry, drawn):
+        y, state, skipped = carry
+        step_key, step_rate = drawn
+        value, slope = jax.value_and_grad(loss)(y, step_key)
+        usable = jnp.isfinite(value) & jnp.all(jnp.isfinite(slope))
+        # optax multiplies floats by integers, which strict promotion forbids.
+        with jax.numpy_dtype_promotion("standard"):
+            updates, after = adam.update(jnp.where(usable, slope, 0.0), state)
+        moved = jnp.where(usable, y - step_rate * updates, y)
+        state = jax.tree.map(lambda new, old: jnp.where(usable, new, old), after, state)
+        return (moved, state, skipped + (~usable).astype(int)), (moved, value)
+
+    start = jnp.arcsin(jnp.sqrt(point))
+    first = (start, adam.init(start), jnp.asarray(0))
+    (_, _, skipped), (path, history) = jax.lax.scan(
+        step, first, (jax.random.split(key, steps), rates)
+    )
+    return jnp.mean(on_cube(path[steps // 2 :]), axis=0), history, skipped

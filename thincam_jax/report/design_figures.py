@@ -1,0 +1,151 @@
+"""The pictures of a design: the landscape of the objective, and the responses."""
+
+import io
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from thincam_jax.design_run import Candidate, Landscape, Result
+from thincam_jax.report.figures import line_style
+
+_SYMBOLS = {"beta": ("β", "rad/mm²"), "distance": ("distance", "mm")}
+_ROOM = 0.06  # around points, as a part of an axis
+_SHADED = 85  # per cent of the landscape that the shades tell apart; the worst is one shade
+_FLOOR_DB = -30.0  # what is further below the noise is not drawn
+
+
+def as_png(figure: Figure) -> bytes:
+    """The file's content."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=110)
+    return buffer.getvalue()
+
+
+def draw_landscape(result: Result, count: int) -> Figure | None:
+    """The objective over the free numbers, with the reference and the first `count` found.
+
+    None where the search's bounds leave no room to draw.
+    """
+    if result.landscape is None:
+        return None
+    points = (result.reference, *result.found[:count])
+    figure = Figure(figsize=(7.6, 6.0), layout="constrained")
+    ax = figure.subplots()
+    if len(result.landscape.axes) == 1:
+        _draw_line(ax, result, points)
+    else:
+        _draw_map(figure, ax, result, points)
+    ax.legend(fontsize=9, loc="upper center", bbox_to_anchor=(0.5, -0.1), ncols=2, frameon=False)
+    return figure
+
+
+def axis_label(name: str, shots: tuple[int, ...]) -> str:
+    """Of a free number: "β of shot 1 (rad/mm²)"."""
+    symbol, unit = _SYMBOLS[name]
+    word = "shot" if len(shots) == 1 else "shots"
+    return f"{symbol} of {word} {', '.join(str(s) for s in shots)} ({unit})"
+
+
+def _place(landscape: Landscape, one: Candidate) -> list[float]:
+    """Where a design lies on the landscape's axes."""
+    return [getattr(one.shots[shots[0] - 1], name) for name, shots in landscape.variables]
+
+
+def _marker(number: int) -> dict:
+    """Of the reference, number 0, and of what was found: told apart by shape."""
+    face = "black" if number == 0 else "white"
+    edge = "white" if number == 0 else "black"
+    shape = "Xo^Ds"[number % 5]
+    size = 12 if number == 0 else 10
+    return {
+        "marker": shape,
+        "markersize": size,
+        "color": face,
+        "markeredgecolor": edge,
+        "markeredgewidth": 1.3,
+        "linestyle": "none",
+    }
+
+
+def _draw_map(figure: Figure, ax, result: Result, points: tuple[Candidate, ...]) -> None:
+    around = result.landscape
+    assert around is not None  # for the type checker; `draw_landscape` has looked
+    x, y = around.axes
+    told = result.goal.told(around.goal).T
+    worst = np.nanpercentile(told, 100 - _SHADED if result.goal.wants_more else _SHADED)
+    steps = {"vmin" if result.goal.wants_more else "vmax": worst}
+    extend = "min" if result.goal.wants_more else "max"
+    shown = ax.pcolormesh(x, y, told, cmap="cividis", shading="nearest", rasterized=True, **steps)
+    figure.colorbar(shown, ax=ax, label=result.goal.label, extend=extend)
+    # Grounds beside the map are not allowed, or not looked at.
+    ax.set_facecolor("#e8e8e8")
+    places = np.array([_place(around, p) for p in points])
+    for set_limits, axis, own in ((ax.set_xlim, x, places[:, 0]), (ax.set_ylim, y, places[:, 1])):
+        set_limits(*_reach(axis, own))
+    for number, (one, place) in enumerate(zip(points, places, strict=True)):
+        ax.plot(*place, label=_name(result, one), clip_on=False, zorder=5, **_marker(number))
+    ax.set_xlabel(axis_label(*around.variables[0]))
+    ax.set_ylabel(axis_label(*around.variables[1]))
+
+
+def _reach(axis: np.ndarray, own: np.ndarray) -> tuple[float, float]:
+    """The axis, and room for points that lie beyond it."""
+    half = (axis[1] - axis[0]) / 2
+    low, high = axis[0] - half, axis[-1] + half
+    room = _ROOM * (high - low)
+    low = min(low, own.min() - room) if own.min() < low else low
+    high = max(high, own.max() + room) if own.max() > high else high
+    return float(low), float(high)
+
+
+def _draw_line(ax, result: Result, points: tuple[Candidate, ...]) -> None:
+    around = result.landscape
+    assert around is not None  # for the type checker; `draw_landscape` has looked
+    ax.plot(around.axes[0], result.goal.told(around.goal), color="black", linewidth=1)
+    for number, one in enumerate(points):
+        level = float(result.goal.told(one.searched))
+        place = _place(around, one)
+        ax.plot(*place, level, label=_name(result, one), zorder=5, **_marker(number))
+    ax.set_xlabel(axis_label(*around.variables[0]))
+    ax.set_ylabel(result.goal.label)
+    ax.grid(alpha=0.3)
+
+
+def _name(result: Result, one: Candidate) -> str:
+    return f"{one.name} ({float(result.goal.told(one.exact)):.2f} {result.goal.unit})"
+
+
+def draw_responses(result: Result, count: int, pitch: float) -> Figure:
+    """Ring means of the signal-to-noise ratio of the reference and the first `count` found."""
+    figure = Figure(figsize=(8.5, 6.2), layout="constrained")
+    ax, over = figure.subplots(2, 1, sharex=True, height_ratios=(1.5, 1))
+    rings = len(result.reference.level)
+    frequency = (np.arange(rings) + 0.5) / rings * result.edge
+    reference = _decibel(result.reference.level)
+    for number, one in enumerate((result.reference, *result.found[:count])):
+        level = _decibel(one.level)
+        style = line_style(number) | {"markersize": 4, "markevery": (number, 5), "linewidth": 1.2}
+        ax.plot(frequency, level, label=one.name, **style)
+        if number:
+            over.plot(frequency, level - reference, **style)
+    for axes in (ax, over):
+        axes.axhline(0, color="black", linewidth=0.8)
+        axes.grid(alpha=0.3)
+    ax.set_xlim(0, result.edge)
+    ax.set_ylim(bottom=_FLOOR_DB)
+    ax.set_ylabel("signal-to-noise ratio,\nmean over a ring (dB)")
+    ax.legend(fontsize=9)
+    over.set_ylabel(f"over {result.reference.name}\n(dB)")
+    over.set_xlabel("angular frequency of the object (cycles/rad)")
+    distance = max(shot.distance for shot in result.reference.shots)
+    along = (lambda nu: np.asarray(nu) / distance, lambda u: np.asarray(u) * distance)
+    ax.secondary_xaxis("top", functions=along).set_xlabel(
+        f"on the sensor at the reference's {distance:g} mm (cycles/mm); "
+        f"its pixels' Nyquist frequency is {1 / (2 * pitch):.4g}"
+    )
+    return figure
+
+
+def _decibel(level: np.ndarray) -> np.ndarray:
+    """NaN, which is not drawn, below the floor."""
+    return 10 * np.log10(np.where(level > 10 ** (_FLOOR_DB / 10), level, np.nan))
