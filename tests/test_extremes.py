@@ -125,7 +125,11 @@ def test_value(extreme, dtype):
     assert error(extreme, dtype) < getattr(extreme, dtype.__name__)
 
 
-@pytest.mark.parametrize("dtype", DTYPES, ids=lambda dtype: dtype.__name__)
+@pytest.mark.parametrize(
+    "dtype",
+    [DTYPES[0], *(pytest.param(d, marks=pytest.mark.thorough) for d in DTYPES[1:])],
+    ids=[dtype.__name__ for dtype in DTYPES],
+)
 @every_extreme
 def test_gradient_is_finite(extreme, dtype):
     _, gradient = result(extreme, dtype)

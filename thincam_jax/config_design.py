@@ -166,7 +166,7 @@ class SearchConfig(Section):
     objective: Objective = "bayes_error"
     band: tuple[Part, Part] | None = None
     starts: Annotated[int, Field(ge=1, le=1000)] = 16
-    samples: Annotated[int, Field(ge=1, le=100_000)] = 256
+    samples: Annotated[int, Field(ge=1, le=100_000)] = 512
     steps: Annotated[int, Field(ge=1, le=1000)] = 60
     solver: Literal["bfgs", "lbfgsb"] = "bfgs"
     grid: Annotated[int, Field(ge=5, le=501)] = 61

@@ -33,6 +33,7 @@ def run(config, tmp_path_factory):
     return folder.path, results
 
 
+@pytest.mark.thorough
 def test_files(run):
     path, results = run
     assert sorted(p.name for p in path.iterdir()) == ["accuracy.json", "accuracy.png"]
@@ -40,6 +41,7 @@ def test_files(run):
     assert (path / "accuracy.png").read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.thorough
 def test_settings_and_machine(run, config):
     settings, machine = run[1]["settings"], run[1]["machine"]
     assert settings["sizes"] == list(SIZES)
@@ -73,6 +75,7 @@ def own_psf(config, size, model, precision, **how):
     )
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("size", SIZES)
 def test_errors_agree_with_a_recomputation(run, config, size):
     exact = own_psf(config, size, "separable", "float64")
@@ -90,6 +93,7 @@ def test_errors_agree_with_a_recomputation(run, config, size):
             assert row["true_error"] == pytest.approx(error, rel=0.2 if error < 1e-5 else 1e-3)
 
 
+@pytest.mark.thorough
 def test_every_way_is_told(run):
     rows = run[1]["psfs"]
     ways = {(r["model"], r["precision"], r["oversampling"], max(r["shape"])) for r in rows}
@@ -105,6 +109,7 @@ def test_every_way_is_told(run):
             assert row["predicted_error"] >= 0.5 * row["true_error"]
 
 
+@pytest.mark.thorough
 def test_captures_agree_with_a_recomputation(run, config):
     rows = {r["model"]: r for r in run[1]["captures"]}
     (method,) = [m for m in config.methods if m.kind == "wiener"]
@@ -124,6 +129,7 @@ def test_captures_agree_with_a_recomputation(run, config):
     assert rows["separable"]["contrast_error"] < 1e-4
 
 
+@pytest.mark.thorough
 def test_reconstructions(run):
     found = run[1]["reconstructions"]
     assert found["skipped"] is None
@@ -135,6 +141,7 @@ def test_reconstructions(run):
     assert abs(rows["separable"]["psnr_lost_db"]) < 1e-3
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("wrong", ["beta", "distance"])
 def test_controlled_errors(run, wrong):
     """Each hits its level; the larger the error of β the more PSNR is lost.

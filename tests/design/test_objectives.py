@@ -200,10 +200,14 @@ NAMES = ("beta", "phase", "distance", "wavelength", "width", "exposure")
 
 
 @pytest.mark.parametrize(
-    "noise", [SignalNoise(30.0), PhotonNoise(2000.0, 8.0)], ids=["snr", "photons"]
-)
-@pytest.mark.parametrize(
-    "frequencies", [Polar(HIGHEST, 128, 2), Quadrant(HIGHEST, 33)], ids=["polar", "quadrant"]
+    ("frequencies", "noise"),
+    [
+        (Polar(HIGHEST, 128, 2), SignalNoise(30.0)),
+        (Quadrant(HIGHEST, 33), PhotonNoise(2000.0, 8.0)),
+        pytest.param(Polar(HIGHEST, 128, 2), PhotonNoise(2000.0, 8.0), marks=pytest.mark.thorough),
+        pytest.param(Quadrant(HIGHEST, 33), SignalNoise(30.0), marks=pytest.mark.thorough),
+    ],
+    ids=["polar-snr", "quadrant-photons", "polar-photons", "quadrant-snr"],
 )
 def test_gradients(noise, frequencies):
     """Of every objective in every number, against central differences: relative 1e-4.

@@ -168,6 +168,7 @@ def against_grid(frequencies, count, seeds):
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_bayes_error_against_a_grid():
     """5 searches, each at most 1030 evaluations, against 3721 points of a coarser objective."""
     excess, most = against_grid(Polar(HIGHEST, 128, 2), 61, 5)

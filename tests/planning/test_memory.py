@@ -48,7 +48,7 @@ PROCESS = """
     ("shape", "planes", "tolerance"),
     [
         pytest.param((2400, 3200), 1, 1e-2, marks=pytest.mark.thorough),
-        ((1500, 2000), 6, 1e-3),
+        pytest.param((1500, 2000), 6, 1e-3, marks=pytest.mark.thorough),
     ],
 )
 def test_peak_of_a_planned_capture(shape, planes, tolerance):

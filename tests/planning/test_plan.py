@@ -224,7 +224,14 @@ ODD = {
 
 
 @pytest.mark.parametrize("name", ODD)
-@pytest.mark.parametrize("tolerance", [0.1, pytest.param(1e-2, marks=pytest.mark.thorough), 1e-3])
+@pytest.mark.parametrize(
+    "tolerance",
+    [
+        pytest.param(0.1, marks=pytest.mark.thorough),
+        pytest.param(1e-2, marks=pytest.mark.thorough),
+        1e-3,
+    ],
+)
 def test_odd_scenes_stay_within_their_prediction(name, tolerance):
     own, odd = ODD[name]
     plan = tc.plan(own, odd, tolerance=tolerance)

@@ -27,6 +27,7 @@ def zeros(problem):
     return jnp.zeros(problem.image_shape, problem.captures[0].dtype)
 
 
+@pytest.mark.thorough
 def test_it_finds_the_minimum_that_admm_finds():
     problem, truth = scenes.problem(kernel=scenes.spots, tau=3e-3)
     admm = drive(

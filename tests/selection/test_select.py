@@ -43,7 +43,7 @@ def sampled_models(case):
     return found + (["rayleigh_sommerfeld"] if mask**2 * math.prod(fine) < SUMMANDS else [])
 
 
-@pytest.fixture(scope="module", params=[75, pytest.param(500, marks=pytest.mark.thorough)])
+@pytest.fixture(scope="module", params=[pytest.param(500, marks=pytest.mark.thorough)])
 def errors(request):
     """(predicted, true) of all models for as many random cameras, by (model, precision)."""
     found = {}
@@ -68,10 +68,10 @@ def errors(request):
 @pytest.mark.parametrize(
     ("model", "precision", "count"),
     [
-        *((model, "float32", 74) for model in CLOSED),
+        *((model, "float32", 149) for model in CLOSED),
         ("separable", "float64", 60),
-        ("angular_spectrum", "float32", 5),
-        ("rayleigh_sommerfeld", "float32", 2),
+        ("angular_spectrum", "float32", 10),
+        ("rayleigh_sommerfeld", "float32", 5),
     ],
 )
 def test_predictions_hold_over_random_cameras(errors, capsys, model, precision, count):
@@ -95,11 +95,11 @@ def test_predictions_hold_over_random_cameras(errors, capsys, model, precision, 
 
 @pytest.fixture(scope="module")
 def choices():
-    """(tolerance, choice, its true error) for 50 random cameras."""
+    """(tolerance, choice, its true error) for 25 random cameras."""
     found = []
     # Of the binary masks, with many times the orders, only those on the small sensor.
     kinds = [kind for kind in cameras.KINDS if kind[1] == "cosine" or kind[0] == (48, 80)]
-    for case in cameras.random_cases(50, 11, kinds):
+    for case in cameras.random_cases(25, 11, kinds):
         expected = cameras.expected(case)
 
         @functools.cache
