@@ -16,11 +16,19 @@ from thincam_jax.cli_design import design
 from thincam_jax.cli_reconstruct import reconstruct
 from thincam_jax.cli_refocus import refocus
 from thincam_jax.cli_sweep import sweep
-from thincam_jax.config import ConfigError, StudyConfig, load_config, slug
+from thincam_jax.config import StudyConfig, load_config, slug
 from thincam_jax.config_refocus import RefocusConfig, load_experiment
 from thincam_jax.run import run_study, steps
 from thincam_jax.study import RunFolder, check_study
-from thincam_jax.terminal import INTERRUPTED, columns, console, fail, tell
+from thincam_jax.terminal import (
+    INTERRUPTED,
+    USER_ERRORS,
+    Overrides,
+    columns,
+    console,
+    fail,
+    tell,
+)
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -35,13 +43,6 @@ app.command()(sweep)
 app.command()(design)
 
 ConfigFile = Annotated[Path, typer.Argument(help="Experiment file (YAML); see configs/.")]
-Overrides = Annotated[
-    list[str] | None,
-    typer.Option("--set", help="Change a value: a.b=value, list entries by number."),
-]
-
-# What a user can put right; anything else is a defect and keeps its traceback.
-_USER_ERRORS = (ConfigError, FileNotFoundError, IsADirectoryError, PermissionError, MemoryError)
 
 
 @app.command()
@@ -69,7 +70,7 @@ def run(
             metrics = run_study(
                 study, folder, lambda text: bar.update(task, advance=1, description=text)
             )
-    except _USER_ERRORS as error:
+    except USER_ERRORS as error:
         fail(error)
     except KeyboardInterrupt:
         targets = study.targets if isinstance(study, StudyConfig) and folder else ()
@@ -132,7 +133,7 @@ def accuracy(
             results = benches.run_accuracy(
                 study, plan, folder, lambda text: bar.update(task, advance=1, description=text)
             )
-    except _USER_ERRORS as error:
+    except USER_ERRORS as error:
         fail(error)
     except KeyboardInterrupt:
         tell("interrupted; nothing is kept.")

@@ -7,13 +7,11 @@ import rich.progress
 import rich.table
 import typer
 
-from thincam_jax.config import ConfigError, slug
+from thincam_jax.config import slug
 from thincam_jax.config_design import load_design
 from thincam_jax.design_run import check_design
 from thincam_jax.run_design import DesignFolder, run_design, steps
-from thincam_jax.terminal import INTERRUPTED, columns, console, fail, tell
-
-_USER_ERRORS = (ConfigError, FileNotFoundError, IsADirectoryError, PermissionError, MemoryError)
+from thincam_jax.terminal import INTERRUPTED, USER_ERRORS, Overrides, columns, console, fail, tell
 
 
 def design(
@@ -21,10 +19,7 @@ def design(
     out: Annotated[
         Path | None, typer.Option(help="Folder of the results; default runs/NAME of the design.")
     ] = None,
-    set_: Annotated[
-        list[str] | None,
-        typer.Option("--set", help="Change a value: a.b=value, list entries by number."),
-    ] = None,
+    set_: Overrides = None,
 ) -> None:
     """Search for the best design and simulate it beside the design to beat.
 
@@ -40,7 +35,7 @@ def design(
             found = run_design(
                 wanted, folder, lambda text: bar.update(task, advance=1, description=text)
             )
-    except _USER_ERRORS as error:
+    except USER_ERRORS as error:
         fail(error)
     except KeyboardInterrupt:
         tell("interrupted; the same command goes on with the targets that are not finished.")

@@ -11,7 +11,7 @@ import typer
 
 from thincam_jax.config import ConfigError, StudyConfig, slug
 from thincam_jax.config_refocus import load_experiment
-from thincam_jax.terminal import INTERRUPTED, WRONG_INPUT, columns, console, fail, tell
+from thincam_jax.terminal import INTERRUPTED, WRONG_INPUT, Overrides, columns, console, fail, tell
 
 _PARTS = ("dask", "distributed", "pyarrow")
 
@@ -29,10 +29,6 @@ Scheduler = Annotated[
 ]
 Workers = Annotated[
     int | None, typer.Option(help="Local worker processes; default: one for each core.")
-]
-Overrides = Annotated[
-    list[str] | None,
-    typer.Option("--set", help="Change a value: a.b=value, list entries by number."),
 ]
 
 

@@ -1,16 +1,26 @@
 """What the commands share: consoles, exit codes, and how an error is told."""
 
-from typing import NoReturn
+from typing import Annotated, NoReturn
 
 import rich.console
 import rich.progress
 import typer
+
+from thincam_jax.config_file import ConfigError
 
 console = rich.console.Console()
 errors = rich.console.Console(stderr=True)
 
 WRONG_INPUT = 2
 INTERRUPTED = 130  # the shells' exit code after Ctrl-C
+
+# What a user can put right; anything else is a defect and keeps its traceback.
+USER_ERRORS = (ConfigError, FileNotFoundError, IsADirectoryError, PermissionError, MemoryError)
+
+Overrides = Annotated[
+    list[str] | None,
+    typer.Option("--set", help="Change a value: a.b=value, list entries by number."),
+]
 
 
 def tell(text: str) -> None:

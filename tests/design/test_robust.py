@@ -4,33 +4,24 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from design.setting import setup, thesis_design
 
 from thincam_jax.design import (
     Design,
     Polar,
     PowerLaw,
-    Setup,
-    SignalNoise,
     Tolerances,
     bayes_error,
     channels,
     mismatch_error,
     robust_error,
-    shots,
 )
 from thincam_jax.reconstruct.synthesis import phase_pairs
 
-SETUP = Setup(
-    pitch=5.5e-3,
-    sensor_width=5.632,
-    object_distance=250.0,
-    object_width=180.0,
-    noise=SignalNoise(30.0),
-    prior=PowerLaw(2.8),
-)
+SETUP = setup(object_width=180.0, prior=PowerLaw(2.8))
 FREQUENCIES = Polar(jnp.asarray(200.0), 400, 2)
 PAIRS = jnp.asarray(phase_pairs(2))
-DESIGN = shots(jnp.array([25.0, 21.0]), 6.5, (0.0, 1.5 * np.pi), wavelength=5e-4, width=5.632)
+DESIGN = thesis_design()
 
 
 def known(design: Design, setup=SETUP):

@@ -55,7 +55,8 @@ def test_variance_of_random_scenes(captured, kind):
     highest = DISTANCE / PITCH / 2
     frequencies = Quadrant(highest, 200) if kind == "quadrant" else Polar(highest, 800, 4)
     whole = respond(design, judged, frequencies).whole
-    value = float(jax.jit(signal_variance)(design, judged, frequencies, whole)[0])
+    density = spectral_density(judged, frequencies)
+    value = float(jax.jit(signal_variance)(design, judged, frequencies, whole, density)[0])
     variances = np.var(captured, axis=(-2, -1))
     known_to = np.std(variances) / np.sqrt(len(variances)) / np.mean(variances)
     assert known_to < 0.08
@@ -103,7 +104,10 @@ def test_a_wide_sensor_counts_all_variance():
         whole**2 * spectral_density(judged, frequencies) * frequencies.weight, axis=(1, 2)
     )
     # The zero frequency alone is the mean.
-    mean = (whole**2 * spectral_density(judged, frequencies) * frequencies.weight)[:, 0, 0]
-    value = jax.jit(signal_variance)(design, wide, frequencies, whole)
+    density = spectral_density(judged, frequencies)
+    mean = (whole**2 * density * frequencies.weight)[:, 0, 0]
+    known = spectral_density(wide, frequencies)
+    value = jax.jit(signal_variance)(design, wide, frequencies, whole, known)
     np.testing.assert_allclose(value, everything - mean, rtol=1e-3)
-    assert float(signal_variance(design, judged, frequencies, whole)[0]) < 0.9 * float(value[0])
+    seen = signal_variance(design, judged, frequencies, whole, density)
+    assert float(seen[0]) < 0.9 * float(value[0])

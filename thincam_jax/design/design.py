@@ -70,12 +70,14 @@ class Design(eqx.Module):
     def captures(self) -> int:
         return self.beta.shape[0]
 
+    def mask(self, beta, phase) -> FresnelZoneAperture:
+        """The mask of a capture, of the width and the profile that all share."""
+        return FresnelZoneAperture(beta, phase, width=self.width, profile=self.profile)
+
     def cameras(self, sensor: Sensor) -> list[LenslessCamera]:
         """The camera of each capture."""
         return [
-            LenslessCamera(
-                FresnelZoneAperture(b, p, width=self.width, profile=self.profile), sensor, d
-            )
+            LenslessCamera(self.mask(b, p), sensor, d)
             for b, p, d in zip(self.beta, self.phase, self.distance, strict=True)
         ]
 

@@ -29,7 +29,6 @@ from thincam_jax.camera import LenslessCamera
 from thincam_jax.design.design import Design
 from thincam_jax.design.setup import Setup
 from thincam_jax.grids import Grid
-from thincam_jax.masks.fza import FresnelZoneAperture
 from thincam_jax.operators import CropConvolution, kernel_grid
 from thincam_jax.psf import psf
 from thincam_jax.scene import ImagePlane
@@ -136,6 +135,7 @@ class _Channel(eqx.Module):
     summed: CropConvolution
     exposure: tuple[Float[Array, ""], ...]
     distance: Float[Array, ""]
+    grid: Grid
     setup: Setup
     weights: tuple[float, ...] = eqx.field(static=True)
 
@@ -152,6 +152,7 @@ class _Channel(eqx.Module):
         self.exposure = tuple(design.exposure[k] for k in used)
         self.setup = training.setup
         sensor, field = training.sensor, training.field_shape
+        self.grid = Grid(field, sensor.pitch)
         whole = jnp.tensordot(jnp.asarray(row, kernels.dtype), kernels, axes=1)
 
         def convolution(kernel):
@@ -174,12 +175,9 @@ class _Channel(eqx.Module):
         return self.summed(projected) + jnp.sqrt(variance) * noise, variance
 
     def _projected(self, image):
-        grid = Grid(
-            self.summed.field_shape, self.setup.sensor_width / max(self.summed.sensor_shape)
-        )
         plane = ImagePlane(image, self.setup.object_distance, self.setup.object_width)
         # Upright: masks are symmetric, and the image comes back the way it went in.
-        return plane.sample(grid, magnification=self.distance / self.setup.object_distance)
+        return plane.sample(self.grid, magnification=self.distance / self.setup.object_distance)
 
 
 def _kernels(design: Design, training: Training) -> Float[Array, "capture k l"]:
@@ -187,9 +185,8 @@ def _kernels(design: Design, training: Training) -> Float[Array, "capture k l"]:
     sensor, there = training.sensor, training.setup.object_distance
 
     def kernel(beta, phase, distance, wavelength):
-        mask = FresnelZoneAperture(beta, phase, width=design.width, profile=design.profile)
         return psf(
-            LenslessCamera(mask, sensor, distance),
+            LenslessCamera(design.mask(beta, phase), sensor, distance),
             wavelength=wavelength,
             object_distance=there,  # pyright: ignore[reportArgumentType]
             grid=kernel_grid(sensor.grid, training.field_shape),

@@ -20,7 +20,7 @@ from thincam_jax.design.design import Design
 from thincam_jax.design.frequencies import Frequencies
 from thincam_jax.design.response import responses
 from thincam_jax.design.setup import Setup
-from thincam_jax.design.signal import capture_light, spectral_density, variance_over_sensor
+from thincam_jax.design.signal import capture_light, signal_variance, spectral_density
 
 
 class Channels(NamedTuple):
@@ -64,7 +64,7 @@ def channels(
     found = responses(design, setup, frequencies)
     # Kept apart: fused into all that uses it, the power law would be computed for each.
     density = jax.lax.optimization_barrier(spectral_density(setup, frequencies))
-    signal = variance_over_sensor(design, setup, frequencies, found.whole, density)
+    signal = signal_variance(design, setup, frequencies, found.whole, density)
     light = capture_light(design, setup)
     noise = setup.noise.variance(light, signal, design.exposure) * setup.pitch**2
     # Per area of the sensor the scene's density grows with the distance squared, noise does not.

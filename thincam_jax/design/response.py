@@ -31,7 +31,6 @@ from thincam_jax.design.design import Design
 from thincam_jax.design.frequencies import Frequencies, Polar, Quadrant
 from thincam_jax.design.setup import Setup
 from thincam_jax.masks.base import ZoneOrders
-from thincam_jax.masks.fza import FresnelZoneAperture
 from thincam_jax.propagation.orders import pairs
 from thincam_jax.propagation.path import Path
 from thincam_jax.propagation.separable_transfer import TransferFactors, overlaps_of
@@ -52,7 +51,7 @@ def responses(design: Design, setup: Setup, frequencies: Frequencies) -> Respons
     """Real, for the masks are centred."""
 
     def one(beta, phase, distance, wavelength, factors):
-        mask = FresnelZoneAperture(beta, phase, width=design.width, profile=design.profile)
+        mask = design.mask(beta, phase)
         path = Path(wavelength, distance, setup.object_distance)
         if isinstance(frequencies, Quadrant):
             return _exact(mask.zone_orders(), path, setup, frequencies, factors)
@@ -66,9 +65,7 @@ def _factors(
     design: Design, setup: Setup, frequencies: Quadrant
 ) -> Complex[Array, "capture pair n"]:
     """Of all captures at once: under `vmap` both ways of `chirp_integral` would be computed."""
-    mask = FresnelZoneAperture(
-        design.beta[0], design.phase[0], width=design.width, profile=design.profile
-    )
+    mask = design.mask(design.beta[0], design.phase[0])
     u = frequencies.axis / design.distance[:, None]
     shift = design.wavelength[:, None] * frequencies.axis
     magnification = (1 + design.distance / setup.object_distance)[:, None]

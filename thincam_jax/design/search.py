@@ -22,6 +22,9 @@ from thincam_jax.design.space import DesignSpace, active_limits
 
 Objective = Callable[[Design, Any], Float[Array, ""]]
 Solver = Literal["bfgs", "lbfgsb"]
+# Optima closer than this in the unit cube are one.
+APART = 0.02
+
 Status = Literal["converged", "iterations_exhausted", "non_finite"]
 
 
@@ -76,7 +79,7 @@ def search(
     steps: int = 60,
     solver: Solver = "bfgs",
     tolerance: float = 1e-6,
-    apart: float = 0.02,
+    apart: float = APART,
 ) -> Search:
     """The designs of a space where an objective is smallest.
 
@@ -110,11 +113,20 @@ def search(
     return Search(_ranked(space, ended, apart), used, failed)
 
 
+# Points of the unit cube that are evaluated at a time.
+_AT_A_TIME = 32
+
+
+@functools.partial(jax.jit, static_argnames="objective")
 def evaluate(
     objective: Objective, space: DesignSpace, data: Any, points: Float[Array, "point variable"]
 ) -> Float[Array, " point"]:
-    """The objective at points of the unit cube, some at a time."""
-    return _evaluate(objective, space, data, points)
+    """The objective at points of the unit cube."""
+
+    def at(point):
+        return objective(space.design(point), data)
+
+    return jax.lax.map(at, points, batch_size=_AT_A_TIME)
 
 
 def landscape(
@@ -132,17 +144,6 @@ def landscape(
     mesh = jnp.meshgrid(*[axis] * space.size, indexing="ij")
     points = jnp.stack([m.ravel() for m in mesh], axis=-1)
     return points, evaluate(objective, space, data, points)
-
-
-_AT_A_TIME = 32
-
-
-@functools.partial(jax.jit, static_argnames="objective")
-def _evaluate(objective, space, data, points):
-    def at(point):
-        return objective(space.design(point), data)
-
-    return jax.lax.map(at, points, batch_size=_AT_A_TIME)
 
 
 def _even_samples(dimensions: int, count: int, key, dtype) -> Float[Array, "point variable"]:

@@ -8,7 +8,6 @@ from numpy.polynomial.legendre import leggauss
 from thincam_jax.design.design import Design
 from thincam_jax.design.frequencies import Frequencies, Quadrant
 from thincam_jax.design.setup import Setup
-from thincam_jax.masks.fza import FresnelZoneAperture
 
 # The peak of the even light at zero frequency: its lobes, and quadrature nodes over them.
 _LOBES, _NODES = 4.0, 48
@@ -36,25 +35,13 @@ def signal_variance(
     setup: Setup,
     frequencies: Frequencies,
     whole: Float[Array, "capture *point"],
+    density: Float[Array, "*point"],
 ) -> Float[Array, " capture"]:
     r"""Variance of each capture over the sensor, mm⁴.
 
     :math:`\int \eta_f|H|^2 (1 - \mathrm{sinc}^2 L u\ \mathrm{sinc}^2 L v)`: what varies over more
-    than the sensor's width L is no variance on it.
+    than the sensor's width L is no variance on it. `density`: η_f, by `spectral_density`.
     """
-    return variance_over_sensor(
-        design, setup, frequencies, whole, spectral_density(setup, frequencies)
-    )
-
-
-def variance_over_sensor(
-    design: Design,
-    setup: Setup,
-    frequencies: Frequencies,
-    whole: Float[Array, "capture *point"],
-    density: Float[Array, "*point"],
-) -> Float[Array, " capture"]:
-    """`signal_variance` of a density that is known already."""
     power = whole**2 * density * frequencies.weight
     if isinstance(frequencies, Quadrant):
         window = _window(setup, frequencies.axis / design.distance[:, None])
@@ -80,9 +67,7 @@ def _even_variance(design: Design, setup: Setup, distance) -> Float[Array, ""]:
 
 def _evenness(design: Design) -> Float[Array, ""]:
     """Σ|c_k|²: the irradiance behind the mask without its fringes."""
-    mask = FresnelZoneAperture(
-        design.beta[0], design.phase[0], width=design.width, profile=design.profile
-    )
+    mask = design.mask(design.beta[0], design.phase[0])
     return jnp.sum(jnp.abs(mask.zone_orders().coefficients) ** 2)
 
 

@@ -14,13 +14,12 @@ from thincam_jax.config import ConfigError
 from thincam_jax.config_design import DesignConfig, found_name
 from thincam_jax.design import Design, DesignSpace, Variable, channels, landscape, search
 from thincam_jax.design.objectives import ring_means
-from thincam_jax.design.search import Found
+from thincam_jax.design.search import APART, Found
 from thincam_jax.design_run.problem import Data, Goal, Problem, build_problem
 from thincam_jax.study.target import Progress
 
 FIND_STEPS = 3  # progress that `find` reports
 _KEPT = 10  # designs that are re-scored and listed
-_APART = 0.02  # of the space, as in `thincam_jax.design.search`
 _RINGS = 64
 
 
@@ -167,8 +166,8 @@ def _alike(space: DesignSpace, one: Found, other: Found, phases: int) -> bool:
         spans[v.name] = max(spans[v.name], float(upper - lower))
     pairs = zip(*(sorted(_shots(f.design, phases)) for f in (one, other)), strict=True)
     return all(
-        abs(a.beta - b.beta) <= _APART * spans["beta"]
-        and abs(a.distance - b.distance) <= _APART * spans["distance"]
+        abs(a.beta - b.beta) <= APART * spans["beta"]
+        and abs(a.distance - b.distance) <= APART * spans["distance"]
         for a, b in pairs
     )
 
