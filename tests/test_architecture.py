@@ -48,7 +48,15 @@ ORDER = (
         "reconstruct",
     ),
     *("metrics", "depth", "design", "calibrate", "measured"),
-    *("config_file", "config", "config_refocus", "config_design", "study", "design_run", "report"),
+    *(
+        "config_file",
+        "config",
+        "config_refocus",
+        "config_pareto",
+        "config_training",
+        "config_design",
+    ),
+    *("study", "design_run", "report"),
     *("bench", "doctor", "run", "run_refocus", "run_design", "reconstruction_run", "sweep"),
     *("terminal", "cli_reconstruct", "cli_refocus", "cli_sweep", "cli_design", "cli"),
     "hardware",
@@ -59,7 +67,8 @@ MAX_LINES = 500
 JAXOPT_FILES = ("reconstruct/_jaxopt.py", "design/_jaxopt.py")
 FRONT_END_LIBRARIES = ("matplotlib", "pydantic", "typer", "rich", "jinja2")
 FRONT_END = (
-    *("config", "config_refocus", "config_design", "study", "report", "bench", "doctor"),
+    *("config", "config_refocus", "config_pareto", "config_training", "config_design"),
+    *("study", "report", "bench", "doctor"),
     *("terminal", "cli_reconstruct", "cli_refocus", "cli_sweep", "cli_design", "cli"),
 )
 

@@ -100,6 +100,8 @@ class TestExitCode2:
             ("search.limits.mask_pixel=0.2 mm", "no design is feasible: beta of capture 1, 2 ≥ 12"),
             ("search.limits.captures=0", "greater than or equal to 1"),
             ("targets.1.path=missing.png", "targets[1]: "),
+            ("pareto.light.bounds=[10, 100]", "pareto.light: light needs noise that counts elec"),
+            ("pareto.thickness.bounds=[2 mm, 3 mm]", "pareto.thickness: no distance is free"),
             ("sensor.shape=[4, 64]", "sensor.shape: 4×64 pixels are too few"),
         ],
     )

@@ -98,7 +98,7 @@ def test_the_farthest_distance_keeps_the_thickness(tmp_path):
         ("reference.shots=[]", "reference.shots", "give at least 1"),
         ("reference.shots.1.beta=25 /mm^2", "reference.shots", "hold an entry twice"),
         ("reference.shots.1.wavelength=600 nm", "reference.shots[1].wavelength", "one wavelength"),
-        ("reference.name=Found 2", "reference.name", "is what found designs are called"),
+        ("reference.name=Found 2", "reference.name", "is what another or a found design is called"),
         ("search.band=[0.1, 0.4]", "search", "objective bayes_error has no band"),
         ("validate.seeds=0", "validate.seeds", "greater than or equal to 1"),
         ("validate.runs=1", "validate.runs", "unknown key; allowed here: seeds, best"),
@@ -106,6 +106,21 @@ def test_the_farthest_distance_keeps_the_thickness(tmp_path):
         ("noise.read_noise=8", "noise", "give either snr_db"),
         ("prior.measured=true", "prior", "give either exponent"),
         ("targets=[]", "targets", "give at least 1"),
+        ("train={images: [nobody]}", "train.images", "unknown; choose from astronaut, "),
+        ("train={images: [camera, camera]}", "train.images", "hold an entry twice"),
+        ("train={images: []}", "train.images", "give at least 1"),
+        ("train={images: [camera], pixels: 8}", "train.pixels", "greater than or equal to 32"),
+        (
+            "compare=[{name: other, shots: [{beta: 9 /mm^2, distance: 3 mm}]}]",
+            "compare[0].shots",
+            "1 shots, and the reference has 2; give as many",
+        ),
+        (
+            "compare=[{name: pairs, shots: [{beta: 9 /mm^2, distance: 3 mm}, "
+            "{beta: 8 /mm^2, distance: 3 mm}]}]",
+            "compare[0].name",
+            "'pairs' is what another",
+        ),
     ],
 )
 def test_fault_of_an_entry(tmp_path, setting, field, part):
@@ -139,6 +154,110 @@ def test_no_feasible_design(tmp_path, setting, place, part):
     assert part in line
 
 
+FREE_DISTANCE = (
+    "search.free=[{variable: beta, bounds: [12 /mm^2, 30 /mm^2]}, "
+    "{variable: distance, bounds: [2 mm, 4 mm], shots: [2]}]"
+)
+
+
+@pytest.mark.parametrize(
+    ("settings", "field", "part"),
+    [
+        (("pareto={}",), "pareto", "no front is asked for; give thickness, captures or light"),
+        (
+            (FREE_DISTANCE, "pareto.thickness.bounds=[4 mm, 3 mm]"),
+            "pareto.thickness.bounds",
+            "bounds cross: 4 to 3 mm; give the lower first",
+        ),
+        (
+            ("pareto.thickness={bounds: [3 mm, 4 mm], points: 1}",),
+            "pareto.thickness.points",
+            "greater than or equal to 2",
+        ),
+        (("pareto.thickness.bounds=[3 mm, 4 mm]",), "pareto.thickness", "no distance is free"),
+        (
+            (FREE_DISTANCE, "pareto.thickness.bounds=[2 mm, 4 mm]"),
+            "pareto.thickness.bounds",
+            "no design is feasible at 2 mm: the distance of shot 1, 3 mm, is not free",
+        ),
+        (
+            (
+                FREE_DISTANCE,
+                "pareto.thickness.bounds=[1 mm, 4 mm]",
+                "reference.shots.0.distance=1mm",
+            ),
+            "pareto.thickness.bounds",
+            "no design is feasible at 1 mm: the distance of shot 2 is free from 2 mm only",
+        ),
+        (
+            (FREE_DISTANCE, "pareto.thickness.bounds=[3 mm, 5 mm]"),
+            "pareto.thickness.bounds",
+            "bounds reach to 5 mm, and no free distance beyond 4 mm",
+        ),
+        (
+            (
+                *(FREE_DISTANCE, "search.limits.thickness=3.5 mm"),
+                "pareto.thickness.bounds=[3 mm, 4 mm]",
+            ),
+            "pareto.thickness.bounds",
+            "bounds reach to 4 mm, and no free distance beyond 3.5 mm",
+        ),
+        (("pareto.light.bounds=[9, 90]",), "pareto.light", "light needs noise that counts electr"),
+        (
+            ("pareto.light.bounds=[90, 9]",),
+            "pareto.light.bounds",
+            "bounds cross: 90 to 9 electrons",
+        ),
+        (("pareto.light.bounds=[0, 9]",), "pareto.light.bounds[0]", "greater than 0"),
+        (
+            ("pareto.captures.shots=[1, 3]",),
+            "pareto.captures.shots",
+            "3 shots take 6 captures, and search.limits.captures allows 4; give at most 2 shots",
+        ),
+        (
+            ("search.limits.captures=8", "pareto.captures.shots=[5]"),
+            "pareto.captures.shots",
+            "5 shots take 10 captures, and search.limits.captures allows 8",
+        ),
+        (("pareto.captures.shots=[1, 1]",), "pareto.captures.shots", "hold an entry twice"),
+        (("pareto.captures.shots=[]",), "pareto.captures.shots", "give at least 1"),
+        (
+            ("search.free.0.shots=[2]", "pareto.captures.shots=[1, 2]"),
+            "pareto.captures.shots",
+            "of the first shots, 1, nothing is free",
+        ),
+        (
+            ("targets=[{name: a, kind: usaf1951}]", "pareto.captures.shots=[1]"),
+            "pareto.captures",
+            "PSNR needs a photograph among the targets",
+        ),
+    ],
+)
+def test_fault_of_a_front(tmp_path, settings, field, part):
+    line = fault(tmp_path, *settings)
+    assert f": {field}: " in line
+    assert part in line
+
+
+def test_fronts_and_their_costs(tmp_path):
+    fronts = tiny.design(
+        tmp_path,
+        FREE_DISTANCE,
+        "noise={read_noise: 4, electrons: 900}",
+        "pareto.thickness={bounds: [3 mm, 4 mm], points: 3}",
+        "pareto.light={bounds: [10, 1000], points: 3}",
+        "pareto.captures.shots=[2, 1]",
+    )
+    asked = fronts.pareto
+    assert asked.thickness.costs() == pytest.approx([3.0, 3.5, 4.0])
+    assert asked.light.costs() == pytest.approx([10, 100, 1000])
+    assert asked.captures.shots == (1, 2)
+    path = tmp_path / "again.yaml"
+    path.write_text(dump_config(fronts), encoding="utf-8")
+    assert load_design(path) == fronts
+    assert tiny.design(tmp_path).pareto is None
+
+
 def test_more_captures_than_a_design_may_have(tmp_path):
     shots = ", ".join(f"{{beta: {b} /mm^2, distance: 3 mm}}" for b in range(20, 25))
     assert "give 1 to 8" in fault(tmp_path, f"reference.shots=[{shots}]")
@@ -160,6 +279,13 @@ def test_examples(name):
     assert config.prior.measured
     assert len(config.targets) == 4
     assert bool(broken_limits(config)) == (name == "design_slm")
+
+
+def test_example_of_fronts():
+    config = load_design(ROOT / "configs" / "design_pareto.yaml")
+    assert config.noise.electrons == 2000
+    assert config.pareto.captures.shots == (1, 2, 3, 4)
+    assert not broken_limits(config)
 
 
 def test_kinds_are_told_apart(tmp_path):

@@ -14,10 +14,18 @@ from thincam_jax.config import ConfigError, MethodConfig, StudyConfig, TargetCon
 from thincam_jax.design import landscape, search
 from thincam_jax.design.search import Found, Search
 from thincam_jax.design.space import active_limits
-from thincam_jax.design_run import build_study, compare, full_well, ranking
+from thincam_jax.design_run import Front, Fronts, Point, build_study, compare, full_well, ranking
+from thincam_jax.design_run import Transfer as ContrastTransfer
 from thincam_jax.design_run.problem import Goal
-from thincam_jax.design_run.ranking import Candidate, FreeValue, Landscape, Result, Shot
-from thincam_jax.report.design_figures import as_png, axis_label, draw_landscape, draw_responses
+from thincam_jax.design_run.ranking import Candidate, Landscape, Result, Shot
+from thincam_jax.design_run.sensitivity import FreeValue
+from thincam_jax.report.design_figures import (
+    as_png,
+    axis_label,
+    draw_landscape,
+    draw_mtf,
+    draw_responses,
+)
 from thincam_jax.report.design_page import findings
 from thincam_jax.run_design import DesignFolder, run_design, steps
 from thincam_jax.sensor import electrons_per_unit
@@ -67,7 +75,7 @@ def test_what_is_written(whole):
     assert len(texts) == steps(config) == 6
     assert {p.name for p in path.iterdir()} == {
         *("config.yaml", "found.yaml", "design.json", "environment.json", "report.html"),
-        *("landscape.png", "responses.png", "targets"),
+        *("landscape.png", "responses.png", "mtf.png", "targets"),
     }
     assert skimage.io.imread(path / "landscape.png").shape[:2] == (660, 836)
     assert design["seed"] == 3
@@ -105,7 +113,7 @@ def test_found_study_gives_the_first_seed(whole):
 def test_report_stands_alone(whole):
     config, path, design, _ = whole
     page = (path / "report.html").read_text("utf-8")
-    assert page.count("data:image/png;base64,") == 2
+    assert page.count("data:image/png;base64,") == 3
     assert "A tiny design" in page
     psnr = design["validation"]["methods"]["pairs"]["picture"]["psnr_db"]
     assert f"{psnr['mean']:.2f} ± {psnr['deviation']:.2f}" in page
@@ -167,6 +175,37 @@ def test_interrupted_design_goes_on(whole, again, monkeypatch):
     interrupted()
     with pytest.raises(ConfigError, match="holds a design of another configuration"):
         again.folder.claim(again.config.model_copy(update={"seed": 4}))
+
+
+def test_fronts_are_written_and_reported(whole, again, monkeypatch, tmp_path):
+    """They come after the targets, and count as progress."""
+    bounds, told = "{bounds: [12 rad/mm^2, 30 rad/mm^2], variable: beta}", []
+    config = tiny.design(
+        tmp_path,
+        f"search.free=[{bounds}, {{variable: distance, bounds: [2 mm, 3 mm]}}]",
+        "pareto.thickness={bounds: [2 mm, 3 mm], points: 2}",
+    )
+    points = tuple(Point(cost, (Shot(20.0, cost),) * 2, 4 * cost, "", 0.1) for cost in (2.0, 3.0))
+
+    def found(_, progress, well):
+        assert well is None
+        for point in points:
+            progress(f"thickness {point.cost}")
+        return Fronts(Front(points, points[1]), None, None, 18.75, None)
+
+    monkeypatch.setattr(running, "find_fronts", found)
+    again.folder = DesignFolder(tmp_path / "fronts")
+    design = run_design(config, again.folder, told.append)
+    assert len(told) + 3 == steps(config)  # `find` is replaced
+    assert told[-3:] == ["thickness 2.0", "thickness 3.0", "report"]
+    path = again.folder.path
+    assert json.loads((path / "design.json").read_text("utf-8")) == design
+    assert [p["thickness_mm"] for p in design["pareto"]["thickness"]["points"]] == [2.0, 3.0]
+    assert (path / "pareto.png").exists()
+    page = (path / "report.html").read_text("utf-8")
+    assert "Thickness against resolution" in page
+    assert "0.120" in page  # 12 cycles/rad at 100 mm, line pairs/mm
+    assert "pareto" not in whole[2]
 
 
 def metrics(psnr, step, pixel=0.1):
@@ -269,6 +308,26 @@ class TestPictures:
         assert top.get_xlim()[1] == pytest.approx(6.25)
         assert "12.5" in top.get_xlabel()
         assert ax.lines[0].get_xdata()[0] == pytest.approx(18.75 / 128)
+
+    def test_contrast_side_by_side(self):
+        """Common axes; a curve for the chain, and one for each sum of captures."""
+        levels = np.linspace(1e-2, 1e-4, 64)
+        sums = (((1,), (2,)), ((3,), (4,)))
+        transfer = ContrastTransfer(np.stack([levels, levels / 2]), levels * 50, sums)
+        result = self.result()._replace(transfers=(transfer, transfer))
+        figure = draw_mtf(result, 100.0)
+        assert [ax.get_title() for ax in figure.axes] == ["pairs", "found 1"]
+        left, right = figure.axes
+        assert left.get_ylim() == right.get_ylim()
+        assert [line.get_label() for line in right.lines] == [
+            "camera and reconstruction",
+            "captures 1 − 2: β 20 rad/mm² at 3 mm",
+            "captures 3 − 4: β 17 rad/mm² at 3 mm",
+        ]
+        assert len({line.get_linestyle() + line.get_marker() for line in right.lines}) == 3
+        figure.draw_without_rendering()
+        assert left.child_axes[0].get_xlim()[1] == pytest.approx(0.1875)
+        assert draw_mtf(self.result(), 100.0) is None
 
     def test_labels(self):
         assert axis_label("distance", (1, 2)) == "distance of shots 1, 2 (mm)"

@@ -24,6 +24,8 @@ from thincam_jax.config import (
     slug,
 )
 from thincam_jax.config_file import read_raw
+from thincam_jax.config_pareto import ParetoConfig, check_pareto
+from thincam_jax.config_training import TrainingConfig
 from thincam_jax.design import Design, DesignSpace, Limits, Variable, shots
 from thincam_jax.psf import Model
 from thincam_jax.units import parse_quantity
@@ -102,6 +104,13 @@ class ReferenceConfig(Section):
         return MethodConfig(
             name=self.name, kind="wiener", synthesis=self.synthesis, shots=self.shots
         )
+
+
+class RivalConfig(Section):
+    """Another design that is simulated beside the reference, at the same budget."""
+
+    name: Name
+    shots: Annotated[tuple[ShotConfig, ...], Field(min_length=1)]
 
 
 class FreeConfig(Section):
@@ -208,7 +217,10 @@ class DesignConfig(Section):
     noise: DesignNoiseConfig
     prior: PriorConfig = PriorConfig(measured=True)
     reference: ReferenceConfig
+    compare: tuple[RivalConfig, ...] = ()
     search: SearchConfig
+    train: TrainingConfig | None = None
+    pareto: ParetoConfig | None = None
     targets: Annotated[tuple[TargetConfig, ...], Field(min_length=1)]
     # Not `validate`, which pydantic has for itself.
     validation: ValidateConfig = Field(default=ValidateConfig(), alias="validate")
@@ -217,7 +229,7 @@ class DesignConfig(Section):
     @pydantic.model_validator(mode="after")
     def _fits(self):
         check_names(self, "targets")
-        _check_reference(self)
+        _check_given(self)
         if self.prior.measured and not self.pictures():
             message = "measured needs a photograph among the targets; give prior.exponent instead"
             raise misfit(message, "prior", "measured")
@@ -225,6 +237,8 @@ class DesignConfig(Section):
             self.space()
         except ValueError as error:
             raise misfit(str(error), "search", _blamed(str(error))) from None
+        if self.pareto is not None:
+            check_pareto(self)
         return self
 
     def pictures(self) -> tuple[TargetConfig, ...]:
@@ -279,18 +293,34 @@ def _variables(config: DesignConfig):
             yield Variable(free.variable, *free.bounds, group)
 
 
-def _check_reference(config: DesignConfig) -> None:
-    shots = [(s.beta, s.distance) for s in config.reference.shots]
+def _check_given(config: DesignConfig) -> None:
+    """The designs that the file itself gives."""
+    taken = {slug(found_name(rank)) for rank in range(1, config.validation.best + 1)}
+    _check_shots(config, config.reference, taken, ("reference",))
+    for index, rival in enumerate(config.compare):
+        place = ("compare", index)
+        taken.add(slug(config.reference.name))
+        _check_shots(config, rival, taken, place)
+        taken.add(slug(rival.name))
+        count = len(config.reference.shots)
+        if len(rival.shots) != count:
+            message = f"{len(rival.shots)} shots, and the reference has {count}; give as many"
+            raise misfit(message, *place, "shots")
+
+
+def _check_shots(
+    config: DesignConfig, given: ReferenceConfig | RivalConfig, taken: set[str], place
+) -> None:
+    shots = [(s.beta, s.distance) for s in given.shots]
     if len(set(shots)) < len(shots):
-        raise misfit("shots hold an entry twice; give each once", "reference", "shots")
-    for index, shot in enumerate(config.reference.shots):
+        raise misfit("shots hold an entry twice; give each once", *place, "shots")
+    for index, shot in enumerate(given.shots):
         if shot.wavelength not in (None, config.wavelength):
             message = "a design has one wavelength; drop this one"
-            raise misfit(message, "reference", "shots", index, "wavelength")
-    taken = [slug(found_name(rank)) for rank in range(1, config.validation.best + 1)]
-    if slug(config.reference.name) in taken:
-        message = f"{config.reference.name!r} is what found designs are called; choose another name"
-        raise misfit(message, "reference", "name")
+            raise misfit(message, *place, "shots", index, "wavelength")
+    if slug(given.name) in taken:
+        message = f"{given.name!r} is what another or a found design is called; choose another name"
+        raise misfit(message, *place, "name")
 
 
 def _blamed(message: str) -> str:

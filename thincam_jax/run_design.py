@@ -5,11 +5,22 @@ from typing import Any
 
 from thincam_jax.config import Section, StudyConfig, dump_config
 from thincam_jax.config_design import DesignConfig
-from thincam_jax.design_run import FIND_STEPS, build_study, compare, find, full_well, simulate
-from thincam_jax.design_run.record import record
+from thincam_jax.design_run import (
+    build_study,
+    compare,
+    find,
+    find_fronts,
+    find_steps,
+    full_well,
+    pareto_steps,
+    simulate,
+)
+from thincam_jax.design_run.ranking import Result
+from thincam_jax.design_run.record import record, record_fronts
 from thincam_jax.doctor import environment
 from thincam_jax.report import design_figures as figures
 from thincam_jax.report.design_page import render
+from thincam_jax.report.design_pareto_figure import draw_fronts
 from thincam_jax.study import RunFolder
 from thincam_jax.study.folder import claim_folder, to_json
 from thincam_jax.study.target import Progress
@@ -21,8 +32,8 @@ class DesignFolder(RunFolder):
     - `config.yaml`: the resolved configuration.
     - `found.yaml`: the reference and the best designs, for `thincam run`.
     - `targets/NAME.json`: the simulation of a finished target; an interrupted design skips these.
-    - `landscape.png`, `responses.png`, `environment.json`, `report.html`, `design.json`: written at
-      the end.
+    - `landscape.png`, `responses.png`, `mtf.png`, `pareto.png`, `environment.json`, `report.html`,
+      `design.json`: written at the end.
     """
 
     def claim(self, config: Section) -> None:
@@ -36,7 +47,7 @@ class DesignFolder(RunFolder):
 
 def steps(config: DesignConfig) -> int:
     """How many times `run_design` reports progress."""
-    return FIND_STEPS + len(config.targets) + 1
+    return find_steps(config) + len(config.targets) + pareto_steps(config.pareto) + 1
 
 
 def run_design(config: DesignConfig, folder: DesignFolder, progress: Progress) -> dict[str, Any]:
@@ -48,25 +59,42 @@ def run_design(config: DesignConfig, folder: DesignFolder, progress: Progress) -
     folder.claim(config)
     result = find(config, progress)
     best = result.found[: config.validation.best]
-    study = build_study(config, best, full_well(config))
+    well = full_well(config)
+    study = build_study(config, best, well)
     folder.write("found.yaml", dump_config(study))
     trials = {}
     for index, target in enumerate(study.targets):
         progress(target.name)
         trials[target.name] = _target(config, study, index, folder)
     design = record(config, result, study, compare(study, trials))
+    if config.pareto is not None:
+        design["pareto"] = record_fronts(config, find_fronts(config, progress, well))
     progress("report")
-    landscape = figures.draw_landscape(result, len(best))
-    if landscape is not None:
-        folder.write("landscape.png", figures.as_png(landscape))
-    responses = figures.draw_responses(result, len(best), study.sensor.pitch)
-    folder.write("responses.png", figures.as_png(responses))
+    _draw(config, result, design, folder)
     surroundings = environment(time.time() - started)
     folder.write("environment.json", to_json({**surroundings, "seed": config.seed}))
     folder.write("report.html", render(config, folder.path, design, surroundings))
     # Last: it marks the design as complete.
     folder.write("design.json", to_json(design))
     return design
+
+
+def _draw(
+    config: DesignConfig, result: Result, design: dict[str, Any], folder: DesignFolder
+) -> None:
+    count = len(result.found[: config.validation.best])
+    distance = config.object.distance
+    pictures = {
+        "landscape.png": figures.draw_landscape(result, count),
+        "responses.png": figures.draw_responses(result, count, config.sensor.pitch),
+        "mtf.png": figures.draw_mtf(result, distance),
+    }
+    if "pareto" in design:
+        name = result.reference.name
+        pictures["pareto.png"] = draw_fronts(design["pareto"], name, distance)
+    for name, figure in pictures.items():
+        if figure is not None:
+            folder.write(name, figures.as_png(figure))
 
 
 def _target(config: DesignConfig, study: StudyConfig, index: int, folder: DesignFolder):

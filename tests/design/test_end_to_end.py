@@ -52,7 +52,7 @@ def training(noise=None, synthesis=None, **settings):
         setup(noise),
         phase_pairs(2) if synthesis is None else synthesis,
         sensor_shape=SENSOR,
-        longest_distance=7.0,
+        distances=(4.0, 7.0),
         key=jax.random.key(5),
         **{"tolerance": 1e-12, "steps": 600, **settings},
     )
@@ -196,7 +196,7 @@ def test_errors():
             setup(),
             phase_pairs(1),
             sensor_shape=SENSOR,
-            longest_distance=7.0,
+            distances=(4.0, 7.0),
             key=jax.random.key(0),
         )
     with pytest.raises(ValueError, match="adds 2 captures and the design takes 4"):

@@ -2,18 +2,20 @@
 
 from thincam_jax.design.design import Design as Design
 from thincam_jax.design.design import shots as shots
-from thincam_jax.design.end_to_end import Training as Training
 from thincam_jax.design.end_to_end import drawn_error as drawn_error
 from thincam_jax.design.end_to_end import end_to_end_error as end_to_end_error
 from thincam_jax.design.end_to_end import restore as restore
 from thincam_jax.design.frequencies import Polar as Polar
 from thincam_jax.design.frequencies import Quadrant as Quadrant
+from thincam_jax.design.match import Match as Match
+from thincam_jax.design.match import match_response as match_response
 from thincam_jax.design.objectives import bayes_error as bayes_error
 from thincam_jax.design.objectives import channels as channels
 from thincam_jax.design.objectives import limit as limit
 from thincam_jax.design.objectives import mismatch_error as mismatch_error
 from thincam_jax.design.objectives import unevenness as unevenness
 from thincam_jax.design.objectives import worst_ratio_db as worst_ratio_db
+from thincam_jax.design.pareto import non_dominated as non_dominated
 from thincam_jax.design.prior import PowerLaw as PowerLaw
 from thincam_jax.design.prior import fit_power_law as fit_power_law
 from thincam_jax.design.robust import Tolerances as Tolerances
@@ -27,3 +29,15 @@ from thincam_jax.design.space import DesignSpace as DesignSpace
 from thincam_jax.design.space import Limits as Limits
 from thincam_jax.design.space import Variable as Variable
 from thincam_jax.design.stochastic import stochastic_descent as stochastic_descent
+from thincam_jax.design.suggest import Suggester as Suggester
+from thincam_jax.design.suggest import Suggestion as Suggestion
+from thincam_jax.design.suggest import load_suggester as load_suggester
+from thincam_jax.design.suggest import propose as propose
+from thincam_jax.design.suggest import save_suggester as save_suggester
+from thincam_jax.design.suggest import suggest as suggest
+from thincam_jax.design.train_suggester import train_suggester as train_suggester
+from thincam_jax.design.training import Training as Training
+from thincam_jax.design.wanted import response_misfit as response_misfit
+from thincam_jax.design.wanted import ring_levels as ring_levels
+from thincam_jax.design.wiener import restore_by_wiener as restore_by_wiener
+from thincam_jax.design.wiener import wiener_error as wiener_error

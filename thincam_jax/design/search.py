@@ -100,9 +100,9 @@ def search(
         if number < 1:
             raise ValueError(f"{name} = {number}; give at least 1")
     _checks.choice("solver", solver, ("bfgs", "lbfgsb"))
-    points = _even_samples(space.size, max(samples, starts), key, space.lower.dtype)
+    points = even_samples(space.size, max(samples, starts), key, space.lower.dtype)
     values = evaluate(objective, space, data, points)
-    chosen = _starts(np.asarray(points), np.asarray(values), starts)
+    chosen = best_apart(np.asarray(points), np.asarray(values), starts)
     descend = _descend if solver == "bfgs" else _descend_in_box
     ended = descend(
         objective, space, data, points[chosen], _scale(values[chosen]), steps, tolerance
@@ -110,23 +110,51 @@ def search(
     ended = jax.device_get(ended)
     failed = sum(int(np.sum(~np.isfinite(v))) for v in (np.asarray(values), ended.values))
     used = len(points) + int(np.sum(ended.evaluations))
-    return Search(_ranked(space, ended, apart), used, failed)
+    return Search(ranked(space, ended, apart), used, failed)
+
+
+def descend(
+    objective: Objective,
+    space: DesignSpace,
+    data: Any,
+    points: Float[Array, "start variable"],
+    *,
+    steps: int = 60,
+    tolerance: float = 1e-6,
+    apart: float = APART,
+) -> Search:
+    """Descents from given points of the unit cube, one after the other: for costly objectives.
+
+    By BFGS; arguments and result as of `search`.
+    """
+    ended = []
+    for point in points:
+        value = evaluate(objective, space, data, point[None])
+        ended.append(_descend(objective, space, data, point[None], _scale(value), steps, tolerance))
+    stacked = jax.device_get(jax.tree.map(lambda *parts: jnp.concatenate(parts), *ended))
+    failed = int(np.sum(~np.isfinite(stacked.values)))
+    return Search(ranked(space, stacked, apart), int(np.sum(stacked.evaluations)), failed)
 
 
 # Points of the unit cube that are evaluated at a time.
 _AT_A_TIME = 32
 
 
-@functools.partial(jax.jit, static_argnames="objective")
+@functools.partial(jax.jit, static_argnames=("objective", "at_a_time"))
 def evaluate(
-    objective: Objective, space: DesignSpace, data: Any, points: Float[Array, "point variable"]
+    objective: Objective,
+    space: DesignSpace,
+    data: Any,
+    points: Float[Array, "point variable"],
+    *,
+    at_a_time: int = _AT_A_TIME,
 ) -> Float[Array, " point"]:
-    """The objective at points of the unit cube."""
+    """The objective at points of the unit cube, so many at a time."""
 
     def at(point):
         return objective(space.design(point), data)
 
-    return jax.lax.map(at, points, batch_size=_AT_A_TIME)
+    return jax.lax.map(at, points, batch_size=at_a_time)
 
 
 def landscape(
@@ -146,14 +174,15 @@ def landscape(
     return points, evaluate(objective, space, data, points)
 
 
-def _even_samples(dimensions: int, count: int, key, dtype) -> Float[Array, "point variable"]:
+def even_samples(dimensions: int, count: int, key, dtype) -> Float[Array, "point variable"]:
+    """Scrambled Sobol points of the unit cube."""
     seed = int(jax.random.randint(key, (), 0, 2**31 - 1))
     power = max(0, (count - 1).bit_length())
     sampler = qmc.Sobol(dimensions, scramble=True, rng=seed)
     return jnp.asarray(sampler.random_base2(power)[:count], dtype)
 
 
-def _starts(points: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:
+def best_apart(points: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:
     """The lowest samples, each farther from those chosen before than samples are on average."""
     spacing = 0.5 * len(points) ** (-1 / points.shape[1])
     chosen: list[int] = []
@@ -216,7 +245,8 @@ def _descend_in_box(objective, space, data, points, scales, steps: int, toleranc
     return jax.vmap(one)(points, scales)
 
 
-def _ranked(space: DesignSpace, ended: Descents, apart: float) -> tuple[Found, ...]:
+def ranked(space: DesignSpace, ended: Descents, apart: float) -> tuple[Found, ...]:
+    """The optima, best first, without those nearer than `apart` to a better one."""
     found: list[Found] = []
     order = jnp.argsort(jnp.where(jnp.isfinite(ended.values), ended.values, jnp.inf))
     for index in order:

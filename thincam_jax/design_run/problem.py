@@ -31,7 +31,7 @@ from thincam_jax.study.build import build_plane, synthesis_matrix
 
 DEFAULT_BAND = (0.05, 0.5)
 # What is called worse by 1 %: 10 log10(1.01) dB for what is in dB.
-_RISE, _RISE_DB = 0.01, 0.0432
+RISE, _RISE_DB = 0.01, 0.0432
 
 _MARGIN, _FEWEST = 1.1, 128  # of the samples that fringes need; at least
 
@@ -104,7 +104,7 @@ class Goal:
 
     def rise(self, value: float) -> float:
         """What is called worse by 1 %."""
-        return _RISE_DB if self.name in ("worst_ratio", "unevenness") else _RISE * abs(value)
+        return _RISE_DB if self.name in ("worst_ratio", "unevenness") else RISE * abs(value)
 
 
 class Problem(NamedTuple):
@@ -168,6 +168,13 @@ def _prior(config: DesignConfig) -> PowerLaw:
     study = build_study(config)
     planes = (build_plane(study, target) for target in config.pictures())
     return fit_power_law(np.asarray(p.image, dtype=float).mean(axis=0) for p in planes)
+
+
+def spans_of(space: DesignSpace) -> np.ndarray:
+    """How long each side of the cube is in the variables' units; straight, with a fixed width."""
+    ends = (space.values(jnp.full(space.size, end, space.lower.dtype)) for end in (1.0, 0.0))
+    upper, lower = (np.asarray(end, dtype=float) for end in ends)
+    return upper - lower
 
 
 def broken_limits(config: DesignConfig) -> tuple[str, ...]:

@@ -1,7 +1,6 @@
 """The search, its designs ranked and re-scored exactly, and what surrounds them."""
 
-import functools
-import math
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import equinox as eqx
@@ -12,15 +11,21 @@ import numpy as np
 from thincam_jax._precision import allow
 from thincam_jax.config import ConfigError
 from thincam_jax.config_design import DesignConfig, found_name
-from thincam_jax.design import Design, DesignSpace, Variable, channels, landscape, search
+from thincam_jax.design import Design, DesignSpace, channels, landscape, search
 from thincam_jax.design.objectives import ring_means
 from thincam_jax.design.search import APART, Found
-from thincam_jax.design_run.problem import Data, Goal, Problem, build_problem
+from thincam_jax.design_run.problem import RISE, Data, Goal, Problem, build_problem, spans_of
+from thincam_jax.design_run.sensitivity import (
+    FreeValue,
+    around,
+    free_values,
+    shots_of_variable,
+)
+from thincam_jax.design_run.train import Trained, train
+from thincam_jax.design_run.transfer import RINGS, Transfer, modulation_transfer
 from thincam_jax.study.target import Progress
 
-FIND_STEPS = 3  # progress that `find` reports
 _KEPT = 10  # designs that are re-scored and listed
-_RINGS = 64
 
 
 class Shot(NamedTuple):
@@ -30,24 +35,12 @@ class Shot(NamedTuple):
     distance: float
 
 
-class FreeValue(NamedTuple):
-    """A free number of a found design.
-
-    - `shots`: that it belongs to, from 1.
-    - `tolerance`: the change that makes the objective worse by 1 %; None where none does.
-    """
-
-    variable: str
-    shots: tuple[int, ...]
-    value: float
-    tolerance: float | None
-
-
 class Candidate(NamedTuple):
     """A design, its goal (smaller is better) as searched and exactly, and its ring means.
 
     - `level`: signal-to-noise ratio of each ring.
     - `values`, `status`, `active`: of what was found; empty for the reference.
+    - `trained`: the error of the training images, with training.
     """
 
     name: str
@@ -58,6 +51,7 @@ class Candidate(NamedTuple):
     values: tuple[FreeValue, ...] = ()
     status: str = ""
     active: tuple[str, ...] = ()
+    trained: float | None = None
 
 
 class Landscape(NamedTuple):
@@ -73,7 +67,12 @@ class Landscape(NamedTuple):
 
 
 class Result(NamedTuple):
-    """What a search gave; `edge`: of the frequencies looked at, cycles/rad."""
+    """What a search gave.
+
+    - `edge`: of the frequencies looked at, cycles/rad.
+    - `transfers`: the modulation transfer of the reference and of the best design.
+    - `trainings`: evaluations of the training error.
+    """
 
     goal: Goal
     reference: Candidate
@@ -83,14 +82,20 @@ class Result(NamedTuple):
     exponent: float
     edge: float
     landscape: Landscape | None
+    transfers: tuple[Transfer, Transfer] | None = None
+    trainings: int = 0
 
 
 def find(config: DesignConfig, progress: Progress) -> Result:
-    """In double precision: the objective's fringes are finer than single precision holds."""
+    """The search, in double precision: its objective's fringes are finer than single holds.
+
+    Training, which is not that fine, is in the precision that JAX is set to.
+    """
+    wanted = config.search
+    phases = len(config.reference.method().shot_phases())
     with allow("float64"):
         problem = build_problem(config)
         progress("search")
-        wanted = config.search
         searched = search(
             problem.goal,
             problem.space,
@@ -101,29 +106,50 @@ def find(config: DesignConfig, progress: Progress) -> Result:
             steps=wanted.steps,
             solver=wanted.solver,
         )
+        kept = _distinct(problem.space, searched.found, phases)
+    trained = None
+    if config.train is not None:
+        progress("training")
+        trained = train(config, config.train, problem, [np.asarray(k.point) for k in kept])
+    with allow("float64"):
         progress("found designs")
-        phases = len(config.reference.method().shot_phases())
-        found, best = _rescore(problem, searched.found, phases)
+        if trained is None:
+            found, best = _rescore(problem, kept, phases)
+        else:
+            found, best = _rank_trained(problem, trained, phases)
         progress("landscape")
-        around = _landscape(problem, best, wanted.grid, phases)
-        base = problem.space.base
-        reference = Candidate(config.reference.name, _shots(base, phases), *_score(problem, base))
-        return Result(
-            problem.goal,
-            reference,
-            found,
-            searched.evaluations,
-            searched.failed,
-            float(problem.data.setup.prior.exponent),
-            float(problem.data.frequencies.highest),
-            around,
-        )
+        return _result(config, problem, searched, trained, found, best)
 
 
-def _rescore(
-    problem: Problem, found: tuple[Found, ...], phases: int
-) -> tuple[tuple[Candidate, ...], Design]:
-    """The best, without those whose shots are only in another order, ranked exactly; and the first.
+def find_steps(config: DesignConfig) -> int:
+    """How many times `find` reports progress."""
+    return 3 if config.train is None else 4
+
+
+def _result(config: DesignConfig, problem: Problem, searched, trained, found, best) -> Result:
+    phases = len(config.reference.method().shot_phases())
+    base = problem.space.base
+    shots = shots_of_design(base, phases)
+    reference = Candidate(config.reference.name, shots, *_score(problem, base))
+    evaluations = searched.evaluations
+    if trained is not None:
+        reference = reference._replace(trained=trained.reference)
+    return Result(
+        problem.goal,
+        reference,
+        found,
+        evaluations,
+        searched.failed,
+        float(problem.data.setup.prior.exponent),
+        float(problem.data.frequencies.highest),
+        _landscape(problem, best, config.search.grid, phases),
+        (modulation_transfer(base, problem.exact), modulation_transfer(best, problem.exact)),
+        0 if trained is None else trained.evaluations,
+    )
+
+
+def _distinct(space: DesignSpace, found: tuple[Found, ...], phases: int) -> tuple[Found, ...]:
+    """The best, without those whose shots are only in another order.
 
     **Errors**: ConfigError where the objective was no number at any start.
     """
@@ -133,27 +159,58 @@ def _rescore(
         )
     kept: list[Found] = []
     for one in found:
-        if not any(_alike(problem.space, one, other, phases) for other in kept):
+        if not any(_alike(space, one, other, phases) for other in kept):
             kept.append(one)
         if len(kept) == _KEPT:
             break
+    return tuple(kept)
+
+
+def _rescore(
+    problem: Problem, kept: tuple[Found, ...], phases: int
+) -> tuple[tuple[Candidate, ...], Design]:
+    """The search's designs, ranked exactly; and the first."""
     candidates = [
-        Candidate(
-            "",
-            _shots(one.design, phases),
-            *_score(problem, one.design),
-            _free_values(problem, one, phases),
-            one.status,
-            one.active,
-        )
-        for one in kept
+        _candidate(problem, one, _tolerances(problem, one, phases), phases) for one in kept
     ]
     order = sorted(range(len(kept)), key=lambda n: candidates[n].exact)
-    ranked = (candidates[n]._replace(name=found_name(k)) for k, n in enumerate(order, 1))
-    return tuple(ranked), kept[order[0]].design
+    return _named(candidates[n] for n in order), kept[order[0]].design
 
 
-def _shots(design: Design, phases: int) -> tuple[Shot, ...]:
+def _rank_trained(
+    problem: Problem, trained: Trained, phases: int
+) -> tuple[tuple[Candidate, ...], Design]:
+    """The trained designs, by their training error; and the first.
+
+    **Errors**: ConfigError where that was no number at any start.
+    """
+    space = problem.space
+    near = {id(one): around for one, around in zip(trained.found, trained.around, strict=True)}
+    candidates, designs = [], []
+    for one in _distinct(space, trained.found, phases):
+        point = jnp.asarray(np.asarray(one.point), space.lower.dtype)
+        exact = one._replace(design=space.design(point), values=space.values(point), point=point)
+        rise = RISE * one.objective
+        values = free_values(space, exact, near[id(one)], rise, phases)
+        candidate = _candidate(problem, exact, values, phases)
+        candidates.append(candidate._replace(trained=one.objective))
+        designs.append(exact.design)
+    return _named(candidates), designs[0]
+
+
+def _candidate(
+    problem: Problem, one: Found, values: tuple[FreeValue, ...], phases: int
+) -> Candidate:
+    shots, score = shots_of_design(one.design, phases), _score(problem, one.design)
+    return Candidate("", shots, *score, values, one.status, one.active)
+
+
+def _named(candidates: Iterable[Candidate]) -> tuple[Candidate, ...]:
+    return tuple(c._replace(name=found_name(k)) for k, c in enumerate(candidates, 1))
+
+
+def shots_of_design(design: Design, phases: int) -> tuple[Shot, ...]:
+    """β and distance of each shot, which takes `phases` captures."""
     numbers = (design.beta, design.distance)
     beta, distance = (np.asarray(n, dtype=float)[::phases] for n in numbers)
     return tuple(Shot(float(b), float(d)) for b, d in zip(beta, distance, strict=True))
@@ -164,7 +221,7 @@ def _alike(space: DesignSpace, one: Found, other: Found, phases: int) -> bool:
     spans = {"beta": 0.0, "distance": 0.0}
     for v, lower, upper in zip(space.variables, space.lower, space.upper, strict=True):
         spans[v.name] = max(spans[v.name], float(upper - lower))
-    pairs = zip(*(sorted(_shots(f.design, phases)) for f in (one, other)), strict=True)
+    pairs = zip(*(sorted(shots_of_design(f.design, phases)) for f in (one, other)), strict=True)
     return all(
         abs(a.beta - b.beta) <= APART * spans["beta"]
         and abs(a.distance - b.distance) <= APART * spans["distance"]
@@ -182,70 +239,19 @@ def _score(problem: Problem, design: Design) -> tuple[float, float, np.ndarray]:
 @eqx.filter_jit
 def _goal_and_rings(goal: Goal, design: Design, data: Data):
     known = channels(design, data.setup, data.synthesis, data.frequencies)
-    return goal(design, data), ring_means(known, data.frequencies, _RINGS)
+    return goal(design, data), ring_means(known, data.frequencies, RINGS)
 
 
-def _free_values(problem: Problem, found: Found, phases: int) -> tuple[FreeValue, ...]:
-    space = problem.space
-    spans = _spans(space)
-    slopes, curves = _along(problem.goal, space, problem.data, found.point)
-    values = []
-    for number, variable in enumerate(space.variables):
-        span = float(spans[number])
-        change = None
-        if span > 0:
-            rise = problem.goal.rise(found.objective)
-            change = _change(float(slopes[number]) / span, float(curves[number]) / span**2, rise)
-        shots = _shots_of(variable, phases)
-        values.append(FreeValue(variable.name, shots, float(found.values[number]), change))
-    return tuple(values)
-
-
-def _spans(space: DesignSpace) -> np.ndarray:
-    """What a side of the cube is in the variables' units; straight, for the width is not free."""
-    ends = (space.values(jnp.full(space.size, end, space.lower.dtype)) for end in (1.0, 0.0))
-    upper, lower = (np.asarray(end, dtype=float) for end in ends)
-    return upper - lower
-
-
-def _shots_of(variable: Variable, phases: int) -> tuple[int, ...]:
-    return tuple(sorted({c // phases + 1 for c in variable.captures}))
-
-
-@functools.partial(jax.jit, static_argnames="goal")
-def _along(goal: Goal, space: DesignSpace, data: Data, point):
-    """First and second derivative of the goal along each side of the cube."""
-
-    def one(direction):
-        def value(step):
-            return goal(space.design(point + step * direction), data)
-
-        def slope(step):
-            return jax.jvp(value, (step,), (jnp.ones_like(step),))[1]
-
-        start = jnp.zeros((), point.dtype)
-        return jax.jvp(slope, (start,), (jnp.ones_like(start),))
-
-    return jax.lax.map(one, jnp.eye(len(point), dtype=point.dtype))
-
-
-def _change(slope: float, curve: float, rise: float) -> float | None:
-    """The least change that costs `rise`: |slope| δ + curve δ²/2 = rise.
-
-    At an optimum within the bounds there is no slope; at a bound it counts, and is all that counts
-    where the curvature is negative.
-    """
-    slope = abs(slope)
-    root = slope**2 + 2 * curve * rise
-    if not math.isfinite(root) or root < 0 or slope + math.sqrt(root) == 0:
-        return None
-    return 2 * rise / (slope + math.sqrt(root))
+def _tolerances(problem: Problem, one: Found, phases: int) -> tuple[FreeValue, ...]:
+    space, goal = problem.space, problem.goal
+    near = around(goal, space, problem.data, one.point)
+    return free_values(space, one, near, goal.rise(one.objective), phases)
 
 
 def _landscape(problem: Problem, best: Design, count: int, phases: int) -> Landscape | None:
     """Over the first two free numbers, or the only one; None where bounds leave them no room."""
     space = problem.space
-    spans = _spans(space)[:2]
+    spans = spans_of(space)[:2]
     if not np.all(spans > 0):
         return None
     variables = space.variables[:2]
@@ -255,5 +261,5 @@ def _landscape(problem: Problem, best: Design, count: int, phases: int) -> Lands
     lower = np.asarray(plane.lower, dtype=float)
     axes = tuple(low + place * span for low, span in zip(lower, spans, strict=True))
     shape = (count,) * len(variables)
-    named = tuple((v.name, _shots_of(v, phases)) for v in variables)
+    named = tuple((v.name, shots_of_variable(v, phases)) for v in variables)
     return Landscape(named, axes, np.asarray(goal, dtype=float).reshape(shape))

@@ -1,9 +1,14 @@
 """What goes into design.json."""
 
+import math
 from typing import Any
+
+import numpy as np
 
 from thincam_jax.config import StudyConfig
 from thincam_jax.config_design import DesignConfig
+from thincam_jax.design import non_dominated
+from thincam_jax.design_run.pareto import Front, Fronts, Point
 from thincam_jax.design_run.problem import broken_limits
 from thincam_jax.design_run.ranking import Candidate, FreeValue, Result, Shot
 
@@ -29,6 +34,7 @@ def record(config: DesignConfig, result: Result, study: StudyConfig, validation:
             "failed_starts": result.failed,
             "solver": config.search.solver,
         },
+        "training": _training(config, result),
         "reference": {
             **_candidate(result, result.reference),
             "broken_limits": list(broken_limits(config)),
@@ -44,6 +50,16 @@ def record(config: DesignConfig, result: Result, study: StudyConfig, validation:
     }
 
 
+def _training(config: DesignConfig, result: Result) -> dict[str, Any] | None:
+    if config.train is None:
+        return None
+    return {
+        "reconstruction": config.train.reconstruction,
+        "images": list(config.train.images),
+        "evaluations": result.trainings,
+    }
+
+
 def _candidate(result: Result, one: Candidate) -> dict[str, Any]:
     sign = -1 if result.goal.wants_more else 1
     return {
@@ -52,6 +68,7 @@ def _candidate(result: Result, one: Candidate) -> dict[str, Any]:
         "objective": _round(sign * one.searched),
         "objective_exact": _round(sign * one.exact),
         "told": _round(float(result.goal.told(one.exact))),
+        "training_error": None if one.trained is None else _round(one.trained),
     }
 
 
@@ -59,9 +76,86 @@ def _found(result: Result, one: Candidate) -> dict[str, Any]:
     return {
         **_candidate(result, one),
         "predicted_gain": _round(result.goal.gain(result.reference.exact, one.exact)),
+        "training_gain_db": _training_gain(result.reference, one),
         "values": [_value(value) for value in one.values],
         "status": one.status,
         "active_limits": list(one.active),
+    }
+
+
+def _training_gain(reference: Candidate, one: Candidate) -> float | None:
+    if reference.trained is None or one.trained is None:
+        return None
+    return _round(10 * math.log10(reference.trained / one.trained))
+
+
+def record_fronts(config: DesignConfig, fronts: Fronts) -> dict[str, Any]:
+    """The fronts, each with its points in the order of their cost, and which of them count."""
+    told: dict[str, Any] = {"highest_cycles_per_rad": _round(fronts.edge)}
+    if fronts.thickness is not None:
+        told["thickness"] = _front(config, fronts.thickness, "thickness_mm")
+    if fronts.captures is not None:
+        assert fronts.picture_variance is not None  # for the type checker
+        told["captures"] = _captures(config, fronts.captures, fronts.picture_variance)
+    if fronts.light is not None:
+        told["light"] = _front(config, fronts.light, "electrons_per_mm2")
+    return told
+
+
+def _front(config: DesignConfig, front: Front, cost: str) -> dict[str, Any]:
+    """Cost against resolution."""
+    worth = [(p.cost, p.resolution) for p in front.points]
+    beaten = ~non_dominated(np.asarray(worth), larger=(False, True))
+    points = [_point(config, p, cost) for p in front.points]
+    return {
+        "reference": _point(config, front.reference, cost),
+        "points": [{**p, "dominated": bool(b)} for p, b in zip(points, beaten, strict=True)],
+    }
+
+
+def _captures(config: DesignConfig, front: Front, variance: float) -> dict[str, Any]:
+    """Captures against PSNR, predicted and simulated."""
+
+    def predicted(point: Point) -> dict[str, Any]:
+        level = -10 * math.log10(point.error * variance)
+        told = _point(config, point, "captures")
+        return {**told, "captures": round(point.cost), "predicted_psnr_db": _round(level)}
+
+    points = []
+    for point in front.points:
+        known = [psnr for _, psnr in point.simulated if psnr is not None]
+        whole = len(known) == len(point.simulated)
+        points.append(
+            {
+                **predicted(point),
+                "simulated_psnr_db": dict(point.simulated),
+                "simulated_mean_db": _round(float(np.mean(known))) if whole else None,
+            }
+        )
+    for name in ("predicted_psnr_db", "simulated_mean_db"):
+        worth = [(p["captures"], math.nan if p[name] is None else p[name]) for p in points]
+        beaten = ~non_dominated(np.asarray(worth, float), larger=(False, True))
+        key = "dominated" if name == "predicted_psnr_db" else "simulated_dominated"
+        for point, is_beaten in zip(points, beaten, strict=True):
+            point[key] = bool(is_beaten)
+    return {
+        "exposure": "the same for each capture, at the SNR given"
+        if config.noise.electrons is None
+        else "that of the reference's captures, divided evenly",
+        "picture_variance": _round(variance),
+        "reference": predicted(front.reference),
+        "points": points,
+    }
+
+
+def _point(config: DesignConfig, point: Point, cost: str) -> dict[str, Any]:
+    return {
+        cost: _round(point.cost),
+        "shots": [_shot(shot) for shot in point.shots],
+        "resolution_cycles_per_rad": _round(point.resolution),
+        "resolution_line_pairs_per_mm": _round(point.resolution / config.object.distance),
+        "resolution_ends": point.ends or None,
+        "bayes_error": _round(point.error),
     }
 
 

@@ -19,13 +19,13 @@ _NUDGE = 1e-9
 def build_study(
     config: DesignConfig, found: Sequence[Any] = (), full_well: float | None = None
 ) -> StudyConfig:
-    """The reference and what was found (each with `name` and `shots`) beside each other.
+    """The designs that the file gives, and what was found (`name` and `shots`), side by side.
 
     `full_well`: in electrons, for shot noise; see `full_well`.
     """
     reference = config.reference
     methods = [_method(reference, reference.name, reference.shots)]
-    methods += [_method(reference, one.name, one.shots) for one in found]
+    methods += [_method(reference, one.name, one.shots) for one in (*config.compare, *found)]
     sensor: dict[str, Any] = {
         "shape": config.sensor.shape,
         "pitch": f"{config.sensor.pitch!r} mm",

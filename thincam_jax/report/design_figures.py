@@ -1,16 +1,18 @@
-"""The pictures of a design: the landscape of the objective, and the responses."""
+"""The pictures of a design: the objective's landscape, the responses, and contrast transfer."""
 
 import io
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from thincam_jax.design_run import Candidate, Landscape, Result
+from thincam_jax.design_run import Candidate, Landscape, Result, Transfer
+from thincam_jax.design_run.ranking import Shot
 from thincam_jax.report.figures import line_style
 
 _SYMBOLS = {"beta": ("β", "rad/mm²"), "distance": ("distance", "mm")}
 _ROOM = 0.06  # around points, as a part of an axis
 _SHADED = 85  # per cent of the landscape that the shades tell apart; the worst is one shade
+_LEAST_CONTRAST = 1e-5
 _FLOOR_DB = -30.0  # what is further below the noise is not drawn
 
 
@@ -144,6 +146,53 @@ def draw_responses(result: Result, count: int, pitch: float) -> Figure:
         f"its pixels' Nyquist frequency is {1 / (2 * pitch):.4g}"
     )
     return figure
+
+
+def draw_mtf(result: Result, object_distance: float) -> Figure | None:
+    """Contrast transfer of the reference and of the best design side by side, on common axes.
+
+    `object_distance` in mm. None for a result without transfers.
+    """
+    if result.transfers is None:
+        return None
+    figure = Figure(figsize=(11.0, 5.6), layout="constrained")
+    panels = figure.subplots(1, 2, sharex=True, sharey=True)
+    for ax, one, transfer in zip(
+        panels, (result.reference, result.found[0]), result.transfers, strict=True
+    ):
+        _draw_transfer(ax, one, transfer, result.edge)
+        along = (
+            lambda nu: np.asarray(nu) / object_distance,
+            lambda u: np.asarray(u) * object_distance,
+        )
+        ax.secondary_xaxis("top", functions=along).set_xlabel("on the object (cycles/mm)")
+        ax.set_xlabel("angular frequency (cycles/rad)")
+    panels[0].set_ylabel("contrast transfer, over rings")
+    return figure
+
+
+def _draw_transfer(ax, one: Candidate, transfer: Transfer, edge: float) -> None:
+    frequency = (np.arange(len(transfer.chain)) + 0.5) / len(transfer.chain) * edge
+    chain = {"color": "black", "linewidth": 2.2, "label": "camera and reconstruction"}
+    ax.plot(frequency, transfer.chain, **chain)
+    phases = max(n for sums in transfer.sums for part in sums for n in part) // len(one.shots)
+    for number, (level, sums) in enumerate(zip(transfer.channels, transfer.sums, strict=True)):
+        style = line_style(number) | {"markersize": 4, "markevery": (2 * number, 8)}
+        shot = one.shots[(sums[0][0] - 1) // phases]
+        ax.plot(frequency, level, linewidth=1.2, label=_sum_label(shot, sums), **style)
+    ax.set_yscale("log")
+    ax.set_xlim(0, edge)
+    ax.set_ylim(_LEAST_CONTRAST, 1.5)
+    ax.grid(alpha=0.3)
+    ax.set_title(one.name, fontsize=11)
+    ax.legend(fontsize=9, loc="upper center", bbox_to_anchor=(0.5, -0.13), frameon=False)
+
+
+def _sum_label(shot: Shot, sums: tuple[tuple[int, ...], tuple[int, ...]]) -> str:
+    """Of a sum of captures: "captures 1 − 2: β 25 rad/mm² at 6.5 mm"."""
+    added, taken = (" + ".join(str(n) for n in part) for part in sums)
+    formula = f"{added} − {taken.replace('+', '−')}" if taken else added
+    return f"captures {formula}: β {shot.beta:.4g} rad/mm² at {shot.distance:.3g} mm"
 
 
 def _decibel(level: np.ndarray) -> np.ndarray:

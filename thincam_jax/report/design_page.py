@@ -21,6 +21,7 @@ def render(
         free=[_label(value) for value in design["found"][0]["values"]],
         validated=list(design["validation"]["methods"]),
         findings=findings(design),
+        fronts=fronts(design),
         environment=environment,
         yaml=dump_config(config),
         picture=lambda name: data_url(folder / name) if (folder / name).exists() else None,
@@ -37,11 +38,14 @@ def findings(design: dict[str, Any]) -> list[str]:
     """What the numbers say, in sentences."""
     best, reference = design["found"][0], design["reference"]
     unit = design["objective"]["told"].rpartition("(")[2].rstrip(")")
+    by = "training" if design["training"] else design["objective"]["name"]
     sentences = [
-        f"The best design by {design['objective']['name']} is {_shots(best)}. The objective "
+        f"The best design by {by} is {_shots(best)}. The objective "
         f"predicts {best['predicted_gain']:+.3g} {unit} over {reference['name']} "
         f"({_shots(reference)})."
     ]
+    if best["training_gain_db"] is not None:
+        sentences.append(f"On the training images it gains {best['training_gain_db']:+.2f} dB.")
     sentences += [f"The reference breaks a limit: {why}." for why in reference["broken_limits"]]
     if best["active_limits"]:
         sentences.append(f"It lies against a limit: {'; '.join(best['active_limits'])}.")
@@ -67,6 +71,87 @@ def findings(design: dict[str, Any]) -> list[str]:
             "table below): their PSNR is not on one grid and compares to some tenths of a dB only."
         )
     return sentences
+
+
+_COSTS = {
+    "thickness": ("thickness, mm", "thickness_mm"),
+    "captures": ("captures", "captures"),
+    "light": ("electrons from each mm²", "electrons_per_mm2"),
+}
+_SHOT_LABELS = ("β of the shots, rad/mm²", "distance, mm")
+_LIMIT = (
+    "Resolution is the frequency up to which every ring of frequencies has a signal-to-noise "
+    "ratio of at least 1."
+)
+
+
+def fronts(design: dict[str, Any]) -> list[dict[str, Any]]:
+    """Of each Pareto front its table: title, labels of the columns, rows of texts, a sentence."""
+    told = design.get("pareto", {})
+    return [
+        _front(name, told[name], design["reference"]["name"]) for name in _COSTS if name in told
+    ]
+
+
+def _front(name: str, front: dict[str, Any], reference: str) -> dict[str, Any]:
+    label, cost = _COSTS[name]
+    points = [(_cost(p[cost]), p) for p in front["points"]]
+    points.append((f"{reference}: {_cost(front['reference'][cost])}", front["reference"]))
+    kept = {True: "no", False: "yes", None: ""}
+    if name == "captures":
+        pictures = list(front["points"][0]["simulated_psnr_db"])
+        return {
+            "title": "Captures against PSNR",
+            "labels": [
+                label,
+                *_SHOT_LABELS,
+                "predicted, dB",
+                *(f"{p}, dB" for p in pictures),
+                "front",
+            ],
+            "rows": [
+                [
+                    *(text, *_numbers(p), f"{p['predicted_psnr_db']:.2f}"),
+                    *(_decibel(p.get("simulated_psnr_db", {}).get(n)) for n in pictures),
+                    kept[p.get("dominated")],
+                ]
+                for text, p in points
+            ],
+            "told": f"The exposure is {front['exposure']}. Predicted from the error of the best "
+            "linear reconstruction and the mean variance of the pictures; simulated in full at one "
+            "seed. The front is that of the prediction. Where distances differ, so do the object's "
+            "pixels, and simulated PSNR compares to some tenths of a dB only.",
+        }
+    return {
+        "title": f"{name.capitalize()} against resolution",
+        "labels": [label, *_SHOT_LABELS, "cycles/rad", "line pairs/mm on the object", "", "front"],
+        "rows": [
+            [
+                *(text, *_numbers(p)),
+                f"{p['resolution_cycles_per_rad']:.1f}",
+                f"{p['resolution_line_pairs_per_mm']:.3f}",
+                p["resolution_ends"] or "",
+                kept[p.get("dominated")],
+            ]
+            for text, p in points
+        ],
+        "told": _LIMIT,
+    }
+
+
+def _numbers(point: dict[str, Any]) -> tuple[str, str]:
+    """β of each shot, and their distances, or the one that they share."""
+    betas = (f"{s['beta_rad_per_mm2']:.2f}" for s in point["shots"])
+    distances = [f"{s['distance_mm']:.2f}" for s in point["shots"]]
+    return ", ".join(betas), ", ".join(distances if len(set(distances)) > 1 else distances[:1])
+
+
+def _cost(value: float | int) -> str:
+    return f"{value:.0f}" if value >= 1000 else f"{value:.4g}"
+
+
+def _decibel(value: float | None) -> str:
+    return "–" if value is None else f"{value:.2f}"
 
 
 def _shots(one: dict[str, Any]) -> str:

@@ -1,0 +1,77 @@
+"""Least squares to a wished response: designs found again, and what none gives is said."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from design.setting import setup, two_betas
+
+from thincam_jax.design import Polar, PowerLaw, match_response
+from thincam_jax.design.match import _least_squares
+from thincam_jax.design.wanted import ResponseModel
+from thincam_jax.reconstruct import phase_pairs
+
+RINGS = 16
+DATA = (setup(prior=PowerLaw(2.8)), jnp.asarray(phase_pairs(2)), Polar(96.0, 128, 2))
+SPACE = two_betas()
+MODEL = ResponseModel(SPACE, *DATA, RINGS)
+POINT = jnp.array([0.61, 0.27])
+WANTED = MODEL.levels(POINT)
+
+
+def match(wanted=WANTED, seed=0, data=DATA, **options):
+    options = {"starts": 4, "samples": 64} | options
+    return match_response(SPACE, wanted, *data, key=jax.random.key(seed), **options)
+
+
+def test_design_is_found_from_its_response():
+    """β to 0.01 rad/mm² of 28, in either order of the pairs."""
+    result = match()
+    best = result.found[0]
+    np.testing.assert_allclose(jnp.sort(best.values), jnp.sort(SPACE.values(POINT)), atol=0.01)
+    assert (result.status, result.failed, best.active) == ("matched", 0, ())
+    assert result.misfit_db == best.objective < 0.01
+    np.testing.assert_allclose(MODEL.misfit(best.point, WANTED), best.objective, atol=1e-9)
+    assert 64 < result.evaluations <= 64 + 4 * 31
+
+
+def test_other_wishes_do_not_compile_again():
+    match()
+    before = _least_squares._cache_size()
+    other = match(MODEL.levels(jnp.array([0.2, 0.9])), 5)
+    assert other.status == "matched"
+    assert _least_squares._cache_size() == before
+
+
+def test_descents_are_better_than_samples():
+    """Of a wish that no design fulfils, too: and this is told."""
+    result = match(jnp.full(RINGS, 30.0))
+    points = jnp.stack(jnp.meshgrid(*[jnp.linspace(0.0, 1.0, 9)] * 2), -1).reshape(-1, 2)
+    misfits = jax.lax.map(lambda p: MODEL.misfit(p, jnp.full(RINGS, 30.0)), points)
+    assert result.status == "not_attained"
+    assert 5.0 < result.misfit_db < float(jnp.min(misfits))
+    assert match(tolerance_db=30.0).status == "matched"
+
+
+def test_responses_without_a_number_are_told():
+    bad = setup(prior=PowerLaw(2.8), contrast=1e200)
+    result = match(data=(bad, *DATA[1:]))
+    assert (result.status, result.found) == ("non_finite", ())
+    assert result.failed == 64 + 4
+    assert result.misfit_db == np.inf
+
+
+@pytest.mark.parametrize(
+    ("wanted", "options", "message"),
+    [
+        (np.full(RINGS, np.nan), {}, "wanted level of ring 1 is nan, no finite number"),
+        (np.full((2, 2), 1.0), {}, r"wanted has shape \(2, 2\); give \(4,\)"),
+        (np.full(300, 1.0), {}, "rings = 300, and the frequencies lie in 128 of them"),
+        (np.full(RINGS, -3.0), {}, "is -3, below 0 dB; give levels"),
+        (WANTED, {"starts": 0}, "starts = 0; give at least 1"),
+    ],
+)
+def test_errors(wanted, options, message):
+    with pytest.raises(ValueError, match=message) as told:
+        match(wanted, **options)
+    assert "\n" not in str(told.value)

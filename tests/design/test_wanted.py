@@ -1,0 +1,72 @@
+"""Levels of a response, and the misfit of two."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from design.setting import setup, thesis_design, two_betas
+
+from helpers import finite_difference
+from thincam_jax.design import Polar, PowerLaw, channels, response_misfit, ring_levels
+from thincam_jax.design.wanted import ResponseModel, checked_levels
+from thincam_jax.reconstruct import phase_pairs
+
+FREQUENCIES = Polar(96.0, 128, 2)
+DATA = (setup(prior=PowerLaw(2.8)), jnp.asarray(phase_pairs(2)), FREQUENCIES)
+KNOWN = channels(thesis_design(), *DATA)
+MODEL = ResponseModel(two_betas(), *DATA, 16)
+POINT = jnp.array([0.6, 0.3])
+
+
+def test_levels_are_means_over_rings():
+    """Against sums by hand; above the noise the ratio in dB, in it 0."""
+    levels = ring_levels(KNOWN, FREQUENCIES, 16)
+    ratio, weight = np.asarray(KNOWN.signal_to_noise), np.asarray(KNOWN.weight)
+    for ring in (0, 5, 15):
+        inside = slice(8 * ring, 8 * ring + 8)
+        mean = np.sum((ratio * weight)[:, inside]) / np.sum(weight[:, inside])
+        np.testing.assert_allclose(levels[ring], 10 * np.log10(1 + mean), rtol=1e-12)
+    loud = KNOWN._replace(response=1e3 * KNOWN.response)
+    gained = ring_levels(loud, FREQUENCIES, 16) - levels
+    np.testing.assert_allclose(gained[:2], 60.0, atol=0.2)
+    quiet = KNOWN._replace(response=1e-6 * KNOWN.response)
+    assert np.all(ring_levels(quiet, FREQUENCIES, 16) < 1e-3)
+
+
+def test_misfit_is_the_root_mean_square():
+    levels = ring_levels(KNOWN, FREQUENCIES, 16)
+    np.testing.assert_allclose(response_misfit(KNOWN, FREQUENCIES, levels + 3.0), 3.0, rtol=1e-12)
+    apart = levels.at[3].add(4.0)
+    np.testing.assert_allclose(response_misfit(KNOWN, FREQUENCIES, apart), 1.0, rtol=1e-12)
+    assert response_misfit(KNOWN, FREQUENCIES, levels) < 1e-12
+
+
+def test_slopes():
+    """Against differences of fourth order, and a number where the misfit is 0."""
+    wanted = MODEL.levels(POINT) + jnp.linspace(-1.0, 3.0, 16)
+    value = jax.jit(lambda p, w: MODEL.misfit(p, w))
+    slope = jax.jit(jax.grad(MODEL.misfit))
+    for direction in np.eye(2):
+        expected = finite_difference(lambda p: value(p, wanted), POINT, direction, 2e-6)
+        np.testing.assert_allclose(slope(POINT, wanted) @ direction, expected, rtol=1e-5)
+    assert np.all(np.isfinite(slope(POINT, MODEL.levels(POINT))))
+
+
+def test_order_of_captures_does_not_matter():
+    np.testing.assert_allclose(MODEL.levels(POINT), MODEL.levels(POINT[::-1]), rtol=1e-9)
+
+
+def test_errors():
+    with pytest.raises(ValueError, match="rings = 0; give at least 1"):
+        ResponseModel(two_betas(), *DATA, 0)
+    with pytest.raises(ValueError, match="rings = 200, and the frequencies lie in 128 of them"):
+        ResponseModel(two_betas(), *DATA, 200)
+    with pytest.raises(ValueError, match=r"shape \(3,\); give \(16,\), a level in dB"):
+        checked_levels([1.0, 2.0, 3.0], 16, jnp.float64)
+    with pytest.raises(ValueError, match="ring 2 is inf, no finite number"):
+        checked_levels([1.0, np.inf], 2, jnp.float64)
+
+
+def test_traced_levels_pass():
+    levels = jax.jit(lambda w: checked_levels(w, 2, jnp.float64))(jnp.array([1.0, -1.0]))
+    np.testing.assert_array_equal(levels, [1.0, -1.0])

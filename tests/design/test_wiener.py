@@ -1,0 +1,163 @@
+"""The Wiener objective against the package's Wiener synthesis and against differences."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import thincam_jax as tc
+from thincam_jax.design import (
+    Design,
+    PhotonNoise,
+    PowerLaw,
+    Setup,
+    SignalNoise,
+    Training,
+    restore_by_wiener,
+    wiener_error,
+)
+from thincam_jax.design.training import channels_of
+from thincam_jax.reconstruct.synthesis import phase_pairs
+
+SENSOR, PITCH = (80, 96), 0.02
+PAIR = (0.0, 1.5 * np.pi)
+OBJECT, DISTANCE = 100.0, 7.0
+# Its pixels are those of the sensor at 7 mm.
+COUNT = 70
+WIDTH = COUNT * PITCH * OBJECT / DISTANCE
+
+
+def setup(noise=None, pitch=PITCH):
+    return Setup(
+        pitch=pitch,
+        sensor_width=PITCH * max(SENSOR),
+        object_distance=OBJECT,
+        object_width=WIDTH,
+        noise=noise or SignalNoise(30.0),
+        prior=PowerLaw(2.5),
+    )
+
+
+def pictures(count):
+    rng = np.random.default_rng(7)
+    rough = rng.normal(size=(2, count, count)).cumsum(1).cumsum(2)
+    return 1 + 0.5 * rough / np.abs(rough).max(axis=(1, 2), keepdims=True)
+
+
+def training(noise=None, *, count=COUNT, sensor=SENSOR, synthesis=None, pitch=PITCH):
+    return Training(
+        pictures(count),
+        setup(noise, pitch),
+        phase_pairs(2) if synthesis is None else synthesis,
+        sensor_shape=sensor,
+        distances=(5.0, DISTANCE),
+        key=jax.random.key(5),
+    )
+
+
+def design(beta=(19.0, 23.0), distance=(7.0, 7.0), wavelength=5e-4, width=1.71):
+    pairs = [jnp.repeat(jnp.asarray(x), 2) for x in (beta, distance)]
+    return Design(pairs[0], jnp.asarray(PAIR * 2), pairs[1], wavelength=wavelength, width=width)
+
+
+def synthesised(chosen, given):
+    """By `WienerSynthesis` from the captures of PSFs, with the same noise."""
+    sensor = tc.Sensor(SENSOR, PITCH)
+    reconstruct = tc.WienerSynthesis(
+        chosen.cameras(sensor),
+        wavelength=chosen.wavelength,
+        object_distance=OBJECT,
+        synthesis=phase_pairs(2),
+        field_shape=(COUNT, COUNT),
+    )
+    restored = []
+    for image, drawn in zip(given.images, given.noise, strict=True):
+        captures, variances = [], []
+        for channel, noise in zip(channels_of(chosen, given), drawn, strict=True):
+            projected = channel._projected(image)
+            first, second = (one(projected) for one in channel.captures)
+            variance = channel.capture(image, noise)[1]
+            # All the noise of the difference in one capture, shared out in what is told of it.
+            captures += [first + jnp.sqrt(variance) * noise, second]
+            variances += [variance / 2, variance / 2]
+        found = reconstruct(jnp.stack(captures), jnp.stack(variances)).image
+        restored.append(np.asarray(found)[::-1, ::-1])
+    return np.stack(restored)
+
+
+def test_restored_are_those_of_the_wiener_synthesis():
+    given, chosen = training(), design()
+    found = np.asarray(restore_by_wiener(chosen, given))
+    expected = synthesised(chosen, given)
+    images = np.asarray(given.images)
+    error = [np.mean((r - images) ** 2) / np.var(images) for r in (found, expected)]
+    assert error[1] < 0.3  # the captures tell something
+    assert error[0] == pytest.approx(error[1], rel=0.1)
+    assert np.mean((found - expected) ** 2) < 0.1 * np.mean((expected - images) ** 2)
+    variance = np.var(images, axis=(1, 2))
+    whole = np.mean(np.mean((found - images) ** 2, axis=(1, 2)) / variance)
+    assert float(wiener_error(chosen, given)) == pytest.approx(whole, rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    "noise",
+    [SignalNoise(30.0), pytest.param(PhotonNoise(3000.0, 5.0), marks=pytest.mark.thorough)],
+)
+def test_gradient_by_differences(noise):
+    given = training(noise, count=12, sensor=(20, 24))
+    place = jnp.array([19.0, 23.0, 5.13, 6.91, 5e-4, 1.71])
+
+    @jax.jit
+    def error(x):
+        return wiener_error(design(x[:2], x[2:4], x[4], x[5]), given)
+
+    slope = jax.grad(error)(place)
+    for index, value in enumerate(place):
+        step = jnp.zeros(6).at[index].set(1e-5 * value)
+        difference = (error(place + step) - error(place - step)) / (2e-5 * value)
+        assert float(slope[index] / difference) == pytest.approx(1, abs=1e-4)
+
+
+def test_coarse_pixels_carry_the_noise_of_the_fine_ones():
+    """Four pixels' mean has a quarter of the variance: the same as 6 dB more light a pixel."""
+    small = {"count": 12, "sensor": (20, 24)}
+    coarse = training(SignalNoise(20.0), pitch=0.04, **small)
+    fine = training(SignalNoise(20.0 + 20 * np.log10(2)), pitch=0.08, **small)
+    assert float(wiener_error(design(), coarse)) == pytest.approx(
+        float(wiener_error(design(), fine)), rel=1e-9
+    )
+    noisier = training(SignalNoise(0.0), pitch=0.08, **small)
+    assert float(wiener_error(design(), noisier)) > float(wiener_error(design(), fine))
+
+
+def test_a_capture_with_its_bias_is_restored():
+    single = training(synthesis=np.eye(4)[:1], count=12, sensor=(20, 24))
+    assert 0 < float(wiener_error(design(), single)) < 1
+
+
+def test_new_values_are_not_traced_again():
+    traces = []
+
+    @eqx.filter_jit
+    def error(chosen, given):
+        traces.append(1)
+        return wiener_error(chosen, given)
+
+    error(design(), training(count=12, sensor=(20, 24)))
+    error(design((21.0, 8.0), (5.5, 6.5)), training(SignalNoise(20.0), count=12, sensor=(20, 24)))
+    assert len(traces) == 1
+
+
+def test_errors():
+    with pytest.raises(ValueError, match="adds 2 captures and the design takes 4"):
+        wiener_error(design(), training(synthesis=phase_pairs(1)))
+    with pytest.raises(ValueError, match="give the shortest and the longest"):
+        Training(
+            pictures(12),
+            setup(),
+            phase_pairs(2),
+            sensor_shape=SENSOR,
+            distances=(7.0, 5.0),
+            key=jax.random.key(0),
+        )

@@ -1,0 +1,53 @@
+"""Training: descents by the error of a reconstruction."""
+
+import numpy as np
+import pytest
+from design_run import tiny
+
+from thincam_jax.design_run import build_problem, find
+from thincam_jax.design_run.train import build_training, train
+
+ASKED = ("train.images=[camera]", "train.pixels=32", "train.starts=1", "train.steps=3")
+
+
+@pytest.fixture(scope="module")
+def config(tmp_path_factory):
+    return tiny.design(tmp_path_factory.mktemp("train"), *ASKED)
+
+
+@pytest.fixture(scope="module")
+def trained(config):
+    return train(config, config.train, build_problem(config), [np.array([0.9, 0.05])])
+
+
+def test_descents_end_lower_than_they_began(config, trained):
+    assert 1 <= len(trained.found) <= 2  # from the given point, and from the reference
+    errors = [one.objective for one in trained.found]
+    assert errors == sorted(errors)
+    assert 0 < errors[0] < trained.reference
+    assert trained.evaluations > 2
+    space = config.space()
+    for one in trained.found:
+        assert np.all(np.asarray(one.values) >= np.asarray(space.lower))
+        assert np.all(np.asarray(one.values) <= np.asarray(space.upper))
+
+
+def test_training_is_of_the_sensor_and_the_picture(config):
+    training = build_training(config, config.train, build_problem(config))
+    # The field is 1.8 mm of the shorter side's 1.92.
+    assert training.sensor.shape == (32, 32)
+    assert float(training.sensor.pitch) == pytest.approx(0.06)
+    assert training.images.shape == (1, 30, 30)
+    assert float(training.images.mean()) == pytest.approx(1)
+
+
+def test_ranked_by_the_training_error(config, trained):
+    steps = []
+    result = find(config, steps.append)
+    assert steps == ["search", "training", "found designs", "landscape"]
+    assert result.reference.trained == pytest.approx(trained.reference, rel=1e-4)
+    errors = [one.trained for one in result.found]
+    assert None not in errors and errors == sorted(errors)
+    assert result.trainings > 0
+    for one in result.found:
+        assert [v.value for v in one.values] == pytest.approx([s.beta for s in one.shots])

@@ -1,0 +1,37 @@
+"""The section `train` of a design's file: descents by the reconstruction of photographs."""
+
+from typing import Annotated, Literal
+
+import pydantic
+from pydantic import Field
+
+from thincam_jax.config import Section
+from thincam_jax.targets import sample_images
+
+
+class TrainingConfig(Section):
+    """The search's designs, improved by the error of an actual reconstruction.
+
+    - `images`: photographs of scikit-image; their middle square is taken.
+    - `reconstruction`: `wiener`, the Wiener synthesis as in the simulation; `linear`, the best
+      linear estimate, which knows of the crop, by conjugate gradients.
+    - `pixels`: of the sensor's shorter side in training.
+    - `starts`: of the search's designs, beside the reference; `steps` of each descent.
+    """
+
+    images: Annotated[tuple[str, ...], Field(min_length=1)]
+    reconstruction: Literal["wiener", "linear"] = "wiener"
+    pixels: Annotated[int, Field(ge=32, le=2048)] = 256
+    starts: Annotated[int, Field(ge=1, le=100)] = 4
+    steps: Annotated[int, Field(ge=1, le=1000)] = 30
+
+    @pydantic.field_validator("images")
+    @classmethod
+    def _known(cls, images: tuple[str, ...]) -> tuple[str, ...]:
+        for image in images:
+            if image not in sample_images():
+                listed = ", ".join(sample_images())
+                raise ValueError(f"image {image!r} is unknown; choose from {listed}")
+        if len(set(images)) < len(images):
+            raise ValueError("images hold an entry twice; give each once")
+        return images

@@ -1,0 +1,207 @@
+r"""Images to train a design on, and their captures by it, differentiable in all its numbers.
+
+Each image f on the object gives captures
+
+.. math:: g_c = A_c f + n_c, \qquad A_c f = C\,(h_c * R_{d} f)
+
+with R_d the projection onto the pixels of a sensor at the distance d, h_c the PSF of a sum of
+captures and C the crop. What is made of them is told in `end_to_end` and `wiener`.
+"""
+
+import math
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from thincam_jax.camera import LenslessCamera
+from thincam_jax.design.design import Design
+from thincam_jax.design.setup import Setup
+from thincam_jax.grids import Grid
+from thincam_jax.operators import CropConvolution, kernel_grid
+from thincam_jax.psf import psf
+from thincam_jax.scene import ImagePlane
+from thincam_jax.sensor import Sensor
+
+
+class Window(NamedTuple):
+    """A square of angles, and its samples: what a discrete spectrum of the scene belongs to.
+
+    - `angle`: its side, rad: the sensor as seen through the mask at the shortest distance, and the
+      object beside it, so that nothing wraps round.
+    - `samples`: along it, as fine as the pixels at the longest distance.
+    - `across`: of them over the sensor's width, at that distance.
+    """
+
+    angle: float
+    samples: int
+    across: float
+
+
+def _window(setup: Setup, pixels: int, shortest: float, longest: float) -> Window:
+    width = float(setup.sensor_width)
+    angle = width / shortest + float(setup.field)
+    count = 2 * math.ceil(angle * longest * pixels / width / 2)
+    return Window(angle, count, count * width / longest / angle)
+
+
+class Training(eqx.Module):
+    """Images to restore, and the noise that their captures are given.
+
+    Made with `distances`, the shortest and the longest (mm) that designs may take.
+
+    - `images`: (image, v, u), square, over the object's width, of mean 1.
+    - `noise`: standard normal numbers (image, channel, y, x): the same in every evaluation, so that
+      the objective is smooth; draw others from step to step for a stochastic search.
+    - `setup`: the noise's shape divides its `sensor_width` into pixels, larger ones than those of
+      its `pitch`; noise is averaged over them.
+    - `synthesis`: rows (channel) of weights of the captures; a row adds captures at one distance.
+    - `field_shape`: of the projection on the sensor, at least the object's at the longest distance.
+    - `window`: of the angles that a reconstruction's spectrum is taken over.
+    - `tolerance`, `steps`: of conjugate gradients: relative residual, and at most so many.
+    """
+
+    images: Float[Array, "image v u"]
+    noise: Float[Array, "image channel y x"]
+    setup: Setup
+    synthesis: tuple[tuple[float, ...], ...] = eqx.field(static=True)
+    field_shape: tuple[int, int] = eqx.field(static=True)
+    window: Window = eqx.field(static=True)
+    tolerance: float = eqx.field(static=True)
+    steps: int = eqx.field(static=True)
+
+    def __init__(
+        self,
+        images: Float[Array, "image v u"] | Float[np.ndarray, "image v u"],
+        setup: Setup,
+        synthesis: Float[np.ndarray, "channel capture"],
+        *,
+        sensor_shape: tuple[int, int],
+        distances: tuple[float, float],
+        key: PRNGKeyArray,
+        tolerance: float = 1e-4,
+        steps: int = 200,
+    ):
+        if not 0 < distances[0] <= distances[1]:
+            raise ValueError(f"distances = {distances} mm; give the shortest and the longest, > 0")
+        given = jnp.asarray(images, float)
+        if given.ndim != 3 or given.shape[-1] != given.shape[-2]:
+            raise ValueError(f"images have shape {given.shape}; give (image, n, n), square ones")
+        self.images = given / jnp.mean(given, axis=(-2, -1), keepdims=True)
+        rows = np.asarray(synthesis, dtype=float)
+        if rows.ndim != 2 or not np.any(rows, axis=1).all():
+            raise ValueError(
+                f"synthesis has shape {rows.shape}; give (channel, capture) without rows of zeros"
+            )
+        self.synthesis = tuple(map(tuple, rows.tolist()))
+        shape = (len(given), len(rows), *sensor_shape)
+        self.noise = jax.random.normal(key, shape, self.images.dtype)
+        self.setup = setup
+        pixels = float(setup.field * distances[1] / setup.sensor_width) * max(sensor_shape)
+        # Both ends of the projection, and the parity of the sensor, so that their centres agree.
+        rows, columns = (math.ceil(pixels) + 2 + (math.ceil(pixels) + n) % 2 for n in sensor_shape)
+        self.field_shape = (rows, columns)
+        self.window = _window(setup, max(sensor_shape), *distances)
+        self.tolerance, self.steps = tolerance, steps
+
+    @property
+    def sensor(self) -> Sensor:
+        """As many pixels as there is noise for."""
+        rows, columns = self.noise.shape[-2:]
+        return Sensor((rows, columns), self.setup.sensor_width / max(rows, columns))
+
+
+class Channel(eqx.Module):
+    """A sum of captures at one distance: A_c."""
+
+    captures: tuple[CropConvolution, ...]
+    summed: CropConvolution
+    exposure: tuple[Float[Array, ""], ...]
+    distance: Float[Array, ""]
+    grid: Grid
+    setup: Setup
+    weights: tuple[float, ...] = eqx.field(static=True)
+
+    def __init__(
+        self,
+        design: Design,
+        training: Training,
+        kernels: Float[Array, "capture k l"],
+        row: Float[np.ndarray, " capture"],
+    ):
+        used = [int(k) for k in np.flatnonzero(row)]
+        self.weights = tuple(float(row[k]) for k in used)
+        self.distance = design.distance[used[0]]
+        self.exposure = tuple(design.exposure[k] for k in used)
+        self.setup = training.setup
+        sensor, field = training.sensor, training.field_shape
+        self.grid = Grid(field, sensor.pitch)
+        whole = jnp.tensordot(jnp.asarray(row, kernels.dtype), kernels, axes=1)
+
+        def convolution(kernel):
+            return CropConvolution(kernel, sensor.pitch, sensor.shape, field)
+
+        self.captures = tuple(convolution(kernels[k]) for k in used)
+        self.summed = convolution(whole)
+
+    def __call__(self, image: Float[Array, "v u"]) -> Float[Array, "y x"]:
+        return self.summed(self._projected(image))
+
+    def capture(self, image, noise) -> tuple[Float[Array, "y x"], Float[Array, ""]]:
+        """The sum of the noisy captures, and the variance of its noise."""
+        projected = self._projected(image)
+        clean = [own(projected) for own in self.captures]
+        variance = noise_variance(clean, self.weights, self.exposure, self.setup, self.grid.pitch)
+        return self.summed(projected) + jnp.sqrt(variance) * noise, variance
+
+    def _projected(self, image):
+        plane = ImagePlane(image, self.setup.object_distance, self.setup.object_width)
+        # Upright: masks are symmetric, and the image comes back the way it went in.
+        return plane.sample(self.grid, magnification=self.distance / self.setup.object_distance)
+
+
+def noise_variance(clean, weights, exposure, setup: Setup, pitch) -> Float[Array, ""]:
+    """Of a pixel of a sum of captures that are `clean` without it, pixels `pitch` (mm) wide."""
+    variance = jnp.zeros((), clean[0].dtype)
+    for capture, weight, share in zip(clean, weights, exposure, strict=True):
+        each = setup.noise.variance(jnp.mean(capture), jnp.var(capture), share)
+        variance = variance + weight**2 * each
+    # Pixels that stand for several of the sensor's have the mean of their noise.
+    return variance * (setup.pitch / pitch) ** 2
+
+
+def check_captures(design: Design, training: Training) -> None:
+    """ValueError if the synthesis is for another number of captures."""
+    count = len(training.synthesis[0])
+    if count != design.captures:
+        raise ValueError(
+            f"the synthesis adds {count} captures and the design takes {design.captures}; "
+            "make them the same"
+        )
+
+
+def channels_of(design: Design, training: Training) -> tuple[Channel, ...]:
+    """The sums of captures that the training's synthesis asks for."""
+    check_captures(design, training)
+    rows = np.asarray(training.synthesis)
+    kernels = _kernels(design, training)
+    return tuple(Channel(design, training, kernels, row) for row in rows)
+
+
+def _kernels(design: Design, training: Training) -> Float[Array, "capture k l"]:
+    """The PSF of every capture, in one program."""
+    sensor, there = training.sensor, training.setup.object_distance
+
+    def kernel(beta, phase, distance, wavelength):
+        return psf(
+            LenslessCamera(design.mask(beta, phase), sensor, distance),
+            wavelength=wavelength,
+            object_distance=there,  # pyright: ignore[reportArgumentType]
+            grid=kernel_grid(sensor.grid, training.field_shape),
+            pixel_integration=training.setup.pixel_integration,
+        )
+
+    return jax.vmap(kernel)(design.beta, design.phase, design.distance, design.wavelength)

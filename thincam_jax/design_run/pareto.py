@@ -1,0 +1,366 @@
+"""Pareto fronts of designs: what thickness, captures and light buy.
+
+Every point of a front is a search of its own over all that is free: from even samples, and once
+more near the best design of each point beside it. The design that costs less competes itself, too,
+so that what costs more is never worse for want of searching. Designs are compared by the exact
+response, all of them on one band of frequencies.
+"""
+
+from collections.abc import Callable, Iterable
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from thincam_jax._precision import allow
+from thincam_jax.config import ConfigError
+from thincam_jax.config_design import DesignConfig, found_name
+from thincam_jax.config_pareto import ParetoConfig, with_shots
+from thincam_jax.design import (
+    Design,
+    DesignSpace,
+    PhotonNoise,
+    bayes_error,
+    channels,
+    limit,
+    search,
+)
+from thincam_jax.design_run.problem import Data, Goal, Problem, build_problem
+from thincam_jax.design_run.ranking import Shot, shots_of_design
+from thincam_jax.design_run.simulate import simulate
+from thincam_jax.design_run.simulated import build_study
+from thincam_jax.study.build import build_plane, synthesis_matrix
+from thincam_jax.study.target import Progress
+
+_TRIED = 3  # of the designs of a search, are scored exactly
+_NEAR = 0.15  # of the search's bounds to either side, where a search goes on from the point before
+# Limits that limit nothing. `active_limits` names a limit wherever a bound is nearer than the
+# variable's own, as those are that the fronts move.
+_FINEST_PIXEL, _THICKEST = 1e-9, 1e9
+
+
+class Point(NamedTuple):
+    """The best design found at one cost.
+
+    - `cost`: the thickness allowed, mm; how many captures; or electrons from each mm² of open
+      aperture.
+    - `shots`: its β and distances.
+    - `resolution`: cycles/rad, up to which every ring's signal-to-noise ratio is at least 1.
+    - `ends`: what ends it other than the signal, in words; empty where nothing does.
+    - `error`: of the best linear reconstruction, as a part of the scene's variance.
+    - `simulated`: PSNR of each picture, dB, where it was asked for.
+    """
+
+    cost: float
+    shots: tuple[Shot, ...]
+    resolution: float
+    ends: str
+    error: float
+    simulated: tuple[tuple[str, float | None], ...] = ()
+
+
+class Front(NamedTuple):
+    """The points in the order of their cost, and the design to beat at its own."""
+
+    points: tuple[Point, ...]
+    reference: Point
+
+
+class Fronts(NamedTuple):
+    """Those that were asked for.
+
+    - `edge`: the highest frequency of all, cycles/rad.
+    - `picture_variance`: geometric mean over the pictures, whose values end at 1.
+    """
+
+    thickness: Front | None
+    captures: Front | None
+    light: Front | None
+    edge: float
+    picture_variance: float | None
+
+
+class _Judged(NamedTuple):
+    design: Design
+    resolution: float
+    ends: str
+    error: float
+
+
+def pareto_steps(fronts: ParetoConfig | None) -> int:
+    """How many times `find_fronts` reports progress."""
+    if fronts is None:
+        return 0
+    lines = [f.points for f in (fronts.thickness, fronts.light) if f is not None]
+    return sum(lines) + (2 * len(fronts.captures.shots) if fronts.captures is not None else 0)
+
+
+def find_fronts(config: DesignConfig, progress: Progress, full_well: float | None = None) -> Fronts:
+    """The fronts that a design's file asks for; double precision, as in `find`.
+
+    `full_well`: electrons, of the simulation of as many captures as the reference takes.
+
+    **Errors**: ConfigError where the objective was no number at any start.
+    """
+    asked = config.pareto
+    if asked is None:
+        raise ValueError("no front is asked for; give the configuration a section 'pareto'")
+    with allow("float64"):
+        problem = build_problem(config)
+        fronts = Fronts(
+            _thickness(config, asked, problem, progress) if asked.thickness else None,
+            _captures(config, asked, problem, progress) if asked.captures else None,
+            _light(config, asked, problem, progress) if asked.light else None,
+            float(problem.exact.frequencies.highest),
+            _variance(config) if asked.captures else None,
+        )
+    if fronts.captures is None:
+        return fronts
+    points = []
+    for point in fronts.captures.points:
+        progress(f"{point.cost:g} captures, simulated")
+        points.append(point._replace(simulated=_simulated(config, point, full_well)))
+    return fronts._replace(captures=fronts.captures._replace(points=tuple(points)))
+
+
+def _thickness(
+    config: DesignConfig, asked: ParetoConfig, problem: Problem, progress: Progress
+) -> Front:
+    """Limit of resolution of designs whose distances are all within a thickness."""
+    assert asked.thickness is not None  # for the type checker
+    given = _with(problem, Goal("limit"), _unfenced(problem.space))
+    distance = jnp.asarray([v.name == "distance" for v in given.space.variables])
+    costs, problems = asked.thickness.costs(), []
+    for cost in costs:
+        upper = given.space.upper
+        thin = jnp.where(distance, jnp.minimum(upper, cost), upper)
+        space = eqx.tree_at(lambda s: s.upper, given.space, thin)
+        problems.append(given._replace(space=space))
+    points = _line(config, asked, costs, problems, lambda c: progress(f"thickness {c:.3g} mm"))
+    longest = max(shot.distance for shot in config.reference.shots)
+    return Front(points, _point(config, longest, _reference(config, given)))
+
+
+def _light(
+    config: DesignConfig, asked: ParetoConfig, problem: Problem, progress: Progress
+) -> Front:
+    """Limit of resolution of designs with so many electrons."""
+    assert asked.light is not None  # for the type checker
+    given = _with(problem, Goal("limit"), _unfenced(problem.space))
+    costs = asked.light.costs()
+    problems = [_lit(given, cost) for cost in costs]
+    points = _line(config, asked, costs, problems, lambda c: progress(f"light {c:.4g} electrons"))
+    electrons = config.noise.electrons or 0.0
+    return Front(points, _point(config, electrons, _reference(config, given)))
+
+
+def _line(
+    config: DesignConfig,
+    asked: ParetoConfig,
+    costs: list[float],
+    problems: list[Problem],
+    told: Callable[[float], None],
+) -> tuple[Point, ...]:
+    """Each for itself; then near the next, from the last on; then near the one before."""
+    best = []
+    for cost, problem in zip(costs, problems, strict=True):
+        told(cost)
+        best.append(_best(config, asked, problem, None))
+    for n in range(len(best) - 2, -1, -1):
+        best[n] = _best(config, asked, problems[n], best[n + 1], best[n])
+    for n in range(1, len(best)):
+        best[n] = _best(config, asked, problems[n], best[n - 1], best[n])
+    return tuple(_point(config, cost, one) for cost, one in zip(costs, best, strict=True))
+
+
+def _captures(
+    config: DesignConfig, asked: ParetoConfig, problem: Problem, progress: Progress
+) -> Front:
+    """Error of designs of so many captures, which share the reference's exposure time."""
+    assert asked.captures is not None  # for the type checker
+    phases = len(config.reference.method().shot_phases())
+    points: list[Point] = []
+    best: _Judged | None = None
+    for count in asked.captures.shots:
+        progress(f"{count * phases} captures")
+        given = _of_shots(config, problem, count)
+        if best is not None:
+            best = best._replace(design=_longer(best.design, given.space.base, phases))
+        best = _best(config, asked, given, best)
+        points.append(_point(config, float(count * phases), best))
+    reference = _reference(config, problem)
+    return Front(tuple(points), _point(config, float(problem.space.base.captures), reference))
+
+
+def _of_shots(config: DesignConfig, problem: Problem, count: int) -> Problem:
+    """The search for designs of so many shots, on the frequencies of the others.
+
+    The whole exposure is that of the reference's captures, and each capture has the same share.
+    """
+    changed = with_shots(config, count)
+    matrix = jnp.asarray(synthesis_matrix(changed.reference.method()), float)
+    space = _unfenced(changed.space())
+    share = jnp.full(space.base.captures, 1 / space.base.captures, space.lower.dtype)
+    space = eqx.tree_at(lambda s: s.base.exposure, space, share)
+    given = _with(problem, Goal("bayes_error"), space)
+    if config.noise.electrons is not None:
+        given = _lit(given, config.noise.electrons * problem.space.base.captures)
+    return given._replace(
+        data=given.data._replace(synthesis=matrix), exact=given.exact._replace(synthesis=matrix)
+    )
+
+
+def _with(problem: Problem, goal: Goal, space: DesignSpace) -> Problem:
+    return problem._replace(goal=goal, space=space)
+
+
+def _unfenced(space: DesignSpace) -> DesignSpace:
+    """The same with every limit a number; see `_FINEST_PIXEL`."""
+    limits = space.limits._replace(
+        mask_pixel=space.limits.mask_pixel or _FINEST_PIXEL,
+        thickness=space.limits.thickness or _THICKEST,
+    )
+    return DesignSpace(space.base, space.variables, limits)
+
+
+def _lit(problem: Problem, electrons: float) -> Problem:
+    """With so many electrons, in a whole exposure."""
+
+    def lit(data: Data) -> Data:
+        noise = data.setup.noise
+        assert isinstance(noise, PhotonNoise)  # for the type checker; the file was checked
+        number = jnp.asarray(electrons, noise.electrons.dtype)
+        return data._replace(
+            setup=eqx.tree_at(lambda s: s.noise.electrons, data.setup, number),
+        )
+
+    return problem._replace(data=lit(problem.data), exact=lit(problem.exact))
+
+
+def _longer(design: Design, base: Design, phases: int) -> Design:
+    """A design with its last shot taken again, as often as `base` has captures more."""
+    last = range(design.captures - phases, design.captures)
+    more = (base.captures - design.captures) // phases
+    order = jnp.asarray([*range(design.captures), *(list(last) * more)])
+    numbers = (design.beta[order], design.distance[order])
+    return eqx.tree_at(lambda d: (d.beta, d.distance), base, numbers)
+
+
+def _best(
+    config: DesignConfig,
+    asked: ParetoConfig,
+    problem: Problem,
+    beside: _Judged | None,
+    own: _Judged | None = None,
+) -> _Judged:
+    """The best of a search near another design, of that design, and of `own`.
+
+    Without `own`, the best of a search over the whole space in its place.
+    """
+    spaces = [problem.space] if own is None else []
+    designs: list[Design] = []
+    if beside is not None:
+        place = _place(problem.space, beside.design)
+        spaces.append(_near(problem.space, place))
+        designs.append(problem.space.design(place))
+    for space in spaces:
+        searched = search(
+            problem.goal,
+            space,
+            problem.data,
+            key=jax.random.key(config.seed),
+            starts=asked.starts,
+            samples=asked.samples,
+            steps=asked.steps,
+            solver=asked.solver,
+        )
+        designs += [found.design for found in searched.found[:_TRIED]]
+    judged = [_judge(config, design, problem.exact) for design in designs]
+    judged = _known(judged if own is None else [own, *judged])
+    if problem.goal.name == "limit":
+        return min(judged, key=lambda j: (-j.resolution, j.error))
+    return min(judged, key=lambda j: j.error)
+
+
+def _known(judged: Iterable[_Judged]) -> list[_Judged]:
+    known = [j for j in judged if np.isfinite(j.error)]
+    if not known:
+        raise ConfigError(
+            "pareto: the objective is no number at any start; give bounds nearer to the reference"
+        )
+    return known
+
+
+def _place(space: DesignSpace, design: Design) -> Float[Array, " variable"]:
+    """Where a design lies in the unit cube of a space, or the nearest to it."""
+    values = [getattr(design, v.name)[v.captures[0]] for v in space.variables]
+    lower, upper = (space.values(jnp.full(space.size, e, space.lower.dtype)) for e in (0.0, 1.0))
+    span = upper - lower
+    inside = (jnp.stack(values) - lower) / jnp.where(span > 0, span, 1.0)
+    return jnp.clip(jnp.where(span > 0, inside, 0.5), 0.0, 1.0)
+
+
+def _near(space: DesignSpace, place: Float[Array, " variable"]) -> DesignSpace:
+    """What of a space lies near a place, without another compilation."""
+    ends = [space.values(jnp.clip(place + step, 0.0, 1.0)) for step in (-_NEAR, _NEAR)]
+    return eqx.tree_at(lambda s: (s.lower, s.upper), space, tuple(ends))
+
+
+def _reference(config: DesignConfig, problem: Problem) -> _Judged:
+    return _judge(config, problem.space.base, problem.exact)
+
+
+def _judge(config: DesignConfig, design: Design, data: Data) -> _Judged:
+    """Resolution and error by the exact response; no resolution beyond what the pixels sample."""
+    found, error = (float(value) for value in _exactly(design, data))
+    edge = float(data.frequencies.highest)
+    nyquist = float(jnp.max(design.distance)) / (2 * config.sensor.pitch)
+    ends = "at the band's end" if found >= edge * (1 - 1e-9) else ""
+    if nyquist < min(found, edge):
+        ends = "at the pixels' Nyquist frequency"
+    return _Judged(design, min(found, edge, nyquist), ends, error)
+
+
+@eqx.filter_jit
+def _exactly(design: Design, data: Data) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    known = channels(design, data.setup, data.synthesis, data.frequencies)
+    return limit(known, data.frequencies), bayes_error(known)
+
+
+def _point(config: DesignConfig, cost: float, best: _Judged) -> Point:
+    phases = len(config.reference.method().shot_phases())
+    shots = shots_of_design(best.design, phases)
+    return Point(cost, shots, best.resolution, best.ends, best.error)
+
+
+def _variance(config: DesignConfig) -> float:
+    study = build_study(config)
+    images = (np.asarray(build_plane(study, t).image, dtype=float) for t in config.pictures())
+    return float(np.exp(np.mean([np.log(np.mean(np.var(i, axis=(-2, -1)))) for i in images])))
+
+
+class _Named(NamedTuple):
+    name: str
+    shots: tuple[Shot, ...]
+
+
+def _simulated(
+    config: DesignConfig, point: Point, full_well: float | None
+) -> tuple[tuple[str, float | None], ...]:
+    """PSNR of every picture in the full simulation, at the seed of the configuration."""
+    reference = config.reference
+    captures = len(reference.shots) * len(reference.method().shot_phases())
+    well = None if full_well is None else full_well * captures / point.cost
+    # What the reference cannot be called.
+    name = found_name(1)
+    study = build_study(config, [_Named(name, point.shots)], well)
+    study = study.model_copy(update={"methods": study.methods[-1:]})
+    pictures = {t.name for t in config.pictures()}
+    return tuple(
+        (target.name, simulate(study, index, target, 1)[name][0]["psnr_db"])
+        for index, target in enumerate(study.targets)
+        if target.name in pictures
+    )

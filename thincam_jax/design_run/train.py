@@ -1,0 +1,122 @@
+"""The search's designs, improved by gradient through the reconstruction of training images.
+
+What is made small is the error of the images that the cropped captures give back, so that all
+counts which the frequency-wise objectives leave out.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from thincam_jax.config_design import DesignConfig
+from thincam_jax.config_training import TrainingConfig
+from thincam_jax.design import Design, DesignSpace, Training, end_to_end_error, wiener_error
+from thincam_jax.design.search import APART, Found, descend, evaluate
+from thincam_jax.design_run.problem import Problem, spans_of
+from thincam_jax.design_run.sensitivity import Around
+from thincam_jax.study.build import synthesis_matrix
+from thincam_jax.targets import resize, sample_image
+
+# Single precision holds the error to some 1e-6 of itself.
+_TOLERANCE = 1e-4
+
+
+@dataclass(frozen=True)
+class TrainingGoal:
+    """The error of a reconstruction; equal goals are compiled once."""
+
+    reconstruction: str
+
+    def __call__(self, design: Design, training: Training) -> Float[Array, ""]:
+        error = wiener_error if self.reconstruction == "wiener" else end_to_end_error
+        return error(design, training)
+
+
+class Trained(NamedTuple):
+    """Designs by their training error, best first.
+
+    - `found`: with the error as `objective`; `around`: of each.
+    - `reference`: the error of the reference.
+    - `evaluations`: of the error, with its gradient.
+    """
+
+    found: tuple[Found, ...]
+    around: tuple[Around, ...]
+    reference: float
+    evaluations: int
+
+
+def train(
+    config: DesignConfig, wanted: TrainingConfig, problem: Problem, points: list[np.ndarray]
+) -> Trained:
+    """Descents from points of the cube, and from the reference where it keeps the limits."""
+    goal, space = TrainingGoal(wanted.reconstruction), config.space()
+    training = build_training(config, wanted, problem)
+    own = _reference_point(space)
+    starts = [*points[: wanted.starts], *([] if own is None else [own])]
+    chosen = jnp.asarray(np.stack(starts), space.lower.dtype)
+    ended = descend(goal, space, training, chosen, steps=wanted.steps, tolerance=_TOLERANCE)
+    around = tuple(_around(goal, space, training, found) for found in ended.found)
+    reference = eqx.filter_jit(goal)(space.base, training)
+    return Trained(ended.found, around, float(reference), ended.evaluations)
+
+
+def build_training(config: DesignConfig, wanted: TrainingConfig, problem: Problem) -> Training:
+    """In the precision that JAX is set to, with noise of the configuration's seed.
+
+    Of an oblong sensor the square of its shorter side, as everywhere in the search.
+    """
+    setup = jax.tree.map(lambda x: jnp.asarray(np.asarray(x), float), problem.data.setup)
+    # Pixels of the object about as large as those of the sensor at the longest distance.
+    across = float(setup.field) * config.farthest() / float(setup.sensor_width)
+    count = max(16, math.ceil(across * wanted.pixels))
+    return Training(
+        np.stack([_picture(name, count) for name in wanted.images]),
+        setup,
+        synthesis_matrix(config.reference.method()),
+        sensor_shape=(wanted.pixels, wanted.pixels),
+        distances=(config.nearest(), config.farthest()),
+        key=jax.random.key(config.seed),
+    )
+
+
+def _picture(name: str, count: int) -> np.ndarray:
+    """The grey middle square of a photograph."""
+    image = np.atleast_3d(sample_image(name)).mean(axis=-1)
+    side = min(image.shape)
+    top, left = ((n - side) // 2 for n in image.shape)
+    return resize(image[top : top + side, left : left + side], (count, count))
+
+
+def _reference_point(space: DesignSpace) -> np.ndarray | None:
+    """Where the reference lies in the cube; None where it is not in it."""
+    lower = np.asarray(space.values(jnp.zeros_like(space.lower)))
+    spans = spans_of(space)
+    if not np.all(spans > 0):
+        return None
+    values = []
+    for variable in space.variables:
+        number = np.asarray(getattr(space.base, variable.name))
+        own = number[list(variable.captures)]
+        if np.ptp(own) > 0:
+            return None
+        values.append(own[0])
+    point = (np.asarray(values) - lower) / spans
+    return point if np.all((point >= 0) & (point <= 1)) else None
+
+
+def _around(goal: TrainingGoal, space: DesignSpace, training: Training, found: Found) -> Around:
+    """By differences as wide as optima are apart: the error has finer ripples, of some 0.01 dB."""
+    size = space.size
+    middle = np.clip(np.asarray(found.point, float), APART, 1 - APART)
+    steps = APART * np.eye(size)
+    points = np.concatenate([middle[None], middle + steps, middle - steps])
+    values = evaluate(goal, space, training, jnp.asarray(points, space.lower.dtype), at_a_time=1)
+    level, up, down = np.split(np.asarray(values, float), [1, 1 + size])
+    return Around((up - down) / (2 * APART), (up - 2 * level + down) / APART**2)
