@@ -16,8 +16,9 @@ from thincam_jax.design.search import Found, Search
 from thincam_jax.design.space import active_limits
 from thincam_jax.design_run import Front, Fronts, Point, build_study, compare, full_well, ranking
 from thincam_jax.design_run import Transfer as ContrastTransfer
+from thincam_jax.design_run.landscape import Landscape
 from thincam_jax.design_run.problem import Goal
-from thincam_jax.design_run.ranking import Candidate, Landscape, Result, Shot
+from thincam_jax.design_run.ranking import Candidate, Result, Shot
 from thincam_jax.design_run.sensitivity import FreeValue
 from thincam_jax.report.design_figures import (
     as_png,

@@ -32,8 +32,8 @@ class DesignFolder(RunFolder):
     - `config.yaml`: the resolved configuration.
     - `found.yaml`: the reference and the best designs, for `thincam run`.
     - `targets/NAME.json`: the simulation of a finished target; an interrupted design skips these.
-    - `landscape.png`, `responses.png`, `mtf.png`, `pareto.png`, `environment.json`, `report.html`,
-      `design.json`: written at the end.
+    - `landscape.png`, `training.png`, `responses.png`, `mtf.png`, `pareto.png`, `environment.json`,
+      `report.html`, `design.json`: written at the end.
     """
 
     def claim(self, config: Section) -> None:
@@ -86,6 +86,7 @@ def _draw(
     distance = config.object.distance
     pictures = {
         "landscape.png": figures.draw_landscape(result, count),
+        "training.png": figures.draw_training(result, count),
         "responses.png": figures.draw_responses(result, count, config.sensor.pitch),
         "mtf.png": figures.draw_mtf(result, distance),
     }

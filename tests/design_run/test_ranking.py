@@ -10,7 +10,14 @@ from design_run import tiny
 from thincam_jax.config import ConfigError
 from thincam_jax.design import Quadrant, bayes_error, channels, limit, unevenness
 from thincam_jax.design.search import Found, Search
-from thincam_jax.design_run import Goal, broken_limits, build_problem, find, ranking
+from thincam_jax.design_run import (
+    Goal,
+    broken_limits,
+    build_problem,
+    find,
+    landscape_of,
+    ranking,
+)
 from thincam_jax.design_run.sensitivity import least_change
 
 
@@ -151,7 +158,7 @@ def test_where_no_change_costs_anything():
 
 def test_landscape_of_two_variables(config):
     problem = bowl(config)
-    around = ranking._landscape(problem, problem.space.base, 5, 2)
+    around = landscape_of(problem.goal, problem.space, problem.data, problem.space.base, 5, 2)
     assert around.variables == (("beta", (1,)), ("beta", (2,)))
     np.testing.assert_allclose(around.axes, [[12, 16.5, 21, 25.5, 30]] * 2)
     assert around.goal.shape == (5, 5)
@@ -164,7 +171,7 @@ def test_landscape_of_one_and_of_three_variables(tmp_path):
     one = "{variable: beta, bounds: [12 /mm^2, 30 /mm^2], shared: true}"
     moved = "reference.shots.1.distance=2.5 mm"
     problem = bowl(tiny.design(tmp_path, f"search.free=[{one}]", moved))
-    line = ranking._landscape(problem, problem.space.base, 3, 2)
+    line = landscape_of(problem.goal, problem.space, problem.data, problem.space.base, 3, 2)
     assert line.variables == (("beta", (1, 2)),)
     np.testing.assert_allclose(
         line.goal, [1 + (b - 20) ** 2 + 2 * (b - 15) ** 2 + 3 for b in (12, 21, 30)]
@@ -173,7 +180,7 @@ def test_landscape_of_one_and_of_three_variables(tmp_path):
     distance = "{variable: distance, bounds: [2 mm, 3 mm], shared: true}"
     problem = bowl(tiny.design(tmp_path, f"search.free=[{two}, {distance}]"))
     best = found_at(problem, 20.0, 17.0, 2.2).design
-    around = ranking._landscape(problem, best, 3, 2)
+    around = landscape_of(problem.goal, problem.space, problem.data, best, 3, 2)
     assert around.goal[0, -1] == pytest.approx(1 + 8**2 + 2 * 15**2 + 2.2)
 
 
@@ -181,7 +188,9 @@ def test_limits_narrow_the_landscape(tmp_path):
     """π / (0.08 mm · 2 mm) = 19.6 rad/mm²; at a thickness of 2 mm no room is left."""
     config = tiny.design(tmp_path, "search.limits.mask_pixel=80 um")
     problem = bowl(config)
-    around = ranking._landscape(problem, found_at(problem, 13.0, 13.0).design, 3, 2)
+    around = landscape_of(
+        problem.goal, problem.space, problem.data, found_at(problem, 13.0, 13.0).design, 3, 2
+    )
     assert around.axes[0][-1] == pytest.approx(np.pi / 0.08 / 2)
     assert [why[:12] for why in broken_limits(config)] == ["β of shot 1,", "β of shot 2,"]
     config = tiny.design(
@@ -190,7 +199,7 @@ def test_limits_narrow_the_landscape(tmp_path):
         "search.limits.thickness=2 mm",
     )
     problem = bowl(config)
-    assert ranking._landscape(problem, problem.space.base, 3, 2) is None
+    assert landscape_of(problem.goal, problem.space, problem.data, problem.space.base, 3, 2) is None
     assert len(broken_limits(config)) == 2
 
 

@@ -1,9 +1,12 @@
 """Training: descents by the error of a reconstruction."""
 
+import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from design_run import tiny
 
+from thincam_jax.design import wiener_error
 from thincam_jax.design_run import build_problem, find
 from thincam_jax.design_run.train import build_training, train
 
@@ -48,6 +51,13 @@ def test_ranked_by_the_training_error(config, trained):
     assert result.reference.trained == pytest.approx(trained.reference, rel=1e-4)
     errors = [one.trained for one in result.found]
     assert None not in errors and errors == sorted(errors)
-    assert result.trainings > 0
+    assert result.training.evaluations > 0
+    around = result.training.landscape
+    assert around.goal.shape == (5, 5)
+    training = build_training(config, config.train, build_problem(config))
+    betas = [jnp.repeat(jnp.asarray(around.axes[n][place]), 2) for n, place in ((0, 1), (1, 3))]
+    chosen = eqx.tree_at(lambda d: d.beta, config.reference_design(), jnp.concatenate(betas))
+    expected = eqx.filter_jit(wiener_error)(chosen, training)
+    assert around.goal[1, 3] == pytest.approx(float(expected), rel=1e-6)
     for one in result.found:
         assert [v.value for v in one.values] == pytest.approx([s.beta for s in one.shots])

@@ -22,11 +22,11 @@ from thincam_jax.design.search import (
     APART,
     Descents,
     Found,
-    even_samples,
-    ranked,
     best_apart,
     evaluate,
+    even_samples,
     on_cube,
+    ranked,
 )
 from thincam_jax.design.setup import Setup
 from thincam_jax.design.space import DesignSpace

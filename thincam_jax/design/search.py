@@ -158,7 +158,12 @@ def evaluate(
 
 
 def landscape(
-    objective: Objective, space: DesignSpace, data: Any, count: int
+    objective: Objective,
+    space: DesignSpace,
+    data: Any,
+    count: int,
+    *,
+    at_a_time: int = _AT_A_TIME,
 ) -> tuple[Float[Array, "point variable"], Float[Array, " point"]]:
     """The objective on an even grid over the cube, `count` points along each variable.
 
@@ -171,7 +176,7 @@ def landscape(
     axis = jnp.linspace(0.0, 1.0, count, dtype=space.lower.dtype)
     mesh = jnp.meshgrid(*[axis] * space.size, indexing="ij")
     points = jnp.stack([m.ravel() for m in mesh], axis=-1)
-    return points, evaluate(objective, space, data, points)
+    return points, evaluate(objective, space, data, points, at_a_time=at_a_time)
 
 
 def even_samples(dimensions: int, count: int, key, dtype) -> Float[Array, "point variable"]:

@@ -1,6 +1,8 @@
 """From a design's file to designs found, and what the full simulation says of them."""
 
 from thincam_jax.design_run.compare import compare as compare
+from thincam_jax.design_run.landscape import Landscape as Landscape
+from thincam_jax.design_run.landscape import landscape_of as landscape_of
 from thincam_jax.design_run.pareto import Front as Front
 from thincam_jax.design_run.pareto import Fronts as Fronts
 from thincam_jax.design_run.pareto import Point as Point
@@ -10,7 +12,6 @@ from thincam_jax.design_run.problem import Goal as Goal
 from thincam_jax.design_run.problem import broken_limits as broken_limits
 from thincam_jax.design_run.problem import build_problem as build_problem
 from thincam_jax.design_run.ranking import Candidate as Candidate
-from thincam_jax.design_run.ranking import Landscape as Landscape
 from thincam_jax.design_run.ranking import Result as Result
 from thincam_jax.design_run.ranking import find as find
 from thincam_jax.design_run.ranking import find_steps as find_steps
@@ -18,5 +19,6 @@ from thincam_jax.design_run.simulate import simulate as simulate
 from thincam_jax.design_run.simulated import build_study as build_study
 from thincam_jax.design_run.simulated import check_design as check_design
 from thincam_jax.design_run.simulated import full_well as full_well
+from thincam_jax.design_run.train import TrainingGoal as TrainingGoal
 from thincam_jax.design_run.transfer import Transfer as Transfer
 from thincam_jax.design_run.transfer import modulation_transfer as modulation_transfer

@@ -11,17 +11,17 @@ import numpy as np
 from thincam_jax._precision import allow
 from thincam_jax.config import ConfigError
 from thincam_jax.config_design import DesignConfig, found_name
-from thincam_jax.design import Design, DesignSpace, channels, landscape, search
+from thincam_jax.design import Design, DesignSpace, channels, search
 from thincam_jax.design.objectives import ring_means
 from thincam_jax.design.search import APART, Found
-from thincam_jax.design_run.problem import RISE, Data, Goal, Problem, build_problem, spans_of
+from thincam_jax.design_run.landscape import Landscape, landscape_of
+from thincam_jax.design_run.problem import RISE, Data, Goal, Problem, build_problem
 from thincam_jax.design_run.sensitivity import (
     FreeValue,
     around,
     free_values,
-    shots_of_variable,
 )
-from thincam_jax.design_run.train import Trained, train
+from thincam_jax.design_run.train import Trained, TrainingGoal, train
 from thincam_jax.design_run.transfer import RINGS, Transfer, modulation_transfer
 from thincam_jax.study.target import Progress
 
@@ -54,16 +54,12 @@ class Candidate(NamedTuple):
     trained: float | None = None
 
 
-class Landscape(NamedTuple):
-    """The goal over one or two free numbers, the others as in the best design.
+class Training(NamedTuple):
+    """Of the descents by the error of a reconstruction: their goal, and how much they took."""
 
-    - `variables`: their names and shots; `axes`: their values; `goal`: (n,) or (n, n), the first
-      variable along the first axis.
-    """
-
-    variables: tuple[tuple[str, tuple[int, ...]], ...]
-    axes: tuple[np.ndarray, ...]
-    goal: np.ndarray
+    goal: TrainingGoal
+    evaluations: int
+    landscape: Landscape | None
 
 
 class Result(NamedTuple):
@@ -71,7 +67,7 @@ class Result(NamedTuple):
 
     - `edge`: of the frequencies looked at, cycles/rad.
     - `transfers`: the modulation transfer of the reference and of the best design.
-    - `trainings`: evaluations of the training error.
+    - `training`: what was trained by, and how long; None without.
     """
 
     goal: Goal
@@ -83,7 +79,7 @@ class Result(NamedTuple):
     edge: float
     landscape: Landscape | None
     transfers: tuple[Transfer, Transfer] | None = None
-    trainings: int = 0
+    training: Training | None = None
 
 
 def find(config: DesignConfig, progress: Progress) -> Result:
@@ -131,20 +127,21 @@ def _result(config: DesignConfig, problem: Problem, searched, trained, found, be
     base = problem.space.base
     shots = shots_of_design(base, phases)
     reference = Candidate(config.reference.name, shots, *_score(problem, base))
-    evaluations = searched.evaluations
+    training = None
     if trained is not None:
         reference = reference._replace(trained=trained.reference)
+        training = Training(trained.goal, trained.evaluations, trained.landscape)
     return Result(
         problem.goal,
         reference,
         found,
-        evaluations,
+        searched.evaluations,
         searched.failed,
         float(problem.data.setup.prior.exponent),
         float(problem.data.frequencies.highest),
-        _landscape(problem, best, config.search.grid, phases),
+        landscape_of(problem.goal, problem.space, problem.data, best, config.search.grid, phases),
         (modulation_transfer(base, problem.exact), modulation_transfer(best, problem.exact)),
-        0 if trained is None else trained.evaluations,
+        training,
     )
 
 
@@ -246,20 +243,3 @@ def _tolerances(problem: Problem, one: Found, phases: int) -> tuple[FreeValue, .
     space, goal = problem.space, problem.goal
     near = around(goal, space, problem.data, one.point)
     return free_values(space, one, near, goal.rise(one.objective), phases)
-
-
-def _landscape(problem: Problem, best: Design, count: int, phases: int) -> Landscape | None:
-    """Over the first two free numbers, or the only one; None where bounds leave them no room."""
-    space = problem.space
-    spans = spans_of(space)[:2]
-    if not np.all(spans > 0):
-        return None
-    variables = space.variables[:2]
-    plane = DesignSpace(best, variables, space.limits)
-    _, goal = landscape(problem.goal, plane, problem.data, count)
-    place = np.linspace(0.0, 1.0, count)
-    lower = np.asarray(plane.lower, dtype=float)
-    axes = tuple(low + place * span for low, span in zip(lower, spans, strict=True))
-    shape = (count,) * len(variables)
-    named = tuple((v.name, shots_of_variable(v, phases)) for v in variables)
-    return Landscape(named, axes, np.asarray(goal, dtype=float).reshape(shape))

@@ -51,12 +51,12 @@ def record(config: DesignConfig, result: Result, study: StudyConfig, validation:
 
 
 def _training(config: DesignConfig, result: Result) -> dict[str, Any] | None:
-    if config.train is None:
+    if config.train is None or result.training is None:
         return None
     return {
         "reconstruction": config.train.reconstruction,
         "images": list(config.train.images),
-        "evaluations": result.trainings,
+        "evaluations": result.training.evaluations,
     }
 
 

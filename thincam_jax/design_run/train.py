@@ -6,7 +6,7 @@ counts which the frequency-wise objectives leave out.
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -18,6 +18,7 @@ from thincam_jax.config_design import DesignConfig
 from thincam_jax.config_training import TrainingConfig
 from thincam_jax.design import Design, DesignSpace, Training, end_to_end_error, wiener_error
 from thincam_jax.design.search import APART, Found, descend, evaluate
+from thincam_jax.design_run.landscape import Landscape, landscape_of
 from thincam_jax.design_run.problem import Problem, spans_of
 from thincam_jax.design_run.sensitivity import Around
 from thincam_jax.study.build import synthesis_matrix
@@ -25,6 +26,8 @@ from thincam_jax.targets import resize, sample_image
 
 # Single precision holds the error to some 1e-6 of itself.
 _TOLERANCE = 1e-4
+# Points along each side of the landscape, by the number of free numbers.
+_GRID = {1: 61, 2: 15}
 
 
 @dataclass(frozen=True)
@@ -32,24 +35,34 @@ class TrainingGoal:
     """The error of a reconstruction; equal goals are compiled once."""
 
     reconstruction: str
+    unit: str = "dB"
+    label: str = "error of the training images over their variance (dB)"
+    wants_more: bool = False
 
     def __call__(self, design: Design, training: Training) -> Float[Array, ""]:
         error = wiener_error if self.reconstruction == "wiener" else end_to_end_error
         return error(design, training)
 
+    def told(self, value: Any) -> Any:
+        """An error as it is shown, in dB."""
+        return 10 * np.log10(np.asarray(value, dtype=float))
+
 
 class Trained(NamedTuple):
     """Designs by their training error, best first.
 
+    - `goal`: what was made small; `landscape`: around the best of them.
     - `found`: with the error as `objective`; `around`: of each.
     - `reference`: the error of the reference.
     - `evaluations`: of the error, with its gradient.
     """
 
+    goal: TrainingGoal
     found: tuple[Found, ...]
     around: tuple[Around, ...]
     reference: float
     evaluations: int
+    landscape: Landscape | None
 
 
 def train(
@@ -64,7 +77,23 @@ def train(
     ended = descend(goal, space, training, chosen, steps=wanted.steps, tolerance=_TOLERANCE)
     around = tuple(_around(goal, space, training, found) for found in ended.found)
     reference = eqx.filter_jit(goal)(space.base, training)
-    return Trained(ended.found, around, float(reference), ended.evaluations)
+    return Trained(
+        goal,
+        ended.found,
+        around,
+        float(reference),
+        ended.evaluations,
+        _surroundings(config, goal, space, training, ended.found),
+    )
+
+
+def _surroundings(config: DesignConfig, goal, space: DesignSpace, training, found):
+    """Coarser than the search's landscape: an evaluation takes some tenths of a second."""
+    if not found:
+        return None
+    count = min(config.search.grid, _GRID[min(space.size, 2)])
+    phases = len(config.reference.method().shot_phases())
+    return landscape_of(goal, space, training, found[0].design, count, phases, at_a_time=1)
 
 
 def build_training(config: DesignConfig, wanted: TrainingConfig, problem: Problem) -> Training:

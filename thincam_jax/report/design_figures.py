@@ -1,11 +1,14 @@
 """The pictures of a design: the objective's landscape, the responses, and contrast transfer."""
 
 import io
+import operator
+from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from thincam_jax.design_run import Candidate, Landscape, Result, Transfer
+from thincam_jax.design_run import Candidate, Goal, Landscape, Result, TrainingGoal, Transfer
 from thincam_jax.design_run.ranking import Shot
 from thincam_jax.report.figures import line_style
 
@@ -23,6 +26,21 @@ def as_png(figure: Figure) -> bytes:
     return buffer.getvalue()
 
 
+class _View(NamedTuple):
+    """A landscape, what it is of, and the value of a design as drawn and as told."""
+
+    around: Landscape
+    goal: Goal | TrainingGoal
+    drawn: Callable[[Candidate], float | None]
+    told: Callable[[Candidate], float | None]
+
+    def name(self, one: Candidate) -> str:
+        value = self.told(one)
+        if value is None:
+            return one.name
+        return f"{one.name} ({float(self.goal.told(value)):.2f} {self.goal.unit})"
+
+
 def draw_landscape(result: Result, count: int) -> Figure | None:
     """The objective over the free numbers, with the reference and the first `count` found.
 
@@ -30,13 +48,27 @@ def draw_landscape(result: Result, count: int) -> Figure | None:
     """
     if result.landscape is None:
         return None
+    searched, exact = operator.attrgetter("searched"), operator.attrgetter("exact")
+    return _draw(_View(result.landscape, result.goal, searched, exact), result, count)
+
+
+def draw_training(result: Result, count: int) -> Figure | None:
+    """The same of the training error; None without training."""
+    if result.training is None or result.training.landscape is None:
+        return None
+    trained = operator.attrgetter("trained")
+    view = _View(result.training.landscape, result.training.goal, trained, trained)
+    return _draw(view, result, count)
+
+
+def _draw(view: _View, result: Result, count: int) -> Figure:
     points = (result.reference, *result.found[:count])
     figure = Figure(figsize=(7.6, 6.0), layout="constrained")
     ax = figure.subplots()
-    if len(result.landscape.axes) == 1:
-        _draw_line(ax, result, points)
+    if len(view.around.axes) == 1:
+        _draw_line(ax, view, points)
     else:
-        _draw_map(figure, ax, result, points)
+        _draw_map(figure, ax, view, points)
     ax.legend(fontsize=9, loc="upper center", bbox_to_anchor=(0.5, -0.1), ncols=2, frameon=False)
     return figure
 
@@ -69,23 +101,22 @@ def _marker(number: int) -> dict:
     }
 
 
-def _draw_map(figure: Figure, ax, result: Result, points: tuple[Candidate, ...]) -> None:
-    around = result.landscape
-    assert around is not None  # for the type checker; `draw_landscape` has looked
+def _draw_map(figure: Figure, ax, view: _View, points: tuple[Candidate, ...]) -> None:
+    around, goal = view.around, view.goal
     x, y = around.axes
-    told = result.goal.told(around.goal).T
-    worst = np.nanpercentile(told, 100 - _SHADED if result.goal.wants_more else _SHADED)
-    steps = {"vmin" if result.goal.wants_more else "vmax": worst}
-    extend = "min" if result.goal.wants_more else "max"
+    told = goal.told(around.goal).T
+    worst = np.nanpercentile(told, 100 - _SHADED if goal.wants_more else _SHADED)
+    steps = {"vmin" if goal.wants_more else "vmax": worst}
+    extend = "min" if goal.wants_more else "max"
     shown = ax.pcolormesh(x, y, told, cmap="cividis", shading="nearest", rasterized=True, **steps)
-    figure.colorbar(shown, ax=ax, label=result.goal.label, extend=extend)
+    figure.colorbar(shown, ax=ax, label=goal.label, extend=extend)
     # Grounds beside the map are not allowed, or not looked at.
     ax.set_facecolor("#e8e8e8")
     places = np.array([_place(around, p) for p in points])
     for set_limits, axis, own in ((ax.set_xlim, x, places[:, 0]), (ax.set_ylim, y, places[:, 1])):
         set_limits(*_reach(axis, own))
     for number, (one, place) in enumerate(zip(points, places, strict=True)):
-        ax.plot(*place, label=_name(result, one), clip_on=False, zorder=5, **_marker(number))
+        ax.plot(*place, label=view.name(one), clip_on=False, zorder=5, **_marker(number))
     ax.set_xlabel(axis_label(*around.variables[0]))
     ax.set_ylabel(axis_label(*around.variables[1]))
 
@@ -100,21 +131,17 @@ def _reach(axis: np.ndarray, own: np.ndarray) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def _draw_line(ax, result: Result, points: tuple[Candidate, ...]) -> None:
-    around = result.landscape
-    assert around is not None  # for the type checker; `draw_landscape` has looked
-    ax.plot(around.axes[0], result.goal.told(around.goal), color="black", linewidth=1)
+def _draw_line(ax, view: _View, points: tuple[Candidate, ...]) -> None:
+    around, goal = view.around, view.goal
+    ax.plot(around.axes[0], goal.told(around.goal), color="black", linewidth=1)
     for number, one in enumerate(points):
-        level = float(result.goal.told(one.searched))
+        level = view.drawn(one)
+        assert level is not None  # for the type checker; what is drawn was scored
         place = _place(around, one)
-        ax.plot(*place, level, label=_name(result, one), zorder=5, **_marker(number))
+        ax.plot(*place, float(goal.told(level)), label=view.name(one), zorder=5, **_marker(number))
     ax.set_xlabel(axis_label(*around.variables[0]))
-    ax.set_ylabel(result.goal.label)
+    ax.set_ylabel(goal.label)
     ax.grid(alpha=0.3)
-
-
-def _name(result: Result, one: Candidate) -> str:
-    return f"{one.name} ({float(result.goal.told(one.exact)):.2f} {result.goal.unit})"
 
 
 def draw_responses(result: Result, count: int, pitch: float) -> Figure:
