@@ -8,6 +8,7 @@ import pydantic
 from pydantic import Field
 
 from thincam_jax.config import (
+    Angle,
     ConfigError,
     Length,
     MethodConfig,
@@ -26,11 +27,11 @@ from thincam_jax.config import (
 from thincam_jax.config_file import read_raw
 from thincam_jax.config_pareto import ParetoConfig, check_pareto
 from thincam_jax.config_training import TrainingConfig
-from thincam_jax.design import Design, DesignSpace, Limits, Variable, shots
+from thincam_jax.design import Design, DesignSpace, Limits, Tolerances, Variable, shots
 from thincam_jax.psf import Model
 from thincam_jax.units import parse_quantity
 
-Objective = Literal["bayes_error", "worst_ratio", "limit", "unevenness"]
+Objective = Literal["bayes_error", "robust_error", "worst_ratio", "limit", "unevenness"]
 Part = Annotated[float, Field(ge=0, le=1)]
 _KINDS = {"beta": ("curvature", "rad/mm^2"), "distance": ("length", "mm")}
 # A band has to hold some of the 64 rings that the objectives average over.
@@ -152,6 +153,33 @@ class LimitsConfig(Section):
     captures: Annotated[int, Field(ge=1, le=8)] = 8
 
 
+class TolerancesConfig(Section):
+    """`thincam_jax.design.Tolerances`: what the reconstruction does not know, of `robust_error`.
+
+    `beta`: as a part of itself; `how`: the mean over the tolerances, or the worst of them.
+    """
+
+    beta: Annotated[float, Field(gt=0, lt=0.5)] | None = None
+    distance: Length | None = None
+    wavelength: Length | None = None
+    object_distance: Length | None = None
+    tilt: Angle | None = None
+    how: Literal["mean", "worst"] = "mean"
+
+    @pydantic.model_validator(mode="after")
+    def _some(self):
+        given = self.model_dump(exclude={"how"}, exclude_none=True)
+        if not given:
+            raise ValueError("no tolerance is given; give at least one, such as distance: 20 um")
+        if self.tilt is not None and not self.tilt > 0:
+            raise ValueError(f"tilt is {self.tilt:g} rad; give an angle above 0")
+        return self
+
+    def tolerances(self) -> Tolerances:
+        """As numbers, 0 for what is exact."""
+        return Tolerances(*(getattr(self, name) or 0.0 for name in Tolerances._fields))
+
+
 class FrequenciesConfig(Section):
     """How finely responses are sampled: radii and directions of the search, the exact square.
 
@@ -174,12 +202,19 @@ class SearchConfig(Section):
     limits: LimitsConfig = LimitsConfig()
     objective: Objective = "bayes_error"
     band: tuple[Part, Part] | None = None
+    tolerances: TolerancesConfig | None = None
     starts: Annotated[int, Field(ge=1, le=1000)] = 16
     samples: Annotated[int, Field(ge=1, le=100_000)] = 512
     steps: Annotated[int, Field(ge=1, le=1000)] = 60
     solver: Literal["bfgs", "lbfgsb"] = "bfgs"
     grid: Annotated[int, Field(ge=5, le=501)] = 61
     frequencies: FrequenciesConfig = FrequenciesConfig()
+
+    @pydantic.model_validator(mode="after")
+    def _belongs(self):
+        if (self.objective == "robust_error") != (self.tolerances is not None):
+            raise ValueError("objective robust_error and tolerances belong together; give both")
+        return self
 
     @pydantic.model_validator(mode="after")
     def _band(self):

@@ -15,13 +15,14 @@ class TrainingConfig(Section):
     - `images`: photographs of scikit-image; their middle square is taken.
     - `reconstruction`: `wiener`, the Wiener synthesis as in the simulation; `linear`, the best
       linear estimate, which knows of the crop, by conjugate gradients.
-    - `pixels`: of the sensor's shorter side in training.
+    - `pixels`: of the sensor's shorter side in training; by default as many as the finest fringes
+      need, and no more than the sensor has.
     - `starts`: of the search's designs, beside the reference; `steps` of each descent.
     """
 
     images: Annotated[tuple[str, ...], Field(min_length=1)]
     reconstruction: Literal["wiener", "linear"] = "wiener"
-    pixels: Annotated[int, Field(ge=32, le=2048)] = 256
+    pixels: Annotated[int, Field(ge=32, le=4096)] | None = None
     starts: Annotated[int, Field(ge=1, le=100)] = 4
     steps: Annotated[int, Field(ge=1, le=1000)] = 30
 

@@ -8,7 +8,15 @@ import pytest
 from design_run import tiny
 
 from thincam_jax.config import ConfigError
-from thincam_jax.design import Quadrant, bayes_error, channels, limit, unevenness
+from thincam_jax.design import (
+    Quadrant,
+    Tolerances,
+    bayes_error,
+    channels,
+    limit,
+    robust_error,
+    unevenness,
+)
 from thincam_jax.design.search import Found, Search
 from thincam_jax.design_run import (
     Goal,
@@ -149,6 +157,18 @@ def test_tolerance_is_a_change_of_one_per_cent(config, scored):
 )
 def test_change_that_costs_a_rise(slope, curve, rise, change):
     assert least_change(slope, curve, rise) == pytest.approx(change)
+
+
+def test_tolerances_reach_the_goal(config, tmp_path):
+    asked = "search.tolerances={distance: 30 um, beta: 0.002}"
+    robust = build_problem(tiny.design(tmp_path, "search.objective=robust_error", asked))
+    base = robust.space.base
+    exact = float(Goal("bayes_error")(base, robust.data))
+    found = float(robust.goal(base, robust.data))
+    expected = robust_error(base, *robust.data, Tolerances(beta=0.002, distance=0.03))
+    assert found == pytest.approx(float(expected), rel=1e-12)
+    assert found > 1.001 * exact
+    assert robust.goal.told(found) == pytest.approx(10 * np.log10(found))
 
 
 def test_where_no_change_costs_anything():

@@ -44,6 +44,16 @@ def test_training_is_of_the_sensor_and_the_picture(config):
     assert float(training.images.mean()) == pytest.approx(1)
 
 
+def test_pixels_show_the_finest_fringes(config):
+    """30 rad/mm² over 1 mm are 9.55 cycles/mm: three pixels each of them, 55 over 1.92 mm."""
+    asked = config.train.model_copy(update={"pixels": None})
+    training = build_training(config, asked, build_problem(config))
+    assert training.sensor.shape == (48, 48)  # as many as there are
+    fine = config.sensor.model_copy(update={"shape": (96, 128), "pitch": 0.02})
+    finer = config.model_copy(update={"sensor": fine})
+    assert build_training(finer, asked, build_problem(config)).sensor.shape == (56, 56)
+
+
 def test_ranked_by_the_training_error(config, trained):
     steps = []
     result = find(config, steps.append)

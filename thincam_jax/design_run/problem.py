@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -18,10 +18,12 @@ from thincam_jax.design import (
     Quadrant,
     Setup,
     SignalNoise,
+    Tolerances,
     bayes_error,
     channels,
     fit_power_law,
     limit,
+    robust_error,
     unevenness,
     worst_ratio_db,
 )
@@ -48,11 +50,14 @@ class Data(NamedTuple):
 class Goal:
     """An objective to be made small; equal goals are compiled once.
 
-    `band`: of `worst_ratio` and `unevenness`.
+    - `band`: of `worst_ratio` and `unevenness`.
+    - `tolerances`, `how`: of `robust_error`.
     """
 
     name: Objective
     band: tuple[float, float] = DEFAULT_BAND
+    tolerances: Tolerances = Tolerances()
+    how: Literal["mean", "worst"] = "mean"
 
     def __call__(self, design: Design, data: Any) -> Float[Array, ""]:
         """What is made small: the negative of what is to be large."""
@@ -60,6 +65,8 @@ class Goal:
         return -value if self.wants_more else value
 
     def _value(self, design: Design, data: Any) -> Float[Array, ""]:
+        if self.name == "robust_error":
+            return robust_error(design, *data, self.tolerances, how=self.how)
         known = channels(design, data.setup, data.synthesis, data.frequencies)
         if self.name == "bayes_error":
             return bayes_error(known)
@@ -84,6 +91,7 @@ class Goal:
         """What the objective is, in words, with the unit of `told`."""
         words = {
             "bayes_error": "predicted error over the scene's variance",
+            "robust_error": "predicted error with the tolerances",
             "worst_ratio": "lowest signal-to-noise ratio of the band",
             "limit": "limit of resolution",
             "unevenness": "unevenness of the band",
@@ -93,7 +101,7 @@ class Goal:
     def told(self, minimised: Any) -> Any:
         """A value of the goal as it is shown: errors in dB, and what is to be large as it is."""
         value = np.asarray(minimised, dtype=float)
-        if self.name == "bayes_error":
+        if self.name in ("bayes_error", "robust_error"):
             return 10 * np.log10(value)
         return -value if self.wants_more else value
 
@@ -125,11 +133,19 @@ def build_problem(config: DesignConfig) -> Problem:
     highest = jnp.asarray(config.farthest() / (4 * config.sensor.pitch))
     counts = config.search.frequencies
     return Problem(
-        Goal(config.search.objective, config.search.band or DEFAULT_BAND),
+        _goal(config),
         config.space(),
         Data(setup, synthesis, Polar(highest, counts.radii, counts.directions)),
         Data(setup, synthesis, Quadrant(highest, counts.exact or _exact_count(config, highest))),
     )
+
+
+def _goal(config: DesignConfig) -> Goal:
+    asked = config.search
+    band, given = asked.band or DEFAULT_BAND, asked.tolerances
+    if given is None:
+        return Goal(asked.objective, band)
+    return Goal(asked.objective, band, given.tolerances(), given.how)
 
 
 def _exact_count(config: DesignConfig, highest) -> int:

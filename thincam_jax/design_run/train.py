@@ -101,18 +101,32 @@ def build_training(config: DesignConfig, wanted: TrainingConfig, problem: Proble
 
     Of an oblong sensor the square of its shorter side, as everywhere in the search.
     """
+    pixels = wanted.pixels or _pixels(config)
     setup = jax.tree.map(lambda x: jnp.asarray(np.asarray(x), float), problem.data.setup)
     # Pixels of the object about as large as those of the sensor at the longest distance.
     across = float(setup.field) * config.farthest() / float(setup.sensor_width)
-    count = max(16, math.ceil(across * wanted.pixels))
+    count = max(16, math.ceil(across * pixels))
     return Training(
         np.stack([_picture(name, count) for name in wanted.images]),
         setup,
         synthesis_matrix(config.reference.method()),
-        sensor_shape=(wanted.pixels, wanted.pixels),
+        sensor_shape=(pixels, pixels),
         distances=(config.nearest(), config.farthest()),
         key=jax.random.key(config.seed),
     )
+
+
+def _pixels(config: DesignConfig) -> int:
+    """So that the fringes at the masks' edges, of βR/π cycles/mm, have three pixels a period.
+
+    With fewer, their contrast is lost to the pixels' own average, and fine zones look worse than
+    they are.
+    """
+    finest = [s.beta for s in config.reference.shots]
+    finest += [f.bounds[1] for f in config.search.free if f.variable == "beta"]
+    edge = max(finest) * config.mask.width / (2 * math.pi)
+    needed = math.ceil(3 * edge * config.sensor.width)
+    return max(32, min(needed, *config.sensor.shape))
 
 
 def _picture(name: str, count: int) -> np.ndarray:
