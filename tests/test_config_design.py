@@ -277,7 +277,9 @@ def test_measured_prior_needs_a_picture(tmp_path):
     assert "prior.measured: measured needs a photograph" in line
 
 
-@pytest.mark.parametrize("name", ["design_pitches", "design_slm"])
+@pytest.mark.parametrize(
+    "name", ["design_pitches", "design_slm", "design_distances", "design_both"]
+)
 def test_examples(name):
     config = load_design(ROOT / "configs" / f"{name}.yaml")
     assert config.prior.measured

@@ -23,7 +23,7 @@ class TrainingConfig(Section):
     images: Annotated[tuple[str, ...], Field(min_length=1)]
     reconstruction: Literal["wiener", "linear"] = "wiener"
     pixels: Annotated[int, Field(ge=32, le=4096)] | None = None
-    starts: Annotated[int, Field(ge=1, le=100)] = 4
+    starts: Annotated[int, Field(ge=1, le=10)] = 4
     steps: Annotated[int, Field(ge=1, le=1000)] = 30
 
     @pydantic.field_validator("images")

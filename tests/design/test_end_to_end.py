@@ -247,6 +247,7 @@ def test_steps_without_a_number_are_skipped_and_counted():
     np.testing.assert_allclose(found.values, target, atol=0.4)
 
 
+@pytest.mark.thorough
 def test_drawn_noise_is_other_noise_and_of_the_key():
     given, chosen = training(), design()
     errors = [float(drawn_error(chosen, given, jax.random.key(k))) for k in (0, 0, 1)]

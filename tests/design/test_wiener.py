@@ -86,6 +86,18 @@ def synthesised(chosen, given):
     return np.stack(restored)
 
 
+@pytest.mark.thorough
+def test_restored_are_nearly_those_of_the_wiener_synthesis_at_two_distances():
+    """Shorter captures are interpolated there, and their noise is weighed otherwise."""
+    given, chosen = training(), design(distance=(5.0, 7.0))
+    images = np.asarray(given.images)
+    found, expected = np.asarray(restore_by_wiener(chosen, given)), synthesised(chosen, given)
+    error = [np.mean((r - images) ** 2) / np.var(images) for r in (found, expected)]
+    assert error[1] < 0.2
+    assert error[0] == pytest.approx(error[1], rel=0.25)
+    assert np.mean((found - expected) ** 2) < 0.15 * np.mean((expected - images) ** 2)
+
+
 def test_restored_are_those_of_the_wiener_synthesis():
     given, chosen = training(), design()
     found = np.asarray(restore_by_wiener(chosen, given))
@@ -152,6 +164,17 @@ def test_new_values_are_not_traced_again():
 def test_errors():
     with pytest.raises(ValueError, match="adds 2 captures and the design takes 4"):
         wiener_error(design(), training(synthesis=phase_pairs(1)))
+    with pytest.raises(ValueError, match="distance = 4 mm, and the training was made for 5 to 7"):
+        wiener_error(design(distance=(4.0, 7.0)), training())
+    with pytest.raises(ValueError, match="an image has no contrast"):
+        Training(
+            np.ones((1, 12, 12)),
+            setup(),
+            phase_pairs(2),
+            sensor_shape=SENSOR,
+            distances=(5.0, 7.0),
+            key=jax.random.key(0),
+        )
     with pytest.raises(ValueError, match="give the shortest and the longest"):
         Training(
             pictures(12),

@@ -159,9 +159,21 @@ def test_change_that_costs_a_rise(slope, curve, rise, change):
     assert least_change(slope, curve, rise) == pytest.approx(change)
 
 
-def test_tolerances_reach_the_goal(config, tmp_path):
+def robust_problem(folder):
     asked = "search.tolerances={distance: 30 um, beta: 0.002}"
-    robust = build_problem(tiny.design(tmp_path, "search.objective=robust_error", asked))
+    return build_problem(tiny.design(folder, "search.objective=robust_error", asked))
+
+
+def test_tolerances_reach_the_goal(tmp_path):
+    goal = robust_problem(tmp_path).goal
+    assert (goal.name, goal.how) == ("robust_error", "mean")
+    assert goal.tolerances == Tolerances(beta=0.002, distance=pytest.approx(0.03))
+    assert goal != Goal("robust_error")
+
+
+@pytest.mark.thorough
+def test_tolerances_cost_something(tmp_path):
+    robust = robust_problem(tmp_path)
     base = robust.space.base
     exact = float(Goal("bayes_error")(base, robust.data))
     found = float(robust.goal(base, robust.data))

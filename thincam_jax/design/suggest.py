@@ -179,7 +179,7 @@ class Suggestion(NamedTuple):
 
 
 def suggest(suggester: Suggester, wanted, *, tolerance_db: float = MATCHED) -> Suggestion:
-    """A design whose levels are near to wanted ones, in milliseconds once compiled.
+    """A design whose levels are near to wanted ones, in some tens of milliseconds once compiled.
 
     **Arguments**
 
@@ -283,7 +283,7 @@ def _header(suggester: Suggester) -> dict:
 def _read_header(path, line: bytes) -> dict:
     try:
         header = json.loads(line)
-        known = header["format"] == _FORMAT
+        known = header["format"] == _FORMAT and isinstance(header["network"], dict)
     except (ValueError, KeyError, TypeError):
         known, header = False, {}
     if not known:

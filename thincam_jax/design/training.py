@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from thincam_jax import _checks
 from thincam_jax.camera import LenslessCamera
 from thincam_jax.design.design import Design
 from thincam_jax.design.setup import Setup
@@ -53,6 +54,12 @@ class Training(eqx.Module):
 
     Made with `distances`, the shortest and the longest (mm) that designs may take.
 
+    **Validity.** Of a design nearer than the shortest, light wraps round; of one farther than the
+    longest, the field is cut off: both are refused where the distances are known numbers.
+
+    **Errors**: ValueError for images that are not square or have no contrast, for distances out
+    of order, and for a synthesis with rows of zeros.
+
     - `images`: (image, v, u), square, over the object's width, of mean 1.
     - `noise`: standard normal numbers (image, channel, y, x): the same in every evaluation, so that
       the objective is smooth; draw others from step to step for a stochastic search.
@@ -60,7 +67,7 @@ class Training(eqx.Module):
       its `pitch`; noise is averaged over them.
     - `synthesis`: rows (channel) of weights of the captures; a row adds captures at one distance.
     - `field_shape`: of the projection on the sensor, at least the object's at the longest distance.
-    - `window`: of the angles that a reconstruction's spectrum is taken over.
+    - `distances`: mm; `window`: of the angles that a reconstruction's spectrum is taken over.
     - `tolerance`, `steps`: of conjugate gradients: relative residual, and at most so many.
     """
 
@@ -69,6 +76,7 @@ class Training(eqx.Module):
     setup: Setup
     synthesis: tuple[tuple[float, ...], ...] = eqx.field(static=True)
     field_shape: tuple[int, int] = eqx.field(static=True)
+    distances: tuple[float, float] = eqx.field(static=True)
     window: Window = eqx.field(static=True)
     tolerance: float = eqx.field(static=True)
     steps: int = eqx.field(static=True)
@@ -90,6 +98,8 @@ class Training(eqx.Module):
         given = jnp.asarray(images, float)
         if given.ndim != 3 or given.shape[-1] != given.shape[-2]:
             raise ValueError(f"images have shape {given.shape}; give (image, n, n), square ones")
+        if not _checks.is_traced(given) and not np.all(np.ptp(np.asarray(given), axis=(1, 2)) > 0):
+            raise ValueError("an image has no contrast, or is not finite; there is nothing to see")
         self.images = given / jnp.mean(given, axis=(-2, -1), keepdims=True)
         rows = np.asarray(synthesis, dtype=float)
         if rows.ndim != 2 or not np.any(rows, axis=1).all():
@@ -104,6 +114,7 @@ class Training(eqx.Module):
         # Both ends of the projection, and the parity of the sensor, so that their centres agree.
         rows, columns = (math.ceil(pixels) + 2 + (math.ceil(pixels) + n) % 2 for n in sensor_shape)
         self.field_shape = (rows, columns)
+        self.distances = (float(distances[0]), float(distances[1]))
         self.window = _window(setup, max(sensor_shape), *distances)
         self.tolerance, self.steps = tolerance, steps
 
@@ -174,13 +185,22 @@ def noise_variance(clean, weights, exposure, setup: Setup, pitch) -> Float[Array
 
 
 def check_captures(design: Design, training: Training) -> None:
-    """ValueError if the synthesis is for another number of captures."""
+    """ValueError if the synthesis is for other captures, or a distance is out of the training's."""
     count = len(training.synthesis[0])
     if count != design.captures:
         raise ValueError(
             f"the synthesis adds {count} captures and the design takes {design.captures}; "
             "make them the same"
         )
+    if _checks.is_traced(design.distance):
+        return
+    shortest, longest = training.distances
+    for distance in np.asarray(design.distance):
+        if not shortest * (1 - 1e-5) <= distance <= longest * (1 + 1e-5):
+            raise ValueError(
+                f"distance = {distance:g} mm, and the training was made for {shortest:g} to "
+                f"{longest:g} mm; make one with other distances"
+            )
 
 
 def channels_of(design: Design, training: Training) -> tuple[Channel, ...]:

@@ -10,6 +10,11 @@ angular frequencies ν fall on each sensor, at ν/d,
 with H_c in closed form at ν/d (`thincam_jax.propagation.separable_transfer`), the noise's η_c, and
 η_f ∝ 1/(ν² + ν₀²) of a strength that is found from the captures' own power. As there, the filter
 takes captures as if nothing had been cropped, and what that costs is in the error.
+
+It is not the same to the last digit: `WienerSynthesis` interpolates shorter captures and counts
+the noise of each by its samples after that, estimates the mean, and finds the strength per sample.
+At one distance the errors agree within some tenths of a dB, at two within one; where designs rank
+near to each other, the full simulation decides.
 """
 
 from typing import NamedTuple

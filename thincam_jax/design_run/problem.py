@@ -66,7 +66,8 @@ class Goal:
 
     def _value(self, design: Design, data: Any) -> Float[Array, ""]:
         if self.name == "robust_error":
-            return robust_error(design, *data, self.tolerances, how=self.how)
+            setup, synthesis, at = data
+            return robust_error(design, setup, synthesis, at, self.tolerances, how=self.how)
         known = channels(design, data.setup, data.synthesis, data.frequencies)
         if self.name == "bayes_error":
             return bayes_error(known)

@@ -54,11 +54,13 @@ class Candidate(NamedTuple):
     trained: float | None = None
 
 
-class Training(NamedTuple):
+class TrainingRun(NamedTuple):
     """Of the descents by the error of a reconstruction: their goal, and how much they took."""
 
     goal: TrainingGoal
     evaluations: int
+    failed: int
+    pixels: int
     landscape: Landscape | None
 
 
@@ -79,7 +81,7 @@ class Result(NamedTuple):
     edge: float
     landscape: Landscape | None
     transfers: tuple[Transfer, Transfer] | None = None
-    training: Training | None = None
+    training: TrainingRun | None = None
 
 
 def find(config: DesignConfig, progress: Progress) -> Result:
@@ -130,7 +132,9 @@ def _result(config: DesignConfig, problem: Problem, searched, trained, found, be
     training = None
     if trained is not None:
         reference = reference._replace(trained=trained.reference)
-        training = Training(trained.goal, trained.evaluations, trained.landscape)
+        training = TrainingRun(
+            trained.goal, trained.evaluations, trained.failed, trained.pixels, trained.landscape
+        )
     return Result(
         problem.goal,
         reference,
@@ -177,10 +181,7 @@ def _rescore(
 def _rank_trained(
     problem: Problem, trained: Trained, phases: int
 ) -> tuple[tuple[Candidate, ...], Design]:
-    """The trained designs, by their training error; and the first.
-
-    **Errors**: ConfigError where that was no number at any start.
-    """
+    """The trained designs, by their training error; and the first."""
     space = problem.space
     near = {id(one): around for one, around in zip(trained.found, trained.around, strict=True)}
     candidates, designs = [], []

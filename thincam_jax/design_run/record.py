@@ -56,7 +56,10 @@ def _training(config: DesignConfig, result: Result) -> dict[str, Any] | None:
     return {
         "reconstruction": config.train.reconstruction,
         "images": list(config.train.images),
+        "pixels": result.training.pixels,
+        "starts": config.train.starts,
         "evaluations": result.training.evaluations,
+        "failed_descents": result.training.failed,
     }
 
 
@@ -85,6 +88,8 @@ def _found(result: Result, one: Candidate) -> dict[str, Any]:
 
 def _training_gain(reference: Candidate, one: Candidate) -> float | None:
     if reference.trained is None or one.trained is None:
+        return None
+    if not (reference.trained > 0 and one.trained > 0):  # no number, or a perfect image
         return None
     return _round(10 * math.log10(reference.trained / one.trained))
 
@@ -117,7 +122,8 @@ def _captures(config: DesignConfig, front: Front, variance: float) -> dict[str, 
     """Captures against PSNR, predicted and simulated."""
 
     def predicted(point: Point) -> dict[str, Any]:
-        level = -10 * math.log10(point.error * variance)
+        size = point.error * variance
+        level = -10 * math.log10(size) if size > 0 else math.nan
         told = _point(config, point, "captures")
         return {**told, "captures": round(point.cost), "predicted_psnr_db": _round(level)}
 
@@ -159,7 +165,7 @@ def _point(config: DesignConfig, point: Point, cost: str) -> dict[str, Any]:
     }
 
 
-def _shot(shot: Shot) -> dict[str, float]:
+def _shot(shot: Shot) -> dict[str, float | None]:
     return {"beta_rad_per_mm2": _round(shot.beta), "distance_mm": _round(shot.distance)}
 
 
@@ -173,5 +179,6 @@ def _value(value: FreeValue) -> dict[str, Any]:
     }
 
 
-def _round(value: float) -> float:
-    return float(f"{value:.7g}")
+def _round(value: float) -> float | None:
+    """Seven digits; None for what is no number, which JSON does not know."""
+    return float(f"{value:.7g}") if math.isfinite(value) else None

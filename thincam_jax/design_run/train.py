@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from thincam_jax.config import ConfigError
 from thincam_jax.config_design import DesignConfig
 from thincam_jax.config_training import TrainingConfig
 from thincam_jax.design import Design, DesignSpace, Training, end_to_end_error, wiener_error
@@ -54,7 +55,8 @@ class Trained(NamedTuple):
     - `goal`: what was made small; `landscape`: around the best of them.
     - `found`: with the error as `objective`; `around`: of each.
     - `reference`: the error of the reference.
-    - `evaluations`: of the error, with its gradient.
+    - `evaluations`: of the error, with its gradient; `failed`: descents without a number.
+    - `pixels`: of the sensor's side in training.
     """
 
     goal: TrainingGoal
@@ -62,19 +64,29 @@ class Trained(NamedTuple):
     around: tuple[Around, ...]
     reference: float
     evaluations: int
+    failed: int
+    pixels: int
     landscape: Landscape | None
 
 
 def train(
     config: DesignConfig, wanted: TrainingConfig, problem: Problem, points: list[np.ndarray]
 ) -> Trained:
-    """Descents from points of the cube, and from the reference where it keeps the limits."""
+    """Descents from points of the cube, and from the reference where it keeps the limits.
+
+    **Errors**: ConfigError where the error is no number at any start.
+    """
     goal, space = TrainingGoal(wanted.reconstruction), config.space()
     training = build_training(config, wanted, problem)
     own = _reference_point(space)
     starts = [*points[: wanted.starts], *([] if own is None else [own])]
     chosen = jnp.asarray(np.stack(starts), space.lower.dtype)
     ended = descend(goal, space, training, chosen, steps=wanted.steps, tolerance=_TOLERANCE)
+    if not ended.found:
+        raise ConfigError(
+            "train: the error of the training images is no number at any start; give "
+            "reconstruction: wiener, other images, or less noise"
+        )
     around = tuple(_around(goal, space, training, found) for found in ended.found)
     reference = eqx.filter_jit(goal)(space.base, training)
     return Trained(
@@ -83,14 +95,14 @@ def train(
         around,
         float(reference),
         ended.evaluations,
+        ended.failed,
+        training.sensor.shape[0],
         _surroundings(config, goal, space, training, ended.found),
     )
 
 
 def _surroundings(config: DesignConfig, goal, space: DesignSpace, training, found):
     """Coarser than the search's landscape: an evaluation takes some tenths of a second."""
-    if not found:
-        return None
     count = min(config.search.grid, _GRID[min(space.size, 2)])
     phases = len(config.reference.method().shot_phases())
     return landscape_of(goal, space, training, found[0].design, count, phases, at_a_time=1)
@@ -151,11 +163,16 @@ def _reference_point(space: DesignSpace) -> np.ndarray | None:
             return None
         values.append(own[0])
     point = (np.asarray(values) - lower) / spans
-    return point if np.all((point >= 0) & (point <= 1)) else None
+    # On a bound, rounding may put it outside.
+    inside = np.all((point >= -1e-5) & (point <= 1 + 1e-5))
+    return np.clip(point, 0.0, 1.0) if inside else None
 
 
 def _around(goal: TrainingGoal, space: DesignSpace, training: Training, found: Found) -> Around:
-    """By differences as wide as optima are apart: the error has finer ripples, of some 0.01 dB."""
+    """By differences as wide as optima are apart: the error has finer ripples, of some 0.01 dB.
+
+    At a bound, those of the nearest point that has room on either side.
+    """
     size = space.size
     middle = np.clip(np.asarray(found.point, float), APART, 1 - APART)
     steps = APART * np.eye(size)
