@@ -104,6 +104,7 @@ def test_wavelength_and_distance_of_a_plane_wave_are_one():
     np.testing.assert_allclose(fit.wavelength * fit.camera.distance, 3.0 * 500 * nm, rtol=1e-3)
 
 
+@pytest.mark.thorough
 def test_another_picture_is_told():
     noise = np.random.default_rng(0).normal(size=TRUE.sensor.shape)
     fit = fit_psf(noise, START, **LIGHT)

@@ -50,6 +50,7 @@ def test_the_registered_reference_lies_on_the_capture():
     np.testing.assert_allclose(found.registered[inner], capture[inner], atol=0.01)
 
 
+@pytest.mark.thorough
 def test_different_scenes_are_told():
     found = estimate_registration(blobs(seed=1), blobs(seed=2))
     assert found.status in ("poor_fit", "not_converged")

@@ -24,6 +24,7 @@ def match(wanted=WANTED, seed=0, data=DATA, **options):
     return match_response(SPACE, wanted, *data, key=jax.random.key(seed), **options)
 
 
+@pytest.mark.thorough
 def test_design_is_found_from_its_response():
     """β to 0.01 rad/mm² of 28, in either order of the pairs."""
     result = match()

@@ -78,6 +78,7 @@ def test_every_tolerance_costs_and_more_of_it_costs_more(tolerances):
     assert exact < once < twice
 
 
+@pytest.mark.thorough
 def test_the_worst_is_above_each_and_near_the_largest():
     tolerances = Tolerances(distance=0.02, wavelength=2e-6)
     nominal, errors = known(DESIGN), []

@@ -41,6 +41,7 @@ def test_misfit_is_the_root_mean_square():
     assert response_misfit(KNOWN, FREQUENCIES, levels) < 1e-12
 
 
+@pytest.mark.thorough
 def test_slopes():
     """Against differences of fourth order, and a number where the misfit is 0."""
     wanted = MODEL.levels(POINT) + jnp.linspace(-1.0, 3.0, 16)

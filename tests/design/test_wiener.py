@@ -131,6 +131,7 @@ def test_gradient_by_differences(noise):
         assert float(slope[index] / difference) == pytest.approx(1, abs=1e-4)
 
 
+@pytest.mark.thorough
 def test_coarse_pixels_carry_the_noise_of_the_fine_ones():
     """Four pixels' mean has a quarter of the variance: the same as 6 dB more light a pixel."""
     small = {"count": 12, "sensor": (20, 24)}

@@ -60,6 +60,7 @@ def test_pixels_show_the_finest_fringes(config):
     assert build_training(finer, asked, build_problem(config)).sensor.shape == (56, 56)
 
 
+@pytest.mark.thorough
 def test_ranked_by_the_training_error(config):
     steps = []
     result = find(config, steps.append)

@@ -97,6 +97,7 @@ def test_effects_have_the_sizes_of_the_physics(deep):
     assert sizes["shot noise"] == pytest.approx(1 / np.sqrt(0.9 * 13_500))
 
 
+@pytest.mark.thorough
 def test_gradients_pass_through_a_planned_capture():
     """With respect to the images and β; in double precision, for differences' sake."""
     few = scene(3, 2)
@@ -223,6 +224,7 @@ ODD = {
 }
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", ODD)
 @pytest.mark.parametrize(
     "tolerance",

@@ -186,6 +186,7 @@ def few(problem):
     return run(AndersonAdmm(problem, relaxation=1.5), problem, 40, adapt_until=10)
 
 
+@pytest.mark.thorough
 def test_new_values_are_not_compiled_anew():
     problem, _ = scenes.problem()
     programs = (_jaxopt._begin_mixing, _jaxopt._advance_mixing, _jaxopt._look_mixing)

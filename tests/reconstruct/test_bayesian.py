@@ -148,6 +148,7 @@ def counts(mean, background=0.0):
     return jnp.asarray(seen.astype(float))[None], jnp.asarray(kernel)[None], gain * truth
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("mean", "gap"), [pytest.param(400.0, 4e-3, marks=pytest.mark.thorough), (1e4, 2e-3)]
 )

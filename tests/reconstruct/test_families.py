@@ -29,6 +29,7 @@ def cosines(noise=0.02):
     return jnp.asarray(seen)[None], jnp.asarray(kernel)[None], truth
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("method", [pytest.param("fista", marks=pytest.mark.thorough), "twist"])
 def test_a_regulariser_takes_the_place_of_total_variation(method):
     """Few cosines are found better as such than as an image of few edges, with the same τ."""

@@ -243,6 +243,7 @@ def test_the_series_solves_linear_systems():
     np.testing.assert_array_equal(none.value, 0.0)
 
 
+@pytest.mark.thorough
 def test_single_precision_has_a_gradient():
     """Finite, and that of double precision to a few per cent."""
     problem, _ = scenes.problem(captures=1, tau=0.05)

@@ -96,6 +96,7 @@ def test_no_image_beside_a_sparse_minimum_is_better(basis, nonnegative):
         assert 0.2 < float(jnp.mean(details == 0)) or float(jnp.mean(jnp.abs(details) < 1e-9)) > 0.2
 
 
+@pytest.mark.thorough
 def test_the_backends_do_the_same():
     problem, _ = scenes.problem(kernel=scenes.spots, tau=3e-3)
     how = {"iterations": 60, "tolerance": 0.0, "inner": 30}

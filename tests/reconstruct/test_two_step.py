@@ -74,6 +74,7 @@ def test_it_stands_extremes():
     extremes.check_shapes(few)
 
 
+@pytest.mark.thorough
 def test_new_values_are_not_compiled_anew():
     from thincam_jax.reconstruct import two_step as module
 

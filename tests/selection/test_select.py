@@ -114,6 +114,7 @@ def choices():
     return found
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 @pytest.mark.parametrize("tolerance", TOLERANCES)
 def test_choices_meet_their_tolerance(choices, capsys, tolerance):
