@@ -10,6 +10,7 @@ from thincam_jax import cli_design
 
 FOUND = {
     "reference": {"name": "pairs", "shots": [{"beta_rad_per_mm2": 25.0, "distance_mm": 3.0}]},
+    "compare": [],
     "found": [
         {
             "name": f"found {rank}",

@@ -51,7 +51,7 @@ def _print(found: dict) -> None:
         table.add_column(f"{target}\ndB", justify="right")
     for target in validation["charts"]:
         table.add_column(f"{target}\nelements", justify="right")
-    for one in (found["reference"], *found["found"]):
+    for one in (found["reference"], *found["compare"], *found["found"]):
         simulated = validation["methods"].get(one["name"])
         if simulated is None:
             continue

@@ -39,6 +39,10 @@ def record(config: DesignConfig, result: Result, study: StudyConfig, validation:
             **_candidate(result, result.reference),
             "broken_limits": list(broken_limits(config)),
         },
+        "compare": [
+            {"name": rival.name, "shots": [_shot(Shot(s.beta, s.distance)) for s in rival.shots]}
+            for rival in config.compare
+        ],
         "found": [_found(result, candidate) for candidate in result.found],
         "validation": {
             "seeds": config.validation.seeds,
