@@ -14,8 +14,9 @@ from thincam_jax.config import ConfigError, MethodConfig, StudyConfig, TargetCon
 from thincam_jax.design import landscape, search
 from thincam_jax.design.search import Found, Search
 from thincam_jax.design.space import active_limits
-from thincam_jax.design_run import Front, Fronts, Point, build_study, compare, full_well, ranking
+from thincam_jax.design_run import Front, Fronts, Point, build_study, compare, full_well
 from thincam_jax.design_run import Transfer as ContrastTransfer
+from thincam_jax.design_run import problem as problem_of_search
 from thincam_jax.design_run.landscape import Landscape
 from thincam_jax.design_run.problem import Goal
 from thincam_jax.design_run.ranking import Candidate, Result, Shot
@@ -57,7 +58,7 @@ def whole(tmp_path_factory):
     config, texts = tiny.design(home), []
     folder = DesignFolder(home / "out")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(ranking, "search", by_grid)
+        patch.setattr(problem_of_search, "search", by_grid)
         return config, folder.path, run_design(config, folder, texts.append), texts
 
 

@@ -107,6 +107,13 @@ def choice(name: str, value: Any, options: Iterable[str]) -> str:
     return value
 
 
+def at_least_one(counts: dict[str, int]) -> None:
+    """Refuses the first of the named counts that is below 1."""
+    for name, number in counts.items():
+        if number < 1:
+            raise ValueError(f"{name} = {number}; give at least 1")
+
+
 def shape2d(name: str, value: Any) -> tuple[int, int]:
     """A pair (y, x) of pixel counts, each at least 1."""
     try:

@@ -14,6 +14,7 @@ from thincam_jax.config_pareto import with_shots
 from thincam_jax.design import landscape, search
 from thincam_jax.design.search import Found, Search
 from thincam_jax.design_run import build_problem, find_fronts, pareto_steps
+from thincam_jax.design_run import problem as problem_of_search
 from thincam_jax.design_run.pareto import Front, Fronts, Point
 from thincam_jax.design_run.ranking import Shot
 from thincam_jax.design_run.record import record_fronts
@@ -42,7 +43,7 @@ def by_grid(goal, space, data, **options):
 
 @pytest.fixture
 def on_a_grid(monkeypatch):
-    monkeypatch.setattr(pareto, "search", by_grid)
+    monkeypatch.setattr(problem_of_search, "search", by_grid)
 
 
 def rising(values):
@@ -88,7 +89,7 @@ def test_what_costs_more_is_never_worse_for_want_of_searching(tmp_path, monkeypa
         off = jnp.abs(design.beta[0] - 21.0) + jnp.abs(design.beta[2] - 21.0)
         return 10.0 - off / 9, jnp.asarray(0.1)
 
-    monkeypatch.setattr(pareto, "search", lucky_once)
+    monkeypatch.setattr(problem_of_search, "search", lucky_once)
     monkeypatch.setattr(pareto, "_exactly", judged)
     config = tiny.design(tmp_path, FREE, THICKNESS)
     fronts = find_fronts(config, tiny.ignore)

@@ -26,6 +26,7 @@ from thincam_jax.design_run import (
     landscape_of,
     ranking,
 )
+from thincam_jax.design_run import problem as problem_of_search
 from thincam_jax.design_run.sensitivity import least_change
 
 
@@ -236,6 +237,6 @@ def test_limits_narrow_the_landscape(tmp_path):
 
 
 def test_an_objective_that_is_no_number_is_refused(config, monkeypatch):
-    monkeypatch.setattr(ranking, "search", lambda *_, **__: Search((), 3, 3))
+    monkeypatch.setattr(problem_of_search, "search", lambda *_, **__: Search((), 3, 3))
     with pytest.raises(ConfigError, match="no number at any start"):
         find(config, tiny.ignore)

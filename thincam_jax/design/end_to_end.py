@@ -20,7 +20,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from thincam_jax._phase import as_complex
 from thincam_jax.design.design import Design
-from thincam_jax.design.training import Training, channels_of
+from thincam_jax.design.training import Training, channels_of, relative_error
 
 
 def end_to_end_error(design: Design, training: Training) -> Float[Array, ""]:
@@ -29,9 +29,7 @@ def end_to_end_error(design: Design, training: Training) -> Float[Array, ""]:
     The PSNR in dB is −10·log₁₀ of this, up to a constant of the images. NaN where conjugate
     gradients did not reach the tolerance.
     """
-    restored = restore(design, training)
-    error = jnp.mean((restored - training.images) ** 2, axis=(-2, -1))
-    return jnp.mean(error / jnp.var(training.images, axis=(-2, -1)))
+    return relative_error(restore(design, training), training)
 
 
 def drawn_error(design: Design, training: Training, key: PRNGKeyArray) -> Float[Array, ""]:

@@ -111,11 +111,17 @@ def ring_means(known: Channels, frequencies: Frequencies, rings: int) -> Float[A
     Its fringes are finer than what a picture shows; a ring's mean is what an edge of that
     fineness meets.
     """
+    return over_rings(known.signal_to_noise, frequencies, rings)
+
+
+def over_rings(
+    values: Float[Array, "*point"], frequencies: Frequencies, rings: int
+) -> Float[Array, " ring"]:
+    """Means over rings of equal width, by area."""
     ring = frequencies.ring(rings)
-    ratio = (known.signal_to_noise * known.weight).ravel()
-    area = known.weight.ravel()
-    total = jax.ops.segment_sum(ratio, ring, rings + 1)[:-1]
-    return total / jax.ops.segment_sum(area, ring, rings + 1)[:-1]
+    weight = frequencies.weight
+    total = jax.ops.segment_sum((values * weight).ravel(), ring, rings + 1)[:-1]
+    return total / jax.ops.segment_sum(weight.ravel(), ring, rings + 1)[:-1]
 
 
 def worst_ratio_db(

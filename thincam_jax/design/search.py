@@ -96,9 +96,7 @@ def search(
 
     **Errors**: ValueError for numbers of starts, samples or steps below 1.
     """
-    for name, number in (("starts", starts), ("samples", samples), ("steps", steps)):
-        if number < 1:
-            raise ValueError(f"{name} = {number}; give at least 1")
+    _checks.at_least_one({"starts": starts, "samples": samples, "steps": steps})
     _checks.choice("solver", solver, ("bfgs", "lbfgsb"))
     points = even_samples(space.size, max(samples, starts), key, space.lower.dtype)
     values = evaluate(objective, space, data, points)

@@ -139,9 +139,13 @@ def _reason(space: DesignSpace, variable: Variable, value, within: float) -> str
     # As near to its own bound as what calls it active: no limit is needed to explain it.
     if float(value) >= variable.upper - (within + 1e-6) * (variable.upper - variable.lower):
         return ""
+    # A space that was narrowed since lies against its own bounds only.
+    limit = space.limits.thickness if variable.name == "distance" else space.limits.mask_pixel
+    if limit is None:
+        return ""
     if variable.name == "distance":
-        return f" (thickness of {space.limits.thickness:g} mm)"
-    return f" (mask pixels of {space.limits.mask_pixel:g} mm)"
+        return f" (thickness of {limit:g} mm)"
+    return f" (mask pixels of {limit:g} mm)"
 
 
 def _check_variables(base: Design, variables: tuple[Variable, ...]) -> None:

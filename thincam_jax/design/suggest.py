@@ -24,7 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from thincam_jax import _files
+from thincam_jax import _checks, _files
 from thincam_jax.design.design import Design
 from thincam_jax.design.frequencies import Frequencies
 from thincam_jax.design.match import MATCHED, MatchStatus, match_status
@@ -58,9 +58,7 @@ class Suggester(eqx.Module):
     def __init__(
         self, model: ResponseModel, *, key: PRNGKeyArray, guesses: int, width: int, depth: int
     ):
-        for name, number in (("guesses", guesses), ("width", width), ("depth", depth)):
-            if number < 1:
-                raise ValueError(f"{name} = {number}; give at least 1")
+        _checks.at_least_one({"guesses": guesses, "width": width, "depth": depth})
         dtype = model.space.lower.dtype
         sizes = (model.rings, *[width] * depth, guesses * model.space.size)
         keys = jax.random.split(key, depth + 1)

@@ -91,9 +91,7 @@ def train_suggester(
     sampled design has a finite response.
     """
     counts = {"samples": samples, "warm_up": warm_up, "steps": steps, "batch": batch}
-    for name, number in counts.items():
-        if number < 1:
-            raise ValueError(f"{name} = {number}; give at least 1")
+    _checks.at_least_one(counts)
     dtype = space.lower.dtype
     highest_rate = _checks.positive("rate", rate, "a number").astype(dtype)
     model = ResponseModel(space, setup, synthesis, frequencies, rings)

@@ -125,6 +125,12 @@ class Training(eqx.Module):
         return Sensor((rows, columns), self.setup.sensor_width / max(rows, columns))
 
 
+def relative_error(restored: Float[Array, "image v u"], training: Training) -> Float[Array, ""]:
+    """Mean squared error of restored images over their variance, averaged over them."""
+    error = jnp.mean((restored - training.images) ** 2, axis=(-2, -1))
+    return jnp.mean(error / jnp.var(training.images, axis=(-2, -1)))
+
+
 class Channel(eqx.Module):
     """A sum of captures at one distance: A_c."""
 

@@ -28,10 +28,11 @@ from thincam_jax._phase import as_complex, phasor
 from thincam_jax._precision import product
 from thincam_jax.design.design import Design
 from thincam_jax.design.prior import PowerLaw
-from thincam_jax.design.training import Training, check_captures, noise_variance
+from thincam_jax.design.training import Training, check_captures, noise_variance, relative_error
 from thincam_jax.propagation.path import Path
 from thincam_jax.propagation.separable_transfer import transfer_factors
 from thincam_jax.reconstruct.spectra import crop_noise, inner_band, scene_power
+from thincam_jax.reconstruct.synthesis import keep_bias
 
 
 def wiener_error(design: Design, training: Training) -> Float[Array, ""]:
@@ -39,9 +40,7 @@ def wiener_error(design: Design, training: Training) -> Float[Array, ""]:
 
     The PSNR in dB is −10·log₁₀ of this, up to a constant of the images.
     """
-    restored = restore_by_wiener(design, training)
-    error = jnp.mean((restored - training.images) ** 2, axis=(-2, -1))
-    return jnp.mean(error / jnp.var(training.images, axis=(-2, -1)))
+    return relative_error(restore_by_wiener(design, training), training)
 
 
 def restore_by_wiener(design: Design, training: Training) -> Float[Array, "image v u"]:
@@ -55,6 +54,7 @@ def restore_by_wiener(design: Design, training: Training) -> Float[Array, "image
     # The mean's part in each capture: the prior concerns the contrast only.
     even = _scene_spectrum(jnp.ones_like(training.images[0]), training, at)
     means = [[_captured(even, h, c, at) for h in c.each] for c in channels]
+    responses = jnp.stack([c.summed for c in channels])
 
     def one(given):
         image, noise = given
@@ -71,7 +71,6 @@ def restore_by_wiener(design: Design, training: Training) -> Float[Array, "image
                 _spectrum(summed + jnp.sqrt(variance) * drawn, channel, training.sensor.pitch)
             )
             noises.append(variance * training.sensor.pitch**4 * drawn.size)
-        responses = jnp.stack([c.summed for c in channels])
         scene = _filtered(responses, jnp.stack(spectra), jnp.stack(noises), training, at)
         return _image(scene, image.shape[-1], training, at) + 1
 
@@ -162,7 +161,7 @@ def _filtered(responses, spectra, noises, training: Training, at: _Frequencies):
     padded, sensor = (window.samples,) * 2, (window.across,) * 2
     expected = responses**2 * shape
     scene = shape * scene_power(power - density, expected, inner_band(padded, sensor))
-    biased = np.abs(np.sum(np.asarray(training.synthesis), axis=1)) > 1e-6
+    biased = keep_bias(np.asarray(training.synthesis))
     if biased.any():
         steps = crop_noise(power, padded, sensor)
         density = density + jnp.where(biased[:, None, None], steps, 0.0)

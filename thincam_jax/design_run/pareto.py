@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -26,9 +25,15 @@ from thincam_jax.design import (
     bayes_error,
     channels,
     limit,
-    search,
 )
-from thincam_jax.design_run.problem import Data, Goal, Problem, build_problem
+from thincam_jax.design_run.problem import (
+    Data,
+    Goal,
+    Problem,
+    build_problem,
+    place_of,
+    search_problem,
+)
 from thincam_jax.design_run.ranking import Shot, shots_of_design
 from thincam_jax.design_run.simulate import simulate
 from thincam_jax.design_run.simulated import build_study
@@ -37,9 +42,6 @@ from thincam_jax.study.target import Progress
 
 _TRIED = 3  # of the designs of a search, are scored exactly
 _NEAR = 0.15  # of the search's bounds to either side, where a search goes on from the point before
-# Limits that limit nothing. `active_limits` names a limit wherever a bound is nearer than the
-# variable's own, as those are that the fronts move.
-_FINEST_PIXEL, _THICKEST = 1e-9, 1e9
 
 
 class Point(NamedTuple):
@@ -131,7 +133,7 @@ def _thickness(
 ) -> Front:
     """Limit of resolution of designs whose distances are all within a thickness."""
     assert asked.thickness is not None  # for the type checker
-    given = _with(problem, Goal("limit"), _unfenced(problem.space))
+    given = problem._replace(goal=Goal("limit"))
     distance = jnp.asarray([v.name == "distance" for v in given.space.variables])
     costs, problems = asked.thickness.costs(), []
     for cost in costs:
@@ -149,7 +151,7 @@ def _light(
 ) -> Front:
     """Limit of resolution of designs with so many electrons."""
     assert asked.light is not None  # for the type checker
-    given = _with(problem, Goal("limit"), _unfenced(problem.space))
+    given = problem._replace(goal=Goal("limit"))
     costs = asked.light.costs()
     problems = [_lit(given, cost) for cost in costs]
     points = _line(config, asked, costs, problems, lambda c: progress(f"light {c:.4g} electrons"))
@@ -202,28 +204,15 @@ def _of_shots(config: DesignConfig, problem: Problem, count: int) -> Problem:
     """
     changed = with_shots(config, count)
     matrix = jnp.asarray(synthesis_matrix(changed.reference.method()), float)
-    space = _unfenced(changed.space())
+    space = changed.space()
     share = jnp.full(space.base.captures, 1 / space.base.captures, space.lower.dtype)
     space = eqx.tree_at(lambda s: s.base.exposure, space, share)
-    given = _with(problem, Goal("bayes_error"), space)
+    given = problem._replace(goal=Goal("bayes_error"), space=space)
     if config.noise.electrons is not None:
         given = _lit(given, config.noise.electrons * problem.space.base.captures)
     return given._replace(
         data=given.data._replace(synthesis=matrix), exact=given.exact._replace(synthesis=matrix)
     )
-
-
-def _with(problem: Problem, goal: Goal, space: DesignSpace) -> Problem:
-    return problem._replace(goal=goal, space=space)
-
-
-def _unfenced(space: DesignSpace) -> DesignSpace:
-    """The same with every limit a number; see `_FINEST_PIXEL`."""
-    limits = space.limits._replace(
-        mask_pixel=space.limits.mask_pixel or _FINEST_PIXEL,
-        thickness=space.limits.thickness or _THICKEST,
-    )
-    return DesignSpace(space.base, space.variables, limits)
 
 
 def _lit(problem: Problem, electrons: float) -> Problem:
@@ -263,20 +252,12 @@ def _best(
     spaces = [problem.space] if own is None else []
     designs: list[Design] = []
     if beside is not None:
-        place = _place(problem.space, beside.design)
+        inside = np.clip(place_of(problem.space, beside.design), 0.0, 1.0)
+        place = jnp.asarray(inside, problem.space.lower.dtype)
         spaces.append(_near(problem.space, place))
         designs.append(problem.space.design(place))
     for space in spaces:
-        searched = search(
-            problem.goal,
-            space,
-            problem.data,
-            key=jax.random.key(config.seed),
-            starts=asked.starts,
-            samples=asked.samples,
-            steps=asked.steps,
-            solver=asked.solver,
-        )
+        searched = search_problem(problem._replace(space=space), asked, config.seed)
         designs += [found.design for found in searched.found[:_TRIED]]
     judged = [_judge(config, design, problem.exact) for design in designs]
     judged = _known(judged if own is None else [own, *judged])
@@ -292,15 +273,6 @@ def _known(judged: Iterable[_Judged]) -> list[_Judged]:
             "pareto: the objective is no number at any start; give bounds nearer to the reference"
         )
     return known
-
-
-def _place(space: DesignSpace, design: Design) -> Float[Array, " variable"]:
-    """Where a design lies in the unit cube of a space, or the nearest to it."""
-    values = [getattr(design, v.name)[v.captures[0]] for v in space.variables]
-    lower, upper = (space.values(jnp.full(space.size, e, space.lower.dtype)) for e in (0.0, 1.0))
-    span = upper - lower
-    inside = (jnp.stack(values) - lower) / jnp.where(span > 0, span, 1.0)
-    return jnp.clip(jnp.where(span > 0, inside, 0.5), 0.0, 1.0)
 
 
 def _near(space: DesignSpace, place: Float[Array, " variable"]) -> DesignSpace:

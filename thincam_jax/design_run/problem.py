@@ -4,11 +4,13 @@ import math
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from thincam_jax.config_design import DesignConfig, DesignNoiseConfig, Objective
+from thincam_jax.config_design import DesignConfig, DesignNoiseConfig, Objective, SearchConfig
+from thincam_jax.config_pareto import ParetoConfig
 from thincam_jax.design import (
     Design,
     DesignSpace,
@@ -24,10 +26,12 @@ from thincam_jax.design import (
     fit_power_law,
     limit,
     robust_error,
+    search,
     unevenness,
     worst_ratio_db,
 )
 from thincam_jax.design.frequencies import Frequencies
+from thincam_jax.design.search import Search
 from thincam_jax.design_run.simulated import build_study
 from thincam_jax.study.build import build_plane, synthesis_matrix
 
@@ -185,6 +189,32 @@ def _prior(config: DesignConfig) -> PowerLaw:
     study = build_study(config)
     planes = (build_plane(study, target) for target in config.pictures())
     return fit_power_law(np.asarray(p.image, dtype=float).mean(axis=0) for p in planes)
+
+
+def search_problem(problem: Problem, wanted: SearchConfig | ParetoConfig, seed: int) -> Search:
+    """The search, as long as a section of the file wants it."""
+    return search(
+        problem.goal,
+        problem.space,
+        problem.data,
+        key=jax.random.key(seed),
+        starts=wanted.starts,
+        samples=wanted.samples,
+        steps=wanted.steps,
+        solver=wanted.solver,
+    )
+
+
+def place_of(space: DesignSpace, design: Design) -> np.ndarray:
+    """Where a design lies in the unit cube, or outside of it; ½ where the bounds leave no room.
+
+    Of a number that captures share, the first one's counts.
+    """
+    lower = np.asarray(space.values(jnp.zeros_like(space.lower)), dtype=float)
+    spans = spans_of(space)
+    values = [float(getattr(design, v.name)[v.captures[0]]) for v in space.variables]
+    inside = (np.asarray(values) - lower) / np.where(spans > 0, spans, 1.0)
+    return np.where(spans > 0, inside, 0.5)
 
 
 def spans_of(space: DesignSpace) -> np.ndarray:

@@ -4,24 +4,30 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 from thincam_jax._precision import allow
 from thincam_jax.config import ConfigError
 from thincam_jax.config_design import DesignConfig, found_name
-from thincam_jax.design import Design, DesignSpace, channels, search
+from thincam_jax.design import Design, DesignSpace, channels
 from thincam_jax.design.objectives import ring_means
 from thincam_jax.design.search import APART, Found
 from thincam_jax.design_run.landscape import Landscape, landscape_of
-from thincam_jax.design_run.problem import RISE, Data, Goal, Problem, build_problem
+from thincam_jax.design_run.problem import (
+    RISE,
+    Data,
+    Goal,
+    Problem,
+    build_problem,
+    search_problem,
+)
 from thincam_jax.design_run.sensitivity import (
     FreeValue,
     around,
     free_values,
 )
-from thincam_jax.design_run.train import Trained, TrainingGoal, train
+from thincam_jax.design_run.train import Trained, train
 from thincam_jax.design_run.transfer import RINGS, Transfer, modulation_transfer
 from thincam_jax.study.target import Progress
 
@@ -54,22 +60,12 @@ class Candidate(NamedTuple):
     trained: float | None = None
 
 
-class TrainingRun(NamedTuple):
-    """Of the descents by the error of a reconstruction: their goal, and how much they took."""
-
-    goal: TrainingGoal
-    evaluations: int
-    failed: int
-    pixels: int
-    landscape: Landscape | None
-
-
 class Result(NamedTuple):
     """What a search gave.
 
     - `edge`: of the frequencies looked at, cycles/rad.
     - `transfers`: the modulation transfer of the reference and of the best design.
-    - `training`: what was trained by, and how long; None without.
+    - `training`: what the training gave; None without.
     """
 
     goal: Goal
@@ -81,7 +77,7 @@ class Result(NamedTuple):
     edge: float
     landscape: Landscape | None
     transfers: tuple[Transfer, Transfer] | None = None
-    training: TrainingRun | None = None
+    training: Trained | None = None
 
 
 def find(config: DesignConfig, progress: Progress) -> Result:
@@ -89,21 +85,11 @@ def find(config: DesignConfig, progress: Progress) -> Result:
 
     Training, which is not that fine, is in the precision that JAX is set to.
     """
-    wanted = config.search
     phases = len(config.reference.method().shot_phases())
     with allow("float64"):
         problem = build_problem(config)
         progress("search")
-        searched = search(
-            problem.goal,
-            problem.space,
-            problem.data,
-            key=jax.random.key(config.seed),
-            starts=wanted.starts,
-            samples=wanted.samples,
-            steps=wanted.steps,
-            solver=wanted.solver,
-        )
+        searched = search_problem(problem, config.search, config.seed)
         kept = _distinct(problem.space, searched.found, phases)
     trained = None
     if config.train is not None:
@@ -129,12 +115,8 @@ def _result(config: DesignConfig, problem: Problem, searched, trained, found, be
     base = problem.space.base
     shots = shots_of_design(base, phases)
     reference = Candidate(config.reference.name, shots, *_score(problem, base))
-    training = None
     if trained is not None:
         reference = reference._replace(trained=trained.reference)
-        training = TrainingRun(
-            trained.goal, trained.evaluations, trained.failed, trained.pixels, trained.landscape
-        )
     return Result(
         problem.goal,
         reference,
@@ -145,7 +127,7 @@ def _result(config: DesignConfig, problem: Problem, searched, trained, found, be
         float(problem.data.frequencies.highest),
         landscape_of(problem.goal, problem.space, problem.data, best, config.search.grid, phases),
         (modulation_transfer(base, problem.exact), modulation_transfer(best, problem.exact)),
-        training,
+        trained,
     )
 
 

@@ -20,7 +20,7 @@ from thincam_jax.config_training import TrainingConfig
 from thincam_jax.design import Design, DesignSpace, Training, end_to_end_error, wiener_error
 from thincam_jax.design.search import APART, Found, descend, evaluate
 from thincam_jax.design_run.landscape import Landscape, landscape_of
-from thincam_jax.design_run.problem import Problem, spans_of
+from thincam_jax.design_run.problem import Problem, place_of, spans_of
 from thincam_jax.design_run.sensitivity import Around
 from thincam_jax.study.build import synthesis_matrix
 from thincam_jax.targets import resize, sample_image
@@ -151,18 +151,10 @@ def _picture(name: str, count: int) -> np.ndarray:
 
 def _reference_point(space: DesignSpace) -> np.ndarray | None:
     """Where the reference lies in the cube; None where it is not in it."""
-    lower = np.asarray(space.values(jnp.zeros_like(space.lower)))
-    spans = spans_of(space)
-    if not np.all(spans > 0):
+    shared = (getattr(space.base, v.name)[jnp.asarray(v.captures)] for v in space.variables)
+    if not np.all(spans_of(space) > 0) or any(np.ptp(np.asarray(own)) > 0 for own in shared):
         return None
-    values = []
-    for variable in space.variables:
-        number = np.asarray(getattr(space.base, variable.name))
-        own = number[list(variable.captures)]
-        if np.ptp(own) > 0:
-            return None
-        values.append(own[0])
-    point = (np.asarray(values) - lower) / spans
+    point = place_of(space, space.base)
     # On a bound, rounding may put it outside.
     inside = np.all((point >= -1e-5) & (point <= 1 + 1e-5))
     return np.clip(point, 0.0, 1.0) if inside else None

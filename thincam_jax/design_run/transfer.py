@@ -26,7 +26,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from thincam_jax.design import Design, Quadrant, channels
-from thincam_jax.design.frequencies import Frequencies
+from thincam_jax.design.objectives import over_rings
 from thincam_jax.design_run.problem import Data
 
 RINGS = 64
@@ -80,13 +80,5 @@ def _means(
     held = jnp.sum(jnp.abs(data.synthesis) * light, axis=1)
     contrast = known.response / held[:, None, None]
     ratio = known.signal_to_noise
-    squared = jax.vmap(lambda c: _over_rings(c**2, data.frequencies))(contrast)
-    return jnp.sqrt(squared), _over_rings(ratio / (1 + ratio), data.frequencies)
-
-
-def _over_rings(values: Float[Array, "*point"], frequencies: Frequencies) -> Float[Array, " ring"]:
-    """Means over rings, by area."""
-    ring = frequencies.ring(RINGS)
-    weight = frequencies.weight
-    total = jax.ops.segment_sum((values * weight).ravel(), ring, RINGS + 1)[:-1]
-    return total / jax.ops.segment_sum(weight.ravel(), ring, RINGS + 1)[:-1]
+    squared = jax.vmap(lambda c: over_rings(c**2, data.frequencies, RINGS))(contrast)
+    return jnp.sqrt(squared), over_rings(ratio / (1 + ratio), data.frequencies, RINGS)

@@ -9,7 +9,7 @@ import numpy as np
 from thincam_jax.camera import LenslessCamera
 from thincam_jax.reconstruct.noise import estimate_variance, given_variances
 from thincam_jax.reconstruct.registration import distance_ratios
-from thincam_jax.reconstruct.synthesis import check_synthesis
+from thincam_jax.reconstruct.synthesis import check_synthesis, keep_bias
 
 # Contrast of a channel over its noise from which a filter is trusted. A judgement: total variation
 # gains 0.5 to 2.5 dB at 1 to 3 (configs/fza_admm_tv.yaml), and next to nothing without noise.
@@ -36,7 +36,7 @@ def choose_method(
         return "admm_tv", "several planes are asked for, which a filter does not tell apart"
     matrix = np.eye(len(cameras)) if synthesis is None else np.asarray(synthesis, dtype=float)
     check_synthesis(matrix, cameras, distance_ratios(cameras))
-    biased = np.abs(matrix.sum(axis=1)) > 1e-6
+    biased = keep_bias(matrix)
     biased |= np.array([_backgrounds_differ(row, cameras) for row in matrix])
     if biased.any():
         return "admm_tv", (

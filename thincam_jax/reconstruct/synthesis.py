@@ -48,6 +48,11 @@ def contrasts(count: int) -> np.ndarray:
     return scipy.linalg.helmert(count)
 
 
+def keep_bias(synthesis: np.ndarray) -> np.ndarray:
+    """Which channels keep the captures' common background: those whose weights do not cancel."""
+    return np.abs(synthesis.sum(axis=1)) > 1e-6
+
+
 def check_synthesis(
     synthesis: np.ndarray, cameras: Sequence[LenslessCamera], ratios: Sequence[float]
 ) -> None:
