@@ -254,6 +254,7 @@ def test_doctor():
     assert f"Python {found['python']} on {found['platform']}" in lines
     assert "devices: " + ", ".join(found["devices"]) in lines
     assert "  float64: yes" in lines
+    assert "  compiled sums: right" in lines
     assert f"jax {found['versions']['jax']}" in lines
 
 

@@ -4,6 +4,7 @@ import platform
 from importlib import metadata
 
 import jax
+import numpy as np
 import pytest
 
 from thincam_jax import doctor
@@ -43,6 +44,19 @@ def test_precision_that_the_device_refuses(monkeypatch):
 
     monkeypatch.setattr(doctor.jnp.fft, "fft", refuse)
     assert doctor.dtype_support()["float32"] == "no (RuntimeError)"
+
+
+def test_compiler_that_adds_up_wrong_is_told(monkeypatch):
+    """As jaxlib 0.10.2 does."""
+    assert doctor.compiled_sums() == "right"
+    mean = doctor._of_channels
+
+    def compiled_wrong(response, capture, noise):
+        right = mean(response, capture, noise)
+        return right if isinstance(response, np.ndarray) else 1.001 * right
+
+    monkeypatch.setattr(doctor, "_of_channels", compiled_wrong)
+    assert doctor.compiled_sums().startswith("WRONG; install another jaxlib")
 
 
 @pytest.mark.parametrize("name", ["jax", "equinox", "numpy", "scikit-image", "thincam_jax"])

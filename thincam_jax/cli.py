@@ -152,6 +152,7 @@ def doctor() -> None:
     console.print("devices: " + ", ".join(found["devices"]), highlight=False)
     for name, support in doctoring.dtype_support().items():
         console.print(f"  {name}: {support}", highlight=False)
+    console.print(f"  compiled sums: {doctoring.compiled_sums()}", highlight=False)
     for name, version in found["versions"].items():
         console.print(f"{name} {version or 'NOT INSTALLED'}", highlight=False)
     for name, purpose in doctoring.missing_parts().items():

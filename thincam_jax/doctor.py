@@ -7,6 +7,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 PACKAGES = (
     *("thincam_jax", "jax", "jaxlib", "equinox", "numpy", "scipy", "scikit-image", "optimistix"),
@@ -54,6 +55,33 @@ def dtype_support() -> dict[str, str]:
         except (TypeError, RuntimeError) as error:
             support[name] = f"no ({type(error).__name__})"
     return support
+
+
+def compiled_sums() -> str:
+    """Whether the compiler of the default device adds up right, tried out.
+
+    jaxlib 0.10.2 does not on a CPU: reductions that it fuses with what follows read other memory
+    (https://github.com/jax-ml/jax/issues/39103), and the result is a number, or none.
+    """
+    rows = np.random.default_rng(0).uniform(0.5, 1.5, (40_000, 3)).astype(np.float32)
+    response, capture = rows.ravel()[: 4 * 64**2].reshape(2, 1, 2, 64, 64)
+    noise = np.asarray([[0.7, 1.3]], np.float32)
+    squares = jax.jit(_of_rows)(rows, np.eye(3, dtype=np.float32))
+    means = jax.jit(_of_channels)(response, capture, noise)
+    right = np.allclose(squares, np.sum(rows**2, axis=1), rtol=1e-4) and np.allclose(
+        means, _of_channels(response, capture, noise), rtol=1e-4
+    )
+    return "right" if right else "WRONG; install another jaxlib, 0.10.1 or above 0.10.2"
+
+
+def _of_rows(rows, matrix):
+    return jax.vmap(lambda row: jnp.sum((matrix @ row) ** 2))(rows)
+
+
+def _of_channels(response, capture, noise):
+    """A mean weighted by noise, as of the channels of a Wiener filter."""
+    noise = noise[:, :, None, None]
+    return (response / noise * capture).sum(1) / ((response**2 / noise).sum(1) + 1)
 
 
 def missing_parts() -> dict[str, str]:
