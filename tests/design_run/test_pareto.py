@@ -54,7 +54,7 @@ def test_thickness_and_light_buy_resolution(on_a_grid, tmp_path):
     light = "pareto.light={bounds: [90, 9e5], points: 3}"
     config, told = tiny.design(tmp_path, FREE, LIGHT, THICKNESS, light), []
     fronts = find_fronts(config, told.append)
-    assert len(told) == pareto_steps(config.pareto) == 6
+    assert len(told) == pareto_steps(config.pareto) == 14
     assert fronts.captures is None
     assert fronts.edge == pytest.approx(3.0 * 12.5 / 2)
     assert fronts.thickness is not None

@@ -8,7 +8,7 @@ from design_run import tiny
 
 from thincam_jax.design import wiener_error
 from thincam_jax.design.search import evaluate
-from thincam_jax.design_run import build_problem, find
+from thincam_jax.design_run import build_problem, find, find_steps
 from thincam_jax.design_run.train import build_training, train
 
 ASKED = ("train.images=[camera]", "train.pixels=32", "train.starts=1", "train.steps=2")
@@ -22,7 +22,8 @@ def config(tmp_path_factory):
 @pytest.fixture(scope="module")
 def trained(config):
     config = config.model_copy(update={"train": config.train.model_copy(update={"steps": 12})})
-    return train(config, config.train, build_problem(config), [np.array([0.9, 0.05])])
+    start = np.array([0.9, 0.05])
+    return train(config, config.train, build_problem(config), [start], tiny.ignore)
 
 
 @pytest.mark.thorough
@@ -64,7 +65,13 @@ def test_pixels_show_the_finest_fringes(config):
 def test_ranked_by_the_training_error(config):
     steps = []
     result = find(config, steps.append)
-    assert steps == ["search", "training", "found designs", "landscape"]
+    assert [text for text in steps if not text.startswith("training")] == [
+        "search",
+        "around the trained designs",
+        "found designs",
+        "landscape",
+    ]
+    assert len(steps) == find_steps(config)
     training = build_training(config, config.train, build_problem(config))
     error = eqx.filter_jit(wiener_error)
     reference = float(error(config.reference_design(), training))

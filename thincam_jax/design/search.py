@@ -120,13 +120,17 @@ def descend(
     steps: int = 60,
     tolerance: float = 1e-6,
     apart: float = APART,
+    told: Callable[[int], object] | None = None,
 ) -> Search:
     """Descents from given points of the unit cube, one after the other: for costly objectives.
 
-    By BFGS; arguments and result as of `search`.
+    By BFGS; arguments and result as of `search`. `told` is called with the place of each point as
+    its descent begins.
     """
     ended = []
-    for point in points:
+    for place, point in enumerate(points):
+        if told is not None:
+            told(place)
         value = evaluate(objective, space, data, point[None])
         ended.append(_descend(objective, space, data, point[None], _scale(value), steps, tolerance))
     stacked = jax.device_get(jax.tree.map(lambda *parts: jnp.concatenate(parts), *ended))

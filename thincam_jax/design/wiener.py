@@ -9,7 +9,9 @@ angular frequencies ν fall on each sensor, at ν/d,
 
 with H_c in closed form at ν/d (`thincam_jax.propagation.separable_transfer`), the noise's η_c, and
 η_f ∝ 1/(ν² + ν₀²) of a strength that is found from the captures' own power. As there, the filter
-takes captures as if nothing had been cropped, and what that costs is in the error.
+takes captures as if nothing had been cropped, and what that costs is in the error. H_c is even, so
+that all of it is done in real numbers for the even and odd parts of the images
+(`thincam_jax.design.parity`).
 
 It is not the same to the last digit: `WienerSynthesis` interpolates shorter captures and counts
 the noise of each by its samples after that, estimates the mean, and finds the strength per sample.
@@ -22,11 +24,18 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Array, Float
 
-from thincam_jax._phase import as_complex, phasor
-from thincam_jax._precision import product
 from thincam_jax.design.design import Design
+from thincam_jax.design.parity import (
+    both_signs,
+    fold,
+    half_places,
+    series,
+    transform,
+    unfold,
+    waves,
+)
 from thincam_jax.design.prior import PowerLaw
 from thincam_jax.design.training import Training, check_captures, noise_variance, relative_error
 from thincam_jax.propagation.path import Path
@@ -51,65 +60,72 @@ def restore_by_wiener(design: Design, training: Training) -> Float[Array, "image
     check_captures(design, training)
     at = _frequencies(training)
     channels = tuple(_channel(design, training, row, at) for row in training.synthesis)
+    scene = _scene_waves(training, at)
     # The mean's part in each capture: the prior concerns the contrast only.
-    even = _scene_spectrum(jnp.ones_like(training.images[0]), training, at)
-    means = [[_captured(even, h, c, at) for h in c.each] for c in channels]
+    even = transform(fold(jnp.ones_like(training.images[0])), *[scene.seen] * 2)
+    means = [[_captured(even, h, c, training, at) for h in c.each] for c in channels]
     responses = jnp.stack([c.summed for c in channels])
 
     def one(given):
         image, noise = given
-        contrast = _scene_spectrum(image - 1, training, at)
+        contrast = transform(fold(image - 1), *[scene.seen] * 2)
         spectra, noises = [], []
         for channel, mean, drawn in zip(channels, means, noise, strict=True):
-            parts = [_captured(contrast, h, channel, at) for h in channel.each]
+            parts = [_captured(contrast, h, channel, training, at) for h in channel.each]
             whole = [m + p for m, p in zip(mean, parts, strict=True)]
             variance = noise_variance(
                 whole, channel.weights, channel.exposure, training.setup, training.sensor.pitch
             )
             summed = sum(w * p for w, p in zip(channel.weights, parts, strict=True))
-            spectra.append(
-                _spectrum(summed + jnp.sqrt(variance) * drawn, channel, training.sensor.pitch)
-            )
-            noises.append(variance * training.sensor.pitch**4 * drawn.size)
-        scene = _filtered(responses, jnp.stack(spectra), jnp.stack(noises), training, at)
-        return _image(scene, image.shape[-1], training, at) + 1
+            noisy = summed + jnp.sqrt(variance) * drawn
+            area = training.sensor.pitch**2
+            spectra.append(transform(fold(noisy), channel.rows, channel.columns) * area)
+            noises.append(variance * area**2 * drawn.size)
+        found = _filtered(responses, jnp.stack(spectra), jnp.stack(noises), training, at)
+        return unfold(series(found * _measure(at), *[scene.shown] * 2), image.shape) + 1
 
     # One after the other: an image's spectra are larger than itself.
     return jax.lax.map(one, (training.images, training.noise))
 
 
-class _Frequencies(NamedTuple):
-    """Of a real transform on the window, cycles/rad."""
+def _frequencies(training: Training) -> Float[Array, " frequency"]:
+    """Those of the window that are not negative, cycles/rad, the same along v and u."""
+    window = training.window
+    return jnp.asarray(np.fft.rfftfreq(window.samples, window.angle / window.samples), float)
 
-    v: Float[Array, " v"]
-    u: Float[Array, " u"]
+
+class _SceneWaves(NamedTuple):
+    """Along either axis of an image: averaged over its pixels, and at their middles."""
+
+    seen: Float[Array, "2 pixel frequency"]
+    shown: Float[Array, "2 pixel frequency"]
 
 
-def _frequencies(training: Training) -> _Frequencies:
-    window, dtype = training.window, training.images.dtype
-    step = window.angle / window.samples
-    made = (f(window.samples, step) for f in (np.fft.fftfreq, np.fft.rfftfreq))
-    return _Frequencies(*(jnp.asarray(f, dtype) for f in made))
+def _scene_waves(training: Training, at: Float[Array, " frequency"]) -> _SceneWaves:
+    count = training.images.shape[-1]
+    pixel = training.setup.field / count
+    middles = waves(half_places(count, pixel), at)
+    return _SceneWaves(middles * jnp.sinc(pixel * at) * pixel, middles)
 
 
 class _Channel(NamedTuple):
     """A sum of captures at one distance.
 
     - `each`: H, mm², of its captures; `summed`: H d², mm⁴, of their sum.
-    - `rows`, `columns`: e^{2πjνx/d} of each pixel and frequency.
+    - `rows`, `columns`: cos and sin(2πxν/d) of the pixels and frequencies.
     - `weights`, `exposure`: of its captures.
     """
 
     each: tuple[Float[Array, "v u"], ...]
     summed: Float[Array, "v u"]
-    rows: Complex[Array, "y v"]
-    columns: Complex[Array, "x u"]
+    rows: Float[Array, "2 y v"]
+    columns: Float[Array, "2 x u"]
     weights: tuple[float, ...]
     exposure: tuple[Float[Array, ""], ...]
 
 
 def _channel(
-    design: Design, training: Training, row: tuple[float, ...], at: _Frequencies
+    design: Design, training: Training, row: tuple[float, ...], at: Float[Array, " frequency"]
 ) -> _Channel:
     setup, sensor = training.setup, training.sensor
     pitch = sensor.pitch if setup.pixel_integration else None
@@ -119,73 +135,41 @@ def _channel(
     def response(k):
         path = Path(design.wavelength[k], distance, setup.object_distance)
         mask = design.mask(design.beta[k], design.phase[k])
-        v, u = (f / distance for f in at)
-        return transfer_factors(mask, path, v, u, pixel_pitch=pitch).response()
+        on_sensor = at / distance
+        return transfer_factors(mask, path, on_sensor, on_sensor, pixel_pitch=pitch).response()
 
     each = tuple(response(k) for k in used)
     weights = tuple(row[k] for k in used)
     summed = sum(w * h for w, h in zip(weights, each, strict=True)) * distance**2
-    places = (sensor.grid.y, sensor.grid.x)
-    rows, columns = (
-        phasor(2 * jnp.pi * x[:, None] * (f / distance)) for f, x in zip(at, places, strict=True)
-    )
+    rows, columns = (waves(half_places(n, sensor.pitch), at / distance) for n in sensor.shape)
     return _Channel(each, summed, rows, columns, weights, tuple(design.exposure[k] for k in used))
 
 
-def _scene_spectrum(image, training: Training, at: _Frequencies) -> Complex[Array, "v u"]:
-    """F, rad², of an image of uniform square pixels."""
-    rows, columns = _image_waves(image.shape[-1], training, at)
-    pixel = training.setup.field / image.shape[-1]
-    soft = jnp.sinc(pixel * at.v)[:, None] * jnp.sinc(pixel * at.u) * pixel**2
-    whole = product(product(rows.conj().T, as_complex(image)), columns.conj())
-    return whole * as_complex(soft)
-
-
-def _captured(scene, response, channel: _Channel, at: _Frequencies) -> Float[Array, "y x"]:
+def _captured(scene, response, channel: _Channel, training: Training, at) -> Float[Array, "y x"]:
     """A capture without noise, mm² times the scene's unit."""
-    return _series(scene * as_complex(response), channel.rows, channel.columns, at)
+    parts = series(scene * (response * _measure(at)), channel.rows, channel.columns)
+    return unfold(parts, training.sensor.shape)
 
 
-def _spectrum(capture, channel: _Channel, pitch) -> Complex[Array, "v u"]:
-    """G_c, mm² times the capture's unit."""
-    across = product(as_complex(capture), channel.columns.conj())
-    return product(channel.rows.conj().T, across) * as_complex(pitch**2)
+def _measure(at: Float[Array, " frequency"]) -> Float[Array, "v u"]:
+    """What a sum over the window's frequencies, of either sign, weighs each with, 1/rad²."""
+    along = jnp.asarray(both_signs(2 * len(at) - 2), at.dtype) * (at[1] - at[0])
+    return along[:, None] * along
 
 
-def _filtered(responses, spectra, noises, training: Training, at: _Frequencies):
-    """F̂, rad²."""
+def _filtered(responses, spectra, noises, training: Training, at) -> Float[Array, "2 2 v u"]:
+    """F̂, rad², in parts."""
     window = training.window
-    shape = PowerLaw(2.0)(at.v[:, None] ** 2 + at.u**2, training.setup.field)
+    shape = PowerLaw(2.0)(at[:, None] ** 2 + at**2, training.setup.field)
     density = noises[:, None, None]
-    power = jnp.abs(spectra) ** 2
+    power = jnp.sum(spectra**2, axis=(1, 2))  # its mean over the signs of the frequencies
     padded, sensor = (window.samples,) * 2, (window.across,) * 2
-    expected = responses**2 * shape
-    scene = shape * scene_power(power - density, expected, inner_band(padded, sensor))
+    inner = inner_band(padded, sensor)[: len(at)]
+    scene = shape * scene_power(power - density, responses**2 * shape, inner)
     biased = keep_bias(np.asarray(training.synthesis))
     if biased.any():
-        steps = crop_noise(power, padded, sensor)
+        half_plane = jnp.concatenate([power[:, :-1], power[:, :0:-1]], axis=1)
+        steps = crop_noise(half_plane, padded, sensor)[:, : len(at)]
         density = density + jnp.where(biased[:, None, None], steps, 0.0)
     gain = jnp.sum(responses**2 / density, axis=0) + 1 / scene
-    return jnp.sum(as_complex(responses / density) * spectra, axis=0) / as_complex(gain)
-
-
-def _image(scene, count: int, training: Training, at: _Frequencies) -> Float[Array, "v u"]:
-    """The scene at the middles of its pixels."""
-    rows, columns = _image_waves(count, training, at)
-    return _series(scene, rows, columns, at)
-
-
-def _image_waves(count: int, training: Training, at: _Frequencies):
-    """e^{2πjνθ} at the middles θ of the pixels: (pixel, frequency), along either axis."""
-    places = (jnp.arange(count, dtype=at.v.dtype) - (count - 1) / 2) * training.setup.field / count
-    return tuple(phasor(2 * jnp.pi * places[:, None] * f) for f in at)
-
-
-def _series(spectrum, rows, columns, at: _Frequencies) -> Float[Array, "y x"]:
-    """The real sum over the window's frequencies at the places of `rows` and `columns`."""
-    # Half of a real image's spectrum is here; what is not makes this count twice, but at both ends.
-    twice = np.full(len(at.u), 2.0)
-    twice[[0, -1]] = 1.0
-    step = at.u[1] - at.u[0]
-    weights = as_complex(jnp.asarray(twice, step.dtype) * step**2)
-    return product(product(rows, spectrum * weights), columns.T).real
+    return jnp.sum((responses / density)[:, None, None] * spectra, axis=0) / gain

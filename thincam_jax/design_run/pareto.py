@@ -96,7 +96,8 @@ def pareto_steps(fronts: ParetoConfig | None) -> int:
     """How many times `find_fronts` reports progress."""
     if fronts is None:
         return 0
-    lines = [f.points for f in (fronts.thickness, fronts.light) if f is not None]
+    # There, back and there again, see `_line`.
+    lines = [3 * f.points - 2 for f in (fronts.thickness, fronts.light) if f is not None]
     return sum(lines) + (2 * len(fronts.captures.shots) if fronts.captures is not None else 0)
 
 
@@ -172,8 +173,10 @@ def _line(
         told(cost)
         best.append(_best(config, asked, problem, None))
     for n in range(len(best) - 2, -1, -1):
+        told(costs[n])
         best[n] = _best(config, asked, problems[n], best[n + 1], best[n])
     for n in range(1, len(best)):
+        told(costs[n])
         best[n] = _best(config, asked, problems[n], best[n - 1], best[n])
     return tuple(_point(config, cost, one) for cost, one in zip(costs, best, strict=True))
 

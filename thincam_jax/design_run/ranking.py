@@ -27,7 +27,7 @@ from thincam_jax.design_run.sensitivity import (
     around,
     free_values,
 )
-from thincam_jax.design_run.train import Trained, train
+from thincam_jax.design_run.train import Trained, train, train_steps
 from thincam_jax.design_run.transfer import RINGS, Transfer, modulation_transfer
 from thincam_jax.study.target import Progress
 
@@ -93,8 +93,8 @@ def find(config: DesignConfig, progress: Progress) -> Result:
         kept = _distinct(problem.space, searched.found, phases)
     trained = None
     if config.train is not None:
-        progress("training")
-        trained = train(config, config.train, problem, [np.asarray(k.point) for k in kept])
+        points = [np.asarray(k.point) for k in kept]
+        trained = train(config, config.train, problem, points, progress)
     with allow("float64"):
         progress("found designs")
         if trained is None:
@@ -107,7 +107,7 @@ def find(config: DesignConfig, progress: Progress) -> Result:
 
 def find_steps(config: DesignConfig) -> int:
     """How many times `find` reports progress."""
-    return 3 if config.train is None else 4
+    return 3 + train_steps(config.train)
 
 
 def _result(config: DesignConfig, problem: Problem, searched, trained, found, best) -> Result:

@@ -23,6 +23,7 @@ from thincam_jax.design_run.landscape import Landscape, landscape_of
 from thincam_jax.design_run.problem import Problem, place_of, spans_of
 from thincam_jax.design_run.sensitivity import Around
 from thincam_jax.study.build import synthesis_matrix
+from thincam_jax.study.target import Progress
 from thincam_jax.targets import resize, sample_image
 
 # Single precision holds the error to some 1e-6 of itself.
@@ -69,8 +70,17 @@ class Trained(NamedTuple):
     landscape: Landscape | None
 
 
+def train_steps(wanted: TrainingConfig | None) -> int:
+    """How many times `train` reports progress: a descent each, and what surrounds the best."""
+    return 0 if wanted is None else wanted.starts + 2
+
+
 def train(
-    config: DesignConfig, wanted: TrainingConfig, problem: Problem, points: list[np.ndarray]
+    config: DesignConfig,
+    wanted: TrainingConfig,
+    problem: Problem,
+    points: list[np.ndarray],
+    progress: Progress,
 ) -> Trained:
     """Descents from points of the cube, and from the reference where it keeps the limits.
 
@@ -80,13 +90,24 @@ def train(
     training = build_training(config, wanted, problem)
     own = _reference_point(space)
     starts = [*points[: wanted.starts], *([] if own is None else [own])]
-    chosen = jnp.asarray(np.stack(starts), space.lower.dtype)
-    ended = descend(goal, space, training, chosen, steps=wanted.steps, tolerance=_TOLERANCE)
+    # Steps were counted before it was known how many starts the search would give.
+    for _ in range(wanted.starts + 1 - len(starts)):
+        progress("training")
+    ended = descend(
+        goal,
+        space,
+        training,
+        jnp.asarray(np.stack(starts), space.lower.dtype),
+        steps=wanted.steps,
+        tolerance=_TOLERANCE,
+        told=lambda place: progress(f"training {place + 1} of {len(starts)}"),
+    )
     if not ended.found:
         raise ConfigError(
             "train: the error of the training images is no number at any start; give "
             "reconstruction: wiener, other images, or less noise"
         )
+    progress("around the trained designs")
     around = tuple(_around(goal, space, training, found) for found in ended.found)
     reference = eqx.filter_jit(goal)(space.base, training)
     return Trained(
