@@ -14,7 +14,15 @@ from thincam_jax.config import ConfigError, MethodConfig, StudyConfig, TargetCon
 from thincam_jax.design import landscape, search
 from thincam_jax.design.search import Found, Search
 from thincam_jax.design.space import active_limits
-from thincam_jax.design_run import Front, Fronts, Point, build_study, compare, full_well
+from thincam_jax.design_run import (
+    Front,
+    Fronts,
+    Point,
+    build_study,
+    check_design,
+    compare,
+    full_well,
+)
 from thincam_jax.design_run import Transfer as ContrastTransfer
 from thincam_jax.design_run import problem as problem_of_search
 from thincam_jax.design_run.landscape import Landscape
@@ -250,6 +258,18 @@ def test_shots_that_coincide_are_two_exposures(tmp_path):
     assert len(build.settings(build_study(config, [same]), method)) == 4
     assert len({shot.beta for shot in method.shots}) == 2
     assert [shot.beta for shot in method.shots] == pytest.approx([20.0, 20.0], rel=1e-8)
+
+
+def test_only_the_simulation_has_the_pixels_of_a_display(tmp_path):
+    settings = ("model=separable", "mask.pixel_pitch=50 um", "mask.fill_factor=0.9")
+    config = tiny.design(tmp_path, *settings)
+    study = build_study(config)
+    camera = build.build_camera(study, build.all_settings(study)[0])
+    assert (camera.mask.pixels, float(camera.mask.fill_factor)) == (40, pytest.approx(0.9))
+    assert config.reference_design().cameras(camera.sensor)[0].mask.pixels is None
+    check_design(config)
+    with pytest.raises(ConfigError, match="mask"):
+        check_design(tiny.design(tmp_path, "mask.pixel_pitch=70 um"))
 
 
 def test_electrons_are_those_of_the_file(tmp_path):

@@ -51,10 +51,15 @@ class PixelsConfig(Section):
 
 
 class ApertureConfig(Section):
-    """What all masks share."""
+    """What all masks share.
+
+    Of a display that shows them only the simulation has the pixels.
+    """
 
     width: Length
     profile: Literal["cosine", "binary"] = "cosine"
+    pixel_pitch: Length | None = None
+    fill_factor: Annotated[float, Field(gt=0, le=1)] = 1.0
 
 
 class DesignNoiseConfig(Section):

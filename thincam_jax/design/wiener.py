@@ -7,16 +7,19 @@ angular frequencies ν fall on each sensor, at ν/d,
 .. math:: G_c(\nu) = p^2 \sum_x g_c(x)\, e^{-2\pi j\nu x/d}, \qquad
     \hat F = \frac{\sum_c H_c\, d_c^2\, G_c/\eta_c}{\sum_c H_c^2\, d_c^4/\eta_c + 1/\eta_f}
 
-with H_c in closed form at ν/d (`thincam_jax.propagation.separable_transfer`), the noise's η_c, and
-η_f ∝ 1/(ν² + ν₀²) of a strength that is found from the captures' own power. As there, the filter
+with H_c in closed form at ν/d (`thincam_jax.propagation.separable_transfer`). Spectra are densities
+over the solid angle Ω_c = Np²/d_c² that a sensor's N pixels cover: η_c = E|N_c|²/Ω_c = σ_c²p²d_c²
+for noise of variance σ_c², and η_f ∝ 1/(ν² + ν₀²) of a strength that is found from the captures'
+own power |G_c|²/Ω_c. As there, the filter
 takes captures as if nothing had been cropped, and what that costs is in the error. H_c is even, so
 that all of it is done in real numbers for the even and odd parts of the images
 (`thincam_jax.design.parity`).
 
-It is not the same to the last digit: `WienerSynthesis` interpolates shorter captures and counts
-the noise of each by its samples after that, estimates the mean, and finds the strength per sample.
-At one distance the errors agree within some tenths of a dB, at two within one; where designs rank
-near to each other, the full simulation decides.
+It is not the same to the last digit: `WienerSynthesis` interpolates shorter captures, estimates
+the mean, and finds the strength on its own window. In the thesis' camera the gain of one pair of
+distances over another agrees within 0.3 dB (docs/designs.md); on a few dozen pixels, where few
+frequencies tell the strength, errors differ by up to 1.5 dB. Where designs rank near to each other,
+the full simulation decides.
 """
 
 from typing import NamedTuple
@@ -64,12 +67,11 @@ def restore_by_wiener(design: Design, training: Training) -> Float[Array, "image
     # The mean's part in each capture: the prior concerns the contrast only.
     even = transform(fold(jnp.ones_like(training.images[0])), *[scene.seen] * 2)
     means = [[_captured(even, h, c, training, at) for h in c.each] for c in channels]
-    responses = jnp.stack([c.summed for c in channels])
 
     def one(given):
         image, noise = given
         contrast = transform(fold(image - 1), *[scene.seen] * 2)
-        spectra, noises = [], []
+        spectra, variances = [], []
         for channel, mean, drawn in zip(channels, means, noise, strict=True):
             parts = [_captured(contrast, h, channel, training, at) for h in channel.each]
             whole = [m + p for m, p in zip(mean, parts, strict=True)]
@@ -80,8 +82,8 @@ def restore_by_wiener(design: Design, training: Training) -> Float[Array, "image
             noisy = summed + jnp.sqrt(variance) * drawn
             area = training.sensor.pitch**2
             spectra.append(transform(fold(noisy), channel.rows, channel.columns) * area)
-            noises.append(variance * area**2 * drawn.size)
-        found = _filtered(responses, jnp.stack(spectra), jnp.stack(noises), training, at)
+            variances.append(variance)
+        found = _filtered(channels, jnp.stack(spectra), jnp.stack(variances), training, at)
         return unfold(series(found * _measure(at), *[scene.shown] * 2), image.shape) + 1
 
     # One after the other: an image's spectra are larger than itself.
@@ -113,13 +115,14 @@ class _Channel(NamedTuple):
 
     - `each`: H, mm², of its captures; `summed`: H d², mm⁴, of their sum.
     - `rows`, `columns`: cos and sin(2πxν/d) of the pixels and frequencies.
-    - `weights`, `exposure`: of its captures.
+    - `distance`: mm; `weights`, `exposure`: of its captures.
     """
 
     each: tuple[Float[Array, "v u"], ...]
     summed: Float[Array, "v u"]
     rows: Float[Array, "2 y v"]
     columns: Float[Array, "2 x u"]
+    distance: Float[Array, ""]
     weights: tuple[float, ...]
     exposure: tuple[Float[Array, ""], ...]
 
@@ -142,7 +145,8 @@ def _channel(
     weights = tuple(row[k] for k in used)
     summed = sum(w * h for w, h in zip(weights, each, strict=True)) * distance**2
     rows, columns = (waves(half_places(n, sensor.pitch), at / distance) for n in sensor.shape)
-    return _Channel(each, summed, rows, columns, weights, tuple(design.exposure[k] for k in used))
+    exposure = tuple(design.exposure[k] for k in used)
+    return _Channel(each, summed, rows, columns, distance, weights, exposure)
 
 
 def _captured(scene, response, channel: _Channel, training: Training, at) -> Float[Array, "y x"]:
@@ -157,12 +161,15 @@ def _measure(at: Float[Array, " frequency"]) -> Float[Array, "v u"]:
     return along[:, None] * along
 
 
-def _filtered(responses, spectra, noises, training: Training, at) -> Float[Array, "2 2 v u"]:
+def _filtered(channels, spectra, variances, training: Training, at) -> Float[Array, "2 2 v u"]:
     """F̂, rad², in parts."""
-    window = training.window
+    window, area = training.window, training.sensor.pitch**2
+    squared = jnp.stack([c.distance**2 for c in channels])[:, None, None]
+    responses = jnp.stack([c.summed for c in channels])
     shape = PowerLaw(2.0)(at[:, None] ** 2 + at**2, training.setup.field)
-    density = noises[:, None, None]
-    power = jnp.sum(spectra**2, axis=(1, 2))  # its mean over the signs of the frequencies
+    density = variances[:, None, None] * area * squared
+    # Summed over the parts it is the mean over the signs of the frequencies.
+    power = jnp.sum(spectra**2, axis=(1, 2)) * squared / (training.noise[0, 0].size * area)
     padded, sensor = (window.samples,) * 2, (window.across,) * 2
     inner = inner_band(padded, sensor)[: len(at)]
     scene = shape * scene_power(power - density, responses**2 * shape, inner)
