@@ -213,14 +213,15 @@ def temporary(iterations: int, *, gradient: bool) -> int:
 def test_memory_does_not_grow_with_the_iterations():
     """Neither that of the run nor that of its gradient, to the byte.
 
-    The gradient by τ alone takes 1.29 times the memory of a run here and 1.26 times for 256×264
-    pixels and half as many samples (window 384×400, float64): a run holds 17 arrays of the window,
+    The gradient by τ alone takes 1.42 times the memory of a run here and 1.40 times for 256×264
+    pixels and half as many samples (window 384×400, float64): a run holds 15 arrays of the window,
     and its gradient beside the vector that it solves for the four of the point at which it is
-    taken, 21/17 = 1.24. By β and τ it is 1.68 times, with the cotangents of spectrum and PSF.
+    taken, 19/15 = 1.27 at the least. By spectrum and τ it is 1.53 and 1.72 times, with the
+    cotangents of the spectrum.
     """
     forward, backward = ([temporary(n, gradient=g) for n in (100, 400)] for g in (False, True))
     assert forward[0] == forward[1] > 0
-    assert backward[0] == backward[1] < 1.4 * forward[0]
+    assert backward[0] == backward[1] < 1.5 * forward[0]
 
 
 def test_the_series_solves_linear_systems():

@@ -121,7 +121,7 @@ def test_masks_keep_the_differences_inside_of_the_field():
     masks = field_masks(field, window, corner)
     for slope in within_field(slopes, masks):
         assert not np.asarray(slope).any()
-    down, right, behind = (np.asarray(m) for m in masks)
+    down, right, behind = (np.asarray(y & x) for y, x in masks)
     assert down.sum() == 3 * 5 and right.sum() == 4 * 4 and behind.sum() == 4 * 5
     assert down[3:6, columns].all() and right[rows, 1:5].all() and behind[rows, columns].all()
 
@@ -250,3 +250,33 @@ def test_what_is_refused():
             TotalVariation("round")
         with pytest.raises(ValueError, match="coupling = 'x' is unknown; choose one of 'none'"):
             TotalVariation(coupling="x")
+
+
+@pytest.mark.parametrize("kind", ["isotropic", "anisotropic"])
+@pytest.mark.parametrize("coupling", ["none", "joint", "opponent"])
+def test_slope_of_the_prox_by_differences(kind, coupling):
+    """In slopes and step; of vectors that are shortened and of those that vanish."""
+    variation = TotalVariation(kind, coupling, chroma_weight=1.3)
+    length = 2.0 if coupling == "joint" else 0.8  # of some vectors, more than they have
+    rng = np.random.default_rng(2)
+    place, way = (tuple(jnp.asarray(rng.normal(size=(2, 3, 1, 4, 5)))) for _ in range(2))
+
+    def along(t):
+        moved = tuple(s[None] + t * w[None] for s, w in zip(place, way, strict=True))
+        return jnp.stack(variation.prox(moved, length + 0.7 * t))
+
+    value, slope = jax.jvp(along, (0.0,), (1.0,))
+    assert 0 < float(jnp.mean(jnp.abs(value) < 1e-12)) < 1 or coupling == "opponent"
+    np.testing.assert_allclose(slope, (along(1e-6) - along(-1e-6)) / 2e-6, atol=1e-8)
+    # What is still does not turn: only the step changes, or only one direction.
+    step = jax.jvp(lambda x: jnp.stack(variation.prox(place, x)), (length,), (1.0,))[1]
+    both = (variation.prox(place, length + x) for x in (1e-6, -1e-6))
+    up, down = (jnp.stack(b) for b in both)
+    np.testing.assert_allclose(step, (up - down) / 2e-6, atol=1e-8)
+    first = jax.grad(lambda x: jnp.sum(jnp.stack(variation.prox((x, place[1]), length)) ** 2))
+    moved = jnp.sum(first(place[0]) * way[0])
+    sums = [
+        jnp.sum(jnp.stack(variation.prox((place[0] + x * way[0], place[1]), length)) ** 2)
+        for x in (1e-6, -1e-6)
+    ]
+    assert float(moved) == pytest.approx(float(sums[0] - sums[1]) / 2e-6, rel=1e-6)

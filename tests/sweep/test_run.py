@@ -143,6 +143,9 @@ def environment(file: Path) -> dict[str, str]:
     cache = {
         "JAX_COMPILATION_CACHE_DIR": str(file.parent / "compiled"),
         "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+        # jaxlib 0.10.1 takes its own preferences for features that the processor lacks, and says
+        # so at everything it finds there: https://github.com/jax-ml/jax/issues/38445.
+        "TF_CPP_MIN_LOG_LEVEL": "3",
     }
     return {**kept, **cache, "PYTHONPATH": path}
 

@@ -124,7 +124,8 @@ class CropConvolution(AbstractOperator):
         """The adjoint of `combine`."""
         rows, columns = capture.shape[-2:]
         leading = capture.shape[:-2] + (1,) * self.summed
-        return capture.reshape(*leading, rows, columns) * self.spectrum.conj()
+        # Of what stands beside the capture a gradient keeps a copy, but for the spectrum itself.
+        return (capture.conj().reshape(*leading, rows, columns) * self.spectrum).conj()
 
 
 def place(image: Float[Array, "*batch y x"], corner, window) -> Float[Array, "*batch v u"]:

@@ -136,8 +136,9 @@ def reflected(splitting: Splitting, penalties: Penalties, state: State) -> State
     framed = within_field(state.slopes, masks)
     shrunk = splitting.variation.prox(framed, splitting.tau / penalties.variation)
     slopes = [q + 2 * (z - f) for q, z, f in zip(state.slopes, shrunk, framed, strict=True)]
+    y, x = masks[-1]
     allowed = jnp.abs(state.image) if splitting.nonnegative else state.image
-    return State(tuple(data), tuple(slopes), jnp.where(masks[-1], allowed, -state.image))
+    return State(tuple(data), tuple(slopes), jnp.where(y & x, allowed, -state.image))
 
 
 def _data_pull(operator: CropConvolution, capture, weight, penalty, q):

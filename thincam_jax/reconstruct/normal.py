@@ -4,6 +4,7 @@ import functools
 import operator
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
@@ -52,7 +53,7 @@ class NormalInverse(eqx.Module):
         smooth = penalties.variation * difference_symbol(self.window, spectrum.real.dtype)
         if self.power is not None:
             inverse = 1 / (penalties.data * self.power + smooth + penalties.image)
-            return spectrum * as_complex(inverse)
+            return jax.lax.complex(spectrum.real * inverse, spectrum.imag * inverse)
         planes = spectrum.shape[-3]
         depth = penalties.variation * self._depth_symbol(planes, smooth.dtype)
         inverse = 1 / (smooth + depth[:, None, None] + penalties.image)

@@ -1,10 +1,13 @@
 r"""Total variation of an image, its proximal map, and the differences it is made of."""
 
+import functools
 from typing import Literal
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float
 
 from thincam_jax import _checks
@@ -71,13 +74,11 @@ class TotalVariation(eqx.Module):
         """The slopes u that minimise step·TV + ½‖u − slopes‖²: each vector shortened by `step`."""
         rotated = self._rotate(slopes)
         weights = self._channel_weights(slopes[0].dtype)
-        if self.kind == "anisotropic" and self.coupling != "joint":
-            shrunk = tuple(s * _kept(jnp.abs(s), step * weights) for s in rotated)
-        elif self.kind == "anisotropic":
-            shrunk = tuple(s * _kept(_norm((s,), channels=True), step * weights) for s in rotated)
+        channels, step = self.coupling == "joint", step * weights
+        if self.kind == "isotropic":
+            shrunk = _shortened(rotated, step, channels)
         else:
-            kept = _kept(self._length(rotated), step * weights)
-            shrunk = tuple(s * kept for s in rotated)
+            shrunk = tuple(_shortened((s,), step, channels)[0] for s in rotated)
         return self._rotate(shrunk, back=True)
 
     def _length(self, slopes):
@@ -135,20 +136,23 @@ def differences_adjoint(
     return image
 
 
-def field_masks(field_shape, window, corner=(0, 0)) -> tuple[Array, Array, Array]:
-    """Where the differences down, right and behind lie inside of the field, on a window."""
+def field_masks(field_shape, window, corner=(0, 0)) -> tuple[tuple[Array, Array], ...]:
+    """Where the differences down, right and behind lie inside of the field, on a window.
+
+    A column and a row of booleans each, both of which hold there: no mask of the window's size
+    becomes a constant, and none is kept for a gradient.
+    """
     rows, columns = (np.arange(n) - c for n, c in zip(window, corner, strict=True))
     height, width = field_shape
-    # Built from two lines each, so that no mask of the window's size becomes a constant.
     y, y_down = (jnp.asarray((rows >= 0) & (rows < n))[:, None] for n in (height, height - 1))
     x, x_right = (jnp.asarray((columns >= 0) & (columns < n)) for n in (width, width - 1))
-    return y_down & x, y & x_right, y & x
+    return (y_down, x), (y, x_right), (y, x)
 
 
 def within_field(slopes, masks):
     """Slopes with those that leave the field set to zero."""
-    masks = masks[: len(slopes)]
-    return tuple(jnp.where(m, s, 0) for m, s in zip(masks, slopes, strict=True))
+    lines = [[m.astype(s.dtype) for m in pair] for pair, s in zip(masks, slopes, strict=False)]
+    return tuple(s * y * x for s, (y, x) in zip(slopes, lines, strict=True))
 
 
 def _norm(slopes, *, channels: bool):
@@ -161,7 +165,40 @@ def _norm(slopes, *, channels: bool):
     return jnp.where(zero, 0, jnp.sqrt(jnp.where(zero, 1, squared)))
 
 
-def _kept(length, step):
-    """The part of a vector that shortening leaves: max(0, 1 − step/length)."""
+@functools.partial(jax.custom_jvp, nondiff_argnums=(2,))
+def _shortened(slopes, step, channels: bool):
+    """Vectors of slopes, over the channel axis too if these are joined, shortened by `step`."""
+    kept, _ = _kept_and_longer(slopes, step, channels)
+    return tuple(s * kept for s in slopes)
+
+
+@functools.partial(_shortened.defjvp, symbolic_zeros=True)
+def _shortened_slope(channels: bool, primals, tangents):
+    r"""With the part k that is kept and the direction n, k ds + (1 − k) n (n·ds) − n dstep.
+
+    Written out so that a gradient holds k and n alone: the compiler's own holds four times as much.
+    """
+    (slopes, step), (turns, change) = primals, tangents
+    kept, longer = _kept_and_longer(slopes, step, channels)
+    length = jnp.where(longer, _norm(slopes, channels=channels), 1)
+    direction = tuple(jnp.where(longer, s / length, 0) for s in slopes)
+    turns = [
+        jnp.zeros_like(s) if isinstance(t, SymbolicZero) else t
+        for t, s in zip(turns, slopes, strict=True)
+    ]
+    along = sum(n * t for n, t in zip(direction, turns, strict=True))
+    if channels:
+        along = jnp.sum(along, axis=-4, keepdims=True)
+    out = tuple(
+        kept * t + n * (along - kept * along) for n, t in zip(direction, turns, strict=True)
+    )
+    if not isinstance(change, SymbolicZero):
+        out = tuple(t - n * change for n, t in zip(direction, out, strict=True))
+    return tuple(s * kept for s in slopes), out
+
+
+def _kept_and_longer(slopes, step, channels: bool):
+    """The part of a vector that shortening leaves: max(0, 1 − step/length); where it is above 0."""
+    length = _norm(slopes, channels=channels)
     longer = length > step
-    return jnp.where(longer, 1 - step / jnp.where(longer, length, 1), 0)
+    return jnp.where(longer, 1 - step / jnp.where(longer, length, 1), 0), longer
