@@ -17,12 +17,14 @@ class TrainingConfig(Section):
       linear estimate, which knows of the crop, by conjugate gradients.
     - `pixels`: of the sensor's shorter side in training; by default as many as the finest fringes
       need, and no more than the sensor has.
-    - `starts`: of the search's designs, beside the reference; `steps` of each descent.
+    - `samples`: even ones over the bounds; descents begin at the best `starts` of these, of the
+      search's designs and the reference; `steps` of each.
     """
 
     images: Annotated[tuple[str, ...], Field(min_length=1)]
     reconstruction: Literal["wiener", "linear"] = "wiener"
     pixels: Annotated[int, Field(ge=32, le=4096)] | None = None
+    samples: Annotated[int, Field(ge=1, le=10_000)] = 64
     starts: Annotated[int, Field(ge=1, le=10)] = 4
     steps: Annotated[int, Field(ge=1, le=1000)] = 30
 

@@ -11,7 +11,13 @@ from thincam_jax.design.search import evaluate
 from thincam_jax.design_run import build_problem, find, find_steps
 from thincam_jax.design_run.train import build_training, train
 
-ASKED = ("train.images=[camera]", "train.pixels=32", "train.starts=1", "train.steps=2")
+ASKED = (
+    "train.images=[camera]",
+    "train.pixels=32",
+    "train.samples=2",
+    "train.starts=1",
+    "train.steps=2",
+)
 
 
 @pytest.fixture(scope="module")

@@ -18,7 +18,14 @@ from thincam_jax.config import ConfigError
 from thincam_jax.config_design import DesignConfig
 from thincam_jax.config_training import TrainingConfig
 from thincam_jax.design import Design, DesignSpace, Training, end_to_end_error, wiener_error
-from thincam_jax.design.search import APART, Found, descend, evaluate
+from thincam_jax.design.search import (
+    APART,
+    Found,
+    best_apart,
+    descend,
+    evaluate,
+    even_samples,
+)
 from thincam_jax.design_run.landscape import Landscape, landscape_of
 from thincam_jax.design_run.problem import Problem, place_of, spans_of
 from thincam_jax.design_run.sensitivity import Around
@@ -56,7 +63,7 @@ class Trained(NamedTuple):
     - `goal`: what was made small; `landscape`: around the best of them.
     - `found`: with the error as `objective`; `around`: of each.
     - `reference`: the error of the reference.
-    - `evaluations`: of the error, with its gradient; `failed`: descents without a number.
+    - `evaluations`: of the error, with or without its gradient; `failed`: descents without a number.
     - `pixels`: of the sensor's side in training.
     """
 
@@ -71,7 +78,7 @@ class Trained(NamedTuple):
 
 
 def train_steps(wanted: TrainingConfig | None) -> int:
-    """How many times `train` reports progress: a descent each, and what surrounds the best."""
+    """How many times `train` reports progress: samples, descents, and what surrounds the best."""
     return 0 if wanted is None else wanted.starts + 2
 
 
@@ -82,22 +89,24 @@ def train(
     points: list[np.ndarray],
     progress: Progress,
 ) -> Trained:
-    """Descents from points of the cube, and from the reference where it keeps the limits.
+    """Descents from the best of some points of the cube, of even samples and of the reference.
+
+    The reference counts where it keeps the limits.
 
     **Errors**: ConfigError where the error is no number at any start.
     """
     goal, space = TrainingGoal(wanted.reconstruction), config.space()
     training = build_training(config, wanted, problem)
-    own = _reference_point(space)
-    starts = [*points[: wanted.starts], *([] if own is None else [own])]
-    # Steps were counted before it was known how many starts the search would give.
-    for _ in range(wanted.starts + 1 - len(starts)):
+    progress("training, samples")
+    starts = _starts(config, wanted, goal, space, training, points)
+    # Steps were counted before it was known whether there are as many.
+    for _ in range(wanted.starts - len(starts)):
         progress("training")
     ended = descend(
         goal,
         space,
         training,
-        jnp.asarray(np.stack(starts), space.lower.dtype),
+        starts,
         steps=wanted.steps,
         tolerance=_TOLERANCE,
         told=lambda place: progress(f"training {place + 1} of {len(starts)}"),
@@ -115,11 +124,21 @@ def train(
         ended.found,
         around,
         float(reference),
-        ended.evaluations,
+        ended.evaluations + len(points) + wanted.samples,
         ended.failed,
         training.sensor.shape[0],
         _surroundings(config, goal, space, training, ended.found),
     )
+
+
+def _starts(config: DesignConfig, wanted: TrainingConfig, goal, space, training, points):
+    """The lowest in training error, apart from each other."""
+    own = _reference_point(space)
+    dtype, key = space.lower.dtype, jax.random.key(config.seed)
+    given = jnp.asarray(np.stack([*points, *([] if own is None else [own])]), dtype)
+    every = jnp.concatenate([given, even_samples(space.size, wanted.samples, key, dtype)])
+    values = evaluate(goal, space, training, every, at_a_time=1)
+    return every[best_apart(np.asarray(every), np.asarray(values), wanted.starts)]
 
 
 def _surroundings(config: DesignConfig, goal, space: DesignSpace, training, found):
