@@ -63,7 +63,7 @@ class Trained(NamedTuple):
     - `goal`: what was made small; `landscape`: around the best of them.
     - `found`: with the error as `objective`; `around`: of each.
     - `reference`: the error of the reference.
-    - `evaluations`: of the error, with or without its gradient; `failed`: descents without a number.
+    - `evaluations`: of the error, with or without its gradient; `failed`: descents without one.
     - `pixels`: of the sensor's side in training.
     """
 
