@@ -53,7 +53,8 @@ class PixelsConfig(Section):
 class ApertureConfig(Section):
     """What all masks share.
 
-    Of a display that shows them only the simulation has the pixels.
+    - `pixel_pitch`, `fill_factor`: of a display that shows them; only the simulation has its
+      pixels.
     """
 
     width: Length

@@ -10,7 +10,7 @@ from thincam_jax.targets import sample_images
 
 
 class TrainingConfig(Section):
-    """The search's designs, improved by the error of an actual reconstruction.
+    """Designs improved by the error of an actual reconstruction.
 
     - `images`: photographs of scikit-image; their middle square is taken.
     - `reconstruction`: `wiener`, the Wiener synthesis as in the simulation; `linear`, the best

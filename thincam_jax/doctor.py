@@ -9,6 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from thincam_jax._precision import product
+
 PACKAGES = (
     *("thincam_jax", "jax", "jaxlib", "equinox", "numpy", "scipy", "scikit-image", "optimistix"),
     *("lineax", "optax", "jaxopt", "pydantic", "matplotlib"),
@@ -71,11 +73,11 @@ def compiled_sums() -> str:
     right = np.allclose(squares, np.sum(rows**2, axis=1), rtol=1e-4) and np.allclose(
         means, _of_channels(response, capture, noise), rtol=1e-4
     )
-    return "right" if right else "WRONG; install another jaxlib, 0.10.1 or above 0.10.2"
+    return "right" if right else "WRONG; install another jaxlib, such as 0.10.1"
 
 
 def _of_rows(rows, matrix):
-    return jax.vmap(lambda row: jnp.sum((matrix @ row) ** 2))(rows)
+    return jax.vmap(lambda row: jnp.sum(product(matrix, row) ** 2))(rows)
 
 
 def _of_channels(response, capture, noise):

@@ -88,7 +88,7 @@ def synthesised(chosen, given):
 
 @pytest.mark.thorough
 def test_restored_are_nearly_those_of_the_wiener_synthesis_at_two_distances():
-    """With little noise: on so few pixels the estimates of the scene's strength differ else."""
+    """With little noise: on so few pixels estimates of the scene's strength differ otherwise."""
     given, chosen = training(SignalNoise(45.0)), design(distance=(5.0, 7.0))
     images = np.asarray(given.images)
     found, expected = np.asarray(restore_by_wiener(chosen, given)), synthesised(chosen, given)

@@ -1,5 +1,7 @@
 """Training: descents by the error of a reconstruction."""
 
+import dataclasses
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -9,7 +11,7 @@ from design_run import tiny
 from thincam_jax.design import wiener_error
 from thincam_jax.design.search import evaluate
 from thincam_jax.design_run import build_problem, find, find_steps
-from thincam_jax.design_run.train import build_training, train
+from thincam_jax.design_run.train import _starts, build_training, train
 
 ASKED = (
     "train.images=[camera]",
@@ -32,16 +34,49 @@ def trained(config):
     return train(config, config.train, build_problem(config), [start], tiny.ignore)
 
 
+@dataclasses.dataclass(frozen=True)
+class Basins:
+    """Of both β: the lowest at (15, 15), another at (27, 20), and no number beside."""
+
+    def __call__(self, design, data):
+        first, second = design.beta[0], design.beta[2]
+        value = jnp.minimum(
+            (first - 15) ** 2 + (second - 15) ** 2, 0.5 + (first - 27) ** 2 + (second - 20) ** 2
+        )
+        return jnp.where(first < 14.5, jnp.nan, value)
+
+
+def test_descents_begin_at_the_best_points_apart(config):
+    wanted = config.train.model_copy(update={"samples": 128, "starts": 4})
+    space, nowhere = config.space(), np.array([0.0, 0.5])
+    starts, count = _starts(config, wanted, Basins(), space, None, [nowhere, np.array([0.5, 0.9])])
+    assert count == 2 + 1 + 128  # with the reference
+    values = np.asarray(evaluate(Basins(), space, None, starts))
+    assert np.all(values[:2] < 4)
+    assert np.all(np.diff(values) >= 0)
+    apart = np.abs(starts[:, None] - starts).max(axis=-1)[np.triu_indices(4, 1)]
+    assert np.all(apart >= 0.05)
+    betas = np.asarray([space.values(p) for p in starts])
+    assert {bool(b > 21) for b in betas[:, 0]} == {True, False}  # a start in either basin
+
+
+def test_the_reference_and_designs_of_the_search_can_be_starts(config):
+    wanted = config.train.model_copy(update={"samples": 1, "starts": 10})
+    given = np.array([0.18, 0.16])
+    starts, count = _starts(config, wanted, Basins(), config.space(), None, [given])
+    assert count == 3 >= len(starts)  # the sample may meet no number
+    assert np.asarray(starts[0]) == pytest.approx(given)
+    assert any(np.allclose(config.space().values(p), [25.0, 21.0]) for p in starts)
+
+
 @pytest.mark.thorough
 def test_descents_end_lower_than_they_began(config, trained):
-    assert 1 <= len(trained.found) <= 2  # from the given point, and from the reference
     errors = [one.objective for one in trained.found]
-    assert errors == sorted(errors)
     assert 0 < errors[0] < trained.reference
     goal, training = trained.goal, build_training(config, config.train, build_problem(config))
     start = evaluate(goal, config.space(), training, jnp.asarray([[0.9, 0.05]]), at_a_time=1)
     assert errors[0] < float(start[0])
-    assert trained.evaluations > 2
+    assert trained.evaluations > 4 + 1  # more than those of the candidates, and a step
     space = config.space()
     for one in trained.found:
         assert np.all(np.asarray(one.values) >= np.asarray(space.lower))
@@ -69,6 +104,8 @@ def test_pixels_show_the_finest_fringes(config):
 
 @pytest.mark.thorough
 def test_ranked_by_the_training_error(config):
+    # More starts than there are candidates.
+    config = config.model_copy(update={"train": config.train.model_copy(update={"starts": 10})})
     steps = []
     result = find(config, steps.append)
     assert [text for text in steps if not text.startswith("training")] == [

@@ -29,7 +29,8 @@ def half_places(count: int, pitch) -> Float[Array, " place"]:
 def fold(image: Float[Array, "y x"]) -> Float[Array, "2 2 half_y half_x"]:
     """Sums (0) and differences (1) of the samples at (±y, ±x), along each axis.
 
-    The middle line of an odd number of samples counts once.
+    Four times the parts above, so that a sum over these places is one over all; the middle line of
+    an odd number of samples counts once.
     """
     return _fold(_fold(image, 0), 2).swapaxes(0, 1)
 
@@ -63,7 +64,7 @@ def series(
 
 
 def both_signs(count: int) -> np.ndarray:
-    """How often each frequency 0 … N/2 of N stands in a sum over all N."""
+    """How often each frequency 0 … N/2 of N, an even number, stands in a sum over all N."""
     times = np.full(count // 2 + 1, 2.0)
     times[[0, -1]] = 1.0
     return times

@@ -189,9 +189,14 @@ def even_samples(dimensions: int, count: int, key, dtype) -> Float[Array, "point
     return jnp.asarray(sampler.random_base2(power)[:count], dtype)
 
 
-def best_apart(points: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:
-    """The lowest samples, each farther from those chosen before than samples are on average."""
-    spacing = 0.5 * len(points) ** (-1 / points.shape[1])
+def best_apart(
+    points: np.ndarray, values: np.ndarray, count: int, *, least: float = 0.0
+) -> np.ndarray:
+    """The lowest samples, each farther from those chosen before than half of the mean spacing.
+
+    `least`: what that is at least, in the cube.
+    """
+    spacing = max(least, 0.5 * len(points) ** (-1 / points.shape[1]))
     chosen: list[int] = []
     rest: list[int] = []
     for index in np.argsort(np.where(np.isfinite(values), values, np.inf), kind="stable"):

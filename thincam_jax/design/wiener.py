@@ -10,10 +10,9 @@ angular frequencies ν fall on each sensor, at ν/d,
 with H_c in closed form at ν/d (`thincam_jax.propagation.separable_transfer`). Spectra are densities
 over the solid angle Ω_c = Np²/d_c² that a sensor's N pixels cover: η_c = E|N_c|²/Ω_c = σ_c²p²d_c²
 for noise of variance σ_c², and η_f ∝ 1/(ν² + ν₀²) of a strength that is found from the captures'
-own power |G_c|²/Ω_c. As there, the filter
-takes captures as if nothing had been cropped, and what that costs is in the error. H_c is even, so
-that all of it is done in real numbers for the even and odd parts of the images
-(`thincam_jax.design.parity`).
+own power |G_c|²/Ω_c. As there, the filter takes captures as if nothing had been cropped, and what
+that costs is in the error. H_c is even, so that all of it is done in real numbers for the even and
+odd parts of the images (`thincam_jax.design.parity`).
 
 It is not the same to the last digit: `WienerSynthesis` interpolates shorter captures, estimates
 the mean, and finds the strength on its own window. In the thesis' camera the gain of one pair of

@@ -61,6 +61,7 @@ def _training(config: DesignConfig, result: Result) -> dict[str, Any] | None:
         "reconstruction": config.train.reconstruction,
         "images": list(config.train.images),
         "pixels": result.training.pixels,
+        "samples": config.train.samples,
         "starts": config.train.starts,
         "evaluations": result.training.evaluations,
         "failed_descents": result.training.failed,

@@ -1,4 +1,4 @@
-"""The search's designs, improved by gradient through the reconstruction of training images.
+"""Designs improved by gradient through the reconstruction of training images.
 
 What is made small is the error of the images that the cropped captures give back, so that all
 counts which the frequency-wise objectives leave out.
@@ -35,6 +35,8 @@ from thincam_jax.targets import resize, sample_image
 
 # Single precision holds the error to some 1e-6 of itself.
 _TOLERANCE = 1e-4
+# Descents that begin nearer to each other, in the cube, most often end in one place.
+_BASIN = 0.05
 # Points along each side of the landscape, by the number of free numbers.
 _GRID = {1: 61, 2: 15}
 
@@ -63,7 +65,8 @@ class Trained(NamedTuple):
     - `goal`: what was made small; `landscape`: around the best of them.
     - `found`: with the error as `objective`; `around`: of each.
     - `reference`: the error of the reference.
-    - `evaluations`: of the error, with or without its gradient; `failed`: descents without one.
+    - `evaluations`: of the error, with or without its gradient; `failed`: descents that met no
+      number.
     - `pixels`: of the sensor's side in training.
     """
 
@@ -98,7 +101,7 @@ def train(
     goal, space = TrainingGoal(wanted.reconstruction), config.space()
     training = build_training(config, wanted, problem)
     progress("training, samples")
-    starts = _starts(config, wanted, goal, space, training, points)
+    starts, sampled = _starts(config, wanted, goal, space, training, points)
     # Steps were counted before it was known whether there are as many.
     for _ in range(wanted.starts - len(starts)):
         progress("training")
@@ -124,7 +127,7 @@ def train(
         ended.found,
         around,
         float(reference),
-        ended.evaluations + len(points) + wanted.samples,
+        ended.evaluations + sampled,
         ended.failed,
         training.sensor.shape[0],
         _surroundings(config, goal, space, training, ended.found),
@@ -132,13 +135,15 @@ def train(
 
 
 def _starts(config: DesignConfig, wanted: TrainingConfig, goal, space, training, points):
-    """The lowest in training error, apart from each other."""
+    """The lowest in training error, apart from each other; and of how many."""
     own = _reference_point(space)
     dtype, key = space.lower.dtype, jax.random.key(config.seed)
     given = jnp.asarray(np.stack([*points, *([] if own is None else [own])]), dtype)
     every = jnp.concatenate([given, even_samples(space.size, wanted.samples, key, dtype)])
-    values = evaluate(goal, space, training, every, at_a_time=1)
-    return every[best_apart(np.asarray(every), np.asarray(values), wanted.starts)]
+    values = np.asarray(evaluate(goal, space, training, every, at_a_time=1))
+    known = np.flatnonzero(np.isfinite(values)) if np.isfinite(values).any() else slice(None)
+    best = best_apart(np.asarray(every)[known], values[known], wanted.starts, least=_BASIN)
+    return every[known][best], len(every)
 
 
 def _surroundings(config: DesignConfig, goal, space: DesignSpace, training, found):

@@ -124,7 +124,7 @@ class CropConvolution(AbstractOperator):
         """The adjoint of `combine`."""
         rows, columns = capture.shape[-2:]
         leading = capture.shape[:-2] + (1,) * self.summed
-        # Of what stands beside the capture a gradient keeps a copy, but for the spectrum itself.
+        # A gradient keeps the factor beside the capture: its conjugate would be one more copy.
         return (capture.conj().reshape(*leading, rows, columns) * self.spectrum).conj()
 
 

@@ -53,6 +53,7 @@ class NormalInverse(eqx.Module):
         smooth = penalties.variation * difference_symbol(self.window, spectrum.real.dtype)
         if self.power is not None:
             inverse = 1 / (penalties.data * self.power + smooth + penalties.image)
+            # By real factors, of which a gradient keeps no complex copy.
             return jax.lax.complex(spectrum.real * inverse, spectrum.imag * inverse)
         planes = spectrum.shape[-3]
         depth = penalties.variation * self._depth_symbol(planes, smooth.dtype)

@@ -198,7 +198,7 @@ def _shortened_slope(channels: bool, primals, tangents):
 
 
 def _kept_and_longer(slopes, step, channels: bool):
-    """The part of a vector that shortening leaves: max(0, 1 − step/length); where it is above 0."""
+    """The part of a vector that shortening leaves, max(0, 1 − step/length), and where it is any."""
     length = _norm(slopes, channels=channels)
     longer = length > step
     return jnp.where(longer, 1 - step / jnp.where(longer, length, 1), 0), longer
