@@ -36,6 +36,7 @@ def test_design_is_found_from_its_response():
     assert 64 < result.evaluations <= 64 + 4 * 31
 
 
+@pytest.mark.thorough
 def test_other_wishes_do_not_compile_again():
     match()
     before = _least_squares._cache_size()
