@@ -168,7 +168,7 @@ def _norm(slopes, *, channels: bool):
 @functools.partial(jax.custom_jvp, nondiff_argnums=(2,))
 def _shortened(slopes, step, channels: bool):
     """Vectors of slopes, over the channel axis too if these are joined, shortened by `step`."""
-    kept, _ = _kept_and_longer(slopes, step, channels)
+    kept, _, _ = _kept(slopes, step, channels)
     return tuple(s * kept for s in slopes)
 
 
@@ -179,8 +179,7 @@ def _shortened_slope(channels: bool, primals, tangents):
     Written out so that a gradient holds k and n alone: the compiler's own holds four times as much.
     """
     (slopes, step), (turns, change) = primals, tangents
-    kept, longer = _kept_and_longer(slopes, step, channels)
-    length = jnp.where(longer, _norm(slopes, channels=channels), 1)
+    kept, longer, length = _kept(slopes, step, channels)
     direction = tuple(jnp.where(longer, s / length, 0) for s in slopes)
     turns = [
         jnp.zeros_like(s) if isinstance(t, SymbolicZero) else t
@@ -197,8 +196,12 @@ def _shortened_slope(channels: bool, primals, tangents):
     return tuple(s * kept for s in slopes), out
 
 
-def _kept_and_longer(slopes, step, channels: bool):
-    """The part of a vector that shortening leaves, max(0, 1 − step/length), and where it is any."""
-    length = _norm(slopes, channels=channels)
-    longer = length > step
-    return jnp.where(longer, 1 - step / jnp.where(longer, length, 1), 0), longer
+def _kept(slopes, step, channels: bool):
+    """The part of a vector that shortening leaves, max(0, 1 − step/length).
+
+    With where it leaves any, and the length there (1 elsewhere).
+    """
+    whole = _norm(slopes, channels=channels)
+    longer = whole > step
+    length = jnp.where(longer, whole, 1)
+    return jnp.where(longer, 1 - step / length, 0), longer, length
