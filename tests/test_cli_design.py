@@ -64,10 +64,10 @@ def test_options_and_what_is_printed(file, asked, tmp_path):
     rows = [line for line in result.stdout.splitlines() if "│" in line]
     assert [row.split("│")[1].strip() for row in rows] == ["pairs", "found 1"]  # that are simulated
     assert [cell.strip() for cell in rows[0].split("│")[2:-1]] == [
-        *("25.00", "3", "", "24.13", "–")
+        *("25.00", "3.00", "", "24.13", "–")
     ]
     assert [cell.strip() for cell in rows[1].split("│")[2:-1]] == [
-        *("17.13", "2.5", "+0.19", "+0.46", "–")
+        *("17.13", "2.50", "+0.19", "+0.46", "–")
     ]
     assert f"report: {out / 'report.html'}" in result.stdout
     assert result.stderr == ""

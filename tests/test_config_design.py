@@ -58,6 +58,36 @@ def test_a_free_number_belongs_to_all_phases_of_its_shots(tmp_path, entry, captu
     assert [(v.lower, v.upper) for v in space.variables] == [(lower, upper)] * len(captures)
 
 
+def test_width_wavelength_and_exposure(tmp_path):
+    """The width belongs to all; the exposures of all captures are as long as the reference's."""
+    free = (
+        "search.free=[{variable: wavelength, bounds: [450 nm, 0.7 um], shots: [1]}, "
+        "{variable: exposure, bounds: [0.4, 1.6], shots: [2]}, "
+        "{variable: width, bounds: [1 mm, 2.4 mm]}]"
+    )
+    config = tiny.design(tmp_path, free, "noise={read_noise: 4, electrons: 900}")
+    space = config.space()
+    named = [(v.name, v.lower, v.upper, v.captures) for v in space.variables]
+    assert named == [
+        ("width", 1.0, 2.4, ()),
+        ("wavelength", pytest.approx(4.5e-4), pytest.approx(7e-4), (0, 1)),
+        ("exposure", 0.4, 1.6, (2, 3)),
+    ]
+    assert space.limits.exposure == 4
+    assert config.widest() == 2.4
+    assert tiny.design(tmp_path).widest() == 2.0
+    path = tmp_path / "again.yaml"
+    path.write_text(dump_config(config), encoding="utf-8")
+    assert load_design(path) == config
+
+
+def test_a_display_shows_no_finer_than_its_pixels(tmp_path):
+    display = "mask.pixel_pitch=50 um"
+    line = fault(tmp_path, display, "search.limits.mask_pixel=40 um")
+    assert "search.limits.mask_pixel: 0.04 mm is finer than the display's pixels of 0.05" in line
+    assert tiny.design(tmp_path, display, "search.limits.mask_pixel=50 um").mask.pixel_pitch == 0.05
+
+
 def test_fringe_scanning_takes_four_captures_a_shot(tmp_path):
     config = tiny.design(
         tmp_path, "reference.synthesis=fringe_scanning", "search.limits.captures=8"
@@ -71,6 +101,9 @@ def test_the_farthest_distance_keeps_the_thickness(tmp_path):
     assert tiny.design(tmp_path, free).farthest() == 9.0
     assert tiny.design(tmp_path, free, "search.limits.thickness=5 mm").farthest() == 5.0
     assert tiny.design(tmp_path, free, "search.limits.thickness=2.5 mm").farthest() == 3.0
+
+
+SHARED = ("search.free[0]", "all masks share the width; drop 'shared' and 'shots'")
 
 
 @pytest.mark.parametrize(
@@ -90,14 +123,34 @@ def test_the_farthest_distance_keeps_the_thickness(tmp_path):
         ("search.free.0.bounds=[8 mm, 9 mm]", "search.free[0].bounds", "is a length, not a curv"),
         ("search.free.0.bounds=[8, 9]", "search.free[0].bounds", "8 has no unit"),
         ("search.free.0.bounds=8 /mm^2", "search.free[0].bounds", "give [lowest, highest]"),
-        ("search.free.0.variable=width", "search.free[0].variable", "'beta' or 'distance'"),
+        ("search.free.0.variable=tilt", "search.free[0].variable", "'width' or 'exposure'"),
+        ("search.free.0={variable: width, bounds: [1 mm, 2 mm], shared: true}", *SHARED),
+        ("search.free.0={variable: width, bounds: [1 mm, 2 mm], shots: [1]}", *SHARED),
+        (
+            "search.free.0={variable: exposure, bounds: [0.5, 1.5], shots: [1]}",
+            *("search.free", "matters to noise that counts electrons"),
+        ),
+        (
+            "search.free.0={variable: exposure, bounds: [0.5 s, 1.5]}",
+            *("search.free[0].bounds", "'0.5 s' is no number; give parts of the reference's"),
+        ),
+        (
+            "search.free.0={variable: wavelength, bounds: [500 nm, 2 mm]}",
+            *("search.free[0].bounds", "give bounds from 10 nm to 1 mm"),
+        ),
+        (
+            "mask={width: 2 mm, fill_factor: 0.8}",
+            *("mask.fill_factor", "of a display's pixels; give their pixel_pitch, too"),
+        ),
         ("search.free.0.colour=1", "search.free[0].colour", "variable, bounds, shared, shots"),
         ("search.free=[]", "search.free", "give at least 1"),
         ("search.starts=0", "search.starts", "greater than or equal to 1"),
         ("search.limits.captures=0", "search.limits.captures", "greater than or equal to 1"),
         ("reference.shots=[]", "reference.shots", "give at least 1"),
         ("reference.shots.1.beta=25 /mm^2", "reference.shots", "hold an entry twice"),
-        ("reference.shots.1.wavelength=600 nm", "reference.shots[1].wavelength", "one wavelength"),
+        ("reference.shots.1.wavelength=600 nm", "reference.shots[1].wavelength", "whole file"),
+        ("reference.shots.0.width=1 mm", "reference.shots[0].width", "whole file; drop this one"),
+        ("reference.shots.0.exposure=2", "reference.shots[0].exposure", "whole file"),
         ("reference.name=Found 2", "reference.name", "is what another or a found design is called"),
         ("search.band=[0.1, 0.4]", "search", "objective bayes_error has no band"),
         ("validate.seeds=0", "validate.seeds", "greater than or equal to 1"),

@@ -4,6 +4,7 @@ import inspect
 import json
 from types import SimpleNamespace
 
+import jax
 import numpy as np
 import pytest
 import skimage.io
@@ -21,22 +22,21 @@ from thincam_jax.design_run import (
     build_study,
     check_design,
     compare,
-    full_well,
 )
 from thincam_jax.design_run import Transfer as ContrastTransfer
 from thincam_jax.design_run import problem as problem_of_search
 from thincam_jax.design_run.landscape import Landscape
 from thincam_jax.design_run.problem import Goal
-from thincam_jax.design_run.ranking import Candidate, Result, Shot
+from thincam_jax.design_run.ranking import Candidate, Result
 from thincam_jax.design_run.sensitivity import FreeValue
 from thincam_jax.report.design_figures import (
     as_png,
-    axis_label,
     draw_landscape,
     draw_mtf,
     draw_responses,
 )
 from thincam_jax.report.design_page import findings
+from thincam_jax.report.design_words import cells, free_number, sentence, told_of
 from thincam_jax.run_design import DesignFolder, run_design, steps
 from thincam_jax.sensor import electrons_per_unit
 from thincam_jax.study import build
@@ -133,13 +133,19 @@ def test_report_stands_alone(whole):
     assert "kind: design" in page
 
 
+def shots_of(method):
+    return tuple(tiny.shot(s.beta, s.distance) for s in method.shots)
+
+
 @pytest.fixture
 def again(whole, monkeypatch):
     """The same design in another folder without the search; `found` may be changed."""
     config, path, design, _ = whole
     methods = load_config(path / "found.yaml").methods[1:]
     found = tuple(
-        Candidate(one["name"], tuple(Shot(s.beta, s.distance) for s in m.shots), 0.1, 0.09, RINGS)
+        Candidate(
+            one["name"], tuple(tiny.shot(s.beta, s.distance) for s in m.shots), 0.1, 0.09, RINGS
+        )
         for one, m in zip(design["found"][:2], methods, strict=True)
     )
     again = SimpleNamespace(config=config, folder=DesignFolder(path.parent / "again"), found=found)
@@ -173,7 +179,7 @@ def test_interrupted_design_goes_on(whole, again, monkeypatch):
     # Other designs are not taken for those that were simulated.
     same, again.found = (
         again.found,
-        tuple(one._replace(shots=(one.shots[0], Shot(15.5, 3.0))) for one in again.found),
+        tuple(one._replace(shots=(one.shots[0], tiny.shot(15.5, 3.0))) for one in again.found),
     )
     interrupted()
     again.found = same
@@ -195,10 +201,11 @@ def test_fronts_are_written_and_reported(whole, again, monkeypatch, tmp_path):
         f"search.free=[{bounds}, {{variable: distance, bounds: [2 mm, 3 mm]}}]",
         "pareto.thickness={bounds: [2 mm, 3 mm], points: 2}",
     )
-    points = tuple(Point(cost, (Shot(20.0, cost),) * 2, 4 * cost, "", 0.1) for cost in (2.0, 3.0))
+    points = tuple(
+        Point(cost, (tiny.shot(20.0, cost),) * 2, 4 * cost, "", 0.1) for cost in (2.0, 3.0)
+    )
 
-    def found(_, progress, well):
-        assert well is None
+    def found(_, progress):
         for point in (*points, *points[:1], *points[1:]):  # back, and there again
             progress(f"thickness {point.cost}")
         return Fronts(Front(points, points[1]), None, None, 18.75, None)
@@ -253,7 +260,7 @@ def test_gains_are_taken_seed_by_seed():
 
 def test_shots_that_coincide_are_two_exposures(tmp_path):
     config = tiny.design(tmp_path)
-    same = SimpleNamespace(name="found 1", shots=(Shot(20.0, 3.0),) * 2)
+    same = SimpleNamespace(name="found 1", shots=(tiny.shot(20.0, 3.0),) * 2)
     method = build_study(config, [same]).methods[1]
     assert len(build.settings(build_study(config, [same]), method)) == 4
     assert len({shot.beta for shot in method.shots}) == 2
@@ -274,7 +281,7 @@ def test_only_the_simulation_has_the_pixels_of_a_display(tmp_path):
 
 def test_electrons_are_those_of_the_file(tmp_path):
     config = tiny.design(tmp_path, "noise={read_noise: 0, electrons: 2e5}")
-    study = build_study(config, (), full_well(config))
+    study = build_study(config)
     setting = build.all_settings(study)[0]
     plane = build.build_plane(study, study.targets[0])
     camera = build.build_camera(study, setting)
@@ -285,20 +292,50 @@ def test_electrons_are_those_of_the_file(tmp_path):
     assert float(noise.variance(clean, counted)[0]) == pytest.approx(
         float(clean.mean()) / 2e5, rel=1e-4
     )
-    assert full_well(tiny.design(tmp_path)) is None
+    assert float(build_noise_of(config, tiny.shot(20.0, 3.0, exposure=0.5))) == pytest.approx(
+        2 * float(clean.mean()) / 2e5, rel=0.05
+    )
+
+
+def build_noise_of(config, shot):
+    """Variance of the first capture of a found design, mm⁴."""
+    study = build_study(config, [SimpleNamespace(name="found 1", shots=(shot,) * 2)])
+    setting = build.settings(study, study.methods[1])[0]
+    plane = build.build_plane(study, study.targets[0])
+    return build.take(study, setting, plane, jax.random.key(0)).variance[0]
+
+
+def test_found_numbers_reach_the_simulation(tmp_path):
+    """Width (in whole pixels of a display), wavelength and exposure; what all share is left out."""
+    config = tiny.design(
+        tmp_path, "noise={read_noise: 0, electrons: 2e5}", "mask.pixel_pitch=50 um"
+    )
+    found = tiny.shot(20.0, 2.5, width=1.49, wavelength=6e-4, exposure=0.7)
+    study = build_study(config, [SimpleNamespace(name="found 1", shots=(found,))])
+    (shot,) = study.methods[1].shots
+    setting = build.settings(study, study.methods[1])[0]
+    assert shot.width == pytest.approx(1.45)
+    assert setting[:1] + setting[2:] == pytest.approx((20.0, 2.5, 6e-4, 1.45, 0.7))
+    camera = build.build_camera(study, setting)
+    assert (camera.mask.pixels, float(camera.mask.width)) == (29, pytest.approx(1.45))
+    assert float(camera.sensor.electrons) == pytest.approx(0.7 * 2e5)
+    assert study.methods[0].shots[0].model_dump(exclude_defaults=True).keys() == {
+        "beta",
+        "distance",
+    }
 
 
 class TestPictures:
     def result(self, reference=(25.0, 21.0), goal="bayes_error", axes=2):
         found = Candidate(
             "found 1",
-            (Shot(20.0, 3.0), Shot(17.0, 3.0)),
+            (tiny.shot(20.0, 3.0), tiny.shot(17.0, 3.0)),
             0.1,
             0.09,
             np.ones(64),
             (FreeValue("beta", (1,), 20.0, 0.1), FreeValue("beta", (2,), 17.0, None)),
         )
-        old = found._replace(name="pairs", shots=tuple(Shot(b, 3.0) for b in reference))
+        old = found._replace(name="pairs", shots=tuple(tiny.shot(b, 3.0) for b in reference))
         axis = np.linspace(12, 30, 7)
         named = tuple(("beta", (n,)) for n in range(1, axes + 1))
         level = np.linspace(0.09, 0.4, 7**axes).reshape((7,) * axes)
@@ -312,7 +349,7 @@ class TestPictures:
             assert ax.get_xlim()[1] >= right
             places = [tuple(float(c[0]) for c in line.get_data()) for line in ax.lines]
             assert places == [reference, (20.0, 17.0)]
-            assert ax.get_xlabel() == "β of shot 1 (rad/mm²)"
+            assert ax.get_xlabel() == "β of shot 1, rad/mm²"
             assert figure.axes[1].get_ylabel() == Goal("bayes_error").label
             assert as_png(figure).startswith(b"\x89PNG")
 
@@ -352,7 +389,41 @@ class TestPictures:
         assert draw_mtf(self.result(), 100.0) is None
 
     def test_labels(self):
-        assert axis_label("distance", (1, 2)) == "distance of shots 1, 2 (mm)"
+        assert free_number("distance", (1, 2)) == "distance of shots 1, 2, mm"
+        assert free_number("width", ()) == "mask width, mm"
+        assert free_number("exposure", (2,)) == "exposure of shot 2"
+
+    def test_axes_have_the_units_of_their_labels(self):
+        """Wavelengths are in nm, and all shots have the width of the first."""
+        result, axis = self.result(), np.linspace(4e-4, 6e-4, 7)
+        named = (("width", ()), ("wavelength", (2,)))
+        level = np.linspace(0.09, 0.4, 49).reshape(7, 7)
+        ax = draw_landscape(
+            result._replace(landscape=Landscape(named, (np.linspace(1, 3, 7), axis), level)), 1
+        ).axes[0]
+        assert (ax.get_xlabel(), ax.get_ylabel()) == ("mask width, mm", "wavelength of shot 2, nm")
+        assert ax.lines[0].get_xydata()[0] == pytest.approx([2.0, 500.0])
+        assert ax.get_ylim() == pytest.approx((400 - 100 / 6, 600 + 100 / 6))
+
+
+def test_what_differs_is_told():
+    """β and distances always; the width and the wavelength where they are not all the same."""
+
+    def design(*shots):
+        keys = ("beta_rad_per_mm2", "distance_mm", "wavelength_nm", "width_mm", "exposure")
+        return {"shots": [dict(zip(keys, shot, strict=True)) for shot in shots]}
+
+    one = design((20.0, 3.0, 500.0, 2.0, 1.0), (20.0, 2.5, 500.0, 2.0, 1.0))
+    other = design((25.0, 3.0, 620.0, 1.5, 1.0), (21.0, 3.0, 500.0, 1.5, 1.0))
+    assert told_of([one]) == ("beta", "distance")
+    names = told_of([one, other])
+    assert names == ("beta", "distance", "wavelength", "width")
+    assert cells(one, names) == ["20.00, 20.00", "3.00, 2.50", "500", "2.00"]
+    assert cells(other, names) == ["25.00, 21.00", "3.00", "620, 500", "1.50"]
+    assert sentence(other, names) == (
+        "β 25.00 at 3.00 mm, wavelength 620 nm, mask width 1.50 mm and "
+        "β 21.00 at 3.00 mm, wavelength 500 nm, mask width 1.50 mm"
+    )
 
 
 def test_sentences_of_the_report(whole):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import thincam_jax as tc
-from thincam_jax.sensor import read_out
+from thincam_jax.sensor import electrons_per_unit, read_out
 
 
 def ramp(shape=(200, 301), mean=0.7):
@@ -75,6 +75,21 @@ def test_each_image_of_a_batch_is_exposed_on_its_own():
     np.testing.assert_allclose(both[:, 0], [[0.5, 0.5], [5.0, 5.0]])
 
 
+def test_electrons_are_the_same_for_every_image(key):
+    """1000 from each mm², however bright the image; what is more than the well holds is lost."""
+    levels = jnp.repeat(jnp.array([[0.05, 0.3, 1.0]]), 60_000, axis=0)
+    sensor = tc.Sensor(levels.shape, 0.01, electrons=1000.0, full_well=1e5)
+    both = jnp.stack([levels, 10 * levels])
+    noisy = np.asarray(read_out(sensor, both, noise=tc.PoissonGaussianNoise(1e-6), key=key)) * 1000
+    np.testing.assert_allclose(noisy.mean(axis=1), [[50, 300, 1000], [500, 3000, 1e4]], rtol=0.005)
+    np.testing.assert_allclose(noisy.var(axis=1), [[50, 300, 1000], [500, 3000, 1e4]], rtol=0.03)
+    full = tc.Sensor((1, 3), 0.01, electrons=1000.0, full_well=300.0, bit_depth=2)
+    np.testing.assert_allclose(read_out(full, levels[:1]), [[0.0, 0.3, 0.3]], atol=1e-12)
+    counted = electrons_per_unit(full, both)
+    assert counted.shape == (2, 1, 1)
+    np.testing.assert_array_equal(counted, 1000.0)
+
+
 def test_quantisation():
     """2 bits: levels at 0, ⅓, ⅔ and 1 of the full well, here 1.25 of the brightest pixel."""
     image = jnp.linspace(0.0, 1.0, 401)[None]
@@ -121,6 +136,8 @@ def test_differentiable_through_the_noise(key):
         (lambda: tc.Sensor((4, 5), 1.0, exposure=1.0, bit_depth=0), "bit_depth = 0: give a whole"),
         (lambda: tc.Sensor((4, 5), 1.0, exposure=1.0, bit_depth=8.5), "bit_depth = 8.5"),
         (lambda: tc.Sensor((4, 5), 1.0, bit_depth=8), "bit_depth needs an exposure"),
+        (lambda: tc.Sensor((4, 5), 1.0, electrons=0.0), "electrons = 0.0 electrons from each mm²"),
+        (lambda: tc.Sensor((4, 5), 1.0, exposure=1.0, electrons=9.0), "how long .* give one"),
         (lambda: tc.GaussianNoise(np.nan), "snr_db is NaN; give a number in dB"),
         (lambda: tc.PoissonGaussianNoise(-1.0), "read_noise = -1.0 electrons"),
         (

@@ -10,6 +10,7 @@ import typer
 from thincam_jax.config import slug
 from thincam_jax.config_design import load_design
 from thincam_jax.design_run import check_design
+from thincam_jax.report.design_words import QUANTITIES, cells, told_of
 from thincam_jax.run_design import DesignFolder, run_design, steps
 from thincam_jax.terminal import INTERRUPTED, USER_ERRORS, Overrides, columns, console, fail, tell
 
@@ -45,20 +46,22 @@ def design(
 
 
 def _print(found: dict) -> None:
-    table = rich.table.Table("design", "β\nrad/mm²", "distance\nmm", "predicted")
     validation = found["validation"]
+    designs = (found["reference"], *found["compare"], *found["found"])
+    names = told_of(designs)
+    labels = (QUANTITIES[name].label.replace(", ", "\n") for name in names)
+    table = rich.table.Table("design", *labels, "predicted")
     for target in validation["pictures"]:
         table.add_column(f"{target}\ndB", justify="right")
     for target in validation["charts"]:
         table.add_column(f"{target}\nelements", justify="right")
-    for one in (found["reference"], *found["compare"], *found["found"]):
+    for one in designs:
         simulated = validation["methods"].get(one["name"])
         if simulated is None:
             continue
         table.add_row(
             one["name"],
-            ", ".join(f"{s['beta_rad_per_mm2']:.2f}" for s in one["shots"]),
-            ", ".join(f"{s['distance_mm']:.3g}" for s in one["shots"]),
+            *cells(one, names),
             f"{one['predicted_gain']:+.2f}" if "predicted_gain" in one else "",
             *(_gain(simulated[name], "gain_db") for name in validation["pictures"]),
             *(_gain(simulated[name], "gain_elements") for name in validation["charts"]),

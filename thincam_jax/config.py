@@ -68,17 +68,47 @@ class SensorConfig(Section):
     pitch: Length
     full_well: Annotated[float, Field(gt=0)] = 13_500.0
     exposure: Annotated[float, Field(gt=0)] | None = None
+    electrons: Annotated[float, Field(gt=0)] | None = None
     bit_depth: Annotated[int, Field(ge=1, le=24)] | None = None
 
+    @pydantic.model_validator(mode="after")
+    def _one(self):
+        if self.exposure is not None and self.electrons is not None:
+            message = "both this and exposure say how long the sensor is exposed; give one"
+            raise misfit(message, "electrons")
+        if self.bit_depth is not None and not self.counts:
+            message = "needs an exposure, such as 0.9; give it, or electrons"
+            raise misfit(message, "bit_depth")
+        return self
 
-class MaskConfig(Section):
-    """What all the study's Fresnel zone apertures share."""
+    @property
+    def counts(self) -> bool:
+        """Whether it is known how many electrons a pixel holds."""
+        return self.exposure is not None or self.electrons is not None
+
+
+class ApertureConfig(Section):
+    """What all Fresnel zone apertures share.
+
+    - `pixel_pitch`, `fill_factor`: of a display that shows them.
+    """
 
     width: Length
     profile: Literal["cosine", "binary"] = "cosine"
-    harmonics: Annotated[int, Field(ge=1, le=99)] = 9
     pixel_pitch: Length | None = None
     fill_factor: Annotated[float, Field(gt=0, le=1)] = 1.0
+
+    @pydantic.model_validator(mode="after")
+    def _display(self):
+        if self.pixel_pitch is None and self.fill_factor != 1:
+            raise misfit("is of a display's pixels; give their pixel_pitch, too", "fill_factor")
+        return self
+
+
+class MaskConfig(ApertureConfig):
+    """The same of a study, with the orders of binary masks that are computed."""
+
+    harmonics: Annotated[int, Field(ge=1, le=99)] = 9
 
 
 class ObjectConfig(Section):
@@ -103,11 +133,17 @@ class NoiseConfig(Section):
 
 
 class ShotConfig(Section):
-    """One setting of the camera; the phases of the synthesis are taken at each."""
+    """One setting of the camera; the phases of the synthesis are taken at each.
+
+    - `width`: of its masks; default that of the study.
+    - `exposure`: of each of its captures, relative to that of the sensor.
+    """
 
     beta: Curvature
     distance: Length
     wavelength: Wavelength | None = None
+    width: Length | None = None
+    exposure: Annotated[float, Field(gt=0)] = 1.0
 
 
 class PublishedConfig(Section):
@@ -247,7 +283,10 @@ def check_methods(config: Any) -> None:
     """Refuse methods whose captures or noise do not fit."""
     # A capture that is used twice would count its noise as two independent ones.
     for index, method in enumerate(config.methods):
-        shots = [(s.beta, s.distance, s.wavelength or config.wavelength) for s in method.shots]
+        shots = [
+            (s.beta, s.distance, s.wavelength or config.wavelength, s.width or config.mask.width)
+            for s in method.shots
+        ]
         for what, entries in (("shots", shots), ("phases", method.phases)):
             if len(set(entries)) < len(entries):
                 message = f"{what} hold an entry twice; give each once"
@@ -256,8 +295,14 @@ def check_methods(config: Any) -> None:
         if config.noise is None and method.kind == "wiener":
             message = "wiener weighs noise against signal; give a 'noise' section"
             raise misfit(message, "methods", index, "kind")
-    if config.noise and config.noise.read_noise is not None and config.sensor.exposure is None:
-        message = "read_noise counts electrons; give sensor.exposure, such as 0.9"
+        for number, shot in enumerate(method.shots):
+            if shot.exposure != 1 and not config.sensor.counts:
+                message = (
+                    "this is relative to the sensor's; give sensor.exposure or sensor.electrons"
+                )
+                raise misfit(message, "methods", index, "shots", number, "exposure")
+    if config.noise and config.noise.read_noise is not None and not config.sensor.counts:
+        message = "read_noise counts electrons; give sensor.exposure, such as 0.9, or electrons"
         raise misfit(message, "noise", "read_noise")
 
 

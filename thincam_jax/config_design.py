@@ -9,6 +9,7 @@ from pydantic import Field
 
 from thincam_jax.config import (
     Angle,
+    ApertureConfig,
     ConfigError,
     Length,
     MethodConfig,
@@ -28,12 +29,19 @@ from thincam_jax.config_file import read_raw
 from thincam_jax.config_pareto import ParetoConfig, check_pareto
 from thincam_jax.config_training import TrainingConfig
 from thincam_jax.design import Design, DesignSpace, Limits, Tolerances, Variable, shots
+from thincam_jax.design.space import UNITS
 from thincam_jax.psf import Model
 from thincam_jax.units import parse_quantity
 
 Objective = Literal["bayes_error", "robust_error", "worst_ratio", "limit", "unevenness"]
 Part = Annotated[float, Field(ge=0, le=1)]
-_KINDS = {"beta": ("curvature", "rad/mm^2"), "distance": ("length", "mm")}
+Free = Literal["beta", "distance", "wavelength", "width", "exposure"]
+_KINDS = {
+    "beta": ("curvature", "rad/mm^2"),
+    "distance": ("length", "mm"),
+    "wavelength": ("length", "mm"),
+    "width": ("length", "mm"),
+}
 # A band has to hold some of the 64 rings that the objectives average over.
 _NARROWEST_BAND = 1 / 16
 
@@ -48,19 +56,6 @@ class PixelsConfig(Section):
     def width(self) -> float:
         """Of the shorter side, mm."""
         return min(self.shape) * self.pitch
-
-
-class ApertureConfig(Section):
-    """What all masks share.
-
-    - `pixel_pitch`, `fill_factor`: of a display that shows them; only the simulation has its
-      pixels.
-    """
-
-    width: Length
-    profile: Literal["cosine", "binary"] = "cosine"
-    pixel_pitch: Length | None = None
-    fill_factor: Annotated[float, Field(gt=0, le=1)] = 1.0
 
 
 class DesignNoiseConfig(Section):
@@ -123,10 +118,11 @@ class RivalConfig(Section):
 class FreeConfig(Section):
     """One variable that is free, at every shot for itself, or as one number that they share.
 
-    `shots`: at which of them, counted from 1; default all.
+    - `bounds`: those of the exposure are parts of what each of the reference's captures has.
+    - `shots`: at which of them, counted from 1; default all. All masks share the width.
     """
 
-    variable: Literal["beta", "distance"]
+    variable: Free
     bounds: tuple[float, float]
     shared: bool = False
     shots: Annotated[tuple[Annotated[int, Field(ge=1)], ...], Field(min_length=1)] | None = None
@@ -138,17 +134,37 @@ class FreeConfig(Section):
             return (1.0, 1.0)
         if not isinstance(given, list | tuple) or len(given) != 2:
             raise ValueError(f"{given!r} is no pair; give [lowest, highest]")
-        kind, unit = _KINDS[info.data["variable"]]
-        lower, upper = (parse_quantity(text, kind) for text in given)
+        variable = info.data["variable"]
+        unit = UNITS[variable]
+        lower, upper = (_number(variable, text) for text in given)
         if not (math.isfinite(lower) and math.isfinite(upper) and lower > 0):
             raise ValueError(f"{lower:g} to {upper:g} {unit}; give bounds above zero")
         if not lower < upper:
             raise ValueError(f"bounds cross: {lower:g} to {upper:g} {unit}; give the lower first")
+        if variable == "wavelength" and not 1e-5 <= lower < upper <= 1:
+            raise ValueError(f"{lower:g} to {upper:g} mm; give bounds from 10 nm to 1 mm")
         return (lower, upper)
 
     @pydantic.field_serializer("bounds")
-    def _write(self, bounds: tuple[float, float]) -> list[str]:
-        return [f"{value!r} {_KINDS[self.variable][1]}" for value in bounds]
+    def _write(self, bounds: tuple[float, float]) -> list[str | float]:
+        if self.variable not in _KINDS:
+            return list(bounds)
+        return [f"{value!r} {UNITS[self.variable]}" for value in bounds]
+
+    @pydantic.model_validator(mode="after")
+    def _belongs(self):
+        if self.variable == "width" and (self.shared or self.shots is not None):
+            raise ValueError("all masks share the width; drop 'shared' and 'shots'")
+        return self
+
+
+def _number(variable: str, given: Any) -> float:
+    """In the package's unit; a share of the exposure has none."""
+    if variable in _KINDS:
+        return parse_quantity(given, _KINDS[variable][0])
+    if isinstance(given, bool) or not isinstance(given, int | float):
+        raise ValueError(f"{given!r} is no number; give parts of the reference's, such as 0.5")
+    return float(given)
 
 
 class LimitsConfig(Section):
@@ -271,6 +287,7 @@ class DesignConfig(Section):
     def _fits(self):
         check_names(self, "targets")
         _check_given(self)
+        _check_search(self)
         if self.prior.measured and not self.pictures():
             message = "measured needs a photograph among the targets; give prior.exponent instead"
             raise misfit(message, "prior", "measured")
@@ -300,8 +317,14 @@ class DesignConfig(Section):
 
     def space(self) -> DesignSpace:
         """What is searched; ValueError where no design keeps the limits."""
-        limits = Limits(**dict(self.search.limits))
-        return DesignSpace(self.reference_design(), tuple(_variables(self)), limits)
+        given, base = self.search.limits, self.reference_design()
+        # The reference's captures have a share of 1 each; what is found shares the same.
+        total = float(base.captures) if self.frees("exposure") else None
+        return DesignSpace(base, tuple(_variables(self)), Limits(**dict(given), exposure=total))
+
+    def frees(self, variable: Free) -> bool:
+        """Whether the search chooses it, of some shot."""
+        return any(free.variable == variable for free in self.search.free)
 
     def nearest(self) -> float:
         """The shortest distance of mask and sensor that is looked at, mm."""
@@ -316,6 +339,11 @@ class DesignConfig(Section):
         limit = self.search.limits.thickness or math.inf
         return max(reference, *(min(b, limit) for b in bounds), 0.0)
 
+    def widest(self) -> float:
+        """The widest mask that is looked at, mm."""
+        widths = [f.bounds[1] for f in self.search.free if f.variable == "width"]
+        return max([self.mask.width, *widths])
+
 
 def found_name(rank: int) -> str:
     """What the found design of a rank, from 1, is called."""
@@ -326,6 +354,9 @@ def _variables(config: DesignConfig):
     """The free numbers, each with the captures it belongs to."""
     phases = len(config.reference.method().shot_phases())
     for free in config.search.free:
+        if free.variable == "width":
+            yield Variable("width", *free.bounds)
+            continue
         chosen = free.shots or tuple(range(1, len(config.reference.shots) + 1))
         groups = [tuple((s - 1) * phases + p for p in range(phases)) for s in chosen]
         if free.shared:
@@ -356,17 +387,36 @@ def _check_shots(
     if len(set(shots)) < len(shots):
         raise misfit("shots hold an entry twice; give each once", *place, "shots")
     for index, shot in enumerate(given.shots):
-        if shot.wavelength not in (None, config.wavelength):
-            message = "a design has one wavelength; drop this one"
-            raise misfit(message, *place, "shots", index, "wavelength")
+        alone = {"wavelength": config.wavelength, "width": config.mask.width, "exposure": 1.0}
+        for key, own in alone.items():
+            if getattr(shot, key) not in (None, own):
+                message = f"the {key} is that of the whole file; drop this one"
+                raise misfit(message, *place, "shots", index, key)
     if slug(given.name) in taken:
         message = f"{given.name!r} is what another or a found design is called; choose another name"
         raise misfit(message, *place, "name")
 
 
+def _check_search(config: DesignConfig) -> None:
+    """What is asked for against the rest of the file."""
+    pixel, finest = config.mask.pixel_pitch, config.search.limits.mask_pixel
+    if pixel is not None and finest is not None and finest < pixel * (1 - 1e-6):
+        message = (
+            f"{finest:g} mm is finer than the display's pixels of {pixel:g} mm (mask.pixel_pitch); "
+            "give at least these"
+        )
+        raise misfit(message, "search", "limits", "mask_pixel")
+    if config.frees("exposure") and config.noise.electrons is None:
+        message = (
+            "how the exposure is divided matters to noise that counts electrons; give "
+            "noise.read_noise and noise.electrons, or do not free it"
+        )
+        raise misfit(message, "search", "free")
+
+
 def _blamed(message: str) -> str:
     """The entry of `search` that a message of the space is about."""
-    if "conflicts" in message or "feasible" in message:
+    if "conflict" in message or "feasible" in message:
         return "limits"
     return "free"
 

@@ -181,6 +181,11 @@ def _check_captures(config: Any, front: CapturesConfig) -> None:
             *place,
             "shots",
         )
+    if config.frees("exposure"):
+        message = (
+            "the captures of this front share the exposure evenly, and search.free has it; drop one"
+        )
+        raise misfit(message, *place)
     if not with_shots(config, front.shots[0]).search.free:
         message = f"of the first shots, {front.shots[0]}, nothing is free; give more, or free them"
         raise misfit(message, *place, "shots")

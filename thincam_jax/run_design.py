@@ -11,7 +11,6 @@ from thincam_jax.design_run import (
     find,
     find_fronts,
     find_steps,
-    full_well,
     pareto_steps,
     simulate,
 )
@@ -59,8 +58,7 @@ def run_design(config: DesignConfig, folder: DesignFolder, progress: Progress) -
     folder.claim(config)
     result = find(config, progress)
     best = result.found[: config.validation.best]
-    well = full_well(config)
-    study = build_study(config, best, well)
+    study = build_study(config, best)
     folder.write("found.yaml", dump_config(study))
     trials = {}
     for index, target in enumerate(study.targets):
@@ -68,7 +66,7 @@ def run_design(config: DesignConfig, folder: DesignFolder, progress: Progress) -
         trials[target.name] = _target(config, study, index, folder)
     design = record(config, result, study, compare(study, trials))
     if config.pareto is not None:
-        design["pareto"] = record_fronts(config, find_fronts(config, progress, well))
+        design["pareto"] = record_fronts(config, find_fronts(config, progress))
     progress("report")
     _draw(config, result, design, folder)
     surroundings = environment(time.time() - started)
@@ -101,7 +99,7 @@ def _draw(
 def _target(config: DesignConfig, study: StudyConfig, index: int, folder: DesignFolder):
     """The trials of a target, from before the interruption where the designs are still the same."""
     target = study.targets[index]
-    designs = [[[s.beta, s.distance] for s in m.shots] for m in study.methods]
+    designs = [[list(s.model_dump().values()) for s in m.shots] for m in study.methods]
     stored = folder.finished(target.name)
     if stored is None or stored["designs"] != designs:
         trials = simulate(study, index, target, config.validation.seeds)

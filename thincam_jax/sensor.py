@@ -20,26 +20,38 @@ class Sensor(eqx.Module):
     - `full_well`: electrons that a pixel holds.
     - `exposure`: the brightest noise-free pixel as a part of the full well; above 1 it saturates.
       None is an ideal sensor that never saturates.
+    - `electrons`: in place of `exposure`, an exposure time that is the same for every image: so
+      many electrons of a pixel from each mm² of open aperture, the unit of captures, before a
+      white scene.
     - `bit_depth`: bits of the analogue-digital converter, whose range is the full well; None does
-      not quantise. Needs an `exposure`.
+      not quantise. Needs an `exposure` or `electrons`.
     """
 
     shape: tuple[int, int] = eqx.field(static=True)
     pitch: Float[Array, ""]
     full_well: Float[Array, ""]
     exposure: Float[Array, ""] | None
+    electrons: Float[Array, ""] | None
     bit_depth: int | None = eqx.field(static=True)
 
-    def __init__(self, shape, pitch, *, full_well=13_500.0, exposure=None, bit_depth=None):
+    def __init__(
+        self, shape, pitch, *, full_well=13_500.0, exposure=None, electrons=None, bit_depth=None
+    ):
         self.shape = _checks.shape2d("shape", shape)
         self.pitch = _checks.positive("pitch", pitch, "mm")
         self.full_well = _checks.positive("full_well", full_well, "electrons")
-        self.exposure = None
+        if exposure is not None and electrons is not None:
+            raise ValueError(
+                "exposure and electrons both say how long the sensor is exposed; give one"
+            )
+        self.exposure = self.electrons = None
         if exposure is not None:
             self.exposure = _checks.positive("exposure", exposure, "parts of the full well")
+        if electrons is not None:
+            self.electrons = _checks.positive("electrons", electrons, "electrons from each mm²")
         if bit_depth is not None and (int(bit_depth) != bit_depth or not 1 <= bit_depth <= 24):
             raise ValueError(f"bit_depth = {bit_depth!r}: give a whole number from 1 to 24")
-        if bit_depth is not None and exposure is None:
+        if bit_depth is not None and exposure is None and electrons is None:
             raise ValueError("bit_depth needs an exposure: the converter's range is the full well")
         self.bit_depth = bit_depth
 
@@ -123,7 +135,8 @@ class PoissonGaussianNoise(AbstractNoise):
     def add(self, key, image, electrons):
         if electrons is None:
             raise ValueError(
-                "PoissonGaussianNoise counts electrons: give the Sensor an exposure, such as 0.9"
+                "PoissonGaussianNoise counts electrons: give the Sensor an exposure, such as 0.9, "
+                "or electrons"
             )
         shot_key, read_key = jax.random.split(key)
         mean = jnp.maximum(image * electrons, 0.0)
@@ -138,6 +151,9 @@ def electrons_per_unit(
     sensor: Sensor, image: Float[Array, "*batch y x"]
 ) -> Float[Array, "*batch 1 1"] | None:
     """Electrons per unit of each image at the sensor's exposure; None for an ideal sensor."""
+    if sensor.electrons is not None:
+        counted = sensor.electrons.astype(image.dtype)
+        return jnp.broadcast_to(counted, (*image.shape[:-2], 1, 1))
     if sensor.exposure is None:
         return None
     brightest = jnp.max(image, axis=(-2, -1), keepdims=True)

@@ -67,6 +67,36 @@ def test_mask_pixels_with_a_given_width():
     np.testing.assert_allclose(space.values(jnp.ones(1)), math.pi / 0.02 / 5.632)
 
 
+def test_the_point_of_a_design():
+    """It gives the design back, with the width's limit on β too; ½ where bounds leave no room."""
+    other = Variable("beta", 9.0, 60.0, (2, 3))
+    space = DesignSpace(BASE, (BETA, other, LENGTH, WIDE), Limits(mask_pixel=0.02))
+    points = jnp.asarray(np.random.default_rng(2).uniform(size=(20, 4)))
+    again = jax.vmap(lambda p: space.point(space.design(p)))(points)
+    np.testing.assert_allclose(again, points, atol=1e-12)
+    tight = DesignSpace(BASE, (BETA, Variable("distance", 6.5, 6.5, (0, 1, 2, 3))))
+    np.testing.assert_allclose(tight.point(BASE), [17 / 28, 0.5])
+    outside = shots([50.0, 21.0], 6.5, (0.0, 1.5), wavelength=5e-4, width=5.6)
+    assert float(tight.point(outside)[0]) == pytest.approx(1.5)
+
+
+def test_captures_share_an_exposure():
+    """The free shares as chosen; the others divide the rest as their own shares are."""
+    base = Design(
+        BASE.beta, BASE.phase, 6.5, wavelength=5e-4, width=5.6, exposure=[1.0, 1.0, 1.0, 3.0]
+    )
+    free = Variable("exposure", 0.5, 2.5, (0, 1))
+    space = DesignSpace(base, (BETA, free), Limits(exposure=6.0))
+    for place, shares in ((0.0, [0.5, 0.5, 1.25, 3.75]), (1.0, [2.5, 2.5, 0.25, 0.75])):
+        design = space.design(jnp.asarray([0.3, place]))
+        np.testing.assert_allclose(design.exposure, shares)
+        np.testing.assert_allclose(space.point(design), [0.3, place], atol=1e-12)
+    slope = jax.jacfwd(lambda p: space.design(p).exposure)(jnp.asarray([0.3, 0.5]))
+    np.testing.assert_allclose(slope[:, 1], [2, 2, -1, -3])
+    kept = DesignSpace(base, (BETA,), Limits(exposure=3.0)).design(jnp.asarray([0.3]))
+    np.testing.assert_allclose(kept.exposure, [0.5, 0.5, 0.5, 1.5])
+
+
 def test_mapped_and_compiled_once():
     space = two_betas()
     counted = count_traces(lambda space, points: jax.vmap(space.design)(points))
@@ -119,6 +149,16 @@ def test_active_limits_in_words():
             Limits(mask_pixel=0.03),
             "beta of capture 3 ≥ 21 rad/mm.2 conflicts with mask pixels of 0.03 mm, which over a "
             "width of 5.632 mm show at most 18.59",
+        ),
+        (
+            (Variable("exposure", 0.5, 1.0, (0, 1)), Variable("exposure", 0.5, 2.0, (2, 3))),
+            Limits(exposure=8.0),
+            "of every capture is free, and all of them share 8; leave at least one",
+        ),
+        (
+            (Variable("exposure", 0.5, 2.0, (0, 1)),),
+            Limits(exposure=4.0),
+            "free exposures of up to 4 shares conflict with 4 of all captures; give lower bounds",
         ),
         (
             (WIDE,),

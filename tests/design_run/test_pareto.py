@@ -16,7 +16,6 @@ from thincam_jax.design.search import Found, Search
 from thincam_jax.design_run import build_problem, find_fronts, pareto_steps
 from thincam_jax.design_run import problem as problem_of_search
 from thincam_jax.design_run.pareto import Front, Fronts, Point
-from thincam_jax.design_run.ranking import Shot
 from thincam_jax.design_run.record import record_fronts
 from thincam_jax.report.design_figures import as_png
 from thincam_jax.report.design_page import fronts as tables
@@ -106,7 +105,7 @@ def test_fronts_by_search(tmp_path):
     """With the search itself: no worse than the grid's, and the PSNR is that of a simulation."""
     quick = ("pareto.samples=16", "pareto.starts=2", "pareto.steps=8")
     config = tiny.design(tmp_path, FREE, LIGHT, THICKNESS, "pareto.captures.shots=[1, 2]", *quick)
-    fronts = find_fronts(config, tiny.ignore, 900.0)
+    fronts = find_fronts(config, tiny.ignore)
     assert fronts.captures is not None
     assert fronts.thickness is not None
     assert rising([p.resolution for p in fronts.thickness.points])
@@ -120,7 +119,8 @@ def exposed(config, count):
     """Error and resolution of copies of the reference's first shot, seen by an endless sensor."""
     problem = build_problem(config)
     given = pareto._of_shots(with_shots(config, 1), problem, count)
-    np.testing.assert_allclose(given.space.base.exposure, 1 / (2 * count))
+    divided = config.noise.electrons is not None
+    np.testing.assert_allclose(given.space.base.exposure, 2 / count if divided else 1.0)
     setup = eqx.tree_at(lambda s: s.sensor_width, given.data.setup, jnp.asarray(50.0))
     # Rings are compiled faster than the exact response.
     return float(pareto._exactly(given.space.base, given.data._replace(setup=setup))[1])
@@ -154,7 +154,9 @@ def test_captures_are_simulated_with_their_part_of_the_light(on_a_grid, tmp_path
     asked = []
 
     def simulate(study, index, target, seeds):
-        asked.append((study.sensor.full_well, index, target.name, seeds, len(study.methods)))
+        (method,) = study.methods
+        asked.append((method.shots[0].exposure, index, target.name, seeds))
+        assert study.sensor.electrons == config.noise.electrons
         return {study.methods[0].name: [{"psnr_db": 20.0 + len(asked)}]}
 
     best = []
@@ -172,9 +174,9 @@ def test_captures_are_simulated_with_their_part_of_the_light(on_a_grid, tmp_path
         tmp_path, LIGHT, "pareto.captures.shots=[4, 1]", "search.limits.captures=8"
     )
     told = []
-    fronts = find_fronts(config, told.append, 1000.0)
+    fronts = find_fronts(config, told.append)
     assert len(told) == pareto_steps(config.pareto) == 4
-    assert asked == [(2000.0, 1, "picture", 1, 1), (500.0, 1, "picture", 1, 1)]
+    assert asked == [(2.0, 1, "picture", 1), (0.5, 1, "picture", 1)]
     assert fronts.captures is not None
     assert [p.simulated for p in fronts.captures.points] == [(("picture", v),) for v in (21, 22)]
     assert fronts.captures.reference.cost == 4
@@ -183,7 +185,7 @@ def test_captures_are_simulated_with_their_part_of_the_light(on_a_grid, tmp_path
     (few, none), (many, before) = best
     assert (few, none, many) == (2, None, 8)
     np.testing.assert_allclose(before.design.beta, [25.0] * 8)
-    assert before.design.exposure[0] == pytest.approx(1 / 8)
+    assert before.design.exposure[0] == pytest.approx(4 / 8)
 
 
 def test_further_shots_are_as_the_last(tmp_path):
@@ -227,7 +229,7 @@ def hand_made():
     """Fronts with a point of each sort."""
 
     def point(cost, resolution, error=0.1, ends="", simulated=()):
-        return Point(cost, (Shot(20.0, 3.0),) * 2, resolution, ends, error, simulated)
+        return Point(cost, (tiny.shot(20.0, 3.0),) * 2, resolution, ends, error, simulated)
 
     lines = (point(2.0, 10.0), point(2.5, 12.0), point(3.0, 12.0), point(4.0, 18.75, ends="at it"))
     captures = (

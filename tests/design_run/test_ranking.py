@@ -152,6 +152,44 @@ def test_tolerance_is_a_change_of_one_per_cent(config, scored):
     assert one.values[0].tolerance == pytest.approx(np.sqrt(1.05) - 1)
 
 
+WIDTH = (
+    "search.free=[{variable: beta, bounds: [12 rad/mm^2, 30 rad/mm^2], shared: true}, "
+    "{variable: width, bounds: [1 mm, 2.5 mm]}]",
+    "reference.shots=[{beta: 15 rad/mm^2, distance: 3 mm}]",
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class Slope(Goal):
+    """1 + (β − 14)²/4 + 3 (width − 1.5)²."""
+
+    def __call__(self, design, data):
+        return 1 + (design.beta[0] - 14) ** 2 / 4 + 3 * (design.width - 1.5) ** 2
+
+
+def test_the_tolerance_of_a_width_holds_beta(tmp_path):
+    """Mask pixels tie β to the width in the search's cube, and not in a tolerance."""
+    config = tiny.design(tmp_path, *WIDTH, "search.limits.mask_pixel=80 um")
+    problem = build_problem(config)._replace(goal=Slope("bayes_error"))
+    finest = np.pi / 0.08 / 1.5
+    point = jnp.asarray([(1.5 - 1) / 1.5, (14.0 - 12) / (finest - 12)])
+    design, values = problem.space.design(point), problem.space.values(point)
+    np.testing.assert_allclose(values, [1.5, 14.0])
+    found = Found(design, values, 1.0, "converged", (), point)
+    width, beta = ranking._tolerances(problem, found, 2)
+    assert (width.variable, width.shots, beta.shots) == ("width", (), (1,))
+    assert width.tolerance == pytest.approx(np.sqrt(0.01 / 3))
+    assert beta.tolerance == pytest.approx(0.2)
+    # Over both there is no rectangle to draw.
+    around = landscape_of(problem.goal, problem.space, problem.data, design, 5, 2)
+    assert around.variables == (("beta", (1,)),)
+    np.testing.assert_allclose(around.axes[0][-1], finest)
+    np.testing.assert_allclose(around.goal[-1], 1 + (finest - 14) ** 2 / 4)
+    free = build_problem(tiny.design(tmp_path, *WIDTH))
+    around = landscape_of(problem.goal, free.space, free.data, design, 5, 2)
+    assert around.variables == (("width", ()), ("beta", (1,)))
+
+
 @pytest.mark.parametrize(
     ("slope", "curve", "rise", "change"),
     [(0.0, 2.0, 0.01, 0.1), (2.0, 0.0, 0.01, 0.005), (-3.0, 8.0, 1.0, 0.25)],

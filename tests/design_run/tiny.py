@@ -5,6 +5,7 @@ from pathlib import Path
 from study import tiny
 
 from thincam_jax.config_design import DesignConfig, load_design
+from thincam_jax.design_run.ranking import Shot
 
 TEXT = """\
 name: tiny design
@@ -51,6 +52,11 @@ def write(folder: Path, text: str = TEXT) -> Path:
 
 def design(folder: Path, *overrides: str, text: str = TEXT) -> DesignConfig:
     return load_design(write(folder, text), overrides)
+
+
+def shot(beta: float, distance: float, **others: float) -> Shot:
+    """A shot of a found design, with the wavelength and the mask of the file."""
+    return Shot(**{"beta": beta, "distance": distance, "wavelength": 5e-4, "width": 2.0, **others})
 
 
 def ignore(_: str) -> None:

@@ -51,11 +51,14 @@ class Limits(NamedTuple):
       of them, β·width ≤ π/mask_pixel.
     - `thickness`: the longest distance of mask and sensor, mm.
     - `captures`: how many at most.
+    - `exposure`: of all captures together, shares: what the free ones leave is divided among the
+      others as their own shares are.
     """
 
     mask_pixel: float | None = None
     thickness: float | None = None
     captures: int = MOST_CAPTURES
+    exposure: float | None = None
 
 
 class DesignSpace(eqx.Module):
@@ -78,6 +81,7 @@ class DesignSpace(eqx.Module):
         self.variables = tuple(sorted(variables, key=lambda v: v.name != "width"))
         _check_variables(base, self.variables)
         _check_limits(base, self.variables, self.limits)
+        _check_exposure(base, self.variables, self.limits)
         dtype = base.beta.dtype
         self.lower = jnp.asarray([v.lower for v in self.variables], dtype)
         upper = [self._upper(v) for v in self.variables]
@@ -99,16 +103,32 @@ class DesignSpace(eqx.Module):
 
     def values(self, point: Float[Array, " variable"]) -> Float[Array, " variable"]:
         """The free numbers of a point, in the order of `variables`."""
-        upper = self.upper
-        if self.limits.mask_pixel is not None:
-            width = self.base.width
-            if self.variables[0].name == "width":
-                # No wider than the lowest β allows, and β no higher than that width does.
-                width = self.lower[0] + point[0] * (upper[0] - self.lower[0])
-            finest = math.pi / self.limits.mask_pixel / width
-            is_beta = jnp.asarray([v.name == "beta" for v in self.variables])
-            upper = jnp.where(is_beta, jnp.minimum(upper, finest), upper)
-        return self.lower + point * (upper - self.lower)
+        width = self.base.width
+        if self.variables[0].name == "width":
+            # No wider than the lowest β allows, and β no higher than that width does.
+            width = self.lower[0] + point[0] * (self.upper[0] - self.lower[0])
+        return self.lower + point * (self._highest(width) - self.lower)
+
+    def point(self, design: Design) -> Float[Array, " variable"]:
+        """Where a design lies in the unit cube, or outside of it; ½ where there is no room.
+
+        Of a number that captures share, the first one's counts.
+        """
+        given = [
+            getattr(design, v.name)[v.captures[0]] if v.captures else design.width
+            for v in self.variables
+        ]
+        spans = self._highest(design.width) - self.lower
+        inside = (jnp.stack(given) - self.lower) / jnp.where(spans > 0, spans, 1)
+        return jnp.where(spans > 0, inside, 0.5)
+
+    def _highest(self, width: Float[Array, ""]) -> Float[Array, " variable"]:
+        """What masks of a width may have at most."""
+        if self.limits.mask_pixel is None:
+            return self.upper
+        finest = math.pi / self.limits.mask_pixel / width
+        is_beta = jnp.asarray([v.name == "beta" for v in self.variables])
+        return jnp.where(is_beta, jnp.minimum(self.upper, finest), self.upper)
 
     def _with_values(self, values: Float[Array, " variable"]) -> Design:
         design = self.base
@@ -118,7 +138,19 @@ class DesignSpace(eqx.Module):
             if variable.captures:
                 changed = number.at[jnp.asarray(variable.captures)].set(value)
             design = eqx.tree_at(lambda d, n=variable.name: getattr(d, n), design, changed)
-        return design
+        total = self.limits.exposure
+        if total is None:
+            return design
+        shared = self._shared_out(design.exposure, total)
+        return eqx.tree_at(lambda d: d.exposure, design, shared)
+
+    def _shared_out(self, exposure: Float[Array, " capture"], total: float):
+        """With that total: the captures whose exposure is not free divide the rest."""
+        free = {c for v in self.variables if v.name == "exposure" for c in v.captures}
+        rest = jnp.asarray([float(c not in free) for c in range(len(exposure))], exposure.dtype)
+        left = total - jnp.sum((1 - rest) * exposure)
+        scale = left / jnp.sum(rest * exposure)
+        return exposure * (1 + rest * (scale - 1))
 
 
 def active_limits(space: DesignSpace, point, *, within: float = 1e-3) -> tuple[str, ...]:
@@ -212,6 +244,24 @@ def _check_limits(base: Design, variables: tuple[Variable, ...], limits: Limits)
                 f"{limits.mask_pixel:g} mm; give a width of at most "
                 f"{math.pi / limits.mask_pixel / reach:.4g} mm"
             )
+
+
+def _check_exposure(base: Design, variables: tuple[Variable, ...], limits: Limits) -> None:
+    """Refuse shares that leave the captures that are not free nothing."""
+    if limits.exposure is None:
+        return
+    free = [v for v in variables if v.name == "exposure"]
+    if sum(len(v.captures) for v in free) == base.captures:
+        raise ValueError(
+            f"the exposure of every capture is free, and all of them share {limits.exposure:g}; "
+            "leave at least one that takes the rest"
+        )
+    most = sum(v.upper * len(v.captures) for v in free)
+    if most >= limits.exposure * (1 - 1e-6):
+        raise ValueError(
+            f"no design is feasible: free exposures of up to {most:g} shares conflict with "
+            f"{limits.exposure:g} of all captures; give lower bounds, so that the others have some"
+        )
 
 
 def _lowest(base: Design, variables: tuple[Variable, ...], name: str):

@@ -18,7 +18,6 @@ from thincam_jax.design_run.ranking import find_steps as find_steps
 from thincam_jax.design_run.simulate import simulate as simulate
 from thincam_jax.design_run.simulated import build_study as build_study
 from thincam_jax.design_run.simulated import check_design as check_design
-from thincam_jax.design_run.simulated import full_well as full_well
 from thincam_jax.design_run.train import TrainingGoal as TrainingGoal
 from thincam_jax.design_run.transfer import Transfer as Transfer
 from thincam_jax.design_run.transfer import modulation_transfer as modulation_transfer

@@ -2,18 +2,18 @@
 
 from typing import Any, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 
-from thincam_jax.design import Design, DesignSpace, landscape
-from thincam_jax.design_run.problem import spans_of
+from thincam_jax.design import Design, DesignSpace, Variable, landscape
 from thincam_jax.design_run.sensitivity import shots_of_variable
 
 
 class Landscape(NamedTuple):
     """The goal over one or two free numbers, the others as in the best design.
 
-    - `variables`: their names and shots; `axes`: their values; `goal`: (n,) or (n, n), the first
-      variable along the first axis.
+    - `variables`: their names and shots (none for the width); `axes`: their values.
+    - `goal`: (n,) or (n, n), the first variable along the first axis.
     """
 
     variables: tuple[tuple[str, tuple[int, ...]], ...]
@@ -31,16 +31,28 @@ def landscape_of(
     *,
     at_a_time: int = 32,
 ) -> Landscape | None:
-    """Over the first two free numbers, or the only one; None where bounds leave them no room."""
-    spans = spans_of(space)[:2]
+    """Over the first two free numbers, or the only one; None where bounds leave them no room.
+
+    The width comes last, and not beside β where a mask's pixels tie the two: that is no rectangle.
+    """
+    plane = DesignSpace(best, _shown(space), space.limits)
+    variables = plane.variables
+    ends = (plane.values(jnp.full(plane.size, end, plane.lower.dtype)) for end in (1.0, 0.0))
+    upper, lower = (np.asarray(end, dtype=float) for end in ends)
+    spans = upper - lower
     if not np.all(spans > 0):
         return None
-    variables = space.variables[:2]
-    plane = DesignSpace(best, variables, space.limits)
     _, found = landscape(goal, plane, data, count, at_a_time=at_a_time)
     place = np.linspace(0.0, 1.0, count)
-    lower = np.asarray(plane.lower, dtype=float)
     axes = tuple(low + place * span for low, span in zip(lower, spans, strict=True))
     shape = (count,) * len(variables)
     named = tuple((v.name, shots_of_variable(v, phases)) for v in variables)
     return Landscape(named, axes, np.asarray(found, dtype=float).reshape(shape))
+
+
+def _shown(space: DesignSpace) -> tuple[Variable, ...]:
+    shown = sorted(space.variables, key=lambda v: v.name == "width")[:2]
+    names = [v.name for v in shown]
+    if space.limits.mask_pixel is not None and names == ["beta", "width"]:
+        shown = shown[:1]
+    return tuple(shown)

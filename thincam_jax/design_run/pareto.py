@@ -31,7 +31,6 @@ from thincam_jax.design_run.problem import (
     Goal,
     Problem,
     build_problem,
-    place_of,
     search_problem,
 )
 from thincam_jax.design_run.ranking import Shot, shots_of_design
@@ -101,10 +100,8 @@ def pareto_steps(fronts: ParetoConfig | None) -> int:
     return sum(lines) + (2 * len(fronts.captures.shots) if fronts.captures is not None else 0)
 
 
-def find_fronts(config: DesignConfig, progress: Progress, full_well: float | None = None) -> Fronts:
+def find_fronts(config: DesignConfig, progress: Progress) -> Fronts:
     """The fronts that a design's file asks for; double precision, as in `find`.
-
-    `full_well`: electrons, of the simulation of as many captures as the reference takes.
 
     **Errors**: ConfigError where the objective was no number at any start.
     """
@@ -125,7 +122,7 @@ def find_fronts(config: DesignConfig, progress: Progress, full_well: float | Non
     points = []
     for point in fronts.captures.points:
         progress(f"{point.cost:g} captures, simulated")
-        points.append(point._replace(simulated=_simulated(config, point, full_well)))
+        points.append(point._replace(simulated=_simulated(config, point)))
     return fronts._replace(captures=fronts.captures._replace(points=tuple(points)))
 
 
@@ -203,23 +200,25 @@ def _captures(
 def _of_shots(config: DesignConfig, problem: Problem, count: int) -> Problem:
     """The search for designs of so many shots, on the frequencies of the others.
 
-    The whole exposure is that of the reference's captures, and each capture has the same share.
+    With noise that counts electrons they divide the exposure of the reference's captures evenly.
     """
     changed = with_shots(config, count)
     matrix = jnp.asarray(synthesis_matrix(changed.reference.method()), float)
     space = changed.space()
-    share = jnp.full(space.base.captures, 1 / space.base.captures, space.lower.dtype)
-    space = eqx.tree_at(lambda s: s.base.exposure, space, share)
-    given = problem._replace(goal=Goal("bayes_error"), space=space)
     if config.noise.electrons is not None:
-        given = _lit(given, config.noise.electrons * problem.space.base.captures)
-    return given._replace(
-        data=given.data._replace(synthesis=matrix), exact=given.exact._replace(synthesis=matrix)
+        captures = space.base.captures
+        share = jnp.full(captures, problem.space.base.captures / captures, space.lower.dtype)
+        space = eqx.tree_at(lambda s: s.base.exposure, space, share)
+    return Problem(
+        Goal("bayes_error"),
+        space,
+        problem.data._replace(synthesis=matrix),
+        problem.exact._replace(synthesis=matrix),
     )
 
 
 def _lit(problem: Problem, electrons: float) -> Problem:
-    """With so many electrons, in a whole exposure."""
+    """With so many electrons."""
 
     def lit(data: Data) -> Data:
         noise = data.setup.noise
@@ -237,8 +236,12 @@ def _longer(design: Design, base: Design, phases: int) -> Design:
     last = range(design.captures - phases, design.captures)
     more = (base.captures - design.captures) // phases
     order = jnp.asarray([*range(design.captures), *(list(last) * more)])
-    numbers = (design.beta[order], design.distance[order])
-    return eqx.tree_at(lambda d: (d.beta, d.distance), base, numbers)
+
+    def numbers(of: Design):
+        return of.beta, of.distance, of.wavelength
+
+    longer = tuple(number[order] for number in numbers(design))
+    return eqx.tree_at(lambda d: (*numbers(d), d.width), base, (*longer, design.width))
 
 
 def _best(
@@ -255,8 +258,7 @@ def _best(
     spaces = [problem.space] if own is None else []
     designs: list[Design] = []
     if beside is not None:
-        inside = np.clip(place_of(problem.space, beside.design), 0.0, 1.0)
-        place = jnp.asarray(inside, problem.space.lower.dtype)
+        place = jnp.clip(problem.space.point(beside.design), 0.0, 1.0)
         spaces.append(_near(problem.space, place))
         designs.append(problem.space.design(place))
     for space in spaces:
@@ -322,16 +324,11 @@ class _Named(NamedTuple):
     shots: tuple[Shot, ...]
 
 
-def _simulated(
-    config: DesignConfig, point: Point, full_well: float | None
-) -> tuple[tuple[str, float | None], ...]:
+def _simulated(config: DesignConfig, point: Point) -> tuple[tuple[str, float | None], ...]:
     """PSNR of every picture in the full simulation, at the seed of the configuration."""
-    reference = config.reference
-    captures = len(reference.shots) * len(reference.method().shot_phases())
-    well = None if full_well is None else full_well * captures / point.cost
     # What the reference cannot be called.
     name = found_name(1)
-    study = build_study(config, [_Named(name, point.shots)], well)
+    study = build_study(config, [_Named(name, point.shots)])
     study = study.model_copy(update={"methods": study.methods[-1:]})
     pictures = {t.name for t in config.pictures()}
     return tuple(

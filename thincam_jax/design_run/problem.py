@@ -160,7 +160,7 @@ def _exact_count(config: DesignConfig, highest) -> int:
     its points, up to that width to either side.
     """
     nearest = config.nearest()
-    shadow = config.mask.width * (1 + nearest / config.object.distance) / nearest
+    shadow = config.widest() * (1 + nearest / config.object.distance) / nearest
     return max(_FEWEST, math.ceil(_MARGIN * 2 * shadow * float(highest)) + 1)
 
 
@@ -203,25 +203,6 @@ def search_problem(problem: Problem, wanted: SearchConfig | ParetoConfig, seed: 
         steps=wanted.steps,
         solver=wanted.solver,
     )
-
-
-def place_of(space: DesignSpace, design: Design) -> np.ndarray:
-    """Where a design lies in the unit cube, or outside of it; ½ where the bounds leave no room.
-
-    Of a number that captures share, the first one's counts.
-    """
-    lower = np.asarray(space.values(jnp.zeros_like(space.lower)), dtype=float)
-    spans = spans_of(space)
-    values = [float(getattr(design, v.name)[v.captures[0]]) for v in space.variables]
-    inside = (np.asarray(values) - lower) / np.where(spans > 0, spans, 1.0)
-    return np.where(spans > 0, inside, 0.5)
-
-
-def spans_of(space: DesignSpace) -> np.ndarray:
-    """How long each side of the cube is in the variables' units; straight, with a fixed width."""
-    ends = (space.values(jnp.full(space.size, end, space.lower.dtype)) for end in (1.0, 0.0))
-    upper, lower = (np.asarray(end, dtype=float) for end in ends)
-    return upper - lower
 
 
 def broken_limits(config: DesignConfig) -> tuple[str, ...]:

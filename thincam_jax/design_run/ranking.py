@@ -35,10 +35,13 @@ _KEPT = 10  # designs that are re-scored and listed
 
 
 class Shot(NamedTuple):
-    """β in rad/mm² and distance in mm."""
+    """β in rad/mm²; distance, wavelength and mask's width in mm; exposure in the reference's."""
 
     beta: float
     distance: float
+    wavelength: float
+    width: float
+    exposure: float = 1.0
 
 
 class Candidate(NamedTuple):
@@ -190,22 +193,23 @@ def _named(candidates: Iterable[Candidate]) -> tuple[Candidate, ...]:
 
 
 def shots_of_design(design: Design, phases: int) -> tuple[Shot, ...]:
-    """β and distance of each shot, which takes `phases` captures."""
-    numbers = (design.beta, design.distance)
-    beta, distance = (np.asarray(n, dtype=float)[::phases] for n in numbers)
-    return tuple(Shot(float(b), float(d)) for b, d in zip(beta, distance, strict=True))
+    """The numbers of each shot, which takes `phases` captures."""
+    numbers = (getattr(design, name) for name in Shot._fields)
+    each = np.broadcast_arrays(*(np.asarray(n, dtype=float) for n in numbers))
+    rows = zip(*(n[::phases] for n in each), strict=True)
+    return tuple(Shot(*(float(n) for n in row)) for row in rows)
 
 
 def _alike(space: DesignSpace, one: Found, other: Found, phases: int) -> bool:
     """Whether two designs have the same shots, in whatever order."""
-    spans = {"beta": 0.0, "distance": 0.0}
+    spans = dict.fromkeys(Shot._fields, 0.0)
     for v, lower, upper in zip(space.variables, space.lower, space.upper, strict=True):
         spans[v.name] = max(spans[v.name], float(upper - lower))
     pairs = zip(*(sorted(shots_of_design(f.design, phases)) for f in (one, other)), strict=True)
     return all(
-        abs(a.beta - b.beta) <= APART * spans["beta"]
-        and abs(a.distance - b.distance) <= APART * spans["distance"]
+        abs(getattr(a, name) - getattr(b, name)) <= APART * span
         for a, b in pairs
+        for name, span in spans.items()
     )
 
 

@@ -5,14 +5,13 @@ from typing import Any
 
 import numpy as np
 
-from thincam_jax.config import StudyConfig
+from thincam_jax.config import ShotConfig, StudyConfig
 from thincam_jax.config_design import DesignConfig
 from thincam_jax.design import non_dominated
+from thincam_jax.design.space import UNITS
 from thincam_jax.design_run.pareto import Front, Fronts, Point
 from thincam_jax.design_run.problem import broken_limits
 from thincam_jax.design_run.ranking import Candidate, FreeValue, Result, Shot
-
-UNITS = {"beta": "rad/mm^2", "distance": "mm"}
 
 
 def record(config: DesignConfig, result: Result, study: StudyConfig, validation: dict) -> dict:
@@ -40,7 +39,7 @@ def record(config: DesignConfig, result: Result, study: StudyConfig, validation:
             "broken_limits": list(broken_limits(config)),
         },
         "compare": [
-            {"name": rival.name, "shots": [_shot(Shot(s.beta, s.distance)) for s in rival.shots]}
+            {"name": rival.name, "shots": [_shot(_given(config, s)) for s in rival.shots]}
             for rival in config.compare
         ],
         "found": [_found(result, candidate) for candidate in result.found],
@@ -170,8 +169,18 @@ def _point(config: DesignConfig, point: Point, cost: str) -> dict[str, Any]:
     }
 
 
+def _given(config: DesignConfig, shot: ShotConfig) -> Shot:
+    return Shot(shot.beta, shot.distance, config.wavelength, config.mask.width)
+
+
 def _shot(shot: Shot) -> dict[str, float | None]:
-    return {"beta_rad_per_mm2": _round(shot.beta), "distance_mm": _round(shot.distance)}
+    return {
+        "beta_rad_per_mm2": _round(shot.beta),
+        "distance_mm": _round(shot.distance),
+        "wavelength_nm": _round(shot.wavelength * 1e6),
+        "width_mm": _round(shot.width),
+        "exposure": _round(shot.exposure),
+    }
 
 
 def _value(value: FreeValue) -> dict[str, Any]:

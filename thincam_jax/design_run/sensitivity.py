@@ -8,15 +8,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from thincam_jax.design import DesignSpace, Variable
+from thincam_jax.design import DesignSpace, Limits, Variable
 from thincam_jax.design.search import Found
-from thincam_jax.design_run.problem import spans_of
 
 
 class FreeValue(NamedTuple):
     """A free number of a found design.
 
-    - `shots`: that it belongs to, from 1.
+    - `shots`: that it belongs to, from 1; none for the width, which all share.
     - `tolerance`: the change that makes the objective worse by 1 %; None where none does.
     """
 
@@ -27,7 +26,7 @@ class FreeValue(NamedTuple):
 
 
 class Around(NamedTuple):
-    """First and second derivative of an objective along each side of the cube."""
+    """First and second derivative of an objective by each free number; NaN where it has no room."""
 
     slopes: np.ndarray
     curves: np.ndarray
@@ -38,11 +37,8 @@ def free_values(
 ) -> tuple[FreeValue, ...]:
     """What the search chose, and how far each number may be off before `rise` is lost."""
     values = []
-    for number, (variable, span) in enumerate(zip(space.variables, spans_of(space), strict=True)):
-        change = None
-        if span > 0:
-            slope, curve = (float(a[number]) for a in around)
-            change = least_change(slope / span, curve / span**2, rise)
+    for number, variable in enumerate(space.variables):
+        change = least_change(float(around.slopes[number]), float(around.curves[number]), rise)
         shots = shots_of_variable(variable, phases)
         values.append(FreeValue(variable.name, shots, float(found.values[number]), change))
     return tuple(values)
@@ -51,6 +47,22 @@ def free_values(
 def shots_of_variable(variable: Variable, phases: int) -> tuple[int, ...]:
     """Which shots share it, from 1."""
     return tuple(sorted({c // phases + 1 for c in variable.captures}))
+
+
+def straight(space: DesignSpace, point) -> tuple[DesignSpace, Any, np.ndarray]:
+    """A cube in which one number changes at a time, the point in it, and the lengths of its sides.
+
+    In the search's own, the limit of a mask's pixels ties β to the width.
+    """
+    alone = DesignSpace(space.base, space.variables, Limits(exposure=space.limits.exposure))
+    spans = np.asarray(alone.upper - alone.lower, dtype=float)
+    return alone, alone.point(space.design(jnp.asarray(point, space.lower.dtype))), spans
+
+
+def per_unit(slopes, curves, spans: np.ndarray) -> Around:
+    """From derivatives along the sides of a cube."""
+    known = np.where(spans > 0, spans, np.nan)
+    return Around(np.asarray(slopes, float) / known, np.asarray(curves, float) / known**2)
 
 
 @functools.partial(jax.jit, static_argnames="goal")
@@ -70,7 +82,9 @@ def _along(goal: Any, space: DesignSpace, data: Any, point):
 
 def around(goal: Any, space: DesignSpace, data: Any, point) -> Around:
     """By forward differentiation, twice."""
-    return Around(*(np.asarray(d) for d in _along(goal, space, data, point)))
+    alone, place, spans = straight(space, point)
+    slopes, curves = _along(goal, alone, data, place)
+    return per_unit(slopes, curves, spans)
 
 
 def least_change(slope: float, curve: float, rise: float) -> float | None:

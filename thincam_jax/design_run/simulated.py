@@ -1,31 +1,27 @@
 """Designs as the methods of a study, which simulates them in full."""
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from thincam_jax.config import ConfigError, StudyConfig
-from thincam_jax.config_design import DesignConfig, ReferenceConfig
-from thincam_jax.study.build import all_settings, build_camera, build_plane, imaging
+from thincam_jax.config_design import DesignConfig
+from thincam_jax.study.build import build_plane
 from thincam_jax.study.check import check_study
 
-# The brightest noise-free pixel, as a part of the full well.
-_EXPOSURE = 0.9
+# Electrons of a full well that no pixel fills: the search knows of no saturation.
+_FULL_WELL = 1e9
 # Shots that coincide are two exposures of one setting; a study tells exposures apart by setting.
 _NUDGE = 1e-9
 
 
-def build_study(
-    config: DesignConfig, found: Sequence[Any] = (), full_well: float | None = None
-) -> StudyConfig:
-    """The designs that the file gives, and what was found (`name` and `shots`), side by side.
-
-    `full_well`: in electrons, for shot noise; see `full_well`.
-    """
+def build_study(config: DesignConfig, found: Sequence[Any] = ()) -> StudyConfig:
+    """The designs that the file gives, and what was found (`name` and `shots`), side by side."""
     reference = config.reference
-    methods = [_method(reference, reference.name, reference.shots)]
-    methods += [_method(reference, one.name, one.shots) for one in (*config.compare, *found)]
+    named = (*config.compare, *found)
+    methods = [_method(config, one.name, one.shots) for one in (reference, *named)]
     sensor: dict[str, Any] = {
         "shape": config.sensor.shape,
         "pitch": f"{config.sensor.pitch!r} mm",
@@ -33,10 +29,9 @@ def build_study(
     noise: dict[str, Any] = {"snr_db": config.noise.snr_db, "signal_power": "without_mean"}
     if config.noise.read_noise is not None:
         noise = {"read_noise": config.noise.read_noise}
-        # Before the light is known, any full well will do.
-        sensor |= {"full_well": full_well or 1e4, "exposure": _EXPOSURE}
-    named = ("wavelength", "mask", "object", "targets")
-    parts = config.model_dump(mode="json", include=set(named), exclude_none=True)
+        sensor |= {"full_well": _FULL_WELL, "electrons": config.noise.electrons}
+    shared = {"wavelength", "mask", "object", "targets"}
+    parts = config.model_dump(mode="json", include=shared, exclude_none=True)
     return StudyConfig.model_validate(
         {
             "name": f"{config.name} found"[:60],
@@ -52,19 +47,37 @@ def build_study(
     )
 
 
-def _method(reference: ReferenceConfig, name: str, shots: Sequence[Any]) -> dict[str, Any]:
-    written: list[tuple[float, float]] = []
+def _method(config: DesignConfig, name: str, shots: Sequence[Any]) -> dict[str, Any]:
+    written: list[dict[str, Any]] = []
     for shot in shots:
-        beta = shot.beta
-        while (beta, shot.distance) in written:
-            beta *= 1 - _NUDGE
-        written.append((beta, shot.distance))
+        entry = _shot(config, shot, shot.beta)
+        while entry in written:
+            beta = shot.beta * (1 - _NUDGE) ** (len(written) + 1)
+            entry = _shot(config, shot, beta)
+        written.append(entry)
     return {
         "name": name,
         "kind": "wiener",
-        "synthesis": reference.synthesis,
-        "shots": [{"beta": f"{b!r} rad/mm^2", "distance": f"{d!r} mm"} for b, d in written],
+        "synthesis": config.reference.synthesis,
+        "shots": written,
     }
+
+
+def _shot(config: DesignConfig, shot: Any, beta: float) -> dict[str, Any]:
+    """As a study has it; what all share is left out."""
+    entry: dict[str, Any] = {"beta": f"{beta!r} rad/mm^2", "distance": f"{shot.distance!r} mm"}
+    if shot.wavelength not in (None, config.wavelength):
+        entry["wavelength"] = f"{shot.wavelength!r} mm"
+    if shot.width not in (None, config.mask.width):
+        entry["width"] = f"{_shown(shot.width, config.mask.pixel_pitch)!r} mm"
+    if shot.exposure != 1:
+        entry["exposure"] = shot.exposure
+    return entry
+
+
+def _shown(width: float, pixel: float | None) -> float:
+    """A display shows whole pixels."""
+    return width if pixel is None else max(1, math.floor(width / pixel + 1e-6)) * pixel
 
 
 def check_design(config: DesignConfig) -> None:
@@ -77,20 +90,3 @@ def check_design(config: DesignConfig) -> None:
                 f"targets[{index}]: {image.shape[-2]}×{image.shape[-1]} pixels are too few to "
                 "measure a spectrum; give at least 32×32, or prior.exponent"
             )
-
-
-def full_well(config: DesignConfig) -> float | None:
-    """Electrons of a full well with which a study counts the electrons that the file gives.
-
-    A study lets the brightest pixel of each capture fill the same part of the well. Here that is
-    what the electrons of each mm² of open aperture are in the reference's first capture of the
-    first target; the light of the others is nearly the same, for they share the mask's width. None
-    for noise at an SNR.
-    """
-    if config.noise.electrons is None:
-        return None
-    study = build_study(config)
-    setting = all_settings(study)[0]
-    plane = build_plane(study, study.targets[0])
-    brightest = float(np.max(imaging(study, build_camera(study, setting), setting, plane)))
-    return config.noise.electrons * brightest / _EXPOSURE

@@ -27,8 +27,8 @@ from thincam_jax.design.search import (
     even_samples,
 )
 from thincam_jax.design_run.landscape import Landscape, landscape_of
-from thincam_jax.design_run.problem import Problem, place_of, spans_of
-from thincam_jax.design_run.sensitivity import Around
+from thincam_jax.design_run.problem import Problem
+from thincam_jax.design_run.sensitivity import Around, per_unit, straight
 from thincam_jax.study.build import synthesis_matrix
 from thincam_jax.study.target import Progress
 from thincam_jax.targets import resize, sample_image
@@ -181,7 +181,7 @@ def _pixels(config: DesignConfig) -> int:
     """
     finest = [s.beta for s in config.reference.shots]
     finest += [f.bounds[1] for f in config.search.free if f.variable == "beta"]
-    edge = max(finest) * config.mask.width / (2 * math.pi)
+    edge = max(finest) * config.widest() / (2 * math.pi)
     needed = math.ceil(3 * edge * config.sensor.width)
     return max(32, min(needed, *config.sensor.shape))
 
@@ -196,10 +196,13 @@ def _picture(name: str, count: int) -> np.ndarray:
 
 def _reference_point(space: DesignSpace) -> np.ndarray | None:
     """Where the reference lies in the cube; None where it is not in it."""
-    shared = (getattr(space.base, v.name)[jnp.asarray(v.captures)] for v in space.variables)
-    if not np.all(spans_of(space) > 0) or any(np.ptp(np.asarray(own)) > 0 for own in shared):
+    shared = (
+        getattr(space.base, v.name)[jnp.asarray(v.captures)] for v in space.variables if v.captures
+    )
+    lower, upper = (space.values(jnp.full_like(space.lower, end)) for end in (0.0, 1.0))
+    if not bool(jnp.all(upper > lower)) or any(np.ptp(np.asarray(own)) > 0 for own in shared):
         return None
-    point = place_of(space, space.base)
+    point = np.asarray(space.point(space.base), dtype=float)
     # On a bound, rounding may put it outside.
     inside = np.all((point >= -1e-5) & (point <= 1 + 1e-5))
     return np.clip(point, 0.0, 1.0) if inside else None
@@ -211,9 +214,10 @@ def _around(goal: TrainingGoal, space: DesignSpace, training: Training, found: F
     At a bound, those of the nearest point that has room on either side.
     """
     size = space.size
-    middle = np.clip(np.asarray(found.point, float), APART, 1 - APART)
+    space, place, spans = straight(space, found.point)
+    middle = np.clip(np.asarray(place, float), APART, 1 - APART)
     steps = APART * np.eye(size)
     points = np.concatenate([middle[None], middle + steps, middle - steps])
     values = evaluate(goal, space, training, jnp.asarray(points, space.lower.dtype), at_a_time=1)
     level, up, down = np.split(np.asarray(values, float), [1, 1 + size])
-    return Around((up - down) / (2 * APART), (up - 2 * level + down) / APART**2)
+    return per_unit((up - down) / (2 * APART), (up - 2 * level + down) / APART**2, spans)

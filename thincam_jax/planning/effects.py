@@ -38,6 +38,9 @@ def _left_out(size: float, tolerance: float, what: str) -> str:
 def _shot_noise(camera: LenslessCamera, tolerance: float) -> Effect:
     """Of the brightest pixel, 1/√N of its N electrons."""
     sensor = camera.sensor
+    if sensor.electrons is not None:
+        note = "size not known: the brightest pixel depends on the scene's light"
+        return Effect("shot noise", False, None, note)
     if sensor.exposure is None:
         note = "size not known: give the Sensor an exposure, such as 0.9"
         return Effect("shot noise", False, None, note)

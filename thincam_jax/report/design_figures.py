@@ -10,9 +10,9 @@ from matplotlib.figure import Figure
 
 from thincam_jax.design_run import Candidate, Goal, Landscape, Result, TrainingGoal, Transfer
 from thincam_jax.design_run.ranking import Shot
+from thincam_jax.report.design_words import QUANTITIES, free_number
 from thincam_jax.report.figures import line_style
 
-_SYMBOLS = {"beta": ("β", "rad/mm²"), "distance": ("distance", "mm")}
 _ROOM = 0.06  # around points, as a part of an axis
 _SHADED = 85  # per cent of the landscape that the shades tell apart; the worst is one shade
 _LEAST_CONTRAST = 1e-5
@@ -73,16 +73,18 @@ def _draw(view: _View, result: Result, count: int) -> Figure:
     return figure
 
 
-def axis_label(name: str, shots: tuple[int, ...]) -> str:
-    """Of a free number: "β of shot 1 (rad/mm²)"."""
-    symbol, unit = _SYMBOLS[name]
-    word = "shot" if len(shots) == 1 else "shots"
-    return f"{symbol} of {word} {', '.join(str(s) for s in shots)} ({unit})"
-
-
 def _place(landscape: Landscape, one: Candidate) -> list[float]:
-    """Where a design lies on the landscape's axes."""
-    return [getattr(one.shots[shots[0] - 1], name) for name, shots in landscape.variables]
+    """Where a design lies on the landscape's axes, as drawn."""
+    return [
+        getattr(one.shots[shots[0] - 1 if shots else 0], name) * QUANTITIES[name].scale
+        for name, shots in landscape.variables
+    ]
+
+
+def _axes(landscape: Landscape) -> list[np.ndarray]:
+    """As drawn."""
+    named = zip(landscape.variables, landscape.axes, strict=True)
+    return [axis * QUANTITIES[name].scale for (name, _), axis in named]
 
 
 def _marker(number: int) -> dict:
@@ -103,7 +105,7 @@ def _marker(number: int) -> dict:
 
 def _draw_map(figure: Figure, ax, view: _View, points: tuple[Candidate, ...]) -> None:
     around, goal = view.around, view.goal
-    x, y = around.axes
+    x, y = _axes(around)
     told = goal.told(around.goal).T
     worst = np.nanpercentile(told, 100 - _SHADED if goal.wants_more else _SHADED)
     steps = {"vmin" if goal.wants_more else "vmax": worst}
@@ -117,8 +119,8 @@ def _draw_map(figure: Figure, ax, view: _View, points: tuple[Candidate, ...]) ->
         set_limits(*_reach(axis, own))
     for number, (one, place) in enumerate(zip(points, places, strict=True)):
         ax.plot(*place, label=view.name(one), clip_on=False, zorder=5, **_marker(number))
-    ax.set_xlabel(axis_label(*around.variables[0]))
-    ax.set_ylabel(axis_label(*around.variables[1]))
+    ax.set_xlabel(free_number(*around.variables[0]))
+    ax.set_ylabel(free_number(*around.variables[1]))
 
 
 def _reach(axis: np.ndarray, own: np.ndarray) -> tuple[float, float]:
@@ -133,13 +135,13 @@ def _reach(axis: np.ndarray, own: np.ndarray) -> tuple[float, float]:
 
 def _draw_line(ax, view: _View, points: tuple[Candidate, ...]) -> None:
     around, goal = view.around, view.goal
-    ax.plot(around.axes[0], goal.told(around.goal), color="black", linewidth=1)
+    ax.plot(_axes(around)[0], goal.told(around.goal), color="black", linewidth=1)
     for number, one in enumerate(points):
         level = view.drawn(one)
         assert level is not None  # for the type checker; what is drawn was scored
         place = _place(around, one)
         ax.plot(*place, float(goal.told(level)), label=view.name(one), zorder=5, **_marker(number))
-    ax.set_xlabel(axis_label(*around.variables[0]))
+    ax.set_xlabel(free_number(*around.variables[0]))
     ax.set_ylabel(goal.label)
     ax.grid(alpha=0.3)
 

@@ -5,10 +5,16 @@ from typing import Any
 
 from thincam_jax.config import dump_config
 from thincam_jax.config_design import DesignConfig
+from thincam_jax.report.design_words import (
+    QUANTITIES,
+    cells,
+    found_number,
+    free_number,
+    of_shots,
+    sentence,
+    told_of,
+)
 from thincam_jax.report.template import data_url, load_template
-
-_SYMBOLS = {"beta": "β", "distance": "distance"}
-_UNITS = {"beta": "rad/mm²", "distance": "mm"}
 
 
 def render(
@@ -18,7 +24,12 @@ def render(
     return load_template("design.html.jinja").render(
         config=config,
         design=design,
-        free=[_label(value) for value in design["found"][0]["values"]],
+        free=[free_number(v["variable"], v["shots"]) for v in design["found"][0]["values"]],
+        reference=[
+            of_shots(design["reference"], v["variable"], v["shots"])
+            for v in design["found"][0]["values"]
+        ],
+        numbers=[[found_number(v) for v in one["values"]] for one in design["found"]],
         validated=list(design["validation"]["methods"]),
         findings=findings(design),
         fronts=fronts(design),
@@ -28,21 +39,16 @@ def render(
     )
 
 
-def _label(value: dict[str, Any]) -> str:
-    shots = ", ".join(str(s) for s in value["shots"])
-    word = "shot" if len(value["shots"]) == 1 else "shots"
-    return f"{_SYMBOLS[value['variable']]} of {word} {shots}, {_UNITS[value['variable']]}"
-
-
 def findings(design: dict[str, Any]) -> list[str]:
     """What the numbers say, in sentences."""
     best, reference = design["found"][0], design["reference"]
+    names = told_of([best, reference])
     unit = design["objective"]["told"].rpartition("(")[2].rstrip(")")
     by = "training" if design["training"] else design["objective"]["name"]
     sentences = [
-        f"The best design by {by} is {_shots(best)}. The objective "
+        f"The best design by {by} is {sentence(best, names)}. The objective "
         f"predicts {best['predicted_gain']:+.3g} {unit} over {reference['name']} "
-        f"({_shots(reference)})."
+        f"({sentence(reference, names)})."
     ]
     if best["training_gain_db"] is not None:
         sentences.append(f"On the training images it gains {best['training_gain_db']:+.2f} dB.")
@@ -78,7 +84,6 @@ _COSTS = {
     "captures": ("captures", "captures"),
     "light": ("electrons from each mm²", "electrons_per_mm2"),
 }
-_SHOT_LABELS = ("β of the shots, rad/mm²", "distance, mm")
 _LIMIT = (
     "Resolution is the frequency up to which every ring of frequencies has a signal-to-noise "
     "ratio of at least 1."
@@ -95,6 +100,8 @@ def fronts(design: dict[str, Any]) -> list[dict[str, Any]]:
 
 def _front(name: str, front: dict[str, Any], reference: str) -> dict[str, Any]:
     label, cost = _COSTS[name]
+    names = told_of([*front["points"], front["reference"]])
+    labels = [QUANTITIES[name].label for name in names]
     points = [(_cost(p[cost]), p) for p in front["points"]]
     points.append((f"{reference}: {_cost(front['reference'][cost])}", front["reference"]))
     kept = {True: "no", False: "yes", None: ""}
@@ -104,14 +111,14 @@ def _front(name: str, front: dict[str, Any], reference: str) -> dict[str, Any]:
             "title": "Captures against PSNR",
             "labels": [
                 label,
-                *_SHOT_LABELS,
+                *labels,
                 "predicted, dB",
                 *(f"{p}, dB" for p in pictures),
                 "front",
             ],
             "rows": [
                 [
-                    *(text, *_numbers(p), f"{p['predicted_psnr_db']:.2f}"),
+                    *(text, *cells(p, names), f"{p['predicted_psnr_db']:.2f}"),
                     *(_decibel(p.get("simulated_psnr_db", {}).get(n)) for n in pictures),
                     kept[p.get("dominated")],
                 ]
@@ -124,10 +131,10 @@ def _front(name: str, front: dict[str, Any], reference: str) -> dict[str, Any]:
         }
     return {
         "title": f"{name.capitalize()} against resolution",
-        "labels": [label, *_SHOT_LABELS, "cycles/rad", "line pairs/mm on the object", "", "front"],
+        "labels": [label, *labels, "cycles/rad", "line pairs/mm on the object", "", "front"],
         "rows": [
             [
-                *(text, *_numbers(p)),
+                *(text, *cells(p, names)),
                 f"{p['resolution_cycles_per_rad']:.1f}",
                 f"{p['resolution_line_pairs_per_mm']:.3f}",
                 p["resolution_ends"] or "",
@@ -139,24 +146,12 @@ def _front(name: str, front: dict[str, Any], reference: str) -> dict[str, Any]:
     }
 
 
-def _numbers(point: dict[str, Any]) -> tuple[str, str]:
-    """β of each shot, and their distances, or the one that they share."""
-    betas = (f"{s['beta_rad_per_mm2']:.2f}" for s in point["shots"])
-    distances = [f"{s['distance_mm']:.2f}" for s in point["shots"]]
-    return ", ".join(betas), ", ".join(distances if len(set(distances)) > 1 else distances[:1])
-
-
 def _cost(value: float | int) -> str:
     return f"{value:.0f}" if value >= 1000 else f"{value:.4g}"
 
 
 def _decibel(value: float | None) -> str:
     return "–" if value is None else f"{value:.2f}"
-
-
-def _shots(one: dict[str, Any]) -> str:
-    each = (f"β {s['beta_rad_per_mm2']:.4g} at {s['distance_mm']:.4g} mm" for s in one["shots"])
-    return " and ".join(each)
 
 
 def _spread(spread: dict[str, Any], digits: int) -> str:

@@ -54,12 +54,21 @@ class Setting(NamedTuple):
     phase: float
     distance: float
     wavelength: float
+    width: float
+    exposure: float
 
 
 def settings(config: StudyConfig, method: MethodConfig) -> list[Setting]:
     """The exposures of a method, in the order of its synthesis."""
     return [
-        Setting(shot.beta, phase, shot.distance, shot.wavelength or config.wavelength)
+        Setting(
+            shot.beta,
+            phase,
+            shot.distance,
+            shot.wavelength or config.wavelength,
+            shot.width or config.mask.width,
+            shot.exposure,
+        )
         for shot in method.shots
         for phase in method.shot_phases()
     ]
@@ -74,7 +83,7 @@ def build_camera(config: StudyConfig, setting: Setting) -> LenslessCamera:
     mask = FresnelZoneAperture(
         setting.beta,
         setting.phase,
-        width=config.mask.width,
+        width=setting.width,
         profile=config.mask.profile,
         harmonics=config.mask.harmonics,
         pixel_pitch=config.mask.pixel_pitch,
@@ -84,10 +93,15 @@ def build_camera(config: StudyConfig, setting: Setting) -> LenslessCamera:
         config.sensor.shape,
         config.sensor.pitch,
         full_well=config.sensor.full_well,
-        exposure=config.sensor.exposure,
+        exposure=_times(config.sensor.exposure, setting.exposure),
+        electrons=_times(config.sensor.electrons, setting.exposure),
         bit_depth=config.sensor.bit_depth,
     )
     return LenslessCamera(mask, sensor, setting.distance)
+
+
+def _times(level: float | None, share: float) -> float | None:
+    return None if level is None else level * share
 
 
 def build_noise(config: StudyConfig) -> AbstractNoise | None:
