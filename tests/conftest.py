@@ -6,8 +6,11 @@ from pathlib import Path
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")  # set it to run the tests on another device
 os.environ["MPLBACKEND"] = "Agg"
-# Most of the tests' time goes into compiling, a quarter less of it without these emitters.
-os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false")
+# Most of the tests' time goes into compiling, half as much of it without these emitters and without
+# LLVM's optimisation of programs that run once.
+os.environ.setdefault(
+    "XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0"
+)
 
 import jax
 import jaxtyping

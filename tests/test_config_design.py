@@ -340,6 +340,13 @@ def test_examples(name):
     assert bool(broken_limits(config)) == (name == "design_slm")
 
 
+def test_example_of_little_light():
+    config = load_design(ROOT / "configs" / "design_light.yaml")
+    assert config.noise.electrons == 2000
+    assert [v.name for v in config.space().variables] == ["width", "beta", "beta", "exposure"]
+    assert config.space().limits.exposure == 4
+
+
 def test_example_of_fronts():
     config = load_design(ROOT / "configs" / "design_pareto.yaml")
     assert config.noise.electrons == 2000

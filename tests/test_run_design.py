@@ -36,7 +36,7 @@ from thincam_jax.report.design_figures import (
     draw_responses,
 )
 from thincam_jax.report.design_page import findings
-from thincam_jax.report.design_words import cells, free_number, sentence, told_of
+from thincam_jax.report.design_words import cells, free_number, in_words, told_of
 from thincam_jax.run_design import DesignFolder, run_design, steps
 from thincam_jax.sensor import electrons_per_unit
 from thincam_jax.study import build
@@ -420,10 +420,10 @@ def test_what_differs_is_told():
     assert names == ("beta", "distance", "wavelength", "width")
     assert cells(one, names) == ["20.00, 20.00", "3.00, 2.50", "500", "2.00"]
     assert cells(other, names) == ["25.00, 21.00", "3.00", "620, 500", "1.50"]
-    assert sentence(other, names) == (
-        "β 25.00 at 3.00 mm, wavelength 620 nm, mask width 1.50 mm and "
-        "β 21.00 at 3.00 mm, wavelength 500 nm, mask width 1.50 mm"
-    )
+    assert in_words(other, names) == [
+        "β 25.00 at 3.00 mm, wavelength 620 nm, mask width 1.50 mm",
+        "β 21.00 at 3.00 mm, wavelength 500 nm, mask width 1.50 mm",
+    ]
 
 
 def test_sentences_of_the_report(whole):

@@ -10,7 +10,7 @@ import typer
 from thincam_jax.config import slug
 from thincam_jax.config_design import load_design
 from thincam_jax.design_run import check_design
-from thincam_jax.report.design_words import QUANTITIES, cells, told_of
+from thincam_jax.report.design_words import in_words, told_of
 from thincam_jax.run_design import DesignFolder, run_design, steps
 from thincam_jax.terminal import INTERRUPTED, USER_ERRORS, Overrides, columns, console, fail, tell
 
@@ -49,8 +49,7 @@ def _print(found: dict) -> None:
     validation = found["validation"]
     designs = (found["reference"], *found["compare"], *found["found"])
     names = told_of(designs)
-    labels = (QUANTITIES[name].label.replace(", ", "\n") for name in names)
-    table = rich.table.Table("design", *labels, "predicted")
+    table = rich.table.Table("design", "predicted", show_lines=True)
     for target in validation["pictures"]:
         table.add_column(f"{target}\ndB", justify="right")
     for target in validation["charts"]:
@@ -60,8 +59,7 @@ def _print(found: dict) -> None:
         if simulated is None:
             continue
         table.add_row(
-            one["name"],
-            *cells(one, names),
+            "\n".join([one["name"], *in_words(one, names)]),
             f"{one['predicted_gain']:+.2f}" if "predicted_gain" in one else "",
             *(_gain(simulated[name], "gain_db") for name in validation["pictures"]),
             *(_gain(simulated[name], "gain_elements") for name in validation["charts"]),

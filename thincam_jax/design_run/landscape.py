@@ -31,7 +31,7 @@ def landscape_of(
     *,
     at_a_time: int = 32,
 ) -> Landscape | None:
-    """Over the first two free numbers, or the only one; None where bounds leave them no room.
+    """Over two of the free numbers, or the only one; None where bounds leave them no room.
 
     The width comes last, and not beside β where a mask's pixels tie the two: that is no rectangle.
     """

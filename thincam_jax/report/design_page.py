@@ -10,8 +10,8 @@ from thincam_jax.report.design_words import (
     cells,
     found_number,
     free_number,
+    in_words,
     of_shots,
-    sentence,
     told_of,
 )
 from thincam_jax.report.template import data_url, load_template
@@ -46,9 +46,9 @@ def findings(design: dict[str, Any]) -> list[str]:
     unit = design["objective"]["told"].rpartition("(")[2].rstrip(")")
     by = "training" if design["training"] else design["objective"]["name"]
     sentences = [
-        f"The best design by {by} is {sentence(best, names)}. The objective "
+        f"The best design by {by} is {' and '.join(in_words(best, names))}. The objective "
         f"predicts {best['predicted_gain']:+.3g} {unit} over {reference['name']} "
-        f"({sentence(reference, names)})."
+        f"({' and '.join(in_words(reference, names))})."
     ]
     if best["training_gain_db"] is not None:
         sentences.append(f"On the training images it gains {best['training_gain_db']:+.2f} dB.")

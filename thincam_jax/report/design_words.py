@@ -70,8 +70,8 @@ def cells(one: dict[str, Any], names: Sequence[str]) -> list[str]:
     return told
 
 
-def sentence(one: dict[str, Any], names: Sequence[str]) -> str:
-    """The shots of a design: "β 25.00 at 5.00 mm and β 21.00 at 6.50 mm"."""
+def in_words(one: dict[str, Any], names: Sequence[str]) -> list[str]:
+    """Each shot of a design: "β 25.00 at 5.00 mm", "β 21.00 at 6.50 mm"."""
     told = []
     for shot in range(1, len(one["shots"]) + 1):
         words = f"β {of_shots(one, 'beta', [shot])} at {of_shots(one, 'distance', [shot])} mm"
@@ -80,4 +80,4 @@ def sentence(one: dict[str, Any], names: Sequence[str]) -> str:
                 what, _, unit = QUANTITIES[name].label.partition(",")
                 words += f", {what} {of_shots(one, name, [shot])}{unit}"
         told.append(words)
-    return " and ".join(told)
+    return told
