@@ -81,6 +81,23 @@ def test_width_wavelength_and_exposure(tmp_path):
     assert load_design(path) == config
 
 
+@pytest.mark.parametrize(
+    ("entry", "part"),
+    [
+        ("bounds: [0.5, 1.5]", "leave one out to take the rest, such as by shots: [1]"),
+        ("bounds: [0.5, 2], shots: [1]", "up to 2 leave the other shots nothing of the 2 that"),
+    ],
+)
+def test_exposures_that_leave_nothing(tmp_path, entry, part):
+    noise = "noise={read_noise: 4, electrons: 900}"
+    line = fault(tmp_path, f"search.free=[{{variable: exposure, {entry}}}]", noise)
+    assert ": search.free: " in line
+    assert part in line
+    one = "reference.shots=[{beta: 25 /mm^2, distance: 3 mm}]"
+    line = fault(tmp_path, "search.free=[{variable: exposure, bounds: [0.5, 0.9]}]", noise, one)
+    assert "the exposure of the only shot is that of the reference; do not free it" in line
+
+
 def test_a_display_shows_no_finer_than_its_pixels(tmp_path):
     display = "mask.pixel_pitch=50 um"
     line = fault(tmp_path, display, "search.limits.mask_pixel=40 um")
@@ -128,6 +145,10 @@ SHARED = ("search.free[0]", "all masks share the width; drop 'shared' and 'shots
         ("search.free.0={variable: width, bounds: [1 mm, 2 mm], shots: [1]}", *SHARED),
         (
             "search.free.0={variable: exposure, bounds: [0.5, 1.5], shots: [1]}",
+            *("search.free", "matters to noise that counts electrons"),
+        ),
+        (
+            "search.free.0={variable: exposure, bounds: [0.5, 1.5]}",
             *("search.free", "matters to noise that counts electrons"),
         ),
         (

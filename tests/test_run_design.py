@@ -265,6 +265,12 @@ def test_shots_that_coincide_are_two_exposures(tmp_path):
     assert len(build.settings(build_study(config, [same]), method)) == 4
     assert len({shot.beta for shot in method.shots}) == 2
     assert [shot.beta for shot in method.shots] == pytest.approx([20.0, 20.0], rel=1e-8)
+    config = tiny.design(tmp_path, "noise={read_noise: 0, electrons: 2e5}")
+    longer = SimpleNamespace(
+        name="found 1", shots=tuple(tiny.shot(20.0, 3.0, exposure=e) for e in (0.7, 1.3))
+    )
+    method = build_study(config, [longer]).methods[1]
+    assert [(s.beta, s.exposure) for s in method.shots] == [(20.0, 0.7), (20.0, 1.3)]
 
 
 def test_only_the_simulation_has_the_pixels_of_a_display(tmp_path):

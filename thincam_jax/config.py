@@ -283,10 +283,17 @@ def check_methods(config: Any) -> None:
     """Refuse methods whose captures or noise do not fit."""
     # A capture that is used twice would count its noise as two independent ones.
     for index, method in enumerate(config.methods):
+        widths = [s.width or config.mask.width for s in method.shots]
         shots = [
-            (s.beta, s.distance, s.wavelength or config.wavelength, s.width or config.mask.width)
-            for s in method.shots
+            (s.beta, s.distance, s.wavelength or config.wavelength, width, s.exposure)
+            for s, width in zip(method.shots, widths, strict=True)
         ]
+        if method.synthesis == "contrasts" and len(set(widths)) > 1:
+            message = (
+                "synthesis contrasts needs masks of one width, which share a background; use "
+                "phase_pairs or fringe_scanning"
+            )
+            raise misfit(message, "methods", index, "shots")
         for what, entries in (("shots", shots), ("phases", method.phases)):
             if len(set(entries)) < len(entries):
                 message = f"{what} hold an entry twice; give each once"

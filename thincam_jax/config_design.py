@@ -36,12 +36,8 @@ from thincam_jax.units import parse_quantity
 Objective = Literal["bayes_error", "robust_error", "worst_ratio", "limit", "unevenness"]
 Part = Annotated[float, Field(ge=0, le=1)]
 Free = Literal["beta", "distance", "wavelength", "width", "exposure"]
-_KINDS = {
-    "beta": ("curvature", "rad/mm^2"),
-    "distance": ("length", "mm"),
-    "wavelength": ("length", "mm"),
-    "width": ("length", "mm"),
-}
+# What has a unit in a file; a share of the exposure has none.
+_KINDS = {"beta": "curvature", "distance": "length", "wavelength": "length", "width": "length"}
 # A band has to hold some of the 64 rings that the objectives average over.
 _NARROWEST_BAND = 1 / 16
 
@@ -159,9 +155,9 @@ class FreeConfig(Section):
 
 
 def _number(variable: str, given: Any) -> float:
-    """In the package's unit; a share of the exposure has none."""
+    """In the package's unit."""
     if variable in _KINDS:
-        return parse_quantity(given, _KINDS[variable][0])
+        return parse_quantity(given, _KINDS[variable])
     if isinstance(given, bool) or not isinstance(given, int | float):
         raise ValueError(f"{given!r} is no number; give parts of the reference's, such as 0.5")
     return float(given)
@@ -412,11 +408,33 @@ def _check_search(config: DesignConfig) -> None:
             "noise.read_noise and noise.electrons, or do not free it"
         )
         raise misfit(message, "search", "free")
+    _check_exposures(config)
+
+
+def _check_exposures(config: DesignConfig) -> None:
+    """All shots together have the exposure of the reference's; some have to take the rest."""
+    free = [f for f in config.search.free if f.variable == "exposure"]
+    every = tuple(range(1, len(config.reference.shots) + 1))
+    bounds = {shot: f.bounds[1] for f in free for shot in f.shots or every}
+    if free and set(bounds) >= set(every):
+        message = (
+            "the exposure of every shot is free, and all have what the reference has; leave one "
+            "out to take the rest, such as by shots: [1]"
+        )
+        if len(every) == 1:
+            message = "the exposure of the only shot is that of the reference; do not free it"
+        raise misfit(message, "search", "free")
+    if free and sum(bounds.values()) >= len(every) * (1 - 1e-6):
+        raise misfit(
+            f"exposures of up to {sum(bounds.values()):g} leave the other shots nothing of the "
+            f"{len(every)} that all have; end these bounds lower",
+            *("search", "free"),
+        )
 
 
 def _blamed(message: str) -> str:
     """The entry of `search` that a message of the space is about."""
-    if "conflict" in message or "feasible" in message:
+    if "conflicts" in message or "feasible" in message:
         return "limits"
     return "free"
 

@@ -158,7 +158,7 @@ def test_active_limits_in_words():
         (
             (Variable("exposure", 0.5, 2.0, (0, 1)),),
             Limits(exposure=4.0),
-            "free exposures of up to 4 shares conflict with 4 of all captures; give lower bounds",
+            "free exposures of up to 4 shares conflict with the 4 that all captures have; end",
         ),
         (
             (WIDE,),

@@ -4,6 +4,7 @@ import inspect
 import sys
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -216,6 +217,25 @@ def test_resolution_ends_where_frequencies_or_pixels_do(tmp_path, monkeypatch):
         judged = pareto._judge(config, near, problem.exact)
         assert judged.resolution == pytest.approx(resolution)
         assert judged.ends == ends
+
+
+def test_near_a_place_mask_pixels_hold(tmp_path):
+    """β·width ≤ π/pixel in all of the neighbourhood, which has the place itself in it."""
+    config = tiny.design(
+        tmp_path,
+        "search.free=[{variable: beta, bounds: [5 rad/mm^2, 60 rad/mm^2], shared: true}, "
+        "{variable: width, bounds: [1 mm, 2.5 mm]}]",
+        "search.limits.mask_pixel=50 um",
+    )
+    space = config.space()
+    corners = jnp.asarray([[0.0, 0.0], [0.0, 1.0], [1.0, 0.0], [1.0, 1.0], [0.5, 0.5]])
+    for place in ([0.5, 1.0], [0.1, 0.4], [1.0, 0.9]):
+        near = pareto._near(space, jnp.asarray(place))
+        inside = np.asarray(near.point(space.design(jnp.asarray(place))))
+        assert np.all((inside >= -1e-9) & (inside <= 1 + 1e-9))
+        designs = jax.vmap(near.design)(corners)
+        assert np.all(designs.beta[:, 0] * designs.width <= np.pi / 0.05 * (1 + 1e-9))
+        assert np.all(near.upper > near.lower)
 
 
 def test_an_objective_that_is_no_number_is_refused():

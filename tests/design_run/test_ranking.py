@@ -27,7 +27,8 @@ from thincam_jax.design_run import (
     ranking,
 )
 from thincam_jax.design_run import problem as problem_of_search
-from thincam_jax.design_run.sensitivity import least_change
+from thincam_jax.design_run.landscape import shown
+from thincam_jax.design_run.sensitivity import least_change, straight
 
 
 @dataclasses.dataclass(frozen=True)
@@ -188,6 +189,38 @@ def test_the_tolerance_of_a_width_holds_beta(tmp_path):
     free = build_problem(tiny.design(tmp_path, *WIDTH))
     around = landscape_of(problem.goal, free.space, free.data, design, 5, 2)
     assert around.variables == (("width", ()), ("beta", (1,)))
+
+
+def test_straight_within_the_limits(tmp_path):
+    """Its sides end where the search's do, at the width of the design."""
+    config = tiny.design(
+        tmp_path,
+        "search.free=[{variable: beta, bounds: [12 rad/mm^2, 500 rad/mm^2]}, "
+        "{variable: distance, bounds: [2 mm, 50 mm], shared: true}]",
+        *("search.limits.mask_pixel=40 um", "search.limits.thickness=3 mm"),
+    )
+    space = config.space()
+    alone, place, spans = straight(space, jnp.asarray([0.1, 0.5, 1.0]))
+    np.testing.assert_allclose(spans, [np.pi / 0.04 / 2 - 12] * 2 + [1.0])
+    np.testing.assert_allclose(place, [0.1, 0.5, 1.0], atol=1e-12)
+    assert alone.limits.mask_pixel is None
+
+
+def test_what_a_landscape_is_over(tmp_path):
+    def names(*free):
+        electrons = "noise={read_noise: 4, electrons: 900}"
+        shots = ", ".join(f"{{beta: {b} /mm^2, distance: 3 mm}}" for b in (25, 21, 17))
+        given = ("search.limits.captures=6", f"reference.shots=[{shots}]", electrons)
+        space = tiny.design(tmp_path, f"search.free=[{', '.join(free)}]", *given).space()
+        return [v.name for v in shown(space)]
+
+    width = "{variable: width, bounds: [1 mm, 2 mm]}"
+    beta = "{variable: beta, bounds: [12 /mm^2, 30 /mm^2], shared: true}"
+    one, two = (f"{{variable: exposure, bounds: [0.2, 1.2], shots: [{n}]}}" for n in (1, 2))
+    assert names(width, beta, one) == ["beta", "exposure"]
+    assert names(beta, one, two) == ["beta"]
+    assert names(one, two) == ["exposure", "exposure"]
+    assert names(width) == ["width"]
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from design_run import tiny
 from thincam_jax.design import wiener_error
 from thincam_jax.design.search import evaluate
 from thincam_jax.design_run import build_problem, find, find_steps
-from thincam_jax.design_run.train import _starts, build_training, train
+from thincam_jax.design_run.train import _reference_point, _starts, build_training, train
 
 ASKED = (
     "train.images=[camera]",
@@ -58,6 +58,24 @@ def test_descents_begin_at_the_best_points_apart(config):
     assert np.all(apart >= 0.05)
     betas = np.asarray([space.values(p) for p in starts])
     assert {bool(b > 21) for b in betas[:, 0]} == {True, False}  # a start in either basin
+
+
+def test_the_reference_lies_in_the_cube(tmp_path):
+    """With a free width, too, where the widest mask leaves β no room."""
+    free = (
+        "search.free=[{variable: beta, bounds: [12 rad/mm^2, 30 rad/mm^2], shared: true}, "
+        "{variable: width, bounds: [1 mm, 2.5 mm]}]"
+    )
+    one = "reference.shots=[{beta: 13.5 rad/mm^2, distance: 3 mm}]"
+    limit = f"search.limits.mask_pixel={np.pi / 12 / 2.5!r} mm"
+    space = tiny.design(tmp_path, free, one, limit).space()
+    point = _reference_point(space)
+    np.testing.assert_allclose(point, [1 / 1.5, 0.5], atol=1e-9)
+    np.testing.assert_allclose(space.values(jnp.asarray(point)), [2.0, 13.5])
+    given = "reference.shots=[{beta: 20 rad/mm^2, distance: 3 mm}]"
+    assert _reference_point(tiny.design(tmp_path, free, given).space()) is not None
+    two = "reference.shots=[{beta: 20 rad/mm^2, distance: 3 mm}, {beta: 19 /mm^2, distance: 3 mm}]"
+    assert _reference_point(tiny.design(tmp_path, free, two).space()) is None  # two β, and one free
 
 
 def test_the_reference_and_designs_of_the_search_can_be_starts(config):

@@ -32,9 +32,18 @@ def test_a_shot_may_have_its_own_mask_and_exposure(tmp_path):
     assert float(camera.sensor.exposure) == pytest.approx(0.4)
 
 
-def test_another_exposure_alone_is_no_other_shot(tmp_path):
+def test_the_same_shot_twice_and_longer(tmp_path):
+    """Another exposure is another capture; the same one would count its noise twice."""
+    config = study(tmp_path, "{beta: 25 /mm^2, distance: 3 mm, exposure: 0.5}")
+    assert len(set(build.settings(config, config.methods[1]))) == 4
     with pytest.raises(ConfigError, match="shots hold an entry twice"):
-        study(tmp_path, "{beta: 25 /mm^2, distance: 3 mm, exposure: 0.5}")
+        study(tmp_path, "{beta: 25 /mm^2, distance: 3 mm, width: 2 mm}")
+
+
+def test_contrasts_are_of_masks_of_one_width(tmp_path):
+    shot = "{beta: 21 /mm^2, distance: 3 mm, width: 1 mm}"
+    with pytest.raises(ConfigError, match="methods.1..shots: synthesis contrasts needs masks of"):
+        study(tmp_path, shot, "methods.1.synthesis=contrasts")
 
 
 def test_less_light_has_more_noise(tmp_path):

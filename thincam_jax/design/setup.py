@@ -27,8 +27,8 @@ class SignalNoise(eqx.Module):
 class PhotonNoise(eqx.Module):
     """Shot noise of the design's own light, and read noise.
 
-    - `electrons`: of a pixel, from each mm² of open aperture, in the whole exposure time: what
-      the mask lets through is the design's own.
+    - `electrons`: of a pixel, from each mm² of open aperture, in an exposure of one share
+      (`Design.exposure`): what the mask lets through is the design's own.
     - `read_noise`: standard deviation, electrons, of each capture.
     """
 

@@ -107,7 +107,7 @@ class DesignSpace(eqx.Module):
         if self.variables[0].name == "width":
             # No wider than the lowest β allows, and β no higher than that width does.
             width = self.lower[0] + point[0] * (self.upper[0] - self.lower[0])
-        return self.lower + point * (self._highest(width) - self.lower)
+        return self.lower + point * (self.highest(width) - self.lower)
 
     def point(self, design: Design) -> Float[Array, " variable"]:
         """Where a design lies in the unit cube, or outside of it; ½ where there is no room.
@@ -118,12 +118,12 @@ class DesignSpace(eqx.Module):
             getattr(design, v.name)[v.captures[0]] if v.captures else design.width
             for v in self.variables
         ]
-        spans = self._highest(design.width) - self.lower
+        spans = self.highest(design.width) - self.lower
         inside = (jnp.stack(given) - self.lower) / jnp.where(spans > 0, spans, 1)
         return jnp.where(spans > 0, inside, 0.5)
 
-    def _highest(self, width: Float[Array, ""]) -> Float[Array, " variable"]:
-        """What masks of a width may have at most."""
+    def highest(self, width: Float[Array, ""]) -> Float[Array, " variable"]:
+        """The upper bounds of the free numbers of designs with masks of a width, mm."""
         if self.limits.mask_pixel is None:
             return self.upper
         finest = math.pi / self.limits.mask_pixel / width
@@ -259,8 +259,9 @@ def _check_exposure(base: Design, variables: tuple[Variable, ...], limits: Limit
     most = sum(v.upper * len(v.captures) for v in free)
     if most >= limits.exposure * (1 - 1e-6):
         raise ValueError(
-            f"no design is feasible: free exposures of up to {most:g} shares conflict with "
-            f"{limits.exposure:g} of all captures; give lower bounds, so that the others have some"
+            f"no design is feasible: free exposures of up to {most:g} shares conflict with the "
+            f"{limits.exposure:g} that all captures have; end their bounds lower, so that the "
+            "others have some"
         )
 
 

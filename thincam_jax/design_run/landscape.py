@@ -31,11 +31,14 @@ def landscape_of(
     *,
     at_a_time: int = 32,
 ) -> Landscape | None:
-    """Over two of the free numbers, or the only one; None where bounds leave them no room.
+    """Over two of the free numbers, or the only one; None where there is none to draw, or no room.
 
-    The width comes last, and not beside β where a mask's pixels tie the two: that is no rectangle.
+    See `shown`.
     """
-    plane = DesignSpace(best, _shown(space), space.limits)
+    drawn = shown(space)
+    if not drawn:
+        return None
+    plane = DesignSpace(best, drawn, space.limits)
     variables = plane.variables
     ends = (plane.values(jnp.full(plane.size, end, plane.lower.dtype)) for end in (1.0, 0.0))
     upper, lower = (np.asarray(end, dtype=float) for end in ends)
@@ -50,9 +53,16 @@ def landscape_of(
     return Landscape(named, axes, np.asarray(found, dtype=float).reshape(shape))
 
 
-def _shown(space: DesignSpace) -> tuple[Variable, ...]:
-    shown = sorted(space.variables, key=lambda v: v.name == "width")[:2]
-    names = [v.name for v in shown]
-    if space.limits.mask_pixel is not None and names == ["beta", "width"]:
-        shown = shown[:1]
-    return tuple(shown)
+def shown(space: DesignSpace) -> tuple[Variable, ...]:
+    """The first two variables whose change leaves the others as they are.
+
+    Not the width beside a β that a mask's pixels tie to it, and none of several exposures that
+    share one with a third.
+    """
+    last = sorted(space.variables, key=lambda v: v.name == "width")
+    exposures = sum(v.name == "exposure" for v in last)
+    if exposures > 2 or exposures == 2 and len(last) > 2:
+        last = [v for v in last if v.name != "exposure"]
+    if space.limits.mask_pixel is not None and [v.name for v in last[:2]] == ["beta", "width"]:
+        last = last[:1]
+    return tuple(last[:2])

@@ -281,9 +281,16 @@ def _known(judged: Iterable[_Judged]) -> list[_Judged]:
 
 
 def _near(space: DesignSpace, place: Float[Array, " variable"]) -> DesignSpace:
-    """What of a space lies near a place, without another compilation."""
-    ends = [space.values(jnp.clip(place + step, 0.0, 1.0)) for step in (-_NEAR, _NEAR)]
-    return eqx.tree_at(lambda s: (s.lower, s.upper), space, tuple(ends))
+    """What of a space lies near a place, without another compilation.
+
+    Of β, which a mask's pixels tie to the width, the lowest of the widest masks and the highest of
+    the narrowest: what it then may have with a width is for the space to say.
+    """
+    is_width = jnp.asarray([v.name == "width" for v in space.variables])
+    step = jnp.where(is_width, -_NEAR, _NEAR).astype(place.dtype)
+    less, more = (space.values(jnp.clip(place + s, 0.0, 1.0)) for s in (-step, step))
+    lower, upper = jnp.where(is_width, more, less), jnp.where(is_width, less, more)
+    return eqx.tree_at(lambda s: (s.lower, s.upper), space, (lower, upper))
 
 
 def _reference(config: DesignConfig, problem: Problem) -> _Judged:

@@ -4,6 +4,7 @@ import functools
 import math
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -52,11 +53,14 @@ def shots_of_variable(variable: Variable, phases: int) -> tuple[int, ...]:
 def straight(space: DesignSpace, point) -> tuple[DesignSpace, Any, np.ndarray]:
     """A cube in which one number changes at a time, the point in it, and the lengths of its sides.
 
-    In the search's own, the limit of a mask's pixels ties β to the width.
+    In the search's own, the limit of a mask's pixels ties β to the width; here β ends where it does
+    for the width of this design.
     """
-    alone = DesignSpace(space.base, space.variables, Limits(exposure=space.limits.exposure))
+    design = space.design(jnp.asarray(point, space.lower.dtype))
+    free = DesignSpace(space.base, space.variables, Limits(exposure=space.limits.exposure))
+    alone = eqx.tree_at(lambda s: s.upper, free, space.highest(design.width))
     spans = np.asarray(alone.upper - alone.lower, dtype=float)
-    return alone, alone.point(space.design(jnp.asarray(point, space.lower.dtype))), spans
+    return alone, alone.point(design), spans
 
 
 def per_unit(slopes, curves, spans: np.ndarray) -> Around:

@@ -26,7 +26,7 @@ from thincam_jax.design.search import (
     evaluate,
     even_samples,
 )
-from thincam_jax.design_run.landscape import Landscape, landscape_of
+from thincam_jax.design_run.landscape import Landscape, landscape_of, shown
 from thincam_jax.design_run.problem import Problem
 from thincam_jax.design_run.sensitivity import Around, per_unit, straight
 from thincam_jax.study.build import synthesis_matrix
@@ -148,7 +148,7 @@ def _starts(config: DesignConfig, wanted: TrainingConfig, goal, space, training,
 
 def _surroundings(config: DesignConfig, goal, space: DesignSpace, training, found):
     """Coarser than the search's landscape: an evaluation takes some tenths of a second."""
-    count = min(config.search.grid, _GRID[min(space.size, 2)])
+    count = min(config.search.grid, _GRID[max(1, len(shown(space)))])
     phases = len(config.reference.method().shot_phases())
     return landscape_of(goal, space, training, found[0].design, count, phases, at_a_time=1)
 
@@ -199,8 +199,8 @@ def _reference_point(space: DesignSpace) -> np.ndarray | None:
     shared = (
         getattr(space.base, v.name)[jnp.asarray(v.captures)] for v in space.variables if v.captures
     )
-    lower, upper = (space.values(jnp.full_like(space.lower, end)) for end in (0.0, 1.0))
-    if not bool(jnp.all(upper > lower)) or any(np.ptp(np.asarray(own)) > 0 for own in shared):
+    room = bool(jnp.all(space.highest(space.base.width) > space.lower))
+    if not room or any(np.ptp(np.asarray(own)) > 0 for own in shared):
         return None
     point = np.asarray(space.point(space.base), dtype=float)
     # On a bound, rounding may put it outside.
