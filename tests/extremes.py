@@ -26,8 +26,8 @@ class Extreme:
     Lengths in mm. `pitch` spreads the grid over edges and interior; `centre` (y, x) moves the mask
     so that a fine grid sees an edge. `float32`, `float64`: largest relative L2 error of the PSF.
     `differences`: whether the phases leave digits to finite differences in float64. `naive`: the
-    formula of `tests/test_extremes.py` that fails here, and in which precision. `nodes` a pixel for
-    the reference of an average; the reference has `every` so many rows.
+    formula of `naive_formulas` that fails here, and in which precision. `nodes` a pixel for the
+    reference of an average; the reference has `every` so many rows.
     """
 
     name: str

@@ -255,7 +255,6 @@ class TestCheck:
         [
             ("mask.harmonics=4", "give an odd number"),
             ("mask.pixel_pitch=0.3 mm", "not a whole number of display pixels"),
-            ("sensor.bit_depth=8", "bit_depth needs an exposure"),
         ],
     )
     def test_camera_that_cannot_be_built(self, override, part, tmp_path):

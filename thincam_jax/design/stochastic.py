@@ -6,9 +6,9 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import optax
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from thincam_jax.design.adam import adam
 from thincam_jax.design.design import Design
 from thincam_jax.design.search import on_cube
 from thincam_jax.design.space import DesignSpace
@@ -57,27 +57,11 @@ def stochastic_descent(
 
 @functools.partial(jax.jit, static_argnames=("objective", "steps"))
 def _descend(objective, space, data, point, key, steps: int, rate):
-    adam = optax.scale_by_adam()
-    rates = rate * 0.5 * (1 + jnp.cos(jnp.pi * jnp.linspace(0.0, 1.0, steps, dtype=point.dtype)))
-
     def loss(y, step_key):
-        return objective(space.design(on_cube(y)), data, step_key)
-
-    def step(carry, drawn):
-        y, state, skipped = carry
-        step_key, step_rate = drawn
-        value, slope = jax.value_and_grad(loss)(y, step_key)
-        usable = jnp.isfinite(value) & jnp.all(jnp.isfinite(slope))
-        # optax multiplies floats by integers, which strict promotion forbids.
-        with jax.numpy_dtype_promotion("standard"):
-            updates, after = adam.update(jnp.where(usable, slope, 0.0), state)
-        moved = jnp.where(usable, y - step_rate * updates, y)
-        state = jax.tree.map(lambda new, old: jnp.where(usable, new, old), after, state)
-        return (moved, state, skipped + (~usable).astype(int)), (moved, value)
+        value = objective(space.design(on_cube(y)), data, step_key)
+        return value, (y, value)
 
     start = jnp.arcsin(jnp.sqrt(point))
-    first = (start, adam.init(start), jnp.asarray(0))
-    (_, _, skipped), (path, history) = jax.lax.scan(
-        step, first, (jax.random.split(key, steps), rates)
-    )
-    return jnp.mean(on_cube(path[steps // 2 :]), axis=0), history, skipped
+    end, (path, history), skipped = adam(loss, start, key, jnp.asarray(rate, point.dtype), steps)
+    late = jnp.concatenate([path[steps // 2 + 1 :], end[None]])
+    return jnp.mean(on_cube(late), axis=0), history, skipped

@@ -19,10 +19,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from thincam_jax import _checks
+from thincam_jax.design.adam import adam
 from thincam_jax.design.frequencies import Frequencies
 from thincam_jax.design.search import even_samples
 from thincam_jax.design.setup import Setup
@@ -146,8 +146,9 @@ def _train(suggester: Suggester, points, levels, key, rate, warm_up: int, steps:
         return misfit, misfit
 
     first, second = jax.random.split(key)
-    layers, distances, in_vain = _descend(towards_designs, suggester.layers, first, rate, warm_up)
-    layers, misfits, skipped = _descend(towards_levels, layers, second, rate / 10, steps)
+    start = suggester.layers
+    layers, distances, in_vain = adam(towards_designs, start, first, rate, warm_up, most=1.0)
+    layers, misfits, skipped = adam(towards_levels, layers, second, rate / 10, steps, most=1.0)
     return layers, distances, misfits, in_vain + skipped
 
 
@@ -175,29 +176,3 @@ def _wishes(levels: Float[Array, "point ring"], key, batch: int) -> Float[Array,
     bends = _BEND * weights @ jnp.asarray(np.stack(shapes), levels.dtype)
     every_second = jnp.arange(batch)[:, None] % 2 == 0
     return jnp.maximum(wanted + jnp.where(every_second, bends, 0.0), 0.0)
-
-
-def _descend(loss, layers, key, rate, steps: int):
-    """Adam with a cosine's rate; steps whose slope is no number change nothing."""
-    adam = optax.chain(optax.clip_by_global_norm(1.0), optax.scale_by_adam())
-    rates = rate * 0.5 * (1 + jnp.cos(jnp.pi * jnp.linspace(0.0, 1.0, steps, dtype=rate.dtype)))
-
-    def step(carry, drawn):
-        layers, state, skipped = carry
-        step_key, step_rate = drawn
-        (value, told), slope = jax.value_and_grad(loss, has_aux=True)(layers, step_key)
-        finite = [jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves((value, slope))]
-        usable = jnp.all(jnp.stack(finite))
-        # optax multiplies floats by integers, which strict promotion forbids.
-        with jax.numpy_dtype_promotion("standard"):
-            updates, after = adam.update(slope, state)
-        moved = jax.tree.map(lambda p, u: p - step_rate * u, layers, updates)
-        layers, state = jax.tree.map(
-            lambda new, old: jnp.where(usable, new, old), (moved, after), (layers, state)
-        )
-        return (layers, state, skipped + (~usable).astype(int)), told
-
-    first = (layers, adam.init(layers), jnp.asarray(0))
-    keys = jax.random.split(key, steps)
-    (layers, _, skipped), told = jax.lax.scan(step, first, (keys, rates))
-    return layers, told, skipped
