@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
+# To the compiler: as optimised as in the package's use, where sums round otherwise than without.
+AS_IN_USE = {"xla_backend_optimization_level": 3}
 
 
 def shared_data(name: str) -> Path:

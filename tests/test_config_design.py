@@ -93,6 +93,8 @@ def test_exposures_that_leave_nothing(tmp_path, entry, part):
     line = fault(tmp_path, f"search.free=[{{variable: exposure, {entry}}}]", noise)
     assert ": search.free: " in line
     assert part in line
+    unknown = "search.free=[{variable: exposure, bounds: [0.2, 1.2], shots: [1, 3]}]"
+    assert "the design has captures 1 to 4" in fault(tmp_path, unknown, noise)
     one = "reference.shots=[{beta: 25 /mm^2, distance: 3 mm}]"
     line = fault(tmp_path, "search.free=[{variable: exposure, bounds: [0.5, 0.9]}]", noise, one)
     assert "the exposure of the only shot is that of the reference; do not free it" in line
@@ -163,6 +165,7 @@ SHARED = ("search.free[0]", "all masks share the width; drop 'shared' and 'shots
             "mask={width: 2 mm, fill_factor: 0.8}",
             *("mask.fill_factor", "of a display's pixels; give their pixel_pitch, too"),
         ),
+        ("search.free.0.shots=[1, 1]", "search.free[0].shots", "holds a shot twice"),
         ("search.free.0.colour=1", "search.free[0].colour", "variable, bounds, shared, shots"),
         ("search.free=[]", "search.free", "give at least 1"),
         ("search.starts=0", "search.starts", "greater than or equal to 1"),

@@ -15,7 +15,7 @@ from naive_formulas import NAIVE
 from propagation.reference import chirp_by_quadrature
 
 import thincam_jax as tc
-from helpers import ROOT, count_traces, finite_difference, relative_l2
+from helpers import AS_IN_USE, ROOT, count_traces, finite_difference, relative_l2
 
 DTYPES = (np.float32, np.float64)
 STATIC = ("shape", "model", "pixel_integration")
@@ -39,7 +39,11 @@ def loss_and_psf(camera, pitch, centre, weights, shape, model, pixel_integration
     return jnp.sum(weights * h), h
 
 
-compiled = jax.jit(jax.value_and_grad(loss_and_psf, has_aux=True), static_argnames=STATIC)
+compiled = jax.jit(
+    jax.value_and_grad(loss_and_psf, has_aux=True),
+    static_argnames=STATIC,
+    compiler_options=AS_IN_USE,
+)
 
 
 def loss_weights(extreme: Extreme, seed: int):

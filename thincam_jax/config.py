@@ -283,10 +283,13 @@ def check_methods(config: Any) -> None:
     """Refuse methods whose captures or noise do not fit."""
     # A capture that is used twice would count its noise as two independent ones.
     for index, method in enumerate(config.methods):
-        widths = [s.width or config.mask.width for s in method.shots]
+        # To the picometre: 5600 um and 5.6 mm differ by rounding.
+        widths = [round(s.width or config.mask.width, 9) for s in method.shots]
+        # Between two exposures of one setting there is no contrast.
+        shares = [1.0 if method.synthesis == "contrasts" else s.exposure for s in method.shots]
         shots = [
-            (s.beta, s.distance, s.wavelength or config.wavelength, width, s.exposure)
-            for s, width in zip(method.shots, widths, strict=True)
+            (s.beta, s.distance, s.wavelength or config.wavelength, width, share)
+            for s, width, share in zip(method.shots, widths, shares, strict=True)
         ]
         if method.synthesis == "contrasts" and len(set(widths)) > 1:
             message = (

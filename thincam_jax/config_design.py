@@ -149,6 +149,8 @@ class FreeConfig(Section):
 
     @pydantic.model_validator(mode="after")
     def _belongs(self):
+        if self.shots is not None and len(set(self.shots)) < len(self.shots):
+            raise misfit("holds a shot twice; give each once", "shots")
         if self.variable == "width" and (self.shared or self.shots is not None):
             raise ValueError("all masks share the width; drop 'shared' and 'shots'")
         return self
@@ -415,7 +417,7 @@ def _check_exposures(config: DesignConfig) -> None:
     """All shots together have the exposure of the reference's; some have to take the rest."""
     free = [f for f in config.search.free if f.variable == "exposure"]
     every = tuple(range(1, len(config.reference.shots) + 1))
-    bounds = {shot: f.bounds[1] for f in free for shot in f.shots or every}
+    bounds = {shot: f.bounds[1] for f in free for shot in f.shots or every if shot in every}
     if free and set(bounds) >= set(every):
         message = (
             "the exposure of every shot is free, and all have what the reference has; leave one "

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import thincam_jax as tc
+from helpers import AS_IN_USE
 from thincam_jax.design import (
     Design,
     DesignSpace,
@@ -151,11 +152,11 @@ def test_gradient_through_the_solver_by_differences(noise):
     given = training(noise)
     place = jnp.array([9.0, 7.0, 5.03, 6.41, 5e-4, 1.83])
 
-    @jax.jit
-    def error(x):
+    def of_numbers(x):
         return end_to_end_error(design(x[:2], x[2:4], x[4], x[5]), given)
 
-    slope = jax.grad(error)(place)
+    error = jax.jit(of_numbers, compiler_options=AS_IN_USE)
+    slope = jax.jit(jax.grad(of_numbers), compiler_options=AS_IN_USE)(place)
     for index, value in enumerate(place):
         # The projection averages over pixels whose borders pass each other: steps are short.
         step = jnp.zeros(6).at[index].set(1e-6 * value)
@@ -215,6 +216,26 @@ def free_betas():
     return DesignSpace(
         design(), (Variable("beta", 5.0, 20.0, (0, 1)), Variable("beta", 5.0, 20.0, (2, 3)))
     )
+
+
+def test_a_stochastic_descent_step_by_step():
+    """Adam as published, with the rate of a cosine; the mean of the second half, in the cube."""
+    space, target, start = free_betas(), jnp.array([10.0, 14.0]), jnp.array([0.9, 0.3])
+    key, rate, steps = jax.random.key(3), 0.1, 5
+    found = stochastic_descent(quadratic, space, target, start, key=key, steps=steps, rate=rate)
+    y, first, second, path = np.arcsin(np.sqrt(start)), 0.0, 0.0, []
+    for n, step_key in enumerate(jax.random.split(key, steps), 1):
+
+        def loss(y, step_key=step_key):
+            return quadratic(space.design(jnp.sin(y) ** 2), target, step_key)
+
+        slope = np.asarray(jax.grad(loss)(jnp.asarray(y)))
+        first, second = 0.9 * first + 0.1 * slope, 0.999 * second + 0.001 * slope**2
+        step = (first / (1 - 0.9**n)) / (np.sqrt(second / (1 - 0.999**n)) + 1e-8)
+        y = y - rate * 0.5 * (1 + np.cos(np.pi * (n - 1) / (steps - 1))) * step
+        path.append(np.sin(y) ** 2)
+    np.testing.assert_allclose(found.point, np.mean(path[2:], axis=0), rtol=1e-9)
+    assert found.skipped == 0
 
 
 def test_a_stochastic_descent_finds_the_mean():

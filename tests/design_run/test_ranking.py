@@ -209,18 +209,21 @@ def test_straight_within_the_limits(tmp_path):
 def test_what_a_landscape_is_over(tmp_path):
     def names(*free):
         electrons = "noise={read_noise: 4, electrons: 900}"
-        shots = ", ".join(f"{{beta: {b} /mm^2, distance: 3 mm}}" for b in (25, 21, 17))
-        given = ("search.limits.captures=6", f"reference.shots=[{shots}]", electrons)
+        shots = ", ".join(f"{{beta: {b} /mm^2, distance: 3 mm}}" for b in (25, 21, 17, 15))
+        given = ("search.limits.captures=8", f"reference.shots=[{shots}]", electrons)
         space = tiny.design(tmp_path, f"search.free=[{', '.join(free)}]", *given).space()
         return [v.name for v in shown(space)]
 
     width = "{variable: width, bounds: [1 mm, 2 mm]}"
     beta = "{variable: beta, bounds: [12 /mm^2, 30 /mm^2], shared: true}"
-    one, two = (f"{{variable: exposure, bounds: [0.2, 1.2], shots: [{n}]}}" for n in (1, 2))
+    one, two, three = (
+        f"{{variable: exposure, bounds: [0.2, 1.2], shots: [{n}]}}" for n in (1, 2, 3)
+    )
     assert names(width, beta, one) == ["beta", "exposure"]
     assert names(beta, one, two) == ["beta"]
     assert names(one, two) == ["exposure", "exposure"]
     assert names(width) == ["width"]
+    assert names(one, two, three) == []
 
 
 @pytest.mark.parametrize(

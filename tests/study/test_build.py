@@ -37,7 +37,10 @@ def test_the_same_shot_twice_and_longer(tmp_path):
     config = study(tmp_path, "{beta: 25 /mm^2, distance: 3 mm, exposure: 0.5}")
     assert len(set(build.settings(config, config.methods[1]))) == 4
     with pytest.raises(ConfigError, match="shots hold an entry twice"):
-        study(tmp_path, "{beta: 25 /mm^2, distance: 3 mm, width: 2 mm}")
+        study(tmp_path, "{beta: 25 /mm^2, distance: 3 mm, width: 2000 um}")
+    longer = "{beta: 25 /mm^2, distance: 3 mm, exposure: 0.5}"
+    with pytest.raises(ConfigError, match="shots hold an entry twice"):
+        study(tmp_path, longer, "methods.1.synthesis=contrasts")
 
 
 def test_contrasts_are_of_masks_of_one_width(tmp_path):

@@ -29,6 +29,7 @@ def scheduler(monkeypatch):
         protocol="tcp://",
         host="127.0.0.1",
         dashboard_address=None,
+        scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},
     ) as found:
         yield found
 

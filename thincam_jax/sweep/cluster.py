@@ -54,6 +54,8 @@ def connected(
                 threads_per_worker=1,
                 host="127.0.0.1",
                 dashboard_address=None,  # pyright: ignore[reportArgumentType]
+                # Even without its pages the scheduler opens a port, which another sweep may have.
+                scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},
                 memory_limit=None,
                 silence_logs=logging.CRITICAL,
                 env=_environment(max(1, CPU_COUNT // count)),
