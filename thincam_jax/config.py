@@ -34,8 +34,11 @@ def _positive(value: float) -> float:
     return value
 
 
+LIGHT = (1e-5, 1.0)  # the wavelengths that are taken for light, mm
+
+
 def _optical(value: float) -> float:
-    if not 1e-5 <= value <= 1:
+    if not LIGHT[0] <= value <= LIGHT[1]:
         raise ValueError(f"{value:g} mm is no wavelength of light; give 10 nm to 1 mm")
     return value
 

@@ -8,6 +8,7 @@ import pydantic
 from pydantic import Field
 
 from thincam_jax.config import (
+    LIGHT,
     Angle,
     ApertureConfig,
     ConfigError,
@@ -137,7 +138,7 @@ class FreeConfig(Section):
             raise ValueError(f"{lower:g} to {upper:g} {unit}; give bounds above zero")
         if not lower < upper:
             raise ValueError(f"bounds cross: {lower:g} to {upper:g} {unit}; give the lower first")
-        if variable == "wavelength" and not 1e-5 <= lower < upper <= 1:
+        if variable == "wavelength" and not LIGHT[0] <= lower < upper <= LIGHT[1]:
             raise ValueError(f"{lower:g} to {upper:g} mm; give bounds from 10 nm to 1 mm")
         return (lower, upper)
 

@@ -2,7 +2,6 @@
 
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 
 from thincam_jax.design import Design, DesignSpace, Variable, landscape
@@ -40,8 +39,8 @@ def landscape_of(
         return None
     plane = DesignSpace(best, drawn, space.limits)
     variables = plane.variables
-    ends = (plane.values(jnp.full(plane.size, end, plane.lower.dtype)) for end in (1.0, 0.0))
-    upper, lower = (np.asarray(end, dtype=float) for end in ends)
+    ends = (plane.lower, plane.highest(best.width))
+    lower, upper = (np.asarray(end, dtype=float) for end in ends)
     spans = upper - lower
     if not np.all(spans > 0):
         return None

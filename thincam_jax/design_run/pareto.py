@@ -236,12 +236,11 @@ def _longer(design: Design, base: Design, phases: int) -> Design:
     last = range(design.captures - phases, design.captures)
     more = (base.captures - design.captures) // phases
     order = jnp.asarray([*range(design.captures), *(list(last) * more)])
-
-    def numbers(of: Design):
-        return of.beta, of.distance, of.wavelength
-
-    longer = tuple(number[order] for number in numbers(design))
-    return eqx.tree_at(lambda d: (*numbers(d), d.width), base, (*longer, design.width))
+    return eqx.tree_at(
+        lambda d: (d.beta, d.distance, d.wavelength, d.width),
+        base,
+        (design.beta[order], design.distance[order], design.wavelength[order], design.width),
+    )
 
 
 def _best(

@@ -19,9 +19,8 @@ _NUDGE = 1e-9
 
 def build_study(config: DesignConfig, found: Sequence[Any] = ()) -> StudyConfig:
     """The designs that the file gives, and what was found (`name` and `shots`), side by side."""
-    reference = config.reference
-    named = (*config.compare, *found)
-    methods = [_method(config, one.name, one.shots) for one in (reference, *named)]
+    named = (config.reference, *config.compare, *found)
+    methods = [_method(config, one.name, one.shots) for one in named]
     sensor: dict[str, Any] = {
         "shape": config.sensor.shape,
         "pitch": f"{config.sensor.pitch!r} mm",
@@ -50,10 +49,9 @@ def build_study(config: DesignConfig, found: Sequence[Any] = ()) -> StudyConfig:
 def _method(config: DesignConfig, name: str, shots: Sequence[Any]) -> dict[str, Any]:
     written: list[dict[str, Any]] = []
     for shot in shots:
-        entry = _shot(config, shot, shot.beta)
-        while entry in written:
-            beta = shot.beta * (1 - _NUDGE) ** (len(written) + 1)
-            entry = _shot(config, shot, beta)
+        beta = shot.beta
+        while (entry := _shot(config, shot, beta)) in written:
+            beta *= 1 - _NUDGE
         written.append(entry)
     return {
         "name": name,
@@ -82,9 +80,10 @@ def _shown(width: float, pixel: float | None) -> float:
 
 def check_design(config: DesignConfig) -> None:
     """Refuse what the file alone cannot tell, before the search; errors as of `check_study`."""
-    check_study(build_study(config))
+    study = build_study(config)
+    check_study(study)
     for index, target in enumerate(config.targets):
-        image = np.asarray(build_plane(build_study(config), target).image)
+        image = np.asarray(build_plane(study, target).image)
         if config.prior.measured and target in config.pictures() and min(image.shape[-2:]) < 32:
             raise ConfigError(
                 f"targets[{index}]: {image.shape[-2]}×{image.shape[-1]} pixels are too few to "

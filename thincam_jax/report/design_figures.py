@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from thincam_jax.design_run import Candidate, Goal, Landscape, Result, TrainingGoal, Transfer
 from thincam_jax.design_run.ranking import Shot
-from thincam_jax.report.design_words import QUANTITIES, free_number
+from thincam_jax.report.design_words import QUANTITIES, first, free_number
 from thincam_jax.report.figures import line_style
 
 _ROOM = 0.06  # around points, as a part of an axis
@@ -76,7 +76,7 @@ def _draw(view: _View, result: Result, count: int) -> Figure:
 def _place(landscape: Landscape, one: Candidate) -> list[float]:
     """Where a design lies on the landscape's axes, as drawn."""
     return [
-        getattr(one.shots[shots[0] - 1 if shots else 0], name) * QUANTITIES[name].scale
+        getattr(one.shots[first(shots)], name) * QUANTITIES[name].scale
         for name, shots in landscape.variables
     ]
 

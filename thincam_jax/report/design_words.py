@@ -36,10 +36,15 @@ def free_number(name: str, shots: Sequence[int]) -> str:
     return f"{what} of {word} {', '.join(str(s) for s in shots)}{comma}{unit}"
 
 
+def first(shots: Sequence[int]) -> int:
+    """Where the first of these shots stands; of none, which is all, the first of all."""
+    return shots[0] - 1 if shots else 0
+
+
 def of_shots(one: dict[str, Any], name: str, shots: Sequence[int]) -> str:
     """A number of a design of design.json, as the first of its shots has it."""
     quantity = QUANTITIES[name]
-    return f"{one['shots'][shots[0] - 1 if shots else 0][quantity.key]:{quantity.form}}"
+    return f"{one['shots'][first(shots)][quantity.key]:{quantity.form}}"
 
 
 def found_number(value: dict[str, Any]) -> str:
