@@ -21,11 +21,11 @@ import tifffile
 sys.path.insert(0, str(Path(__file__).parent))
 from scipy_admm import ScipyAdmm
 
-from thincam_jax.reconstruct import psf_problem
-from thincam_jax.reconstruct.apart import Apart
-from thincam_jax.reconstruct.drive import CHUNK
-from thincam_jax.reconstruct.regularised import admm_method
-from thincam_jax.reconstruct.tv_method import AdmmTotalVariation
+from thincam_jax.reconstruction import psf_problem
+from thincam_jax.reconstruction.apart import Apart
+from thincam_jax.reconstruction.drive import CHUNK
+from thincam_jax.reconstruction.regularised import admm_method
+from thincam_jax.reconstruction.tv_method import AdmmTotalVariation
 
 DATA = Path(__file__).parents[2] / "shared" / "data" / "diffusercam-hand"
 
@@ -198,7 +198,7 @@ def test_admm(benchmark, capsys, case):
 
 def memory_line(method):
     """What the compiled chunk allocates, against the arrays it must hold."""
-    from thincam_jax.reconstruct.tv_method import _advance
+    from thincam_jax.reconstruction.tv_method import _advance
 
     state = method.start(zeros(method.problem))
     lowered = _advance.lower(method.splitting, method.penalties, method.relaxation, state, CHUNK)

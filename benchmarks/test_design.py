@@ -11,16 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from thincam_jax.design import (
-    Polar,
-    PowerLaw,
-    Quadrant,
-    Setup,
-    bayes_error,
-    channels,
-    shots,
-)
-from thincam_jax.reconstruct import phase_pairs
+from thincam_jax.design import Polar, PowerLaw, Quadrant, Setup, bayes_error, channels, shots
+from thincam_jax.reconstruction import phase_pairs
 
 HIGHEST = 290.0
 FREQUENCIES = {

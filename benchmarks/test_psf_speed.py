@@ -23,7 +23,9 @@ import numpy as np
 import pytest
 
 import thincam_jax as tc
-from thincam_jax.propagation import Path, angular_spectrum, separable
+from thincam_jax.lensless.propagation import Path
+from thincam_jax.lensless.propagation.angular_spectrum import angular_spectrum
+from thincam_jax.lensless.propagation.separable import separable
 
 SHAPE, PITCH = (1024, 1024), 5.5e-3
 THESIS = {"beta": 25.0, "distance": 6.5, "wavelength": 500e-6, "object_distance": 250.0}

@@ -11,10 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from thincam_jax import design
-from thincam_jax.design.suggest import refine
-from thincam_jax.design.train_suggester import _examples
-from thincam_jax.reconstruct import phase_pairs
+from thincam_jax import design, learn
+from thincam_jax.learn.suggester_training import _examples
+from thincam_jax.learn.suggestions import refine
+from thincam_jax.reconstruction import phase_pairs
 
 HELD_OUT = 200
 BETAS = (
@@ -82,7 +82,7 @@ def answers(kind):
     """Misfits and times of all ways, of both kinds of wishes."""
     space, *data = problem(kind)
     start = time.perf_counter()
-    suggester = design.train_suggester(space, *data, key=jax.random.key(0)).suggester
+    suggester = learn.train_suggester(space, *data, key=jax.random.key(0)).suggester
     jax.block_until_ready(suggester)
     training = time.perf_counter() - start
     model = suggester.model
@@ -94,8 +94,8 @@ def answers(kind):
     rows = []
     for name, wanted in zip(("attainable", "others"), wishes(model), strict=True):
         alone, of_alone = each(lambda w: network_alone(suggester, w), wanted)
-        compiled, of_steps = each(lambda w: design.propose(suggester, w), wanted)
-        told, of_all = each(lambda w: design.suggest(suggester, w), wanted)
+        compiled, of_steps = each(lambda w: learn.propose(suggester, w), wanted)
+        told, of_all = each(lambda w: learn.suggest(suggester, w), wanted)
         nearest, of_nearest = each(lambda w: nearest_sample(model, *examples, w), wanted)
         searched, of_search = each(search, wanted)
         evaluations = np.median([s.evaluations for s in searched])
@@ -117,7 +117,7 @@ def test_suggest(benchmark, kind, capsys):
         training, suggester, rows = answers(kind)
         wanted = jnp.asarray(wishes(suggester.model)[0][0])
         benchmark.pedantic(
-            lambda: jax.block_until_ready(design.propose(suggester, wanted)), rounds=50
+            lambda: jax.block_until_ready(learn.propose(suggester, wanted)), rounds=50
         )
     with capsys.disabled():
         print(f"\n\n{kind}: trained in {training:.0f} s\n")

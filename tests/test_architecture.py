@@ -15,80 +15,45 @@ from helpers import ROOT
 
 PACKAGE = "thincam_jax"
 
-# A module imports only from the modules to its left, or from its own package. `waveguide` stands
-# where it may use everything up to the capture. A new module goes where its imports allow.
-ORDER = (
-    *(
-        "units",
-        "_checks",
-        "_files",
-        "_memory",
-        "_phase",
-        "_precision",
-        "grids",
-        "chirp",
-        "targets",
-        "scene",
-        "masks",
-    ),
-    *(
-        "sensor",
-        "propagation",
-        "camera",
-        "cost",
-        "digits",
-        "psf",
-        "selection",
-        "responses",
-        "operators",
-        "imaging",
-        "planning",
-        "capture",
-        "waveguide",
-        "reconstruct",
-    ),
-    *("metrics", "depth", "design", "calibrate", "measured"),
-    *(
-        "config_file",
-        "config",
-        "config_refocus",
-        "config_pareto",
-        "config_training",
-        "config_design",
-    ),
-    *("study", "design_run", "report"),
-    *("bench", "doctor", "run", "run_refocus", "run_design", "reconstruction_run", "sweep"),
-    *("terminal", "cli_reconstruct", "cli_refocus", "cli_sweep", "cli_design", "cli"),
-    "hardware",
+# A room imports only from the floors below it and from itself, never from a room beside it.
+FLOORS = (
+    ("units", "_core"),
+    ("imaging",),
+    ("lensless", "waveguide"),
+    ("reconstruction", "measured"),
+    ("design",),
+    ("learn",),
+    ("commands",),
 )
-ENTRY = ("__init__", "__main__")  # they stand right of everything but `hardware`
+# The rig stands outside: it may use what captures need, and only its command knows of it.
+OUTSIDE, OUTSIDE_USES = "hardware", "measured"
+ROOMS = (*(room for floor in FLOORS for room in floor), OUTSIDE)
+FLOOR = {room: height for height, floor in enumerate(FLOORS) for room in floor}
+ENTRY = ("__init__", "__main__")  # they stand above all rooms but the one outside
+MOST_ENTRIES = 12
 MAX_LINES = 500
 
-JAXOPT_FILES = ("reconstruct/_jaxopt.py", "design/_jaxopt.py")
+JAXOPT_FILES = ("reconstruction/_jaxopt.py", "design/_jaxopt.py")
 FRONT_END_LIBRARIES = ("matplotlib", "pydantic", "typer", "rich", "jinja2")
-FRONT_END = (
-    *("config", "config_refocus", "config_pareto", "config_training", "config_design"),
-    *("study", "report", "bench", "doctor"),
-    *("terminal", "cli_reconstruct", "cli_refocus", "cli_sweep", "cli_design", "cli"),
-)
+FRONT_END = "commands"
 
 
 @dataclass(frozen=True)
 class Module:
     """One source file: its path inside the package, its text and its syntax tree."""
 
-    path: str  # "propagation/select.py"
+    path: str  # "lensless/psf.py"
     text: str
     tree: ast.Module
 
     @property
     def top(self) -> str:
-        """The top-level module it belongs to: "propagation"."""
+        """The room it belongs to: "lensless"."""
         return Path(self.path).parts[0].removesuffix(".py")
 
     @property
     def package(self) -> list[str]:
-        """The package that relative imports start from: ["thincam_jax", "propagation"]."""
+        """The package that relative imports start from: ["thincam_jax", "lensless"]."""
         return [PACKAGE, *Path(self.path).parts[:-1]]
 
     @property
@@ -121,17 +86,23 @@ def read_package(folder: Path) -> list[Module]:
     return modules
 
 
-def unknown_modules(modules: list[Module]) -> list[str]:
+def unknown_rooms(modules: list[Module]) -> list[str]:
     return [
-        f"{module.path}: the top-level module {module.top!r} has no place in the import order: "
-        "add it to ORDER in tests/test_architecture.py, right of all that it imports"
+        f"{module.path}: the room {module.top!r} has no floor: "
+        "give it one in FLOORS of tests/test_architecture.py, above all that it imports"
         for module in modules
-        if module.top not in (*ORDER, *ENTRY)
+        if module.top not in (*ROOMS, *ENTRY)
     ]
 
 
-def imports_against_the_order(modules: list[Module]) -> list[str]:
-    unknown = {module.top for module in modules} - {*ORDER, *ENTRY}  # told by the rule above
+def crowded_roots(modules: list[Module]) -> list[str]:
+    entries = {module.top for module in modules}
+    if len(entries) <= MOST_ENTRIES:
+        return []
+    return [f"{min(entries)}: the root has {len(entries)} entries, {MOST_ENTRIES} allowed"]
+
+
+def imports_against_the_floors(modules: list[Module]) -> list[str]:
     complaints = []
     for module in modules:
         for line, name in module.imports():
@@ -140,20 +111,45 @@ def imports_against_the_order(modules: list[Module]) -> list[str]:
                 continue
             where = f"{module.path}:{line}"
             target = parts[1] if len(parts) > 1 else None
-            if target == "hardware" and module.top != "hardware":
-                complaints.append(f"{where}: imports hardware, which nothing may import")
-            elif module.top in ENTRY or target in (module.top, *unknown):
-                continue
-            elif target not in ORDER:
+            if target == module.top or module.top not in (*ROOMS, *ENTRY):
+                continue  # a room without a floor is told by the rule above
+            if target == OUTSIDE:
+                if not may_use_the_rig(module, line):
+                    complaints.append(
+                        f"{where}: imports {OUTSIDE}, which only its command may, inside a function"
+                    )
+            elif target not in FLOOR:
                 complaints.append(
                     f"{where}: imports {name} from the top of the package, which imports "
                     "everything: import it from the module that defines it"
                 )
-            elif module.top in ORDER and ORDER.index(target) > ORDER.index(module.top):
-                complaints.append(
-                    f"{where}: {module.top} imports {target}, which stands right of it in ORDER"
-                )
+            elif module.top == OUTSIDE and FLOOR[target] > FLOOR[OUTSIDE_USES]:
+                complaints.append(f"{where}: {OUTSIDE} imports {target}, above {OUTSIDE_USES}")
+            elif module.top in FLOOR and FLOOR[target] >= FLOOR[module.top]:
+                if {module.top, target} != {"units", "_core"}:
+                    complaints.append(f"{where}: {module.top} imports {target}, which is no lower")
     return complaints
+
+
+def may_use_the_rig(module: Module, line: int) -> bool:
+    """A command's file may, where the import waits for the command to be called."""
+    functions = [n for n in ast.walk(module.tree) if isinstance(n, ast.FunctionDef)]
+    inside = any(f.lineno < line <= (f.end_lineno or f.lineno) for f in functions)
+    return module.top == FRONT_END and Path(module.path).name == "command.py" and inside
+
+
+def modules_hidden_by_names(modules: list[Module]) -> list[str]:
+    """`package.name` is a module or what a package's face imports by that name, never both."""
+    paths = {Path(module.path).with_suffix("").as_posix() for module in modules}
+    paths |= {Path(module.path).parent.as_posix() for module in modules}
+    return [
+        f"{module.path}:{line}: {name.split('.')[-1]} hides the module of that name"
+        for module in modules
+        if Path(module.path).name == "__init__.py"
+        for line, name in module.imports()
+        if (Path(module.path).parent / name.split(".")[-1]).as_posix() in paths
+        and name != ".".join([*module.package, name.split(".")[-1]])
+    ]
 
 
 def jaxopt_outside_its_files(modules: list[Module]) -> list[str]:
@@ -167,10 +163,10 @@ def jaxopt_outside_its_files(modules: list[Module]) -> list[str]:
 
 def front_end_libraries_in_the_core(modules: list[Module]) -> list[str]:
     return [
-        f"{module.path}:{line}: imports {name.split('.')[0]}; only {', '.join(FRONT_END)} may"
+        f"{module.path}:{line}: imports {name.split('.')[0]}; only {FRONT_END} may"
         for module in modules
         for line, name in module.imports()
-        if name.split(".")[0] in FRONT_END_LIBRARIES and module.top not in FRONT_END
+        if name.split(".")[0] in FRONT_END_LIBRARIES and module.top != FRONT_END
     ]
 
 
@@ -201,8 +197,10 @@ def missing_docstrings(modules: list[Module]) -> list[str]:
 
 
 RULES = (
-    unknown_modules,
-    imports_against_the_order,
+    unknown_rooms,
+    crowded_roots,
+    imports_against_the_floors,
+    modules_hidden_by_names,
     jaxopt_outside_its_files,
     front_end_libraries_in_the_core,
     star_imports,
@@ -229,48 +227,55 @@ def test_package_keeps(rule, package):
 DOC = '"""What it is."""\n'
 
 # rule, file, source, part of the complaint
+UP = imports_against_the_floors
 BROKEN = [
-    (unknown_modules, "extras.py", DOC, "add it to ORDER in tests/test_architecture.py"),
-    (unknown_modules, "extras/deep.py", DOC, "'extras' has no place"),
-    (imports_against_the_order, "grids.py", "import thincam_jax.psf", "grids imports psf"),
-    (imports_against_the_order, "grids.py", "from thincam_jax.psf import psf", "grids imports psf"),
-    (imports_against_the_order, "grids.py", "from thincam_jax import psf", "grids imports psf"),
-    (imports_against_the_order, "grids.py", "from .psf import psf", "grids imports psf"),
-    (imports_against_the_order, "grids.py", "from . import psf", "grids imports psf"),
-    (imports_against_the_order, "masks/fza.py", "from ..camera import x", "masks imports camera"),
-    (imports_against_the_order, "masks/__init__.py", "from .. import psf", "masks imports psf"),
-    (imports_against_the_order, "grids.py", "def f():\n    from .psf import psf", "grids.py:2: "),
-    (imports_against_the_order, "waveguide/trace.py", "from ..reconstruct import x", "right of it"),
-    (imports_against_the_order, "psf.py", "import thincam_jax as tc", "from the top"),
-    (imports_against_the_order, "psf.py", "from . import Sensor", "from the top"),
-    (imports_against_the_order, "cli.py", "from .hardware import x", "nothing may import"),
-    (imports_against_the_order, "__init__.py", "from . import hardware", "nothing may import"),
-    (jaxopt_outside_its_files, "reconstruct/tv.py", "import jaxopt", "only reconstruct/_jaxopt.py"),
+    (unknown_rooms, "extras.py", DOC, "'extras' has no floor"),
+    (unknown_rooms, "extras/deep.py", DOC, "give it one in FLOORS"),
+    (UP, "_core/grids.py", "import thincam_jax.imaging.scene", "_core imports imaging"),
+    (UP, "_core/grids.py", "from thincam_jax.lensless.psf import psf", "_core imports lensless"),
+    (UP, "_core/grids.py", "from thincam_jax import imaging", "_core imports imaging"),
+    (UP, "_core/grids.py", "from ..lensless import psf", "_core imports lensless"),
+    (UP, "_core/grids.py", "def f():\n    from ..design import x", "_core/grids.py:2: "),
+    (UP, "lensless/psf.py", "from ..waveguide.trace import x", "which is no lower"),
+    (UP, "waveguide/trace.py", "from ..lensless.psf import x", "which is no lower"),
+    (UP, "measured/files.py", "from ..reconstruction import x", "which is no lower"),
+    (UP, "lensless/psf.py", "import thincam_jax as tc", "from the top"),
+    (UP, "lensless/psf.py", "from .. import Sensor", "from the top"),
+    (UP, "hardware/stage.py", "from ..design import x", "above measured"),
+    (UP, "hardware/stage.py", "from ..commands.cli import x", "above measured"),
+    (UP, "design/space.py", "from ..hardware import x", "only its command may"),
+    (UP, "commands/rig/command.py", "from ...hardware import x", "inside a function"),
+    (UP, "commands/cli.py", "def f():\n    from ..hardware import x", "only its command may"),
+    (UP, "__init__.py", "from . import hardware", "only its command may"),
+    (modules_hidden_by_names, "lensless/__init__.py", "from .psf import psf", "psf hides the"),
+    (modules_hidden_by_names, "lensless/__init__.py", "from ..units import masks", "masks hides"),
+    (jaxopt_outside_its_files, "reconstruction/tv.py", "import jaxopt", "_jaxopt.py and design"),
     (jaxopt_outside_its_files, "_jaxopt.py", "from jaxopt.projection import x", "imports jaxopt"),
-    (front_end_libraries_in_the_core, "psf.py", "import matplotlib.pyplot as plt", "matplotlib"),
-    (front_end_libraries_in_the_core, "scene.py", "from pydantic import BaseModel", "pydantic"),
+    (front_end_libraries_in_the_core, "lensless/psf.py", "import matplotlib.pyplot", "matplotlib"),
+    (front_end_libraries_in_the_core, "units.py", "from pydantic import BaseModel", "pydantic"),
     (front_end_libraries_in_the_core, "hardware/stage.py", "import typer", "typer"),
     (front_end_libraries_in_the_core, "__init__.py", "import rich, jinja2", "jinja2"),
-    (star_imports, "psf.py", "from .camera import *", "star import"),
-    (star_imports, "psf.py", "from numpy import *", "star import"),
-    (long_modules, "psf.py", DOC + "x = 1\n" * MAX_LINES, "501 lines, 500 allowed"),
-    (missing_docstrings, "psf.py", "x = 1", "begins with a docstring"),
-    (missing_docstrings, "masks/__init__.py", "", "begins with a docstring"),
+    (star_imports, "lensless/psf.py", "from .camera import *", "star import"),
+    (star_imports, "lensless/psf.py", "from numpy import *", "star import"),
+    (long_modules, "lensless/psf.py", DOC + "x = 1\n" * MAX_LINES, "501 lines, 500 allowed"),
+    (missing_docstrings, "lensless/psf.py", "x = 1", "begins with a docstring"),
+    (missing_docstrings, "lensless/masks/__init__.py", "", "begins with a docstring"),
 ]
 
 SOUND = [
     ("units.py", DOC + "import math"),
-    ("_memory.py", "x = 1"),
-    ("masks/_pattern.py", "x = 1"),
-    ("masks/__init__.py", DOC + "from .fza import Plate as Plate"),
-    ("masks/fza.py", DOC + "from .. import grids\nfrom ..units import mm\nfrom . import _pattern"),
-    ("waveguide/trace.py", DOC + "from ..capture import x"),
-    ("reconstruct/_jaxopt.py", "import jaxopt"),
-    ("report.py", DOC + "import matplotlib.pyplot, jinja2\nfrom .waveguide import x"),
-    ("hardware/stage.py", DOC + "from thincam_jax.cli import x\nfrom .bus import y"),
-    ("__init__.py", DOC + "from .psf import psf as psf\nfrom . import cli"),
-    ("__main__.py", DOC + "from .cli import main"),
-    ("psf.py", DOC + "import rich_text, jaxoptics\n" + "x = 1\n" * (MAX_LINES - 2)),
+    ("_core/memory.py", "x = 1"),
+    ("_core/grids.py", DOC + "from ..units import mm"),
+    ("lensless/masks/_pattern.py", "x = 1"),
+    ("lensless/masks/__init__.py", DOC + "from .fza import Plate as Plate"),
+    ("lensless/masks/fza.py", DOC + "from ..._core import grids\nfrom . import _pattern"),
+    ("lensless/psf.py", DOC + "import rich_text, jaxoptics\n" + "x = 1\n" * (MAX_LINES - 2)),
+    ("reconstruction/_jaxopt.py", "import jaxopt"),
+    ("commands/figures.py", DOC + "import matplotlib.pyplot, jinja2\nfrom ..learn import x"),
+    ("commands/rig/command.py", DOC + "def run():\n    from ...hardware import stage"),
+    ("hardware/stage.py", DOC + "from thincam_jax.measured.read import x\nfrom .bus import y"),
+    ("__init__.py", DOC + "from .lensless.psf import psf as psf\nfrom . import commands"),
+    ("__main__.py", DOC + "from .commands.cli import main"),
 ]
 
 
@@ -287,6 +292,11 @@ def test_rule_sees_what_breaks_it(rule, path, source, complaint, tmp_path):
     complaints = [text for text in rule(modules) if text.startswith(path)]
     assert complaints
     assert complaint in "\n".join(complaints)
+
+
+def test_a_crowded_root_is_seen(tmp_path):
+    files = [(f"room_{n}.py", DOC) for n in range(MOST_ENTRIES + 1)]
+    assert "13 entries, 12 allowed" in crowded_roots(write_package(tmp_path, files))[0]
 
 
 def test_rules_pass_a_sound_package(tmp_path):

@@ -11,8 +11,8 @@ import mpmath
 import numpy as np
 import pytest
 from extremes import CHOICES, EXTREMES, GRADIENTS, LOST, PARAMETERS, Extreme, find
+from lensless.propagation.reference import chirp_by_quadrature
 from naive_formulas import NAIVE
-from propagation.reference import chirp_by_quadrature
 
 import thincam_jax as tc
 from helpers import AS_IN_USE, ROOT, count_traces, finite_difference, relative_l2

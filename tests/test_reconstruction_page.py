@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import PIL.Image
-from reconstruction_run import simulated
+from commands.photo import simulated
 from test_readme import run_examples
 
 

@@ -13,7 +13,7 @@ from thincam_jax.design import (
     channels,
     shots,
 )
-from thincam_jax.reconstruct import phase_pairs
+from thincam_jax.reconstruction import phase_pairs
 
 WAVELENGTH = 500e-6
 PAIR = (0.0, 1.5 * np.pi)

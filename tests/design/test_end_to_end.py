@@ -8,6 +8,7 @@ import pytest
 
 import thincam_jax as tc
 from helpers import AS_IN_USE
+from thincam_jax._core.grids import Grid
 from thincam_jax.design import (
     Design,
     DesignSpace,
@@ -22,8 +23,7 @@ from thincam_jax.design import (
     restore,
     stochastic_descent,
 )
-from thincam_jax.grids import Grid
-from thincam_jax.reconstruct.synthesis import phase_pairs
+from thincam_jax.reconstruction.synthesis import phase_pairs
 
 SENSOR, IMAGE = (20, 24), 14
 PAIR = (0.0, 1.5 * np.pi)

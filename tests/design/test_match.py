@@ -9,7 +9,7 @@ from design.setting import setup, two_betas
 from thincam_jax.design import Polar, PowerLaw, match_response
 from thincam_jax.design.match import _least_squares
 from thincam_jax.design.wanted import ResponseModel
-from thincam_jax.reconstruct import phase_pairs
+from thincam_jax.reconstruction import phase_pairs
 
 RINGS = 16
 DATA = (setup(prior=PowerLaw(2.8)), jnp.asarray(phase_pairs(2)), Polar(96.0, 128, 2))

@@ -24,7 +24,7 @@ from thincam_jax.design import (
     worst_ratio_db,
 )
 from thincam_jax.design.objectives import Channels, ring_means
-from thincam_jax.reconstruct import phase_pairs
+from thincam_jax.reconstruction import phase_pairs
 
 N = 48
 

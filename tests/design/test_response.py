@@ -10,10 +10,10 @@ from helpers import relative_l2
 from thincam_jax.design import Polar, PowerLaw, Quadrant, bayes_error, channels
 from thincam_jax.design.objectives import ring_means
 from thincam_jax.design.response import responses, seen_part
-from thincam_jax.propagation import Path
-from thincam_jax.propagation.separable_transfer import transfer_factors
-from thincam_jax.reconstruct import phase_pairs
-from thincam_jax.sensor import Sensor
+from thincam_jax.imaging.sensor import Sensor
+from thincam_jax.lensless.propagation import Path
+from thincam_jax.lensless.propagation.separable_transfer import transfer_factors
+from thincam_jax.reconstruction import phase_pairs
 
 respond = jax.jit(responses)
 tell = jax.jit(channels)

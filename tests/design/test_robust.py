@@ -16,7 +16,7 @@ from thincam_jax.design import (
     mismatch_error,
     robust_error,
 )
-from thincam_jax.reconstruct.synthesis import phase_pairs
+from thincam_jax.reconstruction.synthesis import phase_pairs
 
 SETUP = setup(object_width=180.0, prior=PowerLaw(2.8))
 FREQUENCIES = Polar(jnp.asarray(200.0), 400, 2)

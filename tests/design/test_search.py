@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from design.setting import HIGHEST, error, setup, two_betas
 
-from thincam_jax.design import DesignSpace, Polar, PowerLaw, Variable, landscape, search
+from thincam_jax.design import DesignSpace, Polar, PowerLaw, Variable, find_designs, landscape
 from thincam_jax.design.search import _descend, _descend_in_box
 
 SPACE = two_betas()
@@ -40,7 +40,7 @@ def counted(design, data):
 
 def run(objective, data, seed=0, **options):
     options = {"starts": 6, "samples": 64} | options
-    return search(objective, SPACE, data, key=jax.random.key(seed), **options)
+    return find_designs(objective, SPACE, data, key=jax.random.key(seed), **options)
 
 
 SOLVERS = pytest.mark.parametrize("solver", ["bfgs", "lbfgsb"])
@@ -162,7 +162,7 @@ def against_grid(frequencies, count, seeds):
     """How far each search's best lies above the grid's, relative, and the most evaluations."""
     data = (setup(prior=PowerLaw(2.8)), frequencies)
     lowest = float(jnp.min(landscape(error, SPACE, data, count)[1]))
-    results = [search(error, SPACE, data, key=jax.random.key(s)) for s in range(seeds)]
+    results = [find_designs(error, SPACE, data, key=jax.random.key(s)) for s in range(seeds)]
     excess = np.array([r.found[0].objective / lowest - 1 for r in results])
     return excess, max(r.evaluations for r in results)
 

@@ -9,7 +9,7 @@ from design.setting import setup, thesis_design, two_betas
 from helpers import finite_difference
 from thincam_jax.design import Polar, PowerLaw, channels, response_misfit, ring_levels
 from thincam_jax.design.wanted import ResponseModel, checked_levels
-from thincam_jax.reconstruct import phase_pairs
+from thincam_jax.reconstruction import phase_pairs
 
 FREQUENCIES = Polar(96.0, 128, 2)
 DATA = (setup(prior=PowerLaw(2.8)), jnp.asarray(phase_pairs(2)), FREQUENCIES)

@@ -18,7 +18,7 @@ from thincam_jax.design import (
     wiener_error,
 )
 from thincam_jax.design.training import channels_of
-from thincam_jax.reconstruct.synthesis import phase_pairs
+from thincam_jax.reconstruction.synthesis import phase_pairs
 
 SENSOR, PITCH = (80, 96), 0.02
 PAIR = (0.0, 1.5 * np.pi)

@@ -20,8 +20,8 @@ from thincam_jax.design.prior import PowerLaw as PowerLaw
 from thincam_jax.design.prior import fit_power_law as fit_power_law
 from thincam_jax.design.robust import Tolerances as Tolerances
 from thincam_jax.design.robust import robust_error as robust_error
+from thincam_jax.design.search import find_designs as find_designs
 from thincam_jax.design.search import landscape as landscape
-from thincam_jax.design.search import search as search
 from thincam_jax.design.setup import PhotonNoise as PhotonNoise
 from thincam_jax.design.setup import Setup as Setup
 from thincam_jax.design.setup import SignalNoise as SignalNoise
@@ -29,13 +29,6 @@ from thincam_jax.design.space import DesignSpace as DesignSpace
 from thincam_jax.design.space import Limits as Limits
 from thincam_jax.design.space import Variable as Variable
 from thincam_jax.design.stochastic import stochastic_descent as stochastic_descent
-from thincam_jax.design.suggest import Suggester as Suggester
-from thincam_jax.design.suggest import Suggestion as Suggestion
-from thincam_jax.design.suggest import load_suggester as load_suggester
-from thincam_jax.design.suggest import propose as propose
-from thincam_jax.design.suggest import save_suggester as save_suggester
-from thincam_jax.design.suggest import suggest as suggest
-from thincam_jax.design.train_suggester import train_suggester as train_suggester
 from thincam_jax.design.training import Training as Training
 from thincam_jax.design.wanted import response_misfit as response_misfit
 from thincam_jax.design.wanted import ring_levels as ring_levels

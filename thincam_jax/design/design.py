@@ -6,10 +6,10 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from thincam_jax import _checks
-from thincam_jax.camera import LenslessCamera
-from thincam_jax.masks.fza import FresnelZoneAperture
-from thincam_jax.sensor import Sensor
+from thincam_jax._core import checks
+from thincam_jax.imaging.sensor import Sensor
+from thincam_jax.lensless.camera import LenslessCamera
+from thincam_jax.lensless.masks.fza import FresnelZoneAperture
 
 MOST_CAPTURES = 8
 
@@ -49,11 +49,11 @@ class Design(eqx.Module):
         **Errors**: ValueError for no capture, more than eight, or a number out of range.
         """
         given = (
-            _checks.positive_all("beta", jnp.asarray(beta, float), "rad/mm^2"),
+            checks.positive_all("beta", jnp.asarray(beta, float), "rad/mm^2"),
             _finite("phase", jnp.asarray(phase, float), "rad"),
-            _checks.positive_all("distance", jnp.asarray(distance, float), "mm"),
-            _checks.positive_all("wavelength", jnp.asarray(wavelength, float), "mm"),
-            _checks.positive_all("exposure", jnp.asarray(exposure, float), "shares"),
+            checks.positive_all("distance", jnp.asarray(distance, float), "mm"),
+            checks.positive_all("wavelength", jnp.asarray(wavelength, float), "mm"),
+            checks.positive_all("exposure", jnp.asarray(exposure, float), "shares"),
         )
         shape = jnp.broadcast_shapes((1,), *(g.shape for g in given))
         if len(shape) != 1 or not 1 <= shape[0] <= MOST_CAPTURES:
@@ -63,8 +63,8 @@ class Design(eqx.Module):
             )
         numbers = [jnp.broadcast_to(g, shape) for g in given]
         self.beta, self.phase, self.distance, self.wavelength, self.exposure = numbers
-        self.width = _checks.positive("width", width, "mm")
-        self.profile = _checks.choice("profile", profile, ("cosine", "binary"))  # pyright: ignore
+        self.width = checks.positive("width", width, "mm")
+        self.profile = checks.choice("profile", profile, ("cosine", "binary"))  # pyright: ignore
 
     @property
     def captures(self) -> int:
@@ -83,7 +83,7 @@ class Design(eqx.Module):
 
 
 def _finite(name: str, value: Array, unit: str) -> Array:
-    return _checks.finite(name, value, unit, shape=value.shape)
+    return checks.finite(name, value, unit, shape=value.shape)
 
 
 def shots(

@@ -18,7 +18,7 @@ import numpy as np
 from jax.scipy.sparse.linalg import cg
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from thincam_jax._phase import as_complex
+from thincam_jax._core.precision import as_complex
 from thincam_jax.design.design import Design
 from thincam_jax.design.training import Training, channels_of, relative_error
 

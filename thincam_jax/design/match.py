@@ -15,7 +15,7 @@ import numpy as np
 import optimistix
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from thincam_jax import _checks
+from thincam_jax._core import checks
 from thincam_jax.design.design import Design
 from thincam_jax.design.frequencies import Frequencies
 from thincam_jax.design.objectives import channels
@@ -97,7 +97,7 @@ def match_response(
     **Errors**: ValueError for wanted levels that are not finite or below 0, and for numbers of
     starts, samples or steps below 1.
     """
-    _checks.at_least_one({"starts": starts, "samples": samples, "steps": steps})
+    checks.at_least_one({"starts": starts, "samples": samples, "steps": steps})
     dtype = space.lower.dtype
     levels = checked_levels(wanted, np.size(wanted), dtype)
     model = ResponseModel(space, setup, synthesis, frequencies, len(levels))

@@ -1,7 +1,7 @@
 r"""What makes a design good: pure functions of it, differentiable in every number.
 
 All but the end-to-end ones rest on what the captures say of each frequency of the scene. With
-responses H_k, noise spectra η_k and the synthesis W (`thincam_jax.reconstruct.synthesis`) this is
+responses H_k, noise spectra η_k and the synthesis W (`reconstruction.synthesis`) this is
 
 .. math:: J(\nu) = \sum_c \frac{|\sum_k W_{ck} \bar H_k|^2}
     {\sum_k W_{ck}^2 \eta_k + \eta_c^{crop}}

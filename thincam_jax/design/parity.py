@@ -16,8 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from thincam_jax._precision import product
-from thincam_jax.grids import centred_indices
+from thincam_jax._core.grids import centred_indices
+from thincam_jax._core.precision import product
 
 
 def half_places(count: int, pitch) -> Float[Array, " place"]:

@@ -6,7 +6,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
 
-from thincam_jax import _checks
+from thincam_jax._core import checks
 
 
 class PowerLaw(eqx.Module):
@@ -23,8 +23,8 @@ class PowerLaw(eqx.Module):
     corner: Float[Array, ""] | None
 
     def __init__(self, exponent=2.0, corner=None):
-        self.exponent = _checks.non_negative("exponent", exponent, "powers of the frequency")
-        self.corner = None if corner is None else _checks.positive("corner", corner, "cycles/rad")
+        self.exponent = checks.non_negative("exponent", exponent, "powers of the frequency")
+        self.corner = None if corner is None else checks.positive("corner", corner, "cycles/rad")
 
     def __call__(
         self, frequency_squared: Float[Array, "*shape"], field: Float[Array, ""]

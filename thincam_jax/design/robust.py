@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from thincam_jax import _checks
+from thincam_jax._core import checks
 from thincam_jax.design.design import Design
 from thincam_jax.design.frequencies import Frequencies
 from thincam_jax.design.objectives import bayes_error, channels, mismatch_error
@@ -46,7 +46,7 @@ def robust_error(
     deviation. "worst": the largest of all E±i, as a soft maximum. The scale of the image on the
     sensor is taken to be registered.
     """
-    _checks.choice("how", how, ("mean", "worst"))
+    checks.choice("how", how, ("mean", "worst"))
     known = channels(design, setup, synthesis, frequencies)
     exact = bayes_error(known)
     moved = list(_moved(design, setup, tolerances))

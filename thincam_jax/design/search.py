@@ -15,7 +15,7 @@ import optimistix
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from scipy.stats import qmc
 
-from thincam_jax import _checks
+from thincam_jax._core import checks
 from thincam_jax.design._jaxopt import descend_in_box
 from thincam_jax.design.design import Design
 from thincam_jax.design.space import DesignSpace, active_limits
@@ -68,7 +68,7 @@ class Search(NamedTuple):
     failed: int
 
 
-def search(
+def find_designs(
     objective: Objective,
     space: DesignSpace,
     data: Any,
@@ -96,8 +96,8 @@ def search(
 
     **Errors**: ValueError for numbers of starts, samples or steps below 1.
     """
-    _checks.at_least_one({"starts": starts, "samples": samples, "steps": steps})
-    _checks.choice("solver", solver, ("bfgs", "lbfgsb"))
+    checks.at_least_one({"starts": starts, "samples": samples, "steps": steps})
+    checks.choice("solver", solver, ("bfgs", "lbfgsb"))
     points = even_samples(space.size, max(samples, starts), key, space.lower.dtype)
     values = evaluate(objective, space, data, points)
     chosen = best_apart(np.asarray(points), np.asarray(values), starts)

@@ -3,7 +3,7 @@ r"""What a design is judged in: sensor, scene and noise."""
 import equinox as eqx
 from jaxtyping import Array, Float
 
-from thincam_jax import _checks
+from thincam_jax._core import checks
 from thincam_jax.design.prior import PowerLaw
 
 
@@ -17,7 +17,7 @@ class SignalNoise(eqx.Module):
     snr_db: Float[Array, ""]
 
     def __init__(self, snr_db=30.0):
-        self.snr_db = _checks.finite("snr_db", snr_db, "dB")
+        self.snr_db = checks.finite("snr_db", snr_db, "dB")
 
     def variance(self, light, signal, exposure):
         """Of a pixel, mm⁴: from the capture's mean (mm²), its variance, the share of exposure."""
@@ -36,8 +36,8 @@ class PhotonNoise(eqx.Module):
     read_noise: Float[Array, ""]
 
     def __init__(self, electrons=2_000.0, read_noise=8.0):
-        self.electrons = _checks.positive("electrons", electrons, "electrons")
-        self.read_noise = _checks.non_negative("read_noise", read_noise, "electrons")
+        self.electrons = checks.positive("electrons", electrons, "electrons")
+        self.read_noise = checks.non_negative("read_noise", read_noise, "electrons")
 
     def variance(self, light, signal, exposure):
         """Of a pixel, mm⁴: from the capture's mean (mm²), its variance, the share of exposure."""
@@ -81,11 +81,11 @@ class Setup(eqx.Module):
         pixel_integration: bool = True,
         crop: bool = True,
     ):
-        self.pitch = _checks.positive("pitch", pitch, "mm")
-        self.sensor_width = _checks.positive("sensor_width", sensor_width, "mm")
-        self.object_distance = _checks.positive("object_distance", object_distance, "mm")
-        self.object_width = _checks.positive("object_width", object_width, "mm")
-        self.contrast = _checks.positive("contrast", contrast, "parts of the mean")
+        self.pitch = checks.positive("pitch", pitch, "mm")
+        self.sensor_width = checks.positive("sensor_width", sensor_width, "mm")
+        self.object_distance = checks.positive("object_distance", object_distance, "mm")
+        self.object_width = checks.positive("object_width", object_width, "mm")
+        self.contrast = checks.positive("contrast", contrast, "parts of the mean")
         self.noise = SignalNoise() if noise is None else noise
         self.prior = PowerLaw() if prior is None else prior
         self.pixel_integration = pixel_integration

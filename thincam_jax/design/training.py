@@ -17,15 +17,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from thincam_jax import _checks
-from thincam_jax.camera import LenslessCamera
+from thincam_jax._core import checks
+from thincam_jax._core.grids import Grid
 from thincam_jax.design.design import Design
 from thincam_jax.design.setup import Setup
-from thincam_jax.grids import Grid
-from thincam_jax.operators import CropConvolution, kernel_grid
-from thincam_jax.psf import psf
-from thincam_jax.scene import ImagePlane
-from thincam_jax.sensor import Sensor
+from thincam_jax.imaging.operators import CropConvolution, kernel_grid
+from thincam_jax.imaging.scene import ImagePlane
+from thincam_jax.imaging.sensor import Sensor
+from thincam_jax.lensless.camera import LenslessCamera
+from thincam_jax.lensless.psf import psf
 
 
 class Window(NamedTuple):
@@ -98,7 +98,7 @@ class Training(eqx.Module):
         given = jnp.asarray(images, float)
         if given.ndim != 3 or given.shape[-1] != given.shape[-2]:
             raise ValueError(f"images have shape {given.shape}; give (image, n, n), square ones")
-        if not _checks.is_traced(given) and not np.all(np.ptp(np.asarray(given), axis=(1, 2)) > 0):
+        if not checks.is_traced(given) and not np.all(np.ptp(np.asarray(given), axis=(1, 2)) > 0):
             raise ValueError("an image has no contrast, or is not finite; there is nothing to see")
         self.images = given / jnp.mean(given, axis=(-2, -1), keepdims=True)
         rows = np.asarray(synthesis, dtype=float)
@@ -198,7 +198,7 @@ def check_captures(design: Design, training: Training) -> None:
             f"the synthesis adds {count} captures and the design takes {design.captures}; "
             "make them the same"
         )
-    if _checks.is_traced(design.distance):
+    if checks.is_traced(design.distance):
         return
     shortest, longest = training.distances
     for distance in np.asarray(design.distance):

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from thincam_jax import _checks
+from thincam_jax._core import checks
 from thincam_jax.design.frequencies import Frequencies
 from thincam_jax.design.objectives import Channels, channels, ring_means
 from thincam_jax.design.setup import Setup
@@ -91,7 +91,7 @@ class ResponseModel(eqx.Module):
 
 def checked_levels(wanted, rings: int, dtype) -> Float[Array, " ring"]:
     """Wanted levels, looked at where they are known: ValueError, one line, for what is none."""
-    if _checks.is_traced(wanted):
+    if checks.is_traced(wanted):
         levels = jnp.asarray(wanted).astype(dtype)
     else:
         levels = jnp.asarray(np.asarray(wanted, dtype=float), dtype)
@@ -100,7 +100,7 @@ def checked_levels(wanted, rings: int, dtype) -> Float[Array, " ring"]:
             f"wanted has shape {levels.shape}; give ({rings},), a level in dB for each ring from "
             "zero frequency up"
         )
-    if not _checks.is_traced(levels):
+    if not checks.is_traced(levels):
         known = np.asarray(levels)
         for bad, what in ((~np.isfinite(known), "no finite number"), (known < 0, "below 0 dB")):
             if bad.any():

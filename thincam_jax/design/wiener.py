@@ -1,13 +1,13 @@
 r"""The error of the Wiener synthesis of training images, differentiated through it.
 
-`thincam_jax.reconstruct.WienerSynthesis` as a smooth function of every number of a design, the
+`thincam_jax.reconstruction.WienerSynthesis` as a smooth function of every number of a design, the
 distances too: captures are not enlarged to one scale; their spectra are taken where the scene's
 angular frequencies ν fall on each sensor, at ν/d,
 
 .. math:: G_c(\nu) = p^2 \sum_x g_c(x)\, e^{-2\pi j\nu x/d}, \qquad
     \hat F = \frac{\sum_c H_c\, d_c^2\, G_c/\eta_c}{\sum_c H_c^2\, d_c^4/\eta_c + 1/\eta_f}
 
-with H_c in closed form at ν/d (`thincam_jax.propagation.separable_transfer`). Spectra are densities
+with H_c in closed form at ν/d (`propagation.separable_transfer`). Spectra are densities
 over the solid angle Ω_c = Np²/d_c² that a sensor's N pixels cover: η_c = E|N_c|²/Ω_c = σ_c²p²d_c²
 for noise of variance σ_c², and η_f ∝ 1/(ν² + ν₀²) of a strength that is found from the captures'
 own power |G_c|²/Ω_c. As there, the filter takes captures as if nothing had been cropped, and what
@@ -40,10 +40,10 @@ from thincam_jax.design.parity import (
 )
 from thincam_jax.design.prior import PowerLaw
 from thincam_jax.design.training import Training, check_captures, noise_variance, relative_error
-from thincam_jax.propagation.path import Path
-from thincam_jax.propagation.separable_transfer import transfer_factors
-from thincam_jax.reconstruct.spectra import crop_noise, inner_band, scene_power
-from thincam_jax.reconstruct.synthesis import keep_bias
+from thincam_jax.lensless.propagation.path import Path
+from thincam_jax.lensless.propagation.separable_transfer import transfer_factors
+from thincam_jax.reconstruction.spectra import crop_noise, inner_band, scene_power
+from thincam_jax.reconstruction.synthesis import keep_bias
 
 
 def wiener_error(design: Design, training: Training) -> Float[Array, ""]:

@@ -5,8 +5,8 @@ from thincam_jax.measured.bayer import demosaic_mask as demosaic_mask
 from thincam_jax.measured.display import to_display as to_display
 from thincam_jax.measured.folder import list_captures as list_captures
 from thincam_jax.measured.options import Preparation as Preparation
-from thincam_jax.measured.prepare import Prepared as Prepared
-from thincam_jax.measured.prepare import prepare as prepare
+from thincam_jax.measured.preparation import Prepared as Prepared
+from thincam_jax.measured.preparation import prepare as prepare
 from thincam_jax.measured.raw import CaptureFileError as CaptureFileError
 from thincam_jax.measured.raw import MeasurementError as MeasurementError
 from thincam_jax.measured.raw import Raw as Raw

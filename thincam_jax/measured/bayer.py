@@ -6,7 +6,7 @@ import numpy as np
 import scipy.ndimage
 from jaxtyping import Bool, Float, Shaped
 
-from thincam_jax import _checks
+from thincam_jax._core import checks
 
 Pattern = Literal["RGGB", "BGGR", "GRBG", "GBRG"]
 Demosaicing = Literal["bilinear", "superpixel"]
@@ -70,7 +70,7 @@ def demosaic_mask(
 
 def colour_sites(shape: tuple[int, ...], pattern: Pattern) -> dict[str, np.ndarray]:
     """Where in the mosaic each of the colours R, G and B is seen: three maps (y, x)."""
-    _checks.choice("pattern", pattern, PATTERNS)
+    checks.choice("pattern", pattern, PATTERNS)
     tile = np.array(list(pattern)).reshape(2, 2)
     rows, columns = shape
     mosaic = np.tile(tile, ((rows + 1) // 2, (columns + 1) // 2))[:rows, :columns]
@@ -79,7 +79,7 @@ def colour_sites(shape: tuple[int, ...], pattern: Pattern) -> dict[str, np.ndarr
 
 def _gather(values: np.ndarray, colour: str, method: Demosaicing) -> np.ndarray:
     """The weighted sum of the samples that a value is made of."""
-    _checks.choice("method", method, METHODS)
+    checks.choice("method", method, METHODS)
     rows, columns = values.shape
     if method == "bilinear":
         if min(rows, columns) < 2:

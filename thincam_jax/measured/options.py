@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from thincam_jax import _checks
+from thincam_jax._core import checks
 from thincam_jax.measured.bayer import METHODS, PATTERNS, Demosaicing, Pattern
 from thincam_jax.measured.raw import MeasurementError
 
@@ -79,7 +79,7 @@ class Preparation:
 
 def _choose(name: str, value: Any, options: tuple[str, ...]) -> None:
     try:
-        _checks.choice(name, value, options)
+        checks.choice(name, value, options)
     except ValueError as error:
         raise MeasurementError(str(error)) from None
 

@@ -13,7 +13,7 @@ import PIL.Image
 import tifffile
 from jaxtyping import ArrayLike, Float
 
-from thincam_jax._files import write_whole
+from thincam_jax._core.files import write_whole
 from thincam_jax.measured.display import WhiteBalance, to_display
 from thincam_jax.measured.raw import MeasurementError
 

@@ -1,0 +1,50 @@
+import os
+
+import pytest
+
+from thincam_jax._core import files
+
+
+def test_text_and_bytes_are_written(tmp_path):
+    assert files.write_whole(tmp_path / "a.txt", "π\n") == tmp_path / "a.txt"
+    assert (tmp_path / "a.txt").read_bytes() == "π\n".encode()
+    files.write_whole(str(tmp_path / "a.txt"), b"\x00\xff")
+    assert (tmp_path / "a.txt").read_bytes() == b"\x00\xff"
+    assert [p.name for p in tmp_path.iterdir()] == ["a.txt"]
+
+
+@pytest.mark.parametrize("crash", [KeyboardInterrupt, OSError])
+def test_crash_before_the_rename_leaves_the_old_file_alone(tmp_path, monkeypatch, crash):
+    path = tmp_path / "a.txt"
+    path.write_text("old", encoding="utf-8")
+    seen = []
+
+    def stop(source, target):
+        seen.append(source.read_text(encoding="utf-8"))
+        raise crash
+
+    monkeypatch.setattr(os, "replace", stop)
+    with pytest.raises(crash):
+        files.write_whole(path, "new")
+    assert seen == ["new"]  # the crash came after all was written
+    assert path.read_text(encoding="utf-8") == "old"
+    assert [p.name for p in tmp_path.iterdir()] == ["a.txt"]
+
+
+def test_crash_while_writing_leaves_nothing_half(tmp_path, monkeypatch):
+    path = tmp_path / "a.txt"
+
+    def half(self, data):
+        with self.open("wb") as file:
+            file.write(data[: len(data) // 2])
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(type(path), "write_bytes", half)
+    with pytest.raises(OSError, match="No space left"):
+        files.write_whole(path, "new text")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_missing_folder_is_told(tmp_path):
+    with pytest.raises(FileNotFoundError):
+        files.write_whole(tmp_path / "absent" / "a.txt", "x")

@@ -1,0 +1,387 @@
+"""Files of kind design: what they mean, and one line for each fault."""
+
+import pytest
+from commands.design import tiny
+
+from helpers import ROOT
+from thincam_jax.commands.design import broken_limits
+from thincam_jax.commands.design.config import load_design
+from thincam_jax.commands.refocus.config import load_experiment
+from thincam_jax.commands.study.config import ConfigError, dump_config
+
+
+def fault(folder, *overrides, text=tiny.TEXT):
+    """The one line of the error, without the file's path."""
+    with pytest.raises(ConfigError) as caught:
+        tiny.design(folder, *overrides, text=text)
+    (line,) = str(caught.value).splitlines()
+    return line.removeprefix(f"{folder / 'tiny.yaml'}:")
+
+
+def line_of(part):
+    lines = tiny.TEXT.splitlines()
+    (found,) = [n for n, line in enumerate(lines, 1) if part in line]
+    return found
+
+
+def test_values_and_defaults(tmp_path):
+    config = tiny.design(tmp_path)
+    assert config.sensor.width == pytest.approx(48 * 0.04)
+    assert config.search.free[0].bounds == (12.0, 30.0)
+    assert config.search.objective == "bayes_error"
+    assert config.validation.best == 2
+    assert config.farthest() == 3.0
+    without = tiny.TEXT.replace("prior:\n  exponent: 2.5\n", "")
+    assert tiny.design(tmp_path, text=without).prior.measured
+
+
+def test_resolved_file_is_read_back(tmp_path):
+    config = tiny.design(tmp_path, "search.objective=unevenness", "search.band=[0.1, 0.4]")
+    path = tmp_path / "again.yaml"
+    path.write_text(dump_config(config), encoding="utf-8")
+    assert "validate:\n" in dump_config(config)
+    assert load_design(path) == config
+
+
+@pytest.mark.parametrize(
+    ("entry", "captures"),
+    [
+        ("{variable: beta, bounds: [9 /mm^2, 20 /mm^2]}", [(0, 1), (2, 3)]),
+        ("{variable: beta, bounds: [9 /mm^2, 20 /mm^2], shared: true}", [(0, 1, 2, 3)]),
+        ("{variable: distance, bounds: [2 mm, 0.4 cm], shots: [2]}", [(2, 3)]),
+    ],
+)
+def test_a_free_number_belongs_to_all_phases_of_its_shots(tmp_path, entry, captures):
+    space = tiny.design(tmp_path, f"search.free=[{entry}]").space()
+    assert [v.captures for v in space.variables] == captures
+    lower, upper = (2.0, 4.0) if "distance" in entry else (9.0, 20.0)
+    assert [(v.lower, v.upper) for v in space.variables] == [(lower, upper)] * len(captures)
+
+
+def test_width_wavelength_and_exposure(tmp_path):
+    """The width belongs to all; the exposures of all captures are as long as the reference's."""
+    free = (
+        "search.free=[{variable: wavelength, bounds: [450 nm, 0.7 um], shots: [1]}, "
+        "{variable: exposure, bounds: [0.4, 1.6], shots: [2]}, "
+        "{variable: width, bounds: [1 mm, 2.4 mm]}]"
+    )
+    config = tiny.design(tmp_path, free, "noise={read_noise: 4, electrons: 900}")
+    space = config.space()
+    named = [(v.name, v.lower, v.upper, v.captures) for v in space.variables]
+    assert named == [
+        ("width", 1.0, 2.4, ()),
+        ("wavelength", pytest.approx(4.5e-4), pytest.approx(7e-4), (0, 1)),
+        ("exposure", 0.4, 1.6, (2, 3)),
+    ]
+    assert space.limits.exposure == 4
+    assert config.widest() == 2.4
+    assert tiny.design(tmp_path).widest() == 2.0
+    path = tmp_path / "again.yaml"
+    path.write_text(dump_config(config), encoding="utf-8")
+    assert load_design(path) == config
+
+
+@pytest.mark.parametrize(
+    ("entry", "part"),
+    [
+        ("bounds: [0.5, 1.5]", "leave one out to take the rest, such as by shots: [1]"),
+        ("bounds: [0.5, 2], shots: [1]", "up to 2 leave the other shots nothing of the 2 that"),
+    ],
+)
+def test_exposures_that_leave_nothing(tmp_path, entry, part):
+    noise = "noise={read_noise: 4, electrons: 900}"
+    line = fault(tmp_path, f"search.free=[{{variable: exposure, {entry}}}]", noise)
+    assert ": search.free: " in line
+    assert part in line
+    unknown = "search.free=[{variable: exposure, bounds: [0.2, 1.2], shots: [1, 3]}]"
+    assert "the design has captures 1 to 4" in fault(tmp_path, unknown, noise)
+    one = "reference.shots=[{beta: 25 /mm^2, distance: 3 mm}]"
+    line = fault(tmp_path, "search.free=[{variable: exposure, bounds: [0.5, 0.9]}]", noise, one)
+    assert "the exposure of the only shot is that of the reference; do not free it" in line
+
+
+def test_a_display_shows_no_finer_than_its_pixels(tmp_path):
+    display = "mask.pixel_pitch=50 um"
+    line = fault(tmp_path, display, "search.limits.mask_pixel=40 um")
+    assert "search.limits.mask_pixel: 0.04 mm is finer than the display's pixels of 0.05" in line
+    assert tiny.design(tmp_path, display, "search.limits.mask_pixel=50 um").mask.pixel_pitch == 0.05
+
+
+def test_fringe_scanning_takes_four_captures_a_shot(tmp_path):
+    config = tiny.design(
+        tmp_path, "reference.synthesis=fringe_scanning", "search.limits.captures=8"
+    )
+    captures = [v.captures for v in config.space().variables]
+    assert captures == [(0, 1, 2, 3), (4, 5, 6, 7)]
+
+
+def test_the_farthest_distance_keeps_the_thickness(tmp_path):
+    free = "search.free=[{variable: distance, bounds: [2 mm, 9 mm]}]"
+    assert tiny.design(tmp_path, free).farthest() == 9.0
+    assert tiny.design(tmp_path, free, "search.limits.thickness=5 mm").farthest() == 5.0
+    assert tiny.design(tmp_path, free, "search.limits.thickness=2.5 mm").farthest() == 3.0
+
+
+SHARED = ("search.free[0]", "all masks share the width; drop 'shared' and 'shots'")
+
+
+@pytest.mark.parametrize(
+    ("setting", "field", "part"),
+    [
+        (
+            "search.free.0.bounds=[9 /mm^2, 8 /mm^2]",
+            "search.free[0].bounds",
+            "bounds cross: 9 to 8",
+        ),
+        (
+            "search.free.0.bounds=[9 /mm^2, 9 /mm^2]",
+            "search.free[0].bounds",
+            "bounds cross: 9 to 9",
+        ),
+        ("search.free.0.bounds=[0 /mm^2, 9 /mm^2]", "search.free[0].bounds", "above zero"),
+        ("search.free.0.bounds=[8 mm, 9 mm]", "search.free[0].bounds", "is a length, not a curv"),
+        ("search.free.0.bounds=[8, 9]", "search.free[0].bounds", "8 has no unit"),
+        ("search.free.0.bounds=8 /mm^2", "search.free[0].bounds", "give [lowest, highest]"),
+        ("search.free.0.variable=tilt", "search.free[0].variable", "'width' or 'exposure'"),
+        ("search.free.0={variable: width, bounds: [1 mm, 2 mm], shared: true}", *SHARED),
+        ("search.free.0={variable: width, bounds: [1 mm, 2 mm], shots: [1]}", *SHARED),
+        (
+            "search.free.0={variable: exposure, bounds: [0.5, 1.5], shots: [1]}",
+            *("search.free", "matters to noise that counts electrons"),
+        ),
+        (
+            "search.free.0={variable: exposure, bounds: [0.5, 1.5]}",
+            *("search.free", "matters to noise that counts electrons"),
+        ),
+        (
+            "search.free.0={variable: exposure, bounds: [0.5 s, 1.5]}",
+            *("search.free[0].bounds", "'0.5 s' is no number; give parts of the reference's"),
+        ),
+        (
+            "search.free.0={variable: wavelength, bounds: [500 nm, 2 mm]}",
+            *("search.free[0].bounds", "give bounds from 10 nm to 1 mm"),
+        ),
+        (
+            "mask={width: 2 mm, fill_factor: 0.8}",
+            *("mask.fill_factor", "of a display's pixels; give their pixel_pitch, too"),
+        ),
+        ("search.free.0.shots=[1, 1]", "search.free[0].shots", "holds a shot twice"),
+        ("search.free.0.colour=1", "search.free[0].colour", "variable, bounds, shared, shots"),
+        ("search.free=[]", "search.free", "give at least 1"),
+        ("search.starts=0", "search.starts", "greater than or equal to 1"),
+        ("search.limits.captures=0", "search.limits.captures", "greater than or equal to 1"),
+        ("reference.shots=[]", "reference.shots", "give at least 1"),
+        ("reference.shots.1.beta=25 /mm^2", "reference.shots", "hold an entry twice"),
+        ("reference.shots.1.wavelength=600 nm", "reference.shots[1].wavelength", "whole file"),
+        ("reference.shots.0.width=1 mm", "reference.shots[0].width", "whole file; drop this one"),
+        ("reference.shots.0.exposure=2", "reference.shots[0].exposure", "whole file"),
+        ("reference.name=Found 2", "reference.name", "is what another or a found design is called"),
+        ("search.band=[0.1, 0.4]", "search", "objective bayes_error has no band"),
+        ("validate.seeds=0", "validate.seeds", "greater than or equal to 1"),
+        ("validate.runs=1", "validate.runs", "unknown key; allowed here: seeds, best"),
+        ("validation.seeds=1", "validation", "unknown key; allowed here: name, kind,"),
+        ("noise.read_noise=8", "noise", "give either snr_db"),
+        ("prior.measured=true", "prior", "give either exponent"),
+        ("targets=[]", "targets", "give at least 1"),
+        ("search.objective=robust_error", "search", "robust_error and tolerances belong together"),
+        ("search.tolerances={distance: 20 um}", "search", "belong together; give both"),
+        ("search.tolerances={how: worst}", "search.tolerances", "give at least one, such as"),
+        ("search.tolerances={tilt: -1 deg}", "search.tolerances", "give an angle above 0"),
+        ("train={images: [nobody]}", "train.images", "unknown; choose from astronaut, "),
+        ("train={images: [camera, camera]}", "train.images", "hold an entry twice"),
+        ("train={images: []}", "train.images", "give at least 1"),
+        ("train={images: [camera], pixels: 8}", "train.pixels", "greater than or equal to 32"),
+        (
+            "compare=[{name: other, shots: [{beta: 9 /mm^2, distance: 3 mm}]}]",
+            "compare[0].shots",
+            "1 shots, and the reference has 2; give as many",
+        ),
+        (
+            "compare=[{name: pairs, shots: [{beta: 9 /mm^2, distance: 3 mm}, "
+            "{beta: 8 /mm^2, distance: 3 mm}]}]",
+            "compare[0].name",
+            "'pairs' is what another",
+        ),
+    ],
+)
+def test_fault_of_an_entry(tmp_path, setting, field, part):
+    line = fault(tmp_path, setting)
+    assert f": {field}: " in line
+    assert part in line
+
+
+@pytest.mark.parametrize(
+    ("setting", "place", "part"),
+    [
+        ("search.limits.captures=2", "limits:", "it takes 4 captures, and the budget is 2"),
+        ("search.limits.thickness=2.9 mm", "limits:", "distance of capture 1 ≥ 3 mm conflicts"),
+        ("search.limits.mask_pixel=0.2 mm", "limits:", "show at most 7.854 rad/mm^2"),
+        ("search.free.0.shots=[3]", "free:", "the design has captures 1 to 4"),
+        (
+            "search.free=[{variable: beta, bounds: [8 /mm^2, 9 /mm^2]}, "
+            "{variable: beta, bounds: [8 /mm^2, 9 /mm^2]}]",
+            "free:",
+            "is free twice",
+        ),
+        ("reference.synthesis=fringe_scanning", "limits:", "it takes 8 captures"),
+    ],
+)
+def test_no_feasible_design(tmp_path, setting, place, part):
+    """The two that conflict are named, at the entry of the file that they stand in."""
+    line = fault(tmp_path, setting)
+    field = place.rstrip(":")
+    at = (f"{line_of(place)}: ", f"--set {setting}: ")
+    assert line.startswith(tuple(f"{a}search.{field}: " for a in at))
+    assert part in line
+
+
+FREE_DISTANCE = (
+    "search.free=[{variable: beta, bounds: [12 /mm^2, 30 /mm^2]}, "
+    "{variable: distance, bounds: [2 mm, 4 mm], shots: [2]}]"
+)
+
+
+@pytest.mark.parametrize(
+    ("settings", "field", "part"),
+    [
+        (("pareto={}",), "pareto", "no front is asked for; give thickness, captures or light"),
+        (
+            (FREE_DISTANCE, "pareto.thickness.bounds=[4 mm, 3 mm]"),
+            "pareto.thickness.bounds",
+            "bounds cross: 4 to 3 mm; give the lower first",
+        ),
+        (
+            ("pareto.thickness={bounds: [3 mm, 4 mm], points: 1}",),
+            "pareto.thickness.points",
+            "greater than or equal to 2",
+        ),
+        (("pareto.thickness.bounds=[3 mm, 4 mm]",), "pareto.thickness", "no distance is free"),
+        (
+            (FREE_DISTANCE, "pareto.thickness.bounds=[2 mm, 4 mm]"),
+            "pareto.thickness.bounds",
+            "no design is feasible at 2 mm: the distance of shot 1, 3 mm, is not free",
+        ),
+        (
+            (
+                FREE_DISTANCE,
+                "pareto.thickness.bounds=[1 mm, 4 mm]",
+                "reference.shots.0.distance=1mm",
+            ),
+            "pareto.thickness.bounds",
+            "no design is feasible at 1 mm: the distance of shot 2 is free from 2 mm only",
+        ),
+        (
+            (FREE_DISTANCE, "pareto.thickness.bounds=[3 mm, 5 mm]"),
+            "pareto.thickness.bounds",
+            "bounds reach to 5 mm, and no free distance beyond 4 mm",
+        ),
+        (
+            (
+                *(FREE_DISTANCE, "search.limits.thickness=3.5 mm"),
+                "pareto.thickness.bounds=[3 mm, 4 mm]",
+            ),
+            "pareto.thickness.bounds",
+            "bounds reach to 4 mm, and no free distance beyond 3.5 mm",
+        ),
+        (("pareto.light.bounds=[9, 90]",), "pareto.light", "light needs noise that counts electr"),
+        (
+            ("pareto.light.bounds=[90, 9]",),
+            "pareto.light.bounds",
+            "bounds cross: 90 to 9 electrons",
+        ),
+        (("pareto.light.bounds=[0, 9]",), "pareto.light.bounds[0]", "greater than 0"),
+        (
+            ("pareto.captures.shots=[1, 3]",),
+            "pareto.captures.shots",
+            "3 shots take 6 captures, and search.limits.captures allows 4; give at most 2 shots",
+        ),
+        (
+            ("search.limits.captures=8", "pareto.captures.shots=[5]"),
+            "pareto.captures.shots",
+            "5 shots take 10 captures, and search.limits.captures allows 8",
+        ),
+        (("pareto.captures.shots=[1, 1]",), "pareto.captures.shots", "hold an entry twice"),
+        (("pareto.captures.shots=[]",), "pareto.captures.shots", "give at least 1"),
+        (
+            ("search.free.0.shots=[2]", "pareto.captures.shots=[1, 2]"),
+            "pareto.captures.shots",
+            "of the first shots, 1, nothing is free",
+        ),
+        (
+            ("targets=[{name: a, kind: usaf1951}]", "pareto.captures.shots=[1]"),
+            "pareto.captures",
+            "PSNR needs a photograph among the targets",
+        ),
+    ],
+)
+def test_fault_of_a_front(tmp_path, settings, field, part):
+    line = fault(tmp_path, *settings)
+    assert f": {field}: " in line
+    assert part in line
+
+
+def test_fronts_and_their_costs(tmp_path):
+    fronts = tiny.design(
+        tmp_path,
+        FREE_DISTANCE,
+        "noise={read_noise: 4, electrons: 900}",
+        "pareto.thickness={bounds: [3 mm, 4 mm], points: 3}",
+        "pareto.light={bounds: [10, 1000], points: 3}",
+        "pareto.captures.shots=[2, 1]",
+    )
+    asked = fronts.pareto
+    assert asked.thickness.costs() == pytest.approx([3.0, 3.5, 4.0])
+    assert asked.light.costs() == pytest.approx([10, 100, 1000])
+    assert asked.captures.shots == (1, 2)
+    path = tmp_path / "again.yaml"
+    path.write_text(dump_config(fronts), encoding="utf-8")
+    assert load_design(path) == fronts
+    assert tiny.design(tmp_path).pareto is None
+
+
+def test_more_captures_than_a_design_may_have(tmp_path):
+    shots = ", ".join(f"{{beta: {b} /mm^2, distance: 3 mm}}" for b in range(20, 25))
+    assert "give 1 to 8" in fault(tmp_path, f"reference.shots=[{shots}]")
+
+
+def test_too_narrow_a_band(tmp_path):
+    line = fault(tmp_path, "search.objective=worst_ratio", "search.band=[0.4, 0.1]")
+    assert "band 0.4 to 0.1 is too narrow" in line
+
+
+def test_measured_prior_needs_a_picture(tmp_path):
+    line = fault(tmp_path, "prior={measured: true}", "targets=[{name: a, kind: usaf1951}]")
+    assert "prior.measured: measured needs a photograph" in line
+
+
+@pytest.mark.parametrize(
+    "name", ["design_pitches", "design_slm", "design_distances", "design_both"]
+)
+def test_examples(name):
+    config = load_design(ROOT / "configs" / f"{name}.yaml")
+    assert config.prior.measured
+    assert len(config.targets) == 4
+    assert bool(broken_limits(config)) == (name == "design_slm")
+
+
+def test_example_of_little_light():
+    config = load_design(ROOT / "configs" / "design_light.yaml")
+    assert config.noise.electrons == 2000
+    assert [v.name for v in config.space().variables] == ["width", "beta", "beta", "exposure"]
+    assert config.space().limits.exposure == 4
+
+
+def test_example_of_fronts():
+    config = load_design(ROOT / "configs" / "design_pareto.yaml")
+    assert config.noise.electrons == 2000
+    assert config.pareto.captures.shots == (1, 2, 3, 4)
+    assert not broken_limits(config)
+
+
+def test_kinds_are_told_apart(tmp_path):
+    path = tiny.write(tmp_path)
+    with pytest.raises(ConfigError, match="give it to 'thincam design'"):
+        load_experiment(path)
+    for name, told in (("quick", "is a study, for"), ("fza_refocus", "is of kind 'refocus', for")):
+        with pytest.raises(ConfigError, match=told):
+            load_design(ROOT / "configs" / f"{name}.yaml")

@@ -1,0 +1,63 @@
+"""A design of some seconds that the tests share; the camera is that of `study.tiny`."""
+
+from pathlib import Path
+
+from commands.study import tiny
+
+from thincam_jax.commands.design.config import DesignConfig, load_design
+from thincam_jax.commands.design.ranking import Shot
+
+TEXT = """\
+name: tiny design
+kind: design
+title: A tiny design
+seed: 3
+wavelength: 500 nm
+model: geometric  # it compiles fastest
+pixel_integration: false
+sensor: {shape: [48, 64], pitch: 40 um}
+mask: {width: 2 mm}
+object: {distance: 100 mm, width: 60 mm}
+noise: {snr_db: 30}
+prior:
+  exponent: 2.5
+reference:
+  name: pairs
+  synthesis: phase_pairs
+  shots:
+    - {beta: 25 rad/mm^2, distance: 3 mm}
+    - {beta: 21 rad/mm^2, distance: 3 mm}
+search:
+  free:
+    - variable: beta
+      bounds: [12 rad/mm^2, 30 rad/mm^2]
+  limits:
+    captures: 4
+  starts: 4
+  samples: 16
+  steps: 8
+  grid: 5
+  frequencies: {radii: 64, directions: 1, exact: 64}
+targets:
+  - {name: chart, kind: usaf1951, pixels: 120}
+  - {name: picture, kind: file, path: PICTURE}
+validate: {seeds: 2, best: 2}
+"""
+
+
+def write(folder: Path, text: str = TEXT) -> Path:
+    """The design's file and its picture in a folder."""
+    return tiny.write(folder, text)
+
+
+def design(folder: Path, *overrides: str, text: str = TEXT) -> DesignConfig:
+    return load_design(write(folder, text), overrides)
+
+
+def shot(beta: float, distance: float, **others: float) -> Shot:
+    """A shot of a found design, with the wavelength and the mask of the file."""
+    return Shot(**{"beta": beta, "distance": distance, "wavelength": 5e-4, "width": 2.0, **others})
+
+
+def ignore(_: str) -> None:
+    """Progress that nobody watches."""

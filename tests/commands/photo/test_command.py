@@ -1,0 +1,333 @@
+"""`thincam reconstruct`: from files to files, in one line what is wrong, and Ctrl-C."""
+
+import json
+
+import numpy as np
+import PIL.Image
+import pytest
+import skimage.transform
+import tifffile
+from commands.photo import simulated
+from typer.testing import CliRunner
+
+from helpers import shared_data
+from thincam_jax.commands import cli
+from thincam_jax.commands.photo import command
+
+runner = CliRunner()
+
+
+def call(paths, out, *more, psf="psf", capture="capture"):
+    given = {"--psf": paths[psf], "--capture": paths.get(capture, capture), "--out": out}
+    command = [str(part) for pair in given.items() for part in pair]
+    return runner.invoke(cli.app, ["reconstruct", *command, *map(str, more)])
+
+
+def one_line(result):
+    """The one line on stderr of a call that ended with exit code 2, without "thincam: "."""
+    assert result.exit_code == 2, result.output
+    assert "Traceback" not in result.output
+    (line,) = result.stderr.splitlines()
+    return line.removeprefix("thincam: ")
+
+
+def record_of(path):
+    return json.loads(path.with_suffix(".json").read_text("utf-8"))
+
+
+@pytest.fixture
+def grey(tmp_path):
+    return simulated.grey_files(tmp_path)
+
+
+def test_twelve_bit_capture(grey, tmp_path):
+    out = tmp_path / "image.png"
+    more = ("--bits", 12, "--background", grey["dark"], "--method", "admm-tv", "--iterations", 80)
+    result = call(grey, out, *more)
+    assert result.exit_code == 0, result.output
+    image = np.load(out.with_suffix(".npy"))
+    assert image.dtype == np.float32
+    truth = simulated.scene()[1]
+    assert simulated.correlation(image, truth) > 0.98
+    with PIL.Image.open(out) as shown:
+        assert shown.mode == "L"
+        np.testing.assert_array_equal(np.array(shown) > 100, _displayed(image) > 100)
+    record = record_of(out)
+    done = record["reconstruction"]
+    assert record["sources"]["psf"] == str(grey["psf"]) and record["sources"]["bits"] == 12
+    assert record["preparation"]["background"]["capture"]["kind"] == f"dark frame {grey['dark']}"
+    assert record["files"] == {"png": "image.png", "npy": "image.npy"}
+    assert (done["method"], done["tau"], done["iterations_at_most"]) == ("admm_tv", 2.0, 80)
+    assert 0 < done["relative_data_residual"] < 0.01
+    assert done["noise_standard_deviation"] == pytest.approx(_noise(grey["capture"]), rel=1e-3)
+    objectives = [step["objective"] for step in done["history"]]
+    assert [step["iteration"] for step in done["history"]] == list(range(0, 81, 10))
+    assert objectives[-1] < 1e-2 * objectives[0]
+    assert record["image"]["maximum"] == pytest.approx(image.max())
+    assert "numpy" in record["environment"]["versions"]
+    assert "image.png: iterations exhausted after 80 iterations" in result.stdout
+
+
+def _noise(path):
+    """The median of 2×2 diagonal differences, in units of the brightest pixel."""
+    light = np.maximum(tifffile.imread(path).astype(float) - simulated.DARK, 0)
+    even = light / light.max()
+    details = even[::2, ::2] - even[1::2, ::2] - even[::2, 1::2] + even[1::2, 1::2]
+    return np.median(np.abs(details)) / (2 * 0.6745)
+
+
+def _displayed(image):
+    """Gamma 2.2 below the percentile that is white."""
+    return 255 * np.clip(image / np.percentile(image, 99.9), 0, 1) ** (1 / 2.2)
+
+
+def test_flip_full_field_and_a_linear_image_alone(grey, tmp_path):
+    """A TIFF of floats; 180° turned, with what lies beside the sensor."""
+    settings = ("--bits", 12, "--background", 40, "--iterations", 20)
+    out, plain = tmp_path / "image.tif", tmp_path / "plain.npy"
+    assert call(grey, out, *settings, "--flip", "--field", "full").exit_code == 0
+    assert call(grey, plain, *settings, "--gamma", 1).exit_code == 0
+    full, middle = tifffile.imread(out), np.load(plain)
+    rows, columns = simulated.SHAPE
+    assert full.shape == (2 * rows - 1, 2 * columns - 1) and middle.shape == (rows, columns)
+    upright = full[::-1, ::-1]
+    top, left = (rows - 1) // 2, (columns - 1) // 2
+    np.testing.assert_array_equal(upright[top : top + rows, left : left + columns], middle)
+    assert not list(tmp_path.glob("image.png")) and not list(tmp_path.glob("plain.png"))
+    assert record_of(out)["image"]["turned_by_180_degrees"] is True
+    assert record_of(out)["display"] is None
+
+
+def test_ridge(grey, tmp_path):
+    """Without total variation: its record says so, and what was used in its place."""
+    out = tmp_path / "image.npy"
+    more = ("--bits", 12, "--background", grey["dark"], "--method", "ridge", "--ridge", 0.5)
+    result = call(grey, out, *more)
+    assert result.exit_code == 0, result.output
+    assert simulated.correlation(np.load(out), simulated.scene()[1]) > 0.9
+    done = record_of(out)["reconstruction"]
+    assert (done["method"], done["ridge"], done["nonnegative"]) == ("ridge", 0.5, False)
+    assert done["tau"] is done["absolute_tau"] is done["variation"] is None
+    assert 0 < done["iterations"] <= 100 and done["relative_data_residual"] < 0.05
+
+
+@pytest.mark.parametrize(("psf", "coupling"), [("psf", "joint"), ("grey_psf", "opponent")])
+def test_colours(tmp_path, psf, coupling):
+    """8-bit PNG with a PSF of one and of three channels; colours are joined by default."""
+    paths = simulated.colour_files(tmp_path)
+    out = tmp_path / "image.png"
+    more = ("--background", simulated.DARK / 16, "--white-balance", "grey-world", "--tau", 1)
+    more += () if coupling == "joint" else ("--coupling", coupling)
+    result = call(paths, out, *more, psf=psf)
+    assert result.exit_code == 0, result.output
+    image, truth = np.moveaxis(np.load(out.with_suffix(".npy")), -1, 0), simulated.scene()
+    for channel, expected in zip(image, truth, strict=True):
+        assert simulated.correlation(channel, expected) > 0.97
+    # The colours of the blobs, up to one factor.
+    ratios = image[:, 25, 29] / image[0, 25, 29]
+    np.testing.assert_allclose(ratios, np.array(simulated.COLOURS[0]) / 0.9, atol=0.1)
+    assert record_of(out)["reconstruction"]["variation"]["coupling"] == coupling
+    with PIL.Image.open(out) as shown:
+        means = np.array(shown).mean(axis=(0, 1))
+    assert means.max() < 1.6 * means.min()
+
+
+def test_mosaic(tmp_path):
+    paths = simulated.bayer_files(tmp_path)
+    out = tmp_path / "image.png"
+    more = ("--bits", 12, "--bayer", "RGGB", "--demosaic", "superpixel")
+    result = call(paths, out, *more, "--background", paths["dark"], "--linear", "tif")
+    assert result.exit_code == 0, result.output
+    image = np.moveaxis(tifffile.imread(out.with_suffix(".tif")), -1, 0)
+    assert image.shape == (3, *simulated.SHAPE)
+    for channel, expected in zip(image, simulated.scene(), strict=True):
+        assert simulated.correlation(channel, expected) > 0.93
+    assert record_of(out)["preparation"]["demosaicing"]["pattern"] == "RGGB"
+
+
+class TestFolder:
+    NAMES = ("a", "b", "c")
+
+    @pytest.fixture
+    def paths(self, tmp_path):
+        folder = tmp_path / "captures"
+        folder.mkdir()
+        return {**simulated.grey_files(folder, self.NAMES), "capture": folder}
+
+    def test_one_that_fails_is_told_and_the_others_go_on(self, paths, tmp_path):
+        """The PSF and the dark frame in the folder are no captures."""
+        paths["b"].write_bytes(paths["b"].read_bytes()[:4000])
+        out = tmp_path / "out"
+        more = ("--bits", 12, "--background", paths["dark"], "--iterations", 20)
+        result = call(paths, out, *more)
+        line = one_line(result)
+        assert line.startswith(f"{paths['b']}: is cut short")
+        names = [f"{name}.{suffix}" for name in "ac" for suffix in ("json", "npy", "png")]
+        assert sorted(path.name for path in out.iterdir()) == names
+        assert [name in result.stdout for name in ("a.png", "b.png", "c.png")] == [1, 0, 1]
+
+    def test_interrupt_keeps_what_is_there(self, paths, tmp_path, monkeypatch):
+        out = tmp_path / "out"
+        interrupt_at(monkeypatch, "b.tif", 20)
+        more = ("--bits", 12, "--background", paths["dark"], "--iterations", 40)
+        result = call(paths, out, *more)
+        assert result.exit_code == 130
+        (line,) = result.stderr.splitlines()
+        assert line.endswith(
+            f"{out / 'b.png'} is the best image so far; not begun: 1 of 3 captures"
+        )
+        assert sorted(path.name for path in out.glob("*.png")) == ["a.png", "b.png"]
+        assert record_of(out / "a.png")["reconstruction"]["iterations"] == 40
+
+
+def interrupt_at(monkeypatch, name, iteration):
+    def interrupted(self, capture, progress):
+        if capture == name and progress.iteration >= iteration:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(command._Bar, "__call__", interrupted)
+
+
+class TestInterrupt:
+    def test_best_image_so_far(self, grey, tmp_path, monkeypatch):
+        interrupt_at(monkeypatch, "capture.tif", 30)
+        out = tmp_path / "image.png"
+        result = call(grey, out, "--bits", 12, "--iterations", 1000)
+        assert result.exit_code == 130
+        assert result.stderr == f"thincam: interrupted; {out} is the best image so far\n"
+        done = record_of(out)["reconstruction"]
+        assert (done["status"], done["iterations"]) == ("interrupted", 30)
+        image = np.load(out.with_suffix(".npy"))
+        assert simulated.correlation(image, simulated.scene()[1]) > 0.9
+
+    def test_before_there_is_one(self, grey, tmp_path, monkeypatch):
+        def interrupted(*_, **__):
+            raise KeyboardInterrupt
+
+        monkeypatch.setattr("thincam_jax.commands.photo.run.prepare", interrupted)
+        result = call(grey, tmp_path / "image.png", "--bits", 12)
+        assert result.exit_code == 130
+        assert "nothing of it is kept" in result.stderr
+        assert not list(tmp_path.glob("image.*"))
+
+
+class TestExitCode2:
+    @pytest.mark.parametrize(
+        ("more", "message"),
+        [
+            (("--downsample", 0), "downsample = 0: give a whole number of at least 1"),
+            (("--downsample", 100), "downsample = 100 is larger than the image of 60×76 pixels"),
+            (("--method", "magic"), "method = 'magic' is unknown; choose one of 'auto'"),
+            (("--method", "wiener"), "method 'wiener' needs a model of the camera"),
+            (("--method", "poisson"), "method 'poisson' needs raw counts"),
+            (("--method", "ridge", "--tau", 2), "method 'ridge' cannot use tau; leave out, or use"),
+            (("--method", "ridge", "--coupling", "joint"), "method 'ridge' cannot use coupling"),
+            (("--method", "ridge", "--ridge", 0), "ridge = 0.0 parts of one is not positive"),
+            (("--ridge", 1), "method 'admm_tv' cannot use ridge; leave out, or use 'ridge'"),
+            (("--tau", -1), "tau = -1.0 parts of one is negative"),
+            (("--tau", "nan"), "tau is NaN"),
+            (("--tau", 1e30), "tau = 1e+30: give about 1 to 3, at most 1e+06"),
+            (("--iterations", 0), "iterations = 0: give at least 1"),
+            (("--bits", 8), "above the 255 of 8 bit"),
+            (("--bits", 10), "above the 1023 of 10 bit"),
+            (("--background", "none.tif"), "none.tif: does not exist"),
+            (("--background", 5000), "is black"),
+            (("--dead", "none.png"), "none.png: does not exist"),
+            (("--coupling", "opponent"), "has 1 channels and coupling 'opponent' is for 3"),
+            (("--white-balance", "1,2"), "--white-balance 1,2: give grey-world, or the gains"),
+            (("--white-balance", "1,2,3"), "for 1 channel(s)"),
+            (("--gamma", 0), "give a gamma above 0"),
+            (("--saturation", 2), "saturation = 2.0: give a number above 0, up to 1"),
+            (("--bayer", "RGGB", "--demosaic", "bilinear", "--capture", "none.tif"), "not exist"),
+        ],
+    )
+    def test_options(self, grey, tmp_path, more, message):
+        self.refused(call(grey, tmp_path / "image.png", *more), tmp_path, message)
+
+    def refused(self, result, folder, message):
+        assert message in one_line(result)
+        assert not list(folder.glob("image*")) and not list(folder.glob(".thincam*"))
+
+    @pytest.mark.parametrize(
+        ("which", "change", "message"),
+        [
+            ("psf", "missing", "psf.tif: does not exist"),
+            ("capture", "missing", "capture.tif: does not exist"),
+            ("psf", "cut", "psf.tif: is cut short"),
+            ("capture", "cut", "capture.tif: is cut short"),
+            ("psf", "text", "psf.tif: is not an image that can be read"),
+            ("psf", "smaller", "60×70 pixels and the capture"),
+            ("psf", "colour", "has 3 channels and the capture"),
+            ("psf", "black", "the PSF is black in channel 0"),
+            ("capture", "two", "has 2 channels and a PNG shows 1 or 3"),
+        ],
+    )
+    def test_files(self, grey, tmp_path, which, change, message):
+        path = grey[which]
+        pixels = tifffile.imread(path)
+        if change == "missing":
+            path.unlink()
+        elif change in ("cut", "text"):
+            path.write_bytes(path.read_bytes()[:4000] if change == "cut" else b"not an image")
+        else:
+            planar = "contig" if change == "two" else None
+            tifffile.imwrite(path, self.changed(pixels, change), planarconfig=planar)
+        self.refused(call(grey, tmp_path / "image.png"), tmp_path, message)
+
+    def changed(self, pixels, change):
+        if change == "smaller":
+            return np.ascontiguousarray(pixels[:, 6:])
+        if change == "black":
+            return np.zeros_like(pixels)
+        return np.stack([pixels] * {"colour": 3, "two": 2}[change], axis=-1)
+
+    @pytest.mark.parametrize(
+        ("out", "message"),
+        [
+            ("no/image.png", "no: is no folder; make it"),
+            ("image.jpg", "give one of these suffixes"),
+            ("image", "give one of these suffixes"),
+            ("psf.tif", "psf.tif: is read as an input and would be overwritten"),
+            ("/proc/image.png", "/proc: cannot be written into"),
+        ],
+    )
+    def test_output(self, grey, tmp_path, out, message):
+        before = {path: path.read_bytes() for path in grey.values()}
+        self.refused(call(grey, tmp_path / out), tmp_path, message)
+        assert {path: path.read_bytes() for path in grey.values()} == before
+
+    def test_folder_is_no_psf(self, grey, tmp_path):
+        result = call(grey | {"psf": tmp_path}, tmp_path / "image.png")
+        assert one_line(result) == f"{tmp_path}: is a folder; give the path of one image"
+
+    def test_unknown_pattern(self, grey, tmp_path):
+        result = call(grey, tmp_path / "image.png", "--bayer", "RGBG")
+        assert result.exit_code == 2
+        assert "RGGB" in result.stderr and "Traceback" not in result.output
+
+
+def test_help():
+    result = runner.invoke(cli.app, ["reconstruct", "--help"])
+    assert result.exit_code == 0
+    for part in ("--psf", "--capture", "--background", "admm-tv", "RGGB", "Ctrl-C"):
+        assert part in result.stdout
+
+
+def test_hand(tmp_path):
+    """A real capture (skipped where it is absent): an open hand, as its authors show it."""
+    folder = shared_data("diffusercam-hand")
+    paths = {"psf": folder / "psf_sample.tif", "capture": folder / "rawdata_hand_sample.tif"}
+    out = tmp_path / "hand.png"
+    result = call(paths, out, "--downsample", 4, "--method", "admm-tv")
+    assert result.exit_code == 0, result.output
+    done = record_of(out)["reconstruction"]
+    assert done["iterations"] == 100 and done["relative_data_residual"] <= 0.01
+    image = np.load(out.with_suffix(".npy"))
+    assert image.shape == (300, 400)
+    with PIL.Image.open(folder / "reference_admm5_notebook_output.png") as figure:
+        panel = np.array(figure.convert("L"), dtype=float)[23:239, 34:323]
+    small = skimage.transform.resize(image, panel.shape, anti_aliasing=True)
+    assert simulated.correlation(small, panel) >= 0.97
+    with PIL.Image.open(out) as shown:
+        pixels = np.array(shown)
+    assert np.median(pixels) < 10 and pixels[140, 205] > 180  # black around, bright the palm

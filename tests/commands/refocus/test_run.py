@@ -1,0 +1,165 @@
+"""Refocus experiments: what a file may say, what a run finds and leaves behind."""
+
+import json
+import re
+
+import numpy as np
+import PIL.Image
+import pytest
+from commands.refocus import tiny
+
+from helpers import ROOT
+from thincam_jax.commands.refocus import build as study
+from thincam_jax.commands.refocus.config import RefocusConfig, load_experiment
+from thincam_jax.commands.refocus.run import run_refocus, steps
+from thincam_jax.commands.study import RunFolder
+from thincam_jax.commands.study.config import ConfigError, StudyConfig, dump_config, load_config
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    home = tmp_path_factory.mktemp("refocus")
+    config, texts = tiny.experiment(home), []
+    folder = RunFolder(home / "out")
+    metrics = run_refocus(config, folder, texts.append)
+    return config, folder.path, metrics, texts
+
+
+def test_both_objects_are_found(run):
+    objects = run[2]["objects"]
+    assert list(objects) == ["near", "far"]
+    for found in objects.values():
+        # To a fifth of the depth of focus, 1.1 and 4.2 mm.
+        depth = found["axial_resolution_mm"]
+        assert found["found_mm"] == pytest.approx(found["distance_mm"], abs=0.2 * depth)
+        error = 100 * (found["found_mm"] / found["distance_mm"] - 1)
+        assert found["error_percent"] == pytest.approx(error, abs=0.05)
+        assert found["focus_contrast"] > 0.1
+    assert 4 < objects["near"]["axial_resolution_mm"] < objects["far"]["axial_resolution_mm"]
+
+
+def test_objects_are_better_in_focus(run):
+    for method in run[2]["methods"].values():
+        near, far = (method["focused_on_mm"][t]["psnr_db"] for t in ("20", "45"))
+        assert near["near"] > far["near"] + 0.3
+        assert far["far"] > near["far"] + 0.1
+        assert method["captures"] == 4
+
+
+def test_sweep_is_kept_as_numbers(run):
+    sweep = run[2]["sweep"]
+    distances = np.array(sweep["distances_mm"])
+    assert distances[0] == pytest.approx(15)
+    assert distances[-1] == pytest.approx(90)
+    np.testing.assert_allclose(np.diff(1 / distances), np.diff(1 / distances)[0], rtol=1e-3)
+    assert sweep["slope_per_pixel"] == pytest.approx(0.02 / 5)
+    for name, curve in sweep["curves"].items():
+        peak = distances[np.argmax(curve)]
+        assert peak == pytest.approx(run[2]["objects"][name]["found_mm"], rel=0.2)
+
+
+def test_progress_and_files(run):
+    config, path, metrics, texts = run
+    assert len(texts) == steps(config) == 4 + 13 + 2 * 2 + 1
+    assert json.loads((path / "metrics.json").read_text("utf-8")) == metrics
+    files = {p.relative_to(path).as_posix() for p in path.rglob("*") if p.is_file()}
+    figures = {f"figures/{n}" for n in ("sweep.png", "sweep.webp", "focus.png", "depth.png")}
+    images = {f"images/{m}--{t}mm.png" for m in ("conventional", "wiener") for t in (20, 45)}
+    assert (
+        files
+        == {"config.yaml", "metrics.json", "environment.json", "report.html"}
+        | figures
+        | {
+            "figures/methods.png",
+            "images/all-in-focus.png",
+        }
+        | images
+    )
+    assert load_experiment(path / "config.yaml") == config
+
+
+def test_animation_goes_there_and_back(run):
+    with PIL.Image.open(run[1] / "figures" / "sweep.webp") as animation:
+        assert animation.n_frames == 13 + 11
+        rows, columns = study.field_shape(run[0], run[0].sweep_method())
+        assert animation.size == (columns, rows + 24)
+
+
+def test_report_stands_alone_and_is_escaped(run):
+    page = (run[1] / "report.html").read_text("utf-8")
+    sources = re.findall(r'src="([^"]+)"', page)
+    assert len(sources) == 5
+    assert all(source.startswith("data:image/") for source in sources)
+    assert "<script" not in page
+    assert "&lt;b&gt;of its own&lt;/b&gt;" in page
+    assert "near, placed at 20 mm, is sharpest at" in page
+
+
+def test_objects_stand_where_they_were_put(tmp_path):
+    """An object's box in the projection: middle at d/t times its place, in pixels."""
+    config = tiny.experiment(tmp_path)
+    method = config.sweep_method()
+    rows, columns = study.field_shape(config, method)
+    for placed, plane in zip(config.objects, study.build_planes(config), strict=True):
+        scale = 5.0 / placed.distance / 0.02
+        box = study.object_box(config, method, placed)
+        middle = [(s.start + s.stop - 1) / 2 for s in box]
+        wanted = [(rows - 1) / 2 + placed.y * scale, (columns - 1) / 2 + placed.x * scale]
+        np.testing.assert_allclose(middle, wanted, atol=1.0)
+        np.testing.assert_allclose([s.stop - s.start for s in box], placed.width * scale, atol=1.01)
+        image = np.asarray(plane.image)
+        y, x = (np.arange(n) - (n - 1) / 2 for n in image.shape)
+        pitch = float(plane.width) / image.shape[1]
+        centre = pitch * np.array([image.sum(1) @ y, image.sum(0) @ x]) / image.sum()
+        np.testing.assert_allclose(centre, (placed.y, placed.x), atol=0.06 * placed.width)
+
+
+@pytest.mark.parametrize(
+    ("override", "part"),
+    [
+        (
+            "sweep.method=best",
+            "sweep.method: 'best' is no method; choose one of conventional, wiener",
+        ),
+        ("objects.0.distance=12 mm", "objects[0].distance: 12 mm lies outside of the sweep"),
+        ("sweep.nearest=95 mm", "sweep: nearest is not below farthest"),
+        ("objects.1.name=near", "objects[1].name: 'near' and 'near'"),
+        ("objects.1.depth=3 mm", "allowed here: name, kind, image, path, pixels, distance, width"),
+        ("objects.0.distance=20", "objects[0].distance: "),
+        ("sweep.measure=eye", "sweep.measure: 'eye' is unknown; choose one of"),
+        ("noise=null", "wiener weighs noise against signal"),
+    ],
+)
+def test_faults_are_told_in_one_line(override, part, tmp_path):
+    with pytest.raises(ConfigError) as caught:
+        tiny.experiment(tmp_path, override)
+    (line,) = str(caught.value).split("\n")
+    assert part in line
+
+
+@pytest.mark.parametrize(
+    ("override", "part"),
+    [
+        ("objects.0.width=0.1 mm", "objects[0]: covers 1 pixels of a reconstruction"),
+        ("mask.harmonics=4", "mask or sensor: "),
+    ],
+)
+def test_what_only_building_shows_is_refused(override, part, tmp_path):
+    with pytest.raises(ConfigError) as caught:
+        study.check_refocus(tiny.experiment(tmp_path, override))
+    (line,) = str(caught.value).split("\n")
+    assert line.startswith(part)
+
+
+def test_kinds_of_files(tmp_path):
+    assert isinstance(load_experiment(ROOT / "configs" / "quick.yaml"), StudyConfig)
+    shipped = load_experiment(ROOT / "configs" / "fza_refocus.yaml")
+    assert isinstance(shipped, RefocusConfig)
+    study.check_refocus(shipped)
+    assert tiny.experiment(tmp_path, text=dump_config(shipped)) == shipped
+    with pytest.raises(ConfigError, match="kind: 'sweep' is unknown; write 'kind: refocus'"):
+        tiny.experiment(tmp_path, text="kind: sweep\n")
+    with pytest.raises(ConfigError, match="kind: unknown key"):
+        load_config(tiny.write(tmp_path))
+    with pytest.raises(FileNotFoundError, match="is missing"):
+        load_experiment(tmp_path / "none.yaml")

@@ -1,0 +1,293 @@
+"""Runs: what they leave behind, that they repeat, and that they go on after an interruption."""
+
+import gc
+import json
+
+import jax
+import numpy as np
+import pytest
+import skimage.io
+from commands.study import tiny
+
+from thincam_jax.commands.study import RunFolder, build, check_study, method_response
+from thincam_jax.commands.study.config import ConfigError, load_config
+from thincam_jax.commands.study.run import run_study, steps
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory):
+    return tmp_path_factory.mktemp("tiny")
+
+
+@pytest.fixture(scope="module")
+def whole(home):
+    """One uninterrupted run: configuration, folder, metrics, the texts of its progress."""
+    config, texts = tiny.study(home), []
+    folder = RunFolder(home / "whole")
+    metrics = run_study(config, folder, texts.append)
+    return config, folder.path, metrics, texts
+
+
+def test_metrics_hold_every_method_and_target(whole):
+    config, path, metrics, _ = whole
+    assert json.loads((path / "metrics.json").read_text("utf-8")) == metrics
+    assert metrics["study"] == "tiny"
+    assert metrics["seed"] == 3
+    assert list(metrics["methods"]) == ["conventional", "pairs"]
+    for method in metrics["methods"].values():
+        assert method["captures"] == 4
+        assert list(method["targets"]) == ["chart", "picture"]
+        for target in method["targets"].values():
+            assert 10 < target["psnr_db"] < 40
+            assert 0.2 < target["ssim"] < 1
+            assert target["object_pixel_mm"] == pytest.approx(0.04 * 100 / 3, abs=1e-6)
+        assert method["targets"]["picture"]["resolved"] is None
+        picture = method["targets"]["picture"]["psnr_db"]
+        assert method["mean_psnr_of_pictures_db"] == picture  # the chart is not among them
+        # The zones end at 8.0 cycles/mm, at 12.5 the pixels do.
+        assert 7 < method["limits"]["cut_off_cycles_per_mm"] <= 12.5
+        assert method["limits"]["cut_off_object_mm"] == pytest.approx(
+            100 / 3 / method["limits"]["cut_off_cycles_per_mm"], abs=1e-3
+        )
+    assert metrics["methods"]["conventional"]["published"] == {
+        "psnr_db": 20.3,
+        "resolved_object_mm": 4.6,
+        "limit_cycles_per_mm": 10.8,
+    }
+    assert set(metrics["methods"]["pairs"]["published"].values()) == {None}
+    assert config.methods[0].published.psnr_db == 20.3
+
+
+def test_resolved_element_is_given_on_the_object_and_on_the_sensor(whole):
+    resolved = whole[2]["methods"]["conventional"]["targets"]["chart"]["resolved"]
+    assert resolved["object_mm"] == 5.0  # the coarsest: a sixteenth of 80 mm
+    assert resolved["sensor_cycles_per_mm"] == pytest.approx(100 / 3 / 5.0, abs=1e-3)
+
+
+def test_reconstruction_is_upright(whole):
+    """The picture's red blob is up and to the left, the green one down and to the right."""
+    for method in ("conventional", "pairs"):
+        image = skimage.io.imread(whole[1] / "images" / f"picture--{method}.png").astype(float)
+        assert image.shape[2] == 3
+        for channel, blob in enumerate([(12, 15), (30, 40), (20, 45)]):
+            brightest = np.unravel_index(np.argmax(image[..., channel]), image.shape[:2])
+            assert np.linalg.norm(np.subtract(brightest, blob)) < 5
+
+
+def test_progress_is_reported_as_often_as_announced(whole):
+    config, _, _, texts = whole
+    assert len(texts) == steps(config) == 2 * (tiny.CAPTURES + 2) + 2 + 1
+    assert texts[0].startswith("chart: ")
+    assert texts[-1] == "report"
+
+
+def test_folder_holds_what_it_says_and_nothing_half(whole):
+    config, path, _, _ = whole
+    files = {p.relative_to(path).as_posix() for p in path.rglob("*") if p.is_file()}
+    expected = {"config.yaml", "metrics.json", "environment.json", "report.html"}
+    expected |= {"targets/chart.json", "targets/picture.json"}
+    expected |= {f"images/{t}--{m}.png" for t in ("chart", "picture") for m in ("pairs", "scene")}
+    expected |= {f"images/{t}--conventional.png" for t in ("chart", "picture")}
+    expected |= {f"figures/{n}.png" for n in ("mtf", "contrast", "psf")}
+    expected |= {f"figures/target-{n}.png" for n in ("chart", "picture")}
+    assert files == expected
+    assert load_config(path / "config.yaml") == config
+    environment = json.loads((path / "environment.json").read_text("utf-8"))
+    assert environment["seed"] == 3
+    assert environment["versions"]["jax"]
+
+
+def test_same_seed_same_bytes_other_seed_other_noise(whole, home):
+    again = RunFolder(home / "again")
+    run_study(whole[0], again, tiny.ignore)
+    bytes_of = (whole[1] / "metrics.json").read_bytes()
+    assert (again.path / "metrics.json").read_bytes() == bytes_of
+    other = RunFolder(home / "other")
+    metrics = run_study(tiny.study(home, "seed=4"), other, tiny.ignore)
+    for name, method in metrics["methods"].items():
+        for target, found in method["targets"].items():
+            before = whole[2]["methods"][name]["targets"][target]["psnr_db"]
+            assert found["psnr_db"] != before
+            assert found["psnr_db"] == pytest.approx(before, abs=4)  # noise, no other physics
+
+
+def counted(monkeypatch):
+    """The settings, channels and keys of all captures taken from here on."""
+    taken, take = [], build.take
+
+    def counting(config, setting, plane, key):
+        numbers = np.asarray(jax.random.key_data(key)).tolist()
+        taken.append((setting, plane.image.shape[0], tuple(numbers)))
+        return take(config, setting, plane, key)
+
+    monkeypatch.setattr(build, "take", counting)
+    return taken
+
+
+def test_interrupted_run_goes_on_where_it_stopped(whole, home, monkeypatch):
+    config, path, metrics, texts = whole
+    folder = RunFolder(home / "interrupted")
+    taken = counted(monkeypatch)
+
+    def interrupt(text):
+        if text.startswith("picture: capture 3"):
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run_study(config, folder, interrupt)
+    assert len(taken) == tiny.CAPTURES + 2
+    assert folder.finished("chart") is not None
+    assert folder.finished("picture") is None
+    assert not (folder.path / "metrics.json").exists()
+    assert not list(folder.path.rglob("*.partial*"))
+
+    taken.clear()
+    progress = []
+    assert run_study(config, folder, progress.append) == metrics
+    assert len(taken) == tiny.CAPTURES
+    assert {channels for _, channels, _ in taken} == {3}  # the chart, in grey, was not redone
+    assert len(progress) == len(texts)
+    assert (folder.path / "metrics.json").read_bytes() == (path / "metrics.json").read_bytes()
+    # The chart's figures of the first part are in the report of the second.
+    assert (folder.path / "figures" / "contrast.png").exists()
+
+
+def test_captures_that_methods_share_are_taken_once(whole, monkeypatch):
+    """In a complete run, which is not an interrupted one: it is done anew, with the same result."""
+    taken, metrics = counted(monkeypatch), (whole[1] / "metrics.json").read_bytes()
+    run_study(whole[0], RunFolder(whole[1]), tiny.ignore)
+    assert (whole[1] / "metrics.json").read_bytes() == metrics
+    for channels in (1, 3):
+        settings = [(s.beta, round(s.phase, 6)) for s, c, _ in taken if c == channels]
+        quarter = round(np.pi / 2, 6)
+        phases = [0.0, quarter, round(np.pi, 6), round(3 * np.pi / 2, 6)]
+        assert settings == [(25.0, p) for p in phases] + [(21.0, 0.0), (21.0, phases[3])]
+    assert len({key for _, _, key in taken}) == len(taken)  # every capture has noise of its own
+
+
+def test_broken_result_of_a_target_is_done_again(home, whole):
+    folder = RunFolder(home / "broken")
+    folder.claim(whole[0])
+    (folder.path / "targets" / "chart.json").write_text('{"metrics": {"conv', encoding="utf-8")
+    assert folder.finished("chart") is None
+    assert folder.finished("picture") is None
+
+
+def test_folder_of_another_study_is_refused(whole, home):
+    before = (whole[1] / "metrics.json").read_bytes()
+    other = tiny.study(home, "seed=5")
+    with pytest.raises(ConfigError, match="holds a run of another configuration") as caught:
+        run_study(other, RunFolder(whole[1]), tiny.ignore)
+    assert "delete this one" in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert (whole[1] / "metrics.json").read_bytes() == before
+
+
+def test_folder_with_other_files_is_refused_untouched(home, whole):
+    foreign = home / "foreign"
+    (foreign / "targets").mkdir(parents=True)
+    for name in ("metrics.json", "report.html", "targets/mine.json"):
+        (foreign / name).write_text("mine", encoding="utf-8")
+    before = sorted(foreign.rglob("*"))
+    with pytest.raises(ConfigError, match="not empty and holds no run; give a new folder"):
+        run_study(whole[0], RunFolder(foreign), tiny.ignore)
+    assert sorted(foreign.rglob("*")) == before
+    assert all(p.read_text("utf-8") == "mine" for p in before if p.is_file())
+
+
+def test_folder_whose_configuration_is_no_text_is_refused(home, whole):
+    folder = RunFolder(home / "binary")
+    folder.path.mkdir()
+    (folder.path / "config.yaml").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(ConfigError, match="another configuration"):
+        folder.claim(whole[0])
+
+
+class TestCheck:
+    """Faults that are found before the first capture: one line each, which names the field."""
+
+    def line(self, config):
+        with pytest.raises(ConfigError) as caught:
+            check_study(config)
+        (line,) = str(caught.value).split("\n")
+        return line
+
+    def test_sound_study(self, tmp_path):
+        check_study(tiny.study(tmp_path))
+
+    def test_missing_image(self, tmp_path):
+        config = tiny.study(tmp_path, "targets.1.path=nowhere.png")
+        missing = tmp_path / "nowhere.png"  # beside the experiment file
+        assert self.line(config).startswith(f"targets[1]: '{missing}' does not exist")
+
+    # Some decoders leave a damaged file open for the collector.
+    @pytest.mark.filterwarnings("ignore::ResourceWarning")
+    @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+    def test_unreadable_image(self, tmp_path):
+        config = tiny.study(tmp_path)
+        (tmp_path / "picture.png").write_bytes(b"\x89PNG but no more")
+        line = self.line(config)
+        assert line.startswith("targets[1]: ")
+        assert "cannot be read as an image" in line
+        gc.collect()
+
+    def test_uniform_image(self, tmp_path):
+        config = tiny.study(tmp_path)
+        black = np.zeros((45, 60), np.uint8)
+        skimage.io.imsave(tmp_path / "picture.png", black, check_contrast=False)
+        assert self.line(config).startswith("targets[1]: the image is uniform")
+
+    @pytest.mark.parametrize("shape", ["[1, 1]", "[1, 64]", "[6, 64]", "[48, 1]", "[48, 41]"])
+    def test_sensor_of_too_few_pixels(self, shape, tmp_path):
+        line = self.line(tiny.study(tmp_path, f"sensor.shape={shape}"))
+        assert line.startswith("sensor.shape: ")
+        assert "give at least 7×42" in line
+
+    def test_object_of_a_few_pixels(self, tmp_path):
+        with pytest.raises(ConfigError) as caught:
+            check_study(tiny.study(tmp_path, "object.width=7 mm"))
+        first, second = str(caught.value).split("\n")
+        assert first.startswith("targets[0]: 'conventional' reconstructs it on 6×6 pixels")
+        assert second.startswith("targets[1]: 'conventional' reconstructs it on 4×6 pixels")
+
+    @pytest.mark.parametrize(
+        ("override", "part"),
+        [
+            ("mask.harmonics=4", "give an odd number"),
+            ("mask.pixel_pitch=0.3 mm", "not a whole number of display pixels"),
+        ],
+    )
+    def test_camera_that_cannot_be_built(self, override, part, tmp_path):
+        line = self.line(tiny.study(tmp_path, override))
+        assert line.startswith("mask, sensor or model: ")
+        assert part in line
+
+
+def test_pictures_alone_give_a_report(tmp_path, home):
+    """Without a chart nothing is resolved; a target may be called like one of the figures."""
+    only = f"targets=[{{name: mtf, kind: file, path: {tmp_path / 'picture.png'}}}]"
+    folder = RunFolder(tmp_path / "out")
+    metrics = run_study(tiny.study(tmp_path, only), folder, tiny.ignore)
+    for method in metrics["methods"].values():
+        assert method["targets"]["mtf"]["resolved"] is None
+    assert not (folder.path / "figures" / "contrast.png").exists()
+    figures = {(folder.path / "figures" / n).read_bytes() for n in ("mtf.png", "target-mtf.png")}
+    assert len(figures) == 2
+    assert (folder.path / "report.html").exists()
+
+
+def test_smallest_sensor_that_is_let_through_gives_finite_results(tmp_path):
+    config = tiny.study(tmp_path, "sensor.shape=[7, 42]", "seed=1")
+    check_study(config)
+    method, target = config.methods[1], config.targets[0]
+    plane = build.build_plane(config, target)
+    captures = [
+        build.take(config, setting, plane, build.capture_key(config, 0, number))
+        for number, setting in enumerate(build.settings(config, method))
+    ]
+    reconstruct = build.build_reconstructor(
+        config, method, build.field_shape(config, method, plane)
+    )
+    images, variances = (jax.numpy.stack(values) for values in zip(*captures, strict=True))
+    assert reconstruct(images, variances).status == "ok"
+    assert np.isfinite(method_response(config, method).metrics["cut_off_cycles_per_mm"])

@@ -1,0 +1,70 @@
+"""A study of a second that the run, report and command tests share.
+
+48×64 pixels of 40 µm (Nyquist 12.5 cycles/mm), a mask of 2 mm whose zones end at βR/π = 8.0
+cycles/mm, an object of 80 mm at 100 mm that fills 60 of the 64 columns at d = 3.0 mm.
+"""
+
+from pathlib import Path
+
+import numpy as np
+import skimage.io
+
+from thincam_jax.commands.study.config import StudyConfig, load_config
+
+TEXT = """\
+name: tiny
+title: A tiny study
+seed: 3
+wavelength: 500 nm
+model: geometric  # it compiles fastest
+pixel_integration: false
+sensor: {shape: [48, 64], pitch: 40 um}
+mask: {width: 2 mm}
+object: {distance: 100 mm, width: 80 mm}
+noise: {snr_db: 30, signal_power: without_mean}
+methods:
+  - name: conventional
+    kind: fringe_scanning
+    shots:
+      - {beta: 25 rad/mm^2, distance: 3 mm}
+    published: {psnr_db: 20.3, resolved: 4.6 mm, limit_cycles_per_mm: 10.8}
+  - name: pairs
+    kind: wiener
+    synthesis: phase_pairs
+    shots:
+      - {beta: 25 rad/mm^2, distance: 3 mm}
+      - {beta: 21 rad/mm^2, distance: 3 mm}
+targets:
+  - {name: chart, kind: usaf1951, pixels: 120}
+  - {name: picture, kind: file, path: PICTURE}
+"""
+
+# Phases 0, π/2, π, 3π/2 at β = 25, of which the pairs use two, and two more at β = 21.
+CAPTURES = 6
+
+
+def picture() -> np.ndarray:
+    """Blobs in colour, 45×60, no symmetry."""
+    y, x = np.mgrid[:45, :60]
+    image = np.full((45, 60, 3), 0.2)
+    for channel, (row, column) in enumerate([(12, 15), (30, 40), (20, 45)]):
+        image[..., channel] += 0.7 * np.exp(-((y - row) ** 2 + (x - column) ** 2) / 60)
+    return np.round(image * 255).astype(np.uint8)
+
+
+def write(folder: Path, text: str = TEXT) -> Path:
+    """The study's file and its picture in a folder."""
+    image = folder / "picture.png"
+    if not image.exists():
+        skimage.io.imsave(image, picture(), check_contrast=False)
+    path = folder / "tiny.yaml"
+    path.write_text(text.replace("PICTURE", str(image)), encoding="utf-8")
+    return path
+
+
+def study(folder: Path, *overrides: str, text: str = TEXT) -> StudyConfig:
+    return load_config(write(folder, text), overrides)
+
+
+def ignore(_: str) -> None:
+    """Progress that nobody watches."""

@@ -1,0 +1,158 @@
+"""The command `thincam sweep`: what it prints, its exit codes, and its one line for each fault."""
+
+import importlib.util
+import os
+import subprocess
+import sys
+
+import pytest
+from commands.sweep import mini
+from commands.test_cli import call, one_line
+
+from helpers import ROOT
+from thincam_jax.commands.sweep import cluster, command, run
+from thincam_jax.commands.sweep.run import Swept
+
+
+@pytest.fixture
+def file(tmp_path):
+    return mini.write(tmp_path)
+
+
+@pytest.fixture
+def asked(monkeypatch):
+    """In place of a sweep: returns what it was asked for."""
+    given = []
+
+    def swept(points, folder, progress, **options):
+        given.append((points, folder, options))
+        progress(len(points), 0)
+        return Swept(len(points), len(points), [])
+
+    monkeypatch.setattr(run, "run_sweep", swept)
+    return given
+
+
+def test_options_and_default_folder(file, asked, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    grid = ("--grid", "seed=0:4:5", "--grid", "methods.*.shots.*.distance=3,4 mm")
+    result = call("sweep", file, *grid, "--set", "name=Other", "--workers", 3)
+    assert result.exit_code == 0, result.output
+    ((points, folder, options),) = asked
+    assert folder.path.as_posix() == "runs/other-sweep"
+    assert len(points) == 10
+    assert all(point.double for point in points)  # as the tests are set
+    assert options == {"scheduler": None, "workers": 3}
+    assert "10 of 10 points: runs/other-sweep/results.parquet" in result.stdout
+    assert result.stderr == ""
+    address = "tcp://192.168.0.2:8786"
+    out = tmp_path / "out"
+    assert call("sweep", file, *grid, "--out", out, "--scheduler", address).exit_code == 0
+    assert asked[1][1].path == out
+    assert asked[1][2] == {"scheduler": address, "workers": None}
+
+
+@pytest.mark.parametrize(("rows", "code"), [(3, 0), (0, 2)])
+def test_failures_are_told(file, tmp_path, monkeypatch, rows, code):
+    failed = [{"values": {"seed": 7}, "reason": "[red]worker died"}] * (4 - rows)
+    monkeypatch.setattr(run, "run_sweep", lambda *_, **__: Swept(4, rows, failed))
+    out = tmp_path / "out"
+    result = call("sweep", file, "--grid", "seed=0:3:4", "--out", out)
+    assert result.exit_code == code
+    (line,) = result.stderr.splitlines()
+    assert line == (
+        f"thincam: {4 - rows} of 4 points failed; the first (seed=7): [red]worker died; all are in "
+        f"{out / 'failures.jsonl'}. The same command tries them again."
+    )
+    assert ("3 of 4 points: " in result.stdout) == (rows == 3)
+
+
+@pytest.mark.parametrize(
+    ("ended", "told"), [((0, 0), "no point is kept yet"), ((9, 2), "7 points are kept")]
+)
+def test_interrupt(file, tmp_path, monkeypatch, ended, told):
+    def interrupted(points, folder, progress, **_):
+        progress(*ended)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(run, "run_sweep", interrupted)
+    result = call("sweep", file, "--grid", "seed=0:9:10", "--out", tmp_path / "out")
+    assert result.exit_code == 130
+    assert result.stderr == f"thincam: interrupted; {told}. The same command goes on from there.\n"
+
+
+class TestExitCode2:
+    @pytest.mark.parametrize(
+        ("options", "part"),
+        [
+            ((), "a sweep needs a --grid: write it as path=lo:hi:n"),
+            (("--grid", "seed=0:4:0"), "--grid seed=0:4:0: n is 0"),
+            (("--grid", "sed=0:4:5"), "--grid sed=0:4:5: sed: unknown key"),
+            (("--grid", "methods.7.name=a"), "methods has no entry 7"),
+            (("--grid", "mask.width=1:2:3"), "mask.width: 1 has no unit: write a length such as"),
+            (("--grid", "mask.width=1:2:3 nms"), 'has the unknown unit "nms"'),
+            (("--grid", "seed=1", "--grid", "seed=2"), "seed is set by --grid seed=1 too"),
+            (("--grid", "seed=1", "--workers", 0), "--workers 0: give at least 1"),
+            (("--grid", "seed=1", "--workers", 1, "--scheduler", "tcp://a:1"), "leave it out"),
+            (("--grid", "seed=1", "--set", "seed=x"), "--set seed=x: seed: 'x'"),
+        ],
+    )
+    def test_options(self, file, tmp_path, options, part):
+        out = tmp_path / "out"
+        assert part in one_line(call("sweep", file, *options, "--out", out))
+        assert not out.exists()
+
+    def test_file(self, tmp_path):
+        missing = tmp_path / "no.yaml"
+        line = one_line(call("sweep", missing, "--grid", "seed=1"))
+        assert line == f"{missing} is missing; give the path of a YAML experiment file"
+
+    def test_experiment_of_another_kind(self):
+        file = ROOT / "configs" / "fza_refocus.yaml"
+        line = one_line(call("sweep", file, "--grid", "seed=1"))
+        assert line == f"{file}: is of kind refocus; a sweep takes a study"
+
+    def test_out(self, file, asked, tmp_path):
+        out = tmp_path / "out"
+        assert call("sweep", file, "--grid", "seed=1", "--out", out).exit_code == 0
+        other = ("--grid", "seed=1", "--set", "noise.snr_db=20")
+        line = one_line(call("sweep", file, *other, "--out", out))
+        assert line.startswith(f"--out {out}: holds a sweep of another configuration (see {out}")
+        for path, part in ((tmp_path, "holds no sweep"), (file, "cannot be made a folder")):
+            assert part in one_line(call("sweep", file, "--grid", "seed=1", "--out", path))
+
+    def test_scheduler_that_does_not_answer(self, file, tmp_path, monkeypatch):
+        monkeypatch.setattr(cluster, "_CONNECT_SECONDS", 0.5)
+        options = ("--grid", "seed=1", "--scheduler", "tcp://127.0.0.1:1")
+        line = one_line(call("sweep", file, *options, "--out", tmp_path / "out"))
+        assert line.startswith("--scheduler tcp://127.0.0.1:1: no scheduler answers there; ")
+
+    def test_missing_parts(self, file, monkeypatch):
+        def without(name):
+            return None if name in ("distributed", "pyarrow") else importlib.util.find_spec(name)
+
+        monkeypatch.setattr(command, "find_spec", without)
+        assert one_line(call("sweep", file, "--grid", "seed=1")) == (
+            "thincam sweep needs distributed, pyarrow; install them with "
+            "pip install 'thincam_jax[sweep]'"
+        )
+
+
+def test_help():
+    result = call("sweep", "--help")
+    assert result.exit_code == 0
+    for part in ("--grid", "--scheduler", "--workers", "results.parquet", "failures.jsonl"):
+        assert part in result.stdout
+
+
+def test_optional_parts_are_imported_by_sweeps_only():
+    code = (
+        "import sys, thincam_jax, thincam_jax.commands.cli; "
+        "print([name for name in ('dask', 'distributed', 'pyarrow') if name in sys.modules])"
+    )
+    path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
+    environment = {**os.environ, "PYTHONPATH": path}
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, env=environment, timeout=120
+    )
+    assert (done.returncode, done.stdout) == (0, "[]\n"), done.stderr

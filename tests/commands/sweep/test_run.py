@@ -1,0 +1,264 @@
+"""Whole sweeps: what ends up in the table whatever happens to points, workers and the command."""
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import jax
+import psutil
+import pyarrow.parquet as pq
+import pytest
+from commands.sweep import mini
+from commands.test_cli import call
+
+from helpers import ROOT
+from thincam_jax.commands.sweep import run
+from thincam_jax.commands.sweep.cluster import Died
+from thincam_jax.commands.sweep.folder import SweepFolder
+from thincam_jax.commands.sweep.measure import Outcome
+from thincam_jax.commands.sweep.run import run_sweep
+
+
+@pytest.fixture
+def config(tmp_path):
+    return mini.study(tmp_path)
+
+
+@pytest.fixture
+def folder(config, tmp_path):
+    folder = SweepFolder(tmp_path / "out")
+    folder.claim(config)
+    return folder
+
+
+@pytest.fixture
+def at_once(monkeypatch):
+    """In place of workers: results in the order of the list; returns the keys that were done."""
+    results, done = {}, []
+
+    def outcomes(_, measure, tasks):
+        for key in tasks:
+            done.append(key)
+            yield key, results.get(key, mini.outcome(1))
+
+    monkeypatch.setattr(run, "connected", lambda *_: contextlib.nullcontext())
+    monkeypatch.setattr(run, "outcomes", outcomes)
+    return results, done
+
+
+def rows(path):
+    return pq.read_table(path / "results.parquet").to_pylist()
+
+
+def failures(path):
+    text = (path / "failures.jsonl").read_text("utf-8")
+    return {tuple(f["values"].values()): f["reason"] for f in map(json.loads, text.splitlines())}
+
+
+def test_finished_points_are_not_done_again_and_failed_ones_are(config, folder, at_once):
+    results, done = at_once
+    points = mini.points(config, "seed=-1:3:5")
+    results[points[2].key] = Outcome(None, "once")
+    results[points[3].key] = Died()
+    results[points[4].key] = ModuleNotFoundError("No module named 'thincam_jax'")
+    told = []
+    swept = run_sweep(points, folder, lambda *numbers: told.append(numbers))
+    assert (swept.points, swept.rows, len(swept.failures)) == (5, 1, 4)
+    assert told == [(0, 0), (1, 1), (2, 1), (3, 2), (4, 3), (5, 4)]
+    assert failures(folder.path) == {
+        (-1,): "--grid seed=-1:3:5: seed: -1: input should be greater than or equal to 0",
+        (1,): "once",
+        (2,): "worker died",
+        (3,): "ModuleNotFoundError: No module named 'thincam_jax'",
+    }
+    results.clear()
+    done.clear()
+    told.clear()
+    assert run_sweep(points, folder, lambda *numbers: told.append(numbers)).rows == 4
+    assert done == [point.key for point in points[2:]]
+    assert told[0] == (1, 0)
+    assert list(failures(folder.path)) == [(-1,)]
+
+
+def test_grid_that_grew(config, folder, at_once):
+    done = at_once[1]
+    run_sweep(mini.points(config, "seed=0:3:4"), folder, mini.ignore)
+    done.clear()
+    points = mini.points(config, "seed=0:5:6")
+    assert run_sweep(points, folder, mini.ignore).rows == 6
+    assert done == [points[4].key, points[5].key]
+    assert [row["seed"] for row in rows(folder.path)] == [0, 1, 2, 3, 4, 5]
+
+
+def test_interrupt_keeps_what_has_ended(config, folder, at_once):
+    def interrupt(ended, _):
+        if ended == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run_sweep(mini.points(config, "seed=0:5:6"), folder, interrupt)
+    assert [row["seed"] for row in rows(folder.path)] == [0, 1]
+    assert run_sweep(mini.points(config, "seed=0:5:6"), folder, mini.ignore).rows == 6
+
+
+def test_workers_that_die_and_points_that_raise(config, folder):
+    """On two processes; the points beside those that kill their worker are not lost."""
+
+    def measure(text, _):  # sent by value: workers do not know the tests
+        import json
+        import os
+        import signal
+
+        seed = json.loads(text)["seed"]
+        if seed == 3:
+            os.kill(os.getpid(), signal.SIGKILL)
+        if seed == 4:
+            raise ZeroDivisionError("four")
+        return Outcome({"psnr_db/single/star": float(seed), "seconds": 0.0})
+
+    swept = run_sweep(
+        mini.points(config, "seed=0:7:8"), folder, mini.ignore, workers=2, measure=measure
+    )
+    assert (swept.points, swept.rows) == (8, 6)
+    assert [row["psnr_db/single/star"] for row in rows(folder.path)] == [0, 1, 2, 5, 6, 7]
+    assert failures(folder.path) == {(3,): "worker died", (4,): "ZeroDivisionError: four"}
+
+
+def command(file: Path, out: Path, *grid: str) -> list[str]:
+    return [
+        *(sys.executable, "-m", "thincam_jax.commands.cli", "sweep", str(file), "--out", str(out)),
+        *("--workers", "2", *(part for axis in grid for part in ("--grid", axis))),
+    ]
+
+
+def environment(file: Path) -> dict[str, str]:
+    """Of a user: float32. What the workers of one sweep compile serves those of the next."""
+    kept = {k: v for k, v in os.environ.items() if not k.startswith("JAX_ENABLE")}
+    path = os.pathsep.join(filter(None, [str(ROOT), kept.get("PYTHONPATH")]))
+    cache = {
+        "JAX_COMPILATION_CACHE_DIR": str(file.parent / "compiled"),
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+        # jaxlib 0.10.1 takes its own preferences for features that the processor lacks, and says
+        # so at everything it finds there: https://github.com/jax-ml/jax/issues/38445.
+        "TF_CPP_MIN_LOG_LEVEL": "3",
+    }
+    return {**kept, **cache, "PYTHONPATH": path}
+
+
+def finish(file: Path, out: Path, *grid: str) -> subprocess.CompletedProcess:
+    return subprocess.run(
+        command(file, out, *grid),
+        capture_output=True,
+        text=True,
+        env=environment(file),
+        timeout=300,
+    )
+
+
+def kill_half_way(file: Path, out: Path, grid: str, half: int) -> None:
+    """SIGKILL for the command once half of the points have ended; its workers end by themselves."""
+    process = subprocess.Popen(
+        command(file, out, grid),
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        env=environment(file),
+    )
+    try:
+        while len(list(out.glob("points/*.parquet"))) < half:
+            assert process.poll() is None, "it ended before half of its points"
+            time.sleep(0.01)
+        workers = psutil.Process(process.pid).children(recursive=True)
+        assert workers
+    finally:
+        process.kill()
+        process.wait()
+    _, alive = psutil.wait_procs(workers, timeout=60)
+    assert not alive
+
+
+def check(path: Path, wanted: list[int]) -> None:
+    assert [row["seed"] for row in rows(path)] == wanted
+    assert len({row["point"] for row in rows(path)}) == len(wanted)
+    psnr = [row["psnr_db/single/star"] for row in rows(path)]
+    assert len(set(psnr)) > len(wanted) / 2  # noise of their own
+    assert all(5 < value < 30 for value in psnr)
+
+
+@pytest.mark.parametrize("count", [24, pytest.param(200, marks=pytest.mark.thorough)])
+def test_sweep_that_is_killed_half_way(tmp_path, count):
+    """It goes on with what is missing; with one point that always fails it has one row less."""
+    file, out = mini.write(tmp_path), tmp_path / "out"
+    kill_half_way(file, out, f"seed=0:{count - 1}:{count}", count // 2)
+    written = {part: part.stat().st_mtime_ns for part in out.glob("points/*.parquet")}
+    assert count // 2 <= len(written) < count
+    assert not (out / "results.parquet").exists()
+    done = finish(file, out, f"seed=0:{count - 1}:{count}")
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""
+    assert f"{count} of {count} points: {out / 'results.parquet'}" in done.stdout
+    check(out, list(range(count)))
+    assert {part: part.stat().st_mtime_ns for part in written} == written
+    assert not (out / "failures.jsonl").exists()
+
+    with jax.enable_x64(False):  # the precision of a user
+        done = call("sweep", file, "--out", out, "--grid", f"seed=-1:{count - 2}:{count}")
+    assert done.exit_code == 0
+    check(out, list(range(count - 1)))
+    reason = (
+        f"--grid seed=-1:{count - 2}:{count}: seed: -1: input should be greater than or equal to 0"
+    )
+    assert failures(out) == {(-1,): reason}
+    (line,) = done.stderr.splitlines()
+    assert line.startswith(
+        f"thincam: 1 of {count} points failed; the first (seed=-1): {reason}; all"
+    )
+
+
+@pytest.mark.thorough
+def test_sweep_of_200_points_of_which_one_fails_in_its_worker(tmp_path):
+    """Killed half-way as well; an object of 1 mm covers too few pixels."""
+    file, out = mini.write(tmp_path), tmp_path / "out"
+    widths = [1, *(round(79.005 + 0.005 * n, 3) for n in range(199))]
+    grid = f"object.width={','.join(map(str, widths))} mm"
+    kill_half_way(file, out, grid, 100)
+    for _ in range(2):  # it fails again
+        done = finish(file, out, grid)
+        assert done.returncode == 0, done.stderr
+        assert [row["object.width"] for row in rows(out)] == widths[1:]
+        ((values, reason),) = failures(out).items()
+        assert values == (1.0,)
+        assert reason.startswith("targets[0]: 'single' reconstructs it on 1×1 pixels")
+        assert len(done.stderr.splitlines()) == 1
+
+
+@pytest.mark.thorough
+def test_ctrl_c_of_a_terminal(tmp_path):
+    """It reaches the workers too, who keep silent; the rows are kept, and nobody stays behind."""
+    file, out = mini.write(tmp_path), tmp_path / "out"
+    process = subprocess.Popen(
+        command(file, out, "seed=0:9999:10000"),
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=environment(file),
+        start_new_session=True,
+    )
+    while len(list(out.glob("points/*.parquet"))) < 5:
+        assert process.poll() is None
+        time.sleep(0.01)
+    workers = psutil.Process(process.pid).children(recursive=True)
+    os.killpg(process.pid, signal.SIGINT)
+    _, errors = process.communicate(timeout=120)
+    assert process.returncode == 130
+    kept = len(rows(out))
+    assert kept >= 5
+    assert errors.splitlines() == [
+        f"thincam: interrupted; {kept} points are kept. The same command goes on from there."
+    ]
+    _, alive = psutil.wait_procs(workers, timeout=60)
+    assert not alive

@@ -1,0 +1,304 @@
+"""The command: exit codes, one clear line for what a user can put right, and how to go on."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+from commands.study import tiny
+from typer.testing import CliRunner
+
+from helpers import ROOT
+from thincam_jax.commands import cli, doctor
+
+runner = CliRunner()
+
+
+def call(*arguments):
+    return runner.invoke(cli.app, [str(a) for a in arguments])
+
+
+def one_line(result):
+    """The one line on stderr of a call that ended with exit code 2, without "thincam: "."""
+    assert result.exit_code == 2, result.output
+    assert "Traceback" not in result.output
+    (line,) = result.stderr.splitlines()
+    assert line.startswith("thincam: ")
+    return line.removeprefix("thincam: ")
+
+
+@pytest.fixture
+def file(tmp_path):
+    return tiny.write(tmp_path)
+
+
+def test_run_prints_the_results_and_where_the_report_is(file, tmp_path):
+    """All options at once; the same command a second time ends with the same figures."""
+    command = ("run", file, "--out", tmp_path / "out", "--set", "seed=9", "--set", "title=T")
+    first = call(*command)
+    assert first.exit_code == 0, first.output
+    assert (tmp_path / "out" / "report.html").exists()
+    config = (tmp_path / "out" / "config.yaml").read_text("utf-8")
+    assert "seed: 9\n" in config
+    assert "title: T\n" in config
+    assert f"report: {tmp_path / 'out' / 'report.html'}" in first.stdout
+    row = next(line for line in first.stdout.splitlines() if "conventional" in line and "│" in line)
+    assert "20.3" in row  # published
+    assert "5.00" in row  # resolved, mm
+    assert first.stderr == ""
+    again = call(*command)
+    assert again.exit_code == 0
+    assert row in again.stdout
+
+
+def test_default_folder_is_named_after_the_study(file, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    folders = []
+    monkeypatch.setattr(
+        cli, "run_study", lambda _, folder, __: folders.append(folder.path) or {"methods": {}}
+    )
+    assert call("run", file).exit_code == 0
+    # A name of dots does not lead out of the folder.
+    assert call("run", file, "--set", "name=..").exit_code == 0
+    assert [path.as_posix() for path in folders] == ["runs/tiny", "runs/unnamed"]
+
+
+class TestExitCode2:
+    def test_missing_file(self, tmp_path):
+        line = one_line(call("run", tmp_path / "no.yaml"))
+        assert line == f"{tmp_path / 'no.yaml'} is missing; give the path of a YAML experiment file"
+
+    def test_folder_for_a_file(self, tmp_path):
+        assert "is a folder; give the path" in one_line(call("run", tmp_path))
+
+    def test_fault_in_the_file(self, file, tmp_path):
+        text = file.read_text("utf-8").replace("width: 2 mm", "width: 2")
+        file.write_text(text, encoding="utf-8")
+        number = next(n for n, row in enumerate(text.split("\n"), 1) if row.startswith("mask:"))
+        line = one_line(call("run", file, "--out", tmp_path / "out"))
+        assert line.startswith(f"{file}:{number}: mask.width: 2 has no unit")
+        assert not (tmp_path / "out").exists()
+
+    def test_every_fault_has_its_line(self, file):
+        result = call("run", file, "--set", "mask.width=2", "--set", "seed=x")
+        assert result.exit_code == 2
+        first, second = result.stderr.splitlines()
+        # Long lines are not broken: a terminal wraps them, a log keeps them whole.
+        assert first == "thincam: --set seed=x: seed: 'x': input should be a valid integer"
+        assert second.startswith("thincam: --set mask.width=2: mask.width: 2 has no unit")
+
+    def test_markup_in_a_message_is_shown_as_it_is(self, file):
+        assert "--set seed=[red]: " in one_line(call("run", file, "--set", "seed=[red]"))
+
+    def test_malformed_override(self, file):
+        assert one_line(call("run", file, "--set", "seed")).startswith("--set seed: write it as")
+
+    def test_image_that_is_missing(self, file, tmp_path):
+        out = tmp_path / "out"
+        line = one_line(call("run", file, "--out", out, "--set", "targets.1.path=no.png"))
+        assert line.startswith(f"targets[1]: '{tmp_path / 'no.png'}' does not exist")
+        assert not out.exists()
+
+    def test_out_is_a_file(self, file, tmp_path):
+        out = tmp_path / "taken"
+        out.write_text("mine", encoding="utf-8")
+        line = one_line(call("run", file, "--out", out))
+        assert line.startswith(f"--out {out}: cannot be made a folder (")
+        assert out.read_text("utf-8") == "mine"
+
+    def test_out_holds_another_study(self, file, tmp_path):
+        out = tmp_path / "out"
+        out.mkdir()
+        (out / "config.yaml").write_text("name: other\n", encoding="utf-8")
+        line = one_line(call("run", file, "--out", out))
+        assert line.startswith(f"--out {out}: holds a run of another configuration")
+
+    @pytest.mark.parametrize("shape", ["[2000000, 2000000]", "[100, 100000000000]"])
+    def test_more_than_the_memory(self, file, shape, tmp_path):
+        """Refused before any work, with the estimate."""
+        out = ("--out", tmp_path / "out")
+        line = one_line(call("run", file, *out, "--set", f"sensor.shape={shape}"))
+        assert " needs about " in line
+        assert "iB" in line
+        assert " are free; " in line
+
+    def test_unknown_option_and_command(self, file):
+        for result in (call("run", file, "--ouput", "x"), call("rum", file), call("run")):
+            assert result.exit_code == 2
+            assert "Traceback" not in result.output
+        assert "No such option" in call("run", file, "--ouput", "x").stderr
+
+
+class TestBenchAccuracy:
+    def test_prints_the_results_and_where_the_figure_is(self, file, tmp_path, monkeypatch):
+        monkeypatch.setattr(cli.benches, "run_accuracy", lambda *_: RESULTS)
+        result = call("bench", "accuracy", file, "--out", tmp_path / "out", "--size", 32)
+        assert result.exit_code == 0, result.output
+        row = next(line for line in result.stdout.splitlines() if "separable" in line)
+        assert "reference" in row
+        assert "a PSF error of 1 % costs pairs 0.2500 dB by a wrong β" in result.stdout
+        assert f"figure: {tmp_path / 'out' / 'accuracy.png'}" in result.stdout
+
+    def test_default_folder_and_options(self, file, tmp_path, monkeypatch):
+        monkeypatch.chdir(tmp_path)
+        seen = []
+        monkeypatch.setattr(
+            cli.benches, "run_accuracy", lambda *given: seen.append(given[1:3]) or RESULTS
+        )
+        options = ("--size", 64, "--size", 32, "--capture-size", 48, "--set", "name=Other")
+        assert call("bench", "accuracy", file, *options).exit_code == 0
+        ((plan, folder),) = seen
+        assert (plan.sizes, plan.capture_size) == ((32, 64), 48)
+        assert folder.path.as_posix() == "runs/other-accuracy"
+
+    def test_fault_in_the_file(self, file):
+        line = one_line(call("bench", "accuracy", file, "--set", "mask.width=5"))
+        assert line.startswith("--set mask.width=5: mask.width: 5 has no unit")
+
+    @pytest.mark.parametrize("option", ["--size", "--capture-size"])
+    @pytest.mark.parametrize(("size", "hint"), [(0, "above zero"), (65, "give at most 64")])
+    def test_size(self, file, tmp_path, option, size, hint):
+        out = tmp_path / "out"
+        line = one_line(call("bench", "accuracy", file, "--out", out, option, size))
+        assert line.startswith(f"{option} {size}: ")
+        assert line.endswith(hint) or hint in line
+        assert not out.exists()
+
+    def test_folder_of_somebody_else(self, file, tmp_path):
+        (tmp_path / "file").write_text("mine")
+        for out, hint in ((tmp_path, "is not empty"), (tmp_path / "file", "cannot be written")):
+            assert hint in one_line(call("bench", "accuracy", file, "--out", out))
+        assert (tmp_path / "file").read_text() == "mine"
+
+    def test_interrupt(self, file, tmp_path, monkeypatch):
+        def interrupted(config, plan, folder, progress):
+            progress("64 pixels")
+            raise KeyboardInterrupt
+
+        monkeypatch.setattr(cli.benches, "run_accuracy", interrupted)
+        result = call("bench", "accuracy", file, "--out", tmp_path / "out")
+        assert result.exit_code == 130
+        assert result.stderr.splitlines() == ["thincam: interrupted; nothing is kept."]
+
+
+# As little as the command prints from.
+RESULTS = {
+    "settings": {"capture_shape": [48, 64], "target": "picture"},
+    "psfs": [
+        {
+            "shape": [24, 32],
+            "model": "separable",
+            "precision": "float64",
+            "oversampling": None,
+            "status": "run",
+            "true_error": 0.0,
+            "predicted_error": 1e-15,
+            "seconds": 0.01,
+            "compile_seconds": 1.0,
+            "worth_choosing": True,
+        }
+    ],
+    "captures": [{"model": "rayleigh_sommerfeld", "status": "not run", "reason": "slow"}],
+    "reconstructions": {
+        "method": "pairs",
+        "skipped": None,
+        "models": [],
+        "controlled": [
+            {
+                "wrong": "beta",
+                "level": 0.01,
+                "status": "run",
+                "change": 1e-4,
+                "psf_error": 0.01,
+                "capture_error": 1e-4,
+                "capture_contrast_error": 1e-3,
+                "psnr_lost_db": 0.25,
+            }
+        ],
+    },
+}
+
+
+def test_defect_keeps_its_traceback(file, monkeypatch, tmp_path):
+    """Only what a user can put right is made a line of."""
+
+    def broken(*_):
+        raise ZeroDivisionError("a defect")
+
+    monkeypatch.setattr(cli, "run_study", broken)
+    result = call("run", file, "--out", tmp_path / "out")
+    assert isinstance(result.exception, ZeroDivisionError)
+
+
+@pytest.mark.parametrize(("done", "hint"), [([], "no target yet"), (["chart"], "chart")])
+def test_interrupt(file, monkeypatch, tmp_path, done, hint):
+    def interrupted(config, folder, progress):
+        folder.claim(config)
+        for name in done:
+            folder.finish(name, {"metrics": {}, "contrasts": {}})
+        progress("picture: capture 1")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli, "run_study", interrupted)
+    result = call("run", file, "--out", tmp_path / "out")
+    assert result.exit_code == 130
+    expected = f"thincam: interrupted; finished: {hint}. The same command goes on from there."
+    assert result.stderr.splitlines() == [expected]
+
+
+def test_doctor():
+    result = call("doctor")
+    assert result.exit_code == 0
+    found = doctor.environment()
+    lines = result.stdout.splitlines()
+    assert f"Python {found['python']} on {found['platform']}" in lines
+    assert "devices: " + ", ".join(found["devices"]) in lines
+    assert "  float64: yes" in lines
+    assert "  compiled sums: right" in lines
+    assert f"jax {found['versions']['jax']}" in lines
+
+
+def test_doctor_tells_what_is_missing(monkeypatch):
+    monkeypatch.setattr(doctor, "PACKAGES", ("no-such-package",))
+    monkeypatch.setattr(doctor, "OPTIONAL", {"no-such-part": "making tea"})
+    lines = call("doctor").stdout.splitlines()
+    assert "no-such-package NOT INSTALLED" in lines
+    assert "optional no-such-part is missing: making tea" in lines
+
+
+@pytest.mark.parametrize(
+    ("arguments", "parts"),
+    [
+        (("--help",), ("run", "doctor", "thin computational cameras")),
+        (("run", "--help"), ("--out", "--set", "a.b=value", "Ctrl-C", "Experiment file")),
+        (("bench", "accuracy", "--help"), ("--size", "--capture-size", "--out", "PSNR")),
+        (("doctor", "--help"), ("versions", "devices")),
+    ],
+)
+def test_help(arguments, parts):
+    result = call(*arguments)
+    assert result.exit_code == 0
+    for part in parts:
+        assert part in result.stdout
+
+
+def test_as_a_process(file):
+    """The whole way, exit code and streams included, in the precision of a user: float32."""
+    kept = {k: v for k, v in os.environ.items() if not k.startswith("JAX_ENABLE")}
+    path = os.pathsep.join(filter(None, [str(ROOT), kept.get("PYTHONPATH")]))
+    command = [
+        sys.executable,
+        "-m",
+        "thincam_jax.commands.cli",
+        "run",
+        str(file),
+        "--set",
+        "mask.width=5",
+    ]
+    done = subprocess.run(
+        command, capture_output=True, text=True, env={**kept, "PYTHONPATH": path}, timeout=120
+    )
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert done.stderr.startswith("thincam: --set mask.width=5: mask.width: 5 has no unit")
+    assert done.stderr.count("\n") == 1

@@ -1,0 +1,346 @@
+"""Limits of resolution: on responses whose limits are known, and on the thesis' two methods."""
+
+import math
+
+import numpy as np
+import pytest
+import scipy.special
+
+from helpers import ROOT, relative_l2
+from thincam_jax.commands.study import method_response
+from thincam_jax.commands.study.config import load_config
+from thincam_jax.imaging.metrics import (
+    cut_off,
+    first_common_zero,
+    low_frequency_value,
+    zero_crossings,
+)
+from thincam_jax.imaging.metrics.mtf import MINIMUM_COLUMNS
+
+WAVELENGTH = 5e-4
+STEP = 0.05
+U = np.arange(0.0, 40.0, STEP)
+
+
+def cosine(distance, frequency=U):
+    """cos(πλdu²): a fringe-scanned response without its carrier (thesis Eq 3.31)."""
+    return np.cos(math.pi * WAVELENGTH * distance * frequency**2)
+
+
+def band(edge, frequency=U):
+    return np.where(frequency <= edge, 1.0, 0.0)
+
+
+class TestCutOff:
+    @pytest.mark.parametrize("edge", [9.97, 22.4, 31.0])
+    def test_ends_with_the_band_and_not_at_a_zero_inside(self, edge):
+        response = np.abs(cosine(6.5)) * band(edge)
+        assert np.min(response[U < 13]) < 0.01 or edge < 12.4  # it does have a zero before
+        assert edge - STEP <= cut_off(U, response) <= edge + STEP
+
+    def test_interpolates(self):
+        """A straight fall of 0.1 per cycle/mm from 1 at 20 reaches 5 % at 29.5 exactly."""
+        fall = np.interp(U, [20, 30], [1.0, 0.0])
+        assert cut_off(U, fall) == pytest.approx(29.5, abs=1e-9)
+        assert cut_off(U, fall, part=0.5) == pytest.approx(25.0, abs=1e-9)
+
+    def test_counts_from_where_it_stays_under(self):
+        """A revival above 5 % moves the limit; one below it does not."""
+        fall = np.interp(U, [20, 25], [1.0, 0.0])
+        bump = np.exp(-((U - 33.0) ** 2))
+        assert cut_off(U, fall + 0.04 * bump) == pytest.approx(24.75, abs=1e-6)
+        expected = 33.0 + math.sqrt(math.log(0.1 / 0.05))
+        assert cut_off(U, fall + 0.1 * bump) == pytest.approx(expected, abs=2e-3)
+
+    def test_does_not_depend_on_scale_sign_phase_or_ripple(self):
+        response = np.interp(U, [20, 30], [1.0, 0.0])
+        ripple = 1 + 0.02 * np.sin(2 * math.pi * U / 0.31)
+        for changed in (1e-9 * response, -response, response * np.exp(1j * U), response * ripple):
+            assert cut_off(U, changed) == pytest.approx(29.5, abs=0.03)
+
+    def test_the_bias_at_zero_does_not_count(self):
+        biased = np.interp(U, [20, 30], [1.0, 0.0])
+        biased[0] = 1e4
+        assert cut_off(U, biased) == pytest.approx(29.5, abs=1e-9)
+
+    def test_band_without_end_is_cut_by_the_sampling(self):
+        assert cut_off(U, np.ones_like(U)) == U[-1]
+
+    def test_uneven_frequencies(self):
+        uneven = 40 * np.linspace(0, 1, 900) ** 1.5
+        fall = np.interp(uneven, [20, 30], [1.0, 0.0])
+        assert cut_off(uneven, fall) == pytest.approx(29.5, abs=1e-6)
+
+
+class TestFirstCommonZero:
+    @pytest.mark.parametrize("distance", [5.0, 6.5])
+    def test_of_one_cosine(self, distance):
+        """πλdu² = π/2: 14.142 and 12.403 cycles/mm."""
+        expected = math.sqrt(1 / (2 * WAVELENGTH * distance))
+        assert first_common_zero(U, [cosine(distance)]) == pytest.approx(expected, abs=1e-3)
+
+    def test_two_cosines_that_miss_nothing_together(self):
+        """Zeros of d = 5.0 and 6.5 mm on the same axis: 14.1, 24.5 and 12.4, 21.5, 27.7."""
+        seen = band(27.0)
+        both = [cosine(5.0) * seen, cosine(6.5) * seen]
+        assert first_common_zero(U, both) is None
+
+    def test_two_cosines_with_a_common_zero(self):
+        """Distances 1 : 3 share their odd multiples of π/2: the near one's first zero."""
+        expected = math.sqrt(1 / (2 * WAVELENGTH * 2.5))
+        both = [cosine(7.5), cosine(2.5)]
+        assert first_common_zero(U, both) == pytest.approx(expected, abs=STEP)
+        assert first_common_zero(U, both[::-1]) == pytest.approx(expected, abs=STEP)
+
+    def test_end_of_the_band_is_no_zero(self):
+        ends = np.interp(U, [8, 11], [1.0, 0.0])  # before the first zero at 12.4
+        assert first_common_zero(U, [ends]) is None
+        tail = ends + np.where(U > 11, 0.03 * np.cos(3 * U), 0.0)  # ringing about zero
+        assert len(zero_crossings(U, tail)) > 10
+        assert first_common_zero(U, [tail]) is None
+
+    def test_ripple_on_a_cosine_moves_nothing(self):
+        rippled = cosine(6.5) * (1 + 0.05 * np.sin(40 * U))
+        assert first_common_zero(U, [rippled]) == pytest.approx(12.403, abs=2e-3)
+
+    def test_a_crossing_in_one_only_is_none(self):
+        assert first_common_zero(U, [cosine(6.5), np.ones_like(U)]) is None
+        # In step of each other, but the second is far from small where the first vanishes.
+        steep = np.where(U < 12.42, 1.0, -1.0)
+        assert first_common_zero(U, [cosine(6.5) * 0.1, steep]) is None
+
+    def test_uneven_frequencies(self):
+        uneven = 40 * np.linspace(0, 1, 2000) ** 1.5
+        found = first_common_zero(uneven, [cosine(6.5, uneven)])
+        assert found == pytest.approx(12.403, abs=1e-3)
+
+
+def test_zero_crossings_of_a_line():
+    frequency = np.array([0.0, 1.0, 4.0, 5.0])  # uneven
+    assert zero_crossings(frequency, np.array([3.0, 1.0, -5.0, 5.0])) == pytest.approx([1.5, 4.5])
+    assert zero_crossings(frequency, np.array([1.0, 0.0, -1.0, -2.0])) == pytest.approx([1.0])
+    assert zero_crossings(frequency, np.array([0.0, 1.0, 2.0, 3.0])).size == 0
+
+
+def test_low_frequency_value_is_the_root_mean_square_of_the_lowest_twentieth():
+    frequency = np.arange(101.0)
+    response = np.where(frequency <= 5, 3.0, 7.0) * np.where(frequency % 2, 1, -1j)
+    response[0] = 1e6
+    assert low_frequency_value(frequency, response) == pytest.approx(3.0, rel=1e-12)
+
+
+LINE = np.interp(U, [20, 30], [1.0, 0.0])
+
+
+@pytest.mark.parametrize("limit", [cut_off, lambda u, h: first_common_zero(u, [h])])
+@pytest.mark.parametrize(
+    ("frequency", "response", "message"),
+    [
+        (U, LINE[:-1], r"shapes \(800,\), \(799,\); give equal lengths"),
+        (U[:, None], LINE[:, None], "equal lengths"),
+        (U[::-1], LINE, "must ascend"),
+        (U - 1.0, LINE, "from zero or above"),
+        (np.repeat(U[::2], 2), LINE, "drop repeats"),
+        (U, np.where(U == U[7], np.nan, LINE), "NaN or infinity"),
+        (U[:10], LINE[:10], "sample the response more finely"),
+        (U[:0], LINE[:0], "equal lengths"),
+    ],
+)
+def test_refuses_what_is_no_response(limit, frequency, response, message):
+    with pytest.raises(ValueError, match=message):
+        limit(frequency, response)
+
+
+def test_refuses_nothing_to_measure():
+    with pytest.raises(ValueError, match="no cut-off"):
+        cut_off(U, np.zeros_like(U))
+    with pytest.raises(ValueError, match="at least one"):
+        first_common_zero(U, [])
+
+
+def test_minimum_columns_is_the_smallest_with_a_low_frequency():
+    def half(columns):
+        return np.fft.fftshift(np.fft.fftfreq(columns))[columns // 2 :]
+
+    for columns in (MINIMUM_COLUMNS, MINIMUM_COLUMNS + 1, MINIMUM_COLUMNS + 2):
+        assert low_frequency_value(half(columns), np.ones(len(half(columns)))) == 1.0
+    with pytest.raises(ValueError, match="more finely"):
+        low_frequency_value(half(MINIMUM_COLUMNS - 2), np.ones((MINIMUM_COLUMNS - 2) // 2))
+
+
+# The thesis' set-up (section 3.5.1): 1024² pixels of 5.5 µm, a mask of 5.632 mm, λ = 500 nm.
+CONVENTIONAL_5, CONVENTIONAL_6, METHOD_A, METHOD_B = range(4)
+
+
+def responses(distance, methods, **changes):
+    changes = {"object.distance": f"{distance} mm", **changes}
+    overrides = tuple(f"{key}={value}" for key, value in changes.items())
+    config = load_config(ROOT / "configs" / "fza_superresolution.yaml", overrides)
+    return [method_response(config, config.methods[index]) for index in methods]
+
+
+@pytest.fixture(scope="module")
+def distant():
+    """All four responses for an object at 1 km, where the magnification is 1."""
+    found = responses(1e6, range(4))
+    for name, response in zip(("5.0 mm", "6.5 mm", "A", "B"), found, strict=True):
+        print(f"distant object, {name}: {response.metrics}")
+    return found
+
+
+@pytest.fixture(scope="module")
+def near():
+    """All four for the thesis' object at 250 mm."""
+    found = responses(250, range(4))
+    for name, response in zip(("5.0 mm", "6.5 mm", "A", "B"), found, strict=True):
+        print(f"object at 250 mm, {name}: {response.metrics}")
+    return found
+
+
+@pytest.mark.parametrize(("method", "expected"), [(CONVENTIONAL_6, 12.40), (CONVENTIONAL_5, 14.14)])
+def test_first_zero_of_fringe_scanning(distant, method, expected):
+    """cos(πλdu²) = 0; the finite mask's ripple moves it by some 0.1."""
+    found = distant[method].metrics["first_zero_cycles_per_mm"]
+    assert found == pytest.approx(expected, abs=0.3)
+
+
+def test_two_distances_leave_no_zero(distant, near):
+    for response in (distant[METHOD_A], near[METHOD_A]):
+        assert response.metrics["first_zero_cycles_per_mm"] is None
+
+
+def test_phase_pairs_have_no_first_zero(distant, near):
+    """ERRATA 3.49, 3.5.1: where cos(πλdu²) vanishes the second harmonic is left. What crosses zero
+    is the carrier sin X − cos X; where, depends on the sampling.
+    """
+    for response in (distant[METHOD_B], near[METHOD_B]):
+        assert response.metrics["first_zero_cycles_per_mm"] is None
+        assert response.metrics["first_zero_object_mm"] is None
+        for zero in (12.4, 21.5):
+            around = np.abs(response.frequency - zero) < 0.4
+            level = low_frequency_value(response.frequency, response.magnitude)
+            assert response.magnitude[around].max() > 0.1 * level
+
+
+def test_object_side_limits_are_the_sensor_side_ones_magnified(near):
+    limits = near[CONVENTIONAL_5].metrics  # on its own plane: t/d = 50
+    assert limits["first_zero_object_mm"] == pytest.approx(
+        50 / limits["first_zero_cycles_per_mm"], abs=1e-3
+    )
+    limits = near[METHOD_A].metrics  # on the plane of the larger distance
+    assert limits["cut_off_object_mm"] == pytest.approx(
+        250 / 6.5 / limits["cut_off_cycles_per_mm"], abs=1e-3
+    )
+
+
+def test_cut_off_of_method_a_is_the_aperture(near):
+    """βR/π = 22.4 cycles/mm (ERRATA 3.5.1), and no zero at 22.9."""
+    assert near[METHOD_A].metrics["cut_off_cycles_per_mm"] == pytest.approx(22.4, abs=1.0)
+
+
+def test_cut_off_of_method_b_is_its_second_harmonic(distant):
+    """2βR/π = 44.8 cycles/mm, twice that of method A, where the order still has 12 %."""
+    assert distant[METHOD_B].metrics["cut_off_cycles_per_mm"] >= 42
+    assert distant[METHOD_B].metrics["cut_off_cycles_per_mm"] == pytest.approx(44.8, abs=1.0)
+
+
+def test_near_object_lowers_the_cut_off_by_the_magnification(near):
+    """2βR/(πM²) for the part of the shadow on the sensor: 42.6 at the larger β."""
+    limit = 2 * 25 / (1 + 6.5 / 250) ** 2 * 5.632 / 2 / math.pi
+    assert near[METHOD_B].metrics["cut_off_cycles_per_mm"] == pytest.approx(limit, abs=1.0)
+
+
+def test_edge_tail_of_method_a_for_a_distant_object(distant):
+    """Beyond βR/π the sharp edge of the aperture leaves a tail, and 5 % is inside it.
+
+    The end of a chirp falls to half at u_c = βR/π and then as 1/(√2 π s), where s is the Fresnel
+    parameter (u/u_c − 1)·R·√(2β/π): 5 % of it is reached only near 31 cycles/mm. Ten per cent,
+    above the tail of two distances, is passed within a Fresnel width of 22.4.
+    """
+    response = distant[METHOD_A]
+    edge = 25 * 2.816 / math.pi
+    width = edge / (2.816 * math.sqrt(2 * 25 / math.pi))  # Δu of s = 1
+    assert cut_off(response.frequency, response.magnitude, 0.1) == pytest.approx(edge, abs=width)
+    tail = edge * (1 + 1 / (math.sqrt(2) * math.pi * 0.05) / (edge / width))
+    assert edge + width < response.metrics["cut_off_cycles_per_mm"] < tail
+
+
+def fields(beta, distance, x, half_width):
+    """(order 0, +1, −1) one-dimensional fields for a plane wave, by scipy's Fresnel integrals."""
+    b = math.pi / (WAVELENGTH * distance)
+    orders = []
+    for k in (0, 1, -1):
+        a = k * beta + b  # exponent aξ² − 2bxξ + bx² = a(ξ − bx/a)² + (b − b²/a)x²
+        scale = np.sqrt(2 * abs(a) / math.pi)
+        edges = [scale * (end - b * x / a) for end in (-half_width, half_width)]
+        (s0, c0), (s1, c1) = (scipy.special.fresnel(e) for e in edges)
+        integral = ((c1 - c0) + 1j * math.copysign(1, a) * (s1 - s0)) / scale
+        turned = integral * np.exp(1j * (b - b**2 / a) * x**2)
+        orders.append(turned / np.sqrt(1j * WAVELENGTH * distance))
+    return orders
+
+
+def independent_response(beta, distance, phases, weights, *, shape, pitch):
+    """Σ_p weight·OTF(u, 0) straight from |U|², with nothing of the package."""
+    rows, columns = ((np.arange(n) - (n - 1) / 2) * pitch for n in shape)
+    across, down = (fields(beta, distance, axis, 2.816) for axis in (columns, rows))
+    total = 0
+    for phase, weight in zip(phases, weights, strict=True):
+        shares = (0.5, 0.25 * np.exp(1j * phase), 0.25 * np.exp(-1j * phase))
+        field = sum(
+            share * y[:, None] * x for share, y, x in zip(shares, down, across, strict=True)
+        )
+        total = total + weight * np.sum(np.abs(field) ** 2, axis=0)
+    u = np.arange(shape[1] // 2) / (shape[1] * pitch)
+    return (np.exp(-2j * np.pi * np.outer(u, columns)) @ total) * pitch**2
+
+
+def test_responses_against_an_independent_evaluation():
+    """Both kinds of synthesis, on a sensor that is not square and has no pixel average."""
+    shape, pitch = (600, 1024), 5.5e-3
+    changes = {"sensor.shape": f"[{shape[0]}, {shape[1]}]", "pixel_integration": "false"}
+    # At 1e9 km the wave is plane.
+    method_a, method_b = responses(1e15, (METHOD_A, METHOD_B), **changes)
+    quarter = math.pi / 2
+    powers = []
+    for distance in (5.0, 6.5):
+        phases = [0, quarter, 2 * quarter, 3 * quarter]
+        scanned = [
+            independent_response(25.0, distance, phases, weights, shape=shape, pitch=pitch)
+            for weights in ((1, 0, -1, 0), (0, -1, 0, 1))
+        ]
+        power = sum(np.abs(channel) ** 2 for channel in scanned)
+        u = method_a.frequency
+        powers.append(np.interp(u * 6.5 / distance, u, power, right=0.0))
+    # A rotation of the two channels, or a common factor, would not matter to either limit.
+    assert relative_l2(method_a.magnitude, _scaled(powers, method_a.magnitude)) < 1e-7
+    powers = [
+        np.abs(independent_response(beta, 6.5, (0, 3 * quarter), (1, -1), shape=shape, pitch=pitch))
+        ** 2
+        for beta in (25.0, 21.0)
+    ]
+    assert relative_l2(method_b.magnitude, _scaled(powers, method_b.magnitude)) < 1e-7
+
+
+def _scaled(powers, like):
+    """The root of the mean power, with the one free factor of a synthesis matrix fitted."""
+    magnitude = np.sqrt(np.mean(powers, axis=0))
+    return magnitude * (magnitude @ like) / (magnitude @ magnitude)
+
+
+def test_rows_belong_to_the_response():
+    """v = 0 sums over the rows: a strip of 64 would give another first zero."""
+    (whole,) = responses(1e6, (CONVENTIONAL_5,))
+    (strip,) = responses(1e6, (CONVENTIONAL_5,), **{"sensor.shape": "[64, 1024]"})
+    key = "first_zero_cycles_per_mm"
+    assert abs(whole.metrics[key] - strip.metrics[key]) > 0.2
+
+
+def test_both_cut_offs_of_an_object_at_350_mm():
+    """Far enough for the sensor to pass most of the magnified shadow, near enough for it to cut the
+    tail of the aperture's edge: method A ends at βR/π and method B above 42 in one set-up.
+    """
+    method_a, method_b = responses(350, (METHOD_A, METHOD_B))
+    print(f"object at 350 mm: {method_a.metrics}, {method_b.metrics}")
+    assert method_a.metrics["cut_off_cycles_per_mm"] == pytest.approx(22.4, abs=1.0)
+    assert method_b.metrics["cut_off_cycles_per_mm"] >= 42

@@ -1,0 +1,275 @@
+"""What holds for every operator: its transpose, its norm, batches, derivatives, compilation."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from imaging.operators.dense import IN, NAMES, OUT, dense, dense_of, flat, numbers, operators, white
+
+from helpers import count_traces, finite_difference
+from thincam_jax.imaging.operators import AbstractOperator, Matrix, Stacked, adjoint_error
+from thincam_jax.imaging.operators.base import is_shape
+
+KINDS = pytest.mark.parametrize("name", NAMES)
+
+
+class Wrong(AbstractOperator):
+    """A matrix with a mistake in its adjoint."""
+
+    matrix: Matrix
+    mistake: str = eqx.field(static=True)
+
+    @property
+    def in_shape(self):
+        return self.matrix.in_shape
+
+    @property
+    def out_shape(self):
+        return self.matrix.out_shape
+
+    def __call__(self, image):
+        return self.matrix(image)
+
+    def adjoint(self, capture):
+        right = self.matrix.adjoint(capture)
+        wrong = {
+            "sign": -right,
+            "factor": 1.1 * right,
+            "shifted": jnp.roll(right, 1, axis=-1),
+            "turned": right[..., ::-1, ::-1],
+            "zero": jnp.zeros_like(right),
+            "nan": jnp.nan * right,
+            "transposed": right.swapaxes(-1, -2),
+        }
+        return wrong[self.mistake]
+
+
+class Mislabelled(Wrong):
+    """One whose captures have another shape than it says."""
+
+    @property
+    def out_shape(self):
+        return self.matrix.out_shape[::-1]
+
+
+def a_matrix(seed=0, rows=10):
+    return Matrix(numbers((rows, 12), seed), IN, (rows // 2, 2))
+
+
+@eqx.filter_jit
+def all_ways(operator, images, captures):
+    """Both maps of a batch, and both mapped over it."""
+    seen, back = operator(images), operator.adjoint(captures)
+    each = jax.vmap(operator)(images), jax.vmap(operator.adjoint)(captures)
+    return seen, back, each
+
+
+@KINDS
+def test_shapes_batches_and_vmap(name):
+    """A batch is what its members are one by one, and what the matrix makes of them."""
+    operator, matrix = operators()[name], dense_of(name)
+    image, capture = white(operator, (2, 3))
+    seen, back, each = all_ways(operator, image, capture)
+    shapes = jax.tree.leaves(operator.out_shape, is_leaf=is_shape)
+    assert [leaf.shape[2:] for leaf in jax.tree.leaves(seen)] == shapes
+    assert back.shape == (2, 3, *operator.in_shape)
+    expected = flat(image, 2) @ matrix.T, flat(capture, 2) @ matrix
+    for forward, backward in ((seen, back), each):
+        np.testing.assert_allclose(flat(forward, 2), expected[0], atol=1e-13)
+        np.testing.assert_allclose(flat(backward, 2), expected[1], atol=1e-13)
+
+
+@KINDS
+@pytest.mark.parametrize(("dtype", "limit"), [(jnp.float64, 1e-14), (jnp.float32, 3e-6)])
+def test_adjoint_error_is_rounding(name, dtype, limit, key):
+    operator = operators(dtype)[name]
+    error = adjoint_error(operator, key)
+    assert error.dtype == dtype
+    assert error < limit
+
+
+@pytest.mark.parametrize(
+    "mistake", ["sign", "factor", "shifted", "turned", "zero", "nan", "transposed"]
+)
+def test_adjoint_error_shows_a_mistake(mistake, key):
+    operator = Wrong(a_matrix(), mistake)
+    if mistake == "transposed":
+        with pytest.raises(ValueError, match=r"adjoint returns shapes \[\(4, 3\)\].*\(3, 4\)"):
+            adjoint_error(operator, key)
+    else:
+        assert not adjoint_error(operator, key) < 0.01
+
+
+def test_adjoint_error_compares_the_shapes_with_those_announced(key):
+    with pytest.raises(ValueError, match=r"operator returns shapes \[\(5, 2\)\].*\[\(2, 5\)\]"):
+        adjoint_error(Mislabelled(a_matrix(), "factor"), key)
+
+
+def test_adjoint_error_of_an_operator_that_is_zero(key):
+    assert adjoint_error(Matrix(np.zeros((10, 12)), IN, OUT), key) == 0
+
+
+@KINDS
+def test_norm_is_the_largest_singular_value(name):
+    """The power iteration comes from below."""
+    operator = operators()[name]
+    largest = np.linalg.svd(dense_of(name), compute_uv=False)[0]
+    value = operator.norm()
+    assert 0.95 * largest < value < largest * (1 + 1e-12)
+
+
+def test_norm_to_all_digits_where_one_value_stands_alone():
+    """As a camera's does: light is positive."""
+    matrix = np.abs(numbers((10, 12)))
+    largest = np.linalg.svd(matrix, compute_uv=False)[0]
+    np.testing.assert_allclose(Matrix(matrix, IN, OUT).norm(), largest, rtol=1e-13)
+
+
+@pytest.mark.parametrize("name", ["planes", "stacked", "sparse", "separable"])
+def test_norm_in_single_precision(name):
+    """Also where float64 is the default: the operator's own precision counts."""
+    value = operators(jnp.float32)[name].norm(iterations=300)
+    assert value.dtype == jnp.float32
+    largest = np.linalg.svd(dense_of(name), compute_uv=False)[0]
+    np.testing.assert_allclose(value, largest, rtol=3e-5)
+
+
+def test_norm_of_zero_and_its_slope():
+    operator = Matrix(np.zeros((10, 12)), IN, OUT)
+    assert operator.norm() == 0
+    slope = eqx.filter_grad(lambda o: o.norm())(operator)
+    np.testing.assert_array_equal(slope.matrix, 0)
+
+
+def test_slope_of_the_norm():
+    """d‖A‖ = uᵀ dA v."""
+    matrix = np.abs(numbers((10, 12)))
+    slope = jax.grad(lambda m: Matrix(m, IN, OUT).norm(iterations=100))(jnp.asarray(matrix))
+    u, _, v = np.linalg.svd(matrix)
+    np.testing.assert_allclose(slope, np.outer(u[:, 0], v[0]), atol=1e-10)
+
+
+def test_norm_passes_nan_on():
+    matrix = Matrix(np.ones((10, 12)), IN, OUT)
+    assert jnp.isnan(Matrix.norm(eqx.tree_at(lambda m: m.matrix, matrix, matrix.matrix * np.nan)))
+
+
+def test_norm_needs_an_iteration():
+    with pytest.raises(ValueError, match="iterations = 0 .* at least 1"):
+        a_matrix().norm(iterations=0)
+
+
+class Counting(AbstractOperator):
+    """A matrix that counts how often its map is traced."""
+
+    matrix: Matrix
+    traces = 0
+
+    @property
+    def in_shape(self):
+        return self.matrix.in_shape
+
+    @property
+    def out_shape(self):
+        return self.matrix.out_shape
+
+    def __call__(self, image):
+        Counting.traces += 1
+        return self.matrix(image)
+
+    def adjoint(self, capture):
+        return self.matrix.adjoint(capture)
+
+
+def test_norm_is_compiled_once():
+    """Called from outside of jit, for operators of other numbers too."""
+    values = [Counting(a_matrix(0)).norm()]
+    traces = Counting.traces
+    values.append(Counting(a_matrix(1)).norm())
+    assert Counting.traces == traces
+    assert abs(values[0] - values[1]) > 1e-3
+
+
+@pytest.mark.parametrize("name", ["planes", "sparse", "masked stacked", "scaled"])
+def test_compiled_once(name):
+    """For other numbers in the operator, and other images."""
+    counted = count_traces(lambda o, image: o.adjoint(o(image)))
+    compiled = eqx.filter_jit(counted)
+    for factor in (1.0, 3.0):
+        operator = jax.tree.map(
+            lambda a, f=factor: a * f if eqx.is_inexact_array(a) else a, operators()[name]
+        )
+        image, _ = white(operator, seed=int(factor))
+        matrix = dense(operator)
+        expected = matrix.T @ (matrix @ flat(image))
+        np.testing.assert_allclose(flat(compiled(operator, image)), expected, rtol=1e-9)
+    assert counted.traces == 1
+
+
+@KINDS
+def test_gradient_in_the_numbers_of_the_operator(name):
+    """Both maps take the same numbers: ⟨A f, g⟩ and ⟨f, Aᵀ g⟩ have one gradient."""
+    operator = operators()[name]
+    image, capture = white(operator)
+    free, rest = eqx.partition(operator, eqx.is_inexact_array)
+    direction = jax.tree.map(lambda a: jnp.asarray(numbers(a.shape, 11), a.dtype), free)
+
+    def forward(free):
+        seen = eqx.combine(free, rest)(image)
+        return sum(jax.tree.leaves(jax.tree.map(jnp.vdot, seen, capture)))
+
+    def backward(free):
+        return jnp.vdot(image, eqx.combine(free, rest).adjoint(capture))
+
+    slopes = jax.jit(jax.grad(forward))(free), jax.jit(jax.grad(backward))(free)
+    for a, b in zip(*map(jax.tree.leaves, slopes), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-12)
+    expected = finite_difference(jax.jit(forward), free, direction, 1e-2)
+    terms = jax.tree.map(lambda s, d: jnp.sum(s * d).real, slopes[0], direction)
+    value = sum(jax.tree.leaves(terms))
+    np.testing.assert_allclose(value, expected, rtol=1e-8, atol=1e-9)
+
+
+@KINDS
+def test_gradient_in_the_image(name):
+    """∇ ½‖A f − g‖² = Aᵀ(A f − g)."""
+    operator, matrix = operators()[name], dense_of(name)
+    image, capture = white(operator)
+    expected = matrix.T @ (matrix @ flat(image) - flat(capture))
+    np.testing.assert_allclose(
+        flat(slope_of_misfit(operator, image, capture)), expected, atol=1e-12
+    )
+
+
+@eqx.filter_jit
+def slope_of_misfit(operator, image, capture):
+    return jax.grad(misfit, 1)(operator, image, capture)
+
+
+def misfit(operator, image, capture):
+    parts = jax.tree.map(lambda a, b: jnp.sum((a - b) ** 2) / 2, operator(image), capture)
+    return sum(jax.tree.leaves(parts))
+
+
+@KINDS
+def test_an_image_or_capture_of_another_shape(name):
+    operator = operators()[name]
+    image, capture = white(operator)
+    for wrong in (image[..., :-1], image[..., :1], jnp.swapaxes(image, -1, -2)):
+        with pytest.raises(ValueError, match=r"has shape .*the operator takes"):
+            operator(wrong)
+    for wrong in (
+        jax.tree.map(lambda c: c[..., :1], capture),
+        jax.tree.map(lambda c: jnp.swapaxes(c, -1, -2), capture),
+    ):
+        with pytest.raises(ValueError, match=r"has shape .*the operator takes") as caught:
+            operator.adjoint(wrong)
+        assert "\n" not in str(caught.value)
+
+
+def test_a_stack_of_one_has_the_norm_of_that_one():
+    separable = operators()["separable"]
+    assert Stacked([separable]).norm() == separable.norm()
+    with pytest.raises(ValueError, match="at least 1"):
+        Stacked([a_matrix()]).norm(iterations=0)

@@ -1,0 +1,174 @@
+"""Crop-convolution against direct sums, its adjoint, its gradients; nothing wraps round."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.signal
+
+from helpers import count_traces, finite_difference
+from thincam_jax._core.grids import Grid
+from thincam_jax.imaging.operators import CropConvolution, kernel_grid, kernel_shape
+
+PITCH = 0.05
+# sensor and field with equal, odd-even and even-odd sizes, and the field smaller and larger
+SHAPES = [
+    ((5, 8), (5, 8)),
+    ((6, 9), (3, 4)),
+    ((4, 7), (9, 6)),
+    ((1, 6), (4, 3)),
+    ((1, 1), (2, 5)),
+    ((3, 2), (1, 1)),
+]
+
+
+def bump(y, x):
+    """A function of the plane without symmetry."""
+    return np.exp(-((y - 0.03) ** 2) / 0.02 - (x + 0.07) ** 2 / 0.05) * (1 + 2 * x - 3 * y)
+
+
+def numbers(shape, seed=0):
+    return np.random.default_rng(seed).normal(size=shape)
+
+
+def operator(kernel, sensor, field, pitch=PITCH):
+    return CropConvolution(jnp.asarray(kernel), pitch, sensor, field)
+
+
+@pytest.mark.parametrize(("sensor", "field"), SHAPES)
+def test_it_is_the_integral_over_the_field(sensor, field):
+    """g(r) = Δ² Σ h(r − r′) f(r′), summed with the coordinates of both grids, one by one."""
+    f = numbers(field)
+    own, other = Grid(sensor, PITCH), Grid(field, PITCH)
+    ys, xs, yf, xf = (np.asarray(a) for a in (own.y, own.x, other.y, other.x))
+    dy = ys[:, None, None, None] - yf[None, None, :, None]
+    dx = xs[None, :, None, None] - xf[None, None, None, :]
+    expected = PITCH**2 * np.sum(bump(dy, dx) * f, axis=(2, 3))
+
+    grid = kernel_grid(own, field)
+    h = bump(np.asarray(grid.y)[:, None], np.asarray(grid.x))
+    value = operator(h, sensor, field)(jnp.asarray(f))
+    np.testing.assert_allclose(value, expected, rtol=1e-10, atol=1e-14)
+
+
+@pytest.mark.parametrize(("sensor", "field"), SHAPES)
+def test_it_is_a_valid_convolution(sensor, field):
+    kernel, f = numbers(kernel_shape(sensor, field)), numbers(field, 1)
+    expected = PITCH**2 * scipy.signal.convolve(kernel, f, mode="valid", method="direct")
+    np.testing.assert_allclose(
+        operator(kernel, sensor, field)(jnp.asarray(f)), expected, atol=1e-15
+    )
+
+
+@pytest.mark.parametrize(("sensor", "field"), SHAPES)
+def test_adjoint(sensor, field):
+    """⟨A f, g⟩ = ⟨f, A* g⟩."""
+    convolution = operator(numbers(kernel_shape(sensor, field)), sensor, field)
+    f, g = jnp.asarray(numbers(field, 1)), jnp.asarray(numbers(sensor, 2))
+    forward, back = jnp.vdot(convolution(f), g), jnp.vdot(f, convolution.adjoint(g))
+    np.testing.assert_allclose(forward, back, rtol=1e-12, atol=1e-15)
+    # and it is the transpose that JAX derives
+    transposed = jax.linear_transpose(convolution, f)(g)[0]
+    np.testing.assert_allclose(convolution.adjoint(g), transposed, atol=1e-15)
+
+
+@pytest.mark.parametrize("corner", [(0, 0), (0, -1), (-1, 0), (-1, -1)])
+def test_nothing_wraps_round(corner):
+    """A bright pixel in the field's corner, on a sensor as large, with the smallest window."""
+    sensor = field = (6, 9)
+    kernel = np.zeros(kernel_shape(sensor, field))
+    kernel[4:7, 7:10] = [[1.0, 2.0, 3.0], [4.0, 5.0, 6.0], [7.0, 8.0, 9.0]]  # about the centre 5, 8
+    f = np.zeros(field)
+    f[corner] = 1.0
+    expected = np.zeros((8, 11))
+    row, column = np.arange(6)[corner[0]], np.arange(9)[corner[1]]
+    expected[row : row + 3, column : column + 3] = kernel[4:7, 7:10]
+    value = operator(kernel, sensor, field, pitch=1.0)(jnp.asarray(f))
+    np.testing.assert_allclose(value, expected[1:-1, 1:-1], atol=1e-14)
+
+
+def test_energy():
+    """On a sensor that holds it all, the light is the field's total times the PSF's integral."""
+    sensor, field = (30, 37), (6, 9)
+    grid = kernel_grid(Grid(sensor, PITCH), field)
+    y, x = np.asarray(grid.y)[:, None], np.asarray(grid.x)
+    h = np.where((abs(y) < 0.5) & (abs(x) < 0.6), 1 + y + x**2, 0.0)
+    f = numbers(field) ** 2
+    g = operator(h, sensor, field)(jnp.asarray(f))
+    np.testing.assert_allclose(g.sum() * PITCH**2, h.sum() * PITCH**2 * f.sum() * PITCH**2)
+
+
+def test_batches_go_one_by_one():
+    sensor, field = (6, 9), (3, 4)
+    convolution = operator(numbers(kernel_shape(sensor, field)), sensor, field)
+    fields, captures = (
+        jnp.asarray(numbers((2, 3, *field))),
+        jnp.asarray(numbers((2, 3, *sensor), 1)),
+    )
+    for function, batch in ((convolution, fields), (convolution.adjoint, captures)):
+        whole = function(batch)
+        assert whole.shape[:2] == (2, 3)
+        for i, j in ((0, 2), (1, 0)):
+            np.testing.assert_allclose(whole[i, j], function(batch[i, j]), atol=1e-15)
+        np.testing.assert_allclose(jax.vmap(jax.vmap(function))(batch), whole, atol=1e-15)
+
+
+def test_kernel_grid_covers_every_difference():
+    grid = kernel_grid(Grid((4, 7), PITCH), (9, 6))
+    assert grid.shape == (12, 12)
+    # from the first sensor pixel to the last field sample
+    np.testing.assert_allclose(grid.y[0], -(3 / 2 + 8 / 2) * PITCH)
+    np.testing.assert_allclose(grid.x[-1], (6 / 2 + 5 / 2) * PITCH)
+
+
+def test_compiled_once_for_all_kernels():
+    sensor, field = (6, 9), (3, 4)
+
+    def blur(kernel, pitch, f):
+        return CropConvolution(kernel, pitch, sensor, field)(f)
+
+    counted = count_traces(blur)
+    compiled = jax.jit(counted)
+    for seed, pitch in ((0, 0.05), (1, 0.06)):
+        kernel = jnp.asarray(numbers(kernel_shape(sensor, field), seed))
+        f = jnp.asarray(numbers(field, seed))
+        expected = pitch**2 * scipy.signal.convolve(kernel, f, mode="valid")
+        np.testing.assert_allclose(compiled(kernel, jnp.asarray(pitch), f), expected, atol=1e-15)
+    assert counted.traces == 1
+
+
+def test_gradients():
+    """Linear in the kernel and in the field, quadratic in the pitch: any step will do."""
+    sensor, field = (4, 7), (9, 6)
+    weights = jnp.asarray(numbers(sensor, 3))
+
+    def loss(kernel, pitch, f):
+        return jnp.sum(weights * CropConvolution(kernel, pitch, sensor, field)(f))
+
+    at = (
+        jnp.asarray(numbers(kernel_shape(sensor, field))),
+        jnp.asarray(PITCH),
+        jnp.asarray(numbers(field, 1)),
+    )
+    slopes = jax.grad(loss, (0, 1, 2))(*at)
+    for argument, (point, slope) in enumerate(zip(at, slopes, strict=True)):
+        direction = [jnp.zeros_like(a) for a in at]
+        direction[argument] = jnp.asarray(numbers(point.shape, 4))
+        expected = finite_difference(lambda a: loss(*a), at, tuple(direction), 1e-2)
+        np.testing.assert_allclose(jnp.vdot(slope, direction[argument]), expected, rtol=1e-9)
+
+
+def test_a_kernel_that_does_not_cover_the_differences():
+    with pytest.raises(ValueError, match=r"kernel has shape \(6, 9\).*\(8, 12\).*kernel_grid"):
+        operator(np.ones((6, 9)), (6, 9), (3, 4))
+
+
+@pytest.mark.parametrize("shape", [(6, 9), (4, 3), (3, 5), (2, 2)])
+def test_a_field_or_capture_of_another_shape(shape):
+    """Larger would be cut and smaller shifted, in silence."""
+    convolution = operator(np.ones((8, 12)), (6, 9), (3, 4))
+    with pytest.raises(ValueError, match=r"field has shape .*= \(3, 4\)"):
+        convolution(jnp.ones(shape))
+    if shape != (6, 9):
+        with pytest.raises(ValueError, match=r"capture has shape .*= \(6, 9\)"):
+            convolution.adjoint(jnp.ones(shape))

@@ -1,0 +1,181 @@
+"""Crop-convolution with measured PSFs of any size, with planes, channels and larger windows."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.fft
+import scipy.signal
+from imaging.operators.dense import numbers
+
+from thincam_jax.imaging.operators import CropConvolution, adjoint_error, kernel_shape, window_shape
+
+PITCH = 0.05
+
+
+def operator(kernel, sensor, field):
+    return CropConvolution(jnp.asarray(kernel), PITCH, sensor, field)
+
+
+def seen_directly(kernel, field, sensor):
+    """The middle of the whole convolution, with nothing beyond it; no size but parity matters."""
+    whole = PITCH**2 * scipy.signal.convolve(field, kernel, mode="full", method="direct")
+    for axis, size in enumerate(sensor):
+        surplus = whole.shape[axis] - size
+        assert surplus % 2 == 0
+        margin = [(0, 0), (0, 0)]
+        margin[axis] = (max(0, -surplus // 2),) * 2
+        start = max(0, surplus // 2)
+        whole = np.pad(whole, margin).take(np.arange(start, start + size), axis=axis)
+    return whole
+
+
+# sensor, PSF, field: small measured PSFs, and ones larger than all differences
+KERNELS = [
+    ((5, 8), (5, 8), (9, 15)),  # the field is all that the PSF brings onto the sensor
+    ((5, 8), (5, 8), (7, 11)),
+    ((5, 8), (4, 8), (6, 9)),
+    ((6, 9), (1, 1), (6, 9)),
+    ((6, 9), (3, 2), (4, 4)),
+    ((6, 7), (2, 5), (11, 3)),
+    ((4, 7), (12, 4), (9, 6)),
+    ((2, 3), (9, 10), (4, 2)),
+    ((1, 6), (8, 9), (4, 2)),
+    ((1, 1), (4, 1), (2, 5)),
+]
+
+
+@pytest.mark.parametrize(("sensor", "kernel", "field"), KERNELS)
+def test_a_kernel_of_another_size(sensor, kernel, field, key):
+    """Smaller is zero outside, larger is cut: the sum is that of all samples it has."""
+    h, f = numbers(kernel), numbers(field, 1)
+    expected = seen_directly(h, f, sensor)
+    convolution = operator(h, sensor, field)
+    np.testing.assert_allclose(convolution(jnp.asarray(f)), expected, atol=1e-15)
+    assert adjoint_error(convolution, key) < 1e-13
+    larger = tuple(n + 3 for n in convolution.window)
+    same = CropConvolution(jnp.asarray(h), PITCH, sensor, field, window=larger)
+    assert same.window == larger
+    np.testing.assert_allclose(same(jnp.asarray(f)), expected, atol=1e-15)
+
+
+def test_a_field_that_fills_the_sensor_needs_no_margin():
+    """The window of a small PSF is smaller than all differences of sensor and field."""
+    sensor, kernel, field = KERNELS[0]
+    h, f = numbers(kernel), numbers(field, 1)
+    assert window_shape(sensor, field, kernel) == field
+    assert all(np.less(field, kernel_shape(sensor, field)))
+    expected = PITCH**2 * scipy.signal.convolve(f, h, mode="valid", method="direct")
+    convolution = operator(h, sensor, field)
+    assert convolution.window == field
+    np.testing.assert_allclose(convolution(jnp.asarray(f)), expected, atol=1e-15)
+
+
+@pytest.mark.parametrize("sensor", range(1, 7))
+@pytest.mark.parametrize("field", range(1, 7))
+def test_the_window_is_the_smallest(sensor, field):
+    """In one sample less the far end of the field would come round onto the sensor."""
+    for kernel in range(1 + (sensor + field) % 2, sensor + field, 2):
+        ends = np.arange(sensor + field - 1) - (field - 1)  # sample differences, r − r′
+        centre = (sensor - field) / 2
+        inside = abs(ends - centre) <= (kernel - 1) / 2
+
+        def fits(window, ends=ends, inside=inside):
+            aliased = np.isin(ends[~inside] % window, ends[inside] % window).any()
+            return not aliased and len(set(ends[inside] % window)) == inside.sum()
+
+        needed = max(sensor, field)
+        while not fits(needed):
+            needed += 1
+        assert inside.sum() == kernel
+        smallest = scipy.fft.next_fast_len(needed, real=True)
+        assert window_shape((sensor, 1), (field, 1), (kernel, 1))[0] == smallest
+
+
+def test_a_window_in_which_light_would_wrap():
+    sensor, kernel, field = KERNELS[0]
+    for window in ((8, 15), (9, 14)):
+        with pytest.raises(ValueError, match=r"fewer than \(9, 15\) samples light wraps round"):
+            CropConvolution(jnp.ones(kernel), PITCH, sensor, field, window=window)
+
+
+@pytest.mark.parametrize("kernel", [(4, 8), (5, 7), (14, 22), (13, 23)])
+def test_a_kernel_without_a_centre_for_sensor_and_field(kernel):
+    with pytest.raises(ValueError, match=r"\(13, 22\) samples .* even number") as caught:
+        operator(np.ones(kernel), (5, 8), (9, 15))
+    assert "\n" not in str(caught.value)
+
+
+# leading axes of kernel and field, how many are summed, those of the capture
+PLANES = [
+    ((3,), (3,), 1, ()),
+    ((2, 3), (2, 3), 2, ()),  # depth and wavelength
+    ((2,), (2,), 0, (2,)),  # colours
+    ((2, 3), (2, 3), 1, (2,)),  # colours, each over depths
+    ((1, 3), (4, 3), 1, (4,)),  # one PSF for all colours
+]
+
+
+@pytest.mark.parametrize(("planes", "images", "summed", "seen"), PLANES)
+def test_planes_add_up_and_channels_stay(planes, images, summed, seen, key):
+    sensor, kernel, field = (5, 8), (4, 6), (6, 11)
+    h, f = numbers((*planes, *kernel)), numbers((2, *images, *field), 1)
+    convolution = CropConvolution(jnp.asarray(h), PITCH, sensor, field, summed=summed)
+    h = np.broadcast_to(h, (*images, *kernel))
+    expected = np.zeros((2, *images, *sensor))
+    for index in np.ndindex(2, *images):
+        expected[index] = seen_directly(h[index[1:]], f[index], sensor)
+    expected = expected.sum(axis=tuple(range(-2 - summed, -2)))
+    value = convolution(jnp.asarray(f))
+    assert value.shape == (2, *seen, *sensor)
+    np.testing.assert_allclose(value, expected, atol=1e-15)
+    assert adjoint_error(convolution, key) < 1e-13
+    # a batch goes back image by image, each plane with its own PSF
+    g = jnp.asarray(numbers((2, *seen, *sensor), 2))
+    back = convolution.adjoint(g)
+    assert back.shape == f.shape
+    np.testing.assert_allclose(jnp.vdot(back, f), jnp.vdot(g, expected), rtol=1e-12)
+
+
+@pytest.mark.parametrize(("planes", "images", "summed", "seen"), PLANES)
+def test_combine_and_spread_are_adjoint(planes, images, summed, seen):
+    """⟨combine F, G⟩ = ⟨F, spread G⟩ with the complex inner product."""
+    convolution = CropConvolution(
+        jnp.asarray(numbers((*planes, 4, 6))), PITCH, (5, 8), (6, 11), summed=summed
+    )
+    half = convolution.spectrum.shape[-2:]
+    F = numbers((2, *images, *half), 1) + 1j * numbers((2, *images, *half), 2)
+    G = numbers((2, *seen, *half), 3) + 1j * numbers((2, *seen, *half), 4)
+    forward = np.vdot(convolution.combine(jnp.asarray(F)), G)
+    np.testing.assert_allclose(forward, np.vdot(F, convolution.spread(jnp.asarray(G))), rtol=1e-12)
+    assert abs(forward.imag) > 1e-3  # the phases take part
+
+
+def test_planes_or_channels_that_are_missing():
+    """One image in place of three would be taken for all of them."""
+    kernel = jnp.ones((2, 3, 4, 6))
+    convolution = CropConvolution(kernel, PITCH, (5, 8), (6, 11), summed=1)
+    for wrong in ((6, 11), (3, 6, 11), (2, 1, 6, 11), (1, 3, 6, 11), (2, 4, 6, 11), (3, 3, 6, 11)):
+        with pytest.raises(ValueError, match=r"plane, plane, y, x\) = \(2, 3, 6, 11\)"):
+            convolution(jnp.ones(wrong))
+    for wrong in ((5, 8), (1, 5, 8), (3, 5, 8)):
+        with pytest.raises(ValueError, match=r"\(…, plane, y, x\) = \(2, 5, 8\)"):
+            convolution.adjoint(jnp.ones(wrong))
+
+
+def test_bad_sizes():
+    kernel = jnp.ones((3, 4, 6))
+    for summed in (-1, 2):
+        with pytest.raises(ValueError, match=f"summed is {summed}, .* has 1 axes .* give 0 to 1"):
+            CropConvolution(kernel, PITCH, (5, 8), (6, 11), summed=summed)
+    with pytest.raises(ValueError, match="sensor_shape = .* at least 1"):
+        CropConvolution(kernel, PITCH, (0, 8), (6, 11))
+    with pytest.raises(ValueError, match="field_shape = .* is not a pair"):
+        CropConvolution(kernel, PITCH, (5, 8), (6, 11, 3))
+
+
+def test_single_precision(key):
+    kernel = jnp.asarray(numbers((3, 4, 6)), jnp.float32)
+    convolution = CropConvolution(kernel, PITCH, (5, 8), (6, 11), summed=1)
+    field = jnp.asarray(numbers((3, 6, 11), 1), jnp.float32)
+    assert convolution(field).dtype == jnp.float32
+    assert adjoint_error(convolution, key) < 3e-6

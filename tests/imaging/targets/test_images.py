@@ -1,0 +1,147 @@
+"""Images from files of every depth, samples without a download, and resampling."""
+
+import gc
+
+import numpy as np
+import pytest
+import skimage.data
+import skimage.io
+import tifffile
+
+from thincam_jax.imaging.targets import load_image, resize, sample_image, sample_images
+
+RAMP = np.linspace(0.0, 1.0, 24 * 31).reshape(24, 31)
+
+
+def write(path, pixels):
+    skimage.io.imsave(path, pixels, check_contrast=False)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("name", "pixels", "step"),
+    [
+        ("a.png", np.round(RAMP * 255).astype(np.uint8), 1 / 255),
+        ("a.png", np.round(RAMP * 65535).astype(np.uint16), 1 / 65535),
+        ("a.tif", np.round(RAMP * 65535).astype(np.uint16), 1 / 65535),
+        ("a.tif", RAMP.astype(np.float32), 1e-7),
+    ],
+)
+def test_the_full_range_of_every_depth_is_0_to_1(tmp_path, name, pixels, step):
+    image = load_image(write(tmp_path / name, pixels))
+    assert image.dtype == np.float64
+    np.testing.assert_allclose(image, RAMP, rtol=0, atol=0.51 * step)
+    assert (image.min(), image.max()) == (0.0, 1.0)
+
+
+def test_alpha_is_dropped_and_channels_keep_their_order(tmp_path):
+    pixels = np.zeros((9, 14, 4), np.uint8)
+    pixels[2, 3], pixels[4, 5, :3], pixels[8, 13, 2] = (255, 51, 0, 7), 102, 255
+    image = load_image(str(write(tmp_path / "a.png", pixels)))
+    assert image.shape == (9, 14, 3)
+    assert image[2, 3] == pytest.approx([1.0, 0.2, 0.0])
+    assert image[4, 5] == pytest.approx([0.4, 0.4, 0.4])
+    assert image[8, 13].tolist() == [0.0, 0.0, 1.0]
+    grey = write(tmp_path / "b.png", pixels[..., :2])
+    np.testing.assert_allclose(load_image(grey), pixels[..., 0] / 255)
+
+
+def test_no_file_and_folder(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"none\.png' does not exist"):
+        load_image(tmp_path / "none.png")
+    with pytest.raises(ValueError, match="is a folder"):
+        load_image(tmp_path)
+
+
+@pytest.mark.filterwarnings("ignore::ResourceWarning")
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+@pytest.mark.parametrize("damage", ["truncated", "text", "no bytes"])
+def test_damaged_files_give_one_line(tmp_path, damage):
+    path = write(tmp_path / "a.png", np.random.default_rng(0).integers(0, 255, (40, 50), np.uint8))
+    whole = path.read_bytes()
+    path.write_bytes({"truncated": whole[:700], "text": b"hello\n" * 20, "no bytes": b""}[damage])
+    with pytest.raises(ValueError, match=r"a\.png' cannot be read as an image") as caught:
+        load_image(path)
+    assert "\n" not in str(caught.value)
+    del caught
+    gc.collect()  # the decoders leave the file open; close it while that warning is ignored
+
+
+@pytest.mark.filterwarnings("ignore:.*zero-size:UserWarning")
+@pytest.mark.parametrize(
+    ("pixels", "message"),
+    [
+        (np.zeros((0, 8), np.uint16), "empty image"),
+        (np.full((9, 8), 1.5, np.float32), "from 1.5 to 1.5"),
+        (np.full((9, 8), np.nan, np.float32), "nan"),
+        (np.full((9, 8), -3, np.int16), "int16 from -3"),
+        (np.zeros((7, 9, 8), np.uint8), r"shape \(7, 9, 8\)"),
+    ],
+)
+def test_contents_that_are_no_image_in_0_to_1(tmp_path, pixels, message):
+    path = tmp_path / "a.tif"
+    tifffile.imwrite(path, pixels, photometric="minisblack")
+    with pytest.raises(ValueError, match=message):
+        load_image(path)
+
+
+@pytest.mark.parametrize("name", ["astronaut", "chelsea", "coffee", "camera", "rocket", "coins"])
+def test_samples_are_those_of_scikit_image(name):
+    np.testing.assert_array_equal(sample_image(name), getattr(skimage.data, name)() / 255)
+
+
+def test_every_listed_sample_can_be_read():
+    names = sample_images()
+    assert {"astronaut", "camera", "cat", "chelsea", "coffee", "rocket"} <= set(names)
+    assert np.array_equal(sample_image("cat"), sample_image("chelsea"))
+    for name in set(names) - {"retina", "hubble_deep_field"}:  # large
+        image = sample_image(name)
+        assert image.shape[2:] in ((), (3,))
+        assert 0 <= image.min() < image.max() <= 1
+
+
+def test_an_unknown_sample_lists_the_known():
+    with pytest.raises(ValueError, match=r"'lena' is not a sample image; .*astronaut, .*rocket"):
+        sample_image("lena")
+
+
+@pytest.mark.parametrize("shape", [(40, 75), (33, 50), (160, 225), (96, 75)])
+def test_resize_keeps_the_mean_and_the_places(shape):
+    """A blob keeps its centroid as a fraction of the field, along each axis, and its total."""
+    y, x = np.mgrid[:80, :150]
+    blob = 0.2 + 0.7 * np.exp(-(((y - 24) / 9) ** 2) - ((x - 100) / 20) ** 2)
+    small = resize(blob, shape)
+    assert small.shape == shape
+    assert small.mean() == pytest.approx(blob.mean(), rel=2e-3)
+    for image in (blob, small):
+        weight = image - 0.2
+        rows, columns = (np.arange(n) + 0.5 for n in image.shape)
+        assert weight.sum(1) @ rows / weight.sum() / len(rows) == pytest.approx(24.5 / 80, abs=3e-3)
+        along_x = weight.sum(0) @ columns / weight.sum() / len(columns)
+        assert along_x == pytest.approx(100.5 / 150, abs=3e-3)
+
+
+def test_resize_removes_what_the_new_pixels_cannot_hold():
+    """Stripes of 2.2 pixels, shrunk 4 times, would alias; they become grey."""
+    stripes = 0.5 + 0.5 * np.sin(2 * np.pi * np.arange(240) / 2.2)
+    image = np.tile(stripes, (80, 1))
+    small = resize(image, (20, 60))
+    assert np.abs(small[2:-2, 2:-2] - 0.5).max() < 0.02
+
+
+def test_resize_channels_apart_and_within_range():
+    image = np.zeros((12, 17, 3))
+    image[:, 8:, 0], image[6:, :, 1] = 1.0, 0.5
+    large = resize(image, (36, 51))
+    assert (large.min(), large.max()) == (0.0, 1.0)
+    assert np.all(large[..., 2] == 0.0)
+    assert large[..., 1].max() == 0.5
+    assert large[18, :, 0].mean() == pytest.approx(9 / 17, abs=2e-3)
+    assert large[:, 20, 1].mean() == pytest.approx(0.25, abs=2e-3)
+    assert np.array_equal(resize(image, (12, 17)), image)
+
+
+@pytest.mark.parametrize("image", [np.zeros(5), np.zeros((0, 3)), np.full((4, 5), np.nan)])
+def test_resize_errors(image):
+    with pytest.raises(ValueError, match="image"):
+        resize(image, (3, 4))

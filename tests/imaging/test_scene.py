@@ -1,0 +1,163 @@
+"""Image planes: totals, scale, orientation; spectra and scenes, and what they refuse."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from helpers import finite_difference
+from thincam_jax._core.grids import Grid
+from thincam_jax.imaging.scene import ImagePlane, Scene, Spectrum
+from thincam_jax.units import nm
+
+
+def picture(shape, seed=0):
+    """Noise: no symmetry that could hide a flip."""
+    return np.random.default_rng(seed).uniform(0.1, 1.0, shape)
+
+
+def averages_by_running_totals(image, width, grid, magnification):
+    """Cell averages from the image's running total, interpolated linearly at the cells' edges."""
+    rows, columns = image.shape
+    pixel = width * abs(magnification) / columns
+    turned = image[::-1, ::-1] if magnification < 0 else image
+
+    def along(values, count, samples):
+        edges = (np.arange(count + 1) - count / 2) * pixel
+        total = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values, axis=0)])
+        cells = (np.arange(samples + 1) - samples / 2) * float(grid.pitch)
+        return np.stack(
+            [np.diff(np.interp(cells, edges, column)) for column in total.T], axis=-1
+        ) * (pixel / float(grid.pitch))
+
+    down = along(turned, rows, grid.shape[0])
+    return along(down.T, columns, grid.shape[1]).T
+
+
+@pytest.mark.parametrize(("pitch", "magnification"), [(0.031, -1.0), (0.11, 0.37), (0.7, -2.6)])
+def test_totals_are_kept_at_any_ratio_of_the_pitches(pitch, magnification):
+    """Light is neither lost nor made: Σ·pitch² is the sum of the pixels times their area."""
+    image = picture((2, 5, 8))
+    plane = ImagePlane(image, 100.0, 1.6)
+    size = np.array([1.0, 1.6]) * abs(magnification)
+    # just large enough, the two axes with one more and two more cells: odd and even counts
+    rows, columns = np.ceil(size / pitch).astype(int)
+    grid = Grid((rows + 1, columns + 2), pitch)
+    sampled = plane.sample(grid, magnification=magnification)
+    area = (1.6 * magnification / 8) ** 2
+    np.testing.assert_allclose(
+        sampled.sum(axis=(1, 2)) * pitch**2, image.sum(axis=(1, 2)) * area, rtol=1e-12
+    )
+
+
+@pytest.mark.parametrize(
+    ("shape", "magnification"), [((9, 14), -1.3), ((10, 7), -0.4), ((1, 5), 0.9)]
+)
+def test_cells_hold_the_exact_average(shape, magnification):
+    image, grid = picture((6, 9)), Grid(shape, 0.13)
+    sampled = ImagePlane(image, 100.0, 1.8).sample(grid, magnification=magnification)
+    expected = averages_by_running_totals(image, 1.8, grid, magnification)
+    np.testing.assert_allclose(sampled, expected, rtol=1e-12, atol=1e-14)
+
+
+def test_a_pinhole_turns_the_image_by_180_degrees():
+    image = picture((4, 7))
+    plane = ImagePlane(image, 100.0, 0.7)
+    grid = Grid((4, 7), 0.1)
+    np.testing.assert_allclose(plane.sample(grid), image[::-1, ::-1], rtol=1e-12)
+    np.testing.assert_allclose(plane.sample(grid, magnification=1.0), image, rtol=1e-12)
+    halved = plane.sample(Grid((8, 14), 0.1), magnification=-2.0)
+    np.testing.assert_allclose(halved, np.kron(image[::-1, ::-1], np.ones((2, 2))), rtol=1e-12)
+
+
+def test_outside_the_image_it_is_dark():
+    sampled = ImagePlane(np.ones((2, 4)), 100.0, 0.4).sample(Grid((5, 8), 0.1))
+    expected = np.zeros((5, 8))
+    expected[1:4, 2:6] = np.array([0.5, 1.0, 0.5])[:, None]  # 2 rows over 5: half cells
+    np.testing.assert_allclose(sampled, expected, atol=1e-14)
+
+
+def test_height_follows_from_square_pixels():
+    assert ImagePlane(np.ones((3, 30, 40)), 250.0, 180.0).height == pytest.approx(135.0)
+    assert ImagePlane(np.ones((50, 40)), 250.0, 180.0).height == pytest.approx(225.0)
+
+
+def test_the_scale_is_differentiable():
+    """Averages are piecewise quadratic in the scale; the step stays within one piece."""
+    image, weights, grid = picture((5, 8)), picture((6, 7), seed=1), Grid((6, 7), 0.13)
+
+    def loss(width, magnification):
+        sampled = ImagePlane(image, 100.0, width).sample(grid, magnification=magnification)
+        return jnp.sum(weights * sampled)
+
+    at = jnp.asarray(1.13), jnp.asarray(-0.71)
+    both = jax.jit(jax.value_and_grad(loss, (0, 1)))
+    for argument, slope in enumerate(both(*at)[1]):
+        direction = tuple(jnp.asarray(float(i == argument)) for i in (0, 1))
+        expected = finite_difference(lambda x: both(*x)[0], at, direction, 1e-4)
+        np.testing.assert_allclose(slope, expected, rtol=1e-8)
+
+
+def test_whole_numbers_become_radiances():
+    plane = ImagePlane(np.array([[0, 255], [3, 4]], dtype=np.uint8), 10.0, 1.0)
+    assert jnp.issubdtype(plane.image.dtype, jnp.floating) and plane.image[0, 1] == 255.0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ((np.ones(4), 10.0, 1.0), r"image has shape \(4,\).*\(…, y, x\)"),
+        ((np.ones((0, 4)), 10.0, 1.0), "non-empty"),
+        ((np.ones((2, 3)), 0.0, 1.0), "distance = 0.0 mm is not positive"),
+        ((np.ones((2, 3)), np.inf, 1.0), "distance is infinite"),
+        ((np.ones((2, 3)), 10.0, -2.0), "width = -2.0 mm is not positive"),
+        ((np.ones((2, 3)), 10.0, np.nan), "width is NaN"),
+        ((np.full((2, 3), np.nan), 10.0, 1.0), "image holds NaN"),
+        ((np.full((2, 3), np.inf), 10.0, 1.0), "image holds NaN or infinity"),
+    ],
+)
+def test_impossible_planes(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        ImagePlane(*arguments)
+
+
+def test_spectrum_weights():
+    """By default an average; given weights are used as they are."""
+    spectrum = Spectrum([450 * nm, 550 * nm, 600 * nm])
+    np.testing.assert_allclose(spectrum.weights, 1 / 3)
+    np.testing.assert_allclose(spectrum.wavelengths, [4.5e-4, 5.5e-4, 6e-4])
+    np.testing.assert_array_equal(Spectrum([450 * nm, 550 * nm], [2.0, 0.0]).weights, [2.0, 0.0])
+    single = Spectrum(500 * nm)
+    np.testing.assert_array_equal(single.weights, [1.0])
+    assert single.wavelengths.shape == (1,)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (([],), "wavelengths is empty"),
+        (([500 * nm, -1.0],), "wavelengths .* must be positive"),
+        (([500 * nm, np.nan],), "wavelengths is NaN"),
+        (([500 * nm], [0.5, 0.5]), r"weights has shape \(2,\)"),
+        (([500 * nm, 600 * nm], [0.5, np.inf]), "weights .* not finite"),
+        (([500 * nm, 600 * nm], [1.5, -0.5]), "weights .* negative"),
+    ],
+)
+def test_impossible_spectra(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        Spectrum(*arguments)
+
+
+def test_scenes_take_one_plane_or_several():
+    plane = ImagePlane(picture((2, 3, 4)), 10.0, 1.0)
+    scene = Scene(plane, 500 * nm)
+    assert scene.planes == (plane,) and float(scene.spectrum.wavelengths[0]) == 500 * nm
+    assert len(Scene([plane, plane], Spectrum(500 * nm)).planes) == 2
+
+
+def test_impossible_scenes():
+    one, batch = ImagePlane(np.ones((3, 4)), 10.0, 1.0), ImagePlane(np.ones((2, 3, 4)), 20.0, 1.0)
+    with pytest.raises(ValueError, match="planes is empty"):
+        Scene([], 500 * nm)
+    with pytest.raises(ValueError, match=r"different batch shapes \[\(\), \(2,\)\]"):
+        Scene([one, batch], 500 * nm)

@@ -1,0 +1,170 @@
+"""Suggested designs: near to what is wanted where a design gives it, honest where none does."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from design.setting import setup, thesis_design, two_betas
+
+from helpers import finite_difference
+from thincam_jax.design import DesignSpace, Polar, PowerLaw, Variable
+from thincam_jax.learn import load_suggester, propose, save_suggester, suggest, train_suggester
+from thincam_jax.learn.suggester_training import _levels
+from thincam_jax.reconstruction import phase_pairs
+
+RINGS = 16
+SPACE = two_betas()
+DATA = (setup(prior=PowerLaw(2.8)), jnp.asarray(phase_pairs(2)), Polar(96.0, 128, 2))
+SMALL = {"rings": RINGS, "samples": 512, "guesses": 3, "width": 48, "depth": 2, "batch": 32}
+HELD_OUT = 100
+
+
+@pytest.fixture(scope="module")
+def trained():
+    return train_suggester(SPACE, *DATA, key=jax.random.key(3), **SMALL, warm_up=600, steps=60)
+
+
+@pytest.fixture(scope="module")
+def suggester(trained):
+    return trained.suggester
+
+
+@pytest.fixture(scope="module")
+def wishes(suggester):
+    """Responses of designs that no example was: (their levels, those of random other designs)."""
+    # As many at a time as in the training: the program is compiled already.
+    points = jax.random.uniform(jax.random.key(77), (SMALL["samples"], SPACE.size))
+    levels = _levels(suggester.model, points)
+    return levels[:HELD_OUT], levels[HELD_OUT : 2 * HELD_OUT]
+
+
+@pytest.fixture(scope="module")
+def proposals(suggester, wishes):
+    """One after the other: together they would be another program."""
+    each = [propose(suggester, wanted) for wanted in wishes[0]]
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *each)
+
+
+def test_training_learns(trained):
+    """Both parts gain, and nothing was skipped; the guesses are not all one."""
+    warm_up, history = np.asarray(trained.warm_up), np.asarray(trained.history)
+    assert trained.skipped == 0
+    assert warm_up.shape == (600,) and history.shape == (60,)
+    assert np.mean(warm_up[-50:]) < 0.4 * np.mean(warm_up[:20])
+    assert np.mean(history[-20:]) < np.mean(history[:5])
+    guesses = trained.suggester(trained.suggester.mean)
+    assert guesses.shape == (3, 2)
+    assert float(jnp.max(jnp.ptp(guesses, axis=0))) > 0.05
+
+
+def test_nearer_than_random_designs(wishes, proposals):
+    """Medians over 100 held-out designs: a random design, the network alone, two steps more."""
+    random = np.median(np.sqrt(np.mean((wishes[1] - wishes[0]) ** 2, axis=-1)))
+    network, refined = (np.median(m) for m in (proposals.first_misfit_db, proposals.misfit_db))
+    assert network < 0.5 * random
+    assert refined < 0.5 * network
+
+
+def test_newton_steps_never_make_worse(suggester, wishes, proposals):
+    """And what is told is the misfit of the design that is given."""
+    assert np.all(proposals.misfit_db <= proposals.first_misfit_db)
+    levels = jax.jit(lambda point: suggester.model.levels(point))
+    for k in (0, 41):
+        told = proposals.levels[k] - wishes[0][k]
+        np.testing.assert_allclose(np.sqrt(np.mean(told**2)), proposals.misfit_db[k], rtol=1e-9)
+        np.testing.assert_allclose(levels(proposals.point[k]), proposals.levels[k], atol=1e-9)
+
+
+def test_suggestion(suggester, wishes, proposals):
+    """As `propose` over all wishes says, and not compiled again for another."""
+    suggest(suggester, wishes[0][0])
+    before = propose._cache_size()
+    for k in (1, 2):
+        found = suggest(suggester, np.asarray(wishes[0][k]))
+        np.testing.assert_allclose(found.point, proposals.point[k], atol=1e-9)
+        np.testing.assert_allclose(found.design.beta, np.repeat(found.values, 2))
+        assert found.status == ("matched" if found.misfit_db <= 1.0 else "not_attained")
+        assert found.misfit_db <= found.network_misfit_db
+    assert propose._cache_size() == before
+
+
+@pytest.mark.thorough
+def test_many_at_a_time_and_slopes(suggester, wishes, proposals):
+    """Under vmap as one by one; the misfit's slope in the wished levels by differences."""
+    together = jax.jit(jax.vmap(propose, in_axes=(None, 0)))(suggester, wishes[0])
+    for several, single in zip(together, proposals, strict=True):
+        np.testing.assert_allclose(several, single, atol=1e-6)
+    wanted, direction = wishes[0][0] + 1.0, jnp.ones(RINGS)
+    told = jax.jit(lambda w: propose(suggester, w).first_misfit_db)
+    expected = finite_difference(told, wanted, direction, 1e-6)
+    np.testing.assert_allclose(jax.grad(told)(wanted) @ direction, expected, rtol=1e-4)
+
+
+def test_unattainable_wishes_are_told(suggester, wishes):
+    """30 dB everywhere, a response turned round, and 8 dB more than there is."""
+    response = wishes[0][0]
+    for wanted in (jnp.full(RINGS, 30.0), response[::-1], response + 8.0):
+        found = suggest(suggester, wanted)
+        assert found.status == "not_attained"
+        assert found.misfit_db > 2.0
+        assert suggest(suggester, wanted, tolerance_db=60.0).status == "matched"
+    # Against the faces: the limits are told.
+    assert any(suggest(suggester, jnp.full(RINGS, level)).active for level in (0.0, 30.0, 60.0))
+
+
+def test_no_number_is_told(suggester):
+    broken = jax.tree.map(lambda leaf: leaf * jnp.nan, suggester)
+    assert suggest(broken, np.full(RINGS, 3.0)).status == "non_finite"
+
+
+@pytest.mark.parametrize(
+    ("wanted", "message"),
+    [
+        (np.zeros(RINGS + 1), r"wanted has shape \(17,\); give \(16,\), a level in dB"),
+        (np.full(RINGS, np.nan), "ring 1 is nan, no finite number; give levels"),
+        (np.linspace(1.0, -1.0, RINGS), "ring 9 is -0.0666667, below 0 dB"),
+    ],
+)
+def test_errors(suggester, wanted, message):
+    with pytest.raises(ValueError, match=message) as told:
+        suggest(suggester, wanted)
+    assert "\n" not in str(told.value)
+
+
+def test_training_errors():
+    with pytest.raises(ValueError, match="batch = 0; give at least 1"):
+        train_suggester(SPACE, *DATA, key=jax.random.key(0), batch=0)
+    with pytest.raises(ValueError, match="guesses = 0; give at least 1"):
+        train_suggester(SPACE, *DATA, key=jax.random.key(0), **(SMALL | {"guesses": 0}))
+
+
+def test_saved_and_loaded_answers_are_the_same(suggester, wishes, tmp_path):
+    path = save_suggester(tmp_path / "two_betas.suggester", suggester)
+    loaded = load_suggester(path, SPACE, *DATA)
+    wanted = wishes[0][0]
+    expected = propose(suggester, wanted)
+    before = propose._cache_size()
+    for there, here in zip(expected, propose(loaded, wanted), strict=True):
+        np.testing.assert_array_equal(there, here)
+    assert propose._cache_size() == before
+
+
+def test_files_of_something_else(suggester, tmp_path):
+    path = save_suggester(tmp_path / "two_betas.suggester", suggester)
+    one = DesignSpace(thesis_design(), (Variable("beta", 8.0, 36.0, (0, 1, 2, 3)),))
+    dim = setup(prior=PowerLaw(2.0))
+    whole = path.read_bytes()
+    (tmp_path / "cut").write_bytes(whole[:-200])
+    (tmp_path / "text").write_text("β = 25\n", encoding="utf-8")
+    cases = (
+        (path, one, DATA, "was trained for other variables: "),
+        (path, two_betas(9.0), DATA, "was trained for other variables: "),
+        (path, SPACE, (*DATA[:2], Polar(96.0, 64, 2)), "for other numbers: "),
+        (path, SPACE, (dim, *DATA[1:]), "setup.prior.exponent was 2.8 and is 2; train"),
+        (tmp_path / "cut", SPACE, DATA, "cut is cut off or damaged"),
+        (tmp_path / "text", SPACE, DATA, "text is no suggester; give a file written by"),
+    )
+    for file, space, data, message in cases:
+        with pytest.raises(ValueError, match=message) as told:
+            load_suggester(file, space, *data)
+        assert "\n" not in str(told.value)

@@ -1,0 +1,116 @@
+"""Unrolled ADMM: untrained it is ADMM, trained it is better on scenes it has not seen."""
+
+import functools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from reconstruction import extremes, scenes
+
+from helpers import finite_difference
+from thincam_jax.learn import unrolled as module
+from thincam_jax.learn.unrolled import UnrolledAdmm, solve_unrolled, train, training_loss
+from thincam_jax.reconstruction.admm import Splitting, default_penalties, image_of, start, step
+from thincam_jax.reconstruction.scaled import even_image
+
+
+def pairs(count, seed):
+    """Scenes and their captures with 1 % of noise."""
+    problem, _ = scenes.problem((17, 19), (13, 14), captures=1, batch=(count,))
+    images = np.stack([scenes.blocks((13, 14), seed=seed + n) for n in range(count)])
+    images = jnp.asarray(images[:, None, None])
+    seen = problem.operators[0](images)
+    noise = jnp.asarray(np.random.default_rng(seed).normal(size=seen.shape))
+    seen = seen + 0.01 * float(seen.max()) * noise
+    return eqx.tree_at(lambda p: p.captures, problem, (seen,)), images
+
+
+def test_untrained_it_is_admm():
+    problem, _ = scenes.problem((17, 19), (13, 14), planes=2)
+    splitting = Splitting(problem)
+    penalties = default_penalties(splitting)
+    state = start(splitting, even_image(problem))
+    advance = jax.jit(step)
+    for _ in range(4):
+        state = advance(splitting, penalties, jnp.asarray(1.0), state)
+    found = UnrolledAdmm(problem, 4)(problem)
+    np.testing.assert_allclose(found, image_of(splitting, state), atol=1e-10)
+
+
+def test_trained_it_beats_as_many_untrained_iterations_on_scenes_it_has_not_seen():
+    seen, images = pairs(10, 100)
+    unseen, others = pairs(8, 900)
+    model = UnrolledAdmm(seen, 5)
+    before = training_loss(model, unseen, others)
+    training = train(model, seen, images, key=jax.random.key(1), steps=60, batch=4)
+    assert training.status == "iterations_exhausted" and len(training.losses) == 60
+    after = training_loss(training.model, unseen, others)
+    assert after < 0.75 * before
+    # Its five iterations are worth more than eight of those.
+    assert after < training_loss(UnrolledAdmm(seen, 8), unseen, others)
+    for positive in training.model.parameters():
+        assert float(positive.min()) > 0
+    # Training again with the same key gives the same.
+    again = train(model, seen, images, key=jax.random.key(1), steps=3, batch=4)
+    assert again.losses == training.losses[:3]
+
+
+def test_the_gradient_is_that_of_differences():
+    problem, images = pairs(2, 40)
+    model = UnrolledAdmm(problem, 3)
+    rng = np.random.default_rng(2)
+    direction = jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape)), model)
+    loss = functools.partial(training_loss, problem=problem, images=images)
+    wanted = finite_difference(loss, model, direction, 1e-5)
+    slope = jax.jit(jax.grad(training_loss))(model, problem, images)
+    found = sum(
+        jnp.vdot(a, b)
+        for a, b in zip(jax.tree.leaves(slope), jax.tree.leaves(direction), strict=True)
+    )
+    np.testing.assert_allclose(found, wanted, rtol=1e-3)
+
+
+@pytest.mark.thorough
+def test_each_member_of_a_batch_is_as_if_alone():
+    """However bright the others are."""
+    problem, _ = pairs(3, 7)
+    gains = jnp.array([1.0, 1e3, 1e-3])[:, None, None, None]
+    problem = eqx.tree_at(lambda p: p.captures, problem, (problem.captures[0] * gains,))
+    model = UnrolledAdmm(problem, 3)
+    together = model(problem)
+    for n in range(3):
+        alone = eqx.tree_at(lambda p: p.captures, problem, (problem.captures[0][n],))
+        np.testing.assert_allclose(model(alone), together[n], rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.thorough
+def test_it_stands_extremes_and_tells_its_course():
+    def solve(problem):
+        return solve_unrolled(problem, UnrolledAdmm(problem, 3))
+
+    extremes.check_shapes(solve)
+    extremes.check_darkness(solve)
+    model = UnrolledAdmm(scenes.single(scenes.problem()[0]), 3)
+    extremes.check_scale(functools.partial(solve_unrolled, model=model))
+    problem, _ = scenes.problem()
+    outcome = solve(problem)
+    assert [p.iteration for p in outcome.history] == [0, 1, 2, 3]
+    assert outcome.history[-1].objective < outcome.history[0].objective
+    before = module._followed._cache_size()
+    solve(scenes.rescaled(problem, 2.0))
+    assert module._followed._cache_size() == before
+    broken = (problem.captures[0].at[0, 0, 0].set(jnp.nan), problem.captures[1])
+    assert solve(eqx.tree_at(lambda p: p.captures, problem, broken)).status == "non_finite"
+
+
+def test_pairs_that_do_not_fit_are_refused():
+    problem, images = pairs(3, 7)
+    model = UnrolledAdmm(problem, 2)
+    with pytest.raises(ValueError, match="give captures"):
+        train(model, problem, images[:2], key=jax.random.key(0))
+    with pytest.raises(ValueError, match="batch = 4 of 3 pairs"):
+        train(model, problem, images, key=jax.random.key(0), batch=4)
+    with pytest.raises(ValueError, match="at least 1"):
+        UnrolledAdmm(problem, 0)

@@ -1,0 +1,210 @@
+"""Errors from one-dimensional fields, against the images that they stand for."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.integrate
+import scipy.special
+from lensless.accuracy import cameras
+
+import thincam_jax as tc
+from helpers import relative_l2
+from thincam_jax.lensless.accuracy.probe import ZoneProbe
+from thincam_jax.lensless.accuracy.sampled import fine_fields
+from thincam_jax.lensless.propagation import Path
+from thincam_jax.lensless.propagation.angular_spectrum import angular_spectrum
+from thincam_jax.lensless.propagation.separable import separable
+
+THESIS = {"beta": 25.0, "width": 5.632, "distance": 6.5, "wavelength": 500e-6}
+CLOSED = ("geometric", "paraxial", "closed_form", "separable")
+
+
+def case_of(shape, pitch, *, profile="cosine", average=False, centre=(0.0, 0.0), **changes):
+    geometry = {**THESIS, "object_distance": 250.0, **changes}
+    return cameras.make_case(shape, pitch, profile, 0.7, centre, geometry, average)
+
+
+def probe_of(case):
+    conditions = dict(case.conditions)
+    average = conditions.pop("pixel_integration")
+    camera = case.camera
+    return ZoneProbe(
+        camera.mask, camera.sensor.grid, camera.path(**conditions), pixel_integration=average
+    )
+
+
+def value(case, model, **arguments):
+    return np.asarray(tc.psf(case.camera, model=model, **case.conditions, **arguments), float)
+
+
+@pytest.mark.parametrize(
+    "case",
+    [
+        case_of((48, 80), 5.5e-3),  # the middle of the shadow
+        case_of((75, 120), 0.07, centre=(0.3, -0.9)),  # all of it, and round it
+        case_of((75, 120), 0.07, profile="binary"),
+        pytest.param(
+            case_of((256, 100), 0.02, average=True, object_distance=20.0),
+            marks=pytest.mark.thorough,
+        ),
+    ],
+    ids=["middle", "whole", "binary", "average"],
+)
+def test_small_images_are_known_exactly(case):
+    """All pairs of models, relative to the reference; and what single precision costs each."""
+    probe = probe_of(case)
+    images = {model: value(case, model) for model in CLOSED}
+    scale = np.linalg.norm(images["separable"])
+    for first in CLOSED:
+        for second in CLOSED:
+            true = np.linalg.norm(images[first] - images[second]) / scale
+            # The probe's own pixel average has twice the nodes.
+            rel = 1e-3 if case.conditions["pixel_integration"] else 1e-6
+            assert probe.difference(first, second) == pytest.approx(true, rel=rel, abs=1e-7)
+        rounded = value(case, first, precision="float32")
+        cost = np.linalg.norm(rounded - images[first]) / scale
+        assert cost <= probe.rounding(first, "float32") < 2 * cost + 5e-7
+    assert probe.difference("geometric", "separable") > 1e-3
+
+
+@pytest.mark.parametrize(
+    ("pitch", "distance", "average"),
+    [(0.02, 6.5, False), (0.005, 1.0, False), (0.009, 30.0, False), (0.005, 6.5, True)],
+)
+def test_large_images_are_estimated(pitch, distance, average):
+    """1500×700 pixels from 256 rows and columns: within 15 %."""
+    case = case_of((1500, 700), pitch, distance=distance, average=average)
+    probe = probe_of(case)
+    reference = value(case, "separable")
+    for model in CLOSED[:-1]:
+        true = relative_l2(value(case, model), reference)
+        assert probe.difference(model, "separable") == pytest.approx(true, rel=0.15)
+
+
+@pytest.mark.parametrize(
+    ("precision", "average", "oversampling"),
+    [
+        ("float32", False, 1),
+        ("float64", False, 3),
+        pytest.param("float32", True, 3, marks=pytest.mark.thorough),
+    ],
+)
+def test_sampled_models(precision, average, oversampling):
+    """The angular spectrum's error within 5 % from one-dimensional transforms; the direct sum's
+    within 30 % from 14×14 of 48×80 pixels."""
+    case = case_of(
+        (48, 80), 0.01, width=0.6, distance=20.0, beta=150.0, centre=(0.03, -0.02), average=average
+    )
+    probe = probe_of(case)
+    exact = cameras.expected(case)
+    for model, within in (("angular_spectrum", 0.05), ("rayleigh_sommerfeld", 0.3)):
+        image = value(case, model, precision=precision, oversampling=oversampling)
+        predicted = getattr(probe, model)(precision, (66, 64), oversampling)
+        assert predicted == pytest.approx(relative_l2(image, exact), rel=within)
+
+
+@pytest.mark.parametrize(("distance", "known"), [(2.0, 0.03), (1.0, 0.06)])
+def test_paraxial_error_of_a_small_aperture(distance, known):
+    """How far Fresnel is from exact diffraction where that can be sampled finely in two dimensions.
+
+    Samples of 1 µm, so that the error of the sampling itself is a tenth of what is looked for. The
+    estimate, from a line, is within a factor of two.
+    """
+    case = case_of((12, 15), 0.03, width=0.3, beta=200.0, distance=distance, object_distance=np.inf)
+    path = Path(THESIS["wavelength"], distance)
+    mask, grid = case.camera.mask, case.camera.sensor.grid
+    exact = jax.jit(
+        lambda: angular_spectrum(mask, grid, path, mask_shape=(10, 11), oversampling=31)
+    )
+    fresnel = np.asarray(jax.jit(lambda: separable(mask, grid, path).image())())
+    true = relative_l2(np.asarray(exact()), fresnel)
+    assert true == pytest.approx(known, rel=0.3)
+    assert true / 2 < probe_of(case).paraxial_error() < 2 * true
+
+
+def test_paraxial_error_averages_out_over_pixels():
+    """It sits in the edges' fringes, of some micrometres."""
+    points, average = (case_of((300, 200), 0.02, average=a) for a in (False, True))
+    error = probe_of(points).paraxial_error()
+    assert 1e-3 < error
+    assert probe_of(average).paraxial_error() < error / 10
+
+
+def slit_field(x, width, distance, wavelength, exact, samples=20001):
+    """The field behind a slit lit by a plane wave by Simpson's rule, its piston dropped.
+
+    Exact: the first Rayleigh-Sommerfeld integral in two dimensions, (jkd/2R)·H₁⁽¹⁾(kR).
+    """
+    wavenumber = 2 * np.pi / wavelength
+    places = np.linspace(-width / 2, width / 2, samples)
+    across = x[:, None] - places
+    if exact:
+        distances = np.sqrt(distance**2 + across**2)
+        kernel = 1j * wavenumber * distance / (2 * distances)
+        detour = across**2 / (distances + distance)
+        kernel = kernel * scipy.special.hankel1e(1, wavenumber * distances)
+        kernel = kernel * np.exp(1j * wavenumber * detour)
+    else:
+        kernel = np.exp(1j * wavenumber * across**2 / (2 * distance))
+        kernel = kernel / np.sqrt(1j * wavelength * distance)
+    return scipy.integrate.simpson(kernel, x=places, axis=-1)
+
+
+@pytest.mark.parametrize("exact", [True, False])
+def test_line_fields_of_a_slit(exact):
+    """Order 0 is a bare slit: its exact field and Fresnel's, each to 5e-3 by independent sums.
+
+    What is left are the edges' steepest waves, that come round from the window's other side. The
+    two fields differ by more than four times that.
+    """
+    width, distance, wavelength, reach, count = 0.5, 0.5, 500e-6, 0.4, 2**16
+    mask = tc.FresnelZoneAperture(25.0, width=width)
+    given = (mask, Path(wavelength, distance), jnp.asarray(reach), jnp.asarray(exact))
+    fields = fine_fields(*given, samples=count)
+    orders = mask.zone_orders().orders
+    place = np.arange(100, count // 2, 400)
+    x = (place - (count / 2 - 1) / 2) * 4 * reach / count
+    found = np.asarray(fields)[orders.index(0)][place]
+    fine = slit_field(x, width, distance, wavelength, exact)
+    other = slit_field(x, width, distance, wavelength, not exact)
+    assert relative_l2(np.abs(found) ** 2, np.abs(fine) ** 2) < 5e-3
+    assert relative_l2(np.abs(other) ** 2, np.abs(fine) ** 2) > 2e-2
+
+
+def test_numbers_of_the_thesis_camera():
+    """ε = βλd/(πM); its phases at the mask's edge; the edge zone in mm."""
+    magnification = 1 + 6.5 / 250
+    epsilon = 25 * 500e-6 * 6.5 / np.pi / magnification
+    numbers = probe_of(case_of((64, 48), 5.5e-3)).numbers()
+    phase = 25 * 2.816**2
+    assert numbers.epsilon == pytest.approx(epsilon)
+    assert numbers.first_order == pytest.approx(epsilon * phase)
+    assert numbers.second_order == pytest.approx(epsilon**2 * phase)
+    assert numbers.edge_zone == pytest.approx(np.sqrt(500e-6 * 6.5 / magnification))
+    # The far edge, seen from the sensor's other side: about π(w/2 + 32 pixels)²/(λd).
+    assert numbers.largest_phase == pytest.approx(np.pi * 2.992**2 / (500e-6 * 6.5), rel=0.05)
+    binary = probe_of(case_of((64, 48), 5.5e-3, profile="binary")).numbers()
+    assert binary.epsilon == pytest.approx(9 * epsilon)
+    assert binary.first_order == pytest.approx(81 * epsilon * phase)
+
+
+def test_one_compilation_for_cameras_of_one_structure(caplog):
+    """Other numbers and another shape of the sensor: nothing is compiled again."""
+
+    def measure(case):
+        probe = probe_of(case)
+        for model in CLOSED:
+            probe.difference(model, "separable")
+            probe.rounding(model, "float32")
+        return probe.paraxial_error()
+
+    def compilations(case):
+        caplog.clear()
+        with jax.log_compiles():
+            measure(case)
+        return [r.getMessage() for r in caplog.records if r.getMessage().startswith("Compiling")]
+
+    jax.clear_caches()
+    assert any("closed_terms" in line for line in compilations(case_of((48, 80), 5.5e-3)))
+    assert compilations(case_of((300, 77), 0.011, beta=60.0, distance=1.0)) == []

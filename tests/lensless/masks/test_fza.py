@@ -1,0 +1,98 @@
+"""The Fresnel zone aperture: its profile, edges, display pixels and refusals."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from lensless.propagation.reference import centred
+
+import thincam_jax as tc
+
+sample = jax.jit(lambda mask, grid: mask.sample(grid))
+
+
+def test_cosine_profile():
+    """½[1 + cos(βr² + φ)] inside the square, 0 outside; +y down, +x right."""
+    mask = tc.FresnelZoneAperture(30.0, 0.7, width=1.0, centre=(0.1, -0.2))
+    value = sample(mask, tc.Grid((24, 31), 0.07))
+    y, x = centred(24, 0.07)[:, None] - 0.1, centred(31, 0.07) + 0.2
+    inside = (np.abs(y) + 0.035 < 0.5) & (np.abs(x) + 0.035 < 0.5)
+    outside = (np.abs(y) - 0.035 > 0.5) | (np.abs(x) - 0.035 > 0.5)
+    expected = 0.5 * (1 + np.cos(30.0 * (y**2 + x**2) + 0.7))
+    np.testing.assert_allclose(value[inside], expected[inside], rtol=0, atol=1e-13)
+    assert inside.sum() > 100 and np.all(np.asarray(value)[outside] == 0.0)
+
+
+def test_cells_cut_by_the_edge_count_by_their_open_area():
+    """Uniform where φ = 0 and β → 0: the samples' sum is the aperture's area exactly."""
+    mask = tc.FresnelZoneAperture(1e-9, width=0.513, centre=(0.011, -0.02))
+    value = np.asarray(sample(mask, tc.Grid((30, 41), 0.02)))
+    np.testing.assert_allclose(value.sum() * 0.02**2, 0.513**2, rtol=1e-9)
+    assert ((value > 0.01) & (value < 0.99)).sum() > 80  # one ring of partly open cells
+
+
+def test_binary_profile_is_its_truncated_series():
+    mask = tc.FresnelZoneAperture(30.0, 0.7, width=2.0, profile="binary", harmonics=99)
+    grid = tc.Grid((24, 31), 0.05)
+    r2 = centred(24, 0.05)[:, None] ** 2 + centred(31, 0.05) ** 2
+    cosine = np.cos(30.0 * r2 + 0.7)
+    clear = np.abs(cosine) > 0.3
+    np.testing.assert_allclose(sample(mask, grid)[clear], (cosine > 0)[clear], rtol=0, atol=0.03)
+    orders = mask.zone_orders()
+    k = np.asarray(orders.orders)
+    expected = np.where(k == 0, 0.5, np.sin(k * np.pi / 2) / (np.where(k == 0, 1, k) * np.pi))
+    np.testing.assert_allclose(orders.coefficients, expected * np.exp(0.7j * k), atol=1e-15)
+    assert sorted(orders.orders) == [k for k in range(-99, 100) if k % 2 or k == 0]
+
+
+def test_display_pixels():
+    """Each pixel shows the value at its centre over the open part √fill × √fill of its cell."""
+    mask = tc.FresnelZoneAperture(30.0, 0.7, width=0.6, pixel_pitch=0.1, fill_factor=0.64)
+    sites = centred(6, 0.1)
+    shown = 0.5 * (1 + np.cos(30.0 * (sites[:, None] ** 2 + sites**2) + 0.7))
+    coarse = sample(mask, tc.Grid((6, 8), 0.1))
+    np.testing.assert_allclose(coarse[:, 1:-1], shown * 0.64, rtol=0, atol=1e-13)
+    np.testing.assert_array_equal(coarse[:, ::7], 0.0)
+    fine = np.asarray(sample(mask, tc.Grid((60, 60), 0.01))).reshape(6, 10, 6, 10)
+    np.testing.assert_allclose(
+        fine[:, 1:9, :, 1:9], np.broadcast_to(shown[:, None, :, None], (6, 8, 6, 8)), atol=1e-13
+    )
+    assert np.all(fine[:, [0, 9]] < 1e-12)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"beta": -25.0}, r"beta = -25.0 rad/mm\^2 is not positive; give beta > 0"),
+        ({"beta": np.nan}, "beta is NaN"),
+        ({"beta": np.inf}, "beta is infinite"),
+        ({"width": 0.0}, "width = 0.0 mm is not positive"),
+        ({"phase": np.inf}, "phase = inf rad is not finite"),
+        ({"centre": (0.0,)}, r"centre has shape \(1,\); give an array of shape \(2,\) in mm"),
+        ({"centre": (0.0, np.nan)}, "centre is NaN"),
+        ({"fill_factor": 1.2}, "fill_factor = 1.2 is out of range; give 0 < fill_factor <= 1"),
+        ({"fill_factor": 0.0}, "fill_factor = 0.0 is out of range"),
+        ({"harmonics": 4}, "harmonics = 4: give an odd number from 1 to 99"),
+        ({"harmonics": 101}, "harmonics = 101"),
+        ({"pixel_pitch": 0.03}, r"width = 1 mm is not a whole number of display pixels of 0.03"),
+        ({"pixel_pitch": 0.03}, "give width = 0.99 or 1.02 mm"),
+        ({"pixel_pitch": -0.1}, "pixel_pitch = -0.1 mm is not positive"),
+        ({"beta": np.ones(3)}, r"beta has shape \(3,\); give one number in rad/mm\^2"),
+    ],
+)
+def test_refusals(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        tc.FresnelZoneAperture(**({"beta": 25.0, "width": 1.0} | arguments))
+
+
+def test_refuses_units_as_text():
+    with pytest.raises(TypeError, match=r"width = '5.6 mm' is not a real number; give it in mm"):
+        tc.FresnelZoneAperture(25.0, width="5.6 mm")
+    with pytest.raises(TypeError, match="phase = 1j is not a real number"):
+        tc.FresnelZoneAperture(25.0, 1j, width=1.0)
+
+
+def test_integers_become_numbers_and_arrays_keep_their_precision():
+    mask = tc.FresnelZoneAperture(25, width=jnp.float32(2.0))
+    assert mask.beta.dtype == jnp.float64 and mask.beta == 25.0
+    assert mask.width.dtype == jnp.float32

@@ -1,0 +1,275 @@
+"""A plan's capture is within its tolerance, and says what it does."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from lensless.plan.scenes import camera, scene
+
+import thincam_jax as tc
+from helpers import finite_difference, relative_l2
+from thincam_jax.units import nm
+
+
+@pytest.fixture(scope="module")
+def deep():
+    """32 planes from 100 mm to 10 m, 31 wavelengths, and their capture computed in full."""
+    whole = scene(32, 31)
+    return whole, tc.capture(camera(), whole)
+
+
+@pytest.mark.parametrize(("tolerance", "most_psfs"), [(0.3, 1), (0.1, 4), (1e-2, 20), (1e-3, 150)])
+def test_error_is_within_the_tolerance_with_few_psfs(deep, tolerance, most_psfs):
+    whole, full = deep
+    plan = tc.plan(camera(), whole, tolerance=tolerance)
+    assert plan.meets_tolerance
+    planned = tc.capture(camera(), whole, plan=plan)
+    true = relative_l2(planned, full)
+    assert true <= plan.predicted_error <= tolerance
+    assert len(plan.distances) * len(plan.wavelengths) <= most_psfs  # of 992
+    assert plan.cost.flops < 0.25 * plan.full_cost.flops
+
+
+def test_a_coarse_tolerance_takes_a_cheaper_model(deep):
+    whole, _ = deep
+    plan = tc.plan(camera(), whole, tolerance=0.3)
+    assert plan.model != "separable"
+    assert plan.precision == "float32"
+    assert not plan.pixel_integration
+
+
+def test_double_precision_where_single_cannot_serve():
+    """At 1e-8 everything is computed, in float64 though the camera is in float32."""
+    own, few = camera(np.float32), scene(2, 2, dtype=np.float32)
+    plan = tc.plan(own, few, tolerance=1e-7)
+    assert (plan.model, plan.precision) == ("separable", "float64")
+    planned = tc.capture(own, few, plan=plan)
+    assert planned.dtype == jnp.float32
+    double = jax.tree.map(lambda leaf: leaf.astype(jnp.float64), (own, few))
+    assert relative_l2(planned, tc.capture(*double)) < 1e-7
+    assert not tc.plan(own, few, tolerance=1e-9).meets_tolerance  # the result is float32
+
+
+def test_equal_planes_merge_into_one():
+    one = scene(1, 1).planes[0]
+    other = tc.ImagePlane(one.image[::-1], one.distance, one.width)
+    both = tc.Scene([one, other], 500 * nm)
+    plan = tc.plan(camera(), both, tolerance=1e-4)
+    assert len(plan.distances) == 1
+    np.testing.assert_allclose(plan.mixing, [[1.0, 1.0]], atol=1e-10)
+    full = tc.capture(camera(), both)
+    assert relative_l2(tc.capture(camera(), both, plan=plan), full) < 1e-4
+
+
+def test_a_batch_is_planned_as_one():
+    colours = scene(4, 3, batch=(3,))
+    plan = tc.plan(camera(), colours, tolerance=1e-2)
+    planned = tc.capture(camera(), colours, plan=plan)
+    assert relative_l2(planned, tc.capture(camera(), colours)) <= plan.predicted_error
+
+
+def test_table_names_every_decision(deep):
+    plan = tc.plan(camera(), deep[0], tolerance=1e-2)
+    table = str(plan)
+    for words in (
+        "tolerance       1.0e-02, predicted",
+        f"{plan.model}, {plan.precision}",
+        f"32 by {len(plan.distances)} PSFs",
+        f"31 by {len(plan.wavelengths)}",
+        f"window {plan.padded_shape[0]}×{plan.padded_shape[1]}",
+        "obliquity, cos⁴θ",
+        "pass noise=PoissonGaussianNoise()" if plan.tolerance < 9e-3 else "does not matter",
+        "Fresnel's approximation",
+        "operations of",
+    ):
+        assert words in table, table
+    assert max(len(line) for line in table.splitlines()) < 100
+
+
+def test_effects_have_the_sizes_of_the_physics(deep):
+    """cos⁴θ over fields of 0.15 rad, and 1/√(0.9·13500) of shot noise."""
+    sizes = {e.name: e.size for e in tc.plan(camera(), deep[0], tolerance=0.1).effects}
+    y, x = np.meshgrid(np.linspace(-0.5, 0.5, 401) * 0.1125, np.linspace(-0.5, 0.5, 401) * 0.15)
+    fall = 1 - (1 + y**2 + x**2) ** -2
+    assert sizes["shift-variance"] == pytest.approx(np.sqrt(np.mean(fall**2)), rel=0.1)
+    assert sizes["shot noise"] == pytest.approx(1 / np.sqrt(0.9 * 13_500))
+
+
+@pytest.mark.thorough
+def test_gradients_pass_through_a_planned_capture():
+    """With respect to the images and β; in double precision, for differences' sake."""
+    few = scene(3, 2)
+    plan = tc.plan(camera(), few, tolerance=1e-3)
+    plan = dataclasses.replace(plan, precision="float64")
+    weights = jnp.asarray(np.random.default_rng(5).normal(size=(80, 96)))
+
+    def loss(beta, image, how):
+        own = camera()
+        mask = tc.FresnelZoneAperture(beta, 0.4, width=3.6, centre=(0.1, -0.2))
+        own = tc.LenslessCamera(mask, own.sensor, 6.5)
+        planes = [tc.ImagePlane(image, 100.0, 15.0), *few.planes[1:]]
+        return jnp.sum(weights * tc.capture(own, tc.Scene(planes, few.spectrum), plan=how))
+
+    at = jnp.asarray(25.0), few.planes[0].image
+    planned = jax.jit(jax.grad(lambda *p: loss(*p, plan), argnums=(0, 1)))(*at)
+    # β moves the phase at the shadow's corner by r² = 6.5 rad per unit
+    difference = finite_difference(
+        lambda beta: loss(beta, at[1], plan), at[0], jnp.asarray(1.0), 1e-3
+    )
+    np.testing.assert_allclose(planned[0], difference, rtol=1e-6)
+    full = jax.grad(lambda *p: loss(*p, None), argnums=1)(*at)
+    assert relative_l2(planned[1], full) < 1e-2
+
+
+def test_noise_is_added_to_a_planned_capture(key):
+    few = scene(1, 1)
+    plan = tc.plan(camera(), few, tolerance=1e-2)
+    noise = tc.PoissonGaussianNoise()
+    noisy = tc.capture(camera(), few, plan=plan, noise=noise, key=key)
+    clean = tc.capture(camera(), few, plan=plan)
+    assert 1e-3 < relative_l2(noisy, clean) < 1e-1
+
+
+def test_a_plan_is_not_run_on_another_scene():
+    plan = tc.plan(camera(), scene(2, 2), tolerance=0.1)
+    with pytest.raises(ValueError, match=r"for 2 planes at given distances.*make a plan"):
+        tc.capture(camera(), scene(3, 2), plan=plan)
+    with pytest.raises(ValueError, match=r"for 2 given wavelengths.*make a plan"):
+        tc.capture(camera(), scene(2, 3), plan=plan)
+    other = tc.FresnelZoneAperture(26.0, width=3.6, centre=(0.1, -0.2))
+    other = tc.LenslessCamera(other, camera().sensor, 7.0)
+    with pytest.raises(ValueError, match=r"another camera \(distance, mask.beta differ\): make"):
+        tc.capture(other, scene(2, 2), plan=plan)
+    with pytest.raises(ValueError, match="a plan chooses model and pixel_integration"):
+        tc.capture(camera(), scene(2, 2), plan=plan, model="geometric")
+
+
+@pytest.mark.parametrize("tolerance", [0.0, -1.0, 5.0, float("nan"), float("inf")])
+def test_bad_tolerances(tolerance):
+    with pytest.raises(ValueError, match="tolerance"):
+        tc.plan(camera(), scene(1, 1), tolerance=tolerance)
+
+
+def test_what_cannot_be_planned():
+    own = camera()
+    mask = tc.SampledMask(np.ones((4, 5)), 0.1)
+    with pytest.raises(TypeError, match="zone orders"):
+        tc.plan(tc.LenslessCamera(mask, own.sensor, 6.5), scene(1, 1), tolerance=0.1)
+
+    def inside(distance):
+        plan = tc.plan(
+            tc.LenslessCamera(own.mask, own.sensor, distance), scene(1, 1), tolerance=1.0
+        )
+        return jnp.asarray(plan.predicted_error)
+
+    with pytest.raises(TypeError, match="plan needs known numbers"):
+        jax.jit(inside)(6.5)
+
+
+def test_a_dark_scene_has_a_plan():
+    dark = tc.Scene(tc.ImagePlane(np.zeros((4, 6)), 200.0, 20.0), 500 * nm)
+    plan = tc.plan(camera(), dark, tolerance=1e-2)
+    assert (np.asarray(tc.capture(camera(), dark, plan=plan)) == 0).all()
+
+
+def flat(distances, width_of, image=None):
+    image = np.ones((24, 32)) if image is None else image
+    return [tc.ImagePlane(image, t, width_of * t) for t in distances]
+
+
+def small(**mask):
+    """64×72 pixels of 88 µm; the mask is the thesis' unless said otherwise."""
+    mask = tc.FresnelZoneAperture(**({"beta": 25.0, "phase": 0.3, "width": 5.632} | mask))
+    return tc.LenslessCamera(mask, tc.Sensor((64, 72), 0.088), 6.5)
+
+
+def lit_edge():
+    """One lit pixel, so far off the axis that its shadow misses the sensor."""
+    image = np.zeros((33, 33))
+    image[0, 16] = 1.0
+    return image
+
+
+WHITE = np.linspace(400 * nm, 1000 * nm, 5)
+TEXTURE = np.random.default_rng(8).normal(size=(24, 32))
+DARK_BUT_ONE = np.where(np.arange(7)[:, None, None] == 4, TEXTURE, 0.0)
+# What asks more of a prediction than a scene of textures does.
+ODD = {
+    "coarse pixels behind a small mask": (
+        tc.LenslessCamera(
+            tc.FresnelZoneAperture(24.3, 0.3, width=0.101), tc.Sensor((64, 72), 0.03), 0.595
+        ),
+        tc.Scene(flat([100.0, 500.0, 5000.0], 1.6), tc.Spectrum(WHITE)),
+    ),
+    "one bright image in a dark batch": (
+        small(),
+        tc.Scene(flat([300.0], 0.3, DARK_BUT_ONE), tc.Spectrum(WHITE)),
+    ),
+    "planes that cancel": (
+        small(),
+        tc.Scene(
+            [*flat([1000.0], 0.2, TEXTURE), *flat([1010.0], 0.2, -TEXTURE)], tc.Spectrum(WHITE)
+        ),
+    ),
+    "light beside the sensor": (
+        small(),
+        tc.Scene(flat([250.0], 2.0, lit_edge()), tc.Spectrum(WHITE[:3])),
+    ),
+    "a display": (
+        small(pixel_pitch=0.176),
+        tc.Scene(flat([100.0, 300.0], 0.3, TEXTURE), tc.Spectrum(WHITE[:3])),
+    ),
+}
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("name", ODD)
+@pytest.mark.parametrize(
+    "tolerance",
+    [
+        pytest.param(0.1, marks=pytest.mark.thorough),
+        pytest.param(1e-2, marks=pytest.mark.thorough),
+        1e-3,
+    ],
+)
+def test_odd_scenes_stay_within_their_prediction(name, tolerance):
+    own, odd = ODD[name]
+    plan = tc.plan(own, odd, tolerance=tolerance)
+    true = relative_l2(tc.capture(own, odd, plan=plan), tc.capture(own, odd))
+    assert true <= plan.predicted_error <= tolerance
+
+
+def test_phases_that_float32_does_not_hold_are_planned_in_float64():
+    mask = tc.FresnelZoneAperture(1e3, width=100.0)
+    own = tc.LenslessCamera(mask, tc.Sensor((64, 72), 1.0), 0.65)
+    one = tc.Scene(flat([500.0], 0.3), 500 * nm)
+    plan = tc.plan(own, one, tolerance=0.3)
+    assert plan.precision == "float64"
+    assert np.isfinite(np.asarray(tc.capture(own, one, plan=plan))).all()
+
+
+def test_a_plan_notices_other_light_and_larger_planes():
+    few = scene(2, 3)
+    plan = tc.plan(camera(), few, tolerance=0.1)
+    brighter = tc.Scene(few.planes, tc.Spectrum(few.spectrum.wavelengths, [0.2, 0.2, 0.2]))
+    with pytest.raises(ValueError, match=r"for 3 given weights.*make a plan"):
+        tc.capture(camera(), brighter, plan=plan)
+    wider = [tc.ImagePlane(p.image, p.distance, 2 * p.width) for p in few.planes]
+    with pytest.raises(ValueError, match=r"cover \(\d+, \d+\) samples.*make a plan"):
+        tc.capture(camera(), tc.Scene(wider, few.spectrum), plan=plan)
+    with pytest.raises(TypeError, match="plan is a float; give what thincam_jax.plan returns"):
+        tc.capture.__wrapped__(camera(), few, plan=0.1)
+    with pytest.raises(TypeError, match="scene is a ImagePlane; give a thincam_jax.Scene"):
+        tc.plan.__wrapped__(camera(), few.planes[0], tolerance=0.1)
+
+
+def test_another_phase_may_use_the_plan():
+    """The exposures of fringe scanning share one."""
+    few = scene(2, 2)
+    plan = tc.plan(camera(), few, tolerance=1e-2)
+    mask = tc.FresnelZoneAperture(25.0, 2.0, width=3.6, centre=(0.1, -0.2))
+    other = tc.LenslessCamera(mask, camera().sensor, 6.5)
+    full = tc.capture(other, few)
+    assert relative_l2(tc.capture(other, few, plan=plan), full) < 1e-2

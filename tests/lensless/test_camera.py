@@ -1,0 +1,65 @@
+"""The lensless camera: its distance, the way of the light through it, its gradients."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import thincam_jax as tc
+from thincam_jax.units import nm, um
+
+
+def camera(distance=6.5):
+    mask = tc.FresnelZoneAperture(25.0, width=5.632)
+    return tc.LenslessCamera(mask=mask, sensor=tc.Sensor((80, 96), 5.5 * um), distance=distance)
+
+
+def test_path_of_the_thesis_camera():
+    """M = (t+d)/t magnifies the shadow; ε = βλd/(πM) measures the diffraction."""
+    path = camera().path(500 * nm, 250.0)
+    assert float(path.magnification) == pytest.approx(1.026)
+    assert float(path.epsilon(jnp.asarray(25.0))) == pytest.approx(0.025862 / 1.026, rel=1e-4)
+    assert float(path.fresnel_curvature) == pytest.approx(np.pi * 1.026 / (5e-4 * 6.5))
+    assert float(camera().path(500 * nm, jnp.inf).magnification) == 1.0
+
+
+@pytest.mark.parametrize(
+    ("distance", "message"),
+    [
+        (0.0, "distance = 0.0 mm is not positive"),
+        (-6.5, "distance = -6.5 mm is not positive"),
+        (np.nan, "distance is NaN"),
+        (np.inf, "distance is infinite"),
+        (np.array([5.0, 6.5]), r"distance has shape \(2,\); give one number"),
+    ],
+)
+def test_impossible_distances(distance, message):
+    with pytest.raises(ValueError, match=message):
+        camera(distance)
+
+
+def test_a_distance_in_words_is_no_number():
+    with pytest.raises(TypeError, match="distance = '6.5 mm' is not a real number; give it in mm"):
+        camera("6.5 mm")
+
+
+def test_a_camera_is_a_tree_of_its_numbers():
+    """β, φ, width, distance and pitch are leaves, so that gradients reach them through jit."""
+
+    @jax.jit
+    def shadow_width(camera):
+        return camera.mask.width * camera.path(500 * nm, 250.0).magnification
+
+    slopes = jax.grad(shadow_width)(camera())
+    assert float(slopes.mask.width) == pytest.approx(1.026)
+    assert float(slopes.distance) == pytest.approx(5.632 / 250)
+    assert float(slopes.mask.beta) == 0.0 and float(slopes.sensor.pitch) == 0.0
+
+
+def test_swapped_arguments_are_refused():
+    mask = tc.FresnelZoneAperture(25.0, width=1.0)
+    sensor = tc.Sensor((3, 4), 0.1)
+    with pytest.raises(TypeError, match="mask is a Sensor; give a mask, such as"):
+        tc.LenslessCamera(sensor, mask, 5.0)
+    with pytest.raises(TypeError, match="sensor is a NoneType; give a thincam_jax.Sensor"):
+        tc.LenslessCamera(mask, None, 5.0)

@@ -1,0 +1,246 @@
+"""Predicted memory against what XLA allocates and against what a process really takes."""
+
+import importlib
+import json
+import os
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import thincam_jax as tc
+from helpers import ROOT
+from thincam_jax.imaging.operators import CropConvolution, kernel_shape
+from thincam_jax.lensless.cost import Cost, convolution_cost, psf_cost
+from thincam_jax.lensless.psf import sampling_of
+
+# The module itself: the package's attribute of that name is the function.
+PSF = importlib.import_module("thincam_jax.lensless.psf")
+CLOSED = ("geometric", "paraxial", "closed_form", "separable")
+PITCH, WIDTH = 5.5e-3, 5.632
+# From here on the prediction must be close from above too.
+_LARGE = 2**20
+
+
+def zones(**arguments):
+    return tc.FresnelZoneAperture(25.0, 0.3, **({"width": WIDTH} | arguments))
+
+
+def numbers(shape, pitch, kind=float):
+    values = np.random.default_rng(0).uniform(size=shape)
+    return tc.SampledMask(values.astype(kind), pitch)
+
+
+def in_precision(tree, dtype):
+    def convert(leaf):
+        if jnp.issubdtype(leaf.dtype, jnp.complexfloating):
+            return leaf.astype(jnp.complex64 if dtype == jnp.float32 else jnp.complex128)
+        return leaf.astype(dtype)
+
+    return jax.tree.map(convert, tree)
+
+
+def allocated(compiled):
+    """Bytes of the result and of all buffers in between."""
+    found = compiled.memory_analysis()
+    return found.temp_size_in_bytes + found.output_size_in_bytes
+
+
+def both(mask, shape, model, average, dtype, oversampling=None):
+    """Measured and predicted bytes of a PSF."""
+    camera = tc.LenslessCamera(mask, tc.Sensor(shape, PITCH), 6.5)
+    camera, wavelength, far = in_precision((camera, jnp.asarray(5e-4), jnp.asarray(250.0)), dtype)
+    path, grid = camera.path(wavelength, far), camera.sensor.grid
+    mask_shape, samples = sampling_of(camera, grid, model, average, oversampling, None)
+    lowered = PSF._psf.lower(camera.mask, grid, path, model, average, mask_shape, samples)
+    cost = psf_cost(
+        camera.mask,
+        grid,
+        model,
+        pixel_integration=average,
+        mask_shape=mask_shape,
+        oversampling=samples,
+        itemsize=jnp.dtype(dtype).itemsize,
+    )
+    return allocated(lowered.compile()), cost.bytes
+
+
+def require_agreement(measured, predicted, line=False):
+    """Of a line of pixels, whose few megabytes matter to nobody, less may be taken."""
+    assert measured <= 1.5 * predicted
+    if max(measured, predicted) > _LARGE and not line:
+        assert predicted <= 4 * measured
+
+
+@pytest.mark.parametrize("average", [False, True], ids=["points", "average"])
+@pytest.mark.parametrize("model", CLOSED)
+@pytest.mark.parametrize(
+    ("mask", "shape", "dtype"),
+    [
+        (zones(), (7, 9), jnp.float32),
+        (zones(), (48, 80), jnp.float32),
+        (zones(), (700, 300), jnp.float64),
+        (zones(), (40, 3000), jnp.float32),
+        (zones(profile="binary"), (1, 5000), jnp.float64),
+        (zones(profile="binary", harmonics=31), (300, 210), jnp.float32),
+    ],
+    ids=["tiny", "small", "medium", "flat", "line", "31 harmonics"],
+)
+def test_closed_forms(mask, shape, dtype, model, average):
+    """Most of the memory: chirp integrals of all nodes and orders, or the image."""
+    require_agreement(*both(mask, shape, model, average, dtype), line=min(shape) == 1)
+
+
+@pytest.mark.parametrize("average", [False, True], ids=["points", "average"])
+@pytest.mark.parametrize("model", ["geometric", "separable"])
+@pytest.mark.parametrize(
+    ("cells", "profile", "shape", "dtype"),
+    [
+        (8, "cosine", (48, 80), jnp.float64),
+        (128, "cosine", (700, 300), jnp.float32),
+        (128, "binary", (48, 80), jnp.float32),
+    ],
+)
+def test_display_pixels(cells, profile, shape, dtype, model, average):
+    mask = zones(profile=profile, pixel_pitch=WIDTH / cells)
+    require_agreement(*both(mask, shape, model, average, dtype))
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+@pytest.mark.parametrize(
+    ("mask", "shape", "average", "oversampling"),
+    [
+        (zones(width=0.5), (48, 80), False, 1),
+        (zones(width=0.5, pixel_pitch=0.01), (301, 200), True, 3),
+        (zones(width=2.0, profile="binary"), (200, 101), False, 3),
+        (numbers((60, 90), 0.011), (48, 80), False, 1),
+        (numbers((300, 200), 5.5e-3, complex), (120, 500), True, 3),
+        (numbers((700, 1000), 2e-3), (48, 80), False, 1),
+    ],
+    ids=["zones", "display", "binary", "numbers", "complex numbers", "fine numbers"],
+)
+@pytest.mark.parametrize("model", ["angular_spectrum", "rayleigh_sommerfeld"])
+def test_sampled_models(mask, shape, average, oversampling, dtype, model):
+    require_agreement(*both(mask, shape, model, average, dtype, oversampling))
+
+
+@pytest.mark.parametrize("average", [False, True], ids=["points", "average"])
+@pytest.mark.parametrize(
+    ("mask", "shape", "dtype"),
+    [
+        (numbers((60, 90), 0.011), (48, 80), jnp.float64),
+        (numbers((700, 1000), 2e-3), (300, 500), jnp.float32),
+        (numbers((300, 200), 5.5e-3, complex), (900, 70), jnp.float32),
+    ],
+)
+def test_shadow_of_numbers(mask, shape, dtype, average):
+    require_agreement(*both(mask, shape, "geometric", average, dtype))
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+@pytest.mark.parametrize(
+    ("sensor", "field", "images"),
+    [
+        ((48, 80), (48, 80), 1),
+        ((48, 80), (500, 601), 3),
+        ((301, 700), (48, 80), 10),
+        ((301, 700), (500, 601), 1),
+    ],
+)
+def test_convolutions(sensor, field, images, dtype):
+    """The spectrum made from a given PSF, and one application or its adjoint: fields included."""
+    kernel = jax.ShapeDtypeStruct(kernel_shape(sensor, field), dtype)
+    stacks = [jax.ShapeDtypeStruct((images, *shape), dtype) for shape in (field, sensor)]
+
+    def build(kernel):
+        return CropConvolution(kernel, jnp.asarray(0.01, dtype), sensor, field)
+
+    predicted = convolution_cost(sensor, field, images, jnp.dtype(dtype).itemsize).bytes
+    for stack, apply in zip(stacks, (lambda c, f: c(f), lambda c, f: c.adjoint(f)), strict=True):
+        whole = jax.jit(lambda kernel, f, apply=apply: apply(build(kernel), f))
+        compiled = whole.lower(kernel, stack).compile()
+        measured = allocated(compiled) + compiled.memory_analysis().argument_size_in_bytes
+        require_agreement(measured, predicted)
+
+
+# What a fresh process is told to do. It compiles first and then looks: `VmRSS` is what is held
+# before the run, `VmHWM` the most ever held, and the run raises it by what it allocates at once.
+PROCESS = """
+    import importlib, json, sys
+    import jax, jax.numpy as jnp
+    import thincam_jax as tc
+    from thincam_jax.cost import psf_cost
+    from thincam_jax.psf import sampling_of
+
+    def held(name):
+        lines = open("/proc/self/status").read().splitlines()
+        return next(int(line.split()[1]) * 1024 for line in lines if line.startswith(name))
+
+    model, n, average = sys.argv[1], int(sys.argv[2]), sys.argv[3] == "average"
+    camera = tc.LenslessCamera(
+        tc.FresnelZoneAperture(25.0, width=5.632), tc.Sensor((n, n), 5.5e-3), 6.5
+    )
+    path, grid = camera.path(5e-4, 250.0), camera.sensor.grid
+    mask_shape, samples = sampling_of(camera, grid, model, average, None, None)
+    psf = importlib.import_module("thincam_jax.lensless.psf")._psf
+    compiled = psf.lower(camera.mask, grid, path, model, average, mask_shape, samples).compile()
+    before, most = held("VmRSS"), held("VmHWM")
+    jax.block_until_ready(compiled(camera.mask, grid, path))
+    cost = psf_cost(
+        camera.mask, grid, model,
+        pixel_integration=average, mask_shape=mask_shape, oversampling=samples,
+    )
+    print(json.dumps([held("VmHWM") - before, cost.bytes, held("VmHWM") > most]))
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="needs Linux's /proc")
+@pytest.mark.parametrize(
+    ("model", "size", "kind"),
+    [("angular_spectrum", 1024, "points"), ("separable", 8192, "average")],
+)
+def test_peak_of_a_process(model, size, kind):
+    """The real peak, with whatever XLA allocates besides its own account (its FFTs' workspace).
+
+    Large enough that the compiler's memory, which the peak may hide in, is passed.
+    """
+    command = [sys.executable, "-c", textwrap.dedent(PROCESS), model, str(size), kind]
+    environment = {**os.environ, "JAX_PLATFORMS": "cpu", "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, cwd=ROOT)
+    assert done.returncode == 0, done.stderr
+    measured, predicted, passed_compiler = json.loads(done.stdout)
+    assert passed_compiler
+    assert measured <= 1.5 * predicted
+    assert predicted <= 4 * measured
+
+
+def test_repetition_costs_time_only():
+    grid = tc.Grid((48, 80), PITCH)
+    once = psf_cost(zones(), grid, "separable")
+    assert once.times(7) == Cost(7 * once.flops, once.bytes)
+
+
+@pytest.mark.parametrize("average", [False, True])
+def test_arithmetic_grows_as_it_should(average):
+    """Closed forms: lines plus a product; transforms: N log N; direct sum: both planes."""
+    mask = zones()
+
+    def flops(model, shape, **more):
+        return psf_cost(mask, tc.Grid(shape, PITCH), model, pixel_integration=average, **more).flops
+
+    plane = {"mask_shape": (1024, 1024), "oversampling": 3}
+    for model in CLOSED:
+        assert flops(model, (1, 4000)) == pytest.approx(10 * flops(model, (1, 400)), rel=0.05)
+        assert flops(model, (4000, 4000)) < 100 * flops(model, (400, 400))
+    direct = [flops("rayleigh_sommerfeld", (n, n), **plane) for n in (20, 40)]
+    assert direct[1] == 4 * direct[0] > flops("angular_spectrum", (20, 20), **plane)
+    order = [flops(m, (500, 300)) for m in CLOSED] + [
+        flops("angular_spectrum", (500, 300), **plane)
+    ]
+    assert order == sorted(order)

@@ -1,0 +1,408 @@
+"""From camera to PSF and OTF: the models side by side, their gradients, and what is refused."""
+
+import importlib
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxtyping
+import numpy as np
+import pytest
+
+import thincam_jax as tc
+from helpers import count_traces, finite_difference
+
+INF = float("inf")
+WAVELENGTH = 500e-6
+
+
+def camera_of(shape=(20, 27), pitch=0.03, *, beta=200.0, phase=0.3, width=0.5, distance=20.0, **m):
+    mask = tc.FresnelZoneAperture(beta, phase, width=width, **m)
+    return tc.LenslessCamera(mask, tc.Sensor(shape, pitch), distance)
+
+
+# --- OTF ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("model", "shape"),
+    [
+        ("geometric", (20, 27)),  # a sum of separable terms, as "separable" is
+        ("geometric", (1, 8)),
+        ("separable", (9, 12)),
+        ("angular_spectrum", (21, 8)),
+        ("angular_spectrum", (1, 1)),
+    ],
+)
+def test_otf_is_the_transform_of_the_psf(model, shape):
+    """Σ h e^{−2πj(ux+vy)} pitch² with x, y from the centre of the grid, sizes odd and even."""
+    camera = camera_of(shape, centre=(0.05, -0.08))
+    h = np.asarray(tc.psf(camera, wavelength=WAVELENGTH, model=model))
+    y, x = ((np.arange(n) - (n - 1) / 2) * 0.03 for n in shape)
+    v, u = (np.fft.fftshift(np.fft.fftfreq(n, 0.03)) for n in shape)
+    expected = np.exp(-2j * np.pi * np.outer(v, y)) @ h @ np.exp(-2j * np.pi * np.outer(x, u))
+    H = tc.otf(camera, wavelength=WAVELENGTH, model=model)
+    np.testing.assert_allclose(H, expected * 0.03**2, rtol=0, atol=1e-12)
+
+
+def rho_squared(camera):
+    return np.asarray(camera.sensor.grid.v)[:, None] ** 2 + np.asarray(camera.sensor.grid.u) ** 2
+
+
+def otf_at(phase, *, distance=6.5, beta=25.0, model="paraxial", shape=(30, 41)):
+    camera = camera_of(shape, 0.02, beta=beta, phase=phase, distance=distance)
+    return np.asarray(tc.otf(camera, wavelength=WAVELENGTH, model=model)), rho_squared(camera)
+
+
+def test_paraxial_otf_is_eq_3_30_corrected():
+    phase, beta, distance = 0.7, 25.0, 6.5
+    H, rho2 = otf_at(phase)
+    x = np.pi**2 * rho2 / beta
+    expected = np.pi / (2 * beta) * np.cos(np.pi * WAVELENGTH * distance * rho2) * np.sin(
+        x - phase
+    ) + np.pi / (16 * beta) * np.sin(x / 2 - 2 * phase)
+    expected[15, 20] += 3 / 8 * 30 * 41 * 0.02**2  # ⅜δ over the area of a frequency cell
+    # Eq 3.30 is of first order in ε: its gains 1/(1 ± ε) and ε² in the phase are left out.
+    eps = beta * WAVELENGTH * distance / np.pi
+    bound = np.pi / (2 * beta) * (eps + eps**2 * x)
+    assert np.all(np.abs(H - expected) <= bound + 1e-12)
+    assert np.abs(H - expected)[rho2 < 200].max() < 0.06 * np.abs(H[rho2 > 0]).max()
+    wrong_sign = np.pi / (2 * beta) * np.sin(x + phase) * np.cos(np.pi * WAVELENGTH * 6.5 * rho2)
+    assert np.abs(H - wrong_sign).max() > 0.5 * np.pi / (2 * beta)
+
+
+def test_closed_form_otf():
+    """Every cosine c·cos(γr² + ψ) of the exact PSF is cπ/γ·sin(π²ρ²/γ − ψ)."""
+    phase, beta = 0.7, 25.0
+    H, rho2 = otf_at(phase, distance=30.0, model="closed_form")
+    eps = beta * WAVELENGTH * 30.0 / np.pi
+    ap, am = 1 / (1 + eps), 1 / (1 - eps)
+    expected = sum(
+        c * np.pi / g * np.sin(np.pi**2 * rho2 / g - psi)
+        for c, g, psi in [
+            (ap / 4, beta * ap, phase),
+            (am / 4, beta * am, phase),
+            (ap * am / 8, beta * (ap + am), 2 * phase),
+        ]
+    )
+    expected[15, 20] += (1 / 4 + (ap**2 + am**2) / 16) * 30 * 41 * 0.02**2
+    np.testing.assert_allclose(H, expected, rtol=0, atol=1e-12)
+
+
+def scanned(distance, frequency):
+    """(OTF(3π/2) − OTF(π/2)) + j(OTF(0) − OTF(π)) along u, by `tc.otf` on 1×N sensors."""
+    pitch = 1 / (len(frequency) * (frequency[1] - frequency[0]))
+    responses = {
+        turns: tc.otf(
+            camera_of(
+                (1, len(frequency)), pitch, beta=25.0, phase=turns * np.pi / 2, distance=distance
+            ),
+            wavelength=WAVELENGTH,
+            model="paraxial",
+        )[0]
+        for turns in range(4)
+    }
+    return np.asarray(responses[3] - responses[1] + 1j * (responses[0] - responses[2]))
+
+
+@pytest.mark.parametrize(("distance", "zero"), [(6.5, 12.40), (5.0, 14.14)])
+def test_first_zero_of_the_fringe_scanned_response(distance, zero):
+    """Eq 3.31, corrected: cos(πλdρ²) = 0 at ρ = 1/√(2λd); 12.40 and 14.14 cycles/mm.
+
+    The package keeps both orders' own chirps kβ(1 − kε), so that the response there is a minimum of
+    modulus, not an exact zero; its product with the conjugate geometric response changes sign.
+    """
+    frequency = np.arange(-3000, 3000) * 0.01
+    response = scanned(distance, frequency)
+    compensated = (response * np.exp(-1j * np.pi**2 * frequency**2 / 25.0)).real
+    positive = frequency > 1.0
+    crossing = np.flatnonzero(np.diff(np.sign(compensated[positive])))[0]
+    found = frequency[positive][crossing] + 0.005
+    assert abs(found - zero) < 0.05
+    assert abs(1 / np.sqrt(2 * WAVELENGTH * distance) - zero) < 0.005
+
+
+@pytest.mark.parametrize("distance", [6.5, 5.0])
+def test_eq_3_31_and_3_49_corrected(distance):
+    """From `paraxial_response`: (π/β)e^{jX}cos(πλdρ²), and the pair's difference with its X/2."""
+    from thincam_jax.lensless.propagation import paraxial_response
+
+    beta, rho2 = 25.0, np.linspace(0.0, 900.0, 301)
+    x, turn = np.pi**2 * rho2 / beta, np.cos(np.pi * WAVELENGTH * distance * rho2)
+    at = {
+        k: np.asarray(
+            paraxial_response(jnp.asarray(rho2), beta, k * np.pi / 2, WAVELENGTH, distance)
+        )
+        for k in range(4)
+    }
+    scan = at[3] - at[1] + 1j * (at[0] - at[2])
+    np.testing.assert_allclose(scan, np.pi / beta * np.exp(1j * x) * turn, rtol=0, atol=1e-13)
+    pair = np.pi / (2 * beta) * turn * (np.sin(x) - np.cos(x)) + np.pi / (8 * beta) * np.sin(x / 2)
+    np.testing.assert_allclose(at[0] - at[3], pair, rtol=0, atol=1e-13)
+
+
+# --- gradients ------------------------------------------------------------------------------------
+
+NAMES = ("beta", "phase", "distance", "wavelength", "object_distance", "width")
+SHAPE, PITCH = (9, 12), 0.06
+WEIGHT = jnp.asarray(np.random.default_rng(11).normal(size=SHAPE))
+POINT = {
+    k: jnp.asarray(v) for k, v in zip(NAMES, (200.0, 0.3, 20.0, 500e-6, 60.0, 0.43), strict=True)
+}
+
+
+def weighted(p, model, pixel_integration=False, transform=False):
+    """A fixed random sum over the PSF, or over the real part of the OTF."""
+    camera = camera_of(
+        SHAPE,
+        PITCH,
+        beta=p["beta"],
+        phase=p["phase"],
+        width=p["width"],
+        distance=p["distance"],
+        centre=(0.02, -0.03),
+    )
+    arguments = {
+        "wavelength": p["wavelength"],
+        "object_distance": p["object_distance"],
+        "model": model,
+        "pixel_integration": pixel_integration,
+    }
+    h = tc.otf(camera, **arguments).real if transform else tc.psf(camera, **arguments)
+    return jnp.sum(h * WEIGHT)
+
+
+def steps(p):
+    """A step for each parameter: 0.003 rad over the rate at which the fastest phase turns with it.
+
+    The fastest are those of the edges' waves, π(x−ξ)²/(λd) with |x−ξ| ≤ L = the sensor's half
+    diagonal plus the mask's: 200 rad here, whose rounding is 5e-14 rad, so that 0.003 rad (see
+    `finite_difference`) leaves some 1e-10. In d and λ that phase turns by itself over d and over λ;
+    in t the spherical wave's π ξ²/(λt) does; in β the zones', βr²; in the width the edge moves
+    through the fringes, 2π L/(λd) per mm.
+    """
+    reach = 0.5 * np.hypot(*SHAPE) * PITCH + float(p["width"])
+    fringe = float(np.pi * reach**2 / (p["wavelength"] * p["distance"]))
+    rates = {
+        "beta": 0.5 * float(p["width"]) ** 2,
+        "phase": 1.0,
+        "distance": fringe / float(p["distance"]),
+        "wavelength": fringe / float(p["wavelength"]),
+        "object_distance": fringe * float(p["distance"] / p["object_distance"] ** 2),
+        "width": 2 * fringe / reach,
+    }
+    return {name: 0.003 / rate for name, rate in rates.items()}
+
+
+def check_gradient(model, rtol, zero=(), **options):
+    function = jax.jit(lambda p: weighted(p, model, **options))
+    exact = jax.jit(jax.grad(function))(POINT)
+    for name, step in steps(POINT).items():
+        direction = {k: jnp.ones(()) if k == name else jnp.zeros(()) for k in POINT}
+        difference = finite_difference(function, POINT, direction, step)
+        if name in zero:
+            assert exact[name] == 0.0 and abs(difference * step) < 1e-13, name
+        else:
+            assert abs(exact[name] * step) > 1e-9, name  # something to compare
+            np.testing.assert_allclose(exact[name], difference, rtol=rtol, err_msg=name)
+
+
+@pytest.mark.parametrize(
+    ("model", "zero"),
+    [
+        ("geometric", ("wavelength", "width")),  # a step at the edge of the shadow
+        ("paraxial", ("width",)),  # the mask has no edge
+        ("closed_form", ("width",)),
+        ("separable", ()),
+    ],
+)
+def test_gradients_of_the_closed_forms(model, zero):
+    check_gradient(model, 1e-7, zero)
+
+
+@pytest.mark.parametrize("model", ["angular_spectrum", "rayleigh_sommerfeld"])
+def test_gradients_of_the_sampled_models(model):
+    check_gradient(model, 1e-7)
+
+
+def test_gradient_of_pixel_averages():
+    """Where every parameter moves by its own step, in forward mode: quick to compile."""
+    function = jax.jit(lambda p: weighted(p, "separable", pixel_integration=True))
+    direction = {k: jnp.asarray(v) for k, v in steps(POINT).items()}
+    slope = jax.jit(lambda p, v: jax.jvp(function, (p,), (v,))[1])(POINT, direction)
+    assert abs(slope) > 1e-4
+    np.testing.assert_allclose(slope, finite_difference(function, POINT, direction, 0.3), rtol=1e-7)
+
+
+@pytest.mark.parametrize(("model", "zero"), [("paraxial", ("width",)), ("angular_spectrum", ())])
+def test_gradients_of_the_otf(model, zero):
+    check_gradient(model, 1e-7, zero, transform=True)
+
+
+# --- jit, vmap and compilation --------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("model", ["separable", "geometric"])
+def test_vmap_is_one_by_one(model):
+    betas = jnp.array([150.0, 200.0, 320.0])
+
+    def one(beta):
+        return tc.psf(
+            camera_of(beta=beta), wavelength=WAVELENGTH, object_distance=60.0, model=model
+        )
+
+    together = jax.jit(jax.vmap(one))(betas)
+    np.testing.assert_allclose(together[2], one(betas[2]), rtol=0, atol=1e-13)
+    assert np.abs(together[0] - together[2]).max() > 0.3
+
+
+def test_changing_a_value_compiles_nothing():
+    """Neither in the user's jit nor in the one inside `tc.psf` and `tc.otf`."""
+    module = importlib.import_module("thincam_jax.lensless.psf")
+
+    @count_traces
+    def h(beta, distance, wavelength, t):
+        camera = camera_of(beta=beta, distance=distance)
+        return tc.psf(camera, wavelength=wavelength, object_distance=t, model="paraxial")
+
+    compiled = jax.jit(h)
+    values = [(200.0, 20.0, 5e-4, 60.0), (190.0, 21.0, 6e-4, 70.0), (150.0, 3.0, 4e-4, 1e9)]
+    first, *_ = [compiled(*map(jnp.asarray, v)) for v in values]
+    assert h.traces == 1
+    for evaluate, inner in ((tc.psf, module._psf), (tc.otf, module._otf)):
+        sizes = []
+        for beta, distance, wavelength, t in [*values, (120, 2, 3e-4, INF)]:
+            camera = camera_of(beta=beta, distance=distance)
+            evaluate(camera, wavelength=wavelength, object_distance=t, model="paraxial")
+            sizes.append(inner._cache_size())
+        assert len(set(sizes)) == 1, sizes
+    once = tc.psf(camera_of(), wavelength=5e-4, object_distance=60.0, model="paraxial")
+    np.testing.assert_allclose(first, once, rtol=0, atol=1e-14)
+
+
+# --- bad and extreme input ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"wavelength": 0.0}, r"wavelength = 0.0 mm is not positive; give wavelength > 0 in mm"),
+        ({"wavelength": -5e-4}, "wavelength = -0.0005 mm"),
+        ({"wavelength": float("nan")}, "wavelength is NaN; give a number in mm"),
+        ({"wavelength": INF}, "wavelength is infinite"),
+        ({"object_distance": 0.0}, "object_distance = 0.0 mm is not positive"),
+        ({"object_distance": float("nan")}, "object_distance is NaN"),
+        ({"oversampling": 3}, "'separable' is a closed form: leave oversampling"),
+        ({"oversampling": 4, "model": "angular_spectrum"}, "oversampling = 4: give an odd number"),
+        ({"oversampling": 0, "model": "angular_spectrum"}, "oversampling = 0: give an odd number"),
+        ({"oversampling": -1, "model": "rayleigh_sommerfeld"}, "oversampling = -1: give an odd"),
+    ],
+)
+def test_refusals(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        tc.psf(camera_of(), **({"wavelength": WAVELENGTH} | arguments))
+
+
+@pytest.mark.parametrize("distance", [0.0, -6.5, float("nan"), INF])
+def test_impossible_distance(distance):
+    with pytest.raises(ValueError, match="distance .*mm"):
+        camera_of(distance=distance)
+
+
+@pytest.mark.parametrize("evaluate", [tc.psf, tc.otf])
+def test_unknown_model_lists_the_known(evaluate, monkeypatch):
+    """As a user meets it, without the type checks of the tests."""
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
+    listed = ", ".join(f"'{m}'" for m in tc.MODELS)
+    with pytest.raises(
+        ValueError, match=f"model = 'fraunhofer' is unknown; choose one of {listed}"
+    ):
+        evaluate(camera_of(), wavelength=WAVELENGTH, model="fraunhofer")
+    assert len(tc.MODELS) == 6
+
+
+def test_text_for_a_length():
+    with pytest.raises(
+        TypeError, match="wavelength = '500 nm' is not a real number; give it in mm"
+    ):
+        tc.psf(camera_of(), wavelength="500 nm")
+
+
+@pytest.mark.parametrize("model", ["geometric", "paraxial", "closed_form", "separable"])
+@pytest.mark.parametrize("shape", [(1, 1), (1, 7)])
+def test_thin_sensors_are_cuts_of_wide_ones(model, shape):
+    wide = tc.psf(camera_of((5, 7)), wavelength=WAVELENGTH, model=model)
+    thin = tc.psf(camera_of(shape), wavelength=WAVELENGTH, model=model)
+    rows = slice(None) if shape[0] == 5 else slice(2, 3)
+    columns = slice(None) if shape[1] == 7 else slice(3, 4)
+    np.testing.assert_allclose(thin, wide[rows, columns], rtol=0, atol=1e-13)
+
+
+def test_mask_wider_than_its_plane_inside_jit():
+    """A traced width cannot choose the plane: that is the sensor's, too small for this mask."""
+
+    def energy(width):
+        camera = camera_of(width=width)
+        return jnp.sum(tc.psf(camera, wavelength=WAVELENGTH, model="angular_spectrum"))
+
+    compiled = jax.jit(energy)
+    assert compiled(jnp.asarray(0.5)) > 0
+    with pytest.raises(Exception, match="wider than the plane that samples it; give a larger"):
+        compiled(jnp.asarray(0.7)).block_until_ready()
+    assert energy(0.7) > compiled(jnp.asarray(0.5))  # known outside jit: the plane grows
+
+
+def test_sizes_that_do_not_fit_are_refused_at_once():
+    """10⁶×10⁶ pixels: the estimate, the memory there is, and what to do; before any work."""
+    camera = camera_of((10**6, 10**6), 1e-3)
+    with pytest.raises(
+        MemoryError, match=r"1000000×1000000 pixels by model 'separable' needs about 7.3 TiB"
+    ):
+        tc.psf(camera, wavelength=WAVELENGTH)
+    with pytest.raises(
+        MemoryError, match="'angular_spectrum' needs about .* are free; use a smaller"
+    ):
+        tc.psf(
+            camera_of((3000, 2000)),
+            wavelength=WAVELENGTH,
+            model="angular_spectrum",
+            oversampling=99,
+        )
+
+
+def test_sampled_mask_needs_a_sampled_model():
+    camera = tc.LenslessCamera(tc.SampledMask(np.ones((3, 4)), 0.1), tc.Sensor((4, 5), 0.1), 5.0)
+    for model in ("separable", "closed_form", "paraxial"):
+        with pytest.raises(
+            TypeError, match=f"{model}.*SampledMask.*'angular_spectrum' or 'rayleigh_"
+        ):
+            tc.psf(camera, wavelength=WAVELENGTH, model=model)
+
+
+def test_display_pixels_need_an_edge():
+    with pytest.raises(ValueError, match="'closed_form' has no display pixels; drop pixel_pitch"):
+        tc.psf(camera_of(pixel_pitch=0.1), wavelength=WAVELENGTH, model="closed_form")
+
+
+def test_grid_replaces_the_sensor():
+    grid = tc.Grid((3, 4), 0.05)
+    elsewhere = tc.psf(camera_of(), wavelength=WAVELENGTH, model="geometric", grid=grid)
+    same = tc.psf(camera_of((3, 4), 0.05), wavelength=WAVELENGTH, model="geometric")
+    np.testing.assert_array_equal(elsewhere, same)
+
+
+def test_leaves_are_arrays():
+    """Every number of the camera is a leaf that can be differentiated, none is frozen."""
+    leaves = jax.tree.leaves(eqx.filter(camera_of(), eqx.is_inexact_array))
+    assert len(leaves) == len(jax.tree.leaves(camera_of())) == 8
+
+
+def test_mask_wider_than_the_sensor_inside_jit():
+    """Its plane's size must be given there; it is then the eager result."""
+    camera = tc.LenslessCamera(
+        tc.FresnelZoneAperture(25.0, 0.3, width=0.4), tc.Sensor((8, 7), 0.01), 6.5
+    )
+    how = {"wavelength": WAVELENGTH, "model": "angular_spectrum"}
+    expected = tc.psf(camera, **how)
+    found = jax.jit(lambda c: tc.psf(c, mask_shape=(40, 41), **how))(camera)
+    np.testing.assert_allclose(found, expected, rtol=1e-10)

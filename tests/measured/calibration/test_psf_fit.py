@@ -1,0 +1,153 @@
+"""PSF fits: recovery from noisy pictures, the errors claimed, what cannot be told apart."""
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import thincam_jax as tc
+from thincam_jax.measured.calibration import fit_psf, problem
+from thincam_jax.units import nm, um
+
+LIGHT = {"object_distance": 100.0, "wavelength": 500 * nm}
+
+
+def camera(
+    beta=30.0, distance=3.0, phase=0.0, centre=(0.0, 0.0), *, shape=(112, 133), pitch=20 * um
+):
+    mask = tc.FresnelZoneAperture(beta, phase, width=2.0, centre=centre)
+    return tc.LenslessCamera(mask, tc.Sensor(shape, pitch), distance)
+
+
+TRUE = camera(phase=1.0, centre=(0.05, -0.03))
+START = camera(27.0, 3.3)
+
+
+def picture(rig, seed=0, snr_db=30.0, **light):
+    h = tc.psf(rig, pixel_integration=True, **(LIGHT | light))
+    return tc.GaussianNoise(snr_db).add(jax.random.key(seed), h, None)
+
+
+def deviations(fit, rig):
+    """Of each value from the truth, in standard errors."""
+    truth = {
+        "beta": rig.mask.beta,
+        "phase": rig.mask.phase,
+        "centre_y": rig.mask.centre[0],
+        "centre_x": rig.mask.centre[1],
+        "distance": rig.distance,
+        "background": 0.0,
+        "gain": 1.0,
+    }
+    return np.array([float((fit.values[n] - truth[n]) / fit.standard_errors[n]) for n in fit.names])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("seed", "beta", "distance"), [(0, 0.9, 1.1)])
+def test_the_thesis_camera_ten_per_cent_off(seed, beta, distance):
+    """1024² pixels, 30 dB: β to 0.1 %, d to 1 %, the centre to 0.05 pixel, and far better."""
+    place = np.random.default_rng(seed).uniform(-0.06, 0.06, 2)  # up to 11 pixels
+    light = {"object_distance": 250.0, "wavelength": 500 * nm}
+
+    def rig(b, d, phase=0.0, centre=(0.0, 0.0)):
+        mask = tc.FresnelZoneAperture(b, phase, width=5.632, centre=centre)
+        return tc.LenslessCamera(mask, tc.Sensor((1024, 1024), 5.5 * um), d)
+
+    true = rig(25.0, 6.5, -2.0 + seed, place)
+    image = 100.0 + 4000.0 * picture(true, seed, **light)
+    fit = fit_psf(image, rig(25.0 * beta, 6.5 * distance), **light)
+    assert fit.status == "ok"
+    np.testing.assert_allclose(fit.camera.mask.beta, 25.0, rtol=1e-5)
+    np.testing.assert_allclose(fit.camera.distance, 6.5, rtol=1e-4)
+    np.testing.assert_allclose(fit.centre_pixels, place / (5.5 * um), atol=1e-3)
+    np.testing.assert_allclose(fit.gain, 4000.0, rtol=1e-3)
+    np.testing.assert_allclose(fit.background, 100.0, atol=1.0)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.thorough
+def test_values_are_right_within_their_errors(seed):
+    fit = fit_psf(picture(TRUE, seed), START, **LIGHT)
+    assert (fit.status, fit.reasons) == ("ok", ())
+    assert np.all(np.abs(deviations(fit, TRUE)) < 4.5)
+    assert float(fit.standard_errors["distance"]) < 0.01
+    noise = 10 ** (-30 / 20) * math.sqrt(np.mean(np.square(picture(TRUE, snr_db=300.0))))
+    np.testing.assert_allclose(np.std(fit.residual), noise, rtol=0.03)
+
+
+@pytest.mark.thorough
+def test_errors_grow_with_the_noise():
+    """Seven unknowns, 10 dB: the errors claimed still cover those made."""
+    fit = fit_psf(picture(TRUE, 3, snr_db=12.0), START, **LIGHT)
+    assert np.all(np.abs(deviations(fit, TRUE)) < 4.5)
+    quiet = fit_psf(picture(TRUE, 3), START, **LIGHT)
+    ratio = float(fit.standard_errors["phase"] / quiet.standard_errors["phase"])
+    np.testing.assert_allclose(ratio, 10 ** (18 / 20), rtol=0.1)
+
+
+@pytest.mark.thorough
+def test_wavelength_and_distance_of_a_plane_wave_are_one():
+    light = {"object_distance": math.inf, "wavelength": 500 * nm}
+    fit = fit_psf(
+        picture(TRUE, **light),
+        TRUE,
+        parameters=("distance", "wavelength", "background", "gain"),
+        search=0.02,
+        **light,
+    )
+    assert fit.status == "ambiguous"
+    assert "distance and wavelength cannot be told apart" in fit.reasons[0]
+    d, w = (fit.names.index(n) for n in ("distance", "wavelength"))
+    np.testing.assert_allclose(fit.correlation[d, w], -1.0, atol=1e-6)
+    np.testing.assert_allclose(fit.wavelength * fit.camera.distance, 3.0 * 500 * nm, rtol=1e-3)
+
+
+@pytest.mark.thorough
+def test_another_picture_is_told():
+    noise = np.random.default_rng(0).normal(size=TRUE.sensor.shape)
+    fit = fit_psf(noise, START, **LIGHT)
+    assert fit.status in ("poor_fit", "not_converged")
+    assert any("contrast" in line for line in fit.reasons)
+
+
+def test_new_values_do_not_compile_again():
+    fit_psf(picture(TRUE, 4), START, **LIGHT)
+    sizes = [f._cached._cache_size() for f in (problem._least_squares, problem.model)]
+    fit_psf(2.0 * picture(TRUE, 5), camera(29.0, 3.1), object_distance=103.0, wavelength=510 * nm)
+    assert sizes == [f._cached._cache_size() for f in (problem._least_squares, problem.model)]
+
+
+def test_residuals_follow_a_direct_sum():
+    """The residual against background + gain·h of the camera that the steps describe."""
+    names = problem.unknown_names(("beta", "centre", "distance", "object_distance", "gain"))
+    start = problem.Setting(TRUE, *map(jnp.asarray, (500 * nm, 0.01, 0.2, 3.0)))
+    steps = jnp.asarray([0.01, 0.5, -1.0, 0.02, 0.001, 0.1])
+    there = start.moved(names, steps)
+    d = 3.0 * math.exp(0.02)
+    nearness = 0.01 + 0.001 / 3.0
+    beta = 30.0 * math.exp(0.01) * ((1 + d * nearness) / 1.03) ** 2
+    rig = camera(beta, d, 1.0, (0.05 + 0.5 * 0.02, -0.03 - 0.02))
+    h = tc.psf(rig, wavelength=500 * nm, object_distance=1 / nearness)
+    np.testing.assert_allclose(there.image(False), 0.2 + 3.1 * h, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"psf_image": np.ones((3, 4))}, "give real numbers on the"),
+        ({"psf_image": np.full((112, 133), np.nan)}, "not finite"),
+        ({"psf_image": np.zeros((112, 133))}, "0 in every pixel"),
+        ({"parameters": ("beta", "tilt")}, "'tilt' is unknown"),
+        ({"parameters": ()}, "at least one name"),
+        ({"search": 0.9}, "too wide"),
+        ({"camera": camera(0.5)}, "fringes"),
+    ],
+)
+def test_refusals_take_one_line(change, message):
+    image = np.random.default_rng(0).uniform(size=(112, 133))
+    given = {"psf_image": image, "camera": START} | LIGHT | change
+    with pytest.raises(ValueError, match=message) as caught:
+        fit_psf(**given)
+    assert "\n" not in str(caught.value)

@@ -1,0 +1,149 @@
+"""τ found from the captures: against a scan of the true error, of the true risk, of the misfit."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import thincam_jax as tc
+from thincam_jax.reconstruction import psf_problem
+from thincam_jax.reconstruction.choose_tau import (
+    discrepancy_tau,
+    learn_tau,
+    mean_squared_error,
+    sure_tau,
+    with_tau,
+)
+from thincam_jax.reconstruction.drive import drive
+from thincam_jax.reconstruction.problem import misfit
+from thincam_jax.reconstruction.tv_method import AdmmTotalVariation
+
+SENSOR, SIGMA = (30, 37), 0.02
+
+
+def scene(seed=0):
+    """Even patches on a dark ground, as large as the whole field, (1, 1, y, x)."""
+    random, image = np.random.default_rng(seed), np.zeros((1, 1, 38, 45))
+    for _ in range(5):
+        top, left = random.integers(4, 24), random.integers(4, 30)
+        image[..., top : top + 9, left : left + 11] += random.uniform(0.3, 1)
+    return jnp.asarray(image)
+
+
+def _psf(seed=0):
+    psf = np.random.default_rng(20 + seed).random((9, 9)) ** 4
+    return psf / psf.sum()
+
+
+def posed(seed=0, tau=2.0):
+    """A blurred, cropped capture with noise, and the truth."""
+    random = np.random.default_rng(10 + seed)
+    psf = _psf(seed)
+    truth = scene(seed)
+    empty = psf_problem(jnp.zeros((1, *SENSOR)), jnp.asarray(psf)[None], noise_variance=1.0)
+    assert empty.image_shape == truth.shape
+    capture = empty.operators[0](truth) + SIGMA * random.normal(size=(1, *SENSOR))
+    problem = psf_problem(capture, jnp.asarray(psf)[None], noise_variance=SIGMA**2, tau=tau)
+    return problem, truth
+
+
+def solved(problem, iterations=200):
+    method = AdmmTotalVariation(problem, relaxation=1.5)
+    first = jnp.zeros(problem.image_shape)
+    return drive(method, first, iterations=iterations, tolerance=1e-7).image
+
+
+def test_discrepancy_makes_the_residual_as_large_as_the_noise():
+    problem, _ = posed(tau=20.0)
+    chosen = discrepancy_tau(problem, jnp.zeros(problem.image_shape), iterations=100, solves=12)
+    pixels = SENSOR[0] * SENSOR[1]
+    assert 2 * float(misfit(chosen.problem, chosen.image).sum()) == pytest.approx(pixels, rel=0.01)
+    # A start a hundred times off finds the same.
+    other, _ = posed(tau=0.5)
+    again = discrepancy_tau(other, jnp.zeros(problem.image_shape), iterations=100, solves=12)
+    assert float(again.problem.tau) == pytest.approx(float(chosen.problem.tau), rel=0.05)
+
+
+def test_discrepancy_counts_valid_pixels_only():
+    problem, _ = posed()
+    masked = jnp.ones((1, *SENSOR)).at[:, :15].set(0.0)
+    weights = (masked / SIGMA**2,)
+    half = type(problem)(problem.operators, problem.captures, tau=problem.tau, weights=weights)
+    chosen = discrepancy_tau(half, jnp.zeros(problem.image_shape), iterations=60, solves=10)
+    assert 2 * float(misfit(chosen.problem, chosen.image).sum()) == pytest.approx(15 * 37, rel=0.03)
+
+
+def test_the_risk_estimate_finds_the_least_true_risk_on_the_sensor(key):
+    problem, truth = posed()
+    clean = problem.operators[0](truth)
+
+    def risk(tau):
+        image = solved(with_tau(problem, tau))
+        return float(jnp.sum((problem.operators[0](image) - clean) ** 2)) / SIGMA**2
+
+    chosen = sure_tau(problem, jnp.zeros(problem.image_shape), key, iterations=100, solves=12)
+    scan = [risk(float(problem.tau) * f) for f in np.geomspace(0.05, 20, 13)]
+    assert risk(float(chosen.problem.tau)) < 1.15 * min(scan)
+    # The estimate itself is the risk, to the accuracy of one probe.
+    tau, estimate = chosen.tried[-1]
+    assert estimate == pytest.approx(risk(tau), abs=0.15 * SENSOR[0] * SENSOR[1])
+
+
+@pytest.mark.thorough
+def test_learning_finds_the_least_error_of_known_images():
+    pairs = [posed(seed, tau=0.3) for seed in (0, 1)]
+    problems, truths = zip(*pairs, strict=True)
+    factor, course = learn_tau(problems, truths, steps=12, iterations=200)
+
+    def error(factor):
+        images = [solved(with_tau(p, p.tau * factor)) for p in problems]
+        return np.mean([float(mean_squared_error(*p)) for p in zip(images, truths, strict=True)])
+
+    assert course[-1] < 0.95 * course[0]
+    scan = [error(f) for f in np.geomspace(0.5, 20, 9)]
+    assert error(float(factor)) < 1.02 * min(scan)
+
+
+@pytest.mark.parametrize("rule", ["discrepancy", "sure"])
+def test_the_entry_point_takes_a_rule(rule):
+    """A τ a hundred times too small or found: the found one is nearer to the truth."""
+    problem, truth = posed()
+    psf = jnp.asarray(_psf(0))[None]
+    given = {"method": "admm_tv", "noise_variance": SIGMA**2, "field_shape": (38, 45)}
+    found = tc.reconstruct(problem.captures[0], psf, tau=rule, **given)
+    poor = tc.reconstruct(problem.captures[0], psf, tau=0.02, **given)
+    errors = [float(mean_squared_error(r.image, truth[:, 0])) for r in (found, poor)]
+    assert found.status in ("converged", "iterations_exhausted")
+    assert errors[0] < 0.8 * errors[1]
+
+
+def test_an_unknown_rule_is_refused():
+    problem, _ = posed()
+    with pytest.raises(ValueError, match="'discrepancy', 'sure'"):
+        tc.reconstruct(
+            problem.captures[0], jnp.asarray(_psf(0))[None], method="admm_tv", tau="guess"
+        )
+
+
+def test_a_search_needs_a_positive_start():
+    problem, _ = posed()
+    with pytest.raises(ValueError, match="give tau > 0"):
+        discrepancy_tau(with_tau(problem, 0.0), jnp.zeros(problem.image_shape))
+
+
+def test_the_gradient_of_the_error_in_tau_is_that_of_differences():
+    problem, truth = posed()
+
+    def error(logarithm):
+        from thincam_jax.reconstruction import solve_fixed_point
+
+        scaled = with_tau(problem, problem.tau * jnp.exp(logarithm))
+        first = jnp.zeros(problem.image_shape)
+        image = solve_fixed_point(scaled, first, iterations=3000, tolerance=1e-12, relaxation=1.5)
+        return mean_squared_error(image.image, truth)
+
+    at = jnp.asarray(0.3)
+    slope = jax.grad(error)(at)
+    step = 1e-4
+    difference = (error(at + step) - error(at - step)) / (2 * step)
+    np.testing.assert_allclose(slope, difference, rtol=1e-3)

@@ -1,0 +1,149 @@
+"""What is minimised, against dense matrices and loops; and what is refused."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from reconstruction import dense, scenes
+
+from helpers import count_traces, finite_difference
+from thincam_jax.imaging.operators import CropConvolution, kernel_shape, window_shape
+from thincam_jax.reconstruction.problem import (
+    Deconvolution,
+    misfit,
+    objective,
+    residuals,
+    uniform_level,
+)
+from thincam_jax.reconstruction.total_variation import TotalVariation
+
+FIELD, SENSORS = (5, 8), ((7, 6), (4, 9))
+RNG = np.random.default_rng(2)
+WINDOW = tuple(
+    max(sizes)
+    for sizes in zip(
+        *(window_shape(s, FIELD, kernel_shape(s, FIELD)) for s in SENSORS), strict=True
+    )
+)
+
+
+def operator(kernel, sensor):
+    return CropConvolution(jnp.asarray(kernel), 0.5, sensor, FIELD, summed=1, window=WINDOW)
+
+
+def example(channels=2, planes=3, kernel_channels=2):
+    """Two captures of a batch of two, with weights; and their matrices (channel, pixel, sample)."""
+    kernels = [RNG.normal(size=(kernel_channels, planes, *kernel_shape(s, FIELD))) for s in SENSORS]
+    captures = [RNG.normal(size=(2, channels, *s)) for s in SENSORS]
+    weights = [RNG.uniform(size=(channels, *s)) for s in SENSORS]
+    problem = Deconvolution(
+        [operator(k, s) for k, s in zip(kernels, SENSORS, strict=True)],
+        [jnp.asarray(c) for c in captures],
+        tau=0.3,
+        weights=weights,
+        variation=TotalVariation("anisotropic", depth_weight=0.4),
+    )
+    matrices = []
+    for kernel, sensor in zip(kernels, SENSORS, strict=True):
+        wide = np.broadcast_to(kernel, (channels, *kernel.shape[1:]))
+        matrices.append(
+            np.stack([np.hstack([dense.matrix(k, sensor, FIELD, 0.5) for k in c]) for c in wide])
+        )
+    return problem, list(zip(matrices, captures, weights, strict=True))
+
+
+@pytest.mark.parametrize("kernel_channels", [1, 2])
+def test_the_objective_by_matrices(kernel_channels):
+    """Σ ½ w (Hf − g)² and τ TV, of each member of a batch."""
+    problem, parts = example(kernel_channels=kernel_channels)
+    assert problem.image_shape == (2, 2, 3, *FIELD)
+    image = RNG.normal(size=problem.image_shape)
+    psi = dense.slopes((3, *FIELD), 0.4)
+    values, gaps = objective(problem, jnp.asarray(image)), residuals(problem, jnp.asarray(image))
+    for n in range(2):
+        flat = image[n].reshape(2, -1)
+        mine = [(a, g[n].reshape(2, -1), w.reshape(2, -1)) for a, g, w in parts]
+        expected = dense.objective(flat, mine, 0.3, psi, "anisotropic", False)
+        assert float(values[n]) == pytest.approx(expected, rel=1e-12)
+        for (a, g, _), gap in zip(mine, gaps, strict=True):
+            difference = np.einsum("cps,cs->cp", a, flat) - g
+            np.testing.assert_allclose(gap[n].reshape(2, -1), difference, atol=1e-12)
+
+
+def test_the_even_image_is_the_best_of_all_even_ones():
+    """Of each channel of each member: the misfit has no slope there, and rises on both sides."""
+    problem, _ = example()
+    level = uniform_level(problem)
+    assert level.shape == (2, 2)
+
+    def cost(levels):
+        even = levels[..., None, None, None]
+        return jnp.sum(misfit(problem, jnp.broadcast_to(even, problem.image_shape)))
+
+    np.testing.assert_allclose(jax.grad(cost)(level), 0, atol=1e-10)
+    for sign in (-1, 1):
+        assert float(cost(level + 0.1 * sign)) > float(cost(level))
+    # without light there is none
+    dark = Deconvolution(
+        [operator(np.zeros((1, 1, *kernel_shape(SENSORS[0], FIELD))), SENSORS[0])],
+        [jnp.ones((1, *SENSORS[0]))],
+        tau=0.0,
+    )
+    np.testing.assert_array_equal(uniform_level(dark), [0.0])
+
+
+def test_gradient_and_traces():
+    """Of the objective with respect to τ, image and captures; once compiled."""
+    problem, _ = example()
+    image = jnp.asarray(RNG.normal(size=problem.image_shape))
+    slope = jnp.asarray(RNG.normal(size=image.shape))
+
+    def total(image):
+        return jnp.sum(objective(problem, image))
+
+    expected = finite_difference(total, image, slope, 1e-5)
+    np.testing.assert_allclose(jnp.vdot(jax.grad(total)(image), slope), expected, rtol=1e-8)
+    counted = count_traces(objective)
+    compiled = jax.jit(counted)
+    for factor in (1.0, 3.0):
+        value = compiled(scenes.rescaled(problem, factor), factor * image)
+    np.testing.assert_allclose(value, 9 * objective(problem, image), rtol=1e-10)
+    assert counted.traces == 1
+
+
+def test_counts_and_single_precision():
+    """Raw counts become real numbers; τ and weights take the captures' precision."""
+    counts = RNG.integers(0, 4000, size=(1, *SENSORS[0]))
+    kernel = RNG.uniform(size=(1, 1, *kernel_shape(SENSORS[0], FIELD)))
+    whole = Deconvolution([operator(kernel, SENSORS[0])], [counts], tau=0.7)
+    assert whole.captures[0].dtype == jnp.float64 and float(whole.tau) == 0.7
+    single = Deconvolution(
+        [operator(kernel.astype(np.float32), SENSORS[0])],
+        [jnp.asarray(counts, jnp.float32)],
+        tau=0.7,
+    )
+    assert single.tau.dtype == jnp.float32 and single.weights[0].dtype == jnp.float32
+    image = jnp.ones(single.image_shape, jnp.float32)
+    assert objective(single, image).dtype == jnp.float32
+
+
+def test_what_is_refused():
+    kernel = RNG.uniform(size=(1, 1, *kernel_shape(SENSORS[0], FIELD)))
+    first = operator(kernel, SENSORS[0])
+    second = operator(RNG.uniform(size=(1, 1, *kernel_shape(SENSORS[1], FIELD))), SENSORS[1])
+    planes = operator(np.repeat(kernel, 2, axis=1), SENSORS[0])
+    coloured = operator(np.repeat(kernel, 3, axis=0), SENSORS[0])
+    a, b = jnp.ones((1, *SENSORS[0])), jnp.ones((1, *SENSORS[1]))
+    for operators, captures, settings, message in (
+        ([first], [a, b], {}, "2 captures for 1 operators; give one operator for each"),
+        ([], [], {}, "0 captures for 0 operators"),
+        ([first, planes], [a, a], {}, "operators differ in window, field or planes"),
+        ([first], [b], {}, r"a capture has shape \(1, 4, 9\); its operator takes .* \(7, 6\)"),
+        ([first], [a[0]], {}, r"a capture has shape \(7, 6\)"),
+        ([coloured], [a], {}, "1 channels and its PSF 3; give a PSF of 1 channel or of as many"),
+        ([first, second], [a, jnp.ones((3, 4, 9))], {}, r"captures differ in batch .*\(1,\), \(3,"),
+        ([first], [a], {"weights": [1.0, 1.0]}, "2 weights for 1 captures; give one for each"),
+        ([first], [a], {"tau": -1.0}, "tau = -1.0 .* is negative; give tau >= 0"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            Deconvolution(operators, captures, **({"tau": 1.0} | settings))

@@ -1,0 +1,383 @@
+"""Wiener synthesis: the formula, its limits, registration, the mean, gradients, refusals."""
+
+import math
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.signal
+from reconstruction import rig
+
+import thincam_jax as tc
+from helpers import count_traces, finite_difference, relative_l2
+from thincam_jax.imaging.operators import kernel_grid
+from thincam_jax.reconstruction import fringe_scanning, phase_pairs, separate
+from thincam_jax.reconstruction import wiener as module
+from thincam_jax.reconstruction.registration import register
+from thincam_jax.units import nm, um
+
+# Scenes of this size leave their whole shadow of a mask of 1.2 mm on the sensor.
+SMALL = (30, 33)
+
+
+def synthesis(cameras, matrix, **settings):
+    usual = {
+        "wavelength": rig.WAVELENGTH,
+        "object_distance": rig.OBJECT_DISTANCE,
+        "field_shape": rig.FIELD,
+        "model": "geometric",
+        "pixel_integration": False,
+    }
+    return tc.WienerSynthesis(cameras, synthesis=matrix, **(usual | settings))
+
+
+def two_pairs(**settings):
+    return rig.pair(beta=30.0, **settings) + rig.pair(beta=25.0, **settings)
+
+
+def point(row=9, column=30):
+    image = np.zeros(rig.FIELD)
+    image[row, column] = 1.0
+    return image, np.array([row - 19.5, column - 23.0]) * rig.OBJECT_PITCH
+
+
+@pytest.mark.parametrize("prior", ["flat", "inverse_square"])
+def test_it_solves_the_normal_equations(prior):
+    """A tiny case against a dense solver in real space: (ΣHᵀH/η + C⁻¹)f = ΣHᵀg/η, circular.
+
+    Only the prior is made of frequencies here, by its definition.
+    """
+    sensor, field = (9, 8), (5, 6)
+    own = tc.Sensor(sensor, 100 * um)
+    cameras = [
+        rig.camera(phase, beta=beta, width=0.7, sensor=own)
+        for beta in (30.0, 25.0)
+        for phase in (0.0, 1.5 * math.pi)
+    ]
+    variance = np.array([1e-6, 2e-6, 5e-6, 3e-6])
+    method = synthesis(cameras, phase_pairs(2), field_shape=field, prior=prior)
+    captures = 0.01 * np.random.default_rng(1).uniform(0.5, 1.5, (4, *sensor))
+    value = method(jnp.asarray(captures), jnp.asarray(variance))
+
+    grid = kernel_grid(own.grid, field)
+    where = {"wavelength": rig.WAVELENGTH, "object_distance": rig.OBJECT_DISTANCE}
+    kernels = [0.01 * np.asarray(tc.psf(c, grid=grid, model="geometric", **where)) for c in cameras]
+    uniform = np.stack([scipy.signal.convolve(k, np.ones(field), mode="valid") for k in kernels])
+    mean = np.sum(captures * uniform) / np.sum(uniform**2)
+    contrast = captures - mean * uniform
+
+    shape = method.padded
+    index = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), -1).reshape(-1, 2)
+
+    def window(image):
+        whole = np.zeros(shape)
+        for (i, j), entry in np.ndenumerate(image):
+            half = (np.array(image.shape) - 1) // 2
+            whole[(i - half[0]) % shape[0], (j - half[1]) % shape[1]] = entry
+        return whole
+
+    def circulant(kernel):
+        difference = (index[:, None] - index[None]) % np.array(shape)
+        return kernel[difference[..., 0], difference[..., 1]]
+
+    channels = [window(contrast[i] - contrast[i + 1]) for i in (0, 2)]
+    operators = [window(kernels[i] - kernels[i + 1]) for i in (0, 2)]
+    noise = [variance[i] + variance[i + 1] for i in (0, 2)]
+
+    v, u = np.fft.fftfreq(shape[0], 0.1)[:, None], np.fft.fftfreq(shape[1], 0.1)
+    power = np.ones(shape) if prior == "flat" else 1 / (u**2 + v**2 + 1 / (6 * 0.1) ** 2)
+    power /= power.mean()
+    # the scene's variance, fitted to the captures away from the axes
+    half = np.s_[:, : shape[1] // 2 + 1]
+    inner = ((np.abs(v) * 0.1 * 9 > 3) & (np.abs(u) * 0.1 * 8 > 3))[half]
+    fitted, weights = 0.0, 0.0
+    for channel, operator, eta in zip(channels, operators, noise, strict=True):
+        measured = np.abs(np.fft.fft2(channel)) ** 2 / (9 * 8) - eta
+        expected = np.abs(np.fft.fft2(operator)) ** 2 * power
+        fitted += np.sum((measured * expected)[half][inner])
+        weights += np.sum((expected**2)[half][inner])
+    assert fitted > 0
+    power *= fitted / weights
+
+    matrix = circulant(np.real(np.fft.ifft2(1 / power)))
+    right = np.zeros(len(index))
+    for channel, operator, eta in zip(channels, operators, noise, strict=True):
+        dense = circulant(operator)
+        matrix = matrix + dense.T @ dense / eta
+        right += dense.T @ channel.ravel() / eta
+    solution = np.linalg.solve(matrix, right).reshape(shape)
+    rows, columns = (np.arange(n) - (n - 1) // 2 for n in field)
+    expected = solution[np.ix_(rows % shape[0], columns % shape[1])][::-1, ::-1] + mean
+    assert np.ptp(expected) > 0.1 * mean
+    assert relative_l2(value.image, expected) < 1e-9
+
+
+def test_without_noise_the_scene_comes_back():
+    image = rig.picture(SMALL)
+    cameras = two_pairs(width=1.2)
+    method = synthesis(cameras, phase_pairs(2), field_shape=SMALL)
+    captures = rig.captures(cameras, image)
+    errors = [relative_l2(method(captures, v).image, image) for v in (1e-5, 1e-7, 1e-9, 1e-14)]
+    assert errors[0] > errors[1] > errors[2] > errors[3] and errors[3] < 1e-3
+
+
+def test_with_all_noise_the_mean_is_left():
+    image = rig.picture()
+    cameras = two_pairs()
+    captures = rig.captures(cameras, image)
+    value = np.asarray(synthesis(cameras, phase_pairs(2))(captures, 1e3).image)
+    assert np.ptp(value) < 1e-4 and abs(value.mean() / image.mean() - 1) < 0.05
+
+
+@pytest.mark.parametrize(
+    ("groups", "prior"), [("near", "flat"), ("far", "inverse_square"), ("both", "flat")]
+)
+def test_a_uniform_scene_is_itself(groups, prior):
+    """Whatever the noise: the mean is estimated from the raw captures and put back."""
+    near, far = rig.phases(), rig.phases(distance=1.3 * rig.DISTANCE)
+    cameras = {"near": near, "far": far, "both": near + far}[groups]
+    pitch = 25 * um * rig.OBJECT_DISTANCE / float(cameras[-1].distance)
+    captures = rig.captures(cameras, np.full(rig.FIELD, 0.7), pitch=pitch)
+    method = synthesis(cameras, fringe_scanning(len(cameras) // 4), prior=prior)
+    for variance in (1e-6, 1.0):
+        np.testing.assert_allclose(method(captures, variance).image, 0.7, rtol=2e-3)
+
+
+def test_the_mean_is_unbiased(key):
+    """64 draws of noise: their spread is σ/‖u‖, u the response to a uniform scene."""
+    cameras = rig.pair()
+    method = synthesis(cameras, phase_pairs(1))
+    uniform = rig.captures(cameras, np.ones(rig.FIELD))
+    sigma = 0.2 * float(uniform.mean())
+    noise = sigma * jax.random.normal(key, (2, 64, *rig.SENSOR.shape))
+    # a variance so large that nothing but the mean is left
+    means = np.asarray(method(0.7 * uniform[:, None] + noise, 1e3).image[:, 0, 0])
+    spread = sigma / float(jnp.linalg.norm(uniform))
+    assert abs(means.mean() - 0.7) < 3 * spread / 8
+    assert abs(means.std() / spread - 1) < 0.3
+
+
+def test_more_captures_are_never_worse(key):
+    """Expected error 1/(1/η_f + Σ|H|²/η): at every frequency, and measured on a white scene.
+
+    The scene fills a part of the field only, so that its power, spread over the sensor's pixels, is
+    that much smaller; all of the error that noise makes is then counted.
+    """
+    scene_variance, sigma, pixels = 0.04, 2e-4, 96 * 85
+    image = np.sqrt(scene_variance) * np.random.default_rng(3).normal(size=SMALL)
+    image -= image.mean()
+    whole = np.zeros(rig.SENSOR.shape)
+    whole[33:63, 26:59] = image
+    cameras = two_pairs(width=1.2)
+    captures = rig.captures(cameras, image)
+    captures = captures + sigma * jax.random.normal(key, captures.shape)
+    errors, predicted = [], []
+    for count in (1, 2):
+        method = synthesis(
+            cameras[: 2 * count], phase_pairs(count), field_shape=rig.SENSOR.shape, prior="flat"
+        )
+        value = np.asarray(method(captures[: 2 * count], sigma**2).image)
+        errors.append(np.sum((value - whole) ** 2) / pixels)
+        gain = np.sum(np.abs(np.asarray(method.spectra)) ** 2, axis=0) / (2 * sigma**2)
+        predicted.append(1 / (pixels / (scene_variance * image.size) + gain))
+    assert (predicted[1] <= predicted[0]).all() and errors[1] < 0.9 * errors[0]
+    for measured, expected in zip(errors, predicted, strict=True):
+        # over all frequencies: those between the first and the last column count twice
+        mean = np.average(expected, axis=1, weights=[1, *[2] * (expected.shape[1] - 1)]).mean()
+        assert abs(measured / mean - 1) < 0.1
+
+
+@pytest.mark.parametrize("groups", ["near", "far", "both"])
+def test_registration_puts_points_in_their_place(groups):
+    """From captures at d, at 1.3 d, and from both: the same place on the object, off the axis."""
+    image, expected = point()
+    near, far = rig.phases(), rig.phases(distance=1.3 * rig.DISTANCE)
+    cameras = {"near": near, "far": far, "both": near + far}[groups]
+    method = synthesis(cameras, fringe_scanning(len(cameras) // 4))
+    value = method(rig.captures(cameras, image), 1e-9)
+    largest = float(cameras[-1].distance)
+    assert float(value.pitch) == pytest.approx(25 * um * rig.OBJECT_DISTANCE / largest)
+    np.testing.assert_allclose(rig.centroid(value), expected, atol=0.15 * rig.OBJECT_PITCH)
+
+
+def test_registered_captures_agree_in_scale_and_gain():
+    """A scene from captures at d and 1.3 d together, on the finer scale of the second."""
+    image, distance = rig.picture(), 1.3 * rig.DISTANCE
+    cameras = rig.phases() + rig.phases(distance=distance)
+    captures = rig.captures(cameras, image, pitch=25 * um * rig.OBJECT_DISTANCE / distance)
+    value = np.asarray(synthesis(cameras, fringe_scanning(2))(captures, 1e-8).image)
+    assert rig.correlation(value, image) > 0.99
+    for flipped in (value[::-1], value[:, ::-1]):
+        assert rig.correlation(flipped, image) < 0.5
+    gain, offset = np.polyfit(image.ravel(), value.ravel(), 1)
+    assert abs(gain - 1) < 0.03 and abs(offset) < 0.02
+
+
+def test_noise_of_an_enlarged_capture(key):
+    """Enlarging by r packs the noise of a channel into 1/r² of the band: the density is r²σ²."""
+    ratio, variance = 1.3, 0.04
+    cameras = rig.pair() + rig.pair(distance=ratio * rig.DISTANCE)
+    method = synthesis(cameras, phase_pairs(2))
+    noise = np.sqrt(2 * variance) * jax.random.normal(key, rig.SENSOR.shape)
+    channels = [register(noise, ratio), noise]
+    pads = [[(0, p - n) for p, n in zip(method.padded, c.shape, strict=True)] for c in channels]
+    spectra = jnp.stack([jnp.fft.rfft2(jnp.pad(c, p)) for c, p in zip(channels, pads, strict=True)])
+    density, _ = method._noise_and_scene(spectra, jnp.full(2, 2 * variance), noise.size)
+    v, u = np.fft.fftfreq(method.padded[0])[:, None], np.fft.rfftfreq(method.padded[1])
+    low = (np.abs(v) < 0.3) & (u < 0.3)  # cycles/pixel, within the enlarged band 0.5/1.3
+    for channel, spectrum, expected in zip(channels, spectra, density, strict=True):
+        measured = np.mean(np.abs(np.asarray(spectrum))[low] ** 2) / channel.size
+        assert abs(float(expected[0, 0]) / measured - 1) < 0.1
+    np.testing.assert_allclose(density[0] / density[1], ratio**2)
+
+
+def test_it_scales_with_the_intensity():
+    cameras = two_pairs()
+    method = synthesis(cameras, phase_pairs(2))
+    captures = rig.captures(cameras, rig.picture())
+    expected = method(captures, 1e-7).image
+    for factor in (1e-6, 1e6):
+        value = method(factor * captures, 1e-7 * factor**2).image
+        assert relative_l2(value, factor * expected) < 1e-9
+
+
+def test_batches_equal_one_by_one():
+    """And each capture and image has its own noise variance."""
+    cameras = two_pairs()
+    method = synthesis(cameras, phase_pairs(2))
+    images = np.stack([rig.picture(), 2 * rig.picture()[::-1]])
+    captures = rig.captures(cameras, images)
+    variance = 1e-8 * jnp.asarray([[1.0, 2.0], [3.0, 5.0], [2.0, 9.0], [1.0, 4.0]])
+    whole = method(captures, variance).image
+    assert whole.shape == (2, *rig.FIELD)
+    for i in range(2):
+        single = method(captures[:, i], variance[:, i]).image
+        assert relative_l2(whole[i], single) < 1e-12
+    assert relative_l2(method(captures[:, 1], variance[:, 0]).image, whole[1]) > 1e-4
+
+
+def test_the_prior_of_natural_scenes_suits_soft_scenes(key):
+    """Against the flat one: less noise in soft blobs; without noise there is no difference."""
+    image, sigma = rig.picture(), 5e-4
+    cameras = rig.pair(beta=30.0)
+    captures = rig.captures(cameras, image)
+    noisy = captures + sigma * jax.random.normal(key, captures.shape)
+    errors = {}
+    for prior in ("flat", "inverse_square"):
+        method = synthesis(cameras, phase_pairs(1), prior=prior)
+        errors[prior] = relative_l2(method(noisy, sigma**2).image, image)
+    assert errors["inverse_square"] < 0.8 * errors["flat"]
+
+
+def test_one_capture_alone_and_its_steps_at_the_border():
+    """With the bias left in: upright, in place; coarser than what the synthesis gives."""
+    image = rig.picture()
+    cameras = rig.pair(width=1.2)
+    captures = rig.captures(cameras, image)
+    alone = synthesis(cameras[:1], separate(1))(captures[:1], 1e-8).image
+    paired = synthesis(cameras, phase_pairs(1))(captures, 1e-8).image
+    assert 0.8 < rig.correlation(alone, image) < rig.correlation(paired, image)
+
+
+def test_three_colours_of_a_grey_scene():
+    """Each wavelength loses other frequencies: together they beat each one, in their order only."""
+    image = 0.5 + 0.2 * np.random.default_rng(3).normal(size=SMALL)
+    colours = np.array([1500.0, 2400.0, 3800.0]) * nm
+    lens = rig.camera(beta=60.0, width=1.2)
+    captures = jnp.concatenate(
+        [rig.captures([lens], image, model="separable", wavelength=c) for c in colours]
+    )
+
+    def error(taken, wavelength):
+        method = synthesis(
+            [lens] * len(taken),
+            separate(len(taken)),
+            wavelength=wavelength,
+            model="separable",
+            field_shape=SMALL,
+            prior="flat",
+        )
+        return relative_l2(method(taken, 1e-9).image, image)
+
+    together = error(captures, colours)
+    single = [error(g[None], c) for c, g in zip(colours, captures, strict=True)]
+    swapped = error(captures, colours[::-1].copy())
+    assert together < 0.9 * min(single) and together < 0.9 * swapped
+
+
+def test_not_traced_again_for_other_captures_variances_and_cameras(monkeypatch):
+    counted = count_traces(module.crop_field)
+    monkeypatch.setattr(module, "crop_field", counted)
+    results = []
+    for beta in (30.0, 28.0):
+        cameras = rig.pair(beta=beta)
+        method = synthesis(cameras, phase_pairs(1), field_shape=(26, 29))  # of no other test
+        captures = rig.captures(cameras, rig.picture())
+        results += [method(gain * captures, gain * 1e-7).image for gain in (1.0, 2.0)]
+    assert counted.traces == 1
+    assert relative_l2(results[0], results[1]) > 0.1 and relative_l2(results[0], results[2]) > 1e-4
+
+
+def test_gradient_in_beta_wavelength_and_variance():
+    """The image in the β that is assumed; 2β(width/2)² = 60 rad is 2 rad per rad/mm² there."""
+    sensor = tc.Sensor((24, 21), 100 * um)
+    taken = rig.pair(sensor=sensor)
+    captures = jnp.stack(
+        [
+            tc.capture(c, rig.scene(rig.picture((10, 11)), 4 * rig.OBJECT_PITCH), model="geometric")
+            for c in taken
+        ]
+    )
+    weights = np.random.default_rng(0).normal(size=(10, 11))
+
+    def loss(numbers):
+        cameras = [eqx.tree_at(lambda c: c.mask.beta, c, numbers["beta"]) for c in taken]
+        method = synthesis(
+            cameras,
+            phase_pairs(1),
+            field_shape=(10, 11),
+            model="closed_form",
+            wavelength=numbers["wavelength"],
+        )
+        return jnp.sum(weights * method(captures, 1e-9 * numbers["variance"]).image)
+
+    at = {"beta": 30.0, "wavelength": 5e-4, "variance": 2.0}
+    at = {name: jnp.asarray(value) for name, value in at.items()}
+    both = jax.jit(jax.value_and_grad(loss))
+    slopes = both(at)[1]
+    for name, step in {"beta": 1e-3, "wavelength": 1e-7, "variance": 1e-2}.items():
+        direction = {other: jnp.asarray(float(other == name)) for other in at}
+        expected = finite_difference(lambda x: both(x)[0], at, direction, step)
+        np.testing.assert_allclose(slopes[name], expected, rtol=1e-5, err_msg=name)
+
+
+def test_what_is_refused():
+    near, far = rig.pair(), rig.pair(distance=3.9)
+    with pytest.raises(ValueError, match=r"synthesis has shape \(1, 3\); give \(channels, 2\)"):
+        synthesis(near, np.ones((1, 3)))
+    with pytest.raises(ValueError, match="row of zeros"):
+        synthesis(near, np.array([[1.0, 0.0], [0.0, 0.0]]))
+    with pytest.raises(ValueError, match="channels share noise.*orthogonal"):
+        synthesis(near, np.array([[1.0, -1.0], [1.0, 0.0]]))
+    with pytest.raises(ValueError, match="captures at different distances"):
+        synthesis([near[0], far[1]], phase_pairs(1))
+    other = rig.camera(sensor=tc.Sensor((96, 85), 24 * um))
+    with pytest.raises(ValueError, match="different sensors.*use one sensor"):
+        synthesis([near[0], other], separate(2))
+    with rig.unchecked(), pytest.raises(ValueError, match="prior = 'x'.*'inverse_square', 'flat'"):
+        synthesis(near, phase_pairs(1), prior="x")
+    with pytest.raises(TypeError, match="distances are traced.*known numbers"):
+        jax.jit(lambda d: synthesis(rig.pair(distance=d), phase_pairs(1)).spectra)(3.0)
+
+    method = synthesis(near, phase_pairs(1))
+    for shape in ((2, 85, 96), (3, 96, 85)):
+        with pytest.raises(ValueError, match=r"captures have shape .*give \(2, …, 96, 85\)"):
+            method(jnp.ones(shape), 1e-6)
+    captures = jnp.ones((2, 96, 85))
+    for variance in (0.0, -1.0, np.array([1e-6, 0.0])):
+        with pytest.raises(ValueError, match="noise_variance .* must be positive"):
+            method(captures, variance)
+    with pytest.raises(ValueError, match=r"noise_variance has shape \(3,\)"):
+        method(captures, np.full(3, 1e-6))

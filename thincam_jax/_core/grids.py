@@ -1,0 +1,86 @@
+"""Sampling grids: where the samples of a plane lie, and their spatial frequencies."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+from scipy.fft import next_fast_len
+
+from thincam_jax._core import checks
+
+
+class Grid(eqx.Module):
+    """A rectangular grid centred on the optical axis.
+
+    Sample i of n lies at (i − (n−1)/2)·pitch: +x to the right, +y down. The shape is static, the
+    pitch a differentiable array.
+
+    - `shape`: (rows, columns).
+    - `pitch`: distance of neighbouring samples, mm, the same in y and x.
+    """
+
+    shape: tuple[int, int] = eqx.field(static=True)
+    pitch: Float[Array, ""]
+
+    def __init__(self, shape, pitch):
+        self.shape = checks.shape2d("shape", shape)
+        self.pitch = checks.positive("pitch", pitch, "mm")
+
+    @property
+    def y(self) -> Float[Array, " rows"]:
+        """Coordinates of the rows, mm."""
+        return centred_indices(self.shape[0], self.pitch.dtype) * self.pitch
+
+    @property
+    def x(self) -> Float[Array, " columns"]:
+        """Coordinates of the columns, mm."""
+        return centred_indices(self.shape[1], self.pitch.dtype) * self.pitch
+
+    @property
+    def v(self) -> Float[Array, " rows"]:
+        """Spatial frequencies of the centred DFT along y, cycles/mm, ascending."""
+        return centred_frequencies(self.shape[0], self.pitch)
+
+    @property
+    def u(self) -> Float[Array, " columns"]:
+        """Spatial frequencies of the centred DFT along x, cycles/mm, ascending."""
+        return centred_frequencies(self.shape[1], self.pitch)
+
+    def with_shape(self, shape: tuple[int, int]) -> "Grid":
+        """The same pitch over another number of samples."""
+        return Grid(shape, self.pitch)
+
+
+def centred_indices(count: int, dtype) -> Float[Array, " count"]:
+    """i − (n−1)/2 for i = 0 … n−1: whole or half numbers, exact in every precision."""
+    return jnp.arange(count, dtype=dtype) - (count - 1) / 2
+
+
+def centred_frequencies(count: int, pitch: Float[Array, ""]) -> Float[Array, " count"]:
+    """Frequencies of a DFT of `count` samples, zero at index count//2, in cycles/mm."""
+    return (jnp.arange(count, dtype=pitch.dtype) - count // 2) / (count * pitch)
+
+
+def fast_shape(shape: tuple[int, int], *, real: bool = False) -> tuple[int, int]:
+    """The smallest shape that holds `shape` and transforms fast."""
+    rows, columns = (int(next_fast_len(n, real=real) or n) for n in shape)
+    return rows, columns
+
+
+def same_parity(shape, sensor_shape) -> tuple[int, int]:
+    """A field's shape, enlarged by at most one pixel to share its centre with the sensor."""
+    shape = checks.shape2d("field_shape", shape)
+    rows, columns = (n + (n - s) % 2 for n, s in zip(shape, sensor_shape, strict=True))
+    return rows, columns
+
+
+def cell_overlap(
+    x: Float[Array, " n"],
+    pitch: Float[Array, ""],
+    lower: Float[Array, " cell"],
+    upper: Float[Array, " cell"],
+) -> Float[Array, "n cell"]:
+    """Length of each [x − pitch/2, x + pitch/2] that lies in each [lower, upper]."""
+    x = x[:, None]
+    above = jnp.minimum(x + pitch / 2, upper)
+    below = jnp.maximum(x - pitch / 2, lower)
+    return jnp.maximum(above - below, 0.0)

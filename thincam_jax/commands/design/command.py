@@ -1,0 +1,84 @@
+"""The command `thincam design`."""
+
+from pathlib import Path
+from typing import Annotated
+
+import rich.progress
+import rich.table
+import typer
+
+from thincam_jax.commands.design import check_design
+from thincam_jax.commands.design.config import load_design
+from thincam_jax.commands.design.run import DesignFolder, run_design, steps
+from thincam_jax.commands.design.words import in_words, told_of
+from thincam_jax.commands.study.config import slug
+from thincam_jax.commands.terminal import (
+    INTERRUPTED,
+    USER_ERRORS,
+    Overrides,
+    columns,
+    console,
+    fail,
+    tell,
+)
+
+
+def design(
+    config: Annotated[Path, typer.Argument(help="Experiment file (YAML) of kind design.")],
+    out: Annotated[
+        Path | None, typer.Option(help="Folder of the results; default runs/NAME of the design.")
+    ] = None,
+    set_: Overrides = None,
+) -> None:
+    """Search for the best design and simulate it beside the design to beat.
+
+    Writes design.json, found.yaml, figures and report.html. Ctrl-C keeps the targets that are
+    finished; the same command goes on from there.
+    """
+    try:
+        wanted = load_design(config, tuple(set_ or ()))
+        check_design(wanted)
+        folder = DesignFolder(out or Path("runs") / slug(wanted.name))
+        with rich.progress.Progress(*columns(), console=console) as bar:
+            task = bar.add_task(wanted.name, total=steps(wanted))
+            found = run_design(
+                wanted, folder, lambda text: bar.update(task, advance=1, description=text)
+            )
+    except USER_ERRORS as error:
+        fail(error)
+    except KeyboardInterrupt:
+        tell("interrupted; the same command goes on with the targets that are not finished.")
+        raise typer.Exit(INTERRUPTED) from None
+    _print(found)
+    console.print(f"report: {folder.path / 'report.html'}", highlight=False, soft_wrap=True)
+
+
+def _print(found: dict) -> None:
+    validation = found["validation"]
+    designs = (found["reference"], *found["compare"], *found["found"])
+    names = told_of(designs)
+    table = rich.table.Table("design", "predicted", show_lines=True)
+    for target in validation["pictures"]:
+        table.add_column(f"{target}\ndB", justify="right")
+    for target in validation["charts"]:
+        table.add_column(f"{target}\nelements", justify="right")
+    for one in designs:
+        simulated = validation["methods"].get(one["name"])
+        if simulated is None:
+            continue
+        table.add_row(
+            "\n".join([one["name"], *in_words(one, names)]),
+            f"{one['predicted_gain']:+.2f}" if "predicted_gain" in one else "",
+            *(_gain(simulated[name], "gain_db") for name in validation["pictures"]),
+            *(_gain(simulated[name], "gain_elements") for name in validation["charts"]),
+        )
+    console.print(table)
+
+
+def _gain(simulated: dict, key: str) -> str:
+    """The gain; for the reference, its own PSNR."""
+    if key in simulated:
+        gain = simulated[key]
+        return f"{gain['mean']:+.2f}" if gain else "–"
+    psnr = simulated["psnr_db"] if key == "gain_db" else None
+    return f"{psnr['mean']:.2f}" if psnr else "–"

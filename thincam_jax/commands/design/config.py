@@ -1,0 +1,454 @@
+"""Experiment files of `kind: design`: what is free, what is wanted, and the design to beat."""
+
+import math
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import pydantic
+from pydantic import Field
+
+from thincam_jax.commands.config_file import read_raw
+from thincam_jax.commands.design.config_pareto import ParetoConfig, check_pareto
+from thincam_jax.commands.design.config_training import TrainingConfig
+from thincam_jax.commands.study.config import (
+    LIGHT,
+    Angle,
+    ApertureConfig,
+    ConfigError,
+    Length,
+    MethodConfig,
+    Name,
+    ObjectConfig,
+    Section,
+    ShotConfig,
+    TargetConfig,
+    Wavelength,
+    check_names,
+    in_folder,
+    load_as,
+    misfit,
+    slug,
+)
+from thincam_jax.design import Design, DesignSpace, Limits, Tolerances, Variable, shots
+from thincam_jax.design.space import UNITS
+from thincam_jax.lensless.psf import Model
+from thincam_jax.units import parse_quantity
+
+Objective = Literal["bayes_error", "robust_error", "worst_ratio", "limit", "unevenness"]
+Part = Annotated[float, Field(ge=0, le=1)]
+Free = Literal["beta", "distance", "wavelength", "width", "exposure"]
+# What has a unit in a file; a share of the exposure has none.
+_KINDS = {"beta": "curvature", "distance": "length", "wavelength": "length", "width": "length"}
+# A band has to hold some of the 64 rings that the objectives average over.
+_NARROWEST_BAND = 1 / 16
+
+
+class PixelsConfig(Section):
+    """The sensor; of its two sides the search takes the shorter one."""
+
+    shape: tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]]
+    pitch: Length
+
+    @property
+    def width(self) -> float:
+        """Of the shorter side, mm."""
+        return min(self.shape) * self.pitch
+
+
+class DesignNoiseConfig(Section):
+    """Gaussian noise at an SNR of the captures' variance, or shot and read noise.
+
+    `electrons` are those of a pixel from each mm² of open aperture, before a white scene.
+    """
+
+    snr_db: Annotated[float, Field(ge=-60, le=200)] | None = None
+    read_noise: Annotated[float, Field(ge=0)] | None = None
+    electrons: Annotated[float, Field(gt=0)] | None = None
+
+    @pydantic.model_validator(mode="after")
+    def _one(self):
+        if (self.snr_db is None) == (self.read_noise is None):
+            raise ValueError("give either snr_db (Gaussian noise) or read_noise (shot noise too)")
+        if (self.read_noise is None) != (self.electrons is None):
+            raise ValueError("read_noise and electrons belong together; give both, or snr_db")
+        return self
+
+
+class PriorConfig(Section):
+    """The scene's spectrum: a power law, its exponent given or measured on the photographs.
+
+    `contrast`: standard deviation of the scene over its mean; shot noise depends on it.
+    """
+
+    exponent: Annotated[float, Field(ge=0, le=6)] | None = None
+    measured: bool = False
+    contrast: Annotated[float, Field(gt=0, le=10)] = 0.5
+
+    @pydantic.model_validator(mode="after")
+    def _one(self):
+        if (self.exponent is None) != self.measured:
+            raise ValueError("give either exponent, such as 2.8, or measured: true")
+        return self
+
+
+class ReferenceConfig(Section):
+    """The design to beat; found designs take as many shots, with the same synthesis."""
+
+    name: Name = "reference"
+    synthesis: Literal["phase_pairs", "fringe_scanning"]
+    shots: Annotated[tuple[ShotConfig, ...], Field(min_length=1)]
+
+    def method(self) -> MethodConfig:
+        """The same as a method of a study."""
+        return MethodConfig(
+            name=self.name, kind="wiener", synthesis=self.synthesis, shots=self.shots
+        )
+
+
+class RivalConfig(Section):
+    """Another design that is simulated beside the reference, at the same budget."""
+
+    name: Name
+    shots: Annotated[tuple[ShotConfig, ...], Field(min_length=1)]
+
+
+class FreeConfig(Section):
+    """One variable that is free, at every shot for itself, or as one number that they share.
+
+    - `bounds`: those of the exposure are parts of what each of the reference's captures has.
+    - `shots`: at which of them, counted from 1; default all. All masks share the width.
+    """
+
+    variable: Free
+    bounds: tuple[float, float]
+    shared: bool = False
+    shots: Annotated[tuple[Annotated[int, Field(ge=1)], ...], Field(min_length=1)] | None = None
+
+    @pydantic.field_validator("bounds", mode="before")
+    @classmethod
+    def _read(cls, given: Any, info: Any) -> Any:
+        if "variable" not in info.data:  # told by itself; of which kind these are is not known
+            return (1.0, 1.0)
+        if not isinstance(given, list | tuple) or len(given) != 2:
+            raise ValueError(f"{given!r} is no pair; give [lowest, highest]")
+        variable = info.data["variable"]
+        unit = UNITS[variable]
+        lower, upper = (_number(variable, text) for text in given)
+        if not (math.isfinite(lower) and math.isfinite(upper) and lower > 0):
+            raise ValueError(f"{lower:g} to {upper:g} {unit}; give bounds above zero")
+        if not lower < upper:
+            raise ValueError(f"bounds cross: {lower:g} to {upper:g} {unit}; give the lower first")
+        if variable == "wavelength" and not LIGHT[0] <= lower < upper <= LIGHT[1]:
+            raise ValueError(f"{lower:g} to {upper:g} mm; give bounds from 10 nm to 1 mm")
+        return (lower, upper)
+
+    @pydantic.field_serializer("bounds")
+    def _write(self, bounds: tuple[float, float]) -> list[str | float]:
+        if self.variable not in _KINDS:
+            return list(bounds)
+        return [f"{value!r} {UNITS[self.variable]}" for value in bounds]
+
+    @pydantic.model_validator(mode="after")
+    def _belongs(self):
+        if self.shots is not None and len(set(self.shots)) < len(self.shots):
+            raise misfit("holds a shot twice; give each once", "shots")
+        if self.variable == "width" and (self.shared or self.shots is not None):
+            raise ValueError("all masks share the width; drop 'shared' and 'shots'")
+        return self
+
+
+def _number(variable: str, given: Any) -> float:
+    """In the package's unit."""
+    if variable in _KINDS:
+        return parse_quantity(given, _KINDS[variable])
+    if isinstance(given, bool) or not isinstance(given, int | float):
+        raise ValueError(f"{given!r} is no number; give parts of the reference's, such as 0.5")
+    return float(given)
+
+
+class LimitsConfig(Section):
+    """`thincam_jax.design.Limits`."""
+
+    mask_pixel: Length | None = None
+    thickness: Length | None = None
+    captures: Annotated[int, Field(ge=1, le=8)] = 8
+
+
+class TolerancesConfig(Section):
+    """`thincam_jax.design.Tolerances`: what the reconstruction does not know, of `robust_error`.
+
+    `beta`: as a part of itself; `how`: the mean over the tolerances, or the worst of them.
+    """
+
+    beta: Annotated[float, Field(gt=0, lt=0.5)] | None = None
+    distance: Length | None = None
+    wavelength: Length | None = None
+    object_distance: Length | None = None
+    tilt: Angle | None = None
+    how: Literal["mean", "worst"] = "mean"
+
+    @pydantic.model_validator(mode="after")
+    def _some(self):
+        given = self.model_dump(exclude={"how"}, exclude_none=True)
+        if not given:
+            raise ValueError("no tolerance is given; give at least one, such as distance: 20 um")
+        if self.tilt is not None and not self.tilt > 0:
+            raise ValueError(f"tilt is {self.tilt:g} rad; give an angle above 0")
+        return self
+
+    def tolerances(self) -> Tolerances:
+        """As numbers, 0 for what is exact."""
+        return Tolerances(*(getattr(self, name) or 0.0 for name in Tolerances._fields))
+
+
+class FrequenciesConfig(Section):
+    """How finely responses are sampled: radii and directions of the search, the exact square.
+
+    `exact`: along each axis; default as many as the responses' fringes need.
+    """
+
+    radii: Annotated[int, Field(ge=64, le=8192)] = 1024
+    directions: Annotated[int, Field(ge=1, le=16)] = 3
+    exact: Annotated[int, Field(ge=64, le=4096)] | None = None
+
+
+class SearchConfig(Section):
+    """What is free, within which limits, what is wanted, and how long to search.
+
+    `band`: of `worst_ratio` and `unevenness`, as parts of half of the pixels' Nyquist frequency.
+    `grid`: points along each side of the landscape.
+    """
+
+    free: Annotated[tuple[FreeConfig, ...], Field(min_length=1)]
+    limits: LimitsConfig = LimitsConfig()
+    objective: Objective = "bayes_error"
+    band: tuple[Part, Part] | None = None
+    tolerances: TolerancesConfig | None = None
+    starts: Annotated[int, Field(ge=1, le=1000)] = 16
+    samples: Annotated[int, Field(ge=1, le=100_000)] = 512
+    steps: Annotated[int, Field(ge=1, le=1000)] = 60
+    solver: Literal["bfgs", "lbfgsb"] = "bfgs"
+    grid: Annotated[int, Field(ge=5, le=501)] = 61
+    frequencies: FrequenciesConfig = FrequenciesConfig()
+
+    @pydantic.model_validator(mode="after")
+    def _belongs(self):
+        if (self.objective == "robust_error") != (self.tolerances is not None):
+            raise ValueError("objective robust_error and tolerances belong together; give both")
+        return self
+
+    @pydantic.model_validator(mode="after")
+    def _band(self):
+        if self.objective not in ("worst_ratio", "unevenness"):
+            if self.band is not None:
+                raise ValueError(f"objective {self.objective} has no band; drop 'band'")
+        elif self.band is not None and not self.band[1] - self.band[0] >= _NARROWEST_BAND:
+            raise ValueError(
+                f"band {self.band[0]:g} to {self.band[1]:g} is too narrow; give the lower first "
+                f"and one at least {_NARROWEST_BAND:g} wide"
+            )
+        return self
+
+
+class ValidateConfig(Section):
+    """The full simulation: how many of the found designs, and noise from how many seeds."""
+
+    seeds: Annotated[int, Field(ge=1, le=100)] = 5
+    best: Annotated[int, Field(ge=1, le=10)] = 3
+
+
+class DesignConfig(Section):
+    """A search for the best design, and its simulation beside the design to beat."""
+
+    name: Name
+    kind: Literal["design"]
+    title: str = ""
+    seed: Annotated[int, Field(ge=0, lt=2**32, strict=True)] = 0
+    wavelength: Wavelength
+    model: Model = "separable"
+    pixel_integration: bool = True
+    sensor: PixelsConfig
+    mask: ApertureConfig
+    object: ObjectConfig
+    noise: DesignNoiseConfig
+    prior: PriorConfig = PriorConfig(measured=True)
+    reference: ReferenceConfig
+    compare: tuple[RivalConfig, ...] = ()
+    search: SearchConfig
+    train: TrainingConfig | None = None
+    pareto: ParetoConfig | None = None
+    targets: Annotated[tuple[TargetConfig, ...], Field(min_length=1)]
+    # Not `validate`, which pydantic has for itself.
+    validation: ValidateConfig = Field(default=ValidateConfig(), alias="validate")
+    notes: tuple[str, ...] = ()
+
+    @pydantic.model_validator(mode="after")
+    def _fits(self):
+        check_names(self, "targets")
+        _check_given(self)
+        _check_search(self)
+        if self.prior.measured and not self.pictures():
+            message = "measured needs a photograph among the targets; give prior.exponent instead"
+            raise misfit(message, "prior", "measured")
+        try:
+            self.space()
+        except ValueError as error:
+            raise misfit(str(error), "search", _blamed(str(error))) from None
+        if self.pareto is not None:
+            check_pareto(self)
+        return self
+
+    def pictures(self) -> tuple[TargetConfig, ...]:
+        """The targets that are photographs or image files."""
+        return tuple(t for t in self.targets if t.kind in ("photograph", "file"))
+
+    def reference_design(self) -> Design:
+        """The design to beat."""
+        method = self.reference.method()
+        return shots(
+            [s.beta for s in method.shots],
+            [s.distance for s in method.shots],
+            method.shot_phases(),
+            wavelength=self.wavelength,
+            width=self.mask.width,
+            profile=self.mask.profile,
+        )
+
+    def space(self) -> DesignSpace:
+        """What is searched; ValueError where no design keeps the limits."""
+        given, base = self.search.limits, self.reference_design()
+        # The reference's captures have a share of 1 each; what is found shares the same.
+        total = float(base.captures) if self.frees("exposure") else None
+        return DesignSpace(base, tuple(_variables(self)), Limits(**dict(given), exposure=total))
+
+    def frees(self, variable: Free) -> bool:
+        """Whether the search chooses it, of some shot."""
+        return any(free.variable == variable for free in self.search.free)
+
+    def nearest(self) -> float:
+        """The shortest distance of mask and sensor that is looked at, mm."""
+        reference = min(s.distance for s in self.reference.shots)
+        bounds = [f.bounds[0] for f in self.search.free if f.variable == "distance"]
+        return min(reference, *bounds, math.inf)
+
+    def farthest(self) -> float:
+        """The longest distance of mask and sensor that is looked at, mm."""
+        reference = max(s.distance for s in self.reference.shots)
+        bounds = [f.bounds[1] for f in self.search.free if f.variable == "distance"]
+        limit = self.search.limits.thickness or math.inf
+        return max(reference, *(min(b, limit) for b in bounds), 0.0)
+
+    def widest(self) -> float:
+        """The widest mask that is looked at, mm."""
+        widths = [f.bounds[1] for f in self.search.free if f.variable == "width"]
+        return max([self.mask.width, *widths])
+
+
+def found_name(rank: int) -> str:
+    """What the found design of a rank, from 1, is called."""
+    return f"found {rank}"
+
+
+def _variables(config: DesignConfig):
+    """The free numbers, each with the captures it belongs to."""
+    phases = len(config.reference.method().shot_phases())
+    for free in config.search.free:
+        if free.variable == "width":
+            yield Variable("width", *free.bounds)
+            continue
+        chosen = free.shots or tuple(range(1, len(config.reference.shots) + 1))
+        groups = [tuple((s - 1) * phases + p for p in range(phases)) for s in chosen]
+        if free.shared:
+            groups = [tuple(c for group in groups for c in group)]
+        for group in groups:
+            yield Variable(free.variable, *free.bounds, group)
+
+
+def _check_given(config: DesignConfig) -> None:
+    """The designs that the file itself gives."""
+    taken = {slug(found_name(rank)) for rank in range(1, config.validation.best + 1)}
+    _check_shots(config, config.reference, taken, ("reference",))
+    for index, rival in enumerate(config.compare):
+        place = ("compare", index)
+        taken.add(slug(config.reference.name))
+        _check_shots(config, rival, taken, place)
+        taken.add(slug(rival.name))
+        count = len(config.reference.shots)
+        if len(rival.shots) != count:
+            message = f"{len(rival.shots)} shots, and the reference has {count}; give as many"
+            raise misfit(message, *place, "shots")
+
+
+def _check_shots(
+    config: DesignConfig, given: ReferenceConfig | RivalConfig, taken: set[str], place
+) -> None:
+    shots = [(s.beta, s.distance) for s in given.shots]
+    if len(set(shots)) < len(shots):
+        raise misfit("shots hold an entry twice; give each once", *place, "shots")
+    for index, shot in enumerate(given.shots):
+        alone = {"wavelength": config.wavelength, "width": config.mask.width, "exposure": 1.0}
+        for key, own in alone.items():
+            if getattr(shot, key) not in (None, own):
+                message = f"the {key} is that of the whole file; drop this one"
+                raise misfit(message, *place, "shots", index, key)
+    if slug(given.name) in taken:
+        message = f"{given.name!r} is what another or a found design is called; choose another name"
+        raise misfit(message, *place, "name")
+
+
+def _check_search(config: DesignConfig) -> None:
+    """What is asked for against the rest of the file."""
+    pixel, finest = config.mask.pixel_pitch, config.search.limits.mask_pixel
+    if pixel is not None and finest is not None and finest < pixel * (1 - 1e-6):
+        message = (
+            f"{finest:g} mm is finer than the display's pixels of {pixel:g} mm (mask.pixel_pitch); "
+            "give at least these"
+        )
+        raise misfit(message, "search", "limits", "mask_pixel")
+    if config.frees("exposure") and config.noise.electrons is None:
+        message = (
+            "how the exposure is divided matters to noise that counts electrons; give "
+            "noise.read_noise and noise.electrons, or do not free it"
+        )
+        raise misfit(message, "search", "free")
+    _check_exposures(config)
+
+
+def _check_exposures(config: DesignConfig) -> None:
+    """All shots together have the exposure of the reference's; some have to take the rest."""
+    free = [f for f in config.search.free if f.variable == "exposure"]
+    every = tuple(range(1, len(config.reference.shots) + 1))
+    bounds = {shot: f.bounds[1] for f in free for shot in f.shots or every if shot in every}
+    if free and set(bounds) >= set(every):
+        message = (
+            "the exposure of every shot is free, and all have what the reference has; leave one "
+            "out to take the rest, such as by shots: [1]"
+        )
+        if len(every) == 1:
+            message = "the exposure of the only shot is that of the reference; do not free it"
+        raise misfit(message, "search", "free")
+    if free and sum(bounds.values()) >= len(every) * (1 - 1e-6):
+        raise misfit(
+            f"exposures of up to {sum(bounds.values()):g} leave the other shots nothing of the "
+            f"{len(every)} that all have; end these bounds lower",
+            *("search", "free"),
+        )
+
+
+def _blamed(message: str) -> str:
+    """The entry of `search` that a message of the space is about."""
+    if "conflicts" in message or "feasible" in message:
+        return "limits"
+    return "free"
+
+
+def load_design(path: str | Path, overrides: tuple[str, ...] = ()) -> DesignConfig:
+    """Read and check a design's file; errors as of `load_config` of a study."""
+    kind = read_raw(Path(path))[0].get("kind")
+    if kind != "design":
+        told = "is a study" if kind is None else f"is of kind {kind!r}"
+        raise ConfigError(
+            f"{path}: kind: {told}, for 'thincam run'; a file for 'thincam design' has "
+            "'kind: design'"
+        )
+    return in_folder(load_as(DesignConfig, path, overrides), path, "targets")

@@ -1,0 +1,194 @@
+"""The section `pareto` of a design's file: what is traded against what, and how long to search."""
+
+import math
+from typing import Annotated, Any, Literal
+
+import pydantic
+from pydantic import Field
+
+from thincam_jax.commands.study.config import Length, Section, misfit
+
+Count = Annotated[int, Field(ge=1, le=8, strict=True)]
+Points = Annotated[int, Field(ge=2, le=100)]
+Electrons = Annotated[float, Field(gt=0)]
+
+
+class ThicknessConfig(Section):
+    """Thickness against resolution: no distance is longer than each of `points` thicknesses."""
+
+    bounds: tuple[Length, Length]
+    points: Points = 8
+
+    @pydantic.field_validator("bounds")
+    @classmethod
+    def _ordered(cls, bounds: tuple[float, float]) -> tuple[float, float]:
+        return _ordered(bounds, " mm")
+
+    def costs(self) -> list[float]:
+        """The thicknesses, mm, evenly apart."""
+        lower, upper = self.bounds
+        step = (upper - lower) / (self.points - 1)
+        return [*(lower + n * step for n in range(self.points - 1)), upper]
+
+
+class CapturesConfig(Section):
+    """Captures against PSNR: how many settings, each with the phases of the synthesis."""
+
+    shots: Annotated[tuple[Count, ...], Field(min_length=1)]
+
+    @pydantic.field_validator("shots")
+    @classmethod
+    def _once(cls, shots: tuple[int, ...]) -> tuple[int, ...]:
+        if len(set(shots)) < len(shots):
+            raise ValueError("shots hold an entry twice; give each once")
+        return tuple(sorted(shots))
+
+
+class LightConfig(Section):
+    """Light against resolution: electrons of a pixel from each mm² of open aperture."""
+
+    bounds: tuple[Electrons, Electrons]
+    points: Points = 6
+
+    @pydantic.field_validator("bounds")
+    @classmethod
+    def _ordered(cls, bounds: tuple[float, float]) -> tuple[float, float]:
+        return _ordered(bounds, " electrons")
+
+    def costs(self) -> list[float]:
+        """The electrons, each by the same factor more than the one before."""
+        lower, upper = self.bounds
+        factor = (upper / lower) ** (1 / (self.points - 1))
+        return [*(lower * factor**n for n in range(self.points - 1)), upper]
+
+
+class ParetoConfig(Section):
+    """Fronts of designs; every point of them is a search over all that is free.
+
+    `samples`, `starts`, `steps`, `solver`: of each of the searches, as of `search`.
+    """
+
+    thickness: ThicknessConfig | None = None
+    captures: CapturesConfig | None = None
+    light: LightConfig | None = None
+    samples: Annotated[int, Field(ge=1, le=100_000)] = 128
+    starts: Annotated[int, Field(ge=1, le=1000)] = 4
+    steps: Annotated[int, Field(ge=1, le=1000)] = 40
+    solver: Literal["bfgs", "lbfgsb"] = "bfgs"
+
+    @pydantic.model_validator(mode="after")
+    def _some(self):
+        if self.thickness is None and self.captures is None and self.light is None:
+            raise ValueError("no front is asked for; give thickness, captures or light")
+        return self
+
+
+def _ordered(bounds: tuple[float, float], unit: str) -> tuple[float, float]:
+    lower, upper = bounds
+    if not lower < upper:
+        raise ValueError(f"bounds cross: {lower:g} to {upper:g}{unit}; give the lower first")
+    return bounds
+
+
+def with_shots(config: Any, count: int) -> Any:
+    """The same search for designs of so many shots.
+
+    Fewer are the first of the reference; more of them begin as copies of its last, and are free in
+    what that is free in.
+    """
+    given = config.reference.shots
+    last = len(given)
+    shots = (*given, *(given[-1],) * (count - last))[:count]
+    free = []
+    for entry in config.search.free:
+        if entry.shots is None:
+            free.append(entry)
+            continue
+        kept = tuple(s for s in entry.shots if s <= count)
+        if last in entry.shots:
+            kept = (*kept, *range(last + 1, count + 1))
+        if kept:
+            free.append(entry.model_copy(update={"shots": kept}))
+    reference = config.reference.model_copy(update={"shots": shots})
+    search = config.search.model_copy(update={"free": tuple(free)})
+    return config.model_copy(update={"reference": reference, "search": search})
+
+
+def check_pareto(config: Any) -> None:
+    """Refuse fronts that the rest of a design's file has no designs for."""
+    fronts = config.pareto
+    if fronts.thickness is not None:
+        _check_thickness(config, fronts.thickness)
+    if fronts.captures is not None:
+        _check_captures(config, fronts.captures)
+    if fronts.light is not None and config.noise.electrons is None:
+        message = (
+            "light needs noise that counts electrons, and snr_db is the same at any light; give "
+            "noise.read_noise and noise.electrons, or drop this front"
+        )
+        raise misfit(message, "pareto", "light")
+
+
+def _check_thickness(config: Any, front: ThicknessConfig) -> None:
+    place = ("pareto", "thickness")
+    free = _free_distances(config)
+    if not free:
+        message = "no distance is free; give search.free a distance, or drop this front"
+        raise misfit(message, *place)
+    thinnest, thickest = front.bounds
+    for number, shot in enumerate(config.reference.shots, 1):
+        if number in free and free[number][0] > thinnest:
+            raise misfit(
+                f"no design is feasible at {thinnest:g} mm: the distance of shot {number} is free "
+                f"from {free[number][0]:g} mm only; begin there, or lower its bound",
+                *place,
+                "bounds",
+            )
+        if number not in free and shot.distance > thinnest:
+            raise misfit(
+                f"no design is feasible at {thinnest:g} mm: the distance of shot {number}, "
+                f"{shot.distance:g} mm, is not free; free it, or begin there",
+                *place,
+                "bounds",
+            )
+    limit = config.search.limits.thickness or math.inf
+    longest = min(limit, max(upper for _, upper in free.values()))
+    if thickest > longest * (1 + 1e-9):
+        raise misfit(
+            f"bounds reach to {thickest:g} mm, and no free distance beyond {longest:g} mm; end "
+            "there, or raise search.free and search.limits.thickness",
+            *place,
+            "bounds",
+        )
+
+
+def _free_distances(config: Any) -> dict[int, tuple[float, float]]:
+    """The bounds of the shots, counted from 1, whose distance is free."""
+    every = tuple(range(1, len(config.reference.shots) + 1))
+    entries = (f for f in config.search.free if f.variable == "distance")
+    return {shot: f.bounds for f in entries for shot in f.shots or every}
+
+
+def _check_captures(config: Any, front: CapturesConfig) -> None:
+    place = ("pareto", "captures")
+    phases = len(config.reference.method().shot_phases())
+    allowed = config.search.limits.captures
+    most = front.shots[-1]
+    if most * phases > allowed:
+        raise misfit(
+            f"{most} shots take {most * phases} captures, and search.limits.captures allows "
+            f"{allowed}; give at most {allowed // phases} shots",
+            *place,
+            "shots",
+        )
+    if config.frees("exposure"):
+        message = (
+            "the captures of this front share the exposure evenly, and search.free has it; drop one"
+        )
+        raise misfit(message, *place)
+    if not with_shots(config, front.shots[0]).search.free:
+        message = f"of the first shots, {front.shots[0]}, nothing is free; give more, or free them"
+        raise misfit(message, *place, "shots")
+    if not config.pictures():
+        message = "PSNR needs a photograph among the targets; give one, or drop this front"
+        raise misfit(message, *place)

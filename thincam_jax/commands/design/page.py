@@ -1,0 +1,161 @@
+"""The report of a design: one HTML page that stands alone."""
+
+from pathlib import Path
+from typing import Any
+
+from thincam_jax.commands.design.config import DesignConfig
+from thincam_jax.commands.design.words import (
+    QUANTITIES,
+    cells,
+    found_number,
+    free_number,
+    in_words,
+    of_shots,
+    told_of,
+)
+from thincam_jax.commands.page import data_url, load_template
+from thincam_jax.commands.study.config import dump_config
+
+
+def render(
+    config: DesignConfig, folder: Path, design: dict[str, Any], environment: dict[str, Any]
+) -> str:
+    """The page, with its pictures inside."""
+    return load_template("design").render(
+        config=config,
+        design=design,
+        free=[free_number(v["variable"], v["shots"]) for v in design["found"][0]["values"]],
+        reference=[
+            of_shots(design["reference"], v["variable"], v["shots"])
+            for v in design["found"][0]["values"]
+        ],
+        numbers=[[found_number(v) for v in one["values"]] for one in design["found"]],
+        validated=list(design["validation"]["methods"]),
+        findings=findings(design),
+        fronts=fronts(design),
+        environment=environment,
+        yaml=dump_config(config),
+        picture=lambda name: data_url(folder / name) if (folder / name).exists() else None,
+    )
+
+
+def findings(design: dict[str, Any]) -> list[str]:
+    """What the numbers say, in sentences."""
+    best, reference = design["found"][0], design["reference"]
+    names = told_of([best, reference])
+    unit = design["objective"]["told"].rpartition("(")[2].rstrip(")")
+    by = "training" if design["training"] else design["objective"]["name"]
+    sentences = [
+        f"The best design by {by} is {' and '.join(in_words(best, names))}. The objective "
+        f"predicts {best['predicted_gain']:+.3g} {unit} over {reference['name']} "
+        f"({' and '.join(in_words(reference, names))})."
+    ]
+    if best["training_gain_db"] is not None:
+        sentences.append(f"On the training images it gains {best['training_gain_db']:+.2f} dB.")
+    sentences += [f"The reference breaks a limit: {why}." for why in reference["broken_limits"]]
+    if best["active_limits"]:
+        sentences.append(f"It lies against a limit: {'; '.join(best['active_limits'])}.")
+    validation = design["validation"]
+    for name, targets in validation["methods"].items():
+        gains = [
+            f"{_spread(t['gain_db'], 2)} dB on {target}"
+            for target, t in targets.items()
+            if target in validation["pictures"] and t.get("gain_db")
+        ]
+        if gains:
+            sentences.append(f"Simulated, {name} gains {', '.join(gains)}.")
+        for target, found in targets.items():
+            if target in validation["charts"] and found.get("gain_elements"):
+                steps = _spread(found["gain_elements"], 1)
+                psnr = (
+                    f"{_spread(found['gain_db'], 2)} dB" if found["gain_db"] else "an exact image"
+                )
+                sentences.append(f"On {target}, {name} resolves {steps} elements more, at {psnr}.")
+    if not validation["one_object_grid"]:
+        sentences.append(
+            "The designs' largest distances differ, and with them the object's pixels (in the "
+            "table below): their PSNR is not on one grid and compares to some tenths of a dB only."
+        )
+    return sentences
+
+
+_COSTS = {
+    "thickness": ("thickness, mm", "thickness_mm"),
+    "captures": ("captures", "captures"),
+    "light": ("electrons from each mm²", "electrons_per_mm2"),
+}
+_LIMIT = (
+    "Resolution is the frequency up to which every ring of frequencies has a signal-to-noise "
+    "ratio of at least 1."
+)
+
+
+def fronts(design: dict[str, Any]) -> list[dict[str, Any]]:
+    """Of each Pareto front its table: title, labels of the columns, rows of texts, a sentence."""
+    told = design.get("pareto", {})
+    return [
+        _front(name, told[name], design["reference"]["name"]) for name in _COSTS if name in told
+    ]
+
+
+def _front(name: str, front: dict[str, Any], reference: str) -> dict[str, Any]:
+    label, cost = _COSTS[name]
+    names = told_of([*front["points"], front["reference"]])
+    labels = [QUANTITIES[name].label for name in names]
+    points = [(_cost(p[cost]), p) for p in front["points"]]
+    points.append((f"{reference}: {_cost(front['reference'][cost])}", front["reference"]))
+    kept = {True: "no", False: "yes", None: ""}
+    if name == "captures":
+        pictures = list(front["points"][0]["simulated_psnr_db"])
+        return {
+            "title": "Captures against PSNR",
+            "labels": [
+                label,
+                *labels,
+                "predicted, dB",
+                *(f"{p}, dB" for p in pictures),
+                "front",
+            ],
+            "rows": [
+                [
+                    *(text, *cells(p, names), f"{p['predicted_psnr_db']:.2f}"),
+                    *(_decibel(p.get("simulated_psnr_db", {}).get(n)) for n in pictures),
+                    kept[p.get("dominated")],
+                ]
+                for text, p in points
+            ],
+            "told": f"The exposure is {front['exposure']}. Predicted from the error of the best "
+            "linear reconstruction and the mean variance of the pictures; simulated in full at one "
+            "seed. The front is that of the prediction. Where distances differ, so do the object's "
+            "pixels, and simulated PSNR compares to some tenths of a dB only.",
+        }
+    return {
+        "title": f"{name.capitalize()} against resolution",
+        "labels": [label, *labels, "cycles/rad", "line pairs/mm on the object", "", "front"],
+        "rows": [
+            [
+                *(text, *cells(p, names)),
+                f"{p['resolution_cycles_per_rad']:.1f}",
+                f"{p['resolution_line_pairs_per_mm']:.3f}",
+                p["resolution_ends"] or "",
+                kept[p.get("dominated")],
+            ]
+            for text, p in points
+        ],
+        "told": _LIMIT,
+    }
+
+
+def _cost(value: float | int) -> str:
+    return f"{value:.0f}" if value >= 1000 else f"{value:.4g}"
+
+
+def _decibel(value: float | None) -> str:
+    return "–" if value is None else f"{value:.2f}"
+
+
+def _spread(spread: dict[str, Any], digits: int) -> str:
+    text = f"{spread['mean']:+.{digits}f}"
+    if spread["deviation"] is not None:
+        text += f" ± {spread['deviation']:.{digits}f}"
+    return text

@@ -1,0 +1,198 @@
+"""What goes into design.json."""
+
+import math
+from typing import Any
+
+import numpy as np
+
+from thincam_jax.commands.design.config import DesignConfig
+from thincam_jax.commands.design.pareto import Front, Fronts, Point
+from thincam_jax.commands.design.problem import broken_limits
+from thincam_jax.commands.design.ranking import Candidate, FreeValue, Result, Shot
+from thincam_jax.commands.study.config import ShotConfig, StudyConfig
+from thincam_jax.design import non_dominated
+from thincam_jax.design.space import UNITS
+
+
+def record(config: DesignConfig, result: Result, study: StudyConfig, validation: dict) -> dict:
+    """The designs, best first, and the validation of those of them that were simulated."""
+    goal = result.goal
+    return {
+        "design": config.name,
+        "seed": config.seed,
+        "objective": {
+            "name": goal.name,
+            "better": "higher" if goal.wants_more else "lower",
+            "told": goal.label,
+            "band": list(goal.band) if goal.name in ("worst_ratio", "unevenness") else None,
+            "highest_cycles_per_rad": _round(result.edge),
+            "prior_exponent": _round(result.exponent),
+        },
+        "search": {
+            "evaluations": result.evaluations,
+            "failed_starts": result.failed,
+            "solver": config.search.solver,
+        },
+        "training": _training(config, result),
+        "reference": {
+            **_candidate(result, result.reference),
+            "broken_limits": list(broken_limits(config)),
+        },
+        "compare": [
+            {"name": rival.name, "shots": [_shot(_given(config, s)) for s in rival.shots]}
+            for rival in config.compare
+        ],
+        "found": [_found(result, candidate) for candidate in result.found],
+        "validation": {
+            "seeds": config.validation.seeds,
+            "pictures": [t.name for t in config.pictures()],
+            "charts": [t.name for t in config.targets if t.kind == "usaf1951"],
+            "one_object_grid": len({max(s.distance for s in m.shots) for m in study.methods}) == 1,
+            "methods": validation,
+        },
+    }
+
+
+def _training(config: DesignConfig, result: Result) -> dict[str, Any] | None:
+    if config.train is None or result.training is None:
+        return None
+    return {
+        "reconstruction": config.train.reconstruction,
+        "images": list(config.train.images),
+        "pixels": result.training.pixels,
+        "samples": config.train.samples,
+        "starts": config.train.starts,
+        "evaluations": result.training.evaluations,
+        "failed_descents": result.training.failed,
+    }
+
+
+def _candidate(result: Result, one: Candidate) -> dict[str, Any]:
+    sign = -1 if result.goal.wants_more else 1
+    return {
+        "name": one.name,
+        "shots": [_shot(shot) for shot in one.shots],
+        "objective": _round(sign * one.searched),
+        "objective_exact": _round(sign * one.exact),
+        "told": _round(float(result.goal.told(one.exact))),
+        "training_error": None if one.trained is None else _round(one.trained),
+    }
+
+
+def _found(result: Result, one: Candidate) -> dict[str, Any]:
+    return {
+        **_candidate(result, one),
+        "predicted_gain": _round(result.goal.gain(result.reference.exact, one.exact)),
+        "training_gain_db": _training_gain(result.reference, one),
+        "values": [_value(value) for value in one.values],
+        "status": one.status,
+        "active_limits": list(one.active),
+    }
+
+
+def _training_gain(reference: Candidate, one: Candidate) -> float | None:
+    if reference.trained is None or one.trained is None:
+        return None
+    if not (reference.trained > 0 and one.trained > 0):  # no number, or a perfect image
+        return None
+    return _round(10 * math.log10(reference.trained / one.trained))
+
+
+def record_fronts(config: DesignConfig, fronts: Fronts) -> dict[str, Any]:
+    """The fronts, each with its points in the order of their cost, and which of them count."""
+    told: dict[str, Any] = {"highest_cycles_per_rad": _round(fronts.edge)}
+    if fronts.thickness is not None:
+        told["thickness"] = _front(config, fronts.thickness, "thickness_mm")
+    if fronts.captures is not None:
+        assert fronts.picture_variance is not None  # for the type checker
+        told["captures"] = _captures(config, fronts.captures, fronts.picture_variance)
+    if fronts.light is not None:
+        told["light"] = _front(config, fronts.light, "electrons_per_mm2")
+    return told
+
+
+def _front(config: DesignConfig, front: Front, cost: str) -> dict[str, Any]:
+    """Cost against resolution."""
+    worth = [(p.cost, p.resolution) for p in front.points]
+    beaten = ~non_dominated(np.asarray(worth), larger=(False, True))
+    points = [_point(config, p, cost) for p in front.points]
+    return {
+        "reference": _point(config, front.reference, cost),
+        "points": [{**p, "dominated": bool(b)} for p, b in zip(points, beaten, strict=True)],
+    }
+
+
+def _captures(config: DesignConfig, front: Front, variance: float) -> dict[str, Any]:
+    """Captures against PSNR, predicted and simulated."""
+
+    def predicted(point: Point) -> dict[str, Any]:
+        size = point.error * variance
+        level = -10 * math.log10(size) if size > 0 else math.nan
+        told = _point(config, point, "captures")
+        return {**told, "captures": round(point.cost), "predicted_psnr_db": _round(level)}
+
+    points = []
+    for point in front.points:
+        known = [psnr for _, psnr in point.simulated if psnr is not None]
+        whole = len(known) == len(point.simulated)
+        points.append(
+            {
+                **predicted(point),
+                "simulated_psnr_db": dict(point.simulated),
+                "simulated_mean_db": _round(float(np.mean(known))) if whole else None,
+            }
+        )
+    for name in ("predicted_psnr_db", "simulated_mean_db"):
+        worth = [(p["captures"], math.nan if p[name] is None else p[name]) for p in points]
+        beaten = ~non_dominated(np.asarray(worth, float), larger=(False, True))
+        key = "dominated" if name == "predicted_psnr_db" else "simulated_dominated"
+        for point, is_beaten in zip(points, beaten, strict=True):
+            point[key] = bool(is_beaten)
+    return {
+        "exposure": "the same for each capture, at the SNR given"
+        if config.noise.electrons is None
+        else "that of the reference's captures, divided evenly",
+        "picture_variance": _round(variance),
+        "reference": predicted(front.reference),
+        "points": points,
+    }
+
+
+def _point(config: DesignConfig, point: Point, cost: str) -> dict[str, Any]:
+    return {
+        cost: _round(point.cost),
+        "shots": [_shot(shot) for shot in point.shots],
+        "resolution_cycles_per_rad": _round(point.resolution),
+        "resolution_line_pairs_per_mm": _round(point.resolution / config.object.distance),
+        "resolution_ends": point.ends or None,
+        "bayes_error": _round(point.error),
+    }
+
+
+def _given(config: DesignConfig, shot: ShotConfig) -> Shot:
+    return Shot(shot.beta, shot.distance, config.wavelength, config.mask.width)
+
+
+def _shot(shot: Shot) -> dict[str, float | None]:
+    return {
+        "beta_rad_per_mm2": _round(shot.beta),
+        "distance_mm": _round(shot.distance),
+        "wavelength_nm": _round(shot.wavelength * 1e6),
+        "width_mm": _round(shot.width),
+        "exposure": _round(shot.exposure),
+    }
+
+
+def _value(value: FreeValue) -> dict[str, Any]:
+    return {
+        "variable": value.variable,
+        "shots": list(value.shots),
+        "value": _round(value.value),
+        "tolerance": None if value.tolerance is None else _round(value.tolerance),
+        "unit": UNITS[value.variable],
+    }
+
+
+def _round(value: float) -> float | None:
+    """Seven digits; None for what is no number, which JSON does not know."""
+    return float(f"{value:.7g}") if math.isfinite(value) else None

@@ -1,0 +1,97 @@
+"""What a run or a bug report needs to know of the installation."""
+
+import platform
+import sys
+from importlib import metadata
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from thincam_jax._core.precision import product
+
+PACKAGES = (
+    *("thincam_jax", "jax", "jaxlib", "equinox", "numpy", "scipy", "scikit-image", "optimistix"),
+    *("lineax", "optax", "jaxopt", "pydantic", "matplotlib"),
+)
+OPTIONAL = {
+    "pytest-benchmark": "benchmarks (make bench)",
+    "mpmath": "tests",
+    "hypothesis": "tests",
+    "dask": "sweeps (thincam sweep)",
+    "distributed": "sweeps (thincam sweep)",
+    "pyarrow": "sweeps (thincam sweep)",
+}
+
+
+def environment(seconds: float | None = None) -> dict[str, Any]:
+    """Versions and machine of a run."""
+    versions = {}
+    for name in PACKAGES:
+        try:
+            versions[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            versions[name] = None
+    return {
+        "python": platform.python_version(),
+        "platform": f"{platform.system()} {platform.machine()}",
+        "devices": [str(d) for d in jax.devices()],
+        "precision": str(jnp.zeros(()).dtype),
+        "versions": versions,
+        "command": ["thincam", *sys.argv[1:]],
+        "seconds": None if seconds is None else round(seconds, 1),
+    }
+
+
+def dtype_support() -> dict[str, str]:
+    """Which precisions the default device computes in, tried out."""
+    support = {}
+    for name in ("float32", "complex64", "float64", "complex128"):
+        if name in ("float64", "complex128") and not jax.config.read("jax_enable_x64"):
+            support[name] = "off; set JAX_ENABLE_X64=1"
+            continue
+        try:
+            transformed = jnp.fft.fft(jnp.ones(4, dtype=name))
+            support[name] = "yes" if bool(jnp.isfinite(transformed).all()) else "wrong results"
+        except (TypeError, RuntimeError) as error:
+            support[name] = f"no ({type(error).__name__})"
+    return support
+
+
+def compiled_sums() -> str:
+    """Whether the compiler of the default device adds up right, tried out.
+
+    jaxlib 0.10.2 does not on a CPU: reductions that it fuses with what follows read other memory
+    (https://github.com/jax-ml/jax/issues/39103), and the result is a number, or none.
+    """
+    rows = np.random.default_rng(0).uniform(0.5, 1.5, (40_000, 3)).astype(np.float32)
+    response, capture = rows.ravel()[: 4 * 64**2].reshape(2, 1, 2, 64, 64)
+    noise = np.asarray([[0.7, 1.3]], np.float32)
+    squares = jax.jit(_of_rows)(rows, np.eye(3, dtype=np.float32))
+    means = jax.jit(_of_channels)(response, capture, noise)
+    right = np.allclose(squares, np.sum(rows**2, axis=1), rtol=1e-4) and np.allclose(
+        means, _of_channels(response, capture, noise), rtol=1e-4
+    )
+    return "right" if right else "WRONG; install another jaxlib, such as 0.10.1"
+
+
+def _of_rows(rows, matrix):
+    return jax.vmap(lambda row: jnp.sum(product(matrix, row) ** 2))(rows)
+
+
+def _of_channels(response, capture, noise):
+    """A mean weighted by noise, as of the channels of a Wiener filter."""
+    noise = noise[:, :, None, None]
+    return (response / noise * capture).sum(1) / ((response**2 / noise).sum(1) + 1)
+
+
+def missing_parts() -> dict[str, str]:
+    """Optional packages that are not installed, and what they are for."""
+    missing = {}
+    for name, purpose in OPTIONAL.items():
+        try:
+            metadata.version(name)
+        except metadata.PackageNotFoundError:
+            missing[name] = purpose
+    return missing

@@ -1,0 +1,147 @@
+"""Which captures are to be reconstructed, and into which files; told before any work."""
+
+import os
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from thincam_jax.commands.photo.options import Output, Sources
+from thincam_jax.measured import CaptureFileError, MeasurementError, write_image
+from thincam_jax.measured.folder import SUFFIXES
+from thincam_jax.measured.write import LINEAR
+
+
+@dataclass(frozen=True)
+class Job:
+    """One capture and the images to be made of it; the record stands beside them as NAME.json."""
+
+    capture: Path
+    images: tuple[Path, ...]
+
+    @property
+    def record(self) -> Path:
+        return self.images[0].with_suffix(".json")
+
+    @property
+    def is_shown(self) -> bool:
+        """Whether one of the images is for looking at."""
+        return self.images[0].suffix.lower() == ".png"
+
+
+def plan_jobs(capture: Path, sources: Sources, output: Output) -> list[Job]:
+    """What is to be made of a capture, or of each capture in a folder.
+
+    Files of the folder that `sources` names are no captures. Nothing is written yet, but whether
+    something can be is tried.
+
+    **Errors**: MeasurementError, one line, for a folder without captures or that is also the
+    output's, an output that cannot be written or that would overwrite an input, and two captures of
+    the same name.
+    """
+    batch = capture.is_dir()
+    captures = _captures_in(capture, sources) if batch else [capture]
+    folder = output.path if batch or output.path.is_dir() else output.path.parent
+    if batch:
+        _check_batch_folder(capture, folder)
+    names = [output.path if folder != output.path else folder / f"{c.stem}.png" for c in captures]
+    jobs = [Job(c, _images(n, output)) for c, n in zip(captures, names, strict=True)]
+    _check_names(jobs, sources)
+    _check_writable(folder, create=batch)
+    return jobs
+
+
+def write_job(job: Job, image: np.ndarray, record: dict[str, Any], output: Output) -> None:
+    """All files of a job, complete before the first of them takes its name; the record first."""
+    folder = job.record.parent
+    folder.mkdir(exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=".thincam-", dir=folder) as staging:
+        for path in job.images:
+            write_image(
+                Path(staging) / path.name,
+                image,
+                record,
+                white_balance=output.white_balance,
+                gamma=output.gamma,
+            )
+        for path in (job.record, *job.images):
+            os.replace(Path(staging) / path.name, path)
+
+
+def _captures_in(folder: Path, sources: Sources) -> list[Path]:
+    used = {path.resolve() for path in sources.paths()}
+    try:
+        entries = sorted(folder.iterdir())
+    except OSError as error:
+        raise CaptureFileError(f"{folder}: cannot be read ({error.strerror})") from None
+    captures = [
+        path
+        for path in entries
+        if path.suffix.lower() in SUFFIXES
+        and not path.name.startswith(".")
+        and path.resolve() not in used
+        and not path.is_dir()
+    ]
+    if not captures:
+        raise CaptureFileError(
+            f"{folder}: holds no capture; give a folder of {', '.join(SUFFIXES)} files"
+        )
+    return captures
+
+
+def _images(path: Path, output: Output) -> tuple[Path, ...]:
+    """The image files of a result that is asked for as `path`."""
+    suffix = path.suffix.lower()
+    if suffix in LINEAR:
+        return (path,)
+    if suffix != ".png":
+        raise MeasurementError(
+            f"{path}: images are written as .png (for looking at), .npy or .tif (linear); give one "
+            "of these suffixes, or a folder that exists"
+        )
+    return (path,) if output.linear == "none" else (path, path.with_suffix(f".{output.linear}"))
+
+
+def _check_batch_folder(captures: Path, folder: Path) -> None:
+    if folder.exists() and not folder.is_dir():
+        raise MeasurementError(f"{folder}: is a file; for a folder of captures give a folder")
+    if folder.resolve() == captures.resolve():
+        raise MeasurementError(
+            f"{folder}: holds the captures, among which the results would be lost; give another "
+            "folder"
+        )
+
+
+def _check_names(jobs: list[Job], sources: Sources) -> None:
+    inputs = {p.resolve(): p for p in (*sources.paths(), *(job.capture for job in jobs))}
+    taken: dict[Path, Path] = {}
+    for job in jobs:
+        for path in (job.record, *job.images):
+            if path.resolve() in inputs:
+                raise MeasurementError(
+                    f"{path}: is read as an input and would be overwritten; give another output"
+                )
+            if path.is_dir():
+                raise MeasurementError(f"{path}: is a folder; give another output")
+        other = taken.setdefault(job.record, job.capture)
+        if other != job.capture:
+            raise MeasurementError(
+                f"{job.capture} and {other.name} would both become {job.images[0].name}; "
+                "rename one of them"
+            )
+
+
+def _check_writable(folder: Path, *, create: bool) -> None:
+    """Try it, for what the system says of permissions is not the whole truth."""
+    tried = folder.parent if create and not folder.exists() else folder
+    if not tried.is_dir():
+        raise MeasurementError(f"{tried}: is no folder; make it, or give another output")
+    try:
+        with tempfile.TemporaryDirectory(prefix=".thincam-", dir=tried):
+            pass
+    except OSError as error:
+        raise MeasurementError(
+            f"{tried}: cannot be written into ({error.strerror or error}); give another folder"
+        ) from None

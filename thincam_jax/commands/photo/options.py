@@ -1,0 +1,135 @@
+"""What a run is asked for: its files, its method, and what it writes."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from thincam_jax._core import checks
+from thincam_jax.measured import MeasurementError, Preparation
+from thincam_jax.measured.display import WhiteBalance
+from thincam_jax.reconstruction import METHODS
+from thincam_jax.reconstruction.arguments import DEFAULT_RIDGE, DEFAULT_TAU, FILTERS, refuse_unused
+
+# Its captures are raw counts; prepared ones have their background taken away and a maximum of 1.
+NEEDS_COUNTS = ("poisson",)
+PSF_METHODS = tuple(m for m in METHODS if m not in (*FILTERS, *NEEDS_COUNTS))
+
+# Far beyond any use; its product with the captures' units stays within float32.
+_LARGEST_TAU = 1e6
+
+Background = Path | float | int | None
+
+
+@dataclass(frozen=True)
+class Sources:
+    """What all captures of a run share; see `measured.prepare`.
+
+    - `psf`, `dead`: files. `background`, `psf_background`: a dark frame's file, a number of counts,
+      or None for the default.
+    - `bits`: bit depth of the camera where its files do not tell it.
+    """
+
+    psf: Path
+    background: Background = None
+    psf_background: Background = None
+    dead: Path | None = None
+    bits: int | None = None
+    preparation: Preparation = Preparation()
+
+    def paths(self) -> list[Path]:
+        """Every file that is read."""
+        given = (self.psf, self.background, self.psf_background, self.dead)
+        return [path for path in given if isinstance(path, Path)]
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """How to reconstruct; see `thincam_jax.reconstruct`.
+
+    - `method`: one of `PSF_METHODS`.
+    - `tau`: weight of the variation relative to the noise; None: 2. `iterations`: at most.
+    - `coupling`: of colours; None: "joint" for several channels.
+    - `field`: "sensor" keeps the part of the image in front of the sensor, "full" all that sends
+      light to it.
+    - `flip`: turn the image by 180°.
+    - `ridge`: of the method "ridge", which has neither tau nor coupling; None: 1.
+
+    **Errors**: MeasurementError for what is unknown or out of range.
+    """
+
+    method: str = "admm_tv"
+    tau: float | int | None = None
+    iterations: int = 100
+    coupling: Literal["none", "joint", "opponent"] | None = None
+    field: Literal["sensor", "full"] = "sensor"
+    flip: bool = False
+    ridge: float | int | None = None
+
+    def __post_init__(self):
+        self._check_method()
+        try:
+            checks.choice("coupling", self.coupling or "none", ("none", "joint", "opponent"))
+            checks.choice("field", self.field, ("sensor", "full"))
+            checks.non_negative("tau", self.relative_tau, "parts of one")
+            if self.ridge is not None:
+                checks.positive("ridge", self.ridge, "parts of one")
+        except ValueError as error:
+            raise MeasurementError(str(error)) from None
+        if self.relative_tau > _LARGEST_TAU:
+            raise MeasurementError(
+                f"tau = {self.relative_tau:g}: give about 1 to 3, at most {_LARGEST_TAU:g}"
+            )
+        if self.iterations < 1:
+            raise MeasurementError(f"iterations = {self.iterations}: give at least 1")
+
+    @property
+    def is_ridge(self) -> bool:
+        return self.method == "ridge"
+
+    @property
+    def relative_tau(self) -> float | int:
+        return DEFAULT_TAU if self.tau is None else self.tau
+
+    @property
+    def relative_ridge(self) -> float | int:
+        return DEFAULT_RIDGE if self.ridge is None else self.ridge
+
+    def _check_method(self) -> None:
+        """Whether it is one, works from prepared captures, and uses what is given."""
+        able = f"choose one of {', '.join(repr(m) for m in PSF_METHODS)}"
+        if self.method in FILTERS:
+            raise MeasurementError(
+                f"method {self.method!r} needs a model of the camera; with a measured PSF {able}"
+            )
+        if self.method in NEEDS_COUNTS:
+            raise MeasurementError(
+                f"method {self.method!r} needs raw counts, which prepared captures are not; {able}"
+            )
+        try:
+            checks.choice("method", self.method, PSF_METHODS)
+            given = {"variation": self.coupling, "tau": self.tau, "ridge": self.ridge}
+            refuse_unused(self.method, **given)
+        except ValueError as error:
+            text = str(error).replace("variation", "coupling")
+            raise MeasurementError(text) from None
+
+
+@dataclass(frozen=True)
+class Output:
+    """Where and how results are written.
+
+    - `path`: an image file; or a folder, in which each result has the name of its capture.
+    - `linear`: format of the float image beside a PNG, "npy" or "tif"; "none" for none.
+    - `gamma`, `white_balance`: of the PNG; see `measured.to_display`.
+    """
+
+    path: Path
+    linear: Literal["npy", "tif", "none"] = "npy"
+    gamma: float | int = 2.2
+    white_balance: WhiteBalance = None
+
+    def __post_init__(self):
+        try:
+            checks.choice("linear", self.linear, ("npy", "tif", "none"))
+        except ValueError as error:
+            raise MeasurementError(str(error)) from None

@@ -1,0 +1,274 @@
+"""Working through captures: prepare, reconstruct, write, and say what was done."""
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from thincam_jax._core.memory import refuse_if_too_large
+from thincam_jax.commands.doctor import environment
+from thincam_jax.commands.photo.jobs import Job, write_job
+from thincam_jax.commands.photo.options import Background, Output, Recipe, Sources
+from thincam_jax.imaging.operators import window_shape
+from thincam_jax.measured import (
+    MeasurementError,
+    Prepared,
+    Raw,
+    prepare,
+    read_image,
+    read_mask,
+    to_display,
+)
+from thincam_jax.reconstruction import (
+    Deconvolution,
+    Progress,
+    Reconstruction,
+    TotalVariation,
+    psf_problem,
+    reconstruct,
+)
+from thincam_jax.reconstruction.entry import Method
+from thincam_jax.reconstruction.problem import residuals
+from thincam_jax.reconstruction.regularised import middle
+
+# Real arrays of the window's size that a reconstruction holds at its peak, for each channel.
+_WINDOWS = 28
+
+Told = Callable[[str, Progress], object]
+
+
+@dataclass(frozen=True)
+class Finished:
+    """A capture whose image is written, and the record that was written beside it."""
+
+    job: Job
+    record: dict[str, Any]
+
+    @property
+    def status(self) -> str:
+        """See `Reconstruction.ending`."""
+        return self.record["reconstruction"]["status"]
+
+
+@dataclass(frozen=True)
+class Failed:
+    """A capture of which nothing was written, and why: one line."""
+
+    job: Job
+    error: MeasurementError | MemoryError
+
+
+def run_jobs(
+    jobs: Sequence[Job], sources: Sources, recipe: Recipe, output: Output, told: Told | None = None
+) -> Iterator[Finished | Failed]:
+    """Reconstruct capture after capture; the files of one are written before the next begins.
+
+    All captures of one shape are computed by what was compiled for the first. One that fails is
+    given as `Failed`, and the next is taken up. `told` is called with the capture's name and the
+    `Progress` of its iteration. Ctrl-C writes the best image so far, with the status "interrupted",
+    and ends; before the first image is there, it raises KeyboardInterrupt.
+
+    **Errors**: MeasurementError, one line, for sources that cannot be read.
+    """
+    rig = _Rig(sources)
+    for job in jobs:
+        try:
+            finished = _run_job(job, rig, recipe, output, told)
+        except (MeasurementError, MemoryError) as error:
+            yield Failed(job, error)
+            continue
+        yield finished
+        if finished.status == "interrupted":
+            return
+
+
+class _Rig:
+    """`Sources`, read once."""
+
+    def __init__(self, sources: Sources):
+        self.sources = sources
+        self.psf = read_image(sources.psf, sources.bits)
+        self.background = self._background(sources.background)
+        self.psf_background = self._background(sources.psf_background)
+        self.dead = None if sources.dead is None else read_mask(sources.dead)
+
+    def _background(self, given: Background) -> Raw | float | None:
+        return read_image(given, self.sources.bits) if isinstance(given, Path) else given
+
+    def prepare(self, capture: Path) -> Prepared:
+        return prepare(
+            self.psf,
+            read_image(capture, self.sources.bits),
+            self.background,
+            self.sources.preparation,
+            psf_background=self.psf_background,
+            dead=self.dead,
+        )
+
+
+def _run_job(job: Job, rig: _Rig, recipe: Recipe, output: Output, told: Told | None) -> Finished:
+    began = time.perf_counter()
+    ready = rig.prepare(job.capture)
+    _check_channels(job, ready, recipe, output)
+    image, facts = _reconstruct(job, ready, recipe, told)
+    shown = {"gamma": output.gamma, "white_balance": output.white_balance}
+    record = {
+        "capture": job.capture,
+        "sources": _told(rig.sources),
+        "preparation": ready.log,
+        "reconstruction": facts,
+        "image": _image_facts(image, recipe),
+        "files": {path.suffix[1:].lower(): path.name for path in job.images},
+        "display": shown if job.is_shown else None,
+        "environment": environment(time.perf_counter() - began),
+    }
+    try:
+        write_job(job, image, record, output)
+    except OSError as error:
+        raise MeasurementError(
+            f"{job.images[0]}: cannot be written ({error.strerror or error})"
+        ) from None
+    return Finished(job, record)
+
+
+def _told(sources: Sources) -> dict[str, Any]:
+    """All but the preparation, which tells its own."""
+    names = ("psf", "background", "psf_background", "dead", "bits")
+    return {name: getattr(sources, name) for name in names}
+
+
+def _reconstruct(
+    job: Job, ready: Prepared, recipe: Recipe, told: Told | None
+) -> tuple[Float[np.ndarray, "channel y x"], dict[str, Any]]:
+    """The image, and what was done for it."""
+    # The mask is given even where all is valid, so that one compilation serves a whole folder.
+    capture, psf, valid = (jnp.asarray(a)[None] for a in (ready.capture, ready.psf, ready.valid))
+    *_, channels, rows, columns = capture.shape  # those of the PSF as well
+    sensor, field = (rows, columns), (2 * rows - 1, 2 * columns - 1)
+    _check_memory(job, window_shape(sensor, field, sensor), channels)
+    coupling = recipe.coupling or ("joint" if channels > 1 else "none")
+    variation = TotalVariation(coupling=coupling)
+    found = reconstruct(
+        capture,
+        psf,
+        method=cast(Method, recipe.method),
+        field_shape=field,
+        tau=recipe.tau,
+        ridge=recipe.ridge,
+        variation=None if recipe.is_ridge else variation,
+        valid=valid,
+        iterations=recipe.iterations,
+        # Conjugate gradients run in one piece: there is nothing to tell of before the end.
+        callback=None if told is None or recipe.is_ridge else _Teller(told, job.capture.name),
+    )
+    if found.status == "non_finite":
+        raise MeasurementError(_lost(job, found, recipe))
+    if found.status == "interrupted" and not found.iterations:
+        raise KeyboardInterrupt
+    problem = psf_problem(
+        capture, psf, tau=recipe.relative_tau, field_shape=field, valid=valid, variation=variation
+    )
+    image = found.image if recipe.field == "full" else middle(found.image, sensor)
+    image = np.asarray(image, dtype=np.float32)
+    return image[:, ::-1, ::-1] if recipe.flip else image, _facts(found, problem, recipe)
+
+
+def _lost(job: Job, found: Reconstruction, recipe: Recipe) -> str:
+    now = ("ridge", recipe.relative_ridge) if recipe.is_ridge else ("tau", recipe.relative_tau)
+    return (
+        f"{job.capture}: the image became NaN or infinite after {found.iterations} iterations; "
+        f"give a {now[0]} (now {now[1]:g}) that is nearer to 1"
+    )
+
+
+class _Teller:
+    """Progress with the name of the capture that it is of; asks for no stop."""
+
+    def __init__(self, told: Told, name: str):
+        self.told, self.name = told, name
+
+    def __call__(self, progress: Progress) -> None:
+        self.told(self.name, progress)
+
+
+def _facts(found: Reconstruction, problem: Deconvolution, recipe: Recipe) -> dict[str, Any]:
+    variation = {"kind": problem.variation.kind, "coupling": problem.variation.coupling}
+    is_ridge = recipe.is_ridge
+    return {
+        "method": found.method,
+        "asked_for": recipe.method,
+        "reason": found.reason,
+        "tau": None if is_ridge else recipe.relative_tau,
+        "absolute_tau": None if is_ridge else problem.tau,
+        "ridge": recipe.relative_ridge if is_ridge else None,
+        # The weight of a trusted pixel is 1/σ².
+        "noise_standard_deviation": 1 / jnp.sqrt(jnp.max(problem.weights[0])),
+        "variation": None if is_ridge else variation,
+        "nonnegative": problem.nonnegative and not is_ridge,
+        "field_shape": problem.field_shape,
+        "iterations_at_most": recipe.iterations,
+        "iterations": found.iterations,
+        "status": found.status,
+        "relative_data_residual": _relative_residual(problem, found.image[:, None]),
+        "history": [step._asdict() for step in found.history],
+        "seconds": round(found.seconds, 3),
+    }
+
+
+@jax.jit
+def _relative_residual(
+    problem: Deconvolution, image: Float[Array, "channel plane y x"]
+) -> Float[Array, ""]:
+    """‖Hf − g‖/‖g‖ over the pixels that are trusted."""
+    (missing,), (capture,), (weight,) = residuals(problem, image), problem.captures, problem.weights
+    trusted = weight > 0
+    return jnp.linalg.norm(jnp.where(trusted, missing, 0)) / jnp.linalg.norm(
+        jnp.where(trusted, capture, 0)
+    )
+
+
+def _image_facts(image: Float[np.ndarray, "channel y x"], recipe: Recipe) -> dict[str, Any]:
+    return {
+        "shape": image.shape,
+        "field": recipe.field,
+        "turned_by_180_degrees": recipe.flip,
+        "minimum": image.min(),
+        "maximum": image.max(),
+    }
+
+
+def _check_channels(job: Job, ready: Prepared, recipe: Recipe, output: Output) -> None:
+    """What would else be noticed when the work is done."""
+    channels = ready.capture.shape[0]
+    if recipe.coupling == "opponent" and channels != 3:
+        raise MeasurementError(
+            f"{job.capture}: has {channels} channels and coupling 'opponent' is for 3; "
+            "choose 'joint' or 'none'"
+        )
+    if job.is_shown:
+        if channels not in (1, 3):
+            raise MeasurementError(
+                f"{job.capture}: has {channels} channels and a PNG shows 1 or 3; give an output "
+                "with the suffix .npy or .tif"
+            )
+        to_display(
+            np.ones((channels, 1, 1)), white_balance=output.white_balance, gamma=output.gamma
+        )
+    if not ready.valid.any(axis=(1, 2)).all():
+        raise MeasurementError(
+            f"{job.capture}: has a channel without any valid pixel; all are saturated or dead"
+        )
+
+
+def _check_memory(job: Job, window: tuple[int, int], channels: int) -> None:
+    refuse_if_too_large(
+        f"{job.capture}: its reconstruction on {window[0]}×{window[1]} samples",
+        4 * _WINDOWS * channels * window[0] * window[1],
+        "give a larger downsample",
+    )

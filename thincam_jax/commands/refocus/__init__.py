@@ -1,0 +1,1 @@
+"""Experiments of `kind: refocus`: distances, depth maps, sharp pictures."""

@@ -1,0 +1,141 @@
+"""Experiment files of `kind: refocus`: objects at several distances, and a sweep of the focus."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import pydantic
+from pydantic import Field
+
+from thincam_jax.commands.config_file import read_raw
+from thincam_jax.commands.study.config import (
+    ConfigError,
+    Length,
+    MaskConfig,
+    MethodConfig,
+    Name,
+    NoiseConfig,
+    ObjectConfig,
+    Section,
+    SensorConfig,
+    StudyConfig,
+    TargetConfig,
+    Wavelength,
+    check_methods,
+    check_names,
+    in_folder,
+    load_as,
+    load_config,
+    misfit,
+    quantity,
+)
+from thincam_jax.lensless.psf import Model
+from thincam_jax.reconstruction.depth.focus import Measure
+from thincam_jax.reconstruction.spectra import Prior
+
+Position = Annotated[float, *quantity("length", "mm")]
+
+
+class PlacedConfig(TargetConfig):
+    """A picture that stands at a distance, its middle at (x, y), on a dark ground.
+
+    Colours are averaged. `crop` takes the middle of a picture, that part of its shorter side.
+    """
+
+    distance: Length
+    width: Length
+    x: Position = 0.0
+    y: Position = 0.0
+    crop: Annotated[float, Field(gt=0, le=1)] = 1.0
+
+
+class SweepConfig(Section):
+    """Over which distances, by which method, and what is called sharp."""
+
+    nearest: Length
+    farthest: Length
+    count: Annotated[int, Field(ge=5, le=200)] = 25
+    method: Name
+    measure: Measure = "laplacian_variance"
+    smoothing: Annotated[float, Field(ge=0, le=50)] = 1.0
+    window: Annotated[float, Field(ge=0.5, le=100)] = 6.0
+
+    @pydantic.model_validator(mode="after")
+    def _ordered(self):
+        if not self.nearest < self.farthest:
+            raise ValueError("nearest is not below farthest; swap them")
+        return self
+
+
+class RefocusConfig(Section):
+    """A scene of several objects, captured once, and focused afterwards."""
+
+    name: Name
+    kind: Literal["refocus"]
+    title: str = ""
+    seed: Annotated[int, Field(ge=0, lt=2**32, strict=True)] = 0
+    wavelength: Wavelength
+    model: Model = "separable"
+    pixel_integration: bool = True
+    prior: Prior = "inverse_square"
+    sensor: SensorConfig
+    mask: MaskConfig
+    noise: NoiseConfig | None = None
+    objects: Annotated[tuple[PlacedConfig, ...], Field(min_length=1)]
+    sweep: SweepConfig
+    methods: Annotated[tuple[MethodConfig, ...], Field(min_length=1)]
+    notes: tuple[str, ...] = ()
+
+    @pydantic.model_validator(mode="after")
+    def _fits(self):
+        check_names(self, "methods", "objects")
+        check_methods(self)
+        names = [method.name for method in self.methods]
+        if self.sweep.method not in names:
+            message = f"{self.sweep.method!r} is no method; choose one of {', '.join(names)}"
+            raise misfit(message, "sweep", "method")
+        for index, placed in enumerate(self.objects):
+            if not self.sweep.nearest < placed.distance < self.sweep.farthest:
+                message = (
+                    f"{placed.distance:g} mm lies outside of the sweep; give a distance between "
+                    f"{self.sweep.nearest:g} and {self.sweep.farthest:g} mm, or a wider sweep"
+                )
+                raise misfit(message, "objects", index, "distance")
+        return self
+
+    def sweep_method(self) -> MethodConfig:
+        """The method that the sweep reconstructs with."""
+        return next(m for m in self.methods if m.name == self.sweep.method)
+
+    def focused(self, distance: float | int) -> StudyConfig:
+        """The same camera, light, noise and methods with a flat object at `distance`, mm."""
+        return StudyConfig.model_construct(
+            name=self.name,
+            title=self.title,
+            seed=self.seed,
+            wavelength=self.wavelength,
+            model=self.model,
+            pixel_integration=self.pixel_integration,
+            prior=self.prior,
+            sensor=self.sensor,
+            mask=self.mask,
+            object=ObjectConfig.model_construct(distance=float(distance), width=float(distance)),
+            noise=self.noise,
+            methods=self.methods,
+            targets=(),
+        )
+
+
+def load_experiment(
+    path: str | Path, overrides: tuple[str, ...] = ()
+) -> StudyConfig | RefocusConfig:
+    """Read and check an experiment file of either kind; errors as of `load_config`."""
+    kind = read_raw(Path(path))[0].get("kind")
+    if kind is None:
+        return load_config(path, overrides)
+    if kind == "design":
+        raise ConfigError(f"{path}: kind: is a design; give it to 'thincam design'")
+    if kind != "refocus":
+        raise ConfigError(
+            f"{path}: kind: {kind!r} is unknown; write 'kind: refocus', or leave it out for a study"
+        )
+    return in_folder(load_as(RefocusConfig, path, overrides), path, "objects")

@@ -1,0 +1,249 @@
+"""The pictures of a refocus run, as PNG files and one animation in its folder."""
+
+import io
+from typing import Any
+
+import numpy as np
+import PIL.Image
+import PIL.ImageDraw
+import PIL.ImageFont
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+
+from thincam_jax.commands.refocus.build import Found, object_box
+from thincam_jax.commands.refocus.config import RefocusConfig
+from thincam_jax.commands.run_folder import RunFolder
+from thincam_jax.commands.study.config import slug
+from thincam_jax.commands.study.figures import line_style, save_figure, save_image
+from thincam_jax.reconstruction.depth import DepthMap, RefocusSweep
+
+_SHOWN = 15  # images on the contact sheet, in rows of five
+_HELD = 160  # ms of an image of the animation
+_SURE = 0.25  # confidence from which the depth map shows a distance
+_MEASURED = {
+    "laplacian_variance": "variance of the Laplacian",
+    "gradient_energy": "energy of the gradient",
+    "gradient_sparsity": "sparsity of the gradient",
+}
+
+
+def grey_levels(image: np.ndarray, white: float) -> np.ndarray:
+    """Radiance as 0…1: black stays black, `white` and above are white."""
+    return np.clip(np.asarray(image, dtype=float) / (white if white > 0 else 1.0), 0.0, 1.0)
+
+
+def white_level(images: np.ndarray) -> float:
+    """The radiance shown white: all but the brightest two in a thousand pixels."""
+    return float(np.percentile(images, 99.8))
+
+
+def save_sweep(folder: RunFolder, sweep: RefocusSweep, objects: dict[str, Any]) -> None:
+    """Contact sheet of the sweep, each image with the distance it is focused on."""
+    images, distances = np.asarray(sweep.images), np.asarray(sweep.distances)
+    white = white_level(images)
+    nearest = {
+        int(np.argmin(np.abs(distances - o["distance_mm"]))): name for name, o in objects.items()
+    }
+    picked = _spread(len(distances), _SHOWN, list(nearest))
+    rows = -(-len(picked) // 5)
+    aspect = images.shape[-2] / images.shape[-1]
+    figure = Figure(figsize=(11, rows * (2.2 * aspect + 0.35)), layout="constrained")
+    axes = figure.subplots(rows, 5, squeeze=False).ravel()
+    for ax in axes:
+        ax.set_axis_off()
+    for ax, index in zip(axes, picked, strict=False):
+        ax.imshow(grey_levels(images[index], white), cmap="gray", vmin=0, vmax=1)
+        name = nearest.get(index)
+        text = f"{distances[index]:.0f} mm" + (f" – {name}" if name else "")
+        ax.set_title(text, fontsize=10, fontweight="bold" if name else "normal")
+    save_figure(folder, "sweep", figure)
+
+
+def _spread(count: int, most: int, wanted: list[int]) -> list[int]:
+    """At most `most` of `count` places, evenly spread but with those wanted among them."""
+    picked = {int(p) for p in np.linspace(0, count - 1, min(most, count)).round()}
+    for place in wanted:
+        free = picked - set(wanted)
+        if place not in picked and free:
+            picked.remove(min(free, key=lambda p: (abs(p - place), p)))
+            picked.add(place)
+    return sorted(picked)
+
+
+def save_animation(folder: RunFolder, sweep: RefocusSweep) -> None:
+    """The sweep there and back as an animated WebP, the distance written below."""
+    images, distances = np.asarray(sweep.images), np.asarray(sweep.distances)
+    white = white_level(images)
+    frames = [_frame(grey_levels(i, white), t) for i, t in zip(images, distances, strict=True)]
+    frames += frames[-2:0:-1]
+    buffer = io.BytesIO()
+    frames[0].save(
+        buffer,
+        format="WEBP",
+        save_all=True,
+        append_images=frames[1:],
+        duration=_HELD,
+        loop=0,
+        quality=70,
+    )
+    folder.write("figures/sweep.webp", buffer.getvalue())
+
+
+def _frame(image: np.ndarray, distance: float) -> PIL.Image.Image:
+    rows, columns = image.shape
+    frame = PIL.Image.new("L", (columns, rows + 24), 255)
+    frame.paste(PIL.Image.fromarray((image * 255).round().astype(np.uint8)), (0, 0))
+    font = PIL.ImageFont.load_default(15)
+    PIL.ImageDraw.Draw(frame).text(
+        (columns / 2, rows + 12), f"focus at {distance:.0f} mm", fill=0, font=font, anchor="mm"
+    )
+    return frame
+
+
+def save_curves(
+    folder: RunFolder,
+    config: RefocusConfig,
+    sweep: RefocusSweep,
+    found: Found,
+    objects: dict[str, Any],
+) -> None:
+    """Focus measure of each object over the sweep, with where it stands and where it was found."""
+    figure = Figure(figsize=(8.5, 4.0), layout="constrained")
+    ax = figure.subplots()
+    distances = np.asarray(sweep.distances)
+    for index, (name, values) in enumerate(objects.items()):
+        region, style = found.region_of[name], line_style(index + 2)
+        if region is not None and found.curves is not None:
+            curve = found.curves.curves[found.curves.labels.index(region)]
+            label = name
+            if values["found_mm"] is not None:
+                label += (
+                    f": found at {values['found_mm']:.1f} mm ({values['error_percent']:+.1f} %)"
+                )
+            ax.plot(distances, curve / curve.max(), label=label, markersize=4, **style)
+        ax.axvline(values["distance_mm"], color=style["color"], linestyle=style["linestyle"])
+        ax.text(values["distance_mm"], 1.1, f" placed at {values['distance_mm']:g} mm", fontsize=9)
+    ax.set_ylim(0, 1.18)
+    ax.set_xlabel("focused on the distance t (mm)")
+    ax.set_ylabel(f"{_MEASURED[config.sweep.measure]},\nrelative to its largest")
+    ax.grid(alpha=0.3)
+    figure.legend(fontsize=9, loc="outside upper center", ncols=2)
+    save_figure(folder, "focus", figure)
+
+
+def save_depth(folder: RunFolder, sweep: RefocusSweep, depth: DepthMap, sharp: np.ndarray) -> None:
+    """Depth map, its confidence, and the picture that is sharp everywhere."""
+    confidence, distance = np.asarray(depth.confidence), np.asarray(depth.distance)
+    white = white_level(np.asarray(sweep.images))
+    save_image(folder, "all-in-focus", grey_levels(sharp, white))
+    rows, columns = sharp.shape
+    slope = float(sweep.slope)
+    extent = (-columns / 2 * slope, columns / 2 * slope, rows / 2 * slope, -rows / 2 * slope)
+    figure = Figure(figsize=(12, 3.4 * rows / columns * 1.15 + 1.5), layout="constrained")
+    axes = figure.subplots(1, 3, sharey=True)
+    shown = np.ma.masked_where(confidence < _SURE, distance)
+    axes[0].set_facecolor("0.85")
+    near, far = float(sweep.distances[0]), float(sweep.distances[-1])
+    map_ = axes[0].imshow(shown, cmap="viridis", vmin=near, vmax=far, extent=extent)
+    figure.colorbar(map_, ax=axes[0], label="t (mm)", location="bottom", aspect=30)
+    axes[0].set_title(f"depth map (grey: confidence below {_SURE})", fontsize=10)
+    sure = axes[1].imshow(confidence, cmap="gray", vmin=0, vmax=1, extent=extent)
+    figure.colorbar(sure, ax=axes[1], label="confidence", location="bottom", aspect=30)
+    axes[1].set_title("confidence", fontsize=10)
+    picture = axes[2].imshow(sharp, cmap="gray", vmin=0, vmax=white, extent=extent)
+    figure.colorbar(picture, ax=axes[2], label="radiance", location="bottom", aspect=30)
+    axes[2].set_title("all in focus", fontsize=10)
+    for ax in axes:
+        ax.set_xlabel("direction x/t")
+    axes[0].set_ylabel("direction y/t")
+    save_figure(folder, "depth", figure)
+
+
+def save_methods(
+    folder: RunFolder,
+    config: RefocusConfig,
+    pictures: dict[tuple[str, float], np.ndarray],
+    metrics: dict[str, Any],
+) -> None:
+    """Every method focused on every object; below each, the objects enlarged."""
+    columns, objects = len(config.methods), config.objects
+    aspect = max(p.shape[0] / p.shape[1] for p in pictures.values())
+    width = 3.1
+    # A row of whole pictures and one of details for each focus.
+    heights = [width * aspect, width / len(objects)] * len(objects)
+    figure = Figure(figsize=(width * columns, sum(heights) + 0.42 * len(objects)))
+    figure.set_layout_engine("constrained")
+    axes = figure.subplots(
+        2 * len(objects), columns, squeeze=False, gridspec_kw={"height_ratios": heights}
+    )
+    for column, method in enumerate(config.methods):
+        for row, focused in enumerate(objects):
+            image = pictures[method.name, focused.distance]
+            save_image(
+                folder,
+                f"{slug(method.name)}--{focused.distance:g}mm",
+                grey_levels(image, white_level(image)),
+            )
+            scores = metrics[method.name]["focused_on_mm"][f"{focused.distance:g}"]["psnr_db"]
+            whole, detail = axes[2 * row, column], axes[2 * row + 1, column]
+            _show_focus(whole, config, method, image, focused)
+            title = f"focused on {focused.distance:g} mm"
+            whole.set_title(f"{method.name}\n{title}" if row == 0 else title, fontsize=10)
+            _show_details(detail, config, method, image, focused)
+            score = scores[focused.name]
+            sharp = "exact" if score is None else f"{score:.1f} dB"
+            detail.set_xlabel(f"in focus: {focused.name}, {sharp}", fontsize=9)
+    save_figure(folder, "methods", figure)
+
+
+def _show_focus(ax, config: RefocusConfig, method, image: np.ndarray, focused) -> None:
+    """A whole picture; the object in focus in a solid box, the others in dashed ones."""
+    ax.imshow(grey_levels(image, white_level(image)), cmap="gray", vmin=0, vmax=1)
+    ax.set_xticks([])
+    ax.set_yticks([])
+    for placed in config.objects:
+        rows, columns = object_box(config, method, placed)
+        ax.add_patch(
+            Rectangle(
+                (columns.start - 4, rows.start - 4),
+                columns.stop - columns.start + 7,
+                rows.stop - rows.start + 7,
+                fill=False,
+                edgecolor="white",
+                linewidth=1.2,
+                linestyle="-" if placed is focused else (0, (2, 3)),
+            )
+        )
+
+
+def _show_details(ax, config: RefocusConfig, method, image: np.ndarray, focused) -> None:
+    """The middle of each object, enlarged, side by side; a frame round that in focus."""
+    white = white_level(image)
+    for index, placed in enumerate(config.objects):
+        rows, columns = object_box(config, method, placed)
+        part = _middle(image[rows, columns])
+        ax.imshow(
+            grey_levels(part, white),
+            cmap="gray",
+            vmin=0,
+            vmax=1,
+            extent=(index + 0.02, index + 0.98, 0.98, 0.02),
+        )
+        if placed is focused:
+            ax.add_patch(
+                Rectangle((index + 0.02, 0.02), 0.96, 0.96, fill=False, color="black", linewidth=2)
+            )
+    ax.set_xlim(0, len(config.objects))
+    ax.set_ylim(1, 0)
+    ax.set_aspect("equal")
+    ax.set_xticks([])
+    ax.set_yticks([])
+    for spine in ax.spines.values():
+        spine.set_visible(False)
+
+
+def _middle(part: np.ndarray) -> np.ndarray:
+    """The middle square of an object, three fifths of its shorter side."""
+    side = max(1, round(0.6 * min(part.shape)))
+    top, left = ((n - side) // 2 for n in part.shape)
+    return part[top : top + side, left : left + side]

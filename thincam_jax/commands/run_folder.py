@@ -1,0 +1,80 @@
+"""The run folder: what is in it, and how an interrupted study goes on."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from thincam_jax._core.files import write_whole
+from thincam_jax.commands.study.config import ConfigError, Section, dump_config, slug
+
+
+class RunFolder:
+    """Files of one run. Every file is written whole or not at all.
+
+    - `config.yaml`: the resolved configuration.
+    - `targets/NAME.json`: the metrics of a finished target; an interrupted study skips these.
+    - `images/`: reconstructions and scenes, `figures/`: the report's pictures.
+    - `metrics.json`, `environment.json`, `report.html`: written at the end.
+    """
+
+    def __init__(self, path: str | Path):
+        self.path = Path(path)
+
+    def claim(self, config: Section) -> None:
+        """Make the folder and write the configuration; refuse a folder that holds anything else.
+
+        An interrupted run of the same configuration goes on; a complete one is done anew.
+        """
+        text = dump_config(config)
+        claim_folder(self.path, "config.yaml", text, "run", ("targets", "images", "figures"))
+        if (self.path / "metrics.json").exists():
+            for result in (self.path / "targets").glob("*.json"):
+                result.unlink()
+            (self.path / "metrics.json").unlink()
+
+    def finished(self, target: str) -> dict[str, Any] | None:
+        """The stored results of a target, or None if it has not been finished."""
+        path = self.path / "targets" / f"{slug(target)}.json"
+        try:
+            return json.loads(path.read_text(encoding="utf-8"))
+        except (OSError, json.JSONDecodeError):
+            return None
+
+    def finish(self, target: str, results: dict[str, Any]) -> None:
+        self.write(f"targets/{slug(target)}.json", to_json(results))
+
+    def write(self, name: str, content: str | bytes) -> Path:
+        """Write a file of the folder, whole or not at all."""
+        return write_whole(self.path / name, content)
+
+
+def claim_folder(path: Path, name: str, text: str, kind: str, folders: Sequence[str] = ()) -> None:
+    """Make a folder with `folders` in it, and write the file `name` that says what it holds.
+
+    `kind` is a word for what it holds. A folder that holds the same already is taken as it is.
+
+    **Errors**: ConfigError where it holds anything else, or cannot be made.
+    """
+    held = path / name
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        # A neighbour is all that is there where the first start was killed.
+        foreign = any(p.name != f"{name}.partial" for p in path.iterdir())
+        if held.exists():
+            if held.read_bytes() != text.encode("utf-8"):
+                raise ConfigError(
+                    f"--out {path}: holds a {kind} of another configuration (see {held}); "
+                    "give another folder or delete this one"
+                )
+        elif foreign:
+            raise ConfigError(f"--out {path}: is not empty and holds no {kind}; give a new folder")
+        write_whole(held, text)
+        for folder in folders:
+            (path / folder).mkdir(exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"--out {path}: cannot be made a folder ({error.strerror})") from None
+
+
+def to_json(data: Any) -> str:
+    return json.dumps(data, indent=2, ensure_ascii=False, allow_nan=False) + "\n"

@@ -1,0 +1,143 @@
+"""The command `thincam sweep`."""
+
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Annotated, Any
+
+import jax
+import rich.progress
+import typer
+
+from thincam_jax.commands.refocus.config import load_experiment
+from thincam_jax.commands.study.config import ConfigError, StudyConfig, slug
+from thincam_jax.commands.terminal import (
+    INTERRUPTED,
+    WRONG_INPUT,
+    Overrides,
+    columns,
+    console,
+    fail,
+    tell,
+)
+
+_PARTS = ("dask", "distributed", "pyarrow")
+
+
+Grid = Annotated[
+    list[str] | None,
+    typer.Option(
+        help="a.b=lo:hi:n, a.b=lo:hi:n:log or a.b=v1,v2,… with the unit at the end; * for all "
+        "entries of a list. Once for each axis."
+    ),
+]
+Out = Annotated[Path | None, typer.Option(help="Folder of the results; default runs/NAME-sweep.")]
+Scheduler = Annotated[
+    str | None, typer.Option(help="Address of a dask scheduler, tcp://host:port.")
+]
+Workers = Annotated[
+    int | None, typer.Option(help="Local worker processes; default: one for each core.")
+]
+
+
+def sweep(
+    config: Annotated[Path, typer.Argument(help="Experiment file (YAML) of a study.")],
+    grid: Grid = None,
+    out: Out = None,
+    scheduler: Scheduler = None,
+    workers: Workers = None,
+    set_: Overrides = None,
+) -> None:
+    """Run a study at every point of a grid; writes results.parquet, a row for each point.
+
+    Points that fail are kept in failures.jsonl with the reason. However a sweep ends, the same
+    command goes on with the points that have no row.
+    """
+    ended = _Ended()
+    try:
+        _check(scheduler, workers)
+        from thincam_jax.commands.sweep.folder import SweepFolder
+        from thincam_jax.commands.sweep.grid import read_axes
+        from thincam_jax.commands.sweep.point import make_points
+
+        study = _study(config, set_ or [])
+        axes = read_axes(grid or [], study.model_dump(mode="json", exclude_none=True))
+        points = make_points(study, axes, bool(jax.config.read("jax_enable_x64")))
+        folder = SweepFolder(out or Path("runs") / f"{slug(study.name)}-sweep")
+        folder.claim(study)
+        swept = _run(study.name, points, folder, scheduler, workers, ended)
+    except (ConfigError, FileNotFoundError, IsADirectoryError, PermissionError) as error:
+        fail(error)
+    except KeyboardInterrupt:
+        tell(f"interrupted; {ended.told()}. The same command goes on from there.")
+        raise typer.Exit(INTERRUPTED) from None
+    _print(swept, folder.path)
+
+
+@dataclass
+class _Ended:
+    """How far a sweep has come."""
+
+    ended: int = 0
+    failed: int = 0
+
+    def told(self) -> str:
+        rows = self.ended - self.failed
+        return f"{rows} points are kept" if rows else "no point is kept yet"
+
+
+def _check(scheduler: str | None, workers: int | None) -> None:
+    missing = [name for name in _PARTS if find_spec(name) is None]
+    if missing:
+        raise ConfigError(
+            f"thincam sweep needs {', '.join(missing)}; install them with "
+            "pip install 'thincam_jax[sweep]'"
+        )
+    if workers is not None and workers < 1:
+        raise ConfigError(f"--workers {workers}: give at least 1")
+    if workers is not None and scheduler is not None:
+        raise ConfigError("--workers are local ones; leave it out with --scheduler")
+
+
+def _study(path: Path, overrides: list[str]) -> StudyConfig:
+    study = load_experiment(path, tuple(overrides))
+    if not isinstance(study, StudyConfig):
+        raise ConfigError(f"{path}: is of kind refocus; a sweep takes a study")
+    return study
+
+
+def _run(
+    name: str,
+    points: list,
+    folder: Any,
+    scheduler: str | None,
+    workers: int | None,
+    so_far: _Ended,
+) -> Any:
+    """With a progress bar."""
+    from thincam_jax.commands.sweep.run import run_sweep
+
+    with rich.progress.Progress(*columns("{task.fields[failed]}"), console=console) as bar:
+        task = bar.add_task(name, total=len(points), failed="")
+
+        def progress(ended: int, failed: int) -> None:
+            so_far.ended, so_far.failed = ended, failed
+            bar.update(task, completed=ended, failed=f"{failed} failed" if failed else "")
+
+        return run_sweep(points, folder, progress, scheduler=scheduler, workers=workers)
+
+
+def _print(swept: Any, path: Path) -> None:
+    table = f"{swept.rows} of {swept.points} points: {path / 'results.parquet'}"
+    if swept.rows:
+        console.print(table, highlight=False, markup=False, soft_wrap=True)
+    if swept.failures:
+        first = swept.failures[0]
+        told = ", ".join(f"{name}={value}" for name, value in first["values"].items())
+        tell(
+            f"{len(swept.failures)} of {swept.points} points failed; the first ({told}): "
+            f"{first['reason']}; all are in {path / 'failures.jsonl'}. "
+            "The same command tries them again."
+        )
+    if not swept.rows:
+        raise typer.Exit(WRONG_INPUT)

@@ -1,0 +1,69 @@
+"""One point of a sweep, as a worker evaluates it."""
+
+import time
+import traceback
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from thincam_jax.commands.config_file import ConfigError
+from thincam_jax.commands.study.check import check_study
+from thincam_jax.commands.study.config import StudyConfig, TargetConfig
+from thincam_jax.commands.study.target import examine_target, mean_psnr_of_pictures
+
+# What a user can put right: the message says all.
+_USER_ERRORS = (ConfigError, FileNotFoundError, PermissionError, MemoryError)
+
+
+class Outcome(NamedTuple):
+    """The metrics of a point by column; or why there are none, in one line, and the traceback."""
+
+    metrics: dict[str, Any] | None
+    reason: str | None = None
+    traceback: str | None = None
+
+
+def measure_point(config: str, double: bool) -> Outcome:
+    """The metrics of a resolved study, given as JSON; an error is an outcome too."""
+    try:
+        with jax.enable_x64(double):
+            return Outcome(_measure(StudyConfig.model_validate_json(config)))
+    except _USER_ERRORS as error:
+        return Outcome(None, "; ".join(str(error).splitlines()))
+    except Exception as error:  # a sweep goes on without a point that shows a defect
+        return Outcome(None, one_line(error), traceback.format_exc())
+
+
+def one_line(error: BaseException) -> str:
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    return ": ".join([type(error).__name__, *lines[:1]])
+
+
+def _measure(config: StudyConfig) -> dict[str, Any]:
+    started = time.perf_counter()
+    check_study(config)
+    reconstructors, row, psnr_db = {}, {}, {m.name: {} for m in config.methods}
+    for index, target in enumerate(config.targets):
+        examined = examine_target(config, index, target, reconstructors, lambda _: None)
+        for method, evaluation in examined.evaluations.items():
+            row |= _columns(method, target, evaluation.metrics)
+            psnr_db[method][target.name] = evaluation.metrics["psnr_db"]
+    for method, values in psnr_db.items():
+        known = [value for value in values.values() if value is not None]
+        row[f"mean_psnr_db/{method}"] = round(float(np.mean(known)), 4) if known else None
+        pictures = mean_psnr_of_pictures(config, values)
+        if pictures is not None:
+            row[f"mean_psnr_of_pictures_db/{method}"] = pictures
+    return {**row, "seconds": round(time.perf_counter() - started, 4)}
+
+
+def _columns(method: str, target: TargetConfig, metrics: dict[str, Any]) -> dict[str, Any]:
+    """Flat: `psnr_db/METHOD/TARGET`, and `resolved_object_mm/METHOD/TARGET` of an inner number."""
+    flat = {}
+    for name, value in metrics.items():
+        if isinstance(value, dict):
+            flat |= {f"{name}_{inner}": number for inner, number in value.items()}
+        elif value is not None or name != "resolved":
+            flat[name] = value
+    return {f"{name}/{method}/{target.name}": value for name, value in flat.items()}

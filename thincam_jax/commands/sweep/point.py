@@ -1,0 +1,100 @@
+"""The points of a sweep: their configurations, and what they are recognised by."""
+
+import copy
+import hashlib
+import json
+from collections.abc import Sequence
+from importlib import metadata
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from thincam_jax.commands.config_file import ConfigError, set_entry
+from thincam_jax.commands.study.config import StudyConfig, check_as
+from thincam_jax.commands.sweep.grid import Axis, grid_values
+
+# Part of every point's key: to be raised when the same configuration is to give other metrics.
+METRICS_VERSION = 1
+
+
+class Point(NamedTuple):
+    """A configuration of the grid.
+
+    - `key`: what its results are recognised by, from all that they depend on.
+    - `values`: the swept values by the path of their axis; in mm, rad and rad/mm² where they are
+      quantities. Those of a refused point are as given.
+    - `config`: the resolved configuration as JSON; None if it is refused.
+    - `double`: whether it is computed in double precision.
+    - `reason`: why the configuration is refused, in one line.
+    """
+
+    key: str
+    values: dict[str, Any]
+    config: str | None
+    double: bool
+    reason: str | None = None
+
+
+def make_points(base: StudyConfig, axes: Sequence[Axis], double: bool) -> list[Point]:
+    """The points of the grid in order. One that the configuration's checks refuse has a reason.
+
+    **Errors**: ConfigError, one line, where all are refused, as for a path that does not exist, and
+    where two are the same.
+    """
+    raw = base.model_dump(mode="json", exclude_none=True)
+    points = [_make_point(raw, axes, values, double) for values in grid_values(axes)]
+    if all(point.config is None for point in points):
+        raise ConfigError(f"{points[0].reason} (no point of the grid can be run)")
+    first: dict[str, Point] = {}
+    for point in points:
+        if point.key in first:
+            raise ConfigError(
+                f"--grid: {told(point.values)} comes twice: two of its values are the same; "
+                "give each once"
+            )
+        first[point.key] = point
+    return points
+
+
+def told(values: dict[str, Any]) -> str:
+    """Swept values in a message."""
+    return ", ".join(f"{path}={value}" for path, value in values.items())
+
+
+def _make_point(raw: dict, axes: Sequence[Axis], values: tuple, double: bool) -> Point:
+    changed, asked = copy.deepcopy(raw), {}
+    given = {axis.path: value for axis, value in zip(axes, values, strict=True)}
+    for axis, value in zip(axes, values, strict=True):
+        for place in axis.places:
+            set_entry(changed, place, value, f"--grid {axis.text}")
+            asked[place] = f"--grid {axis.text}"
+    try:
+        config = check_as(StudyConfig, changed, {}, asked, "--grid")
+    except ConfigError as error:
+        key = _digest(json.dumps(changed, default=str))
+        return Point(key, given, None, double, "; ".join(str(error).splitlines()))
+    text = config.model_dump_json(exclude_none=True)
+    resolved = {axis.path: _entry(config, axis.places[0]) for axis in axes}
+    return Point(_key(config, text, double), resolved, text, double)
+
+
+def _entry(config: Any, place: tuple) -> Any:
+    """The value of an entry; what is no number, text or truth value, as JSON."""
+    for key in place:
+        config = config[key] if isinstance(key, int) else getattr(config, key)
+    if config is None or isinstance(config, bool | int | float | str):
+        return config
+    if hasattr(config, "model_dump_json"):
+        return config.model_dump_json(exclude_none=True)
+    return json.dumps(config, default=lambda entry: entry.model_dump(mode="json"))
+
+
+def _key(config: StudyConfig, text: str, double: bool) -> str:
+    versions = f"{METRICS_VERSION} {metadata.version('thincam_jax')} {'double' if double else ''}"
+    pictures = [Path(target.path) for target in config.targets if target.path]
+    # A picture that is not there is the worker's to report.
+    contents = [hashlib.sha256(p.read_bytes()).hexdigest() for p in pictures if p.is_file()]
+    return _digest("\n".join([versions, text, *contents]))
+
+
+def _digest(text: str) -> str:
+    return hashlib.sha256(text.encode("utf-8")).hexdigest()[:16]

@@ -1,0 +1,73 @@
+"""Running a sweep: the points that the folder does not hold yet, into the folder."""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+from thincam_jax.commands.sweep.cluster import Died, connected, outcomes
+from thincam_jax.commands.sweep.folder import SweepFolder
+from thincam_jax.commands.sweep.measure import Outcome, measure_point, one_line
+from thincam_jax.commands.sweep.point import Point
+
+Progress = Callable[[int, int], object]
+
+
+class Swept(NamedTuple):
+    """How a sweep ended: points, rows of the table, and what is known of those that failed."""
+
+    points: int
+    rows: int
+    failures: list[dict[str, Any]]
+
+
+def run_sweep(
+    points: Sequence[Point],
+    folder: SweepFolder,
+    progress: Progress,
+    *,
+    scheduler: str | None = None,
+    workers: int | None = None,
+    measure: Callable[[str, bool], Outcome] = measure_point,
+) -> Swept:
+    """Measure every point that has no row in the folder, which must have been claimed.
+
+    Each point is written as it ends, by this process: workers need no access to the folder.
+    `progress` is called with the numbers of points that have ended and that have failed. The tables
+    are written at the end, and on Ctrl-C, which is passed on.
+
+    **Errors**: ConfigError where the scheduler cannot be reached or goes away.
+    """
+    todo = {point.key: point for point in points if not folder.has(point)}
+    count = _Count(len(points) - len(todo), progress)
+    runnable = {key: (p.config, p.double) for key, p in todo.items() if p.config is not None}
+    try:
+        for point in todo.values():
+            if point.config is None:
+                folder.keep(point, count.ended(Outcome(None, point.reason)))
+        if runnable:
+            with connected(scheduler, workers, len(runnable)) as client:
+                for key, result in outcomes(client, measure, runnable):
+                    folder.keep(todo[key], count.ended(_outcome(result)))
+    finally:
+        rows, failures = folder.collect(points)
+    return Swept(len(points), rows, failures)
+
+
+class _Count:
+    """How many points have ended, told to whoever watches."""
+
+    def __init__(self, before: int, progress: Progress):
+        self.done, self.failed, self.progress = before, 0, progress
+        progress(before, 0)
+
+    def ended(self, outcome: Outcome) -> Outcome:
+        self.done += 1
+        self.failed += outcome.metrics is None
+        self.progress(self.done, self.failed)
+        return outcome
+
+
+def _outcome(result: Any) -> Outcome:
+    """A worker that dies and a worker without the package have their reasons too."""
+    if isinstance(result, Outcome):
+        return result
+    return Outcome(None, "worker died" if isinstance(result, Died) else one_line(result))

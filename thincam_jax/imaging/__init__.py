@@ -1,0 +1,1 @@
+"""What every camera shares: scenes, sensors, targets, operators, metrics."""

@@ -1,0 +1,176 @@
+"""What every linear operator of a camera can do."""
+
+import abc
+import math
+from typing import Any, TypeGuard
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray, PyTree
+
+from thincam_jax._core import checks
+
+Shapes = PyTree[tuple[int, ...]]
+
+
+class AbstractOperator(eqx.Module):
+    r"""A real linear map A from an image to a capture, and its transpose.
+
+    Both maps take any leading batch axes. The adjoint belongs to the plain sum of products,
+    :math:`\langle A f, g\rangle = \langle f, A^T g\rangle`, which `adjoint_error` checks.
+    """
+
+    @property
+    @abc.abstractmethod
+    def in_shape(self) -> tuple[int, ...]:
+        """Trailing axes of the image."""
+
+    @property
+    @abc.abstractmethod
+    def out_shape(self) -> Shapes:
+        """Trailing axes of the capture; a tuple of shapes where `A(image)` is a tuple."""
+
+    @abc.abstractmethod
+    def __call__(self, image: Float[Array, "..."]) -> PyTree[Float[Array, "..."]]:
+        """The capture of an image."""
+
+    @abc.abstractmethod
+    def adjoint(self, capture: PyTree[Float[Array, "..."]]) -> Float[Array, "..."]:
+        """The transposed map, from a capture to an image."""
+
+    def norm(
+        self, *, iterations: int = 30, key: PRNGKeyArray | None = None, dtype=None
+    ) -> Float[Array, ""]:
+        r"""The largest singular value ‖A‖, by power iteration on AᵀA.
+
+        It is approached from below: after 30 iterations to a few per cent where singular values
+        crowd at the top, to all digits where the largest stands alone. A step of a gradient method
+        should keep a margin. `dtype`: of the iteration, by default that of the operator's numbers.
+        """
+        if iterations < 1:
+            raise ValueError(f"iterations = {iterations} finds no norm; give at least 1")
+        key = jax.random.key(0) if key is None else key
+        # An operator of non-negative numbers, as every PSF is, has a non-negative top vector.
+        start = jnp.abs(jax.random.normal(key, self.in_shape, dtype or dtype_of(self)))
+        return _power_iteration(self, start, iterations)
+
+
+@eqx.filter_jit
+def _power_iteration(operator: AbstractOperator, start: Array, iterations: int):
+    def body(_, carry):
+        vector, _ = carry
+        image = operator.adjoint(operator(vector))
+        size = _length([image])
+        return image / jnp.where(size == 0, 1, size), size
+
+    initial = (start / _length([start]), jnp.zeros((), start.dtype))
+    _, squared = jax.lax.fori_loop(0, iterations, body, initial)
+    return _root(squared)
+
+
+def adjoint_error(operator: AbstractOperator, key: PRNGKeyArray, *, dtype=None) -> Float[Array, ""]:
+    r"""How far an operator's adjoint is from its transpose.
+
+    :math:`|\langle A f, g\rangle - \langle f, A^T g\rangle| / (\|A f\|\,\|g\|)` for white random f
+    and g. A right adjoint gives some multiple of the rounding error, a wrong one about
+    1/√(numbers in g) or more. `dtype`: of f, by default that of the operator's numbers.
+
+    ValueError where a map returns another shape than `out_shape` and `in_shape` say.
+    """
+    expected = shapes_of(operator.out_shape)
+    first, *others = jax.random.split(key, 1 + len(expected))
+    image = jax.random.normal(first, operator.in_shape, dtype or dtype_of(operator))
+    capture = operator(image)
+    leaves, structure = jax.tree.flatten(capture)
+    _require_result("the operator", [leaf.shape for leaf in leaves], expected)
+    noise = [
+        jax.random.normal(k, leaf.shape, leaf.dtype) for k, leaf in zip(others, leaves, strict=True)
+    ]
+    forward = sum(jnp.vdot(a, b) for a, b in zip(leaves, noise, strict=True))
+    returned = operator.adjoint(jax.tree.unflatten(structure, noise))
+    _require_result("the adjoint", [returned.shape], [operator.in_shape])
+    backward = jnp.vdot(image, returned)
+    scale = _length(leaves) * _length(noise)
+    return jnp.abs(forward - backward) / jnp.where(scale == 0, 1, scale)
+
+
+def dtype_of(operator: AbstractOperator):
+    """The real type of an operator's numbers; the default one where it has none."""
+    leaves = jax.tree.leaves(eqx.filter(operator, eqx.is_inexact_array))
+    return jnp.finfo(leaves[0].dtype).dtype if leaves else jnp.zeros(()).dtype
+
+
+def is_shape(shape: Shapes) -> TypeGuard[tuple[int, ...]]:
+    """Whether it is the shape of one array, not several in a tuple."""
+    return all(isinstance(n, int) for n in shape)
+
+
+def shapes_of(shape: Shapes) -> list[tuple[int, ...]]:
+    """The shapes of a capture, one or many."""
+    return [shape] if is_shape(shape) else [s for part in shape for s in shapes_of(part)]
+
+
+def require_shape(name: str, array: Array, shape: tuple[int, ...]) -> None:
+    """One line where an array's trailing axes are not those of the operator."""
+    if array.shape[max(0, array.ndim - len(shape)) :] != shape:
+        raise ValueError(
+            f"{name} has shape {array.shape}; the operator takes {shape}, after any batch axes"
+        )
+
+
+def require_size(name: str, shape: Any, count: int, what: str) -> tuple[int, ...]:
+    """A shape of that many numbers, as a tuple of ints."""
+    try:
+        whole = tuple(int(n) for n in shape)
+        sound = whole == tuple(shape) and all(n >= 1 for n in whole)
+    except (TypeError, ValueError):
+        whole, sound = (), False
+    if not sound or math.prod(whole) != count:
+        raise ValueError(
+            f"{name} = {shape!r}, but the matrix has {count} {what}; give a tuple of whole numbers "
+            f"whose product is {count}"
+        )
+    return whole
+
+
+def real_numbers(name: str, value: Any) -> Float[Array, "..."]:
+    """Finite floating numbers as an array; whole numbers become floating ones."""
+    array = jnp.asarray(value)
+    if jnp.issubdtype(array.dtype, jnp.integer):
+        array = array.astype(float)
+    if not jnp.issubdtype(array.dtype, jnp.floating):
+        raise TypeError(f"{name} holds {array.dtype}; give real numbers")
+    if not checks.is_traced(array):
+        wrong = array.size - int(np.isfinite(np.asarray(array)).sum())
+        if wrong:
+            raise ValueError(f"{name} holds {wrong} numbers that are not finite; give finite ones")
+    # Without the weak type of a plain number, which would be compiled for once more.
+    return jax.lax.convert_element_type(array, array.dtype)
+
+
+def real_matrix(name: str, value: Any) -> Float[Array, "i j"]:
+    """`real_numbers` in rows and columns."""
+    matrix = real_numbers(name, value)
+    if matrix.ndim != 2 or matrix.size == 0:
+        raise ValueError(
+            f"{name} has shape {matrix.shape}; give rows (capture) and columns (image)"
+        )
+    return matrix
+
+
+def _require_result(who: str, given: list, expected: list) -> None:
+    if given != expected:
+        raise ValueError(
+            f"{who} returns shapes {given}, but in_shape and out_shape announce {expected}"
+        )
+
+
+def _length(arrays: list) -> Float[Array, ""]:
+    return _root(sum(jnp.sum(a**2) for a in arrays))
+
+
+def _root(value) -> Float[Array, ""]:
+    """√ whose slope at 0 is 0: the norm of an operator that is zero is at its minimum."""
+    return jnp.where(value == 0, 0, jnp.sqrt(jnp.where(value == 0, 1, value)))

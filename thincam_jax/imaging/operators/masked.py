@@ -1,0 +1,159 @@
+"""Pixels of a capture that do not count, or count with a gain of their own."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
+
+from thincam_jax.imaging.operators.base import (
+    AbstractOperator,
+    Shapes,
+    is_shape,
+    real_numbers,
+    require_shape,
+)
+
+
+class Masked(AbstractOperator):
+    r"""An operator whose dead or saturated pixels read zero.
+
+    .. math:: A f = V\,(B f), \qquad A^T g = B^T (V g), \qquad V = \mathrm{diag}(v)
+
+    Whatever a masked pixel holds, NaN too, is not looked at.
+
+    **Arguments**
+
+    - `operator`: B.
+    - `valid`: v, booleans that broadcast to `out_shape`, True where a pixel counts. Where the
+      capture is a tuple: a tuple of masks, or one for all.
+    """
+
+    operator: AbstractOperator
+    valid: PyTree[Bool[Array, "..."]]
+
+    def __init__(self, operator: AbstractOperator, valid):
+        self.operator = operator
+        self.valid = _per_capture("valid", valid, operator.out_shape, _boolean)
+
+    @property
+    def in_shape(self) -> tuple[int, ...]:
+        return self.operator.in_shape
+
+    @property
+    def out_shape(self) -> Shapes:
+        return self.operator.out_shape
+
+    def __call__(self, image: Float[Array, "..."]) -> PyTree[Float[Array, "..."]]:
+        return jax.tree.map(_where_valid, self.operator(image), self.valid)
+
+    def adjoint(self, capture: PyTree[Float[Array, "..."]]) -> Float[Array, "..."]:
+        _require_capture(capture, self.out_shape)
+        return self.operator.adjoint(jax.tree.map(_where_valid, capture, self.valid))
+
+
+class Scaled(AbstractOperator):
+    r"""An operator whose capture is multiplied by a gain.
+
+    .. math:: A f = c\,(B f), \qquad A^T g = B^T (c\,g)
+
+    The gain may be one number (an exposure), one for each capture or channel, or one for each
+    pixel (a flat field, 1/σ of the noise). It is differentiable.
+
+    **Arguments**
+
+    - `operator`: B.
+    - `gain`: c, finite numbers that broadcast to `out_shape`. Where the capture is a tuple: a
+      tuple of gains, or one for all.
+    """
+
+    operator: AbstractOperator
+    gain: PyTree[Float[Array, "..."]]
+
+    def __init__(self, operator: AbstractOperator, gain):
+        self.operator = operator
+        if isinstance(gain, tuple | list):
+            self.gain = _per_capture("gain", gain, operator.out_shape, real_numbers)
+        else:
+            # Kept as one number or array, also for several captures.
+            self.gain = real_numbers("gain", gain)
+            _per_capture("gain", self.gain, operator.out_shape, real_numbers)
+
+    @property
+    def in_shape(self) -> tuple[int, ...]:
+        return self.operator.in_shape
+
+    @property
+    def out_shape(self) -> Shapes:
+        return self.operator.out_shape
+
+    def __call__(self, image: Float[Array, "..."]) -> PyTree[Float[Array, "..."]]:
+        return self._amplified(self.operator(image))
+
+    def adjoint(self, capture: PyTree[Float[Array, "..."]]) -> Float[Array, "..."]:
+        _require_capture(capture, self.out_shape)
+        return self.operator.adjoint(self._amplified(capture))
+
+    def norm(
+        self, *, iterations: int = 30, key: PRNGKeyArray | None = None, dtype=None
+    ) -> Float[Array, ""]:
+        """The largest singular value: |c|·‖B‖ where c is one number, else by power iteration."""
+        if isinstance(self.gain, tuple) or self.gain.ndim > 0:
+            return super().norm(iterations=iterations, key=key, dtype=dtype)
+        norm = self.operator.norm(iterations=iterations, key=key, dtype=dtype)
+        return jnp.abs(self.gain).astype(norm.dtype) * norm
+
+    def _amplified(self, capture):
+        if isinstance(self.gain, tuple):
+            return jax.tree.map(_times, capture, self.gain)
+        return jax.tree.map(lambda part: _times(part, self.gain), capture)
+
+
+def _where_valid(capture, valid):
+    return jnp.where(valid, capture, 0)
+
+
+def _times(capture, gain):
+    return capture * gain.astype(capture.dtype)
+
+
+def _boolean(name: str, value) -> Bool[Array, "..."]:
+    array = jnp.asarray(value)
+    if array.dtype != jnp.bool_:
+        raise TypeError(
+            f"{name} has dtype {array.dtype}; give booleans, True where a pixel counts (weights "
+            "are a gain of Scaled)"
+        )
+    return array
+
+
+def _per_capture(name: str, value, shape: Shapes, convert):
+    """A value for each array of a capture, each converted, checked against the array's shape."""
+    if not is_shape(shape):
+        parts = value if isinstance(value, tuple | list) else [value] * len(shape)
+        if len(parts) != len(shape):
+            raise ValueError(
+                f"{name} has {len(parts)} parts; give {len(shape)}, one for each capture, or one "
+                "array for all"
+            )
+        pairs = zip(parts, shape, strict=True)
+        return tuple(_per_capture(name, part, own, convert) for part, own in pairs)
+    array = convert(name, value)
+    trailing = shape[max(0, len(shape) - array.ndim) :]
+    if array.ndim > len(shape) or any(
+        a not in (1, n) for a, n in zip(array.shape, trailing, strict=True)
+    ):
+        raise ValueError(
+            f"{name} has shape {array.shape}; give one that broadcasts to the capture's, {shape}"
+        )
+    return array
+
+
+def _require_capture(capture, shape: Shapes) -> None:
+    """Broadcast against the pixels' values, a capture too small would pass unseen."""
+    if is_shape(shape):
+        if isinstance(capture, tuple | list):
+            raise ValueError(f"the capture is a tuple of {len(capture)}; give one array")
+        return require_shape("capture", capture, shape)
+    if not isinstance(capture, tuple | list) or len(capture) != len(shape):
+        raise ValueError(f"the operator has {len(shape)} captures; give a tuple of {len(shape)}")
+    for part, own in zip(capture, shape, strict=True):
+        _require_capture(part, own)

@@ -1,0 +1,113 @@
+"""What the camera looks at: flat images at distances, and the light they send."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from thincam_jax._core import checks
+from thincam_jax._core.grids import Grid, cell_overlap
+from thincam_jax._core.precision import product
+
+
+class ImagePlane(eqx.Module):
+    """A flat, self-luminous image, centred on the optical axis, facing the camera.
+
+    - `image`: radiance, (*batch, y, x), in any unit; a batch can hold the colour channels.
+    - `distance`: to the mask, mm.
+    - `width`: physical width of the image, mm; its pixels are square.
+    """
+
+    image: Float[Array, "*batch y x"]
+    distance: Float[Array, ""]
+    width: Float[Array, ""]
+
+    def __init__(self, image, distance, width):
+        if not checks.is_traced(image) and np.asarray(image).dtype.kind not in "fiub":
+            raise TypeError(f"image is a {type(image).__name__}; give an array of real radiances")
+        self.image = jnp.asarray(image)
+        if not jnp.issubdtype(self.image.dtype, jnp.floating):
+            self.image = self.image.astype(float)
+        if self.image.ndim < 2 or 0 in self.image.shape:
+            raise ValueError(
+                f"image has shape {self.image.shape}; give a non-empty (…, y, x) array"
+            )
+        if not checks.is_traced(self.image) and not np.isfinite(np.asarray(self.image)).all():
+            raise ValueError("image holds NaN or infinity; give finite radiances")
+        self.distance = checks.positive("distance", distance, "mm")
+        self.width = checks.positive("width", width, "mm")
+
+    @property
+    def height(self) -> Float[Array, ""]:
+        """Physical height, mm."""
+        return self.width * (self.image.shape[-2] / self.image.shape[-1])
+
+    def sample(
+        self, grid: Grid, *, magnification: float | Float[Array, ""] = -1.0
+    ) -> Float[Array, "*batch y x"]:
+        """The image, scaled by `magnification`, averaged over the cells of a grid.
+
+        The image's pixels are taken as uniform squares, so that the average is exact and totals are
+        kept at any ratio of the pitches. A negative magnification turns the image by 180°, as a
+        pinhole does (thesis Eq 3.6 with its sign corrected).
+        """
+        rows, columns = self.image.shape[-2:]
+        scale = jnp.abs(jnp.asarray(magnification, dtype=grid.pitch.dtype))
+        down = _cell_average(grid.y, grid.pitch, rows, self.height * scale)
+        across = _cell_average(grid.x, grid.pitch, columns, self.width * scale)
+        image = self.image.astype(down.dtype)
+        turned = jnp.where(jnp.asarray(magnification) < 0, image[..., ::-1, ::-1], image)
+        return product(product(down, turned), across.T)
+
+
+def _cell_average(x, pitch, count: int, width) -> Float[Array, "n count"]:
+    """Weights of `count` pixels that span `width` in the averages over cells of `pitch` at x."""
+    edges = (jnp.arange(count + 1, dtype=x.dtype) / count - 0.5) * width
+    return cell_overlap(x, pitch, edges[:-1], edges[1:]) / pitch
+
+
+class Spectrum(eqx.Module):
+    """Wavelengths and their shares of the captured light.
+
+    - `wavelengths`: mm.
+    - `weights`: non-negative; used as given, so that they sum to 1 for a plain average.
+    """
+
+    wavelengths: Float[Array, " n"]
+    weights: Float[Array, " n"]
+
+    def __init__(self, wavelengths, weights=None):
+        if np.ndim(wavelengths) > 1:
+            raise ValueError(f"wavelengths has shape {np.shape(wavelengths)}; give a list of them")
+        count = np.size(wavelengths)
+        wavelengths = jnp.atleast_1d(jnp.asarray(wavelengths))
+        self.wavelengths = checks.positive_all("wavelengths", wavelengths, "mm")
+        if weights is None:
+            weights = jnp.full(count, 1 / max(count, 1), self.wavelengths.dtype)
+        self.weights = checks.finite("weights", weights, "parts of one", shape=(count,))
+        if count == 0:
+            raise ValueError("wavelengths is empty; give at least one wavelength in mm")
+        if not checks.is_traced(self.weights) and (np.asarray(self.weights) < 0).any():
+            raise ValueError(f"weights = {self.weights} has a negative share; give weights >= 0")
+
+
+class Scene(eqx.Module):
+    """Image planes at distances, all with one spectrum. Planes do not hide each other.
+
+    - `planes`: one `ImagePlane` or a sequence of them, with equal batch shapes.
+    - `spectrum`: a `Spectrum` or one wavelength in mm.
+    """
+
+    planes: tuple[ImagePlane, ...]
+    spectrum: Spectrum
+
+    def __init__(self, planes, spectrum):
+        self.planes = (planes,) if isinstance(planes, ImagePlane) else tuple(planes)
+        self.spectrum = spectrum if isinstance(spectrum, Spectrum) else Spectrum(spectrum)
+        if not self.planes:
+            raise ValueError("planes is empty; give at least one ImagePlane")
+        batches = {plane.image.shape[:-2] for plane in self.planes}
+        if len(batches) > 1:
+            raise ValueError(
+                f"planes have different batch shapes {sorted(batches)}; make them equal"
+            )

@@ -1,0 +1,160 @@
+"""Photographs: from a file, from scikit-image's own samples, and resampled to a pixel count."""
+
+import os
+import warnings
+from importlib import resources
+from pathlib import Path
+
+import numpy as np
+import skimage.io
+import skimage.transform
+from jaxtyping import ArrayLike, Float64, Num
+
+from thincam_jax._core import checks
+
+# Files inside the scikit-image package itself; other names of `skimage.data` need a download.
+_SAMPLES = {
+    "astronaut": "astronaut.png",
+    "brick": "brick.png",
+    "camera": "camera.png",
+    "cat": "chelsea.png",
+    "cell": "cell.png",
+    "chelsea": "chelsea.png",
+    "clock": "clock_motion.png",
+    "coffee": "coffee.png",
+    "coins": "coins.png",
+    "colorwheel": "color.png",
+    "grass": "grass.png",
+    "gravel": "gravel.png",
+    "hubble_deep_field": "hubble_deep_field.jpg",
+    "immunohistochemistry": "ihc.png",
+    "logo": "logo.png",
+    "microaneurysms": "microaneurysms.png",
+    "moon": "moon.png",
+    "page": "page.png",
+    "retina": "retina.jpg",
+    "rocket": "rocket.jpg",
+    "text": "text.png",
+}
+
+
+def load_image(path: str | os.PathLike[str]) -> Float64[np.ndarray, "y x *channel"]:
+    """An image file as float64 in [0, 1], of shape (y, x), or (y, x, 3) if it has colours.
+
+    Unsigned integers of any depth are divided by their largest value, floats must be in [0, 1]
+    already. An alpha channel is dropped, not blended. No gamma is undone.
+
+    Raises FileNotFoundError if there is no such file; ValueError for a folder, a file that is no
+    image or is damaged, an empty image, a stack of several, or values out of range.
+    """
+    path = Path(path)
+    if path.is_dir():
+        raise ValueError(f"{str(path)!r} is a folder; give the path of one image file")
+    if not path.exists():
+        raise FileNotFoundError(f"{str(path)!r} does not exist; give the path of an image file")
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            pixels = np.asarray(skimage.io.imread(path))
+    except Exception as error:  # each decoder raises its own kind
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise ValueError(
+            f"{str(path)!r} cannot be read as an image ({reason}); give an undamaged "
+            "PNG, TIFF or JPEG"
+        ) from error
+    return _unit_range(_without_alpha(pixels, path), path)
+
+
+def sample_image(name: str) -> Float64[np.ndarray, "y x *channel"]:
+    """One of scikit-image's sample pictures as float64 in [0, 1], (y, x) or (y, x, 3).
+
+    Only those whose file is installed with scikit-image, so that nothing is downloaded;
+    `sample_images()` lists them. Raises ValueError for another name, with that list.
+    """
+    available = sample_images()
+    if name not in available:
+        raise ValueError(
+            f"name = {name!r} is not a sample image; choose one of {', '.join(available)}"
+        )
+    with resources.as_file(resources.files("skimage.data") / _SAMPLES[name]) as path:
+        return load_image(path)
+
+
+def sample_images() -> tuple[str, ...]:
+    """The names that `sample_image` knows and that are installed here, in alphabetical order."""
+    folder = resources.files("skimage.data")
+    return tuple(sorted(name for name, file in _SAMPLES.items() if (folder / file).is_file()))
+
+
+def resize(
+    image: Num[ArrayLike, "..."], shape: tuple[int, int]
+) -> Float64[np.ndarray, "y x *channel"]:
+    """The same picture on `shape` = (rows, columns) pixels; (y, x) or (y, x, c), channels apart.
+
+    Both pictures cover the same field, border to border. If an axis shrinks, a Gaussian removes
+    what the new pixels cannot hold and the result is interpolated linearly; if none does,
+    cubically. The result stays within its channel's range, and its mean stays the same up to the
+    interpolation error.
+
+    Raises ValueError for a bad shape, or an image of other dimensions, empty or not finite.
+    """
+    pixels = np.asarray(image)
+    rows, columns = checks.shape2d("shape", shape)
+    if pixels.ndim not in (2, 3) or pixels.size == 0:
+        raise ValueError(
+            f"image has shape {pixels.shape}; give (y, x) or (y, x, channel), not empty"
+        )
+    if pixels.dtype.kind not in "fiub" or not np.isfinite(pixels).all():
+        raise ValueError(f"image of {pixels.dtype} is not all real and finite; give finite numbers")
+    pixels = pixels.astype(np.float64)
+    if pixels.shape[:2] == (rows, columns):
+        return pixels
+    shrinks = rows < pixels.shape[0] or columns < pixels.shape[1]
+    if pixels.ndim == 2:
+        return _resample(pixels, (rows, columns), shrinks)
+    channels = [
+        _resample(channel, (rows, columns), shrinks) for channel in np.moveaxis(pixels, -1, 0)
+    ]
+    return np.stack(channels, axis=-1)
+
+
+def _resample(plane: np.ndarray, shape: tuple[int, int], shrinks: bool) -> np.ndarray:
+    resampled = skimage.transform.resize(
+        plane,
+        shape,
+        order=1 if shrinks else 3,
+        mode="reflect",
+        anti_aliasing=shrinks,
+        preserve_range=True,
+    )
+    return np.clip(np.asarray(resampled), plane.min(), plane.max())
+
+
+def _without_alpha(pixels: np.ndarray, path: Path) -> np.ndarray:
+    """(y, x) or (y, x, 3) from what a file holds."""
+    if pixels.size == 0:
+        raise ValueError(f"{str(path)!r} holds an empty image of shape {pixels.shape}")
+    if pixels.ndim == 2:
+        return pixels
+    if pixels.ndim == 3 and pixels.shape[-1] in (1, 2):  # grey, grey and alpha
+        return pixels[..., 0]
+    if pixels.ndim == 3 and pixels.shape[-1] in (3, 4):  # colours, colours and alpha
+        return pixels[..., :3]
+    raise ValueError(
+        f"{str(path)!r} holds an array of shape {pixels.shape}; give one image, (y, x) in grey or "
+        "(y, x, 3) in colour"
+    )
+
+
+def _unit_range(pixels: np.ndarray, path: Path) -> np.ndarray:
+    """The values as float64 in [0, 1], by the depth of their type."""
+    if pixels.dtype.kind == "b":
+        return pixels.astype(np.float64)
+    if pixels.dtype.kind == "u":
+        return pixels / np.float64(np.iinfo(pixels.dtype).max)
+    if pixels.dtype.kind == "f" and pixels.min() >= 0 and pixels.max() <= 1:  # False for NaN
+        return pixels.astype(np.float64)
+    raise ValueError(
+        f"{str(path)!r} holds {pixels.dtype} from {pixels.min()} to {pixels.max()}; allowed are "
+        "unsigned integers, or floats from 0 to 1: rescale it"
+    )

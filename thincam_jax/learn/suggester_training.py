@@ -1,0 +1,178 @@
+r"""Training of a `Suggester` on designs that are sampled and scored here.
+
+Two parts, both with Adam (optax):
+
+1. *Warm-up.* Regression from the levels of sampled designs to their points, of the guess that is
+   nearest to the point only: designs with like responses then belong to different guesses, and
+   none is drawn to the mean of two designs, which is neither.
+2. *Tandem.* The misfit between wanted levels and those of the suggested design, differentiated
+   through the response model: any design that gives the response is right. Again of the best guess,
+   and of a random one now and then, so that all of them learn. Half of the wishes are responses of
+   sampled designs; the others are such ones shifted and bent by some dB, which no design fulfils
+   and of which the nearest is to be found.
+"""
+
+import functools
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from thincam_jax._core import checks
+from thincam_jax.design.adam import adam
+from thincam_jax.design.frequencies import Frequencies
+from thincam_jax.design.search import even_samples
+from thincam_jax.design.setup import Setup
+from thincam_jax.design.space import DesignSpace
+from thincam_jax.design.wanted import ResponseModel
+from thincam_jax.learn.suggestions import Suggester
+
+# Designs whose levels are computed at a time.
+_AT_A_TIME = 32
+# Levels that vary less than this over all designs are not blown up, dB.
+_LEAST_SCALE = 0.5
+# What the guesses that are not the nearest count in the warm-up, so that none is left behind.
+_OTHERS = 0.02
+# Its batch over that of the tandem, whose steps cost far more.
+_WARM_UP_BATCH = 4
+# How often a random guess is taken in place of the best.
+_RANDOM = 0.1
+# Bends of wishes: amplitude of each, dB, of constant, slope and this many cosines.
+_BEND, _COSINES = 2.0, 4
+
+
+class TrainedSuggester(NamedTuple):
+    """What training gave.
+
+    - `suggester`: the network after the last step.
+    - `warm_up`: distance of the nearest guess in the cube, root mean square, at every step.
+    - `history`: mean misfit of what was suggested, dB, at every tandem step.
+    - `skipped`: steps and samples that met a number that is none; they changed nothing.
+    """
+
+    suggester: Suggester
+    warm_up: Float[Array, " step"]
+    history: Float[Array, " step"]
+    skipped: int
+
+
+def train_suggester(
+    space: DesignSpace,
+    setup: Setup,
+    synthesis: Float[Array, "channel capture"] | Float[np.ndarray, "channel capture"],
+    frequencies: Frequencies,
+    *,
+    key: PRNGKeyArray,
+    rings: int = 32,
+    samples: int = 16384,
+    guesses: int = 4,
+    width: int = 128,
+    depth: int = 3,
+    warm_up: int = 6000,
+    steps: int = 400,
+    batch: int = 64,
+    rate: float = 4e-3,
+) -> TrainedSuggester:
+    """A network that answers `suggest` for one camera.
+
+    **Arguments**
+
+    - `space`: what is free; `setup`, `synthesis`, `frequencies`: as of `channels`.
+    - `rings`: how many levels a wish has.
+    - `samples`: designs, sampled evenly, whose levels are the examples.
+    - `guesses`, `width`, `depth`: points that the network gives, and its hidden layers.
+    - `warm_up`, `steps`: of the two parts; a tandem step costs some 8·`batch` responses.
+    - `rate`: of Adam, falling to zero as a cosine in each part; the tandem begins at a tenth.
+
+    **Errors**: ValueError for numbers below 1, for rings without frequencies, and where no
+    sampled design has a finite response.
+    """
+    counts = {"samples": samples, "warm_up": warm_up, "steps": steps, "batch": batch}
+    checks.at_least_one(counts)
+    dtype = space.lower.dtype
+    highest_rate = checks.positive("rate", rate, "a number").astype(dtype)
+    model = ResponseModel(space, setup, synthesis, frequencies, rings)
+    of_samples, of_network, of_steps = jax.random.split(key, 3)
+    points, levels = _examples(model, samples, of_samples)
+    fresh = Suggester(model, key=of_network, guesses=guesses, width=width, depth=depth)
+    scale = jnp.maximum(jnp.std(levels, axis=0), _LEAST_SCALE)
+    fresh = eqx.tree_at(lambda s: (s.mean, s.scale), fresh, (jnp.mean(levels, axis=0), scale))
+    layers, distances, misfits, skipped = _train(
+        fresh, points, levels, of_steps, highest_rate, warm_up, steps, batch
+    )
+    suggester = eqx.tree_at(lambda s: s.layers, fresh, layers)
+    return TrainedSuggester(suggester, distances, misfits, int(skipped) + samples - len(points))
+
+
+def _examples(model: ResponseModel, samples: int, key):
+    """Points of the cube with finite levels, and these."""
+    points = even_samples(model.space.size, samples, key, model.space.lower.dtype)
+    levels = _levels(model, points)
+    usable = np.isfinite(np.asarray(levels)).all(axis=-1)
+    if not usable.any():
+        raise ValueError(
+            f"none of {samples} designs has a finite response; change the space or the setup"
+        )
+    return points[usable], levels[usable]
+
+
+@jax.jit
+def _levels(
+    model: ResponseModel, points: Float[Array, "point variable"]
+) -> Float[Array, "point ring"]:
+    return jax.lax.map(model.levels, points, batch_size=_AT_A_TIME)
+
+
+@functools.partial(jax.jit, static_argnames=("warm_up", "steps", "batch"))
+def _train(suggester: Suggester, points, levels, key, rate, warm_up: int, steps: int, batch: int):
+    def with_layers(layers) -> Suggester:
+        return eqx.tree_at(lambda s: s.layers, suggester, layers)
+
+    def towards_designs(layers, step_key):
+        chosen = jax.random.randint(step_key, (_WARM_UP_BATCH * batch,), 0, len(points))
+        guesses = jax.vmap(with_layers(layers))(levels[chosen])
+        squared = jnp.mean((guesses - points[chosen][:, None]) ** 2, axis=-1)
+        nearest = jnp.mean(jnp.min(squared, axis=-1))
+        return nearest + _OTHERS * jnp.mean(squared), jnp.sqrt(nearest)
+
+    def towards_levels(layers, step_key):
+        of_wishes, of_guesses = jax.random.split(step_key)
+        wanted = _wishes(levels, of_wishes, batch)
+        guesses = jax.vmap(with_layers(layers))(wanted)
+        misfit = jnp.mean(_chosen_misfits(suggester.model, guesses, wanted, of_guesses))
+        return misfit, misfit
+
+    first, second = jax.random.split(key)
+    start = suggester.layers
+    layers, distances, in_vain = adam(towards_designs, start, first, rate, warm_up, most=1.0)
+    layers, misfits, skipped = adam(towards_levels, layers, second, rate / 10, steps, most=1.0)
+    return layers, distances, misfits, in_vain + skipped
+
+
+def _chosen_misfits(model: ResponseModel, guesses, wanted, key) -> Float[Array, " wish"]:
+    """Of the best guess of each wish, or now and then of any; only these are differentiated."""
+    judged = jax.vmap(jax.vmap(model.misfit, in_axes=(0, None)))(
+        jax.lax.stop_gradient(guesses), wanted
+    )
+    best = jnp.argmin(jnp.where(jnp.isfinite(judged), judged, jnp.inf), axis=-1)
+    of_any, of_which = jax.random.split(key)
+    anyone = jax.random.randint(of_which, best.shape, 0, guesses.shape[1])
+    taken = jnp.where(jax.random.uniform(of_any, best.shape) < _RANDOM, anyone, best)
+    points = jnp.take_along_axis(guesses, taken[:, None, None], axis=1)[:, 0]
+    return jax.vmap(model.misfit)(points, wanted)
+
+
+def _wishes(levels: Float[Array, "point ring"], key, batch: int) -> Float[Array, "wish ring"]:
+    """Responses of sampled designs, every second one shifted and bent."""
+    of_choice, of_bends = jax.random.split(key)
+    wanted = levels[jax.random.randint(of_choice, (batch,), 0, len(levels))]
+    place = (np.arange(levels.shape[1]) + 0.5) / levels.shape[1]
+    shapes = [np.ones_like(place), 2 * place - 1]
+    shapes += [np.cos(np.pi * k * place) for k in range(2, 2 + _COSINES)]
+    weights = jax.random.normal(of_bends, (batch, len(shapes)), levels.dtype)
+    bends = _BEND * weights @ jnp.asarray(np.stack(shapes), levels.dtype)
+    every_second = jnp.arange(batch)[:, None] % 2 == 0
+    return jnp.maximum(wanted + jnp.where(every_second, bends, 0.0), 0.0)

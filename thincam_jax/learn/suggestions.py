@@ -1,0 +1,307 @@
+r"""A design for a wished response, from a network and two Newton steps.
+
+The network maps wanted levels (`thincam_jax.design.wanted`) to points p of a space's unit cube. The
+map has many values: captures may be exchanged, and different designs have like responses. So it
+gives several guesses; two steps of Gauss and Newton's method refine each within the cube,
+
+.. math:: \Delta p = -(J^T J + \mu\,\mathrm{diag}\,J^T J)^{-1} J^T
+    [L(p) - L^{wanted}], \qquad J = \partial L/\partial p
+
+with the best of several dampings μ; and the best of what comes out is the answer. The response
+model judges every guess, so the misfit that is told is the design's, not the network's opinion.
+"""
+
+import json
+import os
+from collections.abc import Iterator
+from io import BytesIO
+from pathlib import Path
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from thincam_jax._core import checks, files
+from thincam_jax.design.design import Design
+from thincam_jax.design.frequencies import Frequencies
+from thincam_jax.design.match import MATCHED, MatchStatus, match_status
+from thincam_jax.design.setup import Setup
+from thincam_jax.design.space import DesignSpace, active_limits
+from thincam_jax.design.wanted import ResponseModel, checked_levels, root_mean_square
+
+STEPS = 2
+# Parts of the diagonal of JᵀJ that are tried beside each other in every step. Ripples of the
+# response make the widest steps useless where the linear model reaches a fringe only.
+_DAMPINGS = (0.01, 0.3, 10.0)
+
+
+class Suggester(eqx.Module):
+    """A network from wanted levels to guesses in the unit cube, and the model that judges them.
+
+    - `layers`: of a multilayer perceptron, SiLU between them, a sigmoid at the end.
+    - `mean`, `scale`: of the levels it was trained on, dB; it sees (wanted − mean)/scale.
+    - `model`: space, setup, synthesis and frequencies it was trained for.
+    - `guesses`: how many points it gives.
+
+    `train_suggester` makes one; as initialised its guesses mean nothing.
+    """
+
+    layers: tuple[eqx.nn.Linear, ...]
+    mean: Float[Array, " ring"]
+    scale: Float[Array, " ring"]
+    model: ResponseModel
+    guesses: int = eqx.field(static=True)
+
+    def __init__(
+        self, model: ResponseModel, *, key: PRNGKeyArray, guesses: int, width: int, depth: int
+    ):
+        checks.at_least_one({"guesses": guesses, "width": width, "depth": depth})
+        dtype = model.space.lower.dtype
+        sizes = (model.rings, *[width] * depth, guesses * model.space.size)
+        keys = jax.random.split(key, depth + 1)
+        self.layers = tuple(
+            eqx.nn.Linear(a, b, dtype=dtype, key=k)
+            for a, b, k in zip(sizes[:-1], sizes[1:], keys, strict=True)
+        )
+        self.mean, self.scale = jnp.zeros(model.rings, dtype), jnp.ones(model.rings, dtype)
+        self.model, self.guesses = model, guesses
+
+    def __call__(self, wanted: Float[Array, " ring"]) -> Float[Array, "guess variable"]:
+        """The network alone: points of the unit cube."""
+        signal = (wanted - self.mean) / self.scale
+        for layer in self.layers[:-1]:
+            signal = jax.nn.silu(layer(signal))
+        return jax.nn.sigmoid(self.layers[-1](signal)).reshape(self.guesses, -1)
+
+
+class Proposal(NamedTuple):
+    """What `propose` finds: points of the unit cube and their misfits, dB.
+
+    - `first_point`, `first_misfit_db`: the best guess of the network alone.
+    - `point`, `misfit_db`: after the Newton steps; never worse.
+    - `levels`: that the design at `point` gives, dB.
+    """
+
+    first_point: Float[Array, " variable"]
+    first_misfit_db: Float[Array, ""]
+    point: Float[Array, " variable"]
+    misfit_db: Float[Array, ""]
+    levels: Float[Array, " ring"]
+
+
+@jax.jit
+def propose(suggester: Suggester, wanted: Float[Array, " ring"]) -> Proposal:
+    """The answer without words: compiled once for all wanted levels, for `jit`, `vmap`, `grad`."""
+    model = suggester.model
+    points = suggester(wanted)
+    refined, first = refine(model, wanted, points)
+    levels = jax.vmap(model.levels)(refined)
+    misfits = jax.vmap(root_mean_square)(levels - wanted)
+    at_first, best = (jnp.argmin(_or_infinite(m)) for m in (first, misfits))
+    return Proposal(points[at_first], first[at_first], refined[best], misfits[best], levels[best])
+
+
+def refine(
+    model: ResponseModel,
+    wanted: Float[Array, " ring"],
+    points: Float[Array, "guess variable"],
+    steps: int = STEPS,
+) -> tuple[Float[Array, "guess variable"], Float[Array, " guess"]]:
+    """Points after some Newton steps in the cube, and their misfits before, dB."""
+
+    def step(points, _):
+        return jax.vmap(_newton_step, in_axes=(None, None, 0))(model, wanted, points)
+
+    # One step after the other as a loop: written out, each would be compiled.
+    refined, misfits = jax.lax.scan(step, points, length=steps)
+    return refined, misfits[0]
+
+
+def _newton_step(
+    model: ResponseModel, wanted: Float[Array, " ring"], point: Float[Array, " variable"]
+) -> tuple[Float[Array, " variable"], Float[Array, ""]]:
+    """The best of some damped Gauss-Newton steps within the cube, or none; the misfit before."""
+
+    def residual(p):
+        difference = model.levels(p) - wanted
+        return difference, difference
+
+    slopes, difference = jax.jacfwd(residual, has_aux=True)(point)
+    gradient = slopes.T @ difference
+    # What lies on a face and would leave the cube stays where it is.
+    held = ((point <= 0) & (gradient > 0)) | ((point >= 1) & (gradient < 0))
+    slopes = jnp.where(held, 0.0, slopes)
+    curvature, gradient = slopes.T @ slopes, jnp.where(held, 0.0, gradient)
+    size = jnp.diagonal(curvature)
+    size = jnp.where(size > 0, size, 1.0)
+
+    def damped(damping):
+        step = jnp.linalg.solve(curvature + jnp.diag(damping * size), gradient)
+        return jnp.clip(point - step, 0.0, 1.0)
+
+    tried = jax.vmap(damped)(jnp.asarray(_DAMPINGS, point.dtype))
+    misfits = jax.vmap(model.misfit, in_axes=(0, None))(tried, wanted)
+    here = root_mean_square(difference)
+    best = jnp.argmin(_or_infinite(misfits))
+    return jnp.where(misfits[best] < here, tried[best], point), here
+
+
+def _or_infinite(misfits: Float[Array, " point"]) -> Float[Array, " point"]:
+    return jnp.where(jnp.isfinite(misfits), misfits, jnp.inf)
+
+
+class Suggestion(NamedTuple):
+    """A design for a wished response.
+
+    - `design`; `values`: its free numbers, in the order of the space's variables.
+    - `misfit_db`: root mean square over the rings of what its levels differ from the wanted, dB.
+    - `network_misfit_db`: the same of the network's best guess, before the Newton steps.
+    - `levels`: what the design gives, dB.
+    - `active`: the limits it lies against, in words.
+    - `status`: "matched" within the tolerance; "not_attained": no design was found that gives
+      what is wanted, and there may be none; "non_finite": no guess has a response.
+    - `point`: in the unit cube.
+    """
+
+    design: Design
+    values: Float[Array, " variable"]
+    misfit_db: float
+    network_misfit_db: float
+    levels: Float[Array, " ring"]
+    active: tuple[str, ...]
+    status: MatchStatus
+    point: Float[Array, " variable"]
+
+
+def suggest(suggester: Suggester, wanted, *, tolerance_db: float = MATCHED) -> Suggestion:
+    """A design whose levels are near to wanted ones, in some tens of milliseconds once compiled.
+
+    **Arguments**
+
+    - `wanted`: levels in dB, one for each ring from zero frequency up (`ring_levels`), at least 0.
+    - `tolerance_db`: misfits up to here are "matched".
+
+    **Validity.** For the camera and the space that the suggester was trained for. It is one of the
+    designs that fit, not the best of all: `match_response` looks for that.
+
+    **Errors**: ValueError for another number of levels, and for levels not finite or below 0.
+    """
+    model = suggester.model
+    levels = checked_levels(wanted, model.rings, model.space.lower.dtype)
+    found = propose(suggester, levels)
+    misfit, network = float(found.misfit_db), float(found.first_misfit_db)
+    return Suggestion(
+        model.space.design(found.point),
+        model.space.values(found.point),
+        misfit,
+        network,
+        found.levels,
+        active_limits(model.space, found.point),
+        match_status(misfit, tolerance_db),
+        found.point,
+    )
+
+
+_FORMAT = "thincam_jax suggester 1"
+
+
+def save_suggester(path: str | os.PathLike[str], suggester: Suggester) -> Path:
+    """Write a trained suggester: one line of JSON, then its numbers. Whole or not at all."""
+    content = BytesIO()
+    content.write(json.dumps(_header(suggester)).encode("utf-8") + b"\n")
+    eqx.tree_serialise_leaves(content, suggester)
+    return files.write_whole(path, content.getvalue())
+
+
+def load_suggester(
+    path: str | os.PathLike[str],
+    space: DesignSpace,
+    setup: Setup,
+    synthesis: Float[Array, "channel capture"] | Float[np.ndarray, "channel capture"],
+    frequencies: Frequencies,
+) -> Suggester:
+    """Read a suggester that was trained for this space and camera.
+
+    **Errors**: ValueError, one line, for a file that is none, and for one that was trained for
+    another space, camera, synthesis, frequencies or precision, with the first that differs.
+    """
+    source = BytesIO(Path(path).read_bytes())
+    header = _read_header(path, source.readline())
+    network = header["network"]
+    model = ResponseModel(space, setup, synthesis, frequencies, network["rings"])
+    fresh = Suggester(
+        model,
+        key=jax.random.key(0),
+        guesses=network["guesses"],
+        width=network["width"],
+        depth=network["depth"],
+    )
+    for name, here in json.loads(json.dumps(_header(fresh))).items():
+        if header.get(name) != here:
+            raise ValueError(
+                f"{path} was trained for other {name}: {json.dumps(header.get(name))}, and here "
+                f"they are {json.dumps(here)}; train a suggester for these"
+            )
+    try:
+        loaded = eqx.tree_deserialise_leaves(source, fresh)
+    except (ValueError, RuntimeError, EOFError, OSError) as error:
+        raise ValueError(f"{path} is cut off or damaged; train and save it again") from error
+    _check_numbers(path, loaded.model, model)
+    return loaded
+
+
+def _header(suggester: Suggester) -> dict:
+    """What must agree before the numbers can be read."""
+    model = suggester.model
+    space, setup = model.space, model.setup
+    return {
+        "format": _FORMAT,
+        "network": {
+            "rings": model.rings,
+            "guesses": suggester.guesses,
+            "width": suggester.layers[0].out_features,
+            "depth": len(suggester.layers) - 1,
+        },
+        "variables": [v._asdict() for v in space.variables],
+        "limits": space.limits._asdict(),
+        "captures": [space.base.captures, space.base.profile],
+        "models": [
+            type(setup.noise).__name__,
+            type(model.frequencies).__name__,
+            setup.pixel_integration,
+            setup.crop,
+        ],
+        "numbers": [f"{name} {n.dtype}{list(n.shape)}" for name, n in _numbers(model)],
+    }
+
+
+def _read_header(path, line: bytes) -> dict:
+    try:
+        header = json.loads(line)
+        known = header["format"] == _FORMAT and isinstance(header["network"], dict)
+    except (ValueError, KeyError, TypeError):
+        known, header = False, {}
+    if not known:
+        raise ValueError(f"{path} is no suggester; give a file written by save_suggester")
+    return header
+
+
+def _numbers(model: ResponseModel) -> Iterator[tuple[str, Array]]:
+    for keys, leaf in jax.tree_util.tree_flatten_with_path(model)[0]:
+        yield jax.tree_util.keystr(keys).lstrip("."), leaf
+
+
+def _check_numbers(path, trained: ResponseModel, given: ResponseModel) -> None:
+    """A suggester answers for the camera that it was trained for, and for no other."""
+    for (name, there), (_, here) in zip(_numbers(trained), _numbers(given), strict=True):
+        if not np.allclose(there, here, rtol=1e-5, atol=0.0):
+            at = np.unravel_index(
+                np.argmax(~np.isclose(there, here, rtol=1e-5, atol=0.0)), here.shape
+            )
+            raise ValueError(
+                f"{path} was trained for another camera: {name} was {float(there[at]):.6g} and is "
+                f"{float(here[at]):.6g}; train a suggester for this one"
+            )

@@ -1,0 +1,228 @@
+r"""Unrolled ADMM: a few iterations whose penalties and thresholds are learned from examples.
+
+ADMM converges whatever its penalties; how good the image is after five iterations depends on
+them. Here every iteration has its own, found by gradient descent on pairs of captures and
+images (Le-ADMM: Monakhova et al., Opt. Express 27, 28075, 2019). The physics stays what it
+is: 5 numbers an iteration are learned, so that some tens of pairs suffice.
+"""
+
+import functools
+import math
+import time
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from thincam_jax._core import checks
+from thincam_jax.reconstruction.admm import (
+    Penalties,
+    Splitting,
+    State,
+    default_penalties,
+    image_of,
+    start,
+    step,
+)
+from thincam_jax.reconstruction.drive import Outcome, Progress, Status
+from thincam_jax.reconstruction.problem import Deconvolution, objective
+from thincam_jax.reconstruction.scaled import even_image
+
+
+class UnrolledAdmm(eqx.Module):
+    r"""`iterations` of ADMM with parameters of their own, all positive as softplus of a number.
+
+    In the units of `Splitting`, in which captures and operators are about 1, so that the image
+    scales with the captures. Each member of a batch has its own units.
+
+    - `data`, `variation`, `image`: penalties μ of the three splits, (iterations,).
+    - `threshold`: by how much slopes are shortened, τ/μ₂.
+    - `relaxation`: α.
+
+    All are kept as the number before softplus.
+    """
+
+    data: Float[Array, " iteration"]
+    variation: Float[Array, " iteration"]
+    image: Float[Array, " iteration"]
+    threshold: Float[Array, " iteration"]
+    relaxation: Float[Array, " iteration"]
+
+    def __init__(self, problem: Deconvolution, iterations: int = 5):
+        """Untrained: plain ADMM with the default penalties of a problem, and its τ."""
+        if iterations < 1:
+            raise ValueError(f"iterations = {iterations}: give at least 1")
+        splitting = jax.jit(Splitting)(problem)
+        penalties = default_penalties(splitting)
+
+        def repeated(value):
+            return jnp.full(iterations, _before_softplus(value))
+
+        self.data = repeated(penalties.data)
+        self.variation = repeated(penalties.variation)
+        self.image = repeated(penalties.image)
+        # A threshold of zero has no number before softplus.
+        least = jnp.finfo(self.data.dtype).eps
+        self.threshold = repeated(jnp.maximum(splitting.tau / penalties.variation, least))
+        self.relaxation = repeated(jnp.ones_like(splitting.tau))
+
+    def __call__(self, problem: Deconvolution) -> Float[Array, "*batch channel plane y x"]:
+        """The image after all iterations, from the even one; the problem's τ is not used."""
+        return self.images(problem)[-1]
+
+    def images(self, problem: Deconvolution) -> Float[Array, "iteration *batch channel plane y x"]:
+        """The image after each iteration."""
+        captures, weights = _members(problem)
+        images = jax.vmap(_iterated, in_axes=(None, None, 0, 0))(self, problem, captures, weights)
+        return jnp.moveaxis(images, 0, 1).reshape(self.data.shape[0], *problem.image_shape)
+
+    def parameters(self) -> tuple[Array, Array, Array, Array, Array]:
+        """The three penalties, threshold and relaxation, each (iterations,)."""
+        rows = (self.data, self.variation, self.image, self.threshold, self.relaxation)
+        data, variation, image, threshold, relaxation = (jax.nn.softplus(r) for r in rows)
+        return data, variation, image, threshold, relaxation
+
+
+def _iterated(model: UnrolledAdmm, problem: Deconvolution, captures, weights):
+    """The images of one member of a batch."""
+    problem = eqx.tree_at(lambda p: (p.captures, p.weights), problem, (captures, weights))
+    splitting = Splitting(problem)
+    first = start(splitting, even_image(problem))
+    # A loop, since the derivative of a straight program takes long to compile.
+    iterate = functools.partial(_iterate, splitting)
+    _, images = jax.lax.scan(iterate, first, model.parameters())
+    return images
+
+
+def _iterate(splitting: Splitting, state: State, parameters):
+    """One iteration with its own parameters, and its image."""
+    data, variation, image, threshold, relaxation = parameters
+    # `step` shortens slopes by τ/μ₂.
+    splitting = eqx.tree_at(lambda s: s.tau, splitting, threshold * variation)
+    state = step(splitting, Penalties(data, variation, image), relaxation, state)
+    return state, image_of(splitting, state)
+
+
+def _members(problem: Deconvolution):
+    """Captures and weights with one batch axis, (member, channel, y, x)."""
+    captures = tuple(c.reshape(-1, *c.shape[-3:]) for c in problem.captures)
+    pairs = zip(problem.weights, problem.captures, strict=True)
+    weights = tuple(jnp.broadcast_to(w, c.shape).reshape(-1, *c.shape[-3:]) for w, c in pairs)
+    return captures, weights
+
+
+class Training(NamedTuple):
+    """The best model by its loss, and the loss before each step.
+
+    - `status`: "converged" never: "iterations_exhausted", or "non_finite" if a loss was no number,
+      after which training stops.
+    """
+
+    model: UnrolledAdmm
+    losses: tuple[float, ...]
+    status: Status
+
+
+def train(
+    model: UnrolledAdmm,
+    problem: Deconvolution,
+    images: Float[Array, "pair channel plane y x"],
+    *,
+    key: PRNGKeyArray,
+    steps: int = 100,
+    batch: int = 4,
+    learning_rate=0.05,
+) -> Training:
+    """Fit a model to pairs of captures and images, by Adam (optax) on the mean squared error.
+
+    **Arguments**
+
+    - `problem`: its captures (pair, channel, y, x) belong to `images`.
+    - `steps`, `batch`: gradient steps, and pairs drawn for each, without replacement.
+    - `learning_rate`: of Adam, in the numbers before softplus.
+
+    The error of a pair is relative to its image's mean square, so that dark scenes count as
+    much as bright ones. Of all models that of the lowest loss on all pairs is returned, taken every
+    tenth step.
+    """
+    _check_pairs(problem, images, batch)
+    rate = checks.positive("learning_rate", learning_rate, "a number").astype(images.dtype)
+    state = optax.scale_by_adam().init(model)  # type: ignore[arg-type]
+    best, lowest, losses = model, float(training_loss(model, problem, images)), []
+    for n in range(steps):
+        chosen = jax.random.choice(jax.random.fold_in(key, n), len(images), (batch,), replace=False)
+        model, state, loss = _descend(model, state, rate, problem, images, chosen)
+        losses.append(float(loss))
+        if not math.isfinite(losses[-1]):
+            return Training(best, tuple(losses), "non_finite")
+        if n % 10 == 9 or n == steps - 1:
+            whole = float(training_loss(model, problem, images))
+            if whole < lowest:
+                best, lowest = model, whole
+    return Training(best, tuple(losses), "iterations_exhausted")
+
+
+def solve_unrolled(problem: Deconvolution, model: UnrolledAdmm) -> Outcome:
+    """The image of a problem by a (trained) model.
+
+    It is the last one, whatever the problem's objective makes of it; the history holds that
+    objective after each iteration. The status is "iterations_exhausted", as all are always done, or
+    "non_finite".
+    """
+    began = time.perf_counter()
+    values, image = _followed(model, problem)
+    history = tuple(
+        Progress(n, float(v), math.nan, math.nan) for n, v in enumerate(jax.device_get(values))
+    )
+    finite = bool(jnp.isfinite(image).all())
+    status: Status = "iterations_exhausted" if finite else "non_finite"
+    return Outcome(image, status, history, len(history) - 1, time.perf_counter() - began)
+
+
+@jax.jit
+def training_loss(
+    model: UnrolledAdmm, problem: Deconvolution, images: Float[Array, "pair channel plane y x"]
+) -> Float[Array, ""]:
+    """Mean over the pairs of ‖image found − image‖²/‖image‖²."""
+    axes = (-4, -3, -2, -1)
+    errors = jnp.sum((model(problem) - images) ** 2, axis=axes)
+    sizes = jnp.sum(images**2, axis=axes)
+    return jnp.mean(errors / jnp.where(sizes > 0, sizes, 1))
+
+
+@jax.jit
+def _descend(model: UnrolledAdmm, state, rate, problem: Deconvolution, images, chosen):
+    """A step of Adam on some of the pairs."""
+    captures, weights = _members(problem)
+    some = jax.tree.map(lambda x: x[chosen], (captures, weights))
+    problem = eqx.tree_at(lambda p: (p.captures, p.weights), problem, some)
+    loss, slope = jax.value_and_grad(training_loss)(model, problem, images[chosen])
+    # optax multiplies floats by integers, which strict promotion forbids.
+    with jax.numpy_dtype_promotion("standard"):
+        updates, state = optax.scale_by_adam().update(slope, state)
+    return jax.tree.map(lambda p, u: p - rate * u, model, updates), state, loss
+
+
+@jax.jit
+def _followed(model: UnrolledAdmm, problem: Deconvolution):
+    """The objective before and after each iteration, summed over a batch, and the last image."""
+    images = model.images(problem)
+    values = [jnp.sum(objective(problem, f)) for f in (even_image(problem), *images)]
+    return jnp.stack(values), images[-1]
+
+
+def _before_softplus(value: Float[Array, ""]) -> Float[Array, ""]:
+    return value + jnp.log(-jnp.expm1(-value))
+
+
+def _check_pairs(problem: Deconvolution, images: Array, batch: int) -> None:
+    if len(problem.image_shape) != 5 or images.shape != problem.image_shape:
+        raise ValueError(
+            f"images have shape {images.shape} for captures {problem.captures[0].shape}; give "
+            f"captures (pair, channel, y, x) and images {problem.image_shape}"
+        )
+    if not 1 <= batch <= len(images):
+        raise ValueError(f"batch = {batch} of {len(images)} pairs; give 1 to {len(images)}")

@@ -1,0 +1,1 @@
+"""The lensless camera: a coded mask at a distance in front of a sensor."""

@@ -1,0 +1,298 @@
+"""What each model gives on a few rows and columns, and how far that is from the best model."""
+
+import functools
+import math
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from thincam_jax._core.grids import Grid
+from thincam_jax._core.precision import PRECISIONS, Precision, allow, cast
+from thincam_jax.lensless.accuracy.norms import (
+    Factors,
+    distance,
+    factors,
+    norm,
+    rounding_distance,
+    weighted,
+)
+from thincam_jax.lensless.accuracy.points import Points, chosen
+from thincam_jax.lensless.accuracy.sampled import angular_spectrum_terms, fine_fields
+from thincam_jax.lensless.accuracy.terms import closed_terms
+from thincam_jax.lensless.masks.base import AbstractMask
+from thincam_jax.lensless.propagation.angular_spectrum import planes
+from thincam_jax.lensless.propagation.closed_form import in_focus
+from thincam_jax.lensless.propagation.orders import pairs, require_zone_orders
+from thincam_jax.lensless.propagation.path import Path
+from thincam_jax.lensless.propagation.plane import block_average, lit_mask
+from thincam_jax.lensless.propagation.rayleigh_sommerfeld import rayleigh_sommerfeld_field
+from thincam_jax.lensless.propagation.separable import PIXEL_NODES
+from thincam_jax.lensless.propagation.separable_sum import SeparableSum
+
+# Samples of the line on which the exact phases are compared with Fresnel's.
+_FINE_SAMPLES = 2**16
+# Nodes of the reference's pixel average: few different ones, each is compiled.
+_NODES = (2 * PIXEL_NODES, 128, 320)
+# Samples across a pixel for its average there.
+_IN_PIXEL = 33
+# Rows and columns of pixels at which the direct sum is tried.
+_FEW = 14
+# What a product of two float32 factors and the sum of a few leave, relative to the image.
+_PRODUCT_ROUNDING: dict[Precision, float] = {"float32": 2e-7, "float64": 5e-16}
+_EPSILON: dict[Precision, float] = {"float32": 2.0**-24, "float64": 2.0**-53}
+
+
+class Lines(NamedTuple):
+    """The rows and columns that are looked at, as centred indices, and what each stands for."""
+
+    rows: Float[np.ndarray, " row"]
+    columns: Float[np.ndarray, " column"]
+    row_weights: Float[np.ndarray, " row"]
+    column_weights: Float[np.ndarray, " column"]
+
+    def points(self, pitch: Float[Array, ""]) -> Points:
+        return Points(self.rows, self.columns, pitch)
+
+
+class Numbers(NamedTuple):
+    """Sizes of the effects of a camera.
+
+    - `epsilon`: |k|ε of the highest order k.
+    - `first_order`, `second_order`: phases kε·kβ(w/2)² and (kε)²·kβ(w/2)² at the edge, rad.
+    - `edge_zone`: √(λd/M), mm.
+    - `largest_phase`: of the zones and of the edge waves on the sensor, rad.
+    """
+
+    epsilon: float
+    first_order: float
+    second_order: float
+    edge_zone: float
+    largest_phase: float
+
+
+def lines_of(mask: AbstractMask, grid: Grid, path: Path) -> Lines:
+    """Rows and columns of the grid, denser at the edges of the shadow."""
+    pitch, scale = float(grid.pitch), float(path.magnification)
+    zone = 3 * math.sqrt(float(path.wavelength * path.distance) * scale) / pitch
+    found = []
+    for axis, count in enumerate(grid.shape):
+        middle = (count - 1) / 2 + scale * float(mask.centre[axis]) / pitch
+        half = scale * float(mask.extent[axis]) / 2 / pitch
+        indices, weights = chosen(count, (middle - half, middle + half), zone, seed=axis)
+        found.append((indices - (count - 1) / 2, weights))
+    (rows, row_weights), (columns, column_weights) = found
+    return Lines(rows, columns, row_weights, column_weights)
+
+
+@jax.jit(static_argnames=("shape", "pixel_integration", "mask_shape", "oversampling"))
+def _direct_sum(
+    mask, points: Points, path: Path, *, shape, pixel_integration, mask_shape, oversampling
+) -> Float[Array, "row column"]:
+    """`rayleigh_sommerfeld` at some pixels."""
+    plane, _ = planes(Grid(shape, points.pitch), mask_shape, oversampling)
+    lit = lit_mask(mask, plane, path)
+    sensor = points.refined(oversampling) if pixel_integration else points
+    field = rayleigh_sommerfeld_field(lit, plane, sensor, path)
+    irradiance = (field.real**2 + field.imag**2) * path.magnification**2
+    return block_average(irradiance, oversampling) if pixel_integration else irradiance
+
+
+def _spread(count: int, most: int) -> Float[np.ndarray, " chosen"]:
+    """At most `most` centred indices out of `count`, one of each of equal strata."""
+    edges = np.linspace(0, count, min(count, most) + 1)
+    inside = np.random.default_rng(2).uniform(size=len(edges) - 1)
+    return np.floor(edges[:-1] + inside * np.diff(edges)) - (count - 1) / 2
+
+
+class ZoneProbe:
+    """Errors of all models for one camera with a zone mask, by one-dimensional probes.
+
+    The reference is `separable` in double precision, exact in the Fresnel approximation. Nothing
+    two-dimensional is evaluated.
+    """
+
+    def __init__(
+        self, mask: AbstractMask, grid: Grid, path: Path, *, pixel_integration: bool
+    ) -> None:
+        self.shape, self.pixel_integration, self.path = grid.shape, pixel_integration, path
+        self.lines = lines_of(mask, grid, path)
+        self.given: dict[Precision, tuple[AbstractMask, Array, Path]]
+        with allow("float64", mask, grid, path):
+            self.given = {p: cast((mask, grid.pitch, path), p) for p in PRECISIONS}
+        self._cache: dict[tuple[str, Precision, int], Factors] = {}
+
+    @functools.cached_property
+    def scale(self) -> float:
+        """‖h‖₂ of the reference; where no light falls on the sensor, errors count as they are."""
+        return norm(self.reference) or 1.0
+
+    def closed(self, model: str, precision: Precision, nodes: int = PIXEL_NODES) -> Factors:
+        """Factors of one of the closed forms."""
+        key = model, precision, nodes
+        if key not in self._cache:
+            with allow(precision):
+                mask, pitch, path = self.given[precision]
+                points = self.lines.points(pitch)
+                terms = closed_terms(mask, points, path, model, self.pixel_integration, nodes)
+                self._cache[key] = self._factors(terms)
+        return self._cache[key]
+
+    @property
+    def reference(self) -> Factors:
+        """`separable` in double precision, pixels averaged with as many nodes as the fringes ask.
+
+        Where a pixel holds more than some ten fringes of the far edge, those of `psf` alias them.
+        """
+        return self.closed("separable", "float64", self._nodes)
+
+    @functools.cached_property
+    def _nodes(self) -> int:
+        if not self.pixel_integration:
+            return PIXEL_NODES
+        with allow("float64"):
+            mask, pitch, path = self.given["float64"]
+            # The irradiance's band ends at width/(λd).
+            width = max(float(extent) for extent in mask.extent)
+            fringes = float(pitch) * width / float(path.wavelength * path.distance)
+        enough = [n for n in _NODES if n >= fringes * math.pi / 2 + 10]
+        return enough[0] if enough else _NODES[-1]
+
+    def _factors(self, terms: SeparableSum) -> Factors:
+        return factors(terms, self.lines.row_weights, self.lines.column_weights)
+
+    def model_error(self, model: str) -> float:
+        """Relative distance of a closed form from the reference, without rounding."""
+        found = self.closed(model, "float64")
+        if model == "separable":
+            return rounding_distance(found, self.reference) / self.scale
+        return distance(found, self.reference) / self.scale
+
+    def difference(self, model: str, other: str) -> float:
+        """Relative distance of two closed forms, without rounding."""
+        first, second = (self.closed(m, "float64") for m in (model, other))
+        return distance(first, second) / self.scale
+
+    def rounding(self, model: str, precision: Precision) -> float:
+        """What the precision costs a closed form; in float64, scaled from that of float32."""
+        single, double = (self.closed(model, p) for p in PRECISIONS)
+        measured = rounding_distance(single, double) / self.scale
+        size = norm(double) / self.scale
+        scaled = measured * _EPSILON[precision] / _EPSILON["float32"]
+        if precision == "float64":
+            # Phases that float32 has lost altogether cost it no more than their waves' amplitude.
+            scaled *= max(1.0, 3 * self.numbers().largest_phase * _EPSILON["float32"])
+        return scaled + size * _PRODUCT_ROUNDING[precision]
+
+    def angular_spectrum(
+        self, precision: Precision, mask_shape: tuple[int, int], oversampling: int
+    ) -> float:
+        """Relative distance of the angular spectrum from the reference, rounding included."""
+        with allow(precision):
+            mask, pitch, path = self.given[precision]
+            terms = angular_spectrum_terms(
+                mask,
+                self.lines.points(pitch),
+                path,
+                shape=self.shape,
+                pixel_integration=self.pixel_integration,
+                mask_shape=mask_shape,
+                oversampling=oversampling,
+            )
+            found = self._factors(terms)
+        return distance(found, self.reference) / self.scale
+
+    def rayleigh_sommerfeld(
+        self, precision: Precision, mask_shape: tuple[int, int], oversampling: int
+    ) -> float:
+        """The same for the direct sum, from a few pixels: where it aliases, no line shows it."""
+        few = [_spread(count, _FEW) for count in self.shape]
+        with allow("float64"):
+            mask, pitch, path = self.given["float64"]
+            points = Points(few[0], few[1], pitch)
+            exact = closed_terms(mask, points, path, "separable", self.pixel_integration).image()
+            exact = np.asarray(exact)
+        with allow(precision):
+            mask, pitch, path = self.given[precision]
+            found = np.asarray(
+                _direct_sum(
+                    mask,
+                    Points(few[0], few[1], pitch),
+                    path,
+                    shape=self.shape,
+                    pixel_integration=self.pixel_integration,
+                    mask_shape=mask_shape,
+                    oversampling=oversampling,
+                ),
+                float,
+            )
+        share = exact.size / math.prod(self.shape)
+        return float(np.linalg.norm(found - exact)) / math.sqrt(share) / self.scale
+
+    def numbers(self) -> "Numbers":
+        """What the reasons speak of."""
+        with allow("float64"):
+            mask, pitch, path = self.given["float64"]
+            zones = require_zone_orders(mask, "separable")
+            epsilon = float(path.epsilon(zones.beta)) * max(abs(k) for k in zones.orders)
+            radius = max(float(extent) for extent in mask.extent) / 2
+            order = max(abs(k) for k in zones.orders)
+            phase = order * float(zones.beta) * radius**2
+            reach = max(self.shape) * float(pitch) / 2 / float(path.magnification) + radius
+            return Numbers(
+                epsilon=epsilon,
+                first_order=epsilon * phase,
+                second_order=epsilon**2 * phase,
+                edge_zone=math.sqrt(
+                    float(path.wavelength * path.distance) / float(path.magnification)
+                ),
+                largest_phase=max(2 * phase, float(path.fresnel_curvature) * reach**2),
+            )
+
+    def in_focus(self) -> bool:
+        """Whether an order focuses on the sensor, where `psf` refuses the closed form."""
+        with allow("float64"):
+            mask, _, path = self.given["float64"]
+            return bool(in_focus(mask, path))
+
+    def paraxial_error(self) -> float:
+        """Relative distance of the Fresnel approximation from exact scalar diffraction.
+
+        From fields on a line through the axis, point-sampled, with exact and with Fresnel's phases.
+        The cross term of the two axes is left out: an estimate, not a bound.
+        """
+        with allow("float64"):
+            mask, pitch, path = self.given["float64"]
+            half_sensor = max(self.shape) * pitch / 2
+            half_mask = jnp.max(jnp.stack(mask.extent)) / 2 + jnp.max(jnp.abs(mask.centre))
+            reach = jnp.maximum(half_sensor, half_mask * path.magnification)
+            fields = [
+                np.asarray(fine_fields(mask, path, reach, jnp.asarray(exact), _FINE_SAMPLES))
+                for exact in (True, False)
+            ]
+            zones = require_zone_orders(mask, "separable")
+            lower, upper, weights = (np.asarray(v) for v in pairs(zones))
+        exact, fresnel = (
+            self._line_factors(field, float(reach), float(pitch), lower, upper, weights)
+            for field in fields
+        )
+        size = norm(fresnel)
+        return rounding_distance(exact, fresnel) / size if size else 0.0
+
+    def _line_factors(self, field, reach, pitch, lower, upper, weights) -> Factors:
+        """Pair products of a fine line's fields at the chosen pixels, averaged if pixels are."""
+        count = field.shape[-1]
+        step = 2 * reach / count
+        half = round(pitch / step / 2) if self.pixel_integration else 0
+        inside = np.unique(np.linspace(-half, half, _IN_PIXEL).round()).astype(int)
+        picked = []
+        for indices in (self.lines.rows, self.lines.columns):
+            position = np.round(indices * pitch / step + (count - 1) / 2).astype(int)
+            found = field[:, np.clip(position[:, None] + inside, 0, count - 1)]
+            picked.append(np.mean(found[lower] * found[upper].conj(), axis=-1))
+        lines = self.lines
+        return weighted(
+            weights[:, None] * picked[0], picked[1], lines.row_weights, lines.column_weights
+        )

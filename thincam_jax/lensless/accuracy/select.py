@@ -1,0 +1,249 @@
+"""The cheapest model that meets a tolerance, with its error predicted and the reasons in words."""
+
+import math
+from typing import NamedTuple
+
+import jax
+
+from thincam_jax._core import checks
+from thincam_jax._core.grids import Grid
+from thincam_jax._core.memory import available_bytes
+from thincam_jax._core.precision import (
+    PRECISIONS,
+    RESULT_ROUNDING,
+    Precision,
+    itemsize_of,
+    precision_of,
+)
+from thincam_jax.lensless.accuracy import reasons as words
+from thincam_jax.lensless.accuracy.probe import ZoneProbe
+from thincam_jax.lensless.camera import LenslessCamera
+from thincam_jax.lensless.cost import Cost, psf_cost
+from thincam_jax.lensless.digits import held_in_single
+from thincam_jax.lensless.psf import MODELS, UNBOUNDED, Model, sampling_of
+
+# Predictions are estimates from some rows and columns (or pixels, for the direct sum): what they
+# are multiplied with so that they stay above the true error, found over 500 random cameras.
+_MARGIN = {"angular_spectrum": 1.4, "rayleigh_sommerfeld": 1.8}
+_MARGIN_CLOSED = 1.25
+# Operations that fit into the time of going to another precision and back, some 0.4 ms.
+_CONVERSION = 1e7
+
+
+class Prediction(NamedTuple):
+    """What one way of computing a PSF gives and costs.
+
+    - `model`, `precision`, `oversampling`: as `psf` takes them; oversampling is None for the
+      closed forms.
+    - `predicted_error`: relative L2 over the sensor, at least the true one in 99 % of cameras.
+    - `cost`: operations and peak memory.
+    """
+
+    model: Model
+    precision: Precision
+    oversampling: int | None
+    predicted_error: float
+    cost: Cost
+
+
+class Selection(NamedTuple):
+    """The choice of `select_model`.
+
+    - `model`, `precision`, `oversampling`: arguments for `psf`, `otf` and `capture`.
+    - `predicted_error`: relative L2 error of the PSF on the sensor.
+    - `meets_tolerance`: False if no model does; the choice is then the most accurate.
+    - `cost`: operations and peak memory of the choice.
+    - `paraxial_error`: estimate of how far exact scalar diffraction is from the Fresnel field that
+      errors are counted from.
+    - `reasons`: one sentence for every effect left out, with its size.
+    - `considered`: the predictions that the choice was made from, cheapest first.
+    """
+
+    model: Model
+    precision: Precision
+    oversampling: int | None
+    predicted_error: float
+    meets_tolerance: bool
+    cost: Cost
+    paraxial_error: float
+    reasons: tuple[str, ...]
+    considered: tuple[Prediction, ...]
+
+
+def select_model(
+    camera: LenslessCamera,
+    *,
+    wavelength,
+    object_distance=math.inf,
+    tolerance: float,
+    pixel_integration: bool = False,
+    grid: Grid | None = None,
+) -> Selection:
+    r"""The cheapest model and precision whose PSF is within `tolerance` of the best one.
+
+    The error is relative, ‖h − h₀‖₂/‖h₀‖₂ over the pixels of the sensor, against the best model of
+    the mask: `separable` in double precision, the exact Fresnel field of the aperture. It is
+    predicted from one-dimensional fields: on some hundred rows and columns the factors of every
+    model are compared with those of the reference, and the norm of the whole image follows from
+    their Gram matrices. No image is computed.
+
+    How far Fresnel's approximation itself is from exact scalar diffraction is told apart, in
+    `paraxial_error` and in the reasons: it is common to all the closed forms, is mostly the fringes
+    far from the aperture's edges, and falls by orders of magnitude with `pixel_integration`.
+
+    **Arguments**: `wavelength`, `object_distance`, `pixel_integration` and `grid` as for `psf`;
+    `tolerance` > 0. Numbers must be known: call it outside of jit and grad.
+
+    **Errors**: ValueError for what is out of range; TypeError for a mask without zone orders and
+    for traced numbers.
+    """
+    tolerance = tolerance_of(tolerance)
+    probe = probe_of(camera, wavelength, object_distance, pixel_integration, grid)
+    sampling_grid = grid or camera.sensor.grid
+    considered: list[Prediction] = []
+    for model, precision, oversampling, cost in ways(camera, sampling_grid, pixel_integration):
+        error = predicted_error(probe, camera, sampling_grid, model, precision, oversampling)
+        considered.append(Prediction(model, precision, oversampling, error, cost))
+        if error <= tolerance:
+            break
+    best = min(considered, key=lambda p: p.predicted_error)
+    chosen = considered[-1] if considered[-1].predicted_error <= tolerance else best
+    paraxial_error = probe.paraxial_error()
+    return Selection(
+        model=chosen.model,
+        precision=chosen.precision,
+        oversampling=chosen.oversampling,
+        predicted_error=chosen.predicted_error,
+        meets_tolerance=chosen.predicted_error <= tolerance,
+        cost=chosen.cost,
+        paraxial_error=paraxial_error,
+        reasons=(*_left_out(probe, chosen), words.fresnel(paraxial_error)),
+        considered=tuple(considered),
+    )
+
+
+def predict_error(
+    camera: LenslessCamera,
+    *,
+    wavelength,
+    object_distance=math.inf,
+    model: Model,
+    precision: Precision | None = None,
+    oversampling: int | None = None,
+    pixel_integration: bool = False,
+    grid: Grid | None = None,
+) -> Prediction:
+    """Predicted error and cost of one model; arguments and reference as for `select_model`."""
+    checks.choice("model", model, MODELS)
+    probe = probe_of(camera, wavelength, object_distance, pixel_integration, grid)
+    grid = grid or camera.sensor.grid
+    if precision is None:
+        precision = precision_of(grid.pitch)
+    checks.choice("precision", precision, PRECISIONS)
+    shape, samples = sampling_of(camera, grid, model, pixel_integration, oversampling, None)
+    cost = _cost(camera, grid, model, pixel_integration, shape, samples, precision)
+    closed = shape is None
+    error = predicted_error(probe, camera, grid, model, precision, None if closed else samples)
+    return Prediction(model, precision, None if closed else samples, error, cost)
+
+
+def tolerance_of(tolerance: float) -> float:
+    """A relative error, at most 1."""
+    tolerance = float(checks.positive("tolerance", tolerance, "parts of one"))
+    if tolerance > 1:
+        raise ValueError(f"tolerance = {tolerance:g} is relative: give at most 1 (0.01 is 1 %)")
+    return tolerance
+
+
+def require_camera(camera: LenslessCamera, function: str) -> None:
+    """A camera with a mask of zone orders, whose fields have one-dimensional factors."""
+    if not isinstance(camera, LenslessCamera):
+        raise TypeError(f"camera is a {type(camera).__name__}; give a thincam_jax.LenslessCamera")
+    if not hasattr(camera.mask, "zone_orders"):
+        raise TypeError(
+            f"{function} needs a mask made of zone orders, such as FresnelZoneAperture; for a "
+            f"{type(camera.mask).__name__} choose 'angular_spectrum' or 'rayleigh_sommerfeld' "
+            "and their oversampling yourself"
+        )
+
+
+def probe_of(camera, wavelength, object_distance, pixel_integration, grid) -> ZoneProbe:
+    """The probe of a camera whose numbers are known."""
+    require_camera(camera, "select_model")
+    path = camera.path(wavelength, object_distance)
+    grid = grid or camera.sensor.grid
+    if any(checks.is_traced(leaf) for leaf in jax.tree.leaves((camera, path, grid))):
+        raise TypeError(
+            "the choice of a model needs known numbers: make it outside of jit and grad"
+        )
+    return ZoneProbe(camera.mask, grid, path, pixel_integration=pixel_integration)
+
+
+def ways(camera: LenslessCamera, grid: Grid, pixel_integration: bool):
+    """The (model, precision, oversampling, cost) that fit into memory, cheapest first.
+
+    They end with the reference, than which nothing is closer to itself.
+    """
+    found = []
+    free = available_bytes()
+    own = precision_of(grid.pitch)
+
+    def time(way) -> float:
+        # An operation in double precision takes about two in single.
+        operations = way[3].flops * (2.0 if way[1] == "float64" else 1.0)
+        return operations + (0.0 if way[1] == own else _CONVERSION)
+
+    displayed = getattr(camera.mask, "pixels", None) is not None
+    models = [m for m in MODELS if not displayed or m not in UNBOUNDED]
+    for model in models:
+        shape, samples = sampling_of(camera, grid, model, pixel_integration, None, None)
+        for precision in PRECISIONS:
+            cost = _cost(camera, grid, model, pixel_integration, shape, samples, precision)
+            if free is None or cost.bytes <= free:
+                found.append((model, precision, None if shape is None else samples, cost))
+    found.sort(key=time)
+    names = [way[:2] for way in found]
+    reference = ("separable", "float64")
+    return found[: names.index(reference) + 1] if reference in names else found
+
+
+def predicted_error(
+    probe: ZoneProbe,
+    camera: LenslessCamera,
+    grid: Grid,
+    model: Model,
+    precision: Precision,
+    oversampling: int | None,
+) -> float:
+    """Relative L2 error of one model, with the margin that keeps it above the true one."""
+    if precision == "float32" and not held_in_single(camera.mask, grid, probe.path, model):
+        return math.inf  # `psf` refuses it
+    result = RESULT_ROUNDING[precision_of(grid.pitch)]
+    if oversampling is None:
+        if model == "closed_form" and probe.in_focus():
+            return math.inf  # `psf` refuses it
+        error = probe.model_error(model) + probe.rounding(model, precision)
+        return _MARGIN_CLOSED * error + result
+    shape, _ = sampling_of(camera, grid, model, probe.pixel_integration, oversampling, None)
+    assert shape is not None  # the model samples, and nothing is traced
+    measure = probe.angular_spectrum if model == "angular_spectrum" else probe.rayleigh_sommerfeld
+    return _MARGIN[model] * measure(precision, shape, oversampling)
+
+
+def _cost(camera, grid, model, pixel_integration, mask_shape, oversampling, precision) -> Cost:
+    return psf_cost(
+        camera.mask,
+        grid,
+        model,
+        pixel_integration=pixel_integration,
+        mask_shape=mask_shape,
+        oversampling=oversampling,
+        itemsize=itemsize_of(precision),
+    )
+
+
+def _left_out(probe: ZoneProbe, chosen: Prediction) -> list[str]:
+    if chosen.oversampling is not None:
+        return [words.sampling(chosen.oversampling, chosen.predicted_error)]
+    told = words.optics_left_out(probe, chosen.model)
+    return [*told, words.rounding(probe, chosen.model, chosen.precision)]

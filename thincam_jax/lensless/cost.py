@@ -1,0 +1,114 @@
+r"""What an evaluation costs before it is done: arithmetic and peak memory.
+
+The laws follow the arrays that each model forms; their constants are measured once, from the
+buffers that XLA allocates on a CPU (``compiled.memory_analysis()``) and from timings.
+"""
+
+import math
+from typing import NamedTuple
+
+from thincam_jax._core.grids import Grid, fast_shape
+from thincam_jax.lensless.masks.base import AbstractMask
+from thincam_jax.lensless.masks.sampled import SampledMask
+from thincam_jax.lensless.propagation.angular_spectrum import padded_shape
+from thincam_jax.lensless.propagation.separable import PIXEL_NODES
+
+# Real operations of one chirp integral (two pairs of Fresnel integrals in both their forms, with
+# their phasors), of one phasor, of one sample of a propagated field besides its transforms, and of
+# one summand of the Rayleigh-Sommerfeld integral.
+_CHIRP, _PHASOR, _WAVE, _SUMMAND = 1200, 40, 100, 60
+# What any evaluation holds beside its arrays: its arguments and constants.
+_BASE = 4096
+# Samples of the sensor that the direct sum does at a time.
+_BATCH = 64
+
+
+class Cost(NamedTuple):
+    """The cost of one evaluation.
+
+    - `flops`: real operations, transcendental functions counted as the operations they take.
+    - `bytes`: peak memory, result included.
+    """
+
+    flops: float
+    bytes: int
+
+    def times(self, count: int) -> "Cost":
+        """The same evaluation `count` times, one after another."""
+        return Cost(self.flops * count, self.bytes)
+
+
+def psf_cost(
+    mask: AbstractMask,
+    grid: Grid,
+    model: str,
+    *,
+    pixel_integration: bool = False,
+    mask_shape: tuple[int, int] | None = None,
+    oversampling: int = 1,
+    itemsize: int = 4,
+) -> Cost:
+    """Cost of `psf` on a grid; `itemsize` is 4 in float32 and 8 in float64."""
+    rows, columns = grid.shape
+    if model in ("angular_spectrum", "rayleigh_sommerfeld"):
+        flops, numbers = _sampled(grid.shape, model, mask_shape, oversampling, pixel_integration)
+    else:
+        flops, numbers = _separable_sum(mask, grid.shape, model, pixel_integration, itemsize)
+    return Cost(float(flops), _BASE + itemsize * (int(numbers) + rows * columns))
+
+
+def _sampled(shape, model, mask_shape, oversampling, pixel_integration) -> tuple[float, float]:
+    """Operations and real numbers held by the models that sample the mask."""
+    fine = [n * oversampling for n in shape]
+    plane = [n * oversampling for n in (mask_shape or shape)]
+    if model == "angular_spectrum":
+        window = math.prod(padded_shape((plane[0], plane[1]), (fine[0], fine[1]), 2.0))
+        return window * (_WAVE + 10.0 * math.log2(window)), 5.0 * window
+    points = math.prod(fine if pixel_integration else shape)
+    held = math.prod(plane) * (2.1 * min(_BATCH, points) + 3) * 2
+    return float(_SUMMAND * math.prod(plane) * points), held
+
+
+def _separable_sum(mask, shape, model, pixel_integration, itemsize) -> tuple[float, float]:
+    """The same for the models that are a short sum of products of one-dimensional factors."""
+    orders = getattr(mask, "orders", None)
+    if orders is None:  # the geometric shadow of a mask given by numbers
+        height, width = mask.amplitude.shape if isinstance(mask, SampledMask) else shape
+        rows, columns = shape
+        products = rows * height * width + rows * width * columns
+        held = rows * (height + 2 * width + 2 * columns) + columns * width
+        return 4.0 * products, float(held)
+    double = itemsize == 8
+    length = sum(shape)
+    cells = getattr(mask, "pixels", None) or 1
+    count = len(orders)
+    pairs = count * (count + 1) // 2
+    if model == "separable":
+        nodes = PIXEL_NODES if pixel_integration else 1
+        integrals = length * nodes * (count if cells == 1 else cells)
+        flops = _CHIRP * integrals + 4 * count * cells * length * nodes * (cells > 1)
+        held = max((12.2 if double else 7.4) * integrals, 5.2 * pairs * length)
+        terms = pairs
+    else:
+        terms = pairs - count + 1 if model != "geometric" else _harmonics(orders)
+        work = _CHIRP if pixel_integration else _PHASOR
+        flops = work * terms * length * cells
+        per_factor = (9.2 if double else 4.6) if pixel_integration else 2.1
+        held = per_factor * terms * length + (2.5 * cells * length if cells > 1 else 0)
+    return float(flops + 4 * terms * math.prod(shape)), float(held)
+
+
+def _harmonics(orders: tuple[int, ...]) -> int:
+    """Number of different |k − l| of a mask's orders: the terms of its shadow."""
+    return len({abs(k - m) for k in orders for m in orders})
+
+
+def convolution_cost(
+    sensor_shape: tuple[int, int], field_shape: tuple[int, int], images: int, itemsize: int
+) -> Cost:
+    """Cost of one crop-convolution of `images` fields with a PSF that is given."""
+    kernel = tuple(s + f - 1 for s, f in zip(sensor_shape, field_shape, strict=True))
+    window = math.prod(fast_shape((kernel[0], kernel[1]), real=True))
+    transforms = 2 * images + 1
+    flops = transforms * 2.5 * window * math.log2(window + 1) + 6 * images * window
+    return Cost(flops, int(itemsize * window * (3 * images + 4)))

@@ -1,0 +1,57 @@
+"""Where single precision cannot hold a PSF's phases."""
+
+import math
+
+import jax
+import numpy as np
+
+from thincam_jax._core import checks
+from thincam_jax._core.grids import Grid
+from thincam_jax.lensless.masks.base import AbstractMask
+from thincam_jax.lensless.propagation.path import Path
+
+# Fringes whose phase is known to a twentieth of a radian are wrong by some per cent.
+_LARGEST = 0.05 * 2.0**24
+
+
+def require_digits(mask: AbstractMask, grid: Grid, path: Path, model: str) -> None:
+    r"""Refuse, in float32, zones whose phase on the sensor float32 does not hold.
+
+    The fringes of the order k have the phase :math:`k\beta r^2/(M^2(1+k\epsilon))` at r on the
+    sensor; rounding leaves it 2⁻²⁴ of itself uncertain. Refused is what is beyond 0.05 rad, where
+    single precision is off by several per cent. Numbers that are traced cannot be looked at.
+    """
+    if not held_in_single(mask, grid, path, model):
+        phase = largest_phase(mask, grid, path, model)
+        raise ValueError(
+            f"float32 holds the zones' phase of {phase:.1e} rad on this sensor only to "
+            f"{phase * 2.0**-24:.1g} rad; pass precision='float64'"
+        )
+
+
+def held_in_single(mask: AbstractMask, grid: Grid, path: Path, model: str) -> bool:
+    """Whether float32 holds the zones' phases; where numbers are traced, it is taken to."""
+    numbers = jax.tree.leaves((mask, grid, path))
+    if not hasattr(mask, "orders") or any(checks.is_traced(n) for n in numbers):
+        return True
+    return largest_phase(mask, grid, path, model) <= _LARGEST
+
+
+def largest_phase(mask, grid: Grid, path: Path, model: str) -> float:
+    """Of the orders' fringes where they have their full strength and light falls, rad."""
+    scale = float(path.magnification)
+    beta, half_mask = float(mask.beta), float(mask.extent[0]) / 2
+    ends = [
+        (n - 1) / 2 * float(grid.pitch) / scale + abs(float(c))
+        for n, c in zip(grid.shape, np.asarray(mask.centre), strict=True)
+    ]
+    epsilon = float(path.epsilon(mask.beta)) if model != "geometric" else 0.0
+    found = 0.0
+    for k in mask.orders:
+        gain = abs(1 + k * epsilon)
+        if k == 0 or gain == 0 or gain > 2:  # beyond, the order is spread out and weak
+            continue
+        # A bounded order is seen where its image is: the aperture, shrunk or grown by its focus.
+        reach = math.inf if model in ("paraxial", "closed_form") else gain * half_mask
+        found = max(found, abs(k) * beta / gain * sum(min(end, reach) ** 2 for end in ends))
+    return found

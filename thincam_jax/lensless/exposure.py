@@ -1,0 +1,135 @@
+"""From one plane of a scene to its noise-free image on the sensor."""
+
+import functools
+import math
+import operator
+from collections.abc import Iterable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from thincam_jax._core import checks
+from thincam_jax._core.grids import Grid, same_parity
+from thincam_jax._core.memory import refuse_if_too_large
+from thincam_jax.imaging.operators import CropConvolution, kernel_grid
+from thincam_jax.imaging.scene import ImagePlane, Spectrum
+from thincam_jax.lensless.camera import LenslessCamera
+from thincam_jax.lensless.cost import convolution_cost
+from thincam_jax.lensless.psf import Model, psf
+
+
+def expose(
+    camera: LenslessCamera,
+    plane: ImagePlane,
+    spectrum: Spectrum,
+    *,
+    model: Model = "separable",
+    pixel_integration: bool = True,
+) -> Float[Array, "*batch y x"]:
+    """Noise-free capture of one plane: its projection convolved with the PSF of its light."""
+    shape = projected_shape(camera, plane)
+    check_memory(camera.sensor, shape, plane.image.shape[:-2])
+    convolution = imaging_operator(
+        camera,
+        spectrum,
+        plane.distance,
+        field_shape=shape,
+        model=model,
+        pixel_integration=pixel_integration,
+    )
+    return convolution(project(camera, plane, shape))
+
+
+def imaging_operator(
+    camera: LenslessCamera,
+    light,
+    object_distance,
+    *,
+    field_shape: tuple[int, int],
+    model: Model = "separable",
+    pixel_integration: bool = True,
+    grid: Grid | None = None,
+) -> CropConvolution:
+    """The operator from a plane's projection on the sensor's pitch to the noise-free capture.
+
+    `light` is a `Spectrum` or one wavelength in mm; the PSF is the weighted sum over it. The other
+    arguments are those of `psf`.
+    """
+    grid = grid or camera.sensor.grid
+    spectrum = light if isinstance(light, Spectrum) else Spectrum(light)
+    kernel = spectral_psf(
+        camera,
+        zip(spectrum.wavelengths, spectrum.weights, strict=True),
+        object_distance,
+        model=model,
+        pixel_integration=pixel_integration,
+        grid=kernel_grid(grid, field_shape),
+    )
+    return CropConvolution(kernel, grid.pitch, grid.shape, field_shape)
+
+
+def spectral_psf(
+    camera: LenslessCamera,
+    light: Iterable[tuple],
+    object_distance,
+    *,
+    model: Model,
+    pixel_integration: bool,
+    grid: Grid,
+) -> Float[Array, "y x"]:
+    """Sum of the PSFs of (wavelength, weight) pairs."""
+    parts = (
+        weight
+        * psf(
+            camera,
+            wavelength=wavelength,
+            object_distance=object_distance,
+            model=model,
+            pixel_integration=pixel_integration,
+            grid=grid,
+        )
+        for wavelength, weight in light
+    )
+    return functools.reduce(operator.add, parts)
+
+
+def projected_shape(camera: LenslessCamera, plane: ImagePlane) -> tuple[int, int]:
+    """Pixels that the plane's image covers on the sensor's pitch; needs untraced numbers."""
+    numbers = (camera.distance, plane.distance, camera.sensor.pitch, plane.width)
+    if any(checks.is_traced(n) for n in numbers):
+        raise TypeError(
+            "capture needs the plane's width and distance and the camera's distance and pitch as "
+            "known numbers, because they set array sizes; build them outside of jit and grad, or "
+            "use imaging_operator"
+        )
+    # In NumPy: inside jit, JAX would trace the product of known numbers too.
+    distance, object_distance, pitch, width = (np.asarray(n) for n in numbers)
+    aspect = plane.image.shape[-2] / plane.image.shape[-1]
+    size = distance / object_distance / pitch * width * np.array([aspect, 1.0])
+    rows, columns = (max(1, math.ceil(n - 1e-3)) for n in size)
+    return same_parity((rows, columns), camera.sensor.shape)
+
+
+@functools.partial(jax.jit, static_argnames="shape")
+def project(
+    camera: LenslessCamera, plane: ImagePlane, shape: tuple[int, int]
+) -> Float[Array, "*batch m n"]:
+    """The plane's image as a pinhole would cast it on `shape` samples of the sensor's pitch."""
+    grid = Grid(shape, camera.sensor.pitch)
+    return plane.sample(grid, magnification=-camera.distance / plane.distance)
+
+
+def check_memory(sensor, field_shape: tuple[int, int], batch: tuple[int, ...]) -> None:
+    """Refuse a capture whose padded images do not fit."""
+    rows, columns = sensor.shape
+    cost = convolution_cost(
+        sensor.shape, field_shape, math.prod(batch), jnp.dtype(sensor.pitch.dtype).itemsize
+    )
+    refuse_if_too_large(
+        f"a capture of {rows}×{columns} pixels of an image projected on "
+        f"{field_shape[0]}×{field_shape[1]}",
+        cost.bytes,
+        "use a smaller sensor, a smaller scene, or fewer images at a time",
+    )

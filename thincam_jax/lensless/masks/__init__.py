@@ -1,0 +1,6 @@
+"""Coded masks: what the light passes on its way to the sensor."""
+
+from thincam_jax.lensless.masks.base import AbstractMask as AbstractMask
+from thincam_jax.lensless.masks.base import ZoneOrders as ZoneOrders
+from thincam_jax.lensless.masks.fza import FresnelZoneAperture as FresnelZoneAperture
+from thincam_jax.lensless.masks.sampled import SampledMask as SampledMask

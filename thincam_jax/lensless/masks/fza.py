@@ -1,0 +1,138 @@
+r"""The Fresnel zone aperture (FZA), thesis Eq 3.1."""
+
+from typing import Any, Literal
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Complex, Float
+
+from thincam_jax._core import checks
+from thincam_jax._core.grids import Grid, cell_overlap, centred_indices
+from thincam_jax._core.precision import as_complex, phasor, product
+from thincam_jax.lensless.masks.base import AbstractMask, ZoneOrders
+
+_HIGHEST_HARMONIC = 99
+
+
+class FresnelZoneAperture(AbstractMask):
+    r"""A square Fresnel zone aperture.
+
+    Amplitude transmittance of the cosine profile, :math:`r` from the mask's centre (thesis Eq 3.1,
+    which Eq 3.18 propagates as a field):
+
+    .. math:: t(r) = \tfrac12 [1 + \cos(\beta r^2 + \varphi)]
+
+    The binary profile opens where that cosine is positive. It is represented by its Fourier series
+    in the phase, :math:`\tfrac12 + \sum_{k\ odd} \sin(k\pi/2)/(k\pi)\, e^{jk(\beta r^2+\varphi)}`,
+    up to ``harmonics``: the best approximation with that many orders, with the overshoot of a
+    truncated series at the zone edges. Every harmonic k acts like a cosine mask of :math:`k\beta`.
+
+    **Arguments**
+
+    - `beta`: β, rad/mm², > 0. The zones at the edge have the local frequency β·width/(2π).
+    - `phase`: initial phase φ, rad.
+    - `width`: side of the square aperture, mm.
+    - `profile`: "cosine" or "binary".
+    - `centre`: (y, x) of the mask's centre, mm.
+    - `pixel_pitch`: pitch in mm of the display that shows the mask (a spatial light modulator);
+      None for a printed mask. Each pixel shows the pattern's value at its centre; `width` must be
+      a whole number of pixels.
+    - `fill_factor`: open fraction of a display pixel's area, 0 < fill_factor ≤ 1.
+    - `harmonics`: highest harmonic of the binary profile, odd.
+
+    **Errors**: ValueError or TypeError, one line, for what is out of range.
+    """
+
+    beta: Float[Array, ""]
+    phase: Float[Array, ""]
+    width: Float[Array, ""]
+    centre: Float[Array, "2"]
+    fill_factor: Float[Array, ""]
+    profile: Literal["cosine", "binary"] = eqx.field(static=True)
+    pixels: int | None = eqx.field(static=True)
+    harmonics: int = eqx.field(static=True)
+
+    def __init__(
+        self,
+        beta,
+        phase: Any = 0.0,
+        *,
+        width,
+        profile: Literal["cosine", "binary"] = "cosine",
+        centre=(0.0, 0.0),
+        pixel_pitch=None,
+        fill_factor=1.0,
+        harmonics: int = 9,
+    ):
+        self.beta = checks.positive("beta", beta, "rad/mm^2")
+        self.phase = checks.finite("phase", phase, "rad")
+        self.width = checks.positive("width", width, "mm")
+        self.centre = checks.finite("centre", centre, "mm", shape=(2,))
+        self.profile = checks.choice("profile", profile, ("cosine", "binary"))  # pyright: ignore
+        self.fill_factor = checks.fraction("fill_factor", fill_factor)
+        if harmonics % 2 == 0 or not 1 <= harmonics <= _HIGHEST_HARMONIC:
+            raise ValueError(
+                f"harmonics = {harmonics}: give an odd number from 1 to {_HIGHEST_HARMONIC}"
+            )
+        self.harmonics = harmonics
+        self.pixels = None if pixel_pitch is None else _whole_pixels(width, pixel_pitch)
+
+    @property
+    def extent(self) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        return self.width, self.width
+
+    @property
+    def orders(self) -> tuple[int, ...]:
+        """The diffraction orders k of the profile, without their weights."""
+        return _series(self.profile, self.harmonics)[0]
+
+    def zone_orders(self) -> ZoneOrders:
+        """The mask as separable chirps: what the closed-form models work with."""
+        orders, weights = _series(self.profile, self.harmonics)
+        k = jnp.asarray(orders, dtype=self.beta.dtype)
+        weights = jnp.asarray(weights, dtype=self.beta.dtype)
+        coefficients = as_complex(weights) * phasor(k * self.phase)
+        if self.pixels is None:
+            sites, half = None, self.width[None] / 2
+            return ZoneOrders(orders, coefficients, self.beta, -half, half, sites)
+        pitch = self.width / self.pixels
+        sites = centred_indices(self.pixels, self.beta.dtype) * pitch
+        half = pitch * jnp.sqrt(self.fill_factor) / 2
+        return ZoneOrders(orders, coefficients, self.beta, sites - half, sites + half, sites)
+
+    def sample(self, grid: Grid) -> Float[Array, "y x"]:
+        zones = self.zone_orders()
+        rows = axis_samples(zones, grid.y - self.centre[0], grid.pitch)
+        columns = axis_samples(zones, grid.x - self.centre[1], grid.pitch)
+        return jnp.real(product((zones.coefficients[:, None] * rows).T, columns))
+
+
+def _series(profile: str, harmonics: int) -> tuple[tuple[int, ...], tuple[float, ...]]:
+    """Orders k and weights of the profile's Fourier series in the phase βr² + φ."""
+    if profile == "cosine":
+        return (0, 1, -1), (0.5, 0.25, 0.25)
+    odd = [k for n in range(1, harmonics + 1, 2) for k in (n, -n)]
+    return (0, *odd), (0.5, *(float(np.sin(k * np.pi / 2) / (k * np.pi)) for k in odd))
+
+
+def axis_samples(zones: ZoneOrders, x: Float[Array, " n"], pitch) -> Complex[Array, "order n"]:
+    """Each order's one-dimensional factor, weighted by the open part of every sample's cell."""
+    k = jnp.asarray(zones.orders, dtype=x.dtype)[:, None]
+    open_part = cell_overlap(x, pitch, zones.lower, zones.upper) / pitch
+    if zones.sites is None:
+        return phasor(k * zones.beta * x**2) * as_complex(open_part[:, 0])
+    return product(phasor(k * zones.beta * zones.sites**2), as_complex(open_part.T))
+
+
+def _whole_pixels(width, pixel_pitch) -> int:
+    pitch = float(checks.positive("pixel_pitch", pixel_pitch, "mm"))
+    width = float(width)
+    pixels = round(width / pitch)
+    if pixels < 1 or abs(pixels * pitch - width) > 1e-4 * pitch:
+        low, high = max(1, int(width / pitch)) * pitch, (int(width / pitch) + 1) * pitch
+        raise ValueError(
+            f"width = {width:g} mm is not a whole number of display pixels of {pitch:g} mm; "
+            f"give width = {low:g} or {high:g} mm"
+        )
+    return pixels

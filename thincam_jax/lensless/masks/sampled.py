@@ -1,0 +1,53 @@
+"""A mask given by numbers: any pattern, measured or designed."""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Complex, Float
+
+from thincam_jax._core import checks
+from thincam_jax._core.grids import Grid, cell_overlap, centred_indices
+from thincam_jax._core.precision import product
+from thincam_jax.lensless.masks.base import AbstractMask
+
+
+class SampledMask(AbstractMask):
+    """A mask of square cells, each with one complex amplitude transmittance.
+
+    **Arguments**
+
+    - `amplitude`: amplitude transmittance of each cell, (y, x); at most 1 for a passive mask.
+    - `pitch`: side of a cell, mm.
+    - `centre`: (y, x) of the mask's centre, mm.
+    """
+
+    amplitude: Complex[Array, "y x"] | Float[Array, "y x"]
+    pitch: Float[Array, ""]
+    centre: Float[Array, "2"]
+
+    def __init__(self, amplitude, pitch, *, centre=(0.0, 0.0)):
+        self.amplitude = jnp.asarray(amplitude)
+        if self.amplitude.ndim != 2 or 0 in self.amplitude.shape:
+            raise ValueError(
+                f"amplitude has shape {self.amplitude.shape}; give a non-empty array (y, x)"
+            )
+        if not jnp.issubdtype(self.amplitude.dtype, jnp.inexact):
+            self.amplitude = self.amplitude.astype(float)
+        self.pitch = checks.positive("pitch", pitch, "mm")
+        self.centre = checks.finite("centre", centre, "mm", shape=(2,))
+
+    @property
+    def extent(self) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        rows, columns = self.amplitude.shape
+        return rows * self.pitch, columns * self.pitch
+
+    def sample(self, grid: Grid) -> Complex[Array, "y x"] | Float[Array, "y x"]:
+        rows, columns = self.amplitude.shape
+        dtype = self.amplitude.dtype
+        down = _coverage(grid.y - self.centre[0], grid.pitch, rows, self.pitch).astype(dtype)
+        across = _coverage(grid.x - self.centre[1], grid.pitch, columns, self.pitch).astype(dtype)
+        return product(product(down, self.amplitude), across.T)
+
+
+def _coverage(x, pitch, cells: int, cell_pitch) -> Float[Array, "n cell"]:
+    """Part of each sample's cell that each mask cell covers."""
+    centres = centred_indices(cells, x.dtype) * cell_pitch
+    return cell_overlap(x, pitch, centres - cell_pitch / 2, centres + cell_pitch / 2) / pitch

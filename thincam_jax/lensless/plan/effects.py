@@ -1,0 +1,58 @@
+"""What a capture holds beside its model's optics, with sizes."""
+
+import math
+
+import numpy as np
+
+from thincam_jax.imaging.scene import Scene
+from thincam_jax.lensless.accuracy.select import probe_of
+from thincam_jax.lensless.camera import LenslessCamera
+from thincam_jax.lensless.plan.records import Effect
+
+
+def effects_of(camera: LenslessCamera, scene: Scene, tolerance: float) -> tuple[Effect, ...]:
+    """Shift-variance, shot noise and Fresnel's approximation."""
+    return (
+        _obliquity(scene, tolerance),
+        _shot_noise(camera, tolerance),
+        _fresnel(camera, scene, tolerance),
+    )
+
+
+def _obliquity(scene: Scene, tolerance: float) -> Effect:
+    """Fall of light towards the edge of the field, cos⁴θ, averaged over the planes."""
+    falls = []
+    for plane in scene.planes:
+        y, x = (np.linspace(-0.5, 0.5, 33) * float(n) for n in (plane.height, plane.width))
+        squared = (y[:, None] ** 2 + x**2) / float(plane.distance) ** 2
+        falls.append(np.mean((1 - (1 + squared) ** -2) ** 2))
+    size = math.sqrt(float(np.mean(falls)))
+    return Effect("shift-variance", False, size, _left_out(size, tolerance, "obliquity, cos⁴θ"))
+
+
+def _left_out(size: float, tolerance: float, what: str) -> str:
+    verdict = "matters, and is not modelled" if size > tolerance else "does not matter"
+    return f"{what}: about {size:.1e}, {verdict}"
+
+
+def _shot_noise(camera: LenslessCamera, tolerance: float) -> Effect:
+    """Of the brightest pixel, 1/√N of its N electrons."""
+    sensor = camera.sensor
+    if sensor.electrons is not None:
+        note = "size not known: the brightest pixel depends on the scene's light"
+        return Effect("shot noise", False, None, note)
+    if sensor.exposure is None:
+        note = "size not known: give the Sensor an exposure, such as 0.9"
+        return Effect("shot noise", False, None, note)
+    size = 1 / math.sqrt(float(sensor.exposure * sensor.full_well))
+    what = "matters: pass noise=PoissonGaussianNoise()" if size > tolerance else "does not matter"
+    return Effect("shot noise", False, size, f"about {size:.1e} a pixel, {what}")
+
+
+def _fresnel(camera, scene: Scene, tolerance: float) -> Effect:
+    """Exact scalar diffraction against Fresnel's, for the nearest plane."""
+    distance = min(float(plane.distance) for plane in scene.planes)
+    wavelength = max(float(w) for w in scene.spectrum.wavelengths)
+    size = probe_of(camera, wavelength, distance, True, None).paraxial_error()
+    note = _left_out(size, tolerance, "Fresnel's approximation of the PSF")
+    return Effect("exact phases", False, size, note)

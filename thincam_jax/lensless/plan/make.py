@@ -1,0 +1,76 @@
+"""Making a plan: the cheapest computation of a scene's capture within a tolerance."""
+
+import jax
+
+from thincam_jax._core import checks
+from thincam_jax._core.grids import fast_shape
+from thincam_jax._core.precision import RESULT_ROUNDING, precision_of
+from thincam_jax.imaging.operators import kernel_shape
+from thincam_jax.imaging.scene import Scene
+from thincam_jax.lensless.accuracy.select import require_camera, tolerance_of
+from thincam_jax.lensless.camera import LenslessCamera
+from thincam_jax.lensless.plan.choose import choose_planes, choose_wavelengths, choose_way
+from thincam_jax.lensless.plan.effects import effects_of
+from thincam_jax.lensless.plan.records import Plan
+from thincam_jax.lensless.plan.view import FULL, View
+
+# Parts of the tolerance that the decisions may use, in the order in which they are taken. What one
+# leaves over is the next one's.
+_MODEL_SHARE, _WAVELENGTH_SHARE = 0.35, 0.6
+
+
+def plan(camera: LenslessCamera, scene: Scene, *, tolerance: float) -> Plan:
+    r"""How to compute the capture of a scene to a relative error, at the least cost.
+
+    The error is ‖g − g₀‖₂/‖g₀‖₂ of the noise-free capture, against every plane and wavelength
+    computed by `separable` in double precision, averaged over the pixels. What is decided, from the
+    PSFs' transfer functions at a few hundred frequencies, weighted with the scene's own spectrum:
+
+    - the model, the precision and whether pixels must be averaged;
+    - how many wavelengths: some of the spectrum's, with weights that reproduce its sum;
+    - how many PSFs for the planes: each plane's PSF is a weighted sum of a few planes'
+      (interpolative decomposition), and planes are added up with these weights *before* they are
+      convolved. Planes with nearly equal PSFs merge into one.
+
+    Obliquity, shot noise and what Fresnel's approximation leaves out are told with their sizes in
+    `Plan.effects`.
+
+    **Errors**: ValueError for a tolerance that is not positive; TypeError for a mask without zone
+    orders, and for traced numbers.
+    """
+    tolerance = tolerance_of(tolerance)
+    require_camera(camera, "plan")
+    if not isinstance(scene, Scene):
+        raise TypeError(f"scene is a {type(scene).__name__}; give a thincam_jax.Scene")
+    if any(checks.is_traced(leaf) for leaf in jax.tree.leaves((camera, scene))):
+        raise TypeError("plan needs known numbers: call it outside of jit and grad")
+    view = View(camera, scene, tolerance)
+    way, model_error = choose_way(view, tolerance * _MODEL_SHARE)
+    model_error += RESULT_ROUNDING[precision_of(camera.sensor.pitch)]
+    left = max(tolerance - model_error, 0.0)
+    colours, weights, colour_error = choose_wavelengths(view, way, left * _WAVELENGTH_SHARE)
+    left = max(tolerance - model_error - colour_error, 0.0)
+    planes, mixing, plane_error = choose_planes(view, way, colours, weights, left)
+    shares = {"model": model_error, "wavelengths": colour_error, "planes": plane_error}
+    window = fast_shape(kernel_shape(camera.sensor.shape, view.field_shape), real=True)
+    return Plan(
+        camera=camera,
+        tolerance=tolerance,
+        predicted_error=sum(shares.values()),
+        model=way.model,
+        precision=way.precision,
+        pixel_integration=way.pixel_integration,
+        distances=tuple(view.distances[p] for p in planes),
+        mixing=mixing,
+        wavelengths=tuple(view.wavelengths[c] for c in colours),
+        weights=tuple(float(w) for w in weights),
+        scene_distances=view.distances,
+        scene_wavelengths=view.wavelengths,
+        scene_weights=tuple(float(w) for w in view.weights),
+        field_shape=view.field_shape,
+        padded_shape=window,
+        cost=view.cost(way, len(planes), len(colours)),
+        full_cost=view.cost(FULL, len(view.distances), len(view.wavelengths)),
+        shares=shares,
+        effects=effects_of(camera, scene, tolerance),
+    )

@@ -1,0 +1,54 @@
+"""The way of the light: point source, mask, sensor."""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from thincam_jax._core import checks
+
+# No optics beyond: a wavelength above 0.1 mm was meant in nanometres or micrometres.
+_LONGEST = 0.1
+
+
+class Path(eqx.Module):
+    """A point source on the axis at distance t before the mask, a sensor at d behind it.
+
+    In the Fresnel approximation a spherical wave from t over d acts like a plane wave over d/M,
+    magnified by M = (t+d)/t (thesis Eq 3.2): PSF(x; t, d) = PSF(x/M; ∞, d/M).
+
+    - `wavelength`: λ, mm.
+    - `distance`: d, mm, > 0.
+    - `object_distance`: t, mm, > 0; infinity is a plane wave.
+    """
+
+    wavelength: Float[Array, ""]
+    distance: Float[Array, ""]
+    object_distance: Float[Array, ""]
+
+    def __init__(self, wavelength, distance, object_distance: Any = jnp.inf):
+        self.wavelength = checks.positive("wavelength", wavelength, "mm")
+        if not checks.is_traced(self.wavelength) and float(self.wavelength) > _LONGEST:
+            raise ValueError(
+                f"wavelength = {float(self.wavelength):g} mm is no light: give it in mm, "
+                "such as 500 * nm"
+            )
+        self.distance = checks.positive("distance", distance, "mm")
+        self.object_distance = checks.positive(
+            "object_distance", object_distance, "mm", allow_infinity=True
+        )
+
+    @property
+    def magnification(self) -> Float[Array, ""]:
+        """M = 1 + d/t: the shadow's size over the mask's."""
+        return 1 + self.distance / self.object_distance
+
+    @property
+    def fresnel_curvature(self) -> Float[Array, ""]:
+        """b = πM/(λd), rad/mm²: of the plane wave over d/M that acts like the spherical one."""
+        return jnp.pi * self.magnification / self.wavelength / self.distance
+
+    def epsilon(self, beta: Float[Array, ""]) -> Float[Array, ""]:
+        """ε = βλd/(πM), the strength of diffraction; at ε = 1 order −1 focuses on the sensor."""
+        return beta * self.wavelength * self.distance / (jnp.pi * self.magnification)

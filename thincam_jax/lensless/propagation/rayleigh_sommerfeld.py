@@ -1,0 +1,68 @@
+r"""`rayleigh_sommerfeld`: the direct sum, slow and without approximation but its samples."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Complex, Float
+
+from thincam_jax._core.grids import Grid
+from thincam_jax._core.precision import turn_phasor
+from thincam_jax.lensless.masks.base import AbstractMask
+from thincam_jax.lensless.propagation.angular_spectrum import planes, within
+from thincam_jax.lensless.propagation.path import Path
+from thincam_jax.lensless.propagation.plane import block_average, lit_mask
+
+# Sensor samples done together: bounds the memory to this many copies of the mask plane.
+_BATCH = 64
+
+
+def rayleigh_sommerfeld_field(
+    field: Complex[Array, "v u"], plane: Grid, sensor: Grid, path: Path
+) -> Complex[Array, "y x"]:
+    r"""First Rayleigh-Sommerfeld integral as a midpoint sum over the samples of the mask plane.
+
+    .. math::
+        U(\mathbf r) = \frac{1}{2\pi}\sum U_0(\boldsymbol\xi)\,\frac dR
+            \Big(\frac1R - jk\Big)\frac{e^{jk(R-d)}}{R}\,\Delta^2,\qquad
+        R = \sqrt{d^2 + |\mathbf r-\boldsymbol\xi|^2}
+
+    with the piston e^{jkd} dropped and R − d formed as ρ²/(R+d). Right while neighbouring samples
+    of the summand differ by less than half a turn: Δ·(ν + ρ/(λR)) < ½ for a field of local
+    frequency ν. Work and time grow with the product of both planes' samples.
+    """
+    d, wavelength = path.distance, path.wavelength
+    wavenumber = 2 * jnp.pi / wavelength
+
+    def at(point):
+        rho2 = (point[0] - plane.y[:, None]) ** 2 + (point[1] - plane.x) ** 2
+        distance = jnp.sqrt(d**2 + rho2)
+        turns = rho2 / (distance + d) / wavelength
+        scale = d / distance**2 * plane.pitch**2 / (2 * jnp.pi)
+        kernel = jax.lax.complex(scale / distance, -wavenumber * scale)
+        return jnp.sum(field * kernel * turn_phasor(turns))
+
+    y, x = jnp.meshgrid(sensor.y, sensor.x, indexing="ij")
+    points = jnp.stack([y.ravel(), x.ravel()], axis=-1)
+    return jax.lax.map(at, points, batch_size=_BATCH).reshape(sensor.shape)
+
+
+def rayleigh_sommerfeld(
+    mask: AbstractMask,
+    grid: Grid,
+    path: Path,
+    *,
+    mask_shape: tuple[int, int] | None = None,
+    oversampling: int = 1,
+    pixel_integration: bool = False,
+) -> Float[Array, "y x"]:
+    """PSF of any mask by direct summation: the reference for tests and small grids.
+
+    Arguments as for `angular_spectrum`; only the mask plane is oversampled for the point-sampled
+    PSF, both planes are for pixel averages.
+    """
+    plane, fine = planes(grid, mask_shape, oversampling)
+    sensor = fine if pixel_integration else grid
+    field = rayleigh_sommerfeld_field(
+        lit_mask(within(mask, plane), plane, path), plane, sensor, path
+    )
+    irradiance = (field.real**2 + field.imag**2) * path.magnification**2
+    return block_average(irradiance, oversampling) if pixel_integration else irradiance

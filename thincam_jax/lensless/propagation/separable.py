@@ -1,0 +1,92 @@
+r"""`separable`: the exact Fresnel field of a square aperture, in closed form."""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Complex, Float
+from numpy.polynomial.legendre import leggauss
+
+from thincam_jax._core.grids import Grid
+from thincam_jax._core.precision import as_complex, phasor, product
+from thincam_jax.lensless.masks.base import AbstractMask, ZoneOrders
+from thincam_jax.lensless.propagation.chirp import chirp_integral
+from thincam_jax.lensless.propagation.orders import pairs, require_zone_orders
+from thincam_jax.lensless.propagation.path import Path
+from thincam_jax.lensless.propagation.separable_sum import SeparableSum
+
+# Gauss-Legendre nodes a pixel for the pixel average. The fringes of the far edge turn by up to 10
+# cycles over a 5.5 µm pixel at d = 6.5 mm, at a few parts in 1000 of the amplitude: 8 nodes are
+# 2e-3 off there, 16 8e-5, 24 1e-10.
+PIXEL_NODES = 24
+
+
+def axis_fields(zones: ZoneOrders, path: Path, x: Float[Array, " n"]) -> Complex[Array, "order n"]:
+    r"""One-dimensional factor of every order's field, relative to the open aperture.
+
+    .. math::
+        A_k(x) = \sqrt{\frac{M}{j\lambda d}} \int e^{jk\beta\xi^2 + jb(x/M-\xi)^2}\,d\xi,
+        \qquad b = \frac{\pi M}{\lambda d}
+
+    over the open part of the aperture: Fresnel integrals (`chirp_integral`). The order with
+    kβ + b = 0 focuses on the sensor and is a sinc. `x` is given on the mask's scale, x/M. Written
+    with the spherical wave's curvature, :math:`\pi\xi^2/(\lambda t) + \pi(x-\xi)^2/(\lambda d)`,
+    every order would carry the phase πx²/(λ(t+d)) that all share: large where t is short.
+    """
+    k = jnp.asarray(zones.orders, dtype=x.dtype)[:, None, None]
+    b = path.fresnel_curvature
+    x = x[None, :, None]
+    if zones.sites is None:
+        field = chirp_integral(k * zones.beta, b, x, zones.lower, zones.upper)
+        field = field.sum(axis=-1)
+    else:
+        # A display pixel has one phase for each order and is a plain slit for the light.
+        cells = chirp_integral(jnp.zeros_like(b), b, x, zones.lower, zones.upper)[0]
+        values = phasor(k[:, 0] * zones.beta * zones.sites**2)
+        field = product(values, cells.T)
+    return field * as_complex(jnp.sqrt(path.magnification / (path.wavelength * path.distance)))
+
+
+def separable(
+    mask: AbstractMask,
+    grid: Grid,
+    path: Path,
+    *,
+    pixel_integration: bool = False,
+    nodes: int = PIXEL_NODES,
+) -> SeparableSum:
+    r"""PSF of a mask with separable zone orders behind its square aperture.
+
+    .. math::
+        h = \Big|\sum_k c_k A_k(x) A_k(y)\Big|^2
+          = \sum_k |c_k|^2 |A_k|^2|A_k|^2
+          + 2\,\mathrm{Re} \sum_{k<l} c_k c_l^* (A_k A_l^*)(x)\,(A_k A_l^*)(y)
+
+    exact within the Fresnel approximation: no sampling condition, any grid, any distance. The
+    paraxial phase that is left out is about πλ³dν⁴/4 at the spatial frequency ν of the field.
+    Nine real separable terms for the cosine profile, (harmonics + 2)² for the binary one.
+
+    `pixel_integration` averages each axis over the pixel by Gauss-Legendre quadrature with `nodes`
+    nodes: the average of a separable term is separable.
+    """
+    zones = require_zone_orders(mask, "separable")
+    scale = path.magnification
+    lower, upper, weights = pairs(zones)
+
+    def products(x):
+        if not pixel_integration:
+            fields = axis_fields(zones, path, x)
+            return fields[lower, :] * jnp.conj(fields[upper, :])
+        places, node_weights = leggauss(nodes)
+        offsets = jnp.asarray(places, dtype=x.dtype)[:, None] * (grid.pitch / scale) / 2
+        fields = axis_fields(zones, path, (x + offsets).ravel())
+        fields = fields.reshape(len(zones.orders), nodes, -1)
+        average = jnp.asarray(node_weights / 2, dtype=x.dtype)[:, None]
+        return jnp.sum(fields[lower, :] * jnp.conj(fields[upper, :]) * as_complex(average), axis=1)
+
+    y, x = grid.y / scale - mask.centre[0], grid.x / scale - mask.centre[1]
+    if pixel_integration:
+        # Both axes at once: half as much to compile, and as fast.
+        both = products(jnp.concatenate([y, x]))
+        rows, columns = jnp.split(both, [grid.shape[0]], axis=-1)
+    else:
+        # One axis a core: a quarter faster.
+        rows, columns = products(y), products(x)
+    return SeparableSum(weights[:, None] * rows, columns, grid)

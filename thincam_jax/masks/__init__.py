@@ -1,6 +1,0 @@
-"""Coded masks: what the light passes on its way to the sensor."""
-
-from thincam_jax.masks.base import AbstractMask as AbstractMask
-from thincam_jax.masks.base import ZoneOrders as ZoneOrders
-from thincam_jax.masks.fza import FresnelZoneAperture as FresnelZoneAperture
-from thincam_jax.masks.sampled import SampledMask as SampledMask

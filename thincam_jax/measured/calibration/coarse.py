@@ -1,0 +1,263 @@
+r"""The way down to a sharp minimum: coarse pixels, and slopes over wide steps, first.
+
+The waves from the rims of the aperture turn fast with d. They hold little of the light, so that the
+sum of squares is a smooth bowl in d with a narrow dip, but most of its derivative: least squares
+with the derivative creep, or stop in a ripple of the bowl. Differences over a step so wide that
+these waves average out follow the bowl instead. The step is narrowed as far as the data allow: as
+long as it is wide against the standard error that it gives.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from scipy import optimize
+
+from thincam_jax._core.grids import Grid
+from thincam_jax.measured.calibration.covariance import Covariance, covariance, of_values
+from thincam_jax.measured.calibration.problem import (
+    SEEN,
+    WHERE,
+    Setting,
+    model,
+    seen_by_steps,
+    unknown_names,
+    with_fringes_held,
+)
+
+_BLOCK = 0.35  # of √(λd): the side of a coarse pixel
+_FEWEST = 48  # coarse pixels along a side
+_TRIALS = 5  # on either side of the best so far
+_ROUNDS = 2  # each with a fifth of the steps of the one before
+_EVALUATIONS = 8  # of least squares at each width of the differences
+_WIDE, _NARROWER, _NARROWEST = 0.02, 0.25, 1e-6  # widths, in parts of one
+_NARROW_ENOUGH = 2e-4  # for a start
+# Only widths above this many standard errors are narrowed: the next, a quarter as wide, is then
+# still three of them, so that the bottom of the bowl lies within it.
+_AGAINST_ERROR = 12.0
+_FRINGE = 0.02  # rad, at the rim: differences of what moves the fringes
+# What the waves of the rims depend on, and so is differenced widely.
+_RIMS = ("width", "wavelength")
+
+
+class View(NamedTuple):
+    """An image and its grid, whose middle is `offset` (y, x, mm) off the axis."""
+
+    image: np.ndarray
+    grid: Grid
+    offset: Float[Array, "2"]
+    pixel_integration: bool
+
+    def model(self, start: Setting, names, steps) -> np.ndarray:
+        steps = jnp.asarray(steps, jnp.float64)
+        where = (self.pixel_integration, self.grid, self.offset)
+        return np.asarray(model(steps, start, names, *where)).ravel()
+
+
+def descend(
+    image: np.ndarray,
+    guess: Setting,
+    start: Setting,
+    parameters: Sequence[str],
+    search: float,
+    pixel_integration: bool,
+) -> Setting:
+    """The setting that fits the image best on coarse pixels, from one whose fringes are right.
+
+    `guess` is what was given, `start` what the fringes say. Only `parameters` change.
+    """
+    view = coarse_view(image, guess, pixel_integration)
+    best = _best_by_trial(view, guess, start, parameters, search)
+    best = _with_linear(view, best, parameters)
+    names = unknown_names(tuple(parameters))
+    width = _WIDE
+    while True:
+        widths = difference_widths(best, width)
+        step = optimize.least_squares(
+            _residual,
+            np.zeros(len(names)),
+            jac=_slopes,  # pyright: ignore[reportArgumentType]
+            x_scale="jac",
+            max_nfev=_EVALUATIONS,
+            args=(view, best, names, widths),
+        )
+        known = _errors(step.jac, 2 * step.cost)
+        turned = np.asarray(seen_by_steps(best, names, step.x))
+        best = best.moved(names, jnp.asarray(step.x))
+        if width < _NARROW_ENOUGH or _too_narrow(known, turned, widths):
+            return best
+        width = width * _NARROWER
+
+
+def honest_covariance(view: View, found: Setting, names) -> Covariance:
+    """Standard errors and correlations of the steps from `found`.
+
+    By differences over steps that are wide against the errors which they give, narrowed as long as
+    they are: derivatives would count on waves of the rims that the noise may well hide.
+    """
+    none = np.zeros(len(names))
+    residual = _residual(none, view, found, names, None)
+    squares, width, seen = float(residual @ residual), _WIDE, None
+    turned = np.asarray(seen_by_steps(found, names, none))
+    while True:
+        widths = difference_widths(found, width)
+        seen = _seen_slopes(view, found, turned, widths, seen)
+        known = _errors(seen @ turned, squares)
+        if width < _NARROWEST or _too_narrow(known, turned, widths):
+            return known
+        width = width * _NARROWER
+
+
+def slope_norms(view: View, setting: Setting, names) -> np.ndarray:
+    """How far the image moves for a step of each unknown."""
+    widths = difference_widths(setting, _WIDE * _NARROWER)
+    norms = np.linalg.norm(_slopes(np.zeros(len(names)), view, setting, names, widths), axis=0)
+    return np.where(norms > 0, norms, 1.0)
+
+
+def difference_widths(setting: Setting, width: float) -> np.ndarray:
+    """Half the step over which each of `SEEN` is differenced; `width` is that of λdM."""
+    camera = setting.camera
+    pixel = float(camera.sensor.pitch)
+    reach = max(camera.sensor.shape) * pixel / 2
+    curvature = float(setting.mask.beta) / float(setting.magnification) ** 2
+    zone = math.sqrt(float(setting.wavelength) * float(camera.distance))
+    every = {
+        "beta": _FRINGE / (curvature * reach**2),
+        "centre_y": _FRINGE / (2 * curvature * reach * pixel),
+        "centre_x": _FRINGE / (2 * curvature * reach * pixel),
+        # A rim moves by a few parts in 100 of a Fresnel zone for `width` of 2 %.
+        "width": 2 * width * zone / float(setting.mask.width),
+        "wavelength": width,
+    }
+    return np.array([every.get(name, _FRINGE) for name in SEEN])
+
+
+def _too_narrow(known: Covariance, turned: np.ndarray, widths: np.ndarray) -> bool:
+    """Whether what the rims tell is known no better than by the width of its differences."""
+    errors = of_values(known, turned).standard_errors
+    rims = [name in _RIMS and bool(np.any(row)) for name, row in zip(SEEN, turned, strict=True)]
+    return not any(rims) or bool(np.any((_AGAINST_ERROR * errors > widths)[rims]))
+
+
+def _errors(jacobian: np.ndarray, squares: float) -> Covariance:
+    pixels, unknowns = jacobian.shape
+    return covariance(jacobian.T @ jacobian, squares / max(1, pixels - unknowns))
+
+
+def _residual(steps, view: View, start: Setting, names, widths) -> np.ndarray:
+    return view.model(start, names, steps) - view.image.ravel()
+
+
+def _slopes(steps, view: View, start: Setting, names, widths) -> np.ndarray:
+    """∂model/∂steps, through what the image depends on."""
+    turned = np.asarray(seen_by_steps(start, names, steps))
+    return _seen_slopes(view, start.moved(names, jnp.asarray(steps)), turned, widths) @ turned
+
+
+def _seen_slopes(view: View, here: Setting, turned, widths, known=None) -> np.ndarray:
+    """By central differences in each of `SEEN`, 0 for what `turned` has no use for.
+
+    Of `known` slopes only the rims' are made again.
+    """
+    slopes = np.zeros((view.image.size, len(SEEN)))
+    for i, name in enumerate(SEEN):
+        if known is not None and name not in _RIMS:
+            slopes[:, i] = known[:, i]
+        elif np.any(turned[i]):
+            step = np.zeros(len(SEEN))
+            step[i] = widths[i]
+            change = view.model(here, SEEN, step) - view.model(here, SEEN, -step)
+            slopes[:, i] = change / (2 * widths[i])
+    return slopes
+
+
+def _best_by_trial(
+    view: View, guess: Setting, start: Setting, parameters: Sequence[str], search: float
+) -> Setting:
+    """The start with the distance, or wavelength, and the width that fit the coarse image best.
+
+    Within `search` of the guess, in parts of one; what is not in `parameters` stays. The fringes'
+    curvature β/M² stays where β is free.
+    """
+    tried = [n for n in ("distance", "wavelength") if n in parameters][:1]
+    tried = [n for n in ("width",) if n in parameters] + tried
+    if not tried or search == 0:
+        return start
+    best = start
+    for turn in range(_ROUNDS):
+        for name in tried:
+            # All of the range first, with where the fringes put it among the trials.
+            middle = float(WHERE[name](guess if turn == 0 else best))
+            values = middle * _trials(name, search / _TRIALS**turn, guess)
+            values = np.append(values, float(WHERE[name](best)))
+            trials = [with_fringes_held(best, name, v, "beta" in parameters) for v in values]
+            best = trials[int(np.argmin([_misfit(view, trial) for trial in trials]))]
+    return best
+
+
+def _trials(name: str, reach: float, guess: Setting) -> np.ndarray:
+    """Factors from 1 − reach to 1 + reach: a rim must not jump over a Fresnel zone."""
+    count = _TRIALS
+    if name == "width":
+        zone = math.sqrt(float(guess.wavelength) * float(guess.camera.distance))
+        count = max(count, math.ceil(reach * float(guess.mask.width) / zone))
+    return 1 + reach * np.arange(-count, count + 1) / count
+
+
+def _misfit(view: View, setting: Setting) -> float:
+    """1 − ρ², with the correlation ρ of the image with the model: the best gain and background."""
+    h = view.model(setting, ("phase",), np.zeros(1))
+    return 1 - float(np.corrcoef(h, view.image.ravel())[0, 1]) ** 2
+
+
+def full_view(image: np.ndarray, setting: Setting, pixel_integration: bool) -> View:
+    return View(image, setting.camera.sensor.grid, jnp.zeros(2), pixel_integration)
+
+
+def coarse_view(image: np.ndarray, guess: Setting, pixel_integration: bool) -> View:
+    """The image averaged over blocks about a third of a Fresnel zone wide; rests are dropped.
+
+    The model is exact for these pixels as well.
+    """
+    pitch = float(guess.camera.sensor.pitch)
+    zone = math.sqrt(float(guess.wavelength) * float(guess.camera.distance))
+    size = max(1, min(round(_BLOCK * zone / pitch), min(image.shape) // _FEWEST))
+    rows, columns = (n // size for n in image.shape)
+    top, left = ((n - n // size * size) // 2 for n in image.shape)
+    kept = image[top : top + rows * size, left : left + columns * size]
+    averages = kept.reshape(rows, size, columns, size).mean(axis=(1, 3))
+    middles = np.array([top + rows * size / 2, left + columns * size / 2])
+    offset = (middles - np.array(image.shape) / 2) * pitch
+    return View(
+        averages,
+        Grid((rows, columns), pitch * size),
+        jnp.asarray(offset),
+        size > 1 or pixel_integration,
+    )
+
+
+def _with_linear(view: View, setting: Setting, parameters: Sequence[str]) -> Setting:
+    """Background and gain by linear least squares, as far as they are free."""
+    h = view.model(setting, ("phase",), np.zeros(1))
+    values = view.image.ravel()
+    background, gain = 0.0, 1.0
+    if "gain" in parameters and "background" in parameters:
+        gain = np.mean((h - h.mean()) * (values - values.mean())) / np.var(h)
+        background = values.mean() - gain * h.mean()
+    elif "gain" in parameters:
+        gain = values @ h / (h @ h)
+    elif "background" in parameters:
+        background = np.mean(values - h)
+    if not gain > 0:  # not the picture of this camera; some gain, so that there is a slope
+        gain = values.std() / h.std()
+    numbers = (jnp.asarray(background, jnp.float64), jnp.asarray(gain, jnp.float64))
+    return eqx.tree_at(_offset_and_gain, setting, numbers)
+
+
+def _offset_and_gain(setting: Setting):
+    return setting.background, setting.gain

@@ -1,0 +1,273 @@
+"""The least-squares problem of a PSF fit: unknowns, model, residual and its Jacobian."""
+
+import operator
+from typing import NamedTuple, cast
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optimistix as optx
+from jaxtyping import Array, Float
+
+from thincam_jax._core.grids import Grid
+from thincam_jax.lensless.camera import LenslessCamera
+from thincam_jax.lensless.masks.fza import FresnelZoneAperture
+from thincam_jax.lensless.psf import psf
+
+# What a fit may be asked for, in the order of the result's tables.
+PARAMETERS = (
+    "beta",
+    "phase",
+    "centre",
+    "width",
+    "distance",
+    "object_distance",
+    "wavelength",
+    "background",
+    "gain",
+)
+# How far a scaled step of 1 moves the image, in parts of its contrast. The solver's damping starts
+# at 1; from a start within a fraction of a fringe that would be slow, 1/STEP² is not.
+STEP = 30.0
+# Of the scaled steps, and of the weighted residual in any pixel. A million pixels at 30 dB
+# determine a scaled step to some 1e-6.
+_TOLERANCE = 1e-7
+
+
+def unknown_names(parameters: tuple[str, ...]) -> tuple[str, ...]:
+    """One name for each number that is fitted: the centre is two."""
+    names = []
+    for name in PARAMETERS:
+        if name in parameters:
+            names += ["centre_y", "centre_x"] if name == "centre" else [name]
+    return tuple(names)
+
+
+class Setting(eqx.Module):
+    """Everything that the picture of a point source on the axis depends on.
+
+    - `nearness`: 1/t, 1/mm; 0 is a plane wave. t itself has no value next to infinity.
+    """
+
+    camera: LenslessCamera
+    wavelength: Float[Array, ""]
+    nearness: Float[Array, ""]
+    background: Float[Array, ""]
+    gain: Float[Array, ""]
+
+    @property
+    def mask(self) -> FresnelZoneAperture:
+        return cast(FresnelZoneAperture, self.camera.mask)
+
+    @property
+    def magnification(self) -> Float[Array, ""]:
+        """M = 1 + d/t."""
+        return 1 + self.camera.distance * self.nearness
+
+    def image(self, pixel_integration: bool, grid: Grid | None = None) -> Float[Array, "y x"]:
+        """background + gain·h, on the sensor or another grid."""
+        h = psf(
+            self.camera,
+            wavelength=self.wavelength,
+            object_distance=1 / self.nearness,  # pyright: ignore[reportArgumentType]
+            model="separable",
+            pixel_integration=pixel_integration,
+            grid=grid,
+        )
+        return self.background + self.gain * h
+
+    def moved(self, names: tuple[str, ...], steps: Float[Array, " unknown"]) -> "Setting":
+        """With every named number away from here by a dimensionless step.
+
+        β/M², width, d and λ by the factor e^s, which keeps them positive; 1/t by s/d; the centre by
+        s pixels; phase (rad), background and gain by s. A free β follows d and t, so that the
+        fringes stay: what is left of d and t are diffraction and the size of the shadow.
+        """
+        s = dict(zip(names, steps, strict=True))
+        mask, pitch = self.mask, self.camera.sensor.pitch
+        none = jnp.zeros_like(steps[0])
+        nearness = self.nearness
+        if "object_distance" in s:  # else untouched: t(1/t) has no derivative at 0
+            nearness = nearness + s["object_distance"] / self.camera.distance
+        offset = jnp.stack([s.get("centre_y", none), s.get("centre_x", none)])
+        distance = self.camera.distance * jnp.exp(s.get("distance", none))
+        beta = mask.beta
+        if "beta" in s:
+            grown = (1 + distance * nearness) / self.magnification
+            beta = beta * jnp.exp(s["beta"]) * grown**2
+        replaced = (
+            beta,
+            mask.phase + s.get("phase", none),
+            mask.width * jnp.exp(s.get("width", none)),
+            mask.centre + offset * pitch,
+            distance,
+            self.wavelength * jnp.exp(s.get("wavelength", none)),
+            nearness,
+            self.background + s.get("background", none),
+            self.gain + s.get("gain", none),
+        )
+        return eqx.tree_at(_numbers, self, replaced)
+
+    def values(self, names: tuple[str, ...]) -> Float[Array, " unknown"]:
+        """The named numbers: mm, rad/mm², rad; for object_distance 1/t in 1/mm."""
+        mask = self.mask
+        every = {
+            "beta": mask.beta,
+            "phase": mask.phase,
+            "centre_y": mask.centre[0],
+            "centre_x": mask.centre[1],
+            "width": mask.width,
+            "distance": self.camera.distance,
+            "object_distance": self.nearness,
+            "wavelength": self.wavelength,
+            "background": self.background,
+            "gain": self.gain,
+        }
+        return jnp.stack([every[name] for name in names])
+
+
+# Where a setting keeps what is found by trial.
+WHERE = {
+    "width": operator.attrgetter("camera.mask.width"),
+    "distance": operator.attrgetter("camera.distance"),
+    "wavelength": operator.attrgetter("wavelength"),
+}
+
+
+def _numbers(setting: Setting):
+    mask = setting.mask
+    return (
+        mask.beta,
+        mask.phase,
+        mask.width,
+        mask.centre,
+        setting.camera.distance,
+        setting.wavelength,
+        setting.nearness,
+        setting.background,
+        setting.gain,
+    )
+
+
+def with_fringes_held(setting: Setting, name: str, value: float, hold: bool) -> Setting:
+    """With another width, distance or wavelength; `hold`: with the β that keeps β/M²."""
+    there = eqx.tree_at(WHERE[name], setting, jnp.asarray(value, setting.nearness.dtype))
+    if not hold:
+        return there
+    ratio = there.magnification / setting.magnification
+    return eqx.tree_at(lambda s: s.camera.mask.beta, there, there.mask.beta * ratio**2)
+
+
+class Problem(eqx.Module):
+    """The data of `residual`.
+
+    - `start`: where all steps are zero.
+    - `image`: what was measured.
+    - `weight`: of the residuals.
+    - `scale`: the step of each unknown that counts as one: that which moves the image by `STEP`
+      (Marquardt's scaling, without which 1 % of β, many rad, would be damped like 1 % of a rad).
+    - `names`, `pixel_integration`: as in `unknown_names` and `psf`; static.
+    """
+
+    start: Setting
+    image: Float[Array, "y x"]
+    weight: Float[Array, ""]
+    scale: Float[Array, " unknown"]
+    names: tuple[str, ...] = eqx.field(static=True)
+    pixel_integration: bool = eqx.field(static=True)
+
+
+class Solution(NamedTuple):
+    """Where the solver stopped, and on the way there, whether it converged."""
+
+    scaled: Float[Array, " unknown"]
+    converged: bool
+    iterations: int
+
+
+def setting_at(scaled: Float[Array, " unknown"], problem: Problem) -> Setting:
+    """The numbers for the steps `scaled`·`problem.scale`."""
+    return problem.start.moved(problem.names, scaled * problem.scale)
+
+
+def residual(scaled: Float[Array, " unknown"], problem: Problem) -> Float[Array, "y x"]:
+    """(model − measured image)·weight."""
+    model = setting_at(scaled, problem).image(problem.pixel_integration)
+    return (model - problem.image) * problem.weight
+
+
+@eqx.filter_jit
+def model(steps, start: Setting, names: tuple[str, ...], pixel_integration, grid: Grid, offset):
+    """The image after the steps, on a grid whose middle is `offset` (y, x, mm) off the sensor's."""
+    setting = start.moved(names, steps)
+    # The grid's middle is its origin: the mask moves the other way.
+    centre = setting.camera.mask.centre - offset / setting.magnification
+    setting = eqx.tree_at(lambda s: s.camera.mask.centre, setting, centre)
+    return setting.image(pixel_integration, grid)
+
+
+# What the image depends on, each moved by its own step: β/M², φ, M·centre, M·width, λdM, and what
+# is linear. d and t act through M and λdM only, so that λ's step stands for that of λdM.
+SEEN = (
+    "beta",
+    "phase",
+    "centre_y",
+    "centre_x",
+    "width",
+    "wavelength",
+    "background",
+    "gain",
+)
+
+
+@eqx.filter_jit
+def seen_by_steps(start: Setting, names: tuple[str, ...], steps) -> Float[Array, "seen step"]:
+    """How far each of `SEEN` moves with each step: exact, also where steps cannot be told apart."""
+    return jax.jacfwd(_seen)(steps, start, names)
+
+
+def _seen(steps, start: Setting, names):
+    there = start.moved(names, steps)
+    mask, scale = there.mask, there.magnification
+    centre = mask.centre * scale / jax.lax.stop_gradient(scale) / there.camera.sensor.pitch
+    numbers = (
+        jnp.log(mask.beta / scale**2),
+        mask.phase,
+        centre[0],
+        centre[1],
+        jnp.log(mask.width * scale),
+        jnp.log(there.wavelength * there.camera.distance * scale),
+        there.background,
+        there.gain,
+    )
+    return jnp.stack(numbers)
+
+
+@eqx.filter_jit
+def values_by_steps(start: Setting, names: tuple[str, ...], steps) -> Float[Array, "value step"]:
+    """The derivative of `Setting.values` in the steps from `start`."""
+    return jax.jacfwd(_values)(steps, start, names)
+
+
+def _values(steps, start: Setting, names):
+    return start.moved(names, steps).values(names)
+
+
+@eqx.filter_jit
+def setting_and_residual(scaled: Float[Array, " unknown"], problem: Problem):
+    """The numbers, and measured image − model."""
+    return setting_at(scaled, problem), -residual(scaled, problem) / problem.weight
+
+
+def solve(problem: Problem, max_steps: int) -> Solution:
+    """Levenberg-Marquardt from `problem.start`."""
+    solution = _least_squares(problem, max_steps)
+    converged = bool(solution.result == optx.RESULTS.successful)
+    return Solution(solution.value, converged, int(solution.stats["num_steps"]))
+
+
+@eqx.filter_jit
+def _least_squares(problem: Problem, max_steps: int):
+    solver = optx.LevenbergMarquardt(rtol=_TOLERANCE, atol=_TOLERANCE)
+    none = jnp.zeros_like(problem.scale)
+    return optx.least_squares(residual, solver, none, problem, max_steps=max_steps, throw=False)

@@ -1,0 +1,255 @@
+r"""`fit_psf`: the numbers of a camera from a picture of a point source."""
+
+import math
+from collections.abc import Sequence
+from typing import Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from thincam_jax._core import checks
+from thincam_jax._core.precision import Precision, allow, cast, precision_of
+from thincam_jax.lensless.camera import LenslessCamera
+from thincam_jax.lensless.masks.fza import FresnelZoneAperture
+from thincam_jax.measured.calibration._images import measured
+from thincam_jax.measured.calibration.coarse import full_view, honest_covariance, slope_norms
+from thincam_jax.measured.calibration.covariance import ambiguous_pairs, of_values
+from thincam_jax.measured.calibration.problem import (
+    PARAMETERS,
+    STEP,
+    Problem,
+    Setting,
+    Solution,
+    setting_and_residual,
+    solve,
+    unknown_names,
+    values_by_steps,
+)
+from thincam_jax.measured.calibration.start import check_fringes, given, search_ranges, start_near
+
+Status = Literal["ok", "ambiguous", "poor_fit", "not_converged"]
+DEFAULT = ("beta", "phase", "centre", "distance", "background", "gain")
+# Part of the image's contrast that a fit must explain; less is another picture, or another turn.
+_EXPLAINED = 0.5
+
+
+class PsfFit(eqx.Module):
+    """What `fit_psf` found.
+
+    - `camera`: the camera with the fitted numbers, in the precision of the one given.
+    - `object_distance`: t, mm; `wavelength`: λ, mm; `background` and `gain`: image = background +
+      gain·h, in the image's unit.
+    - `names`: the numbers that were fitted, the order of `correlation`.
+    - `values`, `standard_errors`: of each of them, in mm, rad/mm², rad and the image's unit. The
+      errors are those of white noise of the residual's own strength, √(σ²(JᵀJ)⁻¹); they hold what
+      the noise does, not what the model leaves out.
+    - `correlation`: of their errors.
+    - `residual`: measured − model, (y, x).
+    - `status`: "ok"; "ambiguous", where numbers cannot be told apart (`AMBIGUOUS`: a correlation
+      above 0.999); "poor_fit", where the model explains less than half of the image's contrast;
+      "not_converged". The first that applies, from the last to the first.
+    - `reasons`: one line for each thing that is not as it should be.
+    - `iterations`: of the least squares.
+    """
+
+    camera: LenslessCamera
+    object_distance: Float[Array, ""]
+    wavelength: Float[Array, ""]
+    background: Float[Array, ""]
+    gain: Float[Array, ""]
+    values: dict[str, Float[Array, ""]]
+    standard_errors: dict[str, Float[Array, ""]]
+    correlation: Float[Array, "unknown unknown"]
+    residual: Float[Array, "y x"]
+    names: tuple[str, ...] = eqx.field(static=True)
+    status: Status = eqx.field(static=True)
+    reasons: tuple[str, ...] = eqx.field(static=True)
+    iterations: int = eqx.field(static=True)
+
+    @property
+    def centre_pixels(self) -> Float[Array, "2"]:
+        """(y, x) of the mask's centre in pixels from the middle of the sensor."""
+        return self.camera.mask.centre / self.camera.sensor.pitch
+
+
+def fit_psf(
+    psf_image,
+    camera: LenslessCamera,
+    *,
+    object_distance,
+    wavelength,
+    parameters: Sequence[str] = DEFAULT,
+    pixel_integration: bool = True,
+    search: float | int = 0.12,
+    centre_search: float | int | None = None,
+    max_steps: int = 60,
+) -> PsfFit:
+    r"""Fit the exact PSF of a zone aperture to a measured one, by least squares.
+
+    .. math::
+        \min \sum_{y,x} \big[ g_{yx} - B - G\,h(y, x;\,\beta, \varphi, y_0, x_0, W, d, t, \lambda)
+        \big]^2
+
+    with h of the model "separable". A matched filter for chirps (`calibrate.chirp_search`) finds
+    β, the mask's centre, φ and d to a fraction of a fringe first, from numbers some 10 % off;
+    Levenberg-Marquardt then fits all pixels. In double precision, whatever the camera's.
+
+    **What a PSF can tell.** Scaling mask and distances leaves a picture unchanged: on the sensor h
+    depends on φ, β/M², M·centre, M·W and λdM only, with M = 1 + d/t.
+
+    - d follows from diffraction, ε = βλd/(πM), if λ is known; λ and d cannot both be fitted where
+      t = ∞, nor λ, d and t at a finite t.
+    - β and t follow from M², thus from M·W, if the width W is known and the rims of the shadow, or
+      the ripples that they throw, are on the sensor; else only β/M².
+    - β, t and W never all three.
+
+    What the data do not separate is found from the correlations and told in `status` and
+    `reasons`; the numbers so named are then one of many equally good choices.
+
+    There is no tilt of the mask against the sensor. Turned by α about the y axis, the mask is
+    foreshortened, which changes the fringes' phase by βx²α² and would keep h separable; but its
+    halves are also magnified and diffracted differently, some 2βr²·αx/t and εβr²·αx/d, which does
+    not. At 1° on the thesis' camera that is 0.06, 0.16 and 0.08 rad in the corners: a fit of the
+    foreshortening alone would take the others for it. A tilt shows in `residual`, as fringes whose
+    contrast grows towards the rim.
+
+    **Arguments**
+
+    - `psf_image`: (y, x) on the camera's sensor, linear in irradiance, in any unit.
+    - `camera`: with a `FresnelZoneAperture`; its numbers are the start.
+    - `object_distance`: t, mm, from the mask, or infinity; `wavelength`: λ, mm.
+    - `parameters`: which to fit, of "beta", "phase", "centre", "width", "distance",
+      "object_distance", "wavelength", "background", "gain"; the others are held. Without
+      "background" it is 0, without "gain" 1.
+    - `pixel_integration`: average h over each pixel, as a sensor does. Without, the waves from the
+      far rim, up to 10 turns a pixel, are aliased, and d is then only as good as the start.
+    - `search`: how far β, d and λ may be from their start, in parts of one.
+    - `centre_search`: how far the centre may be, along y and x, on the sensor, mm; by default a
+      tenth of the sensor's shorter side.
+    - `max_steps`: of Levenberg-Marquardt.
+
+    **Validity.** That of the Fresnel approximation. The search needs ε < 0.5; beyond, least squares
+    start from the camera as given. A start of "width" must be within some √(λd) of the truth.
+
+    **Errors**: ValueError or TypeError, one line, for an image that is not finite, has no contrast
+    or another shape than the sensor, a sensor that holds less than one fringe, unknown parameters
+    and another mask.
+    """
+    parameters = _check_parameters(parameters)
+    image = _check_image(psf_image, camera)
+    ranges = search_ranges(camera, parameters, search, centre_search)
+    with allow("float64", camera):
+        guess = given(cast(camera, "float64"), object_distance, wavelength, parameters)
+        check_fringes(guess)
+        start = start_near(image, guess, parameters, ranges, float(search), pixel_integration)
+        names = unknown_names(parameters)
+        return _fit(
+            image, start, names, pixel_integration, max_steps, precision_of(camera.distance)
+        )
+
+
+def _check_parameters(parameters) -> tuple[str, ...]:
+    if isinstance(parameters, str) or not parameters:
+        raise ValueError(f"parameters = {parameters!r}: give a tuple of at least one name")
+    for name in parameters:
+        checks.choice("a name in parameters", name, PARAMETERS)
+    return tuple(parameters)
+
+
+def _check_image(image, camera: LenslessCamera) -> np.ndarray:
+    if not isinstance(camera.mask, FresnelZoneAperture):
+        raise TypeError(
+            f"fit_psf fits a FresnelZoneAperture; the camera's mask is a "
+            f"{type(camera.mask).__name__}"
+        )
+    if any(checks.is_traced(leaf) for leaf in jax.tree.leaves((image, camera))):
+        raise TypeError(
+            "fit_psf searches, so that it cannot be traced: call it outside jit and grad"
+        )
+    return measured("psf_image", image, camera.sensor.shape, "the sensor")
+
+
+def _fit(image, start: Setting, names, pixel_integration, max_steps, precision) -> PsfFit:
+    problem = _problem(image, start, names, pixel_integration)
+    solution = solve(problem, max_steps)
+    return _report(problem, solution, precision)
+
+
+def _problem(image, start: Setting, names, pixel_integration: bool) -> Problem:
+    contrast = np.linalg.norm(image - image.mean())
+    scale = STEP * contrast / slope_norms(full_view(image, start, pixel_integration), start, names)
+    weight = jnp.asarray(1 / contrast, jnp.float64)
+    return Problem(start, jnp.asarray(image), weight, jnp.asarray(scale), names, pixel_integration)
+
+
+def _report(problem: Problem, solution: Solution, precision: Precision) -> PsfFit:
+    names = problem.names
+    found, residual = setting_and_residual(solution.scaled, problem)
+    view = full_view(np.asarray(problem.image), found, problem.pixel_integration)
+    known = of_values(honest_covariance(view, found, names), _slopes_of_values(found, names))
+    values = dict(zip(names, np.asarray(found.values(names)), strict=True))
+    errors = dict(zip(names, known.standard_errors, strict=True))
+    distance, alike = np.inf, ambiguous_pairs(names, known.correlation)
+    nearness = float(found.nearness)
+    if nearness > 0:
+        distance = 1 / nearness
+    if "object_distance" in names:
+        values["object_distance"] = distance
+        if not any("object_distance" in line for line in alike):
+            alike += _too_far(nearness, errors["object_distance"])
+        errors["object_distance"] = errors["object_distance"] * distance**2
+    explained = 1 - float(jnp.sum((residual * problem.weight) ** 2))
+    status, reasons = _status(solution, explained, alike)
+    return PsfFit(
+        cast(found.camera, precision),
+        cast(jnp.asarray(distance), precision),
+        cast(found.wavelength, precision),
+        cast(found.background, precision),
+        cast(found.gain, precision),
+        cast({name: jnp.asarray(value) for name, value in values.items()}, precision),
+        cast({name: jnp.asarray(error) for name, error in errors.items()}, precision),
+        cast(jnp.asarray(known.correlation), precision),
+        cast(residual, precision),
+        names,
+        status,
+        reasons,
+        solution.iterations,
+    )
+
+
+def _slopes_of_values(found: Setting, names) -> np.ndarray:
+    """Of the values in the steps; t falls where 1/t grows."""
+    slopes = np.array(values_by_steps(found, names, jnp.zeros(len(names))))
+    slopes[np.array(names) == "object_distance"] *= -1
+    return slopes
+
+
+def _too_far(nearness: float, error: float) -> list[str]:
+    """What there is to say of a point whose 1/t may as well be zero."""
+    if nearness > 2 * error:
+        return []
+    nearest = 1 / (max(nearness, 0.0) + 2 * error) if error > 0 else math.inf
+    return [
+        f"object_distance may be infinite: the image says only that it is over {nearest:.3g} mm"
+    ]
+
+
+def _status(
+    solution: Solution, explained: float, alike: list[str]
+) -> tuple[Status, tuple[str, ...]]:
+    status: Status = "ambiguous" if alike else "ok"
+    reasons = list(alike)
+    if not explained >= _EXPLAINED:
+        status = "poor_fit"
+        reasons.insert(
+            0,
+            f"the model explains {max(0.0, explained):.0%} of the image's contrast: it is not "
+            "this camera's PSF, too noisy, or further from the start than search",
+        )
+    if not solution.converged:
+        status = "not_converged"
+        reasons.insert(0, f"least squares stopped after {solution.iterations} steps; try max_steps")
+    return status, tuple(reasons)

@@ -1,0 +1,271 @@
+r"""How much larger one image of a scene is than another, and how far it is moved."""
+
+import math
+from typing import Literal, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+import scipy.ndimage
+from jaxtyping import Array, Float
+
+from thincam_jax._core import checks
+from thincam_jax._core.precision import allow
+from thincam_jax.measured.calibration._images import measured
+from thincam_jax.measured.calibration.resample import LOBES, covered, resample
+
+Status = Literal["ok", "poor_fit", "not_converged"]
+
+_COARSE = 128  # pixels a side, about, of the images in which the start is searched
+_SMALLEST = 32  # pixels a side: less leaves nothing between the margins
+_BLOCK = 24  # pixels a side of the blocks whose errors count as independent
+_LEAST_CORRELATION = 0.5
+_TOLERANCE = 1e-6  # pixels
+_WEIGHT = 1e3  # of residuals: the solver starts with a damping of 1, which is to be weak
+
+
+class Registration(eqx.Module):
+    """What `estimate_registration` found.
+
+    - `scale`: of the image over the reference; `shift`: (y, x), pixels.
+    - `scale_error`, `shift_error`: their standard errors.
+    - `correlation`: of the image with the registered reference, over what both show; 1 is perfect.
+    - `registered`: the reference, enlarged and moved onto the image.
+    - `status`: "ok"; "poor_fit" where the correlation is under 0.5; "not_converged".
+    - `reasons`: one line for each thing that is not as it should be.
+    """
+
+    scale: Float[Array, ""]
+    shift: Float[Array, "2"]
+    scale_error: Float[Array, ""]
+    shift_error: Float[Array, "2"]
+    correlation: Float[Array, ""]
+    registered: Float[Array, "y x"]
+    status: Status = eqx.field(static=True)
+    reasons: tuple[str, ...] = eqx.field(static=True)
+
+
+def estimate_registration(
+    capture,
+    reference,
+    *,
+    scale: float | int = 1.0,
+    search: float | int = 0.15,
+    smoothing: float | int = 1.0,
+    max_steps: int = 50,
+) -> Registration:
+    r"""Scale s and shift a of one image of a scene against another.
+
+    .. math:: \min_{s, a, G, B} \sum \big[ \mathrm{capture}(r)
+        - B - G\,\mathrm{reference}((r - a)/s) \big]^2
+
+    with r in pixels from the middle. For captures of one scene at two mask-sensor distances (the
+    thesis' method A) s = d/d_ref: a scene point's shadow moves by d/t. `reconstruct.registration`
+    then takes the ratio 1/s; a shift says that the mask moved sideways with the distance.
+
+    **What it acts on.** Images that *scale*: reconstructions of the scene, one for each distance
+    (a Wiener filter of that distance alone, or fringe scanning), on the sensor's pitch. Raw
+    captures of a zone aperture do not scale: their fringes have the curvature β/M² at every
+    distance, and only the places of the shadows' centres move with d. Given raw captures, it fits
+    whatever dominates them. The images may differ in brightness and contrast. Rotation is not
+    fitted.
+
+    Phase correlation of small images finds the shift for each of a row of scales, and the best of
+    them is where least squares start, in the small images first. In double precision.
+
+    **Standard errors** count the residual as it is, noise that is correlated over less than 24
+    pixels and misfits included (sums over blocks of pixels, Liang and Zeger's estimate).
+
+    **Arguments**
+
+    - `capture`, `reference`: (y, x), of one shape, at least 32 pixels a side.
+    - `scale`: where to look, such as d/d_ref as set on the stage; > 0.
+    - `search`: how far from there, in parts of one, at most 0.5.
+    - `smoothing`: Gaussian, its σ in pixels of the reference, of both images before they are
+      compared, so that neither noise nor interpolation draws the result to whole pixels; 0 is none.
+    - `max_steps`: of Levenberg-Marquardt.
+
+    **Validity.** Both must show the same part of the scene for the most part: what one shows alone
+    is left out where it lies outside the other, but counts where it lies behind an edge.
+
+    **Errors**: ValueError, one line, for images that are not finite, of different shapes, without
+    contrast or too small, and for numbers out of range.
+    """
+    if any(checks.is_traced(leaf) for leaf in (capture, reference, scale)):
+        raise TypeError("estimate_registration searches: call it outside jit and grad")
+    capture = measured("capture", capture, None, "")
+    reference = measured("reference", reference, capture.shape, "the capture")
+    if min(capture.shape) < _SMALLEST:
+        raise ValueError(f"images of {capture.shape} pixels; give at least {_SMALLEST} a side")
+    scale = float(checks.positive("scale", scale, "parts of one"))
+    search = float(checks.non_negative("search", search, "parts of one"))
+    if search > 0.5:
+        raise ValueError(f"search = {search:g} is too wide; give at most 0.5")
+    smoothing = float(checks.non_negative("smoothing", smoothing, "pixels"))
+    block = max(1, min(capture.shape) // _COARSE)
+    small, other = _averages(capture, block), _averages(reference, block)
+    with allow("float64"):
+        start = _phase_correlation(small, other, scale, search)
+        start, _ = _fit(small, other, start, 1.0, max_steps)
+        start = Place(start.scale, start.shift * block)
+        place, fit = _fit(capture, reference, start, smoothing, max_steps)
+        return _report(capture, reference, place, fit)
+
+
+def _averages(image: np.ndarray, size: int) -> np.ndarray:
+    """Averages over blocks of `size` pixels a side around the middle."""
+    rows, columns = (n // size for n in image.shape)
+    top, left = ((n - n // size * size) // 2 for n in image.shape)
+    kept = image[top : top + rows * size, left : left + columns * size]
+    return kept.reshape(rows, size, columns, size).mean(axis=(1, 3))
+
+
+class Place(NamedTuple):
+    """Scale, and shift (y, x) in pixels."""
+
+    scale: float
+    shift: np.ndarray
+
+
+class Pair(eqx.Module):
+    """The data of `residual`: smoothed images, where to compare them, and from where."""
+
+    capture: Float[Array, "y x"]
+    reference: Float[Array, "y x"]
+    weights: Float[Array, "y x"]
+    scale: Float[Array, ""]
+    shift: Float[Array, "2"]
+
+
+class Fit(NamedTuple):
+    """A pair, the unknowns found for it and whether the solver converged."""
+
+    pair: Pair
+    unknowns: Float[Array, "5"]
+    converged: bool
+
+
+def residual(unknowns: Float[Array, "5"], pair: Pair) -> Float[Array, "y x"]:
+    """(offset + gain·reference((r − a)/s) − capture)·weights.
+
+    The unknowns: s over its start, in pixels at the edge, the way of a from its start (y, x) in
+    pixels, gain and offset.
+    """
+    scale, shift = _place(unknowns, pair)
+    model = unknowns[4] + unknowns[3] * resample(pair.reference, scale, shift)
+    return (model - pair.capture) * pair.weights
+
+
+def _place(unknowns: Float[Array, "5"], pair: Pair) -> tuple[Float[Array, ""], Float[Array, "2"]]:
+    edge = max(pair.capture.shape) / 2
+    return pair.scale * (1 + unknowns[0] / edge), pair.shift + unknowns[1:3]
+
+
+@eqx.filter_jit
+def _least_squares(pair: Pair, max_steps: int):
+    solver = optx.LevenbergMarquardt(rtol=_TOLERANCE, atol=_TOLERANCE)
+    start = jnp.array([0.0, 0.0, 0.0, 1.0, 0.0], pair.capture.dtype)
+    return optx.least_squares(residual, solver, start, pair, max_steps=max_steps, throw=False)
+
+
+def _fit(capture, reference, start: Place, smoothing: float, max_steps: int) -> tuple[Place, Fit]:
+    """Least squares from `start` on images of unit contrast, smoothed on the scene's scale."""
+    smooth = [
+        scipy.ndimage.gaussian_filter(image, sigma, mode="nearest")
+        for image, sigma in ((capture, smoothing * start.scale), (reference, smoothing))
+    ]
+    first, second = (jnp.asarray((image - image.mean()) / image.std()) for image in smooth)
+    scale, shift = jnp.asarray(start.scale, jnp.float64), jnp.asarray(start.shift, jnp.float64)
+    margin = LOBES + math.ceil(3 * smoothing * max(1.0, start.scale))
+    margin = min(margin, min(capture.shape) // 6)
+    weights = covered(capture.shape, scale, shift, margin)
+    pair = Pair(first, second, weights * (_WEIGHT / capture.size**0.5), scale, shift)
+    solution = _least_squares(pair, max_steps)
+    converged = bool(solution.result == optx.RESULTS.successful)
+    scale, shift = _place(solution.value, pair)
+    return Place(float(scale), np.asarray(shift)), Fit(pair, solution.value, converged)
+
+
+def _phase_correlation(capture, reference, scale: float, search: float) -> Place:
+    """The scale whose enlarged reference has the highest peak of phase correlation, and its shift.
+
+    Scales in steps that move the edge by half a pixel.
+    """
+    window = np.outer(*(np.hanning(n + 2)[1:-1] for n in capture.shape))
+    spectrum = np.fft.fft2((capture - capture.mean()) * window)
+    step = 1 / max(capture.shape)
+    count = math.ceil(search / step)
+    best, found = -math.inf, Place(scale, np.zeros(2))
+    none = jnp.zeros(2)
+    level = jnp.asarray(reference - reference.mean())
+    for tried in scale * (1 + np.linspace(-search, search, 2 * count + 1)):
+        enlarged = np.asarray(_resampled(level, jnp.asarray(tried, jnp.float64), none))
+        inside = np.asarray(covered(capture.shape, jnp.asarray(tried, jnp.float64), none, 0))
+        cross = spectrum * np.fft.fft2(enlarged * inside * window).conj()
+        strength = np.abs(cross)
+        # A phase counts by its strength up to the usual one: weak ones are noise.
+        peak = np.fft.ifft2(cross / (strength + np.mean(strength))).real
+        row, column = np.unravel_index(np.argmax(peak), peak.shape)
+        if peak[row, column] > best:
+            best = peak[row, column]
+            wrapped = [
+                (k + n // 2) % n - n // 2 for k, n in zip((row, column), peak.shape, strict=True)
+            ]
+            found = Place(float(tried), np.array(wrapped, float))
+    return found
+
+
+_resampled = eqx.filter_jit(resample)
+
+
+def _report(capture, reference, place: Place, fit: Fit) -> Registration:
+    error = _standard_errors(fit)
+    pair = fit.pair
+    registered = np.asarray(
+        _resampled(jnp.asarray(reference), jnp.asarray(place.scale), jnp.asarray(place.shift))
+    )
+    inside = np.asarray(pair.weights) > 0
+    correlation = 0.0
+    if np.ptp(registered[inside]) > 0:
+        correlation = float(np.corrcoef(registered[inside], capture[inside])[0, 1])
+    status: Status = "ok"
+    reasons = []
+    if correlation < _LEAST_CORRELATION:
+        status = "poor_fit"
+        reasons.append(
+            f"the images correlate by {correlation:.2f} only: they show different scenes, too much "
+            "noise, or are further apart than search"
+        )
+    if not fit.converged:
+        status = "not_converged"
+        reasons.insert(0, "least squares did not converge; try max_steps")
+    edge = max(capture.shape) / 2
+    return Registration(
+        jnp.asarray(place.scale),
+        jnp.asarray(place.shift),
+        jnp.asarray(error[0] * float(pair.scale) / edge),
+        jnp.asarray(error[1:3]),
+        jnp.asarray(correlation),
+        jnp.asarray(registered),
+        status,
+        tuple(reasons),
+    )
+
+
+def _standard_errors(fit: Fit) -> np.ndarray:
+    """Of the unknowns: (JᵀJ)⁻¹ S (JᵀJ)⁻¹ with S = Σ_block (Jᵀr)(Jᵀr)ᵀ, r summed over blocks."""
+    jacobian, values = (np.asarray(v) for v in _linearised(fit.unknowns, fit.pair))
+    scores = jacobian * values[..., None]
+    rows, columns = (n - n % _BLOCK for n in values.shape)
+    blocks = scores[:rows, :columns].reshape(rows // _BLOCK, _BLOCK, columns // _BLOCK, _BLOCK, -1)
+    blocks = blocks.sum(axis=(1, 3)).reshape(-1, scores.shape[-1])
+    normal = np.einsum("yxi,yxj->ij", jacobian, jacobian)
+    inverse = np.linalg.pinv(normal, hermitian=True)
+    return np.sqrt(np.diag(inverse @ (blocks.T @ blocks) @ inverse))
+
+
+@eqx.filter_jit
+def _linearised(unknowns: Float[Array, "5"], pair: Pair):
+    return jax.jacfwd(residual)(unknowns, pair), residual(unknowns, pair)

@@ -1,0 +1,140 @@
+"""Where the least squares of a PSF fit start: a camera that is right to a fraction of a fringe."""
+
+import math
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from thincam_jax._core import checks
+from thincam_jax.lensless.camera import LenslessCamera
+from thincam_jax.measured.calibration.chirp_search import Chirp, Ranges, find_chirp
+from thincam_jax.measured.calibration.coarse import descend
+from thincam_jax.measured.calibration.problem import Setting
+
+# d/t at which a free object distance starts where it was given as infinite, a number that no step
+# can leave: its shadow is within a millionth of that of infinity.
+_FARTHEST = 1e-6
+_WIDEST = 0.5  # of a search, in parts of one
+
+
+def given(camera: LenslessCamera, object_distance, wavelength, parameters) -> Setting:
+    """The camera and the point as given, with an empty background and a gain of one."""
+    path = camera.path(wavelength, object_distance)
+    nearness = 1 / path.object_distance
+    if "object_distance" in parameters:
+        nearness = jnp.maximum(nearness, _FARTHEST / camera.distance)
+    none = jnp.zeros_like(nearness)
+    return Setting(camera, path.wavelength.astype(none.dtype), nearness, none, none + 1)
+
+
+def search_ranges(
+    camera: LenslessCamera, parameters: Sequence[str], search, centre_search
+) -> Ranges:
+    """How far the fringes on the sensor may be from those of the camera given."""
+    search = float(checks.non_negative("search", search, "parts of one"))
+    if search > _WIDEST:
+        raise ValueError(f"search = {search:g} is too wide; give at most {_WIDEST:g}")
+    if centre_search is None:
+        centre_search = 0.1 * min(camera.sensor.shape) * float(camera.sensor.pitch)
+    centre = float(checks.non_negative("centre_search", centre_search, "mm"))
+    free = {name: float(name in parameters) for name in ("beta", "distance", "wavelength")}
+    # A free object distance, or mask-sensor distance, moves β/M² by parts of d/t only.
+    magnification = 0.1 * ("object_distance" in parameters or "distance" in parameters)
+    return Ranges(
+        curvature=search * (free["beta"] + magnification),
+        epsilon=search * sum(free.values()),
+        centre=centre * ("centre" in parameters),
+    )
+
+
+def check_fringes(guess: Setting) -> None:
+    """Refuse a sensor, or a shadow on it, that holds less than one fringe."""
+    mask, sensor = guess.mask, guess.camera.sensor
+    scale = float(guess.magnification)
+    halves = [
+        min(n * float(sensor.pitch) / scale, float(mask.width)) / 2  # on the mask's scale
+        for n in sensor.shape
+    ]
+    fringes = float(mask.beta) * sum(h**2 for h in halves) / (2 * math.pi)
+    if fringes < 1:
+        raise ValueError(
+            f"the sensor holds {fringes:.2g} fringes of the mask: a fit needs at least one; give a "
+            "larger image"
+        )
+
+
+def start_near(
+    image: np.ndarray,
+    guess: Setting,
+    parameters: Sequence[str],
+    ranges: Ranges,
+    search: float,
+    pixel_integration: bool,
+) -> Setting:
+    """The setting whose fringes correlate best with the image, with the best background and gain.
+
+    Only what is in `parameters` differs from the guess.
+    """
+    pitch = float(guess.camera.sensor.pitch)
+    found = find_chirp(image, pitch, _fringes(guess), ranges)
+    near = _with_fringes(guess, found, parameters, search)
+    return descend(image, guess, near, parameters, search, pixel_integration)
+
+
+def _fringes(setting: Setting) -> Chirp:
+    camera, scale = setting.camera, float(setting.magnification)
+    beta = float(setting.mask.beta)
+    epsilon = beta * float(setting.wavelength) * float(camera.distance) / (math.pi * scale)
+    centre = np.asarray(setting.mask.centre) * scale
+    return Chirp(beta / scale**2, epsilon, centre, float(setting.mask.phase))
+
+
+def _with_fringes(
+    guess: Setting, fringes: Chirp, parameters: Sequence[str], search: float
+) -> Setting:
+    """The free numbers that give those fringes: β/M² and ε, the centre and the phase.
+
+    Weak diffraction says little of ε: d and λ stay within `search` of the guess.
+    """
+    camera = guess.camera
+    beta, distance = float(guess.mask.beta), float(camera.distance)
+    wavelength, nearness = float(guess.wavelength), float(guess.nearness)
+    scale = 1 + distance * nearness
+    for _ in range(5):  # β and d depend on each other through M, by parts of d/t
+        scale = 1 + distance * nearness
+        if "beta" in parameters:
+            beta = fringes.curvature * scale**2
+        reduced = math.pi * fringes.epsilon / beta  # λd/M
+        if "distance" in parameters:
+            reduced = reduced / wavelength
+            distance = _within(reduced / (1 - reduced * nearness), guess.camera.distance, search)
+        elif "wavelength" in parameters:
+            wavelength = _within(reduced * scale / distance, guess.wavelength, search)
+    if "beta" not in parameters and "object_distance" in parameters:
+        scale = max(math.sqrt(beta / fringes.curvature), 1 + _FARTHEST)
+        nearness = (scale - 1) / distance
+    mask = guess.mask
+    centre = fringes.centre / scale if "centre" in parameters else np.asarray(mask.centre)
+    phase = float(mask.phase)
+    if "phase" in parameters:
+        phase = phase + math.remainder(fringes.phase - phase, 2 * math.pi)
+    numbers = (beta, phase, centre, distance, wavelength, nearness)
+    return eqx.tree_at(_searched, guess, tuple(jnp.asarray(n, jnp.float64) for n in numbers))
+
+
+def _within(value: float, guess, search: float) -> float:
+    return min(max(value, float(guess) * (1 - search)), float(guess) * (1 + search))
+
+
+def _searched(setting: Setting):
+    camera, mask = setting.camera, setting.mask
+    return (
+        mask.beta,
+        mask.phase,
+        mask.centre,
+        camera.distance,
+        setting.wavelength,
+        setting.nearness,
+    )

@@ -1,0 +1,162 @@
+"""Parts of a problem that share no unknown, each iterated by itself and several at a time.
+
+The images of a batch have only the operator in common, and so do colours whose variations are not
+coupled. On a CPU a part by itself stays in the cache, and cores that one part leaves idle between
+its transforms serve another (docs/reconstruction.md has the comparison). Each part then has units
+and penalties of its own.
+"""
+
+import contextlib
+import math
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from thincam_jax.imaging.operators import CropConvolution
+from thincam_jax.reconstruction.drive import AbstractMethod, Residuals
+from thincam_jax.reconstruction.problem import Deconvolution
+
+
+class Apart(AbstractMethod[tuple[Any, ...]]):
+    """A method for each part of a problem; residuals are those of the worst.
+
+    - `method`: makes the method of a part.
+    """
+
+    methods: tuple[AbstractMethod, ...]
+    shape: tuple[int, ...] = eqx.field(static=True)
+
+    def __init__(self, problem: Deconvolution, method: Callable[[Deconvolution], AbstractMethod]):
+        self.shape = problem.image_shape
+        self.methods = tuple(_together(method, parts(problem)))
+
+    def start(self, image):
+        return tuple(_together(lambda m, i: m.start(i), self.methods, self._split(image)))
+
+    def advance(self, state, count):
+        return tuple(_together(lambda m, s: m.advance(s, count), self.methods, state))
+
+    def image(self, state):
+        images = _together(lambda m, s: m.image(s), self.methods, state)
+        return jnp.stack(images).reshape(self.shape)
+
+    def objective(self, image):
+        values = _together(lambda m, i: m.objective(i), self.methods, self._split(image))
+        return jnp.sum(jnp.stack(values).reshape(*self.shape[:-4], -1), axis=-1)
+
+    def look(self, state):
+        looks = _together(lambda m, s: m.look(s), self.methods, state)
+        states, residuals = zip(*looks, strict=True)
+        primal, dual = (max(r[i] for r in residuals) for i in range(2))
+        return states, Residuals(primal, dual, members=residuals)
+
+    def adapt(self, state, residuals):
+        adapted = _together(lambda m, s, r: m.adapt(s, r), self.methods, state, residuals.members)
+        methods, states = zip(*adapted, strict=True)
+        return eqx.tree_at(lambda a: a.methods, self, methods), states
+
+    def _split(self, image: Float[Array, "*batch channel plane y x"]):
+        return list(image.reshape(len(self.methods), -1, *self.shape[-3:]))
+
+
+def worth_taking_apart(problem: Deconvolution) -> bool:
+    """On a CPU, and there are parts; other devices have cores for all of them in one program."""
+    platforms = {device.platform for device in problem.captures[0].devices()}
+    return platforms == {"cpu"} and _count(problem) > 1
+
+
+def parts(problem: Deconvolution) -> list[Deconvolution]:
+    """A problem for each image of the batch and, of colours that are not coupled, each colour."""
+    count = _count(problem)
+    channels = problem.image_shape[-4]
+    colours = channels if _colours_apart(problem) else 1
+    operators = [[_of_colour(o, c, colours) for o in problem.operators] for c in range(colours)]
+    captures = [c.reshape(count, channels // colours, *c.shape[-2:]) for c in problem.captures]
+    weights = [
+        _weights_of_parts(w, c, count, colours)
+        for w, c in zip(problem.weights, problem.captures, strict=True)
+    ]
+    return [
+        Deconvolution(
+            operators[i % colours],
+            [c[i] for c in captures],
+            tau=problem.tau,
+            weights=[w[i] for w in weights],
+            variation=problem.variation,
+            nonnegative=problem.nonnegative,
+        )
+        for i in range(count)
+    ]
+
+
+def _count(problem: Deconvolution) -> int:
+    channels = problem.image_shape[-4] if _colours_apart(problem) else 1
+    return math.prod(problem.image_shape[:-4]) * channels
+
+
+def _colours_apart(problem: Deconvolution) -> bool:
+    return problem.variation.coupling == "none"
+
+
+def _of_colour(operator: CropConvolution, colour: int, colours: int) -> CropConvolution:
+    """The operator of one of several colours; one PSF for all of them serves each."""
+    if colours == 1 or operator.spectrum.shape[0] == 1:
+        return operator
+    return eqx.tree_at(lambda o: o.spectrum, operator, operator.spectrum[colour : colour + 1])
+
+
+def _weights_of_parts(weight, capture, count: int, colours: int):
+    """Each part's; one weight for all stays one number."""
+    if weight.ndim == 0:
+        return [weight] * count
+    weight = weight.reshape((1,) * (capture.ndim - weight.ndim) + weight.shape)
+    leading = jnp.broadcast_shapes(weight.shape[:-2], capture.shape[:-2])
+    whole = jnp.broadcast_to(weight, (*leading, *weight.shape[-2:]))
+    return whole.reshape(count, leading[-1] // colours, *weight.shape[-2:])
+
+
+def _together(function: Callable, *sequences) -> list:
+    """The function of each part, of as many at a time as there are cores.
+
+    Ctrl-C drops what has not begun. What JAX is told for this thread holds in the others too.
+    """
+    wanted = _settings_of_thread()
+
+    def run(*arguments):
+        with contextlib.ExitStack() as stack:
+            here = _settings_of_thread()
+            for name, value in wanted.items():
+                if here[name] != value:
+                    stack.enter_context(_SETTINGS[name](value))
+            return function(*arguments)
+
+    with ThreadPoolExecutor(min(len(sequences[0]), _cores())) as pool:
+        return list(pool.map(run, *sequences))
+
+
+_SETTINGS = {
+    "jax_enable_x64": jax.enable_x64,
+    "jax_default_device": jax.default_device,
+    "jax_default_matmul_precision": jax.default_matmul_precision,
+    "jax_numpy_dtype_promotion": jax.numpy_dtype_promotion,
+    "jax_debug_nans": jax.debug_nans,
+    "jax_disable_jit": jax.disable_jit,
+}
+
+
+def _settings_of_thread() -> dict[str, Any]:
+    values = {name: getattr(jax.config, name) for name in _SETTINGS}
+    return {name: getattr(value, "value", value) for name, value in values.items()}
+
+
+def _cores() -> int:
+    """Those that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1

@@ -1,0 +1,207 @@
+"""Weights of the regularisation found from the captures: discrepancy principle, SURE, learning."""
+
+import math
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optax
+import scipy.optimize
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from thincam_jax.reconstruction.drive import drive
+from thincam_jax.reconstruction.fixed_point import solve_fixed_point
+from thincam_jax.reconstruction.problem import Deconvolution, misfit, residuals
+from thincam_jax.reconstruction.tv_method import AdmmTotalVariation
+
+
+class ChosenTau(NamedTuple):
+    """A problem with its τ found, its image, and (τ, criterion) of all that were tried."""
+
+    problem: Deconvolution
+    image: Float[Array, "*batch channel plane y x"]
+    tried: tuple[tuple[float, float], ...]
+
+
+def discrepancy_tau(
+    problem: Deconvolution,
+    image: Float[Array, "*batch channel plane y x"],
+    *,
+    iterations: int = 50,
+    solves: int = 8,
+    span: float = 100.0,
+) -> ChosenTau:
+    r"""The τ with which the residual is as large as the noise: Σ w (Hf − g)² = number of pixels.
+
+    Morozov's discrepancy principle; the weights w must be 1/variance. The misfit grows with τ, so
+    that a bisection of log τ finds it, each solve starting from the image of the one before. The
+    search spans a factor of `span` to both sides of the problem's own τ, and ends at its border
+    where the noise lies beyond. It smooths a little too much, because a fitted image also takes up
+    some of the noise.
+
+    **Arguments**: `image`, the first; `iterations` of each of `solves` reconstructions.
+    """
+    centre, wanted = _known_tau(problem), float(sum(jnp.sum(w > 0) for w in _full(problem))) / 2
+    low, high, tried = math.log(centre / span), math.log(centre * span), []
+    current = problem
+    for _ in range(solves):
+        middle = (low + high) / 2
+        current = with_tau(problem, math.exp(middle))
+        image = _solve(current, image, iterations)
+        ratio = float(jnp.sum(misfit(current, image))) / wanted
+        tried.append((math.exp(middle), ratio))
+        low, high = (low, middle) if ratio > 1 else (middle, high)
+    return ChosenTau(current, image, tuple(tried))
+
+
+def sure_tau(
+    problem: Deconvolution,
+    image: Float[Array, "*batch channel plane y x"],
+    key: PRNGKeyArray,
+    *,
+    iterations: int = 50,
+    solves: int = 8,
+    span: float = 100.0,
+) -> ChosenTau:
+    r"""The τ with the least predicted error of Hf, by Stein's unbiased risk estimate.
+
+    .. math:: \mathrm{SURE} = \sum w\,(H\hat f - g)^2 - n + 2\,\mathrm{div}_g(H\hat f)
+
+    with weights w = 1/variance and n pixels (Stein, Ann. Stat. 9, 1135, 1981). The divergence is a
+    probe's response, :math:`b^T (H\hat f(g + \epsilon b) - H\hat f(g))/\epsilon` with b = ±1
+    (Ramani, Blu and Unser, IEEE Trans. Image Process. 17, 1540, 2008), so each τ takes two
+    reconstructions. It is the error on the sensor that is least, not that of the image: frequencies
+    that the mask hardly passes count little. Minimised by golden sections of log τ.
+    """
+    centre = _known_tau(problem)
+    probes = _probes(problem, key)
+    tried: list[tuple[float, float]] = []
+    state = {"image": image}
+
+    def criterion(log_tau: float) -> float:
+        current = with_tau(problem, math.exp(log_tau))
+        state["image"] = _solve(current, state["image"], iterations)
+        moved = eqx.tree_at(
+            lambda p: p.captures,
+            current,
+            tuple(c + b for c, b in zip(problem.captures, probes, strict=True)),
+        )
+        other = _solve(moved, state["image"], iterations)
+        value = float(_risk(current, state["image"], other, probes))
+        tried.append((math.exp(log_tau), value))
+        return value
+
+    bracket = math.log(centre / span), math.log(centre * span)
+    found = scipy.optimize.minimize_scalar(
+        criterion, bounds=bracket, method="bounded", options={"maxiter": solves}
+    )
+    best = with_tau(problem, math.exp(found.x))
+    return ChosenTau(best, _solve(best, state["image"], iterations), tuple(tried))
+
+
+def learn_tau(
+    problems: Sequence[Deconvolution],
+    images: Sequence[Float[Array, "*batch channel plane y x"]],
+    *,
+    steps: int = 30,
+    learning_rate: float = 0.2,
+    iterations: int = 300,
+    loss: Callable | None = None,
+) -> tuple[Float[Array, ""], tuple[float, ...]]:
+    r"""One factor on all problems' τ that makes reconstructions of known images best.
+
+    Bilevel: the outer loss (default: the mean squared error) is minimised over log τ by Adam
+    (optax), its gradient taken through the minimiser by implicit differentiation
+    (`solve_fixed_point`). Returns the factor and the loss at every step.
+    """
+    measure = loss or mean_squared_error
+    optimiser = optax.adam(learning_rate)
+    logarithm = jnp.zeros((), problems[0].captures[0].dtype)
+    state, course = optimiser.init(logarithm), []
+    for _ in range(steps):
+        value, slope = jnp.zeros_like(logarithm), jnp.zeros_like(logarithm)
+        for problem, truth in zip(problems, images, strict=True):
+            one, its_slope = _loss_and_slope(logarithm, problem, truth, measure, iterations)
+            value, slope = value + one, slope + its_slope
+        course.append(float(value) / len(problems))
+        # Adam counts its steps in whole numbers.
+        with jax.numpy_dtype_promotion("standard"):
+            updates, state = optimiser.update(slope, state)
+        logarithm = jnp.asarray(optax.apply_updates(logarithm, updates))
+    return jnp.exp(logarithm), tuple(course)
+
+
+def mean_squared_error(image: Float[Array, "..."], truth: Float[Array, "..."]) -> Float[Array, ""]:
+    return jnp.mean((image - truth) ** 2)
+
+
+def with_tau(problem: Deconvolution, tau) -> Deconvolution:
+    """The same problem with another τ."""
+    return eqx.tree_at(lambda p: p.tau, problem, jnp.asarray(tau, problem.tau.dtype))
+
+
+@eqx.filter_jit
+def _loss_and_slope(logarithm, problem, truth, measure, iterations: int):
+    return jax.value_and_grad(_outer)(logarithm, problem, truth, measure, iterations)
+
+
+def _outer(logarithm, problem, truth, measure, iterations: int):
+    scaled = with_tau(problem, problem.tau * jnp.exp(logarithm))
+    first = jnp.zeros(problem.image_shape, truth.dtype)
+    solution = solve_fixed_point(scaled, first, iterations=iterations, relaxation=1.5)
+    return measure(solution.image, truth)
+
+
+def _known_tau(problem: Deconvolution) -> float:
+    tau = float(problem.tau)
+    if not tau > 0:
+        raise ValueError(f"tau = {tau:g}: a search by factors begins above 0; give tau > 0")
+    return tau
+
+
+def _full(problem: Deconvolution):
+    pairs = zip(problem.weights, problem.captures, strict=True)
+    return [jnp.broadcast_to(w, c.shape) for w, c in pairs]
+
+
+class SearchInterrupted(KeyboardInterrupt):
+    """Ctrl-C during a search; holds the best image of the solve that it ended."""
+
+    def __init__(self, image):
+        super().__init__()
+        self.image = image
+
+
+def _solve(problem: Deconvolution, image, iterations: int):
+    method = AdmmTotalVariation(problem, relaxation=1.5)
+    outcome = drive(method, image, iterations=iterations, tolerance=1e-5)
+    if outcome.status == "interrupted":
+        raise SearchInterrupted(outcome.image)
+    return outcome.image
+
+
+def _probes(problem: Deconvolution, key: PRNGKeyArray):
+    """±1 in units of a tenth of the noise, 0 where a pixel counts nothing."""
+    keys = jax.random.split(key, len(problem.captures))
+    return tuple(
+        jnp.where(w > 0, 0.1 / jnp.sqrt(jnp.where(w > 0, w, 1)), 0)
+        * jax.random.rademacher(k, w.shape, w.dtype)
+        for k, w in zip(keys, _full(problem), strict=True)
+    )
+
+
+@jax.jit
+def _risk(problem: Deconvolution, image, moved, probes):
+    """SURE in units of the noise's variance."""
+    total = jnp.zeros((), image.dtype)
+    for operator, weight, probe, residual in zip(
+        problem.operators, _full(problem), probes, residuals(problem, image), strict=True
+    ):
+        response = operator(moved - image)
+        size = 0.01  # of the probe's square in units of the variance
+        divergence = jnp.sum(weight * probe * response) / size
+        known = jnp.sum((weight > 0).astype(weight.dtype))
+        total = total + jnp.sum(weight * residual**2) - known + 2 * divergence
+    return total

@@ -1,0 +1,154 @@
+"""Distances of the objects, from the maxima of the focus curves of a sweep."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+import scipy.ndimage
+import scipy.signal
+import skimage.measure
+from jaxtyping import Int
+
+from thincam_jax.reconstruction.depth.focus import Measure, focus_measure, gaussian_average
+from thincam_jax.reconstruction.depth.refocus import RefocusSweep
+
+
+class FocusPeak(NamedTuple):
+    """A maximum of a region's focus curve.
+
+    - `region`: its label.
+    - `distance`: mm, between the steps of the sweep.
+    - `contrast`: how far the peak stands above the lowest value of the curve, relative to itself:
+      0 for a flat curve.
+    - `at_end`: the curve still rises at the end of the sweep. The object may stand outside of it;
+      the distance is that of the end.
+    """
+
+    region: int
+    distance: float
+    contrast: float
+    at_end: bool
+
+
+class FocusCurves(NamedTuple):
+    """Focus measure of each region over the sweep, and what follows.
+
+    - `labels`: (region,), `curves`: (region, distance).
+    - `peaks`: of all regions in the order of the labels, each region's highest first.
+    """
+
+    labels: tuple[int, ...]
+    curves: np.ndarray
+    peaks: tuple[FocusPeak, ...]
+
+    def distance_of(self, region: int) -> FocusPeak:
+        """The highest peak of a region."""
+        return next(peak for peak in self.peaks if peak.region == region)
+
+
+def find_distances(
+    sweep: RefocusSweep,
+    *,
+    measure: Measure = "laplacian_variance",
+    smoothing: float | int = 1.0,
+    regions: Int[np.ndarray, "y x"] | None = None,
+    prominence: float | int = 0.15,
+) -> FocusCurves:
+    """Distances at which something in the sweep is in focus.
+
+    A region's focus curve has a maximum at the distance of what it shows. It is placed by the
+    parabola through three points of the curve over 1/t, in which defocus is linear. Channels of a
+    batch are averaged.
+
+    **Arguments**
+
+    - `regions`: whole numbers (y, x), 0 for the ground; see `object_regions`. By default the whole
+      field is one region (1): several objects then show only if they are further apart than
+      `axial_resolution`.
+    - `prominence`: of a second maximum, relative to the curve's range; the highest is always given.
+    - `measure`, `smoothing`: see `focus_measure`.
+
+    Eager: the result holds plain numbers.
+    """
+    shape = sweep.images.shape[-2:]
+    regions = np.ones(shape, dtype=int) if regions is None else np.asarray(regions)
+    if regions.shape != shape:
+        raise ValueError(f"regions has shape {regions.shape}; give labels of {shape} pixels")
+    labels = tuple(int(n) for n in np.unique(regions) if n > 0)
+    if not labels:
+        raise ValueError("regions holds no label above 0; mark at least one object")
+    distances = np.asarray(sweep.distances, dtype=float)
+    curves, peaks = [], []
+    for label in labels:
+        found = focus_measure(
+            sweep.images, measure, smoothing=smoothing, region=jnp.asarray(regions == label)
+        )
+        curve = np.asarray(found, dtype=float).reshape(len(distances), -1).mean(axis=1)
+        curves.append(curve)
+        peaks += _peaks(label, curve, distances, prominence)
+    return FocusCurves(labels, np.stack(curves), tuple(peaks))
+
+
+def _peaks(label: int, curve, distances, prominence: float | int) -> list[FocusPeak]:
+    """Maxima of a curve, the highest first."""
+    low, high = curve.min(), curve.max()
+    least = max(prominence * (high - low), np.finfo(float).tiny)
+    inner, _ = scipy.signal.find_peaks(curve, prominence=least)
+    places = sorted({int(np.argmax(curve)), *map(int, inner)}, key=lambda k: -curve[k])
+    ends = (0, len(curve) - 1)
+    return [
+        FocusPeak(
+            label,
+            float(distances[k]) if k in ends else vertex(curve, distances, k),
+            float((curve[k] - low) / curve[k]) if curve[k] > 0 else 0.0,
+            k in ends,
+        )
+        for k in places
+    ]
+
+
+def vertex(curve: np.ndarray, distances: np.ndarray, place: int) -> float:
+    """Where the parabola over 1/t through a maximum and its neighbours is highest, mm."""
+    u = 1 / distances[place - 1 : place + 2]
+    before, after = (curve[place] - curve[place - 1]), (curve[place] - curve[place + 1])
+    left, right = u[1] - u[0], u[2] - u[1]
+    # Newton's form; steps of unequal length.
+    curvature = before / left + after / right
+    if not abs(curvature) > 0:
+        return float(distances[place])
+    shift = (before * right / left - after * left / right) / (2 * curvature)
+    return float(1 / (u[1] + shift))
+
+
+def object_regions(
+    sweep: RefocusSweep,
+    *,
+    threshold: float | int = 0.25,
+    smoothing: float | int | None = None,
+    least: int | None = None,
+) -> Int[np.ndarray, "y x"]:
+    """Bright objects on a dark ground, told apart where they do not touch: labels (y, x) from 1.
+
+    The mean of the sweep, smoothed, is cut at `threshold` of its highest value; regions are widened
+    by the width of the smoothing, so that the objects' edges, which say most, are in them.
+
+    **Arguments**: `smoothing`, pixels, default 1.5 % of the field's diagonal; `least`, pixels of
+    the smallest region kept, default 0.5 % of the field. Labels go from left to right.
+    """
+    images = sweep.images.reshape(-1, *sweep.images.shape[-2:])
+    rows, columns = images.shape[-2:]
+    width = 0.015 * float(np.hypot(rows, columns)) if smoothing is None else float(smoothing)
+    mean = jnp.mean(images, axis=0)
+    mean = np.asarray(gaussian_average(mean, width) if width > 0 else mean)
+    bright = scipy.ndimage.binary_dilation(
+        mean > threshold * mean.max(), iterations=max(1, round(width))
+    )
+    found = np.asarray(skimage.measure.label(bright))
+    count = int(found.max())
+    smallest = 0.005 * rows * columns if least is None else least
+    kept = [n for n in range(1, count + 1) if np.sum(found == n) >= smallest]
+    kept.sort(key=lambda n: float(np.nonzero(found == n)[1].mean()))
+    regions = np.zeros((rows, columns), dtype=int)
+    for label, n in enumerate(kept, start=1):
+        regions[found == n] = label
+    return regions

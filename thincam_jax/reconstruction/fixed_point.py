@@ -1,0 +1,141 @@
+r"""ADMM-TV as one differentiable function: a fixed point, and its implicit gradient.
+
+`drive` runs an iteration from outside and cannot be differentiated. Here it is one compiled
+`optimistix.fixed_point`: f* = image(q*), q* = T(q*; θ), so that by the implicit function theorem
+
+.. math:: \frac{dq^*}{d\theta} = (1 - J)^{-1}\,\partial_\theta T,\qquad J = \partial_q T
+
+whatever way q* was found. Neither iterations nor their number are stored. T is averaged, so the
+series Σ Jⁿ that `NeumannSeries` sums converges as the iteration itself does.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import lineax as lx
+import optimistix as optx
+from jaxtyping import Array, Bool, Float, Int, PyTree
+
+from thincam_jax.reconstruction.admm import (
+    Penalties,
+    Splitting,
+    default_penalties,
+    image_of,
+    start,
+    step,
+)
+from thincam_jax.reconstruction.problem import Deconvolution
+
+
+class FixedPoint(NamedTuple):
+    """An image, and whether it is one: iterations done, converged before they ran out."""
+
+    image: Float[Array, "*batch channel plane y x"]
+    iterations: Int[Array, ""]
+    converged: Bool[Array, ""]
+
+
+class NeumannSeries(lx.AbstractLinearSolver):
+    r"""Solves (J − 1) w = v by w ← J w − v, for the Jacobian of a fixed-point iteration.
+
+    It is to an averaged map what conjugate gradients are to a symmetric one: it needs one vector,
+    and converges also where 1 − J is singular in directions on which nothing depends (the forces of
+    constraints that hold exactly), if only as fast as the iteration.
+
+    - `tolerance`: on the change of w, relative to w, both in the root mean square.
+    - `max_steps`: when to give up; the sum so far is returned, without a sign of it, and may be
+      some ten per cent short where the iteration itself converges slowly. Compare another number.
+    """
+
+    tolerance: float = 1e-6
+    max_steps: int = 5000
+
+    def init(self, operator: lx.AbstractLinearOperator, options: dict[str, Any]):
+        return lx.linearise(operator)
+
+    def compute(self, state, vector: PyTree[Array], options: dict[str, Any]):
+        def unfinished(carry):
+            _, change, count = carry
+            return (change > self.tolerance) & (count < self.max_steps)
+
+        def body(carry):
+            w, _, count = carry
+            residual = jax.tree.map(jnp.subtract, state.mv(w), vector)
+            w = jax.tree.map(jnp.add, w, residual)
+            size = _norm(w)
+            change = jnp.where(size > 0, _norm(residual) / jnp.where(size > 0, size, 1), 0)
+            return w, change, count + 1
+
+        first = jax.tree.map(jnp.negative, vector)
+        begin = (first, jnp.full_like(_norm(first), jnp.inf), 0)
+        solution, _, count = jax.lax.while_loop(unfinished, body, begin)
+        return solution, lx.RESULTS.successful, {"num_steps": count, "max_steps": self.max_steps}
+
+    def transpose(self, state, options: dict[str, Any]):
+        return state.transpose(), options
+
+    def conj(self, state, options: dict[str, Any]):
+        return lx.conj(state), options
+
+    def assume_full_rank(self) -> bool:
+        return True
+
+
+def solve_fixed_point(
+    problem: Deconvolution,
+    image: Float[Array, "*batch channel plane y x"],
+    *,
+    iterations: int = 500,
+    tolerance: float = 1e-6,
+    relaxation=1.8,
+    penalties: Penalties | None = None,
+    adjoint: lx.AbstractLinearSolver | None = None,
+) -> FixedPoint:
+    """The minimiser of a `Deconvolution` from a first image, for use under jit, grad and vmap.
+
+    Differentiable in captures, PSFs (and so in what they were computed from: β, d, λ), τ and
+    weights. The gradient is that of the minimiser, not of the iteration: with few iterations, or a
+    loose tolerance, it is as far from differences of results as these are from the minimum. The
+    penalties and the first image move the minimiser nowhere, and have no gradient.
+
+    **Arguments**
+
+    - `iterations`: at most; `tolerance`: on the change of the state in one iteration, root mean
+      square, in units in which captures are about 1.
+    - `relaxation`: α of `thincam_jax.reconstruction.admm`.
+    - `adjoint`: the linear solver of the gradient, default `NeumannSeries()`.
+    """
+    splitting = Splitting(problem)
+    penalties = default_penalties(splitting) if penalties is None else penalties
+    dtype = problem.captures[0].dtype
+    first = jax.lax.stop_gradient(start(splitting, image))
+    solution = optx.fixed_point(
+        _next_state,
+        optx.FixedPointIteration(rtol=0.0, atol=tolerance, norm=_root_mean_square),
+        first,
+        args=(splitting, penalties, jnp.asarray(relaxation, dtype)),
+        max_steps=iterations,
+        adjoint=optx.ImplicitAdjoint(adjoint or NeumannSeries()),
+        throw=False,
+    )
+    return FixedPoint(
+        image_of(splitting, solution.value),
+        jnp.asarray(solution.stats["num_steps"]),
+        solution.result == optx.RESULTS.successful,
+    )
+
+
+def _next_state(state, args):
+    """The map T, at module level so that a new problem of old shape is not compiled anew."""
+    splitting, penalties, relaxation = args
+    return step(splitting, penalties, relaxation, state)
+
+
+def _root_mean_square(tree: PyTree[Array]) -> Float[Array, ""]:
+    """In the default precision, which optimistix compares it with."""
+    return optx.rms_norm(tree).astype(float)
+
+
+def _norm(tree: PyTree[Array]) -> Float[Array, ""]:
+    return jnp.sqrt(sum(jnp.sum(x**2) for x in jax.tree.leaves(tree)))

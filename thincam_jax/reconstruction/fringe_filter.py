@@ -1,0 +1,130 @@
+r"""The conventional reconstruction: fringe scanning and the geometric inverse filter."""
+
+import math
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Complex, Float
+
+from thincam_jax._core import checks
+from thincam_jax._core.grids import Grid, fast_shape, same_parity
+from thincam_jax._core.precision import phasor, turn_phasor
+from thincam_jax.lensless.camera import LenslessCamera
+from thincam_jax.lensless.masks.fza import FresnelZoneAperture
+from thincam_jax.reconstruction.result import Reconstruction
+
+
+class FringeScanning(eqx.Module):
+    r"""Four captures with the phases 0, π/2, π, 3π/2 and the inverse of the mask's shadow.
+
+    .. math::
+        G_{FS} = j\,(G_0 - G_\pi) + (G_{3\pi/2} - G_{\pi/2}),\qquad
+        \hat F = G_{FS}\, \frac{\beta'}{\pi} \exp(-j\pi^2\rho^2/\beta'),\quad \beta' = \beta/M^2
+
+    (thesis Eq 3.14-3.17 with the dropped factor π/β and the magnification M restored). It knows
+    nothing of diffraction, and so shows the zeros of cos(πλdρ²/…) as missing frequencies. Where the
+    filter's chirp turns by more than π between frequencies of the padded window it is set to
+    zero; for a mask no larger than the sensor nothing but noise lies there.
+
+    **Arguments**: `cameras`, four with one sensor, distance and β, in the order of the phases;
+    `object_distance` t in mm; `field_shape`, pixels of the result at the object pitch p·t/d.
+    """
+
+    inverse: Complex[Array, "v u"]
+    object_pitch: Float[Array, ""]
+    sensor_shape: tuple[int, int] = eqx.field(static=True)
+    field_shape: tuple[int, int] = eqx.field(static=True)
+
+    def __init__(
+        self,
+        cameras: Sequence[LenslessCamera],
+        *,
+        object_distance,
+        field_shape: tuple[int, int] | None = None,
+    ):
+        beta, camera = _check_phases(cameras), cameras[0]
+        sensor = camera.sensor.grid
+        self.sensor_shape = sensor.shape
+        self.field_shape = same_parity(field_shape or sensor.shape, sensor.shape)
+        sizes = zip(sensor.shape, self.field_shape, strict=True)
+        rows, columns = (s + max(s, f) for s, f in sizes)
+        padded = fast_shape((rows, columns))
+        object_distance = checks.positive("object_distance", object_distance, "mm")
+        magnification = 1 + camera.distance / object_distance
+        grid = Grid(padded, sensor.pitch)
+        self.inverse = _inverse_filter(grid, beta, magnification, camera.mask.centre)
+        self.object_pitch = sensor.pitch * object_distance / camera.distance
+
+    def __call__(self, captures: Float[Array, "capture *batch y x"]) -> Reconstruction:
+        """The reconstruction of captures (4, *batch, y, x), in the order of the phases."""
+        captures = jnp.asarray(captures, dtype=self.object_pitch.dtype)
+        if captures.shape[0] != 4 or captures.shape[-2:] != self.sensor_shape:
+            raise ValueError(
+                f"captures have shape {captures.shape}; give (4, …, {self.sensor_shape[0]}, "
+                f"{self.sensor_shape[1]}), in the order of the phases 0, π/2, π, 3π/2"
+            )
+        count, *batch, rows, columns = captures.shape
+        flat = captures.reshape(count, -1, rows, columns)
+        images = [self._image(flat[:, i]) for i in range(flat.shape[1])]
+        return Reconstruction(
+            jnp.stack(images).reshape(*batch, *self.field_shape), self.object_pitch
+        )
+
+    @eqx.filter_jit
+    def _image(self, captures: Float[Array, "4 y x"]) -> Float[Array, "m n"]:
+        scanned = jax.lax.complex(captures[3] - captures[1], captures[0] - captures[2])
+        padded = self.inverse.shape
+        margins = [(0, p - s) for p, s in zip(padded, scanned.shape, strict=True)]
+        spectrum = jnp.fft.fft2(jnp.pad(scanned, margins)) * self.inverse
+        full = jnp.fft.ifft2(spectrum).real
+        # Sample j of the field is sample j + (sensor − field)/2 of the sensor.
+        shift = [(f - s) // 2 for f, s in zip(self.field_shape, self.sensor_shape, strict=True)]
+        field = jnp.roll(full, shift, axis=(0, 1))[: self.field_shape[0], : self.field_shape[1]]
+        return field[::-1, ::-1]
+
+
+@jax.jit
+def _inverse_filter(grid: Grid, beta, magnification, centre) -> Complex[Array, "v u"]:
+    """(β'/π)·exp(−jπ²ρ²/β') where the window samples it, zero elsewhere."""
+    beta = beta / magnification**2
+    v, u = jnp.fft.ifftshift(grid.v)[:, None], jnp.fft.ifftshift(grid.u)
+    sampled = (jnp.abs(v) < beta * grid.shape[0] * grid.pitch / (2 * jnp.pi)) & (
+        jnp.abs(u) < beta * grid.shape[1] * grid.pitch / (2 * jnp.pi)
+    )
+    gain = jnp.where(sampled, beta / jnp.pi, 0.0)
+    filtered = phasor(-(jnp.pi**2) * (u**2 + v**2) / beta)
+    # A mask beside the axis shifts the shadow by M times its centre.
+    down, right = magnification * centre
+    return gain.astype(filtered.dtype) * filtered * turn_phasor(v * down + u * right)
+
+
+def _check_phases(cameras: Sequence[LenslessCamera]) -> Float[Array, ""]:
+    masks = [c.mask for c in cameras if isinstance(c.mask, FresnelZoneAperture)]
+    if len(cameras) != 4 or len(masks) != 4:
+        raise ValueError(
+            f"fringe scanning takes four cameras with a FresnelZoneAperture; got {len(cameras)}"
+        )
+    phases = np.array([float(m.phase) for m in masks])
+    wanted = np.arange(4) * math.pi / 2
+    if np.abs(np.exp(1j * phases) - np.exp(1j * wanted)).max() > 1e-3:
+        raise ValueError(
+            f"phases are {np.round(phases, 4).tolist()} rad; give 0, π/2, π, 3π/2 in this order"
+        )
+    settings = {
+        (float(c.distance), c.sensor.shape, float(c.sensor.pitch)) + _fixed_numbers(m)
+        for c, m in zip(cameras, masks, strict=True)
+    }
+    if len(settings) > 1:
+        raise ValueError(
+            "the four cameras differ in distance, sensor or mask; make them equal "
+            "in all but the phase"
+        )
+    return masks[0].beta
+
+
+def _fixed_numbers(mask: FresnelZoneAperture) -> tuple:
+    numbers = mask.beta, mask.width, mask.fill_factor, *mask.centre
+    return *(float(n) for n in numbers), mask.profile, mask.harmonics, mask.pixels

@@ -1,0 +1,76 @@
+r"""Which captures are added and subtracted before the deconvolution.
+
+A synthesis is a real matrix W (channel × capture): the channel c is Σ_k W_ck g_k, and its response
+Σ_k W_ck H_k. The fringe-scanned response of the thesis is complex; its real and imaginary parts are
+two real channels here, so that results are real without a projection and noise is counted right.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+import scipy.linalg
+
+from thincam_jax.lensless.camera import LenslessCamera
+
+
+def separate(count: int) -> np.ndarray:
+    """Every capture a channel of its own: one capture, or colour channels."""
+    return np.eye(count)
+
+
+def fringe_scanning(groups: int) -> np.ndarray:
+    """Captures in groups of four phases 0, π/2, π, 3π/2 (thesis Eq 3.14, 3.31, corrected).
+
+    For each group the channels H(3π/2) − H(π/2) and H(0) − H(π), which are (π/β)cos X and
+    (π/β)sin X times the diffraction term, X = π²ρ²/β: constant and second harmonic cancel.
+    """
+    return np.kron(np.eye(groups), np.array([[0.0, -1.0, 0.0, 1.0], [1.0, 0.0, -1.0, 0.0]]))
+
+
+def phase_pairs(groups: int) -> np.ndarray:
+    """Captures in pairs of phases 0, 3π/2: H(0) − H(3π/2) of each (thesis Eq 3.49, corrected).
+
+    The constant cancels; the second harmonic, and with it twice the aperture's cut-off, stays.
+    """
+    return np.kron(np.eye(groups), np.array([[1.0, -1.0]]))
+
+
+def contrasts(count: int) -> np.ndarray:
+    """All that captures say beside their common background: count − 1 orthonormal sums.
+
+    Masks of one width at one distance cast the same background, whatever their β and phase, so
+    that it cancels wherever the weights of a row add up to zero. Pairs of two β leave one such sum
+    unused, (g₁ + g₂) − (g₃ + g₄), which has fringes as strong as theirs. Rows are those of
+    Helmert's matrix; for captures of equal noise any other orthonormal ones say the same.
+    """
+    if count < 2:
+        raise ValueError(f"contrasts of {count} captures; give at least 2")
+    return scipy.linalg.helmert(count)
+
+
+def keep_bias(synthesis: np.ndarray) -> np.ndarray:
+    """Which channels keep the captures' common background: those whose weights do not cancel."""
+    return np.abs(synthesis.sum(axis=1)) > 1e-6
+
+
+def check_synthesis(
+    synthesis: np.ndarray, cameras: Sequence[LenslessCamera], ratios: Sequence[float]
+) -> None:
+    """Refuse what does not add captures of one scale, or counts noise twice."""
+    if synthesis.ndim != 2 or synthesis.shape[1] != len(cameras):
+        raise ValueError(
+            f"synthesis has shape {synthesis.shape}; give (channels, {len(cameras)}), "
+            "one column for each camera"
+        )
+    if not np.any(synthesis, axis=1).all():
+        raise ValueError("synthesis has a row of zeros: every channel needs a capture")
+    for row in synthesis:
+        used = {r for w, r in zip(row, ratios, strict=True) if w}
+        if len(used) > 1:
+            raise ValueError("a channel combines captures at different distances; make them two")
+    gram = synthesis @ synthesis.T
+    if np.abs(gram - np.diag(np.diag(gram))).max() > 1e-9 * np.abs(gram).max():
+        raise ValueError("channels share noise: make the rows of synthesis orthogonal")
+    grids = {(c.sensor.shape, float(c.sensor.pitch)) for c in cameras}
+    if len(grids) > 1:
+        raise ValueError(f"cameras have different sensors {sorted(grids)}; use one sensor")

@@ -1,0 +1,207 @@
+r"""Total variation of an image, its proximal map, and the differences it is made of."""
+
+import functools
+from typing import Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.custom_derivatives import SymbolicZero
+from jaxtyping import Array, Float
+
+from thincam_jax._core import checks
+
+Kind = Literal["isotropic", "anisotropic"]
+Coupling = Literal["none", "joint", "opponent"]
+
+# Red, green, blue to grey, red-green, yellow-blue; orthonormal, so that white noise stays white.
+OPPONENT = np.array([[1, 1, 1], [1, -1, 0], [1, 1, -2]]) / np.sqrt([[3], [2], [6]])
+
+
+class TotalVariation(eqx.Module):
+    r"""Total variation of images (*batch, channel, plane, y, x), and how its parts are joined.
+
+    .. math:: TV(f) = \sum_{c,\mathbf r} w_c\, \|(\partial_y f_c, \partial_x f_c,
+        \delta\, \partial_z f_c)(\mathbf r)\|
+
+    with forward differences (thesis Eq 5.11, Ψ). No difference leaves the image: its border costs
+    nothing.
+
+    **Arguments**
+
+    - `kind`: "isotropic" takes the length of the vector of differences, "anisotropic" the sum of
+      their absolute values, which favours edges along the axes.
+    - `coupling`: of colours. "none": each channel by itself. "joint": one length over all channels
+      (vectorial total variation), so that edges lie in the same place. "opponent" (three channels):
+      the sum of the variations of grey and of the two colour differences. Noise of three
+      channels is averaged in grey, and colours vary less than grey in most scenes.
+    - `depth_weight`: δ, the weight of a difference between planes; 0 leaves planes independent.
+    - `chroma_weight`: weight of the two colour differences with "opponent".
+    """
+
+    depth_weight: Float[Array, ""]
+    chroma_weight: Float[Array, ""]
+    kind: Kind = eqx.field(static=True)
+    coupling: Coupling = eqx.field(static=True)
+
+    def __init__(
+        self,
+        kind: Kind = "isotropic",
+        coupling: Coupling = "none",
+        *,
+        depth_weight=0.0,
+        chroma_weight=1.5,
+    ):
+        checks.choice("kind", kind, ("isotropic", "anisotropic"))
+        checks.choice("coupling", coupling, ("none", "joint", "opponent"))
+        self.kind, self.coupling = kind, coupling
+        self.depth_weight = checks.non_negative("depth_weight", depth_weight, "parts of one")
+        self.chroma_weight = checks.non_negative("chroma_weight", chroma_weight, "parts of one")
+
+    def __call__(self, image: Float[Array, "*batch channel plane y x"]) -> Float[Array, "*batch"]:
+        """The total variation."""
+        shape = image.shape[-2:]
+        slopes = differences(image, self.depth_weight)
+        rotated = self._rotate(within_field(slopes, field_masks(shape, shape)))
+        lengths = self._length(rotated) * self._channel_weights(image.dtype)
+        axes = (-4, -3, -2, -1)
+        return jnp.sum(lengths, axis=axes)
+
+    def prox(
+        self, slopes: tuple[Float[Array, "*batch channel plane y x"], ...], step
+    ) -> tuple[Float[Array, "*batch channel plane y x"], ...]:
+        """The slopes u that minimise step·TV + ½‖u − slopes‖²: each vector shortened by `step`."""
+        rotated = self._rotate(slopes)
+        weights = self._channel_weights(slopes[0].dtype)
+        channels, step = self.coupling == "joint", step * weights
+        if self.kind == "isotropic":
+            shrunk = _shortened(rotated, step, channels)
+        else:
+            shrunk = tuple(_shortened((s,), step, channels)[0] for s in rotated)
+        return self._rotate(shrunk, back=True)
+
+    def _length(self, slopes):
+        """Lengths of the joined vectors; summed over directions if these are apart."""
+        channels = self.coupling == "joint"
+        if self.kind == "isotropic":
+            return _norm(slopes, channels=channels)
+        return sum(_norm((s,), channels=channels) for s in slopes)
+
+    def _rotate(self, slopes, *, back: bool = False):
+        if self.coupling != "opponent":
+            return slopes
+        channels = slopes[0].shape[-4]
+        if channels != 3:
+            raise ValueError(
+                f'coupling "opponent" is for 3 colour channels, the image has {channels}; '
+                'use "joint" or "none"'
+            )
+        matrix = jnp.asarray(OPPONENT.T if back else OPPONENT, dtype=slopes[0].dtype)
+        return tuple(jnp.einsum("dc,...czyx->...dzyx", matrix, s) for s in slopes)
+
+    def _channel_weights(self, dtype):
+        if self.coupling != "opponent":
+            return jnp.ones((1, 1, 1, 1), dtype)
+        chroma = self.chroma_weight.astype(dtype)
+        return jnp.stack([jnp.ones((), dtype), chroma, chroma])[:, None, None, None]
+
+
+def differences(
+    image: Float[Array, "*batch plane y x"], depth_weight
+) -> tuple[Float[Array, "*batch plane y x"], ...]:
+    """Forward differences along y and x, round the window's end, and between planes.
+
+    The last plane's difference is zero; without several planes there is none.
+    """
+    down = jnp.roll(image, -1, axis=-2) - image
+    right = jnp.roll(image, -1, axis=-1) - image
+    if image.shape[-3] == 1:
+        return down, right
+    behind = jnp.diff(image, axis=-3, append=image[..., -1:, :, :])
+    return down, right, jnp.asarray(depth_weight, image.dtype) * behind
+
+
+def differences_adjoint(
+    slopes: tuple[Float[Array, "*batch plane y x"], ...], depth_weight
+) -> Float[Array, "*batch plane y x"]:
+    """The transpose of `differences`."""
+    down, right, *depth = slopes
+    image = (jnp.roll(down, 1, axis=-2) - down) + (jnp.roll(right, 1, axis=-1) - right)
+    for behind in depth:
+        behind = jnp.asarray(depth_weight, image.dtype) * behind[..., :-1, :, :]
+        margins = [(0, 0)] * (behind.ndim - 3)
+        before = jnp.pad(behind, [*margins, (1, 0), (0, 0), (0, 0)])
+        image = image + before - jnp.pad(behind, [*margins, (0, 1), (0, 0), (0, 0)])
+    return image
+
+
+def field_masks(field_shape, window, corner=(0, 0)) -> tuple[tuple[Array, Array], ...]:
+    """Where the differences down, right and behind lie inside of the field, on a window.
+
+    A column and a row of booleans each, both of which hold there: no mask of the window's size
+    becomes a constant, and none is kept for a gradient.
+    """
+    rows, columns = (np.arange(n) - c for n, c in zip(window, corner, strict=True))
+    height, width = field_shape
+    y, y_down = (jnp.asarray((rows >= 0) & (rows < n))[:, None] for n in (height, height - 1))
+    x, x_right = (jnp.asarray((columns >= 0) & (columns < n)) for n in (width, width - 1))
+    return (y_down, x), (y, x_right), (y, x)
+
+
+def within_field(slopes, masks):
+    """Slopes with those that leave the field set to zero."""
+    lines = [[m.astype(s.dtype) for m in pair] for pair, s in zip(masks, slopes, strict=False)]
+    return tuple(s * y * x for s, (y, x) in zip(slopes, lines, strict=True))
+
+
+def _norm(slopes, *, channels: bool):
+    """Length of vectors of slopes, over the channel axis too if these are joined."""
+    squared = sum(s * s for s in slopes)
+    if channels:
+        squared = jnp.sum(squared, axis=-4, keepdims=True)
+    # The root's derivative at zero is infinite: keep it out of reach.
+    zero = squared == 0
+    return jnp.where(zero, 0, jnp.sqrt(jnp.where(zero, 1, squared)))
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(2,))
+def _shortened(slopes, step, channels: bool):
+    """Vectors of slopes, over the channel axis too if these are joined, shortened by `step`."""
+    kept, _, _ = _kept(slopes, step, channels)
+    return tuple(s * kept for s in slopes)
+
+
+@functools.partial(_shortened.defjvp, symbolic_zeros=True)
+def _shortened_slope(channels: bool, primals, tangents):
+    r"""With the part k that is kept and the direction n, k ds + (1 − k) n (n·ds) − n dstep.
+
+    Written out so that a gradient holds k and n alone: the compiler's own holds four times as much.
+    """
+    (slopes, step), (turns, change) = primals, tangents
+    kept, longer, length = _kept(slopes, step, channels)
+    direction = tuple(jnp.where(longer, s / length, 0) for s in slopes)
+    turns = [
+        jnp.zeros_like(s) if isinstance(t, SymbolicZero) else t
+        for t, s in zip(turns, slopes, strict=True)
+    ]
+    along = sum(n * t for n, t in zip(direction, turns, strict=True))
+    if channels:
+        along = jnp.sum(along, axis=-4, keepdims=True)
+    out = tuple(
+        kept * t + n * (along - kept * along) for n, t in zip(direction, turns, strict=True)
+    )
+    if not isinstance(change, SymbolicZero):
+        out = tuple(t - n * change for n, t in zip(direction, out, strict=True))
+    return tuple(s * kept for s in slopes), out
+
+
+def _kept(slopes, step, channels: bool):
+    """The part of a vector that shortening leaves, max(0, 1 − step/length).
+
+    With where it leaves any, and the length there (1 elsewhere).
+    """
+    whole = _norm(slopes, channels=channels)
+    longer = whole > step
+    length = jnp.where(longer, whole, 1)
+    return jnp.where(longer, 1 - step / length, 0), longer, length

@@ -1,6 +1,0 @@
-"""Which model is the cheapest that is accurate enough, found from one-dimensional fields."""
-
-from thincam_jax.selection.select import Prediction as Prediction
-from thincam_jax.selection.select import Selection as Selection
-from thincam_jax.selection.select import predict_error as predict_error
-from thincam_jax.selection.select import select_model as select_model
