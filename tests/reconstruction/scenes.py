@@ -7,7 +7,7 @@ import numpy as np
 
 from thincam_jax.imaging.operators import CropConvolution
 from thincam_jax.imaging.operators.crop_convolution import kernel_shape
-from thincam_jax.reconstruction.problem import Deconvolution
+from thincam_jax.reconstruction.problem import InverseProblem
 
 SENSOR, FIELD = (24, 29), (18, 21)
 
@@ -55,6 +55,17 @@ def convolution(
     return CropConvolution(jnp.asarray(stack), pitch, sensor, field, summed=1)
 
 
+def inverse(operators, captures, *, tau, **settings):
+    """A problem with τ in absolute units, as the dense references want it."""
+    return absolute(InverseProblem(operators, captures, **settings), tau)
+
+
+def absolute(problem: InverseProblem, tau) -> InverseProblem:
+    """The problem with another τ, given in absolute units."""
+    tau = jnp.asarray(tau, problem.tau.dtype)
+    return eqx.tree_at(lambda p: p.tau, problem, tau / problem.tau_unit)
+
+
 def problem(
     sensor=SENSOR,
     field=FIELD,
@@ -81,10 +92,10 @@ def problem(
     rng = np.random.default_rng(11)
     seen = [operator(truth) for operator in operators]
     noisy = [g + noise * float(jnp.max(g)) * jnp.asarray(rng.normal(size=g.shape)) for g in seen]
-    return Deconvolution(operators, noisy, tau=tau, **settings), truth
+    return inverse(operators, noisy, tau=tau, **settings), truth
 
 
-def single(problem: Deconvolution) -> Deconvolution:
+def single(problem: InverseProblem) -> InverseProblem:
     """The same in float32."""
 
     def cast(leaf):
@@ -94,7 +105,7 @@ def single(problem: Deconvolution) -> Deconvolution:
     return jax.tree.map(cast, problem)
 
 
-def rescaled(problem: Deconvolution, factor: float) -> Deconvolution:
+def rescaled(problem: InverseProblem, factor: float) -> InverseProblem:
     """All captures, and τ with them, times a factor: the minimiser is that times the factor."""
     captures = tuple(c * jnp.asarray(factor, c.dtype) for c in problem.captures)
     tau = problem.tau * jnp.asarray(factor, problem.tau.dtype)

@@ -16,7 +16,8 @@ from thincam_jax.commands.design.command import design
 from thincam_jax.commands.photo.command import reconstruct
 from thincam_jax.commands.refocus.command import refocus
 from thincam_jax.commands.refocus.config import RefocusConfig, load_experiment
-from thincam_jax.commands.study import RunFolder, check_study
+from thincam_jax.commands.run_folder import RunFolder
+from thincam_jax.commands.study import check_study
 from thincam_jax.commands.study.config import StudyConfig, load_config, slug
 from thincam_jax.commands.study.run import run_study, steps
 from thincam_jax.commands.sweep.command import sweep

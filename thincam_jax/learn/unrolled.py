@@ -18,18 +18,10 @@ import optax
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from thincam_jax._core import checks
-from thincam_jax.reconstruction.admm import (
-    Penalties,
-    Splitting,
-    State,
-    default_penalties,
-    image_of,
-    start,
-    step,
-)
+from thincam_jax.reconstruction.admm import splitting_of
 from thincam_jax.reconstruction.drive import Outcome, Progress, Status
-from thincam_jax.reconstruction.problem import Deconvolution, objective
-from thincam_jax.reconstruction.scaled import even_image
+from thincam_jax.reconstruction.problem import InverseProblem, objective, uniform_image
+from thincam_jax.reconstruction.splitting import AbstractSplitting, Penalties, State, admm_map
 
 
 class UnrolledAdmm(eqx.Module):
@@ -51,12 +43,12 @@ class UnrolledAdmm(eqx.Module):
     threshold: Float[Array, " iteration"]
     relaxation: Float[Array, " iteration"]
 
-    def __init__(self, problem: Deconvolution, iterations: int = 5):
+    def __init__(self, problem: InverseProblem, iterations: int = 5):
         """Untrained: plain ADMM with the default penalties of a problem, and its τ."""
         if iterations < 1:
             raise ValueError(f"iterations = {iterations}: give at least 1")
-        splitting = jax.jit(Splitting)(problem)
-        penalties = default_penalties(splitting)
+        splitting = splitting_of(problem)
+        penalties = splitting.penalties
 
         def repeated(value):
             return jnp.full(iterations, _before_softplus(value))
@@ -69,13 +61,13 @@ class UnrolledAdmm(eqx.Module):
         self.threshold = repeated(jnp.maximum(splitting.tau / penalties.variation, least))
         self.relaxation = repeated(jnp.ones_like(splitting.tau))
 
-    def __call__(self, problem: Deconvolution) -> Float[Array, "*batch channel plane y x"]:
-        """The image after all iterations, from the even one; the problem's τ is not used."""
+    def __call__(self, problem: InverseProblem) -> Float[Array, "*batch channel plane y x"]:
+        """The image after all iterations, from the uniform one; the problem's τ is not used."""
         return self.images(problem)[-1]
 
-    def images(self, problem: Deconvolution) -> Float[Array, "iteration *batch channel plane y x"]:
+    def images(self, problem: InverseProblem) -> Float[Array, "iteration *batch channel plane y x"]:
         """The image after each iteration."""
-        captures, weights = _members(problem)
+        captures, weights = _elements(problem)
         images = jax.vmap(_iterated, in_axes=(None, None, 0, 0))(self, problem, captures, weights)
         return jnp.moveaxis(images, 0, 1).reshape(self.data.shape[0], *problem.image_shape)
 
@@ -86,28 +78,30 @@ class UnrolledAdmm(eqx.Module):
         return data, variation, image, threshold, relaxation
 
 
-def _iterated(model: UnrolledAdmm, problem: Deconvolution, captures, weights):
-    """The images of one member of a batch."""
+def _iterated(model: UnrolledAdmm, problem: InverseProblem, captures, weights):
+    """The images of one batch element."""
     problem = eqx.tree_at(lambda p: (p.captures, p.weights), problem, (captures, weights))
-    splitting = Splitting(problem)
-    first = start(splitting, even_image(problem))
+    splitting = splitting_of(problem)
+    first = splitting.start(uniform_image(problem))
     # A loop, since the derivative of a straight program takes long to compile.
     iterate = functools.partial(_iterate, splitting)
     _, images = jax.lax.scan(iterate, first, model.parameters())
     return images
 
 
-def _iterate(splitting: Splitting, state: State, parameters):
+def _iterate(splitting: AbstractSplitting, state: State, parameters):
     """One iteration with its own parameters, and its image."""
     data, variation, image, threshold, relaxation = parameters
-    # `step` shortens slopes by τ/μ₂.
+    # The variation's proximal map shortens slopes by τ/μ₂.
     splitting = eqx.tree_at(lambda s: s.tau, splitting, threshold * variation)
-    state = step(splitting, Penalties(data, variation, image), relaxation, state)
-    return state, image_of(splitting, state)
+    splitting = splitting.with_penalties(Penalties(data, variation, image))
+    mapped = admm_map(state, splitting)
+    state = jax.tree.map(lambda q, t: q + relaxation * (t - q), state, mapped)
+    return state, splitting.image(state)
 
 
-def _members(problem: Deconvolution):
-    """Captures and weights with one batch axis, (member, channel, y, x)."""
+def _elements(problem: InverseProblem):
+    """Captures and weights with one batch axis, (element, channel, y, x)."""
     captures = tuple(c.reshape(-1, *c.shape[-3:]) for c in problem.captures)
     pairs = zip(problem.weights, problem.captures, strict=True)
     weights = tuple(jnp.broadcast_to(w, c.shape).reshape(-1, *c.shape[-3:]) for w, c in pairs)
@@ -117,7 +111,7 @@ def _members(problem: Deconvolution):
 class Training(NamedTuple):
     """The best model by its loss, and the loss before each step.
 
-    - `status`: "converged" never: "iterations_exhausted", or "non_finite" if a loss was no number,
+    - `status`: "converged" never: "iterations_exhausted", or "non_finite" if a loss was NaN,
       after which training stops.
     """
 
@@ -128,7 +122,7 @@ class Training(NamedTuple):
 
 def train(
     model: UnrolledAdmm,
-    problem: Deconvolution,
+    problem: InverseProblem,
     images: Float[Array, "pair channel plane y x"],
     *,
     key: PRNGKeyArray,
@@ -165,7 +159,7 @@ def train(
     return Training(best, tuple(losses), "iterations_exhausted")
 
 
-def solve_unrolled(problem: Deconvolution, model: UnrolledAdmm) -> Outcome:
+def solve_unrolled(problem: InverseProblem, model: UnrolledAdmm) -> Outcome:
     """The image of a problem by a (trained) model.
 
     It is the last one, whatever the problem's objective makes of it; the history holds that
@@ -184,7 +178,7 @@ def solve_unrolled(problem: Deconvolution, model: UnrolledAdmm) -> Outcome:
 
 @jax.jit
 def training_loss(
-    model: UnrolledAdmm, problem: Deconvolution, images: Float[Array, "pair channel plane y x"]
+    model: UnrolledAdmm, problem: InverseProblem, images: Float[Array, "pair channel plane y x"]
 ) -> Float[Array, ""]:
     """Mean over the pairs of ‖image found − image‖²/‖image‖²."""
     axes = (-4, -3, -2, -1)
@@ -194,9 +188,9 @@ def training_loss(
 
 
 @jax.jit
-def _descend(model: UnrolledAdmm, state, rate, problem: Deconvolution, images, chosen):
+def _descend(model: UnrolledAdmm, state, rate, problem: InverseProblem, images, chosen):
     """A step of Adam on some of the pairs."""
-    captures, weights = _members(problem)
+    captures, weights = _elements(problem)
     some = jax.tree.map(lambda x: x[chosen], (captures, weights))
     problem = eqx.tree_at(lambda p: (p.captures, p.weights), problem, some)
     loss, slope = jax.value_and_grad(training_loss)(model, problem, images[chosen])
@@ -207,10 +201,10 @@ def _descend(model: UnrolledAdmm, state, rate, problem: Deconvolution, images, c
 
 
 @jax.jit
-def _followed(model: UnrolledAdmm, problem: Deconvolution):
+def _followed(model: UnrolledAdmm, problem: InverseProblem):
     """The objective before and after each iteration, summed over a batch, and the last image."""
     images = model.images(problem)
-    values = [jnp.sum(objective(problem, f)) for f in (even_image(problem), *images)]
+    values = [jnp.sum(objective(problem, f)) for f in (uniform_image(problem), *images)]
     return jnp.stack(values), images[-1]
 
 
@@ -218,7 +212,7 @@ def _before_softplus(value: Float[Array, ""]) -> Float[Array, ""]:
     return value + jnp.log(-jnp.expm1(-value))
 
 
-def _check_pairs(problem: Deconvolution, images: Array, batch: int) -> None:
+def _check_pairs(problem: InverseProblem, images: Array, batch: int) -> None:
     if len(problem.image_shape) != 5 or images.shape != problem.image_shape:
         raise ValueError(
             f"images have shape {images.shape} for captures {problem.captures[0].shape}; give "

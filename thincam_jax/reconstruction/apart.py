@@ -20,7 +20,8 @@ from jaxtyping import Array, Float
 
 from thincam_jax.imaging.operators import CropConvolution
 from thincam_jax.reconstruction.drive import AbstractMethod, Residuals
-from thincam_jax.reconstruction.problem import Deconvolution
+from thincam_jax.reconstruction.problem import InverseProblem, convolutions
+from thincam_jax.reconstruction.total_variation import TotalVariation
 
 
 class Apart(AbstractMethod[tuple[Any, ...]]):
@@ -32,7 +33,7 @@ class Apart(AbstractMethod[tuple[Any, ...]]):
     methods: tuple[AbstractMethod, ...]
     shape: tuple[int, ...] = eqx.field(static=True)
 
-    def __init__(self, problem: Deconvolution, method: Callable[[Deconvolution], AbstractMethod]):
+    def __init__(self, problem: InverseProblem, method: Callable[[InverseProblem], AbstractMethod]):
         self.shape = problem.image_shape
         self.methods = tuple(_together(method, parts(problem)))
 
@@ -50,14 +51,13 @@ class Apart(AbstractMethod[tuple[Any, ...]]):
         values = _together(lambda m, i: m.objective(i), self.methods, self._split(image))
         return jnp.sum(jnp.stack(values).reshape(*self.shape[:-4], -1), axis=-1)
 
-    def look(self, state):
-        looks = _together(lambda m, s: m.look(s), self.methods, state)
-        states, residuals = zip(*looks, strict=True)
-        primal, dual = (max(r[i] for r in residuals) for i in range(2))
-        return states, Residuals(primal, dual, members=residuals)
+    def residuals(self, state):
+        each = tuple(m.residuals(s) for m, s in zip(self.methods, state, strict=True))
+        primal, dual = max(r.primal for r in each), max(r.dual for r in each)
+        return Residuals(primal, dual, apart=each)
 
     def adapt(self, state, residuals):
-        adapted = _together(lambda m, s, r: m.adapt(s, r), self.methods, state, residuals.members)
+        adapted = _together(lambda m, s, r: m.adapt(s, r), self.methods, state, residuals.apart)
         methods, states = zip(*adapted, strict=True)
         return eqx.tree_at(lambda a: a.methods, self, methods), states
 
@@ -65,43 +65,52 @@ class Apart(AbstractMethod[tuple[Any, ...]]):
         return list(image.reshape(len(self.methods), -1, *self.shape[-3:]))
 
 
-def worth_taking_apart(problem: Deconvolution) -> bool:
-    """On a CPU, and there are parts; other devices have cores for all of them in one program."""
+def worth_taking_apart(problem: InverseProblem) -> bool:
+    """On a CPU, for convolutions, and if there are parts.
+
+    Other devices have cores for all of them in one program, other operators serve them together.
+    """
+    if convolutions(problem) is None:
+        return False
     platforms = {device.platform for device in problem.captures[0].devices()}
     return platforms == {"cpu"} and _count(problem) > 1
 
 
-def parts(problem: Deconvolution) -> list[Deconvolution]:
+def parts(problem: InverseProblem) -> list[InverseProblem]:
     """A problem for each image of the batch and, of colours that are not coupled, each colour."""
     count = _count(problem)
     channels = problem.image_shape[-4]
     colours = channels if _colours_apart(problem) else 1
-    operators = [[_of_colour(o, c, colours) for o in problem.operators] for c in range(colours)]
+    operators = [
+        [_of_colour(o, c, colours) for o in convolutions(problem) or ()] for c in range(colours)
+    ]
     captures = [c.reshape(count, channels // colours, *c.shape[-2:]) for c in problem.captures]
     weights = [
         _weights_of_parts(w, c, count, colours)
         for w, c in zip(problem.weights, problem.captures, strict=True)
     ]
     return [
-        Deconvolution(
-            operators[i % colours],
-            [c[i] for c in captures],
-            tau=problem.tau,
-            weights=[w[i] for w in weights],
-            variation=problem.variation,
-            nonnegative=problem.nonnegative,
+        eqx.tree_at(
+            lambda p: (p.operators, p.captures, p.weights),
+            problem,
+            (
+                tuple(operators[i % colours]),
+                tuple(c[i] for c in captures),
+                tuple(w[i] for w in weights),
+            ),
         )
         for i in range(count)
     ]
 
 
-def _count(problem: Deconvolution) -> int:
+def _count(problem: InverseProblem) -> int:
     channels = problem.image_shape[-4] if _colours_apart(problem) else 1
     return math.prod(problem.image_shape[:-4]) * channels
 
 
-def _colours_apart(problem: Deconvolution) -> bool:
-    return problem.variation.coupling == "none"
+def _colours_apart(problem: InverseProblem) -> bool:
+    regulariser = problem.regulariser
+    return isinstance(regulariser, TotalVariation) and regulariser.coupling == "none"
 
 
 def _of_colour(operator: CropConvolution, colour: int, colours: int) -> CropConvolution:

@@ -8,25 +8,24 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optax
-import scipy.optimize
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from thincam_jax.reconstruction.admm import AdmmMethod
 from thincam_jax.reconstruction.drive import drive
 from thincam_jax.reconstruction.fixed_point import solve_fixed_point
-from thincam_jax.reconstruction.problem import Deconvolution, misfit, residuals
-from thincam_jax.reconstruction.tv_method import AdmmTotalVariation
+from thincam_jax.reconstruction.problem import InverseProblem, misfit, residuals, see, with_tau
 
 
 class ChosenTau(NamedTuple):
     """A problem with its τ found, its image, and (τ, criterion) of all that were tried."""
 
-    problem: Deconvolution
+    problem: InverseProblem
     image: Float[Array, "*batch channel plane y x"]
     tried: tuple[tuple[float, float], ...]
 
 
 def discrepancy_tau(
-    problem: Deconvolution,
+    problem: InverseProblem,
     image: Float[Array, "*batch channel plane y x"],
     *,
     iterations: int = 50,
@@ -57,7 +56,7 @@ def discrepancy_tau(
 
 
 def sure_tau(
-    problem: Deconvolution,
+    problem: InverseProblem,
     image: Float[Array, "*batch channel plane y x"],
     key: PRNGKeyArray,
     *,
@@ -94,6 +93,8 @@ def sure_tau(
         return value
 
     bracket = math.log(centre / span), math.log(centre * span)
+    import scipy.optimize  # at once is too early: it takes a tenth of a second
+
     found = scipy.optimize.minimize_scalar(
         criterion, bounds=bracket, method="bounded", options={"maxiter": solves}
     )
@@ -102,7 +103,7 @@ def sure_tau(
 
 
 def learn_tau(
-    problems: Sequence[Deconvolution],
+    problems: Sequence[InverseProblem],
     images: Sequence[Float[Array, "*batch channel plane y x"]],
     *,
     steps: int = 30,
@@ -137,11 +138,6 @@ def mean_squared_error(image: Float[Array, "..."], truth: Float[Array, "..."]) -
     return jnp.mean((image - truth) ** 2)
 
 
-def with_tau(problem: Deconvolution, tau) -> Deconvolution:
-    """The same problem with another τ."""
-    return eqx.tree_at(lambda p: p.tau, problem, jnp.asarray(tau, problem.tau.dtype))
-
-
 @eqx.filter_jit
 def _loss_and_slope(logarithm, problem, truth, measure, iterations: int):
     return jax.value_and_grad(_outer)(logarithm, problem, truth, measure, iterations)
@@ -154,14 +150,14 @@ def _outer(logarithm, problem, truth, measure, iterations: int):
     return measure(solution.image, truth)
 
 
-def _known_tau(problem: Deconvolution) -> float:
+def _known_tau(problem: InverseProblem) -> float:
     tau = float(problem.tau)
     if not tau > 0:
         raise ValueError(f"tau = {tau:g}: a search by factors begins above 0; give tau > 0")
     return tau
 
 
-def _full(problem: Deconvolution):
+def _full(problem: InverseProblem):
     pairs = zip(problem.weights, problem.captures, strict=True)
     return [jnp.broadcast_to(w, c.shape) for w, c in pairs]
 
@@ -174,15 +170,15 @@ class SearchInterrupted(KeyboardInterrupt):
         self.image = image
 
 
-def _solve(problem: Deconvolution, image, iterations: int):
-    method = AdmmTotalVariation(problem, relaxation=1.5)
+def _solve(problem: InverseProblem, image, iterations: int):
+    method = AdmmMethod(problem, relaxation=1.5)
     outcome = drive(method, image, iterations=iterations, tolerance=1e-5)
     if outcome.status == "interrupted":
         raise SearchInterrupted(outcome.image)
     return outcome.image
 
 
-def _probes(problem: Deconvolution, key: PRNGKeyArray):
+def _probes(problem: InverseProblem, key: PRNGKeyArray):
     """±1 in units of a tenth of the noise, 0 where a pixel counts nothing."""
     keys = jax.random.split(key, len(problem.captures))
     return tuple(
@@ -193,13 +189,13 @@ def _probes(problem: Deconvolution, key: PRNGKeyArray):
 
 
 @jax.jit
-def _risk(problem: Deconvolution, image, moved, probes):
+def _risk(problem: InverseProblem, image, moved, probes):
     """SURE in units of the noise's variance."""
     total = jnp.zeros((), image.dtype)
     for operator, weight, probe, residual in zip(
         problem.operators, _full(problem), probes, residuals(problem, image), strict=True
     ):
-        response = operator(moved - image)
+        response = see(operator, moved - image)
         size = 0.01  # of the probe's square in units of the variance
         divergence = jnp.sum(weight * probe * response) / size
         known = jnp.sum((weight > 0).astype(weight.dtype))

@@ -10,11 +10,13 @@ import abc
 import math
 import time
 from collections.abc import Callable
-from typing import Generic, Literal, NamedTuple, TypeVar
+from typing import Any, ClassVar, Generic, Literal, NamedTuple, TypeVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import optimistix
+from jaxtyping import Array, Float, PyTree
 
 Method_State = TypeVar("Method_State")
 Status = Literal["converged", "iterations_exhausted", "stopped", "interrupted", "non_finite"]
@@ -24,13 +26,13 @@ class Residuals(NamedTuple):
     """How far an iteration is from its end, each relative to what it is a residual of.
 
     - `parts`: the same of each of several splits, for methods that weigh them.
-    - `members`: the same of each of several problems that are iterated apart.
+    - `apart`: the same of each of several problems that are iterated apart.
     """
 
     primal: float
     dual: float
     parts: tuple[tuple[float, float], ...] = ()
-    members: tuple["Residuals", ...] = ()
+    apart: tuple["Residuals", ...] = ()
 
 
 class Progress(NamedTuple):
@@ -76,8 +78,8 @@ class AbstractMethod(eqx.Module, Generic[Method_State]):
         """What is to be small."""
 
     @abc.abstractmethod
-    def look(self, state: Method_State) -> tuple[Method_State, Residuals]:
-        """One iteration on, with its residuals."""
+    def residuals(self, state: Method_State) -> Residuals:
+        """Those of the last iteration."""
 
     def adapt(
         self, state: Method_State, residuals: Residuals
@@ -86,12 +88,64 @@ class AbstractMethod(eqx.Module, Generic[Method_State]):
         return self, state
 
 
+class Running(eqx.Module):
+    """Where a solver of optimistix stands: y, and its own state."""
+
+    value: PyTree[Array]
+    inside: Any
+
+
+class OptimistixMethod(AbstractMethod[Running]):
+    """A method whose iterations are those of a solver of optimistix.
+
+    The solver is stepped from outside through its interactive interface, `init`, `step` and
+    `postprocess`; `optimistix.fixed_point` and `optimistix.minimise` run the same object in one
+    compiled loop. The solver's state has `primal` and `dual`, and `parts` where it has several.
+
+    - `solver`, and `arguments` of its function.
+    - `donated`: whether the memory of a state is used again for the next one.
+    """
+
+    solver: eqx.AbstractVar[Any]
+    arguments: eqx.AbstractVar[Any]
+    donated: ClassVar[bool] = False
+
+    @staticmethod
+    @abc.abstractmethod
+    def function(value: PyTree[Array], arguments: Any) -> tuple[Any, None]:
+        """What the solver is to solve, and nothing beside it."""
+
+    @abc.abstractmethod
+    def value_of(self, image: Float[Array, "*batch channel plane y x"]) -> PyTree[Array]:
+        """y of an image."""
+
+    @abc.abstractmethod
+    def image_of(self, value: PyTree[Array]) -> Float[Array, "*batch channel plane y x"]:
+        """The image of a y."""
+
+    def start(self, image):
+        return _start(self, image)
+
+    def advance(self, state, count):
+        run = _advance_donated if self.donated else _advance
+        for size in [CHUNK] * (count // CHUNK) + [1] * (count % CHUNK):
+            state = run(self, state, size)
+        return state
+
+    def image(self, state):
+        return _image(self, state)
+
+    def residuals(self, state):
+        inside = jax.device_get(state.inside)
+        parts = tuple((float(p), float(d)) for p, d in getattr(inside, "parts", ()))
+        return Residuals(float(inside.primal), float(inside.dual), parts)
+
+
 Callback = Callable[[Progress], object]
 
-# With the iteration that is looked at, ten. Each run of a program gets its memory anew from the
-# system, which takes time for large windows: shared by nine iterations it does not matter.
-CHUNK = 9
-LOOK_EVERY = CHUNK + 1
+# Each run of a program gets its memory anew from the system, which takes time for large windows:
+# shared by ten iterations it does not matter.
+CHUNK = 10
 
 
 def drive(
@@ -100,7 +154,7 @@ def drive(
     *,
     iterations: int,
     tolerance: float,
-    look_every: int = LOOK_EVERY,
+    look_every: int = CHUNK,
     adapt_until: int = 0,
     callback: Callback | None = None,
     done: int = 0,
@@ -118,10 +172,10 @@ def drive(
     try:
         state = method.start(image)
         while done < iterations:
-            plain = min(look_every, iterations - done) - 1
-            state, residuals = method.look(_advance(method, state, plain))
-            done += plain + 1
-            current = method.image(state)
+            count = min(look_every, iterations - done)
+            state = method.advance(state, count)
+            done += count
+            residuals, current = method.residuals(state), method.image(state)
             progress = Progress(done, float(jnp.sum(method.objective(current))), *residuals[:2])
             if not math.isfinite(progress.objective):
                 status = "non_finite"
@@ -143,12 +197,71 @@ def drive(
     return Outcome(best, status, tuple(history), done, time.perf_counter() - began)
 
 
-def _advance(method: AbstractMethod, state, count: int):
-    for size in [CHUNK] * (count // CHUNK) + [1] * (count % CHUNK):
-        state = method.advance(state, size)
-    return state
-
-
 def _look_at(method: AbstractMethod, image, done: int) -> Progress:
     nan = math.nan
     return Progress(done, float(jnp.sum(method.objective(image))), nan, nan)
+
+
+@eqx.filter_jit
+def _start(method: OptimistixMethod, image) -> Running:
+    value = method.value_of(image)
+    structure, nothing = jax.eval_shape(method.function, value, method.arguments)
+    tags = frozenset()
+    inside = method.solver.init(
+        method.function, value, method.arguments, {}, structure, nothing, tags
+    )
+    return Running(value, inside)
+
+
+def _steps(method: OptimistixMethod, state: Running, count: int) -> Running:
+    for _ in range(count):
+        value, inside, _ = method.solver.step(
+            method.function, state.value, method.arguments, {}, state.inside, frozenset()
+        )
+        state = Running(value, inside)
+    return state
+
+
+_advance = eqx.filter_jit(_steps)
+_advance_donated = eqx.filter_jit(_steps, donate="all-except-first")
+
+
+@eqx.filter_jit
+def _image(method: OptimistixMethod, state: Running):
+    value, _, _ = method.solver.postprocess(
+        *(method.function, state.value, None, method.arguments, {}, state.inside, frozenset()),
+        optimistix.RESULTS.successful,
+    )
+    return method.image_of(value)
+
+
+def concluded(
+    start: Float[Array, "*batch channel plane y x"],
+    image: Float[Array, "*batch channel plane y x"],
+    objective: Callable[[Array], Array],
+    *,
+    converged: bool,
+    iterations: int,
+    began: float,
+) -> Outcome:
+    """The outcome of a method that runs to its end in one piece.
+
+    What `drive` would say: the objective before and after, and the start where the end is NaN.
+
+    - `began`: `time.perf_counter()` at the start.
+    """
+    nan = math.nan
+    before, after = (
+        Progress(n, float(jnp.sum(objective(x))), nan, nan)
+        for n, x in ((0, start), (iterations, image))
+    )
+    # Of captures that hold NaN a linear solver may return a clean zero.
+    finite = bool(jnp.isfinite(image).all()) and math.isfinite(after.objective)
+    status: Status = "converged" if converged else "iterations_exhausted"
+    return Outcome(
+        image if finite else start,
+        status if finite else "non_finite",
+        (before, after),
+        iterations,
+        time.perf_counter() - began,
+    )

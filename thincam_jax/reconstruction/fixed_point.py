@@ -17,15 +17,9 @@ import lineax as lx
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from thincam_jax.reconstruction.admm import (
-    Penalties,
-    Splitting,
-    default_penalties,
-    image_of,
-    start,
-    step,
-)
-from thincam_jax.reconstruction.problem import Deconvolution
+from thincam_jax.reconstruction.admm import RELAXATION, Admm, splitting_of
+from thincam_jax.reconstruction.problem import InverseProblem
+from thincam_jax.reconstruction.splitting import Penalties, admm_map
 
 
 class FixedPoint(NamedTuple):
@@ -83,16 +77,16 @@ class NeumannSeries(lx.AbstractLinearSolver):
 
 
 def solve_fixed_point(
-    problem: Deconvolution,
+    problem: InverseProblem,
     image: Float[Array, "*batch channel plane y x"],
     *,
     iterations: int = 500,
     tolerance: float = 1e-6,
-    relaxation=1.8,
+    relaxation=RELAXATION,
     penalties: Penalties | None = None,
     adjoint: lx.AbstractLinearSolver | None = None,
 ) -> FixedPoint:
-    """The minimiser of a `Deconvolution` from a first image, for use under jit, grad and vmap.
+    """The minimiser of a `InverseProblem` from a first image, for use under jit, grad and vmap.
 
     Differentiable in captures, PSFs (and so in what they were computed from: β, d, λ), τ and
     weights. The gradient is that of the minimiser, not of the iteration: with few iterations, or a
@@ -101,40 +95,27 @@ def solve_fixed_point(
 
     **Arguments**
 
-    - `iterations`: at most; `tolerance`: on the change of the state in one iteration, root mean
-      square, in units in which captures are about 1.
-    - `relaxation`: α of `thincam_jax.reconstruction.admm`.
+    - `iterations`: at most; `tolerance`: on the relative residuals, see `Admm`.
+    - `relaxation`: α of `thincam_jax.reconstruction.splitting`.
     - `adjoint`: the linear solver of the gradient, default `NeumannSeries()`.
     """
-    splitting = Splitting(problem)
-    penalties = default_penalties(splitting) if penalties is None else penalties
-    dtype = problem.captures[0].dtype
-    first = jax.lax.stop_gradient(start(splitting, image))
+    splitting = splitting_of(problem)
+    if penalties is not None:
+        splitting = splitting.with_penalties(penalties)
     solution = optx.fixed_point(
-        _next_state,
-        optx.FixedPointIteration(rtol=0.0, atol=tolerance, norm=_root_mean_square),
-        first,
-        args=(splitting, penalties, jnp.asarray(relaxation, dtype)),
+        admm_map,
+        Admm(tolerance, relaxation),
+        jax.lax.stop_gradient(splitting.start(image)),
+        args=splitting,
         max_steps=iterations,
         adjoint=optx.ImplicitAdjoint(adjoint or NeumannSeries()),
         throw=False,
     )
     return FixedPoint(
-        image_of(splitting, solution.value),
+        splitting.image(solution.value),
         jnp.asarray(solution.stats["num_steps"]),
         solution.result == optx.RESULTS.successful,
     )
-
-
-def _next_state(state, args):
-    """The map T, at module level so that a new problem of old shape is not compiled anew."""
-    splitting, penalties, relaxation = args
-    return step(splitting, penalties, relaxation, state)
-
-
-def _root_mean_square(tree: PyTree[Array]) -> Float[Array, ""]:
-    """In the default precision, which optimistix compares it with."""
-    return optx.rms_norm(tree).astype(float)
 
 
 def _norm(tree: PyTree[Array]) -> Float[Array, ""]:

@@ -2,6 +2,7 @@ r"""The conventional reconstruction: fringe scanning and the geometric inverse f
 
 import math
 from collections.abc import Sequence
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -14,10 +15,12 @@ from thincam_jax._core.grids import Grid, fast_shape, same_parity
 from thincam_jax._core.precision import phasor, turn_phasor
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.masks.fza import FresnelZoneAperture
-from thincam_jax.reconstruction.result import Reconstruction
+from thincam_jax.reconstruction.recording import Cameras
+from thincam_jax.reconstruction.solver import AbstractSolver, Reconstruction
+from thincam_jax.reconstruction.wiener import filtered_cameras
 
 
-class FringeScanning(eqx.Module):
+class FringeFilter(eqx.Module):
     r"""Four captures with the phases 0, π/2, π, 3π/2 and the inverse of the mask's shadow.
 
     .. math::
@@ -29,8 +32,8 @@ class FringeScanning(eqx.Module):
     filter's chirp turns by more than π between frequencies of the padded window it is set to
     zero; for a mask no larger than the sensor nothing but noise lies there.
 
-    **Arguments**: `cameras`, four with one sensor, distance and β, in the order of the phases;
-    `object_distance` t in mm; `field_shape`, pixels of the result at the object pitch p·t/d.
+    **Arguments**: `cameras`, four with one sensor, distance and β, in the order of the phases.
+    Their wavelength is not used.
     """
 
     inverse: Complex[Array, "v u"]
@@ -38,21 +41,16 @@ class FringeScanning(eqx.Module):
     sensor_shape: tuple[int, int] = eqx.field(static=True)
     field_shape: tuple[int, int] = eqx.field(static=True)
 
-    def __init__(
-        self,
-        cameras: Sequence[LenslessCamera],
-        *,
-        object_distance,
-        field_shape: tuple[int, int] | None = None,
-    ):
-        beta, camera = _check_phases(cameras), cameras[0]
+    def __init__(self, cameras: Cameras):
+        cameras.require("fringe_scanning", "object_distance")
+        beta, camera = _check_phases(cameras.cameras), cameras.cameras[0]
         sensor = camera.sensor.grid
         self.sensor_shape = sensor.shape
-        self.field_shape = same_parity(field_shape or sensor.shape, sensor.shape)
+        self.field_shape = same_parity(cameras.field_shape or sensor.shape, sensor.shape)
         sizes = zip(sensor.shape, self.field_shape, strict=True)
         rows, columns = (s + max(s, f) for s, f in sizes)
         padded = fast_shape((rows, columns))
-        object_distance = checks.positive("object_distance", object_distance, "mm")
+        object_distance = checks.positive("object_distance", cameras.object_distance, "mm")
         magnification = 1 + camera.distance / object_distance
         grid = Grid(padded, sensor.pitch)
         self.inverse = _inverse_filter(grid, beta, magnification, camera.mask.centre)
@@ -69,9 +67,8 @@ class FringeScanning(eqx.Module):
         count, *batch, rows, columns = captures.shape
         flat = captures.reshape(count, -1, rows, columns)
         images = [self._image(flat[:, i]) for i in range(flat.shape[1])]
-        return Reconstruction(
-            jnp.stack(images).reshape(*batch, *self.field_shape), self.object_pitch
-        )
+        image = jnp.stack(images).reshape(*batch, *self.field_shape)
+        return Reconstruction(image, self.object_pitch, "fringe_scanning")
 
     @eqx.filter_jit
     def _image(self, captures: Float[Array, "4 y x"]) -> Float[Array, "m n"]:
@@ -84,6 +81,22 @@ class FringeScanning(eqx.Module):
         shift = [(f - s) // 2 for f, s in zip(self.field_shape, self.sensor_shape, strict=True)]
         field = jnp.roll(full, shift, axis=(0, 1))[: self.field_shape[0], : self.field_shape[1]]
         return field[::-1, ::-1]
+
+
+class FringeScanning(AbstractSolver):
+    """The conventional geometric inverse of four phases, see `FringeFilter`; for comparison.
+
+    It needs `Cameras`; neither noise nor wavelength is used.
+    """
+
+    name: ClassVar[str] = "fringe_scanning"
+
+    def prepare(self, cameras: Cameras) -> FringeFilter:
+        """The filter of these cameras, a function of the captures."""
+        return FringeFilter(cameras)
+
+    def solve(self, recording):
+        return self.prepare(filtered_cameras(recording, self.name))(jnp.stack(recording.captures))
 
 
 @jax.jit

@@ -1,10 +1,10 @@
-r"""Captures without their even light: what the iterations of a biased camera begin with.
+r"""Captures without their uniform light: what the iterations of a biased camera begin with.
 
 A zone aperture lets a good part of the light through evenly. One frequency of its response, zero,
 is then hundreds of times as strong as the others, and an iteration that has to get that one right
-moves the others little. A high-pass takes the even light away *exactly*, for what is even over the
-length of its window is a constant to it, and it commutes with the camera: with g = C(h ∗ f), C the
-crop to the sensor,
+moves the others little. A high-pass takes the uniform light away *exactly*, for what is even over
+the length of its window is a constant to it, and it commutes with the camera: with g = C(h ∗ f), C
+the crop to the sensor,
 
 .. math:: p * g = C'\big((p * h) * f\big), \qquad p = \delta - w,\quad \sum w = 1
 
@@ -19,13 +19,18 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.ndimage
 from jaxtyping import Array, Bool, Float
 
-from thincam_jax.imaging.operators.crop_convolution import cut, place
+from thincam_jax.imaging.operators.crop_convolution import CropConvolution, cut, place
 from thincam_jax.reconstruction.drive import AbstractMethod
-from thincam_jax.reconstruction.normal import mean_power, or_one
-from thincam_jax.reconstruction.problem import Deconvolution, objective, residuals, uniform_level
+from thincam_jax.reconstruction.problem import (
+    InverseProblem,
+    convolutions,
+    objective,
+    residuals,
+    uniform_level,
+)
+from thincam_jax.reconstruction.scaled import or_one
 
 # A camera is biased if its response at zero frequency is that many times the root mean square of
 # all: for a zone aperture 0.7 times its width in pixels, almost nothing where the background
@@ -37,13 +42,16 @@ _PART, _SMALLEST = 8, 5
 _ENOUGH = 0.25
 
 
-def high_passed(problem: Deconvolution) -> Deconvolution | None:
+def high_passed(problem: InverseProblem) -> InverseProblem | None:
     """The problem with what is biased high-passed; None if nothing is, or too little would be left.
 
     The captures keep their shape: pixels near the border, or near one that is not to be trusted,
     have the weight 0.
     """
-    rows = tuple(bool(bias > _BIASED) for bias in jax.device_get(_biases(problem)))
+    operators = convolutions(problem)
+    if operators is None:
+        return None
+    rows = tuple(bool(bias > _BIASED) for bias in jax.device_get(_biases(operators)))
     shortest = min(min(c.shape[-2:]) for c in problem.captures)
     length = 2 * (shortest // (2 * _PART)) + 1
     if not any(rows) or length < _SMALLEST:
@@ -70,15 +78,18 @@ def whole_windows(
     trusted: Bool[np.ndarray, "*batch y x"], length: int
 ) -> Bool[np.ndarray, "*batch y x"]:
     """The pixels in whose window, `length` on a side, all are there and trusted."""
-    size = (*(1,) * (trusted.ndim - 2), length, length)
-    return scipy.ndimage.minimum_filter(trusted, size, mode="constant", cval=False)
+    margin = length // 2
+    whole = np.pad(trusted, [(0, 0)] * (trusted.ndim - 2) + [(margin, margin)] * 2)
+    for axis in (-2, -1):
+        whole = np.min(np.lib.stride_tricks.sliding_window_view(whole, length, axis=axis), axis=-1)
+    return whole
 
 
 class Judged(AbstractMethod[Any]):
     """A method for one problem whose images are judged by another's objective."""
 
     method: AbstractMethod
-    problem: Deconvolution
+    problem: InverseProblem
 
     def start(self, image):
         return self.method.start(image)
@@ -89,8 +100,8 @@ class Judged(AbstractMethod[Any]):
     def image(self, state):
         return self.method.image(state)
 
-    def look(self, state):
-        return self.method.look(state)
+    def residuals(self, state):
+        return self.method.residuals(state)
 
     def objective(self, image):
         return _objective(self.problem, levelled(self.problem, image))
@@ -102,9 +113,9 @@ class Judged(AbstractMethod[Any]):
 
 @jax.jit
 def levelled(
-    problem: Deconvolution, image: Float[Array, "*batch channel plane y x"]
+    problem: InverseProblem, image: Float[Array, "*batch channel plane y x"]
 ) -> Float[Array, "*batch channel plane y x"]:
-    """The image with the even light added that explains the captures best, f ≥ 0 if asked."""
+    """The image with the uniform light added that explains the captures best, f ≥ 0 if asked."""
     missing = tuple(-r for r in residuals(problem, image))
     level = uniform_level(eqx.tree_at(lambda p: p.captures, problem, missing))
     image = image + level[..., None, None, None]
@@ -115,17 +126,16 @@ _objective = jax.jit(objective)
 
 
 @jax.jit
-def _biases(problem: Deconvolution) -> list[Float[Array, ""]]:
-    even = [jnp.max(jnp.abs(o.spectrum[..., 0, 0])) for o in problem.operators]
-    return [
-        e / jnp.sqrt(or_one(mean_power(o))) for e, o in zip(even, problem.operators, strict=True)
-    ]
+def _biases(operators: tuple[CropConvolution, ...]) -> list[Float[Array, ""]]:
+    even = [jnp.max(jnp.abs(o.spectrum[..., 0, 0])) for o in operators]
+    return [e / jnp.sqrt(or_one(o.mean_power())) for e, o in zip(even, operators, strict=True)]
 
 
 @eqx.filter_jit
-def _without_slow_part(problem: Deconvolution, rows: tuple[bool, ...], length: int):
+def _without_slow_part(problem: InverseProblem, rows: tuple[bool, ...], length: int):
     """Spectra and captures times the transfer function of the high-pass."""
-    window = problem.window
+    operators, captures = list(convolutions(problem) or ()), list(problem.captures)
+    window = operators[0].window
     transfer = jnp.asarray(1 - _window_transfer(length, window), problem.captures[0].dtype)
 
     def filtered(capture, corner):
@@ -133,7 +143,6 @@ def _without_slow_part(problem: Deconvolution, rows: tuple[bool, ...], length: i
         whole = jnp.fft.irfft2(spectrum * transfer.astype(spectrum.dtype), s=window)
         return cut(whole, corner, capture.shape[-2:])
 
-    operators, captures = list(problem.operators), list(problem.captures)
     for index, row in enumerate(rows):
         if row:
             operator = operators[index]

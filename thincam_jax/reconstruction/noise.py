@@ -1,5 +1,7 @@
 """How noisy a capture is, from the capture alone."""
 
+from collections.abc import Sequence
+
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
@@ -37,24 +39,27 @@ def _blocks(image, rows: int, columns: int):
 
 
 def estimate_variance(
-    captures: Float[Array, "capture *batch y x"],
-    valid: Bool[Array, "capture *batch y x"] | None = None,
+    captures: Sequence[Float[Array, "*batch y x"]] | Float[Array, "capture *batch y x"],
+    valid: Sequence[Bool[Array, "*batch y x"]] | Bool[Array, "capture *batch y x"] | None = None,
 ) -> Float[Array, " capture"]:
     """Variance of each capture's noise, averaged over its batch.
 
     A capture without any is taken to have noise of a thousandth of the root mean square of all, so
     that what depends on the estimate scales with the captures; of 1 if they are all zero.
     """
-    count = captures.shape[0]
-    found = jnp.mean(estimate_noise(captures, valid).reshape(count, -1) ** 2, axis=1)
-    least = 1e-6 * jnp.mean(captures**2)
+    masks = [None] * len(captures) if valid is None else valid
+    pairs = zip(captures, masks, strict=True)
+    found = jnp.stack([jnp.mean(estimate_noise(c, m) ** 2) for c, m in pairs])
+    least = 1e-6 * jnp.mean(jnp.stack([jnp.mean(c**2) for c in captures]))
     return jnp.where(found > 0, found, jnp.where(least > 0, least, 1))
 
 
-def given_variances(noise_variance, captures) -> Float[Array, " capture"]:
+def given_variances(
+    noise_variance, captures: Sequence[Float[Array, "..."]] | Float[Array, "capture ..."]
+) -> Float[Array, " capture"]:
     """The variance given, of each capture, averaged over its batch."""
-    count = captures.shape[0]
-    each = jnp.asarray(noise_variance, captures.dtype)
+    count = len(captures)
+    each = jnp.asarray(noise_variance, captures[0].dtype)
     if not checks.is_traced(each) and not bool(jnp.all((each >= 0) & jnp.isfinite(each))):
         raise ValueError(
             f"noise_variance = {noise_variance} is negative or not finite; give variances in the "

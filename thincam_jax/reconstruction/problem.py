@@ -1,39 +1,55 @@
-"""What a regularised reconstruction minimises."""
+"""What a reconstruction minimises: one problem for every camera that brings an operator."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
-from thincam_jax.imaging.operators import CropConvolution
+from thincam_jax.imaging.operators import AbstractOperator, CropConvolution, Masked, Scaled, Stacked
+from thincam_jax.imaging.operators.base import is_shape
+from thincam_jax.reconstruction.regularisers import AbstractRegulariser
 from thincam_jax.reconstruction.total_variation import TotalVariation
 
 
-class Deconvolution(eqx.Module):
-    r"""Captures g_k of one image f through crop-convolutions, and what is wanted of the image.
+class InverseProblem(eqx.Module):
+    r"""Captures g_k of one image f through linear operators A_k, and what is asked of the image.
 
-    .. math:: E(f) = \tfrac12 \sum_k \big\|\sqrt{w_k}\,(H_k f - g_k)\big\|^2 + \tau\, TV(f),
+    .. math:: E(f) = \tfrac12 \sum_k \big\|\sqrt{w_k}\,(A_k f - g_k)\big\|^2 + \tau\,u\,R(f),
         \qquad f \ge 0
 
-    (thesis Eq 5.11 with the crop of the sensor in H).
+    (thesis Eq 5.11 with the crop of the sensor in A). Images have the axes (*batch, channel, plane,
+    y, x). An operator whose `in_shape` is (y, x) or (plane, y, x) serves every channel alike.
+
+    τ is relative. Its unit u is the standard deviation of a pixel of the back-projected noise
+    Σ Aᵀwn, if the weights are 1/variance:
+
+    .. math:: u = \Big(\sum_k \max(w_k)\,\|A_k\|_F^2 / N\Big)^{1/2}
+
+    with N numbers in the image. A step between two pixels costs what noise alone would pay for it
+    if τ were 1; 1 to 3 suit most scenes, whatever the camera.
 
     **Arguments**
 
-    - `operators`: one for each capture, on one window and one field. Their spectra have the shape
-      (channel or 1, plane, v, u), the planes summed.
-    - `captures`: g_k, (*batch, channel, y, x).
+    - `operators`: one for each capture, or one `Stacked`. `Stacked`, `Masked` and `Scaled` are
+      resolved into plain operators, captures and weights, so that what is inside of them keeps its
+      structure. Masked pixels leave the objective.
+    - `captures`: g_k, (*batch, channel, …), then the axes of the operator's capture.
     - `weights`: w_k that broadcast to the captures: 1/variance up to a common factor, 0 where a
-      pixel is dead or saturated.
-    - `tau`: τ, in units of captures × operator.
-    - `variation`: what TV is.
+      pixel is dead or saturated; default 1.
+    - `tau`: τ ≥ 0, relative.
+    - `regulariser`: R; default isotropic total variation.
     - `nonnegative`: whether f ≥ 0 is asked.
+
+    **Errors**: ValueError, one line, where operators and captures do not fit.
     """
 
-    operators: tuple[CropConvolution, ...]
-    captures: tuple[Float[Array, "*batch channel y x"], ...]
+    operators: tuple[AbstractOperator, ...]
+    captures: tuple[Float[Array, "..."], ...]
     weights: tuple[Float[Array, "..."], ...]
     tau: Float[Array, ""]
-    variation: TotalVariation
+    tau_unit: Float[Array, ""]
+    regulariser: AbstractRegulariser
     nonnegative: bool = eqx.field(static=True)
 
     def __init__(
@@ -41,79 +57,215 @@ class Deconvolution(eqx.Module):
         operators,
         captures,
         *,
-        tau,
         weights=None,
-        variation: TotalVariation | None = None,
+        tau=2.0,
+        regulariser: AbstractRegulariser | None = None,
         nonnegative: bool = True,
     ):
-        self.operators = tuple(operators)
-        self.captures = tuple(_floating(c) for c in captures)
-        _check_operators(self.operators, self.captures)
-        given = [1.0] * len(self.captures) if weights is None else list(weights)
-        if len(given) != len(self.captures):
+        operators = [operators] if isinstance(operators, AbstractOperator) else list(operators)
+        captures = list(captures) if isinstance(captures, tuple | list) else [captures]
+        if len(operators) == 1 and isinstance(operators[0], Stacked) and len(captures) > 1:
+            operators = list(operators[0].operators)
+        if not operators or len(operators) != len(captures):
             raise ValueError(
-                f"{len(given)} weights for {len(self.captures)} captures; give one for each"
+                f"{len(captures)} captures for {len(operators)} operators; give one operator for "
+                "each"
             )
+        given = [1.0] * len(captures) if weights is None else list(weights)
+        if len(given) != len(captures):
+            raise ValueError(
+                f"{len(given)} weights for {len(captures)} captures; give one for each"
+            )
+        parts = [
+            part for one in zip(operators, captures, given, strict=True) for part in _plain(*one)
+        ]
+        self.operators = tuple(o for o, _, _ in parts)
+        self.captures = tuple(_floating(c) for _, c, _ in parts)
         self.weights = tuple(
-            jnp.asarray(w, dtype=c.dtype) for w, c in zip(given, self.captures, strict=True)
+            jnp.asarray(w, dtype=c.dtype) for (_, _, w), c in zip(parts, self.captures, strict=True)
         )
-        self.tau = checks.non_negative("tau", tau, "units of captures times operator").astype(
-            self.captures[0].dtype
-        )
-        self.variation = TotalVariation() if variation is None else variation
+        _check_operators(self.operators, self.captures)
+        dtype = self.captures[0].dtype
+        self.tau = checks.non_negative("tau", tau, "times the noise").astype(dtype)
+        self.tau_unit = noise_in_the_image(self.operators, self.weights).astype(dtype)
+        self.regulariser = TotalVariation() if regulariser is None else regulariser
         self.nonnegative = nonnegative
 
     @property
-    def field_shape(self) -> tuple[int, int]:
-        return self.operators[0].field_shape
+    def absolute_tau(self) -> Float[Array, ""]:
+        """τ·u, the weight of R(f) in E, in units of captures × operator × weight."""
+        return self.tau * self.tau_unit
 
     @property
-    def window(self) -> tuple[int, int]:
-        return self.operators[0].window
+    def field_shape(self) -> tuple[int, int]:
+        """Rows and columns of the image."""
+        rows, columns = self.operators[0].in_shape[-2:]
+        return rows, columns
 
     @property
     def image_shape(self) -> tuple[int, ...]:
         """Shape of the image: (*batch, channel, plane, y, x)."""
-        planes = self.operators[0].spectrum.shape[-3]
-        return (*self.captures[0].shape[:-2], planes, *self.field_shape)
+        first = self.operators[0]
+        planes = first.in_shape[-3] if len(first.in_shape) > 2 else 1
+        leading = self.captures[0].shape[: self.captures[0].ndim - len(detector_shape(first))]
+        return (*leading, planes, *self.field_shape)
 
 
-def residuals(problem: Deconvolution, image: Float[Array, "*batch channel plane y x"]):
-    """H_k f − g_k of every capture."""
+def noise_in_the_image(operators, weights) -> Float[Array, ""]:
+    """u of `InverseProblem`: the standard deviation of a pixel of the back-projected noise."""
+    parts = [o.mean_power() * jnp.max(w) for o, w in zip(operators, weights, strict=True)]
+    return jnp.sqrt(sum(parts[1:], start=parts[0]))
+
+
+def detector_shape(operator: AbstractOperator) -> tuple[int, ...]:
+    """The axes of a capture after batch and channel."""
+    return operator.out_shape[1:] if len(operator.in_shape) == 4 else operator.out_shape
+
+
+def see(operator: AbstractOperator, image: Float[Array, "..."]) -> Float[Array, "..."]:
+    """A f of an image (*batch, channel, plane, y, x)."""
+    return operator(image[..., 0, :, :] if len(operator.in_shape) == 2 else image)
+
+
+def back_project(operator: AbstractOperator, capture: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Aᵀ g with the axes of an image."""
+    image = operator.adjoint(capture)
+    return image[..., None, :, :] if len(operator.in_shape) == 2 else image
+
+
+def residuals(problem: InverseProblem, image: Float[Array, "*batch channel plane y x"]):
+    """A_k f − g_k of every capture."""
     return tuple(
-        operator(image) - capture
+        see(operator, image) - capture
         for operator, capture in zip(problem.operators, problem.captures, strict=True)
     )
 
 
-def misfit(problem: Deconvolution, image: Float[Array, "*batch channel plane y x"]):
-    """½ Σ w (H f − g)² of each member of the batch."""
+def back_projected(problem: InverseProblem, differences) -> Float[Array, "..."]:
+    r""":math:`\sum_k A_k^T w_k d_k`."""
+    parts = zip(problem.operators, problem.weights, differences, strict=True)
+    first, *others = [back_project(operator, w * d) for operator, w, d in parts]
+    return sum(others, start=first)
+
+
+def gradient(problem: InverseProblem, image: Float[Array, "*batch channel plane y x"]):
+    r"""That of the misfit: :math:`\sum_k A_k^T w_k (A_k f - g_k)`."""
+    return back_projected(problem, residuals(problem, image))
+
+
+def misfit(problem: InverseProblem, image: Float[Array, "*batch channel plane y x"]):
+    """½ Σ w (A f − g)² of each batch element."""
     parts = [
-        jnp.sum(w * r**2, axis=(-3, -2, -1))
-        for w, r in zip(problem.weights, residuals(problem, image), strict=True)
+        jnp.sum(w * r**2, axis=tuple(range(-1 - len(detector_shape(o)), 0)))
+        for o, w, r in zip(
+            problem.operators, problem.weights, residuals(problem, image), strict=True
+        )
     ]
-    return sum(parts) / 2
+    return sum(parts[1:], start=parts[0]) / 2
 
 
 def objective(
-    problem: Deconvolution, image: Float[Array, "*batch channel plane y x"]
+    problem: InverseProblem, image: Float[Array, "*batch channel plane y x"]
 ) -> Float[Array, "*batch"]:
-    """E(f) of each member of the batch; it says nothing of f ≥ 0."""
-    return misfit(problem, image) + problem.tau * problem.variation(image)
+    """E(f) of each batch element; it says nothing of f ≥ 0."""
+    return misfit(problem, image) + problem.absolute_tau * problem.regulariser(image)
 
 
-def uniform_level(problem: Deconvolution) -> Float[Array, "*batch channel"]:
-    """The brightness of an even image that explains each channel best, by least squares."""
-    even = jnp.ones(problem.image_shape[-4:], problem.captures[0].dtype)
+def total_misfit(
+    image: Float[Array, "*batch channel plane y x"], problem: InverseProblem
+) -> Float[Array, ""]:
+    """½ Σ w (A f − g)² over the batch, as optimistix calls it: image first, problem second."""
+    return jnp.sum(misfit(problem, image))
+
+
+def total_objective(
+    image: Float[Array, "*batch channel plane y x"], problem: InverseProblem
+) -> Float[Array, ""]:
+    """E(f) over the batch, for `optimistix.minimise(total_objective, …, args=problem)`."""
+    return jnp.sum(objective(problem, image))
+
+
+def with_tau(problem: InverseProblem, tau) -> InverseProblem:
+    """The same problem with another relative τ."""
+    return eqx.tree_at(lambda p: p.tau, problem, jnp.asarray(tau, problem.tau.dtype))
+
+
+def uniform_level(problem: InverseProblem) -> Float[Array, "*batch channel"]:
+    """The brightness of a uniform image that explains each channel best, by least squares."""
+    uniform = jnp.ones(problem.image_shape[-4:], problem.captures[0].dtype)
     seen, light = 0.0, 0.0
     for operator, capture, weight in zip(
         problem.operators, problem.captures, problem.weights, strict=True
     ):
-        flat = operator(even)
-        seen = seen + jnp.sum(weight * flat * capture, axis=(-2, -1))
-        light = light + jnp.sum(weight * flat * flat, axis=(-2, -1))
+        axes = tuple(range(-len(detector_shape(operator)), 0))
+        flat = see(operator, uniform)
+        seen = seen + jnp.sum(weight * flat * capture, axis=axes)
+        light = light + jnp.sum(weight * flat * flat, axis=axes)
     light = jnp.broadcast_to(light, jnp.shape(seen))
     return jnp.where(light > 0, seen / jnp.where(light > 0, light, 1), 0)
+
+
+@jax.jit
+def uniform_image(problem: InverseProblem) -> Float[Array, "*batch channel plane y x"]:
+    """The uniform image that explains the captures best, not below zero: a good start."""
+    level = jnp.maximum(uniform_level(problem), 0)[..., None, None, None]
+    return jnp.broadcast_to(level, problem.image_shape)
+
+
+def start_image(
+    problem: InverseProblem, image: Float[Array, "..."] | None
+) -> Float[Array, "*batch channel plane y x"]:
+    """The image given, checked, or the uniform one."""
+    if image is None:
+        return uniform_image(problem)
+    if image.shape != problem.image_shape:
+        raise ValueError(
+            f"the start image has shape {image.shape}; give (…, channel, plane, y, x) = "
+            f"{problem.image_shape}"
+        )
+    return jnp.asarray(image, problem.captures[0].dtype)
+
+
+def convolutions(problem: InverseProblem) -> tuple[CropConvolution, ...] | None:
+    """The operators if all are convolutions on one window, which transforms diagonalise."""
+    found = tuple(o for o in problem.operators if isinstance(o, CropConvolution))
+    layouts = {(o.window, o.field_shape, o.spectrum.shape[-3]) for o in found}
+    return found if len(found) == len(problem.operators) and len(layouts) == 1 else None
+
+
+def _plain(operator: AbstractOperator, capture, weight) -> list[tuple]:
+    """(operator, capture, weight) of every capture, without `Stacked`, `Masked` and `Scaled`."""
+    if isinstance(operator, Stacked):
+        count = len(operator.operators)
+        parts = zip(operator.operators, _each(capture, count), _each(weight, count), strict=True)
+        return [plain for part in parts for plain in _plain(*part)]
+    if isinstance(operator, Masked | Scaled):
+        change = _trusted if isinstance(operator, Masked) else _rescaled
+        values = operator.valid if isinstance(operator, Masked) else operator.gain
+        if is_shape(operator.out_shape):
+            return _plain(operator.operator, *change(capture, weight, values))
+        count = len(operator.out_shape)
+        pairs = zip(*(_each(v, count) for v in (capture, weight, values)), strict=True)
+        captures, weights = zip(*(change(*pair) for pair in pairs), strict=True)
+        return _plain(operator.operator, captures, weights)
+    if isinstance(operator, CropConvolution):
+        operator = operator.with_channels_and_planes()
+    return [(operator, capture, weight)]
+
+
+def _trusted(capture, weight, valid):
+    """A masked pixel may hold NaN; its weight is 0."""
+    return jnp.where(valid, jnp.asarray(capture), 0), jnp.where(valid, weight, 0)
+
+
+def _rescaled(capture, weight, gain):
+    """w (c A f − g)² = w c² (A f − g/c)²."""
+    inverse = jnp.where(gain == 0, 0, 1 / jnp.where(gain == 0, 1, gain))
+    return capture * inverse, weight * gain**2
+
+
+def _each(value, count: int) -> list:
+    return list(value) if isinstance(value, tuple | list) else [value] * count
 
 
 def _floating(capture) -> Array:
@@ -123,30 +275,35 @@ def _floating(capture) -> Array:
 
 
 def _check_operators(operators, captures) -> None:
-    if not operators or len(operators) != len(captures):
+    fields = {(*o.in_shape[-3:-2], *o.in_shape[-2:]) for o in operators}
+    for operator in operators:
+        most = 4 if isinstance(operator, CropConvolution) else 3
+        if not 2 <= len(operator.in_shape) <= most:
+            raise ValueError(
+                f"a {type(operator).__name__} takes images {operator.in_shape}; give it an "
+                "in_shape (y, x) or (plane, y, x)"
+            )
+    if len(fields) > 1:
         raise ValueError(
-            f"{len(captures)} captures for {len(operators)} operators; give one operator for each"
+            f"operators take images of shapes {sorted(fields)}; they see one image, so give "
+            "operators of one field and as many planes"
         )
-    layouts = {(o.window, o.field_shape, o.summed, o.spectrum.shape[-3]) for o in operators}
-    if len(layouts) > 1 or operators[0].summed != 1:
-        raise ValueError(
-            "operators differ in window, field or planes; give CropConvolutions of kernels "
-            "(channel, plane, k, l) with summed=1 and one window"
-        )
-    leading = {capture.shape[:-2] for capture in captures}
+    leading = set()
+    for operator, capture in zip(operators, captures, strict=True):
+        detector = detector_shape(operator)
+        if capture.ndim <= len(detector) or capture.shape[-len(detector) :] != detector:
+            raise ValueError(
+                f"a capture has shape {capture.shape}; its operator takes (…, channel, "
+                f"{', '.join(map(str, detector))})"
+            )
+        leading.add(capture.shape[: capture.ndim - len(detector)])
+        channels = operator.out_shape[0] if len(operator.in_shape) == 4 else 1
+        if channels not in (1, capture.shape[-len(detector) - 1]):
+            raise ValueError(
+                f"a capture has {capture.shape[-len(detector) - 1]} channels and its PSF "
+                f"{channels}; give a PSF of 1 channel or of as many"
+            )
     if len(leading) > 1:
         raise ValueError(
             f"captures differ in batch or channels: {sorted(leading)}; they show one image"
         )
-    for operator, capture in zip(operators, captures, strict=True):
-        channels = operator.spectrum.shape[0] if operator.spectrum.ndim == 4 else 0
-        if capture.ndim < 3 or capture.shape[-2:] != operator.sensor_shape:
-            raise ValueError(
-                f"a capture has shape {capture.shape}; its operator takes (…, channel, y, x) with "
-                f"(y, x) = {operator.sensor_shape}"
-            )
-        if channels not in (1, capture.shape[-3]):
-            raise ValueError(
-                f"a capture has {capture.shape[-3]} channels and its PSF {channels}; give a PSF "
-                "of 1 channel or of as many"
-            )

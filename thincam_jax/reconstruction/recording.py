@@ -1,122 +1,460 @@
-"""Captures with all that is known of how they were taken."""
+"""What was seen: captures with all that is known of how they were taken."""
 
+import functools
+import operator
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
+import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
+from thincam_jax._core import checks
+from thincam_jax._core.grids import same_parity
+from thincam_jax.imaging.operators import (
+    AbstractOperator,
+    CropConvolution,
+    Stacked,
+    kernel_grid,
+    kernel_shape,
+    window_shape,
+)
+from thincam_jax.imaging.operators.base import shapes_of
+from thincam_jax.imaging.operators.crop_convolution import cut
 from thincam_jax.lensless.camera import LenslessCamera
-from thincam_jax.lensless.psf import Model
-from thincam_jax.reconstruction.arguments import FILTERS, METHODS, Settings, require
-from thincam_jax.reconstruction.build import camera_problem, object_pitch, psf_problem
-from thincam_jax.reconstruction.problem import Deconvolution
-from thincam_jax.reconstruction.regularised import Solved, middle
-from thincam_jax.reconstruction.result import Reconstruction
-from thincam_jax.reconstruction.spectra import Prior
+from thincam_jax.lensless.psf import MODELS, Model, psf
+from thincam_jax.reconstruction.drive import Outcome
+from thincam_jax.reconstruction.noise import estimate_variance, given_variances
+from thincam_jax.reconstruction.problem import InverseProblem
+from thincam_jax.reconstruction.registration import distance_ratios, own_field, register
+from thincam_jax.reconstruction.regularisers import AbstractRegulariser
+from thincam_jax.reconstruction.solver import Reconstruction
+from thincam_jax.reconstruction.synthesis import check_synthesis, separate
 
 
-class Recording(NamedTuple):
-    """What is reconstructed from; each as in `reconstruct`."""
+class Cameras(eqx.Module):
+    """Cameras whose PSFs are computed, one for each capture, with the light that they saw.
 
-    captures: Float[Array, "capture *batch y x"]
-    cameras: Sequence[LenslessCamera] | Array
-    object_distance: Any = None
-    wavelength: Any = None
-    noise_variance: Any = None
-    synthesis: Any = None
-    field_shape: tuple[int, int] | None = None
-    valid: Any = None
-    prior: Prior = "inverse_square"
-    model: Model = "separable"
-    pixel_integration: bool = True
+    **Arguments**
+
+    - `cameras`: what took the captures. Captures at several mask-sensor distances are brought to
+      the scale of the largest (`register`), and their PSFs with them.
+    - `wavelength`: mm, one or one for each camera.
+    - `object_distance`: t, mm, on which to focus. Several make as many planes, each seen in its own
+      projection, so that pixels of the planes that are behind each other lie on one ray through
+      the mask.
+    - `field_shape`: pixels of the image, default those of the sensor; light from beyond is taken
+      for none. Its pixels are p·t/d apart on the object, d the largest distance.
+    - `model`, `pixel_integration`: of the PSFs, see `thincam_jax.psf`.
+    """
+
+    cameras: tuple[LenslessCamera, ...]
+    wavelength: Any
+    object_distance: Any
+    field_shape: tuple[int, int] | None = eqx.field(static=True)
+    model: Model = eqx.field(static=True)
+    pixel_integration: bool = eqx.field(static=True)
+
+    def __init__(
+        self,
+        cameras: Sequence[LenslessCamera],
+        *,
+        wavelength=None,
+        object_distance=None,
+        field_shape: tuple[int, int] | None = None,
+        model: Model = "separable",
+        pixel_integration: bool = True,
+    ):
+        if isinstance(cameras, LenslessCamera):
+            raise TypeError("cameras is one camera; give a list, [camera], one for each capture")
+        self.cameras = tuple(cameras)
+        if not self.cameras:
+            raise ValueError("cameras is empty; give one camera for each capture")
+        if not all(isinstance(camera, LenslessCamera) for camera in self.cameras):
+            raise TypeError("cameras holds something else; give LenslessCameras, or use Psfs")
+        checks.choice("model", model, MODELS)
+        self.wavelength, self.object_distance = wavelength, object_distance
+        self.field_shape, self.model = field_shape, model
+        self.pixel_integration = pixel_integration
 
     @property
-    def has_cameras(self) -> bool:
-        """Or else measured PSFs."""
-        return isinstance(self.cameras, Sequence)
+    def count(self) -> int:
+        """Captures that belong to these."""
+        return len(self.cameras)
+
+    @property
+    def pitch(self) -> Float[Array, "*plane"]:
+        """Distance of the image's pixels on the object, mm: p·t/d of the largest d."""
+        furthest = max(self.cameras, key=lambda c: float(c.distance))
+        return furthest.sensor.pitch * jnp.asarray(self.object_distance) / furthest.distance
+
+    def require(self, method: str, *names: str) -> None:
+        """One line for what a method needs and was not told."""
+        missing = [f"{name} (mm)" for name in names if getattr(self, name) is None]
+        if missing:
+            raise ValueError(f"method {method!r} needs {' and '.join(missing)} of the Cameras")
+
+    def kernels(self, field: tuple[int, int], ratios) -> list[Float[Array, "1 plane k l"]]:
+        """PSF of each camera and plane on the reference scale; enlarged by r, 1/r² as bright."""
+        distances = np.atleast_1d(np.asarray(self.object_distance, dtype=object))
+        wavelengths = jnp.broadcast_to(jnp.asarray(self.wavelength), (self.count,))
+        kernels = []
+        for camera, wavelength, ratio in zip(self.cameras, wavelengths, ratios, strict=True):
+            grid = kernel_grid(camera.sensor.grid, own_field(field, ratio))
+            planes = [
+                psf(
+                    camera,
+                    wavelength=wavelength,
+                    object_distance=distance,
+                    grid=grid,
+                    model=self.model,
+                    pixel_integration=self.pixel_integration,
+                )
+                for distance in distances
+            ]
+            kernels.append(jnp.stack([register(k, ratio) / ratio**2 for k in planes])[None])
+        return kernels
 
 
-def check_recording(method: str, recording: Recording) -> None:
-    """Filters are made of cameras, and measured PSFs stand for all that describes those."""
-    if method in FILTERS:
-        known_cameras(recording, method)
-    if recording.has_cameras:
-        return
-    names = ("object_distance", "wavelength", "synthesis")
-    unused = [name for name in names if getattr(recording, name) is not None]
-    if unused:
-        raise ValueError(
-            f"measured PSFs cannot use {' and '.join(unused)}; leave out, or give cameras"
+class Psfs(eqx.Module):
+    """Measured PSFs on the pixels of the captures, one for each capture.
+
+    **Arguments**
+
+    - `psfs`: (capture, k, l), (capture, channel, k, l) or (capture, channel, plane, k, l), the
+      channel axis of length 1 or that of the captures.
+    - `field_shape`: pixels of the field; default all that sends light to the sensor, sensor +
+      PSF − 1. The image is then the part in front of the sensor, else the field that is given.
+    """
+
+    psfs: Float[Array, "capture channel plane k l"]
+    field_shape: tuple[int, int] | None = eqx.field(static=True)
+
+    def __init__(self, psfs, *, field_shape: tuple[int, int] | None = None):
+        psfs = jnp.asarray(psfs)
+        if not 3 <= psfs.ndim <= 5:
+            raise ValueError(
+                f"PSFs have shape {psfs.shape}; give (capture, k, l), such as psf[None] for one, "
+                "(capture, channel, k, l) or (capture, channel, plane, k, l)"
+            )
+        self.psfs = psfs.reshape(*psfs.shape[:-2], *(1,) * (5 - psfs.ndim), *psfs.shape[-2:])
+        self.field_shape = field_shape
+
+    @property
+    def count(self) -> int:
+        """Captures that belong to these."""
+        return self.psfs.shape[0]
+
+
+class Recording(eqx.Module):
+    """What was seen: captures, how they came about, their noise, and the pixels to trust.
+
+    **Arguments**
+
+    - `captures`: (capture, *batch, y, x), or a list of (*batch, y, x), one for each of `seen_by`.
+      The last batch axis is the colour channel. With operators (*batch, …) of each, with the axes
+      that the operator's captures have.
+    - `seen_by`: `Cameras`, whose PSFs are computed; `Psfs`, which were measured; or an operator of
+      `thincam_jax.imaging.operators`, or a list of them, which all see one image.
+    - `noise_variance`: one number, or one for each capture, in the captures' units squared;
+      estimated where it is not given (see `estimate_variance`), which takes captures that are
+      images.
+    - `valid`: mask of the pixels to trust, that broadcasts to the captures.
+
+    **Errors**: ValueError, one line, for captures that do not fit what has seen them.
+    """
+
+    captures: tuple[Float[Array, "..."], ...]
+    seen_by: Cameras | Psfs | Stacked
+    noise_variance: Any
+    valid: tuple[Array, ...] | None
+
+    def __init__(self, captures, seen_by, *, noise_variance=None, valid=None):
+        if isinstance(seen_by, Sequence) and seen_by and isinstance(seen_by[0], LenslessCamera):
+            raise TypeError(
+                "a list of cameras does not say in which light; give tc.Cameras(cameras, "
+                "wavelength=…, object_distance=…)"
+            )
+        if isinstance(seen_by, AbstractOperator) and not isinstance(seen_by, Stacked):
+            captures, valid = [captures], None if valid is None else [valid]
+            seen_by = Stacked([seen_by])
+        elif isinstance(seen_by, Sequence):
+            seen_by = Stacked(seen_by)
+        if not isinstance(seen_by, Cameras | Psfs | Stacked):
+            raise TypeError(
+                f"the captures were seen by a {type(seen_by).__name__}; give tc.Cameras(…), "
+                "tc.Psfs(…), or operators"
+            )
+        self.seen_by = seen_by
+        count = len(seen_by.operators) if isinstance(seen_by, Stacked) else seen_by.count
+        self.captures = tuple(_floating(c) for c in captures)
+        if len(self.captures) != count or any(c.ndim < 2 for c in self._images()):
+            given = getattr(captures, "shape", [c.shape for c in self.captures])
+            raise ValueError(
+                f"captures have shape {given} for {count} cameras, PSFs or operators; give "
+                f"({count}, …, y, x)"
+            )
+        self.noise_variance = noise_variance
+        self.valid = None if valid is None else self._masks(valid)
+
+    def problem(
+        self,
+        *,
+        tau: Any = 2.0,
+        regulariser: AbstractRegulariser | None = None,
+        nonnegative: bool = True,
+        synthesis: Any = None,
+    ) -> InverseProblem:
+        """What an iterative method is to minimise; see `InverseProblem` for the arguments.
+
+        - `synthesis`: real matrix (channel × capture) of sums of captures that are reconstructed in
+          place of the captures; default: the captures. Sums in which the bright background cancels
+          converge much faster.
+        """
+        captures, valid = self._trusted()
+        settings = {"tau": tau, "regulariser": regulariser, "nonnegative": nonnegative}
+        if isinstance(self.seen_by, Stacked):
+            _no_synthesis(synthesis, "operators")
+            variances = self._variances(np.eye(len(captures)), captures, valid)
+            shapes = shapes_of(self.seen_by.out_shape)
+            lengths = [len(s) - _channels(o) for s, o in self._detectors(shapes)]
+            captures = [_with_channel(c, n) for c, n in zip(captures, lengths, strict=True)]
+            weights = [
+                1 / v if m is None else _with_channel(m.astype(c.dtype), n) / v
+                for m, v, c, n in zip(valid, variances, captures, lengths, strict=True)
+            ]
+            return InverseProblem(self.seen_by.operators, captures, weights=weights, **settings)
+        matrix, sums = self._sums(synthesis, captures, valid)
+        variances = [
+            variance * s.ratio**2
+            for variance, s in zip(self._variances(matrix, captures, valid), sums, strict=True)
+        ]
+        pitch = self._pitch(captures[0].dtype)
+        return _convolutions(sums, variances, pitch, self._field(), settings)
+
+    def reconstruction(
+        self, problem: InverseProblem, outcome: Outcome, method: str, tau: float | None = None
+    ) -> Reconstruction:
+        """The image of an outcome with the axes of the captures, upright, and how it came about."""
+        image, pitch = outcome.image, None
+        if isinstance(self.seen_by, Cameras):
+            pitch = self.seen_by.pitch
+        elif isinstance(self.seen_by, Psfs) and self.seen_by.field_shape is None:
+            image = middle(image, self.captures[0].shape[-2:])  # the part in front of the sensor
+        planes = image.shape[-3]
+        batch = image.shape[:-3] if self._has_channel() else image.shape[:-4]
+        image = image.reshape(*batch, *((planes,) if planes > 1 else ()), *image.shape[-2:])
+        return Reconstruction(
+            self.oriented(image),
+            pitch,
+            method,
+            ending=outcome.status,
+            history=outcome.history,
+            iterations=outcome.iterations,
+            seconds=outcome.seconds,
+            tau=tau,
         )
 
+    def oriented(self, image):
+        """An image as the scene is: cameras turn it over; the other way it is the same."""
+        if image is None or not isinstance(self.seen_by, Cameras):
+            return image
+        return jnp.asarray(image)[..., ::-1, ::-1]
 
-def known_cameras(recording: Recording, method: str) -> Sequence[LenslessCamera]:
-    """The cameras, or an error that says what does without them."""
-    if isinstance(recording.cameras, Sequence):
-        return recording.cameras
-    *others, last = [repr(m) for m in METHODS if m not in (*FILTERS, "auto")]
-    raise ValueError(
-        f"method {method!r} needs cameras; with measured PSFs use {', '.join(others)} or {last}"
-    )
+    def with_noise(self, variance) -> "Recording":
+        """The same recording with another noise variance."""
+        return Recording(self.captures, self.seen_by, noise_variance=variance, valid=self.valid)
+
+    def focused(self, object_distance) -> "Recording":
+        """The same recording with its `Cameras` focused on another distance, mm."""
+        if not isinstance(self.seen_by, Cameras):
+            raise ValueError("a distance is that of computed PSFs; this recording has no Cameras")
+        cameras = self.seen_by
+        focused = Cameras(
+            cameras.cameras,
+            wavelength=cameras.wavelength,
+            object_distance=object_distance,
+            field_shape=cameras.field_shape,
+            model=cameras.model,
+            pixel_integration=cameras.pixel_integration,
+        )
+        return Recording(
+            self.captures, focused, noise_variance=self.noise_variance, valid=self.valid
+        )
+
+    def _images(self) -> list[Array]:
+        """The captures that must be images."""
+        return [] if isinstance(self.seen_by, Stacked) else list(self.captures)
+
+    def _detectors(self, shapes):
+        return zip(shapes, self.seen_by.operators, strict=True)  # type: ignore[union-attr]
+
+    def _has_channel(self) -> bool:
+        """Whether the captures have an axis before those of the detector."""
+        if isinstance(self.seen_by, Stacked):
+            shape = shapes_of(self.seen_by.out_shape)[0]
+            own = len(shape) - _channels(self.seen_by.operators[0])
+            return self.captures[0].ndim > own
+        return self.captures[0].ndim > 2
+
+    def _masks(self, valid: Any) -> tuple[Array, ...]:
+        """A mask for each capture."""
+        shapes = [c.shape for c in self.captures]
+        if not isinstance(valid, tuple | list):
+            valid = jnp.asarray(valid)
+            one_for_all = valid.ndim <= len(shapes[0])
+            valid = [valid] * len(shapes) if one_for_all else list(valid)
+        try:
+            pairs = zip(valid, shapes, strict=True)
+            return tuple(jnp.broadcast_to(jnp.asarray(m, bool), s) for m, s in pairs)
+        except ValueError:
+            given = [jnp.shape(m) for m in valid]
+            raise ValueError(
+                f"valid has shapes {given}; give a mask for each capture, of shapes {shapes}"
+            ) from None
+
+    def _trusted(self) -> tuple[list[Array], list[Array | None]]:
+        """Captures and masks; what is neither valid nor finite becomes 0."""
+        if self.valid is None:
+            return list(self.captures), [None] * len(self.captures)
+        pairs = list(zip(self.captures, self.valid, strict=True))
+        return [jnp.where(m | jnp.isfinite(c), c, 0) for c, m in pairs], [m for _, m in pairs]
+
+    def _variances(self, matrix: np.ndarray, captures, valid) -> list[Float[Array, ""]]:
+        """Variances of sums of captures: as given, or estimated where that is nothing or zero."""
+        squares = [jnp.asarray(row**2, captures[0].dtype) for row in matrix]
+        if self.noise_variance is None:
+            each = self._estimated(captures, valid)
+            return [jnp.sum(square * each) for square in squares]
+        given = given_variances(self.noise_variance, captures)
+        totals = [jnp.sum(square * given) for square in squares]
+        if all(not checks.is_traced(total) and bool(total > 0) for total in totals):
+            return totals
+        each = self._estimated(captures, valid)
+        return [
+            jnp.where(total > 0, total, jnp.sum(square * each))
+            for total, square in zip(totals, squares, strict=True)
+        ]
+
+    def _estimated(self, captures, valid) -> Float[Array, " capture"]:
+        if isinstance(self.seen_by, Stacked) and any(c.ndim < 2 for c in captures):
+            raise ValueError("give noise_variance: captures that are no images do not show it")
+        return estimate_variance(captures, None if valid[0] is None else valid)
+
+    def _pitch(self, dtype) -> Float[Array, ""]:
+        if isinstance(self.seen_by, Cameras):
+            return self.seen_by.cameras[0].sensor.pitch
+        return jnp.ones((), dtype)
+
+    def _field(self) -> tuple[int, int]:
+        seen_by, sensor = self.seen_by, self.captures[0].shape[-2:]
+        if isinstance(seen_by, Cameras):
+            grid = seen_by.cameras[0].sensor.grid
+            return same_parity(seen_by.field_shape or grid.shape, grid.shape)
+        kernel = seen_by.psfs.shape[-2:]  # type: ignore[union-attr]
+        whole = tuple(s + k - 1 for s, k in zip(sensor, kernel, strict=True))
+        return _fitting_field(seen_by.field_shape or whole, sensor, kernel)  # type: ignore
+
+    def _sums(self, synthesis, captures, valid) -> tuple[np.ndarray, list["_Sum"]]:
+        """The rows of a synthesis with their kernels and captures."""
+        seen_by = self.seen_by
+        count = len(captures)
+        matrix = separate(count) if synthesis is None else np.asarray(synthesis, dtype=float)
+        if isinstance(seen_by, Cameras):
+            ratios = distance_ratios(seen_by.cameras)
+            check_synthesis(matrix, seen_by.cameras, ratios)
+            kernels = seen_by.kernels(self._field(), ratios)
+        else:
+            _no_synthesis(synthesis, "measured PSFs")
+            ratios = [1.0] * count
+            kernels = list(seen_by.psfs.astype(captures[0].dtype))  # type: ignore[union-attr]
+        return matrix, [_Sum(row, kernels, captures, valid, ratios) for row in matrix]
 
 
-def problem_of(method: str, recording: Recording, settings: Settings) -> Deconvolution:
-    """What an iterative method is to minimise."""
-    cameras = recording.cameras
-    how = {
-        "tau": settings.number,
-        "noise_variance": recording.noise_variance,
-        "field_shape": recording.field_shape,
-        "valid": recording.valid,
-        "variation": settings.variation,
-        "nonnegative": True if settings.nonnegative is None else settings.nonnegative,
-    }
-    if not isinstance(cameras, Sequence):
-        return psf_problem(recording.captures, cameras, **how)
-    require(method, object_distance=recording.object_distance, wavelength=recording.wavelength)
-    return camera_problem(
-        recording.captures,
-        cameras,
-        wavelength=recording.wavelength,
-        object_distance=recording.object_distance,
-        synthesis=recording.synthesis,
-        model=recording.model,
-        pixel_integration=recording.pixel_integration,
-        **how,
-    )
+class _Sum:
+    """One row of a synthesis: its kernel, its capture, and where this is to be trusted."""
+
+    def __init__(self, row: np.ndarray, kernels, captures, valid, ratios):
+        used = [(float(w), k) for k, w in enumerate(row) if w]
+        self.ratio = ratios[used[0][1]]
+        self.kernel = functools.reduce(operator.add, [w * kernels[k] for w, k in used])
+        whole = functools.reduce(operator.add, [w * captures[k] for w, k in used])
+        self.capture = _with_channel(register(whole, self.ratio), 2)
+        self.valid = None
+        if valid[0] is not None or self.ratio > 1:
+            both = jnp.ones(captures[0].shape, bool)
+            if valid[0] is not None:
+                both = jnp.all(jnp.stack([valid[k] for _, k in used]), axis=0)
+            # A pixel that an invalid one, or the dark beyond the sensor, has been interpolated into
+            # is not trusted either; the interpolation overshoots, too.
+            seen = register(both.astype(captures[0].dtype), self.ratio)
+            self.valid = _with_channel(jnp.abs(seen - 1) < 0.01, 2)
 
 
-def upright(recording: Recording, image):
-    """An image as the scene is: cameras turn it over; the other way it is the same."""
-    if image is None or not recording.has_cameras:
-        return image
-    return jnp.asarray(image)[..., ::-1, ::-1]
+def _convolutions(sums, variances, pitch, field_shape, settings) -> InverseProblem:
+    """Operators on one window, and their weights."""
+    dtype = sums[0].capture.dtype
+    windows = [
+        window_shape(s.capture.shape[-2:], field_shape, _reach(s.kernel, s.capture, field_shape))
+        for s in sums
+    ]
+    window = (max(w[0] for w in windows), max(w[1] for w in windows))
+    operators = [
+        CropConvolution(
+            s.kernel.astype(dtype),
+            pitch.astype(dtype),
+            s.capture.shape[-2:],
+            field_shape,
+            summed=1,
+            window=window,
+        )
+        for s in sums
+    ]
+    weights = [
+        (1.0 if s.valid is None else s.valid.astype(dtype)) / v
+        for s, v in zip(sums, variances, strict=True)
+    ]
+    return InverseProblem(operators, [s.capture for s in sums], weights=weights, **settings)
 
 
-def reconstruction(
-    recording: Recording, problem: Deconvolution, solved: Solved, method: str, tau
-) -> Reconstruction:
-    """The image with the axes of the captures, upright, and how it came about.
+def middle(image: Float[Array, "*batch y x"], shape) -> Float[Array, "*batch v u"]:
+    """The middle of an image."""
+    corner = [(n - s) // 2 for n, s in zip(image.shape[-2:], shape, strict=True)]
+    return cut(image, corner, shape)
 
-    `tau`: the relative one that the problem was built with; None for methods without.
-    """
-    captures, outcome = recording.captures, solved.outcome
-    pitch, shape = None, problem.field_shape
-    if isinstance(recording.cameras, Sequence):
-        pitch = object_pitch(recording.cameras, recording.object_distance)
-    elif recording.field_shape is None:
-        shape = captures.shape[-2:]  # the part in front of the sensor
-    image = upright(recording, middle(outcome.image, shape))
-    planes, batch = image.shape[-3], captures.shape[1:-2]
-    image = image.reshape(*batch, *((planes,) if planes > 1 else ()), *image.shape[-2:])
-    return Reconstruction(
-        image,
-        pitch,
-        method,
-        ending=outcome.status,
-        history=outcome.history,
-        iterations=outcome.iterations,
-        seconds=outcome.seconds,
-        tau=None if tau is None else float(tau) * solved.tau_factor,
-    )
+
+def _floating(capture) -> Array:
+    """Raw counts are taken as they are, but as real numbers."""
+    capture = jnp.asarray(capture)
+    return capture if jnp.issubdtype(capture.dtype, jnp.floating) else capture.astype(float)
+
+
+def _channels(operator: AbstractOperator) -> int:
+    """1 if the operator's own axes begin with the colour channel."""
+    return int(len(operator.in_shape) == 4)
+
+
+def _with_channel(capture: Array, axes: int) -> Array:
+    """A capture with an axis for the colour before its own axes."""
+    return capture[None] if capture.ndim == axes else capture
+
+
+def _no_synthesis(synthesis, what: str) -> None:
+    if synthesis is not None:
+        raise ValueError(f"a synthesis adds captures of known cameras; leave it out with {what}")
+
+
+def _reach(kernel, capture, field_shape) -> tuple[int, int]:
+    """What of a kernel can send light from the field to the sensor."""
+    most = kernel_shape(capture.shape[-2:], field_shape)
+    rows, columns = (min(k, m) for k, m in zip(kernel.shape[-2:], most, strict=True))
+    return rows, columns
+
+
+def _fitting_field(field_shape, sensor, kernel) -> tuple[int, int]:
+    """A field whose centre fits the sensor's and the PSF's samples: smaller by one if need be."""
+    shape = checks.shape2d("field_shape", field_shape)
+    sizes = zip(shape, sensor, kernel, strict=True)
+    rows, columns = (max(f - (s + f - 1 - k) % 2, 1) for f, s, k in sizes)
+    return rows, columns

@@ -1,170 +1,271 @@
-"""The iterative methods behind `reconstruct`: from a problem to a `Reconstruction`."""
+"""Total variation or another regulariser: what its solvers have in common, and the solvers."""
 
+import abc
 import math
 import time
-from typing import Literal, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple, get_args
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
-from thincam_jax.imaging.operators.crop_convolution import cut, place
-from thincam_jax.reconstruction._jaxopt import AndersonAdmm
+from thincam_jax._core import checks
+from thincam_jax.imaging.operators.crop_convolution import place
+from thincam_jax.reconstruction.admm import AdmmMethod
 from thincam_jax.reconstruction.apart import Apart, worth_taking_apart
 from thincam_jax.reconstruction.choose_tau import SearchInterrupted, discrepancy_tau, sure_tau
-from thincam_jax.reconstruction.drive import LOOK_EVERY, AbstractMethod, Callback, Outcome, drive
+from thincam_jax.reconstruction.drive import CHUNK, AbstractMethod, Callback, Outcome, drive
+from thincam_jax.reconstruction.fista import solve_fista
 from thincam_jax.reconstruction.high_pass import Judged, high_passed, levelled
-from thincam_jax.reconstruction.problem import Deconvolution, uniform_level
-from thincam_jax.reconstruction.proximal import solve_proximal
-from thincam_jax.reconstruction.regulariser import AbstractRegulariser
-from thincam_jax.reconstruction.tv_method import AdmmTotalVariation
-from thincam_jax.reconstruction.two_step import solve_two_step
+from thincam_jax.reconstruction.problem import InverseProblem, uniform_level
+from thincam_jax.reconstruction.recording import Cameras
+from thincam_jax.reconstruction.regularisers import AbstractRegulariser
+from thincam_jax.reconstruction.solver import (
+    AbstractIterativeSolver,
+    Reconstruction,
+    as_synthesis,
+    check_limits,
+)
+from thincam_jax.reconstruction.total_variation import TotalVariation
 
 TauRule = Literal["discrepancy", "sure"]
-Iterative = Literal["admm_tv", "fista", "twist"]
-Acceleration = Literal["none", "anderson"]
+DEFAULT_TAU = 2.0
 
 # Penalties that go on changing make the objective jump: on the captures of tests/reconstruction/
 # test_acceleration.py ADMM then needs 1.4 to twice the iterations.
 _BALANCED = 30
-# Of the iterations for a biased camera, those without its even light.
+# Of the iterations for a biased camera, those without its uniform light.
 _FIRST_PART = 0.4
 
 
-class Options(NamedTuple):
-    """How to iterate; see `reconstruct`. `rule` finds τ, None takes the problem's.
+class Start(NamedTuple):
+    """A first image, and whether the user gave it."""
 
-    `regulariser`: of proximal gradients; None takes the problem's total variation. `acceleration`:
-    of ADMM.
+    image: Float[Array, "*batch channel plane y x"]
+    given: bool
+
+
+class AbstractRegularised(AbstractIterativeSolver):
+    """A solver that minimises ½ Σ w (Af − g)² + τ R(f)."""
+
+    tau: eqx.AbstractVar[Any]
+    nonnegative: eqx.AbstractVar[bool]
+    synthesis: eqx.AbstractVar[np.ndarray | None]
+    iterations: eqx.AbstractVar[int]
+    tolerance: eqx.AbstractVar[float]
+
+    @property
+    @abc.abstractmethod
+    def prior(self) -> AbstractRegulariser:
+        """R."""
+
+    @abc.abstractmethod
+    def minimise(self, problem: InverseProblem, start: Start, callback: Callback | None) -> Outcome:
+        """The minimiser of a problem."""
+
+    def solve(self, recording, *, start=None, callback=None) -> Reconstruction:
+        """The image of a recording, from the image given, a uniform one, or zero.
+
+        A uniform image explains the bright background of a zone aperture's capture at once, which
+        would else take hundreds of iterations; a field that is mostly dark is nearer to zero.
+        """
+        rule = self.tau if isinstance(self.tau, str) else None
+        problem = recording.problem(
+            tau=DEFAULT_TAU if rule else self.tau,
+            regulariser=self.prior,
+            nonnegative=self.nonnegative,
+            synthesis=self.synthesis,
+        )
+        began = time.perf_counter()
+        uniform = isinstance(recording.seen_by, Cameras)
+        image = first_image(problem, recording.oriented(start), uniform=uniform)
+        if self.nonnegative:  # the best image so far may be this one
+            image = jnp.maximum(image, 0)
+        given = start is not None or not uniform
+        if rule:
+            try:
+                found = _search(rule, problem, image)
+            except SearchInterrupted as end:
+                seconds = time.perf_counter() - began
+                outcome = Outcome(end.image, "interrupted", (), 0, seconds)
+                return recording.reconstruction(problem, outcome, self.name, float(problem.tau))
+            problem, image, given = found.problem, found.image, True
+        outcome = self.minimise(problem, Start(image, given), callback)
+        if rule:
+            outcome = outcome._replace(seconds=time.perf_counter() - began)
+        return recording.reconstruction(problem, outcome, self.name, float(problem.tau))
+
+
+def _search(rule: str, problem: InverseProblem, image):
+    if rule == "discrepancy":
+        return discrepancy_tau(problem, image)
+    return sure_tau(problem, image, jax.random.key(0))
+
+
+class AdmmTV(AbstractRegularised):
+    """Least squares with total variation by ADMM, which knows that the sensor crops.
+
+    For convolutions it transforms, for a separable or dense operator it factorises once, for any
+    other each iteration solves a linear system by conjugate gradients.
+
+    **Arguments**
+
+    - `tau`: weight of the variation relative to the noise, about 1 to 3; see `InverseProblem`.
+      "discrepancy" or "sure" find it, in some ten times the time, for Gaussian noise; see
+      `choose_tau`.
+    - `variation`: its kind and the coupling of colours, see `TotalVariation`.
+    - `nonnegative`: ask for f ≥ 0.
+    - `synthesis`: sums of captures in place of the captures, see
+      `thincam_jax.reconstruction.synthesis`; for `Cameras` only.
+    - `iterations`: at most. `tolerance`: on the relative residuals.
+
+    **Errors**: ValueError, one line, for values out of range.
     """
 
-    method: Iterative
-    iterations: int
-    tolerance: float
-    relaxation: float
-    start: Float[Array, "*batch y x"] | None
-    callback: Callback | None
-    rule: TauRule | None = None
-    regulariser: AbstractRegulariser | None = None
-    acceleration: Acceleration = "none"
+    name: ClassVar[str] = "admm_tv"
+    tau: Float[Array, ""] | str
+    variation: TotalVariation
+    nonnegative: bool = eqx.field(static=True)
+    synthesis: np.ndarray | None
+    iterations: int = eqx.field(static=True)
+    tolerance: float = eqx.field(static=True)
+
+    def __init__(
+        self,
+        tau=DEFAULT_TAU,
+        *,
+        variation: TotalVariation | None = None,
+        nonnegative: bool = True,
+        synthesis=None,
+        iterations: int = 100,
+        tolerance: float = 1e-4,
+    ):
+        self.tau = checked_tau(tau)
+        self.variation = _checked("variation", variation, TotalVariation)
+        self.nonnegative, self.synthesis = nonnegative, as_synthesis(synthesis)
+        check_limits(iterations, tolerance)
+        self.iterations, self.tolerance = iterations, tolerance
+
+    @property
+    def prior(self):
+        return self.variation
+
+    def minimise(self, problem, start, callback):
+        """In two parts for a biased camera: first without the uniform light, then with all."""
+        first = None if start.given else self._without_uniform_light(problem, start.image, callback)
+        if first is None:
+            return self._by_admm(problem, start.image, callback)
+        if first.status in ("stopped", "interrupted", "non_finite"):
+            return first
+        try:
+            second = self._by_admm(problem, first.image, callback, first.iterations)
+        except KeyboardInterrupt:  # before its iterations, which keep their own best image
+            return first._replace(status="interrupted")
+        return second._replace(
+            history=first.history + second.history[1:], seconds=first.seconds + second.seconds
+        )
+
+    def _by_admm(self, problem, image, callback, done: int = 0) -> Outcome:
+        return drive(
+            admm_method(problem),
+            image,
+            iterations=self.iterations,
+            tolerance=self.tolerance,
+            adapt_until=done + min(_BALANCED, (self.iterations - done) // 2),
+            callback=callback,
+            done=done,
+        )
+
+    def _without_uniform_light(self, problem, image, callback) -> Outcome | None:
+        """The first part of the iterations, levelled; None if the camera or their number asks none.
+
+        Whole chunks between two looks, so that a callback sees every tenth iteration throughout.
+        """
+        count = CHUNK * round(_FIRST_PART * self.iterations / CHUNK)
+        easier = high_passed(problem) if count else None
+        if easier is None:
+            return None
+        outcome = drive(
+            Judged(admm_method(easier), problem),
+            image,
+            iterations=count,
+            tolerance=self.tolerance,
+            adapt_until=min(_BALANCED, count // 2),
+            callback=callback,
+        )
+        return outcome._replace(image=levelled(problem, outcome.image))
 
 
-class Solved(NamedTuple):
-    """An outcome, and what a search multiplied the problem's τ by."""
+class Fista(AbstractRegularised):
+    """The minimiser of `AdmmTV` by proximal gradients, with any regulariser.
 
-    outcome: Outcome
-    tau_factor: float = 1.0
+    Nothing but applications of A and Aᵀ is asked of the operators. There are no penalties to
+    choose, and more iterations to do.
 
+    **Arguments**: as of `AdmmTV`, and
 
-def minimise(problem: Deconvolution, options: Options, *, even_start: bool) -> Solved:
-    """The minimiser, from the image given, an even one, or zero.
-
-    An even image explains the bright background of a zone aperture's capture at once, which would
-    else take hundreds of iterations; a field that is mostly dark is nearer to zero.
+    - `regulariser`: R, such as `TotalVariation`, the default, or `Sparsity` in wavelets or cosines,
+      with the same τ: a coefficient of an orthonormal basis has the noise of a pixel.
     """
-    image = first_image(problem, options.start, even=even_start)
-    if problem.nonnegative:  # the best image so far may be this one
-        image = jnp.maximum(image, 0)
-    if options.rule is None:
-        if even_start and options.start is None and options.method == "admm_tv":
-            return Solved(_by_admm_in_two(problem, image, options))
-        return Solved(_iterate(problem, image, options))
-    began = time.perf_counter()
-    try:
-        if options.rule == "discrepancy":
-            found = discrepancy_tau(problem, image)
-        else:
-            found = sure_tau(problem, image, jax.random.key(0))
-    except SearchInterrupted as end:
-        seconds = time.perf_counter() - began
-        return Solved(Outcome(end.image, "interrupted", (), 0, seconds))
-    outcome = _iterate(found.problem, found.image, options)
-    outcome = outcome._replace(seconds=time.perf_counter() - began)
-    return Solved(outcome, float(found.problem.tau / problem.tau))
+
+    name: ClassVar[str] = "fista"
+    tau: Float[Array, ""] | str
+    regulariser: AbstractRegulariser
+    nonnegative: bool = eqx.field(static=True)
+    synthesis: np.ndarray | None
+    iterations: int = eqx.field(static=True)
+    tolerance: float = eqx.field(static=True)
+
+    def __init__(
+        self,
+        tau=DEFAULT_TAU,
+        *,
+        regulariser: AbstractRegulariser | None = None,
+        nonnegative: bool = True,
+        synthesis=None,
+        iterations: int = 100,
+        tolerance: float = 1e-4,
+    ):
+        self.tau = checked_tau(tau)
+        kind = AbstractRegulariser if regulariser is not None else TotalVariation
+        self.regulariser = _checked("regulariser", regulariser, kind)
+        if isinstance(self.tau, str) and not isinstance(self.regulariser, TotalVariation):
+            raise ValueError(
+                f"tau = {tau!r} is found for total variation only; give a number, about 1 to 3"
+            )
+        self.nonnegative, self.synthesis = nonnegative, as_synthesis(synthesis)
+        check_limits(iterations, tolerance)
+        self.iterations, self.tolerance = iterations, tolerance
+
+    @property
+    def prior(self):
+        return self.regulariser
+
+    def minimise(self, problem, start, callback):
+        """By FISTA with restart."""
+        return solve_fista(
+            problem,
+            image=start.image,
+            iterations=self.iterations,
+            tolerance=self.tolerance,
+            callback=callback,
+        )
 
 
-def _iterate(problem: Deconvolution, image, options: Options) -> Outcome:
-    """The method asked for."""
-    if options.method == "admm_tv":
-        return _by_admm(problem, image, options)
-    solve = solve_proximal if options.method == "fista" else solve_two_step
-    return solve(
-        problem,
-        regulariser=options.regulariser,
-        image=image,
-        iterations=options.iterations,
-        tolerance=options.tolerance,
-        callback=options.callback,
-    )
-
-
-def _by_admm(problem: Deconvolution, image, options: Options, done: int = 0) -> Outcome:
-    return drive(
-        admm_method(problem, options.relaxation, options.acceleration),
-        image,
-        iterations=options.iterations,
-        tolerance=options.tolerance,
-        adapt_until=done + min(_BALANCED, (options.iterations - done) // 2),
-        callback=options.callback,
-        done=done,
-    )
-
-
-def _by_admm_in_two(problem: Deconvolution, image, options: Options) -> Outcome:
-    """First without the even light, then with all of the data from the image so found."""
-    first = _without_even_light(problem, image, options)
-    if first is None:
-        return _by_admm(problem, image, options)
-    if first.status in ("stopped", "interrupted", "non_finite"):
-        return first
-    try:
-        second = _by_admm(problem, first.image, options, first.iterations)
-    except KeyboardInterrupt:  # before its iterations, which keep their own best image
-        return first._replace(status="interrupted")
-    return second._replace(
-        history=first.history + second.history[1:], seconds=first.seconds + second.seconds
-    )
-
-
-def _without_even_light(problem: Deconvolution, image, options: Options) -> Outcome | None:
-    """The first part of the iterations, levelled; None if the camera or their number asks for none.
-
-    Whole chunks between two looks, so that a callback sees every tenth iteration throughout.
-    """
-    count = LOOK_EVERY * round(_FIRST_PART * options.iterations / LOOK_EVERY)
-    easier = high_passed(problem) if count else None
-    if easier is None:
-        return None
-    outcome = drive(
-        Judged(admm_method(easier, options.relaxation, options.acceleration), problem),
-        image,
-        iterations=count,
-        tolerance=options.tolerance,
-        adapt_until=min(_BALANCED, count // 2),
-        callback=options.callback,
-    )
-    return outcome._replace(image=levelled(problem, outcome.image))
-
-
-def admm_method(
-    problem: Deconvolution, relaxation: float, acceleration: Acceleration = "none"
-) -> AbstractMethod:
+def admm_method(problem: InverseProblem) -> AbstractMethod:
     """ADMM for a problem, or for each of its parts."""
-    kind = AndersonAdmm if acceleration == "anderson" else AdmmTotalVariation
-
-    def method(part: Deconvolution) -> AbstractMethod:
-        return kind(part, relaxation=relaxation)
-
-    return Apart(problem, method) if worth_taking_apart(problem) else method(problem)
+    return Apart(problem, AdmmMethod) if worth_taking_apart(problem) else AdmmMethod(problem)
 
 
 def first_image(
-    problem: Deconvolution, start, *, even: bool
+    problem: InverseProblem, start, *, uniform: bool
 ) -> Float[Array, "*batch channel plane y x"]:
-    """The start given, amid zeros where it is smaller than the field; else an even one, or zero."""
+    """The start given, amid zeros where it is smaller than the field; else uniform, or zero."""
     shape, dtype = problem.image_shape, problem.captures[0].dtype
     if start is None:
-        level = even_level(problem)[..., None, None, None] if even else jnp.zeros((), dtype)
+        level = _level(problem)[..., None, None, None] if uniform else jnp.zeros((), dtype)
         return jnp.broadcast_to(level, shape)
     start = jnp.asarray(start, dtype)
     if start.ndim < 2 or start.size != math.prod((*shape[:-2], *start.shape[-2:])):
@@ -184,10 +285,22 @@ def first_image(
     return place(start, corner, problem.field_shape)
 
 
-def middle(image: Float[Array, "*batch y x"], shape) -> Float[Array, "*batch v u"]:
-    """The middle of an image."""
-    corner = [(n - s) // 2 for n, s in zip(image.shape[-2:], shape, strict=True)]
-    return cut(image, corner, shape)
+_level = jax.jit(uniform_level)
 
 
-even_level = jax.jit(uniform_level)
+def checked_tau(tau: Any) -> Any:
+    """τ ≥ 0, or the name of a rule that finds it."""
+    if isinstance(tau, str):
+        checks.choice("tau", tau, get_args(TauRule))
+        return tau
+    return checks.non_negative("tau", tau, "times the noise")
+
+
+def _checked(name: str, value, kind: type):
+    """A value of the kind that is asked for; by default one as the kind makes it."""
+    if value is None:
+        return kind()
+    if not isinstance(value, kind):
+        wanted = kind.__name__.removeprefix("Abstract")
+        raise ValueError(f"{name} is a {type(value).__name__}; give a {wanted}")
+    return value

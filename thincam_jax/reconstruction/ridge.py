@@ -1,65 +1,130 @@
-r"""Ridge (Tikhonov) regression, matrix-free, by conjugate gradients.
+r"""Ridge (Tikhonov) regression: the posterior mean under a white prior.
 
-.. math:: f = \arg\min_f \tfrac12 \sum_k \|\sqrt{w_k}\,(H_k f - g_k)\|^2
+.. math:: f = \arg\min_f \tfrac12 \sum_k \|\sqrt{w_k}\,(A_k f - g_k)\|^2
     + \tfrac{\rho}{2}\|f - \bar f\|^2, \qquad
-    \Big(\sum_k H_k^T w_k H_k + \rho\Big)(f - \bar f) = \sum_k H_k^T w_k (g_k - H_k \bar f)
+    \Big(\sum_k A_k^T w_k A_k + \rho\Big)(f - \bar f) = \sum_k A_k^T w_k (g_k - A_k \bar f)
 
 It is linear in the captures and knows the crop of the sensor and the weight of every pixel, which a
-Wiener filter does not. For Gaussian noise and a white prior it is the mean of the posterior.
+Wiener filter does not. With weights 1/σ² and a white Gaussian prior of mean f̄ and variance s²,
+f is the mean of the posterior if ρ = 1/s². s is not known. It is taken as large as the brightness
+of the uniform image that explains the captures best (`uniform_level`), a scene of full contrast:
+
+.. math:: \rho = \rho_{rel} / s^2,\qquad s^2 = \mathrm{mean}\,\mathrm{level}^2
+
+over batch and channels. It is the rule k = σ² / mean β² of Hoerl, Kennard and Baldwin (Commun.
+Stat. 4, 105, 1975), with the uniform image for a first fit. f̄ is that image.
 """
 
 import functools
 import time
+from typing import ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import lineax
-import optimistix
+import numpy as np
 from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
-from thincam_jax.imaging.operators.crop_convolution import cut, place
-from thincam_jax.reconstruction.drive import Outcome
-from thincam_jax.reconstruction.normal import squared_modulus
-from thincam_jax.reconstruction.outcome import concluded
-from thincam_jax.reconstruction.problem import Deconvolution, misfit, residuals
-from thincam_jax.reconstruction.scaled import ScaledProblem, pulled_back, start_image
+from thincam_jax.reconstruction.drive import Outcome, concluded
+from thincam_jax.reconstruction.normal_equations import IterativeNormal, normal_equations
+from thincam_jax.reconstruction.problem import (
+    InverseProblem,
+    back_projected,
+    misfit,
+    residuals,
+    start_image,
+    uniform_level,
+)
+from thincam_jax.reconstruction.scaled import ScaledProblem
+from thincam_jax.reconstruction.solver import AbstractSolver, as_synthesis, check_limits
+
+
+class Ridge(AbstractSolver):
+    """The posterior mean under a white prior, linear in the captures; it may be negative.
+
+    Dense and separable operators are factorised, all others take conjugate gradients.
+
+    **Arguments**
+
+    - `ridge`: noise variance over image variance, in parts of what the captures' mean brightness
+      makes of it. 1 is right for pixels that vary independently by as much as their mean. More
+      draws the image to its mean, less lets more noise into it.
+    - `synthesis`: as of `AdmmTV`.
+    - `iterations`: at most. `tolerance`: of the residual of the normal equations and of the last
+      step, root mean square, relative to the right-hand side and the image.
+
+    **Errors**: ValueError, one line, for values out of range.
+    """
+
+    name: ClassVar[str] = "ridge"
+    ridge: float = eqx.field(static=True)
+    synthesis: np.ndarray | None
+    iterations: int = eqx.field(static=True)
+    tolerance: float = eqx.field(static=True)
+
+    def __init__(
+        self, ridge=1.0, *, synthesis=None, iterations: int = 300, tolerance: float = 1e-4
+    ):
+        self.ridge = float(checks.positive("ridge", ridge, "noise variance / image variance"))
+        self.synthesis = as_synthesis(synthesis)
+        check_limits(iterations, tolerance)
+        self.iterations, self.tolerance = iterations, tolerance
+
+    def solve(self, recording):
+        problem = recording.problem(synthesis=self.synthesis)
+        # Sums in which the uniform light cancels do not tell how bright the scene is; the captures
+        # do.
+        plain = problem if self.synthesis is None else recording.problem()
+        level = _level(plain)
+        level = jnp.where(jnp.isfinite(level), level, 0)  # else the captures say what is wrong
+        mean = jnp.maximum(level, 0)[..., None, None, None]
+        outcome = solve_ridge(
+            problem,
+            precision=self.ridge * image_precision(level),
+            mean=jnp.broadcast_to(mean, problem.image_shape),
+            iterations=self.iterations,
+            tolerance=self.tolerance,
+        )
+        return recording.reconstruction(problem, outcome, self.name)
+
+
+def image_precision(level: Float[Array, "..."]) -> float:
+    """1/s² of a scene of full contrast and this brightness; 1 of a dark one."""
+    # In double precision of NumPy: squares of small brightnesses leave float32.
+    variance = float(np.mean(np.asarray(level, dtype=np.float64) ** 2))
+    return 1.0 / (variance if variance > 0 else 1.0)
 
 
 def solve_ridge(
-    problem: Deconvolution,
+    problem: InverseProblem,
     *,
-    ridge,
+    precision,
     mean: Float[Array, "..."] | None = None,
     iterations: int = 300,
     tolerance: float = 1e-6,
 ) -> Outcome:
-    """The ridge reconstruction of a problem; its τ, TV and sign are not used.
+    """The ridge reconstruction of a problem; its τ, R and sign are not used.
 
-    The image may be negative. One piece of compiled code: there is no progress to be watched.
+    One piece of compiled code: there is no progress to be watched.
 
     **Arguments**
 
-    - `ridge`: ρ > 0, in units of weight × operator²: 1/variance of the image, where the weights are
-      1/variance of the noise.
-    - `mean`: f̄, what the image is drawn to; default the even image that explains the captures best.
-    - `tolerance`: of the residual of the normal equations and of the last step, root mean square,
-      relative to the right-hand side and the image.
-
-    The status is "converged" or "iterations_exhausted" as lineax says.
+    - `precision`: ρ > 0, 1/variance of the image, where the weights are 1/variance of the noise.
+    - `mean`: f̄, what the image is drawn to; default the uniform image that explains the captures.
+    - `iterations`, `tolerance`: of conjugate gradients, see `Ridge`.
     """
     began = time.perf_counter()
     dtype = problem.captures[0].dtype
-    ridge = checks.positive("ridge", ridge, "units of weight times operator squared").astype(dtype)
+    rho = checks.positive("precision", precision, "1/variance of the image").astype(dtype)
     mean = start_image(problem, mean)
-    limit = jnp.asarray(tolerance, dtype)
-    image, done, steps = _solve(problem, ridge, mean, limit, iterations)
+    image, converged, steps = _solve(problem, rho, mean, jnp.asarray(tolerance, dtype), iterations)
     return concluded(
         mean,
         image,
-        functools.partial(ridge_objective, problem, ridge, mean),
-        converged=bool(done),
+        functools.partial(ridge_objective, problem, rho, mean),
+        converged=bool(converged),
         iterations=int(steps),
         began=began,
     )
@@ -67,78 +132,30 @@ def solve_ridge(
 
 @jax.jit
 def ridge_objective(
-    problem: Deconvolution,
-    ridge: Float[Array, ""],
+    problem: InverseProblem,
+    precision: Float[Array, ""],
     mean: Float[Array, "*batch channel plane y x"],
     image: Float[Array, "*batch channel plane y x"],
 ) -> Float[Array, "*batch"]:
-    """The misfit plus ρ/2 ‖f − f̄‖² of each member of the batch."""
-    return misfit(problem, image) + ridge / 2 * jnp.sum((image - mean) ** 2, axis=(-4, -3, -2, -1))
-
-
-class _Normal(eqx.Module):
-    """Σ HᵀwH + ρ, times a factor."""
-
-    problem: Deconvolution
-    ridge: Float[Array, ""]
-    factor: Float[Array, ""]
-
-    def __call__(self, image):
-        seen = tuple(operator(image) for operator in self.problem.operators)
-        return self.factor * (pulled_back(self.problem, seen) + self.ridge * image)
-
-
-class _Preconditioner(eqx.Module):
-    """(Σ w̄|Ĥ|² + ρ)⁻¹ on the window, and cut: what the inverse were without the crop.
-
-    Positive definite, since it is a positive filter between a map and its transpose.
-    """
-
-    problem: Deconvolution
-    ridge: Float[Array, ""]
-
-    def __call__(self, image):
-        operator = self.problem.operators[0]
-        power = sum(
-            jnp.mean(w) * squared_modulus(o.spectrum)
-            for o, w in zip(self.problem.operators, self.problem.weights, strict=True)
-        )
-        field = place(image, operator.field_corner, operator.window)
-        filtered = jnp.fft.rfft2(field)
-        filtered = filtered / (power + self.ridge).astype(filtered.dtype)
-        field = jnp.fft.irfft2(filtered, s=operator.window)
-        return cut(field, operator.field_corner, operator.field_shape)
+    """The misfit plus ρ/2 ‖f − f̄‖² of each batch element."""
+    gap = jnp.sum((image - mean) ** 2, axis=(-4, -3, -2, -1))
+    return misfit(problem, image) + precision / 2 * gap
 
 
 @functools.partial(jax.jit, static_argnames="iterations")
-def _solve(problem: Deconvolution, ridge, mean, tolerance, iterations: int):
+def _solve(problem: InverseProblem, precision, mean, tolerance, iterations: int):
     scaled = ScaledProblem(problem)
-    inside, rho = scaled.problem, ridge / scaled.curvature
-    mean = mean / scaled.image_unit
-    target = -pulled_back(inside, residuals(inside, mean))
-    factor = curvature_scale(target)
-    structure = jax.ShapeDtypeStruct(target.shape, target.dtype)
-    tags = lineax.positive_semidefinite_tag
-    operator = lineax.FunctionLinearOperator(_Normal(inside, rho, factor), structure, tags)
-    preconditioner = lineax.FunctionLinearOperator(_Preconditioner(inside, rho), structure, tags)
-    size = jnp.sqrt(jnp.mean(target**2))
-    solver = lineax.CG(
-        rtol=tolerance, atol=tolerance * size, norm=optimistix.rms_norm, max_steps=iterations
-    )
-    solution = lineax.linear_solve(
-        operator, target, solver, options={"preconditioner": preconditioner}, throw=False
-    )
-    done = solution.result == lineax.RESULTS.successful
-    image = (mean + factor * solution.value) * scaled.image_unit
-    return image, done, solution.stats["num_steps"]
+    inside, mean = scaled.problem, mean / scaled.image_unit
+    target = -back_projected(inside, residuals(inside, mean))
+    normal = normal_equations(inside, precision / scaled.curvature)
+    if isinstance(normal, IterativeNormal):
+        solution = normal.solution(target, jnp.zeros_like(target), tolerance, iterations)
+        change, steps = solution.value, solution.stats["num_steps"]
+        converged = solution.result == lineax.RESULTS.successful
+    else:
+        change = normal.solve(target)
+        converged, steps = jnp.isfinite(change).all(), jnp.asarray(1)
+    return (mean + change) * scaled.image_unit, converged, steps
 
 
-def curvature_scale(image: Float[Array, "..."]) -> Float[Array, ""]:
-    """A factor for quadratic forms that `lineax.CG` is to minimise over images like this.
-
-    lineax takes a curvature pᵀAp/‖r‖² below 100·eps·(number of unknowns) for a breakdown, whatever
-    the size of A. In float32 that is 3 for 512² pixels: more than any A of norm 1 has. A is
-    therefore multiplied by what leaves room for eigenvalues down to 1e-6.
-    """
-    eps = float(jnp.finfo(image.dtype).eps)
-    return jnp.asarray(max(1.0, 1e8 * eps * image.size), image.dtype)
+_level = jax.jit(uniform_level)

@@ -1,13 +1,12 @@
-r"""A deconvolution in units in which a gradient step of length 1 is right."""
+r"""A problem in units in which a gradient step of length 1 is right."""
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from thincam_jax.imaging.operators.base import AbstractOperator
-from thincam_jax.reconstruction.normal import or_one, squared_modulus
-from thincam_jax.reconstruction.problem import Deconvolution, residuals, uniform_level
+from thincam_jax.imaging.operators import AbstractOperator, CropConvolution, Scaled
+from thincam_jax.reconstruction.problem import InverseProblem, back_project, convolutions, see
 
 # The power method approaches the largest singular value from below.
 MARGIN = 1.05
@@ -15,9 +14,9 @@ POWER_ITERATIONS = 40
 
 
 class Seen(AbstractOperator):
-    r"""All that is seen of an image: :math:`f \mapsto (\sqrt{w_k}\, H_k f)_k`, batch included."""
+    r"""All that is seen of an image: :math:`f \mapsto (\sqrt{w_k}\, A_k f)_k`, batch included."""
 
-    problem: Deconvolution
+    problem: InverseProblem
 
     @property
     def in_shape(self) -> tuple[int, ...]:
@@ -29,16 +28,16 @@ class Seen(AbstractOperator):
 
     def __call__(self, image):
         pairs = zip(self.problem.operators, self.problem.weights, strict=True)
-        return tuple(jnp.sqrt(w) * operator(image) for operator, w in pairs)
+        return tuple(jnp.sqrt(w) * see(operator, image) for operator, w in pairs)
 
     def adjoint(self, capture):
         parts = zip(self.problem.operators, self.problem.weights, capture, strict=True)
-        first, *others = [operator.adjoint(jnp.sqrt(w) * c) for operator, w, c in parts]
+        first, *others = [back_project(operator, jnp.sqrt(w) * c) for operator, w, c in parts]
         return sum(others, start=first)
 
 
 class ScaledProblem(eqx.Module):
-    r"""A problem with captures of about 1, weights of at most 1, and :math:`\|\sqrt{w}H\| \le 1`.
+    r"""A problem with captures of about 1, weights of at most 1, and :math:`\|\sqrt{w}A\| \le 1`.
 
     The gradient of its misfit then changes by at most as much as the image does (L = 1). τ is
     that of a regulariser with R(sf) = sR(f), as every norm is. Scaling by powers of the units
@@ -48,73 +47,71 @@ class ScaledProblem(eqx.Module):
     - `curvature`: L of the problem given, with its margin.
     """
 
-    problem: Deconvolution
+    problem: InverseProblem
     image_unit: Float[Array, ""]
     curvature: Float[Array, ""]
 
-    def __init__(self, problem: Deconvolution):
+    def __init__(self, problem: InverseProblem):
         # A minimiser does not depend on the units it is sought in, nor its derivatives on theirs.
-        fixed = jax.lax.stop_gradient(problem)
-        heaviest = or_one(jnp.stack([jnp.max(w) for w in fixed.weights]).max())
-        spectra = [jnp.max(jnp.abs(o.spectrum)) for o in fixed.operators]
-        strongest = or_one(jnp.stack(spectra).max())
-        captured = _root_mean_square(fixed.captures)
-        norm = _norm(_divided(fixed, strongest, captured, heaviest))
-        operator_unit = strongest * norm
+        operator_unit, captured, heaviest = _units(jax.lax.stop_gradient(problem))
         self.problem = _divided(problem, operator_unit, captured, heaviest)
         self.image_unit = captured / operator_unit
         self.curvature = heaviest * operator_unit**2
 
 
-def gradient(problem: Deconvolution, image: Float[Array, "*batch channel plane y x"]):
-    r"""That of the misfit: :math:`\sum_k H_k^T w_k (H_k f - g_k)`."""
-    return pulled_back(problem, residuals(problem, image))
+@jax.jit
+def _units(problem: InverseProblem):
+    """Of operators, captures and weights."""
+    heaviest = or_one(jnp.stack([jnp.max(w) for w in problem.weights]).max())
+    strongest = or_one(jnp.stack([_strength(o) for o in problem.operators]).max())
+    captured = _root_mean_square(problem.captures)
+    norm = _norm(_divided(problem, strongest, captured, heaviest))
+    return strongest * norm, captured, heaviest
 
 
-def pulled_back(problem: Deconvolution, differences) -> Float[Array, "*batch channel plane y x"]:
-    r""":math:`\sum_k H_k^T w_k d_k`."""
-    parts = zip(problem.operators, problem.weights, differences, strict=True)
-    first, *others = [operator.adjoint(w * d) for operator, w, d in parts]
-    return sum(others, start=first)
+def or_one(value: Float[Array, "..."]) -> Float[Array, "..."]:
+    """A divisor: the value where it is positive, else 1."""
+    return jnp.where(value > 0, value, 1)
 
 
-def even_image(problem: Deconvolution) -> Float[Array, "*batch channel plane y x"]:
-    """The even image that explains the captures best, not below zero: a good start."""
-    level = jnp.maximum(uniform_level(problem), 0)[..., None, None, None]
-    return jnp.broadcast_to(level, problem.image_shape)
+def _strength(operator: AbstractOperator) -> Float[Array, ""]:
+    """A first idea of ‖A‖, which keeps squares within the range of the precision."""
+    if isinstance(operator, CropConvolution):
+        return jnp.max(jnp.abs(operator.spectrum))
+    return operator.norm(iterations=3)
 
 
-def start_image(
-    problem: Deconvolution, image: Float[Array, "..."] | None
-) -> Float[Array, "*batch channel plane y x"]:
-    """The image given, checked, or the even one."""
-    if image is None:
-        return _even_image(problem)
-    if image.shape != problem.image_shape:
-        raise ValueError(
-            f"the start image has shape {image.shape}; give (…, channel, plane, y, x) = "
-            f"{problem.image_shape}"
-        )
-    return jnp.asarray(image, problem.captures[0].dtype)
-
-
-def _divided(problem: Deconvolution, operator_unit, capture_unit, weight_unit) -> Deconvolution:
-    spectra = [o.spectrum / operator_unit.astype(o.spectrum.dtype) for o in problem.operators]
+def _divided(problem: InverseProblem, operator_unit, capture_unit, weight_unit) -> InverseProblem:
+    operators = tuple(_times(o, 1 / operator_unit) for o in problem.operators)
     captures = tuple(c / capture_unit for c in problem.captures)
     weights = tuple(w / weight_unit for w in problem.weights)
-    tau = problem.tau / weight_unit / operator_unit / capture_unit
-    problem = eqx.tree_at(lambda p: [o.spectrum for o in p.operators], problem, spectra)
-    return eqx.tree_at(lambda p: (p.captures, p.weights, p.tau), problem, (captures, weights, tau))
+    tau_unit = problem.tau_unit / weight_unit / operator_unit / capture_unit
+    return eqx.tree_at(
+        lambda p: (p.operators, p.captures, p.weights, p.tau_unit),
+        problem,
+        (operators, captures, weights, tau_unit),
+    )
 
 
-def _norm(problem: Deconvolution) -> Float[Array, ""]:
-    """‖√w H‖ with its margin, by the power method, at most what the spectra allow."""
+def _times(operator: AbstractOperator, factor) -> AbstractOperator:
+    """An operator times a number; what is large, such as a dense matrix, is not copied."""
+    if isinstance(operator, CropConvolution):
+        spectrum = operator.spectrum * factor.astype(operator.spectrum.dtype)
+        return eqx.tree_at(lambda o: o.spectrum, operator, spectrum)
+    return Scaled(operator, factor)
+
+
+def _norm(problem: InverseProblem) -> Float[Array, ""]:
+    """‖√w A‖ with its margin, by the power method, at most what the spectra allow."""
     dtype = problem.captures[0].dtype
     found = MARGIN * Seen(problem).norm(iterations=POWER_ITERATIONS, dtype=dtype)
+    operators = convolutions(problem)
+    if operators is None:
+        return or_one(found)
     # Placing on the window and cutting out of it lengthen nothing: the transfer functions bound it.
     power = sum(
-        jnp.max(w) * jnp.sum(squared_modulus(o.spectrum), axis=-3)
-        for o, w in zip(problem.operators, problem.weights, strict=True)
+        jnp.max(w) * jnp.sum(o.spectrum.real**2 + o.spectrum.imag**2, axis=-3)
+        for o, w in zip(operators, problem.weights, strict=True)
     )
     return or_one(jnp.minimum(found, jnp.sqrt(jnp.max(power))))
 
@@ -124,7 +121,3 @@ def _root_mean_square(arrays) -> Float[Array, ""]:
     largest = or_one(jnp.stack([jnp.max(jnp.abs(a)) for a in arrays]).max())
     means = [jnp.mean((a / largest) ** 2) for a in arrays]
     return or_one(largest * jnp.sqrt(sum(means) / len(means)))
-
-
-_even_image = jax.jit(even_image)
-scaled_problem = jax.jit(ScaledProblem)

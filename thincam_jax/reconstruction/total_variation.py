@@ -11,6 +11,7 @@ from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
+from thincam_jax.reconstruction.regularisers import AbstractRegulariser
 
 Kind = Literal["isotropic", "anisotropic"]
 Coupling = Literal["none", "joint", "opponent"]
@@ -19,7 +20,7 @@ Coupling = Literal["none", "joint", "opponent"]
 OPPONENT = np.array([[1, 1, 1], [1, -1, 0], [1, 1, -2]]) / np.sqrt([[3], [2], [6]])
 
 
-class TotalVariation(eqx.Module):
+class TotalVariation(AbstractRegulariser):
     r"""Total variation of images (*batch, channel, plane, y, x), and how its parts are joined.
 
     .. math:: TV(f) = \sum_{c,\mathbf r} w_c\, \|(\partial_y f_c, \partial_x f_c,
@@ -61,19 +62,38 @@ class TotalVariation(eqx.Module):
 
     def __call__(self, image: Float[Array, "*batch channel plane y x"]) -> Float[Array, "*batch"]:
         """The total variation."""
-        shape = image.shape[-2:]
-        slopes = differences(image, self.depth_weight)
-        rotated = self._rotate(within_field(slopes, field_masks(shape, shape)))
+        rotated = self._rotate(self.analyse(image))
         lengths = self._length(rotated) * self._channel_weights(image.dtype)
         axes = (-4, -3, -2, -1)
         return jnp.sum(lengths, axis=axes)
 
-    def prox(
-        self, slopes: tuple[Float[Array, "*batch channel plane y x"], ...], step
+    @property
+    def orthonormal(self) -> bool:
+        """Differences are not: the proximal map of an image takes inner iterations."""
+        return False
+
+    def analyse(
+        self, image: Float[Array, "*batch channel plane y x"]
     ) -> tuple[Float[Array, "*batch channel plane y x"], ...]:
-        """The slopes u that minimise step·TV + ½‖u − slopes‖²: each vector shortened by `step`."""
-        rotated = self._rotate(slopes)
-        weights = self._channel_weights(slopes[0].dtype)
+        """The differences inside of the image."""
+        return _inside(differences(image, self.depth_weight))
+
+    def synthesise(
+        self, parts: tuple[Float[Array, "*batch channel plane y x"], ...]
+    ) -> Float[Array, "*batch channel plane y x"]:
+        """The transpose of `analyse`."""
+        return differences_adjoint(_inside(parts), self.depth_weight)
+
+    def squared_norm(self, dtype) -> Float[Array, ""]:
+        """Each of the directions takes differences of two samples: at most 2² = 4."""
+        return 8 + 4 * self.depth_weight.astype(dtype) ** 2
+
+    def shrink(
+        self, parts: tuple[Float[Array, "*batch channel plane y x"], ...], step
+    ) -> tuple[Float[Array, "*batch channel plane y x"], ...]:
+        """The slopes u that minimise step·TV + ½‖u − parts‖²: each vector shortened by `step`."""
+        rotated = self._rotate(parts)
+        weights = self._channel_weights(parts[0].dtype)
         channels, step = self.coupling == "joint", step * weights
         if self.kind == "isotropic":
             shrunk = _shortened(rotated, step, channels)
@@ -153,6 +173,11 @@ def within_field(slopes, masks):
     """Slopes with those that leave the field set to zero."""
     lines = [[m.astype(s.dtype) for m in pair] for pair, s in zip(masks, slopes, strict=False)]
     return tuple(s * y * x for s, (y, x) in zip(slopes, lines, strict=True))
+
+
+def _inside(slopes):
+    shape = slopes[0].shape[-2:]
+    return within_field(slopes, field_masks(shape, shape))
 
 
 def _norm(slopes, *, channels: bool):

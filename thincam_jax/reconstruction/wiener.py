@@ -1,7 +1,7 @@
 r"""Wiener synthesis of K captures into one image (thesis Eq 3.44, corrected)."""
 
 import functools
-from collections.abc import Sequence
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -13,15 +13,16 @@ from thincam_jax._core import checks
 from thincam_jax._core.grids import Grid, fast_shape, same_parity
 from thincam_jax._core.precision import as_complex
 from thincam_jax.imaging.operators import CropConvolution, kernel_grid, kernel_shape
-from thincam_jax.lensless.camera import LenslessCamera
-from thincam_jax.lensless.psf import Model, psf
+from thincam_jax.lensless.psf import psf
+from thincam_jax.reconstruction.noise import estimate_variance
+from thincam_jax.reconstruction.recording import Cameras, Recording
 from thincam_jax.reconstruction.registration import (
     distance_ratios,
     own_field,
     register,
     registered_shape,
 )
-from thincam_jax.reconstruction.result import Reconstruction
+from thincam_jax.reconstruction.solver import AbstractSolver, Reconstruction, as_synthesis
 from thincam_jax.reconstruction.spectra import (
     Prior,
     crop_noise,
@@ -29,7 +30,7 @@ from thincam_jax.reconstruction.spectra import (
     prior_spectrum,
     scene_power,
 )
-from thincam_jax.reconstruction.synthesis import check_synthesis, keep_bias
+from thincam_jax.reconstruction.synthesis import check_synthesis, keep_bias, separate
 
 
 class WienerSynthesis(eqx.Module):
@@ -57,13 +58,11 @@ class WienerSynthesis(eqx.Module):
 
     **Arguments**
 
-    - `cameras`: one for each capture; all with the same sensor.
-    - `wavelength`: mm, one or one for each capture.
-    - `object_distance`: t, mm.
+    - `cameras`: one for each capture, all with the same sensor, at one distance t; their
+      `field_shape` is that of the result, at the object pitch p·t/d. The scene is taken as black
+      outside.
     - `synthesis`: real matrix (channel × capture); a channel combines captures at one distance, and
-      channels must not share noise (rows orthogonal).
-    - `field_shape`: pixels of the result, at the object pitch p·t/d; default the sensor's shape.
-      The scene is taken as black outside.
+      channels must not share noise (rows orthogonal). Default: every capture a channel.
     - `prior`: "inverse_square", η_f ∝ 1/(ρ² + ρ₀²) with ρ₀ one cycle per field, or "flat".
     """
 
@@ -78,32 +77,24 @@ class WienerSynthesis(eqx.Module):
     field_shape: tuple[int, int] = eqx.field(static=True)
     padded: tuple[int, int] = eqx.field(static=True)
 
-    def __init__(
-        self,
-        cameras: Sequence[LenslessCamera],
-        *,
-        wavelength,
-        object_distance,
-        synthesis,
-        field_shape: tuple[int, int] | None = None,
-        prior: Prior = "inverse_square",
-        model: Model = "separable",
-        pixel_integration: bool = True,
-    ):
+    def __init__(self, cameras: Cameras, *, synthesis=None, prior: Prior = "inverse_square"):
         checks.choice("prior", prior, ("inverse_square", "flat"))
-        synthesis = np.asarray(synthesis, dtype=float)
-        capture_ratios = distance_ratios(cameras)
-        check_synthesis(synthesis, cameras, capture_ratios)
-        sensor = cameras[0].sensor.grid
+        cameras.require("wiener", "wavelength", "object_distance")
+        each, count = cameras.cameras, cameras.count
+        synthesis = separate(count) if synthesis is None else np.asarray(synthesis, dtype=float)
+        capture_ratios = distance_ratios(each)
+        check_synthesis(synthesis, each, capture_ratios)
+        sensor = each[0].sensor.grid
         self.sensor_shape = sensor.shape
-        self.field_shape = same_parity(field_shape or sensor.shape, sensor.shape)
+        self.field_shape = same_parity(cameras.field_shape or sensor.shape, sensor.shape)
         self.ratios = tuple(
             next(r for w, r in zip(row, capture_ratios, strict=True) if w) for row in synthesis
         )
-        how = {"model": model, "pixel_integration": pixel_integration}
-        wavelengths = jnp.broadcast_to(jnp.asarray(wavelength), (len(cameras),))
+        object_distance = cameras.object_distance
+        how = {"model": cameras.model, "pixel_integration": cameras.pixel_integration}
+        wavelengths = jnp.broadcast_to(jnp.asarray(cameras.wavelength), (count,))
         kernels, uniform = [], []
-        for camera, w, ratio in zip(cameras, wavelengths, capture_ratios, strict=True):
+        for camera, w, ratio in zip(each, wavelengths, capture_ratios, strict=True):
             own = own_field(self.field_shape, ratio)
             grid = kernel_grid(sensor, own)
             h = psf(camera, wavelength=w, object_distance=object_distance, grid=grid, **how)
@@ -121,8 +112,7 @@ class WienerSynthesis(eqx.Module):
         self.prior = prior_spectrum(prior, Grid(self.padded, sensor.pitch), self.field_shape)
         self.synthesis = jnp.asarray(synthesis, dtype=self.uniform.dtype)
         self.weights = tuple(map(tuple, synthesis.tolist()))
-        furthest = max(cameras, key=lambda c: float(c.distance))
-        self.object_pitch = sensor.pitch * object_distance / furthest.distance
+        self.object_pitch = cameras.pitch
 
     def __call__(
         self, captures: Float[Array, "capture *batch y x"], noise_variance
@@ -150,7 +140,7 @@ class WienerSynthesis(eqx.Module):
         flat = captures.reshape(count, -1, rows, columns)
         images = [self._image(flat[:, i], variance[:, i]) for i in range(flat.shape[1])]
         image = jnp.stack(images).reshape(*batch, *self.field_shape)
-        return Reconstruction(image, self.object_pitch)
+        return Reconstruction(image, self.object_pitch, "wiener")
 
     @eqx.filter_jit
     def _image(self, captures: Float[Array, "capture y x"], variance: Float[Array, " capture"]):
@@ -186,6 +176,52 @@ class WienerSynthesis(eqx.Module):
             steps = crop_noise(periodogram, self.padded, self.sensor_shape)
             density = density + jnp.where(biased[:, None, None], steps, 0.0)
         return density, scene
+
+
+class Wiener(AbstractSolver):
+    """The Wiener synthesis of all captures, in closed form; see `WienerSynthesis`.
+
+    It needs `Cameras`. Noise that the recording does not tell is estimated. To reconstruct many
+    scenes with the same cameras call `prepare(cameras)` once, and its result on each.
+
+    - `synthesis`, `prior`: as of `WienerSynthesis`.
+    """
+
+    name: ClassVar[str] = "wiener"
+    synthesis: np.ndarray | None
+    prior: Prior = eqx.field(static=True)
+
+    def __init__(self, *, synthesis=None, prior: Prior = "inverse_square"):
+        checks.choice("prior", prior, ("inverse_square", "flat"))
+        self.synthesis = as_synthesis(synthesis)
+        self.prior = prior
+
+    def prepare(self, cameras: Cameras) -> WienerSynthesis:
+        """The filter of these cameras, a function of captures and noise variance."""
+        return WienerSynthesis(cameras, synthesis=self.synthesis, prior=self.prior)
+
+    def solve(self, recording):
+        cameras = filtered_cameras(recording, self.name)
+        captures = jnp.stack(recording.captures)
+        variance = recording.noise_variance
+        if variance is None:
+            variance = estimate_variance(captures)
+        return self.prepare(cameras)(captures, variance)
+
+
+def filtered_cameras(recording: Recording, method: str) -> Cameras:
+    """What a filter is made of, or one line on why this recording has none."""
+    if not isinstance(recording.seen_by, Cameras):
+        raise ValueError(
+            f"method {method!r} needs cameras; with measured PSFs or operators use AdmmTV, Fista, "
+            "Ridge or PoissonTV"
+        )
+    if recording.valid is not None:
+        raise ValueError(
+            f"method {method!r} cannot leave out pixels that are not valid; use AdmmTV, Fista, "
+            "Ridge or PoissonTV"
+        )
+    return recording.seen_by
 
 
 def _coverage(own_field, field_shape, ratio: float) -> np.ndarray:

@@ -12,7 +12,7 @@ from helpers import ROOT
 from thincam_jax.commands.refocus import build as study
 from thincam_jax.commands.refocus.config import RefocusConfig, load_experiment
 from thincam_jax.commands.refocus.run import run_refocus, steps
-from thincam_jax.commands.study import RunFolder
+from thincam_jax.commands.run_folder import RunFolder
 from thincam_jax.commands.study.config import ConfigError, StudyConfig, dump_config, load_config
 
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from thincam_jax.commands.study import RunFolder
+from thincam_jax.commands.run_folder import RunFolder
 from thincam_jax.commands.study.config import load_config
 from thincam_jax.commands.study.run import run_study
 

@@ -10,7 +10,7 @@ import skimage.io
 from commands.study import tiny
 
 from thincam_jax.commands.doctor import environment
-from thincam_jax.commands.study import RunFolder
+from thincam_jax.commands.run_folder import RunFolder
 from thincam_jax.commands.study.page import findings, render
 from thincam_jax.commands.study.run import run_study
 

@@ -9,7 +9,8 @@ import pytest
 import skimage.io
 from commands.study import tiny
 
-from thincam_jax.commands.study import RunFolder, build, check_study, method_response
+from thincam_jax.commands.run_folder import RunFolder
+from thincam_jax.commands.study import build, check_study, method_response
 from thincam_jax.commands.study.config import ConfigError, load_config
 from thincam_jax.commands.study.run import run_study, steps
 

@@ -13,8 +13,7 @@ from thincam_jax.commands.design.ranking import Result
 from thincam_jax.commands.design.record import record, record_fronts
 from thincam_jax.commands.design.simulate import simulate
 from thincam_jax.commands.doctor import environment
-from thincam_jax.commands.run_folder import claim_folder, to_json
-from thincam_jax.commands.study import RunFolder
+from thincam_jax.commands.run_folder import RunFolder, claim_folder, to_json
 from thincam_jax.commands.study.config import Section, StudyConfig, dump_config
 from thincam_jax.commands.study.target import Progress
 

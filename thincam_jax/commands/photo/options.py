@@ -7,12 +7,11 @@ from typing import Literal
 from thincam_jax._core import checks
 from thincam_jax.measured import MeasurementError, Preparation
 from thincam_jax.measured.display import WhiteBalance
-from thincam_jax.reconstruction import METHODS
-from thincam_jax.reconstruction.arguments import DEFAULT_RIDGE, DEFAULT_TAU, FILTERS, refuse_unused
+from thincam_jax.reconstruction import SOLVERS, AbstractSolver, AdmmTV, Fista, Ridge, TotalVariation
 
-# Its captures are raw counts; prepared ones have their background taken away and a maximum of 1.
-NEEDS_COUNTS = ("poisson",)
-PSF_METHODS = tuple(m for m in METHODS if m not in (*FILTERS, *NEEDS_COUNTS))
+# What works from a measured PSF and prepared captures; "auto" then is admm_tv.
+PSF_METHODS = ("auto", "admm_tv", "fista", "ridge")
+DEFAULT_TAU, DEFAULT_RIDGE = 2.0, 1.0
 
 # Far beyond any use; its product with the captures' units stays within float32.
 _LARGEST_TAU = 1e6
@@ -94,24 +93,36 @@ class Recipe:
     def relative_ridge(self) -> float | int:
         return DEFAULT_RIDGE if self.ridge is None else self.ridge
 
+    def solver(self, channels: int) -> AbstractSolver:
+        """The solver for a capture of so many colour channels."""
+        if self.is_ridge:
+            return Ridge(self.relative_ridge, iterations=self.iterations)
+        variation = TotalVariation(coupling=self.coupling or ("joint" if channels > 1 else "none"))
+        if self.method == "fista":
+            return Fista(self.relative_tau, regulariser=variation, iterations=self.iterations)
+        return AdmmTV(self.relative_tau, variation=variation, iterations=self.iterations)
+
     def _check_method(self) -> None:
         """Whether it is one, works from prepared captures, and uses what is given."""
         able = f"choose one of {', '.join(repr(m) for m in PSF_METHODS)}"
-        if self.method in FILTERS:
+        if self.method in ("wiener", "fringe_scanning"):
             raise MeasurementError(
                 f"method {self.method!r} needs a model of the camera; with a measured PSF {able}"
             )
-        if self.method in NEEDS_COUNTS:
+        if self.method in SOLVERS and self.method not in PSF_METHODS:
             raise MeasurementError(
                 f"method {self.method!r} needs raw counts, which prepared captures are not; {able}"
             )
-        try:
-            checks.choice("method", self.method, PSF_METHODS)
-            given = {"variation": self.coupling, "tau": self.tau, "ridge": self.ridge}
-            refuse_unused(self.method, **given)
-        except ValueError as error:
-            text = str(error).replace("variation", "coupling")
-            raise MeasurementError(text) from None
+        if self.method not in PSF_METHODS:
+            raise MeasurementError(f"method = {self.method!r} is unknown; {able}")
+        given = {"coupling": self.coupling, "tau": self.tau, "ridge": self.ridge}
+        unused = ("coupling", "tau") if self.is_ridge else ("ridge",)
+        for name in unused:
+            if given[name] is not None:
+                other = "'admm_tv'" if self.is_ridge else "'ridge'"
+                raise MeasurementError(
+                    f"method {self.method!r} cannot use {name}; leave it out, or use {other}"
+                )
 
 
 @dataclass(frozen=True)

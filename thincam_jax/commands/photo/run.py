@@ -4,7 +4,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -26,16 +26,18 @@ from thincam_jax.measured import (
     to_display,
 )
 from thincam_jax.reconstruction import (
-    Deconvolution,
+    InverseProblem,
     Progress,
+    Psfs,
     Reconstruction,
+    Recording,
     TotalVariation,
-    psf_problem,
+    choose_solver,
     reconstruct,
 )
-from thincam_jax.reconstruction.entry import Method
 from thincam_jax.reconstruction.problem import residuals
-from thincam_jax.reconstruction.regularised import middle
+from thincam_jax.reconstruction.recording import middle
+from thincam_jax.reconstruction.regularised import AbstractRegularised
 
 # Real arrays of the window's size that a reconstruction holds at its peak, for each channel.
 _WINDOWS = 28
@@ -152,31 +154,22 @@ def _reconstruct(
     *_, channels, rows, columns = capture.shape  # those of the PSF as well
     sensor, field = (rows, columns), (2 * rows - 1, 2 * columns - 1)
     _check_memory(job, window_shape(sensor, field, sensor), channels)
-    coupling = recipe.coupling or ("joint" if channels > 1 else "none")
-    variation = TotalVariation(coupling=coupling)
-    found = reconstruct(
-        capture,
-        psf,
-        method=cast(Method, recipe.method),
-        field_shape=field,
-        tau=recipe.tau,
-        ridge=recipe.ridge,
-        variation=None if recipe.is_ridge else variation,
-        valid=valid,
-        iterations=recipe.iterations,
-        # Conjugate gradients run in one piece: there is nothing to tell of before the end.
-        callback=None if told is None or recipe.is_ridge else _Teller(told, job.capture.name),
-    )
+    recording = Recording(capture, Psfs(psf, field_shape=field), valid=valid)
+    solver = recipe.solver(channels)
+    # Conjugate gradients run in one piece: there is nothing to tell of before the end.
+    callback = None if told is None or recipe.is_ridge else _Teller(told, job.capture.name)
+    found = reconstruct(recording, solver, callback=callback)
     if found.status == "non_finite":
         raise MeasurementError(_lost(job, found, recipe))
     if found.status == "interrupted" and not found.iterations:
         raise KeyboardInterrupt
-    problem = psf_problem(
-        capture, psf, tau=recipe.relative_tau, field_shape=field, valid=valid, variation=variation
+    problem = recording.problem(
+        tau=recipe.relative_tau,
+        regulariser=solver.prior if isinstance(solver, AbstractRegularised) else None,
     )
     image = found.image if recipe.field == "full" else middle(found.image, sensor)
     image = np.asarray(image, dtype=np.float32)
-    return image[:, ::-1, ::-1] if recipe.flip else image, _facts(found, problem, recipe)
+    return image[:, ::-1, ::-1] if recipe.flip else image, _facts(recording, found, problem, recipe)
 
 
 def _lost(job: Job, found: Reconstruction, recipe: Recipe) -> str:
@@ -197,15 +190,18 @@ class _Teller:
         self.told(self.name, progress)
 
 
-def _facts(found: Reconstruction, problem: Deconvolution, recipe: Recipe) -> dict[str, Any]:
-    variation = {"kind": problem.variation.kind, "coupling": problem.variation.coupling}
-    is_ridge = recipe.is_ridge
+def _facts(
+    recording: Recording, found: Reconstruction, problem: InverseProblem, recipe: Recipe
+) -> dict[str, Any]:
+    is_ridge, prior = recipe.is_ridge, problem.regulariser
+    assert isinstance(prior, TotalVariation)
+    variation = {"kind": prior.kind, "coupling": prior.coupling}
     return {
         "method": found.method,
         "asked_for": recipe.method,
-        "reason": found.reason,
+        "reason": choose_solver(recording)[1] if recipe.method == "auto" else "",
         "tau": None if is_ridge else recipe.relative_tau,
-        "absolute_tau": None if is_ridge else problem.tau,
+        "absolute_tau": None if is_ridge else problem.absolute_tau,
         "ridge": recipe.relative_ridge if is_ridge else None,
         # The weight of a trusted pixel is 1/σ².
         "noise_standard_deviation": 1 / jnp.sqrt(jnp.max(problem.weights[0])),
@@ -223,7 +219,7 @@ def _facts(found: Reconstruction, problem: Deconvolution, recipe: Recipe) -> dic
 
 @jax.jit
 def _relative_residual(
-    problem: Deconvolution, image: Float[Array, "channel plane y x"]
+    problem: InverseProblem, image: Float[Array, "channel plane y x"]
 ) -> Float[Array, ""]:
     """‖Hf − g‖/‖g‖ over the pixels that are trusted."""
     (missing,), (capture,), (weight,) = residuals(problem, image), problem.captures, problem.weights

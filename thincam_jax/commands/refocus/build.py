@@ -13,7 +13,7 @@ from jaxtyping import Array
 from thincam_jax._core.grids import Grid
 from thincam_jax.commands.refocus.config import PlacedConfig, RefocusConfig
 from thincam_jax.commands.study import build
-from thincam_jax.commands.study.config import ConfigError, MethodConfig
+from thincam_jax.commands.study.config import ConfigError, MethodConfig, VariationConfig
 from thincam_jax.imaging.metrics import psnr
 from thincam_jax.imaging.metrics.image import SSIM_WINDOW
 from thincam_jax.imaging.scene import ImagePlane, Scene
@@ -21,7 +21,16 @@ from thincam_jax.imaging.sensor import Sensor, electrons_per_unit, read_out
 from thincam_jax.imaging.targets import resize
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.capture import capture
-from thincam_jax.reconstruction import Reconstruction, TotalVariation
+from thincam_jax.reconstruction import (
+    AbstractSolver,
+    AdmmTV,
+    Cameras,
+    FringeScanning,
+    Reconstruction,
+    Recording,
+    TotalVariation,
+    Wiener,
+)
 from thincam_jax.reconstruction.depth import (
     RefocusSweep,
     axial_resolution,
@@ -172,24 +181,32 @@ def run_sweep(
     study = config.focused(config.objects[0].distance)
     used = method_settings(config, method)
     images, variances = captures.of(config, method)
-    options = method.variation
-    variation = None if options is None else TotalVariation(options.kind)
-    return refocus_sweep(
-        images,
+    cameras = Cameras(
         [build.build_camera(study, s) for s in used],
-        sweep_distances(config),
-        method=method.kind,
         wavelength=[s.wavelength for s in used],
-        noise_variance=variances if config.noise else None,
-        synthesis=build.synthesis_matrix(method),
         field_shape=field_shape(config, method),
-        prior=config.prior,
-        tau=None if options is None else options.tau,
-        variation=variation,
-        iterations=None if options is None else options.iterations,
         model=config.model,
         pixel_integration=config.pixel_integration,
-        callback=progress,
+    )
+    recording = Recording(images, cameras, noise_variance=variances if config.noise else None)
+    return refocus_sweep(
+        recording, sweep_distances(config), _solver(config, method), callback=progress
+    )
+
+
+def _solver(config: RefocusConfig, method: MethodConfig) -> AbstractSolver:
+    """What the sweep reconstructs by."""
+    if method.kind == "fringe_scanning":
+        return FringeScanning()
+    synthesis = build.synthesis_matrix(method)
+    if method.kind == "wiener":
+        return Wiener(synthesis=synthesis, prior=config.prior)
+    options = method.variation or VariationConfig()
+    return AdmmTV(
+        options.tau,
+        variation=TotalVariation(options.kind),
+        synthesis=synthesis,
+        iterations=options.iterations,
     )
 
 

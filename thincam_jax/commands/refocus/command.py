@@ -7,7 +7,7 @@ import typer
 from thincam_jax.commands.refocus.build import check_refocus
 from thincam_jax.commands.refocus.config import RefocusConfig
 from thincam_jax.commands.refocus.run import run_refocus, steps
-from thincam_jax.commands.study import RunFolder
+from thincam_jax.commands.run_folder import RunFolder
 from thincam_jax.commands.terminal import INTERRUPTED, columns, console, tell
 
 

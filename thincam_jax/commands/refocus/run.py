@@ -11,8 +11,7 @@ from thincam_jax.commands.refocus import build as study
 from thincam_jax.commands.refocus import figures as figures
 from thincam_jax.commands.refocus.config import RefocusConfig
 from thincam_jax.commands.refocus.page import render
-from thincam_jax.commands.run_folder import to_json
-from thincam_jax.commands.study import RunFolder
+from thincam_jax.commands.run_folder import RunFolder, to_json
 from thincam_jax.reconstruction.depth import all_in_focus, depth_map
 
 Progress = Callable[[str], None]

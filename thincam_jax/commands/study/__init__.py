@@ -1,6 +1,5 @@
 """A configured study: captures, reconstructions, metrics and a report."""
 
-from thincam_jax.commands.run_folder import RunFolder as RunFolder
 from thincam_jax.commands.study.build import build_camera as build_camera
 from thincam_jax.commands.study.build import build_plane as build_plane
 from thincam_jax.commands.study.build import build_reconstructor as build_reconstructor

@@ -36,10 +36,13 @@ from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.capture import capture
 from thincam_jax.lensless.masks.fza import FresnelZoneAperture
 from thincam_jax.reconstruction import (
+    AdmmTV,
+    Cameras,
     FringeScanning,
     Reconstruction,
+    Recording,
     TotalVariation,
-    WienerSynthesis,
+    Wiener,
     reconstruct,
 )
 from thincam_jax.reconstruction import synthesis as syntheses
@@ -202,53 +205,39 @@ def build_reconstructor(
 ) -> Callable[[Array, Array], Reconstruction]:
     """A function of the captures (capture, channel, y, x) and variances (capture, channel)."""
     used = settings(config, method)
-    cameras = [build_camera(config, s) for s in used]
-    if method.kind == "fringe_scanning":
-        scanning = FringeScanning(
-            cameras, object_distance=config.object.distance, field_shape=shape
-        )
-        return lambda captures, variances: scanning(captures)
-    if method.kind == "admm_tv":
-        return functools.partial(_admm_tv, config, method, cameras, shape)
-    return WienerSynthesis(
-        cameras,
+    cameras = Cameras(
+        [build_camera(config, s) for s in used],
         wavelength=[s.wavelength for s in used],
         object_distance=config.object.distance,
-        synthesis=synthesis_matrix(method),
         field_shape=shape,
-        prior=config.prior,
         model=config.model,
         pixel_integration=config.pixel_integration,
     )
+    if method.kind == "fringe_scanning":
+        scanning = FringeScanning().prepare(cameras)
+        return lambda captures, variances: scanning(captures)
+    if method.kind == "admm_tv":
+        return functools.partial(_admm_tv, config, method, cameras)
+    return Wiener(synthesis=synthesis_matrix(method), prior=config.prior).prepare(cameras)
 
 
 def _admm_tv(
-    config: StudyConfig,
-    method: MethodConfig,
-    cameras: list[LenslessCamera],
-    shape: tuple[int, int],
-    captures: Array,
-    variances: Array,
+    config: StudyConfig, method: MethodConfig, cameras: Cameras, captures: Array, variances: Array
 ) -> Reconstruction:
     """Total variation on the crop model; without noise in the study it is estimated."""
+    recording = Recording(
+        captures, cameras, noise_variance=None if config.noise is None else variances
+    )
     options = method.variation or VariationConfig()
     variation = TotalVariation(
         options.kind,
         options.coupling_of(captures.shape[1]),
         chroma_weight=options.chroma_weight,
     )
-    return reconstruct(
-        captures,
-        cameras,
-        method="admm_tv",
-        object_distance=config.object.distance,
-        wavelength=[s.wavelength for s in settings(config, method)],
-        noise_variance=None if config.noise is None else variances,
-        synthesis=synthesis_matrix(method),
-        field_shape=shape,
-        tau=options.tau,
+    solver = AdmmTV(
+        options.tau,
         variation=variation,
+        synthesis=synthesis_matrix(method),
         iterations=options.iterations,
-        model=config.model,
-        pixel_integration=config.pixel_integration,
     )
+    return reconstruct(recording, solver)

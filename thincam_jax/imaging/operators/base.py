@@ -56,6 +56,27 @@ class AbstractOperator(eqx.Module):
         start = jnp.abs(jax.random.normal(key, self.in_shape, dtype or dtype_of(self)))
         return _power_iteration(self, start, iterations)
 
+    def mean_power(self) -> Float[Array, ""]:
+        r"""Mean squared length of a column: what unit noise on the capture becomes in the image.
+
+        :math:`\|A\|_F^2` over the number of columns, from the response to random signs (Hutchinson,
+        Commun. Stat. Simul. Comput. 18, 1059, 1989), to a few per cent; exact where an operator
+        says so.
+        """
+        return _mean_power(self)
+
+
+_PROBES = 16
+
+
+@eqx.filter_jit
+def _mean_power(operator: AbstractOperator) -> Float[Array, ""]:
+    dtype = dtype_of(operator)
+    signs = jax.random.rademacher(jax.random.key(0), (_PROBES, *operator.in_shape), dtype)
+    size = _PROBES * math.prod(operator.in_shape)
+    leaves = jax.tree.leaves(operator(signs))
+    return jnp.asarray(sum(jnp.sum(leaf**2) for leaf in leaves) / size)
+
 
 @eqx.filter_jit
 def _power_iteration(operator: AbstractOperator, start: Array, iterations: int):

@@ -115,6 +115,35 @@ class CropConvolution(AbstractOperator):
         product = self.spread(jnp.fft.rfft2(padded))
         return cut(jnp.fft.irfft2(product, s=self.window), self.field_corner, self.field_shape)
 
+    def mean_power(self) -> Float[Array, ""]:
+        """Mean of |H|² over all frequencies, channels and planes: Σh² of the PSF without the crop.
+
+        A pixel far outside of what the sensor sees sends it no light, but is counted as the others.
+        """
+        power = self.spectrum.real**2 + self.spectrum.imag**2
+        # The half plane of a real transform leaves out the mirror images of its inner columns.
+        columns = self.window[1]
+        whole = 2 * jnp.sum(power, axis=-1) - power[..., 0]
+        if columns % 2 == 0:
+            whole = whole - power[..., -1]
+        return jnp.mean(whole) / columns
+
+    def with_channels_and_planes(self) -> "CropConvolution":
+        """The same map on images (…, channel, plane, m, n), its planes summed."""
+        leading = self.spectrum.ndim - 2
+        if leading == 2 and self.summed == 1:
+            return self
+        if leading > 2 or self.summed > 1 or leading - self.summed > 1:
+            raise ValueError(
+                f"a convolution has {leading} axes before its rows, {self.summed} of them summed; "
+                "give kernels (channel, plane, k, l), with the planes summed"
+            )
+        planes = self.spectrum.shape[-3] if self.summed else 1
+        spectrum = self.spectrum.reshape(-1, planes, *self.spectrum.shape[-2:])
+        other = eqx.tree_at(lambda o: o.spectrum, self, spectrum)
+        object.__setattr__(other, "summed", 1)  # of the copy: a static field is no leaf
+        return other
+
     def combine(self, fields: Complex[Array, "*batch v u"]) -> Complex[Array, "*channels v u"]:
         """Spectrum of the whole image on the window, from the fields' spectra."""
         product = fields * self.spectrum

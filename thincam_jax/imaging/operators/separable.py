@@ -58,6 +58,11 @@ class Separable(AbstractOperator):
         """
         return jnp.linalg.norm(self.left, 2) * jnp.linalg.norm(self.right, 2)
 
+    def mean_power(self) -> Float[Array, ""]:
+        """Mean squared length of a column, exactly: that of `left` times that of `right`."""
+        columns = self.left.shape[1] * self.right.shape[1]
+        return jnp.sum(self.left**2) * jnp.sum(self.right**2) / columns
+
 
 def _between(left, image, right):
     """left · image · right, in the order of fewer products."""

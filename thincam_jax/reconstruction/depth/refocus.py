@@ -1,19 +1,17 @@
 """Reconstructions of one set of captures over a list of object distances."""
 
-from collections.abc import Callable, Sequence
-from typing import cast
+from collections.abc import Callable
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from thincam_jax.lensless.camera import LenslessCamera
-from thincam_jax.lensless.psf import Model
-from thincam_jax.reconstruction import TotalVariation, reconstruct
-from thincam_jax.reconstruction.arguments import FILTERS, Method
+from thincam_jax.reconstruction.methods import choose_solver, reconstruct
 from thincam_jax.reconstruction.noise import estimate_variance
-from thincam_jax.reconstruction.spectra import Prior
+from thincam_jax.reconstruction.poisson import PoissonTV
+from thincam_jax.reconstruction.recording import Cameras, Recording
+from thincam_jax.reconstruction.solver import AbstractSolver
 
 _LEAST = 3  # a maximum inside of the sweep needs two neighbours
 
@@ -43,81 +41,55 @@ class RefocusSweep(eqx.Module):
 
 
 def refocus_sweep(
-    captures: Float[Array, "capture *batch y x"] | Sequence[Float[Array, "*batch y x"]],
-    cameras: Sequence[LenslessCamera],
+    recording: Recording,
     distances,
+    solver: AbstractSolver | None = None,
     *,
-    method: Method = "wiener",
-    wavelength=None,
-    noise_variance=None,
-    synthesis=None,
-    field_shape: tuple[int, int] | None = None,
-    prior: Prior = "inverse_square",
-    tau=None,
-    variation: TotalVariation | None = None,
-    iterations: int | None = None,
-    tolerance: float | None = None,
-    model: Model = "separable",
-    pixel_integration: bool = True,
     callback: Callable[[int], object] | None = None,
 ) -> RefocusSweep:
     """One reconstruction after the other, focused on each of `distances`.
 
     Each is a whole image of the scene as if all of it stood there: what does stands out sharp, the
-    rest is blurred. Planes are not separated; for that, give `thincam_jax.reconstruct` several
-    distances at once with admm_tv.
+    rest is blurred. Planes are not separated; for that, give `Cameras` several distances at once
+    and use `AdmmTV`.
 
     Nothing is compiled twice: a distance is an argument of every method's compiled programs, and
     all images but the first cost their arithmetic only.
 
     **Arguments**
 
+    - `recording`: seen by `Cameras`, whose own object distance is not used.
     - `distances`: mm, at least three, increasing; best evenly spaced in 1/t (`refocus_distances`),
       with a step below a third of `axial_resolution`.
+    - `solver`: default the one of `choose_solver`, chosen once: images of two methods do not
+      compare.
     - `callback`: called with the number of images done after each.
-    - all others: as in `thincam_jax.reconstruct`.
 
     **Errors**: ValueError, one line, for distances that are not positive and increasing.
     """
     focus = _increasing(distances)
+    if not isinstance(recording.seen_by, Cameras):
+        raise ValueError("a sweep refocuses computed PSFs; give a recording seen by Cameras")
+    tau = getattr(solver, "tau", None)
     if isinstance(tau, str):
         raise ValueError(
             f"tau = {tau!r} would be another number at each distance, whose images then do not "
             "compare; give a number"
         )
-    if noise_variance is None and method != "poisson":
-        noise_variance = estimate_variance(jnp.asarray(captures))
-    images, pitch = [], None
+    if recording.noise_variance is None and not isinstance(solver, PoissonTV):
+        recording = recording.with_noise(estimate_variance(recording.captures))
+    if solver is None:
+        solver, _ = choose_solver(recording.focused(focus[0]))
+    images, slope = [], None
     for index, distance in enumerate(focus):
-        result = reconstruct(
-            captures,
-            cameras,
-            method=method,
-            object_distance=distance,
-            wavelength=wavelength,
-            noise_variance=noise_variance,
-            synthesis=synthesis,
-            field_shape=field_shape,
-            prior=prior,
-            tau=tau,
-            variation=variation,
-            iterations=iterations,
-            tolerance=tolerance,
-            model=model,
-            pixel_integration=pixel_integration,
-        )
+        result = reconstruct(recording.focused(distance), solver)
         images.append(result.image)
-        pitch = result.pitch
-        if method == "auto":  # chooses once: images of two methods do not compare
-            method = cast(Method, result.method)
-            if method in FILTERS:  # they refuse what the choice has left aside
-                tau = variation = iterations = tolerance = None
+        slope = jnp.reshape(jnp.asarray(result.pitch), ()) / distance  # p·t/d over t
         if callback is not None:
             callback(index + 1)
     stack = jnp.stack(images)
-    # p·t/d of the last image over its t.
-    slope = jnp.reshape(jnp.asarray(pitch, stack.dtype), ()) / jnp.asarray(focus[-1], stack.dtype)
-    return RefocusSweep(stack, jnp.asarray(focus, stack.dtype), slope, method)
+    slope = jnp.asarray(slope, stack.dtype)
+    return RefocusSweep(stack, jnp.asarray(focus, stack.dtype), slope, solver.name)
 
 
 def _increasing(distances) -> list[float]:

@@ -1,11 +1,16 @@
 r"""What is asked of an image besides its captures: R(f) = φ(Kf), and its proximal map."""
 
 import abc
+import functools
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import jax.scipy.fft
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from thincam_jax.reconstruction.wavelet import Wavelet
 
 Parts = tuple[Float[Array, "..."], ...]
 
@@ -20,7 +25,7 @@ class AbstractRegulariser(eqx.Module):
 
     @abc.abstractmethod
     def __call__(self, image: Float[Array, "*batch channel plane y x"]) -> Float[Array, "*batch"]:
-        """R of each member of the batch."""
+        """R of each batch element."""
 
     @abc.abstractmethod
     def analyse(self, image: Float[Array, "*batch channel plane y x"]) -> Parts:
@@ -100,8 +105,8 @@ def run_on(
     Nesterov's momentum in the sequence of Beck and Teboulle (SIAM J. Imaging Sci. 2, 183, 2009). It
     starts anew where it points uphill, ⟨lead − after, after − before⟩ > 0: the gradient scheme of
     O'Donoghue and Candès (Found. Comput. Math. 15, 715, 2015). Near the minimum, where an
-    objective is about quadratic, convergence is then linear at the best rate. Each member of a
-    batch has its own t, (*batch, 1, 1, 1, 1).
+    objective is about quadratic, convergence is then linear at the best rate. Each batch
+    element has its own t, (*batch, 1, 1, 1, 1).
     """
     later = (1 + jnp.sqrt(1 + 4 * t**2)) / 2
     speed = (t - 1) / later
@@ -116,3 +121,86 @@ def run_on(
 def first_t(image: Float[Array, "*batch channel plane y x"]) -> Float[Array, "*batch 1 1 1 1"]:
     """The t to start `run_on` with."""
     return jnp.ones((*image.shape[:-4], 1, 1, 1, 1), image.dtype)
+
+
+def denoise(
+    image: Float[Array, "*batch channel plane y x"],
+    step,
+    regulariser: AbstractRegulariser,
+    *,
+    nonnegative: bool = False,
+    iterations: int = 100,
+) -> Float[Array, "*batch channel plane y x"]:
+    r"""The image x that minimises ½‖x − image‖² + step·R(x), with x ≥ 0 where asked.
+
+    With R = TV it is denoising by Rudin, Osher and Fatemi. The larger `step` is against the
+    differences in the image, the more of them it takes; `step` has the unit of the image.
+    """
+    step = jnp.asarray(step, image.dtype)
+    return _denoise(image, step, regulariser, nonnegative, iterations)
+
+
+@functools.partial(jax.jit, static_argnames=("nonnegative", "iterations"))
+def _denoise(image, step, regulariser, nonnegative: bool, iterations: int):
+    dual = no_dual(regulariser, image)
+    return prox(regulariser, image, step, dual, nonnegative=nonnegative, iterations=iterations)[0]
+
+
+class Cosines(eqx.Module):
+    """The orthonormal discrete cosine transform (DCT-II) over the last two axes."""
+
+    def analyse(self, image: Float[Array, "*batch y x"]) -> Float[Array, "*batch y x"]:
+        """The coefficients of an image, zero frequency first."""
+        return jax.scipy.fft.dctn(image, axes=(-2, -1), norm="ortho")
+
+    def synthesise(self, coefficients: Float[Array, "*batch y x"]) -> Float[Array, "*batch y x"]:
+        """The image of coefficients: the transpose and inverse of `analyse`."""
+        return jax.scipy.fft.idctn(coefficients, axes=(-2, -1), norm="ortho")
+
+    def coarse_shape(self, shape: tuple[int, int]) -> tuple[int, int]:
+        """The mean is one coefficient."""
+        return 1, 1
+
+
+class Sparsity(AbstractRegulariser):
+    r"""R(f) = Σ |details of f| in an orthonormal basis, each plane and channel by itself.
+
+    The coarse coefficients (of cosines: the mean) are free, so that an even image costs nothing and
+    its brightness is not drawn to zero. R is a seminorm.
+
+    - `basis`: `Wavelet` or `Cosines`.
+    """
+
+    basis: Wavelet | Cosines
+
+    def __init__(self, basis: Wavelet | Cosines | None = None):
+        self.basis = Wavelet() if basis is None else basis
+
+    @property
+    def orthonormal(self):
+        return True
+
+    def __call__(self, image):
+        (details,) = self.analyse(image)
+        counted = jnp.where(self._free(details.shape), 0, jnp.abs(details))
+        return jnp.sum(counted, axis=(-4, -3, -2, -1))
+
+    def analyse(self, image):
+        return (self.basis.analyse(image),)
+
+    def synthesise(self, parts):
+        return self.basis.synthesise(parts[0])
+
+    def shrink(self, parts, step):
+        (details,) = parts
+        shrunk = jnp.sign(details) * jnp.maximum(jnp.abs(details) - step, 0)
+        return (jnp.where(self._free(details.shape), details, shrunk),)
+
+    def squared_norm(self, dtype):
+        return jnp.ones((), dtype)
+
+    def _free(self, shape) -> Bool[Array, "y x"]:
+        """Where the coarse coefficients stand."""
+        sizes = zip(shape[-2:], self.basis.coarse_shape(shape[-2:]), strict=True)
+        y, x = (jnp.asarray(np.arange(n) < coarse) for n, coarse in sizes)
+        return y[:, None] & x

@@ -1,0 +1,216 @@
+r"""Solving :math:`(\sum_k A_k^T w_k A_k + \mu)\, z = b` by the structure of the operators.
+
+Dense: the Gram matrix once, a Cholesky factorisation for each μ. One separable pair with one
+weight: two small eigendecompositions, once. All else: conjugate gradients (`lineax.CG`).
+
+Factorisations are not differentiated: derivatives follow from the equation itself
+(`jax.lax.custom_linear_solve`), so that equal eigenvalues do no harm.
+"""
+
+import abc
+import functools
+import math
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import lineax
+import optimistix
+from jaxtyping import Array, Float
+
+from thincam_jax._core.precision import product
+from thincam_jax.imaging.operators import AbstractOperator, Matrix, Scaled, Separable
+from thincam_jax.imaging.operators.crop_convolution import cut, place
+from thincam_jax.reconstruction.problem import (
+    InverseProblem,
+    back_projected,
+    convolutions,
+    detector_shape,
+    see,
+)
+
+# Of conjugate gradients within an iteration, relative to the right-hand side.
+INNER_TOLERANCE = {"float32": 1e-5, "float64": 1e-10}
+INNER_STEPS = 500
+
+
+class AbstractNormal(eqx.Module):
+    """The normal equations of a problem with a shift μ > 0, made ready to be solved."""
+
+    problem: eqx.AbstractVar[InverseProblem]
+    shift: eqx.AbstractVar[Float[Array, ""]]
+
+    @abc.abstractmethod
+    def solve(self, right: Float[Array, "..."]) -> Float[Array, "..."]:
+        """z of a right-hand side b (*batch, channel, plane, y, x)."""
+
+    @abc.abstractmethod
+    def shifted(self, shift: Float[Array, ""]) -> "AbstractNormal":
+        """The same with another μ; what does not depend on it is kept."""
+
+    def __call__(self, right, guess):
+        """z of b, differentiable; `guess` is what an iterative solution begins with."""
+        del guess
+        symmetric = lambda _, b: self.solve(b)  # noqa: E731
+        return jax.lax.custom_linear_solve(self.applied, right, symmetric, symmetric=True)
+
+    def applied(self, image):
+        """(Σ AᵀwA + μ) z."""
+        seen = tuple(see(operator, image) for operator in self.problem.operators)
+        return back_projected(self.problem, seen) + self.shift * image
+
+
+def normal_equations(problem: InverseProblem, shift: Float[Array, ""]) -> AbstractNormal:
+    """The solver that suits the operators and weights of a problem."""
+    fixed = jax.lax.stop_gradient(problem)
+    same = [math.prod(w.shape[: -len(detector_shape(o))]) == 1 for o, w in _weighted(fixed)]
+    bare = [_bare(o) for o in fixed.operators]
+    if all(same) and all(isinstance(o, Matrix) for o in bare):
+        return DenseNormal(problem, shift, _gram(fixed))
+    if len(bare) == 1 and isinstance(bare[0], Separable) and fixed.weights[0].size == 1:
+        return SeparableNormal(problem, shift, *_modes(fixed))
+    return IterativeNormal(problem, shift)
+
+
+class DenseNormal(AbstractNormal):
+    """By the Cholesky factor of the Gram matrix (pixel, pixel) plus μ."""
+
+    problem: InverseProblem
+    shift: Float[Array, ""]
+    gram: Float[Array, "n n"]
+    factor: Float[Array, "n n"]
+
+    def __init__(self, problem: InverseProblem, shift, gram):
+        self.problem, self.shift, self.gram = problem, shift, gram
+        self.factor = _cholesky(gram, jax.lax.stop_gradient(shift))
+
+    def solve(self, right):
+        flat = right.reshape(-1, self.gram.shape[0]).T
+        return jax.scipy.linalg.cho_solve((self.factor, True), flat).T.reshape(right.shape)
+
+    def shifted(self, shift):
+        return DenseNormal(self.problem, shift, self.gram)
+
+
+class SeparableNormal(AbstractNormal):
+    """By the eigenvectors of LᵀL and RᵀR, whose products are those of the whole."""
+
+    problem: InverseProblem
+    shift: Float[Array, ""]
+    rows: Float[Array, "m m"]
+    columns: Float[Array, "n n"]
+    power: Float[Array, "m n"]
+
+    def solve(self, right):
+        modes = product(product(self.rows.T, right), self.columns)
+        modes = modes / (self.power + jax.lax.stop_gradient(self.shift))
+        return product(product(self.rows, modes), self.columns.T)
+
+    def shifted(self, shift):
+        return eqx.tree_at(lambda n: n.shift, self, shift)
+
+
+class IterativeNormal(AbstractNormal):
+    """By conjugate gradients to `INNER_TOLERANCE`; convolutions are preconditioned."""
+
+    problem: InverseProblem
+    shift: Float[Array, ""]
+
+    def solve(self, right):
+        return self(right, jnp.zeros_like(right))
+
+    def __call__(self, right, guess):
+        limit = INNER_TOLERANCE[str(right.dtype)]
+        solution = self.solution(right, guess, limit, INNER_STEPS)
+        return solution.value
+
+    def solution(self, right, guess, tolerance, steps: int) -> lineax.Solution:
+        """What lineax says; `tolerance` is relative to the right-hand side, root mean square."""
+        structure = jax.ShapeDtypeStruct(right.shape, right.dtype)
+        tags = lineax.positive_semidefinite_tag
+        # lineax takes a curvature pᵀAp/‖r‖² below 100·eps·(number of unknowns) for a breakdown,
+        # whatever the size of A. In float32 that is 3 for 512² pixels: more than any A of norm 1
+        # has. A is therefore multiplied by what leaves room for eigenvalues down to 1e-6.
+        eps = float(jnp.finfo(right.dtype).eps)
+        factor = max(1.0, 1e8 * eps * right.size)
+        operator = lineax.FunctionLinearOperator(
+            lambda image: factor * self.applied(image), structure, tags
+        )
+        options = {"y0": guess / factor}
+        operators = convolutions(self.problem)
+        if operators is not None:
+            filtered = functools.partial(self._uncropped, operators)
+            options["preconditioner"] = lineax.FunctionLinearOperator(filtered, structure, tags)
+        size = jnp.sqrt(jnp.mean(right**2))
+        solver = lineax.CG(
+            rtol=tolerance, atol=tolerance * size, norm=optimistix.rms_norm, max_steps=steps
+        )
+        solution = lineax.linear_solve(operator, right, solver, options=options, throw=False)
+        return eqx.tree_at(lambda s: s.value, solution, factor * solution.value)
+
+    def shifted(self, shift):
+        return IterativeNormal(self.problem, shift)
+
+    def _uncropped(self, operators, image):
+        """(Σ w̄|Ĥ|² + μ)⁻¹ on the window, and cut: what the inverse were without the crop.
+
+        Positive definite, since it is a positive filter between a map and its transpose.
+        """
+        operator = operators[0]
+        power = sum(
+            jnp.mean(w) * (o.spectrum.real**2 + o.spectrum.imag**2)
+            for o, w in zip(operators, self.problem.weights, strict=True)
+        )
+        field = place(image, operator.field_corner, operator.window)
+        filtered = jnp.fft.rfft2(field)
+        filtered = filtered / (power + self.shift).astype(filtered.dtype)
+        field = jnp.fft.irfft2(filtered, s=operator.window)
+        return cut(field, operator.field_corner, operator.field_shape)
+
+
+def _weighted(problem: InverseProblem):
+    return zip(problem.operators, problem.weights, strict=True)
+
+
+def _bare(operator: AbstractOperator) -> AbstractOperator:
+    """What a `ScaledProblem` has put a unit around."""
+    return operator.operator if isinstance(operator, Scaled) else operator
+
+
+def _gain(operator: AbstractOperator):
+    return operator.gain if isinstance(operator, Scaled) else 1.0
+
+
+@jax.jit
+def _gram(problem: InverseProblem) -> Float[Array, "n n"]:
+    """Σ AᵀwA."""
+    parts = []
+    for operator, weight in _weighted(problem):
+        bare, gain = _bare(operator), _gain(operator)
+        assert isinstance(bare, Matrix)
+        matrix = bare.matrix
+        if weight.size == 1:
+            parts.append(weight.reshape(()) * gain**2 * product(matrix.T, matrix))
+        else:
+            rows = weight.reshape(weight.shape[-len(detector_shape(operator)) :])
+            rows = jnp.broadcast_to(rows, detector_shape(operator)).reshape(-1, 1)
+            parts.append(gain**2 * product(matrix.T, rows * matrix))
+    return sum(parts[1:], start=parts[0])
+
+
+@jax.jit
+def _cholesky(gram, shift):
+    return jnp.linalg.cholesky(gram + shift * jnp.eye(gram.shape[0], dtype=gram.dtype))
+
+
+@jax.jit
+def _modes(problem: InverseProblem):
+    """Eigenvectors of LᵀL and RᵀR, and the eigenvalues of the whole, weight included."""
+    (operator,), (weight,) = problem.operators, problem.weights
+    pair = _bare(operator)
+    assert isinstance(pair, Separable)
+    (first, rows), (second, columns) = (
+        jnp.linalg.eigh(product(m.T, m)) for m in (pair.left, pair.right)
+    )
+    power = weight.reshape(()) * _gain(operator) ** 2 * jnp.outer(first, second)
+    return rows, columns, jnp.maximum(power, 0)

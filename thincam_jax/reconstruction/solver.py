@@ -1,0 +1,82 @@
+"""What a reconstruction is asked for and what it returns: solvers as objects, results."""
+
+import abc
+from typing import TYPE_CHECKING, ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from thincam_jax._core import checks
+from thincam_jax.reconstruction.drive import Callback, Progress
+
+if TYPE_CHECKING:
+    from thincam_jax.reconstruction.recording import Recording
+
+
+class Reconstruction(eqx.Module):
+    """A reconstructed image; with cameras upright as the scene is, otherwise as the captures are.
+
+    - `image`: radiance, (*batch, y, x), in the scene's unit; (*batch, plane, y, x) with planes.
+    - `pitch`: distance of its pixels on the object, mm (of each plane); None without cameras.
+    - `method`, `reason`: how it was made, and why so if that was left to `choose_solver`.
+    - `ending`: how an iteration ended: "converged", "iterations_exhausted", "stopped" by the
+      callback, "interrupted" by Ctrl-C or "non_finite"; None for methods in closed form.
+    - `history`: objective and residuals along the way; see `Progress`.
+    - `iterations`, `seconds`: done and taken; compilation is part of the time.
+    - `tau`: the relative τ used, as given or found; None for methods without.
+    """
+
+    image: Float[Array, "*batch y x"]
+    pitch: Float[Array, "*plane"] | None
+    method: str = eqx.field(static=True, default="")
+    reason: str = eqx.field(static=True, default="")
+    ending: str | None = eqx.field(static=True, default=None)
+    history: tuple[Progress, ...] = eqx.field(static=True, default=())
+    iterations: int = eqx.field(static=True, default=0)
+    seconds: float = eqx.field(static=True, default=0.0)
+    tau: float | None = eqx.field(static=True, default=None)
+
+    @property
+    def status(self) -> str:
+        """`ending`, or "ok" without one; "non_finite" for NaN or infinity. Unknown inside jit."""
+        if not bool(jnp.isfinite(self.image).all()):
+            return "non_finite"
+        return self.ending or "ok"
+
+
+class AbstractSolver(eqx.Module):
+    """What is done about a recording; its fields are all that can be asked of the method."""
+
+    name: ClassVar[str]
+
+    @abc.abstractmethod
+    def solve(self, recording: "Recording") -> Reconstruction:
+        """The image of a scene from captures of it."""
+
+
+class AbstractIterativeSolver(AbstractSolver):
+    """A solver that goes from image to image, and so can begin with one and be watched."""
+
+    @abc.abstractmethod
+    def solve(
+        self,
+        recording: "Recording",
+        *,
+        start: Float[Array, "..."] | None = None,
+        callback: Callback | None = None,
+    ) -> Reconstruction:
+        """The image of a scene from captures of it; see `reconstruct`."""
+
+
+def check_limits(iterations: int, tolerance: float) -> None:
+    """When to end: how many iterations at most, and how small the residuals must be."""
+    if isinstance(iterations, bool) or not isinstance(iterations, int) or iterations < 1:
+        raise ValueError(f"iterations = {iterations}; give a whole number of at least 1")
+    checks.non_negative("tolerance", tolerance, "a ratio")
+
+
+def as_synthesis(synthesis) -> np.ndarray | None:
+    """A synthesis as a matrix, (channel, capture)."""
+    return None if synthesis is None else np.asarray(synthesis, dtype=float)
