@@ -49,7 +49,7 @@ class Module:
     @property
     def top(self) -> str:
         """The room it belongs to: "lensless"."""
-        return Path(self.path).parts[0].removesuffix(".py")
+        return Path(Path(self.path).parts[0]).stem
 
     @property
     def package(self) -> list[str]:
@@ -79,7 +79,9 @@ class Module:
 
 def read_package(folder: Path) -> list[Module]:
     modules = []
-    for path in sorted(folder.rglob("*.py")):
+    for path in sorted(folder.rglob("*.py*")):
+        if path.suffix not in (".py", ".pyi"):  # a stub holds the names of a lazy package
+            continue
         text = path.read_text(encoding="utf-8")
         name = path.relative_to(folder).as_posix()
         modules.append(Module(name, text, ast.parse(text, str(path))))
@@ -145,7 +147,7 @@ def modules_hidden_by_names(modules: list[Module]) -> list[str]:
     return [
         f"{module.path}:{line}: {name.split('.')[-1]} hides the module of that name"
         for module in modules
-        if Path(module.path).name == "__init__.py"
+        if Path(module.path).stem == "__init__"
         for line, name in module.imports()
         if (Path(module.path).parent / name.split(".")[-1]).as_posix() in paths
         and name != ".".join([*module.package, name.split(".")[-1]])
@@ -247,8 +249,10 @@ BROKEN = [
     (UP, "commands/rig/command.py", "from ...hardware import x", "inside a function"),
     (UP, "commands/cli.py", "def f():\n    from ..hardware import x", "only its command may"),
     (UP, "__init__.py", "from . import hardware", "only its command may"),
+    (UP, "__init__.pyi", "from .hardware.stage import Stage as Stage", "only its command may"),
     (modules_hidden_by_names, "lensless/__init__.py", "from .psf import psf", "psf hides the"),
     (modules_hidden_by_names, "lensless/__init__.py", "from ..units import masks", "masks hides"),
+    (modules_hidden_by_names, "__init__.pyi", "from .lensless.psf import units", "units hides"),
     (jaxopt_outside_its_files, "reconstruction/tv.py", "import jaxopt", "_jaxopt.py and design"),
     (jaxopt_outside_its_files, "_jaxopt.py", "from jaxopt.projection import x", "imports jaxopt"),
     (front_end_libraries_in_the_core, "lensless/psf.py", "import matplotlib.pyplot", "matplotlib"),

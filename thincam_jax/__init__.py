@@ -1,38 +1,9 @@
-"""thincam_jax: simulate, reconstruct and design thin computational cameras, in JAX."""
+"""thincam_jax: simulate, reconstruct and design thin computational cameras, in JAX.
 
-from thincam_jax._core.grids import Grid as Grid
-from thincam_jax.imaging.scene import ImagePlane as ImagePlane
-from thincam_jax.imaging.scene import Scene as Scene
-from thincam_jax.imaging.scene import Spectrum as Spectrum
-from thincam_jax.imaging.sensor import GaussianNoise as GaussianNoise
-from thincam_jax.imaging.sensor import PoissonGaussianNoise as PoissonGaussianNoise
-from thincam_jax.imaging.sensor import Sensor as Sensor
-from thincam_jax.lensless.accuracy import Selection as Selection
-from thincam_jax.lensless.accuracy import predict_error as predict_error
-from thincam_jax.lensless.accuracy import select_model as select_model
-from thincam_jax.lensless.camera import LenslessCamera as LenslessCamera
-from thincam_jax.lensless.capture import capture as capture
-from thincam_jax.lensless.masks.fza import FresnelZoneAperture as FresnelZoneAperture
-from thincam_jax.lensless.masks.sampled import SampledMask as SampledMask
-from thincam_jax.lensless.phase_shift import fringe_scanned_otf as fringe_scanned_otf
-from thincam_jax.lensless.phase_shift import phase_pair_otf as phase_pair_otf
-from thincam_jax.lensless.plan import Plan as Plan
-from thincam_jax.lensless.plan import plan as plan
-from thincam_jax.lensless.psf import MODELS as MODELS
-from thincam_jax.lensless.psf import otf as otf
-from thincam_jax.lensless.psf import psf as psf
-from thincam_jax.measured.calibration import fit_psf as fit_psf
-from thincam_jax.reconstruction import AdmmTV as AdmmTV
-from thincam_jax.reconstruction import Cameras as Cameras
-from thincam_jax.reconstruction import Fista as Fista
-from thincam_jax.reconstruction import FringeScanning as FringeScanning
-from thincam_jax.reconstruction import InverseProblem as InverseProblem
-from thincam_jax.reconstruction import PoissonTV as PoissonTV
-from thincam_jax.reconstruction import Psfs as Psfs
-from thincam_jax.reconstruction import Recording as Recording
-from thincam_jax.reconstruction import Ridge as Ridge
-from thincam_jax.reconstruction import TotalVariation as TotalVariation
-from thincam_jax.reconstruction import Wiener as Wiener
-from thincam_jax.reconstruction import choose_solver as choose_solver
-from thincam_jax.reconstruction import reconstruct as reconstruct
-from thincam_jax.reconstruction import solve_fixed_point as solve_fixed_point
+The names stand in `__init__.pyi`. Each is imported at its first use: JAX takes a second to import,
+which `thincam --help` need not wait for.
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

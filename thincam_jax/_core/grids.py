@@ -2,8 +2,8 @@
 
 import equinox as eqx
 import jax.numpy as jnp
+import scipy
 from jaxtyping import Array, Float
-from scipy.fft import next_fast_len
 
 from thincam_jax._core import checks
 
@@ -62,7 +62,7 @@ def centred_frequencies(count: int, pitch: Float[Array, ""]) -> Float[Array, " c
 
 def fast_shape(shape: tuple[int, int], *, real: bool = False) -> tuple[int, int]:
     """The smallest shape that holds `shape` and transforms fast."""
-    rows, columns = (int(next_fast_len(n, real=real) or n) for n in shape)
+    rows, columns = (int(scipy.fft.next_fast_len(n, real=real) or n) for n in shape)
     return rows, columns
 
 

@@ -12,11 +12,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix
+import scipy
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
-from scipy.stats import qmc
 
 from thincam_jax._core import checks
-from thincam_jax.design._jaxopt import descend_in_box
 from thincam_jax.design.design import Design
 from thincam_jax.design.space import DesignSpace, active_limits
 
@@ -185,7 +184,7 @@ def even_samples(dimensions: int, count: int, key, dtype) -> Float[Array, "point
     """Scrambled Sobol points of the unit cube."""
     seed = int(jax.random.randint(key, (), 0, 2**31 - 1))
     power = max(0, (count - 1).bit_length())
-    sampler = qmc.Sobol(dimensions, scramble=True, rng=seed)
+    sampler = scipy.stats.qmc.Sobol(dimensions, scramble=True, rng=seed)
     return jnp.asarray(sampler.random_base2(power)[:count], dtype)
 
 
@@ -247,6 +246,8 @@ def _descend(objective, space, data, points, scales, steps: int, tolerance) -> D
 
 @functools.partial(jax.jit, static_argnames=("objective", "steps"))
 def _descend_in_box(objective, space, data, points, scales, steps: int, tolerance) -> Descents:
+    from thincam_jax.design._jaxopt import descend_in_box  # jaxopt is slow to import
+
     def one(point, scale):
         def loss(p, given):
             return objective(space.design(p), given) / scale

@@ -3,7 +3,7 @@
 from typing import Literal
 
 import numpy as np
-import scipy.ndimage
+import scipy
 from jaxtyping import Bool, Float, Shaped
 
 from thincam_jax._core import checks

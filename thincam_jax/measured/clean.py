@@ -4,7 +4,7 @@ import math
 from typing import Any
 
 import numpy as np
-import scipy.signal
+import scipy
 from jaxtyping import Float
 
 from thincam_jax.measured.options import Centre

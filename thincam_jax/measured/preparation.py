@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-import scipy.ndimage
+import scipy
 from jaxtyping import Bool, Float32
 
 from thincam_jax.measured.bayer import demosaic, demosaic_mask

@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable
 
 import numpy as np
-import scipy.optimize
+import scipy
 
 from thincam_jax.commands.accuracy.cameras import psf_of
 from thincam_jax.commands.accuracy.norms import relative_error

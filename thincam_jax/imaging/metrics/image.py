@@ -5,7 +5,7 @@ its quality; the alignment takes them out first. Eager NumPy, not differentiable
 """
 
 import numpy as np
-import skimage.metrics
+import skimage
 from jaxtyping import ArrayLike, Float64, Num
 
 SSIM_WINDOW = 7  # pixels; scikit-image's uniform window

@@ -6,7 +6,7 @@ import math
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import scipy.sparse
+import scipy
 from jax.experimental import sparse
 from jaxtyping import Array, Float, Int
 

@@ -6,8 +6,7 @@ from importlib import resources
 from pathlib import Path
 
 import numpy as np
-import skimage.io
-import skimage.transform
+import skimage
 from jaxtyping import ArrayLike, Float64, Num
 
 from thincam_jax._core import checks

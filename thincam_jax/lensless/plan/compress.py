@@ -1,7 +1,7 @@
 """Few columns that stand for many: an interpolative decomposition under a weight."""
 
 import numpy as np
-import scipy.linalg
+import scipy
 from jaxtyping import Complex, Float
 
 

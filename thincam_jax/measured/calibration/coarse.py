@@ -14,8 +14,8 @@ from typing import NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jaxtyping import Array, Float
-from scipy import optimize
 
 from thincam_jax._core.grids import Grid
 from thincam_jax.measured.calibration.covariance import Covariance, covariance, of_values
@@ -77,7 +77,7 @@ def descend(
     width = _WIDE
     while True:
         widths = difference_widths(best, width)
-        step = optimize.least_squares(
+        step = scipy.optimize.least_squares(
             _residual,
             np.zeros(len(names)),
             jac=_slopes,  # pyright: ignore[reportArgumentType]

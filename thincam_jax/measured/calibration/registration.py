@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-import scipy.ndimage
+import scipy
 from jaxtyping import Array, Float
 
 from thincam_jax._core import checks

@@ -1,0 +1,55 @@
+"""What an import brings with it: a fresh process pays for what it uses, and for nothing more."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+import thincam_jax as tc
+from helpers import ROOT
+
+SLOW = ("jax", "matplotlib", "pydantic", "scipy", "skimage")
+
+
+def imported_by(code: str) -> set[str]:
+    """The modules of a new process after `code`, by full name."""
+    path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
+    done = subprocess.run(
+        [sys.executable, "-c", f"{code}\nimport sys; print(*sys.modules)"],
+        capture_output=True,
+        text=True,
+        env={**os.environ, "PYTHONPATH": path},
+        timeout=120,
+        check=True,
+    )
+    return set(done.stdout.splitlines()[-1].split())
+
+
+def test_the_package_alone_is_light():
+    assert imported_by("import thincam_jax").isdisjoint(SLOW)
+
+
+def test_units_are_light():
+    assert imported_by("from thincam_jax.units import nm").isdisjoint(SLOW)
+
+
+@pytest.mark.parametrize("name", ["psf", "capture", "plan", "select_model"])
+def test_optics_wait_for_no_library_of_analysis_or_plots(name):
+    """SciPy itself is there, of its parts only those that JAX's sparse matrices import."""
+    modules = imported_by(f"import thincam_jax as tc; tc.{name}")
+    assert "jax" in modules
+    assert modules.isdisjoint(("matplotlib", "skimage", "jaxopt", "pydantic"))
+    parts = ("fft", "ndimage", "optimize", "signal", "stats")
+    assert modules.isdisjoint(f"scipy.{part}" for part in parts)
+
+
+def test_every_name_of_the_package_is_there():
+    assert "LenslessCamera" in dir(tc)
+    for name in tc.__all__:
+        assert getattr(tc, name) is not None
+
+
+def test_a_name_that_is_not_there():
+    with pytest.raises(AttributeError, match="no_such_camera"):
+        _ = tc.no_such_camera  # pyright: ignore
