@@ -6,6 +6,7 @@ from pathlib import Path
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")  # set it to run the tests on another device
 os.environ["MPLBACKEND"] = "Agg"
+os.environ["THINCAM_CACHE"] = "off"  # commands in tests leave no compiled programs with the user
 # Most of the tests' time goes into compiling, half of it without these emitters and without LLVM's
 # optimisation. What tests rounding is compiled `helpers.AS_IN_USE`.
 os.environ.setdefault(

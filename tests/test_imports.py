@@ -9,7 +9,7 @@ import pytest
 import thincam_jax as tc
 from helpers import ROOT
 
-SLOW = ("jax", "matplotlib", "pydantic", "scipy", "skimage")
+SLOW = ("jax", "matplotlib", "numpy", "scipy", "skimage", "yaml")
 
 
 def imported_by(code: str) -> set[str]:
@@ -42,6 +42,34 @@ def test_optics_wait_for_no_library_of_analysis_or_plots(name):
     assert modules.isdisjoint(("matplotlib", "skimage", "jaxopt", "pydantic"))
     parts = ("fft", "ndimage", "optimize", "signal", "stats")
     assert modules.isdisjoint(f"scipy.{part}" for part in parts)
+
+
+@pytest.mark.parametrize(
+    "typed",
+    ["--help", "--version", "run --help", "bench accuracy --help"]
+    + [f"{command} --help" for command in ("reconstruct", "sweep", "design", "doctor", "init")],
+)
+def test_help_of_a_command_waits_for_nothing(typed):
+    modules = imported_by(as_command(typed))
+    assert "thincam_jax.commands.cli" in modules
+    assert modules.isdisjoint(SLOW)
+
+
+def test_completion_waits_for_nothing():
+    asked = {"_THINCAM_COMPLETE": "complete_bash", "COMP_WORDS": "thincam r", "COMP_CWORD": "1"}
+    code = f"import os; os.environ.update({asked})\n{as_command('')}"
+    assert imported_by(code).isdisjoint(SLOW)
+
+
+def as_command(typed: str) -> str:
+    return f"""
+import sys
+sys.argv = ["thincam", *{typed.split()}]
+from thincam_jax.commands.cli import main
+try:
+    main()
+except SystemExit as end:
+    assert not end.code"""
 
 
 def test_every_name_of_the_package_is_there():

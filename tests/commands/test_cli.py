@@ -1,8 +1,12 @@
 """The command: exit codes, one clear line for what a user can put right, and how to go on."""
 
 import os
+import shlex
+import shutil
 import subprocess
 import sys
+from importlib.metadata import version
+from pathlib import Path
 
 import pytest
 from commands.study import tiny
@@ -10,6 +14,10 @@ from typer.testing import CliRunner
 
 from helpers import ROOT
 from thincam_jax.commands import cli, doctor
+from thincam_jax.commands.accuracy import run as benches
+from thincam_jax.commands.cache import cache_state
+from thincam_jax.commands.examples import kinds
+from thincam_jax.commands.study import run as studies
 
 runner = CliRunner()
 
@@ -55,7 +63,7 @@ def test_default_folder_is_named_after_the_study(file, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     folders = []
     monkeypatch.setattr(
-        cli, "run_study", lambda _, folder, __: folders.append(folder.path) or {"methods": {}}
+        studies, "run_study", lambda _, folder, __: folders.append(folder.path) or {"methods": {}}
     )
     assert call("run", file).exit_code == 0
     # A name of dots does not lead out of the folder.
@@ -131,7 +139,7 @@ class TestExitCode2:
 
 class TestBenchAccuracy:
     def test_prints_the_results_and_where_the_figure_is(self, file, tmp_path, monkeypatch):
-        monkeypatch.setattr(cli.benches, "run_accuracy", lambda *_: RESULTS)
+        monkeypatch.setattr(benches, "run_accuracy", lambda *_: RESULTS)
         result = call("bench", "accuracy", file, "--out", tmp_path / "out", "--size", 32)
         assert result.exit_code == 0, result.output
         row = next(line for line in result.stdout.splitlines() if "separable" in line)
@@ -143,7 +151,7 @@ class TestBenchAccuracy:
         monkeypatch.chdir(tmp_path)
         seen = []
         monkeypatch.setattr(
-            cli.benches, "run_accuracy", lambda *given: seen.append(given[1:3]) or RESULTS
+            benches, "run_accuracy", lambda *given: seen.append(given[1:3]) or RESULTS
         )
         options = ("--size", 64, "--size", 32, "--capture-size", 48, "--set", "name=Other")
         assert call("bench", "accuracy", file, *options).exit_code == 0
@@ -175,7 +183,7 @@ class TestBenchAccuracy:
             progress("64 pixels")
             raise KeyboardInterrupt
 
-        monkeypatch.setattr(cli.benches, "run_accuracy", interrupted)
+        monkeypatch.setattr(benches, "run_accuracy", interrupted)
         result = call("bench", "accuracy", file, "--out", tmp_path / "out")
         assert result.exit_code == 130
         assert result.stderr.splitlines() == ["thincam: interrupted; nothing is kept."]
@@ -225,7 +233,7 @@ def test_defect_keeps_its_traceback(file, monkeypatch, tmp_path):
     def broken(*_):
         raise ZeroDivisionError("a defect")
 
-    monkeypatch.setattr(cli, "run_study", broken)
+    monkeypatch.setattr(studies, "run_study", broken)
     result = call("run", file, "--out", tmp_path / "out")
     assert isinstance(result.exception, ZeroDivisionError)
 
@@ -239,7 +247,7 @@ def test_interrupt(file, monkeypatch, tmp_path, done, hint):
         progress("picture: capture 1")
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(cli, "run_study", interrupted)
+    monkeypatch.setattr(studies, "run_study", interrupted)
     result = call("run", file, "--out", tmp_path / "out")
     assert result.exit_code == 130
     expected = f"thincam: interrupted; finished: {hint}. The same command goes on from there."
@@ -256,6 +264,7 @@ def test_doctor():
     assert "  float64: yes" in lines
     assert "  compiled sums: right" in lines
     assert f"jax {found['versions']['jax']}" in lines
+    assert f"compiled programs: {cache_state()}" in lines
 
 
 def test_doctor_tells_what_is_missing(monkeypatch):
@@ -280,6 +289,48 @@ def test_help(arguments, parts):
     assert result.exit_code == 0
     for part in parts:
         assert part in result.stdout
+
+
+def test_version():
+    result = call("--version")
+    assert (result.exit_code, result.stdout) == (0, f"thincam_jax {version('thincam_jax')}\n")
+
+
+@pytest.mark.parametrize(
+    ("typed", "completed"),
+    [
+        ("thincam re", ["reconstruct"]),
+        ("thincam bench ", ["accuracy"]),
+        ("thincam init des", [kind for kind in kinds() if kind.startswith("des")]),
+        ("thincam reconstruct --method a", ["auto", "admm-tv"]),
+        ("thincam reconstruct --bayer R", ["RGGB"]),
+    ],
+)
+def test_completion(typed, completed):
+    words = {"COMP_WORDS": typed, "COMP_CWORD": str(typed.count(" "))}
+    given = {"_THINCAM_COMPLETE": "complete_bash", **words}
+    result = runner.invoke(cli.app, [], prog_name="thincam", env=given)
+    assert result.stdout.split() == completed
+
+
+@pytest.mark.parametrize("option", ["--show-completion", "--install-completion"])
+def test_completion_of_the_shell_that_asks(option, tmp_path):
+    """It is found from the process that called."""
+    bash = shutil.which("bash")
+    if bash is None:
+        pytest.skip("needs bash")
+    command = f"{shlex.quote(sys.executable)} -m thincam_jax.commands.cli {option}; exit $?"
+    path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
+    environment = {**os.environ, "PYTHONPATH": path, "HOME": str(tmp_path)}
+    done = subprocess.run(
+        [bash, "-c", command], capture_output=True, text=True, env=environment, timeout=120
+    )
+    assert done.returncode == 0, done.stderr
+    script = done.stdout
+    if option == "--install-completion":
+        line = (tmp_path / ".bashrc").read_text().strip()
+        script = Path(line.removeprefix("source ").strip("'")).read_text()
+    assert "complete -o default -F _thincam_completion thincam" in script
 
 
 def test_as_a_process(file):

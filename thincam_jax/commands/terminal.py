@@ -1,30 +1,55 @@
-"""What the commands share: consoles, exit codes, and how an error is told."""
+"""What the commands share: exit codes, how an error is told, and progress bars.
 
-from typing import Annotated, NoReturn
+As the files `command.py`, it imports nothing at its head that `thincam --help` does not need.
+"""
 
-import rich.console
-import rich.progress
+import contextlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, NoReturn
+
 import typer
 
-from thincam_jax.commands.config_file import ConfigError
-
-console = rich.console.Console()
-errors = rich.console.Console(stderr=True)
+if TYPE_CHECKING:
+    import rich.progress
 
 WRONG_INPUT = 2
 INTERRUPTED = 130  # the shells' exit code after Ctrl-C
 
-# What a user can put right; anything else is a defect and keeps its traceback.
-USER_ERRORS = (ConfigError, FileNotFoundError, IsADirectoryError, PermissionError, MemoryError)
-
+ConfigFile = Annotated[Path, typer.Argument(help="Experiment file (YAML); thincam init makes one.")]
 Overrides = Annotated[
     list[str] | None,
     typer.Option("--set", help="Change a value: a.b=value, list entries by number."),
 ]
 
 
+@contextlib.contextmanager
+def told(interrupted: Callable[[], str]) -> Iterator[None]:
+    """What a user can put right is told in one line, and Ctrl-C by what `interrupted` says.
+
+    Anything else is a defect and keeps its traceback.
+    """
+    try:
+        yield
+    except KeyboardInterrupt:
+        tell(interrupted())
+        raise typer.Exit(INTERRUPTED) from None
+    except Exception as error:
+        from thincam_jax.commands.config_file import ConfigError
+
+        if not isinstance(
+            error,
+            (ConfigError, FileNotFoundError, IsADirectoryError, PermissionError, MemoryError),
+        ):
+            raise
+        fail(error)
+
+
 def tell(text: str) -> None:
     """Lines on standard error, whole and without markup."""
+    from rich.console import Console
+
+    errors = Console(stderr=True)
     for line in text.splitlines():
         errors.print(f"thincam: {line}", highlight=False, markup=False, soft_wrap=True)
 
@@ -35,14 +60,24 @@ def fail(error: BaseException) -> NoReturn:
     raise typer.Exit(WRONG_INPUT)
 
 
-def columns(*more: str) -> tuple[rich.progress.ProgressColumn, ...]:
-    """Of a progress bar; `more` are templates, as "{task.fields[objective]}"."""
-    return (
-        rich.progress.TextColumn("{task.description}"),
-        rich.progress.BarColumn(),
-        rich.progress.MofNCompleteColumn(),
-        *(rich.progress.TextColumn(template) for template in more),
-        rich.progress.TimeElapsedColumn(),
-        rich.progress.TextColumn("left"),
-        rich.progress.TimeRemainingColumn(),
+def progress_bar(*more: str) -> "rich.progress.Progress":
+    """With a count and the times; `more` are templates, as "{task.fields[objective]}"."""
+    from rich import progress
+
+    return progress.Progress(
+        progress.TextColumn("{task.description}"),
+        progress.BarColumn(),
+        progress.MofNCompleteColumn(),
+        *(progress.TextColumn(template) for template in more),
+        progress.TimeElapsedColumn(),
+        progress.TextColumn("left"),
+        progress.TimeRemainingColumn(),
     )
+
+
+@contextlib.contextmanager
+def counted(name: str, steps: int) -> Iterator[Callable[[str], None]]:
+    """A progress bar of so many steps; what it yields is called at each, with its name."""
+    with progress_bar() as bar:
+        task = bar.add_task(name, total=steps)
+        yield lambda text: bar.update(task, advance=1, description=text)

@@ -6,7 +6,7 @@ import skimage.io
 from commands.design import tiny
 from commands.test_cli import call, one_line
 
-from thincam_jax.commands.design import command
+from thincam_jax.commands.design import run as designs
 
 FOUND = {
     "reference": {"name": "pairs", "shots": [{"beta_rad_per_mm2": 25.0, "distance_mm": 3.0}]},
@@ -51,7 +51,7 @@ def asked(monkeypatch):
         progress("search")
         return FOUND
 
-    monkeypatch.setattr(command, "run_design", run)
+    monkeypatch.setattr(designs, "run_design", run)
     return given
 
 
@@ -83,7 +83,7 @@ def test_interrupt(file, monkeypatch, tmp_path):
     def interrupted(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(command, "run_design", interrupted)
+    monkeypatch.setattr(designs, "run_design", interrupted)
     result = call("design", file, "--out", tmp_path / "out")
     assert result.exit_code == 130
     assert result.stderr.startswith("thincam: interrupted; the same command goes on")
@@ -124,7 +124,7 @@ class TestExitCode2:
             folder.claim(config)
             return FOUND
 
-        monkeypatch.setattr(command, "run_design", claim)
+        monkeypatch.setattr(designs, "run_design", claim)
         out = tmp_path / "out"
         assert call("design", file, "--out", out).exit_code == 0
         line = one_line(call("design", file, "--out", out, "--set", "seed=8"))

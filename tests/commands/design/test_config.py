@@ -4,8 +4,8 @@ import pytest
 from commands.design import tiny
 
 from helpers import ROOT
-from thincam_jax.commands.design import broken_limits
 from thincam_jax.commands.design.config import load_design
+from thincam_jax.commands.design.problem import broken_limits
 from thincam_jax.commands.refocus.config import load_experiment
 from thincam_jax.commands.study.config import ConfigError, dump_config
 

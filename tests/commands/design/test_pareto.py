@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from commands.design import tiny
 
-from thincam_jax.commands.design import build_problem, find_fronts, pareto_steps
 from thincam_jax.commands.design import problem as problem_of_search
 from thincam_jax.commands.design.config_pareto import with_shots
 from thincam_jax.commands.design.figures import as_png
 from thincam_jax.commands.design.page import fronts as tables
-from thincam_jax.commands.design.pareto import Front, Fronts, Point
+from thincam_jax.commands.design.pareto import Front, Fronts, Point, find_fronts, pareto_steps
 from thincam_jax.commands.design.pareto_figure import draw_fronts
+from thincam_jax.commands.design.problem import build_problem
 from thincam_jax.commands.design.record import record_fronts
 from thincam_jax.commands.study.config import ConfigError
 from thincam_jax.design import find_designs, landscape

@@ -7,16 +7,11 @@ import numpy as np
 import pytest
 from commands.design import tiny
 
-from thincam_jax.commands.design import (
-    Goal,
-    broken_limits,
-    build_problem,
-    find,
-    landscape_of,
-    ranking,
-)
 from thincam_jax.commands.design import problem as problem_of_search
-from thincam_jax.commands.design.landscape import shown
+from thincam_jax.commands.design import ranking
+from thincam_jax.commands.design.landscape import landscape_of, shown
+from thincam_jax.commands.design.problem import Goal, broken_limits, build_problem
+from thincam_jax.commands.design.ranking import find
 from thincam_jax.commands.design.sensitivity import least_change, straight
 from thincam_jax.commands.study.config import ConfigError
 from thincam_jax.design import (

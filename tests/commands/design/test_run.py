@@ -10,18 +10,19 @@ import pytest
 import skimage.io
 from commands.design import tiny
 
-from thincam_jax.commands.design import Front, Fronts, Point, build_study, check_design
-from thincam_jax.commands.design import Transfer as ContrastTransfer
 from thincam_jax.commands.design import problem as problem_of_search
 from thincam_jax.commands.design import run as running
 from thincam_jax.commands.design.compare import compare
 from thincam_jax.commands.design.figures import as_png, draw_landscape, draw_mtf, draw_responses
 from thincam_jax.commands.design.landscape import Landscape
 from thincam_jax.commands.design.page import findings
+from thincam_jax.commands.design.pareto import Front, Fronts, Point
 from thincam_jax.commands.design.problem import Goal
 from thincam_jax.commands.design.ranking import Candidate, Result
 from thincam_jax.commands.design.run import DesignFolder, run_design, steps
 from thincam_jax.commands.design.sensitivity import FreeValue
+from thincam_jax.commands.design.simulated import build_study, check_design
+from thincam_jax.commands.design.transfer import Transfer as ContrastTransfer
 from thincam_jax.commands.design.words import cells, free_number, in_words, told_of
 from thincam_jax.commands.study import build
 from thincam_jax.commands.study.config import (

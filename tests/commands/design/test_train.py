@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from commands.design import tiny
 
-from thincam_jax.commands.design import build_problem, find, find_steps
+from thincam_jax.commands.design.problem import build_problem
+from thincam_jax.commands.design.ranking import find, find_steps
 from thincam_jax.commands.design.train import _reference_point, _starts, build_training, train
 from thincam_jax.design import wiener_error
 from thincam_jax.design.search import evaluate

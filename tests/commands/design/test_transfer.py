@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 
 from thincam_jax._core.grids import Grid
-from thincam_jax.commands.design import modulation_transfer, transfer
+from thincam_jax.commands.design import transfer
 from thincam_jax.commands.design.problem import Data
+from thincam_jax.commands.design.transfer import modulation_transfer
 from thincam_jax.design import Polar, Quadrant, Setup, SignalNoise, shots
 from thincam_jax.design.objectives import Channels
 from thincam_jax.imaging.sensor import Sensor

@@ -1,6 +1,7 @@
 """`thincam reconstruct`: from files to files, in one line what is wrong, and Ctrl-C."""
 
 import json
+from typing import get_type_hints
 
 import numpy as np
 import PIL.Image
@@ -12,7 +13,9 @@ from typer.testing import CliRunner
 
 from helpers import shared_data
 from thincam_jax.commands import cli
-from thincam_jax.commands.photo import command
+from thincam_jax.commands.photo import command, console
+from thincam_jax.commands.photo.options import PSF_METHODS, Output, Recipe
+from thincam_jax.measured import Preparation
 
 runner = CliRunner()
 
@@ -185,7 +188,7 @@ def interrupt_at(monkeypatch, name, iteration):
         if capture == name and progress.iteration >= iteration:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(command._Bar, "__call__", interrupted)
+    monkeypatch.setattr(console._Bar, "__call__", interrupted)
 
 
 class TestInterrupt:
@@ -304,6 +307,21 @@ class TestExitCode2:
         result = call(grey, tmp_path / "image.png", "--bayer", "RGBG")
         assert result.exit_code == 2
         assert "RGGB" in result.stderr and "Traceback" not in result.output
+
+
+def test_what_help_lists_is_what_can_be_done():
+    """The command knows it without importing the solvers."""
+    assert [name.replace("-", "_") for name in command.METHODS] == list(PSF_METHODS)
+    typed = get_type_hints(command.reconstruct)
+    for option, record, field in (
+        ("bayer", Preparation, "bayer"),
+        ("demosaic", Preparation, "demosaicing"),
+        ("psf_channels", Preparation, "psf_channels"),
+        ("coupling", Recipe, "coupling"),
+        ("field", Recipe, "field"),
+        ("linear", Output, "linear"),
+    ):
+        assert typed[option] == get_type_hints(record)[field]
 
 
 def test_help():

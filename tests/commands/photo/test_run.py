@@ -10,17 +10,10 @@ from commands.photo import simulated
 
 from helpers import relative_l2
 from thincam_jax._core import memory
-from thincam_jax.commands.photo import (
-    Failed,
-    Finished,
-    Output,
-    Recipe,
-    Sources,
-    jobs,
-    plan_jobs,
-    run,
-    run_jobs,
-)
+from thincam_jax.commands.photo import jobs, run
+from thincam_jax.commands.photo.jobs import plan_jobs
+from thincam_jax.commands.photo.options import Output, Recipe, Sources
+from thincam_jax.commands.photo.run import Failed, Finished, run_jobs
 from thincam_jax.measured import MeasurementError, Preparation
 from thincam_jax.reconstruction import Reconstruction
 

@@ -5,8 +5,9 @@ import pytest
 from commands.study import tiny
 
 import thincam_jax as tc
-from thincam_jax.commands.study import build, method_response
+from thincam_jax.commands.study import build
 from thincam_jax.commands.study.config import MethodConfig
+from thincam_jax.commands.study.response import method_response
 
 
 @pytest.mark.parametrize(

@@ -10,8 +10,10 @@ import skimage.io
 from commands.study import tiny
 
 from thincam_jax.commands.run_folder import RunFolder
-from thincam_jax.commands.study import build, check_study, method_response
+from thincam_jax.commands.study import build
+from thincam_jax.commands.study.check import check_study
 from thincam_jax.commands.study.config import ConfigError, load_config
+from thincam_jax.commands.study.response import method_response
 from thincam_jax.commands.study.run import run_study, steps
 
 

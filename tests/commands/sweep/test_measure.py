@@ -7,7 +7,7 @@ from commands.study import tiny
 from commands.sweep import mini
 
 from thincam_jax.commands.run_folder import RunFolder
-from thincam_jax.commands.study import Response
+from thincam_jax.commands.study.response import Response
 from thincam_jax.commands.study.run import run_study
 from thincam_jax.commands.sweep.measure import measure_point
 

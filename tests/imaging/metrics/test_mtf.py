@@ -7,8 +7,8 @@ import pytest
 import scipy.special
 
 from helpers import ROOT, relative_l2
-from thincam_jax.commands.study import method_response
 from thincam_jax.commands.study.config import load_config
+from thincam_jax.commands.study.response import method_response
 from thincam_jax.imaging.metrics import (
     cut_off,
     first_common_zero,

@@ -3,24 +3,9 @@
 from pathlib import Path
 from typing import Annotated
 
-import rich.progress
-import rich.table
 import typer
 
-from thincam_jax.commands.design import check_design
-from thincam_jax.commands.design.config import load_design
-from thincam_jax.commands.design.run import DesignFolder, run_design, steps
-from thincam_jax.commands.design.words import in_words, told_of
-from thincam_jax.commands.study.config import slug
-from thincam_jax.commands.terminal import (
-    INTERRUPTED,
-    USER_ERRORS,
-    Overrides,
-    columns,
-    console,
-    fail,
-    tell,
-)
+from thincam_jax.commands.terminal import Overrides, counted, told
 
 
 def design(
@@ -35,25 +20,28 @@ def design(
     Writes design.json, found.yaml, figures and report.html. Ctrl-C keeps the targets that are
     finished; the same command goes on from there.
     """
-    try:
+    goes_on = "interrupted; the same command goes on with the targets that are not finished."
+    with told(lambda: goes_on):
+        from thincam_jax.commands.design.config import load_design
+        from thincam_jax.commands.design.run import DesignFolder, run_design, steps
+        from thincam_jax.commands.design.simulated import check_design
+        from thincam_jax.commands.study.config import slug
+
         wanted = load_design(config, tuple(set_ or ()))
         check_design(wanted)
         folder = DesignFolder(out or Path("runs") / slug(wanted.name))
-        with rich.progress.Progress(*columns(), console=console) as bar:
-            task = bar.add_task(wanted.name, total=steps(wanted))
-            found = run_design(
-                wanted, folder, lambda text: bar.update(task, advance=1, description=text)
-            )
-    except USER_ERRORS as error:
-        fail(error)
-    except KeyboardInterrupt:
-        tell("interrupted; the same command goes on with the targets that are not finished.")
-        raise typer.Exit(INTERRUPTED) from None
+        with counted(wanted.name, steps(wanted)) as progress:
+            found = run_design(wanted, folder, progress)
     _print(found)
-    console.print(f"report: {folder.path / 'report.html'}", highlight=False, soft_wrap=True)
+    print(f"report: {folder.path / 'report.html'}")
 
 
 def _print(found: dict) -> None:
+    import rich
+    import rich.table
+
+    from thincam_jax.commands.design.words import in_words, told_of
+
     validation = found["validation"]
     designs = (found["reference"], *found["compare"], *found["found"])
     names = told_of(designs)
@@ -72,7 +60,7 @@ def _print(found: dict) -> None:
             *(_gain(simulated[name], "gain_db") for name in validation["pictures"]),
             *(_gain(simulated[name], "gain_elements") for name in validation["charts"]),
         )
-    console.print(table)
+    rich.print(table)
 
 
 def _gain(simulated: dict, key: str) -> str:

@@ -8,8 +8,11 @@ from typing import NamedTuple
 import numpy as np
 from matplotlib.figure import Figure
 
-from thincam_jax.commands.design import Candidate, Goal, Landscape, Result, TrainingGoal, Transfer
-from thincam_jax.commands.design.ranking import Shot
+from thincam_jax.commands.design.landscape import Landscape
+from thincam_jax.commands.design.problem import Goal
+from thincam_jax.commands.design.ranking import Candidate, Result, Shot
+from thincam_jax.commands.design.train import TrainingGoal
+from thincam_jax.commands.design.transfer import Transfer
 from thincam_jax.commands.design.words import QUANTITIES, first, free_number
 from thincam_jax.commands.study.figures import line_style
 

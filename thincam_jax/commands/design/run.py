@@ -3,15 +3,16 @@
 import time
 from typing import Any
 
-from thincam_jax.commands.design import build_study, find, find_fronts, find_steps, pareto_steps
 from thincam_jax.commands.design import figures as figures
 from thincam_jax.commands.design.compare import compare
 from thincam_jax.commands.design.config import DesignConfig
 from thincam_jax.commands.design.page import render
+from thincam_jax.commands.design.pareto import find_fronts, pareto_steps
 from thincam_jax.commands.design.pareto_figure import draw_fronts
-from thincam_jax.commands.design.ranking import Result
+from thincam_jax.commands.design.ranking import Result, find, find_steps
 from thincam_jax.commands.design.record import record, record_fronts
 from thincam_jax.commands.design.simulate import simulate
+from thincam_jax.commands.design.simulated import build_study
 from thincam_jax.commands.doctor import environment
 from thincam_jax.commands.run_folder import RunFolder, claim_folder, to_json
 from thincam_jax.commands.study.config import Section, StudyConfig, dump_config

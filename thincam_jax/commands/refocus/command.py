@@ -1,30 +1,23 @@
 """What `thincam run` does with an experiment of `kind: refocus`."""
 
-import rich.progress
+import rich
 import rich.table
-import typer
 
 from thincam_jax.commands.refocus.build import check_refocus
 from thincam_jax.commands.refocus.config import RefocusConfig
 from thincam_jax.commands.refocus.run import run_refocus, steps
 from thincam_jax.commands.run_folder import RunFolder
-from thincam_jax.commands.terminal import INTERRUPTED, columns, console, tell
+from thincam_jax.commands.terminal import counted, told
 
 
 def refocus(config: RefocusConfig, folder: RunFolder) -> None:
     """Run the experiment with a progress bar and print what was found."""
-    try:
+    with told(lambda: "interrupted; the same command starts anew."):
         check_refocus(config)
-        with rich.progress.Progress(*columns(), console=console) as bar:
-            task = bar.add_task(config.name, total=steps(config))
-            metrics = run_refocus(
-                config, folder, lambda text: bar.update(task, advance=1, description=text)
-            )
-    except KeyboardInterrupt:
-        tell("interrupted; the same command starts anew.")
-        raise typer.Exit(INTERRUPTED) from None
+        with counted(config.name, steps(config)) as progress:
+            metrics = run_refocus(config, folder, progress)
     _print_objects(metrics["objects"])
-    console.print(f"report: {folder.path / 'report.html'}", highlight=False, soft_wrap=True)
+    print(f"report: {folder.path / 'report.html'}")
 
 
 def _print_objects(objects: dict) -> None:
@@ -35,4 +28,4 @@ def _print_objects(objects: dict) -> None:
         keys = ("distance_mm", "found_mm", "error_percent", "axial_resolution_mm")
         values = [found[key] for key in keys]
         table.add_row(name, *("–" if value is None else f"{value:.1f}" for value in values))
-    console.print(table)
+    rich.print(table)

@@ -5,24 +5,11 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any
 
-import jax
-import rich.progress
 import typer
 
-from thincam_jax.commands.refocus.config import load_experiment
-from thincam_jax.commands.study.config import ConfigError, StudyConfig, slug
-from thincam_jax.commands.terminal import (
-    INTERRUPTED,
-    WRONG_INPUT,
-    Overrides,
-    columns,
-    console,
-    fail,
-    tell,
-)
+from thincam_jax.commands.terminal import WRONG_INPUT, Overrides, progress_bar, tell, told
 
 _PARTS = ("dask", "distributed", "pyarrow")
-
 
 Grid = Annotated[
     list[str] | None,
@@ -54,23 +41,25 @@ def sweep(
     command goes on with the points that have no row.
     """
     ended = _Ended()
-    try:
+    with told(lambda: f"interrupted; {ended.told()}. The same command goes on from there."):
         _check(scheduler, workers)
+        import jax
+
+        from thincam_jax.commands.config_file import ConfigError
+        from thincam_jax.commands.refocus.config import load_experiment
+        from thincam_jax.commands.study.config import StudyConfig, slug
         from thincam_jax.commands.sweep.folder import SweepFolder
         from thincam_jax.commands.sweep.grid import read_axes
         from thincam_jax.commands.sweep.point import make_points
 
-        study = _study(config, set_ or [])
+        study = load_experiment(config, tuple(set_ or ()))
+        if not isinstance(study, StudyConfig):
+            raise ConfigError(f"{config}: is of kind refocus; a sweep takes a study")
         axes = read_axes(grid or [], study.model_dump(mode="json", exclude_none=True))
         points = make_points(study, axes, bool(jax.config.read("jax_enable_x64")))
         folder = SweepFolder(out or Path("runs") / f"{slug(study.name)}-sweep")
         folder.claim(study)
         swept = _run(study.name, points, folder, scheduler, workers, ended)
-    except (ConfigError, FileNotFoundError, IsADirectoryError, PermissionError) as error:
-        fail(error)
-    except KeyboardInterrupt:
-        tell(f"interrupted; {ended.told()}. The same command goes on from there.")
-        raise typer.Exit(INTERRUPTED) from None
     _print(swept, folder.path)
 
 
@@ -87,6 +76,8 @@ class _Ended:
 
 
 def _check(scheduler: str | None, workers: int | None) -> None:
+    from thincam_jax.commands.config_file import ConfigError
+
     missing = [name for name in _PARTS if find_spec(name) is None]
     if missing:
         raise ConfigError(
@@ -97,13 +88,6 @@ def _check(scheduler: str | None, workers: int | None) -> None:
         raise ConfigError(f"--workers {workers}: give at least 1")
     if workers is not None and scheduler is not None:
         raise ConfigError("--workers are local ones; leave it out with --scheduler")
-
-
-def _study(path: Path, overrides: list[str]) -> StudyConfig:
-    study = load_experiment(path, tuple(overrides))
-    if not isinstance(study, StudyConfig):
-        raise ConfigError(f"{path}: is of kind refocus; a sweep takes a study")
-    return study
 
 
 def _run(
@@ -117,7 +101,7 @@ def _run(
     """With a progress bar."""
     from thincam_jax.commands.sweep.run import run_sweep
 
-    with rich.progress.Progress(*columns("{task.fields[failed]}"), console=console) as bar:
+    with progress_bar("{task.fields[failed]}") as bar:
         task = bar.add_task(name, total=len(points), failed="")
 
         def progress(ended: int, failed: int) -> None:
@@ -130,12 +114,12 @@ def _run(
 def _print(swept: Any, path: Path) -> None:
     table = f"{swept.rows} of {swept.points} points: {path / 'results.parquet'}"
     if swept.rows:
-        console.print(table, highlight=False, markup=False, soft_wrap=True)
+        print(table)
     if swept.failures:
         first = swept.failures[0]
-        told = ", ".join(f"{name}={value}" for name, value in first["values"].items())
+        values = ", ".join(f"{name}={value}" for name, value in first["values"].items())
         tell(
-            f"{len(swept.failures)} of {swept.points} points failed; the first ({told}): "
+            f"{len(swept.failures)} of {swept.points} points failed; the first ({values}): "
             f"{first['reason']}; all are in {path / 'failures.jsonl'}. "
             "The same command tries them again."
         )

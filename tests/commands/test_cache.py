@@ -1,0 +1,111 @@
+"""Compiled programs of commands: where they are, that they are read, and no error where not."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from commands.test_cli import call
+
+from helpers import ROOT
+from thincam_jax.commands import cache, cli
+
+
+@pytest.fixture
+def environment(monkeypatch, tmp_path):
+    """Without settings of JAX's cache, and put back afterwards."""
+    names = [name for name in os.environ if name.startswith(("JAX_COMPILATION", "JAX_PERSISTENT"))]
+    for name in (*names, *cache._SETTINGS, "JAX_COMPILATION_CACHE_DIR"):
+        monkeypatch.setenv(name, "")
+        monkeypatch.delenv(name)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(cache.warnings, "filterwarnings", lambda *_: None)
+    monkeypatch.setattr(sys, "platform", "linux")
+    return tmp_path / "thincam_jax" / "programs"
+
+
+@pytest.mark.parametrize(
+    ("platform", "variable", "folder"),
+    [
+        ("linux", "XDG_CACHE_HOME", "thincam_jax/programs"),
+        ("win32", "LOCALAPPDATA", "thincam_jax/programs"),
+        ("linux", None, "home/.cache/thincam_jax/programs"),
+        ("darwin", None, "home/Library/Caches/thincam_jax/programs"),
+        ("win32", None, "home/AppData/Local/thincam_jax/programs"),
+    ],
+)
+def test_folder_of_the_platform(monkeypatch, tmp_path, platform, variable, folder):
+    monkeypatch.setattr(sys, "platform", platform)
+    monkeypatch.setattr(Path, "home", lambda: tmp_path / "home")
+    for name in ("XDG_CACHE_HOME", "LOCALAPPDATA"):
+        monkeypatch.delenv(name, raising=False)
+    if variable:
+        monkeypatch.setenv(variable, str(tmp_path))
+    assert cache.cache_folder() == tmp_path / folder
+
+
+def test_jax_is_told_where_and_how_much(environment):
+    cache.keep_programs()
+    assert os.environ["JAX_COMPILATION_CACHE_DIR"] == str(environment)
+    assert int(os.environ["JAX_COMPILATION_CACHE_MAX_SIZE"]) == 2**30
+    (environment / "jit_f-cache").write_bytes(bytes(2**20))
+    assert cache.cache_state() == f"{environment}, 1.0 MiB of at most 1024"
+
+
+def test_what_the_user_has_told_jax_stands(environment, monkeypatch, tmp_path):
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path / "mine"))
+    cache.keep_programs()
+    assert "JAX_COMPILATION_CACHE_MAX_SIZE" not in os.environ
+    assert not environment.exists()
+    assert cache.cache_state() == f"{tmp_path / 'mine'}, 0.0 MiB"
+
+
+def test_folder_that_cannot_be_made(environment, monkeypatch, tmp_path):
+    (tmp_path / "thincam_jax").write_text("mine")
+    cache.keep_programs()
+    assert "JAX_COMPILATION_CACHE_DIR" not in os.environ
+    assert cache.cache_state() == f"{environment}, not in use"
+
+
+def test_folder_that_cannot_be_written(environment, monkeypatch):
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    cache.keep_programs()
+    assert "JAX_COMPILATION_CACHE_DIR" not in os.environ
+
+
+@pytest.mark.parametrize(
+    ("options", "switch", "kept"),
+    [((), "on", 1), ((), "off", 0), (("--no-cache",), "on", 0), (("--cache",), "off", 1)],
+)
+def test_switch(monkeypatch, tmp_path, options, switch, kept):
+    calls = []
+    monkeypatch.setattr(cli, "keep_programs", lambda: calls.append(1))
+    monkeypatch.setenv("THINCAM_CACHE", switch)
+    assert call(*options, "init", "study", "--out", tmp_path).exit_code == 0
+    assert len(calls) == kept
+
+
+def test_second_run_reads_what_the_first_has_compiled(tmp_path):
+    """Also where a program is damaged, and where another was not written to its end."""
+    told = ("JAX_COMPILATION", "JAX_PERSISTENT", "TF_CPP")  # by these tests' own process
+    kept = {k: v for k, v in os.environ.items() if not k.startswith(told)}
+    path = os.pathsep.join(filter(None, [str(ROOT), kept.get("PYTHONPATH")]))
+    place = {"XDG_CACHE_HOME": tmp_path, "HOME": tmp_path, "LOCALAPPDATA": tmp_path}
+    variables = {**kept, "PYTHONPATH": path, "THINCAM_CACHE": "on", **place}
+
+    def run():
+        command = [sys.executable, "-m", "thincam_jax.commands.cli", "doctor"]
+        done = subprocess.run(command, capture_output=True, text=True, env=variables, timeout=120)
+        assert (done.returncode, done.stderr) == (0, "")
+        assert "compiled sums: right" in done.stdout
+        return {path: path.read_bytes() for path in tmp_path.rglob("*-atime")}
+
+    first = run()
+    assert len(first) > 3
+    damaged, unfinished, *_ = first
+    damaged.with_name(damaged.name.replace("-atime", "-cache")).write_bytes(b"damaged")
+    unfinished.unlink()
+    second = run()
+    assert second.keys() == first.keys()
+    assert all(second[path] != first[path] for path in first if path != damaged)  # when read

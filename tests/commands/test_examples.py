@@ -1,0 +1,57 @@
+"""`thincam init`: every shipped experiment file can be had, and nothing is overwritten."""
+
+import tomllib
+from pathlib import Path
+
+import pytest
+from commands.test_cli import call, one_line
+
+from helpers import ROOT
+from thincam_jax.commands import examples
+from thincam_jax.commands.design.config import load_design
+from thincam_jax.commands.refocus.config import load_experiment
+
+FILES = sorted((ROOT / "configs").glob("*.yaml"))
+
+
+@pytest.mark.parametrize("kind", examples.kinds())
+def test_a_file_that_its_command_takes(kind, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    result = call("init", kind)
+    assert result.exit_code == 0, result.output
+    command = "design" if "design" in kind else "run"
+    assert result.stdout == f"{kind}.yaml; next: thincam {command} {kind}.yaml\n"
+    (load_design if command == "design" else load_experiment)(tmp_path / f"{kind}.yaml")
+
+
+def test_every_shipped_file_is_one(tmp_path):
+    for kind in examples.kinds():
+        assert call("init", kind, "--out", tmp_path).exit_code == 0
+    written = {path.read_text("utf-8") for path in tmp_path.iterdir()}
+    assert len(examples.kinds()) == len(FILES)
+    assert written == {path.read_text("utf-8") for path in FILES}
+
+
+def test_nothing_is_overwritten(tmp_path):
+    path = tmp_path / "mine.yaml"
+    assert call("init", "study", "--out", path).exit_code == 0
+    path.write_text("mine")
+    assert one_line(call("init", "study", "--out", path)).startswith(f"{path} exists; give another")
+    assert path.read_text() == "mine"
+
+
+def test_unknown_kind_and_missing_folder(tmp_path):
+    line = one_line(call("init", "camera"))
+    assert line.startswith("init camera: choose one of study, refocus, design, design_both, ")
+    assert "no" in one_line(call("init", "study", "--out", tmp_path / "no" / "study.yaml"))
+
+
+def test_the_wheel_holds_them_where_they_are_looked_for(tmp_path, monkeypatch):
+    """There they come before those of a repository around it."""
+    wheel = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["tool"]["hatch"]["build"]
+    place = wheel["targets"]["wheel"]["force-include"]["configs"]
+    (tmp_path / place).mkdir(parents=True)
+    (tmp_path / place / "camera.yaml").write_text("")
+    module = Path(examples.__file__).relative_to(ROOT)
+    monkeypatch.setattr(examples, "__file__", str(tmp_path / module))
+    assert examples.kinds() == ["study", "refocus", "design", "camera"]

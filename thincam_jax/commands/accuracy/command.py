@@ -1,0 +1,45 @@
+"""The command `thincam bench accuracy`."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from thincam_jax.commands.terminal import ConfigFile, Overrides, counted, told
+
+
+def accuracy(
+    config: ConfigFile,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder of the results; default runs/NAME-accuracy.")
+    ] = None,
+    size: Annotated[
+        list[int] | None,
+        typer.Option(help="Pixels along the sensor's longer side; give it once for each size."),
+    ] = None,
+    capture_size: Annotated[
+        int | None, typer.Option(help="The same for captures and reconstructions; default 256.")
+    ] = None,
+    set_: Overrides = None,
+) -> None:
+    """Every model's error and time, and what an error of the PSF costs in PSNR.
+
+    Writes accuracy.json and accuracy.png.
+    """
+    with told(lambda: "interrupted; nothing is kept."):
+        import rich
+
+        from thincam_jax.commands.accuracy.console import accuracy_table, cost_table, verdict
+        from thincam_jax.commands.accuracy.folder import BenchFolder
+        from thincam_jax.commands.accuracy.run import Options, check, run_accuracy, steps
+        from thincam_jax.commands.study.config import load_config, slug
+
+        study = load_config(config, tuple(set_ or ()))
+        plan = check(study, Options(tuple(size or ()), capture_size))
+        folder = BenchFolder(out or Path("runs") / f"{slug(study.name)}-accuracy")
+        with counted(study.name, steps(study, plan)) as progress:
+            results = run_accuracy(study, plan, folder, progress)
+    rich.print(accuracy_table(results))
+    rich.print(cost_table(results))
+    for line in (*verdict(results), f"figure: {folder.path / 'accuracy.png'}"):
+        print(line)

@@ -1,0 +1,71 @@
+"""The compiled programs that commands keep from one run to the next, in the user's cache folder.
+
+JAX keeps them. It is told so through the environment, before it is imported: `thincam --help` need
+not wait for JAX, and worker processes keep their programs in the same folder.
+"""
+
+import os
+import sys
+import warnings
+from pathlib import Path
+
+LARGEST = 2**30  # bytes; beyond, JAX drops what was not used for longest
+
+_SETTINGS = {
+    "JAX_COMPILATION_CACHE_MAX_SIZE": str(LARGEST),
+    # A command has many small programs, of which most take longer to compile than to read.
+    "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+    # XLA takes the processor for another one and says so in 4 kB for each program that it reads
+    # (https://github.com/jax-ml/jax/issues/38445). Failures are exceptions, which are told anyway.
+    "TF_CPP_MIN_LOG_LEVEL": "3",
+}
+
+
+def cache_folder() -> Path:
+    """Where the programs are: in the platform's folder for what can be made again."""
+    if sys.platform == "win32":
+        base = os.environ.get("LOCALAPPDATA") or Path.home() / "AppData/Local"
+    elif sys.platform == "darwin":
+        base = Path.home() / "Library/Caches"
+    else:
+        base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(base) / "thincam_jax" / "programs"
+
+
+def keep_programs() -> None:
+    """Have JAX keep what it compiles, unless the user has told JAX where to.
+
+    Where the folder cannot be written, nothing is kept and nothing is said.
+    """
+    if "JAX_COMPILATION_CACHE_DIR" in os.environ:
+        return
+    folder = cache_folder()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        _drop_unfinished(folder)
+    except OSError:
+        return
+    if os.access(folder, os.W_OK | os.X_OK):
+        os.environ["JAX_COMPILATION_CACHE_DIR"] = str(folder)
+        for name, value in _SETTINGS.items():
+            os.environ.setdefault(name, value)
+        # Compiled anew, as if it were not there.
+        warnings.filterwarnings("ignore", "Error .* persistent compilation cache entry")
+
+
+def _drop_unfinished(folder: Path) -> None:
+    """JAX writes a program and then when it was used; it stumbles over one without the other."""
+    for program in folder.glob("*-cache"):
+        if not program.with_name(program.name.removesuffix("cache") + "atime").exists():
+            program.unlink(missing_ok=True)
+
+
+def cache_state() -> str:
+    """The folder and its size, or that it is not in use."""
+    chosen = os.environ.get("JAX_COMPILATION_CACHE_DIR")
+    folder = Path(chosen) if chosen else cache_folder()
+    if not chosen:
+        return f"{folder}, not in use"
+    size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
+    most = f" of at most {LARGEST / 2**20:.0f}" if folder == cache_folder() else ""
+    return f"{folder}, {size / 2**20:.1f} MiB{most}"

@@ -1,0 +1,101 @@
+"""Between the command line and a run: what was typed, a progress bar, a line for each capture."""
+
+from pathlib import Path
+
+import rich.markup
+import rich.progress
+
+from thincam_jax.commands.photo.jobs import Job
+from thincam_jax.commands.photo.options import Background, Output, Recipe, Sources
+from thincam_jax.commands.photo.run import Failed, Finished, run_jobs
+from thincam_jax.commands.terminal import INTERRUPTED, WRONG_INPUT, progress_bar, tell
+from thincam_jax.measured import MeasurementError
+from thincam_jax.measured.display import WhiteBalance
+from thincam_jax.reconstruction import Progress
+
+
+def read_background(text: str | None) -> Background:
+    """A dark frame's path, or a number of counts."""
+    if text is None:
+        return None
+    try:
+        return float(text)
+    except ValueError:
+        return Path(text)
+
+
+def read_white_balance(text: str | None) -> WhiteBalance:
+    """The gains of the colours, or how to find them.
+
+    **Errors**: MeasurementError for anything else.
+    """
+    if text is None:
+        return None
+    if text.replace("-", "_") == "grey_world":
+        return "grey_world"
+    try:
+        red, green, blue = (float(part) for part in text.split(","))
+    except ValueError:
+        raise MeasurementError(
+            f"--white-balance {text}: give grey-world, or the gains of red, green and blue as "
+            "1.8,1,1.4"
+        ) from None
+    return red, green, blue
+
+
+def run_with_bar(jobs: list[Job], sources: Sources, recipe: Recipe, output: Output) -> int:
+    """Work through the jobs with a progress bar; returns the exit code."""
+    end = 0
+    with progress_bar("{task.fields[objective]}") as bar:
+        teller = _Bar(bar, recipe.iterations, [job.capture.name for job in jobs])
+        for result in run_jobs(jobs, sources, recipe, output, teller):
+            if isinstance(result, Failed):
+                tell(str(result.error))
+                end = WRONG_INPUT
+                continue
+            bar.console.print(_summary(result), highlight=False, markup=False, soft_wrap=True)
+            if result.status == "interrupted":
+                tell(_interrupted(result.job, jobs))
+                return INTERRUPTED
+            teller.finish(result.record["reconstruction"]["iterations"])
+    return end
+
+
+class _Bar:
+    """One bar for the capture at work, with its number and the objective."""
+
+    def __init__(self, bar: rich.progress.Progress, iterations: int, names: list[str]):
+        self.bar, self.iterations, self.names = bar, iterations, names
+        self.name = names[0]
+        self.task = bar.add_task(self._title(), total=iterations, objective="")
+
+    def __call__(self, name: str, progress: Progress) -> None:
+        if name != self.name:
+            self.name = name
+            self.bar.reset(self.task, description=self._title(), total=self.iterations)
+        objective = f"objective {progress.objective:.4g}"
+        self.bar.update(self.task, completed=progress.iteration, objective=objective)
+
+    def finish(self, iterations: int) -> None:
+        """Full, also where fewer iterations were enough."""
+        self.bar.update(self.task, completed=iterations, total=iterations)
+
+    def _title(self) -> str:
+        count = len(self.names)
+        number = f" ({self.names.index(self.name) + 1} of {count})" if count > 1 else ""
+        return rich.markup.escape(self.name) + number
+
+
+def _summary(result: Finished) -> str:
+    done = result.record["reconstruction"]
+    status = done["status"].replace("_", " ")
+    return (
+        f"{result.job.images[0]}: {status} after {done['iterations']} iterations, relative data "
+        f"residual {float(done['relative_data_residual']):.3g}, {done['seconds']:.1f} s"
+    )
+
+
+def _interrupted(job: Job, jobs: list[Job]) -> str:
+    left = len(jobs) - jobs.index(job) - 1
+    rest = f"; not begun: {left} of {len(jobs)} captures" if left else ""
+    return f"interrupted; {job.images[0]} is the best image so far{rest}"
