@@ -9,8 +9,9 @@ import pytest
 from commands.study import tiny
 
 import thincam_jax as tc
-from thincam_jax.commands import accuracy
 from thincam_jax.commands.accuracy import sizes
+from thincam_jax.commands.accuracy.folder import BenchFolder
+from thincam_jax.commands.accuracy.run import Options, check, run_accuracy, steps
 from thincam_jax.commands.study import build
 from thincam_jax.commands.study.config import ConfigError, dump_config
 
@@ -25,11 +26,11 @@ def config(tmp_path_factory):
 @pytest.fixture(scope="module")
 def run(config, tmp_path_factory):
     """Folder and results of one run, and what it told."""
-    folder = accuracy.BenchFolder(tmp_path_factory.mktemp("out") / "new")
-    plan = accuracy.check(config, accuracy.Options(SIZES, 48))
+    folder = BenchFolder(tmp_path_factory.mktemp("out") / "new")
+    plan = check(config, Options(SIZES, 48))
     told = []
-    results = accuracy.run_accuracy(config, plan, folder, told.append)
-    assert len(told) == accuracy.steps(config, plan)
+    results = run_accuracy(config, plan, folder, told.append)
+    assert len(told) == steps(config, plan)
     return folder.path, results
 
 
@@ -183,19 +184,19 @@ class TestSizes:
 
     @pytest.mark.parametrize("size", [0, -3, 65])
     def test_refused(self, config, size):
-        for options in (accuracy.Options((size,)), accuracy.Options((), size)):
+        for options in (Options((size,)), Options((), size)):
             with pytest.raises(ConfigError, match=f"size {size}: "):
-                accuracy.check(config, options)
+                check(config, options)
 
     def test_too_few_pixels_to_reconstruct(self, config):
         with pytest.raises(ConfigError, match="^--capture-size 5: "):
-            accuracy.check(config, accuracy.Options((), 5))
+            check(config, Options((), 5))
 
 
 def test_without_wiener(config):
     """Fringe scanning assumes no PSF: told, not run."""
     alone = config.model_copy(update={"methods": config.methods[:1]})
-    plan = accuracy.check(alone, accuracy.Options(SIZES))
+    plan = check(alone, Options(SIZES))
     assert plan.rig.skipped == "conventional: fringe scanning assumes no PSF"
 
 
@@ -203,7 +204,7 @@ class TestFolder:
     def test_foreign_files_stay(self, tmp_path):
         (tmp_path / "thesis.txt").write_text("mine")
         with pytest.raises(ConfigError, match="is not empty and holds no accuracy benchmark"):
-            accuracy.BenchFolder(tmp_path).claim("a: 1\n")
+            BenchFolder(tmp_path).claim("a: 1\n")
         assert [p.name for p in tmp_path.iterdir()] == ["thesis.txt"]
 
     @pytest.mark.parametrize("name", ["accuracy.json", "accuracy.png"])
@@ -211,11 +212,11 @@ class TestFolder:
     def test_foreign_files_of_the_same_name_stay(self, tmp_path, name, content):
         (tmp_path / name).write_text(content)
         with pytest.raises(ConfigError, match="holds no accuracy benchmark"):
-            accuracy.BenchFolder(tmp_path).claim("a: 1\n")
+            BenchFolder(tmp_path).claim("a: 1\n")
         assert (tmp_path / name).read_text() == content
 
     def test_done_anew_only_with_the_same_configuration(self, tmp_path):
-        folder = accuracy.BenchFolder(tmp_path / "deep" / "new")
+        folder = BenchFolder(tmp_path / "deep" / "new")
         folder.claim("a: 1\n")
         folder.finish({"bench": "accuracy", "config": "a: 1\n"}, b"picture")
         folder.claim("a: 1\n")
@@ -225,4 +226,4 @@ class TestFolder:
     def test_a_file_in_the_way(self, tmp_path):
         (tmp_path / "file").write_text("mine")
         with pytest.raises(ConfigError, match="cannot be written to as a folder"):
-            accuracy.BenchFolder(tmp_path / "file").claim("a: 1\n")
+            BenchFolder(tmp_path / "file").claim("a: 1\n")

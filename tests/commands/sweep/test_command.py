@@ -146,10 +146,13 @@ def test_help():
 
 
 def test_optional_parts_are_imported_by_sweeps_only():
-    code = (
-        "import sys, thincam_jax, thincam_jax.commands.cli; "
-        "print([name for name in ('dask', 'distributed', 'pyarrow') if name in sys.modules])"
-    )
+    code = """
+import importlib, pkgutil, sys, thincam_jax
+for module in pkgutil.walk_packages(thincam_jax.__path__, "thincam_jax."):
+    if not module.name.startswith("thincam_jax.commands.sweep."):
+        importlib.import_module(module.name)
+print([name for name in ("dask", "distributed", "pyarrow") if name in sys.modules])
+"""
     path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
     environment = {**os.environ, "PYTHONPATH": path}
     done = subprocess.run(

@@ -27,8 +27,8 @@ def run(
         return f"interrupted; finished: {done}. The same command goes on from there."
 
     with told(finished):
-        from thincam_jax.commands.refocus.command import refocus
         from thincam_jax.commands.refocus.config import RefocusConfig, load_experiment
+        from thincam_jax.commands.refocus.console import refocus
         from thincam_jax.commands.run_folder import RunFolder
         from thincam_jax.commands.study.check import check_study
         from thincam_jax.commands.study.config import slug
