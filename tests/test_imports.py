@@ -34,8 +34,8 @@ def test_units_are_light():
     assert imported_by("from thincam_jax.units import nm").isdisjoint(SLOW)
 
 
-@pytest.mark.parametrize("name", ["psf", "capture", "plan", "select_model"])
-def test_optics_wait_for_no_library_of_analysis_or_plots(name):
+@pytest.mark.parametrize("name", ["psf", "capture", "plan", "select_model", "reconstruct"])
+def test_names_wait_for_no_library_of_analysis_or_plots(name):
     """SciPy itself is there, of its parts only those that JAX's sparse matrices import."""
     modules = imported_by(f"import thincam_jax as tc; tc.{name}")
     assert "jax" in modules

@@ -9,7 +9,7 @@ from typer import Option
 from thincam_jax.commands.terminal import fail, told
 
 # Known without importing JAX; the tests hold them to `options.PSF_METHODS`.
-METHODS = ("auto", "admm-tv", "fista", "twist", "ridge")
+METHODS = ("auto", "admm-tv", "fista", "ridge")
 
 
 def reconstruct(

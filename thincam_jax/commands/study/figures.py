@@ -5,7 +5,7 @@ import math
 import os
 
 import numpy as np
-import skimage.io
+import skimage
 from matplotlib.figure import Figure
 
 from thincam_jax.commands.run_folder import RunFolder
