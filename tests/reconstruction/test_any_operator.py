@@ -1,0 +1,291 @@
+"""Any operator feeds any solver: against a bounded least-squares solution of the dual by SciPy.
+
+Anisotropic total variation and f ≥ 0 make the dual of
+
+    ½ Σ w (Af − g)² + τ‖Df‖₁,  f ≥ 0
+
+a least-squares problem with bounds: f = G⁻¹(b − Dᵀp + λ) with G = AᵀwA = LLᵀ and b = Aᵀwg, where
+|p| ≤ τ and λ ≥ 0 minimise ‖L⁻¹(b − Dᵀp + λ)‖. `scipy.optimize.lsq_linear` solves that; it shares
+nothing with ADMM, FISTA or conjugate gradients.
+"""
+
+import functools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix
+import pytest
+import scipy.linalg
+import scipy.optimize
+import scipy.sparse
+from reconstruction import dense, scenes
+
+import thincam_jax as tc
+from helpers import finite_difference, relative_l2
+from thincam_jax.imaging.operators import (
+    AbstractOperator,
+    CropConvolution,
+    Masked,
+    Matrix,
+    Scaled,
+    Separable,
+    Sparse,
+    Stacked,
+    kernel_shape,
+)
+from thincam_jax.reconstruction.admm import Admm, splitting_of
+from thincam_jax.reconstruction.normal_equations import (
+    DenseNormal,
+    IterativeNormal,
+    SeparableNormal,
+)
+from thincam_jax.reconstruction.problem import objective, total_objective, uniform_level
+from thincam_jax.reconstruction.ridge import image_precision
+from thincam_jax.reconstruction.splitting import admm_map
+
+FIELD = (9, 12)
+TAU = 5.0
+VARIATION = tc.TotalVariation("anisotropic")
+
+
+def operators() -> dict[str, AbstractOperator]:
+    rng = np.random.default_rng(4)
+    pixels = FIELD[0] * FIELD[1]
+    few = scipy.sparse.random(200, pixels, 0.1, random_state=2)
+    kernel = scenes.spots(kernel_shape((14, 17), FIELD))
+    crop = CropConvolution(jnp.asarray(kernel), 0.5, (14, 17), FIELD)
+    return {
+        "dense": Matrix(rng.normal(size=(900, 400)), (20, 20), (30, 30)),
+        "separable": Separable(rng.normal(size=(13, 9)), rng.normal(size=(17, 12))),
+        "sparse": Sparse(few + scipy.sparse.eye(200, pixels), FIELD, (10, 20)),
+        "stacked": Stacked(
+            [
+                Matrix(rng.normal(size=(70, pixels)), FIELD, (7, 10)),
+                Scaled(Separable(rng.normal(size=(11, 9)), rng.normal(size=(10, 12))), 0.5),
+            ]
+        ),
+        "masked": Masked(crop, rng.random((14, 17)) > 0.1),
+    }
+
+
+class Case:
+    """A recording of blocks with 2 % of noise, and what SciPy needs of it."""
+
+    def __init__(self, name: str):
+        operator = operators()[name]
+        rng = np.random.default_rng(8)
+        rows, columns = operator.in_shape[-2:]
+        truth = jnp.asarray(scenes.blocks((rows, columns)) - 0.4)  # below zero in places: f ≥ 0 is active
+        leaves, structure = jax.tree.flatten(operator(truth))
+        noise = [0.02 * float(jnp.std(leaf)) for leaf in leaves]
+        noisy = [
+            leaf + s * jnp.asarray(rng.normal(size=leaf.shape))
+            for leaf, s in zip(leaves, noise, strict=True)
+        ]
+        captures = jax.tree.unflatten(structure, noisy)
+        variances = [s**2 for s in noise]
+        self.shape = (rows, columns)
+        self.recording = tc.Recording(captures, operator, noise_variance=variances)
+        self.problem = self.recording.problem(tau=TAU, regulariser=VARIATION)
+        basis = jnp.eye(rows * columns).reshape(-1, rows, columns)
+        seen = jax.tree.leaves(operator(basis))
+        parts = [(np.asarray(s).reshape(rows * columns, -1).T, v) for s, v in zip(seen, variances)]
+        self.gram = sum(a.T @ a / v for a, v in parts)
+        flat = [np.asarray(g).ravel() for g in noisy]
+        self.pulled = sum(a.T @ g / v for (a, v), g in zip(parts, flat, strict=True))
+
+    def minimiser(self) -> np.ndarray:
+        """By SciPy, from the dual."""
+        tau = float(self.problem.absolute_tau)
+        count = len(self.pulled)
+        down, right, _ = dense.slopes((1, *self.shape))
+        differences = np.concatenate([d[np.abs(d).sum(axis=1) > 0] for d in (down, right)])
+        factor = np.linalg.cholesky(self.gram)
+        into = functools.partial(scipy.linalg.solve_triangular, factor, lower=True)
+        table = np.hstack([tau * into(differences.T), -into(np.eye(count))])
+        edges = len(differences)
+        low = np.r_[-np.ones(edges), np.zeros(count)]
+        high = np.r_[np.ones(edges), np.full(count, np.inf)]
+        found = scipy.optimize.lsq_linear(
+            table, into(self.pulled), (low, high), method="bvls", tol=1e-15, max_iter=5000
+        )
+        dual, sign = tau * found.x[:edges], found.x[edges:]
+        image = np.linalg.solve(self.gram, self.pulled - differences.T @ dual + sign)
+        assert (image > -1e-6 * image.max()).all() and (image < 1e-6 * image.max()).any()
+        return image.reshape(self.shape)
+
+
+case = functools.cache(Case)
+
+
+@functools.cache
+def expected(name: str) -> np.ndarray:
+    return case(name).minimiser()
+
+
+NAMES = pytest.mark.parametrize("name", list(operators()))
+
+
+@NAMES
+def test_total_variation_by_admm_and_fista(name):
+    """Both are within 1e-6 of the minimiser, and report that they have converged."""
+    for solver in (
+        tc.AdmmTV(TAU, variation=VARIATION, iterations=6000, tolerance=1e-9),
+        tc.Fista(TAU, regulariser=VARIATION, iterations=6000, tolerance=1e-10),
+    ):
+        found = tc.reconstruct(case(name).recording, solver)
+        assert found.image.shape == case(name).shape and found.pitch is None
+        assert relative_l2(found.image, expected(name)) < 1e-6, solver.name
+        assert found.status == "converged" and float(found.image.min()) >= 0
+    # The variation and the sign matter.
+    plain = np.linalg.solve(case(name).gram, case(name).pulled).reshape(case(name).shape)
+    assert relative_l2(plain, expected(name)) > 1e-2
+
+
+@NAMES
+def test_ridge(name):
+    """The posterior mean, by the normal equations as one dense system."""
+    given = case(name)
+    level = float(uniform_level(given.problem)[0])
+    found = tc.reconstruct(given.recording, tc.Ridge(3.0, iterations=2000, tolerance=1e-12))
+    precision = 3.0 * image_precision(jnp.asarray(level))
+    count = given.gram.shape[0]
+    right = given.pulled + precision * max(level, 0.0)  # the mean is not below zero
+    wanted = np.linalg.solve(given.gram + precision * np.eye(count), right)
+    assert found.status == "converged"
+    assert relative_l2(found.image, wanted.reshape(given.shape)) < 1e-6
+
+
+def test_the_inner_solve_follows_the_structure():
+    kinds = {"dense": DenseNormal, "separable": SeparableNormal, "sparse": IterativeNormal}
+    for name, kind in kinds.items():
+        assert type(splitting_of(case(name).problem).normal) is kind
+    # A masked convolution keeps its transforms: the mask is a weight.
+    assert isinstance(case("masked").problem.operators[0], CropConvolution)
+    assert type(splitting_of(case("masked").problem)).__name__ == "FourierSplitting"
+
+
+def test_solvers_of_optimistix_take_the_problem():
+    """LBFGS on a smooth problem, and the fixed point of ADMM's map, reach the same images."""
+    given = case("separable")
+    smooth = given.recording.problem(tau=0.0, nonnegative=False)
+    start = jnp.zeros(smooth.image_shape)
+    found = optimistix.minimise(
+        total_objective, optimistix.LBFGS(1e-13, 1e-13), start, args=smooth, max_steps=2000
+    )
+    wanted = np.linalg.solve(given.gram, given.pulled).reshape(given.shape)
+    assert relative_l2(found.value[0, 0], wanted) < 1e-6
+
+    splitting = splitting_of(given.problem)
+    begin = splitting.start(start)
+    for solver in (
+        Admm(rtol=1e-9),
+        optimistix.FixedPointIteration(rtol=0.0, atol=1e-11, damp=-0.8),
+    ):
+        solution = optimistix.fixed_point(
+            admm_map, solver, begin, args=splitting, max_steps=20_000, throw=False
+        )
+        assert solution.result == optimistix.RESULTS.successful
+        image = splitting.image(solution.value)[0, 0]
+        assert relative_l2(image, expected("separable")) < 1e-6
+
+
+def test_implicit_gradients_of_a_dense_operator():
+    """Of the image's brightness in a place, by matrix, captures and τ, against differences."""
+    rng = np.random.default_rng(1)
+    shape = (4, 5)
+    matrix = jnp.asarray(rng.normal(size=(33, 20)))
+    truth = jnp.asarray(scenes.blocks(shape))
+    seen = Matrix(matrix, shape, (3, 11))(truth) + 0.1 * jnp.asarray(rng.normal(size=(3, 11)))
+    where = jnp.asarray(rng.normal(size=shape))
+
+    def brightness(given):
+        matrix, captures, tau = given
+        recording = tc.Recording(captures, Matrix(matrix, shape, (3, 11)), noise_variance=0.01)
+        problem = recording.problem(tau=tau)
+        start = jnp.zeros(problem.image_shape)
+        found = tc.solve_fixed_point(problem, start, iterations=5000, tolerance=1e-12)
+        return jnp.vdot(where, found.image[0, 0])
+
+    at = (matrix, seen, jnp.asarray(1.5))
+    slopes = jax.jit(jax.grad(brightness))(at)
+    value = jax.jit(brightness)
+    for index in range(3):
+        direction = tuple(
+            jnp.asarray(rng.normal(size=x.shape)) if n == index else jnp.zeros_like(x)
+            for n, x in enumerate(at)
+        )
+        slope = sum(jnp.vdot(s, d) for s, d in zip(slopes, direction, strict=True))
+        change = finite_difference(value, at, direction, 1e-4)
+        assert float(slope) == pytest.approx(float(change), rel=1e-4)
+
+
+def test_batches_and_planes():
+    """A batch is its elements; an operator on (plane, y, x) has its planes in the image."""
+    rng = np.random.default_rng(3)
+    operator = Separable(rng.normal(size=(13, 9)), rng.normal(size=(17, 12)))
+    images = jnp.asarray(np.stack([scenes.blocks(FIELD, seed=n) for n in range(6)]))
+    captures = operator(images.reshape(2, 3, *FIELD))
+    solver = tc.AdmmTV(iterations=400, tolerance=1e-6)
+    both = tc.reconstruct(tc.Recording(captures, operator, noise_variance=1e-3), solver)
+    assert both.image.shape == (2, 3, *FIELD)
+    alone = tc.reconstruct(tc.Recording(captures[1, 2], operator, noise_variance=1e-3), solver)
+    assert relative_l2(both.image[1, 2], alone.image) < 1e-3
+    assert relative_l2(both.image[1, 2], images[5]) < 1e-2
+
+    shape = (2, 5, 4)
+    matrix = Matrix(rng.normal(size=(60, 40)), shape, (60,))
+    truth = jnp.asarray(np.stack([scenes.blocks(shape[1:], seed=n) for n in range(2)]))
+    recording = tc.Recording(matrix(truth), matrix, noise_variance=1e-6)
+    found = tc.reconstruct(recording, tc.AdmmTV(iterations=300))
+    assert found.image.shape == shape and relative_l2(found.image, truth) < 1e-2
+
+
+def test_captures_in_any_units_and_single_precision():
+    """Captures times a number: the image times that number."""
+    given = case("separable")
+    operator = jax.tree.map(lambda x: x.astype(jnp.float32), operators()["separable"])
+    capture = given.recording.captures[0].astype(jnp.float32)
+    plain = tc.reconstruct(tc.Recording(capture, operator), tc.AdmmTV(iterations=40))
+    assert plain.image.dtype == jnp.float32
+    for factor in (1e-8, 1e8):
+        scaled = tc.Recording(jnp.float32(factor) * capture, operator)
+        other = tc.reconstruct(scaled, tc.AdmmTV(iterations=40))
+        assert relative_l2(other.image / factor, plain.image) < 1e-3
+
+
+def test_new_values_compile_nothing():
+    """Other captures, variances and τ of one shape run the programs that are there."""
+    given = case("dense")
+    solver = tc.AdmmTV(TAU, iterations=10)
+    tc.reconstruct(given.recording, solver)
+
+    @jax.jit
+    def energy(problem, image):
+        energy.traces += 1
+        return objective(problem, image)
+
+    energy.traces = 0
+    for factor in (1.0, 2.0):
+        problem = eqx.tree_at(lambda p: p.tau, given.problem, factor * given.problem.tau)
+        energy(problem, jnp.ones(problem.image_shape))
+    assert energy.traces == 1
+
+
+def test_what_is_refused():
+    operator = Matrix(np.ones((6, 4)), (2, 2), (6,))
+    for captures, seen_by, message in (
+        (jnp.ones(5), operator, r"a capture has shape \(1, 5\); its operator takes"),
+        ([jnp.ones(6)], [operator, operator], "for 2 cameras, PSFs or operators"),
+        (jnp.ones(6), Matrix(np.ones((6, 4)), (4,), (6,)), "in_shape \\(y, x\\) or"),
+    ):
+        with pytest.raises(ValueError, match=message) as refused:
+            tc.Recording(captures, seen_by, noise_variance=1.0).problem()
+        assert "\n" not in str(refused.value)
+    with pytest.raises(ValueError, match="give noise_variance"):
+        tc.reconstruct(tc.Recording(jnp.ones(6), operator), tc.AdmmTV())
+    with pytest.raises(ValueError, match="synthesis adds captures of known cameras"):
+        recording = tc.Recording(jnp.ones(6), operator, noise_variance=1.0)
+        tc.reconstruct(recording, tc.AdmmTV(synthesis=np.eye(1)))
