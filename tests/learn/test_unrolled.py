@@ -12,8 +12,9 @@ from reconstruction import extremes, scenes
 from helpers import finite_difference
 from thincam_jax.learn import unrolled as module
 from thincam_jax.learn.unrolled import UnrolledAdmm, solve_unrolled, train, training_loss
-from thincam_jax.reconstruction.admm import Splitting, default_penalties, image_of, start, step
-from thincam_jax.reconstruction.scaled import even_image
+from thincam_jax.reconstruction.admm import splitting_of
+from thincam_jax.reconstruction.problem import uniform_image
+from thincam_jax.reconstruction.splitting import admm_map
 
 
 def pairs(count, seed):
@@ -29,14 +30,13 @@ def pairs(count, seed):
 
 def test_untrained_it_is_admm():
     problem, _ = scenes.problem((17, 19), (13, 14), planes=2)
-    splitting = Splitting(problem)
-    penalties = default_penalties(splitting)
-    state = start(splitting, even_image(problem))
-    advance = jax.jit(step)
+    splitting = splitting_of(problem)
+    state = splitting.start(uniform_image(problem))
+    advance = jax.jit(admm_map)
     for _ in range(4):
-        state = advance(splitting, penalties, jnp.asarray(1.0), state)
+        state = advance(state, splitting)
     found = UnrolledAdmm(problem, 4)(problem)
-    np.testing.assert_allclose(found, image_of(splitting, state), atol=1e-10)
+    np.testing.assert_allclose(found, splitting.image(state), atol=1e-10)
 
 
 def test_trained_it_beats_as_many_untrained_iterations_on_scenes_it_has_not_seen():
@@ -73,7 +73,7 @@ def test_the_gradient_is_that_of_differences():
 
 
 @pytest.mark.thorough
-def test_each_member_of_a_batch_is_as_if_alone():
+def test_each_element_of_a_batch_is_as_if_alone():
     """However bright the others are."""
     problem, _ = pairs(3, 7)
     gains = jnp.array([1.0, 1e3, 1e-3])[:, None, None, None]

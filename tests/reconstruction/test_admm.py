@@ -1,4 +1,4 @@
-"""ADMM against a primal-dual solver on dense matrices; what its penalties must not change."""
+"""ADMM against a primal-dual solver on dense matrices, and how its method gets to the minimum."""
 
 from typing import NamedTuple
 
@@ -7,21 +7,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from reconstruction import dense, scenes
+import tifffile
+from reconstruction import dense, rig, scenes
 
-from helpers import count_traces, relative_l2
+import thincam_jax as tc
+from helpers import count_traces, relative_l2, shared_data
 from thincam_jax.imaging.operators import CropConvolution, kernel_shape, window_shape
-from thincam_jax.reconstruction.admm import (
-    Penalties,
-    Splitting,
-    default_penalties,
-    image_of,
-    reflected,
-    rescale,
-    start,
-    step,
-)
-from thincam_jax.reconstruction.problem import Deconvolution, objective
+from thincam_jax.reconstruction import drive
+from thincam_jax.reconstruction.admm import AdmmMethod, splitting_of
+from thincam_jax.reconstruction.problem import InverseProblem, objective
+from thincam_jax.reconstruction.splitting import Penalties, admm_map, consensus
 from thincam_jax.reconstruction.total_variation import TotalVariation
 
 FIELD = (6, 11)
@@ -31,7 +26,7 @@ SENSORS = ((7, 9), (10, 6))
 class Case(NamedTuple):
     """A problem twice: for the package, and as matrices."""
 
-    problem: Deconvolution
+    problem: InverseProblem
     parts: list
     tau: float
     psi: np.ndarray
@@ -97,34 +92,41 @@ def case(name: str) -> Case:
         "joint" if setting.joint else "none",
         depth_weight=setting.depth_weight,
     )
-    problem = Deconvolution(
+    problem = scenes.inverse(
         operators,
         captures,
         tau=setting.tau,
         weights=weights,
-        variation=variation,
+        regulariser=variation,
         nonnegative=setting.nonnegative,
     )
     psi = dense.slopes((planes, *FIELD), setting.depth_weight)
     return Case(problem, parts, setting.tau, psi, setting.kind, setting.joint)
 
 
+def relaxed(splitting, relaxation, state):
+    """One iteration: q + α (T(q) − q)."""
+    mapped = admm_map(state, splitting)
+    return jax.tree.map(lambda q, t: q + relaxation * (t - q), state, mapped)
+
+
 @jax.jit
-def _iterate(splitting, penalties, relaxation, state, count):
-    return jax.lax.fori_loop(
-        0, count, lambda _, s: step(splitting, penalties, relaxation, s), state
-    )
+def iterate(splitting, relaxation, state, count):
+    return jax.lax.fori_loop(0, count, lambda _, s: relaxed(splitting, relaxation, s), state)
+
+
+def weighed(problem, factors):
+    """The splitting of a problem with its penalties multiplied."""
+    splitting = splitting_of(problem)
+    wanted = Penalties(*(jnp.asarray(f, problem.tau.dtype) for f in factors))
+    return splitting.with_penalties(jax.tree.map(jnp.multiply, splitting.penalties, wanted))
 
 
 def solved(problem, *, relaxation=1.8, factors=(0.1, 0.1, 0.1), iterations=1500, image=None):
-    splitting = Splitting(problem)
-    penalties = default_penalties(splitting)
-    wanted = Penalties(*(jnp.asarray(f, problem.tau.dtype) for f in factors))
-    penalties = jax.tree.map(jnp.multiply, penalties, wanted)
+    splitting = weighed(problem, factors)
     image = jnp.zeros(problem.image_shape, problem.tau.dtype) if image is None else image
-    begin = start(splitting, image)
     relaxation = jnp.asarray(relaxation, problem.tau.dtype)
-    return image_of(splitting, _iterate(splitting, penalties, relaxation, begin, iterations))
+    return splitting.image(iterate(splitting, relaxation, splitting.start(image), iterations))
 
 
 def reference(given: Case) -> np.ndarray:
@@ -176,86 +178,15 @@ def test_relaxation_and_penalties_do_not_move_the_minimiser(relaxation, factors)
     assert relative_l2(value, expected) < 1e-6
 
 
-def test_a_state_stands_for_its_image():
-    """`start` and back; negative parts are cut only if that is asked."""
-    for nonnegative in (True, False):
-        problem, _ = scenes.problem(planes=2, channels=2, nonnegative=nonnegative)
-        splitting = Splitting(problem)
-        image = jnp.asarray(np.random.default_rng(1).normal(size=problem.image_shape))
-        back = image_of(splitting, start(splitting, image))
-        expected = jnp.maximum(image, 0) if nonnegative else image
-        np.testing.assert_allclose(back, expected, atol=1e-13)
-
-
 def test_the_minimiser_is_a_fixed_point():
     """At the end q stays, and z = Kf in all splits: no gap is left."""
     given = case("two")
-    splitting = Splitting(given.problem)
-    penalties = jax.tree.map(lambda p: 0.1 * p, default_penalties(splitting))
-    begin = start(splitting, jnp.zeros(given.problem.image_shape))
-    state = _iterate(splitting, penalties, jnp.asarray(1.8), begin, 2000)
-    after = step(splitting, penalties, jnp.asarray(1.0), state)
+    splitting = weighed(given.problem, (0.1, 0.1, 0.1))
+    begin = splitting.start(jnp.zeros(given.problem.image_shape))
+    state = iterate(splitting, jnp.asarray(1.8), begin, 2000)
+    after = admm_map(state, splitting)
     for before, now in zip(jax.tree.leaves(state), jax.tree.leaves(after), strict=True):
         np.testing.assert_allclose(now, before, atol=1e-10)
-
-
-def consensus(splitting, penalties, state):
-    back = reflected(splitting, penalties, state)
-    return jax.tree.map(lambda q, r: 0.5 * (q + r), state, back)
-
-
-def test_other_penalties_keep_image_and_forces():
-    """`rescale`: z as before, μ(q − z), which are the forces, as before; the same fixed point."""
-    given = case("colour")
-    splitting = Splitting(given.problem)
-    penalties = default_penalties(splitting)
-    state = start(splitting, jnp.full(given.problem.image_shape, 0.4))
-    state = _iterate(splitting, penalties, jnp.asarray(1.5), state, 20)
-    factors = Penalties(*(jnp.asarray(f) for f in (0.3, 2.5, 1.7)))
-    others, scaled = rescale(splitting, state, penalties, factors)
-    for name in ("data", "variation", "image"):
-        ratio = float(getattr(others, name) / getattr(penalties, name))
-        assert ratio == pytest.approx(float(getattr(factors, name)), rel=1e-12)
-    z, still = consensus(splitting, penalties, state), consensus(splitting, others, scaled)
-    force = 0.0
-    for part, name in (("data", "data"), ("slopes", "variation"), ("image", "image")):
-        old, new = getattr(penalties, name), getattr(others, name)
-        sides = (getattr(s, part) for s in (state, z, scaled, still))
-        for q, a, r, b in zip(*(jax.tree.leaves(s) for s in sides), strict=True):
-            np.testing.assert_allclose(b, a, atol=1e-12)
-            np.testing.assert_allclose(new * (r - b), old * (q - a), atol=1e-12)
-            force = max(force, float(jnp.abs(q - a).max()))
-    assert force > 0.1
-    np.testing.assert_allclose(image_of(splitting, scaled), image_of(splitting, state), atol=1e-12)
-
-
-def test_the_reflection_minimises_each_part():
-    """z of the data: (w g + μ q)/(w + μ) on the sensor, q beside it; of the image: its field."""
-    given = case("one")
-    splitting = Splitting(given.problem)
-    penalties = Penalties(*(jnp.asarray(p) for p in (0.7, 2.0, 3.0)))
-    rng = np.random.default_rng(4)
-    state = start(splitting, jnp.zeros(given.problem.image_shape))
-    state = jax.tree.map(lambda q: jnp.asarray(rng.normal(size=q.shape)), state)
-    z = consensus(splitting, penalties, state)
-    operator = splitting.operators[0]
-    (top, left), (rows, columns) = operator.sensor_corner, operator.sensor_shape
-    inside = np.zeros(operator.window, bool)
-    inside[top : top + rows, left : left + columns] = True
-    q = np.asarray(state.data[0])[0]
-    w, g = np.asarray(splitting.weights[0])[0], np.asarray(splitting.captures[0])[0]
-    expected = q.copy()
-    expected[inside] = ((w * g + 0.7 * q[inside].reshape(g.shape)) / (w + 0.7)).ravel()
-    np.testing.assert_allclose(z.data[0][0], expected, rtol=1e-12, atol=1e-12)
-    field = np.zeros(operator.window, bool)
-    (top, left), (rows, columns) = operator.field_corner, operator.field_shape
-    field[top : top + rows, left : left + columns] = True
-    q = np.asarray(state.image)[0, 0]
-    np.testing.assert_allclose(z.image[0, 0], np.where(field, np.maximum(q, 0), 0), atol=1e-15)
-    # the last row's difference downwards leaves the field, and costs nothing
-    row = top + rows - 1
-    np.testing.assert_array_equal(z.slopes[0][0, 0, row], state.slopes[0][0, 0, row])
-    assert jnp.abs(z.slopes[0][0, 0, row - 1] - state.slopes[0][0, 0, row - 1]).max() > 1e-3
 
 
 @pytest.mark.parametrize("factor", [1e-8, 1e8])
@@ -287,14 +218,13 @@ def test_a_batch_is_its_members_and_new_values_compile_once():
     mapped = jax.vmap(alone)(problem.captures)
     np.testing.assert_allclose(mapped, together, rtol=1e-9, atol=1e-11)
 
-    counted = count_traces(step)
+    counted = count_traces(relaxed)
     compiled = jax.jit(counted)
     for tau, relaxation in ((1e-3, 1.0), (2e-3, 1.6)):
-        other = scenes.rescaled(problem, 1 + tau)
-        other = eqx.tree_at(lambda p: p.tau, other, jnp.asarray(tau))
-        splitting = Splitting(other)
-        begin = start(splitting, jnp.zeros(other.image_shape))
-        compiled(splitting, default_penalties(splitting), jnp.asarray(relaxation), begin)
+        other = scenes.absolute(scenes.rescaled(problem, 1 + tau), tau)
+        splitting = splitting_of(other)
+        begin = splitting.start(jnp.zeros(other.image_shape))
+        compiled(splitting, jnp.asarray(relaxation), begin)
     assert counted.traces == 1
 
 
@@ -312,8 +242,191 @@ def test_extremes_are_finite():
     )
     for given in (dark, blind, closed):
         np.testing.assert_array_equal(solved(given, iterations=20), 0)
-    free, flat = (
-        solved(eqx.tree_at(lambda p: p.tau, problem, jnp.asarray(tau)), iterations=200)
-        for tau in (0.0, 1e6)
-    )
+    free, flat = (solved(scenes.absolute(problem, tau), iterations=200) for tau in (0.0, 1e6))
     assert bool(jnp.isfinite(free).all()) and 0 < float(jnp.ptp(flat)) < 0.2 * float(jnp.ptp(free))
+
+
+def driven(problem, *, iterations=1500, tolerance=1e-9, image=None, **settings):
+    method = AdmmMethod(problem, relaxation=settings.pop("relaxation", 1.7))
+    image = jnp.zeros(problem.image_shape, problem.tau.dtype) if image is None else image
+    settings = {"adapt_until": iterations // 2} | settings
+    return drive.drive(method, image, iterations=iterations, tolerance=tolerance, **settings)
+
+
+@pytest.mark.parametrize("name", ["colour_anisotropic", "planes"])
+def test_it_converges_to_the_minimum_of_another_method(name):
+    """With its own penalties, which start 10 times too large for these problems and adapt."""
+    given = case(name)
+    outcome = driven(given.problem, iterations=4000)
+    expected = reference(given)
+    assert outcome.status == "converged"
+    assert relative_l2(np.asarray(outcome.image).reshape(expected.shape), expected) < 1e-6
+    assert energy(given, outcome.image) == pytest.approx(energy(given, expected), rel=1e-9)
+    # the history is that of the objective, and ends at the lowest
+    last, values = outcome.history[-1], [p.objective for p in outcome.history]
+    assert values[-1] == pytest.approx(energy(given, expected), rel=1e-9)
+    assert min(values) >= energy(given, expected) * (1 - 1e-9)
+    assert max(last.primal, last.dual) < 1e-9
+
+
+def test_the_best_image_is_that_of_the_lowest_objective():
+    problem, _ = scenes.problem()
+    outcome = driven(problem, iterations=40, tolerance=0.0)
+    assert outcome.status == "iterations_exhausted"
+    method = AdmmMethod(problem)
+    best = min(p.objective for p in outcome.history)
+    assert float(method.objective(outcome.image)) == pytest.approx(best, rel=1e-12)
+
+
+def test_residuals_are_what_their_names_say():
+    """Primal: Kf − z against the larger of the two; dual: how far z moved, against the forces."""
+    problem, _ = scenes.problem()
+    method = AdmmMethod(problem, relaxation=1.3)
+    splitting = method.arguments
+    state = method.advance(method.start(jnp.full(problem.image_shape, 0.3)), 7)
+    before = jax.tree.map(jnp.copy, state.value)
+    state = method.advance(state, 1)
+    after, found = state.value, method.residuals(state)
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, atol=1e-13),
+        after,
+        relaxed(splitting, 1.3, before),
+    )
+    old, new = (consensus(splitting, s) for s in (before, after))
+    image = jax.tree.map(lambda z, a, b: z + (a - b) / 1.3, old, after, before)
+
+    def size(tree):
+        """Lengths in the metric of the penalties."""
+        total = 0.0
+        for name, leaf in (("data", "data"), ("slopes", "variation"), ("image", "image")):
+            weight = float(getattr(splitting.penalties, leaf))
+            for part in jax.tree.leaves(getattr(tree, name)):
+                total += weight * float((np.asarray(part) ** 2).sum())
+        return total**0.5
+
+    gap = jax.tree.map(jnp.subtract, image, old)
+    forces = jax.tree.map(jnp.subtract, after, new)
+    assert found.dual == pytest.approx(
+        size(jax.tree.map(jnp.subtract, new, old)) / size(forces), rel=1e-10
+    )
+    # each split takes the larger of Kf and z
+    assert found.primal <= size(gap) / max(size(image), size(old)) * (1 + 1e-10)
+    assert found.primal >= size(gap) / (size(image) ** 2 + size(old) ** 2) ** 0.5
+    assert len(found.parts) == 3 and all(p > 0 and d > 0 for p, d in found.parts)
+
+
+def test_balance_moves_penalties_the_right_way():
+    """From penalties far too large or too small, ten times nearer to the minimum with balance."""
+    given = case("colour")
+    lowest = energy(given, reference(given))
+    for factor in (300.0, 1 / 300.0):
+        bad = weighed(given.problem, (factor,) * 3).penalties
+        method = AdmmMethod(given.problem, penalties=bad, relaxation=1.5)
+        first = jnp.zeros(given.problem.image_shape)
+        errors = []
+        for until in (0, 150):
+            run = drive.drive(method, first, iterations=300, tolerance=0.0, adapt_until=until)
+            errors.append(energy(given, run.image) / lowest - 1)
+        assert errors[1] < 0.1 * errors[0]
+
+
+def test_balanced_penalties_keep_the_image():
+    problem, _ = scenes.problem()
+    method = AdmmMethod(problem)
+    state = method.advance(method.start(jnp.full(problem.image_shape, 0.3)), 1)
+    residuals = method.residuals(state)
+    uneven = residuals._replace(parts=((4.0, 1.0), (1.0, 100.0), (1.0, 1.0)))
+    before = method.image(state)
+    other, changed = method.adapt(state, uneven)
+    assert isinstance(other, AdmmMethod)
+    np.testing.assert_allclose(other.image(changed), before, atol=1e-12)
+    expected = Penalties(*(jnp.asarray(f) for f in (2.0, 1 / 3, 1.0)))
+    for old, new, factor in zip(
+        *(
+            jax.tree.leaves(p)
+            for p in (method.arguments.penalties, other.arguments.penalties, expected)
+        ),
+        strict=True,
+    ):
+        assert float(new / old) == pytest.approx(float(factor), rel=1e-12)
+    # nothing is rebuilt for a balance that is good enough
+    even = residuals._replace(parts=((1.1, 1.0), (1.0, 1.1), (0.0, 1.0)))
+    assert method.adapt(state, even)[0] is method
+
+
+def test_no_light_converges_at_once_and_nan_has_a_status():
+    problem, _ = scenes.problem()
+    dark = eqx.tree_at(
+        lambda p: p.captures, problem, tuple(jnp.zeros_like(c) for c in problem.captures)
+    )
+    outcome = driven(dark, iterations=50)
+    assert (outcome.status, outcome.iterations) == ("converged", 10)
+    np.testing.assert_array_equal(outcome.image, 0)
+    broken = (problem.captures[0].at[0, 0, 0].set(jnp.nan), problem.captures[1])
+    outcome = driven(eqx.tree_at(lambda p: p.captures, problem, broken), iterations=50)
+    assert outcome.status == "non_finite"
+
+
+def test_single_precision_and_no_new_compilation():
+    """New captures, τ, relaxation and penalties of old shapes; all residuals are finite."""
+    problem, _ = scenes.problem()
+    expected = driven(problem, iterations=30, tolerance=0.0)
+    value = driven(scenes.single(problem), iterations=30, tolerance=0.0)
+    assert value.image.dtype == jnp.float32
+    assert relative_l2(value.image, expected.image) < 1e-4
+    assert all(np.isfinite(p[1:]).all() for p in value.history[1:])
+    size = drive._advance_donated._cached._cache_size()
+    other = scenes.absolute(scenes.rescaled(problem, 3.0), 0.1)
+    driven(other, iterations=30, tolerance=0.0, relaxation=1.1)
+    penalties = weighed(problem, (0.3, 2.0, 1.5)).penalties
+    method = AdmmMethod(problem, penalties=penalties)
+    method.advance(method.start(expected.image), 20)
+    assert drive._advance_donated._cached._cache_size() == size
+    assert rig.correlation(expected.image, value.image) > 0.999
+
+
+def test_a_warm_start_goes_on_where_the_image_was():
+    """From a minimiser the image stays one: the first look is at its objective."""
+    given = case("two")
+    done = driven(given.problem)
+    lowest = energy(given, done.image)
+    again = driven(given.problem, image=done.image, iterations=10, tolerance=0.0)
+    assert again.history[0].objective == pytest.approx(lowest, rel=1e-12)
+    assert energy(given, again.image) <= lowest * (1 + 1e-12)
+    method = AdmmMethod(given.problem)
+    back = method.image(method.start(done.image))
+    np.testing.assert_allclose(back, done.image, atol=1e-12)
+
+
+def hand(bin_by):
+    """The measured capture of a hand through a diffuser, binned."""
+    folder = shared_data("diffusercam-hand")
+    psf, raw = (
+        tifffile.imread(folder / name).astype(float)
+        for name in ("psf_sample.tif", "rawdata_hand_sample.tif")
+    )
+    background = psf[5:15, 5:15].mean()
+    rows, columns = (n // bin_by for n in psf.shape)
+    psf, raw = (
+        np.maximum(i - background, 0)
+        .reshape(rows, bin_by, columns, bin_by)
+        .mean((1, 3))
+        .astype(np.float32)
+        for i in (psf, raw)
+    )
+    return tc.Recording(jnp.asarray(raw[None]), tc.Psfs(jnp.asarray((psf / psf.sum())[None])))
+
+
+@pytest.mark.parametrize(
+    "bin_by, most", [(8, 100), pytest.param(4, 130, marks=pytest.mark.thorough)]
+)
+def test_what_500_plain_iterations_reach_in_a_quarter_of_them(bin_by, most):
+    """A measured capture, with the relaxation and the balance of `AdmmTV`: 80 and 110."""
+    recording = hand(bin_by)
+    plain = driven(
+        recording.problem(), iterations=500, tolerance=0.0, relaxation=1.0, adapt_until=0
+    )
+    goal = plain.history[-1].objective * (1 + 1e-6)
+    result = tc.reconstruct(recording, tc.AdmmTV(iterations=150, tolerance=0.0))
+    reached = (p.iteration for p in result.history if p.objective <= goal)
+    assert next(reached, np.inf) <= most

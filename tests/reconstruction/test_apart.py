@@ -10,15 +10,15 @@ from reconstruction import rig, scenes
 
 import thincam_jax as tc
 from helpers import relative_l2
+from thincam_jax.reconstruction.admm import AdmmMethod
 from thincam_jax.reconstruction.apart import Apart, _together, parts, worth_taking_apart
 from thincam_jax.reconstruction.drive import drive
-from thincam_jax.reconstruction.problem import Deconvolution, objective
+from thincam_jax.reconstruction.problem import objective
 from thincam_jax.reconstruction.total_variation import TotalVariation
-from thincam_jax.reconstruction.tv_method import AdmmTotalVariation
 
 
 def admm(problem):
-    return AdmmTotalVariation(problem, relaxation=1.7)
+    return AdmmMethod(problem, relaxation=1.7)
 
 
 def solve(method, problem, **settings):
@@ -32,12 +32,12 @@ def masked(problem, seed=0):
     rng = np.random.default_rng(seed)
     weights = [rng.uniform(0.5, 2, c.shape) * (rng.uniform(size=c.shape) > 0.1)
                for c in problem.captures]  # fmt: skip
-    return Deconvolution(
+    return scenes.inverse(
         problem.operators,
         problem.captures,
-        tau=problem.tau,
+        tau=problem.absolute_tau,
         weights=weights,
-        variation=problem.variation,
+        regulariser=problem.regulariser,
         nonnegative=problem.nonnegative,
     )
 
@@ -46,7 +46,7 @@ def masked(problem, seed=0):
 def test_the_objective_of_the_parts_is_that_of_the_whole(coupling, count):
     """Whatever the axes along which the parts lie, with weights of every kind."""
     problem, _ = scenes.problem(
-        batch=(3,), channels=2, planes=2, variation=TotalVariation(coupling=coupling)
+        batch=(3,), channels=2, planes=2, regulariser=TotalVariation(coupling=coupling)
     )
     image = jnp.asarray(np.random.default_rng(5).normal(size=problem.image_shape))
     for whole in (problem, masked(problem)):
@@ -61,7 +61,7 @@ def test_one_psf_for_all_colours_and_weights_that_broadcast():
     problem, _ = scenes.problem(batch=(2,), channels=3)
     shared = [jax.tree.map(lambda s: s[:1], o) for o in problem.operators]
     row = jnp.linspace(0.5, 1.5, problem.captures[0].shape[-1])
-    whole = Deconvolution(shared, problem.captures, tau=0.1, weights=[row, 2.0])
+    whole = scenes.inverse(shared, problem.captures, tau=0.1, weights=[row, 2.0])
     image = jnp.asarray(np.random.default_rng(1).uniform(size=whole.image_shape))
     apart = Apart(whole, admm)
     np.testing.assert_allclose(apart.objective(image), objective(whole, image), rtol=1e-12)
@@ -82,26 +82,29 @@ def test_the_worst_part_counts():
     """A part with little light is done when it is, not when the bright one is."""
     problem, _ = scenes.problem(batch=(2,), captures=1)
     dim = jnp.asarray([1.0, 1e-6])[:, None, None, None]
-    problem = Deconvolution(
-        problem.operators, [c * dim for c in problem.captures], tau=problem.tau * 1e-3
+    problem = scenes.inverse(
+        problem.operators, [c * dim for c in problem.captures], tau=problem.absolute_tau * 1e-3
     )
     apart = Apart(problem, admm)
-    state = apart.advance(apart.start(jnp.zeros(problem.image_shape)), 5)
-    _, found = apart.look(state)
-    assert found.primal == max(r.primal for r in found.members)
-    assert found.dual == max(r.dual for r in found.members)
-    assert len({r.primal for r in found.members}) == 2
+    found = apart.residuals(apart.advance(apart.start(jnp.zeros(problem.image_shape)), 6))
+    assert found.primal == max(r.primal for r in found.apart)
+    assert found.dual == max(r.dual for r in found.apart)
+    assert len({r.primal for r in found.apart}) == 2
 
 
 def test_units_and_penalties_do_not_depend_on_the_batch():
     """Through the entry point: the same captures alone and beside a bright one."""
     cameras = rig.pair()
     captures = rig.captures(cameras, rig.picture())
-    where = {"object_distance": rig.OBJECT_DISTANCE, "wavelength": rig.WAVELENGTH}
-    options = {"method": "admm_tv", "iterations": 30, "tolerance": 0.0, "noise_variance": 1e-12}
-    alone = tc.reconstruct(captures[:, None], cameras, **where, **options)
-    beside = jnp.stack([captures, 1e3 * captures[..., ::-1]], axis=1)[:, :, None]
-    both = tc.reconstruct(beside, cameras, **where, **options)
+    seen_by = tc.Cameras(cameras, object_distance=rig.OBJECT_DISTANCE, wavelength=rig.WAVELENGTH)
+    solver = tc.AdmmTV(iterations=30, tolerance=0.0)
+    alone, both = (
+        tc.reconstruct(tc.Recording(given, seen_by, noise_variance=1e-12), solver)
+        for given in (
+            captures[:, None],
+            jnp.stack([captures, 1e3 * captures[..., ::-1]], axis=1)[:, :, None],
+        )
+    )
     np.testing.assert_allclose(both.image[0], alone.image, rtol=1e-10, atol=1e-12)
 
 
@@ -110,7 +113,7 @@ def test_only_what_has_parts_is_taken_apart():
     assert worth_taking_apart(scenes.problem(batch=(2,))[0])
     assert worth_taking_apart(scenes.problem(channels=2)[0])
     assert not worth_taking_apart(scenes.problem()[0])
-    assert not worth_taking_apart(scenes.problem(channels=2, variation=coupled)[0])
+    assert not worth_taking_apart(scenes.problem(channels=2, regulariser=coupled)[0])
 
 
 def test_precision_of_the_calling_thread():
@@ -134,7 +137,7 @@ def test_operators_are_not_copied():
     problem, _ = scenes.problem(batch=(5,))
     apart = Apart(problem, admm)
     for n in range(2):
-        spectra = [m.splitting.operators[n].spectrum for m in apart.methods]
+        spectra = [m.arguments.operators[n].spectrum for m in apart.methods]
         assert {s.unsafe_buffer_pointer() for s in spectra} == {
             problem.operators[n].spectrum.unsafe_buffer_pointer()
         }

@@ -6,17 +6,16 @@ import numpy as np
 import pytest
 
 import thincam_jax as tc
-from thincam_jax.reconstruction import psf_problem
+from thincam_jax.reconstruction import InverseProblem
+from thincam_jax.reconstruction.admm import AdmmMethod
 from thincam_jax.reconstruction.choose_tau import (
     discrepancy_tau,
     learn_tau,
     mean_squared_error,
     sure_tau,
-    with_tau,
 )
 from thincam_jax.reconstruction.drive import drive
-from thincam_jax.reconstruction.problem import misfit
-from thincam_jax.reconstruction.tv_method import AdmmTotalVariation
+from thincam_jax.reconstruction.problem import misfit, with_tau
 
 SENSOR, SIGMA = (30, 37), 0.02
 
@@ -35,20 +34,24 @@ def _psf(seed=0):
     return psf / psf.sum()
 
 
+def recording(capture, seed=0, **settings):
+    return tc.Recording(
+        capture, tc.Psfs(jnp.asarray(_psf(seed))[None], **settings), noise_variance=SIGMA**2
+    )
+
+
 def posed(seed=0, tau=2.0):
     """A blurred, cropped capture with noise, and the truth."""
     random = np.random.default_rng(10 + seed)
-    psf = _psf(seed)
     truth = scene(seed)
-    empty = psf_problem(jnp.zeros((1, *SENSOR)), jnp.asarray(psf)[None], noise_variance=1.0)
+    empty = recording(jnp.zeros((1, *SENSOR)), seed).problem()
     assert empty.image_shape == truth.shape
     capture = empty.operators[0](truth) + SIGMA * random.normal(size=(1, *SENSOR))
-    problem = psf_problem(capture, jnp.asarray(psf)[None], noise_variance=SIGMA**2, tau=tau)
-    return problem, truth
+    return recording(capture, seed).problem(tau=tau), truth
 
 
 def solved(problem, iterations=200):
-    method = AdmmTotalVariation(problem, relaxation=1.5)
+    method = AdmmMethod(problem, relaxation=1.5)
     first = jnp.zeros(problem.image_shape)
     return drive(method, first, iterations=iterations, tolerance=1e-7).image
 
@@ -68,7 +71,7 @@ def test_discrepancy_counts_valid_pixels_only():
     problem, _ = posed()
     masked = jnp.ones((1, *SENSOR)).at[:, :15].set(0.0)
     weights = (masked / SIGMA**2,)
-    half = type(problem)(problem.operators, problem.captures, tau=problem.tau, weights=weights)
+    half = InverseProblem(problem.operators, problem.captures, tau=problem.tau, weights=weights)
     chosen = discrepancy_tau(half, jnp.zeros(problem.image_shape), iterations=60, solves=10)
     assert 2 * float(misfit(chosen.problem, chosen.image).sum()) == pytest.approx(15 * 37, rel=0.03)
 
@@ -108,21 +111,16 @@ def test_learning_finds_the_least_error_of_known_images():
 def test_the_entry_point_takes_a_rule(rule):
     """A τ a hundred times too small or found: the found one is nearer to the truth."""
     problem, truth = posed()
-    psf = jnp.asarray(_psf(0))[None]
-    given = {"method": "admm_tv", "noise_variance": SIGMA**2, "field_shape": (38, 45)}
-    found = tc.reconstruct(problem.captures[0], psf, tau=rule, **given)
-    poor = tc.reconstruct(problem.captures[0], psf, tau=0.02, **given)
+    seen = recording(problem.captures[0], field_shape=(38, 45))
+    found, poor = (tc.reconstruct(seen, tc.AdmmTV(tau)) for tau in (rule, 0.02))
     errors = [float(mean_squared_error(r.image, truth[:, 0])) for r in (found, poor)]
     assert found.status in ("converged", "iterations_exhausted")
     assert errors[0] < 0.8 * errors[1]
 
 
 def test_an_unknown_rule_is_refused():
-    problem, _ = posed()
     with pytest.raises(ValueError, match="'discrepancy', 'sure'"):
-        tc.reconstruct(
-            problem.captures[0], jnp.asarray(_psf(0))[None], method="admm_tv", tau="guess"
-        )
+        tc.AdmmTV("guess")
 
 
 def test_a_search_needs_a_positive_start():

@@ -31,8 +31,8 @@ class Walk(AbstractMethod[Float[Array, ""]]):
     def objective(self, image):
         return image[..., 0, 0, 0, 0]
 
-    def look(self, state):
-        return state + 1, Residuals(10.0 ** -float(state + 1), 10.0 ** -float(state))
+    def residuals(self, state):
+        return Residuals(10.0 ** -float(state), 10.0 ** (1 - float(state)))
 
     def adapt(self, state, residuals):
         assert residuals.primal == pytest.approx(10.0 ** -float(state))

@@ -16,9 +16,9 @@ from reconstruction.test_admm import case, reference, solved
 import thincam_jax as tc
 from helpers import count_traces, finite_difference, relative_l2
 from thincam_jax.imaging.operators import CropConvolution, kernel_grid
-from thincam_jax.reconstruction.admm import Penalties, Splitting, default_penalties
+from thincam_jax.reconstruction.admm import splitting_of
 from thincam_jax.reconstruction.fixed_point import NeumannSeries, solve_fixed_point
-from thincam_jax.reconstruction.problem import Deconvolution
+from thincam_jax.reconstruction.splitting import Penalties
 from thincam_jax.units import nm
 
 BETA, DISTANCE, TAU = 50.0, 4.0, 0.05
@@ -75,14 +75,14 @@ def parameters() -> Parameters:
 
 def tuned(problem, factor=0.4) -> Penalties:
     """Penalties with which this problem converges fast."""
-    penalties = jax.lax.stop_gradient(default_penalties(Splitting(problem)))
+    penalties = jax.lax.stop_gradient(splitting_of(problem).penalties)
     return jax.tree.map(lambda p: p * jnp.asarray(factor, p.dtype), penalties)
 
 
 def psnr(at: Parameters, iterations=200):
     """PSNR of the minimiser, dB."""
     operator = camera_operator(at.beta, at.distance)
-    problem = Deconvolution((operator,), (at.capture,), tau=jnp.exp(at.log_tau) * captured()[1])
+    problem = scenes.inverse((operator,), (at.capture,), tau=jnp.exp(at.log_tau) * captured()[1])
     result = solve_fixed_point(
         problem,
         jnp.zeros(problem.image_shape),
@@ -231,12 +231,14 @@ def test_the_series_solves_linear_systems():
     matrix *= 0.8 / np.linalg.norm(matrix, 2)
     right = rng.normal(size=9)
     operator = lx.MatrixLinearOperator(jnp.asarray(matrix - np.eye(9)))
-    solver = NeumannSeries(1e-14, 1000)
+    solver = NeumannSeries(1e-14, 1000, relaxation=1.0)
     for given, dense_matrix in ((operator, matrix), (operator.T, matrix.T)):
         solution = lx.linear_solve(given, jnp.asarray(right), solver, throw=False)
         expected = np.linalg.solve(dense_matrix - np.eye(9), right)
         np.testing.assert_allclose(solution.value, expected, rtol=1e-10)
-    few = lx.linear_solve(operator, jnp.asarray(right), NeumannSeries(1e-14, 3), throw=False)
+    few = lx.linear_solve(
+        operator, jnp.asarray(right), NeumannSeries(1e-14, 3, relaxation=1.0), throw=False
+    )
     expected = -sum(np.linalg.matrix_power(matrix, n) @ right for n in range(4))
     np.testing.assert_allclose(few.value, expected, rtol=1e-12)
     assert int(few.stats["num_steps"]) == 3

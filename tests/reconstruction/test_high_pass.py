@@ -15,7 +15,7 @@ from thincam_jax.imaging.operators import CropConvolution
 from thincam_jax.imaging.operators.crop_convolution import kernel_shape
 from thincam_jax.reconstruction import high_pass, regularised
 from thincam_jax.reconstruction.high_pass import high_passed, levelled, whole_windows
-from thincam_jax.reconstruction.problem import Deconvolution, objective, residuals
+from thincam_jax.reconstruction.problem import objective, residuals
 from thincam_jax.units import um
 
 SENSOR, FIELD, LENGTH = (48, 61), (40, 45), 7
@@ -50,7 +50,7 @@ def noisy_problem(*responses, batch=(), channels=1, weights=None):
     rng = np.random.default_rng(8)
     operators = [CropConvolution(jnp.asarray(k), PITCH, SENSOR, FIELD, summed=1) for k in responses]
     captures = [jnp.asarray(rng.uniform(1, 2, (*batch, channels, *SENSOR))) for _ in responses]
-    return Deconvolution(operators, captures, tau=1e-3, weights=weights)
+    return scenes.inverse(operators, captures, tau=1e-3, weights=weights)
 
 
 def hann(length=LENGTH):
@@ -181,7 +181,7 @@ def test_too_few_pixels():
     """A sensor of 31 pixels has no window of 5, and scattered dead pixels leave no window whole."""
     for rows, wanted in ((31, False), (32, True)):
         operator = scenes.convolution((rows, 47), FIELD)
-        problem = Deconvolution([operator], [jnp.ones((1, rows, 47))], tau=1e-3)
+        problem = scenes.inverse([operator], [jnp.ones((1, rows, 47))], tau=1e-3)
         assert (high_passed(problem) is not None) == wanted
     dead = np.ones(SENSOR)
     dead[::6, ::6] = 0
@@ -198,7 +198,7 @@ def test_captures_of_other_sizes_and_float32():
         CropConvolution(jnp.asarray(k, "float32"), PITCH, s, FIELD, summed=1, window=window)
         for k, s in zip(plates, sizes, strict=True)
     ]
-    problem = Deconvolution(operators, [o(image) for o in operators], tau=1e-3)
+    problem = scenes.inverse(operators, [o(image) for o in operators], tau=1e-3)
     easier = high_passed(problem)
     assert {x.dtype for x in (*easier.captures, *easier.weights)} == {jnp.dtype("float32")}
     off = residuals(easier, image)
@@ -215,7 +215,7 @@ def test_the_level_is_found_again(planes, channels, batch):
     image = jnp.asarray(rng.uniform(1, 2, shape))
     mask = jnp.asarray(rng.uniform(size=scenes.SENSOR) > 0.2, float)
     captures = [o(image) for o in operators]
-    problem = Deconvolution(operators, captures, tau=1e-3, weights=[mask, 3.0])
+    problem = scenes.inverse(operators, captures, tau=1e-3, weights=[mask, 3.0])
     lost = jnp.asarray(rng.uniform(-0.5, 0.5, (*batch, channels, 1, 1, 1)))
     np.testing.assert_allclose(levelled(problem, image - lost), image, rtol=1e-10)
 
@@ -224,7 +224,7 @@ def test_nothing_negative_remains_where_that_is_asked():
     operator = scenes.convolution()
     image = jnp.asarray(np.random.default_rng(6).uniform(-1, 1, (1, 1, *scenes.FIELD)))
     for asked in (True, False):
-        problem = Deconvolution([operator], [operator(image)], tau=1e-3, nonnegative=asked)
+        problem = scenes.inverse([operator], [operator(image)], tau=1e-3, nonnegative=asked)
         assert (jnp.min(levelled(problem, image)) >= 0) == asked
 
 
@@ -246,19 +246,18 @@ def wide_capture():
     return wide()
 
 
-def solve(capture, *, iterations=60, **settings):
+def solve(capture, *, iterations=60, tolerance=0.0, **settings):
     camera, image, variance, valid = capture
-    settings = {"tolerance": 0.0, "noise_variance": variance, "valid": valid} | settings
-    return tc.reconstruct(
-        image,
+    cameras = tc.Cameras(
         [camera],
-        method="admm_tv",
         object_distance=rig.OBJECT_DISTANCE,
         wavelength=rig.WAVELENGTH,
         model="geometric",
         pixel_integration=False,
-        iterations=iterations,
-        **settings,
+    )
+    recording = tc.Recording(image, cameras, noise_variance=variance, valid=valid)
+    return tc.reconstruct(
+        recording, tc.AdmmTV(iterations=iterations, tolerance=tolerance), **settings
     )
 
 
@@ -316,7 +315,7 @@ def test_ctrl_c_between_the_parts_keeps_the_image(wide_capture, monkeypatch):
     def interrupt(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(regularised, "_by_admm", interrupt)
+    monkeypatch.setattr(tc.AdmmTV, "_by_admm", interrupt)
     result = solve(wide_capture)
     assert (result.status, result.iterations) == ("interrupted", 20)
 

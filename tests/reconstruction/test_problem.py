@@ -7,12 +7,24 @@ import pytest
 from reconstruction import dense, scenes
 
 from helpers import count_traces, finite_difference
-from thincam_jax.imaging.operators import CropConvolution, kernel_shape, window_shape
+from thincam_jax.imaging.operators import (
+    CropConvolution,
+    Masked,
+    Matrix,
+    Scaled,
+    Separable,
+    Stacked,
+    kernel_shape,
+    window_shape,
+)
 from thincam_jax.reconstruction.problem import (
-    Deconvolution,
+    InverseProblem,
+    gradient,
     misfit,
     objective,
     residuals,
+    total_misfit,
+    total_objective,
     uniform_level,
 )
 from thincam_jax.reconstruction.total_variation import TotalVariation
@@ -36,12 +48,12 @@ def example(channels=2, planes=3, kernel_channels=2):
     kernels = [RNG.normal(size=(kernel_channels, planes, *kernel_shape(s, FIELD))) for s in SENSORS]
     captures = [RNG.normal(size=(2, channels, *s)) for s in SENSORS]
     weights = [RNG.uniform(size=(channels, *s)) for s in SENSORS]
-    problem = Deconvolution(
+    problem = scenes.inverse(
         [operator(k, s) for k, s in zip(kernels, SENSORS, strict=True)],
         [jnp.asarray(c) for c in captures],
         tau=0.3,
         weights=weights,
-        variation=TotalVariation("anisotropic", depth_weight=0.4),
+        regulariser=TotalVariation("anisotropic", depth_weight=0.4),
     )
     matrices = []
     for kernel, sensor in zip(kernels, SENSORS, strict=True):
@@ -54,7 +66,7 @@ def example(channels=2, planes=3, kernel_channels=2):
 
 @pytest.mark.parametrize("kernel_channels", [1, 2])
 def test_the_objective_by_matrices(kernel_channels):
-    """Σ ½ w (Hf − g)² and τ TV, of each member of a batch."""
+    """Σ ½ w (Hf − g)² and τ TV, of each element of a batch."""
     problem, parts = example(kernel_channels=kernel_channels)
     assert problem.image_shape == (2, 2, 3, *FIELD)
     image = RNG.normal(size=problem.image_shape)
@@ -70,8 +82,8 @@ def test_the_objective_by_matrices(kernel_channels):
             np.testing.assert_allclose(gap[n].reshape(2, -1), difference, atol=1e-12)
 
 
-def test_the_even_image_is_the_best_of_all_even_ones():
-    """Of each channel of each member: the misfit has no slope there, and rises on both sides."""
+def test_the_uniform_image_is_the_best_of_all_uniform_ones():
+    """Of each channel and batch element: the misfit has no slope there, and rises on both sides."""
     problem, _ = example()
     level = uniform_level(problem)
     assert level.shape == (2, 2)
@@ -84,7 +96,7 @@ def test_the_even_image_is_the_best_of_all_even_ones():
     for sign in (-1, 1):
         assert float(cost(level + 0.1 * sign)) > float(cost(level))
     # without light there is none
-    dark = Deconvolution(
+    dark = InverseProblem(
         [operator(np.zeros((1, 1, *kernel_shape(SENSORS[0], FIELD))), SENSORS[0])],
         [jnp.ones((1, *SENSORS[0]))],
         tau=0.0,
@@ -111,13 +123,42 @@ def test_gradient_and_traces():
     assert counted.traces == 1
 
 
+def test_stacks_masks_and_gains_are_resolved():
+    """What is inside stays as it is; masked pixels, NaN too, leave the objective with its slope."""
+    shape, pixels = (4, 3), 10
+    dense_matrix = RNG.normal(size=(pixels, 12))
+    left, right = RNG.normal(size=(5, 4)), RNG.normal(size=(2, 3))
+    inner = Matrix(dense_matrix, shape, (pixels,)), Separable(left, right)
+    valid, gain = RNG.uniform(size=pixels) < 0.7, RNG.uniform(0.5, 2.0, size=(5, 2))
+    gain[2, 1] = 0.0
+    stack = Stacked([Masked(inner[0], valid), Scaled(inner[1], gain)])
+    captures = [RNG.normal(size=(3, pixels)), RNG.normal(size=(3, 5, 2))]
+    matrices = [dense_matrix[valid], gain.reshape(-1, 1) * np.kron(left, right)]
+    spoilt = np.where(valid, captures[0], np.nan)
+    problem = InverseProblem(stack, [spoilt, captures[1]], weights=[1.0, 0.5], tau=0.0)
+    assert problem.operators == inner and problem.image_shape == (3, 1, *shape)
+    image = jnp.asarray(RNG.normal(size=problem.image_shape))
+    flat = np.asarray(image).reshape(3, -1)
+    seen = [captures[0][:, valid], captures[1].reshape(3, -1)]
+    seen[1][:, gain.ravel() == 0] = 0.0
+    gaps = [flat @ m.T - g for m, g in zip(matrices, seen, strict=True)]
+    expected = (gaps[0] ** 2).sum() / 2 + 0.5 * (gaps[1] ** 2).sum() / 2
+    assert float(total_objective(image, problem)) == pytest.approx(expected, rel=1e-12)
+    slope = jax.grad(total_misfit)(image, problem)
+    np.testing.assert_allclose(gradient(problem, image), slope, rtol=1e-12, atol=1e-12)
+    # and where the mask stands before the stack, with the captures as its own tuple
+    masks = (valid, gain > 0)
+    whole = InverseProblem(Masked(stack, masks), [(spoilt, captures[1])], weights=[(1.0, 0.5)])
+    assert float(total_misfit(image, whole)) == pytest.approx(expected, rel=1e-12)
+
+
 def test_counts_and_single_precision():
     """Raw counts become real numbers; τ and weights take the captures' precision."""
     counts = RNG.integers(0, 4000, size=(1, *SENSORS[0]))
     kernel = RNG.uniform(size=(1, 1, *kernel_shape(SENSORS[0], FIELD)))
-    whole = Deconvolution([operator(kernel, SENSORS[0])], [counts], tau=0.7)
+    whole = InverseProblem([operator(kernel, SENSORS[0])], [counts], tau=0.7)
     assert whole.captures[0].dtype == jnp.float64 and float(whole.tau) == 0.7
-    single = Deconvolution(
+    single = InverseProblem(
         [operator(kernel.astype(np.float32), SENSORS[0])],
         [jnp.asarray(counts, jnp.float32)],
         tau=0.7,
@@ -137,8 +178,13 @@ def test_what_is_refused():
     for operators, captures, settings, message in (
         ([first], [a, b], {}, "2 captures for 1 operators; give one operator for each"),
         ([], [], {}, "0 captures for 0 operators"),
-        ([first, planes], [a, a], {}, "operators differ in window, field or planes"),
-        ([first], [b], {}, r"a capture has shape \(1, 4, 9\); its operator takes .* \(7, 6\)"),
+        ([first, planes], [a, a], {}, r"shapes \[\(1, 5, 8\), \(2, 5, 8\)\]; they see one image"),
+        (
+            [first],
+            [b],
+            {},
+            r"a capture has shape \(1, 4, 9\); its operator takes \(…, channel, 7, 6\)",
+        ),
         ([first], [a[0]], {}, r"a capture has shape \(7, 6\)"),
         ([coloured], [a], {}, "1 channels and its PSF 3; give a PSF of 1 channel or of as many"),
         ([first, second], [a, jnp.ones((3, 4, 9))], {}, r"captures differ in batch .*\(1,\), \(3,"),
@@ -146,4 +192,4 @@ def test_what_is_refused():
         ([first], [a], {"tau": -1.0}, "tau = -1.0 .* is negative; give tau >= 0"),
     ):
         with pytest.raises(ValueError, match=message):
-            Deconvolution(operators, captures, **({"tau": 1.0} | settings))
+            InverseProblem(operators, captures, **({"tau": 1.0} | settings))

@@ -138,10 +138,10 @@ def penalty(slopes, kind, coupling, chroma):
 
 
 def shortened(slopes, step, kind, coupling, chroma=1.7):
-    """The package's prox of slopes (direction, channel, y)."""
+    """The package's shrunk slopes (direction, channel, y)."""
     variation = TotalVariation(kind, coupling, chroma_weight=chroma)
     given = tuple(jnp.asarray(s)[:, None, :, None] for s in slopes)
-    value = variation.prox(given, jnp.asarray(step))
+    value = variation.shrink(given, jnp.asarray(step))
     return np.stack([np.asarray(v)[:, 0, :, 0] for v in value])
 
 
@@ -210,7 +210,7 @@ def test_gradients(kind, coupling):
 
     def shrunk(scale):
         slopes = tuple(scale * s for s in differences(image, 0.4))
-        return sum(jnp.sum(v**3) for v in variation.prox(slopes, 0.3 * scale**2))
+        return sum(jnp.sum(v**3) for v in variation.shrink(slopes, 0.3 * scale**2))
 
     scale = jnp.asarray(1.1)
     expected = finite_difference(shrunk, scale, jnp.asarray(1.0), 1e-5)
@@ -264,7 +264,7 @@ def test_slope_of_the_prox_by_differences(kind, coupling):
 
     def along(t):
         moved = tuple(s[None] + t * w[None] for s, w in zip(place, way, strict=True))
-        return jnp.stack(variation.prox(moved, length + 0.7 * t))
+        return jnp.stack(variation.shrink(moved, length + 0.7 * t))
 
     value, slope = jax.jvp(along, (0.0,), (1.0,))
     if coupling == "opponent":
@@ -272,14 +272,14 @@ def test_slope_of_the_prox_by_differences(kind, coupling):
     assert 0.1 < float(jnp.mean(jnp.abs(value) < 1e-12)) < 0.9
     np.testing.assert_allclose(slope, (along(1e-6) - along(-1e-6)) / 2e-6, atol=1e-8)
     # Symbolic zeros: only the step changes, or only one direction.
-    step = jax.jvp(lambda x: jnp.stack(variation.prox(place, x)), (length,), (1.0,))[1]
-    both = (variation.prox(place, length + x) for x in (1e-6, -1e-6))
+    step = jax.jvp(lambda x: jnp.stack(variation.shrink(place, x)), (length,), (1.0,))[1]
+    both = (variation.shrink(place, length + x) for x in (1e-6, -1e-6))
     up, down = (jnp.stack(b) for b in both)
     np.testing.assert_allclose(step, (up - down) / 2e-6, atol=1e-8)
-    first = jax.grad(lambda x: jnp.sum(jnp.stack(variation.prox((x, place[1]), length)) ** 2))
+    first = jax.grad(lambda x: jnp.sum(jnp.stack(variation.shrink((x, place[1]), length)) ** 2))
     moved = jnp.sum(first(place[0]) * way[0])
     sums = [
-        jnp.sum(jnp.stack(variation.prox((place[0] + x * way[0], place[1]), length)) ** 2)
+        jnp.sum(jnp.stack(variation.shrink((place[0] + x * way[0], place[1]), length)) ** 2)
         for x in (1e-6, -1e-6)
     ]
     assert float(moved) == pytest.approx(float(sums[0] - sums[1]) / 2e-6, rel=1e-6)

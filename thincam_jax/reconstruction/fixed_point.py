@@ -31,7 +31,7 @@ class FixedPoint(NamedTuple):
 
 
 class NeumannSeries(lx.AbstractLinearSolver):
-    r"""Solves (J − 1) w = v by w ← J w − v, for the Jacobian of a fixed-point iteration.
+    r"""Solves (J − 1) w = v by w ← w + α ((J − 1) w − v), J the Jacobian of an averaged map.
 
     It is to an averaged map what conjugate gradients are to a symmetric one: it needs one vector,
     and converges also where 1 − J is singular in directions on which nothing depends (the forces of
@@ -40,10 +40,12 @@ class NeumannSeries(lx.AbstractLinearSolver):
     - `tolerance`: on the change of w, relative to w, both in the root mean square.
     - `max_steps`: when to give up; the sum so far is returned, without a sign of it, and may be
       some ten per cent short where the iteration itself converges slowly. Compare another number.
+    - `relaxation`: α, 0 < α < 2 as for the iteration; 1 is the plain series, for any contraction.
     """
 
     tolerance: float = 1e-6
     max_steps: int = 5000
+    relaxation: float = RELAXATION
 
     def init(self, operator: lx.AbstractLinearOperator, options: dict[str, Any]):
         return lx.linearise(operator)
@@ -55,13 +57,13 @@ class NeumannSeries(lx.AbstractLinearSolver):
 
         def body(carry):
             w, _, count = carry
-            residual = jax.tree.map(jnp.subtract, state.mv(w), vector)
-            w = jax.tree.map(jnp.add, w, residual)
+            step = jax.tree.map(lambda a, v: self.relaxation * (a - v), state.mv(w), vector)
+            w = jax.tree.map(jnp.add, w, step)
             size = _norm(w)
-            change = jnp.where(size > 0, _norm(residual) / jnp.where(size > 0, size, 1), 0)
+            change = jnp.where(size > 0, _norm(step) / jnp.where(size > 0, size, 1), 0)
             return w, change, count + 1
 
-        first = jax.tree.map(jnp.negative, vector)
+        first = jax.tree.map(lambda v: -self.relaxation * v, vector)
         begin = (first, jnp.full_like(_norm(first), jnp.inf), 0)
         solution, _, count = jax.lax.while_loop(unfinished, body, begin)
         return solution, lx.RESULTS.successful, {"num_steps": count, "max_steps": self.max_steps}

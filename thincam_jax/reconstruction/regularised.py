@@ -34,7 +34,7 @@ TauRule = Literal["discrepancy", "sure"]
 DEFAULT_TAU = 2.0
 
 # Penalties that go on changing make the objective jump: on the captures of tests/reconstruction/
-# test_acceleration.py ADMM then needs 1.4 to twice the iterations.
+# test_admm.py ADMM then needs 1.4 to twice the iterations.
 _BALANCED = 30
 # Of the iterations for a biased camera, those without its uniform light.
 _FIRST_PART = 0.4

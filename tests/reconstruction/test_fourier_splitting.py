@@ -1,15 +1,18 @@
-"""The linear step of ADMM against a dense system per frequency."""
+"""The splitting for convolutions: its linear step against dense systems, its parts by formulas."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from reconstruction import scenes
+from reconstruction.test_admm import case, iterate
 
 from helpers import finite_difference, relative_l2
 from thincam_jax.imaging.operators import CropConvolution
 from thincam_jax.imaging.operators.crop_convolution import kernel_shape
-from thincam_jax.reconstruction.admm import Penalties
-from thincam_jax.reconstruction.normal import NormalInverse, difference_symbol, mean_power
+from thincam_jax.reconstruction.admm import splitting_of
+from thincam_jax.reconstruction.fourier_splitting import NormalInverse, difference_symbol
+from thincam_jax.reconstruction.splitting import Penalties, consensus, rescaled
 
 RNG = np.random.default_rng(5)
 SENSOR, FIELD = (7, 9), (6, 11)
@@ -84,7 +87,7 @@ def test_mean_power_is_the_energy_of_the_kernel(window):
     kernel = RNG.uniform(size=(2, 3, *kernel_shape(SENSOR, FIELD)))
     operator = CropConvolution(jnp.asarray(kernel), 0.5, SENSOR, FIELD, summed=1, window=window)
     expected = np.mean(np.sum((kernel * 0.25) ** 2, axis=(-2, -1)))
-    assert float(mean_power(operator)) == pytest.approx(expected, rel=1e-12)
+    assert float(operator.mean_power()) == pytest.approx(expected, rel=1e-12)
 
 
 @pytest.mark.parametrize("planes", [1, 3])
@@ -115,3 +118,64 @@ def test_single_precision_and_gradients(planes):
         direction = tuple(jnp.asarray(float(i == index)) for i in range(2))
         difference = finite_difference(lambda x: size(*x), at, direction, 1e-4)
         np.testing.assert_allclose(slope, difference, rtol=1e-7, atol=1e-9)
+
+
+def test_a_state_stands_for_its_image():
+    """`start` and back; negative parts are cut only if that is asked."""
+    for nonnegative in (True, False):
+        problem, _ = scenes.problem(planes=2, channels=2, nonnegative=nonnegative)
+        splitting = splitting_of(problem)
+        image = jnp.asarray(np.random.default_rng(1).normal(size=problem.image_shape))
+        back = splitting.image(splitting.start(image))
+        expected = jnp.maximum(image, 0) if nonnegative else image
+        np.testing.assert_allclose(back, expected, atol=1e-13)
+
+
+def test_other_penalties_keep_image_and_forces():
+    """`rescaled`: z as before, μ(q − z), which are the forces, as before; the same fixed point."""
+    given = case("colour")
+    splitting = splitting_of(given.problem)
+    state = splitting.start(jnp.full(given.problem.image_shape, 0.4))
+    state = iterate(splitting, jnp.asarray(1.5), state, 20)
+    factors = Penalties(*(jnp.asarray(f) for f in (0.3, 2.5, 1.7)))
+    other = splitting.with_penalties(jax.tree.map(jnp.multiply, splitting.penalties, factors))
+    scaled = rescaled(splitting, state, factors)
+    z, still = consensus(splitting, state), consensus(other, scaled)
+    force = 0.0
+    for part, name in (("data", "data"), ("slopes", "variation"), ("image", "image")):
+        old, new = getattr(splitting.penalties, name), getattr(other.penalties, name)
+        sides = (getattr(s, part) for s in (state, z, scaled, still))
+        for q, a, r, b in zip(*(jax.tree.leaves(s) for s in sides), strict=True):
+            np.testing.assert_allclose(b, a, atol=1e-12)
+            np.testing.assert_allclose(new * (r - b), old * (q - a), atol=1e-12)
+            force = max(force, float(jnp.abs(q - a).max()))
+    assert force > 0.1
+    np.testing.assert_allclose(other.image(scaled), splitting.image(state), atol=1e-12)
+
+
+def test_the_reflection_minimises_each_part():
+    """z of the data: (w g + μ q)/(w + μ) on the sensor, q beside it; of the image: its field."""
+    given = case("one")
+    splitting = splitting_of(given.problem).with_penalties(penalties(0.7, 2.0, 3.0))
+    rng = np.random.default_rng(4)
+    state = splitting.start(jnp.zeros(given.problem.image_shape))
+    state = jax.tree.map(lambda q: jnp.asarray(rng.normal(size=q.shape)), state)
+    z = consensus(splitting, state)
+    operator = splitting.operators[0]
+    (top, left), (rows, columns) = operator.sensor_corner, operator.sensor_shape
+    inside = np.zeros(operator.window, bool)
+    inside[top : top + rows, left : left + columns] = True
+    q = np.asarray(state.data[0])[0]
+    w, g = np.asarray(splitting.weights[0])[0], np.asarray(splitting.captures[0])[0]
+    expected = q.copy()
+    expected[inside] = ((w * g + 0.7 * q[inside].reshape(g.shape)) / (w + 0.7)).ravel()
+    np.testing.assert_allclose(z.data[0][0], expected, rtol=1e-12, atol=1e-12)
+    field = np.zeros(operator.window, bool)
+    (top, left), (rows, columns) = operator.field_corner, operator.field_shape
+    field[top : top + rows, left : left + columns] = True
+    q = np.asarray(state.image)[0, 0]
+    np.testing.assert_allclose(z.image[0, 0], np.where(field, np.maximum(q, 0), 0), atol=1e-15)
+    # the last row's difference downwards leaves the field, and costs nothing
+    row = top + rows - 1
+    np.testing.assert_array_equal(z.slopes[0][0, 0, row], state.slopes[0][0, 0, row])
+    assert jnp.abs(z.slopes[0][0, 0, row - 1] - state.slopes[0][0, 0, row - 1]).max() > 1e-3
