@@ -33,7 +33,7 @@ ENTRY = ("__init__", "__main__")  # they stand above all rooms but the one outsi
 MOST_ENTRIES = 12
 MAX_LINES = 500
 
-JAXOPT_FILES = ("reconstruction/_jaxopt.py", "design/_jaxopt.py")
+JAXOPT_FILES = ("reconstruction/implicit_gradient.py", "design/_jaxopt.py")
 FRONT_END_LIBRARIES = ("matplotlib", "pydantic", "typer", "rich", "jinja2")
 FRONT_END = "commands"
 
@@ -253,7 +253,7 @@ BROKEN = [
     (modules_hidden_by_names, "lensless/__init__.py", "from .psf import psf", "psf hides the"),
     (modules_hidden_by_names, "lensless/__init__.py", "from ..units import masks", "masks hides"),
     (modules_hidden_by_names, "__init__.pyi", "from .lensless.psf import units", "units hides"),
-    (jaxopt_outside_its_files, "reconstruction/tv.py", "import jaxopt", "_jaxopt.py and design"),
+    (jaxopt_outside_its_files, "reconstruction/tv.py", "import jaxopt", "implicit_gradient.py and design"),
     (jaxopt_outside_its_files, "_jaxopt.py", "from jaxopt.projection import x", "imports jaxopt"),
     (front_end_libraries_in_the_core, "lensless/psf.py", "import matplotlib.pyplot", "matplotlib"),
     (front_end_libraries_in_the_core, "units.py", "from pydantic import BaseModel", "pydantic"),
@@ -274,7 +274,7 @@ SOUND = [
     ("lensless/masks/__init__.py", DOC + "from .fza import Plate as Plate"),
     ("lensless/masks/fza.py", DOC + "from ..._core import grids\nfrom . import _pattern"),
     ("lensless/psf.py", DOC + "import rich_text, jaxoptics\n" + "x = 1\n" * (MAX_LINES - 2)),
-    ("reconstruction/_jaxopt.py", "import jaxopt"),
+    ("reconstruction/implicit_gradient.py", DOC + "import jaxopt"),
     ("commands/figures.py", DOC + "import matplotlib.pyplot, jinja2\nfrom ..learn import x"),
     ("commands/rig/command.py", DOC + "def run():\n    from ...hardware import stage"),
     ("hardware/stage.py", DOC + "from thincam_jax.measured.read import x\nfrom .bus import y"),
