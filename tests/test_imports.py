@@ -9,7 +9,7 @@ import pytest
 import thincam_jax as tc
 from helpers import ROOT
 
-SLOW = ("jax", "matplotlib", "numpy", "scipy", "skimage", "yaml")
+SLOW = ("jax", "matplotlib", "numpy", "rich", "scipy", "skimage", "yaml")
 
 
 def imported_by(code: str) -> set[str]:

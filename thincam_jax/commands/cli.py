@@ -19,7 +19,8 @@ from thincam_jax.commands.study.command import run
 from thincam_jax.commands.sweep.command import sweep
 from thincam_jax.commands.terminal import INTERRUPTED
 
-app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False)
+# Help without colours and boxes, which take longer than all the rest of it.
+app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False, rich_markup_mode=None)
 bench = typer.Typer(no_args_is_help=True, help="Measure what the models of a study cost.")
 bench.command()(accuracy)
 for command in (init, run, reconstruct, sweep, design):
@@ -40,14 +41,16 @@ def _print_version(asked: bool) -> bool:
 def options(
     version: Annotated[
         bool,
-        typer.Option("--version", callback=_print_version, is_eager=True, help="Print it."),
+        typer.Option(
+            "--version", callback=_print_version, is_eager=True, help="Print the version."
+        ),
     ] = False,
     cache: Annotated[
         bool,
         typer.Option(
             "--cache/--no-cache",
             envvar="THINCAM_CACHE",
-            help="Keep compiled programs for the next run; thincam doctor shows where.",
+            help="Keep compiled programs for the next run.",
         ),
     ] = True,
 ) -> None:
@@ -58,7 +61,7 @@ def options(
 
 @app.command()
 def doctor() -> None:
-    """Print versions, devices, supported precisions and missing optional parts."""
+    """Print versions, devices and what is missing."""
     from thincam_jax.commands import doctor as doctoring
 
     found = doctoring.environment()

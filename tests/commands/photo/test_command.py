@@ -223,7 +223,10 @@ class TestExitCode2:
             (("--method", "magic"), "method = 'magic' is unknown; choose one of 'auto'"),
             (("--method", "wiener"), "method 'wiener' needs a model of the camera"),
             (("--method", "poisson"), "method 'poisson' needs raw counts"),
-            (("--method", "ridge", "--tau", 2), "method 'ridge' cannot use tau; leave it out, or use"),
+            (
+                ("--method", "ridge", "--tau", 2),
+                "method 'ridge' cannot use tau; leave it out",
+            ),
             (("--method", "ridge", "--coupling", "joint"), "method 'ridge' cannot use coupling"),
             (("--method", "ridge", "--ridge", 0), "ridge = 0.0 parts of one is not positive"),
             (("--ridge", 1), "method 'admm_tv' cannot use ridge; leave it out, or use 'ridge'"),

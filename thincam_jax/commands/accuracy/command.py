@@ -22,9 +22,9 @@ def accuracy(
     ] = None,
     set_: Overrides = None,
 ) -> None:
-    """Every model's error and time, and what an error of the PSF costs in PSNR.
+    """Measure every model's error and time.
 
-    Writes accuracy.json and accuracy.png.
+    And what an error of the PSF costs in PSNR. Writes accuracy.json and accuracy.png.
     """
     with told(lambda: "interrupted; nothing is kept."):
         import rich

@@ -15,10 +15,10 @@ def design(
     ] = None,
     set_: Overrides = None,
 ) -> None:
-    """Search for the best design and simulate it beside the design to beat.
+    """Search for the best design.
 
-    Writes design.json, found.yaml, figures and report.html. Ctrl-C keeps the targets that are
-    finished; the same command goes on from there.
+    Simulates it beside the design to beat; writes design.json, found.yaml, figures and report.html.
+    Ctrl-C keeps the targets that are finished; the same command goes on from there.
     """
     goes_on = "interrupted; the same command goes on with the targets that are not finished."
     with told(lambda: goes_on):

@@ -73,10 +73,10 @@ def reconstruct(
         str | None, Option(help="Of the PNG: grey-world, or gains as 1.8,1,1.4.")
     ] = None,
 ) -> None:
-    """Reconstruct a capture, or a folder of captures, with a measured PSF.
+    """Reconstruct captures with a measured PSF.
 
-    Writes the image, its linear values and a JSON record of all that was done. Ctrl-C keeps the
-    best image so far.
+    Takes one, or all of a folder. Writes the image, its linear values and a JSON record of all that
+    was done. Ctrl-C keeps the best image so far.
     """
     nothing = "interrupted; of the capture at work no image is there yet, nothing of it is kept"
     with told(lambda: nothing):

@@ -15,9 +15,10 @@ def run(
     ] = None,
     set_: Overrides = None,
 ) -> None:
-    """Run a study: captures, reconstructions, metrics.json, figures and report.html.
+    """Simulate a study and reconstruct it.
 
-    Ctrl-C keeps what is finished; the same command goes on from there.
+    Writes images, metrics.json, figures and report.html. Ctrl-C keeps what is finished; the same
+    command goes on from there.
     """
     folder, targets = None, ()
 

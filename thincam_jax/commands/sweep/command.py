@@ -35,10 +35,10 @@ def sweep(
     workers: Workers = None,
     set_: Overrides = None,
 ) -> None:
-    """Run a study at every point of a grid; writes results.parquet, a row for each point.
+    """Run a study at every point of a grid.
 
-    Points that fail are kept in failures.jsonl with the reason. However a sweep ends, the same
-    command goes on with the points that have no row.
+    Writes results.parquet, a row for each point. Points that fail are kept in failures.jsonl with
+    the reason. However a sweep ends, the same command goes on with the points that have no row.
     """
     ended = _Ended()
     with told(lambda: f"interrupted; {ended.told()}. The same command goes on from there."):
