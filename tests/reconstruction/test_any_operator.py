@@ -77,7 +77,8 @@ class Case:
         operator = operators()[name]
         rng = np.random.default_rng(8)
         rows, columns = operator.in_shape[-2:]
-        truth = jnp.asarray(scenes.blocks((rows, columns)) - 0.4)  # below zero in places: f ≥ 0 is active
+        # Below zero in places, so that f ≥ 0 matters.
+        truth = jnp.asarray(scenes.blocks((rows, columns)) - 0.4)
         leaves, structure = jax.tree.flatten(operator(truth))
         noise = [0.02 * float(jnp.std(leaf)) for leaf in leaves]
         noisy = [
@@ -91,7 +92,8 @@ class Case:
         self.problem = self.recording.problem(tau=TAU, regulariser=VARIATION)
         basis = jnp.eye(rows * columns).reshape(-1, rows, columns)
         seen = jax.tree.leaves(operator(basis))
-        parts = [(np.asarray(s).reshape(rows * columns, -1).T, v) for s, v in zip(seen, variances)]
+        matrices = [np.asarray(s).reshape(rows * columns, -1).T for s in seen]
+        parts = list(zip(matrices, variances, strict=True))
         self.gram = sum(a.T @ a / v for a, v in parts)
         flat = [np.asarray(g).ravel() for g in noisy]
         self.pulled = sum(a.T @ g / v for (a, v), g in zip(parts, flat, strict=True))
