@@ -313,6 +313,8 @@ def test_residuals_are_what_their_names_say():
     assert found.primal <= size(gap) / max(size(image), size(old)) * (1 + 1e-10)
     assert found.primal >= size(gap) / (size(image) ** 2 + size(old) ** 2) ** 0.5
     assert len(found.parts) == 3 and all(p > 0 and d > 0 for p, d in found.parts)
+    # what ends a fixed point: the move of the plain map, relative to the state
+    assert float(state.inside.change) == pytest.approx(size(gap) / size(before), rel=1e-10)
 
 
 def test_balance_moves_penalties_the_right_way():

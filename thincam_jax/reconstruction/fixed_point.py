@@ -97,7 +97,7 @@ def solve_fixed_point(
 
     **Arguments**
 
-    - `iterations`: at most; `tolerance`: on the relative residuals, see `Admm`.
+    - `iterations`: at most; `tolerance`: on the relative change of the state, see `Admm`.
     - `relaxation`: α of `thincam_jax.reconstruction.splitting`.
     - `adjoint`: the linear solver of the gradient, default `NeumannSeries()`.
     """
