@@ -21,11 +21,11 @@ import tifffile
 sys.path.insert(0, str(Path(__file__).parent))
 from scipy_admm import ScipyAdmm
 
-from thincam_jax.reconstruction import psf_problem
+from thincam_jax.reconstruction import Psfs, Recording
+from thincam_jax.reconstruction.admm import RELAXATION, AdmmMethod
 from thincam_jax.reconstruction.apart import Apart
-from thincam_jax.reconstruction.drive import CHUNK
+from thincam_jax.reconstruction.drive import CHUNK, _advance_donated
 from thincam_jax.reconstruction.regularised import admm_method
-from thincam_jax.reconstruction.tv_method import AdmmTotalVariation
 
 DATA = Path(__file__).parents[2] / "shared" / "data" / "diffusercam-hand"
 
@@ -55,7 +55,7 @@ def photograph():
     psf = np.fft.irfft2(speckle * smooth, s=(1024, 1024))
     psf = np.maximum(psf - psf.std(), 0).astype(np.float32)
     psf /= psf.sum()
-    problem = psf_problem(jnp.zeros((1, 3, 1024, 1024), jnp.float32), jnp.asarray(psf[None]))
+    problem = posed(np.zeros((1, 3, 1024, 1024), np.float32), psf[None])
     image = jnp.asarray(np.moveaxis(scene, -1, 0))[:, None]
     margins = [(n // 2 - 512, n - n // 2 - 512) for n in problem.field_shape]
     field = jnp.pad(image, [(0, 0), (0, 0), *margins])
@@ -64,18 +64,18 @@ def photograph():
     return noisy.astype(np.float32)[None], psf[None], 50
 
 
+def posed(captures, psfs):
+    """Captures (capture, channel, y, x) with measured PSFs, and τ = 2."""
+    return Recording(jnp.asarray(captures), Psfs(jnp.asarray(psfs))).problem(tau=2.0)
+
+
 def _frequencies(count):
     return np.fft.fftfreq(count), np.fft.rfftfreq(count)
 
 
-RELAXATION = 1.8
-
-
 def run(method, state, iterations):
     """As `drive` does between two looks."""
-    for size in [CHUNK] * (iterations // CHUNK) + [1] * (iterations % CHUNK):
-        state = method.advance(state, size)
-    return jax.block_until_ready(state)
+    return jax.block_until_ready(method.advance(state, iterations))
 
 
 def zeros(problem):
@@ -94,7 +94,7 @@ def median_time(function, rounds, *, warm_up=True):
 
 
 def scipy_of(method, penalties, relaxation):
-    splitting = method.splitting
+    splitting = method.arguments
     operator = splitting.operators[0]
     solver = ScipyAdmm(
         np.asarray(operator.spectrum[0, 0]) * float(splitting.gains[0]),
@@ -115,7 +115,7 @@ def restart(solver):
 
 def tutorial_penalties(method):
     """μ = 1e-6, 1e-5, 4e-5 for an operator with a mean square of 1/(samples of the window)."""
-    samples = np.prod(method.splitting.operators[0].window)
+    samples = np.prod(method.arguments.operators[0].window)
     return 1e-6, 1e-5 * samples, 4e-5 * samples
 
 
@@ -131,7 +131,7 @@ def iterations_to(method, problem, goal, most=400):
 
 def transforms_time(problem, rounds):
     """The FFTs of one iteration, each started by itself, so that all cores work on it."""
-    window = problem.window
+    window = problem.operators[0].window
     channels = problem.image_shape[-4]
     real = jnp.ones((channels, 1, *window), jnp.float32)
     forward = jax.jit(jnp.fft.rfft2)
@@ -149,11 +149,10 @@ def transforms_time(problem, rounds):
 @pytest.mark.benchmark(group="admm")
 def test_admm(benchmark, capsys, case):
     captures, psfs, count = case()
-    problem = psf_problem(jnp.asarray(captures), jnp.asarray(psfs), tau=2.0)
-    method = admm_method(problem, RELAXATION)
-    whole = AdmmTotalVariation(problem, relaxation=RELAXATION)
+    problem = posed(captures, psfs)
+    method, whole = admm_method(problem), AdmmMethod(problem)
     rounds = 5
-    own = [float(p) for p in jax.tree.leaves(whole.penalties)]
+    own = [float(p) for p in jax.tree.leaves(whole.arguments.penalties)]
     lines = []
     for name, penalties, relaxation in (
         ("tutorial's penalties", tutorial_penalties(whole), 1.0),
@@ -168,7 +167,7 @@ def test_admm(benchmark, capsys, case):
 
         # NumPy compiles nothing, and half a minute needs no second try.
         slow = median_time(theirs, rounds if case is hand else 1, warm_up=case is hand)
-        image = solver.image() * float(whole.splitting.image_unit)
+        image = solver.image() * float(whole.arguments.image_unit)
         goal = float(jnp.sum(method.objective(jnp.asarray(image)[:, None])))
         needed = iterations_to(method, problem, goal * (1 + 1e-6))
         assert needed is not None, f"never as good as SciPy with {name}"
@@ -192,18 +191,17 @@ def test_admm(benchmark, capsys, case):
         lines.append(batch_line(captures, psfs, one))
     benchmark.pedantic(lambda: run(method, method.start(zeros(problem)), CHUNK), rounds=3)
     with capsys.disabled():
-        print(f"\n{case.__name__}, window {problem.window}, {problem.image_shape[-4]} channels")
+        print(
+            f"\n{case.__name__}, window {problem.operators[0].window}, {problem.image_shape[-4]} channels"
+        )
         print("\n".join(lines))
 
 
 def memory_line(method):
     """What the compiled chunk allocates, against the arrays it must hold."""
-    from thincam_jax.reconstruction.tv_method import _advance
-
     state = method.start(zeros(method.problem))
-    lowered = _advance.lower(method.splitting, method.penalties, method.relaxation, state, CHUNK)
-    memory = lowered.compile().memory_analysis()
-    held = sum(x.nbytes for x in jax.tree.leaves((state, method.splitting)))
+    memory = _advance_donated.lower(method, state, CHUNK).compile().compiled.memory_analysis()
+    held = sum(x.nbytes for x in jax.tree.leaves((state, method.arguments)))
     peak = (
         memory.argument_size_in_bytes
         + memory.temp_size_in_bytes
@@ -219,10 +217,8 @@ def apart_line(whole, problem, one):
 
 
 def batch_line(captures, psfs, one):
-    eight = psf_problem(
-        jnp.asarray(np.repeat(captures[:, None], 8, axis=1)), jnp.asarray(psfs), tau=2.0
-    )
-    method = admm_method(eight, RELAXATION)
+    eight = posed(np.repeat(captures[:, None], 8, axis=1), psfs)
+    method = admm_method(eight)
     run(method, method.start(zeros(eight)), CHUNK)
     time_of_eight = median_time(lambda: run(method, method.start(zeros(eight)), 5 * CHUNK), 5) / (
         5 * CHUNK
