@@ -53,6 +53,18 @@ def captures(cameras, image, *, model="geometric", **where):
     return jnp.stack([tc.capture(c, view, model=model, pixel_integration=False) for c in cameras])
 
 
+def seen_by(cameras, **settings) -> tc.Cameras:
+    """Cameras in the light of `scene`, with the PSFs that `captures` is made with."""
+    usual = {
+        "wavelength": WAVELENGTH,
+        "object_distance": OBJECT_DISTANCE,
+        "field_shape": FIELD,
+        "model": "geometric",
+        "pixel_integration": False,
+    }
+    return tc.Cameras(cameras, **(usual | settings))
+
+
 def correlation(image, other) -> float:
     return float(np.corrcoef(np.ravel(image), np.ravel(other))[0, 1])
 

@@ -13,8 +13,9 @@ from thincam_jax.units import nm, um
 
 
 def scanning(cameras, **settings):
+    """The filter; neither light nor model of the cameras matters to it."""
     where = {"object_distance": rig.OBJECT_DISTANCE, "field_shape": rig.FIELD} | settings
-    return tc.FringeScanning(cameras, **where)
+    return tc.FringeScanning().prepare(tc.Cameras(cameras, **where))
 
 
 def test_the_scene_comes_back_upright_with_its_radiance():
@@ -124,15 +125,10 @@ def test_not_traced_again_for_other_captures_and_cameras(monkeypatch):
 def test_through_the_entry_point():
     cameras = rig.phases(beta=50.0)
     taken = rig.captures(cameras, rig.picture())
-    value = tc.reconstruct(
-        list(taken),
-        cameras,
-        method="fringe_scanning",
-        object_distance=rig.OBJECT_DISTANCE,
-        field_shape=rig.FIELD,
-    )
+    recording = tc.Recording(list(taken), rig.seen_by(cameras))
+    value = tc.reconstruct(recording, tc.FringeScanning())
     np.testing.assert_array_equal(value.image, scanning(cameras)(taken).image)
-    assert value.status == "ok"
+    assert value.status == "ok" and value.method == "fringe_scanning"
 
 
 def test_what_is_refused():

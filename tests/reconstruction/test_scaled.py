@@ -7,13 +7,13 @@ import pytest
 from reconstruction import scenes
 
 from thincam_jax.imaging.operators.base import adjoint_error
-from thincam_jax.reconstruction.problem import misfit
-from thincam_jax.reconstruction.scaled import Seen, gradient, scaled_problem, start_image
+from thincam_jax.reconstruction.problem import gradient, misfit, start_image
+from thincam_jax.reconstruction.scaled import ScaledProblem, Seen
 
 
 def test_the_largest_singular_value_is_just_below_one():
     problem, _ = scenes.problem((11, 9), (8, 7), weights=[0.3, 2.0])
-    scaled = scaled_problem(problem)
+    scaled = ScaledProblem(problem)
     inside = scaled.problem
     pixels = jnp.eye(56).reshape(56, 1, 1, 8, 7)
     columns = [
@@ -32,15 +32,15 @@ def test_the_largest_singular_value_is_just_below_one():
 
 def test_objectives_differ_by_a_factor_only_and_the_gradient_is_that_of_the_misfit():
     problem, truth = scenes.problem(channels=2, batch=(2,), tau=0.3)
-    scaled = scaled_problem(problem)
+    scaled = ScaledProblem(problem)
     inside = scaled.problem
     unit = scaled.image_unit
     ratios = []
     for image in (truth, 0.3 * truth + 0.1):
-        before = np.array([misfit(problem, image), problem.tau * problem.variation(image)])
+        before = np.array([misfit(problem, image), problem.absolute_tau * problem.regulariser(image)])
         small = image / unit
         ratios.append(
-            before / np.array([misfit(inside, small), inside.tau * inside.variation(small)])
+            before / np.array([misfit(inside, small), inside.absolute_tau * inside.regulariser(small)])
         )
     np.testing.assert_allclose(ratios, np.full_like(ratios, ratios[0][0, 0]), rtol=1e-9)
     wanted = jax.grad(lambda f: jnp.sum(misfit(inside, f)))(truth)
@@ -54,10 +54,10 @@ def test_all_that_is_seen_has_its_transpose():
 
 @pytest.mark.parametrize("factor", [1e-12, 1e-8, 1e8, 1e12])
 def test_no_unit_is_too_large_or_too_small_for_float32(factor):
-    plain = scaled_problem(scenes.single(scenes.problem()[0]))
-    other = scaled_problem(scenes.single(scenes.rescaled(scenes.problem()[0], factor)))
+    plain = ScaledProblem(scenes.single(scenes.problem()[0]))
+    other = ScaledProblem(scenes.single(scenes.rescaled(scenes.problem()[0], factor)))
     np.testing.assert_allclose(other.problem.captures[0], plain.problem.captures[0], rtol=1e-5)
-    np.testing.assert_allclose(other.problem.tau, plain.problem.tau, rtol=1e-5)
+    np.testing.assert_allclose(other.problem.absolute_tau, plain.problem.absolute_tau, rtol=1e-5)
     np.testing.assert_allclose(other.image_unit / factor, plain.image_unit, rtol=1e-5)
 
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from thincam_jax.reconstruction.sparsity import Cosines, Sparsity
+from thincam_jax.reconstruction.regularisers import Cosines, Sparsity
 from thincam_jax.reconstruction.wavelet import FILTERS, Wavelet
 
 SIZES = [(1, 1), (2, 7), (13, 16)]

@@ -13,7 +13,12 @@ from reconstruction import rig
 import thincam_jax as tc
 from helpers import count_traces, finite_difference, relative_l2
 from thincam_jax.imaging.operators import kernel_grid
-from thincam_jax.reconstruction import fringe_scanning, phase_pairs, separate
+from thincam_jax.reconstruction import (
+    WienerSynthesis,
+    fringe_scanning,
+    phase_pairs,
+    separate,
+)
 from thincam_jax.reconstruction import wiener as module
 from thincam_jax.reconstruction.registration import register
 from thincam_jax.units import nm, um
@@ -22,15 +27,8 @@ from thincam_jax.units import nm, um
 SMALL = (30, 33)
 
 
-def synthesis(cameras, matrix, **settings):
-    usual = {
-        "wavelength": rig.WAVELENGTH,
-        "object_distance": rig.OBJECT_DISTANCE,
-        "field_shape": rig.FIELD,
-        "model": "geometric",
-        "pixel_integration": False,
-    }
-    return tc.WienerSynthesis(cameras, synthesis=matrix, **(usual | settings))
+def synthesis(cameras, matrix, prior="inverse_square", **settings):
+    return WienerSynthesis(rig.seen_by(cameras, **settings), synthesis=matrix, prior=prior)
 
 
 def two_pairs(**settings):
