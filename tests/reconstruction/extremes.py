@@ -8,6 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from reconstruction import scenes
 
+import thincam_jax as tc
+
 
 def check_shapes(solve, **settings):
     """One and seven channels, planes, prime sizes; finite, right shape, something done."""
@@ -41,3 +43,23 @@ def check_scale(solve, rtol=2e-3):
         assert outcome.image.dtype == jnp.float32
         difference = np.asarray(outcome.image) / factor - np.asarray(plain)
         assert np.abs(difference).max() < rtol * float(jnp.abs(plain).max())
+
+
+def check_recordings(solver):
+    """Darkness, nothing trusted, a pixel of NaN; single precision stays."""
+    rng, shape = np.random.default_rng(4), (12, 13)
+    psfs = tc.Psfs(jnp.asarray(rng.uniform(size=(1, 5, 4))))
+    bright = jnp.asarray(rng.poisson(20.0, size=(1, *shape)).astype(float))
+    everywhere = jnp.ones(bright.shape, bool)
+    ended = ("converged", "iterations_exhausted")
+    for captures, valid in ((0 * bright, everywhere), (bright, ~everywhere), (bright, everywhere)):
+        found = tc.reconstruct(tc.Recording(captures, psfs, valid=valid), solver)
+        assert found.status in ended and found.image.shape == shape
+        assert bool(jnp.isfinite(found.image).all())
+    single = tc.Psfs(psfs.psfs.astype(jnp.float32))
+    found = tc.reconstruct(tc.Recording(bright.astype(jnp.float32), single), solver)
+    assert found.image.dtype == jnp.float32
+    broken = bright.at[0, 3, 4].set(jnp.nan)
+    assert tc.reconstruct(tc.Recording(broken, psfs), solver).status == "non_finite"
+    masked = tc.Recording(broken, psfs, valid=jnp.isfinite(broken))
+    assert tc.reconstruct(masked, solver).status in ended

@@ -9,6 +9,7 @@ import math
 import jax.numpy as jnp
 import jaxtyping
 import numpy as np
+import pytest
 
 import thincam_jax as tc
 from thincam_jax.units import nm, um
@@ -91,3 +92,10 @@ class unchecked:  # noqa: N801
 
     def __exit__(self, *_):
         jaxtyping.config.update("jaxtyping_disable", False)
+
+
+def refused(message, make, kind=ValueError):
+    """What is made raises, and one line says what is wrong."""
+    with unchecked(), pytest.raises(kind, match=message) as error:
+        make()
+    assert "\n" not in str(error.value)

@@ -37,10 +37,13 @@ def test_objectives_differ_by_a_factor_only_and_the_gradient_is_that_of_the_misf
     unit = scaled.image_unit
     ratios = []
     for image in (truth, 0.3 * truth + 0.1):
-        before = np.array([misfit(problem, image), problem.absolute_tau * problem.regulariser(image)])
+        before = np.array(
+            [misfit(problem, image), problem.absolute_tau * problem.regulariser(image)]
+        )
         small = image / unit
         ratios.append(
-            before / np.array([misfit(inside, small), inside.absolute_tau * inside.regulariser(small)])
+            before
+            / np.array([misfit(inside, small), inside.absolute_tau * inside.regulariser(small)])
         )
     np.testing.assert_allclose(ratios, np.full_like(ratios, ratios[0][0, 0]), rtol=1e-9)
     wanted = jax.grad(lambda f: jnp.sum(misfit(inside, f)))(truth)

@@ -42,7 +42,7 @@ class FringeFilter(eqx.Module):
     field_shape: tuple[int, int] = eqx.field(static=True)
 
     def __init__(self, cameras: Cameras):
-        cameras.require("fringe_scanning", "object_distance")
+        cameras.require("object_distance")
         beta, camera = _check_phases(cameras.cameras), cameras.cameras[0]
         sensor = camera.sensor.grid
         self.sensor_shape = sensor.shape

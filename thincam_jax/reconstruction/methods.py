@@ -12,7 +12,7 @@ from thincam_jax.reconstruction.drive import Callback
 from thincam_jax.reconstruction.fringe_filter import FringeScanning
 from thincam_jax.reconstruction.noise import estimate_variance, given_variances
 from thincam_jax.reconstruction.poisson import PoissonTV
-from thincam_jax.reconstruction.recording import Cameras, Recording
+from thincam_jax.reconstruction.recording import Cameras, Psfs, Recording
 from thincam_jax.reconstruction.registration import distance_ratios
 from thincam_jax.reconstruction.regularised import AdmmTV, Fista
 from thincam_jax.reconstruction.ridge import Ridge
@@ -59,7 +59,7 @@ def reconstruct(
     its `prepare` once. Under jit, grad or vmap use `solve_fixed_point`.
 
     **Errors**: ValueError and TypeError, one line, for captures that do not fit what has seen
-    them, and for a start or callback of a solver without iterations.
+    them, and for a start or callback of a solver that runs in one piece.
     """
     if not isinstance(recording, Recording):
         raise TypeError(
@@ -74,7 +74,7 @@ def reconstruct(
     elif not isinstance(solver, AbstractSolver):
         raise TypeError(f"solver is {solver!r}; give a solver, such as tc.AdmmTV(tau=2.0)")
     elif start is not None or callback is not None:
-        raise ValueError(f"{type(solver).__name__} has no iterations; leave out start and callback")
+        raise ValueError(f"{type(solver).__name__} runs in one piece; leave out start and callback")
     else:
         result = solver.solve(recording)
     return dataclasses.replace(result, reason=reason) if reason else result
@@ -96,7 +96,9 @@ def choose_solver(recording: Recording, synthesis=None) -> tuple[AbstractSolver,
 def _choice(recording: Recording, synthesis) -> tuple[str, str]:
     seen_by = recording.seen_by
     if not isinstance(seen_by, Cameras):
-        return "admm_tv", "PSFs were measured: light falls beside the sensor, which it models"
+        if isinstance(seen_by, Psfs):
+            return "admm_tv", "PSFs were measured: light falls beside the sensor, which it models"
+        return "admm_tv", "operators were given, and a filter is made of cameras"
     if recording.valid is not None:
         return "admm_tv", "some pixels are not to be trusted, which a filter cannot leave out"
     if np.ndim(seen_by.object_distance) > 0:

@@ -37,7 +37,7 @@ from thincam_jax.reconstruction.problem import (
 )
 from thincam_jax.reconstruction.recording import Cameras
 from thincam_jax.reconstruction.registration import distance_ratios
-from thincam_jax.reconstruction.regularised import DEFAULT_TAU, first_image
+from thincam_jax.reconstruction.regularised import DEFAULT_TAU, first_image, of_kind
 from thincam_jax.reconstruction.solver import AbstractIterativeSolver, check_limits
 from thincam_jax.reconstruction.total_variation import TotalVariation
 
@@ -83,6 +83,7 @@ class Counts(eqx.Module):
             raise ValueError(
                 f"{len(given)} backgrounds for {len(problem.captures)} captures; give one for each"
             )
+        of_kind("regulariser", problem.regulariser, TotalVariation)
         self.problem, self.link = counts_problem(problem), link
         self.background = tuple(jnp.asarray(b, dtype) for b in given)
         self.smoothing = checks.positive("smoothing", smoothing, "parts of the mean").astype(dtype)
@@ -140,7 +141,7 @@ class PoissonTV(AbstractIterativeSolver):
                 f"tau = {tau!r} is found for Gaussian noise only; give a number, about 1 to 3"
             )
         self.tau = checks.non_negative("tau", tau, "times the noise")
-        self.variation = TotalVariation() if variation is None else variation
+        self.variation = of_kind("variation", variation, TotalVariation)
         self.background = background
         check_limits(iterations, tolerance)
         self.iterations, self.tolerance = iterations, tolerance

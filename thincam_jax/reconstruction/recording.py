@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -15,12 +16,14 @@ from thincam_jax._core.grids import same_parity
 from thincam_jax.imaging.operators import (
     AbstractOperator,
     CropConvolution,
+    Masked,
+    Scaled,
     Stacked,
     kernel_grid,
     kernel_shape,
     window_shape,
 )
-from thincam_jax.imaging.operators.base import shapes_of
+from thincam_jax.imaging.operators.base import is_shape, shapes_of
 from thincam_jax.imaging.operators.crop_convolution import cut
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.psf import MODELS, Model, psf
@@ -89,14 +92,15 @@ class Cameras(eqx.Module):
         furthest = max(self.cameras, key=lambda c: float(c.distance))
         return furthest.sensor.pitch * jnp.asarray(self.object_distance) / furthest.distance
 
-    def require(self, method: str, *names: str) -> None:
-        """One line for what a method needs and was not told."""
-        missing = [f"{name} (mm)" for name in names if getattr(self, name) is None]
+    def require(self, *names: str) -> None:
+        """One line for what is needed and was not told."""
+        missing = [name for name in names if getattr(self, name) is None]
         if missing:
-            raise ValueError(f"method {method!r} needs {' and '.join(missing)} of the Cameras")
+            raise ValueError(f"the Cameras have no {' and no '.join(missing)}; give it in mm")
 
     def kernels(self, field: tuple[int, int], ratios) -> list[Float[Array, "1 plane k l"]]:
         """PSF of each camera and plane on the reference scale; enlarged by r, 1/r² as bright."""
+        self.require("wavelength", "object_distance")
         distances = np.atleast_1d(np.asarray(self.object_distance, dtype=object))
         wavelengths = jnp.broadcast_to(jnp.asarray(self.wavelength), (self.count,))
         kernels = []
@@ -176,25 +180,23 @@ class Recording(eqx.Module):
                 "a list of cameras does not say in which light; give tc.Cameras(cameras, "
                 "wavelength=…, object_distance=…)"
             )
-        if isinstance(seen_by, AbstractOperator) and not isinstance(seen_by, Stacked):
-            captures, valid = [captures], None if valid is None else [valid]
-            seen_by = Stacked([seen_by])
-        elif isinstance(seen_by, Sequence):
-            seen_by = Stacked(seen_by)
+        if isinstance(seen_by, AbstractOperator):
+            if is_shape(seen_by.out_shape):
+                captures, valid = [captures], None if valid is None else [valid]
+            seen_by = [seen_by]
+        if isinstance(seen_by, Sequence):
+            if not all(isinstance(one, AbstractOperator) for one in seen_by):
+                raise TypeError("seen_by holds something else than operators; give operators only")
+            seen_by = Stacked([part for one in seen_by for part in _apart(one)])
+            captures, valid = (_flat(parts) for parts in (captures, valid))
         if not isinstance(seen_by, Cameras | Psfs | Stacked):
             raise TypeError(
                 f"the captures were seen by a {type(seen_by).__name__}; give tc.Cameras(…), "
                 "tc.Psfs(…), or operators"
             )
         self.seen_by = seen_by
-        count = len(seen_by.operators) if isinstance(seen_by, Stacked) else seen_by.count
         self.captures = tuple(_floating(c) for c in captures)
-        if len(self.captures) != count or any(c.ndim < 2 for c in self._images()):
-            given = getattr(captures, "shape", [c.shape for c in self.captures])
-            raise ValueError(
-                f"captures have shape {given} for {count} cameras, PSFs or operators; give "
-                f"({count}, …, y, x)"
-            )
+        self._check_captures(getattr(captures, "shape", [c.shape for c in self.captures]))
         self.noise_variance = noise_variance
         self.valid = None if valid is None else self._masks(valid)
 
@@ -283,9 +285,20 @@ class Recording(eqx.Module):
             self.captures, focused, noise_variance=self.noise_variance, valid=self.valid
         )
 
-    def _images(self) -> list[Array]:
-        """The captures that must be images."""
-        return [] if isinstance(self.seen_by, Stacked) else list(self.captures)
+    def _check_captures(self, given) -> None:
+        """As many as were seen; what cameras and PSFs see are images of one shape."""
+        seen_by, shapes = self.seen_by, [c.shape for c in self.captures]
+        count = len(seen_by.operators) if isinstance(seen_by, Stacked) else seen_by.count
+        unlike = len(set(shapes)) > 1 or any(len(shape) < 2 for shape in shapes)
+        if len(shapes) != count or (unlike and not isinstance(seen_by, Stacked)):
+            raise ValueError(
+                f"captures have shape {given} for {count} cameras, PSFs or operators; give "
+                f"({count}, …, y, x)"
+            )
+        if isinstance(seen_by, Cameras):
+            sensor, pixels = seen_by.cameras[0].sensor.shape, shapes[0][-2:]
+            if pixels != sensor:
+                raise ValueError(f"captures have {pixels} pixels, the cameras' sensor {sensor}")
 
     def _detectors(self, shapes):
         return zip(shapes, self.seen_by.operators, strict=True)  # type: ignore[union-attr]
@@ -303,8 +316,9 @@ class Recording(eqx.Module):
         shapes = [c.shape for c in self.captures]
         if not isinstance(valid, tuple | list):
             valid = jnp.asarray(valid)
-            one_for_all = valid.ndim <= len(shapes[0])
-            valid = [valid] * len(shapes) if one_for_all else list(valid)
+            valid = list(valid) if valid.ndim > len(shapes[0]) else [valid]
+        if len(valid) == 1:
+            valid = [*valid] * len(shapes)
         try:
             pairs = zip(valid, shapes, strict=True)
             return tuple(jnp.broadcast_to(jnp.asarray(m, bool), s) for m, s in pairs)
@@ -428,6 +442,23 @@ def _floating(capture) -> Array:
     """Raw counts are taken as they are, but as real numbers."""
     capture = jnp.asarray(capture)
     return capture if jnp.issubdtype(capture.dtype, jnp.floating) else capture.astype(float)
+
+
+def _apart(operator: AbstractOperator) -> list[AbstractOperator]:
+    """Operators of one capture each in place of one of several, with its masks and gains."""
+    if isinstance(operator, Stacked):
+        return [part for one in operator.operators for part in _apart(one)]
+    if is_shape(operator.out_shape) or not isinstance(operator, Masked | Scaled):
+        return [operator]
+    given = operator.valid if isinstance(operator, Masked) else operator.gain
+    inside = _apart(operator.operator)
+    values = jax.tree.leaves(given) if isinstance(given, tuple) else [given] * len(inside)
+    return [type(operator)(one, value) for one, value in zip(inside, values, strict=True)]
+
+
+def _flat(parts):
+    """The arrays of a nested tuple; one array of several captures, or None, as it is."""
+    return jax.tree.leaves(parts) if isinstance(parts, tuple | list) else parts
 
 
 def _channels(operator: AbstractOperator) -> int:

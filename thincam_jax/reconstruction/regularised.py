@@ -143,7 +143,7 @@ class AdmmTV(AbstractRegularised):
         tolerance: float = 1e-4,
     ):
         self.tau = checked_tau(tau)
-        self.variation = _checked("variation", variation, TotalVariation)
+        self.variation = of_kind("variation", variation, TotalVariation)
         self.nonnegative, self.synthesis = nonnegative, as_synthesis(synthesis)
         check_limits(iterations, tolerance)
         self.iterations, self.tolerance = iterations, tolerance
@@ -230,7 +230,7 @@ class Fista(AbstractRegularised):
     ):
         self.tau = checked_tau(tau)
         kind = AbstractRegulariser if regulariser is not None else TotalVariation
-        self.regulariser = _checked("regulariser", regulariser, kind)
+        self.regulariser = of_kind("regulariser", regulariser, kind)
         if isinstance(self.tau, str) and not isinstance(self.regulariser, TotalVariation):
             raise ValueError(
                 f"tau = {tau!r} is found for total variation only; give a number, about 1 to 3"
@@ -296,7 +296,7 @@ def checked_tau(tau: Any) -> Any:
     return checks.non_negative("tau", tau, "times the noise")
 
 
-def _checked(name: str, value, kind: type):
+def of_kind(name: str, value, kind: type):
     """A value of the kind that is asked for; by default one as the kind makes it."""
     if value is None:
         return kind()

@@ -79,7 +79,7 @@ class WienerSynthesis(eqx.Module):
 
     def __init__(self, cameras: Cameras, *, synthesis=None, prior: Prior = "inverse_square"):
         checks.choice("prior", prior, ("inverse_square", "flat"))
-        cameras.require("wiener", "wavelength", "object_distance")
+        cameras.require("wavelength", "object_distance")
         each, count = cameras.cameras, cameras.count
         synthesis = separate(count) if synthesis is None else np.asarray(synthesis, dtype=float)
         capture_ratios = distance_ratios(each)

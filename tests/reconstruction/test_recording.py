@@ -1,4 +1,4 @@
-"""From captures to problems: registered, weighted, in units in which τ is about 1."""
+"""From what was seen to problems, registered and weighted, and from outcomes to results."""
 
 import math
 
@@ -11,23 +11,38 @@ from scipy import signal
 
 import thincam_jax as tc
 from helpers import relative_l2
-from thincam_jax.imaging.operators import CropConvolution, kernel_shape
-from thincam_jax.reconstruction.build import absolute_tau, camera_problem, object_pitch, psf_problem
-from thincam_jax.reconstruction.problem import residuals
+from thincam_jax.imaging.operators import (
+    CropConvolution,
+    Masked,
+    Matrix,
+    Scaled,
+    Separable,
+    Stacked,
+    kernel_shape,
+)
+from thincam_jax.reconstruction import InverseProblem
+from thincam_jax.reconstruction.drive import Outcome
+from thincam_jax.reconstruction.problem import residuals, total_objective
 
 SENSOR, FIELD = tc.Sensor((52, 61), rig.SENSOR.pitch), (28, 33)
-SETTINGS = {
-    "object_distance": rig.OBJECT_DISTANCE,
-    "wavelength": rig.WAVELENGTH,
-    "field_shape": FIELD,
-    "model": "geometric",
-    "pixel_integration": False,
-}
 RNG = np.random.default_rng(8)
 
 
 def cameras(count=2, **settings):
     return rig.phases(count, sensor=SENSOR, width=1.2, **settings)
+
+
+def camera_problem(captures, lenses, *, synthesis=None, noise_variance=None, valid=None, **light):
+    """The problem of captures by cameras in the light of `rig.scene`."""
+    seen_by = rig.seen_by(lenses, **({"field_shape": FIELD} | light))
+    recording = tc.Recording(captures, seen_by, noise_variance=noise_variance, valid=valid)
+    return recording.problem(synthesis=synthesis)
+
+
+def psf_problem(captures, psfs, *, field_shape=None, tau=2.0, **known):
+    """The problem of captures with measured PSFs."""
+    seen_by = tc.Psfs(psfs, field_shape=field_shape)
+    return tc.Recording(captures, seen_by, **known).problem(tau=tau)
 
 
 def projected(image) -> jax.Array:
@@ -48,7 +63,7 @@ def test_the_scene_explains_its_captures():
     """The image projected on the sensor through the operators is what `capture` says."""
     image = rig.picture(FIELD)
     seen = rig.captures(cameras(), image)
-    problem = camera_problem(seen, cameras(), **SETTINGS)
+    problem = camera_problem(seen, cameras())
     assert problem.field_shape == FIELD and len(problem.operators) == 2
     assert max(share(problem, projected(image))) < 1e-6
     assert min(share(problem, projected(image[::-1]))) > 0.02
@@ -60,7 +75,7 @@ def test_sums_of_captures_take_sums_of_kernels():
     rigs = cameras(4)
     seen = rig.captures(rigs, image)
     rows = np.array([[1.0, 0.0, -1.0, 0.0], [0.0, 2.0, 0.0, -2.0]])
-    problem = camera_problem(seen, rigs, synthesis=rows, noise_variance=[1.0, 2, 3, 4], **SETTINGS)
+    problem = camera_problem(seen, rigs, synthesis=rows, noise_variance=[1.0, 2, 3, 4])
     assert max(share(problem, projected(image))) < 1e-6
     np.testing.assert_allclose(problem.captures[1][0], 2 * (seen[1] - seen[3]), rtol=1e-12)
     for weight, variance in zip(problem.weights, (1 + 3, 4 * (2 + 4)), strict=True):
@@ -72,11 +87,11 @@ def test_two_distances_are_registered():
     image = rig.picture(FIELD)
     rigs = cameras(1, distance=3.0) + cameras(1, distance=2.4)
     seen = rig.captures(rigs, image)
-    problem = camera_problem(seen, rigs, **SETTINGS)
+    problem = camera_problem(seen, rigs)
     assert problem.captures[1].shape[-2:] == (66, 77)  # 52·1.25 = 65, 61·1.25 = 76.25
     assert share(problem, projected(image))[0] < 1e-6
     assert share(problem, projected(image))[1] < 0.01
-    trusted = np.asarray(problem.weights[1]) > 0
+    trusted = np.asarray(problem.weights[1])[0] > 0
     assert trusted[2:-2, 2:-2].all() and bool((problem.weights[0] > 0).all())
     # beyond the rim the capture is dark, the model is not
     value = residuals(problem, projected(image))[1] + problem.captures[1]
@@ -91,12 +106,12 @@ def test_an_invalid_pixel_taints_what_is_interpolated_from_it():
     valid = np.ones(seen.shape, bool)
     valid[1, 20, 30] = valid[0, 7, 9] = False
     bright = seen.at[1, 20, 30].add(1.0).at[0, 7, 9].add(1.0)
-    clean, spoilt = (camera_problem(s, rigs, valid=valid, **SETTINGS) for s in (seen, bright))
+    clean, spoilt = (camera_problem(s, rigs, valid=valid) for s in (seen, bright))
     for k in (0, 1):
         change = np.abs(np.asarray(spoilt.captures[k] - clean.captures[k]))
-        trusted = np.asarray(clean.weights[k])[None] > 0
+        trusted = np.asarray(clean.weights[k]) > 0
         assert change.max() > 0.5 and change[trusted].max() < 0.011
-    first = np.asarray(clean.weights[0])
+    first = np.asarray(clean.weights[0])[0]
     assert first[7, 9] == 0 and (first == 0).sum() == 1
 
 
@@ -107,7 +122,7 @@ def test_what_is_invalid_need_not_be_a_number():
     valid[0, 3, 4] = valid[1, 20, 21] = False
     broken = noisy.at[0, 3, 4].set(jnp.nan).at[1, 20, 21].set(jnp.inf)
     for problem in (
-        camera_problem(broken, cameras(), valid=valid, **SETTINGS),
+        camera_problem(broken, cameras(), valid=valid),
         psf_problem(broken, broken[:, 30:39, 30:41], valid=valid),
     ):
         for leaf in jax.tree.leaves(problem):
@@ -127,21 +142,22 @@ def test_planes_at_several_distances():
     seen = jnp.stack(
         [tc.capture(c, view, model="geometric", pixel_integration=False) for c in cameras()]
     )
-    problem = camera_problem(seen, cameras(), **(SETTINGS | {"object_distance": distances}))
+    problem = camera_problem(seen, cameras(), object_distance=distances)
     assert problem.image_shape == (1, 2, *FIELD)
     both = jnp.concatenate([projected(front), projected(back)], axis=1)
     assert max(share(problem, both)) < 1e-6
     assert min(share(problem, both[:, ::-1])) > 1e-3
     np.testing.assert_allclose(
-        object_pitch(cameras(), jnp.asarray(distances)), SENSOR.pitch * np.array(distances) / 3.0
+        rig.seen_by(cameras(), object_distance=jnp.asarray(distances)).pitch,
+        SENSOR.pitch * np.array(distances) / 3.0,
     )
 
 
 def test_the_field_takes_the_parity_of_the_sensor():
     seen = rig.captures(cameras(), rig.picture(FIELD))
-    problem = camera_problem(seen, cameras(), **(SETTINGS | {"field_shape": (27, 33)}))
+    problem = camera_problem(seen, cameras(), field_shape=(27, 33))
     assert problem.field_shape == (28, 33)
-    whole = camera_problem(seen, cameras(), **(SETTINGS | {"field_shape": None}))
+    whole = camera_problem(seen, cameras(), field_shape=None)
     assert whole.field_shape == SENSOR.shape
 
 
@@ -218,7 +234,9 @@ def test_tau_is_the_noise_of_the_back_projection():
     back = sum(o.adjoint(n / s**2) for o, n, s in zip(operators, noise, sizes, strict=True))
     middle = back[..., 6:-6, 6:-6]  # where the whole PSF falls on the sensor
     expected = math.sqrt(float(jnp.mean(middle**2)))
-    value = absolute_tau(jnp.asarray(1.0), operators, [s**2 for s in sizes])
+    weights = [1 / s**2 for s in sizes]
+    captures = [jnp.zeros((1, *shape)) for _ in sizes]
+    value = InverseProblem(operators, captures, weights=weights, tau=1.0).absolute_tau
     assert float(value) == pytest.approx(expected, rel=0.02)
 
 
@@ -229,7 +247,7 @@ def test_problems_scale_with_their_captures(factor):
     psfs = jnp.asarray(RNG.uniform(size=(2, 7, 6)), jnp.float32)
     one = psf_problem(jnp.asarray(seen), psfs)
     other = psf_problem(jnp.asarray(seen) * jnp.float32(factor), psfs)
-    np.testing.assert_allclose(other.tau, one.tau / factor, rtol=1e-5)
+    np.testing.assert_allclose(other.absolute_tau, one.absolute_tau / factor, rtol=1e-5)
     for a, b in zip(one.weights, other.weights, strict=True):
         assert b.dtype == jnp.float32
         np.testing.assert_allclose(b, a / factor**2, rtol=1e-5)
@@ -241,7 +259,7 @@ def test_captures_without_noise_scale_too():
     seen[0, 8:12, 9:14] = 3.0
     one, other = (psf_problem(jnp.asarray(f * seen), jnp.ones((1, 3, 3))) for f in (1.0, 1e-6))
     np.testing.assert_allclose(1 / one.weights[0], 1e-6 * np.mean(seen**2), rtol=1e-9)
-    np.testing.assert_allclose(other.tau, 1e6 * one.tau, rtol=1e-9)
+    np.testing.assert_allclose(other.absolute_tau, 1e6 * one.absolute_tau, rtol=1e-9)
     given = psf_problem(jnp.asarray(seen), jnp.ones((1, 3, 3)), noise_variance=0.0)
     np.testing.assert_allclose(given.weights[0], one.weights[0])
     dark = psf_problem(jnp.zeros((1, 20, 23)), jnp.ones((1, 3, 3)))
@@ -250,35 +268,160 @@ def test_captures_without_noise_scale_too():
 
 def test_single_precision_captures_make_single_precision_problems():
     seen = rig.captures(cameras(), rig.picture(FIELD))
-    double = camera_problem(seen, cameras(), noise_variance=1e-6, **SETTINGS)
-    single = camera_problem(seen.astype(jnp.float32), cameras(), noise_variance=1e-6, **SETTINGS)
-    assert single.tau.dtype == jnp.float32
+    double = camera_problem(seen, cameras(), noise_variance=1e-6)
+    single = camera_problem(seen.astype(jnp.float32), cameras(), noise_variance=1e-6)
+    assert single.absolute_tau.dtype == jnp.float32
     assert single.operators[0].spectrum.dtype == jnp.complex64
     value = np.asarray(single.operators[0].spectrum).astype(complex)
     assert relative_l2(value, double.operators[0].spectrum) < 1e-5
 
 
+@pytest.mark.parametrize("shape", [(), (61,), (52, 61), (1, 52, 61), (2, 52, 61), (2, 1, 52, 61)])
+def test_masks_of_any_shape_that_fits_say_the_same(shape):
+    """One for all captures or one for each; of a grey capture, or of each of its colours."""
+    colours = (1,) if len(shape) == 4 else ()
+    seen = jnp.asarray(RNG.uniform(size=(2, *colours, *SENSOR.shape)))
+    mask = np.ones(shape, bool)
+    if shape:
+        mask[..., 30] = False
+    problem = psf_problem(seen, jnp.ones((2, 4, 5)), valid=mask, noise_variance=0.5)
+    expected = np.ones((1, *SENSOR.shape))
+    expected[..., 30] = not shape
+    for weight in problem.weights:
+        np.testing.assert_allclose(weight, 2.0 * expected)
+
+
+def test_masks_of_single_captures():
+    """A list of them; they need not be of one shape."""
+    seen = jnp.asarray(RNG.uniform(size=(2, 3, *SENSOR.shape)))
+    dead = np.ones(SENSOR.shape, bool)
+    dead[7] = False
+    problem = psf_problem(seen, jnp.ones((2, 4, 5)), valid=[True, dead], noise_variance=1.0)
+    whole = np.ones((3, *SENSOR.shape))
+    np.testing.assert_array_equal(problem.weights[0], whole)
+    np.testing.assert_array_equal(problem.weights[1], whole * dead)
+
+
+def matrix(pixels, seed=3):
+    """A dense operator on images of 4×5 pixels."""
+    table = np.random.default_rng(seed).uniform(size=(pixels, 20))
+    return Matrix(jnp.asarray(table), (4, 5), (pixels,))
+
+
+def test_operators_with_captures_of_any_shape():
+    """Of one and of several; colours and batches keep their axes, and PSFs have no pitch."""
+    one, two = matrix(30), Separable(jnp.ones((6, 4)), jnp.ones((7, 5)))
+    for batch in ((), (3,), (2, 3)):
+        taken = [jnp.ones((*batch, 30)), jnp.ones((*batch, 6, 7))]
+        for captures, seen_by in (
+            (taken[0], one),
+            ([taken[0]], [one]),
+            (taken, [one, two]),
+            (taken, Stacked([one, two])),
+            ([taken[0], taken], [one, Stacked([one, two])]),
+        ):
+            recording = tc.Recording(captures, seen_by, noise_variance=1.0)
+            problem = recording.problem()
+            assert problem.image_shape == (*(batch or (1,)), 1, 4, 5)
+            image = jnp.asarray(RNG.uniform(size=problem.image_shape))
+            outcome = Outcome(image, "converged", (), 1, 0.0)
+            result = recording.reconstruction(problem, outcome, "admm_tv")
+            np.testing.assert_array_equal(result.image, image.reshape(*batch, 4, 5))
+            assert result.pitch is None
+
+
+def test_masks_and_gains_of_operators_are_those_of_the_recording():
+    """Before or around a stack, or said by the recording: one problem."""
+    operators, shapes = [matrix(30), matrix(12, seed=4)], [(30,), (12,)]
+    captures = [jnp.asarray(RNG.uniform(size=s)).at[3].set(jnp.nan) for s in shapes]
+    masks = [jnp.ones(s, bool).at[3].set(False) for s in shapes]
+    inside = [Masked(o, m) for o, m in zip(operators, masks, strict=True)]
+    problems = [
+        tc.Recording(captures, seen_by, noise_variance=[1.0, 4.0], valid=valid).problem()
+        for seen_by, valid in (
+            (operators, masks),
+            (inside, None),
+            (Stacked(inside), None),
+            (Masked(Stacked(operators), tuple(masks)), None),
+        )
+    ]
+    doubled = [2 * c for c in captures]
+    scaled = Scaled(Masked(Stacked(operators), tuple(masks)), 2.0)
+    problems.append(tc.Recording(doubled, scaled, noise_variance=[4.0, 16.0]).problem())
+    image = jnp.asarray(RNG.uniform(size=(1, 1, 4, 5)))
+    first = total_objective(image, problems[0])
+    assert bool(jnp.isfinite(first))
+    for other in problems[1:]:
+        assert float(total_objective(image, other)) == pytest.approx(float(first), rel=1e-12)
+
+
 def test_what_is_refused():
     seen = jnp.ones((2, *SENSOR.shape))
     for captures, psfs, settings, message in (
-        (seen, jnp.ones((3, 4, 5)), {}, r"PSFs have shape \(3, 4, 5\) for 2 captures; give"),
-        (seen, jnp.ones((4, 5)), {}, r"PSFs have shape \(4, 5\) for 2 captures; give"),
+        (seen, jnp.ones((3, 4, 5)), {}, r"shape \(2, 52, 61\) for 3 cameras, PSFs or operators; g"),
+        (seen, jnp.ones((4, 5)), {}, r"PSFs have shape \(4, 5\); give \(capture, k, l\), such as"),
         (seen, jnp.ones((2, 3, 4, 5)), {}, "1 channels and its PSF 3; give a PSF of 1 channel"),
+        (seen[:, 0, 0], jnp.ones((2, 4, 5)), {}, r"captures have shape \(2,\) for 2 cameras"),
+        (
+            [seen[0], seen[1, 2:]],
+            jnp.ones((2, 4, 5)),
+            {},
+            r"shape \[\(52, 61\), \(50, 61\)\] for 2",
+        ),
         (seen, jnp.ones((2, 4, 5)), {"tau": -1.0}, "tau = -1.0 .* is negative"),
         (seen, jnp.ones((2, 4, 5)), {"field_shape": (0, 4)}, "field_shape = .* at least 1"),
         (seen, jnp.ones((2, 4, 5)), {"noise_variance": [1.0] * 3}, "noise_variance has shape"),
+        (seen, jnp.ones((2, 4, 5)), {"noise_variance": -1.0}, "noise_variance = -1.0 is negative"),
+        (seen, jnp.ones((2, 4, 5)), {"valid": np.ones((3, 52, 61), bool)}, "valid has shapes"),
     ):
-        with rig.unchecked(), pytest.raises(ValueError, match=message):
-            psf_problem(captures, psfs, **settings)
+        rig.refused(message, lambda c=captures, p=psfs, s=settings: psf_problem(c, p, **s))
     # a field of one sample whose centre cannot be that of the PSF's samples
-    with pytest.raises(ValueError, match=r"kernel has shape \(5, 8\); its centre fits"):
-        psf_problem(jnp.ones((1, 12, 17)), jnp.ones((1, 5, 8)), field_shape=(1, 1))
-    with pytest.raises(ValueError, match=r"synthesis has shape \(1, 3\)"):
-        camera_problem(seen, cameras(), synthesis=np.ones((1, 3)), **SETTINGS)
+    small, psf = seen[:1, :12, :17], jnp.ones((1, 5, 8))
+    message = r"kernel has shape \(5, 8\); its centre fits"
+    rig.refused(message, lambda: psf_problem(small, psf, field_shape=(1, 1)))
+
+
+def test_what_cameras_refuse():
+    seen, two = jnp.ones((2, *SENSOR.shape)), cameras()
+    for captures, settings, message in (
+        (seen, {"synthesis": np.ones((1, 3))}, r"synthesis has shape \(1, 3\)"),
+        (seen[:, 3:], {}, r"captures have \(49, 61\) pixels, the cameras' sensor \(52, 61\)"),
+        (seen[:1], {}, r"captures have shape \(1, 52, 61\) for 2 cameras"),
+        (seen, {"wavelength": None}, "the Cameras have no wavelength; give it in mm"),
+        (seen, {"object_distance": None}, "the Cameras have no object_distance; give it in mm"),
+        (seen, {"model": "x"}, "model = 'x' is unknown; choose one of 'geometric', 'paraxial'"),
+    ):
+        rig.refused(message, lambda c=captures, s=settings: camera_problem(c, two, **s))
+    for value, message in (
+        (two[0], r"cameras is one camera; give a list, \[camera\]"),
+        ([two[0], 3], "cameras holds something else; give LenslessCameras, or use Psfs"),
+    ):
+        rig.refused(message, lambda v=value: tc.Cameras(v), TypeError)
+    rig.refused("cameras is empty; give one camera", lambda: tc.Cameras([]))
+
+
+def test_what_has_seen_the_captures_is_one_of_three():
+    seen = jnp.ones((2, *SENSOR.shape))
+    for value, message in (
+        (cameras(), r"does not say in which light; give tc.Cameras\(cameras, wavelength="),
+        (jnp.ones((2, 4, 5)), r"were seen by a ArrayImpl; give tc.Cameras\(…\), tc.Psfs\(…\), or"),
+        ([matrix(30), 3], "seen_by holds something else than operators"),
+    ):
+        rig.refused(message, lambda v=value: tc.Recording(seen, v), TypeError)
+    rig.refused("operators is empty", lambda: tc.Recording(seen, []))
+    one, two = [jnp.ones(30)], [matrix(30)] * 2
+    rig.refused(r"captures have shape \[\(30,\)\] for 2 c", lambda: tc.Recording(one, two))
+    vectors = tc.Recording(jnp.ones(30), matrix(30))
+    rig.refused("give noise_variance: captures that are no images", vectors.problem)
+    known = tc.Recording(jnp.ones(30), matrix(30), noise_variance=1.0)
+    psfs = tc.Recording(seen, tc.Psfs(jnp.ones((2, 4, 5))))
+    for recording in (known, psfs):
+        message = "a synthesis adds captures of known cameras; leave it out with"
+        rig.refused(message, lambda r=recording: r.problem(synthesis=np.eye(1)))
 
 
 def test_kernels_reach_over_every_difference():
     """A PSF on `kernel_grid`: nothing of the field is left out, nothing wraps round."""
-    problem = camera_problem(jnp.ones((2, *SENSOR.shape)), cameras(), **SETTINGS)
+    problem = camera_problem(jnp.ones((2, *SENSOR.shape)), cameras())
     rows, columns = kernel_shape(SENSOR.shape, FIELD)
-    assert problem.window[0] >= rows and problem.window[1] >= columns
+    assert problem.operators[0].window[0] >= rows and problem.operators[0].window[1] >= columns
