@@ -8,17 +8,15 @@ import numpy as np
 import pytest
 
 from helpers import count_traces
-from thincam_jax.reconstruction.regulariser import no_dual, prox
-from thincam_jax.reconstruction.sparsity import Cosines, Sparsity
+from thincam_jax.reconstruction.regularisers import Cosines, Sparsity, denoise, no_dual, prox
 from thincam_jax.reconstruction.total_variation import TotalVariation
-from thincam_jax.reconstruction.tv_prox import VariationRegulariser, tv_prox
 from thincam_jax.reconstruction.wavelet import Wavelet
 
 RNG = np.random.default_rng(4)
 REGULARISERS = [
-    VariationRegulariser(TotalVariation()),
-    VariationRegulariser(TotalVariation("anisotropic", depth_weight=0.7)),
-    VariationRegulariser(TotalVariation(coupling="opponent", depth_weight=0.3)),
+    TotalVariation(),
+    TotalVariation("anisotropic", depth_weight=0.7),
+    TotalVariation(coupling="opponent", depth_weight=0.3),
     Sparsity(Wavelet("daubechies4", 2)),
     Sparsity(Cosines()),
 ]
@@ -95,29 +93,29 @@ def test_cutting_off_the_negative_part_afterwards_is_no_proximal_map():
 def test_tv_of_a_line_of_two_pixels_in_closed_form():
     """½|x − v|² + s|x₁ − x₀|: both move by s towards their mean, which they do not cross."""
     v = jnp.array([1.0, 4.0]).reshape(1, 1, 1, 2)
-    found = [tv_prox(v, s, TotalVariation(), iterations=300).ravel() for s in (0.5, 5.0)]
+    found = [denoise(v, s, TotalVariation(), iterations=300).ravel() for s in (0.5, 5.0)]
     np.testing.assert_allclose(found, [[1.5, 3.5], [2.5, 2.5]], atol=1e-9)
-    signed = tv_prox(v - 3, 0.5, TotalVariation(), nonnegative=True, iterations=300).ravel()
+    signed = denoise(v - 3, 0.5, TotalVariation(), nonnegative=True, iterations=300).ravel()
     np.testing.assert_allclose(signed, [0.0, 0.5], atol=1e-9)
 
 
 def test_tv_keeps_the_mean_of_every_channel_and_a_single_pixel():
     v = image((2, 3, 1, 7, 11))
-    x = tv_prox(v, 0.4, TotalVariation())
+    x = denoise(v, 0.4, TotalVariation())
     np.testing.assert_allclose(x.mean((-2, -1)), v.mean((-2, -1)), atol=1e-12)
     pixel = jnp.array([[[[-2.0]]]])
-    np.testing.assert_allclose(tv_prox(pixel, 0.4, TotalVariation()), pixel)
-    np.testing.assert_allclose(tv_prox(pixel, 0.4, TotalVariation(), nonnegative=True), 0)
+    np.testing.assert_allclose(denoise(pixel, 0.4, TotalVariation()), pixel)
+    np.testing.assert_allclose(denoise(pixel, 0.4, TotalVariation(), nonnegative=True), 0)
 
 
 def test_it_scales_with_the_image_in_float32_and_is_compiled_once():
     v = image().astype(jnp.float32)
-    plain = tv_prox(v, 0.3, TotalVariation())
+    plain = denoise(v, 0.3, TotalVariation())
     for factor in (1e-8, 1e8):
-        scaled = tv_prox(v * jnp.float32(factor), 0.3 * factor, TotalVariation())
+        scaled = denoise(v * jnp.float32(factor), 0.3 * factor, TotalVariation())
         np.testing.assert_allclose(scaled / jnp.float32(factor), plain, atol=2e-5)
 
-    counted = count_traces(lambda image, step: tv_prox(image, step, TotalVariation()))
+    counted = count_traces(lambda image, step: denoise(image, step, TotalVariation()))
     compiled = jax.jit(counted)
     compiled(v, jnp.float32(0.1)), compiled(v, jnp.float32(0.2))
     assert counted.traces == 1

@@ -1,0 +1,210 @@
+"""FISTA: the minimum, restart, optimistix, derivatives, extremes."""
+
+import functools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix
+import pytest
+from reconstruction import extremes, scenes
+
+from helpers import relative_l2
+from thincam_jax.reconstruction import drive as module
+from thincam_jax.reconstruction.admm import AdmmMethod
+from thincam_jax.reconstruction.drive import drive
+from thincam_jax.reconstruction.fista import (
+    AcceleratedProximalGradient,
+    FistaMethod,
+    RegulariserMap,
+    solve_fista,
+)
+from thincam_jax.reconstruction.problem import objective, total_misfit, total_objective
+from thincam_jax.reconstruction.regularisers import Cosines, Sparsity
+from thincam_jax.reconstruction.scaled import ScaledProblem
+from thincam_jax.reconstruction.wavelet import Wavelet
+
+few = functools.partial(solve_fista, iterations=10)
+
+
+def zeros(problem):
+    return jnp.zeros(problem.image_shape, problem.captures[0].dtype)
+
+
+@pytest.mark.thorough
+def test_it_finds_the_minimum_that_admm_finds():
+    problem, truth = scenes.problem(kernel=scenes.spots, tau=3e-3)
+    admm = drive(
+        AdmmMethod(problem),
+        zeros(problem),
+        iterations=1500,
+        tolerance=1e-9,
+        adapt_until=200,
+    )
+    lowest = min(p.objective for p in admm.history)
+    found = solve_fista(problem, iterations=400, tolerance=1e-7, inner=30)
+    assert found.status == "converged"
+    assert abs(found.history[-1].objective / lowest - 1) < 1e-5
+    assert relative_l2(found.image, admm.image) < 3e-3
+    assert relative_l2(found.image, truth) < 0.6 * relative_l2(zeros(problem) + truth.mean(), truth)
+
+
+def test_the_minimum_in_closed_form_of_one_pixel_that_is_seen_by_itself():
+    """With H = h and no variation, f = max(0, g/h)."""
+    problem, _ = scenes.problem((1, 1), (1, 1), captures=1)
+    for capture in (0.7, -0.7):
+        own = eqx.tree_at(lambda p: p.captures, problem, (jnp.full((1, 1, 1), capture),))
+        gain = problem.operators[0](jnp.ones((1, 1, 1, 1)))
+        found = solve_fista(own, iterations=200, tolerance=1e-12)
+        np.testing.assert_allclose(found.image.ravel(), max(0, capture / gain.item()), rtol=1e-6)
+
+
+def without_restart(problem, iterations):
+    """Objectives at every tenth iteration of FISTA as published in 2009, step by step."""
+    method = FistaMethod(problem)
+    proximal, scaled = method.solver.proximal, method.scaled
+
+    @jax.jit
+    def step(x, lead, t, kept):
+        new, kept = proximal(lead - jax.grad(total_misfit)(lead, scaled.problem), kept)
+        later = (1 + jnp.sqrt(1 + 4 * t**2)) / 2
+        return new, new + (t - 1) / later * (new - x), later, kept
+
+    state = zeros(problem), zeros(problem), jnp.asarray(1.0), proximal.start(zeros(problem))
+    values = []
+    for done in range(1, iterations + 1):
+        state = step(*state)
+        if done % 10 == 0:
+            values.append(float(total_objective(state[0] * scaled.image_unit, problem)))
+    return values
+
+
+def test_restart_reaches_in_70_iterations_what_takes_more_than_140_without():
+    problem, _ = scenes.problem(
+        kernel=scenes.spots, nonnegative=False, regulariser=Sparsity(Wavelet("haar", 2))
+    )
+    run = solve_fista(problem, image=zeros(problem), iterations=70, tolerance=0.0)
+    plain = without_restart(problem, 350)
+    # The same method but for the restart, and the same minimum.
+    assert run.history[1].objective == pytest.approx(plain[0], rel=1e-9)
+    goal = min(plain) * (1 + 1e-12)
+    assert run.history[-1].objective <= goal
+    assert min(plain[:14]) > goal
+
+
+@pytest.mark.parametrize("nonnegative", [False, True])
+@pytest.mark.parametrize("basis", [Cosines(), Wavelet("haar", 2)], ids=["cosines", "haar"])
+@pytest.mark.thorough
+def test_no_image_beside_a_sparse_minimum_is_better(basis, nonnegative):
+    regulariser = Sparsity(basis)
+    problem, _ = scenes.problem(
+        kernel=scenes.spots, tau=3e-2, nonnegative=nonnegative, regulariser=regulariser
+    )
+    found = solve_fista(problem, iterations=400, tolerance=1e-8, inner=30).image
+    energy = jax.jit(objective)
+    lowest = energy(problem, found)
+    rng = np.random.default_rng(5)
+    for size in (1e-4, 1e-3, 1e-2):
+        for _ in range(10):
+            other = found + size * jnp.asarray(rng.normal(size=found.shape))
+            other = jnp.maximum(other, 0) if nonnegative else other
+            assert energy(problem, other) > lowest
+    assert not nonnegative or float(found.min()) >= 0
+    (details,) = regulariser.analyse(found)
+    if not nonnegative:
+        assert 0.2 < float(jnp.mean(details == 0)) or float(jnp.mean(jnp.abs(details) < 1e-9)) > 0.2
+
+
+def test_optimistix_in_one_loop_gives_the_image_of_steps_from_outside():
+    problem, _ = scenes.problem(kernel=scenes.spots, tau=3e-3)
+    own = solve_fista(problem, image=zeros(problem), iterations=60, tolerance=0.0)
+    method = FistaMethod(problem)
+    loop = optimistix.minimise(
+        total_misfit,
+        method.solver,
+        zeros(problem),
+        args=method.arguments,
+        max_steps=60,
+        throw=False,
+    )
+    assert int(loop.stats["num_steps"]) == 60 and own.status == "iterations_exhausted"
+    np.testing.assert_allclose(method.image_of(loop.value), own.image, atol=1e-10)
+    solver = AcceleratedProximalGradient(method.solver.proximal, 1e-4)
+    ended = optimistix.minimise(total_misfit, solver, zeros(problem), args=method.arguments)
+    assert solve_fista(problem, image=zeros(problem), tolerance=1e-4).status == "converged"
+    near = method.image_of(ended.value)
+    assert relative_l2(near, own.image) < 0.1
+
+
+@pytest.mark.thorough
+def test_optimistix_drives_the_minimiser_and_differentiates_through_it():
+    """dE*/dτ = R(f*), the envelope theorem, by the derivative of the solution."""
+    regulariser = Sparsity(Wavelet("haar", 2))
+    problem, _ = scenes.problem(
+        *((9, 8), (6, 7)),
+        kernel=scenes.spots,
+        captures=1,
+        nonnegative=False,
+        regulariser=regulariser,
+    )
+    inside = ScaledProblem(problem).problem
+
+    def lowest(tau):
+        found = optimistix.minimise(
+            total_misfit,
+            AcceleratedProximalGradient(RegulariserMap(regulariser, tau, False), 1e-9),
+            zeros(problem),
+            args=inside,
+            max_steps=256,
+            throw=False,
+            adjoint=optimistix.RecursiveCheckpointAdjoint(),
+        ).value
+        return total_misfit(found, inside) + tau * regulariser(found)[()], found
+
+    (_, found), slope = jax.value_and_grad(lowest, has_aux=True)(jnp.asarray(3e-3))
+    np.testing.assert_allclose(slope, regulariser(found), rtol=1e-5)
+
+
+def compilations():
+    """Of the programs that `drive` runs of any method."""
+    programs = (module._start, module._advance, module._image)
+    return [program._cached._cache_size() for program in programs]
+
+
+def test_new_values_are_not_compiled_anew():
+    problem, _ = scenes.problem()
+    few(problem)
+    before = compilations()
+    few(scenes.rescaled(problem, 3.0), tolerance=1e-3)
+    assert compilations() == before
+
+
+@pytest.mark.thorough
+def test_it_stands_extremes():
+    extremes.check_darkness(few)
+    extremes.check_scale(few)
+    extremes.check_shapes(few)
+
+
+def test_progress_is_told_and_a_callback_can_stop():
+    problem, _ = scenes.problem()
+    seen = []
+
+    def stop(progress):
+        seen.append(progress)
+        return progress.iteration >= 20
+
+    outcome = solve_fista(problem, callback=stop, iterations=100)
+    assert outcome.status == "stopped" and outcome.iterations == 20
+    assert [p.iteration for p in seen] == [10, 20]
+    assert seen[1].objective < seen[0].objective
+
+
+def test_a_capture_with_nan_has_a_status():
+    problem, _ = scenes.problem()
+    broken = (problem.captures[0].at[0, 0, 0].set(jnp.nan), problem.captures[1])
+    broken = eqx.tree_at(lambda p: p.captures, problem, broken)
+    outcome = few(broken, image=zeros(problem))
+    assert outcome.status == "non_finite"
+    assert bool(jnp.isfinite(outcome.image).all())
