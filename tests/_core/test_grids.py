@@ -5,7 +5,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from thincam_jax._core.grids import Grid, fast_shape, same_parity
+from thincam_jax._core.grids import (
+    Grid,
+    block_mean,
+    block_sum,
+    central_blocks,
+    fast_shape,
+    same_parity,
+)
 
 SHAPES = [(1, 1), (1, 6), (5, 1), (4, 7)]
 
@@ -65,3 +72,28 @@ def test_impossible_pitch(pitch):
 def test_pitch_that_is_no_number():
     with pytest.raises(TypeError, match="pitch = '5.5 um' is not a real number; give it in mm"):
         Grid((2, 3), "5.5 um")
+
+
+class TestBlocks:
+    @pytest.mark.parametrize("of", [np.asarray, jnp.asarray])
+    def test_sums_and_means_block_by_block(self, of):
+        image = np.random.default_rng(7).normal(size=(2, 6, 9))
+        expected = np.zeros((2, 2, 3))
+        for c, y, x in np.ndindex(expected.shape):
+            expected[c, y, x] = image[c, 3 * y : 3 * y + 3, 3 * x : 3 * x + 3].sum()
+        np.testing.assert_allclose(block_sum(of(image), 3), expected, rtol=1e-13, atol=1e-14)
+        np.testing.assert_allclose(block_mean(of(image), 3), expected / 9, rtol=1e-13, atol=1e-14)
+        np.testing.assert_array_equal(
+            block_sum(of(image > 0), 3)[0, 0, 0], (image > 0)[0, :3, :3].sum()
+        )
+
+    def test_in_double_precision_nothing_is_lost_to_summation(self):
+        image = np.full((1, 512, 1024), 0.1, np.float32)
+        image[..., ::2] = 1e-4
+        exact = np.mean([np.float64(np.float32(0.1)), np.float64(np.float32(1e-4))]) * 512**2
+        np.testing.assert_allclose(block_sum(image, 512, np.float64), exact, rtol=1e-12)
+
+    def test_the_crop_is_central(self):
+        assert central_blocks((12, 15), 4) == (slice(0, 12), slice(1, 13))
+        assert central_blocks((11, 7), 4) == (slice(1, 9), slice(1, 5))
+        assert central_blocks((11, 7), 1) == (slice(0, 11), slice(0, 7))

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from thincam_jax.measured.clean import centre_psf, clean
+from thincam_jax.measured.preparation import centre_psf, clean
 
 
 def test_each_channel_is_cut_at_its_own_level():

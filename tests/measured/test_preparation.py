@@ -160,6 +160,18 @@ def test_dead_pixels_are_left_out_of_means():
     assert found.psf[0, 2, 5] in [found.psf[0, *p] for p in ((1, 5), (3, 5), (2, 4), (2, 6))]
 
 
+def test_means_over_a_random_map_of_dead_pixels():
+    capture = measured(seed=12)
+    dead = np.random.default_rng(8).random(capture.shape) > 0.5
+    options = Preparation(downsample=3, capture_scale="none")
+    found = prepare(Raw(measured(), 12), Raw(capture, 12), 0, options, dead=dead)
+    assert found.valid.all()
+    for y, x in np.ndindex(ROWS // 3, COLUMNS // 3):
+        block = np.s_[3 * y : 3 * y + 3, 3 * x : 3 * x + 3]
+        mean = capture[block][~dead[block]].mean() / 4095
+        np.testing.assert_allclose(found.capture[0, y, x], mean, rtol=1e-6)
+
+
 def test_odd_sides_are_cropped_centrally():
     psf, capture = measured(shape=(27, 38)), measured(shape=(27, 38), seed=12)
     options = Preparation(downsample=4, capture_scale="none")

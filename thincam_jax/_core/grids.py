@@ -1,5 +1,7 @@
 """Sampling grids: where the samples of a plane lie, and their spatial frequencies."""
 
+from typing import Any
+
 import equinox as eqx
 import jax.numpy as jnp
 import scipy
@@ -84,3 +86,26 @@ def cell_overlap(
     above = jnp.minimum(x + pitch / 2, upper)
     below = jnp.maximum(x - pitch / 2, lower)
     return jnp.maximum(above - below, 0.0)
+
+
+def central_blocks(shape: tuple[int, int], size: int) -> tuple[slice, slice]:
+    """The central part of a (y, x) image whose sides are multiples of `size`."""
+    starts = [(n % size) // 2 for n in shape]
+    rows, columns = (slice(s, s + n - n % size) for s, n in zip(starts, shape, strict=True))
+    return rows, columns
+
+
+def block_sum(image: Any, size: int, dtype: Any = None) -> Any:
+    """Sums over size × size blocks of the last two axes, whose lengths are multiples of `size`.
+
+    For NumPy and JAX. `dtype`: of the sums, by default the one of `sum`. Rows first, which leaves
+    little for the slower sum along them.
+    """
+    *batch, rows, columns = image.shape
+    tall = image.reshape(*batch, rows // size, size, columns).sum(axis=-2, dtype=dtype)
+    return tall.reshape(*batch, rows // size, columns // size, size).sum(axis=-1, dtype=dtype)
+
+
+def block_mean(image: Any, size: int) -> Any:
+    """Means over size × size blocks; see `block_sum`."""
+    return block_sum(image, size) / size**2

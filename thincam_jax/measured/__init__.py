@@ -2,15 +2,15 @@
 
 from thincam_jax.measured.bayer import demosaic as demosaic
 from thincam_jax.measured.bayer import demosaic_mask as demosaic_mask
-from thincam_jax.measured.display import to_display as to_display
-from thincam_jax.measured.folder import list_captures as list_captures
 from thincam_jax.measured.options import Preparation as Preparation
 from thincam_jax.measured.preparation import Prepared as Prepared
 from thincam_jax.measured.preparation import prepare as prepare
 from thincam_jax.measured.raw import CaptureFileError as CaptureFileError
 from thincam_jax.measured.raw import MeasurementError as MeasurementError
 from thincam_jax.measured.raw import Raw as Raw
+from thincam_jax.measured.read import list_captures as list_captures
 from thincam_jax.measured.read import read_image as read_image
 from thincam_jax.measured.read import read_mask as read_mask
 from thincam_jax.measured.write import log_text as log_text
+from thincam_jax.measured.write import to_display as to_display
 from thincam_jax.measured.write import write_image as write_image

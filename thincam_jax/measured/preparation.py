@@ -1,18 +1,17 @@
 """From the files of a measured PSF and a capture to what a reconstruction takes."""
 
 import dataclasses
+import math
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
 import scipy
-from jaxtyping import Bool, Float32
+from jaxtyping import Bool, Float, Float32
 
+from thincam_jax._core.grids import block_sum, central_blocks
 from thincam_jax.measured.bayer import demosaic, demosaic_mask
-from thincam_jax.measured.blocks import block_any, block_mean, crop_to_blocks
-from thincam_jax.measured.clean import centre_psf, clean
-from thincam_jax.measured.match import check_match
-from thincam_jax.measured.options import Preparation
+from thincam_jax.measured.options import Centre, Preparation, check_match
 from thincam_jax.measured.raw import MeasurementError, Raw
 
 Background = Raw | float | int | Literal["corner"]
@@ -37,7 +36,7 @@ class Prepared:
 
 @dataclass(frozen=True, eq=False)
 class _Frame:
-    """An image on its way, in parts of full scale."""
+    """An image between two steps, in parts of full scale."""
 
     values: np.ndarray  # (channel, y, x) float32
     saturated: np.ndarray  # bool
@@ -88,47 +87,33 @@ def prepare(
     }
     raws = {"psf": psf, "capture": capture}
     check_match(psf, capture, backgrounds, dead, options)
-    log: dict[str, Any] = {"options": dataclasses.asdict(options), "order": []}
-    record = _Recorder(log)
-    record("full_scale", {name: _facts(raw) for name, raw in raws.items()})
+    log: dict[str, Any] = {"full_scale": {name: _facts(raw) for name, raw in raws.items()}}
     planes = {name: _in_full_scale(raw) for name, raw in raws.items()}
     saturated = {name: _saturated(raw, planes[name], options) for name, raw in raws.items()}
     corner = _corner(planes["psf"], options)
     levels = {n: _level(b, raws[n], corner) for n, b in backgrounds.items()}
     noise = _noise(planes["psf"] - levels["psf"], options)
-    record("background", {n: _told(b, levels[n]) for n, b in backgrounds.items()})
+    log["background"] = {n: _background_facts(b, levels[n]) for n, b in backgrounds.items()}
     planes = {n: planes[n] - levels[n] for n in planes}
-    record("clipping", {n: int(np.count_nonzero(p < 0)) for n, p in planes.items()})
+    log["clipping"] = {n: int(np.count_nonzero(p < 0)) for n, p in planes.items()}
     known = ~(np.zeros(capture.pixels.shape[:2], bool) if dead is None else dead)
     frames = {
         n: _Frame(np.maximum(p, 0), saturated[n], np.broadcast_to(known, p.shape))
         for n, p in planes.items()
     }
-    record("validity", {n: _counts(f, raws[n]) for n, f in frames.items()})
+    log["validity"] = {n: _counts(f, raws[n]) for n, f in frames.items()}
     if options.bayer is not None:
         frames = {n: _demosaiced(f, options) for n, f in frames.items()}
     how = options.demosaicing if options.bayer else None
-    record("demosaicing", {"pattern": options.bayer, "method": how})
-    crop = crop_to_blocks(frames["psf"].values.shape[1:], options.downsample)
-    frames = {n: _downsampled(f, crop, options.downsample) for n, f in frames.items()}
-    record("downsampling", _crop_told(crop, options.downsample, frames["psf"]))
-    light = _prepared_psf(_filled(frames["psf"], "PSF"), noise, options, record)
+    log["demosaicing"] = {"pattern": options.bayer, "method": how}
+    frames = _downsampled(frames, options.downsample, log)
+    light = _prepared_psf(_filled(frames["psf"], "PSF"), noise, options, log)
     image = _filled(frames["capture"], "capture")
-    light, image = _scaled(light, image, options, record)
+    light, image = _scaled(light, image, options, log)
     valid = frames["capture"].known & ~frames["capture"].saturated
-    log["validity"]["valid_share"] = float(valid.mean())
+    log["validity"] = {**log["validity"], "valid_share": float(valid.mean())}
+    log |= {"order": list(log), "options": dataclasses.asdict(options)}
     return Prepared(light, image, valid, log)
-
-
-class _Recorder:
-    """Writes a step into the log."""
-
-    def __init__(self, log: dict[str, Any]):
-        self.log = log
-
-    def __call__(self, step: str, facts: dict[str, Any]) -> None:
-        self.log["order"].append(step)
-        self.log[step] = facts
 
 
 def _facts(raw: Raw) -> dict[str, Any]:
@@ -190,7 +175,7 @@ def _level(background: Background, raw: Raw, corner: np.ndarray) -> np.ndarray:
     return np.full((1, 1, 1), background / raw.full_scale, np.float32)
 
 
-def _told(background: Background, level: np.ndarray) -> dict[str, Any]:
+def _background_facts(background: Background, level: np.ndarray) -> dict[str, Any]:
     kind = background if isinstance(background, str) else "number"
     if isinstance(background, Raw):
         kind = f"dark frame {background.name}"
@@ -217,27 +202,38 @@ def _demosaiced(frame: _Frame, options: Preparation) -> _Frame:
     return _Frame(*(np.moveaxis(plane, -1, 0) for plane in (colours, saturated, has)))
 
 
-def _downsampled(frame: _Frame, crop: tuple[slice, slice], factor: int) -> _Frame:
-    values, saturated, known = (
-        plane[:, *crop] for plane in (frame.values, frame.saturated, frame.known)
-    )
-    if factor == 1:
-        return _Frame(values, saturated, known)
-    means = block_mean(values, factor, None if known.all() else known)
-    return _Frame(means, block_any(saturated, factor), block_any(known, factor))
-
-
-def _crop_told(crop: tuple[slice, slice], factor: int, frame: _Frame) -> dict[str, Any]:
-    return {
+def _downsampled(frames: dict[str, _Frame], factor: int, log: dict[str, Any]) -> dict[str, _Frame]:
+    """Means of blocks. A mean is what one pixel of that size would have measured."""
+    shape = frames["psf"].values.shape[1:]
+    if factor > min(shape):
+        raise MeasurementError(
+            f"downsample = {factor} is larger than the image of {shape[0]}×{shape[1]} pixels"
+        )
+    kept = central_blocks(shape, factor)
+    if factor > 1:
+        frames = {name: _means(frame, kept, factor) for name, frame in frames.items()}
+    log["downsampling"] = {
         "factor": factor,
-        "first_pixel": [part.start for part in crop],
-        "cropped_to": [part.stop - part.start for part in crop],
-        "shape": list(frame.values.shape[1:]),
+        "first_pixel": [part.start for part in kept],
+        "cropped_to": [part.stop - part.start for part in kept],
+        "shape": list(frames["psf"].values.shape[1:]),
     }
+    return frames
+
+
+def _means(frame: _Frame, kept: tuple[slice, slice], factor: int) -> _Frame:
+    """Means of the known pixels of each block, summed in float64; 0 where none is known."""
+    values, saturated, known = (
+        plane[:, *kept] for plane in (frame.values, frame.saturated, frame.known)
+    )
+    total = block_sum(np.where(known, values, 0), factor, np.float64)
+    count = block_sum(known, factor)
+    means = np.divide(total, count, out=np.zeros_like(total), where=count > 0)
+    return _Frame(means.astype(values.dtype), block_sum(saturated, factor) > 0, count > 0)
 
 
 def _filled(frame: _Frame, name: str) -> np.ndarray:
-    """Values nobody measured, from the nearest that somebody did."""
+    """The image with each unknown value replaced by the nearest known one."""
     if frame.known.all():
         return frame.values
     if not frame.known.any(axis=(1, 2)).all():
@@ -254,24 +250,23 @@ def _filled(frame: _Frame, name: str) -> np.ndarray:
 
 
 def _prepared_psf(
-    psf: np.ndarray, noise: np.ndarray, options: Preparation, record: _Recorder
+    psf: np.ndarray, noise: np.ndarray, options: Preparation, log: dict[str, Any]
 ) -> np.ndarray:
     """Cleaned, centred and averaged as asked for."""
     psf, cleaned = clean(psf, noise, options.threshold, options.noise_threshold)
-    record("clean_up", {**cleaned, "noise": noise.tolist()})
-    centred = {"by": None, "shift": [0, 0]}
+    log["clean_up"] = {**cleaned, "noise": noise.tolist()}
+    log["centring"] = {"by": None, "shift": [0, 0]}
     if options.centre is not None:
-        psf, centred = centre_psf(psf, options.centre)
-    record("centring", centred)
+        psf, log["centring"] = centre_psf(psf, options.centre)
     before = psf.shape[0]
     if options.psf_channels == "mean":
         psf = psf.mean(axis=0, keepdims=True, dtype=np.float64).astype(np.float32)
-    record("channels", {"psf": options.psf_channels, "before": before, "after": psf.shape[0]})
+    log["channels"] = {"psf": options.psf_channels, "before": before, "after": psf.shape[0]}
     return psf
 
 
 def _scaled(
-    psf: np.ndarray, capture: np.ndarray, options: Preparation, record: _Recorder
+    psf: np.ndarray, capture: np.ndarray, options: Preparation, log: dict[str, Any]
 ) -> tuple[np.ndarray, np.ndarray]:
     sums = psf.sum(axis=(1, 2), dtype=np.float64)
     if not (sums > 0).all():
@@ -291,6 +286,74 @@ def _scaled(
         raise MeasurementError(
             "the capture is black once the background is subtracted; give a lower background"
         )
-    record("scaling", {"psf_divisor": sums.tolist(), "capture_divisor": divisor})
+    log["scaling"] = {"psf_divisor": sums.tolist(), "capture_divisor": divisor}
     scaled = psf / sums[:, None, None], precise / divisor
     return scaled[0].astype(np.float32), scaled[1].astype(np.float32)
+
+
+def clean(
+    psf: Float[np.ndarray, "channel y x"],
+    noise: Float[np.ndarray, "#channel"],
+    threshold: float | int | None = None,
+    noise_threshold: float | int | None = None,
+) -> tuple[Float[np.ndarray, "channel y x"], dict[str, Any]]:
+    """The PSF with its small values set to zero, and a record of what that removed.
+
+    Below `threshold` parts of each channel's maximum or `noise_threshold` times its `noise`,
+    whichever is larger. Noise left in a PSF acts as a haze over the reconstruction; but what is
+    removed of the PSF's own faint light is missing too.
+    """
+    levels = np.zeros(psf.shape[0])
+    if threshold is not None:
+        levels = np.maximum(levels, threshold * psf.max(axis=(1, 2)))
+    if noise_threshold is not None:
+        levels = np.maximum(levels, noise_threshold * noise)
+    small = psf < levels[:, None, None]
+    kept = np.where(small, psf.dtype.type(0), psf)
+    light = float(psf.sum(dtype=np.float64))
+    return kept, {
+        "threshold": threshold,
+        "noise_threshold": noise_threshold,
+        "level": levels.tolist(),
+        "zeroed": int(np.count_nonzero(small & (psf > 0))),
+        "light_removed": 1 - float(kept.sum(dtype=np.float64)) / light if light > 0 else 0.0,
+    }
+
+
+def centre_psf(
+    psf: Float[np.ndarray, "channel y x"], by: Centre
+) -> tuple[Float[np.ndarray, "channel y x"], dict[str, Any]]:
+    """The PSF shifted by whole pixels to the middle of its array, and a record of the shift.
+
+    `by` is one of "centroid", "peak", "symmetry" (see `Preparation.centre`), of the sum of the
+    channels; all are shifted alike. What leaves the array is lost, what enters is 0.
+    """
+    found = _centre(psf.sum(axis=0, dtype=np.float64), by)
+    sides = zip(psf.shape[1:], found, strict=True)
+    # Rounded up at a half, so that a single bright pixel comes to n//2, the origin of a DFT.
+    rows, columns = (math.floor((n - 1) / 2 - c + 0.5) for n, c in sides)
+    moved = scipy.ndimage.shift(psf, (0, rows, columns), order=0)
+    light = float(psf.sum(dtype=np.float64))
+    return moved, {
+        "by": by,
+        "found": [float(c) for c in found],
+        "shift": [rows, columns],
+        "light_lost": 1 - float(moved.sum(dtype=np.float64)) / light if light > 0 else 0.0,
+    }
+
+
+def _centre(image: np.ndarray, by: Centre) -> tuple[float, float]:
+    """Row and column, in pixels from the first, maybe between two."""
+    if by == "centroid":
+        total = image.sum()
+        if not total > 0:
+            return (image.shape[0] - 1) / 2, (image.shape[1] - 1) / 2
+        row = image.sum(axis=1) @ np.arange(image.shape[0]) / total
+        column = image.sum(axis=0) @ np.arange(image.shape[1]) / total
+        return float(row), float(column)
+    scores, scale = image, 1
+    if by == "symmetry":
+        # Σ p(c + r) p(c − r) is largest for the centre c that maps the image best onto itself.
+        scores, scale = scipy.signal.fftconvolve(image, image), 2
+    row, column = np.unravel_index(np.argmax(scores), scores.shape)
+    return int(row) / scale, int(column) / scale

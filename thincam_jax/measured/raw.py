@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 
 import numpy as np
+from jaxtyping import ArrayLike, Float64
 
 MAX_CHANNELS = 4
 
@@ -121,3 +122,28 @@ def _check_range(name: str, pixels: np.ndarray, bits: int) -> None:
                 else "give the bit depth of the file"
             )
         )
+
+
+def image_with_contrast(
+    name: str, image: ArrayLike, shape: tuple[int, ...] | None = None, of: str = ""
+) -> Float64[np.ndarray, "y x"]:
+    """A finite image that is not constant, in double precision.
+
+    `shape`: the one it must have, that of `of`; None for any (y, x).
+
+    **Errors**: MeasurementError, one line.
+    """
+    image = np.asarray(image)
+    if image.dtype.kind not in "fiu" or image.ndim != 2 or shape not in (None, image.shape):
+        wanted = "an image (y, x)" if shape is None else f"the {shape} pixels of {of}"
+        raise MeasurementError(
+            f"{name} has shape {image.shape} and type {image.dtype}; give real numbers on {wanted}"
+        )
+    image = image.astype(np.float64)
+    bad = int(np.count_nonzero(~np.isfinite(image)))
+    if bad:
+        raise MeasurementError(f"{name} has {bad} pixels that are not finite; replace them first")
+    if image.size == 0 or np.ptp(image) <= 1e-12 * np.abs(image).max():
+        level = f"{image.flat[0]:g} in every pixel" if image.size else "empty"
+        raise MeasurementError(f"{name} is {level}: give one that shows something")
+    return image

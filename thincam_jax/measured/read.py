@@ -1,16 +1,25 @@
 """Image files: TIFF, PNG and NPY, told apart by their first bytes and not by their names."""
 
+import contextlib
 import io
+import logging
 import os
+import re
+import struct
 import warnings
+from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
 
+import imagecodecs
 import numpy as np
+import tifffile
+from jaxtyping import Bool
 
-from thincam_jax.measured._png import read_png
-from thincam_jax.measured._tiff import read_tiff
+from thincam_jax._core.memory import refuse_if_too_large
 from thincam_jax.measured.raw import CaptureFileError, MeasurementError, Raw
 
+SUFFIXES = (".tif", ".tiff", ".png", ".npy")
 _STARTS = {
     b"\x89PNG\r\n\x1a\n": "png",
     b"\x93NUMPY": "npy",
@@ -19,6 +28,18 @@ _STARTS = {
     b"II+\0": "tiff",  # BigTIFF: more than 4 GB
     b"MM\0+": "tiff",
 }
+# Pixels are announced in at most so many times the bytes of the file: LZW, the densest of the usual
+# compressions, needs a byte for some 2500 of a black image. Beyond it is a decompression bomb.
+_DENSEST = 4000
+# Read as they are: no palette, no inverted scale, no colour difference.
+_PLAIN = (
+    tifffile.PHOTOMETRIC.MINISBLACK,
+    tifffile.PHOTOMETRIC.RGB,
+    tifffile.PHOTOMETRIC.CFA,
+    tifffile.PHOTOMETRIC.LINEAR_RAW,
+)
+_PNG_CHANNELS = {0: 1, 2: 3, 4: 2, 6: 4}  # by colour type
+_PNG_END = b"\0\0\0\0IEND\xaeB`\x82"
 
 
 def read_image(path: str | os.PathLike[str], bits: int | None = None) -> Raw:
@@ -38,7 +59,7 @@ def read_image(path: str | os.PathLike[str], bits: int | None = None) -> Raw:
         raise CaptureFileError(str(error)) from None
 
 
-def read_mask(path: str | os.PathLike[str]) -> np.ndarray:
+def read_mask(path: str | os.PathLike[str]) -> Bool[np.ndarray, "y x"]:
     """A map (y, x) of pixels from a one-channel image file, True where it is not zero.
 
     As for a sensor's dead pixels. An NPY file may hold bool.
@@ -54,6 +75,52 @@ def read_mask(path: str | os.PathLike[str]) -> np.ndarray:
     return pixels != 0
 
 
+def list_captures(folder: str | os.PathLike[str], bits: int | None = None) -> list[Path]:
+    """The image files of a folder, by name, with numbers in the order of their values.
+
+    Every one is read, with `bits` as in `read_image`, so that a long computation does not stop at a
+    damaged one.
+
+    **Errors**: CaptureFileError, one line, for no such folder, no images in it, a file that cannot
+    be read, or an image of another shape than most.
+    """
+    shapes = {path: read_image(path, bits).pixels.shape for path in image_files(folder)}
+    common, _ = Counter(shapes.values()).most_common(1)[0]
+    for path, shape in shapes.items():
+        if shape != common:
+            same = next(p for p, s in shapes.items() if s == common)
+            raise CaptureFileError(
+                f"{path}: has shape {shape}, others, as {same.name}, have {common}; captures of "
+                "one folder must be of one shape: take it out"
+            )
+    return list(shapes)
+
+
+def image_files(folder: str | os.PathLike[str]) -> list[Path]:
+    """The files of a folder with `SUFFIXES`, unread, capture_9 before capture_10; no hidden ones.
+
+    **Errors**: CaptureFileError, one line, for no such folder or no such files.
+    """
+    try:
+        entries = list(Path(folder).iterdir())
+    except OSError as error:
+        raise CaptureFileError(
+            f"{folder}: cannot be read as a folder ({error.strerror}); give a folder of captures"
+        ) from None
+    paths = [p for p in entries if p.suffix.lower() in SUFFIXES and not p.name.startswith(".")]
+    paths = [p for p in paths if not p.is_dir()]
+    if not paths:
+        raise CaptureFileError(
+            f"{folder}: holds no capture; give a folder of {', '.join(SUFFIXES)} files"
+        )
+    return sorted(paths, key=_order)
+
+
+def _order(path: Path) -> tuple[list[tuple[int, str]], str]:
+    parts = re.split(r"([0-9]+)", path.name)
+    return [(int(p), "") if p.isdecimal() else (-1, p) for p in parts], path.name
+
+
 def _decode(path: Path) -> tuple[np.ndarray, str, int | None]:
     """Pixels, format and, where the file tells it, bits a sample."""
     data = _bytes(path)
@@ -62,10 +129,9 @@ def _decode(path: Path) -> tuple[np.ndarray, str, int | None]:
         short = not data or any(start.startswith(data) for start in _STARTS)
         what = "is empty or cut short" if short else "is not an image that can be read"
         raise CaptureFileError(f"{path}: {what}; give an undamaged TIFF, PNG or NPY file")
-    readers = {"png": read_png, "tiff": read_tiff, "npy": _read_npy}
+    readers = {"png": _read_png, "tiff": _read_tiff, "npy": _read_npy}
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of the decoders; what is wrong is told below
+        with _silence():
             pixels, bits = readers[kind](data)
     except CaptureFileError as error:
         raise CaptureFileError(f"{path}: {error}") from None
@@ -89,6 +155,15 @@ def _bytes(path: Path) -> bytes:
         raise CaptureFileError(f"{path}: cannot be read ({error.strerror or error})") from None
 
 
+def _refuse_bomb(announced: int, held: int) -> None:
+    """Refuse, before there is room for them, more bytes of pixels than a file can hold."""
+    if announced > _DENSEST * held:
+        raise CaptureFileError(
+            f"announces {announced} bytes of pixels, more than its {held} can hold: it is damaged"
+        )
+    refuse_if_too_large("its image", announced, "give a smaller one")
+
+
 def _read_npy(data: bytes) -> tuple[np.ndarray, None]:
     stream = io.BytesIO(data)
     version = np.lib.format.read_magic(stream)
@@ -109,3 +184,95 @@ def _read_npy(data: bytes) -> tuple[np.ndarray, None]:
         )
     stream.seek(0)
     return np.load(stream, allow_pickle=False), None
+
+
+def _read_png(data: bytes) -> tuple[np.ndarray, int]:
+    """Pixels (y, x) or (y, x, channel) and bits a sample, checksums checked."""
+    columns, rows, depth, colour = struct.unpack_from(">IIBB", data, 16)
+    if colour not in _PNG_CHANNELS:
+        raise CaptureFileError("stores a palette, no counts; save it as grey or RGB")
+    if depth < 8:
+        raise CaptureFileError(f"has {depth} bit a sample; 8 to 16 are read")
+    if b"acTL" in data[: data.find(b"IDAT")]:
+        raise CaptureFileError("is animated; give one image a file")
+    if _PNG_END not in data:
+        raise CaptureFileError("is cut short: the PNG's last chunks are missing")
+    _refuse_bomb(rows * columns * _PNG_CHANNELS[colour] * depth // 8, len(data))
+    pixels = imagecodecs.png_decode(data)
+    return _without_alpha(pixels, pixels.ndim == 3 and pixels.shape[2] in (2, 4)), depth
+
+
+def _read_tiff(data: bytes) -> tuple[np.ndarray, int | None]:
+    """Pixels (y, x) or (y, x, channel) and bits a sample; no bits for floats."""
+    with tifffile.TiffFile(io.BytesIO(data)) as file:
+        page = _only_page(file)
+        if page.photometric not in _PLAIN:
+            name = getattr(page.photometric, "name", page.photometric)
+            raise CaptureFileError(f"stores colours as {name}, no counts; save it as grey or RGB")
+        if page.axes not in ("YX", "YXS", "SYX"):
+            raise CaptureFileError(
+                f"has axes {page.axes}; give one image (y, x) or (y, x, channel)"
+            )
+        if page.size == 0:
+            raise CaptureFileError("is empty: its image has no pixels")
+        _check_whole(page, len(data))
+        pixels = page.asarray()
+        bits = page.bitspersample
+        if page.axes == "SYX":
+            pixels = np.moveaxis(pixels, 0, -1)
+        alpha = bool(page.extrasamples) and page.extrasamples[-1] in (1, 2)
+    pixels = _without_alpha(pixels, alpha and pixels.ndim == 3 and pixels.dtype.kind == "u")
+    is_count = pixels.dtype.kind == "u" and isinstance(bits, int)
+    return pixels, bits if is_count and 8 <= bits <= 16 else None
+
+
+def _only_page(file: tifffile.TiffFile) -> tifffile.TiffPage:
+    """The file's one image; previews of lower resolution do not count."""
+    pages = [page.aspage() for page in file.pages]
+    whole = [page for page in pages if not page.is_reduced] or pages[:1]
+    if not whole:
+        raise CaptureFileError("is cut short: the TIFF holds no image")
+    if len(whole) > 1:
+        shapes = {page.shape for page in whole}
+        what = " of different sizes" if len(shapes) > 1 else ""
+        raise CaptureFileError(f"holds {len(whole)} images{what}; give one image a file")
+    return whole[0]
+
+
+def _check_whole(page: tifffile.TiffPage, size: int) -> None:
+    """Refuse strips that lie behind the file's end, or are missing: they would read as zeros."""
+    strips = list(zip(page.dataoffsets, page.databytecounts, strict=True))
+    if not strips or any(count == 0 or offset + count > size for offset, count in strips):
+        raise CaptureFileError("is cut short: a part of the TIFF's pixels is missing")
+    _refuse_bomb(page.nbytes, size)
+    plain = page.compression == tifffile.COMPRESSION.NONE
+    if plain and isinstance(page.bitspersample, int):
+        needed = (page.size * page.bitspersample) // 8
+        if sum(count for _, count in strips) < needed:
+            raise CaptureFileError("is damaged: the TIFF has fewer pixels than it announces")
+
+
+def _without_alpha(pixels: np.ndarray, has_alpha: bool) -> np.ndarray:
+    """The channels before the last one, if that is an alpha channel that hides nothing."""
+    if not has_alpha:
+        return pixels
+    if (pixels[..., -1] != np.iinfo(pixels.dtype).max).any():
+        raise CaptureFileError("has transparent pixels, as no capture has; save it without alpha")
+    opaque = pixels[..., :-1]
+    return opaque[..., 0] if opaque.shape[-1] == 1 else opaque
+
+
+@contextlib.contextmanager
+def _silence() -> Iterator[None]:
+    """Without the decoders' remarks on standard error: what is wrong is told by the error."""
+    loggers = [logging.getLogger(name) for name in ("tifffile", "imagecodecs")]
+    before = [logger.disabled for logger in loggers]
+    for logger in loggers:
+        logger.disabled = True
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        for logger, disabled in zip(loggers, before, strict=True):
+            logger.disabled = disabled

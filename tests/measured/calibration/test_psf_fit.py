@@ -122,7 +122,7 @@ def test_new_values_do_not_compile_again():
 def test_residuals_follow_a_direct_sum():
     """The residual against background + gain·h of the camera that the steps describe."""
     names = problem.unknown_names(("beta", "centre", "distance", "object_distance", "gain"))
-    start = problem.Setting(TRUE, *map(jnp.asarray, (500 * nm, 0.01, 0.2, 3.0)))
+    start = problem.FitState(TRUE, *map(jnp.asarray, (500 * nm, 0.01, 0.2, 3.0)))
     steps = jnp.asarray([0.01, 0.5, -1.0, 0.02, 0.001, 0.1])
     there = start.moved(names, steps)
     d = 3.0 * math.exp(0.02)

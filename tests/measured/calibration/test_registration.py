@@ -1,9 +1,12 @@
 """Registration against scenes that are drawn, in closed form, at another scale and place."""
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from thincam_jax.measured.calibration import estimate_registration
+from thincam_jax.measured.calibration.registration import covered, resample
 
 SHAPE = (150, 181)
 
@@ -23,6 +26,56 @@ def blobs(scale=1.0, shift=(0.0, 0.0), seed=0):
 
 def noisy(image, part, seed):
     return image + part * image.std() * np.random.default_rng(seed).normal(size=image.shape)
+
+
+def waves(scale, shift, shape=SHAPE):
+    """Twelve plane waves of up to 0.3 cycles a pixel, enlarged about the middle and moved."""
+    rng = np.random.default_rng(4)
+    y, x = (
+        (jnp.arange(n, dtype=float) - (n - 1) / 2 - a) / scale
+        for n, a in zip(shape, shift, strict=True)
+    )
+    image = 0.0
+    for _ in range(12):
+        v, u, phase = rng.uniform(-0.21, 0.21, 2).tolist() + [rng.uniform(0, 6)]
+        image = image + jnp.cos(2 * jnp.pi * (v * y[:, None] + u * x) + phase)
+    return image
+
+
+class TestResample:
+    """Against waves in closed form, and their derivatives."""
+
+    @pytest.mark.parametrize(
+        ("scale", "shift"), [(1.07, (2.3, -4.6)), (1.3, (0.0, 0.5)), (1.0, (3.0, -2.0))]
+    )
+    def test_values_and_derivatives(self, scale, shift):
+        image = waves(1.0, (0.0, 0.0))
+        at = jnp.asarray(scale), jnp.asarray(shift)
+        # Six pixels: five lobes of the kernel, and one for rounding up.
+        inside = np.asarray(covered(SHAPE, *at, 6)) > 0
+        found, exact = resample(image, *at), waves(*at)
+        assert inside.mean() > 0.5
+        assert rms((found - exact)[inside]) < 4e-3 * rms(exact)
+        for which in (0, 1):
+            found = jax.jacfwd(lambda s, a: resample(image, s, a), which)(*at)[inside]
+            exact = jax.jacfwd(waves, which)(*at)[inside]
+            assert rms(found - exact) < 2.5e-2 * rms(exact)
+
+    def test_border(self):
+        """Zero beyond the edges, between the image's own values up to them."""
+        found = np.asarray(resample(jnp.ones(SHAPE), jnp.asarray(0.8), jnp.array([4.0, 0.0])))
+        y, x = ((np.arange(n) - (n - 1) / 2 - a) / 0.8 for n, a in zip(SHAPE, (4, 0), strict=True))
+        shown = (np.abs(y)[:, None] <= SHAPE[0] / 2) & (np.abs(x) <= SHAPE[1] / 2)
+        np.testing.assert_allclose(found, shown, atol=1e-12)
+
+    def test_nothing_changes_at_scale_one(self):
+        image = waves(1.0, (0.0, 0.0))
+        found = resample(image, jnp.asarray(1.0), jnp.zeros(2))
+        np.testing.assert_allclose(found, image, atol=1e-12)
+
+
+def rms(values):
+    return float(jnp.sqrt(jnp.mean(values**2)))
 
 
 @pytest.mark.parametrize(

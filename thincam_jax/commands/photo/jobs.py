@@ -10,7 +10,7 @@ import numpy as np
 
 from thincam_jax.commands.photo.options import Output, Sources
 from thincam_jax.measured import CaptureFileError, MeasurementError, write_image
-from thincam_jax.measured.folder import SUFFIXES
+from thincam_jax.measured.read import image_files
 from thincam_jax.measured.write import LINEAR
 
 
@@ -72,22 +72,9 @@ def write_job(job: Job, image: np.ndarray, record: dict[str, Any], output: Outpu
 
 def _captures_in(folder: Path, sources: Sources) -> list[Path]:
     used = {path.resolve() for path in sources.paths()}
-    try:
-        entries = sorted(folder.iterdir())
-    except OSError as error:
-        raise CaptureFileError(f"{folder}: cannot be read ({error.strerror})") from None
-    captures = [
-        path
-        for path in entries
-        if path.suffix.lower() in SUFFIXES
-        and not path.name.startswith(".")
-        and path.resolve() not in used
-        and not path.is_dir()
-    ]
+    captures = [path for path in image_files(folder) if path.resolve() not in used]
     if not captures:
-        raise CaptureFileError(
-            f"{folder}: holds no capture; give a folder of {', '.join(SUFFIXES)} files"
-        )
+        raise CaptureFileError(f"{folder}: holds no capture beside the PSF and what is subtracted")
     return captures
 
 

@@ -6,7 +6,7 @@ from typing import Literal
 
 from thincam_jax._core import checks
 from thincam_jax.measured import MeasurementError, Preparation
-from thincam_jax.measured.display import WhiteBalance
+from thincam_jax.measured.write import WhiteBalance
 from thincam_jax.reconstruction import SOLVERS, AbstractSolver, AdmmTV, Fista, Ridge, TotalVariation
 
 # What works from a measured PSF and prepared captures; "auto" then is admm_tv.

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from thincam_jax._core.grids import Grid
+from thincam_jax._core.grids import Grid, block_mean
 from thincam_jax._core.precision import PRECISIONS, Precision, allow, cast
 from thincam_jax.lensless.accuracy.norms import (
     Factors,
@@ -27,7 +27,7 @@ from thincam_jax.lensless.propagation.angular_spectrum import planes
 from thincam_jax.lensless.propagation.closed_form import in_focus
 from thincam_jax.lensless.propagation.orders import pairs, require_zone_orders
 from thincam_jax.lensless.propagation.path import Path
-from thincam_jax.lensless.propagation.plane import block_average, lit_mask
+from thincam_jax.lensless.propagation.plane import lit_mask
 from thincam_jax.lensless.propagation.rayleigh_sommerfeld import rayleigh_sommerfeld_field
 from thincam_jax.lensless.propagation.separable import PIXEL_NODES
 from thincam_jax.lensless.propagation.separable_sum import SeparableSum
@@ -97,7 +97,7 @@ def _direct_sum(
     sensor = points.refined(oversampling) if pixel_integration else points
     field = rayleigh_sommerfeld_field(lit, plane, sensor, path)
     irradiance = (field.real**2 + field.imag**2) * path.magnification**2
-    return block_average(irradiance, oversampling) if pixel_integration else irradiance
+    return block_mean(irradiance, oversampling) if pixel_integration else irradiance
 
 
 def _spread(count: int, most: int) -> Float[np.ndarray, " chosen"]:

@@ -7,11 +7,11 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Complex, Float
 
-from thincam_jax._core.grids import Grid, centred_frequencies, fast_shape
+from thincam_jax._core.grids import Grid, block_mean, centred_frequencies, fast_shape
 from thincam_jax._core.precision import turn_phasor
 from thincam_jax.lensless.masks.base import AbstractMask
 from thincam_jax.lensless.propagation.path import Path
-from thincam_jax.lensless.propagation.plane import block_average, lit_mask
+from thincam_jax.lensless.propagation.plane import lit_mask
 
 
 class Sampling(NamedTuple):
@@ -105,7 +105,7 @@ def angular_spectrum(
     field = jnp.roll(field, shift, axis=(0, 1))[: sensor.shape[0], : sensor.shape[1]]
     irradiance = (field.real**2 + field.imag**2) * path.magnification**2
     if pixel_integration:
-        return block_average(irradiance, oversampling)
+        return block_mean(irradiance, oversampling)
     middle = oversampling // 2
     return irradiance[middle::oversampling, middle::oversampling]
 

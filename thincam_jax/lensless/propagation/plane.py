@@ -1,7 +1,7 @@
 """What the sampled models share: the mask plane's samples and the wave that lights them."""
 
 import jax.numpy as jnp
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Array, Complex
 
 from thincam_jax._core.grids import Grid
 from thincam_jax._core.precision import as_complex, turn_phasor
@@ -23,9 +23,3 @@ def spherical_wave(plane: Grid, path: Path) -> Complex[Array, "y x"]:
     # sqrt(t² + ρ²) − t without cancellation.
     detour = rho2 * nearness / (1 + stretch)
     return turn_phasor(detour / path.wavelength) * as_complex(1 / stretch)
-
-
-def block_average(image: Float[Array, "y x"], factor: int) -> Float[Array, "v u"]:
-    """Averages over factor×factor blocks."""
-    rows, columns = (n // factor for n in image.shape)
-    return image.reshape(rows, factor, columns, factor).mean(axis=(1, 3))

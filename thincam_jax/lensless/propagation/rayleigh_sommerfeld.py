@@ -4,12 +4,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
 
-from thincam_jax._core.grids import Grid
+from thincam_jax._core.grids import Grid, block_mean
 from thincam_jax._core.precision import turn_phasor
 from thincam_jax.lensless.masks.base import AbstractMask
 from thincam_jax.lensless.propagation.angular_spectrum import planes, within
 from thincam_jax.lensless.propagation.path import Path
-from thincam_jax.lensless.propagation.plane import block_average, lit_mask
+from thincam_jax.lensless.propagation.plane import lit_mask
 
 # Sensor samples done together: bounds the memory to this many copies of the mask plane.
 _BATCH = 64
@@ -65,4 +65,4 @@ def rayleigh_sommerfeld(
         lit_mask(within(mask, plane), plane, path), plane, sensor, path
     )
     irradiance = (field.real**2 + field.imag**2) * path.magnification**2
-    return block_average(irradiance, oversampling) if pixel_integration else irradiance
+    return block_mean(irradiance, oversampling) if pixel_integration else irradiance

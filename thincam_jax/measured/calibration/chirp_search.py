@@ -22,6 +22,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from thincam_jax._core.grids import block_mean, central_blocks
+
 # Of π/R² and π/(2γR), the curvature and the shift that turn the outermost fringe by half a cycle.
 _STEP = 0.5
 _WEAK = 0.5  # ε above which order −1 is too near its focus for this picture of the fringes
@@ -94,10 +96,13 @@ class _Blocks:
         self.reference = guess.curvature
         y, x = ((np.arange(n) - (n - 1) / 2) * pitch for n in image.shape)
         y0, x0 = guess.centre
+        kept = central_blocks(image.shape, size)
         slow = (image - image.mean()) * np.exp(-1j * self.reference * (x - x0) ** 2)
         slow = slow * np.exp(-1j * self.reference * (y - y0) ** 2)[:, None]
-        self.values = _averages(_averages(slow, size).T, size).T
-        self.y, self.x = _averages(y, size), _averages(x, size)
+        self.values = block_mean(slow[kept], size)
+        self.y, self.x = (
+            r[part].reshape(-1, size).mean(axis=1) for r, part in zip((y, x), kept, strict=True)
+        )
         self.origin = guess.centre
 
     def correlate(self, gammas: np.ndarray, centre, places) -> np.ndarray:
@@ -163,11 +168,3 @@ def _axis(half_range: float, step: float) -> np.ndarray:
     """−half_range … half_range with 0 among them."""
     count = math.ceil(half_range / step)
     return np.arange(-count, count + 1) * step
-
-
-def _averages(values: np.ndarray, size: int) -> np.ndarray:
-    """Averages of `size` neighbours along the last axis; what is left over is dropped evenly."""
-    count = values.shape[-1] // size
-    first = (values.shape[-1] - count * size) // 2
-    kept = values[..., first : first + count * size]
-    return kept.reshape(*values.shape[:-1], count, size).mean(axis=-1)

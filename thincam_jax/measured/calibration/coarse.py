@@ -17,13 +17,15 @@ import numpy as np
 import scipy
 from jaxtyping import Array, Float
 
-from thincam_jax._core.grids import Grid
-from thincam_jax.measured.calibration.covariance import Covariance, covariance, of_values
+from thincam_jax._core.grids import Grid, block_mean, central_blocks
 from thincam_jax.measured.calibration.problem import (
     SEEN,
     WHERE,
-    Setting,
+    Covariance,
+    FitState,
+    covariance,
     model,
+    of_values,
     seen_by_steps,
     unknown_names,
     with_fringes_held,
@@ -44,7 +46,7 @@ _FRINGE = 0.02  # rad, at the rim: differences of what moves the fringes
 _RIMS = ("width", "wavelength")
 
 
-class View(NamedTuple):
+class FitImage(NamedTuple):
     """An image and its grid, whose middle is `offset` (y, x, mm) off the axis."""
 
     image: np.ndarray
@@ -52,7 +54,7 @@ class View(NamedTuple):
     offset: Float[Array, "2"]
     pixel_integration: bool
 
-    def model(self, start: Setting, names, steps) -> np.ndarray:
+    def model(self, start: FitState, names, steps) -> np.ndarray:
         steps = jnp.asarray(steps, jnp.float64)
         where = (self.pixel_integration, self.grid, self.offset)
         return np.asarray(model(steps, start, names, *where)).ravel()
@@ -60,19 +62,19 @@ class View(NamedTuple):
 
 def descend(
     image: np.ndarray,
-    guess: Setting,
-    start: Setting,
+    guess: FitState,
+    start: FitState,
     parameters: Sequence[str],
     search: float,
     pixel_integration: bool,
-) -> Setting:
-    """The setting that fits the image best on coarse pixels, from one whose fringes are right.
+) -> FitState:
+    """The state that fits the image best on coarse pixels, from one whose fringes are right.
 
     `guess` is what was given, `start` what the fringes say. Only `parameters` change.
     """
-    view = coarse_view(image, guess, pixel_integration)
-    best = _best_by_trial(view, guess, start, parameters, search)
-    best = _with_linear(view, best, parameters)
+    measured = coarse_image(image, guess, pixel_integration)
+    best = _best_by_trial(measured, guess, start, parameters, search)
+    best = _with_linear(measured, best, parameters)
     names = unknown_names(tuple(parameters))
     width = _WIDE
     while True:
@@ -83,7 +85,7 @@ def descend(
             jac=_slopes,  # pyright: ignore[reportArgumentType]
             x_scale="jac",
             max_nfev=_EVALUATIONS,
-            args=(view, best, names, widths),
+            args=(measured, best, names, widths),
         )
         known = _errors(step.jac, 2 * step.cost)
         turned = np.asarray(seen_by_steps(best, names, step.x))
@@ -93,45 +95,45 @@ def descend(
         width = width * _NARROWER
 
 
-def honest_covariance(view: View, found: Setting, names) -> Covariance:
+def honest_covariance(measured: FitImage, found: FitState, names) -> Covariance:
     """Standard errors and correlations of the steps from `found`.
 
     By differences over steps that are wide against the errors which they give, narrowed as long as
     they are: derivatives would count on waves of the rims that the noise may well hide.
     """
     none = np.zeros(len(names))
-    residual = _residual(none, view, found, names, None)
+    residual = _residual(none, measured, found, names, None)
     squares, width, seen = float(residual @ residual), _WIDE, None
     turned = np.asarray(seen_by_steps(found, names, none))
     while True:
         widths = difference_widths(found, width)
-        seen = _seen_slopes(view, found, turned, widths, seen)
+        seen = _seen_slopes(measured, found, turned, widths, seen)
         known = _errors(seen @ turned, squares)
         if width < _NARROWEST or _too_narrow(known, turned, widths):
             return known
         width = width * _NARROWER
 
 
-def slope_norms(view: View, setting: Setting, names) -> np.ndarray:
+def slope_norms(measured: FitImage, state: FitState, names) -> np.ndarray:
     """How far the image moves for a step of each unknown."""
-    widths = difference_widths(setting, _WIDE * _NARROWER)
-    norms = np.linalg.norm(_slopes(np.zeros(len(names)), view, setting, names, widths), axis=0)
+    widths = difference_widths(state, _WIDE * _NARROWER)
+    norms = np.linalg.norm(_slopes(np.zeros(len(names)), measured, state, names, widths), axis=0)
     return np.where(norms > 0, norms, 1.0)
 
 
-def difference_widths(setting: Setting, width: float) -> np.ndarray:
+def difference_widths(state: FitState, width: float) -> np.ndarray:
     """Half the step over which each of `SEEN` is differenced; `width` is that of λdM."""
-    camera = setting.camera
+    camera = state.camera
     pixel = float(camera.sensor.pitch)
     reach = max(camera.sensor.shape) * pixel / 2
-    curvature = float(setting.mask.beta) / float(setting.magnification) ** 2
-    zone = math.sqrt(float(setting.wavelength) * float(camera.distance))
+    curvature = float(state.mask.beta) / float(state.magnification) ** 2
+    zone = math.sqrt(float(state.wavelength) * float(camera.distance))
     every = {
         "beta": _FRINGE / (curvature * reach**2),
         "centre_y": _FRINGE / (2 * curvature * reach * pixel),
         "centre_x": _FRINGE / (2 * curvature * reach * pixel),
         # A rim moves by a few parts in 100 of a Fresnel zone for `width` of 2 %.
-        "width": 2 * width * zone / float(setting.mask.width),
+        "width": 2 * width * zone / float(state.mask.width),
         "wavelength": width,
     }
     return np.array([every.get(name, _FRINGE) for name in SEEN])
@@ -149,36 +151,36 @@ def _errors(jacobian: np.ndarray, squares: float) -> Covariance:
     return covariance(jacobian.T @ jacobian, squares / max(1, pixels - unknowns))
 
 
-def _residual(steps, view: View, start: Setting, names, widths) -> np.ndarray:
-    return view.model(start, names, steps) - view.image.ravel()
+def _residual(steps, measured: FitImage, start: FitState, names, widths) -> np.ndarray:
+    return measured.model(start, names, steps) - measured.image.ravel()
 
 
-def _slopes(steps, view: View, start: Setting, names, widths) -> np.ndarray:
+def _slopes(steps, measured: FitImage, start: FitState, names, widths) -> np.ndarray:
     """∂model/∂steps, through what the image depends on."""
     turned = np.asarray(seen_by_steps(start, names, steps))
-    return _seen_slopes(view, start.moved(names, jnp.asarray(steps)), turned, widths) @ turned
+    return _seen_slopes(measured, start.moved(names, jnp.asarray(steps)), turned, widths) @ turned
 
 
-def _seen_slopes(view: View, here: Setting, turned, widths, known=None) -> np.ndarray:
+def _seen_slopes(measured: FitImage, here: FitState, turned, widths, known=None) -> np.ndarray:
     """By central differences in each of `SEEN`, 0 for what `turned` has no use for.
 
     Of `known` slopes only the rims' are made again.
     """
-    slopes = np.zeros((view.image.size, len(SEEN)))
+    slopes = np.zeros((measured.image.size, len(SEEN)))
     for i, name in enumerate(SEEN):
         if known is not None and name not in _RIMS:
             slopes[:, i] = known[:, i]
         elif np.any(turned[i]):
             step = np.zeros(len(SEEN))
             step[i] = widths[i]
-            change = view.model(here, SEEN, step) - view.model(here, SEEN, -step)
+            change = measured.model(here, SEEN, step) - measured.model(here, SEEN, -step)
             slopes[:, i] = change / (2 * widths[i])
     return slopes
 
 
 def _best_by_trial(
-    view: View, guess: Setting, start: Setting, parameters: Sequence[str], search: float
-) -> Setting:
+    measured: FitImage, guess: FitState, start: FitState, parameters: Sequence[str], search: float
+) -> FitState:
     """The start with the distance, or wavelength, and the width that fit the coarse image best.
 
     Within `search` of the guess, in parts of one; what is not in `parameters` stays. The fringes'
@@ -196,11 +198,11 @@ def _best_by_trial(
             values = middle * _trials(name, search / _TRIALS**turn, guess)
             values = np.append(values, float(WHERE[name](best)))
             trials = [with_fringes_held(best, name, v, "beta" in parameters) for v in values]
-            best = trials[int(np.argmin([_misfit(view, trial) for trial in trials]))]
+            best = trials[int(np.argmin([_misfit(measured, trial) for trial in trials]))]
     return best
 
 
-def _trials(name: str, reach: float, guess: Setting) -> np.ndarray:
+def _trials(name: str, reach: float, guess: FitState) -> np.ndarray:
     """Factors from 1 − reach to 1 + reach: a rim must not jump over a Fresnel zone."""
     count = _TRIALS
     if name == "width":
@@ -209,17 +211,17 @@ def _trials(name: str, reach: float, guess: Setting) -> np.ndarray:
     return 1 + reach * np.arange(-count, count + 1) / count
 
 
-def _misfit(view: View, setting: Setting) -> float:
+def _misfit(measured: FitImage, state: FitState) -> float:
     """1 − ρ², with the correlation ρ of the image with the model: the best gain and background."""
-    h = view.model(setting, ("phase",), np.zeros(1))
-    return 1 - float(np.corrcoef(h, view.image.ravel())[0, 1]) ** 2
+    h = measured.model(state, ("phase",), np.zeros(1))
+    return 1 - float(np.corrcoef(h, measured.image.ravel())[0, 1]) ** 2
 
 
-def full_view(image: np.ndarray, setting: Setting, pixel_integration: bool) -> View:
-    return View(image, setting.camera.sensor.grid, jnp.zeros(2), pixel_integration)
+def full_image(image: np.ndarray, state: FitState, pixel_integration: bool) -> FitImage:
+    return FitImage(image, state.camera.sensor.grid, jnp.zeros(2), pixel_integration)
 
 
-def coarse_view(image: np.ndarray, guess: Setting, pixel_integration: bool) -> View:
+def coarse_image(image: np.ndarray, guess: FitState, pixel_integration: bool) -> FitImage:
     """The image averaged over blocks about a third of a Fresnel zone wide; rests are dropped.
 
     The model is exact for these pixels as well.
@@ -227,24 +229,22 @@ def coarse_view(image: np.ndarray, guess: Setting, pixel_integration: bool) -> V
     pitch = float(guess.camera.sensor.pitch)
     zone = math.sqrt(float(guess.wavelength) * float(guess.camera.distance))
     size = max(1, min(round(_BLOCK * zone / pitch), min(image.shape) // _FEWEST))
-    rows, columns = (n // size for n in image.shape)
-    top, left = ((n - n // size * size) // 2 for n in image.shape)
-    kept = image[top : top + rows * size, left : left + columns * size]
-    averages = kept.reshape(rows, size, columns, size).mean(axis=(1, 3))
-    middles = np.array([top + rows * size / 2, left + columns * size / 2])
+    kept = central_blocks(image.shape, size)
+    averages = block_mean(image[kept], size)
+    middles = np.array([(part.start + part.stop) / 2 for part in kept])
     offset = (middles - np.array(image.shape) / 2) * pitch
-    return View(
+    return FitImage(
         averages,
-        Grid((rows, columns), pitch * size),
+        Grid(averages.shape, pitch * size),
         jnp.asarray(offset),
         size > 1 or pixel_integration,
     )
 
 
-def _with_linear(view: View, setting: Setting, parameters: Sequence[str]) -> Setting:
+def _with_linear(measured: FitImage, state: FitState, parameters: Sequence[str]) -> FitState:
     """Background and gain by linear least squares, as far as they are free."""
-    h = view.model(setting, ("phase",), np.zeros(1))
-    values = view.image.ravel()
+    h = measured.model(state, ("phase",), np.zeros(1))
+    values = measured.image.ravel()
     background, gain = 0.0, 1.0
     if "gain" in parameters and "background" in parameters:
         gain = np.mean((h - h.mean()) * (values - values.mean())) / np.var(h)
@@ -256,8 +256,8 @@ def _with_linear(view: View, setting: Setting, parameters: Sequence[str]) -> Set
     if not gain > 0:  # not the picture of this camera; some gain, so that there is a slope
         gain = values.std() / h.std()
     numbers = (jnp.asarray(background, jnp.float64), jnp.asarray(gain, jnp.float64))
-    return eqx.tree_at(_offset_and_gain, setting, numbers)
+    return eqx.tree_at(_offset_and_gain, state, numbers)
 
 
-def _offset_and_gain(setting: Setting):
-    return setting.background, setting.gain
+def _offset_and_gain(state: FitState):
+    return state.background, state.gain

@@ -1,4 +1,4 @@
-"""The least-squares problem of a PSF fit: unknowns, model, residual and its Jacobian."""
+"""The least-squares problem of a PSF fit: unknowns, model, residual, and what the fit knows."""
 
 import operator
 from typing import NamedTuple, cast
@@ -6,6 +6,7 @@ from typing import NamedTuple, cast
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
 
@@ -43,7 +44,7 @@ def unknown_names(parameters: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(names)
 
 
-class Setting(eqx.Module):
+class FitState(eqx.Module):
     """Everything that the picture of a point source on the axis depends on.
 
     - `nearness`: 1/t, 1/mm; 0 is a plane wave. t itself has no value next to infinity.
@@ -76,7 +77,7 @@ class Setting(eqx.Module):
         )
         return self.background + self.gain * h
 
-    def moved(self, names: tuple[str, ...], steps: Float[Array, " unknown"]) -> "Setting":
+    def moved(self, names: tuple[str, ...], steps: Float[Array, " unknown"]) -> "FitState":
         """With every named number away from here by a dimensionless step.
 
         β/M², width, d and λ by the factor e^s, which keeps them positive; 1/t by s/d; the centre by
@@ -126,7 +127,7 @@ class Setting(eqx.Module):
         return jnp.stack([every[name] for name in names])
 
 
-# Where a setting keeps what is found by trial.
+# Where a state keeps what is found by trial.
 WHERE = {
     "width": operator.attrgetter("camera.mask.width"),
     "distance": operator.attrgetter("camera.distance"),
@@ -134,31 +135,31 @@ WHERE = {
 }
 
 
-def _numbers(setting: Setting):
-    mask = setting.mask
+def _numbers(state: FitState):
+    mask = state.mask
     return (
         mask.beta,
         mask.phase,
         mask.width,
         mask.centre,
-        setting.camera.distance,
-        setting.wavelength,
-        setting.nearness,
-        setting.background,
-        setting.gain,
+        state.camera.distance,
+        state.wavelength,
+        state.nearness,
+        state.background,
+        state.gain,
     )
 
 
-def with_fringes_held(setting: Setting, name: str, value: float, hold: bool) -> Setting:
+def with_fringes_held(state: FitState, name: str, value: float, hold: bool) -> FitState:
     """With another width, distance or wavelength; `hold`: with the β that keeps β/M²."""
-    there = eqx.tree_at(WHERE[name], setting, jnp.asarray(value, setting.nearness.dtype))
+    there = eqx.tree_at(WHERE[name], state, jnp.asarray(value, state.nearness.dtype))
     if not hold:
         return there
-    ratio = there.magnification / setting.magnification
+    ratio = there.magnification / state.magnification
     return eqx.tree_at(lambda s: s.camera.mask.beta, there, there.mask.beta * ratio**2)
 
 
-class Problem(eqx.Module):
+class FitProblem(eqx.Module):
     """The data of `residual`.
 
     - `start`: where all steps are zero.
@@ -169,7 +170,7 @@ class Problem(eqx.Module):
     - `names`, `pixel_integration`: as in `unknown_names` and `psf`; static.
     """
 
-    start: Setting
+    start: FitState
     image: Float[Array, "y x"]
     weight: Float[Array, ""]
     scale: Float[Array, " unknown"]
@@ -185,25 +186,25 @@ class Solution(NamedTuple):
     iterations: int
 
 
-def setting_at(scaled: Float[Array, " unknown"], problem: Problem) -> Setting:
+def state_at(scaled: Float[Array, " unknown"], problem: FitProblem) -> FitState:
     """The numbers for the steps `scaled`·`problem.scale`."""
     return problem.start.moved(problem.names, scaled * problem.scale)
 
 
-def residual(scaled: Float[Array, " unknown"], problem: Problem) -> Float[Array, "y x"]:
+def residual(scaled: Float[Array, " unknown"], problem: FitProblem) -> Float[Array, "y x"]:
     """(model − measured image)·weight."""
-    model = setting_at(scaled, problem).image(problem.pixel_integration)
+    model = state_at(scaled, problem).image(problem.pixel_integration)
     return (model - problem.image) * problem.weight
 
 
 @eqx.filter_jit
-def model(steps, start: Setting, names: tuple[str, ...], pixel_integration, grid: Grid, offset):
+def model(steps, start: FitState, names: tuple[str, ...], pixel_integration, grid: Grid, offset):
     """The image after the steps, on a grid whose middle is `offset` (y, x, mm) off the sensor's."""
-    setting = start.moved(names, steps)
+    state = start.moved(names, steps)
     # The grid's middle is its origin: the mask moves the other way.
-    centre = setting.camera.mask.centre - offset / setting.magnification
-    setting = eqx.tree_at(lambda s: s.camera.mask.centre, setting, centre)
-    return setting.image(pixel_integration, grid)
+    centre = state.camera.mask.centre - offset / state.magnification
+    state = eqx.tree_at(lambda s: s.camera.mask.centre, state, centre)
+    return state.image(pixel_integration, grid)
 
 
 # What the image depends on, each moved by its own step: β/M², φ, M·centre, M·width, λdM, and what
@@ -221,12 +222,12 @@ SEEN = (
 
 
 @eqx.filter_jit
-def seen_by_steps(start: Setting, names: tuple[str, ...], steps) -> Float[Array, "seen step"]:
+def seen_by_steps(start: FitState, names: tuple[str, ...], steps) -> Float[Array, "seen step"]:
     """How far each of `SEEN` moves with each step: exact, also where steps cannot be told apart."""
     return jax.jacfwd(_seen)(steps, start, names)
 
 
-def _seen(steps, start: Setting, names):
+def _seen(steps, start: FitState, names):
     there = start.moved(names, steps)
     mask, scale = there.mask, there.magnification
     centre = mask.centre * scale / jax.lax.stop_gradient(scale) / there.camera.sensor.pitch
@@ -244,22 +245,22 @@ def _seen(steps, start: Setting, names):
 
 
 @eqx.filter_jit
-def values_by_steps(start: Setting, names: tuple[str, ...], steps) -> Float[Array, "value step"]:
-    """The derivative of `Setting.values` in the steps from `start`."""
+def values_by_steps(start: FitState, names: tuple[str, ...], steps) -> Float[Array, "value step"]:
+    """The derivative of `FitState.values` in the steps from `start`."""
     return jax.jacfwd(_values)(steps, start, names)
 
 
-def _values(steps, start: Setting, names):
+def _values(steps, start: FitState, names):
     return start.moved(names, steps).values(names)
 
 
 @eqx.filter_jit
-def setting_and_residual(scaled: Float[Array, " unknown"], problem: Problem):
+def state_and_residual(scaled: Float[Array, " unknown"], problem: FitProblem):
     """The numbers, and measured image − model."""
-    return setting_at(scaled, problem), -residual(scaled, problem) / problem.weight
+    return state_at(scaled, problem), -residual(scaled, problem) / problem.weight
 
 
-def solve(problem: Problem, max_steps: int) -> Solution:
+def solve(problem: FitProblem, max_steps: int) -> Solution:
     """Levenberg-Marquardt from `problem.start`."""
     solution = _least_squares(problem, max_steps)
     converged = bool(solution.result == optx.RESULTS.successful)
@@ -267,7 +268,61 @@ def solve(problem: Problem, max_steps: int) -> Solution:
 
 
 @eqx.filter_jit
-def _least_squares(problem: Problem, max_steps: int):
+def _least_squares(problem: FitProblem, max_steps: int):
     solver = optx.LevenbergMarquardt(rtol=_TOLERANCE, atol=_TOLERANCE)
     none = jnp.zeros_like(problem.scale)
     return optx.least_squares(residual, solver, none, problem, max_steps=max_steps, throw=False)
+
+
+# Two numbers of correlation ρ have standard errors 1/√(1−ρ²) times those they would have if the
+# other were known: at 0.999, 22 times. The image then holds one combination of the two by more than
+# a digit better than either, and any small flaw of the model goes into the difference.
+AMBIGUOUS = 0.999
+# The smallest eigenvalue, relative to the unit diagonal, that is not rounding.
+_SMALLEST = 1e-13
+
+
+class Covariance(NamedTuple):
+    """Of the unknowns of a fit, in their order."""
+
+    standard_errors: np.ndarray
+    correlation: np.ndarray
+
+
+def covariance(curvature: np.ndarray, variance: float) -> Covariance:
+    """σ²(JᵀJ)⁻¹ as standard errors and correlations.
+
+    `curvature`: JᵀJ. `variance`: σ² of a residual, taken as white. A direction that the data do not
+    see at all has, in place of an infinite error, that of an eigenvalue at the rounding's level:
+    about 1e6 times the error of a number that is seen.
+    """
+    norm = np.sqrt(np.diag(curvature))
+    norm = np.where(norm > 0, norm, norm.max() * _SMALLEST or 1.0)
+    values, vectors = np.linalg.eigh(curvature / np.outer(norm, norm))
+    inverse = (vectors / np.maximum(values, _SMALLEST)) @ vectors.T
+    spread = np.sqrt(np.diag(inverse))
+    correlation = inverse / np.outer(spread, spread)
+    return Covariance(np.sqrt(variance) * spread / norm, np.clip(correlation, -1.0, 1.0))
+
+
+def of_values(steps: Covariance, slopes: np.ndarray) -> Covariance:
+    """The covariance of values from that of steps, with ∂values/∂steps."""
+    scaled = slopes * steps.standard_errors
+    whole = scaled @ steps.correlation @ scaled.T
+    errors = np.sqrt(np.diag(whole))
+    safe = np.where(errors > 0, errors, 1.0)
+    return Covariance(errors, np.clip(whole / np.outer(safe, safe), -1.0, 1.0))
+
+
+def ambiguous_pairs(names: tuple[str, ...], correlation: np.ndarray) -> list[str]:
+    """One line for each pair of unknowns that the data cannot tell apart, most alike first."""
+    rows, columns = np.triu_indices(len(names), 1)
+    found = [
+        (
+            abs(rho),
+            f"{names[i]} and {names[j]} cannot be told apart: their correlation is {rho:.6f}",
+        )
+        for i, j, rho in zip(rows, columns, correlation[rows, columns], strict=True)
+        if abs(rho) > AMBIGUOUS
+    ]
+    return [text + "; fix one of them" for _, text in sorted(found, reverse=True)]

@@ -14,21 +14,22 @@ from thincam_jax._core import checks
 from thincam_jax._core.precision import Precision, allow, cast, precision_of
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.masks.fza import FresnelZoneAperture
-from thincam_jax.measured.calibration._images import measured
-from thincam_jax.measured.calibration.coarse import full_view, honest_covariance, slope_norms
-from thincam_jax.measured.calibration.covariance import ambiguous_pairs, of_values
+from thincam_jax.measured.calibration.coarse import full_image, honest_covariance, slope_norms
 from thincam_jax.measured.calibration.problem import (
     PARAMETERS,
     STEP,
-    Problem,
-    Setting,
+    FitProblem,
+    FitState,
     Solution,
-    setting_and_residual,
+    ambiguous_pairs,
+    of_values,
     solve,
+    state_and_residual,
     unknown_names,
     values_by_steps,
 )
 from thincam_jax.measured.calibration.start import check_fringes, given, search_ranges, start_near
+from thincam_jax.measured.raw import image_with_contrast
 
 Status = Literal["ok", "ambiguous", "poor_fit", "not_converged"]
 DEFAULT = ("beta", "phase", "centre", "distance", "background", "gain")
@@ -169,27 +170,29 @@ def _check_image(image, camera: LenslessCamera) -> np.ndarray:
         raise TypeError(
             "fit_psf searches, so that it cannot be traced: call it outside jit and grad"
         )
-    return measured("psf_image", image, camera.sensor.shape, "the sensor")
+    return image_with_contrast("psf_image", image, camera.sensor.shape, "the sensor")
 
 
-def _fit(image, start: Setting, names, pixel_integration, max_steps, precision) -> PsfFit:
+def _fit(image, start: FitState, names, pixel_integration, max_steps, precision) -> PsfFit:
     problem = _problem(image, start, names, pixel_integration)
     solution = solve(problem, max_steps)
     return _report(problem, solution, precision)
 
 
-def _problem(image, start: Setting, names, pixel_integration: bool) -> Problem:
+def _problem(image, start: FitState, names, pixel_integration: bool) -> FitProblem:
     contrast = np.linalg.norm(image - image.mean())
-    scale = STEP * contrast / slope_norms(full_view(image, start, pixel_integration), start, names)
+    scale = STEP * contrast / slope_norms(full_image(image, start, pixel_integration), start, names)
     weight = jnp.asarray(1 / contrast, jnp.float64)
-    return Problem(start, jnp.asarray(image), weight, jnp.asarray(scale), names, pixel_integration)
+    return FitProblem(
+        start, jnp.asarray(image), weight, jnp.asarray(scale), names, pixel_integration
+    )
 
 
-def _report(problem: Problem, solution: Solution, precision: Precision) -> PsfFit:
+def _report(problem: FitProblem, solution: Solution, precision: Precision) -> PsfFit:
     names = problem.names
-    found, residual = setting_and_residual(solution.scaled, problem)
-    view = full_view(np.asarray(problem.image), found, problem.pixel_integration)
-    known = of_values(honest_covariance(view, found, names), _slopes_of_values(found, names))
+    found, residual = state_and_residual(solution.scaled, problem)
+    measured = full_image(np.asarray(problem.image), found, problem.pixel_integration)
+    known = of_values(honest_covariance(measured, found, names), _slopes_of_values(found, names))
     values = dict(zip(names, np.asarray(found.values(names)), strict=True))
     errors = dict(zip(names, known.standard_errors, strict=True))
     distance, alike = np.inf, ambiguous_pairs(names, known.correlation)
@@ -220,7 +223,7 @@ def _report(problem: Problem, solution: Solution, precision: Precision) -> PsfFi
     )
 
 
-def _slopes_of_values(found: Setting, names) -> np.ndarray:
+def _slopes_of_values(found: FitState, names) -> np.ndarray:
     """Of the values in the steps; t falls where 1/t grows."""
     slopes = np.array(values_by_steps(found, names, jnp.zeros(len(names))))
     slopes[np.array(names) == "object_distance"] *= -1

@@ -12,12 +12,13 @@ import scipy
 from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
+from thincam_jax._core.grids import block_mean, block_sum, central_blocks, centred_indices
 from thincam_jax._core.precision import allow
-from thincam_jax.measured.calibration._images import measured
-from thincam_jax.measured.calibration.resample import LOBES, covered, resample
+from thincam_jax.measured.raw import image_with_contrast
 
 Status = Literal["ok", "poor_fit", "not_converged"]
 
+_LOBES = 5  # of the interpolation's kernel (Lanczos) on either side
 _COARSE = 128  # pixels a side, about, of the images in which the start is searched
 _SMALLEST = 32  # pixels a side: less leaves nothing between the margins
 _BLOCK = 24  # pixels a side of the blocks whose errors count as independent
@@ -95,8 +96,8 @@ def estimate_registration(
     """
     if any(checks.is_traced(leaf) for leaf in (capture, reference, scale)):
         raise TypeError("estimate_registration searches: call it outside jit and grad")
-    capture = measured("capture", capture, None, "")
-    reference = measured("reference", reference, capture.shape, "the capture")
+    capture = image_with_contrast("capture", capture)
+    reference = image_with_contrast("reference", reference, capture.shape, "the capture")
     if min(capture.shape) < _SMALLEST:
         raise ValueError(f"images of {capture.shape} pixels; give at least {_SMALLEST} a side")
     scale = float(checks.positive("scale", scale, "parts of one"))
@@ -105,21 +106,14 @@ def estimate_registration(
         raise ValueError(f"search = {search:g} is too wide; give at most 0.5")
     smoothing = float(checks.non_negative("smoothing", smoothing, "pixels"))
     block = max(1, min(capture.shape) // _COARSE)
-    small, other = _averages(capture, block), _averages(reference, block)
+    inner = central_blocks(capture.shape, block)
+    small, other = (block_mean(image[inner], block) for image in (capture, reference))
     with allow("float64"):
         start = _phase_correlation(small, other, scale, search)
         start, _ = _fit(small, other, start, 1.0, max_steps)
         start = Place(start.scale, start.shift * block)
         place, fit = _fit(capture, reference, start, smoothing, max_steps)
         return _report(capture, reference, place, fit)
-
-
-def _averages(image: np.ndarray, size: int) -> np.ndarray:
-    """Averages over blocks of `size` pixels a side around the middle."""
-    rows, columns = (n // size for n in image.shape)
-    top, left = ((n - n // size * size) // 2 for n in image.shape)
-    kept = image[top : top + rows * size, left : left + columns * size]
-    return kept.reshape(rows, size, columns, size).mean(axis=(1, 3))
 
 
 class Place(NamedTuple):
@@ -158,6 +152,44 @@ def residual(unknowns: Float[Array, "5"], pair: Pair) -> Float[Array, "y x"]:
     return (model - pair.capture) * pair.weights
 
 
+def resample(
+    image: Float[Array, "y x"], scale: Float[Array, ""], shift: Float[Array, "2"]
+) -> Float[Array, "y x"]:
+    """image((r − shift)/scale) on the image's own pixels, r in pixels from the middle.
+
+    The image is enlarged about its middle by `scale`, then moved by `shift` (y, x), by separable
+    Lanczos interpolation, differentiable in both. What comes from beyond its edges is 0; near them
+    the outermost pixels count for more: use `covered` to leave that out. A scale well under 1
+    aliases what is finer than the enlarged pixels.
+    """
+    middle = jnp.asarray(image.shape, scale.dtype) / 2
+    return jax.image.scale_and_translate(
+        image,
+        image.shape,
+        (0, 1),
+        jnp.stack([scale, scale]),
+        shift + middle * (1 - scale),
+        "lanczos5",
+        antialias=False,
+    )
+
+
+def covered(
+    shape: tuple[int, int], scale: Float[Array, ""], shift: Float[Array, "2"], margin: int
+) -> Float[Array, "y x"]:
+    """1 where a resampled image comes from inside, `margin` pixels off the edge, 0 elsewhere.
+
+    The border of the result, `margin` wide, is left out as well.
+    """
+    sides = []
+    for count, offset in zip(shape, shift, strict=True):
+        r = centred_indices(count, scale.dtype)
+        reach = (count - 1) / 2 - margin
+        inside = (jnp.abs((r - offset) / scale) <= reach) & (jnp.abs(r) <= reach)
+        sides.append(inside.astype(scale.dtype))
+    return sides[0][:, None] * sides[1]
+
+
 def _place(unknowns: Float[Array, "5"], pair: Pair) -> tuple[Float[Array, ""], Float[Array, "2"]]:
     edge = max(pair.capture.shape) / 2
     return pair.scale * (1 + unknowns[0] / edge), pair.shift + unknowns[1:3]
@@ -178,7 +210,7 @@ def _fit(capture, reference, start: Place, smoothing: float, max_steps: int) -> 
     ]
     first, second = (jnp.asarray((image - image.mean()) / image.std()) for image in smooth)
     scale, shift = jnp.asarray(start.scale, jnp.float64), jnp.asarray(start.shift, jnp.float64)
-    margin = LOBES + math.ceil(3 * smoothing * max(1.0, start.scale))
+    margin = _LOBES + math.ceil(3 * smoothing * max(1.0, start.scale))
     margin = min(margin, min(capture.shape) // 6)
     weights = covered(capture.shape, scale, shift, margin)
     pair = Pair(first, second, weights * (_WEIGHT / capture.size**0.5), scale, shift)
@@ -259,11 +291,11 @@ def _standard_errors(fit: Fit) -> np.ndarray:
     jacobian, values = (np.asarray(v) for v in _linearised(fit.unknowns, fit.pair))
     scores = jacobian * values[..., None]
     rows, columns = (n - n % _BLOCK for n in values.shape)
-    blocks = scores[:rows, :columns].reshape(rows // _BLOCK, _BLOCK, columns // _BLOCK, _BLOCK, -1)
-    blocks = blocks.sum(axis=(1, 3)).reshape(-1, scores.shape[-1])
+    blocks = block_sum(np.moveaxis(scores, -1, 0)[:, :rows, :columns], _BLOCK)
+    blocks = blocks.reshape(len(blocks), -1)
     normal = np.einsum("yxi,yxj->ij", jacobian, jacobian)
     inverse = np.linalg.pinv(normal, hermitian=True)
-    return np.sqrt(np.diag(inverse @ (blocks.T @ blocks) @ inverse))
+    return np.sqrt(np.diag(inverse @ (blocks @ blocks.T) @ inverse))
 
 
 @eqx.filter_jit

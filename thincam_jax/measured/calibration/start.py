@@ -11,7 +11,7 @@ from thincam_jax._core import checks
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.measured.calibration.chirp_search import Chirp, Ranges, find_chirp
 from thincam_jax.measured.calibration.coarse import descend
-from thincam_jax.measured.calibration.problem import Setting
+from thincam_jax.measured.calibration.problem import FitState
 
 # d/t at which a free object distance starts where it was given as infinite, a number that no step
 # can leave: its shadow is within a millionth of that of infinity.
@@ -19,14 +19,14 @@ _FARTHEST = 1e-6
 _WIDEST = 0.5  # of a search, in parts of one
 
 
-def given(camera: LenslessCamera, object_distance, wavelength, parameters) -> Setting:
+def given(camera: LenslessCamera, object_distance, wavelength, parameters) -> FitState:
     """The camera and the point as given, with an empty background and a gain of one."""
     path = camera.path(wavelength, object_distance)
     nearness = 1 / path.object_distance
     if "object_distance" in parameters:
         nearness = jnp.maximum(nearness, _FARTHEST / camera.distance)
     none = jnp.zeros_like(nearness)
-    return Setting(camera, path.wavelength.astype(none.dtype), nearness, none, none + 1)
+    return FitState(camera, path.wavelength.astype(none.dtype), nearness, none, none + 1)
 
 
 def search_ranges(
@@ -49,7 +49,7 @@ def search_ranges(
     )
 
 
-def check_fringes(guess: Setting) -> None:
+def check_fringes(guess: FitState) -> None:
     """Refuse a sensor, or a shadow on it, that holds less than one fringe."""
     mask, sensor = guess.mask, guess.camera.sensor
     scale = float(guess.magnification)
@@ -67,13 +67,13 @@ def check_fringes(guess: Setting) -> None:
 
 def start_near(
     image: np.ndarray,
-    guess: Setting,
+    guess: FitState,
     parameters: Sequence[str],
     ranges: Ranges,
     search: float,
     pixel_integration: bool,
-) -> Setting:
-    """The setting whose fringes correlate best with the image, with the best background and gain.
+) -> FitState:
+    """The state whose fringes correlate best with the image, with the best background and gain.
 
     Only what is in `parameters` differs from the guess.
     """
@@ -83,17 +83,17 @@ def start_near(
     return descend(image, guess, near, parameters, search, pixel_integration)
 
 
-def _fringes(setting: Setting) -> Chirp:
-    camera, scale = setting.camera, float(setting.magnification)
-    beta = float(setting.mask.beta)
-    epsilon = beta * float(setting.wavelength) * float(camera.distance) / (math.pi * scale)
-    centre = np.asarray(setting.mask.centre) * scale
-    return Chirp(beta / scale**2, epsilon, centre, float(setting.mask.phase))
+def _fringes(state: FitState) -> Chirp:
+    camera, scale = state.camera, float(state.magnification)
+    beta = float(state.mask.beta)
+    epsilon = beta * float(state.wavelength) * float(camera.distance) / (math.pi * scale)
+    centre = np.asarray(state.mask.centre) * scale
+    return Chirp(beta / scale**2, epsilon, centre, float(state.mask.phase))
 
 
 def _with_fringes(
-    guess: Setting, fringes: Chirp, parameters: Sequence[str], search: float
-) -> Setting:
+    guess: FitState, fringes: Chirp, parameters: Sequence[str], search: float
+) -> FitState:
     """The free numbers that give those fringes: β/M² and ε, the centre and the phase.
 
     Weak diffraction says little of ε: d and λ stay within `search` of the guess.
@@ -128,13 +128,13 @@ def _within(value: float, guess, search: float) -> float:
     return min(max(value, float(guess) * (1 - search)), float(guess) * (1 + search))
 
 
-def _searched(setting: Setting):
-    camera, mask = setting.camera, setting.mask
+def _searched(state: FitState):
+    camera, mask = state.camera, state.mask
     return (
         mask.beta,
         mask.phase,
         mask.centre,
         camera.distance,
-        setting.wavelength,
-        setting.nearness,
+        state.wavelength,
+        state.nearness,
     )
