@@ -174,7 +174,10 @@ class TestBenchAccuracy:
 
     def test_folder_of_somebody_else(self, file, tmp_path):
         (tmp_path / "file").write_text("mine")
-        for out, hint in ((tmp_path, "is not empty"), (tmp_path / "file", "cannot be written")):
+        for out, hint in (
+            (tmp_path, "is not empty"),
+            (tmp_path / "file", "cannot be made a folder"),
+        ):
             assert hint in one_line(call("bench", "accuracy", file, "--out", out))
         assert (tmp_path / "file").read_text() == "mine"
 

@@ -1,5 +1,6 @@
 """What a run or a bug report needs to know of the installation."""
 
+import os
 import platform
 import sys
 from importlib import metadata
@@ -19,8 +20,8 @@ OPTIONAL = {
     "pytest-benchmark": "benchmarks (make bench)",
     "mpmath": "tests",
     "hypothesis": "tests",
-    "dask": "sweeps (thincam sweep)",
-    "distributed": "sweeps (thincam sweep)",
+    "dask": "sweeps on other machines (thincam sweep --scheduler)",
+    "distributed": "sweeps on other machines (thincam sweep --scheduler)",
     "pyarrow": "sweeps (thincam sweep)",
 }
 
@@ -42,6 +43,14 @@ def environment(seconds: float | None = None) -> dict[str, Any]:
         "command": ["thincam", *sys.argv[1:]],
         "seconds": None if seconds is None else round(seconds, 1),
     }
+
+
+def usable_cores() -> int:
+    """Cores that this process may use."""
+    try:
+        return len(os.sched_getaffinity(0))
+    except AttributeError:  # not on every system
+        return os.cpu_count() or 1
 
 
 def dtype_support() -> dict[str, str]:

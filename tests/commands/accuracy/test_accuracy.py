@@ -9,9 +9,8 @@ import pytest
 from commands.study import tiny
 
 import thincam_jax as tc
-from thincam_jax.commands.accuracy import sizes
-from thincam_jax.commands.accuracy.folder import BenchFolder
-from thincam_jax.commands.accuracy.run import Options, check, run_accuracy, steps
+from thincam_jax.commands.accuracy import cameras
+from thincam_jax.commands.accuracy import run as accuracy
 from thincam_jax.commands.study import build
 from thincam_jax.commands.study.config import ConfigError, dump_config
 
@@ -37,7 +36,11 @@ def run(config, tmp_path_factory):
 @pytest.mark.thorough
 def test_files(run):
     path, results = run
-    assert sorted(p.name for p in path.iterdir()) == ["accuracy.json", "accuracy.png"]
+    assert sorted(p.name for p in path.iterdir()) == [
+        "accuracy.json",
+        "accuracy.png",
+        "config.yaml",
+    ]
     assert json.loads((path / "accuracy.json").read_text("utf-8")) == results
     assert (path / "accuracy.png").read_bytes().startswith(b"\x89PNG")
 
@@ -115,7 +118,7 @@ def test_captures_agree_with_a_recomputation(run, config):
     rows = {r["model"]: r for r in run[1]["captures"]}
     (method,) = [m for m in config.methods if m.kind == "wiener"]
     setting = build.settings(config, method)[0]
-    camera = build.build_camera(sizes.binned(config, 48), setting)
+    camera = build.build_camera(cameras.binned(config, 48), setting)
     plane = build.build_plane(config, config.targets[1])
     scene = tc.Scene(plane, setting.wavelength)
     exact, shadow = (
@@ -163,24 +166,24 @@ def test_controlled_errors(run, wrong):
 class TestSizes:
     @pytest.mark.parametrize("size", [7, 16, 33, 64])
     def test_binning_keeps_the_area(self, config, size):
-        sensor, whole = sizes.binned(config, size).sensor, config.sensor
+        sensor, whole = cameras.binned(config, size).sensor, config.sensor
         assert max(sensor.shape) == size
         sides = [n * sensor.pitch for n in sensor.shape]
         assert sides[1] == pytest.approx(64 * whole.pitch, rel=1e-12)
         assert sides[0] == pytest.approx(48 * whole.pitch, abs=sensor.pitch / 2 + 1e-12)
-        assert sizes.binned(config, size).mask == config.mask
+        assert cameras.binned(config, size).mask == config.mask
 
     def test_default_sizes(self, config):
         def large(n):
             update = {"sensor": config.sensor.model_copy(update={"shape": (n // 2, n)})}
             return config.model_copy(update=update)
 
-        assert sizes.sizes_of(config, ()) == (64,)
-        assert sizes.sizes_of(large(512), ()) == (128, 256, 512)
-        assert sizes.sizes_of(large(1000), ()) == (128, 256, 512, 1000)
-        assert sizes.sizes_of(large(1000), (300, 200, 300)) == (200, 300)
-        assert sizes.capture_size_of(config, None) == 64
-        assert sizes.capture_size_of(large(1000), None) == 256
+        assert cameras.sizes_of(config, ()) == (64,)
+        assert cameras.sizes_of(large(512), ()) == (128, 256, 512)
+        assert cameras.sizes_of(large(1000), ()) == (128, 256, 512, 1000)
+        assert cameras.sizes_of(large(1000), (300, 200, 300)) == (200, 300)
+        assert cameras.capture_size_of(config, None) == 64
+        assert cameras.capture_size_of(large(1000), None) == 256
 
     @pytest.mark.parametrize("size", [0, -3, 65])
     def test_refused(self, config, size):
@@ -196,34 +199,30 @@ class TestSizes:
 def test_without_wiener(config):
     """Fringe scanning assumes no PSF: told, not run."""
     alone = config.model_copy(update={"methods": config.methods[:1]})
-    plan = check(alone, Options(SIZES))
-    assert plan.rig.skipped == "conventional: fringe scanning assumes no PSF"
+    plan = accuracy.check(alone, accuracy.Options(SIZES))
+    assert plan.case.skipped == "conventional: fringe scanning assumes no PSF"
 
 
 class TestFolder:
-    def test_foreign_files_stay(self, tmp_path):
-        (tmp_path / "thesis.txt").write_text("mine")
-        with pytest.raises(ConfigError, match="is not empty and holds no accuracy benchmark"):
-            BenchFolder(tmp_path).claim("a: 1\n")
-        assert [p.name for p in tmp_path.iterdir()] == ["thesis.txt"]
+    """Every other fault of a folder is tested where runs and sweeps claim theirs."""
 
-    @pytest.mark.parametrize("name", ["accuracy.json", "accuracy.png"])
-    @pytest.mark.parametrize("content", ["{}", "[1]", "no JSON"])
-    def test_foreign_files_of_the_same_name_stay(self, tmp_path, name, content):
-        (tmp_path / name).write_text(content)
-        with pytest.raises(ConfigError, match="holds no accuracy benchmark"):
-            BenchFolder(tmp_path).claim("a: 1\n")
-        assert (tmp_path / name).read_text() == content
+    @pytest.mark.parametrize("name", ["thesis.txt", "accuracy.json", "accuracy.png"])
+    def test_foreign_files_stay(self, config, tmp_path, name):
+        (tmp_path / name).write_text("mine")
+        with pytest.raises(ConfigError, match="is not empty and holds no benchmark"):
+            accuracy.BenchFolder(tmp_path).claim(config)
+        assert (tmp_path / name).read_text() == "mine"
+        assert [p.name for p in tmp_path.iterdir()] == [name]
 
-    def test_done_anew_only_with_the_same_configuration(self, tmp_path):
-        folder = BenchFolder(tmp_path / "deep" / "new")
-        folder.claim("a: 1\n")
-        folder.finish({"bench": "accuracy", "config": "a: 1\n"}, b"picture")
-        folder.claim("a: 1\n")
-        with pytest.raises(ConfigError, match="the benchmark of another configuration"):
-            folder.claim("a: 2\n")
+    def test_done_anew_only_with_the_same_configuration(self, config, tmp_path):
+        folder = accuracy.BenchFolder(tmp_path / "deep" / "new")
+        folder.claim(config)
+        folder.finish({"bench": "accuracy"}, b"picture")
+        folder.claim(config)
+        with pytest.raises(ConfigError, match="a benchmark of another configuration"):
+            folder.claim(config.model_copy(update={"seed": 7}))
 
-    def test_a_file_in_the_way(self, tmp_path):
+    def test_a_file_in_the_way(self, config, tmp_path):
         (tmp_path / "file").write_text("mine")
-        with pytest.raises(ConfigError, match="cannot be written to as a folder"):
-            BenchFolder(tmp_path / "file").claim("a: 1\n")
+        with pytest.raises(ConfigError, match="cannot be made a folder"):
+            accuracy.BenchFolder(tmp_path / "file").claim(config)

@@ -1,5 +1,8 @@
 """A study of some ten milliseconds, once compiled, for sweeps of many points."""
 
+import json
+import os
+import signal
 from pathlib import Path
 
 from thincam_jax.commands.study.config import StudyConfig, load_config
@@ -51,3 +54,14 @@ def outcome(number: float) -> Outcome:
 
 def ignore(ended: int, failed: int) -> None:
     """Progress that nobody watches."""
+
+
+def deadly_measure(text: str, double: bool) -> Outcome:
+    """In place of `measure_point`: seed 3 kills its worker, 4 raises."""
+    seed = json.loads(text)["seed"]
+    if seed == 3:
+        os.kill(os.getpid(), signal.SIGKILL)
+    if seed == 4:
+        raise ZeroDivisionError("four")
+    print("not a result")
+    return outcome(seed)

@@ -10,7 +10,7 @@ from commands.sweep import mini
 from commands.test_cli import call, one_line
 
 from helpers import ROOT
-from thincam_jax.commands.sweep import cluster, command, run
+from thincam_jax.commands.sweep import command, run, scheduler
 from thincam_jax.commands.sweep.run import Swept
 
 
@@ -122,7 +122,7 @@ class TestExitCode2:
             assert part in one_line(call("sweep", file, "--grid", "seed=1", "--out", path))
 
     def test_scheduler_that_does_not_answer(self, file, tmp_path, monkeypatch):
-        monkeypatch.setattr(cluster, "_CONNECT_SECONDS", 0.5)
+        monkeypatch.setattr(scheduler, "_CONNECT_SECONDS", 0.5)
         options = ("--grid", "seed=1", "--scheduler", "tcp://127.0.0.1:1")
         line = one_line(call("sweep", file, *options, "--out", tmp_path / "out"))
         assert line.startswith("--scheduler tcp://127.0.0.1:1: no scheduler answers there; ")
@@ -132,10 +132,13 @@ class TestExitCode2:
             return None if name in ("distributed", "pyarrow") else importlib.util.find_spec(name)
 
         monkeypatch.setattr(command, "find_spec", without)
-        assert one_line(call("sweep", file, "--grid", "seed=1")) == (
-            "thincam sweep needs distributed, pyarrow; install them with "
-            "pip install 'thincam_jax[sweep]'"
-        )
+        for options, missing in (
+            ((), "pyarrow"),
+            (("--scheduler", "tcp://a:1"), "distributed, pyarrow"),
+        ):
+            assert one_line(call("sweep", file, "--grid", "seed=1", *options)) == (
+                f"thincam sweep needs {missing}; install them with pip install 'thincam_jax[sweep]'"
+            )
 
 
 def test_help():

@@ -18,10 +18,10 @@ from commands.test_cli import call
 
 from helpers import ROOT
 from thincam_jax.commands.sweep import run
-from thincam_jax.commands.sweep.cluster import Died
 from thincam_jax.commands.sweep.folder import SweepFolder
 from thincam_jax.commands.sweep.measure import Outcome
 from thincam_jax.commands.sweep.run import run_sweep
+from thincam_jax.commands.sweep.workers import Died
 
 
 @pytest.fixture
@@ -41,13 +41,12 @@ def at_once(monkeypatch):
     """In place of workers: results in the order of the list; returns the keys that were done."""
     results, done = {}, []
 
-    def outcomes(_, measure, tasks):
+    def outcomes(measure, tasks):
         for key in tasks:
             done.append(key)
             yield key, results.get(key, mini.outcome(1))
 
-    monkeypatch.setattr(run, "connected", lambda *_: contextlib.nullcontext())
-    monkeypatch.setattr(run, "outcomes", outcomes)
+    monkeypatch.setattr(run, "connected", lambda *_: contextlib.nullcontext(outcomes))
     return results, done
 
 
@@ -106,23 +105,16 @@ def test_interrupt_keeps_what_has_ended(config, folder, at_once):
     assert run_sweep(mini.points(config, "seed=0:5:6"), folder, mini.ignore).rows == 6
 
 
-def test_workers_that_die_and_points_that_raise(config, folder):
+def test_workers_that_die_and_points_that_raise(config, folder, monkeypatch):
     """On two processes; the points beside those that kill their worker are not lost."""
-
-    def measure(text, _):  # sent by value: workers do not know the tests
-        import json
-        import os
-        import signal
-
-        seed = json.loads(text)["seed"]
-        if seed == 3:
-            os.kill(os.getpid(), signal.SIGKILL)
-        if seed == 4:
-            raise ZeroDivisionError("four")
-        return Outcome({"psnr_db/single/star": float(seed), "seconds": 0.0})
-
+    paths = (ROOT, ROOT / "tests", *filter(None, [os.environ.get("PYTHONPATH")]))
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(map(str, paths)))
     swept = run_sweep(
-        mini.points(config, "seed=0:7:8"), folder, mini.ignore, workers=2, measure=measure
+        mini.points(config, "seed=0:7:8"),
+        folder,
+        mini.ignore,
+        workers=2,
+        measure=mini.deadly_measure,
     )
     assert (swept.points, swept.rows) == (8, 6)
     assert [row["psnr_db/single/star"] for row in rows(folder.path)] == [0, 1, 2, 5, 6, 7]
@@ -172,8 +164,11 @@ def kill_half_way(file: Path, out: Path, grid: str, half: int) -> None:
         while len(list(out.glob("points/*.parquet"))) < half:
             assert process.poll() is None, "it ended before half of its points"
             time.sleep(0.01)
-        workers = psutil.Process(process.pid).children(recursive=True)
+        parent = psutil.Process(process.pid)
+        workers = parent.children(recursive=True)
         assert workers
+        # A port would let any user of this machine run code as this one.
+        assert not [c for p in (parent, *workers) for c in p.net_connections("inet")]
     finally:
         process.kill()
         process.wait()

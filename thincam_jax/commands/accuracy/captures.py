@@ -8,11 +8,14 @@ import numpy as np
 
 from thincam_jax._core.grids import Grid
 from thincam_jax._core.precision import Precision, allow, cast
-from thincam_jax.commands.accuracy.cameras import conditions_of, psf_of
-from thincam_jax.commands.accuracy.norms import contrast_error, relative_error
-from thincam_jax.commands.accuracy.psfs import words
-from thincam_jax.commands.accuracy.rig import Rig
-from thincam_jax.commands.accuracy.ways import why_not
+from thincam_jax.commands.accuracy.cameras import (
+    Case,
+    conditions_of,
+    contrast_error,
+    psf_of,
+    relative_error,
+)
+from thincam_jax.commands.accuracy.psfs import why_not, words
 from thincam_jax.commands.study.build import Setting
 from thincam_jax.imaging.scene import Spectrum
 from thincam_jax.lensless.cost import psf_cost
@@ -20,7 +23,7 @@ from thincam_jax.lensless.exposure import imaging_operator, project, projected_s
 from thincam_jax.lensless.psf import MODELS, Model, sampling_of
 
 
-def capture_rows(rig: Rig, progress: Callable[[str], None]) -> list[dict[str, Any]]:
+def capture_rows(case: Case, progress: Callable[[str], None]) -> list[dict[str, Any]]:
     """A row for every model, in float32, of the method's first exposure.
 
     - `psf_error`: of the PSF over the sensor.
@@ -30,17 +33,17 @@ def capture_rows(rig: Rig, progress: Callable[[str], None]) -> list[dict[str, An
 
     All are relative to separable in float64.
     """
-    setting, reach = rig.settings[0], rig.kernel_shape
-    reference = clean_capture(rig, setting)
-    exact = [psf_of(rig.config, setting, shape=shape) for shape in (None, reach)]
+    setting, reach = case.settings[0], case.kernel_shape
+    reference = clean_capture(case, setting)
+    exact = [psf_of(case.config, setting, shape=shape) for shape in (None, reach)]
     rows = []
     for model in MODELS:
         progress(f"capture: {words(model)}")
-        reason = kernel_reason(rig, setting, model)
+        reason = kernel_reason(case, setting, model)
         row: dict[str, Any] = {"model": model, "status": "not run", "reason": reason}
         if reason is None:
-            image = clean_capture(rig, setting, model, "float32")
-            psfs = [psf_of(rig.config, setting, model, "float32", s) for s in (None, reach)]
+            image = clean_capture(case, setting, model, "float32")
+            psfs = [psf_of(case.config, setting, model, "float32", s) for s in (None, reach)]
             errors = [relative_error(h, h0) for h, h0 in zip(psfs, exact, strict=True)]
             row |= {
                 "status": "run",
@@ -54,7 +57,7 @@ def capture_rows(rig: Rig, progress: Callable[[str], None]) -> list[dict[str, An
 
 
 def clean_capture(
-    rig: Rig,
+    case: Case,
     setting: Setting,
     model: Model = "separable",
     precision: Precision = "float64",
@@ -65,9 +68,9 @@ def clean_capture(
     With `assumed`, the PSF is that of another camera; where the scene falls stays as it is.
     """
     with allow(precision):
-        camera = conditions_of(rig.config, setting)[precision].camera
-        blurring = conditions_of(rig.config, assumed or setting)[precision]
-        plane = cast(rig.plane, precision)
+        camera = conditions_of(case.config, setting)[precision].camera
+        blurring = conditions_of(case.config, assumed or setting)[precision]
+        plane = cast(case.plane, precision)
         shape = projected_shape(camera, plane)
         convolution = imaging_operator(
             blurring.camera,
@@ -75,17 +78,17 @@ def clean_capture(
             blurring.object_distance,
             field_shape=shape,
             model=model,
-            pixel_integration=rig.config.pixel_integration,
+            pixel_integration=case.config.pixel_integration,
         )
         return np.asarray(convolution(project(camera, plane, shape)))
 
 
-def kernel_reason(rig: Rig, setting: Setting, model: Model) -> str | None:
+def kernel_reason(case: Case, setting: Setting, model: Model) -> str | None:
     """Why a model is not run for a capture; None where it is."""
     with allow("float64"):
-        given = conditions_of(rig.config, setting)["float64"]
-        whole = rig.config.pixel_integration
-        grid = Grid(rig.kernel_shape, jnp.asarray(given.camera.sensor.pitch))
+        given = conditions_of(case.config, setting)["float64"]
+        whole = case.config.pixel_integration
+        grid = Grid(case.kernel_shape, jnp.asarray(given.camera.sensor.pitch))
         shape, samples = sampling_of(given.camera, grid, model, whole, None, None)
         cost = psf_cost(
             given.camera.mask,

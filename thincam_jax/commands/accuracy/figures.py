@@ -1,14 +1,13 @@
 """The picture of the benchmark: errors against times, and what an error costs."""
 
 import io
-from typing import Any, NamedTuple
+from typing import Any
 
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from thincam_jax.commands.accuracy.labels import place_labels
 from thincam_jax.commands.accuracy.psfs import label, words
 
 # Models are told apart by marker, precisions by filling, sizes by grey.
@@ -33,72 +32,48 @@ _LINEAR_DB = 0.01  # losses below this are drawn to a linear scale
 Point = tuple[float, float]
 
 
-class Drawn(NamedTuple):
-    """Points of a panel that get names, and paths that the names keep clear of."""
-
-    points: list[Point]
-    names: list[str]
-    paths: list[list[Point]]
-
-
 def draw(results: dict[str, Any]) -> bytes:
     """The figure as a PNG file."""
-    figure = Figure(figsize=(13.5, 7.2), layout="constrained")
+    figure = Figure(figsize=(13.5, 7.6), layout="constrained")
     FigureCanvasAgg(figure)
     panels = figure.subplot_mosaic(
         [["times", "captures"], ["times", "losses"]], width_ratios=(1.45, 1)
     )
     panels["losses"].sharex(panels["captures"])
-    timed = _draw_times(panels["times"], results)
-    captured = _draw_captures(panels["captures"], results)
-    lost = _draw_losses(panels["losses"], results)
-    figure.draw_without_rendering()
-    figure.set_layout_engine("none")  # labels are placed in what stays
-    for name, (points, names, lines) in zip(
-        ("times", "captures", "losses"), (timed, captured, lost), strict=True
-    ):
-        place_labels(panels[name], points, names, lines=lines)
+    _draw_times(panels["times"], results)
+    _draw_captures(panels["captures"], results)
+    _draw_losses(panels["losses"], results)
+    figure.legend(handles=_legend(results), loc="outside lower center", ncols=5, fontsize=9)
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=110)
     return buffer.getvalue()
 
 
-def shown_error(row: dict[str, Any]) -> float:
-    """The reference has no error but what its own rounding is predicted to leave."""
-    return row["true_error"] or row["predicted_error"] or 1e-16
-
-
-def _draw_times(ax: Axes, results: dict[str, Any]) -> Drawn:
-    """Error against time, and the front of each size."""
+def _draw_times(ax: Axes, results: dict[str, Any]) -> None:
+    """Error against time; the candidates of each size that are worth choosing are joined."""
     run = [row for row in results["psfs"] if row["status"] == "run"]
     shown = [row for row in run if row["true_error"] <= _WORST]
-    shapes = sorted({tuple(row["shape"]) for row in run}, reverse=True)
-    fronts = [_front(shown, shape) for shape in shapes]
-    for row in shown:
-        rank = shapes.index(tuple(row["shape"]))
-        _draw_way(ax, row, _grey(rank), zorder=5 - rank)
-    for rank, front in enumerate(fronts):
-        path = [_time_point(row) for row in front]
+    floor = min((row["true_error"] for row in run if row["true_error"]), default=1e-16) / 10
+    for rank, shape in enumerate(_shapes(results)):
+        rows = [row for row in shown if tuple(row["shape"]) == shape]
+        for row in rows:
+            _draw_candidate(ax, row, floor, _grey(rank), zorder=5 - rank)
+        front = sorted(_time_point(row, floor) for row in rows if row["worth_choosing"])
         width = 1.6 if rank == 0 else 1.0
-        ax.plot(*zip(*path, strict=True), "-", linewidth=width, color=_grey(rank), zorder=1)
+        ax.plot(*zip(*front, strict=True), "-", linewidth=width, color=_grey(rank), zorder=1)
     ax.set_xscale("log")
     ax.set_yscale("log")
     ax.margins(x=0.1, y=0.08)
     ax.set_xlabel("time of one PSF, compiled (s)")
     ax.set_ylabel("relative L2 error of the PSF over the sensor")
     ax.grid(alpha=0.25)
-    ax.legend(handles=_legend(shown, shapes), fontsize=8.5, loc="lower right", framealpha=1)
     _titles(ax, results)
     _tell_the_worst(ax, [row for row in run if row not in shown])
-    names = [
-        label(r["model"], r["precision"], r["oversampling"])
-        + ("\n(reference)" if r["true_error"] == 0 else "")
-        for r in fronts[0]
-    ]
-    # Labels keep off the other points too: each is a path of one point.
-    paths = [[_time_point(row)] * 2 for row in shown]
-    paths += [[_time_point(row) for row in front] for front in fronts]
-    return Drawn([_time_point(row) for row in fronts[0]], names, paths)
+
+
+def _shapes(results: dict[str, Any]) -> list[tuple[int, ...]]:
+    """The sizes of the sensor, the largest first."""
+    return sorted({tuple(row["shape"]) for row in results["psfs"]}, reverse=True)
 
 
 def _tell_the_worst(ax: Axes, rows: list[dict[str, Any]]) -> None:
@@ -119,15 +94,16 @@ def _titles(ax: Axes, results: dict[str, Any]) -> None:
     ax.set_title(
         f"{results['settings']['study']}: β = {camera['beta_rad_per_mm2']:g} rad/mm², "
         f"d = {camera['distance_mm']:g} mm, on {device['device_kind']} ({device['cores']} cores)\n"
-        "joined: worth choosing, nothing is both faster and more accurate",
+        "joined: worth choosing, nothing is both faster and more accurate\n"
+        "reference: separable in float64, its error of 0 drawn at the bottom",
         fontsize=10,
         loc="left",
     )
 
 
-def _draw_way(ax: Axes, row: dict[str, Any], colour: str, zorder: int) -> None:
+def _draw_candidate(ax: Axes, row: dict[str, Any], floor: float, colour: str, zorder: int) -> None:
     ax.plot(
-        *_time_point(row),
+        *_time_point(row, floor),
         marker=_marker(row),
         color=colour,
         markerfacecolor=colour if row["precision"] == "float32" else "white",
@@ -137,13 +113,9 @@ def _draw_way(ax: Axes, row: dict[str, Any], colour: str, zorder: int) -> None:
     )
 
 
-def _front(run: list[dict[str, Any]], shape: tuple[int, ...]) -> list[dict[str, Any]]:
-    front = [r for r in run if tuple(r["shape"]) == shape and r["worth_choosing"]]
-    return sorted(front, key=lambda row: row["seconds"])
-
-
-def _time_point(row: dict[str, Any]) -> Point:
-    return row["seconds"], shown_error(row)
+def _time_point(row: dict[str, Any], floor: float) -> Point:
+    """Time and error; `floor` in place of the reference's error of 0."""
+    return row["seconds"], row["true_error"] or floor
 
 
 def _grey(rank: int) -> str:
@@ -154,11 +126,14 @@ def _marker(row: dict[str, Any]) -> str:
     return _MARKERS[row["model"], row["oversampling"]]
 
 
-def _legend(run: list[dict[str, Any]], shapes: list[tuple[int, ...]]) -> list[Line2D]:
+def _legend(results: dict[str, Any]) -> list[Line2D]:
+    """Of all panels."""
+
     def mark(text: str, **style) -> Line2D:
         return Line2D([], [], linestyle="none", markersize=7, label=text, **style)
 
-    used = [way for way in _MARKERS if any((r["model"], r["oversampling"]) == way for r in run)]
+    run = [row for row in results["psfs"] if row["status"] == "run"]
+    used = {(row["model"], row["oversampling"]) for row in run}
     handles = [
         mark(words(model) + (f" ×{samples}" if samples else ""), marker=marker, color="black")
         for (model, samples), marker in _MARKERS.items()
@@ -166,16 +141,16 @@ def _legend(run: list[dict[str, Any]], shapes: list[tuple[int, ...]]) -> list[Li
     ]
     handles.append(mark("filled: float32", marker="o", color="black"))
     handles.append(mark("open: float64", marker="o", color="black", markerfacecolor="white"))
-    for rank, (rows, columns) in enumerate(shapes):
+    for rank, (rows, columns) in enumerate(_shapes(results)):
         handles.append(Line2D([], [], color=_grey(rank), label=f"{rows}×{columns} pixels"))
     return handles
 
 
-def _draw_captures(ax: Axes, results: dict[str, Any]) -> Drawn:
+def _draw_captures(ax: Axes, results: dict[str, Any]) -> None:
     """Error of a capture without its mean against that of the PSF."""
     run = [row for row in results["captures"] if row["status"] == "run"]
     points = [(row["psf_error"], row["contrast_error"]) for row in run]
-    lines = _draw_wrong(ax, results, "capture_contrast_error")
+    _draw_wrong(ax, results, "capture_contrast_error")
     _draw_models(ax, run, points)
     ax.set_yscale("log")
     ax.set_ylabel("relative error of the capture\nwithout its mean")
@@ -183,16 +158,15 @@ def _draw_captures(ax: Axes, results: dict[str, Any]) -> Drawn:
     title = f"{results['settings']['target']}, {rows}×{columns} pixels, captured"
     ax.set_title(title, fontsize=10, loc="left")
     _finish_cost(ax)
-    return Drawn(points, [words(row["model"]) for row in run], lines)
 
 
-def _draw_losses(ax: Axes, results: dict[str, Any]) -> Drawn:
+def _draw_losses(ax: Axes, results: dict[str, Any]) -> None:
     """PSNR lost against the error of the assumed PSF."""
     found = results["reconstructions"]
     if found["skipped"]:
         ax.set_axis_off()
         ax.text(0.5, 0.5, f"no reconstruction:\n{found['skipped']}", ha="center", fontsize=10)
-        return Drawn([], [], [])
+        return
     run = [row for row in found["models"] if row["status"] == "run"]
     points = [(row["psf_error"], row["psnr_lost_db"]) for row in run]
     lines = _draw_wrong(ax, results, "psnr_lost_db")
@@ -211,8 +185,6 @@ def _draw_losses(ax: Axes, results: dict[str, Any]) -> Drawn:
         loc="left",
     )
     _finish_cost(ax)
-    lines.append([(x, 0.0) for x in ax.get_xlim()])
-    return Drawn(points, [words(row["model"]) for row in run], lines)
 
 
 def _draw_wrong(ax: Axes, results: dict[str, Any], quantity: str) -> list[list[Point]]:

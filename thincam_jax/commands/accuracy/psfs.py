@@ -1,21 +1,89 @@
 """Errors and times of every way of computing the PSF."""
 
+import statistics
+import time
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
-from thincam_jax._core.precision import allow
-from thincam_jax.commands.accuracy.cameras import Conditions, conditions_of, psf_of
-from thincam_jax.commands.accuracy.norms import relative_error
-from thincam_jax.commands.accuracy.pareto import worth_choosing
-from thincam_jax.commands.accuracy.sizes import binned
-from thincam_jax.commands.accuracy.timing import measure
-from thincam_jax.commands.accuracy.ways import Way, all_ways, why_not
+import jax
+import numpy as np
+
+from thincam_jax._core.memory import available_bytes, readable
+from thincam_jax._core.precision import PRECISIONS, Precision, allow, itemsize_of
+from thincam_jax.commands.accuracy.cameras import (
+    Conditions,
+    binned,
+    conditions_of,
+    psf_of,
+    relative_error,
+)
 from thincam_jax.commands.study.build import Setting
 from thincam_jax.commands.study.config import StudyConfig
 from thincam_jax.lensless.accuracy.select import predicted_error, probe_of
-from thincam_jax.lensless.psf import psf
+from thincam_jax.lensless.camera import LenslessCamera
+from thincam_jax.lensless.cost import Cost, psf_cost
+from thincam_jax.lensless.propagation.closed_form import in_focus
+from thincam_jax.lensless.psf import MODELS, SAMPLED, Model, psf, sampling_of
 
 Progress = Callable[[str], None]
+
+OVERSAMPLINGS = (1, 3)
+# Operations of a direct sum that take some seconds; it is not run beyond.
+DIRECT_SUM_LIMIT = 2e10
+# A median of at most so many calls, and no further one once they took so many seconds.
+_MOST_CALLS, _SECONDS = 15, 0.5
+# A call that takes longer than this needs no warming up: it is itself the measurement.
+_LONG = 1.0
+_GAIN = 0.05  # a smaller error by less than this part is no gain
+
+
+class Candidate(NamedTuple):
+    """One way of computing a PSF.
+
+    - `model`, `precision`, `oversampling`, `mask_shape`: as `psf` takes them; the last two are None
+      for the closed forms.
+    - `cost`: predicted operations and memory.
+    """
+
+    model: Model
+    precision: Precision
+    oversampling: int | None
+    mask_shape: tuple[int, int] | None
+    cost: Cost
+
+
+def candidates(camera: LenslessCamera, pixel_integration: bool) -> list[Candidate]:
+    """Every model in both precisions, the sampled ones at each oversampling."""
+    grid = camera.sensor.grid
+    found = []
+    for model in MODELS:
+        for oversampling in OVERSAMPLINGS if model in SAMPLED else (None,):
+            shape, samples = sampling_of(camera, grid, model, pixel_integration, oversampling, None)
+            for precision in PRECISIONS:
+                cost = psf_cost(
+                    camera.mask,
+                    grid,
+                    model,
+                    pixel_integration=pixel_integration,
+                    mask_shape=shape,
+                    oversampling=samples,
+                    itemsize=itemsize_of(precision),
+                )
+                found.append(Candidate(model, precision, oversampling, shape, cost))
+    return found
+
+
+def why_not(model: Model, cost: Cost, given: Conditions) -> str | None:
+    """Why a model is not run under given conditions; None where it is."""
+    if model == "rayleigh_sommerfeld" and cost.flops > DIRECT_SUM_LIMIT:
+        return f"a direct sum of {cost.flops:.1e} operations, above {DIRECT_SUM_LIMIT:.0e}"
+    free = available_bytes()
+    if free is not None and cost.bytes > free:
+        return f"needs about {readable(cost.bytes)}, {readable(free)} are free"
+    path = given.camera.path(given.wavelength, given.object_distance)
+    if model == "closed_form" and in_focus(given.camera.mask, path):
+        return "has no PSF: an order of the mask focuses on the sensor"
+    return None
 
 
 def psf_rows(
@@ -36,27 +104,35 @@ def psf_rows(
         exact = given["float64"]
         probe = probe_of(*exact, whole, None)
         grid = exact.camera.sensor.grid
-        for way in all_ways(exact.camera, whole):
-            progress(f"{size} pixels: {label(way.model, way.precision, way.oversampling)}")
-            row = _described(config, way, why_not(way.model, way.cost, exact))
+        for one in candidates(exact.camera, whole):
+            how = one.model, one.precision, one.oversampling
+            progress(f"{size} pixels: {label(*how)}")
+            row = _described(config, one, why_not(one.model, one.cost, exact))
             if row["status"] == "run":
-                row["predicted_error"] = predicted_error(
-                    probe, exact.camera, grid, way.model, way.precision, way.oversampling
-                )
-                row |= _measured(given[way.precision], way, whole, reference)
+                row["predicted_error"] = predicted_error(probe, exact.camera, grid, *how)
+                row |= _measured(given[one.precision], one, whole, reference)
             rows.append(row)
-    run = [row for row in rows if row["status"] == "run"]
-    flags = worth_choosing([r["true_error"] for r in run], [r["seconds"] for r in run])
-    for row, flag in zip(run, flags, strict=True):
-        row["worth_choosing"] = flag
+    mark_front([row for row in rows if row["status"] == "run"])
     return rows
 
 
-def way_count(config: StudyConfig, setting: Setting) -> int:
+def mark_front(rows: list[dict[str, Any]]) -> None:
+    """Set `worth_choosing` where no other row is as fast and as accurate: the Pareto front.
+
+    Errors within 5 % of each other count as equal, so that the last digits of a model's error do
+    not make its slower precision worth choosing. Of rows that are equal in both the first is.
+    """
+    best = float("inf")
+    for row in sorted(rows, key=lambda row: (row["seconds"], row["true_error"])):
+        row["worth_choosing"] = row["true_error"] < (1 - _GAIN) * best
+        best = row["true_error"] if row["worth_choosing"] else best
+
+
+def candidate_count(config: StudyConfig, setting: Setting) -> int:
     """How many rows a size has."""
     with allow("float64"):
         camera = conditions_of(config, setting)["float64"].camera
-        return len(all_ways(camera, config.pixel_integration))
+        return len(candidates(camera, config.pixel_integration))
 
 
 def label(model: str, precision: str, oversampling: int | None) -> str:
@@ -70,13 +146,13 @@ def words(model: str) -> str:
     return model.replace("rayleigh_s", "Rayleigh-S").replace("_", " ")
 
 
-def _described(config: StudyConfig, way: Way, reason: str | None) -> dict[str, Any]:
+def _described(config: StudyConfig, candidate: Candidate, reason: str | None) -> dict[str, Any]:
     return {
         "shape": list(config.sensor.shape),
         "pitch_mm": config.sensor.pitch,
-        "model": way.model,
-        "precision": way.precision,
-        "oversampling": way.oversampling,
+        "model": candidate.model,
+        "precision": candidate.precision,
+        "oversampling": candidate.oversampling,
         "status": "run" if reason is None else "not run",
         "reason": reason,
         "true_error": None,
@@ -84,23 +160,23 @@ def _described(config: StudyConfig, way: Way, reason: str | None) -> dict[str, A
         "seconds": None,
         "compile_seconds": None,
         "calls": 0,
-        "flops": way.cost.flops,
-        "bytes": way.cost.bytes,
+        "flops": candidate.cost.flops,
+        "bytes": candidate.cost.bytes,
         "worth_choosing": False,
     }
 
 
-def _measured(given: Conditions, way: Way, pixel_integration: bool, reference) -> dict:
+def _measured(given: Conditions, candidate: Candidate, pixel_integration: bool, reference) -> dict:
     def compute(camera, wavelength, object_distance):
         return psf(
             camera,
             wavelength=wavelength,
             object_distance=object_distance,
-            model=way.model,
+            model=candidate.model,
             pixel_integration=pixel_integration,
-            oversampling=way.oversampling,
-            mask_shape=way.mask_shape,
-            precision=way.precision,
+            oversampling=candidate.oversampling,
+            mask_shape=candidate.mask_shape,
+            precision=candidate.precision,
         )
 
     timing = measure(compute, *given)
@@ -110,3 +186,36 @@ def _measured(given: Conditions, way: Way, pixel_integration: bool, reference) -
         "compile_seconds": timing.compile_seconds,
         "calls": timing.calls,
     }
+
+
+class Timing(NamedTuple):
+    """How long one call takes, and what it gives.
+
+    - `result`: of the call.
+    - `seconds`: median over `calls` calls after one that does not count, each waited for; of a
+      call that takes more than a second, that of the first.
+    - `compile_seconds`: tracing and compilation, once, s.
+    """
+
+    result: np.ndarray
+    seconds: float
+    compile_seconds: float
+    calls: int
+
+
+def measure(function, *arguments: Any) -> Timing:
+    """Compile a function of arrays and time it."""
+    start = time.perf_counter()
+    compiled = jax.jit(function).lower(*arguments).compile()
+    compile_seconds = time.perf_counter() - start
+    result, first = _timed(compiled, arguments)
+    taken = [first] if first > _LONG else []
+    while len(taken) < _MOST_CALLS and sum(taken) < _SECONDS:
+        taken.append(_timed(compiled, arguments)[1])
+    return Timing(np.asarray(result), statistics.median(taken), compile_seconds, len(taken))
+
+
+def _timed(compiled, arguments) -> tuple[Any, float]:
+    start = time.perf_counter()
+    result = jax.block_until_ready(compiled(*arguments))
+    return result, time.perf_counter() - start

@@ -10,7 +10,7 @@ from thincam_jax.commands.photo.options import Background, Output, Recipe, Sourc
 from thincam_jax.commands.photo.run import Failed, Finished, run_jobs
 from thincam_jax.commands.terminal import INTERRUPTED, WRONG_INPUT, progress_bar, tell
 from thincam_jax.measured import MeasurementError
-from thincam_jax.measured.display import WhiteBalance
+from thincam_jax.measured.write import WhiteBalance
 from thincam_jax.reconstruction import Progress
 
 

@@ -9,7 +9,8 @@ import typer
 
 from thincam_jax.commands.terminal import WRONG_INPUT, Overrides, progress_bar, tell, told
 
-_PARTS = ("dask", "distributed", "pyarrow")
+_PARTS = ("pyarrow",)
+_SCHEDULER_PARTS = ("dask", "distributed", "pyarrow")
 
 Grid = Annotated[
     list[str] | None,
@@ -78,7 +79,8 @@ class _Ended:
 def _check(scheduler: str | None, workers: int | None) -> None:
     from thincam_jax.commands.config_file import ConfigError
 
-    missing = [name for name in _PARTS if find_spec(name) is None]
+    parts = _SCHEDULER_PARTS if scheduler else _PARTS
+    missing = [name for name in parts if find_spec(name) is None]
     if missing:
         raise ConfigError(
             f"thincam sweep needs {', '.join(missing)}; install them with "

@@ -1,12 +1,13 @@
 """Running a sweep: the points that the folder does not hold yet, into the folder."""
 
-from collections.abc import Callable, Sequence
+import contextlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
-from thincam_jax.commands.sweep.cluster import Died, connected, outcomes
 from thincam_jax.commands.sweep.folder import SweepFolder
 from thincam_jax.commands.sweep.measure import Outcome, measure_point, one_line
 from thincam_jax.commands.sweep.point import Point
+from thincam_jax.commands.sweep.workers import Died, Outcomes, local_workers
 
 Progress = Callable[[int, int], object]
 
@@ -44,12 +45,40 @@ def run_sweep(
             if point.config is None:
                 folder.keep(point, count.ended(Outcome(None, point.reason)))
         if runnable:
-            with connected(scheduler, workers, len(runnable)) as client:
-                for key, result in outcomes(client, measure, runnable):
+            with connected(scheduler, workers, len(runnable)) as outcomes:
+                for key, result in _tried_twice(outcomes, measure, runnable):
                     folder.keep(todo[key], count.ended(_outcome(result)))
     finally:
         rows, failures = folder.collect(points)
     return Swept(len(points), rows, failures)
+
+
+def connected(
+    scheduler: str | None, workers: int | None, tasks: int
+) -> contextlib.AbstractContextManager[Outcomes]:
+    """The scheduler's workers, or that many new ones here."""
+    if scheduler is None:
+        return local_workers(workers, tasks)
+    from thincam_jax.commands.sweep.scheduler import scheduled_workers  # needs dask
+
+    return scheduled_workers(scheduler)
+
+
+def _tried_twice(
+    outcomes: Outcomes, measure: Callable, tasks: Mapping[str, tuple]
+) -> Iterator[tuple[str, Any]]:
+    """A task whose worker died is done once more when no other is under way.
+
+    If that dies too, the death is the task's own: not of a memory that others had filled.
+    """
+    suspects = []
+    for name, result in outcomes(measure, tasks):
+        if isinstance(result, Died):
+            suspects.append(name)
+        else:
+            yield name, result
+    for name in suspects:
+        yield from outcomes(measure, {name: tasks[name]})
 
 
 class _Count:

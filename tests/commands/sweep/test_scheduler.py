@@ -1,4 +1,4 @@
-"""Workers and schedulers: those of another process, that are not there, and that go away."""
+"""Schedulers: one of another process, one without workers, and what is none."""
 
 import logging
 import socket
@@ -7,12 +7,12 @@ import distributed
 import pytest
 
 from thincam_jax.commands.study.config import ConfigError
-from thincam_jax.commands.sweep import cluster
-from thincam_jax.commands.sweep.cluster import connected, outcomes
+from thincam_jax.commands.sweep import scheduler as schedulers
+from thincam_jax.commands.sweep.scheduler import scheduled_workers
 
 
 def fault(address):
-    with pytest.raises(ConfigError) as caught, connected(address, None, 1):
+    with pytest.raises(ConfigError) as caught, scheduled_workers(address):
         pass
     (line,) = str(caught.value).splitlines()
     return line
@@ -21,7 +21,7 @@ def fault(address):
 @pytest.fixture
 def scheduler(monkeypatch):
     """A scheduler with no worker yet."""
-    monkeypatch.setattr(cluster, "_CONNECT_SECONDS", 1)
+    monkeypatch.setattr(schedulers, "_CONNECT_SECONDS", 1)
     with distributed.LocalCluster(
         n_workers=0,
         threads_per_worker=1,
@@ -40,15 +40,15 @@ def test_scheduler_that_runs_already(scheduler):
         f"--scheduler {address}: has no workers; start some with 'dask worker {address}'"
     )
     scheduler.scale(1)
-    with connected(address, None, 1) as client:
-        found = dict(outcomes(client, divmod, {"fine": (7, 2), "broken": (7, 0)}))
+    with scheduled_workers(address) as outcomes:
+        found = dict(outcomes(divmod, {"fine": (7, 2), "broken": (7, 0)}))
     assert found["fine"] == (3, 1)
     assert isinstance(found["broken"], ZeroDivisionError)
     scheduler.scale(0)
 
 
 def test_nobody_answers(monkeypatch):
-    monkeypatch.setattr(cluster, "_CONNECT_SECONDS", 0.5)
+    monkeypatch.setattr(schedulers, "_CONNECT_SECONDS", 0.5)
     level = logging.getLogger("distributed").level
     for address in ("tcp://127.0.0.1:1", "nonsense", "http://127.0.0.1:1", "tcp://"):
         line = fault(address)
@@ -58,7 +58,7 @@ def test_nobody_answers(monkeypatch):
 
 def test_somebody_else_answers(monkeypatch):
     """A port that takes the connection and says nothing."""
-    monkeypatch.setattr(cluster, "_CONNECT_SECONDS", 0.5)
+    monkeypatch.setattr(schedulers, "_CONNECT_SECONDS", 0.5)
     with socket.create_server(("127.0.0.1", 0)) as server:
         line = fault(f"tcp://127.0.0.1:{server.getsockname()[1]}")
     assert ": no scheduler answers there; " in line
