@@ -9,7 +9,7 @@ import pytest
 import thincam_jax as tc
 from helpers import finite_difference, relative_l2
 from thincam_jax.imaging.operators import kernel_grid
-from thincam_jax.lensless.exposure import imaging_operator, projected_shape
+from thincam_jax.lensless.forward import imaging_operator, projected_shape
 from thincam_jax.units import nm, um
 
 # 1.6 mm × 1.92 mm of sensor; β·(width/2)² = 36 rad, zones at the edge of 9.5 cycles/mm (Nyquist 25)

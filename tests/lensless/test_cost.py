@@ -174,8 +174,8 @@ PROCESS = """
     import importlib, json, sys
     import jax, jax.numpy as jnp
     import thincam_jax as tc
-    from thincam_jax.cost import psf_cost
-    from thincam_jax.psf import sampling_of
+    from thincam_jax.lensless.cost import psf_cost
+    from thincam_jax.lensless.psf import sampling_of
 
     def held(name):
         lines = open("/proc/self/status").read().splitlines()

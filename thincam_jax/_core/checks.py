@@ -3,14 +3,22 @@
 Traced values cannot be looked at and pass; they were checked when the object was built.
 """
 
-from collections.abc import Iterable
-from typing import Any
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array
+from jaxtyping import Array, ArrayLike, Real
+
+# What users give: checked below, which tells a wrong value in one line, and not by its type.
+if TYPE_CHECKING:
+    Number = Real[ArrayLike, ""]
+    Numbers = Real[ArrayLike, "..."]
+    Shape = Sequence[int]
+else:
+    Number = Numbers = Shape = Any
 
 
 def is_traced(value: Any) -> bool:

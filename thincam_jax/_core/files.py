@@ -5,9 +5,9 @@ from pathlib import Path
 
 
 def write_whole(path: str | os.PathLike[str], content: bytes | str) -> Path:
-    """Write a file by way of a neighbour, `NAME.partial`, that is renamed; text as UTF-8.
+    """Write `NAME.partial` beside the file and rename it; text as UTF-8.
 
-    An error or Ctrl-C in between leaves what stood there before, and no neighbour.
+    After an error or Ctrl-C the old file is untouched and no partial one is left.
     """
     path = Path(path)
     partial = path.with_name(path.name + ".partial")

@@ -5,9 +5,10 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import scipy
-from jaxtyping import Array, Float
+from jaxtyping import Array, DTypeLike, Float
 
 from thincam_jax._core import checks
+from thincam_jax._core.checks import Number, Shape
 
 
 class Grid(eqx.Module):
@@ -23,7 +24,7 @@ class Grid(eqx.Module):
     shape: tuple[int, int] = eqx.field(static=True)
     pitch: Float[Array, ""]
 
-    def __init__(self, shape, pitch):
+    def __init__(self, shape: Shape, pitch: Number):
         self.shape = checks.shape2d("shape", shape)
         self.pitch = checks.positive("pitch", pitch, "mm")
 
@@ -52,7 +53,7 @@ class Grid(eqx.Module):
         return Grid(shape, self.pitch)
 
 
-def centred_indices(count: int, dtype) -> Float[Array, " count"]:
+def centred_indices(count: int, dtype: DTypeLike) -> Float[Array, " count"]:
     """i − (n−1)/2 for i = 0 … n−1: whole or half numbers, exact in every precision."""
     return jnp.arange(count, dtype=dtype) - (count - 1) / 2
 
@@ -68,7 +69,7 @@ def fast_shape(shape: tuple[int, int], *, real: bool = False) -> tuple[int, int]
     return rows, columns
 
 
-def same_parity(shape, sensor_shape) -> tuple[int, int]:
+def same_parity(shape: Shape, sensor_shape: tuple[int, int]) -> tuple[int, int]:
     """A field's shape, enlarged by at most one pixel to share its centre with the sensor."""
     shape = checks.shape2d("field_shape", shape)
     rows, columns = (n + (n - s) % 2 for n, s in zip(shape, sensor_shape, strict=True))

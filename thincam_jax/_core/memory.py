@@ -6,7 +6,7 @@ import jax
 
 
 def available_bytes() -> int | None:
-    """Free memory of the default device (of the machine, on a CPU); None if it cannot be told."""
+    """Free memory of the default device (of the machine, on a CPU); None where that is unknown."""
     device = jax.devices()[0]
     if device.platform == "cpu":
         try:

@@ -54,16 +54,16 @@ def product(first: Any, second: Any) -> Any:
 
 def cast(tree: Any, precision: Precision) -> Any:
     """The pytree with all its floating arrays, and plain floats, in one precision."""
-    wanted = jnp.dtype(precision)
+    target = jnp.dtype(precision)
 
     def convert(leaf):
         if isinstance(leaf, bool | int | str) or leaf is None:
             return leaf
         if isinstance(leaf, float):
-            return jnp.asarray(leaf, wanted)
+            return jnp.asarray(leaf, target)
         if jnp.issubdtype(leaf.dtype, jnp.complexfloating):
             return leaf.astype(jnp.complex128 if precision == "float64" else jnp.complex64)
-        return leaf.astype(wanted) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf
+        return leaf.astype(target) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf
 
     return jax.tree.map(convert, tree)
 

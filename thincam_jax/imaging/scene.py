@@ -1,11 +1,14 @@
 """What the camera looks at: flat images at distances, and the light they send."""
 
+from collections.abc import Iterable
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
+from thincam_jax._core.checks import Number, Numbers
 from thincam_jax._core.grids import Grid, cell_overlap
 from thincam_jax._core.precision import product
 
@@ -22,7 +25,7 @@ class ImagePlane(eqx.Module):
     distance: Float[Array, ""]
     width: Float[Array, ""]
 
-    def __init__(self, image, distance, width):
+    def __init__(self, image: Numbers, distance: Number, width: Number):
         if not checks.is_traced(image) and np.asarray(image).dtype.kind not in "fiub":
             raise TypeError(f"image is a {type(image).__name__}; give an array of real radiances")
         self.image = jnp.asarray(image)
@@ -76,7 +79,7 @@ class Spectrum(eqx.Module):
     wavelengths: Float[Array, " n"]
     weights: Float[Array, " n"]
 
-    def __init__(self, wavelengths, weights=None):
+    def __init__(self, wavelengths: Numbers, weights: Numbers | None = None):
         if np.ndim(wavelengths) > 1:
             raise ValueError(f"wavelengths has shape {np.shape(wavelengths)}; give a list of them")
         count = np.size(wavelengths)
@@ -101,7 +104,7 @@ class Scene(eqx.Module):
     planes: tuple[ImagePlane, ...]
     spectrum: Spectrum
 
-    def __init__(self, planes, spectrum):
+    def __init__(self, planes: ImagePlane | Iterable[ImagePlane], spectrum: Spectrum | Number):
         self.planes = (planes,) if isinstance(planes, ImagePlane) else tuple(planes)
         self.spectrum = spectrum if isinstance(spectrum, Spectrum) else Spectrum(spectrum)
         if not self.planes:

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from thincam_jax._core import checks
+from thincam_jax._core.checks import Number, Shape
 from thincam_jax._core.grids import Grid
 
 
@@ -35,7 +36,14 @@ class Sensor(eqx.Module):
     bit_depth: int | None = eqx.field(static=True)
 
     def __init__(
-        self, shape, pitch, *, full_well=13_500.0, exposure=None, electrons=None, bit_depth=None
+        self,
+        shape: Shape,
+        pitch: Number,
+        *,
+        full_well: Number = 13_500.0,
+        exposure: Number | None = None,
+        electrons: Number | None = None,
+        bit_depth: int | None = None,
     ):
         self.shape = checks.shape2d("shape", shape)
         self.pitch = checks.positive("pitch", pitch, "mm")
@@ -94,20 +102,29 @@ class GaussianNoise(AbstractNoise):
     snr_db: Float[Array, ""]
     signal_power: Literal["total", "without_mean"] = eqx.field(static=True)
 
-    def __init__(self, snr_db, signal_power: Literal["total", "without_mean"] = "total"):
+    def __init__(self, snr_db: Number, signal_power: Literal["total", "without_mean"] = "total"):
         self.snr_db = checks.finite("snr_db", snr_db, "dB")
         self.signal_power = checks.choice(  # pyright: ignore[reportAttributeAccessIssue]
             "signal_power", signal_power, ("total", "without_mean")
         )
 
-    def variance(self, image, electrons=None):
+    def variance(
+        self,
+        image: Float[Array, "*batch y x"],
+        electrons: Float[Array, "*batch 1 1"] | None = None,
+    ) -> Float[Array, "*batch"]:
         if self.signal_power == "total":
             power = jnp.mean(image**2, axis=(-2, -1))
         else:
             power = jnp.var(image, axis=(-2, -1))
         return power * 10 ** (-self.snr_db.astype(image.dtype) / 10)
 
-    def add(self, key, image, electrons):
+    def add(
+        self,
+        key: PRNGKeyArray,
+        image: Float[Array, "*batch y x"],
+        electrons: Float[Array, "*batch 1 1"] | None,
+    ) -> Float[Array, "*batch y x"]:
         sigma = jnp.sqrt(self.variance(image))[..., None, None]
         return image + sigma * jax.random.normal(key, image.shape, image.dtype)
 
@@ -122,17 +139,26 @@ class PoissonGaussianNoise(AbstractNoise):
 
     read_noise: Float[Array, ""]
 
-    def __init__(self, read_noise=8.0):
+    def __init__(self, read_noise: Number = 8.0):
         self.read_noise = checks.non_negative("read_noise", read_noise, "electrons")
 
-    def variance(self, image, electrons=None):
+    def variance(
+        self,
+        image: Float[Array, "*batch y x"],
+        electrons: Float[Array, "*batch 1 1"] | None = None,
+    ) -> Float[Array, "*batch"]:
         if electrons is None:
             raise ValueError("PoissonGaussianNoise counts electrons: give their number")
         mean = jnp.mean(jnp.maximum(image * electrons, 0.0), axis=(-2, -1))
         read = self.read_noise.astype(image.dtype) ** 2
         return (mean + read) / electrons[..., 0, 0] ** 2
 
-    def add(self, key, image, electrons):
+    def add(
+        self,
+        key: PRNGKeyArray,
+        image: Float[Array, "*batch y x"],
+        electrons: Float[Array, "*batch 1 1"] | None,
+    ) -> Float[Array, "*batch y x"]:
         if electrons is None:
             raise ValueError(
                 "PoissonGaussianNoise counts electrons: give the Sensor an exposure, such as 0.9, "
@@ -157,8 +183,8 @@ def electrons_per_unit(
     if sensor.exposure is None:
         return None
     brightest = jnp.max(image, axis=(-2, -1), keepdims=True)
-    wanted = (sensor.exposure * sensor.full_well).astype(image.dtype)
-    return wanted / jnp.where(brightest > 0, brightest, 1.0)
+    target = (sensor.exposure * sensor.full_well).astype(image.dtype)
+    return target / jnp.where(brightest > 0, brightest, 1.0)
 
 
 def read_out(

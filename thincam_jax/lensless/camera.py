@@ -1,12 +1,14 @@
 """The lensless camera: a mask at a distance before a sensor."""
 
 import functools
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
+from thincam_jax._core.checks import Number
 from thincam_jax.imaging.sensor import Sensor
 from thincam_jax.lensless.masks.base import AbstractMask
 from thincam_jax.lensless.propagation.path import Path
@@ -24,7 +26,7 @@ class LenslessCamera(eqx.Module):
     sensor: Sensor
     distance: Float[Array, ""]
 
-    def __init__(self, mask, sensor, distance):
+    def __init__(self, mask: Any, sensor: Any, distance: Number):
         if not isinstance(mask, AbstractMask):
             raise TypeError(
                 f"mask is a {type(mask).__name__}; give a mask, such as a FresnelZoneAperture"
@@ -35,8 +37,8 @@ class LenslessCamera(eqx.Module):
         self.sensor = sensor
         self.distance = checks.positive("distance", distance, "mm")
 
-    def path(self, wavelength, object_distance) -> Path:
-        """The way of the light from a point at `object_distance` (mm) in front of the mask."""
+    def path(self, wavelength: Number, object_distance: Number) -> Path:
+        """The light's path from a point at `object_distance` (mm) in front of the mask."""
         # Plain numbers take the camera's precision, so that float32 cameras stay float32.
         like = functools.partial(jnp.asarray, dtype=self.distance.dtype)
         wavelength = like(wavelength) if isinstance(wavelength, int | float) else wavelength

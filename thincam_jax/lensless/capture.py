@@ -8,7 +8,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from thincam_jax.imaging.scene import Scene
 from thincam_jax.imaging.sensor import AbstractNoise, read_out
 from thincam_jax.lensless.camera import LenslessCamera
-from thincam_jax.lensless.exposure import expose
+from thincam_jax.lensless.forward import expose
 from thincam_jax.lensless.plan import Plan, run_plan
 from thincam_jax.lensless.psf import Model
 

@@ -1,6 +1,7 @@
-"""Where single precision cannot hold a PSF's phases."""
+"""Where float32 is too coarse for a PSF's phases."""
 
 import math
+from typing import Any
 
 import jax
 import numpy as np
@@ -15,11 +16,11 @@ _LARGEST = 0.05 * 2.0**24
 
 
 def require_digits(mask: AbstractMask, grid: Grid, path: Path, model: str) -> None:
-    r"""Refuse, in float32, zones whose phase on the sensor float32 does not hold.
+    r"""ValueError where float32 cannot represent the phase of the zones on the sensor.
 
     The fringes of the order k have the phase :math:`k\beta r^2/(M^2(1+k\epsilon))` at r on the
-    sensor; rounding leaves it 2⁻²⁴ of itself uncertain. Refused is what is beyond 0.05 rad, where
-    single precision is off by several per cent. Numbers that are traced cannot be looked at.
+    sensor, which float32 rounds by 2⁻²⁴ of itself. More than 0.05 rad is refused: the PSF would be
+    wrong by several per cent. Traced numbers are not checked.
     """
     if not held_in_single(mask, grid, path, model):
         phase = largest_phase(mask, grid, path, model)
@@ -30,15 +31,15 @@ def require_digits(mask: AbstractMask, grid: Grid, path: Path, model: str) -> No
 
 
 def held_in_single(mask: AbstractMask, grid: Grid, path: Path, model: str) -> bool:
-    """Whether float32 holds the zones' phases; where numbers are traced, it is taken to."""
+    """Whether float32 can represent the zones' phases; True for traced numbers."""
     numbers = jax.tree.leaves((mask, grid, path))
     if not hasattr(mask, "orders") or any(checks.is_traced(n) for n in numbers):
         return True
     return largest_phase(mask, grid, path, model) <= _LARGEST
 
 
-def largest_phase(mask, grid: Grid, path: Path, model: str) -> float:
-    """Of the orders' fringes where they have their full strength and light falls, rad."""
+def largest_phase(mask: Any, grid: Grid, path: Path, model: str) -> float:
+    """Largest phase, rad, of the orders' fringes where they are strong and light falls."""
     scale = float(path.magnification)
     beta, half_mask = float(mask.beta), float(mask.extent[0]) / 2
     ends = [

@@ -6,6 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Complex
 
+from thincam_jax._core.checks import Number
 from thincam_jax._core.grids import Grid
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.masks.fza import FresnelZoneAperture
@@ -15,8 +16,8 @@ from thincam_jax.lensless.psf import Model, otf
 def fringe_scanned_otf(
     camera: LenslessCamera,
     *,
-    wavelength,
-    object_distance=math.inf,
+    wavelength: Number,
+    object_distance: Number = math.inf,
     model: Model = "separable",
     pixel_integration: bool = False,
     grid: Grid | None = None,
@@ -42,8 +43,8 @@ def fringe_scanned_otf(
 def phase_pair_otf(
     camera: LenslessCamera,
     *,
-    wavelength,
-    object_distance=math.inf,
+    wavelength: Number,
+    object_distance: Number = math.inf,
     model: Model = "separable",
     pixel_integration: bool = False,
     grid: Grid | None = None,
@@ -66,8 +67,8 @@ def phase_pair_otf(
 def _otfs(
     camera: LenslessCamera,
     phases: tuple[float, ...],
-    wavelength,
-    object_distance,
+    wavelength: Number,
+    object_distance: Number,
     model: Model,
     pixel_integration: bool,
     grid: Grid | None,

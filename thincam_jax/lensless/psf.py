@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from thincam_jax._core import checks
+from thincam_jax._core.checks import Number, Shape
 from thincam_jax._core.grids import Grid
 from thincam_jax._core.memory import refuse_if_too_large
 from thincam_jax._core.precision import PRECISIONS, Precision, allow, as_complex, cast, precision_of
@@ -18,13 +19,13 @@ from thincam_jax.lensless.cost import psf_cost
 from thincam_jax.lensless.digits import require_digits
 from thincam_jax.lensless.masks.base import AbstractMask
 from thincam_jax.lensless.propagation.angular_spectrum import angular_spectrum, require_odd
-from thincam_jax.lensless.propagation.chirps import ChirpSum
+from thincam_jax.lensless.propagation.chirp_sum import ChirpSum
 from thincam_jax.lensless.propagation.closed_form import closed_form, in_focus
 from thincam_jax.lensless.propagation.geometric import geometric
 from thincam_jax.lensless.propagation.paraxial import paraxial
 from thincam_jax.lensless.propagation.path import Path
 from thincam_jax.lensless.propagation.rayleigh_sommerfeld import rayleigh_sommerfeld
-from thincam_jax.lensless.propagation.separable import separable
+from thincam_jax.lensless.propagation.separable import PIXEL_NODES, separable
 from thincam_jax.lensless.propagation.separable_sum import SeparableSum, centre_phase
 
 Model = Literal[
@@ -40,13 +41,14 @@ MODELS: tuple[Model, ...] = get_args(Model)
 # sample the mask.
 UNBOUNDED: tuple[Model, ...] = ("paraxial", "closed_form")
 SAMPLED: tuple[Model, ...] = ("angular_spectrum", "rayleigh_sommerfeld")
+CLOSED: tuple[Model, ...] = tuple(model for model in MODELS if model not in SAMPLED)
 
 
 def psf(
     camera: LenslessCamera,
     *,
-    wavelength,
-    object_distance=math.inf,
+    wavelength: Number,
+    object_distance: Number = math.inf,
     model: Model = "separable",
     pixel_integration: bool = False,
     grid: Grid | None = None,
@@ -88,8 +90,8 @@ def psf(
 def otf(
     camera: LenslessCamera,
     *,
-    wavelength,
-    object_distance=math.inf,
+    wavelength: Number,
+    object_distance: Number = math.inf,
     model: Model = "separable",
     pixel_integration: bool = False,
     grid: Grid | None = None,
@@ -119,14 +121,9 @@ def _irradiance(
     oversampling: int,
 ) -> SeparableSum | ChirpSum | Float[Array, "y x"]:
     """The PSF in the form in which the model has it: terms where there are terms, else an image."""
-    if model == "geometric":
-        return geometric(mask, grid, path, pixel_integration=pixel_integration)
-    if model == "paraxial":
-        return paraxial(mask, path)
-    if model == "closed_form":
-        return closed_form(_unfocused(mask, path), path)
-    if model == "separable":
-        return separable(mask, grid, path, pixel_integration=pixel_integration)
+    if model not in SAMPLED:
+        mask = _unfocused(mask, path) if model == "closed_form" else mask
+        return _closed(mask, grid, path, model, pixel_integration, PIXEL_NODES)
     sampled = angular_spectrum if model == "angular_spectrum" else rayleigh_sommerfeld
     return sampled(
         mask,
@@ -136,6 +133,36 @@ def _irradiance(
         oversampling=oversampling,
         pixel_integration=pixel_integration,
     )
+
+
+def _closed(
+    mask: AbstractMask, grid: Grid, path: Path, model: Model, pixel_integration: bool, nodes: int
+) -> SeparableSum | ChirpSum | Float[Array, "y x"]:
+    if model == "geometric":
+        return geometric(mask, grid, path, pixel_integration=pixel_integration)
+    if model == "separable":
+        return separable(mask, grid, path, pixel_integration=pixel_integration, nodes=nodes)
+    return paraxial(mask, path) if model == "paraxial" else closed_form(mask, path)
+
+
+@jax.jit(static_argnames=("model", "pixel_integration", "nodes"))
+def closed_terms(
+    mask: AbstractMask,
+    grid: Grid,
+    path: Path,
+    model: Model,
+    pixel_integration: bool,
+    nodes: int = PIXEL_NODES,
+) -> SeparableSum:
+    """The PSF of a mask with zone orders by one of the closed forms, as separable terms.
+
+    `nodes`: of the pixel average of `separable`.
+    """
+    h = _closed(mask, grid, path, model, pixel_integration, nodes)
+    if isinstance(h, ChirpSum):
+        h = h.sample(grid, pixel_integration=pixel_integration)
+    assert isinstance(h, SeparableSum)  # of a mask with zone orders
+    return h
 
 
 _STATIC = ("model", "pixel_integration", "mask_shape", "oversampling")
@@ -181,7 +208,14 @@ def _evaluate(function, mask, grid, path, model, pixel_integration, sampling, pr
     return result if precision == own else cast(result, own)
 
 
-def sampling_of(camera, grid, model, pixel_integration, oversampling, mask_shape):
+def sampling_of(
+    camera: LenslessCamera,
+    grid: Grid,
+    model: Model,
+    pixel_integration: bool,
+    oversampling: int | None,
+    mask_shape: Shape | None,
+) -> tuple[tuple[int, int] | None, int]:
     """Mask plane in pixels and samples per pixel, for the models that sample."""
     if model not in SAMPLED:
         if oversampling is not None or mask_shape is not None:

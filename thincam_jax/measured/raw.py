@@ -3,7 +3,9 @@
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import ArrayLike, Float64
+from jaxtyping import Float64
+
+from thincam_jax._core.checks import Numbers
 
 MAX_CHANNELS = 4
 
@@ -125,7 +127,7 @@ def _check_range(name: str, pixels: np.ndarray, bits: int) -> None:
 
 
 def image_with_contrast(
-    name: str, image: ArrayLike, shape: tuple[int, ...] | None = None, of: str = ""
+    name: str, image: Numbers, shape: tuple[int, ...] | None = None, of: str = ""
 ) -> Float64[np.ndarray, "y x"]:
     """A finite image that is not constant, in double precision.
 

@@ -122,7 +122,7 @@ def _order(path: Path) -> tuple[list[tuple[int, str]], str]:
 
 
 def _decode(path: Path) -> tuple[np.ndarray, str, int | None]:
-    """Pixels, format and, where the file tells it, bits a sample."""
+    """Pixels, format and, where the file holds them, bits a sample."""
     data = _bytes(path)
     kind = next((kind for start, kind in _STARTS.items() if data.startswith(start)), None)
     if kind is None:

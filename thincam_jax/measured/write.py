@@ -1,4 +1,4 @@
-"""Writing an image, linear or as it is looked at, and the record of how it was made."""
+"""Writing an image, linear or for display, and the record of how it was made."""
 
 import io
 import json

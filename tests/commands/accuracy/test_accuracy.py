@@ -25,11 +25,11 @@ def config(tmp_path_factory):
 @pytest.fixture(scope="module")
 def run(config, tmp_path_factory):
     """Folder and results of one run, and what it told."""
-    folder = BenchFolder(tmp_path_factory.mktemp("out") / "new")
-    plan = check(config, Options(SIZES, 48))
+    folder = accuracy.BenchFolder(tmp_path_factory.mktemp("out") / "new")
+    plan = accuracy.check(config, accuracy.Options(SIZES, 48))
     told = []
-    results = run_accuracy(config, plan, folder, told.append)
-    assert len(told) == steps(config, plan)
+    results = accuracy.run_accuracy(config, plan, folder, told.append)
+    assert len(told) == accuracy.steps(config, plan)
     return folder.path, results
 
 
@@ -187,13 +187,13 @@ class TestSizes:
 
     @pytest.mark.parametrize("size", [0, -3, 65])
     def test_refused(self, config, size):
-        for options in (Options((size,)), Options((), size)):
+        for options in (accuracy.Options((size,)), accuracy.Options((), size)):
             with pytest.raises(ConfigError, match=f"size {size}: "):
-                check(config, options)
+                accuracy.check(config, options)
 
     def test_too_few_pixels_to_reconstruct(self, config):
         with pytest.raises(ConfigError, match="^--capture-size 5: "):
-            check(config, Options((), 5))
+            accuracy.check(config, accuracy.Options((), 5))
 
 
 def test_without_wiener(config):

@@ -14,7 +14,7 @@ from thincam_jax.commands.study.config import ConfigError, MethodConfig, StudyCo
 from thincam_jax.imaging.operators import kernel_shape
 from thincam_jax.imaging.scene import ImagePlane
 from thincam_jax.lensless.camera import LenslessCamera
-from thincam_jax.lensless.exposure import projected_shape
+from thincam_jax.lensless.forward import projected_shape
 from thincam_jax.lensless.psf import Model, psf
 
 DEFAULT_SIZES = (128, 256, 512)  # pixels along the longer side

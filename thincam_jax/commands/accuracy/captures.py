@@ -19,7 +19,7 @@ from thincam_jax.commands.accuracy.psfs import why_not, words
 from thincam_jax.commands.study.build import Setting
 from thincam_jax.imaging.scene import Spectrum
 from thincam_jax.lensless.cost import psf_cost
-from thincam_jax.lensless.exposure import imaging_operator, project, projected_shape
+from thincam_jax.lensless.forward import imaging_operator, project, projected_shape
 from thincam_jax.lensless.psf import MODELS, Model, sampling_of
 
 

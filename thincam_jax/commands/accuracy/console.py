@@ -8,7 +8,7 @@ from thincam_jax.commands.accuracy.psfs import label, words
 
 
 def accuracy_table(results: dict[str, Any]) -> Table:
-    """Every way at the largest size, the fastest first; those worth choosing are marked."""
+    """Every candidate at the largest size, the fastest first; those worth choosing are marked."""
     largest = max((row["shape"] for row in results["psfs"]), key=max)
     rows = [row for row in results["psfs"] if row["shape"] == largest]
     rows.sort(key=lambda row: row["seconds"] or float("inf"))

@@ -26,7 +26,7 @@ _WRONG: dict[str, dict[str, Any]] = {
     "beta": {"linestyle": "-", "marker": "x", "label": "wrong β"},
     "distance": {"linestyle": "--", "marker": "+", "label": "wrong d"},
 }
-_WORST = 3.0  # relative errors above this are told, not drawn
+_WORST = 3.0  # relative errors above this are written, not drawn
 _LINEAR_DB = 0.01  # losses below this are drawn to a linear scale
 
 Point = tuple[float, float]

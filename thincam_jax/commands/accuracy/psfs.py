@@ -1,4 +1,4 @@
-"""Errors and times of every way of computing the PSF."""
+"""Errors and times of every candidate: model, precision and oversampling of the PSF."""
 
 import statistics
 import time
@@ -38,7 +38,7 @@ _GAIN = 0.05  # a smaller error by less than this part is no gain
 
 
 class Candidate(NamedTuple):
-    """One way of computing a PSF.
+    """How a PSF is computed.
 
     - `model`, `precision`, `oversampling`, `mask_shape`: as `psf` takes them; the last two are None
       for the closed forms.
@@ -89,7 +89,7 @@ def why_not(model: Model, cost: Cost, given: Conditions) -> str | None:
 def psf_rows(
     config: StudyConfig, setting: Setting, size: int, progress: Progress
 ) -> list[dict[str, Any]]:
-    """A row for every way at one size; `worth_choosing` marks the Pareto front of those run.
+    """A row for every candidate at one size; `worth_choosing` marks the Pareto front of those run.
 
     Errors are relative, ‖h − h₀‖₂/‖h₀‖₂ over the sensor, against h₀ by separable in float64, the
     exact Fresnel field. Times are of the compiled function: what Python adds to a call of `psf` is
@@ -136,7 +136,7 @@ def candidate_count(config: StudyConfig, setting: Setting) -> int:
 
 
 def label(model: str, precision: str, oversampling: int | None) -> str:
-    """A way in words, such as "angular spectrum ×3, float32"."""
+    """A candidate in words, such as "angular spectrum ×3, float32"."""
     samples = f" ×{oversampling}" if oversampling else ""
     return f"{words(model)}{samples}, {precision}"
 
@@ -203,7 +203,7 @@ class Timing(NamedTuple):
     calls: int
 
 
-def measure(function, *arguments: Any) -> Timing:
+def measure(function: Callable, *arguments: Any) -> Timing:
     """Compile a function of arrays and time it."""
     start = time.perf_counter()
     compiled = jax.jit(function).lower(*arguments).compile()

@@ -117,6 +117,7 @@ def build_noise(config: StudyConfig) -> AbstractNoise | None:
         return None
     if config.noise.read_noise is not None:
         return PoissonGaussianNoise(config.noise.read_noise)
+    assert config.noise.snr_db is not None  # one of the two is given
     return GaussianNoise(config.noise.snr_db, config.noise.signal_power)
 
 

@@ -82,7 +82,7 @@ def _tried_twice(
 
 
 class _Count:
-    """How many points have ended, told to whoever watches."""
+    """How many points have ended; every change is reported to `progress`."""
 
     def __init__(self, before: int, progress: Progress):
         self.done, self.failed, self.progress = before, 0, progress

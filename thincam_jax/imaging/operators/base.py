@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray, PyTree
+from jaxtyping import Array, DTypeLike, Float, PRNGKeyArray, PyTree
 
 from thincam_jax._core import checks
 
@@ -41,7 +41,11 @@ class AbstractOperator(eqx.Module):
         """The transposed map, from a capture to an image."""
 
     def norm(
-        self, *, iterations: int = 30, key: PRNGKeyArray | None = None, dtype=None
+        self,
+        *,
+        iterations: int = 30,
+        key: PRNGKeyArray | None = None,
+        dtype: DTypeLike | None = None,
     ) -> Float[Array, ""]:
         r"""The largest singular value ‖A‖, by power iteration on AᵀA.
 
@@ -91,7 +95,9 @@ def _power_iteration(operator: AbstractOperator, start: Array, iterations: int):
     return _root(squared)
 
 
-def adjoint_error(operator: AbstractOperator, key: PRNGKeyArray, *, dtype=None) -> Float[Array, ""]:
+def adjoint_error(
+    operator: AbstractOperator, key: PRNGKeyArray, *, dtype: DTypeLike | None = None
+) -> Float[Array, ""]:
     r"""How far an operator's adjoint is from its transpose.
 
     :math:`|\langle A f, g\rangle - \langle f, A^T g\rangle| / (\|A f\|\,\|g\|)` for white random f
@@ -117,7 +123,7 @@ def adjoint_error(operator: AbstractOperator, key: PRNGKeyArray, *, dtype=None) 
     return jnp.abs(forward - backward) / jnp.where(scale == 0, 1, scale)
 
 
-def dtype_of(operator: AbstractOperator):
+def dtype_of(operator: AbstractOperator) -> np.dtype:
     """The real type of an operator's numbers; the default one where it has none."""
     leaves = jax.tree.leaves(eqx.filter(operator, eqx.is_inexact_array))
     return jnp.finfo(leaves[0].dtype).dtype if leaves else jnp.zeros(()).dtype
@@ -134,7 +140,7 @@ def shapes_of(shape: Shapes) -> list[tuple[int, ...]]:
 
 
 def require_shape(name: str, array: Array, shape: tuple[int, ...]) -> None:
-    """One line where an array's trailing axes are not those of the operator."""
+    """ValueError where an array's trailing axes are not those of the operator."""
     if array.shape[max(0, array.ndim - len(shape)) :] != shape:
         raise ValueError(
             f"{name} has shape {array.shape}; the operator takes {shape}, after any batch axes"

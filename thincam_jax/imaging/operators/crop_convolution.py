@@ -2,13 +2,15 @@
 
 import functools
 import math
+from collections.abc import Sequence
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Array, Complex, Float, Num
 
 from thincam_jax._core import checks
+from thincam_jax._core.checks import Number, Shape
 from thincam_jax._core.grids import Grid, fast_shape
 from thincam_jax.imaging.operators.base import AbstractOperator
 
@@ -49,9 +51,9 @@ class CropConvolution(AbstractOperator):
     def __init__(
         self,
         kernel: Float[Array, "*planes k l"],
-        pitch,
-        sensor_shape,
-        field_shape,
+        pitch: Number,
+        sensor_shape: Shape,
+        field_shape: Shape,
         *,
         summed: int = 0,
         window: tuple[int, int] | None = None,
@@ -103,7 +105,7 @@ class CropConvolution(AbstractOperator):
     def __call__(self, field: Float[Array, "*batch m n"]) -> Float[Array, "*channels y x"]:
         """The capture of a field (*batch, *channel, *summed, m, n)."""
         _require_shape("field", field, self.in_shape, self.summed)
-        # Where the field lies in the window matters to nobody but a phase, which the corner undoes.
+        # The field's place in the window only adds a phase, which cutting at the corner undoes.
         padded = place(field, self.field_corner, self.window)
         product = self.combine(jnp.fft.rfft2(padded))
         return cut(jnp.fft.irfft2(product, s=self.window), self.sensor_corner, self.sensor_shape)
@@ -157,14 +159,18 @@ class CropConvolution(AbstractOperator):
         return (capture.conj().reshape(*leading, rows, columns) * self.spectrum).conj()
 
 
-def place(image: Float[Array, "*batch y x"], corner, window) -> Float[Array, "*batch v u"]:
+def place(
+    image: Num[Array, "*batch y x"], corner: Sequence[int], window: Sequence[int]
+) -> Num[Array, "*batch v u"]:
     """An image on a window of zeros."""
     sizes = zip(corner, image.shape[-2:], window, strict=True)
     margins = [(c, w - n - c) for c, n, w in sizes]
     return jnp.pad(image, [(0, 0)] * (image.ndim - 2) + margins)
 
 
-def cut(window: Float[Array, "*batch v u"], corner, shape) -> Float[Array, "*batch y x"]:
+def cut(
+    window: Num[Array, "*batch v u"], corner: Sequence[int], shape: Sequence[int]
+) -> Num[Array, "*batch y x"]:
     """The part of a window that starts at a corner."""
     (top, left), (rows, columns) = corner, shape
     return window[..., top : top + rows, left : left + columns]
@@ -189,7 +195,7 @@ def _fit(kernel: Float[Array, "*planes k l"], shape: tuple[int, int]):
 
 
 def _require_shape(name: str, image: Array, shape: tuple[int, ...], summed: int) -> None:
-    """One line for an image that would be cut, shifted or repeated without a word.
+    """ValueError for an image that would otherwise be cut, shifted or repeated silently.
 
     A channel axis of length 1 is one PSF for any number of channels.
     """

@@ -2,7 +2,7 @@
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
+from jaxtyping import Array, ArrayLike, Bool, DTypeLike, Float, PRNGKeyArray, PyTree, Real
 
 from thincam_jax.imaging.operators.base import (
     AbstractOperator,
@@ -30,7 +30,7 @@ class Masked(AbstractOperator):
     operator: AbstractOperator
     valid: PyTree[Bool[Array, "..."]]
 
-    def __init__(self, operator: AbstractOperator, valid):
+    def __init__(self, operator: AbstractOperator, valid: PyTree[Bool[ArrayLike, "..."]]):
         self.operator = operator
         self.valid = _per_capture("valid", valid, operator.out_shape, _boolean)
 
@@ -68,7 +68,7 @@ class Scaled(AbstractOperator):
     operator: AbstractOperator
     gain: PyTree[Float[Array, "..."]]
 
-    def __init__(self, operator: AbstractOperator, gain):
+    def __init__(self, operator: AbstractOperator, gain: PyTree[Real[ArrayLike, "..."]]):
         self.operator = operator
         if isinstance(gain, tuple | list):
             self.gain = _per_capture("gain", gain, operator.out_shape, real_numbers)
@@ -93,7 +93,11 @@ class Scaled(AbstractOperator):
         return self.operator.adjoint(self._amplified(capture))
 
     def norm(
-        self, *, iterations: int = 30, key: PRNGKeyArray | None = None, dtype=None
+        self,
+        *,
+        iterations: int = 30,
+        key: PRNGKeyArray | None = None,
+        dtype: DTypeLike | None = None,
     ) -> Float[Array, ""]:
         """The largest singular value: |c|·‖B‖ where c is one number, else by power iteration."""
         if isinstance(self.gain, tuple) or self.gain.ndim > 0:
@@ -148,7 +152,7 @@ def _per_capture(name: str, value, shape: Shapes, convert):
 
 
 def _require_capture(capture, shape: Shapes) -> None:
-    """Broadcast against the pixels' values, a capture too small would pass unseen."""
+    """ValueError for a capture of another shape, which would be broadcast silently."""
     if is_shape(shape):
         if isinstance(capture, tuple | list):
             raise ValueError(f"the capture is a tuple of {len(capture)}; give one array")

@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from thincam_jax._core.checks import Numbers, Shape
 from thincam_jax._core.precision import product
 from thincam_jax.imaging.operators.base import (
     AbstractOperator,
@@ -33,7 +34,7 @@ class Matrix(AbstractOperator):
     image_shape: tuple[int, ...] = eqx.field(static=True)
     capture_shape: tuple[int, ...] = eqx.field(static=True)
 
-    def __init__(self, matrix, in_shape, out_shape):
+    def __init__(self, matrix: Numbers, in_shape: Shape, out_shape: Shape):
         self.matrix = real_matrix("matrix", matrix)
         rows, columns = self.matrix.shape
         self.image_shape = require_size("in_shape", in_shape, columns, "columns")

@@ -1,8 +1,9 @@
 """A camera whose rows and columns are coded independently."""
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, DTypeLike, Float, PRNGKeyArray
 
+from thincam_jax._core.checks import Numbers
 from thincam_jax._core.precision import product
 from thincam_jax.imaging.operators.base import AbstractOperator, real_matrix, require_shape
 
@@ -25,7 +26,7 @@ class Separable(AbstractOperator):
     left: Float[Array, "y m"]
     right: Float[Array, "x n"]
 
-    def __init__(self, left, right):
+    def __init__(self, left: Numbers, right: Numbers):
         self.left, self.right = real_matrix("left", left), real_matrix("right", right)
         if self.left.dtype != self.right.dtype:
             raise TypeError(
@@ -50,7 +51,11 @@ class Separable(AbstractOperator):
         return _between(self.left.T, capture, self.right)
 
     def norm(
-        self, *, iterations: int = 30, key: PRNGKeyArray | None = None, dtype=None
+        self,
+        *,
+        iterations: int = 30,
+        key: PRNGKeyArray | None = None,
+        dtype: DTypeLike | None = None,
     ) -> Float[Array, ""]:
         """The largest singular value, exactly: that of `left` times that of `right`.
 

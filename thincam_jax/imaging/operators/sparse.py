@@ -2,6 +2,7 @@
 
 import functools
 import math
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -10,6 +11,7 @@ import scipy
 from jax.experimental import sparse
 from jaxtyping import Array, Float, Int
 
+from thincam_jax._core.checks import Shape
 from thincam_jax.imaging.operators.base import (
     AbstractOperator,
     real_numbers,
@@ -41,7 +43,7 @@ class Sparse(AbstractOperator):
     image_shape: tuple[int, ...] = eqx.field(static=True)
     capture_shape: tuple[int, ...] = eqx.field(static=True)
 
-    def __init__(self, matrix, in_shape, out_shape):
+    def __init__(self, matrix: Any, in_shape: Shape, out_shape: Shape):
         self.values, self.rows, self.columns = _entries(matrix)
         self.image_shape = require_size("in_shape", in_shape, matrix.shape[1], "columns")
         self.capture_shape = require_size("out_shape", out_shape, matrix.shape[0], "rows")

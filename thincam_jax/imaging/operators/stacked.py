@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from jaxtyping import Array, Float, PRNGKeyArray, PyTree
+from jaxtyping import Array, DTypeLike, Float, PRNGKeyArray, PyTree
 
 from thincam_jax.imaging.operators.base import AbstractOperator, Shapes
 
@@ -58,7 +58,11 @@ class Stacked(AbstractOperator):
         return total
 
     def norm(
-        self, *, iterations: int = 30, key: PRNGKeyArray | None = None, dtype=None
+        self,
+        *,
+        iterations: int = 30,
+        key: PRNGKeyArray | None = None,
+        dtype: DTypeLike | None = None,
     ) -> Float[Array, ""]:
         """The largest singular value: by power iteration, but of one operator its own."""
         if len(self.operators) == 1:

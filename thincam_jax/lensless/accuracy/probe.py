@@ -1,4 +1,8 @@
-"""What each model gives on a few rows and columns, and how far that is from the best model."""
+r"""What each model gives on a few rows and columns, and how far that is from the best model.
+
+With real factors R (term × row) and C (term × column) an image is RᵀC and
+:math:`\|R^TC\|_F^2 = \sum (RR^T)\circ(CC^T)`: the error of a whole PSF costs what its axes cost.
+"""
 
 import functools
 import math
@@ -7,30 +11,24 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Complex, Float
 
 from thincam_jax._core.grids import Grid, block_mean
 from thincam_jax._core.precision import PRECISIONS, Precision, allow, cast
-from thincam_jax.lensless.accuracy.norms import (
-    Factors,
-    distance,
-    factors,
-    norm,
-    rounding_distance,
-    weighted,
+from thincam_jax.lensless.accuracy.lines import (
+    SparseGrid,
+    angular_spectrum_terms,
+    chosen,
+    fine_fields,
 )
-from thincam_jax.lensless.accuracy.points import Points, chosen
-from thincam_jax.lensless.accuracy.sampled import angular_spectrum_terms, fine_fields
-from thincam_jax.lensless.accuracy.terms import closed_terms
-from thincam_jax.lensless.masks.base import AbstractMask
-from thincam_jax.lensless.propagation.angular_spectrum import planes
+from thincam_jax.lensless.masks.base import AbstractMask, pairs, require_zone_orders
+from thincam_jax.lensless.propagation.angular_spectrum import lit_mask, planes
 from thincam_jax.lensless.propagation.closed_form import in_focus
-from thincam_jax.lensless.propagation.orders import pairs, require_zone_orders
 from thincam_jax.lensless.propagation.path import Path
-from thincam_jax.lensless.propagation.plane import lit_mask
 from thincam_jax.lensless.propagation.rayleigh_sommerfeld import rayleigh_sommerfeld_field
 from thincam_jax.lensless.propagation.separable import PIXEL_NODES
 from thincam_jax.lensless.propagation.separable_sum import SeparableSum
+from thincam_jax.lensless.psf import Model, closed_terms
 
 # Samples of the line on which the exact phases are compared with Fresnel's.
 _FINE_SAMPLES = 2**16
@@ -53,8 +51,8 @@ class Lines(NamedTuple):
     row_weights: Float[np.ndarray, " row"]
     column_weights: Float[np.ndarray, " column"]
 
-    def points(self, pitch: Float[Array, ""]) -> Points:
-        return Points(self.rows, self.columns, pitch)
+    def points(self, pitch: Float[Array, ""]) -> SparseGrid:
+        return SparseGrid(self.rows, self.columns, pitch)
 
 
 class Numbers(NamedTuple):
@@ -89,7 +87,7 @@ def lines_of(mask: AbstractMask, grid: Grid, path: Path) -> Lines:
 
 @jax.jit(static_argnames=("shape", "pixel_integration", "mask_shape", "oversampling"))
 def _direct_sum(
-    mask, points: Points, path: Path, *, shape, pixel_integration, mask_shape, oversampling
+    mask, points: SparseGrid, path: Path, *, shape, pixel_integration, mask_shape, oversampling
 ) -> Float[Array, "row column"]:
     """`rayleigh_sommerfeld` at some pixels."""
     plane, _ = planes(Grid(shape, points.pitch), mask_shape, oversampling)
@@ -107,6 +105,71 @@ def _spread(count: int, most: int) -> Float[np.ndarray, " chosen"]:
     return np.floor(edges[:-1] + inside * np.diff(edges)) - (count - 1) / 2
 
 
+class Factors(NamedTuple):
+    """Real factors of an image on chosen rows and columns, each scaled by the root of its weight.
+
+    - `rows`, `columns`: factor × sample, in double precision.
+    """
+
+    rows: Float[np.ndarray, "factor row"]
+    columns: Float[np.ndarray, "factor column"]
+
+
+def factors(
+    terms: SeparableSum,
+    row_weights: Float[np.ndarray, " row"],
+    column_weights: Float[np.ndarray, " column"],
+) -> Factors:
+    """The factors of a separable sum whose samples stand for `weights` samples each."""
+    return weighted(
+        np.asarray(terms.rows, complex),
+        np.asarray(terms.columns, complex),
+        row_weights,
+        column_weights,
+    )
+
+
+def weighted(
+    rows: Complex[np.ndarray, "term row"],
+    columns: Complex[np.ndarray, "term column"],
+    row_weights: Float[np.ndarray, " row"],
+    column_weights: Float[np.ndarray, " column"],
+) -> Factors:
+    """The same from the complex factors of Σ Re{Y X}."""
+    rows, columns = rows * np.sqrt(row_weights), columns * np.sqrt(column_weights)
+    # Re{YX} = Re Y Re X − Im Y Im X.
+    return Factors(
+        np.concatenate([np.real(rows), -np.imag(rows)]),
+        np.concatenate([np.real(columns), np.imag(columns)]),
+    )
+
+
+def norm(image: Factors) -> float:
+    """‖h‖₂ over the grid."""
+    square = np.sum((image.rows @ image.rows.T) * (image.columns @ image.columns.T))
+    return float(np.sqrt(max(square, 0.0)))
+
+
+def distance(first: Factors, second: Factors) -> float:
+    """‖h₁ − h₂‖₂ for sums of different terms; what cancels leaves 1e-8 of their norms."""
+    return norm(
+        Factors(
+            np.concatenate([first.rows, second.rows]),
+            np.concatenate([first.columns, -second.columns]),
+        )
+    )
+
+
+def rounding_distance(first: Factors, second: Factors) -> float:
+    """‖h₁ − h₂‖₂ for sums of the same terms, nearly equal: no digits cancel."""
+    return norm(
+        Factors(
+            np.concatenate([first.rows - second.rows, second.rows]),
+            np.concatenate([first.columns, first.columns - second.columns]),
+        )
+    )
+
+
 class ZoneProbe:
     """Errors of all models for one camera with a zone mask, by one-dimensional probes.
 
@@ -122,14 +185,14 @@ class ZoneProbe:
         self.given: dict[Precision, tuple[AbstractMask, Array, Path]]
         with allow("float64", mask, grid, path):
             self.given = {p: cast((mask, grid.pitch, path), p) for p in PRECISIONS}
-        self._cache: dict[tuple[str, Precision, int], Factors] = {}
+        self._cache: dict[tuple[Model, Precision, int], Factors] = {}
 
     @functools.cached_property
     def scale(self) -> float:
         """‖h‖₂ of the reference; where no light falls on the sensor, errors count as they are."""
         return norm(self.reference) or 1.0
 
-    def closed(self, model: str, precision: Precision, nodes: int = PIXEL_NODES) -> Factors:
+    def closed(self, model: Model, precision: Precision, nodes: int = PIXEL_NODES) -> Factors:
         """Factors of one of the closed forms."""
         key = model, precision, nodes
         if key not in self._cache:
@@ -163,19 +226,19 @@ class ZoneProbe:
     def _factors(self, terms: SeparableSum) -> Factors:
         return factors(terms, self.lines.row_weights, self.lines.column_weights)
 
-    def model_error(self, model: str) -> float:
+    def model_error(self, model: Model) -> float:
         """Relative distance of a closed form from the reference, without rounding."""
         found = self.closed(model, "float64")
         if model == "separable":
             return rounding_distance(found, self.reference) / self.scale
         return distance(found, self.reference) / self.scale
 
-    def difference(self, model: str, other: str) -> float:
+    def difference(self, model: Model, other: Model) -> float:
         """Relative distance of two closed forms, without rounding."""
         first, second = (self.closed(m, "float64") for m in (model, other))
         return distance(first, second) / self.scale
 
-    def rounding(self, model: str, precision: Precision) -> float:
+    def rounding(self, model: Model, precision: Precision) -> float:
         """What the precision costs a closed form; in float64, scaled from that of float32."""
         single, double = (self.closed(model, p) for p in PRECISIONS)
         measured = rounding_distance(single, double) / self.scale
@@ -211,7 +274,7 @@ class ZoneProbe:
         few = [_spread(count, _FEW) for count in self.shape]
         with allow("float64"):
             mask, pitch, path = self.given["float64"]
-            points = Points(few[0], few[1], pitch)
+            points = SparseGrid(few[0], few[1], pitch)
             exact = closed_terms(mask, points, path, "separable", self.pixel_integration).image()
             exact = np.asarray(exact)
         with allow(precision):
@@ -219,7 +282,7 @@ class ZoneProbe:
             found = np.asarray(
                 _direct_sum(
                     mask,
-                    Points(few[0], few[1], pitch),
+                    SparseGrid(few[0], few[1], pitch),
                     path,
                     shape=self.shape,
                     pixel_integration=self.pixel_integration,
@@ -232,7 +295,7 @@ class ZoneProbe:
         return float(np.linalg.norm(found - exact)) / math.sqrt(share) / self.scale
 
     def numbers(self) -> "Numbers":
-        """What the reasons speak of."""
+        """Sizes of the effects that the reasons name."""
         with allow("float64"):
             mask, pitch, path = self.given["float64"]
             zones = require_zone_orders(mask, "separable")

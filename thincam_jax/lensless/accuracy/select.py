@@ -6,6 +6,7 @@ from typing import NamedTuple
 import jax
 
 from thincam_jax._core import checks
+from thincam_jax._core.checks import Number
 from thincam_jax._core.grids import Grid
 from thincam_jax._core.memory import available_bytes
 from thincam_jax._core.precision import (
@@ -15,11 +16,11 @@ from thincam_jax._core.precision import (
     itemsize_of,
     precision_of,
 )
-from thincam_jax.lensless.accuracy import reasons as words
 from thincam_jax.lensless.accuracy.probe import ZoneProbe
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.cost import Cost, psf_cost
 from thincam_jax.lensless.digits import held_in_single
+from thincam_jax.lensless.propagation.separable import PIXEL_NODES
 from thincam_jax.lensless.psf import MODELS, UNBOUNDED, Model, sampling_of
 
 # Predictions are estimates from some rows and columns (or pixels, for the direct sum): what they
@@ -31,7 +32,7 @@ _CONVERSION = 1e7
 
 
 class Prediction(NamedTuple):
-    """What one way of computing a PSF gives and costs.
+    """What a model gives and costs.
 
     - `model`, `precision`, `oversampling`: as `psf` takes them; oversampling is None for the
       closed forms.
@@ -73,8 +74,8 @@ class Selection(NamedTuple):
 def select_model(
     camera: LenslessCamera,
     *,
-    wavelength,
-    object_distance=math.inf,
+    wavelength: Number,
+    object_distance: Number = math.inf,
     tolerance: float,
     pixel_integration: bool = False,
     grid: Grid | None = None,
@@ -87,7 +88,7 @@ def select_model(
     model are compared with those of the reference, and the norm of the whole image follows from
     their Gram matrices. No image is computed.
 
-    How far Fresnel's approximation itself is from exact scalar diffraction is told apart, in
+    How far Fresnel's approximation itself is from exact scalar diffraction is given separately, in
     `paraxial_error` and in the reasons: it is common to all the closed forms, is mostly the fringes
     far from the aperture's edges, and falls by orders of magnitude with `pixel_integration`.
 
@@ -101,7 +102,9 @@ def select_model(
     probe = probe_of(camera, wavelength, object_distance, pixel_integration, grid)
     sampling_grid = grid or camera.sensor.grid
     considered: list[Prediction] = []
-    for model, precision, oversampling, cost in ways(camera, sampling_grid, pixel_integration):
+    for model, precision, oversampling, cost in candidates(
+        camera, sampling_grid, pixel_integration
+    ):
         error = predicted_error(probe, camera, sampling_grid, model, precision, oversampling)
         considered.append(Prediction(model, precision, oversampling, error, cost))
         if error <= tolerance:
@@ -117,7 +120,7 @@ def select_model(
         meets_tolerance=chosen.predicted_error <= tolerance,
         cost=chosen.cost,
         paraxial_error=paraxial_error,
-        reasons=(*_left_out(probe, chosen), words.fresnel(paraxial_error)),
+        reasons=_reasons(probe, chosen, paraxial_error),
         considered=tuple(considered),
     )
 
@@ -125,8 +128,8 @@ def select_model(
 def predict_error(
     camera: LenslessCamera,
     *,
-    wavelength,
-    object_distance=math.inf,
+    wavelength: Number,
+    object_distance: Number = math.inf,
     model: Model,
     precision: Precision | None = None,
     oversampling: int | None = None,
@@ -167,7 +170,13 @@ def require_camera(camera: LenslessCamera, function: str) -> None:
         )
 
 
-def probe_of(camera, wavelength, object_distance, pixel_integration, grid) -> ZoneProbe:
+def probe_of(
+    camera: LenslessCamera,
+    wavelength: Number,
+    object_distance: Number,
+    pixel_integration: bool,
+    grid: Grid | None,
+) -> ZoneProbe:
     """The probe of a camera whose numbers are known."""
     require_camera(camera, "select_model")
     path = camera.path(wavelength, object_distance)
@@ -179,7 +188,9 @@ def probe_of(camera, wavelength, object_distance, pixel_integration, grid) -> Zo
     return ZoneProbe(camera.mask, grid, path, pixel_integration=pixel_integration)
 
 
-def ways(camera: LenslessCamera, grid: Grid, pixel_integration: bool):
+def candidates(
+    camera: LenslessCamera, grid: Grid, pixel_integration: bool
+) -> list[tuple[Model, Precision, int | None, Cost]]:
     """The (model, precision, oversampling, cost) that fit into memory, cheapest first.
 
     They end with the reference, than which nothing is closer to itself.
@@ -188,13 +199,13 @@ def ways(camera: LenslessCamera, grid: Grid, pixel_integration: bool):
     free = available_bytes()
     own = precision_of(grid.pitch)
 
-    def time(way) -> float:
+    def time(candidate) -> float:
         # An operation in double precision takes about two in single.
-        operations = way[3].flops * (2.0 if way[1] == "float64" else 1.0)
-        return operations + (0.0 if way[1] == own else _CONVERSION)
+        operations = candidate[3].flops * (2.0 if candidate[1] == "float64" else 1.0)
+        return operations + (0.0 if candidate[1] == own else _CONVERSION)
 
     displayed = getattr(camera.mask, "pixels", None) is not None
-    models = [m for m in MODELS if not displayed or m not in UNBOUNDED]
+    models: list[Model] = [m for m in MODELS if not displayed or m not in UNBOUNDED]
     for model in models:
         shape, samples = sampling_of(camera, grid, model, pixel_integration, None, None)
         for precision in PRECISIONS:
@@ -202,7 +213,7 @@ def ways(camera: LenslessCamera, grid: Grid, pixel_integration: bool):
             if free is None or cost.bytes <= free:
                 found.append((model, precision, None if shape is None else samples, cost))
     found.sort(key=time)
-    names = [way[:2] for way in found]
+    names = [candidate[:2] for candidate in found]
     reference = ("separable", "float64")
     return found[: names.index(reference) + 1] if reference in names else found
 
@@ -242,8 +253,47 @@ def _cost(camera, grid, model, pixel_integration, mask_shape, oversampling, prec
     )
 
 
-def _left_out(probe: ZoneProbe, chosen: Prediction) -> list[str]:
+def _reasons(probe: ZoneProbe, chosen: Prediction, paraxial_error: float) -> tuple[str, ...]:
+    """What the chosen model leaves out, in words and numbers."""
+    fresnel = (
+        "errors are counted from the exact Fresnel field; exact scalar diffraction differs from "
+        f"that by about {paraxial_error:.1e}"
+    )
     if chosen.oversampling is not None:
-        return [words.sampling(chosen.oversampling, chosen.predicted_error)]
-    told = words.optics_left_out(probe, chosen.model)
-    return [*told, words.rounding(probe, chosen.model, chosen.precision)]
+        return (
+            f"the mask is held by {chosen.oversampling}×{chosen.oversampling} samples a pixel, and "
+            "the phases are exact where 'separable' has Fresnel's: together "
+            f"{chosen.predicted_error:.1e}",
+            fresnel,
+        )
+    size = probe.rounding(chosen.model, chosen.precision)
+    phase = probe.numbers().largest_phase
+    rounding = f"{chosen.precision} rounds phases of up to {phase:.1e} rad: {size:.1e}"
+    return (*_optics_left_out(probe, chosen.model), rounding, fresnel)
+
+
+def _optics_left_out(probe: ZoneProbe, model: Model) -> list[str]:
+    """Diffraction and edges that a closed form leaves out, in the steps of the ladder."""
+    numbers = probe.numbers()
+    zone = f"an edge zone of √(λd/M) = {numbers.edge_zone * 1e3:.3g} µm"
+    if model == "geometric":
+        size = probe.model_error("geometric")
+        return [
+            f"diffraction is left out (ε = {numbers.epsilon:.2g}, up to {numbers.first_order:.2g} "
+            f"rad at the mask's edge; {zone}): {size:.1e}"
+        ]
+    if model == "separable":
+        if not probe.pixel_integration:
+            return []
+        size = probe.model_error("separable")
+        return [f"a pixel's average is taken at {PIXEL_NODES} points an axis: {size:.1e}"]
+    edge = probe.model_error("closed_form")
+    effects = [f"the aperture's edge is left out ({zone}): {edge:.1e}"]
+    if model == "paraxial":
+        second = probe.difference("paraxial", "closed_form")
+        effects.insert(
+            0,
+            f"diffraction of second order in ε = {numbers.epsilon:.2g} is left out (up to "
+            f"{numbers.second_order:.2g} rad at the mask's edge): {second:.1e}",
+        )
+    return effects

@@ -1,6 +1,6 @@
 r"""The Fresnel zone aperture (FZA), thesis Eq 3.1."""
 
-from typing import Any, Literal
+from typing import Literal
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from thincam_jax._core import checks
+from thincam_jax._core.checks import Number, Numbers
 from thincam_jax._core.grids import Grid, cell_overlap, centred_indices
 from thincam_jax._core.precision import as_complex, phasor, product
 from thincam_jax.lensless.masks.base import AbstractMask, ZoneOrders
@@ -55,14 +56,14 @@ class FresnelZoneAperture(AbstractMask):
 
     def __init__(
         self,
-        beta,
-        phase: Any = 0.0,
+        beta: Number,
+        phase: Number = 0.0,
         *,
-        width,
+        width: Number,
         profile: Literal["cosine", "binary"] = "cosine",
-        centre=(0.0, 0.0),
-        pixel_pitch=None,
-        fill_factor=1.0,
+        centre: Numbers | tuple[Number, Number] = (0.0, 0.0),
+        pixel_pitch: Number | None = None,
+        fill_factor: Number = 1.0,
         harmonics: int = 9,
     ):
         self.beta = checks.positive("beta", beta, "rad/mm^2")
@@ -116,7 +117,9 @@ def _series(profile: str, harmonics: int) -> tuple[tuple[int, ...], tuple[float,
     return (0, *odd), (0.5, *(float(np.sin(k * np.pi / 2) / (k * np.pi)) for k in odd))
 
 
-def axis_samples(zones: ZoneOrders, x: Float[Array, " n"], pitch) -> Complex[Array, "order n"]:
+def axis_samples(
+    zones: ZoneOrders, x: Float[Array, " n"], pitch: Float[Array, ""]
+) -> Complex[Array, "order n"]:
     """Each order's one-dimensional factor, weighted by the open part of every sample's cell."""
     k = jnp.asarray(zones.orders, dtype=x.dtype)[:, None]
     open_part = cell_overlap(x, pitch, zones.lower, zones.upper) / pitch

@@ -1,9 +1,12 @@
 """A mask given by numbers: any pattern, measured or designed."""
 
+from typing import Any
+
 import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
 
 from thincam_jax._core import checks
+from thincam_jax._core.checks import Number, Numbers
 from thincam_jax._core.grids import Grid, cell_overlap, centred_indices
 from thincam_jax._core.precision import product
 from thincam_jax.lensless.masks.base import AbstractMask
@@ -23,7 +26,13 @@ class SampledMask(AbstractMask):
     pitch: Float[Array, ""]
     centre: Float[Array, "2"]
 
-    def __init__(self, amplitude, pitch, *, centre=(0.0, 0.0)):
+    def __init__(
+        self,
+        amplitude: Any,
+        pitch: Number,
+        *,
+        centre: Numbers | tuple[Number, Number] = (0.0, 0.0),
+    ):
         self.amplitude = jnp.asarray(amplitude)
         if self.amplitude.ndim != 2 or 0 in self.amplitude.shape:
             raise ValueError(

@@ -3,9 +3,10 @@
 import math
 
 import numpy as np
+import scipy.linalg
+from jaxtyping import Complex, Float
 
-from thincam_jax.lensless.plan.compress import fit, order_of_columns
-from thincam_jax.lensless.plan.view import FULL, View, Way
+from thincam_jax.lensless.plan.seen import FULL, PsfMethod, SeenScene
 from thincam_jax.lensless.propagation.separable import PIXEL_NODES
 
 # Nodes of the pixel average where PSFs are compared with each other, and how far the tolerance must
@@ -17,90 +18,98 @@ _CONVOLUTION_ROUNDING = 1.5e-6
 _EVERYTHING = 3e-5
 
 
-def choose_way(view: View, tolerance: float) -> tuple[Way, float]:
+def choose_psf(seen: SeenScene, tolerance: float) -> tuple[PsfMethod, float]:
     """The cheapest model, precision and pixel average within the tolerance at the corners."""
     # Double precision is for where single cannot serve: a cheaper model would not help there.
-    ways = [
-        Way(model, "float32", average)
-        for model in view.models
+    methods = [
+        PsfMethod(model, "float32", average)
+        for model in seen.models
         for average in (False, True)
-        if view.held_in_single(model)
+        if seen.held_in_single(model)
     ]
-    ways += [Way("separable", "float64", average) for average in (False, True)]
-    if _way_error(view, Way("separable", "float32", False)) > max(tolerance, 1e-3):
-        ways = [way for way in ways if way.pixel_integration]
-    best: tuple[Way, float] = (FULL, 0.0)
-    for way in sorted(ways, key=lambda w: _speed(view, w)):
-        error = _way_error(view, way)
+    methods += [PsfMethod("separable", "float64", average) for average in (False, True)]
+    if _method_error(seen, PsfMethod("separable", "float32", False)) > max(tolerance, 1e-3):
+        methods = [method for method in methods if method.pixel_integration]
+    best: tuple[PsfMethod, float] = (FULL, 0.0)
+    for method in sorted(methods, key=lambda m: _speed(seen, m)):
+        error = _method_error(seen, method)
         if error <= tolerance:
-            return way, error
+            return method, error
     return best
 
 
-def _speed(view: View, way: Way) -> float:
-    double = way.precision == "float64"
-    return view.psf_cost(way).flops * (2.0 if double else 1.0)
+def _speed(seen: SeenScene, method: PsfMethod) -> float:
+    double = method.precision == "float64"
+    return seen.psf_cost(method).flops * (2.0 if double else 1.0)
 
 
-def _way_error(view: View, way: Way) -> float:
-    if way == FULL:
+def _method_error(seen: SeenScene, method: PsfMethod) -> float:
+    if method == FULL:
         return 0.0
     worst = 0.0
-    for (wavelength, distance), exact in zip(view.corners, view.references, strict=True):
-        found = view.probe.exact(
-            wavelength, distance, way.model, way.precision, way.pixel_integration
+    for (wavelength, distance), exact in zip(seen.corners, seen.references, strict=True):
+        found = seen.probe.exact(
+            wavelength, distance, method.model, method.precision, method.pixel_integration
         )
-        error = view.relative_of_all((found - exact) * view.weights.sum())
+        error = seen.relative_of_all((found - exact) * seen.weights.sum())
         worst = max(worst, error if math.isfinite(error) else math.inf)
-    rounding = _CONVOLUTION_ROUNDING * view.crop if way.precision == "float32" else 0.0
+    rounding = _CONVOLUTION_ROUNDING * seen.crop if method.precision == "float32" else 0.0
     return worst + rounding
 
 
-def choose_wavelengths(view: View, way: Way, tolerance: float):
+def choose_wavelengths(
+    seen: SeenScene, method: PsfMethod, tolerance: float
+) -> tuple[list[int], Float[np.ndarray, " colour"], float]:
     """Some wavelengths and their weights, that reproduce the sum over all for three planes."""
-    count = len(view.wavelengths)
-    if count == 1 or view.tolerance < _EVERYTHING:
-        return list(range(count)), view.weights, 0.0
-    some = sorted(set(np.quantile(view.distances, [0, 0.5, 1], method="nearest").tolist()))
+    count = len(seen.wavelengths)
+    if count == 1 or seen.tolerance < _EVERYTHING:
+        return list(range(count)), seen.weights, 0.0
+    some = sorted(set(np.quantile(seen.distances, [0, 0.5, 1], method="nearest").tolist()))
     columns = np.concatenate(
-        [np.stack([_quick(view, way, w, t) for w in view.wavelengths], axis=-1) for t in some]
+        [np.stack([_quick(seen, method, w, t) for w in seen.wavelengths], axis=-1) for t in some]
     )
-    power = np.tile(np.sqrt(view.power), len(some))[:, None]
-    target = columns @ view.weights
+    power = np.tile(np.sqrt(seen.power), len(some))[:, None]
+    target = columns @ seen.weights
     order = order_of_columns((columns * power)[::2])
     for few in range(1, count):
         picked = sorted(order[:few])
         weights = fit((columns[:, picked] * power)[::2], (target * power[:, 0])[::2])
         error = columns[:, picked] @ weights - target
-        size = max(view.relative_of_all(part) for part in np.split(error, len(some)))
+        size = max(seen.relative_of_all(part) for part in np.split(error, len(some)))
         if size <= tolerance:
             return picked, weights, size
-    return list(range(count)), view.weights, 0.0
+    return list(range(count)), seen.weights, 0.0
 
 
-def _quick(view: View, way: Way, wavelength: float, distance: float):
-    few = view.tolerance > _ABOVE_EDGES * view.edge_wave
+def _quick(seen: SeenScene, method: PsfMethod, wavelength: float, distance: float):
+    few = seen.tolerance > _ABOVE_EDGES * seen.edge_wave
     nodes = _FEW_NODES if few else PIXEL_NODES
-    return view.probe.quick(wavelength, distance, way.model, way.pixel_integration, nodes)
+    return seen.probe.quick(wavelength, distance, method.model, method.pixel_integration, nodes)
 
 
-def choose_planes(view: View, way: Way, colours, weights, tolerance: float):
+def choose_planes(
+    seen: SeenScene,
+    method: PsfMethod,
+    colours: list[int],
+    weights: Float[np.ndarray, " colour"],
+    tolerance: float,
+) -> tuple[list[int], Float[np.ndarray, "distance plane"], float]:
     """Some planes whose PSFs stand for all, and the weights with which they do."""
-    count = len(view.distances)
-    if count == 1 or view.tolerance < _EVERYTHING:
+    count = len(seen.distances)
+    if count == 1 or seen.tolerance < _EVERYTHING:
         return list(range(count)), np.eye(count), 0.0
     columns = np.stack(
         [
             sum(
-                w * _quick(view, way, view.wavelengths[c], t)
+                w * _quick(seen, method, seen.wavelengths[c], t)
                 for c, w in zip(colours, weights, strict=True)
             )
-            for t in view.distances
+            for t in seen.distances
         ],
         axis=-1,
     )
-    area = np.sqrt(view.frequencies.weights)
-    light = np.sqrt(np.sum(np.abs(view.spectra) ** 2, axis=1)).T * area[:, None]
+    area = np.sqrt(seen.frequencies.weights)
+    light = np.sqrt(np.sum(np.abs(seen.spectra) ** 2, axis=1)).T * area[:, None]
     order = order_of_columns((columns * light)[::2])
     for few in range(1, count):
         picked = sorted(order[:few])
@@ -112,8 +121,24 @@ def choose_planes(view: View, way: Way, colours, weights, tolerance: float):
             ],
             axis=-1,
         )
-        error = np.einsum("kp,pbk->bk", chosen @ mixing - columns, view.spectra)
-        size = view.relative(error)
+        error = np.einsum("kp,pbk->bk", chosen @ mixing - columns, seen.spectra)
+        size = seen.relative(error)
         if size <= tolerance:
             return picked, mixing, size
     return list(range(count)), np.eye(count), 0.0
+
+
+def order_of_columns(columns: Complex[np.ndarray, "k n"]) -> list[int]:
+    """Columns in the order in which they add most to those before (QR with pivoting)."""
+    stacked = np.concatenate([np.real(columns), np.imag(columns)])
+    decomposition = scipy.linalg.qr(stacked, mode="r", pivoting=True)
+    return [int(p) for p in decomposition[-1]]
+
+
+def fit(
+    columns: Complex[np.ndarray, "k few"], target: Complex[np.ndarray, " k"]
+) -> Float[np.ndarray, " few"]:
+    """Real weights of the columns that come closest to the target."""
+    stacked = np.concatenate([np.real(columns), np.imag(columns)])
+    aim = np.concatenate([np.real(target), np.imag(target)])
+    return np.linalg.lstsq(stacked, aim, rcond=1e-12)[0]

@@ -1,13 +1,25 @@
 """What a capture holds beside its model's optics, with sizes."""
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
 from thincam_jax.imaging.scene import Scene
 from thincam_jax.lensless.accuracy.select import probe_of
 from thincam_jax.lensless.camera import LenslessCamera
-from thincam_jax.lensless.plan.records import Effect
+
+
+class Effect(NamedTuple):
+    """An effect of the camera and whether the plan models it.
+
+    - `size`: relative to the capture; None where it is not known.
+    """
+
+    name: str
+    modelled: bool
+    size: float | None
+    note: str
 
 
 def effects_of(camera: LenslessCamera, scene: Scene, tolerance: float) -> tuple[Effect, ...]:

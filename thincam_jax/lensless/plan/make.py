@@ -9,10 +9,10 @@ from thincam_jax.imaging.operators import kernel_shape
 from thincam_jax.imaging.scene import Scene
 from thincam_jax.lensless.accuracy.select import require_camera, tolerance_of
 from thincam_jax.lensless.camera import LenslessCamera
-from thincam_jax.lensless.plan.choose import choose_planes, choose_wavelengths, choose_way
+from thincam_jax.lensless.plan.choose import choose_planes, choose_psf, choose_wavelengths
 from thincam_jax.lensless.plan.effects import effects_of
-from thincam_jax.lensless.plan.records import Plan
-from thincam_jax.lensless.plan.view import FULL, View
+from thincam_jax.lensless.plan.run import Plan
+from thincam_jax.lensless.plan.seen import FULL, SeenScene
 
 # Parts of the tolerance that the decisions may use, in the order in which they are taken. What one
 # leaves over is the next one's.
@@ -32,8 +32,8 @@ def plan(camera: LenslessCamera, scene: Scene, *, tolerance: float) -> Plan:
       (interpolative decomposition), and planes are added up with these weights *before* they are
       convolved. Planes with nearly equal PSFs merge into one.
 
-    Obliquity, shot noise and what Fresnel's approximation leaves out are told with their sizes in
-    `Plan.effects`.
+    `Plan.effects` lists obliquity, shot noise and what Fresnel's approximation leaves out, with
+    their sizes.
 
     **Errors**: ValueError for a tolerance that is not positive; TypeError for a mask without zone
     orders, and for traced numbers.
@@ -44,33 +44,33 @@ def plan(camera: LenslessCamera, scene: Scene, *, tolerance: float) -> Plan:
         raise TypeError(f"scene is a {type(scene).__name__}; give a thincam_jax.Scene")
     if any(checks.is_traced(leaf) for leaf in jax.tree.leaves((camera, scene))):
         raise TypeError("plan needs known numbers: call it outside of jit and grad")
-    view = View(camera, scene, tolerance)
-    way, model_error = choose_way(view, tolerance * _MODEL_SHARE)
+    seen = SeenScene(camera, scene, tolerance)
+    method, model_error = choose_psf(seen, tolerance * _MODEL_SHARE)
     model_error += RESULT_ROUNDING[precision_of(camera.sensor.pitch)]
     left = max(tolerance - model_error, 0.0)
-    colours, weights, colour_error = choose_wavelengths(view, way, left * _WAVELENGTH_SHARE)
+    colours, weights, colour_error = choose_wavelengths(seen, method, left * _WAVELENGTH_SHARE)
     left = max(tolerance - model_error - colour_error, 0.0)
-    planes, mixing, plane_error = choose_planes(view, way, colours, weights, left)
+    planes, mixing, plane_error = choose_planes(seen, method, colours, weights, left)
     shares = {"model": model_error, "wavelengths": colour_error, "planes": plane_error}
-    window = fast_shape(kernel_shape(camera.sensor.shape, view.field_shape), real=True)
+    window = fast_shape(kernel_shape(camera.sensor.shape, seen.field_shape), real=True)
     return Plan(
         camera=camera,
         tolerance=tolerance,
         predicted_error=sum(shares.values()),
-        model=way.model,
-        precision=way.precision,
-        pixel_integration=way.pixel_integration,
-        distances=tuple(view.distances[p] for p in planes),
+        model=method.model,
+        precision=method.precision,
+        pixel_integration=method.pixel_integration,
+        distances=tuple(seen.distances[p] for p in planes),
         mixing=mixing,
-        wavelengths=tuple(view.wavelengths[c] for c in colours),
+        wavelengths=tuple(seen.wavelengths[c] for c in colours),
         weights=tuple(float(w) for w in weights),
-        scene_distances=view.distances,
-        scene_wavelengths=view.wavelengths,
-        scene_weights=tuple(float(w) for w in view.weights),
-        field_shape=view.field_shape,
+        scene_distances=seen.distances,
+        scene_wavelengths=seen.wavelengths,
+        scene_weights=tuple(float(w) for w in seen.weights),
+        field_shape=seen.field_shape,
         padded_shape=window,
-        cost=view.cost(way, len(planes), len(colours)),
-        full_cost=view.cost(FULL, len(view.distances), len(view.wavelengths)),
+        cost=seen.cost(method, len(planes), len(colours)),
+        full_cost=seen.cost(FULL, len(seen.distances), len(seen.wavelengths)),
         shares=shares,
         effects=effects_of(camera, scene, tolerance),
     )

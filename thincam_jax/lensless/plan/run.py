@@ -1,16 +1,105 @@
-"""Carrying out a plan."""
+"""A plan: whether it is run on what it was made for, and carrying it out."""
 
+from dataclasses import dataclass
+
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
-from thincam_jax._core.memory import refuse_if_too_large
-from thincam_jax._core.precision import allow, cast, precision_of
+from thincam_jax._core import checks
+from thincam_jax._core.memory import readable, refuse_if_too_large
+from thincam_jax._core.precision import Precision, allow, cast, precision_of
 from thincam_jax.imaging.operators import CropConvolution, kernel_grid
 from thincam_jax.imaging.scene import Scene
 from thincam_jax.lensless.camera import LenslessCamera
-from thincam_jax.lensless.exposure import project, spectral_psf
-from thincam_jax.lensless.plan.fits import require_fits
-from thincam_jax.lensless.plan.records import Plan
+from thincam_jax.lensless.cost import Cost
+from thincam_jax.lensless.forward import project, projected_shape, spectral_psf
+from thincam_jax.lensless.masks.fza import FresnelZoneAperture
+from thincam_jax.lensless.plan.effects import Effect
+from thincam_jax.lensless.psf import Model
+
+# How far a camera's numbers may be from the plan's, relative.
+_NEAR = 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """How `capture` computes a scene within a tolerance; made by `thincam_jax.plan`.
+
+    Print it for a table. It holds for scenes with the same planes and wavelengths as the one that
+    it was made for and images like its, and for cameras within 1 % of its own, at any phase of the
+    mask.
+
+    - `camera`: that it was made for.
+    - `tolerance`, `predicted_error`: relative L2 error of the noise-free capture, of a
+      batch as a whole.
+    - `model`, `precision`, `pixel_integration`: arguments of `psf`.
+    - `distances`: object distances in mm whose PSFs are computed, out of the scene's.
+    - `mixing`: (distance, plane) weights: the PSF of a plane is this sum of the computed ones, so
+      that planes are merged before they are convolved.
+    - `wavelengths`, `weights`: wavelengths in mm that are computed, and their shares of the light.
+    - `scene_distances`, `scene_wavelengths`, `scene_weights`: of the
+      scene that the plan was made for.
+    - `field_shape`: samples of the largest projected plane on the sensor's pitch.
+    - `padded_shape`: window of the convolutions.
+    - `cost`, `full_cost`: of the plan and of computing every plane and wavelength.
+    - `shares`: predicted errors of the single decisions.
+    - `effects`: what the capture holds and what it does not.
+    """
+
+    camera: LenslessCamera
+    tolerance: float
+    predicted_error: float
+    model: Model
+    precision: Precision
+    pixel_integration: bool
+    distances: tuple[float, ...]
+    mixing: Float[np.ndarray, "distance plane"]
+    wavelengths: tuple[float, ...]
+    weights: tuple[float, ...]
+    scene_distances: tuple[float, ...]
+    scene_wavelengths: tuple[float, ...]
+    scene_weights: tuple[float, ...]
+    field_shape: tuple[int, int]
+    padded_shape: tuple[int, int]
+    cost: Cost
+    full_cost: Cost
+    shares: dict[str, float]
+    effects: tuple[Effect, ...]
+
+    @property
+    def meets_tolerance(self) -> bool:
+        """False where no way of computing meets the tolerance; the plan is then the best one."""
+        return self.predicted_error <= self.tolerance
+
+    def __str__(self) -> str:
+        average = "averaged over pixels" if self.pixel_integration else "at the pixels' centres"
+        planes, colours = len(self.scene_distances), len(self.scene_wavelengths)
+        shares = self.shares
+        rows, columns = self.field_shape
+        met = "" if self.meets_tolerance else "  NOT MET"
+        lines = [
+            ("tolerance", f"{self.tolerance:.1e}, predicted {self.predicted_error:.1e}{met}"),
+            ("model", f"{self.model}, {self.precision}, {average}: {shares['model']:.1e}"),
+            ("depth planes", f"{planes} by {len(self.distances)} PSFs: {shares['planes']:.1e}"),
+            (
+                "wavelengths",
+                f"{colours} by {len(self.wavelengths)}: {shares['wavelengths']:.1e}",
+            ),
+            (
+                "convolution",
+                f"field {rows}×{columns}, window {self.padded_shape[0]}×{self.padded_shape[1]}",
+            ),
+            *((effect.name, effect.note) for effect in self.effects),
+            (
+                "cost",
+                f"{self.cost.flops:.1e} operations of {self.full_cost.flops:.1e} in full, "
+                f"{readable(self.cost.bytes)}",
+            ),
+        ]
+        width = max(len(name) for name, _ in lines)
+        return "\n".join(f"{name:<{width}}  {text}" for name, text in lines)
 
 
 def run_plan(plan: Plan, camera: LenslessCamera, scene: Scene) -> Float[Array, "*batch y x"]:
@@ -42,3 +131,64 @@ def run_plan(plan: Plan, camera: LenslessCamera, scene: Scene) -> Float[Array, "
             shapes = camera.sensor.shape, plan.field_shape
             total = total + CropConvolution(kernel, grid.pitch, *shapes)(field)
     return cast(total, own)
+
+
+def require_fits(plan: Plan, camera: LenslessCamera, scene: Scene) -> None:
+    """ValueError where camera or scene are not the plan's. Traced numbers are not checked."""
+    other = _other_numbers(plan.camera, camera)
+    if other:
+        raise ValueError(
+            f"the plan is for another camera ({', '.join(other)} differ): make a plan for this one"
+        )
+    distances = [plane.distance for plane in scene.planes]
+    spectrum = scene.spectrum
+    for what, given, planned in (
+        ("planes at given distances", distances, plan.scene_distances),
+        ("given wavelengths", spectrum.wavelengths, plan.scene_wavelengths),
+        ("given weights of them", spectrum.weights, plan.scene_weights),
+    ):
+        if not _same(given, planned):
+            raise ValueError(
+                f"the plan is for {len(planned)} {what}, the scene has others: make a plan for it"
+            )
+    widths = [plane.width for plane in scene.planes]
+    if any(checks.is_traced(n) for n in (*distances, *widths, camera.distance)):
+        return
+    shapes = [projected_shape(camera, plane) for plane in scene.planes]
+    needed = max(s[0] for s in shapes), max(s[1] for s in shapes)
+    if any(n > p for n, p in zip(needed, plan.field_shape, strict=True)):
+        raise ValueError(
+            f"the plan is for planes that cover {plan.field_shape} samples on the sensor, the "
+            f"scene's cover {needed}: make a plan for it"
+        )
+
+
+def _same(given, planned) -> bool:
+    if len(given) != len(planned):
+        return False
+    if any(checks.is_traced(n) for n in jax.tree.leaves(given)):
+        return True
+    return np.allclose(np.asarray(given, float), planned, rtol=1e-6)
+
+
+def _other_numbers(own: LenslessCamera, camera: LenslessCamera) -> list[str]:
+    """Names of the numbers that differ by more than 1 %; the mask's phase is not compared."""
+    if jax.tree.structure(own.mask) != jax.tree.structure(camera.mask):
+        return ["mask"]
+    if own.sensor.shape != camera.sensor.shape:
+        return ["sensor.shape"]
+    width = own.mask.extent[0]
+    numbers = {
+        "sensor.pitch": (own.sensor.pitch, camera.sensor.pitch, own.sensor.pitch),
+        "distance": (own.distance, camera.distance, own.distance),
+        "mask.width": (width, camera.mask.extent[0], width),
+        "mask.centre": (own.mask.centre, camera.mask.centre, width),
+    }
+    if isinstance(own.mask, FresnelZoneAperture) and isinstance(camera.mask, FresnelZoneAperture):
+        numbers["mask.beta"] = own.mask.beta, camera.mask.beta, own.mask.beta
+    return [
+        name
+        for name, (first, second, scale) in numbers.items()
+        if not checks.is_traced(second)
+        and np.abs(np.asarray(first) - np.asarray(second)).max() > _NEAR * float(scale)
+    ]

@@ -1,6 +1,14 @@
-"""The PSF's transfer function at chosen frequencies, from one-dimensional factors."""
+r"""The PSF's transfer function and a scene's spectrum at a few frequencies.
+
+A capture is a linear convolution, so that by Parseval its energy is
+:math:`\iint |\sum_t H_t F_t|^2\,dv\,du` over the frequencies of the samples. The integral is taken
+at a few hundred random ones, closer together towards zero, where scenes have their light: that
+shows how an error of the PSF shows in the image of this scene.
+"""
 
 import functools
+import math
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -8,13 +16,74 @@ import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from thincam_jax._core.precision import Precision, allow, cast, product
-from thincam_jax.lensless.accuracy.points import Points
-from thincam_jax.lensless.accuracy.terms import closed_terms
+from thincam_jax.lensless.accuracy.lines import SparseGrid
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.masks.base import AbstractMask
-from thincam_jax.lensless.plan.spectrum import Frequencies, centred, waves
 from thincam_jax.lensless.propagation.path import Path
 from thincam_jax.lensless.propagation.separable import PIXEL_NODES
+from thincam_jax.lensless.psf import Model, closed_terms
+
+# Rings of frequencies, and frequencies in each.
+_RINGS, _IN_RING = 32, 16
+
+
+class Frequencies(NamedTuple):
+    """Frequencies in cycles per sample, and the area that each stands for.
+
+    - `v`, `u`: down and across; of a pair of opposite frequencies one stands for both.
+    - `weights`: areas; together 1, the whole band.
+    """
+
+    v: Float[np.ndarray, " k"]
+    u: Float[np.ndarray, " k"]
+    weights: Float[np.ndarray, " k"]
+
+
+def sample_frequencies(longest: int, seed: int = 0) -> Frequencies:
+    """Stratified over rings that grow geometrically from a quarter of 1/`longest`."""
+    random = np.random.default_rng(seed)
+    edges = [0.0, *np.geomspace(min(0.25 / longest, 0.25), 0.5, _RINGS - 1), math.sqrt(0.5)]
+    found = [_ring(random, low, high) for low, high in zip(edges[:-1], edges[1:], strict=True)]
+    v, u, weights = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    return Frequencies(v, u, weights / weights.sum())
+
+
+def _ring(random, low: float, high: float):
+    """Frequencies of one ring inside the square band, and the ring's area shared among them."""
+    tried = 4096 if high > 0.5 else _IN_RING
+    radius = np.sqrt(random.uniform(low**2, high**2, tried))
+    angle = random.uniform(-np.pi / 2, np.pi / 2, tried)
+    v, u = radius * np.sin(angle), radius * np.cos(angle)
+    inside = (np.abs(v) < 0.5) & (u < 0.5)
+    area = np.pi * (high**2 - low**2) * inside.mean()
+    v, u = v[inside][:_IN_RING], u[inside][:_IN_RING]
+    return v, u, np.full(len(v), area / len(v))
+
+
+def waves(
+    frequencies: Float[np.ndarray, " k"], indices: Float[np.ndarray, " n"], length: int
+) -> Float[np.ndarray, "length k2"]:
+    """cos and −sin of the frequencies at centred indices, side by side; zero beyond them."""
+    phase = 2 * np.pi * indices[:, None] * frequencies
+    filled = np.zeros((length, 2 * len(frequencies)))
+    filled[: len(indices)] = np.concatenate([np.cos(phase), -np.sin(phase)], axis=1)
+    return filled
+
+
+def centred(count: int) -> Float[np.ndarray, " n"]:
+    return np.arange(count) - (count - 1) / 2
+
+
+def image_spectrum(
+    images: Float[np.ndarray, "batch m n"], frequencies: Frequencies
+) -> Complex[np.ndarray, "batch k"]:
+    """F(v, u) = Σ f e^{−2πj(vy+ux)} of images about their centres."""
+    rows, columns = (centred(n) for n in images.shape[-2:])
+    # cos and −sin side by side: one real product, at half the cost of a complex one.
+    half = images @ waves(frequencies.u, columns, len(columns))
+    cosine, sine = np.split(half, 2, axis=-1)
+    down = np.exp(-2j * np.pi * np.outer(rows, frequencies.v))
+    return np.einsum("bmk,mk->bk", cosine + 1j * sine, down)
 
 
 class TransferProbe:
@@ -40,7 +109,12 @@ class TransferProbe:
         ]
 
     def exact(
-        self, wavelength, distance, model: str, precision: Precision, pixel_integration: bool
+        self,
+        wavelength: float,
+        distance: float,
+        model: Model,
+        precision: Precision,
+        pixel_integration: bool,
     ) -> Complex[np.ndarray, " k"]:
         """H with factors in that precision, transformed in double precision."""
         with allow("float64"):
@@ -63,7 +137,7 @@ class TransferProbe:
         return tuple(jnp.asarray(w, jnp.float32) for w in self.waves)
 
     def quick(
-        self, wavelength, distance, model: str, pixel_integration: bool, nodes: int
+        self, wavelength: float, distance: float, model: Model, pixel_integration: bool, nodes: int
     ) -> Complex[np.ndarray, " k"]:
         """H in single precision, with a chosen number of nodes a pixel, for many PSFs."""
         return self._transfer(
@@ -81,7 +155,7 @@ class TransferProbe:
     ) -> Complex[np.ndarray, " k"]:
         path = self.camera.path(float(wavelength), float(distance))
         mask, pitch, path = cast((self.camera.mask, self.camera.sensor.pitch, path), precision)
-        points = Points(self.places[0], self.places[1], pitch)
+        points = SparseGrid(self.places[0], self.places[1], pitch)
         transfer = _transfer(mask, points, path, *waves_of, model, pixel_integration, nodes)
         return np.asarray(transfer, complex)
 
@@ -89,11 +163,11 @@ class TransferProbe:
 @jax.jit(static_argnames=("model", "pixel_integration", "nodes"))
 def _transfer(
     mask: AbstractMask,
-    points: Points,
+    points: SparseGrid,
     path: Path,
     down: Float[Array, "m k2"],
     across: Float[Array, "n k2"],
-    model: str,
+    model: Model,
     pixel_integration: bool,
     nodes: int,
 ) -> Complex[Array, " k"]:

@@ -4,9 +4,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
 from thincam_jax._core.precision import as_complex
-from thincam_jax.lensless.masks.base import AbstractMask
-from thincam_jax.lensless.propagation.chirps import ChirpSum, gather_constants, require_continuous
-from thincam_jax.lensless.propagation.orders import pairs, require_zone_orders
+from thincam_jax.lensless.masks.base import AbstractMask, pairs, require_zone_orders
+from thincam_jax.lensless.propagation.chirp_sum import (
+    ChirpSum,
+    gather_constants,
+    require_continuous,
+)
 from thincam_jax.lensless.propagation.path import Path
 
 

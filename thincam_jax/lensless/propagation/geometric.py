@@ -6,9 +6,8 @@ from jaxtyping import Array, Complex, Float
 
 from thincam_jax._core.grids import Grid
 from thincam_jax._core.precision import as_complex, phasor, product
-from thincam_jax.lensless.masks.base import AbstractMask, ZoneOrders
+from thincam_jax.lensless.masks.base import AbstractMask, ZoneOrders, pairs
 from thincam_jax.lensless.propagation.chirp import chirp_average
-from thincam_jax.lensless.propagation.orders import pairs
 from thincam_jax.lensless.propagation.path import Path
 from thincam_jax.lensless.propagation.separable_sum import SeparableSum
 

@@ -1,10 +1,15 @@
 r"""`paraxial`: the thesis' approximation for weak diffraction, ε = λβd/π → 0."""
 
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
-from thincam_jax.lensless.masks.base import AbstractMask
-from thincam_jax.lensless.propagation.chirps import ChirpSum, gather_constants, require_continuous
-from thincam_jax.lensless.propagation.orders import pairs, require_zone_orders
+from thincam_jax._core.checks import Number, Numbers
+from thincam_jax.lensless.masks.base import AbstractMask, pairs, require_zone_orders
+from thincam_jax.lensless.propagation.chirp_sum import (
+    ChirpSum,
+    gather_constants,
+    require_continuous,
+)
 from thincam_jax.lensless.propagation.path import Path
 
 
@@ -37,7 +42,9 @@ def paraxial(mask: AbstractMask, path: Path) -> ChirpSum:
     return ChirpSum(weights, curvatures / scale**2, scale * mask.centre)
 
 
-def paraxial_response(frequency_squared, beta, phase, wavelength, distance):
+def paraxial_response(
+    frequency_squared: Numbers, beta: Number, phase: Number, wavelength: Number, distance: Number
+) -> Float[Array, "..."]:
     r"""The OTF of Eq 3.30 (corrected) without its δ, for ρ² in cycles²/mm² and t → ∞, mm².
 
     .. math::
@@ -47,4 +54,4 @@ def paraxial_response(frequency_squared, beta, phase, wavelength, distance):
     x = jnp.pi**2 * frequency_squared / beta
     diffraction = jnp.cos(jnp.pi * wavelength * distance * frequency_squared)
     first = jnp.pi / (2 * beta) * diffraction * jnp.sin(x - phase)
-    return first + jnp.pi / (16 * beta) * jnp.sin(x / 2 - 2 * phase)
+    return jnp.asarray(first + jnp.pi / (16 * beta) * jnp.sin(x / 2 - 2 * phase))

@@ -1,14 +1,13 @@
-"""The way of the light: point source, mask, sensor."""
-
-from typing import Any
+"""The light's path: point source, mask, sensor."""
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
+from thincam_jax._core.checks import Number
 
-# No optics beyond: a wavelength above 0.1 mm was meant in nanometres or micrometres.
+# mm: a longer wavelength was meant in nanometres or micrometres.
 _LONGEST = 0.1
 
 
@@ -27,7 +26,7 @@ class Path(eqx.Module):
     distance: Float[Array, ""]
     object_distance: Float[Array, ""]
 
-    def __init__(self, wavelength, distance, object_distance: Any = jnp.inf):
+    def __init__(self, wavelength: Number, distance: Number, object_distance: Number = jnp.inf):
         self.wavelength = checks.positive("wavelength", wavelength, "mm")
         if not checks.is_traced(self.wavelength) and float(self.wavelength) > _LONGEST:
             raise ValueError(

@@ -7,9 +7,8 @@ from jaxtyping import Array, Complex, Float
 from thincam_jax._core.grids import Grid, block_mean
 from thincam_jax._core.precision import turn_phasor
 from thincam_jax.lensless.masks.base import AbstractMask
-from thincam_jax.lensless.propagation.angular_spectrum import planes, within
+from thincam_jax.lensless.propagation.angular_spectrum import lit_mask, planes, within
 from thincam_jax.lensless.propagation.path import Path
-from thincam_jax.lensless.propagation.plane import lit_mask
 
 # Sensor samples done together: bounds the memory to this many copies of the mask plane.
 _BATCH = 64

@@ -2,7 +2,7 @@
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Array, Complex, DTypeLike, Float
 
 from thincam_jax._core.grids import Grid
 from thincam_jax._core.precision import as_complex, product, turn_phasor
@@ -51,7 +51,7 @@ def _centred_dft(samples: Float[Array, "factor n"]) -> Complex[Array, "factor n"
     return spectrum * centre_phase(n, samples.dtype)
 
 
-def centre_phase(count: int, dtype) -> Complex[Array, " count"]:
+def centre_phase(count: int, dtype: DTypeLike) -> Complex[Array, " count"]:
     """e^{2πj u (n−1)/2} on the centred DFT frequencies: moves the origin to the grid's centre."""
     turns = (jnp.arange(count, dtype=dtype) - count // 2) * ((count - 1) / (2 * count))
     return turn_phasor(turns)

@@ -19,10 +19,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
+from thincam_jax._core.checks import Number
 from thincam_jax._core.precision import as_complex, phasor, product
-from thincam_jax.lensless.masks.base import AbstractMask, ZoneOrders
+from thincam_jax.lensless.masks.base import AbstractMask, ZoneOrders, pairs, require_zone_orders
 from thincam_jax.lensless.propagation.chirp import chirp_integral
-from thincam_jax.lensless.propagation.orders import pairs, require_zone_orders
 from thincam_jax.lensless.propagation.path import Path
 
 
@@ -48,7 +48,7 @@ def transfer_factors(
     v: Float[Array, " v"],
     u: Float[Array, " u"],
     *,
-    pixel_pitch=None,
+    pixel_pitch: Number | None = None,
 ) -> TransferFactors:
     r"""Transfer function of a centred mask at the frequencies (v, u) on the sensor, cycles/mm.
 

@@ -1,10 +1,10 @@
-r"""The way down to a sharp minimum: coarse pixels, and slopes over wide steps, first.
+r"""Least squares towards a narrow minimum: coarse pixels and wide difference steps first.
 
-The waves from the rims of the aperture turn fast with d. They hold little of the light, so that the
-sum of squares is a smooth bowl in d with a narrow dip, but most of its derivative: least squares
-with the derivative creep, or stop in a ripple of the bowl. Differences over a step so wide that
-these waves average out follow the bowl instead. The step is narrowed as far as the data allow: as
-long as it is wide against the standard error that it gives.
+The phase of the waves from the aperture's rims changes fast with d. They carry little light, so
+that the sum of squares is a smooth bowl in d with a narrow dip at the bottom, but they dominate its
+derivative: Levenberg-Marquardt with exact derivatives creeps, or stops in a ripple of the bowl.
+Finite differences over a step wide enough to average these waves out follow the bowl. The step is
+narrowed as long as it stays wide against the standard error that it gives.
 """
 
 import math
@@ -15,7 +15,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import scipy
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from thincam_jax._core.grids import Grid, block_mean, central_blocks
 from thincam_jax.measured.calibration.problem import (
@@ -54,7 +54,9 @@ class FitImage(NamedTuple):
     offset: Float[Array, "2"]
     pixel_integration: bool
 
-    def model(self, start: FitState, names, steps) -> np.ndarray:
+    def model(
+        self, start: FitState, names: tuple[str, ...], steps: Float[ArrayLike, " unknown"]
+    ) -> np.ndarray:
         steps = jnp.asarray(steps, jnp.float64)
         where = (self.pixel_integration, self.grid, self.offset)
         return np.asarray(model(steps, start, names, *where)).ravel()
@@ -95,11 +97,13 @@ def descend(
         width = width * _NARROWER
 
 
-def honest_covariance(measured: FitImage, found: FitState, names) -> Covariance:
+def covariance_by_differences(
+    measured: FitImage, found: FitState, names: tuple[str, ...]
+) -> Covariance:
     """Standard errors and correlations of the steps from `found`.
 
-    By differences over steps that are wide against the errors which they give, narrowed as long as
-    they are: derivatives would count on waves of the rims that the noise may well hide.
+    By finite differences, narrowed as long as they are wide against the errors that they give:
+    exact derivatives would count on waves of the rims that the noise may hide.
     """
     none = np.zeros(len(names))
     residual = _residual(none, measured, found, names, None)
@@ -114,7 +118,7 @@ def honest_covariance(measured: FitImage, found: FitState, names) -> Covariance:
         width = width * _NARROWER
 
 
-def slope_norms(measured: FitImage, state: FitState, names) -> np.ndarray:
+def slope_norms(measured: FitImage, state: FitState, names: tuple[str, ...]) -> np.ndarray:
     """How far the image moves for a step of each unknown."""
     widths = difference_widths(state, _WIDE * _NARROWER)
     norms = np.linalg.norm(_slopes(np.zeros(len(names)), measured, state, names, widths), axis=0)
@@ -140,7 +144,7 @@ def difference_widths(state: FitState, width: float) -> np.ndarray:
 
 
 def _too_narrow(known: Covariance, turned: np.ndarray, widths: np.ndarray) -> bool:
-    """Whether what the rims tell is known no better than by the width of its differences."""
+    """Whether the errors of what the rims determine have reached the width of the differences."""
     errors = of_values(known, turned).standard_errors
     rims = [name in _RIMS and bool(np.any(row)) for name, row in zip(SEEN, turned, strict=True)]
     return not any(rims) or bool(np.any((_AGAINST_ERROR * errors > widths)[rims]))

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from thincam_jax._core.grids import Grid
 from thincam_jax.lensless.camera import LenslessCamera
@@ -179,7 +179,7 @@ class FitProblem(eqx.Module):
 
 
 class Solution(NamedTuple):
-    """Where the solver stopped, and on the way there, whether it converged."""
+    """What Levenberg-Marquardt found, whether it converged and after how many iterations."""
 
     scaled: Float[Array, " unknown"]
     converged: bool
@@ -198,7 +198,14 @@ def residual(scaled: Float[Array, " unknown"], problem: FitProblem) -> Float[Arr
 
 
 @eqx.filter_jit
-def model(steps, start: FitState, names: tuple[str, ...], pixel_integration, grid: Grid, offset):
+def model(
+    steps: Float[Array, " unknown"],
+    start: FitState,
+    names: tuple[str, ...],
+    pixel_integration: bool,
+    grid: Grid,
+    offset: Float[Array, "2"],
+) -> Float[Array, "y x"]:
     """The image after the steps, on a grid whose middle is `offset` (y, x, mm) off the sensor's."""
     state = start.moved(names, steps)
     # The grid's middle is its origin: the mask moves the other way.
@@ -222,7 +229,9 @@ SEEN = (
 
 
 @eqx.filter_jit
-def seen_by_steps(start: FitState, names: tuple[str, ...], steps) -> Float[Array, "seen step"]:
+def seen_by_steps(
+    start: FitState, names: tuple[str, ...], steps: Float[ArrayLike, " step"]
+) -> Float[Array, "seen step"]:
     """How far each of `SEEN` moves with each step: exact, also where steps cannot be told apart."""
     return jax.jacfwd(_seen)(steps, start, names)
 
@@ -245,7 +254,9 @@ def _seen(steps, start: FitState, names):
 
 
 @eqx.filter_jit
-def values_by_steps(start: FitState, names: tuple[str, ...], steps) -> Float[Array, "value step"]:
+def values_by_steps(
+    start: FitState, names: tuple[str, ...], steps: Float[ArrayLike, " step"]
+) -> Float[Array, "value step"]:
     """The derivative of `FitState.values` in the steps from `start`."""
     return jax.jacfwd(_values)(steps, start, names)
 
@@ -255,7 +266,9 @@ def _values(steps, start: FitState, names):
 
 
 @eqx.filter_jit
-def state_and_residual(scaled: Float[Array, " unknown"], problem: FitProblem):
+def state_and_residual(
+    scaled: Float[Array, " unknown"], problem: FitProblem
+) -> tuple[FitState, Float[Array, "y x"]]:
     """The numbers, and measured image − model."""
     return state_at(scaled, problem), -residual(scaled, problem) / problem.weight
 

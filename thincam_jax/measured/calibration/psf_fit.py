@@ -11,10 +11,15 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
+from thincam_jax._core.checks import Number, Numbers
 from thincam_jax._core.precision import Precision, allow, cast, precision_of
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.masks.fza import FresnelZoneAperture
-from thincam_jax.measured.calibration.coarse import full_image, honest_covariance, slope_norms
+from thincam_jax.measured.calibration.coarse import (
+    covariance_by_differences,
+    full_image,
+    slope_norms,
+)
 from thincam_jax.measured.calibration.problem import (
     PARAMETERS,
     STEP,
@@ -77,11 +82,11 @@ class PsfFit(eqx.Module):
 
 
 def fit_psf(
-    psf_image,
+    psf_image: Numbers,
     camera: LenslessCamera,
     *,
-    object_distance,
-    wavelength,
+    object_distance: Number,
+    wavelength: Number,
     parameters: Sequence[str] = DEFAULT,
     pixel_integration: bool = True,
     search: float | int = 0.12,
@@ -107,8 +112,8 @@ def fit_psf(
       the ripples that they throw, are on the sensor; else only β/M².
     - β, t and W never all three.
 
-    What the data do not separate is found from the correlations and told in `status` and
-    `reasons`; the numbers so named are then one of many equally good choices.
+    `status` and `reasons` name the numbers that the data do not separate, by their correlations;
+    these are then one of many equally good choices.
 
     There is no tilt of the mask against the sensor. Turned by α about the y axis, the mask is
     foreshortened, which changes the fringes' phase by βx²α² and would keep h separable; but its
@@ -192,7 +197,9 @@ def _report(problem: FitProblem, solution: Solution, precision: Precision) -> Ps
     names = problem.names
     found, residual = state_and_residual(solution.scaled, problem)
     measured = full_image(np.asarray(problem.image), found, problem.pixel_integration)
-    known = of_values(honest_covariance(measured, found, names), _slopes_of_values(found, names))
+    known = of_values(
+        covariance_by_differences(measured, found, names), _slopes_of_values(found, names)
+    )
     values = dict(zip(names, np.asarray(found.values(names)), strict=True))
     errors = dict(zip(names, known.standard_errors, strict=True))
     distance, alike = np.inf, ambiguous_pairs(names, known.correlation)

@@ -12,6 +12,7 @@ import scipy
 from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
+from thincam_jax._core.checks import Numbers
 from thincam_jax._core.grids import block_mean, block_sum, central_blocks, centred_indices
 from thincam_jax._core.precision import allow
 from thincam_jax.measured.raw import image_with_contrast
@@ -49,8 +50,8 @@ class Registration(eqx.Module):
 
 
 def estimate_registration(
-    capture,
-    reference,
+    capture: Numbers,
+    reference: Numbers,
     *,
     scale: float | int = 1.0,
     search: float | int = 0.15,
@@ -144,7 +145,7 @@ class Fit(NamedTuple):
 def residual(unknowns: Float[Array, "5"], pair: Pair) -> Float[Array, "y x"]:
     """(offset + gain·reference((r − a)/s) − capture)·weights.
 
-    The unknowns: s over its start, in pixels at the edge, the way of a from its start (y, x) in
+    The unknowns: the change of s from its start, in pixels at the image's edge, that of a (y, x) in
     pixels, gain and offset.
     """
     scale, shift = _place(unknowns, pair)

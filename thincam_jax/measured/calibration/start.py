@@ -1,4 +1,4 @@
-"""Where the least squares of a PSF fit start: a camera that is right to a fraction of a fringe."""
+"""The start of a PSF fit's least squares: the camera to a fraction of a fringe."""
 
 import math
 from collections.abc import Sequence
@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from thincam_jax._core import checks
+from thincam_jax._core.checks import Number
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.measured.calibration.chirp_search import Chirp, Ranges, find_chirp
 from thincam_jax.measured.calibration.coarse import descend
@@ -19,7 +20,12 @@ _FARTHEST = 1e-6
 _WIDEST = 0.5  # of a search, in parts of one
 
 
-def given(camera: LenslessCamera, object_distance, wavelength, parameters) -> FitState:
+def given(
+    camera: LenslessCamera,
+    object_distance: Number,
+    wavelength: Number,
+    parameters: Sequence[str],
+) -> FitState:
     """The camera and the point as given, with an empty background and a gain of one."""
     path = camera.path(wavelength, object_distance)
     nearness = 1 / path.object_distance
@@ -30,7 +36,7 @@ def given(camera: LenslessCamera, object_distance, wavelength, parameters) -> Fi
 
 
 def search_ranges(
-    camera: LenslessCamera, parameters: Sequence[str], search, centre_search
+    camera: LenslessCamera, parameters: Sequence[str], search: Number, centre_search: Number | None
 ) -> Ranges:
     """How far the fringes on the sensor may be from those of the camera given."""
     search = float(checks.non_negative("search", search, "parts of one"))

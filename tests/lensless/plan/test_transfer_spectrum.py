@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from thincam_jax.lensless.plan.spectrum import centred, image_spectrum, sample_frequencies, waves
+from thincam_jax.lensless.plan.transfer import centred, image_spectrum, sample_frequencies, waves
 
 
 @pytest.mark.parametrize("longest", [1, 7, 200, 16384])

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from thincam_jax._core.grids import Grid
-from thincam_jax.lensless.accuracy.norms import distance, factors, norm, rounding_distance
+from thincam_jax.lensless.accuracy.probe import distance, factors, norm, rounding_distance
 from thincam_jax.lensless.propagation.separable_sum import SeparableSum
 
 SHAPE = (17, 23)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from thincam_jax._core.grids import Grid
-from thincam_jax.lensless.accuracy.points import COUNT, Points, chosen
+from thincam_jax.lensless.accuracy.lines import COUNT, SparseGrid, chosen
 
 SEEDS = range(300)
 
@@ -74,7 +74,7 @@ def test_points_are_those_of_the_grid(factor):
     grid = Grid((40, 9), jnp.asarray(0.02))
     indices = [np.array([0, 7, 39]), np.array([8, 2])]
     centred = [i - (n - 1) / 2 for i, n in zip(indices, grid.shape, strict=True)]
-    points = Points(*centred, grid.pitch)
+    points = SparseGrid(*centred, grid.pitch)
     assert points.shape == (3, 2)
     np.testing.assert_allclose(points.y, grid.y[indices[0]], rtol=1e-14)
     np.testing.assert_allclose(points.x, grid.x[indices[1]], rtol=1e-14)

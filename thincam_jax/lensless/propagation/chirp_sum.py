@@ -27,10 +27,13 @@ class ChirpSum(eqx.Module):
 
     def sample(self, grid: Grid, *, pixel_integration: bool) -> SeparableSum:
         """On a grid: at the pixel centres, or averaged over the pixels (Fresnel integrals)."""
-        factor = axis_averages if pixel_integration else axis_values
         # Both axes at once: half as much to compile.
         points = jnp.concatenate([grid.y - self.centre[0], grid.x - self.centre[1]])
-        both = factor(self.curvatures, points, grid.pitch)
+        curvatures = self.curvatures[:, None]
+        if pixel_integration:
+            both = chirp_average(curvatures, points, grid.pitch / 2) * as_complex(1 / grid.pitch)
+        else:
+            both = phasor(curvatures * points**2)
         rows, columns = jnp.split(both, [grid.shape[0]], axis=-1)
         return SeparableSum(self.weights[:, None] * rows, columns, grid)
 
@@ -55,16 +58,6 @@ class ChirpSum(eqx.Module):
             -grid.u * self.centre[1]
         )
         return as_complex(spectrum) * shift
-
-
-def axis_values(curvatures, x: Float[Array, " n"], pitch=None) -> Complex[Array, "term n"]:
-    """e^{jγx²} at each x."""
-    return phasor(curvatures[:, None] * x**2)
-
-
-def axis_averages(curvatures, x: Float[Array, " n"], pitch) -> Complex[Array, "term n"]:
-    """e^{jγx²} averaged over [x − pitch/2, x + pitch/2], exactly."""
-    return chirp_average(curvatures[:, None], x, pitch / 2) * as_complex(1 / pitch)
 
 
 def gather_constants(

@@ -1,4 +1,4 @@
-r"""Sampled fields in one dimension.
+r"""Some rows and columns of a grid that stand for all of them, and sampled fields on them.
 
 In the Fresnel approximation the field of a separable mask stays separable, so that a sampled
 propagation is, but for the cross term of the exact phase, the product of two one-dimensional ones:
@@ -9,18 +9,92 @@ import functools
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Complex, Float
+import numpy as np
+from jaxtyping import Array, Bool, Complex, Float, Int
 
 from thincam_jax._core.grids import Grid, centred_frequencies, centred_indices
 from thincam_jax._core.precision import as_complex, turn_phasor
-from thincam_jax.lensless.accuracy.points import Points
-from thincam_jax.lensless.masks.base import AbstractMask
+from thincam_jax.lensless.masks.base import AbstractMask, pairs, require_zone_orders
 from thincam_jax.lensless.masks.fza import axis_samples
-from thincam_jax.lensless.propagation.angular_spectrum import padded_shape, planes, propagate
-from thincam_jax.lensless.propagation.orders import pairs, require_zone_orders
+from thincam_jax.lensless.propagation.angular_spectrum import (
+    padded_shape,
+    planes,
+    propagate,
+    spherical_wave,
+)
 from thincam_jax.lensless.propagation.path import Path
-from thincam_jax.lensless.propagation.plane import spherical_wave
 from thincam_jax.lensless.propagation.separable_sum import SeparableSum
+
+# Rows and columns that are looked at. All sizes have this many, so that nothing recompiles.
+COUNT = 256
+# Share of them that may lie at the shadow's two edges, where the fields change fastest.
+_AT_EDGES = 0.5
+
+
+class SparseGrid(Grid):
+    """A grid's rows and columns at some of its indices; stands in for a grid in the models.
+
+    - `row_indices`, `column_indices`: i − (n−1)/2, exact.
+    """
+
+    row_indices: Float[Array, " rows"]
+    column_indices: Float[Array, " columns"]
+
+    def __init__(
+        self,
+        row_indices: Float[np.ndarray | Array, " rows"],
+        column_indices: Float[np.ndarray | Array, " columns"],
+        pitch: Float[Array, ""],
+    ):
+        self.shape = (len(row_indices), len(column_indices))
+        self.pitch = pitch
+        self.row_indices = jnp.asarray(row_indices, pitch.dtype)
+        self.column_indices = jnp.asarray(column_indices, pitch.dtype)
+
+    def refined(self, factor: int) -> "SparseGrid":
+        """The `factor` (odd) samples by `factor` of every pixel."""
+        inside = np.arange(factor) - factor // 2
+
+        def fine(indices):
+            return (indices[:, None] * factor + inside.astype(indices.dtype)).ravel()
+
+        return SparseGrid(fine(self.row_indices), fine(self.column_indices), self.pitch / factor)
+
+    @property
+    def y(self) -> Float[Array, " rows"]:
+        return self.row_indices * self.pitch
+
+    @property
+    def x(self) -> Float[Array, " columns"]:
+        return self.column_indices * self.pitch
+
+
+def chosen(
+    count: int, edges: tuple[float, float], zone: float, seed: int
+) -> tuple[Int[np.ndarray, " chosen"], Float[np.ndarray, " chosen"]]:
+    """Indices out of `count`, and how many of them each stands for.
+
+    Everything if it is few enough; else a stratified random choice that is denser within `zone`
+    (in samples) of the `edges` (indices, which may lie outside). Filled up with weight zero.
+    """
+    if count <= COUNT:
+        filled = np.zeros(COUNT, int)
+        filled[:count] = np.arange(count)
+        return filled, (np.arange(COUNT) < count).astype(float)
+    indices = np.arange(count)
+    distance = np.min([np.abs(indices - edge) for edge in edges], axis=0)
+    near = distance <= max(zone, 4.0)
+    density = np.full(count, COUNT * (1 - _AT_EDGES) / count)
+    if near.any():
+        density[near] = np.minimum(1.0, density[near] + COUNT * _AT_EDGES / near.sum())
+    density *= COUNT / density.sum()
+    density = np.minimum(density, 1.0)
+    # One of each stratum of equal total density.
+    total = np.cumsum(density)
+    offsets = np.random.default_rng(seed).uniform(size=COUNT)
+    strata = (np.arange(COUNT) + offsets) * total[-1] / COUNT
+    found = np.minimum(np.searchsorted(total, strata), count - 1)
+    return found, total[-1] / (COUNT * density[found])
 
 
 @functools.partial(
@@ -28,7 +102,7 @@ from thincam_jax.lensless.propagation.separable_sum import SeparableSum
 )
 def angular_spectrum_terms(
     mask: AbstractMask,
-    points: Points,
+    points: SparseGrid,
     path: Path,
     *,
     shape: tuple[int, int],

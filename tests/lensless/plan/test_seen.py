@@ -5,7 +5,7 @@ import pytest
 import scipy.signal
 
 import thincam_jax as tc
-from thincam_jax.lensless.plan.crop import crop_factor
+from thincam_jax.lensless.plan.seen import crop_factor
 
 
 @pytest.mark.parametrize("width", [1.0, 2.5, 9.0])

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from thincam_jax.lensless.plan.compress import fit, order_of_columns
+from thincam_jax.lensless.plan.choose import fit, order_of_columns
 
 
 def columns_of_rank(rank, count, random):

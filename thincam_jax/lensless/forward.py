@@ -11,10 +11,12 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
+from thincam_jax._core.checks import Number
 from thincam_jax._core.grids import Grid, same_parity
 from thincam_jax._core.memory import refuse_if_too_large
 from thincam_jax.imaging.operators import CropConvolution, kernel_grid
 from thincam_jax.imaging.scene import ImagePlane, Spectrum
+from thincam_jax.imaging.sensor import Sensor
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.cost import convolution_cost
 from thincam_jax.lensless.psf import Model, psf
@@ -44,8 +46,8 @@ def expose(
 
 def imaging_operator(
     camera: LenslessCamera,
-    light,
-    object_distance,
+    light: Spectrum | Number,
+    object_distance: Number,
     *,
     field_shape: tuple[int, int],
     model: Model = "separable",
@@ -72,8 +74,8 @@ def imaging_operator(
 
 def spectral_psf(
     camera: LenslessCamera,
-    light: Iterable[tuple],
-    object_distance,
+    light: Iterable[tuple[Number, Float[Array, ""] | float]],
+    object_distance: Number,
     *,
     model: Model,
     pixel_integration: bool,
@@ -121,7 +123,7 @@ def project(
     return plane.sample(grid, magnification=-camera.distance / plane.distance)
 
 
-def check_memory(sensor, field_shape: tuple[int, int], batch: tuple[int, ...]) -> None:
+def check_memory(sensor: Sensor, field_shape: tuple[int, int], batch: tuple[int, ...]) -> None:
     """Refuse a capture whose padded images do not fit."""
     rows, columns = sensor.shape
     cost = convolution_cost(

@@ -10,24 +10,27 @@ from jaxtyping import Complex, Float
 from thincam_jax._core.precision import Precision, itemsize_of
 from thincam_jax.imaging.operators import kernel_grid, kernel_shape
 from thincam_jax.imaging.scene import Scene
-from thincam_jax.lensless.accuracy.terms import CLOSED
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.cost import Cost, convolution_cost, psf_cost
 from thincam_jax.lensless.digits import held_in_single
-from thincam_jax.lensless.exposure import project, projected_shape
-from thincam_jax.lensless.plan.crop import crop_factor
-from thincam_jax.lensless.plan.spectrum import image_spectrum, sample_frequencies
-from thincam_jax.lensless.plan.transfer import TransferProbe
-from thincam_jax.lensless.psf import UNBOUNDED, Model
+from thincam_jax.lensless.forward import project, projected_shape
+from thincam_jax.lensless.plan.transfer import (
+    TransferProbe,
+    image_spectrum,
+    sample_frequencies,
+)
+from thincam_jax.lensless.psf import CLOSED, UNBOUNDED, Model
 
 # Predictions come from some hundred random frequencies: what they are multiplied with.
 _MARGIN = 1.5
 # Nodes of the pixel average for the capture's energy, which fringes hardly change.
 _ENERGY_NODES = 6
+# Points across the shadow and the sensor at which the energy is counted.
+_POINTS = 96
 
 
-class Way(NamedTuple):
-    """One way of computing a PSF."""
+class PsfMethod(NamedTuple):
+    """How a PSF is computed."""
 
     model: Model
     precision: Precision
@@ -38,10 +41,10 @@ class Way(NamedTuple):
         return itemsize_of(self.precision)
 
 
-FULL = Way("separable", "float64", True)
+FULL = PsfMethod("separable", "float64", True)
 
 
-class View:
+class SeenScene:
     """A scene as the sensor sees it, at a few frequencies."""
 
     def __init__(self, camera: LenslessCamera, scene: Scene, tolerance: float) -> None:
@@ -59,7 +62,7 @@ class View:
             np.asarray(project(camera, p, self.field_shape), float).reshape(-1, *self.field_shape)
             for p in scene.planes
         ]
-        # (plane, member, frequency)
+        # (plane, image, frequency)
         self.spectra = np.stack([image_spectrum(f, self.frequencies) for f in fields])
         total = np.sum(fields, axis=0)
         self.crop = crop_factor(camera, min(self.distances), total)
@@ -84,7 +87,7 @@ class View:
             for w, t in self.corners
         ]
 
-    def relative(self, error: Complex[np.ndarray, "*member k"]) -> float:
+    def relative(self, error: Complex[np.ndarray, "*batch k"]) -> float:
         """Norm of an image given by its spectrum, relative to that of the capture."""
         energy = float(np.sum(self.frequencies.weights * np.abs(error) ** 2))
         if energy == 0.0:
@@ -96,7 +99,8 @@ class View:
     def relative_of_all(self, error: Complex[np.ndarray, " k"]) -> float:
         """The same for an error of the PSF that all planes share.
 
-        They add up, or, where they cancel, may do so no longer: the larger of the two.
+        The planes' errors add up with their signs, or, should these not cancel, by their squares:
+        the larger of the two.
         """
         apart = np.sqrt(np.sum(np.abs(self.spectra) ** 2, axis=(0, 1)))
         return max(self.relative(error * self.spectra.sum(axis=0)), self.relative(error * apart))
@@ -114,12 +118,12 @@ class View:
 
     @property
     def models(self) -> tuple[Model, ...]:
-        """Closed forms that can hold the mask."""
+        """Closed forms that can represent the mask."""
         displayed = getattr(self.camera.mask, "pixels", None) is not None
         return tuple(m for m in CLOSED if not displayed or m not in UNBOUNDED)
 
     def held_in_single(self, model: str) -> bool:
-        """Whether float32 holds the zones' phases, on the kernel's grid, for every plane."""
+        """Whether float32 can represent the zones' phases on the kernel's grid for every plane."""
         grid = kernel_grid(self.camera.sensor.grid, self.field_shape)
         path = self.camera.path(min(self.wavelengths), max(self.distances))
         return held_in_single(self.camera.mask, grid, path, model)
@@ -131,25 +135,75 @@ class View:
         zone = math.sqrt(max(self.wavelengths) * float(self.camera.distance))
         return zone / (math.pi * width)
 
-    def psf_cost(self, way: Way) -> Cost:
+    def psf_cost(self, method: PsfMethod) -> Cost:
         return psf_cost(
             self.camera.mask,
             kernel_grid(self.camera.sensor.grid, self.field_shape),
-            way.model,
-            pixel_integration=way.pixel_integration,
-            itemsize=way.itemsize,
+            method.model,
+            pixel_integration=method.pixel_integration,
+            itemsize=method.itemsize,
         )
 
-    def cost(self, way: Way, planes: int, colours: int) -> Cost:
+    def cost(self, method: PsfMethod, planes: int, colours: int) -> Cost:
         """Of a capture from so many PSFs, for all planes of the scene."""
-        one = self.psf_cost(way)
+        one = self.psf_cost(method)
         convolution = convolution_cost(
-            self.camera.sensor.shape, self.field_shape, self.batch, way.itemsize
+            self.camera.sensor.shape, self.field_shape, self.batch, method.itemsize
         )
         samples = math.prod(self.field_shape) * self.batch
         projection = 2 * sum(self.field_shape) * samples
         return Cost(
             planes * (colours * one.flops + convolution.flops)
             + len(self.distances) * (projection + 2 * planes * samples),
-            one.bytes + convolution.bytes + (len(self.distances) + planes) * samples * way.itemsize,
+            one.bytes
+            + convolution.bytes
+            + (len(self.distances) + planes) * samples * method.itemsize,
         )
+
+
+def crop_factor(
+    camera: LenslessCamera, distance: float, images: Float[np.ndarray, "batch m n"]
+) -> float:
+    """‖g‖₂ of the whole image over that of its part on the sensor, at least 1.
+
+    Infinite where no light falls on the sensor but what is diffracted there.
+    Errors are known for the whole image; this bounds them on the sensor. The mask's shadow without
+    its fringes, a box, stands for the PSF: its convolution is a difference of running sums.
+    """
+    pitch = float(camera.sensor.pitch)
+    scale = 1 + float(camera.distance) / distance
+    box = [scale * float(extent) / pitch for extent in camera.mask.extent]
+    offset = [scale * float(c) / pitch for c in camera.mask.centre]
+    kernel = [n + s - 1 for n, s in zip(images.shape[-2:], camera.sensor.shape, strict=True)]
+    # The PSF is only known, and only needed, on the kernel's grid.
+    low = [max(o - b / 2, -k / 2) for o, b, k in zip(offset, box, kernel, strict=True)]
+    high = [min(o + b / 2, k / 2) for o, b, k in zip(offset, box, kernel, strict=True)]
+    if any(top <= bottom for bottom, top in zip(low, high, strict=True)):
+        return math.inf
+    running = np.pad(images.cumsum(axis=-1).cumsum(axis=-2), ((0, 0), (1, 0), (1, 0)))
+    sizes = images.shape[-2:]
+    whole = [
+        np.linspace(bottom - n / 2, top + n / 2, _POINTS)
+        for bottom, top, n in zip(low, high, sizes, strict=True)
+    ]
+    sensor = [np.linspace(-n / 2, n / 2, _POINTS) for n in camera.sensor.shape]
+    energies = [_energy(running, points, low, high) for points in (whole, sensor)]
+    return max(1.0, math.sqrt(energies[0] / energies[1])) if energies[1] > 0 else math.inf
+
+
+def _energy(running, points, low, high) -> float:
+    """∬ of the squared convolution over the rectangle of the points."""
+    sizes = [n - 1 for n in running.shape[-2:]]
+    ends = [
+        [np.clip(np.round(p - edge + n / 2).astype(int), 0, n) for edge in (top, bottom)]
+        for p, bottom, top, n in zip(points, low, high, sizes, strict=True)
+    ]
+    (first_row, last_row), (first, last) = ends
+
+    def corner(rows, columns):
+        return running[:, rows[:, None], columns]
+
+    image = corner(last_row, last) - corner(first_row, last)
+    image = image - corner(last_row, first) + corner(first_row, first)
+    area = math.prod(float(p[-1] - p[0]) for p in points)
+    return float(np.mean(image**2)) * area
