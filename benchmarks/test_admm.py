@@ -191,9 +191,8 @@ def test_admm(benchmark, capsys, case):
         lines.append(batch_line(captures, psfs, one))
     benchmark.pedantic(lambda: run(method, method.start(zeros(problem)), CHUNK), rounds=3)
     with capsys.disabled():
-        print(
-            f"\n{case.__name__}, window {problem.operators[0].window}, {problem.image_shape[-4]} channels"
-        )
+        channels = problem.image_shape[-4]
+        print(f"\n{case.__name__}, window {problem.operators[0].window}, {channels} channels")
         print("\n".join(lines))
 
 

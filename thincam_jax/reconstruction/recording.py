@@ -174,7 +174,9 @@ class Recording(eqx.Module):
     noise_variance: Any
     valid: tuple[Array, ...] | None
 
-    def __init__(self, captures, seen_by, *, noise_variance=None, valid=None):
+    def __init__(
+        self, captures: Any, seen_by: Any, *, noise_variance: Any = None, valid: Any = None
+    ):
         if isinstance(seen_by, Sequence) and seen_by and isinstance(seen_by[0], LenslessCamera):
             raise TypeError(
                 "a list of cameras does not say in which light; give tc.Cameras(cameras, "

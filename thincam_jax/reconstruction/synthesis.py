@@ -8,7 +8,7 @@ two real channels here, so that results are real without a projection and noise 
 from collections.abc import Sequence
 
 import numpy as np
-import scipy.linalg
+import scipy
 
 from thincam_jax.lensless.camera import LenslessCamera
 

@@ -30,8 +30,13 @@ def accuracy(
         import rich
 
         from thincam_jax.commands.accuracy.console import accuracy_table, cost_table, verdict
-        from thincam_jax.commands.accuracy.run import BenchFolder
-        from thincam_jax.commands.accuracy.run import Options, check, run_accuracy, steps
+        from thincam_jax.commands.accuracy.run import (
+            BenchFolder,
+            Options,
+            check,
+            run_accuracy,
+            steps,
+        )
         from thincam_jax.commands.study.config import load_config, slug
 
         study = load_config(config, tuple(set_ or ()))

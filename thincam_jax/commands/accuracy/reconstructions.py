@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-import scipy.optimize
+import scipy
 
 from thincam_jax.commands.accuracy.cameras import (
     Case,

@@ -4,9 +4,8 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-import scipy.ndimage
-import scipy.signal
-import skimage.measure
+import scipy
+import skimage
 from jaxtyping import Int
 
 from thincam_jax.reconstruction.depth.focus import Measure, focus_measure, gaussian_average
