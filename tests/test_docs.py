@@ -1,0 +1,171 @@
+"""The pages say what is so: their examples run, and what they name is there."""
+
+import ast
+import json
+import re
+import runpy
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import PIL.Image
+import pytest
+from commands.photo import simulated
+
+from helpers import ROOT
+
+PACKAGE = ROOT / "thincam_jax"
+
+
+def run_examples(page: str) -> dict:
+    blocks = re.findall(r"```python\n(.*?)```", (ROOT / page).read_text("utf-8"), re.DOTALL)
+    assert blocks
+    names: dict = {}
+    for block in blocks:
+        exec(block, names)  # the project's own pages
+    return names
+
+
+def test_readme(capsys):
+    names = run_examples("README.md")
+    assert names["h"].shape == names["H"].shape == (1024, 1024)
+    # The mean of ¼(1 + cos)² is 3/8 of the open aperture's light.
+    assert abs(float(np.mean(names["h"][256:768, 256:768])) - 3 / 8) < 0.01
+    assert np.isfinite(float(capsys.readouterr().out.split()[0]))
+
+
+def test_documentation(capsys):
+    names = run_examples("docs/index.md")
+    assert names["result"].image.shape == (3, 130, 196)
+    status, decibels = capsys.readouterr().out.split()
+    assert status == "ok"
+    assert float(decibels) > 20
+
+
+def test_accuracy_page(capsys):
+    """The printed choice stands in the page, and the plan is within its tolerance."""
+    names = run_examples("docs/accuracy.md")
+    printed = capsys.readouterr().out
+    page = (ROOT / "docs/accuracy.md").read_text("utf-8")
+    assert not re.findall(r"\b[A-Z]{7,}\b", page)  # no figure left to be filled in
+    choice = names["choice"]
+    assert f"{choice.model} {choice.precision} {choice.predicted_error:.4f}" in page
+    *told, rounding, fresnel = choice.reasons
+    assert all(sentence in page and sentence in printed for sentence in (*told, fresnel))
+    assert rounding in printed  # its last digit depends on the precision of the camera's numbers
+    full = names["tc"].capture(names["small"], names["scene"])
+    assert str(names["plan"]) in printed
+    assert (
+        str(names["plan"]).splitlines()[2:5]
+        == re.findall(r"\n(depth planes.*\n.*\n.*)", page)[0].splitlines()
+    )
+    assert np.linalg.norm(names["image"] - full) < 1e-2 * np.linalg.norm(full)
+
+
+def test_reconstruction_page(tmp_path, monkeypatch, capsys):
+    """The image is the scene, and the gradient is the slope of what it is said to be."""
+    monkeypatch.chdir(tmp_path)
+    simulated.bayer_files(tmp_path)
+    with jax.enable_x64(False):  # the precision of a user
+        names = run_examples("docs/reconstruction.md")
+    printed = capsys.readouterr().out
+    assert "(3, 30, 38)" in printed
+    assert "nan" not in printed
+    ready, image = names["ready"], np.asarray(names["result"].image)
+    assert ready.log["background"]["capture"]["kind"] == "dark frame dark.tif"
+    truth = simulated.scene().reshape(3, 30, 2, 38, 2).mean(axis=(2, 4))
+    for channel, expected in zip(image, truth, strict=True):
+        assert simulated.correlation(channel, expected) > 0.9
+    with PIL.Image.open("result.png") as shown:
+        assert shown.mode == "RGB" and shown.size == (38, 30)
+    assert json.loads((tmp_path / "result.json").read_text("utf-8")) == json.loads(
+        names["measured"].log_text(ready.log)
+    )
+    assert bool(jnp.isfinite(names["by_psf"]).all())
+    for name in ("photo", "chart"):  # differences are taken in double precision
+        names[name] = jnp.asarray(names[name], dtype=jnp.float64)
+    psfs, step = jnp.asarray(names["psfs"], dtype=jnp.float64), 0.05
+    ends = [float(names["misfit"](psfs, tau)) for tau in (2 - step, 2 + step)]
+    np.testing.assert_allclose(float(names["by_tau"]), np.diff(ends)[0] / (2 * step), rtol=0.02)
+
+
+NUMBER = r"[3-5]\.\d+"
+
+
+def equations(text: str) -> set[str]:
+    """The numbers in "3.6, 3.14-3.16": 3.6, 3.14, 3.15 and 3.16."""
+    found = set()
+    for first, last in re.findall(rf"({NUMBER})(?:[-–]({NUMBER}))?", text):
+        chapter, start = first.split(".")
+        end = (last or first).split(".")[1]
+        found |= {f"{chapter}.{n}" for n in range(int(start), int(end) + 1)}
+    return found
+
+
+def cited(source: str) -> set[str]:
+    """What a source file cites: "thesis Eq 3.14, 3.31" or "thesis Eq 3.14 and 3.31"."""
+    citations = re.findall(rf"\bEq\.?\s+({NUMBER}(?:(?:[-–]|,\s+|\s+and\s+){NUMBER})*)", source)
+    return set().union(*map(equations, citations))
+
+
+def thesis_rows() -> list[tuple[set[str], str, str]]:
+    """Equations, file and name of each row of docs/thesis.md."""
+    page = (ROOT / "docs/thesis.md").read_text("utf-8")
+    rows = re.findall(r"^\| ([\d., –]+) \|[^|]*\| `(.*?)` \| `(.*?)` \|", page, re.MULTILINE)
+    return [(equations(numbers), file, name) for numbers, file, name in rows]
+
+
+def defined(source: str) -> set[str]:
+    """Functions and classes of a file, methods as `Class.method`."""
+    kinds, found = (ast.FunctionDef, ast.ClassDef), set()
+    for node in ast.parse(source).body:
+        if isinstance(node, kinds):
+            found.add(node.name)
+            found |= {f"{node.name}.{part.name}" for part in node.body if isinstance(part, kinds)}
+    return found
+
+
+def test_every_row_of_the_thesis_page_names_what_exists():
+    rows = thesis_rows()
+    assert len(rows) > 25
+    missing = [
+        f"{file}: {name}"
+        for _, file, name in rows
+        if not (PACKAGE / file).is_file()
+        or name not in defined((PACKAGE / file).read_text("utf-8"))
+    ]
+    assert not missing, "docs/thesis.md names what is not there:\n" + "\n".join(missing)
+
+
+def test_every_equation_that_a_file_cites_has_its_row():
+    rows = thesis_rows()
+    missing = [
+        f"{file}: Eq {number}"
+        for path in sorted(PACKAGE.rglob("*.py"))
+        for file in [path.relative_to(PACKAGE).as_posix()]
+        for number in sorted(cited(path.read_text("utf-8")))
+        if not any(number in numbers and file == where for numbers, where, _ in rows)
+    ]
+    assert not missing, "docs/thesis.md lacks a row for:\n" + "\n".join(missing)
+
+
+@pytest.mark.parametrize(
+    ("text", "numbers"),
+    [
+        ("(thesis Eq 3.14-3.16 with", {"3.14", "3.15", "3.16"}),
+        ("thesis Eq 3.14 and 3.31, corrected; ε = 3.5", {"3.14", "3.31"}),
+        ("Eq 3.11,\n    3.12 with", {"3.11", "3.12"}),
+        ("IEEE 3, 384, 2017, Eq 3)", set()),
+    ],
+)
+def test_citations_are_read(text, numbers):
+    assert cited(text) == numbers
+
+
+def test_picture_of_the_rooms_is_of_today(tmp_path):
+    """Its imports are those of the source; the numbers of lines are of the day it was drawn."""
+    script = runpy.run_path(str(ROOT / "docs/draw_rooms.py"))
+    today = {room: used for room, (_, used) in script["rooms_and_imports"]().items()}
+    assert script["imports_drawn"]() == today, "draw it again: python docs/draw_rooms.py"
+    script["draw"](tmp_path / "rooms.png")
+    assert script["imports_drawn"](tmp_path / "rooms.png") == today
