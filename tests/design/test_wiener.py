@@ -64,13 +64,13 @@ def design(beta=(19.0, 23.0), distance=(7.0, 7.0), wavelength=5e-4, width=1.71):
 def synthesised(chosen, given):
     """By `WienerSynthesis` from the captures of PSFs, with the same noise."""
     sensor = tc.Sensor(SENSOR, PITCH)
-    reconstruct = tc.WienerSynthesis(
+    cameras = tc.Cameras(
         chosen.cameras(sensor),
         wavelength=chosen.wavelength,
         object_distance=OBJECT,
-        synthesis=phase_pairs(2),
         field_shape=(COUNT, COUNT),
     )
+    reconstruct = tc.Wiener(synthesis=phase_pairs(2)).prepare(cameras)
     restored = []
     for image, drawn in zip(given.images, given.noise, strict=True):
         captures, variances = [], []

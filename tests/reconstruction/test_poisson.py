@@ -1,4 +1,4 @@
-"""Poisson likelihood: its pieces against scipy, its gradient, and that it beats least squares."""
+"""Poisson likelihood: its pieces against scipy, its gradient, what its τ means, few counts."""
 
 import functools
 
@@ -7,30 +7,27 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.signal
 import scipy.stats
-from reconstruction import extremes, scenes
+from reconstruction import extremes, rig, scenes
 
+import thincam_jax as tc
 from helpers import finite_difference, relative_l2
+from thincam_jax.reconstruction import Sparsity
+from thincam_jax.reconstruction.fista import solve_fista
 from thincam_jax.reconstruction.poisson import (
     LINKS,
     Counts,
+    counts_problem,
     half_deviance,
     poisson_loss,
-    poisson_objective,
     positive,
     smooth_variation,
     solve_poisson,
     unlinked,
 )
-from thincam_jax.reconstruction.poisson_newton import (
-    Weighed,
-    anscombe,
-    deviance_residual,
-    newton_objective,
-    photon_residuals,
-    solve_poisson_newton,
-)
-from thincam_jax.reconstruction.proximal import solve_proximal
+from thincam_jax.reconstruction.problem import noise_in_the_image, with_tau
+from thincam_jax.reconstruction.recording import middle
 from thincam_jax.reconstruction.total_variation import TotalVariation
 
 
@@ -46,7 +43,8 @@ def photons(mean=3.0, background=0.1, seed=0, **settings):
 
 
 def weighing(problem, tau):
-    return eqx.tree_at(lambda p: p.tau, problem, jnp.asarray(tau))
+    """The problem with another τ, in absolute units of the likelihood of counts."""
+    return with_tau(problem, tau / counts_problem(problem).tau_unit)
 
 
 @pytest.mark.parametrize("count", [0, 1, 7, 200])
@@ -56,23 +54,6 @@ def test_the_deviance_is_that_of_the_distribution(count):
     wanted = best - scipy.stats.poisson.logpmf(count, means)
     found = half_deviance(jnp.full(4, float(count)), jnp.asarray(means))
     np.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-9)
-    residual = deviance_residual(jnp.full(4, float(count)), jnp.asarray(means))
-    np.testing.assert_allclose(residual**2 / 2, wanted, rtol=1e-7, atol=1e-9)
-    assert np.all(np.sign(residual) == np.sign(means - count))
-
-
-def test_residuals_are_smooth_where_count_and_mean_agree():
-    for of in (deviance_residual, anscombe):
-        slope = jax.vmap(jax.grad(lambda m, of=of: of(jnp.asarray(50.0), m)))
-        near = slope(50 * (1 + jnp.array([-1e-2 - 1e-7, -1e-2 + 1e-7, 0.0, 1e-9])))
-        np.testing.assert_allclose(near[0], near[1], rtol=1e-6)
-        np.testing.assert_allclose(near[2:], 1 / np.sqrt(50), rtol=5e-3)
-
-
-def test_anscombe_residuals_have_unit_variance():
-    counts = np.random.default_rng(2).poisson(9.0, 200_000).astype(float)
-    residuals = anscombe(jnp.asarray(counts), jnp.asarray(9.0))
-    assert abs(float(jnp.var(residuals)) - 1) < 0.02
 
 
 def test_the_smooth_variation_is_between_tv_and_tv_less_half_the_smoothing():
@@ -114,7 +95,7 @@ def test_it_beats_least_squares_at_three_counts_a_pixel(seed):
     ]
     clear = eqx.tree_at(lambda p: p.captures, problem, (problem.captures[0] - background,))
     squares = [
-        solve_proximal(weighing(clear, 3 * t / level), iterations=150, tolerance=1e-4)
+        solve_fista(scenes.absolute(clear, 3 * t / level), iterations=150, tolerance=1e-4)
         for t in (0.5, 0.7, 1.0, 1.4, 2.0)
     ]
     likely, squares = ([relative_l2(o.image, truth) for o in found] for found in (likely, squares))
@@ -124,7 +105,7 @@ def test_it_beats_least_squares_at_three_counts_a_pixel(seed):
 
 
 @pytest.mark.thorough
-def test_links_and_methods_agree_on_the_minimum():
+def test_links_agree_on_the_minimum():
     problem, _ = photons(mean=30.0, sensor=(13, 12), field=(9, 10))
     tau = weighing(problem, 0.02)
     values = [
@@ -137,39 +118,9 @@ def test_links_and_methods_agree_on_the_minimum():
         assert float(v.image.min()) >= 0
 
 
-@pytest.mark.parametrize("residual", ["anscombe", "deviance"])
-def test_newton_ends_where_no_image_beside_is_better(residual):
-    problem, truth = photons(mean=20.0, sensor=(13, 12), field=(9, 10))
-    found = solve_poisson_newton(
-        problem, smoothness=3.0, background=[0.1], residual=residual, iterations=100
-    )
-    assert found.status == "converged"
-    counts = Counts(problem, background=[0.1], link="square")
-    weighed = Weighed(counts, jnp.asarray(3.0), residual)
-    lowest = newton_objective(weighed, found.image)
-    rng = np.random.default_rng(3)
-    for size in (0.01, 0.1):
-        for _ in range(10):
-            other = found.image * jnp.exp(size * jnp.asarray(rng.normal(size=truth.shape)))
-            assert newton_objective(weighed, other) > lowest
-    # Its data part, with deviance residuals, is the likelihood itself.
-    data, _ = photon_residuals(weighed, found.image)
-    if residual == "deviance":
-        plain = Counts(weighing(problem, 0.0), background=[0.1], link="square")
-        likelihood = poisson_objective(plain, found.image)
-        np.testing.assert_allclose(jnp.sum(data[0] ** 2) / 2, likelihood, rtol=1e-9)
-
-
-@pytest.mark.parametrize(
-    "solve",
-    [
-        functools.partial(solve_poisson, iterations=20),
-        functools.partial(solve_poisson_newton, smoothness=0.1, iterations=5),
-    ],
-    ids=["l-bfgs", "newton"],
-)
 @pytest.mark.thorough
-def test_it_stands_extremes(solve):
+def test_it_stands_extremes():
+    solve = functools.partial(solve_poisson, iterations=20)
     extremes.check_shapes(solve, noise=0.0)
     # Without a count the image is of at most what would have given about one.
     problem, _ = photons()
@@ -184,7 +135,114 @@ def test_it_stands_extremes(solve):
 def test_what_are_no_counts_is_refused():
     problem, _ = scenes.problem()
     negative = eqx.tree_at(lambda p: p.captures, problem, tuple(c - 100 for c in problem.captures))
-    with pytest.raises(ValueError, match="negative counts"):
-        solve_poisson(negative)
-    with pytest.raises(ValueError, match="1 backgrounds for 2 captures"):
-        solve_poisson(problem, background=[0.1])
+    rig.refused("a capture has negative counts", lambda: solve_poisson(negative))
+    message = "1 backgrounds for 2 captures; give one for each"
+    rig.refused(message, lambda: solve_poisson(problem, background=[0.1]))
+    sparse = eqx.tree_at(lambda p: p.regulariser, problem, Sparsity())
+    message = "regulariser is a Sparsity; give a TotalVariation"
+    rig.refused(message, lambda: solve_poisson(sparse))
+
+
+def test_what_the_solver_refuses():
+    rig.refused("tau = 'sure' is found for Gaussian noise only", lambda: tc.PoissonTV("sure"))
+    rig.refused("tau = -1.0 .* is negative", lambda: tc.PoissonTV(-1.0))
+    message = "variation is a Sparsity; give a TotalVariation"
+    rig.refused(message, lambda: tc.PoissonTV(variation=Sparsity()))
+    seen = tc.Recording(jnp.ones((1, 20, 21)), tc.Psfs(jnp.ones((1, 5, 6))))
+    for background, message in (
+        ([1.0, 2.0], "2 backgrounds for 1 captures"),
+        (jnp.ones((1, 3)), r"background has shape \(3,\)"),
+        (["dark"], "background 'dark' is not a number"),
+        (jnp.ones((4, 3)), r"such as \[frame\] for one"),
+        (-1.0, "background is negative"),
+    ):
+        solver = tc.PoissonTV(background=background)
+        rig.refused(message, lambda s=solver: tc.reconstruct(seen, s))
+    message = "method 'poisson' runs in one piece; leave out the callback"
+    rig.refused(message, lambda: tc.reconstruct(seen, tc.PoissonTV(), callback=print))
+    cameras = rig.seen_by([rig.camera(), rig.camera(distance=2.5)])
+    apart = tc.Recording(jnp.ones((2, *rig.SENSOR.shape)), cameras)
+    message = "needs all cameras at one distance"
+    rig.refused(message, lambda: tc.reconstruct(apart, tc.PoissonTV()))
+
+
+def test_recordings_at_the_extremes():
+    extremes.check_recordings(tc.PoissonTV(iterations=30))
+
+
+def recording(mean, background=0.0):
+    """Counts of blocks of moderate contrast on a bright ground, what saw them, and the scene."""
+    kernel = scenes.spots((9, 8))
+    kernel /= kernel.sum()
+    truth = 1 + 0.3 * scenes.blocks((38, 41))
+    light = scipy.signal.convolve2d(truth, kernel, mode="valid")
+    gain = mean / light.mean()
+    seen = np.random.default_rng(8).poisson(gain * light + background)
+    psfs = tc.Psfs(jnp.asarray(kernel)[None], field_shape=truth.shape)
+    return jnp.asarray(seen.astype(float))[None], psfs, gain * truth
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize(
+    ("mean", "gap"), [pytest.param(400.0, 4e-3, marks=pytest.mark.thorough), (1e4, 2e-3)]
+)
+def test_poisson_of_many_counts_is_total_variation_of_gaussian_noise(mean, gap):
+    """With the variance of the mean count: near to each other, and farther with another τ."""
+    background = mean / 5
+    captures, psfs, _ = recording(mean, background)
+    poisson = tc.PoissonTV(2.0, background=[background])
+    likely = tc.reconstruct(tc.Recording(captures, psfs), poisson)
+    assert likely.tau == 2.0 and likely.method == "poisson" and likely.status == "converged"
+    gaps = {}
+    for tau in (1.4, 2.0, 2.8):
+        gaussian = tc.Recording(captures - background, psfs, noise_variance=captures.mean())
+        squares = tc.reconstruct(gaussian, tc.AdmmTV(tau, iterations=600, tolerance=1e-5))
+        seen = (middle(jnp.asarray(r.image), captures.shape[-2:]) for r in (likely, squares))
+        gaps[tau] = relative_l2(*seen)
+    assert gaps[2.0] < gap
+    assert gaps[2.0] < 0.75 * min(gaps[1.4], gaps[2.8])
+
+
+def test_the_tau_of_counts_is_that_of_their_mean():
+    """Over the pixels that are trusted; their weights are 1."""
+    captures, psfs, _ = recording(50.0)
+    captures = captures.at[0, 0, 0].set(1e9)
+    valid = jnp.ones(captures.shape, bool).at[0, 0, 0].set(False)
+    problem = tc.Recording(captures, psfs, valid=valid, noise_variance=7.0).problem(tau=1.5)
+    made = counts_problem(problem)
+    mean = captures[0].ravel()[1:].mean()
+    expected = 1.5 * noise_in_the_image(problem.operators, [1 / mean])
+    assert float(made.absolute_tau) == pytest.approx(float(expected))
+    np.testing.assert_array_equal(made.weights[0], valid)
+
+
+def test_poisson_of_few_counts():
+    """Three a pixel: never negative, with its background as a frame; goes on from a start."""
+    captures, psfs, truth = recording(3.0, background=1.0)
+    seen = tc.Recording(captures, psfs)
+    likely = tc.reconstruct(seen, tc.PoissonTV(background=jnp.ones_like(captures)))
+    assert float(likely.image.min()) >= 0
+    assert likely.status in ("converged", "iterations_exhausted")
+    assert relative_l2(likely.image, truth) < 0.15
+    again = tc.reconstruct(seen, tc.PoissonTV(background=1.0), start=likely.image)
+    assert again.history[0].objective < likely.history[0].objective
+    negative = tc.Recording(captures - 50.0, psfs)
+    rig.refused("negative counts", lambda: tc.reconstruct(negative, tc.PoissonTV()))
+
+
+def test_poisson_with_cameras_is_upright():
+    """From a start given upright, too: that of the result is left after a step or two."""
+    clean = rig.captures(rig.pair(), rig.picture())
+    gain = 300.0 / float(clean.mean())
+    counts = jnp.asarray(np.random.default_rng(5).poisson(gain * clean).astype(float))
+    seen, once = tc.Recording(counts, rig.seen_by(rig.pair())), tc.PoissonTV(iterations=1)
+    found = tc.reconstruct(seen, tc.PoissonTV())
+    assert rig.correlation(found.image, rig.picture()) > 0.97
+    assert float(found.image.mean()) == pytest.approx(gain * rig.picture().mean(), rel=0.05)
+    assert float(found.pitch) == pytest.approx(rig.OBJECT_PITCH)
+    again = tc.reconstruct(seen, once, start=found.image)
+    turned = tc.reconstruct(seen, once, start=found.image[::-1, ::-1])
+    lowest = found.history[-1].objective
+    assert again.history[0].objective == pytest.approx(lowest, rel=1e-3)
+    # Most of the lowest one is the noise: half a unit for each of the pixels.
+    assert turned.history[0].objective > 1.2 * lowest

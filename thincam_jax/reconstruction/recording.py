@@ -458,7 +458,7 @@ def _apart(operator: AbstractOperator) -> list[AbstractOperator]:
     return [type(operator)(one, value) for one, value in zip(inside, values, strict=True)]
 
 
-def _flat(parts):
+def _flat(parts: Any) -> Any:
     """The arrays of a nested tuple; one array of several captures, or None, as it is."""
     return jax.tree.leaves(parts) if isinstance(parts, tuple | list) else parts
 

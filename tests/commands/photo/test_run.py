@@ -17,7 +17,7 @@ from thincam_jax.commands.photo.run import Failed, Finished, run_jobs
 from thincam_jax.measured import MeasurementError, Preparation
 from thincam_jax.reconstruction import Reconstruction
 
-SHORT = Recipe(iterations=16)  # steps of five and of one
+SHORT = Recipe(iterations=16)  # steps of ten and of one
 
 
 @pytest.fixture

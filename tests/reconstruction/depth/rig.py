@@ -52,6 +52,12 @@ def captures(cams, planes, *, snr_db=30.0, seed=0, model="separable"):
     )
 
 
+def seen_by(cams, **settings) -> tc.Cameras:
+    """Cameras in the light of `captures`, focused where a sweep or a test says."""
+    usual = {"wavelength": WAVELENGTH, "field_shape": FIELD, "pixel_integration": False}
+    return tc.Cameras(cams, **(usual | settings))
+
+
 def shapes():
     """Three bright shapes on black, none above another, each with edges and detail: (3, y, x)."""
     y, x = np.mgrid[: FIELD[0], : FIELD[1]]

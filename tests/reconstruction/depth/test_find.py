@@ -6,6 +6,7 @@ import pytest
 from reconstruction.depth import blurred, rig
 from reconstruction.rig import unchecked
 
+import thincam_jax as tc
 from thincam_jax.reconstruction import fringe_scanning
 from thincam_jax.reconstruction.depth import (
     MEASURES,
@@ -83,16 +84,9 @@ def test_objects_before_a_camera_are_found():
     planes = [rig.plane(rig.checks(b), t) for b, t in zip(boxes, (20.0, 45.0), strict=True)]
     seen = rig.captures(cams, planes)
     variance = float(np.mean(np.asarray(seen) ** 2)) * 1e-3
-    sweep = refocus_sweep(
-        seen,
-        cams,
-        refocus_distances(15.0, 90.0, 16),
-        wavelength=rig.WAVELENGTH,
-        noise_variance=variance,
-        synthesis=fringe_scanning(1),
-        field_shape=rig.FIELD,
-        pixel_integration=False,
-    )
+    recording = tc.Recording(seen, rig.seen_by(cams), noise_variance=variance)
+    wiener = tc.Wiener(synthesis=fringe_scanning(1))
+    sweep = refocus_sweep(recording, refocus_distances(15.0, 90.0, 16), wiener)
     regions = object_regions(sweep)
     assert regions.max() == 2
     found = find_distances(sweep, regions=regions)

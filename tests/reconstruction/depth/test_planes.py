@@ -20,19 +20,10 @@ def seen():
     return cams, rig.captures(cams, planes, snr_db=30.0)
 
 
-def reconstruct(seen, **settings):
+def reconstruct(seen, planes=PLANES, **settings):
     cams, captures = seen
-    return tc.reconstruct(
-        captures,
-        cams,
-        method="admm_tv",
-        object_distance=list(PLANES),
-        wavelength=rig.WAVELENGTH,
-        synthesis=fringe_scanning(1),
-        field_shape=rig.FIELD,
-        pixel_integration=False,
-        **settings,
-    )
+    recording = tc.Recording(captures, rig.seen_by(cams, object_distance=list(planes)))
+    return tc.reconstruct(recording, tc.AdmmTV(1.0, synthesis=fringe_scanning(1), **settings))
 
 
 def shares(image, power):
@@ -54,7 +45,7 @@ def test_planes_are_separable_by_the_formula():
 
 def test_each_object_is_in_its_own_plane(seen):
     """Four phases, 30 dB, f ≥ 0 on black: over 90 % of the light, over 99 % of the energy."""
-    result = reconstruct(seen, tau=1.0, iterations=150)
+    result = reconstruct(seen, iterations=150)
     image = np.asarray(result.image)
     assert image.shape == (3, *rig.FIELD)
     assert shares(image, 1).min() > 0.9
@@ -71,26 +62,14 @@ def test_each_object_is_in_its_own_plane(seen):
 
 def test_a_depth_weight_pulls_the_planes_together(seen):
     """Variation across planes suits what reaches through them, and not objects that do not."""
-    weighted = reconstruct(seen, tau=1.0, iterations=60, variation=TotalVariation(depth_weight=0.5))
-    plain = reconstruct(seen, tau=1.0, iterations=60)
+    weighted = reconstruct(seen, iterations=60, variation=TotalVariation(depth_weight=0.5))
+    plain = reconstruct(seen, iterations=60)
     assert (shares(np.asarray(weighted.image), 1) < shares(np.asarray(plain.image), 1)).all()
 
 
 def test_planes_in_another_order_change_places(seen):
-    cams, captures = seen
     found = []
     for order in ((0, 1, 2), (2, 0, 1)):
-        result = tc.reconstruct(
-            captures,
-            cams,
-            method="admm_tv",
-            object_distance=[PLANES[k] for k in order],
-            wavelength=rig.WAVELENGTH,
-            synthesis=fringe_scanning(1),
-            field_shape=rig.FIELD,
-            pixel_integration=False,
-            tau=1.0,
-            iterations=20,
-        )
+        result = reconstruct(seen, [PLANES[k] for k in order], iterations=20)
         found.append(result.image[jnp.argsort(jnp.asarray(order))])
     np.testing.assert_allclose(found[1], found[0], atol=1e-8)

@@ -5,59 +5,54 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from reconstruction.depth import rig
+from reconstruction.rig import refused
 
 import thincam_jax as tc
 from thincam_jax.reconstruction import fringe_scanning
 from thincam_jax.reconstruction.depth import RefocusSweep, refocus_sweep
+from thincam_jax.reconstruction.noise import estimate_variance
 
 DISTANCES = (18.0, 20.0, 24.0, 45.0)
 
 
 @pytest.fixture(scope="module")
-def scene():
+def recording():
     cams = rig.cameras()
     planes = [
         rig.plane(rig.checks((slice(10, 34), slice(4, 22))), 20.0),
         rig.plane(rig.checks((slice(10, 34), slice(34, 52))), 45.0),
     ]
-    return cams, rig.captures(cams, planes)
+    return tc.Recording(rig.captures(cams, planes), rig.seen_by(cams), noise_variance=1e-4)
 
 
-WIENER = {
-    "wavelength": rig.WAVELENGTH,
-    "noise_variance": 1e-4,
-    "synthesis": fringe_scanning(1),
-    "pixel_integration": False,
-}
-SETTINGS = {
-    "fringe_scanning": {},
-    "wiener": WIENER,
-    "admm_tv": WIENER | {"iterations": 10, "tau": 1.0},
+SYNTHESIS = fringe_scanning(1)
+SOLVERS = {
+    "fringe_scanning": tc.FringeScanning(),
+    "wiener": tc.Wiener(synthesis=SYNTHESIS),
+    "admm_tv": tc.AdmmTV(1.0, synthesis=SYNTHESIS, iterations=10),
 }
 
 
-@pytest.mark.parametrize("method", SETTINGS)
-def test_images_are_those_of_reconstruct(scene, method):
-    cams, seen = scene
-    settings = SETTINGS[method] | {"field_shape": rig.FIELD}
-    done = []
-    sweep = refocus_sweep(
-        seen, cams, DISTANCES[:3], method=method, callback=done.append, **settings
-    )
+@pytest.mark.parametrize("name", SOLVERS)
+def test_images_are_those_of_reconstruct(recording, name):
+    solver, done = SOLVERS[name], []
+    sweep = refocus_sweep(recording, DISTANCES[:3], solver, callback=done.append)
     assert done == [1, 2, 3]
-    assert sweep.method == method
+    assert sweep.method == name
     for image, t in zip(sweep.images, DISTANCES[:3], strict=True):
-        alone = tc.reconstruct(seen, cams, method=method, object_distance=t, **settings)
+        focused = rig.seen_by(recording.seen_by.cameras, object_distance=t)
+        alone = tc.reconstruct(
+            tc.Recording(recording.captures, focused, noise_variance=1e-4), solver
+        )
         np.testing.assert_allclose(image, alone.image, rtol=1e-9, atol=1e-9)
     assert not np.allclose(sweep.images[0], sweep.images[2], atol=1e-3)
     assert float(sweep.slope) == pytest.approx(rig.PITCH / rig.DISTANCE)
     np.testing.assert_allclose(sweep.pitch, np.array(DISTANCES[:3]) * rig.PITCH / rig.DISTANCE)
 
 
-def test_a_direction_stays_where_it_is(scene):
+def test_a_direction_stays_where_it_is(recording):
     """Both boxes, at 20 and 45 mm, cover the same pixels whatever the focus."""
-    cams, seen = scene
-    sweep = refocus_sweep(seen, cams, DISTANCES, method="fringe_scanning", field_shape=rig.FIELD)
+    sweep = refocus_sweep(recording, DISTANCES, tc.FringeScanning())
     for image in np.asarray(sweep.images):
         for columns in (slice(0, 28), slice(28, 56)):
             light = np.maximum(image[:, columns] - 0.25 * image.max(), 0)
@@ -67,11 +62,9 @@ def test_a_direction_stays_where_it_is(scene):
             np.testing.assert_allclose(middle, wanted, atol=0.8)
 
 
-@pytest.mark.parametrize("method", SETTINGS)
-def test_further_distances_compile_nothing(scene, method):
-    cams, seen = scene
-    settings = SETTINGS[method] | {"method": method, "field_shape": rig.FIELD}
-    refocus_sweep(seen, cams, DISTANCES[:3], **settings)
+@pytest.mark.parametrize("name", SOLVERS)
+def test_further_distances_compile_nothing(recording, name):
+    refocus_sweep(recording, DISTANCES[:3], SOLVERS[name])
     compiled = []
 
     def listen(event, seconds, **_):
@@ -82,21 +75,41 @@ def test_further_distances_compile_nothing(scene, method):
     jax.jit(lambda x: jnp.sin(x) * 1.2345)(jnp.arange(3.0))  # the listener hears
     assert len(compiled) >= 1
     compiled.clear()
-    refocus_sweep(seen, cams, (17.5, 31.0, 77.0), **settings)
+    refocus_sweep(recording, (17.5, 31.0, 77.0), SOLVERS[name])
     assert compiled == []
 
 
-def test_auto_chooses_once(scene):
-    cams, seen = scene
-    sweep = refocus_sweep(seen, cams, DISTANCES[:3], method="auto", field_shape=rig.FIELD, **WIENER)
-    assert sweep.method in ("wiener", "admm_tv", "fringe_scanning")
+def test_a_solver_is_chosen_once(recording):
+    """And the noise, where it is not told, is estimated once."""
+    sweep = refocus_sweep(recording, DISTANCES[:3])
+    solver, _ = tc.choose_solver(recording.focused(DISTANCES[0]))
+    assert sweep.method == solver.name == "admm_tv"
     assert isinstance(sweep, RefocusSweep)
+    alone = tc.reconstruct(recording.focused(DISTANCES[1]), solver)
+    np.testing.assert_allclose(sweep.images[1], alone.image, rtol=1e-9, atol=1e-9)
+
+
+def test_the_noise_of_all_images_is_that_of_the_captures(recording):
+    cams, captures = recording.seen_by, recording.captures
+    wiener = SOLVERS["wiener"]
+    told = tc.Recording(captures, cams, noise_variance=estimate_variance(captures))
+    estimated = refocus_sweep(tc.Recording(captures, cams), DISTANCES[:3], wiener)
+    known = refocus_sweep(told, DISTANCES[:3], wiener)
+    np.testing.assert_allclose(estimated.images, known.images, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize(
     "distances", [(20.0, 30.0), (30.0, 20.0, 10.0), (0.0, 1.0, 2.0), (1.0, 2.0, np.inf), 20.0]
 )
-def test_bad_distances_are_refused(scene, distances):
-    cams, seen = scene
+def test_bad_distances_are_refused(recording, distances):
     with pytest.raises(ValueError, match="distances"):
-        refocus_sweep(seen, cams, distances, method="fringe_scanning")
+        refocus_sweep(recording, distances, tc.FringeScanning())
+
+
+def test_what_has_no_distance_and_what_does_not_compare_is_refused(recording):
+    psfs = tc.Recording(jnp.ones((1, 20, 21)), tc.Psfs(jnp.ones((1, 5, 6))))
+    message = "a sweep refocuses computed PSFs; give a recording seen by Cameras"
+    refused(message, lambda: refocus_sweep(psfs, DISTANCES))
+    refused("a distance is that of computed PSFs", lambda: psfs.focused(20.0))
+    message = "tau = 'sure' would be another number at each distance"
+    refused(message, lambda: refocus_sweep(recording, DISTANCES, tc.AdmmTV("sure")))
