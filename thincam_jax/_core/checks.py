@@ -3,7 +3,7 @@
 Traced values cannot be looked at and pass; they were checked when the object was built.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import jax
@@ -62,49 +62,44 @@ def _floating(value: Any) -> Array:
     return jax.lax.convert_element_type(array, array.dtype)
 
 
+def _require(array: Array, holds: Callable[[np.ndarray], Any], message: str) -> Array:
+    """The array, or ValueError with its value in the message; a traced one passes."""
+    known = _known(array)
+    if known is not None and not np.all(holds(known)):
+        raise ValueError(message.format(known))
+    return array
+
+
 def finite(name: str, value: Any, unit: str, *, shape: tuple[int, ...] = ()) -> Array:
     array = real(name, value, unit, shape=shape)
-    known = _known(array)
-    if known is not None and not np.isfinite(known).all():
-        raise ValueError(f"{name} = {known} {unit} is not finite; give a finite number in {unit}")
-    return array
+    message = f"{name} = {{}} {unit} is not finite; give a finite number in {unit}"
+    return _require(array, np.isfinite, message)
 
 
 def positive(name: str, value: Any, unit: str, *, allow_infinity: bool = False) -> Array:
     array = real(name, value, unit)
-    known = _known(array)
-    if known is not None:
-        if not (known > 0).all():
-            raise ValueError(f"{name} = {known} {unit} is not positive; give {name} > 0 in {unit}")
-        if not allow_infinity and not np.isfinite(known).all():
-            raise ValueError(f"{name} is infinite; give a finite number in {unit}")
-    return array
+    message = f"{name} = {{}} {unit} is not positive; give {name} > 0 in {unit}"
+    _require(array, lambda known: known > 0, message)
+    message = f"{name} is infinite; give a finite number in {unit}"
+    return _require(array, lambda known: allow_infinity or np.isfinite(known), message)
 
 
 def non_negative(name: str, value: Any, unit: str) -> Array:
-    array = finite(name, value, unit)
-    known = _known(array)
-    if known is not None and known < 0:
-        raise ValueError(f"{name} = {known} {unit} is negative; give {name} >= 0 in {unit}")
-    return array
+    message = f"{name} = {{}} {unit} is negative; give {name} >= 0 in {unit}"
+    return _require(finite(name, value, unit), lambda known: known >= 0, message)
 
 
 def positive_all(name: str, value: Array, unit: str) -> Array:
     """An array of any shape with finite positive entries."""
     array = finite(name, value, unit, shape=value.shape)
-    known = _known(array)
-    if known is not None and not (known > 0).all():
-        raise ValueError(f"{name} = {known} {unit} must be positive; give {name} > 0 in {unit}")
-    return array
+    message = f"{name} = {{}} {unit} must be positive; give {name} > 0 in {unit}"
+    return _require(array, lambda known: known > 0, message)
 
 
 def fraction(name: str, value: Any) -> Array:
     """A number above 0 and at most 1."""
-    array = real(name, value, "parts of one")
-    known = _known(array)
-    if known is not None and not (0 < known <= 1):
-        raise ValueError(f"{name} = {known} is out of range; give 0 < {name} <= 1")
-    return array
+    message = f"{name} = {{}} is out of range; give 0 < {name} <= 1"
+    return _require(real(name, value, "parts of one"), lambda known: 0 < known <= 1, message)
 
 
 def choice(name: str, value: Any, options: Iterable[str]) -> str:

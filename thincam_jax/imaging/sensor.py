@@ -43,7 +43,7 @@ class Sensor(eqx.Module):
         full_well: Number = 13_500.0,
         exposure: Number | None = None,
         electrons: Number | None = None,
-        bit_depth: int | None = None,
+        bit_depth: float | int | None = None,
     ):
         self.shape = checks.shape2d("shape", shape)
         self.pitch = checks.positive("pitch", pitch, "mm")
@@ -61,7 +61,7 @@ class Sensor(eqx.Module):
             raise ValueError(f"bit_depth = {bit_depth!r}: give a whole number from 1 to 24")
         if bit_depth is not None and exposure is None and electrons is None:
             raise ValueError("bit_depth needs an exposure: the converter's range is the full well")
-        self.bit_depth = bit_depth
+        self.bit_depth = None if bit_depth is None else int(bit_depth)
 
     @property
     def grid(self) -> Grid:

@@ -32,10 +32,8 @@ def fringe_scanned_otf(
     t → ∞): the constant and the second harmonic cancel. The phase of the camera's mask is not used.
     Arguments and errors as for `otf`; TypeError for masks that have no phase.
     """
-
-    h = _otfs(
-        camera, (0.0, 0.25, 0.5, 0.75), wavelength, object_distance, model, pixel_integration, grid
-    )
+    given = (wavelength, object_distance, model, pixel_integration, grid)
+    h = [_otf(_with_phase(camera, turns), *given) for turns in (0.0, 0.25, 0.5, 0.75)]
     quadrature = h[0] - h[2]
     return (h[3] - h[1]) + jnp.asarray(1j, dtype=quadrature.dtype) * quadrature
 
@@ -58,33 +56,19 @@ def phase_pair_otf(
     (thesis Eq 3.49, corrected): the constant cancels, the second harmonic stays. Arguments and
     errors as for `fringe_scanned_otf`.
     """
-    first, second = _otfs(
-        camera, (0.0, 0.75), wavelength, object_distance, model, pixel_integration, grid
+    given = (wavelength, object_distance, model, pixel_integration, grid)
+    return _otf(_with_phase(camera, 0.0), *given) - _otf(_with_phase(camera, 0.75), *given)
+
+
+def _otf(camera, wavelength, object_distance, model, pixel_integration, grid):
+    return otf(
+        camera,
+        wavelength=wavelength,
+        object_distance=object_distance,
+        model=model,
+        pixel_integration=pixel_integration,
+        grid=grid,
     )
-    return first - second
-
-
-def _otfs(
-    camera: LenslessCamera,
-    phases: tuple[float, ...],
-    wavelength: Number,
-    object_distance: Number,
-    model: Model,
-    pixel_integration: bool,
-    grid: Grid | None,
-) -> list[Complex[Array, "v u"]]:
-    """The camera's OTF at several phases of its mask, in turns."""
-    return [
-        otf(
-            _with_phase(camera, turns),
-            wavelength=wavelength,
-            object_distance=object_distance,
-            model=model,
-            pixel_integration=pixel_integration,
-            grid=grid,
-        )
-        for turns in phases
-    ]
 
 
 def _with_phase(camera: LenslessCamera, turns: float) -> LenslessCamera:

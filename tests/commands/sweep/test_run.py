@@ -129,9 +129,13 @@ def command(file: Path, out: Path, *grid: str) -> list[str]:
 
 
 def environment(file: Path) -> dict[str, str]:
-    """Of a user: float32. What the workers of one sweep compile serves those of the next."""
+    """Of a user without dask's workers, in float32. One sweep's compilations serve the next."""
     kept = {k: v for k, v in os.environ.items() if not k.startswith("JAX_ENABLE")}
-    path = os.pathsep.join(filter(None, [str(ROOT), kept.get("PYTHONPATH")]))
+    without = file.parent / "without"
+    without.mkdir(exist_ok=True)
+    # Not dask itself, which pint imports where it is installed.
+    (without / "distributed.py").write_text("raise ImportError('local sweeps do without')\n")
+    path = os.pathsep.join(filter(None, [str(without), str(ROOT), kept.get("PYTHONPATH")]))
     cache = {
         "JAX_COMPILATION_CACHE_DIR": str(file.parent / "compiled"),
         "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",

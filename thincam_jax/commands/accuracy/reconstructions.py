@@ -184,27 +184,11 @@ def solve(config: StudyConfig, method: MethodConfig, quantity: str, level: float
         wrong = psfs_of(config, changed(method, quantity, math.exp(logarithm)))
         return math.log(relative_error(wrong, reference) / level)
 
-    bracket = _bracket(excess)
-    if bracket is None:
-        return None
-    found = scipy.optimize.root_scalar(
-        excess, bracket=bracket, method="brentq", xtol=_TOLERANCE / 2, rtol=1e-9
-    )
-    return max(1, round(math.exp(found.root) / _STEP)) * _STEP
-
-
-def _bracket(excess: Callable[[float], float]) -> tuple[float, float] | None:
-    """Logarithms of a change that is too small and of one that is too large."""
-    guess, end = math.log(_FIRST), math.log(_LARGEST)
-    # Small errors grow in proportion to what is wrong.
-    guess = min(guess - excess(guess), end)
-    step = math.log(1.3) if excess(guess) < 0 else -math.log(1.3)
-    last = guess
-    while last < end or step < 0:
-        following = min(last + step, end)
-        if (excess(following) < 0) != (step > 0):
-            return min(last, following), max(last, following)
-        last, step = following, 2 * step
-        if step < -100:
-            break
+    first, end = math.log(_FIRST), math.log(_LARGEST)
+    guess = min(first - excess(first), end)  # small errors grow in proportion to what is wrong
+    for reach in (0.3, 1.0, 3.0, 10.0):
+        low, high = guess - reach, min(guess + reach, end)
+        if excess(low) < 0 < excess(high):
+            root = scipy.optimize.brentq(excess, low, high, xtol=_TOLERANCE / 2, rtol=1e-9)
+            return max(1, round(math.exp(root) / _STEP)) * _STEP
     return None

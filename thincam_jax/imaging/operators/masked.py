@@ -2,8 +2,9 @@
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Bool, DTypeLike, Float, PRNGKeyArray, PyTree, Real
+from jaxtyping import Array, Bool, DTypeLike, Float, PRNGKeyArray, PyTree
 
+from thincam_jax._core.checks import Numbers
 from thincam_jax.imaging.operators.base import (
     AbstractOperator,
     Shapes,
@@ -30,7 +31,7 @@ class Masked(AbstractOperator):
     operator: AbstractOperator
     valid: PyTree[Bool[Array, "..."]]
 
-    def __init__(self, operator: AbstractOperator, valid: PyTree[Bool[ArrayLike, "..."]]):
+    def __init__(self, operator: AbstractOperator, valid: PyTree[Numbers]):
         self.operator = operator
         self.valid = _per_capture("valid", valid, operator.out_shape, _boolean)
 
@@ -68,7 +69,7 @@ class Scaled(AbstractOperator):
     operator: AbstractOperator
     gain: PyTree[Float[Array, "..."]]
 
-    def __init__(self, operator: AbstractOperator, gain: PyTree[Real[ArrayLike, "..."]]):
+    def __init__(self, operator: AbstractOperator, gain: PyTree[Numbers]):
         self.operator = operator
         if isinstance(gain, tuple | list):
             self.gain = _per_capture("gain", gain, operator.out_shape, real_numbers)

@@ -12,28 +12,18 @@ from jaxtyping import ArrayLike, Float64, Num
 from thincam_jax._core import checks
 
 # Files inside the scikit-image package itself; other names of `skimage.data` need a download.
-_SAMPLES = {
-    "astronaut": "astronaut.png",
-    "brick": "brick.png",
-    "camera": "camera.png",
+_PLAIN = (
+    *("astronaut", "brick", "camera", "cell", "chelsea", "coffee", "coins", "grass", "gravel"),
+    *("logo", "microaneurysms", "moon", "page", "text"),
+)
+_SAMPLES = {name: f"{name}.png" for name in _PLAIN} | {
     "cat": "chelsea.png",
-    "cell": "cell.png",
-    "chelsea": "chelsea.png",
     "clock": "clock_motion.png",
-    "coffee": "coffee.png",
-    "coins": "coins.png",
     "colorwheel": "color.png",
-    "grass": "grass.png",
-    "gravel": "gravel.png",
     "hubble_deep_field": "hubble_deep_field.jpg",
     "immunohistochemistry": "ihc.png",
-    "logo": "logo.png",
-    "microaneurysms": "microaneurysms.png",
-    "moon": "moon.png",
-    "page": "page.png",
     "retina": "retina.jpg",
     "rocket": "rocket.jpg",
-    "text": "text.png",
 }
 
 

@@ -213,21 +213,22 @@ def _report(problem: FitProblem, solution: Solution, precision: Precision) -> Ps
         errors["object_distance"] = errors["object_distance"] * distance**2
     explained = 1 - float(jnp.sum((residual * problem.weight) ** 2))
     status, reasons = _status(solution, explained, alike)
-    return PsfFit(
-        cast(found.camera, precision),
-        cast(jnp.asarray(distance), precision),
-        cast(found.wavelength, precision),
-        cast(found.background, precision),
-        cast(found.gain, precision),
-        cast({name: jnp.asarray(value) for name, value in values.items()}, precision),
-        cast({name: jnp.asarray(error) for name, error in errors.items()}, precision),
-        cast(jnp.asarray(known.correlation), precision),
-        cast(residual, precision),
+    found_fit = PsfFit(
+        found.camera,
+        jnp.asarray(distance),
+        found.wavelength,
+        found.background,
+        found.gain,
+        {name: jnp.asarray(value) for name, value in values.items()},
+        {name: jnp.asarray(error) for name, error in errors.items()},
+        jnp.asarray(known.correlation),
+        residual,
         names,
         status,
         reasons,
         solution.iterations,
     )
+    return cast(found_fit, precision)
 
 
 def _slopes_of_values(found: FitState, names) -> np.ndarray:
