@@ -189,6 +189,8 @@ def solve(config: StudyConfig, method: MethodConfig, quantity: str, level: float
     for reach in (0.3, 1.0, 3.0, 10.0):
         low, high = guess - reach, min(guess + reach, end)
         if excess(low) < 0 < excess(high):
-            root = scipy.optimize.brentq(excess, low, high, xtol=_TOLERANCE / 2, rtol=1e-9)
-            return max(1, round(math.exp(root) / _STEP)) * _STEP
+            found = scipy.optimize.root_scalar(
+                excess, bracket=(low, high), method="brentq", xtol=_TOLERANCE / 2, rtol=1e-9
+            )
+            return max(1, round(math.exp(found.root) / _STEP)) * _STEP
     return None
