@@ -8,10 +8,10 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .NOTPARALLEL:
-.PHONY: help run test lint bench docs clean
+.PHONY: help run test test-all lint bench docs clean
 
 help: ## Show this list.
-	@sed -n 's/^\([a-z]*\):.*## \(.*\)/  make \1|\2/p' Makefile | awk -F'|' '{ printf "%-14s %s\n", $$1, $$2 }'
+	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1|\2/p' Makefile | awk -F'|' '{ printf "%-14s %s\n", $$1, $$2 }'
 	@echo 'Variables: PYTHON=python3.12 (the interpreter .venv is made with), ARGS="..." (more arguments).'
 
 run: .venv/.installed-core ## Simulate and reconstruct the example experiment into runs/.
@@ -19,6 +19,9 @@ run: .venv/.installed-core ## Simulate and reconstruct the example experiment in
 
 test: .venv/.installed-test ## Run the tests, e.g. make test ARGS="tests/test_units.py -k angle".
 	@$(BIN)/python -m pytest -n 2 --dist loadfile $(ARGS)
+
+test-all: .venv/.installed-test ## Run all tests, the thorough ones too (the better part of an hour).
+	@$(BIN)/python -m pytest -n 2 --dist loadfile -m "thorough or not thorough" $(ARGS)
 
 lint: .venv/.installed-dev ## Check the style, the formatting and the types.
 	@$(BIN)/ruff check .

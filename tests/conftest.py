@@ -7,10 +7,13 @@ from pathlib import Path
 os.environ.setdefault("JAX_PLATFORMS", "cpu")  # set it to run the tests on another device
 os.environ["MPLBACKEND"] = "Agg"
 os.environ["THINCAM_CACHE"] = "off"  # commands in tests leave no compiled programs with the user
-# Most of the tests' time goes into compiling, half of it without these emitters and without LLVM's
-# optimisation. What tests rounding is compiled `helpers.AS_IN_USE`.
+# Most of the tests' time goes into compiling some 14,000 small programs. Without these emitters and
+# LLVM's optimisation, and with each program in one piece, it is a third of the time. What tests
+# rounding is compiled `helpers.AS_IN_USE`; tests/test_default_flags.py runs a sample without flags.
 os.environ.setdefault(
-    "XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0"
+    "XLA_FLAGS",
+    "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0"
+    " --xla_llvm_disable_expensive_passes=true --xla_cpu_parallel_codegen_split_count=1",
 )
 
 import jax
@@ -19,9 +22,20 @@ import pytest
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
+jax.config.update("jax_traceback_in_locations_limit", 0)  # lines in HLO that nobody reads here
 
 # Before the first import of the package: from here on every annotated call is checked.
 jaxtyping.install_import_hook("thincam_jax", "beartype.beartype")
+
+
+def pytest_collection_finish():
+    """Tracing makes many short-lived objects: by default a tenth of the time is garbage collection.
+
+    What was imported stays, and need not be looked at again.
+    """
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(50_000, 20, 20)
 
 
 @pytest.fixture

@@ -1,5 +1,7 @@
 """The end-to-end objective against dense linear algebra and against differences."""
 
+import functools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -7,7 +9,7 @@ import numpy as np
 import pytest
 
 import thincam_jax as tc
-from helpers import AS_IN_USE
+from helpers import AS_IN_USE, count_traces
 from thincam_jax._core.grids import Grid
 from thincam_jax.design import (
     Design,
@@ -61,7 +63,16 @@ def training(noise=None, synthesis=None, **settings):
 
 def design(beta=(9.0, 7.0), distance=(5.03, 6.41), wavelength=5e-4, width=1.83):
     pairs = [jnp.repeat(jnp.asarray(x), 2) for x in (beta, distance)]
-    return Design(pairs[0], jnp.asarray(PAIR * 2), pairs[1], wavelength=wavelength, width=width)
+    phases = jnp.asarray(PAIR * len(beta))
+    return Design(pairs[0], phases, pairs[1], wavelength=wavelength, width=width)
+
+
+@count_traces
+def restored_and_error(chosen, given):
+    return restore(chosen, given), end_to_end_error(chosen, given)
+
+
+compiled = eqx.filter_jit(restored_and_error)
 
 
 def dense(chosen, given):
@@ -126,7 +137,8 @@ def test_restored_are_the_best_linear_estimates(noise):
     given, chosen = training(noise), design()
     maps = dense(chosen, given)
     covariance = prior_matrix()
-    found = np.asarray(restore(chosen, given))
+    restored_images, whole = compiled(chosen, given)
+    found = np.asarray(restored_images)
     for image, drawn, restored in zip(given.images, given.noise, found, strict=True):
         flat = np.asarray(image).ravel()
         pairs = [maps[0] - maps[1], maps[2] - maps[3]]
@@ -141,7 +153,7 @@ def test_restored_are_the_best_linear_estimates(noise):
         np.testing.assert_allclose(restored, expected, rtol=0, atol=1e-7)
     images = np.asarray(given.images)
     error = np.mean((found - images) ** 2, axis=(1, 2)) / np.var(images, axis=(1, 2))
-    assert float(end_to_end_error(chosen, given)) == pytest.approx(error.mean(), rel=1e-9)
+    assert float(whole) == pytest.approx(error.mean(), rel=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -152,11 +164,15 @@ def test_gradient_through_the_solver_by_differences(noise):
     given = training(noise)
     place = jnp.array([9.0, 7.0, 5.03, 6.41, 5e-4, 1.83])
 
-    def of_numbers(x):
+    @functools.partial(jax.jit, compiler_options=AS_IN_USE)
+    @jax.value_and_grad
+    def error_and_slope(x):
         return end_to_end_error(design(x[:2], x[2:4], x[4], x[5]), given)
 
-    error = jax.jit(of_numbers, compiler_options=AS_IN_USE)
-    slope = jax.jit(jax.grad(of_numbers), compiler_options=AS_IN_USE)(place)
+    def error(x):
+        return error_and_slope(x)[0]
+
+    slope = error_and_slope(place)[1]
     for index, value in enumerate(place):
         # The projection averages over pixels whose borders pass each other: steps are short.
         step = jnp.zeros(6).at[index].set(1e-6 * value)
@@ -167,27 +183,23 @@ def test_gradient_through_the_solver_by_differences(noise):
 @pytest.mark.thorough
 def test_more_noise_and_less_light_restore_less():
     chosen = design()
-    errors = [float(end_to_end_error(chosen, training(SignalNoise(s)))) for s in (40.0, 20.0, 0.0)]
+    errors = [float(compiled(chosen, training(SignalNoise(s)))[1]) for s in (40.0, 20.0, 0.0)]
     assert 0 < errors[0] < errors[1] < errors[2]
     few, many = (training(PhotonNoise(e, 5.0)) for e in (300.0, 30_000.0))
-    assert float(end_to_end_error(chosen, few)) > float(end_to_end_error(chosen, many))
+    assert float(compiled(chosen, few)[1]) > float(compiled(chosen, many)[1])
 
 
 def test_too_few_steps_are_told():
-    assert jnp.isnan(end_to_end_error(design(), training(steps=2)))
+    given = training(steps=2, synthesis=phase_pairs(1))
+    assert jnp.isnan(compiled(design((9.0,), (5.03,)), given)[1])
 
 
 def test_new_values_are_not_traced_again():
-    traces = []
-
-    @eqx.filter_jit
-    def error(chosen, given):
-        traces.append(1)
-        return end_to_end_error(chosen, given)
-
-    error(design(), training())
-    error(design((11.0, 8.0)), training(SignalNoise(20.0)))
-    assert len(traces) == 1
+    compiled(design(), training(PhotonNoise(3000.0, 5.0)))
+    before = restored_and_error.traces
+    assert before > 0
+    compiled(design((11.0, 8.0)), training(PhotonNoise(300.0, 4.0)))
+    assert restored_and_error.traces == before
 
 
 def test_errors():
@@ -271,5 +283,6 @@ def test_steps_without_a_number_are_skipped_and_counted():
 @pytest.mark.thorough
 def test_drawn_noise_is_other_noise_and_of_the_key():
     given, chosen = training(), design()
-    errors = [float(drawn_error(chosen, given, jax.random.key(k))) for k in (0, 0, 1)]
+    error = eqx.filter_jit(drawn_error)
+    errors = [float(error(chosen, given, jax.random.key(k))) for k in (0, 0, 1)]
     assert errors[0] == errors[1] != errors[2]

@@ -1,5 +1,6 @@
 """Robust errors against samples of the errors they stand for."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -24,16 +25,28 @@ PAIRS = jnp.asarray(phase_pairs(2))
 DESIGN = thesis_design()
 
 
-def known(design: Design, setup=SETUP):
-    return channels(design, setup, PAIRS, FREQUENCIES)
+@jax.jit
+def known(design: Design):
+    return channels(design, SETUP, PAIRS, FREQUENCIES)
 
 
-def robust(tolerances, how="mean", design=DESIGN):
-    return float(robust_error(design, SETUP, PAIRS, FREQUENCIES, tolerances, how=how))
+nominal_error = jax.jit(bayes_error)
+error_beside = jax.jit(mismatch_error)
+compiled = eqx.filter_jit(robust_error)
+
+
+def robust(tolerances, how="mean"):
+    return float(compiled(DESIGN, SETUP, PAIRS, FREQUENCIES, tolerances, how=how))
 
 
 def test_without_tolerances_it_is_the_bayes_error():
-    assert robust(Tolerances()) == float(bayes_error(known(DESIGN)))
+    @jax.jit
+    def both(design):
+        data = SETUP, PAIRS, FREQUENCIES
+        return robust_error(design, *data, Tolerances()), bayes_error(channels(design, *data))
+
+    robust_one, exact = both(DESIGN)
+    assert robust_one == exact
 
 
 @pytest.mark.parametrize(
@@ -55,7 +68,7 @@ def test_the_mean_is_that_of_samples(name, size):
     # Both signs of each: what is odd in the errors cancels.
     draws = size * rng.normal(size=(100, 4))
     pairs = [(float(of(jnp.asarray(d))) + float(of(jnp.asarray(-d)))) / 2 for d in draws]
-    exact = float(bayes_error(nominal))
+    exact = float(nominal_error(nominal))
     rise = robust(Tolerances(**{name: size})) - exact
     spread = np.std(pairs) / np.sqrt(len(pairs))
     assert rise > 5 * spread
@@ -86,11 +99,11 @@ def test_the_worst_is_above_each_and_near_the_largest():
         for k in range(4):
             moved = DESIGN.distance.at[k].add(sign * 0.02)
             other = Design(DESIGN.beta, DESIGN.phase, moved, wavelength=5e-4, width=5.632)
-            errors.append(float(mismatch_error(nominal, known(other))))
+            errors.append(float(error_beside(nominal, known(other))))
         other = Design(
             DESIGN.beta, DESIGN.phase, DESIGN.distance, wavelength=5e-4 + sign * 2e-6, width=5.632
         )
-        errors.append(float(mismatch_error(nominal, known(other))))
+        errors.append(float(error_beside(nominal, known(other))))
     worst = robust(tolerances, "worst")
     assert max(errors) <= worst <= max(errors) + 0.04 * robust(Tolerances())
 
@@ -103,7 +116,7 @@ def test_a_tilt_counts_as_a_distance():
         other = Design(
             DESIGN.beta, DESIGN.phase, DESIGN.distance + sign * depth, wavelength=5e-4, width=5.632
         )
-        errors.append(float(mismatch_error(nominal, known(other))))
+        errors.append(float(error_beside(nominal, known(other))))
     assert robust(Tolerances(tilt=tilt)) == pytest.approx(np.mean(errors), rel=1e-9)
 
 
@@ -121,7 +134,7 @@ def test_gradient_by_differences(how):
         return robust_error(chosen, SETUP, PAIRS, FREQUENCIES, tolerances, how=how)
 
     place = jnp.array([25.0, 21.0, 6.3, 6.45, 5e-4, 5.6])
-    slope = jax.grad(error)(place)
+    slope = jax.jit(jax.grad(error))(place)
     for index, value in enumerate(place):
         step = jnp.zeros(6).at[index].set(1e-6 * value)
         difference = (error(place + step) - error(place - step)) / (2e-6 * value)

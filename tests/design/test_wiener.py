@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import thincam_jax as tc
+from helpers import count_traces
 from thincam_jax.design import (
     Design,
     PhotonNoise,
@@ -61,6 +62,30 @@ def design(beta=(19.0, 23.0), distance=(7.0, 7.0), wavelength=5e-4, width=1.71):
     return Design(pairs[0], jnp.asarray(PAIR * 2), pairs[1], wavelength=wavelength, width=width)
 
 
+@count_traces
+def restored_and_error(chosen, given):
+    return restore_by_wiener(chosen, given), wiener_error(chosen, given)
+
+
+compiled = eqx.filter_jit(restored_and_error)
+
+
+@eqx.filter_jit
+def captured(chosen, given):
+    """Captures and variances of each image: one of a pair holds all the noise of the difference."""
+    found = []
+    for image, drawn in zip(given.images, given.noise, strict=True):
+        captures, variances = [], []
+        for channel, noise in zip(channels_of(chosen, given), drawn, strict=True):
+            projected = channel._projected(image)
+            first, second = (one(projected) for one in channel.captures)
+            variance = channel.capture(image, noise)[1]
+            captures += [first + jnp.sqrt(variance) * noise, second]
+            variances += [variance / 2, variance / 2]  # shared out in what is told of it
+        found.append((jnp.stack(captures), jnp.stack(variances)))
+    return found
+
+
 def synthesised(chosen, given):
     """By `WienerSynthesis` from the captures of PSFs, with the same noise."""
     sensor = tc.Sensor(SENSOR, PITCH)
@@ -71,19 +96,8 @@ def synthesised(chosen, given):
         field_shape=(COUNT, COUNT),
     )
     reconstruct = tc.Wiener(synthesis=phase_pairs(2)).prepare(cameras)
-    restored = []
-    for image, drawn in zip(given.images, given.noise, strict=True):
-        captures, variances = [], []
-        for channel, noise in zip(channels_of(chosen, given), drawn, strict=True):
-            projected = channel._projected(image)
-            first, second = (one(projected) for one in channel.captures)
-            variance = channel.capture(image, noise)[1]
-            # All the noise of the difference in one capture, shared out in what is told of it.
-            captures += [first + jnp.sqrt(variance) * noise, second]
-            variances += [variance / 2, variance / 2]
-        found = reconstruct(jnp.stack(captures), jnp.stack(variances)).image
-        restored.append(np.asarray(found)[::-1, ::-1])
-    return np.stack(restored)
+    images = [reconstruct(*seen).image for seen in captured(chosen, given)]
+    return np.stack([np.asarray(image)[::-1, ::-1] for image in images])
 
 
 @pytest.mark.thorough
@@ -91,7 +105,7 @@ def test_restored_are_nearly_those_of_the_wiener_synthesis_at_two_distances():
     """With little noise: on so few pixels estimates of the scene's strength differ otherwise."""
     given, chosen = training(SignalNoise(45.0)), design(distance=(5.0, 7.0))
     images = np.asarray(given.images)
-    found, expected = np.asarray(restore_by_wiener(chosen, given)), synthesised(chosen, given)
+    found, expected = np.asarray(compiled(chosen, given)[0]), synthesised(chosen, given)
     error = [np.mean((r - images) ** 2) / np.var(images) for r in (found, expected)]
     assert error[1] < 0.1
     assert error[0] == pytest.approx(error[1], rel=0.08)
@@ -100,8 +114,8 @@ def test_restored_are_nearly_those_of_the_wiener_synthesis_at_two_distances():
 
 def test_restored_are_those_of_the_wiener_synthesis():
     given, chosen = training(), design()
-    found = np.asarray(restore_by_wiener(chosen, given))
-    expected = synthesised(chosen, given)
+    restored, error_of_all = compiled(chosen, given)
+    found, expected = np.asarray(restored), synthesised(chosen, given)
     images = np.asarray(given.images)
     error = [np.mean((r - images) ** 2) / np.var(images) for r in (found, expected)]
     assert error[1] < 0.3  # the captures tell something
@@ -109,7 +123,7 @@ def test_restored_are_those_of_the_wiener_synthesis():
     assert np.mean((found - expected) ** 2) < 0.1 * np.mean((expected - images) ** 2)
     variance = np.var(images, axis=(1, 2))
     whole = np.mean(np.mean((found - images) ** 2, axis=(1, 2)) / variance)
-    assert float(wiener_error(chosen, given)) == pytest.approx(whole, rel=1e-9)
+    assert float(error_of_all) == pytest.approx(whole, rel=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -121,10 +135,14 @@ def test_gradient_by_differences(noise):
     place = jnp.array([19.0, 23.0, 5.13, 6.91, 5e-4, 1.71])
 
     @jax.jit
-    def error(x):
+    @jax.value_and_grad
+    def error_and_slope(x):
         return wiener_error(design(x[:2], x[2:4], x[4], x[5]), given)
 
-    slope = jax.grad(error)(place)
+    def error(x):
+        return error_and_slope(x)[0]
+
+    slope = error_and_slope(place)[1]
     for index, value in enumerate(place):
         step = jnp.zeros(6).at[index].set(1e-5 * value)
         difference = (error(place + step) - error(place - step)) / (2e-5 * value)
@@ -137,29 +155,24 @@ def test_coarse_pixels_carry_the_noise_of_the_fine_ones():
     small = {"count": 12, "sensor": (20, 24)}
     coarse = training(SignalNoise(20.0), pitch=0.04, **small)
     fine = training(SignalNoise(20.0 + 20 * np.log10(2)), pitch=0.08, **small)
-    assert float(wiener_error(design(), coarse)) == pytest.approx(
-        float(wiener_error(design(), fine)), rel=1e-9
-    )
+    error = [float(compiled(design(), given)[1]) for given in (coarse, fine)]
+    assert error[0] == pytest.approx(error[1], rel=1e-9)
     noisier = training(SignalNoise(0.0), pitch=0.08, **small)
-    assert float(wiener_error(design(), noisier)) > float(wiener_error(design(), fine))
+    assert float(compiled(design(), noisier)[1]) > error[1]
 
 
 def test_a_capture_with_its_bias_is_restored():
     single = training(synthesis=np.eye(4)[:1], count=12, sensor=(20, 24))
-    assert 0 < float(wiener_error(design(), single)) < 1
+    assert 0 < float(compiled(design(), single)[1]) < 1
 
 
 def test_new_values_are_not_traced_again():
-    traces = []
-
-    @eqx.filter_jit
-    def error(chosen, given):
-        traces.append(1)
-        return wiener_error(chosen, given)
-
-    error(design(), training(count=12, sensor=(20, 24)))
-    error(design((21.0, 8.0), (5.5, 6.5)), training(SignalNoise(20.0), count=12, sensor=(20, 24)))
-    assert len(traces) == 1
+    small = {"count": 12, "sensor": (20, 24)}
+    compiled(design(), training(**small))
+    before = restored_and_error.traces
+    assert before > 0
+    compiled(design((21.0, 8.0), (5.5, 6.5)), training(SignalNoise(20.0), **small))
+    assert restored_and_error.traces == before
 
 
 def test_errors():

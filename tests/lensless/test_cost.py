@@ -1,6 +1,7 @@
 """Predicted memory against what XLA allocates and against what a process really takes."""
 
 import importlib
+import itertools
 import json
 import os
 import subprocess
@@ -77,80 +78,114 @@ def require_agreement(measured, predicted, line=False):
         assert predicted <= 4 * measured
 
 
-@pytest.mark.parametrize("average", [False, True], ids=["points", "average"])
-@pytest.mark.parametrize("model", CLOSED)
+def spread_over(step, **parameters):
+    """All combinations of the parameters, of which a default run takes one in `step`.
+
+    It takes those whose places in the lists add up to a multiple of `step`: every value comes with
+    several of the others. A thorough run takes all. A parameter is a dictionary of its values by
+    what they are called; a tuple counts as several arguments.
+    """
+    rows = []
+    for places in itertools.product(*(enumerate(values.items()) for values in parameters.values())):
+        values = [value for _, (_, value) in places]
+        arguments = [a for v in values for a in (v if isinstance(v, tuple) else (v,))]
+        taken = sum(place for place, _ in places) % step == 0
+        marks = () if taken else pytest.mark.thorough
+        rows.append(pytest.param(*arguments, marks=marks, id="-".join(n for _, (n, _) in places)))
+    return rows
+
+
+AVERAGE = {"points": False, "average": True}
+DTYPE = {"float32": jnp.float32, "float64": jnp.float64}
+
+
 @pytest.mark.parametrize(
-    ("mask", "shape", "dtype"),
-    [
-        (zones(), (7, 9), jnp.float32),
-        (zones(), (48, 80), jnp.float32),
-        (zones(), (700, 300), jnp.float64),
-        (zones(), (40, 3000), jnp.float32),
-        (zones(profile="binary"), (1, 5000), jnp.float64),
-        (zones(profile="binary", harmonics=31), (300, 210), jnp.float32),
-    ],
-    ids=["tiny", "small", "medium", "flat", "line", "31 harmonics"],
+    ("mask", "shape", "dtype", "model", "average"),
+    spread_over(
+        4,
+        case={
+            "tiny": (zones(), (7, 9), jnp.float32),
+            "small": (zones(), (48, 80), jnp.float32),
+            "medium": (zones(), (700, 300), jnp.float64),
+            "flat": (zones(), (40, 3000), jnp.float32),
+            "line": (zones(profile="binary"), (1, 5000), jnp.float64),
+            "31 harmonics": (zones(profile="binary", harmonics=31), (300, 210), jnp.float32),
+        },
+        model={model: model for model in CLOSED},
+        average=AVERAGE,
+    ),
 )
 def test_closed_forms(mask, shape, dtype, model, average):
     """Most of the memory: chirp integrals of all nodes and orders, or the image."""
     require_agreement(*both(mask, shape, model, average, dtype), line=min(shape) == 1)
 
 
-@pytest.mark.parametrize("average", [False, True], ids=["points", "average"])
-@pytest.mark.parametrize("model", ["geometric", "separable"])
 @pytest.mark.parametrize(
-    ("cells", "profile", "shape", "dtype"),
-    [
-        (8, "cosine", (48, 80), jnp.float64),
-        (128, "cosine", (700, 300), jnp.float32),
-        (128, "binary", (48, 80), jnp.float32),
-    ],
+    ("cells", "profile", "shape", "dtype", "model", "average"),
+    spread_over(
+        3,
+        display={
+            "8 cells": (8, "cosine", (48, 80), jnp.float64),
+            "128 cells": (128, "cosine", (700, 300), jnp.float32),
+            "128 binary cells": (128, "binary", (48, 80), jnp.float32),
+        },
+        model={"geometric": "geometric", "separable": "separable"},
+        average=AVERAGE,
+    ),
 )
 def test_display_pixels(cells, profile, shape, dtype, model, average):
     mask = zones(profile=profile, pixel_pitch=WIDTH / cells)
     require_agreement(*both(mask, shape, model, average, dtype))
 
 
-@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 @pytest.mark.parametrize(
-    ("mask", "shape", "average", "oversampling"),
-    [
-        (zones(width=0.5), (48, 80), False, 1),
-        (zones(width=0.5, pixel_pitch=0.01), (301, 200), True, 3),
-        (zones(width=2.0, profile="binary"), (200, 101), False, 3),
-        (numbers((60, 90), 0.011), (48, 80), False, 1),
-        (numbers((300, 200), 5.5e-3, complex), (120, 500), True, 3),
-        (numbers((700, 1000), 2e-3), (48, 80), False, 1),
-    ],
-    ids=["zones", "display", "binary", "numbers", "complex numbers", "fine numbers"],
+    ("mask", "shape", "average", "oversampling", "dtype", "model"),
+    spread_over(
+        3,
+        case={
+            "zones": (zones(width=0.5), (48, 80), False, 1),
+            "display": (zones(width=0.5, pixel_pitch=0.01), (301, 200), True, 3),
+            "binary": (zones(width=2.0, profile="binary"), (200, 101), False, 3),
+            "numbers": (numbers((60, 90), 0.011), (48, 80), False, 1),
+            "complex numbers": (numbers((300, 200), 5.5e-3, complex), (120, 500), True, 3),
+            "fine numbers": (numbers((700, 1000), 2e-3), (48, 80), False, 1),
+        },
+        dtype=DTYPE,
+        model={model: model for model in ("angular_spectrum", "rayleigh_sommerfeld")},
+    ),
 )
-@pytest.mark.parametrize("model", ["angular_spectrum", "rayleigh_sommerfeld"])
 def test_sampled_models(mask, shape, average, oversampling, dtype, model):
     require_agreement(*both(mask, shape, model, average, dtype, oversampling))
 
 
-@pytest.mark.parametrize("average", [False, True], ids=["points", "average"])
 @pytest.mark.parametrize(
-    ("mask", "shape", "dtype"),
-    [
-        (numbers((60, 90), 0.011), (48, 80), jnp.float64),
-        (numbers((700, 1000), 2e-3), (300, 500), jnp.float32),
-        (numbers((300, 200), 5.5e-3, complex), (900, 70), jnp.float32),
-    ],
+    ("mask", "shape", "dtype", "average"),
+    spread_over(
+        2,
+        case={
+            "few": (numbers((60, 90), 0.011), (48, 80), jnp.float64),
+            "many": (numbers((700, 1000), 2e-3), (300, 500), jnp.float32),
+            "complex": (numbers((300, 200), 5.5e-3, complex), (900, 70), jnp.float32),
+        },
+        average=AVERAGE,
+    ),
 )
 def test_shadow_of_numbers(mask, shape, dtype, average):
     require_agreement(*both(mask, shape, "geometric", average, dtype))
 
 
-@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 @pytest.mark.parametrize(
-    ("sensor", "field", "images"),
-    [
-        ((48, 80), (48, 80), 1),
-        ((48, 80), (500, 601), 3),
-        ((301, 700), (48, 80), 10),
-        ((301, 700), (500, 601), 1),
-    ],
+    ("sensor", "field", "images", "dtype"),
+    spread_over(
+        2,
+        case={
+            "equal": ((48, 80), (48, 80), 1),
+            "large fields": ((48, 80), (500, 601), 3),
+            "large sensor": ((301, 700), (48, 80), 10),
+            "both large": ((301, 700), (500, 601), 1),
+        },
+        dtype=DTYPE,
+    ),
 )
 def test_convolutions(sensor, field, images, dtype):
     """The spectrum made from a given PSF, and one application or its adjoint: fields included."""

@@ -94,12 +94,12 @@ def test_predictions_hold_over_random_cameras(errors, capsys, model, precision, 
 
 
 @pytest.fixture(scope="module")
-def choices():
-    """(tolerance, choice, what gives its true error) for 25 random cameras."""
+def choices(request):
+    """(tolerance, choice, what gives its true error) for so many random cameras."""
     found = []
     # Of the binary masks, with many times the orders, only those on the small sensor.
     kinds = [kind for kind in cameras.KINDS if kind[1] == "cosine" or kind[0] == (48, 80)]
-    for case in cameras.random_cases(25, 11, kinds):
+    for case in cameras.random_cases(request.param, 11, kinds):
 
         @functools.cache
         def error(model, precision, oversampling, case=case):
@@ -115,6 +115,7 @@ def choices():
 
 @pytest.mark.thorough
 @pytest.mark.slow
+@pytest.mark.parametrize("choices", [25], indirect=True)
 @pytest.mark.parametrize("tolerance", TOLERANCES)
 def test_choices_meet_their_tolerance(choices, capsys, tolerance):
     """In 90 % of cameras, by the error against the independent reference."""
@@ -132,7 +133,9 @@ def test_choices_meet_their_tolerance(choices, capsys, tolerance):
     assert tolerance < 0.01 or any(choice.model != "separable" for choice, _ in own)
 
 
-@pytest.mark.slow
+@pytest.mark.parametrize(
+    "choices", [8, pytest.param(25, marks=pytest.mark.thorough)], indirect=True
+)
 def test_a_looser_tolerance_never_costs_more(choices):
     def weight(choice):  # of cameras in float64, which it costs to leave
         double = choice.precision == "float64"

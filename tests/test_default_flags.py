@@ -1,0 +1,25 @@
+"""A sample of the suite as users run it: with XLA's own flags, optimised and with its emitters."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from helpers import ROOT
+
+# Propagation, an operator, and iterations of ADMM: what other tests compile without optimisation.
+SAMPLE = (
+    "tests/lensless/propagation/test_closed_form.py",
+    "tests/imaging/operators/test_crop_convolution.py",
+    "tests/reconstruction/test_fourier_splitting.py",
+)
+
+
+@pytest.mark.skipif(not os.environ.get("XLA_FLAGS"), reason="these tests have XLA's own flags")
+def test_a_sample_passes_with_default_flags():
+    env = {**os.environ, "XLA_FLAGS": ""}
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *SAMPLE]
+    done = subprocess.run(command, capture_output=True, text=True, env=env, cwd=ROOT)
+    assert done.returncode == 0, done.stdout[-2000:]
+    assert " passed" in done.stdout
