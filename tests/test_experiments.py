@@ -1,0 +1,35 @@
+"""The scripts of experiments/ at their reduced size: their own assertions, and their figures."""
+
+import runpy
+
+import jax
+import matplotlib.pyplot as plt
+import pytest
+import skimage.io
+
+from helpers import ROOT
+
+SCRIPTS = sorted((ROOT / "experiments").glob("*.py"))
+
+
+def test_the_scripts_are_there():
+    assert {"first_image", "superresolution", "speed_for_accuracy"} <= {s.stem for s in SCRIPTS}
+
+
+@pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.stem)
+def test_a_script_runs_and_draws(script, monkeypatch, tmp_path):
+    """In a user's precision. Every panel with a scale says what it shows, and in which unit."""
+    monkeypatch.setenv("THINCAM_SIZE", "small")
+    monkeypatch.setenv("THINCAM_FIGURES", str(tmp_path))
+    with jax.enable_x64(False), jax.numpy_dtype_promotion("standard"):
+        runpy.run_path(str(script))
+    try:
+        panels = [ax for number in plt.get_fignums() for ax in plt.figure(number).axes]
+        labelled = [ax for ax in panels if ax.get_xlabel() or ax.get_ylabel()]
+        assert len(labelled) >= 4
+    finally:
+        plt.close("all")
+    pictures = list((tmp_path / script.stem).glob("*.png"))
+    assert len(pictures) >= 2
+    for picture in pictures:
+        assert skimage.io.imread(picture).std() > 1  # something is drawn
