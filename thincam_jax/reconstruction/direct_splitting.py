@@ -76,7 +76,8 @@ class DirectSplitting(AbstractSplitting):
         penalties = self.penalties
         total = penalties.data * data + penalties.image * target.image
         total = total + penalties.variation * self.variation.synthesise(target.slopes)
-        smooth = penalties.variation * _difference_symbol(total.shape[-3:], self.variation)
+        symbol = _difference_symbol(total.shape[-3:], self.variation.depth_weight, total.dtype)
+        smooth = penalties.variation * symbol
         shift = penalties.data + penalties.image
         axes = (-3, -2, -1)
         modes = jax.scipy.fft.dctn(total, axes=axes, norm="ortho") / (smooth + shift)
@@ -86,13 +87,10 @@ class DirectSplitting(AbstractSplitting):
         return State((image,), self.variation.analyse(image), image)
 
 
-def _difference_symbol(
-    shape: tuple[int, ...], variation: TotalVariation
-) -> Float[Array, "plane y x"]:
+def _difference_symbol(shape: tuple[int, ...], depth_weight, dtype) -> Float[Array, "plane y x"]:
     """ΨᵀΨ in the cosine transform: 4 sin²(πk/2n) along each axis, δ² times that between planes."""
-    dtype = variation.depth_weight.dtype
     planes, rows, columns = (
         jnp.asarray(4 * np.sin(np.pi * np.arange(n) / (2 * n)) ** 2, dtype) for n in shape
     )
-    depth = variation.depth_weight**2 * planes
+    depth = depth_weight.astype(dtype) ** 2 * planes
     return depth[:, None, None] + rows[:, None] + columns
