@@ -206,7 +206,7 @@ def test_single_precision_agrees_with_double():
     assert relative_l2(value, expected) < 1e-4 and relative_l2(expected, truth) < 0.9
 
 
-def test_a_batch_is_its_members_and_new_values_compile_once():
+def test_a_batch_is_its_elements_and_new_values_compile_once():
     """The same by a leading axis and by vmap over the captures."""
     problem, _ = scenes.problem(batch=(2,), channels=1)
     together = solved(problem, iterations=30)

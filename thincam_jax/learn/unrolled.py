@@ -27,8 +27,8 @@ from thincam_jax.reconstruction.splitting import AbstractSplitting, Penalties, S
 class UnrolledAdmm(eqx.Module):
     r"""`iterations` of ADMM with parameters of their own, all positive as softplus of a number.
 
-    In the units of `Splitting`, in which captures and operators are about 1, so that the image
-    scales with the captures. Each member of a batch has its own units.
+    In the units of the splitting, in which captures and operators are about 1, so that the image
+    scales with the captures. Each batch element has its own units.
 
     - `data`, `variation`, `image`: penalties μ of the three splits, (iterations,).
     - `threshold`: by how much slopes are shortened, τ/μ₂.
