@@ -47,13 +47,8 @@ def test_reconstructed_point_fades_as_predicted():
     step = float(axial_resolution(cams[0], t))
 
     def brightness(focus):
-        found = tc.reconstruct(
-            seen,
-            cams,
-            method="fringe_scanning",
-            object_distance=focus,
-            field_shape=rig.FIELD,
-        )
+        seen_by = tc.Cameras(cams, object_distance=focus, field_shape=rig.FIELD)
+        found = tc.reconstruct(tc.Recording(seen, seen_by), tc.FringeScanning())
         return float(np.max(np.asarray(found.image)[22:26, 26:30]))
 
     sharp = brightness(t)
