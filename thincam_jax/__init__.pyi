@@ -14,11 +14,11 @@ from .lensless.camera import LenslessCamera as LenslessCamera
 from .lensless.capture import capture as capture
 from .lensless.masks.fza import FresnelZoneAperture as FresnelZoneAperture
 from .lensless.masks.sampled import SampledMask as SampledMask
+from .lensless.method import MODELS as MODELS
 from .lensless.phase_shift import fringe_scanned_otf as fringe_scanned_otf
 from .lensless.phase_shift import phase_pair_otf as phase_pair_otf
 from .lensless.plan import Plan as Plan
 from .lensless.plan import plan as plan
-from .lensless.psf import MODELS as MODELS
 from .lensless.psf import otf as otf
 from .lensless.psf import psf as psf
 from .measured.calibration import fit_psf as fit_psf

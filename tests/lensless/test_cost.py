@@ -18,7 +18,7 @@ import thincam_jax as tc
 from helpers import ROOT
 from thincam_jax.imaging.operators import CropConvolution, kernel_shape
 from thincam_jax.lensless.cost import Cost, convolution_cost, psf_cost
-from thincam_jax.lensless.psf import sampling_of
+from thincam_jax.lensless.method import PsfMethod, psf_method
 
 # The module itself: the package's attribute of that name is the function.
 PSF = importlib.import_module("thincam_jax.lensless.psf")
@@ -57,18 +57,9 @@ def both(mask, shape, model, average, dtype, oversampling=None):
     camera = tc.LenslessCamera(mask, tc.Sensor(shape, PITCH), 6.5)
     camera, wavelength, far = in_precision((camera, jnp.asarray(5e-4), jnp.asarray(250.0)), dtype)
     path, grid = camera.path(wavelength, far), camera.sensor.grid
-    mask_shape, samples = sampling_of(camera, grid, model, average, oversampling, None)
-    lowered = PSF._psf.lower(camera.mask, grid, path, model, average, mask_shape, samples)
-    cost = psf_cost(
-        camera.mask,
-        grid,
-        model,
-        pixel_integration=average,
-        mask_shape=mask_shape,
-        oversampling=samples,
-        itemsize=jnp.dtype(dtype).itemsize,
-    )
-    return allocated(lowered.compile()), cost.bytes
+    method = psf_method(camera.mask, grid, model, average, oversampling=oversampling)
+    lowered = PSF._psf.lower(camera.mask, grid, path, method)
+    return allocated(lowered.compile()), psf_cost(camera.mask, grid, method).bytes
 
 
 def require_agreement(measured, predicted, line=False):
@@ -210,7 +201,7 @@ PROCESS = """
     import jax, jax.numpy as jnp
     import thincam_jax as tc
     from thincam_jax.lensless.cost import psf_cost
-    from thincam_jax.lensless.psf import sampling_of
+    from thincam_jax.lensless.method import psf_method
 
     def held(name):
         lines = open("/proc/self/status").read().splitlines()
@@ -221,15 +212,12 @@ PROCESS = """
         tc.FresnelZoneAperture(25.0, width=5.632), tc.Sensor((n, n), 5.5e-3), 6.5
     )
     path, grid = camera.path(5e-4, 250.0), camera.sensor.grid
-    mask_shape, samples = sampling_of(camera, grid, model, average, None, None)
+    method = psf_method(camera.mask, grid, model, average)
     psf = importlib.import_module("thincam_jax.lensless.psf")._psf
-    compiled = psf.lower(camera.mask, grid, path, model, average, mask_shape, samples).compile()
+    compiled = psf.lower(camera.mask, grid, path, method).compile()
     before, most = held("VmRSS"), held("VmHWM")
     jax.block_until_ready(compiled(camera.mask, grid, path))
-    cost = psf_cost(
-        camera.mask, grid, model,
-        pixel_integration=average, mask_shape=mask_shape, oversampling=samples,
-    )
+    cost = psf_cost(camera.mask, grid, method)
     print(json.dumps([held("VmHWM") - before, cost.bytes, held("VmHWM") > most]))
 """
 
@@ -257,7 +245,7 @@ def test_peak_of_a_process(model, size, kind):
 
 def test_repetition_costs_time_only():
     grid = tc.Grid((48, 80), PITCH)
-    once = psf_cost(zones(), grid, "separable")
+    once = psf_cost(zones(), grid, PsfMethod("separable"))
     assert once.times(7) == Cost(7 * once.flops, once.bytes)
 
 
@@ -267,9 +255,10 @@ def test_arithmetic_grows_as_it_should(average):
     mask = zones()
 
     def flops(model, shape, **more):
-        return psf_cost(mask, tc.Grid(shape, PITCH), model, pixel_integration=average, **more).flops
+        method = PsfMethod(model, pixel_integration=average, **more)
+        return psf_cost(mask, tc.Grid(shape, PITCH), method).flops
 
-    plane = {"mask_shape": (1024, 1024), "oversampling": 3}
+    plane = {"mask_shape": (1024, 1024), "samples": 3}
     for model in CLOSED:
         assert flops(model, (1, 4000)) == pytest.approx(10 * flops(model, (1, 400)), rel=0.05)
         assert flops(model, (4000, 4000)) < 100 * flops(model, (400, 400))

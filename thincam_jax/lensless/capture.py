@@ -9,8 +9,8 @@ from thincam_jax.imaging.scene import Scene
 from thincam_jax.imaging.sensor import AbstractNoise, read_out
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.forward import expose
+from thincam_jax.lensless.method import Model
 from thincam_jax.lensless.plan import Plan, run_plan
-from thincam_jax.lensless.psf import Model
 
 
 def capture(

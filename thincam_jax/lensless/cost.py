@@ -8,8 +8,10 @@ import math
 from typing import NamedTuple
 
 from thincam_jax._core.grids import Grid, fast_shape
+from thincam_jax._core.precision import itemsize_of
 from thincam_jax.lensless.masks.base import AbstractMask
 from thincam_jax.lensless.masks.sampled import SampledMask
+from thincam_jax.lensless.method import SAMPLED, PsfMethod
 from thincam_jax.lensless.propagation.angular_spectrum import padded_shape
 from thincam_jax.lensless.propagation.separable import PIXEL_NODES
 
@@ -38,38 +40,30 @@ class Cost(NamedTuple):
         return Cost(self.flops * count, self.bytes)
 
 
-def psf_cost(
-    mask: AbstractMask,
-    grid: Grid,
-    model: str,
-    *,
-    pixel_integration: bool = False,
-    mask_shape: tuple[int, int] | None = None,
-    oversampling: int = 1,
-    itemsize: int = 4,
-) -> Cost:
-    """Cost of `psf` on a grid; `itemsize` is 4 in float32 and 8 in float64."""
+def psf_cost(mask: AbstractMask, grid: Grid, method: PsfMethod) -> Cost:
+    """Cost of `psf` on a grid."""
     rows, columns = grid.shape
-    if model in ("angular_spectrum", "rayleigh_sommerfeld"):
-        flops, numbers = _sampled(grid.shape, model, mask_shape, oversampling, pixel_integration)
+    itemsize = itemsize_of(method.precision)
+    if method.model in SAMPLED:
+        flops, numbers = _sampled(grid.shape, method)
     else:
-        flops, numbers = _separable_sum(mask, grid.shape, model, pixel_integration, itemsize)
+        flops, numbers = _separable_sum(mask, grid.shape, method)
     return Cost(float(flops), _BASE + itemsize * (int(numbers) + rows * columns))
 
 
-def _sampled(shape, model, mask_shape, oversampling, pixel_integration) -> tuple[float, float]:
+def _sampled(shape: tuple[int, int], method: PsfMethod) -> tuple[float, float]:
     """Operations and real numbers held by the models that sample the mask."""
-    fine = [n * oversampling for n in shape]
-    plane = [n * oversampling for n in (mask_shape or shape)]
-    if model == "angular_spectrum":
+    fine = [n * method.samples for n in shape]
+    plane = [n * method.samples for n in (method.mask_shape or shape)]
+    if method.model == "angular_spectrum":
         window = math.prod(padded_shape((plane[0], plane[1]), (fine[0], fine[1]), 2.0))
         return window * (_WAVE + 10.0 * math.log2(window)), 5.0 * window
-    points = math.prod(fine if pixel_integration else shape)
+    points = math.prod(fine if method.pixel_integration else shape)
     held = math.prod(plane) * (2.1 * min(_BATCH, points) + 3) * 2
     return float(_SUMMAND * math.prod(plane) * points), held
 
 
-def _separable_sum(mask, shape, model, pixel_integration, itemsize) -> tuple[float, float]:
+def _separable_sum(mask, shape: tuple[int, int], method: PsfMethod) -> tuple[float, float]:
     """The same for the models that are a short sum of products of one-dimensional factors."""
     orders = getattr(mask, "orders", None)
     if orders is None:  # the geometric shadow of a mask given by numbers
@@ -78,22 +72,22 @@ def _separable_sum(mask, shape, model, pixel_integration, itemsize) -> tuple[flo
         products = rows * height * width + rows * width * columns
         held = rows * (height + 2 * width + 2 * columns) + columns * width
         return 4.0 * products, float(held)
-    double = itemsize == 8
+    double = method.precision == "float64"
     length = sum(shape)
     cells = getattr(mask, "pixels", None) or 1
     count = len(orders)
     pairs = count * (count + 1) // 2
-    if model == "separable":
-        nodes = PIXEL_NODES if pixel_integration else 1
+    if method.model == "separable":
+        nodes = PIXEL_NODES if method.pixel_integration else 1
         integrals = length * nodes * (count if cells == 1 else cells)
         flops = _CHIRP * integrals + 4 * count * cells * length * nodes * (cells > 1)
         held = max((12.2 if double else 7.4) * integrals, 5.2 * pairs * length)
         terms = pairs
     else:
-        terms = pairs - count + 1 if model != "geometric" else _harmonics(orders)
-        work = _CHIRP if pixel_integration else _PHASOR
+        terms = pairs - count + 1 if method.model != "geometric" else _harmonics(orders)
+        work = _CHIRP if method.pixel_integration else _PHASOR
         flops = work * terms * length * cells
-        per_factor = (9.2 if double else 4.6) if pixel_integration else 2.1
+        per_factor = (9.2 if double else 4.6) if method.pixel_integration else 2.1
         held = per_factor * terms * length + (2.5 * cells * length if cells > 1 else 0)
     return float(flops + 4 * terms * math.prod(shape)), float(held)
 

@@ -19,7 +19,8 @@ from thincam_jax.imaging.scene import ImagePlane, Spectrum
 from thincam_jax.imaging.sensor import Sensor
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.cost import convolution_cost
-from thincam_jax.lensless.psf import Model, psf
+from thincam_jax.lensless.method import Model
+from thincam_jax.lensless.psf import psf
 
 
 def expose(

@@ -10,7 +10,8 @@ from thincam_jax._core.checks import Number
 from thincam_jax._core.grids import Grid
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.masks.fza import FresnelZoneAperture
-from thincam_jax.lensless.psf import Model, otf
+from thincam_jax.lensless.method import Model
+from thincam_jax.lensless.psf import otf
 
 
 def fringe_scanned_otf(

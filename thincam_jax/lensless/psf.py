@@ -1,24 +1,22 @@
 """From a camera to its point spread function and optical transfer function."""
 
 import math
-from typing import Literal, get_args
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Complex, Float
 
-from thincam_jax._core import checks
-from thincam_jax._core.checks import Number, Shape
+from thincam_jax._core.checks import Number
 from thincam_jax._core.grids import Grid
 from thincam_jax._core.memory import refuse_if_too_large
-from thincam_jax._core.precision import PRECISIONS, Precision, allow, as_complex, cast, precision_of
+from thincam_jax._core.precision import Precision, allow, as_complex, cast, precision_of
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.cost import psf_cost
 from thincam_jax.lensless.digits import require_digits
 from thincam_jax.lensless.masks.base import AbstractMask
-from thincam_jax.lensless.propagation.angular_spectrum import angular_spectrum, require_odd
+from thincam_jax.lensless.method import SAMPLED, Model, PsfMethod, psf_method
+from thincam_jax.lensless.propagation.angular_spectrum import angular_spectrum
 from thincam_jax.lensless.propagation.chirp_sum import ChirpSum
 from thincam_jax.lensless.propagation.closed_form import closed_form, in_focus
 from thincam_jax.lensless.propagation.geometric import geometric
@@ -27,21 +25,6 @@ from thincam_jax.lensless.propagation.path import Path
 from thincam_jax.lensless.propagation.rayleigh_sommerfeld import rayleigh_sommerfeld
 from thincam_jax.lensless.propagation.separable import PIXEL_NODES, separable
 from thincam_jax.lensless.propagation.separable_sum import SeparableSum, centre_phase
-
-Model = Literal[
-    "geometric",
-    "paraxial",
-    "closed_form",
-    "separable",
-    "angular_spectrum",
-    "rayleigh_sommerfeld",
-]
-MODELS: tuple[Model, ...] = get_args(Model)
-# Those of unbounded chirps, which cannot hold an edge or the pixels of a display; and those that
-# sample the mask.
-UNBOUNDED: tuple[Model, ...] = ("paraxial", "closed_form")
-SAMPLED: tuple[Model, ...] = ("angular_spectrum", "rayleigh_sommerfeld")
-CLOSED: tuple[Model, ...] = tuple(model for model in MODELS if model not in SAMPLED)
 
 
 def psf(
@@ -82,9 +65,10 @@ def psf(
     that the model cannot take, MemoryError (before any work, with the estimate) for a size that
     does not fit.
     """
-    path, grid = _prepare(camera, wavelength, object_distance, model, grid)
-    sampling = sampling_of(camera, grid, model, pixel_integration, oversampling, mask_shape)
-    return _evaluate(_psf, camera.mask, grid, path, model, pixel_integration, sampling, precision)
+    grid = grid or camera.sensor.grid
+    given = (model, pixel_integration, precision, oversampling, mask_shape)
+    method = psf_method(camera.mask, grid, *given)
+    return _evaluate(_psf, camera.mask, grid, camera.path(wavelength, object_distance), method)
 
 
 def otf(
@@ -106,32 +90,27 @@ def otf(
     analytic transform, without pixel average: a δ at zero frequency is one over the area of a
     frequency cell.
     """
-    path, grid = _prepare(camera, wavelength, object_distance, model, grid)
-    sampling = sampling_of(camera, grid, model, pixel_integration, oversampling, mask_shape)
-    return _evaluate(_otf, camera.mask, grid, path, model, pixel_integration, sampling, precision)
+    grid = grid or camera.sensor.grid
+    given = (model, pixel_integration, precision, oversampling, mask_shape)
+    method = psf_method(camera.mask, grid, *given)
+    return _evaluate(_otf, camera.mask, grid, camera.path(wavelength, object_distance), method)
 
 
 def _irradiance(
-    mask: AbstractMask,
-    grid: Grid,
-    path: Path,
-    model: Model,
-    pixel_integration: bool,
-    mask_shape: tuple[int, int] | None,
-    oversampling: int,
+    mask: AbstractMask, grid: Grid, path: Path, method: PsfMethod
 ) -> SeparableSum | ChirpSum | Float[Array, "y x"]:
     """The PSF in the form in which the model has it: terms where there are terms, else an image."""
-    if model not in SAMPLED:
-        mask = _unfocused(mask, path) if model == "closed_form" else mask
-        return _closed(mask, grid, path, model, pixel_integration, PIXEL_NODES)
-    sampled = angular_spectrum if model == "angular_spectrum" else rayleigh_sommerfeld
+    if method.model not in SAMPLED:
+        mask = _unfocused(mask, path) if method.model == "closed_form" else mask
+        return _closed(mask, grid, path, method.model, method.pixel_integration, PIXEL_NODES)
+    sampled = angular_spectrum if method.model == "angular_spectrum" else rayleigh_sommerfeld
     return sampled(
         mask,
         grid,
         path,
-        mask_shape=mask_shape,
-        oversampling=oversampling,
-        pixel_integration=pixel_integration,
+        mask_shape=method.mask_shape,
+        oversampling=method.samples,
+        pixel_integration=method.pixel_integration,
     )
 
 
@@ -165,20 +144,17 @@ def closed_terms(
     return h
 
 
-_STATIC = ("model", "pixel_integration", "mask_shape", "oversampling")
-
-
-@jax.jit(static_argnames=_STATIC)
-def _psf(mask, grid, path, model, pixel_integration, mask_shape, oversampling):
-    h = _irradiance(mask, grid, path, model, pixel_integration, mask_shape, oversampling)
+@jax.jit(static_argnames="method")
+def _psf(mask: AbstractMask, grid: Grid, path: Path, method: PsfMethod):
+    h = _irradiance(mask, grid, path, method)
     if isinstance(h, ChirpSum):
-        h = h.sample(grid, pixel_integration=pixel_integration)
+        h = h.sample(grid, pixel_integration=method.pixel_integration)
     return h.image() if isinstance(h, SeparableSum) else h
 
 
-@jax.jit(static_argnames=_STATIC)
-def _otf(mask, grid, path, model, pixel_integration, mask_shape, oversampling):
-    h = _irradiance(mask, grid, path, model, pixel_integration, mask_shape, oversampling)
+@jax.jit(static_argnames="method")
+def _otf(mask: AbstractMask, grid: Grid, path: Path, method: PsfMethod):
+    h = _irradiance(mask, grid, path, method)
     if isinstance(h, ChirpSum):
         return h.transform(grid)
     if isinstance(h, SeparableSum):
@@ -188,72 +164,24 @@ def _otf(mask, grid, path, model, pixel_integration, mask_shape, oversampling):
     return spectrum * rows[:, None] * columns
 
 
-def _prepare(camera, wavelength, object_distance, model, grid) -> tuple[Path, Grid]:
-    checks.choice("model", model, MODELS)
-    return camera.path(wavelength, object_distance), grid or camera.sensor.grid
-
-
-def _evaluate(function, mask, grid, path, model, pixel_integration, sampling, precision):
-    """In the precision asked for; the result comes back in the camera's."""
+def _evaluate(function, mask: AbstractMask, grid: Grid, path: Path, method: PsfMethod):
+    """In the method's precision; the result comes back in the camera's."""
     own = precision_of(grid.pitch)
-    precision = own if precision is None else precision
-    checks.choice("precision", precision, PRECISIONS)
-    with allow(precision, mask, grid, path):
-        if precision != own:
-            mask, grid, path = cast((mask, grid, path), precision)
-        if precision == "float32":
-            require_digits(mask, grid, path, model)
-        _check_memory(mask, grid, model, pixel_integration, *sampling)
-        result = function(mask, grid, path, model, pixel_integration, *sampling)
-    return result if precision == own else cast(result, own)
-
-
-def sampling_of(
-    camera: LenslessCamera,
-    grid: Grid,
-    model: Model,
-    pixel_integration: bool,
-    oversampling: int | None,
-    mask_shape: Shape | None,
-) -> tuple[tuple[int, int] | None, int]:
-    """Mask plane in pixels and samples per pixel, for the models that sample."""
-    if model not in SAMPLED:
-        if oversampling is not None or mask_shape is not None:
-            raise ValueError(
-                f"model {model!r} is a closed form: leave oversampling and mask_shape out"
-            )
-        return None, 1
-    if oversampling is None:
-        oversampling = 3 if pixel_integration else 1
-    require_odd(oversampling)
-    if mask_shape is not None:
-        return checks.shape2d("mask_shape", mask_shape), oversampling
-    sizes = [*camera.mask.extent, grid.pitch, camera.mask.centre]
-    if any(checks.is_traced(s) for s in sizes):
-        return None, oversampling  # the size cannot be looked at: the sensor's, checked when run
-    height, width, pitch, centre = (np.asarray(s) for s in sizes)
-    reach = (np.array([height, width]) + 2 * np.abs(centre)) / pitch
-    rows, columns = (max(1, math.ceil(r - 1e-4)) for r in reach)
-    return (rows, columns), oversampling
-
-
-def _check_memory(mask, grid: Grid, model: Model, pixel_integration, mask_shape, oversampling):
-    rows, columns = grid.shape
-    cost = psf_cost(
-        mask,
-        grid,
-        model,
-        pixel_integration=pixel_integration,
-        mask_shape=mask_shape,
-        oversampling=oversampling,
-        itemsize=jnp.dtype(grid.pitch.dtype).itemsize,
-    )
-    refuse_if_too_large(
-        f"a PSF of {rows}×{columns} pixels by model {model!r}",
-        cost.bytes,
-        "use a smaller grid"
-        + ("" if model == "separable" else ", less oversampling or the model 'separable'"),
-    )
+    with allow(method.precision, mask, grid, path):
+        if method.precision != own:
+            mask, grid, path = cast((mask, grid, path), method.precision)
+        if method.precision == "float32":
+            require_digits(mask, grid, path, method.model)
+        rows, columns = grid.shape
+        refuse_if_too_large(
+            f"a PSF of {rows}×{columns} pixels by model {method.model!r}",
+            psf_cost(mask, grid, method).bytes,
+            "use a smaller grid"
+            if method.model == "separable"
+            else "use a smaller grid, less oversampling or the model 'separable'",
+        )
+        result = function(mask, grid, path, method)
+    return result if method.precision == own else cast(result, own)
 
 
 def _unfocused(mask: AbstractMask, path: Path) -> AbstractMask:

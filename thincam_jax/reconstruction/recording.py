@@ -26,7 +26,8 @@ from thincam_jax.imaging.operators import (
 from thincam_jax.imaging.operators.base import is_shape, shapes_of
 from thincam_jax.imaging.operators.crop_convolution import cut
 from thincam_jax.lensless.camera import LenslessCamera
-from thincam_jax.lensless.psf import MODELS, Model, psf
+from thincam_jax.lensless.method import MODELS, Model
+from thincam_jax.lensless.psf import psf
 from thincam_jax.reconstruction.drive import Outcome
 from thincam_jax.reconstruction.noise import estimate_variance, given_variances
 from thincam_jax.reconstruction.problem import InverseProblem

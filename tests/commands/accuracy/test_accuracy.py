@@ -26,7 +26,7 @@ def config(tmp_path_factory):
 def run(config, tmp_path_factory):
     """Folder and results of one run, and what it told."""
     folder = accuracy.BenchFolder(tmp_path_factory.mktemp("out") / "new")
-    plan = accuracy.check(config, accuracy.Options(SIZES, 48))
+    plan = accuracy.check(config, accuracy.Sizes(SIZES, 48))
     told = []
     results = accuracy.run_accuracy(config, plan, folder, told.append)
     assert len(told) == accuracy.steps(config, plan)
@@ -187,19 +187,19 @@ class TestSizes:
 
     @pytest.mark.parametrize("size", [0, -3, 65])
     def test_refused(self, config, size):
-        for options in (accuracy.Options((size,)), accuracy.Options((), size)):
+        for options in (accuracy.Sizes((size,)), accuracy.Sizes((), size)):
             with pytest.raises(ConfigError, match=f"size {size}: "):
                 accuracy.check(config, options)
 
     def test_too_few_pixels_to_reconstruct(self, config):
         with pytest.raises(ConfigError, match="^--capture-size 5: "):
-            accuracy.check(config, accuracy.Options((), 5))
+            accuracy.check(config, accuracy.Sizes((), 5))
 
 
 def test_without_wiener(config):
     """Fringe scanning assumes no PSF: told, not run."""
     alone = config.model_copy(update={"methods": config.methods[:1]})
-    plan = accuracy.check(alone, accuracy.Options(SIZES))
+    plan = accuracy.check(alone, accuracy.Sizes(SIZES))
     assert plan.case.skipped == "conventional: fringe scanning assumes no PSF"
 
 

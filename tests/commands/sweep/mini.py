@@ -8,7 +8,7 @@ from pathlib import Path
 from thincam_jax.commands.study.config import StudyConfig, load_config
 from thincam_jax.commands.sweep.grid import Axis, read_axes
 from thincam_jax.commands.sweep.measure import Outcome
-from thincam_jax.commands.sweep.point import Point, make_points
+from thincam_jax.commands.sweep.point import GridPoint, make_points
 
 TEXT = """\
 name: mini
@@ -43,7 +43,7 @@ def axes(config: StudyConfig, *grid: str) -> list[Axis]:
     return read_axes(grid, config.model_dump(mode="json", exclude_none=True))
 
 
-def points(config: StudyConfig, *grid: str, double: bool = False) -> list[Point]:
+def points(config: StudyConfig, *grid: str, double: bool = False) -> list[GridPoint]:
     return make_points(config, axes(config, *grid), double)
 
 

@@ -13,6 +13,7 @@ from lensless.accuracy import cameras
 import thincam_jax as tc
 from helpers import relative_l2
 from thincam_jax.lensless.accuracy.select import predicted_error, probe_of
+from thincam_jax.lensless.method import psf_method
 from thincam_jax.lensless.propagation.angular_spectrum import padded_shape
 
 CLOSED = ("geometric", "paraxial", "closed_form", "separable")
@@ -57,7 +58,9 @@ def errors(request):
         for model, precision in ways:
             way = {"model": model, "precision": precision}
             samples = (3 if probe.pixel_integration else 1) if model in SAMPLED else None
-            predicted = predicted_error(probe, case.camera, grid, model, precision, samples)
+            mask, average = case.camera.mask, probe.pixel_integration
+            method = psf_method(mask, grid, model, average, precision, samples)
+            predicted = predicted_error(probe, mask, grid, method)
             if math.isfinite(predicted):  # else psf refuses it, as is tested below
                 pair = (predicted, true_error(case, expected, **way))
                 found.setdefault((model, precision), []).append(pair)

@@ -5,13 +5,13 @@ import pytest
 from lensless.plan.scenes import camera
 
 import thincam_jax as tc
+from thincam_jax.lensless.method import CLOSED
 from thincam_jax.lensless.plan.transfer import (
     TransferProbe,
     _rounded_up,
     centred,
     sample_frequencies,
 )
-from thincam_jax.lensless.psf import CLOSED
 from thincam_jax.units import nm
 
 KERNEL = (45, 70)

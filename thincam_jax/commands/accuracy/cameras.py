@@ -15,7 +15,8 @@ from thincam_jax.imaging.operators import kernel_shape
 from thincam_jax.imaging.scene import ImagePlane
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.forward import projected_shape
-from thincam_jax.lensless.psf import Model, psf
+from thincam_jax.lensless.method import Model
+from thincam_jax.lensless.psf import psf
 
 DEFAULT_SIZES = (128, 256, 512)  # pixels along the longer side
 DEFAULT_CAPTURE_SIZE = 256

@@ -20,7 +20,7 @@ from thincam_jax.commands.study.build import Setting
 from thincam_jax.imaging.scene import Spectrum
 from thincam_jax.lensless.cost import psf_cost
 from thincam_jax.lensless.forward import imaging_operator, project, projected_shape
-from thincam_jax.lensless.psf import MODELS, Model, sampling_of
+from thincam_jax.lensless.method import MODELS, Model, psf_method
 
 
 def capture_rows(case: Case, progress: Callable[[str], None]) -> list[dict[str, Any]]:
@@ -89,13 +89,5 @@ def kernel_reason(case: Case, setting: Setting, model: Model) -> str | None:
         given = conditions_of(case.config, setting)["float64"]
         whole = case.config.pixel_integration
         grid = Grid(case.kernel_shape, jnp.asarray(given.camera.sensor.pitch))
-        shape, samples = sampling_of(given.camera, grid, model, whole, None, None)
-        cost = psf_cost(
-            given.camera.mask,
-            grid,
-            model,
-            pixel_integration=whole,
-            mask_shape=shape,
-            oversampling=samples,
-        )
-        return why_not(model, cost, given)
+        method = psf_method(given.camera.mask, grid, model, whole, "float32")
+        return why_not(model, psf_cost(given.camera.mask, grid, method), given)

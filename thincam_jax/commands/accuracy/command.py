@@ -32,7 +32,7 @@ def accuracy(
         from thincam_jax.commands.accuracy.console import accuracy_table, cost_table, verdict
         from thincam_jax.commands.accuracy.run import (
             BenchFolder,
-            Options,
+            Sizes,
             check,
             run_accuracy,
             steps,
@@ -40,7 +40,7 @@ def accuracy(
         from thincam_jax.commands.study.config import load_config, slug
 
         study = load_config(config, tuple(set_ or ()))
-        plan = check(study, Options(tuple(size or ()), capture_size))
+        plan = check(study, Sizes(tuple(size or ()), capture_size))
         folder = BenchFolder(out or Path("runs") / f"{slug(study.name)}-accuracy")
         with counted(study.name, steps(study, plan)) as progress:
             results = run_accuracy(study, plan, folder, progress)

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from thincam_jax._core.memory import available_bytes, readable
-from thincam_jax._core.precision import PRECISIONS, Precision, allow, itemsize_of
+from thincam_jax._core.precision import PRECISIONS, allow
 from thincam_jax.commands.accuracy.cameras import (
     Conditions,
     binned,
@@ -22,8 +22,9 @@ from thincam_jax.commands.study.config import StudyConfig
 from thincam_jax.lensless.accuracy.select import predicted_error, probe_of
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.cost import Cost, psf_cost
+from thincam_jax.lensless.method import MODELS, SAMPLED, Model, PsfMethod, psf_method
 from thincam_jax.lensless.propagation.closed_form import in_focus
-from thincam_jax.lensless.psf import MODELS, SAMPLED, Model, psf, sampling_of
+from thincam_jax.lensless.psf import psf
 
 Progress = Callable[[str], None]
 
@@ -37,40 +38,16 @@ _LONG = 1.0
 _GAIN = 0.05  # a smaller error by less than this part is no gain
 
 
-class Candidate(NamedTuple):
-    """How a PSF is computed.
-
-    - `model`, `precision`, `oversampling`, `mask_shape`: as `psf` takes them; the last two are None
-      for the closed forms.
-    - `cost`: predicted operations and memory.
-    """
-
-    model: Model
-    precision: Precision
-    oversampling: int | None
-    mask_shape: tuple[int, int] | None
-    cost: Cost
-
-
-def candidates(camera: LenslessCamera, pixel_integration: bool) -> list[Candidate]:
+def candidates(camera: LenslessCamera, pixel_integration: bool) -> list[tuple[PsfMethod, Cost]]:
     """Every model in both precisions, the sampled ones at each oversampling."""
-    grid = camera.sensor.grid
-    found = []
-    for model in MODELS:
-        for oversampling in OVERSAMPLINGS if model in SAMPLED else (None,):
-            shape, samples = sampling_of(camera, grid, model, pixel_integration, oversampling, None)
-            for precision in PRECISIONS:
-                cost = psf_cost(
-                    camera.mask,
-                    grid,
-                    model,
-                    pixel_integration=pixel_integration,
-                    mask_shape=shape,
-                    oversampling=samples,
-                    itemsize=itemsize_of(precision),
-                )
-                found.append(Candidate(model, precision, oversampling, shape, cost))
-    return found
+    mask, grid = camera.mask, camera.sensor.grid
+    methods = [
+        psf_method(mask, grid, model, pixel_integration, precision, oversampling)
+        for model in MODELS
+        for oversampling in (OVERSAMPLINGS if model in SAMPLED else (None,))
+        for precision in PRECISIONS
+    ]
+    return [(method, psf_cost(mask, grid, method)) for method in methods]
 
 
 def why_not(model: Model, cost: Cost, given: Conditions) -> str | None:
@@ -104,13 +81,12 @@ def psf_rows(
         exact = given["float64"]
         probe = probe_of(*exact, whole, None)
         grid = exact.camera.sensor.grid
-        for one in candidates(exact.camera, whole):
-            how = one.model, one.precision, one.oversampling
-            progress(f"{size} pixels: {label(*how)}")
-            row = _described(config, one, why_not(one.model, one.cost, exact))
+        for method, cost in candidates(exact.camera, whole):
+            progress(f"{size} pixels: {label(method.model, method.precision, method.oversampling)}")
+            row = _described(config, method, cost, why_not(method.model, cost, exact))
             if row["status"] == "run":
-                row["predicted_error"] = predicted_error(probe, exact.camera, grid, *how)
-                row |= _measured(given[one.precision], one, whole, reference)
+                row["predicted_error"] = predicted_error(probe, exact.camera.mask, grid, method)
+                row |= _measured(given[method.precision], method, reference)
             rows.append(row)
     mark_front([row for row in rows if row["status"] == "run"])
     return rows
@@ -146,13 +122,15 @@ def words(model: str) -> str:
     return model.replace("rayleigh_s", "Rayleigh-S").replace("_", " ")
 
 
-def _described(config: StudyConfig, candidate: Candidate, reason: str | None) -> dict[str, Any]:
+def _described(
+    config: StudyConfig, method: PsfMethod, cost: Cost, reason: str | None
+) -> dict[str, Any]:
     return {
         "shape": list(config.sensor.shape),
         "pitch_mm": config.sensor.pitch,
-        "model": candidate.model,
-        "precision": candidate.precision,
-        "oversampling": candidate.oversampling,
+        "model": method.model,
+        "precision": method.precision,
+        "oversampling": method.oversampling,
         "status": "run" if reason is None else "not run",
         "reason": reason,
         "true_error": None,
@@ -160,23 +138,23 @@ def _described(config: StudyConfig, candidate: Candidate, reason: str | None) ->
         "seconds": None,
         "compile_seconds": None,
         "calls": 0,
-        "flops": candidate.cost.flops,
-        "bytes": candidate.cost.bytes,
+        "flops": cost.flops,
+        "bytes": cost.bytes,
         "worth_choosing": False,
     }
 
 
-def _measured(given: Conditions, candidate: Candidate, pixel_integration: bool, reference) -> dict:
+def _measured(given: Conditions, method: PsfMethod, reference: np.ndarray) -> dict[str, Any]:
     def compute(camera, wavelength, object_distance):
         return psf(
             camera,
             wavelength=wavelength,
             object_distance=object_distance,
-            model=candidate.model,
-            pixel_integration=pixel_integration,
-            oversampling=candidate.oversampling,
-            mask_shape=candidate.mask_shape,
-            precision=candidate.precision,
+            model=method.model,
+            pixel_integration=method.pixel_integration,
+            oversampling=method.oversampling,
+            mask_shape=method.mask_shape,
+            precision=method.precision,
         )
 
     timing = measure(compute, *given)

@@ -20,7 +20,7 @@ from thincam_jax.commands.study import build
 from thincam_jax.commands.study.config import MethodConfig, StudyConfig
 from thincam_jax.commands.study.evaluate import evaluate
 from thincam_jax.imaging.metrics import psnr
-from thincam_jax.lensless.psf import MODELS, Model
+from thincam_jax.lensless.method import MODELS, Model
 from thincam_jax.reconstruction import Reconstruction
 
 # What is wrong: the mask's curvature β, or its distance d from the sensor.

@@ -23,7 +23,7 @@ from thincam_jax.commands.run_folder import claim_folder, to_json
 from thincam_jax.commands.study import build
 from thincam_jax.commands.study.check import check_study
 from thincam_jax.commands.study.config import ConfigError, StudyConfig, dump_config
-from thincam_jax.lensless.psf import MODELS
+from thincam_jax.lensless.method import MODELS
 
 
 class BenchFolder:
@@ -42,7 +42,7 @@ class BenchFolder:
         write_whole(self.path / "accuracy.json", to_json(results))
 
 
-class Options(NamedTuple):
+class Sizes(NamedTuple):
     """What a user may choose.
 
     - `sizes`: pixels along the sensor's longer side, for the PSFs; empty for the default ones.
@@ -61,7 +61,7 @@ class Benchmark(NamedTuple):
     case: Case
 
 
-def check(config: StudyConfig, options: Options) -> Benchmark:
+def check(config: StudyConfig, options: Sizes) -> Benchmark:
     """Refuse what cannot be run, before anything is; ConfigError, one line for each fault."""
     if config.mask.pixel_pitch is not None:
         raise ConfigError(

@@ -31,7 +31,7 @@ from thincam_jax.commands.study.config import (
 )
 from thincam_jax.design import Design, DesignSpace, Limits, Tolerances, Variable, shots
 from thincam_jax.design.space import UNITS
-from thincam_jax.lensless.psf import Model
+from thincam_jax.lensless.method import Model
 from thincam_jax.units import parse_quantity
 
 Objective = Literal["bayes_error", "robust_error", "worst_ratio", "limit", "unevenness"]

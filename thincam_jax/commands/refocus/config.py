@@ -28,7 +28,7 @@ from thincam_jax.commands.study.config import (
     misfit,
     quantity,
 )
-from thincam_jax.lensless.psf import Model
+from thincam_jax.lensless.method import Model
 from thincam_jax.reconstruction.depth.focus import Measure
 from thincam_jax.reconstruction.spectra import Prior
 

@@ -13,7 +13,7 @@ from pydantic_core import PydanticCustomError
 from thincam_jax.commands.config_file import ConfigError as ConfigError
 from thincam_jax.commands.config_file import override, read_raw
 from thincam_jax.imaging.targets import sample_images
-from thincam_jax.lensless.psf import Model
+from thincam_jax.lensless.method import Model
 from thincam_jax.reconstruction.spectra import Prior
 from thincam_jax.units import parse_quantity
 

@@ -10,7 +10,7 @@ from thincam_jax.commands.run_folder import claim_folder
 from thincam_jax.commands.study.config import StudyConfig, dump_config
 from thincam_jax.commands.sweep import table
 from thincam_jax.commands.sweep.measure import Outcome
-from thincam_jax.commands.sweep.point import Point
+from thincam_jax.commands.sweep.point import GridPoint
 
 
 class SweepFolder:
@@ -32,11 +32,11 @@ class SweepFolder:
         """
         claim_folder(self.path, "study.yaml", dump_config(base), "sweep", ("points",))
 
-    def has(self, point: Point) -> bool:
+    def has(self, point: GridPoint) -> bool:
         """Whether the point has succeeded before; a row that cannot be read does not count."""
         return table.read_row(self._row(point)) is not None
 
-    def keep(self, point: Point, outcome: Outcome) -> None:
+    def keep(self, point: GridPoint, outcome: Outcome) -> None:
         """Write what became of a point."""
         if outcome.metrics is None:
             told = {"point": point.key, "values": point.values, "reason": outcome.reason}
@@ -48,7 +48,7 @@ class SweepFolder:
             write_whole(self._row(point), table.row_bytes(row))
             self._failure(point).unlink(missing_ok=True)
 
-    def collect(self, points: Sequence[Point]) -> tuple[int, list[dict[str, Any]]]:
+    def collect(self, points: Sequence[GridPoint]) -> tuple[int, list[dict[str, Any]]]:
         """Write the tables of what has ended; the number of rows, and the failures."""
         rows, failures = [], []
         for point in points:
@@ -67,8 +67,8 @@ class SweepFolder:
                 (self.path / name).unlink(missing_ok=True)
         return len(rows), failures
 
-    def _row(self, point: Point) -> Path:
+    def _row(self, point: GridPoint) -> Path:
         return self.path / "points" / f"{point.key}.parquet"
 
-    def _failure(self, point: Point) -> Path:
+    def _failure(self, point: GridPoint) -> Path:
         return self.path / "points" / f"{point.key}.failed.json"

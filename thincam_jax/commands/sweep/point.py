@@ -16,7 +16,7 @@ from thincam_jax.commands.sweep.grid import Axis, grid_values
 METRICS_VERSION = 1
 
 
-class Point(NamedTuple):
+class GridPoint(NamedTuple):
     """A configuration of the grid.
 
     - `key`: what its results are recognised by, from all that they depend on.
@@ -34,7 +34,7 @@ class Point(NamedTuple):
     reason: str | None = None
 
 
-def make_points(base: StudyConfig, axes: Sequence[Axis], double: bool) -> list[Point]:
+def make_points(base: StudyConfig, axes: Sequence[Axis], double: bool) -> list[GridPoint]:
     """The points of the grid in order. One that the configuration's checks refuse has a reason.
 
     **Errors**: ConfigError, one line, where all are refused, as for a path that does not exist, and
@@ -44,7 +44,7 @@ def make_points(base: StudyConfig, axes: Sequence[Axis], double: bool) -> list[P
     points = [_make_point(raw, axes, values, double) for values in grid_values(axes)]
     if all(point.config is None for point in points):
         raise ConfigError(f"{points[0].reason} (no point of the grid can be run)")
-    first: dict[str, Point] = {}
+    first: dict[str, GridPoint] = {}
     for point in points:
         if point.key in first:
             raise ConfigError(
@@ -60,7 +60,7 @@ def told(values: dict[str, Any]) -> str:
     return ", ".join(f"{path}={value}" for path, value in values.items())
 
 
-def _make_point(raw: dict, axes: Sequence[Axis], values: tuple, double: bool) -> Point:
+def _make_point(raw: dict, axes: Sequence[Axis], values: tuple, double: bool) -> GridPoint:
     changed, asked = copy.deepcopy(raw), {}
     given = {axis.path: value for axis, value in zip(axes, values, strict=True)}
     for axis, value in zip(axes, values, strict=True):
@@ -71,10 +71,10 @@ def _make_point(raw: dict, axes: Sequence[Axis], values: tuple, double: bool) ->
         config = check_as(StudyConfig, changed, {}, asked, "--grid")
     except ConfigError as error:
         key = _digest(json.dumps(changed, default=str))
-        return Point(key, given, None, double, "; ".join(str(error).splitlines()))
+        return GridPoint(key, given, None, double, "; ".join(str(error).splitlines()))
     text = config.model_dump_json(exclude_none=True)
     resolved = {axis.path: _entry(config, axis.places[0]) for axis in axes}
-    return Point(_key(config, text, double), resolved, text, double)
+    return GridPoint(_key(config, text, double), resolved, text, double)
 
 
 def _entry(config: Any, place: tuple) -> Any:

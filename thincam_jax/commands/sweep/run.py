@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 from thincam_jax.commands.sweep.folder import SweepFolder
 from thincam_jax.commands.sweep.measure import Outcome, measure_point, one_line
-from thincam_jax.commands.sweep.point import Point
+from thincam_jax.commands.sweep.point import GridPoint
 from thincam_jax.commands.sweep.workers import Died, Outcomes, local_workers
 
 Progress = Callable[[int, int], object]
@@ -21,7 +21,7 @@ class Swept(NamedTuple):
 
 
 def run_sweep(
-    points: Sequence[Point],
+    points: Sequence[GridPoint],
     folder: SweepFolder,
     progress: Progress,
     *,

@@ -22,13 +22,14 @@ from thincam_jax.lensless.accuracy.lines import (
     fine_fields,
 )
 from thincam_jax.lensless.masks.base import AbstractMask, pairs, require_zone_orders
+from thincam_jax.lensless.method import Model, PsfMethod
 from thincam_jax.lensless.propagation.angular_spectrum import lit_mask, planes
 from thincam_jax.lensless.propagation.closed_form import in_focus
 from thincam_jax.lensless.propagation.path import Path
 from thincam_jax.lensless.propagation.rayleigh_sommerfeld import rayleigh_sommerfeld_field
 from thincam_jax.lensless.propagation.separable import PIXEL_NODES
 from thincam_jax.lensless.propagation.separable_sum import SeparableSum
-from thincam_jax.lensless.psf import Model, closed_terms
+from thincam_jax.lensless.psf import closed_terms
 
 # Samples of the line on which the exact phases are compared with Fresnel's.
 _FINE_SAMPLES = 2**16
@@ -249,27 +250,23 @@ class ZoneProbe:
             scaled *= max(1.0, 3 * self.numbers().largest_phase * _EPSILON["float32"])
         return scaled + size * _PRODUCT_ROUNDING[precision]
 
-    def angular_spectrum(
-        self, precision: Precision, mask_shape: tuple[int, int], oversampling: int
-    ) -> float:
+    def angular_spectrum(self, method: PsfMethod) -> float:
         """Relative distance of the angular spectrum from the reference, rounding included."""
-        with allow(precision):
-            mask, pitch, path = self.given[precision]
+        with allow(method.precision):
+            mask, pitch, path = self.given[method.precision]
             terms = angular_spectrum_terms(
                 mask,
                 self.lines.points(pitch),
                 path,
                 shape=self.shape,
                 pixel_integration=self.pixel_integration,
-                mask_shape=mask_shape,
-                oversampling=oversampling,
+                mask_shape=method.mask_shape,
+                oversampling=method.samples,
             )
             found = self._factors(terms)
         return distance(found, self.reference) / self.scale
 
-    def rayleigh_sommerfeld(
-        self, precision: Precision, mask_shape: tuple[int, int], oversampling: int
-    ) -> float:
+    def rayleigh_sommerfeld(self, method: PsfMethod) -> float:
         """The same for the direct sum, from a few pixels: where it aliases, no line shows it."""
         few = [_spread(count, _FEW) for count in self.shape]
         with allow("float64"):
@@ -277,8 +274,8 @@ class ZoneProbe:
             points = SparseGrid(few[0], few[1], pitch)
             exact = closed_terms(mask, points, path, "separable", self.pixel_integration).image()
             exact = np.asarray(exact)
-        with allow(precision):
-            mask, pitch, path = self.given[precision]
+        with allow(method.precision):
+            mask, pitch, path = self.given[method.precision]
             found = np.asarray(
                 _direct_sum(
                     mask,
@@ -286,8 +283,8 @@ class ZoneProbe:
                     path,
                     shape=self.shape,
                     pixel_integration=self.pixel_integration,
-                    mask_shape=mask_shape,
-                    oversampling=oversampling,
+                    mask_shape=method.mask_shape,
+                    oversampling=method.samples,
                 ),
                 float,
             )

@@ -13,15 +13,15 @@ from thincam_jax._core.precision import (
     PRECISIONS,
     RESULT_ROUNDING,
     Precision,
-    itemsize_of,
     precision_of,
 )
 from thincam_jax.lensless.accuracy.probe import ZoneProbe
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.cost import Cost, psf_cost
 from thincam_jax.lensless.digits import held_in_single
+from thincam_jax.lensless.masks.base import AbstractMask
+from thincam_jax.lensless.method import MODELS, UNBOUNDED, Model, PsfMethod, psf_method
 from thincam_jax.lensless.propagation.separable import PIXEL_NODES
-from thincam_jax.lensless.psf import MODELS, UNBOUNDED, Model, sampling_of
 
 # Predictions are estimates from some rows and columns (or pixels, for the direct sum): what they
 # are multiplied with so that they stay above the true error, found over 500 random cameras.
@@ -102,12 +102,9 @@ def select_model(
     probe = probe_of(camera, wavelength, object_distance, pixel_integration, grid)
     sampling_grid = grid or camera.sensor.grid
     considered: list[Prediction] = []
-    for model, precision, oversampling, cost in candidates(
-        camera, sampling_grid, pixel_integration
-    ):
-        error = predicted_error(probe, camera, sampling_grid, model, precision, oversampling)
-        considered.append(Prediction(model, precision, oversampling, error, cost))
-        if error <= tolerance:
+    for method, cost in candidates(camera.mask, sampling_grid, pixel_integration):
+        considered.append(_prediction(probe, camera.mask, sampling_grid, method, cost))
+        if considered[-1].predicted_error <= tolerance:
             break
     best = min(considered, key=lambda p: p.predicted_error)
     chosen = considered[-1] if considered[-1].predicted_error <= tolerance else best
@@ -137,17 +134,17 @@ def predict_error(
     grid: Grid | None = None,
 ) -> Prediction:
     """Predicted error and cost of one model; arguments and reference as for `select_model`."""
-    checks.choice("model", model, MODELS)
     probe = probe_of(camera, wavelength, object_distance, pixel_integration, grid)
     grid = grid or camera.sensor.grid
-    if precision is None:
-        precision = precision_of(grid.pitch)
-    checks.choice("precision", precision, PRECISIONS)
-    shape, samples = sampling_of(camera, grid, model, pixel_integration, oversampling, None)
-    cost = _cost(camera, grid, model, pixel_integration, shape, samples, precision)
-    closed = shape is None
-    error = predicted_error(probe, camera, grid, model, precision, None if closed else samples)
-    return Prediction(model, precision, None if closed else samples, error, cost)
+    method = psf_method(camera.mask, grid, model, pixel_integration, precision, oversampling)
+    return _prediction(probe, camera.mask, grid, method, psf_cost(camera.mask, grid, method))
+
+
+def _prediction(
+    probe: ZoneProbe, mask: AbstractMask, grid: Grid, method: PsfMethod, cost: Cost
+) -> Prediction:
+    error = predicted_error(probe, mask, grid, method)
+    return Prediction(method.model, method.precision, method.oversampling, error, cost)
 
 
 def tolerance_of(tolerance: float) -> float:
@@ -189,68 +186,45 @@ def probe_of(
 
 
 def candidates(
-    camera: LenslessCamera, grid: Grid, pixel_integration: bool
-) -> list[tuple[Model, Precision, int | None, Cost]]:
-    """The (model, precision, oversampling, cost) that fit into memory, cheapest first.
-
-    They end with the reference, than which nothing is closer to itself.
-    """
-    found = []
+    mask: AbstractMask, grid: Grid, pixel_integration: bool
+) -> list[tuple[PsfMethod, Cost]]:
+    """What fits into memory, cheapest first, up to the reference."""
     free = available_bytes()
     own = precision_of(grid.pitch)
+    displayed = getattr(mask, "pixels", None) is not None
+    methods = [
+        psf_method(mask, grid, model, pixel_integration, precision)
+        for model in MODELS
+        for precision in PRECISIONS
+        if not displayed or model not in UNBOUNDED
+    ]
+    costs = {method: psf_cost(mask, grid, method) for method in methods}
 
-    def time(candidate) -> float:
+    def time(method: PsfMethod) -> float:
         # An operation in double precision takes about two in single.
-        operations = candidate[3].flops * (2.0 if candidate[1] == "float64" else 1.0)
-        return operations + (0.0 if candidate[1] == own else _CONVERSION)
+        operations = costs[method].flops * (2.0 if method.precision == "float64" else 1.0)
+        return operations + (0.0 if method.precision == own else _CONVERSION)
 
-    displayed = getattr(camera.mask, "pixels", None) is not None
-    models: list[Model] = [m for m in MODELS if not displayed or m not in UNBOUNDED]
-    for model in models:
-        shape, samples = sampling_of(camera, grid, model, pixel_integration, None, None)
-        for precision in PRECISIONS:
-            cost = _cost(camera, grid, model, pixel_integration, shape, samples, precision)
-            if free is None or cost.bytes <= free:
-                found.append((model, precision, None if shape is None else samples, cost))
-    found.sort(key=time)
-    names = [candidate[:2] for candidate in found]
-    reference = ("separable", "float64")
-    return found[: names.index(reference) + 1] if reference in names else found
+    fitting = sorted((m for m in methods if free is None or costs[m].bytes <= free), key=time)
+    reference = PsfMethod("separable", "float64", pixel_integration)
+    if reference in fitting:
+        fitting = fitting[: fitting.index(reference) + 1]
+    return [(method, costs[method]) for method in fitting]
 
 
-def predicted_error(
-    probe: ZoneProbe,
-    camera: LenslessCamera,
-    grid: Grid,
-    model: Model,
-    precision: Precision,
-    oversampling: int | None,
-) -> float:
-    """Relative L2 error of one model, with the margin that keeps it above the true one."""
-    if precision == "float32" and not held_in_single(camera.mask, grid, probe.path, model):
+def predicted_error(probe: ZoneProbe, mask: AbstractMask, grid: Grid, method: PsfMethod) -> float:
+    """Relative L2 error of a PSF, with the margin that keeps it above the true one."""
+    model, precision = method.model, method.precision
+    if precision == "float32" and not held_in_single(mask, grid, probe.path, model):
         return math.inf  # `psf` refuses it
-    result = RESULT_ROUNDING[precision_of(grid.pitch)]
-    if oversampling is None:
-        if model == "closed_form" and probe.in_focus():
-            return math.inf  # `psf` refuses it
-        error = probe.model_error(model) + probe.rounding(model, precision)
-        return _MARGIN_CLOSED * error + result
-    shape, _ = sampling_of(camera, grid, model, probe.pixel_integration, oversampling, None)
-    assert shape is not None  # the model samples, and nothing is traced
-    measure = probe.angular_spectrum if model == "angular_spectrum" else probe.rayleigh_sommerfeld
-    return _MARGIN[model] * measure(precision, shape, oversampling)
-
-
-def _cost(camera, grid, model, pixel_integration, mask_shape, oversampling, precision) -> Cost:
-    return psf_cost(
-        camera.mask,
-        grid,
-        model,
-        pixel_integration=pixel_integration,
-        mask_shape=mask_shape,
-        oversampling=oversampling,
-        itemsize=itemsize_of(precision),
-    )
+    if model == "angular_spectrum":
+        return _MARGIN[model] * probe.angular_spectrum(method)
+    if model == "rayleigh_sommerfeld":
+        return _MARGIN[model] * probe.rayleigh_sommerfeld(method)
+    if model == "closed_form" and probe.in_focus():
+        return math.inf  # `psf` refuses it
+    error = probe.model_error(model) + probe.rounding(model, precision)
+    return _MARGIN_CLOSED * error + RESULT_ROUNDING[precision_of(grid.pitch)]
 
 
 def _reasons(probe: ZoneProbe, chosen: Prediction, paraxial_error: float) -> tuple[str, ...]:

@@ -6,7 +6,8 @@ import numpy as np
 import scipy.linalg
 from jaxtyping import Complex, Float
 
-from thincam_jax.lensless.plan.seen import FULL, PsfMethod, SeenScene
+from thincam_jax.lensless.method import PsfMethod
+from thincam_jax.lensless.plan.seen import FULL, SeenScene
 from thincam_jax.lensless.propagation.separable import PIXEL_NODES
 
 # Nodes of the pixel average where PSFs are compared with each other, and how far the tolerance must

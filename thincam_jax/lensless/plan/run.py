@@ -16,8 +16,8 @@ from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.cost import Cost
 from thincam_jax.lensless.forward import project, projected_shape, spectral_psf
 from thincam_jax.lensless.masks.fza import FresnelZoneAperture
+from thincam_jax.lensless.method import Model
 from thincam_jax.lensless.plan.effects import Effect
-from thincam_jax.lensless.psf import Model
 
 # How far a camera's numbers may be from the plan's, relative.
 _NEAR = 0.01

@@ -2,24 +2,23 @@
 
 import functools
 import math
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Complex, Float
 
-from thincam_jax._core.precision import Precision, itemsize_of
+from thincam_jax._core.precision import itemsize_of
 from thincam_jax.imaging.operators import kernel_grid, kernel_shape
 from thincam_jax.imaging.scene import Scene
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.cost import Cost, convolution_cost, psf_cost
 from thincam_jax.lensless.digits import held_in_single
 from thincam_jax.lensless.forward import project, projected_shape
+from thincam_jax.lensless.method import CLOSED, UNBOUNDED, Model, PsfMethod
 from thincam_jax.lensless.plan.transfer import (
     TransferProbe,
     image_spectrum,
     sample_frequencies,
 )
-from thincam_jax.lensless.psf import CLOSED, UNBOUNDED, Model
 
 # Predictions come from some hundred random frequencies: what they are multiplied with.
 _MARGIN = 1.5
@@ -27,18 +26,6 @@ _MARGIN = 1.5
 _ENERGY_NODES = 6
 # Points across the shadow and the sensor at which the energy is counted.
 _POINTS = 96
-
-
-class PsfMethod(NamedTuple):
-    """How a PSF is computed."""
-
-    model: Model
-    precision: Precision
-    pixel_integration: bool
-
-    @property
-    def itemsize(self) -> int:
-        return itemsize_of(self.precision)
 
 
 FULL = PsfMethod("separable", "float64", True)
@@ -136,28 +123,21 @@ class SeenScene:
         return zone / (math.pi * width)
 
     def psf_cost(self, method: PsfMethod) -> Cost:
-        return psf_cost(
-            self.camera.mask,
-            kernel_grid(self.camera.sensor.grid, self.field_shape),
-            method.model,
-            pixel_integration=method.pixel_integration,
-            itemsize=method.itemsize,
-        )
+        grid = kernel_grid(self.camera.sensor.grid, self.field_shape)
+        return psf_cost(self.camera.mask, grid, method)
 
     def cost(self, method: PsfMethod, planes: int, colours: int) -> Cost:
         """Of a capture from so many PSFs, for all planes of the scene."""
-        one = self.psf_cost(method)
+        one, itemsize = self.psf_cost(method), itemsize_of(method.precision)
         convolution = convolution_cost(
-            self.camera.sensor.shape, self.field_shape, self.batch, method.itemsize
+            self.camera.sensor.shape, self.field_shape, self.batch, itemsize
         )
         samples = math.prod(self.field_shape) * self.batch
         projection = 2 * sum(self.field_shape) * samples
         return Cost(
             planes * (colours * one.flops + convolution.flops)
             + len(self.distances) * (projection + 2 * planes * samples),
-            one.bytes
-            + convolution.bytes
-            + (len(self.distances) + planes) * samples * method.itemsize,
+            one.bytes + convolution.bytes + (len(self.distances) + planes) * samples * itemsize,
         )
 
 

@@ -19,9 +19,10 @@ from thincam_jax._core.precision import Precision, allow, cast, product
 from thincam_jax.lensless.accuracy.lines import SparseGrid
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.masks.base import AbstractMask
+from thincam_jax.lensless.method import Model
 from thincam_jax.lensless.propagation.path import Path
 from thincam_jax.lensless.propagation.separable import PIXEL_NODES
-from thincam_jax.lensless.psf import Model, closed_terms
+from thincam_jax.lensless.psf import closed_terms
 
 # Rings of frequencies, and frequencies in each.
 _RINGS, _IN_RING = 32, 16

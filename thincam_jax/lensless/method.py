@@ -1,0 +1,85 @@
+"""The models of the PSF by name, and how one is computed."""
+
+import math
+from typing import Literal, NamedTuple, get_args
+
+import numpy as np
+
+from thincam_jax._core import checks
+from thincam_jax._core.checks import Shape
+from thincam_jax._core.grids import Grid
+from thincam_jax._core.precision import PRECISIONS, Precision, precision_of
+from thincam_jax.lensless.masks.base import AbstractMask
+from thincam_jax.lensless.propagation.angular_spectrum import require_odd
+
+Model = Literal[
+    "geometric",
+    "paraxial",
+    "closed_form",
+    "separable",
+    "angular_spectrum",
+    "rayleigh_sommerfeld",
+]
+MODELS: tuple[Model, ...] = get_args(Model)
+# Those of unbounded chirps, which cannot hold an edge or the pixels of a display; and those that
+# sample the mask.
+UNBOUNDED: tuple[Model, ...] = ("paraxial", "closed_form")
+SAMPLED: tuple[Model, ...] = ("angular_spectrum", "rayleigh_sommerfeld")
+CLOSED: tuple[Model, ...] = tuple(model for model in MODELS if model not in SAMPLED)
+
+
+class PsfMethod(NamedTuple):
+    """How a PSF is computed: all that is static where JAX compiles; arguments as of `psf`.
+
+    - `samples`, `mask_shape`: samples a pixel, and pixels of the mask plane, of the models that
+      sample the mask; 1 and None for the closed forms, and None for a mask of traced size.
+    """
+
+    model: Model
+    precision: Precision = "float32"
+    pixel_integration: bool = False
+    samples: int = 1
+    mask_shape: tuple[int, int] | None = None
+
+    @property
+    def oversampling(self) -> int | None:
+        """As `psf` takes it."""
+        return self.samples if self.model in SAMPLED else None
+
+
+def psf_method(
+    mask: AbstractMask,
+    grid: Grid,
+    model: Model,
+    pixel_integration: bool = False,
+    precision: Precision | None = None,
+    oversampling: int | None = None,
+    mask_shape: Shape | None = None,
+) -> PsfMethod:
+    """The arguments of `psf`, checked, with its defaults in place of None."""
+    checks.choice("model", model, MODELS)
+    precision = precision_of(grid.pitch) if precision is None else precision
+    checks.choice("precision", precision, PRECISIONS)
+    if model not in SAMPLED:
+        if oversampling is not None or mask_shape is not None:
+            raise ValueError(
+                f"model {model!r} is a closed form: leave oversampling and mask_shape out"
+            )
+        return PsfMethod(model, precision, pixel_integration)
+    if oversampling is None:
+        oversampling = 3 if pixel_integration else 1
+    require_odd(oversampling)
+    given = None if mask_shape is None else checks.shape2d("mask_shape", mask_shape)
+    shape = given or _mask_plane(mask, grid)
+    return PsfMethod(model, precision, pixel_integration, oversampling, shape)
+
+
+def _mask_plane(mask: AbstractMask, grid: Grid) -> tuple[int, int] | None:
+    """Pixels that hold the mask; None for a traced size: then the sensor's, checked when run."""
+    sizes = [*mask.extent, grid.pitch, mask.centre]
+    if any(checks.is_traced(s) for s in sizes):
+        return None
+    height, width, pitch, centre = (np.asarray(s) for s in sizes)
+    reach = (np.array([height, width]) + 2 * np.abs(centre)) / pitch
+    rows, columns = (max(1, math.ceil(r - 1e-4)) for r in reach)
+    return rows, columns
