@@ -1,7 +1,7 @@
 """The models of the PSF by name, and how one is computed."""
 
 import math
-from typing import Literal, NamedTuple, get_args
+from typing import Literal, NamedTuple, cast, get_args
 
 import numpy as np
 
@@ -50,16 +50,16 @@ class PsfMethod(NamedTuple):
 def psf_method(
     mask: AbstractMask,
     grid: Grid,
-    model: Model,
+    model: str,
     pixel_integration: bool = False,
-    precision: Precision | None = None,
+    precision: str | None = None,
     oversampling: int | None = None,
     mask_shape: Shape | None = None,
 ) -> PsfMethod:
     """The arguments of `psf`, checked, with its defaults in place of None."""
-    checks.choice("model", model, MODELS)
+    model = cast(Model, checks.choice("model", model, MODELS))
     precision = precision_of(grid.pitch) if precision is None else precision
-    checks.choice("precision", precision, PRECISIONS)
+    precision = cast(Precision, checks.choice("precision", precision, PRECISIONS))
     if model not in SAMPLED:
         if oversampling is not None or mask_shape is not None:
             raise ValueError(

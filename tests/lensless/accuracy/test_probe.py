@@ -12,6 +12,7 @@ import thincam_jax as tc
 from helpers import relative_l2
 from thincam_jax.lensless.accuracy.lines import fine_fields
 from thincam_jax.lensless.accuracy.probe import ZoneProbe
+from thincam_jax.lensless.method import PsfMethod
 from thincam_jax.lensless.propagation import Path
 from thincam_jax.lensless.propagation.angular_spectrum import angular_spectrum
 from thincam_jax.lensless.propagation.separable import separable
@@ -100,7 +101,8 @@ def test_sampled_models(precision, average, oversampling):
     exact = cameras.expected(case)
     for model, within in (("angular_spectrum", 0.05), ("rayleigh_sommerfeld", 0.3)):
         image = value(case, model, precision=precision, oversampling=oversampling)
-        predicted = getattr(probe, model)(precision, (66, 64), oversampling)
+        method = PsfMethod(model, precision, average, oversampling, (66, 64))
+        predicted = getattr(probe, model)(method)
         assert predicted == pytest.approx(relative_l2(image, exact), rel=within)
 
 
