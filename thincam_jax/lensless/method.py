@@ -50,9 +50,9 @@ class PsfMethod(NamedTuple):
 def psf_method(
     mask: AbstractMask,
     grid: Grid,
-    model: str,
+    model: object,
     pixel_integration: bool = False,
-    precision: str | None = None,
+    precision: object = None,
     oversampling: int | None = None,
     mask_shape: Shape | None = None,
 ) -> PsfMethod:
