@@ -232,11 +232,11 @@ def test_defect_keeps_its_traceback(file, monkeypatch, tmp_path):
 
 @pytest.mark.parametrize(("done", "hint"), [([], "no target yet"), (["chart"], "chart")])
 def test_interrupt(file, monkeypatch, tmp_path, done, hint):
-    def interrupted(config, folder, progress):
-        folder.claim(config)
+    def interrupted(study, folder, progress):
+        folder.claim(study.config)
         for name in done:
             folder.finish(name, {"metrics": {}, "contrasts": {}})
-        progress("picture: capture 1")
+        progress("picture: capture 1", 9)
         raise KeyboardInterrupt
 
     monkeypatch.setattr(cli, "run_study", interrupted)

@@ -12,13 +12,15 @@ import typer
 from thincam_jax.commands import accuracy as benches
 from thincam_jax.commands import doctor as doctoring
 from thincam_jax.commands.accuracy.console import accuracy_table, cost_table, verdict
+from thincam_jax.commands.config_file import slug
 from thincam_jax.commands.design.command import design
 from thincam_jax.commands.photo.command import reconstruct
 from thincam_jax.commands.refocus.command import refocus
 from thincam_jax.commands.refocus.config import RefocusConfig, load_experiment
-from thincam_jax.commands.study import RunFolder, check_study
-from thincam_jax.commands.study.config import StudyConfig, load_config, slug
-from thincam_jax.commands.study.run import run_study, steps
+from thincam_jax.commands.run_folder import RunFolder
+from thincam_jax.commands.study.build import build_study
+from thincam_jax.commands.study.config import StudyConfig, load_config
+from thincam_jax.commands.study.run import run_study
 from thincam_jax.commands.sweep.command import sweep
 from thincam_jax.commands.terminal import (
     INTERRUPTED,
@@ -63,12 +65,14 @@ def run(
         if isinstance(study, RefocusConfig):
             refocus(study, RunFolder(out or Path("runs") / slug(study.name)))
             return
-        check_study(study)
+        built = build_study(study)
         folder = RunFolder(out or Path("runs") / slug(study.name))
         with rich.progress.Progress(*columns(), console=console) as bar:
-            task = bar.add_task(study.name, total=steps(study))
+            task = bar.add_task(study.name, total=None)
             metrics = run_study(
-                study, folder, lambda text: bar.update(task, advance=1, description=text)
+                built,
+                folder,
+                lambda text, total: bar.update(task, advance=1, total=total, description=text),
             )
     except USER_ERRORS as error:
         fail(error)

@@ -1,12 +1,31 @@
-"""The run folder: what is in it, and how an interrupted study goes on."""
+"""A run: the list of its work, its folder, and how an interrupted one goes on."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from thincam_jax._core.files import write_whole
-from thincam_jax.commands.study.config import ConfigError, Section, dump_config, slug
+from thincam_jax.commands.checked_config import dump_config
+from thincam_jax.commands.config_file import ConfigError, slug
+from thincam_jax.commands.sections import Section
+
+# Called as a step begins, with its text and with the number of all steps.
+Progress = Callable[[str, int], object]
+
+
+class Step(NamedTuple):
+    """A part of a run: what is told as it begins, and what does it."""
+
+    text: str
+    do: Callable[[], object]
+
+
+def carry_out(work: Sequence[Step], progress: Progress) -> None:
+    """Do what is listed, in its order."""
+    for step in work:
+        progress(step.text, len(work))
+        step.do()
 
 
 class RunFolder:

@@ -4,10 +4,11 @@ import pytest
 from commands.design import tiny
 
 from helpers import ROOT
-from thincam_jax.commands.design import broken_limits
+from thincam_jax.commands.checked_config import dump_config
+from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.design.config import load_design
+from thincam_jax.commands.design.record import broken_limits
 from thincam_jax.commands.refocus.config import load_experiment
-from thincam_jax.commands.study.config import ConfigError, dump_config
 
 
 def fault(folder, *overrides, text=tiny.TEXT):

@@ -7,8 +7,9 @@ import pytest
 import scipy.special
 
 from helpers import ROOT, relative_l2
-from thincam_jax.commands.study import method_response
+from thincam_jax.commands.study.build import build_study
 from thincam_jax.commands.study.config import load_config
+from thincam_jax.commands.study.response import method_response
 from thincam_jax.imaging.metrics import (
     cut_off,
     first_common_zero,
@@ -176,7 +177,8 @@ def responses(distance, methods, **changes):
     changes = {"object.distance": f"{distance} mm", **changes}
     overrides = tuple(f"{key}={value}" for key, value in changes.items())
     config = load_config(ROOT / "configs" / "fza_superresolution.yaml", overrides)
-    return [method_response(config, config.methods[index]) for index in methods]
+    study = build_study(config)
+    return [method_response(study, study.methods[index]) for index in methods]
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ from thincam_jax.commands.accuracy.norms import contrast_error, relative_error
 from thincam_jax.commands.accuracy.psfs import words
 from thincam_jax.commands.accuracy.rig import Rig
 from thincam_jax.commands.accuracy.ways import why_not
-from thincam_jax.commands.study.build import Setting
+from thincam_jax.commands.study.build import Exposure
 from thincam_jax.imaging.scene import Spectrum
 from thincam_jax.lensless.cost import psf_cost
 from thincam_jax.lensless.exposure import imaging_operator, project, projected_shape
@@ -30,17 +30,17 @@ def capture_rows(rig: Rig, progress: Callable[[str], None]) -> list[dict[str, An
 
     All are relative to separable in float64.
     """
-    setting, reach = rig.settings[0], rig.kernel_shape
-    reference = clean_capture(rig, setting)
-    exact = [psf_of(rig.config, setting, shape=shape) for shape in (None, reach)]
+    exposure, reach = rig.exposures[0], rig.kernel_shape
+    reference = clean_capture(rig, exposure)
+    exact = [psf_of(rig.study, exposure, shape=shape) for shape in (None, reach)]
     rows = []
     for model in MODELS:
         progress(f"capture: {words(model)}")
-        reason = kernel_reason(rig, setting, model)
+        reason = kernel_reason(rig, exposure, model)
         row: dict[str, Any] = {"model": model, "status": "not run", "reason": reason}
         if reason is None:
-            image = clean_capture(rig, setting, model, "float32")
-            psfs = [psf_of(rig.config, setting, model, "float32", s) for s in (None, reach)]
+            image = clean_capture(rig, exposure, model, "float32")
+            psfs = [psf_of(rig.study, exposure, model, "float32", s) for s in (None, reach)]
             errors = [relative_error(h, h0) for h, h0 in zip(psfs, exact, strict=True)]
             row |= {
                 "status": "run",
@@ -55,19 +55,19 @@ def capture_rows(rig: Rig, progress: Callable[[str], None]) -> list[dict[str, An
 
 def clean_capture(
     rig: Rig,
-    setting: Setting,
+    exposure: Exposure,
     model: Model = "separable",
     precision: Precision = "float64",
-    assumed: Setting | None = None,
+    assumed: Exposure | None = None,
 ) -> np.ndarray:
     """What falls on the sensor, (channel, y, x), without noise or saturation.
 
     With `assumed`, the PSF is that of another camera; where the scene falls stays as it is.
     """
     with allow(precision):
-        camera = conditions_of(rig.config, setting)[precision].camera
-        blurring = conditions_of(rig.config, assumed or setting)[precision]
-        plane = cast(rig.plane, precision)
+        camera = conditions_of(rig.study, exposure)[precision].camera
+        blurring = conditions_of(rig.study, assumed or exposure)[precision]
+        plane = cast(rig.target.plane, precision)
         shape = projected_shape(camera, plane)
         convolution = imaging_operator(
             blurring.camera,
@@ -75,16 +75,16 @@ def clean_capture(
             blurring.object_distance,
             field_shape=shape,
             model=model,
-            pixel_integration=rig.config.pixel_integration,
+            pixel_integration=rig.study.pixel_integration,
         )
         return np.asarray(convolution(project(camera, plane, shape)))
 
 
-def kernel_reason(rig: Rig, setting: Setting, model: Model) -> str | None:
+def kernel_reason(rig: Rig, exposure: Exposure, model: Model) -> str | None:
     """Why a model is not run for a capture; None where it is."""
     with allow("float64"):
-        given = conditions_of(rig.config, setting)["float64"]
-        whole = rig.config.pixel_integration
+        given = conditions_of(rig.study, exposure)["float64"]
+        whole = rig.study.pixel_integration
         grid = Grid(rig.kernel_shape, jnp.asarray(given.camera.sensor.pitch))
         shape, samples = sampling_of(given.camera, grid, model, whole, None, None)
         cost = psf_cost(

@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import Any
 
 from thincam_jax._core.files import write_whole
+from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.run_folder import to_json
-from thincam_jax.commands.study.config import ConfigError
 
 BENCH = "accuracy"
 _FILES = ("accuracy.json", "accuracy.png")

@@ -1,5 +1,6 @@
 """Cameras that are slightly wrong, by a given error of their PSFs."""
 
+import dataclasses
 import math
 from collections.abc import Callable
 
@@ -8,8 +9,7 @@ import scipy.optimize
 
 from thincam_jax.commands.accuracy.cameras import psf_of
 from thincam_jax.commands.accuracy.norms import relative_error
-from thincam_jax.commands.study.build import settings
-from thincam_jax.commands.study.config import MethodConfig, StudyConfig
+from thincam_jax.commands.study.build import Method, Study
 
 # What is wrong: the mask's curvature β, or its distance d from the sensor.
 QUANTITIES = ("beta", "distance")
@@ -22,30 +22,30 @@ _LARGEST, _FIRST = 0.5, 1e-5
 _STEP = 2.0**-20
 
 
-def changed(method: MethodConfig, quantity: str, part: float) -> MethodConfig:
-    """The method with one quantity of all its shots multiplied by 1 + part."""
-    shots = tuple(
-        shot.model_copy(update={quantity: getattr(shot, quantity) * (1 + part)})
-        for shot in method.shots
+def changed(method: Method, quantity: str, part: float) -> Method:
+    """The method with one quantity of all its exposures multiplied by 1 + part."""
+    exposures = tuple(
+        exposure._replace(**{quantity: getattr(exposure, quantity) * (1 + part)})
+        for exposure in method.exposures
     )
-    return method.model_copy(update={"shots": shots})
+    return dataclasses.replace(method, exposures=exposures)
 
 
-def psfs_of(config: StudyConfig, method: MethodConfig) -> np.ndarray:
+def psfs_of(study: Study, method: Method) -> np.ndarray:
     """The exact PSFs (exposure, y, x) of a method on the sensor, in float64."""
-    return np.stack([psf_of(config, s) for s in settings(config, method)])
+    return np.stack([psf_of(study, exposure) for exposure in method.exposures])
 
 
-def solve(config: StudyConfig, method: MethodConfig, quantity: str, level: float) -> float | None:
+def solve(study: Study, method: Method, quantity: str, level: float) -> float | None:
     """The relative change of a quantity that makes the method's PSFs wrong by `level`.
 
     By a bracketed search in its logarithm (Brent's), to 1 % of the level. None where no change of
     up to a half does it.
     """
-    reference = psfs_of(config, method)
+    reference = psfs_of(study, method)
 
     def excess(logarithm: float) -> float:
-        wrong = psfs_of(config, changed(method, quantity, math.exp(logarithm)))
+        wrong = psfs_of(study, changed(method, quantity, math.exp(logarithm)))
         return math.log(relative_error(wrong, reference) / level)
 
     bracket = _bracket(excess)

@@ -10,8 +10,7 @@ from thincam_jax.commands.accuracy.pareto import worth_choosing
 from thincam_jax.commands.accuracy.sizes import binned
 from thincam_jax.commands.accuracy.timing import measure
 from thincam_jax.commands.accuracy.ways import Way, all_ways, why_not
-from thincam_jax.commands.study.build import Setting
-from thincam_jax.commands.study.config import StudyConfig
+from thincam_jax.commands.study.build import Exposure, Study
 from thincam_jax.lensless.accuracy.select import predicted_error, probe_of
 from thincam_jax.lensless.psf import psf
 
@@ -19,7 +18,7 @@ Progress = Callable[[str], None]
 
 
 def psf_rows(
-    config: StudyConfig, setting: Setting, size: int, progress: Progress
+    study: Study, exposure: Exposure, size: int, progress: Progress
 ) -> list[dict[str, Any]]:
     """A row for every way at one size; `worth_choosing` marks the Pareto front of those run.
 
@@ -27,10 +26,10 @@ def psf_rows(
     exact Fresnel field. Times are of the compiled function: what Python adds to a call of `psf` is
     left out.
     """
-    config = binned(config, size)
-    whole = config.pixel_integration
-    given = conditions_of(config, setting)
-    reference = psf_of(config, setting)
+    study = binned(study, size)
+    whole = study.pixel_integration
+    given = conditions_of(study, exposure)
+    reference = psf_of(study, exposure)
     rows = []
     with allow("float64"):
         exact = given["float64"]
@@ -38,7 +37,7 @@ def psf_rows(
         grid = exact.camera.sensor.grid
         for way in all_ways(exact.camera, whole):
             progress(f"{size} pixels: {label(way.model, way.precision, way.oversampling)}")
-            row = _described(config, way, why_not(way.model, way.cost, exact))
+            row = _described(study, way, why_not(way.model, way.cost, exact))
             if row["status"] == "run":
                 row["predicted_error"] = predicted_error(
                     probe, exact.camera, grid, way.model, way.precision, way.oversampling
@@ -52,11 +51,11 @@ def psf_rows(
     return rows
 
 
-def way_count(config: StudyConfig, setting: Setting) -> int:
+def way_count(study: Study, exposure: Exposure) -> int:
     """How many rows a size has."""
     with allow("float64"):
-        camera = conditions_of(config, setting)["float64"].camera
-        return len(all_ways(camera, config.pixel_integration))
+        camera = conditions_of(study, exposure)["float64"].camera
+        return len(all_ways(camera, study.pixel_integration))
 
 
 def label(model: str, precision: str, oversampling: int | None) -> str:
@@ -70,10 +69,10 @@ def words(model: str) -> str:
     return model.replace("rayleigh_s", "Rayleigh-S").replace("_", " ")
 
 
-def _described(config: StudyConfig, way: Way, reason: str | None) -> dict[str, Any]:
+def _described(study: Study, way: Way, reason: str | None) -> dict[str, Any]:
     return {
-        "shape": list(config.sensor.shape),
-        "pitch_mm": config.sensor.pitch,
+        "shape": list(study.sensor.shape),
+        "pitch_mm": study.sensor.pitch,
         "model": way.model,
         "precision": way.precision,
         "oversampling": way.oversampling,

@@ -1,10 +1,11 @@
 """What a wrong PSF costs a reconstruction, in PSNR."""
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from thincam_jax.commands.accuracy.cameras import psf_of
 from thincam_jax.commands.accuracy.captures import clean_capture, kernel_reason
@@ -12,8 +13,13 @@ from thincam_jax.commands.accuracy.norms import contrast_error, relative_error
 from thincam_jax.commands.accuracy.perturb import LEVELS, QUANTITIES, changed, psfs_of, solve
 from thincam_jax.commands.accuracy.psfs import words
 from thincam_jax.commands.accuracy.rig import Rig
-from thincam_jax.commands.study import build
-from thincam_jax.commands.study.config import MethodConfig
+from thincam_jax.commands.study.build import (
+    Method,
+    build_reconstructor,
+    field_shape,
+    stacked,
+    take,
+)
 from thincam_jax.commands.study.evaluate import evaluate
 from thincam_jax.imaging.metrics import psnr
 from thincam_jax.lensless.psf import MODELS, Model
@@ -29,8 +35,8 @@ class Experiment(NamedTuple):
     - `psnr_db`: with the exact model.
     """
 
-    captures: np.ndarray
-    variances: np.ndarray
+    captures: Array
+    variances: Array
     shape: tuple[int, int]
     pitch: Any
     psfs: np.ndarray
@@ -39,19 +45,11 @@ class Experiment(NamedTuple):
 
 def make_experiment(rig: Rig) -> Experiment:
     """Take the captures with the study's noise and reconstruct them with the exact model."""
-    known = build.all_settings(rig.config)
-    exposures = [
-        build.take(
-            rig.config, s, rig.plane, build.capture_key(rig.config, rig.number, known.index(s))
-        )
-        for s in rig.settings
-    ]
     experiment = Experiment(
-        np.stack([e.image for e in exposures]),
-        np.stack([e.variance for e in exposures]),
-        build.field_shape(rig.config, rig.method, rig.plane),
+        *stacked([take(rig.study, exposure, rig.target) for exposure in rig.exposures]),
+        field_shape(rig.study, rig.method, rig.target),
         None,
-        psfs_of(rig.config, rig.method),
+        psfs_of(rig.study, rig.method),
         float("nan"),
     )
     found = _reconstruct(rig, experiment, rig.method, "separable")
@@ -70,11 +68,11 @@ def model_rows(
     rows = []
     for model in MODELS:
         progress(f"reconstruction: {words(model)}")
-        reasons = [kernel_reason(rig, s, model) for s in rig.settings]
+        reasons = [kernel_reason(rig, s, model) for s in rig.exposures]
         reason = next((r for r in reasons if r), None)
         row: dict[str, Any] = {"model": model, "status": "not run", "reason": reason}
         if reason is None:
-            psfs = np.stack([psf_of(rig.config, s, model, "float32") for s in rig.settings])
+            psfs = np.stack([psf_of(rig.study, s, model, "float32") for s in rig.exposures])
             error = relative_error(psfs, experiment.psfs)
             row |= {"status": "run", "psf_error": error}
             row |= _lost(rig, experiment, _reconstruct(rig, experiment, rig.method, model))
@@ -91,12 +89,12 @@ def controlled_rows(
     is the true one, so that only the PSF is wrong. `psnr_lost_db` is the worse of a change up and
     down: by chance, one of them can gain a little.
     """
-    reference = clean_capture(rig, rig.settings[0])
+    reference = clean_capture(rig, rig.exposures[0])
     rows = []
     for quantity in QUANTITIES:
         for level in LEVELS:
             progress(f"a PSF error of {100 * level:g} % by a wrong {quantity}")
-            part = solve(rig.config, rig.method, quantity, level)
+            part = solve(rig.study, rig.method, quantity, level)
             row: dict[str, Any] = {"wrong": quantity, "level": level}
             if part is None:
                 reason = f"no change of {quantity} of up to a half gives this error"
@@ -110,14 +108,13 @@ def controlled_rows(
 def _controlled(rig: Rig, experiment: Experiment, reference, quantity: str, part: float) -> dict:
     """PSF and capture error of a change, and the PSNR lost by it in the worse direction."""
     up, down = (changed(rig.method, quantity, p) for p in (part, -part))
-    assumed = build.settings(rig.config, up)[0]
-    wrong = clean_capture(rig, rig.settings[0], assumed=assumed)
+    wrong = clean_capture(rig, rig.exposures[0], assumed=up.exposures[0])
     both = [
         _lost(rig, experiment, _reconstruct(rig, experiment, m, "separable")) for m in (up, down)
     ]
     worse = max(both, key=lambda lost: lost["psnr_lost_db"])
     return {
-        "psf_error": relative_error(psfs_of(rig.config, up), experiment.psfs),
+        "psf_error": relative_error(psfs_of(rig.study, up), experiment.psfs),
         "capture_error": relative_error(wrong, reference),
         "capture_contrast_error": contrast_error(wrong, reference),
         **worse,
@@ -129,16 +126,14 @@ def _lost(rig: Rig, experiment: Experiment, found: Reconstruction) -> dict[str, 
     return {"psnr_db": reached, "psnr_lost_db": experiment.psnr_db - reached}
 
 
-def _reconstruct(
-    rig: Rig, experiment: Experiment, method: MethodConfig, model: Model
-) -> Reconstruction:
-    config = rig.config.model_copy(update={"model": model})
-    reconstructor = build.build_reconstructor(config, method, experiment.shape)
-    return reconstructor(jnp.asarray(experiment.captures), jnp.asarray(experiment.variances))
+def _reconstruct(rig: Rig, experiment: Experiment, method: Method, model: Model) -> Reconstruction:
+    study = dataclasses.replace(rig.study, model=model)
+    reconstructor = build_reconstructor(study, method, experiment.shape, rig.target.distance)
+    return reconstructor(experiment.captures, experiment.variances)
 
 
 def _psnr(rig: Rig, experiment: Experiment, found: Reconstruction) -> float:
     """dB, of the same pixels of the object whatever camera was assumed."""
     found = Reconstruction(found.image, experiment.pitch)
-    judged = evaluate(rig.config, rig.method, rig.target, rig.plane, found)
+    judged = evaluate(rig.method, rig.target, found)
     return psnr(judged.image, judged.truth)

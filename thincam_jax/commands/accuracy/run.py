@@ -16,9 +16,10 @@ from thincam_jax.commands.accuracy.reconstructions import (
 )
 from thincam_jax.commands.accuracy.rig import Rig, make_rig
 from thincam_jax.commands.accuracy.sizes import capture_size_of, sizes_of
-from thincam_jax.commands.study import build
-from thincam_jax.commands.study.check import check_study
-from thincam_jax.commands.study.config import ConfigError, StudyConfig, dump_config
+from thincam_jax.commands.checked_config import dump_config
+from thincam_jax.commands.config_file import ConfigError
+from thincam_jax.commands.study.build import Exposure, Study, build_study
+from thincam_jax.commands.study.config import StudyConfig
 from thincam_jax.lensless.psf import MODELS
 
 Progress = Callable[[str], None]
@@ -36,8 +37,9 @@ class Options(NamedTuple):
 
 
 class Plan(NamedTuple):
-    """A checked benchmark: the sizes, and what is captured."""
+    """A checked benchmark: the study, the sizes, and what is captured."""
 
+    study: Study
     sizes: tuple[int, ...]
     capture_size: int
     rig: Rig
@@ -50,15 +52,15 @@ def check(config: StudyConfig, options: Options) -> Plan:
             "mask.pixel_pitch: the benchmark compares models that have no display pixels; leave it "
             "out of the file"
         )
-    sizes = sizes_of(config, options.sizes)
-    capture_size = capture_size_of(config, options.capture_size)
-    check_study(config)
-    return Plan(sizes, capture_size, make_rig(config, capture_size))
+    sizes = sizes_of(config.sensor, options.sizes)
+    capture_size = capture_size_of(config.sensor, options.capture_size)
+    study = build_study(config)
+    return Plan(study, sizes, capture_size, make_rig(study, capture_size))
 
 
 def steps(config: StudyConfig, plan: Plan) -> int:
     """How many times `run_accuracy` reports progress."""
-    ways = len(plan.sizes) * way_count(config, build.all_settings(config)[0])
+    ways = len(plan.sizes) * way_count(plan.study, plan.study.exposures[0])
     controlled = 0 if plan.rig.skipped else 1 + len(MODELS) + len(LEVELS) * len(QUANTITIES)
     return ways + len(MODELS) + controlled + 1
 
@@ -72,13 +74,13 @@ def run_accuracy(
     first picture and first Wiener method.
     """
     folder.claim(dump_config(config))
-    setting = build.all_settings(config)[0]
-    psfs = [row for size in plan.sizes for row in psf_rows(config, setting, size, progress)]
+    study, exposure = plan.study, plan.study.exposures[0]
+    psfs = [row for size in plan.sizes for row in psf_rows(study, exposure, size, progress)]
     captures = capture_rows(plan.rig, progress)
     results = {
         "bench": BENCH,
         "config": dump_config(config),
-        "settings": _settings(config, plan, setting),
+        "settings": _settings(config, plan, exposure),
         "machine": machine(),
         "psfs": psfs,
         "captures": captures,
@@ -89,27 +91,27 @@ def run_accuracy(
     return results
 
 
-def _settings(config: StudyConfig, plan: Plan, setting: build.Setting) -> dict[str, Any]:
-    captured = plan.rig.settings[0]
+def _settings(config: StudyConfig, plan: Plan, exposure: Exposure) -> dict[str, Any]:
+    captured = plan.rig.exposures[0]
     return {
         "study": config.name,
         "reference": "separable, float64",
         "sizes": list(plan.sizes),
-        "camera": _numbers(setting),
+        "camera": _numbers(exposure),
         "object_distance_mm": config.object.distance,
         "pixel_integration": config.pixel_integration,
-        "capture_shape": list(plan.rig.config.sensor.shape),
+        "capture_shape": list(plan.rig.study.sensor.shape),
         "target": plan.rig.target.name,
         "captured": _numbers(captured),
     }
 
 
-def _numbers(setting: build.Setting) -> dict[str, float]:
+def _numbers(exposure: Exposure) -> dict[str, float]:
     return {
-        "beta_rad_per_mm2": setting.beta,
-        "phase_rad": setting.phase,
-        "distance_mm": setting.distance,
-        "wavelength_mm": setting.wavelength,
+        "beta_rad_per_mm2": exposure.beta,
+        "phase_rad": exposure.phase,
+        "distance_mm": exposure.distance,
+        "wavelength_mm": exposure.wavelength,
     }
 
 

@@ -1,48 +1,52 @@
 """The same camera with fewer and larger pixels."""
 
-from thincam_jax.commands.study.config import ConfigError, StudyConfig
+import dataclasses
+
+from thincam_jax.commands.config_file import ConfigError
+from thincam_jax.commands.sections import SensorConfig
+from thincam_jax.commands.study.build import Study
 
 DEFAULT_SIZES = (128, 256, 512)  # pixels along the longer side
 DEFAULT_CAPTURE_SIZE = 256
 
 
-def own_size(config: StudyConfig) -> int:
+def own_size(sensor: SensorConfig) -> int:
     """Pixels along the longer side of the study's own sensor."""
-    return max(config.sensor.shape)
+    return max(sensor.shape)
 
 
-def sizes_of(config: StudyConfig, asked: tuple[int, ...]) -> tuple[int, ...]:
+def sizes_of(sensor: SensorConfig, asked: tuple[int, ...]) -> tuple[int, ...]:
     """The sizes asked for, or the default ones and the study's own; each once, smallest first.
 
     **Errors**: ConfigError for a size that is not positive or above the study's own.
     """
     for size in asked:
-        _check("--size", size, own_size(config))
-    own = own_size(config)
+        _check("--size", size, own_size(sensor))
+    own = own_size(sensor)
     wanted = asked or (*(s for s in DEFAULT_SIZES if s < own), own)
     return tuple(sorted(set(wanted)))
 
 
-def capture_size_of(config: StudyConfig, asked: int | None) -> int:
+def capture_size_of(sensor: SensorConfig, asked: int | None) -> int:
     """The size for captures and reconstructions; errors as for `sizes_of`."""
     if asked is None:
-        return min(DEFAULT_CAPTURE_SIZE, own_size(config))
-    _check("--capture-size", asked, own_size(config))
+        return min(DEFAULT_CAPTURE_SIZE, own_size(sensor))
+    _check("--capture-size", asked, own_size(sensor))
     return asked
 
 
-def binned(config: StudyConfig, size: int) -> StudyConfig:
+def binned(study: Study, size: int) -> Study:
     """The study with its pixels binned so that the sensor's longer side has `size` of them.
 
     The pitch grows by the same ratio, so that the sensor keeps its area: along the longer side
     exactly, along the shorter one to half a pixel. The mask stays as it is.
     """
-    ratio = own_size(config) / size
-    rows, columns = (max(1, round(n / ratio)) for n in config.sensor.shape)
-    sensor = config.sensor.model_copy(
-        update={"shape": (rows, columns), "pitch": config.sensor.pitch * ratio}
+    ratio = own_size(study.sensor) / size
+    rows, columns = (max(1, round(n / ratio)) for n in study.sensor.shape)
+    sensor = study.sensor.model_copy(
+        update={"shape": (rows, columns), "pitch": study.sensor.pitch * ratio}
     )
-    return config.model_copy(update={"sensor": sensor})
+    return dataclasses.replace(study, sensor=sensor, reconstructors={})
 
 
 def _check(option: str, size: int, own: int) -> None:

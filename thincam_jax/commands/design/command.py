@@ -7,11 +7,11 @@ import rich.progress
 import rich.table
 import typer
 
-from thincam_jax.commands.design import check_design
+from thincam_jax.commands.config_file import slug
 from thincam_jax.commands.design.config import load_design
-from thincam_jax.commands.design.run import DesignFolder, run_design, steps
+from thincam_jax.commands.design.run import DesignFolder, run_design
+from thincam_jax.commands.design.simulation import build_designs
 from thincam_jax.commands.design.words import in_words, told_of
-from thincam_jax.commands.study.config import slug
 from thincam_jax.commands.terminal import (
     INTERRUPTED,
     USER_ERRORS,
@@ -37,12 +37,14 @@ def design(
     """
     try:
         wanted = load_design(config, tuple(set_ or ()))
-        check_design(wanted)
+        study = build_designs(wanted)
         folder = DesignFolder(out or Path("runs") / slug(wanted.name))
         with rich.progress.Progress(*columns(), console=console) as bar:
-            task = bar.add_task(wanted.name, total=steps(wanted))
+            task = bar.add_task(wanted.name, total=None)
             found = run_design(
-                wanted, folder, lambda text: bar.update(task, advance=1, description=text)
+                study,
+                folder,
+                lambda text, total: bar.update(task, advance=1, total=total, description=text),
             )
     except USER_ERRORS as error:
         fail(error)

@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 import pydantic
 from pydantic import Field
 
-from thincam_jax.commands.study.config import Length, Section, misfit
+from thincam_jax.commands.sections import Length, Section, misfit
 
 Count = Annotated[int, Field(ge=1, le=8, strict=True)]
 Points = Annotated[int, Field(ge=2, le=100)]
@@ -81,6 +81,14 @@ class ParetoConfig(Section):
         if self.thickness is None and self.captures is None and self.light is None:
             raise ValueError("no front is asked for; give thickness, captures or light")
         return self
+
+    def costs(self, phases: int) -> dict[str, list[float]]:
+        """Of each front: mm; captures, so many phases a shot; electrons."""
+        lines = {"thickness": self.thickness, "light": self.light}
+        found = {name: line.costs() for name, line in lines.items() if line is not None}
+        if self.captures is not None:
+            found["captures"] = [float(count * phases) for count in self.captures.shots]
+        return {name: found[name] for name in ("thickness", "captures", "light") if name in found}
 
 
 def _ordered(bounds: tuple[float, float], unit: str) -> tuple[float, float]:
@@ -171,7 +179,7 @@ def _free_distances(config: Any) -> dict[int, tuple[float, float]]:
 
 def _check_captures(config: Any, front: CapturesConfig) -> None:
     place = ("pareto", "captures")
-    phases = len(config.reference.method().shot_phases())
+    phases = len(config.reference.phases)
     allowed = config.search.limits.captures
     most = front.shots[-1]
     if most * phases > allowed:

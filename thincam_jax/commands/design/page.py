@@ -3,7 +3,9 @@
 from pathlib import Path
 from typing import Any
 
+from thincam_jax.commands.checked_config import dump_config
 from thincam_jax.commands.design.config import DesignConfig
+from thincam_jax.commands.design.record import COSTS
 from thincam_jax.commands.design.words import (
     QUANTITIES,
     cells,
@@ -14,7 +16,6 @@ from thincam_jax.commands.design.words import (
     told_of,
 )
 from thincam_jax.commands.page import data_url, load_template
-from thincam_jax.commands.study.config import dump_config
 
 
 def render(
@@ -79,11 +80,6 @@ def findings(design: dict[str, Any]) -> list[str]:
     return sentences
 
 
-_COSTS = {
-    "thickness": ("thickness, mm", "thickness_mm"),
-    "captures": ("captures", "captures"),
-    "light": ("electrons from each mm²", "electrons_per_mm2"),
-}
 _LIMIT = (
     "Resolution is the frequency up to which every ring of frequencies has a signal-to-noise "
     "ratio of at least 1."
@@ -93,13 +89,11 @@ _LIMIT = (
 def fronts(design: dict[str, Any]) -> list[dict[str, Any]]:
     """Of each Pareto front its table: title, labels of the columns, rows of texts, a sentence."""
     told = design.get("pareto", {})
-    return [
-        _front(name, told[name], design["reference"]["name"]) for name in _COSTS if name in told
-    ]
+    return [_front(name, told[name], design["reference"]["name"]) for name in COSTS if name in told]
 
 
 def _front(name: str, front: dict[str, Any], reference: str) -> dict[str, Any]:
-    label, cost = _COSTS[name]
+    label, cost = COSTS[name]
     names = told_of([*front["points"], front["reference"]])
     labels = [QUANTITIES[name].label for name in names]
     points = [(_cost(p[cost]), p) for p in front["points"]]

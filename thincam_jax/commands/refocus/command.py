@@ -4,21 +4,23 @@ import rich.progress
 import rich.table
 import typer
 
-from thincam_jax.commands.refocus.build import check_refocus
+from thincam_jax.commands.refocus.build import build_refocus
 from thincam_jax.commands.refocus.config import RefocusConfig
-from thincam_jax.commands.refocus.run import run_refocus, steps
-from thincam_jax.commands.study import RunFolder
+from thincam_jax.commands.refocus.run import run_refocus
+from thincam_jax.commands.run_folder import RunFolder
 from thincam_jax.commands.terminal import INTERRUPTED, columns, console, tell
 
 
 def refocus(config: RefocusConfig, folder: RunFolder) -> None:
     """Run the experiment with a progress bar and print what was found."""
     try:
-        check_refocus(config)
+        study = build_refocus(config)
         with rich.progress.Progress(*columns(), console=console) as bar:
-            task = bar.add_task(config.name, total=steps(config))
+            task = bar.add_task(config.name, total=None)
             metrics = run_refocus(
-                config, folder, lambda text: bar.update(task, advance=1, description=text)
+                study,
+                folder,
+                lambda text, total: bar.update(task, advance=1, total=total, description=text),
             )
     except KeyboardInterrupt:
         tell("interrupted; the same command starts anew.")

@@ -10,12 +10,13 @@ import PIL.ImageFont
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
+from thincam_jax.commands.config_file import slug
 from thincam_jax.commands.refocus.build import Found, object_box
-from thincam_jax.commands.refocus.config import RefocusConfig
 from thincam_jax.commands.run_folder import RunFolder
-from thincam_jax.commands.study.config import slug
+from thincam_jax.commands.study.build import Method, Study, Target
 from thincam_jax.commands.study.figures import line_style, save_figure, save_image
 from thincam_jax.reconstruction.depth import DepthMap, RefocusSweep
+from thincam_jax.reconstruction.depth.focus import Measure
 
 _SHOWN = 15  # images on the contact sheet, in rows of five
 _HELD = 160  # ms of an image of the animation
@@ -102,7 +103,7 @@ def _frame(image: np.ndarray, distance: float) -> PIL.Image.Image:
 
 def save_curves(
     folder: RunFolder,
-    config: RefocusConfig,
+    measure: Measure,
     sweep: RefocusSweep,
     found: Found,
     objects: dict[str, Any],
@@ -125,7 +126,7 @@ def save_curves(
         ax.text(values["distance_mm"], 1.1, f" placed at {values['distance_mm']:g} mm", fontsize=9)
     ax.set_ylim(0, 1.18)
     ax.set_xlabel("focused on the distance t (mm)")
-    ax.set_ylabel(f"{_MEASURED[config.sweep.measure]},\nrelative to its largest")
+    ax.set_ylabel(f"{_MEASURED[measure]},\nrelative to its largest")
     ax.grid(alpha=0.3)
     figure.legend(fontsize=9, loc="outside upper center", ncols=2)
     save_figure(folder, "focus", figure)
@@ -161,12 +162,12 @@ def save_depth(folder: RunFolder, sweep: RefocusSweep, depth: DepthMap, sharp: n
 
 def save_methods(
     folder: RunFolder,
-    config: RefocusConfig,
+    study: Study,
     pictures: dict[tuple[str, float], np.ndarray],
     metrics: dict[str, Any],
 ) -> None:
     """Every method focused on every object; below each, the objects enlarged."""
-    columns, objects = len(config.methods), config.objects
+    columns, objects = len(study.methods), study.targets
     aspect = max(p.shape[0] / p.shape[1] for p in pictures.values())
     width = 3.1
     # A row of whole pictures and one of details for each focus.
@@ -176,7 +177,7 @@ def save_methods(
     axes = figure.subplots(
         2 * len(objects), columns, squeeze=False, gridspec_kw={"height_ratios": heights}
     )
-    for column, method in enumerate(config.methods):
+    for column, method in enumerate(study.methods):
         for row, focused in enumerate(objects):
             image = pictures[method.name, focused.distance]
             save_image(
@@ -186,23 +187,23 @@ def save_methods(
             )
             scores = metrics[method.name]["focused_on_mm"][f"{focused.distance:g}"]["psnr_db"]
             whole, detail = axes[2 * row, column], axes[2 * row + 1, column]
-            _show_focus(whole, config, method, image, focused)
+            _show_focus(whole, study, method, image, focused)
             title = f"focused on {focused.distance:g} mm"
             whole.set_title(f"{method.name}\n{title}" if row == 0 else title, fontsize=10)
-            _show_details(detail, config, method, image, focused)
+            _show_details(detail, study, method, image, focused)
             score = scores[focused.name]
             sharp = "exact" if score is None else f"{score:.1f} dB"
             detail.set_xlabel(f"in focus: {focused.name}, {sharp}", fontsize=9)
     save_figure(folder, "methods", figure)
 
 
-def _show_focus(ax, config: RefocusConfig, method, image: np.ndarray, focused) -> None:
+def _show_focus(ax, study: Study, method: Method, image: np.ndarray, focused: Target) -> None:
     """A whole picture; the object in focus in a solid box, the others in dashed ones."""
     ax.imshow(grey_levels(image, white_level(image)), cmap="gray", vmin=0, vmax=1)
     ax.set_xticks([])
     ax.set_yticks([])
-    for placed in config.objects:
-        rows, columns = object_box(config, method, placed)
+    for placed in study.targets:
+        rows, columns = object_box(study, method, placed)
         ax.add_patch(
             Rectangle(
                 (columns.start - 4, rows.start - 4),
@@ -216,11 +217,11 @@ def _show_focus(ax, config: RefocusConfig, method, image: np.ndarray, focused) -
         )
 
 
-def _show_details(ax, config: RefocusConfig, method, image: np.ndarray, focused) -> None:
+def _show_details(ax, study: Study, method: Method, image: np.ndarray, focused: Target) -> None:
     """The middle of each object, enlarged, side by side; a frame round that in focus."""
     white = white_level(image)
-    for index, placed in enumerate(config.objects):
-        rows, columns = object_box(config, method, placed)
+    for index, placed in enumerate(study.targets):
+        rows, columns = object_box(study, method, placed)
         part = _middle(image[rows, columns])
         ax.imshow(
             grey_levels(part, white),
@@ -233,7 +234,7 @@ def _show_details(ax, config: RefocusConfig, method, image: np.ndarray, focused)
             ax.add_patch(
                 Rectangle((index + 0.02, 0.02), 0.96, 0.96, fill=False, color="black", linewidth=2)
             )
-    ax.set_xlim(0, len(config.objects))
+    ax.set_xlim(0, len(study.targets))
     ax.set_ylim(1, 0)
     ax.set_aspect("equal")
     ax.set_xticks([])

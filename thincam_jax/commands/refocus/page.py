@@ -2,10 +2,10 @@
 
 from typing import Any
 
+from thincam_jax.commands.checked_config import dump_config
 from thincam_jax.commands.page import data_url, load_template
 from thincam_jax.commands.refocus.config import RefocusConfig
 from thincam_jax.commands.run_folder import RunFolder
-from thincam_jax.commands.study.config import dump_config
 
 
 def render(

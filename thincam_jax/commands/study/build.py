@@ -1,20 +1,30 @@
-"""From a study's configuration to cameras, scenes and reconstructions."""
+"""From an experiment file to what is simulated: cameras, exposures, noise, targets and methods."""
 
 import functools
 import math
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from thincam_jax.commands.study.config import (
+from thincam_jax.commands.config_file import ConfigError
+from thincam_jax.commands.sections import (
+    MaskConfig,
     MethodConfig,
-    StudyConfig,
+    MethodKind,
+    NoiseConfig,
+    SensorConfig,
+    Synthesis,
     TargetConfig,
     VariationConfig,
 )
+from thincam_jax.commands.study.config import StudyConfig
+from thincam_jax.imaging.metrics.image import SSIM_WINDOW
+from thincam_jax.imaging.metrics.mtf import MINIMUM_COLUMNS
 from thincam_jax.imaging.scene import ImagePlane, Scene
 from thincam_jax.imaging.sensor import (
     AbstractNoise,
@@ -35,6 +45,7 @@ from thincam_jax.imaging.targets import (
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.capture import capture
 from thincam_jax.lensless.masks.fza import FresnelZoneAperture
+from thincam_jax.lensless.psf import Model, psf
 from thincam_jax.reconstruction import (
     FringeScanning,
     Reconstruction,
@@ -43,6 +54,7 @@ from thincam_jax.reconstruction import (
     reconstruct,
 )
 from thincam_jax.reconstruction import synthesis as syntheses
+from thincam_jax.reconstruction.spectra import Prior
 
 _DRAWN: dict[str, Callable] = {
     "usaf1951": usaf1951,
@@ -50,205 +62,373 @@ _DRAWN: dict[str, Callable] = {
     "siemens_star": siemens_star,
     "point_grid": functools.partial(point_grid, count=(9, 9)),
 }
+# The scene's power is read off frequencies above three cycles a sensor (`spectra.inner_band`).
+_MINIMUM_ROWS = 7
+
+Reconstructor = Callable[[Array, Array], Reconstruction]
 
 
-class Setting(NamedTuple):
-    """One exposure: what a capture is identified by."""
+class Exposure(NamedTuple):
+    """One exposure; those that are equal are taken once for all methods.
+
+    - `beta`, `phase`, `width`: of the mask, rad/mm², rad and mm.
+    - `distance`: mask to sensor, mm; `wavelength`: mm.
+    - `share`: of the sensor's exposure time.
+    - `take`: counts the exposures of a method that are equal in all else.
+    """
 
     beta: float
     phase: float
     distance: float
     wavelength: float
     width: float
-    exposure: float
+    share: float = 1.0
+    take: int = 1
 
 
-def settings(config: StudyConfig, method: MethodConfig) -> list[Setting]:
-    """The exposures of a method, in the order of its synthesis."""
-    return [
-        Setting(
+class Capture(NamedTuple):
+    """What was read out (*channel, y, x), and the variance of its noise (*channel,)."""
+
+    image: np.ndarray
+    variance: np.ndarray
+
+
+@dataclass(frozen=True)
+class Method:
+    """A reconstruction and the exposures that it takes, in the order of its synthesis.
+
+    - `phases`: how many exposures each shot has.
+    - `variation`: of admm_tv.
+    """
+
+    name: str
+    kind: MethodKind
+    synthesis: Synthesis
+    exposures: tuple[Exposure, ...]
+    phases: int
+    variation: VariationConfig | None = None
+
+    @property
+    def shots(self) -> tuple[Exposure, ...]:
+        """The first exposure of each shot."""
+        return self.exposures[:: self.phases]
+
+    @property
+    def distance(self) -> float:
+        """The largest mask-sensor distance, on whose scale the method reconstructs, mm."""
+        return max(exposure.distance for exposure in self.exposures)
+
+    @property
+    def synthesis_matrix(self) -> np.ndarray:
+        """Real weights (channel, exposure)."""
+        return synthesis_matrix(self.synthesis, len(self.shots), self.phases)
+
+
+def synthesis_matrix(synthesis: Synthesis, shots: int, phases: int) -> np.ndarray:
+    """Real weights (channel, exposure) of so many shots with so many phases each."""
+    if synthesis == "fringe_scanning":
+        return syntheses.fringe_scanning(shots)
+    if synthesis == "phase_pairs":
+        return syntheses.phase_pairs(shots)
+    if synthesis == "contrasts":
+        return syntheses.contrasts(shots * phases)
+    return syntheses.separate(shots * phases)
+
+
+@dataclass(frozen=True)
+class Target:
+    """What is seen: its place in the study, on which its noise depends; distance and width in mm.
+
+    `plane` holds the colour channels as a batch: (channel, y, x).
+    """
+
+    number: int
+    name: str
+    kind: str
+    distance: float
+    width: float
+    plane: ImagePlane
+
+    @property
+    def is_picture(self) -> bool:
+        """Whether it is a photograph or an image file, and not drawn."""
+        return self.kind in ("photograph", "file")
+
+
+@dataclass(frozen=True, eq=False)
+class Study:
+    """Cameras before targets, and the methods that reconstruct their captures.
+
+    - `config`: the experiment file that it was built from.
+    - `sensor`, `mask`: what all cameras share.
+    - `noise`: None leaves captures as they are.
+    - `reconstructors`: those that were built so far, by method's name and shape of the field.
+    """
+
+    config: Any
+    sensor: SensorConfig
+    mask: MaskConfig
+    noise: AbstractNoise | None
+    methods: tuple[Method, ...]
+    targets: tuple[Target, ...]
+    seed: int = 0
+    model: Model = "separable"
+    pixel_integration: bool = True
+    prior: Prior = "inverse_square"
+    reconstructors: dict[tuple, Reconstructor] = field(default_factory=dict)
+
+    @functools.cached_property
+    def exposures(self) -> tuple[Exposure, ...]:
+        """Of all methods, each once, in the order of first use."""
+        return tuple(dict.fromkeys(e for m in self.methods for e in m.exposures))
+
+    @property
+    def object_distance(self) -> float:
+        """Where the targets stand, mm."""
+        return self.config.object.distance
+
+    def camera(self, exposure: Exposure) -> LenslessCamera:
+        """The camera of an exposure."""
+        mask = {**dict(self.mask), "width": exposure.width}
+        levels = {name: getattr(self.sensor, name) for name in ("exposure", "electrons")}
+        levels = {n: None if v is None else v * exposure.share for n, v in levels.items()}
+        return LenslessCamera(
+            FresnelZoneAperture(exposure.beta, exposure.phase, **mask),
+            Sensor(**{**dict(self.sensor), **levels}),
+            exposure.distance,
+        )
+
+    def psf(self, exposure: Exposure) -> Array:
+        """Of a point on the axis at the distance of the targets, (y, x)."""
+        return psf(
+            self.camera(exposure),
+            wavelength=exposure.wavelength,
+            object_distance=self.object_distance,
+            model=self.model,
+            pixel_integration=self.pixel_integration,
+        )
+
+
+def build_study(config: StudyConfig) -> Study:
+    """All that a study needs, images read and everything checked, before the first capture.
+
+    **Errors**: ConfigError, one line for each fault, beginning with the field.
+    """
+    targets, unread = read_targets(config.targets, config.object.distance, config.object.width)
+    study = assemble(config, targets)
+    check_study(study, unread)
+    return study
+
+
+def assemble(config: Any, targets: Sequence[Target]) -> Study:
+    """From a configuration that names methods, camera and noise as a study's does."""
+    return Study(
+        config,
+        config.sensor,
+        config.mask,
+        None if config.noise is None else build_noise(config.noise),
+        tuple(_method(config, method) for method in config.methods),
+        tuple(targets),
+        config.seed,
+        config.model,
+        config.pixel_integration,
+        config.prior,
+    )
+
+
+def _method(config: Any, method: MethodConfig) -> Method:
+    phases = method.shot_phases()
+    exposures = tuple(
+        Exposure(
             shot.beta,
             phase,
             shot.distance,
             shot.wavelength or config.wavelength,
             shot.width or config.mask.width,
             shot.exposure,
+            shot.take or 1,
         )
         for shot in method.shots
-        for phase in method.shot_phases()
-    ]
-
-
-def all_settings(config: StudyConfig) -> list[Setting]:
-    """Every exposure of the study once, in order of first use."""
-    return list(dict.fromkeys(s for m in config.methods for s in settings(config, m)))
-
-
-def build_camera(config: StudyConfig, setting: Setting) -> LenslessCamera:
-    mask = FresnelZoneAperture(
-        setting.beta,
-        setting.phase,
-        width=setting.width,
-        profile=config.mask.profile,
-        harmonics=config.mask.harmonics,
-        pixel_pitch=config.mask.pixel_pitch,
-        fill_factor=config.mask.fill_factor,
+        for phase in phases
     )
-    sensor = Sensor(
-        config.sensor.shape,
-        config.sensor.pitch,
-        full_well=config.sensor.full_well,
-        exposure=_times(config.sensor.exposure, setting.exposure),
-        electrons=_times(config.sensor.electrons, setting.exposure),
-        bit_depth=config.sensor.bit_depth,
+    return Method(
+        method.name, method.kind, method.synthesis, exposures, len(phases), method.variation
     )
-    return LenslessCamera(mask, sensor, setting.distance)
 
 
-def _times(level: float | None, share: float) -> float | None:
-    return None if level is None else level * share
+def build_noise(noise: NoiseConfig) -> AbstractNoise:
+    if noise.read_noise is not None:
+        return PoissonGaussianNoise(noise.read_noise)
+    return GaussianNoise(noise.snr_db, noise.signal_power)
 
 
-def build_noise(config: StudyConfig) -> AbstractNoise | None:
-    if config.noise is None:
-        return None
-    if config.noise.read_noise is not None:
-        return PoissonGaussianNoise(config.noise.read_noise)
-    return GaussianNoise(config.noise.snr_db, config.noise.signal_power)
+def read_targets(
+    entries: Sequence[TargetConfig], distance: float, width: float
+) -> tuple[list[Target], dict[int, str]]:
+    """The targets at one distance, and by its place why another cannot be read."""
+    targets, unread = [], {}
+    for number, entry in enumerate(entries):
+        try:
+            image = np.moveaxis(np.atleast_3d(read_picture(entry)), -1, 0)
+        except (ValueError, FileNotFoundError) as error:
+            unread[number] = str(error)
+            continue
+        plane = ImagePlane(image.astype(np.float32), distance, width)
+        targets.append(Target(number, entry.name, entry.kind, distance, width, plane))
+    return targets, unread
 
 
-def build_plane(config: StudyConfig, target: TargetConfig) -> ImagePlane:
-    """The target in front of the camera, with its colour channels as a batch: (channel, y, x)."""
+def read_picture(target: TargetConfig) -> np.ndarray:
+    """Drawn, a photograph or a file: (y, x) or (y, x, channel)."""
     if target.kind in _DRAWN:
-        image = _DRAWN[target.kind]((target.pixels, target.pixels))
-    elif target.kind == "photograph":
-        image = sample_image(target.image or "")
-    else:
-        image = load_image(target.path or "")
-    image = np.moveaxis(np.atleast_3d(image), -1, 0)
-    return ImagePlane(image.astype(np.float32), config.object.distance, config.object.width)
+        return _DRAWN[target.kind]((target.pixels, target.pixels))
+    if target.kind == "photograph":
+        return sample_image(target.image or "")
+    return load_image(target.path or "")
 
 
-class Exposure(NamedTuple):
-    """A capture (channel, y, x) and the variance of each channel's noise (channel,)."""
+def check_study(study: Study, unread: dict[int, str] | None = None) -> None:
+    """Refuse cameras that cannot be built, images that cannot be read, and too few pixels.
 
-    image: np.ndarray
-    variance: np.ndarray
+    `unread`: why images could not be read, by the target's place.
 
-
-def take(config: StudyConfig, setting: Setting, plane: ImagePlane, key: Array) -> Exposure:
-    """One capture of a target; its noise is that of the noise-free image."""
-    camera = build_camera(config, setting)
-    return expose(config, camera, imaging(config, camera, setting, plane), key)
-
-
-def expose(config: StudyConfig, camera: LenslessCamera, clean: Array, key: Array) -> Exposure:
-    """What the sensor reads out of a noise-free image (channel, y, x)."""
-    noise = build_noise(config)
-    if noise is None:
-        variance = np.zeros(clean.shape[0], clean.dtype)
-    else:
-        variance = np.asarray(noise.variance(clean, electrons_per_unit(camera.sensor, clean)))
-    return Exposure(np.asarray(read_out(camera.sensor, clean, noise=noise, key=key)), variance)
+    **Errors**: ConfigError, one line for each fault, beginning with the field.
+    """
+    known = {target.number: _target_fault(study, target) for target in study.targets}
+    known |= unread or {}
+    faults = [f"targets[{number}]: {fault}" for number, fault in sorted(known.items()) if fault]
+    camera = _camera_fault(study)
+    if camera or faults:
+        raise ConfigError("\n".join([*filter(None, [camera]), *faults]))
 
 
-def imaging(
-    config: StudyConfig, camera: LenslessCamera, setting: Setting, plane: ImagePlane
-) -> Array:
-    """What falls on the sensor, (channel, y, x)."""
-    ideal = LenslessCamera(
-        camera.mask, Sensor(config.sensor.shape, config.sensor.pitch), camera.distance
-    )
-    return capture(
-        ideal,
-        Scene(plane, setting.wavelength),
-        model=config.model,
-        pixel_integration=config.pixel_integration,
-    )
+def _camera_fault(study: Study) -> str:
+    """Empty for none."""
+    rows, columns = study.sensor.shape
+    if rows < _MINIMUM_ROWS or columns < MINIMUM_COLUMNS:
+        return (
+            f"sensor.shape: {rows}×{columns} pixels are too few for a study; "
+            f"give at least {_MINIMUM_ROWS}×{MINIMUM_COLUMNS}"
+        )
+    try:
+        for exposure in study.exposures:
+            study.camera(exposure)
+        # Traced only: whether the model takes this mask at all.
+        jax.eval_shape(lambda: study.psf(study.exposures[0]))
+    except (ValueError, TypeError) as error:
+        return f"mask, sensor or model: {error}"
+    return ""
 
 
-def capture_key(config: StudyConfig, target: int, exposure: int) -> Array:
-    """The random key of one capture: the same however the study is interrupted."""
-    return jax.random.fold_in(jax.random.fold_in(jax.random.key(config.seed), target), exposure)
+def _target_fault(study: Study, target: Target) -> str:
+    """Empty for none."""
+    if target.plane.image.min() == target.plane.image.max():
+        return "the image is uniform: there is nothing to reconstruct; give another one"
+    for method in study.methods:
+        shape = field_shape(study, method, target)
+        if min(shape) < SSIM_WINDOW:
+            return (
+                f"{method.name!r} reconstructs it on {shape[0]}×{shape[1]} pixels, at least "
+                f"{SSIM_WINDOW}×{SSIM_WINDOW} are needed; give a larger object.width or a "
+                "smaller sensor.pitch"
+            )
+    return ""
 
 
-def synthesis_matrix(method: MethodConfig) -> np.ndarray:
-    shots = len(method.shots)
-    if method.synthesis == "fringe_scanning":
-        return syntheses.fringe_scanning(shots)
-    if method.synthesis == "phase_pairs":
-        return syntheses.phase_pairs(shots)
-    if method.synthesis == "contrasts":
-        return syntheses.contrasts(shots * len(method.phases))
-    return syntheses.separate(shots * len(method.phases))
-
-
-def reference_distance(method: MethodConfig) -> float:
-    """The largest mask-sensor distance, on whose scale a method reconstructs, mm."""
-    return max(shot.distance for shot in method.shots)
-
-
-def field_shape(config: StudyConfig, method: MethodConfig, plane: ImagePlane) -> tuple[int, int]:
+def field_shape(study: Study, method: Method, target: Target) -> tuple[int, int]:
     """Pixels of the reconstruction: what covers the target at the object pitch."""
-    scale = reference_distance(method) / config.object.distance / config.sensor.pitch
+    scale = method.distance / target.distance / study.sensor.pitch
     rows, columns = (
-        max(1, math.ceil(float(size) * scale - 1e-3)) for size in (plane.height, plane.width)
+        max(1, math.ceil(float(size) * scale - 1e-3))
+        for size in (target.plane.height, target.plane.width)
     )
     return rows, columns
 
 
+def noise_free(study: Study, exposure: Exposure, planes: ImagePlane | list[ImagePlane]) -> Array:
+    """What falls on the sensor, (*channel, y, x)."""
+    camera = study.camera(exposure)
+    # Without saturation.
+    ideal = Sensor(camera.sensor.shape, camera.sensor.pitch)
+    return capture(
+        LenslessCamera(camera.mask, ideal, camera.distance),
+        Scene(planes, exposure.wavelength),
+        model=study.model,
+        pixel_integration=study.pixel_integration,
+    )
+
+
+def expose(study: Study, exposure: Exposure, clean: Array, number: int, trial: int = 0) -> Capture:
+    """What is read out of a noise-free image of the target of a place in the study.
+
+    The noise is that of the image; its random key is the same however a study is interrupted, and
+    another one for each further trial.
+    """
+    seed = jax.random.key((study.seed + trial) % 2**32)
+    place = study.exposures.index(exposure)
+    key = jax.random.fold_in(jax.random.fold_in(seed, number), place)
+    sensor, noise = study.camera(exposure).sensor, study.noise
+    if noise is None:
+        variance = np.zeros(clean.shape[:-2], clean.dtype)
+    else:
+        variance = np.asarray(noise.variance(clean, electrons_per_unit(sensor, clean)))
+    return Capture(np.asarray(read_out(sensor, clean, noise=noise, key=key)), variance)
+
+
+def take(study: Study, exposure: Exposure, target: Target) -> Capture:
+    """One capture of a target."""
+    return expose(study, exposure, noise_free(study, exposure, target.plane), target.number)
+
+
+def stacked(captures: Sequence[Capture]) -> tuple[Array, Array]:
+    """Images (capture, *channel, y, x) and variances (capture, *channel)."""
+    images, variances = (np.stack(values) for values in zip(*captures, strict=True))
+    return jnp.asarray(images), jnp.asarray(variances)
+
+
 def build_reconstructor(
-    config: StudyConfig, method: MethodConfig, shape: tuple[int, int]
-) -> Callable[[Array, Array], Reconstruction]:
+    study: Study, method: Method, shape: tuple[int, int], object_distance: float
+) -> Reconstructor:
     """A function of the captures (capture, channel, y, x) and variances (capture, channel)."""
-    used = settings(config, method)
-    cameras = [build_camera(config, s) for s in used]
+    cameras = [study.camera(exposure) for exposure in method.exposures]
     if method.kind == "fringe_scanning":
-        scanning = FringeScanning(
-            cameras, object_distance=config.object.distance, field_shape=shape
-        )
+        scanning = FringeScanning(cameras, object_distance=object_distance, field_shape=shape)
         return lambda captures, variances: scanning(captures)
-    if method.kind == "admm_tv":
-        return functools.partial(_admm_tv, config, method, cameras, shape)
-    return WienerSynthesis(
-        cameras,
-        wavelength=[s.wavelength for s in used],
-        object_distance=config.object.distance,
-        synthesis=synthesis_matrix(method),
-        field_shape=shape,
-        prior=config.prior,
-        model=config.model,
-        pixel_integration=config.pixel_integration,
-    )
-
-
-def _admm_tv(
-    config: StudyConfig,
-    method: MethodConfig,
-    cameras: list[LenslessCamera],
-    shape: tuple[int, int],
-    captures: Array,
-    variances: Array,
-) -> Reconstruction:
-    """Total variation on the crop model; without noise in the study it is estimated."""
+    wavelength = [exposure.wavelength for exposure in method.exposures]
+    if method.kind == "wiener":
+        return WienerSynthesis(
+            cameras,
+            wavelength=wavelength,
+            object_distance=object_distance,
+            synthesis=method.synthesis_matrix,
+            field_shape=shape,
+            prior=study.prior,
+            model=study.model,
+            pixel_integration=study.pixel_integration,
+        )
     options = method.variation or VariationConfig()
-    variation = TotalVariation(
-        options.kind,
-        options.coupling_of(captures.shape[1]),
-        chroma_weight=options.chroma_weight,
-    )
-    return reconstruct(
-        captures,
-        cameras,
-        method="admm_tv",
-        object_distance=config.object.distance,
-        wavelength=[s.wavelength for s in settings(config, method)],
-        noise_variance=None if config.noise is None else variances,
-        synthesis=synthesis_matrix(method),
-        field_shape=shape,
-        tau=options.tau,
-        variation=variation,
-        iterations=options.iterations,
-        model=config.model,
-        pixel_integration=config.pixel_integration,
-    )
+
+    def total_variation(captures: Array, variances: Array) -> Reconstruction:
+        """On the crop model; without noise in the study it is estimated."""
+        variation = TotalVariation(
+            options.kind,
+            options.coupling_of(captures.shape[1]),
+            chroma_weight=options.chroma_weight,
+        )
+        return reconstruct(
+            captures,
+            cameras,
+            method="admm_tv",
+            object_distance=object_distance,
+            wavelength=wavelength,
+            noise_variance=None if study.noise is None else variances,
+            synthesis=method.synthesis_matrix,
+            field_shape=shape,
+            tau=options.tau,
+            variation=variation,
+            iterations=options.iterations,
+            model=study.model,
+            pixel_integration=study.pixel_integration,
+        )
+
+    return total_variation

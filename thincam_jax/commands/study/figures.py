@@ -8,13 +8,12 @@ import numpy as np
 import skimage.io
 from matplotlib.figure import Figure
 
+from thincam_jax.commands.config_file import slug
 from thincam_jax.commands.run_folder import RunFolder
-from thincam_jax.commands.study.build import all_settings, build_camera
-from thincam_jax.commands.study.config import StudyConfig, TargetConfig, slug
+from thincam_jax.commands.study.build import Study, Target
 from thincam_jax.commands.study.evaluate import Evaluation
 from thincam_jax.commands.study.response import Response
 from thincam_jax.imaging.metrics import low_frequency_value
-from thincam_jax.lensless.psf import psf
 
 # Told apart by dash and marker as well as by colour, so that they read in grey.
 _LINES = (
@@ -49,8 +48,8 @@ def save_image(folder: RunFolder, name: str, image: np.ndarray) -> None:
 
 def save_target(
     folder: RunFolder,
-    config: StudyConfig,
-    target: TargetConfig,
+    study: Study,
+    target: Target,
     capture: np.ndarray,
     evaluations: dict[str, Evaluation],
 ) -> None:
@@ -65,11 +64,11 @@ def save_target(
         panels.append((name, evaluation.image, _caption(evaluation)))
     figure, wholes, details = _pairs_of_axes(len(panels) + 1, truth.shape[0] / truth.shape[1])
     _show(wholes[0], raw / raw.max(), "first raw capture")
-    _show_detail_of_capture(details[0], raw / raw.max(), config)
+    _show_detail_of_capture(details[0], raw / raw.max(), study)
     for ax, detail, (name, image, caption) in zip(wholes[1:], details[1:], panels, strict=True):
         _show(ax, image, f"{name}\n{caption}" if caption else name)
         _show(detail, _middle(image), "")
-        detail.set_xlabel(f"middle {config.object.width / 3:.0f} mm", fontsize=9)
+        detail.set_xlabel(f"middle {target.width / 3:.0f} mm", fontsize=9)
     # No target's name can be taken for one of the study's own figures.
     save_figure(folder, f"target-{slug(target.name)}", figure)
 
@@ -109,11 +108,11 @@ def _show(ax, image: np.ndarray, title: str) -> None:
         ax.set_title(title, fontsize=9)
 
 
-def _show_detail_of_capture(ax, raw: np.ndarray, config: StudyConfig) -> None:
+def _show_detail_of_capture(ax, raw: np.ndarray, study: Study) -> None:
     detail = _middle(raw)
     low, high = detail.min(axis=(0, 1)), detail.max(axis=(0, 1))
     _show(ax, (detail - low) / np.where(high > low, high - low, 1), "")
-    width = config.sensor.shape[1] * config.sensor.pitch / 3
+    width = study.sensor.shape[1] * study.sensor.pitch / 3
     ax.set_xlabel(f"middle {width:.2g} mm of the sensor,\nstretched", fontsize=9)
 
 
@@ -127,9 +126,9 @@ def _middle(image: np.ndarray) -> np.ndarray:
     ]
 
 
-def save_responses(folder: RunFolder, config: StudyConfig, responses: dict[str, Response]) -> None:
+def save_responses(folder: RunFolder, study: Study, responses: dict[str, Response]) -> None:
     """Transfer functions of all methods, with their limits; methods of one synthesis share one."""
-    panels = _by_synthesis(config, responses)
+    panels = _by_synthesis(study, responses)
     figure = Figure(figsize=(8.5, 2.1 * len(panels) + 0.8), layout="constrained")
     axes = np.atleast_1d(figure.subplots(len(panels), 1, sharex=True))
     end = max(r.metrics["cut_off_cycles_per_mm"] for r in responses.values()) * 1.4
@@ -155,18 +154,15 @@ def save_responses(folder: RunFolder, config: StudyConfig, responses: dict[str, 
     save_figure(folder, "mtf", figure)
 
 
-def _by_synthesis(
-    config: StudyConfig, responses: dict[str, Response]
-) -> list[tuple[str, Response]]:
+def _by_synthesis(study: Study, responses: dict[str, Response]) -> list[tuple[str, Response]]:
     """Titles and responses: the methods that take the same captures and sums of them as one."""
     names: dict[tuple, list[str]] = {}
-    for method in config.methods:
-        key = (method.shots, method.synthesis, method.shot_phases())
-        names.setdefault(key, []).append(method.name)
+    for method in study.methods:
+        names.setdefault((method.exposures, method.synthesis), []).append(method.name)
     return [("; ".join(group), responses[group[0]]) for group in names.values()]
 
 
-def save_contrasts(folder: RunFolder, config: StudyConfig, contrasts: dict[str, list]) -> None:
+def save_contrasts(folder: RunFolder, contrasts: dict[str, list]) -> None:
     """Contrast of every chart element against its period, for each method."""
     figure = Figure(figsize=(8.5, 4.2), layout="constrained")
     ax = figure.subplots()
@@ -188,23 +184,15 @@ def save_contrasts(folder: RunFolder, config: StudyConfig, contrasts: dict[str, 
     save_figure(folder, "contrast", figure)
 
 
-def save_psf(folder: RunFolder, config: StudyConfig) -> None:
+def save_psf(folder: RunFolder, study: Study) -> None:
     """The first exposure's PSF: the image, and a line through its middle."""
-    setting = all_settings(config)[0]
-    camera = build_camera(config, setting)
-    h = np.asarray(
-        psf(
-            camera,
-            wavelength=setting.wavelength,
-            object_distance=config.object.distance,
-            model=config.model,
-            pixel_integration=config.pixel_integration,
-        )
-    )
+    exposure = study.exposures[0]
+    h = np.asarray(study.psf(exposure))
+    grid = study.camera(exposure).sensor.grid
     figure = Figure(figsize=(8.5, 3.4), layout="constrained")
     image, line = figure.subplots(1, 2, gridspec_kw={"width_ratios": (1, 1.6)})
-    x, y = np.asarray(camera.sensor.grid.x), np.asarray(camera.sensor.grid.y)
-    half = config.sensor.pitch / 2
+    x, y = np.asarray(grid.x), np.asarray(grid.y)
+    half = study.sensor.pitch / 2
     extent = (x[0] - half, x[-1] + half, y[-1] + half, y[0] - half)
     shown = image.imshow(h, cmap="gray", extent=extent)
     figure.colorbar(shown, ax=image, label="irradiance / open aperture")
@@ -213,8 +201,6 @@ def save_psf(folder: RunFolder, config: StudyConfig) -> None:
     line.plot(x, h[h.shape[0] // 2], color="black", linewidth=0.7)
     line.set_xlabel("x (mm), through the middle")
     line.set_ylabel("irradiance / open aperture")
-    line.set_title(
-        f"β = {setting.beta:g} rad/mm², φ = {setting.phase:.2f} rad, d = {setting.distance:g} mm",
-        fontsize=9,
-    )
+    mask = f"β = {exposure.beta:g} rad/mm², φ = {exposure.phase:.2f} rad"
+    line.set_title(f"{mask}, d = {exposure.distance:g} mm", fontsize=9)
     save_figure(folder, "psf", figure)

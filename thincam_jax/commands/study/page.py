@@ -2,9 +2,11 @@
 
 from typing import Any
 
+from thincam_jax.commands.checked_config import dump_config
+from thincam_jax.commands.config_file import slug
 from thincam_jax.commands.page import data_url, load_template
 from thincam_jax.commands.run_folder import RunFolder
-from thincam_jax.commands.study.config import StudyConfig, dump_config, slug
+from thincam_jax.commands.study.config import StudyConfig
 
 
 def render(

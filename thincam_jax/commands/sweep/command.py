@@ -9,8 +9,9 @@ import jax
 import rich.progress
 import typer
 
+from thincam_jax.commands.config_file import ConfigError, slug
 from thincam_jax.commands.refocus.config import load_experiment
-from thincam_jax.commands.study.config import ConfigError, StudyConfig, slug
+from thincam_jax.commands.study.config import StudyConfig
 from thincam_jax.commands.terminal import (
     INTERRUPTED,
     WRONG_INPUT,
