@@ -7,7 +7,7 @@ import pytest
 import scipy.special
 
 from helpers import ROOT, relative_l2
-from thincam_jax.commands.study.build import build_study
+from thincam_jax.commands.study.build import assemble
 from thincam_jax.commands.study.config import load_config
 from thincam_jax.commands.study.response import method_response
 from thincam_jax.imaging.metrics import (
@@ -177,7 +177,7 @@ def responses(distance, methods, **changes):
     changes = {"object.distance": f"{distance} mm", **changes}
     overrides = tuple(f"{key}={value}" for key, value in changes.items())
     config = load_config(ROOT / "configs" / "fza_superresolution.yaml", overrides)
-    study = build_study(config)
+    study = assemble(config, ())
     return [method_response(study, study.methods[index]) for index in methods]
 
 
