@@ -1,7 +1,7 @@
 """Sections of experiment files that several kinds share, with the units of their numbers."""
 
 import math
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import pydantic
 from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, PlainSerializer
@@ -9,6 +9,8 @@ from pydantic_core import PydanticCustomError
 
 from thincam_jax.commands.config_file import slug
 from thincam_jax.imaging.targets import sample_images
+from thincam_jax.lensless.psf import Model
+from thincam_jax.reconstruction.spectra import Prior
 from thincam_jax.units import parse_quantity
 
 
@@ -237,7 +239,34 @@ class TargetConfig(Section):
         return self
 
 
-def check_names(config: Any, *lists: str) -> None:
+class ExperimentConfig(Section):
+    """What every kind of experiment file begins with."""
+
+    name: Name
+    title: str = ""
+    seed: Annotated[int, Field(ge=0, lt=2**32, strict=True)] = 0
+    wavelength: Wavelength
+    model: Model = "separable"
+    pixel_integration: bool = True
+
+
+class CamerasConfig(ExperimentConfig):
+    """Cameras and the methods that reconstruct their captures."""
+
+    prior: Prior = "inverse_square"
+    sensor: SensorConfig
+    mask: MaskConfig
+    noise: NoiseConfig | None = None
+    methods: Annotated[tuple[MethodConfig, ...], Field(min_length=1)]
+
+    @pydantic.model_validator(mode="after")
+    def _methods_fit(self):
+        check_names(self, "methods")
+        check_methods(self)
+        return self
+
+
+def check_names(config: ExperimentConfig, *lists: str) -> None:
     """Refuse two entries of a list whose names give one file name."""
     for what in lists:
         names = [entry.name for entry in getattr(config, what)]
@@ -253,7 +282,7 @@ def check_names(config: Any, *lists: str) -> None:
                 raise misfit(message, what, index, "name")
 
 
-def check_methods(config: Any) -> None:
+def check_methods(config: CamerasConfig) -> None:
     """Refuse methods whose captures or noise do not fit."""
     # A capture that is used twice would count its noise as two independent ones.
     for index, method in enumerate(config.methods):

@@ -7,7 +7,7 @@ from commands.study import tiny
 
 from thincam_jax.commands.design.config import DesignConfig, load_design
 from thincam_jax.commands.design.simulation import build_designs
-from thincam_jax.commands.study.build import Study
+from thincam_jax.commands.study.study import Study
 from thincam_jax.design import Design
 
 TEXT = """\

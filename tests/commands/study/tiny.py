@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 import skimage.io
 
-from thincam_jax.commands.study.build import Study, build_study
+from thincam_jax.commands.study.build import build_study
 from thincam_jax.commands.study.config import StudyConfig, load_config
+from thincam_jax.commands.study.study import Study
 
 TEXT = """\
 name: tiny

@@ -8,7 +8,7 @@ from jaxtyping import Array
 
 from thincam_jax._core.grids import Grid
 from thincam_jax._core.precision import PRECISIONS, Precision, allow, cast
-from thincam_jax.commands.study.build import Exposure, Study
+from thincam_jax.commands.study.study import Exposure, Study
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.psf import Model, psf
 
@@ -52,7 +52,7 @@ def psf_of(
             wavelength=wavelength,
             object_distance=float(distance),
             model=model,
-            pixel_integration=study.pixel_integration,
+            pixel_integration=study.config.pixel_integration,
             grid=Grid(shape, grid.pitch) if shape else grid,
             precision=precision,
         )

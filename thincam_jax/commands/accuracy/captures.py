@@ -13,7 +13,7 @@ from thincam_jax.commands.accuracy.norms import contrast_error, relative_error
 from thincam_jax.commands.accuracy.psfs import words
 from thincam_jax.commands.accuracy.rig import Rig
 from thincam_jax.commands.accuracy.ways import why_not
-from thincam_jax.commands.study.build import Exposure
+from thincam_jax.commands.study.study import Exposure
 from thincam_jax.imaging.scene import Spectrum
 from thincam_jax.lensless.cost import psf_cost
 from thincam_jax.lensless.exposure import imaging_operator, project, projected_shape
@@ -75,7 +75,7 @@ def clean_capture(
             blurring.object_distance,
             field_shape=shape,
             model=model,
-            pixel_integration=rig.study.pixel_integration,
+            pixel_integration=rig.study.config.pixel_integration,
         )
         return np.asarray(convolution(project(camera, plane, shape)))
 
@@ -84,7 +84,7 @@ def kernel_reason(rig: Rig, exposure: Exposure, model: Model) -> str | None:
     """Why a model is not run for a capture; None where it is."""
     with allow("float64"):
         given = conditions_of(rig.study, exposure)["float64"]
-        whole = rig.study.pixel_integration
+        whole = rig.study.config.pixel_integration
         grid = Grid(rig.kernel_shape, jnp.asarray(given.camera.sensor.pitch))
         shape, samples = sampling_of(given.camera, grid, model, whole, None, None)
         cost = psf_cost(

@@ -9,7 +9,7 @@ import scipy.optimize
 
 from thincam_jax.commands.accuracy.cameras import psf_of
 from thincam_jax.commands.accuracy.norms import relative_error
-from thincam_jax.commands.study.build import Method, Study
+from thincam_jax.commands.study.study import Method, Study
 
 # What is wrong: the mask's curvature β, or its distance d from the sensor.
 QUANTITIES = ("beta", "distance")

@@ -10,7 +10,7 @@ from thincam_jax.commands.accuracy.pareto import worth_choosing
 from thincam_jax.commands.accuracy.sizes import binned
 from thincam_jax.commands.accuracy.timing import measure
 from thincam_jax.commands.accuracy.ways import Way, all_ways, why_not
-from thincam_jax.commands.study.build import Exposure, Study
+from thincam_jax.commands.study.study import Exposure, Study
 from thincam_jax.lensless.accuracy.select import predicted_error, probe_of
 from thincam_jax.lensless.psf import psf
 
@@ -27,7 +27,7 @@ def psf_rows(
     left out.
     """
     study = binned(study, size)
-    whole = study.pixel_integration
+    whole = study.config.pixel_integration
     given = conditions_of(study, exposure)
     reference = psf_of(study, exposure)
     rows = []
@@ -55,7 +55,7 @@ def way_count(study: Study, exposure: Exposure) -> int:
     """How many rows a size has."""
     with allow("float64"):
         camera = conditions_of(study, exposure)["float64"].camera
-        return len(all_ways(camera, study.pixel_integration))
+        return len(all_ways(camera, study.config.pixel_integration))
 
 
 def label(model: str, precision: str, oversampling: int | None) -> str:

@@ -13,14 +13,9 @@ from thincam_jax.commands.accuracy.norms import contrast_error, relative_error
 from thincam_jax.commands.accuracy.perturb import LEVELS, QUANTITIES, changed, psfs_of, solve
 from thincam_jax.commands.accuracy.psfs import words
 from thincam_jax.commands.accuracy.rig import Rig
-from thincam_jax.commands.study.build import (
-    Method,
-    build_reconstructor,
-    field_shape,
-    stacked,
-    take,
-)
+from thincam_jax.commands.study.build import build_reconstructor, field_shape, stacked, take
 from thincam_jax.commands.study.evaluate import evaluate
+from thincam_jax.commands.study.study import Method
 from thincam_jax.imaging.metrics import psnr
 from thincam_jax.lensless.psf import MODELS, Model
 from thincam_jax.reconstruction import Reconstruction

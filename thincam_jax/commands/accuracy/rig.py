@@ -5,7 +5,8 @@ from typing import NamedTuple
 
 from thincam_jax.commands.accuracy.sizes import binned
 from thincam_jax.commands.config_file import ConfigError
-from thincam_jax.commands.study.build import Exposure, Method, Study, Target, check_study
+from thincam_jax.commands.study.build import check_study
+from thincam_jax.commands.study.study import Exposure, Method, Study, Target
 from thincam_jax.imaging.operators import kernel_shape
 from thincam_jax.lensless.exposure import projected_shape
 

@@ -18,8 +18,9 @@ from thincam_jax.commands.accuracy.rig import Rig, make_rig
 from thincam_jax.commands.accuracy.sizes import capture_size_of, sizes_of
 from thincam_jax.commands.checked_config import dump_config
 from thincam_jax.commands.config_file import ConfigError
-from thincam_jax.commands.study.build import Exposure, Study, build_study
+from thincam_jax.commands.study.build import build_study
 from thincam_jax.commands.study.config import StudyConfig
+from thincam_jax.commands.study.study import Exposure, Study
 from thincam_jax.lensless.psf import MODELS
 
 Progress = Callable[[str], None]

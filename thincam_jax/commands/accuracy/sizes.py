@@ -4,7 +4,7 @@ import dataclasses
 
 from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.sections import SensorConfig
-from thincam_jax.commands.study.build import Study
+from thincam_jax.commands.study.study import Study
 
 DEFAULT_SIZES = (128, 256, 512)  # pixels along the longer side
 DEFAULT_CAPTURE_SIZE = 256

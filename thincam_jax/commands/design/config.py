@@ -15,6 +15,7 @@ from thincam_jax.commands.sections import (
     PHASES,
     Angle,
     ApertureConfig,
+    ExperimentConfig,
     Length,
     Name,
     NoiseConfig,
@@ -22,14 +23,12 @@ from thincam_jax.commands.sections import (
     Section,
     ShotConfig,
     TargetConfig,
-    Wavelength,
     check_names,
     misfit,
 )
 from thincam_jax.design import Design, DesignSpace, Limits, Tolerances, Variable, shots
 from thincam_jax.design.space import UNITS
 from thincam_jax.imaging.targets import sample_images
-from thincam_jax.lensless.psf import Model
 from thincam_jax.units import parse_quantity
 
 ObjectiveName = Literal["bayes_error", "robust_error", "worst_ratio", "limit", "unevenness"]
@@ -291,16 +290,10 @@ class TrainingConfig(Section):
         return images
 
 
-class DesignConfig(Section):
+class DesignConfig(ExperimentConfig):
     """A search for the best design, and its simulation beside the design to beat."""
 
-    name: Name
     kind: Literal["design"]
-    title: str = ""
-    seed: Annotated[int, Field(ge=0, lt=2**32, strict=True)] = 0
-    wavelength: Wavelength
-    model: Model = "separable"
-    pixel_integration: bool = True
     sensor: PixelsConfig
     mask: ApertureConfig
     object: ObjectConfig
@@ -358,23 +351,15 @@ class DesignConfig(Section):
         """Whether the search chooses it, of some shot."""
         return any(free.variable == variable for free in self.search.free)
 
-    def nearest(self) -> float:
-        """The shortest distance of mask and sensor that is looked at, mm."""
-        reference = min(s.distance for s in self.reference.shots)
-        bounds = [f.bounds[0] for f in self.search.free if f.variable == "distance"]
-        return min(reference, *bounds, math.inf)
-
-    def farthest(self) -> float:
-        """The longest distance of mask and sensor that is looked at, mm."""
-        reference = max(s.distance for s in self.reference.shots)
-        bounds = [f.bounds[1] for f in self.search.free if f.variable == "distance"]
-        limit = self.search.limits.thickness or math.inf
-        return max(reference, *(min(b, limit) for b in bounds), 0.0)
-
-    def widest(self) -> float:
-        """The widest mask that is looked at, mm."""
-        widths = [f.bounds[1] for f in self.search.free if f.variable == "width"]
-        return max([self.mask.width, *widths])
+    def reach(self, variable: Literal["beta", "distance", "width"]) -> tuple[float, float]:
+        """The least and the largest that is looked at, of the reference and within the bounds."""
+        given = [self.mask.width]
+        if variable != "width":
+            given = [getattr(shot, variable) for shot in self.reference.shots]
+        bounds = [end for f in self.search.free if f.variable == variable for end in f.bounds]
+        if variable == "distance":
+            bounds = [min(end, self.search.limits.thickness or math.inf) for end in bounds]
+        return min([*given, *bounds]), max([*given, *bounds])
 
 
 def found_name(rank: int) -> str:

@@ -1,6 +1,5 @@
 """The pictures of a design: the objective's landscape, responses, contrast transfer and fronts."""
 
-import io
 import operator
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -16,6 +15,7 @@ from thincam_jax.commands.design.surroundings import Landscape
 from thincam_jax.commands.design.train import TrainingObjective
 from thincam_jax.commands.design.transfer import Transfer
 from thincam_jax.commands.design.words import QUANTITIES, first, free_number
+from thincam_jax.commands.study.figures import as_png as as_png
 from thincam_jax.commands.study.figures import line_style
 
 _ROOM = 0.06  # around points, as a part of an axis
@@ -29,13 +29,6 @@ _LABELS = {
     "captures": "captures",
     "light": "light: electrons from each mm² of open aperture",
 }
-
-
-def as_png(figure: Figure) -> bytes:
-    """The file's content."""
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=110)
-    return buffer.getvalue()
 
 
 class _DrawnLandscape(NamedTuple):

@@ -1,9 +1,7 @@
 """The report of a design: one HTML page that stands alone."""
 
-from pathlib import Path
 from typing import Any
 
-from thincam_jax.commands.checked_config import dump_config
 from thincam_jax.commands.design.config import DesignConfig
 from thincam_jax.commands.design.record import COSTS
 from thincam_jax.commands.design.words import (
@@ -15,29 +13,27 @@ from thincam_jax.commands.design.words import (
     of_shots,
     told_of,
 )
-from thincam_jax.commands.page import data_url, load_template
+from thincam_jax.commands.page import number, render_page
+from thincam_jax.commands.run_folder import RunFolder
 
 
 def render(
-    config: DesignConfig, folder: Path, design: dict[str, Any], environment: dict[str, Any]
+    config: DesignConfig, folder: RunFolder, design: dict[str, Any], environment: dict[str, Any]
 ) -> str:
     """The page, with its pictures inside."""
-    return load_template("design").render(
-        config=config,
-        design=design,
-        free=[free_number(v["variable"], v["shots"]) for v in design["found"][0]["values"]],
-        reference=[
-            of_shots(design["reference"], v["variable"], v["shots"])
-            for v in design["found"][0]["values"]
-        ],
-        numbers=[[found_number(v) for v in one["values"]] for one in design["found"]],
-        validated=list(design["validation"]["methods"]),
-        findings=findings(design),
-        fronts=fronts(design),
-        environment=environment,
-        yaml=dump_config(config),
-        picture=lambda name: data_url(folder / name) if (folder / name).exists() else None,
-    )
+    free = [(value["variable"], value["shots"]) for value in design["found"][0]["values"]]
+    shown = {
+        "command": "design",
+        "environment": environment,
+        "design": design,
+        "free": [free_number(*one) for one in free],
+        "reference": [of_shots(design["reference"], *one) for one in free],
+        "numbers": [[found_number(v) for v in one["values"]] for one in design["found"]],
+        "validated": list(design["validation"]["methods"]),
+        "findings": findings(design),
+        "fronts": fronts(design),
+    }
+    return render_page("design", config, folder.path, shown)
 
 
 def findings(design: dict[str, Any]) -> list[str]:
@@ -113,7 +109,7 @@ def _front(name: str, front: dict[str, Any], reference: str) -> dict[str, Any]:
             "rows": [
                 [
                     *(text, *cells(p, names), f"{p['predicted_psnr_db']:.2f}"),
-                    *(_decibel(p.get("simulated_psnr_db", {}).get(n)) for n in pictures),
+                    *(number(p.get("simulated_psnr_db", {}).get(n), 2) for n in pictures),
                     kept[p.get("dominated")],
                 ]
                 for text, p in points
@@ -142,10 +138,6 @@ def _front(name: str, front: dict[str, Any], reference: str) -> dict[str, Any]:
 
 def _cost(value: float | int) -> str:
     return f"{value:.0f}" if value >= 1000 else f"{value:.4g}"
-
-
-def _decibel(value: float | None) -> str:
-    return "–" if value is None else f"{value:.2f}"
 
 
 def _spread(spread: dict[str, Any], digits: int) -> str:

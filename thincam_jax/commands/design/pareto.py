@@ -34,7 +34,7 @@ from thincam_jax.commands.design.problem import (
 )
 from thincam_jax.commands.design.simulation import simulate, with_designs
 from thincam_jax.commands.run_folder import Step
-from thincam_jax.commands.study.build import Study
+from thincam_jax.commands.study.study import Study
 from thincam_jax.design import Design, DesignSpace, PhotonNoise, bayes_error, channels, limit
 
 _TRIED = 3  # of the designs of a search, are scored exactly

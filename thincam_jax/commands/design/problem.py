@@ -16,7 +16,7 @@ from thincam_jax.commands.design.config import (
     SearchConfig,
 )
 from thincam_jax.commands.design.config_pareto import ParetoConfig
-from thincam_jax.commands.study.build import Study, synthesis_matrix
+from thincam_jax.commands.study.study import Study, synthesis_matrix
 from thincam_jax.design import (
     Design,
     DesignSpace,
@@ -174,7 +174,7 @@ def build_problem(study: Study) -> DesignProblem:
     synthesis = jnp.asarray(synthesis_of(space.base, config), float)
     # The largest field of view reaches half of the pixels' Nyquist frequency 1/(2 pitch), which all
     # designs of the search can be compared up to.
-    highest = jnp.asarray(config.farthest() / (4 * config.sensor.pitch))
+    highest = jnp.asarray(config.reach("distance")[1] / (4 * config.sensor.pitch))
     counts = config.search.frequencies
     exact = Quadrant(highest, counts.exact or _exact_count(config, highest))
     return DesignProblem(
@@ -198,8 +198,8 @@ def _exact_count(config: DesignConfig, highest) -> int:
     As an angle, a PSF is as wide as the mask's shadow over its distance; |H|² holds differences of
     its points, up to that width to either side.
     """
-    nearest = config.nearest()
-    shadow = config.widest() * (1 + nearest / config.object.distance) / nearest
+    nearest, widest = config.reach("distance")[0], config.reach("width")[1]
+    shadow = widest * (1 + nearest / config.object.distance) / nearest
     return max(_FEWEST, math.ceil(_MARGIN * 2 * shadow * float(highest)) + 1)
 
 

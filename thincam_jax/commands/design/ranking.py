@@ -31,7 +31,7 @@ from thincam_jax.commands.design.surroundings import (
 from thincam_jax.commands.design.train import Trained, TrainingDescents
 from thincam_jax.commands.design.transfer import RINGS, Transfer, modulation_transfer
 from thincam_jax.commands.run_folder import Step
-from thincam_jax.commands.study.build import Study
+from thincam_jax.commands.study.study import Study
 from thincam_jax.design import Design, DesignSpace, channels
 from thincam_jax.design.objectives import ring_means
 from thincam_jax.design.search import APART, Found, Search

@@ -10,8 +10,9 @@ from thincam_jax.commands.design.pareto import Front, FrontPoint, Fronts
 from thincam_jax.commands.design.problem import Shot
 from thincam_jax.commands.design.ranking import Candidate, FoundDesigns
 from thincam_jax.commands.design.surroundings import FreeValue
+from thincam_jax.commands.design.words import QUANTITIES
 from thincam_jax.commands.sections import ShotConfig
-from thincam_jax.commands.study.build import Study
+from thincam_jax.commands.study.study import Study
 from thincam_jax.design import non_dominated
 from thincam_jax.design.space import UNITS
 
@@ -48,7 +49,7 @@ def record(result: FoundDesigns, study: Study, validation: dict) -> dict:
             "broken_limits": list(broken_limits(config)),
         },
         "compare": [
-            {"name": rival.name, "shots": [_shot(_given(config, s)) for s in rival.shots]}
+            {"name": rival.name, "shots": [_given(config, shot) for shot in rival.shots]}
             for rival in config.compare
         ],
         "found": [_found(result, candidate) for candidate in result.found],
@@ -84,7 +85,7 @@ def _candidate(result: FoundDesigns, one: Candidate) -> dict[str, Any]:
         "objective": _round(sign * one.searched),
         "objective_exact": _round(sign * one.exact),
         "told": _round(float(result.objective.told(one.exact))),
-        "training_error": None if one.trained is None else _round(one.trained),
+        "training_error": _round(one.trained),
     }
 
 
@@ -177,18 +178,12 @@ def _point(config: DesignConfig, point: FrontPoint, cost: str) -> dict[str, Any]
     }
 
 
-def _given(config: DesignConfig, shot: ShotConfig) -> Shot:
-    return Shot(shot.beta, shot.distance, config.wavelength, config.mask.width)
+def _given(config: DesignConfig, shot: ShotConfig) -> dict[str, float | None]:
+    return _shot(Shot(shot.beta, shot.distance, config.wavelength, config.mask.width))
 
 
 def _shot(shot: Shot) -> dict[str, float | None]:
-    return {
-        "beta_rad_per_mm2": _round(shot.beta),
-        "distance_mm": _round(shot.distance),
-        "wavelength_nm": _round(shot.wavelength * 1e6),
-        "width_mm": _round(shot.width),
-        "exposure": _round(shot.exposure),
-    }
+    return {q.key: _round(getattr(shot, name) * q.scale) for name, q in QUANTITIES.items()}
 
 
 def _value(value: FreeValue) -> dict[str, Any]:
@@ -196,14 +191,14 @@ def _value(value: FreeValue) -> dict[str, Any]:
         "variable": value.variable,
         "shots": list(value.shots),
         "value": _round(value.value),
-        "tolerance": None if value.tolerance is None else _round(value.tolerance),
+        "tolerance": _round(value.tolerance),
         "unit": UNITS[value.variable],
     }
 
 
-def _round(value: float) -> float | None:
+def _round(value: float | None) -> float | None:
     """Seven digits; None for NaN and infinity, which JSON does not know."""
-    return float(f"{value:.7g}") if math.isfinite(value) else None
+    return float(f"{value:.7g}") if value is not None and math.isfinite(value) else None
 
 
 def broken_limits(config: DesignConfig) -> tuple[str, ...]:

@@ -18,17 +18,8 @@ from thincam_jax.commands.design.simulation import (
     simulate,
     with_designs,
 )
-from thincam_jax.commands.doctor import environment
-from thincam_jax.commands.run_folder import (
-    Progress,
-    RunFolder,
-    Step,
-    carry_out,
-    claim_folder,
-    to_json,
-)
-from thincam_jax.commands.sections import Section
-from thincam_jax.commands.study.build import Study, Target
+from thincam_jax.commands.run_folder import Progress, RunFolder, Step, carry_out
+from thincam_jax.commands.study.study import Study, Target
 
 
 class DesignFolder(RunFolder):
@@ -41,13 +32,7 @@ class DesignFolder(RunFolder):
       `report.html`, `design.json`: written at the end.
     """
 
-    def claim(self, config: Section) -> None:
-        """As for a study; what marks a complete design is design.json."""
-        claim_folder(self.path, "config.yaml", dump_config(config), "design", ("targets",))
-        if (self.path / "design.json").exists():
-            for result in (self.path / "targets").glob("*.json"):
-                result.unlink()
-            (self.path / "design.json").unlink()
+    kind, folders, result = "design", ("targets",), "design.json"
 
 
 def run_design(study: Study, folder: DesignFolder, progress: Progress) -> dict[str, Any]:
@@ -117,8 +102,5 @@ class _DesignRun:
         for name, figure in pictures.items():
             if figure is not None:
                 folder.write(name, figures.as_png(figure))
-        surroundings = environment(time.time() - self.started)
-        folder.write("environment.json", to_json({**surroundings, "seed": self.config.seed}))
-        folder.write("report.html", render(self.config, folder.path, self.design, surroundings))
-        # Last: it marks the design as complete.
-        folder.write("design.json", to_json(self.design))
+        page = partial(render, self.config, folder, self.design)
+        folder.complete(self.design, self.config.seed, self.started, page)

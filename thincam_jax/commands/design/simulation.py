@@ -13,28 +13,11 @@ from thincam_jax._core.precision import allow
 from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.design.config import DesignConfig
 from thincam_jax.commands.design.problem import phases_of
-from thincam_jax.commands.sections import (
-    MaskConfig,
-    MethodConfig,
-    SensorConfig,
-    ShotConfig,
-)
-from thincam_jax.commands.study.build import (
-    Exposure,
-    Method,
-    Study,
-    Target,
-    build_noise,
-    build_reconstructor,
-    check_study,
-    expose,
-    field_shape,
-    noise_free,
-    read_targets,
-    stacked,
-)
+from thincam_jax.commands.sections import MaskConfig, MethodConfig, SensorConfig, ShotConfig
+from thincam_jax.commands.study import build
 from thincam_jax.commands.study.config import StudyConfig
 from thincam_jax.commands.study.evaluate import evaluate
+from thincam_jax.commands.study.study import Exposure, Method, Study, Target
 from thincam_jax.design import Design
 
 # Electrons of a full well that no pixel fills: the search knows of no saturation.
@@ -55,21 +38,21 @@ def build_designs(config: DesignConfig) -> Study:
         sensor |= {"full_well": _FULL_WELL, "electrons": config.noise.electrons}
     with allow("float64"):
         given = {one.name: config.design(one) for one in (config.reference, *config.compare)}
-    targets, unread = read_targets(config.targets, config.object.distance, config.object.width)
+    targets, unread = build.read_targets(
+        config.targets, config.object.distance, config.object.width
+    )
     study = Study(
         config,
         # Of numbers that the design's file has had checked.
         SensorConfig.model_construct(**sensor),
         MaskConfig.model_construct(**dict(config.mask)),
-        build_noise(config.noise.simulated()),
+        build.build_noise(config.noise.simulated()),
         (),
         tuple(targets),
-        config.seed,
         config.model,
-        config.pixel_integration,
     )
     study = with_designs(study, given)
-    check_study(study, unread)
+    build.check_study(study, unread)
     for target in study.targets:
         rows, columns = target.plane.image.shape[-2:]
         if config.prior.measured and target.is_picture and min(rows, columns) < _SMALLEST_PICTURE:
@@ -156,13 +139,15 @@ def simulate(study: Study, target: Target, seeds: int) -> Trials:
     for number, method in enumerate(study.methods):
         for exposure in method.exposures:
             if exposure not in clean:
-                clean[exposure] = noise_free(study, exposure, target.plane)
-        shape = field_shape(study, method, target)
-        reconstructor = build_reconstructor(study, method, shape, target.distance)
+                clean[exposure] = build.noise_free(study, exposure, target.plane)
+        shape = build.field_shape(study, method, target)
+        reconstructor = build.build_reconstructor(study, method, shape, target.distance)
         trials[method.name] = []
         for trial in range(seeds):
-            captures = [expose(study, e, clean[e], target.number, trial) for e in method.exposures]
-            found = evaluate(method, target, reconstructor(*stacked(captures)))
+            captures = [
+                build.expose(study, e, clean[e], target.number, trial) for e in method.exposures
+            ]
+            found = evaluate(method, target, reconstructor(*build.stacked(captures)))
             trials[method.name].append(found.metrics)
         later = {exposure for m in study.methods[number + 1 :] for exposure in m.exposures}
         clean = {exposure: image for exposure, image in clean.items() if exposure in later}

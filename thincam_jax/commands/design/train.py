@@ -26,14 +26,8 @@ from thincam_jax.commands.design.surroundings import (
     shown,
     straight,
 )
-from thincam_jax.design import (
-    Design,
-    DesignSpace,
-    Setup,
-    Training,
-    end_to_end_error,
-    wiener_error,
-)
+from thincam_jax.commands.study.build import middle_square
+from thincam_jax.design import Design, DesignSpace, Setup, Training, end_to_end_error, wiener_error
 from thincam_jax.design.search import (
     APART,
     Found,
@@ -182,14 +176,15 @@ def build_training(config: DesignConfig, wanted: TrainingConfig, setup: Setup) -
     pixels = wanted.pixels or _pixels(config)
     setup = jax.tree.map(lambda x: jnp.asarray(np.asarray(x), float), setup)
     # Pixels of the object about as large as those of the sensor at the longest distance.
-    across = float(setup.field) * config.farthest() / float(setup.sensor_width)
+    distances = config.reach("distance")
+    across = float(setup.field) * distances[1] / float(setup.sensor_width)
     count = max(16, math.ceil(across * pixels))
     return Training(
         np.stack([_picture(name, count) for name in wanted.images]),
         setup,
         synthesis_of(config.design(config.reference), config),
         sensor_shape=(pixels, pixels),
-        distances=(config.nearest(), config.farthest()),
+        distances=distances,
         key=jax.random.key(config.seed),
     )
 
@@ -200,9 +195,7 @@ def _pixels(config: DesignConfig) -> int:
     With fewer, their contrast is lost to the pixels' own average, and fine zones look worse than
     they are.
     """
-    finest = [s.beta for s in config.reference.shots]
-    finest += [f.bounds[1] for f in config.search.free if f.variable == "beta"]
-    edge = max(finest) * config.widest() / (2 * math.pi)
+    edge = config.reach("beta")[1] * config.reach("width")[1] / (2 * math.pi)
     needed = math.ceil(3 * edge * config.sensor.width)
     return max(32, min(needed, *config.sensor.shape))
 
@@ -210,9 +203,7 @@ def _pixels(config: DesignConfig) -> int:
 def _picture(name: str, count: int) -> np.ndarray:
     """The grey middle square of a photograph."""
     image = np.atleast_3d(sample_image(name)).mean(axis=-1)
-    side = min(image.shape)
-    top, left = ((n - side) // 2 for n in image.shape)
-    return resize(image[top : top + side, left : left + side], (count, count))
+    return resize(middle_square(image, min(image.shape)), (count, count))
 
 
 def _reference_point(space: DesignSpace) -> np.ndarray | None:

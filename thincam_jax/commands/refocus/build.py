@@ -12,20 +12,9 @@ import numpy as np
 from thincam_jax._core.grids import Grid
 from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.refocus.config import PlacedConfig, RefocusConfig
-from thincam_jax.commands.study.build import (
-    Capture,
-    Exposure,
-    Method,
-    Study,
-    Target,
-    assemble,
-    build_reconstructor,
-    expose,
-    noise_free,
-    read_picture,
-    stacked,
-)
+from thincam_jax.commands.study import build
 from thincam_jax.commands.study.evaluate import sample
+from thincam_jax.commands.study.study import Capture, Exposure, Method, Study, Target
 from thincam_jax.imaging.metrics import psnr
 from thincam_jax.imaging.metrics.image import SSIM_WINDOW
 from thincam_jax.imaging.scene import ImagePlane
@@ -60,7 +49,7 @@ def build_refocus(config: RefocusConfig) -> Study:
 
     **Errors**: ConfigError, one line for each fault, beginning with the field.
     """
-    study, faults, objects = assemble(config, ()), [], []
+    study, faults, objects = build.assemble(config, ()), [], []
     try:
         for exposure in study.exposures:
             study.camera(exposure)
@@ -84,8 +73,10 @@ def build_refocus(config: RefocusConfig) -> Study:
 
 
 def _place(study: Study, number: int, placed: PlacedConfig) -> PlacedTarget:
-    picture = np.atleast_3d(read_picture(placed)).astype(np.float32)
-    picture = _cropped(picture.astype(np.float64).mean(axis=-1), placed.crop)
+    picture = np.atleast_3d(build.read_picture(placed)).astype(np.float32)
+    picture = picture.astype(np.float64).mean(axis=-1)
+    if placed.crop < 1:
+        picture = build.middle_square(picture, round(placed.crop * min(picture.shape)))
     # Two pixels of the picture to one of the reconstruction.
     finest = max(_pixels_per_mm(study, method, placed) for method in study.methods)
     columns = max(8, round(2 * placed.width * finest))
@@ -99,15 +90,6 @@ def _place(study: Study, number: int, placed: PlacedConfig) -> PlacedTarget:
     plane = ImagePlane(canvas, placed.distance, canvas.shape[1] * pitch)
     numbers = (placed.distance, placed.width, plane, placed.x, placed.y)
     return PlacedTarget(number, placed.name, placed.kind, *numbers)
-
-
-def _cropped(picture: np.ndarray, part: float) -> np.ndarray:
-    """The middle square of a picture, `part` of its shorter side; the whole for 1."""
-    if part == 1:
-        return picture
-    side = max(1, round(part * min(picture.shape)))
-    top, left = ((n - side) // 2 for n in picture.shape)
-    return picture[top : top + side, left : left + side]
 
 
 def _pixels_per_mm(study: Study, method: Method, placed: PlacedConfig | Target) -> float:
@@ -129,7 +111,7 @@ def sweep_distances(study: Study) -> list[float]:
 def take_scene(study: Study, exposure: Exposure) -> Capture:
     """One capture of all objects together, (y, x)."""
     planes = [target.plane for target in study.targets]
-    return expose(study, exposure, noise_free(study, exposure, planes), 0)
+    return build.expose(study, exposure, build.noise_free(study, exposure, planes), 0)
 
 
 def field_shape(study: Study, method: Method) -> tuple[int, int]:
@@ -144,11 +126,14 @@ def field_shape(study: Study, method: Method) -> tuple[int, int]:
 
 
 def focus_on(
-    study: Study, method: Method, captures: Mapping[Exposure, Capture], distance: float
+    study: Study,
+    method: Method,
+    captures: Mapping[Exposure, Capture],
+    distance: float,
 ) -> Reconstruction:
     """A method's reconstruction (y, x) focused on one distance."""
-    images, variances = stacked([captures[exposure] for exposure in method.exposures])
-    reconstructor = build_reconstructor(study, method, field_shape(study, method), distance)
+    images, variances = build.stacked([captures[exposure] for exposure in method.exposures])
+    reconstructor = build.build_reconstructor(study, method, field_shape(study, method), distance)
     result = reconstructor(images[:, None], variances[:, None])
     return jax.tree.map(lambda leaf: leaf[0] if leaf.ndim == 3 else leaf, result)
 
@@ -162,7 +147,7 @@ def join_sweep(study: Study, distances: list[float], focused: list[Reconstructio
     return RefocusSweep(images, jnp.asarray(distances, images.dtype), slope, method)
 
 
-class Found(NamedTuple):
+class FoundObjects(NamedTuple):
     """Regions of a sweep, their focus curves, and which region each object is (None: none)."""
 
     regions: np.ndarray
@@ -175,16 +160,18 @@ class Found(NamedTuple):
         return None if region is None or self.curves is None else self.curves.distance_of(region)
 
 
-def find_objects(study: Study, sweep: RefocusSweep) -> Found:
+def find_objects(study: Study, sweep: RefocusSweep) -> FoundObjects:
     """Regions of the picture and their distances; objects are named by where they were placed."""
     regions, asked = object_regions(sweep), study.config.sweep
     boxes = {t.name: object_box(study, sweep_method(study), t) for t in study.targets}
     if not regions.any():
-        return Found(regions, None, dict.fromkeys(boxes))
+        return FoundObjects(regions, None, dict.fromkeys(boxes))
     curves = find_distances(
         sweep, measure=asked.measure, smoothing=asked.smoothing, regions=regions
     )
-    return Found(regions, curves, {name: _covering(regions[box]) for name, box in boxes.items()})
+    return FoundObjects(
+        regions, curves, {name: _covering(regions[box]) for name, box in boxes.items()}
+    )
 
 
 def _covering(part: np.ndarray) -> int | None:
@@ -222,7 +209,7 @@ def psnr_of_objects(
     return scores
 
 
-def object_metrics(study: Study, found: Found) -> dict[str, Any]:
+def object_metrics(study: Study, found: FoundObjects) -> dict[str, Any]:
     """Distance of each object as placed and as found."""
     metrics: dict[str, Any] = {}
     cameras = [study.camera(exposure) for exposure in sweep_method(study).exposures]

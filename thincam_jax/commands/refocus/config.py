@@ -9,24 +9,17 @@ from pydantic import Field
 from thincam_jax.commands.checked_config import load_as
 from thincam_jax.commands.config_file import ConfigError, read_raw
 from thincam_jax.commands.sections import (
+    CamerasConfig,
     Length,
-    MaskConfig,
-    MethodConfig,
     Name,
-    NoiseConfig,
     Section,
-    SensorConfig,
     TargetConfig,
-    Wavelength,
-    check_methods,
     check_names,
     misfit,
     quantity,
 )
 from thincam_jax.commands.study.config import StudyConfig, load_config
-from thincam_jax.lensless.psf import Model
 from thincam_jax.reconstruction.depth.focus import Measure
-from thincam_jax.reconstruction.spectra import Prior
 
 Position = Annotated[float, *quantity("length", "mm")]
 
@@ -62,29 +55,17 @@ class SweepConfig(Section):
         return self
 
 
-class RefocusConfig(Section):
+class RefocusConfig(CamerasConfig):
     """A scene of several objects, captured once, and focused afterwards."""
 
-    name: Name
     kind: Literal["refocus"]
-    title: str = ""
-    seed: Annotated[int, Field(ge=0, lt=2**32, strict=True)] = 0
-    wavelength: Wavelength
-    model: Model = "separable"
-    pixel_integration: bool = True
-    prior: Prior = "inverse_square"
-    sensor: SensorConfig
-    mask: MaskConfig
-    noise: NoiseConfig | None = None
     objects: Annotated[tuple[PlacedConfig, ...], Field(min_length=1)]
     sweep: SweepConfig
-    methods: Annotated[tuple[MethodConfig, ...], Field(min_length=1)]
     notes: tuple[str, ...] = ()
 
     @pydantic.model_validator(mode="after")
-    def _fits(self):
-        check_names(self, "methods", "objects")
-        check_methods(self)
+    def _objects_fit(self):
+        check_names(self, "objects")
         names = [method.name for method in self.methods]
         if self.sweep.method not in names:
             message = f"{self.sweep.method!r} is no method; choose one of {', '.join(names)}"

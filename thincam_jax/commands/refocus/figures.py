@@ -11,10 +11,11 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from thincam_jax.commands.config_file import slug
-from thincam_jax.commands.refocus.build import Found, object_box
+from thincam_jax.commands.refocus.build import FoundObjects, object_box
 from thincam_jax.commands.run_folder import RunFolder
-from thincam_jax.commands.study.build import Method, Study, Target
+from thincam_jax.commands.study.build import middle_square
 from thincam_jax.commands.study.figures import line_style, save_figure, save_image
+from thincam_jax.commands.study.study import Method, Study, Target
 from thincam_jax.reconstruction.depth import DepthMap, RefocusSweep
 from thincam_jax.reconstruction.depth.focus import Measure
 
@@ -105,7 +106,7 @@ def save_curves(
     folder: RunFolder,
     measure: Measure,
     sweep: RefocusSweep,
-    found: Found,
+    found: FoundObjects,
     objects: dict[str, Any],
 ) -> None:
     """Focus measure of each object over the sweep, with where it stands and where it was found."""
@@ -222,7 +223,8 @@ def _show_details(ax, study: Study, method: Method, image: np.ndarray, focused: 
     white = white_level(image)
     for index, placed in enumerate(study.targets):
         rows, columns = object_box(study, method, placed)
-        part = _middle(image[rows, columns])
+        part = image[rows, columns]
+        part = middle_square(part, round(0.6 * min(part.shape)))
         ax.imshow(
             grey_levels(part, white),
             cmap="gray",
@@ -241,10 +243,3 @@ def _show_details(ax, study: Study, method: Method, image: np.ndarray, focused: 
     ax.set_yticks([])
     for spine in ax.spines.values():
         spine.set_visible(False)
-
-
-def _middle(part: np.ndarray) -> np.ndarray:
-    """The middle square of an object, three fifths of its shorter side."""
-    side = max(1, round(0.6 * min(part.shape)))
-    top, left = ((n - side) // 2 for n in part.shape)
-    return part[top : top + side, left : left + side]

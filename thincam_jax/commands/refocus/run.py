@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from thincam_jax.commands.doctor import environment
+from thincam_jax.commands.page import render_page
 from thincam_jax.commands.refocus import figures
 from thincam_jax.commands.refocus.build import (
     find_objects,
@@ -18,9 +18,9 @@ from thincam_jax.commands.refocus.build import (
     sweep_method,
     take_scene,
 )
-from thincam_jax.commands.refocus.page import render
-from thincam_jax.commands.run_folder import Progress, RunFolder, Step, carry_out, to_json
-from thincam_jax.commands.study.build import Capture, Exposure, Method, Study
+from thincam_jax.commands.refocus.config import RefocusConfig
+from thincam_jax.commands.run_folder import Progress, RunFolder, Step, carry_out
+from thincam_jax.commands.study.study import Capture, Exposure, Method, Study
 from thincam_jax.reconstruction import Reconstruction
 from thincam_jax.reconstruction.depth import all_in_focus, depth_map
 
@@ -88,7 +88,7 @@ class _RefocusRun:
         self.metrics = {
             "study": study.config.name,
             "kind": study.config.kind,
-            "seed": study.seed,
+            "seed": study.config.seed,
             "objects": object_metrics(study, found),
             "sweep": _sweep_metrics(study, sweep, found),
             "methods": self.methods,
@@ -102,10 +102,8 @@ class _RefocusRun:
         figures.save_curves(folder, asked.measure, sweep, found, self.metrics["objects"])
         figures.save_depth(folder, sweep, depth, sharp)
         figures.save_methods(folder, study, self.pictures, self.methods)
-        surroundings = environment(time.time() - self.started)
-        folder.write("environment.json", to_json({**surroundings, "seed": study.seed}))
-        folder.write("report.html", render(study.config, folder, self.metrics, surroundings))
-        folder.write("metrics.json", to_json(self.metrics))
+        page = partial(render, study.config, folder, self.metrics)
+        folder.complete(self.metrics, study.config.seed, self.started, page)
 
 
 def _sweep_metrics(study: Study, sweep, found) -> dict[str, Any]:
@@ -124,3 +122,38 @@ def _sweep_metrics(study: Study, sweep, found) -> dict[str, Any]:
             if region is not None
         },
     }
+
+
+def render(
+    config: RefocusConfig, folder: RunFolder, metrics: dict[str, Any], environment: dict[str, Any]
+) -> str:
+    """The page, with its pictures inside."""
+    shown = {
+        "command": "run",
+        "environment": environment,
+        "metrics": metrics,
+        "findings": findings(config, metrics),
+    }
+    return render_page("refocus", config, folder.path / "figures", shown)
+
+
+def findings(config: RefocusConfig, metrics: dict[str, Any]) -> list[str]:
+    """What the numbers say, in sentences."""
+    sentences = []
+    for name, found in metrics["objects"].items():
+        if found["found_mm"] is None:
+            sentences.append(f"{name}, placed at {found['distance_mm']:g} mm, was not found.")
+            continue
+        sentences.append(
+            f"{name}, placed at {found['distance_mm']:g} mm, is sharpest at "
+            f"{found['found_mm']:.1f} mm ({found['error_percent']:+.1f} %)."
+        )
+    spans = [found["axial_resolution_mm"] for found in metrics["objects"].values()]
+    distances = sorted(placed.distance for placed in config.objects)
+    if len(distances) > 1:
+        gap = min(b - a for a, b in zip(distances, distances[1:], strict=False))
+        sentences.append(
+            f"The objects stand {gap:g} mm apart or more; the depth of focus, "
+            f"π t (t+d) / (β d R²), is {min(spans):.0f} to {max(spans):.0f} mm."
+        )
+    return sentences

@@ -1,10 +1,7 @@
 """From an experiment file to what is simulated: cameras, exposures, noise, targets and methods."""
 
-import functools
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
@@ -13,16 +10,15 @@ from jaxtyping import Array
 
 from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.sections import (
-    MaskConfig,
+    CamerasConfig,
     MethodConfig,
-    MethodKind,
     NoiseConfig,
-    SensorConfig,
-    Synthesis,
     TargetConfig,
     VariationConfig,
 )
 from thincam_jax.commands.study.config import StudyConfig
+from thincam_jax.commands.study.study import Capture, Exposure, Method, Reconstructor, Study, Target
+from thincam_jax.imaging import targets as drawn
 from thincam_jax.imaging.metrics.image import SSIM_WINDOW
 from thincam_jax.imaging.metrics.mtf import MINIMUM_COLUMNS
 from thincam_jax.imaging.scene import ImagePlane, Scene
@@ -34,18 +30,8 @@ from thincam_jax.imaging.sensor import (
     electrons_per_unit,
     read_out,
 )
-from thincam_jax.imaging.targets import (
-    load_image,
-    point_grid,
-    sample_image,
-    siemens_star,
-    slanted_edge,
-    usaf1951,
-)
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.capture import capture
-from thincam_jax.lensless.masks.fza import FresnelZoneAperture
-from thincam_jax.lensless.psf import Model, psf
 from thincam_jax.reconstruction import (
     FringeScanning,
     Reconstruction,
@@ -53,160 +39,9 @@ from thincam_jax.reconstruction import (
     WienerSynthesis,
     reconstruct,
 )
-from thincam_jax.reconstruction import synthesis as syntheses
-from thincam_jax.reconstruction.spectra import Prior
 
-_DRAWN: dict[str, Callable] = {
-    "usaf1951": usaf1951,
-    "slanted_edge": slanted_edge,
-    "siemens_star": siemens_star,
-    "point_grid": functools.partial(point_grid, count=(9, 9)),
-}
 # The scene's power is read off frequencies above three cycles a sensor (`spectra.inner_band`).
 _MINIMUM_ROWS = 7
-
-Reconstructor = Callable[[Array, Array], Reconstruction]
-
-
-class Exposure(NamedTuple):
-    """One exposure; those that are equal are taken once for all methods.
-
-    - `beta`, `phase`, `width`: of the mask, rad/mm², rad and mm.
-    - `distance`: mask to sensor, mm; `wavelength`: mm.
-    - `share`: of the sensor's exposure time.
-    - `take`: counts the exposures of a method that are equal in all else.
-    """
-
-    beta: float
-    phase: float
-    distance: float
-    wavelength: float
-    width: float
-    share: float = 1.0
-    take: int = 1
-
-
-class Capture(NamedTuple):
-    """What was read out (*channel, y, x), and the variance of its noise (*channel,)."""
-
-    image: np.ndarray
-    variance: np.ndarray
-
-
-@dataclass(frozen=True)
-class Method:
-    """A reconstruction and the exposures that it takes, in the order of its synthesis.
-
-    - `phases`: how many exposures each shot has.
-    - `variation`: of admm_tv.
-    """
-
-    name: str
-    kind: MethodKind
-    synthesis: Synthesis
-    exposures: tuple[Exposure, ...]
-    phases: int
-    variation: VariationConfig | None = None
-
-    @property
-    def shots(self) -> tuple[Exposure, ...]:
-        """The first exposure of each shot."""
-        return self.exposures[:: self.phases]
-
-    @property
-    def distance(self) -> float:
-        """The largest mask-sensor distance, on whose scale the method reconstructs, mm."""
-        return max(exposure.distance for exposure in self.exposures)
-
-    @property
-    def synthesis_matrix(self) -> np.ndarray:
-        """Real weights (channel, exposure)."""
-        return synthesis_matrix(self.synthesis, len(self.shots), self.phases)
-
-
-def synthesis_matrix(synthesis: Synthesis, shots: int, phases: int) -> np.ndarray:
-    """Real weights (channel, exposure) of so many shots with so many phases each."""
-    if synthesis == "fringe_scanning":
-        return syntheses.fringe_scanning(shots)
-    if synthesis == "phase_pairs":
-        return syntheses.phase_pairs(shots)
-    if synthesis == "contrasts":
-        return syntheses.contrasts(shots * phases)
-    return syntheses.separate(shots * phases)
-
-
-@dataclass(frozen=True)
-class Target:
-    """What is seen: its place in the study, on which its noise depends; distance and width in mm.
-
-    `plane` holds the colour channels as a batch: (channel, y, x).
-    """
-
-    number: int
-    name: str
-    kind: str
-    distance: float
-    width: float
-    plane: ImagePlane
-
-    @property
-    def is_picture(self) -> bool:
-        """Whether it is a photograph or an image file, and not drawn."""
-        return self.kind in ("photograph", "file")
-
-
-@dataclass(frozen=True, eq=False)
-class Study:
-    """Cameras before targets, and the methods that reconstruct their captures.
-
-    - `config`: the experiment file that it was built from.
-    - `sensor`, `mask`: what all cameras share.
-    - `noise`: None leaves captures as they are.
-    - `reconstructors`: those that were built so far, by method's name and shape of the field.
-    """
-
-    config: Any
-    sensor: SensorConfig
-    mask: MaskConfig
-    noise: AbstractNoise | None
-    methods: tuple[Method, ...]
-    targets: tuple[Target, ...]
-    seed: int = 0
-    model: Model = "separable"
-    pixel_integration: bool = True
-    prior: Prior = "inverse_square"
-    reconstructors: dict[tuple, Reconstructor] = field(default_factory=dict)
-
-    @functools.cached_property
-    def exposures(self) -> tuple[Exposure, ...]:
-        """Of all methods, each once, in the order of first use."""
-        return tuple(dict.fromkeys(e for m in self.methods for e in m.exposures))
-
-    @property
-    def object_distance(self) -> float:
-        """Where the targets stand, mm."""
-        return self.config.object.distance
-
-    def camera(self, exposure: Exposure) -> LenslessCamera:
-        """The camera of an exposure."""
-        mask = {**dict(self.mask), "width": exposure.width}
-        levels = {name: getattr(self.sensor, name) for name in ("exposure", "electrons")}
-        levels = {n: None if v is None else v * exposure.share for n, v in levels.items()}
-        return LenslessCamera(
-            FresnelZoneAperture(exposure.beta, exposure.phase, **mask),
-            Sensor(**{**dict(self.sensor), **levels}),
-            exposure.distance,
-        )
-
-    def psf(self, exposure: Exposure) -> Array:
-        """Of a point on the axis at the distance of the targets, (y, x)."""
-        return psf(
-            self.camera(exposure),
-            wavelength=exposure.wavelength,
-            object_distance=self.object_distance,
-            model=self.model,
-            pixel_integration=self.pixel_integration,
-        )
 
 
 def build_study(config: StudyConfig) -> Study:
@@ -220,23 +55,21 @@ def build_study(config: StudyConfig) -> Study:
     return study
 
 
-def assemble(config: Any, targets: Sequence[Target]) -> Study:
-    """From a configuration that names methods, camera and noise as a study's does."""
+def assemble(config: CamerasConfig, targets: Sequence[Target]) -> Study:
+    """Cameras, noise and methods of a file, before targets."""
     return Study(
         config,
         config.sensor,
         config.mask,
-        None if config.noise is None else build_noise(config.noise),
+        build_noise(config.noise),
         tuple(_method(config, method) for method in config.methods),
         tuple(targets),
-        config.seed,
         config.model,
-        config.pixel_integration,
         config.prior,
     )
 
 
-def _method(config: Any, method: MethodConfig) -> Method:
+def _method(config: CamerasConfig, method: MethodConfig) -> Method:
     phases = method.shot_phases()
     exposures = tuple(
         Exposure(
@@ -256,7 +89,9 @@ def _method(config: Any, method: MethodConfig) -> Method:
     )
 
 
-def build_noise(noise: NoiseConfig) -> AbstractNoise:
+def build_noise(noise: NoiseConfig | None) -> AbstractNoise | None:
+    if noise is None:
+        return None
     if noise.read_noise is not None:
         return PoissonGaussianNoise(noise.read_noise)
     return GaussianNoise(noise.snr_db, noise.signal_power)
@@ -280,11 +115,21 @@ def read_targets(
 
 def read_picture(target: TargetConfig) -> np.ndarray:
     """Drawn, a photograph or a file: (y, x) or (y, x, channel)."""
-    if target.kind in _DRAWN:
-        return _DRAWN[target.kind]((target.pixels, target.pixels))
     if target.kind == "photograph":
-        return sample_image(target.image or "")
-    return load_image(target.path or "")
+        return drawn.sample_image(target.image or "")
+    if target.kind == "file":
+        return drawn.load_image(target.path or "")
+    shape = (target.pixels, target.pixels)
+    if target.kind == "point_grid":
+        return drawn.point_grid(shape, count=(9, 9))
+    return getattr(drawn, target.kind)(shape)
+
+
+def middle_square(image: np.ndarray, side: int) -> np.ndarray:
+    """The middle (side, side, …) of an image, one pixel at least."""
+    side = max(1, side)
+    top, left = ((n - side) // 2 for n in image.shape[:2])
+    return image[top : top + side, left : left + side]
 
 
 def check_study(study: Study, unread: dict[int, str] | None = None) -> None:
@@ -354,7 +199,7 @@ def noise_free(study: Study, exposure: Exposure, planes: ImagePlane | list[Image
         LenslessCamera(camera.mask, ideal, camera.distance),
         Scene(planes, exposure.wavelength),
         model=study.model,
-        pixel_integration=study.pixel_integration,
+        pixel_integration=study.config.pixel_integration,
     )
 
 
@@ -364,7 +209,7 @@ def expose(study: Study, exposure: Exposure, clean: Array, number: int, trial: i
     The noise is that of the image; its random key is the same however a study is interrupted, and
     another one for each further trial.
     """
-    seed = jax.random.key((study.seed + trial) % 2**32)
+    seed = jax.random.key((study.config.seed + trial) % 2**32)
     place = study.exposures.index(exposure)
     key = jax.random.fold_in(jax.random.fold_in(seed, number), place)
     sensor, noise = study.camera(exposure).sensor, study.noise
@@ -404,7 +249,7 @@ def build_reconstructor(
             field_shape=shape,
             prior=study.prior,
             model=study.model,
-            pixel_integration=study.pixel_integration,
+            pixel_integration=study.config.pixel_integration,
         )
     options = method.variation or VariationConfig()
 
@@ -428,7 +273,7 @@ def build_reconstructor(
             variation=variation,
             iterations=options.iterations,
             model=study.model,
-            pixel_integration=study.pixel_integration,
+            pixel_integration=study.config.pixel_integration,
         )
 
     return total_variation

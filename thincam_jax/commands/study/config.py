@@ -7,45 +7,19 @@ import pydantic
 from pydantic import Field
 
 from thincam_jax.commands.checked_config import load_as
-from thincam_jax.commands.sections import (
-    MaskConfig,
-    MethodConfig,
-    Name,
-    NoiseConfig,
-    ObjectConfig,
-    Section,
-    SensorConfig,
-    TargetConfig,
-    Wavelength,
-    check_methods,
-    check_names,
-)
-from thincam_jax.lensless.psf import Model
-from thincam_jax.reconstruction.spectra import Prior
+from thincam_jax.commands.sections import CamerasConfig, ObjectConfig, TargetConfig, check_names
 
 
-class StudyConfig(Section):
-    """A whole study: one camera family, several methods, several targets."""
+class StudyConfig(CamerasConfig):
+    """A whole study: every method on every target."""
 
-    name: Name
-    title: str = ""
-    seed: Annotated[int, Field(ge=0, lt=2**32, strict=True)] = 0
-    wavelength: Wavelength
-    model: Model = "separable"
-    pixel_integration: bool = True
-    prior: Prior = "inverse_square"
-    sensor: SensorConfig
-    mask: MaskConfig
     object: ObjectConfig
-    noise: NoiseConfig | None = None
-    methods: Annotated[tuple[MethodConfig, ...], Field(min_length=1)]
     targets: Annotated[tuple[TargetConfig, ...], Field(min_length=1)]
     notes: tuple[str, ...] = ()
 
     @pydantic.model_validator(mode="after")
-    def _fits(self):
-        check_names(self, "methods", "targets")
-        check_methods(self)
+    def _targets_fit(self):
+        check_names(self, "targets")
         return self
 
 

@@ -9,17 +9,8 @@ import numpy as np
 from jaxtyping import Array
 
 from thincam_jax._core.grids import Grid
-from thincam_jax.commands.study.build import (
-    Capture,
-    Exposure,
-    Method,
-    Study,
-    Target,
-    build_reconstructor,
-    field_shape,
-    stacked,
-    take,
-)
+from thincam_jax.commands.study import build
+from thincam_jax.commands.study.study import Capture, Exposure, Method, Study, Target
 from thincam_jax.imaging.metrics import align, psnr, resolved_element, ssim, usaf_contrast
 from thincam_jax.imaging.scene import ImagePlane
 from thincam_jax.imaging.targets import line_pair, usaf1951_elements
@@ -45,7 +36,7 @@ def evaluate_targets(study: Study) -> dict[str, dict[str, dict[str, Any]]]:
     """The metrics of every method by method's and target's name, without a folder or figures."""
     found: dict[str, dict[str, dict[str, Any]]] = {m.name: {} for m in study.methods}
     for target in study.targets:
-        captures = {exposure: take(study, exposure, target) for exposure in study.exposures}
+        captures = {exposure: build.take(study, exposure, target) for exposure in study.exposures}
         for method in study.methods:
             metrics = evaluate_method(study, method, target, captures).metrics
             found[method.name][target.name] = metrics
@@ -53,14 +44,17 @@ def evaluate_targets(study: Study) -> dict[str, dict[str, dict[str, Any]]]:
 
 
 def evaluate_method(
-    study: Study, method: Method, target: Target, captures: Mapping[Exposure, Capture]
+    study: Study,
+    method: Method,
+    target: Target,
+    captures: Mapping[Exposure, Capture],
 ) -> Evaluation:
     """Reconstruct a target from the method's captures, and judge what comes out."""
-    shape = field_shape(study, method, target)
+    shape = build.field_shape(study, method, target)
     key = (method.name, shape)
     if key not in study.reconstructors:
-        study.reconstructors[key] = build_reconstructor(study, method, shape, target.distance)
-    used = stacked([captures[exposure] for exposure in method.exposures])
+        study.reconstructors[key] = build.build_reconstructor(study, method, shape, target.distance)
+    used = build.stacked([captures[exposure] for exposure in method.exposures])
     return evaluate(method, target, study.reconstructors[key](*used))
 
 
@@ -80,7 +74,7 @@ def evaluate(method: Method, target: Target, reconstruction: Reconstruction) -> 
     rows, columns = image.shape[-2:]
     grid = Grid((rows, columns), _known_pitch(reconstruction))
     truth = np.asarray(sample(target.plane, grid), dtype=float)
-    image, truth = (_as_picture(i) for i in (image, truth))
+    image, truth = (as_picture(i) for i in (image, truth))
     metrics: dict[str, Any] = {
         "psnr_db": _finite(round(psnr(image, truth), 4)),
         "ssim": round(ssim(image, truth), 5),
@@ -110,7 +104,8 @@ def sample(plane: ImagePlane, grid: Grid) -> Array:
     return plane.sample(grid, magnification=1.0)
 
 
-def _as_picture(image: np.ndarray) -> np.ndarray:
+def as_picture(image: np.ndarray) -> np.ndarray:
+    """From (channel, y, x) to (y, x) or (y, x, channel)."""
     picture = np.moveaxis(image, 0, -1)
     return picture[..., 0] if picture.shape[-1] == 1 else picture
 

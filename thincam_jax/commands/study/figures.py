@@ -2,17 +2,17 @@
 
 import io
 import math
-import os
 
 import numpy as np
-import skimage.io
+import PIL.Image
 from matplotlib.figure import Figure
 
 from thincam_jax.commands.config_file import slug
 from thincam_jax.commands.run_folder import RunFolder
-from thincam_jax.commands.study.build import Study, Target
-from thincam_jax.commands.study.evaluate import Evaluation
+from thincam_jax.commands.study.build import middle_square
+from thincam_jax.commands.study.evaluate import Evaluation, as_picture
 from thincam_jax.commands.study.response import Response
+from thincam_jax.commands.study.study import Study, Target
 from thincam_jax.imaging.metrics import low_frequency_value
 
 # Told apart by dash and marker as well as by colour, so that they read in grey.
@@ -30,20 +30,24 @@ def line_style(index: int) -> dict:
     return dict(_LINES[index % len(_LINES)])
 
 
-def save_figure(folder: RunFolder, name: str, figure: Figure) -> None:
-    """A figure as figures/NAME.png."""
+def as_png(figure: Figure) -> bytes:
+    """The file's content."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=110)
-    folder.write(f"figures/{name}.png", buffer.getvalue())
+    return buffer.getvalue()
+
+
+def save_figure(folder: RunFolder, name: str, figure: Figure) -> None:
+    """A figure as figures/NAME.png."""
+    folder.write(f"figures/{name}.png", as_png(figure))
 
 
 def save_image(folder: RunFolder, name: str, image: np.ndarray) -> None:
     """An image of values 0…1 as an 8-bit PNG."""
     pixels = np.round(np.clip(image, 0.0, 1.0) * 255).astype(np.uint8)
-    path = folder.path / "images" / f"{name}.png"
-    partial = path.with_name(f"{name}.partial.png")
-    skimage.io.imsave(partial, pixels, check_contrast=False)
-    os.replace(partial, path)
+    buffer = io.BytesIO()
+    PIL.Image.fromarray(pixels).save(buffer, format="PNG")
+    folder.write(f"images/{name}.png", buffer.getvalue())
 
 
 def save_target(
@@ -56,15 +60,14 @@ def save_target(
     """A target's scene, one raw capture and all reconstructions, whole and enlarged."""
     truth = list(evaluations.values())[-1].truth
     save_image(folder, f"{slug(target.name)}--scene", truth)
-    raw = np.moveaxis(capture, 0, -1)
-    raw = raw[..., 0] if raw.shape[-1] == 1 else raw
+    raw = as_picture(capture / capture.max())
     panels = [("scene", truth, "")]
     for name, evaluation in evaluations.items():
         save_image(folder, f"{slug(target.name)}--{slug(name)}", evaluation.image)
         panels.append((name, evaluation.image, _caption(evaluation)))
     figure, wholes, details = _pairs_of_axes(len(panels) + 1, truth.shape[0] / truth.shape[1])
-    _show(wholes[0], raw / raw.max(), "first raw capture")
-    _show_detail_of_capture(details[0], raw / raw.max(), study)
+    _show(wholes[0], raw, "first raw capture")
+    _show_detail_of_capture(details[0], raw, study)
     for ax, detail, (name, image, caption) in zip(wholes[1:], details[1:], panels, strict=True):
         _show(ax, image, f"{name}\n{caption}" if caption else name)
         _show(detail, _middle(image), "")
@@ -119,11 +122,7 @@ def _show_detail_of_capture(ax, raw: np.ndarray, study: Study) -> None:
 def _middle(image: np.ndarray) -> np.ndarray:
     """The central square whose side is a third of the width."""
     rows, columns = image.shape[:2]
-    half = max(1, min(columns // 6, rows // 2))
-    return image[
-        rows // 2 - half : rows // 2 + half or None,
-        columns // 2 - half : columns // 2 + half or None,
-    ]
+    return middle_square(image, 2 * min(columns // 6, rows // 2))
 
 
 def save_responses(folder: RunFolder, study: Study, responses: dict[str, Response]) -> None:

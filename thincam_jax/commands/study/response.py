@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from thincam_jax.commands.study.build import Exposure, Method, Study, synthesis_matrix
+from thincam_jax.commands.study.study import Exposure, Method, Study, synthesis_matrix
 from thincam_jax.imaging.metrics import cut_off, first_common_zero
 from thincam_jax.lensless.psf import otf
 
@@ -83,7 +83,7 @@ def _profile(study: Study, exposure: Exposure) -> np.ndarray:
         wavelength=exposure.wavelength,
         object_distance=study.object_distance,
         model=study.model,
-        pixel_integration=study.pixel_integration,
+        pixel_integration=study.config.pixel_integration,
     )
     rows, columns = study.sensor.shape
     return np.asarray(response[rows // 2, columns // 2 :])

@@ -4,17 +4,13 @@ import time
 from functools import partial
 from typing import Any
 
-from thincam_jax.commands.doctor import environment
-from thincam_jax.commands.run_folder import Progress, RunFolder, Step, carry_out, to_json
+from thincam_jax.commands.run_folder import Progress, RunFolder, Step, carry_out
 from thincam_jax.commands.study import figures
-from thincam_jax.commands.study.build import Capture, Exposure, Method, Study, Target, take
-from thincam_jax.commands.study.evaluate import (
-    Evaluation,
-    evaluate_method,
-    mean_psnr_of_pictures,
-)
+from thincam_jax.commands.study.build import take
+from thincam_jax.commands.study.evaluate import Evaluation, evaluate_method, mean_psnr_of_pictures
 from thincam_jax.commands.study.page import render
 from thincam_jax.commands.study.response import Response, method_response
+from thincam_jax.commands.study.study import Capture, Exposure, Method, Study, Target
 
 
 def run_study(study: Study, folder: RunFolder, progress: Progress) -> dict[str, Any]:
@@ -98,11 +94,8 @@ class _StudyRun:
         if contrasts:
             figures.save_contrasts(folder, contrasts)
         figures.save_psf(folder, study)
-        surroundings = environment(time.time() - self.started)
-        folder.write("environment.json", to_json({**surroundings, "seed": study.seed}))
-        folder.write("report.html", render(study.config, folder, self.metrics, surroundings))
-        # Last: it marks the run as complete.
-        folder.write("metrics.json", to_json(self.metrics))
+        page = partial(render, study.config, folder, self.metrics)
+        folder.complete(self.metrics, study.config.seed, self.started, page)
 
     def collected(self) -> dict[str, Any]:
         """What goes into metrics.json."""
@@ -120,4 +113,4 @@ class _StudyRun:
                     "limit_cycles_per_mm": entry.published.limit_cycles_per_mm,
                 },
             }
-        return {"study": study.config.name, "seed": study.seed, "methods": methods}
+        return {"study": study.config.name, "seed": study.config.seed, "methods": methods}
