@@ -4,7 +4,7 @@ import math
 from typing import Annotated, Any, Literal
 
 import pydantic
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
 from thincam_jax.commands.sections import Length, Section, misfit
 
@@ -13,16 +13,21 @@ Points = Annotated[int, Field(ge=2, le=100)]
 Electrons = Annotated[float, Field(gt=0)]
 
 
+def _rising(unit: str) -> AfterValidator:
+    def check(bounds: tuple[float, float]) -> tuple[float, float]:
+        lower, upper = bounds
+        if not lower < upper:
+            raise ValueError(f"bounds cross: {lower:g} to {upper:g}{unit}; give the lower first")
+        return bounds
+
+    return AfterValidator(check)
+
+
 class ThicknessConfig(Section):
     """Thickness against resolution: no distance is longer than each of `points` thicknesses."""
 
-    bounds: tuple[Length, Length]
+    bounds: Annotated[tuple[Length, Length], _rising(" mm")]
     points: Points = 8
-
-    @pydantic.field_validator("bounds")
-    @classmethod
-    def _ordered(cls, bounds: tuple[float, float]) -> tuple[float, float]:
-        return _ordered(bounds, " mm")
 
     def costs(self) -> list[float]:
         """The thicknesses, mm, evenly apart."""
@@ -47,13 +52,8 @@ class CapturesConfig(Section):
 class LightConfig(Section):
     """Light against resolution: electrons of a pixel from each mm² of open aperture."""
 
-    bounds: tuple[Electrons, Electrons]
+    bounds: Annotated[tuple[Electrons, Electrons], _rising(" electrons")]
     points: Points = 6
-
-    @pydantic.field_validator("bounds")
-    @classmethod
-    def _ordered(cls, bounds: tuple[float, float]) -> tuple[float, float]:
-        return _ordered(bounds, " electrons")
 
     def costs(self) -> list[float]:
         """The electrons, each by the same factor more than the one before."""
@@ -89,13 +89,6 @@ class ParetoConfig(Section):
         if self.captures is not None:
             found["captures"] = [float(count * phases) for count in self.captures.shots]
         return {name: found[name] for name in ("thickness", "captures", "light") if name in found}
-
-
-def _ordered(bounds: tuple[float, float], unit: str) -> tuple[float, float]:
-    lower, upper = bounds
-    if not lower < upper:
-        raise ValueError(f"bounds cross: {lower:g} to {upper:g}{unit}; give the lower first")
-    return bounds
 
 
 def with_shots(config: Any, count: int) -> Any:

@@ -6,9 +6,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.ticker import FixedLocator, NullLocator
 
-from thincam_jax.commands.design.problem import DesignObjective, Shot
+from thincam_jax.commands.design.problem import DesignObjective, Shot, phases_of
 from thincam_jax.commands.design.ranking import Candidate, FoundDesigns
 from thincam_jax.commands.design.record import COSTS
 from thincam_jax.commands.design.surroundings import Landscape
@@ -96,18 +97,9 @@ def _axes(landscape: Landscape) -> list[np.ndarray]:
 
 def _marker(number: int) -> dict:
     """Of the reference, number 0, and of what was found: told apart by shape."""
-    face = "black" if number == 0 else "white"
-    edge = "white" if number == 0 else "black"
-    shape = "Xo^Ds"[number % 5]
-    size = 12 if number == 0 else 10
-    return {
-        "marker": shape,
-        "markersize": size,
-        "color": face,
-        "markeredgecolor": edge,
-        "markeredgewidth": 1.3,
-        "linestyle": "none",
-    }
+    face, edge, size = ("white", "black", 10) if number else ("black", "white", 12)
+    style = {"marker": "Xo^Ds"[number % 5], "markersize": size, "linestyle": "none"}
+    return style | {"color": face, "markeredgecolor": edge, "markeredgewidth": 1.3}
 
 
 def _draw_map(figure: Figure, ax, view: _DrawnLandscape, points: tuple[Candidate, ...]) -> None:
@@ -126,8 +118,8 @@ def _draw_map(figure: Figure, ax, view: _DrawnLandscape, points: tuple[Candidate
         set_limits(*_reach(axis, own))
     for number, (one, place) in enumerate(zip(points, places, strict=True)):
         ax.plot(*place, label=view.name(one), clip_on=False, zorder=5, **_marker(number))
-    ax.set_xlabel(free_number(*around.variables[0]))
-    ax.set_ylabel(free_number(*around.variables[1]))
+    names = [free_number(*variable) for variable in around.variables]
+    ax.set(xlabel=names[0], ylabel=names[1])
 
 
 def _reach(axis: np.ndarray, own: np.ndarray) -> tuple[float, float]:
@@ -150,8 +142,7 @@ def _draw_line(ax, view: _DrawnLandscape, points: tuple[Candidate, ...]) -> None
         ax.plot(
             *place, float(objective.told(level)), label=view.name(one), zorder=5, **_marker(number)
         )
-    ax.set_xlabel(free_number(*around.variables[0]))
-    ax.set_ylabel(objective.label)
+    ax.set(xlabel=free_number(*around.variables[0]), ylabel=objective.label)
     ax.grid(alpha=0.3)
 
 
@@ -171,15 +162,13 @@ def draw_responses(result: FoundDesigns, count: int, pitch: float) -> Figure:
     for axes in (ax, over):
         axes.axhline(0, color="black", linewidth=0.8)
         axes.grid(alpha=0.3)
-    ax.set_xlim(0, result.edge)
+    ax.set(xlim=(0, result.edge), ylabel="signal-to-noise ratio,\nmean over a ring (dB)")
     ax.set_ylim(bottom=_FLOOR_DB)
-    ax.set_ylabel("signal-to-noise ratio,\nmean over a ring (dB)")
     ax.legend(fontsize=9)
     over.set_ylabel(f"over {result.reference.name}\n(dB)")
     over.set_xlabel("angular frequency of the object (cycles/rad)")
     distance = max(shot.distance for shot in result.reference.shots)
-    along = (lambda nu: np.asarray(nu) / distance, lambda u: np.asarray(u) * distance)
-    ax.secondary_xaxis("top", functions=along).set_xlabel(
+    ax.secondary_xaxis("top", functions=_at(distance)).set_xlabel(
         f"on the sensor at the reference's {distance:g} mm (cycles/mm); "
         f"its pixels' Nyquist frequency is {1 / (2 * pitch):.4g}"
     )
@@ -195,15 +184,11 @@ def draw_mtf(result: FoundDesigns, object_distance: float) -> Figure | None:
         return None
     figure = Figure(figsize=(11.0, 5.6), layout="constrained")
     panels = figure.subplots(1, 2, sharex=True, sharey=True)
-    for ax, one, transfer in zip(
-        panels, (result.reference, result.found[0]), result.transfers, strict=True
-    ):
+    shown = (result.reference, result.found[0])
+    for ax, one, transfer in zip(panels, shown, result.transfers, strict=True):
         _draw_transfer(ax, one, transfer, result.edge)
-        along = (
-            lambda nu: np.asarray(nu) / object_distance,
-            lambda u: np.asarray(u) * object_distance,
-        )
-        ax.secondary_xaxis("top", functions=along).set_xlabel("on the object (cycles/mm)")
+        top = ax.secondary_xaxis("top", functions=_at(object_distance))
+        top.set_xlabel("on the object (cycles/mm)")
         ax.set_xlabel("angular frequency (cycles/rad)")
     panels[0].set_ylabel("contrast transfer, over rings")
     return figure
@@ -213,14 +198,12 @@ def _draw_transfer(ax, one: Candidate, transfer: Transfer, edge: float) -> None:
     frequency = (np.arange(len(transfer.chain)) + 0.5) / len(transfer.chain) * edge
     chain = {"color": "black", "linewidth": 2.2, "label": "camera and reconstruction"}
     ax.plot(frequency, transfer.chain, **chain)
-    phases = max(n for sums in transfer.sums for part in sums for n in part) // len(one.shots)
+    phases = phases_of(one.design)
     for number, (level, sums) in enumerate(zip(transfer.channels, transfer.sums, strict=True)):
         style = line_style(number) | {"markersize": 4, "markevery": (2 * number, 8)}
         shot = one.shots[(sums[0][0] - 1) // phases]
         ax.plot(frequency, level, linewidth=1.2, label=_sum_label(shot, sums), **style)
-    ax.set_yscale("log")
-    ax.set_xlim(0, edge)
-    ax.set_ylim(_LEAST_CONTRAST, 1.5)
+    ax.set(yscale="log", xlim=(0, edge), ylim=(_LEAST_CONTRAST, 1.5))
     ax.grid(alpha=0.3)
     ax.set_title(one.name, fontsize=11)
     ax.legend(fontsize=9, loc="upper center", bbox_to_anchor=(0.5, -0.13), frameon=False)
@@ -233,6 +216,11 @@ def _sum_label(shot: Shot, sums: tuple[tuple[int, ...], tuple[int, ...]]) -> str
     return f"captures {formula}: β {shot.beta:.4g} rad/mm² at {shot.distance:.3g} mm"
 
 
+def _at(distance: float) -> tuple[Callable, Callable]:
+    """From angular frequencies to those on a plane at a distance, and back."""
+    return lambda nu: np.asarray(nu) / distance, lambda u: np.asarray(u) * distance
+
+
 def _decibel(level: np.ndarray) -> np.ndarray:
     """NaN, which is not drawn, below the floor."""
     return 10 * np.log10(np.where(level > 10 ** (_FLOOR_DB / 10), level, np.nan))
@@ -241,10 +229,8 @@ def _decibel(level: np.ndarray) -> np.ndarray:
 def draw_fronts(fronts: dict[str, Any], reference: str, object_distance: float) -> Figure:
     """A panel for each front; `fronts` as in design.json, `object_distance` in mm."""
     asked = [name for name in _LABELS if name in fronts]
-    figure = Figure(figsize=(4.2 * len(asked) + 0.6, 4.9), layout="constrained")
-    engine = figure.get_layout_engine()
-    assert engine is not None  # for the type checker
-    engine.set(wspace=0.06)  # pyright: ignore[reportCallIssue]
+    layout = ConstrainedLayoutEngine(wspace=0.06)
+    figure = Figure(figsize=(4.2 * len(asked) + 0.6, 4.9), layout=layout)
     for ax, name in zip(figure.subplots(1, len(asked), squeeze=False)[0], asked, strict=True):
         ax.set_xlabel(_LABELS[name])
         ax.grid(alpha=0.3)
@@ -252,7 +238,8 @@ def draw_fronts(fronts: dict[str, Any], reference: str, object_distance: float) 
             _draw_captures(ax, fronts[name], reference)
         else:
             _draw_resolution(ax, fronts[name], COSTS[name][1], reference)
-            _object_scale(ax, object_distance)
+            right = ax.secondary_yaxis("right", functions=_at(object_distance))
+            right.set_ylabel("on the object (line pairs/mm)")
         if name == "light":
             ax.set_xscale("log")
         ax.margins(0.08, 0.1)
@@ -271,11 +258,8 @@ def _draw_resolution(ax, front: dict[str, Any], cost: str, reference: str) -> No
         (True, True, "dominated; at least, where frequencies end"),
     ]
     for beaten, ended, label in groups:
-        chosen = [
-            p
-            for p in points
-            if p["dominated"] == beaten and (p["resolution_ends"] is not None) == ended
-        ]
+        kind = (beaten, ended)
+        chosen = [p for p in points if (p["dominated"], bool(p["resolution_ends"])) == kind]
         if chosen:
             shape = "^" if ended else "o"
             _marks(ax, chosen, cost, value, label, marker=shape, markerfacecolor=_FACE[beaten])
@@ -325,8 +309,3 @@ def _steps(ax, points: list[dict[str, Any]], cost: str, value: str, flag: str, d
     # On to the last of all points, which may be dominated.
     front.append((max(p[cost] for p in points), front[-1][1]))
     ax.step(*np.transpose(front), where="post", color="black", linewidth=1.1, linestyle=dash)
-
-
-def _object_scale(ax, distance: float) -> None:
-    along = (lambda nu: np.asarray(nu) / distance, lambda u: np.asarray(u) * distance)
-    ax.secondary_yaxis("right", functions=along).set_ylabel("on the object (line pairs/mm)")

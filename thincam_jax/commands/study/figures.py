@@ -89,8 +89,7 @@ def _pairs_of_axes(count: int, aspect: float):
     axes = figure.subplots(2 * bands, columns, gridspec_kw={"height_ratios": (aspect, 1) * bands})
     wholes, details = axes[::2].ravel(), axes[1::2].ravel()
     for ax in axes.ravel():
-        ax.set_xticks([])
-        ax.set_yticks([])
+        ax.set(xticks=[], yticks=[])
     for ax in (*wholes[count:], *details[count:]):
         ax.set_axis_off()
     return figure, wholes[:count], details[:count]
@@ -145,9 +144,7 @@ def save_responses(folder: RunFolder, study: Study, responses: dict[str, Respons
         end = min(end, response.frequency[-1])
         side = "right" if cut > 0.85 * end else "left"
         ax.text(cut, 0.84 * top, f" cut-off {cut:.1f} ", fontsize=8, va="top", ha=side)
-        ax.set_ylim(0, top)
-        ax.set_xlim(0, end)
-        ax.set_ylabel("relative MTF")
+        ax.set(xlim=(0, end), ylim=(0, top), ylabel="relative MTF")
         ax.set_title(name, fontsize=10, loc="left")
     axes[-1].set_xlabel("spatial frequency u on the reference sensor plane (cycles/mm), v = 0")
     save_figure(folder, "mtf", figure)
@@ -175,9 +172,8 @@ def save_contrasts(folder: RunFolder, contrasts: dict[str, list]) -> None:
     ticks = [10, 5, 2, 1, 0.5, 0.2]
     ax.set_xticks(ticks, [f"{t:g}" for t in ticks])
     ax.minorticks_off()
-    ax.set_ylim(-1.05, 1.1)
-    ax.set_xlabel("line pair on the object (mm)")
-    ax.set_ylabel("contrast of the three bars,\nworse direction")
+    contrast = "contrast of the three bars,\nworse direction"
+    ax.set(ylim=(-1.05, 1.1), xlabel="line pair on the object (mm)", ylabel=contrast)
     ax.legend(fontsize=9, loc="lower left")
     ax.grid(alpha=0.3)
     save_figure(folder, "contrast", figure)
@@ -195,11 +191,9 @@ def save_psf(folder: RunFolder, study: Study) -> None:
     extent = (x[0] - half, x[-1] + half, y[-1] + half, y[0] - half)
     shown = image.imshow(h, cmap="gray", extent=extent)
     figure.colorbar(shown, ax=image, label="irradiance / open aperture")
-    image.set_xlabel("x (mm)")
-    image.set_ylabel("y (mm)")
+    image.set(xlabel="x (mm)", ylabel="y (mm)")
     line.plot(x, h[h.shape[0] // 2], color="black", linewidth=0.7)
-    line.set_xlabel("x (mm), through the middle")
-    line.set_ylabel("irradiance / open aperture")
+    line.set(xlabel="x (mm), through the middle", ylabel="irradiance / open aperture")
     mask = f"β = {exposure.beta:g} rad/mm², φ = {exposure.phase:.2f} rad"
     line.set_title(f"{mask}, d = {exposure.distance:g} mm", fontsize=9)
     save_figure(folder, "psf", figure)
