@@ -151,7 +151,7 @@ class TestBenchAccuracy:
         monkeypatch.chdir(tmp_path)
         seen = []
         monkeypatch.setattr(
-            benches, "run_accuracy", lambda *given: seen.append(given[1:3]) or RESULTS
+            benches, "run_accuracy", lambda *given: seen.append(given[:2]) or RESULTS
         )
         options = ("--size", 64, "--size", 32, "--capture-size", 48, "--set", "name=Other")
         assert call("bench", "accuracy", file, *options).exit_code == 0
@@ -182,8 +182,8 @@ class TestBenchAccuracy:
         assert (tmp_path / "file").read_text() == "mine"
 
     def test_interrupt(self, file, tmp_path, monkeypatch):
-        def interrupted(config, plan, folder, progress):
-            progress("64 pixels")
+        def interrupted(plan, folder, progress):
+            progress("64 pixels", 9)
             raise KeyboardInterrupt
 
         monkeypatch.setattr(benches, "run_accuracy", interrupted)
@@ -243,11 +243,11 @@ def test_defect_keeps_its_traceback(file, monkeypatch, tmp_path):
 
 @pytest.mark.parametrize(("done", "hint"), [([], "no target yet"), (["chart"], "chart")])
 def test_interrupt(file, monkeypatch, tmp_path, done, hint):
-    def interrupted(config, folder, progress):
-        folder.claim(config)
+    def interrupted(study, folder, progress):
+        folder.claim(study.config)
         for name in done:
             folder.finish(name, {"metrics": {}, "contrasts": {}})
-        progress("picture: capture 1")
+        progress("picture: capture 1", 9)
         raise KeyboardInterrupt
 
     monkeypatch.setattr(studies, "run_study", interrupted)

@@ -5,7 +5,8 @@ import re
 import pytest
 from commands.study.test_config import BASE, changed, faults, line_of, load
 
-from thincam_jax.commands.study.config import ConfigError, load_config
+from thincam_jax.commands.config_file import ConfigError
+from thincam_jax.commands.study.config import load_config
 
 
 class TestYaml:

@@ -1,5 +1,6 @@
 """The text of an experiment file: YAML read with the lines of its entries, values set by path."""
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -119,3 +120,8 @@ def read_value(text: str, asked: str) -> Any:
         return yaml.safe_load(text)
     except (yaml.YAMLError, ValueError):
         raise ConfigError(f"{asked}: {text!r} is not valid YAML; put texts in quotes") from None
+
+
+def slug(name: str) -> str:
+    """A name as a file name."""
+    return re.sub(r"[^a-z0-9.]+", "-", name.lower()).strip("-.") or "unnamed"

@@ -1,19 +1,43 @@
-"""What the report pages share: their templates, and pictures inside of the page."""
+"""What the report pages share: their frame, and pictures inside of the page."""
 
 import base64
 from importlib import resources
 from pathlib import Path
+from typing import Any
 
 import jinja2
 
+from thincam_jax.commands.checked_config import dump_config
 
-def load_template(room: str) -> jinja2.Template:
-    """The page template of a room; texts are escaped, and a name that is missing is an error."""
+
+def render_page(room: str, config: Any, pictures: Path, shown: dict[str, Any]) -> str:
+    """The page of a room, from its template: the experiment, what is `shown`, how it was computed.
+
+    `pictures`: the folder of its figures. Texts are escaped; a name that is missing is an error.
+    """
     engine = jinja2.Environment(
-        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
+        loader=jinja2.FunctionLoader(_template),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
     )
-    source = resources.files(f"thincam_jax.commands.{room}").joinpath("page.html.jinja")
-    return engine.from_string(source.read_text(encoding="utf-8"))
+    engine.globals["number"] = number
+
+    def picture(name: str) -> str | None:
+        return data_url(pictures / name) if (pictures / name).exists() else None
+
+    page = engine.get_template(f"{room}/page.html.jinja")
+    return page.render(config=config, yaml=dump_config(config), picture=picture, **shown)
+
+
+def _template(name: str) -> str:
+    return resources.files("thincam_jax.commands").joinpath(name).read_text(encoding="utf-8")
+
+
+def number(value: float | None, digits: int) -> str:
+    """With so many decimals; a dash for none."""
+    return "–" if value is None else f"{value:.{digits}f}"
 
 
 def data_url(picture: Path) -> str:

@@ -1,12 +1,33 @@
-"""The run folder: what is in it, and how an interrupted study goes on."""
+"""A run: the list of its work, its folder, and how an interrupted one goes on."""
 
 import json
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from thincam_jax._core.files import write_whole
-from thincam_jax.commands.study.config import ConfigError, Section, dump_config, slug
+from thincam_jax.commands.checked_config import dump_config
+from thincam_jax.commands.config_file import ConfigError, slug
+from thincam_jax.commands.doctor import environment
+from thincam_jax.commands.sections import Section
+
+# Called as a step begins, with its text and with the number of all steps.
+Progress = Callable[[str, int], object]
+
+
+class Step(NamedTuple):
+    """A part of a run: what is told as it begins, and what does it."""
+
+    text: str
+    do: Callable[[], object]
+
+
+def carry_out(work: Sequence[Step], progress: Progress) -> None:
+    """Do what is listed, in its order."""
+    for step in work:
+        progress(step.text, len(work))
+        step.do()
 
 
 class RunFolder:
@@ -15,8 +36,12 @@ class RunFolder:
     - `config.yaml`: the resolved configuration.
     - `targets/NAME.json`: the metrics of a finished target; an interrupted study skips these.
     - `images/`: reconstructions and scenes, `figures/`: the report's pictures.
-    - `metrics.json`, `environment.json`, `report.html`: written at the end.
+    - `environment.json`, `report.html` and, last, the `result`: written at the end.
     """
+
+    kind = "run"
+    folders: tuple[str, ...] = ("targets", "images", "figures")
+    result = "metrics.json"
 
     def __init__(self, path: str | Path):
         self.path = Path(path)
@@ -26,12 +51,11 @@ class RunFolder:
 
         An interrupted run of the same configuration goes on; a complete one is done anew.
         """
-        text = dump_config(config)
-        claim_folder(self.path, "config.yaml", text, "run", ("targets", "images", "figures"))
-        if (self.path / "metrics.json").exists():
-            for result in (self.path / "targets").glob("*.json"):
-                result.unlink()
-            (self.path / "metrics.json").unlink()
+        claim_folder(self.path, "config.yaml", dump_config(config), self.kind, self.folders)
+        if (self.path / self.result).exists():
+            for finished in (self.path / "targets").glob("*.json"):
+                finished.unlink()
+            (self.path / self.result).unlink()
 
     def finished(self, target: str) -> dict[str, Any] | None:
         """The stored results of a target, or None if it has not been finished."""
@@ -47,6 +71,15 @@ class RunFolder:
     def write(self, name: str, content: str | bytes) -> Path:
         """Write a file of the folder, whole or not at all."""
         return write_whole(self.path / name, content)
+
+    def complete(
+        self, result: dict[str, Any], seed: int, started: float, page: Callable[[dict], str]
+    ) -> None:
+        """Write what surrounds the run, its page made of that, and what marks it as complete."""
+        surroundings = environment(time.time() - started)
+        self.write("environment.json", to_json({**surroundings, "seed": seed}))
+        self.write("report.html", page(surroundings))
+        self.write(self.result, to_json(result))
 
 
 def claim_folder(path: Path, name: str, text: str, kind: str, folders: Sequence[str] = ()) -> None:

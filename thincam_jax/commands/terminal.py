@@ -76,8 +76,8 @@ def progress_bar(*more: str) -> "rich.progress.Progress":
 
 
 @contextlib.contextmanager
-def counted(name: str, steps: int) -> Iterator[Callable[[str], None]]:
-    """A progress bar of so many steps; what it yields is called at each, with its name."""
+def counted(name: str) -> Iterator[Callable[[str, int], None]]:
+    """A progress bar; what it yields is called at each step, with its text and their number."""
     with progress_bar() as bar:
-        task = bar.add_task(name, total=steps)
-        yield lambda text: bar.update(task, advance=1, description=text)
+        task = bar.add_task(name, total=None)
+        yield lambda text, total: bar.update(task, advance=1, total=total, description=text)

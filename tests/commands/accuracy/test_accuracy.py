@@ -11,8 +11,9 @@ from commands.study import tiny
 import thincam_jax as tc
 from thincam_jax.commands.accuracy import cameras
 from thincam_jax.commands.accuracy import run as accuracy
-from thincam_jax.commands.study import build
-from thincam_jax.commands.study.config import ConfigError, dump_config
+from thincam_jax.commands.checked_config import dump_config
+from thincam_jax.commands.config_file import ConfigError
+from thincam_jax.commands.study.build import build_study
 
 SIZES = (32,)  # of the sensor's 64
 
@@ -27,9 +28,9 @@ def run(config, tmp_path_factory):
     """Folder and results of one run, and what it told."""
     folder = accuracy.BenchFolder(tmp_path_factory.mktemp("out") / "new")
     plan = accuracy.check(config, accuracy.Sizes(SIZES, 48))
-    told = []
-    results = accuracy.run_accuracy(config, plan, folder, told.append)
-    assert len(told) == accuracy.steps(config, plan)
+    told = tiny.Told()
+    results = accuracy.run_accuracy(plan, folder, told)
+    assert len(told) == told.total
     return folder.path, results
 
 
@@ -116,11 +117,10 @@ def test_every_way_is_told(run):
 @pytest.mark.thorough
 def test_captures_agree_with_a_recomputation(run, config):
     rows = {r["model"]: r for r in run[1]["captures"]}
-    (method,) = [m for m in config.methods if m.kind == "wiener"]
-    setting = build.settings(config, method)[0]
-    camera = build.build_camera(cameras.binned(config, 48), setting)
-    plane = build.build_plane(config, config.targets[1])
-    scene = tc.Scene(plane, setting.wavelength)
+    study = cameras.binned(build_study(config), 48)
+    (method,) = [m for m in study.methods if m.kind == "wiener"]
+    camera = study.camera(method.exposures[0])
+    scene = tc.Scene(study.targets[1].plane, method.exposures[0].wavelength)
     exact, shadow = (
         np.asarray(tc.capture(camera, scene, model=m, pixel_integration=False), float)
         for m in ("separable", "geometric")
@@ -166,23 +166,23 @@ def test_controlled_errors(run, wrong):
 class TestSizes:
     @pytest.mark.parametrize("size", [7, 16, 33, 64])
     def test_binning_keeps_the_area(self, config, size):
-        sensor, whole = cameras.binned(config, size).sensor, config.sensor
+        study = cameras.binned(build_study(config), size)
+        sensor, whole = study.sensor, config.sensor
         assert max(sensor.shape) == size
         sides = [n * sensor.pitch for n in sensor.shape]
         assert sides[1] == pytest.approx(64 * whole.pitch, rel=1e-12)
         assert sides[0] == pytest.approx(48 * whole.pitch, abs=sensor.pitch / 2 + 1e-12)
-        assert cameras.binned(config, size).mask == config.mask
+        assert study.mask == config.mask
 
     def test_default_sizes(self, config):
         def large(n):
-            update = {"sensor": config.sensor.model_copy(update={"shape": (n // 2, n)})}
-            return config.model_copy(update=update)
+            return config.sensor.model_copy(update={"shape": (n // 2, n)})
 
-        assert cameras.sizes_of(config, ()) == (64,)
+        assert cameras.sizes_of(config.sensor, ()) == (64,)
         assert cameras.sizes_of(large(512), ()) == (128, 256, 512)
         assert cameras.sizes_of(large(1000), ()) == (128, 256, 512, 1000)
         assert cameras.sizes_of(large(1000), (300, 200, 300)) == (200, 300)
-        assert cameras.capture_size_of(config, None) == 64
+        assert cameras.capture_size_of(config.sensor, None) == 64
         assert cameras.capture_size_of(large(1000), None) == 256
 
     @pytest.mark.parametrize("size", [0, -3, 65])

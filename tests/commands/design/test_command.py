@@ -46,9 +46,9 @@ def asked(monkeypatch):
     """In place of a design's run: what it was asked for."""
     given = []
 
-    def run(config, folder, progress):
-        given.append((config, folder.path))
-        progress("search")
+    def run(study, folder, progress):
+        given.append((study.config, folder.path))
+        progress("search", 4)
         return FOUND
 
     monkeypatch.setattr(designs, "run_design", run)
@@ -120,8 +120,8 @@ class TestExitCode2:
         assert line.startswith("targets[1]: 20×40 pixels are too few to measure a spectrum")
 
     def test_folder_of_another_configuration(self, file, tmp_path, monkeypatch):
-        def claim(config, folder, _):
-            folder.claim(config)
+        def claim(study, folder, _):
+            folder.claim(study.config)
             return FOUND
 
         monkeypatch.setattr(designs, "run_design", claim)

@@ -4,10 +4,11 @@ import pytest
 from commands.design import tiny
 
 from helpers import ROOT
+from thincam_jax.commands.checked_config import dump_config
+from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.design.config import load_design
-from thincam_jax.commands.design.problem import broken_limits
+from thincam_jax.commands.design.record import broken_limits
 from thincam_jax.commands.refocus.config import load_experiment
-from thincam_jax.commands.study.config import ConfigError, dump_config
 
 
 def fault(folder, *overrides, text=tiny.TEXT):
@@ -30,7 +31,7 @@ def test_values_and_defaults(tmp_path):
     assert config.search.free[0].bounds == (12.0, 30.0)
     assert config.search.objective == "bayes_error"
     assert config.validation.best == 2
-    assert config.farthest() == 3.0
+    assert config.reach("distance")[1] == 3.0
     without = tiny.TEXT.replace("prior:\n  exponent: 2.5\n", "")
     assert tiny.design(tmp_path, text=without).prior.measured
 
@@ -74,8 +75,8 @@ def test_width_wavelength_and_exposure(tmp_path):
         ("exposure", 0.4, 1.6, (2, 3)),
     ]
     assert space.limits.exposure == 4
-    assert config.widest() == 2.4
-    assert tiny.design(tmp_path).widest() == 2.0
+    assert config.reach("width")[1] == 2.4
+    assert tiny.design(tmp_path).reach("width")[1] == 2.0
     path = tmp_path / "again.yaml"
     path.write_text(dump_config(config), encoding="utf-8")
     assert load_design(path) == config
@@ -117,9 +118,9 @@ def test_fringe_scanning_takes_four_captures_a_shot(tmp_path):
 
 def test_the_farthest_distance_keeps_the_thickness(tmp_path):
     free = "search.free=[{variable: distance, bounds: [2 mm, 9 mm]}]"
-    assert tiny.design(tmp_path, free).farthest() == 9.0
-    assert tiny.design(tmp_path, free, "search.limits.thickness=5 mm").farthest() == 5.0
-    assert tiny.design(tmp_path, free, "search.limits.thickness=2.5 mm").farthest() == 3.0
+    assert tiny.design(tmp_path, free).reach("distance")[1] == 9.0
+    assert tiny.design(tmp_path, free, "search.limits.thickness=5 mm").reach("distance")[1] == 5.0
+    assert tiny.design(tmp_path, free, "search.limits.thickness=2.5 mm").reach("distance")[1] == 3.0
 
 
 SHARED = ("search.free[0]", "all masks share the width; drop 'shared' and 'shots'")
@@ -179,7 +180,7 @@ SHARED = ("search.free[0]", "all masks share the width; drop 'shared' and 'shots
         ("search.band=[0.1, 0.4]", "search", "objective bayes_error has no band"),
         ("validate.seeds=0", "validate.seeds", "greater than or equal to 1"),
         ("validate.runs=1", "validate.runs", "unknown key; allowed here: seeds, best"),
-        ("validation.seeds=1", "validation", "unknown key; allowed here: name, kind,"),
+        ("validation.seeds=1", "validation", "unknown key; allowed here: name, title,"),
         ("noise.read_noise=8", "noise", "give either snr_db"),
         ("prior.measured=true", "prior", "give either exponent"),
         ("targets=[]", "targets", "give at least 1"),

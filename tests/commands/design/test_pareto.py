@@ -1,7 +1,6 @@
 """Fronts of thickness, captures and light: what costs more is never worse, and what is divided."""
 
 import inspect
-import sys
 
 import equinox as eqx
 import jax
@@ -9,20 +8,20 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from commands.design import tiny
+from commands.study.tiny import Told
 
+from thincam_jax.commands.config_file import ConfigError
+from thincam_jax.commands.design import pareto
 from thincam_jax.commands.design import problem as problem_of_search
 from thincam_jax.commands.design.config_pareto import with_shots
-from thincam_jax.commands.design.figures import as_png
+from thincam_jax.commands.design.figures import as_png, draw_fronts
 from thincam_jax.commands.design.page import fronts as tables
-from thincam_jax.commands.design.pareto import Front, Fronts, Point, find_fronts, pareto_steps
-from thincam_jax.commands.design.pareto_figure import draw_fronts
+from thincam_jax.commands.design.pareto import Front, FrontPoint, Fronts, FrontSearches
 from thincam_jax.commands.design.problem import build_problem
 from thincam_jax.commands.design.record import record_fronts
-from thincam_jax.commands.study.config import ConfigError
+from thincam_jax.commands.run_folder import carry_out
 from thincam_jax.design import find_designs, landscape
 from thincam_jax.design.search import Found, Search
-
-pareto = sys.modules["thincam_jax.commands.design.pareto"]
 
 FREE = (
     "search.free=[{variable: beta, bounds: [12 rad/mm^2, 30 rad/mm^2]}, "
@@ -46,20 +45,24 @@ def on_a_grid(monkeypatch):
     monkeypatch.setattr(problem_of_search, "find_designs", by_grid)
 
 
+def find_fronts(study, told=tiny.ignore):
+    searches = FrontSearches(study, study.config.pareto)
+    carry_out(searches.work, told)
+    return searches.result()
+
+
 def rising(values):
     return all(b >= a for a, b in zip(values, values[1:], strict=False))
 
 
 def test_thickness_and_light_buy_resolution(on_a_grid, tmp_path):
     light = "pareto.light={bounds: [90, 9e5], points: 3}"
-    config, told = tiny.design(tmp_path, FREE, LIGHT, THICKNESS, light), []
-    fronts = find_fronts(config, told.append)
-    assert len(told) == pareto_steps(config.pareto) == 14
-    assert fronts.captures is None
-    assert fronts.edge == pytest.approx(3.0 * 12.5 / 2)
-    assert fronts.thickness is not None
-    assert fronts.light is not None
-    thickness, light = fronts.thickness.points, fronts.light.points
+    told = Told()
+    found = find_fronts(tiny.built(tmp_path, FREE, LIGHT, THICKNESS, light), told)
+    assert len(told) == told.total == 14
+    assert list(found.fronts) == ["thickness", "light"]
+    assert found.edge == pytest.approx(3.0 * 12.5 / 2)
+    thickness, light = (front.points for front in found.fronts.values())
     assert [p.cost for p in thickness] == pytest.approx([2.0, 2.5, 3.0])
     assert [p.cost for p in light] == pytest.approx([90, 9e3, 9e5])
     for points in (thickness, light):
@@ -70,9 +73,10 @@ def test_thickness_and_light_buy_resolution(on_a_grid, tmp_path):
         assert all(2.0 <= shot.distance <= point.cost + 1e-9 for shot in point.shots)
         assert all(12 <= shot.beta <= 30 for shot in point.shots)
     # No less than the design to beat, which is a design at 3 mm and 900 electrons.
-    assert thickness[-1].resolution >= 0.9 * fronts.thickness.reference.resolution
-    assert fronts.thickness.reference.resolution == fronts.light.reference.resolution
-    assert (fronts.thickness.reference.cost, fronts.light.reference.cost) == (3.0, 900.0)
+    references = [front.reference for front in found.fronts.values()]
+    assert thickness[-1].resolution >= 0.9 * references[0].resolution
+    assert references[0].resolution == references[1].resolution
+    assert [reference.cost for reference in references] == [3.0, 900.0]
 
 
 def test_what_costs_more_is_never_worse_for_want_of_searching(tmp_path, monkeypatch):
@@ -91,10 +95,7 @@ def test_what_costs_more_is_never_worse_for_want_of_searching(tmp_path, monkeypa
 
     monkeypatch.setattr(problem_of_search, "find_designs", lucky_once)
     monkeypatch.setattr(pareto, "_exactly", judged)
-    config = tiny.design(tmp_path, FREE, THICKNESS)
-    fronts = find_fronts(config, tiny.ignore)
-    assert fronts.thickness is not None
-    points = fronts.thickness.points
+    points = find_fronts(tiny.built(tmp_path, FREE, THICKNESS)).fronts["thickness"].points
     # The thinner one, too, has the same β, at the distance that it is allowed.
     assert [p.resolution for p in points] == pytest.approx([10.0] * 3)
     assert [p.shots[0].distance for p in points] == pytest.approx([2.0, 2.25, 2.25])
@@ -105,20 +106,18 @@ def test_what_costs_more_is_never_worse_for_want_of_searching(tmp_path, monkeypa
 def test_fronts_by_search(tmp_path):
     """With the search itself: no worse than the grid's, and the PSNR is that of a simulation."""
     quick = ("pareto.samples=16", "pareto.starts=2", "pareto.steps=8")
-    config = tiny.design(tmp_path, FREE, LIGHT, THICKNESS, "pareto.captures.shots=[1, 2]", *quick)
-    fronts = find_fronts(config, tiny.ignore)
-    assert fronts.captures is not None
-    assert fronts.thickness is not None
-    assert rising([p.resolution for p in fronts.thickness.points])
-    one, two = fronts.captures.points
+    asked = (FREE, LIGHT, THICKNESS, "pareto.captures.shots=[1, 2]", *quick)
+    fronts = find_fronts(tiny.built(tmp_path, *asked)).fronts
+    assert rising([p.resolution for p in fronts["thickness"].points])
+    one, two = fronts["captures"].points
     assert (one.cost, two.cost) == (2, 4)
     assert two.error < one.error
     assert 10 < dict(two.simulated)["picture"] < 60
 
 
-def exposed(config, count):
+def exposed(study, count):
     """Error and resolution of copies of the reference's first shot, seen by an endless sensor."""
-    problem = build_problem(config)
+    problem, config = build_problem(study), study.config
     given = pareto._of_shots(with_shots(config, 1), problem, count)
     divided = config.noise.electrons is not None
     np.testing.assert_allclose(given.space.base.exposure, 2 / count if divided else 1.0)
@@ -131,14 +130,14 @@ def test_captures_share_the_exposure(tmp_path):
     """Two halves of an exposure are a whole one, but for the read noise of each."""
     errors = {}
     for name, noise in (("none", 0), ("some", 100)):
-        config = tiny.design(tmp_path, f"noise={{read_noise: {noise}, electrons: 9000}}")
-        errors[name] = [exposed(config, count) for count in (1, 2)]
+        study = tiny.built(tmp_path, f"noise={{read_noise: {noise}, electrons: 9000}}")
+        errors[name] = [exposed(study, count) for count in (1, 2)]
     assert errors["none"][1] == pytest.approx(errors["none"][0], rel=1e-9)
     assert errors["some"][1] > 1.01 * errors["some"][0]
     # As many captures as the reference takes have the electrons of the file each.
-    config = tiny.design(tmp_path, LIGHT, "pareto.captures.shots=[2]")
-    problem = build_problem(config)
-    given = pareto._of_shots(config, problem, 2)
+    study = tiny.built(tmp_path, LIGHT, "pareto.captures.shots=[2]")
+    problem = build_problem(study)
+    given = pareto._of_shots(study.config, problem, 2)
     for one, whole in ((given.data, problem.data), (given.exact, problem.exact)):
         counted = one.setup.noise.electrons * given.space.base.exposure
         np.testing.assert_allclose(counted, whole.setup.noise.electrons)
@@ -146,47 +145,42 @@ def test_captures_share_the_exposure(tmp_path):
 
 @pytest.mark.thorough
 def test_at_an_snr_each_capture_is_as_good_as_alone(tmp_path):
-    config = tiny.design(tmp_path)
-    assert exposed(config, 2) < 0.9 * exposed(config, 1)
+    study = tiny.built(tmp_path)
+    assert exposed(study, 2) < 0.9 * exposed(study, 1)
 
 
 def test_captures_are_simulated_with_their_part_of_the_light(on_a_grid, tmp_path, monkeypatch):
     """Half the captures of the reference's four hold twice the electrons each."""
     asked = []
 
-    def simulate(study, index, target, seeds):
+    def simulate(study, target, seeds):
         (method,) = study.methods
-        asked.append((method.shots[0].exposure, index, target.name, seeds))
-        assert study.sensor.electrons == config.noise.electrons
-        return {study.methods[0].name: [{"psnr_db": 20.0 + len(asked)}]}
+        asked.append((method.exposures[0].share, target.number, target.name, seeds))
+        assert study.sensor.electrons == study.config.noise.electrons
+        return {method.name: [{"psnr_db": 20.0 + len(asked)}]}
 
     best = []
 
-    def judged(config, asked, problem, before):
-        best.append((problem.space.base.captures, before))
-        return pareto._Judged(problem.space.base, 9.0, "", 0.1 / len(best))
+    def judged(self, problem, near, own):
+        best.append((problem.space.base.captures, near))
+        return FrontPoint(0.0, problem.space.base, 9.0, "", 0.1 / len(best))
 
     monkeypatch.setattr(pareto, "simulate", simulate)
-    monkeypatch.setattr(pareto, "_best", judged)
-    monkeypatch.setattr(
-        pareto, "_reference", lambda _, p: pareto._Judged(p.space.base, 1.0, "", 0.2)
-    )
-    config = tiny.design(
-        tmp_path, LIGHT, "pareto.captures.shots=[4, 1]", "search.limits.captures=8"
-    )
-    told = []
-    fronts = find_fronts(config, told.append)
-    assert len(told) == pareto_steps(config.pareto) == 4
+    monkeypatch.setattr(FrontSearches, "_best", judged)
+    monkeypatch.setattr(pareto, "_judge", lambda base, _: FrontPoint(0.0, base, 1.0, "", 0.2))
+    told = Told()
+    captures = ("pareto.captures.shots=[4, 1]", "search.limits.captures=8")
+    front = find_fronts(tiny.built(tmp_path, LIGHT, *captures), told).fronts["captures"]
+    assert len(told) == told.total == 4
     assert asked == [(2.0, 1, "picture", 1), (0.5, 1, "picture", 1)]
-    assert fronts.captures is not None
-    assert [p.simulated for p in fronts.captures.points] == [(("picture", v),) for v in (21, 22)]
-    assert fronts.captures.reference.cost == 4
-    assert [len(p.shots) for p in fronts.captures.points] == [1, 4]
+    assert [p.simulated for p in front.points] == [(("picture", v),) for v in (21, 22)]
+    assert front.reference.cost == 4
+    assert [len(p.shots) for p in front.points] == [1, 4]
     # A search for more begins at the best of fewer, its last shot taken again.
     (few, none), (many, before) = best
     assert (few, none, many) == (2, None, 8)
-    np.testing.assert_allclose(before.design.beta, [25.0] * 8)
-    assert before.design.exposure[0] == pytest.approx(4 / 8)
+    np.testing.assert_allclose(before.beta, [25.0] * 8)
+    assert before.exposure[0] == pytest.approx(4 / 8)
 
 
 def test_further_shots_are_as_the_last(tmp_path):
@@ -203,8 +197,7 @@ def test_further_shots_are_as_the_last(tmp_path):
 
 
 def test_resolution_ends_where_frequencies_or_pixels_do(tmp_path, monkeypatch):
-    problem = build_problem(tiny.design(tmp_path))
-    config, edge = tiny.design(tmp_path), 3.0 * 12.5 / 2
+    problem, edge = build_problem(tiny.built(tmp_path)), 3.0 * 12.5 / 2
     for found, distance, resolution, ends in (
         (edge, 3.0, edge, "at the band's end"),
         (np.inf, 3.0, edge, "at the band's end"),
@@ -214,7 +207,7 @@ def test_resolution_ends_where_frequencies_or_pixels_do(tmp_path, monkeypatch):
         values = (jnp.asarray(found), jnp.asarray(0.1))
         monkeypatch.setattr(pareto, "_exactly", lambda *_, values=values: values)
         near = eqx.tree_at(lambda d: d.distance, problem.space.base, jnp.full(4, distance))
-        judged = pareto._judge(config, near, problem.exact)
+        judged = pareto._judge(near, problem.exact)
         assert judged.resolution == pytest.approx(resolution)
         assert judged.ends == ends
 
@@ -238,8 +231,8 @@ def test_near_a_place_mask_pixels_hold(tmp_path):
         assert np.all(near.upper > near.lower)
 
 
-def test_an_objective_that_is_no_number_is_refused():
-    bad = pareto._Judged(None, np.nan, "", np.nan)
+def test_an_objective_that_is_nan_is_refused():
+    bad = FrontPoint(np.nan, tiny.found([25.0]), np.nan, "", np.nan)
     with pytest.raises(ConfigError, match="no number at any start"):
         pareto._known([bad])
     assert pareto._known([bad, bad._replace(error=0.1)]) == [bad._replace(error=0.1)]
@@ -249,7 +242,7 @@ def hand_made():
     """Fronts with a point of each sort."""
 
     def point(cost, resolution, error=0.1, ends="", simulated=()):
-        return Point(cost, (tiny.shot(20.0, 3.0),) * 2, resolution, ends, error, simulated)
+        return FrontPoint(cost, tiny.found([20.0, 20.0]), resolution, ends, error, simulated)
 
     lines = (point(2.0, 10.0), point(2.5, 12.0), point(3.0, 12.0), point(4.0, 18.75, ends="at it"))
     captures = (
@@ -259,7 +252,8 @@ def hand_made():
     )
     reference = point(3.0, 11.0, 0.08)
     line = Front(lines, reference)
-    return Fronts(line, Front(captures, reference._replace(cost=4.0)), line, 18.75, 0.04)
+    front = Front(captures, reference._replace(cost=4.0))
+    return Fronts({"thickness": line, "captures": front, "light": line}, 18.75, 0.04)
 
 
 def test_record_figure_and_tables(tmp_path):

@@ -4,35 +4,30 @@ import inspect
 import json
 from types import SimpleNamespace
 
-import jax
 import numpy as np
 import pytest
 import skimage.io
 from commands.design import tiny
+from commands.study.tiny import Told
 
+from thincam_jax.commands.checked_config import dump_config
+from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.design import problem as problem_of_search
 from thincam_jax.commands.design import run as running
-from thincam_jax.commands.design.compare import compare
 from thincam_jax.commands.design.figures import as_png, draw_landscape, draw_mtf, draw_responses
-from thincam_jax.commands.design.landscape import Landscape
 from thincam_jax.commands.design.page import findings
-from thincam_jax.commands.design.pareto import Front, Fronts, Point
-from thincam_jax.commands.design.problem import Goal
-from thincam_jax.commands.design.ranking import Candidate, Result
-from thincam_jax.commands.design.run import DesignFolder, run_design, steps
-from thincam_jax.commands.design.sensitivity import FreeValue
-from thincam_jax.commands.design.simulated import build_study, check_design
-from thincam_jax.commands.design.transfer import Transfer as ContrastTransfer
+from thincam_jax.commands.design.pareto import Front, FrontPoint, Fronts
+from thincam_jax.commands.design.problem import DesignObjective
+from thincam_jax.commands.design.ranking import Candidate, FoundDesigns
+from thincam_jax.commands.design.run import DesignFolder, run_design
+from thincam_jax.commands.design.simulation import as_study_config, compare, with_designs
+from thincam_jax.commands.design.surroundings import FreeValue, Landscape
+from thincam_jax.commands.design.transfer import Transfer
 from thincam_jax.commands.design.words import cells, free_number, in_words, told_of
-from thincam_jax.commands.study import build
-from thincam_jax.commands.study.config import (
-    ConfigError,
-    MethodConfig,
-    StudyConfig,
-    TargetConfig,
-    load_config,
-)
-from thincam_jax.commands.study.target import examine_target
+from thincam_jax.commands.run_folder import Step
+from thincam_jax.commands.study.build import build_study, noise_free, take
+from thincam_jax.commands.study.config import load_config
+from thincam_jax.commands.study.evaluate import evaluate_method
 from thincam_jax.design import find_designs, landscape
 from thincam_jax.design.search import Found, Search
 from thincam_jax.design.space import active_limits
@@ -57,28 +52,28 @@ def by_grid(goal, space, data, **options):
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
-    """One uninterrupted run: configuration, folder, what was found, the texts of its progress."""
+    """One uninterrupted run: the study, folder, what was found, the texts of its progress."""
     home = tmp_path_factory.mktemp("design")
-    config, texts = tiny.design(home), []
+    study, texts = tiny.built(home), Told()
     folder = DesignFolder(home / "out")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(problem_of_search, "find_designs", by_grid)
-        return config, folder.path, run_design(config, folder, texts.append), texts
+        return study, folder.path, run_design(study, folder, texts), texts
 
 
 @pytest.mark.thorough
 def test_searched_design_is_no_worse_than_the_grid(whole, tmp_path):
-    config = tiny.design(tmp_path, "search.samples=32", "search.steps=20")
-    design = run_design(config, DesignFolder(tmp_path / "out"), tiny.ignore)
+    study = tiny.built(tmp_path, "search.samples=32", "search.steps=20")
+    design = run_design(study, DesignFolder(tmp_path / "out"), tiny.ignore)
     assert design["search"]["evaluations"] > 32
     assert design["found"][0]["objective_exact"] <= whole[2]["found"][0]["objective_exact"]
     assert json.loads((tmp_path / "out" / "design.json").read_text("utf-8")) == design
 
 
 def test_what_is_written(whole):
-    config, path, design, texts = whole
+    _, path, design, texts = whole
     assert json.loads((path / "design.json").read_text("utf-8")) == design
-    assert len(texts) == steps(config) == 6
+    assert len(texts) == texts.total == 6
     assert {p.name for p in path.iterdir()} == {
         *("config.yaml", "found.yaml", "design.json", "environment.json", "report.html"),
         *("landscape.png", "responses.png", "mtf.png", "targets"),
@@ -105,14 +100,16 @@ def test_found_designs_are_better_and_within_bounds(whole):
 def test_found_study_gives_the_first_seed(whole):
     """`thincam run found.yaml` simulates the same captures."""
     _, path, design, _ = whole
-    study = load_config(path / "found.yaml")
+    study = build_study(load_config(path / "found.yaml"))
     names = [method.name for method in study.methods]
     assert names == ["pairs", *(one["name"] for one in design["found"][: len(names) - 1])]
-    evaluations = examine_target(study, 1, study.targets[1], {}, tiny.ignore).evaluations
-    for name in names:
+    picture = study.targets[1]
+    captures = {exposure: take(study, exposure, picture) for exposure in study.exposures}
+    for name, method in zip(names, study.methods, strict=True):
         trials = design["validation"]["methods"][name]["picture"]["psnr_db"]["values"]
         assert len(trials) == 2
-        assert trials[0] == evaluations[name].metrics["psnr_db"]
+        found = evaluate_method(study, method, picture, captures)
+        assert trials[0] == found.metrics["psnr_db"]
         assert trials[0] != trials[1]  # other noise
 
 
@@ -129,28 +126,25 @@ def test_report_stands_alone(whole):
     assert "kind: design" in page
 
 
-def shots_of(method):
-    return tuple(tiny.shot(s.beta, s.distance) for s in method.shots)
-
-
 @pytest.fixture
 def again(whole, monkeypatch):
     """The same design in another folder without the search; `found` may be changed."""
-    config, path, design, _ = whole
+    study, path, design, _ = whole
     methods = load_config(path / "found.yaml").methods[1:]
     found = tuple(
-        Candidate(
-            one["name"], tuple(tiny.shot(s.beta, s.distance) for s in m.shots), 0.1, 0.09, RINGS
-        )
+        Candidate(one["name"], tiny.found([s.beta for s in m.shots]), 0.1, 0.09, RINGS)
         for one, m in zip(design["found"][:2], methods, strict=True)
     )
-    again = SimpleNamespace(config=config, folder=DesignFolder(path.parent / "again"), found=found)
+    again = SimpleNamespace(study=study, folder=DesignFolder(path.parent / "again"), found=found)
 
-    def result(*_):
-        reference = again.found[0]._replace(name="pairs")
-        return Result(Goal("bayes_error"), reference, again.found, 1, 0, 2.5, 9.0, None)
+    class Finder:
+        def __init__(self, _):
+            reference = again.found[0]._replace(name="pairs")
+            objective, found = DesignObjective("bayes_error"), again.found
+            self.result = FoundDesigns(objective, reference, found, 1, 0, 2.5, 9.0, None)
+            self.work = []
 
-    monkeypatch.setattr(running, "find", result)
+    monkeypatch.setattr(running, "Finder", Finder)
     return again
 
 
@@ -158,59 +152,60 @@ def test_interrupted_design_goes_on(whole, again, monkeypatch):
     """The finished target is not simulated again, and the figures are those of a whole run."""
     simulate, simulated = running.simulate, []
 
-    def one_only(study, index, target, seeds):
+    def one_only(study, target, seeds):
         if simulated:
             raise KeyboardInterrupt
         simulated.append(target.name)
-        return simulate(study, index, target, seeds)
+        return simulate(study, target, seeds)
 
     def interrupted():
         with pytest.raises(KeyboardInterrupt):
-            run_design(again.config, again.folder, tiny.ignore)
+            run_design(again.study, again.folder, tiny.ignore)
         assert not (again.folder.path / "design.json").exists()
 
     monkeypatch.setattr(running, "simulate", one_only)
     interrupted()
     assert simulated == ["chart"]
     # Other designs are not taken for those that were simulated.
-    same, again.found = (
-        again.found,
-        tuple(one._replace(shots=(one.shots[0], tiny.shot(15.5, 3.0))) for one in again.found),
-    )
+    same = again.found
+    again.found = tuple(one._replace(design=tiny.found([20.0, 15.5])) for one in same)
     interrupted()
     again.found = same
     simulated.clear()
-    design = run_design(again.config, again.folder, tiny.ignore)
+    design = run_design(again.study, again.folder, tiny.ignore)
     assert simulated == ["picture"]
     assert design["validation"] == whole[2]["validation"]
     # A complete design is done anew.
     interrupted()
     with pytest.raises(ConfigError, match="holds a design of another configuration"):
-        again.folder.claim(again.config.model_copy(update={"seed": 4}))
+        again.folder.claim(again.study.config.model_copy(update={"seed": 4}))
 
 
 def test_fronts_are_written_and_reported(whole, again, monkeypatch, tmp_path):
     """They come after the targets, and count as progress."""
-    bounds, told = "{bounds: [12 rad/mm^2, 30 rad/mm^2], variable: beta}", []
-    config = tiny.design(
+    bounds, told = "{bounds: [12 rad/mm^2, 30 rad/mm^2], variable: beta}", Told()
+    study = tiny.built(
         tmp_path,
         f"search.free=[{bounds}, {{variable: distance, bounds: [2 mm, 3 mm]}}]",
         "pareto.thickness={bounds: [2 mm, 3 mm], points: 2}",
     )
     points = tuple(
-        Point(cost, (tiny.shot(20.0, cost),) * 2, 4 * cost, "", 0.1) for cost in (2.0, 3.0)
+        FrontPoint(cost, tiny.found([20.0] * 2, cost), 4 * cost, "", 0.1) for cost in (2.0, 3.0)
     )
 
-    def found(_, progress):
-        for point in (*points, *points[:1], *points[1:]):  # back, and there again
-            progress(f"thickness {point.cost}")
-        return Fronts(Front(points, points[1]), None, None, 18.75, None)
+    class FrontSearches:
+        def __init__(self, _, asked):
+            self.work = [
+                Step(f"thickness {c:g}", lambda: None) for c in asked.costs(2)["thickness"]
+            ]
 
-    monkeypatch.setattr(running, "find_fronts", found)
+        def result(self):
+            return Fronts({"thickness": Front(points, points[1])}, 18.75, None)
+
+    monkeypatch.setattr(running, "FrontSearches", FrontSearches)
     again.folder = DesignFolder(tmp_path / "fronts")
-    design = run_design(config, again.folder, told.append)
-    assert len(told) + 3 == steps(config)  # `find` is replaced
-    assert told[-3:] == ["thickness 2.0", "thickness 3.0", "report"]
+    design = run_design(study, again.folder, told)
+    assert told == ["chart", "picture", "thickness 2", "thickness 3", "report"]
     path = again.folder.path
     assert json.loads((path / "design.json").read_text("utf-8")) == design
     assert [p["thickness_mm"] for p in design["pareto"]["thickness"]["points"]] == [2.0, 3.0]
@@ -229,17 +224,13 @@ def metrics(psnr, step, pixel=0.1):
 
 
 def test_gains_are_taken_seed_by_seed():
-    study = StudyConfig.model_construct(
-        methods=tuple(MethodConfig.model_construct(name=n) for n in ("old", "new")),
-        targets=(TargetConfig.model_construct(name="a"),),
-    )
     trials = {
         "a": {
             "old": [metrics(20.0, 7), metrics(22.0, 8)],
             "new": [metrics(20.5, 9), metrics(22.9, 8)],
         }
     }
-    compared = compare(study, trials)
+    compared = compare(trials)
     assert "gain_db" not in compared["old"]["a"]
     gain = compared["new"]["a"]["gain_db"]
     assert gain["values"] == [0.5, 0.9]
@@ -248,101 +239,90 @@ def test_gains_are_taken_seed_by_seed():
     assert compared["new"]["a"]["gain_elements"]["values"] == [2, 0]
     # Not resolved, or exact: no number is made up.
     trials["a"]["old"][0] = metrics(None, None)
-    compared = compare(study, trials)
+    compared = compare(trials)
     assert compared["new"]["a"]["gain_db"] is None
     assert compared["new"]["a"]["gain_elements"] is None
     assert compared["old"]["a"]["resolved_object_mm"][0] is None
 
 
+def read_again(study, folder):
+    """As `thincam run` reads found.yaml."""
+    path = folder / "found.yaml"
+    path.write_text(dump_config(as_study_config(study)), encoding="utf-8")
+    return build_study(load_config(path))
+
+
 def test_shots_that_coincide_are_two_exposures(tmp_path):
-    config = tiny.design(tmp_path)
-    same = SimpleNamespace(name="found 1", shots=(tiny.shot(20.0, 3.0),) * 2)
-    method = build_study(config, [same]).methods[1]
-    assert len(build.settings(build_study(config, [same]), method)) == 4
-    assert len({shot.beta for shot in method.shots}) == 2
-    assert [shot.beta for shot in method.shots] == pytest.approx([20.0, 20.0], rel=1e-8)
-    config = tiny.design(tmp_path, "noise={read_noise: 0, electrons: 2e5}")
-    longer = SimpleNamespace(
-        name="found 1", shots=tuple(tiny.shot(20.0, 3.0, exposure=e) for e in (0.7, 1.3))
-    )
-    method = build_study(config, [longer]).methods[1]
-    assert [(s.beta, s.exposure) for s in method.shots] == [(20.0, 0.7), (20.0, 1.3)]
+    """In the simulation, and in the file of what was found."""
+    same = {"found 1": tiny.found([20.0, 17.0, 20.0])}
+    study = with_designs(tiny.built(tmp_path), same)
+    method = study.methods[1]
+    assert len(set(method.exposures)) == 6
+    assert [(shot.beta, shot.take) for shot in method.shots] == [(20, 1), (17, 1), (20, 2)]
+    assert read_again(study, tmp_path).methods == study.methods
+    electrons = "noise={read_noise: 0, electrons: 2e5}"
+    longer = {"found 1": tiny.found([20.0, 20.0], exposure=[0.7, 1.3])}
+    method = with_designs(tiny.built(tmp_path, electrons), longer).methods[1]
+    assert [(s.beta, s.share, s.take) for s in method.shots] == [(20, 0.7, 1), (20, 1.3, 1)]
 
 
 def test_only_the_simulation_has_the_pixels_of_a_display(tmp_path):
     settings = ("model=separable", "mask.pixel_pitch=50 um", "mask.fill_factor=0.9")
-    config = tiny.design(tmp_path, *settings)
-    study = build_study(config)
-    camera = build.build_camera(study, build.all_settings(study)[0])
+    study = tiny.built(tmp_path, *settings)
+    camera = study.camera(study.exposures[0])
     assert (camera.mask.pixels, float(camera.mask.fill_factor)) == (40, pytest.approx(0.9))
-    assert config.reference_design().cameras(camera.sensor)[0].mask.pixels is None
-    check_design(config)
+    reference = study.config.design(study.config.reference)
+    assert reference.cameras(camera.sensor)[0].mask.pixels is None
     with pytest.raises(ConfigError, match="mask"):
-        check_design(tiny.design(tmp_path, "mask.pixel_pitch=70 um"))
+        tiny.built(tmp_path, "mask.pixel_pitch=70 um")
 
 
 def test_electrons_are_those_of_the_file(tmp_path):
-    config = tiny.design(tmp_path, "noise={read_noise: 0, electrons: 2e5}")
-    study = build_study(config)
-    setting = build.all_settings(study)[0]
-    plane = build.build_plane(study, study.targets[0])
-    camera = build.build_camera(study, setting)
-    clean = build.imaging(study, camera, setting, plane)
-    noise = build.build_noise(study)
-    counted = electrons_per_unit(camera.sensor, clean)
+    study = tiny.built(tmp_path, "noise={read_noise: 0, electrons: 2e5}")
+    exposure, plane = study.exposures[0], study.targets[0].plane
+    clean = noise_free(study, exposure, plane)
+    counted = electrons_per_unit(study.camera(exposure).sensor, clean)
     assert float(counted[0, 0, 0]) == pytest.approx(2e5, rel=1e-4)
-    assert float(noise.variance(clean, counted)[0]) == pytest.approx(
+    assert float(study.noise.variance(clean, counted)[0]) == pytest.approx(
         float(clean.mean()) / 2e5, rel=1e-4
     )
-    assert float(build_noise_of(config, tiny.shot(20.0, 3.0, exposure=0.5))) == pytest.approx(
-        2 * float(clean.mean()) / 2e5, rel=0.05
-    )
-
-
-def build_noise_of(config, shot):
-    """Variance of the first capture of a found design, mm⁴."""
-    study = build_study(config, [SimpleNamespace(name="found 1", shots=(shot,) * 2)])
-    setting = build.settings(study, study.methods[1])[0]
-    plane = build.build_plane(study, study.targets[0])
-    return build.take(study, setting, plane, jax.random.key(0)).variance[0]
+    found = {"found 1": tiny.found([20.0, 17.0], exposure=0.5)}
+    found = with_designs(study, found)
+    variance = take(found, found.methods[1].exposures[0], found.targets[0]).variance[0]
+    assert float(variance) == pytest.approx(2 * float(clean.mean()) / 2e5, rel=0.05)
 
 
 def test_found_numbers_reach_the_simulation(tmp_path):
     """Width (in whole pixels of a display), wavelength and exposure; what all share is left out."""
-    config = tiny.design(
-        tmp_path, "noise={read_noise: 0, electrons: 2e5}", "mask.pixel_pitch=50 um"
-    )
-    found = tiny.shot(20.0, 2.5, width=1.49, wavelength=6e-4, exposure=0.7)
-    study = build_study(config, [SimpleNamespace(name="found 1", shots=(found,))])
-    (shot,) = study.methods[1].shots
-    setting = build.settings(study, study.methods[1])[0]
-    assert shot.width == pytest.approx(1.45)
-    assert setting[:1] + setting[2:] == pytest.approx((20.0, 2.5, 6e-4, 1.45, 0.7))
-    camera = build.build_camera(study, setting)
+    given = ("noise={read_noise: 0, electrons: 2e5}", "mask.pixel_pitch=50 um")
+    found = tiny.found([20.0], 2.5, width=1.49, wavelength=6e-4, exposure=0.7)
+    study = with_designs(tiny.built(tmp_path, *given), {"found 1": found})
+    exposure = study.methods[1].exposures[0]
+    assert exposure == pytest.approx((20.0, 0.0, 2.5, 6e-4, 1.45, 0.7, 1))
+    camera = study.camera(exposure)
     assert (camera.mask.pixels, float(camera.mask.width)) == (29, pytest.approx(1.45))
     assert float(camera.sensor.electrons) == pytest.approx(0.7 * 2e5)
-    assert study.methods[0].shots[0].model_dump(exclude_defaults=True).keys() == {
-        "beta",
-        "distance",
-    }
+    assert read_again(study, tmp_path).methods == study.methods
+    shot = as_study_config(study).methods[0].shots[0]
+    assert shot.model_dump(exclude_defaults=True).keys() == {"beta", "distance"}
 
 
 class TestPictures:
     def result(self, reference=(25.0, 21.0), goal="bayes_error", axes=2):
         found = Candidate(
             "found 1",
-            (tiny.shot(20.0, 3.0), tiny.shot(17.0, 3.0)),
+            tiny.found([20.0, 17.0]),
             0.1,
             0.09,
             np.ones(64),
             (FreeValue("beta", (1,), 20.0, 0.1), FreeValue("beta", (2,), 17.0, None)),
         )
-        old = found._replace(name="pairs", shots=tuple(tiny.shot(b, 3.0) for b in reference))
+        old = found._replace(name="pairs", design=tiny.found(reference))
         axis = np.linspace(12, 30, 7)
         named = tuple(("beta", (n,)) for n in range(1, axes + 1))
         level = np.linspace(0.09, 0.4, 7**axes).reshape((7,) * axes)
         around = Landscape(named, (axis,) * axes, level)
-        return Result(Goal(goal), old, (found,), 1, 0, 2.5, 18.75, around)
+        return FoundDesigns(DesignObjective(goal), old, (found,), 1, 0, 2.5, 18.75, around)
 
     def test_map_reaches_to_a_reference_beyond_it(self):
         for reference, right in (((25.0, 21.0), 31.5), ((40.0, 21.0), 40.0)):
@@ -352,7 +332,7 @@ class TestPictures:
             places = [tuple(float(c[0]) for c in line.get_data()) for line in ax.lines]
             assert places == [reference, (20.0, 17.0)]
             assert ax.get_xlabel() == "β of shot 1, rad/mm²"
-            assert figure.axes[1].get_ylabel() == Goal("bayes_error").label
+            assert figure.axes[1].get_ylabel() == DesignObjective("bayes_error").label
             assert as_png(figure).startswith(b"\x89PNG")
 
     @pytest.mark.parametrize("goal", ["limit", "worst_ratio", "unevenness"])
@@ -374,7 +354,7 @@ class TestPictures:
         """Common axes; a curve for the chain, and one for each sum of captures."""
         levels = np.linspace(1e-2, 1e-4, 64)
         sums = (((1,), (2,)), ((3,), (4,)))
-        transfer = ContrastTransfer(np.stack([levels, levels / 2]), levels * 50, sums)
+        transfer = Transfer(np.stack([levels, levels / 2]), levels * 50, sums)
         result = self.result()._replace(transfers=(transfer, transfer))
         figure = draw_mtf(result, 100.0)
         assert [ax.get_title() for ax in figure.axes] == ["pairs", "found 1"]

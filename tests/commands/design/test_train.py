@@ -7,10 +7,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from commands.design import tiny
+from commands.study.tiny import Told
 
 from thincam_jax.commands.design.problem import build_problem
-from thincam_jax.commands.design.ranking import find, find_steps
-from thincam_jax.commands.design.train import _reference_point, _starts, build_training, train
+from thincam_jax.commands.design.ranking import Finder
+from thincam_jax.commands.design.train import (
+    TrainingDescents,
+    _reference_point,
+    build_training,
+    start_points,
+)
+from thincam_jax.commands.run_folder import carry_out
 from thincam_jax.design import wiener_error
 from thincam_jax.design.search import evaluate
 
@@ -24,20 +31,31 @@ ASKED = (
 
 
 @pytest.fixture(scope="module")
-def config(tmp_path_factory):
-    return tiny.design(tmp_path_factory.mktemp("train"), *ASKED)
+def study(tmp_path_factory):
+    return tiny.built(tmp_path_factory.mktemp("train"), *ASKED)
 
 
 @pytest.fixture(scope="module")
-def trained(config):
-    config = config.model_copy(update={"train": config.train.model_copy(update={"steps": 12})})
-    start = np.array([0.9, 0.05])
-    return train(config, config.train, build_problem(config), [start], tiny.ignore)
+def config(study):
+    return study.config
+
+
+def setup_of(study):
+    return build_problem(study).data.setup
+
+
+@pytest.fixture(scope="module")
+def trained(study, config):
+    wanted = config.train.model_copy(update={"steps": 12})
+    descents = TrainingDescents(config, wanted, setup_of(study), [np.array([0.9, 0.05])])
+    for number in range(2):  # there is one
+        descents.descend(number)
+    return descents.finish()
 
 
 @dataclasses.dataclass(frozen=True)
 class Basins:
-    """Of both β: the lowest at (15, 15), another at (27, 20), and no number beside."""
+    """Of both β: the lowest at (15, 15), another at (27, 20), and NaN beside."""
 
     def __call__(self, design, data):
         first, second = design.beta[0], design.beta[2]
@@ -47,10 +65,17 @@ class Basins:
         return jnp.where(first < 14.5, jnp.nan, value)
 
 
+def starts_of(space, wanted, *points):
+    def values(at):
+        return np.asarray(evaluate(Basins(), space, None, at))
+
+    return start_points(space, values, [np.array(point) for point in points], wanted, 3)
+
+
 def test_descents_begin_at_the_best_points_apart(config):
     wanted = config.train.model_copy(update={"samples": 128, "starts": 4})
-    space, nowhere = config.space(), np.array([0.0, 0.5])
-    starts, count = _starts(config, wanted, Basins(), space, None, [nowhere, np.array([0.5, 0.9])])
+    space, nowhere = config.space(), [0.0, 0.5]
+    starts, count = starts_of(space, wanted, nowhere, [0.5, 0.9])
     assert count == 2 + 1 + 128  # with the reference
     values = np.asarray(evaluate(Basins(), space, None, starts))
     assert np.all(values[:2] < 4)
@@ -81,19 +106,21 @@ def test_the_reference_lies_in_the_cube(tmp_path):
 
 def test_the_reference_and_designs_of_the_search_can_be_starts(config):
     wanted = config.train.model_copy(update={"samples": 1, "starts": 10})
-    given = np.array([0.18, 0.16])
-    starts, count = _starts(config, wanted, Basins(), config.space(), None, [given])
-    assert count == 3 >= len(starts)  # the sample may meet no number
+    given = [0.18, 0.16]
+    starts, count = starts_of(config.space(), wanted, given)
+    assert count == 3 >= len(starts)  # the sample may meet NaN
     assert np.asarray(starts[0]) == pytest.approx(given)
     assert any(np.allclose(config.space().values(p), [25.0, 21.0]) for p in starts)
 
 
 @pytest.mark.thorough
-def test_descents_end_lower_than_they_began(config, trained):
+def test_descents_end_lower_than_they_began(study, config, trained):
     errors = [one.objective for one in trained.found]
     assert 0 < errors[0] < trained.reference
-    goal, training = trained.goal, build_training(config, config.train, build_problem(config))
-    start = evaluate(goal, config.space(), training, jnp.asarray([[0.9, 0.05]]), at_a_time=1)
+    training = build_training(config, config.train, setup_of(study))
+    start = evaluate(
+        trained.objective, config.space(), training, jnp.asarray([[0.9, 0.05]]), at_a_time=1
+    )
     assert errors[0] < float(start[0])
     assert trained.evaluations > 4 + 1  # more than those of the candidates, and a step
     space = config.space()
@@ -102,8 +129,8 @@ def test_descents_end_lower_than_they_began(config, trained):
         assert np.all(np.asarray(one.values) <= np.asarray(space.upper))
 
 
-def test_training_is_of_the_sensor_and_the_picture(config):
-    training = build_training(config, config.train, build_problem(config))
+def test_training_is_of_the_sensor_and_the_picture(study, config):
+    training = build_training(config, config.train, setup_of(study))
     # The field is 1.8 mm of the shorter side's 1.92.
     assert training.sensor.shape == (32, 32)
     assert float(training.sensor.pitch) == pytest.approx(0.06)
@@ -111,40 +138,42 @@ def test_training_is_of_the_sensor_and_the_picture(config):
     assert float(training.images.mean()) == pytest.approx(1)
 
 
-def test_pixels_show_the_finest_fringes(config):
+def test_pixels_show_the_finest_fringes(study, config):
     """30 rad/mm² over 1 mm are 9.55 cycles/mm: three pixels each of them, 55.003 over 1.92 mm."""
     asked = config.train.model_copy(update={"pixels": None})
-    training = build_training(config, asked, build_problem(config))
+    training = build_training(config, asked, setup_of(study))
     assert training.sensor.shape == (48, 48)  # as many as there are
     fine = config.sensor.model_copy(update={"shape": (96, 128), "pitch": 0.02})
     finer = config.model_copy(update={"sensor": fine})
-    assert build_training(finer, asked, build_problem(config)).sensor.shape == (56, 56)
+    assert build_training(finer, asked, setup_of(study)).sensor.shape == (56, 56)
 
 
 @pytest.mark.thorough
-def test_ranked_by_the_training_error(config):
+def test_ranked_by_the_training_error(tmp_path):
     # More starts than there are candidates.
-    config = config.model_copy(update={"train": config.train.model_copy(update={"starts": 10})})
-    steps = []
-    result = find(config, steps.append)
+    study, steps = tiny.built(tmp_path, *ASKED, "train.starts=10"), Told()
+    config, finder = study.config, Finder(study)
+    carry_out(finder.work, steps)
+    result = finder.result
     assert [text for text in steps if not text.startswith("training")] == [
         "search",
         "around the trained designs",
         "found designs",
         "landscape",
     ]
-    assert len(steps) == find_steps(config)
-    training = build_training(config, config.train, build_problem(config))
+    assert len(steps) == steps.total == 3 + 1 + 10 + 1
+    training = build_training(config, config.train, setup_of(study))
+    base = config.design(config.reference)
     error = eqx.filter_jit(wiener_error)
-    reference = float(error(config.reference_design(), training))
+    reference = float(error(base, training))
     assert result.reference.trained == pytest.approx(reference, rel=1e-6)
     errors = [one.trained for one in result.found]
     assert None not in errors and errors == sorted(errors)
     assert result.training.evaluations > 0
     around = result.training.landscape
-    assert around.goal.shape == (5, 5)
+    assert around.values.shape == (5, 5)
     betas = [jnp.repeat(jnp.asarray(around.axes[n][place]), 2) for n, place in ((0, 1), (1, 3))]
-    chosen = eqx.tree_at(lambda d: d.beta, config.reference_design(), jnp.concatenate(betas))
-    assert around.goal[1, 3] == pytest.approx(float(error(chosen, training)), rel=1e-6)
+    chosen = eqx.tree_at(lambda d: d.beta, base, jnp.concatenate(betas))
+    assert around.values[1, 3] == pytest.approx(float(error(chosen, training)), rel=1e-6)
     for one in result.found:
         assert [v.value for v in one.values] == pytest.approx([s.beta for s in one.shots])

@@ -6,7 +6,7 @@ import pytest
 
 from thincam_jax._core.grids import Grid
 from thincam_jax.commands.design import transfer
-from thincam_jax.commands.design.problem import Data
+from thincam_jax.commands.design.problem import ObjectiveData
 from thincam_jax.commands.design.transfer import modulation_transfer
 from thincam_jax.design import Polar, Quadrant, Setup, SignalNoise, shots
 from thincam_jax.design.objectives import Channels
@@ -19,7 +19,7 @@ HIGHEST = 18.75  # cycles/rad: 6.25 cycles/mm at 3 mm, where the zones of the ma
 DESIGN = shots([20.0, 15.0], DISTANCE, (0.0, 1.5 * np.pi), wavelength=WAVELENGTH, width=2.0)
 
 
-def data(snr_db=30.0, synthesis=None) -> Data:
+def data(snr_db=30.0, synthesis=None) -> ObjectiveData:
     """A sensor so wide that all the light of a narrow object falls on it."""
     setup = Setup(
         pitch=0.04,
@@ -30,7 +30,7 @@ def data(snr_db=30.0, synthesis=None) -> Data:
         pixel_integration=False,
     )
     matrix = jnp.asarray(phase_pairs(2) if synthesis is None else synthesis)
-    return Data(setup, matrix, Quadrant(jnp.asarray(HIGHEST), 160))
+    return ObjectiveData(setup, matrix, Quadrant(jnp.asarray(HIGHEST), 160))
 
 
 def rings_of(image, pitch):

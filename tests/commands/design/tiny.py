@@ -2,10 +2,13 @@
 
 from pathlib import Path
 
+import numpy as np
 from commands.study import tiny
 
 from thincam_jax.commands.design.config import DesignConfig, load_design
-from thincam_jax.commands.design.ranking import Shot
+from thincam_jax.commands.design.simulation import build_designs
+from thincam_jax.commands.study.study import Study
+from thincam_jax.design import Design
 
 TEXT = """\
 name: tiny design
@@ -54,10 +57,18 @@ def design(folder: Path, *overrides: str, text: str = TEXT) -> DesignConfig:
     return load_design(write(folder, text), overrides)
 
 
-def shot(beta: float, distance: float, **others: float) -> Shot:
-    """A shot of a found design, with the wavelength and the mask of the file."""
-    return Shot(**{"beta": beta, "distance": distance, "wavelength": 5e-4, "width": 2.0, **others})
+def built(folder: Path, *overrides: str, text: str = TEXT) -> Study:
+    return build_designs(design(folder, *overrides, text=text))
 
 
-def ignore(_: str) -> None:
+def found(betas, distances=3.0, width=2.0, **others) -> Design:
+    """A design of so many shots with the two phases, and the wavelength of the file."""
+    each = {"beta": betas, "distance": distances, "wavelength": 5e-4, **others}
+    numbers = np.broadcast_arrays(*each.values())
+    repeated = {name: np.repeat(n, 2) for name, n in zip(each, numbers, strict=True)}
+    phase = np.tile([0.0, 1.5 * np.pi], len(numbers[0]))
+    return Design(**repeated, phase=phase, width=width)
+
+
+def ignore(*_) -> None:
     """Progress that nobody watches."""

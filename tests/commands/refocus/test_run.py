@@ -7,22 +7,25 @@ import numpy as np
 import PIL.Image
 import pytest
 from commands.refocus import tiny
+from commands.study.tiny import Told
 
 from helpers import ROOT
-from thincam_jax.commands.refocus import build as study
+from thincam_jax.commands.checked_config import dump_config
+from thincam_jax.commands.config_file import ConfigError
+from thincam_jax.commands.refocus.build import build_refocus, field_shape, object_box, sweep_method
 from thincam_jax.commands.refocus.config import RefocusConfig, load_experiment
-from thincam_jax.commands.refocus.run import run_refocus, steps
+from thincam_jax.commands.refocus.run import run_refocus
 from thincam_jax.commands.run_folder import RunFolder
-from thincam_jax.commands.study.config import ConfigError, StudyConfig, dump_config, load_config
+from thincam_jax.commands.study.config import StudyConfig, load_config
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     home = tmp_path_factory.mktemp("refocus")
-    config, texts = tiny.experiment(home), []
+    study, texts = build_refocus(tiny.experiment(home)), Told()
     folder = RunFolder(home / "out")
-    metrics = run_refocus(config, folder, texts.append)
-    return config, folder.path, metrics, texts
+    metrics = run_refocus(study, folder, texts)
+    return study, folder.path, metrics, texts
 
 
 def test_both_objects_are_found(run):
@@ -59,8 +62,8 @@ def test_sweep_is_kept_as_numbers(run):
 
 
 def test_progress_and_files(run):
-    config, path, metrics, texts = run
-    assert len(texts) == steps(config) == 4 + 13 + 2 * 2 + 1
+    study, path, metrics, texts = run
+    assert len(texts) == texts.total == 4 + 13 + 2 * 2 + 1
     assert json.loads((path / "metrics.json").read_text("utf-8")) == metrics
     files = {p.relative_to(path).as_posix() for p in path.rglob("*") if p.is_file()}
     figures = {f"figures/{n}" for n in ("sweep.png", "sweep.webp", "focus.png", "depth.png")}
@@ -75,13 +78,13 @@ def test_progress_and_files(run):
         }
         | images
     )
-    assert load_experiment(path / "config.yaml") == config
+    assert load_experiment(path / "config.yaml") == study.config
 
 
 def test_animation_goes_there_and_back(run):
     with PIL.Image.open(run[1] / "figures" / "sweep.webp") as animation:
         assert animation.n_frames == 13 + 11
-        rows, columns = study.field_shape(run[0], run[0].sweep_method())
+        rows, columns = field_shape(run[0], sweep_method(run[0]))
         assert animation.size == (columns, rows + 24)
 
 
@@ -97,19 +100,19 @@ def test_report_stands_alone_and_is_escaped(run):
 
 def test_objects_stand_where_they_were_put(tmp_path):
     """An object's box in the projection: middle at d/t times its place, in pixels."""
-    config = tiny.experiment(tmp_path)
-    method = config.sweep_method()
-    rows, columns = study.field_shape(config, method)
-    for placed, plane in zip(config.objects, study.build_planes(config), strict=True):
+    study = build_refocus(tiny.experiment(tmp_path))
+    method = sweep_method(study)
+    rows, columns = field_shape(study, method)
+    for placed in study.targets:
         scale = 5.0 / placed.distance / 0.02
-        box = study.object_box(config, method, placed)
+        box = object_box(study, method, placed)
         middle = [(s.start + s.stop - 1) / 2 for s in box]
         wanted = [(rows - 1) / 2 + placed.y * scale, (columns - 1) / 2 + placed.x * scale]
         np.testing.assert_allclose(middle, wanted, atol=1.0)
         np.testing.assert_allclose([s.stop - s.start for s in box], placed.width * scale, atol=1.01)
-        image = np.asarray(plane.image)
+        image = np.asarray(placed.plane.image)
         y, x = (np.arange(n) - (n - 1) / 2 for n in image.shape)
-        pitch = float(plane.width) / image.shape[1]
+        pitch = float(placed.plane.width) / image.shape[1]
         centre = pitch * np.array([image.sum(1) @ y, image.sum(0) @ x]) / image.sum()
         np.testing.assert_allclose(centre, (placed.y, placed.x), atol=0.06 * placed.width)
 
@@ -146,7 +149,7 @@ def test_faults_are_told_in_one_line(override, part, tmp_path):
 )
 def test_what_only_building_shows_is_refused(override, part, tmp_path):
     with pytest.raises(ConfigError) as caught:
-        study.check_refocus(tiny.experiment(tmp_path, override))
+        build_refocus(tiny.experiment(tmp_path, override))
     (line,) = str(caught.value).split("\n")
     assert line.startswith(part)
 
@@ -155,7 +158,7 @@ def test_kinds_of_files(tmp_path):
     assert isinstance(load_experiment(ROOT / "configs" / "quick.yaml"), StudyConfig)
     shipped = load_experiment(ROOT / "configs" / "fza_refocus.yaml")
     assert isinstance(shipped, RefocusConfig)
-    study.check_refocus(shipped)
+    assert len(build_refocus(shipped).targets) == 2
     assert tiny.experiment(tmp_path, text=dump_config(shipped)) == shipped
     with pytest.raises(ConfigError, match="kind: 'sweep' is unknown; write 'kind: refocus'"):
         tiny.experiment(tmp_path, text="kind: sweep\n")

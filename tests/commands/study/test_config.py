@@ -7,13 +7,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from helpers import ROOT
-from thincam_jax.commands.study.config import (
-    ConfigError,
-    StudyConfig,
-    dump_config,
-    load_config,
-    slug,
-)
+from thincam_jax.commands.checked_config import dump_config
+from thincam_jax.commands.config_file import ConfigError, slug
+from thincam_jax.commands.study.config import StudyConfig, load_config
 from thincam_jax.imaging.targets import sample_images
 
 BASE = """\

@@ -6,7 +6,6 @@ import pytest
 from commands.study import tiny
 
 from thincam_jax._core.grids import Grid
-from thincam_jax.commands.study import build
 from thincam_jax.commands.study.evaluate import evaluate
 from thincam_jax.reconstruction import Reconstruction
 
@@ -14,64 +13,65 @@ CHART, PICTURE = 0, 1
 
 
 @pytest.fixture(scope="module")
-def config(tmp_path_factory):
-    return tiny.study(tmp_path_factory.mktemp("evaluate"))
+def study(tmp_path_factory):
+    return tiny.built(tmp_path_factory.mktemp("evaluate"))
 
 
-def scored(config, target, change, pitch=1.0):
+def scored(study, number, change, pitch=1.0):
     """The evaluation of the scene itself on pixels of `pitch`, after a change."""
-    plane = build.build_plane(config, config.targets[target])
+    target = study.targets[number]
+    plane = target.plane
     rows, columns = (round(float(n) / pitch) for n in (plane.height, plane.width))
     grid = Grid((rows, columns), pitch)
     image = np.asarray(plane.sample(grid, magnification=1.0), dtype=float)
     result = Reconstruction(jnp.asarray(change(image)), jnp.asarray(pitch))
-    return evaluate(config, config.methods[0], config.targets[target], plane, result)
+    return evaluate(study.methods[0], target, result)
 
 
 @pytest.mark.parametrize("target", [CHART, PICTURE])
-def test_perfect_but_for_gain_and_offset(config, target):
-    found = scored(config, target, lambda image: 7.0 * image - 3.0)
+def test_perfect_but_for_gain_and_offset(study, target):
+    found = scored(study, target, lambda image: 7.0 * image - 3.0)
     assert found.metrics["psnr_db"] is None  # infinite, which JSON does not have
     assert found.metrics["ssim"] > 0.9999
     assert found.image == pytest.approx(found.truth, abs=1e-5)  # in the scene's own units
 
 
-def test_small_error(config):
+def test_small_error(study):
     """An error of ±0.001, uncorrelated with the scene: 60 dB."""
     signs = np.random.default_rng(0).choice([-1e-3, 1e-3], (4000, 4000))
-    found = scored(config, PICTURE, lambda i: i + signs[: i.shape[-2], : i.shape[-1]], pitch=0.5)
+    found = scored(study, PICTURE, lambda i: i + signs[: i.shape[-2], : i.shape[-1]], pitch=0.5)
     assert found.metrics["psnr_db"] == pytest.approx(60, abs=0.05)
 
 
 @pytest.mark.parametrize("axis", [-1, -2])
-def test_mirrored(config, axis):
-    found = scored(config, PICTURE, lambda image: np.flip(image, axis))
+def test_mirrored(study, axis):
+    found = scored(study, PICTURE, lambda image: np.flip(image, axis))
     assert found.metrics["psnr_db"] < 25
     assert found.metrics["ssim"] < 0.9
 
 
-def test_channels_keep_their_place(config):
-    found = scored(config, PICTURE, lambda image: image[::-1])
+def test_channels_keep_their_place(study):
+    found = scored(study, PICTURE, lambda image: image[::-1])
     assert found.truth.shape == (60, 80, 3)
     assert found.metrics["psnr_db"] < 25
 
 
-def test_known_error(config):
+def test_known_error(study):
     """±0.1 in a checkerboard on a channel of variance V: the best gain leaves 0.01·V/(V + 0.01)."""
 
     def checkered(image):
         y, x = np.indices(image.shape[-2:])
         return image + 0.1 * (-1.0) ** (x + y)
 
-    found = scored(config, PICTURE, checkered)
+    found = scored(study, PICTURE, checkered)
     variance = found.truth.var(axis=(0, 1))
     expected = -10 * np.log10(np.mean(0.01 * variance / (variance + 0.01)))
     assert found.metrics["psnr_db"] == pytest.approx(expected, abs=0.02)
 
 
-def test_resolved_element_of_the_perfect_chart(config):
+def test_resolved_element_of_the_perfect_chart(study):
     """All that the pixels hold: a bar of 2.5 mm is 2.5 pixels; 80/6.67 … the coarsest is 5 mm."""
-    found = scored(config, CHART, lambda image: image, pitch=0.5)
+    found = scored(study, CHART, lambda image: image, pitch=0.5)
     resolved = found.metrics["resolved"]
     assert resolved["object_mm"] <= 2.5
     # Seen from the mask, d/t times smaller on the sensor.
@@ -83,14 +83,14 @@ def test_resolved_element_of_the_perfect_chart(config):
     assert coarsest == pytest.approx([1.0, 1.0], abs=0.05)
 
 
-def test_nothing_resolved_in_a_blurred_chart(config):
+def test_nothing_resolved_in_a_blurred_chart(study):
     def blurred(image):
         return image * 0.0 + np.linspace(0, 1, image.shape[-1])
 
-    assert scored(config, CHART, blurred, pitch=0.5).metrics["resolved"] is None
+    assert scored(study, CHART, blurred, pitch=0.5).metrics["resolved"] is None
 
 
-def test_a_picture_has_no_resolution(config):
-    found = scored(config, PICTURE, lambda image: image)
+def test_a_picture_has_no_resolution(study):
+    found = scored(study, PICTURE, lambda image: image)
     assert found.metrics["resolved"] is None
     assert found.contrast is None

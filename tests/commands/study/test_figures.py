@@ -1,5 +1,7 @@
 """How pictures are laid out: what is read, not how it looks."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from commands.study import tiny
@@ -29,14 +31,14 @@ def test_many_methods_go_into_several_bands(count, rows, columns):
 
 
 def test_methods_of_the_same_captures_and_sums_share_a_transfer_function(tmp_path):
-    config = tiny.study(tmp_path)
-    first = config.methods[0]
-    twin = first.model_copy(update={"name": "twin"})
-    other = config.model_copy(update={"methods": (*config.methods, twin)})
+    study = tiny.built(tmp_path)
+    first = study.methods[0]
+    twin = dataclasses.replace(first, name="twin")
+    other = dataclasses.replace(study, methods=(*study.methods, twin))
     responses = {
         m.name: Response(np.arange(3.0), np.full(3, float(n)), {})
         for n, m in enumerate(other.methods)
     }
     panels = _by_synthesis(other, responses)
-    assert [title for title, _ in panels] == [f"{first.name}; twin", config.methods[1].name]
+    assert [title for title, _ in panels] == [f"{first.name}; twin", study.methods[1].name]
     assert panels[0][1] is responses[first.name]

@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from thincam_jax.commands.run_folder import RunFolder
+from thincam_jax.commands.study.build import build_study
 from thincam_jax.commands.study.config import load_config
 from thincam_jax.commands.study.run import run_study
 
@@ -25,7 +26,7 @@ def test_total_variation_beside_wiener(tmp_path):
             "targets": whole.targets[:1],
         }
     )
-    metrics = run_study(config, RunFolder(tmp_path / "gain"), lambda text: None)
+    metrics = run_study(build_study(config), RunFolder(tmp_path / "gain"), lambda *_: None)
     psnr = {n: m["targets"]["astronaut"]["psnr_db"] for n, m in metrics["methods"].items()}
     assert psnr["single capture, ADMM-TV"] > psnr["single capture, Wiener"] + 10
     assert psnr["single capture, ADMM-TV"] > psnr["method B, Wiener"]

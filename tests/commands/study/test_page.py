@@ -11,6 +11,7 @@ from commands.study import tiny
 
 from thincam_jax.commands.doctor import environment
 from thincam_jax.commands.run_folder import RunFolder
+from thincam_jax.commands.study.build import build_study
 from thincam_jax.commands.study.page import findings, render
 from thincam_jax.commands.study.run import run_study
 
@@ -23,7 +24,7 @@ def run(tmp_path_factory):
     quoted = EVIL.replace("'", "''")
     config = tiny.study(home, f"title='{quoted}'", f"notes=['{quoted}', A second note.]")
     folder = RunFolder(home / "out")
-    metrics = run_study(config, folder, tiny.ignore)
+    metrics = run_study(build_study(config), folder, tiny.ignore)
     return config, folder, metrics, (folder.path / "report.html").read_text("utf-8")
 
 

@@ -5,8 +5,6 @@ import pytest
 from commands.study import tiny
 
 import thincam_jax as tc
-from thincam_jax.commands.study import build
-from thincam_jax.commands.study.config import MethodConfig
 from thincam_jax.commands.study.response import method_response
 
 
@@ -15,27 +13,25 @@ from thincam_jax.commands.study.response import method_response
 )
 def test_contrasts_carry_all_but_the_common_part(betas, phases, tmp_path):
     """Σ|contrast|² = Σ|H|² − |ΣH|²/n, over all captures; also with one phase a shot."""
-    config = tiny.study(tmp_path)
-    method = MethodConfig.model_validate(
-        {
-            "name": "contrasts",
-            "kind": "wiener",
-            "synthesis": "contrasts",
-            "phases": phases,
-            "shots": [{"beta": f"{b} rad/mm^2", "distance": "3 mm"} for b in betas],
-        }
+    shots = [{"beta": f"{b} rad/mm^2", "distance": "3 mm"} for b in betas]
+    study = tiny.built(
+        tmp_path,
+        "methods.1.synthesis=contrasts",
+        f"methods.1.phases={phases}",
+        f"methods.1.shots={shots}",
     )
-    found = method_response(config, method)
+    method = study.methods[1]
+    found = method_response(study, method)
     count = len(betas) * len(phases)
     each = [
         tc.otf(
-            build.build_camera(config, setting),
-            wavelength=setting.wavelength,
-            object_distance=config.object.distance,
-            model=config.model,
+            study.camera(exposure),
+            wavelength=exposure.wavelength,
+            object_distance=100.0,
+            model="geometric",
             pixel_integration=False,
         )[24, 32:]
-        for setting in build.settings(config, method)
+        for exposure in method.exposures
     ]
     assert len(each) == count
     profiles = np.stack(each)

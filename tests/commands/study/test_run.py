@@ -3,18 +3,19 @@
 import gc
 import json
 
-import jax
 import numpy as np
 import pytest
 import skimage.io
 from commands.study import tiny
 
+from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.run_folder import RunFolder
-from thincam_jax.commands.study import build
-from thincam_jax.commands.study.check import check_study
-from thincam_jax.commands.study.config import ConfigError, load_config
+from thincam_jax.commands.study import run as running
+from thincam_jax.commands.study.build import build_study, take
+from thincam_jax.commands.study.config import load_config
+from thincam_jax.commands.study.evaluate import evaluate_method
 from thincam_jax.commands.study.response import method_response
-from thincam_jax.commands.study.run import run_study, steps
+from thincam_jax.commands.study.run import run_study
 
 
 @pytest.fixture(scope="module")
@@ -24,15 +25,15 @@ def home(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def whole(home):
-    """One uninterrupted run: configuration, folder, metrics, the texts of its progress."""
-    config, texts = tiny.study(home), []
+    """One uninterrupted run: the study, folder, metrics, the texts of its progress."""
+    study, texts = tiny.built(home), tiny.Told()
     folder = RunFolder(home / "whole")
-    metrics = run_study(config, folder, texts.append)
-    return config, folder.path, metrics, texts
+    metrics = run_study(study, folder, texts)
+    return study, folder.path, metrics, texts
 
 
 def test_metrics_hold_every_method_and_target(whole):
-    config, path, metrics, _ = whole
+    _, path, metrics, _ = whole
     assert json.loads((path / "metrics.json").read_text("utf-8")) == metrics
     assert metrics["study"] == "tiny"
     assert metrics["seed"] == 3
@@ -58,7 +59,6 @@ def test_metrics_hold_every_method_and_target(whole):
         "limit_cycles_per_mm": 10.8,
     }
     assert set(metrics["methods"]["pairs"]["published"].values()) == {None}
-    assert config.methods[0].published.psnr_db == 20.3
 
 
 def test_resolved_element_is_given_on_the_object_and_on_the_sensor(whole):
@@ -78,14 +78,14 @@ def test_reconstruction_is_upright(whole):
 
 
 def test_progress_is_reported_as_often_as_announced(whole):
-    config, _, _, texts = whole
-    assert len(texts) == steps(config) == 2 * (tiny.CAPTURES + 2) + 2 + 1
+    texts = whole[3]
+    assert len(texts) == texts.total == 2 * (tiny.CAPTURES + 2) + 2 + 1
     assert texts[0].startswith("chart: ")
     assert texts[-1] == "report"
 
 
 def test_folder_holds_what_it_says_and_nothing_half(whole):
-    config, path, _, _ = whole
+    study, path, _, _ = whole
     files = {p.relative_to(path).as_posix() for p in path.rglob("*") if p.is_file()}
     expected = {"config.yaml", "metrics.json", "environment.json", "report.html"}
     expected |= {"targets/chart.json", "targets/picture.json"}
@@ -94,7 +94,7 @@ def test_folder_holds_what_it_says_and_nothing_half(whole):
     expected |= {f"figures/{n}.png" for n in ("mtf", "contrast", "psf")}
     expected |= {f"figures/target-{n}.png" for n in ("chart", "picture")}
     assert files == expected
-    assert load_config(path / "config.yaml") == config
+    assert load_config(path / "config.yaml") == study.config
     environment = json.loads((path / "environment.json").read_text("utf-8"))
     assert environment["seed"] == 3
     assert environment["versions"]["jax"]
@@ -106,7 +106,7 @@ def test_same_seed_same_bytes_other_seed_other_noise(whole, home):
     bytes_of = (whole[1] / "metrics.json").read_bytes()
     assert (again.path / "metrics.json").read_bytes() == bytes_of
     other = RunFolder(home / "other")
-    metrics = run_study(tiny.study(home, "seed=4"), other, tiny.ignore)
+    metrics = run_study(tiny.built(home, "seed=4"), other, tiny.ignore)
     for name, method in metrics["methods"].items():
         for target, found in method["targets"].items():
             before = whole[2]["methods"][name]["targets"][target]["psnr_db"]
@@ -115,29 +115,29 @@ def test_same_seed_same_bytes_other_seed_other_noise(whole, home):
 
 
 def counted(monkeypatch):
-    """The settings, channels and keys of all captures taken from here on."""
-    taken, take = [], build.take
+    """The exposures, channels and noise of all captures taken from here on."""
+    taken = []
 
-    def counting(config, setting, plane, key):
-        numbers = np.asarray(jax.random.key_data(key)).tolist()
-        taken.append((setting, plane.image.shape[0], tuple(numbers)))
-        return take(config, setting, plane, key)
+    def counting(study, exposure, target):
+        found = take(study, exposure, target)
+        taken.append((exposure, len(found.image), found.image.tobytes()))
+        return found
 
-    monkeypatch.setattr(build, "take", counting)
+    monkeypatch.setattr(running, "take", counting)
     return taken
 
 
 def test_interrupted_run_goes_on_where_it_stopped(whole, home, monkeypatch):
-    config, path, metrics, texts = whole
+    study, path, metrics, texts = whole
     folder = RunFolder(home / "interrupted")
     taken = counted(monkeypatch)
 
-    def interrupt(text):
+    def interrupt(text, _):
         if text.startswith("picture: capture 3"):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        run_study(config, folder, interrupt)
+        run_study(study, folder, interrupt)
     assert len(taken) == tiny.CAPTURES + 2
     assert folder.finished("chart") is not None
     assert folder.finished("picture") is None
@@ -145,11 +145,12 @@ def test_interrupted_run_goes_on_where_it_stopped(whole, home, monkeypatch):
     assert not list(folder.path.rglob("*.partial*"))
 
     taken.clear()
-    progress = []
-    assert run_study(config, folder, progress.append) == metrics
+    progress = tiny.Told()
+    assert run_study(study, folder, progress) == metrics
     assert len(taken) == tiny.CAPTURES
     assert {channels for _, channels, _ in taken} == {3}  # the chart, in grey, was not redone
-    assert len(progress) == len(texts)
+    assert progress == [text for text in texts if not text.startswith("chart: ")]
+    assert progress.total == len(progress)
     assert (folder.path / "metrics.json").read_bytes() == (path / "metrics.json").read_bytes()
     # The chart's figures of the first part are in the report of the second.
     assert (folder.path / "figures" / "contrast.png").exists()
@@ -165,12 +166,12 @@ def test_captures_that_methods_share_are_taken_once(whole, monkeypatch):
         quarter = round(np.pi / 2, 6)
         phases = [0.0, quarter, round(np.pi, 6), round(3 * np.pi / 2, 6)]
         assert settings == [(25.0, p) for p in phases] + [(21.0, 0.0), (21.0, phases[3])]
-    assert len({key for _, _, key in taken}) == len(taken)  # every capture has noise of its own
+    assert len({image for _, _, image in taken}) == len(taken)  # each has noise of its own
 
 
 def test_broken_result_of_a_target_is_done_again(home, whole):
     folder = RunFolder(home / "broken")
-    folder.claim(whole[0])
+    folder.claim(whole[0].config)
     (folder.path / "targets" / "chart.json").write_text('{"metrics": {"conv', encoding="utf-8")
     assert folder.finished("chart") is None
     assert folder.finished("picture") is None
@@ -178,7 +179,7 @@ def test_broken_result_of_a_target_is_done_again(home, whole):
 
 def test_folder_of_another_study_is_refused(whole, home):
     before = (whole[1] / "metrics.json").read_bytes()
-    other = tiny.study(home, "seed=5")
+    other = tiny.built(home, "seed=5")
     with pytest.raises(ConfigError, match="holds a run of another configuration") as caught:
         run_study(other, RunFolder(whole[1]), tiny.ignore)
     assert "delete this one" in str(caught.value)
@@ -203,7 +204,7 @@ def test_folder_whose_configuration_is_no_text_is_refused(home, whole):
     folder.path.mkdir()
     (folder.path / "config.yaml").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(ConfigError, match="another configuration"):
-        folder.claim(whole[0])
+        folder.claim(whole[0].config)
 
 
 class TestCheck:
@@ -211,12 +212,12 @@ class TestCheck:
 
     def line(self, config):
         with pytest.raises(ConfigError) as caught:
-            check_study(config)
+            build_study(config)
         (line,) = str(caught.value).split("\n")
         return line
 
     def test_sound_study(self, tmp_path):
-        check_study(tiny.study(tmp_path))
+        assert len(tiny.built(tmp_path).targets) == 2
 
     def test_missing_image(self, tmp_path):
         config = tiny.study(tmp_path, "targets.1.path=nowhere.png")
@@ -248,7 +249,7 @@ class TestCheck:
 
     def test_object_of_a_few_pixels(self, tmp_path):
         with pytest.raises(ConfigError) as caught:
-            check_study(tiny.study(tmp_path, "object.width=7 mm"))
+            tiny.built(tmp_path, "object.width=7 mm")
         first, second = str(caught.value).split("\n")
         assert first.startswith("targets[0]: 'conventional' reconstructs it on 6×6 pixels")
         assert second.startswith("targets[1]: 'conventional' reconstructs it on 4×6 pixels")
@@ -270,7 +271,7 @@ def test_pictures_alone_give_a_report(tmp_path, home):
     """Without a chart nothing is resolved; a target may be called like one of the figures."""
     only = f"targets=[{{name: mtf, kind: file, path: {tmp_path / 'picture.png'}}}]"
     folder = RunFolder(tmp_path / "out")
-    metrics = run_study(tiny.study(tmp_path, only), folder, tiny.ignore)
+    metrics = run_study(tiny.built(tmp_path, only), folder, tiny.ignore)
     for method in metrics["methods"].values():
         assert method["targets"]["mtf"]["resolved"] is None
     assert not (folder.path / "figures" / "contrast.png").exists()
@@ -280,17 +281,8 @@ def test_pictures_alone_give_a_report(tmp_path, home):
 
 
 def test_smallest_sensor_that_is_let_through_gives_finite_results(tmp_path):
-    config = tiny.study(tmp_path, "sensor.shape=[7, 42]", "seed=1")
-    check_study(config)
-    method, target = config.methods[1], config.targets[0]
-    plane = build.build_plane(config, target)
-    captures = [
-        build.take(config, setting, plane, build.capture_key(config, 0, number))
-        for number, setting in enumerate(build.settings(config, method))
-    ]
-    reconstruct = build.build_reconstructor(
-        config, method, build.field_shape(config, method, plane)
-    )
-    images, variances = (jax.numpy.stack(values) for values in zip(*captures, strict=True))
-    assert reconstruct(images, variances).status == "ok"
-    assert np.isfinite(method_response(config, method).metrics["cut_off_cycles_per_mm"])
+    study = tiny.built(tmp_path, "sensor.shape=[7, 42]", "seed=1")
+    method, target = study.methods[1], study.targets[0]
+    captures = {exposure: take(study, exposure, target) for exposure in method.exposures}
+    assert np.isfinite(evaluate_method(study, method, target, captures).metrics["psnr_db"])
+    assert np.isfinite(method_response(study, method).metrics["cut_off_cycles_per_mm"])

@@ -9,7 +9,9 @@ from pathlib import Path
 import numpy as np
 import skimage.io
 
+from thincam_jax.commands.study.build import build_study
 from thincam_jax.commands.study.config import StudyConfig, load_config
+from thincam_jax.commands.study.study import Study
 
 TEXT = """\
 name: tiny
@@ -66,5 +68,17 @@ def study(folder: Path, *overrides: str, text: str = TEXT) -> StudyConfig:
     return load_config(write(folder, text), overrides)
 
 
-def ignore(_: str) -> None:
+def built(folder: Path, *overrides: str, text: str = TEXT) -> Study:
+    return build_study(study(folder, *overrides, text=text))
+
+
+def ignore(*_) -> None:
     """Progress that nobody watches."""
+
+
+class Told(list[str]):
+    """The texts of a run's progress, each of which was told the number of all."""
+
+    def __call__(self, text: str, total: int) -> None:
+        self.append(text)
+        self.total = total

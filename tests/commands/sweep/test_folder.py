@@ -6,7 +6,8 @@ import pyarrow.parquet as pq
 import pytest
 from commands.sweep import mini
 
-from thincam_jax.commands.study.config import ConfigError, load_config
+from thincam_jax.commands.config_file import ConfigError
+from thincam_jax.commands.study.config import load_config
 from thincam_jax.commands.sweep.folder import SweepFolder
 from thincam_jax.commands.sweep.measure import Outcome
 

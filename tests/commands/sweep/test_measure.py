@@ -1,22 +1,19 @@
 """One point: its columns, that they are those of a run, and what is compiled anew."""
 
 import jax
-import numpy as np
 import pytest
 from commands.study import tiny
 from commands.sweep import mini
 
 from thincam_jax.commands.run_folder import RunFolder
-from thincam_jax.commands.study.response import Response
+from thincam_jax.commands.study.build import build_study
 from thincam_jax.commands.study.run import run_study
 from thincam_jax.commands.sweep.measure import measure_point
 
 
 def test_columns_are_the_metrics_of_a_run(tmp_path, monkeypatch):
-    for name in ("_write_report", "figures.save_target"):
-        monkeypatch.setattr(f"thincam_jax.commands.study.run.{name}", lambda *_: None)
-    no_limits = Response(np.zeros(1), np.zeros(1), {})
-    monkeypatch.setattr("thincam_jax.commands.study.run.method_response", lambda *_: no_limits)
+    for name in ("save_target", "save_responses", "save_contrasts", "save_psf"):
+        monkeypatch.setattr(f"thincam_jax.commands.study.figures.{name}", lambda *_: None)
     targets = tiny.TEXT[tiny.TEXT.index("  - {name: chart") :]
     config = tiny.study(tmp_path, text=mini.TEXT[: mini.TEXT.index("  - {name: star")] + targets)
     (point,) = mini.points(config, "seed=0", double=True)
@@ -25,7 +22,8 @@ def test_columns_are_the_metrics_of_a_run(tmp_path, monkeypatch):
     row = measured.metrics
     assert row is not None
     assert row.pop("seconds") > 0
-    expected, methods = {}, run_study(config, RunFolder(tmp_path / "run"), tiny.ignore)["methods"]
+    expected, study = {}, build_study(config)
+    methods = run_study(study, RunFolder(tmp_path / "run"), tiny.ignore)["methods"]
     for name, method in methods.items():
         mean = sum(target["psnr_db"] for target in method["targets"].values()) / 2
         expected[f"mean_psnr_db/{name}"] = pytest.approx(mean, abs=1e-4)
@@ -81,7 +79,7 @@ def test_defect_is_a_reason_with_its_traceback(tmp_path, monkeypatch):
     def broken(_):
         raise ZeroDivisionError("a\n  defect")
 
-    monkeypatch.setattr("thincam_jax.commands.sweep.measure.check_study", broken)
+    monkeypatch.setattr("thincam_jax.commands.sweep.measure.build_study", broken)
     (point,) = mini.points(mini.study(tmp_path), "seed=1")
     measured = measure_point(point.config, False)
     assert measured.reason == "ZeroDivisionError: a"

@@ -6,7 +6,7 @@ import socket
 import distributed
 import pytest
 
-from thincam_jax.commands.study.config import ConfigError
+from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.sweep import scheduler as schedulers
 from thincam_jax.commands.sweep.scheduler import scheduled_workers
 

@@ -7,6 +7,7 @@ import pytest
 import scipy.special
 
 from helpers import ROOT, relative_l2
+from thincam_jax.commands.study.build import assemble
 from thincam_jax.commands.study.config import load_config
 from thincam_jax.commands.study.response import method_response
 from thincam_jax.imaging.metrics import (
@@ -176,7 +177,8 @@ def responses(distance, methods, **changes):
     changes = {"object.distance": f"{distance} mm", **changes}
     overrides = tuple(f"{key}={value}" for key, value in changes.items())
     config = load_config(ROOT / "configs" / "fza_superresolution.yaml", overrides)
-    return [method_response(config, config.methods[index]) for index in methods]
+    study = assemble(config, ())
+    return [method_response(study, study.methods[index]) for index in methods]
 
 
 @pytest.fixture(scope="module")

@@ -1,5 +1,7 @@
 """What is compared: a study's camera with binned pixels in both precisions, and one target."""
 
+import dataclasses
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -8,11 +10,11 @@ from jaxtyping import Array, ArrayLike, Num
 
 from thincam_jax._core.grids import Grid
 from thincam_jax._core.precision import PRECISIONS, Precision, allow, cast
-from thincam_jax.commands.study import build
-from thincam_jax.commands.study.check import check_study
-from thincam_jax.commands.study.config import ConfigError, MethodConfig, StudyConfig, TargetConfig
+from thincam_jax.commands.config_file import ConfigError
+from thincam_jax.commands.sections import SensorConfig
+from thincam_jax.commands.study.build import check_study
+from thincam_jax.commands.study.study import Exposure, Method, Study, Target
 from thincam_jax.imaging.operators import kernel_shape
-from thincam_jax.imaging.scene import ImagePlane
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.forward import projected_shape
 from thincam_jax.lensless.method import Model
@@ -22,43 +24,43 @@ DEFAULT_SIZES = (128, 256, 512)  # pixels along the longer side
 DEFAULT_CAPTURE_SIZE = 256
 
 
-def own_size(config: StudyConfig) -> int:
+def own_size(sensor: SensorConfig) -> int:
     """Pixels along the longer side of the study's own sensor."""
-    return max(config.sensor.shape)
+    return max(sensor.shape)
 
 
-def sizes_of(config: StudyConfig, asked: tuple[int, ...]) -> tuple[int, ...]:
+def sizes_of(sensor: SensorConfig, asked: tuple[int, ...]) -> tuple[int, ...]:
     """The sizes asked for, or the default ones and the study's own; each once, smallest first.
 
     **Errors**: ConfigError for a size that is not positive or above the study's own.
     """
     for size in asked:
-        _check("--size", size, own_size(config))
-    own = own_size(config)
+        _check("--size", size, own_size(sensor))
+    own = own_size(sensor)
     wanted = asked or (*(s for s in DEFAULT_SIZES if s < own), own)
     return tuple(sorted(set(wanted)))
 
 
-def capture_size_of(config: StudyConfig, asked: int | None) -> int:
+def capture_size_of(sensor: SensorConfig, asked: int | None) -> int:
     """The size for captures and reconstructions; errors as for `sizes_of`."""
     if asked is None:
-        return min(DEFAULT_CAPTURE_SIZE, own_size(config))
-    _check("--capture-size", asked, own_size(config))
+        return min(DEFAULT_CAPTURE_SIZE, own_size(sensor))
+    _check("--capture-size", asked, own_size(sensor))
     return asked
 
 
-def binned(config: StudyConfig, size: int) -> StudyConfig:
+def binned(study: Study, size: int) -> Study:
     """The study with its pixels binned so that the sensor's longer side has `size` of them.
 
     The pitch grows by the same ratio, so that the sensor keeps its area: along the longer side
     exactly, along the shorter one to half a pixel. The mask stays as it is.
     """
-    ratio = own_size(config) / size
-    rows, columns = (max(1, round(n / ratio)) for n in config.sensor.shape)
-    sensor = config.sensor.model_copy(
-        update={"shape": (rows, columns), "pitch": config.sensor.pitch * ratio}
+    ratio = own_size(study.sensor) / size
+    rows, columns = (max(1, round(n / ratio)) for n in study.sensor.shape)
+    sensor = study.sensor.model_copy(
+        update={"shape": (rows, columns), "pitch": study.sensor.pitch * ratio}
     )
-    return config.model_copy(update={"sensor": sensor})
+    return dataclasses.replace(study, sensor=sensor)
 
 
 def _check(option: str, size: int, own: int) -> None:
@@ -78,38 +80,38 @@ class Conditions(NamedTuple):
     object_distance: Array
 
 
-def conditions_of(config: StudyConfig, setting: build.Setting) -> dict[Precision, Conditions]:
-    """One setting in each precision. The numbers are those of float32 in both.
+def conditions_of(study: Study, exposure: Exposure) -> dict[Precision, Conditions]:
+    """One exposure in each precision. The numbers are those of float32 in both.
 
     So a difference between the two is what the arithmetic leaves, not how the numbers are stored.
     """
     found: dict[Precision, Conditions] = {}
     with allow("float64"):
-        numbers = (setting.wavelength, config.object.distance)
+        numbers = (exposure.wavelength, study.object_distance)
         wavelength, distance = (jnp.asarray(np.float32(n)) for n in numbers)
-        single = cast(build.build_camera(config, setting), "float32")
+        single = cast(study.camera(exposure), "float32")
         for precision in PRECISIONS:
             found[precision] = Conditions(*cast((single, wavelength, distance), precision))
     return found
 
 
 def psf_of(
-    config: StudyConfig,
-    setting: build.Setting,
+    study: Study,
+    exposure: Exposure,
     model: Model = "separable",
     precision: Precision = "float64",
     shape: tuple[int, int] | None = None,
 ) -> np.ndarray:
     """PSF on the sensor, or on `shape` of its pixels; by default the one that errors count from."""
     with allow(precision):
-        camera, wavelength, distance = conditions_of(config, setting)[precision]
+        camera, wavelength, distance = conditions_of(study, exposure)[precision]
         grid = camera.sensor.grid
         h = psf(
             camera,
             wavelength=wavelength,
             object_distance=float(distance),
             model=model,
-            pixel_integration=config.pixel_integration,
+            pixel_integration=study.config.pixel_integration,
             grid=Grid(shape, grid.pitch) if shape else grid,
             precision=precision,
         )
@@ -130,48 +132,45 @@ def contrast_error(
     return relative_error(*(c - c.mean(axis=(-2, -1), keepdims=True) for c in contrasts))
 
 
-class Case(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Case:
     """A target in front of a study's camera with binned pixels.
 
-    - `config`: the binned study, with the exact model.
+    - `study`: the binned study, with the exact model.
     - `method`: the method that reconstructs; its first exposure is the one captured.
-    - `target`, `plane`: what is seen; `number` is the target's place in the study.
+    - `target`: what is seen.
     - `skipped`: why nothing is reconstructed; None where something is.
     """
 
-    config: StudyConfig
-    method: MethodConfig
-    target: TargetConfig
-    plane: ImagePlane
-    number: int
+    study: Study
+    method: Method
+    target: Target
     skipped: str | None
 
     @property
-    def settings(self) -> list[build.Setting]:
+    def exposures(self) -> tuple[Exposure, ...]:
         """The method's exposures."""
-        return build.settings(self.config, self.method)
+        return self.method.exposures
 
     @property
     def kernel_shape(self) -> tuple[int, int]:
         """Pixels of the PSF that the first capture takes: more than the sensor's by the scene's."""
-        camera = build.build_camera(self.config, self.settings[0])
-        return kernel_shape(camera.sensor.shape, projected_shape(camera, self.plane))
+        camera = self.study.camera(self.exposures[0])
+        return kernel_shape(camera.sensor.shape, projected_shape(camera, self.target.plane))
 
 
-def make_case(config: StudyConfig, size: int) -> Case:
+def make_case(study: Study, size: int) -> Case:
     """The first picture (else the first target) and the first Wiener method (else the first).
 
     **Errors**: ConfigError where the size is too small to reconstruct.
     """
-    config = binned(config, size).model_copy(update={"model": "separable"})
+    study = dataclasses.replace(binned(study, size), model="separable")
     try:
-        check_study(config)
+        check_study(study)
     except ConfigError as error:
         raise ConfigError(f"--capture-size {size}: {str(error).splitlines()[0]}") from None
-    pictures = [t for t in config.targets if t.kind in ("photograph", "file")]
-    target = (pictures or list(config.targets))[0]
-    wiener = [m for m in config.methods if m.kind == "wiener"]
-    method = (wiener or list(config.methods))[0]
+    pictures = [target for target in study.targets if target.is_picture]
+    wiener = [method for method in study.methods if method.kind == "wiener"]
+    method = (wiener or study.methods)[0]
     skipped = None if wiener else f"{method.name}: fringe scanning assumes no PSF"
-    number = config.targets.index(target)
-    return Case(config, method, target, build.build_plane(config, target), number, skipped)
+    return Case(study, method, (pictures or list(study.targets))[0], skipped)

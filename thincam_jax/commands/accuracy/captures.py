@@ -1,6 +1,6 @@
 """Errors of noise-free captures."""
 
-from collections.abc import Callable
+from functools import cached_property, partial
 from typing import Any
 
 import jax.numpy as jnp
@@ -16,14 +16,15 @@ from thincam_jax.commands.accuracy.cameras import (
     relative_error,
 )
 from thincam_jax.commands.accuracy.psfs import why_not, words
-from thincam_jax.commands.study.build import Setting
+from thincam_jax.commands.run_folder import Step
+from thincam_jax.commands.study.study import Exposure
 from thincam_jax.imaging.scene import Spectrum
 from thincam_jax.lensless.cost import psf_cost
 from thincam_jax.lensless.forward import imaging_operator, project, projected_shape
 from thincam_jax.lensless.method import MODELS, Model, psf_method
 
 
-def capture_rows(case: Case, progress: Callable[[str], None]) -> list[dict[str, Any]]:
+class CaptureErrors:
     """A row for every model, in float32, of the method's first exposure.
 
     - `psf_error`: of the PSF over the sensor.
@@ -31,19 +32,31 @@ def capture_rows(case: Case, progress: Callable[[str], None]) -> list[dict[str, 
       the projected target.
     - `error`, `contrast_error`: of the capture, with its mean and without.
 
-    All are relative to separable in float64.
+    All are relative to separable in float64. `work` fills `rows`.
     """
-    setting, reach = case.settings[0], case.kernel_shape
-    reference = clean_capture(case, setting)
-    exact = [psf_of(case.config, setting, shape=shape) for shape in (None, reach)]
-    rows = []
-    for model in MODELS:
-        progress(f"capture: {words(model)}")
-        reason = kernel_reason(case, setting, model)
+
+    def __init__(self, case: Case):
+        self.case, self.rows = case, []
+        self.work = [
+            Step(f"capture: {words(model)}", partial(self._add, model)) for model in MODELS
+        ]
+
+    @cached_property
+    def _exact(self) -> tuple[np.ndarray, list[np.ndarray]]:
+        """The capture, and the PSF over the sensor and over all that the capture takes."""
+        exposure = self.case.exposures[0]
+        shapes = (None, self.case.kernel_shape)
+        psfs = [psf_of(self.case.study, exposure, shape=shape) for shape in shapes]
+        return clean_capture(self.case, exposure), psfs
+
+    def _add(self, model: Model) -> None:
+        exposure, reach = self.case.exposures[0], self.case.kernel_shape
+        reason = kernel_reason(self.case, exposure, model)
         row: dict[str, Any] = {"model": model, "status": "not run", "reason": reason}
         if reason is None:
-            image = clean_capture(case, setting, model, "float32")
-            psfs = [psf_of(case.config, setting, model, "float32", s) for s in (None, reach)]
+            reference, exact = self._exact
+            image = clean_capture(self.case, exposure, model, "float32")
+            psfs = [psf_of(self.case.study, exposure, model, "float32", s) for s in (None, reach)]
             errors = [relative_error(h, h0) for h, h0 in zip(psfs, exact, strict=True)]
             row |= {
                 "status": "run",
@@ -52,25 +65,24 @@ def capture_rows(case: Case, progress: Callable[[str], None]) -> list[dict[str, 
                 "error": relative_error(image, reference),
                 "contrast_error": contrast_error(image, reference),
             }
-        rows.append(row)
-    return rows
+        self.rows.append(row)
 
 
 def clean_capture(
     case: Case,
-    setting: Setting,
+    exposure: Exposure,
     model: Model = "separable",
     precision: Precision = "float64",
-    assumed: Setting | None = None,
+    assumed: Exposure | None = None,
 ) -> np.ndarray:
     """What falls on the sensor, (channel, y, x), without noise or saturation.
 
     With `assumed`, the PSF is that of another camera; where the scene falls stays as it is.
     """
     with allow(precision):
-        camera = conditions_of(case.config, setting)[precision].camera
-        blurring = conditions_of(case.config, assumed or setting)[precision]
-        plane = cast(case.plane, precision)
+        camera = conditions_of(case.study, exposure)[precision].camera
+        blurring = conditions_of(case.study, assumed or exposure)[precision]
+        plane = cast(case.target.plane, precision)
         shape = projected_shape(camera, plane)
         convolution = imaging_operator(
             blurring.camera,
@@ -78,16 +90,16 @@ def clean_capture(
             blurring.object_distance,
             field_shape=shape,
             model=model,
-            pixel_integration=case.config.pixel_integration,
+            pixel_integration=case.study.config.pixel_integration,
         )
         return np.asarray(convolution(project(camera, plane, shape)))
 
 
-def kernel_reason(case: Case, setting: Setting, model: Model) -> str | None:
+def kernel_reason(case: Case, exposure: Exposure, model: Model) -> str | None:
     """Why a model is not run for a capture; None where it is."""
     with allow("float64"):
-        given = conditions_of(case.config, setting)["float64"]
-        whole = case.config.pixel_integration
+        given = conditions_of(case.study, exposure)["float64"]
+        whole = case.study.config.pixel_integration
         grid = Grid(case.kernel_shape, jnp.asarray(given.camera.sensor.pitch))
         method = psf_method(given.camera.mask, grid, model, whole, "float32")
         return why_not(model, psf_cost(given.camera.mask, grid, method), given)

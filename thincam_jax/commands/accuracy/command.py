@@ -30,20 +30,15 @@ def accuracy(
         import rich
 
         from thincam_jax.commands.accuracy.console import accuracy_table, cost_table, verdict
-        from thincam_jax.commands.accuracy.run import (
-            BenchFolder,
-            Sizes,
-            check,
-            run_accuracy,
-            steps,
-        )
-        from thincam_jax.commands.study.config import load_config, slug
+        from thincam_jax.commands.accuracy.run import BenchFolder, Sizes, check, run_accuracy
+        from thincam_jax.commands.config_file import slug
+        from thincam_jax.commands.study.config import load_config
 
         study = load_config(config, tuple(set_ or ()))
         plan = check(study, Sizes(tuple(size or ()), capture_size))
         folder = BenchFolder(out or Path("runs") / f"{slug(study.name)}-accuracy")
-        with counted(study.name, steps(study, plan)) as progress:
-            results = run_accuracy(study, plan, folder, progress)
+        with counted(study.name) as progress:
+            results = run_accuracy(plan, folder, progress)
     rich.print(accuracy_table(results))
     rich.print(cost_table(results))
     for line in (*verdict(results), f"figure: {folder.path / 'accuracy.png'}"):

@@ -3,6 +3,7 @@
 import statistics
 import time
 from collections.abc import Callable
+from functools import cached_property, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -17,16 +18,14 @@ from thincam_jax.commands.accuracy.cameras import (
     psf_of,
     relative_error,
 )
-from thincam_jax.commands.study.build import Setting
-from thincam_jax.commands.study.config import StudyConfig
+from thincam_jax.commands.run_folder import Step
+from thincam_jax.commands.study.study import Exposure, Study
 from thincam_jax.lensless.accuracy.select import predicted_error, probe_of
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.cost import Cost, psf_cost
 from thincam_jax.lensless.method import MODELS, SAMPLED, Model, PsfMethod, psf_method
 from thincam_jax.lensless.propagation.closed_form import in_focus
 from thincam_jax.lensless.psf import psf
-
-Progress = Callable[[str], None]
 
 OVERSAMPLINGS = (1, 3)
 # Operations of a direct sum that take some seconds; it is not run beyond.
@@ -63,33 +62,46 @@ def why_not(model: Model, cost: Cost, given: Conditions) -> str | None:
     return None
 
 
-def psf_rows(
-    config: StudyConfig, setting: Setting, size: int, progress: Progress
-) -> list[dict[str, Any]]:
+class PsfErrors:
     """A row for every candidate at one size; `worth_choosing` marks the Pareto front of those run.
 
     Errors are relative, ‖h − h₀‖₂/‖h₀‖₂ over the sensor, against h₀ by separable in float64, the
     exact Fresnel field. Times are of the compiled function: what Python adds to a call of `psf` is
-    left out.
+    left out. `work` fills `rows`.
     """
-    config = binned(config, size)
-    whole = config.pixel_integration
-    given = conditions_of(config, setting)
-    reference = psf_of(config, setting)
-    rows = []
-    with allow("float64"):
-        exact = given["float64"]
-        probe = probe_of(*exact, whole, None)
-        grid = exact.camera.sensor.grid
-        for method, cost in candidates(exact.camera, whole):
-            progress(f"{size} pixels: {label(method.model, method.precision, method.oversampling)}")
-            row = _described(config, method, cost, why_not(method.model, cost, exact))
+
+    def __init__(self, study: Study, exposure: Exposure, size: int):
+        self.study, self.exposure, self.rows = binned(study, size), exposure, []
+        self.given = conditions_of(self.study, exposure)
+        with allow("float64"):
+            found = candidates(self.given["float64"].camera, study.config.pixel_integration)
+        self.work = [
+            Step(
+                f"{size} pixels: {label(method.model, method.precision, method.oversampling)}",
+                partial(self._add, method, cost),
+            )
+            for method, cost in found
+        ]
+
+    @cached_property
+    def _exact(self) -> tuple[Any, np.ndarray]:
+        """Where errors are predicted from, and the PSF that they count from."""
+        probe = probe_of(*self.given["float64"], self.study.config.pixel_integration, None)
+        return probe, psf_of(self.study, self.exposure)
+
+    def _add(self, method: PsfMethod, cost: Cost) -> None:
+        with allow("float64"):
+            exact = self.given["float64"]
+            row = _described(self.study, method, cost, why_not(method.model, cost, exact))
             if row["status"] == "run":
-                row["predicted_error"] = predicted_error(probe, exact.camera.mask, grid, method)
-                row |= _measured(given[method.precision], method, reference)
-            rows.append(row)
-    mark_front([row for row in rows if row["status"] == "run"])
-    return rows
+                probe, reference = self._exact
+                row["predicted_error"] = predicted_error(
+                    probe, exact.camera.mask, exact.camera.sensor.grid, method
+                )
+                row |= _measured(self.given[method.precision], method, reference)
+        self.rows.append(row)
+        if len(self.rows) == len(self.work):
+            mark_front([row for row in self.rows if row["status"] == "run"])
 
 
 def mark_front(rows: list[dict[str, Any]]) -> None:
@@ -104,13 +116,6 @@ def mark_front(rows: list[dict[str, Any]]) -> None:
         best = row["true_error"] if row["worth_choosing"] else best
 
 
-def candidate_count(config: StudyConfig, setting: Setting) -> int:
-    """How many rows a size has."""
-    with allow("float64"):
-        camera = conditions_of(config, setting)["float64"].camera
-        return len(candidates(camera, config.pixel_integration))
-
-
 def label(model: str, precision: str, oversampling: int | None) -> str:
     """A candidate in words, such as "angular spectrum ×3, float32"."""
     samples = f" ×{oversampling}" if oversampling else ""
@@ -122,12 +127,10 @@ def words(model: str) -> str:
     return model.replace("rayleigh_s", "Rayleigh-S").replace("_", " ")
 
 
-def _described(
-    config: StudyConfig, method: PsfMethod, cost: Cost, reason: str | None
-) -> dict[str, Any]:
+def _described(study: Study, method: PsfMethod, cost: Cost, reason: str | None) -> dict[str, Any]:
     return {
-        "shape": list(config.sensor.shape),
-        "pitch_mm": config.sensor.pitch,
+        "shape": list(study.sensor.shape),
+        "pitch_mm": study.sensor.pitch,
         "model": method.model,
         "precision": method.precision,
         "oversampling": method.oversampling,

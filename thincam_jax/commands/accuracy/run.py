@@ -8,22 +8,17 @@ import jax
 
 from thincam_jax._core.files import write_whole
 from thincam_jax.commands.accuracy.cameras import Case, capture_size_of, make_case, sizes_of
-from thincam_jax.commands.accuracy.captures import capture_rows
+from thincam_jax.commands.accuracy.captures import CaptureErrors
 from thincam_jax.commands.accuracy.figures import draw
-from thincam_jax.commands.accuracy.psfs import Progress, candidate_count, psf_rows
-from thincam_jax.commands.accuracy.reconstructions import (
-    LEVELS,
-    QUANTITIES,
-    controlled_rows,
-    make_experiment,
-    model_rows,
-)
+from thincam_jax.commands.accuracy.psfs import PsfErrors
+from thincam_jax.commands.accuracy.reconstructions import ReconstructionErrors
+from thincam_jax.commands.checked_config import dump_config
+from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.doctor import usable_cores
-from thincam_jax.commands.run_folder import claim_folder, to_json
-from thincam_jax.commands.study import build
-from thincam_jax.commands.study.check import check_study
-from thincam_jax.commands.study.config import ConfigError, StudyConfig, dump_config
-from thincam_jax.lensless.method import MODELS
+from thincam_jax.commands.run_folder import Progress, Step, carry_out, claim_folder, to_json
+from thincam_jax.commands.study.build import build_study
+from thincam_jax.commands.study.config import StudyConfig
+from thincam_jax.commands.study.study import Exposure, Study
 
 
 class BenchFolder:
@@ -54,8 +49,9 @@ class Sizes(NamedTuple):
 
 
 class Benchmark(NamedTuple):
-    """A checked benchmark: the sizes, and what is captured."""
+    """A checked benchmark: the study, the sizes, and what is captured."""
 
+    study: Study
     sizes: tuple[int, ...]
     capture_size: int
     case: Case
@@ -68,66 +64,67 @@ def check(config: StudyConfig, options: Sizes) -> Benchmark:
             "mask.pixel_pitch: the benchmark compares models that have no display pixels; leave it "
             "out of the file"
         )
-    sizes = sizes_of(config, options.sizes)
-    capture_size = capture_size_of(config, options.capture_size)
-    check_study(config)
-    return Benchmark(sizes, capture_size, make_case(config, capture_size))
+    sizes = sizes_of(config.sensor, options.sizes)
+    capture_size = capture_size_of(config.sensor, options.capture_size)
+    study = build_study(config)
+    return Benchmark(study, sizes, capture_size, make_case(study, capture_size))
 
 
-def steps(config: StudyConfig, plan: Benchmark) -> int:
-    """How many times `run_accuracy` reports progress."""
-    candidates = len(plan.sizes) * candidate_count(config, build.all_settings(config)[0])
-    controlled = 0 if plan.case.skipped else 1 + len(MODELS) + len(LEVELS) * len(QUANTITIES)
-    return candidates + len(MODELS) + controlled + 1
-
-
-def run_accuracy(
-    config: StudyConfig, plan: Benchmark, folder: BenchFolder, progress: Progress
-) -> dict[str, Any]:
+def run_accuracy(plan: Benchmark, folder: BenchFolder, progress: Progress) -> dict[str, Any]:
     """Run the benchmark into a folder; returns what `accuracy.json` holds.
 
     The camera is that of the study's first exposure; the captures and reconstructions are of its
     first picture and first Wiener method.
     """
-    folder.claim(config)
-    setting = build.all_settings(config)[0]
-    psfs = [row for size in plan.sizes for row in psf_rows(config, setting, size, progress)]
-    captures = capture_rows(plan.case, progress)
-    results = {
-        "bench": "accuracy",
-        "config": dump_config(config),
-        "settings": _settings(config, plan, setting),
-        "machine": _machine(),
-        "psfs": psfs,
-        "captures": captures,
-        "reconstructions": _reconstructions(plan.case, progress),
-    }
-    progress("figure")
-    folder.finish(results, draw(results))
+    study, exposure, results = plan.study, plan.study.exposures[0], {}
+    folder.claim(study.config)
+    psfs = [PsfErrors(study, exposure, size) for size in plan.sizes]
+    captures, reconstructions = CaptureErrors(plan.case), ReconstructionErrors(plan.case)
+
+    def report() -> None:
+        results.update(
+            bench="accuracy",
+            config=dump_config(study.config),
+            settings=_settings(plan),
+            machine=_machine(),
+            psfs=[row for errors in psfs for row in errors.rows],
+            captures=captures.rows,
+            reconstructions={
+                "method": plan.case.method.name,
+                "skipped": plan.case.skipped,
+                "exact_psnr_db": reconstructions.exact_psnr_db,
+                "models": reconstructions.models,
+                "controlled": reconstructions.controlled,
+            },
+        )
+        folder.finish(results, draw(results))
+
+    work = [step for errors in (*psfs, captures, reconstructions) for step in errors.work]
+    carry_out([*work, Step("figure", report)], progress)
     return results
 
 
-def _settings(config: StudyConfig, plan: Benchmark, setting: build.Setting) -> dict[str, Any]:
-    captured = plan.case.settings[0]
+def _settings(plan: Benchmark) -> dict[str, Any]:
+    config = plan.study.config
     return {
         "study": config.name,
         "reference": "separable, float64",
         "sizes": list(plan.sizes),
-        "camera": _numbers(setting),
+        "camera": _numbers(plan.study.exposures[0]),
         "object_distance_mm": config.object.distance,
         "pixel_integration": config.pixel_integration,
-        "capture_shape": list(plan.case.config.sensor.shape),
+        "capture_shape": list(plan.case.study.sensor.shape),
         "target": plan.case.target.name,
-        "captured": _numbers(captured),
+        "captured": _numbers(plan.case.exposures[0]),
     }
 
 
-def _numbers(setting: build.Setting) -> dict[str, float]:
+def _numbers(exposure: Exposure) -> dict[str, float]:
     return {
-        "beta_rad_per_mm2": setting.beta,
-        "phase_rad": setting.phase,
-        "distance_mm": setting.distance,
-        "wavelength_mm": setting.wavelength,
+        "beta_rad_per_mm2": exposure.beta,
+        "phase_rad": exposure.phase,
+        "distance_mm": exposure.distance,
+        "wavelength_mm": exposure.wavelength,
     }
 
 
@@ -140,17 +137,4 @@ def _machine() -> dict[str, Any]:
         "device_platform": device.platform,
         "cores": usable_cores(),
         "jax": jax.__version__,
-    }
-
-
-def _reconstructions(case: Case, progress: Progress) -> dict[str, Any]:
-    found: dict[str, Any] = {"method": case.method.name, "skipped": case.skipped}
-    if case.skipped is not None:
-        return found | {"exact_psnr_db": None, "models": [], "controlled": []}
-    progress(f"captures for {case.method.name}")
-    experiment = make_experiment(case)
-    return found | {
-        "exact_psnr_db": experiment.psnr_db,
-        "models": model_rows(case, experiment, progress),
-        "controlled": controlled_rows(case, experiment, progress),
     }

@@ -22,16 +22,16 @@ def design(
     """
     goes_on = "interrupted; the same command goes on with the targets that are not finished."
     with told(lambda: goes_on):
+        from thincam_jax.commands.config_file import slug
         from thincam_jax.commands.design.config import load_design
-        from thincam_jax.commands.design.run import DesignFolder, run_design, steps
-        from thincam_jax.commands.design.simulated import check_design
-        from thincam_jax.commands.study.config import slug
+        from thincam_jax.commands.design.run import DesignFolder, run_design
+        from thincam_jax.commands.design.simulation import build_designs
 
         wanted = load_design(config, tuple(set_ or ()))
-        check_design(wanted)
+        study = build_designs(wanted)
         folder = DesignFolder(out or Path("runs") / slug(wanted.name))
-        with counted(wanted.name, steps(wanted)) as progress:
-            found = run_design(wanted, folder, progress)
+        with counted(wanted.name) as progress:
+            found = run_design(study, folder, progress)
     _print(found)
     print(f"report: {folder.path / 'report.html'}")
 

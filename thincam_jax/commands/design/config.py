@@ -7,34 +7,31 @@ from typing import Annotated, Any, Literal
 import pydantic
 from pydantic import Field
 
-from thincam_jax.commands.config_file import read_raw
+from thincam_jax.commands.checked_config import load_as
+from thincam_jax.commands.config_file import ConfigError, read_raw, slug
 from thincam_jax.commands.design.config_pareto import ParetoConfig, check_pareto
-from thincam_jax.commands.design.config_training import TrainingConfig
-from thincam_jax.commands.study.config import (
+from thincam_jax.commands.sections import (
     LIGHT,
+    PHASES,
     Angle,
     ApertureConfig,
-    ConfigError,
+    ExperimentConfig,
     Length,
-    MethodConfig,
     Name,
+    NoiseConfig,
     ObjectConfig,
     Section,
     ShotConfig,
     TargetConfig,
-    Wavelength,
     check_names,
-    in_folder,
-    load_as,
     misfit,
-    slug,
 )
 from thincam_jax.design import Design, DesignSpace, Limits, Tolerances, Variable, shots
 from thincam_jax.design.space import UNITS
-from thincam_jax.lensless.method import Model
+from thincam_jax.imaging.targets import sample_images
 from thincam_jax.units import parse_quantity
 
-Objective = Literal["bayes_error", "robust_error", "worst_ratio", "limit", "unevenness"]
+ObjectiveName = Literal["bayes_error", "robust_error", "worst_ratio", "limit", "unevenness"]
 Part = Annotated[float, Field(ge=0, le=1)]
 Free = Literal["beta", "distance", "wavelength", "width", "exposure"]
 # What has a unit in a file; a share of the exposure has none.
@@ -73,6 +70,12 @@ class DesignNoiseConfig(Section):
             raise ValueError("read_noise and electrons belong together; give both, or snr_db")
         return self
 
+    def simulated(self) -> NoiseConfig:
+        """The same of a study."""
+        if self.read_noise is not None:
+            return NoiseConfig(read_noise=self.read_noise)
+        return NoiseConfig(snr_db=self.snr_db, signal_power="without_mean")
+
 
 class PriorConfig(Section):
     """The scene's spectrum: a power law, its exponent given or measured on the photographs.
@@ -98,11 +101,10 @@ class ReferenceConfig(Section):
     synthesis: Literal["phase_pairs", "fringe_scanning"]
     shots: Annotated[tuple[ShotConfig, ...], Field(min_length=1)]
 
-    def method(self) -> MethodConfig:
-        """The same as a method of a study."""
-        return MethodConfig(
-            name=self.name, kind="wiener", synthesis=self.synthesis, shots=self.shots
-        )
+    @property
+    def phases(self) -> tuple[float, ...]:
+        """Taken at each shot, rad."""
+        return PHASES[self.synthesis]
 
 
 class RivalConfig(Section):
@@ -221,7 +223,7 @@ class SearchConfig(Section):
 
     free: Annotated[tuple[FreeConfig, ...], Field(min_length=1)]
     limits: LimitsConfig = LimitsConfig()
-    objective: Objective = "bayes_error"
+    objective: ObjectiveName = "bayes_error"
     band: tuple[Part, Part] | None = None
     tolerances: TolerancesConfig | None = None
     starts: Annotated[int, Field(ge=1, le=1000)] = 16
@@ -257,16 +259,41 @@ class ValidateConfig(Section):
     best: Annotated[int, Field(ge=1, le=10)] = 3
 
 
-class DesignConfig(Section):
+class TrainingConfig(Section):
+    """Designs improved by the error of an actual reconstruction.
+
+    - `images`: photographs of scikit-image; their middle square is taken.
+    - `reconstruction`: `wiener`, the Wiener synthesis as in the simulation; `linear`, the best
+      linear estimate, which knows of the crop, by conjugate gradients.
+    - `pixels`: of the sensor's shorter side in training; by default as many as the finest fringes
+      need, and no more than the sensor has.
+    - `samples`: even ones over the bounds; descents begin at the best `starts` of these, of the
+      search's designs and the reference; `steps` of each.
+    """
+
+    images: Annotated[tuple[str, ...], Field(min_length=1)]
+    reconstruction: Literal["wiener", "linear"] = "wiener"
+    pixels: Annotated[int, Field(ge=32, le=4096)] | None = None
+    samples: Annotated[int, Field(ge=1, le=10_000)] = 64
+    starts: Annotated[int, Field(ge=1, le=10)] = 4
+    steps: Annotated[int, Field(ge=1, le=1000)] = 30
+
+    @pydantic.field_validator("images")
+    @classmethod
+    def _known(cls, images: tuple[str, ...]) -> tuple[str, ...]:
+        for image in images:
+            if image not in sample_images():
+                listed = ", ".join(sample_images())
+                raise ValueError(f"image {image!r} is unknown; choose from {listed}")
+        if len(set(images)) < len(images):
+            raise ValueError("images hold an entry twice; give each once")
+        return images
+
+
+class DesignConfig(ExperimentConfig):
     """A search for the best design, and its simulation beside the design to beat."""
 
-    name: Name
     kind: Literal["design"]
-    title: str = ""
-    seed: Annotated[int, Field(ge=0, lt=2**32, strict=True)] = 0
-    wavelength: Wavelength
-    model: Model = "separable"
-    pixel_integration: bool = True
     sensor: PixelsConfig
     mask: ApertureConfig
     object: ObjectConfig
@@ -302,13 +329,12 @@ class DesignConfig(Section):
         """The targets that are photographs or image files."""
         return tuple(t for t in self.targets if t.kind in ("photograph", "file"))
 
-    def reference_design(self) -> Design:
-        """The design to beat."""
-        method = self.reference.method()
+    def design(self, given: ReferenceConfig | RivalConfig) -> Design:
+        """One of the designs that the file gives."""
         return shots(
-            [s.beta for s in method.shots],
-            [s.distance for s in method.shots],
-            method.shot_phases(),
+            [s.beta for s in given.shots],
+            [s.distance for s in given.shots],
+            self.reference.phases,
             wavelength=self.wavelength,
             width=self.mask.width,
             profile=self.mask.profile,
@@ -316,7 +342,7 @@ class DesignConfig(Section):
 
     def space(self) -> DesignSpace:
         """What is searched; ValueError where no design keeps the limits."""
-        given, base = self.search.limits, self.reference_design()
+        given, base = self.search.limits, self.design(self.reference)
         # The reference's captures have a share of 1 each; what is found shares the same.
         total = float(base.captures) if self.frees("exposure") else None
         return DesignSpace(base, tuple(_variables(self)), Limits(**dict(given), exposure=total))
@@ -325,23 +351,15 @@ class DesignConfig(Section):
         """Whether the search chooses it, of some shot."""
         return any(free.variable == variable for free in self.search.free)
 
-    def nearest(self) -> float:
-        """The shortest distance of mask and sensor that is looked at, mm."""
-        reference = min(s.distance for s in self.reference.shots)
-        bounds = [f.bounds[0] for f in self.search.free if f.variable == "distance"]
-        return min(reference, *bounds, math.inf)
-
-    def farthest(self) -> float:
-        """The longest distance of mask and sensor that is looked at, mm."""
-        reference = max(s.distance for s in self.reference.shots)
-        bounds = [f.bounds[1] for f in self.search.free if f.variable == "distance"]
-        limit = self.search.limits.thickness or math.inf
-        return max(reference, *(min(b, limit) for b in bounds), 0.0)
-
-    def widest(self) -> float:
-        """The widest mask that is looked at, mm."""
-        widths = [f.bounds[1] for f in self.search.free if f.variable == "width"]
-        return max([self.mask.width, *widths])
+    def reach(self, variable: Literal["beta", "distance", "width"]) -> tuple[float, float]:
+        """The least and the largest that is looked at, of the reference and within the bounds."""
+        given = [self.mask.width]
+        if variable != "width":
+            given = [getattr(shot, variable) for shot in self.reference.shots]
+        bounds = [end for f in self.search.free if f.variable == variable for end in f.bounds]
+        if variable == "distance":
+            bounds = [min(end, self.search.limits.thickness or math.inf) for end in bounds]
+        return min([*given, *bounds]), max([*given, *bounds])
 
 
 def found_name(rank: int) -> str:
@@ -351,7 +369,7 @@ def found_name(rank: int) -> str:
 
 def _variables(config: DesignConfig):
     """The free numbers, each with the captures it belongs to."""
-    phases = len(config.reference.method().shot_phases())
+    phases = len(config.reference.phases)
     for free in config.search.free:
         if free.variable == "width":
             yield Variable("width", *free.bounds)
@@ -386,8 +404,13 @@ def _check_shots(
     if len(set(shots)) < len(shots):
         raise misfit("shots hold an entry twice; give each once", *place, "shots")
     for index, shot in enumerate(given.shots):
-        alone = {"wavelength": config.wavelength, "width": config.mask.width, "exposure": 1.0}
-        for key, own in alone.items():
+        shared = {
+            "wavelength": config.wavelength,
+            "width": config.mask.width,
+            "exposure": 1.0,
+            "take": None,
+        }
+        for key, own in shared.items():
             if getattr(shot, key) not in (None, own):
                 message = f"the {key} is that of the whole file; drop this one"
                 raise misfit(message, *place, "shots", index, key)
@@ -443,7 +466,7 @@ def _blamed(message: str) -> str:
 
 
 def load_design(path: str | Path, overrides: tuple[str, ...] = ()) -> DesignConfig:
-    """Read and check a design's file; errors as of `load_config` of a study."""
+    """Read and check a design's file; errors as of `load_as`."""
     kind = read_raw(Path(path))[0].get("kind")
     if kind != "design":
         told = "is a study" if kind is None else f"is of kind {kind!r}"
@@ -451,4 +474,4 @@ def load_design(path: str | Path, overrides: tuple[str, ...] = ()) -> DesignConf
             f"{path}: kind: {told}, for 'thincam run'; a file for 'thincam design' has "
             "'kind: design'"
         )
-    return in_folder(load_as(DesignConfig, path, overrides), path, "targets")
+    return load_as(DesignConfig, path, overrides)

@@ -4,25 +4,30 @@ import math
 from typing import Annotated, Any, Literal
 
 import pydantic
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
-from thincam_jax.commands.study.config import Length, Section, misfit
+from thincam_jax.commands.sections import Length, Section, misfit
 
 Count = Annotated[int, Field(ge=1, le=8, strict=True)]
 Points = Annotated[int, Field(ge=2, le=100)]
 Electrons = Annotated[float, Field(gt=0)]
 
 
+def _rising(unit: str) -> AfterValidator:
+    def check(bounds: tuple[float, float]) -> tuple[float, float]:
+        lower, upper = bounds
+        if not lower < upper:
+            raise ValueError(f"bounds cross: {lower:g} to {upper:g}{unit}; give the lower first")
+        return bounds
+
+    return AfterValidator(check)
+
+
 class ThicknessConfig(Section):
     """Thickness against resolution: no distance is longer than each of `points` thicknesses."""
 
-    bounds: tuple[Length, Length]
+    bounds: Annotated[tuple[Length, Length], _rising(" mm")]
     points: Points = 8
-
-    @pydantic.field_validator("bounds")
-    @classmethod
-    def _ordered(cls, bounds: tuple[float, float]) -> tuple[float, float]:
-        return _ordered(bounds, " mm")
 
     def costs(self) -> list[float]:
         """The thicknesses, mm, evenly apart."""
@@ -47,13 +52,8 @@ class CapturesConfig(Section):
 class LightConfig(Section):
     """Light against resolution: electrons of a pixel from each mm² of open aperture."""
 
-    bounds: tuple[Electrons, Electrons]
+    bounds: Annotated[tuple[Electrons, Electrons], _rising(" electrons")]
     points: Points = 6
-
-    @pydantic.field_validator("bounds")
-    @classmethod
-    def _ordered(cls, bounds: tuple[float, float]) -> tuple[float, float]:
-        return _ordered(bounds, " electrons")
 
     def costs(self) -> list[float]:
         """The electrons, each by the same factor more than the one before."""
@@ -82,12 +82,13 @@ class ParetoConfig(Section):
             raise ValueError("no front is asked for; give thickness, captures or light")
         return self
 
-
-def _ordered(bounds: tuple[float, float], unit: str) -> tuple[float, float]:
-    lower, upper = bounds
-    if not lower < upper:
-        raise ValueError(f"bounds cross: {lower:g} to {upper:g}{unit}; give the lower first")
-    return bounds
+    def costs(self, phases: int) -> dict[str, list[float]]:
+        """Of each front: mm; captures, so many phases a shot; electrons."""
+        lines = {"thickness": self.thickness, "light": self.light}
+        found = {name: line.costs() for name, line in lines.items() if line is not None}
+        if self.captures is not None:
+            found["captures"] = [float(count * phases) for count in self.captures.shots]
+        return {name: found[name] for name in ("thickness", "captures", "light") if name in found}
 
 
 def with_shots(config: Any, count: int) -> Any:
@@ -171,7 +172,7 @@ def _free_distances(config: Any) -> dict[int, tuple[float, float]]:
 
 def _check_captures(config: Any, front: CapturesConfig) -> None:
     place = ("pareto", "captures")
-    phases = len(config.reference.method().shot_phases())
+    phases = len(config.reference.phases)
     allowed = config.search.limits.captures
     most = front.shots[-1]
     if most * phases > allowed:

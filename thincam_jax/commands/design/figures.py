@@ -1,39 +1,42 @@
-"""The pictures of a design: the objective's landscape, the responses, and contrast transfer."""
+"""The pictures of a design: the objective's landscape, responses, contrast transfer and fronts."""
 
-import io
 import operator
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
+from matplotlib.ticker import FixedLocator, NullLocator
 
-from thincam_jax.commands.design.landscape import Landscape
-from thincam_jax.commands.design.problem import Goal
-from thincam_jax.commands.design.ranking import Candidate, Result, Shot
-from thincam_jax.commands.design.train import TrainingGoal
+from thincam_jax.commands.design.problem import DesignObjective, Shot, phases_of
+from thincam_jax.commands.design.ranking import Candidate, FoundDesigns
+from thincam_jax.commands.design.record import COSTS
+from thincam_jax.commands.design.surroundings import Landscape
+from thincam_jax.commands.design.train import TrainingObjective
 from thincam_jax.commands.design.transfer import Transfer
 from thincam_jax.commands.design.words import QUANTITIES, first, free_number
+from thincam_jax.commands.study.figures import as_png as as_png
 from thincam_jax.commands.study.figures import line_style
 
 _ROOM = 0.06  # around points, as a part of an axis
 _SHADED = 85  # per cent of the landscape that the shades tell apart; the worst is one shade
 _LEAST_CONTRAST = 1e-5
 _FLOOR_DB = -30.0  # what is further below the noise is not drawn
+_FACE = {True: "white", False: "black"}  # of points that are dominated, and of the front's
+_MARKER = {"markersize": 8, "markeredgewidth": 1.3, "linestyle": "none", "zorder": 4}
+_LABELS = {
+    "thickness": "thickness: longest distance allowed (mm)",
+    "captures": "captures",
+    "light": "light: electrons from each mm² of open aperture",
+}
 
 
-def as_png(figure: Figure) -> bytes:
-    """The file's content."""
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=110)
-    return buffer.getvalue()
-
-
-class _View(NamedTuple):
+class _DrawnLandscape(NamedTuple):
     """A landscape, what it is of, and the value of a design as drawn and as told."""
 
     around: Landscape
-    goal: Goal | TrainingGoal
+    objective: DesignObjective | TrainingObjective
     drawn: Callable[[Candidate], float | None]
     told: Callable[[Candidate], float | None]
 
@@ -41,10 +44,10 @@ class _View(NamedTuple):
         value = self.told(one)
         if value is None:
             return one.name
-        return f"{one.name} ({float(self.goal.told(value)):.2f} {self.goal.unit})"
+        return f"{one.name} ({float(self.objective.told(value)):.2f} {self.objective.unit})"
 
 
-def draw_landscape(result: Result, count: int) -> Figure | None:
+def draw_landscape(result: FoundDesigns, count: int) -> Figure | None:
     """The objective over the free numbers, with the reference and the first `count` found.
 
     None where the search's bounds leave no room to draw.
@@ -52,19 +55,21 @@ def draw_landscape(result: Result, count: int) -> Figure | None:
     if result.landscape is None:
         return None
     searched, exact = operator.attrgetter("searched"), operator.attrgetter("exact")
-    return _draw(_View(result.landscape, result.goal, searched, exact), result, count)
+    return _draw(
+        _DrawnLandscape(result.landscape, result.objective, searched, exact), result, count
+    )
 
 
-def draw_training(result: Result, count: int) -> Figure | None:
+def draw_training(result: FoundDesigns, count: int) -> Figure | None:
     """The same of the training error; None without training."""
     if result.training is None or result.training.landscape is None:
         return None
     trained = operator.attrgetter("trained")
-    view = _View(result.training.landscape, result.training.goal, trained, trained)
+    view = _DrawnLandscape(result.training.landscape, result.training.objective, trained, trained)
     return _draw(view, result, count)
 
 
-def _draw(view: _View, result: Result, count: int) -> Figure:
+def _draw(view: _DrawnLandscape, result: FoundDesigns, count: int) -> Figure:
     points = (result.reference, *result.found[:count])
     figure = Figure(figsize=(7.6, 6.0), layout="constrained")
     ax = figure.subplots()
@@ -92,29 +97,20 @@ def _axes(landscape: Landscape) -> list[np.ndarray]:
 
 def _marker(number: int) -> dict:
     """Of the reference, number 0, and of what was found: told apart by shape."""
-    face = "black" if number == 0 else "white"
-    edge = "white" if number == 0 else "black"
-    shape = "Xo^Ds"[number % 5]
-    size = 12 if number == 0 else 10
-    return {
-        "marker": shape,
-        "markersize": size,
-        "color": face,
-        "markeredgecolor": edge,
-        "markeredgewidth": 1.3,
-        "linestyle": "none",
-    }
+    face, edge, size = ("white", "black", 10) if number else ("black", "white", 12)
+    style = {"marker": "Xo^Ds"[number % 5], "markersize": size, "linestyle": "none"}
+    return style | {"color": face, "markeredgecolor": edge, "markeredgewidth": 1.3}
 
 
-def _draw_map(figure: Figure, ax, view: _View, points: tuple[Candidate, ...]) -> None:
-    around, goal = view.around, view.goal
+def _draw_map(figure: Figure, ax, view: _DrawnLandscape, points: tuple[Candidate, ...]) -> None:
+    around, objective = view.around, view.objective
     x, y = _axes(around)
-    told = goal.told(around.goal).T
-    worst = np.nanpercentile(told, 100 - _SHADED if goal.wants_more else _SHADED)
-    steps = {"vmin" if goal.wants_more else "vmax": worst}
-    extend = "min" if goal.wants_more else "max"
+    told = objective.told(around.values).T
+    worst = np.nanpercentile(told, 100 - _SHADED if objective.wants_more else _SHADED)
+    steps = {"vmin" if objective.wants_more else "vmax": worst}
+    extend = "min" if objective.wants_more else "max"
     shown = ax.pcolormesh(x, y, told, cmap="cividis", shading="nearest", rasterized=True, **steps)
-    figure.colorbar(shown, ax=ax, label=goal.label, extend=extend)
+    figure.colorbar(shown, ax=ax, label=objective.label, extend=extend)
     # Grounds beside the map are not allowed, or not looked at.
     ax.set_facecolor("#e8e8e8")
     places = np.array([_place(around, p) for p in points])
@@ -122,8 +118,8 @@ def _draw_map(figure: Figure, ax, view: _View, points: tuple[Candidate, ...]) ->
         set_limits(*_reach(axis, own))
     for number, (one, place) in enumerate(zip(points, places, strict=True)):
         ax.plot(*place, label=view.name(one), clip_on=False, zorder=5, **_marker(number))
-    ax.set_xlabel(free_number(*around.variables[0]))
-    ax.set_ylabel(free_number(*around.variables[1]))
+    names = [free_number(*variable) for variable in around.variables]
+    ax.set(xlabel=names[0], ylabel=names[1])
 
 
 def _reach(axis: np.ndarray, own: np.ndarray) -> tuple[float, float]:
@@ -136,20 +132,21 @@ def _reach(axis: np.ndarray, own: np.ndarray) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def _draw_line(ax, view: _View, points: tuple[Candidate, ...]) -> None:
-    around, goal = view.around, view.goal
-    ax.plot(_axes(around)[0], goal.told(around.goal), color="black", linewidth=1)
+def _draw_line(ax, view: _DrawnLandscape, points: tuple[Candidate, ...]) -> None:
+    around, objective = view.around, view.objective
+    ax.plot(_axes(around)[0], objective.told(around.values), color="black", linewidth=1)
     for number, one in enumerate(points):
         level = view.drawn(one)
         assert level is not None  # for the type checker; what is drawn was scored
         place = _place(around, one)
-        ax.plot(*place, float(goal.told(level)), label=view.name(one), zorder=5, **_marker(number))
-    ax.set_xlabel(free_number(*around.variables[0]))
-    ax.set_ylabel(goal.label)
+        ax.plot(
+            *place, float(objective.told(level)), label=view.name(one), zorder=5, **_marker(number)
+        )
+    ax.set(xlabel=free_number(*around.variables[0]), ylabel=objective.label)
     ax.grid(alpha=0.3)
 
 
-def draw_responses(result: Result, count: int, pitch: float) -> Figure:
+def draw_responses(result: FoundDesigns, count: int, pitch: float) -> Figure:
     """Ring means of the signal-to-noise ratio of the reference and the first `count` found."""
     figure = Figure(figsize=(8.5, 6.2), layout="constrained")
     ax, over = figure.subplots(2, 1, sharex=True, height_ratios=(1.5, 1))
@@ -165,22 +162,20 @@ def draw_responses(result: Result, count: int, pitch: float) -> Figure:
     for axes in (ax, over):
         axes.axhline(0, color="black", linewidth=0.8)
         axes.grid(alpha=0.3)
-    ax.set_xlim(0, result.edge)
+    ax.set(xlim=(0, result.edge), ylabel="signal-to-noise ratio,\nmean over a ring (dB)")
     ax.set_ylim(bottom=_FLOOR_DB)
-    ax.set_ylabel("signal-to-noise ratio,\nmean over a ring (dB)")
     ax.legend(fontsize=9)
     over.set_ylabel(f"over {result.reference.name}\n(dB)")
     over.set_xlabel("angular frequency of the object (cycles/rad)")
     distance = max(shot.distance for shot in result.reference.shots)
-    along = (lambda nu: np.asarray(nu) / distance, lambda u: np.asarray(u) * distance)
-    ax.secondary_xaxis("top", functions=along).set_xlabel(
+    ax.secondary_xaxis("top", functions=_at(distance)).set_xlabel(
         f"on the sensor at the reference's {distance:g} mm (cycles/mm); "
         f"its pixels' Nyquist frequency is {1 / (2 * pitch):.4g}"
     )
     return figure
 
 
-def draw_mtf(result: Result, object_distance: float) -> Figure | None:
+def draw_mtf(result: FoundDesigns, object_distance: float) -> Figure | None:
     """Contrast transfer of the reference and of the best design side by side, on common axes.
 
     `object_distance` in mm. None for a result without transfers.
@@ -189,15 +184,11 @@ def draw_mtf(result: Result, object_distance: float) -> Figure | None:
         return None
     figure = Figure(figsize=(11.0, 5.6), layout="constrained")
     panels = figure.subplots(1, 2, sharex=True, sharey=True)
-    for ax, one, transfer in zip(
-        panels, (result.reference, result.found[0]), result.transfers, strict=True
-    ):
+    shown = (result.reference, result.found[0])
+    for ax, one, transfer in zip(panels, shown, result.transfers, strict=True):
         _draw_transfer(ax, one, transfer, result.edge)
-        along = (
-            lambda nu: np.asarray(nu) / object_distance,
-            lambda u: np.asarray(u) * object_distance,
-        )
-        ax.secondary_xaxis("top", functions=along).set_xlabel("on the object (cycles/mm)")
+        top = ax.secondary_xaxis("top", functions=_at(object_distance))
+        top.set_xlabel("on the object (cycles/mm)")
         ax.set_xlabel("angular frequency (cycles/rad)")
     panels[0].set_ylabel("contrast transfer, over rings")
     return figure
@@ -207,14 +198,12 @@ def _draw_transfer(ax, one: Candidate, transfer: Transfer, edge: float) -> None:
     frequency = (np.arange(len(transfer.chain)) + 0.5) / len(transfer.chain) * edge
     chain = {"color": "black", "linewidth": 2.2, "label": "camera and reconstruction"}
     ax.plot(frequency, transfer.chain, **chain)
-    phases = max(n for sums in transfer.sums for part in sums for n in part) // len(one.shots)
+    phases = phases_of(one.design)
     for number, (level, sums) in enumerate(zip(transfer.channels, transfer.sums, strict=True)):
         style = line_style(number) | {"markersize": 4, "markevery": (2 * number, 8)}
         shot = one.shots[(sums[0][0] - 1) // phases]
         ax.plot(frequency, level, linewidth=1.2, label=_sum_label(shot, sums), **style)
-    ax.set_yscale("log")
-    ax.set_xlim(0, edge)
-    ax.set_ylim(_LEAST_CONTRAST, 1.5)
+    ax.set(yscale="log", xlim=(0, edge), ylim=(_LEAST_CONTRAST, 1.5))
     ax.grid(alpha=0.3)
     ax.set_title(one.name, fontsize=11)
     ax.legend(fontsize=9, loc="upper center", bbox_to_anchor=(0.5, -0.13), frameon=False)
@@ -227,6 +216,96 @@ def _sum_label(shot: Shot, sums: tuple[tuple[int, ...], tuple[int, ...]]) -> str
     return f"captures {formula}: β {shot.beta:.4g} rad/mm² at {shot.distance:.3g} mm"
 
 
+def _at(distance: float) -> tuple[Callable, Callable]:
+    """From angular frequencies to those on a plane at a distance, and back."""
+    return lambda nu: np.asarray(nu) / distance, lambda u: np.asarray(u) * distance
+
+
 def _decibel(level: np.ndarray) -> np.ndarray:
     """NaN, which is not drawn, below the floor."""
     return 10 * np.log10(np.where(level > 10 ** (_FLOOR_DB / 10), level, np.nan))
+
+
+def draw_fronts(fronts: dict[str, Any], reference: str, object_distance: float) -> Figure:
+    """A panel for each front; `fronts` as in design.json, `object_distance` in mm."""
+    asked = [name for name in _LABELS if name in fronts]
+    layout = ConstrainedLayoutEngine(wspace=0.06)
+    figure = Figure(figsize=(4.2 * len(asked) + 0.6, 4.9), layout=layout)
+    for ax, name in zip(figure.subplots(1, len(asked), squeeze=False)[0], asked, strict=True):
+        ax.set_xlabel(_LABELS[name])
+        ax.grid(alpha=0.3)
+        if name == "captures":
+            _draw_captures(ax, fronts[name], reference)
+        else:
+            _draw_resolution(ax, fronts[name], COSTS[name][1], reference)
+            right = ax.secondary_yaxis("right", functions=_at(object_distance))
+            right.set_ylabel("on the object (line pairs/mm)")
+        if name == "light":
+            ax.set_xscale("log")
+        ax.margins(0.08, 0.1)
+        ax.legend(fontsize=9, loc="upper center", bbox_to_anchor=(0.5, -0.14), frameon=False)
+    return figure
+
+
+def _draw_resolution(ax, front: dict[str, Any], cost: str, reference: str) -> None:
+    value = "resolution_cycles_per_rad"
+    points = front["points"]
+    _steps(ax, points, cost, value, "dominated", "-")
+    groups = [
+        (False, False, "on the front"),
+        (True, False, "dominated by one of lower cost"),
+        (False, True, "on the front; at least, where frequencies end"),
+        (True, True, "dominated; at least, where frequencies end"),
+    ]
+    for beaten, ended, label in groups:
+        kind = (beaten, ended)
+        chosen = [p for p in points if (p["dominated"], bool(p["resolution_ends"])) == kind]
+        if chosen:
+            shape = "^" if ended else "o"
+            _marks(ax, chosen, cost, value, label, marker=shape, markerfacecolor=_FACE[beaten])
+    _mark_reference(ax, front["reference"], cost, value, reference)
+    ax.set_ylabel("limit of resolution (cycles/rad)")
+
+
+def _draw_captures(ax, front: dict[str, Any], reference: str) -> None:
+    points = front["points"]
+    known = [p for p in points if p["simulated_mean_db"] is not None]
+    lines = [
+        (points, "predicted_psnr_db", "dominated", "predicted", "-", "o", "black"),
+        (known, "simulated_mean_db", "simulated_dominated", "simulated", "--", "s", "#8a8a8a"),
+    ]
+    for chosen, value, flag, label, dash, shape, colour in lines:
+        _steps(ax, chosen, "captures", value, flag, dash)
+        for beaten, told in ((False, label), (True, f"{label}; dominated")):
+            group = [p for p in chosen if p[flag] == beaten]
+            if group:
+                face = "white" if beaten else colour
+                _marks(ax, group, "captures", value, told, marker=shape, markerfacecolor=face)
+    _mark_reference(
+        ax, front["reference"], "captures", "predicted_psnr_db", f"{reference}, predicted"
+    )
+    ax.xaxis.set_major_locator(FixedLocator(sorted({p["captures"] for p in points})))
+    ax.xaxis.set_minor_locator(NullLocator())
+    ax.set_ylabel("PSNR, mean over the pictures (dB)")
+
+
+def _marks(ax, points: list[dict[str, Any]], cost: str, value: str, label: str, **style) -> None:
+    places = ([p[cost] for p in points], [p[value] for p in points])
+    ax.plot(*places, label=label, markeredgecolor="black", **(_MARKER | style))
+
+
+def _mark_reference(ax, point: dict[str, Any], cost: str, value: str, name: str) -> None:
+    style = _MARKER | {"marker": "X", "markersize": 11, "zorder": 5}
+    ax.plot(
+        point[cost], point[value], label=name, color="#606060", markeredgecolor="white", **style
+    )
+
+
+def _steps(ax, points: list[dict[str, Any]], cost: str, value: str, flag: str, dash: str) -> None:
+    """What is reached at each cost: the best of the points up to there."""
+    front = sorted((p[cost], p[value]) for p in points if not p[flag])
+    if not front:
+        return
+    # On to the last of all points, which may be dominated.
+    front.append((max(p[cost] for p in points), front[-1][1]))
+    ax.step(*np.transpose(front), where="post", color="black", linewidth=1.1, linestyle=dash)

@@ -1,9 +1,9 @@
 """The report of a design: one HTML page that stands alone."""
 
-from pathlib import Path
 from typing import Any
 
 from thincam_jax.commands.design.config import DesignConfig
+from thincam_jax.commands.design.record import COSTS
 from thincam_jax.commands.design.words import (
     QUANTITIES,
     cells,
@@ -13,30 +13,27 @@ from thincam_jax.commands.design.words import (
     of_shots,
     told_of,
 )
-from thincam_jax.commands.page import data_url, load_template
-from thincam_jax.commands.study.config import dump_config
+from thincam_jax.commands.page import number, render_page
+from thincam_jax.commands.run_folder import RunFolder
 
 
 def render(
-    config: DesignConfig, folder: Path, design: dict[str, Any], environment: dict[str, Any]
+    config: DesignConfig, folder: RunFolder, design: dict[str, Any], environment: dict[str, Any]
 ) -> str:
     """The page, with its pictures inside."""
-    return load_template("design").render(
-        config=config,
-        design=design,
-        free=[free_number(v["variable"], v["shots"]) for v in design["found"][0]["values"]],
-        reference=[
-            of_shots(design["reference"], v["variable"], v["shots"])
-            for v in design["found"][0]["values"]
-        ],
-        numbers=[[found_number(v) for v in one["values"]] for one in design["found"]],
-        validated=list(design["validation"]["methods"]),
-        findings=findings(design),
-        fronts=fronts(design),
-        environment=environment,
-        yaml=dump_config(config),
-        picture=lambda name: data_url(folder / name) if (folder / name).exists() else None,
-    )
+    free = [(value["variable"], value["shots"]) for value in design["found"][0]["values"]]
+    shown = {
+        "command": "design",
+        "environment": environment,
+        "design": design,
+        "free": [free_number(*one) for one in free],
+        "reference": [of_shots(design["reference"], *one) for one in free],
+        "numbers": [[found_number(v) for v in one["values"]] for one in design["found"]],
+        "validated": list(design["validation"]["methods"]),
+        "findings": findings(design),
+        "fronts": fronts(design),
+    }
+    return render_page("design", config, folder.path, shown)
 
 
 def findings(design: dict[str, Any]) -> list[str]:
@@ -79,11 +76,6 @@ def findings(design: dict[str, Any]) -> list[str]:
     return sentences
 
 
-_COSTS = {
-    "thickness": ("thickness, mm", "thickness_mm"),
-    "captures": ("captures", "captures"),
-    "light": ("electrons from each mm²", "electrons_per_mm2"),
-}
 _LIMIT = (
     "Resolution is the frequency up to which every ring of frequencies has a signal-to-noise "
     "ratio of at least 1."
@@ -93,13 +85,11 @@ _LIMIT = (
 def fronts(design: dict[str, Any]) -> list[dict[str, Any]]:
     """Of each Pareto front its table: title, labels of the columns, rows of texts, a sentence."""
     told = design.get("pareto", {})
-    return [
-        _front(name, told[name], design["reference"]["name"]) for name in _COSTS if name in told
-    ]
+    return [_front(name, told[name], design["reference"]["name"]) for name in COSTS if name in told]
 
 
 def _front(name: str, front: dict[str, Any], reference: str) -> dict[str, Any]:
-    label, cost = _COSTS[name]
+    label, cost = COSTS[name]
     names = told_of([*front["points"], front["reference"]])
     labels = [QUANTITIES[name].label for name in names]
     points = [(_cost(p[cost]), p) for p in front["points"]]
@@ -119,7 +109,7 @@ def _front(name: str, front: dict[str, Any], reference: str) -> dict[str, Any]:
             "rows": [
                 [
                     *(text, *cells(p, names), f"{p['predicted_psnr_db']:.2f}"),
-                    *(_decibel(p.get("simulated_psnr_db", {}).get(n)) for n in pictures),
+                    *(number(p.get("simulated_psnr_db", {}).get(n), 2) for n in pictures),
                     kept[p.get("dominated")],
                 ]
                 for text, p in points
@@ -148,10 +138,6 @@ def _front(name: str, front: dict[str, Any], reference: str) -> dict[str, Any]:
 
 def _cost(value: float | int) -> str:
     return f"{value:.0f}" if value >= 1000 else f"{value:.4g}"
-
-
-def _decibel(value: float | None) -> str:
-    return "–" if value is None else f"{value:.2f}"
 
 
 def _spread(spread: dict[str, Any], digits: int) -> str:

@@ -6,7 +6,10 @@ so that what costs more is never worse for want of searching. Designs are compar
 response, all of them on one band of frequencies.
 """
 
-from collections.abc import Callable, Iterable
+import dataclasses
+import math
+from collections.abc import Iterable
+from functools import cached_property, partial
 from typing import NamedTuple
 
 import equinox as eqx
@@ -15,27 +18,39 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from thincam_jax._core.precision import allow
+from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.design.config import DesignConfig, found_name
 from thincam_jax.commands.design.config_pareto import ParetoConfig, with_shots
-from thincam_jax.commands.design.problem import Data, Goal, Problem, build_problem, search_problem
-from thincam_jax.commands.design.ranking import Shot, shots_of_design
-from thincam_jax.commands.design.simulate import simulate
-from thincam_jax.commands.design.simulated import build_study
-from thincam_jax.commands.study.build import build_plane, synthesis_matrix
-from thincam_jax.commands.study.config import ConfigError
-from thincam_jax.commands.study.target import Progress
+from thincam_jax.commands.design.problem import (
+    DesignObjective,
+    DesignProblem,
+    ObjectiveData,
+    Shot,
+    build_problem,
+    phases_of,
+    search_problem,
+    shots_of_design,
+    synthesis_of,
+)
+from thincam_jax.commands.design.simulation import simulate, with_designs
+from thincam_jax.commands.run_folder import Step
+from thincam_jax.commands.study.study import Study
 from thincam_jax.design import Design, DesignSpace, PhotonNoise, bayes_error, channels, limit
 
 _TRIED = 3  # of the designs of a search, are scored exactly
 _NEAR = 0.15  # of the search's bounds to either side, where a search goes on from the point before
+_TOLD = {
+    "thickness": "thickness {:.3g} mm",
+    "captures": "{:g} captures",
+    "light": "light {:.4g} electrons",
+}
 
 
-class Point(NamedTuple):
+class FrontPoint(NamedTuple):
     """The best design found at one cost.
 
     - `cost`: the thickness allowed, mm; how many captures; or electrons from each mm² of open
       aperture.
-    - `shots`: its β and distances.
     - `resolution`: cycles/rad, up to which every ring's signal-to-noise ratio is at least 1.
     - `ends`: what ends it other than the signal, in words; empty where nothing does.
     - `error`: of the best linear reconstruction, as a part of the scene's variance.
@@ -43,171 +58,174 @@ class Point(NamedTuple):
     """
 
     cost: float
-    shots: tuple[Shot, ...]
+    design: Design
     resolution: float
     ends: str
     error: float
     simulated: tuple[tuple[str, float | None], ...] = ()
 
+    @property
+    def shots(self) -> tuple[Shot, ...]:
+        return shots_of_design(self.design)
+
 
 class Front(NamedTuple):
     """The points in the order of their cost, and the design to beat at its own."""
 
-    points: tuple[Point, ...]
-    reference: Point
+    points: tuple[FrontPoint, ...]
+    reference: FrontPoint
 
 
 class Fronts(NamedTuple):
-    """Those that were asked for.
+    """Those that were asked for: thickness, captures, light.
 
     - `edge`: the highest frequency of all, cycles/rad.
-    - `picture_variance`: geometric mean over the pictures, whose values end at 1.
+    - `picture_variance`: geometric mean over the pictures, whose values end at 1; of captures.
     """
 
-    thickness: Front | None
-    captures: Front | None
-    light: Front | None
+    fronts: dict[str, Front]
     edge: float
     picture_variance: float | None
 
 
-class _Judged(NamedTuple):
-    design: Design
-    resolution: float
-    ends: str
-    error: float
+class FrontSearches:
+    """The fronts that a design's file asks for: their list of work, and what it results in.
 
+    A point of thickness or light is searched for by itself; then near the next, from the last on;
+    then near the one before. Captures share the reference's exposure time; each number of them is
+    searched for by itself and near the one before. Double precision, as in `Finder`.
 
-def pareto_steps(fronts: ParetoConfig | None) -> int:
-    """How many times `find_fronts` reports progress."""
-    if fronts is None:
-        return 0
-    # There, back and there again, see `_line`.
-    lines = [3 * f.points - 2 for f in (fronts.thickness, fronts.light) if f is not None]
-    return sum(lines) + (2 * len(fronts.captures.shots) if fronts.captures is not None else 0)
-
-
-def find_fronts(config: DesignConfig, progress: Progress) -> Fronts:
-    """The fronts that a design's file asks for; double precision, as in `find`.
-
-    **Errors**: ConfigError where the objective was no number at any start.
+    **Errors**: ConfigError where the objective was NaN at every start.
     """
-    asked = config.pareto
-    if asked is None:
-        raise ValueError("no front is asked for; give the configuration a section 'pareto'")
-    with allow("float64"):
-        problem = build_problem(config)
-        fronts = Fronts(
-            _thickness(config, asked, problem, progress) if asked.thickness else None,
-            _captures(config, asked, problem, progress) if asked.captures else None,
-            _light(config, asked, problem, progress) if asked.light else None,
-            float(problem.exact.frequencies.highest),
-            _variance(config) if asked.captures else None,
-        )
-    if fronts.captures is None:
-        return fronts
-    points = []
-    for point in fronts.captures.points:
-        progress(f"{point.cost:g} captures, simulated")
-        points.append(point._replace(simulated=_simulated(config, point)))
-    return fronts._replace(captures=fronts.captures._replace(points=tuple(points)))
 
+    def __init__(self, study: Study, asked: ParetoConfig):
+        self.study, self.asked = study, asked
+        self.config: DesignConfig = study.config
+        self.phases = len(self.config.reference.phases)
+        self.costs = asked.costs(self.phases)
+        self.best: dict[str, dict[int, FrontPoint]] = {name: {} for name in self.costs}
+        self.work: list[Step] = []
+        for name, costs in self.costs.items():
+            for place, beside in _order(name, len(costs)):
+                search = partial(self.search, name, place, beside)
+                self.work.append(Step(_TOLD[name].format(costs[place]), search))
+        for place, cost in enumerate(self.costs.get("captures", ())):
+            self.work.append(Step(f"{cost:g} captures, simulated", partial(self.simulate, place)))
 
-def _thickness(
-    config: DesignConfig, asked: ParetoConfig, problem: Problem, progress: Progress
-) -> Front:
-    """Limit of resolution of designs whose distances are all within a thickness."""
-    assert asked.thickness is not None  # for the type checker
-    given = problem._replace(goal=Goal("limit"))
-    distance = jnp.asarray([v.name == "distance" for v in given.space.variables])
-    costs, problems = asked.thickness.costs(), []
-    for cost in costs:
+    @cached_property
+    def problem(self) -> DesignProblem:
+        """On the frequencies of the reference, which all points share."""
+        return build_problem(self.study)
+
+    def search(self, name: str, place: int, beside: int | None) -> None:
+        """A point of a front, near that of another place or over the whole space."""
+        cost, best = self.costs[name][place], self.best[name]
+        with allow("float64"):
+            problem = self._problem(name, cost)
+            near = None if beside is None else best[beside].design
+            if near is not None and name == "captures":
+                near = _longer(near, problem.space.base)
+            best[place] = self._best(problem, near, best.get(place))._replace(cost=cost)
+
+    def _problem(self, name: str, cost: float) -> DesignProblem:
+        if name == "captures":
+            return _of_shots(self.config, self.problem, round(cost) // self.phases)
+        given = self.problem._replace(objective=DesignObjective("limit"))
+        if name == "light":
+            return _lit(given, cost)
+        is_distance = jnp.asarray([v.name == "distance" for v in given.space.variables])
         upper = given.space.upper
-        thin = jnp.where(distance, jnp.minimum(upper, cost), upper)
-        space = eqx.tree_at(lambda s: s.upper, given.space, thin)
-        problems.append(given._replace(space=space))
-    points = _line(config, asked, costs, problems, lambda c: progress(f"thickness {c:.3g} mm"))
-    longest = max(shot.distance for shot in config.reference.shots)
-    return Front(points, _point(config, longest, _reference(config, given)))
+        thin = jnp.where(is_distance, jnp.minimum(upper, cost), upper)
+        return given._replace(space=eqx.tree_at(lambda s: s.upper, given.space, thin))
+
+    def _best(
+        self, problem: DesignProblem, near: Design | None, own: FrontPoint | None
+    ) -> FrontPoint:
+        """The best of a search near another design, of that design, and of `own`.
+
+        Without `own`, of a search over the whole space, too.
+        """
+        spaces = [problem.space] if own is None else []
+        designs: list[Design] = []
+        if near is not None:
+            place = jnp.clip(problem.space.point(near), 0.0, 1.0)
+            spaces.append(_near(problem.space, place))
+            designs.append(problem.space.design(place))
+        for space in spaces:
+            searched = search_problem(problem._replace(space=space), self.asked, self.config.seed)
+            designs += [found.design for found in searched.found[:_TRIED]]
+        judged = [_judge(design, problem.exact) for design in designs]
+        judged = _known(judged if own is None else [own, *judged])
+        if problem.objective.name == "limit":
+            return min(judged, key=lambda j: (-j.resolution, j.error))
+        return min(judged, key=lambda j: j.error)
+
+    def simulate(self, place: int) -> None:
+        """PSNR of every picture in the full simulation, at the seed of the configuration."""
+        point, name = self.best["captures"][place], found_name(1)
+        study = with_designs(dataclasses.replace(self.study, methods=()), {name: point.design})
+        simulated = tuple(
+            (target.name, simulate(study, target, 1)[name][0]["psnr_db"])
+            for target in study.targets
+            if target.is_picture
+        )
+        self.best["captures"][place] = point._replace(simulated=simulated)
+
+    def result(self) -> Fronts:
+        """When all work is done."""
+        costs = {
+            "thickness": max(shot.distance for shot in self.config.reference.shots),
+            "captures": float(self.problem.space.base.captures),
+            "light": self.config.noise.electrons or 0.0,
+        }
+        with allow("float64"):
+            reference = _judge(self.problem.space.base, self.problem.exact)
+        fronts = {
+            name: Front(tuple(best[n] for n in sorted(best)), reference._replace(cost=costs[name]))
+            for name, best in self.best.items()
+        }
+        variance = _variance(self.study) if "captures" in fronts else None
+        return Fronts(fronts, float(self.problem.exact.frequencies.highest), variance)
 
 
-def _light(
-    config: DesignConfig, asked: ParetoConfig, problem: Problem, progress: Progress
-) -> Front:
-    """Limit of resolution of designs with so many electrons."""
-    assert asked.light is not None  # for the type checker
-    given = problem._replace(goal=Goal("limit"))
-    costs = asked.light.costs()
-    problems = [_lit(given, cost) for cost in costs]
-    points = _line(config, asked, costs, problems, lambda c: progress(f"light {c:.4g} electrons"))
-    electrons = config.noise.electrons or 0.0
-    return Front(points, _point(config, electrons, _reference(config, given)))
+def _order(name: str, count: int) -> list[tuple[int, int | None]]:
+    """In which order the points of a front are searched for, each beside which other one."""
+    if name == "captures":
+        return [(n, n - 1 if n else None) for n in range(count)]
+    alone = [(n, None) for n in range(count)]
+    back = [(n, n + 1) for n in reversed(range(count - 1))]
+    return [*alone, *back, *((n, n - 1) for n in range(1, count))]
 
 
-def _line(
-    config: DesignConfig,
-    asked: ParetoConfig,
-    costs: list[float],
-    problems: list[Problem],
-    told: Callable[[float], None],
-) -> tuple[Point, ...]:
-    """Each for itself; then near the next, from the last on; then near the one before."""
-    best = []
-    for cost, problem in zip(costs, problems, strict=True):
-        told(cost)
-        best.append(_best(config, asked, problem, None))
-    for n in range(len(best) - 2, -1, -1):
-        told(costs[n])
-        best[n] = _best(config, asked, problems[n], best[n + 1], best[n])
-    for n in range(1, len(best)):
-        told(costs[n])
-        best[n] = _best(config, asked, problems[n], best[n - 1], best[n])
-    return tuple(_point(config, cost, one) for cost, one in zip(costs, best, strict=True))
+def _variance(study: Study) -> float:
+    planes = (target.plane for target in study.targets if target.is_picture)
+    images = (np.asarray(plane.image, dtype=float) for plane in planes)
+    return float(np.exp(np.mean([np.log(np.mean(np.var(i, axis=(-2, -1)))) for i in images])))
 
 
-def _captures(
-    config: DesignConfig, asked: ParetoConfig, problem: Problem, progress: Progress
-) -> Front:
-    """Error of designs of so many captures, which share the reference's exposure time."""
-    assert asked.captures is not None  # for the type checker
-    phases = len(config.reference.method().shot_phases())
-    points: list[Point] = []
-    best: _Judged | None = None
-    for count in asked.captures.shots:
-        progress(f"{count * phases} captures")
-        given = _of_shots(config, problem, count)
-        if best is not None:
-            best = best._replace(design=_longer(best.design, given.space.base, phases))
-        best = _best(config, asked, given, best)
-        points.append(_point(config, float(count * phases), best))
-    reference = _reference(config, problem)
-    return Front(tuple(points), _point(config, float(problem.space.base.captures), reference))
-
-
-def _of_shots(config: DesignConfig, problem: Problem, count: int) -> Problem:
+def _of_shots(config: DesignConfig, problem: DesignProblem, count: int) -> DesignProblem:
     """The search for designs of so many shots, on the frequencies of the others.
 
     With noise that counts electrons they divide the exposure of the reference's captures evenly.
     """
-    changed = with_shots(config, count)
-    matrix = jnp.asarray(synthesis_matrix(changed.reference.method()), float)
-    space = changed.space()
+    space = with_shots(config, count).space()
+    matrix = jnp.asarray(synthesis_of(space.base, config), float)
     if config.noise.electrons is not None:
         captures = space.base.captures
         share = jnp.full(captures, problem.space.base.captures / captures, space.lower.dtype)
         space = eqx.tree_at(lambda s: s.base.exposure, space, share)
-    return Problem(
-        Goal("bayes_error"),
+    return DesignProblem(
+        DesignObjective("bayes_error"),
         space,
         problem.data._replace(synthesis=matrix),
         problem.exact._replace(synthesis=matrix),
     )
 
 
-def _lit(problem: Problem, electrons: float) -> Problem:
+def _lit(problem: DesignProblem, electrons: float) -> DesignProblem:
     """With so many electrons."""
 
-    def lit(data: Data) -> Data:
+    def lit(data: ObjectiveData) -> ObjectiveData:
         noise = data.setup.noise
         assert isinstance(noise, PhotonNoise)  # for the type checker; the file was checked
         number = jnp.asarray(electrons, noise.electrons.dtype)
@@ -218,8 +236,9 @@ def _lit(problem: Problem, electrons: float) -> Problem:
     return problem._replace(data=lit(problem.data), exact=lit(problem.exact))
 
 
-def _longer(design: Design, base: Design, phases: int) -> Design:
+def _longer(design: Design, base: Design) -> Design:
     """A design with its last shot taken again, as often as `base` has captures more."""
+    phases = phases_of(base)
     last = range(design.captures - phases, design.captures)
     more = (base.captures - design.captures) // phases
     order = jnp.asarray([*range(design.captures), *(list(last) * more)])
@@ -230,34 +249,7 @@ def _longer(design: Design, base: Design, phases: int) -> Design:
     )
 
 
-def _best(
-    config: DesignConfig,
-    asked: ParetoConfig,
-    problem: Problem,
-    beside: _Judged | None,
-    own: _Judged | None = None,
-) -> _Judged:
-    """The best of a search near another design, of that design, and of `own`.
-
-    Without `own`, the best of a search over the whole space in its place.
-    """
-    spaces = [problem.space] if own is None else []
-    designs: list[Design] = []
-    if beside is not None:
-        place = jnp.clip(problem.space.point(beside.design), 0.0, 1.0)
-        spaces.append(_near(problem.space, place))
-        designs.append(problem.space.design(place))
-    for space in spaces:
-        searched = search_problem(problem._replace(space=space), asked, config.seed)
-        designs += [found.design for found in searched.found[:_TRIED]]
-    judged = [_judge(config, design, problem.exact) for design in designs]
-    judged = _known(judged if own is None else [own, *judged])
-    if problem.goal.name == "limit":
-        return min(judged, key=lambda j: (-j.resolution, j.error))
-    return min(judged, key=lambda j: j.error)
-
-
-def _known(judged: Iterable[_Judged]) -> list[_Judged]:
+def _known(judged: Iterable[FrontPoint]) -> list[FrontPoint]:
     known = [j for j in judged if np.isfinite(j.error)]
     if not known:
         raise ConfigError(
@@ -279,53 +271,18 @@ def _near(space: DesignSpace, place: Float[Array, " variable"]) -> DesignSpace:
     return eqx.tree_at(lambda s: (s.lower, s.upper), space, (lower, upper))
 
 
-def _reference(config: DesignConfig, problem: Problem) -> _Judged:
-    return _judge(config, problem.space.base, problem.exact)
-
-
-def _judge(config: DesignConfig, design: Design, data: Data) -> _Judged:
+def _judge(design: Design, data: ObjectiveData) -> FrontPoint:
     """Resolution and error by the exact response; no resolution beyond what the pixels sample."""
     found, error = (float(value) for value in _exactly(design, data))
     edge = float(data.frequencies.highest)
-    nyquist = float(jnp.max(design.distance)) / (2 * config.sensor.pitch)
+    nyquist = float(jnp.max(design.distance)) / (2 * float(data.setup.pitch))
     ends = "at the band's end" if found >= edge * (1 - 1e-9) else ""
     if nyquist < min(found, edge):
         ends = "at the pixels' Nyquist frequency"
-    return _Judged(design, min(found, edge, nyquist), ends, error)
+    return FrontPoint(math.nan, design, min(found, edge, nyquist), ends, error)
 
 
 @eqx.filter_jit
-def _exactly(design: Design, data: Data) -> tuple[Float[Array, ""], Float[Array, ""]]:
+def _exactly(design: Design, data: ObjectiveData) -> tuple[Float[Array, ""], Float[Array, ""]]:
     known = channels(design, data.setup, data.synthesis, data.frequencies)
     return limit(known, data.frequencies), bayes_error(known)
-
-
-def _point(config: DesignConfig, cost: float, best: _Judged) -> Point:
-    phases = len(config.reference.method().shot_phases())
-    shots = shots_of_design(best.design, phases)
-    return Point(cost, shots, best.resolution, best.ends, best.error)
-
-
-def _variance(config: DesignConfig) -> float:
-    study = build_study(config)
-    images = (np.asarray(build_plane(study, t).image, dtype=float) for t in config.pictures())
-    return float(np.exp(np.mean([np.log(np.mean(np.var(i, axis=(-2, -1)))) for i in images])))
-
-
-class _Named(NamedTuple):
-    name: str
-    shots: tuple[Shot, ...]
-
-
-def _simulated(config: DesignConfig, point: Point) -> tuple[tuple[str, float | None], ...]:
-    """PSNR of every picture in the full simulation, at the seed of the configuration."""
-    # What the reference cannot be called.
-    name = found_name(1)
-    study = build_study(config, [_Named(name, point.shots)])
-    study = study.model_copy(update={"methods": study.methods[-1:]})
-    pictures = {t.name for t in config.pictures()}
-    return tuple(
-        (target.name, simulate(study, index, target, 1)[name][0]["psnr_db"])
-        for index, target in enumerate(study.targets)
-        if target.name in pictures
-    )

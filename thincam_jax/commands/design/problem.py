@@ -1,4 +1,4 @@
-"""What is searched for: the goal as a function of designs, and the numbers it takes."""
+"""What is searched for: the objective as a function of designs, and the numbers it takes."""
 
 import math
 from dataclasses import dataclass
@@ -12,12 +12,11 @@ from jaxtyping import Array, Float
 from thincam_jax.commands.design.config import (
     DesignConfig,
     DesignNoiseConfig,
-    Objective,
+    ObjectiveName,
     SearchConfig,
 )
 from thincam_jax.commands.design.config_pareto import ParetoConfig
-from thincam_jax.commands.design.simulated import build_study
-from thincam_jax.commands.study.build import build_plane, synthesis_matrix
+from thincam_jax.commands.study.study import Study, synthesis_matrix
 from thincam_jax.design import (
     Design,
     DesignSpace,
@@ -47,8 +46,31 @@ RISE, _RISE_DB = 0.01, 0.0432
 _MARGIN, _FEWEST = 1.1, 128  # of the samples that fringes need; at least
 
 
-class Data(NamedTuple):
-    """What a goal takes beside the design."""
+class Shot(NamedTuple):
+    """β in rad/mm²; distance, wavelength and mask's width in mm; exposure in the reference's."""
+
+    beta: float
+    distance: float
+    wavelength: float
+    width: float
+    exposure: float = 1.0
+
+
+def phases_of(design: Design) -> int:
+    """How many captures each shot takes: every shot takes the same, different phases."""
+    return len(np.unique(np.asarray(design.phase)))
+
+
+def shots_of_design(design: Design) -> tuple[Shot, ...]:
+    """The numbers of each shot."""
+    numbers = (getattr(design, name) for name in Shot._fields)
+    each = np.broadcast_arrays(*(np.asarray(n, dtype=float) for n in numbers))
+    rows = zip(*(n[:: phases_of(design)].tolist() for n in each), strict=True)
+    return tuple(Shot(*row) for row in rows)
+
+
+class ObjectiveData(NamedTuple):
+    """What an objective takes beside the design."""
 
     setup: Setup
     synthesis: Float[Array, "channel capture"]
@@ -56,14 +78,14 @@ class Data(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Goal:
-    """An objective to be made small; equal goals are compiled once.
+class DesignObjective:
+    """What is to be made small; equal objectives are compiled once.
 
     - `band`: of `worst_ratio` and `unevenness`.
     - `tolerances`, `how`: of `robust_error`.
     """
 
-    name: Objective
+    name: ObjectiveName
     band: tuple[float, float] = DEFAULT_BAND
     tolerances: Tolerances = Tolerances()
     how: Literal["mean", "worst"] = "mean"
@@ -92,6 +114,11 @@ class Goal:
         return self.name in ("worst_ratio", "limit")
 
     @property
+    def has_band(self) -> bool:
+        """Whether it looks at a band of frequencies only."""
+        return self.name in ("worst_ratio", "unevenness")
+
+    @property
     def unit(self) -> str:
         """Of `told`."""
         return "cycles/rad" if self.name == "limit" else "dB"
@@ -109,53 +136,60 @@ class Goal:
         return f"{words[self.name]} ({self.unit})"
 
     def told(self, minimised: Any) -> Any:
-        """A value of the goal as it is shown: errors in dB, and what is to be large as it is."""
+        """A minimised value as it is shown: errors in dB, and what is to be large as it is."""
         value = np.asarray(minimised, dtype=float)
         if self.name in ("bayes_error", "robust_error"):
             return 10 * np.log10(value)
         return -value if self.wants_more else value
 
     def gain(self, reference: float, found: float) -> float:
-        """How much better the goal `found` is than that of the reference, in the unit of `told`."""
+        """How much better the value `found` is than the reference's, in the unit of `told`."""
         gain = float(self.told(reference) - self.told(found))
         return -gain if self.wants_more else gain
 
     def rise(self, value: float) -> float:
         """What is called worse by 1 %."""
-        return _RISE_DB if self.name in ("worst_ratio", "unevenness") else RISE * abs(value)
+        return _RISE_DB if self.has_band else RISE * abs(value)
 
 
-class Problem(NamedTuple):
+class DesignProblem(NamedTuple):
     """A search: `data` for the many evaluations, `exact` for the designs that were found."""
 
-    goal: Goal
+    objective: DesignObjective
     space: DesignSpace
-    data: Data
-    exact: Data
+    data: ObjectiveData
+    exact: ObjectiveData
 
 
-def build_problem(config: DesignConfig) -> Problem:
+def synthesis_of(design: Design, config: DesignConfig) -> np.ndarray:
+    """Of a design's captures, real weights (channel, capture)."""
+    phases = phases_of(design)
+    return synthesis_matrix(config.reference.synthesis, design.captures // phases, phases)
+
+
+def build_problem(study: Study) -> DesignProblem:
     """In the precision that JAX is set to; looks at the photographs where the prior needs them."""
-    setup = _setup(config)
-    synthesis = jnp.asarray(synthesis_matrix(config.reference.method()), float)
+    config: DesignConfig = study.config
+    setup, space = _setup(study), config.space()
+    synthesis = jnp.asarray(synthesis_of(space.base, config), float)
     # The largest field of view reaches half of the pixels' Nyquist frequency 1/(2 pitch), which all
     # designs of the search can be compared up to.
-    highest = jnp.asarray(config.farthest() / (4 * config.sensor.pitch))
+    highest = jnp.asarray(config.reach("distance")[1] / (4 * config.sensor.pitch))
     counts = config.search.frequencies
-    return Problem(
-        _goal(config),
-        config.space(),
-        Data(setup, synthesis, Polar(highest, counts.radii, counts.directions)),
-        Data(setup, synthesis, Quadrant(highest, counts.exact or _exact_count(config, highest))),
+    exact = Quadrant(highest, counts.exact or _exact_count(config, highest))
+    return DesignProblem(
+        _objective(config.search),
+        space,
+        ObjectiveData(setup, synthesis, Polar(highest, counts.radii, counts.directions)),
+        ObjectiveData(setup, synthesis, exact),
     )
 
 
-def _goal(config: DesignConfig) -> Goal:
-    asked = config.search
+def _objective(asked: SearchConfig) -> DesignObjective:
     band, given = asked.band or DEFAULT_BAND, asked.tolerances
     if given is None:
-        return Goal(asked.objective, band)
-    return Goal(asked.objective, band, given.tolerances(), given.how)
+        return DesignObjective(asked.objective, band)
+    return DesignObjective(asked.objective, band, given.tolerances(), given.how)
 
 
 def _exact_count(config: DesignConfig, highest) -> int:
@@ -164,19 +198,20 @@ def _exact_count(config: DesignConfig, highest) -> int:
     As an angle, a PSF is as wide as the mask's shadow over its distance; |H|² holds differences of
     its points, up to that width to either side.
     """
-    nearest = config.nearest()
-    shadow = config.widest() * (1 + nearest / config.object.distance) / nearest
+    nearest, widest = config.reach("distance")[0], config.reach("width")[1]
+    shadow = widest * (1 + nearest / config.object.distance) / nearest
     return max(_FEWEST, math.ceil(_MARGIN * 2 * shadow * float(highest)) + 1)
 
 
-def _setup(config: DesignConfig) -> Setup:
+def _setup(study: Study) -> Setup:
+    config: DesignConfig = study.config
     return Setup(
         pitch=config.sensor.pitch,
         sensor_width=config.sensor.width,
         object_distance=config.object.distance,
         object_width=config.object.width,
         noise=_noise(config.noise),
-        prior=_prior(config),
+        prior=_prior(study),
         contrast=config.prior.contrast,
         pixel_integration=config.pixel_integration,
     )
@@ -188,18 +223,19 @@ def _noise(noise: DesignNoiseConfig) -> SignalNoise | PhotonNoise:
     return PhotonNoise(noise.electrons or 0.0, noise.read_noise or 0.0)
 
 
-def _prior(config: DesignConfig) -> PowerLaw:
-    if config.prior.exponent is not None:
-        return PowerLaw(config.prior.exponent)
-    study = build_study(config)
-    planes = (build_plane(study, target) for target in config.pictures())
+def _prior(study: Study) -> PowerLaw:
+    if study.config.prior.exponent is not None:
+        return PowerLaw(study.config.prior.exponent)
+    planes = (target.plane for target in study.targets if target.is_picture)
     return fit_power_law(np.asarray(p.image, dtype=float).mean(axis=0) for p in planes)
 
 
-def search_problem(problem: Problem, wanted: SearchConfig | ParetoConfig, seed: int) -> Search:
+def search_problem(
+    problem: DesignProblem, wanted: SearchConfig | ParetoConfig, seed: int
+) -> Search:
     """The search, as long as a section of the file wants it."""
     return find_designs(
-        problem.goal,
+        problem.objective,
         problem.space,
         problem.data,
         key=jax.random.key(seed),
@@ -208,23 +244,3 @@ def search_problem(problem: Problem, wanted: SearchConfig | ParetoConfig, seed: 
         steps=wanted.steps,
         solver=wanted.solver,
     )
-
-
-def broken_limits(config: DesignConfig) -> tuple[str, ...]:
-    """Which limits of the search the reference itself does not keep, in words."""
-    words = []
-    limits = config.search.limits
-    for number, shot in enumerate(config.reference.shots, 1):
-        if limits.mask_pixel is not None:
-            finest = math.pi / limits.mask_pixel / config.mask.width
-            if shot.beta > finest * (1 + 1e-6):
-                words.append(
-                    f"β of shot {number}, {shot.beta:g} rad/mm², is more than the "
-                    f"{finest:.4g} rad/mm² that mask pixels of {1000 * limits.mask_pixel:g} µm show"
-                )
-        if limits.thickness is not None and shot.distance > limits.thickness * (1 + 1e-6):
-            words.append(
-                f"the distance of shot {number}, {shot.distance:g} mm, is more than the thickness "
-                f"of {limits.thickness:g} mm"
-            )
-    return tuple(words)

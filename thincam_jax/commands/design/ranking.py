@@ -1,6 +1,7 @@
 """The search, its designs ranked and re-scored exactly, and what surrounds them."""
 
 from collections.abc import Iterable
+from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
@@ -8,40 +9,38 @@ import jax.numpy as jnp
 import numpy as np
 
 from thincam_jax._core.precision import allow
-from thincam_jax.commands.design.config import DesignConfig, found_name
-from thincam_jax.commands.design.landscape import Landscape, landscape_of
+from thincam_jax.commands.config_file import ConfigError
+from thincam_jax.commands.design.config import DesignConfig, TrainingConfig, found_name
 from thincam_jax.commands.design.problem import (
     RISE,
-    Data,
-    Goal,
-    Problem,
+    DesignObjective,
+    DesignProblem,
+    ObjectiveData,
+    Shot,
     build_problem,
     search_problem,
+    shots_of_design,
 )
-from thincam_jax.commands.design.sensitivity import FreeValue, around, free_values
-from thincam_jax.commands.design.train import Trained, train, train_steps
+from thincam_jax.commands.design.surroundings import (
+    FreeValue,
+    Landscape,
+    derivatives,
+    free_values,
+    landscape_of,
+)
+from thincam_jax.commands.design.train import Trained, TrainingDescents
 from thincam_jax.commands.design.transfer import RINGS, Transfer, modulation_transfer
-from thincam_jax.commands.study.config import ConfigError
-from thincam_jax.commands.study.target import Progress
+from thincam_jax.commands.run_folder import Step
+from thincam_jax.commands.study.study import Study
 from thincam_jax.design import Design, DesignSpace, channels
 from thincam_jax.design.objectives import ring_means
-from thincam_jax.design.search import APART, Found
+from thincam_jax.design.search import APART, Found, Search
 
 _KEPT = 10  # designs that are re-scored and listed
 
 
-class Shot(NamedTuple):
-    """β in rad/mm²; distance, wavelength and mask's width in mm; exposure in the reference's."""
-
-    beta: float
-    distance: float
-    wavelength: float
-    width: float
-    exposure: float = 1.0
-
-
 class Candidate(NamedTuple):
-    """A design, its goal (smaller is better) as searched and exactly, and its ring means.
+    """A design, its objective (smaller is better) as searched and exactly, and its ring means.
 
     - `level`: signal-to-noise ratio of each ring.
     - `values`, `status`, `active`: of what was found; empty for the reference.
@@ -49,7 +48,7 @@ class Candidate(NamedTuple):
     """
 
     name: str
-    shots: tuple[Shot, ...]
+    design: Design
     searched: float
     exact: float
     level: np.ndarray
@@ -58,8 +57,12 @@ class Candidate(NamedTuple):
     active: tuple[str, ...] = ()
     trained: float | None = None
 
+    @property
+    def shots(self) -> tuple[Shot, ...]:
+        return shots_of_design(self.design)
 
-class Result(NamedTuple):
+
+class FoundDesigns(NamedTuple):
     """What a search gave.
 
     - `edge`: of the frequencies looked at, cycles/rad.
@@ -67,7 +70,7 @@ class Result(NamedTuple):
     - `training`: what the training gave; None without.
     """
 
-    goal: Goal
+    objective: DesignObjective
     reference: Candidate
     found: tuple[Candidate, ...]
     evaluations: int
@@ -79,61 +82,85 @@ class Result(NamedTuple):
     training: Trained | None = None
 
 
-def find(config: DesignConfig, progress: Progress) -> Result:
-    """The search, in double precision: its objective's fringes are finer than single holds.
+class Finder:
+    """The search of a design's file: its list of work, which ends with the `result`.
 
-    Training, which is not that fine, is in the precision that JAX is set to.
+    In double precision: the objective's fringes are finer than single holds. Training, which is not
+    that fine, is in the precision that JAX is set to.
     """
-    phases = len(config.reference.method().shot_phases())
-    with allow("float64"):
-        problem = build_problem(config)
-        progress("search")
-        searched = search_problem(problem, config.search, config.seed)
-        kept = _distinct(problem.space, searched.found, phases)
-    trained = None
-    if config.train is not None:
-        points = [np.asarray(k.point) for k in kept]
-        trained = train(config, config.train, problem, points, progress)
-    with allow("float64"):
-        progress("found designs")
-        if trained is None:
-            found, best = _rescore(problem, kept, phases)
-        else:
-            found, best = _rank_trained(problem, trained, phases)
-        progress("landscape")
-        return _result(config, problem, searched, trained, found, best)
+
+    problem: DesignProblem
+    searched: Search
+    kept: tuple[Found, ...]
+    descents: TrainingDescents
+    trained: Trained | None = None
+    found: tuple[Candidate, ...]
+    result: FoundDesigns
+
+    def __init__(self, study: Study):
+        self.study = study
+        self.config: DesignConfig = study.config
+        self.work = [Step("search", self.search)]
+        if (wanted := self.config.train) is not None:
+            self.work.append(Step("training, samples", partial(self.sample, wanted)))
+            for number in range(wanted.starts):
+                text = f"training {number + 1} of {wanted.starts}"
+                self.work.append(Step(text, partial(self.descend, number)))
+            self.work.append(Step("around the trained designs", self.finish_training))
+        self.work += [Step("found designs", self.rank), Step("landscape", self.surround)]
+
+    def search(self) -> None:
+        with allow("float64"):
+            self.problem = build_problem(self.study)
+            self.searched = search_problem(self.problem, self.config.search, self.config.seed)
+            self.kept = distinct(self.problem.space, self.searched.found)
+
+    def sample(self, wanted: TrainingConfig) -> None:
+        points = [np.asarray(one.point) for one in self.kept]
+        setup = self.problem.data.setup
+        self.descents = TrainingDescents(self.config, wanted, setup, points)
+
+    def descend(self, number: int) -> None:
+        self.descents.descend(number)
+
+    def finish_training(self) -> None:
+        self.trained = self.descents.finish()
+
+    def rank(self) -> None:
+        with allow("float64"):
+            if self.trained is None:
+                self.found = rescored(self.problem, self.kept)
+            else:
+                self.found = rank_trained(self.problem, self.trained)
+
+    def surround(self) -> None:
+        problem, base, best = self.problem, self.problem.space.base, self.found[0].design
+        with allow("float64"):
+            reference = Candidate(self.config.reference.name, base, *_score(problem, base))
+            if self.trained is not None:
+                reference = reference._replace(trained=self.trained.reference)
+            given = (problem.objective, problem.space, problem.data)
+            self.result = FoundDesigns(
+                problem.objective,
+                reference,
+                self.found,
+                self.searched.evaluations,
+                self.searched.failed,
+                float(problem.data.setup.prior.exponent),
+                float(problem.data.frequencies.highest),
+                landscape_of(*given, best, self.config.search.grid),
+                (
+                    modulation_transfer(base, problem.exact),
+                    modulation_transfer(best, problem.exact),
+                ),
+                self.trained,
+            )
 
 
-def find_steps(config: DesignConfig) -> int:
-    """How many times `find` reports progress."""
-    return 3 + train_steps(config.train)
-
-
-def _result(config: DesignConfig, problem: Problem, searched, trained, found, best) -> Result:
-    phases = len(config.reference.method().shot_phases())
-    base = problem.space.base
-    shots = shots_of_design(base, phases)
-    reference = Candidate(config.reference.name, shots, *_score(problem, base))
-    if trained is not None:
-        reference = reference._replace(trained=trained.reference)
-    return Result(
-        problem.goal,
-        reference,
-        found,
-        searched.evaluations,
-        searched.failed,
-        float(problem.data.setup.prior.exponent),
-        float(problem.data.frequencies.highest),
-        landscape_of(problem.goal, problem.space, problem.data, best, config.search.grid, phases),
-        (modulation_transfer(base, problem.exact), modulation_transfer(best, problem.exact)),
-        trained,
-    )
-
-
-def _distinct(space: DesignSpace, found: tuple[Found, ...], phases: int) -> tuple[Found, ...]:
+def distinct(space: DesignSpace, found: tuple[Found, ...]) -> tuple[Found, ...]:
     """The best, without those whose shots are only in another order.
 
-    **Errors**: ConfigError where the objective was no number at any start.
+    **Errors**: ConfigError where the objective was NaN at every start.
     """
     if not found:
         raise ConfigError(
@@ -141,67 +168,46 @@ def _distinct(space: DesignSpace, found: tuple[Found, ...], phases: int) -> tupl
         )
     kept: list[Found] = []
     for one in found:
-        if not any(_alike(space, one, other, phases) for other in kept):
+        if not any(_alike(space, one, other) for other in kept):
             kept.append(one)
         if len(kept) == _KEPT:
             break
     return tuple(kept)
 
 
-def _rescore(
-    problem: Problem, kept: tuple[Found, ...], phases: int
-) -> tuple[tuple[Candidate, ...], Design]:
-    """The search's designs, ranked exactly; and the first."""
-    candidates = [
-        _candidate(problem, one, _tolerances(problem, one, phases), phases) for one in kept
-    ]
-    order = sorted(range(len(kept)), key=lambda n: candidates[n].exact)
-    return _named(candidates[n] for n in order), kept[order[0]].design
+def rescored(problem: DesignProblem, kept: tuple[Found, ...]) -> tuple[Candidate, ...]:
+    """The search's designs, ranked exactly."""
+    candidates = (_candidate(problem, one, tolerances(problem, one)) for one in kept)
+    return _named(sorted(candidates, key=lambda candidate: candidate.exact))
 
 
-def _rank_trained(
-    problem: Problem, trained: Trained, phases: int
-) -> tuple[tuple[Candidate, ...], Design]:
-    """The trained designs, by their training error; and the first."""
+def rank_trained(problem: DesignProblem, trained: Trained) -> tuple[Candidate, ...]:
+    """The trained designs, by their training error."""
     space = problem.space
-    near = {id(one): around for one, around in zip(trained.found, trained.around, strict=True)}
-    candidates, designs = [], []
-    for one in _distinct(space, trained.found, phases):
+    near = {id(one): own for one, own in zip(trained.found, trained.near, strict=True)}
+    candidates = []
+    for one in distinct(space, trained.found):
         point = jnp.asarray(np.asarray(one.point), space.lower.dtype)
         exact = one._replace(design=space.design(point), values=space.values(point), point=point)
-        rise = RISE * one.objective
-        values = free_values(space, exact, near[id(one)], rise, phases)
-        candidate = _candidate(problem, exact, values, phases)
-        candidates.append(candidate._replace(trained=one.objective))
-        designs.append(exact.design)
-    return _named(candidates), designs[0]
+        values = free_values(space, exact, near[id(one)], RISE * one.objective)
+        candidates.append(_candidate(problem, exact, values)._replace(trained=one.objective))
+    return _named(candidates)
 
 
-def _candidate(
-    problem: Problem, one: Found, values: tuple[FreeValue, ...], phases: int
-) -> Candidate:
-    shots, score = shots_of_design(one.design, phases), _score(problem, one.design)
-    return Candidate("", shots, *score, values, one.status, one.active)
+def _candidate(problem: DesignProblem, one: Found, values: tuple[FreeValue, ...]) -> Candidate:
+    return Candidate("", one.design, *_score(problem, one.design), values, one.status, one.active)
 
 
 def _named(candidates: Iterable[Candidate]) -> tuple[Candidate, ...]:
     return tuple(c._replace(name=found_name(k)) for k, c in enumerate(candidates, 1))
 
 
-def shots_of_design(design: Design, phases: int) -> tuple[Shot, ...]:
-    """The numbers of each shot, which takes `phases` captures."""
-    numbers = (getattr(design, name) for name in Shot._fields)
-    each = np.broadcast_arrays(*(np.asarray(n, dtype=float) for n in numbers))
-    rows = zip(*(n[::phases] for n in each), strict=True)
-    return tuple(Shot(*(float(n) for n in row)) for row in rows)
-
-
-def _alike(space: DesignSpace, one: Found, other: Found, phases: int) -> bool:
+def _alike(space: DesignSpace, one: Found, other: Found) -> bool:
     """Whether two designs have the same shots, in whatever order."""
     spans = dict.fromkeys(Shot._fields, 0.0)
     for v, lower, upper in zip(space.variables, space.lower, space.upper, strict=True):
         spans[v.name] = max(spans[v.name], float(upper - lower))
-    pairs = zip(*(sorted(shots_of_design(f.design, phases)) for f in (one, other)), strict=True)
+    pairs = zip(*(sorted(shots_of_design(f.design)) for f in (one, other)), strict=True)
     return all(
         abs(getattr(a, name) - getattr(b, name)) <= APART * span
         for a, b in pairs
@@ -209,20 +215,20 @@ def _alike(space: DesignSpace, one: Found, other: Found, phases: int) -> bool:
     )
 
 
-def _score(problem: Problem, design: Design) -> tuple[float, float, np.ndarray]:
-    """The goal as searched, exactly, and the signal-to-noise ratio of the rings."""
-    searched, _ = _goal_and_rings(problem.goal, design, problem.data)
-    exact, level = _goal_and_rings(problem.goal, design, problem.exact)
+def _score(problem: DesignProblem, design: Design) -> tuple[float, float, np.ndarray]:
+    """The objective as searched, exactly, and the signal-to-noise ratio of the rings."""
+    searched, _ = _value_and_rings(problem.objective, design, problem.data)
+    exact, level = _value_and_rings(problem.objective, design, problem.exact)
     return float(searched), float(exact), np.asarray(level)
 
 
 @eqx.filter_jit
-def _goal_and_rings(goal: Goal, design: Design, data: Data):
+def _value_and_rings(objective: DesignObjective, design: Design, data: ObjectiveData):
     known = channels(design, data.setup, data.synthesis, data.frequencies)
-    return goal(design, data), ring_means(known, data.frequencies, RINGS)
+    return objective(design, data), ring_means(known, data.frequencies, RINGS)
 
 
-def _tolerances(problem: Problem, one: Found, phases: int) -> tuple[FreeValue, ...]:
-    space, goal = problem.space, problem.goal
-    near = around(goal, space, problem.data, one.point)
-    return free_values(space, one, near, goal.rise(one.objective), phases)
+def tolerances(problem: DesignProblem, one: Found) -> tuple[FreeValue, ...]:
+    """The free numbers, each with the change that makes the objective worse by 1 %."""
+    near = derivatives(problem.objective, problem.space, problem.data, one.point)
+    return free_values(problem.space, one, near, problem.objective.rise(one.objective))

@@ -6,25 +6,35 @@ from typing import Any
 import numpy as np
 
 from thincam_jax.commands.design.config import DesignConfig
-from thincam_jax.commands.design.pareto import Front, Fronts, Point
-from thincam_jax.commands.design.problem import broken_limits
-from thincam_jax.commands.design.ranking import Candidate, FreeValue, Result, Shot
-from thincam_jax.commands.study.config import ShotConfig, StudyConfig
+from thincam_jax.commands.design.pareto import Front, FrontPoint, Fronts
+from thincam_jax.commands.design.problem import Shot
+from thincam_jax.commands.design.ranking import Candidate, FoundDesigns
+from thincam_jax.commands.design.surroundings import FreeValue
+from thincam_jax.commands.design.words import QUANTITIES
+from thincam_jax.commands.sections import ShotConfig
+from thincam_jax.commands.study.study import Study
 from thincam_jax.design import non_dominated
 from thincam_jax.design.space import UNITS
 
+# Of each front what its cost is called in words, and in design.json.
+COSTS = {
+    "thickness": ("thickness, mm", "thickness_mm"),
+    "captures": ("captures", "captures"),
+    "light": ("electrons from each mm²", "electrons_per_mm2"),
+}
 
-def record(config: DesignConfig, result: Result, study: StudyConfig, validation: dict) -> dict:
+
+def record(result: FoundDesigns, study: Study, validation: dict) -> dict:
     """The designs, best first, and the validation of those of them that were simulated."""
-    goal = result.goal
+    config, objective = study.config, result.objective
     return {
         "design": config.name,
         "seed": config.seed,
         "objective": {
-            "name": goal.name,
-            "better": "higher" if goal.wants_more else "lower",
-            "told": goal.label,
-            "band": list(goal.band) if goal.name in ("worst_ratio", "unevenness") else None,
+            "name": objective.name,
+            "better": "higher" if objective.wants_more else "lower",
+            "told": objective.label,
+            "band": list(objective.band) if objective.has_band else None,
             "highest_cycles_per_rad": _round(result.edge),
             "prior_exponent": _round(result.exponent),
         },
@@ -39,7 +49,7 @@ def record(config: DesignConfig, result: Result, study: StudyConfig, validation:
             "broken_limits": list(broken_limits(config)),
         },
         "compare": [
-            {"name": rival.name, "shots": [_shot(_given(config, s)) for s in rival.shots]}
+            {"name": rival.name, "shots": [_given(config, shot) for shot in rival.shots]}
             for rival in config.compare
         ],
         "found": [_found(result, candidate) for candidate in result.found],
@@ -47,13 +57,13 @@ def record(config: DesignConfig, result: Result, study: StudyConfig, validation:
             "seeds": config.validation.seeds,
             "pictures": [t.name for t in config.pictures()],
             "charts": [t.name for t in config.targets if t.kind == "usaf1951"],
-            "one_object_grid": len({max(s.distance for s in m.shots) for m in study.methods}) == 1,
+            "one_object_grid": len({method.distance for method in study.methods}) == 1,
             "methods": validation,
         },
     }
 
 
-def _training(config: DesignConfig, result: Result) -> dict[str, Any] | None:
+def _training(config: DesignConfig, result: FoundDesigns) -> dict[str, Any] | None:
     if config.train is None or result.training is None:
         return None
     return {
@@ -67,22 +77,22 @@ def _training(config: DesignConfig, result: Result) -> dict[str, Any] | None:
     }
 
 
-def _candidate(result: Result, one: Candidate) -> dict[str, Any]:
-    sign = -1 if result.goal.wants_more else 1
+def _candidate(result: FoundDesigns, one: Candidate) -> dict[str, Any]:
+    sign = -1 if result.objective.wants_more else 1
     return {
         "name": one.name,
         "shots": [_shot(shot) for shot in one.shots],
         "objective": _round(sign * one.searched),
         "objective_exact": _round(sign * one.exact),
-        "told": _round(float(result.goal.told(one.exact))),
-        "training_error": None if one.trained is None else _round(one.trained),
+        "told": _round(float(result.objective.told(one.exact))),
+        "training_error": _round(one.trained),
     }
 
 
-def _found(result: Result, one: Candidate) -> dict[str, Any]:
+def _found(result: FoundDesigns, one: Candidate) -> dict[str, Any]:
     return {
         **_candidate(result, one),
-        "predicted_gain": _round(result.goal.gain(result.reference.exact, one.exact)),
+        "predicted_gain": _round(result.objective.gain(result.reference.exact, one.exact)),
         "training_gain_db": _training_gain(result.reference, one),
         "values": [_value(value) for value in one.values],
         "status": one.status,
@@ -93,7 +103,7 @@ def _found(result: Result, one: Candidate) -> dict[str, Any]:
 def _training_gain(reference: Candidate, one: Candidate) -> float | None:
     if reference.trained is None or one.trained is None:
         return None
-    if not (reference.trained > 0 and one.trained > 0):  # no number, or a perfect image
+    if not (reference.trained > 0 and one.trained > 0):  # NaN, or a perfect image
         return None
     return _round(10 * math.log10(reference.trained / one.trained))
 
@@ -101,13 +111,12 @@ def _training_gain(reference: Candidate, one: Candidate) -> float | None:
 def record_fronts(config: DesignConfig, fronts: Fronts) -> dict[str, Any]:
     """The fronts, each with its points in the order of their cost, and which of them count."""
     told: dict[str, Any] = {"highest_cycles_per_rad": _round(fronts.edge)}
-    if fronts.thickness is not None:
-        told["thickness"] = _front(config, fronts.thickness, "thickness_mm")
-    if fronts.captures is not None:
-        assert fronts.picture_variance is not None  # for the type checker
-        told["captures"] = _captures(config, fronts.captures, fronts.picture_variance)
-    if fronts.light is not None:
-        told["light"] = _front(config, fronts.light, "electrons_per_mm2")
+    for name, front in fronts.fronts.items():
+        if name == "captures":
+            assert fronts.picture_variance is not None  # for the type checker
+            told[name] = _captures(config, front, fronts.picture_variance)
+        else:
+            told[name] = _front(config, front, COSTS[name][1])
     return told
 
 
@@ -125,7 +134,7 @@ def _front(config: DesignConfig, front: Front, cost: str) -> dict[str, Any]:
 def _captures(config: DesignConfig, front: Front, variance: float) -> dict[str, Any]:
     """Captures against PSNR, predicted and simulated."""
 
-    def predicted(point: Point) -> dict[str, Any]:
+    def predicted(point: FrontPoint) -> dict[str, Any]:
         size = point.error * variance
         level = -10 * math.log10(size) if size > 0 else math.nan
         told = _point(config, point, "captures")
@@ -158,7 +167,7 @@ def _captures(config: DesignConfig, front: Front, variance: float) -> dict[str, 
     }
 
 
-def _point(config: DesignConfig, point: Point, cost: str) -> dict[str, Any]:
+def _point(config: DesignConfig, point: FrontPoint, cost: str) -> dict[str, Any]:
     return {
         cost: _round(point.cost),
         "shots": [_shot(shot) for shot in point.shots],
@@ -169,18 +178,12 @@ def _point(config: DesignConfig, point: Point, cost: str) -> dict[str, Any]:
     }
 
 
-def _given(config: DesignConfig, shot: ShotConfig) -> Shot:
-    return Shot(shot.beta, shot.distance, config.wavelength, config.mask.width)
+def _given(config: DesignConfig, shot: ShotConfig) -> dict[str, float | None]:
+    return _shot(Shot(shot.beta, shot.distance, config.wavelength, config.mask.width))
 
 
 def _shot(shot: Shot) -> dict[str, float | None]:
-    return {
-        "beta_rad_per_mm2": _round(shot.beta),
-        "distance_mm": _round(shot.distance),
-        "wavelength_nm": _round(shot.wavelength * 1e6),
-        "width_mm": _round(shot.width),
-        "exposure": _round(shot.exposure),
-    }
+    return {q.key: _round(getattr(shot, name) * q.scale) for name, q in QUANTITIES.items()}
 
 
 def _value(value: FreeValue) -> dict[str, Any]:
@@ -188,11 +191,31 @@ def _value(value: FreeValue) -> dict[str, Any]:
         "variable": value.variable,
         "shots": list(value.shots),
         "value": _round(value.value),
-        "tolerance": None if value.tolerance is None else _round(value.tolerance),
+        "tolerance": _round(value.tolerance),
         "unit": UNITS[value.variable],
     }
 
 
-def _round(value: float) -> float | None:
-    """Seven digits; None for what is no number, which JSON does not know."""
-    return float(f"{value:.7g}") if math.isfinite(value) else None
+def _round(value: float | None) -> float | None:
+    """Seven digits; None for NaN and infinity, which JSON does not know."""
+    return float(f"{value:.7g}") if value is not None and math.isfinite(value) else None
+
+
+def broken_limits(config: DesignConfig) -> tuple[str, ...]:
+    """Which limits of the search the reference itself does not keep, in words."""
+    words = []
+    limits = config.search.limits
+    for number, shot in enumerate(config.reference.shots, 1):
+        if limits.mask_pixel is not None:
+            finest = math.pi / limits.mask_pixel / config.mask.width
+            if shot.beta > finest * (1 + 1e-6):
+                words.append(
+                    f"β of shot {number}, {shot.beta:g} rad/mm², is more than the "
+                    f"{finest:.4g} rad/mm² that mask pixels of {1000 * limits.mask_pixel:g} µm show"
+                )
+        if limits.thickness is not None and shot.distance > limits.thickness * (1 + 1e-6):
+            words.append(
+                f"the distance of shot {number}, {shot.distance:g} mm, is more than the thickness "
+                f"of {limits.thickness:g} mm"
+            )
+    return tuple(words)

@@ -1,22 +1,25 @@
 """Running a design: the search, the simulation of what it found, and a report."""
 
 import time
+from functools import cached_property, partial
 from typing import Any
 
-from thincam_jax.commands.design import figures as figures
-from thincam_jax.commands.design.compare import compare
+from thincam_jax.commands.checked_config import dump_config
+from thincam_jax.commands.design import figures
 from thincam_jax.commands.design.config import DesignConfig
 from thincam_jax.commands.design.page import render
-from thincam_jax.commands.design.pareto import find_fronts, pareto_steps
-from thincam_jax.commands.design.pareto_figure import draw_fronts
-from thincam_jax.commands.design.ranking import Result, find, find_steps
+from thincam_jax.commands.design.pareto import FrontSearches
+from thincam_jax.commands.design.ranking import Finder
 from thincam_jax.commands.design.record import record, record_fronts
-from thincam_jax.commands.design.simulate import simulate
-from thincam_jax.commands.design.simulated import build_study
-from thincam_jax.commands.doctor import environment
-from thincam_jax.commands.run_folder import RunFolder, claim_folder, to_json
-from thincam_jax.commands.study.config import Section, StudyConfig, dump_config
-from thincam_jax.commands.study.target import Progress
+from thincam_jax.commands.design.simulation import (
+    Trials,
+    as_study_config,
+    compare,
+    simulate,
+    with_designs,
+)
+from thincam_jax.commands.run_folder import Progress, RunFolder, Step, carry_out
+from thincam_jax.commands.study.study import Study, Target
 
 
 class DesignFolder(RunFolder):
@@ -29,74 +32,75 @@ class DesignFolder(RunFolder):
       `report.html`, `design.json`: written at the end.
     """
 
-    def claim(self, config: Section) -> None:
-        """As for a study; what marks a complete design is design.json."""
-        claim_folder(self.path, "config.yaml", dump_config(config), "design", ("targets",))
-        if (self.path / "design.json").exists():
-            for result in (self.path / "targets").glob("*.json"):
-                result.unlink()
-            (self.path / "design.json").unlink()
+    kind, folders, result = "design", ("targets",), "design.json"
 
 
-def steps(config: DesignConfig) -> int:
-    """How many times `run_design` reports progress."""
-    return find_steps(config) + len(config.targets) + pareto_steps(config.pareto) + 1
-
-
-def run_design(config: DesignConfig, folder: DesignFolder, progress: Progress) -> dict[str, Any]:
+def run_design(study: Study, folder: DesignFolder, progress: Progress) -> dict[str, Any]:
     """Search, simulate and report; returns (and writes) what goes into design.json.
 
-    The same configuration gives the same on the same machine.
+    `study` holds the designs of the file. The same configuration gives the same on the same
+    machine.
     """
-    started = time.time()
-    folder.claim(config)
-    result = find(config, progress)
-    best = result.found[: config.validation.best]
-    study = build_study(config, best)
-    folder.write("found.yaml", dump_config(study))
-    trials = {}
-    for index, target in enumerate(study.targets):
-        progress(target.name)
-        trials[target.name] = _target(config, study, index, folder)
-    design = record(config, result, study, compare(study, trials))
-    if config.pareto is not None:
-        design["pareto"] = record_fronts(config, find_fronts(config, progress))
-    progress("report")
-    _draw(config, result, design, folder)
-    surroundings = environment(time.time() - started)
-    folder.write("environment.json", to_json({**surroundings, "seed": config.seed}))
-    folder.write("report.html", render(config, folder.path, design, surroundings))
-    # Last: it marks the design as complete.
-    folder.write("design.json", to_json(design))
-    return design
+    folder.claim(study.config)
+    run = _DesignRun(study, folder)
+    carry_out(run.work, progress)
+    return run.design
 
 
-def _draw(
-    config: DesignConfig, result: Result, design: dict[str, Any], folder: DesignFolder
-) -> None:
-    count = len(result.found[: config.validation.best])
-    distance = config.object.distance
-    pictures = {
-        "landscape.png": figures.draw_landscape(result, count),
-        "training.png": figures.draw_training(result, count),
-        "responses.png": figures.draw_responses(result, count, config.sensor.pitch),
-        "mtf.png": figures.draw_mtf(result, distance),
-    }
-    if "pareto" in design:
-        name = result.reference.name
-        pictures["pareto.png"] = draw_fronts(design["pareto"], name, distance)
-    for name, figure in pictures.items():
-        if figure is not None:
-            folder.write(name, figures.as_png(figure))
+class _DesignRun:
+    """A design on its way.
 
+    `work` holds the search, the simulation of each target, the fronts and the report.
+    """
 
-def _target(config: DesignConfig, study: StudyConfig, index: int, folder: DesignFolder):
-    """The trials of a target, from before the interruption where the designs are still the same."""
-    target = study.targets[index]
-    designs = [[list(s.model_dump().values()) for s in m.shots] for m in study.methods]
-    stored = folder.finished(target.name)
-    if stored is None or stored["designs"] != designs:
-        trials = simulate(study, index, target, config.validation.seeds)
-        stored = {"designs": designs, "trials": trials}
-        folder.finish(target.name, stored)
-    return stored["trials"]
+    def __init__(self, study: Study, folder: DesignFolder):
+        self.study, self.folder, self.started = study, folder, time.time()
+        self.config: DesignConfig = study.config
+        self.design: dict[str, Any] = {}
+        self.trials: dict[str, Trials] = {}
+        self.finder = Finder(study)
+        self.fronts = None
+        self.work = [*self.finder.work]
+        self.work += [Step(t.name, partial(self.simulate, t)) for t in study.targets]
+        if self.config.pareto is not None:
+            self.fronts = FrontSearches(study, self.config.pareto)
+            self.work += self.fronts.work
+        self.work.append(Step("report", self.report))
+
+    @cached_property
+    def simulated(self) -> Study:
+        """The designs of the file and the best of those found."""
+        best = self.finder.result.found[: self.config.validation.best]
+        return with_designs(self.study, {one.name: one.design for one in best})
+
+    def simulate(self, target: Target) -> None:
+        """From before an interruption where the designs are still the same."""
+        self.folder.write("found.yaml", dump_config(as_study_config(self.simulated)))
+        designs = [[list(e) for e in method.exposures] for method in self.simulated.methods]
+        stored = self.folder.finished(target.name)
+        if stored is None or stored["designs"] != designs:
+            trials = simulate(self.simulated, target, self.config.validation.seeds)
+            stored = {"designs": designs, "trials": trials}
+            self.folder.finish(target.name, stored)
+        self.trials[target.name] = stored["trials"]
+
+    def report(self) -> None:
+        result, folder = self.finder.result, self.folder
+        self.design = record(result, self.simulated, compare(self.trials))
+        if self.fronts is not None:
+            self.design["pareto"] = record_fronts(self.config, self.fronts.result())
+        count, distance = self.config.validation.best, self.config.object.distance
+        pictures = {
+            "landscape.png": figures.draw_landscape(result, count),
+            "training.png": figures.draw_training(result, count),
+            "responses.png": figures.draw_responses(result, count, self.config.sensor.pitch),
+            "mtf.png": figures.draw_mtf(result, distance),
+        }
+        if self.fronts is not None:
+            name = result.reference.name
+            pictures["pareto.png"] = figures.draw_fronts(self.design["pareto"], name, distance)
+        for name, figure in pictures.items():
+            if figure is not None:
+                folder.write(name, figures.as_png(figure))
+        page = partial(render, self.config, folder, self.design)
+        folder.complete(self.design, self.config.seed, self.started, page)

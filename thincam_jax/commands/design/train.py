@@ -5,6 +5,7 @@ counts which the frequency-wise objectives leave out.
 """
 
 import math
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -14,16 +15,28 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from thincam_jax.commands.design.config import DesignConfig
-from thincam_jax.commands.design.config_training import TrainingConfig
-from thincam_jax.commands.design.landscape import Landscape, landscape_of, shown
-from thincam_jax.commands.design.problem import Problem
-from thincam_jax.commands.design.sensitivity import Around, per_unit, straight
-from thincam_jax.commands.study.build import synthesis_matrix
-from thincam_jax.commands.study.config import ConfigError
-from thincam_jax.commands.study.target import Progress
-from thincam_jax.design import Design, DesignSpace, Training, end_to_end_error, wiener_error
-from thincam_jax.design.search import APART, Found, best_apart, descend, evaluate, even_samples
+from thincam_jax.commands.config_file import ConfigError
+from thincam_jax.commands.design.config import DesignConfig, TrainingConfig
+from thincam_jax.commands.design.problem import synthesis_of
+from thincam_jax.commands.design.surroundings import (
+    Derivatives,
+    Landscape,
+    landscape_of,
+    per_unit,
+    shown,
+    straight,
+)
+from thincam_jax.commands.study.build import middle_square
+from thincam_jax.design import Design, DesignSpace, Setup, Training, end_to_end_error, wiener_error
+from thincam_jax.design.search import (
+    APART,
+    Found,
+    Search,
+    best_apart,
+    descend,
+    evaluate,
+    even_samples,
+)
 from thincam_jax.imaging.targets import resize, sample_image
 
 # Single precision holds the error to some 1e-6 of itself.
@@ -35,8 +48,8 @@ _GRID = {1: 61, 2: 15}
 
 
 @dataclass(frozen=True)
-class TrainingGoal:
-    """The error of a reconstruction; equal goals are compiled once."""
+class TrainingObjective:
+    """The error of a reconstruction; equal objectives are compiled once."""
 
     reconstruction: str
     unit: str = "dB"
@@ -55,17 +68,16 @@ class TrainingGoal:
 class Trained(NamedTuple):
     """Designs by their training error, best first.
 
-    - `goal`: what was made small; `landscape`: around the best of them.
-    - `found`: with the error as `objective`; `around`: of each.
+    - `objective`: what was made small; `landscape`: around the best of them.
+    - `found`: with the error as `objective`; `near`: of each, how the error changes around it.
     - `reference`: the error of the reference.
-    - `evaluations`: of the error, with or without its gradient; `failed`: descents that met no
-      number.
+    - `evaluations`: of the error, with or without its gradient; `failed`: descents that met NaN.
     - `pixels`: of the sensor's side in training.
     """
 
-    goal: TrainingGoal
+    objective: TrainingObjective
     found: tuple[Found, ...]
-    around: tuple[Around, ...]
+    near: tuple[Derivatives, ...]
     reference: float
     evaluations: int
     failed: int
@@ -73,95 +85,106 @@ class Trained(NamedTuple):
     landscape: Landscape | None
 
 
-def train_steps(wanted: TrainingConfig | None) -> int:
-    """How many times `train` reports progress: samples, descents, and what surrounds the best."""
-    return 0 if wanted is None else wanted.starts + 2
-
-
-def train(
-    config: DesignConfig,
-    wanted: TrainingConfig,
-    problem: Problem,
-    points: list[np.ndarray],
-    progress: Progress,
-) -> Trained:
+class TrainingDescents:
     """Descents from the best of some points of the cube, of even samples and of the reference.
 
-    The reference counts where it keeps the limits.
-
-    **Errors**: ConfigError where the error is no number at any start.
+    The reference counts where it keeps the limits. `setup` is that of the search.
     """
-    goal, space = TrainingGoal(wanted.reconstruction), config.space()
-    training = build_training(config, wanted, problem)
-    progress("training, samples")
-    starts, sampled = _starts(config, wanted, goal, space, training, points)
-    # Steps were counted before it was known whether there are as many.
-    for _ in range(wanted.starts - len(starts)):
-        progress("training")
-    ended = descend(
-        goal,
-        space,
-        training,
-        starts,
-        steps=wanted.steps,
-        tolerance=_TOLERANCE,
-        told=lambda place: progress(f"training {place + 1} of {len(starts)}"),
-    )
-    if not ended.found:
-        raise ConfigError(
-            "train: the error of the training images is no number at any start; give "
-            "reconstruction: wiener, other images, or less noise"
+
+    def __init__(
+        self, config: DesignConfig, wanted: TrainingConfig, setup: Setup, points: list[np.ndarray]
+    ):
+        self.config, self.wanted, self.space = config, wanted, config.space()
+        self.objective = TrainingObjective(wanted.reconstruction)
+        self.training = build_training(config, wanted, setup)
+        self.starts, self.evaluations = start_points(
+            self.space, self._values, points, wanted, config.seed
         )
-    progress("around the trained designs")
-    around = tuple(_around(goal, space, training, found) for found in ended.found)
-    reference = eqx.filter_jit(goal)(space.base, training)
-    return Trained(
-        goal,
-        ended.found,
-        around,
-        float(reference),
-        ended.evaluations + sampled,
-        ended.failed,
-        training.sensor.shape[0],
-        _surroundings(config, goal, space, training, ended.found),
-    )
+        self.ended: list[Search] = []
+
+    def _values(self, points: Array) -> np.ndarray:
+        return np.asarray(evaluate(self.objective, self.space, self.training, points, at_a_time=1))
+
+    def descend(self, number: int) -> None:
+        """From the start of that number, if there are so many."""
+        start = self.starts[number : number + 1]
+        if len(start):
+            given = (self.objective, self.space, self.training, start)
+            self.ended.append(descend(*given, steps=self.wanted.steps, tolerance=_TOLERANCE))
+
+    def finish(self) -> Trained:
+        """What the descents ended in, and what surrounds it.
+
+        **Errors**: ConfigError where the error is NaN at every start.
+        """
+        found = _apart(one for ended in self.ended for one in ended.found)
+        if not found:
+            raise ConfigError(
+                "train: the error of the training images is no number at any start; give "
+                "reconstruction: wiener, other images, or less noise"
+            )
+        given = (self.objective, self.space, self.training)
+        # Coarser than the search's landscape: an evaluation takes some tenths of a second.
+        count = min(self.config.search.grid, _GRID[max(1, len(shown(self.space)))])
+        return Trained(
+            self.objective,
+            found,
+            tuple(_derivatives(*given, one) for one in found),
+            float(eqx.filter_jit(self.objective)(self.space.base, self.training)),
+            self.evaluations + sum(ended.evaluations for ended in self.ended),
+            sum(ended.failed for ended in self.ended),
+            self.training.sensor.shape[0],
+            landscape_of(*given, found[0].design, count, at_a_time=1),
+        )
 
 
-def _starts(config: DesignConfig, wanted: TrainingConfig, goal, space, training, points):
-    """The lowest in training error, apart from each other; and of how many."""
+def start_points(
+    space: DesignSpace,
+    values_at: Callable[[Array], np.ndarray],
+    points: list[np.ndarray],
+    wanted: TrainingConfig,
+    seed: int,
+) -> tuple[Array, int]:
+    """Of points, the reference and even samples the lowest, apart from each other; and of how many.
+
+    `values_at`: what is made small, of points (point, variable) of the cube.
+    """
     own = _reference_point(space)
-    dtype, key = space.lower.dtype, jax.random.key(config.seed)
+    dtype, key = space.lower.dtype, jax.random.key(seed)
     given = jnp.asarray(np.stack([*points, *([] if own is None else [own])]), dtype)
     every = jnp.concatenate([given, even_samples(space.size, wanted.samples, key, dtype)])
-    values = np.asarray(evaluate(goal, space, training, every, at_a_time=1))
+    values = values_at(every)
     known = np.flatnonzero(np.isfinite(values)) if np.isfinite(values).any() else slice(None)
     best = best_apart(np.asarray(every)[known], values[known], wanted.starts, least=_BASIN)
     return every[known][best], len(every)
 
 
-def _surroundings(config: DesignConfig, goal, space: DesignSpace, training, found):
-    """Coarser than the search's landscape: an evaluation takes some tenths of a second."""
-    count = min(config.search.grid, _GRID[max(1, len(shown(space)))])
-    phases = len(config.reference.method().shot_phases())
-    return landscape_of(goal, space, training, found[0].design, count, phases, at_a_time=1)
+def _apart(found: Iterable[Found]) -> tuple[Found, ...]:
+    """Best first, without those that repeat a better one."""
+    kept: list[Found] = []
+    for one in sorted(found, key=lambda f: f.objective):
+        if all(np.max(np.abs(one.point - other.point)) >= APART for other in kept):
+            kept.append(one)
+    return tuple(kept)
 
 
-def build_training(config: DesignConfig, wanted: TrainingConfig, problem: Problem) -> Training:
+def build_training(config: DesignConfig, wanted: TrainingConfig, setup: Setup) -> Training:
     """In the precision that JAX is set to, with noise of the configuration's seed.
 
     Of an oblong sensor the square of its shorter side, as everywhere in the search.
     """
     pixels = wanted.pixels or _pixels(config)
-    setup = jax.tree.map(lambda x: jnp.asarray(np.asarray(x), float), problem.data.setup)
+    setup = jax.tree.map(lambda x: jnp.asarray(np.asarray(x), float), setup)
     # Pixels of the object about as large as those of the sensor at the longest distance.
-    across = float(setup.field) * config.farthest() / float(setup.sensor_width)
+    distances = config.reach("distance")
+    across = float(setup.field) * distances[1] / float(setup.sensor_width)
     count = max(16, math.ceil(across * pixels))
     return Training(
         np.stack([_picture(name, count) for name in wanted.images]),
         setup,
-        synthesis_matrix(config.reference.method()),
+        synthesis_of(config.design(config.reference), config),
         sensor_shape=(pixels, pixels),
-        distances=(config.nearest(), config.farthest()),
+        distances=distances,
         key=jax.random.key(config.seed),
     )
 
@@ -172,9 +195,7 @@ def _pixels(config: DesignConfig) -> int:
     With fewer, their contrast is lost to the pixels' own average, and fine zones look worse than
     they are.
     """
-    finest = [s.beta for s in config.reference.shots]
-    finest += [f.bounds[1] for f in config.search.free if f.variable == "beta"]
-    edge = max(finest) * config.widest() / (2 * math.pi)
+    edge = config.reach("beta")[1] * config.reach("width")[1] / (2 * math.pi)
     needed = math.ceil(3 * edge * config.sensor.width)
     return max(32, min(needed, *config.sensor.shape))
 
@@ -182,9 +203,7 @@ def _pixels(config: DesignConfig) -> int:
 def _picture(name: str, count: int) -> np.ndarray:
     """The grey middle square of a photograph."""
     image = np.atleast_3d(sample_image(name)).mean(axis=-1)
-    side = min(image.shape)
-    top, left = ((n - side) // 2 for n in image.shape)
-    return resize(image[top : top + side, left : left + side], (count, count))
+    return resize(middle_square(image, min(image.shape)), (count, count))
 
 
 def _reference_point(space: DesignSpace) -> np.ndarray | None:
@@ -201,7 +220,9 @@ def _reference_point(space: DesignSpace) -> np.ndarray | None:
     return np.clip(point, 0.0, 1.0) if inside else None
 
 
-def _around(goal: TrainingGoal, space: DesignSpace, training: Training, found: Found) -> Around:
+def _derivatives(
+    objective: TrainingObjective, space: DesignSpace, training: Training, found: Found
+) -> Derivatives:
     """By differences as wide as optima are apart: the error has finer ripples, of some 0.01 dB.
 
     At a bound, those of the nearest point that has room on either side.
@@ -211,6 +232,7 @@ def _around(goal: TrainingGoal, space: DesignSpace, training: Training, found: F
     middle = np.clip(np.asarray(place, float), APART, 1 - APART)
     steps = APART * np.eye(size)
     points = np.concatenate([middle[None], middle + steps, middle - steps])
-    values = evaluate(goal, space, training, jnp.asarray(points, space.lower.dtype), at_a_time=1)
+    points = jnp.asarray(points, space.lower.dtype)
+    values = evaluate(objective, space, training, points, at_a_time=1)
     level, up, down = np.split(np.asarray(values, float), [1, 1 + size])
     return per_unit((up - down) / (2 * APART), (up - 2 * level + down) / APART**2, spans)

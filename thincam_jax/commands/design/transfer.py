@@ -25,7 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from thincam_jax.commands.design.problem import Data
+from thincam_jax.commands.design.problem import ObjectiveData
 from thincam_jax.design import Design, Quadrant, channels
 from thincam_jax.design.objectives import over_rings
 
@@ -45,7 +45,7 @@ class Transfer(NamedTuple):
     sums: tuple[tuple[tuple[int, ...], tuple[int, ...]], ...]
 
 
-def modulation_transfer(design: Design, data: Data) -> Transfer:
+def modulation_transfer(design: Design, data: ObjectiveData) -> Transfer:
     """The contrast transfer of a design, by the exact response of the square aperture.
 
     `data`: with frequencies on a `Quadrant`. Channels are (channel, ring), the chain (ring,), both
@@ -70,7 +70,7 @@ def _numbers(used: np.ndarray) -> tuple[int, ...]:
 
 @eqx.filter_jit
 def _means(
-    design: Design, data: Data
+    design: Design, data: ObjectiveData
 ) -> tuple[Float[Array, "channel ring"], Float[Array, " ring"]]:
     known = channels(design, data.setup, data.synthesis, data.frequencies)
     # Each capture by itself, at zero frequency: all that its mask lets through.

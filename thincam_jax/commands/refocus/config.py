@@ -6,31 +6,20 @@ from typing import Annotated, Literal
 import pydantic
 from pydantic import Field
 
-from thincam_jax.commands.config_file import read_raw
-from thincam_jax.commands.study.config import (
-    ConfigError,
+from thincam_jax.commands.checked_config import load_as
+from thincam_jax.commands.config_file import ConfigError, read_raw
+from thincam_jax.commands.sections import (
+    CamerasConfig,
     Length,
-    MaskConfig,
-    MethodConfig,
     Name,
-    NoiseConfig,
-    ObjectConfig,
     Section,
-    SensorConfig,
-    StudyConfig,
     TargetConfig,
-    Wavelength,
-    check_methods,
     check_names,
-    in_folder,
-    load_as,
-    load_config,
     misfit,
     quantity,
 )
-from thincam_jax.lensless.method import Model
+from thincam_jax.commands.study.config import StudyConfig, load_config
 from thincam_jax.reconstruction.depth.focus import Measure
-from thincam_jax.reconstruction.spectra import Prior
 
 Position = Annotated[float, *quantity("length", "mm")]
 
@@ -66,29 +55,17 @@ class SweepConfig(Section):
         return self
 
 
-class RefocusConfig(Section):
+class RefocusConfig(CamerasConfig):
     """A scene of several objects, captured once, and focused afterwards."""
 
-    name: Name
     kind: Literal["refocus"]
-    title: str = ""
-    seed: Annotated[int, Field(ge=0, lt=2**32, strict=True)] = 0
-    wavelength: Wavelength
-    model: Model = "separable"
-    pixel_integration: bool = True
-    prior: Prior = "inverse_square"
-    sensor: SensorConfig
-    mask: MaskConfig
-    noise: NoiseConfig | None = None
     objects: Annotated[tuple[PlacedConfig, ...], Field(min_length=1)]
     sweep: SweepConfig
-    methods: Annotated[tuple[MethodConfig, ...], Field(min_length=1)]
     notes: tuple[str, ...] = ()
 
     @pydantic.model_validator(mode="after")
-    def _fits(self):
-        check_names(self, "methods", "objects")
-        check_methods(self)
+    def _objects_fit(self):
+        check_names(self, "objects")
         names = [method.name for method in self.methods]
         if self.sweep.method not in names:
             message = f"{self.sweep.method!r} is no method; choose one of {', '.join(names)}"
@@ -101,28 +78,6 @@ class RefocusConfig(Section):
                 )
                 raise misfit(message, "objects", index, "distance")
         return self
-
-    def sweep_method(self) -> MethodConfig:
-        """The method that the sweep reconstructs with."""
-        return next(m for m in self.methods if m.name == self.sweep.method)
-
-    def focused(self, distance: float | int) -> StudyConfig:
-        """The same camera, light, noise and methods with a flat object at `distance`, mm."""
-        return StudyConfig.model_construct(
-            name=self.name,
-            title=self.title,
-            seed=self.seed,
-            wavelength=self.wavelength,
-            model=self.model,
-            pixel_integration=self.pixel_integration,
-            prior=self.prior,
-            sensor=self.sensor,
-            mask=self.mask,
-            object=ObjectConfig.model_construct(distance=float(distance), width=float(distance)),
-            noise=self.noise,
-            methods=self.methods,
-            targets=(),
-        )
 
 
 def load_experiment(
@@ -138,4 +93,4 @@ def load_experiment(
         raise ConfigError(
             f"{path}: kind: {kind!r} is unknown; write 'kind: refocus', or leave it out for a study"
         )
-    return in_folder(load_as(RefocusConfig, path, overrides), path, "objects")
+    return load_as(RefocusConfig, path, overrides, "objects")

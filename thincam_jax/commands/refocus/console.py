@@ -3,9 +3,9 @@
 import rich
 import rich.table
 
-from thincam_jax.commands.refocus.build import check_refocus
+from thincam_jax.commands.refocus.build import build_refocus
 from thincam_jax.commands.refocus.config import RefocusConfig
-from thincam_jax.commands.refocus.run import run_refocus, steps
+from thincam_jax.commands.refocus.run import run_refocus
 from thincam_jax.commands.run_folder import RunFolder
 from thincam_jax.commands.terminal import counted, told
 
@@ -13,9 +13,9 @@ from thincam_jax.commands.terminal import counted, told
 def refocus(config: RefocusConfig, folder: RunFolder) -> None:
     """Run the experiment with a progress bar and print what was found."""
     with told(lambda: "interrupted; the same command starts anew."):
-        check_refocus(config)
-        with counted(config.name, steps(config)) as progress:
-            metrics = run_refocus(config, folder, progress)
+        study = build_refocus(config)
+        with counted(config.name) as progress:
+            metrics = run_refocus(study, folder, progress)
     _print_objects(metrics["objects"])
     print(f"report: {folder.path / 'report.html'}")
 

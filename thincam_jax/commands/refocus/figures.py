@@ -10,12 +10,14 @@ import PIL.ImageFont
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from thincam_jax.commands.refocus.build import Found, object_box
-from thincam_jax.commands.refocus.config import RefocusConfig
+from thincam_jax.commands.config_file import slug
+from thincam_jax.commands.refocus.build import FoundObjects, object_box
 from thincam_jax.commands.run_folder import RunFolder
-from thincam_jax.commands.study.config import slug
+from thincam_jax.commands.study.build import middle_square
 from thincam_jax.commands.study.figures import line_style, save_figure, save_image
+from thincam_jax.commands.study.study import Method, Study, Target
 from thincam_jax.reconstruction.depth import DepthMap, RefocusSweep
+from thincam_jax.reconstruction.depth.focus import Measure
 
 _SHOWN = 15  # images on the contact sheet, in rows of five
 _HELD = 160  # ms of an image of the animation
@@ -102,9 +104,9 @@ def _frame(image: np.ndarray, distance: float) -> PIL.Image.Image:
 
 def save_curves(
     folder: RunFolder,
-    config: RefocusConfig,
+    measure: Measure,
     sweep: RefocusSweep,
-    found: Found,
+    found: FoundObjects,
     objects: dict[str, Any],
 ) -> None:
     """Focus measure of each object over the sweep, with where it stands and where it was found."""
@@ -123,9 +125,8 @@ def save_curves(
             ax.plot(distances, curve / curve.max(), label=label, markersize=4, **style)
         ax.axvline(values["distance_mm"], color=style["color"], linestyle=style["linestyle"])
         ax.text(values["distance_mm"], 1.1, f" placed at {values['distance_mm']:g} mm", fontsize=9)
-    ax.set_ylim(0, 1.18)
-    ax.set_xlabel("focused on the distance t (mm)")
-    ax.set_ylabel(f"{_MEASURED[config.sweep.measure]},\nrelative to its largest")
+    measured = f"{_MEASURED[measure]},\nrelative to its largest"
+    ax.set(ylim=(0, 1.18), xlabel="focused on the distance t (mm)", ylabel=measured)
     ax.grid(alpha=0.3)
     figure.legend(fontsize=9, loc="outside upper center", ncols=2)
     save_figure(folder, "focus", figure)
@@ -142,108 +143,80 @@ def save_depth(folder: RunFolder, sweep: RefocusSweep, depth: DepthMap, sharp: n
     figure = Figure(figsize=(12, 3.4 * rows / columns * 1.15 + 1.5), layout="constrained")
     axes = figure.subplots(1, 3, sharey=True)
     shown = np.ma.masked_where(confidence < _SURE, distance)
-    axes[0].set_facecolor("0.85")
-    near, far = float(sweep.distances[0]), float(sweep.distances[-1])
-    map_ = axes[0].imshow(shown, cmap="viridis", vmin=near, vmax=far, extent=extent)
-    figure.colorbar(map_, ax=axes[0], label="t (mm)", location="bottom", aspect=30)
-    axes[0].set_title(f"depth map (grey: confidence below {_SURE})", fontsize=10)
-    sure = axes[1].imshow(confidence, cmap="gray", vmin=0, vmax=1, extent=extent)
-    figure.colorbar(sure, ax=axes[1], label="confidence", location="bottom", aspect=30)
-    axes[1].set_title("confidence", fontsize=10)
-    picture = axes[2].imshow(sharp, cmap="gray", vmin=0, vmax=white, extent=extent)
-    figure.colorbar(picture, ax=axes[2], label="radiance", location="bottom", aspect=30)
-    axes[2].set_title("all in focus", fontsize=10)
-    for ax in axes:
+    span = (float(sweep.distances[0]), float(sweep.distances[-1]))
+    panels = [
+        (shown, "viridis", span, "t (mm)", f"depth map (grey: confidence below {_SURE})"),
+        (confidence, "gray", (0, 1), "confidence", "confidence"),
+        (sharp, "gray", (0, white), "radiance", "all in focus"),
+    ]
+    for ax, (image, cmap, (low, high), label, title) in zip(axes, panels, strict=True):
+        drawn = ax.imshow(image, cmap=cmap, vmin=low, vmax=high, extent=extent)
+        figure.colorbar(drawn, ax=ax, label=label, location="bottom", aspect=30)
+        ax.set_title(title, fontsize=10)
         ax.set_xlabel("direction x/t")
-    axes[0].set_ylabel("direction y/t")
+    axes[0].set(facecolor="0.85", ylabel="direction y/t")
     save_figure(folder, "depth", figure)
 
 
 def save_methods(
     folder: RunFolder,
-    config: RefocusConfig,
+    study: Study,
     pictures: dict[tuple[str, float], np.ndarray],
     metrics: dict[str, Any],
 ) -> None:
     """Every method focused on every object; below each, the objects enlarged."""
-    columns, objects = len(config.methods), config.objects
+    columns, objects = len(study.methods), study.targets
     aspect = max(p.shape[0] / p.shape[1] for p in pictures.values())
     width = 3.1
     # A row of whole pictures and one of details for each focus.
     heights = [width * aspect, width / len(objects)] * len(objects)
-    figure = Figure(figsize=(width * columns, sum(heights) + 0.42 * len(objects)))
-    figure.set_layout_engine("constrained")
+    size = (width * columns, sum(heights) + 0.42 * len(objects))
+    figure = Figure(figsize=size, layout="constrained")
     axes = figure.subplots(
         2 * len(objects), columns, squeeze=False, gridspec_kw={"height_ratios": heights}
     )
-    for column, method in enumerate(config.methods):
+    for column, method in enumerate(study.methods):
         for row, focused in enumerate(objects):
-            image = pictures[method.name, focused.distance]
-            save_image(
-                folder,
-                f"{slug(method.name)}--{focused.distance:g}mm",
-                grey_levels(image, white_level(image)),
-            )
-            scores = metrics[method.name]["focused_on_mm"][f"{focused.distance:g}"]["psnr_db"]
+            image, distance = pictures[method.name, focused.distance], f"{focused.distance:g}"
+            whole_image = grey_levels(image, white_level(image))
+            save_image(folder, f"{slug(method.name)}--{distance}mm", whole_image)
+            scores = metrics[method.name]["focused_on_mm"][distance]["psnr_db"]
             whole, detail = axes[2 * row, column], axes[2 * row + 1, column]
-            _show_focus(whole, config, method, image, focused)
-            title = f"focused on {focused.distance:g} mm"
+            whole.imshow(whole_image, cmap="gray", vmin=0, vmax=1)
+            _frame_objects(whole, study, method, focused)
+            title = f"focused on {distance} mm"
             whole.set_title(f"{method.name}\n{title}" if row == 0 else title, fontsize=10)
-            _show_details(detail, config, method, image, focused)
+            _show_details(detail, study, method, image, focused)
             score = scores[focused.name]
             sharp = "exact" if score is None else f"{score:.1f} dB"
             detail.set_xlabel(f"in focus: {focused.name}, {sharp}", fontsize=9)
     save_figure(folder, "methods", figure)
 
 
-def _show_focus(ax, config: RefocusConfig, method, image: np.ndarray, focused) -> None:
-    """A whole picture; the object in focus in a solid box, the others in dashed ones."""
-    ax.imshow(grey_levels(image, white_level(image)), cmap="gray", vmin=0, vmax=1)
-    ax.set_xticks([])
-    ax.set_yticks([])
-    for placed in config.objects:
-        rows, columns = object_box(config, method, placed)
-        ax.add_patch(
-            Rectangle(
-                (columns.start - 4, rows.start - 4),
-                columns.stop - columns.start + 7,
-                rows.stop - rows.start + 7,
-                fill=False,
-                edgecolor="white",
-                linewidth=1.2,
-                linestyle="-" if placed is focused else (0, (2, 3)),
-            )
-        )
+def _frame_objects(ax, study: Study, method: Method, focused: Target) -> None:
+    """The object in focus in a solid box, the others in dashed ones."""
+    ax.set(xticks=[], yticks=[])
+    for placed in study.targets:
+        rows, columns = object_box(study, method, placed)
+        corner = (columns.start - 4, rows.start - 4)
+        sides = (columns.stop - columns.start + 7, rows.stop - rows.start + 7)
+        dash = "-" if placed is focused else (0, (2, 3))
+        frame = Rectangle(corner, *sides, fill=False, edgecolor="white", linewidth=1.2)
+        frame.set_linestyle(dash)
+        ax.add_patch(frame)
 
 
-def _show_details(ax, config: RefocusConfig, method, image: np.ndarray, focused) -> None:
+def _show_details(ax, study: Study, method: Method, image: np.ndarray, focused: Target) -> None:
     """The middle of each object, enlarged, side by side; a frame round that in focus."""
     white = white_level(image)
-    for index, placed in enumerate(config.objects):
-        rows, columns = object_box(config, method, placed)
-        part = _middle(image[rows, columns])
-        ax.imshow(
-            grey_levels(part, white),
-            cmap="gray",
-            vmin=0,
-            vmax=1,
-            extent=(index + 0.02, index + 0.98, 0.98, 0.02),
-        )
+    for index, placed in enumerate(study.targets):
+        rows, columns = object_box(study, method, placed)
+        part = image[rows, columns]
+        part = grey_levels(middle_square(part, round(0.6 * min(part.shape))), white)
+        left = index + 0.02
+        ax.imshow(part, cmap="gray", vmin=0, vmax=1, extent=(left, left + 0.96, 0.98, 0.02))
         if placed is focused:
-            ax.add_patch(
-                Rectangle((index + 0.02, 0.02), 0.96, 0.96, fill=False, color="black", linewidth=2)
-            )
-    ax.set_xlim(0, len(config.objects))
-    ax.set_ylim(1, 0)
-    ax.set_aspect("equal")
-    ax.set_xticks([])
-    ax.set_yticks([])
-    for spine in ax.spines.values():
-        spine.set_visible(False)
-
-
-def _middle(part: np.ndarray) -> np.ndarray:
-    """The middle square of an object, three fifths of its shorter side."""
-    side = max(1, round(0.6 * min(part.shape)))
-    top, left = ((n - side) // 2 for n in part.shape)
-    return part[top : top + side, left : left + side]
+            frame = Rectangle((left, 0.02), 0.96, 0.96, fill=False, color="black", linewidth=2)
+            ax.add_patch(frame)
+    ax.set(xlim=(0, len(study.targets)), ylim=(1, 0), aspect="equal", xticks=[], yticks=[])
+    ax.spines[:].set_visible(False)

@@ -1,104 +1,119 @@
 """Running a refocus experiment: one set of captures, a sweep of the focus, a report."""
 
 import time
-from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
 
-from thincam_jax.commands.doctor import environment
-from thincam_jax.commands.refocus import build as study
-from thincam_jax.commands.refocus import figures as figures
+from thincam_jax.commands.page import render_page
+from thincam_jax.commands.refocus import figures
+from thincam_jax.commands.refocus.build import (
+    find_objects,
+    focus_on,
+    join_sweep,
+    object_metrics,
+    psnr_of_objects,
+    sweep_distances,
+    sweep_method,
+    take_scene,
+)
 from thincam_jax.commands.refocus.config import RefocusConfig
-from thincam_jax.commands.refocus.page import render
-from thincam_jax.commands.run_folder import RunFolder, to_json
+from thincam_jax.commands.run_folder import Progress, RunFolder, Step, carry_out
+from thincam_jax.commands.study.study import Capture, Exposure, Method, Study
+from thincam_jax.reconstruction import Reconstruction
 from thincam_jax.reconstruction.depth import all_in_focus, depth_map
 
-Progress = Callable[[str], None]
 
-
-def steps(config: RefocusConfig) -> int:
-    """How many times `run_refocus` reports progress."""
-    captures = len(study.all_settings(config))
-    return captures + config.sweep.count + len(config.methods) * len(config.objects) + 1
-
-
-def run_refocus(config: RefocusConfig, folder: RunFolder, progress: Progress) -> dict[str, Any]:
+def run_refocus(study: Study, folder: RunFolder, progress: Progress) -> dict[str, Any]:
     """Capture, sweep, reconstruct and report; returns (and writes) the metrics.
 
     The same configuration gives the same metrics. An interrupted run is done anew.
     """
-    started = time.time()
-    folder.claim(config)
-    planes = study.build_planes(config)
-    captures = study.Captures({}, {})
-    for number, setting in enumerate(study.all_settings(config)):
-        progress(f"capture {number + 1}")
-        image, variance = study.take(config, planes, number, setting)
-        captures.images[setting], captures.variances[setting] = image, variance
-    name = config.sweep.method
-    sweep = study.run_sweep(config, captures, lambda n: progress(f"{name}: distance {n}"))
-    found = study.find_objects(config, sweep)
-    pictures, methods = _focus(config, captures, planes, progress)
-    metrics = {
-        "study": config.name,
-        "kind": config.kind,
-        "seed": config.seed,
-        "objects": study.object_metrics(config, found),
-        "sweep": _sweep_metrics(config, sweep, found),
-        "methods": methods,
-    }
-    progress("report")
-    depth = depth_map(
-        sweep,
-        measure=config.sweep.measure,
-        smoothing=config.sweep.smoothing,
-        window=config.sweep.window,
-    )
-    sharp = np.asarray(all_in_focus(sweep, depth))
-    figures.save_sweep(folder, sweep, metrics["objects"])
-    figures.save_animation(folder, sweep)
-    figures.save_curves(folder, config, sweep, found, metrics["objects"])
-    figures.save_depth(folder, sweep, depth, sharp)
-    figures.save_methods(folder, config, pictures, metrics["methods"])
-    surroundings = environment(time.time() - started)
-    folder.write("environment.json", to_json({**surroundings, "seed": config.seed}))
-    folder.write("report.html", render(config, folder, metrics, surroundings))
-    folder.write("metrics.json", to_json(metrics))
-    return metrics
+    folder.claim(study.config)
+    run = _RefocusRun(study, folder)
+    carry_out(run.work, progress)
+    return run.metrics
 
 
-def _focus(config, captures, planes, progress):
-    """Every method focused on every object: pictures, and what goes into metrics.json."""
-    pictures: dict[tuple[str, float], np.ndarray] = {}
-    metrics: dict[str, Any] = {}
-    for method in config.methods:
-        focused = {}
-        for placed in config.objects:
-            progress(f"{method.name}: {placed.distance:g} mm")
-            result = study.reconstruct_at(config, method, captures, placed.distance)
-            pictures[method.name, placed.distance] = np.asarray(result.image)
-            focused[f"{placed.distance:g}"] = {
-                "psnr_db": study.evaluate(config, method, planes, result),
-                "status": result.status,
-                "iterations": result.iterations or None,
-            }
-        metrics[method.name] = {
-            "captures": len(study.method_settings(config, method)),
-            "focused_on_mm": focused,
+class _RefocusRun:
+    """A refocus experiment on its way.
+
+    `work` holds the captures, the distances of the sweep, each method focused on each object, and
+    the report.
+    """
+
+    def __init__(self, study: Study, folder: RunFolder):
+        self.study, self.folder, self.started = study, folder, time.time()
+        self.captures: dict[Exposure, Capture] = {}
+        self.swept: list[Reconstruction] = []
+        self.pictures: dict[tuple[str, float], np.ndarray] = {}
+        self.methods: dict[str, Any] = {
+            m.name: {"captures": len(m.exposures), "focused_on_mm": {}} for m in study.methods
         }
-    return pictures, metrics
+        self.metrics: dict[str, Any] = {}
+        self.work = [
+            Step(f"capture {number}", partial(self.capture, exposure))
+            for number, exposure in enumerate(study.exposures, 1)
+        ]
+        name = study.config.sweep.method
+        for number, distance in enumerate(sweep_distances(study), 1):
+            self.work.append(Step(f"{name}: distance {number}", partial(self.sweep, distance)))
+        for method in study.methods:
+            for distance in (target.distance for target in study.targets):
+                focus = partial(self.focus, method, distance)
+                self.work.append(Step(f"{method.name}: {distance:g} mm", focus))
+        self.work.append(Step("report", self.report))
+
+    def capture(self, exposure: Exposure) -> None:
+        self.captures[exposure] = take_scene(self.study, exposure)
+
+    def sweep(self, distance: float) -> None:
+        method = sweep_method(self.study)
+        self.swept.append(focus_on(self.study, method, self.captures, distance))
+
+    def focus(self, method: Method, distance: float) -> None:
+        result = focus_on(self.study, method, self.captures, distance)
+        self.pictures[method.name, distance] = np.asarray(result.image)
+        self.methods[method.name]["focused_on_mm"][f"{distance:g}"] = {
+            "psnr_db": psnr_of_objects(self.study, method, result),
+            "status": result.status,
+            "iterations": result.iterations or None,
+        }
+
+    def report(self) -> None:
+        study, folder, asked = self.study, self.folder, self.study.config.sweep
+        sweep = join_sweep(study, sweep_distances(study), self.swept)
+        found = find_objects(study, sweep)
+        self.metrics = {
+            "study": study.config.name,
+            "kind": study.config.kind,
+            "seed": study.config.seed,
+            "objects": object_metrics(study, found),
+            "sweep": _sweep_metrics(study, sweep, found),
+            "methods": self.methods,
+        }
+        depth = depth_map(
+            sweep, measure=asked.measure, smoothing=asked.smoothing, window=asked.window
+        )
+        sharp = np.asarray(all_in_focus(sweep, depth))
+        figures.save_sweep(folder, sweep, self.metrics["objects"])
+        figures.save_animation(folder, sweep)
+        figures.save_curves(folder, asked.measure, sweep, found, self.metrics["objects"])
+        figures.save_depth(folder, sweep, depth, sharp)
+        figures.save_methods(folder, study, self.pictures, self.methods)
+        page = partial(render, study.config, folder, self.metrics)
+        folder.complete(self.metrics, study.config.seed, self.started, page)
 
 
-def _sweep_metrics(config: RefocusConfig, sweep, found) -> dict[str, Any]:
+def _sweep_metrics(study: Study, sweep, found) -> dict[str, Any]:
     """The focus curves as numbers."""
-    found_curves = found.curves
     curves = {}
-    if found_curves is not None:
-        curves = dict(zip(found_curves.labels, found_curves.curves, strict=True))
+    if found.curves is not None:
+        curves = dict(zip(found.curves.labels, found.curves.curves, strict=True))
     return {
-        "method": config.sweep.method,
-        "measure": config.sweep.measure,
+        "method": study.config.sweep.method,
+        "measure": study.config.sweep.measure,
         "distances_mm": [round(float(t), 4) for t in sweep.distances],
         "slope_per_pixel": float(f"{float(sweep.slope):.6g}"),
         "curves": {
@@ -107,3 +122,38 @@ def _sweep_metrics(config: RefocusConfig, sweep, found) -> dict[str, Any]:
             if region is not None
         },
     }
+
+
+def render(
+    config: RefocusConfig, folder: RunFolder, metrics: dict[str, Any], environment: dict[str, Any]
+) -> str:
+    """The page, with its pictures inside."""
+    shown = {
+        "command": "run",
+        "environment": environment,
+        "metrics": metrics,
+        "findings": findings(config, metrics),
+    }
+    return render_page("refocus", config, folder.path / "figures", shown)
+
+
+def findings(config: RefocusConfig, metrics: dict[str, Any]) -> list[str]:
+    """What the numbers say, in sentences."""
+    sentences = []
+    for name, found in metrics["objects"].items():
+        if found["found_mm"] is None:
+            sentences.append(f"{name}, placed at {found['distance_mm']:g} mm, was not found.")
+            continue
+        sentences.append(
+            f"{name}, placed at {found['distance_mm']:g} mm, is sharpest at "
+            f"{found['found_mm']:.1f} mm ({found['error_percent']:+.1f} %)."
+        )
+    spans = [found["axial_resolution_mm"] for found in metrics["objects"].values()]
+    distances = sorted(placed.distance for placed in config.objects)
+    if len(distances) > 1:
+        gap = min(b - a for a, b in zip(distances, distances[1:], strict=False))
+        sentences.append(
+            f"The objects stand {gap:g} mm apart or more; the depth of focus, "
+            f"π t (t+d) / (β d R²), is {min(spans):.0f} to {max(spans):.0f} mm."
+        )
+    return sentences

@@ -1,20 +1,26 @@
-"""From a study's configuration to cameras, scenes and reconstructions."""
+"""From an experiment file to what is simulated: cameras, exposures, noise, targets and methods."""
 
-import functools
 import math
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Sequence
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from thincam_jax.commands.study.config import (
+from thincam_jax.commands.config_file import ConfigError
+from thincam_jax.commands.sections import (
+    CamerasConfig,
     MethodConfig,
-    StudyConfig,
+    NoiseConfig,
     TargetConfig,
     VariationConfig,
 )
+from thincam_jax.commands.study.config import StudyConfig
+from thincam_jax.commands.study.study import Capture, Exposure, Method, Reconstructor, Study, Target
+from thincam_jax.imaging import targets as drawn
+from thincam_jax.imaging.metrics.image import SSIM_WINDOW
+from thincam_jax.imaging.metrics.mtf import MINIMUM_COLUMNS
 from thincam_jax.imaging.scene import ImagePlane, Scene
 from thincam_jax.imaging.sensor import (
     AbstractNoise,
@@ -24,17 +30,8 @@ from thincam_jax.imaging.sensor import (
     electrons_per_unit,
     read_out,
 )
-from thincam_jax.imaging.targets import (
-    load_image,
-    point_grid,
-    sample_image,
-    siemens_star,
-    slanted_edge,
-    usaf1951,
-)
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.capture import capture
-from thincam_jax.lensless.masks.fza import FresnelZoneAperture
 from thincam_jax.reconstruction import (
     AdmmTV,
     Cameras,
@@ -45,200 +42,235 @@ from thincam_jax.reconstruction import (
     Wiener,
     reconstruct,
 )
-from thincam_jax.reconstruction import synthesis as syntheses
 
-_DRAWN: dict[str, Callable] = {
-    "usaf1951": usaf1951,
-    "slanted_edge": slanted_edge,
-    "siemens_star": siemens_star,
-    "point_grid": functools.partial(point_grid, count=(9, 9)),
-}
+# The scene's power is read off frequencies above three cycles a sensor (`spectra.inner_band`).
+_MINIMUM_ROWS = 7
 
 
-class Setting(NamedTuple):
-    """One exposure: what a capture is identified by."""
+def build_study(config: StudyConfig) -> Study:
+    """All that a study needs, images read and everything checked, before the first capture.
 
-    beta: float
-    phase: float
-    distance: float
-    wavelength: float
-    width: float
-    exposure: float
+    **Errors**: ConfigError, one line for each fault, beginning with the field.
+    """
+    targets, unread = read_targets(config.targets, config.object.distance, config.object.width)
+    study = assemble(config, targets)
+    check_study(study, unread)
+    return study
 
 
-def settings(config: StudyConfig, method: MethodConfig) -> list[Setting]:
-    """The exposures of a method, in the order of its synthesis."""
-    return [
-        Setting(
+def assemble(config: CamerasConfig, targets: Sequence[Target]) -> Study:
+    """Cameras, noise and methods of a file, before targets."""
+    return Study(
+        config,
+        config.sensor,
+        config.mask,
+        build_noise(config.noise),
+        tuple(_method(config, method) for method in config.methods),
+        tuple(targets),
+        config.model,
+        config.prior,
+    )
+
+
+def _method(config: CamerasConfig, method: MethodConfig) -> Method:
+    phases = method.shot_phases()
+    exposures = tuple(
+        Exposure(
             shot.beta,
             phase,
             shot.distance,
             shot.wavelength or config.wavelength,
             shot.width or config.mask.width,
             shot.exposure,
+            shot.take or 1,
         )
         for shot in method.shots
-        for phase in method.shot_phases()
-    ]
-
-
-def all_settings(config: StudyConfig) -> list[Setting]:
-    """Every exposure of the study once, in order of first use."""
-    return list(dict.fromkeys(s for m in config.methods for s in settings(config, m)))
-
-
-def build_camera(config: StudyConfig, setting: Setting) -> LenslessCamera:
-    mask = FresnelZoneAperture(
-        setting.beta,
-        setting.phase,
-        width=setting.width,
-        profile=config.mask.profile,
-        harmonics=config.mask.harmonics,
-        pixel_pitch=config.mask.pixel_pitch,
-        fill_factor=config.mask.fill_factor,
+        for phase in phases
     )
-    sensor = Sensor(
-        config.sensor.shape,
-        config.sensor.pitch,
-        full_well=config.sensor.full_well,
-        exposure=_times(config.sensor.exposure, setting.exposure),
-        electrons=_times(config.sensor.electrons, setting.exposure),
-        bit_depth=config.sensor.bit_depth,
+    return Method(
+        method.name, method.kind, method.synthesis, exposures, len(phases), method.variation
     )
-    return LenslessCamera(mask, sensor, setting.distance)
 
 
-def _times(level: float | None, share: float) -> float | None:
-    return None if level is None else level * share
-
-
-def build_noise(config: StudyConfig) -> AbstractNoise | None:
-    if config.noise is None:
-        return None
-    if config.noise.read_noise is not None:
-        return PoissonGaussianNoise(config.noise.read_noise)
-    assert config.noise.snr_db is not None  # one of the two is given
-    return GaussianNoise(config.noise.snr_db, config.noise.signal_power)
-
-
-def build_plane(config: StudyConfig, target: TargetConfig) -> ImagePlane:
-    """The target in front of the camera, with its colour channels as a batch: (channel, y, x)."""
-    if target.kind in _DRAWN:
-        image = _DRAWN[target.kind]((target.pixels, target.pixels))
-    elif target.kind == "photograph":
-        image = sample_image(target.image or "")
-    else:
-        image = load_image(target.path or "")
-    image = np.moveaxis(np.atleast_3d(image), -1, 0)
-    return ImagePlane(image.astype(np.float32), config.object.distance, config.object.width)
-
-
-class Exposure(NamedTuple):
-    """A capture (channel, y, x) and the variance of each channel's noise (channel,)."""
-
-    image: np.ndarray
-    variance: np.ndarray
-
-
-def take(config: StudyConfig, setting: Setting, plane: ImagePlane, key: Array) -> Exposure:
-    """One capture of a target; its noise is that of the noise-free image."""
-    camera = build_camera(config, setting)
-    return expose(config, camera, imaging(config, camera, setting, plane), key)
-
-
-def expose(config: StudyConfig, camera: LenslessCamera, clean: Array, key: Array) -> Exposure:
-    """What the sensor reads out of a noise-free image (channel, y, x)."""
-    noise = build_noise(config)
+def build_noise(noise: NoiseConfig | None) -> AbstractNoise | None:
     if noise is None:
-        variance = np.zeros(clean.shape[0], clean.dtype)
-    else:
-        variance = np.asarray(noise.variance(clean, electrons_per_unit(camera.sensor, clean)))
-    return Exposure(np.asarray(read_out(camera.sensor, clean, noise=noise, key=key)), variance)
+        return None
+    if noise.read_noise is not None:
+        return PoissonGaussianNoise(noise.read_noise)
+    assert noise.snr_db is not None  # one of the two is given
+    return GaussianNoise(noise.snr_db, noise.signal_power)
 
 
-def imaging(
-    config: StudyConfig, camera: LenslessCamera, setting: Setting, plane: ImagePlane
-) -> Array:
-    """What falls on the sensor, (channel, y, x)."""
-    ideal = LenslessCamera(
-        camera.mask, Sensor(config.sensor.shape, config.sensor.pitch), camera.distance
-    )
-    return capture(
-        ideal,
-        Scene(plane, setting.wavelength),
-        model=config.model,
-        pixel_integration=config.pixel_integration,
-    )
+def read_targets(
+    entries: Sequence[TargetConfig], distance: float, width: float
+) -> tuple[list[Target], dict[int, str]]:
+    """The targets at one distance, and by its place why another cannot be read."""
+    targets, unread = [], {}
+    for number, entry in enumerate(entries):
+        try:
+            image = np.moveaxis(np.atleast_3d(read_picture(entry)), -1, 0)
+        except (ValueError, FileNotFoundError) as error:
+            unread[number] = str(error)
+            continue
+        plane = ImagePlane(image.astype(np.float32), distance, width)
+        targets.append(Target(number, entry.name, entry.kind, distance, width, plane))
+    return targets, unread
 
 
-def capture_key(config: StudyConfig, target: int, exposure: int) -> Array:
-    """The random key of one capture: the same however the study is interrupted."""
-    return jax.random.fold_in(jax.random.fold_in(jax.random.key(config.seed), target), exposure)
+def read_picture(target: TargetConfig) -> np.ndarray:
+    """Drawn, a photograph or a file: (y, x) or (y, x, channel)."""
+    if target.kind == "photograph":
+        return drawn.sample_image(target.image or "")
+    if target.kind == "file":
+        return drawn.load_image(target.path or "")
+    shape = (target.pixels, target.pixels)
+    if target.kind == "point_grid":
+        return drawn.point_grid(shape, count=(9, 9))
+    return getattr(drawn, target.kind)(shape)
 
 
-def synthesis_matrix(method: MethodConfig) -> np.ndarray:
-    shots = len(method.shots)
-    if method.synthesis == "fringe_scanning":
-        return syntheses.fringe_scanning(shots)
-    if method.synthesis == "phase_pairs":
-        return syntheses.phase_pairs(shots)
-    if method.synthesis == "contrasts":
-        return syntheses.contrasts(shots * len(method.phases))
-    return syntheses.separate(shots * len(method.phases))
+def middle_square(image: np.ndarray, side: int) -> np.ndarray:
+    """The middle (side, side, …) of an image, one pixel at least."""
+    side = max(1, side)
+    top, left = ((n - side) // 2 for n in image.shape[:2])
+    return image[top : top + side, left : left + side]
 
 
-def reference_distance(method: MethodConfig) -> float:
-    """The largest mask-sensor distance, on whose scale a method reconstructs, mm."""
-    return max(shot.distance for shot in method.shots)
+def check_study(study: Study, unread: dict[int, str] | None = None) -> None:
+    """Refuse cameras that cannot be built, images that cannot be read, and too few pixels.
+
+    `unread`: why images could not be read, by the target's place.
+
+    **Errors**: ConfigError, one line for each fault, beginning with the field.
+    """
+    known = {target.number: _target_fault(study, target) for target in study.targets}
+    known |= unread or {}
+    faults = [f"targets[{number}]: {fault}" for number, fault in sorted(known.items()) if fault]
+    camera = _camera_fault(study)
+    if camera or faults:
+        raise ConfigError("\n".join([*filter(None, [camera]), *faults]))
 
 
-def field_shape(config: StudyConfig, method: MethodConfig, plane: ImagePlane) -> tuple[int, int]:
+def _camera_fault(study: Study) -> str:
+    """Empty for none."""
+    rows, columns = study.sensor.shape
+    if rows < _MINIMUM_ROWS or columns < MINIMUM_COLUMNS:
+        return (
+            f"sensor.shape: {rows}×{columns} pixels are too few for a study; "
+            f"give at least {_MINIMUM_ROWS}×{MINIMUM_COLUMNS}"
+        )
+    try:
+        for exposure in study.exposures:
+            study.camera(exposure)
+        # Traced only: whether the model takes this mask at all.
+        jax.eval_shape(lambda: study.psf(study.exposures[0]))
+    except (ValueError, TypeError) as error:
+        return f"mask, sensor or model: {error}"
+    return ""
+
+
+def _target_fault(study: Study, target: Target) -> str:
+    """Empty for none."""
+    if target.plane.image.min() == target.plane.image.max():
+        return "the image is uniform: there is nothing to reconstruct; give another one"
+    for method in study.methods:
+        shape = field_shape(study, method, target)
+        if min(shape) < SSIM_WINDOW:
+            return (
+                f"{method.name!r} reconstructs it on {shape[0]}×{shape[1]} pixels, at least "
+                f"{SSIM_WINDOW}×{SSIM_WINDOW} are needed; give a larger object.width or a "
+                "smaller sensor.pitch"
+            )
+    return ""
+
+
+def field_shape(study: Study, method: Method, target: Target) -> tuple[int, int]:
     """Pixels of the reconstruction: what covers the target at the object pitch."""
-    scale = reference_distance(method) / config.object.distance / config.sensor.pitch
+    scale = method.distance / target.distance / study.sensor.pitch
     rows, columns = (
-        max(1, math.ceil(float(size) * scale - 1e-3)) for size in (plane.height, plane.width)
+        max(1, math.ceil(float(size) * scale - 1e-3))
+        for size in (target.plane.height, target.plane.width)
     )
     return rows, columns
 
 
-def build_reconstructor(
-    config: StudyConfig, method: MethodConfig, shape: tuple[int, int]
-) -> Callable[[Array, Array], Reconstruction]:
-    """A function of the captures (capture, channel, y, x) and variances (capture, channel)."""
-    used = settings(config, method)
-    cameras = Cameras(
-        [build_camera(config, s) for s in used],
-        wavelength=[s.wavelength for s in used],
-        object_distance=config.object.distance,
-        field_shape=shape,
-        model=config.model,
-        pixel_integration=config.pixel_integration,
+def noise_free(study: Study, exposure: Exposure, planes: ImagePlane | list[ImagePlane]) -> Array:
+    """What falls on the sensor, (*channel, y, x)."""
+    camera = study.camera(exposure)
+    # Without saturation.
+    ideal = Sensor(camera.sensor.shape, camera.sensor.pitch)
+    return capture(
+        LenslessCamera(camera.mask, ideal, camera.distance),
+        Scene(planes, exposure.wavelength),
+        model=study.model,
+        pixel_integration=study.config.pixel_integration,
     )
+
+
+def expose(study: Study, exposure: Exposure, clean: Array, number: int, trial: int = 0) -> Capture:
+    """What is read out of a noise-free image of the target of a place in the study.
+
+    The noise is that of the image; its random key is the same however a study is interrupted, and
+    another one for each further trial.
+    """
+    seed = jax.random.key((study.config.seed + trial) % 2**32)
+    place = study.exposures.index(exposure)
+    key = jax.random.fold_in(jax.random.fold_in(seed, number), place)
+    sensor, noise = study.camera(exposure).sensor, study.noise
+    if noise is None:
+        variance = np.zeros(clean.shape[:-2], clean.dtype)
+    else:
+        variance = np.asarray(noise.variance(clean, electrons_per_unit(sensor, clean)))
+    return Capture(np.asarray(read_out(sensor, clean, noise=noise, key=key)), variance)
+
+
+def take(study: Study, exposure: Exposure, target: Target) -> Capture:
+    """One capture of a target."""
+    return expose(study, exposure, noise_free(study, exposure, target.plane), target.number)
+
+
+def stacked(captures: Sequence[Capture]) -> tuple[Array, Array]:
+    """Images (capture, *channel, y, x) and variances (capture, *channel)."""
+    images, variances = (np.stack(values) for values in zip(*captures, strict=True))
+    return jnp.asarray(images), jnp.asarray(variances)
+
+
+def build_reconstructor(
+    study: Study, method: Method, shape: tuple[int, int], object_distance: float
+) -> Reconstructor:
+    """A function of the captures (capture, channel, y, x) and variances (capture, channel)."""
+    cameras = Cameras(
+        [study.camera(exposure) for exposure in method.exposures],
+        wavelength=[exposure.wavelength for exposure in method.exposures],
+        object_distance=object_distance,
+        field_shape=shape,
+        model=study.model,
+        pixel_integration=study.config.pixel_integration,
+    )
+    synthesis = method.synthesis_matrix
     if method.kind == "fringe_scanning":
         scanning = FringeScanning().prepare(cameras)
         return lambda captures, variances: scanning(captures)
-    if method.kind == "admm_tv":
-        return functools.partial(_admm_tv, config, method, cameras)
-    return Wiener(synthesis=synthesis_matrix(method), prior=config.prior).prepare(cameras)
-
-
-def _admm_tv(
-    config: StudyConfig, method: MethodConfig, cameras: Cameras, captures: Array, variances: Array
-) -> Reconstruction:
-    """Total variation on the crop model; without noise in the study it is estimated."""
-    recording = Recording(
-        captures, cameras, noise_variance=None if config.noise is None else variances
-    )
+    if method.kind == "wiener":
+        return Wiener(synthesis=synthesis, prior=study.prior).prepare(cameras)
     options = method.variation or VariationConfig()
-    variation = TotalVariation(
-        options.kind,
-        options.coupling_of(captures.shape[1]),
-        chroma_weight=options.chroma_weight,
-    )
-    solver = AdmmTV(
-        options.tau,
-        variation=variation,
-        synthesis=synthesis_matrix(method),
-        iterations=options.iterations,
-    )
-    return reconstruct(recording, solver)
+
+    def total_variation(captures: Array, variances: Array) -> Reconstruction:
+        """On the crop model; without noise in the study it is estimated."""
+        variation = TotalVariation(
+            options.kind,
+            options.coupling_of(captures.shape[1]),
+            chroma_weight=options.chroma_weight,
+        )
+        noise_variance = None if study.noise is None else variances
+        return reconstruct(
+            Recording(captures, cameras, noise_variance=noise_variance),
+            AdmmTV(
+                options.tau,
+                variation=variation,
+                synthesis=synthesis,
+                iterations=options.iterations,
+            ),
+        )
+
+    return total_variation

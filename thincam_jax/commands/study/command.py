@@ -28,21 +28,21 @@ def run(
         return f"interrupted; finished: {done}. The same command goes on from there."
 
     with told(finished):
+        from thincam_jax.commands.config_file import slug
         from thincam_jax.commands.refocus.config import RefocusConfig, load_experiment
         from thincam_jax.commands.refocus.console import refocus
         from thincam_jax.commands.run_folder import RunFolder
-        from thincam_jax.commands.study.check import check_study
-        from thincam_jax.commands.study.config import slug
-        from thincam_jax.commands.study.run import run_study, steps
+        from thincam_jax.commands.study.build import build_study
+        from thincam_jax.commands.study.run import run_study
 
-        study = load_experiment(config, tuple(set_ or ()))
-        folder = RunFolder(out or Path("runs") / slug(study.name))
-        if isinstance(study, RefocusConfig):
-            refocus(study, folder)
+        asked = load_experiment(config, tuple(set_ or ()))
+        folder = RunFolder(out or Path("runs") / slug(asked.name))
+        if isinstance(asked, RefocusConfig):
+            refocus(asked, folder)
             return
-        check_study(study)
-        targets = study.targets
-        with counted(study.name, steps(study)) as progress:
+        study = build_study(asked)
+        targets = asked.targets
+        with counted(asked.name) as progress:
             metrics = run_study(study, folder, progress)
     _print_results(metrics)
     print(f"report: {folder.path / 'report.html'}")

@@ -1,14 +1,16 @@
 """How good a reconstruction is: agreement with the scene, and what it resolves."""
 
 import math
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import numpy as np
+from jaxtyping import Array
 
 from thincam_jax._core.grids import Grid
-from thincam_jax.commands.study.build import reference_distance
-from thincam_jax.commands.study.config import MethodConfig, StudyConfig, TargetConfig
+from thincam_jax.commands.study import build
+from thincam_jax.commands.study.study import Capture, Exposure, Method, Study, Target
 from thincam_jax.imaging.metrics import align, psnr, resolved_element, ssim, usaf_contrast
 from thincam_jax.imaging.scene import ImagePlane
 from thincam_jax.imaging.targets import line_pair, usaf1951_elements
@@ -30,19 +32,49 @@ class Evaluation(NamedTuple):
     contrast: list[tuple[float, str, float]] | None
 
 
-def evaluate(
-    config: StudyConfig,
-    method: MethodConfig,
-    target: TargetConfig,
-    plane: ImagePlane,
-    reconstruction: Reconstruction,
+def evaluate_targets(study: Study) -> dict[str, dict[str, dict[str, Any]]]:
+    """The metrics of every method by method's and target's name, without a folder or figures."""
+    found: dict[str, dict[str, dict[str, Any]]] = {m.name: {} for m in study.methods}
+    for target in study.targets:
+        captures = {exposure: build.take(study, exposure, target) for exposure in study.exposures}
+        for method in study.methods:
+            metrics = evaluate_method(study, method, target, captures).metrics
+            found[method.name][target.name] = metrics
+    return found
+
+
+def evaluate_method(
+    study: Study,
+    method: Method,
+    target: Target,
+    captures: Mapping[Exposure, Capture],
 ) -> Evaluation:
+    """Reconstruct a target from the method's captures, and judge what comes out."""
+    shape = build.field_shape(study, method, target)
+    key = (method.name, shape)
+    if key not in study.reconstructors:
+        study.reconstructors[key] = build.build_reconstructor(study, method, shape, target.distance)
+    used = build.stacked([captures[exposure] for exposure in method.exposures])
+    return evaluate(method, target, study.reconstructors[key](*used))
+
+
+def mean_psnr_of_pictures(study: Study, metrics: dict[str, dict[str, Any]]) -> float | None:
+    """The mean over photographs and files, dB, from metrics by target; None without any.
+
+    Drawn targets are left out, and exact reconstructions, which have no PSNR.
+    """
+    pictures = [metrics[t.name]["psnr_db"] for t in study.targets if t.is_picture]
+    known = [value for value in pictures if value is not None]
+    return round(float(np.mean(known)), 4) if known else None
+
+
+def evaluate(method: Method, target: Target, reconstruction: Reconstruction) -> Evaluation:
     """PSNR and SSIM after alignment, over the target's area; the resolved element of a chart."""
     image = np.asarray(reconstruction.image, dtype=float)
     rows, columns = image.shape[-2:]
     grid = Grid((rows, columns), _known_pitch(reconstruction))
-    truth = np.asarray(_sample(plane, grid), dtype=float)
-    image, truth = (_as_picture(i) for i in (image, truth))
+    truth = np.asarray(sample(target.plane, grid), dtype=float)
+    image, truth = (as_picture(i) for i in (image, truth))
     metrics: dict[str, Any] = {
         "psnr_db": _finite(round(psnr(image, truth), 4)),
         "ssim": round(ssim(image, truth), 5),
@@ -51,7 +83,7 @@ def evaluate(
     }
     contrast = None
     if target.kind == "usaf1951":
-        metrics["resolved"], contrast = _resolution(config, method, image, float(grid.pitch))
+        metrics["resolved"], contrast = _resolution(method, target, image, float(grid.pitch))
     return Evaluation(align(image, truth)[0], truth, metrics, contrast)
 
 
@@ -67,27 +99,29 @@ def _finite(value: float) -> float | None:
 
 
 @eqx.filter_jit
-def _sample(plane: ImagePlane, grid: Grid):
+def sample(plane: ImagePlane, grid: Grid) -> Array:
+    """The scene averaged over the pixels of an upright reconstruction."""
     return plane.sample(grid, magnification=1.0)
 
 
-def _as_picture(image: np.ndarray) -> np.ndarray:
+def as_picture(image: np.ndarray) -> np.ndarray:
+    """From (channel, y, x) to (y, x) or (y, x, channel)."""
     picture = np.moveaxis(image, 0, -1)
     return picture[..., 0] if picture.shape[-1] == 1 else picture
 
 
-def _resolution(config: StudyConfig, method: MethodConfig, image: np.ndarray, pitch: float):
+def _resolution(method: Method, target: Target, image: np.ndarray, pitch: float):
     """The finest element resolved in both directions, and the contrast of all."""
-    records = usaf_contrast(image, usaf1951_elements(), config.object.width / pitch)
+    records = usaf_contrast(image, usaf1951_elements(), target.width / pitch)
     contrast = [
-        (line_pair(r.element, config.object.width), r.element.orientation, float(r.contrast))
+        (line_pair(r.element, target.width), r.element.orientation, float(r.contrast))
         for r in records
     ]
     element = resolved_element(records)
     if element is None:
         return None, contrast
-    period = line_pair(element, config.object.width)
-    magnification = config.object.distance / reference_distance(method)
+    period = line_pair(element, target.width)
+    magnification = target.distance / method.distance
     resolved = {
         "group": element.group,
         "element": element.element,

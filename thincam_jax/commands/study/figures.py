@@ -2,19 +2,18 @@
 
 import io
 import math
-import os
 
 import numpy as np
-import skimage
+import PIL.Image
 from matplotlib.figure import Figure
 
+from thincam_jax.commands.config_file import slug
 from thincam_jax.commands.run_folder import RunFolder
-from thincam_jax.commands.study.build import all_settings, build_camera
-from thincam_jax.commands.study.config import StudyConfig, TargetConfig, slug
-from thincam_jax.commands.study.evaluate import Evaluation
+from thincam_jax.commands.study.build import middle_square
+from thincam_jax.commands.study.evaluate import Evaluation, as_picture
 from thincam_jax.commands.study.response import Response
+from thincam_jax.commands.study.study import Study, Target
 from thincam_jax.imaging.metrics import low_frequency_value
-from thincam_jax.lensless.psf import psf
 
 # Told apart by dash and marker as well as by colour, so that they read in grey.
 _LINES = (
@@ -31,45 +30,48 @@ def line_style(index: int) -> dict:
     return dict(_LINES[index % len(_LINES)])
 
 
-def save_figure(folder: RunFolder, name: str, figure: Figure) -> None:
-    """A figure as figures/NAME.png."""
+def as_png(figure: Figure) -> bytes:
+    """The file's content."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=110)
-    folder.write(f"figures/{name}.png", buffer.getvalue())
+    return buffer.getvalue()
+
+
+def save_figure(folder: RunFolder, name: str, figure: Figure) -> None:
+    """A figure as figures/NAME.png."""
+    folder.write(f"figures/{name}.png", as_png(figure))
 
 
 def save_image(folder: RunFolder, name: str, image: np.ndarray) -> None:
     """An image of values 0…1 as an 8-bit PNG."""
     pixels = np.round(np.clip(image, 0.0, 1.0) * 255).astype(np.uint8)
-    path = folder.path / "images" / f"{name}.png"
-    partial = path.with_name(f"{name}.partial.png")
-    skimage.io.imsave(partial, pixels, check_contrast=False)
-    os.replace(partial, path)
+    buffer = io.BytesIO()
+    PIL.Image.fromarray(pixels).save(buffer, format="PNG")
+    folder.write(f"images/{name}.png", buffer.getvalue())
 
 
 def save_target(
     folder: RunFolder,
-    config: StudyConfig,
-    target: TargetConfig,
+    study: Study,
+    target: Target,
     capture: np.ndarray,
     evaluations: dict[str, Evaluation],
 ) -> None:
     """A target's scene, one raw capture and all reconstructions, whole and enlarged."""
     truth = list(evaluations.values())[-1].truth
     save_image(folder, f"{slug(target.name)}--scene", truth)
-    raw = np.moveaxis(capture, 0, -1)
-    raw = raw[..., 0] if raw.shape[-1] == 1 else raw
+    raw = as_picture(capture / capture.max())
     panels = [("scene", truth, "")]
     for name, evaluation in evaluations.items():
         save_image(folder, f"{slug(target.name)}--{slug(name)}", evaluation.image)
         panels.append((name, evaluation.image, _caption(evaluation)))
     figure, wholes, details = _pairs_of_axes(len(panels) + 1, truth.shape[0] / truth.shape[1])
-    _show(wholes[0], raw / raw.max(), "first raw capture")
-    _show_detail_of_capture(details[0], raw / raw.max(), config)
+    _show(wholes[0], raw, "first raw capture")
+    _show_detail_of_capture(details[0], raw, study)
     for ax, detail, (name, image, caption) in zip(wholes[1:], details[1:], panels, strict=True):
         _show(ax, image, f"{name}\n{caption}" if caption else name)
         _show(detail, _middle(image), "")
-        detail.set_xlabel(f"middle {config.object.width / 3:.0f} mm", fontsize=9)
+        detail.set_xlabel(f"middle {target.width / 3:.0f} mm", fontsize=9)
     # No target's name can be taken for one of the study's own figures.
     save_figure(folder, f"target-{slug(target.name)}", figure)
 
@@ -87,8 +89,7 @@ def _pairs_of_axes(count: int, aspect: float):
     axes = figure.subplots(2 * bands, columns, gridspec_kw={"height_ratios": (aspect, 1) * bands})
     wholes, details = axes[::2].ravel(), axes[1::2].ravel()
     for ax in axes.ravel():
-        ax.set_xticks([])
-        ax.set_yticks([])
+        ax.set(xticks=[], yticks=[])
     for ax in (*wholes[count:], *details[count:]):
         ax.set_axis_off()
     return figure, wholes[:count], details[:count]
@@ -109,27 +110,23 @@ def _show(ax, image: np.ndarray, title: str) -> None:
         ax.set_title(title, fontsize=9)
 
 
-def _show_detail_of_capture(ax, raw: np.ndarray, config: StudyConfig) -> None:
+def _show_detail_of_capture(ax, raw: np.ndarray, study: Study) -> None:
     detail = _middle(raw)
     low, high = detail.min(axis=(0, 1)), detail.max(axis=(0, 1))
     _show(ax, (detail - low) / np.where(high > low, high - low, 1), "")
-    width = config.sensor.shape[1] * config.sensor.pitch / 3
+    width = study.sensor.shape[1] * study.sensor.pitch / 3
     ax.set_xlabel(f"middle {width:.2g} mm of the sensor,\nstretched", fontsize=9)
 
 
 def _middle(image: np.ndarray) -> np.ndarray:
     """The central square whose side is a third of the width."""
     rows, columns = image.shape[:2]
-    half = max(1, min(columns // 6, rows // 2))
-    return image[
-        rows // 2 - half : rows // 2 + half or None,
-        columns // 2 - half : columns // 2 + half or None,
-    ]
+    return middle_square(image, 2 * min(columns // 6, rows // 2))
 
 
-def save_responses(folder: RunFolder, config: StudyConfig, responses: dict[str, Response]) -> None:
+def save_responses(folder: RunFolder, study: Study, responses: dict[str, Response]) -> None:
     """Transfer functions of all methods, with their limits; methods of one synthesis share one."""
-    panels = _by_synthesis(config, responses)
+    panels = _by_synthesis(study, responses)
     figure = Figure(figsize=(8.5, 2.1 * len(panels) + 0.8), layout="constrained")
     axes = np.atleast_1d(figure.subplots(len(panels), 1, sharex=True))
     end = max(r.metrics["cut_off_cycles_per_mm"] for r in responses.values()) * 1.4
@@ -147,26 +144,21 @@ def save_responses(folder: RunFolder, config: StudyConfig, responses: dict[str, 
         end = min(end, response.frequency[-1])
         side = "right" if cut > 0.85 * end else "left"
         ax.text(cut, 0.84 * top, f" cut-off {cut:.1f} ", fontsize=8, va="top", ha=side)
-        ax.set_ylim(0, top)
-        ax.set_xlim(0, end)
-        ax.set_ylabel("relative MTF")
+        ax.set(xlim=(0, end), ylim=(0, top), ylabel="relative MTF")
         ax.set_title(name, fontsize=10, loc="left")
     axes[-1].set_xlabel("spatial frequency u on the reference sensor plane (cycles/mm), v = 0")
     save_figure(folder, "mtf", figure)
 
 
-def _by_synthesis(
-    config: StudyConfig, responses: dict[str, Response]
-) -> list[tuple[str, Response]]:
+def _by_synthesis(study: Study, responses: dict[str, Response]) -> list[tuple[str, Response]]:
     """Titles and responses: the methods that take the same captures and sums of them as one."""
     names: dict[tuple, list[str]] = {}
-    for method in config.methods:
-        key = (method.shots, method.synthesis, method.shot_phases())
-        names.setdefault(key, []).append(method.name)
+    for method in study.methods:
+        names.setdefault((method.exposures, method.synthesis), []).append(method.name)
     return [("; ".join(group), responses[group[0]]) for group in names.values()]
 
 
-def save_contrasts(folder: RunFolder, config: StudyConfig, contrasts: dict[str, list]) -> None:
+def save_contrasts(folder: RunFolder, contrasts: dict[str, list]) -> None:
     """Contrast of every chart element against its period, for each method."""
     figure = Figure(figsize=(8.5, 4.2), layout="constrained")
     ax = figure.subplots()
@@ -180,41 +172,28 @@ def save_contrasts(folder: RunFolder, config: StudyConfig, contrasts: dict[str, 
     ticks = [10, 5, 2, 1, 0.5, 0.2]
     ax.set_xticks(ticks, [f"{t:g}" for t in ticks])
     ax.minorticks_off()
-    ax.set_ylim(-1.05, 1.1)
-    ax.set_xlabel("line pair on the object (mm)")
-    ax.set_ylabel("contrast of the three bars,\nworse direction")
+    contrast = "contrast of the three bars,\nworse direction"
+    ax.set(ylim=(-1.05, 1.1), xlabel="line pair on the object (mm)", ylabel=contrast)
     ax.legend(fontsize=9, loc="lower left")
     ax.grid(alpha=0.3)
     save_figure(folder, "contrast", figure)
 
 
-def save_psf(folder: RunFolder, config: StudyConfig) -> None:
+def save_psf(folder: RunFolder, study: Study) -> None:
     """The first exposure's PSF: the image, and a line through its middle."""
-    setting = all_settings(config)[0]
-    camera = build_camera(config, setting)
-    h = np.asarray(
-        psf(
-            camera,
-            wavelength=setting.wavelength,
-            object_distance=config.object.distance,
-            model=config.model,
-            pixel_integration=config.pixel_integration,
-        )
-    )
+    exposure = study.exposures[0]
+    h = np.asarray(study.psf(exposure))
+    grid = study.camera(exposure).sensor.grid
     figure = Figure(figsize=(8.5, 3.4), layout="constrained")
     image, line = figure.subplots(1, 2, gridspec_kw={"width_ratios": (1, 1.6)})
-    x, y = np.asarray(camera.sensor.grid.x), np.asarray(camera.sensor.grid.y)
-    half = config.sensor.pitch / 2
+    x, y = np.asarray(grid.x), np.asarray(grid.y)
+    half = study.sensor.pitch / 2
     extent = (x[0] - half, x[-1] + half, y[-1] + half, y[0] - half)
     shown = image.imshow(h, cmap="gray", extent=extent)
     figure.colorbar(shown, ax=image, label="irradiance / open aperture")
-    image.set_xlabel("x (mm)")
-    image.set_ylabel("y (mm)")
+    image.set(xlabel="x (mm)", ylabel="y (mm)")
     line.plot(x, h[h.shape[0] // 2], color="black", linewidth=0.7)
-    line.set_xlabel("x (mm), through the middle")
-    line.set_ylabel("irradiance / open aperture")
-    line.set_title(
-        f"β = {setting.beta:g} rad/mm², φ = {setting.phase:.2f} rad, d = {setting.distance:g} mm",
-        fontsize=9,
-    )
+    line.set(xlabel="x (mm), through the middle", ylabel="irradiance / open aperture")
+    mask = f"β = {exposure.beta:g} rad/mm², φ = {exposure.phase:.2f} rad"
+    line.set_title(f"{mask}, d = {exposure.distance:g} mm", fontsize=9)
     save_figure(folder, "psf", figure)

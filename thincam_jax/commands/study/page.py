@@ -2,32 +2,24 @@
 
 from typing import Any
 
-from thincam_jax.commands.page import data_url, load_template
+from thincam_jax.commands.config_file import slug
+from thincam_jax.commands.page import render_page
 from thincam_jax.commands.run_folder import RunFolder
-from thincam_jax.commands.study.config import StudyConfig, dump_config, slug
+from thincam_jax.commands.study.config import StudyConfig
 
 
 def render(
     config: StudyConfig, folder: RunFolder, metrics: dict[str, Any], environment: dict[str, Any]
 ) -> str:
     """The page, with its pictures inside."""
-    return load_template("study").render(
-        config=config,
-        methods=metrics["methods"],
-        seed=metrics["seed"],
-        findings=findings(config, metrics),
-        environment=environment,
-        yaml=dump_config(config),
-        figure=lambda name: _data_url(folder, name),
-        slug=slug,
-    )
-
-
-def _data_url(folder: RunFolder, name: str) -> str | None:
-    path = folder.path / "figures" / f"{name}.png"
-    if not path.exists():
-        return None
-    return data_url(path)
+    shown = {
+        "command": "run",
+        "environment": environment,
+        "methods": metrics["methods"],
+        "findings": findings(config, metrics),
+        "slug": slug,
+    }
+    return render_page("study", config, folder.path / "figures", shown)
 
 
 def findings(config: StudyConfig, metrics: dict[str, Any]) -> list[str]:

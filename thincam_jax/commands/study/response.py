@@ -5,14 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from thincam_jax.commands.study.build import (
-    Setting,
-    build_camera,
-    reference_distance,
-    settings,
-    synthesis_matrix,
-)
-from thincam_jax.commands.study.config import MethodConfig, ShotConfig, StudyConfig
+from thincam_jax.commands.study.study import Exposure, Method, Study, synthesis_matrix
 from thincam_jax.imaging.metrics import cut_off, first_common_zero
 from thincam_jax.lensless.psf import otf
 
@@ -31,7 +24,7 @@ class Response(NamedTuple):
     metrics: dict[str, Any]
 
 
-def method_response(config: StudyConfig, method: MethodConfig) -> Response:
+def method_response(study: Study, method: Method) -> Response:
     """The response with the finite mask, for a point on the axis, and its limits.
 
     - First zero crossing: the lowest frequency that no shot of the method carries. A fringe-scanned
@@ -40,21 +33,21 @@ def method_response(config: StudyConfig, method: MethodConfig) -> Response:
       apart, no frequency band is missing, and there is no first zero (None).
     - Cut-off: where the magnitude stays under 5 % of its low-frequency value.
     """
-    reference = reference_distance(method)
-    frequency = _frequencies(config)
+    reference = method.distance
+    frequency = _frequencies(study)
     signed, powers = [], []
-    for shot, channels in _groups(config, method):
+    for shot, channels in _groups(study, method):
         ratio = reference / shot.distance
         # A frequency on the reference plane is ratio times higher on this shot's sensor.
         power = np.sum(np.abs(channels) ** 2, axis=0)
         powers.append(np.interp(frequency * ratio, frequency, power, right=0.0))
         if method.synthesis == "fringe_scanning":
-            response = _without_carrier(config, shot, frequency, channels)
+            response = _without_carrier(study, shot, frequency, channels)
             signed.append(np.interp(frequency * ratio, frequency, response, right=0.0))
     magnitude = np.sqrt(np.mean(powers, axis=0))
     limit = cut_off(frequency, magnitude)
     zero = first_common_zero(frequency, signed) if signed else None
-    magnification = config.object.distance / reference
+    magnification = study.object_distance / reference
     return Response(
         frequency,
         magnitude,
@@ -67,43 +60,39 @@ def method_response(config: StudyConfig, method: MethodConfig) -> Response:
     )
 
 
-def _frequencies(config: StudyConfig) -> np.ndarray:
+def _frequencies(study: Study) -> np.ndarray:
     """Frequencies ≥ 0 of the sensor's columns, cycles/mm."""
-    columns = config.sensor.shape[1]
-    return np.arange(columns - columns // 2) / (columns * config.sensor.pitch)
+    columns = study.sensor.shape[1]
+    return np.arange(columns - columns // 2) / (columns * study.sensor.pitch)
 
 
-def _groups(config: StudyConfig, method: MethodConfig) -> list[tuple[ShotConfig, np.ndarray]]:
-    """Shots with the responses (channel, u) of their channels; one distance is one group."""
-    profiles = np.stack([_profile(config, s) for s in settings(config, method)])
+def _groups(study: Study, method: Method) -> list[tuple[Exposure, np.ndarray]]:
+    """Shots with the responses (channel, u) of their channels; contrasts are one group."""
+    profiles = np.stack([_profile(study, exposure) for exposure in method.exposures])
     if method.synthesis == "contrasts":
-        return [(method.shots[0], synthesis_matrix(method) @ profiles)]
-    phases = len(method.shot_phases())
-    single = synthesis_matrix(method.model_copy(update={"shots": method.shots[:1]}))
-    return [
-        (shot, single @ profiles[index * phases : (index + 1) * phases])
-        for index, shot in enumerate(method.shots)
-    ]
+        return [(method.shots[0], method.synthesis_matrix @ profiles)]
+    single = synthesis_matrix(method.synthesis, 1, method.phases)
+    each = profiles.reshape(len(method.shots), method.phases, -1)
+    return [(shot, single @ own) for shot, own in zip(method.shots, each, strict=True)]
 
 
-def _profile(config: StudyConfig, setting: Setting) -> np.ndarray:
+def _profile(study: Study, exposure: Exposure) -> np.ndarray:
     """The OTF of one exposure along u ≥ 0, v = 0."""
     response = otf(
-        build_camera(config, setting),
-        wavelength=setting.wavelength,
-        object_distance=config.object.distance,
-        model=config.model,
-        pixel_integration=config.pixel_integration,
+        study.camera(exposure),
+        wavelength=exposure.wavelength,
+        object_distance=study.object_distance,
+        model=study.model,
+        pixel_integration=study.config.pixel_integration,
     )
-    rows, columns = config.sensor.shape
+    rows, columns = study.sensor.shape
     return np.asarray(response[rows // 2, columns // 2 :])
 
 
 def _without_carrier(
-    config: StudyConfig, shot: ShotConfig, u: np.ndarray, channels: np.ndarray
+    study: Study, shot: Exposure, u: np.ndarray, channels: np.ndarray
 ) -> np.ndarray:
     """A fringe-scanned response over e^{jX}, X = π²u²/β on the sensor: real, cos(πλdu²)."""
-    magnification = 1 + shot.distance / config.object.distance
-    beta = shot.beta / magnification**2
+    beta = shot.beta / (1 + shot.distance / study.object_distance) ** 2
     scanned = channels[0] + 1j * channels[1]
     return (scanned * np.exp(-1j * math.pi**2 * u**2 / beta)).real

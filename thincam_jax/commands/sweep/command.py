@@ -46,9 +46,9 @@ def sweep(
         _check(scheduler, workers)
         import jax
 
-        from thincam_jax.commands.config_file import ConfigError
+        from thincam_jax.commands.config_file import ConfigError, slug
         from thincam_jax.commands.refocus.config import load_experiment
-        from thincam_jax.commands.study.config import StudyConfig, slug
+        from thincam_jax.commands.study.config import StudyConfig
         from thincam_jax.commands.sweep.folder import SweepFolder
         from thincam_jax.commands.sweep.grid import read_axes
         from thincam_jax.commands.sweep.point import make_points

@@ -6,8 +6,9 @@ from pathlib import Path
 from typing import Any
 
 from thincam_jax._core.files import write_whole
+from thincam_jax.commands.checked_config import dump_config
 from thincam_jax.commands.run_folder import claim_folder
-from thincam_jax.commands.study.config import StudyConfig, dump_config
+from thincam_jax.commands.study.config import StudyConfig
 from thincam_jax.commands.sweep import table
 from thincam_jax.commands.sweep.measure import Outcome
 from thincam_jax.commands.sweep.point import GridPoint

@@ -8,9 +8,9 @@ import jax
 import numpy as np
 
 from thincam_jax.commands.config_file import ConfigError
-from thincam_jax.commands.study.check import check_study
-from thincam_jax.commands.study.config import StudyConfig, TargetConfig
-from thincam_jax.commands.study.target import examine_target, mean_psnr_of_pictures
+from thincam_jax.commands.study.build import build_study
+from thincam_jax.commands.study.config import StudyConfig
+from thincam_jax.commands.study.evaluate import evaluate_targets, mean_psnr_of_pictures
 
 # What a user can put right: the message says all.
 _USER_ERRORS = (ConfigError, FileNotFoundError, PermissionError, MemoryError)
@@ -41,24 +41,23 @@ def one_line(error: BaseException) -> str:
 
 
 def _measure(config: StudyConfig) -> dict[str, Any]:
-    started = time.perf_counter()
-    check_study(config)
-    reconstructors, row, psnr_db = {}, {}, {m.name: {} for m in config.methods}
-    for index, target in enumerate(config.targets):
-        examined = examine_target(config, index, target, reconstructors, lambda _: None)
-        for method, evaluation in examined.evaluations.items():
-            row |= _columns(method, target, evaluation.metrics)
-            psnr_db[method][target.name] = evaluation.metrics["psnr_db"]
-    for method, values in psnr_db.items():
-        known = [value for value in values.values() if value is not None]
+    started, row = time.perf_counter(), {}
+    study = build_study(config)
+    found = evaluate_targets(study)
+    for target in study.targets:
+        for method, targets in found.items():
+            row |= _columns(f"{method}/{target.name}", targets[target.name])
+    for method, targets in found.items():
+        psnr_db = [metrics["psnr_db"] for metrics in targets.values()]
+        known = [value for value in psnr_db if value is not None]
         row[f"mean_psnr_db/{method}"] = round(float(np.mean(known)), 4) if known else None
-        pictures = mean_psnr_of_pictures(config, values)
+        pictures = mean_psnr_of_pictures(study, targets)
         if pictures is not None:
             row[f"mean_psnr_of_pictures_db/{method}"] = pictures
     return {**row, "seconds": round(time.perf_counter() - started, 4)}
 
 
-def _columns(method: str, target: TargetConfig, metrics: dict[str, Any]) -> dict[str, Any]:
+def _columns(place: str, metrics: dict[str, Any]) -> dict[str, Any]:
     """Flat: `psnr_db/METHOD/TARGET`, and `resolved_object_mm/METHOD/TARGET` of an inner number."""
     flat = {}
     for name, value in metrics.items():
@@ -66,4 +65,4 @@ def _columns(method: str, target: TargetConfig, metrics: dict[str, Any]) -> dict
             flat |= {f"{name}_{inner}": number for inner, number in value.items()}
         elif value is not None or name != "resolved":
             flat[name] = value
-    return {f"{name}/{method}/{target.name}": value for name, value in flat.items()}
+    return {f"{name}/{place}": value for name, value in flat.items()}

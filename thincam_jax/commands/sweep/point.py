@@ -8,8 +8,9 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from thincam_jax.commands.checked_config import check_as
 from thincam_jax.commands.config_file import ConfigError, set_entry
-from thincam_jax.commands.study.config import StudyConfig, check_as
+from thincam_jax.commands.study.config import StudyConfig
 from thincam_jax.commands.sweep.grid import Axis, grid_values
 
 # Part of every point's key: to be raised when the same configuration is to give other metrics.

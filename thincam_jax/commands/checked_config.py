@@ -1,0 +1,151 @@
+"""From the text of an experiment file to checked sections, a line for every fault, and back."""
+
+from pathlib import Path
+from typing import Any, TypeVar, get_args
+
+import pydantic
+import yaml
+
+from thincam_jax.commands.config_file import ConfigError, override, read_raw
+
+Config = TypeVar("Config", bound=pydantic.BaseModel)
+
+
+def load_as(
+    model: type[Config], path: str | Path, overrides: tuple[str, ...] = (), seen: str = "targets"
+) -> Config:
+    """Read an experiment file of the given sections; `overrides` are "a.b=value" texts.
+
+    `seen` is the list whose image files are named from the folder of the experiment file.
+
+    **Errors**: ConfigError with one line for each fault: file and line, field, what was given,
+    what is allowed. FileNotFoundError where there is no such file.
+    """
+    path = Path(path)
+    raw, places = read_raw(path)
+    asked = {override(raw, text): f"--set {text}" for text in overrides}
+    config = check_as(model, raw, places, asked, f"{path}:1")
+    folder = path.resolve().parent
+    named = tuple(
+        entry.model_copy(update={"path": str(folder / entry.path)}) if entry.path else entry
+        for entry in getattr(config, seen)
+    )
+    return config.model_copy(update={seen: named})
+
+
+def check_as(
+    model: type[Config], raw: dict, places: dict[tuple, str], asked: dict[tuple, str], top: str
+) -> Config:
+    """Check raw data; a fault names the setting that asked for it, else the place in the file.
+
+    `places` and `asked` are by location; `top` is the place of what has none.
+    """
+    try:
+        return model.model_validate(raw)
+    except pydantic.ValidationError as error:
+        faults = [_fault(e, places, asked, top, model) for e in _own(error.errors())]
+        raise ConfigError("\n".join(faults)) from None
+
+
+def dump_config(config: pydantic.BaseModel) -> str:
+    """The resolved configuration as YAML that is read back to the same values."""
+    data = config.model_dump(mode="json", exclude_none=True, by_alias=True)
+    return yaml.safe_dump(data, sort_keys=False, allow_unicode=True, width=100)
+
+
+def _place(location: tuple, places: dict, asked: dict, top: str) -> str:
+    """The override or the file's line that holds a location, or what is nearest to it."""
+    parts = [location[:end] for end in range(len(location), 0, -1)]
+    for part in parts:  # an override stands in for whatever the file has there
+        if part in asked:
+            return asked[part]
+    if location not in places:
+        for path, override in asked.items():
+            if location and path[: len(location)] == location:
+                return override
+    for part in parts:
+        for known in ((*part, "(key)"), part):
+            if known in places:
+                return places[known]
+    return top
+
+
+def _own(errors: list[Any]) -> list[Any]:
+    """Without the lists that pydantic calls too short because it dropped a faulty entry."""
+    return [
+        error
+        for error in errors
+        if error["type"] != "too_short"
+        or not any(e["loc"][:-1][: len(error["loc"])] == error["loc"] for e in errors)
+    ]
+
+
+def _fault(error: Any, places: dict, asked: dict, top: str, model: Any) -> str:
+    """One line: place, field, what is wrong and what is allowed."""
+    location = (*error["loc"], *error.get("ctx", {}).get("place", ()))
+    if error["type"] == "invalid_key":
+        location = (*location[:-1], str(location[-1]))
+    field = _dotted(location) or "the file"
+    place = _place(location, places, asked, top)
+    return f"{place}: {field}: {_message(error, location, model)}"
+
+
+def _message(error: Any, location: tuple, model: Any) -> str:
+    """What is wrong and what is allowed, in the words of an experiment file."""
+    kind, given, context = error["type"], error.get("input"), error.get("ctx", {})
+    if kind == "extra_forbidden":
+        return f"unknown key; allowed here: {', '.join(_allowed(location[:-1], model))}"
+    if kind == "missing" and isinstance(location[-1], int):
+        return "missing; the list needs this entry"
+    if kind == "literal_error":
+        return f"{given!r} is unknown; choose one of {context['expected']}"
+    if kind in ("too_short", "too_long"):
+        limit = context.get("min_length", context.get("max_length"))
+        word = "at least" if kind == "too_short" else "at most"
+        return f"{given!r} has {len(given)} entries; give {word} {limit}"
+    if kind in _WORDS:
+        return _WORDS[kind].format(given=given)
+    message = error["msg"].removeprefix("Value error, ")
+    if kind in ("value_error", "misfit"):
+        return message
+    return f"{given!r}: {message[0].lower()}{message[1:]}"
+
+
+_WORDS = {
+    "missing": "missing; this key is needed",
+    "model_type": "{given!r} is not a section; give lines of 'key: value'",
+    "tuple_type": "{given!r} is not a list; write it as [a, b] or as lines beginning with '- '",
+    "invalid_key": "a key must be a text; put it in quotes",
+}
+
+
+def _dotted(location: tuple) -> str:
+    text = ""
+    for part in location:
+        text += f"[{part}]" if isinstance(part, int) else f".{part}" if text else str(part)
+    return text
+
+
+def _allowed(location: tuple, model: Any) -> list[str]:
+    """Keys of the section at a location."""
+    section: Any = model
+    for part in location:
+        if isinstance(part, int):
+            continue
+        section = _section_of(_keys(section)[part].annotation)
+    return list(_keys(section))
+
+
+def _keys(section: Any) -> dict[str, Any]:
+    """The fields of a section by what they are called in a file."""
+    return {field.alias or name: field for name, field in section.model_fields.items()}
+
+
+def _section_of(annotation: Any) -> Any:
+    if isinstance(annotation, type) and issubclass(annotation, pydantic.BaseModel):
+        return annotation
+    for inner in get_args(annotation):
+        found = _section_of(inner)
+        if found is not None:
+            return found
+    return None

@@ -1,0 +1,319 @@
+"""Sections of experiment files that several kinds share, with the units of their numbers."""
+
+import math
+from typing import Annotated, Literal
+
+import pydantic
+from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, PlainSerializer
+from pydantic_core import PydanticCustomError
+
+from thincam_jax.commands.config_file import slug
+from thincam_jax.imaging.targets import sample_images
+from thincam_jax.lensless.method import Model
+from thincam_jax.reconstruction.spectra import Prior
+from thincam_jax.units import parse_quantity
+
+
+def misfit(message: str, *place: str | int) -> PydanticCustomError:
+    """A fault between entries, reported at one of them."""
+    return PydanticCustomError("misfit", "{message}", {"message": message, "place": place})
+
+
+def _positive(value: float) -> float:
+    if not value > 0:
+        raise ValueError(f"{value:g} is not positive; give a value above zero")
+    return value
+
+
+LIGHT = (1e-5, 1.0)  # the wavelengths that are taken for light, mm
+
+
+def _optical(value: float) -> float:
+    if not LIGHT[0] <= value <= LIGHT[1]:
+        raise ValueError(f"{value:g} mm is no wavelength of light; give 10 nm to 1 mm")
+    return value
+
+
+def quantity(kind: str, unit: str):
+    # A resolved file is read back, so it is written in the unit of the package, with every digit.
+    return (
+        BeforeValidator(lambda text: parse_quantity(text, kind)),
+        PlainSerializer(lambda value: f"{value!r} {unit}"),
+    )
+
+
+Length = Annotated[float, *quantity("length", "mm"), AfterValidator(_positive)]
+Wavelength = Annotated[float, *quantity("length", "mm"), AfterValidator(_optical)]
+Curvature = Annotated[float, *quantity("curvature", "rad/mm^2"), AfterValidator(_positive)]
+Angle = Annotated[float, *quantity("angle", "rad")]
+Name = Annotated[str, Field(min_length=1, max_length=60, pattern=r"^[\w .,()=+\-]+$")]
+
+
+class Section(pydantic.BaseModel):
+    """A part of an experiment file: unknown keys are refused."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class SensorConfig(Section):
+    """`thincam_jax.Sensor`."""
+
+    shape: tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]]
+    pitch: Length
+    full_well: Annotated[float, Field(gt=0)] = 13_500.0
+    exposure: Annotated[float, Field(gt=0)] | None = None
+    electrons: Annotated[float, Field(gt=0)] | None = None
+    bit_depth: Annotated[int, Field(ge=1, le=24)] | None = None
+
+    @pydantic.model_validator(mode="after")
+    def _one(self):
+        if self.exposure is not None and self.electrons is not None:
+            message = "both this and exposure say how long the sensor is exposed; give one"
+            raise misfit(message, "electrons")
+        if self.bit_depth is not None and not self.counts:
+            message = "needs an exposure, such as 0.9; give it, or electrons"
+            raise misfit(message, "bit_depth")
+        return self
+
+    @property
+    def counts(self) -> bool:
+        """Whether it is known how many electrons a pixel holds."""
+        return self.exposure is not None or self.electrons is not None
+
+
+class ApertureConfig(Section):
+    """What all Fresnel zone apertures share.
+
+    - `pixel_pitch`, `fill_factor`: of a display that shows them.
+    """
+
+    width: Length
+    profile: Literal["cosine", "binary"] = "cosine"
+    pixel_pitch: Length | None = None
+    fill_factor: Annotated[float, Field(gt=0, le=1)] = 1.0
+
+    @pydantic.model_validator(mode="after")
+    def _display(self):
+        if self.pixel_pitch is None and self.fill_factor != 1:
+            raise misfit("is of a display's pixels; give their pixel_pitch, too", "fill_factor")
+        return self
+
+
+class MaskConfig(ApertureConfig):
+    """The same of a study, with the orders of binary masks that are computed."""
+
+    harmonics: Annotated[int, Field(ge=1, le=99)] = 9
+
+
+class ObjectConfig(Section):
+    """Where the targets stand and how wide they are."""
+
+    distance: Length
+    width: Length
+
+
+class NoiseConfig(Section):
+    """Gaussian noise at an SNR, or shot noise with a read noise in electrons."""
+
+    snr_db: Annotated[float, Field(ge=-60, le=200)] | None = None
+    signal_power: Literal["total", "without_mean"] = "total"
+    read_noise: Annotated[float, Field(ge=0)] | None = None
+
+    @pydantic.model_validator(mode="after")
+    def _one(self):
+        if (self.snr_db is None) == (self.read_noise is None):
+            raise ValueError("give either snr_db (Gaussian noise) or read_noise (shot noise too)")
+        return self
+
+
+class ShotConfig(Section):
+    """One setting of the camera; the phases of the synthesis are taken at each.
+
+    - `width`: of its masks; default that of the study.
+    - `exposure`: of each of its captures, relative to that of the sensor.
+    - `take`: 2 for a second exposure of a setting, which has noise of its own; and so on.
+    """
+
+    beta: Curvature
+    distance: Length
+    wavelength: Wavelength | None = None
+    width: Length | None = None
+    exposure: Annotated[float, Field(gt=0)] = 1.0
+    take: Annotated[int, Field(ge=2)] | None = None
+
+
+class PublishedConfig(Section):
+    """Figures that a publication gives for a method, shown beside the study's own."""
+
+    psnr_db: float | None = None
+    resolved: Length | None = None
+    limit_cycles_per_mm: Annotated[float, Field(gt=0)] | None = None
+
+
+class VariationConfig(Section):
+    """Total variation of an admm_tv method; see `thincam_jax.reconstruct`."""
+
+    tau: Annotated[float, Field(ge=0)] = 2.0
+    iterations: Annotated[int, Field(ge=1, le=100_000)] = 100
+    kind: Literal["isotropic", "anisotropic"] = "isotropic"
+    coupling: Literal["none", "joint", "opponent"] | None = None
+    chroma_weight: Annotated[float, Field(ge=0)] = 2.0
+
+    def coupling_of(self, channels: int) -> Literal["none", "joint", "opponent"]:
+        """As given; else what suits the number of colour channels."""
+        if channels == 1:
+            return "none"
+        return self.coupling or ("opponent" if channels == 3 else "joint")
+
+
+MethodKind = Literal["fringe_scanning", "wiener", "admm_tv"]
+Synthesis = Literal["fringe_scanning", "phase_pairs", "contrasts", "separate"]
+# The mask phases taken at each shot, rad, where the synthesis sets them.
+PHASES = {
+    "fringe_scanning": (0.0, math.pi / 2, math.pi, 3 * math.pi / 2),
+    "phase_pairs": (0.0, 3 * math.pi / 2),
+}
+
+
+class MethodConfig(Section):
+    """A reconstruction and the captures that it takes."""
+
+    name: Name
+    kind: MethodKind
+    variation: VariationConfig | None = None
+    synthesis: Synthesis = "fringe_scanning"
+    shots: Annotated[tuple[ShotConfig, ...], Field(min_length=1)]
+    phases: Annotated[tuple[Angle, ...], Field(min_length=1)] = (0.0,)
+    published: PublishedConfig = PublishedConfig()
+
+    @pydantic.model_validator(mode="after")
+    def _fits(self):
+        if self.kind == "fringe_scanning" and (
+            len(self.shots) != 1 or self.synthesis != "fringe_scanning"
+        ):
+            raise ValueError("kind fringe_scanning takes one shot and its own synthesis")
+        if self.variation is not None and self.kind != "admm_tv":
+            raise ValueError(f"kind {self.kind} has no total variation; drop 'variation'")
+        if self.synthesis in PHASES and self.phases != (0.0,):
+            raise ValueError(f"synthesis {self.synthesis} sets the phases itself; drop 'phases'")
+        if self.synthesis == "contrasts":
+            self._check_contrasts()
+        return self
+
+    def _check_contrasts(self) -> None:
+        if len(self.shots) * len(self.phases) < 2:
+            raise ValueError("synthesis contrasts compares captures; give two phases or shots")
+        if len({shot.distance for shot in self.shots}) > 1:
+            raise ValueError(
+                "synthesis contrasts needs shots at one distance, where they share a background; "
+                "use phase_pairs or fringe_scanning"
+            )
+
+    def shot_phases(self) -> tuple[float, ...]:
+        """The mask phases taken at each shot, rad."""
+        return PHASES.get(self.synthesis, self.phases)
+
+
+class TargetConfig(Section):
+    """A scene: a drawn chart or pattern, a photograph of scikit-image, or an image file.
+
+    Charts and patterns are squares of `pixels` × `pixels`.
+    """
+
+    name: Name
+    kind: Literal["usaf1951", "slanted_edge", "siemens_star", "point_grid", "photograph", "file"]
+    image: str | None = None
+    path: str | None = None
+    pixels: Annotated[int, Field(ge=8, le=8192)] = 1700
+
+    @pydantic.model_validator(mode="after")
+    def _fits(self):
+        needed = {"photograph": "image", "file": "path"}.get(self.kind)
+        for key in ("image", "path"):
+            if (getattr(self, key) is None) == (key == needed):
+                verb = "needs" if key == needed else "takes no"
+                raise ValueError(f"kind {self.kind} {verb} '{key}'")
+        if self.image is not None and self.image not in sample_images():
+            listed = ", ".join(sample_images())
+            raise ValueError(f"image {self.image!r} is unknown; choose one of {listed}")
+        return self
+
+
+class ExperimentConfig(Section):
+    """What every kind of experiment file begins with."""
+
+    name: Name
+    title: str = ""
+    seed: Annotated[int, Field(ge=0, lt=2**32, strict=True)] = 0
+    wavelength: Wavelength
+    model: Model = "separable"
+    pixel_integration: bool = True
+
+
+class CamerasConfig(ExperimentConfig):
+    """Cameras and the methods that reconstruct their captures."""
+
+    prior: Prior = "inverse_square"
+    sensor: SensorConfig
+    mask: MaskConfig
+    noise: NoiseConfig | None = None
+    methods: Annotated[tuple[MethodConfig, ...], Field(min_length=1)]
+
+    @pydantic.model_validator(mode="after")
+    def _methods_fit(self):
+        check_names(self, "methods")
+        check_methods(self)
+        return self
+
+
+def check_names(config: ExperimentConfig, *lists: str) -> None:
+    """Refuse two entries of a list whose names give one file name."""
+    for what in lists:
+        names = [entry.name for entry in getattr(config, what)]
+        # Files are named after them, without capitals and signs.
+        files = [slug(name) for name in names]
+        for index, file in enumerate(files):
+            first = files.index(file)
+            if first < index:
+                message = (
+                    f"{names[index]!r} and {names[first]!r} of {what}[{first}] "
+                    f"give the same file name {file!r}; choose another name"
+                )
+                raise misfit(message, what, index, "name")
+
+
+def check_methods(config: CamerasConfig) -> None:
+    """Refuse methods whose captures or noise do not fit."""
+    # A capture that is used twice would count its noise as two independent ones.
+    for index, method in enumerate(config.methods):
+        # To the picometre: 5600 um and 5.6 mm differ by rounding.
+        widths = [round(s.width or config.mask.width, 9) for s in method.shots]
+        shots = [
+            (s.beta, s.distance, s.wavelength or config.wavelength, width)
+            # Between two exposures of one setting there is no contrast.
+            + (() if method.synthesis == "contrasts" else (s.exposure, s.take))
+            for s, width in zip(method.shots, widths, strict=True)
+        ]
+        if method.synthesis == "contrasts" and len(set(widths)) > 1:
+            message = (
+                "synthesis contrasts needs masks of one width, which share a background; use "
+                "phase_pairs or fringe_scanning"
+            )
+            raise misfit(message, "methods", index, "shots")
+        for what, entries in (("shots", shots), ("phases", method.phases)):
+            if len(set(entries)) < len(entries):
+                message = f"{what} hold an entry twice; give each once"
+                raise misfit(message, "methods", index, what)
+    for index, method in enumerate(config.methods):
+        if config.noise is None and method.kind == "wiener":
+            message = "wiener weighs noise against signal; give a 'noise' section"
+            raise misfit(message, "methods", index, "kind")
+        for number, shot in enumerate(method.shots):
+            if shot.exposure != 1 and not config.sensor.counts:
+                message = (
+                    "this is relative to the sensor's; give sensor.exposure or sensor.electrons"
+                )
+                raise misfit(message, "methods", index, "shots", number, "exposure")
+    if config.noise and config.noise.read_noise is not None and not config.sensor.counts:
+        message = "read_noise counts electrons; give sensor.exposure, such as 0.9, or electrons"
+        raise misfit(message, "noise", "read_noise")

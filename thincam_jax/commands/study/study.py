@@ -1,0 +1,160 @@
+"""What is simulated: exposures of cameras, targets, and the methods that reconstruct them."""
+
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Array
+
+from thincam_jax.commands.sections import (
+    PHASES,
+    MaskConfig,
+    MethodKind,
+    SensorConfig,
+    Synthesis,
+    VariationConfig,
+)
+from thincam_jax.imaging.scene import ImagePlane
+from thincam_jax.imaging.sensor import AbstractNoise, Sensor
+from thincam_jax.lensless.camera import LenslessCamera
+from thincam_jax.lensless.masks.fza import FresnelZoneAperture
+from thincam_jax.lensless.method import Model
+from thincam_jax.lensless.psf import psf
+from thincam_jax.reconstruction import Reconstruction
+from thincam_jax.reconstruction import synthesis as syntheses
+from thincam_jax.reconstruction.spectra import Prior
+
+Reconstructor = Callable[[Array, Array], Reconstruction]
+
+
+class Exposure(NamedTuple):
+    """One exposure; those that are equal are taken once for all methods.
+
+    - `beta`, `phase`, `width`: of the mask, rad/mm², rad and mm.
+    - `distance`: mask to sensor, mm; `wavelength`: mm.
+    - `share`: of the sensor's exposure time.
+    - `take`: counts the exposures of a method that are equal in all else.
+    """
+
+    beta: float
+    phase: float
+    distance: float
+    wavelength: float
+    width: float
+    share: float = 1.0
+    take: int = 1
+
+
+class Capture(NamedTuple):
+    """What was read out (*channel, y, x), and the variance of its noise (*channel,)."""
+
+    image: np.ndarray
+    variance: np.ndarray
+
+
+@dataclass(frozen=True)
+class Method:
+    """A reconstruction and the exposures that it takes, in the order of its synthesis.
+
+    - `phases`: how many exposures each shot has.
+    - `variation`: of admm_tv.
+    """
+
+    name: str
+    kind: MethodKind
+    synthesis: Synthesis
+    exposures: tuple[Exposure, ...]
+    phases: int
+    variation: VariationConfig | None = None
+
+    @property
+    def shots(self) -> tuple[Exposure, ...]:
+        """The first exposure of each shot."""
+        return self.exposures[:: self.phases]
+
+    @property
+    def distance(self) -> float:
+        """The largest mask-sensor distance, on whose scale the method reconstructs, mm."""
+        return max(exposure.distance for exposure in self.exposures)
+
+    @property
+    def synthesis_matrix(self) -> np.ndarray:
+        """Real weights (channel, exposure)."""
+        return synthesis_matrix(self.synthesis, len(self.shots), self.phases)
+
+
+def synthesis_matrix(synthesis: Synthesis, shots: int, phases: int) -> np.ndarray:
+    """Real weights (channel, exposure) of so many shots with so many phases each."""
+    # Those that set the phases themselves treat each shot alike.
+    return getattr(syntheses, synthesis)(shots if synthesis in PHASES else shots * phases)
+
+
+@dataclass(frozen=True)
+class Target:
+    """What is seen: its place in the study, on which its noise depends; distance and width in mm.
+
+    `plane` holds the colour channels as a batch: (channel, y, x).
+    """
+
+    number: int
+    name: str
+    kind: str
+    distance: float
+    width: float
+    plane: ImagePlane
+
+    @property
+    def is_picture(self) -> bool:
+        """Whether it is a photograph or an image file, and not drawn."""
+        return self.kind in ("photograph", "file")
+
+
+@dataclass(frozen=True, eq=False)
+class Study:
+    """Cameras before targets, and the methods that reconstruct their captures.
+
+    - `config`: the experiment file that it was built from.
+    - `sensor`, `mask`: what all cameras share.
+    - `noise`: None leaves captures as they are.
+    - `reconstructors`: those that were built so far, by method's name and shape of the field.
+    """
+
+    config: Any
+    sensor: SensorConfig
+    mask: MaskConfig
+    noise: AbstractNoise | None
+    methods: tuple[Method, ...]
+    targets: tuple[Target, ...]
+    model: Model
+    prior: Prior = "inverse_square"
+    reconstructors: dict[tuple, Reconstructor] = field(default_factory=dict, init=False)
+
+    @functools.cached_property
+    def exposures(self) -> tuple[Exposure, ...]:
+        """Of all methods, each once, in the order of first use."""
+        return tuple(dict.fromkeys(e for m in self.methods for e in m.exposures))
+
+    @property
+    def object_distance(self) -> float:
+        """Where the targets stand, mm."""
+        return self.config.object.distance
+
+    def camera(self, exposure: Exposure) -> LenslessCamera:
+        """The camera of an exposure."""
+        mask, sensor = {**dict(self.mask), "width": exposure.width}, dict(self.sensor)
+        for level in ("exposure", "electrons"):
+            sensor[level] = sensor[level] and sensor[level] * exposure.share
+        aperture = FresnelZoneAperture(exposure.beta, exposure.phase, **mask)
+        return LenslessCamera(aperture, Sensor(**sensor), exposure.distance)
+
+    def psf(self, exposure: Exposure) -> Array:
+        """Of a point on the axis at the distance of the targets, (y, x)."""
+        return psf(
+            self.camera(exposure),
+            wavelength=exposure.wavelength,
+            object_distance=self.object_distance,
+            model=self.model,
+            pixel_integration=self.config.pixel_integration,
+        )
