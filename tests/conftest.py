@@ -20,9 +20,15 @@ import jax
 import jaxtyping
 import pytest
 
+from helpers import ROOT
+
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_traceback_in_locations_limit", 0)  # lines in HLO that nobody reads here
+# What one worker has compiled, and the last run, is not compiled again. `make clean` removes it.
+jax.config.update("jax_compilation_cache_dir", str(ROOT / ".pytest_cache" / "programs"))
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 
 # Before the first import of the package: from here on every annotated call is checked.
 jaxtyping.install_import_hook("thincam_jax", "beartype.beartype")
