@@ -1,7 +1,7 @@
-"""Designs for wished responses: the network, with two Newton steps, and the search beside them.
+"""Designs for target responses: the network with two Gauss–Newton steps, and the search beside it.
 
-The thesis' four captures at 30 dB, in single precision. Held-out wishes are responses of designs of
-the space; of the others, flat, shifted and turned round ones, no design gives any.
+The thesis' four captures at 30 dB, in single precision. Held-out targets are responses of designs
+of the space; of the others, flat, shifted and turned round ones, no design gives any.
 """
 
 import time
@@ -42,7 +42,7 @@ def problem(kind):
     return design.DesignSpace(base, SPACES[kind]), camera, jnp.asarray(phase_pairs(2)), frequencies
 
 
-def wishes(model):
+def targets(model):
     """Attainable ones, and others: 8 flat, 6 shifted, 6 turned round."""
     points = jax.random.uniform(jax.random.key(2026), (HELD_OUT, model.space.size))
     attainable = jax.jit(jax.vmap(model.levels))(points)
@@ -53,25 +53,25 @@ def wishes(model):
 
 
 @jax.jit
-def network_alone(suggester, wanted):
-    guesses = suggester(wanted)
-    misfits = jax.vmap(suggester.model.misfit, in_axes=(0, None))(guesses, wanted)
+def network_alone(suggester, target):
+    guesses = suggester(target)
+    misfits = jax.vmap(suggester.model.misfit, in_axes=(0, None))(guesses, target)
     return guesses[jnp.argmin(misfits)], jnp.min(misfits)
 
 
 @jax.jit
-def nearest_sample(model, points, levels, wanted):
-    """The example of the training whose levels are nearest, and two Newton steps from there."""
-    point = points[jnp.argmin(jnp.mean((levels - wanted) ** 2, axis=-1))]
-    refined, first = refine(model, wanted, point[None])
-    return first[0], model.misfit(refined[0], wanted)
+def nearest_sample(model, points, levels, target):
+    """The example of the training whose levels are nearest, after two Gauss–Newton steps."""
+    point = points[jnp.argmin(jnp.mean((levels - target) ** 2, axis=-1))]
+    refined, first = refine(model, target, point[None])
+    return first[0], model.misfit(refined[0], target)
 
 
-def each(function, wanted):
-    """Of every wish, after one that compiles: what comes out, and the median time, s."""
-    jax.block_until_ready(function(wanted[0]))
+def each(function, target):
+    """Of every target, after one that compiles: what comes out, and the median time, s."""
+    jax.block_until_ready(function(target[0]))
     found, times = [], []
-    for one in wanted:
+    for one in target:
         start = time.perf_counter()
         found.append(jax.block_until_ready(function(one)))
         times.append(time.perf_counter() - start)
@@ -79,7 +79,7 @@ def each(function, wanted):
 
 
 def answers(kind):
-    """Misfits and times of all ways, of both kinds of wishes."""
+    """Misfits and times of all ways, of both kinds of targets."""
     space, *data = problem(kind)
     start = time.perf_counter()
     suggester = learn.train_suggester(space, *data, key=jax.random.key(0)).suggester
@@ -88,16 +88,16 @@ def answers(kind):
     model = suggester.model
     examples = _examples(model, 4096, jax.random.key(1))
 
-    def search(wanted):
-        return design.match_response(space, wanted, *data, key=jax.random.key(4))
+    def search(target):
+        return design.match_response(space, target, *data, key=jax.random.key(4))
 
     rows = []
-    for name, wanted in zip(("attainable", "others"), wishes(model), strict=True):
-        alone, of_alone = each(lambda w: network_alone(suggester, w), wanted)
-        compiled, of_steps = each(lambda w: learn.propose(suggester, w), wanted)
-        told, of_all = each(lambda w: learn.suggest(suggester, w), wanted)
-        nearest, of_nearest = each(lambda w: nearest_sample(model, *examples, w), wanted)
-        searched, of_search = each(search, wanted)
+    for name, target in zip(("attainable", "others"), targets(model), strict=True):
+        alone, of_alone = each(lambda w: network_alone(suggester, w), target)
+        compiled, of_steps = each(lambda w: learn.propose(suggester, w), target)
+        told, of_all = each(lambda w: learn.suggest(suggester, w), target)
+        nearest, of_nearest = each(lambda w: nearest_sample(model, *examples, w), target)
+        searched, of_search = each(search, target)
         evaluations = np.median([s.evaluations for s in searched])
         rows += [
             (name, "network", of_alone, [a[1] for a in alone]),
@@ -115,13 +115,13 @@ def answers(kind):
 def test_suggest(benchmark, kind, capsys):
     with jax.enable_x64(False):
         training, suggester, rows = answers(kind)
-        wanted = jnp.asarray(wishes(suggester.model)[0][0])
+        target = jnp.asarray(targets(suggester.model)[0][0])
         benchmark.pedantic(
-            lambda: jax.block_until_ready(learn.propose(suggester, wanted)), rounds=50
+            lambda: jax.block_until_ready(learn.propose(suggester, target)), rounds=50
         )
     with capsys.disabled():
         print(f"\n\n{kind}: trained in {training:.0f} s\n")
-        print("| wishes | by | time, ms | median, dB | 95 %, dB | within 1 dB |")
+        print("| targets | by | time, ms | median, dB | 95 %, dB | within 1 dB |")
         for name, way, seconds, misfits in rows:
             misfits = np.asarray(misfits, float)
             median, most = np.percentile(misfits, [50, 95])

@@ -1,4 +1,4 @@
-"""Least squares to a wished response: designs found again, and what none gives is said."""
+"""Least squares to a target response: designs found again, and what none gives is said."""
 
 import jax
 import jax.numpy as jnp
@@ -8,7 +8,7 @@ from design.setting import setup, two_betas
 
 from thincam_jax.design import Polar, PowerLaw, match_response
 from thincam_jax.design.match import _least_squares
-from thincam_jax.design.wanted import ResponseModel
+from thincam_jax.design.target_response import ResponseModel
 from thincam_jax.reconstruction import phase_pairs
 
 RINGS = 16
@@ -19,9 +19,9 @@ POINT = jnp.array([0.61, 0.27])
 WANTED = MODEL.levels(POINT)
 
 
-def match(wanted=WANTED, seed=0, data=DATA, **options):
+def match(target=WANTED, seed=0, data=DATA, **options):
     options = {"starts": 4, "samples": 64} | options
-    return match_response(SPACE, wanted, *data, key=jax.random.key(seed), **options)
+    return match_response(SPACE, target, *data, key=jax.random.key(seed), **options)
 
 
 @pytest.mark.thorough
@@ -46,7 +46,7 @@ def test_other_wishes_do_not_compile_again():
 
 
 def test_descents_are_better_than_samples():
-    """Of a wish that no design fulfils, too: and this is told."""
+    """Of a target that no design fulfils, too: and this is told."""
     result = match(jnp.full(RINGS, 30.0))
     points = jnp.stack(jnp.meshgrid(*[jnp.linspace(0.0, 1.0, 9)] * 2), -1).reshape(-1, 2)
     misfits = jax.lax.map(lambda p: MODEL.misfit(p, jnp.full(RINGS, 30.0)), points)
@@ -64,16 +64,16 @@ def test_responses_without_a_number_are_told():
 
 
 @pytest.mark.parametrize(
-    ("wanted", "options", "message"),
+    ("target", "options", "message"),
     [
-        (np.full(RINGS, np.nan), {}, "wanted level of ring 1 is nan, no finite number"),
-        (np.full((2, 2), 1.0), {}, r"wanted has shape \(2, 2\); give \(4,\)"),
+        (np.full(RINGS, np.nan), {}, "target level of ring 1 is nan, no finite number"),
+        (np.full((2, 2), 1.0), {}, r"target has shape \(2, 2\); give \(4,\)"),
         (np.full(300, 1.0), {}, "rings = 300, and the frequencies lie in 128 of them"),
         (np.full(RINGS, -3.0), {}, "is -3, below 0 dB; give levels"),
         (WANTED, {"starts": 0}, "starts = 0; give at least 1"),
     ],
 )
-def test_errors(wanted, options, message):
+def test_errors(target, options, message):
     with pytest.raises(ValueError, match=message) as told:
-        match(wanted, **options)
+        match(target, **options)
     assert "\n" not in str(told.value)

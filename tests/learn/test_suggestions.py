@@ -1,4 +1,4 @@
-"""Suggested designs: near to what is wanted where a design gives it, honest where none does."""
+"""Suggested designs: near to the target where a design gives it, honest where none does."""
 
 import jax
 import jax.numpy as jnp
@@ -33,7 +33,7 @@ def suggester(trained):
 
 
 @pytest.fixture(scope="module")
-def wishes(suggester):
+def targets(suggester):
     """Responses of designs that no example was: (their levels, those of random other designs)."""
     # As many at a time as in the training: the program is compiled already.
     points = jax.random.uniform(jax.random.key(77), (SMALL["samples"], SPACE.size))
@@ -42,9 +42,9 @@ def wishes(suggester):
 
 
 @pytest.fixture(scope="module")
-def proposals(suggester, wishes):
+def proposals(suggester, targets):
     """One after the other: together they would be another program."""
-    each = [propose(suggester, wanted) for wanted in wishes[0]]
+    each = [propose(suggester, target) for target in targets[0]]
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *each)
 
 
@@ -60,30 +60,30 @@ def test_training_learns(trained):
     assert float(jnp.max(jnp.ptp(guesses, axis=0))) > 0.05
 
 
-def test_nearer_than_random_designs(wishes, proposals):
+def test_nearer_than_random_designs(targets, proposals):
     """Medians over held-out designs: a random design, the network alone, two steps more."""
-    random = np.median(np.sqrt(np.mean((wishes[1] - wishes[0]) ** 2, axis=-1)))
+    random = np.median(np.sqrt(np.mean((targets[1] - targets[0]) ** 2, axis=-1)))
     network, refined = (np.median(m) for m in (proposals.first_misfit_db, proposals.misfit_db))
     assert network < 0.5 * random
     assert refined < 0.5 * network
 
 
-def test_newton_steps_never_make_worse(suggester, wishes, proposals):
+def test_newton_steps_never_make_worse(suggester, targets, proposals):
     """And what is told is the misfit of the design that is given."""
     assert np.all(proposals.misfit_db <= proposals.first_misfit_db)
     levels = jax.jit(lambda point: suggester.model.levels(point))
     for k in (0, 31):
-        told = proposals.levels[k] - wishes[0][k]
+        told = proposals.levels[k] - targets[0][k]
         np.testing.assert_allclose(np.sqrt(np.mean(told**2)), proposals.misfit_db[k], rtol=1e-9)
         np.testing.assert_allclose(levels(proposals.point[k]), proposals.levels[k], atol=1e-9)
 
 
-def test_suggestion(suggester, wishes, proposals):
-    """As `propose` over all wishes says, and not compiled again for another."""
-    suggest(suggester, wishes[0][0])
+def test_suggestion(suggester, targets, proposals):
+    """As `propose` over all targets says, and not compiled again for another."""
+    suggest(suggester, targets[0][0])
     before = propose._cache_size()
     for k in (1, 2):
-        found = suggest(suggester, np.asarray(wishes[0][k]))
+        found = suggest(suggester, np.asarray(targets[0][k]))
         np.testing.assert_allclose(found.point, proposals.point[k], atol=1e-9)
         np.testing.assert_allclose(found.design.beta, np.repeat(found.values, 2))
         assert found.status == ("matched" if found.misfit_db <= 1.0 else "not_attained")
@@ -92,25 +92,25 @@ def test_suggestion(suggester, wishes, proposals):
 
 
 @pytest.mark.thorough
-def test_many_at_a_time_and_slopes(suggester, wishes, proposals):
-    """Under vmap as one by one; the misfit's slope in the wished levels by differences."""
-    together = jax.jit(jax.vmap(propose, in_axes=(None, 0)))(suggester, wishes[0])
+def test_many_at_a_time_and_slopes(suggester, targets, proposals):
+    """Under vmap as one by one; the misfit's slope in the target levels by differences."""
+    together = jax.jit(jax.vmap(propose, in_axes=(None, 0)))(suggester, targets[0])
     for several, single in zip(together, proposals, strict=True):
         np.testing.assert_allclose(several, single, atol=1e-6)
-    wanted, direction = wishes[0][0] + 1.0, jnp.ones(RINGS)
+    target, direction = targets[0][0] + 1.0, jnp.ones(RINGS)
     told = jax.jit(lambda w: propose(suggester, w).first_misfit_db)
-    expected = finite_difference(told, wanted, direction, 1e-6)
-    np.testing.assert_allclose(jax.grad(told)(wanted) @ direction, expected, rtol=1e-4)
+    expected = finite_difference(told, target, direction, 1e-6)
+    np.testing.assert_allclose(jax.grad(told)(target) @ direction, expected, rtol=1e-4)
 
 
-def test_unattainable_wishes_are_told(suggester, wishes):
+def test_unattainable_targets_are_told(suggester, targets):
     """30 dB everywhere, a response turned round, and 8 dB more than there is."""
-    response = wishes[0][0]
-    for wanted in (jnp.full(RINGS, 30.0), response[::-1], response + 8.0):
-        found = suggest(suggester, wanted)
+    response = targets[0][0]
+    for target in (jnp.full(RINGS, 30.0), response[::-1], response + 8.0):
+        found = suggest(suggester, target)
         assert found.status == "not_attained"
         assert found.misfit_db > 2.0
-        assert suggest(suggester, wanted, tolerance_db=60.0).status == "matched"
+        assert suggest(suggester, target, tolerance_db=60.0).status == "matched"
     # Against the faces: the limits are told.
     assert any(suggest(suggester, jnp.full(RINGS, level)).active for level in (0.0, 30.0, 60.0))
 
@@ -121,16 +121,16 @@ def test_no_number_is_told(suggester):
 
 
 @pytest.mark.parametrize(
-    ("wanted", "message"),
+    ("target", "message"),
     [
-        (np.zeros(RINGS + 1), r"wanted has shape \(17,\); give \(16,\), a level in dB"),
+        (np.zeros(RINGS + 1), r"target has shape \(17,\); give \(16,\), a level in dB"),
         (np.full(RINGS, np.nan), "ring 1 is nan, no finite number; give levels"),
         (np.linspace(1.0, -1.0, RINGS), "ring 9 is -0.0666667, below 0 dB"),
     ],
 )
-def test_errors(suggester, wanted, message):
+def test_errors(suggester, target, message):
     with pytest.raises(ValueError, match=message) as told:
-        suggest(suggester, wanted)
+        suggest(suggester, target)
     assert "\n" not in str(told.value)
 
 
@@ -141,13 +141,13 @@ def test_training_errors():
         train_suggester(SPACE, *DATA, key=jax.random.key(0), **(SMALL | {"guesses": 0}))
 
 
-def test_saved_and_loaded_answers_are_the_same(suggester, wishes, tmp_path):
+def test_saved_and_loaded_answers_are_the_same(suggester, targets, tmp_path):
     path = save_suggester(tmp_path / "two_betas.suggester", suggester)
     loaded = load_suggester(path, SPACE, *DATA)
-    wanted = wishes[0][0]
-    expected = propose(suggester, wanted)
+    target = targets[0][0]
+    expected = propose(suggester, target)
     before = propose._cache_size()
-    for there, here in zip(expected, propose(loaded, wanted), strict=True):
+    for there, here in zip(expected, propose(loaded, target), strict=True):
         np.testing.assert_array_equal(there, here)
     assert propose._cache_size() == before
 

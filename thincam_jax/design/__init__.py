@@ -29,8 +29,8 @@ from thincam_jax.design.space import DesignSpace as DesignSpace
 from thincam_jax.design.space import Limits as Limits
 from thincam_jax.design.space import Variable as Variable
 from thincam_jax.design.stochastic import stochastic_descent as stochastic_descent
+from thincam_jax.design.target_response import response_misfit as response_misfit
+from thincam_jax.design.target_response import ring_levels as ring_levels
 from thincam_jax.design.training import Training as Training
-from thincam_jax.design.wanted import response_misfit as response_misfit
-from thincam_jax.design.wanted import ring_levels as ring_levels
 from thincam_jax.design.wiener import restore_by_wiener as restore_by_wiener
 from thincam_jax.design.wiener import wiener_error as wiener_error

@@ -16,7 +16,8 @@ class Quadrant(eqx.Module):
 
     The response of a centred zone aperture is even in both, so that n² samples are those of a
     (2n − 1)² image. Samples must be closer than half the inverse of the mask's width as seen from
-    the sensor, d/(2·width): else the even light falls between them and its variance is missed.
+    the sensor, d/(2·width): else the uniform background falls between them
+    and its variance is missed.
 
     - `axis`: ν from zero up, cycles/rad, along either axis.
     - `weight`: of each point, so that Σ w g is ∬ g dν_x dν_y over the plane.

@@ -1,6 +1,6 @@
-r"""The design whose response is nearest to a wished one, by least squares from many starts.
+r"""The design whose response is nearest to a target response, by least squares from many starts.
 
-.. math:: \min_p \frac1R \sum_{r=1}^R [L_r(p) - L_r^{wanted}]^2
+.. math:: \min_p \frac1R \sum_{r=1}^R [L_r(p) - L_r^{target}]^2
 
 over the unit cube of a space, by Levenberg and Marquardt's method: the misfit is a sum of squares,
 and R levels say more of where to go than their sum.
@@ -31,7 +31,7 @@ from thincam_jax.design.search import (
 )
 from thincam_jax.design.setup import Setup
 from thincam_jax.design.space import DesignSpace
-from thincam_jax.design.wanted import (
+from thincam_jax.design.target_response import (
     ResponseModel,
     checked_levels,
     response_misfit,
@@ -53,7 +53,7 @@ class Match(NamedTuple):
     - `status`: "matched" within the tolerance, "not_attained", or "non_finite" if no design that
       was looked at has a response.
     - `evaluations`: of the response, with or without its derivatives, samples included.
-    - `failed`: how many samples and descents met a response that is no number.
+    - `failed`: how many samples and descents met a response that is not finite.
     """
 
     found: tuple[Found, ...]
@@ -65,7 +65,7 @@ class Match(NamedTuple):
 
 def match_response(
     space: DesignSpace,
-    wanted,
+    target,
     setup: Setup,
     synthesis: Float[Array, "channel capture"] | Float[np.ndarray, "channel capture"],
     frequencies: Frequencies,
@@ -78,11 +78,11 @@ def match_response(
     tolerance_db: float = MATCHED,
     apart: float = APART,
 ) -> Match:
-    """The designs of a space whose levels are nearest to wanted ones.
+    """The designs of a space whose levels are nearest to target ones.
 
     **Arguments**
 
-    - `wanted`: levels in dB, one for each ring from zero frequency up (`ring_levels`), at least 0.
+    - `target`: levels in dB, one for each ring from zero frequency up (`ring_levels`), at least 0.
     - `setup`, `synthesis`, `frequencies`: as of `channels`.
     - `starts`: descents (optimistix' Levenberg-Marquardt under the smooth map sin² onto the cube);
       `samples`: of the even sampling before, from the best of which they start.
@@ -92,14 +92,14 @@ def match_response(
     - `apart`: optima closer than this in the cube are one.
 
     **Validity.** The response has many local optima; more starts and samples find better ones. A
-    wish that no design fulfils is told by the status "not_attained".
+    target that no design fulfils is told by the status "not_attained".
 
-    **Errors**: ValueError for wanted levels that are not finite or below 0, and for numbers of
+    **Errors**: ValueError for target levels that are not finite or below 0, and for numbers of
     starts, samples or steps below 1.
     """
     checks.at_least_one({"starts": starts, "samples": samples, "steps": steps})
     dtype = space.lower.dtype
-    levels = checked_levels(wanted, np.size(wanted), dtype)
+    levels = checked_levels(target, np.size(target), dtype)
     model = ResponseModel(space, setup, synthesis, frequencies, len(levels))
     points = even_samples(space.size, max(samples, starts), key, dtype)
     values = evaluate(_misfit, space, (model, levels), points)
@@ -120,15 +120,15 @@ def match_status(misfit_db: float, tolerance_db: float) -> MatchStatus:
 
 
 def _misfit(design: Design, data: Any) -> Float[Array, ""]:
-    model, wanted = data
+    model, target = data
     known = channels(design, model.setup, model.synthesis, model.frequencies)
-    return response_misfit(known, model.frequencies, wanted)
+    return response_misfit(known, model.frequencies, target)
 
 
 @functools.partial(jax.jit, static_argnames="steps")
 def _least_squares(
     model: ResponseModel,
-    wanted: Float[Array, " ring"],
+    target: Float[Array, " ring"],
     points: Float[Array, "start variable"],
     steps: int,
     tolerance,
@@ -136,20 +136,20 @@ def _least_squares(
     solver = optimistix.LevenbergMarquardt(rtol=tolerance, atol=tolerance)
 
     def residual(y, given):
-        model, wanted = given
-        return (model.levels(on_cube(y)) - wanted) * (_WEIGHT / wanted.shape[0] ** 0.5)
+        model, target = given
+        return (model.levels(on_cube(y)) - target) * (_WEIGHT / target.shape[0] ** 0.5)
 
     def one(point):
         solution = optimistix.least_squares(
             residual,
             solver,
             jnp.arcsin(jnp.sqrt(point)),
-            args=(model, wanted),
+            args=(model, target),
             max_steps=steps,
             throw=False,
         )
         ended = on_cube(solution.value)
-        value = root_mean_square(model.levels(ended) - wanted)
+        value = root_mean_square(model.levels(ended) - target)
         converged = solution.result == optimistix.RESULTS.successful
         return Descents(ended, value, solution.stats["num_steps"] + 1, converged)
 

@@ -12,7 +12,8 @@ Two models, both within the Fresnel approximation:
       \quad s = \lambda d\rho
 
   cut off along either axis where the point of the mask that sends light there lies beyond the
-  aperture, the edge smoothed over one zone. The even light is left out: it is a peak at zero.
+  aperture, the edge smoothed over one zone. The uniform background, a peak at
+  zero, is left out.
 
 **Crop.** Light of the frequency u of a pair of orders comes from one point of the mask,
 M ζ(u) from the shadow's centre, and reaches the sensor for a part q(u) of the object's points only.

@@ -59,7 +59,7 @@ class Search(NamedTuple):
 
     - `evaluations`: of the objective, with or without its gradient: of all samples and of each
       descent up to its own end.
-    - `failed`: how many samples and descents met an objective that is no number.
+    - `failed`: how many samples and descents met an objective that is not finite.
     """
 
     found: tuple[Found, ...]

@@ -9,7 +9,7 @@ from thincam_jax.design.design import Design
 from thincam_jax.design.frequencies import Frequencies, Quadrant
 from thincam_jax.design.setup import Setup
 
-# The peak of the even light at zero frequency: its lobes, and quadrature nodes over them.
+# The peak of the uniform background at zero frequency: its lobes, and quadrature nodes over them.
 _LOBES, _NODES = 4.0, 48
 
 
@@ -46,13 +46,13 @@ def signal_variance(
     if isinstance(frequencies, Quadrant):
         window = _window(setup, frequencies.axis / design.distance[:, None])
         return jnp.sum(power * (1 - window[:, :, None] * window[:, None, :]), axis=(-2, -1))
-    # The rings lie at higher frequencies; the even light, which they lack, varies slowly.
+    # The rings lie at higher frequencies; the uniform background, which they lack, varies slowly.
     even = jax.vmap(lambda d: _even_variance(design, setup, d))(design.distance)
     return jnp.sum(power, axis=(-2, -1)) + _unit(setup, frequencies) * even
 
 
 def _even_variance(design: Design, setup: Setup, distance) -> Float[Array, ""]:
-    """What the even light casts: the object through a square opening, without its mean."""
+    """What the uniform background casts: the object through a square opening, without its mean."""
     shadow = design.width * (1 + distance / setup.object_distance)
     end = _LOBES / shadow
     nodes, weights = leggauss(_NODES)

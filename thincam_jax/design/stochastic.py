@@ -21,7 +21,7 @@ class Descent(NamedTuple):
 
     - `design`, `values`, `point`: of the mean of the second half of the steps, in the cube.
     - `history`: the objective, as drawn, at every step.
-    - `skipped`: steps whose objective or gradient was no number; they changed nothing.
+    - `skipped`: steps whose objective or gradient was not finite; they changed nothing.
     """
 
     design: Design

@@ -5,9 +5,9 @@ Two parts, both with Adam (optax):
 1. *Warm-up.* Regression from the levels of sampled designs to their points, of the guess that is
    nearest to the point only: designs with like responses then belong to different guesses, and
    none is drawn to the mean of two designs, which is neither.
-2. *Tandem.* The misfit between wanted levels and those of the suggested design, differentiated
+2. *Tandem.* The misfit between target levels and those of the suggested design, differentiated
    through the response model: any design that gives the response is right. Again of the best guess,
-   and of a random one now and then, so that all of them learn. Half of the wishes are responses of
+   and of a random one now and then, so that all of them learn. Half of the targets are responses of
    sampled designs; the others are such ones shifted and bent by some dB, which no design fulfils
    and of which the nearest is to be found.
 """
@@ -27,7 +27,7 @@ from thincam_jax.design.frequencies import Frequencies
 from thincam_jax.design.search import even_samples
 from thincam_jax.design.setup import Setup
 from thincam_jax.design.space import DesignSpace
-from thincam_jax.design.wanted import ResponseModel
+from thincam_jax.design.target_response import ResponseModel
 from thincam_jax.learn.suggestions import Suggester
 
 # Designs whose levels are computed at a time.
@@ -40,7 +40,7 @@ _OTHERS = 0.02
 _WARM_UP_BATCH = 4
 # How often a random guess is taken in place of the best.
 _RANDOM = 0.1
-# Bends of wishes: amplitude of each, dB, of constant, slope and this many cosines.
+# Bends of targets: amplitude of each, dB, of constant, slope and this many cosines.
 _BEND, _COSINES = 2.0, 4
 
 
@@ -81,7 +81,7 @@ def train_suggester(
     **Arguments**
 
     - `space`: what is free; `setup`, `synthesis`, `frequencies`: as of `channels`.
-    - `rings`: how many levels a wish has.
+    - `rings`: how many levels a target has.
     - `samples`: designs, sampled evenly, whose levels are the examples.
     - `guesses`, `width`, `depth`: points that the network gives, and its hidden layers.
     - `warm_up`, `steps`: of the two parts; a tandem step costs some 8·`batch` responses.
@@ -139,10 +139,10 @@ def _train(suggester: Suggester, points, levels, key, rate, warm_up: int, steps:
         return nearest + _OTHERS * jnp.mean(squared), jnp.sqrt(nearest)
 
     def towards_levels(layers, step_key):
-        of_wishes, of_guesses = jax.random.split(step_key)
-        wanted = _wishes(levels, of_wishes, batch)
-        guesses = jax.vmap(with_layers(layers))(wanted)
-        misfit = jnp.mean(_chosen_misfits(suggester.model, guesses, wanted, of_guesses))
+        of_targets, of_guesses = jax.random.split(step_key)
+        target = _targets(levels, of_targets, batch)
+        guesses = jax.vmap(with_layers(layers))(target)
+        misfit = jnp.mean(_chosen_misfits(suggester.model, guesses, target, of_guesses))
         return misfit, misfit
 
     first, second = jax.random.split(key)
@@ -152,27 +152,27 @@ def _train(suggester: Suggester, points, levels, key, rate, warm_up: int, steps:
     return layers, distances, misfits, in_vain + skipped
 
 
-def _chosen_misfits(model: ResponseModel, guesses, wanted, key) -> Float[Array, " wish"]:
-    """Of the best guess of each wish, or now and then of any; only these are differentiated."""
+def _chosen_misfits(model: ResponseModel, guesses, target, key) -> Float[Array, " target"]:
+    """Of the best guess of each target, or now and then of any; only these are differentiated."""
     judged = jax.vmap(jax.vmap(model.misfit, in_axes=(0, None)))(
-        jax.lax.stop_gradient(guesses), wanted
+        jax.lax.stop_gradient(guesses), target
     )
     best = jnp.argmin(jnp.where(jnp.isfinite(judged), judged, jnp.inf), axis=-1)
     of_any, of_which = jax.random.split(key)
     anyone = jax.random.randint(of_which, best.shape, 0, guesses.shape[1])
     taken = jnp.where(jax.random.uniform(of_any, best.shape) < _RANDOM, anyone, best)
     points = jnp.take_along_axis(guesses, taken[:, None, None], axis=1)[:, 0]
-    return jax.vmap(model.misfit)(points, wanted)
+    return jax.vmap(model.misfit)(points, target)
 
 
-def _wishes(levels: Float[Array, "point ring"], key, batch: int) -> Float[Array, "wish ring"]:
+def _targets(levels: Float[Array, "point ring"], key, batch: int) -> Float[Array, "target ring"]:
     """Responses of sampled designs, every second one shifted and bent."""
     of_choice, of_bends = jax.random.split(key)
-    wanted = levels[jax.random.randint(of_choice, (batch,), 0, len(levels))]
+    target = levels[jax.random.randint(of_choice, (batch,), 0, len(levels))]
     place = (np.arange(levels.shape[1]) + 0.5) / levels.shape[1]
     shapes = [np.ones_like(place), 2 * place - 1]
     shapes += [np.cos(np.pi * k * place) for k in range(2, 2 + _COSINES)]
     weights = jax.random.normal(of_bends, (batch, len(shapes)), levels.dtype)
     bends = _BEND * weights @ jnp.asarray(np.stack(shapes), levels.dtype)
     every_second = jnp.arange(batch)[:, None] % 2 == 0
-    return jnp.maximum(wanted + jnp.where(every_second, bends, 0.0), 0.0)
+    return jnp.maximum(target + jnp.where(every_second, bends, 0.0), 0.0)

@@ -1,11 +1,11 @@
-r"""A design for a wished response, from a network and two Newton steps.
+r"""A design for a target response, from a network and two Gauss–Newton steps.
 
-The network maps wanted levels (`thincam_jax.design.wanted`) to points p of a space's unit cube. The
-map has many values: captures may be exchanged, and different designs have like responses. So it
-gives several guesses; two steps of Gauss and Newton's method refine each within the cube,
+The network maps target levels (`thincam_jax.design.target_response`) to points p of a space's unit
+cube. The map has many values: captures may be exchanged, and different designs have like responses.
+So it gives several guesses; two Gauss–Newton steps refine each within the cube,
 
 .. math:: \Delta p = -(J^T J + \mu\,\mathrm{diag}\,J^T J)^{-1} J^T
-    [L(p) - L^{wanted}], \qquad J = \partial L/\partial p
+    [L(p) - L^{target}], \qquad J = \partial L/\partial p
 
 with the best of several dampings μ; and the best of what comes out is the answer. The response
 model judges every guess, so the misfit that is told is the design's, not the network's opinion.
@@ -30,7 +30,7 @@ from thincam_jax.design.frequencies import Frequencies
 from thincam_jax.design.match import MATCHED, MatchStatus, match_status
 from thincam_jax.design.setup import Setup
 from thincam_jax.design.space import DesignSpace, active_limits
-from thincam_jax.design.wanted import ResponseModel, checked_levels, root_mean_square
+from thincam_jax.design.target_response import ResponseModel, checked_levels, root_mean_square
 
 STEPS = 2
 # Parts of the diagonal of JᵀJ that are tried beside each other in every step. Ripples of the
@@ -39,10 +39,10 @@ _DAMPINGS = (0.01, 0.3, 10.0)
 
 
 class Suggester(eqx.Module):
-    """A network from wanted levels to guesses in the unit cube, and the model that judges them.
+    """A network from target levels to guesses in the unit cube, and the model that judges them.
 
     - `layers`: of a multilayer perceptron, SiLU between them, a sigmoid at the end.
-    - `mean`, `scale`: of the levels it was trained on, dB; it sees (wanted − mean)/scale.
+    - `mean`, `scale`: of the levels it was trained on, dB; it sees (target − mean)/scale.
     - `model`: space, setup, synthesis and frequencies it was trained for.
     - `guesses`: how many points it gives.
 
@@ -69,9 +69,9 @@ class Suggester(eqx.Module):
         self.mean, self.scale = jnp.zeros(model.rings, dtype), jnp.ones(model.rings, dtype)
         self.model, self.guesses = model, guesses
 
-    def __call__(self, wanted: Float[Array, " ring"]) -> Float[Array, "guess variable"]:
+    def __call__(self, target: Float[Array, " ring"]) -> Float[Array, "guess variable"]:
         """The network alone: points of the unit cube."""
-        signal = (wanted - self.mean) / self.scale
+        signal = (target - self.mean) / self.scale
         for layer in self.layers[:-1]:
             signal = jax.nn.silu(layer(signal))
         return jax.nn.sigmoid(self.layers[-1](signal)).reshape(self.guesses, -1)
@@ -81,7 +81,7 @@ class Proposal(NamedTuple):
     """What `propose` finds: points of the unit cube and their misfits, dB.
 
     - `first_point`, `first_misfit_db`: the best guess of the network alone.
-    - `point`, `misfit_db`: after the Newton steps; never worse.
+    - `point`, `misfit_db`: after the Gauss–Newton steps; never worse.
     - `levels`: that the design at `point` gives, dB.
     """
 
@@ -93,27 +93,27 @@ class Proposal(NamedTuple):
 
 
 @jax.jit
-def propose(suggester: Suggester, wanted: Float[Array, " ring"]) -> Proposal:
-    """The answer without words: compiled once for all wanted levels, for `jit`, `vmap`, `grad`."""
+def propose(suggester: Suggester, target: Float[Array, " ring"]) -> Proposal:
+    """The answer without words: compiled once for all target levels, for `jit`, `vmap`, `grad`."""
     model = suggester.model
-    points = suggester(wanted)
-    refined, first = refine(model, wanted, points)
+    points = suggester(target)
+    refined, first = refine(model, target, points)
     levels = jax.vmap(model.levels)(refined)
-    misfits = jax.vmap(root_mean_square)(levels - wanted)
+    misfits = jax.vmap(root_mean_square)(levels - target)
     at_first, best = (jnp.argmin(_or_infinite(m)) for m in (first, misfits))
     return Proposal(points[at_first], first[at_first], refined[best], misfits[best], levels[best])
 
 
 def refine(
     model: ResponseModel,
-    wanted: Float[Array, " ring"],
+    target: Float[Array, " ring"],
     points: Float[Array, "guess variable"],
     steps: int = STEPS,
 ) -> tuple[Float[Array, "guess variable"], Float[Array, " guess"]]:
-    """Points after some Newton steps in the cube, and their misfits before, dB."""
+    """Points after some Gauss–Newton steps in the cube, and their misfits before, dB."""
 
     def step(points, _):
-        return jax.vmap(_newton_step, in_axes=(None, None, 0))(model, wanted, points)
+        return jax.vmap(_newton_step, in_axes=(None, None, 0))(model, target, points)
 
     # One step after the other as a loop: written out, each would be compiled.
     refined, misfits = jax.lax.scan(step, points, length=steps)
@@ -121,12 +121,12 @@ def refine(
 
 
 def _newton_step(
-    model: ResponseModel, wanted: Float[Array, " ring"], point: Float[Array, " variable"]
+    model: ResponseModel, target: Float[Array, " ring"], point: Float[Array, " variable"]
 ) -> tuple[Float[Array, " variable"], Float[Array, ""]]:
-    """The best of some damped Gauss-Newton steps within the cube, or none; the misfit before."""
+    """The best of some damped Gauss–Newton steps within the cube, or none; the misfit before."""
 
     def residual(p):
-        difference = model.levels(p) - wanted
+        difference = model.levels(p) - target
         return difference, difference
 
     slopes, difference = jax.jacfwd(residual, has_aux=True)(point)
@@ -143,7 +143,7 @@ def _newton_step(
         return jnp.clip(point - step, 0.0, 1.0)
 
     tried = jax.vmap(damped)(jnp.asarray(_DAMPINGS, point.dtype))
-    misfits = jax.vmap(model.misfit, in_axes=(0, None))(tried, wanted)
+    misfits = jax.vmap(model.misfit, in_axes=(0, None))(tried, target)
     here = root_mean_square(difference)
     best = jnp.argmin(_or_infinite(misfits))
     return jnp.where(misfits[best] < here, tried[best], point), here
@@ -154,15 +154,15 @@ def _or_infinite(misfits: Float[Array, " point"]) -> Float[Array, " point"]:
 
 
 class Suggestion(NamedTuple):
-    """A design for a wished response.
+    """A design for a target response.
 
     - `design`; `values`: its free numbers, in the order of the space's variables.
-    - `misfit_db`: root mean square over the rings of what its levels differ from the wanted, dB.
-    - `network_misfit_db`: the same of the network's best guess, before the Newton steps.
+    - `misfit_db`: root mean square over the rings of what its levels differ from the target, dB.
+    - `network_misfit_db`: the same of the network's best guess, before the Gauss–Newton steps.
     - `levels`: what the design gives, dB.
     - `active`: the limits it lies against, in words.
     - `status`: "matched" within the tolerance; "not_attained": no design was found that gives
-      what is wanted, and there may be none; "non_finite": no guess has a response.
+      the target, and there may be none; "non_finite": no guess has a response.
     - `point`: in the unit cube.
     """
 
@@ -176,12 +176,12 @@ class Suggestion(NamedTuple):
     point: Float[Array, " variable"]
 
 
-def suggest(suggester: Suggester, wanted, *, tolerance_db: float = MATCHED) -> Suggestion:
-    """A design whose levels are near to wanted ones, in some tens of milliseconds once compiled.
+def suggest(suggester: Suggester, target, *, tolerance_db: float = MATCHED) -> Suggestion:
+    """A design whose levels are near to target ones, in some tens of milliseconds once compiled.
 
     **Arguments**
 
-    - `wanted`: levels in dB, one for each ring from zero frequency up (`ring_levels`), at least 0.
+    - `target`: levels in dB, one for each ring from zero frequency up (`ring_levels`), at least 0.
     - `tolerance_db`: misfits up to here are "matched".
 
     **Validity.** For the camera and the space that the suggester was trained for. It is one of the
@@ -190,7 +190,7 @@ def suggest(suggester: Suggester, wanted, *, tolerance_db: float = MATCHED) -> S
     **Errors**: ValueError for another number of levels, and for levels not finite or below 0.
     """
     model = suggester.model
-    levels = checked_levels(wanted, model.rings, model.space.lower.dtype)
+    levels = checked_levels(target, model.rings, model.space.lower.dtype)
     found = propose(suggester, levels)
     misfit, network = float(found.misfit_db), float(found.first_misfit_db)
     return Suggestion(

@@ -56,7 +56,7 @@ class UnrolledAdmm(eqx.Module):
         self.data = repeated(penalties.data)
         self.variation = repeated(penalties.variation)
         self.image = repeated(penalties.image)
-        # A threshold of zero has no number before softplus.
+        # A threshold of zero has no finite value before softplus.
         least = jnp.finfo(self.data.dtype).eps
         self.threshold = repeated(jnp.maximum(splitting.tau / penalties.variation, least))
         self.relaxation = repeated(jnp.ones_like(splitting.tau))

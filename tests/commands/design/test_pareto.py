@@ -233,7 +233,7 @@ def test_near_a_place_mask_pixels_hold(tmp_path):
 
 def test_an_objective_that_is_nan_is_refused():
     bad = FrontPoint(np.nan, tiny.found([25.0]), np.nan, "", np.nan)
-    with pytest.raises(ConfigError, match="no number at any start"):
+    with pytest.raises(ConfigError, match="NaN at any start"):
         pareto._known([bad])
     assert pareto._known([bad, bad._replace(error=0.1)]) == [bad._replace(error=0.1)]
 

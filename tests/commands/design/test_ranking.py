@@ -309,5 +309,5 @@ def test_limits_narrow_the_landscape(tmp_path):
 
 def test_an_objective_that_is_nan_is_refused(study, monkeypatch):
     monkeypatch.setattr(problem_of_search, "find_designs", lambda *_, **__: Search((), 3, 3))
-    with pytest.raises(ConfigError, match="no number at any start"):
+    with pytest.raises(ConfigError, match="NaN at any start"):
         carry_out(Finder(study).work, tiny.ignore)

@@ -253,7 +253,7 @@ def _known(judged: Iterable[FrontPoint]) -> list[FrontPoint]:
     known = [j for j in judged if np.isfinite(j.error)]
     if not known:
         raise ConfigError(
-            "pareto: the objective is no number at any start; give bounds nearer to the reference"
+            "pareto: the objective is NaN at any start; give bounds nearer to the reference"
         )
     return known
 

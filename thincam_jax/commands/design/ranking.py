@@ -164,7 +164,7 @@ def distinct(space: DesignSpace, found: tuple[Found, ...]) -> tuple[Found, ...]:
     """
     if not found:
         raise ConfigError(
-            "search: the objective is no number at any start; give bounds nearer to the reference"
+            "search: the objective is NaN at any start; give bounds nearer to the reference"
         )
     kept: list[Found] = []
     for one in found:

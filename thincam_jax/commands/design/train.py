@@ -120,7 +120,7 @@ class TrainingDescents:
         found = _apart(one for ended in self.ended for one in ended.found)
         if not found:
             raise ConfigError(
-                "train: the error of the training images is no number at any start; give "
+                "train: the error of the training images is NaN at any start; give "
                 "reconstruction: wiener, other images, or less noise"
             )
         given = (self.objective, self.space, self.training)

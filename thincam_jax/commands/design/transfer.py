@@ -51,7 +51,7 @@ def modulation_transfer(design: Design, data: ObjectiveData) -> Transfer:
     `data`: with frequencies on a `Quadrant`. Channels are (channel, ring), the chain (ring,), both
     without unit. Valid as are the responses: Fresnel diffraction, centred masks.
 
-    **Errors**: TypeError for frequencies on `Polar`, where the even light is left out.
+    **Errors**: TypeError for frequencies on `Polar`, where the uniform background is left out.
     """
     if not isinstance(data.frequencies, Quadrant):
         raise TypeError("contrast is measured against the light at zero frequency; give a Quadrant")

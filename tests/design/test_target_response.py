@@ -8,7 +8,7 @@ from design.setting import setup, thesis_design, two_betas
 
 from helpers import finite_difference
 from thincam_jax.design import Polar, PowerLaw, channels, response_misfit, ring_levels
-from thincam_jax.design.wanted import ResponseModel, checked_levels
+from thincam_jax.design.target_response import ResponseModel, checked_levels
 from thincam_jax.reconstruction import phase_pairs
 
 FREQUENCIES = Polar(96.0, 128, 2)
@@ -44,12 +44,12 @@ def test_misfit_is_the_root_mean_square():
 @pytest.mark.thorough
 def test_slopes():
     """Against differences of fourth order, and a number where the misfit is 0."""
-    wanted = MODEL.levels(POINT) + jnp.linspace(-1.0, 3.0, 16)
+    target = MODEL.levels(POINT) + jnp.linspace(-1.0, 3.0, 16)
     value = jax.jit(lambda p, w: MODEL.misfit(p, w))
     slope = jax.jit(jax.grad(MODEL.misfit))
     for direction in np.eye(2):
-        expected = finite_difference(lambda p: value(p, wanted), POINT, direction, 2e-6)
-        np.testing.assert_allclose(slope(POINT, wanted) @ direction, expected, rtol=1e-5)
+        expected = finite_difference(lambda p: value(p, target), POINT, direction, 2e-6)
+        np.testing.assert_allclose(slope(POINT, target) @ direction, expected, rtol=1e-5)
     assert np.all(np.isfinite(slope(POINT, MODEL.levels(POINT))))
 
 

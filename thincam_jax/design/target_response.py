@@ -1,4 +1,4 @@
-r"""A wished frequency response, and how far a design is from it.
+r"""A target frequency response, and how far a design is from it.
 
 A response is told by its **levels**: in rings of frequencies of equal width, from zero up, the mean
 signal-to-noise ratio r of `ring_means`, as
@@ -29,14 +29,14 @@ def ring_levels(known: Channels, frequencies: Frequencies, rings: int) -> Float[
 
 
 def response_misfit(
-    known: Channels, frequencies: Frequencies, wanted: Float[Array, " ring"]
+    known: Channels, frequencies: Frequencies, target: Float[Array, " ring"]
 ) -> Float[Array, ""]:
-    """Root mean square over the rings of what levels lack of, or exceed, the wanted ones, dB."""
-    return root_mean_square(ring_levels(known, frequencies, wanted.shape[0]) - wanted)
+    """Root mean square over the rings of what levels lack of, or exceed, the target ones, dB."""
+    return root_mean_square(ring_levels(known, frequencies, target.shape[0]) - target)
 
 
 def root_mean_square(difference: Float[Array, " ring"]) -> Float[Array, ""]:
-    """With a slope of 0, not of no number, where all is 0."""
+    """With a slope of 0, not NaN, where all is 0."""
     return jnp.sqrt(jnp.mean(difference**2) + jnp.finfo(difference.dtype).eps ** 2)
 
 
@@ -83,21 +83,21 @@ class ResponseModel(eqx.Module):
         return ring_levels(known, self.frequencies, self.rings)
 
     def misfit(
-        self, point: Float[Array, " variable"], wanted: Float[Array, " ring"]
+        self, point: Float[Array, " variable"], target: Float[Array, " ring"]
     ) -> Float[Array, ""]:
         """`response_misfit` of the design at a point, dB."""
-        return root_mean_square(self.levels(point) - wanted)
+        return root_mean_square(self.levels(point) - target)
 
 
-def checked_levels(wanted, rings: int, dtype) -> Float[Array, " ring"]:
+def checked_levels(target, rings: int, dtype) -> Float[Array, " ring"]:
     """Wanted levels, looked at where they are known: ValueError, one line, for what is none."""
-    if checks.is_traced(wanted):
-        levels = jnp.asarray(wanted).astype(dtype)
+    if checks.is_traced(target):
+        levels = jnp.asarray(target).astype(dtype)
     else:
-        levels = jnp.asarray(np.asarray(wanted, dtype=float), dtype)
+        levels = jnp.asarray(np.asarray(target, dtype=float), dtype)
     if levels.shape != (rings,):
         raise ValueError(
-            f"wanted has shape {levels.shape}; give ({rings},), a level in dB for each ring from "
+            f"target has shape {levels.shape}; give ({rings},), a level in dB for each ring from "
             "zero frequency up"
         )
     if not checks.is_traced(levels):
@@ -106,7 +106,7 @@ def checked_levels(wanted, rings: int, dtype) -> Float[Array, " ring"]:
             if bad.any():
                 ring = int(np.argmax(bad))
                 raise ValueError(
-                    f"wanted level of ring {ring + 1} is {known[ring]:g}, {what}; give levels "
-                    "10·log10(1 + ratio) of at least 0 dB, and 0 where nothing is wanted"
+                    f"target level of ring {ring + 1} is {known[ring]:g}, {what}; give levels "
+                    "10·log10(1 + ratio) of at least 0 dB, and 0 where nothing is asked for"
                 )
     return levels
