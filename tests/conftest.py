@@ -6,6 +6,7 @@ from pathlib import Path
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")  # set it to run the tests on another device
 os.environ["MPLBACKEND"] = "Agg"
+os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # of programs that are loaded, not compiled
 os.environ["THINCAM_CACHE"] = "off"  # commands in tests leave no compiled programs with the user
 # Most of the tests' time goes into compiling some 14,000 small programs. Without these emitters and
 # LLVM's optimisation, and with each program in one piece, it is a third of the time. What tests

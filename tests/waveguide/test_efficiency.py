@@ -1,0 +1,93 @@
+"""Kogelnik's closed form against his coupled equations, and ghost weights against quadrature."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.integrate
+from waveguide.setting import RECORDED, hologram
+
+from thincam_jax import waveguide as wg
+from thincam_jax.units import nm
+
+
+def coupled_waves(film, across, wavelength, polarisation):
+    """η by the ODE: c_R R′ = −jκS, c_S S′ + jϑS = −jκR, with R(0) = 1 and S(T) = 0."""
+    index, depth, fringes = 1.5, float(film.thickness), np.asarray(film.grating)
+    s = np.array([*np.asarray(across) / index, 0.0])
+    s[2] = np.sqrt(1 - s @ s)
+    beta = 2 * np.pi * index / wavelength
+    c_r, c_s = s[2], s[2] - fringes[2] / beta
+    detuning = (2 * beta * s @ fringes - fringes @ fringes) / (2 * beta)
+    normal = fringes / np.linalg.norm(fringes)
+    overlap = 1.0 if polarisation == "TE" else abs(s @ (s - 2 * (s @ normal) * normal))
+    kappa = np.pi * float(film.index_modulation) * overlap / wavelength
+
+    def slope(_, waves):
+        r, sig = waves.reshape(2, 2)
+        return np.stack(
+            [-1j * kappa * sig / c_r, (-1j * kappa * r - 1j * detuning * sig) / c_s]
+        ).reshape(-1)
+
+    start = np.eye(2, dtype=complex).reshape(-1)
+    run = scipy.integrate.solve_ivp(
+        slope, (0, depth), start, method="DOP853", rtol=1e-12, atol=1e-13
+    )
+    ends = run.y[:, -1].reshape(2, 2)  # (wave, which one began with 1)
+    signal = -ends[1, 0] / ends[1, 1]  # S(0) for S(T) = 0
+    return abs(c_s) / c_r * abs(signal) ** 2
+
+
+@pytest.mark.parametrize("polarisation", ["TE", "TM"])
+def test_coupled_waves(polarisation):
+    film, random = hologram(), np.random.default_rng(3)
+    for _ in range(20):
+        across = random.uniform(-0.3, 0.3, 2)
+        centre = float(film.bragg_wavelength(jnp.asarray(across))[0])
+        wavelength = centre + random.uniform(-15, 15) * nm
+        found = wg.diffraction_efficiency(
+            film, jnp.asarray(across), jnp.asarray(wavelength), polarisation
+        )
+        expected = coupled_waves(film, across, wavelength, polarisation)
+        assert found == pytest.approx(expected, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("polarisation", "peak", "width"), [("TE", 0.983, 8.6), ("TM", 0.748, 5.2)]
+)
+def test_at_normal_incidence(polarisation, peak, width):
+    """The figures of the errata's film: efficiency, and full width at half its maximum, nm."""
+    wavelengths = RECORDED + jnp.linspace(-10, 10, 4001) * nm
+    eta = np.asarray(
+        wg.diffraction_efficiency(hologram(), jnp.zeros((4001, 2)), wavelengths, polarisation)
+    )
+    assert eta.max() == pytest.approx(peak, abs=5e-4)
+    assert np.sum(eta > eta.max() / 2) * 0.005 == pytest.approx(width, abs=0.06)
+
+
+def test_ghost_weights_are_the_integral():
+    film, across = hologram(), jnp.array([0.05, -0.11])
+    weights = wg.ghost_weights(film, across, 4)
+    centre = float(film.bragg_wavelength(across)[0])
+    wavelengths = centre + np.linspace(-120, 120, 48001) * nm
+    total = np.zeros(4)
+    for polarisation in ("TE", "TM"):
+        eta = np.asarray(
+            wg.diffraction_efficiency(
+                film, jnp.broadcast_to(across, (48001, 2)), jnp.asarray(wavelengths), polarisation
+            )
+        )
+        powers = np.arange(4)[:, None]
+        total += np.trapezoid(eta**2 * (1 - eta) ** powers, wavelengths) / 2
+    np.testing.assert_allclose(weights, total, rtol=2e-3)
+
+
+def test_extremes():
+    """No light without modulation; all of it, and no NaN, with far too much."""
+    across, at = jnp.zeros(2), jnp.asarray(RECORDED)
+    assert wg.diffraction_efficiency(hologram(index_modulation=0.0), across, at) == 0
+    for thickness in (0.016, 1e3):
+        film = hologram(index_modulation=0.2, thickness=thickness)
+        assert wg.diffraction_efficiency(film, across, at) == pytest.approx(1, abs=1e-6)
+    assert np.isfinite(wg.ghost_weights(hologram(thickness=1e3), across, 3)).all()
+    # Far in the ultraviolet the hologram would transmit: no diffracted wave goes back.
+    assert wg.diffraction_efficiency(hologram(), across, jnp.asarray(0.3 * RECORDED)) == 0

@@ -1,0 +1,17 @@
+"""The see-through-screen camera: holograms on a glass plate, rays and ghosts (thesis chapter 5)."""
+
+from thincam_jax.waveguide.camera import Rectangle as Rectangle
+from thincam_jax.waveguide.camera import Screen as Screen
+from thincam_jax.waveguide.camera import SeeThroughCamera as SeeThroughCamera
+from thincam_jax.waveguide.efficiency import diffraction_efficiency as diffraction_efficiency
+from thincam_jax.waveguide.efficiency import ghost_weights as ghost_weights
+from thincam_jax.waveguide.hologram import VolumeHologram as VolumeHologram
+from thincam_jax.waveguide.hologram import refracted as refracted
+from thincam_jax.waveguide.rays import Rays as Rays
+from thincam_jax.waveguide.rays import RayStatus as RayStatus
+from thincam_jax.waveguide.rays import pixel_centres as pixel_centres
+from thincam_jax.waveguide.rays import trace as trace
+from thincam_jax.waveguide.refractive_index import CauchyIndex as CauchyIndex
+from thincam_jax.waveguide.refractive_index import ConstantIndex as ConstantIndex
+from thincam_jax.waveguide.refractive_index import SellmeierIndex as SellmeierIndex
+from thincam_jax.waveguide.refractive_index import bk7 as bk7

@@ -1,0 +1,85 @@
+"""The see-through-screen camera: a glass plate with two holograms before an ordinary camera.
+
+z runs from the sensor to the object, +y from the top to the bottom hologram. The sensor is at
+z = 0, the lens at d0, the plate's rear surface with the bottom hologram at d0 + d1, its front
+surface with the top hologram a glass thickness w further, and objects d2 before that (thesis Fig
+5.5).
+"""
+
+import equinox as eqx
+from jaxtyping import Array, Float
+
+from thincam_jax._core import checks
+from thincam_jax._core.checks import Number, Numbers
+from thincam_jax.imaging.sensor import Sensor
+from thincam_jax.waveguide.hologram import VolumeHologram
+from thincam_jax.waveguide.refractive_index import AbstractIndex, as_index
+
+
+class Rectangle(eqx.Module):
+    """A part of a plane: `centre` and `size` (x, y), mm."""
+
+    centre: Float[Array, "2"]
+    size: Float[Array, "2"]
+
+    def __init__(self, centre: Numbers, size: Numbers):
+        self.centre = checks.finite("centre", centre, "mm", shape=(2,))
+        self.size = checks.finite("size", size, "mm", shape=(2,))
+        if not checks.is_traced(self.size) and not (self.size > 0).all():
+            raise ValueError(f"size = {self.size} mm; give a width and a height above 0")
+
+    def holds(self, points: Float[Array, "*point 2"]):
+        """Whether points (x, y), mm, lie in it."""
+        return (abs(points - self.centre) <= self.size / 2).all(axis=-1)
+
+
+class Screen(eqx.Module):
+    """A plane-parallel glass plate with the same hologram at the top and at the bottom.
+
+    - `hologram`: on the front surface before the camera and on the rear surface before the object.
+    - `glass_thickness`: w, mm. `glass_index`: of the plate.
+    - `top`, `bottom`: where the holograms are, mm from the camera's axis; None: everywhere.
+    """
+
+    hologram: VolumeHologram
+    glass_thickness: Float[Array, ""]
+    glass_index: AbstractIndex
+    top: Rectangle | None
+    bottom: Rectangle | None
+
+    def __init__(
+        self,
+        hologram: VolumeHologram,
+        glass_thickness: Number,
+        glass_index: AbstractIndex | Number,
+        top: Rectangle | None = None,
+        bottom: Rectangle | None = None,
+    ):
+        self.hologram = hologram
+        self.glass_thickness = checks.positive("glass_thickness", glass_thickness, "mm")
+        self.glass_index = as_index("glass_index", glass_index)
+        self.top, self.bottom = top, bottom
+
+
+class SeeThroughCamera(eqx.Module):
+    """A screen and the camera behind its top hologram.
+
+    - `focal_distance`: d0, from the sensor to the lens, mm; the lens is a pinhole here.
+    - `lens_distance`: d1, from the lens to the plate's rear surface, mm.
+    """
+
+    screen: Screen
+    sensor: Sensor
+    focal_distance: Float[Array, ""]
+    lens_distance: Float[Array, ""]
+
+    def __init__(
+        self, screen: Screen, sensor: Sensor, focal_distance: Number, lens_distance: Number
+    ):
+        if not isinstance(screen, Screen):
+            raise TypeError(f"screen is a {type(screen).__name__}; give a waveguide.Screen")
+        if not isinstance(sensor, Sensor):
+            raise TypeError(f"sensor is a {type(sensor).__name__}; give a thincam_jax.Sensor")
+        self.screen, self.sensor = screen, sensor
+        self.focal_distance = checks.positive("focal_distance", focal_distance, "mm")
+        self.lens_distance = checks.positive("lens_distance", lens_distance, "mm")

@@ -1,0 +1,122 @@
+r"""How much light a volume hologram diffracts.
+
+Kogelnik's coupled waves (Bell Syst. Tech. J. 48, 2909, 1969).
+
+For a lossless reflection hologram and light of direction s in the film (β = 2πn/λ),
+
+.. math:: \eta = \Big[1 + \frac{1 - \xi^2/\nu^2}{\sinh^2\sqrt{\nu^2-\xi^2}}\Big]^{-1}, \quad
+    \nu = \frac{\pi\,\Delta n\,T\,p}{\lambda\sqrt{c_R|c_S|}}, \quad
+    \xi = \frac{\vartheta T}{2|c_S|}, \quad
+    \vartheta = \mathbf s\cdot\mathbf K - |\mathbf K|^2/2\beta
+
+with c_R = s_z, c_S = s_z − K_z/β, and p = 1 for light polarised across the plane of incidence (TE)
+or |s·s′| within it (TM). It holds for films of many fringes, as long as only one order is near to
+the Bragg condition.
+"""
+
+import math
+from typing import Literal
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from thincam_jax._core import checks
+from thincam_jax.waveguide.hologram import VolumeHologram
+
+Polarisation = Literal["TE", "TM"]
+
+
+def diffraction_efficiency(
+    hologram: VolumeHologram,
+    tangential: Float[Array, "*ray 2"],
+    wavelength: Float[Array, "*ray"],
+    polarisation: Polarisation = "TE",
+) -> Float[Array, "*ray"]:
+    """η of light from air with direction cosines (x, y), at a wavelength in mm: from 0 to 1.
+
+    0 where no wave is diffracted back (c_S ≥ 0): there it would be a transmission hologram.
+    """
+    checks.choice("polarisation", polarisation, ("TE", "TM"))
+    return _efficiency(*_coupling(hologram, tangential, wavelength, polarisation))
+
+
+def ghost_weights(
+    hologram: VolumeHologram, tangential: Float[Array, "*ray 2"], orders: int
+) -> Float[Array, "order *ray"]:
+    r"""What reaches a pixel of white light after i contacts that let it pass, as a bandwidth, mm.
+
+    .. math:: W_i = \int \eta^2 (1-\eta)^i\,d\lambda
+
+    for light that both holograms diffract, unpolarised: the mean of TE and TM, each kept through.
+    (Rays out of the plane of the recording mix the two a little.) The weight at the peak is not it:
+    there 1 − η is near 0. By the trapezoidal rule in ξ, whose integrand is analytic and holds
+    frequencies below 2(2 + i): exact but for the tails beyond |ξ| = 10π, below 1e-3.
+    """
+    checks.at_least_one({"orders": orders})
+    centre, found = hologram.bragg_wavelength(tangential)
+    slope = _detuning_slope(hologram, tangential, centre)
+    step = math.pi / (4 + orders)
+    count = round(10 * math.pi / step)
+    offsets = step * jnp.arange(-count, count + 1, dtype=centre.dtype)
+    # dλ/dξ at the centre; ξ is linear in λ but for dispersion and the change of c_S.
+    wavelengths = centre[..., None] + offsets / slope[..., None]
+    sums = []
+    for polarisation in ("TE", "TM"):
+        eta = _efficiency(*_coupling(hologram, tangential[..., None, :], wavelengths, polarisation))
+        left = jnp.stack([eta**2 * (1 - eta) ** i for i in range(orders)])
+        sums.append(jnp.sum(left, axis=-1))
+    mean = (sums[0] + sums[1]) / 2 * step / jnp.abs(slope)
+    return jnp.where(found, mean, 0.0)
+
+
+def _coupling(hologram, tangential, wavelength, polarisation):
+    """ν, ξ, and whether a wave is diffracted back."""
+    index = hologram.index(wavelength)
+    direction = directions(tangential, index)
+    wavenumber = 2 * jnp.pi * index / wavelength
+    incident = direction[..., 2]
+    back = hologram.grating[2] / wavenumber - incident  # −c_S
+    reflected = back > 0
+    back = jnp.where(reflected, back, 1.0)
+    detuning = jnp.sum(direction * hologram.grating, -1) - jnp.sum(hologram.grating**2) / (
+        2 * wavenumber
+    )
+    overlap = 1.0
+    if polarisation == "TM":
+        overlap = jnp.abs(jnp.sum(direction * hologram.diffracted(direction), -1))
+    strength = jnp.pi * hologram.index_modulation * hologram.thickness * overlap / wavelength
+    return (
+        strength / jnp.sqrt(incident * back),
+        detuning * hologram.thickness / (2 * back),
+        reflected,
+    )
+
+
+def _detuning_slope(hologram, tangential, wavelength):
+    """dξ/dλ at a Bragg wavelength, without the slope of the index."""
+    index = hologram.index(wavelength)
+    direction = directions(tangential, index)
+    back = jnp.abs(hologram.diffracted(direction)[..., 2])
+    slope = -jnp.sum(hologram.grating**2) / (4 * jnp.pi * index)
+    return slope * hologram.thickness / (2 * back)
+
+
+def _efficiency(strength, detuning, reflected):
+    """η = ν²g/(1 + ν²g) with g = sinh²(√x)/x, x = ν² − ξ²: one expression for all x."""
+    x = strength**2 - detuning**2
+    x = jnp.minimum(x, 1e3)  # beyond it η is 1 to all digits, and sinh² overflows
+    small = jnp.abs(x) < 1e-4
+    root = jnp.sqrt(jnp.where(small, 1.0, jnp.abs(x)))
+    ratio = jnp.where(x > 0, jnp.sinh(jnp.minimum(root, 32.0)), jnp.sin(root)) / root
+    ratio = jnp.where(small, 1 + x / 6, ratio)
+    coupled = strength**2 * ratio**2
+    return jnp.where(reflected, coupled / (1 + coupled), 0.0)
+
+
+def directions(
+    tangential: Float[Array, "*ray 2"], index: Float[Array, "*wave"]
+) -> Float[Array, "*wave 3"]:
+    """Unit vectors in a medium, +z, of light whose direction cosines in air are (x, y)."""
+    across = tangential / index[..., None]
+    along = jnp.sqrt(1 - jnp.sum(across**2, axis=-1, keepdims=True))
+    return jnp.concatenate([across, along], axis=-1)

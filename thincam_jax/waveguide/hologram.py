@@ -1,0 +1,190 @@
+r"""Volume holograms: how they are recorded, and the light that they diffract.
+
+Two plane waves of a laser record planes of refractive index with the grating vector
+
+.. math:: \mathbf K = \frac{2\pi n}{\lambda}(\hat{\mathbf o} - \hat{\mathbf r})
+
+of the directions of the object and the reference wave in the film (thesis Eq 5.4; for the
+reflection hologram the reference comes from the other side, which the thesis misses: its Θ_R is the
+acute angle, so that K_z has a plus). Light of direction s in the film is diffracted where it meets
+the Bragg condition (Eq 5.5); with k = 2πn/λ this is a mirror reflection at the planes,
+
+.. math:: \lambda_B = 4\pi n\,\mathbf s\cdot\mathbf K/|\mathbf K|^2, \qquad
+    \mathbf s' = \mathbf s - 2(\mathbf s\cdot\hat{\mathbf K})\hat{\mathbf K}
+
+Directions are unit vectors (x, y, z) in the film; z is its normal.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optimistix
+from jaxtyping import Array, Bool, Float
+
+from thincam_jax._core import checks
+from thincam_jax._core.checks import Number
+from thincam_jax.waveguide.refractive_index import AbstractIndex, ConstantIndex, as_index, changed
+
+
+class VolumeHologram(eqx.Module):
+    """A reflection hologram of plane, equidistant fringes in a film.
+
+    - `grating`: K, rad/mm, (x, y, z).
+    - `index`: of the film after processing, also that of the glass that it is on (no refraction
+      between the two).
+    - `thickness`: of the film after processing, mm.
+    - `index_modulation`: Δn, the amplitude of n + Δn·cos(K·r).
+    """
+
+    grating: Float[Array, "3"]
+    index: AbstractIndex
+    thickness: Float[Array, ""]
+    index_modulation: Float[Array, ""]
+
+    def __init__(
+        self,
+        grating: Float[Array, "3"],
+        index: AbstractIndex | Number,
+        thickness: Number,
+        index_modulation: Number,
+    ):
+        self.grating = checks.finite("grating", grating, "rad/mm", shape=(3,))
+        self.index = as_index("index", index)
+        self.thickness = checks.positive("thickness", thickness, "mm")
+        self.index_modulation = checks.non_negative("index_modulation", index_modulation, "n")
+
+    @staticmethod
+    def record(
+        wavelength: Number,
+        object_angle: Number,
+        reference_angle: Number,
+        *,
+        index: AbstractIndex | Number,
+        thickness: Number,
+        index_modulation: Number,
+    ) -> "VolumeHologram":
+        """The reflection hologram that two plane waves in the plane x = 0 record.
+
+        - `wavelength`: of the laser, mm.
+        - `object_angle`, `reference_angle`: from the normal in the film, rad, both acute: the
+          object wave runs along +z, the reference wave along −z. `refracted` makes them of angles
+          in glass or air.
+        - `index`, `thickness`: of the film while it is recorded; mm. `processed` says what
+          development changes.
+        - `index_modulation`: Δn.
+        """
+        laser = checks.positive("wavelength", wavelength, "mm")
+        film = as_index("index", index)
+        toward = _acute("object_angle", object_angle)
+        reference = _acute("reference_angle", reference_angle)
+        across = jnp.sin(toward) - jnp.sin(reference)
+        along = jnp.cos(toward) + jnp.cos(reference)
+        wavenumber = 2 * jnp.pi * film(laser) / laser
+        grating = wavenumber * jnp.stack([jnp.zeros_like(across), across, along])
+        return VolumeHologram(grating, film, thickness, index_modulation)
+
+    def processed(
+        self, shrinkage: Number = 0.0, index_change: Number | None = None
+    ) -> "VolumeHologram":
+        """The hologram after development.
+
+        - `shrinkage`: part of the thickness that is lost; the fringes come nearer along the normal.
+        - `index_change`: of the average index; None for none.
+        """
+        shrinkage = checks.real("shrinkage", shrinkage, "parts of the thickness")
+        if not checks.is_traced(shrinkage) and not -1 < float(shrinkage) < 1:
+            raise ValueError(f"shrinkage = {float(shrinkage):g}; give a part between −1 and 1")
+        index = self.index
+        if index_change is not None:
+            index = changed(index, checks.finite("index_change", index_change, "n"))
+        grating = self.grating / jnp.ones(3).at[2].set(1 - shrinkage).astype(self.grating.dtype)
+        thickness = self.thickness * (1 - shrinkage)
+        return VolumeHologram(grating, index, thickness, self.index_modulation)
+
+    def diffracted(self, direction: Float[Array, "*ray 3"]) -> Float[Array, "*ray 3"]:
+        """s′ of Bragg-matched light of direction s: the reflection at the fringes."""
+        unit = self.grating / jnp.sqrt(jnp.sum(self.grating**2))
+        along = jnp.sum(direction * unit, axis=-1, keepdims=True)
+        return direction - 2 * along * unit
+
+    def bragg_wavelength(
+        self, tangential: Float[Array, "*ray 2"]
+    ) -> tuple[Float[Array, "*ray"], Bool[Array, "*ray"]]:
+        r"""λ in vacuum, mm, that Bragg-matches light from air, and whether there is one.
+
+        `tangential` are the direction cosines (x, y) in air, which refraction keeps. With s = t/n,
+
+        .. math:: \lambda\,|\mathbf K|^2/4\pi = \mathbf t\cdot\mathbf K_{xy} + \sqrt{n^2-t^2}\,K_z
+
+        In closed form for a constant index. With dispersion the difference of both sides grows with
+        λ wherever n falls with it, so that it has one root at most: by bisection within the band of
+        the index, implicitly differentiable (`optimistix`). Where there is none the recorded
+        colour's value of the right-hand side stands in, finite, with False.
+        """
+        squared = jnp.sum(tangential**2, axis=-1)
+        across = jnp.sum(tangential * self.grating[:2], axis=-1)
+        power = jnp.sum(self.grating**2)
+        if isinstance(self.index, ConstantIndex):
+            inside = jnp.sqrt(self.index.value**2 - squared)
+            found = 4 * jnp.pi * (across + inside * self.grating[2]) / power
+            return jnp.where(found > 0, found, 1.0), found > 0
+        low, high = self.index.band
+
+        def one(across, squared):
+            data = (self.index, across, squared, self.grating[2], power)
+            ends = [_mismatch(jnp.asarray(end, across.dtype), data) for end in (low, high)]
+            found = (ends[0] < 0) & (ends[1] > 0)
+            middle = jnp.asarray((low * high) ** 0.5, across.dtype)
+            # Without a root the search is for that of a line instead, which has one.
+            safe = (*data, found, middle)
+            eps = float(jnp.finfo(across.dtype).eps)
+            solver = optimistix.Bisection(rtol=eps, atol=eps * low, flip=False)
+            solution = optimistix.root_find(
+                _bracketed,
+                solver,
+                middle,
+                args=safe,
+                options={"lower": low, "upper": high},
+                max_steps=64,
+                throw=False,
+            )
+            return solution.value, found
+
+        flat = (across.reshape(-1), squared.reshape(-1))
+        values, found = jax.vmap(one)(*flat)
+        return values.reshape(across.shape), found.reshape(across.shape)
+
+
+def refracted(angle: Number, before: Number, after: Number) -> Float[Array, ""]:
+    """The angle from the normal, rad, in an index `after`, of light from an index `before`."""
+    sine = jnp.sin(checks.finite("angle", angle, "rad"))
+    sine = sine * checks.positive("before", before, "n") / checks.positive("after", after, "n")
+    if not checks.is_traced(sine) and abs(float(sine)) > 1:
+        raise ValueError(
+            f"angle = {angle:g} rad is totally reflected: its sine in the second medium would be "
+            f"{float(sine):g}; give a smaller angle"
+        )
+    return jnp.arcsin(sine)
+
+
+def _mismatch(wavelength, data):
+    """How much longer a wavelength is than the one that the fringes match at it, times |K|²/4π."""
+    index, across, squared, along, power = data
+    inside = jnp.sqrt(index(wavelength) ** 2 - squared)
+    return wavelength * power / (4 * jnp.pi) - across - inside * along
+
+
+def _bracketed(wavelength, data):
+    """`_mismatch`, or a line through the middle of the band where it has no root."""
+    *given, found, middle = data
+    return jnp.where(found, _mismatch(wavelength, given), wavelength - middle)
+
+
+def _acute(name: str, angle: Number) -> Float[Array, ""]:
+    value = checks.real(name, angle, "rad")
+    if not checks.is_traced(value) and not abs(float(value)) < jnp.pi / 2:
+        raise ValueError(
+            f"{name} = {float(value):g} rad is not acute; give the angle from the film's normal, "
+            "between −π/2 and π/2, such as 61.2 * deg"
+        )
+    return value

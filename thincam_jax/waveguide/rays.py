@@ -1,0 +1,138 @@
+r"""Rays from a sensor's pixels back through lens and screen to the object (thesis Eq 5.1–5.9).
+
+Parallel layers keep the tangential direction cosines **t** of a ray, and each hologram mirrors it
+at its fringes; so a ray is two vectors: **t** before and **p** = n·s′ between the holograms. The
+object point of order i, of 2i total reflections, is then
+
+.. math:: \mathbf P_i = (d_1 + d_2)\frac{\mathbf t}{\sqrt{1-t^2}}
+    + (2i+1)\,w\frac{\mathbf p}{\sqrt{n_g^2-p^2}} + 2w\frac{\mathbf t}{\sqrt{n_g^2-t^2}}
+
+without any angle, so that it has gradients on the axis too.
+"""
+
+import enum
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from thincam_jax._core import checks
+from thincam_jax._core.checks import Number
+from thincam_jax.waveguide.camera import Rectangle, SeeThroughCamera
+from thincam_jax.waveguide.efficiency import directions, ghost_weights
+
+
+class RayStatus(enum.IntEnum):
+    """How a ray of one order ended."""
+
+    OK = 0
+    NO_BRAGG_MATCH = 1  # no wavelength in the film's band is diffracted back
+    EVANESCENT = 2  # diffracted more obliquely than the glass can carry
+    NOT_GUIDED = 3  # below the critical angle: it leaves the glass
+    OFF_HOLOGRAM = 4  # it meets the screen where there is no hologram
+    MISSED = 5  # it passes the object
+
+
+class Rays(eqx.Module):
+    """Rays of all pixels and orders.
+
+    - `points`: where they meet the object's plane, (order, *pixel, 3), mm. Finite for every status.
+    - `wavelength`: the Bragg wavelength, (*pixel), mm.
+    - `weight`: ∫ η²(1−η)^m dλ with m earlier contacts with the hologram, (order, *pixel), mm; 0 for
+      rays that are not OK.
+    - `guided`: direction cosines (x, y) of the guided light times its index, (*pixel, 2).
+    - `status`: of each, a number of `RayStatus`, (order, *pixel).
+    """
+
+    points: Float[Array, "order *pixel 3"]
+    wavelength: Float[Array, "*pixel"]
+    weight: Float[Array, "order *pixel"]
+    guided: Float[Array, "*pixel 2"]
+    status: Int[Array, "order *pixel"]
+
+
+@eqx.filter_jit
+def trace(
+    camera: SeeThroughCamera,
+    pixels: Float[Array, "*pixel 2"],
+    object_distance: Number,
+    orders: int = 4,
+    extent: Rectangle | None = None,
+) -> Rays:
+    """Trace rays from points on the sensor to a plane before the screen.
+
+    **Arguments**
+
+    - `pixels`: (x, y) on the sensor, mm from its middle.
+    - `object_distance`: d2, from the plate's front surface, mm.
+    - `orders`: how many ghosts, i = 0 … orders − 1, of 2i total reflections each.
+    - `extent`: of the object, (x, y) mm from the camera's axis; None is infinite.
+
+    The lens is a pinhole and the holograms are thin against the glass. Rays are those of the Bragg
+    wavelength of each pixel; the light beside it is in the weights, its smear is not.
+    """
+    checks.at_least_one({"orders": orders})
+    screen, distance = camera.screen, checks.positive("object_distance", object_distance, "mm")
+    hologram = screen.hologram
+    across = -pixels / jnp.sqrt(
+        jnp.sum(pixels**2, axis=-1, keepdims=True) + camera.focal_distance**2
+    )
+    wavelength, matched = hologram.bragg_wavelength(across)
+    film = hologram.index(wavelength)
+    inside = directions(across, film)
+    mirrored = hologram.diffracted(inside)
+    guided = film[..., None] * mirrored[..., :2]
+    matched = matched & (jnp.sum(inside * hologram.grating, -1) > 0) & (mirrored[..., 2] < 0)
+
+    glass = screen.glass_index(wavelength)
+    squared = jnp.sum(guided**2, axis=-1)
+    # n_g² − p² by the mirrored z, in which no digits cancel where p is large.
+    left = (film * mirrored[..., 2]) ** 2 + (glass - film) * (glass + film)
+    carried = left > 0
+    bounce = guided / jnp.sqrt(jnp.where(carried, left, 1))[..., None]
+    crossing = _shift(across, glass)
+    width = screen.glass_thickness
+    top = camera.lens_distance * _shift(across, jnp.ones_like(glass)) + width * crossing
+    odd = 2 * jnp.arange(orders, dtype=top.dtype) + 1
+    bottom = top + jnp.expand_dims(odd, range(1, top.ndim + 1)) * width * bounce
+    ended = bottom + width * crossing + distance * _shift(across, jnp.ones_like(glass))
+
+    on_top = True if screen.top is None else screen.top.holds(top)
+    on_bottom = (
+        jnp.ones(bottom.shape[:-1], bool) if screen.bottom is None else screen.bottom.holds(bottom)
+    )
+    met = True if extent is None else extent.holds(ended)
+    status = jnp.full(bottom.shape[:-1], int(RayStatus.OK))
+    # The first fault of a ray, in the order in which it comes to it, is written last.
+    for fault, sound in (
+        (RayStatus.MISSED, met),
+        (RayStatus.OFF_HOLOGRAM, on_bottom & on_top),
+        (RayStatus.NOT_GUIDED, squared > 1),
+        (RayStatus.EVANESCENT, carried),
+        (RayStatus.NO_BRAGG_MATCH, matched),
+    ):
+        status = jnp.where(sound, status, int(fault))
+
+    weights = ghost_weights(hologram, across, orders)
+    # Earlier contacts with the hologram diffracted a part away.
+    contacts = on_bottom.astype(int)
+    met_before = jnp.cumsum(contacts, axis=0) - contacts
+    weight = jnp.take_along_axis(weights, met_before, axis=0)
+    end = camera.focal_distance + camera.lens_distance + width + distance
+    points = jnp.concatenate(
+        [ended, jnp.broadcast_to(end, (*ended.shape[:-1], 1)).astype(ended.dtype)], axis=-1
+    )
+    return Rays(points, wavelength, jnp.where(status == RayStatus.OK, weight, 0), guided, status)
+
+
+def _shift(tangential: Float[Array, "*ray 2"], index: Float[Array, "*ray"]):
+    """How far light goes sideways in a layer of thickness 1: p/√(n² − p²)."""
+    squared = jnp.sum(tangential**2, axis=-1)
+    return tangential / jnp.sqrt(index**2 - squared)[..., None]
+
+
+def pixel_centres(camera: SeeThroughCamera) -> Float[Array, "y x 2"]:
+    """Where the sensor's pixels are, (x, y) mm."""
+    grid = camera.sensor.grid
+    y, x = jnp.meshgrid(grid.y, grid.x, indexing="ij")
+    return jnp.stack([x, y], axis=-1)
