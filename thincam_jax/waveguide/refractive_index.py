@@ -113,4 +113,4 @@ def changed(index: AbstractIndex, change: Float[Array, ""]) -> AbstractIndex:
     """The index with `change` added; a constant one stays constant."""
     if isinstance(index, ConstantIndex):
         return ConstantIndex(index.value + change)
-    return ChangedIndex(index, change, index.band)
+    return ChangedIndex(before=index, change=change, band=index.band)
