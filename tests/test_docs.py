@@ -169,3 +169,9 @@ def test_picture_of_the_rooms_is_of_today(tmp_path):
     assert script["imports_drawn"]() == today, "draw it again: python docs/draw_rooms.py"
     script["draw"](tmp_path / "rooms.png")
     assert script["imports_drawn"](tmp_path / "rooms.png") == today
+
+
+def test_screen_page():
+    names = run_examples("docs/screen.md")
+    np.testing.assert_allclose(names["rays"].wavelength / 1e-6, [532, 564.729], atol=1e-3)
+    assert names["result"].image.shape[-2:] == (64, 64)
