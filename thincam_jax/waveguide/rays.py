@@ -98,9 +98,7 @@ def trace(
     ended = bottom + width * crossing + distance * _shift(across, jnp.ones_like(glass))
 
     on_top = True if screen.top is None else screen.top.holds(top)
-    on_bottom = (
-        jnp.ones(bottom.shape[:-1], bool) if screen.bottom is None else screen.bottom.holds(bottom)
-    )
+    on_bottom = True if screen.bottom is None else screen.bottom.holds(bottom)
     met = True if extent is None else extent.holds(ended)
     status = jnp.full(bottom.shape[:-1], int(RayStatus.OK))
     # The first fault of a ray, in the order in which it comes to it, is written last.
@@ -113,11 +111,11 @@ def trace(
     ):
         status = jnp.where(sound, status, int(fault))
 
-    weights = ghost_weights(hologram, across, orders)
-    # Earlier contacts with the hologram diffracted a part away.
-    contacts = on_bottom.astype(int)
-    met_before = jnp.cumsum(contacts, axis=0) - contacts
-    weight = jnp.take_along_axis(weights, met_before, axis=0)
+    weight = ghost_weights(hologram, across, orders)
+    if screen.bottom is not None:
+        # Only contacts with the hologram take a part of the light away.
+        contacts = jnp.asarray(on_bottom).astype(int)
+        weight = jnp.take_along_axis(weight, jnp.cumsum(contacts, axis=0) - contacts, axis=0)
     end = camera.focal_distance + camera.lens_distance + width + distance
     points = jnp.concatenate(
         [ended, jnp.broadcast_to(end, (*ended.shape[:-1], 1)).astype(ended.dtype)], axis=-1
