@@ -135,17 +135,15 @@ def test_ranked_by_the_exact_value_and_orders_of_shots_are_one(study, scored):
 
 
 def test_tolerance_is_a_change_of_one_per_cent(study, scored):
-    """At (20, 15) the objective is 4: one hundredth is 0.04 = δ₁² = 2 δ₂²."""
+    """Of the exact objective: 8.8 at (20, 15), with a slope of 2.4 and a curvature of 2.6."""
     problem = bowl(study)
     (one,) = rescored(problem, (found_at(problem, 20.0, 15.0),))
     first, second = one.values
     assert (first.variable, first.shots, second.shots) == ("beta", (1,), (2,))
     assert (first.value, second.value) == pytest.approx((20, 15))
-    assert first.tolerance == pytest.approx(0.2)
-    assert second.tolerance == pytest.approx(np.sqrt(0.02))
-    # Beside the optimum, where the objective is 5, the slope of 2 counts, too: 2 δ + δ² = 0.05.
-    (one,) = rescored(problem, (found_at(problem, 21.0, 15.0),))
-    assert one.values[0].tolerance == pytest.approx(np.sqrt(1.05) - 1)
+    # 2.4 δ + 1.3 δ² = 0.088, and 2 δ² = 0.088.
+    assert first.tolerance == pytest.approx((np.sqrt(2.4**2 + 5.2 * 0.088) - 2.4) / 2.6)
+    assert second.tolerance == pytest.approx(np.sqrt(0.044))
 
 
 WIDTH = (
@@ -172,7 +170,7 @@ def test_the_tolerance_of_a_width_holds_beta(tmp_path):
     design, values = problem.space.design(point), problem.space.values(point)
     np.testing.assert_allclose(values, [1.5, 14.0])
     found = Found(design, values, 1.0, "converged", (), point)
-    width, beta = tolerances(problem, found)
+    width, beta = tolerances(problem, found, 1.0)
     assert (width.variable, width.shots, beta.shots) == ("width", (), (1,))
     assert width.tolerance == pytest.approx(np.sqrt(0.01 / 3))
     assert beta.tolerance == pytest.approx(0.2)

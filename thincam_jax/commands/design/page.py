@@ -30,21 +30,26 @@ def render(
         "reference": [of_shots(design["reference"], *one) for one in free],
         "numbers": [[found_number(v) for v in one["values"]] for one in design["found"]],
         "validated": list(design["validation"]["methods"]),
+        "unit": _unit(design),
         "findings": findings(design),
         "fronts": fronts(design),
     }
     return render_page("design", config, folder.path, shown)
 
 
+def _unit(design: dict[str, Any]) -> str:
+    """In which the objective is told."""
+    return design["objective"]["told"].rpartition("(")[2].rstrip(")")
+
+
 def findings(design: dict[str, Any]) -> list[str]:
     """What the numbers say, in sentences."""
     best, reference = design["found"][0], design["reference"]
     names = told_of([best, reference])
-    unit = design["objective"]["told"].rpartition("(")[2].rstrip(")")
     by = "training" if design["training"] else design["objective"]["name"]
     sentences = [
         f"The best design by {by} is {' and '.join(in_words(best, names))}. The objective "
-        f"predicts {best['predicted_gain']:+.3g} {unit} over {reference['name']} "
+        f"predicts {best['predicted_gain']:+.3g} {_unit(design)} over {reference['name']} "
         f"({' and '.join(in_words(reference, names))})."
     ]
     if best["training_gain_db"] is not None:

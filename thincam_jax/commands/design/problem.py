@@ -231,9 +231,9 @@ def _prior(study: Study) -> PowerLaw:
 
 
 def search_problem(
-    problem: DesignProblem, wanted: SearchConfig | ParetoConfig, seed: int
+    problem: DesignProblem, wanted: SearchConfig | ParetoConfig, seed: int, exact: Any = None
 ) -> Search:
-    """The search, as long as a section of the file wants it."""
+    """The search, as long as a section of the file wants it; improved where `exact` is given."""
     return find_designs(
         problem.objective,
         problem.space,
@@ -243,4 +243,5 @@ def search_problem(
         samples=wanted.samples,
         steps=wanted.steps,
         solver=wanted.solver,
+        exact=exact,
     )

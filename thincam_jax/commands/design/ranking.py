@@ -112,7 +112,8 @@ class Finder:
     def search(self) -> None:
         with allow("float64"):
             self.problem = build_problem(self.study)
-            self.searched = search_problem(self.problem, self.config.search, self.config.seed)
+            given = (self.problem, self.config.search, self.config.seed)
+            self.searched = search_problem(*given, exact=self.problem.exact)
             self.kept = distinct(self.problem.space, self.searched.found)
 
     def sample(self, wanted: TrainingConfig) -> None:
@@ -177,7 +178,10 @@ def distinct(space: DesignSpace, found: tuple[Found, ...]) -> tuple[Found, ...]:
 
 def rescored(problem: DesignProblem, kept: tuple[Found, ...]) -> tuple[Candidate, ...]:
     """The search's designs, ranked exactly."""
-    candidates = (_candidate(problem, one, tolerances(problem, one)) for one in kept)
+    candidates = []
+    for one in kept:
+        unmeasured = _candidate(problem, one, ())
+        candidates.append(unmeasured._replace(values=tolerances(problem, one, unmeasured.exact)))
     return _named(sorted(candidates, key=lambda candidate: candidate.exact))
 
 
@@ -228,7 +232,7 @@ def _value_and_rings(objective: DesignObjective, design: Design, data: Objective
     return objective(design, data), ring_means(known, data.frequencies, RINGS)
 
 
-def tolerances(problem: DesignProblem, one: Found) -> tuple[FreeValue, ...]:
-    """The free numbers, each with the change that makes the objective worse by 1 %."""
-    near = derivatives(problem.objective, problem.space, problem.data, one.point)
-    return free_values(problem.space, one, near, problem.objective.rise(one.objective))
+def tolerances(problem: DesignProblem, one: Found, exact: float) -> tuple[FreeValue, ...]:
+    """The free numbers, each with the change that makes the objective, `exact`, worse by 1 %."""
+    near = derivatives(problem.objective, problem.space, problem.exact, one.point)
+    return free_values(problem.space, one, near, problem.objective.rise(exact))

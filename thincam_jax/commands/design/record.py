@@ -42,6 +42,7 @@ def record(result: FoundDesigns, study: Study, validation: dict) -> dict:
             "evaluations": result.evaluations,
             "failed_starts": result.failed,
             "solver": config.search.solver,
+            "approximation_off": _round(_approximation_off(result)),
         },
         "training": _training(config, result),
         "reference": {
@@ -61,6 +62,12 @@ def record(result: FoundDesigns, study: Study, validation: dict) -> dict:
             "methods": validation,
         },
     }
+
+
+def _approximation_off(result: FoundDesigns) -> float:
+    """How far the value as searched lies from the exact one at most, in the unit it is told in."""
+    told = result.objective.told
+    return max(abs(float(told(one.searched) - told(one.exact))) for one in result.found)
 
 
 def _training(config: DesignConfig, result: FoundDesigns) -> dict[str, Any] | None:

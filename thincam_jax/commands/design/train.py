@@ -5,7 +5,7 @@ counts which the frequency-wise objectives leave out.
 """
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -36,6 +36,7 @@ from thincam_jax.design.search import (
     descend,
     evaluate,
     even_samples,
+    without_repeats,
 )
 from thincam_jax.imaging.targets import resize, sample_image
 
@@ -117,7 +118,7 @@ class TrainingDescents:
 
         **Errors**: ConfigError where the error is NaN at every start.
         """
-        found = _apart(one for ended in self.ended for one in ended.found)
+        found = without_repeats(one for ended in self.ended for one in ended.found)
         if not found:
             raise ConfigError(
                 "train: the error of the training images is NaN at any start; give "
@@ -157,15 +158,6 @@ def start_points(
     known = np.flatnonzero(np.isfinite(values)) if np.isfinite(values).any() else slice(None)
     best = best_apart(np.asarray(every)[known], values[known], wanted.starts, least=_BASIN)
     return every[known][best], len(every)
-
-
-def _apart(found: Iterable[Found]) -> tuple[Found, ...]:
-    """Best first, without those that repeat a better one."""
-    kept: list[Found] = []
-    for one in sorted(found, key=lambda f: f.objective):
-        if all(np.max(np.abs(one.point - other.point)) >= APART for other in kept):
-            kept.append(one)
-    return tuple(kept)
 
 
 def build_training(config: DesignConfig, wanted: TrainingConfig, setup: Setup) -> Training:
