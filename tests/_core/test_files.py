@@ -46,5 +46,24 @@ def test_crash_while_writing_leaves_nothing_half(tmp_path, monkeypatch):
 
 
 def test_missing_folder_is_told(tmp_path):
-    with pytest.raises(FileNotFoundError):
-        files.write_whole(tmp_path / "absent" / "a.txt", "x")
+    path = tmp_path / "absent" / "a.txt"
+    with pytest.raises(files.WriteError) as raised:
+        files.write_whole(path, "x")
+    assert str(raised.value).startswith(f"{path}: cannot be written (No such file or directory); ")
+
+
+def test_only_regular_files_are_read(tmp_path):
+    (tmp_path / "file").write_bytes(b"abc")
+    assert files.read_regular(tmp_path / "file") == b"abc"
+    (tmp_path / "zero").symlink_to("/dev/zero")
+    os.mkfifo(tmp_path / "pipe")
+    for name in ("zero", "pipe"):
+        with pytest.raises(OSError, match="a device or a pipe"):
+            files.read_regular(tmp_path / name)
+    with (tmp_path / "large").open("wb") as large:
+        large.truncate(2**42)  # takes no room
+    with pytest.raises(MemoryError, match=r"large needs about 4\.0 TiB"):
+        files.read_regular(tmp_path / "large")
+    (tmp_path / "loop").symlink_to(tmp_path / "loop")
+    with pytest.raises(OSError, match="symbolic links"):
+        files.read_regular(tmp_path / "loop")

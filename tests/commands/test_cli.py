@@ -1,6 +1,7 @@
 """The command: exit codes, one clear line for what a user can put right, and how to go on."""
 
 import os
+import resource
 import shlex
 import shutil
 import subprocess
@@ -17,6 +18,7 @@ from thincam_jax.commands import cli, doctor
 from thincam_jax.commands.accuracy import run as benches
 from thincam_jax.commands.cache import cache_state
 from thincam_jax.commands.examples import kinds
+from thincam_jax.commands.run_folder import RunFolder
 from thincam_jax.commands.study import run as studies
 
 runner = CliRunner()
@@ -255,6 +257,101 @@ def test_interrupt(file, monkeypatch, tmp_path, done, hint):
     assert result.exit_code == 130
     expected = f"thincam: interrupted; finished: {hint}. The same command goes on from there."
     assert result.stderr.splitlines() == [expected]
+
+
+@pytest.fixture
+def full_disk():
+    """No file takes more than 3 kB."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (3_000, before[1]))
+    yield
+    resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def test_full_disk(file, monkeypatch, tmp_path, full_disk):
+    """One line, and what was finished is there."""
+
+    def fill(study, folder, progress):
+        folder.claim(study.config)
+        progress("chart", 9)
+        folder.finish("chart", {"metrics": {}, "contrasts": {}})
+        folder.write("figures/mtf.png", bytes(4_000))
+
+    monkeypatch.setattr(studies, "run_study", fill)
+    out = tmp_path / "out"
+    line = one_line(call("run", file, "--out", out))
+    assert line.startswith(f"{out}/figures/mtf.png: cannot be written (File too large); make room")
+    assert RunFolder(out).finished("chart") is not None
+    assert list((out / "figures").iterdir()) == []
+    # What cannot even begin says so of its first file.
+    line = one_line(call("run", file, "--out", out / "other", "--set", f"title={'T' * 3_000}"))
+    assert line.startswith(f"{out}/other/config.yaml: cannot be written")
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        MemoryError(),
+        RuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 4294967296 bytes."),
+    ],
+)
+def test_memory_that_ends_has_words(file, monkeypatch, tmp_path, error):
+    def broken(*_):
+        raise error
+
+    monkeypatch.setattr(studies, "run_study", broken)
+    line = one_line(call("run", file, "--out", tmp_path / "out"))
+    assert line.startswith("out of memory; give fewer pixels")
+
+
+# A process whose start-up is held where a second module is imported, and one that has begun.
+_STARTING = """
+import builtins, os, signal, sys
+from thincam_jax.commands import start
+real, sys.argv = builtins.__import__, ["thincam", "doctor"]
+def slow(name, *more):
+    if name == {held!r}:
+        os.kill(os.getpid(), signal.SIGINT)
+    return real(name, *more)
+builtins.__import__ = slow
+start.main()
+"""
+_SWALLOWED = """
+import gc, os, signal, sys, time
+from thincam_jax.commands import start
+signal.signal(signal.SIGINT, start.leave)
+sys.unraisablehook = start._again
+gc.callbacks.append(lambda phase, _: phase == "stop" and os.kill(os.getpid(), signal.SIGINT))
+with start.interruptible():
+    try:
+        gc.collect()
+        gc.callbacks.clear()
+        time.sleep(20)
+    except KeyboardInterrupt:
+        print("told", flush=True)
+        os._exit(start.INTERRUPTED)
+"""
+
+
+@pytest.mark.parametrize(
+    ("code", "streams"),
+    [
+        (_STARTING.format(held="typer"), ("", "thincam: interrupted\n")),
+        (_STARTING.format(held="jax"), ("", "thincam: interrupted\n")),
+        (_SWALLOWED, ("told\n", "")),
+    ],
+    ids=["first import", "JAX", "swallowed by a callback"],
+)
+def test_ctrl_c_at_any_moment(code, streams):
+    path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        env={**os.environ, "PYTHONPATH": path},
+        timeout=120,
+    )
+    assert (done.returncode, (done.stdout, done.stderr)) == (130, streams)
 
 
 def test_doctor():

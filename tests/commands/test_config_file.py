@@ -5,7 +5,7 @@ import re
 import pytest
 from commands.study.test_config import BASE, changed, faults, line_of, load
 
-from thincam_jax.commands.config_file import ConfigError
+from thincam_jax.commands.config_file import ConfigError, read_value
 from thincam_jax.commands.study.config import load_config
 
 
@@ -48,6 +48,19 @@ class TestYaml:
         text = changed("title: A study", "title: &loop [*loop]")
         (line,) = faults(tmp_path, text)
         assert "alias inside its anchor" in line
+
+    def test_aliases_that_stand_for_billions(self, tmp_path):
+        """Refused before anything is built: some 400 bytes, 8e9 entries."""
+        rows = ["a0: &a0 [x]"]
+        rows += [f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 9)}]" for n in range(1, 11)]
+        (line,) = faults(tmp_path, "\n".join(rows))
+        assert "its aliases stand for 8.34e+09 entries, at most 100000 are read" in line
+        merged = ["a0: &a0 {x: 1}"]
+        merged += [f"a{n}: &a{n} {{<<: [{', '.join([f'*a{n - 1}'] * 9)}]}}" for n in range(1, 11)]
+        (line,) = faults(tmp_path, "\n".join(merged))
+        assert "its aliases stand for" in line
+        with pytest.raises(ConfigError, match="--set title: its aliases stand for"):
+            read_value("{" + ", ".join(rows) + "}", "--set title")
 
     def test_unit_without_a_space(self, tmp_path):
         config = load(tmp_path, changed("pitch: 40 um", "pitch: 40um"))

@@ -43,7 +43,9 @@ def test_nothing_is_overwritten(tmp_path):
 def test_unknown_kind_and_missing_folder(tmp_path):
     line = one_line(call("init", "camera"))
     assert line.startswith("init camera: choose one of study, refocus, design, design_both, ")
-    assert "no" in one_line(call("init", "study", "--out", tmp_path / "no" / "study.yaml"))
+    assert "cannot be written (No such file" in one_line(
+        call("init", "study", "--out", tmp_path / "no" / "study.yaml")
+    )
 
 
 def test_the_wheel_holds_them_where_they_are_looked_for(tmp_path, monkeypatch):

@@ -1,13 +1,29 @@
-"""Files that are written whole or not at all."""
+"""Files that are written whole or not at all, and read only where their size is known."""
 
+import errno
 import os
+import stat
 from pathlib import Path
+
+from thincam_jax._core.memory import refuse_if_too_large
+
+
+class WriteError(OSError):
+    """A file that could not be written, as on a full disk, in one line."""
+
+    def __str__(self) -> str:
+        return (
+            f"{self.filename}: cannot be written ({self.strerror}); make room or give another "
+            "folder; what was written before is kept"
+        )
 
 
 def write_whole(path: str | os.PathLike[str], content: bytes | str) -> Path:
     """Write `NAME.partial` beside the file and rename it; text as UTF-8.
 
     After an error or Ctrl-C the old file is untouched and no partial one is left.
+
+    **Errors**: WriteError, one line, for what the system refuses.
     """
     path = Path(path)
     partial = path.with_name(path.name + ".partial")
@@ -15,8 +31,35 @@ def write_whole(path: str | os.PathLike[str], content: bytes | str) -> Path:
     try:
         partial.write_bytes(data)
         os.replace(partial, path)
+    except OSError as error:
+        _drop(partial)
+        raise WriteError(error.errno, error.strerror or str(error), str(path)) from error
     except BaseException:
-        if not partial.is_dir():
-            partial.unlink(missing_ok=True)
+        _drop(partial)
         raise
     return path
+
+
+def _drop(partial: Path) -> None:
+    if partial.is_file():
+        partial.unlink()
+
+
+def read_regular(path: str | os.PathLike[str]) -> bytes:
+    """All bytes of a regular file, as many as it is known to hold before.
+
+    **Errors**: OSError for a device, a pipe or what cannot be opened; MemoryError, one line, where
+    it does not fit.
+    """
+    # Without waiting for the other end, should it be a pipe.
+    with open(path, "rb", opener=lambda name, flags: os.open(name, flags | _NO_WAIT)) as file:
+        status = os.fstat(file.fileno())
+        if not stat.S_ISREG(status.st_mode):
+            raise OSError(errno.EINVAL, "a device or a pipe, no regular file", str(path))
+        if status.st_size > _SMALL:
+            refuse_if_too_large(str(path), status.st_size, "give a smaller file")
+        return file.read(status.st_size)
+
+
+_SMALL = 2**20  # bytes that are read without asking for the memory
+_NO_WAIT = getattr(os, "O_NONBLOCK", 0)  # not on every system

@@ -2,11 +2,11 @@
 
 import os
 
-import jax
-
 
 def available_bytes() -> int | None:
     """Free memory of the default device (of the machine, on a CPU); None where that is unknown."""
+    import jax  # slow, and not needed to read a small file
+
     device = jax.devices()[0]
     if device.platform == "cpu":
         try:

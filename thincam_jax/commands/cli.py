@@ -4,8 +4,6 @@ What a command computes with is imported when it runs: help and the shell's comp
 it. Hence the files `command.py` import nothing slow at their heads.
 """
 
-import os
-import sys
 from typing import Annotated
 
 import typer
@@ -15,9 +13,9 @@ from thincam_jax.commands.cache import cache_state, keep_programs
 from thincam_jax.commands.design.command import design
 from thincam_jax.commands.examples import init
 from thincam_jax.commands.photo.command import reconstruct
+from thincam_jax.commands.start import main
 from thincam_jax.commands.study.command import run
 from thincam_jax.commands.sweep.command import sweep
-from thincam_jax.commands.terminal import INTERRUPTED
 
 # Help without colours and boxes, which take longer than all the rest of it.
 app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False, rich_markup_mode=None)
@@ -77,18 +75,5 @@ def doctor() -> None:
         print(f"optional {name} is missing: {purpose}")
 
 
-def main() -> None:
-    """Entry point of the command `thincam`."""
-    try:
-        app(prog_name="thincam")
-    except SystemExit as end:
-        if end.code == INTERRUPTED:
-            # Not by way of the interpreter's end: threads that still compile may crash there.
-            sys.stdout.flush()
-            sys.stderr.flush()
-            os._exit(INTERRUPTED)
-        raise
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

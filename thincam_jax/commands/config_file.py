@@ -6,6 +6,10 @@ from typing import Any
 
 import yaml
 
+from thincam_jax._core.files import read_regular
+
+_MOST_ENTRIES = 100_000
+
 
 class ConfigError(ValueError):
     """An experiment file that cannot be used; the message has a line for every fault."""
@@ -17,9 +21,7 @@ def read_raw(path: Path) -> tuple[dict, dict[tuple, str]]:
         what = "a folder" if path.is_dir() else "missing"
         raise FileNotFoundError(f"{path} is {what}; give the path of a YAML experiment file")
     try:
-        text = path.read_text(encoding="utf-8")
-        node = yaml.compose(text, Loader=yaml.SafeLoader)
-        raw = yaml.safe_load(text)
+        node, raw = _read_yaml(read_regular(path).decode("utf-8"))
         places = {location: f"{path}:{line}" for location, line in _lines(node)}
     except UnicodeDecodeError as error:
         raise ConfigError(f"{path}: not a text file in UTF-8 ({error.reason})") from None
@@ -28,16 +30,49 @@ def read_raw(path: Path) -> tuple[dict, dict[tuple, str]]:
         line = f":{mark.line + 1}" if mark else ""
         problem = getattr(error, "problem", None) or "not YAML"
         raise ConfigError(f"{path}{line}: not valid YAML: {problem}") from None
+    except _TooLargeError as error:
+        raise ConfigError(f"{path}: {error}") from None
     except ValueError as error:  # such as a date that does not exist
         raise ConfigError(f"{path}: not valid YAML: {error}; put texts in quotes") from None
-    except RecursionError:
-        raise ConfigError(f"{path}: nested too deeply, or an alias inside its anchor") from None
     if not isinstance(raw, dict):
         raise ConfigError(f"{path}:1: give a mapping of 'key: value' lines, beginning with 'name:'")
     twice = [f"{path}:{line}: {message}" for line, message in _repeated_keys(node)]
     if twice:
         raise ConfigError("\n".join(twice))
     return raw, places
+
+
+class _TooLargeError(ValueError):
+    """A document that is not to be built."""
+
+
+def _read_yaml(text: str) -> tuple[yaml.Node | None, Any]:
+    """The composed nodes of a document and its data.
+
+    Entries are counted before any is built, an aliased part wherever it stands: ten nested aliases
+    make billions of 386 bytes.
+    """
+    try:
+        node = yaml.compose(text, Loader=yaml.SafeLoader)
+        count = 0 if node is None else _entries(node, {})
+        if count > _MOST_ENTRIES:
+            raise _TooLargeError(
+                f"its aliases stand for {count:.3g} entries, at most {_MOST_ENTRIES} are read; "
+                "write out what is meant"
+            )
+        return node, yaml.safe_load(text)
+    except RecursionError:
+        raise _TooLargeError("nested too deeply, or an alias inside its anchor") from None
+
+
+def _entries(node: yaml.Node, known: dict[int, int]) -> int:
+    """Entries of a node with those of all below it; each node is visited once."""
+    if id(node) not in known and isinstance(node, yaml.CollectionNode):
+        inner = (
+            n for entry in node.value for n in (entry if isinstance(entry, tuple) else (entry,))
+        )
+        known[id(node)] = 1 + sum(_entries(n, known) for n in inner)
+    return known.get(id(node), 1)
 
 
 def _repeated_keys(node) -> list[tuple[int, str]]:
@@ -117,7 +152,9 @@ def set_entry(raw: Any, keys: tuple, value: Any, asked: str) -> None:
 def read_value(text: str, asked: str) -> Any:
     """A value as YAML has it; `asked` is how the user asked for it, for the message."""
     try:
-        return yaml.safe_load(text)
+        return _read_yaml(text)[1]
+    except _TooLargeError as error:
+        raise ConfigError(f"{asked}: {error}") from None
     except (yaml.YAMLError, ValueError):
         raise ConfigError(f"{asked}: {text!r} is not valid YAML; put texts in quotes") from None
 

@@ -31,6 +31,7 @@ def init(
 ) -> None:
     """Write an example experiment file to begin with."""
     with told(lambda: "interrupted"):
+        from thincam_jax._core.files import write_whole
         from thincam_jax.commands.config_file import ConfigError
 
         if kind not in kinds():
@@ -38,9 +39,7 @@ def init(
         path = out or Path()
         path = path / f"{kind}.yaml" if path.is_dir() else path
         text = (_folder() / f"{_FILE_OF.get(kind, kind)}.yaml").read_text(encoding="utf-8")
-        try:
-            with path.open("x", encoding="utf-8") as file:
-                file.write(text)
-        except FileExistsError:
-            raise ConfigError(f"{path} exists; give another --out, or delete it") from None
+        if path.exists():
+            raise ConfigError(f"{path} exists; give another --out, or delete it")
+        write_whole(path, text)
     print(f"{path}; next: thincam {'design' if kind.startswith('design') else 'run'} {path}")

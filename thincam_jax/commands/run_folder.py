@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from thincam_jax._core.files import write_whole
+from thincam_jax._core.files import WriteError, write_whole
 from thincam_jax.commands.checked_config import dump_config
 from thincam_jax.commands.config_file import ConfigError, slug
 from thincam_jax.commands.doctor import environment
@@ -105,6 +105,8 @@ def claim_folder(path: Path, name: str, text: str, kind: str, folders: Sequence[
         write_whole(held, text)
         for folder in folders:
             (path / folder).mkdir(exist_ok=True)
+    except WriteError:
+        raise
     except OSError as error:
         raise ConfigError(f"--out {path}: cannot be made a folder ({error.strerror})") from None
 

@@ -10,11 +10,12 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
+from thincam_jax.commands.start import INTERRUPTED, interruptible
+
 if TYPE_CHECKING:
     import rich.progress
 
 WRONG_INPUT = 2
-INTERRUPTED = 130  # the shells' exit code after Ctrl-C
 
 ConfigFile = Annotated[Path, typer.Argument(help="Experiment file (YAML); thincam init makes one.")]
 Overrides = Annotated[
@@ -37,12 +38,23 @@ def told(interrupted: Callable[[], str]) -> Iterator[None]:
     except Exception as error:
         from thincam_jax.commands.config_file import ConfigError
 
-        if not isinstance(
-            error,
-            (ConfigError, FileNotFoundError, IsADirectoryError, PermissionError, MemoryError),
-        ):
+        if not isinstance(error, (ConfigError, OSError, MemoryError)) and not _no_memory(error):
             raise
         fail(error)
+
+
+def _no_memory(error: BaseException) -> bool:
+    """Whether Python or XLA could not have what they asked for; the texts of either say nothing."""
+    return str(error).startswith("RESOURCE_EXHAUSTED") or (
+        isinstance(error, MemoryError) and not str(error)
+    )
+
+
+def in_a_line(error: BaseException) -> str:
+    """What a user is told of an error."""
+    if _no_memory(error):
+        return "out of memory; give fewer pixels (a larger --downsample or pitch) or close programs"
+    return str(error)
 
 
 def tell(text: str) -> None:
@@ -56,15 +68,19 @@ def tell(text: str) -> None:
 
 def fail(error: BaseException) -> NoReturn:
     """End for an error that a user can put right."""
-    tell(str(error))
+    tell(in_a_line(error))
     raise typer.Exit(WRONG_INPUT)
 
 
-def progress_bar(*more: str) -> "rich.progress.Progress":
-    """With a count and the times; `more` are templates, as "{task.fields[objective]}"."""
+@contextlib.contextmanager
+def progress_bar(*more: str) -> "Iterator[rich.progress.Progress]":
+    """With a count and the times; `more` are templates, as "{task.fields[objective]}".
+
+    What is done under it has something to keep when it is interrupted.
+    """
     from rich import progress
 
-    return progress.Progress(
+    bar = progress.Progress(
         progress.TextColumn("{task.description}"),
         progress.BarColumn(),
         progress.MofNCompleteColumn(),
@@ -73,6 +89,8 @@ def progress_bar(*more: str) -> "rich.progress.Progress":
         progress.TextColumn("left"),
         progress.TimeRemainingColumn(),
     )
+    with interruptible(), bar:
+        yield bar
 
 
 @contextlib.contextmanager

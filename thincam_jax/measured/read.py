@@ -16,6 +16,7 @@ import numpy as np
 import tifffile
 from jaxtyping import Bool
 
+from thincam_jax._core.files import read_regular
 from thincam_jax._core.memory import refuse_if_too_large
 from thincam_jax.measured.raw import CaptureFileError, MeasurementError, Raw
 
@@ -146,7 +147,7 @@ def _decode(path: Path) -> tuple[np.ndarray, str, int | None]:
 
 def _bytes(path: Path) -> bytes:
     try:
-        return path.read_bytes()
+        return read_regular(path)
     except FileNotFoundError:
         raise CaptureFileError(f"{path}: does not exist; give the path of an image") from None
     except IsADirectoryError:

@@ -8,7 +8,8 @@ import rich.progress
 from thincam_jax.commands.photo.jobs import Job
 from thincam_jax.commands.photo.options import Background, Output, Recipe, Sources
 from thincam_jax.commands.photo.run import Failed, Finished, run_jobs
-from thincam_jax.commands.terminal import INTERRUPTED, WRONG_INPUT, progress_bar, tell
+from thincam_jax.commands.start import INTERRUPTED
+from thincam_jax.commands.terminal import WRONG_INPUT, in_a_line, progress_bar, tell
 from thincam_jax.measured import MeasurementError
 from thincam_jax.measured.write import WhiteBalance
 from thincam_jax.reconstruction import Progress
@@ -50,7 +51,7 @@ def run_with_bar(jobs: list[Job], sources: Sources, recipe: Recipe, output: Outp
         teller = _Bar(bar, recipe.iterations, [job.capture.name for job in jobs])
         for result in run_jobs(jobs, sources, recipe, output, teller):
             if isinstance(result, Failed):
-                tell(str(result.error))
+                tell(in_a_line(result.error))
                 end = WRONG_INPUT
                 continue
             bar.console.print(_summary(result), highlight=False, markup=False, soft_wrap=True)

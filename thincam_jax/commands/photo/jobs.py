@@ -71,8 +71,8 @@ def write_job(job: Job, image: np.ndarray, record: dict[str, Any], output: Outpu
 
 
 def _captures_in(folder: Path, sources: Sources) -> list[Path]:
-    used = {path.resolve() for path in sources.paths()}
-    captures = [path for path in image_files(folder) if path.resolve() not in used]
+    used = {os.path.realpath(path) for path in sources.paths()}
+    captures = [path for path in image_files(folder) if os.path.realpath(path) not in used]
     if not captures:
         raise CaptureFileError(f"{folder}: holds no capture beside the PSF and what is subtracted")
     return captures
@@ -94,7 +94,7 @@ def _images(path: Path, output: Output) -> tuple[Path, ...]:
 def _check_batch_folder(captures: Path, folder: Path) -> None:
     if folder.exists() and not folder.is_dir():
         raise MeasurementError(f"{folder}: is a file; for a folder of captures give a folder")
-    if folder.resolve() == captures.resolve():
+    if os.path.realpath(folder) == os.path.realpath(captures):
         raise MeasurementError(
             f"{folder}: holds the captures, among which the results would be lost; give another "
             "folder"
@@ -102,11 +102,12 @@ def _check_batch_folder(captures: Path, folder: Path) -> None:
 
 
 def _check_names(jobs: list[Job], sources: Sources) -> None:
-    inputs = {p.resolve(): p for p in (*sources.paths(), *(job.capture for job in jobs))}
+    read = (*sources.paths(), *(job.capture for job in jobs))
+    inputs = {os.path.realpath(path) for path in read}  # also of links in a circle
     taken: dict[Path, Path] = {}
     for job in jobs:
         for path in (job.record, *job.images):
-            if path.resolve() in inputs:
+            if os.path.realpath(path) in inputs:
                 raise MeasurementError(
                     f"{path}: is read as an input and would be overwritten; give another output"
                 )

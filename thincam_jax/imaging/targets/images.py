@@ -37,8 +37,9 @@ def load_image(path: str | os.PathLike[str]) -> Float64[np.ndarray, "y x *channe
     image or is damaged, an empty image, a stack of several, or values out of range.
     """
     path = Path(path)
-    if path.is_dir():
-        raise ValueError(f"{str(path)!r} is a folder; give the path of one image file")
+    if path.exists() and not path.is_file():
+        what = "a folder" if path.is_dir() else "a device or a pipe"
+        raise ValueError(f"{str(path)!r} is {what}; give the path of one image file")
     if not path.exists():
         raise FileNotFoundError(f"{str(path)!r} does not exist; give the path of an image file")
     try:

@@ -1,0 +1,63 @@
+"""Where the command `thincam` starts: Ctrl-C ends it in one line from the first moment.
+
+Imported before anything else, hence it imports next to nothing itself.
+"""
+
+import contextlib
+import os
+import signal
+import sys
+from collections.abc import Iterator
+
+INTERRUPTED = 130  # the shells' exit code after Ctrl-C
+
+
+def main() -> None:
+    """Entry point of the command `thincam`."""
+    signal.signal(signal.SIGINT, leave)
+    sys.unraisablehook = _again
+    from thincam_jax.commands.cli import app
+
+    try:
+        app(prog_name="thincam")
+    except SystemExit as end:
+        if end.code == INTERRUPTED:
+            # Not by way of the interpreter's end: threads that still compile may crash there.
+            sys.stdout.flush()
+            sys.stderr.flush()
+            os._exit(INTERRUPTED)
+        raise
+
+
+def leave(*_: object) -> None:
+    """At once: an exception would meet imports and libraries that are not ready for one."""
+    os.write(2, b"thincam: interrupted\n")
+    os._exit(INTERRUPTED)
+
+
+@contextlib.contextmanager
+def interruptible() -> Iterator[None]:
+    """Work that has something to keep: Ctrl-C is a KeyboardInterrupt in it."""
+    before = signal.getsignal(signal.SIGINT)
+    if before is not leave:  # another program's
+        yield
+        return
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _again(lost: "sys.UnraisableHookArgs") -> None:
+    """A KeyboardInterrupt that a callback could not pass on, as XLA's at a garbage collection."""
+    if not issubclass(lost.exc_type, KeyboardInterrupt):
+        sys.__unraisablehook__(lost)
+        return
+    import threading
+
+    threading.Timer(0.05, signal.raise_signal, (signal.SIGINT,)).start()
+
+
+if __name__ == "__main__":
+    main()
