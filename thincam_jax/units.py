@@ -50,6 +50,12 @@ _KINDS = {
         'write a length such as "180 mm"',
         '"500 nm", "5.5 um", "180 mm" or "0.25 m"',
     ),
+    "wavelength": _Kind(
+        "a wavelength",
+        {"meter": "millimeter"},
+        'write a wavelength such as "500 nm"',
+        '"500 nm" or "0.5 um"',
+    ),
     "angle": _Kind(
         "an angle",
         {"radian": "radian"},
@@ -97,6 +103,9 @@ _TERM = r"(?:[^\W\d]\w*|°[CF]?|%)(?:\s*(?:\*\*|\^)\s*[+-]?\d(?!\d))?"
 _UNITS = re.compile(rf"(?:1?\s*/\s*)?{_TERM}(?:(?:\s*[*/·]\s*|\s+){_TERM})*")
 
 
+_LONGEST = 80  # signs of a quantity
+
+
 @functools.cache
 def _registry() -> pint.UnitRegistry:
     """The unit registry, made at the first use: importing pint takes a few tenths of a second."""
@@ -112,8 +121,8 @@ def parse_quantity(text: object, kind: str) -> float:
 
     - `text`: a string such as `"180 mm"`, `"61.2 deg"` or `"25 rad/mm^2"`, or a scalar pint
       quantity of any registry. A number without a unit is refused: no unit is guessed.
-    - `kind`: `"length"`, `"angle"` or `"curvature"` (β of a Fresnel zone aperture; the radian may
-      be left out, `"25 /mm^2"`).
+    - `kind`: `"length"`, `"wavelength"`, `"angle"` or `"curvature"` (β of a Fresnel zone
+      aperture; the radian may be left out, `"25 /mm^2"`).
 
     **Returns:**
 
@@ -131,6 +140,8 @@ def parse_quantity(text: object, kind: str) -> float:
     wanted = _KINDS[kind]
     if isinstance(text, str):
         text = " ".join(text.split())
+        if len(text) > _LONGEST:
+            raise ValueError(f'"{text[:_LONGEST]}…" is not {wanted.name}: {wanted.advice}')
         shown = f'"{text}"'
         quantity = _read(text, wanted)
     elif hasattr(text, "magnitude") and hasattr(text, "to_root_units"):

@@ -106,8 +106,13 @@ class TestExitCode2:
     def test_image_that_is_missing(self, file, tmp_path):
         out = tmp_path / "out"
         line = one_line(call("run", file, "--out", out, "--set", "targets.1.path=no.png"))
-        assert line.startswith(f"targets[1]: '{tmp_path / 'no.png'}' does not exist")
+        given = f"'{tmp_path / 'no.png'}' does not exist"
+        assert line.startswith(f"--set targets.1.path=no.png: targets[1]: {given}")
         assert not out.exists()
+        text = file.read_text("utf-8").replace("picture.png", "no.png")
+        file.write_text(text, encoding="utf-8")
+        number = next(n for n, row in enumerate(text.split("\n"), 1) if "no.png" in row)
+        assert one_line(call("run", file)).startswith(f"{file}:{number}: targets[1]: {given}")
 
     def test_out_is_a_file(self, file, tmp_path):
         out = tmp_path / "taken"
@@ -131,6 +136,7 @@ class TestExitCode2:
         assert " needs about " in line
         assert "iB" in line
         assert " are free; " in line
+        assert line.startswith(f"--set sensor.shape={shape}: sensor.shape: ")
 
     def test_unknown_option_and_command(self, file):
         for result in (call("run", file, "--ouput", "x"), call("rum", file), call("run")):

@@ -7,13 +7,18 @@ import pydantic
 import yaml
 
 from thincam_jax.commands.config_file import ConfigError, override, read_raw
+from thincam_jax.commands.sections import ExperimentConfig
 
 Config = TypeVar("Config", bound=pydantic.BaseModel)
+Experiment = TypeVar("Experiment", bound=ExperimentConfig)
 
 
 def load_as(
-    model: type[Config], path: str | Path, overrides: tuple[str, ...] = (), seen: str = "targets"
-) -> Config:
+    model: type[Experiment],
+    path: str | Path,
+    overrides: tuple[str, ...] = (),
+    seen: str = "targets",
+) -> Experiment:
     """Read an experiment file of the given sections; `overrides` are "a.b=value" texts.
 
     `seen` is the list whose image files are named from the folder of the experiment file.
@@ -23,8 +28,9 @@ def load_as(
     """
     path = Path(path)
     raw, places = read_raw(path)
-    asked = {override(raw, text): f"--set {text}" for text in overrides}
+    asked = {override(raw, text): f"--set {_cut(text)}" for text in overrides}
     config = check_as(model, raw, places, asked, f"{path}:1")
+    config = config.found_at(lambda location: _place(location, places, asked, f"{path}:1"))
     folder = path.resolve().parent
     named = tuple(
         entry.model_copy(update={"path": str(folder / entry.path)}) if entry.path else entry
@@ -44,7 +50,7 @@ def check_as(
         return model.model_validate(raw)
     except pydantic.ValidationError as error:
         faults = [_fault(e, places, asked, top, model) for e in _own(error.errors())]
-        raise ConfigError("\n".join(faults)) from None
+        raise ConfigError("\n".join(_once(faults))) from None
 
 
 def dump_config(config: pydantic.BaseModel) -> str:
@@ -80,14 +86,25 @@ def _own(errors: list[Any]) -> list[Any]:
     ]
 
 
-def _fault(error: Any, places: dict, asked: dict, top: str, model: Any) -> str:
-    """One line: place, field, what is wrong and what is allowed."""
+def _once(faults: list[tuple[str, str, str]]) -> list[str]:
+    """A line for each fault; what one setting does to several entries is told of the first."""
+    lines: dict[tuple[str, str], list[str]] = {}
+    for place, field, message in faults:
+        lines.setdefault((place, message), []).append(field)
+    return [
+        f"{place}: {fields[0]}{f' and {len(fields) - 1} more' if fields[1:] else ''}: {message}"
+        for (place, message), fields in lines.items()
+    ]
+
+
+def _fault(error: Any, places: dict, asked: dict, top: str, model: Any) -> tuple[str, str, str]:
+    """Place, field, and what is wrong and what is allowed."""
     location = (*error["loc"], *error.get("ctx", {}).get("place", ()))
     if error["type"] == "invalid_key":
         location = (*location[:-1], str(location[-1]))
     field = _dotted(location) or "the file"
     place = _place(location, places, asked, top)
-    return f"{place}: {field}: {_message(error, location, model)}"
+    return place, field, _message(error, location, model)
 
 
 def _message(error: Any, location: tuple, model: Any) -> str:
@@ -98,23 +115,34 @@ def _message(error: Any, location: tuple, model: Any) -> str:
     if kind == "missing" and isinstance(location[-1], int):
         return "missing; the list needs this entry"
     if kind == "literal_error":
-        return f"{given!r} is unknown; choose one of {context['expected']}"
+        return f"{_short(given)} is unknown; choose one of {context['expected']}"
     if kind in ("too_short", "too_long"):
         limit = context.get("min_length", context.get("max_length"))
         word = "at least" if kind == "too_short" else "at most"
-        return f"{given!r} has {len(given)} entries; give {word} {limit}"
+        return f"{_short(given)} has {len(given)} entries; give {word} {limit}"
     if kind in _WORDS:
-        return _WORDS[kind].format(given=given)
+        return _WORDS[kind].format(given=_short(given))
     message = error["msg"].removeprefix("Value error, ")
     if kind in ("value_error", "misfit"):
         return message
-    return f"{given!r}: {message[0].lower()}{message[1:]}"
+    return f"{_short(given)}: {message[0].lower()}{message[1:]}"
+
+
+_LONGEST = 80  # signs of what was given that a message repeats
+
+
+def _short(given: Any) -> str:
+    return _cut(repr(given))
+
+
+def _cut(text: str) -> str:
+    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}… ({len(text)} signs)"
 
 
 _WORDS = {
     "missing": "missing; this key is needed",
-    "model_type": "{given!r} is not a section; give lines of 'key: value'",
-    "tuple_type": "{given!r} is not a list; write it as [a, b] or as lines beginning with '- '",
+    "model_type": "{given} is not a section; give lines of 'key: value'",
+    "tuple_type": "{given} is not a list; write it as [a, b] or as lines beginning with '- '",
     "invalid_key": "a key must be a text; put it in quotes",
 }
 
@@ -122,7 +150,8 @@ _WORDS = {
 def _dotted(location: tuple) -> str:
     text = ""
     for part in location:
-        text += f"[{part}]" if isinstance(part, int) else f".{part}" if text else str(part)
+        name = _cut(str(part))
+        text += f"[{part}]" if isinstance(part, int) else f".{name}" if text else name
     return text
 
 

@@ -1,7 +1,8 @@
 """Sections of experiment files that several kinds share, with the units of their numbers."""
 
 import math
-from typing import Annotated, Literal
+from collections.abc import Callable
+from typing import Annotated, Literal, TypeVar
 
 import pydantic
 from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, PlainSerializer
@@ -19,12 +20,6 @@ def misfit(message: str, *place: str | int) -> PydanticCustomError:
     return PydanticCustomError("misfit", "{message}", {"message": message, "place": place})
 
 
-def _positive(value: float) -> float:
-    if not value > 0:
-        raise ValueError(f"{value:g} is not positive; give a value above zero")
-    return value
-
-
 LIGHT = (1e-5, 1.0)  # the wavelengths that are taken for light, mm
 
 
@@ -34,17 +29,23 @@ def _optical(value: float) -> float:
     return value
 
 
-def quantity(kind: str, unit: str):
+def quantity(kind: str, unit: str, *, positive: bool = False):
+    def read(text: object) -> float:
+        value = parse_quantity(text, kind)
+        if positive and not value > 0:
+            raise ValueError(f'"{text}" is not positive; give a value above zero')
+        return value
+
     # A resolved file is read back, so it is written in the unit of the package, with every digit.
     return (
-        BeforeValidator(lambda text: parse_quantity(text, kind)),
+        BeforeValidator(read),
         PlainSerializer(lambda value: f"{value!r} {unit}"),
     )
 
 
-Length = Annotated[float, *quantity("length", "mm"), AfterValidator(_positive)]
-Wavelength = Annotated[float, *quantity("length", "mm"), AfterValidator(_optical)]
-Curvature = Annotated[float, *quantity("curvature", "rad/mm^2"), AfterValidator(_positive)]
+Length = Annotated[float, *quantity("length", "mm", positive=True)]
+Wavelength = Annotated[float, *quantity("wavelength", "mm"), AfterValidator(_optical)]
+Curvature = Annotated[float, *quantity("curvature", "rad/mm^2", positive=True)]
 Angle = Annotated[float, *quantity("angle", "rad")]
 Name = Annotated[str, Field(min_length=1, max_length=60, pattern=r"^[\w .,()=+\-]+$")]
 
@@ -239,6 +240,9 @@ class TargetConfig(Section):
         return self
 
 
+Own = TypeVar("Own", bound="ExperimentConfig")
+
+
 class ExperimentConfig(Section):
     """What every kind of experiment file begins with."""
 
@@ -248,6 +252,17 @@ class ExperimentConfig(Section):
     wavelength: Wavelength
     model: Model = "separable"
     pixel_integration: bool = True
+    _place: Callable[[tuple], str] | None = pydantic.PrivateAttr(default=None)
+
+    def place_of(self, *location: str | int) -> str:
+        """File and line of an entry, or the option that set it, with a colon; else nothing."""
+        return "" if self._place is None else f"{self._place(location)}: "
+
+    def found_at(self: Own, place: Callable[[tuple], str]) -> Own:
+        """The same, told by `place` where its entries come from."""
+        copy = self.model_copy()
+        copy._place = place
+        return copy
 
 
 class CamerasConfig(ExperimentConfig):

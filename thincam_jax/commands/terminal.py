@@ -97,5 +97,8 @@ def progress_bar(*more: str) -> "Iterator[rich.progress.Progress]":
 def counted(name: str) -> Iterator[Callable[[str, int], None]]:
     """A progress bar; what it yields is called at each step, with its text and their number."""
     with progress_bar() as bar:
-        task = bar.add_task(name, total=None)
-        yield lambda text, total: bar.update(task, advance=1, total=total, description=text)
+        # Seen from the first step on: before, all may be refused.
+        task = bar.add_task(name, total=None, visible=False)
+        yield lambda text, total: bar.update(
+            task, advance=1, total=total, description=text, visible=True
+        )

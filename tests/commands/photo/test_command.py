@@ -34,6 +34,33 @@ def one_line(result):
     return line.removeprefix("thincam: ")
 
 
+def test_pixels_without_light_are_not_enough(grey, tmp_path):
+    """All that holds light counts as saturated: the residual would be 0/0."""
+    counts = tifffile.imread(grey["capture"])
+    tifffile.imwrite(grey["capture"], np.where(counts > 500, counts, 0).astype(np.uint16))
+    options = ("--background", 0, "--bits", 12, "--saturation", 1e-6)
+    line = one_line(call(grey, tmp_path / "image.png", *options))
+    assert "has a channel without a trusted pixel that holds light" in line
+    assert not (tmp_path / "image.png").exists()
+
+
+def test_a_black_image_is_told(grey, tmp_path):
+    out = tmp_path / "image.png"
+    result = call(grey, out, "--background", grey["dark"], "--tau", 1e6, "--iterations", 20)
+    assert result.exit_code == 0
+    assert result.stderr == (
+        f"thincam: {out}: the image explains almost nothing of the capture; tau = 1e+06 is too "
+        "large, give about 1\n"
+    )
+
+
+def test_links_to_no_file(grey, tmp_path):
+    for name, target in (("zero", "/dev/zero"), ("loop", tmp_path / "loop.tif")):
+        (tmp_path / f"{name}.tif").symlink_to(target)
+        capture = tmp_path / f"{name}.tif"
+        assert "cannot be read (" in one_line(call(grey, tmp_path / "a.png", capture=capture))
+
+
 def record_of(path):
     return json.loads(path.with_suffix(".json").read_text("utf-8"))
 

@@ -6,8 +6,12 @@ import numpy as np
 import pytest
 from commands.study import tiny
 
-from thincam_jax.commands.study.figures import _by_synthesis, _pairs_of_axes
+from thincam_jax.commands.run_folder import RunFolder
+from thincam_jax.commands.study import figures
+from thincam_jax.commands.study.figures import _by_synthesis, _detail, _pairs_of_axes
 from thincam_jax.commands.study.response import Response
+from thincam_jax.imaging.targets import usaf1951
+from thincam_jax.imaging.targets.usaf import usaf1951_elements
 
 
 @pytest.mark.parametrize(
@@ -28,6 +32,35 @@ def test_many_methods_go_into_several_bands(count, rows, columns):
     assert len(places) == count
     hidden = [ax for ax in figure.axes if not ax.axison]
     assert len(hidden) == rows * columns - 2 * count
+
+
+def test_the_detail_of_a_chart_holds_its_fine_groups(tmp_path):
+    """All sets of its second layer and none of the first, whose bars are four times as wide."""
+    chart, picture = tiny.built(tmp_path).targets
+    image = usaf1951((320, 320))
+    fine, label = _detail(image, chart)
+    assert label == "fine groups, 20 mm"
+    sets = [e for e in usaf1951_elements() if e.group in (0, 1)]
+    assert {abs(np.subtract(e.centre, (-2.5 / 32, 2.25 / 32))).max() < 0.12 for e in sets} == {True}
+    np.testing.assert_allclose(fine.sum(), usaf1951((320, 320))[95:175, 143:223].sum(), rtol=0.1)
+    assert _detail(image, picture)[1] == "middle 27 mm"
+
+
+def test_panels_of_transfer_functions_share_a_scale_and_show_limits(tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(figures, "save_figure", lambda *given: drawn.append(given[-1]))
+    study = tiny.built(tmp_path)
+    limits = {"first_zero_cycles_per_mm": None, "cut_off_cycles_per_mm": 9.0}
+    found = {
+        m.name: Response(np.arange(50.0) / 4, np.linspace(1, 3 - 2 * n, 50), limits)
+        for n, m in enumerate(study.methods)
+    }
+    figures.save_responses(RunFolder(tmp_path), study, found)
+    panels = drawn[0].axes
+    assert len({ax.get_ylim() for ax in panels}) == len({ax.get_xlim() for ax in panels}) == 1
+    first, second = ([t.get_text() for t in ax.get_legend().get_texts()] for ax in panels)
+    assert first == ["cut-off 9.0", "Nyquist 12.5", "published limit 10.8"]
+    assert second == ["cut-off 9.0", "Nyquist 12.5"]
 
 
 def test_methods_of_the_same_captures_and_sums_share_a_transfer_function(tmp_path):

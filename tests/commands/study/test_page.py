@@ -32,8 +32,11 @@ def test_no_reference_outside_the_page(run):
     page = run[3]
     tags = " ".join(re.findall(r"<[^>]+>", page))
     sources = re.findall(r"""(?:src|href|srcset|data|action)\s*=\s*["']?([^"'\s>]+)""", tags)
-    assert len(sources) == 5  # transfer functions, contrast, two targets, PSF
-    assert all(source.startswith("data:image/png;base64,") for source in sources)
+    within = [source for source in sources if source.startswith("#")]
+    assert all(f'id="{source[1:]}"' in page for source in within)  # the contents
+    pictures = [source for source in sources if source not in within]
+    assert len(pictures) == 7  # two targets and their captures, transfer functions, contrast, PSF
+    assert all(source.startswith("data:image/png;base64,") for source in pictures)
     tags = set(re.findall(r"<\s*([a-z]\w*)", page))
     assert not tags & {"script", "link", "iframe", "object", "embed", "base"}
     assert not re.search(r"url\(|@import|file://", page)
@@ -130,6 +133,6 @@ def test_page_of_a_run_without_a_chart(run):
         entry["targets"]["chart"]["resolved"] = None
     (folder.path / "figures" / "contrast.png").rename(folder.path / "figures" / "contrast.away")
     page = render(config, folder, metrics, environment())
-    assert page.count("<img ") == 4
+    assert page.count("<img ") == 6
     (row,) = [r for r in rows(page) if r[0] == "conventional" and len(r) == 8]
     assert row[1:3] == ["–", "–"]

@@ -91,6 +91,11 @@ class TestExitCode2:
             (("--grid", "methods.7.name=a"), "methods has no entry 7"),
             (("--grid", "mask.width=1:2:3"), "mask.width: 1 has no unit: write a length such as"),
             (("--grid", "mask.width=1:2:3 nms"), 'has the unknown unit "nms"'),
+            # Of every entry that a * stands for, once.
+            (
+                ("--grid", "methods.*.shots.*.*=7"),
+                "methods[0].shots[0].beta and 1 more: 7 has no unit",
+            ),
             (("--grid", "seed=1", "--grid", "seed=2"), "seed is set by --grid seed=1 too"),
             (("--grid", "seed=1", "--workers", 0), "--workers 0: give at least 1"),
             (("--grid", "seed=1", "--workers", 1, "--scheduler", "tcp://a:1"), "leave it out"),

@@ -12,7 +12,7 @@ from thincam_jax.commands.sweep.measure import measure_point
 
 
 def test_columns_are_the_metrics_of_a_run(tmp_path, monkeypatch):
-    for name in ("save_target", "save_responses", "save_contrasts", "save_psf"):
+    for name in ("save_target", "save_captures", "save_responses", "save_contrasts", "save_psf"):
         monkeypatch.setattr(f"thincam_jax.commands.study.figures.{name}", lambda *_: None)
     targets = tiny.TEXT[tiny.TEXT.index("  - {name: chart") :]
     config = tiny.study(tmp_path, text=mini.TEXT[: mini.TEXT.index("  - {name: star")] + targets)

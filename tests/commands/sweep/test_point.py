@@ -90,7 +90,7 @@ def test_refused_point_has_its_reason(config):
     assert bad.values == {"methods.0.shots.0.beta": "-5 rad/mm^2"}
     assert bad.reason == (
         "--grid methods.0.shots.0.beta=25,-5 rad/mm^2: methods[0].shots[0].beta: "
-        "-5 is not positive; give a value above zero"
+        '"-5 rad/mm^2" is not positive; give a value above zero'
     )
     assert told(bad.values) == "methods.0.shots.0.beta=-5 rad/mm^2"
 

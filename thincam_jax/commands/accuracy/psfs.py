@@ -63,7 +63,9 @@ def why_not(model: Model, cost: Cost, given: Conditions) -> str | None:
 
 
 class PsfErrors:
-    """A row for every candidate at one size; `worth_choosing` marks the Pareto front of those run.
+    """A row for every candidate at one size; `worth_choosing` marks the Pareto front.
+
+    It is of those whose error is measured: not of the reference, which has none to compare.
 
     Errors are relative, ‖h − h₀‖₂/‖h₀‖₂ over the sensor, against h₀ by separable in float64, the
     exact Fresnel field. Times are of the compiled function: what Python adds to a call of `psf` is
@@ -101,7 +103,7 @@ class PsfErrors:
                 row |= _measured(self.given[method.precision], method, reference)
         self.rows.append(row)
         if len(self.rows) == len(self.work):
-            mark_front([row for row in self.rows if row["status"] == "run"])
+            mark_front([row for row in self.rows if row["status"] == "run" and row["true_error"]])
 
 
 def mark_front(rows: list[dict[str, Any]]) -> None:

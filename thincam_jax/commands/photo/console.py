@@ -55,6 +55,8 @@ def run_with_bar(jobs: list[Job], sources: Sources, recipe: Recipe, output: Outp
                 end = WRONG_INPUT
                 continue
             bar.console.print(_summary(result), highlight=False, markup=False, soft_wrap=True)
+            if (doubt := _doubt(result, recipe)) is not None:
+                tell(doubt)
             if result.status == "interrupted":
                 tell(_interrupted(result.job, jobs))
                 return INTERRUPTED
@@ -68,18 +70,20 @@ class _Bar:
     def __init__(self, bar: rich.progress.Progress, iterations: int, names: list[str]):
         self.bar, self.iterations, self.names = bar, iterations, names
         self.name = names[0]
-        self.task = bar.add_task(self._title(), total=iterations, objective="")
+        # Seen from the first iteration on: before, all may be refused.
+        self.task = bar.add_task(self._title(), total=iterations, objective="", visible=False)
 
     def __call__(self, name: str, progress: Progress) -> None:
         if name != self.name:
             self.name = name
             self.bar.reset(self.task, description=self._title(), total=self.iterations)
         objective = f"objective {progress.objective:.4g}"
-        self.bar.update(self.task, completed=progress.iteration, objective=objective)
+        done = {"completed": progress.iteration, "objective": objective}
+        self.bar.update(self.task, visible=True, **done)
 
     def finish(self, iterations: int) -> None:
         """Full, also where fewer iterations were enough."""
-        self.bar.update(self.task, completed=iterations, total=iterations)
+        self.bar.update(self.task, completed=iterations, total=iterations, visible=True)
 
     def _title(self) -> str:
         count = len(self.names)
@@ -94,6 +98,19 @@ def _summary(result: Finished) -> str:
         f"{result.job.images[0]}: {status} after {done['iterations']} iterations, relative data "
         f"residual {float(done['relative_data_residual']):.3g}, {done['seconds']:.1f} s"
     )
+
+
+def _doubt(result: Finished, recipe: Recipe) -> str | None:
+    """What is wrong with an image that does not explain its capture; None where it does."""
+    residual = float(result.record["reconstruction"]["relative_data_residual"])
+    if residual < _UNEXPLAINED:
+        return None
+    name, value = ("ridge", recipe.relative_ridge) if recipe.is_ridge else ("tau", recipe.tau)
+    asked = f"{name} = {value:g} is too large, give about 1" if value else "the PSF may be another"
+    return f"{result.job.images[0]}: the image explains almost nothing of the capture; {asked}"
+
+
+_UNEXPLAINED = 0.9  # of the capture's norm
 
 
 def _interrupted(job: Job, jobs: list[Job]) -> str:

@@ -256,9 +256,10 @@ def _check_channels(job: Job, ready: Prepared, recipe: Recipe, output: Output) -
         to_display(
             np.ones((channels, 1, 1)), white_balance=output.white_balance, gamma=output.gamma
         )
-    if not ready.valid.any(axis=(1, 2)).all():
+    if not (ready.valid & (ready.capture > 0)).any(axis=(1, 2)).all():
         raise MeasurementError(
-            f"{job.capture}: has a channel without any valid pixel; all are saturated or dead"
+            f"{job.capture}: has a channel without a trusted pixel that holds light; all others "
+            "are saturated or dead: give a larger saturation, or expose less"
         )
 
 

@@ -145,7 +145,12 @@ def check_study(study: Study, unread: dict[int, str] | None = None) -> None:
     """
     known = {target.number: _target_fault(study, target) for target in study.targets}
     known |= unread or {}
-    faults = [f"targets[{number}]: {fault}" for number, fault in sorted(known.items()) if fault]
+    place_of = study.config.place_of
+    faults = [
+        f"{place_of('targets', number)}targets[{number}]: {fault}"
+        for number, fault in sorted(known.items())
+        if fault
+    ]
     camera = _camera_fault(study)
     if camera or faults:
         raise ConfigError("\n".join([*filter(None, [camera]), *faults]))
@@ -154,9 +159,10 @@ def check_study(study: Study, unread: dict[int, str] | None = None) -> None:
 def _camera_fault(study: Study) -> str:
     """Empty for none."""
     rows, columns = study.sensor.shape
+    place = study.config.place_of("sensor", "shape")
     if rows < _MINIMUM_ROWS or columns < MINIMUM_COLUMNS:
         return (
-            f"sensor.shape: {rows}×{columns} pixels are too few for a study; "
+            f"{place}sensor.shape: {rows}×{columns} pixels are too few for a study; "
             f"give at least {_MINIMUM_ROWS}×{MINIMUM_COLUMNS}"
         )
     try:
@@ -164,6 +170,8 @@ def _camera_fault(study: Study) -> str:
             study.camera(exposure)
         # Traced only: whether the model takes this mask at all.
         jax.eval_shape(lambda: study.psf(study.exposures[0]))
+    except MemoryError as error:
+        return f"{place}sensor.shape: {error}"
     except (ValueError, TypeError) as error:
         return f"mask, sensor or model: {error}"
     return ""

@@ -12,7 +12,7 @@ from thincam_jax.commands.run_folder import RunFolder
 from thincam_jax.commands.study.build import middle_square
 from thincam_jax.commands.study.evaluate import Evaluation, as_picture
 from thincam_jax.commands.study.response import Response
-from thincam_jax.commands.study.study import Study, Target
+from thincam_jax.commands.study.study import Capture, Exposure, Study, Target
 from thincam_jax.imaging.metrics import low_frequency_value
 
 # Told apart by dash and marker as well as by colour, so that they read in grey.
@@ -70,10 +70,30 @@ def save_target(
     _show_detail_of_capture(details[0], raw, study)
     for ax, detail, (name, image, caption) in zip(wholes[1:], details[1:], panels, strict=True):
         _show(ax, image, f"{name}\n{caption}" if caption else name)
-        _show(detail, _middle(image), "")
-        detail.set_xlabel(f"middle {target.width / 3:.0f} mm", fontsize=9)
+        part, label = _detail(image, target)
+        _show(detail, part, "")
+        detail.set_xlabel(label, fontsize=9)
     # No target's name can be taken for one of the study's own figures.
     save_figure(folder, f"target-{slug(target.name)}", figure)
+
+
+def save_captures(
+    folder: RunFolder, study: Study, target: Target, captures: dict[Exposure, Capture]
+) -> None:
+    """All captures of a target, each from black to its own maximum."""
+    columns = min(_BESIDE, len(captures))
+    rows = math.ceil(len(captures) / columns)
+    aspect = study.sensor.shape[0] / study.sensor.shape[1]
+    size = (2.2 * columns, rows * (2.2 * aspect + 0.6))
+    figure = Figure(figsize=size, layout="constrained")
+    axes = figure.subplots(rows, columns, squeeze=False).ravel()
+    for ax in axes:
+        ax.set_axis_off()
+    for number, (ax, exposure) in enumerate(zip(axes, study.exposures, strict=False), 1):
+        image = captures[exposure].image
+        title = f"{number}: β {exposure.beta:.3g} rad/mm², φ {exposure.phase:.2f},\n"
+        _show(ax, as_picture(image / image.max()), f"{title}d {exposure.distance:.3g} mm")
+    save_figure(folder, f"captures-{slug(target.name)}", figure)
 
 
 # More beside each other are too small to be read on a page.
@@ -118,6 +138,25 @@ def _show_detail_of_capture(ax, raw: np.ndarray, study: Study) -> None:
     ax.set_xlabel(f"middle {width:.2g} mm of the sensor,\nstretched", fontsize=9)
 
 
+# The second layer of the USAF chart, with the finer ones inside: place of its centre down and right
+# of the chart's, and its side, as parts of the chart (see `thincam_jax.imaging.targets.usaf`).
+_FINE = (-2.5 / 32, 2.25 / 32, 8 / 32)
+
+
+def _detail(image: np.ndarray, target: Target) -> tuple[np.ndarray, str]:
+    """The part of a picture that is enlarged, and what it is."""
+    if target.kind != "usaf1951":
+        return _middle(image), f"middle {target.width / 3:.0f} mm"
+    down, right, part = _FINE
+    side = min(image.shape[:2])
+    half = max(1, round(side * part / 2))
+    row, column = (
+        round(n / 2 + side * s) for n, s in zip(image.shape, (down, right), strict=False)
+    )
+    fine = image[row - half : row + half, column - half : column + half]
+    return fine, f"fine groups, {target.width * part:.0f} mm"
+
+
 def _middle(image: np.ndarray) -> np.ndarray:
     """The central square whose side is a third of the width."""
     rows, columns = image.shape[:2]
@@ -125,25 +164,32 @@ def _middle(image: np.ndarray) -> np.ndarray:
 
 
 def save_responses(folder: RunFolder, study: Study, responses: dict[str, Response]) -> None:
-    """Transfer functions of all methods, with their limits; methods of one synthesis share one."""
+    """Transfer functions of all methods on one scale; methods of one synthesis share a panel.
+
+    With their limits, those that are published, and the pixels' Nyquist frequency.
+    """
+    published = {m.name: m.published.limit_cycles_per_mm for m in study.config.methods}
+    nyquist = 0.5 / study.sensor.pitch
     panels = _by_synthesis(study, responses)
     figure = Figure(figsize=(8.5, 2.1 * len(panels) + 0.8), layout="constrained")
     axes = np.atleast_1d(figure.subplots(len(panels), 1, sharex=True))
-    end = max(r.metrics["cut_off_cycles_per_mm"] for r in responses.values()) * 1.4
+    end = 1.08 * max(nyquist, *(limit or 0 for limit in published.values()))
+    levels = [r.magnitude[1:] / low_frequency_value(r.frequency, r.magnitude) for _, r in panels]
+    top = 1.05 * max(1.3, *(float(level.max()) for level in levels))
     for index, (ax, (name, response)) in enumerate(zip(axes, panels, strict=True)):
-        level = low_frequency_value(response.frequency, response.magnitude)
-        top = max(1.3, 1.05 * float(response.magnitude[1:].max()) / level)
         style = line_style(index) | {"marker": "", "linestyle": "-"}
-        ax.plot(response.frequency[1:], response.magnitude[1:] / level, linewidth=1.1, **style)
+        ax.plot(response.frequency[1:], levels[index], linewidth=1.1, **style)
+        ax.axvspan(nyquist, end, color="#d8d8d8", linewidth=0)
         limits = response.metrics
         zero, cut = limits["first_zero_cycles_per_mm"], limits["cut_off_cycles_per_mm"]
-        if zero is not None:
-            ax.axvline(zero, color="black", linestyle=":", linewidth=1)
-            ax.text(zero, 0.95 * top, f" first zero {zero:.1f}", fontsize=8, va="top")
-        ax.axvline(cut, color="black", linestyle="--", linewidth=1)
-        end = min(end, response.frequency[-1])
-        side = "right" if cut > 0.85 * end else "left"
-        ax.text(cut, 0.84 * top, f" cut-off {cut:.1f} ", fontsize=8, va="top", ha=side)
+        stated = {published.get(own) for own in name.split("; ")} - {None}
+        marks = [("first zero", zero, ":"), ("cut-off", cut, "--"), ("Nyquist", nyquist, "-")]
+        marks += [("published limit", limit, "-.") for limit in sorted(stated)]
+        for what, at, dash in marks:
+            if at is not None:
+                label = f"{what} {at:.1f}"
+                ax.axvline(at, color="black", linestyle=dash, linewidth=1, label=label)
+        ax.legend(fontsize=8, loc="upper right", framealpha=0.9)
         ax.set(xlim=(0, end), ylim=(0, top), ylabel="relative MTF")
         ax.set_title(name, fontsize=10, loc="left")
     axes[-1].set_xlabel("spatial frequency u on the reference sensor plane (cycles/mm), v = 0")

@@ -73,6 +73,7 @@ class _StudyRun:
     def finish(self, target: Target) -> None:
         first = self.captures[self.study.exposures[0]].image
         figures.save_target(self.folder, self.study, target, first, self.evaluations)
+        figures.save_captures(self.folder, self.study, target, self.captures)
         found = self.evaluations.items()
         contrasts = {name: e.contrast for name, e in found if e.contrast is not None}
         metrics = {name: e.metrics for name, e in found}
