@@ -99,7 +99,11 @@ def test_quantity_of_any_registry_is_accepted():
         ("180", "length", '180 has no unit: write a length such as "180 mm"'),
         (0.5, "angle", '0.5 has no unit: write an angle such as "61.2 deg"'),
         (5e-4, "wavelength", '0.0005 has no unit: write a wavelength such as "500 nm"'),
-        ("1" * 5000, "length", '"' + "1" * 80 + '…" is not a length: write a length such'),
+        (
+            "1" * 5000,
+            "length",
+            '"' + "1" * 80 + '…" is not a length: write a length such as "180 mm"',
+        ),
         ("25", "curvature", '25 has no unit: write a curvature such as "25 rad/mm^2"'),
         ("25 s", "length", '"25 s" is a time, not a length: write a length such as "180 mm"'),
         ("2 deg", "length", '"2 deg" is an angle, not a length: write a length such as "180 mm"'),
@@ -145,7 +149,8 @@ def test_quantity_of_any_registry_is_accepted():
         (
             "180 mm",
             "width",
-            '\'width\' is not a kind of quantity: use one of "length", "angle", "curvature"',
+            "'width' is not a kind of quantity: "
+            'use one of "length", "wavelength", "angle", "curvature"',
         ),
     ],
 )

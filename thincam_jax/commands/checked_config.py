@@ -50,7 +50,7 @@ def check_as(
         return model.model_validate(raw)
     except pydantic.ValidationError as error:
         faults = [_fault(e, places, asked, top, model) for e in _own(error.errors())]
-        raise ConfigError("\n".join(_once(faults))) from None
+        raise ConfigError("\n".join(_once(faults, asked))) from None
 
 
 def dump_config(config: pydantic.BaseModel) -> str:
@@ -86,14 +86,15 @@ def _own(errors: list[Any]) -> list[Any]:
     ]
 
 
-def _once(faults: list[tuple[str, str, str]]) -> list[str]:
-    """A line for each fault; what one setting does to several entries is told of the first."""
-    lines: dict[tuple[str, str], list[str]] = {}
+def _once(faults: list[tuple[str, str, str]], asked: dict[tuple, str]) -> list[str]:
+    """A line for each fault; what one option does to several entries is told of the first."""
+    lines: dict[tuple[str, ...], list[str]] = {}
     for place, field, message in faults:
-        lines.setdefault((place, message), []).append(field)
+        one = (place, message) if place in asked.values() else (place, message, field)
+        lines.setdefault(one, []).append(field)
     return [
         f"{place}: {fields[0]}{f' and {len(fields) - 1} more' if fields[1:] else ''}: {message}"
-        for (place, message), fields in lines.items()
+        for (place, message, *_), fields in lines.items()
     ]
 
 

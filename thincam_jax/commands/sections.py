@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from typing import Annotated, Literal, TypeVar
 
 import pydantic
@@ -240,6 +241,13 @@ class TargetConfig(Section):
         return self
 
 
+@dataclass(frozen=True)
+class Places:
+    """Where the entries of a file come from, which makes no difference to what they are."""
+
+    find: Callable[[tuple], str] | None = field(default=None, compare=False)
+
+
 Own = TypeVar("Own", bound="ExperimentConfig")
 
 
@@ -252,16 +260,16 @@ class ExperimentConfig(Section):
     wavelength: Wavelength
     model: Model = "separable"
     pixel_integration: bool = True
-    _place: Callable[[tuple], str] | None = pydantic.PrivateAttr(default=None)
+    _places: Places = pydantic.PrivateAttr(default_factory=Places)
 
     def place_of(self, *location: str | int) -> str:
         """File and line of an entry, or the option that set it, with a colon; else nothing."""
-        return "" if self._place is None else f"{self._place(location)}: "
+        return "" if self._places.find is None else f"{self._places.find(location)}: "
 
-    def found_at(self: Own, place: Callable[[tuple], str]) -> Own:
-        """The same, told by `place` where its entries come from."""
+    def found_at(self: Own, find: Callable[[tuple], str]) -> Own:
+        """The same, told by `find` where its entries come from."""
         copy = self.model_copy()
-        copy._place = place
+        copy._places = Places(find)
         return copy
 
 

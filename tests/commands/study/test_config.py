@@ -105,7 +105,7 @@ FAULTS = {
     "no unit, exponent": ("width: 2 mm", "width: 1e-3", "mask.width", ["1e-3 has no unit"]),
     "wrong unit": ("pitch: 40 um", "pitch: 40 s", "sensor.pitch", ["a time, not a length"]),
     "unknown unit": ("pitch: 40 um", "pitch: 40 foo", "sensor.pitch", ['unknown unit "foo"', "nm"]),
-    "angle for a length": ("500 nm", "500 deg", "wavelength", ["an angle, not a length"]),
+    "angle for a length": ("500 nm", "500 deg", "wavelength", ["an angle, not a wavelength"]),
     "negative": (
         "width: 2 mm",
         "width: -2 mm",

@@ -81,6 +81,9 @@ def test_interrupt(file, tmp_path, monkeypatch, ended, told):
     assert result.stderr == f"thincam: interrupted; {told}. The same command goes on from there.\n"
 
 
+_TWO = "[{beta: 25 /mm^2, distance: 3 mm}, {beta: 20 /mm^2, distance: 3 mm}]"
+
+
 class TestExitCode2:
     @pytest.mark.parametrize(
         ("options", "part"),
@@ -93,7 +96,7 @@ class TestExitCode2:
             (("--grid", "mask.width=1:2:3 nms"), 'has the unknown unit "nms"'),
             # Of every entry that a * stands for, once.
             (
-                ("--grid", "methods.*.shots.*.*=7"),
+                ("--grid", "methods.*.shots.*.beta=7", "--set", f"methods.0.shots={_TWO}"),
                 "methods[0].shots[0].beta and 1 more: 7 has no unit",
             ),
             (("--grid", "seed=1", "--grid", "seed=2"), "seed is set by --grid seed=1 too"),

@@ -147,7 +147,7 @@ def check_study(study: Study, unread: dict[int, str] | None = None) -> None:
     known |= unread or {}
     place_of = study.config.place_of
     faults = [
-        f"{place_of('targets', number)}targets[{number}]: {fault}"
+        f"{place_of('targets', number, 'path')}targets[{number}]: {fault}"
         for number, fault in sorted(known.items())
         if fault
     ]

@@ -38,8 +38,9 @@ def sweep(
 ) -> None:
     """Run a study at every point of a grid.
 
-    Writes results.parquet, a row for each point. Points that fail are kept in failures.jsonl with
-    the reason. However a sweep ends, the same command goes on with the points that have no row.
+    Writes results.parquet and results.csv, a row for each point, and summary.png. Points that fail
+    are kept in failures.jsonl with the reason. However a sweep ends, the same command goes on with
+    the points that have no row.
     """
     ended = _Ended()
     with told(lambda: f"interrupted; {ended.told()}. The same command goes on from there."):
@@ -117,7 +118,7 @@ def _run(
 def _print(swept: Any, path: Path) -> None:
     table = f"{swept.rows} of {swept.points} points: {path / 'results.parquet'}"
     if swept.rows:
-        print(table)
+        print("\n".join([table, *swept.best]))
     if swept.failures:
         first = swept.failures[0]
         values = ", ".join(f"{name}={value}" for name, value in first["values"].items())

@@ -20,7 +20,8 @@ class SweepFolder:
     - `study.yaml`: the resolved configuration that every point begins from.
     - `points/KEY.parquet`: the row of a point that succeeded, `points/KEY.failed.json` why one
       failed; written when it ends. KEY stands for the point's configuration.
-    - `results.parquet`, `failures.jsonl`: those of the current grid, in its order.
+    - `results.parquet`, the same as `results.csv`, and `failures.jsonl`: those of the current grid,
+      in its order. `summary.png`: PSNR along its axes, of a sweep that has ended.
     """
 
     def __init__(self, path: str | Path):
@@ -49,8 +50,10 @@ class SweepFolder:
             write_whole(self._row(point), table.row_bytes(row))
             self._failure(point).unlink(missing_ok=True)
 
-    def collect(self, points: Sequence[GridPoint]) -> tuple[int, list[dict[str, Any]]]:
-        """Write the tables of what has ended; the number of rows, and the failures."""
+    def collect(
+        self, points: Sequence[GridPoint]
+    ) -> tuple[table.pa.Table | None, list[dict[str, Any]]]:
+        """Write the tables of what has ended; that of the rows, and the failures."""
         rows, failures = [], []
         for point in points:
             row = table.read_row(self._row(point))
@@ -58,15 +61,17 @@ class SweepFolder:
                 rows.append((point.values, row))
             elif self._failure(point).exists():
                 failures.append(json.loads(self._failure(point).read_text(encoding="utf-8")))
+        found = table.joined(rows) if rows else None
         for name, content in (
-            ("results.parquet", table.table_bytes(rows) if rows else None),
+            ("results.parquet", None if found is None else table.parquet_bytes(found)),
+            ("results.csv", None if found is None else table.csv_bytes(found)),
             ("failures.jsonl", "".join(json.dumps(f, ensure_ascii=False) + "\n" for f in failures)),
         ):
             if content:
                 write_whole(self.path / name, content)
             else:
                 (self.path / name).unlink(missing_ok=True)
-        return len(rows), failures
+        return found, failures
 
     def _row(self, point: GridPoint) -> Path:
         return self.path / "points" / f"{point.key}.parquet"

@@ -7,17 +7,19 @@ from typing import Any, NamedTuple
 from thincam_jax.commands.sweep.folder import SweepFolder
 from thincam_jax.commands.sweep.measure import Outcome, measure_point, one_line
 from thincam_jax.commands.sweep.point import GridPoint
+from thincam_jax.commands.sweep.summary import summarise
 from thincam_jax.commands.sweep.workers import Died, Outcomes, local_workers
 
 Progress = Callable[[int, int], object]
 
 
 class Swept(NamedTuple):
-    """How a sweep ended: points, rows of the table, and what is known of those that failed."""
+    """How a sweep ended: points, rows of the table, what failed, and the best points in words."""
 
     points: int
     rows: int
     failures: list[dict[str, Any]]
+    best: tuple[str, ...] = ()
 
 
 def run_sweep(
@@ -33,7 +35,7 @@ def run_sweep(
 
     Each point is written as it ends, by this process: workers need no access to the folder.
     `progress` is called with the numbers of points that have ended and that have failed. The tables
-    are written at the end, and on Ctrl-C, which is passed on.
+    are written at the end, and on Ctrl-C, which is passed on; the summary at the end only.
 
     **Errors**: ConfigError where the scheduler cannot be reached or goes away.
     """
@@ -49,8 +51,11 @@ def run_sweep(
                 for key, result in _tried_twice(outcomes, measure, runnable):
                     folder.keep(todo[key], count.ended(_outcome(result)))
     finally:
-        rows, failures = folder.collect(points)
-    return Swept(len(points), rows, failures)
+        table, failures = folder.collect(points)
+    if table is None:
+        return Swept(len(points), 0, failures)
+    best = summarise(folder.path, table, list(points[0].values))
+    return Swept(len(points), table.num_rows, failures, best)
 
 
 def connected(

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
+import pyarrow.csv
 import pyarrow.parquet as pq
 
 _PLAIN = ("point", "seconds")  # columns that are neither a swept value nor NAME/METHOD…
@@ -29,8 +30,8 @@ def read_row(path: Path) -> pa.Table | None:
         return None
 
 
-def table_bytes(rows: Sequence[tuple[dict[str, Any], pa.Table]]) -> bytes:
-    """A Parquet file of rows, each with its swept values.
+def joined(rows: Sequence[tuple[dict[str, Any], pa.Table]]) -> pa.Table:
+    """One table of rows, each with its swept values.
 
     The values are those given here: the row may have been written for a grid of other axes.
     """
@@ -42,7 +43,19 @@ def table_bytes(rows: Sequence[tuple[dict[str, Any], pa.Table]]) -> bytes:
         column = measured.column(name)
         # Nothing but missing values, as the PSNR of exact reconstructions: numbers all the same.
         columns[name] = column.cast(pa.float64()) if pa.types.is_null(column.type) else column
-    return _to_bytes(pa.table(columns))
+    return pa.table(columns)
+
+
+def parquet_bytes(table: pa.Table) -> bytes:
+    """A table as a Parquet file."""
+    return _to_bytes(table)
+
+
+def csv_bytes(table: pa.Table) -> bytes:
+    """A table as comma-separated values with a line of headings."""
+    sink = pa.BufferOutputStream()
+    pa.csv.write_csv(table, sink)
+    return sink.getvalue().to_pybytes()
 
 
 def _measured(row: pa.Table) -> list[str]:

@@ -1,0 +1,120 @@
+"""What a sweep found: the best points, and how the methods' PSNR goes along each axis."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from thincam_jax._core.files import write_whole
+from thincam_jax.commands.study.figures import as_png, line_style
+from thincam_jax.commands.sweep.point import told
+
+_MEASURE = "mean_psnr_db/"  # of each method, over all targets
+_MAPS = 4  # of methods, at most
+# Of the swept values that are numbers, by the last key of their path.
+_UNITS = {
+    **dict.fromkeys(("distance", "width", "pitch", "wavelength", "pixel_pitch"), "mm"),
+    **{"beta": "rad/mm²", "phases": "rad", "snr_db": "dB", "read_noise": "electrons"},
+}
+
+
+def summarise(folder: Path, table: pa.Table, axes: Sequence[str]) -> tuple[str, ...]:
+    """Write summary.png, and say in a line for each method where its mean PSNR is best.
+
+    `axes`: the columns of swept values. Nothing where no point has a PSNR.
+    """
+    rows = table.to_pylist()
+    methods = {
+        name.removeprefix(_MEASURE): name
+        for name in table.column_names
+        if name.startswith(_MEASURE) and any(row[name] is not None for row in rows)
+    }
+    if not methods:
+        return ()
+    write_whole(folder / "summary.png", as_png(_drawn(rows, axes, methods)))
+    best = []
+    for method, column in methods.items():
+        row = max((row for row in rows if row[column] is not None), key=lambda row: row[column])
+        at = told({path: row[path] for path in axes})
+        best.append(f"best mean PSNR of {method}: {row[column]:.2f} dB at {at}")
+    return tuple(best)
+
+
+def _drawn(rows: list[dict], axes: Sequence[str], methods: dict[str, str]) -> Figure:
+    """A panel of lines for each axis; of two axes also a map for each of the first methods."""
+    maps = list(methods.items())[:_MAPS] if len(axes) == 2 else []
+    count = len(axes) + len(maps)
+    columns = min(2, count)
+    figure = Figure(figsize=(5.6 * columns, 3.9 * -(-count // columns)), layout="constrained")
+    panels = list(figure.subplots(-(-count // columns), columns, squeeze=False).ravel())
+    for ax in panels[count:]:
+        ax.set_axis_off()
+    for ax, path in zip(panels, axes, strict=False):
+        _draw_lines(ax, rows, path, methods, alone=len(axes) == 1)
+    for ax, (method, column) in zip(panels[len(axes) :], maps, strict=False):
+        shown = _draw_map(ax, rows, axes[0], axes[1], column)
+        ax.set_title(method, fontsize=10, loc="left")
+        figure.colorbar(shown, ax=ax, label="mean PSNR (dB)")
+    return figure
+
+
+def _draw_lines(
+    ax: Axes, rows: list[dict], path: str, methods: dict[str, str], alone: bool
+) -> None:
+    """The mean over the other axes, and their range as bars."""
+    values, place = _values(rows, path)
+    for number, (method, column) in enumerate(methods.items()):
+        run = [row for row in rows if row[column] is not None]
+        groups = [[row[column] for row in run if row[path] == value] for value in values]
+        known = [n for n, group in enumerate(groups) if group]
+        means = np.array([np.mean(groups[n]) for n in known])
+        spread = [
+            means - [min(groups[n]) for n in known],
+            [max(groups[n]) for n in known] - means,
+        ]
+        style = line_style(number) | {"markersize": 5, "linewidth": 1.2, "capsize": 3}
+        ax.errorbar(place[known], means, None if alone else spread, label=method, **style)
+    ax.set(xlabel=_label(path), ylabel="mean PSNR of all targets (dB)")
+    if not alone:
+        ax.set_title("mean over the other axes; bars: their range", fontsize=9, loc="left")
+    _name_ticks(ax.xaxis, values, place)
+    ax.grid(alpha=0.3)
+    ax.legend(fontsize=8)
+
+
+def _draw_map(ax: Axes, rows: list[dict], across: str, up: str, column: str) -> Any:
+    xs, ys = (_values(rows, path)[0] for path in (across, up))
+    level = np.full((len(ys), len(xs)), np.nan)
+    for row in rows:
+        if row[column] is not None:
+            level[ys.index(row[up]), xs.index(row[across])] = row[column]
+    shown = ax.pcolormesh(np.arange(len(xs)), np.arange(len(ys)), level, cmap="cividis")
+    ax.set(xlabel=_label(across), ylabel=_label(up))
+    for axis, values in ((ax.xaxis, xs), (ax.yaxis, ys)):
+        axis.set_ticks(range(len(values)), [_short(value) for value in values])
+    return shown
+
+
+def _values(rows: list[dict], path: str) -> tuple[list[Any], np.ndarray]:
+    """The values of an axis in the grid's order, and where they are drawn."""
+    values = list(dict.fromkeys(row[path] for row in rows))
+    numbers = all(isinstance(v, int | float) and not isinstance(v, bool) for v in values)
+    return values, np.asarray(values if numbers else range(len(values)), float)
+
+
+def _name_ticks(axis: Any, values: list[Any], place: np.ndarray) -> None:
+    if any(isinstance(value, str) for value in values):
+        axis.set_ticks(place, [_short(value) for value in values])
+
+
+def _short(value: Any) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value)[:16]
+
+
+def _label(path: str) -> str:
+    unit = _UNITS.get(path.rpartition(".")[2])
+    return f"{path} ({unit})" if unit else path
