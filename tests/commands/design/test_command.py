@@ -11,6 +11,7 @@ from thincam_jax.commands.design import run as designs
 FOUND = {
     "reference": {"name": "pairs", "shots": [{"beta_rad_per_mm2": 25.0, "distance_mm": 3.0}]},
     "compare": [],
+    "objective": {"told": "predicted error over the scene's variance (dB)"},
     "found": [
         {
             "name": f"found {rank}",
@@ -64,11 +65,15 @@ def test_options_and_what_is_printed(file, asked, tmp_path):
     rows = [line for line in result.stdout.splitlines() if "│" in line]
     table = [[cell.strip() for cell in row.split("│")[1:-1]] for row in rows]
     assert table == [  # those that are simulated
-        ["pairs", "", "24.13", "–"],
+        ["pairs", "–", "–", "–"],
         ["β 25.00 at 3.00 mm", "", "", ""],
         ["found 1", "+0.19", "+0.46", "–"],
         ["β 17.13 at 2.50 mm", "", "", ""],
     ]
+    heading = [line.split("┃")[1:-1] for line in result.stdout.splitlines() if "┃" in line]
+    units = ["design", "gain, dB", "gain, dB", "gain, elements"]
+    assert [cell.strip() for cell in heading[1]] == units
+    assert "gains are over pairs, whose PSNR is: picture 24.13 dB\n" in result.stdout
     assert f"report: {out / 'report.html'}" in result.stdout
     assert result.stderr == ""
 

@@ -76,7 +76,8 @@ def test_what_is_written(whole):
     assert len(texts) == texts.total == 6
     assert {p.name for p in path.iterdir()} == {
         *("config.yaml", "found.yaml", "design.json", "environment.json", "report.html"),
-        *("landscape.png", "responses.png", "mtf.png", "targets"),
+        *("landscape.png", "responses.png", "mtf.png", "masks.png", "targets"),
+        *("reconstructions-chart.png", "reconstructions-picture.png"),
     }
     assert skimage.io.imread(path / "landscape.png").shape[:2] == (660, 836)
     assert design["seed"] == 3
@@ -116,7 +117,7 @@ def test_found_study_gives_the_first_seed(whole):
 def test_report_stands_alone(whole):
     config, path, design, _ = whole
     page = (path / "report.html").read_text("utf-8")
-    assert page.count("data:image/png;base64,") == 3
+    assert page.count("data:image/png;base64,") == 6
     assert "A tiny design" in page
     psnr = design["validation"]["methods"]["pairs"]["picture"]["psnr_db"]
     assert f"{psnr['mean']:.2f} ± {psnr['deviation']:.2f}" in page
@@ -152,11 +153,11 @@ def test_interrupted_design_goes_on(whole, again, monkeypatch):
     """The finished target is not simulated again, and the figures are those of a whole run."""
     simulate, simulated = running.simulate, []
 
-    def one_only(study, target, seeds):
+    def one_only(study, target, *more):
         if simulated:
             raise KeyboardInterrupt
         simulated.append(target.name)
-        return simulate(study, target, seeds)
+        return simulate(study, target, *more)
 
     def interrupted():
         with pytest.raises(KeyboardInterrupt):
@@ -413,6 +414,10 @@ def test_sentences_of_the_report(whole):
     told = " ".join(findings(design))
     assert "Simulated, found 1 gains" in told
     assert "not on one grid" not in told
+    chart = design["validation"]["methods"]["found 1"]["chart"]
+    chart |= {"gain_elements": {"mean": 0, "deviation": None}}
+    chart |= {"gain_db": {"mean": -1.06, "deviation": None}}
+    assert "at -1.06 dB (28 % more squared error)" in " ".join(findings(design))
     design["validation"]["one_object_grid"] = False
     design["reference"]["broken_limits"] = ["β of shot 1 is too much"]
     design["found"][0]["active_limits"] = ["beta ≤ 9"]

@@ -45,28 +45,30 @@ def _print(found: dict) -> None:
     validation = found["validation"]
     designs = (found["reference"], *found["compare"], *found["found"])
     names = told_of(designs)
-    table = rich.table.Table("design", "predicted", show_lines=True)
+    unit = found["objective"]["told"].rpartition("(")[2].rstrip(")")
+    table = rich.table.Table("design", show_lines=True)
+    table.add_column(f"predicted\ngain, {unit}", justify="right")
     for target in validation["pictures"]:
-        table.add_column(f"{target}\ndB", justify="right")
+        table.add_column(f"{target}\ngain, dB", justify="right")
     for target in validation["charts"]:
-        table.add_column(f"{target}\nelements", justify="right")
+        table.add_column(f"{target}\ngain, elements", justify="right")
     for one in designs:
         simulated = validation["methods"].get(one["name"])
         if simulated is None:
             continue
         table.add_row(
             "\n".join([one["name"], *in_words(one, names)]),
-            f"{one['predicted_gain']:+.2f}" if "predicted_gain" in one else "",
+            f"{one['predicted_gain']:+.2f}" if "predicted_gain" in one else "–",
             *(_gain(simulated[name], "gain_db") for name in validation["pictures"]),
             *(_gain(simulated[name], "gain_elements") for name in validation["charts"]),
         )
     rich.print(table)
+    name = found["reference"]["name"]
+    levels = {t: validation["methods"][name][t]["psnr_db"] for t in validation["pictures"]}
+    known = [f"{target} {psnr['mean']:.2f} dB" for target, psnr in levels.items() if psnr]
+    print(f"gains are over {name}, whose PSNR is: {', '.join(known) or 'that of exact images'}")
 
 
 def _gain(simulated: dict, key: str) -> str:
-    """The gain; for the reference, its own PSNR."""
-    if key in simulated:
-        gain = simulated[key]
-        return f"{gain['mean']:+.2f}" if gain else "–"
-    psnr = simulated["psnr_db"] if key == "gain_db" else None
-    return f"{psnr['mean']:.2f}" if psnr else "–"
+    gain = simulated.get(key)
+    return f"{gain['mean']:+.2f}" if gain else "–"

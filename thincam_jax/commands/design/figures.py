@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.ticker import FixedLocator, NullLocator
 
+from thincam_jax._core.grids import Grid
 from thincam_jax.commands.design.problem import DesignObjective, Shot, phases_of
 from thincam_jax.commands.design.ranking import Candidate, FoundDesigns
 from thincam_jax.commands.design.record import COSTS
@@ -18,6 +19,7 @@ from thincam_jax.commands.design.transfer import Transfer
 from thincam_jax.commands.design.words import QUANTITIES, first, free_number
 from thincam_jax.commands.study.figures import as_png as as_png
 from thincam_jax.commands.study.figures import line_style
+from thincam_jax.commands.study.study import Study
 
 _ROOM = 0.06  # around points, as a part of an axis
 _SHADED = 85  # per cent of the landscape that the shades tell apart; the worst is one shade
@@ -45,6 +47,34 @@ class _DrawnLandscape(NamedTuple):
         if value is None:
             return one.name
         return f"{one.name} ({float(self.objective.told(value)):.2f} {self.objective.unit})"
+
+
+_MASK_SAMPLES = 600  # along a side of a drawn mask
+
+
+def draw_masks(study: Study, best: str) -> Figure:
+    """The first mask of each shot and its PSF, of the reference and of the best design, in rows."""
+    methods = [study.methods[0], next(m for m in study.methods if m.name == best)]
+    shots = max(len(method.shots) for method in methods)
+    figure = Figure(figsize=(5.2 * shots, 6.2), layout="constrained")
+    rows = figure.subplots(2, 2 * shots, squeeze=False)
+    for axes, method in zip(rows, methods, strict=True):
+        for ax in axes:
+            ax.set_axis_off()
+        for ax, beside, shot in zip(axes[::2], axes[1::2], method.shots, strict=False):
+            camera, half = study.camera(shot), shot.width / 2
+            grid = Grid((_MASK_SAMPLES,) * 2, shot.width / _MASK_SAMPLES)
+            mask = np.abs(np.asarray(camera.mask.sample(grid)))
+            ax.imshow(mask, cmap="gray", vmin=0, vmax=1, extent=(-half, half, half, -half))
+            h = np.asarray(study.psf(shot))
+            y, x = (n * study.sensor.pitch / 2 for n in h.shape)
+            beside.imshow(h, cmap="gray", extent=(-x, x, y, -y))
+            for drawn, what in ((ax, "mask"), (beside, "its PSF")):
+                drawn.set_axis_on()
+                drawn.set_xlabel("x (mm)")
+                drawn.set_title(f"{method.name}, {what}", fontsize=9)
+            ax.set_ylabel(f"β {shot.beta:.4g} rad/mm² at {shot.distance:.3g} mm\ny (mm)")
+    return figure
 
 
 def draw_landscape(result: FoundDesigns, count: int) -> Figure | None:

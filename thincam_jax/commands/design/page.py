@@ -2,6 +2,7 @@
 
 from typing import Any
 
+from thincam_jax.commands.config_file import slug
 from thincam_jax.commands.design.config import DesignConfig
 from thincam_jax.commands.design.record import COSTS
 from thincam_jax.commands.design.words import (
@@ -30,6 +31,7 @@ def render(
         "reference": [of_shots(design["reference"], *one) for one in free],
         "numbers": [[found_number(v) for v in one["values"]] for one in design["found"]],
         "validated": list(design["validation"]["methods"]),
+        "slug": slug,
         "unit": _unit(design),
         "findings": findings(design),
         "fronts": fronts(design),
@@ -60,7 +62,7 @@ def findings(design: dict[str, Any]) -> list[str]:
     validation = design["validation"]
     for name, targets in validation["methods"].items():
         gains = [
-            f"{_spread(t['gain_db'], 2)} dB on {target}"
+            f"{_worth(t['gain_db'])} on {target}"
             for target, t in targets.items()
             if target in validation["pictures"] and t.get("gain_db")
         ]
@@ -69,9 +71,7 @@ def findings(design: dict[str, Any]) -> list[str]:
         for target, found in targets.items():
             if target in validation["charts"] and found.get("gain_elements"):
                 steps = _spread(found["gain_elements"], 1)
-                psnr = (
-                    f"{_spread(found['gain_db'], 2)} dB" if found["gain_db"] else "an exact image"
-                )
+                psnr = _worth(found["gain_db"]) if found["gain_db"] else "an exact image"
                 sentences.append(f"On {target}, {name} resolves {steps} elements more, at {psnr}.")
     if not validation["one_object_grid"]:
         sentences.append(
@@ -143,6 +143,13 @@ def _front(name: str, front: dict[str, Any], reference: str) -> dict[str, Any]:
 
 def _cost(value: float | int) -> str:
     return f"{value:.0f}" if value >= 1000 else f"{value:.4g}"
+
+
+def _worth(gain: dict[str, Any]) -> str:
+    """A gain of PSNR, and what it does to the error: "−1.06 dB (28 % more squared error)"."""
+    change = 100 * (10 ** (-gain["mean"] / 10) - 1)
+    word = "more" if change > 0 else "less"
+    return f"{_spread(gain, 2)} dB ({abs(change):.0f} % {word} squared error)"
 
 
 def _spread(spread: dict[str, Any], digits: int) -> str:

@@ -5,6 +5,7 @@ from functools import cached_property, partial
 from typing import Any
 
 from thincam_jax.commands.checked_config import dump_config
+from thincam_jax.commands.config_file import slug
 from thincam_jax.commands.design import figures
 from thincam_jax.commands.design.config import DesignConfig
 from thincam_jax.commands.design.page import render
@@ -19,6 +20,8 @@ from thincam_jax.commands.design.simulation import (
     with_designs,
 )
 from thincam_jax.commands.run_folder import Progress, RunFolder, Step, carry_out
+from thincam_jax.commands.study.evaluate import Evaluation
+from thincam_jax.commands.study.figures import draw_found
 from thincam_jax.commands.study.study import Study, Target
 
 
@@ -28,8 +31,9 @@ class DesignFolder(RunFolder):
     - `config.yaml`: the resolved configuration.
     - `found.yaml`: the reference and the best designs, for `thincam run`.
     - `targets/NAME.json`: the simulation of a finished target; an interrupted design skips these.
-    - `landscape.png`, `training.png`, `responses.png`, `mtf.png`, `pareto.png`, `environment.json`,
-      `report.html`, `design.json`: written at the end.
+    - `reconstructions-NAME.png`: of the scene of a target, written with its simulation.
+    - `masks.png`, `landscape.png`, `training.png`, `responses.png`, `mtf.png`, `pareto.png`,
+      `environment.json`, `report.html`, `design.json`: written at the end.
     """
 
     kind, folders, result = "design", ("targets",), "design.json"
@@ -79,7 +83,11 @@ class _DesignRun:
         designs = [[list(e) for e in method.exposures] for method in self.simulated.methods]
         stored = self.folder.finished(target.name)
         if stored is None or stored["designs"] != designs:
-            trials = simulate(self.simulated, target, self.config.validation.seeds)
+            shown: dict[str, Evaluation] = {}
+            trials = simulate(self.simulated, target, self.config.validation.seeds, shown)
+            figure, *_ = draw_found(target, shown)
+            name = f"reconstructions-{slug(target.name)}.png"
+            self.folder.write(name, figures.as_png(figure))
             stored = {"designs": designs, "trials": trials}
             self.folder.finish(target.name, stored)
         self.trials[target.name] = stored["trials"]
@@ -91,6 +99,7 @@ class _DesignRun:
             self.design["pareto"] = record_fronts(self.config, self.fronts.result())
         count, distance = self.config.validation.best, self.config.object.distance
         pictures = {
+            "masks.png": figures.draw_masks(self.simulated, result.found[0].name),
             "landscape.png": figures.draw_landscape(result, count),
             "training.png": figures.draw_training(result, count),
             "responses.png": figures.draw_responses(result, count, self.config.sensor.pitch),

@@ -16,7 +16,7 @@ from thincam_jax.commands.design.problem import phases_of
 from thincam_jax.commands.sections import MaskConfig, MethodConfig, SensorConfig, ShotConfig
 from thincam_jax.commands.study import build
 from thincam_jax.commands.study.config import StudyConfig
-from thincam_jax.commands.study.evaluate import evaluate
+from thincam_jax.commands.study.evaluate import Evaluation, evaluate
 from thincam_jax.commands.study.study import Exposure, Method, Study, Target
 from thincam_jax.design import Design
 
@@ -129,10 +129,13 @@ def _method_config(config: DesignConfig, method: Method) -> MethodConfig:
     )
 
 
-def simulate(study: Study, target: Target, seeds: int) -> Trials:
+def simulate(
+    study: Study, target: Target, seeds: int, shown: dict[str, Evaluation] | None = None
+) -> Trials:
     """Every method on one target; captures without noise are computed once.
 
-    The first seed is the study's own, so that `thincam run` gives the same.
+    `shown` is given the reconstructions of the first seed. That is the study's own, so that
+    `thincam run` gives the same.
     """
     clean: dict[Exposure, Array] = {}
     trials: Trials = {}
@@ -149,6 +152,8 @@ def simulate(study: Study, target: Target, seeds: int) -> Trials:
             ]
             found = evaluate(method, target, reconstructor(*build.stacked(captures)))
             trials[method.name].append(found.metrics)
+            if shown is not None:
+                shown.setdefault(method.name, found)
         later = {exposure for m in study.methods[number + 1 :] for exposure in m.exposures}
         clean = {exposure: image for exposure, image in clean.items() if exposure in later}
     return trials

@@ -5,6 +5,7 @@ import math
 
 import numpy as np
 import PIL.Image
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from thincam_jax.commands.config_file import slug
@@ -58,23 +59,40 @@ def save_target(
     evaluations: dict[str, Evaluation],
 ) -> None:
     """A target's scene, one raw capture and all reconstructions, whole and enlarged."""
-    truth = list(evaluations.values())[-1].truth
-    save_image(folder, f"{slug(target.name)}--scene", truth)
-    raw = as_picture(capture / capture.max())
-    panels = [("scene", truth, "")]
+    save_image(folder, f"{slug(target.name)}--scene", _truth(evaluations))
     for name, evaluation in evaluations.items():
         save_image(folder, f"{slug(target.name)}--{slug(name)}", evaluation.image)
-        panels.append((name, evaluation.image, _caption(evaluation)))
-    figure, wholes, details = _pairs_of_axes(len(panels) + 1, truth.shape[0] / truth.shape[1])
-    _show(wholes[0], raw, "first raw capture")
-    _show_detail_of_capture(details[0], raw, study)
-    for ax, detail, (name, image, caption) in zip(wholes[1:], details[1:], panels, strict=True):
+    figure, whole, detail = draw_found(target, evaluations, with_capture=True)
+    raw = as_picture(capture / capture.max())
+    _show(whole, raw, "first raw capture")
+    _show_detail_of_capture(detail, raw, study)
+    # No target's name can be taken for one of the study's own figures.
+    save_figure(folder, f"target-{slug(target.name)}", figure)
+
+
+def _truth(evaluations: dict[str, Evaluation]) -> np.ndarray:
+    return list(evaluations.values())[-1].truth
+
+
+def draw_found(
+    target: Target, evaluations: dict[str, Evaluation], *, with_capture: bool = False
+) -> tuple[Figure, Axes, Axes]:
+    """A target's scene and its reconstructions, whole and enlarged, and the first two axes.
+
+    These are left free for a capture, where there is to be one.
+    """
+    truth = _truth(evaluations)
+    panels = [("scene", truth, "")]
+    panels += [(name, one.image, _caption(one)) for name, one in evaluations.items()]
+    first, aspect = int(with_capture), truth.shape[0] / truth.shape[1]
+    figure, wholes, details = _pairs_of_axes(first + len(panels), aspect)
+    axes = zip(wholes[first:], details[first:], panels, strict=True)
+    for ax, detail, (name, image, caption) in axes:
         _show(ax, image, f"{name}\n{caption}" if caption else name)
         part, label = _detail(image, target)
         _show(detail, part, "")
         detail.set_xlabel(label, fontsize=9)
-    # No target's name can be taken for one of the study's own figures.
-    save_figure(folder, f"target-{slug(target.name)}", figure)
+    return figure, wholes[0], details[0]
 
 
 def save_captures(
