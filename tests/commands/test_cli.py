@@ -14,7 +14,7 @@ from commands.study import tiny
 from typer.testing import CliRunner
 
 from helpers import ROOT
-from thincam_jax.commands import cli, doctor
+from thincam_jax.commands import cli, doctor, help
 from thincam_jax.commands.accuracy import run as benches
 from thincam_jax.commands.cache import cache_state
 from thincam_jax.commands.examples import kinds
@@ -367,6 +367,8 @@ def test_doctor():
     lines = result.stdout.splitlines()
     assert f"Python {found['python']} on {found['platform']}" in lines
     assert "devices: " + ", ".join(found["devices"]) in lines
+    assert any(line.startswith(f"cores: {doctor.usable_cores()}; memory: ") for line in lines)
+    assert f"optional hypothesis {version('hypothesis')}" in lines
     assert "  float64: yes" in lines
     assert "  compiled sums: right" in lines
     assert f"jax {found['versions']['jax']}" in lines
@@ -395,6 +397,23 @@ def test_help(arguments, parts):
     assert result.exit_code == 0
     for part in parts:
         assert part in result.stdout
+
+
+def test_help_is_in_the_order_of_use():
+    listed = call("--help").stdout.partition("Commands:")[2].splitlines()
+    assert [line.split()[0] for line in listed if line] == list(help.ORDER)
+    text = call("reconstruct", "--help").stdout
+    titles = ("Options:", *(f"{group}:" for group in help.GROUPS), "Examples:")
+    assert [line.strip() for line in text.splitlines() if line.strip() in titles] == list(titles)
+    assert text.index("--psf ") < text.index("Calibration:") < text.index("--dead")
+    for command in help.ORDER[:5]:
+        assert f"Examples:\n    thincam {command} " in call(command, "--help").stdout
+
+
+def test_every_page_is_in_the_index():
+    pages = {page.name for page in (ROOT / "docs").glob("*.md")} - {"index.md"}
+    text = (ROOT / "docs" / "index.md").read_text("utf-8")
+    assert [page for page in sorted(pages) if f"({page})" not in text] == []
 
 
 def test_version():

@@ -12,17 +12,40 @@ from thincam_jax.commands.accuracy.command import accuracy
 from thincam_jax.commands.cache import cache_state, keep_programs
 from thincam_jax.commands.design.command import design
 from thincam_jax.commands.examples import init
+from thincam_jax.commands.help import Grouped, InOrder, examples_text
 from thincam_jax.commands.photo.command import reconstruct
 from thincam_jax.commands.start import main
 from thincam_jax.commands.study.command import run
 from thincam_jax.commands.sweep.command import sweep
 
 # Help without colours and boxes, which take longer than all the rest of it.
-app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False, rich_markup_mode=None)
+app = typer.Typer(
+    no_args_is_help=True, pretty_exceptions_enable=False, rich_markup_mode=None, cls=InOrder
+)
 bench = typer.Typer(no_args_is_help=True, help="Measure what the models of a study cost.")
-bench.command()(accuracy)
-for command in (init, run, reconstruct, sweep, design):
-    app.command()(command)
+bench.command(
+    epilog=examples_text("thincam bench accuracy study.yaml --size 64 --size 128"),
+)(accuracy)
+app.command(epilog=examples_text("thincam init study", "thincam init design --out mine.yaml"))(init)
+app.command(
+    epilog=examples_text("thincam run study.yaml", "thincam run study.yaml --set noise.snr_db=40"),
+)(run)
+app.command(
+    cls=Grouped,
+    epilog=examples_text(
+        "thincam reconstruct --psf PSF.tif --capture RAW.tif --downsample 4 --out IMAGE.png",
+        "thincam reconstruct --psf PSF.png --capture CAPTURES --background DARK.png --out IMAGES",
+    ),
+)(reconstruct)
+app.command(
+    epilog=examples_text(
+        "thincam sweep study.yaml --grid seed=0:4:5",
+        'thincam sweep study.yaml --grid "methods.*.shots.*.beta=15:30:4 rad/mm^2"',
+    ),
+)(sweep)
+app.command(
+    epilog=examples_text("thincam design design.yaml", "thincam design design.yaml --out found"),
+)(design)
 app.add_typer(bench, name="bench")
 
 
@@ -65,12 +88,15 @@ def doctor() -> None:
     found = doctoring.environment()
     print(f"Python {found['python']} on {found['platform']}")
     print("devices: " + ", ".join(found["devices"]))
+    print(f"cores: {found['cores']}; memory: {found['memory']} free")
     for name, support in doctoring.dtype_support().items():
         print(f"  {name}: {support}")
     print(f"  compiled sums: {doctoring.compiled_sums()}")
     print(f"compiled programs: {cache_state()}")
     for name, version in found["versions"].items():
         print(f"{name} {version or 'NOT INSTALLED'}")
+    for name, version in doctoring.optional_versions().items():
+        print(f"optional {name} {version}")
     for name, purpose in doctoring.missing_parts().items():
         print(f"optional {name} is missing: {purpose}")
 

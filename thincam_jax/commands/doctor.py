@@ -1,5 +1,6 @@
 """What a run or a bug report needs to know of the installation."""
 
+import contextlib
 import os
 import platform
 import sys
@@ -10,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from thincam_jax._core.memory import available_bytes, readable
 from thincam_jax._core.precision import product
 
 PACKAGES = (
@@ -38,6 +40,8 @@ def environment(seconds: float | None = None) -> dict[str, Any]:
         "python": platform.python_version(),
         "platform": f"{platform.system()} {platform.machine()}",
         "devices": [str(d) for d in jax.devices()],
+        "cores": usable_cores(),
+        "memory": "size not known" if (free := available_bytes()) is None else readable(free),
         "precision": str(jnp.zeros(()).dtype),
         "versions": versions,
         "command": ["thincam", *sys.argv[1:]],
@@ -95,12 +99,16 @@ def _of_channels(response, capture, noise):
     return (response / noise * capture).sum(1) / ((response**2 / noise).sum(1) + 1)
 
 
+def optional_versions() -> dict[str, str]:
+    """Of the optional packages that are installed."""
+    found = {}
+    for name in OPTIONAL:
+        with contextlib.suppress(metadata.PackageNotFoundError):
+            found[name] = metadata.version(name)
+    return found
+
+
 def missing_parts() -> dict[str, str]:
     """Optional packages that are not installed, and what they are for."""
-    missing = {}
-    for name, purpose in OPTIONAL.items():
-        try:
-            metadata.version(name)
-        except metadata.PackageNotFoundError:
-            missing[name] = purpose
-    return missing
+    found = optional_versions()
+    return {name: purpose for name, purpose in OPTIONAL.items() if name not in found}

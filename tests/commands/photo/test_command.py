@@ -317,7 +317,7 @@ class TestExitCode2:
     @pytest.mark.parametrize(
         ("out", "message"),
         [
-            ("no/image.png", "no: is no folder; make it"),
+            ("psf.tif/image.png", "psf.tif: is no folder; give another"),
             ("image.jpg", "give one of these suffixes"),
             ("image", "give one of these suffixes"),
             ("psf.tif", "psf.tif: is read as an input and would be overwritten"),

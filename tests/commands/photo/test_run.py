@@ -148,7 +148,7 @@ def test_all_saturated(folder, tmp_path):
     planned = plan_jobs(folder / "first.tif", sources(folder), output)
     low = sources(folder, preparation=Preparation(saturation=1e-3))
     (result,) = run_jobs(planned, low, SHORT, output)
-    assert isinstance(result, Failed) and "without any valid pixel" in str(result.error)
+    assert isinstance(result, Failed) and "without a trusted pixel" in str(result.error)
 
 
 class TestPlan:
@@ -162,6 +162,7 @@ class TestPlan:
         names = [path.relative_to(tmp_path).as_posix() for path in planned[0].images]
         assert names == ["out/first.png", "out/first.tif"]
         assert not (tmp_path / "out").exists()
+        plan_jobs(folder, sources(folder), Output(tmp_path / "more" / "out"))  # can be made
 
     def test_folder_for_one_capture(self, folder, tmp_path):
         (job,) = plan_jobs(folder / "second.tif", sources(folder), Output(tmp_path))
@@ -173,7 +174,7 @@ class TestPlan:
             ("captures", "holds the captures"),
             ("captures/../captures", "holds the captures"),
             ("file.png", "is a file; for a folder of captures give a folder"),
-            ("no/out", "no: is no folder; make it"),
+            ("file.png/out", "file.png: is no folder; give another"),
         ],
     )
     def test_output_of_a_folder(self, folder, tmp_path, out, message):

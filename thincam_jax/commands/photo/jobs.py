@@ -49,14 +49,14 @@ def plan_jobs(capture: Path, sources: Sources, output: Output) -> list[Job]:
     names = [output.path if folder != output.path else folder / f"{c.stem}.png" for c in captures]
     jobs = [Job(c, _images(n, output)) for c, n in zip(captures, names, strict=True)]
     _check_names(jobs, sources)
-    _check_writable(folder, create=batch)
+    _check_writable(folder)
     return jobs
 
 
 def write_job(job: Job, image: np.ndarray, record: dict[str, Any], output: Output) -> None:
     """All files of a job, complete before the first of them takes its name; the record first."""
     folder = job.record.parent
-    folder.mkdir(exist_ok=True)
+    folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=".thincam-", dir=folder) as staging:
         for path in job.images:
             write_image(
@@ -121,11 +121,11 @@ def _check_names(jobs: list[Job], sources: Sources) -> None:
             )
 
 
-def _check_writable(folder: Path, *, create: bool) -> None:
-    """Try it, for what the system says of permissions is not the whole truth."""
-    tried = folder.parent if create and not folder.exists() else folder
+def _check_writable(folder: Path) -> None:
+    """Try it, or what is to hold it: what the system says of permissions is not the whole truth."""
+    tried = next(path for path in (folder, *folder.absolute().parents) if path.exists())
     if not tried.is_dir():
-        raise MeasurementError(f"{tried}: is no folder; make it, or give another output")
+        raise MeasurementError(f"{tried}: is no folder; give another output")
     try:
         with tempfile.TemporaryDirectory(prefix=".thincam-", dir=tried):
             pass
