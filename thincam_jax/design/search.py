@@ -114,9 +114,9 @@ def find_designs(
     found = ranked(space, ended, apart)
     if exact is None or not found:
         return Search(found, used, failed)
-    starts = np.stack([*(one.point for one in found), points[chosen[0]]])
-    found, more = _improved(objective, space, exact, starts, [one.status for one in found])
-    return Search(without_repeats(found, apart), used + more, failed)
+    begun = np.stack([*(one.point for one in found), points[chosen[0]]])
+    better, more = _improved(objective, space, exact, begun, [one.status for one in found])
+    return Search(without_repeats(better, apart), used + more, failed)
 
 
 # How many optima are improved on the exact objective, and how: from the best of so many even

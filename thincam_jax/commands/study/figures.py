@@ -200,7 +200,7 @@ def save_responses(folder: RunFolder, study: Study, responses: dict[str, Respons
         ax.axvspan(nyquist, end, color="#d8d8d8", linewidth=0)
         limits = response.metrics
         zero, cut = limits["first_zero_cycles_per_mm"], limits["cut_off_cycles_per_mm"]
-        stated = {published.get(own) for own in name.split("; ")} - {None}
+        stated = {limit for own in name.split("; ") if (limit := published.get(own))}
         marks = [("first zero", zero, ":"), ("cut-off", cut, "--"), ("Nyquist", nyquist, "-")]
         marks += [("published limit", limit, "-.") for limit in sorted(stated)]
         for what, at, dash in marks:

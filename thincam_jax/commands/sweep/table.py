@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
-import pyarrow.csv
 import pyarrow.parquet as pq
+from pyarrow import csv
 
 _PLAIN = ("point", "seconds")  # columns that are neither a swept value nor NAME/METHOD…
 
@@ -54,7 +54,7 @@ def parquet_bytes(table: pa.Table) -> bytes:
 def csv_bytes(table: pa.Table) -> bytes:
     """A table as comma-separated values with a line of headings."""
     sink = pa.BufferOutputStream()
-    pa.csv.write_csv(table, sink)
+    csv.write_csv(table, sink)
     return sink.getvalue().to_pybytes()
 
 
