@@ -4,10 +4,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.ndimage
 
 from helpers import count_traces
 from thincam_jax.reconstruction.noise import estimate_noise, estimate_variance
 
+compiled = jax.jit(estimate_noise)
 RNG = np.random.default_rng(9)
 
 
@@ -24,21 +26,71 @@ def test_white_noise_is_measured_without_bias(shape):
         assert np.abs(estimates / 0.7 - 1).max() < 0.2
 
 
+def disc_capture(black, peak, electrons, read, bits):
+    """Counts of a disc behind a diffuser, and the root mean square of their noise."""
+    random, (y, x) = np.random.default_rng(3), np.ogrid[-47.5:48, -63.5:64]
+    radius = {0.0: 200, 0.6: 38, 0.9: 19}[black]  # of what the light reaches, pixels
+    grain = scipy.ndimage.gaussian_filter(random.normal(size=(96, 128)), 5)
+    light = np.clip(1 - np.hypot(y, x) / radius, 0, 0.7) * (1 + 0.3 * grain / grain.std()).clip(0.1)
+    light *= peak / light.max()
+    counts = random.poisson(light * electrons) / electrons if electrons else light
+    counts = counts + read * random.normal(size=light.shape)
+    counts = np.clip(np.round(counts), 0, 2**bits - 1) if bits else counts
+    return counts, (counts - light).std()
+
+
+@pytest.mark.parametrize("black", [0.0, 0.6, 0.9])
+@pytest.mark.parametrize(
+    ("peak", "electrons", "read", "bits"),
+    [
+        (1000, 0, 10, None),
+        (1000, 0.5, 1, None),
+        (12, 8, 0, 8),
+        (60, 8, 0, 8),
+        (200, 8, 0.5, 8),
+        (200, 0, 2, 8),
+        (800, 2, 0.5, 10),
+        (800, 0, 4, 10),
+        (3200, 0.5, 0.5, 12),
+        (3200, 0, 20, 12),
+    ],
+)
+def test_noise_is_found_whatever_is_black(black, peak, electrons, read, bits):
+    """Within 20 % of the true one, of light and of the electronics, black to the last count or not.
+
+    Also of counts less a background that is no whole number, in parts of the brightest.
+    """
+    counts, true = disc_capture(black, peak, electrons, read, bits)
+    if bits and not read:
+        assert np.mean(counts == 0) == pytest.approx(black, abs=0.1)
+    assert float(compiled(jnp.asarray(counts, jnp.float32))) == pytest.approx(true, rel=0.2)
+    if bits and not read:
+        prepared = jnp.asarray(np.maximum(counts - 0.37, 0) / peak, jnp.float32)
+        assert peak * float(compiled(prepared)) == pytest.approx(true, rel=0.2)
+
+
 def test_outliers_do_not_count():
-    """Dead pixels, 5 % of them, move a median little and a standard deviation much."""
+    """Dead pixels, 2 % of them, move a median little and a standard deviation much."""
     noise = RNG.normal(size=(200, 201))
-    dead = RNG.uniform(size=noise.shape) < 0.05
+    dead = RNG.uniform(size=noise.shape) < 0.02
     value = float(estimate_noise(jnp.asarray(np.where(dead, 1e4, noise))))
     assert value == pytest.approx(1.0, rel=0.3)
+    assert float(estimate_noise(jnp.asarray(noise), jnp.asarray(~dead))) < 1.05
 
 
-def test_what_is_even_or_a_ramp_has_none():
+def test_what_is_even_has_none_and_a_ramp_of_counts_that_of_rounding():
     y, x = np.arange(12.0)[:, None], np.arange(17.0)
-    for image in (np.full((12, 17), 3.0), 2 * y - 5 * x, y**2 + np.abs(x - 4)):
-        assert float(estimate_noise(jnp.asarray(image))) == 0.0
-    # a checkerboard is nothing but detail: |4a| / (2·0.6745)
-    board = 0.5 * (-1.0) ** (y + x)
-    assert float(estimate_noise(jnp.asarray(board))) == pytest.approx(2.0 / (2 * 0.6745))
+    assert float(estimate_noise(jnp.full((12, 17), 3.0))) == 0.0
+    for image in (2 * y - 5 * x, y**2 + np.abs(x - 4)):
+        assert float(estimate_noise(jnp.asarray(image))) == pytest.approx(1 / 12**0.5)
+
+
+def test_saturated_pixels_do_not_count():
+    counts, true = disc_capture(0.0, 400, 8, 0, 11)
+    full = np.minimum(counts, 255)
+    assert 0.1 < np.mean(full == 255) < 0.5
+    found = float(compiled(jnp.asarray(full, jnp.float32)))
+    assert 0.5 * true < found < true  # of what is darker
 
 
 @pytest.mark.parametrize("factor", [1e-12, 1e12])

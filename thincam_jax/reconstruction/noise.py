@@ -1,41 +1,129 @@
 """How noisy a capture is, from the capture alone."""
 
+import math
 from collections.abc import Sequence
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from thincam_jax._core import checks
+
+# Classes of brightness of a photon-transfer curve, and the least details of one.
+_CLASSES, _LEAST = 32, 64
+_AT_ENDS = 3  # pixels of a detail that may be as dark, or as bright, as any of the capture
+_ENOUGH = 1 << 16  # details, of larger captures
+_MEDIAN = 0.6745  # of |x|, if x is normal with standard deviation 1
 
 
 def estimate_noise(
     capture: Float[Array, "*batch y x"], valid: Bool[Array, "*batch y x"] | None = None
 ) -> Float[Array, "*batch"]:
-    r"""Standard deviation of white noise in an image, from its finest diagonal detail.
+    r"""Root mean square of the noise of a capture, from its finest detail.
 
-    .. math:: \sigma = \mathrm{median}\,|g_{00} - g_{01} - g_{10} + g_{11}| / (2 \cdot 0.6745)
+    The detail is the second difference along both axes,
 
-    over 2×2 blocks (Donoho and Johnstone, Biometrika 81, 425, 1994, with the Haar wavelet). A
-    lensless capture is smooth at this scale; where fringes are as fine as pixels the estimate is
-    too high. Blocks with a pixel that is not `valid` do not count. It is 0 where no block is left.
+    .. math:: d = \sum_{ij} c_i c_j\, g_{ij},\quad c = (1, -2, 1),\qquad \sigma^2 =
+        \frac{1}{K} \sum_{k=1}^{K} \Big(\frac{\mathrm{median}_k |d|}{0.6745 \cdot 6}\Big)^2
+
+    (the stencil of Immerkær, Comput. Vis. Image Underst. 64, 300, 1996). The noise of light grows
+    with it (the photon-transfer curve), so the medians are those of K equally large classes of
+    local brightness, and σ² is the mean variance over the sensor. Where several of the nine pixels
+    are as dark as anything in the capture, it is black to the last count, and has classes of its
+    own: they show less noise, or none. Details of saturated pixels, as bright as anything, do not
+    count, nor do those with a pixel that is not `valid`. Counts are first spread over their step q,
+    which the distances of their values tell; where it is not black, σ is at least the error of
+    rounding, q/√12.
+
+    A lensless capture is smooth at this scale. Where fringes are as fine as pixels the estimate is
+    too high; where neighbours share their noise, as after a bilinear demosaicing, it is too low.
+    It is 0 of what is even.
     """
-    rows, columns = (n - n % 2 for n in capture.shape[-2:])
-    if rows < 2 or columns < 2:
+    if min(capture.shape[-2:]) < 3:
         return jnp.zeros(capture.shape[:-2], capture.dtype)
-    blocks = _blocks(capture, rows, columns)
-    detail = jnp.abs(blocks[..., 0, 0] - blocks[..., 0, 1] - blocks[..., 1, 0] + blocks[..., 1, 1])
-    if valid is not None:
-        whole = jnp.all(_blocks(valid, rows, columns), axis=(-2, -1))
-        detail = jnp.where(whole, detail, jnp.nan)
-    median = jnp.nanmedian(detail, axis=(-2, -1))
-    return jnp.where(jnp.isnan(median), 0, median) / (2 * 0.6745)
+    known = jnp.isfinite(capture) if valid is None else valid & jnp.isfinite(capture)
+    least = jnp.min(jnp.where(known, capture, jnp.inf), axis=(-2, -1))
+    most = jnp.max(jnp.where(known, capture, -jnp.inf), axis=(-2, -1))
+    step = _quantisation_step(jnp.where(known, capture, jnp.inf), most - least)
+    windows = _windows(capture)
+    black, full = (jnp.sum(windows == e[..., None], axis=0) > _AT_ENDS for e in (least, most))
+    shown = jnp.all(_windows(known), axis=0) & ~full
+    stencil = jnp.asarray(np.outer((1, -2, 1), (1, -2, 1)).ravel(), capture.dtype)
+    detail = jnp.tensordot(stencil, windows, axes=1)
+    key = jax.random.key(0)
+    spread = jax.random.uniform(key, detail.shape[-1:], detail.dtype, -0.5, 0.5)
+    detail = jnp.abs(detail + spread * step[..., None])
+    light, rounding = _brightness(windows), step**2 / 12
+    variance, count = jnp.zeros_like(step), jnp.zeros_like(step)
+    for part, least_variance in ((shown & ~black, rounding), (shown & black, 0)):
+        squares = _photon_transfer(jnp.where(part, light, jnp.inf), detail)
+        own = jnp.maximum((squares - rounding) / jnp.sum(stencil**2), least_variance)
+        number = jnp.sum(part, axis=-1).astype(step.dtype)
+        variance, count = variance + number * own, count + number
+    return jnp.sqrt(variance / jnp.maximum(count, 1))
 
 
-def _blocks(image, rows: int, columns: int):
-    """The image in 2×2 blocks: (…, row, column, 2, 2)."""
-    even = image[..., :rows, :columns]
-    apart = even.reshape(*even.shape[:-2], rows // 2, 2, columns // 2, 2)
-    return jnp.swapaxes(apart, -3, -2)
+def _stride(image: Array) -> int:
+    return max(1, math.isqrt(image.shape[-2] * image.shape[-1] // _ENOUGH))
+
+
+def _windows(image: Array) -> Array:
+    """The 3×3 pixels around every pixel, or fewer of a large image: (9, *batch, window)."""
+    rows, columns = (n - 2 for n in image.shape[-2:])
+    n = _stride(image)
+    parts = [image[..., i : i + rows : n, j : j + columns : n] for i in range(3) for j in range(3)]
+    return jnp.stack(parts).reshape(9, *image.shape[:-2], -1)
+
+
+def _brightness(windows: Float[Array, "9 *batch n"]) -> Float[Array, "*batch n"]:
+    """The median of the rows' medians, which a dead pixel does not move."""
+    return _middle(*(_middle(*windows[i : i + 3]) for i in (0, 3, 6)))
+
+
+def _middle(a: Array, b: Array, c: Array) -> Array:
+    return jnp.maximum(jnp.minimum(a, b), jnp.minimum(jnp.maximum(a, b), c))
+
+
+def _quantisation_step(values: Float[Array, "*batch y x"], span: Float[Array, "*batch"]):
+    """The usual least distance of two different values, of those that are finite.
+
+    The tenth part of the distances, and the smallest of all, may be less: where a background that
+    is no whole number of counts has been subtracted, zero is nearer to its neighbour.
+    """
+    n = _stride(values)
+    every = values[..., ::n, ::n]
+    gaps = jnp.diff(jnp.sort(every.reshape(*every.shape[:-2], -1)))
+    rounding = 4e-6  # of single precision; the last of 16 bits is 1.5e-5
+    steps = jnp.isfinite(gaps) & (gaps > rounding * span[..., None])
+    count = jnp.sum(steps, axis=-1)
+    index = jnp.clip(1 + count // 10, 0, jnp.maximum(count - 1, 0))
+    found = _at(jnp.sort(jnp.where(steps, gaps, jnp.inf)), index)
+    return jnp.where(count > 0, found, 0)
+
+
+def _photon_transfer(brightness: Float[Array, "*batch n"], detail: Float[Array, "*batch n"]):
+    """Mean over classes of brightness of the variance of the details; infinite ones are left out.
+
+    Two sorts, whatever the number of classes: by brightness, then by class and size.
+    """
+    brightness, detail = jax.lax.sort((brightness, detail), num_keys=1)
+    count = jnp.sum(jnp.isfinite(brightness), axis=-1)
+    classes = jnp.clip(count // _LEAST, 1, _CLASSES)
+    total = jnp.maximum(count, 1)
+    rank = jnp.arange(detail.shape[-1])
+    number = jnp.where(rank < count[..., None], rank * classes[..., None] // total[..., None], 99)
+    _, detail = jax.lax.sort((number, detail), num_keys=2)
+    squares = jnp.zeros(count.shape, detail.dtype)
+    for k in range(_CLASSES):
+        first, last = -(-k * total // classes), -(-(k + 1) * total // classes) - 1
+        middle = (_at(detail, (first + last) // 2) + _at(detail, (first + last + 1) // 2)) / 2
+        squares += jnp.where(k < classes, (middle / _MEDIAN) ** 2, 0)
+    return jnp.where(count > 0, squares / classes.astype(detail.dtype), 0)
+
+
+def _at(values: Array, index: Array) -> Array:
+    return jnp.take_along_axis(values, index[..., None], axis=-1, mode="clip")[..., 0]
 
 
 def estimate_variance(

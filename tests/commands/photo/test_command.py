@@ -89,7 +89,9 @@ def test_twelve_bit_capture(grey, tmp_path):
     assert record["files"] == {"png": "image.png", "npy": "image.npy"}
     assert (done["method"], done["tau"], done["iterations_at_most"]) == ("admm_tv", 2.0, 80)
     assert 0 < done["relative_data_residual"] < 0.01
-    assert done["noise_standard_deviation"] == pytest.approx(_noise(grey["capture"]), rel=1e-3)
+    # 2, and what the spots of the PSF, as fine as pixels, add.
+    assert 2.0 < done["noise"]["counts"] < 8.0
+    assert done["noise"]["found"].startswith("estimated from the finest detail")
     objectives = [step["objective"] for step in done["history"]]
     assert [step["iteration"] for step in done["history"]] == list(range(0, 81, 10))
     assert objectives[-1] < 1e-2 * objectives[0]
@@ -98,17 +100,22 @@ def test_twelve_bit_capture(grey, tmp_path):
     assert "image.png: iterations exhausted after 80 iterations" in result.stdout
 
 
-def _noise(path):
-    """The median of 2×2 diagonal differences, in units of the brightest pixel."""
-    light = np.maximum(tifffile.imread(path).astype(float) - simulated.DARK, 0)
-    even = light / light.max()
-    details = even[::2, ::2] - even[1::2, ::2] - even[::2, 1::2] + even[1::2, 1::2]
-    return np.median(np.abs(details)) / (2 * 0.6745)
-
-
 def _displayed(image):
     """Gamma 2.2 below the percentile that is white."""
     return 255 * np.clip(image / np.percentile(image, 99.9), 0, 1) ** (1 / 2.2)
+
+
+def test_noise_that_is_given(grey, tmp_path):
+    """In counts of a raw pixel; blocks of four have half of it, in parts of the brightest."""
+    out = tmp_path / "image.npy"
+    more = ("--bits", 12, "--background", grey["dark"], "--iterations", 5, "--noise", 3)
+    result = call(grey, out, *more, "--downsample", 2)
+    assert "noise 3 counts (given)" in result.stdout
+    record = record_of(out)
+    brightest = record["preparation"]["scaling"]["capture_divisor"]
+    done = record["reconstruction"]
+    assert done["noise"] == {"counts": pytest.approx(3), "found": "given"}
+    assert done["noise_standard_deviation"] == pytest.approx(1.5 / (4095 * brightest), rel=1e-5)
 
 
 def test_flip_full_field_and_a_linear_image_alone(grey, tmp_path):
@@ -173,6 +180,17 @@ def test_mosaic(tmp_path):
     for channel, expected in zip(image, simulated.scene(), strict=True):
         assert simulated.correlation(channel, expected) > 0.93
     assert record_of(out)["preparation"]["demosaicing"]["pattern"] == "RGGB"
+
+
+def test_noise_of_a_mosaic(tmp_path):
+    """Interpolated neighbours share their noise: it is that of each colour's own pixels."""
+    paths = simulated.bayer_files(tmp_path)
+    counts = 40 + np.random.default_rng(7).normal(400, 50, (120, 152)).clip(0, 3000)
+    tifffile.imwrite(paths["capture"], counts.round().astype(np.uint16))
+    out = tmp_path / "image.npy"
+    more = ("--bits", 12, "--bayer", "RGGB", "--background", 0, "--iterations", 1)
+    assert call(paths, out, *more).exit_code == 0
+    assert record_of(out)["reconstruction"]["noise"]["counts"] == pytest.approx(50, rel=0.1)
 
 
 class TestFolder:
@@ -259,6 +277,7 @@ class TestExitCode2:
             (("--ridge", 1), "method 'admm_tv' cannot use ridge; leave it out, or use 'ridge'"),
             (("--tau", -1), "tau = -1.0 parts of one is negative"),
             (("--tau", "nan"), "tau is NaN"),
+            (("--noise", 0), "noise = 0.0 counts is not positive"),
             (("--tau", 1e30), "tau = 1e+30: give about 1 to 3, at most 1e+06"),
             (("--iterations", 0), "iterations = 0: give at least 1"),
             (("--bits", 8), "above the 255 of 8 bit"),

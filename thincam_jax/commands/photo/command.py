@@ -56,6 +56,10 @@ def reconstruct(
         float | None,
         Option(help="Of ridge: noise over image variance, in parts of the expected. Default: 1."),
     ] = None,
+    noise: Annotated[
+        float | None,
+        Option(help="Of a raw pixel, standard deviation in counts. Default: estimated."),
+    ] = None,
     iterations: Annotated[int, Option(help="At most.")] = 100,
     coupling: Annotated[
         Literal["none", "joint", "opponent"] | None,
@@ -113,6 +117,7 @@ def reconstruct(
                 field=field,
                 flip=flip,
                 ridge=ridge,
+                noise=noise,
             )
             output = Output(out, linear, gamma, read_white_balance(white_balance))
             end = run_with_bar(plan_jobs(capture, sources, output), sources, recipe, output)

@@ -93,10 +93,11 @@ class _Bar:
 
 def _summary(result: Finished) -> str:
     done = result.record["reconstruction"]
-    status = done["status"].replace("_", " ")
+    status, noise = done["status"].replace("_", " "), done["noise"]
     return (
         f"{result.job.images[0]}: {status} after {done['iterations']} iterations, relative data "
-        f"residual {float(done['relative_data_residual']):.3g}, {done['seconds']:.1f} s"
+        f"residual {float(done['relative_data_residual']):.3g}, {done['seconds']:.1f} s, noise "
+        f"{noise['counts']:.3g} counts ({noise['found'].split()[0]})"
     )
 
 

@@ -52,6 +52,7 @@ class Recipe:
       light to it.
     - `flip`: turn the image by 180°.
     - `ridge`: of the method "ridge", which has neither tau nor coupling; None: 1.
+    - `noise`: standard deviation of a raw pixel's noise, counts; None: estimated.
 
     **Errors**: MeasurementError for what is unknown or out of range.
     """
@@ -63,6 +64,7 @@ class Recipe:
     field: Literal["sensor", "full"] = "sensor"
     flip: bool = False
     ridge: float | int | None = None
+    noise: float | int | None = None
 
     def __post_init__(self):
         self._check_method()
@@ -72,6 +74,8 @@ class Recipe:
             checks.non_negative("tau", self.relative_tau, "parts of one")
             if self.ridge is not None:
                 checks.positive("ridge", self.ridge, "parts of one")
+            if self.noise is not None:
+                checks.positive("noise", self.noise, "counts")
         except ValueError as error:
             raise MeasurementError(str(error)) from None
         if self.relative_tau > _LARGEST_TAU:

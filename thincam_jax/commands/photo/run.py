@@ -35,6 +35,7 @@ from thincam_jax.reconstruction import (
     choose_solver,
     reconstruct,
 )
+from thincam_jax.reconstruction.noise import estimate_noise, estimate_variance
 from thincam_jax.reconstruction.problem import residuals
 from thincam_jax.reconstruction.recording import middle
 from thincam_jax.reconstruction.regularised import AbstractRegularised
@@ -154,7 +155,9 @@ def _reconstruct(
     *_, channels, rows, columns = capture.shape  # those of the PSF as well
     sensor, field = (rows, columns), (2 * rows - 1, 2 * columns - 1)
     _check_memory(job, window_shape(sensor, field, sensor), channels)
-    recording = Recording(capture, Psfs(psf, field_shape=field), valid=valid)
+    noise, how = _noise(ready, recipe)
+    seen_by = Psfs(psf, field_shape=field)
+    recording = Recording(capture, seen_by, valid=valid, noise_variance=noise**2)
     solver = recipe.solver(channels)
     # Conjugate gradients run in one piece: there is nothing to tell of before the end.
     callback = None if told is None or recipe.is_ridge else _Teller(told, job.capture.name)
@@ -169,7 +172,33 @@ def _reconstruct(
     )
     image = found.image if recipe.field == "full" else middle(found.image, sensor)
     image = np.asarray(image, dtype=np.float32)
-    return image[:, ::-1, ::-1] if recipe.flip else image, _facts(recording, found, problem, recipe)
+    facts = _facts(recording, found, problem, recipe)
+    facts["noise"] = {"counts": noise / _of_a_count(ready), "found": how}
+    return image[:, ::-1, ::-1] if recipe.flip else image, facts
+
+
+def _noise(ready: Prepared, recipe: Recipe) -> tuple[float, str]:
+    """Standard deviation of a prepared pixel's noise, and how it was found."""
+    if recipe.noise is not None:
+        return recipe.noise * _of_a_count(ready), "given"
+    how = "estimated from the finest detail at each brightness"
+    light, valid = (jnp.asarray(array) for array in (ready.capture, ready.valid))
+    if ready.log["demosaicing"]["method"] == "bilinear":
+        # Neighbours share their noise. Every second pixel has its own; where a colour was measured
+        # it has the most.
+        parts = [np.s_[:, i::2, j::2] for i in range(2) for j in range(2)]
+        each = jnp.stack([estimate_noise(light[part], valid[part]) for part in parts])
+        noise = float(jnp.sqrt(jnp.mean(jnp.max(each, axis=0) ** 2)))
+        if noise > 0:
+            return noise, f"{how}, in every second pixel of each colour"
+    return float(jnp.sqrt(estimate_variance([light], [valid])[0])), how
+
+
+def _of_a_count(ready: Prepared) -> float:
+    """What a raw pixel's standard deviation of one count is in the prepared capture."""
+    log = ready.log
+    full_scale = log["full_scale"]["capture"]["full_scale"]
+    return 1 / (full_scale * log["downsampling"]["factor"] * log["scaling"]["capture_divisor"])
 
 
 def _lost(job: Job, found: Reconstruction, recipe: Recipe) -> str:
