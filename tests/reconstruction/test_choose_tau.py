@@ -118,6 +118,22 @@ def test_the_entry_point_takes_a_rule(rule):
     assert errors[0] < 0.8 * errors[1]
 
 
+@pytest.mark.parametrize("rule", ["discrepancy", "sure"])
+def test_a_wrong_psf_is_told_and_does_not_lower_tau(rule):
+    """No τ makes the residual as small as the noise: both fell to the border of 0.02."""
+    problem, truth = posed()
+    wrong = 0.6 * _psf(0) + 0.4 * _psf(1)
+    psfs = tc.Psfs(jnp.asarray(wrong)[None], field_shape=(38, 45))
+    seen = tc.Recording(problem.captures[0], psfs, noise_variance=SIGMA**2)
+    found, default = (tc.reconstruct(seen, tc.AdmmTV(tau)) for tau in (rule, 2.0))
+    assert "times the noise" in found.reason and "PSF is not quite right" in found.reason
+    assert found.tau > 2.0
+    errors = [float(mean_squared_error(r.image, truth[:, 0])) for r in (found, default)]
+    assert errors[0] < errors[1]
+    right = tc.reconstruct(recording(problem.captures[0], field_shape=(38, 45)), tc.AdmmTV(rule))
+    assert not right.reason and right.tau < 8.1
+
+
 def test_an_unknown_rule_is_refused():
     with pytest.raises(ValueError, match="'discrepancy', 'sure'"):
         tc.AdmmTV("guess")

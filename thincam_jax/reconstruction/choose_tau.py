@@ -13,15 +13,54 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from thincam_jax.reconstruction.admm import AdmmMethod
 from thincam_jax.reconstruction.drive import drive
 from thincam_jax.reconstruction.fixed_point import solve_fixed_point
+from thincam_jax.reconstruction.noise import local_noise
 from thincam_jax.reconstruction.problem import InverseProblem, misfit, residuals, see, with_tau
+
+# What `find_tau` searches, in parts of the problem's own τ. A smaller one is never worth much, and
+# where the PSF is a little wrong, both rules ask for one that spoils the image.
+_SPAN = (0.8, 4.0)
+# Residuals over noise, as variances: what the estimate of noise leaves open, and what is told.
+_UNCERTAIN, _NOTICED = 0.3, 1.1
 
 
 class ChosenTau(NamedTuple):
-    """A problem with its τ found, its image, and (τ, criterion) of all that were tried."""
+    """A problem with its τ found, its image, and (τ, criterion) of all that were tried.
+
+    `reason` says what was noticed on the way.
+    """
 
     problem: InverseProblem
     image: Float[Array, "*batch channel plane y x"]
     tried: tuple[tuple[float, float], ...]
+    reason: str = ""
+
+
+def find_tau(rule: str, problem: InverseProblem, image: Float[Array, "..."]) -> ChosenTau:
+    r"""τ by "discrepancy" or "sure", where a PSF may be wrong and the noise is an estimate.
+
+    Both rules take what they cannot explain for noise of a known size. If the PSF is a little
+    wrong, more is left than the noise, and they ask for a τ at which the image explains it all the
+    same. So they search near the problem's own τ, and the residual may differ from the noise by as
+    much as an estimate of noise does. Where it stays above, the difference is taken for the model's
+    error and added to the noise: τ becomes at least its own :math:`\sqrt{\sum w\,(Hf - g)^2/n}`
+    times.
+    """
+    own = _known_tau(problem)
+    if rule == "discrepancy":
+        found = discrepancy_tau(problem, image, span=_SPAN, tolerance=_UNCERTAIN)
+    else:
+        found = sure_tau(problem, image, jax.random.key(0), span=_SPAN)
+    excess = float(jnp.sum(misfit(found.problem, found.image))) / _expected(problem)
+    if not excess > _NOTICED:
+        return found
+    tau, least = float(found.problem.tau), own * math.sqrt(excess)
+    reason = (
+        f"the residual is {math.sqrt(excess):.3g} times the noise at tau = {tau:.3g}: the PSF is "
+        "not quite right, or the noise is more than was estimated or given; taken as more noise, "
+        f"tau is at least {least:.3g}"
+    )
+    raised = with_tau(problem, max(tau, least))
+    return found._replace(problem=raised, reason=reason)
 
 
 def discrepancy_tau(
@@ -30,28 +69,31 @@ def discrepancy_tau(
     *,
     iterations: int = 50,
     solves: int = 8,
-    span: float = 100.0,
+    span: tuple[float, float] = (0.01, 100.0),
+    tolerance: float = 0.0,
 ) -> ChosenTau:
     r"""The τ with which the residual is as large as the noise: Σ w (Hf − g)² = number of pixels.
 
     Morozov's discrepancy principle; the weights w must be 1/variance. The misfit grows with τ, so
-    that a bisection of log τ finds it, each solve starting from the image of the one before. The
-    search spans a factor of `span` to both sides of the problem's own τ, and ends at its border
-    where the noise lies beyond. It smooths a little too much, because a fitted image also takes up
-    some of the noise.
+    that a bisection of log τ finds it, each solve starting from the image of the one before. It
+    begins with the problem's own τ, and ends where the two agree within `tolerance`, or at a border
+    of the `span`, in parts of that τ, where the noise lies beyond. It smooths a little too much,
+    because a fitted image also takes up some of the noise.
 
     **Arguments**: `image`, the first; `iterations` of each of `solves` reconstructions.
     """
-    centre, wanted = _known_tau(problem), float(sum(jnp.sum(w > 0) for w in _full(problem))) / 2
-    low, high, tried = math.log(centre / span), math.log(centre * span), []
-    current = problem
+    own, wanted = _known_tau(problem), _expected(problem)
+    low, high = (math.log(own * factor) for factor in span)
+    middle, tried, current = math.log(own), [], problem
     for _ in range(solves):
-        middle = (low + high) / 2
         current = with_tau(problem, math.exp(middle))
         image = _solve(current, image, iterations)
         ratio = float(jnp.sum(misfit(current, image))) / wanted
         tried.append((math.exp(middle), ratio))
+        if abs(ratio - 1) <= tolerance:
+            break
         low, high = (low, middle) if ratio > 1 else (middle, high)
+        middle = (low + high) / 2
     return ChosenTau(current, image, tuple(tried))
 
 
@@ -60,9 +102,9 @@ def sure_tau(
     image: Float[Array, "*batch channel plane y x"],
     key: PRNGKeyArray,
     *,
-    iterations: int = 50,
+    iterations: int = 100,
     solves: int = 8,
-    span: float = 100.0,
+    span: tuple[float, float] = (0.01, 100.0),
 ) -> ChosenTau:
     r"""The τ with the least predicted error of Hf, by Stein's unbiased risk estimate.
 
@@ -71,35 +113,37 @@ def sure_tau(
     with weights w = 1/variance and n pixels (Stein, Ann. Stat. 9, 1135, 1981). The divergence is a
     probe's response, :math:`b^T (H\hat f(g + \epsilon b) - H\hat f(g))/\epsilon` with b = ±1
     (Ramani, Blu and Unser, IEEE Trans. Image Process. 17, 1540, 2008), so each τ takes two
-    reconstructions. It is the error on the sensor that is least, not that of the image: frequencies
-    that the mask hardly passes count little. Minimised by golden sections of log τ.
+    reconstructions. The noise of light is larger where more falls, where the image also follows it
+    more, so the probe has the local strength of the noise in the captures. It is the error on the
+    sensor that is least, not that of the image: frequencies that the mask hardly passes count
+    little. Minimised by golden sections of log τ.
     """
-    centre = _known_tau(problem)
+    own = _known_tau(problem)
     probes = _probes(problem, key)
     tried: list[tuple[float, float]] = []
-    state = {"image": image}
 
     def criterion(log_tau: float) -> float:
         current = with_tau(problem, math.exp(log_tau))
-        state["image"] = _solve(current, state["image"], iterations)
+        # All from the same image: else each would come nearer than the one before, whatever its τ.
+        seen = _solve(current, image, iterations)
         moved = eqx.tree_at(
             lambda p: p.captures,
             current,
             tuple(c + b for c, b in zip(problem.captures, probes, strict=True)),
         )
-        other = _solve(moved, state["image"], iterations)
-        value = float(_risk(current, state["image"], other, probes))
+        other = _solve(moved, image, iterations)
+        value = float(_risk(current, seen, other, probes))
         tried.append((math.exp(log_tau), value))
         return value
 
-    bracket = math.log(centre / span), math.log(centre * span)
+    low, high = (math.log(own * factor) for factor in span)
     import scipy.optimize  # at once is too early: it takes a tenth of a second
 
     found = scipy.optimize.minimize_scalar(
-        criterion, bounds=bracket, method="bounded", options={"maxiter": solves}
+        criterion, bounds=(low, high), method="bounded", options={"maxiter": solves}
     )
     best = with_tau(problem, math.exp(found.x))
-    return ChosenTau(best, _solve(best, state["image"], iterations), tuple(tried))
+    return ChosenTau(best, _solve(best, image, iterations), tuple(tried))
 
 
 def learn_tau(
@@ -157,6 +201,11 @@ def _known_tau(problem: InverseProblem) -> float:
     return tau
 
 
+def _expected(problem: InverseProblem) -> float:
+    """The misfit that noise of variance 1/w has."""
+    return float(sum(jnp.sum(w > 0) for w in _full(problem))) / 2
+
+
 def _full(problem: InverseProblem):
     pairs = zip(problem.weights, problem.captures, strict=True)
     return [jnp.broadcast_to(w, c.shape) for w, c in pairs]
@@ -179,12 +228,14 @@ def _solve(problem: InverseProblem, image, iterations: int):
 
 
 def _probes(problem: InverseProblem, key: PRNGKeyArray):
-    """±1 in units of a tenth of the noise, 0 where a pixel counts nothing."""
+    """±1 in units of a tenth of the local noise, 0 where a pixel counts nothing."""
     keys = jax.random.split(key, len(problem.captures))
+    parts = zip(keys, _full(problem), problem.captures, strict=True)
     return tuple(
-        jnp.where(w > 0, 0.1 / jnp.sqrt(jnp.where(w > 0, w, 1)), 0)
+        0.1
+        * jnp.where(w > 0, local_noise(c, w > 0) / jnp.sqrt(jnp.where(w > 0, w, 1)), 0)
         * jax.random.rademacher(k, w.shape, w.dtype)
-        for k, w in zip(keys, _full(problem), strict=True)
+        for k, w, c in parts
     )
 
 

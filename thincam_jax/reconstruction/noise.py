@@ -38,7 +38,7 @@ def estimate_noise(
 
     A lensless capture is smooth at this scale. Where fringes are as fine as pixels the estimate is
     too high; where neighbours share their noise, as after a bilinear demosaicing, it is too low.
-    It is 0 of what is even.
+    It is 0 of what is even, or has two values only.
     """
     if min(capture.shape[-2:]) < 3:
         return jnp.zeros(capture.shape[:-2], capture.dtype)
@@ -61,7 +61,28 @@ def estimate_noise(
         own = jnp.maximum((squares - rounding) / jnp.sum(stencil**2), least_variance)
         number = jnp.sum(part, axis=-1).astype(step.dtype)
         variance, count = variance + number * own, count + number
-    return jnp.sqrt(variance / jnp.maximum(count, 1))
+    return jnp.where(step > 0, jnp.sqrt(variance / jnp.maximum(count, 1)), 0)
+
+
+def local_noise(capture: Float[Array, "..."], valid: Bool[Array, "..."]) -> Float[Array, "..."]:
+    """The noise around each pixel over its root mean square, from the finest detail of 9×9 pixels.
+
+    1 everywhere in captures that are no images, or even.
+    """
+    if capture.ndim < 2 or min(capture.shape[-2:]) < 3:
+        return jnp.ones_like(capture)
+    border = [(0, 0)] * (capture.ndim - 2) + [(1, 1)] * 2
+    detail = jnp.abs(jnp.diff(jnp.diff(capture, n=2, axis=-1), n=2, axis=-2))
+    detail = jnp.where(valid, jnp.pad(detail, border, mode="edge"), 0)
+    around, known = (
+        jax.lax.reduce_window(
+            a, 0.0, jax.lax.add, (1,) * (a.ndim - 2) + (9, 9), (1,) * a.ndim, "SAME"
+        )
+        for a in (detail, valid.astype(capture.dtype))
+    )
+    noise = around / jnp.maximum(known, 1)
+    mean = jnp.mean(noise**2, where=valid)
+    return jnp.where(mean > 0, noise / jnp.sqrt(jnp.where(mean > 0, mean, 1)), 1)
 
 
 def _stride(image: Array) -> int:
@@ -89,7 +110,8 @@ def _quantisation_step(values: Float[Array, "*batch y x"], span: Float[Array, "*
     """The usual least distance of two different values, of those that are finite.
 
     The tenth part of the distances, and the smallest of all, may be less: where a background that
-    is no whole number of counts has been subtracted, zero is nearer to its neighbour.
+    is no whole number of counts has been subtracted, zero is nearer to its neighbour. 0 of fewer
+    than three values.
     """
     n = _stride(values)
     every = values[..., ::n, ::n]
@@ -99,7 +121,7 @@ def _quantisation_step(values: Float[Array, "*batch y x"], span: Float[Array, "*
     count = jnp.sum(steps, axis=-1)
     index = jnp.clip(1 + count // 10, 0, jnp.maximum(count - 1, 0))
     found = _at(jnp.sort(jnp.where(steps, gaps, jnp.inf)), index)
-    return jnp.where(count > 0, found, 0)
+    return jnp.where(count > 1, found, 0)
 
 
 def _photon_transfer(brightness: Float[Array, "*batch n"], detail: Float[Array, "*batch n"]):

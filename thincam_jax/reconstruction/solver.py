@@ -20,7 +20,8 @@ class Reconstruction(eqx.Module):
 
     - `image`: radiance, (*batch, y, x), in the scene's unit; (*batch, plane, y, x) with planes.
     - `pitch`: distance of its pixels on the object, mm (of each plane); None without cameras.
-    - `method`, `reason`: how it was made, and why so if that was left to `choose_solver`.
+    - `method`, `reason`: how it was made, and why so if that was left to `choose_solver`, or what
+      was noticed when τ was left to a rule.
     - `ending`: how an iteration ended: "converged", "iterations_exhausted", "stopped" by the
       callback, "interrupted" by Ctrl-C or "non_finite"; None for methods in closed form.
     - `history`: objective and residuals along the way; see `Progress`.
