@@ -28,11 +28,13 @@ from .reconstruction import Fista as Fista
 from .reconstruction import FringeScanning as FringeScanning
 from .reconstruction import InverseProblem as InverseProblem
 from .reconstruction import PoissonTV as PoissonTV
+from .reconstruction import PsfCheck as PsfCheck
 from .reconstruction import Psfs as Psfs
 from .reconstruction import Recording as Recording
 from .reconstruction import Ridge as Ridge
 from .reconstruction import TotalVariation as TotalVariation
 from .reconstruction import Wiener as Wiener
+from .reconstruction import check_psf as check_psf
 from .reconstruction import choose_solver as choose_solver
 from .reconstruction import reconstruct as reconstruct
 from .reconstruction import solve_fixed_point as solve_fixed_point

@@ -13,7 +13,7 @@ from thincam_jax.commands.cache import cache_state, keep_programs
 from thincam_jax.commands.design.command import design
 from thincam_jax.commands.examples import init
 from thincam_jax.commands.help import Grouped, InOrder, examples_text
-from thincam_jax.commands.photo.command import reconstruct
+from thincam_jax.commands.photo.command import check, reconstruct
 from thincam_jax.commands.start import main
 from thincam_jax.commands.study.command import run
 from thincam_jax.commands.sweep.command import sweep
@@ -46,7 +46,14 @@ app.command(
 app.command(
     epilog=examples_text("thincam design design.yaml", "thincam design design.yaml --out found"),
 )(design)
+# The callback keeps the name of a single command.
+calibrate = typer.Typer(no_args_is_help=True, help="Find out what a rig's own pictures say of it.")
+calibrate.callback()(lambda: None)
+calibrate.command(
+    epilog=examples_text("thincam calibrate check --psf PSF.tif --capture RAW.tif"),
+)(check)
 app.add_typer(bench, name="bench")
+app.add_typer(calibrate, name="calibrate")
 
 
 def _print_version(asked: bool) -> bool:

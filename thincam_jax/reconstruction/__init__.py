@@ -10,6 +10,8 @@ from thincam_jax.reconstruction.methods import reconstruct as reconstruct
 from thincam_jax.reconstruction.plug_and_play import solve_plug_and_play as solve_plug_and_play
 from thincam_jax.reconstruction.poisson import PoissonTV as PoissonTV
 from thincam_jax.reconstruction.problem import InverseProblem as InverseProblem
+from thincam_jax.reconstruction.psf_check import PsfCheck as PsfCheck
+from thincam_jax.reconstruction.psf_check import check_psf as check_psf
 from thincam_jax.reconstruction.recording import Cameras as Cameras
 from thincam_jax.reconstruction.recording import Psfs as Psfs
 from thincam_jax.reconstruction.recording import Recording as Recording

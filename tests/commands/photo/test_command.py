@@ -398,3 +398,23 @@ def test_hand(tmp_path):
     with PIL.Image.open(out) as shown:
         pixels = np.array(shown)
     assert np.median(pixels) < 10 and pixels[140, 205] > 180  # black around, bright the palm
+
+
+def check(paths, *more, psf="psf"):
+    given = ["--psf", paths[psf], "--capture", paths["capture"], "--background", paths["dark"]]
+    return runner.invoke(cli.app, ["calibrate", "check", *map(str, given), *map(str, more)])
+
+
+def test_check_names_a_turned_psf(grey, tmp_path):
+    right = check(grey)
+    assert right.exit_code == 0, right.output
+    assert "your PSF fits best as it is" in right.stdout
+    grey["turned"] = tmp_path / "turned.tif"
+    tifffile.imwrite(grey["turned"], tifffile.imread(grey["psf"])[::-1, ::-1])
+    wrong = check(grey, psf="turned")
+    assert wrong.exit_code == 1
+    assert "your PSF is wrong: it fits better turned by 180°" in wrong.stdout
+
+
+def test_check_of_files_too_small_is_one_line(grey):
+    assert "give at least 32 a side" in one_line(check(grey, "--downsample", 2))

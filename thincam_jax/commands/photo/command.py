@@ -125,3 +125,59 @@ def reconstruct(
             fail(error)
     if end:
         raise typer.Exit(end)
+
+
+def check(
+    psf: Annotated[Path, Option(help="Measured PSF: TIFF, PNG or NPY.")],
+    capture: Annotated[Path, Option(help="Capture of the same size.")],
+    background: Annotated[
+        str | None,
+        Option(help="Dark frame, or a number of counts. Default: a corner of the PSF."),
+    ] = None,
+    psf_background: Annotated[
+        str | None, Option(help="That of the PSF, where it was exposed otherwise.")
+    ] = None,
+    downsample: Annotated[
+        int | None,
+        Option(help="Side of the blocks that are averaged. Default: 160 pixels are left."),
+    ] = None,
+    bits: Annotated[int | None, Option(help="Bit depth, as 12 where 16 are stored.")] = None,
+    bayer: Annotated[
+        Literal["RGGB", "BGGR", "GRBG", "GBRG"] | None,
+        Option(help="Colours of the mosaic, from its upper left."),
+    ] = None,
+    dead: Annotated[Path | None, Option(help="Map of dead pixels, not zero where dead.")] = None,
+    search: Annotated[float, Option(help="How far to look for the scale, parts of one.")] = 0.06,
+) -> None:
+    """Tell whether a PSF is that of a capture.
+
+    Tries other scales, turns and mirror images of it. The exit code is 1 if one of them fits
+    better.
+    """
+    with told(lambda: "interrupted; nothing is known of the PSF"):
+        from thincam_jax.commands.photo.check import check_files, enough_blocks
+        from thincam_jax.commands.photo.console import read_background
+        from thincam_jax.commands.photo.options import Sources
+        from thincam_jax.commands.terminal import progress_bar
+        from thincam_jax.measured import MeasurementError, Preparation
+
+        try:
+            sources = Sources(
+                psf,
+                read_background(background),
+                read_background(psf_background),
+                dead,
+                bits,
+                Preparation(bayer=bayer, downsample=1 if downsample is None else downsample),
+            )
+            sources = enough_blocks(sources) if downsample is None else sources
+            with progress_bar() as bar:
+                task = bar.add_task("PSFs", total=None)
+                lines, fits = check_files(
+                    sources, capture, search, lambda n, of: bar.update(task, completed=n, total=of)
+                )
+        except (MeasurementError, OSError) as error:
+            fail(error)
+    print("\n".join(lines))
+    if not fits:
+        raise typer.Exit(1)

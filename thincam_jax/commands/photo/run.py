@@ -79,7 +79,7 @@ def run_jobs(
 
     **Errors**: MeasurementError, one line, for sources that cannot be read.
     """
-    rig = _Rig(sources)
+    rig = Rig(sources)
     for job in jobs:
         try:
             finished = _run_job(job, rig, recipe, output, told)
@@ -91,7 +91,7 @@ def run_jobs(
             return
 
 
-class _Rig:
+class Rig:
     """`Sources`, read once."""
 
     def __init__(self, sources: Sources):
@@ -115,7 +115,7 @@ class _Rig:
         )
 
 
-def _run_job(job: Job, rig: _Rig, recipe: Recipe, output: Output, told: Told | None) -> Finished:
+def _run_job(job: Job, rig: Rig, recipe: Recipe, output: Output, told: Told | None) -> Finished:
     began = time.perf_counter()
     ready = rig.prepare(job.capture)
     _check_channels(job, ready, recipe, output)

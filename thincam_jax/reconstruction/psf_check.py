@@ -1,0 +1,301 @@
+r"""Whether a measured PSF is that of a capture: other scales, turns and mirror images, tried."""
+
+import math
+from collections.abc import Callable
+from typing import Literal, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import scipy
+from jaxtyping import Float
+
+from thincam_jax._core import checks
+from thincam_jax._core.grids import block_sum
+from thincam_jax.reconstruction.drive import drive
+from thincam_jax.reconstruction.problem import InverseProblem, objective, residuals
+from thincam_jax.reconstruction.recording import Psfs, Recording
+from thincam_jax.reconstruction.regularised import admm_method, first_image
+
+Orientation = Literal[
+    "as given",
+    "turned by 90°",
+    "turned by 180°",
+    "turned by 270°",
+    "mirrored left to right",
+    "mirrored left to right, then turned by 90°",
+    "mirrored top to bottom",
+    "mirrored left to right, then turned by 270°",
+]
+ORIENTATIONS: tuple[Orientation, ...] = Orientation.__args__  # type: ignore[attr-defined]
+
+_ITERATIONS = 50
+_BLOCKS = 8  # along the longer side, for what chance does to the misfit
+_RESAMPLED = 200
+_RINGS = 32  # of spatial frequency, per cycle/pixel
+# Of the change of sharpness by a scale that is taken back. Without, wrong PSFs win by being sharper
+# (scales 0.2 to 0.7 % off over random cameras); all of it errs as far to the other side.
+_SHARE = 0.5
+_LEAST_SCALE = 0.3  # pixels at the middle of the longer edges
+_SIGNIFICANCE = 4.0  # standard errors
+_LEAST_GAIN = 0.02  # of the objective, for another orientation
+
+
+class PsfCheck(NamedTuple):
+    """What `check_psf` found.
+
+    - `orientation`: what the PSF given has to undergo to fit best; the turns are anticlockwise.
+    - `scale`: of the PSF that fits best over the one given; `scale_error`: its standard error.
+    - `scales`, `objectives`: the profile: scales tried in the best orientation, and the lowest
+      objective at each, relative to the lowest of all.
+    - `noise_ratio`: rms of the residual of the best PSF over the noise; near 1 it explains all.
+    - `reasons`: one line for each thing that is wrong; empty where the PSF fits as it is.
+    """
+
+    orientation: Orientation
+    scale: float
+    scale_error: float
+    scales: tuple[float, ...]
+    objectives: tuple[float, ...]
+    noise_ratio: float
+    reasons: tuple[str, ...]
+
+    @property
+    def fits(self) -> bool:
+        """Whether no other scale or orientation fits better than the one given."""
+        return not self.reasons
+
+
+class _Tried(NamedTuple):
+    """A PSF tried: the lowest objective, and ½ w r² summed over blocks of pixels."""
+
+    objective: float
+    misfits: np.ndarray
+
+
+def check_psf(
+    recording: Recording,
+    *,
+    search: float | int = 0.06,
+    tau: float | int = 2.0,
+    callback: Callable[[int, int], object] | None = None,
+) -> PsfCheck:
+    r"""Tell a PSF of a wrong scale, turned or mirrored, from the capture itself.
+
+    For each orientation o and scale s of the PSF h the scene is reconstructed, non-negative and
+    with total variation R, and the lowest objective is noted:
+
+    .. math:: J(o, s) = \min_{f \ge 0} \tfrac12 \sum w\,(h_{o,s} * f - g)^2 + \tau R(f).
+
+    A wrong PSF explains a capture nearly as well as the right one, by an image full of artefacts:
+    the residual alone is 1 to 2 times as large. J counts the artefacts, too. The eight turns and
+    mirror images come first, then scales about the best of them, in steps of half a pixel at the
+    edge; s is at the lowest point of the parabola through them. Its standard error is that of
+    bootstrap over blocks of pixels. A scale is named wrong if it is off by more than four standard
+    errors and 0.3 pixels at the edge, an orientation if the block's misfits agree on it by four
+    standard errors and J falls by 2 %. A turn of a symmetric PSF changes nothing and is not named.
+
+    **What it does not tell**: a shifted PSF, which shifts the picture and fits as well; and blur,
+    or a scale more than `search` away.
+
+    **Arguments**
+
+    - `recording`: captures of at least 32 pixels a side with `Psfs` of one plane. Some 20
+      reconstructions are made: average blocks of pixels until the longer side is 100 to 200.
+    - `search`: how far to look for the scale, in parts of one, at most 0.5.
+    - `tau`: as of `AdmmTV`.
+    - `callback`: called with the number of PSFs tried and of those to try.
+
+    **Errors**: ValueError, one line, for recordings without measured PSFs, and numbers out of
+    range; TypeError inside jit.
+    """
+    if not isinstance(recording.seen_by, Psfs) or recording.seen_by.psfs.shape[2] != 1:
+        raise ValueError("a check takes measured PSFs of one plane; give a recording with tc.Psfs")
+    if checks.is_traced(recording.captures[0]):
+        raise TypeError("check_psf searches: call it outside jit and grad")
+    shape = recording.captures[0].shape[-2:]
+    if min(shape) < 32:
+        raise ValueError(f"captures have {shape} pixels; give at least 32 a side")
+    search = float(checks.positive("search", search, "parts of one"))
+    if search > 0.5:
+        raise ValueError(f"search = {search:g} is too wide; give at most 0.5")
+    given = np.asarray(recording.seen_by.psfs)
+    try_psf = _Trial(recording, float(tau))
+    pixel = 2 / max(shape)
+    wide = math.ceil(search / pixel)
+    steps = [k for k in range(-wide, wide + 1) if k]
+    todo = len(ORIENTATIONS) + len(steps) + 2
+    done = 0
+
+    def tried(turned, scale: float) -> _Tried:
+        nonlocal done
+        found = try_psf(_scaled(turned, scale))
+        done += 1
+        if callback is not None:
+            callback(done, todo)
+        return found
+
+    turned = [_oriented(given, k) for k in range(len(ORIENTATIONS))]
+    found = [tried(psf, 1.0) for psf in turned]
+    best = _best_orientation(found)
+    profile = {1.0: found[best]}
+    profile |= {1 + k * pixel: tried(turned[best], 1 + k * pixel) for k in steps}
+    lowest = min(profile, key=lambda s: profile[s].objective)
+    for scale in (lowest - pixel / 2, lowest + pixel / 2):
+        profile[scale] = tried(turned[best], scale)
+    return _judged(ORIENTATIONS[best], profile, pixel, try_psf.pixels)
+
+
+class _Trial:
+    """Reconstructs with one PSF after the other, all else kept as it is with the one given."""
+
+    def __init__(self, recording: Recording, tau: float):
+        self.recording, self.tau = recording, tau
+        problem = recording.problem(tau=tau)
+        self.weights, self.tau_unit = problem.weights, problem.tau_unit
+        pairs = zip(problem.weights, problem.captures, strict=True)
+        self.pixels = sum(int(np.count_nonzero(np.broadcast_to(w, c.shape))) for w, c in pairs)
+        self.block = max(4, max(recording.captures[0].shape[-2:]) // _BLOCKS)
+
+    def __call__(self, psf: np.ndarray) -> _Tried:
+        seen_by = self.recording.seen_by
+        assert isinstance(seen_by, Psfs)
+        problem = Recording(
+            self.recording.captures,
+            Psfs(psf, field_shape=seen_by.field_shape),
+            noise_variance=self.recording.noise_variance,
+            valid=self.recording.valid,
+        ).problem(tau=self.tau)
+        problem = eqx.tree_at(
+            lambda p: (p.weights, p.tau_unit), problem, (self.weights, self.tau_unit)
+        )
+        outcome = drive(
+            admm_method(problem),
+            first_image(problem, None, uniform=False),
+            iterations=_ITERATIONS,
+            tolerance=1e-6,
+            adapt_until=_ITERATIONS // 2,
+        )
+        return _Tried(*_values(problem, outcome.image, self.block))
+
+
+def _values(problem: InverseProblem, image, block: int):
+    found, misfits = _parts(problem, image)
+    rows, columns = (-(-n // block) * block for n in misfits.shape)
+    padded = np.zeros((rows, columns))
+    padded[: misfits.shape[0], : misfits.shape[1]] = misfits
+    return float(found), block_sum(padded, block).ravel()
+
+
+@eqx.filter_jit
+def _parts(problem: InverseProblem, image):
+    """The objective, and ½ w r² of each pixel, summed over captures and channels."""
+    missing = residuals(problem, image)
+    squares = [w * r**2 / 2 for w, r in zip(problem.weights, missing, strict=True)]
+    each = [jnp.sum(s.reshape(-1, *s.shape[-2:]), axis=0) for s in squares]
+    return jnp.sum(objective(problem, image)), sum(each[1:], start=each[0])
+
+
+def _oriented(psf: np.ndarray, number: int) -> np.ndarray:
+    """The PSF in one of `ORIENTATIONS`, cut or filled up with zeros to its own shape."""
+    mirrored = psf[..., ::-1] if number >= 4 else psf
+    turned = np.rot90(mirrored, number % 4, axes=(-2, -1))
+    for axis in (-2, -1):
+        excess = turned.shape[axis] - psf.shape[axis]
+        if excess > 0:
+            turned = turned.take(range(excess // 2, excess // 2 + psf.shape[axis]), axis=axis)
+        elif excess < 0:
+            width = [(0, 0)] * psf.ndim
+            width[axis] = (-excess // 2, -excess - -excess // 2)
+            turned = np.pad(turned, width)
+    return turned
+
+
+def _scaled(psf: np.ndarray, scale: float) -> Float[np.ndarray, "capture channel plane k l"]:
+    """The PSF enlarged about its middle, by cubic splines, of the sum and near the sharpness given.
+
+    A sharper PSF asks for less detail in the image, and so explains a capture at a lower cost,
+    right or wrong: its power over spatial frequency is brought towards that of the one given.
+    """
+    if scale == 1:
+        return psf
+    middle = (np.array(psf.shape[-2:]) - 1) / 2
+    planes = psf.reshape(-1, *psf.shape[-2:])
+    start = middle - middle / scale
+    changed = np.stack(
+        [
+            scipy.ndimage.affine_transform(p, np.full(2, 1 / scale), start, mode="nearest")
+            for p in planes
+        ]
+    )
+    wanted, found = (np.fft.rfft2(images) for images in (planes, changed))
+    frequency = np.hypot(
+        *np.meshgrid(np.fft.fftfreq(psf.shape[-2]), np.fft.rfftfreq(psf.shape[-1]), indexing="ij")
+    )
+    for before, after in zip(wanted, found, strict=True):
+        after *= _sharpness(before, after, frequency)
+    return np.fft.irfft2(found, psf.shape[-2:]).reshape(psf.shape).astype(psf.dtype)
+
+
+def _sharpness(wanted: np.ndarray, found: np.ndarray, frequency: np.ndarray) -> np.ndarray:
+    """exp(a + b ν²) that brings one spectrum to the power of another, 1 at ν = 0."""
+    ring = np.round(frequency * _RINGS).astype(int).ravel()
+    power, other = (np.bincount(ring, np.abs(s.ravel()) ** 2)[1:] for s in (wanted, found))
+    radius = np.arange(1, len(power) + 1) / _RINGS
+    used = (power > 0) & (other > 0)
+    ratio = _SHARE * np.log(power[used] / other[used]) / 2
+    slope, level = np.polyfit(radius[used] ** 2, ratio, 1, w=np.sqrt(power[used]))
+    gain = np.exp(level + slope * frequency**2)
+    gain[0, 0] = wanted[0, 0].real / found[0, 0].real
+    return gain
+
+
+def _best_orientation(found: list[_Tried]) -> int:
+    """The one with the lowest objective, if it is better than the one given beyond chance."""
+    best = min(range(len(found)), key=lambda k: found[k].objective)
+    gains = found[0].misfits - found[best].misfits
+    spread = np.std(gains) * math.sqrt(gains.size)
+    better = found[0].objective - found[best].objective
+    is_clear = better > _LEAST_GAIN * found[best].objective
+    return best if is_clear and np.sum(gains) > _SIGNIFICANCE * spread else 0
+
+
+def _judged(
+    orientation: Orientation, profile: dict[float, _Tried], pixel: float, pixels: int
+) -> PsfCheck:
+    scales = np.array(sorted(profile))
+    found = [profile[s] for s in scales]
+    objectives = np.array([one.objective for one in found])
+    place = int(np.argmin(objectives))
+    near = np.abs(scales - scales[place]) < 1.1 * pixel
+    at_end = place in (0, len(scales) - 1)
+    misfits = np.stack([one.misfits for one in found])[near]
+    rest = objectives[near] - misfits.sum(axis=1)
+    chance = np.random.default_rng(0)
+    drawn = chance.integers(misfits.shape[1], size=(_RESAMPLED, misfits.shape[1]))
+    vertices = [_vertex(scales[near], misfits[:, d].sum(axis=1) + rest) for d in drawn]
+    scale = _vertex(scales[near], objectives[near])
+    error = float(np.std(vertices))
+    reasons = [] if orientation == "as given" else [f"it fits better {orientation}"]
+    if at_end:
+        reasons.append(f"it fits better at {scale:.4f} times its size, or beyond: search farther")
+    elif abs(scale - 1) > max(_LEAST_SCALE * pixel, _SIGNIFICANCE * error):
+        reasons.append(f"it fits better at {scale:.4f} ± {error:.4f} times its size")
+    return PsfCheck(
+        orientation,
+        scale,
+        error,
+        tuple(scales.tolist()),
+        tuple((objectives / objectives[place]).tolist()),
+        math.sqrt(2 * found[place].misfits.sum() / pixels),
+        tuple(reasons),
+    )
+
+
+def _vertex(scales: np.ndarray, values: np.ndarray) -> float:
+    """Where the parabola through the values is lowest, within the scales."""
+    middle = scales.mean()
+    curvature, slope, _ = np.polyfit(scales - middle, values, 2)
+    if curvature <= 0:
+        return float(scales[np.argmin(values)])
+    return float(np.clip(middle - slope / (2 * curvature), scales[0], scales[-1]))
