@@ -11,6 +11,7 @@ from pydantic_core import PydanticCustomError
 
 from thincam_jax.commands.config_file import slug
 from thincam_jax.imaging.targets import sample_images
+from thincam_jax.lensless.masks.fza import Profile
 from thincam_jax.lensless.method import Model
 from thincam_jax.reconstruction.spectra import Prior
 from thincam_jax.units import parse_quantity
@@ -90,7 +91,7 @@ class ApertureConfig(Section):
     """
 
     width: Length
-    profile: Literal["cosine", "binary"] = "cosine"
+    profile: Profile = "cosine"
     pixel_pitch: Length | None = None
     fill_factor: Annotated[float, Field(gt=0, le=1)] = 1.0
 

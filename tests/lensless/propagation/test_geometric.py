@@ -89,6 +89,14 @@ def test_binary_profile():
     assert np.abs(value - (np.cos(angle) > 0))[clear].max() < 0.25
 
 
+def test_intensity_profile():
+    """The shadow of √I is I, up to the harmonics that are left out."""
+    y, x = (reference.centred(n, 0.031) for n in (20, 27))
+    r2 = (y / 1.25 - CENTRE[0])[:, None] ** 2 + (x / 1.25 - CENTRE[1]) ** 2
+    value = psf_of((20, 27), 0.031, profile="intensity", harmonics=9)
+    np.testing.assert_allclose(value, 0.5 * (1 + np.cos(BETA * r2 + PHASE)), rtol=0, atol=8e-3)
+
+
 def test_display_pixels():
     """10×10 pixels of 0.1 mm, half open: constant inside, dark between; the average is exact."""
     pixel, fill, m = 0.1, 0.49, 1.25

@@ -1,6 +1,6 @@
 r"""The Fresnel zone aperture (FZA), thesis Eq 3.1."""
 
-from typing import Literal
+from typing import Literal, get_args
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -14,6 +14,8 @@ from thincam_jax._core.precision import as_complex, phasor, product
 from thincam_jax.lensless.masks.base import AbstractMask, ZoneOrders
 
 _HIGHEST_HARMONIC = 99
+Profile = Literal["cosine", "intensity", "binary"]
+PROFILES: tuple[Profile, ...] = get_args(Profile)
 
 
 class FresnelZoneAperture(AbstractMask):
@@ -23,6 +25,13 @@ class FresnelZoneAperture(AbstractMask):
     which Eq 3.18 propagates as a field):
 
     .. math:: t(r) = \tfrac12 [1 + \cos(\beta r^2 + \varphi)]
+
+    Behind it the geometric shadow is t². Much of the literature has the cosine in the irradiance,
+    :math:`I = \tfrac12 [1 + \cos(\beta r^2 + \varphi)]`. That is the profile "intensity": its
+    amplitude is :math:`\sqrt I = |\cos((\beta r^2 + \varphi)/2)|`, that of a grey film without
+    phase, represented by its Fourier series
+    :math:`\tfrac2\pi \sum_k (-1)^{k+1}/(4k^2-1)\, e^{jk(\beta r^2+\varphi)}` up to ``harmonics``;
+    what is left out is at most 2/π/(2·harmonics + 1) of the amplitude, where it is dark.
 
     The binary profile opens where that cosine is positive. It is represented by its Fourier series
     in the phase, :math:`\tfrac12 + \sum_{k\ odd} \sin(k\pi/2)/(k\pi)\, e^{jk(\beta r^2+\varphi)}`,
@@ -34,13 +43,13 @@ class FresnelZoneAperture(AbstractMask):
     - `beta`: β, rad/mm², > 0. The zones at the edge have the local frequency β·width/(2π).
     - `phase`: initial phase φ, rad.
     - `width`: side of the square aperture, mm.
-    - `profile`: "cosine" or "binary".
+    - `profile`: "cosine", "intensity" or "binary".
     - `centre`: (y, x) of the mask's centre, mm.
     - `pixel_pitch`: pitch in mm of the display that shows the mask (a spatial light modulator);
       None for a printed mask. Each pixel shows the pattern's value at its centre; `width` must be
       a whole number of pixels.
     - `fill_factor`: open fraction of a display pixel's area, 0 < fill_factor ≤ 1.
-    - `harmonics`: highest harmonic of the binary profile, odd.
+    - `harmonics`: highest harmonic of the intensity and binary profiles, odd.
 
     **Errors**: ValueError or TypeError, one line, for what is out of range.
     """
@@ -50,7 +59,7 @@ class FresnelZoneAperture(AbstractMask):
     width: Float[Array, ""]
     centre: Float[Array, "2"]
     fill_factor: Float[Array, ""]
-    profile: Literal["cosine", "binary"] = eqx.field(static=True)
+    profile: Profile = eqx.field(static=True)
     pixels: int | None = eqx.field(static=True)
     harmonics: int = eqx.field(static=True)
 
@@ -60,7 +69,7 @@ class FresnelZoneAperture(AbstractMask):
         phase: Number = 0.0,
         *,
         width: Number,
-        profile: Literal["cosine", "binary"] = "cosine",
+        profile: Profile = "cosine",
         centre: Numbers | tuple[Number, Number] = (0.0, 0.0),
         pixel_pitch: Number | None = None,
         fill_factor: Number = 1.0,
@@ -70,7 +79,7 @@ class FresnelZoneAperture(AbstractMask):
         self.phase = checks.finite("phase", phase, "rad")
         self.width = checks.positive("width", width, "mm")
         self.centre = checks.finite("centre", centre, "mm", shape=(2,))
-        self.profile = checks.choice("profile", profile, ("cosine", "binary"))  # pyright: ignore
+        self.profile = checks.choice("profile", profile, PROFILES)  # pyright: ignore
         self.fill_factor = checks.fraction("fill_factor", fill_factor)
         if harmonics % 2 == 0 or not 1 <= harmonics <= _HIGHEST_HARMONIC:
             raise ValueError(
@@ -113,6 +122,9 @@ def _series(profile: str, harmonics: int) -> tuple[tuple[int, ...], tuple[float,
     """Orders k and weights of the profile's Fourier series in the phase βr² + φ."""
     if profile == "cosine":
         return (0, 1, -1), (0.5, 0.25, 0.25)
+    if profile == "intensity":
+        every = [0, *(k for n in range(1, harmonics + 1) for k in (n, -n))]
+        return tuple(every), tuple(2 / np.pi * (-1.0) ** (k + 1) / (4 * k * k - 1) for k in every)
     odd = [k for n in range(1, harmonics + 1, 2) for k in (n, -n)]
     return (0, *odd), (0.5, *(float(np.sin(k * np.pi / 2) / (k * np.pi)) for k in odd))
 

@@ -60,7 +60,8 @@ def separable(
 
     exact within the Fresnel approximation: no sampling condition, any grid, any distance. The
     paraxial phase that is left out is about πλ³dν⁴/4 at the spatial frequency ν of the field.
-    Nine real separable terms for the cosine profile, (harmonics + 2)² for the binary one.
+    Nine real separable terms for the cosine profile, (harmonics + 2)² for the binary one,
+    (2·harmonics + 1)² for that of the intensity.
 
     `pixel_integration` averages each axis over the pixel by Gauss-Legendre quadrature with `nodes`
     nodes: the average of a separable term is separable.
