@@ -227,7 +227,7 @@ def test_the_log_names_every_step_and_is_plain_json():
     log = prepare(Raw(psf, 12), Raw(capture, 12), options=options).log
     assert set(log) == {"options", "order", *log["order"]}
     assert log["order"][:4] == ["full_scale", "background", "clipping", "validity"]
-    assert log["order"][-1] == "scaling" and len(log["order"]) == 10
+    assert log["order"][-1] == "scaling" and len(log["order"]) == 11
     assert json.loads(json.dumps(log, allow_nan=False)) == json.loads(log_text(log))
     at_maximum = log["full_scale"]["psf"]["pixels_at_maximum"]
     assert at_maximum == (psf == psf.max()).sum()
@@ -293,3 +293,23 @@ def test_black_images():
 def test_options_out_of_range(options, message):
     with pytest.raises(MeasurementError, match=message):
         Preparation(**options)
+
+
+def blob(shape, pitch):
+    """Two spots, irradiance at the pixels' centres; `pitch` in units of the larger pixels."""
+    y, x = (pitch * (np.arange(n) - (n - 1) / 2) for n in shape)
+    y, x = y[:, None], x[None, :]
+    spots = np.exp(-((y - 2) ** 2 + x**2) / 8) + 0.5 * np.exp(-((y + 3) ** 2 + (x - 4) ** 2) / 12)
+    return Raw(np.round(50_000 * spots).astype(np.uint16))
+
+
+@pytest.mark.parametrize(("shape", "pitch"), [((50, 70), 0.5), ((30, 20), 1.25), ((24, 36), 1.0)])
+def test_psf_of_other_pixels_is_brought_to_the_captures(shape, pitch):
+    """Half as large or larger pixels, more or fewer of them: the same PSF on the capture's."""
+    expected = blob((ROWS, COLUMNS), 1.0).pixels.astype(float)
+    options = Preparation(psf_scale=pitch, corner=(0, 2))
+    found = prepare(blob(shape, pitch), Raw(measured(bits=16)), 0, options)
+    assert found.psf.shape == found.capture.shape
+    assert found.log["order"].index("resampling") < found.log["order"].index("downsampling")
+    light = unit_sum(expected)
+    assert np.abs(found.psf[0] - light).max() < 0.03 * light.max()

@@ -28,6 +28,10 @@ class Preparation:
     - `threshold`: values of the PSF below this part of each channel's maximum become 0.
     - `noise_threshold`: values of the PSF below this many standard deviations of its noise become
       0: of the corner's pixels, divided by `downsample`, as white noise is by block means.
+    - `psf_scale`: enlarge the PSF about its middle by this factor, onto the capture's pixels: the
+      ratio of the pixel pitches (PSF over capture) of another sensor or binning, or the scale that
+      `thincam_jax.check_psf` finds. The PSF may then have another size: it is cut or filled up
+      with zeros. None: as it is.
     - `centre`: shift the PSF by whole pixels so that its "centroid", its "peak" or its centre of
       "symmetry" (the peak of its convolution with itself is at twice that) comes to the middle of
       the array, to sample n//2 for a single bright pixel. One shift for all channels. None, the
@@ -51,6 +55,7 @@ class Preparation:
     saturation: float | int | None = None
     threshold: float | int | None = None
     noise_threshold: float | int | None = None
+    psf_scale: float | int | None = None
     centre: Centre | None = None
     psf_channels: Literal["each", "mean"] = "each"
     psf_sum: Literal["each", "joint"] = "each"
@@ -77,6 +82,7 @@ class Preparation:
         _in_range("saturation", self.saturation, 0.0, 1.0)
         _in_range("threshold", self.threshold, 0.0, 1.0)
         _in_range("noise_threshold", self.noise_threshold, 0.0, 1e6)
+        _in_range("psf_scale", self.psf_scale, 0.0, 100.0)
 
 
 def _choose(name: str, value: Any, options: tuple[str, ...]) -> None:
@@ -106,7 +112,7 @@ def check_match(
 
     `backgrounds` holds those of "psf" and of "capture".
     """
-    _check_sizes(psf, capture, dead)
+    _check_sizes(psf, capture, dead, options.psf_scale)
     _check_channels(psf, capture, options)
     if options.corner[1] > min(psf.pixels.shape[:2]):
         raise MeasurementError(
@@ -122,11 +128,14 @@ def _size(raw: Raw) -> str:
     return f"{rows}×{columns}"
 
 
-def _check_sizes(psf: Raw, capture: Raw, dead: np.ndarray | None) -> None:
-    if psf.pixels.shape[:2] != capture.pixels.shape[:2]:
+def _check_sizes(
+    psf: Raw, capture: Raw, dead: np.ndarray | None, scale: float | int | None
+) -> None:
+    if psf.pixels.shape[:2] != capture.pixels.shape[:2] and scale is None:
         raise MeasurementError(
             f"the PSF ({psf.name}) has {_size(psf)} pixels and the capture ({capture.name}) "
-            f"{_size(capture)}; give both from the same part of one sensor, equally binned"
+            f"{_size(capture)}; give both from the same part of one sensor, equally binned, or "
+            "with psf_scale the ratio of their pixel pitches"
         )
     if dead is not None and dead.shape != capture.pixels.shape[:2]:
         raise MeasurementError(

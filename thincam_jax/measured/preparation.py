@@ -65,12 +65,13 @@ def prepare(
     4. `validity`: saturated pixels (before the subtraction) and `dead` ones, True in a map (y, x)
        of the sensor (`read_mask`).
     5. `demosaicing`, if the options name a Bayer pattern.
-    6. `downsampling`: exact means of square blocks; sides that do not divide are cropped centrally.
-    7. `clean_up` and 8. `centring` of the PSF, if asked for.
-    9. `channels`: one PSF for all, if asked for.
-    10. `scaling`: the PSF to unit sum, the capture as asked for; both divisors are recorded.
+    6. `resampling` of the PSF onto the capture's pixels, if asked for.
+    7. `downsampling`: exact means of square blocks; sides that do not divide are cropped centrally.
+    8. `clean_up` and 9. `centring` of the PSF, if asked for.
+    10. `channels`: one PSF for all, if asked for.
+    11. `scaling`: the PSF to unit sum, the capture as asked for; both divisors are recorded.
 
-    In 5 and 6 a dead pixel is left out of the means, for it is missing by chance; a value is
+    In 5 and 7 a dead pixel is left out of the means, for it is missing by chance; a value is
     invalid where nothing is left, and is then copied from the nearest good one. A saturated pixel
     makes every value it enters invalid, for it is missing because it is bright: the mean of the
     others would be too dark. The PSF has no such mask; its saturated pixels are counted in the log,
@@ -98,14 +99,17 @@ def prepare(
     log["clipping"] = {n: int(np.count_nonzero(p < 0)) for n, p in planes.items()}
     known = ~(np.zeros(capture.pixels.shape[:2], bool) if dead is None else dead)
     frames = {
-        n: _Frame(np.maximum(p, 0), saturated[n], np.broadcast_to(known, p.shape))
-        for n, p in planes.items()
+        n: _Frame(np.maximum(p, 0), saturated[n], _known(known, p.shape)) for n, p in planes.items()
     }
     log["validity"] = {n: _counts(f, raws[n]) for n, f in frames.items()}
     if options.bayer is not None:
         frames = {n: _demosaiced(f, options) for n, f in frames.items()}
     how = options.demosaicing if options.bayer else None
     log["demosaicing"] = {"pattern": options.bayer, "method": how}
+    if options.psf_scale is not None:
+        shape = frames["capture"].values.shape[-2:]
+        frames["psf"] = _resampled(frames["psf"], shape, float(options.psf_scale))
+    log["resampling"] = {"psf_scale": options.psf_scale}
     frames = _downsampled(frames, options.downsample, log)
     light = _prepared_psf(_filled(frames["psf"], "PSF"), noise, options, log)
     image = _filled(frames["capture"], "capture")
@@ -200,6 +204,32 @@ def _demosaiced(frame: _Frame, options: Preparation) -> _Frame:
         saturated = demosaic_mask(frame.saturated[0], pattern, method)
     has = ~nothing if known is None else demosaic_mask(known, pattern, method)
     return _Frame(*(np.moveaxis(plane, -1, 0) for plane in (colours, saturated, has)))
+
+
+def _known(known: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """The sensor's good pixels; a PSF of another sensor has no dead ones that are known."""
+    return np.broadcast_to(known, shape) if known.shape == shape[1:] else np.ones(shape, bool)
+
+
+def _resampled(frame: _Frame, shape: tuple[int, ...], scale: float) -> _Frame:
+    """A PSF enlarged about its middle by cubic splines, cut or filled up with zeros to a shape.
+
+    What is made smaller is blurred first, by half of what its pixels then cover.
+    """
+    planes = _filled(frame, "PSF").astype(np.float64)
+    blur = max(0.0, (1 / scale - 1) / 2)
+    middle, other = ((np.array(n[-2:]) - 1) / 2 for n in (planes.shape, shape))
+    values = [
+        scipy.ndimage.affine_transform(
+            scipy.ndimage.gaussian_filter(plane, blur, mode="nearest") if blur else plane,
+            np.full(2, 1 / scale),
+            middle - other / scale,
+            output_shape=tuple(shape),
+        )
+        for plane in planes
+    ]
+    light = np.maximum(np.stack(values), 0).astype(frame.values.dtype)
+    return _Frame(light, np.zeros(light.shape, bool), np.ones(light.shape, bool))
 
 
 def _downsampled(frames: dict[str, _Frame], factor: int, log: dict[str, Any]) -> dict[str, _Frame]:

@@ -416,5 +416,28 @@ def test_check_names_a_turned_psf(grey, tmp_path):
     assert "your PSF is wrong: it fits better turned by 180°" in wrong.stdout
 
 
+def test_psf_has_its_own_bits_corner_and_pixels(grey, tmp_path):
+    """The PSF on pixels half as large, in 16 bits, with the dark corner elsewhere."""
+    fine = np.kron(tifffile.imread(grey["psf"]), np.ones((2, 2), np.uint16)) * 16
+    grey["fine"] = tmp_path / "fine.tif"
+    tifffile.imwrite(grey["fine"], fine)
+    out = tmp_path / "image.npy"
+    options = ("--bits", 12, "--psf-bits", 16, "--background", simulated.DARK)
+    options += ("--psf-background", 16 * simulated.DARK, "--corner", "2:9", "--psf-scale", 0.5)
+    result = call(grey, out, *options, psf="fine")
+    assert result.exit_code == 0, result.output
+    told = record_of(out)
+    assert told["preparation"]["full_scale"]["psf"]["bits"] == 16
+    assert told["preparation"]["full_scale"]["capture"]["bits"] == 12
+    assert told["preparation"]["options"]["corner"] == [2, 9]
+    expected = simulated.scene()[1]
+    assert simulated.correlation(np.load(out), expected) > 0.9
+
+
+def test_wrong_corner_is_one_line(grey, tmp_path):
+    line = one_line(call(grey, tmp_path / "image.npy", "--corner", "5-15"))
+    assert line == "--corner 5-15: give the first pixel and the one after the last, as 5:15"
+
+
 def test_check_of_files_too_small_is_one_line(grey):
     assert "give at least 32 a side" in one_line(check(grey, "--downsample", 2))

@@ -27,6 +27,14 @@ def reconstruct(
     ] = None,
     downsample: Annotated[int, Option(help="Side of the blocks of pixels that are averaged.")] = 1,
     bits: Annotated[int | None, Option(help="Bit depth, as 12 where 16 are stored.")] = None,
+    psf_bits: Annotated[int | None, Option(help="That of the PSF, where it is another.")] = None,
+    corner: Annotated[
+        str, Option(help="Rows and columns of the PSF's dark corner, FIRST:AFTER_LAST.")
+    ] = "5:15",
+    psf_scale: Annotated[
+        float | None,
+        Option(help="Enlarge the PSF, of any size: pitch of its pixels over the capture's."),
+    ] = None,
     bayer: Annotated[
         Literal["RGGB", "BGGR", "GRBG", "GBRG"] | None,
         Option(help="Colours of the mosaic, from its upper left."),
@@ -86,6 +94,7 @@ def reconstruct(
     with told(lambda: nothing):
         from thincam_jax.commands.photo.console import (
             read_background,
+            read_corner,
             read_white_balance,
             run_with_bar,
         )
@@ -104,10 +113,13 @@ def reconstruct(
                     bayer=bayer,
                     demosaicing=demosaic,
                     downsample=downsample,
+                    corner=read_corner(corner),
+                    psf_scale=psf_scale,
                     saturation=saturation,
                     noise_threshold=noise_threshold,
                     psf_channels=psf_channels,
                 ),
+                psf_bits,
             )
             recipe = Recipe(
                 method=method.replace("-", "_"),
@@ -142,6 +154,14 @@ def check(
         Option(help="Side of the blocks that are averaged. Default: 160 pixels are left."),
     ] = None,
     bits: Annotated[int | None, Option(help="Bit depth, as 12 where 16 are stored.")] = None,
+    psf_bits: Annotated[int | None, Option(help="That of the PSF, where it is another.")] = None,
+    corner: Annotated[
+        str, Option(help="Rows and columns of the PSF's dark corner, FIRST:AFTER_LAST.")
+    ] = "5:15",
+    psf_scale: Annotated[
+        float | None,
+        Option(help="Enlarge the PSF, of any size: pitch of its pixels over the capture's."),
+    ] = None,
     bayer: Annotated[
         Literal["RGGB", "BGGR", "GRBG", "GBRG"] | None,
         Option(help="Colours of the mosaic, from its upper left."),
@@ -156,7 +176,7 @@ def check(
     """
     with told(lambda: "interrupted; nothing is known of the PSF"):
         from thincam_jax.commands.photo.check import check_files, enough_blocks
-        from thincam_jax.commands.photo.console import read_background
+        from thincam_jax.commands.photo.console import read_background, read_corner
         from thincam_jax.commands.photo.options import Sources
         from thincam_jax.commands.terminal import progress_bar
         from thincam_jax.measured import MeasurementError, Preparation
@@ -168,7 +188,13 @@ def check(
                 read_background(psf_background),
                 dead,
                 bits,
-                Preparation(bayer=bayer, downsample=1 if downsample is None else downsample),
+                Preparation(
+                    bayer=bayer,
+                    downsample=1 if downsample is None else downsample,
+                    corner=read_corner(corner),
+                    psf_scale=psf_scale,
+                ),
+                psf_bits,
             )
             sources = enough_blocks(sources) if downsample is None else sources
             with progress_bar() as bar:

@@ -25,6 +25,20 @@ def read_background(text: str | None) -> Background:
         return Path(text)
 
 
+def read_corner(text: str) -> tuple[int, int]:
+    """The first pixel of the corner and the one after its last, from "5:15".
+
+    **Errors**: MeasurementError for anything else.
+    """
+    try:
+        first, last = (int(part) for part in text.split(":"))
+    except ValueError:
+        raise MeasurementError(
+            f"--corner {text}: give the first pixel and the one after the last, as 5:15"
+        ) from None
+    return first, last
+
+
 def read_white_balance(text: str | None) -> WhiteBalance:
     """The gains of the colours, or how to find them.
 

@@ -25,7 +25,8 @@ class Sources:
 
     - `psf`, `dead`: files. `background`, `psf_background`: a dark frame's file, a number of counts,
       or None for the default.
-    - `bits`: bit depth of the camera where its files do not tell it.
+    - `bits`: bit depth of the camera where its files do not tell it; `psf_bits` that of the PSF
+      and its background where it is another.
     """
 
     psf: Path
@@ -34,6 +35,7 @@ class Sources:
     dead: Path | None = None
     bits: int | None = None
     preparation: Preparation = Preparation()
+    psf_bits: int | None = None
 
     def paths(self) -> list[Path]:
         """Every file that is read."""

@@ -96,13 +96,11 @@ class Rig:
 
     def __init__(self, sources: Sources):
         self.sources = sources
-        self.psf = read_image(sources.psf, sources.bits)
-        self.background = self._background(sources.background)
-        self.psf_background = self._background(sources.psf_background)
+        psf_bits = sources.bits if sources.psf_bits is None else sources.psf_bits
+        self.psf = read_image(sources.psf, psf_bits)
+        self.background = _background(sources.background, sources.bits)
+        self.psf_background = _background(sources.psf_background, psf_bits)
         self.dead = None if sources.dead is None else read_mask(sources.dead)
-
-    def _background(self, given: Background) -> Raw | float | None:
-        return read_image(given, self.sources.bits) if isinstance(given, Path) else given
 
     def prepare(self, capture: Path) -> Prepared:
         return prepare(
@@ -113,6 +111,10 @@ class Rig:
             psf_background=self.psf_background,
             dead=self.dead,
         )
+
+
+def _background(given: Background, bits: int | None) -> Raw | float | None:
+    return read_image(given, bits) if isinstance(given, Path) else given
 
 
 def _run_job(job: Job, rig: Rig, recipe: Recipe, output: Output, told: Told | None) -> Finished:
@@ -142,7 +144,7 @@ def _run_job(job: Job, rig: Rig, recipe: Recipe, output: Output, told: Told | No
 
 def _told(sources: Sources) -> dict[str, Any]:
     """All but the preparation, which tells its own."""
-    names = ("psf", "background", "psf_background", "dead", "bits")
+    names = ("psf", "background", "psf_background", "dead", "bits", "psf_bits")
     return {name: getattr(sources, name) for name in names}
 
 
