@@ -4,12 +4,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy
 from reconstruction.depth import rig
 from reconstruction.rig import refused
 
 import thincam_jax as tc
 from thincam_jax.reconstruction import fringe_scanning
-from thincam_jax.reconstruction.depth import RefocusSweep, refocus_sweep
+from thincam_jax.reconstruction.depth import (
+    RefocusSweep,
+    depth_map,
+    find_distances,
+    refocus_sweep,
+)
 from thincam_jax.reconstruction.noise import estimate_variance
 
 DISTANCES = (18.0, 20.0, 24.0, 45.0)
@@ -108,8 +114,52 @@ def test_bad_distances_are_refused(recording, distances):
 
 def test_what_has_no_distance_and_what_does_not_compare_is_refused(recording):
     psfs = tc.Recording(jnp.ones((1, 20, 21)), tc.Psfs(jnp.ones((1, 5, 6))))
-    message = "a sweep refocuses computed PSFs; give a recording seen by Cameras"
+    message = r"the PSFs have 1 planes, .* for 4 distances; give one for each"
     refused(message, lambda: refocus_sweep(psfs, DISTANCES))
     refused("a distance is that of computed PSFs", lambda: psfs.focused(20.0))
     message = "tau = 'sure' would be another number at each distance"
     refused(message, lambda: refocus_sweep(recording, DISTANCES, tc.AdmmTV("sure")))
+
+
+def spots(scale, shape=(48, 64)):
+    """A diffuser's PSF; it grows as the point comes nearer."""
+    generator = np.random.default_rng(4)
+    centres = generator.uniform(-0.38, 0.38, (60, 2)) * shape * scale
+    y, x = (np.arange(n)[:, None] - (n - 1) / 2 for n in shape)
+    rows, columns = (np.exp(-((a - c) ** 2) / 2) for a, c in zip((y, x), centres.T, strict=True))
+    psf = rows @ columns.T
+    return psf / psf.sum()
+
+
+def test_measured_psfs_tell_the_distances():
+    """Two chequered boxes, each seen through the PSF measured at its distance."""
+    distances = (12.0, 16.0, 24.0, 48.0)
+    psfs = np.stack([spots(1 + 3 / t) for t in distances])
+    capture = np.zeros((48, 64))
+    boxes = (slice(14, 34), slice(8, 26)), (slice(14, 34), slice(38, 56))
+    for box, plane in zip(boxes, (1, 2), strict=True):
+        image = np.zeros((95, 127))
+        image[23:71, 31:95][box] = np.kron(np.indices((5, 6)).sum(0) % 2, np.ones((4, 3)))
+        whole = scipy.signal.fftconvolve(image, psfs[plane])
+        capture += whole[47:95, 63:127]
+    capture += 1e-4 * np.random.default_rng(5).normal(size=capture.shape)
+    recording = tc.Recording(capture[None], tc.Psfs(psfs[None, None]))
+    sweep = refocus_sweep(recording, distances, tc.AdmmTV(iterations=60))
+    assert sweep.slope is None and sweep.pitch is None
+    alone = tc.reconstruct(
+        tc.Recording(
+            capture[None],
+            tc.Psfs(psfs[None, 2]),
+            noise_variance=estimate_variance(jnp.asarray(capture[None])),
+        ),
+        tc.AdmmTV(iterations=60),
+    )
+    np.testing.assert_allclose(sweep.images[2], alone.image, rtol=1e-9, atol=1e-9)
+    regions = np.zeros(capture.shape, int)
+    for label, box in enumerate(boxes, start=1):
+        regions[box] = label
+    found = find_distances(sweep, regions=regions)
+    assert [round(found.distance_of(n).distance) for n in (1, 2)] == pytest.approx([16, 24], abs=2)
+    depth = depth_map(sweep)
+    for box, wanted in zip(boxes, (16, 24), strict=True):
+        assert np.median(depth.distance[box]) == pytest.approx(wanted, abs=2)

@@ -138,6 +138,7 @@ def save_depth(folder: RunFolder, sweep: RefocusSweep, depth: DepthMap, sharp: n
     white = white_level(np.asarray(sweep.images))
     save_image(folder, "all-in-focus", grey_levels(sharp, white))
     rows, columns = sharp.shape
+    assert sweep.slope is not None  # a study's cameras are computed
     slope = float(sweep.slope)
     extent = (-columns / 2 * slope, columns / 2 * slope, rows / 2 * slope, -rows / 2 * slope)
     figure = Figure(figsize=(12, 3.4 * rows / columns * 1.15 + 1.5), layout="constrained")

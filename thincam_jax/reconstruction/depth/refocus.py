@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 from thincam_jax.reconstruction.methods import choose_solver, reconstruct
 from thincam_jax.reconstruction.noise import estimate_variance
 from thincam_jax.reconstruction.poisson import PoissonTV
-from thincam_jax.reconstruction.recording import Cameras, Recording
+from thincam_jax.reconstruction.recording import Cameras, Psfs, Recording
 from thincam_jax.reconstruction.solver import AbstractSolver
 
 _LEAST = 3  # a maximum inside of the sweep needs two neighbours
@@ -26,18 +26,18 @@ class RefocusSweep(eqx.Module):
 
     - `images`: radiance, (distance, *batch, y, x), upright.
     - `distances`: t, mm, increasing.
-    - `slope`: p/d.
+    - `slope`: p/d; None over measured PSFs, which do not tell it.
     """
 
     images: Float[Array, "distance *batch y x"]
     distances: Float[Array, " distance"]
-    slope: Float[Array, ""]
+    slope: Float[Array, ""] | None
     method: str = eqx.field(static=True, default="")
 
     @property
-    def pitch(self) -> Float[Array, " distance"]:
-        """Distance of the pixels on the object, mm, of each image."""
-        return self.slope * self.distances
+    def pitch(self) -> Float[Array, " distance"] | None:
+        """Distance of the pixels on the object, mm, of each image; None over measured PSFs."""
+        return None if self.slope is None else self.slope * self.distances
 
 
 def refocus_sweep(
@@ -58,7 +58,8 @@ def refocus_sweep(
 
     **Arguments**
 
-    - `recording`: seen by `Cameras`, whose own object distance is not used.
+    - `recording`: seen by `Cameras`, whose own object distance is not used; or by `Psfs` with a
+      plane for each of `distances`, measured there with a point on the axis.
     - `distances`: mm, at least three, increasing; best evenly spaced in 1/t (`refocus_distances`),
       with a step below a third of `axial_resolution`.
     - `solver`: default the one of `choose_solver`, chosen once: images of two methods do not
@@ -68,8 +69,6 @@ def refocus_sweep(
     **Errors**: ValueError, one line, for distances that are not positive and increasing.
     """
     focus = _increasing(distances)
-    if not isinstance(recording.seen_by, Cameras):
-        raise ValueError("a sweep refocuses computed PSFs; give a recording seen by Cameras")
     tau = getattr(solver, "tau", None)
     if isinstance(tau, str):
         raise ValueError(
@@ -78,18 +77,45 @@ def refocus_sweep(
         )
     if recording.noise_variance is None and not isinstance(solver, PoissonTV):
         recording = recording.with_noise(estimate_variance(recording.captures))
+    focused = _focused(recording, focus)
     if solver is None:
-        solver, _ = choose_solver(recording.focused(focus[0]))
+        solver, _ = choose_solver(focused[0])
     images, slope = [], None
-    for index, distance in enumerate(focus):
-        result = reconstruct(recording.focused(distance), solver)
+    for index, (one, distance) in enumerate(zip(focused, focus, strict=True)):
+        result = reconstruct(one, solver)
         images.append(result.image)
-        slope = jnp.reshape(jnp.asarray(result.pitch), ()) / distance  # p·t/d over t
+        if result.pitch is not None:
+            slope = jnp.reshape(jnp.asarray(result.pitch), ()) / distance  # p·t/d over t
         if callback is not None:
             callback(index + 1)
     stack = jnp.stack(images)
-    slope = jnp.asarray(slope, stack.dtype)
+    slope = None if slope is None else jnp.asarray(slope, stack.dtype)
     return RefocusSweep(stack, jnp.asarray(focus, stack.dtype), slope, solver.name)
+
+
+def _focused(recording: Recording, distances: list[float]) -> list[Recording]:
+    """The recording focused on each distance: another PSF, all else as it is."""
+    seen_by = recording.seen_by
+    if isinstance(seen_by, Cameras):
+        return [recording.focused(distance) for distance in distances]
+    if not isinstance(seen_by, Psfs):
+        raise ValueError("a sweep refocuses PSFs; give a recording seen by Cameras or Psfs")
+    planes = seen_by.psfs.shape[2]
+    if planes != len(distances):
+        raise ValueError(
+            f"the PSFs have {planes} planes, (capture, channel, plane, k, l), for "
+            f"{len(distances)} distances; give one for each"
+        )
+    stacks = [seen_by.psfs[:, :, k : k + 1] for k in range(planes)]
+    return [
+        Recording(
+            recording.captures,
+            Psfs(stack, field_shape=seen_by.field_shape),
+            noise_variance=recording.noise_variance,
+            valid=recording.valid,
+        )
+        for stack in stacks
+    ]
 
 
 def _increasing(distances) -> list[float]:
