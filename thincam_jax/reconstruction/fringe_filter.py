@@ -12,7 +12,7 @@ from jaxtyping import Array, Complex, Float
 
 from thincam_jax._core import checks
 from thincam_jax._core.grids import Grid, fast_shape, same_parity
-from thincam_jax._core.precision import phasor, turn_phasor
+from thincam_jax._core.precision import as_complex, phasor, turn_phasor
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.masks.fza import FresnelZoneAperture
 from thincam_jax.reconstruction.recording import Cameras
@@ -21,7 +21,7 @@ from thincam_jax.reconstruction.wiener import filtered_cameras
 
 
 class FringeFilter(eqx.Module):
-    r"""Four captures with the phases 0, π/2, π, 3π/2 and the inverse of the mask's shadow.
+    r"""Captures of four phases, or of two in quadrature, and the inverse of the mask's shadow.
 
     .. math::
         G_{FS} = j\,(G_0 - G_\pi) + (G_{3\pi/2} - G_{\pi/2}),\qquad
@@ -32,18 +32,24 @@ class FringeFilter(eqx.Module):
     filter's chirp turns by more than π between frequencies of the padded window it is set to
     zero; for a mask no larger than the sensor nothing but noise lies there.
 
-    **Arguments**: `cameras`, four with one sensor, distance and β, in the order of the phases.
-    Their wavelength is not used.
+    Of two phases, 0 and 3π/2, it is
+    :math:`G = 2j\,[(G_0 - \bar G_0) - j\,(G_{3\pi/2} - \bar G_{3\pi/2})]`, with +j for 0 and π/2.
+    Only the mean of the background is taken away, where four phases cancel all of it: a few bright
+    things on black come out as well as by four, a bright field does not; use `AdmmTV` for that.
+
+    **Arguments**: `cameras`, of one sensor, distance and β, with the phases 0, π/2, π, 3π/2, or 0
+    and one of π/2 and 3π/2, in any order, that of the captures. Their wavelength is not used.
     """
 
     inverse: Complex[Array, "v u"]
+    weights: Complex[Array, " capture"]
     object_pitch: Float[Array, ""]
     sensor_shape: tuple[int, int] = eqx.field(static=True)
     field_shape: tuple[int, int] = eqx.field(static=True)
 
     def __init__(self, cameras: Cameras):
         cameras.require("object_distance")
-        beta, camera = _check_phases(cameras.cameras), cameras.cameras[0]
+        (beta, weights), camera = _check_phases(cameras.cameras), cameras.cameras[0]
         sensor = camera.sensor.grid
         self.sensor_shape = sensor.shape
         self.field_shape = same_parity(cameras.field_shape or sensor.shape, sensor.shape)
@@ -54,15 +60,17 @@ class FringeFilter(eqx.Module):
         magnification = 1 + camera.distance / object_distance
         grid = Grid(padded, sensor.pitch)
         self.inverse = _inverse_filter(grid, beta, magnification, camera.mask.centre)
+        self.weights = jnp.asarray(weights, self.inverse.dtype)
         self.object_pitch = sensor.pitch * object_distance / camera.distance
 
     def __call__(self, captures: Float[Array, "capture *batch y x"]) -> Reconstruction:
-        """The reconstruction of captures (4, *batch, y, x), in the order of the phases."""
+        """The reconstruction of captures (capture, *batch, y, x), in the order of the cameras."""
         captures = jnp.asarray(captures, dtype=self.object_pitch.dtype)
-        if captures.shape[0] != 4 or captures.shape[-2:] != self.sensor_shape:
+        wanted = len(self.weights)
+        if captures.shape[0] != wanted or captures.shape[-2:] != self.sensor_shape:
             raise ValueError(
-                f"captures have shape {captures.shape}; give (4, …, {self.sensor_shape[0]}, "
-                f"{self.sensor_shape[1]}), in the order of the phases 0, π/2, π, 3π/2"
+                f"captures have shape {captures.shape}; give ({wanted}, …, {self.sensor_shape[0]}, "
+                f"{self.sensor_shape[1]}), in the order of the cameras"
             )
         count, *batch, rows, columns = captures.shape
         flat = captures.reshape(count, -1, rows, columns)
@@ -71,8 +79,10 @@ class FringeFilter(eqx.Module):
         return Reconstruction(image, self.object_pitch, "fringe_scanning")
 
     @eqx.filter_jit
-    def _image(self, captures: Float[Array, "4 y x"]) -> Float[Array, "m n"]:
-        scanned = jax.lax.complex(captures[3] - captures[1], captures[0] - captures[2])
+    def _image(self, captures: Float[Array, "capture y x"]) -> Float[Array, "m n"]:
+        if len(self.weights) == 2:  # four cancel the whole background, two only its mean
+            captures = captures - jnp.mean(captures, axis=(1, 2), keepdims=True)
+        scanned = jnp.tensordot(self.weights, as_complex(captures), axes=1)
         padded = self.inverse.shape
         margins = [(0, p - s) for p, s in zip(padded, scanned.shape, strict=True)]
         spectrum = jnp.fft.fft2(jnp.pad(scanned, margins)) * self.inverse
@@ -84,7 +94,7 @@ class FringeFilter(eqx.Module):
 
 
 class FringeScanning(AbstractSolver):
-    """The conventional geometric inverse of four phases, see `FringeFilter`; for comparison.
+    """The conventional geometric inverse of two or four phases, see `FringeFilter`; for comparison.
 
     It needs `Cameras`; neither noise nor wavelength is used.
     """
@@ -114,17 +124,25 @@ def _inverse_filter(grid: Grid, beta, magnification, centre) -> Complex[Array, "
     return gain.astype(filtered.dtype) * filtered * turn_phasor(v * down + u * right)
 
 
-def _check_phases(cameras: Sequence[LenslessCamera]) -> Float[Array, ""]:
+def _check_phases(
+    cameras: Sequence[LenslessCamera],
+) -> tuple[Float[Array, ""], Complex[np.ndarray, " capture"]]:
+    """β, and the weight j·e^{jφ} of each capture, twice that where there are two."""
+    count = len(cameras)
     masks = [c.mask for c in cameras if isinstance(c.mask, FresnelZoneAperture)]
-    if len(cameras) != 4 or len(masks) != 4:
+    if count not in (2, 4) or len(masks) != count:
         raise ValueError(
-            f"fringe scanning takes four cameras with a FresnelZoneAperture; got {len(cameras)}"
+            "fringe scanning takes four cameras with a FresnelZoneAperture, or two in quadrature; "
+            f"got {count}"
         )
     phases = np.array([float(m.phase) for m in masks])
-    wanted = np.arange(4) * math.pi / 2
-    if np.abs(np.exp(1j * phases) - np.exp(1j * wanted)).max() > 1e-3:
+    quarters = np.round(phases / (math.pi / 2))
+    found = sorted(int(q) for q in quarters % 4)
+    is_near = np.abs(phases - quarters * math.pi / 2).max() < 1e-3
+    if not is_near or found not in ([0, 1, 2, 3], [0, 1], [0, 3]):
         raise ValueError(
-            f"phases are {np.round(phases, 4).tolist()} rad; give 0, π/2, π, 3π/2 in this order"
+            f"phases are {np.round(phases, 4).tolist()} rad; give 0, π/2, π, 3π/2, or 0 and one of "
+            "π/2 and 3π/2"
         )
     settings = {
         (float(c.distance), c.sensor.shape, float(c.sensor.pitch)) + _fixed_numbers(m)
@@ -132,10 +150,9 @@ def _check_phases(cameras: Sequence[LenslessCamera]) -> Float[Array, ""]:
     }
     if len(settings) > 1:
         raise ValueError(
-            "the four cameras differ in distance, sensor or mask; make them equal "
-            "in all but the phase"
+            "the cameras differ in distance, sensor or mask; make them equal in all but the phase"
         )
-    return masks[0].beta
+    return masks[0].beta, 4 / count * 1j * np.array([1, 1j, -1, -1j])[(quarters % 4).astype(int)]
 
 
 def _fixed_numbers(mask: FresnelZoneAperture) -> tuple:
