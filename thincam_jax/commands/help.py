@@ -7,12 +7,28 @@ from typing import Any
 
 from typer.core import TyperCommand, TyperGroup
 
-ORDER = ("init", "run", "reconstruct", "sweep", "design", "bench", "doctor")
+ORDER = ("init", "run", "reconstruct", "calibrate", "sweep", "design", "bench", "doctor")
 # Of `thincam reconstruct`; what is in none stands first.
 GROUPS = {
-    "Calibration": ("background", "psf_background", "dead", "bits", "saturation", "noise"),
+    "Calibration": (
+        "background",
+        "psf_background",
+        "dead",
+        "bits",
+        "psf_bits",
+        "saturation",
+        "noise",
+    ),
     "Preparation": (
-        *("downsample", "bayer", "demosaic", "noise_threshold", "psf_channels", "corner"),
+        *(
+            "downsample",
+            "bayer",
+            "demosaic",
+            "noise_threshold",
+            "psf_channels",
+            "psf_scale",
+            "corner",
+        ),
     ),
     "Reconstruction": ("method", "tau", "ridge", "iterations", "coupling"),
     "Image": ("field", "flip", "linear", "gamma", "white_balance"),
