@@ -76,7 +76,8 @@ def fail(error: BaseException) -> NoReturn:
 def progress_bar(*more: str) -> "Iterator[rich.progress.Progress]":
     """With a count and the times; `more` are templates, as "{task.fields[objective]}".
 
-    What is done under it has something to keep when it is interrupted.
+    It is seen once it is started: before, all may be refused. What is done under it has something
+    to keep when it is interrupted.
     """
     from rich import progress
 
@@ -89,16 +90,22 @@ def progress_bar(*more: str) -> "Iterator[rich.progress.Progress]":
         progress.TextColumn("left"),
         progress.TimeRemainingColumn(),
     )
-    with interruptible(), bar:
-        yield bar
+    with interruptible():
+        try:
+            yield bar
+        finally:
+            if bar.live.is_started:
+                bar.stop()
 
 
 @contextlib.contextmanager
 def counted(name: str) -> Iterator[Callable[[str, int], None]]:
     """A progress bar; what it yields is called at each step, with its text and their number."""
     with progress_bar() as bar:
-        # Seen from the first step on: before, all may be refused.
-        task = bar.add_task(name, total=None, visible=False)
-        yield lambda text, total: bar.update(
-            task, advance=1, total=total, description=text, visible=True
-        )
+        task = bar.add_task(name, total=None)
+
+        def begun(text: str, total: int) -> None:
+            bar.update(task, advance=1, total=total, description=text)
+            bar.start()
+
+        yield begun

@@ -84,8 +84,7 @@ class _Bar:
     def __init__(self, bar: rich.progress.Progress, iterations: int, names: list[str]):
         self.bar, self.iterations, self.names = bar, iterations, names
         self.name = names[0]
-        # Seen from the first iteration on: before, all may be refused.
-        self.task = bar.add_task(self._title(), total=iterations, objective="", visible=False)
+        self.task = bar.add_task(self._title(), total=iterations, objective="")
 
     def __call__(self, name: str, progress: Progress) -> None:
         if name != self.name:
@@ -93,11 +92,13 @@ class _Bar:
             self.bar.reset(self.task, description=self._title(), total=self.iterations)
         objective = f"objective {progress.objective:.4g}"
         done = {"completed": progress.iteration, "objective": objective}
-        self.bar.update(self.task, visible=True, **done)
+        self.bar.update(self.task, **done)
+        self.bar.start()
 
     def finish(self, iterations: int) -> None:
         """Full, also where fewer iterations were enough."""
-        self.bar.update(self.task, completed=iterations, total=iterations, visible=True)
+        self.bar.update(self.task, completed=iterations, total=iterations)
+        self.bar.start()
 
     def _title(self) -> str:
         count = len(self.names)

@@ -105,12 +105,12 @@ def _run(
     from thincam_jax.commands.sweep.run import run_sweep
 
     with progress_bar("{task.fields[failed]}") as bar:
-        task = bar.add_task(name, total=len(points), failed="", visible=False)
+        task = bar.add_task(name, total=len(points), failed="")
 
         def progress(ended: int, failed: int) -> None:
             so_far.ended, so_far.failed = ended, failed
-            told_failed = f"{failed} failed" if failed else ""
-            bar.update(task, completed=ended, failed=told_failed, visible=True)
+            bar.update(task, completed=ended, failed=f"{failed} failed" if failed else "")
+            bar.start()
 
         return run_sweep(points, folder, progress, scheduler=scheduler, workers=workers)
 
