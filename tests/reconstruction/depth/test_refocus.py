@@ -163,3 +163,17 @@ def test_measured_psfs_tell_the_distances():
     depth = depth_map(sweep)
     for box, wanted in zip(boxes, (16, 24), strict=True):
         assert np.median(depth.distance[box]) == pytest.approx(wanted, abs=2)
+
+
+@pytest.mark.thorough
+def test_planes_reconstructed_together_share_what_stands_between_them():
+    """Half-way between two planes a box is in both; on one of them it is in that."""
+    planes = np.stack([spots(scale) for scale in (1.0, 1.06)])
+    image = np.zeros((95, 127))
+    image[40:60, 50:80] = np.kron(np.indices((5, 6)).sum(0) % 2, np.ones((4, 5)))
+    for scale, least, most in ((1.0, 0.9, 1.0), (1.03, 0.3, 0.7), (1.06, 0.0, 0.1)):
+        capture = scipy.signal.fftconvolve(image, spots(scale))[47:95, 63:127]
+        capture += 1e-3 * capture.max() * np.random.default_rng(6).normal(size=capture.shape)
+        recording = tc.Recording(capture[None], tc.Psfs(planes[None, None]))
+        first, second = tc.reconstruct(recording, tc.AdmmTV(iterations=150)).image.sum((1, 2))
+        assert least < first / (first + second) < most
