@@ -64,7 +64,7 @@ def responses(design: Design, setup: Setup, frequencies: Frequencies) -> Respons
 def _factors(
     design: Design, setup: Setup, frequencies: Quadrant
 ) -> Complex[Array, "capture pair n"]:
-    """Of all captures at once: under `vmap` both ways of `chirp_integral` would be computed."""
+    """Of all captures at once."""
     mask = design.mask(design.beta[0], design.phase[0])
     u = frequencies.axis / design.distance[:, None]
     shift = design.wavelength[:, None] * frequencies.axis

@@ -4,7 +4,7 @@ import functools
 from typing import Any
 
 import equinox as eqx
-import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
@@ -39,8 +39,9 @@ class LenslessCamera(eqx.Module):
 
     def path(self, wavelength: Number, object_distance: Number) -> Path:
         """The light's path from a point at `object_distance` (mm) in front of the mask."""
-        # Plain numbers take the camera's precision, so that float32 cameras stay float32.
-        like = functools.partial(jnp.asarray, dtype=self.distance.dtype)
+        # Plain numbers take the camera's precision, so that float32 cameras stay float32. In NumPy,
+        # they stay known inside jit.
+        like = functools.partial(np.asarray, dtype=self.distance.dtype)
         wavelength = like(wavelength) if isinstance(wavelength, int | float) else wavelength
         if isinstance(object_distance, int | float):
             object_distance = like(object_distance)

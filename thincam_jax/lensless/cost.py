@@ -13,11 +13,10 @@ from thincam_jax.lensless.masks.base import AbstractMask
 from thincam_jax.lensless.masks.sampled import SampledMask
 from thincam_jax.lensless.method import SAMPLED, PsfMethod
 from thincam_jax.lensless.propagation.angular_spectrum import padded_shape
-from thincam_jax.lensless.propagation.separable import PIXEL_NODES
 
-# Real operations of one chirp integral (two pairs of Fresnel integrals in both their forms, with
-# their phasors), of one phasor, of one sample of a propagated field besides its transforms, and of
-# one summand of the Rayleigh-Sommerfeld integral.
+# Real operations of one chirp integral (both edges in both their forms, with their phasors), of one
+# phasor, of one sample of a propagated field besides its transforms, and of one summand of the
+# Rayleigh-Sommerfeld integral.
 _CHIRP, _PHASOR, _WAVE, _SUMMAND = 1200, 40, 100, 60
 # What any evaluation holds beside its arrays: its arguments and constants.
 _BASE = 4096
@@ -72,22 +71,24 @@ def _separable_sum(mask, shape: tuple[int, int], method: PsfMethod) -> tuple[flo
         products = rows * height * width + rows * width * columns
         held = rows * (height + 2 * width + 2 * columns) + columns * width
         return 4.0 * products, float(held)
-    double = method.precision == "float64"
     length = sum(shape)
     cells = getattr(mask, "pixels", None) or 1
     count = len(orders)
     pairs = count * (count + 1) // 2
     if method.model == "separable":
-        nodes = PIXEL_NODES if method.pixel_integration else 1
-        integrals = length * nodes * (count if cells == 1 else cells)
+        nodes = method.nodes if method.pixel_integration else 1
+        at_once = length * (count if cells == 1 else cells)
+        integrals = nodes * at_once
         flops = _CHIRP * integrals + 4 * count * cells * length * nodes * (cells > 1)
-        held = max((12.2 if double else 7.4) * integrals, 5.2 * pairs * length)
+        # One node after another; the orders' fields of all of them.
+        fields = nodes * count * length if method.pixel_integration else 0
+        held = max(5.5 * at_once + 2.5 * fields, 5.2 * pairs * length)
         terms = pairs
     else:
         terms = pairs - count + 1 if method.model != "geometric" else _harmonics(orders)
         work = _CHIRP if method.pixel_integration else _PHASOR
         flops = work * terms * length * cells
-        per_factor = (9.2 if double else 4.6) if method.pixel_integration else 2.1
+        per_factor = 12.0 if method.pixel_integration else 2.1
         held = per_factor * terms * length + (2.5 * cells * length if cells > 1 else 0)
     return float(flops + 4 * terms * math.prod(shape)), float(held)
 

@@ -11,6 +11,7 @@ from thincam_jax._core.grids import Grid
 from thincam_jax._core.precision import PRECISIONS, Precision, precision_of
 from thincam_jax.lensless.masks.base import AbstractMask
 from thincam_jax.lensless.propagation.angular_spectrum import require_odd
+from thincam_jax.lensless.propagation.separable import PIXEL_NODES
 
 Model = Literal[
     "geometric",
@@ -33,6 +34,7 @@ class PsfMethod(NamedTuple):
 
     - `samples`, `mask_shape`: samples a pixel, and pixels of the mask plane, of the models that
       sample the mask; 1 and None for the closed forms, and None for a mask of traced size.
+    - `nodes`: a pixel and axis, of the pixel average of `separable`.
     """
 
     model: Model
@@ -40,6 +42,7 @@ class PsfMethod(NamedTuple):
     pixel_integration: bool = False
     samples: int = 1
     mask_shape: tuple[int, int] | None = None
+    nodes: int = PIXEL_NODES
 
     @property
     def oversampling(self) -> int | None:

@@ -23,7 +23,7 @@ from thincam_jax.lensless.propagation.geometric import geometric
 from thincam_jax.lensless.propagation.paraxial import paraxial
 from thincam_jax.lensless.propagation.path import Path
 from thincam_jax.lensless.propagation.rayleigh_sommerfeld import rayleigh_sommerfeld
-from thincam_jax.lensless.propagation.separable import PIXEL_NODES, separable
+from thincam_jax.lensless.propagation.separable import PIXEL_NODES, pixel_nodes, separable
 from thincam_jax.lensless.propagation.separable_sum import SeparableSum, centre_phase
 
 
@@ -102,7 +102,7 @@ def _irradiance(
     """The PSF in the form in which the model has it: terms where there are terms, else an image."""
     if method.model not in SAMPLED:
         mask = _unfocused(mask, path) if method.model == "closed_form" else mask
-        return _closed(mask, grid, path, method.model, method.pixel_integration, PIXEL_NODES)
+        return _closed(mask, grid, path, method.model, method.pixel_integration, method.nodes)
     sampled = angular_spectrum if method.model == "angular_spectrum" else rayleigh_sommerfeld
     return sampled(
         mask,
@@ -167,6 +167,8 @@ def _otf(mask: AbstractMask, grid: Grid, path: Path, method: PsfMethod):
 def _evaluate(function, mask: AbstractMask, grid: Grid, path: Path, method: PsfMethod):
     """In the method's precision; the result comes back in the camera's."""
     own = precision_of(grid.pitch)
+    if method.model == "separable" and method.pixel_integration:
+        method = method._replace(nodes=pixel_nodes(mask, grid, path, method.precision))
     with allow(method.precision, mask, grid, path):
         if method.precision != own:
             mask, grid, path = cast((mask, grid, path), method.precision)

@@ -260,7 +260,7 @@ def _optics_left_out(probe: ZoneProbe, model: Model) -> list[str]:
         if not probe.pixel_integration:
             return []
         size = probe.model_error("separable")
-        return [f"a pixel's average is taken at {PIXEL_NODES} points an axis: {size:.1e}"]
+        return [f"a pixel's average is taken at up to {PIXEL_NODES} points an axis: {size:.1e}"]
     edge = probe.model_error("closed_form")
     effects = [f"the aperture's edge is left out ({zone}): {edge:.1e}"]
     if model == "paraxial":

@@ -10,25 +10,56 @@ product of two one-dimensional integrals
 :math:`\pi/(\lambda t)`; :math:`b = \pi/(\lambda d)` is the Fresnel propagation over :math:`d`.
 """
 
+import functools
+import math
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
+from numpy.polynomial import Chebyshev, Polynomial
 from numpy.polynomial.legendre import leggauss
 
-from thincam_jax._core.precision import as_complex, phasor
-
-# The phase across the interval, in rad, below which quadrature is used instead of edge terms.
-# Edge terms diverge like 1/phase as the interval's phase goes to zero and then cancel; at 3 rad the
-# cancellation costs under a digit and 16 Gauss-Legendre nodes are exact to 1e-16.
-_SLOW_PHASE = 3.0
-SLOW_NODES = 16
+from thincam_jax._core.precision import Precision, phasor, precision_of
 
 # Beyond |z| = 5 the asymptotic series of the auxiliary Fresnel functions (DLMF 7.12.2, 7.12.3) is
-# exact to 1e-15 with these numbers of terms; it stays regular where z itself overflows.
+# exact to 1e-15 with ten terms and to 1e-8 with four; it stays regular where z itself overflows.
 _FAR = 5.0
 _SERIES_F = tuple((-1.0) ** m * float(np.prod(np.arange(4 * m - 1, 0, -2.0))) for m in range(10))
 _SERIES_G = tuple((-1.0) ** m * float(np.prod(np.arange(4 * m + 1, 0, -2.0))) for m in range(10))
+# Below it they are polynomials in t = (z − c)/(z + c), divided by z + c.
+_CENTRE = 2.0
+# The phase across the interval, in rad, below which a power series is used in place of edge waves,
+# which diverge like 1/phase as it goes to zero and then cancel.
+_SLOW_PHASE = 0.5
+
+
+class _Degrees(NamedTuple):
+    """Of the polynomials and series, enough for a precision."""
+
+    near: int
+    far: int
+    slow: int
+
+
+_DEGREES = {"float32": _Degrees(15, 4, 7), "float64": _Degrees(29, 10, 13)}
+
+
+def _auxiliary_polynomials(degree: int) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    r"""Coefficients of (z + c) f and (z + c) g in t = (z − c)/(z + c) over 0 ≤ z ≤ 5.
+
+    :math:`g + jf = \int_0^\infty e^{j\pi(s^2/2 + zs)}\,ds` along s = r e^{jπ/4}, where it decays.
+    """
+    top = (_FAR - _CENTRE) / (_FAR + _CENTRE)
+    t = (top - 1) / 2 + (top + 1) / 2 * np.cos(np.pi * (np.arange(80) + 0.5) / 80)
+    z = _CENTRE * (1 + t) / (1 - t)
+    nodes, weights = leggauss(80)
+    turn, r = np.exp(0.25j * np.pi), 2.75 * (nodes + 1)
+    values = np.exp(-0.5 * np.pi * r**2 + 1j * np.pi * turn * z[:, None] * r) @ weights
+    fit = Chebyshev.fit(t, 2.75 * turn * values * (z + _CENTRE), degree, domain=(-1.0, top))
+    coefficients = fit.convert(kind=Polynomial).coef
+    return tuple(coefficients.imag.tolist()), tuple(coefficients.real.tolist())
 
 
 def chirp_integral(
@@ -42,14 +73,16 @@ def chirp_integral(
 
     With :math:`a = g + b`, completing the square gives Fresnel integrals of
     :math:`z = \sqrt{2/(\pi|a|)}\,(a\xi - bx)` (DLMF 7.2.7, 7.2.8). That form is singular at
-    :math:`a = 0`, where the order focuses on the sensor and the integral is a sinc. Three forms,
-    each used where it loses no digits, cover all cases:
+    :math:`a = 0`, where the order focuses on the sensor and the integral is a sinc. So it is
+    written as the wave of each edge, by the auxiliary Fresnel functions (DLMF 7.5.3, 7.5.4), plus
+    the stationary-point wave :math:`e^{j g b x^2/a}` when that point lies between the ends:
 
-    - phase across the interval under 3 rad: Gauss-Legendre quadrature;
-    - an end with \|z\| < 5: ``jax.scipy.special.fresnel``;
-    - an end with \|z\| ≥ 5: the asymptotic edge wave, written in
-      :math:`y = a / (2 (a\xi - bx)^2)` so that it is regular at :math:`a = 0`, plus the
-      stationary-point wave :math:`e^{j g b x^2/a}` when that point lies between the ends.
+    - an end with \|z\| < 5: polynomials in z;
+    - an end with \|z\| ≥ 5: the asymptotic series, written in
+      :math:`y = a / (2 (a\xi - bx)^2)` so that it is regular at :math:`a = 0`;
+    - phase across the interval under ½ rad: its power series in place of both edges.
+
+    All are short polynomials, computed everywhere: no branch, so that `jax.vmap` costs nothing.
 
     No piston or large phase is formed and divided out again. The error grows with the phases that
     the result itself contains: about eps times \|g b x²/a\| for the stationary wave.
@@ -78,72 +111,94 @@ def chirp_average(
     return _integral(g, none, none, middle, half, middle - half, middle + half)
 
 
+_NEAR = {p: _auxiliary_polynomials(d.near) for p, d in _DEGREES.items()}
+
+
 def _integral(g, b, x, middle, half, lower, upper) -> Complex[Array, "..."]:
     g, b, x, middle, half, lower, upper = jnp.broadcast_arrays(g, b, x, middle, half, lower, upper)
-    slope = g * middle + b * (middle - x)
-    slow = jnp.abs(g + b) * half**2 + 2 * jnp.abs(slope * half) < _SLOW_PHASE
-    edges = _by_edges(g, b, x, lower, upper, slow)
-    return jax.lax.cond(
-        jnp.any(slow),
-        lambda: jnp.where(slow, _by_quadrature(g, b, x, middle, half, slow), edges),
-        lambda: edges,
-    )
-
-
-def _by_quadrature(g, b, x, middle, half, used) -> Complex[Array, "..."]:
-    """Gauss-Legendre, for intervals over which the phase hardly turns."""
-    nodes, weights = leggauss(SLOW_NODES)
-    nodes, weights = (jnp.asarray(v, dtype=x.dtype)[:, None] for v in (nodes, weights))
-    # Where this form is not used its phase may be anything: keep it, and its gradient, finite.
-    half_used = jnp.where(used, half, 0.0).ravel()
-    s = nodes * half_used
-    slope = (g * middle + b * (middle - x)).ravel()
-    relative = phasor(2 * slope * s + (g + b).ravel() * s**2)
-    centre = phasor(g * middle**2 + b * (x - middle) ** 2)
-    total = as_complex(half_used) * jnp.sum(as_complex(weights) * relative, axis=0)
-    return centre * total.reshape(x.shape)
-
-
-def _by_edges(g, b, x, lower, upper, unused) -> Complex[Array, "..."]:
+    precision = precision_of(x)
     a = g + b
+    slope, bend = 2 * (g * middle + b * (middle - x)) * half, a * half**2
+    slow = jnp.abs(bend) + jnp.abs(slope) < _SLOW_PHASE
+    # Where a form is not used its arguments may be anything: keep it, and its gradient, finite.
+    slope, bend = jnp.where(slow, slope, 0.0), jnp.where(slow, bend, 0.0)
+    even, odd = (half * part for part in _slow_waves(bend, slope**2, precision))
     sign = jnp.where(a < 0, -1.0, 1.0).astype(x.dtype)
-    magnitude = jnp.where(unused | (a == 0), 1.0, jnp.abs(a))
+    magnitude = jnp.where(slow | (a == 0), 1.0, jnp.abs(a))
     amplitude = jnp.sqrt(0.5 * jnp.pi / magnitude)
 
     def edge(end):
-        """The edge's wave, and which side of it the stationary point lies on (0 if included)."""
+        """Phase and amplitude of the edge's wave, and its side of the stationary point."""
         slope = g * end + b * (end - x)
-        phase = g * end**2 + b * (x - end) ** 2
-        near = slope**2 < (0.5 * jnp.pi * _FAR**2) * jnp.abs(a)
+        direction = jnp.where(slope < 0, -1.0, 1.0).astype(x.dtype)
+        near = (slope**2 < (0.5 * jnp.pi * _FAR**2) * jnp.abs(a)) & ~slow
+        far = ~near & ~slow
+        z = jnp.where(near, direction * slope, 0.0) * jnp.sqrt(2 / (jnp.pi * magnitude))
+        f_near, g_near = _near(z, precision)
+        steep = jnp.where(far, slope, 1.0)
+        y = jnp.where(far, 0.5 * a / steep**2, 0.0)
+        f_far, g_far = _far(y, precision)
+        in_phase = jnp.where(near, sign * direction * amplitude * g_near, 0.5 * g_far / steep)
+        quadrature = jnp.where(near, direction * amplitude * f_near, 0.5 * f_far / steep)
+        return g * end**2 + b * (x - end) ** 2, in_phase, quadrature, sign * direction
 
-        near = near & ~unused
-        slope_near = jnp.where(near, slope, 0.0)
-        z = sign * slope_near * jnp.sqrt(2 / (jnp.pi * magnitude))
-        sine, cosine = jax.scipy.special.fresnel(z)
-        stationary = phasor(phase - sign * slope_near**2 / magnitude)
-        wave_near = as_complex(amplitude) * stationary * jax.lax.complex(cosine, sign * sine)
-
-        far = ~near & ~unused
-        slope_far = jnp.where(far, slope, 1.0)
-        y = jnp.where(far, 0.5 * a / slope_far**2, 0.0)
-        f, h = _polynomial(_SERIES_F, y**2), y * _polynomial(_SERIES_G, y**2)
-        wave_far = -phasor(phase) * jax.lax.complex(h / (2 * slope_far), f / (2 * slope_far))
-
-        side = jnp.where(far, sign * jnp.sign(slope), 0.0)
-        wave = jnp.where(near, wave_near, jnp.where(far, wave_far, 0.0))
-        # Kept apart: fused, the compiler evaluates an end's Fresnel integrals more than once.
-        return jax.lax.optimization_barrier((wave, side))
-
-    wave_lower, side_lower = edge(lower)
-    wave_upper, side_upper = edge(upper)
-    inside = (side_upper - side_lower) / 2
+    phase_lower, in_phase_lower, quadrature_lower, side_lower = edge(lower)
+    phase_upper, in_phase_upper, quadrature_upper, side_upper = edge(upper)
+    wave_lower = jnp.where(slow, 0.0, in_phase_lower), jnp.where(slow, 0.0, quadrature_lower)
+    wave_upper = jnp.where(slow, even, -in_phase_upper), jnp.where(slow, odd, -quadrature_upper)
+    centre = g * middle**2 + b * (x - middle) ** 2
+    phase_upper = jnp.where(slow, centre, phase_upper)
     # The stationary phase g b x²/a is meaningful only if the stationary point b x/a is in reach.
-    signed = sign * magnitude
-    phase = jnp.where(inside != 0, (b / signed) * g * jnp.where(inside != 0, x, 0.0) ** 2, 0.0)
-    stationary = (
-        as_complex(amplitude * inside) * phasor(phase) * jax.lax.complex(jnp.ones_like(sign), sign)
+    inside = jnp.where(slow, 0.0, (side_upper - side_lower) / 2)
+    phase = jnp.where(inside != 0, (b / (sign * magnitude)) * g * x**2, 0.0)
+    stationary = inside * amplitude, inside * sign * amplitude
+    return (
+        jax.lax.complex(*wave_upper) * phasor(phase_upper)
+        + jax.lax.complex(*wave_lower) * phasor(phase_lower)
+        + jax.lax.complex(*stationary) * phasor(phase)
     )
-    return wave_upper - wave_lower + stationary
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(1,))
+def _near(z, precision: Precision):
+    """Auxiliary Fresnel functions f(z), g(z) for 0 ≤ z ≤ 5."""
+    t = (z - _CENTRE) / (z + _CENTRE)
+    f, g = (_polynomial(coefficients, t) / (z + _CENTRE) for coefficients in _NEAR[precision])
+    return f, g
+
+
+@_near.defjvp
+def _near_slope(precision, primals, tangents):
+    """f' = −πzg, g' = πzf − 1 (DLMF 7.10.2)."""
+    (z,), (z_dot,) = primals, tangents
+    f, g = _near(z, precision)
+    return (f, g), (-jnp.pi * z * g * z_dot, (jnp.pi * z * f - 1) * z_dot)
+
+
+def _far(y, precision: Precision):
+    """The same for large z, times πz, in y = 1/(πz²)."""
+    terms = _DEGREES[precision].far
+    f, g = (_polynomial(series[:terms], y**2) for series in (_SERIES_F, _SERIES_G))
+    return f, y * g
+
+
+def _slow_waves(q, p_squared, precision: Precision):
+    r"""Real and imaginary part of :math:`\int_{-1}^1 e^{j(ps + qs^2)}\,ds`, by its power series.
+
+    The sum of :math:`2 (jp)^{2m} (jq)^n / [(2m)!\,n!\,(2m + 2n + 1)]`.
+    """
+    parts = [jnp.zeros_like(q), jnp.zeros_like(q)]
+    degree = _DEGREES[precision].slow
+    for m in reversed(range(degree // 2 + 1)):
+        for parity in (0, 1):
+            row = tuple(
+                (-1.0) ** (m + n // 2)
+                * 2
+                / (math.factorial(2 * m) * math.factorial(n) * (2 * m + 2 * n + 1))
+                for n in range(parity, degree - 2 * m + 1, 2)
+            )
+            parts[parity] = parts[parity] * p_squared + (_polynomial(row, q**2) if row else 0.0)
+    return parts[0], parts[1] * q
 
 
 def _polynomial(coefficients: tuple[float, ...], t: Float[Array, "..."]) -> Float[Array, "..."]:
