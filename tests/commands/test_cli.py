@@ -406,7 +406,7 @@ def test_help_is_in_the_order_of_use():
     titles = ("Options:", *(f"{group}:" for group in help.GROUPS), "Examples:")
     assert [line.strip() for line in text.splitlines() if line.strip() in titles] == list(titles)
     assert text.index("--psf ") < text.index("Calibration:") < text.index("--dead")
-    for command in help.ORDER[:5]:
+    for command in ("init", "run", "reconstruct", "sweep", "design"):
         assert f"Examples:\n    thincam {command} " in call(command, "--help").stdout
 
 

@@ -1,6 +1,6 @@
 """What a design chooses: the captures of a lensless camera."""
 
-from typing import Literal
+from typing import get_args
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from thincam_jax._core import checks
 from thincam_jax.imaging.sensor import Sensor
 from thincam_jax.lensless.camera import LenslessCamera
-from thincam_jax.lensless.masks.fza import FresnelZoneAperture
+from thincam_jax.lensless.masks.fza import FresnelZoneAperture, Profile
 
 MOST_CAPTURES = 8
 
@@ -31,7 +31,7 @@ class Design(eqx.Module):
     wavelength: Float[Array, " capture"]
     exposure: Float[Array, " capture"]
     width: Float[Array, ""]
-    profile: Literal["cosine", "binary"] = eqx.field(static=True)
+    profile: Profile = eqx.field(static=True)
 
     def __init__(
         self,
@@ -42,7 +42,7 @@ class Design(eqx.Module):
         wavelength,
         width,
         exposure=1.0,
-        profile: Literal["cosine", "binary"] = "cosine",
+        profile: Profile = "cosine",
     ):
         """Numbers, or one for each capture: they are broadcast against each other.
 
@@ -64,7 +64,7 @@ class Design(eqx.Module):
         numbers = [jnp.broadcast_to(g, shape) for g in given]
         self.beta, self.phase, self.distance, self.wavelength, self.exposure = numbers
         self.width = checks.positive("width", width, "mm")
-        self.profile = checks.choice("profile", profile, ("cosine", "binary"))  # pyright: ignore
+        self.profile = checks.choice("profile", profile, get_args(Profile))  # pyright: ignore
 
     @property
     def captures(self) -> int:
@@ -93,7 +93,7 @@ def shots(
     *,
     wavelength,
     width,
-    profile: Literal["cosine", "binary"] = "cosine",
+    profile: Profile = "cosine",
 ) -> Design:
     """Each setting (β, d) with each of the phases, in the order of a study's captures."""
     settings = jnp.broadcast_arrays(jnp.atleast_1d(jnp.asarray(beta, float)), jnp.asarray(distance))

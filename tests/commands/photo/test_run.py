@@ -72,7 +72,7 @@ def test_same_image_as_step_by_step(folder, tmp_path):
     (result,) = run_jobs(planned, sources(folder), whole, output)
     assert isinstance(result, Finished)
     image = np.load(output.path)
-    ready = run._Rig(sources(folder)).prepare(folder / "first.tif")
+    ready = run.Rig(sources(folder)).prepare(folder / "first.tif")
     rows, columns = simulated.SHAPE
     light = simulated.scipy.signal.fftconvolve(image, ready.psf[0], mode="valid")
     assert light.shape == (rows, columns)
