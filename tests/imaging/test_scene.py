@@ -114,11 +114,18 @@ def test_whole_numbers_become_radiances():
         ((np.ones((2, 3)), 10.0, np.nan), "width is NaN"),
         ((np.full((2, 3), np.nan), 10.0, 1.0), "image holds NaN"),
         ((np.full((2, 3), np.inf), 10.0, 1.0), "image holds NaN or infinity"),
+        ((np.full((2, 3), -1.0), 10.0, 1.0), "image holds -1, a negative radiance"),
+        ((np.ones((40, 30, 3)), 10.0, 1.0), r"\(40, 30, 3\), the colours last.*moveaxis"),
     ],
 )
 def test_impossible_planes(arguments, message):
     with pytest.raises(ValueError, match=message):
         ImagePlane(*arguments)
+
+
+def test_an_image_of_complex_numbers_is_named():
+    with pytest.raises(TypeError, match="a ndarray of complex128; give an array of real"):
+        ImagePlane(np.ones((2, 3), complex), 10.0, 1.0)
 
 
 def test_spectrum_weights():
@@ -138,6 +145,8 @@ def test_spectrum_weights():
         (([],), "wavelengths is empty"),
         (([500 * nm, -1.0],), "wavelengths .* must be positive"),
         (([500 * nm, np.nan],), "wavelengths is NaN"),
+        (([500e-9],), "5e-07 mm is no light: give it in mm, not in m, such as"),
+        ((500.0,), "500 mm is no light"),
         (([500 * nm], [0.5, 0.5]), r"weights has shape \(2,\)"),
         (([500 * nm, 600 * nm], [0.5, np.inf]), "weights .* not finite"),
         (([500 * nm, 600 * nm], [1.5, -0.5]), "weights .* negative"),

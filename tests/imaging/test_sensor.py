@@ -167,3 +167,13 @@ def test_unknown_signal_power(monkeypatch):
         ValueError, match="'peak' is unknown; choose one of 'total', 'without_mean'"
     ):
         tc.GaussianNoise(20.0, "peak")
+
+
+def test_a_pitch_in_micrometres_is_refused():
+    with pytest.raises(ValueError, match=r"pitch = 5.5 mm is no pixel: .*5.5 \* um"):
+        tc.Sensor((3, 4), 5.5)
+
+
+def test_a_number_is_no_random_key():
+    with pytest.raises(TypeError, match=r"key = 0 is no random key; pass key=jax.random.key\(0\)"):
+        read_out(tc.Sensor((3, 4), 0.1), jnp.ones((3, 4)), noise=tc.GaussianNoise(30.0), key=0)

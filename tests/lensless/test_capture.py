@@ -283,3 +283,9 @@ def test_camera_built_inside_jit():
     built = tc.LenslessCamera(mask, tc.Sensor((30, 41), 0.04), 6.5)
     eager = tc.capture(built, tc.Scene(tc.ImagePlane(image, 250.0, 30.0), 500 * nm)).sum()
     assert total(jnp.asarray(25.0), jnp.asarray(image)) == pytest.approx(float(eager), rel=1e-12)
+
+
+def test_an_array_is_no_scene():
+    camera = tc.LenslessCamera(tc.FresnelZoneAperture(25.0, width=1.0), tc.Sensor((3, 4), 0.1), 5.0)
+    with pytest.raises(TypeError, match="scene is a ndarray; give thincam_jax.Scene"):
+        tc.capture(camera, np.ones((3, 4)))

@@ -425,3 +425,25 @@ def test_kernels_reach_over_every_difference():
     problem = camera_problem(jnp.ones((2, *SENSOR.shape)), cameras())
     rows, columns = kernel_shape(SENSOR.shape, FIELD)
     assert problem.operators[0].window[0] >= rows and problem.operators[0].window[1] >= columns
+
+
+@pytest.mark.parametrize(
+    ("captures", "psfs", "more", "error", "message"),
+    [
+        (np.ones((1, 6, 7), complex), np.ones((1, 3, 3)), {}, TypeError, "complex128; give real"),
+        (np.ones((1, 6, 7, 3)), np.ones((1, 3, 3)), {}, ValueError, "the colours last.*moveaxis"),
+        (np.ones((1, 6, 7)), np.ones((1, 6, 7, 3)), {}, ValueError, "psfs .* the colours last"),
+        (np.ones((1, 6, 7)), np.zeros((1, 3, 3)), {}, ValueError, "zero everywhere"),
+        (np.ones((1, 6, 7)), np.ones((1, 3, 3)), {"valid": False}, ValueError, "valid is False"),
+    ],
+)
+def test_captures_that_cannot_be_meant(captures, psfs, more, error, message):
+    with pytest.raises(error, match=message):
+        tc.Recording(captures, tc.Psfs(psfs), **more)
+
+
+def test_iterative_solvers_say_what_works_under_jit():
+    recording = tc.Recording(np.ones((1, 6, 7)), tc.Psfs(np.ones((1, 3, 3))))
+    solve = jax.jit(lambda r: tc.reconstruct(r, tc.AdmmTV()).image)
+    with pytest.raises(TypeError, match="AdmmTV .* outside of jit.*tc.solve_fixed_point"):
+        solve(recording)

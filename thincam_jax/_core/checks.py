@@ -21,6 +21,15 @@ else:
     Number = Numbers = Shape = Any
 
 
+# mm: from 10 nm on it is light; a longer wavelength was meant in nanometres or micrometres, a
+# shorter one in metres.
+_SHORTEST, _LONGEST = 1e-5, 0.1
+# mm: pixels of sensors are smaller.
+_LARGEST_PITCH = 1.0
+# Units of plain ratios, which nobody writes.
+_RATIOS = ("parts of one", "a ratio")
+
+
 def is_traced(value: Any) -> bool:
     """Whether the value is not known yet: an argument of a function under jit, grad or vmap."""
     return isinstance(value, Tracer)
@@ -72,20 +81,20 @@ def _require(array: Array, holds: Callable[[np.ndarray], Any], message: str) -> 
 
 def finite(name: str, value: Any, unit: str, *, shape: tuple[int, ...] = ()) -> Array:
     array = real(name, value, unit, shape=shape)
-    message = f"{name} = {{}} {unit} is not finite; give a finite number in {unit}"
+    message = f"{name} = {{}}{_after(unit)} is not finite; give a finite number{_within(unit)}"
     return _require(array, np.isfinite, message)
 
 
 def positive(name: str, value: Any, unit: str, *, allow_infinity: bool = False) -> Array:
     array = real(name, value, unit)
-    message = f"{name} = {{}} {unit} is not positive; give {name} > 0 in {unit}"
+    message = f"{name} = {{}}{_after(unit)} is not positive; give {name} > 0{_within(unit)}"
     _require(array, lambda known: known > 0, message)
-    message = f"{name} is infinite; give a finite number in {unit}"
+    message = f"{name} is infinite; give a finite number{_within(unit)}"
     return _require(array, lambda known: allow_infinity or np.isfinite(known), message)
 
 
 def non_negative(name: str, value: Any, unit: str) -> Array:
-    message = f"{name} = {{}} {unit} is negative; give {name} >= 0 in {unit}"
+    message = f"{name} = {{}}{_after(unit)} is negative; give {name} >= 0{_within(unit)}"
     return _require(finite(name, value, unit), lambda known: known >= 0, message)
 
 
@@ -94,6 +103,48 @@ def positive_all(name: str, value: Array, unit: str) -> Array:
     array = finite(name, value, unit, shape=value.shape)
     message = f"{name} = {{}} {unit} must be positive; give {name} > 0 in {unit}"
     return _require(array, lambda known: known > 0, message)
+
+
+def _after(unit: str) -> str:
+    return "" if unit in _RATIOS else f" {unit}"
+
+
+def _within(unit: str) -> str:
+    return "" if unit in _RATIOS else f" in {unit}"
+
+
+def wavelength(name: str, value: Any) -> Array:
+    """One wavelength of light or several, mm; what must be nm, µm or m is refused."""
+    array = (
+        positive_all(name, jnp.asarray(value), "mm")
+        if np.ndim(value)
+        else positive(name, value, "mm")
+    )
+    known = _known(array)
+    if known is not None and np.any(known > _LONGEST):
+        raise ValueError(
+            f"{name} = {known.max():g} mm is no light: give it in mm, such as 500 * nm"
+        )
+    if known is not None and np.any(known < _SHORTEST):
+        raise ValueError(
+            f"{name} = {known.min():g} mm is no light: give it in mm, not in m, such as 500 * nm"
+        )
+    return array
+
+
+def pixel_pitch(name: str, value: Any) -> Array:
+    """A sensor's pixel pitch, mm; what must be µm is refused."""
+    message = f"{name} = {{}} mm is no pixel: give it in mm, such as 5.5 * um"
+    return _require(positive(name, value, "mm"), lambda known: known <= _LARGEST_PITCH, message)
+
+
+def channels_first(name: str, shape: tuple[int, ...]) -> None:
+    """Refuses (…, y, x, channel), whose columns would be taken for images."""
+    if len(shape) >= 3 and shape[-1] in (3, 4) and min(shape[-3:-1]) > 4:
+        raise ValueError(
+            f"{name} has shape {shape}, the colours last; give (…, channel, y, x), such as "
+            "numpy.moveaxis(image, -1, -3)"
+        )
 
 
 def fraction(name: str, value: Any) -> Array:

@@ -27,7 +27,10 @@ class ImagePlane(eqx.Module):
 
     def __init__(self, image: Numbers, distance: Number, width: Number):
         if not checks.is_traced(image) and np.asarray(image).dtype.kind not in "fiub":
-            raise TypeError(f"image is a {type(image).__name__}; give an array of real radiances")
+            raise TypeError(
+                f"image is a {type(image).__name__} of {np.asarray(image).dtype}; give an array of "
+                "real radiances"
+            )
         self.image = jnp.asarray(image)
         if not jnp.issubdtype(self.image.dtype, jnp.floating):
             self.image = self.image.astype(float)
@@ -37,6 +40,12 @@ class ImagePlane(eqx.Module):
             )
         if not checks.is_traced(self.image) and not np.isfinite(np.asarray(self.image)).all():
             raise ValueError("image holds NaN or infinity; give finite radiances")
+        checks.channels_first("image", self.image.shape)
+        if not checks.is_traced(self.image) and (np.asarray(self.image) < 0).any():
+            raise ValueError(
+                f"image holds {np.asarray(self.image).min():.3g}, a negative radiance; give "
+                "radiances >= 0"
+            )
         self.distance = checks.positive("distance", distance, "mm")
         self.width = checks.positive("width", width, "mm")
 
@@ -84,7 +93,7 @@ class Spectrum(eqx.Module):
             raise ValueError(f"wavelengths has shape {np.shape(wavelengths)}; give a list of them")
         count = np.size(wavelengths)
         wavelengths = jnp.atleast_1d(jnp.asarray(wavelengths))
-        self.wavelengths = checks.positive_all("wavelengths", wavelengths, "mm")
+        self.wavelengths = checks.wavelength("wavelengths", wavelengths)
         if weights is None:
             weights = jnp.full(count, 1 / max(count, 1), self.wavelengths.dtype)
         self.weights = checks.finite("weights", weights, "parts of one", shape=(count,))

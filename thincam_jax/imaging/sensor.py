@@ -46,7 +46,7 @@ class Sensor(eqx.Module):
         bit_depth: float | int | None = None,
     ):
         self.shape = checks.shape2d("shape", shape)
-        self.pitch = checks.positive("pitch", pitch, "mm")
+        self.pitch = checks.pixel_pitch("pitch", pitch)
         self.full_well = checks.positive("full_well", full_well, "electrons")
         if exposure is not None and electrons is not None:
             raise ValueError(
@@ -199,10 +199,12 @@ def read_out(
     Noise, then saturation at the full well, then quantisation, as `sensor` and `noise` ask for.
     Every (y, x) image of a batch is exposed on its own.
 
-    **Errors**: ValueError if noise is given without a key.
+    **Errors**: ValueError if noise is given without a key, TypeError for a number as key.
     """
     if noise is not None and key is None:
         raise ValueError("noise needs a key: pass key=jax.random.key(seed)")
+    if noise is not None and not eqx.is_array(key):
+        raise TypeError(f"key = {key!r} is no random key; pass key=jax.random.key({key!r})")
     return _read_out(sensor, image, noise, key)
 
 

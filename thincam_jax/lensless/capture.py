@@ -41,6 +41,11 @@ def capture(
 
     **Returns** (*batch, y, x) in units of radiance × mm².
     """
+    if not isinstance(scene, Scene):
+        raise TypeError(
+            f"scene is a {type(scene).__name__}; give thincam_jax.Scene(ImagePlane(image, "
+            "distance=…, width=…), wavelength)"
+        )
     if plan is not None:
         if model is not None or pixel_integration is not None:
             raise ValueError("a plan chooses model and pixel_integration: leave them out")

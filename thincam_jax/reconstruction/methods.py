@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from thincam_jax._core import checks
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.reconstruction.drive import Callback
 from thincam_jax.reconstruction.fringe_filter import FringeScanning
@@ -70,6 +71,11 @@ def reconstruct(
     if solver is None:
         solver, reason = choose_solver(recording)
     if isinstance(solver, AbstractIterativeSolver):
+        if any(checks.is_traced(capture) for capture in recording.captures):
+            raise TypeError(
+                f"{type(solver).__name__} looks at its numbers between the iterations: call it "
+                "outside of jit, grad and vmap, or use tc.solve_fixed_point there"
+            )
         result = solver.solve(recording, start=start, callback=callback)
     elif not isinstance(solver, AbstractSolver):
         raise TypeError(f"solver is {solver!r}; give a solver, such as tc.AdmmTV(tau=2.0)")

@@ -138,6 +138,9 @@ class Psfs(eqx.Module):
 
     def __init__(self, psfs, *, field_shape: tuple[int, int] | None = None):
         psfs = jnp.asarray(psfs)
+        checks.channels_first("psfs", psfs.shape)
+        if not checks.is_traced(psfs) and not np.asarray(psfs).any():
+            raise ValueError("the PSFs are zero everywhere; give PSFs that send light")
         if not 3 <= psfs.ndim <= 5:
             raise ValueError(
                 f"PSFs have shape {psfs.shape}; give (capture, k, l), such as psf[None] for one, "
@@ -202,6 +205,8 @@ class Recording(eqx.Module):
         self._check_captures(getattr(captures, "shape", [c.shape for c in self.captures]))
         self.noise_variance = noise_variance
         self.valid = None if valid is None else self._masks(valid)
+        if self.valid and not any(checks.is_traced(m) or np.asarray(m).any() for m in self.valid):
+            raise ValueError("valid is False everywhere; give a mask with pixels to trust")
 
     def problem(
         self,
@@ -298,6 +303,8 @@ class Recording(eqx.Module):
                 f"captures have shape {given} for {count} cameras, PSFs or operators; give "
                 f"({count}, …, y, x)"
             )
+        if not isinstance(seen_by, Stacked):
+            checks.channels_first("a capture", shapes[0])
         if isinstance(seen_by, Cameras):
             sensor, pixels = seen_by.cameras[0].sensor.shape, shapes[0][-2:]
             if pixels != sensor:
@@ -444,6 +451,8 @@ def middle(image: Float[Array, "*batch y x"], shape) -> Float[Array, "*batch v u
 def _floating(capture) -> Array:
     """Raw counts are taken as they are, but as real numbers."""
     capture = jnp.asarray(capture)
+    if jnp.issubdtype(capture.dtype, jnp.complexfloating):
+        raise TypeError(f"a capture is {capture.dtype}; give real numbers")
     return capture if jnp.issubdtype(capture.dtype, jnp.floating) else capture.astype(float)
 
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -175,8 +176,10 @@ def test_a_dark_scene_has_a_plan():
 
 
 def flat(distances, width_of, image=None):
-    image = np.ones((24, 32)) if image is None else image
-    return [tc.ImagePlane(image, t, width_of * t) for t in distances]
+    image = jnp.ones((24, 32)) if image is None else jnp.asarray(image)
+    planes = [tc.ImagePlane(np.ones(image.shape), t, width_of * t) for t in distances]
+    # Differences of scenes too, which no plane is built from: a negative radiance is refused.
+    return [eqx.tree_at(lambda p: p.image, plane, image) for plane in planes]
 
 
 def small(**mask):

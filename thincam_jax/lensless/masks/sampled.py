@@ -3,6 +3,7 @@
 from typing import Any
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from thincam_jax._core import checks
@@ -38,6 +39,8 @@ class SampledMask(AbstractMask):
             raise ValueError(
                 f"amplitude has shape {self.amplitude.shape}; give a non-empty array (y, x)"
             )
+        if not checks.is_traced(self.amplitude) and not np.isfinite(self.amplitude).all():
+            raise ValueError("amplitude holds NaN or infinity; give finite transmittances")
         if not jnp.issubdtype(self.amplitude.dtype, jnp.inexact):
             self.amplitude = self.amplitude.astype(float)
         self.pitch = checks.positive("pitch", pitch, "mm")

@@ -7,9 +7,6 @@ from jaxtyping import Array, Float
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Number
 
-# mm: a longer wavelength was meant in nanometres or micrometres.
-_LONGEST = 0.1
-
 
 class Path(eqx.Module):
     """A point source on the axis at distance t before the mask, a sensor at d behind it.
@@ -27,12 +24,7 @@ class Path(eqx.Module):
     object_distance: Float[Array, ""]
 
     def __init__(self, wavelength: Number, distance: Number, object_distance: Number = jnp.inf):
-        self.wavelength = checks.positive("wavelength", wavelength, "mm")
-        if not checks.is_traced(self.wavelength) and float(self.wavelength) > _LONGEST:
-            raise ValueError(
-                f"wavelength = {float(self.wavelength):g} mm is no light: give it in mm, "
-                "such as 500 * nm"
-            )
+        self.wavelength = checks.wavelength("wavelength", wavelength)
         self.distance = checks.positive("distance", distance, "mm")
         self.object_distance = checks.positive(
             "object_distance", object_distance, "mm", allow_infinity=True
