@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from importlib.metadata import version
 
 import pytest
 
@@ -81,3 +82,7 @@ def test_every_name_of_the_package_is_there():
 def test_a_name_that_is_not_there():
     with pytest.raises(AttributeError, match="no_such_camera"):
         _ = tc.no_such_camera  # pyright: ignore
+
+
+def test_the_version_is_that_of_the_installation():
+    assert tc.__version__ == version("thincam_jax")

@@ -38,3 +38,5 @@ from .reconstruction import check_psf as check_psf
 from .reconstruction import choose_solver as choose_solver
 from .reconstruction import reconstruct as reconstruct
 from .reconstruction import solve_fixed_point as solve_fixed_point
+
+__version__: str

@@ -1,7 +1,7 @@
 """The image sensor: pixels, noise, saturation and digitisation."""
 
 import abc
-from typing import Literal
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
@@ -11,6 +11,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Number, Shape
 from thincam_jax._core.grids import Grid
+from thincam_jax.units import um
 
 
 class Sensor(eqx.Module):
@@ -62,6 +63,10 @@ class Sensor(eqx.Module):
         if bit_depth is not None and exposure is None and electrons is None:
             raise ValueError("bit_depth needs an exposure: the converter's range is the full well")
         self.bit_depth = None if bit_depth is None else int(bit_depth)
+
+    def __repr__(self) -> str:
+        rows, columns = self.shape
+        return f"Sensor({rows}×{columns} pixels of {checks.shown(self.pitch, 'µm', um)})"
 
     @property
     def grid(self) -> Grid:
@@ -192,7 +197,7 @@ def read_out(
     image: Float[Array, "*batch y x"],
     *,
     noise: AbstractNoise | None = None,
-    key: PRNGKeyArray | None = None,
+    key: Any = None,
 ) -> Float[Array, "*batch y x"]:
     """What the sensor reports for a noise-free image, in the image's own units.
 

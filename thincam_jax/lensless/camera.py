@@ -37,6 +37,10 @@ class LenslessCamera(eqx.Module):
         self.sensor = sensor
         self.distance = checks.positive("distance", distance, "mm")
 
+    def __repr__(self) -> str:
+        distance = checks.shown(self.distance, "mm")
+        return f"LenslessCamera({self.mask}, {self.sensor}, distance {distance})"
+
     def path(self, wavelength: Number, object_distance: Number) -> Path:
         """The light's path from a point at `object_distance` (mm) in front of the mask."""
         # Plain numbers take the camera's precision, so that float32 cameras stay float32. In NumPy,

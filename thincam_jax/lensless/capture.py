@@ -2,8 +2,9 @@
 
 import functools
 import operator
+from typing import Any
 
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float
 
 from thincam_jax.imaging.scene import Scene
 from thincam_jax.imaging.sensor import AbstractNoise, read_out
@@ -15,9 +16,9 @@ from thincam_jax.lensless.plan import Plan, run_plan
 
 def capture(
     camera: LenslessCamera,
-    scene: Scene,
+    scene: Any,
     *,
-    key: PRNGKeyArray | None = None,
+    key: Any = None,
     noise: AbstractNoise | None = None,
     model: Model | None = None,
     pixel_integration: bool | None = None,

@@ -88,6 +88,11 @@ class FresnelZoneAperture(AbstractMask):
         self.harmonics = harmonics
         self.pixels = None if pixel_pitch is None else _whole_pixels(width, pixel_pitch)
 
+    def __repr__(self) -> str:
+        beta, phase = checks.shown(self.beta, "rad/mm²"), checks.shown(self.phase, "rad")
+        width = checks.shown(self.width, "mm")
+        return f"FresnelZoneAperture(β {beta}, phase {phase}, width {width}, {self.profile})"
+
     @property
     def extent(self) -> tuple[Float[Array, ""], Float[Array, ""]]:
         return self.width, self.width
