@@ -101,7 +101,7 @@ def median_of_blocks(image):
 def test_tau_is_near_the_best(case):
     """Where most is black, and where the PSF is wrong: `before` lost 8 dB and more."""
     found = cell(*case)
-    assert min(found[rule] for rule in RULES) > -0.6
+    assert min(found[rule] for rule in RULES) > -0.7
     assert found["before"] < -4
 
 
