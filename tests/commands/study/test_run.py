@@ -92,7 +92,9 @@ def test_folder_holds_what_it_says_and_nothing_half(whole):
     expected |= {f"images/{t}--{m}.png" for t in ("chart", "picture") for m in ("pairs", "scene")}
     expected |= {f"images/{t}--conventional.png" for t in ("chart", "picture")}
     expected |= {f"figures/{n}.png" for n in ("mtf", "contrast", "psf")}
-    expected |= {f"figures/target-{n}.png" for n in ("chart", "picture")}
+    expected |= {
+        f"figures/{kind}-{n}.png" for n in ("chart", "picture") for kind in ("target", "captures")
+    }
     assert files == expected
     assert load_config(path / "config.yaml") == study.config
     environment = json.loads((path / "environment.json").read_text("utf-8"))
