@@ -224,7 +224,7 @@ class TestCheck:
     def test_missing_image(self, tmp_path):
         config = tiny.study(tmp_path, "targets.1.path=nowhere.png")
         missing = tmp_path / "nowhere.png"  # beside the experiment file
-        assert self.line(config).startswith(f"targets[1]: '{missing}' does not exist")
+        assert f"targets[1]: '{missing}' does not exist" in self.line(config)
 
     # Some decoders leave a damaged file open for the collector.
     @pytest.mark.filterwarnings("ignore::ResourceWarning")
@@ -233,7 +233,7 @@ class TestCheck:
         config = tiny.study(tmp_path)
         (tmp_path / "picture.png").write_bytes(b"\x89PNG but no more")
         line = self.line(config)
-        assert line.startswith("targets[1]: ")
+        assert "targets[1]: " in line
         assert "cannot be read as an image" in line
         gc.collect()
 
@@ -241,20 +241,20 @@ class TestCheck:
         config = tiny.study(tmp_path)
         black = np.zeros((45, 60), np.uint8)
         skimage.io.imsave(tmp_path / "picture.png", black, check_contrast=False)
-        assert self.line(config).startswith("targets[1]: the image is uniform")
+        assert "targets[1]: the image is uniform" in self.line(config)
 
     @pytest.mark.parametrize("shape", ["[1, 1]", "[1, 64]", "[6, 64]", "[48, 1]", "[48, 41]"])
     def test_sensor_of_too_few_pixels(self, shape, tmp_path):
         line = self.line(tiny.study(tmp_path, f"sensor.shape={shape}"))
-        assert line.startswith("sensor.shape: ")
+        assert "sensor.shape: " in line
         assert "give at least 7×42" in line
 
     def test_object_of_a_few_pixels(self, tmp_path):
         with pytest.raises(ConfigError) as caught:
             tiny.built(tmp_path, "object.width=7 mm")
         first, second = str(caught.value).split("\n")
-        assert first.startswith("targets[0]: 'conventional' reconstructs it on 6×6 pixels")
-        assert second.startswith("targets[1]: 'conventional' reconstructs it on 4×6 pixels")
+        assert "targets[0]: 'conventional' reconstructs it on 6×6 pixels" in first
+        assert "targets[1]: 'conventional' reconstructs it on 4×6 pixels" in second
 
     @pytest.mark.parametrize(
         ("override", "part"),
