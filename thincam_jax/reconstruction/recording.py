@@ -280,14 +280,11 @@ class Recording(eqx.Module):
         """The same recording with its `Cameras` focused on another distance, mm."""
         if not isinstance(self.seen_by, Cameras):
             raise ValueError("a distance is that of computed PSFs; this recording has no Cameras")
-        cameras = self.seen_by
-        focused = Cameras(
-            cameras.cameras,
-            wavelength=cameras.wavelength,
-            object_distance=object_distance,
-            field_shape=cameras.field_shape,
-            model=cameras.model,
-            pixel_integration=cameras.pixel_integration,
+        focused = eqx.tree_at(
+            lambda cameras: cameras.object_distance,
+            self.seen_by,
+            object_distance,
+            is_leaf=lambda leaf: leaf is None,
         )
         return Recording(
             self.captures, focused, noise_variance=self.noise_variance, valid=self.valid
