@@ -11,7 +11,6 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Number, Shape
 from thincam_jax._core.grids import Grid
-from thincam_jax.units import um
 
 
 class Sensor(eqx.Module):
@@ -66,7 +65,7 @@ class Sensor(eqx.Module):
 
     def __repr__(self) -> str:
         rows, columns = self.shape
-        return f"Sensor({rows}×{columns} pixels of {checks.shown(self.pitch, 'µm', um)})"
+        return f"Sensor({rows}×{columns} pixels of {checks.shown(self.pitch, 'µm', 1e-3)})"
 
     @property
     def grid(self) -> Grid:
