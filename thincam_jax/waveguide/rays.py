@@ -1,4 +1,4 @@
-r"""Rays from a sensor's pixels back through lens and screen to the object (thesis Eq 5.1–5.9).
+r"""Rays from pixels back through lens and screen to the object (thesis Eq 5.1–5.3, 5.6–5.9).
 
 Parallel layers keep the tangential direction cosines **t** of a ray, and each hologram mirrors it
 at its fringes; so a ray is two vectors: **t** before and **p** = n·s′ between the holograms. The
