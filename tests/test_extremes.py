@@ -4,6 +4,7 @@ import dataclasses
 import functools
 import math
 
+import equinox as eqx
 import extremes
 import jax
 import jax.numpy as jnp
@@ -321,7 +322,11 @@ def choice_of(name: str):
     mask = tc.FresnelZoneAperture(
         extreme.beta, extreme.phase, width=extreme.width, centre=extreme.centre
     )
-    camera = tc.LenslessCamera(mask, tc.Sensor(extreme.shape, extreme.pitch), extreme.distance)
+    # Wider pixels than a sensor's spread the grid over the shadow.
+    sensor = eqx.tree_at(
+        lambda s: s.pitch, tc.Sensor(extreme.shape, 0.1), jnp.asarray(extreme.pitch)
+    )
+    camera = tc.LenslessCamera(mask, sensor, extreme.distance)
     return camera, {
         "wavelength": extreme.wavelength,
         "object_distance": extreme.object_distance,

@@ -6,6 +6,7 @@ Nyquist 20. A scene pixel of 0.833 mm at 100 mm projects on one pixel of the cam
 
 import math
 
+import equinox as eqx
 import jax.numpy as jnp
 import jaxtyping
 import numpy as np
@@ -45,7 +46,10 @@ def picture(shape=FIELD):
 
 
 def scene(image, pitch=OBJECT_PITCH, wavelength=WAVELENGTH, distance=OBJECT_DISTANCE):
-    return tc.Scene(tc.ImagePlane(image, distance, pitch * np.shape(image)[-1]), wavelength)
+    # Captures are linear, and tests look at scenes without a mean, too.
+    plane = tc.ImagePlane(np.ones_like(image, float), distance, pitch * np.shape(image)[-1])
+    plane = eqx.tree_at(lambda plane: plane.image, plane, jnp.asarray(image, float))
+    return tc.Scene(plane, wavelength)
 
 
 def captures(cameras, image, *, model="geometric", **where):

@@ -88,7 +88,7 @@ def test_endings():
 
 @pytest.mark.parametrize("kernel", [(9, 10), (60, 51)])
 def test_extremes_are_finite(kernel):
-    """No light, saturated, no trusted pixel, one bright pixel, no variation, nothing but that."""
+    """No light, saturated, one bright pixel, no variation, nothing but that."""
     shape = (30, 23)
     psf = tc.Psfs(jnp.asarray(rig.picture(kernel))[None])
     ones, zeros = jnp.ones((1, *shape)), jnp.zeros((1, *shape))
@@ -96,7 +96,6 @@ def test_extremes_are_finite(kernel):
     for captures, settings in (
         (zeros, {}),
         (4095.0 * ones, {}),
-        (4095.0 * ones, {"known": {"valid": jnp.zeros(ones.shape, bool)}}),
         (zeros.at[0, 7, 20].set(1.0), {}),
         (ordinary, {"tau": 0.0}),
         (ordinary, {"tau": 1e6}),
@@ -106,7 +105,7 @@ def test_extremes_are_finite(kernel):
         assert result.image.shape == shape and bool(jnp.isfinite(result.image).all())
         assert result.status in ("converged", "iterations_exhausted")
         assert float(result.image.min()) >= 0
-        if captures is zeros or "valid" in settings.get("known", {}):
+        if captures is zeros:
             assert result.status == "converged"
             np.testing.assert_array_equal(result.image, 0)
 
@@ -138,7 +137,7 @@ def test_when_to_end_is_checked_at_once(kind):
         ({"iterations": 0}, "iterations = 0; give a whole number of at least 1"),
         ({"iterations": True}, "iterations = True; give a whole number of at least 1"),
         ({"iterations": 3.0}, "iterations = 3.0; give a whole number of at least 1"),
-        ({"tolerance": -1.0}, "tolerance = -1.0 .* is negative"),
+        ({"tolerance": -1.0}, "tolerance = -1.0 is negative"),
     ):
         rig.refused(message, lambda s=settings: kind(**s))
 

@@ -241,7 +241,7 @@ def test_what_is_refused():
     with pytest.raises(ValueError, match="for 3 colour channels, the image has 2"):
         TotalVariation(coupling="opponent")(jnp.ones((2, 1, 4, 5)))
     for name in ("depth_weight", "chroma_weight"):
-        with pytest.raises(ValueError, match=f"{name} = -1.0 parts of one is negative"):
+        with pytest.raises(ValueError, match=f"{name} = -1.0 is negative"):
             TotalVariation(**{name: -1.0})
     with rig.unchecked():
         with pytest.raises(

@@ -21,9 +21,8 @@ else:
     Number = Numbers = Shape = Any
 
 
-# mm: from 10 nm on it is light; a longer wavelength was meant in nanometres or micrometres, a
-# shorter one in metres.
-_SHORTEST, _LONGEST = 1e-5, 0.1
+# mm: a longer wavelength was meant in nanometres or micrometres; light in metres has such numbers.
+_LONGEST, _IN_METRES = 0.1, (1.5e-7, 2.5e-6)
 # mm: pixels of sensors are smaller.
 _LARGEST_PITCH = 1.0
 # Units of plain ratios, which nobody writes.
@@ -125,7 +124,8 @@ def wavelength(name: str, value: Any) -> Array:
         raise ValueError(
             f"{name} = {known.max():g} mm is no light: give it in mm, such as 500 * nm"
         )
-    if known is not None and np.any(known < _SHORTEST):
+    low, high = _IN_METRES
+    if known is not None and np.any((known > low) & (known < high)):
         raise ValueError(
             f"{name} = {known.min():g} mm is no light: give it in mm, not in m, such as 500 * nm"
         )

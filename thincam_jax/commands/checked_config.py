@@ -28,7 +28,7 @@ def load_as(
     """
     path = Path(path)
     raw, places = read_raw(path)
-    asked = {override(raw, text): f"--set {_cut(text)}" for text in overrides}
+    asked = {override(raw, text): f"--set {shortened(text)}" for text in overrides}
     config = check_as(model, raw, places, asked, f"{path}:1")
     config = config.found_at(lambda location: _place(location, places, asked, f"{path}:1"))
     folder = path.resolve().parent
@@ -129,15 +129,15 @@ def _message(error: Any, location: tuple, model: Any) -> str:
     return f"{_short(given)}: {message[0].lower()}{message[1:]}"
 
 
-_LONGEST = 80  # signs of what was given that a message repeats
+_LONGEST = 80  # characters of what was given that a message repeats
 
 
 def _short(given: Any) -> str:
-    return _cut(repr(given))
+    return shortened(repr(given))
 
 
-def _cut(text: str) -> str:
-    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}… ({len(text)} signs)"
+def shortened(text: str) -> str:
+    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}… ({len(text)} characters)"
 
 
 _WORDS = {
@@ -151,7 +151,7 @@ _WORDS = {
 def _dotted(location: tuple) -> str:
     text = ""
     for part in location:
-        name = _cut(str(part))
+        name = shortened(str(part))
         text += f"[{part}]" if isinstance(part, int) else f".{name}" if text else name
     return text
 

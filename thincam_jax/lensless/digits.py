@@ -40,13 +40,14 @@ def held_in_single(mask: AbstractMask, grid: Grid, path: Path, model: str) -> bo
 
 def largest_phase(mask: Any, grid: Grid, path: Path, model: str) -> float:
     """Largest phase, rad, of the orders' fringes where they are strong and light falls."""
-    scale = float(path.magnification)
+    with jax.ensure_compile_time_eval():  # inside jit, sums of known numbers are traced as well
+        scale = float(path.magnification)
+        epsilon = float(path.epsilon(mask.beta)) if model != "geometric" else 0.0
     beta, half_mask = float(mask.beta), float(mask.extent[0]) / 2
     ends = [
         (n - 1) / 2 * float(grid.pitch) / scale + abs(float(c))
         for n, c in zip(grid.shape, np.asarray(mask.centre), strict=True)
     ]
-    epsilon = float(path.epsilon(mask.beta)) if model != "geometric" else 0.0
     found = 0.0
     for k in mask.orders:
         gain = abs(1 + k * epsilon)

@@ -4,7 +4,7 @@ import pytest
 from commands.design import tiny
 
 from helpers import ROOT
-from thincam_jax.commands.checked_config import dump_config
+from thincam_jax.commands.checked_config import dump_config, shortened
 from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.design.config import load_design
 from thincam_jax.commands.design.record import broken_limits
@@ -220,7 +220,7 @@ def test_fault_of_an_entry(tmp_path, setting, field, part):
         ("search.free.0.shots=[3]", "free:", "the design has captures 1 to 4"),
         (
             "search.free=[{variable: beta, bounds: [8 /mm^2, 9 /mm^2]}, "
-            "{variable: beta, bounds: [8 /mm^2, 9 /mm^2]}]",
+            "{variable: beta, bounds: [8 /mm^2, 9 /mm^2]}]",  # a long one is told in part
             "free:",
             "is free twice",
         ),
@@ -231,7 +231,7 @@ def test_no_feasible_design(tmp_path, setting, place, part):
     """The two that conflict are named, at the entry of the file that they stand in."""
     line = fault(tmp_path, setting)
     field = place.rstrip(":")
-    at = (f"{line_of(place)}: ", f"--set {setting}: ")
+    at = (f"{line_of(place)}: ", f"--set {shortened(setting)}: ")
     assert line.startswith(tuple(f"{a}search.{field}: " for a in at))
     assert part in line
 

@@ -37,7 +37,7 @@ def points():
     yield 25.0, 0.0, 0.3, -0.5, 2.5  # no propagation
     yield -25.0, 0.0, 0.3, -0.5, 2.5
     yield 0.0, b, 3.0, -0.4, 0.6  # a slit, far outside its shadow
-    for half in (0.02886, 0.02887):  # from power series to edge waves: a·half² = ½ rad
+    for half in (0.0707, 0.0708):  # from power series to edge waves: a·half² = 3 rad
         yield 450.0, b, 0.0, -half, half
     yield 25.0, B, 1.234, -2.816, 2.816  # the thesis' aperture
 

@@ -32,7 +32,7 @@ _SERIES_G = tuple((-1.0) ** m * float(np.prod(np.arange(4 * m + 1, 0, -2.0))) fo
 _CENTRE = 2.0
 # The phase across the interval, in rad, below which a power series is used in place of edge waves,
 # which diverge like 1/phase as it goes to zero and then cancel.
-_SLOW_PHASE = 0.5
+_SLOW_PHASE = 3.0
 
 
 class _Degrees(NamedTuple):
@@ -43,7 +43,7 @@ class _Degrees(NamedTuple):
     slow: int
 
 
-_DEGREES = {"float32": _Degrees(15, 4, 7), "float64": _Degrees(29, 10, 13)}
+_DEGREES = {"float32": _Degrees(15, 4, 18), "float64": _Degrees(29, 10, 29)}
 
 
 def _auxiliary_polynomials(degree: int) -> tuple[tuple[float, ...], tuple[float, ...]]:
@@ -80,7 +80,7 @@ def chirp_integral(
     - an end with \|z\| < 5: polynomials in z;
     - an end with \|z\| ≥ 5: the asymptotic series, written in
       :math:`y = a / (2 (a\xi - bx)^2)` so that it is regular at :math:`a = 0`;
-    - phase across the interval under ½ rad: its power series in place of both edges.
+    - phase across the interval under 3 rad: its power series in place of both edges.
 
     All are short polynomials, computed everywhere: no branch, so that `jax.vmap` costs nothing.
 
