@@ -21,6 +21,7 @@ from .lensless.plan import Plan as Plan
 from .lensless.plan import plan as plan
 from .lensless.psf import otf as otf
 from .lensless.psf import psf as psf
+from .lensless.sampling import SamplingWarning as SamplingWarning
 from .measured.calibration import fit_psf as fit_psf
 from .reconstruction import AdmmTV as AdmmTV
 from .reconstruction import Cameras as Cameras

@@ -50,6 +50,12 @@ def _no_memory(error: BaseException) -> bool:
     )
 
 
+def warn(warnings: list[str]) -> None:
+    """Each in a line on standard error."""
+    for warning in warnings:
+        tell(f"warning: {warning}")
+
+
 def in_a_line(error: BaseException) -> str:
     """What a user is told of an error."""
     if _no_memory(error):

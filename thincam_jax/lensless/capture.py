@@ -12,6 +12,7 @@ from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.forward import expose
 from thincam_jax.lensless.method import Model
 from thincam_jax.lensless.plan import Plan, run_plan
+from thincam_jax.lensless.sampling import warn_if_unresolved
 
 
 def capture(
@@ -40,13 +41,15 @@ def capture(
     - `pixel_integration`: average the PSF over the pixels, as a real sensor does; by default yes.
     - `plan`: from `thincam_jax.plan`; says how to compute in place of the two before.
 
-    **Returns** (*batch, y, x) in units of radiance × mm².
+    **Returns** (*batch, y, x) in units of radiance × mm². SamplingWarning where the mask's shadow is
+    finer than the pixels resolve.
     """
     if not isinstance(scene, Scene):
         raise TypeError(
             f"scene is a {type(scene).__name__}; give thincam_jax.Scene(ImagePlane(image, "
             "distance=…, width=…), wavelength)"
         )
+    warn_if_unresolved(camera, (plane.distance for plane in scene.planes))
     if plan is not None:
         if model is not None or pixel_integration is not None:
             raise ValueError("a plan chooses model and pixel_integration: leave them out")

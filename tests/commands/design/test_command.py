@@ -139,3 +139,10 @@ class TestExitCode2:
 
     def test_a_study_is_told_apart(self, file):
         assert "give it to 'thincam design'" in one_line(call("run", file))
+
+
+def test_coarse_pixels_are_told_once(file, asked, tmp_path):
+    result = call("design", file, "--out", tmp_path / "out", "--set", "sensor.pitch=88um")
+    assert result.exit_code == 0, result.output
+    (line,) = result.stderr.splitlines()
+    assert line.startswith("thincam: warning: the mask casts 7.73 cycles/mm on pixels that resolve")

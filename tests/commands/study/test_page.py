@@ -8,6 +8,8 @@ import re
 import pytest
 import skimage.io
 from commands.study import tiny
+from commands.sweep import mini
+from commands.test_cli import call
 
 from thincam_jax.commands.doctor import environment
 from thincam_jax.commands.run_folder import RunFolder
@@ -136,3 +138,15 @@ def test_page_of_a_run_without_a_chart(run):
     assert page.count("<img ") == 6
     (row,) = [r for r in rows(page) if r[0] == "conventional" and len(r) == 8]
     assert row[1:3] == ["–", "–"]
+
+
+def test_pixels_coarser_than_the_zones_are_told_once_here_and_on_the_terminal(tmp_path):
+    out = tmp_path / "out"
+    result = call("run", mini.write(tmp_path), "--out", out, "--set", "sensor.pitch=88um")
+    assert result.exit_code == 0, result.output
+    (line,) = result.stderr.splitlines()
+    told = "the mask casts 7.73 cycles/mm on pixels that resolve 5.68 (Nyquist, 1/(2 pitch))"
+    assert line.startswith(f"thincam: warning: {told}")
+    page = (out / "report.html").read_text("utf-8")
+    assert page.count(told) == 1
+    assert f"<strong>Warning:</strong> {told}" in page

@@ -170,3 +170,12 @@ print([name for name in ("dask", "distributed", "pyarrow") if name in sys.module
         [sys.executable, "-c", code], capture_output=True, text=True, env=environment, timeout=120
     )
     assert (done.returncode, done.stdout) == (0, "[]\n"), done.stderr
+
+
+def test_coarse_pixels_are_told_once(file, asked, tmp_path):
+    out = tmp_path / "out"
+    result = call("sweep", file, "--grid", "sensor.pitch=50,80,90 um", "--out", out)
+    assert result.exit_code == 0, result.output
+    (line,) = result.stderr.splitlines()
+    first = "warning: 2 of 3 points; the first (sensor.pitch=0.08): the mask casts 7.73 cycles/mm"
+    assert line.startswith(f"thincam: {first}")

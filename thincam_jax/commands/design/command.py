@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from thincam_jax.commands.terminal import Overrides, counted, told
+from thincam_jax.commands.terminal import Overrides, counted, told, warn
 
 
 def design(
@@ -29,6 +29,7 @@ def design(
 
         wanted = load_design(config, tuple(set_ or ()))
         study = build_designs(wanted)
+        warn(study.warnings)
         folder = DesignFolder(out or Path("runs") / slug(wanted.name))
         with counted(wanted.name) as progress:
             found = run_design(study, folder, progress)

@@ -27,6 +27,7 @@ def render(
         "command": "design",
         "environment": environment,
         "design": design,
+        "warnings": design["warnings"],
         "free": [free_number(*one) for one in free],
         "reference": [of_shots(design["reference"], *one) for one in free],
         "numbers": [[found_number(v) for v in one["values"]] for one in design["found"]],

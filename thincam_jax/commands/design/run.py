@@ -95,6 +95,7 @@ class _DesignRun:
     def report(self) -> None:
         result, folder = self.finder.result, self.folder
         self.design = record(result, self.simulated, compare(self.trials))
+        self.design["warnings"] = self.simulated.warnings
         if self.fronts is not None:
             self.design["pareto"] = record_fronts(self.config, self.fronts.result())
         count, distance = self.config.validation.best, self.config.object.distance

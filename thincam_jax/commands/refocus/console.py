@@ -7,13 +7,14 @@ from thincam_jax.commands.refocus.build import build_refocus
 from thincam_jax.commands.refocus.config import RefocusConfig
 from thincam_jax.commands.refocus.run import run_refocus
 from thincam_jax.commands.run_folder import RunFolder
-from thincam_jax.commands.terminal import counted, told
+from thincam_jax.commands.terminal import counted, told, warn
 
 
 def refocus(config: RefocusConfig, folder: RunFolder) -> None:
     """Run the experiment with a progress bar and print what was found."""
     with told(lambda: "interrupted; the same command starts anew."):
         study = build_refocus(config)
+        warn(study.warnings)
         with counted(config.name) as progress:
             metrics = run_refocus(study, folder, progress)
     _print_objects(metrics["objects"])

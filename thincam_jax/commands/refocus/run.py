@@ -92,6 +92,7 @@ class _RefocusRun:
             "objects": object_metrics(study, found),
             "sweep": _sweep_metrics(study, sweep, found),
             "methods": self.methods,
+            "warnings": study.warnings,
         }
         depth = depth_map(
             sweep, measure=asked.measure, smoothing=asked.smoothing, window=asked.window
@@ -132,6 +133,7 @@ def render(
         "command": "run",
         "environment": environment,
         "metrics": metrics,
+        "warnings": metrics["warnings"],
         "findings": findings(config, metrics),
     }
     return render_page("refocus", config, folder.path / "figures", shown)

@@ -1,6 +1,8 @@
 """From an experiment file to what is simulated: cameras, exposures, noise, targets and methods."""
 
+import functools
 import math
+import operator
 from collections.abc import Sequence
 
 import jax
@@ -26,12 +28,10 @@ from thincam_jax.imaging.sensor import (
     AbstractNoise,
     GaussianNoise,
     PoissonGaussianNoise,
-    Sensor,
     electrons_per_unit,
     read_out,
 )
-from thincam_jax.lensless.camera import LenslessCamera
-from thincam_jax.lensless.capture import capture
+from thincam_jax.lensless import forward
 from thincam_jax.reconstruction import (
     AdmmTV,
     Cameras,
@@ -65,14 +65,15 @@ def assemble(config: CamerasConfig, targets: Sequence[Target]) -> Study:
         config.sensor,
         config.mask,
         build_noise(config.noise),
-        tuple(_method(config, method) for method in config.methods),
+        tuple(as_method(config, method) for method in config.methods),
         tuple(targets),
         config.model,
         config.prior,
     )
 
 
-def _method(config: CamerasConfig, method: MethodConfig) -> Method:
+def as_method(config: CamerasConfig, method: MethodConfig) -> Method:
+    """A method of a file, with all of its exposures."""
     phases = method.shot_phases()
     exposures = tuple(
         Exposure(
@@ -203,16 +204,19 @@ def field_shape(study: Study, method: Method, target: Target) -> tuple[int, int]
 
 
 def noise_free(study: Study, exposure: Exposure, planes: ImagePlane | list[ImagePlane]) -> Array:
-    """What falls on the sensor, (*channel, y, x)."""
-    camera = study.camera(exposure)
-    # Without saturation.
-    ideal = Sensor(camera.sensor.shape, camera.sensor.pitch)
-    return capture(
-        LenslessCamera(camera.mask, ideal, camera.distance),
-        Scene(planes, exposure.wavelength),
-        model=study.model,
-        pixel_integration=study.config.pixel_integration,
+    """What falls on the sensor, (*channel, y, x): without saturation."""
+    scene = Scene(planes, exposure.wavelength)
+    images = (
+        forward.expose(
+            study.camera(exposure),
+            plane,
+            scene.spectrum,
+            model=study.model,
+            pixel_integration=study.config.pixel_integration,
+        )
+        for plane in scene.planes
     )
+    return functools.reduce(operator.add, images)
 
 
 def expose(study: Study, exposure: Exposure, clean: Array, number: int, trial: int = 0) -> Capture:

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from thincam_jax.commands.terminal import ConfigFile, Overrides, counted, told
+from thincam_jax.commands.terminal import ConfigFile, Overrides, counted, told, warn
 
 
 def run(
@@ -41,6 +41,7 @@ def run(
             refocus(asked, folder)
             return
         study = build_study(asked)
+        warn(study.warnings)
         targets = asked.targets
         with counted(asked.name) as progress:
             metrics = run_study(study, folder, progress)

@@ -16,6 +16,7 @@ def render(
         "command": "run",
         "environment": environment,
         "methods": metrics["methods"],
+        "warnings": metrics["warnings"],
         "findings": findings(config, metrics),
         "slug": slug,
     }

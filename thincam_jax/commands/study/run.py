@@ -114,4 +114,9 @@ class _StudyRun:
                     "limit_cycles_per_mm": entry.published.limit_cycles_per_mm,
                 },
             }
-        return {"study": study.config.name, "seed": study.config.seed, "methods": methods}
+        return {
+            "study": study.config.name,
+            "seed": study.config.seed,
+            "methods": methods,
+            "warnings": study.warnings,
+        }

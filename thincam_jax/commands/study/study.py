@@ -1,7 +1,8 @@
 """What is simulated: exposures of cameras, targets, and the methods that reconstruct them."""
 
 import functools
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -19,9 +20,10 @@ from thincam_jax.commands.sections import (
 from thincam_jax.imaging.scene import ImagePlane
 from thincam_jax.imaging.sensor import AbstractNoise, Sensor
 from thincam_jax.lensless.camera import LenslessCamera
-from thincam_jax.lensless.masks.fza import FresnelZoneAperture
+from thincam_jax.lensless.masks.fza import FresnelZoneAperture, edge_frequency
 from thincam_jax.lensless.method import Model
 from thincam_jax.lensless.psf import psf
+from thincam_jax.lensless.sampling import unresolved
 from thincam_jax.reconstruction import Reconstruction
 from thincam_jax.reconstruction import synthesis as syntheses
 from thincam_jax.reconstruction.spectra import Prior
@@ -91,6 +93,17 @@ def synthesis_matrix(synthesis: Synthesis, shots: int, phases: int) -> np.ndarra
     return getattr(syntheses, synthesis)(shots if synthesis in PHASES else shots * phases)
 
 
+def unresolved_zones(
+    exposures: Iterable[Exposure], pitch: float, object_distance: float
+) -> list[str]:
+    """The warning that pixels of a pitch, mm, do not resolve the finest zones, where they do not."""
+    finest = max(
+        edge_frequency(e.beta, e.width) / (1 + e.distance / object_distance) for e in exposures
+    )
+    fault = unresolved(finest, pitch)
+    return [fault] if fault else []
+
+
 @dataclass(frozen=True)
 class Target:
     """What is seen: its place in the study, on which its noise depends; distance and width in mm.
@@ -135,6 +148,12 @@ class Study:
     def exposures(self) -> tuple[Exposure, ...]:
         """Of all methods, each once, in the order of first use."""
         return tuple(dict.fromkeys(e for m in self.methods for e in m.exposures))
+
+    @property
+    def warnings(self) -> list[str]:
+        """What a user is told before it runs, and in the report."""
+        farthest = max((target.distance for target in self.targets), default=math.inf)
+        return unresolved_zones(self.exposures, self.sensor.pitch, farthest)
 
     @property
     def object_distance(self) -> float:

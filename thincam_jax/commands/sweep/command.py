@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from thincam_jax.commands.terminal import WRONG_INPUT, Overrides, progress_bar, tell, told
+from thincam_jax.commands.terminal import WRONG_INPUT, Overrides, progress_bar, tell, told, warn
 
 _PARTS = ("pyarrow",)
 _SCHEDULER_PARTS = ("dask", "distributed", "pyarrow")
@@ -61,6 +61,7 @@ def sweep(
         points = make_points(study, axes, bool(jax.config.read("jax_enable_x64")))
         folder = SweepFolder(out or Path("runs") / f"{slug(study.name)}-sweep")
         folder.claim(study)
+        warn(_warnings(points))
         swept = _run(study.name, points, folder, scheduler, workers, ended)
     _print(swept, folder.path)
 
@@ -91,6 +92,16 @@ def _check(scheduler: str | None, workers: int | None) -> None:
         raise ConfigError(f"--workers {workers}: give at least 1")
     if workers is not None and scheduler is not None:
         raise ConfigError("--workers are local ones; leave it out with --scheduler")
+
+
+def _warnings(points: list) -> list[str]:
+    """What is said of the first point that has something said of it, and of how many."""
+    doubtful = [point for point in points if point.warnings]
+    if not doubtful:
+        return []
+    values = ", ".join(f"{name}={value}" for name, value in doubtful[0].values.items())
+    first = "; ".join(doubtful[0].warnings)
+    return [f"{len(doubtful)} of {len(points)} points; the first ({values}): {first}"]
 
 
 def _run(

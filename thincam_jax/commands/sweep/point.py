@@ -10,7 +10,9 @@ from typing import Any, NamedTuple
 
 from thincam_jax.commands.checked_config import check_as
 from thincam_jax.commands.config_file import ConfigError, set_entry
+from thincam_jax.commands.study.build import as_method
 from thincam_jax.commands.study.config import StudyConfig
+from thincam_jax.commands.study.study import unresolved_zones
 from thincam_jax.commands.sweep.grid import Axis, grid_values
 
 # Part of every point's key: to be raised when the same configuration is to give other metrics.
@@ -26,6 +28,7 @@ class GridPoint(NamedTuple):
     - `config`: the resolved configuration as JSON; None if it is refused.
     - `double`: whether it is computed in double precision.
     - `reason`: why the configuration is refused, in one line.
+    - `warnings`: of one that is not.
     """
 
     key: str
@@ -33,6 +36,7 @@ class GridPoint(NamedTuple):
     config: str | None
     double: bool
     reason: str | None = None
+    warnings: tuple[str, ...] = ()
 
 
 def make_points(base: StudyConfig, axes: Sequence[Axis], double: bool) -> list[GridPoint]:
@@ -75,7 +79,9 @@ def _make_point(raw: dict, axes: Sequence[Axis], values: tuple, double: bool) ->
         return GridPoint(key, given, None, double, "; ".join(str(error).splitlines()))
     text = config.model_dump_json(exclude_none=True)
     resolved = {axis.path: _entry(config, axis.places[0]) for axis in axes}
-    return GridPoint(_key(config, text, double), resolved, text, double)
+    exposures = [e for method in config.methods for e in as_method(config, method).exposures]
+    warnings = unresolved_zones(exposures, config.sensor.pitch, config.object.distance)
+    return GridPoint(_key(config, text, double), resolved, text, double, None, tuple(warnings))
 
 
 def _entry(config: Any, place: tuple) -> Any:

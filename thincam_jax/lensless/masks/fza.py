@@ -1,6 +1,6 @@
 r"""The Fresnel zone aperture (FZA), thesis Eq 3.1."""
 
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -98,6 +98,11 @@ class FresnelZoneAperture(AbstractMask):
         return self.width, self.width
 
     @property
+    def finest_frequency(self) -> Float[Array, ""]:
+        """Of the zones at the middle of the edges, cycles/mm."""
+        return edge_frequency(self.beta, self.width)
+
+    @property
     def orders(self) -> tuple[int, ...]:
         """The diffraction orders k of the profile, without their weights."""
         return _series(self.profile, self.harmonics)[0]
@@ -121,6 +126,11 @@ class FresnelZoneAperture(AbstractMask):
         rows = axis_samples(zones, grid.y - self.centre[0], grid.pitch)
         columns = axis_samples(zones, grid.x - self.centre[1], grid.pitch)
         return jnp.real(product((zones.coefficients[:, None] * rows).T, columns))
+
+
+def edge_frequency(beta: Any, width: Any) -> Any:
+    """Of an aperture's zones, β·width/(2π), cycles/mm: d(βr²)/dr = 2πf at r = width/2."""
+    return beta * width / (2 * np.pi)
 
 
 def _series(profile: str, harmonics: int) -> tuple[tuple[int, ...], tuple[float, ...]]:

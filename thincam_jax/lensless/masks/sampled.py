@@ -51,6 +51,19 @@ class SampledMask(AbstractMask):
         rows, columns = self.amplitude.shape
         return rows * self.pitch, columns * self.pitch
 
+    @property
+    def finest_frequency(self) -> float:
+        """Beyond which, along either axis, half of the modulation |t|² − mean lies, cycles/mm."""
+        shadow = np.abs(np.asarray(self.amplitude)) ** 2
+        power = np.abs(np.fft.rfft2(shadow - shadow.mean())) ** 2
+        power[:, 1 : (shadow.shape[1] + 1) // 2] *= 2  # the columns that are left out
+        down, across = np.fft.fftfreq(shadow.shape[0]), np.fft.rfftfreq(shadow.shape[1])
+        frequency = np.maximum(abs(down[:, None]), across).ravel()
+        order = np.argsort(frequency)
+        below = np.cumsum(power.ravel()[order])
+        place = np.searchsorted(below, below[-1] / 2)
+        return float(frequency[order[place]] / np.asarray(self.pitch))
+
     def sample(self, grid: Grid) -> Complex[Array, "y x"] | Float[Array, "y x"]:
         rows, columns = self.amplitude.shape
         dtype = self.amplitude.dtype
