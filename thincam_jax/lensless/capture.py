@@ -41,8 +41,8 @@ def capture(
     - `pixel_integration`: average the PSF over the pixels, as a real sensor does; by default yes.
     - `plan`: from `thincam_jax.plan`; says how to compute in place of the two before.
 
-    **Returns** (*batch, y, x) in units of radiance × mm². SamplingWarning where the mask's shadow is
-    finer than the pixels resolve.
+    **Returns** (*batch, y, x) in units of radiance × mm². Warns (`SamplingWarning`) where the
+    mask's shadow is finer than the pixels resolve.
     """
     if not isinstance(scene, Scene):
         raise TypeError(

@@ -118,6 +118,9 @@ def test_points_are_the_product_of_the_axes():
     assert grid_values(axes) == [(0, 8), (0, 10), (0, 12), (1, 8), (1, 10), (1, 12)]
 
 
+NINES = "9," * 99
+
+
 @pytest.mark.parametrize(
     ("text", "part"),
     [
@@ -135,6 +138,8 @@ def test_points_are_the_product_of_the_axes():
         ("seed=0:4:3:log", "log needs both ends above zero"),
         ("mask.width=1 mm:2 mm:3", "a unit stands once, at the end"),
         ("title=[a", "put texts in quotes"),
+        # Counted as in files.
+        (f"seed=&a [{NINES}],&b [{'*a,' * 99}],[{'*b,' * 99}]", "its aliases stand for 9.9e+05"),
         ("mask.*=1", "mask is no list"),
         ("*=1", "the file is no list"),
         ("methods.5.shots.*.beta=1", "methods.5.shots is no list"),

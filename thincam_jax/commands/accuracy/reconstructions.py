@@ -69,6 +69,7 @@ class ReconstructionErrors:
         case = self.case
         self.captures = stacked([take(case.study, e, case.target) for e in case.exposures])
         self.psfs = psfs_of(case.study, case.method)  # exact
+        self.clean = clean_capture(case, case.exposures[0])
         exact = self._reconstruct(case.method, "separable")
         self.pitch = exact.pitch
         self.exact_psnr_db = self._psnr(exact)
@@ -98,14 +99,13 @@ class ReconstructionErrors:
         """PSF and capture error of a change, and the PSNR lost by it in the worse direction."""
         case = self.case
         up, down = (changed(case.method, quantity, p) for p in (part, -part))
-        reference = clean_capture(case, case.exposures[0])
         wrong = clean_capture(case, case.exposures[0], assumed=up.exposures[0])
         both = [self._lost(self._reconstruct(method, "separable")) for method in (up, down)]
         worse = max(both, key=lambda lost: lost["psnr_lost_db"])
         return {
             "psf_error": relative_error(psfs_of(case.study, up), self.psfs),
-            "capture_error": relative_error(wrong, reference),
-            "capture_contrast_error": contrast_error(wrong, reference),
+            "capture_error": relative_error(wrong, self.clean),
+            "capture_contrast_error": contrast_error(wrong, self.clean),
             **worse,
         }
 

@@ -12,38 +12,47 @@ from thincam_jax.commands.terminal import fail, told
 METHODS = ("auto", "admm-tv", "fista", "ridge")
 
 
+Psf = Annotated[Path, Option(help="Measured PSF: TIFF, PNG or NPY.")]
+Background = Annotated[
+    str | None,
+    Option(help="Dark frame, or a number of counts. Default: a corner of the PSF."),
+]
+PsfBackground = Annotated[
+    str | None, Option(help="That of the PSF, where it was exposed otherwise.")
+]
+Bits = Annotated[int | None, Option(help="Bit depth, as 12 where 16 are stored.")]
+PsfBits = Annotated[int | None, Option(help="That of the PSF, where it is another.")]
+Corner = Annotated[str, Option(help="Rows and columns of the PSF's dark corner, FIRST:AFTER_LAST.")]
+PsfScale = Annotated[
+    float | None,
+    Option(help="Enlarge the PSF, of any size: pitch of its pixels over the capture's."),
+]
+Bayer = Annotated[
+    Literal["RGGB", "BGGR", "GRBG", "GBRG"] | None,
+    Option(help="Colours of the mosaic, from its upper left."),
+]
+Dead = Annotated[Path | None, Option(help="Map of dead pixels, not zero where dead.")]
+
+
 def reconstruct(
-    psf: Annotated[Path, Option(help="Measured PSF: TIFF, PNG or NPY.")],
+    psf: Psf,
     capture: Annotated[Path, Option(help="Capture of the same size; or a folder of captures.")],
     out: Annotated[
         Path, Option(help="Image (.png, .npy, .tif); a folder for a folder of captures.")
     ],
-    background: Annotated[
-        str | None,
-        Option(help="Dark frame, or a number of counts. Default: a corner of the PSF."),
-    ] = None,
-    psf_background: Annotated[
-        str | None, Option(help="That of the PSF, where it was exposed otherwise.")
-    ] = None,
+    background: Background = None,
+    psf_background: PsfBackground = None,
     downsample: Annotated[int, Option(help="Side of the blocks of pixels that are averaged.")] = 1,
-    bits: Annotated[int | None, Option(help="Bit depth, as 12 where 16 are stored.")] = None,
-    psf_bits: Annotated[int | None, Option(help="That of the PSF, where it is another.")] = None,
-    corner: Annotated[
-        str, Option(help="Rows and columns of the PSF's dark corner, FIRST:AFTER_LAST.")
-    ] = "5:15",
-    psf_scale: Annotated[
-        float | None,
-        Option(help="Enlarge the PSF, of any size: pitch of its pixels over the capture's."),
-    ] = None,
-    bayer: Annotated[
-        Literal["RGGB", "BGGR", "GRBG", "GBRG"] | None,
-        Option(help="Colours of the mosaic, from its upper left."),
-    ] = None,
+    bits: Bits = None,
+    psf_bits: PsfBits = None,
+    corner: Corner = "5:15",
+    psf_scale: PsfScale = None,
+    bayer: Bayer = None,
     demosaic: Annotated[
         Literal["bilinear", "superpixel"],
         Option(help="superpixel joins 2×2 pixels: half the size."),
     ] = "bilinear",
-    dead: Annotated[Path | None, Option(help="Map of dead pixels, not zero where dead.")] = None,
+    dead: Dead = None,
     saturation: Annotated[
         float | None, Option(help="Saturated from this part of full scale on.")
     ] = None,
@@ -140,33 +149,20 @@ def reconstruct(
 
 
 def check(
-    psf: Annotated[Path, Option(help="Measured PSF: TIFF, PNG or NPY.")],
+    psf: Psf,
     capture: Annotated[Path, Option(help="Capture of the same size.")],
-    background: Annotated[
-        str | None,
-        Option(help="Dark frame, or a number of counts. Default: a corner of the PSF."),
-    ] = None,
-    psf_background: Annotated[
-        str | None, Option(help="That of the PSF, where it was exposed otherwise.")
-    ] = None,
+    background: Background = None,
+    psf_background: PsfBackground = None,
     downsample: Annotated[
         int | None,
         Option(help="Side of the blocks that are averaged. Default: 160 pixels are left."),
     ] = None,
-    bits: Annotated[int | None, Option(help="Bit depth, as 12 where 16 are stored.")] = None,
-    psf_bits: Annotated[int | None, Option(help="That of the PSF, where it is another.")] = None,
-    corner: Annotated[
-        str, Option(help="Rows and columns of the PSF's dark corner, FIRST:AFTER_LAST.")
-    ] = "5:15",
-    psf_scale: Annotated[
-        float | None,
-        Option(help="Enlarge the PSF, of any size: pitch of its pixels over the capture's."),
-    ] = None,
-    bayer: Annotated[
-        Literal["RGGB", "BGGR", "GRBG", "GBRG"] | None,
-        Option(help="Colours of the mosaic, from its upper left."),
-    ] = None,
-    dead: Annotated[Path | None, Option(help="Map of dead pixels, not zero where dead.")] = None,
+    bits: Bits = None,
+    psf_bits: PsfBits = None,
+    corner: Corner = "5:15",
+    psf_scale: PsfScale = None,
+    bayer: Bayer = None,
+    dead: Dead = None,
     search: Annotated[float, Option(help="How far to look for the scale, parts of one.")] = 0.06,
 ) -> None:
     """Tell whether a PSF is that of a capture.

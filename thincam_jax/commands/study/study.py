@@ -96,7 +96,7 @@ def synthesis_matrix(synthesis: Synthesis, shots: int, phases: int) -> np.ndarra
 def unresolved_zones(
     exposures: Iterable[Exposure], pitch: float, object_distance: float
 ) -> list[str]:
-    """The warning that pixels of a pitch, mm, do not resolve the finest zones, where they do not."""
+    """A warning where pixels of a pitch, mm, do not resolve the finest zones."""
     finest = max(
         edge_frequency(e.beta, e.width) / (1 + e.distance / object_distance) for e in exposures
     )

@@ -7,9 +7,8 @@ from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
-import yaml
 
-from thincam_jax.commands.config_file import ConfigError, path_keys
+from thincam_jax.commands.config_file import ConfigError, path_keys, read_value
 
 MOST_POINTS = 100_000
 
@@ -91,9 +90,9 @@ def _values(text: str, values: str) -> tuple[Any, ...]:
     if re.match(r"[\d.+-][^,]*:", values):
         return _range(text, values)
     try:
-        listed = yaml.safe_load(f"[{values}]")
-    except (yaml.YAMLError, ValueError):
-        raise ConfigError(f"--grid {text}: {_FORM}; put texts in quotes") from None
+        listed = read_value(f"[{values}]", f"--grid {text}")
+    except ConfigError as error:
+        raise ConfigError(f"{error}; {_FORM}") from None
     if not listed:
         raise ConfigError(f"--grid {text}: has no values; {_FORM}")
     return tuple(_with_last_unit(listed))
