@@ -420,6 +420,9 @@ def test_what_has_seen_the_captures_is_one_of_three():
         rig.refused(message, lambda r=recording: r.problem(synthesis=np.eye(1)))
 
 
+HOLED = np.where(np.arange(42) == 9, np.nan, 1.0).reshape(1, 6, 7)
+
+
 def test_kernels_reach_over_every_difference():
     """A PSF on `kernel_grid`: nothing of the field is left out, nothing wraps round."""
     problem = camera_problem(jnp.ones((2, *SENSOR.shape)), cameras())
@@ -435,11 +438,21 @@ def test_kernels_reach_over_every_difference():
         (np.ones((1, 6, 7)), np.ones((1, 6, 7, 3)), {}, ValueError, "psfs .* the colours last"),
         (np.ones((1, 6, 7)), np.zeros((1, 3, 3)), {}, ValueError, "zero everywhere"),
         (np.ones((1, 6, 7)), np.ones((1, 3, 3)), {"valid": False}, ValueError, "valid is False"),
+        (HOLED, np.ones((1, 3, 3)), {}, ValueError, r"captures\[0\] holds NaN .* valid=numpy.isf"),
+        (np.ones((1, 6, 7)), HOLED, {}, ValueError, "the PSFs hold NaN or infinity"),
+        (np.ones((1, 6, 7)), -np.ones((1, 3, 3)), {}, ValueError, "a PSF sums to -9, which is neg"),
     ],
 )
 def test_captures_that_cannot_be_meant(captures, psfs, more, error, message):
     with pytest.raises(error, match=message):
         tc.Recording(captures, tc.Psfs(psfs), **more)
+
+
+def test_a_field_that_does_not_fit_is_refused_before_any_work():
+    seen_by = tc.Psfs(np.ones((1, 3, 3)), field_shape=(200_000, 200_000))
+    recording = tc.Recording(np.ones((1, 6, 7)), seen_by)
+    with pytest.raises(MemoryError, match="a field of 200000×199999 pixels needs about .* smaller"):
+        tc.reconstruct(recording, tc.Ridge())
 
 
 def test_iterative_solvers_say_what_works_under_jit():

@@ -80,8 +80,6 @@ def test_endings():
     interrupted = variation(seen, psf, callback=interrupt)
     assert (interrupted.status, interrupted.iterations) == ("interrupted", 20)
     np.testing.assert_array_equal(interrupted.image, stopped.image)
-    broken = variation(seen.at[0, 3, 4].set(jnp.nan), psf)
-    assert broken.status == "non_finite"
     once = variation(seen, psf, iterations=7)
     assert (once.status, once.iterations) == ("iterations_exhausted", 7)
 

@@ -12,8 +12,6 @@ from thincam_jax.reconstruction.poisson import PoissonTV as PoissonTV
 from thincam_jax.reconstruction.problem import InverseProblem as InverseProblem
 from thincam_jax.reconstruction.psf_check import PsfCheck as PsfCheck
 from thincam_jax.reconstruction.psf_check import check_psf as check_psf
-from thincam_jax.reconstruction.recording import Cameras as Cameras
-from thincam_jax.reconstruction.recording import Psfs as Psfs
 from thincam_jax.reconstruction.recording import Recording as Recording
 from thincam_jax.reconstruction.registration import register as register
 from thincam_jax.reconstruction.regularised import AdmmTV as AdmmTV
@@ -21,6 +19,8 @@ from thincam_jax.reconstruction.regularised import Fista as Fista
 from thincam_jax.reconstruction.regularisers import Cosines as Cosines
 from thincam_jax.reconstruction.regularisers import Sparsity as Sparsity
 from thincam_jax.reconstruction.ridge import Ridge as Ridge
+from thincam_jax.reconstruction.seen_by import Cameras as Cameras
+from thincam_jax.reconstruction.seen_by import Psfs as Psfs
 from thincam_jax.reconstruction.solver import AbstractSolver as AbstractSolver
 from thincam_jax.reconstruction.solver import Reconstruction as Reconstruction
 from thincam_jax.reconstruction.synthesis import contrasts as contrasts

@@ -15,7 +15,7 @@ from thincam_jax._core.grids import Grid, fast_shape, same_parity
 from thincam_jax._core.precision import as_complex, phasor, turn_phasor
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.masks.fza import FresnelZoneAperture
-from thincam_jax.reconstruction.recording import Cameras
+from thincam_jax.reconstruction.seen_by import Cameras
 from thincam_jax.reconstruction.solver import AbstractSolver, Reconstruction
 from thincam_jax.reconstruction.wiener import filtered_cameras
 

@@ -13,10 +13,11 @@ from thincam_jax.reconstruction.drive import Callback
 from thincam_jax.reconstruction.fringe_filter import FringeScanning
 from thincam_jax.reconstruction.noise import estimate_variance, given_variances
 from thincam_jax.reconstruction.poisson import PoissonTV
-from thincam_jax.reconstruction.recording import Cameras, Psfs, Recording
+from thincam_jax.reconstruction.recording import Recording
 from thincam_jax.reconstruction.registration import distance_ratios
 from thincam_jax.reconstruction.regularised import AdmmTV, Fista
 from thincam_jax.reconstruction.ridge import Ridge
+from thincam_jax.reconstruction.seen_by import Cameras, Psfs
 from thincam_jax.reconstruction.solver import (
     AbstractIterativeSolver,
     AbstractSolver,

@@ -35,9 +35,9 @@ from thincam_jax.reconstruction.problem import (
     start_image,
     uniform_level,
 )
-from thincam_jax.reconstruction.recording import Cameras
 from thincam_jax.reconstruction.registration import distance_ratios
 from thincam_jax.reconstruction.regularised import DEFAULT_TAU, first_image, of_kind
+from thincam_jax.reconstruction.seen_by import Cameras
 from thincam_jax.reconstruction.solver import AbstractIterativeSolver, check_limits
 from thincam_jax.reconstruction.total_variation import TotalVariation
 

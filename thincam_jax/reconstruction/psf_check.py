@@ -14,8 +14,9 @@ from thincam_jax._core import checks
 from thincam_jax._core.grids import block_sum
 from thincam_jax.reconstruction.drive import drive
 from thincam_jax.reconstruction.problem import InverseProblem, objective, residuals
-from thincam_jax.reconstruction.recording import Psfs, Recording
+from thincam_jax.reconstruction.recording import Recording
 from thincam_jax.reconstruction.regularised import admm_method, first_image
+from thincam_jax.reconstruction.seen_by import Psfs
 
 Orientation = Literal[
     "as given",

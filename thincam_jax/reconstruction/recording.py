@@ -1,6 +1,7 @@
 """What was seen: captures with all that is known of how they were taken."""
 
 import functools
+import math
 import operator
 from collections.abc import Sequence
 from typing import Any
@@ -13,146 +14,27 @@ from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
 from thincam_jax._core.grids import same_parity
+from thincam_jax._core.memory import refuse_if_too_large
 from thincam_jax.imaging.operators import (
     AbstractOperator,
     CropConvolution,
     Masked,
     Scaled,
     Stacked,
-    kernel_grid,
     kernel_shape,
     window_shape,
 )
 from thincam_jax.imaging.operators.base import is_shape, shapes_of
 from thincam_jax.imaging.operators.crop_convolution import cut
 from thincam_jax.lensless.camera import LenslessCamera
-from thincam_jax.lensless.method import MODELS, Model
-from thincam_jax.lensless.psf import psf
 from thincam_jax.reconstruction.drive import Outcome
 from thincam_jax.reconstruction.noise import estimate_variance, given_variances
 from thincam_jax.reconstruction.problem import InverseProblem
-from thincam_jax.reconstruction.registration import distance_ratios, own_field, register
+from thincam_jax.reconstruction.registration import distance_ratios, register
 from thincam_jax.reconstruction.regularisers import AbstractRegulariser
+from thincam_jax.reconstruction.seen_by import Cameras, Psfs
 from thincam_jax.reconstruction.solver import Reconstruction
 from thincam_jax.reconstruction.synthesis import check_synthesis, separate
-
-
-class Cameras(eqx.Module):
-    """Cameras whose PSFs are computed, one for each capture, with the light that they saw.
-
-    **Arguments**
-
-    - `cameras`: what took the captures. Captures at several mask-sensor distances are brought to
-      the scale of the largest (`register`), and their PSFs with them.
-    - `wavelength`: mm, one or one for each camera.
-    - `object_distance`: t, mm, on which to focus. Several make as many planes, each seen in its own
-      projection, so that pixels of the planes that are behind each other lie on one ray through
-      the mask.
-    - `field_shape`: pixels of the image, default those of the sensor; light from beyond is taken
-      for none. Its pixels are p·t/d apart on the object, d the largest distance.
-    - `model`, `pixel_integration`: of the PSFs, see `thincam_jax.psf`.
-    """
-
-    cameras: tuple[LenslessCamera, ...]
-    wavelength: Any
-    object_distance: Any
-    field_shape: tuple[int, int] | None = eqx.field(static=True)
-    model: Model = eqx.field(static=True)
-    pixel_integration: bool = eqx.field(static=True)
-
-    def __init__(
-        self,
-        cameras: Sequence[LenslessCamera],
-        *,
-        wavelength=None,
-        object_distance=None,
-        field_shape: tuple[int, int] | None = None,
-        model: Model = "separable",
-        pixel_integration: bool = True,
-    ):
-        if isinstance(cameras, LenslessCamera):
-            raise TypeError("cameras is one camera; give a list, [camera], one for each capture")
-        self.cameras = tuple(cameras)
-        if not self.cameras:
-            raise ValueError("cameras is empty; give one camera for each capture")
-        if not all(isinstance(camera, LenslessCamera) for camera in self.cameras):
-            raise TypeError("cameras holds something else; give LenslessCameras, or use Psfs")
-        checks.choice("model", model, MODELS)
-        self.wavelength, self.object_distance = wavelength, object_distance
-        self.field_shape, self.model = field_shape, model
-        self.pixel_integration = pixel_integration
-
-    @property
-    def count(self) -> int:
-        """Captures that belong to these."""
-        return len(self.cameras)
-
-    @property
-    def pitch(self) -> Float[Array, "*plane"]:
-        """Distance of the image's pixels on the object, mm: p·t/d of the largest d."""
-        furthest = max(self.cameras, key=lambda c: float(c.distance))
-        return furthest.sensor.pitch * jnp.asarray(self.object_distance) / furthest.distance
-
-    def require(self, *names: str) -> None:
-        """One line for what is needed and was not told."""
-        missing = [name for name in names if getattr(self, name) is None]
-        if missing:
-            raise ValueError(f"the Cameras have no {' and no '.join(missing)}; give it in mm")
-
-    def kernels(self, field: tuple[int, int], ratios) -> list[Float[Array, "1 plane k l"]]:
-        """PSF of each camera and plane on the reference scale; enlarged by r, 1/r² as bright."""
-        self.require("wavelength", "object_distance")
-        distances = np.atleast_1d(np.asarray(self.object_distance, dtype=object))
-        wavelengths = jnp.broadcast_to(jnp.asarray(self.wavelength), (self.count,))
-        kernels = []
-        for camera, wavelength, ratio in zip(self.cameras, wavelengths, ratios, strict=True):
-            grid = kernel_grid(camera.sensor.grid, own_field(field, ratio))
-            planes = [
-                psf(
-                    camera,
-                    wavelength=wavelength,
-                    object_distance=distance,
-                    grid=grid,
-                    model=self.model,
-                    pixel_integration=self.pixel_integration,
-                )
-                for distance in distances
-            ]
-            kernels.append(jnp.stack([register(k, ratio) / ratio**2 for k in planes])[None])
-        return kernels
-
-
-class Psfs(eqx.Module):
-    """Measured PSFs on the pixels of the captures, one for each capture.
-
-    **Arguments**
-
-    - `psfs`: (capture, k, l), (capture, channel, k, l) or (capture, channel, plane, k, l), the
-      channel axis of length 1 or that of the captures.
-    - `field_shape`: pixels of the field; default all that sends light to the sensor, sensor +
-      PSF − 1. The image is then the part in front of the sensor, else the field that is given.
-    """
-
-    psfs: Float[Array, "capture channel plane k l"]
-    field_shape: tuple[int, int] | None = eqx.field(static=True)
-
-    def __init__(self, psfs, *, field_shape: tuple[int, int] | None = None):
-        psfs = jnp.asarray(psfs)
-        checks.channels_first("psfs", psfs.shape)
-        if not checks.is_traced(psfs) and not np.asarray(psfs).any():
-            raise ValueError("the PSFs are zero everywhere; give PSFs that send light")
-        if not 3 <= psfs.ndim <= 5:
-            raise ValueError(
-                f"PSFs have shape {psfs.shape}; give (capture, k, l), such as psf[None] for one, "
-                "(capture, channel, k, l) or (capture, channel, plane, k, l)"
-            )
-        self.psfs = psfs.reshape(*psfs.shape[:-2], *(1,) * (5 - psfs.ndim), *psfs.shape[-2:])
-        self.field_shape = field_shape
-
-    @property
-    def count(self) -> int:
-        """Captures that belong to these."""
-        return self.psfs.shape[0]
 
 
 class Recording(eqx.Module):
@@ -207,6 +89,8 @@ class Recording(eqx.Module):
         self.valid = None if valid is None else self._masks(valid)
         if self.valid and not any(checks.is_traced(m) or np.asarray(m).any() for m in self.valid):
             raise ValueError("valid is False everywhere; give a mask with pixels to trust")
+        if not isinstance(seen_by, Stacked):  # operators may have masks of their own
+            self._require_finite()
 
     def problem(
         self,
@@ -306,6 +190,16 @@ class Recording(eqx.Module):
             sensor, pixels = seen_by.cameras[0].sensor.shape, shapes[0][-2:]
             if pixels != sensor:
                 raise ValueError(f"captures have {pixels} pixels, the cameras' sensor {sensor}")
+
+    def _require_finite(self) -> None:
+        """Trusted pixels are numbers."""
+        for number, (capture, valid) in enumerate(zip(*self._trusted(), strict=True)):
+            known = not checks.is_traced(capture) and not checks.is_traced(valid)
+            if known and not bool(jnp.isfinite(capture).all()):
+                raise ValueError(
+                    f"captures[{number}] holds NaN or infinity; mend it, or leave such pixels out "
+                    "with valid=numpy.isfinite(captures)"
+                )
 
     def _detectors(self, shapes):
         return zip(shapes, self.seen_by.operators, strict=True)  # type: ignore[union-attr]
@@ -421,6 +315,12 @@ def _convolutions(sums, variances, pitch, field_shape, settings) -> InverseProbl
         for s in sums
     ]
     window = (max(w[0] for w in windows), max(w[1] for w in windows))
+    # Captures, kernels and a field, each with its transform, at the least.
+    refuse_if_too_large(
+        f"a reconstruction on a field of {field_shape[0]}×{field_shape[1]} pixels",
+        dtype.itemsize * math.prod(window) * (2 * len(sums) + 3),
+        "give a smaller field_shape, fewer pixels or fewer captures",
+    )
     operators = [
         CropConvolution(
             s.kernel.astype(dtype),

@@ -21,8 +21,8 @@ from thincam_jax.reconstruction.drive import CHUNK, AbstractMethod, Callback, Ou
 from thincam_jax.reconstruction.fista import solve_fista
 from thincam_jax.reconstruction.high_pass import Judged, high_passed, levelled
 from thincam_jax.reconstruction.problem import InverseProblem, uniform_level
-from thincam_jax.reconstruction.recording import Cameras
 from thincam_jax.reconstruction.regularisers import AbstractRegulariser
+from thincam_jax.reconstruction.seen_by import Cameras
 from thincam_jax.reconstruction.solver import (
     AbstractIterativeSolver,
     Reconstruction,

@@ -15,13 +15,14 @@ from thincam_jax._core.precision import as_complex
 from thincam_jax.imaging.operators import CropConvolution, kernel_grid, kernel_shape
 from thincam_jax.lensless.psf import psf
 from thincam_jax.reconstruction.noise import estimate_variance
-from thincam_jax.reconstruction.recording import Cameras, Recording
+from thincam_jax.reconstruction.recording import Recording
 from thincam_jax.reconstruction.registration import (
     distance_ratios,
     own_field,
     register,
     registered_shape,
 )
+from thincam_jax.reconstruction.seen_by import Cameras
 from thincam_jax.reconstruction.solver import AbstractSolver, Reconstruction, as_synthesis
 from thincam_jax.reconstruction.spectra import (
     Prior,

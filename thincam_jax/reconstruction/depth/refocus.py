@@ -10,7 +10,8 @@ from jaxtyping import Array, Float
 from thincam_jax.reconstruction.methods import choose_solver, reconstruct
 from thincam_jax.reconstruction.noise import estimate_variance
 from thincam_jax.reconstruction.poisson import PoissonTV
-from thincam_jax.reconstruction.recording import Cameras, Psfs, Recording
+from thincam_jax.reconstruction.recording import Recording
+from thincam_jax.reconstruction.seen_by import Cameras, Psfs
 from thincam_jax.reconstruction.solver import AbstractSolver
 
 _LEAST = 3  # a maximum inside of the sweep needs two neighbours
