@@ -1,6 +1,7 @@
 """The names of `thincam_jax`; `__init__.py` reads them from here."""
 
 from ._core.grids import Grid as Grid
+from .commands import plot as plot
 from .imaging.scene import ImagePlane as ImagePlane
 from .imaging.scene import Scene as Scene
 from .imaging.scene import Spectrum as Spectrum

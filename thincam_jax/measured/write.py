@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import PIL.Image
 import tifffile
 from jaxtyping import ArrayLike, Float, UInt8
 
 from thincam_jax._core.files import write_whole
+from thincam_jax.imaging.display import eight_bit, png_bytes
 from thincam_jax.measured.raw import MeasurementError
 
 LINEAR = (".npy", ".tif", ".tiff")
@@ -92,9 +92,7 @@ def to_display(
         )
     balanced = np.maximum(linear, 0.0)
     balanced = balanced * _gains(balanced, white_balance)[:, None, None]
-    white = np.percentile(balanced, percentile) or balanced.max()
-    shown = np.clip(balanced / white, 0.0, 1.0) if white > 0 else balanced
-    pixels = np.round(255 * shown ** (1 / gamma)).astype(np.uint8)
+    pixels = eight_bit(balanced, gamma, percentile)
     return pixels[0] if pixels.shape[0] == 1 else np.moveaxis(pixels, 0, -1)
 
 
@@ -117,13 +115,6 @@ def _gains(image: np.ndarray, white_balance: WhiteBalance) -> np.ndarray:
             "above 0 for each of red, green and blue"
         )
     return gains
-
-
-def png_bytes(pixels: np.ndarray) -> bytes:
-    """A PNG file of 8-bit grey (y, x) or RGB (y, x, 3)."""
-    buffer = io.BytesIO()
-    PIL.Image.fromarray(pixels).save(buffer, format="PNG")
-    return buffer.getvalue()
 
 
 def log_text(log: Mapping[str, Any]) -> str:

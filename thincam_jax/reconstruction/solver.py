@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
+from thincam_jax.imaging.display import eight_bit, pictures, png_bytes
 from thincam_jax.reconstruction.drive import Callback, Progress
 
 if TYPE_CHECKING:
@@ -45,6 +46,16 @@ class Reconstruction(eqx.Module):
         if not bool(jnp.isfinite(self.image).all()):
             return "non_finite"
         return self.ending or "ok"
+
+    @property
+    def has_planes(self) -> bool:
+        """Whether the images of several distances are known to be behind each other."""
+        return self.pitch is not None and self.pitch.ndim > 0
+
+    def _repr_png_(self) -> bytes:
+        """What a notebook shows: the image with gamma 2.2; planes and a batch beside each other."""
+        images = pictures(self.image, planes=self.has_planes)
+        return png_bytes(eight_bit(np.concatenate(images, axis=1)))
 
 
 class AbstractSolver(eqx.Module):

@@ -4,16 +4,17 @@ import io
 import math
 
 import numpy as np
-import PIL.Image
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from thincam_jax.commands.config_file import slug
+from thincam_jax.commands.plot import draw_psf
 from thincam_jax.commands.run_folder import RunFolder
 from thincam_jax.commands.study.build import middle_square
 from thincam_jax.commands.study.evaluate import Evaluation, as_picture
 from thincam_jax.commands.study.response import Response
 from thincam_jax.commands.study.study import Capture, Exposure, Study, Target
+from thincam_jax.imaging.display import png_bytes
 from thincam_jax.imaging.metrics import low_frequency_value
 
 # Told apart by dash and marker as well as by colour, so that they read in grey.
@@ -46,9 +47,7 @@ def save_figure(folder: RunFolder, name: str, figure: Figure) -> None:
 def save_image(folder: RunFolder, name: str, image: np.ndarray) -> None:
     """An image of values 0…1 as an 8-bit PNG."""
     pixels = np.round(np.clip(image, 0.0, 1.0) * 255).astype(np.uint8)
-    buffer = io.BytesIO()
-    PIL.Image.fromarray(pixels).save(buffer, format="PNG")
-    folder.write(f"images/{name}.png", buffer.getvalue())
+    folder.write(f"images/{name}.png", png_bytes(pixels))
 
 
 def save_target(
@@ -249,15 +248,6 @@ def save_psf(folder: RunFolder, study: Study) -> None:
     h = np.asarray(study.psf(exposure))
     grid = study.camera(exposure).sensor.grid
     figure = Figure(figsize=(8.5, 3.4), layout="constrained")
-    image, line = figure.subplots(1, 2, gridspec_kw={"width_ratios": (1, 1.6)})
-    x, y = np.asarray(grid.x), np.asarray(grid.y)
-    half = study.sensor.pitch / 2
-    extent = (x[0] - half, x[-1] + half, y[-1] + half, y[0] - half)
-    shown = image.imshow(h, cmap="gray", extent=extent)
-    figure.colorbar(shown, ax=image, label="irradiance / open aperture")
-    image.set(xlabel="x (mm)", ylabel="y (mm)")
-    line.plot(x, h[h.shape[0] // 2], color="black", linewidth=0.7)
-    line.set(xlabel="x (mm), through the middle", ylabel="irradiance / open aperture")
     mask = f"β = {exposure.beta:g} rad/mm², φ = {exposure.phase:.2f} rad"
-    line.set_title(f"{mask}, d = {exposure.distance:g} mm", fontsize=9)
+    draw_psf(figure, h, grid, f"{mask}, d = {exposure.distance:g} mm")
     save_figure(folder, "psf", figure)

@@ -1,0 +1,74 @@
+"""Figures of `tc.plot`, and the picture that a result shows of itself in a notebook."""
+
+import io
+
+import jax.numpy as jnp
+import matplotlib
+import numpy as np
+import pytest
+import skimage.io
+
+import thincam_jax as tc
+from thincam_jax.reconstruction import Reconstruction
+
+matplotlib.use("Agg")
+RNG = np.random.default_rng(0)
+IMAGE = RNG.uniform(size=(9, 13))
+
+
+def result(image, pitch=None) -> Reconstruction:
+    return Reconstruction(jnp.asarray(image), None if pitch is None else jnp.asarray(pitch))
+
+
+@pytest.fixture(autouse=True)
+def closed():
+    from matplotlib import pyplot
+
+    yield
+    pyplot.close("all")
+
+
+def test_a_psf_lies_on_the_sensor_in_mm():
+    mask = tc.FresnelZoneAperture(25.0, width=1.0)
+    camera = tc.LenslessCamera(mask, tc.Sensor((24, 30), 0.05), distance=3.0)
+    figure = tc.plot.psf(camera, wavelength=5e-4, model="geometric", pixel_integration=False)
+    image, line = figure.axes[:2]
+    assert image.images[0].get_extent() == pytest.approx([-0.75, 0.75, 0.6, -0.6])
+    expected = tc.psf(camera, wavelength=5e-4, model="geometric")
+    np.testing.assert_array_equal(image.images[0].get_array(), expected)
+    np.testing.assert_array_equal(line.lines[0].get_ydata(), expected[12])
+
+
+def test_images_are_compared_with_the_truth():
+    found = result(2 * IMAGE + 0.1 * RNG.normal(size=IMAGE.shape))
+    figure = tc.plot.compare({"scene": IMAGE, "ridge": found}, truth="scene")
+    titles = [ax.get_title() for ax in figure.axes]
+    assert titles[0] == "scene" and titles[1].startswith("ridge, 2") and titles[1].endswith(" dB")
+    assert len(tc.plot.compare({"colour": np.stack([IMAGE] * 3)}).axes) == 1
+    for images, truth in (({}, None), ({"a": IMAGE}, "b"), ({"a": IMAGE, "b": IMAGE[1:]}, "a")):
+        with pytest.raises(ValueError, match="give (images by name|the truth on the same pixels)"):
+            tc.plot.compare(images, truth=truth)
+
+
+@pytest.mark.parametrize(
+    ("shape", "pitch", "shown"),
+    [
+        ((9, 13), None, (9, 13)),
+        ((3, 9, 13), 0.1, (9, 13, 3)),  # colours
+        ((3, 9, 13), [0.1, 0.2, 0.3], (9, 39)),  # planes
+        ((2, 9, 13), None, (9, 26)),
+    ],
+)
+def test_a_result_shows_itself(shape, pitch, shown):
+    linear = RNG.uniform(size=shape)
+    picture = skimage.io.imread(io.BytesIO(result(linear, pitch)._repr_png_()))
+    assert picture.shape == shown
+    assert picture.max() == 255
+    first = linear[0] if len(shown) == 2 and len(shape) == 3 else linear
+    part = picture[:, :13] if len(shown) == 2 else np.moveaxis(picture, -1, 0)
+    assert np.corrcoef(first.ravel() ** (1 / 2.2), part.ravel())[0, 1] > 0.99
+
+
+def test_a_result_that_is_not_finite_is_shown_too():
+    broken = np.where(IMAGE > 0.9, np.nan, IMAGE)
+    assert result(broken)._repr_png_()[:4] == b"\x89PNG"

@@ -1,0 +1,35 @@
+"""Linear images as 8-bit pictures."""
+
+import io
+from typing import Any
+
+import numpy as np
+import PIL.Image
+
+
+def eight_bit(
+    linear: np.ndarray, gamma: float | int = 2.2, percentile: float | int = 99.9
+) -> np.ndarray:
+    """round(255 clip(I/w, 0, 1)^(1/γ)), w this percentile of I; the maximum where that is 0."""
+    balanced = np.maximum(linear, 0.0)
+    white = np.percentile(balanced, percentile) or balanced.max()
+    shown = np.clip(balanced / white, 0.0, 1.0) if white > 0 else balanced
+    return np.round(255 * shown ** (1 / gamma)).astype(np.uint8)
+
+
+def png_bytes(pixels: np.ndarray) -> bytes:
+    """A PNG file of 8-bit grey (y, x) or RGB (y, x, 3)."""
+    buffer = io.BytesIO()
+    PIL.Image.fromarray(pixels).save(buffer, format="PNG")
+    return buffer.getvalue()
+
+
+def pictures(image: Any, *, planes: bool = False) -> list[np.ndarray]:
+    """The images of (*batch, y, x), each (y, x) or, of three channels, (y, x, 3), colours last.
+
+    With `planes` the last batch axis counts planes, and is not the colour channel.
+    """
+    image = np.nan_to_num(np.asarray(image, dtype=float))
+    if not planes and image.ndim > 2 and image.shape[-3] == 3:
+        return list(np.moveaxis(image.reshape(-1, *image.shape[-3:]), 1, -1))
+    return list(image.reshape(-1, *image.shape[-2:]))
