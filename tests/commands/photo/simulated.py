@@ -56,7 +56,7 @@ def grey_files(folder: Path, captures=("capture",), shape=SHAPE) -> dict[str, Pa
     for number, name in enumerate(captures):
         view = capture(scene(shape, 3 * number)[1:2], light)
         images[name] = counts(view[0], 10 + number)
-    return {name: _tiff(folder / f"{name}.tif", image) for name, image in images.items()}
+    return {name: write_tiff(folder / f"{name}.tif", image) for name, image in images.items()}
 
 
 def colour_files(folder: Path) -> dict[str, Path]:
@@ -83,7 +83,7 @@ def bayer_files(folder: Path, shape=(120, 152)) -> dict[str, Path]:
         "capture": mosaic(counts(view, 6)),
         "dark": np.full(shape, DARK),
     }
-    return {name: _tiff(folder / f"{name}.tif", image) for name, image in images.items()}
+    return {name: write_tiff(folder / f"{name}.tif", image) for name, image in images.items()}
 
 
 def mosaic(image):
@@ -98,6 +98,6 @@ def correlation(image, other) -> float:
     return float(np.corrcoef(np.ravel(image), np.ravel(other))[0, 1])
 
 
-def _tiff(path: Path, image) -> Path:
+def write_tiff(path: Path, image) -> Path:
     tifffile.imwrite(path, np.asarray(image).astype(np.uint16))
     return path

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 import typer
 from typer import Option
 
-from thincam_jax.commands.terminal import fail, told
+from thincam_jax.commands.terminal import Overrides, fail, told
 
 # Known without importing JAX; the tests hold them to `options.PSF_METHODS`.
 METHODS = ("auto", "admm-tv", "fista", "ridge")
@@ -35,11 +35,16 @@ Dead = Annotated[Path | None, Option(help="Map of dead pixels, not zero where de
 
 
 def reconstruct(
-    psf: Psf,
     capture: Annotated[Path, Option(help="Capture of the same size; or a folder of captures.")],
     out: Annotated[
         Path, Option(help="Image (.png, .npy, .tif); a folder for a folder of captures.")
     ],
+    psf: Annotated[Path | None, Option(help="Measured PSF: TIFF, PNG or NPY.")] = None,
+    camera: Annotated[
+        Path | None,
+        Option(help="In place of --psf, a study (YAML) whose first shot took the capture."),
+    ] = None,
+    set_: Overrides = None,
     background: Background = None,
     psf_background: PsfBackground = None,
     downsample: Annotated[int, Option(help="Side of the blocks of pixels that are averaged.")] = 1,
@@ -94,7 +99,7 @@ def reconstruct(
         str | None, Option(help="Of the PNG: grey-world, or gains as 1.8,1,1.4.")
     ] = None,
 ) -> None:
-    """Reconstruct captures with a measured PSF.
+    """Reconstruct captures with a measured PSF, or with that of a camera's numbers.
 
     Takes one, or all of a folder. Writes the image, its linear values and a JSON record of all that
     was done. Ctrl-C keeps the best image so far.
@@ -102,6 +107,7 @@ def reconstruct(
     nothing = "interrupted; of the capture at work no image is there yet, nothing of it is kept"
     with told(lambda: nothing):
         from thincam_jax.commands.photo.console import (
+            known_psf,
             read_background,
             read_corner,
             read_white_balance,
@@ -112,10 +118,11 @@ def reconstruct(
         from thincam_jax.measured import MeasurementError, Preparation
 
         try:
+            known = known_psf(psf, camera, set_, background)
             sources = Sources(
-                psf,
+                known,
                 read_background(background),
-                read_background(psf_background),
+                0.0 if camera else read_background(psf_background),
                 dead,
                 bits,
                 Preparation(

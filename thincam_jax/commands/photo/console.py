@@ -7,10 +7,10 @@ import rich.progress
 
 from thincam_jax.commands.photo.jobs import Job
 from thincam_jax.commands.photo.options import Background, Output, Recipe, Sources
-from thincam_jax.commands.photo.run import Failed, Finished, run_jobs
+from thincam_jax.commands.photo.run import Failed, Finished, computed_psf, run_jobs
 from thincam_jax.commands.start import INTERRUPTED
 from thincam_jax.commands.terminal import WRONG_INPUT, in_a_line, progress_bar, tell
-from thincam_jax.measured import MeasurementError
+from thincam_jax.measured import MeasurementError, Raw
 from thincam_jax.measured.write import WhiteBalance
 from thincam_jax.reconstruction import Progress
 
@@ -23,6 +23,30 @@ def read_background(text: str | None) -> Background:
         return float(text)
     except ValueError:
         return Path(text)
+
+
+def known_psf(
+    psf: Path | None, camera: Path | None, overrides: list[str] | None, background: str | None
+) -> Path | Raw:
+    """The file of a measured PSF, or the PSF of a camera.
+
+    **Errors**: MeasurementError where not one of the two is given; ConfigError of the camera.
+    """
+    if (psf is None) == (camera is None):
+        raise MeasurementError(
+            "give either --psf, a measured PSF, or --camera, a study with the camera's numbers"
+        )
+    if psf is not None:
+        if overrides:
+            raise MeasurementError("--set changes the file of --camera; leave it out with --psf")
+        return psf
+    assert camera is not None
+    if background is None:
+        raise MeasurementError(
+            "--camera: a computed PSF has no dark corner; give --background, a dark frame or a "
+            "number of counts"
+        )
+    return computed_psf(camera, overrides or ())
 
 
 def read_corner(text: str) -> tuple[int, int]:

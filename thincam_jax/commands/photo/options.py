@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Literal
 
 from thincam_jax._core import checks
-from thincam_jax.measured import MeasurementError, Preparation
+from thincam_jax.measured import MeasurementError, Preparation, Raw
 from thincam_jax.measured.write import WhiteBalance
 from thincam_jax.reconstruction import SOLVERS, AbstractSolver, AdmmTV, Fista, Ridge, TotalVariation
 
@@ -23,13 +23,13 @@ Background = Path | float | int | None
 class Sources:
     """What all captures of a run share; see `measured.prepare`.
 
-    - `psf`, `dead`: files. `background`, `psf_background`: a dark frame's file, a number of counts,
-      or None for the default.
+    - `psf`: a file, or what `computed_psf` computed. `dead`: a file. `background`,
+      `psf_background`: a dark frame's file, a number of counts, or None for the default.
     - `bits`: bit depth of the camera where its files do not tell it; `psf_bits` that of the PSF
       and its background where it is another.
     """
 
-    psf: Path
+    psf: Path | Raw
     background: Background = None
     psf_background: Background = None
     dead: Path | None = None

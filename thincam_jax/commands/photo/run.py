@@ -12,9 +12,13 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from thincam_jax._core.memory import refuse_if_too_large
+from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.doctor import environment
 from thincam_jax.commands.photo.jobs import Job, write_job
 from thincam_jax.commands.photo.options import Background, Output, Recipe, Sources
+from thincam_jax.commands.refocus.config import load_experiment
+from thincam_jax.commands.study.build import assemble, check_study
+from thincam_jax.commands.study.config import StudyConfig
 from thincam_jax.imaging.operators import window_shape
 from thincam_jax.measured import (
     MeasurementError,
@@ -97,7 +101,8 @@ class Rig:
     def __init__(self, sources: Sources):
         self.sources = sources
         psf_bits = sources.bits if sources.psf_bits is None else sources.psf_bits
-        self.psf = read_image(sources.psf, psf_bits)
+        given = sources.psf
+        self.psf = given if isinstance(given, Raw) else read_image(given, psf_bits)
         self.background = _background(sources.background, sources.bits)
         self.psf_background = _background(sources.psf_background, psf_bits)
         self.dead = None if sources.dead is None else read_mask(sources.dead)
@@ -111,6 +116,24 @@ class Rig:
             psf_background=self.psf_background,
             dead=self.dead,
         )
+
+
+def computed_psf(config: Path, overrides: Sequence[str]) -> Raw:
+    """The PSF of a study's first shot, at the distance of its object.
+
+    **Errors**: ConfigError, as of `load_experiment`, and for a file of another kind.
+    """
+    experiment = load_experiment(config, tuple(overrides))
+    if not isinstance(experiment, StudyConfig):
+        raise ConfigError(f"{config}: is of kind refocus; a camera is read from a study")
+    study = assemble(experiment, ())
+    check_study(study)
+    shot = study.exposures[0]
+    name = (
+        f"camera of {config}: {study.camera(shot)}, wavelength {shot.wavelength * 1e6:g} nm, "
+        f"object at {study.object_distance:g} mm"
+    )
+    return Raw(np.asarray(study.psf(shot)), name=name)
 
 
 def _background(given: Background, bits: int | None) -> Raw | float | None:
@@ -144,8 +167,9 @@ def _run_job(job: Job, rig: Rig, recipe: Recipe, output: Output, told: Told | No
 
 def _told(sources: Sources) -> dict[str, Any]:
     """All but the preparation, which tells its own."""
-    names = ("psf", "background", "psf_background", "dead", "bits", "psf_bits")
-    return {name: getattr(sources, name) for name in names}
+    names = ("background", "psf_background", "dead", "bits", "psf_bits")
+    psf = sources.psf.name if isinstance(sources.psf, Raw) else sources.psf
+    return {"psf": psf, **{name: getattr(sources, name) for name in names}}
 
 
 def _reconstruct(
