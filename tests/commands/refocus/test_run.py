@@ -96,6 +96,9 @@ def test_report_stands_alone_and_is_escaped(run):
     assert "<script" not in page
     assert "&lt;b&gt;of its own&lt;/b&gt;" in page
     assert "near, placed at 20 mm, is sharpest at" in page
+    parts = re.findall(r'href="#(\w+)"', page)
+    assert parts == re.findall(r'<h2 id="(\w+)">', page)  # the contents
+    assert len(parts) == 6
 
 
 def test_objects_stand_where_they_were_put(tmp_path):
