@@ -38,10 +38,10 @@ def warn_if_unresolved(camera: LenslessCamera, distances: Iterable[Any]) -> None
     """
     distances = list(distances)
     known = not any(map(checks.is_traced, jax.tree.leaves((camera, distances))))
-    if known and hasattr(camera.mask, "finest_frequency"):
+    finest = getattr(camera.mask, "finest_frequency", None) if known else None
+    if finest is not None:
         farthest = max(float(distance) for distance in distances)
         magnification = 1 + float(camera.distance) / farthest
-        frequency = float(camera.mask.finest_frequency) / magnification
-        fault = unresolved(frequency, float(camera.sensor.pitch))
+        fault = unresolved(float(finest) / magnification, float(camera.sensor.pitch))
         if fault:
             warnings.warn(fault, SamplingWarning, stacklevel=3)
