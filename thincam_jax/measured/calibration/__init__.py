@@ -1,5 +1,15 @@
-"""What a rig's own pictures say of it: PSF fits and the registration of reconstructions."""
+"""What a rig's own pictures say of it: PSF fits, registration, matrices by Hadamard patterns."""
 
+from thincam_jax.measured.calibration.captures import CaptureStoreError as CaptureStoreError
+from thincam_jax.measured.calibration.captures import CaptureWriter as CaptureWriter
+from thincam_jax.measured.calibration.captures import HadamardCaptures as HadamardCaptures
+from thincam_jax.measured.calibration.captures import create_captures as create_captures
+from thincam_jax.measured.calibration.captures import open_captures as open_captures
+from thincam_jax.measured.calibration.captures import resume_captures as resume_captures
+from thincam_jax.measured.calibration.captures import simulate_captures as simulate_captures
+from thincam_jax.measured.calibration.hadamard import HadamardSeries as HadamardSeries
+from thincam_jax.measured.calibration.hadamard import hadamard_pattern as hadamard_pattern
+from thincam_jax.measured.calibration.hadamard import walsh_hadamard as walsh_hadamard
 from thincam_jax.measured.calibration.problem import PARAMETERS as PARAMETERS
 from thincam_jax.measured.calibration.psf_fit import PsfFit as PsfFit
 from thincam_jax.measured.calibration.psf_fit import fit_psf as fit_psf
@@ -7,3 +17,8 @@ from thincam_jax.measured.calibration.registration import Registration as Regist
 from thincam_jax.measured.calibration.registration import (
     estimate_registration as estimate_registration,
 )
+from thincam_jax.measured.calibration.system_matrix import matrix_blocks as matrix_blocks
+from thincam_jax.measured.calibration.system_matrix import read_matrix as read_matrix
+from thincam_jax.measured.calibration.system_matrix import recover_matrix as recover_matrix
+from thincam_jax.measured.calibration.system_matrix import stored_blocks as stored_blocks
+from thincam_jax.measured.calibration.system_matrix import write_matrix as write_matrix

@@ -1,0 +1,187 @@
+r"""The matrix of a camera from its Hadamard captures (thesis Eq 5.17 with the N that it lost).
+
+.. math:: \mathbf H = \mathbf V'\mathbf U'^T/N
+
+It is linear in the captures, so that the offset, the same in all of them, need not be taken off one
+by one: a constant is transformed into the first cell's column, the only one where the white frame
+and the dark ones come in.
+
+The captures are read in blocks of sensor rows, and each block's part of H is finished before the
+next is read: in memory are one block and, if it is wanted there, H.
+"""
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from thincam_jax._core.memory import refuse_if_too_large
+from thincam_jax.imaging.operators import Matrix
+from thincam_jax.measured.calibration.captures import CaptureStoreError, HadamardCaptures
+from thincam_jax.measured.calibration.hadamard import natural_rows, walsh_hadamard
+
+_KIND, _VERSION = "system matrix", 1
+_BLOCK = 2**22  # bytes of a chunk of a stored matrix
+_ALIGNED = 64  # bytes: an array that starts at a multiple becomes one of JAX without a copy
+
+Block = tuple[slice, Float[np.ndarray, "pixel cell"]]
+
+
+def matrix_blocks(captures: HadamardCaptures) -> Iterator[Block]:
+    """H of the pixels of some sensor rows after another, and which pixels, numbered row by row.
+
+    In counts of the camera for a cell that is white. Each is a new float32 array.
+    """
+    for pixels, fill in _pending(captures):
+        block = np.empty((pixels.stop - pixels.start, captures.series.cell_count), np.float32)
+        fill(block)
+        yield pixels, block
+
+
+def recover_matrix(captures: HadamardCaptures) -> Matrix:
+    """H as an operator, in float32, for `Recording`: 3.2 GB for 64² cells and 440² pixels, once.
+
+    **Errors**: CaptureStoreError for damaged captures; MemoryError, one line, where it does not
+    fit.
+    """
+    series, count = captures.series, math.prod(captures.sensor_shape)
+    matrix = _aligned(count, series.cell_count)
+    for pixels, fill in _pending(captures):
+        fill(matrix[pixels])
+    return _operator(matrix, series.object_shape, captures.sensor_shape)
+
+
+def write_matrix(captures: HadamardCaptures, path: str | Path) -> Path:
+    """H into a Zarr store, block by block, never whole in memory; `read_matrix` reads it.
+
+    **Errors**: CaptureStoreError, one line, where something is at `path` already.
+    """
+    path, series = Path(path), captures.series
+    if path.exists():
+        raise CaptureStoreError(f"{path} exists; give another name")
+    import zarr
+    from zarr.codecs import Crc32cCodec
+
+    count, cells = math.prod(captures.sensor_shape), series.cell_count
+    group = zarr.create_group(path)
+    array = group.create_array(
+        "matrix",
+        shape=(count, cells),
+        dtype="float32",
+        chunks=(min(count, max(1, _BLOCK // (4 * cells))), cells),
+        compressors=[Crc32cCodec()],
+        config={"write_empty_chunks": True},
+        dimension_names=("pixel", "cell"),
+    )
+    # Written in whole chunks: what is left of a block goes with the next.
+    left, start = np.empty((0, cells), np.float32), 0
+    for _, block in matrix_blocks(captures):
+        left = np.concatenate([left, block])
+        whole = len(left) - len(left) % array.chunks[0]
+        array[start : start + whole] = left[:whole]
+        left, start = left[whole:], start + whole
+    array[start:] = left
+    # Last: a matrix that was not finished is none.
+    group.attrs.update(
+        kind=_KIND,
+        version=_VERSION,
+        object_shape=series.object_shape,
+        sensor_shape=captures.sensor_shape,
+    )
+    return path
+
+
+def stored_blocks(path: str | Path) -> Iterator[Block]:
+    """A stored matrix in blocks of its pixels, without ever holding it whole."""
+    _, array = _stored(path)
+    step = array.chunks[0]
+    for start in range(0, array.shape[0], step):
+        pixels = slice(start, min(start + step, array.shape[0]))
+        yield pixels, _read(path, array, pixels)
+
+
+def read_matrix(path: str | Path) -> Matrix:
+    """A stored matrix as an operator, in memory once.
+
+    **Errors**: CaptureStoreError, one line, for what is no matrix, is not finished or is damaged.
+    """
+    attributes, array = _stored(path)
+    matrix = _aligned(*array.shape)
+    for pixels, block in stored_blocks(path):
+        matrix[pixels] = block
+    return _operator(matrix, attributes["object_shape"], attributes["sensor_shape"])
+
+
+def _pending(captures: HadamardCaptures) -> Iterator[tuple[slice, Any]]:
+    """Pixels, and a function that writes their part of H where it is told."""
+    series, (rows, columns) = captures.series, captures.sensor_shape
+    shown_at = np.argsort(natural_rows(series.cell_count, series.order))
+    for start in range(0, rows, captures.block_rows):
+        stop = min(start + captures.block_rows, rows)
+        frames = captures.rows(start, stop).reshape(series.frame_count, -1)
+
+        def fill(out: np.ndarray, frames: np.ndarray = frames) -> None:
+            if series.display == "complementary":
+                shown = frames[: series.pattern_frames]
+                signed = np.subtract(shown[::2], shown[1::2], dtype=np.float32)
+                walsh_hadamard(signed[shown_at], out)
+                out /= series.cell_count
+                return
+            walsh_hadamard(frames[shown_at], out)
+            out *= 2 / series.cell_count
+            # v′ = 2(v − dark) − (v₀ − dark)
+            dark = frames[series.pattern_frames :]
+            out[:, 0] -= frames[0]
+            if len(dark):
+                out[:, 0] -= dark.mean(axis=0, dtype=np.float32)
+
+        yield slice(start * columns, stop * columns), fill
+
+
+def _aligned(count: int, cells: int) -> Float[np.ndarray, "pixel cell"]:
+    size = 4 * count * cells
+    # Checking its numbers takes a byte each.
+    refuse_if_too_large(
+        f"a matrix of {count} × {cells}", size * 5 // 4, "write it to a store (write_matrix)"
+    )
+    room = np.empty(size + _ALIGNED, np.uint8)
+    start = -room.ctypes.data % _ALIGNED
+    return room[start : start + size].view(np.float32).reshape(count, cells)
+
+
+def _operator(matrix: np.ndarray, object_shape, sensor_shape) -> Matrix:
+    return Matrix(jax.device_put(matrix, may_alias=True), object_shape, sensor_shape)
+
+
+def _stored(path: str | Path) -> tuple[dict[str, Any], Any]:
+    import zarr
+
+    try:
+        group = zarr.open_group(path, mode="r")
+        attributes: dict[str, Any] = dict(group.attrs)
+        array: Any = group["matrix"]
+        if attributes["kind"] != _KIND or attributes["version"] != _VERSION:
+            raise ValueError(f"{attributes['kind']}, version {attributes['version']}")
+        shape = tuple(math.prod(attributes[name]) for name in ("sensor_shape", "object_shape"))
+        if array.shape != shape:
+            raise ValueError(f"the matrix has another shape than {shape}")
+    except (OSError, ValueError, KeyError) as error:
+        raise CaptureStoreError(
+            f"{path} is no finished system matrix ({type(error).__name__}: {error}); give one that "
+            "write_matrix made"
+        ) from error
+    return attributes, array
+
+
+def _read(path, array: Any, pixels: slice) -> np.ndarray:
+    try:
+        return np.asarray(array[pixels])
+    except (ValueError, OSError) as error:
+        raise CaptureStoreError(
+            f"{path}: pixels {pixels.start} … {pixels.stop - 1} are damaged ({error}); write the "
+            "matrix again"
+        ) from error
