@@ -1,0 +1,149 @@
+"""Screens found from a matrix or from ghosts: the errors claimed, other distances, what is open."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import thincam_jax as tc
+from thincam_jax import waveguide as wg
+from thincam_jax.imaging.metrics import psnr
+from thincam_jax.imaging.operators import Matrix
+from thincam_jax.imaging.targets import resize, sample_image
+from thincam_jax.measured.calibration import GhostPositions, fit_screen
+from thincam_jax.units import deg, nm, um
+
+CELLS = (8, 16)
+
+
+def camera(reference=61.2, glass=5.0, lens=10.0, tilt=0.0, pixels=(22, 30), pitch=70.4 * um):
+    film = wg.VolumeHologram.record(
+        532 * nm, 0.0, reference * deg, index=1.5, thickness=16 * um, index_modulation=0.02
+    )
+    _, y, z = film.grating
+    grating = jnp.stack([-jnp.sin(tilt) * y, jnp.cos(tilt) * y, z])
+    film = wg.VolumeHologram(grating, 1.5, film.thickness, film.index_modulation)
+    return wg.SeeThroughCamera(wg.Screen(film, glass, 1.5), tc.Sensor(pixels, pitch), 6.0, lens)
+
+
+def plane(distance=550.0, centre=(0.0, 27.0), shape=CELLS):
+    return wg.ObjectPlane(shape, distance, 150.0, centre)
+
+
+TRUE = {"reference": 61.7, "glass": 5.1, "lens": 10.6, "tilt": 0.01}
+CENTRE = (0.8, 27.9)
+VALUES = {
+    "glass_thickness": 5.1,
+    "lens_distance": 10.6,
+    "slant": 61.7 * deg / 2,
+    "tilt": 0.01,
+    "object_x": 0.8,
+    "object_y": 27.9,
+}
+
+
+def ghosts(deviation, true=TRUE, orders=3):
+    """A dot for every order of twelve pixels, with an error of measurement."""
+    random = np.random.default_rng(0)
+    pixels = random.uniform(-1, 1, (12, 2))
+    seen = wg.trace(camera(**true), jnp.asarray(pixels), 550.0, orders).points[..., :2]
+    points = (np.asarray(seen) - CENTRE).reshape(-1, 2)
+    noisy = points + deviation * random.normal(size=points.shape)
+    return GhostPositions(
+        np.tile(pixels, (orders, 1)), noisy, np.repeat(np.arange(orders), 12), deviation
+    )
+
+
+def matrix(system, noise=0.0):
+    size = np.prod(system.in_shape)
+    columns = jax.vmap(system)(jnp.eye(size).reshape(size, *system.in_shape)).reshape(size, -1)
+    error = np.random.default_rng(1).normal(size=columns.shape[::-1])
+    return Matrix(np.asarray(columns).T + noise * error, system.in_shape, system.out_shape)
+
+
+def deviations(fit, truth):
+    return np.array([float((fit.values[n] - truth[n]) / fit.standard_errors[n]) for n in truth])
+
+
+def test_a_screen_from_a_few_ghosts():
+    """Within the errors that it claims, which the noise explains."""
+    fit = fit_screen(ghosts(0.05), camera(), plane())
+    assert np.abs(deviations(fit, VALUES)).max() < 4
+    assert fit.standard_errors["glass_thickness"] < 0.1
+    exact = fit_screen(ghosts(1e-7), camera(), plane())
+    for name, value in VALUES.items():
+        assert float(exact.values[name]) == pytest.approx(value, abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("names", "told"),
+    [
+        (("lens_distance", "object_distance"), "lens_distance and object_distance cannot"),
+        (("slant", "shrinkage"), "slant and shrinkage cannot be told apart"),
+        (("tilt", "film_thickness"), "do not see film_thickness at all"),
+    ],
+)
+def test_what_positions_cannot_tell_is_said(names, told):
+    fit = fit_screen(ghosts(0.05), camera(), plane(), names)
+    assert any(told in line for line in fit.reasons)
+
+
+def test_another_screen_is_told():
+    fit = fit_screen(ghosts(0.05, TRUE | {"glass": 9.0}), camera(), plane(), ("slant",))
+    assert fit.status == "poor_fit"
+
+
+@pytest.mark.thorough
+def test_a_screen_from_its_matrix():
+    """In any unit; noise of a tenth of the largest entries."""
+    true = wg.system_operator(camera(**TRUE), plane(centre=CENTRE))
+    measured = matrix(true, noise=0.01)
+    scaled = Matrix(40 * measured.matrix, measured.in_shape, measured.out_shape)
+    fit = fit_screen(scaled, camera(), plane())
+    assert np.abs(deviations(fit, VALUES | {"gain": 40.0})).max() < 4
+    found = matrix(fit.system(fit.plane)).matrix
+    error = jnp.linalg.norm(found / 40 - matrix(true).matrix)
+    assert error < 0.2 * jnp.linalg.norm(matrix(true).matrix)
+
+
+def reconstructed(operator, capture, deviation):
+    recording = tc.Recording(capture[None, None], [operator], noise_variance=deviation**2)
+    return np.squeeze(tc.reconstruct(recording, tc.AdmmTV(0.5, iterations=40)).image)
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("distance", [400.0, 900.0])
+def test_another_distance_without_measuring(distance):
+    """From ghosts at 550 mm, within 1 dB of the matrix of the true screen at 30 dB."""
+    fit = fit_screen(ghosts(0.05), camera(pixels=(55, 55), pitch=38.4 * um), plane())
+    seen = plane(distance, (0.0, 27.0), (32, 32))
+    true = wg.system_operator(camera(**TRUE, pixels=(55, 55), pitch=38.4 * um), seen)
+    image = resize(sample_image("camera"), (32, 32))
+    clean = true(jnp.asarray(image))
+    deviation = float(jnp.sqrt(jnp.mean(clean**2))) * 10**-1.5
+    capture = clean + deviation * jax.random.normal(jax.random.key(0), clean.shape)
+    measured, modelled = (
+        psnr(reconstructed(operator, capture, deviation), image)
+        for operator in (true, fit.system(seen))
+    )
+    assert measured - modelled < 1
+
+
+def test_what_cannot_be_fitted_is_refused():
+    measured = Matrix(np.ones((660, 128)), CELLS, (22, 30))
+    with pytest.raises(ValueError, match="the plane has 16 × 8, but the matrix was measured for 8"):
+        fit_screen(measured, camera(), plane(shape=(16, 8)))
+    with pytest.raises(ValueError, match="the sensor has 30 × 22, but the matrix was measured for"):
+        fit_screen(measured, camera(pixels=(30, 22)), plane())
+    with pytest.raises(ValueError, match="a name in parameters = 'w'"):
+        fit_screen(measured, camera(), plane(), ("w",))
+    with pytest.raises(ValueError, match="give a tuple of different names"):
+        fit_screen(measured, camera(), plane(), ("tilt", "tilt"))
+    few = GhostPositions(np.zeros((1, 2)), np.zeros((1, 2)), np.zeros(1, int), 0.1)
+    with pytest.raises(ValueError, match="2 measured numbers for 6 unknowns: give more ghosts"):
+        fit_screen(few, camera(), plane())
+    late = GhostPositions(np.zeros((1, 2)), np.zeros((1, 2)), np.array([4]), 0.1)
+    with pytest.raises(ValueError, match="a ghost of order 4, but orders = 4"):
+        fit_screen(late, camera(), plane(), ("slant",))
+    with pytest.raises(ValueError, match="orders = .*; give a whole number"):
+        GhostPositions(np.zeros((1, 2)), np.zeros((1, 2)), np.array([0.5]), 0.1)

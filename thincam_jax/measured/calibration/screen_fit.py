@@ -1,0 +1,475 @@
+r"""`fit_screen`: the numbers of a see-through screen from its matrix, or a few of its ghosts.
+
+A matrix holds for the distance at which it was measured. The rays that explain it hold for all.
+"""
+
+from collections.abc import Sequence
+from typing import Literal, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+import scipy
+from jaxtyping import Array, Float, Int
+
+from thincam_jax._core import checks
+from thincam_jax._core.checks import Numbers
+from thincam_jax._core.precision import allow, cast, precision_of
+from thincam_jax.imaging.operators import Matrix, Scaled
+from thincam_jax.measured.calibration.problem import Covariance, covariance
+from thincam_jax.measured.raw import MeasurementError
+from thincam_jax.waveguide import (
+    ObjectPlane,
+    RayStatus,
+    SeeThroughCamera,
+    pixel_centres,
+    system_operator,
+    trace,
+)
+from thincam_jax.waveguide.refractive_index import changed
+
+# What can be fitted, its unit, and a step that is small against what it does to an image.
+PARAMETERS = {
+    "glass_thickness": ("mm", 0.01),
+    "lens_distance": ("mm", 0.1),
+    "focal_distance": ("mm", 0.001),
+    "index": ("", 1e-3),
+    "slant": ("rad", 1e-3),
+    "tilt": ("rad", 1e-3),
+    "shrinkage": ("", 1e-3),
+    "film_thickness": ("mm", 1e-4),
+    "index_modulation": ("", 1e-4),
+    "object_distance": ("mm", 1.0),
+    "object_x": ("mm", 0.1),
+    "object_y": ("mm", 0.1),
+}
+DEFAULT = ("glass_thickness", "lens_distance", "slant", "tilt", "object_x", "object_y")
+Status = Literal["ok", "ambiguous", "poor_fit", "not_converged"]
+
+_PIXELS = 400  # of the sensor whose rows of the matrix are fitted
+_BLURS = (2.0, 0.7, 0.0)  # cells, one after another
+_TOLERANCE = 1e-5  # of steps that change the residual by a tenth, and of the squares
+_EXPLAINED = 0.5  # of the matrix' squares, or it is another camera's
+_UNEXPLAINED = 9.0  # mean squared residual of positions over their variance
+# Of JᵀJ with a unit diagonal. At this smallest eigenvalue two numbers have a correlation of 0.999.
+_AMBIGUOUS = 1e-3
+
+
+class GhostPositions(eqx.Module):
+    """Where pixels see the object: a dot on a monitor, and the pixels that its ghosts light.
+
+    - `pixels`: (x, y) on the sensor, mm from its middle, (ghost, 2).
+    - `points`: of the object, (x, y) mm from its middle, (ghost, 2).
+    - `orders`: of each ghost; 0 is the image.
+    - `deviation`: standard deviation of the points, mm.
+    """
+
+    pixels: Float[Array, "ghost 2"]
+    points: Float[Array, "ghost 2"]
+    orders: Int[Array, " ghost"]
+    deviation: Float[Array, ""]
+
+    def __init__(self, pixels: Numbers, points: Numbers, orders: Numbers, deviation: float | Array):
+        numbers = np.asarray(orders)
+        if numbers.ndim != 1 or numbers.dtype.kind not in "iu" or (numbers < 0).any():
+            raise ValueError(f"orders = {orders!r}; give a whole number from 0 for each ghost")
+        self.pixels = checks.finite("pixels", pixels, "mm", shape=(len(numbers), 2))
+        self.points = checks.finite("points", points, "mm", shape=(len(numbers), 2))
+        self.orders = jnp.asarray(numbers)
+        self.deviation = checks.positive("deviation", deviation, "mm")
+
+
+class ScreenFit(eqx.Module):
+    """What `fit_screen` found.
+
+    - `camera`, `plane`: as given, with the fitted numbers. `gain`: the matrix over the model's.
+    - `values`, `standard_errors`: of what was fitted. The errors are √(σ²(JᵀJ)⁻¹) with the
+      residual's own σ for a matrix, the given one for positions; what the model leaves out is not
+      in them.
+    - `correlation`: of the errors, in the order of `values`.
+    - `explained`: part of the measured squares that the model explains.
+    - `status`: "ok"; "ambiguous", where some numbers cannot be told apart by these data;
+      "poor_fit"; "not_converged". The first that applies, from the last to the first.
+    - `reasons`: one line for each thing that is not as it should be.
+    """
+
+    camera: SeeThroughCamera
+    plane: ObjectPlane
+    gain: Float[Array, ""]
+    values: dict[str, Float[Array, ""]]
+    standard_errors: dict[str, Float[Array, ""]]
+    correlation: Float[Array, "unknown unknown"]
+    explained: Float[Array, ""]
+    status: Status = eqx.field(static=True)
+    reasons: tuple[str, ...] = eqx.field(static=True)
+    orders: int = eqx.field(static=True)
+
+    def system(self, plane: ObjectPlane) -> Scaled:
+        """The matrix for an object at another distance, in the unit of the measured one."""
+        return Scaled(system_operator(self.camera, plane, self.orders), self.gain)
+
+
+class _State(NamedTuple):
+    camera: SeeThroughCamera
+    plane: ObjectPlane
+    gain: Array
+    shrinkage: Array
+
+    def moved(self, names: tuple[str, ...], steps) -> "_State":
+        camera, plane, gain, shrinkage = self
+        for name, step in zip(names, steps, strict=True):
+            if name == "gain":
+                gain = gain + step
+            elif name.startswith("object_"):
+                plane = _moved_plane(plane, name, step)
+            else:
+                camera = _moved_camera(camera, name, step)
+            if name == "shrinkage":
+                shrinkage = shrinkage + (1 - shrinkage) * step
+        return _State(camera, plane, gain, shrinkage)
+
+    def value(self, name: str) -> Array:
+        screen, grating = self.camera.screen, self.camera.screen.hologram.grating
+        colour = jnp.asarray(532e-6, grating.dtype)
+        return {
+            "glass_thickness": lambda: screen.glass_thickness,
+            "lens_distance": lambda: self.camera.lens_distance,
+            "focal_distance": lambda: self.camera.focal_distance,
+            "index": lambda: screen.glass_index(colour),
+            "slant": lambda: jnp.arctan2(jnp.hypot(grating[0], grating[1]), grating[2]),
+            "tilt": lambda: jnp.arctan2(grating[0], -grating[1]),
+            "film_thickness": lambda: screen.hologram.thickness,
+            "index_modulation": lambda: screen.hologram.index_modulation,
+            "object_distance": lambda: self.plane.distance,
+            "object_x": lambda: self.plane.centre[0],
+            "object_y": lambda: self.plane.centre[1],
+            "shrinkage": lambda: self.shrinkage,
+            "gain": lambda: self.gain,
+        }[name]()
+
+
+def _moved_plane(plane: ObjectPlane, name: str, step) -> ObjectPlane:
+    if name == "object_distance":
+        return eqx.tree_at(lambda p: p.distance, plane, plane.distance + step)
+    axis = 0 if name == "object_x" else 1
+    return eqx.tree_at(lambda p: p.centre, plane, plane.centre.at[axis].add(step))
+
+
+def _moved_camera(camera: SeeThroughCamera, name: str, step) -> SeeThroughCamera:
+    hologram, screen = camera.screen.hologram, camera.screen
+    if name == "index":
+        return eqx.tree_at(
+            lambda c: (c.screen.hologram.index, c.screen.glass_index),
+            camera,
+            (changed(hologram.index, step), changed(screen.glass_index, step)),
+        )
+    if name == "shrinkage":
+        return eqx.tree_at(lambda c: c.screen.hologram, camera, hologram.processed(step))
+    if name in ("slant", "tilt"):
+        turned = _turned(hologram.grating, name, step)
+        return eqx.tree_at(lambda c: c.screen.hologram.grating, camera, turned)
+    where = {
+        "glass_thickness": lambda c: c.screen.glass_thickness,
+        "lens_distance": lambda c: c.lens_distance,
+        "focal_distance": lambda c: c.focal_distance,
+        "film_thickness": lambda c: c.screen.hologram.thickness,
+        "index_modulation": lambda c: c.screen.hologram.index_modulation,
+    }[name]
+    return eqx.tree_at(where, camera, where(camera) + step)
+
+
+def _turned(grating: Float[Array, "3"], name: str, angle) -> Float[Array, "3"]:
+    """K with its slant from the film's normal changed, or turned about the normal."""
+    x, y, z = grating
+    cos, sin = jnp.cos(angle), jnp.sin(angle)
+    if name == "tilt":
+        return jnp.stack([cos * x - sin * y, sin * x + cos * y, z])
+    # In the plane of recording, whatever its tilt.
+    across = jnp.sqrt(x**2 + y**2)
+    slanted = cos + sin * z / across
+    return jnp.stack([x * slanted, y * slanted, cos * z - sin * across])
+
+
+class _Problem(NamedTuple):
+    """Measured numbers and where they come from.
+
+    `unit`: of steps. `scale`: one over the residual's unit. `full`: mean weight of a pixel.
+    """
+
+    start: _State
+    measured: Array
+    pixels: Array
+    orders: Array | None
+    unit: Array
+    scale: Array
+    full: Array
+    blur: Array
+
+
+def fit_screen(
+    measured: Matrix | GhostPositions,
+    camera: SeeThroughCamera,
+    plane: ObjectPlane,
+    parameters: Sequence[str] = DEFAULT,
+    *,
+    orders: int = 4,
+    max_steps: int = 60,
+) -> ScreenFit:
+    r"""Fit rays to a measured matrix, or to ghosts' positions, by least squares.
+
+    .. math:: \min \sum_{p, c} \Big[ H_{pc} - G \sum_i \frac{W_i(p)}{\bar W}\,
+        a_{pc}\big(\mathbf P_i(p)\big) \Big]^2
+        \qquad \text{or} \qquad \sum_g \frac{|\mathbf P_{i_g}(p_g) - \mathbf P_g|^2}{\sigma^2}
+
+    with the rays of `trace` and the part a of a pixel's view that lies in a cell. Rows of the
+    matrix are first blurred over the cells, then less and less: from a start whose ghosts are a few
+    cells off. Levenberg-Marquardt (`optimistix`), in double precision, on 400 pixels spread over the
+    sensor.
+
+    **What the data can tell.** At one distance only d1 + d2 acts. Points depend on the fringes'
+    direction, `slant` and `tilt`, not on their period: the two recording angles act by half their
+    difference (the slant), and shrinkage is a slant too, but for its small part in the weights. The
+    film acts on the weights only. `status` and `reasons` name what the data leave open.
+
+    **Arguments**
+
+    - `measured`: H from `recover_matrix`, or `GhostPositions`.
+    - `camera`, `plane`: the start; the plane as it was when H was measured.
+    - `parameters`: of "glass_thickness", "lens_distance", "focal_distance", "index" (of film and
+      glass), "slant" (of the fringes' normal from the plate's), "tilt" (of the plane of recording
+      about the plate's normal), "shrinkage" (further, of the film), "film_thickness",
+      "index_modulation", "object_distance", "object_x", "object_y". The gain of a matrix is always
+      fitted. All others are held.
+    - `orders`: how many ghosts.
+
+    **Errors**: MeasurementError (a ValueError), one line, for a matrix of other sizes than the
+    plane and the sensor, fewer numbers than unknowns, and unknown parameters.
+    """
+    if isinstance(parameters, str) or not parameters or len(set(parameters)) < len(parameters):
+        raise ValueError(f"parameters = {parameters!r}: give a tuple of different names")
+    for name in parameters:
+        checks.choice("a name in parameters", name, PARAMETERS)
+    names, blurs = tuple(parameters), (0.0,)
+    if isinstance(measured, Matrix):
+        _require_sizes(measured, camera, plane)
+        names, blurs = (*names, "gain"), _BLURS
+    precision = precision_of(camera.lens_distance)
+    with allow("float64", camera):
+        start = cast(_State(camera, plane, jnp.ones(()), jnp.zeros(())), "float64")
+        if isinstance(measured, Matrix):
+            problem = _of_matrix(measured, start, orders)
+        else:
+            problem = _of_positions(measured, start, orders)
+        if problem.measured.size <= len(names):
+            raise MeasurementError(
+                f"{problem.measured.size} measured numbers for {len(names)} unknowns: give more "
+                "ghosts, or fewer parameters"
+            )
+        rows, converged = problem.measured, True
+        for blur in blurs:
+            problem = _blurred(problem, rows, blur)
+            problem = _scaled(problem, names, orders)
+            solution = _least_squares(problem, names, orders, max_steps)
+            converged = bool(solution.result == optx.RESULTS.successful)
+            found = problem.start.moved(names, tuple(solution.value * problem.unit))
+            problem = problem._replace(start=found)
+        return cast(_report(problem, names, orders, converged), precision)
+
+
+def _require_sizes(measured: Matrix, camera: SeeThroughCamera, plane: ObjectPlane) -> None:
+    for what, given, wanted in (
+        ("the plane has", plane.shape, measured.in_shape),
+        ("the sensor has", camera.sensor.shape, measured.out_shape),
+    ):
+        if given != wanted:
+            raise MeasurementError(
+                f"{what} {given[0]} × {given[1]}, but the matrix was measured for "
+                f"{' × '.join(map(str, wanted))}; give the plane and the camera of the calibration"
+            )
+
+
+def _of_matrix(measured: Matrix, start: _State, orders: int) -> _Problem:
+    rows, columns = measured.out_shape
+    step = max(1.0, (rows * columns / _PIXELS) ** 0.5)
+    ys, xs = (np.unique(np.arange(step / 2, n, step).astype(int)) for n in (rows, columns))
+    chosen = (ys[:, None] * columns + xs).ravel()
+    kept = jnp.asarray(measured.matrix[chosen], jnp.float64).reshape(-1, *start.plane.shape)
+    pixels = pixel_centres(start.camera)[ys[:, None], xs].reshape(-1, 2)
+    full = _mean_weight(start.camera, start.plane, pixels, orders)
+    if not (full > 0 and jnp.sum(kept**2) > 0):
+        raise MeasurementError(
+            "no ray of the start reaches the object, or the matrix is 0; give another start"
+        )
+    zero = jnp.zeros(())
+    problem = _Problem(start, kept, pixels, None, jnp.ones(1), jnp.ones(()), full, zero)
+    # The gain is linear: what fits best at the start, at the widest blur.
+    problem = _blurred(problem, kept, _BLURS[0])
+    model = _model(start, problem, orders)
+    gain = jnp.sum(model * problem.measured) / jnp.sum(model**2)
+    start = start._replace(gain=jnp.where(gain > 0, gain, 1.0))
+    return problem._replace(start=start, measured=kept)
+
+
+def _of_positions(measured: GhostPositions, start: _State, orders: int) -> _Problem:
+    most = int(measured.orders.max())
+    if most >= orders:
+        raise MeasurementError(f"a ghost of order {most}, but orders = {orders}; give more orders")
+    seen = cast(measured, "float64")
+    one = jnp.ones(())
+    return _Problem(
+        start, seen.points, seen.pixels, seen.orders, one[None], 1 / seen.deviation, one, one
+    )
+
+
+def _blurred(problem: _Problem, rows: Array, blur: float) -> _Problem:
+    """The measured rows with their cells blurred; positions are as they are."""
+    if problem.orders is not None:
+        return problem
+    if blur > 0:
+        rows = jnp.asarray(scipy.ndimage.gaussian_filter(rows, (0, blur, blur), mode="constant"))
+    scale = 1 / jnp.linalg.norm(rows)
+    return problem._replace(measured=rows, blur=jnp.asarray(blur), scale=scale)
+
+
+def _scaled(problem: _Problem, names: tuple[str, ...], orders: int) -> _Problem:
+    """With steps that each change the residual by a tenth of what was measured."""
+    units = jnp.asarray([PARAMETERS[n][1] if n in PARAMETERS else 1.0 for n in names])
+    unscaled = problem._replace(unit=units)
+    lengths = jnp.linalg.norm(_jacobian(unscaled, names, orders), axis=0)
+    size = 0.1 * jnp.linalg.norm(problem.measured * problem.scale)
+    return problem._replace(unit=units * size / jnp.where(lengths > 0, lengths, size))
+
+
+def _residual(steps, args):
+    problem, names, orders = args
+    state = problem.start.moved(names, tuple(steps * problem.unit))
+    return ((_model(state, problem, orders) - problem.measured) * problem.scale).reshape(-1)
+
+
+@eqx.filter_jit
+def _least_squares(problem: _Problem, names: tuple[str, ...], orders: int, max_steps: int):
+    solver = optx.LevenbergMarquardt(rtol=_TOLERANCE, atol=_TOLERANCE)
+    args = (problem, names, orders)
+    none = jnp.zeros_like(problem.unit)
+    options = {"jac": "fwd"}
+    return optx.least_squares(
+        _residual, solver, none, args, options=options, max_steps=max_steps, throw=False
+    )
+
+
+@eqx.filter_jit
+def _jacobian(problem: _Problem, names: tuple[str, ...], orders: int):
+    none = jnp.zeros_like(problem.unit)
+    return jax.jacfwd(_residual)(none, (problem, names, orders))
+
+
+@eqx.filter_jit
+def _model(state: _State, problem: _Problem, orders: int):
+    """The rows of the matrix, (pixel, y, x), or the points from the object's middle."""
+    camera, plane = state.camera, state.plane
+    rays = trace(camera, problem.pixels, plane.distance, orders, None)
+    if problem.orders is not None:
+        place = jnp.arange(problem.pixels.shape[0])
+        return rays.points[problem.orders, place, :2] - plane.centre
+    size = camera.sensor.pitch * (camera.lens_distance + plane.distance) / camera.focal_distance
+    down, across = (
+        _parts(rays.points[..., axis], plane, axis, size, problem.blur) for axis in (1, 0)
+    )
+    weight = state.gain * rays.weight / problem.full
+    return jnp.einsum("op,opy,opx->pyx", weight, down, across)
+
+
+def _parts(points, plane: ObjectPlane, axis: int, size, blur):
+    """What part of an interval of that size about each point lies in each cell of an axis.
+
+    The second difference of F(u) = ∫ Φ(v/σ) dv with the normal distribution Φ, max(u, 0) for σ = 0.
+    """
+    number = plane.shape[1 - axis]
+    low = (points - size / 2 - plane.centre[axis]) / plane.pitch + number / 2
+    edges = jnp.arange(number + 1, dtype=low.dtype)
+    wide = jnp.where(blur > 0, blur, 1.0)
+
+    def ramp(u):
+        smooth = u * jax.scipy.stats.norm.cdf(u / wide) + wide * jax.scipy.stats.norm.pdf(u / wide)
+        return jnp.where(blur > 0, smooth, jnp.maximum(u, 0))
+
+    relative = edges - low[..., None]
+    left = ramp(relative) - ramp(relative - size / plane.pitch)
+    return jnp.diff(left, axis=-1) * plane.pitch / size
+
+
+def _mean_weight(camera: SeeThroughCamera, plane: ObjectPlane, pixels, orders: int):
+    """Of a pixel's ghosts together, as `system_operator` takes it for 1."""
+    rays = trace(camera, pixels, plane.distance, orders, None)
+    sound = rays.status == RayStatus.OK
+    return jnp.mean(jnp.sum(jnp.where(sound, rays.weight, 0), axis=0))
+
+
+def _report(problem: _Problem, names, orders: int, converged: bool) -> ScreenFit:
+    found = problem.start
+    none = jnp.zeros_like(problem.unit)
+    residual = np.asarray(_residual(none, (problem, names, orders)))
+    slopes, squares = np.asarray(_jacobian(problem, names, orders)), float(residual @ residual)
+    curvature = slopes.T @ slopes
+    explained = 1 - squares / float(jnp.sum((problem.measured * problem.scale) ** 2))
+    of_matrix = problem.orders is None
+    mean = squares / (residual.size - len(names))
+    known: Covariance = covariance(curvature, mean if of_matrix else 1.0)
+    errors = known.standard_errors * np.asarray(problem.unit)
+    gain = found.gain
+    if of_matrix:
+        everywhere = _mean_weight(found.camera, found.plane, pixel_centres(found.camera), orders)
+        gain, errors[-1] = (float(everywhere / problem.full) * v for v in (gain, errors[-1]))
+    sound = explained >= _EXPLAINED if of_matrix else mean <= _UNEXPLAINED
+    status, reasons = _status(converged, sound, _alike(names, curvature), explained)
+    values = {n: jnp.asarray(found.value(n)) for n in names} | ({"gain": gain} if of_matrix else {})
+    return ScreenFit(
+        found.camera,
+        found.plane,
+        jnp.asarray(gain),
+        values,
+        {n: jnp.asarray(e) for n, e in zip(names, errors, strict=True)},
+        jnp.asarray(known.correlation),
+        jnp.asarray(explained),
+        status,
+        reasons,
+        orders,
+    )
+
+
+def _alike(names: tuple[str, ...], curvature: np.ndarray) -> list[str]:
+    """One line for each combination of numbers that the data hardly see, the worst first."""
+    norm = np.sqrt(np.diag(curvature))
+    unseen = [names[index] for index in np.flatnonzero(norm == 0)]
+    lines = [f"these data do not see {name} at all; hold it" for name in unseen]
+    norm = np.where(norm > 0, norm, 1.0)
+    strengths, vectors = np.linalg.eigh(curvature / np.outer(norm, norm) + np.diag(norm == 0))
+    for strength, vector in zip(strengths, vectors.T, strict=True):
+        if strength < _AMBIGUOUS:
+            together = [n for n, v in zip(names, vector, strict=True) if abs(v) > 0.2]
+            lines.append(
+                f"{', '.join(together[:-1])} and {together[-1]} cannot be told apart by these "
+                f"data: together their errors are {max(strength, 1e-15) ** -0.5:.0f} times those "
+                "of each alone; hold one of them"
+            )
+    return lines
+
+
+def _status(
+    converged: bool, sound: bool, alike: list[str], explained: float
+) -> tuple[Status, tuple[str, ...]]:
+    status: Status = "ambiguous" if alike else "ok"
+    reasons = list(alike)
+    if not sound:
+        status = "poor_fit"
+        reasons.insert(
+            0,
+            f"the model explains {max(0.0, explained):.1%} of what was measured, too little for "
+            "its noise: it is another camera, or further from the start than a few cells",
+        )
+    if not converged:
+        status = "not_converged"
+        reasons.insert(0, "least squares did not converge; try max_steps, or fewer parameters")
+    return status, tuple(reasons)
