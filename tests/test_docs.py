@@ -175,3 +175,12 @@ def test_screen_page():
     names = run_examples("docs/screen.md")
     np.testing.assert_allclose(names["rays"].wavelength / 1e-6, [532, 564.729], atol=1e-3)
     assert names["result"].image.shape[-2:] == (64, 64)
+
+
+def test_screen_calibration_page(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    names = run_examples("docs/screen_calibration.md")
+    fit = names["fit"]
+    error = fit.values["glass_thickness"] - 5.0
+    assert abs(float(error)) < 4 * float(fit.standard_errors["glass_thickness"])
+    assert fit.status == "ok"

@@ -225,8 +225,8 @@ def fit_screen(
 
     with the rays of `trace` and the part a of a pixel's view that lies in a cell. Rows of the
     matrix are first blurred over the cells, then less and less: from a start whose ghosts are a few
-    cells off. Levenberg-Marquardt (`optimistix`), in double precision, on 400 pixels spread over the
-    sensor.
+    cells off. Levenberg-Marquardt (`optimistix`), in double precision, on 400 pixels spread over
+    the sensor.
 
     **What the data can tell.** At one distance only d1 + d2 acts. Points depend on the fringes'
     direction, `slant` and `tilt`, not on their period: the two recording angles act by half their
