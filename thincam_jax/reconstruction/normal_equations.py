@@ -1,7 +1,8 @@
 r"""Solving :math:`(\sum_k A_k^T w_k A_k + \mu)\, z = b` by the structure of the operators.
 
 Dense: the Gram matrix once, a Cholesky factorisation for each μ. One separable pair with one
-weight: two small eigendecompositions, once. All else: conjugate gradients (`lineax.CG`).
+weight: two small eigendecompositions, once; a `ReducedMatrix` brings its own. All else: conjugate
+gradients (`lineax.CG`).
 
 Factorisations are not differentiated: derivatives follow from the equation itself
 (`jax.lax.custom_linear_solve`), so that equal eigenvalues do no harm.
@@ -19,8 +20,15 @@ import optimistix
 from jaxtyping import Array, Float
 
 from thincam_jax._core.precision import product
-from thincam_jax.imaging.operators import AbstractOperator, Matrix, Scaled, Separable
+from thincam_jax.imaging.operators import (
+    AbstractOperator,
+    Matrix,
+    ReducedMatrix,
+    Scaled,
+    Separable,
+)
 from thincam_jax.imaging.operators.crop_convolution import cut, place
+from thincam_jax.imaging.operators.reduced import each_times
 from thincam_jax.reconstruction.problem import (
     InverseProblem,
     back_projected,
@@ -67,8 +75,11 @@ def normal_equations(problem: InverseProblem, shift: Float[Array, ""]) -> Abstra
     bare = [_bare(o) for o in fixed.operators]
     if all(same) and all(isinstance(o, Matrix) for o in bare):
         return DenseNormal(problem, shift, _gram(fixed))
-    if len(bare) == 1 and isinstance(bare[0], Separable) and fixed.weights[0].size == 1:
-        return SeparableNormal(problem, shift, *_modes(fixed))
+    if len(bare) == 1 and fixed.weights[0].size == 1:
+        if isinstance(bare[0], Separable):
+            return SeparableNormal(problem, shift, *_modes(fixed))
+        if isinstance(bare[0], ReducedMatrix):
+            return ReducedNormal(problem, shift)
     return IterativeNormal(problem, shift)
 
 
@@ -108,6 +119,25 @@ class SeparableNormal(AbstractNormal):
 
     def shifted(self, shift):
         return eqx.tree_at(lambda n: n.shift, self, shift)
+
+
+class ReducedNormal(AbstractNormal):
+    """By the eigenvectors that a reduced matrix has, whatever μ."""
+
+    problem: InverseProblem
+    shift: Float[Array, ""]
+
+    def solve(self, right):
+        fixed, shift = jax.lax.stop_gradient((self.problem, self.shift))
+        (operator,), (weight,) = fixed.operators, fixed.weights
+        bare = _bare(operator)
+        assert isinstance(bare, ReducedMatrix)
+        power = weight.reshape(()) * (_gain(operator) * bare.values) ** 2
+        modes = bare.modes(right.reshape(-1, bare.values.size)) / (power + shift)
+        return each_times(bare.vectors, modes).reshape(right.shape)
+
+    def shifted(self, shift):
+        return ReducedNormal(self.problem, shift)
 
 
 class IterativeNormal(AbstractNormal):

@@ -253,7 +253,8 @@ class Recording(eqx.Module):
         ]
 
     def _estimated(self, captures, valid) -> Float[Array, " capture"]:
-        if isinstance(self.seen_by, Stacked) and any(c.ndim < 2 for c in captures):
+        seen_by = self.seen_by
+        if isinstance(seen_by, Stacked) and any(len(s) < 2 for s in shapes_of(seen_by.out_shape)):
             raise ValueError("give noise_variance: captures that are no images do not show it")
         return estimate_variance(captures, None if valid[0] is None else valid)
 

@@ -104,7 +104,12 @@ def _times(operator: AbstractOperator, factor) -> AbstractOperator:
 def _norm(problem: InverseProblem) -> Float[Array, ""]:
     """‖√w A‖ with its margin, by the power method, at most what the spectra allow."""
     dtype = problem.captures[0].dtype
-    found = MARGIN * Seen(problem).norm(iterations=POWER_ITERATIONS, dtype=dtype)
+    (first, *others), (weight, *_) = problem.operators, problem.weights
+    if not others and weight.size == 1:  # of one image, and of an operator that may know it
+        found = jnp.sqrt(weight.reshape(())) * first.norm(iterations=POWER_ITERATIONS, dtype=dtype)
+    else:
+        found = Seen(problem).norm(iterations=POWER_ITERATIONS, dtype=dtype)
+    found = MARGIN * found
     operators = convolutions(problem)
     if operators is None:
         return or_one(found)

@@ -9,6 +9,7 @@ from thincam_jax.imaging.operators.crop_convolution import window_shape as windo
 from thincam_jax.imaging.operators.masked import Masked as Masked
 from thincam_jax.imaging.operators.masked import Scaled as Scaled
 from thincam_jax.imaging.operators.matrix import Matrix as Matrix
+from thincam_jax.imaging.operators.reduced import ReducedMatrix as ReducedMatrix
 from thincam_jax.imaging.operators.separable import Separable as Separable
 from thincam_jax.imaging.operators.sparse import Sparse as Sparse
 from thincam_jax.imaging.operators.stacked import Stacked as Stacked
