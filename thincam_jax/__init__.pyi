@@ -34,6 +34,7 @@ from .reconstruction import PsfCheck as PsfCheck
 from .reconstruction import Psfs as Psfs
 from .reconstruction import Recording as Recording
 from .reconstruction import Ridge as Ridge
+from .reconstruction import Stream as Stream
 from .reconstruction import TotalVariation as TotalVariation
 from .reconstruction import Wiener as Wiener
 from .reconstruction import check_psf as check_psf

@@ -23,6 +23,7 @@ from thincam_jax.reconstruction.seen_by import Cameras as Cameras
 from thincam_jax.reconstruction.seen_by import Psfs as Psfs
 from thincam_jax.reconstruction.solver import AbstractSolver as AbstractSolver
 from thincam_jax.reconstruction.solver import Reconstruction as Reconstruction
+from thincam_jax.reconstruction.stream import Stream as Stream
 from thincam_jax.reconstruction.synthesis import contrasts as contrasts
 from thincam_jax.reconstruction.synthesis import fringe_scanning as fringe_scanning
 from thincam_jax.reconstruction.synthesis import phase_pairs as phase_pairs

@@ -37,12 +37,14 @@ class DirectSplitting(AbstractSplitting):
     tau: Float[Array, ""]
     variation: TotalVariation
     image_unit: Float[Array, ""]
+    capture_unit: Float[Array, ""]
     penalties: Penalties
     nonnegative: bool = eqx.field(static=True)
 
     def __init__(self, problem: InverseProblem, variation: TotalVariation):
         scaled = ScaledProblem(problem)
         self.problem, self.image_unit = scaled.problem, scaled.image_unit
+        self.capture_unit = scaled.capture_unit
         self.pulled = back_projected(self.problem, self.problem.captures)
         self.tau = self.problem.absolute_tau
         self.variation, self.nonnegative = variation, problem.nonnegative
@@ -52,9 +54,16 @@ class DirectSplitting(AbstractSplitting):
         self.penalties = Penalties(0.1 * one, 0.1 * one, 0.1 * one)
         self.normal = normal_equations(self.problem, self.penalties.data)
 
+    def with_captures(self, captures):
+        pulled = back_projected(self.problem, [c / self.capture_unit for c in captures])
+        return eqx.tree_at(lambda s: s.pulled, self, pulled)
+
     def with_penalties(self, penalties):
         normal = self.normal.shifted(penalties.data)
         return eqx.tree_at(lambda s: (s.penalties, s.normal), self, (penalties, normal))
+
+    def settled(self):
+        return eqx.tree_at(lambda s: s.normal, self, self.normal.settled())
 
     def start(self, image):
         return self._images(image / self.image_unit)

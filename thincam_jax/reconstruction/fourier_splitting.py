@@ -62,6 +62,10 @@ class FourierSplitting(AbstractSplitting):
         self.variation, self.nonnegative = variation, problem.nonnegative
         self.penalties = _default_penalties(self.operators, self.gains)
 
+    def with_captures(self, captures):
+        scaled = tuple(g / self.image_unit * c for g, c in zip(self.gains, captures, strict=True))
+        return eqx.tree_at(lambda s: s.captures, self, scaled)
+
     def start(self, image):
         operator = self.operators[0]
         field = place(image / self.image_unit, operator.field_corner, operator.window)

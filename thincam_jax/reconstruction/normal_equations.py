@@ -56,6 +56,10 @@ class AbstractNormal(eqx.Module):
     def shifted(self, shift: Float[Array, ""]) -> "AbstractNormal":
         """The same with another μ; what does not depend on it is kept."""
 
+    def settled(self) -> "AbstractNormal":
+        """The same where μ stays for hundreds of solutions."""
+        return self
+
     def __call__(self, right, guess):
         """z of b, differentiable; `guess` is what an iterative solution begins with."""
         del guess
@@ -128,16 +132,40 @@ class ReducedNormal(AbstractNormal):
     shift: Float[Array, ""]
 
     def solve(self, right):
-        fixed, shift = jax.lax.stop_gradient((self.problem, self.shift))
-        (operator,), (weight,) = fixed.operators, fixed.weights
-        bare = _bare(operator)
-        assert isinstance(bare, ReducedMatrix)
-        power = weight.reshape(()) * (_gain(operator) * bare.values) ** 2
-        modes = bare.modes(right.reshape(-1, bare.values.size)) / (power + shift)
+        bare, power = self._powers()
+        modes = bare.modes(right.reshape(-1, bare.values.size)) / power
         return each_times(bare.vectors, modes).reshape(right.shape)
 
     def shifted(self, shift):
         return ReducedNormal(self.problem, shift)
+
+    def settled(self):
+        bare, power = self._powers()
+        inverse = product(bare.vectors / power, bare.transposed)
+        return InverseNormal(self.problem, self.shift, inverse)
+
+    def _powers(self):
+        """The operator, and the eigenvalues of the whole, μ included."""
+        fixed, shift = jax.lax.stop_gradient((self.problem, self.shift))
+        (operator,), (weight,) = fixed.operators, fixed.weights
+        bare = _bare(operator)
+        assert isinstance(bare, ReducedMatrix)
+        return bare, weight.reshape(()) * (_gain(operator) * bare.values) ** 2 + shift
+
+
+class InverseNormal(AbstractNormal):
+    """By the inverse matrix itself: one product a solution."""
+
+    problem: InverseProblem
+    shift: Float[Array, ""]
+    inverse: Float[Array, "n n"]
+
+    def solve(self, right):
+        flat = right.reshape(-1, self.inverse.shape[0])
+        return each_times(jax.lax.stop_gradient(self.inverse), flat).reshape(right.shape)
+
+    def shifted(self, shift):
+        return normal_equations(self.problem, shift)
 
 
 class IterativeNormal(AbstractNormal):

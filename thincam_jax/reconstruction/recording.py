@@ -208,8 +208,7 @@ class Recording(eqx.Module):
         """Whether the captures have an axis before those of the detector."""
         if isinstance(self.seen_by, Stacked):
             shape = shapes_of(self.seen_by.out_shape)[0]
-            own = len(shape) - _channels(self.seen_by.operators[0])
-            return self.captures[0].ndim > own
+            return self.captures[0].ndim > len(shape) - _channels(self.seen_by.operators[0])
         return self.captures[0].ndim > 2
 
     def _masks(self, valid: Any) -> tuple[Array, ...]:
@@ -242,15 +241,14 @@ class Recording(eqx.Module):
         if self.noise_variance is None:
             each = self._estimated(captures, valid)
             return [jnp.sum(square * each) for square in squares]
-        given = given_variances(self.noise_variance, captures)
-        totals = [jnp.sum(square * given) for square in squares]
-        if all(not checks.is_traced(total) and bool(total > 0) for total in totals):
+        with jax.ensure_compile_time_eval():  # a variance that is known stays so under jit
+            given = given_variances(self.noise_variance, captures)
+            totals = [jnp.sum(jnp.asarray(row**2, given.dtype) * given) for row in matrix]
+        if all(not checks.is_traced(total) and float(total) > 0 for total in totals):
             return totals
         each = self._estimated(captures, valid)
-        return [
-            jnp.where(total > 0, total, jnp.sum(square * each))
-            for total, square in zip(totals, squares, strict=True)
-        ]
+        pairs = zip(totals, squares, strict=True)
+        return [jnp.where(t > 0, t, jnp.sum(s * each)) for t, s in pairs]
 
     def _estimated(self, captures, valid) -> Float[Array, " capture"]:
         seen_by = self.seen_by

@@ -43,19 +43,21 @@ class ScaledProblem(eqx.Module):
     that of a regulariser with R(sf) = sR(f), as every norm is. Scaling by powers of the units
     makes iterations see the same numbers whatever the units of captures, pixels and weights.
 
-    - `image_unit`: an image of `problem` times this is one of the problem given.
+    - `image_unit`: an image of `problem` times this is one of the problem given; `capture_unit`:
+      the same of captures.
     - `curvature`: L of the problem given, with its margin.
     """
 
     problem: InverseProblem
     image_unit: Float[Array, ""]
+    capture_unit: Float[Array, ""]
     curvature: Float[Array, ""]
 
     def __init__(self, problem: InverseProblem):
         # A minimiser does not depend on the units it is sought in, nor its derivatives on theirs.
         operator_unit, captured, heaviest = _units(jax.lax.stop_gradient(problem))
         self.problem = _divided(problem, operator_unit, captured, heaviest)
-        self.image_unit = captured / operator_unit
+        self.image_unit, self.capture_unit = captured / operator_unit, captured
         self.curvature = heaviest * operator_unit**2
 
 

@@ -77,9 +77,17 @@ class AbstractSplitting(eqx.Module):
     def nearest(self, target: State) -> State:
         """K f of the f whose K f is nearest to the target in the norm of the penalties."""
 
+    @abc.abstractmethod
+    def with_captures(self: Some, captures: tuple[Float[Array, "..."], ...]) -> Some:
+        """The same splitting, units included, of other captures g."""
+
     def with_penalties(self: Some, penalties: Penalties) -> Some:
         """The same splitting with other penalties."""
         return eqx.tree_at(lambda s: s.penalties, self, penalties)
+
+    def settled(self: Some) -> Some:
+        """The same where penalties stay for hundreds of iterations."""
+        return self
 
 
 def admm_map(state: State, splitting: AbstractSplitting) -> State:

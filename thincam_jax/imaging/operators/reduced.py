@@ -120,8 +120,11 @@ class ReducedMatrix(AbstractOperator):
 
         **Errors**: ValueError, one line, for other numbers of pixels or columns.
         """
-        rows = _rows(matrix)
-        count, columns = rows.shape
+        if isinstance(matrix, AbstractOperator):
+            rows, (count, columns) = matrix, map(math.prod, (matrix.out_shape, matrix.in_shape))
+        else:
+            rows = _rows(matrix)
+            count, columns = rows.shape
         if columns != self.values.size:
             raise ValueError(
                 f"the matrix has {columns} columns and was reduced from {self.values.size}; give "
@@ -219,6 +222,9 @@ def _gram(rows: Any) -> Float[Array, "n n"]:
 
 def _pulled(rows: Any, flat: Float[Array, "batch i"]) -> Float[Array, "batch n"]:
     """Hᵀg of each capture."""
+    if isinstance(rows, AbstractOperator):
+        shape = rows.out_shape
+        return rows.adjoint(flat.reshape(-1, *shape)).reshape(len(flat), -1)
     if scipy.sparse.issparse(rows):
         return jnp.asarray((rows.T @ np.asarray(flat).T).T, flat.dtype)
     total = jnp.zeros((len(flat), rows.shape[1]), flat.dtype)

@@ -1,0 +1,60 @@
+"""Captures that follow one another."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from reconstruction import scenes
+
+import thincam_jax as tc
+from helpers import relative_l2
+from thincam_jax.imaging.operators import (
+    CropConvolution,
+    Masked,
+    Matrix,
+    ReducedMatrix,
+    kernel_shape,
+)
+
+FIELD, SENSOR = (9, 12), (14, 17)
+RNG = np.random.default_rng(3)
+
+
+def reduced():
+    return ReducedMatrix.of(RNG.normal(size=(238, 108)), FIELD)
+
+
+def masked():
+    kernel = scenes.spots(kernel_shape(SENSOR, FIELD))
+    crop = CropConvolution(jnp.asarray(kernel), 0.5, SENSOR, FIELD)
+    return Masked(crop, RNG.random(SENSOR) > 0.1)
+
+
+@pytest.mark.parametrize("system", [reduced, masked])
+def test_an_object_that_stands_still_is_reconstructed(system):
+    """After another one, to the image that the solver alone finds; in the captures' unit."""
+    system = system()
+    shown, later = (jnp.asarray(scenes.blocks(FIELD)[:, ::k]) for k in (1, -1))
+    solver = tc.AdmmTV(1.0, iterations=60)
+    noise = 0.01 * float(jnp.std(system(shown)))
+    recording = tc.Recording(system(shown), system, noise_variance=noise**2)
+    stream = tc.Stream(recording, solver, steps=4)
+    with pytest.raises(ValueError, match=r"captures have shapes .* the first recording's"):
+        stream.next(jnp.ones((3, 5)))
+    capture = 3 * system(later)
+    for _ in range(60):
+        stream, image = stream.next(capture)
+    assert image.shape == FIELD
+    alone = tc.reconstruct(
+        tc.Recording(capture, system, noise_variance=noise**2),
+        tc.AdmmTV(1.0, iterations=400, tolerance=1e-8),
+    )
+    assert relative_l2(image, alone.image) < 1e-3
+
+
+def test_bad_input():
+    system = Matrix(RNG.normal(size=(30, 20)), (4, 5), (5, 6))
+    recording = tc.Recording(jnp.ones((5, 6)), system, noise_variance=1.0)
+    with pytest.raises(ValueError, match="steps = 0; give a whole number of at least 1"):
+        tc.Stream(recording, tc.AdmmTV(1.0), steps=0)
+    with pytest.raises(ValueError, match="tau = 'sure' is found for one capture; give a number"):
+        tc.Stream(recording, tc.AdmmTV("sure"))

@@ -1,0 +1,98 @@
+"""Moving objects: captures that follow one another, each from where the one before has come to."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from thincam_jax.reconstruction.admm import RELAXATION, AdmmMethod
+from thincam_jax.reconstruction.drive import CHUNK, Outcome
+from thincam_jax.reconstruction.problem import InverseProblem
+from thincam_jax.reconstruction.recording import Recording
+from thincam_jax.reconstruction.regularised import AdmmTV
+from thincam_jax.reconstruction.splitting import State, admm_map
+
+
+class Stream(eqx.Module):
+    r"""ADMM-TV of one capture after the other, a few iterations each, image and forces kept.
+
+    .. math:: q_t = T^m(q_{t-1};\, g_t)
+
+    with T of `thincam_jax.reconstruction.splitting`. An object that stands still is reconstructed
+    to convergence, one that moves to what m iterations reach::
+
+        stream = tc.Stream(recording, tc.AdmmTV(0.5), steps=4)   # of the first capture
+        stream, image = stream.next(captures)                    # of each that follows
+
+    Units, penalties and weights stay those of the first recording: the scene may change, the
+    camera and the noise may not.
+
+    **Arguments**
+
+    - `recording`: of the first capture.
+    - `solver`: τ a number; its iterations are spent on the first capture.
+    - `steps`: m, iterations for each that follows.
+
+    **Errors**: ValueError, one line, for steps below 1, a τ to be found, or captures of another
+    shape than the first.
+    """
+
+    recording: Recording
+    solver: AdmmTV
+    method: AdmmMethod
+    state: State
+    steps: int = eqx.field(static=True)
+
+    def __init__(self, recording: Recording, solver: AdmmTV, *, steps: int = 4):
+        if isinstance(steps, bool) or not isinstance(steps, int) or steps < 1:
+            raise ValueError(f"steps = {steps}; give a whole number of at least 1")
+        if isinstance(solver.tau, str):
+            raise ValueError(f"tau = {solver.tau!r} is found for one capture; give a number")
+        self.recording, self.solver, self.steps = recording, solver, steps
+        problem = _posed(recording, solver)
+        method: Any = AdmmMethod(problem)
+        running = method.start(jnp.zeros(problem.image_shape, problem.captures[0].dtype))
+        for done in range(CHUNK, solver.iterations + CHUNK, CHUNK):
+            running = method.advance(running, CHUNK)
+            if done <= solver.iterations // 2:
+                method, running = method.adapt(running, method.residuals(running))
+        self.method = eqx.tree_at(lambda m: m.arguments, method, method.arguments.settled())
+        self.state = running.value
+
+    def next(self, captures: Any) -> tuple["Stream", Float[Array, "*batch y x"]]:
+        """The stream after captures like those of the first recording, and their image."""
+        wanted = [c.shape for c in self.recording.captures]
+        given = captures if len(wanted) > 1 or jnp.shape(captures) != wanted[0] else [captures]
+        if [jnp.shape(c) for c in given] != wanted:
+            raise ValueError(
+                f"captures have shapes {[jnp.shape(c) for c in given]}, the first recording's "
+                f"{wanted}; give captures of the same camera, or begin another stream"
+            )
+        state, image = _next(self, tuple(jnp.asarray(c) for c in given))
+        return eqx.tree_at(lambda s: s.state, self, state), image
+
+
+def _posed(recording: Recording, solver: AdmmTV) -> InverseProblem:
+    return recording.problem(
+        tau=solver.tau,
+        regulariser=solver.prior,
+        nonnegative=solver.nonnegative,
+        synthesis=solver.synthesis,
+    )
+
+
+@eqx.filter_jit
+def _next(stream: Stream, captures: tuple[Array, ...]):
+    first, method, state = stream.recording, stream.method, stream.state
+    seen = Recording(
+        captures, first.seen_by, noise_variance=first.noise_variance, valid=first.valid
+    )
+    problem = _posed(seen, stream.solver)
+    splitting = method.arguments.with_captures(problem.captures)
+    for _ in range(stream.steps):
+        mapped = admm_map(state, splitting)
+        state = jax.tree.map(lambda q, t: q + RELAXATION * (t - q), state, mapped)
+    outcome = Outcome(splitting.image(state), "stopped", (), stream.steps, 0.0)
+    return state, first.reconstruction(problem, outcome, stream.solver.name).image
