@@ -184,3 +184,10 @@ def test_screen_calibration_page(tmp_path, monkeypatch):
     error = fit.values["glass_thickness"] - 5.0
     assert abs(float(error)) < 4 * float(fit.standard_errors["glass_thickness"])
     assert fit.status == "ok"
+
+
+@pytest.mark.thorough
+def test_screen_reconstruction_page():
+    """A uniform scene comes back, by the solver and by the stream."""
+    names = run_examples("docs/screen_reconstruction.md")
+    np.testing.assert_allclose(names["image"], 1, atol=0.02)
