@@ -1,0 +1,103 @@
+"""A dense measured matrix: ADMM-TV on what it is reduced to, against CG inner solves in SciPy.
+
+Both minimise ½‖Hf − g‖² + τ TV(f), f ≥ 0, by as many iterations from zero. `THINCAM_DENSE=full`
+takes the 193600 × 4096 numbers of a real calibration (3.2 GB, minutes); by default 1/149 of them.
+"""
+
+import os
+import time
+
+import jax.numpy as jnp
+import numpy as np
+import scipy.sparse
+import scipy.sparse.linalg
+
+import thincam_jax as tc
+from thincam_jax.imaging.operators import ReducedMatrix
+from thincam_jax.reconstruction.problem import objective
+
+PIXELS, CELLS = (440, 64) if os.environ.get("THINCAM_DENSE") == "full" else (96, 24)
+ITERATIONS = 50
+
+
+def test_fifty_iterations_against_scipy(capsys):
+    """In one run on one machine: seconds, their ratio, and the objectives that are reached."""
+    rng = np.random.default_rng(0)
+    matrix = rng.random((PIXELS**2, CELLS**2), dtype=np.float32) ** 8 / CELLS
+    scene = np.zeros((CELLS, CELLS), np.float32)
+    scene[CELLS // 4 : CELLS // 2, CELLS // 3 : -4] = 1
+    capture = matrix @ scene.ravel()
+    noise = np.float32(0.03 * capture.std())
+    capture += noise * rng.standard_normal(capture.shape, dtype=np.float32)
+
+    began = time.perf_counter()
+    system = ReducedMatrix.of(matrix, scene.shape)
+    system.vectors.block_until_ready()
+    once = time.perf_counter() - began
+    projected = system.project(matrix, capture)
+    recording = tc.Recording(projected, system, noise_variance=float(noise**2))
+    solver = tc.AdmmTV(1.0, iterations=ITERATIONS, tolerance=0.0)
+    ours = [timed(lambda: tc.reconstruct(recording, solver).image) for _ in range(3)][-1]
+    six = tc.Recording(jnp.stack([projected] * 6), system, noise_variance=float(noise**2))
+    batch = [timed(lambda: tc.reconstruct(six, solver).image) for _ in range(3)][-1]
+
+    problem = recording.problem(tau=1.0)
+    tau = float(problem.absolute_tau) * float(noise) ** 2
+    theirs = timed(lambda: scipy_admm(matrix, capture, scene.shape, tau))
+    found = [
+        float(objective(problem, jnp.asarray(i, jnp.float32).reshape(problem.image_shape)))
+        for i in (ours[1], theirs[1])
+    ]
+    with capsys.disabled():
+        print(f"\n{PIXELS**2} × {CELLS**2}: reduced in {once:.1f} s, once; {ITERATIONS} iterations")
+        print(f"  one image {ours[0]:.3f} s, six {batch[0]:.3f} s")
+        print(f"  scipy with CG {theirs[0]:.2f} s, {theirs[0] / ours[0]:.0f} times as long")
+        print(f"  objective {found[0]:.6g}, scipy's {found[1]:.6g}")
+    assert found[0] < 1.01 * found[1]
+
+
+def timed(function):
+    began = time.perf_counter()
+    result = np.asarray(function())
+    return time.perf_counter() - began, result
+
+
+def scipy_admm(matrix, capture, shape, tau):
+    """ADMM with (HᵀH + μ(DᵀD + 1)) f = Hᵀg + μ(Dᵀ(u − λ) + v − κ) by conjugate gradients."""
+    down, right = (
+        scipy.sparse.diags_array([-np.ones(n), np.ones(n - 1)], offsets=[0, 1]).tolil()
+        for n in shape
+    )
+    down[-1, -1] = right[-1, -1] = 0
+    eyes = [scipy.sparse.eye_array(n) for n in shape]
+    differences = scipy.sparse.vstack(
+        [scipy.sparse.kron(down, eyes[1]), scipy.sparse.kron(eyes[0], right)]
+    ).astype(np.float32)
+    differences = scipy.sparse.csr_array(differences)
+    size = matrix.shape[1]
+    vector = np.ones(size, np.float32)
+    for _ in range(20):
+        vector = matrix.T @ (matrix @ vector)
+        largest = np.linalg.norm(vector)
+        vector /= largest
+    penalty = np.float32(0.01 * largest)
+    operator = scipy.sparse.linalg.LinearOperator(
+        (size, size),
+        lambda f: matrix.T @ (matrix @ f) + penalty * (differences.T @ (differences @ f) + f),
+        dtype=np.float32,
+    )
+    pulled = matrix.T @ capture
+    image, sign = np.zeros(size, np.float32), np.zeros(size, np.float32)
+    slopes, force = (np.zeros(2 * size, np.float32) for _ in range(2))
+    allowed = image
+    for _ in range(ITERATIONS):
+        right_side = pulled + penalty * (differences.T @ (slopes - force) + allowed - sign)
+        image, _ = scipy.sparse.linalg.cg(operator, right_side, image, rtol=1e-4, maxiter=30)
+        changes = differences @ image
+        pairs = (changes + force).reshape(2, -1)
+        length = np.maximum(np.linalg.norm(pairs, axis=0), 1e-30)
+        slopes = (pairs * np.maximum(0, 1 - tau / penalty / length)).ravel()
+        force = force + changes - slopes
+        allowed = np.maximum(image + sign, 0)
+        sign = sign + image - allowed
+    return allowed
