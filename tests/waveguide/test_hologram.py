@@ -8,7 +8,7 @@ from waveguide.setting import RECORDED, hologram
 
 from thincam_jax import waveguide as wg
 from thincam_jax.units import deg, nm
-from thincam_jax.waveguide.efficiency import directions
+from thincam_jax.waveguide.hologram import directions
 
 
 def cosines(count=300):

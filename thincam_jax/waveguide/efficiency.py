@@ -21,7 +21,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
-from thincam_jax.waveguide.hologram import VolumeHologram
+from thincam_jax.waveguide.hologram import VolumeHologram, directions
 
 Polarisation = Literal["TE", "TM"]
 
@@ -54,6 +54,16 @@ def ghost_weights(
     """
     checks.at_least_one({"orders": orders})
     centre, found = hologram.bragg_wavelength(tangential)
+    return jnp.where(found, weights_about(hologram, tangential, centre, orders), 0.0)
+
+
+def weights_about(
+    hologram: VolumeHologram,
+    tangential: Float[Array, "*ray 2"],
+    centre: Float[Array, "*ray"],
+    orders: int,
+) -> Float[Array, "order *ray"]:
+    """`ghost_weights` of rays whose Bragg wavelength is known."""
     slope = _detuning_slope(hologram, tangential, centre)
     step = math.pi / (4 + orders)
     count = round(10 * math.pi / step)
@@ -65,8 +75,7 @@ def ghost_weights(
         eta = _efficiency(*_coupling(hologram, tangential[..., None, :], wavelengths, polarisation))
         left = jnp.stack([eta**2 * (1 - eta) ** i for i in range(orders)])
         sums.append(jnp.sum(left, axis=-1))
-    mean = (sums[0] + sums[1]) / 2 * step / jnp.abs(slope)
-    return jnp.where(found, mean, 0.0)
+    return (sums[0] + sums[1]) / 2 * step / jnp.abs(slope)
 
 
 def _coupling(hologram, tangential, wavelength, polarisation):
@@ -111,12 +120,3 @@ def _efficiency(strength, detuning, reflected):
     ratio = jnp.where(small, 1 + x / 6, ratio)
     coupled = strength**2 * ratio**2
     return jnp.where(reflected, coupled / (1 + coupled), 0.0)
-
-
-def directions(
-    tangential: Float[Array, "*ray 2"], index: Float[Array, "*wave"]
-) -> Float[Array, "*wave 3"]:
-    """Unit vectors in a medium, +z, of light whose direction cosines in air are (x, y)."""
-    across = tangential / index[..., None]
-    along = jnp.sqrt(1 - jnp.sum(across**2, axis=-1, keepdims=True))
-    return jnp.concatenate([across, along], axis=-1)

@@ -167,6 +167,15 @@ def refracted(angle: Number, before: Number, after: Number) -> Float[Array, ""]:
     return jnp.arcsin(sine)
 
 
+def directions(
+    tangential: Float[Array, "*ray 2"], index: Float[Array, "*wave"]
+) -> Float[Array, "*wave 3"]:
+    """Unit vectors in a medium, +z, of light whose direction cosines in air are (x, y)."""
+    across = tangential / index[..., None]
+    along = jnp.sqrt(1 - jnp.sum(across**2, axis=-1, keepdims=True))
+    return jnp.concatenate([across, along], axis=-1)
+
+
 def _mismatch(wavelength, data):
     """How much longer a wavelength is than the one that the fringes match at it, times |K|²/4π."""
     index, across, squared, along, power = data

@@ -19,7 +19,8 @@ from jaxtyping import Array, Float, Int
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Number
 from thincam_jax.waveguide.camera import Rectangle, SeeThroughCamera
-from thincam_jax.waveguide.efficiency import directions, ghost_weights
+from thincam_jax.waveguide.efficiency import weights_about
+from thincam_jax.waveguide.hologram import directions
 
 
 class RayStatus(enum.IntEnum):
@@ -92,10 +93,11 @@ def trace(
     bounce = guided / jnp.sqrt(jnp.where(carried, left, 1))[..., None]
     crossing = _shift(across, glass)
     width = screen.glass_thickness
-    top = camera.lens_distance * _shift(across, jnp.ones_like(glass)) + width * crossing
+    slope = _shift(across, jnp.ones_like(glass))
+    top = camera.lens_distance * slope + width * crossing
     odd = 2 * jnp.arange(orders, dtype=top.dtype) + 1
     bottom = top + jnp.expand_dims(odd, range(1, top.ndim + 1)) * width * bounce
-    ended = bottom + width * crossing + distance * _shift(across, jnp.ones_like(glass))
+    ended = bottom + width * crossing + distance * slope
 
     on_top = True if screen.top is None else screen.top.holds(top)
     on_bottom = True if screen.bottom is None else screen.bottom.holds(bottom)
@@ -111,7 +113,7 @@ def trace(
     ):
         status = jnp.where(sound, status, int(fault))
 
-    weight = ghost_weights(hologram, across, orders)
+    weight = weights_about(hologram, across, wavelength, orders)
     if screen.bottom is not None:
         # Only contacts with the hologram take a part of the light away.
         contacts = jnp.asarray(on_bottom).astype(int)

@@ -13,8 +13,8 @@ from jaxtyping import Array, Float
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Number, Numbers, Shape
 from thincam_jax.imaging.operators import Sparse
-from thincam_jax.waveguide.camera import Rectangle, SeeThroughCamera
-from thincam_jax.waveguide.rays import RayStatus, pixel_centres, trace
+from thincam_jax.waveguide.camera import SeeThroughCamera
+from thincam_jax.waveguide.rays import pixel_centres, trace
 
 
 class ObjectPlane(eqx.Module):
@@ -41,11 +41,6 @@ class ObjectPlane(eqx.Module):
     def pitch(self) -> Float[Array, ""]:
         """Of the cells, mm."""
         return self.width / self.shape[1]
-
-    @property
-    def extent(self) -> Rectangle:
-        """Its outline."""
-        return Rectangle(self.centre, self.pitch * jnp.asarray(self.shape[::-1], self.width.dtype))
 
 
 class _Footprint(NamedTuple):
@@ -74,7 +69,7 @@ def system_operator(camera: SeeThroughCamera, plane: ObjectPlane, orders: int = 
     Vignetting by the lens and the pixel's own response are left out, and so is the smear of the
     colours beside each pixel's Bragg wavelength.
     """
-    rays = trace(camera, pixel_centres(camera), plane.distance, orders, None)
+    rays = trace(camera, pixel_centres(camera), plane.distance, orders)
     distance = camera.lens_distance + plane.distance
     size = camera.sensor.pitch * distance / camera.focal_distance
     cell = plane.pitch
@@ -87,9 +82,7 @@ def system_operator(camera: SeeThroughCamera, plane: ObjectPlane, orders: int = 
     count = math.ceil(ratio) + 1
     rows, columns = plane.shape
     down, across = (_footprint(rays.points[..., axis], plane, axis, size, count) for axis in (1, 0))
-    sound = rays.status == RayStatus.OK
-    full = jnp.mean(jnp.sum(jnp.where(sound, rays.weight, 0), axis=0))
-    weight = jnp.where(sound, rays.weight, 0) / full
+    weight = rays.weight / jnp.mean(jnp.sum(rays.weight, axis=0))
     # (order, y, x, cell of the footprint)
     inside = ((down.cells >= 0) & (down.cells < rows))[..., :, None] & (
         (across.cells >= 0) & (across.cells < columns)
