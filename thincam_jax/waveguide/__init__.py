@@ -15,5 +15,7 @@ from thincam_jax.waveguide.refractive_index import CauchyIndex as CauchyIndex
 from thincam_jax.waveguide.refractive_index import ConstantIndex as ConstantIndex
 from thincam_jax.waveguide.refractive_index import SellmeierIndex as SellmeierIndex
 from thincam_jax.waveguide.refractive_index import bk7 as bk7
+from thincam_jax.waveguide.smear import SmearedRays as SmearedRays
+from thincam_jax.waveguide.smear import trace_band as trace_band
 from thincam_jax.waveguide.system import ObjectPlane as ObjectPlane
 from thincam_jax.waveguide.system import system_operator as system_operator

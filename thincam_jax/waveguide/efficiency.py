@@ -15,7 +15,7 @@ the Bragg condition.
 """
 
 import math
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -64,18 +64,38 @@ def weights_about(
     orders: int,
 ) -> Float[Array, "order *ray"]:
     """`ghost_weights` of rays whose Bragg wavelength is known."""
+    band = band_about(hologram, tangential, centre, 20 * (4 + orders))
+    powers = jnp.stack([band.eta**2 * (1 - band.eta) ** i for i in range(orders)])
+    return jnp.sum(jnp.mean(powers, axis=1), axis=-1) * band.step
+
+
+class Band(NamedTuple):
+    """The light that both holograms diffract towards a pixel, sampled evenly in wavelength.
+
+    - `wavelengths`: (*ray, node), mm. `step`: between neighbours, mm, (*ray).
+    - `eta`: the efficiency for TE and for TM, (2, *ray, node).
+    """
+
+    wavelengths: Float[Array, "*ray node"]
+    step: Float[Array, "*ray"]
+    eta: Float[Array, "2 *ray node"]
+
+
+def band_about(
+    hologram: VolumeHologram,
+    tangential: Float[Array, "*ray 2"],
+    centre: Float[Array, "*ray"],
+    nodes: int,
+) -> Band:
+    """From ξ = −10π to 10π about the Bragg wavelengths, in `nodes` even steps."""
     slope = _detuning_slope(hologram, tangential, centre)
-    step = math.pi / (4 + orders)
-    count = round(10 * math.pi / step)
-    offsets = step * jnp.arange(-count, count + 1, dtype=centre.dtype)
-    # dλ/dξ at the centre; ξ is linear in λ but for dispersion and the change of c_S.
+    # ξ is linear in λ but for dispersion and the change of c_S.
+    offsets = jnp.linspace(-10 * math.pi, 10 * math.pi, nodes + 1, dtype=centre.dtype)
     wavelengths = centre[..., None] + offsets / slope[..., None]
-    sums = []
-    for polarisation in ("TE", "TM"):
-        eta = _efficiency(*_coupling(hologram, tangential[..., None, :], wavelengths, polarisation))
-        left = jnp.stack([eta**2 * (1 - eta) ** i for i in range(orders)])
-        sums.append(jnp.sum(left, axis=-1))
-    return (sums[0] + sums[1]) / 2 * step / jnp.abs(slope)
+    across = tangential[..., None, :]
+    couplings = [_coupling(hologram, across, wavelengths, p) for p in ("TE", "TM")]
+    eta = jnp.stack([_efficiency(*coupling) for coupling in couplings])
+    return Band(wavelengths, 20 * math.pi / nodes / jnp.abs(slope), eta)
 
 
 def _coupling(hologram, tangential, wavelength, polarisation):

@@ -11,6 +11,7 @@ without any angle, so that it has gradients on the axis too.
 """
 
 import enum
+from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -74,26 +75,11 @@ def trace(
     """
     checks.at_least_one({"orders": orders})
     screen, distance = camera.screen, checks.positive("object_distance", object_distance, "mm")
-    hologram = screen.hologram
-    across = -pixels / jnp.sqrt(
-        jnp.sum(pixels**2, axis=-1, keepdims=True) + camera.focal_distance**2
-    )
-    wavelength, matched = hologram.bragg_wavelength(across)
-    film = hologram.index(wavelength)
-    inside = directions(across, film)
-    mirrored = hologram.diffracted(inside)
-    guided = film[..., None] * mirrored[..., :2]
-    matched = matched & (jnp.sum(inside * hologram.grating, -1) > 0) & (mirrored[..., 2] < 0)
-
-    glass = screen.glass_index(wavelength)
-    squared = jnp.sum(guided**2, axis=-1)
-    # n_g² − p² by the mirrored z, in which no digits cancel where p is large.
-    left = (film * mirrored[..., 2]) ** 2 + (glass - film) * (glass + film)
-    carried = left > 0
-    bounce = guided / jnp.sqrt(jnp.where(carried, left, 1))[..., None]
-    crossing = _shift(across, glass)
+    across, wavelength, guided, left, fault = bragg_rays(camera, pixels)
+    bounce = guided / jnp.sqrt(jnp.where(left > 0, left, 1))[..., None]
+    crossing = shift(across, screen.glass_index(wavelength))
     width = screen.glass_thickness
-    slope = _shift(across, jnp.ones_like(glass))
+    slope = shift(across, jnp.ones_like(wavelength))
     top = camera.lens_distance * slope + width * crossing
     odd = 2 * jnp.arange(orders, dtype=top.dtype) + 1
     bottom = top + jnp.expand_dims(odd, range(1, top.ndim + 1)) * width * bounce
@@ -102,18 +88,12 @@ def trace(
     on_top = True if screen.top is None else screen.top.holds(top)
     on_bottom = True if screen.bottom is None else screen.bottom.holds(bottom)
     met = True if extent is None else extent.holds(ended)
-    status = jnp.full(bottom.shape[:-1], int(RayStatus.OK))
-    # The first fault of a ray, in the order in which it comes to it, is written last.
-    for fault, sound in (
-        (RayStatus.MISSED, met),
-        (RayStatus.OFF_HOLOGRAM, on_bottom & on_top),
-        (RayStatus.NOT_GUIDED, squared > 1),
-        (RayStatus.EVANESCENT, carried),
-        (RayStatus.NO_BRAGG_MATCH, matched),
-    ):
-        status = jnp.where(sound, status, int(fault))
+    status = jnp.where(met, int(RayStatus.OK), int(RayStatus.MISSED))
+    status = jnp.where(on_bottom & on_top, status, int(RayStatus.OFF_HOLOGRAM))
+    status = jnp.where(fault == RayStatus.OK, status, fault)
+    status = jnp.broadcast_to(status, bottom.shape[:-1])
 
-    weight = weights_about(hologram, across, wavelength, orders)
+    weight = weights_about(screen.hologram, across, wavelength, orders)
     if screen.bottom is not None:
         # Only contacts with the hologram take a part of the light away.
         contacts = jnp.asarray(on_bottom).astype(int)
@@ -125,7 +105,50 @@ def trace(
     return Rays(points, wavelength, jnp.where(status == RayStatus.OK, weight, 0), guided, status)
 
 
-def _shift(tangential: Float[Array, "*ray 2"], index: Float[Array, "*ray"]):
+class BraggRays(NamedTuple):
+    """Rays of each pixel's Bragg wavelength up to where they are guided.
+
+    - `across`: direction cosines (x, y) in air, (*pixel, 2).
+    - `wavelength`: mm, (*pixel).
+    - `guided`: p, direction cosines of the guided light times its index, (*pixel, 2).
+    - `left`: n_g² − p², of which the part along z is the root, (*pixel).
+    - `fault`: the first `RayStatus` up to here, (*pixel).
+    """
+
+    across: Float[Array, "*pixel 2"]
+    wavelength: Float[Array, "*pixel"]
+    guided: Float[Array, "*pixel 2"]
+    left: Float[Array, "*pixel"]
+    fault: Int[Array, "*pixel"]
+
+
+def bragg_rays(camera: SeeThroughCamera, pixels: Float[Array, "*pixel 2"]) -> BraggRays:
+    """From pixels, (x, y) mm, through lens and rear surface to the top hologram."""
+    hologram = camera.screen.hologram
+    across = -pixels / jnp.sqrt(
+        jnp.sum(pixels**2, axis=-1, keepdims=True) + camera.focal_distance**2
+    )
+    wavelength, matched = hologram.bragg_wavelength(across)
+    film = hologram.index(wavelength)
+    inside = directions(across, film)
+    mirrored = hologram.diffracted(inside)
+    guided = film[..., None] * mirrored[..., :2]
+    matched = matched & (jnp.sum(inside * hologram.grating, -1) > 0) & (mirrored[..., 2] < 0)
+    glass = camera.screen.glass_index(wavelength)
+    # n_g² − p² by the mirrored z, in which no digits cancel where p is large.
+    left = (film * mirrored[..., 2]) ** 2 + (glass - film) * (glass + film)
+    fault = jnp.full(wavelength.shape, int(RayStatus.OK))
+    # The first fault of a ray, in the order in which it comes to it, is written last.
+    for status, sound in (
+        (RayStatus.NOT_GUIDED, jnp.sum(guided**2, axis=-1) > 1),
+        (RayStatus.EVANESCENT, left > 0),
+        (RayStatus.NO_BRAGG_MATCH, matched),
+    ):
+        fault = jnp.where(sound, fault, int(status))
+    return BraggRays(across, wavelength, guided, left, fault)
+
+
+def shift(tangential: Float[Array, "*#ray 2"], index: Float[Array, "*#ray"]):
     """How far light goes sideways in a layer of thickness 1: p/√(n² − p²)."""
     squared = jnp.sum(tangential**2, axis=-1)
     return tangential / jnp.sqrt(index**2 - squared)[..., None]

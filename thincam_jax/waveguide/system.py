@@ -4,17 +4,17 @@ import math
 from typing import NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.experimental import sparse
-from jaxtyping import Array, Float
+import scipy.sparse
+from jaxtyping import Array, Float, Int
 
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Number, Numbers, Shape
 from thincam_jax.imaging.operators import Sparse
 from thincam_jax.waveguide.camera import SeeThroughCamera
 from thincam_jax.waveguide.rays import pixel_centres, trace
+from thincam_jax.waveguide.smear import SmearedRays, trace_band
 
 
 class ObjectPlane(eqx.Module):
@@ -43,14 +43,59 @@ class ObjectPlane(eqx.Module):
         return self.width / self.shape[1]
 
 
-class _Footprint(NamedTuple):
-    """The cells that pixels see along one axis, and what part of a pixel's light is from each."""
+class Footprints(NamedTuple):
+    """The cells that pixels see along y and x, and what part of a pixel's light is from each.
 
-    cells: Array
-    parts: Array
+    - `first`: index of the first cell, (y or x, *ray). It may lie beside the object.
+    - `parts`: of that cell and its followers, (y or x, *ray, cell).
+    """
+
+    first: Int[np.ndarray, "2 *ray"]
+    parts: Float[np.ndarray, "2 *ray cell"]
 
 
-def system_operator(camera: SeeThroughCamera, plane: ObjectPlane, orders: int = 4) -> Sparse:
+def footprints(points: Float[np.ndarray, "*ray 2"], plane: ObjectPlane, size: float) -> Footprints:
+    """Overlaps of the cells with squares of the given size, mm, about points (x, y)."""
+    pitch = float(plane.pitch)
+    ratio = size / pitch
+    if not 0 < ratio < 64:
+        raise ValueError(
+            f"a pixel sees {ratio:g} cells of the object; give cells of at least a 64th of the "
+            f"{size:.3g} mm that it sees"
+        )
+    count = math.ceil(ratio) + 1
+    numbers = np.asarray(plane.shape).reshape(2, *(1,) * (points.ndim - 1))
+    centre = np.asarray(plane.centre)[::-1].reshape(numbers.shape)
+    middle = (np.moveaxis(points, -1, 0)[::-1] - centre) / pitch + numbers / 2
+    low = np.clip(middle, -2 * count, numbers + 2 * count)[..., None] - ratio / 2
+    edges = np.floor(low) + np.arange(count)
+    parts = np.minimum(low + ratio, edges + 1) - np.maximum(low, edges)
+    parts = np.maximum(parts, 0).astype(points.dtype) / points.dtype.type(ratio)
+    return Footprints(edges[..., 0].astype(np.int32), parts)
+
+
+def seen_size(camera: SeeThroughCamera, plane: ObjectPlane) -> Float[Array, ""]:
+    """Side of the square of the object's plane that a pixel sees, mm."""
+    return camera.sensor.pitch * (camera.lens_distance + plane.distance) / camera.focal_distance
+
+
+def smeared_rays(
+    camera: SeeThroughCamera,
+    pixels: Float[Array, "*pixel 2"],
+    plane: ObjectPlane,
+    orders: int,
+    samples: int | None,
+) -> SmearedRays:
+    """`trace_band`, or for None `trace` as one sample at the Bragg wavelength."""
+    if samples is not None:
+        return trace_band(camera, pixels, plane.distance, orders, samples)
+    rays = trace(camera, pixels, plane.distance, orders)
+    return SmearedRays(rays.points[..., None, :2], rays.weight)
+
+
+def system_operator(
+    camera: SeeThroughCamera, plane: ObjectPlane, orders: int = 4, samples: int | None = None
+) -> Sparse:
     r"""The capture of a lit object as the sum of its ghosts.
 
     .. math:: g(\mathbf x_0) = \sum_i W_i(\mathbf x_0)\, f(\mathbf P_i(\mathbf x_0)) \big/
@@ -65,46 +110,45 @@ def system_operator(camera: SeeThroughCamera, plane: ObjectPlane, orders: int = 
     **Arguments**
 
     - `orders`: how many ghosts; those that leave the hologram or miss the object do not count.
+    - `samples`: parts of the band of each pixel and order, as `trace_band` divides it; None for
+      the Bragg wavelength alone, without the smear of the colours beside it.
 
-    Vignetting by the lens and the pixel's own response are left out, and so is the smear of the
-    colours beside each pixel's Bragg wavelength.
+    Vignetting by the lens and the pixel's own response are left out.
+
+    **Errors**: ValueError where no pixel has a guided ray, and for cells below a 64th of what a
+    pixel sees.
     """
-    rays = trace(camera, pixel_centres(camera), plane.distance, orders)
-    distance = camera.lens_distance + plane.distance
-    size = camera.sensor.pitch * distance / camera.focal_distance
-    cell = plane.pitch
-    ratio = float(size / cell)
-    if not 0 < ratio < 64:
+    rays = smeared_rays(camera, pixel_centres(camera), plane, orders, samples)
+    level = float(jnp.mean(jnp.sum(rays.weight, axis=0)))
+    if level == 0:
         raise ValueError(
-            f"a pixel sees {ratio:g} cells of the object; give cells of at least a 64th of the "
-            f"{float(size):.3g} mm that it sees"
+            "no light reaches the sensor by this screen; waveguide.check_screen says why"
         )
-    count = math.ceil(ratio) + 1
+    return Sparse(
+        system_matrix(rays, plane, float(seen_size(camera, plane)), level),
+        plane.shape,
+        camera.sensor.shape,
+    )
+
+
+def system_matrix(rays: SmearedRays, plane: ObjectPlane, size: float, level: float):
+    """H of pixels that see squares of the object of that size, mm; `level`: what weight is 1."""
+    weight = np.asarray(rays.weight)
+    orders, pixels = weight.shape[0], weight[0].size
+    points = np.asarray(rays.points).reshape(orders, pixels, -1, 2)
+    weight = weight.reshape(orders, pixels, 1) / weight.dtype.type(level * points.shape[2])
     rows, columns = plane.shape
-    down, across = (_footprint(rays.points[..., axis], plane, axis, size, count) for axis in (1, 0))
-    weight = rays.weight / jnp.mean(jnp.sum(rays.weight, axis=0))
-    # (order, y, x, cell of the footprint)
-    inside = ((down.cells >= 0) & (down.cells < rows))[..., :, None] & (
-        (across.cells >= 0) & (across.cells < columns)
-    )[..., None, :]
-    values = weight[..., None, None] * down.parts[..., :, None] * across.parts[..., None, :]
-    cells = down.cells[..., :, None] * columns + across.cells[..., None, :]
-    pixels = np.arange(math.prod(camera.sensor.shape)).reshape(*camera.sensor.shape, 1, 1)
-    kept = np.asarray(inside & (values > 0)).reshape(-1)
-    entries = np.broadcast_to(pixels, cells.shape).reshape(-1)[kept]
-    places = jnp.stack([jnp.asarray(entries), cells.reshape(-1)[kept]], axis=-1)
-    shape = (math.prod(camera.sensor.shape), rows * columns)
-    matrix = sparse.BCOO((values.reshape(-1)[kept], places.astype(jnp.int32)), shape=shape)
-    return Sparse(matrix, plane.shape, camera.sensor.shape)
-
-
-def _footprint(points, plane: ObjectPlane, axis: int, size, count: int) -> _Footprint:
-    """Overlap of an interval of that size about each point with the cells along an axis."""
-    number = plane.shape[1 - axis]
-    start = plane.centre[axis] - number * plane.pitch / 2
-    low = (points - size / 2 - start) / plane.pitch
-    high = low + size / plane.pitch
-    first = jax.lax.stop_gradient(jnp.floor(low))
-    edges = first[..., None] + jnp.arange(count, dtype=low.dtype)
-    parts = jnp.minimum(high[..., None], edges + 1) - jnp.maximum(low[..., None], edges)
-    return _Footprint(edges.astype(int), jnp.maximum(parts, 0) * plane.pitch / size)
+    total = scipy.sparse.csr_array((pixels, rows * columns), dtype=weight.dtype)
+    # Order by order, for the memory; entries at the same place are added up.
+    for number in range(orders):
+        first, parts = footprints(points[number], plane, size)
+        down, across = first[..., None] + np.arange(parts.shape[-1], dtype=np.int32)
+        values = weight[number][..., None, None] * parts[0][..., None] * parts[1][..., None, :]
+        inside = ((down >= 0) & (down < rows))[..., None] & ((across >= 0) & (across < columns))[
+            ..., None, :
+        ]
+        kept = inside & (values > 0)
+        cells = (down[..., None] * columns + across[..., None, :])[kept]
+        places = (np.nonzero(kept)[0], cells)
+        total = total + scipy.sparse.csr_array((values[kept], places), shape=total.shape)
+    return total

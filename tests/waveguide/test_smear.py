@@ -1,0 +1,137 @@
+"""The smear of a pixel's colours, against each wavelength traced surface by surface."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from waveguide.setting import camera, hologram
+
+import thincam_jax as tc
+from thincam_jax import waveguide as wg
+from thincam_jax.imaging.operators import adjoint_error
+from thincam_jax.units import nm, um
+
+PIXELS = [(0.0, 0.0), (0.0, 1.0536), (-1.0536, -1.0536)]
+
+
+def one_wavelength(pixel, order, wavelength, index, distance=550.0, width=5.0):
+    """(x, y) on the object by wave vectors: the tangential one is kept, the medium sets its length.
+
+    At each hologram K is taken from the wave vector and z follows from the wavenumber, for every
+    wavelength, so that nothing is known of the Bragg condition.
+    """
+    fringes = 2 * np.pi * 1.5 / 532e-6 * np.array([-np.sin(np.radians(61.2))])
+    wavenumber = 2 * np.pi / wavelength
+    ray = -np.array([*pixel]) / np.hypot(np.hypot(*pixel), 6.0)
+
+    def gone(tangential, medium, depth):
+        length = medium * wavenumber
+        return depth * tangential / np.sqrt(length**2 - tangential @ tangential)
+
+    outside = ray * wavenumber
+    guided = outside - np.array([0.0, *fringes])
+    if not wavenumber < np.linalg.norm(guided) < index * wavenumber:
+        return None
+    place = gone(outside, 1.0, 10.0) + gone(outside, index, width)
+    place = place + (2 * order + 1) * gone(guided, index, width)
+    return place + gone(outside, index, width) + gone(outside, 1.0, distance)
+
+
+def lights(across, wavelengths, orders):
+    """η²(1−η)^i, unpolarised, (order, wavelength)."""
+    directions = jnp.broadcast_to(jnp.asarray(across), (len(wavelengths), 2))
+    eta = [
+        np.asarray(
+            wg.diffraction_efficiency(hologram(), directions, jnp.asarray(wavelengths), kind)
+        )
+        for kind in ("TE", "TM")
+    ]
+    powers = np.arange(orders)[:, None]
+    return np.mean([e**2 * (1 - e) ** powers for e in eta], axis=0)
+
+
+@pytest.mark.parametrize("pixel", PIXELS)
+def test_parts_of_the_band(pixel):
+    """Sums, means and deciles of 4001 wavelengths weighted by η²(1−η)^i."""
+    sts, film = camera(), hologram()
+    samples = 10
+    rays = wg.trace_band(sts, jnp.asarray(pixel), 550.0, 3, samples)
+    across = -np.array(pixel) / np.hypot(np.hypot(*pixel), 6.0)
+    centre = float(film.bragg_wavelength(jnp.asarray(across))[0])
+    wavelengths = centre + np.linspace(-80, 80, 4001) * nm
+    lights_there = lights(across, wavelengths, 3)
+    for order in range(3):
+        found = [one_wavelength(pixel, order, w, 1.5) for w in wavelengths]
+        guided = np.array([f is not None for f in found])
+        light = lights_there[order][guided]
+        places = np.array([f for f in found if f is not None])
+        np.testing.assert_allclose(rays.weight[order], light.sum() * 0.04 * nm, rtol=5e-3)
+        mean = light @ places / light.sum()
+        np.testing.assert_allclose(rays.points[order].mean(axis=0), mean, atol=0.05)
+        # Parts of equal light, from one end of the band to the other; the cut at |ξ| = 10π shows
+        # in the outermost ones.
+        part = np.minimum(np.cumsum(light) / light.sum() * samples, samples - 1e-9).astype(int)
+        means = np.stack([np.average(places[part == k], 0, light[part == k]) for k in range(10)])
+        ours = np.asarray(rays.points[order])
+        ours = ours[np.argsort(ours[:, 1])]
+        np.testing.assert_allclose(ours, means, atol=0.1 * (2 * order + 1))
+
+
+def test_the_bragg_wavelength_alone():
+    """A thick film of a narrow band smears nothing: the samples lie at the points of `trace`."""
+    pixels = jnp.asarray(PIXELS)
+    narrow = camera(hologram(thickness=16.0, index_modulation=2e-5))
+    rays, band = wg.trace(narrow, pixels, 550.0, 2), wg.trace_band(narrow, pixels, 550.0, 2, 4)
+    np.testing.assert_allclose(band.weight, rays.weight, rtol=1e-2)
+    spread = np.abs(np.asarray(band.points) - np.asarray(rays.points)[..., None, :2])
+    assert spread.max() < 0.02
+
+
+def test_holograms_and_critical_angle_cut_the_band():
+    """At its edge a hologram keeps a part of a contact's band, and the later contacts their own."""
+    pixel = jnp.zeros((1, 2))
+    whole = wg.trace_band(camera(), pixel, 550.0, 3, 4)
+    edge = float(wg.trace(camera(), pixel, 550.0, 3).points[1, 0, 1])
+    half = wg.Rectangle((0.0, edge / 2), (10.0, edge))
+    cut = wg.trace_band(camera(bottom=half), pixel, 550.0, 3, 4)
+    np.testing.assert_allclose(cut.weight[0], whole.weight[0], rtol=1e-12)
+    assert 0.3 < float(cut.weight[1, 0] / whole.weight[1, 0]) < 0.7
+    assert float(cut.points[1, ..., 1].max()) < edge + 0.01
+    assert not cut.weight[2].any()
+    # −29.87° is the critical angle of the Bragg wavelength: half of the band is still guided there.
+    steep = jnp.array([[0.0, 6.0 * np.tan(np.radians(29.87))]])
+    part = wg.trace_band(camera(), steep, 550.0, 3, 4)
+    assert 0.3 < float(part.weight[0, 0]) / 4.9e-6 < 0.8
+
+
+def test_a_capture_is_the_sum_over_the_band():
+    """Against 101 wavelengths of a coarse sensor, cells averaged by many points."""
+    sensor = tc.Sensor((5, 6), 360 * um)
+    sts = wg.SeeThroughCamera(wg.Screen(hologram(), 5.0, 1.5), sensor, 6.0, 10.0)
+    plane = wg.ObjectPlane((20, 16), 550.0, 160.0, (0.0, 27.0))
+    image = np.random.default_rng(4).uniform(size=plane.shape)
+    operator = wg.system_operator(sts, plane, 2, samples=20)
+    assert adjoint_error(operator, jax.random.key(1)) < 1e-14
+    film, expected, level = hologram(), np.zeros(sensor.shape), 0.0
+    pixels = np.asarray(wg.pixel_centres(sts))
+    size = 0.36 * 560 / 6
+    offsets = (np.arange(60) + 0.5) / 60 * size - size / 2
+    for row, column in np.ndindex(*sensor.shape):
+        pixel = pixels[row, column]
+        across = jnp.asarray(-pixel / np.hypot(np.hypot(*pixel), 6.0))
+        centre = float(film.bragg_wavelength(across)[0])
+        wavelengths = centre + np.linspace(-25, 25, 101) * nm
+        eta = lights(across, wavelengths, 2)
+        level += eta.sum()
+        for order in range(2):
+            for wavelength, light in zip(wavelengths, eta[order], strict=True):
+                place = one_wavelength(pixel, order, wavelength, 1.5)
+                if place is None or light < 1e-4:
+                    continue
+                columns = np.floor((place[0] + offsets) / 10 + 8).astype(int)
+                rows = np.floor((place[1] - 27 + offsets) / 10 + 10).astype(int)
+                columns = columns[(columns >= 0) & (columns < 16)]
+                rows = rows[(rows >= 0) & (rows < 20)]
+                expected[row, column] += light * image[np.ix_(rows, columns)].sum() / 3600
+    expected /= level / 30
+    np.testing.assert_allclose(operator(jnp.asarray(image)), expected, atol=6e-3)

@@ -1,0 +1,120 @@
+r"""The colours beside each pixel's Bragg wavelength, and where on the object they come from.
+
+A film diffracts a band of wavelengths. The boundary conditions at its plane surfaces keep the
+tangential component of the wave vector up to that of the fringes, so that light of the wavelength
+λ, on or off the Bragg condition, is guided with
+
+.. math:: \mathbf p(\lambda) = \mathbf t - \frac{\lambda}{2\pi}\mathbf K_{xy}
+
+The second hologram gives K back: all colours of a pixel leave in the same direction **t**, but
+from other places. A pixel's ghost is smeared along the screen by what the path (2i + 1) w p/√(n² −
+p²) changes over the band, with the weight η²(1−η)^i of each wavelength.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from thincam_jax._core import checks
+from thincam_jax._core.checks import Number
+from thincam_jax.waveguide.camera import SeeThroughCamera
+from thincam_jax.waveguide.efficiency import band_about
+from thincam_jax.waveguide.rays import RayStatus, bragg_rays, shift
+
+# Pixels whose bands are in memory together.
+_PIXELS = 256
+
+
+class SmearedRays(NamedTuple):
+    """Where a pixel's light of each order comes from.
+
+    - `points`: (x, y) on the object's plane, mm, of equal parts of the light, (order, *pixel,
+      sample, 2).
+    - `weight`: ∫ η²(1−η)^m dλ over what is guided and meets the holograms, (order, *pixel), mm.
+    """
+
+    points: Float[Array, "order *pixel sample 2"]
+    weight: Float[Array, "order *pixel"]
+
+
+@eqx.filter_jit
+def trace_band(
+    camera: SeeThroughCamera,
+    pixels: Float[Array, "*pixel 2"],
+    object_distance: Number,
+    orders: int = 4,
+    samples: int = 8,
+) -> SmearedRays:
+    """As `trace`, for the whole band of each pixel in place of its Bragg wavelength.
+
+    The light of a pixel and order is divided into `samples` equal parts from one end of the band to
+    the other, each at the mean of where it comes from: the mean over the band is exact with one
+    sample already. Every wavelength is held to the critical angle and to the holograms' extents by
+    itself, so that a pixel may lose a part of its band.
+    """
+    checks.at_least_one({"orders": orders, "samples": samples})
+    distance = checks.positive("object_distance", object_distance, "mm")
+    # Nodes that hold the integrand's frequencies in ξ, and some for every sample.
+    nodes = max(20 * (4 + orders), 6 * samples)
+    flat = pixels.reshape(-1, 2)
+    centres, parts, weight = jax.lax.map(
+        lambda pixel: _one(camera, pixel, distance, (orders, samples, nodes)),
+        flat,
+        batch_size=min(_PIXELS, flat.shape[0]),
+    )
+    points = centres[:, None, None, :] + parts
+    shape = pixels.shape[:-1]
+    return SmearedRays(
+        jnp.moveaxis(points, 1, 0).reshape(orders, *shape, samples, 2),
+        weight.T.reshape(orders, *shape),
+    )
+
+
+def _one(camera, pixel, distance, counts):
+    """What all samples of a pixel share, (2), what they do not, (order, sample, 2), and weights."""
+    orders, samples, nodes = counts
+    screen = camera.screen
+    hologram, width = screen.hologram, screen.glass_thickness
+    across, centre, guided, left, fault = bragg_rays(camera, pixel)
+    band = band_about(hologram, across, centre, nodes)
+    away = (centre - band.wavelengths)[:, None] * hologram.grating[:2] / (2 * jnp.pi)
+    glass, at_centre = screen.glass_index(band.wavelengths), screen.glass_index(centre)
+    tangential = guided + away
+    # n_g² − p² from that of the Bragg wavelength, whose digits are not cancelled.
+    left = left + (glass - at_centre) * (glass + at_centre)
+    left = left - jnp.sum(away * (tangential + guided), axis=-1)
+    carried = left > 0
+    bounce = width * tangential / jnp.sqrt(jnp.where(carried, left, 1))[:, None]
+    crossing = width * shift(across, glass)
+    slope = shift(across, jnp.ones_like(centre))
+    top = camera.lens_distance * slope + crossing
+    sound = carried & (jnp.sum(tangential**2, -1) > 1) & (fault != RayStatus.NO_BRAGG_MATCH)
+    if screen.top is not None:
+        sound = sound & screen.top.holds(top)
+
+    def contact(passed, odd):
+        bottom = top + odd * bounce
+        met = jnp.ones(nodes + 1, bool) if screen.bottom is None else screen.bottom.holds(bottom)
+        light = jnp.where(met & sound, jnp.mean(band.eta**2 * passed, axis=0), 0)
+        ends = odd * bounce + 2 * crossing
+        return jnp.where(met, 1 - band.eta, 1) * passed, _parts(light, ends, samples)
+
+    odd = 2 * jnp.arange(orders, dtype=centre.dtype) + 1
+    _, (parts, weight) = jax.lax.scan(contact, jnp.ones_like(band.eta), odd)
+    return (camera.lens_distance + distance) * slope, parts, weight * band.step
+
+
+def _parts(light, ends, samples: int):
+    """Means of `samples` equal parts of a distribution, (sample, 2), and its sum."""
+    total = jnp.sum(light)
+    share = light / jnp.where(total > 0, total, 1)
+    middle = share @ ends
+    below = jnp.concatenate([jnp.zeros(1, share.dtype), jnp.cumsum(share)])
+    moments = jnp.cumsum(share[:, None] * (ends - middle), axis=0)
+    moments = jnp.concatenate([jnp.zeros((1, 2), share.dtype), moments])
+    marks = jnp.linspace(0, 1, samples + 1, dtype=share.dtype) * below[-1]
+    at = jax.vmap(jnp.interp, (None, None, 1), 1)(marks, below, moments)
+    return middle + samples * jnp.diff(at, axis=0), total
