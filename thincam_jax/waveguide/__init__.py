@@ -7,6 +7,9 @@ from thincam_jax.waveguide.efficiency import diffraction_efficiency as diffracti
 from thincam_jax.waveguide.efficiency import ghost_weights as ghost_weights
 from thincam_jax.waveguide.hologram import VolumeHologram as VolumeHologram
 from thincam_jax.waveguide.hologram import refracted as refracted
+from thincam_jax.waveguide.planning import LitPlane as LitPlane
+from thincam_jax.waveguide.planning import Plan as Plan
+from thincam_jax.waveguide.planning import plan as plan
 from thincam_jax.waveguide.rays import Rays as Rays
 from thincam_jax.waveguide.rays import RayStatus as RayStatus
 from thincam_jax.waveguide.rays import pixel_centres as pixel_centres

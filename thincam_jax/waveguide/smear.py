@@ -25,7 +25,7 @@ from thincam_jax.waveguide.efficiency import band_about
 from thincam_jax.waveguide.rays import RayStatus, bragg_rays, shift
 
 # Pixels whose bands are in memory together.
-_PIXELS = 256
+_PIXELS = 384
 
 
 class SmearedRays(NamedTuple):
@@ -57,8 +57,9 @@ def trace_band(
     """
     checks.at_least_one({"orders": orders, "samples": samples})
     distance = checks.positive("object_distance", object_distance, "mm")
-    # Nodes that hold the integrand's frequencies in ξ, and some for every sample.
-    nodes = max(20 * (4 + orders), 6 * samples)
+    # Nodes that hold the integrand's frequencies in ξ, and some for every sample; for most numbers
+    # of both the same, so that fewer of them change nothing else.
+    nodes = max(20 * (4 + orders), 8 * samples, 720)
     flat = pixels.reshape(-1, 2)
     centres, parts, weight = jax.lax.map(
         lambda pixel: _one(camera, pixel, distance, (orders, samples, nodes)),
@@ -91,20 +92,35 @@ def _one(camera, pixel, distance, counts):
     crossing = width * shift(across, glass)
     slope = shift(across, jnp.ones_like(centre))
     top = camera.lens_distance * slope + crossing
-    sound = carried & (jnp.sum(tangential**2, -1) > 1) & (fault != RayStatus.NO_BRAGG_MATCH)
-    if screen.top is not None:
-        sound = sound & screen.top.holds(top)
+    sound = _covered(left) * _covered(jnp.sum(tangential**2, -1) - 1) * _on(screen.top, top)
+    sound = jnp.where(carried & (fault != RayStatus.NO_BRAGG_MATCH), sound, 0)
 
     def contact(passed, odd):
-        bottom = top + odd * bounce
-        met = jnp.ones(nodes + 1, bool) if screen.bottom is None else screen.bottom.holds(bottom)
-        light = jnp.where(met & sound, jnp.mean(band.eta**2 * passed, axis=0), 0)
+        met = _on(screen.bottom, top + odd * bounce)
+        light = jnp.mean(band.eta**2 * passed, axis=0) * met * sound
         ends = odd * bounce + 2 * crossing
-        return jnp.where(met, 1 - band.eta, 1) * passed, _parts(light, ends, samples)
+        return (1 - met * band.eta) * passed, _parts(light, ends, samples)
 
     odd = 2 * jnp.arange(orders, dtype=centre.dtype) + 1
     _, (parts, weight) = jax.lax.scan(contact, jnp.ones_like(band.eta), odd)
     return (camera.lens_distance + distance) * slope, parts, weight * band.step
+
+
+def _on(hologram, places):
+    """What part of the light about each node meets a hologram."""
+    if hologram is None:
+        return jnp.ones(places.shape[0], places.dtype)
+    return _covered(jnp.min(hologram.size / 2 - jnp.abs(places - hologram.centre), axis=-1))
+
+
+def _covered(margin):
+    """What part of each node's step has a positive margin: an edge between two nodes is halved.
+
+    Without it an edge would jump from node to node, and no small number of nodes would do.
+    """
+    change = jnp.abs(jnp.gradient(margin))
+    part = jnp.clip(0.5 + margin / jnp.where(change > 0, change, 1), 0, 1)
+    return jnp.where(change > 0, part, (margin > 0).astype(margin.dtype))
 
 
 def _parts(light, ends, samples: int):

@@ -65,13 +65,20 @@ def footprints(points: Float[np.ndarray, "*ray 2"], plane: ObjectPlane, size: fl
         )
     count = math.ceil(ratio) + 1
     numbers = np.asarray(plane.shape).reshape(2, *(1,) * (points.ndim - 1))
-    centre = np.asarray(plane.centre)[::-1].reshape(numbers.shape)
-    middle = (np.moveaxis(points, -1, 0)[::-1] - centre) / pitch + numbers / 2
-    low = np.clip(middle, -2 * count, numbers + 2 * count)[..., None] - ratio / 2
+    middle = np.clip(in_cells(points, plane), -2 * count, numbers + 2 * count)
+    low = middle[..., None] - ratio / 2
     edges = np.floor(low) + np.arange(count)
     parts = np.minimum(low + ratio, edges + 1) - np.maximum(low, edges)
-    parts = np.maximum(parts, 0).astype(points.dtype) / points.dtype.type(ratio)
-    return Footprints(edges[..., 0].astype(np.int32), parts)
+    return Footprints(edges[..., 0].astype(np.int32), np.maximum(parts, 0) / ratio)
+
+
+def in_cells(
+    points: Float[np.ndarray, "*ray 2"], plane: ObjectPlane
+) -> Float[np.ndarray, "2 *ray"]:
+    """Points (x, y), mm, as rows and columns of cells from the object's corner, in float64."""
+    numbers, centre = np.asarray(plane.shape, float), np.asarray(plane.centre, float)[::-1]
+    places = (points[..., ::-1].astype(float) - centre) / float(plane.pitch) + numbers / 2
+    return np.moveaxis(places, -1, 0)
 
 
 def seen_size(camera: SeeThroughCamera, plane: ObjectPlane) -> Float[Array, ""]:
@@ -142,6 +149,7 @@ def system_matrix(rays: SmearedRays, plane: ObjectPlane, size: float, level: flo
     # Order by order, for the memory; entries at the same place are added up.
     for number in range(orders):
         first, parts = footprints(points[number], plane, size)
+        parts = parts.astype(weight.dtype)
         down, across = first[..., None] + np.arange(parts.shape[-1], dtype=np.int32)
         values = weight[number][..., None, None] * parts[0][..., None] * parts[1][..., None, :]
         inside = ((down >= 0) & (down < rows))[..., None] & ((across >= 0) & (across < columns))[

@@ -1,0 +1,112 @@
+"""Plans: predicted errors against true ones over random cameras, and what a plan says."""
+
+import functools
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import thincam_jax as tc
+from helpers import relative_l2
+from thincam_jax import waveguide as wg
+from thincam_jax.imaging.targets import resize, sample_image
+from thincam_jax.units import deg, nm, um
+from thincam_jax.waveguide.system import seen_size, system_matrix
+
+SHAPE, CELLS = (32, 12), (24, 28)
+
+
+def reference(plan):
+    """The capture with all orders, 64 parts of each band and dispersion, in double precision."""
+    rays = wg.trace_band(
+        plan.camera,
+        wg.pixel_centres(plan.camera),
+        plan.plane.distance,
+        32,
+        64,
+    )
+    return system_matrix(rays, plan.plane, float(seen_size(plan.camera, plan.plane)), plan.level)
+
+
+def errors(plan, image):
+    """Predicted and true."""
+    system = plan.system()
+    found = np.asarray(system(jnp.asarray(image, jnp.dtype(plan.precision))), float)
+    return plan.predicted_error, relative_l2(found.ravel(), reference(plan) @ image.ravel())
+
+
+@functools.cache
+def pictures():
+    """Photographs, a page of text, noise, and a few bright cells, in (24, 28) cells."""
+    random = np.random.default_rng(8)
+    photographs = [resize(sample_image(name), CELLS) for name in ("camera", "page")]
+    sparse = np.zeros(CELLS)
+    sparse[random.integers(0, 24, 12), random.integers(0, 28, 12)] = 1
+    blocks = np.kron(random.uniform(size=(6, 7)), np.ones((4, 4)))
+    return [np.clip(p, 0, 1) for p in photographs] + [random.uniform(size=CELLS), blocks, sparse]
+
+
+def random_case(random):
+    """A camera whose middle sees guided light, an object about where it looks, and a tolerance."""
+    while True:
+        index = random.uniform(1.48, 1.6)
+        if random.uniform() < 0.5:
+            index = wg.CauchyIndex(index, random.uniform(2e-9, 8e-9))
+        film = wg.VolumeHologram.record(
+            random.uniform(500, 600) * nm,
+            random.uniform(-5, 5) * deg,
+            random.uniform(50, 74) * deg,
+            index=index,
+            thickness=random.uniform(8, 40) * um,
+            index_modulation=random.uniform(0.008, 0.04),
+        ).processed(shrinkage=random.uniform(-0.01, 0.03))
+        focal, field = random.uniform(4, 10), random.uniform(0.08, 0.22)
+        sensor = tc.Sensor(SHAPE, 2 * focal * field / SHAPE[0])
+        width = np.exp(random.uniform(np.log(3), np.log(12)))
+        screen = wg.Screen(film, width, film.index)
+        sts = wg.SeeThroughCamera(screen, sensor, focal, random.uniform(2, 20))
+        distance = np.exp(random.uniform(np.log(100), np.log(2000)))
+        middle = wg.trace(sts, jnp.zeros(2), distance, 1)
+        if int(middle.status[0]) != wg.RayStatus.OK:
+            continue
+        # The bottom hologram: of any length, or of all that matters.
+        first = float(middle.points[0, 1])
+        height = random.uniform(1, 6) * first + 80 * field if random.uniform() < 0.5 else 1e4
+        bottom = wg.Rectangle((0.0, first), (200.0, height))
+        sts = eqx.tree_at(lambda c: c.screen.bottom, sts, bottom, is_leaf=lambda n: n is None)
+        seen = 2 * field * distance
+        offset = random.uniform(-0.2, 0.2, 2) * seen
+        centre = np.asarray(middle.points[0, :2]) + offset
+        plane = wg.ObjectPlane(CELLS, distance, random.uniform(0.3, 1.3) * seen, centre)
+        image = pictures()[random.integers(5)]
+        return sts, wg.LitPlane(plane, image), 10 ** random.uniform(-3.5, -0.5)
+
+
+@pytest.mark.parametrize("count", [6, pytest.param(200, marks=pytest.mark.thorough)])
+def test_predictions_hold_over_random_cameras(capsys, count):
+    """True ≤ predicted in 99 % of cameras, predicted ≤ 10·true in 80 %."""
+    random, pairs, met, kinds = np.random.default_rng(12), [], [], []
+    for _ in range(count):
+        sts, scene, tolerance = random_case(random)
+        plan = wg.plan(sts, scene, tolerance=tolerance)
+        pairs.append(errors(plan, np.asarray(scene.image)))
+        met.append((plan.meets_tolerance, pairs[-1][1] <= tolerance))
+        way = (not plan.field_dependent, plan.dispersion, plan.samples is not None)
+        kinds.append((*way, plan.precision == "float32"))
+    predicted, true = np.array(pairs).T
+    covered, close = np.mean(true <= predicted), np.mean(predicted <= 10 * true)
+    claimed, held = np.array(met).T
+    with capsys.disabled():
+        quantiles = np.quantile(predicted / true, [0, 0.01, 0.05, 0.5, 0.95, 0.99, 1])
+        print(
+            f"\n{count} cameras: true ≤ predicted {covered:.1%}, predicted ≤ 10·true {close:.1%}; "
+            "predicted/true at 0, 1, 5, 50, 95, 99, 100 %: "
+            + ", ".join(f"{q:.3g}" for q in quantiles)
+            + f"; true from {true.min():.1e} to {true.max():.1e}; tolerance claimed "
+            f"{claimed.mean():.1%}, held {held.mean():.1%}; rows and columns apart, dispersion, "
+            "smear, float32: " + ", ".join(f"{share:.0%}" for share in np.mean(kinds, axis=0))
+        )
+    assert covered >= 0.99
+    assert close >= 0.80
+    assert np.mean(held[claimed]) >= 0.99

@@ -1,0 +1,406 @@
+"""Plans: the cheapest model of what a screen's camera sees, within a tolerance."""
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from thincam_jax._core import checks
+from thincam_jax._core.checks import Numbers
+from thincam_jax._core.precision import Precision, allow, cast
+from thincam_jax.imaging.operators import Separable, Sparse
+from thincam_jax.waveguide.camera import SeeThroughCamera
+from thincam_jax.waveguide.rays import RayStatus, pixel_centres, trace
+from thincam_jax.waveguide.refractive_index import ConstantIndex
+from thincam_jax.waveguide.system import (
+    ObjectPlane,
+    footprints,
+    in_cells,
+    seen_size,
+    smeared_rays,
+    system_matrix,
+)
+
+# Numbers of ghosts and of parts of the band that are tried; the last is the reference.
+_ORDERS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
+_SAMPLES = (None, 1, 2, 4, 8, 16, 32, 64)
+# Rows of the sensor, and pixels of each, at which the models are compared: along the rows little
+# changes. What keeps the error there above that of the whole sensor, found over 200 random cameras:
+# factors of the root mean square, of the largest, where few pixels hold the error, and of both where
+# rows and columns are taken apart, which is off most at the ends of few columns.
+_ROWS, _COLUMNS = 24, 4
+_MARGIN, _LARGEST, _APART = 1.2, 1.5, 1.6
+# Parts of the tolerance that the decisions may use, in the order in which they are taken.
+_SHARES = {"orders": 0.4, "smear": 0.6, "dispersion": 0.4, "precision": 0.4}
+# What the sums of a capture in float32 round.
+_SUMS = 3e-7
+
+
+class LitPlane(eqx.Module):
+    """A flat object and its light: `image`, the radiances of its cells, (y, x)."""
+
+    plane: ObjectPlane
+    image: Float[Array, "y x"]
+
+    def __init__(self, plane: ObjectPlane, image: Numbers):
+        self.plane = plane
+        self.image = checks.finite("image", image, "radiance", shape=plane.shape)
+        if not checks.is_traced(self.image) and not np.asarray(self.image).any():
+            raise ValueError("image is dark, and errors are relative to its capture; give light")
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """How to model a screen's capture within a tolerance; made by `waveguide.plan`.
+
+    Print it for a table. It holds for images like the one that it was made for.
+
+    - `camera`, `plane`: that it was made for.
+    - `tolerance`, `predicted_error`: relative L2 of the noise-free capture.
+    - `orders`: ghosts that are modelled, of `all_orders` that can meet the object.
+    - `samples`: parts of the band of each pixel and order; None: the Bragg wavelength alone.
+    - `dispersion`: whether the indices change with the wavelength.
+    - `field_dependent`: False where rows and columns are apart: every column has the ghosts of one
+      column, every row those of one row, and the system is `Separable`.
+    - `precision`: of the rays and of the system's numbers.
+    - `level`: weight, mm, that counts as 1: the mean over pixels of the sum over all orders.
+    - `shares`: errors of the single decisions. `simpler`: predicted ones of `separable`, and of
+      `shift-invariant`: a convolution, with the ghosts of the sensor's middle everywhere.
+    """
+
+    camera: SeeThroughCamera
+    plane: ObjectPlane
+    tolerance: float
+    predicted_error: float
+    orders: int
+    all_orders: int
+    samples: int | None
+    dispersion: bool
+    field_dependent: bool
+    precision: Precision
+    level: float
+    shares: dict[str, float]
+    simpler: dict[str, float]
+
+    @property
+    def meets_tolerance(self) -> bool:
+        """False where no model meets the tolerance; the plan is then the best one."""
+        return self.predicted_error <= self.tolerance
+
+    def __str__(self) -> str:
+        met = "" if self.meets_tolerance else "  NOT MET"
+        band = "Bragg wavelength alone" if self.samples is None else f"{self.samples} parts"
+        share = {name: f": {size:.1e}" for name, size in self.shares.items()}
+        field = "every pixel its own ghosts" if self.field_dependent else "rows and columns apart"
+        simpler = ", ".join(f"{name} {size:.1e}" for name, size in self.simpler.items())
+        lines = [
+            ("tolerance", f"{self.tolerance:.1e}, predicted {self.predicted_error:.1e}{met}"),
+            ("ghosts", f"{self.orders} of {self.all_orders}{share['orders']}"),
+            ("smear", f"{band}{share['smear']}"),
+            ("dispersion", f"{'on' if self.dispersion else 'off'}{share['dispersion']}"),
+            ("precision", f"{self.precision}{share['precision']}"),
+            ("field", f"{field} (predicted with {simpler})"),
+        ]
+        width = max(len(name) for name, _ in lines)
+        return "\n".join(f"{name:<{width}}  {text}" for name, text in lines)
+
+    def system(self) -> Sparse | Separable:
+        """The planned operator, from the plane's cells to the sensor."""
+        camera = self.camera if self.dispersion else without_dispersion(self.camera)
+        with allow(self.precision, camera):
+            camera, plane = cast((camera, self.plane), self.precision)
+            size = float(seen_size(camera, plane))
+            counts = self.orders, self.samples
+            if not self.field_dependent:
+                return _separable(camera, plane, size, counts, self.level)
+            rays = smeared_rays(camera, pixel_centres(camera), plane, *counts)
+            matrix = system_matrix(rays, plane, size, self.level)
+            return Sparse(matrix, plane.shape, camera.sensor.shape)
+
+
+def plan(camera: SeeThroughCamera, scene: LitPlane, *, tolerance: float) -> Plan:
+    r"""How to model the capture of a scene to a relative error, at the least cost.
+
+    The error is ‖g − g₀‖₂/‖g₀‖₂ of the noise-free capture. g₀ has every order that can meet the
+    object, 64 parts of each band, dispersion, and double precision. What is decided: how many
+    orders; whether the band's smear and dispersion are modelled, and with how many parts; whether
+    rows and columns can be taken apart; the precision. All are compared with g₀ at 96 pixels
+    of 24 rows; no whole capture is computed.
+
+    A plane wave per pixel, thin holograms and Kogelnik's efficiency are common to all models, as is
+    the end of each band at |ξ| = 10π, beyond which lie some 1e-3 of the light.
+
+    **Errors**: ValueError for a tolerance that is not between 0 and 1 and where no light arrives;
+    TypeError for traced numbers and for a scene that is no `LitPlane`.
+    """
+    tolerance = float(checks.positive("tolerance", tolerance, "parts of one"))
+    if tolerance > 1:
+        raise ValueError(f"tolerance = {tolerance:g} is relative: give at most 1 (0.01 is 1 %)")
+    if not isinstance(scene, LitPlane):
+        raise TypeError(f"scene is a {type(scene).__name__}; give a waveguide.LitPlane")
+    if any(checks.is_traced(leaf) for leaf in jax.tree.leaves((camera, scene))):
+        raise TypeError("plan needs known numbers: call it outside of jit and grad")
+    with allow("float64", camera, scene):
+        probe = _Probe(*cast((camera, scene), "float64"))
+        share = 1.0
+        while True:
+            made = probe.plan(camera, scene.plane, tolerance, share)
+            if made.meets_tolerance or share < 0.05:
+                return made
+            share /= 2
+
+
+def without_dispersion(camera: SeeThroughCamera) -> SeeThroughCamera:
+    """The camera whose indices are, at every wavelength, those of its middle's colour."""
+    screen = camera.screen
+    wavelength, _ = screen.hologram.bragg_wavelength(jnp.zeros(2, camera.sensor.pitch.dtype))
+    indices = (screen.hologram.index, screen.glass_index)
+    constant = [ConstantIndex(index(wavelength)) for index in indices]
+    return eqx.tree_at(lambda c: (c.screen.hologram.index, c.screen.glass_index), camera, constant)
+
+
+class _Rays(NamedTuple):
+    """`SmearedRays` as NumPy arrays in double precision."""
+
+    points: Float[np.ndarray, "order pixel sample 2"]
+    weight: Float[np.ndarray, "order pixel"]
+
+
+class _Probe:
+    """A scene at some pixels: the reference, and what other models are away from it."""
+
+    def __init__(self, camera: SeeThroughCamera, scene: LitPlane):
+        self.camera, self.plane = camera, scene.plane
+        screen = camera.screen
+        indices = screen.hologram.index, screen.glass_index
+        self.dispersive = not all(isinstance(index, ConstantIndex) for index in indices)
+        self.size = float(seen_size(camera, scene.plane))
+        footprints(np.zeros((1, 2)), scene.plane, self.size)  # refuses cells that are too small
+        rows, columns = scene.plane.shape
+        self.sums = np.zeros((rows + 1, columns + 1))
+        self.sums[1:, 1:] = np.cumsum(np.cumsum(np.asarray(scene.image), axis=0), axis=1)
+        # The middle first, for what is shift-invariant.
+        self.pixels = np.concatenate([np.zeros((1, 2)), _spread(camera)])
+        self.all_orders = _all_orders(camera, scene.plane, self.pixels)
+        self._traced: dict = {}
+        rays = self.rays(True, "float64")
+        self.level = float(np.sum(rays.weight, axis=0)[1:].mean())
+        if self.level == 0:
+            raise ValueError("no light reaches the sensor by this screen: see check_screen")
+        self.reference = self.seen(rays)
+        self.norm = float(np.linalg.norm(self.reference.sum(axis=0)))
+        if self.norm == 0:
+            raise ValueError("no pixel sees the object's light; give it another place")
+        # Orders beyond the last that is computed, whose weights fall.
+        beyond = max(self.all_orders - _ORDERS[-1], 0)
+        tail = np.max(rays.weight[-1]) * beyond / self.level * np.sqrt(np.mean(scene.image**2))
+        self.tail = float(tail) * math.sqrt(len(self.pixels)) / self.norm
+
+    def rays(
+        self,
+        dispersion: bool,
+        precision: Precision,
+        samples: int | None = _SAMPLES[-1],
+        pixels: np.ndarray | None = None,
+    ) -> _Rays:
+        """All orders, at the probe's pixels or as many others; traced once for all samples."""
+        key = dispersion, precision, samples is None, None if pixels is None else pixels.tobytes()
+        if key not in self._traced:
+            camera = self.camera if dispersion else without_dispersion(self.camera)
+            places = jnp.asarray(self.pixels if pixels is None else pixels)
+            most = None if samples is None else _SAMPLES[-1]
+            camera, places, plane = cast((camera, places, self.plane), precision)
+            found = smeared_rays(camera, places, plane, _ORDERS[-1], most)
+            self._traced[key] = _Rays(*(np.asarray(part, float) for part in found))
+        return _grouped(self._traced[key], samples or 1)
+
+    def seen(self, rays: _Rays, orders: int | None = None) -> np.ndarray:
+        """What the pixels but the middle see of the image, (order, pixel)."""
+        points, weight = rays.points[:orders, 1:], rays.weight[:orders, 1:]
+        ratio = self.size / float(self.plane.pitch)
+        rows, columns = in_cells(points, self.plane)
+        total = 0.0
+        for down, across in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
+            corner = _bilinear(self.sums, rows + down * ratio / 2, columns + across * ratio / 2)
+            total = total + down * across * corner
+        return np.mean(total, axis=-1) / ratio**2 * weight / self.level
+
+    def plan(self, camera, plane, tolerance: float, share: float) -> Plan:
+        """The cheapest decisions, each within its part of what the tolerance leaves."""
+        left = tolerance * share / _MARGIN
+        shares = {}
+        orders, size = 1, 0.0
+        for orders in _ORDERS:
+            size = self._length(self.reference[orders:].sum(axis=0))
+            if size <= left * _SHARES["orders"]:
+                break
+        shares["orders"], left = size, max(left - size, 0.0)
+
+        def within(size: float, decision: str) -> bool:
+            return size <= left * _SHARES[decision]
+
+        def capture(*way):
+            return self.seen(self.rays(*way), orders).sum(axis=0)
+
+        so_far = found = self.reference[:orders].sum(axis=0)
+        samples = None
+        for samples in _SAMPLES:
+            found = capture(True, "float64", samples)
+            size = self._length(found - so_far)
+            if within(size, "smear"):
+                break
+        shares["smear"], left, so_far = size, max(left - size, 0.0), found
+        found = capture(False, "float64", samples) if self.dispersive else so_far
+        size = self._length(found - so_far)
+        dispersion = not within(size, "dispersion")
+        shares["dispersion"] = 0.0 if dispersion else size
+        left, so_far = left - shares["dispersion"], so_far if dispersion else found
+        found = capture(dispersion, "float32", samples)
+        size = self._length(found - so_far) + _SUMS
+        precision: Precision = "float32" if within(size, "precision") else "float64"
+        shares["precision"] = size if precision == "float32" else 0.0
+        simpler = {
+            "separable": self._separable(dispersion, samples, orders),
+            "shift-invariant": self._shift_invariant(dispersion, samples, orders),
+        }
+        found = capture(dispersion, precision, samples)
+        simpler = {name: _APART * self._predicted(c, precision) for name, c in simpler.items()}
+        predicted = self._predicted(found, precision)
+        apart_serves = simpler["separable"] <= tolerance
+        return Plan(
+            camera=camera,
+            plane=plane,
+            tolerance=tolerance,
+            predicted_error=simpler["separable"] if apart_serves else predicted,
+            orders=orders,
+            all_orders=self.all_orders,
+            samples=samples,
+            dispersion=dispersion,
+            field_dependent=not apart_serves,
+            precision=precision,
+            level=self.level,
+            shares=shares,
+            simpler=simpler,
+        )
+
+    def _predicted(self, capture: np.ndarray, precision: Precision) -> float:
+        away = capture - self.reference.sum(axis=0)
+        largest = float(np.abs(away).max()) / self.norm
+        rounding = _SUMS if precision == "float32" else 0.0
+        return _MARGIN * self._length(away) + _LARGEST * largest + self.tail + rounding
+
+    def _length(self, difference: np.ndarray) -> float:
+        return float(np.linalg.norm(difference)) / self.norm
+
+    def _separable(self, dispersion: bool, samples: int | None, orders: int):
+        """The capture with rows and columns apart."""
+        column, row = _cross(self.camera)
+        down, across = self.pixels.copy(), self.pixels.copy()
+        down[:, 0], across[:, 1] = column, row
+        vertical, horizontal = (
+            self.rays(dispersion, "float64", samples, places) for places in (down, across)
+        )
+        points = vertical.points.copy()
+        points[..., 0] = _mean_x(horizontal, orders)[None, :, None]
+        return self.seen(_Rays(points, vertical.weight), orders).sum(axis=0)
+
+    def _shift_invariant(self, dispersion: bool, samples: int | None, orders: int):
+        """The capture with the ghosts of the sensor's middle for all pixels."""
+        rays = self.rays(dispersion, "float64", samples)
+        scale = -float(self.camera.lens_distance + self.plane.distance)
+        linear = scale / float(self.camera.focal_distance) * self.pixels
+        points = rays.points[:, :1] + linear[None, :, None, :]
+        weight = np.broadcast_to(rays.weight[:, :1], rays.weight.shape)
+        return self.seen(_Rays(points, weight), orders).sum(axis=0)
+
+
+def _separable(camera, plane, size, counts, level) -> Separable:
+    """Rows with the ghosts of one column of pixels, columns with the mean shift of one row."""
+    grid, (column, row) = camera.sensor.grid, _cross(camera)
+    vertical = smeared_rays(
+        camera, jnp.stack([jnp.full_like(grid.y, column), grid.y], -1), plane, *counts
+    )
+    horizontal = smeared_rays(
+        camera, jnp.stack([grid.x, jnp.full_like(grid.x, row)], -1), plane, *counts
+    )
+    x = _mean_x(_Rays(*(np.asarray(part, float) for part in horizontal)), counts[0])
+    places = np.stack([x, np.full_like(x, float(plane.centre[1]))], axis=-1)
+    right = _overlaps(places[None, :, None], plane, size, 1)[0, :, 0]
+    left = _overlaps(np.asarray(vertical.points), plane, size, 0)
+    weight = np.asarray(vertical.weight, float)[..., None] / level
+    left = np.mean(left, axis=2) * weight
+    dtype = grid.y.dtype
+    return Separable(jnp.asarray(left.sum(axis=0), dtype), jnp.asarray(right, dtype))
+
+
+def _overlaps(points, plane, size, axis):
+    """Parts of the light of each point from every row (axis 0) or column of cells."""
+    first, parts = (part[axis] for part in footprints(points, plane, size))
+    dense = np.zeros((*first.shape, plane.shape[axis]))
+    for offset in range(parts.shape[-1]):
+        cell = first + offset
+        places = np.nonzero((cell >= 0) & (cell < plane.shape[axis]))
+        dense[(*places, cell[places])] += parts[..., offset][places]
+    return dense
+
+
+def _cross(camera) -> tuple[float, float]:
+    """The column, off the middle by the root mean square of x, and the row that stand for all."""
+    pitch, columns = float(camera.sensor.pitch), camera.sensor.shape[1]
+    return pitch * columns / math.sqrt(12), 0.0
+
+
+def _mean_x(rays: _Rays, orders: int):
+    """Where a pixel's light comes from along x, the mean over orders and colours."""
+    weight, x = rays.weight[:orders], rays.points[:orders, ..., 0].mean(axis=-1)
+    total = weight.sum(axis=0)
+    return (weight * x).sum(axis=0) / np.where(total > 0, total, 1)
+
+
+def _grouped(rays: _Rays, samples: int) -> _Rays:
+    """Fewer parts of the band, each the mean of as many neighbours."""
+    points = rays.points
+    groups = points.reshape(*points.shape[:2], samples, -1, 2)
+    return _Rays(groups.mean(axis=-2), rays.weight)
+
+
+def _spread(camera) -> np.ndarray:
+    """Pixels (x, y), mm, each at random in its own part of the sensor."""
+    pixels = np.asarray(pixel_centres(camera), float)
+    counts = [min(n, most) for n, most in zip(camera.sensor.shape, (_ROWS, _COLUMNS), strict=True)]
+    random = np.random.default_rng(0)
+    y, x = (
+        ((np.indices(counts)[axis] + random.uniform(size=counts)) * size / counts[axis]).astype(int)
+        for axis, size in enumerate(camera.sensor.shape)
+    )
+    return pixels[y, x].reshape(-1, 2)
+
+
+def _all_orders(camera, plane, pixels) -> int:
+    """A number of orders beyond which every ghost has left the object or the hologram."""
+    rays = trace(camera, jnp.asarray(pixels), plane.distance, 2)
+    first, second = np.asarray(rays.points[..., :2], float)
+    half = float(plane.pitch) * np.asarray(plane.shape[::-1]) / 2 + float(seen_size(camera, plane))
+    steps = second - first
+    # Of the band, light near the critical angle goes three quarters of the way and less.
+    ahead = np.asarray(plane.centre) + np.sign(steps) * half - first
+    lasts = np.where(np.abs(steps) > 1e-9, ahead / np.where(steps == 0, 1, 0.75 * steps), np.inf)
+    count = lasts.min(axis=-1)
+    count = float(np.max(np.where(rays.status[0] == RayStatus.OK, count, 0)))
+    return max(1, math.ceil(count) + 2)
+
+
+def _bilinear(sums, rows, columns):
+    """Sums over cells up to places between their edges; beyond the edges nothing is added."""
+    limits = sums.shape[0] - 1, sums.shape[1] - 1
+    rows, columns = (np.clip(p, 0, n) for p, n in zip((rows, columns), limits, strict=True))
+    i, j = (np.minimum(p.astype(int), n - 1) for p, n in zip((rows, columns), limits, strict=True))
+    y, x = rows - i, columns - j
+    upper = sums[i, j] * (1 - x) + sums[i, j + 1] * x
+    lower = sums[i + 1, j] * (1 - x) + sums[i + 1, j + 1] * x
+    return upper * (1 - y) + lower * y
