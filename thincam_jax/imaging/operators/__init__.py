@@ -6,6 +6,9 @@ from thincam_jax.imaging.operators.crop_convolution import CropConvolution as Cr
 from thincam_jax.imaging.operators.crop_convolution import kernel_grid as kernel_grid
 from thincam_jax.imaging.operators.crop_convolution import kernel_shape as kernel_shape
 from thincam_jax.imaging.operators.crop_convolution import window_shape as window_shape
+from thincam_jax.imaging.operators.low_rank import LowRank as LowRank
+from thincam_jax.imaging.operators.low_rank import LowRankFit as LowRankFit
+from thincam_jax.imaging.operators.low_rank import low_rank_psf as low_rank_psf
 from thincam_jax.imaging.operators.masked import Masked as Masked
 from thincam_jax.imaging.operators.masked import Scaled as Scaled
 from thincam_jax.imaging.operators.matrix import Matrix as Matrix

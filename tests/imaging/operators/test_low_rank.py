@@ -1,0 +1,91 @@
+"""A sum of convolutions against the direct sum over a PSF that changes over the field."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import thincam_jax as tc
+from helpers import relative_l2
+from thincam_jax.imaging.metrics import psnr
+from thincam_jax.imaging.operators import adjoint_error, low_rank_psf
+
+SENSOR, FIELD, KERNEL, PITCH = (21, 26), (17, 22), (11, 13), 0.5
+
+
+def psf(y, x):
+    """Of a point at (y, x), each from −1 to 1: a spot that grows and moves, and a ghost."""
+    rows, columns = (np.arange(n) - n // 2 for n in KERNEL)
+    width = 1.2 + 0.3 * y + 0.2 * x**2
+    rows, columns = rows[:, None] - 0.4 * x, columns + 0.5 * y * x
+    ghost = (0.3 + 0.1 * x) * np.exp(-((rows - 3) ** 2 + columns**2) / 2)
+    return np.exp(-(rows**2 + columns**2) / (2 * width**2)) / width**2 + ghost
+
+
+def grid(points):
+    places = [np.linspace(-1, 1, n) for n in points]
+    return np.array([[psf(y, x) for x in places[1]] for y in places[0]])
+
+
+def direct(image):
+    """g = Σ_u f(u) h(x − u; u), point by point."""
+    rows, columns = (s + k - 1 for s, k in zip(FIELD, KERNEL, strict=True))
+    whole = np.zeros((rows, columns))
+    places = [np.linspace(-1, 1, n) for n in FIELD]
+    for m, n in np.ndindex(*FIELD):
+        spot = PITCH**2 * image[m, n] * psf(places[0][m], places[1][n])
+        whole[m : m + KERNEL[0], n : n + KERNEL[1]] += spot
+    margins = [(r - s) // 2 for r, s in zip(whole.shape, SENSOR, strict=True)]
+    return whole[margins[0] :, margins[1] :][: SENSOR[0], : SENSOR[1]]
+
+
+def test_direct_sum():
+    """The error is what is stated, and falls with tolerance and grid."""
+    image = np.random.default_rng(2).uniform(size=FIELD)
+    expected, found = direct(image), []
+    for tolerance, points in ((0.1, (5, 5)), (1e-2, (9, 11)), (1e-3, (21, 21))):
+        fit = low_rank_psf(grid(points), PITCH, SENSOR, FIELD, tolerance=tolerance)
+        error = relative_l2(np.asarray(fit.operator(jnp.asarray(image))), expected)
+        assert fit.truncation_error <= tolerance
+        assert error < fit.truncation_error + fit.interpolation_error
+        found.append((fit.operator.weights.shape[0], error))
+    ranks, errors = zip(*found, strict=True)
+    assert ranks[0] < ranks[1] < ranks[2] < 20
+    assert errors[2] < 1e-3 < errors[0]
+
+
+def test_adjoint_and_batches():
+    operator = low_rank_psf(grid((5, 7)), PITCH, SENSOR, FIELD, tolerance=0.03).operator
+    assert adjoint_error(operator, jax.random.key(3)) < 1e-14
+    images = jax.random.uniform(jax.random.key(4), (2, 3, *FIELD))
+    one_by_one = [[operator(image) for image in row] for row in images]
+    np.testing.assert_allclose(operator(images), one_by_one, atol=1e-13)
+
+
+def test_images_come_back():
+    """By the solver of every camera; with one PSF for the whole field they do not."""
+    image = np.zeros(FIELD)
+    image[4:12, 5:9], image[8:11, 12:19] = 1.0, 0.6
+    capture = jnp.asarray(direct(image))[None, None]
+    reached = []
+    for tolerance in (1e-2, 0.5):
+        operator = low_rank_psf(grid((9, 9)), PITCH, SENSOR, FIELD, tolerance=tolerance).operator
+        recording = tc.Recording(capture, [operator], noise_variance=1e-6)
+        found = tc.reconstruct(recording, tc.AdmmTV(0.5, iterations=30))
+        reached.append(float(psnr(np.squeeze(np.asarray(found.image)), image)))
+    assert reached[0] > 25
+    assert reached[0] - reached[1] > 6
+
+
+@pytest.mark.parametrize(
+    ("psfs", "tolerance", "message"),
+    [
+        (np.ones((1, 3, *KERNEL)), 0.1, "give .grid y, grid x, k, l. with at least 2×2 points"),
+        (np.ones((3, *KERNEL)), 0.1, "psfs has shape .3, 11, 13.; give"),
+        (np.zeros((3, 3, *KERNEL)), 0.1, "psfs are zero everywhere; give PSFs with light"),
+        (np.ones((3, 3, *KERNEL)), 2.0, "tolerance = 2 is relative: give less than 1"),
+    ],
+)
+def test_errors(psfs, tolerance, message):
+    with pytest.raises(ValueError, match=message):
+        low_rank_psf(psfs, PITCH, SENSOR, FIELD, tolerance=tolerance)

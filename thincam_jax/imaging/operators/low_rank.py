@@ -1,0 +1,116 @@
+"""A camera whose PSF changes slowly over the field."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+import scipy.interpolate
+from jaxtyping import Array, Float
+
+from thincam_jax._core import checks
+from thincam_jax._core.checks import Number, Numbers, Shape
+from thincam_jax.imaging.operators.base import AbstractOperator, real_numbers, require_shape
+from thincam_jax.imaging.operators.crop_convolution import CropConvolution
+
+
+class LowRank(AbstractOperator):
+    r"""A sum of convolutions of the field, each weighted by a map of its own.
+
+    .. math:: g = \sum_r p_r * (w_r f), \qquad h(\mathbf x; \mathbf u) = \sum_r
+        w_r(\mathbf u)\, p_r(\mathbf x - \mathbf u)
+
+    (Flicker and Rigaut, J. Opt. Soc. Am. A 22, 504, 2005). `low_rank_psf` makes it of measured
+    PSFs.
+
+    - `weights`: w_r, (r, m, n). `convolution`: with all p_r, summed over them.
+    """
+
+    weights: Float[Array, "r m n"]
+    convolution: CropConvolution
+
+    @property
+    def in_shape(self) -> tuple[int, ...]:
+        return self.weights.shape[1:]
+
+    @property
+    def out_shape(self) -> tuple[int, ...]:
+        return self.convolution.sensor_shape
+
+    def __call__(self, image: Float[Array, "..."]) -> Float[Array, "..."]:
+        require_shape("image", image, self.in_shape)
+        return self.convolution(image[..., None, :, :] * self.weights)
+
+    def adjoint(self, capture: Float[Array, "..."]) -> Float[Array, "..."]:
+        require_shape("capture", capture, self.out_shape)
+        return jnp.sum(self.convolution.adjoint(capture) * self.weights, axis=-3)
+
+
+class LowRankFit(NamedTuple):
+    """An operator for a grid of PSFs, and how far it is from them.
+
+    - `truncation_error`: of the PSFs at the grid's points, ‖difference‖₂/‖PSFs‖₂.
+    - `interpolation_error`: an estimate of the same between the points: a quarter of what is off
+      where every other point is left out and interpolated; infinite for grids too small for it.
+    """
+
+    operator: LowRank
+    truncation_error: float
+    interpolation_error: float
+
+
+def low_rank_psf(
+    psfs: Numbers, pitch: Number, sensor_shape: Shape, field_shape: Shape, *, tolerance: float
+) -> LowRankFit:
+    """The sum of fewest convolutions whose PSFs are within a tolerance of a measured grid of them.
+
+    **Arguments**
+
+    - `psfs`: (grid y, grid x, k, l): PSFs of points spread evenly from the field's first row and
+      column to its last, each about the place where the field's sample is on the sensor.
+    - `pitch`, `sensor_shape`, `field_shape`: as `CropConvolution` takes them; k and l too.
+    - `tolerance`: of the truncation, relative L2 over the whole grid.
+
+    The p_r are the singular vectors of the PSFs; their weights are interpolated linearly.
+
+    **Errors**: ValueError for a grid of fewer than 2×2 points, PSFs that are all zero, and a
+    tolerance that is not between 0 and 1.
+    """
+    grid = real_numbers("psfs", psfs)
+    field_shape = checks.shape2d("field_shape", field_shape)
+    tolerance = float(checks.positive("tolerance", tolerance, "parts of one"))
+    if tolerance >= 1:
+        raise ValueError(f"tolerance = {tolerance:g} is relative: give less than 1 (0.01 is 1 %)")
+    if grid.ndim != 4 or min(grid.shape[:2]) < 2:
+        raise ValueError(
+            f"psfs has shape {grid.shape}; give (grid y, grid x, k, l) with at least 2×2 points"
+        )
+    points, size = grid.shape[:2], grid.shape[2:]
+    flat = np.asarray(grid, float).reshape(points[0] * points[1], -1)
+    left, values, right = np.linalg.svd(flat, full_matrices=False)
+    whole = np.linalg.norm(values)
+    if whole == 0:
+        raise ValueError("psfs are zero everywhere; give PSFs with light")
+    # What is left out by the first 0, 1, 2, … of them.
+    tails = np.sqrt(np.append(np.cumsum(values[::-1] ** 2)[::-1], 0)) / whole
+    rank = max(1, int(np.argmax(tails <= tolerance)))
+    maps = (left[:, :rank] * values[:rank]).reshape(*points, rank)
+    weights = _interpolated(maps, field_shape)
+    coarse = [slice(None, None, 2)] * 2
+    estimate = np.inf
+    if all(n >= 3 and n % 2 for n in points):
+        between = _interpolated(maps[tuple(coarse)], points)
+        # The p_r are orthonormal, so that lengths of weights are those of PSFs.
+        estimate = float(np.linalg.norm(between - np.moveaxis(maps, -1, 0))) / whole / 4
+    dtype = grid.dtype
+    kernels = jnp.asarray(right[:rank].reshape(rank, *size), dtype)
+    convolution = CropConvolution(kernels, pitch, sensor_shape, field_shape, summed=1)
+    operator = LowRank(jnp.asarray(weights, dtype), convolution)
+    return LowRankFit(operator, float(tails[rank]), estimate)
+
+
+def _interpolated(maps, shape) -> np.ndarray:
+    """(grid y, grid x, r) on (r, *shape), from corner to corner."""
+    axes = [np.linspace(0, 1, n) for n in maps.shape[:2]]
+    y, x = np.meshgrid(*(np.linspace(0, 1, n) for n in shape), indexing="ij")
+    found = scipy.interpolate.RegularGridInterpolator(axes, maps)(np.stack([y, x], axis=-1))
+    return np.moveaxis(found, -1, 0)
