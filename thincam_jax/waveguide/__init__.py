@@ -12,6 +12,7 @@ from thincam_jax.waveguide.planning import Plan as Plan
 from thincam_jax.waveguide.planning import plan as plan
 from thincam_jax.waveguide.rays import Rays as Rays
 from thincam_jax.waveguide.rays import RayStatus as RayStatus
+from thincam_jax.waveguide.rays import check_screen as check_screen
 from thincam_jax.waveguide.rays import pixel_centres as pixel_centres
 from thincam_jax.waveguide.rays import trace as trace
 from thincam_jax.waveguide.refractive_index import CauchyIndex as CauchyIndex

@@ -89,6 +89,7 @@ def band_about(
 ) -> Band:
     """From ξ = −10π to 10π about the Bragg wavelengths, in `nodes` even steps."""
     slope = _detuning_slope(hologram, tangential, centre)
+    slope = jnp.where(slope == 0, jnp.inf, slope)  # no fringes: no band
     # ξ is linear in λ but for dispersion and the change of c_S.
     offsets = jnp.linspace(-10 * math.pi, 10 * math.pi, nodes + 1, dtype=centre.dtype)
     wavelengths = centre[..., None] + offsets / slope[..., None]

@@ -103,7 +103,8 @@ class VolumeHologram(eqx.Module):
 
     def diffracted(self, direction: Float[Array, "*ray 3"]) -> Float[Array, "*ray 3"]:
         """s′ of Bragg-matched light of direction s: the reflection at the fringes."""
-        unit = self.grating / jnp.sqrt(jnp.sum(self.grating**2))
+        power = jnp.sum(self.grating**2)
+        unit = self.grating / jnp.sqrt(jnp.where(power > 0, power, 1))
         along = jnp.sum(direction * unit, axis=-1, keepdims=True)
         return direction - 2 * along * unit
 
@@ -126,7 +127,8 @@ class VolumeHologram(eqx.Module):
         power = jnp.sum(self.grating**2)
         if isinstance(self.index, ConstantIndex):
             inside = jnp.sqrt(self.index.value**2 - squared)
-            found = 4 * jnp.pi * (across + inside * self.grating[2]) / power
+            found = 4 * jnp.pi * (across + inside * self.grating[2])
+            found = found / jnp.where(power > 0, power, 1)  # no fringes match nothing
             return jnp.where(found > 0, found, 1.0), found > 0
         low, high = self.index.band
 

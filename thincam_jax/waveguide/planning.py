@@ -30,9 +30,9 @@ from thincam_jax.waveguide.system import (
 _ORDERS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
 _SAMPLES = (None, 1, 2, 4, 8, 16, 32, 64)
 # Rows of the sensor, and pixels of each, at which the models are compared: along the rows little
-# changes. What keeps the error there above that of the whole sensor, over random cameras: factors of
-# the root mean square, of the largest, where few pixels hold the error, and of both where rows and
-# columns are taken apart, which is off most at the ends of few columns.
+# changes. What keeps the error there above that of the whole sensor over random cameras: factors
+# of the root mean square, of the largest, where few pixels hold the error, and of both where rows
+# and columns are taken apart, which is off most at the ends of few columns.
 _ROWS, _COLUMNS = 24, 4
 _MARGIN, _LARGEST, _APART = 1.2, 1.5, 1.6
 # Parts of the tolerance that the decisions may use, in the order in which they are taken.

@@ -11,6 +11,7 @@ without any angle, so that it has gradients on the axis too.
 """
 
 import enum
+import math
 from typing import NamedTuple
 
 import equinox as eqx
@@ -159,3 +160,42 @@ def pixel_centres(camera: SeeThroughCamera) -> Float[Array, "y x 2"]:
     grid = camera.sensor.grid
     y, x = jnp.meshgrid(grid.y, grid.x, indexing="ij")
     return jnp.stack([x, y], axis=-1)
+
+
+def check_screen(camera: SeeThroughCamera) -> None:
+    """ValueError, saying what to change, where the sensor's middle would see nothing.
+
+    Light has to be diffracted beyond the critical angle of the glass, and no hologram may be
+    shorter than the way 2wp/√(n_g² − p²) from one contact to the next, or light would pass it by.
+    """
+    screen = camera.screen
+    _, wavelength, guided, left, fault = bragg_rays(
+        camera, jnp.zeros_like(screen.hologram.grating[:2])
+    )
+    index, across = float(screen.glass_index(wavelength)), float(jnp.linalg.norm(guided))
+    if fault == RayStatus.NO_BRAGG_MATCH:
+        raise ValueError(
+            "the hologram diffracts no wavelength of its index's band back to the sensor's middle; "
+            "record it with other angles or another wavelength"
+        )
+    if fault == RayStatus.EVANESCENT:
+        raise ValueError(
+            f"light is diffracted to n sin Θ' = {across:.4g}, which a glass of n = {index:.4g} "
+            "cannot carry; give a smaller reference angle or a glass of higher index"
+        )
+    if fault == RayStatus.NOT_GUIDED:
+        angle, critical = (math.degrees(math.asin(sine / index)) for sine in (across, 1.0))
+        raise ValueError(
+            f"light is diffracted to Θ' = {angle:.2f}° in the glass, under the critical angle of "
+            f"{critical:.2f}° (n = {index:.4g}), and leaves it; give a larger reference angle"
+        )
+    bounce = 2 * float(screen.glass_thickness) * guided / float(left) ** 0.5
+    for name, hologram in (("top", screen.top), ("bottom", screen.bottom)):
+        if hologram is not None and bool(jnp.any(hologram.size < jnp.abs(bounce))):
+            size, step = (
+                ", ".join(f"{float(n):.4g}" for n in v) for v in (hologram.size, abs(bounce))
+            )
+            raise ValueError(
+                f"{name}.size = ({size}) mm is smaller than one bounce of the guided light, "
+                f"({step}) mm: light would pass it by; give a larger hologram or a thinner glass"
+            )
