@@ -107,6 +107,26 @@ for ax, (values, label) in zip(axes, maps, strict=True):
 figure.savefig(FIGURES / "field.png", dpi=110)
 
 # %% [markdown]
+# ## The smear of the ghosts
+#
+# A pixel's band is several nanometres wide. Its colours leave in one direction but took other paths
+# in the glass: a ghost is smeared along the screen, wider with every order, and the side lobes of
+# the band show in it. Grey is what a pixel sees.
+
+# %%
+middle = wg.trace(camera, jnp.zeros((1, 2)), distance, 3)
+band = wg.trace_band(camera, jnp.zeros((1, 2)), distance, 3, 2048)
+pixel_seen = 4.8e-3 * binned * (10.0 + distance) / 6.0
+figure, axes = plt.subplots(1, 3, figsize=(10, 3), layout="constrained")
+for order, ax in enumerate(axes):
+    away = np.asarray(band.points[order, 0, :, 1] - middle.points[order, 0, 1])
+    ax.hist(away, np.linspace(-4, 4, 121), color="0.3", density=True)
+    ax.axvspan(-pixel_seen / 2, pixel_seen / 2, color="0.85", zorder=0)
+    ax.set(xlabel="y from the Bragg ray's end (mm)", title=f"order {order}")
+axes[0].set_ylabel("light (1/mm)")
+figure.savefig(FIGURES / "smear.png", dpi=110)
+
+# %% [markdown]
 # ## A capture, and the image that comes back
 #
 # The capture is the sum of four ghosts with the weights ∫η²(1−η)ⁱ dλ. The system is a sparse matrix

@@ -191,3 +191,10 @@ def test_screen_reconstruction_page():
     """A uniform scene comes back, by the solver and by the stream."""
     names = run_examples("docs/screen_reconstruction.md")
     np.testing.assert_allclose(names["image"], 1, atol=0.02)
+
+
+def test_screen_models_page(capsys):
+    names = run_examples("docs/screen_models.md")
+    assert names["plan"].meets_tolerance and names["capture"].shape == (110, 110)
+    assert names["fit"].truncation_error < 1e-3
+    assert "ghosts" in capsys.readouterr().out

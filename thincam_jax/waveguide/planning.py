@@ -33,7 +33,7 @@ _SAMPLES = (None, 1, 2, 4, 8, 16, 32, 64)
 # changes. What keeps the error there above that of the whole sensor over random cameras: factors
 # of the root mean square, of the largest, where few pixels hold the error, and of both where rows
 # and columns are taken apart, which is off most at the ends of few columns.
-_ROWS, _COLUMNS = 24, 4
+_ROWS, _COLUMNS = 24, 8
 _MARGIN, _LARGEST, _APART = 1.2, 1.5, 1.6
 # Parts of the tolerance that the decisions may use, in the order in which they are taken.
 _SHARES = {"orders": 0.4, "smear": 0.6, "dispersion": 0.4, "precision": 0.4}
@@ -129,7 +129,7 @@ def plan(camera: SeeThroughCamera, scene: LitPlane, *, tolerance: float) -> Plan
     The error is ‖g − g₀‖₂/‖g₀‖₂ of the noise-free capture. g₀ has every order that can meet the
     object, 64 parts of each band, dispersion, and double precision. What is decided: how many
     orders; whether the band's smear and dispersion are modelled, and with how many parts; whether
-    rows and columns can be taken apart; the precision. All are compared with g₀ at 96 pixels
+    rows and columns can be taken apart; the precision. All are compared with g₀ at 192 pixels
     of 24 rows; no whole capture is computed.
 
     A plane wave per pixel, thin holograms and Kogelnik's efficiency are common to all models, as is
@@ -186,7 +186,8 @@ class _Probe:
         self.sums[1:, 1:] = np.cumsum(np.cumsum(np.asarray(scene.image), axis=0), axis=1)
         # The middle first, for what is shift-invariant.
         self.pixels = np.concatenate([np.zeros((1, 2)), _spread(camera)])
-        self.all_orders = _all_orders(camera, scene.plane, self.pixels)
+        seen = _orders_seen(camera, scene.plane, self.pixels)
+        self.all_orders = int(seen.max())
         self._traced: dict = {}
         rays = self.rays(True, "float64")
         self.level = float(np.sum(rays.weight, axis=0)[1:].mean())
@@ -197,9 +198,9 @@ class _Probe:
         if self.norm == 0:
             raise ValueError("no pixel sees the object's light; give it another place")
         # Orders beyond the last that is computed, whose weights fall.
-        beyond = max(self.all_orders - _ORDERS[-1], 0)
-        tail = np.max(rays.weight[-1]) * beyond / self.level * np.sqrt(np.mean(scene.image**2))
-        self.tail = float(tail) * math.sqrt(len(self.pixels)) / self.norm
+        tail = rays.weight[-1] * np.maximum(seen - _ORDERS[-1], 0) / self.level
+        brightness = float(np.sqrt(np.mean(scene.image**2)))
+        self.tail = float(np.linalg.norm(tail)) * brightness / self.norm
 
     def rays(
         self,
@@ -381,8 +382,8 @@ def _spread(camera) -> np.ndarray:
     return pixels[y, x].reshape(-1, 2)
 
 
-def _all_orders(camera, plane, pixels) -> int:
-    """A number of orders beyond which every ghost has left the object or the hologram."""
+def _orders_seen(camera, plane, pixels) -> np.ndarray:
+    """For each pixel, a number of orders beyond which every ghost has left the object."""
     rays = trace(camera, jnp.asarray(pixels), plane.distance, 2)
     first, second = np.asarray(rays.points[..., :2], float)
     half = float(plane.pitch) * np.asarray(plane.shape[::-1]) / 2 + float(seen_size(camera, plane))
@@ -391,8 +392,7 @@ def _all_orders(camera, plane, pixels) -> int:
     ahead = np.asarray(plane.centre) + np.sign(steps) * half - first
     lasts = np.where(np.abs(steps) > 1e-9, ahead / np.where(steps == 0, 1, 0.75 * steps), np.inf)
     count = lasts.min(axis=-1)
-    count = float(np.max(np.where(rays.status[0] == RayStatus.OK, count, 0)))
-    return max(1, math.ceil(count) + 2)
+    return np.ceil(np.where(rays.status[0] == RayStatus.OK, np.maximum(count, 0), 0)) + 1
 
 
 def _bilinear(sums, rows, columns):

@@ -118,7 +118,7 @@ def _covered(margin):
 
     Without it an edge would jump from node to node, and no small number of nodes would do.
     """
-    change = jnp.abs(jnp.gradient(margin))
+    change = jnp.abs(jnp.asarray(jnp.gradient(margin)))
     part = jnp.clip(0.5 + margin / jnp.where(change > 0, change, 1), 0, 1)
     return jnp.where(change > 0, part, (margin > 0).astype(margin.dtype))
 

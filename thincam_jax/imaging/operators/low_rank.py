@@ -105,7 +105,7 @@ def low_rank_psf(
     kernels = jnp.asarray(right[:rank].reshape(rank, *size), dtype)
     convolution = CropConvolution(kernels, pitch, sensor_shape, field_shape, summed=1)
     operator = LowRank(jnp.asarray(weights, dtype), convolution)
-    return LowRankFit(operator, float(tails[rank]), estimate)
+    return LowRankFit(operator, float(tails[rank]), float(estimate))
 
 
 def _interpolated(maps, shape) -> np.ndarray:
