@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from waveguide.setting import camera, hologram
+from waveguide.setting import hologram
 
 import thincam_jax as tc
 from helpers import relative_l2
@@ -119,9 +119,9 @@ def scene():
     return wg.LitPlane(wg.ObjectPlane(CELLS, 550.0, 150.0, (0.0, 27.0)), pictures()[0])
 
 
-def thin(glass):
+def thin(glass, modulation=0.02):
     """A plate of that thickness before the test's sensor."""
-    screen = wg.Screen(hologram(), glass, 1.5)
+    screen = wg.Screen(hologram(index_modulation=modulation), glass, 1.5)
     return wg.SeeThroughCamera(screen, tc.Sensor(SHAPE, 66 * um), 6.0, 10.0)
 
 
@@ -132,9 +132,7 @@ def test_what_a_scene_requires(scene):
     assert isinstance(loose.system(), Separable) and isinstance(strict.system(), Sparse)
     assert loose.orders < strict.orders
     assert loose.samples is None and strict.samples is not None
-    # A convolution is far off in 5 mm of glass and near in 0.02 mm of it.
-    assert strict.simpler["shift-invariant"] > 0.2
-    assert wg.plan(thin(0.02), scene, tolerance=0.2).simpler["shift-invariant"] < 0.02
+    assert strict.simpler["shift-invariant"] > 0.2  # a convolution is far off in 5 mm of glass
     for words in (
         "tolerance   1.0e-03, predicted",
         f"ghosts      {strict.orders} of",
@@ -148,8 +146,7 @@ def test_what_a_scene_requires(scene):
     [
         ({"tolerance": 0.0}, ValueError, "tolerance = 0.0 is not positive"),
         ({"tolerance": 3.0}, ValueError, "tolerance = 3 is relative: give at most 1"),
-        ({"scene": np.ones(CELLS)}, TypeError, "scene is a ndarray; give a waveguide.LitPlane"),
-        ({"camera": camera(glass=1.2)}, ValueError, "no light reaches the sensor.*check_screen"),
+        ({"camera": thin(5.0, 0.0)}, ValueError, "no light reaches the sensor.*check_screen"),
     ],
 )
 def test_errors(scene, change, error, message):

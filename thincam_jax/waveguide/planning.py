@@ -197,8 +197,10 @@ class _Probe:
         self.norm = float(np.linalg.norm(self.reference.sum(axis=0)))
         if self.norm == 0:
             raise ValueError("no pixel sees the object's light; give it another place")
-        # Orders beyond the last that is computed, whose weights fall.
-        tail = rays.weight[-1] * np.maximum(seen - _ORDERS[-1], 0) / self.level
+        # Orders beyond the last that is computed.
+        # Weights fall as i^(−3/2), so that all that follow are at most twice I times the last.
+        beyond = np.clip(seen - _ORDERS[-1], 0, 2 * _ORDERS[-1])
+        tail = rays.weight[-1] * beyond / self.level
         brightness = float(np.sqrt(np.mean(scene.image**2)))
         self.tail = float(np.linalg.norm(tail)) * brightness / self.norm
 
