@@ -9,7 +9,7 @@ from commands.test_cli import call, one_line
 from helpers import ROOT
 from thincam_jax.commands import examples
 from thincam_jax.commands.design.config import load_design
-from thincam_jax.commands.refocus.config import load_experiment
+from thincam_jax.commands.kinds import load_experiment
 
 FILES = sorted((ROOT / "configs").glob("*.yaml"))
 

@@ -46,6 +46,7 @@ def quantity(kind: str, unit: str, *, positive: bool = False):
 
 
 Length = Annotated[float, *quantity("length", "mm", positive=True)]
+Position = Annotated[float, *quantity("length", "mm")]
 Wavelength = Annotated[float, *quantity("wavelength", "mm"), AfterValidator(_optical)]
 Curvature = Annotated[float, *quantity("curvature", "rad/mm^2", positive=True)]
 Angle = Annotated[float, *quantity("angle", "rad")]
@@ -258,9 +259,6 @@ class ExperimentConfig(Section):
     name: Name
     title: str = ""
     seed: Annotated[int, Field(ge=0, lt=2**32, strict=True)] = 0
-    wavelength: Wavelength
-    model: Model = "separable"
-    pixel_integration: bool = True
     _places: Places = pydantic.PrivateAttr(default_factory=Places)
 
     def place_of(self, *location: str | int) -> str:
@@ -274,7 +272,15 @@ class ExperimentConfig(Section):
         return copy
 
 
-class CamerasConfig(ExperimentConfig):
+class LenslessConfig(ExperimentConfig):
+    """The light of lensless cameras, and how their PSFs are computed."""
+
+    wavelength: Wavelength
+    model: Model = "separable"
+    pixel_integration: bool = True
+
+
+class CamerasConfig(LenslessConfig):
     """Cameras and the methods that reconstruct their captures."""
 
     prior: Prior = "inverse_square"

@@ -8,7 +8,7 @@ from thincam_jax.commands.checked_config import dump_config, shortened
 from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.design.config import load_design
 from thincam_jax.commands.design.record import broken_limits
-from thincam_jax.commands.refocus.config import load_experiment
+from thincam_jax.commands.kinds import load_experiment
 
 
 def fault(folder, *overrides, text=tiny.TEXT):

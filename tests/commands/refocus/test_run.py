@@ -12,8 +12,9 @@ from commands.study.tiny import Told
 from helpers import ROOT
 from thincam_jax.commands.checked_config import dump_config
 from thincam_jax.commands.config_file import ConfigError
+from thincam_jax.commands.kinds import load_experiment
 from thincam_jax.commands.refocus.build import build_refocus, field_shape, object_box, sweep_method
-from thincam_jax.commands.refocus.config import RefocusConfig, load_experiment
+from thincam_jax.commands.refocus.config import RefocusConfig
 from thincam_jax.commands.refocus.run import run_refocus
 from thincam_jax.commands.run_folder import RunFolder
 from thincam_jax.commands.study.config import StudyConfig, load_config

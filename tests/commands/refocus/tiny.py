@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from thincam_jax.commands.refocus.config import load_experiment
+from thincam_jax.commands.kinds import load_experiment
 
 TEXT = """\
 name: tiny-refocus

@@ -15,8 +15,8 @@ from thincam_jax.commands.sections import (
     PHASES,
     Angle,
     ApertureConfig,
-    ExperimentConfig,
     Length,
+    LenslessConfig,
     Name,
     NoiseConfig,
     ObjectConfig,
@@ -290,7 +290,7 @@ class TrainingConfig(Section):
         return images
 
 
-class DesignConfig(ExperimentConfig):
+class DesignConfig(LenslessConfig):
     """A search for the best design, and its simulation beside the design to beat."""
 
     kind: Literal["design"]

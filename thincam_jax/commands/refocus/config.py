@@ -1,27 +1,21 @@
 """Experiment files of `kind: refocus`: objects at several distances, and a sweep of the focus."""
 
-from pathlib import Path
 from typing import Annotated, Literal
 
 import pydantic
 from pydantic import Field
 
-from thincam_jax.commands.checked_config import load_as
-from thincam_jax.commands.config_file import ConfigError, read_raw
 from thincam_jax.commands.sections import (
     CamerasConfig,
     Length,
     Name,
+    Position,
     Section,
     TargetConfig,
     check_names,
     misfit,
-    quantity,
 )
-from thincam_jax.commands.study.config import StudyConfig, load_config
 from thincam_jax.reconstruction.depth.focus import Measure
-
-Position = Annotated[float, *quantity("length", "mm")]
 
 
 class PlacedConfig(TargetConfig):
@@ -78,19 +72,3 @@ class RefocusConfig(CamerasConfig):
                 )
                 raise misfit(message, "objects", index, "distance")
         return self
-
-
-def load_experiment(
-    path: str | Path, overrides: tuple[str, ...] = ()
-) -> StudyConfig | RefocusConfig:
-    """Read and check an experiment file of either kind; errors as of `load_config`."""
-    kind = read_raw(Path(path))[0].get("kind")
-    if kind is None:
-        return load_config(path, overrides)
-    if kind == "design":
-        raise ConfigError(f"{path}: kind: is a design; give it to 'thincam design'")
-    if kind != "refocus":
-        raise ConfigError(
-            f"{path}: kind: {kind!r} is unknown; write 'kind: refocus', or leave it out for a study"
-        )
-    return load_as(RefocusConfig, path, overrides, "objects")

@@ -29,9 +29,11 @@ def run(
 
     with told(finished):
         from thincam_jax.commands.config_file import slug
-        from thincam_jax.commands.refocus.config import RefocusConfig, load_experiment
+        from thincam_jax.commands.kinds import load_experiment
+        from thincam_jax.commands.refocus.config import RefocusConfig
         from thincam_jax.commands.refocus.console import refocus
         from thincam_jax.commands.run_folder import RunFolder
+        from thincam_jax.commands.screen.config import ScreenConfig
         from thincam_jax.commands.study.build import build_study
         from thincam_jax.commands.study.run import run_study
 
@@ -39,6 +41,11 @@ def run(
         folder = RunFolder(out or Path("runs") / slug(asked.name))
         if isinstance(asked, RefocusConfig):
             refocus(asked, folder)
+            return
+        if isinstance(asked, ScreenConfig):
+            from thincam_jax.commands.screen.run import screen
+
+            screen(asked, folder)
             return
         study = build_study(asked)
         warn(study.warnings)

@@ -48,7 +48,7 @@ def sweep(
         import jax
 
         from thincam_jax.commands.config_file import ConfigError, slug
-        from thincam_jax.commands.refocus.config import load_experiment
+        from thincam_jax.commands.kinds import load_experiment
         from thincam_jax.commands.study.config import StudyConfig
         from thincam_jax.commands.sweep.folder import SweepFolder
         from thincam_jax.commands.sweep.grid import read_axes
@@ -56,7 +56,7 @@ def sweep(
 
         study = load_experiment(config, tuple(set_ or ()))
         if not isinstance(study, StudyConfig):
-            raise ConfigError(f"{config}: is of kind refocus; a sweep takes a study")
+            raise ConfigError(f"{config}: is of kind {study.kind}; a sweep takes a study")
         axes = read_axes(grid or [], study.model_dump(mode="json", exclude_none=True))
         points = make_points(study, axes, bool(jax.config.read("jax_enable_x64")))
         folder = SweepFolder(out or Path("runs") / f"{slug(study.name)}-sweep")

@@ -1,0 +1,140 @@
+"""Screen experiments: what a file may say, what a run finds and leaves behind."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+from commands.screen import tiny
+from commands.study.tiny import Told
+
+from helpers import ROOT
+from thincam_jax.commands.checked_config import dump_config
+from thincam_jax.commands.config_file import ConfigError
+from thincam_jax.commands.run_folder import RunFolder
+from thincam_jax.commands.screen.build import build_model_rays, build_setup
+from thincam_jax.commands.screen.figures import srgb
+from thincam_jax.commands.screen.run import run_screen
+from thincam_jax.units import nm
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    home = tmp_path_factory.mktemp("screen")
+    setup, texts = build_setup(tiny.experiment(home)), Told()
+    folder = RunFolder(home / "out")
+    metrics = run_screen(setup, folder, texts)
+    return setup, folder.path, metrics, texts
+
+
+def test_the_right_model_is_the_best(run):
+    models = run[2]["models"]
+    means = {
+        name: [method["mean_psnr_db"] for method in model["methods"].values()]
+        for name, model in models.items()
+    }
+    for name in ("convolution", "single"):
+        assert (np.array(means["right"]) > np.array(means[name]) + 1.5).all()
+    assert min(means["right"]) > 25
+
+
+def test_rays_are_those_of_the_plate(run):
+    rays = run[2]["rays"]
+    low, high = rays["wavelength_nm"]
+    assert 480 < low < 532 < high < 575
+    assert rays["guided_angle_deg"][0] > 41.8
+    assert rays["first_ghost_down_mm"][0] < 18.19 < rays["first_ghost_down_mm"][1]
+    assert sum(rays["status_percent"].values()) == pytest.approx(100, abs=0.1)
+    assert rays["status_percent"]["off_hologram"] > 0
+
+
+def test_progress_and_files(run):
+    setup, path, metrics, texts = run
+    assert len(texts) == texts.total == 1 + 3 * 2 + 1
+    assert json.loads((path / "metrics.json").read_text("utf-8")) == metrics
+    names = {p.name for p in (path / "figures").iterdir()}
+    assert names == {f"{n}.png" for n in ("rays", "field", "images", "models", "errors")}
+    assert len(list((path / "images").iterdir())) == 2 * 2
+    assert tiny.experiment(path, text=(path / "config.yaml").read_text("utf-8")) == setup.config
+
+
+def test_report_stands_alone_and_is_escaped(run):
+    page = (run[1] / "report.html").read_text("utf-8")
+    sources = re.findall(r'src="([^"]+)"', page)
+    assert len(sources) == 5
+    assert all(source.startswith("data:image/") for source in sources)
+    assert "&lt;b&gt;of its own&lt;/b&gt;" in page
+    assert ">16.8</td>" in page  # published
+
+
+@pytest.mark.parametrize(
+    ("mistake", "on_axis"),
+    [("none", 0.0), ("shift_invariant", 0.0), ("grating", 0.0), ("ghost_index", -18.19)],
+)
+def test_mistakes_are_those_of_the_thesis(run, mistake, on_axis):
+    """All but the ghost index agree on the axis, and none elsewhere."""
+    setup = run[0]
+    right = setup.rays()
+    wrong = build_model_rays(setup, setup.camera, right, mistake)
+    moved = np.asarray(wrong.points - right.points)[..., 1]
+    rows, columns = setup.camera.sensor.shape
+    middle = moved[:, rows // 2 - 1 : rows // 2 + 1, columns // 2 - 1 : columns // 2 + 1].mean(
+        (1, 2)
+    )
+    np.testing.assert_allclose(middle, on_axis, atol=0.05)
+    assert (np.ptp(moved[0]) > 1) == (mistake != "none")
+
+
+def test_colours_of_wavelengths():
+    red, green, blue = srgb(np.array([630.0, 530.0, 455.0]) * nm)
+    assert red.argmax() == 0 and green.argmax() == 1 and blue.argmax() == 2
+    assert red.max() == green.max() == blue.max() == 1
+
+
+@pytest.mark.parametrize(
+    ("override", "part"),
+    [
+        (
+            "hologram.reference_angle=40 deg",
+            "hologram.reference_angle: 40 deg is below the critical angle of 41.81 deg: light "
+            "leaves the glass",
+        ),
+        ("screen.glass_index=1.3", "screen.glass_index: a glass of index 1.3 cannot carry light"),
+        (
+            "screen.bottom.height=12 mm",
+            "screen.bottom.height: a hologram 12 mm high is smaller than one bounce of 18.19 mm",
+        ),
+        ("hologram.wavelength=532", "hologram.wavelength: "),
+        ("models.1.mistake=all", "models[1].mistake: 'all' is unknown; choose one of"),
+        ("methods.0.variation.tau=2", "methods[0].variation: kind ridge does not take it"),
+        (
+            "targets.0.published={FISTA: {psnr_db: 3, seconds: 1}}",
+            "targets[0].published.FISTA: 'FISTA' is no method; choose one of CGM, ADMM-TV",
+        ),
+        ("noise.snr_db=loud", "noise.snr_db: "),
+    ],
+)
+def test_faults_are_told_in_one_line_with_their_place(override, part, tmp_path):
+    with pytest.raises(ConfigError) as caught:
+        tiny.experiment(tmp_path, override)
+    line = str(caught.value).split("\n")[0]
+    assert line.startswith("--set ")
+    assert part in line
+
+
+def test_a_fault_in_the_file_is_told_with_its_line(tmp_path):
+    with pytest.raises(ConfigError, match=r"tiny.yaml:6: hologram.reference_angle: 41 deg is "):
+        tiny.experiment(tmp_path, text=tiny.TEXT.replace("61.2 deg", "41 deg"))
+
+
+def test_a_camera_that_sees_nothing_is_refused(tmp_path):
+    config = tiny.experiment(tmp_path, "screen.bottom.y=900 mm")
+    with pytest.raises(ConfigError, match=r"tiny.yaml:\d+: screen: no ray .* off hologram"):
+        build_setup(config)
+
+
+def test_the_shipped_file(tmp_path):
+    shipped = tiny.experiment(tmp_path, text=(ROOT / "configs/sts_camera.yaml").read_text("utf-8"))
+    assert tiny.experiment(tmp_path, text=dump_config(shipped)) == shipped
+    assert shipped.sensor.shape == (440, 440)
+    assert {model.mistake for model in shipped.models} >= {"grating", "ghost_index"}

@@ -1,0 +1,1 @@
+"""Experiments of `kind: screen`: the see-through-screen camera, its ghosts and their removal."""

@@ -1,0 +1,245 @@
+"""From an experiment file to a camera with two holograms, its targets, and models of it."""
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from thincam_jax import waveguide as wg
+from thincam_jax.commands.config_file import ConfigError
+from thincam_jax.commands.screen.config import (
+    ModelConfig,
+    RectangleConfig,
+    ScreenConfig,
+    ScreenMethodConfig,
+    ScreenTargetConfig,
+)
+from thincam_jax.commands.sections import VariationConfig
+from thincam_jax.commands.study.build import build_noise, middle_square, read_picture
+from thincam_jax.imaging.operators import Sparse
+from thincam_jax.imaging.sensor import Sensor, electrons_per_unit, read_out
+from thincam_jax.imaging.targets import resize
+from thincam_jax.reconstruction import (
+    AdmmTV,
+    Reconstruction,
+    Recording,
+    Ridge,
+    TotalVariation,
+    reconstruct,
+)
+from thincam_jax.waveguide.efficiency import directions
+
+# Wrong models, and what is wrong with them.
+MISTAKES = {
+    "none": "as the camera is",
+    "grating": "K as printed in thesis Eq 5.4, with cos Θ_O − cos Θ_R: a transmission hologram",
+    "ghost_index": "i of thesis Eq 5.9 counted from 0, as its text has it",
+    "shift_invariant": "the ghosts of the axis everywhere: a convolution",
+    "no_ghosts": "the first image alone",
+}
+
+
+class Shown(NamedTuple):
+    """A target on the cells of the monitor, radiance 0 to 1."""
+
+    config: ScreenTargetConfig
+    image: np.ndarray
+
+
+@dataclass(frozen=True)
+class Setup:
+    """What is simulated: the camera, the monitor before it, and what it shows."""
+
+    config: ScreenConfig
+    camera: wg.SeeThroughCamera
+    plane: wg.ObjectPlane
+    targets: tuple[Shown, ...]
+
+    def rays(self) -> wg.Rays:
+        """Of every pixel and order."""
+        pixels = wg.pixel_centres(self.camera)
+        return wg.trace(self.camera, pixels, self.plane.distance, self.config.orders)
+
+
+def build_setup(config: ScreenConfig) -> Setup:
+    """Everything checked, images read.
+
+    **Errors**: ConfigError, one line for each fault, beginning with its place.
+    """
+    targets, faults = [], []
+    for number, target in enumerate(config.targets):
+        try:
+            targets.append(Shown(target, _picture(target, config.object.cells)))
+        except (ValueError, FileNotFoundError) as error:
+            place = config.place_of("targets", number, "path")
+            faults.append(f"{place}targets[{number}]: {error}")
+    camera, seen = build_camera(config), config.object
+    plane = wg.ObjectPlane(seen.cells, seen.distance, seen.width, (seen.x, seen.y))
+    setup = Setup(config, camera, plane, tuple(targets))
+    status = np.asarray(setup.rays().status)
+    if not (status == wg.RayStatus.OK).any():
+        most = wg.RayStatus(int(np.bincount(status.ravel()).argmax())).name.lower()
+        faults.append(
+            f"{config.place_of('screen')}screen: no ray from the sensor reaches the object's plane "
+            f"(most: {most.replace('_', ' ')}); see docs/screen.md for what a status means"
+        )
+    if faults:
+        raise ConfigError("\n".join(faults))
+    return setup
+
+
+def build_camera(config: ScreenConfig, glass_thickness: float | None = None) -> wg.SeeThroughCamera:
+    """The camera, or one with another glass, mm."""
+    film, plate = config.hologram, config.screen
+    hologram = wg.VolumeHologram.record(
+        film.wavelength,
+        film.object_angle,
+        film.reference_angle,
+        index=film.index,
+        thickness=film.thickness,
+        index_modulation=film.index_modulation,
+    ).processed(film.shrinkage)
+    screen = wg.Screen(
+        hologram,
+        glass_thickness or plate.glass_thickness,
+        plate.glass_index,
+        _rectangle(plate.top),
+        _rectangle(plate.bottom),
+    )
+    lens = config.lens
+    sensor = Sensor(**dict(config.sensor))
+    return wg.SeeThroughCamera(screen, sensor, lens.focal_distance, lens.lens_distance)
+
+
+def _rectangle(part: RectangleConfig | None) -> wg.Rectangle | None:
+    return None if part is None else wg.Rectangle((part.x, part.y), (part.width, part.height))
+
+
+def _picture(target: ScreenTargetConfig, cells: tuple[int, int]) -> np.ndarray:
+    picture = np.atleast_3d(read_picture(target)).mean(axis=-1)
+    if target.crop < 1:
+        picture = middle_square(picture, round(target.crop * min(picture.shape)))
+    picture = resize(picture, cells)
+    if target.binary:
+        picture = (picture > picture.mean()).astype(float)
+    if picture.min() == picture.max():
+        raise ValueError("the image is uniform: there is nothing to reconstruct; give another one")
+    return picture
+
+
+def build_models(setup: Setup) -> list[Sparse]:
+    """What reconstructions take the camera for; the first one takes the captures, too.
+
+    All have as many entries as the largest, the others in no pixel, for one compiled program.
+    """
+    rays = setup.rays()
+    models = [_build_model(setup, model, rays) for model in setup.config.models]
+    most = max(model.values.size for model in models)
+    outside = math.prod(setup.camera.sensor.shape), math.prod(setup.plane.shape)
+
+    def padded(model: Sparse) -> Sparse:
+        entries = model.values, model.rows, model.columns
+        longer = [
+            jnp.pad(entry, (0, most - entry.size), constant_values=value)
+            for entry, value in zip(entries, (0, *outside), strict=True)
+        ]
+        return eqx.tree_at(lambda m: (m.values, m.rows, m.columns), model, longer)
+
+    return [padded(model) for model in models]
+
+
+def _build_model(setup: Setup, model: ModelConfig, rays: wg.Rays) -> Sparse:
+    camera = setup.camera
+    if model.glass_thickness is not None:
+        camera = build_camera(setup.config, model.glass_thickness)
+        pixels = wg.pixel_centres(camera)
+        rays = wg.trace(camera, pixels, setup.plane.distance, setup.config.orders)
+    return wg.operator_of_rays(
+        camera, setup.plane, build_model_rays(setup, camera, rays, model.mistake)
+    )
+
+
+def build_model_rays(
+    setup: Setup, camera: wg.SeeThroughCamera, rays: wg.Rays, mistake: str
+) -> wg.Rays:
+    """The rays with one of `MISTAKES`."""
+    if mistake == "none":
+        return rays
+    if mistake == "no_ghosts":
+        first = rays.points[:1], rays.weight[:1], rays.status[:1]
+        return eqx.tree_at(lambda r: (r.points, r.weight, r.status), rays, first)
+    pixels = wg.pixel_centres(camera)
+    if mistake == "shift_invariant":
+        middle = jnp.zeros((1, 1, 2), pixels.dtype)
+        axis = wg.trace(camera, middle, setup.plane.distance, setup.config.orders)
+        scale = (camera.lens_distance + setup.plane.distance) / camera.focal_distance
+        points = rays.points.at[..., :2].set(axis.points[..., :2] - scale * pixels)
+        weight = jnp.broadcast_to(axis.weight, rays.weight.shape)
+        return eqx.tree_at(lambda r: (r.points, r.weight), rays, (points, weight))
+    width, index = camera.screen.glass_thickness, camera.screen.glass_index(rays.wavelength)
+    bounce = _bounce(rays.guided, index)
+    if mistake == "ghost_index":
+        return _moved(rays, -2 * width * bounce)
+    across = -pixels / jnp.sqrt(
+        jnp.sum(pixels**2, axis=-1, keepdims=True) + camera.focal_distance**2
+    )
+    film, angles = camera.screen.hologram.index(rays.wavelength), setup.config.hologram
+    inside = directions(across, film)
+    along = np.cos(angles.object_angle) - np.cos(angles.reference_angle)
+    grating = camera.screen.hologram.grating
+    printed = eqx.tree_at(
+        lambda h: h.grating,
+        camera.screen.hologram,
+        grating.at[2].multiply(
+            along / (np.cos(angles.object_angle) + np.cos(angles.reference_angle))
+        ),
+    )
+    guided = film[..., None] * printed.diffracted(inside)[..., :2]
+    odd = (2 * jnp.arange(setup.config.orders, dtype=pixels.dtype) + 1)[:, None, None, None]
+    return _moved(rays, odd * width * (_bounce(guided, index) - bounce))
+
+
+def _bounce(guided: Array, index: Array) -> Array:
+    """How far guided light goes in a glass of thickness 1."""
+    left = index**2 - jnp.sum(guided**2, axis=-1)
+    return guided / jnp.sqrt(jnp.maximum(left, 1e-6))[..., None]
+
+
+def _moved(rays: wg.Rays, by: Array) -> wg.Rays:
+    return eqx.tree_at(lambda r: r.points, rays, rays.points.at[..., :2].add(by))
+
+
+class Captured(NamedTuple):
+    """Captures (target, y, x), and the variance of their noise."""
+
+    images: Array
+    variance: Array
+
+
+def capture(setup: Setup, system: Sparse) -> Captured:
+    """Every target as the sensor reads it; each has noise of its own key."""
+    images = jnp.asarray([shown.image for shown in setup.targets], system.values.dtype)
+    clean, sensor = system(images), setup.camera.sensor
+    noise = build_noise(setup.config.noise)
+    assert noise is not None  # the section is needed
+    keys = [jax.random.fold_in(jax.random.key(setup.config.seed), n) for n in range(len(images))]
+    read = [
+        read_out(sensor, one, noise=noise, key=key) for one, key in zip(clean, keys, strict=True)
+    ]
+    return Captured(jnp.stack(read), noise.variance(clean, electrons_per_unit(sensor, clean)))
+
+
+def undo(model: Sparse, method: ScreenMethodConfig, captured: Captured) -> Reconstruction:
+    """All targets at once, (target, y, x)."""
+    options = method.variation or VariationConfig()
+    solver = Ridge(method.ridge or 1.0)
+    if method.kind == "admm_tv":
+        variation = TotalVariation(options.kind)
+        solver = AdmmTV(options.tau, variation=variation, iterations=options.iterations)
+    variance = captured.variance[None]
+    return reconstruct(Recording(captured.images[None], [model], noise_variance=variance), solver)

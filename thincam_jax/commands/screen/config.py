@@ -1,0 +1,183 @@
+"""Experiment files of `kind: screen`: a camera behind a glass plate with two holograms."""
+
+import math
+from typing import Annotated, Literal
+
+import pydantic
+from pydantic import Field
+
+from thincam_jax.commands.sections import (
+    Angle,
+    ExperimentConfig,
+    Length,
+    Name,
+    NoiseConfig,
+    Position,
+    Section,
+    SensorConfig,
+    TargetConfig,
+    VariationConfig,
+    Wavelength,
+    check_names,
+    misfit,
+)
+from thincam_jax.units import deg
+
+Index = Annotated[float, Field(ge=1, le=4)]
+Acute = Annotated[Angle, Field(gt=-math.pi / 2, lt=math.pi / 2)]
+
+
+class HologramConfig(Section):
+    """How both holograms are recorded; angles are in the film, from its normal."""
+
+    wavelength: Wavelength
+    object_angle: Acute = 0.0
+    reference_angle: Acute
+    index: Index = 1.5
+    thickness: Length
+    index_modulation: Annotated[float, Field(gt=0, le=0.5)]
+    shrinkage: Annotated[float, Field(gt=-1, lt=1)] = 0.0
+
+
+class RectangleConfig(Section):
+    """Where a hologram is: its size, and its middle from the camera's axis, y downwards."""
+
+    width: Length
+    height: Length
+    x: Position = 0.0
+    y: Position = 0.0
+
+
+class PlateConfig(Section):
+    """The glass plate; a hologram without an outline covers its whole surface."""
+
+    glass_thickness: Length
+    glass_index: Index = 1.5
+    top: RectangleConfig | None = None
+    bottom: RectangleConfig | None = None
+
+
+class LensConfig(Section):
+    """From sensor to lens (d0), and from lens to the plate (d1)."""
+
+    focal_distance: Length
+    lens_distance: Length
+
+
+class CellsConfig(Section):
+    """The object: a monitor of square cells (rows, columns), its middle at (x, y)."""
+
+    cells: tuple[Annotated[int, Field(ge=7, le=512)], Annotated[int, Field(ge=7, le=512)]]
+    distance: Length
+    width: Length
+    x: Position = 0.0
+    y: Position = 0.0
+
+
+class ScreenMethodConfig(Section):
+    """A reconstruction: ridge regression by conjugate gradients, or total variation by ADMM."""
+
+    name: Name
+    kind: Literal["ridge", "admm_tv"]
+    ridge: Annotated[float, Field(gt=0)] | None = None
+    variation: VariationConfig | None = None
+
+    @pydantic.model_validator(mode="after")
+    def _fits(self):
+        other = "variation" if self.kind == "ridge" else "ridge"
+        if getattr(self, other) is not None:
+            raise misfit(f"kind {self.kind} does not take it; drop {other!r}", other)
+        return self
+
+
+Mistake = Literal["none", "grating", "ghost_index", "shift_invariant", "no_ghosts"]
+
+
+class ModelConfig(Section):
+    """What the reconstruction takes the camera for.
+
+    - `mistake`: one of `build.MISTAKES`; `glass_thickness`: another than the plate has.
+    """
+
+    name: Name
+    mistake: Mistake = "none"
+    glass_thickness: Length | None = None
+
+
+class MeasuredConfig(Section):
+    """What a publication reports of a target."""
+
+    psnr_db: float
+    seconds: Annotated[float, Field(gt=0)]
+
+
+class ScreenTargetConfig(TargetConfig):
+    """A picture on the monitor's cells, in grey.
+
+    - `crop`: takes the middle of a picture, that part of its shorter side; `binary`: black where
+      it is below its mean, else white; `published`: by the method's name.
+    """
+
+    crop: Annotated[float, Field(gt=0, le=1)] = 1.0
+    binary: bool = False
+    published: dict[str, MeasuredConfig] = {}
+
+
+class ScreenConfig(ExperimentConfig):
+    """Captures through a see-through screen, undone with right and wrong models of it."""
+
+    kind: Literal["screen"]
+    hologram: HologramConfig
+    screen: PlateConfig
+    lens: LensConfig
+    sensor: SensorConfig
+    object: CellsConfig
+    orders: Annotated[int, Field(ge=1, le=16)] = 4
+    noise: NoiseConfig
+    methods: Annotated[tuple[ScreenMethodConfig, ...], Field(min_length=1)]
+    models: Annotated[tuple[ModelConfig, ...], Field(min_length=1)]
+    targets: Annotated[tuple[ScreenTargetConfig, ...], Field(min_length=1)]
+    notes: tuple[str, ...] = ()
+
+    @pydantic.model_validator(mode="after")
+    def _fits(self):
+        check_names(self, "methods", "models", "targets")
+        self._check_guided()
+        methods = [method.name for method in self.methods]
+        for number, target in enumerate(self.targets):
+            for name in target.published:
+                if name not in methods:
+                    message = f"{name!r} is no method; choose one of {', '.join(methods)}"
+                    raise misfit(message, "targets", number, "published", name)
+        if self.noise.read_noise is not None and not self.sensor.counts:
+            message = "read_noise counts electrons; give sensor.exposure, such as 0.9, or electrons"
+            raise misfit(message, "noise", "read_noise")
+        return self
+
+    def _check_guided(self) -> None:
+        """Light along the axis is guided, and does not step over the bottom hologram."""
+        film, plate = self.hologram, self.screen
+        sine = film.index * math.sin(abs(film.reference_angle))
+        if sine <= 1:
+            critical = math.asin(1 / film.index) / deg
+            message = (
+                f"{abs(film.reference_angle) / deg:.4g} deg is below the critical angle of "
+                f"{critical:.4g} deg: light leaves the glass in place of being guided; give a "
+                "larger angle, or a film of a higher index"
+            )
+            raise misfit(message, "hologram", "reference_angle")
+        if sine >= plate.glass_index:
+            message = (
+                f"a glass of index {plate.glass_index:g} cannot carry light of "
+                f"{abs(film.reference_angle) / deg:.4g} deg in a film of index {film.index:g}; "
+                f"give an index above {sine:.4g}"
+            )
+            raise misfit(message, "screen", "glass_index")
+        bounce = 2 * plate.glass_thickness * sine / math.sqrt(plate.glass_index**2 - sine**2)
+        part = plate.bottom
+        if part is not None and part.height < bounce:
+            message = (
+                f"a hologram {part.height:g} mm high is smaller than one bounce of {bounce:.4g} "
+                "mm, so that guided light steps over it; give a higher one or a thinner glass"
+            )
+            raise misfit(message, "screen", "bottom", "height")
