@@ -20,6 +20,7 @@ lens: {focal_distance: 6 mm, lens_distance: 10 mm}
 sensor: {shape: [44, 60], pitch: 35.2 um}
 object: {cells: [12, 16], distance: 550 mm, width: 120 mm, y: 27 mm}
 orders: 3
+band_samples: 3
 noise: {snr_db: 40}
 methods:
   - {name: CGM, kind: ridge}

@@ -13,6 +13,7 @@ from jaxtyping import Array
 from thincam_jax import waveguide as wg
 from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.screen.config import (
+    Mistake,
     ModelConfig,
     RectangleConfig,
     ScreenConfig,
@@ -33,6 +34,7 @@ from thincam_jax.reconstruction import (
     reconstruct,
 )
 from thincam_jax.waveguide.efficiency import directions
+from thincam_jax.waveguide.system import seen_size, smeared_rays, system_matrix
 
 # Wrong models, and what is wrong with them.
 MISTAKES = {
@@ -41,6 +43,7 @@ MISTAKES = {
     "ghost_index": "i of thesis Eq 5.9 counted from 0, as its text has it",
     "shift_invariant": "the ghosts of the axis everywhere: a convolution",
     "no_ghosts": "the first image alone",
+    "no_smear": "each pixel's Bragg wavelength alone, without the band about it",
 }
 
 
@@ -137,8 +140,7 @@ def build_models(setup: Setup) -> list[Sparse]:
 
     All have as many entries as the largest, the others in no pixel, for one compiled program.
     """
-    rays = setup.rays()
-    models = [_build_model(setup, model, rays) for model in setup.config.models]
+    models = [_build_model(setup, model) for model in setup.config.models]
     most = max(model.values.size for model in models)
     outside = math.prod(setup.camera.sensor.shape), math.prod(setup.plane.shape)
 
@@ -153,65 +155,54 @@ def build_models(setup: Setup) -> list[Sparse]:
     return [padded(model) for model in models]
 
 
-def _build_model(setup: Setup, model: ModelConfig, rays: wg.Rays) -> Sparse:
-    camera = setup.camera
+def _build_model(setup: Setup, model: ModelConfig) -> Sparse:
+    camera, plane = setup.camera, setup.plane
     if model.glass_thickness is not None:
         camera = build_camera(setup.config, model.glass_thickness)
-        pixels = wg.pixel_centres(camera)
-        rays = wg.trace(camera, pixels, setup.plane.distance, setup.config.orders)
-    return wg.operator_of_rays(
-        camera, setup.plane, build_model_rays(setup, camera, rays, model.mistake)
-    )
+    rays = mistaken_rays(setup, camera, model.mistake)
+    level = float(jnp.mean(jnp.sum(rays.weight, axis=0)))
+    matrix = system_matrix(rays, plane, float(seen_size(camera, plane)), level)
+    return Sparse(matrix, plane.shape, camera.sensor.shape)
 
 
-def build_model_rays(
-    setup: Setup, camera: wg.SeeThroughCamera, rays: wg.Rays, mistake: str
-) -> wg.Rays:
-    """The rays with one of `MISTAKES`."""
-    if mistake == "none":
-        return rays
+def mistaken_rays(setup: Setup, camera: wg.SeeThroughCamera, mistake: Mistake) -> wg.SmearedRays:
+    """The rays of a camera, followed with one of `MISTAKES`."""
+    config, plane, pixels = setup.config, setup.plane, wg.pixel_centres(camera)
+    samples = None if mistake == "no_smear" else config.band_samples
+    rays = smeared_rays(camera, pixels, plane, config.orders, samples)
     if mistake == "no_ghosts":
-        first = rays.points[:1], rays.weight[:1], rays.status[:1]
-        return eqx.tree_at(lambda r: (r.points, r.weight, r.status), rays, first)
-    pixels = wg.pixel_centres(camera)
+        return wg.SmearedRays(rays.points[:1], rays.weight[:1])
     if mistake == "shift_invariant":
         middle = jnp.zeros((1, 1, 2), pixels.dtype)
-        axis = wg.trace(camera, middle, setup.plane.distance, setup.config.orders)
-        scale = (camera.lens_distance + setup.plane.distance) / camera.focal_distance
-        points = rays.points.at[..., :2].set(axis.points[..., :2] - scale * pixels)
-        weight = jnp.broadcast_to(axis.weight, rays.weight.shape)
-        return eqx.tree_at(lambda r: (r.points, r.weight), rays, (points, weight))
-    width, index = camera.screen.glass_thickness, camera.screen.glass_index(rays.wavelength)
-    bounce = _bounce(rays.guided, index)
+        axis = smeared_rays(camera, middle, plane, config.orders, samples)
+        scale = (camera.lens_distance + plane.distance) / camera.focal_distance
+        points = axis.points - scale * pixels[..., None, :]
+        return wg.SmearedRays(points, jnp.broadcast_to(axis.weight, rays.weight.shape))
+    if mistake not in ("ghost_index", "grating"):
+        return rays
+    found = wg.trace(camera, pixels, plane.distance, 1)
+    width, index = camera.screen.glass_thickness, camera.screen.glass_index(found.wavelength)
+    bounce = _bounce(found.guided, index)
     if mistake == "ghost_index":
-        return _moved(rays, -2 * width * bounce)
+        return rays._replace(points=rays.points - 2 * width * bounce[..., None, :])
     across = -pixels / jnp.sqrt(
         jnp.sum(pixels**2, axis=-1, keepdims=True) + camera.focal_distance**2
     )
-    film, angles = camera.screen.hologram.index(rays.wavelength), setup.config.hologram
-    inside = directions(across, film)
-    along = np.cos(angles.object_angle) - np.cos(angles.reference_angle)
-    grating = camera.screen.hologram.grating
-    printed = eqx.tree_at(
-        lambda h: h.grating,
-        camera.screen.hologram,
-        grating.at[2].multiply(
-            along / (np.cos(angles.object_angle) + np.cos(angles.reference_angle))
-        ),
-    )
-    guided = film[..., None] * printed.diffracted(inside)[..., :2]
-    odd = (2 * jnp.arange(setup.config.orders, dtype=pixels.dtype) + 1)[:, None, None, None]
-    return _moved(rays, odd * width * (_bounce(guided, index) - bounce))
+    hologram, angles = camera.screen.hologram, config.hologram
+    film = hologram.index(found.wavelength)
+    toward, reference = math.cos(angles.object_angle), math.cos(angles.reference_angle)
+    along = hologram.grating.at[2].multiply((toward - reference) / (toward + reference))
+    printed = eqx.tree_at(lambda h: h.grating, hologram, along)
+    guided = film[..., None] * printed.diffracted(directions(across, film))[..., :2]
+    odd = (2 * jnp.arange(config.orders, dtype=pixels.dtype) + 1)[:, None, None, None]
+    moved = odd * width * (_bounce(guided, index) - bounce)
+    return rays._replace(points=rays.points + moved[..., None, :])
 
 
 def _bounce(guided: Array, index: Array) -> Array:
     """How far guided light goes in a glass of thickness 1."""
     left = index**2 - jnp.sum(guided**2, axis=-1)
     return guided / jnp.sqrt(jnp.maximum(left, 1e-6))[..., None]
-
-
-def _moved(rays: wg.Rays, by: Array) -> wg.Rays:
-    return eqx.tree_at(lambda r: r.points, rays, rays.points.at[..., :2].add(by))
 
 
 class Captured(NamedTuple):

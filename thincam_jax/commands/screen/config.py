@@ -90,7 +90,7 @@ class ScreenMethodConfig(Section):
         return self
 
 
-Mistake = Literal["none", "grating", "ghost_index", "shift_invariant", "no_ghosts"]
+Mistake = Literal["none", "grating", "ghost_index", "shift_invariant", "no_ghosts", "no_smear"]
 
 
 class ModelConfig(Section):
@@ -124,7 +124,11 @@ class ScreenTargetConfig(TargetConfig):
 
 
 class ScreenConfig(ExperimentConfig):
-    """Captures through a see-through screen, undone with right and wrong models of it."""
+    """Captures through a see-through screen, undone with right and wrong models of it.
+
+    - `orders`: of ghosts; `band_samples`: of the colours about each pixel's Bragg wavelength, None
+      for that one alone.
+    """
 
     kind: Literal["screen"]
     hologram: HologramConfig
@@ -133,6 +137,7 @@ class ScreenConfig(ExperimentConfig):
     sensor: SensorConfig
     object: CellsConfig
     orders: Annotated[int, Field(ge=1, le=16)] = 4
+    band_samples: Annotated[int, Field(ge=1, le=64)] | None = None
     noise: NoiseConfig
     methods: Annotated[tuple[ScreenMethodConfig, ...], Field(min_length=1)]
     models: Annotated[tuple[ModelConfig, ...], Field(min_length=1)]
