@@ -16,6 +16,12 @@ from thincam_jax.design.objectives import mismatch_error as mismatch_error
 from thincam_jax.design.objectives import unevenness as unevenness
 from thincam_jax.design.objectives import worst_ratio_db as worst_ratio_db
 from thincam_jax.design.pareto import non_dominated as non_dominated
+from thincam_jax.design.plate import FoundPlate as FoundPlate
+from thincam_jax.design.plate import Plate as Plate
+from thincam_jax.design.plate import PlateLimits as PlateLimits
+from thincam_jax.design.plate import Viewing as Viewing
+from thincam_jax.design.plate import find_plate as find_plate
+from thincam_jax.design.plate import judge_plate as judge_plate
 from thincam_jax.design.prior import PowerLaw as PowerLaw
 from thincam_jax.design.prior import fit_power_law as fit_power_law
 from thincam_jax.design.robust import Tolerances as Tolerances

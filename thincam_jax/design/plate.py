@@ -1,0 +1,239 @@
+r"""The plate of a see-through-screen camera by gradient: glass, holograms and lens.
+
+What a plate is worth is the expected error of the best linear reconstruction. About a pixel the
+capture is locally the object convolved with the pixel's ghosts, their smear included, so that with
+the points :math:`\mathbf P_{is}` and the weights :math:`W_i` of `waveguide.trace_band`
+
+.. math:: H(\boldsymbol\nu) = \sum_i \frac{W_i}{S}\sum_s e^{2\pi j\,\boldsymbol\nu\cdot
+    (\mathbf P_{is} - \mathbf P_{00})}, \qquad
+    \frac{\epsilon}{\mathrm{var} f} = \Big\langle \frac{\int d^2\nu\,
+    [1/\eta_f + |H|^2/\eta_n]^{-1}}{\int d^2\nu\,\eta_f} \Big\rangle
+
+averaged over the field (thesis Eq 3.48, corrected: ERRATA 3.46; one capture). ν is in cycles/mm on
+the object. η_n = σ² A, where A is the area of the object that a pixel sees, and σ² the variance of
+shot noise: more light makes it larger, but the ratio to the signal better. The borders of the
+object, and what changes over a few ghosts' distance, are left out.
+"""
+
+import functools
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from thincam_jax._core import checks
+from thincam_jax.design.adam import adam
+from thincam_jax.design.prior import PowerLaw
+from thincam_jax.design.search import best_apart, even_samples, on_cube
+from thincam_jax.imaging.sensor import Sensor
+from thincam_jax.units import deg, nm, um
+from thincam_jax.waveguide import Screen, SeeThroughCamera, VolumeHologram, trace, trace_band
+
+# Points of the field along y, and along x on one side of the axis.
+_FIELD = (5, 3)
+# Frequencies along y, both signs, and along x.
+_FREQUENCIES = (32, 16)
+# Of n sin Θ′ above the critical angle's 1, where half of the light counts: a descent feels the end
+# of the guided range before it, where the true loss is a step without a slope.
+_MARGIN = 0.02
+
+
+def _number(value) -> Float[Array, ""]:
+    # Not weakly typed, so that every plate is of one compiled program.
+    return value if isinstance(value, jax.Array) else jnp.asarray(value, float)
+
+
+class Plate(eqx.Module):
+    """What of a see-through-screen camera is chosen; lengths in mm, the angle in rad.
+
+    The defaults are those of ERRATA.md, for what the thesis does not give.
+    """
+
+    glass_thickness: Float[Array, ""] = eqx.field(default=5.0, converter=_number)
+    reference_angle: Float[Array, ""] = eqx.field(default=61.2 * deg, converter=_number)
+    film_thickness: Float[Array, ""] = eqx.field(default=16 * um, converter=_number)
+    index_modulation: Float[Array, ""] = eqx.field(default=0.02, converter=_number)
+    lens_distance: Float[Array, ""] = eqx.field(default=10.0, converter=_number)
+    focal_distance: Float[Array, ""] = eqx.field(default=6.0, converter=_number)
+
+    def camera(self, sensor: Sensor, *, wavelength=532 * nm, index=1.5) -> SeeThroughCamera:
+        """The camera with it: object wave along the normal, film and glass of one index."""
+        hologram = VolumeHologram.record(
+            wavelength,
+            0.0,
+            self.reference_angle,
+            index=index,
+            thickness=self.film_thickness,
+            index_modulation=self.index_modulation,
+        )
+        screen = Screen(hologram, self.glass_thickness, index)
+        return SeeThroughCamera(screen, sensor, self.focal_distance, self.lens_distance)
+
+
+class PlateLimits(NamedTuple):
+    """Between which plates can be made; equal ends fix a number."""
+
+    lower: Plate
+    upper: Plate
+
+    def plate(self, point: Float[Array, "6"]) -> Plate:
+        """That of a point of the unit cube, its axes in the order of the fields of `Plate`."""
+        low, high = (jnp.stack(jax.tree.leaves(end)) for end in self)
+        values = low + point.astype(low.dtype) * (high - low)
+        return jax.tree.unflatten(jax.tree.structure(self.lower), list(values))
+
+
+class Viewing(NamedTuple):
+    """What the plate is to see.
+
+    - `sensor`: its pixels. `object_distance`, `object_width`: mm. `cell`: the finest detail, mm,
+      whose Nyquist frequency ends the integral.
+    - `snr_db`: of the captures of the default plate; another's follows from its light.
+    - `mean`, `variance`: of the object's radiance. `prior`: how its variance is spread.
+    """
+
+    sensor: Sensor
+    object_distance: float = 550.0
+    object_width: float = 150.0
+    cell: float = 150.0 / 64
+    snr_db: float = 30.0
+    mean: float = 0.5
+    variance: float = 0.08
+    prior: PowerLaw = PowerLaw(2.5)
+
+
+class Judged(NamedTuple):
+    """A plate's worth.
+
+    - `error`: expected, as a part of the object's variance. `light`: mean weight ∑W_i, mm.
+    - `field_of_view`: along y, rad. `ghost`: mean distance of the first ghost, mm on the object.
+    - `ghost_light`: part of the light that comes by ghosts.
+    """
+
+    error: Float[Array, ""]
+    light: Float[Array, ""]
+    field_of_view: Float[Array, ""]
+    ghost: Float[Array, ""]
+    ghost_light: Float[Array, ""]
+
+
+def noise_variance(viewing: Viewing, light: Float[Array, ""]) -> Float[Array, ""]:
+    """σ² of the captures of a plate of that light, in the units of the weights squared, mm²."""
+    reference = _light(_rays(Plate(), viewing))
+    power = viewing.mean**2 + viewing.variance
+    return 10 ** (-viewing.snr_db / 10) * power * reference * light
+
+
+@eqx.filter_jit
+def judge_plate(plate: Plate, viewing: Viewing) -> Judged:
+    """Expected error and what else is asked of a plate; differentiable in all of its numbers."""
+    rays = _rays(plate, viewing)
+    dtype = rays.weight.dtype
+    light = _light(rays)
+    pitch = viewing.sensor.pitch
+    seen = pitch * (plate.lens_distance + viewing.object_distance) / plate.focal_distance
+    noise = noise_variance(viewing, light) * seen**2
+    highest = 1 / (2 * viewing.cell)
+    v, u = ((np.arange(n) + 0.5) / n for n in _FREQUENCIES)
+    grid = np.stack(np.meshgrid(u, 2 * v - 1), axis=-1).reshape(-1, 2) * highest
+    frequencies = jnp.asarray(grid, dtype)
+    density = viewing.prior(
+        jnp.sum(frequencies**2, axis=-1), jnp.asarray(viewing.object_width, dtype)
+    )
+    # The half plane of u > 0 holds half of the variance.
+    element = 2 * highest**2 / len(grid)
+    density = density * viewing.variance / (2 * jnp.sum(density) * element)
+    offset = rays.points - rays.points[:1, :, :1]
+    phase = jnp.einsum("ipsc,fc->ipsf", offset, frequencies, precision="highest")
+    # Reduced to turns before 2π.
+    turns = 2 * jnp.pi * (phase - jax.lax.stop_gradient(jnp.round(phase)))
+    shares = rays.weight[..., None] / rays.points.shape[2]
+    real = jnp.sum(jnp.sum(jnp.cos(turns), axis=2) * shares, axis=0)
+    imaginary = jnp.sum(jnp.sum(jnp.sin(turns), axis=2) * shares, axis=0)
+    known = density * (real**2 + imaginary**2) / noise
+    error = jnp.mean(jnp.sum(density / (1 + known), axis=-1)) / jnp.sum(density)
+    half = pitch * viewing.sensor.shape[0] / 2
+    middle = jnp.mean(rays.points, axis=2)
+    ghost = jnp.mean(jnp.sqrt(jnp.sum((middle[1] - middle[0]) ** 2, axis=-1)))
+    behind = jnp.mean(jnp.sum(rays.weight[1:], axis=0)) / light
+    return Judged(error, light, 2 * jnp.arctan(half / plate.focal_distance), ghost, behind)
+
+
+def _rays(plate: Plate, viewing: Viewing):
+    """Over the field, (order, pixel, sample, 2) and weights (order, pixel)."""
+    camera = plate.camera(viewing.sensor)
+    rows, columns = viewing.sensor.shape
+    along = [(np.arange(n) + 0.5) / n for n in _FIELD]
+    y, x = (2 * along[0] - 1) * rows / 2, along[1] * columns / 2
+    places = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    pixels = jnp.asarray(places, plate.glass_thickness.dtype) * viewing.sensor.pitch
+    rays = trace_band(camera, pixels, viewing.object_distance, 4, 6)
+    guided = trace(camera, pixels, viewing.object_distance, 1).guided
+    above = jnp.sqrt(jnp.sum(guided**2, axis=-1)) - 1
+    return rays._replace(weight=rays.weight * jax.nn.sigmoid((above - _MARGIN) / (_MARGIN / 4)))
+
+
+def _light(rays) -> Float[Array, ""]:
+    return jnp.mean(jnp.sum(rays.weight, axis=0))
+
+
+class FoundPlate(NamedTuple):
+    """The best plate of a search, its error, and that of each step of the descent that met it."""
+
+    plate: Plate
+    error: float
+    history: np.ndarray
+
+
+def find_plate(
+    viewing: Viewing,
+    limits: PlateLimits,
+    *,
+    key: PRNGKeyArray,
+    starts: int = 4,
+    samples: int = 32,
+    steps: int = 60,
+) -> FoundPlate:
+    """The plate of least expected error within limits, by Adam from the best of even samples.
+
+    **Errors**: ValueError for limits that cross, and for counts below 1.
+    """
+    checks.at_least_one({"starts": starts, "samples": samples, "steps": steps})
+    for name in Plate.__dataclass_fields__:
+        low, high = (float(getattr(end, name)) for end in limits)
+        if not 0 < low <= high:
+            raise ValueError(
+                f"limits of {name} are {low:g} to {high:g}; give the lower one first, above 0"
+            )
+    dtype = limits.lower.glass_thickness.dtype
+    points = even_samples(6, max(samples, starts), key, dtype)
+    values = np.asarray(_errors(limits, viewing, points))
+    chosen = points[best_apart(np.asarray(points), values, starts)]
+    ended, errors, history = (np.asarray(v) for v in _descend(limits, viewing, chosen, key, steps))
+    best = int(np.nanargmin(errors))
+    plate = limits.plate(jnp.asarray(ended[best], dtype))
+    return FoundPlate(plate, float(errors[best]), history[best])
+
+
+@jax.jit
+def _errors(limits: PlateLimits, viewing: Viewing, points):
+    return jax.lax.map(lambda point: judge_plate(limits.plate(point), viewing).error, points)
+
+
+@functools.partial(jax.jit, static_argnames=("steps",))
+def _descend(limits: PlateLimits, viewing: Viewing, points, key, steps: int):
+    def loss(y, _):
+        value = judge_plate(limits.plate(on_cube(y)), viewing).error
+        return jnp.log(value), (value, on_cube(y))
+
+    def one(point):
+        # A face is a stationary point of sin².
+        begun = jnp.arcsin(jnp.sqrt(jnp.clip(point, 1e-2, 1 - 1e-2)))
+        _, (history, places), _ = adam(loss, begun, key, jnp.asarray(0.05, point.dtype), steps)
+        best = jnp.nanargmin(history)
+        return places[best], history[best], history
+
+    return jax.lax.map(one, points)
