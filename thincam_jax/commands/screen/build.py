@@ -82,7 +82,7 @@ def build_setup(config: ScreenConfig) -> Setup:
             place = config.place_of("targets", number, "path")
             faults.append(f"{place}targets[{number}]: {error}")
     camera, seen = build_camera(config), config.object
-    plane = wg.ObjectPlane(seen.cells, seen.distance, seen.width, (seen.x, seen.y))
+    plane = wg.ObjectPlane(seen.cells, seen.distance, seen.width, jnp.asarray([seen.x, seen.y]))
     setup = Setup(config, camera, plane, tuple(targets))
     status = np.asarray(setup.rays().status)
     if not (status == wg.RayStatus.OK).any():
@@ -120,7 +120,9 @@ def build_camera(config: ScreenConfig, glass_thickness: float | None = None) -> 
 
 
 def _rectangle(part: RectangleConfig | None) -> wg.Rectangle | None:
-    return None if part is None else wg.Rectangle((part.x, part.y), (part.width, part.height))
+    if part is None:
+        return None
+    return wg.Rectangle(jnp.asarray([part.x, part.y]), jnp.asarray([part.width, part.height]))
 
 
 def _picture(target: ScreenTargetConfig, cells: tuple[int, int]) -> np.ndarray:

@@ -1,5 +1,6 @@
 """The pictures of a screen run, as PNG files in its folder."""
 
+import jax.numpy as jnp
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -46,7 +47,7 @@ def save_rays(folder: RunFolder, setup: Setup) -> None:
     camera, screen = setup.camera, setup.camera.screen
     half = 0.43 * camera.sensor.shape[0] * float(camera.sensor.pitch)
     pixels = np.array([[0.0, -half], [0.0, 0.0], [0.0, half]])
-    rays = wg.trace(camera, pixels, float(setup.plane.distance), setup.config.orders)
+    rays = wg.trace(camera, jnp.asarray(pixels), setup.plane.distance, setup.config.orders)
     d0, d1 = float(camera.focal_distance), float(camera.lens_distance)
     width, start = float(screen.glass_thickness), d0 + d1
     slopes = -pixels[:, 1] / d0
