@@ -167,5 +167,5 @@ def render(
     config: ScreenConfig, folder: RunFolder, metrics: dict[str, Any], environment: dict[str, Any]
 ) -> str:
     """The page, with its pictures inside."""
-    shown = {"command": "run", "environment": environment, "metrics": metrics}
+    shown = {"command": "run", "environment": environment, "metrics": metrics, "warnings": ()}
     return render_page("screen", config, folder.path / "figures", shown)
