@@ -17,6 +17,7 @@ _ENOUGH = 1 << 16  # details, of larger captures
 _MEDIAN = 0.6745  # of |x|, if x is normal with standard deviation 1
 
 
+@jax.jit
 def estimate_noise(
     capture: Float[Array, "*batch y x"], valid: Bool[Array, "*batch y x"] | None = None
 ) -> Float[Array, "*batch"]:
@@ -120,7 +121,7 @@ def _quantisation_step(values: Float[Array, "*batch y x"], span: Float[Array, "*
     steps = jnp.isfinite(gaps) & (gaps > rounding * span[..., None])
     count = jnp.sum(steps, axis=-1)
     index = jnp.clip(1 + count // 10, 0, jnp.maximum(count - 1, 0))
-    found = _at(jnp.sort(jnp.where(steps, gaps, jnp.inf)), index)
+    found = _at(jnp.sort(jnp.where(steps, gaps, jnp.inf)), index[..., None])[..., 0]
     return jnp.where(count > 1, found, 0)
 
 
@@ -136,16 +137,16 @@ def _photon_transfer(brightness: Float[Array, "*batch n"], detail: Float[Array, 
     rank = jnp.arange(detail.shape[-1])
     number = jnp.where(rank < count[..., None], rank * classes[..., None] // total[..., None], 99)
     _, detail = jax.lax.sort((number, detail), num_keys=2)
-    squares = jnp.zeros(count.shape, detail.dtype)
-    for k in range(_CLASSES):
-        first, last = -(-k * total // classes), -(-(k + 1) * total // classes) - 1
-        middle = (_at(detail, (first + last) // 2) + _at(detail, (first + last + 1) // 2)) / 2
-        squares += jnp.where(k < classes, (middle / _MEDIAN) ** 2, 0)
+    # (*batch, class)
+    k, total, of = jnp.arange(_CLASSES), total[..., None], classes[..., None]
+    first, last = -(-k * total // of), -(-(k + 1) * total // of) - 1
+    middle = (_at(detail, (first + last) // 2) + _at(detail, (first + last + 1) // 2)) / 2
+    squares = jnp.sum(jnp.where(k < of, (middle / _MEDIAN) ** 2, 0), axis=-1)
     return jnp.where(count > 0, squares / classes.astype(detail.dtype), 0)
 
 
 def _at(values: Array, index: Array) -> Array:
-    return jnp.take_along_axis(values, index[..., None], axis=-1, mode="clip")[..., 0]
+    return jnp.take_along_axis(values, index, axis=-1, mode="clip")
 
 
 def estimate_variance(

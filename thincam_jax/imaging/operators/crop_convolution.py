@@ -102,6 +102,7 @@ class CropConvolution(AbstractOperator):
         """Window sample of the sensor's first pixel."""
         return _corner(self.sensor_shape, self.window)
 
+    @jax.jit
     def __call__(self, field: Float[Array, "*batch m n"]) -> Float[Array, "*channels y x"]:
         """The capture of a field (*batch, *channel, *summed, m, n)."""
         _require_shape("field", field, self.in_shape, self.summed)
@@ -110,6 +111,7 @@ class CropConvolution(AbstractOperator):
         product = self.combine(jnp.fft.rfft2(padded))
         return cut(jnp.fft.irfft2(product, s=self.window), self.sensor_corner, self.sensor_shape)
 
+    @jax.jit
     def adjoint(self, capture: Float[Array, "*channels y x"]) -> Float[Array, "*batch m n"]:
         """The transposed operator: correlation of a capture with the PSF."""
         _require_shape("capture", capture, self.out_shape, 0)
@@ -117,6 +119,7 @@ class CropConvolution(AbstractOperator):
         product = self.spread(jnp.fft.rfft2(padded))
         return cut(jnp.fft.irfft2(product, s=self.window), self.field_corner, self.field_shape)
 
+    @jax.jit
     def mean_power(self) -> Float[Array, ""]:
         """Mean of |H|² over all frequencies, channels and planes: Σh² of the PSF without the crop.
 
