@@ -419,9 +419,8 @@ def hand(bin_by):
     return tc.Recording(jnp.asarray(raw[None]), tc.Psfs(jnp.asarray((psf / psf.sum())[None])))
 
 
-@pytest.mark.parametrize(
-    "bin_by, most", [(8, 100), pytest.param(4, 130, marks=pytest.mark.thorough)]
-)
+@pytest.mark.thorough
+@pytest.mark.parametrize("bin_by, most", [(8, 100), (4, 130)])
 def test_what_500_plain_iterations_reach_in_a_quarter_of_them(bin_by, most):
     """A measured capture, with the relaxation and the balance of `AdmmTV`: 80 and 110."""
     recording = hand(bin_by)

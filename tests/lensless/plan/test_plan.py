@@ -21,7 +21,15 @@ def deep():
     return whole, tc.capture(camera(), whole)
 
 
-@pytest.mark.parametrize(("tolerance", "most_psfs"), [(0.3, 1), (0.1, 4), (1e-2, 20), (1e-3, 150)])
+@pytest.mark.parametrize(
+    ("tolerance", "most_psfs"),
+    [
+        (0.3, 1),
+        pytest.param(0.1, 4, marks=pytest.mark.thorough),
+        (1e-2, 20),
+        pytest.param(1e-3, 150, marks=pytest.mark.thorough),
+    ],
+)
 def test_error_is_within_the_tolerance_with_few_psfs(deep, tolerance, most_psfs):
     whole, full = deep
     plan = tc.plan(camera(), whole, tolerance=tolerance)
