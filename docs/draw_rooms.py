@@ -26,9 +26,9 @@ def rooms_and_imports() -> dict[str, tuple[int, list[str]]]:
     names = []
     for floor in FLOORS:
         names += [*floor, OUTSIDE] if OUTSIDE_USES in floor else floor
-    rooms = {}
+    rooms, package = {}, read_package(ROOT / PACKAGE)
     for name in names:
-        modules = [module for module in read_package(ROOT / PACKAGE) if module.top == name]
+        modules = [module for module in package if module.top == name]
         imported = {tuple(to.split(".")[:2]) for module in modules for _, to in module.imports()}
         used = [other for other in names if other != name and (PACKAGE, other) in imported]
         if modules:

@@ -35,8 +35,8 @@ jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 # JAX sets up a compiler context, with all dialects, for every program: here one serves them all. It
 # is a quarter of the time. tests/test_default_flags.py runs its sample without.
 if os.environ["XLA_FLAGS"]:
-    CONTEXT = mlir.make_ir_context()
-    mlir.make_ir_context = lambda: CONTEXT
+    CONTEXT, NEW_CONTEXT = mlir.make_ir_context(), mlir.make_ir_context
+    mlir.make_ir_context = lambda: CONTEXT if mlir.ir.Context.current is None else NEW_CONTEXT()
 
 # Before the first import of the package: from here on every annotated call is checked.
 jaxtyping.install_import_hook("thincam_jax", "beartype.beartype")

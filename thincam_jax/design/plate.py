@@ -92,7 +92,8 @@ class Viewing(NamedTuple):
     - `sensor`: its pixels. `object_distance`, `object_width`: mm. `cell`: the finest detail, mm,
       whose Nyquist frequency ends the integral.
     - `snr_db`: of the captures of the default plate; another's follows from its light.
-    - `mean`, `variance`: of the object's radiance. `prior`: how its variance is spread.
+    - `mean`, `variance`: of the object's radiance. `prior`: how its variance is spread,
+      by default `PowerLaw(2.5)`.
     """
 
     sensor: Sensor
@@ -102,7 +103,7 @@ class Viewing(NamedTuple):
     snr_db: float = 30.0
     mean: float = 0.5
     variance: float = 0.08
-    prior: PowerLaw = PowerLaw(2.5)
+    prior: PowerLaw | None = None
 
 
 class Judged(NamedTuple):
@@ -140,7 +141,8 @@ def judge_plate(plate: Plate, viewing: Viewing) -> Judged:
     v, u = ((np.arange(n) + 0.5) / n for n in _FREQUENCIES)
     grid = np.stack(np.meshgrid(u, 2 * v - 1), axis=-1).reshape(-1, 2) * highest
     frequencies = jnp.asarray(grid, dtype)
-    density = viewing.prior(
+    prior = PowerLaw(2.5) if viewing.prior is None else viewing.prior
+    density = prior(
         jnp.sum(frequencies**2, axis=-1), jnp.asarray(viewing.object_width, dtype)
     )
     # The half plane of u > 0 holds half of the variance.

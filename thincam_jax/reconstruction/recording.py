@@ -158,7 +158,8 @@ class Recording(eqx.Module):
 
     def with_noise(self, variance) -> "Recording":
         """The same recording with another noise variance."""
-        return Recording(self.captures, self.seen_by, noise_variance=variance, valid=self.valid)
+        none = {"is_leaf": lambda leaf: leaf is None}
+        return eqx.tree_at(lambda recording: recording.noise_variance, self, variance, **none)
 
     def focused(self, object_distance) -> "Recording":
         """The same recording with its `Cameras` focused on another distance, mm."""

@@ -14,9 +14,9 @@ from jaxtyping import Array, Float
 from thincam_jax._core.memory import refuse_if_too_large
 from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.doctor import environment
+from thincam_jax.commands.kinds import load_experiment
 from thincam_jax.commands.photo.jobs import Job, write_job
 from thincam_jax.commands.photo.options import Background, Output, Recipe, Sources
-from thincam_jax.commands.refocus.config import load_experiment
 from thincam_jax.commands.study.build import assemble, check_study
 from thincam_jax.commands.study.config import StudyConfig
 from thincam_jax.imaging.operators import window_shape

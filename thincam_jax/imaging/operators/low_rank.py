@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-import scipy.interpolate
+import scipy
 from jaxtyping import Array, Float
 
 from thincam_jax._core import checks

@@ -12,7 +12,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.sparse
+import scipy
 from jaxtyping import Array, DTypeLike, Float, PRNGKeyArray
 
 from thincam_jax._core.checks import Shape
