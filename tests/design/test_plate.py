@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import thincam_jax as tc
-from thincam_jax.design import Plate, PlateLimits, Viewing, find_plate, judge_plate
+from thincam_jax.design import Plate, PlateLimits, PowerLaw, Viewing, find_plate, judge_plate
 from thincam_jax.design.plate import noise_variance
 from thincam_jax.units import deg, um
 from thincam_jax.waveguide import ObjectPlane, system_operator
@@ -52,7 +52,7 @@ def test_expected_error_is_that_of_the_exact_system(numbers):
     matrix = np.zeros((60 * 60, 400))
     np.add.at(matrix, (np.asarray(operator.rows), np.asarray(operator.columns)), operator.values)
     y, x = (np.fft.fftfreq(40, 7.5) for _ in range(2))
-    spectrum = np.asarray(VIEWING.prior(jnp.asarray(y[:, None] ** 2 + x**2), jnp.asarray(150.0)))
+    spectrum = np.asarray(PowerLaw(2.5)(jnp.asarray(y[:, None] ** 2 + x**2), jnp.asarray(150.0)))
     correlation = np.fft.ifft2(spectrum).real
     correlation *= VIEWING.variance / correlation[0, 0]
     rows, columns = np.divmod(np.arange(400), 20)
