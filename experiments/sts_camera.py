@@ -143,6 +143,7 @@ models = {
     "glass 2 % thicker": wg.system_operator(see_through(5.1), plane, orders),
     "without ghosts": wg.system_operator(camera, plane, 1),
 }
+iterations = {"full": 100, "small": 30}[SIZE]
 images, reached = {}, {}
 for number, (name, scene) in enumerate(scenes.items()):
     clean = system(jnp.asarray(scene, jnp.float32))
@@ -153,7 +154,7 @@ for number, (name, scene) in enumerate(scenes.items()):
         recording = tc.Recording(
             (clean + noise)[None, None], [operator], noise_variance=deviation**2
         )
-        found = tc.reconstruct(recording, tc.AdmmTV(0.5))
+        found = tc.reconstruct(recording, tc.AdmmTV(0.5, iterations=iterations))
         images[name, model] = np.squeeze(np.asarray(found.image))
         reached[name, model] = float(psnr(images[name, model], scene))
         print(f"{name}, {model}: {reached[name, model]:.1f} dB")

@@ -13,7 +13,7 @@ SAMPLE = (
     "tests/lensless/propagation/test_closed_form.py",
     "tests/imaging/operators/test_crop_convolution.py::test_it_is_the_integral_over_the_field",
     "tests/imaging/operators/test_crop_convolution.py::test_gradients",
-    "tests/reconstruction/test_fourier_splitting.py",
+    "tests/reconstruction/test_fourier_splitting.py::test_single_precision_and_gradients",
 )
 
 

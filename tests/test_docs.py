@@ -62,6 +62,7 @@ def test_accuracy_page(capsys):
     assert np.linalg.norm(names["image"] - full) < 1e-2 * np.linalg.norm(full)
 
 
+@pytest.mark.thorough
 def test_reconstruction_page(tmp_path, monkeypatch, capsys):
     """The image is the scene, and the gradient is the slope of what it is said to be."""
     monkeypatch.chdir(tmp_path)

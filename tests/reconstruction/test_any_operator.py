@@ -130,7 +130,10 @@ def expected(name: str) -> np.ndarray:
 NAMES = pytest.mark.parametrize("name", list(operators()))
 
 
-@NAMES
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(n, marks=[pytest.mark.thorough] * (n == "dense")) for n in operators()],
+)
 def test_total_variation_by_admm_and_fista(name):
     """Both are within 1e-6 of the minimiser, and report that they have converged."""
     for solver in (

@@ -85,7 +85,8 @@ def random_case(random):
         return sts, wg.LitPlane(plane, image), 10 ** random.uniform(-3.5, -0.5)
 
 
-@pytest.mark.parametrize("count", [2, pytest.param(200, marks=pytest.mark.thorough)])
+@pytest.mark.thorough
+@pytest.mark.parametrize("count", [2, 200])
 def test_predictions_hold_over_random_cameras(capsys, count):
     """True ≤ predicted in 99 % of cameras, predicted ≤ 10·true in 80 %."""
     random, pairs, met, kinds = np.random.default_rng(12), [], [], []

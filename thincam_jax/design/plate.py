@@ -142,9 +142,7 @@ def judge_plate(plate: Plate, viewing: Viewing) -> Judged:
     grid = np.stack(np.meshgrid(u, 2 * v - 1), axis=-1).reshape(-1, 2) * highest
     frequencies = jnp.asarray(grid, dtype)
     prior = PowerLaw(2.5) if viewing.prior is None else viewing.prior
-    density = prior(
-        jnp.sum(frequencies**2, axis=-1), jnp.asarray(viewing.object_width, dtype)
-    )
+    density = prior(jnp.sum(frequencies**2, axis=-1), jnp.asarray(viewing.object_width, dtype))
     # The half plane of u > 0 holds half of the variance.
     element = 2 * highest**2 / len(grid)
     density = density * viewing.variance / (2 * jnp.sum(density) * element)
