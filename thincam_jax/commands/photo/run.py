@@ -125,7 +125,7 @@ def computed_psf(config: Path, overrides: Sequence[str]) -> Raw:
     """
     experiment = load_experiment(config, tuple(overrides))
     if not isinstance(experiment, StudyConfig):
-        raise ConfigError(f"{config}: is of kind refocus; a camera is read from a study")
+        raise ConfigError(f"{config}: is of kind {experiment.kind}; a camera is read from a study")
     study = assemble(experiment, ())
     check_study(study)
     shot = study.exposures[0]
