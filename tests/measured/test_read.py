@@ -14,7 +14,7 @@ import tifffile
 from measured import files
 
 from thincam_jax._core import memory
-from thincam_jax.measured import CaptureFileError, Raw, read_image, read_mask
+from thincam_jax.measured import CaptureFileError, Raw, read_image, read_images, read_mask
 
 SHAPE = (7, 10)
 
@@ -220,8 +220,12 @@ def test_stacks_are_refused(tmp_path):
         for rows in (7, 8, 8):
             writer.write(np.zeros((rows, 9), np.uint8), photometric="minisblack")
     refused(path, "holds 3 images of different sizes")
+    with pytest.raises(CaptureFileError, match="holds 3 images of different sizes"):
+        read_images(path)
     write_tiff(path, np.zeros((2, 7, 9), np.uint8))
     refused(path, "holds 2 images; give one")
+    first, second = read_images(path)
+    assert first.pixels.shape == (7, 9) and second.name == f"{path}, image 2"
     frames = [PIL.Image.fromarray(counts(np.uint8, seed=n)) for n in (1, 2)]
     frames[0].save(tmp_path / "a.png", save_all=True, append_images=frames[1:])
     refused(tmp_path / "a.png", "is animated")

@@ -10,6 +10,7 @@ from thincam_jax.measured.raw import MeasurementError as MeasurementError
 from thincam_jax.measured.raw import Raw as Raw
 from thincam_jax.measured.read import list_captures as list_captures
 from thincam_jax.measured.read import read_image as read_image
+from thincam_jax.measured.read import read_images as read_images
 from thincam_jax.measured.read import read_mask as read_mask
 from thincam_jax.measured.write import log_text as log_text
 from thincam_jax.measured.write import to_display as to_display

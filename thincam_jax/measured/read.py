@@ -9,6 +9,7 @@ import struct
 import warnings
 from collections import Counter
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import imagecodecs
@@ -52,10 +53,28 @@ def read_image(path: str | os.PathLike[str], bits: int | None = None) -> Raw:
     **Errors**: CaptureFileError, one line, for a file that is missing, cut short, damaged or no
     image, for a stack of images, and for all that `Raw` refuses.
     """
+    (pixels,), kind, found = _decode(Path(path))
+    return _raw(pixels, found if bits is None else bits, kind, str(path))
+
+
+def read_images(path: str | os.PathLike[str], bits: int | None = None) -> list[Raw]:
+    """Images that belong together: the pages of a TIFF, or the files of a folder by name.
+
+    Numbers in the names count by their values: psf_90mm.tif before psf_120mm.tif.
+
+    **Errors**: CaptureFileError as in `read_image`; a TIFF's pages must be of one size.
+    """
     path = Path(path)
-    pixels, kind, found = _decode(path)
+    if path.is_dir():
+        return [read_image(one, bits) for one in image_files(path)]
+    pages, kind, found = _decode(path, stack=True)
+    bits = found if bits is None else bits
+    return [_raw(page, bits, kind, f"{path}, image {n}") for n, page in enumerate(pages, 1)]
+
+
+def _raw(pixels: np.ndarray, bits: int | None, kind: str, name: str) -> Raw:
     try:
-        return Raw(pixels, found if bits is None else bits, kind, str(path))
+        return Raw(pixels, bits, kind, name)
     except MeasurementError as error:
         raise CaptureFileError(str(error)) from None
 
@@ -67,7 +86,7 @@ def read_mask(path: str | os.PathLike[str]) -> Bool[np.ndarray, "y x"]:
 
     **Errors**: CaptureFileError as in `read_image`.
     """
-    pixels, _, _ = _decode(Path(path))
+    (pixels,), _, _ = _decode(Path(path))
     if pixels.ndim != 2 or pixels.size == 0 or pixels.dtype.kind not in "buif":
         raise CaptureFileError(
             f"{path}: holds {pixels.dtype} values of shape {pixels.shape}; give a map (y, x) that "
@@ -122,18 +141,21 @@ def _order(path: Path) -> tuple[list[tuple[int, str]], str]:
     return [(int(p), "") if p.isdecimal() else (-1, p) for p in parts], path.name
 
 
-def _decode(path: Path) -> tuple[np.ndarray, str, int | None]:
-    """Pixels, format and, where the file holds them, bits a sample."""
+def _decode(path: Path, stack: bool = False) -> tuple[list[np.ndarray], str, int | None]:
+    """Pixels of each image, format and, where the file holds them, bits a sample.
+
+    More than one image only of a stack.
+    """
     data = _bytes(path)
     kind = next((kind for start, kind in _STARTS.items() if data.startswith(start)), None)
     if kind is None:
         short = not data or any(start.startswith(data) for start in _STARTS)
         what = "is empty or cut short" if short else "is not an image that can be read"
         raise CaptureFileError(f"{path}: {what}; give an undamaged TIFF, PNG or NPY file")
-    readers = {"png": _read_png, "tiff": _read_tiff, "npy": _read_npy}
+    readers = {"png": _read_png, "tiff": partial(_read_tiff, stack=stack), "npy": _read_npy}
     try:
         with _silence():
-            pixels, bits = readers[kind](data)
+            images, bits = readers[kind](data)
     except CaptureFileError as error:
         raise CaptureFileError(f"{path}: {error}") from None
     except Exception as error:  # each decoder raises its own kind
@@ -142,7 +164,7 @@ def _decode(path: Path) -> tuple[np.ndarray, str, int | None]:
             f"{path}: cannot be read as {kind.upper()} ({reason}); the file is cut short, damaged "
             "or of a rare kind: copy it again or save it anew"
         ) from None
-    return pixels, kind, bits
+    return images, kind, bits
 
 
 def _bytes(path: Path) -> bytes:
@@ -165,7 +187,7 @@ def _refuse_bomb(announced: int, held: int) -> None:
     refuse_if_too_large("its image", announced, "give a smaller one")
 
 
-def _read_npy(data: bytes) -> tuple[np.ndarray, None]:
+def _read_npy(data: bytes) -> tuple[list[np.ndarray], None]:
     stream = io.BytesIO(data)
     version = np.lib.format.read_magic(stream)
     readers = {
@@ -184,10 +206,10 @@ def _read_npy(data: bytes) -> tuple[np.ndarray, None]:
             f"is cut short: {held - stream.tell()} of the {size} bytes of its values are there"
         )
     stream.seek(0)
-    return np.load(stream, allow_pickle=False), None
+    return [np.load(stream, allow_pickle=False)], None
 
 
-def _read_png(data: bytes) -> tuple[np.ndarray, int]:
+def _read_png(data: bytes) -> tuple[list[np.ndarray], int]:
     """Pixels (y, x) or (y, x, channel) and bits a sample, checksums checked."""
     columns, rows, depth, colour = struct.unpack_from(">IIBB", data, 16)
     if colour not in _PNG_CHANNELS:
@@ -200,44 +222,47 @@ def _read_png(data: bytes) -> tuple[np.ndarray, int]:
         raise CaptureFileError("is cut short: the PNG's last chunks are missing")
     _refuse_bomb(rows * columns * _PNG_CHANNELS[colour] * depth // 8, len(data))
     pixels = imagecodecs.png_decode(data)
-    return _without_alpha(pixels, pixels.ndim == 3 and pixels.shape[2] in (2, 4)), depth
+    return [_without_alpha(pixels, pixels.ndim == 3 and pixels.shape[2] in (2, 4))], depth
 
 
-def _read_tiff(data: bytes) -> tuple[np.ndarray, int | None]:
-    """Pixels (y, x) or (y, x, channel) and bits a sample; no bits for floats."""
+def _read_tiff(data: bytes, *, stack: bool) -> tuple[list[np.ndarray], int | None]:
+    """Pixels (y, x) or (y, x, channel) of each image and bits a sample; no bits for floats."""
     with tifffile.TiffFile(io.BytesIO(data)) as file:
-        page = _only_page(file)
-        if page.photometric not in _PLAIN:
-            name = getattr(page.photometric, "name", page.photometric)
-            raise CaptureFileError(f"stores colours as {name}, no counts; save it as grey or RGB")
-        if page.axes not in ("YX", "YXS", "SYX"):
-            raise CaptureFileError(
-                f"has axes {page.axes}; give one image (y, x) or (y, x, channel)"
-            )
-        if page.size == 0:
-            raise CaptureFileError("is empty: its image has no pixels")
-        _check_whole(page, len(data))
-        pixels = page.asarray()
-        bits = page.bitspersample
-        if page.axes == "SYX":
-            pixels = np.moveaxis(pixels, 0, -1)
-        alpha = bool(page.extrasamples) and page.extrasamples[-1] in (1, 2)
-    pixels = _without_alpha(pixels, alpha and pixels.ndim == 3 and pixels.dtype.kind == "u")
-    is_count = pixels.dtype.kind == "u" and isinstance(bits, int)
-    return pixels, bits if is_count and 8 <= bits <= 16 else None
+        pages = _whole_pages(file, stack)
+        _refuse_bomb(sum(page.nbytes for page in pages), len(data))
+        images = [_read_page(page, len(data)) for page in pages]
+        bits = pages[0].bitspersample
+    is_count = images[0].dtype.kind == "u" and isinstance(bits, int)
+    return images, bits if is_count and 8 <= bits <= 16 else None
 
 
-def _only_page(file: tifffile.TiffFile) -> tifffile.TiffPage:
-    """The file's one image; previews of lower resolution do not count."""
+def _read_page(page: tifffile.TiffPage, size: int) -> np.ndarray:
+    if page.photometric not in _PLAIN:
+        name = getattr(page.photometric, "name", page.photometric)
+        raise CaptureFileError(f"stores colours as {name}, no counts; save it as grey or RGB")
+    if page.axes not in ("YX", "YXS", "SYX"):
+        raise CaptureFileError(f"has axes {page.axes}; give one image (y, x) or (y, x, channel)")
+    if page.size == 0:
+        raise CaptureFileError("is empty: its image has no pixels")
+    _check_whole(page, size)
+    pixels = page.asarray()
+    if page.axes == "SYX":
+        pixels = np.moveaxis(pixels, 0, -1)
+    alpha = bool(page.extrasamples) and page.extrasamples[-1] in (1, 2)
+    return _without_alpha(pixels, alpha and pixels.ndim == 3 and pixels.dtype.kind == "u")
+
+
+def _whole_pages(file: tifffile.TiffFile, stack: bool) -> list[tifffile.TiffPage]:
+    """The file's images, one or those of a stack; previews of lower resolution do not count."""
     pages = [page.aspage() for page in file.pages]
     whole = [page for page in pages if not page.is_reduced] or pages[:1]
     if not whole:
         raise CaptureFileError("is cut short: the TIFF holds no image")
-    if len(whole) > 1:
-        shapes = {page.shape for page in whole}
-        what = " of different sizes" if len(shapes) > 1 else ""
+    same = len({page.shape for page in whole}) == 1
+    if len(whole) > 1 and not (stack and same):
+        what = "" if same else " of different sizes"
         raise CaptureFileError(f"holds {len(whole)} images{what}; give one image a file")
-    return whole[0]
+    return whole
 
 
 def _check_whole(page: tifffile.TiffPage, size: int) -> None:
@@ -245,7 +270,6 @@ def _check_whole(page: tifffile.TiffPage, size: int) -> None:
     strips = list(zip(page.dataoffsets, page.databytecounts, strict=True))
     if not strips or any(count == 0 or offset + count > size for offset, count in strips):
         raise CaptureFileError("is cut short: a part of the TIFF's pixels is missing")
-    _refuse_bomb(page.nbytes, size)
     plain = page.compression == tifffile.COMPRESSION.NONE
     if plain and isinstance(page.bitspersample, int):
         needed = (page.size * page.bitspersample) // 8

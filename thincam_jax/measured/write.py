@@ -50,7 +50,7 @@ def write_image(
             to_display(image, white_balance=white_balance, gamma=gamma, percentile=percentile)
         )
     else:
-        content = _linear_bytes(np.asarray(image, dtype=np.float32), suffix)
+        content = linear_bytes(np.asarray(image, dtype=np.float32), suffix)
     if log is not None:
         write_whole(path.with_suffix(".json"), log_text(log))
     return write_whole(path, content)
@@ -123,7 +123,7 @@ def log_text(log: Mapping[str, Any]) -> str:
     return json.dumps(plain, indent=2, sort_keys=True, ensure_ascii=False, allow_nan=False) + "\n"
 
 
-def _linear_bytes(image: np.ndarray, suffix: str) -> bytes:
+def linear_bytes(image: np.ndarray, suffix: str) -> bytes:
     stored = image[0] if image.shape[0] == 1 else np.moveaxis(image, 0, -1)
     stored = np.ascontiguousarray(stored)
     buffer = io.BytesIO()

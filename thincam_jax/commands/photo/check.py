@@ -44,6 +44,6 @@ def check_files(
 def enough_blocks(sources: Sources) -> Sources:
     """The sources with a `downsample` that leaves about 160 pixels of the longer side."""
     halved = sources.preparation.demosaicing == "superpixel" and sources.preparation.bayer
-    pixels = max(Rig(sources).psf.pixels.shape[:2]) // (2 if halved else 1)
+    pixels = max(Rig(sources).psfs[0].pixels.shape[:2]) // (2 if halved else 1)
     preparation = dataclasses.replace(sources.preparation, downsample=max(1, round(pixels / _SIDE)))
     return dataclasses.replace(sources, preparation=preparation)

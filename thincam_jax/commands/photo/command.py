@@ -40,6 +40,10 @@ def reconstruct(
         Path, Option(help="Image (.png, .npy, .tif); a folder for a folder of captures.")
     ],
     psf: Annotated[Path | None, Option(help="Measured PSF: TIFF, PNG or NPY.")] = None,
+    distances: Annotated[
+        str | None,
+        Option(help="60mm,80mm,100mm: refocus; --psf is a folder or TIFF of a PSF for each."),
+    ] = None,
     camera: Annotated[
         Path | None,
         Option(help="In place of --psf, a study (YAML) whose first shot took the capture."),
@@ -110,6 +114,7 @@ def reconstruct(
             known_psf,
             read_background,
             read_corner,
+            read_distances,
             read_white_balance,
             run_with_bar,
         )
@@ -136,6 +141,7 @@ def reconstruct(
                     psf_channels=psf_channels,
                 ),
                 psf_bits,
+                read_distances(distances, psf),
             )
             recipe = Recipe(
                 method=method.replace("-", "_"),

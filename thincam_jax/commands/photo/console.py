@@ -13,6 +13,8 @@ from thincam_jax.commands.terminal import WRONG_INPUT, in_a_line, progress_bar, 
 from thincam_jax.measured import MeasurementError, Raw
 from thincam_jax.measured.write import WhiteBalance
 from thincam_jax.reconstruction import Progress
+from thincam_jax.reconstruction.depth.refocus import increasing
+from thincam_jax.units import parse_quantity
 
 
 def read_background(text: str | None) -> Background:
@@ -47,6 +49,22 @@ def known_psf(
             "number of counts"
         )
     return computed_psf(camera, overrides or ())
+
+
+def read_distances(text: str | None, psf: Path | None) -> tuple[float, ...]:
+    """Distances of measured PSFs, mm, from "60mm,80mm,100mm".
+
+    **Errors**: MeasurementError where they are none, not increasing, or there is no measured PSF.
+    """
+    if text is None:
+        return ()
+    if psf is None:
+        raise MeasurementError("--distances are those of measured PSFs; give them by --psf")
+    try:
+        distances = increasing([parse_quantity(part, "length") for part in text.split(",")])
+    except ValueError as error:
+        raise MeasurementError(f"--distances {text}: {error}") from None
+    return tuple(distances)
 
 
 def read_corner(text: str) -> tuple[int, int]:
@@ -86,13 +104,15 @@ def run_with_bar(jobs: list[Job], sources: Sources, recipe: Recipe, output: Outp
     """Work through the jobs with a progress bar; returns the exit code."""
     end = 0
     with progress_bar("{task.fields[objective]}") as bar:
-        teller = _Bar(bar, recipe.iterations, [job.capture.name for job in jobs])
+        teller = _Bar(bar, recipe.iterations, [job.name for job in jobs if job.focus is not None])
         for result in run_jobs(jobs, sources, recipe, output, teller):
             if isinstance(result, Failed):
                 tell(in_a_line(result.error))
                 end = WRONG_INPUT
                 continue
             bar.console.print(_summary(result), highlight=False, markup=False, soft_wrap=True)
+            if result.job.focus is None:
+                continue
             if (doubt := _doubt(result, recipe)) is not None:
                 tell(doubt)
             if result.status == "interrupted":
@@ -131,6 +151,9 @@ class _Bar:
 
 
 def _summary(result: Finished) -> str:
+    if result.job.focus is None:
+        others = ", ".join(path.name for path in result.job.beside)
+        return f"{result.job.images[0]}: each part from the distance it is sharp at; {others}"
     done = result.record["reconstruction"]
     status, noise = done["status"].replace("_", " "), done["noise"]
     return (
@@ -154,6 +177,8 @@ _UNEXPLAINED = 0.9  # of the capture's norm
 
 
 def _interrupted(job: Job, jobs: list[Job]) -> str:
+    jobs = [one for one in jobs if one.focus is not None]
+    what = "distances" if job.label else "captures"
     left = len(jobs) - jobs.index(job) - 1
-    rest = f"; not begun: {left} of {len(jobs)} captures" if left else ""
+    rest = f"; not begun: {left} of {len(jobs)} {what}" if left else ""
     return f"interrupted; {job.images[0]} is the best image so far{rest}"

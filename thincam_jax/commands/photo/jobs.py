@@ -2,6 +2,7 @@
 
 import os
 import tempfile
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,10 +17,23 @@ from thincam_jax.measured.write import LINEAR
 
 @dataclass(frozen=True)
 class Job:
-    """One capture and the images to be made of it; the record stands beside them as NAME.json."""
+    """One capture and the images to be made of it; the record stands beside them as NAME.json.
+
+    - `focus`: which of the distances, where there are any; None: all that were before, as one
+      image that is sharp everywhere.
+    - `label`: that distance, for messages.
+    - `beside`: further files.
+    """
 
     capture: Path
     images: tuple[Path, ...]
+    focus: int | None = 0
+    label: str = ""
+    beside: tuple[Path, ...] = ()
+
+    @property
+    def name(self) -> str:
+        return self.capture.name + self.label
 
     @property
     def record(self) -> Path:
@@ -47,13 +61,34 @@ def plan_jobs(capture: Path, sources: Sources, output: Output) -> list[Job]:
     if batch:
         _check_batch_folder(capture, folder)
     names = [output.path if folder != output.path else folder / f"{c.stem}.png" for c in captures]
-    jobs = [Job(c, _images(n, output)) for c, n in zip(captures, names, strict=True)]
+    planned = zip(captures, names, strict=True)
+    jobs = [job for c, n in planned for job in _jobs_of(c, n, sources, output)]
     _check_names(jobs, sources)
     _check_writable(folder)
     return jobs
 
 
-def write_job(job: Job, image: np.ndarray, record: dict[str, Any], output: Output) -> None:
+def _jobs_of(capture: Path, path: Path, sources: Sources, output: Output) -> list[Job]:
+    """One for each distance, and one of all of them; or the only one."""
+    images = _images(path, output)
+    if not sources.distances:
+        return [Job(capture, images)]
+    jobs = []
+    for focus, distance in enumerate(sources.distances):
+        name = path.with_name(f"{path.stem}-{distance:g}mm{path.suffix}")
+        jobs.append(Job(capture, _images(name, output), focus, f" at {distance:g} mm"))
+    drawn = (path.with_name(f"{path.stem}-{name}.png") for name in ("sweep", "depth"))
+    linear = (p.with_name(f"{p.stem}-depth{p.suffix}") for p in images if p.suffix != ".png")
+    return [*jobs, Job(capture, images, None, beside=(*drawn, *linear))]
+
+
+def write_job(
+    job: Job,
+    image: np.ndarray,
+    record: dict[str, Any],
+    output: Output,
+    beside: Mapping[Path, bytes] | None = None,
+) -> None:
     """All files of a job, complete before the first of them takes its name; the record first."""
     folder = job.record.parent
     folder.mkdir(parents=True, exist_ok=True)
@@ -66,7 +101,9 @@ def write_job(job: Job, image: np.ndarray, record: dict[str, Any], output: Outpu
                 white_balance=output.white_balance,
                 gamma=output.gamma,
             )
-        for path in (job.record, *job.images):
+        for path, content in (beside or {}).items():
+            (Path(staging) / path.name).write_bytes(content)
+        for path in (job.record, *job.images, *job.beside):
             os.replace(Path(staging) / path.name, path)
 
 
@@ -106,7 +143,7 @@ def _check_names(jobs: list[Job], sources: Sources) -> None:
     inputs = {os.path.realpath(path) for path in read}  # also of links in a circle
     taken: dict[Path, Path] = {}
     for job in jobs:
-        for path in (job.record, *job.images):
+        for path in (job.record, *job.images, *job.beside):
             if os.path.realpath(path) in inputs:
                 raise MeasurementError(
                     f"{path}: is read as an input and would be overwritten; give another output"

@@ -6,6 +6,7 @@ from typing import Literal
 
 from thincam_jax._core import checks
 from thincam_jax.measured import MeasurementError, Preparation, Raw
+from thincam_jax.measured.read import image_files
 from thincam_jax.measured.write import WhiteBalance
 from thincam_jax.reconstruction import SOLVERS, AbstractSolver, AdmmTV, Fista, Ridge, TotalVariation
 
@@ -27,6 +28,8 @@ class Sources:
       `psf_background`: a dark frame's file, a number of counts, or None for the default.
     - `bits`: bit depth of the camera where its files do not tell it; `psf_bits` that of the PSF
       and its background where it is another.
+    - `distances`: mm, increasing, of the PSFs that `psf` then holds, one for each; see
+      `measured.read_images`. Without, it is one PSF.
     """
 
     psf: Path | Raw
@@ -36,11 +39,13 @@ class Sources:
     bits: int | None = None
     preparation: Preparation = Preparation()
     psf_bits: int | None = None
+    distances: tuple[float, ...] = ()
 
     def paths(self) -> list[Path]:
         """Every file that is read."""
         given = (self.psf, self.background, self.psf_background, self.dead)
-        return [path for path in given if isinstance(path, Path)]
+        paths = [path for path in given if isinstance(path, Path)]
+        return paths + (image_files(paths[0]) if self.distances and paths[0].is_dir() else [])
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,7 @@ from thincam_jax.measured import (
     Raw,
     prepare,
     read_image,
+    read_images,
     read_mask,
     to_display,
 )
@@ -56,11 +57,12 @@ class Finished:
 
     job: Job
     record: dict[str, Any]
+    image: Float[np.ndarray, "channel y x"]
 
     @property
     def status(self) -> str:
         """See `Reconstruction.ending`."""
-        return self.record["reconstruction"]["status"]
+        return self.record.get("reconstruction", {}).get("status", "")
 
 
 @dataclass(frozen=True)
@@ -83,13 +85,19 @@ def run_jobs(
 
     **Errors**: MeasurementError, one line, for sources that cannot be read.
     """
-    rig = Rig(sources)
+    rig, focused = Rig(sources), []
     for job in jobs:
         try:
-            finished = _run_job(job, rig, recipe, output, told)
+            if job.focus is None:
+                images, focused = focused, []
+                finished = _join(job, images, rig, output)
+            else:
+                finished = _run_job(job, rig, recipe, output, told)
         except (MeasurementError, MemoryError) as error:
             yield Failed(job, error)
             continue
+        if sources.distances and job.focus is not None:
+            focused.append(finished.image)
         yield finished
         if finished.status == "interrupted":
             return
@@ -102,19 +110,33 @@ class Rig:
         self.sources = sources
         psf_bits = sources.bits if sources.psf_bits is None else sources.psf_bits
         given = sources.psf
-        self.psf = given if isinstance(given, Raw) else read_image(given, psf_bits)
+        if isinstance(given, Raw):
+            self.psfs = [given]
+        elif sources.distances:
+            self.psfs = read_images(given, psf_bits)
+            _check_count(given, self.psfs, sources.distances)
+        else:
+            self.psfs = [read_image(given, psf_bits)]
         self.background = _background(sources.background, sources.bits)
         self.psf_background = _background(sources.psf_background, psf_bits)
         self.dead = None if sources.dead is None else read_mask(sources.dead)
 
-    def prepare(self, capture: Path) -> Prepared:
+    def prepare(self, capture: Path, focus: int = 0) -> Prepared:
         return prepare(
-            self.psf,
+            self.psfs[focus],
             read_image(capture, self.sources.bits),
             self.background,
             self.sources.preparation,
             psf_background=self.psf_background,
             dead=self.dead,
+        )
+
+
+def _check_count(given: Path, psfs: list[Raw], distances: tuple[float, ...]) -> None:
+    if len(psfs) != len(distances):
+        raise MeasurementError(
+            f"{given}: holds {len(psfs)} PSFs for {len(distances)} distances; give one for each, "
+            "nearest first"
         )
 
 
@@ -142,7 +164,7 @@ def _background(given: Background, bits: int | None) -> Raw | float | None:
 
 def _run_job(job: Job, rig: Rig, recipe: Recipe, output: Output, told: Told | None) -> Finished:
     began = time.perf_counter()
-    ready = rig.prepare(job.capture)
+    ready = rig.prepare(job.capture, job.focus or 0)
     _check_channels(job, ready, recipe, output)
     image, facts = _reconstruct(job, ready, recipe, told)
     shown = {"gamma": output.gamma, "white_balance": output.white_balance}
@@ -156,20 +178,46 @@ def _run_job(job: Job, rig: Rig, recipe: Recipe, output: Output, told: Told | No
         "display": shown if job.is_shown else None,
         "environment": environment(time.perf_counter() - began),
     }
+    return _written(job, image, record, output)
+
+
+def _join(job: Job, images: list[np.ndarray], rig: Rig, output: Output) -> Finished:
+    """The image that is sharp everywhere, with the depth map; of one image for each distance."""
+    from thincam_jax.commands.photo.depth import draw_depth, find_depth
+
+    began, distances = time.perf_counter(), rig.sources.distances
+    if len(images) != len(distances):
+        raise MeasurementError(
+            f"{job.images[0]}: is not made, nor a depth map: {len(images)} of {len(distances)} "
+            "distances could be reconstructed"
+        )
+    sweep, depth, sharp = find_depth(images, distances)
+    record = {
+        "capture": job.capture,
+        "sources": _told(rig.sources),
+        "psfs": [psf.name for psf in rig.psfs],
+        "files": [path.name for path in (*job.images, *job.beside)],
+        "environment": environment(time.perf_counter() - began),
+    }
+    return _written(job, sharp, record, output, draw_depth(job, sweep, depth, sharp))
+
+
+def _written(job: Job, image: np.ndarray, record, output: Output, beside=None) -> Finished:
     try:
-        write_job(job, image, record, output)
+        write_job(job, image, record, output, beside)
     except OSError as error:
         raise MeasurementError(
             f"{job.images[0]}: cannot be written ({error.strerror or error})"
         ) from None
-    return Finished(job, record)
+    return Finished(job, record, image)
 
 
 def _told(sources: Sources) -> dict[str, Any]:
     """All but the preparation, which tells its own."""
     names = ("background", "psf_background", "dead", "bits", "psf_bits")
     psf = sources.psf.name if isinstance(sources.psf, Raw) else sources.psf
-    return {"psf": psf, **{name: getattr(sources, name) for name in names}}
+    told = {"psf": psf, **{name: getattr(sources, name) for name in names}}
+    return told | ({"distances_mm": sources.distances} if sources.distances else {})
 
 
 def _reconstruct(
@@ -186,7 +234,7 @@ def _reconstruct(
     recording = Recording(capture, seen_by, valid=valid, noise_variance=noise**2)
     solver = recipe.solver(channels)
     # Conjugate gradients run in one piece: there is nothing to tell of before the end.
-    callback = None if told is None or recipe.is_ridge else _Teller(told, job.capture.name)
+    callback = None if told is None or recipe.is_ridge else _Teller(told, job.name)
     found = reconstruct(recording, solver, callback=callback)
     if found.status == "non_finite":
         raise MeasurementError(_lost(job, found, recipe))

@@ -39,7 +39,7 @@ def white_level(images: np.ndarray) -> float:
     return float(np.percentile(images, 99.8))
 
 
-def save_sweep(folder: RunFolder, sweep: RefocusSweep, objects: dict[str, Any]) -> None:
+def draw_sweep(sweep: RefocusSweep, objects: dict[str, Any]) -> Figure:
     """Contact sheet of the sweep, each image with the distance it is focused on."""
     images, distances = np.asarray(sweep.images), np.asarray(sweep.distances)
     white = white_level(images)
@@ -47,18 +47,20 @@ def save_sweep(folder: RunFolder, sweep: RefocusSweep, objects: dict[str, Any]) 
         int(np.argmin(np.abs(distances - o["distance_mm"]))): name for name, o in objects.items()
     }
     picked = _spread(len(distances), _SHOWN, list(nearest))
-    rows = -(-len(picked) // 5)
+    columns = min(5, len(picked))
+    rows = -(-len(picked) // columns)
     aspect = images.shape[-2] / images.shape[-1]
-    figure = Figure(figsize=(11, rows * (2.2 * aspect + 0.35)), layout="constrained")
-    axes = figure.subplots(rows, 5, squeeze=False).ravel()
+    size = (2.2 * columns, rows * (2.2 * aspect + 0.35))
+    figure = Figure(figsize=size, layout="constrained")
+    axes = figure.subplots(rows, columns, squeeze=False).ravel()
     for ax in axes:
         ax.set_axis_off()
     for ax, index in zip(axes, picked, strict=False):
         ax.imshow(grey_levels(images[index], white), cmap="gray", vmin=0, vmax=1)
         name = nearest.get(index)
-        text = f"{distances[index]:.0f} mm" + (f" – {name}" if name else "")
+        text = f"{distances[index]:.4g} mm" + (f" – {name}" if name else "")
         ax.set_title(text, fontsize=10, fontweight="bold" if name else "normal")
-    save_figure(folder, "sweep", figure)
+    return figure
 
 
 def _spread(count: int, most: int, wanted: list[int]) -> list[int]:
@@ -132,14 +134,17 @@ def save_curves(
     save_figure(folder, "focus", figure)
 
 
-def save_depth(folder: RunFolder, sweep: RefocusSweep, depth: DepthMap, sharp: np.ndarray) -> None:
-    """Depth map, its confidence, and the picture that is sharp everywhere."""
+def draw_depth(sweep: RefocusSweep, depth: DepthMap, sharp: np.ndarray) -> Figure:
+    """Depth map, its confidence, and the picture that is sharp everywhere.
+
+    Over directions; over pixels where measured PSFs do not tell these.
+    """
     confidence, distance = np.asarray(depth.confidence), np.asarray(depth.distance)
     white = white_level(np.asarray(sweep.images))
-    save_image(folder, "all-in-focus", grey_levels(sharp, white))
     rows, columns = sharp.shape
-    assert sweep.slope is not None  # a study's cameras are computed
-    slope = float(sweep.slope)
+    slope, names = 1.0, ("x (pixels)", "y (pixels)")
+    if sweep.slope is not None:
+        slope, names = float(sweep.slope), ("direction x/t", "direction y/t")
     extent = (-columns / 2 * slope, columns / 2 * slope, rows / 2 * slope, -rows / 2 * slope)
     figure = Figure(figsize=(12, 3.4 * rows / columns * 1.15 + 1.5), layout="constrained")
     axes = figure.subplots(1, 3, sharey=True)
@@ -154,9 +159,9 @@ def save_depth(folder: RunFolder, sweep: RefocusSweep, depth: DepthMap, sharp: n
         drawn = ax.imshow(image, cmap=cmap, vmin=low, vmax=high, extent=extent)
         figure.colorbar(drawn, ax=ax, label=label, location="bottom", aspect=30)
         ax.set_title(title, fontsize=10)
-        ax.set_xlabel("direction x/t")
-    axes[0].set(facecolor="0.85", ylabel="direction y/t")
-    save_figure(folder, "depth", figure)
+        ax.set_xlabel(names[0])
+    axes[0].set(facecolor="0.85", ylabel=names[1])
+    return figure
 
 
 def save_methods(

@@ -20,6 +20,7 @@ from thincam_jax.commands.refocus.build import (
 )
 from thincam_jax.commands.refocus.config import RefocusConfig
 from thincam_jax.commands.run_folder import Progress, RunFolder, Step, carry_out
+from thincam_jax.commands.study.figures import save_figure, save_image
 from thincam_jax.commands.study.study import Capture, Exposure, Method, Study
 from thincam_jax.reconstruction import Reconstruction
 from thincam_jax.reconstruction.depth import all_in_focus, depth_map
@@ -98,10 +99,12 @@ class _RefocusRun:
             sweep, measure=asked.measure, smoothing=asked.smoothing, window=asked.window
         )
         sharp = np.asarray(all_in_focus(sweep, depth))
-        figures.save_sweep(folder, sweep, self.metrics["objects"])
+        save_figure(folder, "sweep", figures.draw_sweep(sweep, self.metrics["objects"]))
         figures.save_animation(folder, sweep)
         figures.save_curves(folder, asked.measure, sweep, found, self.metrics["objects"])
-        figures.save_depth(folder, sweep, depth, sharp)
+        white = figures.white_level(np.asarray(sweep.images))
+        save_image(folder, "all-in-focus", figures.grey_levels(sharp, white))
+        save_figure(folder, "depth", figures.draw_depth(sweep, depth, sharp))
         figures.save_methods(folder, study, self.pictures, self.methods)
         page = partial(render, study.config, folder, self.metrics)
         folder.complete(self.metrics, study.config.seed, self.started, page)

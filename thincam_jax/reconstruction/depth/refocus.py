@@ -69,7 +69,7 @@ def refocus_sweep(
 
     **Errors**: ValueError, one line, for distances that are not positive and increasing.
     """
-    focus = _increasing(distances)
+    focus = increasing(distances)
     tau = getattr(solver, "tau", None)
     if isinstance(tau, str):
         raise ValueError(
@@ -119,7 +119,8 @@ def _focused(recording: Recording, distances: list[float]) -> list[Recording]:
     ]
 
 
-def _increasing(distances) -> list[float]:
+def increasing(distances) -> list[float]:
+    """The distances of a sweep, mm, checked: ValueError as of `refocus_sweep`."""
     values = np.asarray(distances, dtype=float)
     if values.ndim != 1 or values.size < _LEAST:
         raise ValueError(
