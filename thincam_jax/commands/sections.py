@@ -104,8 +104,9 @@ class ApertureConfig(Section):
 
 
 class MaskConfig(ApertureConfig):
-    """The same of a study, with the orders of binary masks that are computed."""
+    """The same of a study: of a rectangle with its `height`, and which orders are computed."""
 
+    height: Length | None = None
     harmonics: Annotated[int, Field(ge=1, le=99)] = 9
 
 

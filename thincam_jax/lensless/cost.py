@@ -72,7 +72,7 @@ def _separable_sum(mask, shape: tuple[int, int], method: PsfMethod) -> tuple[flo
         held = rows * (height + 2 * width + 2 * columns) + columns * width
         return 4.0 * products, float(held)
     length = sum(shape)
-    cells = getattr(mask, "pixels", None) or 1
+    cells = max(getattr(mask, "pixels", None) or (1,))  # of the longer side
     count = len(orders)
     pairs = count * (count + 1) // 2
     if method.model == "separable":

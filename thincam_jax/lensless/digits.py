@@ -43,7 +43,7 @@ def largest_phase(mask: Any, grid: Grid, path: Path, model: str) -> float:
     with jax.ensure_compile_time_eval():  # inside jit, sums of known numbers are traced as well
         scale = float(path.magnification)
         epsilon = float(path.epsilon(mask.beta)) if model != "geometric" else 0.0
-    beta, half_mask = float(mask.beta), float(mask.extent[0]) / 2
+    beta, halves = float(mask.beta), [float(side) / 2 for side in mask.extent]
     ends = [
         (n - 1) / 2 * float(grid.pitch) / scale + abs(float(c))
         for n, c in zip(grid.shape, np.asarray(mask.centre), strict=True)
@@ -54,6 +54,7 @@ def largest_phase(mask: Any, grid: Grid, path: Path, model: str) -> float:
         if k == 0 or gain == 0 or gain > 2:  # beyond, the order is spread out and weak
             continue
         # A bounded order is seen where its image is: the aperture, shrunk or grown by its focus.
-        reach = math.inf if model in ("paraxial", "closed_form") else gain * half_mask
-        found = max(found, abs(k) * beta / gain * sum(min(end, reach) ** 2 for end in ends))
+        gain_of_reach = math.inf if model in ("paraxial", "closed_form") else gain
+        reach = (min(end, gain_of_reach * half) for end, half in zip(ends, halves, strict=True))
+        found = max(found, abs(k) * beta / gain * sum(r**2 for r in reach))
     return found

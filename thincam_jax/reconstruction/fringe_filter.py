@@ -156,5 +156,5 @@ def _check_phases(
 
 
 def _fixed_numbers(mask: FresnelZoneAperture) -> tuple:
-    numbers = mask.beta, mask.width, mask.fill_factor, *mask.centre
+    numbers = mask.beta, *mask.extent, mask.fill_factor, *mask.centre
     return *(float(n) for n in numbers), mask.profile, mask.harmonics, mask.pixels

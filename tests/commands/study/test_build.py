@@ -31,6 +31,15 @@ def test_a_shot_may_have_its_own_mask_and_exposure(tmp_path):
     assert float(study.camera(method.exposures[2]).sensor.exposure) == pytest.approx(0.4)
 
 
+def test_a_mask_may_be_a_rectangle(tmp_path):
+    """Of which a shot may change the width; zones are as fine as at its farther edges."""
+    shot = "{beta: 25 rad/mm^2, distance: 3 mm, width: 1.2 mm}"
+    study, method = pairs(tmp_path, shot, "mask={width: 2 mm, height: 3.5 mm}")
+    assert study.camera(method.exposures[2]).mask.extent == pytest.approx((3.5, 1.2))
+    (told,) = study.warnings
+    assert told.startswith("the mask casts 13.5 cycles/mm on pixels that resolve 12.5")
+
+
 def test_the_same_shot_twice_and_longer(tmp_path):
     """Another exposure is another capture; the same one would count its noise twice."""
     _, method = pairs(tmp_path, "{beta: 25 /mm^2, distance: 3 mm, exposure: 0.5}")

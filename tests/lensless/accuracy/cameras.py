@@ -86,9 +86,8 @@ def _random_case(rng, kinds) -> Case:
 
 
 def make_case(shape, pitch, profile, phase, centre, geometry, average) -> Case:
-    mask = tc.FresnelZoneAperture(
-        geometry["beta"], phase, width=geometry["width"], profile=profile, centre=centre
-    )
+    sides = {side: geometry.get(side) for side in ("width", "height")}
+    mask = tc.FresnelZoneAperture(geometry["beta"], phase, **sides, profile=profile, centre=centre)
     camera = tc.LenslessCamera(mask, tc.Sensor(shape, pitch), geometry["distance"])
     conditions = {k: geometry[k] for k in ("wavelength", "object_distance")}
     conditions["pixel_integration"] = average

@@ -31,6 +31,27 @@ def test_cells_cut_by_the_edge_count_by_their_open_area():
     assert ((value > 0.01) & (value < 0.99)).sum() > 80  # one ring of partly open cells
 
 
+def test_rectangle():
+    """Its area is width × height; pixels fill both; the finest zones are at the farther edges."""
+    sides = {"width": 0.513, "height": 0.27}
+    mask = tc.FresnelZoneAperture(1e-9, **sides, centre=(0.011, -0.02))
+    value = np.asarray(sample(mask, tc.Grid((30, 41), 0.02)))
+    np.testing.assert_allclose(value.sum() * 0.02**2, 0.513 * 0.27, rtol=1e-9)
+    assert "width 0.513 mm, height 0.27 mm" in repr(mask)
+    tall = tc.FresnelZoneAperture(30.0, 0.7, width=0.5, height=0.8, pixel_pitch=0.1)
+    assert tall.pixels == (8, 5)
+    assert float(tall.finest_frequency) == pytest.approx(30.0 * 0.8 / (2 * np.pi))
+    shown = np.asarray(sample(tall, tc.Grid((10, 9), 0.1)))
+    y, x = centred(10, 0.1)[:, None], centred(9, 0.1)
+    inside = (np.abs(y) < 0.4) & (np.abs(x) < 0.25 - 0.01)
+    np.testing.assert_allclose(
+        shown[inside], (0.5 * (1 + np.cos(30.0 * (y**2 + x**2) + 0.7)))[inside], atol=1e-13
+    )
+    assert (shown > 0).sum() <= 8 * 5
+    with pytest.raises(ValueError, match=r"height = 0\.75 mm is not a whole number of display"):
+        tc.FresnelZoneAperture(30.0, width=0.5, height=0.75, pixel_pitch=0.1)
+
+
 def test_binary_profile_is_its_truncated_series():
     mask = tc.FresnelZoneAperture(30.0, 0.7, width=2.0, profile="binary", harmonics=99)
     grid = tc.Grid((24, 31), 0.05)

@@ -1,4 +1,4 @@
-"""The Fresnel field of a square zone aperture, worked out again in NumPy, SciPy and mpmath.
+"""The Fresnel field of a rectangular zone aperture, worked out again in NumPy, SciPy and mpmath.
 
 Nothing here comes from the package, and no shortcut that the package takes is taken: the mask's
 offset stays under the integral, no order is paired with another.
@@ -45,11 +45,12 @@ def axis_field(order, x, *, beta, width, distance, wavelength, object_distance, 
     return np.sqrt(magnification / (1j * wavelength * distance)) * np.exp(1j * rest) * integral
 
 
-def psf(y, x, *, phase=0.0, centre=(0.0, 0.0), orders=None, **geometry):
+def psf(y, x, *, phase=0.0, centre=(0.0, 0.0), orders=None, height=None, **geometry):
     """|Σ_k c_k e^{jkφ} A_k(y) A_k(x)|², (y, x)."""
+    along_y = geometry if height is None else {**geometry, "width": height}
     field = np.zeros((len(y), len(x)), complex)
     for k, c in (orders or COSINE).items():
-        rows = axis_field(k, y, centre=centre[0], **geometry)
+        rows = axis_field(k, y, centre=centre[0], **along_y)
         columns = axis_field(k, x, centre=centre[1], **geometry)
         field += c * np.exp(1j * k * phase) * np.outer(rows, columns)
     return np.abs(field) ** 2

@@ -28,11 +28,11 @@ def psf_of(shape, pitch, *, model="geometric", wavelength=500e-6, average=False,
     )
 
 
-def shadow(y, x, width=1.0, t=20.0):
+def shadow(y, x, width=1.0, t=20.0, height=1.0):
     """|t(r/M)|² (Eq 3.3 corrected: the shadow is the larger), M = 1 + d/t."""
     m = 1 + 5.0 / t
     y, x = (y / m - CENTRE[0])[:, None], x / m - CENTRE[1]
-    inside = (np.abs(y) <= width / 2) & (np.abs(x) <= width / 2)
+    inside = (np.abs(y) <= height / 2) & (np.abs(x) <= width / 2)
     return inside * (0.5 * (1 + np.cos(BETA * (x**2 + y**2) + PHASE))) ** 2
 
 
@@ -41,6 +41,19 @@ def test_is_the_magnified_mask(shape, t):
     y, x = (reference.centred(n, 0.031) for n in shape)
     expected = shadow(y, x, t=t)
     np.testing.assert_allclose(psf_of(shape, 0.031, t=t), expected, rtol=0, atol=1e-13)
+
+
+def test_rectangle():
+    """Its points, and the means of its pixels, those at the edges too, by sampling them."""
+    y, x = (reference.centred(n, 0.031) for n in (40, 53))
+    sides = {"width": 1.0, "height": 0.6}
+    found = psf_of((40, 53), 0.031, **sides)
+    np.testing.assert_allclose(found, shadow(y, x, **sides), rtol=0, atol=1e-13)
+    y, x = (reference.centred(15 * n, 0.031 / 15) for n in (40, 53))
+    average = shadow(y, x, **sides).reshape(40, 15, 53, 15).mean(axis=(1, 3))
+    found = psf_of((40, 53), 0.031, average=True, **sides)
+    np.testing.assert_allclose(found, average, rtol=0, atol=0.05)
+    assert np.abs(found - average).mean() < 2e-3
 
 
 def test_is_the_limit_of_short_waves():

@@ -207,3 +207,12 @@ def test_errors():
         response(mask_of(pixel_pitch=0.05), path)
     with pytest.raises(TypeError, match="needs a mask made of zone orders"):
         response(tc.SampledMask(np.ones((3, 4)), 0.1), path)
+
+
+def test_rectangle_has_the_factors_of_two_squares():
+    path = Path(WAVELENGTH, DISTANCE)
+    given = [jnp.asarray(V), jnp.asarray(U)]
+    found = transfer_factors(mask_of(height=0.3), path, *given)
+    tall, wide = (transfer_factors(mask_of(width=side), path, *given) for side in (0.3, WIDTH))
+    np.testing.assert_allclose(found.rows, tall.rows, atol=1e-15)
+    np.testing.assert_allclose(found.columns, wide.columns, atol=1e-15)

@@ -14,11 +14,9 @@ from thincam_jax.units import nm, um
 LIGHT = {"object_distance": 100.0, "wavelength": 500 * nm}
 
 
-def camera(
-    beta=30.0, distance=3.0, phase=0.0, centre=(0.0, 0.0), *, shape=(112, 133), pitch=20 * um
-):
-    mask = tc.FresnelZoneAperture(beta, phase, width=2.0, centre=centre)
-    return tc.LenslessCamera(mask, tc.Sensor(shape, pitch), distance)
+def camera(beta=30.0, distance=3.0, phase=0.0, centre=(0.0, 0.0), *, shape=(112, 133), height=None):
+    mask = tc.FresnelZoneAperture(beta, phase, width=2.0, height=height, centre=centre)
+    return tc.LenslessCamera(mask, tc.Sensor(shape, 20 * um), distance)
 
 
 TRUE = camera(phase=1.0, centre=(0.05, -0.03))
@@ -145,6 +143,7 @@ def test_residuals_follow_a_direct_sum():
         ({"parameters": ()}, "at least one name"),
         ({"search": 0.9}, "too wide"),
         ({"camera": camera(0.5)}, "fringes"),
+        ({"camera": camera(height=1.0)}, "fits square masks"),
     ],
 )
 def test_refusals_take_one_line(change, message):

@@ -94,11 +94,13 @@ def synthesis_matrix(synthesis: Synthesis, shots: int, phases: int) -> np.ndarra
 
 
 def unresolved_zones(
-    exposures: Iterable[Exposure], pitch: float, object_distance: float
+    exposures: Iterable[Exposure], pitch: float, object_distance: float, height: float | None
 ) -> list[str]:
-    """A warning where pixels of a pitch, mm, do not resolve the finest zones."""
+    """A warning where pixels of a pitch, mm, do not resolve the finest zones of masks that may have
+    a height."""
     finest = max(
-        edge_frequency(e.beta, e.width) / (1 + e.distance / object_distance) for e in exposures
+        edge_frequency(e.beta, max(e.width, height or 0)) / (1 + e.distance / object_distance)
+        for e in exposures
     )
     fault = unresolved(finest, pitch)
     return [fault] if fault else []
@@ -153,7 +155,8 @@ class Study:
     def warnings(self) -> list[str]:
         """What a user is told before it runs, and in the report."""
         farthest = max((target.distance for target in self.targets), default=math.inf)
-        return unresolved_zones(self.exposures, self.sensor.pitch, farthest)
+        height = dict(self.mask).get("height")
+        return unresolved_zones(self.exposures, self.sensor.pitch, farthest, height)
 
     @property
     def object_distance(self) -> float:

@@ -80,7 +80,8 @@ def _make_point(raw: dict, axes: Sequence[Axis], values: tuple, double: bool) ->
     text = config.model_dump_json(exclude_none=True)
     resolved = {axis.path: _entry(config, axis.places[0]) for axis in axes}
     exposures = [e for method in config.methods for e in as_method(config, method).exposures]
-    warnings = unresolved_zones(exposures, config.sensor.pitch, config.object.distance)
+    numbers = config.sensor.pitch, config.object.distance, config.mask.height
+    warnings = unresolved_zones(exposures, *numbers)
     return GridPoint(_key(config, text, double), resolved, text, double, None, tuple(warnings))
 
 

@@ -14,7 +14,12 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 
 from thincam_jax._core.grids import Grid, centred_frequencies, centred_indices
 from thincam_jax._core.precision import as_complex, turn_phasor
-from thincam_jax.lensless.masks.base import AbstractMask, pairs, require_zone_orders
+from thincam_jax.lensless.masks.base import (
+    AbstractMask,
+    axis_orders,
+    pairs,
+    require_zone_orders,
+)
 from thincam_jax.lensless.masks.fza import axis_samples
 from thincam_jax.lensless.propagation.angular_spectrum import (
     padded_shape,
@@ -111,14 +116,15 @@ def angular_spectrum_terms(
     oversampling: int,
 ) -> SeparableSum:
     """The PSF of `angular_spectrum` at some rows and columns of a grid of `shape`, as a product."""
-    zones = require_zone_orders(mask, "angular_spectrum")
+    both = axis_orders(mask, "angular_spectrum")
+    zones = both[1]
     lower, upper, weights = pairs(zones)
     plane, sensor = planes(Grid(shape, points.pitch), mask_shape, oversampling)
     half = oversampling // 2 if pixel_integration else 0
     factors = []
     for axis, indices in enumerate((points.row_indices, points.column_indices)):
         samples, line = plane.shape[axis], Grid((1, plane.shape[axis]), plane.pitch)
-        values = axis_samples(zones, line.x - mask.centre[axis], line.pitch)
+        values = axis_samples(both[axis], line.x - mask.centre[axis], line.pitch)
         lit = values * spherical_wave(line, path)
         # Sensor samples of the chosen pixels, counted from the axis.
         fine = indices[:, None] * oversampling + jnp.arange(-half, half + 1, dtype=indices.dtype)
@@ -140,17 +146,22 @@ def _by_transform(lit, pitch, path: Path, size: int, fine) -> Complex[Array, "or
     return window[:, position]
 
 
-@functools.partial(jax.jit, static_argnames="samples")
+@functools.partial(jax.jit, static_argnames=("samples", "axis"))
 def fine_fields(
-    mask: AbstractMask, path: Path, reach: Float[Array, ""], exact: Bool[Array, ""], samples: int
+    mask: AbstractMask,
+    path: Path,
+    reach: Float[Array, ""],
+    exact: Bool[Array, ""],
+    samples: int,
+    axis: int = 1,
 ) -> Complex[Array, "order n"]:
-    r"""Fields of the orders on a line, finely sampled, over ±`reach` about the axis.
+    r"""Fields of the orders on a line along x (or y, axis 0), finely sampled, over ±`reach`.
 
     `exact` takes the exact phases of the spherical wave and of the propagation, which Fresnel's
     approximation replaces by :math:`\pi\xi^2/(\lambda t)` and :math:`-\pi\lambda d u^2`; the
     difference of the two is what the approximation costs, while the sampling is common to both.
     """
-    zones = require_zone_orders(mask, "separable")
+    zones = require_zone_orders(mask, "separable", axis)
     pitch = 4 * reach / samples  # as much again on both sides, so that nothing wraps round
     x = centred_indices(samples, pitch.dtype) * pitch
     values = axis_samples(zones, x, pitch)

@@ -325,11 +325,14 @@ class ZoneProbe:
         """
         with allow("float64"):
             mask, pitch, path = self.given["float64"]
+            longer = 0 if mask.extent[0] > mask.extent[1] else 1
             half_sensor = max(self.shape) * pitch / 2
             half_mask = jnp.max(jnp.stack(mask.extent)) / 2 + jnp.max(jnp.abs(mask.centre))
             reach = jnp.maximum(half_sensor, half_mask * path.magnification)
             fields = [
-                np.asarray(fine_fields(mask, path, reach, jnp.asarray(exact), _FINE_SAMPLES))
+                np.asarray(
+                    fine_fields(mask, path, reach, jnp.asarray(exact), _FINE_SAMPLES, longer)
+                )
                 for exact in (True, False)
             ]
             zones = require_zone_orders(mask, "separable")

@@ -32,9 +32,10 @@ class AbstractMask(eqx.Module):
 
 
 class ZoneOrders(NamedTuple):
-    """A mask as a finite sum of separable chirps over a square array of identical open cells.
+    """A mask along one axis, as a finite sum of separable chirps over an array of open cells.
 
-    t(x, y) = Σ_k c_k Q_k(x) Q_k(y), Q_k(x) = exp(j k β x²) in the open part of the aperture.
+    t(x, y) = Σ_k c_k Q_k(x) Q_k(y), Q_k(x) = exp(j k β x²) in the open part of the aperture. The
+    axes of a square share one; those of a rectangle differ in the cells alone.
 
     - `orders`: the k, static.
     - `coefficients`: the c_k, complex.
@@ -52,15 +53,23 @@ class ZoneOrders(NamedTuple):
     sites: Float[Array, " cell"] | None
 
 
-def require_zone_orders(mask: AbstractMask, model: str) -> ZoneOrders:
-    """The mask's zone orders, or one line that says which models can be used without."""
+def require_zone_orders(mask: AbstractMask, model: str, axis: int = 1) -> ZoneOrders:
+    """The mask's zone orders along x (or y, axis 0), or one line that says which models can be used
+    without."""
     zone_orders = getattr(mask, "zone_orders", None)
     if zone_orders is None:
         raise TypeError(
             f"model {model!r} needs a mask made of zone orders, such as FresnelZoneAperture; for a "
             f"{type(mask).__name__} use 'angular_spectrum' or 'rayleigh_sommerfeld'"
         )
-    return zone_orders()
+    return zone_orders(axis)
+
+
+def axis_orders(mask: AbstractMask, model: str) -> tuple[ZoneOrders, ZoneOrders]:
+    """The zone orders along y and along x; one object for both where the mask is a square."""
+    columns = require_zone_orders(mask, model)
+    square = getattr(mask, "height", None) is None
+    return columns if square else require_zone_orders(mask, model, axis=0), columns
 
 
 def pairs(zones: ZoneOrders) -> tuple[np.ndarray, np.ndarray, Complex[Array, " pair"]]:

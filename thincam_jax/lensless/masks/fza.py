@@ -11,7 +11,7 @@ from thincam_jax._core import checks
 from thincam_jax._core.checks import Number, Numbers
 from thincam_jax._core.grids import Grid, cell_overlap, centred_indices
 from thincam_jax._core.precision import as_complex, phasor, product
-from thincam_jax.lensless.masks.base import AbstractMask, ZoneOrders
+from thincam_jax.lensless.masks.base import AbstractMask, ZoneOrders, axis_orders
 
 _HIGHEST_HARMONIC = 99
 Profile = Literal["cosine", "intensity", "binary"]
@@ -19,7 +19,7 @@ PROFILES: tuple[Profile, ...] = get_args(Profile)
 
 
 class FresnelZoneAperture(AbstractMask):
-    r"""A square Fresnel zone aperture.
+    r"""A square or rectangular Fresnel zone aperture.
 
     Amplitude transmittance of the cosine profile, :math:`r` from the mask's centre (thesis Eq 3.1,
     which Eq 3.18 propagates as a field):
@@ -42,12 +42,13 @@ class FresnelZoneAperture(AbstractMask):
 
     - `beta`: β, rad/mm², > 0. The zones at the edge have the local frequency β·width/(2π).
     - `phase`: initial phase φ, rad.
-    - `width`: side of the square aperture, mm.
+    - `width`: side of the square aperture, mm; of a rectangle that along x.
+    - `height`: side of a rectangle along y, mm; None for a square.
     - `profile`: "cosine", "intensity" or "binary".
     - `centre`: (y, x) of the mask's centre, mm.
     - `pixel_pitch`: pitch in mm of the display that shows the mask (a spatial light modulator);
-      None for a printed mask. Each pixel shows the pattern's value at its centre; `width` must be
-      a whole number of pixels.
+      None for a printed mask. Each pixel shows the pattern's value at its centre; the sides must
+      be whole numbers of pixels.
     - `fill_factor`: open fraction of a display pixel's area, 0 < fill_factor ≤ 1.
     - `harmonics`: highest harmonic of the intensity and binary profiles, odd.
 
@@ -57,10 +58,11 @@ class FresnelZoneAperture(AbstractMask):
     beta: Float[Array, ""]
     phase: Float[Array, ""]
     width: Float[Array, ""]
+    height: Float[Array, ""] | None
     centre: Float[Array, "2"]
     fill_factor: Float[Array, ""]
     profile: Profile = eqx.field(static=True)
-    pixels: int | None = eqx.field(static=True)
+    pixels: tuple[int, int] | None = eqx.field(static=True)
     harmonics: int = eqx.field(static=True)
 
     def __init__(
@@ -69,6 +71,7 @@ class FresnelZoneAperture(AbstractMask):
         phase: Number = 0.0,
         *,
         width: Number,
+        height: Number | None = None,
         profile: Profile = "cosine",
         centre: Numbers | tuple[Number, Number] = (0.0, 0.0),
         pixel_pitch: Number | None = None,
@@ -78,6 +81,7 @@ class FresnelZoneAperture(AbstractMask):
         self.beta = checks.positive("beta", beta, "rad/mm^2")
         self.phase = checks.finite("phase", phase, "rad")
         self.width = checks.positive("width", width, "mm")
+        self.height = None if height is None else checks.positive("height", height, "mm")
         self.centre = checks.finite("centre", centre, "mm", shape=(2,))
         self.profile = checks.choice("profile", profile, PROFILES)  # pyright: ignore
         self.fill_factor = checks.fraction("fill_factor", fill_factor)
@@ -86,44 +90,50 @@ class FresnelZoneAperture(AbstractMask):
                 f"harmonics = {harmonics}: give an odd number from 1 to {_HIGHEST_HARMONIC}"
             )
         self.harmonics = harmonics
-        self.pixels = None if pixel_pitch is None else _whole_pixels(width, pixel_pitch)
+        self.pixels = None
+        if pixel_pitch is not None:
+            columns = _whole_pixels("width", width, pixel_pitch)
+            rows = columns if height is None else _whole_pixels("height", height, pixel_pitch)
+            self.pixels = rows, columns
 
     def __repr__(self) -> str:
         beta, phase = checks.shown(self.beta, "rad/mm²"), checks.shown(self.phase, "rad")
         width = checks.shown(self.width, "mm")
+        if self.height is not None:
+            width += f", height {checks.shown(self.height, 'mm')}"
         return f"FresnelZoneAperture(β {beta}, phase {phase}, width {width}, {self.profile})"
 
     @property
     def extent(self) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        return self.width, self.width
+        return self.width if self.height is None else self.height, self.width
 
     @property
     def finest_frequency(self) -> Float[Array, ""]:
-        """Of the zones at the middle of the edges, cycles/mm."""
-        return edge_frequency(self.beta, self.width)
+        """Of the zones at the middle of the edges, cycles/mm; of the farther ones."""
+        return edge_frequency(self.beta, jnp.maximum(*self.extent))
 
     @property
     def orders(self) -> tuple[int, ...]:
         """The diffraction orders k of the profile, without their weights."""
         return _series(self.profile, self.harmonics)[0]
 
-    def zone_orders(self) -> ZoneOrders:
-        """The mask as separable chirps: what the closed-form models work with."""
+    def zone_orders(self, axis: int = 1) -> ZoneOrders:
+        """The mask as separable chirps along x (or y, axis 0): what the closed-form models take."""
         orders, weights = _series(self.profile, self.harmonics)
         k = jnp.asarray(orders, dtype=self.beta.dtype)
         weights = jnp.asarray(weights, dtype=self.beta.dtype)
         coefficients = as_complex(weights) * phasor(k * self.phase)
         if self.pixels is None:
-            sites, half = None, self.width[None] / 2
+            sites, half = None, self.extent[axis][None] / 2
             return ZoneOrders(orders, coefficients, self.beta, -half, half, sites)
-        pitch = self.width / self.pixels
-        sites = centred_indices(self.pixels, self.beta.dtype) * pitch
+        pitch = self.extent[axis] / self.pixels[axis]
+        sites = centred_indices(self.pixels[axis], self.beta.dtype) * pitch
         half = pitch * jnp.sqrt(self.fill_factor) / 2
         return ZoneOrders(orders, coefficients, self.beta, sites - half, sites + half, sites)
 
     def sample(self, grid: Grid) -> Float[Array, "y x"]:
-        zones = self.zone_orders()
-        rows = axis_samples(zones, grid.y - self.centre[0], grid.pitch)
+        down, zones = axis_orders(self, "angular_spectrum")
+        rows = axis_samples(down, grid.y - self.centre[0], grid.pitch)
         columns = axis_samples(zones, grid.x - self.centre[1], grid.pitch)
         return jnp.real(product((zones.coefficients[:, None] * rows).T, columns))
 
@@ -155,14 +165,14 @@ def axis_samples(
     return product(phasor(k * zones.beta * zones.sites**2), as_complex(open_part.T))
 
 
-def _whole_pixels(width, pixel_pitch) -> int:
+def _whole_pixels(name: str, width, pixel_pitch) -> int:
     pitch = float(checks.positive("pixel_pitch", pixel_pitch, "mm"))
     width = float(width)
     pixels = round(width / pitch)
     if pixels < 1 or abs(pixels * pitch - width) > 1e-4 * pitch:
         low, high = max(1, int(width / pitch)) * pitch, (int(width / pitch) + 1) * pitch
         raise ValueError(
-            f"width = {width:g} mm is not a whole number of display pixels of {pitch:g} mm; "
-            f"give width = {low:g} or {high:g} mm"
+            f"{name} = {width:g} mm is not a whole number of display pixels of {pitch:g} mm; "
+            f"give {name} = {low:g} or {high:g} mm"
         )
     return pixels

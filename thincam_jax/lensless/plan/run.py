@@ -181,7 +181,8 @@ def _other_numbers(own: LenslessCamera, camera: LenslessCamera) -> list[str]:
     numbers = {
         "sensor.pitch": (own.sensor.pitch, camera.sensor.pitch, own.sensor.pitch),
         "distance": (own.distance, camera.distance, own.distance),
-        "mask.width": (width, camera.mask.extent[0], width),
+        "mask.width": (own.mask.extent[1], camera.mask.extent[1], width),
+        "mask.height": (own.mask.extent[0], camera.mask.extent[0], width),
         "mask.centre": (own.mask.centre, camera.mask.centre, width),
     }
     if isinstance(own.mask, FresnelZoneAperture) and isinstance(camera.mask, FresnelZoneAperture):

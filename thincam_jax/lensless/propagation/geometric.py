@@ -6,7 +6,7 @@ from jaxtyping import Array, Complex, Float
 
 from thincam_jax._core.grids import Grid
 from thincam_jax._core.precision import as_complex, phasor, product
-from thincam_jax.lensless.masks.base import AbstractMask, ZoneOrders, pairs
+from thincam_jax.lensless.masks.base import AbstractMask, ZoneOrders, axis_orders, pairs
 from thincam_jax.lensless.propagation.chirp import chirp_average
 from thincam_jax.lensless.propagation.path import Path
 from thincam_jax.lensless.propagation.separable_sum import SeparableSum
@@ -26,17 +26,20 @@ def geometric(
     A mask without zone orders is sampled on the shadow's grid, averaging over its cells.
     """
     scale = path.magnification
-    zone_orders = getattr(mask, "zone_orders", None)
-    if zone_orders is None:
+    if not hasattr(mask, "zone_orders"):
         shadow = mask.sample(Grid(grid.shape, grid.pitch / scale))
         return jnp.abs(shadow) ** 2
-    zones = zone_orders()
+    down, across = axis_orders(mask, "geometric")
     factor = _axis_averages if pixel_integration else _axis_values
-    orders, weights = _irradiance_orders(zones)
-    # Both axes at once: half as much to compile.
-    points = jnp.concatenate([grid.y / scale - mask.centre[0], grid.x / scale - mask.centre[1]])
-    both = factor(zones, orders, points, grid.pitch / scale)
-    rows, columns = jnp.split(both, [grid.shape[0]], axis=-1)
+    orders, weights = _irradiance_orders(across)
+    y, x = grid.y / scale - mask.centre[0], grid.x / scale - mask.centre[1]
+    if down is across:
+        # Both axes at once: half as much to compile.
+        both = factor(across, orders, jnp.concatenate([y, x]), grid.pitch / scale)
+        rows, columns = jnp.split(both, [grid.shape[0]], axis=-1)
+    else:
+        rows = factor(down, orders, y, grid.pitch / scale)
+        columns = factor(across, orders, x, grid.pitch / scale)
     return SeparableSum(weights[:, None] * rows, columns, grid)
 
 

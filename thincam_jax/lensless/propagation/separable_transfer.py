@@ -21,7 +21,7 @@ from jaxtyping import Array, Complex, Float
 
 from thincam_jax._core.checks import Number
 from thincam_jax._core.precision import as_complex, phasor, product
-from thincam_jax.lensless.masks.base import AbstractMask, ZoneOrders, pairs, require_zone_orders
+from thincam_jax.lensless.masks.base import AbstractMask, ZoneOrders, axis_orders, pairs
 from thincam_jax.lensless.propagation.chirp import chirp_integral
 from thincam_jax.lensless.propagation.path import Path
 
@@ -58,7 +58,7 @@ def transfer_factors(
 
     **Errors**: ValueError for a mask of display pixels, TypeError for one without zone orders.
     """
-    zones = require_zone_orders(mask, "separable")
+    down, zones = axis_orders(mask, "separable")
     if zones.sites is not None:
         raise ValueError(
             "the transfer function in closed form has no display pixels; drop pixel_pitch from "
@@ -66,14 +66,17 @@ def transfer_factors(
         )
     weights = pairs(zones)[2]
 
-    def factors(frequency):
+    def factors(zones, frequency):
         values = overlaps(zones, path, frequency)
         if pixel_pitch is not None:
             values = values * as_complex(jnp.sinc(pixel_pitch * frequency))
         return values
 
-    both = factors(jnp.concatenate([v, u]))
-    rows, columns = jnp.split(both, [v.shape[0]], axis=-1)
+    if down is zones:
+        both = factors(zones, jnp.concatenate([v, u]))
+        rows, columns = jnp.split(both, [v.shape[0]], axis=-1)
+    else:
+        rows, columns = factors(down, v), factors(zones, u)
     return TransferFactors(weights[:, None] * rows, columns)
 
 

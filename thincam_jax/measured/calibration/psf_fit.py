@@ -171,6 +171,8 @@ def _check_image(image, camera: LenslessCamera) -> np.ndarray:
             f"fit_psf fits a FresnelZoneAperture; the camera's mask is a "
             f"{type(camera.mask).__name__}"
         )
+    if camera.mask.height is not None:
+        raise ValueError("fit_psf fits square masks; leave the height out where it is the width")
     if any(checks.is_traced(leaf) for leaf in jax.tree.leaves((image, camera))):
         raise TypeError(
             "fit_psf searches, so that it cannot be traced: call it outside jit and grad"

@@ -40,7 +40,8 @@ def axial_resolution(camera: LenslessCamera, object_distance) -> Float[Array, "*
     t = t.astype(d.dtype)
     magnification = 1 + d / t
     sides = [n * camera.sensor.pitch / (2 * magnification) for n in camera.sensor.shape]
-    squared = sum(jnp.minimum(mask.width / 2, side) ** 2 for side in sides) / 2
+    halves = zip(mask.extent, sides, strict=True)
+    squared = sum(jnp.minimum(across / 2, side) ** 2 for across, side in halves) / 2
     return jnp.pi * t * (t + d) / (mask.beta * d * squared)
 
 
