@@ -9,6 +9,8 @@ import pytest
 
 import thincam_jax as tc
 from thincam_jax.measured.calibration import fit_psf, problem
+from thincam_jax.measured.calibration.psf_fit import FRINGE_SCANNED
+from thincam_jax.measured.calibration.start import _one_picture
 from thincam_jax.units import nm, um
 
 LIGHT = {"object_distance": 100.0, "wavelength": 500 * nm}
@@ -104,6 +106,57 @@ def test_wavelength_and_distance_of_a_plane_wave_are_one():
     np.testing.assert_allclose(fit.wavelength * fit.camera.distance, 3.0 * 500 * nm, rtol=1e-3)
 
 
+def synthesised(weights, seed=6):
+    """Of captures that have noise of their own and a background that the synthesis may cancel."""
+    shots = [
+        0.3 + np.asarray(picture(camera(phase=1.0 + phase, centre=(0.05, -0.03)), seed + k))
+        for k, phase in enumerate(weights)
+    ]
+    return sum(w * shot for w, shot in zip(weights.values(), shots, strict=True))
+
+
+def test_model_of_a_synthesis_is_the_sum_of_pictures():
+    """Here of two in quadrature, which keep a background; and its fringes as one picture."""
+    weights = {0.0: 1.0, math.pi / 2: -1j}
+    synthesis = problem.Synthesis(
+        jnp.asarray(list(weights)), jnp.asarray([[1.0, 0.0], [0.0, -1.0]])
+    )
+    rigs = [camera(phase=1.0 + phase) for phase in weights]
+    h = [np.asarray(tc.psf(rig, wavelength=500 * nm, object_distance=100.0)) for rig in rigs]
+    state = problem.FitState(rigs[0], *map(jnp.asarray, (500 * nm, 0.01, 0.2, 3.0)), synthesis)
+    image = np.asarray(state.image(False))
+    expected = [0.2 + 3 * h[0], -0.2 - 3 * h[1]]
+    np.testing.assert_allclose(image, expected, rtol=1e-9, atol=1e-9)
+    fringes = _one_picture(image, state)
+    assert np.corrcoef(fringes.ravel(), h[0].ravel())[0, 1] > 0.9
+
+
+@pytest.mark.thorough
+def test_a_fringe_scanned_picture():
+    """It is complex; its background has cancelled."""
+    fit = fit_psf(synthesised(FRINGE_SCANNED), START, **LIGHT)
+    assert fit.status == "ok" and "background" not in fit.names
+    assert np.all(np.abs(deviations(fit, TRUE)) < 4.5)
+    np.testing.assert_allclose(fit.camera.mask.beta, 30.0, rtol=1e-4)
+    assert fit.residual.dtype == np.complex128
+    # Noise of 30 dB of each of the four, two in each part.
+    residual = np.asarray(fit.residual)
+    assert np.std(residual.real) == pytest.approx(np.std(residual.imag), rel=0.05)
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("weights", [{0.0: 1.0, 4.712389: -1.0}, {0.0: 1.0, 1.5707963: -1j}])
+def test_two_phases(weights):
+    """Their difference, which is real; and in quadrature, which keeps the background."""
+    fit = fit_psf(synthesised(weights), START, weights=weights, **LIGHT)
+    assert fit.status == "ok"
+    assert ("background" in fit.names) == (abs(sum(weights.values())) > 0)
+    off = deviations(fit, TRUE)
+    if "background" in fit.names:
+        off[fit.names.index("background")] -= 0.3 / float(fit.standard_errors["background"])
+    assert np.all(np.abs(off) < 4.5)
+
+
 @pytest.mark.thorough
 def test_another_picture_is_told():
     noise = np.random.default_rng(0).normal(size=TRUE.sensor.shape)
@@ -143,6 +196,8 @@ def test_residuals_follow_a_direct_sum():
         ({"parameters": ()}, "at least one name"),
         ({"search": 0.9}, "too wide"),
         ({"camera": camera(0.5)}, "fringes"),
+        ({"weights": {0.0: 1.0, 1.5: 1j}}, "give the complex picture"),
+        ({"weights": {0.0: 1.0, 2 * math.pi: -1.0}}, "leave no fringes"),
         ({"camera": camera(height=1.0)}, "fits square masks"),
     ],
 )

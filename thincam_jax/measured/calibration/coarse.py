@@ -232,14 +232,15 @@ def coarse_image(image: np.ndarray, guess: FitState, pixel_integration: bool) ->
     """
     pitch = float(guess.camera.sensor.pitch)
     zone = math.sqrt(float(guess.wavelength) * float(guess.camera.distance))
-    size = max(1, min(round(_BLOCK * zone / pitch), min(image.shape) // _FEWEST))
-    kept = central_blocks(image.shape, size)
-    averages = block_mean(image[kept], size)
+    shape = image.shape[-2:]
+    size = max(1, min(round(_BLOCK * zone / pitch), min(shape) // _FEWEST))
+    kept = central_blocks(shape, size)
+    averages = block_mean(image[..., *kept], size)
     middles = np.array([(part.start + part.stop) / 2 for part in kept])
-    offset = (middles - np.array(image.shape) / 2) * pitch
+    offset = (middles - np.array(shape) / 2) * pitch
     return FitImage(
         averages,
-        Grid(averages.shape, pitch * size),
+        Grid(averages.shape[-2:], pitch * size),
         jnp.asarray(offset),
         size > 1 or pixel_integration,
     )
@@ -249,14 +250,15 @@ def _with_linear(measured: FitImage, state: FitState, parameters: Sequence[str])
     """Background and gain by linear least squares, as far as they are free."""
     h = measured.model(state, ("phase",), np.zeros(1))
     values = measured.image.ravel()
-    background, gain = 0.0, 1.0
-    if "gain" in parameters and "background" in parameters:
-        gain = np.mean((h - h.mean()) * (values - values.mean())) / np.var(h)
-        background = values.mean() - gain * h.mean()
-    elif "gain" in parameters:
-        gain = values @ h / (h @ h)
-    elif "background" in parameters:
-        background = np.mean(values - h)
+    flat = np.broadcast_to(np.asarray(state.flat), measured.image.shape).ravel()
+    columns = {"background": flat, "gain": h}
+    free = [name for name in columns if name in parameters]
+    found = dict.fromkeys(columns, 0.0) | {"gain": 1.0}
+    if free:
+        rest = values if "gain" in free else values - h
+        solution = np.linalg.lstsq(np.stack([columns[n] for n in free], axis=1), rest)[0]
+        found |= dict(zip(free, solution, strict=True))
+    background, gain = found["background"], found["gain"]
     if not gain > 0:  # not the picture of this camera; some gain, so that there is a slope
         gain = values.std() / h.std()
     numbers = (jnp.asarray(background, jnp.float64), jnp.asarray(gain, jnp.float64))

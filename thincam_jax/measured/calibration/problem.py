@@ -1,5 +1,6 @@
 """The least-squares problem of a PSF fit: unknowns, model, residual, and what the fit knows."""
 
+import functools
 import operator
 from typing import NamedTuple, cast
 
@@ -44,10 +45,22 @@ def unknown_names(parameters: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(names)
 
 
+class Synthesis(eqx.Module):
+    """A sum of pictures at several phases: its real part, and its imaginary one if it has one.
+
+    - `phases`: of each picture, rad, on top of the mask's.
+    - `weights`: of the pictures in each part.
+    """
+
+    phases: Float[Array, " shot"]
+    weights: Float[Array, "part shot"]
+
+
 class FitState(eqx.Module):
     """Everything that the picture of a point source on the axis depends on.
 
     - `nearness`: 1/t, 1/mm; 0 is a plane wave. t itself has no value next to infinity.
+    - `synthesis`: None for one picture; else of what sum of pictures it is.
     """
 
     camera: LenslessCamera
@@ -55,6 +68,7 @@ class FitState(eqx.Module):
     nearness: Float[Array, ""]
     background: Float[Array, ""]
     gain: Float[Array, ""]
+    synthesis: Synthesis | None = None
 
     @property
     def mask(self) -> FresnelZoneAperture:
@@ -65,17 +79,33 @@ class FitState(eqx.Module):
         """M = 1 + d/t."""
         return 1 + self.camera.distance * self.nearness
 
-    def image(self, pixel_integration: bool, grid: Grid | None = None) -> Float[Array, "y x"]:
-        """background + gain·h, on the sensor or another grid."""
-        h = psf(
-            self.camera,
+    @property
+    def flat(self) -> Float[Array, "*part"]:
+        """What a background of 1 in every picture is in the image."""
+        if self.synthesis is None:
+            return jnp.ones_like(self.background)
+        return jnp.sum(self.synthesis.weights, axis=1)[:, None, None]
+
+    def image(self, pixel_integration: bool, grid: Grid | None = None) -> Float[Array, "*part y x"]:
+        """background + gain·h, or the sum of these, on the sensor or another grid."""
+        if self.synthesis is None:
+            h = self._psf(pixel_integration, grid, 0.0)
+        else:
+            turned = functools.partial(self._psf, pixel_integration, grid)
+            h = jax.lax.map(turned, self.synthesis.phases)
+            h = jnp.tensordot(self.synthesis.weights, h, axes=1)
+        return self.background * self.flat + self.gain * h
+
+    def _psf(self, pixel_integration: bool, grid: Grid | None, phase) -> Float[Array, "y x"]:
+        turned = self.mask.phase + phase
+        return psf(
+            eqx.tree_at(lambda camera: camera.mask.phase, self.camera, turned),
             wavelength=self.wavelength,
             object_distance=1 / self.nearness,  # pyright: ignore[reportArgumentType]
             model="separable",
             pixel_integration=pixel_integration,
             grid=grid,
         )
-        return self.background + self.gain * h
 
     def moved(self, names: tuple[str, ...], steps: Float[Array, " unknown"]) -> "FitState":
         """With every named number away from here by a dimensionless step.
@@ -171,7 +201,7 @@ class FitProblem(eqx.Module):
     """
 
     start: FitState
-    image: Float[Array, "y x"]
+    image: Float[Array, "*part y x"]
     weight: Float[Array, ""]
     scale: Float[Array, " unknown"]
     names: tuple[str, ...] = eqx.field(static=True)
@@ -191,7 +221,7 @@ def state_at(scaled: Float[Array, " unknown"], problem: FitProblem) -> FitState:
     return problem.start.moved(problem.names, scaled * problem.scale)
 
 
-def residual(scaled: Float[Array, " unknown"], problem: FitProblem) -> Float[Array, "y x"]:
+def residual(scaled: Float[Array, " unknown"], problem: FitProblem) -> Float[Array, "*part y x"]:
     """(model − measured image)·weight."""
     model = state_at(scaled, problem).image(problem.pixel_integration)
     return (model - problem.image) * problem.weight
@@ -205,7 +235,7 @@ def model(
     pixel_integration: bool,
     grid: Grid,
     offset: Float[Array, "2"],
-) -> Float[Array, "y x"]:
+) -> Float[Array, "*part y x"]:
     """The image after the steps, on a grid whose middle is `offset` (y, x, mm) off the sensor's."""
     state = start.moved(names, steps)
     # The grid's middle is its origin: the mask moves the other way.
@@ -268,7 +298,7 @@ def _values(steps, start: FitState, names):
 @eqx.filter_jit
 def state_and_residual(
     scaled: Float[Array, " unknown"], problem: FitProblem
-) -> tuple[FitState, Float[Array, "y x"]]:
+) -> tuple[FitState, Float[Array, "*part y x"]]:
     """The numbers, and measured image − model."""
     return state_at(scaled, problem), -residual(scaled, problem) / problem.weight
 

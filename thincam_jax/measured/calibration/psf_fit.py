@@ -1,14 +1,14 @@
 r"""`fit_psf`: the numbers of a camera from a picture of a point source."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Literal
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float, Inexact
 
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Number, Numbers
@@ -26,6 +26,7 @@ from thincam_jax.measured.calibration.problem import (
     FitProblem,
     FitState,
     Solution,
+    Synthesis,
     ambiguous_pairs,
     of_values,
     solve,
@@ -36,8 +37,11 @@ from thincam_jax.measured.calibration.problem import (
 from thincam_jax.measured.calibration.start import check_fringes, given, search_ranges, start_near
 from thincam_jax.measured.raw import image_with_contrast
 
+Weights = Mapping[float, complex | float | int]
 Status = Literal["ok", "ambiguous", "poor_fit", "not_converged"]
 DEFAULT = ("beta", "phase", "centre", "distance", "background", "gain")
+# The phase and weight of each capture of a fringe-scanned one, as in `fringe_scanned_otf`.
+FRINGE_SCANNED = {0.0: 1j, math.pi / 2: -1.0, math.pi: -1j, 3 * math.pi / 2: 1.0}
 # Part of the image's contrast that a fit must explain; less is another picture, or another turn.
 _EXPLAINED = 0.5
 
@@ -53,7 +57,7 @@ class PsfFit(eqx.Module):
       errors are those of white noise of the residual's own strength, √(σ²(JᵀJ)⁻¹); they hold what
       the noise does, not what the model leaves out.
     - `correlation`: of their errors.
-    - `residual`: measured − model, (y, x).
+    - `residual`: measured − model, (y, x); complex where the image is.
     - `status`: "ok"; "ambiguous", where numbers cannot be told apart (`AMBIGUOUS`: a correlation
       above 0.999); "poor_fit", where the model explains less than half of the image's contrast;
       "not_converged". The first that applies, from the last to the first.
@@ -69,7 +73,7 @@ class PsfFit(eqx.Module):
     values: dict[str, Float[Array, ""]]
     standard_errors: dict[str, Float[Array, ""]]
     correlation: Float[Array, "unknown unknown"]
-    residual: Float[Array, "y x"]
+    residual: Inexact[Array, "y x"]
     names: tuple[str, ...] = eqx.field(static=True)
     status: Status = eqx.field(static=True)
     reasons: tuple[str, ...] = eqx.field(static=True)
@@ -82,9 +86,10 @@ class PsfFit(eqx.Module):
 
 
 def fit_psf(
-    psf_image: Numbers,
+    psf_image: Numbers | Inexact[ArrayLike, "y x"],
     camera: LenslessCamera,
     *,
+    weights: Weights | None = None,
     object_distance: Number,
     wavelength: Number,
     parameters: Sequence[str] = DEFAULT,
@@ -125,6 +130,10 @@ def fit_psf(
     **Arguments**
 
     - `psf_image`: (y, x) on the camera's sensor, linear in irradiance, in any unit.
+    - `weights`: of a picture that is a sum Σ w_k g_k of captures at several phases: each phase φ_k
+      (rad, on top of the mask's) and its w_k. A complex picture without is fringe-scanned as the
+      thesis does, (g(3π/2) − g(π/2)) + j(g(0) − g(π)): `FRINGE_SCANNED`. Where the weights add up
+      to 0 there is no background left, and none is fitted.
     - `camera`: with a `FresnelZoneAperture`; its numbers are the start.
     - `object_distance`: t, mm, from the mask, or infinity; `wavelength`: λ, mm.
     - `parameters`: which to fit, of "beta", "phase", "centre", "width", "distance",
@@ -144,11 +153,15 @@ def fit_psf(
     or another shape than the sensor, a sensor that holds less than one fringe, unknown parameters
     and another mask.
     """
+    synthesis = _check_weights(psf_image, weights)
     parameters = _check_parameters(parameters)
-    image = _check_image(psf_image, camera)
+    if synthesis is not None and not np.any(np.abs(synthesis.weights.sum(axis=1)) > 1e-6):
+        parameters = tuple(name for name in parameters if name != "background")
+    image = _check_image(psf_image, camera, synthesis)
     ranges = search_ranges(camera, parameters, search, centre_search)
     with allow("float64", camera):
-        guess = given(cast(camera, "float64"), object_distance, wavelength, parameters)
+        double = cast((camera, synthesis), "float64")
+        guess = given(double[0], object_distance, wavelength, parameters, double[1])
         check_fringes(guess)
         start = start_near(image, guess, parameters, ranges, float(search), pixel_integration)
         names = unknown_names(parameters)
@@ -165,7 +178,28 @@ def _check_parameters(parameters) -> tuple[str, ...]:
     return tuple(parameters)
 
 
-def _check_image(image, camera: LenslessCamera) -> np.ndarray:
+def _check_weights(image, weights: Weights | None) -> Synthesis | None:
+    """How the picture was put together; None for one capture."""
+    is_complex = np.iscomplexobj(image)
+    if weights is None and not is_complex:
+        return None
+    weights = FRINGE_SCANNED if weights is None else weights
+    phases, factors = np.array(list(weights), float), np.array(list(weights.values()), complex)
+    turns = np.exp(1j * phases)
+    left = np.abs([factors @ turns, factors @ turns.conj()]) if weights else np.zeros(1)
+    if not (np.isfinite(left).all() and left.max() > 1e-6 * np.abs(factors).sum()):
+        raise ValueError(
+            f"weights = {dict(weights)!r} leave no fringes; give each capture's phase in rad and "
+            "its finite weight, as {0.0: 1, math.pi: -1}"
+        )
+    real, imaginary = np.real(factors), np.imag(factors)
+    if np.any(imaginary) and not is_complex:
+        raise ValueError("weights are complex and psf_image is real; give the complex picture")
+    parts = np.stack([real, imaginary][: 1 + is_complex])
+    return Synthesis(jnp.asarray(phases), jnp.asarray(parts))
+
+
+def _check_image(image, camera: LenslessCamera, synthesis: Synthesis | None) -> np.ndarray:
     if not isinstance(camera.mask, FresnelZoneAperture):
         raise TypeError(
             f"fit_psf fits a FresnelZoneAperture; the camera's mask is a "
@@ -177,7 +211,9 @@ def _check_image(image, camera: LenslessCamera) -> np.ndarray:
         raise TypeError(
             "fit_psf searches, so that it cannot be traced: call it outside jit and grad"
         )
-    return image_with_contrast("psf_image", image, camera.sensor.shape, "the sensor")
+    parts = (np.real(image), np.imag(image))[: 1 + np.iscomplexobj(image)]
+    seen = [image_with_contrast("psf_image", p, camera.sensor.shape, "the sensor") for p in parts]
+    return seen[0] if synthesis is None else np.stack(seen)
 
 
 def _fit(image, start: FitState, names, pixel_integration, max_steps, precision) -> PsfFit:
@@ -215,6 +251,8 @@ def _report(problem: FitProblem, solution: Solution, precision: Precision) -> Ps
         errors["object_distance"] = errors["object_distance"] * distance**2
     explained = 1 - float(jnp.sum((residual * problem.weight) ** 2))
     status, reasons = _status(solution, explained, alike)
+    if found.synthesis is not None:
+        residual = residual[0] if len(residual) == 1 else jax.lax.complex(*residual)
     found_fit = PsfFit(
         found.camera,
         jnp.asarray(distance),

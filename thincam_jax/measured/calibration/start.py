@@ -12,7 +12,7 @@ from thincam_jax._core.checks import Number
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.measured.calibration.chirp_search import Chirp, Ranges, find_chirp
 from thincam_jax.measured.calibration.coarse import descend
-from thincam_jax.measured.calibration.problem import FitState
+from thincam_jax.measured.calibration.problem import FitState, Synthesis
 
 # d/t at which a free object distance starts where it was given as infinite, a number that no step
 # can leave: its shadow is within a millionth of that of infinity.
@@ -25,6 +25,7 @@ def given(
     object_distance: Number,
     wavelength: Number,
     parameters: Sequence[str],
+    synthesis: Synthesis | None = None,
 ) -> FitState:
     """The camera and the point as given, with an empty background and a gain of one."""
     path = camera.path(wavelength, object_distance)
@@ -32,7 +33,8 @@ def given(
     if "object_distance" in parameters:
         nearness = jnp.maximum(nearness, _FARTHEST / camera.distance)
     none = jnp.zeros_like(nearness)
-    return FitState(camera, path.wavelength.astype(none.dtype), nearness, none, none + 1)
+    wavelength = path.wavelength.astype(none.dtype)
+    return FitState(camera, wavelength, nearness, none, none + 1, synthesis)
 
 
 def search_ranges(
@@ -84,9 +86,24 @@ def start_near(
     Only what is in `parameters` differs from the guess.
     """
     pitch = float(guess.camera.sensor.pitch)
-    found = find_chirp(image, pitch, _fringes(guess), ranges)
+    found = find_chirp(_one_picture(image, guess), pitch, _fringes(guess), ranges)
     near = _with_fringes(guess, found, parameters, search)
     return descend(image, guess, near, parameters, search, pixel_integration)
+
+
+def _one_picture(image: np.ndarray, guess: FitState) -> np.ndarray:
+    """The fringes cos(βr² + φ) of a synthesis.
+
+    Of each picture's cos(u + φ_k) the sum of weights w_k has
+    ½ e^{ju} Σ w_k e^{jφ_k} + ½ e^{−ju} Σ w_k e^{−jφ_k}: the stronger of the two is taken.
+    """
+    if guess.synthesis is None:
+        return image
+    turns = np.exp(1j * np.asarray(guess.synthesis.phases))
+    weights, unit = np.asarray(guess.synthesis.weights), np.array([1, 1j])[: len(image)]
+    ahead, behind = unit @ weights @ turns, unit @ weights @ turns.conj()
+    strongest = ahead if abs(ahead) >= abs(behind) else behind
+    return np.real(np.tensordot(unit, image, axes=1) / strongest)
 
 
 def _fringes(state: FitState) -> Chirp:
