@@ -27,6 +27,9 @@ def run(tmp_path_factory):
     return setup, folder.path, metrics, texts
 
 
+PICTURES = ("rays", "field", "images", "models", "errors", "columns", "distances")
+
+
 def test_the_right_model_is_the_best(run):
     models = run[2]["models"]
     means = {
@@ -36,6 +39,21 @@ def test_the_right_model_is_the_best(run):
     for name in ("convolution", "single"):
         assert (np.array(means["right"]) > np.array(means[name]) + 1.5).all()
     assert min(means["right"]) > 25
+
+
+@pytest.mark.thorough
+def test_total_variation_through_the_matrix(tmp_path):
+    """The measured matrix serves ADMM as the exact rays do, at another distance too."""
+    methods = "methods=[{name: TV, kind: admm_tv, variation: {tau: 0.5, iterations: 30}}]"
+    config = tiny.experiment(tmp_path, methods, "targets.0.published={}")
+    metrics = run_screen(build_setup(config), RunFolder(tmp_path / "out"), Told())
+    right, measured = (
+        metrics["models"][name]["methods"]["TV"]["mean_psnr_db"]
+        for name in ("right", "measured matrix")
+    )
+    assert measured == pytest.approx(right, abs=0.5) and right > 30
+    means = metrics["calibration"]["distances"]["450 mm"]
+    assert means["from the fit"]["mean_psnr_db"] > means["measured there"]["mean_psnr_db"] - 1
 
 
 def test_rays_are_those_of_the_plate(run):
@@ -48,12 +66,38 @@ def test_rays_are_those_of_the_plate(run):
     assert rays["status_percent"]["off_hologram"] > 0
 
 
+def test_a_calibration_is_as_good_as_its_noise(run):
+    """The matrix has the noise of its frames, and takes the place of the exact rays."""
+    setup, path, metrics, _ = run
+    found = metrics["calibration"]
+    assert found["frames"] == 2 * 8 * 16
+    spread = (2 * (1 + 1 / 12) / 128) ** 0.5
+    assert found["expected_noise_counts"] == pytest.approx(spread, abs=1e-5)
+    assert found["noise_counts"] == pytest.approx(spread, rel=0.1)
+    measured, right = (
+        [method["mean_psnr_db"] for method in metrics["models"][name]["methods"].values()]
+        for name in ("measured matrix", "right")
+    )
+    assert np.array(measured) == pytest.approx(np.array(right), abs=1)
+    assert not list(path.glob("*.zarr"))  # keep_captures
+
+
+def test_another_distance_follows_from_the_fit(run):
+    found = run[2]["calibration"]
+    glass = found["fit"]["values"]["glass_thickness"]
+    assert glass["true"] == 5 and glass["unit"] == "mm"
+    assert glass["found"] == pytest.approx(5, abs=0.05)  # from 5.3 mm
+    means = {name: way["mean_psnr_db"] for name, way in found["distances"]["450 mm"].items()}
+    assert abs(means["from the fit"] - means["measured there"]) < 1
+    assert means["from the fit"] > means["as assumed"] + 1
+
+
 def test_progress_and_files(run):
     setup, path, metrics, texts = run
-    assert len(texts) == texts.total == 1 + 3 * 2 + 1
+    assert len(texts) == texts.total == 1 + 3 * 2 + (1 + 2 + 1 + 1) + 1
     assert json.loads((path / "metrics.json").read_text("utf-8")) == metrics
     names = {p.name for p in (path / "figures").iterdir()}
-    assert names == {f"{n}.png" for n in ("rays", "field", "images", "models", "errors")}
+    assert names == {f"{n}.png" for n in PICTURES}
     assert len(list((path / "images").iterdir())) == 2 * 2
     assert tiny.experiment(path, text=(path / "config.yaml").read_text("utf-8")) == setup.config
 
@@ -61,10 +105,15 @@ def test_progress_and_files(run):
 def test_report_stands_alone_and_is_escaped(run):
     page = (run[1] / "report.html").read_text("utf-8")
     sources = re.findall(r'src="([^"]+)"', page)
-    assert len(sources) == 5
+    assert len(sources) == len(PICTURES)
     assert all(source.startswith("data:image/") for source in sources)
     assert "&lt;b&gt;of its own&lt;/b&gt;" in page
     assert ">16.8</td>" in page  # published
+
+
+@pytest.fixture(scope="module")
+def right(run):
+    return mistaken_rays(run[0], run[0].camera, "none")
 
 
 @pytest.mark.parametrize(
@@ -77,10 +126,9 @@ def test_report_stands_alone_and_is_escaped(run):
         ("no_smear", 0.0),
     ],
 )
-def test_mistakes_are_those_of_the_thesis(run, mistake, on_axis):
+def test_mistakes_are_those_of_the_thesis(run, right, mistake, on_axis):
     """All but the ghost index agree on the axis, and none elsewhere."""
     setup = run[0]
-    right = mistaken_rays(setup, setup.camera, "none")
     wrong = mistaken_rays(setup, setup.camera, mistake)
     moved = np.mean(wrong.points - right.points, axis=-2)[..., 1]
     rows, columns = setup.camera.sensor.shape
@@ -115,9 +163,20 @@ def test_colours_of_wavelengths():
         ("methods.0.variation.tau=2", "methods[0].variation: kind ridge does not take it"),
         (
             "targets.0.published={FISTA: {psnr_db: 3, seconds: 1}}",
-            "targets[0].published.FISTA: 'FISTA' is no method; choose one of CGM, ADMM-TV",
+            "targets[0].published.FISTA: 'FISTA' is no method; choose one of CGM, smooth",
         ),
         ("noise.snr_db=loud", "noise.snr_db: "),
+        (
+            "calibration={fitted: [glass]}",
+            "calibration.fitted[0]: 'glass' is unknown; choose from glass_thickness, ",
+        ),
+        ("calibration.fitted=[tilt, tilt]", "calibration.fitted: names one number twice"),
+        ("calibration.offset=512", "calibration.offset: 512 fills half of the 10 bits"),
+        (
+            "calibration.display=binary",
+            "calibration.display: a binary display with an offset needs dark frames",
+        ),
+        ("models.1.name=measured matrix", "models[1].name: 'measured matrix' is the name of the"),
     ],
 )
 def test_faults_are_told_in_one_line_with_their_place(override, part, tmp_path):
@@ -133,10 +192,29 @@ def test_a_fault_in_the_file_is_told_with_its_line(tmp_path):
         tiny.experiment(tmp_path, text=tiny.TEXT.replace("61.2 deg", "41 deg"))
 
 
+def test_cells_that_are_no_power_of_two_are_told_with_their_line(tmp_path):
+    text = tiny.TEXT.replace("[8, 16]", "[12, 16]")
+    told = r"tiny.yaml:\d+: object.cells: 12 × 16 = 192 cells are no power of two, as Hadamard"
+    with pytest.raises(ConfigError, match=told) as caught:
+        tiny.experiment(tmp_path, text=text)
+    assert str(caught.value).count("\n") == 0
+    tiny.experiment(tmp_path, "calibration=null", text=text)
+
+
 def test_a_camera_that_sees_nothing_is_refused(tmp_path):
     config = tiny.experiment(tmp_path, "screen.bottom.y=900 mm")
     with pytest.raises(ConfigError, match=r"tiny.yaml:\d+: screen: no ray .* off hologram"):
         build_setup(config)
+
+
+def test_the_shipped_calibration(tmp_path):
+    text = (ROOT / "configs/sts_calibration.yaml").read_text("utf-8")
+    shipped = tiny.experiment(tmp_path, text=text)
+    assert tiny.experiment(tmp_path, text=dump_config(shipped)) == shipped
+    full = ("object.cells=[64, 64]", "sensor.shape=[440, 440]", "sensor.pitch=4.8 um")
+    assert all(f'{name}="{value}"' in text for name, value in (s.split("=") for s in full))
+    assert tiny.experiment(tmp_path, *full, text=text).sensor.shape == (440, 440)
+    assert shipped.calibration is not None and shipped.calibration.distances == (400, 900)
 
 
 def test_the_shipped_file(tmp_path):

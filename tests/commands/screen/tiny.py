@@ -1,4 +1,4 @@
-"""A screen experiment of seconds: ERRATA's plate, 12×16 cells, 44×60 large pixels."""
+"""A screen experiment of seconds: ERRATA's plate, 8×16 cells, 22×30 large pixels, calibrated."""
 
 from pathlib import Path
 
@@ -17,18 +17,25 @@ screen:
   glass_thickness: 5 mm
   bottom: {width: 400 mm, height: 50 mm, y: 25 mm}
 lens: {focal_distance: 6 mm, lens_distance: 10 mm}
-sensor: {shape: [44, 60], pitch: 35.2 um}
-object: {cells: [12, 16], distance: 550 mm, width: 120 mm, y: 27 mm}
+sensor: {shape: [22, 30], pitch: 70.4 um}
+object: {cells: [8, 16], distance: 550 mm, width: 120 mm, y: 27 mm}
 orders: 3
 band_samples: 3
 noise: {snr_db: 40}
 methods:
   - {name: CGM, kind: ridge}
-  - {name: ADMM-TV, kind: admm_tv, variation: {tau: 0.5, iterations: 5}}
+  - {name: smooth, kind: ridge, ridge: 3}
 models:
   - {name: right}
   - {name: convolution, mistake: shift_invariant}
   - {name: single, mistake: no_ghosts, glass_thickness: 5.2 mm}
+calibration:
+  bits: 10
+  offset: 20
+  noise: 1
+  glass_thickness: 5.3 mm
+  fitted: [glass_thickness]
+  distances: [450 mm]
 targets:
   - name: star
     kind: siemens_star

@@ -22,7 +22,7 @@ from thincam_jax.commands.screen.config import (
 )
 from thincam_jax.commands.sections import VariationConfig
 from thincam_jax.commands.study.build import build_noise, middle_square, read_picture
-from thincam_jax.imaging.operators import Sparse
+from thincam_jax.imaging.operators import AbstractOperator, Sparse
 from thincam_jax.imaging.sensor import Sensor, electrons_per_unit, read_out
 from thincam_jax.imaging.targets import resize
 from thincam_jax.reconstruction import (
@@ -142,7 +142,7 @@ def build_models(setup: Setup) -> list[Sparse]:
 
     All have as many entries as the largest, the others in no pixel, for one compiled program.
     """
-    models = [_build_model(setup, model) for model in setup.config.models]
+    models = [build_model(setup, model) for model in setup.config.models]
     most = max(model.values.size for model in models)
     outside = math.prod(setup.camera.sensor.shape), math.prod(setup.plane.shape)
 
@@ -157,7 +157,8 @@ def build_models(setup: Setup) -> list[Sparse]:
     return [padded(model) for model in models]
 
 
-def _build_model(setup: Setup, model: ModelConfig) -> Sparse:
+def build_model(setup: Setup, model: ModelConfig) -> Sparse:
+    """One of them alone."""
     camera, plane = setup.camera, setup.plane
     if model.glass_thickness is not None:
         camera = build_camera(setup.config, model.glass_thickness)
@@ -208,7 +209,7 @@ def _bounce(guided: Array, index: Array) -> Array:
 
 
 class Captured(NamedTuple):
-    """Captures (target, y, x), and the variance of their noise."""
+    """Captures (target, y, x), or what is left of them, and the variance of their noise."""
 
     images: Array
     variance: Array
@@ -227,7 +228,7 @@ def capture(setup: Setup, system: Sparse) -> Captured:
     return Captured(jnp.stack(read), noise.variance(clean, electrons_per_unit(sensor, clean)))
 
 
-def undo(model: Sparse, method: ScreenMethodConfig, captured: Captured) -> Reconstruction:
+def undo(model: AbstractOperator, method: ScreenMethodConfig, captured: Captured) -> Reconstruction:
     """All targets at once, (target, y, x)."""
     options = method.variation or VariationConfig()
     solver = Ridge(method.ridge or 1.0)

@@ -21,6 +21,8 @@ from thincam_jax.commands.sections import (
     check_names,
     misfit,
 )
+from thincam_jax.measured.calibration.hadamard import Display, HadamardSeries, Order
+from thincam_jax.measured.calibration.screen_fit import DEFAULT, PARAMETERS
 from thincam_jax.units import deg
 
 Index = Annotated[float, Field(ge=1, le=4)]
@@ -123,11 +125,59 @@ class ScreenTargetConfig(TargetConfig):
     published: dict[str, MeasuredConfig] = {}
 
 
+def _fitted(name: str) -> str:
+    if name not in PARAMETERS:
+        raise ValueError(f"{name!r} is unknown; choose from {', '.join(PARAMETERS)}")
+    return name
+
+
+class CalibrationConfig(Section):
+    """The matrix measured with Hadamard patterns, and the rays that are fitted to it.
+
+    - `order`, `display`, `dark_frames`: of `HadamardSeries`; `bits`: of the camera.
+    - `exposure`: part of the camera's range that a white monitor fills; `offset`: its dark level
+      and `noise`: standard deviation of its white noise, in counts.
+    - `keep_captures`: leaves the stores of the captures in the run's folder.
+    - `glass_thickness`: what the plate is taken for before the fit; `fitted`: what is found.
+    - `distances`: of the object, for which the matrix is told from the fit and is measured anew.
+    """
+
+    order: Order = "sequency"
+    display: Display = "complementary"
+    dark_frames: Annotated[int, Field(ge=0, le=4096)] = 0
+    bits: Annotated[int, Field(ge=4, le=16)] = 12
+    exposure: Annotated[float, Field(gt=0, le=1)] = 0.9
+    offset: Annotated[float, Field(ge=0)] = 0.0
+    noise: Annotated[float, Field(ge=0)] = 0.0
+    keep_captures: bool = False
+    glass_thickness: Length | None = None
+    fitted: Annotated[
+        tuple[Annotated[str, pydantic.AfterValidator(_fitted)], ...], Field(min_length=1)
+    ] = DEFAULT
+    distances: tuple[Length, ...] = ()
+
+    @pydantic.model_validator(mode="after")
+    def _fits(self):
+        if len(set(self.fitted)) < len(self.fitted):
+            raise misfit("names one number twice; give each once", "fitted")
+        if self.offset >= 2**self.bits / 2:
+            message = f"{self.offset:g} fills half of the {self.bits} bits; give less, or more bits"
+            raise misfit(message, "offset")
+        if self.display == "binary" and self.offset and not self.dark_frames:
+            message = "a binary display with an offset needs dark frames; give 8, or offset: 0"
+            raise misfit(message, "display")
+        return self
+
+
+MEASURED = "measured matrix"  # among the models
+
+
 class ScreenConfig(ExperimentConfig):
     """Captures through a see-through screen, undone with right and wrong models of it.
 
     - `orders`: of ghosts; `band_samples`: of the colours about each pixel's Bragg wavelength, None
       for that one alone.
+    - `calibration`: measures the camera of the first model, and reconstructs with that matrix too.
     """
 
     kind: Literal["screen"]
@@ -141,6 +191,7 @@ class ScreenConfig(ExperimentConfig):
     noise: NoiseConfig
     methods: Annotated[tuple[ScreenMethodConfig, ...], Field(min_length=1)]
     models: Annotated[tuple[ModelConfig, ...], Field(min_length=1)]
+    calibration: CalibrationConfig | None = None
     targets: Annotated[tuple[ScreenTargetConfig, ...], Field(min_length=1)]
     notes: tuple[str, ...] = ()
 
@@ -148,6 +199,15 @@ class ScreenConfig(ExperimentConfig):
     def _fits(self):
         check_names(self, "methods", "models", "targets")
         self._check_guided()
+        if self.calibration is not None:
+            try:
+                HadamardSeries(self.object.cells)
+            except ValueError as error:
+                raise misfit(str(error), "object", "cells") from None
+            for number, model in enumerate(self.models):
+                if model.name == MEASURED:
+                    message = f"{MEASURED!r} is the name of the calibration's; give another"
+                    raise misfit(message, "models", number, "name")
         methods = [method.name for method in self.methods]
         for number, target in enumerate(self.targets):
             for name in target.published:

@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.colors import PowerNorm
 from matplotlib.figure import Figure
 
 from thincam_jax import waveguide as wg
@@ -123,7 +124,7 @@ def save_images(
     config = setup.config
     first, last = config.models[0].name, config.methods[-1].name
     right = [(method.name, (first, method.name)) for method in config.methods]
-    wrong = [(model.name, (model.name, last)) for model in config.models]
+    wrong = [(model, (model, method)) for model, method in found if method == last]
     for name, panels in (("images", right), ("models", wrong)):
         shown = 2 if name == "images" else 1
         size = (1.75 * (len(panels) + shown), 1.95 * len(setup.targets))
@@ -157,10 +158,62 @@ def save_errors(
     figure = Figure(figsize=(9, 3.8), layout="constrained")
     ax = figure.subplots()
     names = [target.config.name for target in setup.targets]
-    for index, model in enumerate(setup.config.models):
-        values = scores[model.name, setup.config.methods[-1].name]
-        ax.plot(names, values, label=model.name, **line_style(index))
+    last = [key for key in scores if key[1] == setup.config.methods[-1].name]
+    for index, key in enumerate(last):
+        ax.plot(names, scores[key], label=key[0], **line_style(index))
     ax.set(ylabel="PSNR (dB)", xlabel="target")
     ax.grid(alpha=0.3)
     figure.legend(loc="outside right center", fontsize=9)
     save_figure(folder, "errors", figure)
+
+
+def save_columns(
+    folder: RunFolder,
+    setup: Setup,
+    cells: list[tuple[int, int]],
+    images: dict[str, np.ndarray],
+) -> None:
+    """What the sensor sees of some cells (row, column) alone, in counts; images (cell, y, x).
+
+    The grey goes as the square root, so that ghosts are seen beside the image.
+    """
+    rows, columns = setup.camera.sensor.shape
+    pitch = float(setup.camera.sensor.pitch)
+    x, y = columns * pitch / 2, rows * pitch / 2
+    most = max(stack.max() for stack in images.values())
+    figure = Figure(figsize=(3.0 * len(cells) + 1, 3.0 * len(images)), layout="constrained")
+    grid = figure.subplots(len(images), len(cells), sharex=True, sharey=True, squeeze=False)
+    drawn = None
+    for line, (name, stack) in zip(grid, images.items(), strict=True):
+        for (row, column), ax, image in zip(cells, line, stack, strict=True):
+            norm = PowerNorm(0.5, 0, most)
+            drawn = ax.imshow(image, cmap="gray_r", norm=norm, extent=(-x, x, y, -y))
+            ax.set_title(f"cell ({row}, {column}), {name}", fontsize=10)
+        line[0].set_ylabel("y on the sensor (mm)")
+    for ax in grid[-1]:
+        ax.set_xlabel("x on the sensor (mm)")
+    assert drawn is not None
+    figure.colorbar(drawn, ax=grid, label="counts for a white cell")
+    save_figure(folder, "columns", figure)
+
+
+def save_distances(
+    folder: RunFolder,
+    setup: Setup,
+    images: dict[str, dict[str, np.ndarray]],
+    scores: dict[str, dict[str, dict]],
+) -> None:
+    """One target at other distances, by each matrix, in grey with its PSNR."""
+    target = next((t for t in setup.targets if not t.config.binary), setup.targets[0])
+    number = setup.targets.index(target)
+    ways = list(next(iter(images.values())))
+    figure = Figure(figsize=(2.1 * (len(ways) + 1), 2.4 * len(images)), layout="constrained")
+    grid = figure.subplots(len(images), len(ways) + 1, squeeze=False)
+    for row, ((distance, found), line) in enumerate(zip(images.items(), grid, strict=True)):
+        _panel(line[0], target.image, target.config.name, "" if row else "target")
+        line[0].set_ylabel(f"object at {distance}")
+        for name, ax in zip(ways, line[1:], strict=True):
+            score = scores[distance][name]["targets"][target.config.name]
+            label = "" if score is None else f"{score:.1f} dB"
+            _panel(ax, found[name][number], label, "" if row else name)
+    save_figure(folder, "distances", figure)

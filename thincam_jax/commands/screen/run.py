@@ -24,10 +24,11 @@ from thincam_jax.commands.screen.build import (
     capture,
     undo,
 )
-from thincam_jax.commands.screen.config import ModelConfig, ScreenConfig, ScreenMethodConfig
+from thincam_jax.commands.screen.calibration import Calibration
+from thincam_jax.commands.screen.config import MEASURED, ScreenConfig, ScreenMethodConfig
 from thincam_jax.commands.terminal import counted, told
 from thincam_jax.imaging.metrics import psnr, ssim
-from thincam_jax.imaging.operators import Sparse
+from thincam_jax.imaging.operators import AbstractOperator, Sparse
 from thincam_jax.units import deg, nm
 
 
@@ -65,6 +66,7 @@ class _ScreenRun:
         self.setup, self.folder, self.started = setup, folder, time.time()
         self.systems: list[Sparse] = []
         self.captured: Captured | None = None
+        self.calibration: Calibration | None = None
         self.found: dict[tuple[str, str], np.ndarray] = {}
         self.scores: dict[tuple[str, str], list[float]] = {}
         self.metrics: dict[str, Any] = {}
@@ -76,24 +78,56 @@ class _ScreenRun:
                 does = f"{does}, with a glass of {model.glass_thickness:g} mm"
             self.models[model.name] = {"mistake": does, "methods": {}}
             for method in setup.config.methods:
-                undone = partial(self.undo, number, model, method)
+                undone = partial(self.undo_by_model, number, method)
                 self.work.append(Step(f"{model.name}: {method.name}", undone))
+        if setup.config.calibration is not None:
+            self.models[MEASURED] = {"mistake": "by Hadamard patterns, with noise", "methods": {}}
+            self.work.append(Step("captures of Hadamard patterns", self.calibrate))
+            for method in setup.config.methods:
+                undone = partial(self.undo_by_matrix, method)
+                self.work.append(Step(f"{MEASURED}: {method.name}", undone))
+            self.work.append(Step("fit of the screen", self.fit))
+            for distance in setup.config.calibration.distances:
+                seen = partial(self.look_from, distance)
+                self.work.append(Step(f"object at {distance:g} mm", seen))
         self.work.append(Step("report", self.report))
 
     def capture(self) -> None:
         self.systems = build_models(self.setup)
         self.captured = capture(self.setup, self.systems[0])
 
-    def undo(self, number: int, model: ModelConfig, method: ScreenMethodConfig) -> None:
+    def calibrate(self) -> None:
+        self.calibration = Calibration(self.setup, self.systems[0], self.folder)
+
+    def fit(self) -> None:
+        assert self.calibration is not None  # an earlier step
+        self.calibration.fit_screen()
+
+    def look_from(self, distance: float) -> None:
+        assert self.calibration is not None
+        self.calibration.look_from(distance)
+
+    def undo_by_model(self, number: int, method: ScreenMethodConfig) -> None:
         assert self.captured is not None  # the first step
+        name = self.setup.config.models[number].name
+        self.undo(name, self.systems[number], method, self.captured)
+
+    def undo_by_matrix(self, method: ScreenMethodConfig) -> None:
+        assert self.captured is not None and self.calibration is not None
+        measured = self.calibration.measured
+        self.undo(MEASURED, measured.reduced, method, measured.seen(self.captured))
+
+    def undo(
+        self, name: str, system: AbstractOperator, method: ScreenMethodConfig, captured: Captured
+    ) -> None:
         began = time.perf_counter()
-        result = undo(self.systems[number], method, self.captured)
+        result = undo(system, method, captured)
         images = np.asarray(result.image, float).reshape(-1, *self.setup.plane.shape)
         seconds = time.perf_counter() - began
         scores = [psnr(i, t.image) for i, t in zip(images, self.setup.targets, strict=True)]
-        key = model.name, method.name
+        key = name, method.name
         self.found[key], self.scores[key] = images, scores
-        self.models[model.name]["methods"][method.name] = {
+        self.models[name]["methods"][method.name] = {
             "mean_psnr_db": round(float(np.mean(scores)), 3),
             "seconds_per_image": round(seconds / len(images), 3),
             "status": result.status,
@@ -120,6 +154,9 @@ class _ScreenRun:
             "entries_of_the_system": int(self.systems[0].values.size),
             "peak_memory_gb": round(_peak_memory(), 2),
         }
+        if self.calibration is not None:
+            self.metrics["calibration"] = self.calibration.metrics
+            self.calibration.save_figures()
         figures.save_rays(folder, setup)
         figures.save_field(folder, setup, rays)
         light = np.asarray(rays.wavelength)

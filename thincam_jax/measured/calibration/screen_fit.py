@@ -106,9 +106,12 @@ class ScreenFit(eqx.Module):
     reasons: tuple[str, ...] = eqx.field(static=True)
     orders: int = eqx.field(static=True)
 
-    def system(self, plane: ObjectPlane) -> Scaled:
-        """The matrix for an object at another distance, in the unit of the measured one."""
-        return Scaled(system_operator(self.camera, plane, self.orders), self.gain)
+    def system(self, plane: ObjectPlane, samples: int | None = None) -> Scaled:
+        """The matrix for an object at another distance, in the unit of the measured one.
+
+        - `samples`: of the band of each pixel and order, as of `system_operator`.
+        """
+        return Scaled(system_operator(self.camera, plane, self.orders, samples), self.gain)
 
 
 class _State(NamedTuple):
