@@ -30,7 +30,7 @@ from thincam_jax.imaging.metrics import psnr
 from thincam_jax.imaging.targets import resize, sample_image
 from thincam_jax.units import deg, um
 
-SIZE = os.environ.get("THINCAM_SIZE", "full")  # "small": fewer pixels and steps
+SIZE = os.environ.get("THINCAM_SIZE", "full")  # "small": fewer pixels, cells and steps
 FIGURES = Path(os.environ.get("THINCAM_FIGURES", "runs/experiments")) / "sts_design"
 FIGURES.mkdir(parents=True, exist_ok=True)
 full = SIZE == "full"
@@ -43,13 +43,14 @@ full = SIZE == "full"
 # photopolymer: Δn up to 0.03 and 25 µm.
 
 # %%
-binned = 1 if full else 5
-viewing = Viewing(tc.Sensor((440 // binned, 440 // binned), 4.8 * um * binned))
+binned, cells = (1, 64) if full else (10, 16)
+sensor = tc.Sensor((440 // binned, 440 // binned), 4.8 * um * binned)
+viewing = Viewing(sensor, cell=150.0 / cells)
 default = Plate()
 lower = Plate(5.0, 45 * deg, 8 * um, 0.005, 8.0, 6.0)
 upper = Plate(5.0, 70 * deg, 25 * um, 0.03, 20.0, 6.0)
 key = jax.random.key(0)
-counts = {"starts": 3 if full else 1, "samples": 64, "steps": 40 if full else 12}
+counts = {"starts": 3 if full else 1, "samples": 64 if full else 16, "steps": 40 if full else 8}
 
 
 def told(name, plate):
@@ -84,7 +85,7 @@ sliced = {
 figure, axes = plt.subplots(1, 4, figsize=(13, 3.4), layout="constrained", sharey=True)
 for ax, (name, (unit, label, (low, high))) in zip(axes, sliced.items(), strict=True):
     for plate, style, who in ((default, "k--", "default"), (found.plate, "k-", "found")):
-        places = np.linspace(low, high, 25 if full else 4)
+        places = np.linspace(low, high, 25 if full else 3)
         errors = [
             float(judge_plate(replace(plate, **{name: value * unit}), viewing).error)
             for value in places
@@ -127,17 +128,20 @@ for values in zip(fields, errors["default"], errors["found"], strict=True):
 # ## In full
 #
 # 64 × 64 cells through both plates, every pixel with its own ghosts and their smear, shot noise by
-# the light of each, ADMM-TV with the right model.
+# the light of each, ADMM-TV with the right model. At the small size 16 × 16 and ridge regression.
 
 # %%
-scenes = {"camera": resize(sample_image("camera"), (64, 64))}
-scenes["text"] = resize(sample_image("page")[:180, :180], (64, 64))
+scenes = {"camera": resize(sample_image("camera"), (cells, cells))}
+scenes["text"] = resize(sample_image("page")[:180, :180], (cells, cells))
+solver = tc.AdmmTV(0.5, iterations=50) if full else tc.Ridge()
 images, reached = {}, {}
 for name, plate, judged in (("default", default, before), ("found", found.plate, after)):
     camera = plate.camera(viewing.sensor)
     rays = wg.trace(camera, jnp.zeros((1, 2)), viewing.object_distance, 4)
     middle = float(jnp.sum(rays.points[:, 0, 1] * rays.weight[:, 0]) / jnp.sum(rays.weight))
-    plane = wg.ObjectPlane((64, 64), viewing.object_distance, viewing.object_width, (0.0, middle))
+    plane = wg.ObjectPlane(
+        (cells, cells), viewing.object_distance, viewing.object_width, (0.0, middle)
+    )
     system = wg.system_operator(camera, plane, 4, samples=6)
     variance = float(noise_variance(viewing, judged.light) / judged.light**2)
     for number, (what, scene) in enumerate(scenes.items()):
@@ -145,9 +149,7 @@ for name, plate, judged in (("default", default, before), ("found", found.plate,
         noise = jax.random.normal(jax.random.key(number), clean.shape)
         capture = clean + variance**0.5 * noise
         recording = tc.Recording(capture[None, None], [system], noise_variance=variance)
-        image = np.squeeze(
-            np.asarray(tc.reconstruct(recording, tc.AdmmTV(0.5, iterations=50)).image)
-        )
+        image = np.squeeze(np.asarray(tc.reconstruct(recording, solver).image))
         images[what, name] = image
         reached[what, name] = float(psnr(image, scene))
         print(f"{what}, {name}: {reached[what, name]:.1f} dB")
