@@ -102,36 +102,22 @@ class CropConvolution(AbstractOperator):
         """Window sample of the sensor's first pixel."""
         return _corner(self.sensor_shape, self.window)
 
-    @jax.jit
     def __call__(self, field: Float[Array, "*batch m n"]) -> Float[Array, "*channels y x"]:
         """The capture of a field (*batch, *channel, *summed, m, n)."""
         _require_shape("field", field, self.in_shape, self.summed)
-        # The field's place in the window only adds a phase, which cutting at the corner undoes.
-        padded = place(field, self.field_corner, self.window)
-        product = self.combine(jnp.fft.rfft2(padded))
-        return cut(jnp.fft.irfft2(product, s=self.window), self.sensor_corner, self.sensor_shape)
+        return _captured(self, field)
 
-    @jax.jit
     def adjoint(self, capture: Float[Array, "*channels y x"]) -> Float[Array, "*batch m n"]:
         """The transposed operator: correlation of a capture with the PSF."""
         _require_shape("capture", capture, self.out_shape, 0)
-        padded = place(capture, self.sensor_corner, self.window)
-        product = self.spread(jnp.fft.rfft2(padded))
-        return cut(jnp.fft.irfft2(product, s=self.window), self.field_corner, self.field_shape)
+        return _back_projected(self, capture)
 
-    @jax.jit
     def mean_power(self) -> Float[Array, ""]:
         """Mean of |H|² over all frequencies, channels and planes: Σh² of the PSF without the crop.
 
         A pixel far outside of what the sensor sees sends it no light, but is counted as the others.
         """
-        power = self.spectrum.real**2 + self.spectrum.imag**2
-        # The half plane of a real transform leaves out the mirror images of its inner columns.
-        columns = self.window[1]
-        whole = 2 * jnp.sum(power, axis=-1) - power[..., 0]
-        if columns % 2 == 0:
-            whole = whole - power[..., -1]
-        return jnp.mean(whole) / columns
+        return _mean_power(self.spectrum, self.window[1])
 
     def with_channels_and_planes(self) -> "CropConvolution":
         """The same map on images (…, channel, plane, m, n), its planes summed."""
@@ -160,6 +146,32 @@ class CropConvolution(AbstractOperator):
         leading = capture.shape[:-2] + (1,) * self.summed
         # A gradient keeps the factor beside the capture: its conjugate would be one more copy.
         return (capture.conj().reshape(*leading, rows, columns) * self.spectrum).conj()
+
+
+# Each is one program, where its steps were one by one.
+@jax.jit
+def _captured(operator: CropConvolution, field):
+    # The field's place in the window only adds a phase, which cutting at the corner undoes.
+    padded = place(field, operator.field_corner, operator.window)
+    image = jnp.fft.irfft2(operator.combine(jnp.fft.rfft2(padded)), s=operator.window)
+    return cut(image, operator.sensor_corner, operator.sensor_shape)
+
+
+@jax.jit
+def _back_projected(operator: CropConvolution, capture):
+    padded = place(capture, operator.sensor_corner, operator.window)
+    image = jnp.fft.irfft2(operator.spread(jnp.fft.rfft2(padded)), s=operator.window)
+    return cut(image, operator.field_corner, operator.field_shape)
+
+
+@functools.partial(jax.jit, static_argnames="columns")
+def _mean_power(spectrum, columns):
+    power = spectrum.real**2 + spectrum.imag**2
+    # The half plane of a real transform leaves out the mirror images of its inner columns.
+    whole = 2 * jnp.sum(power, axis=-1) - power[..., 0]
+    if columns % 2 == 0:
+        whole = whole - power[..., -1]
+    return jnp.mean(whole) / columns
 
 
 def place(
