@@ -271,7 +271,7 @@ def test_only_the_simulation_has_the_pixels_of_a_display(tmp_path):
     settings = ("model=separable", "mask.pixel_pitch=50 um", "mask.fill_factor=0.9")
     study = tiny.built(tmp_path, *settings)
     camera = study.camera(study.exposures[0])
-    assert (camera.mask.pixels, float(camera.mask.fill_factor)) == (40, pytest.approx(0.9))
+    assert (camera.mask.pixels, float(camera.mask.fill_factor)) == ((40, 40), pytest.approx(0.9))
     reference = study.config.design(study.config.reference)
     assert reference.cameras(camera.sensor)[0].mask.pixels is None
     with pytest.raises(ConfigError, match="mask"):
@@ -301,7 +301,7 @@ def test_found_numbers_reach_the_simulation(tmp_path):
     exposure = study.methods[1].exposures[0]
     assert exposure == pytest.approx((20.0, 0.0, 2.5, 6e-4, 1.45, 0.7, 1))
     camera = study.camera(exposure)
-    assert (camera.mask.pixels, float(camera.mask.width)) == (29, pytest.approx(1.45))
+    assert (camera.mask.pixels, float(camera.mask.width)) == ((29, 29), pytest.approx(1.45))
     assert float(camera.sensor.electrons) == pytest.approx(0.7 * 2e5)
     assert read_again(study, tmp_path).methods == study.methods
     shot = as_study_config(study).methods[0].shots[0]

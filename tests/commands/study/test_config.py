@@ -291,7 +291,7 @@ def test_fault(name, tmp_path):
 def test_unknown_key_lists_the_keys_of_its_section_only(tmp_path):
     (line,) = faults(tmp_path, changed("  profile: cosine", "  shape: cosine"))
     allowed = line.split("allowed here: ")[1].split(", ")
-    assert allowed == ["width", "profile", "pixel_pitch", "fill_factor", "harmonics"]
+    assert allowed == ["width", "profile", "pixel_pitch", "fill_factor", "height", "harmonics"]
 
 
 @pytest.mark.parametrize(
