@@ -41,6 +41,14 @@ def test_the_right_model_is_the_best(run):
     assert min(means["right"]) > 25
 
 
+def test_without_a_calibration_there_is_a_report(tmp_path):
+    """Its page does not speak of one, and neither do the tables."""
+    config = tiny.experiment(tmp_path, "calibration=null", "models=[{name: right}]")
+    metrics = run_screen(build_setup(config), RunFolder(tmp_path / "out"), Told())
+    page = (tmp_path / "out" / "report.html").read_text("utf-8")
+    assert "calibration" not in metrics and "Hadamard" not in page
+
+
 @pytest.mark.thorough
 def test_total_variation_through_the_matrix(tmp_path):
     """The measured matrix serves ADMM as the exact rays do, at another distance too."""
