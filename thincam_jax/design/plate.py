@@ -30,7 +30,8 @@ from thincam_jax.design.prior import PowerLaw
 from thincam_jax.design.search import best_apart, even_samples, on_cube
 from thincam_jax.imaging.sensor import Sensor
 from thincam_jax.units import deg, nm, um
-from thincam_jax.waveguide import Screen, SeeThroughCamera, VolumeHologram, trace, trace_band
+from thincam_jax.waveguide import Screen, SeeThroughCamera, VolumeHologram, trace_band
+from thincam_jax.waveguide.rays import bragg_rays
 
 # Points of the field along y, and along x on one side of the axis.
 _FIELD = (5, 3)
@@ -171,7 +172,7 @@ def _rays(plate: Plate, viewing: Viewing):
     places = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     pixels = jnp.asarray(places, plate.glass_thickness.dtype) * viewing.sensor.pitch
     rays = trace_band(camera, pixels, viewing.object_distance, 4, 6)
-    guided = trace(camera, pixels, viewing.object_distance, 1).guided
+    guided = bragg_rays(camera, pixels).guided
     above = jnp.sqrt(jnp.sum(guided**2, axis=-1)) - 1
     return rays._replace(weight=rays.weight * jax.nn.sigmoid((above - _MARGIN) / (_MARGIN / 4)))
 

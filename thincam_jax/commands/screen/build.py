@@ -34,6 +34,7 @@ from thincam_jax.reconstruction import (
     reconstruct,
 )
 from thincam_jax.waveguide.efficiency import directions
+from thincam_jax.waveguide.rays import bragg_rays
 from thincam_jax.waveguide.system import seen_size, smeared_rays, system_matrix
 
 # Wrong models, and what is wrong with them.
@@ -183,20 +184,17 @@ def mistaken_rays(setup: Setup, camera: wg.SeeThroughCamera, mistake: Mistake) -
         return wg.SmearedRays(points, jnp.broadcast_to(axis.weight, rays.weight.shape))
     if mistake not in ("ghost_index", "grating"):
         return rays
-    found = wg.trace(camera, pixels, plane.distance, 1)
+    found = bragg_rays(camera, pixels)
     width, index = camera.screen.glass_thickness, camera.screen.glass_index(found.wavelength)
     bounce = _bounce(found.guided, index)
     if mistake == "ghost_index":
         return rays._replace(points=rays.points - 2 * width * bounce[..., None, :])
-    across = -pixels / jnp.sqrt(
-        jnp.sum(pixels**2, axis=-1, keepdims=True) + camera.focal_distance**2
-    )
     hologram, angles = camera.screen.hologram, config.hologram
     film = hologram.index(found.wavelength)
     toward, reference = math.cos(angles.object_angle), math.cos(angles.reference_angle)
     along = hologram.grating.at[2].multiply((toward - reference) / (toward + reference))
     printed = eqx.tree_at(lambda h: h.grating, hologram, along)
-    guided = film[..., None] * printed.diffracted(directions(across, film))[..., :2]
+    guided = film[..., None] * printed.diffracted(directions(found.across, film))[..., :2]
     odd = (2 * jnp.arange(config.orders, dtype=pixels.dtype) + 1)[:, None, None, None]
     moved = odd * width * (_bounce(guided, index) - bounce)
     return rays._replace(points=rays.points + moved[..., None, :])

@@ -64,13 +64,12 @@ def measure(setup: Setup, system: Sparse, folder: RunFolder) -> Known:
     """The matrix of a camera from its captures of Hadamard patterns, stored in the run's folder."""
     options = _options(setup)
     plane, sensor = setup.plane, setup.camera.sensor
-    series = HadamardSeries(plane.shape, options.order, options.display, options.dark_frames)
     brightest = float(jnp.max(system(jnp.ones(plane.shape, system.values.dtype))))
     counts = options.exposure * (2**options.bits - 1 - options.offset) / brightest
     path = folder.path / f"captures-{float(plane.distance):g}mm.zarr"
     shutil.rmtree(path, ignore_errors=True)  # of an interrupted run
     key = jax.random.fold_in(jax.random.key(setup.config.seed), int(1000 * plane.distance))
-    with create_captures(path, series, sensor.shape, bits=options.bits) as writer:
+    with create_captures(path, _series(setup), sensor.shape, bits=options.bits) as writer:
         captures = simulate_captures(
             writer, Scaled(system, counts), key, deviation=options.noise, offset=options.offset
         )
@@ -84,6 +83,11 @@ def _options(setup: Setup) -> CalibrationConfig:
     options = setup.config.calibration
     assert options is not None  # this file is for runs that have one
     return options
+
+
+def _series(setup: Setup) -> HadamardSeries:
+    options = _options(setup)
+    return HadamardSeries(setup.plane.shape, options.order, options.display, options.dark_frames)
 
 
 class Columns(NamedTuple):
@@ -107,13 +111,11 @@ class Calibration:
         seconds = time.perf_counter() - began
         self.columns = _columns(self.measured, system, setup.plane.shape)
         noise = self.columns.measured - self.columns.exact
-        series = (setup.plane.shape, self.options.order, self.options.display)
-        frames = HadamardSeries(*series, self.options.dark_frames).frame_count
         rounding = 1 / 12  # variance of whole numbers, in counts
         of_a_cell = 2 if self.options.display == "complementary" else 4
         spread = of_a_cell * (self.options.noise**2 + rounding) / math.prod(setup.plane.shape)
         self.metrics: dict[str, Any] = {
-            "frames": frames,
+            "frames": _series(setup).frame_count,
             "seconds": round(seconds, 2),
             "largest_counts": round(float(self.columns.exact.max()), 3),
             "noise_counts": round(float(noise.std()), 5),

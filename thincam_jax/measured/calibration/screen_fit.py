@@ -22,13 +22,13 @@ from thincam_jax.measured.calibration.problem import Covariance, covariance
 from thincam_jax.measured.raw import MeasurementError
 from thincam_jax.waveguide import (
     ObjectPlane,
-    RayStatus,
     SeeThroughCamera,
     pixel_centres,
     system_operator,
     trace,
 )
 from thincam_jax.waveguide.refractive_index import changed
+from thincam_jax.waveguide.system import seen_size
 
 # What can be fitted, its unit, and a step that is small against what it does to an image.
 PARAMETERS = {
@@ -372,11 +372,11 @@ def _jacobian(problem: _Problem, names: tuple[str, ...], orders: int):
 def _model(state: _State, problem: _Problem, orders: int):
     """The rows of the matrix, (pixel, y, x), or the points from the object's middle."""
     camera, plane = state.camera, state.plane
-    rays = trace(camera, problem.pixels, plane.distance, orders, None)
+    rays = trace(camera, problem.pixels, plane.distance, orders)
     if problem.orders is not None:
         place = jnp.arange(problem.pixels.shape[0])
         return rays.points[problem.orders, place, :2] - plane.centre
-    size = camera.sensor.pitch * (camera.lens_distance + plane.distance) / camera.focal_distance
+    size = seen_size(camera, plane)
     down, across = (
         _parts(rays.points[..., axis], plane, axis, size, problem.blur) for axis in (1, 0)
     )
@@ -405,9 +405,8 @@ def _parts(points, plane: ObjectPlane, axis: int, size, blur):
 
 def _mean_weight(camera: SeeThroughCamera, plane: ObjectPlane, pixels, orders: int):
     """Of a pixel's ghosts together, as `system_operator` takes it for 1."""
-    rays = trace(camera, pixels, plane.distance, orders, None)
-    sound = rays.status == RayStatus.OK
-    return jnp.mean(jnp.sum(jnp.where(sound, rays.weight, 0), axis=0))
+    rays = trace(camera, pixels, plane.distance, orders)
+    return jnp.mean(jnp.sum(rays.weight, axis=0))
 
 
 def _report(problem: _Problem, names, orders: int, converged: bool) -> ScreenFit:
