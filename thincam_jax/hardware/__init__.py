@@ -1,0 +1,28 @@
+"""The rig: displays that show patterns, cameras that take frames, stages that move the sensor.
+
+Every device, real or virtual, is a `Camera`, a `Stage` or a `Display`; whatever goes wrong is a
+`HardwareError` that names the device, the operation, the cause and what to do. Nothing here is
+imported by the rest of the package; the libraries of the devices come with `thincam-jax[hardware]`.
+"""
+
+from thincam_jax.hardware.base import Camera as Camera
+from thincam_jax.hardware.base import CameraSettings as CameraSettings
+from thincam_jax.hardware.base import Device as Device
+from thincam_jax.hardware.base import Display as Display
+from thincam_jax.hardware.base import Frame as Frame
+from thincam_jax.hardware.base import Identity as Identity
+from thincam_jax.hardware.base import Region as Region
+from thincam_jax.hardware.base import Stage as Stage
+from thincam_jax.hardware.errors import Busy as Busy
+from thincam_jax.hardware.errors import Disconnected as Disconnected
+from thincam_jax.hardware.errors import HardwareError as HardwareError
+from thincam_jax.hardware.errors import IncompleteFrame as IncompleteFrame
+from thincam_jax.hardware.errors import NotFound as NotFound
+from thincam_jax.hardware.errors import NotHomed as NotHomed
+from thincam_jax.hardware.errors import OutOfRange as OutOfRange
+from thincam_jax.hardware.errors import PermissionDenied as PermissionDenied
+from thincam_jax.hardware.errors import ProtocolError as ProtocolError
+from thincam_jax.hardware.errors import Saturated as Saturated
+from thincam_jax.hardware.errors import Timeout as Timeout
+from thincam_jax.hardware.registry import drivers as drivers
+from thincam_jax.hardware.registry import open_device as open_device

@@ -1,0 +1,1 @@
+"""Cameras: USB3 Vision over pyusb, pylon, aravis."""

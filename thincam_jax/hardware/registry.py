@@ -1,0 +1,79 @@
+"""Drivers by name: those of this package, and those that other packages register.
+
+A driver is a class with a frozen dataclass `Options` of what a config file may say, and a class
+method `open(options)` that returns the open device. A package of its own offers one by an entry
+point, in its pyproject.toml:
+
+    [project.entry-points."thincam_jax.cameras"]
+    my_camera = "my_package:MyCamera"
+"""
+
+from collections.abc import Mapping
+from dataclasses import fields
+from importlib import import_module
+from importlib.metadata import entry_points
+from typing import Any, Protocol, TypeVar
+
+from thincam_jax.hardware.base import Device
+from thincam_jax.hardware.errors import NotFound
+
+_BUILT_IN = {
+    "cameras": {
+        "usb3_vision": "thincam_jax.hardware.cameras.usb3_vision:Usb3VisionCamera",
+        "pylon": "thincam_jax.hardware.cameras.pylon:PylonCamera",
+        "aravis": "thincam_jax.hardware.cameras.aravis:AravisCamera",
+    },
+    "stages": {
+        "zaber": "thincam_jax.hardware.stages.zaber:ZaberStage",
+        "grbl": "thincam_jax.hardware.stages.grbl:GrblStage",
+    },
+    "displays": {
+        "sdl": "thincam_jax.hardware.displays.sdl:SdlDisplay",
+        "tkinter": "thincam_jax.hardware.displays.tkinter:TkinterDisplay",
+    },
+}
+KINDS = tuple(_BUILT_IN)
+
+Opened = TypeVar("Opened", bound=Device, covariant=True)
+
+
+class Driver(Protocol[Opened]):
+    """A class that opens a device from what a config file says."""
+
+    Options: type[Any]
+
+    @classmethod
+    def open(cls, options: Any) -> Opened: ...
+
+
+def drivers(kind: str) -> dict[str, str]:
+    """Names of the drivers of a kind, "cameras", "stages" or "displays", and where each is."""
+    if kind not in _BUILT_IN:
+        raise ValueError(f"{kind!r} is no kind of device; give one of {', '.join(KINDS)}")
+    outside = {point.name: point.value for point in entry_points(group=f"thincam_jax.{kind}")}
+    return {**outside, **_BUILT_IN[kind]}
+
+
+def driver(kind: str, name: str) -> Driver[Any]:
+    """The driver's class; `NotFound` where there is none or its library is missing."""
+    known = drivers(kind)
+    if name not in known:
+        raise NotFound(name, "open", f"no driver of that name among the {kind}",
+                       f"use one of {', '.join(known)}")  # fmt: skip
+    module, _, attribute = known[name].partition(":")
+    try:
+        return getattr(import_module(module), attribute)
+    except ImportError as error:
+        remedy = "pip install 'thincam-jax[hardware]'"
+        raise NotFound(name, "open", f"its library is missing ({error})", remedy) from error
+
+
+def open_device(kind: str, name: str, options: Mapping[str, Any] | None = None) -> Any:
+    """The open device of a driver; `options` are the fields of the driver's `Options`."""
+    chosen, given = driver(kind, name), dict(options or {})
+    allowed = [field.name for field in fields(chosen.Options)]
+    if unknown := set(given) - set(allowed):
+        raise ValueError(
+            f"{name} has no option {', '.join(sorted(unknown))}; allowed: {', '.join(allowed)}"
+        )
+    return chosen.open(chosen.Options(**given))

@@ -1,0 +1,1 @@
+"""Linear stages on a serial port: Zaber ASCII and GRBL."""
