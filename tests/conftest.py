@@ -2,19 +2,23 @@
 
 import gc
 import os
+from importlib import import_module
 from pathlib import Path
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")  # set it to run the tests on another device
 os.environ["MPLBACKEND"] = "Agg"
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # of programs that are loaded, not compiled
 os.environ["THINCAM_CACHE"] = "off"  # commands in tests leave no compiled programs with the user
+# There is a worker for each core: threads of NumPy's and XLA's own would wait for each other, busily.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 # Most of the tests' time goes into compiling some 14,000 small programs. Without these emitters and
 # LLVM's optimisation, and with each program in one piece, it is a third of the time. What tests
 # rounding is compiled `helpers.AS_IN_USE`; tests/test_default_flags.py runs a sample without flags.
 os.environ.setdefault(
     "XLA_FLAGS",
     "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0"
-    " --xla_llvm_disable_expensive_passes=true --xla_cpu_parallel_codegen_split_count=1",
+    " --xla_llvm_disable_expensive_passes=true --xla_cpu_parallel_codegen_split_count=1"
+    " --xla_cpu_multi_thread_eigen=false",
 )
 
 import jax
@@ -40,6 +44,8 @@ if os.environ["XLA_FLAGS"]:
 
 # Before the first import of the package: from here on every annotated call is checked.
 jaxtyping.install_import_hook("thincam_jax", "beartype.beartype")
+# The small images of tests take longer to compile for than to reconstruct.
+import_module("thincam_jax.reconstruction.drive").UNROLLED = 2
 
 
 def pytest_collection_finish():

@@ -231,9 +231,9 @@ def test_a_real_capture():
     raw, psf = jnp.asarray(raw)[None], jnp.asarray(psf)[None]
     field = tc.Recording(raw, tc.Psfs(psf)).problem().field_shape
     residual = []
-    for kernel in (psf, psf[..., ::-1, ::-1]):
+    for kernel, iterations in ((psf, 60), (psf[..., ::-1, ::-1], 30)):
         recording = tc.Recording(raw, tc.Psfs(kernel, field_shape=field))
-        result = tc.reconstruct(recording, tc.AdmmTV(iterations=100))
+        result = tc.reconstruct(recording, tc.AdmmTV(iterations=iterations))
         assert result.status in ("converged", "iterations_exhausted")
         gap = residuals(recording.problem(), result.image[None, None])[0]
         residual.append(float(jnp.linalg.norm(gap) / jnp.linalg.norm(raw)))

@@ -128,7 +128,7 @@ class OptimistixMethod(AbstractMethod[Running]):
 
     def advance(self, state, count):
         run = _advance_donated if self.donated else _advance
-        for size in [CHUNK] * (count // CHUNK) + [1] * (count % CHUNK):
+        for size in [UNROLLED] * (count // UNROLLED) + [1] * (count % UNROLLED):
             state = run(self, state, size)
         return state
 
@@ -143,9 +143,11 @@ class OptimistixMethod(AbstractMethod[Running]):
 
 Callback = Callable[[Progress], object]
 
-# Each run of a program gets its memory anew from the system, which takes time for large windows:
-# shared by ten iterations it does not matter.
+# Iterations between two looks.
 CHUNK = 10
+# Iterations in one program. Each run of a program gets its memory anew from the system, which takes
+# time for large windows: shared by ten iterations it does not matter. Fewer compile sooner.
+UNROLLED = CHUNK
 
 
 def drive(
