@@ -6,9 +6,11 @@ streams and gives the device back. A driver raises `HardwareError` and nothing e
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Self
+from typing import TypeVar
 
 import numpy as np
+
+Opened = TypeVar("Opened", bound="Device")
 
 
 @dataclass(frozen=True)
@@ -36,7 +38,7 @@ class Device(ABC):
     def close(self) -> None:
         """Stops the device and gives it back; never raises."""
 
-    def __enter__(self) -> Self:
+    def __enter__(self: Opened) -> Opened:
         return self
 
     def __exit__(self, *_: object) -> None:

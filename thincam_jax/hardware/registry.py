@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import fields
 from importlib import import_module
 from importlib.metadata import entry_points
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 from thincam_jax.hardware.base import Device
 from thincam_jax.hardware.errors import NotFound
@@ -37,6 +37,7 @@ KINDS = tuple(_BUILT_IN)
 Opened = TypeVar("Opened", bound=Device, covariant=True)
 
 
+@runtime_checkable
 class Driver(Protocol[Opened]):
     """A class that opens a device from what a config file says."""
 
