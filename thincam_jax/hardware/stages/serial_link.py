@@ -1,0 +1,188 @@
+"""A serial line that never hangs: each read and write has a deadline, each failure its error."""
+
+import errno
+import os
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TextIO
+
+import serial
+from serial.tools import list_ports
+
+from thincam_jax.hardware.errors import (
+    Busy,
+    Disconnected,
+    HardwareError,
+    NotFound,
+    PermissionDenied,
+    ProtocolError,
+    Timeout,
+)
+
+LONGEST_LINE = 512  # bytes; no answer of a stage is as long
+READ_AT_ONCE = 4096  # bytes
+QUIET = 0.02  # s without a byte, after which the line counts as silent
+LONGEST_PURGE = 0.5  # s
+
+_NOT_FOUND = (errno.ENOENT, errno.ENXIO, errno.ENODEV, errno.ENOTDIR, errno.EISDIR, errno.ENOTTY)
+_DENIED = (errno.EACCES, errno.EPERM)
+_HELD = (errno.EBUSY, errno.EAGAIN)
+
+
+class SerialLink:
+    """Lines of text over a serial port that no other program can open meanwhile.
+
+    `wire_log` is a file to which every line that is sent or received is appended, with its time.
+    Deadlines are times of `time.monotonic()`, in s. Raises `HardwareError` and nothing else:
+    `Timeout` at a deadline, `Disconnected` where the port has gone, `ProtocolError` for a line
+    longer than `LONGEST_LINE`.
+    """
+
+    def __init__(self, name: str, port: str, baud_rate: int, wire_log: str | None = None):
+        self.name = f"{name} at {port}"
+        self._buffer = bytearray()
+        self._log: TextIO | None = None
+        if wire_log is not None:
+            Path(wire_log).parent.mkdir(parents=True, exist_ok=True)
+            self._log = open(wire_log, "a", encoding="ascii", buffering=1)
+        try:
+            with _translated(lambda error: _why_not_open(self.name, port, error)):
+                self._serial = serial.Serial(port, baud_rate, timeout=0, exclusive=True)
+                _allow_second_opening(self._serial, False)
+        except BaseException:
+            if self._log is not None:
+                self._log.close()
+            raise
+
+    def write(self, data: bytes, deadline: float) -> None:
+        """Sends these bytes; `Timeout` where the port does not take them in time."""
+        with _translated(lambda error: self._why_gone("write", error)):
+            self._serial.write_timeout = min(max(deadline - time.monotonic(), 0.001), 60.0)
+            self._serial.write(data)
+        self._note(">", data)
+
+    def read_line(self, deadline: float) -> bytes:
+        """The next line, without its end; `Timeout` at the deadline, however much is waiting."""
+        while True:
+            left = deadline - time.monotonic()
+            if left <= 0:
+                raise Timeout(self.name, "read", "no answer in time",
+                              "check its power, the cable, the port and the baud rate")  # fmt: skip
+            end = self._buffer.find(b"\n")
+            if max(end, 0 if end >= 0 else len(self._buffer)) > LONGEST_LINE:
+                self._buffer.clear()
+                raise ProtocolError(self.name, "read", f"a line of more than {LONGEST_LINE} bytes",
+                                    "check the baud rate and what is connected")  # fmt: skip
+            if end >= 0:
+                line = bytes(self._buffer[:end])
+                del self._buffer[: end + 1]
+                self._note("<", line)
+                return line.rstrip(b"\r")
+            self._buffer += self._receive(left)
+
+    def discard(self) -> None:
+        """Forgets what has come so far."""
+        while self._receive(0):
+            pass
+        self._buffer.clear()
+
+    def purge(self) -> None:
+        """Forgets what comes until the line is silent, so that the next line is a whole one."""
+        end = time.monotonic() + LONGEST_PURGE
+        while self._receive(QUIET):
+            if time.monotonic() > end:
+                raise ProtocolError(self.name, "purge", "it does not stop sending",
+                                    "check the baud rate and what is connected")  # fmt: skip
+        self._buffer.clear()
+
+    def close(self) -> None:
+        """Gives the port back; never raises."""
+        with suppress(HardwareError), _translated(lambda error: self._why_gone("close", error)):
+            _allow_second_opening(self._serial, True)
+        for file in (self._serial, self._log):
+            with suppress(OSError):  # the port has gone, or the disk of the log is full
+                if file is not None:
+                    file.close()
+
+    def _receive(self, seconds: float) -> bytes:
+        """What has come, waiting so long for the first byte; a serial port may give less."""
+        with _translated(lambda error: self._why_gone("read", error)):
+            self._serial.timeout = seconds
+            return self._serial.read(min(max(1, self._serial.in_waiting), READ_AT_ONCE))
+
+    def _note(self, direction: str, data: bytes) -> None:
+        if self._log is not None and not self._log.closed:
+            self._log.write(f"{datetime.now(UTC).isoformat()} {direction} {data!r}\n")
+
+    def _why_gone(self, operation: str, error: Exception) -> HardwareError:
+        if isinstance(error, serial.SerialTimeoutException):
+            return Timeout(self.name, operation, "the port takes no more bytes",
+                           "check the cable and the flow control")  # fmt: skip
+        return Disconnected(self.name, operation, f"the port has gone ({error})",
+                            "plug it in again and open it again")  # fmt: skip
+
+
+@contextmanager
+def _translated(why: Callable[[Exception], HardwareError]) -> Iterator[None]:
+    """What pyserial and the system raise, as an error of a device."""
+    try:
+        yield
+    # termios.error is no OSError; a port closed meanwhile has no file descriptor: a TypeError
+    except (OSError, ValueError, TypeError) as error:
+        raise why(error) from error
+    except Exception as error:
+        if type(error).__module__ != "termios":
+            raise
+        raise why(error) from error
+
+
+def _why_not_open(name: str, port: str, error: Exception) -> HardwareError:
+    number = error.errno if isinstance(error, OSError) else None
+    if number in _HELD:
+        holder = port_holder(port) or "another program"
+        return Busy(name, "open", f"{holder} holds it", "close that program, then try again")
+    if number in _DENIED:
+        return PermissionDenied(name, "open", "this user may not open it", _way_in(port))
+    if number in _NOT_FOUND or (number is None and os.path.exists(port)):
+        others = ", ".join(found.device for found in list_ports.comports()) or "none"
+        return NotFound(name, "open", f"no serial port that works ({error})",
+                        f"check the cable and the option port; ports here: {others}")  # fmt: skip
+    return Disconnected(name, "open", str(error), "plug it in again and open it again")
+
+
+def _way_in(port: str) -> str:
+    """What lets a user open the port: the group that it belongs to, else a udev rule."""
+    rule = 'a udev rule with SUBSYSTEM=="tty", MODE="0660", GROUP="dialout"'
+    try:
+        import grp
+
+        group = grp.getgrgid(os.stat(port).st_gid).gr_name
+    except (ImportError, OSError, KeyError):
+        group = "dialout"
+    if group == "root":
+        return f"write {rule}, and: sudo usermod -aG dialout $USER, then log in again"
+    return f"sudo usermod -aG {group} $USER, then log in again; or {rule}"
+
+
+def port_holder(port: str) -> str:
+    """Program and number of the process that has the port open; "" where the system tells none."""
+    wanted = os.path.realpath(port)
+    for process in Path("/proc").glob("[0-9]*"):
+        try:
+            if any(os.path.realpath(file) == wanted for file in (process / "fd").iterdir()):
+                return f"{(process / 'comm').read_text().strip()} (process {process.name})"
+        except OSError:
+            continue  # another user's process, or one that has ended
+    return ""
+
+
+def _allow_second_opening(port: serial.Serial, allowed: bool) -> None:
+    """pyserial's lock binds those who ask for it; this one binds all but the administrator."""
+    if os.name == "posix":
+        import fcntl
+        import termios
+
+        fcntl.ioctl(port.fileno(), termios.TIOCNXCL if allowed else termios.TIOCEXCL)
