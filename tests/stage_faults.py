@@ -85,7 +85,8 @@ def _one(
                 reached = stage.move_to(target)
                 _check(reached, device, counts)
                 counts.wrong_positions += abs(reached - target) > TOLERANCE
-            _check(stage.position(), device, counts)
+            for _ in range(random_.randrange(1, 20)):  # as long as it moved, so faults hit both
+                _check(stage.position(), device, counts)
         except HardwareError as raised:
             error = raised
     injector.join()

@@ -190,6 +190,12 @@ def test_settings_that_cannot_work_are_told_at_once(settings, message, monkeypat
         open_stage(device)
 
 
+@pytest.mark.parametrize("options", [{"speed": 0.0}, {"answer_time": -1.0}])
+def test_options_that_cannot_be_are_refused(options):
+    with pytest.raises(ValueError, match="give more than 0"):
+        GrblStage.Options(port="", **options)
+
+
 @pytest.mark.parametrize(
     ("line", "message"),
     [

@@ -164,6 +164,11 @@ def test_a_device_that_sends_something_else_is_a_protocol_error(device):
         ZaberStage.open(ZaberStage.Options(port=str(device.port), device=2, answer_time=0.01))
 
 
+def test_options_that_cannot_be_are_refused():
+    with pytest.raises(ValueError, match="give more than 0; the data sheet"):
+        ZaberStage.Options(port="", microstep=0.0)
+
+
 @pytest.mark.parametrize(
     ("line", "message"),
     [

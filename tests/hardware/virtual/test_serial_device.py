@@ -114,6 +114,16 @@ def test_input_without_an_end_is_not_kept(driver, virtual):
 
 
 @KINDS
+def test_garbage_before_an_answer_is_survived(driver, virtual):
+    with virtual(FAST) as device, open_stage(driver, device) as stage:
+        stage.home()
+        for garbage in (b"\xff\x00\n", b"half an ans", b"\n\n\r\n", b"ok\r\n", bytes(600)):
+            device._send(garbage)
+            reached = stage.move_to(4.0)
+            assert reached == stage.position() == pytest.approx(device.true_position, abs=1e-3)
+
+
+@KINDS
 def test_opened_again_and_again_it_answers_each_driver(driver, virtual):
     with virtual(FAST) as device:
         for _ in range(5):

@@ -106,6 +106,14 @@ class GrblStage(SerialStage):
         answer_time: float = 1.0  # s allowed for an answer
         wire_log: str | None = None  # file for all that is sent and received
 
+        def __post_init__(self) -> None:
+            if self.axis not in ("X", "Y", "Z"):
+                raise ValueError(f"axis {self.axis!r}: give X, Y or Z")
+            if not (self.answer_time > 0 and (self.speed is None or self.speed > 0)):
+                raise ValueError(
+                    f"speed {self.speed} mm/s, answer_time {self.answer_time} s: give more than 0"
+                )
+
     @classmethod
     def open(cls, options: Options) -> "GrblStage":
         """The stage; whatever moves is stopped."""

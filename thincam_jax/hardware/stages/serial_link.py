@@ -46,8 +46,12 @@ class SerialLink:
         self._buffer = bytearray()
         self._log: TextIO | None = None
         if wire_log is not None:
-            Path(wire_log).parent.mkdir(parents=True, exist_ok=True)
-            self._log = open(wire_log, "a", encoding="ascii", buffering=1)
+            try:
+                Path(wire_log).parent.mkdir(parents=True, exist_ok=True)
+                self._log = open(wire_log, "a", encoding="ascii", buffering=1)
+            except OSError as error:
+                raise PermissionDenied(self.name, "open", f"no wire log at {wire_log} ({error})",
+                                       "name a file that you may write") from error  # fmt: skip
         try:
             with _translated(lambda error: _why_not_open(self.name, port, error)):
                 self._serial = serial.Serial(port, baud_rate, timeout=0, exclusive=True)
@@ -83,12 +87,6 @@ class SerialLink:
                 return line.rstrip(b"\r")
             self._buffer += self._receive(left)
 
-    def discard(self) -> None:
-        """Forgets what has come so far."""
-        while self._receive(0):
-            pass
-        self._buffer.clear()
-
     def purge(self) -> None:
         """Forgets what comes until the line is silent, so that the next line is a whole one."""
         end = time.monotonic() + LONGEST_PURGE
@@ -115,7 +113,8 @@ class SerialLink:
 
     def _note(self, direction: str, data: bytes) -> None:
         if self._log is not None and not self._log.closed:
-            self._log.write(f"{datetime.now(UTC).isoformat()} {direction} {data!r}\n")
+            with suppress(OSError):  # a full disk ends the log, not the acquisition
+                self._log.write(f"{datetime.now(UTC).isoformat()} {direction} {data!r}\n")
 
     def _why_gone(self, operation: str, error: Exception) -> HardwareError:
         if isinstance(error, serial.SerialTimeoutException):

@@ -97,6 +97,13 @@ class ZaberStage(SerialStage):
         answer_time: float = 1.0  # s allowed for an answer
         wire_log: str | None = None  # file for all that is sent and received
 
+        def __post_init__(self) -> None:
+            if not (self.microstep > 0 and self.answer_time > 0):
+                raise ValueError(
+                    f"microstep {self.microstep} mm, answer_time {self.answer_time} s: give "
+                    "more than 0; the data sheet of the stage names its microstep"
+                )
+
     @classmethod
     def open(cls, options: Options) -> "ZaberStage":
         """The stage; it is not moved."""
@@ -113,7 +120,7 @@ class ZaberStage(SerialStage):
         self._number = 0
         self._checked = False  # until the device is told to send checksums
         self._resolution = options.microstep
-        self._ask("set comm.checksum 1", axis=0)
+        self._ask("set comm.checksum 1", axis=0)  # it keeps this; other programs do not mind
         self._checked = True
         device = self._number_of("get deviceid", axis=0)
         serial = self._number_of("get system.serial", axis=0)

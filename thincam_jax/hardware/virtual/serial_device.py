@@ -35,7 +35,7 @@ class Motion:
 
     travel: float = 50.0  # mm
     speed: float = 100.0  # mm/s
-    start: float = 10.0  # mm, where it stands when it is switched on
+    start: float = 0.0  # mm, where it stands when it is switched on
     latency: float = 0.05  # s
 
 
