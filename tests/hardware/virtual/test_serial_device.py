@@ -114,6 +114,28 @@ def test_input_without_an_end_is_not_kept(driver, virtual):
 
 
 @KINDS
+def test_a_move_whose_answer_was_spoilt_is_not_sent_again_after_a_stop(driver, virtual):
+    slow = Motion(travel=10.0, start=5.0, speed=20.0, latency=0.05)
+    with virtual(slow) as device, open_stage(driver, device) as stage:
+        stage.home()
+        # the stop comes while the move's answer, late and spoilt, is still awaited
+        stopper = threading.Timer(0.03, stage.stop)
+        started = stage._start_move
+
+        def start(position):
+            device.faults.inject("latency")
+            device.faults.inject("wrong_checksum")
+            stopper.start()
+            started(position)
+
+        stage._start_move = start
+        reached = stage.move_to(5.0)
+        stopper.join()
+        assert abs(reached - 5.0) > 0.1
+        assert reached == pytest.approx(device.true_position, abs=1e-3)
+
+
+@KINDS
 def test_garbage_before_an_answer_is_survived(driver, virtual):
     with virtual(FAST) as device, open_stage(driver, device) as stage:
         stage.home()

@@ -90,7 +90,9 @@ class SerialStage(Stage):
         self._check_homed("move")
         stops, stood = self._stops, time.monotonic()
         deadline = stood + timeout
-        self._start_move(position)
+        with self._lock:  # it may be sent twice, but never after a stop
+            if stops == self._stops:
+                self._start_move(position)
         while True:
             report, now = self._report(), time.monotonic()
             if self._lost:

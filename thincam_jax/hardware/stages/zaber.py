@@ -147,7 +147,9 @@ class ZaberStage(SerialStage):
     def _home(self, deadline: float) -> None:
         stops = self._stops
         self._warnings("warnings clear")
-        self._ask("home")
+        with self._lock:  # it may be sent twice, but never after a stop
+            if stops == self._stops:
+                self._ask("home")
         while self._report().moving:
             if time.monotonic() > deadline:
                 raise Timeout(self._link.name, "home", "no reference found in time",
