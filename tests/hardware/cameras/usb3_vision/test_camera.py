@@ -1,0 +1,171 @@
+"""The camera against the virtual device: settings, frames, and who may open it."""
+
+import errno
+import sys
+
+import numpy as np
+import pytest
+import usb.core
+
+from thincam_jax.hardware import (
+    Busy,
+    CameraSettings,
+    Disconnected,
+    NotFound,
+    OutOfRange,
+    PermissionDenied,
+    ProtocolError,
+    Region,
+    Timeout,
+    open_device,
+)
+from thincam_jax.hardware.cameras.usb3_vision import Usb3VisionCamera
+from thincam_jax.hardware.virtual.usb3_vision import TRIGGER_MODE, VirtualUsb3Vision
+
+REGION = Region(8, 4, 20, 28)
+
+
+def open_camera(device, **options):
+    return Usb3VisionCamera.open(Usb3VisionCamera.Options(backend=device, **options))
+
+
+def test_says_who_it_is(camera):
+    identity = camera.identity
+    assert (identity.model, identity.serial, identity.version) == ("Virtual camera", "0001", "1.0")
+    assert camera.sensor_shape == (48, 64)
+
+
+@pytest.mark.parametrize("pixel_format", ["Mono8", "Mono10", "Mono12", "Mono16", "Mono12p"])
+@pytest.mark.parametrize("region", [None, REGION, Region(0, 0, 16, 20)])
+def test_frames_arrive_exactly(camera, scene, pixel_format, region):
+    taken = camera.configure(CameraSettings(0.002, region, pixel_format, gain=6.0))
+    assert taken.region == (region or Region(0, 0, 48, 64))
+    assert (taken.exposure, taken.gain, taken.pixel_format) == (0.002, 6.0, pixel_format)
+    for number in range(2):
+        frame = camera.trigger_and_grab(1.0)
+        assert np.array_equal(frame.pixels, scene.frame(number, taken))
+        assert (frame.number, frame.exposure) == (number, 0.002)
+        assert frame.bit_depth == int(pixel_format[4:].rstrip("p"))
+    assert frame.pixels.dtype == (np.uint8 if pixel_format == "Mono8" else np.uint16)
+
+
+def test_settings_move_to_the_nearest(camera):
+    taken = camera.configure(CameraSettings(0.01, Region(9, 5, 17, 31)))
+    assert taken.region == Region(8, 4, 16, 32)
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        (CameraSettings(1e-6), "allowed: 10 to 1e\\+07 µs"),
+        (CameraSettings(0.01, gain=30.0), "allowed: 0 to 24 dB"),
+        (CameraSettings(0.01, Region(0, 0, 49, 64)), "48 rows and 64 columns"),
+        (CameraSettings(0.01, Region(0, 0, 4, 64)), "allowed: 16 to 48 pixels"),
+        (CameraSettings(0.01, pixel_format="BayerRG8"), "use one of Mono8, Mono10"),
+    ],
+)
+def test_what_it_cannot_take_is_refused(camera, settings, said):
+    with pytest.raises(OutOfRange, match=said):
+        camera.configure(settings)
+    camera.configure(CameraSettings(0.01))
+    camera.trigger_and_grab(1.0)
+
+
+def test_numbers_and_times_increase_over_settings(camera):
+    frames = []
+    for exposure in (0.01, 0.02):
+        camera.configure(CameraSettings(exposure))
+        frames += [camera.trigger_and_grab(1.0) for _ in range(2)]
+    assert [frame.number for frame in frames] == [0, 1, 2, 3]
+    assert np.all(np.diff([frame.time for frame in frames]) > 0)
+
+
+@pytest.mark.parametrize("flush", [True, False])
+def test_a_frame_that_nobody_asked_for_is_discarded(device, camera, scene, flush):
+    camera.configure(CameraSettings(0.01))
+    device._expose_frame()  # as if another trigger line had fired
+    if flush:
+        camera.flush()
+    frame = camera.trigger_and_grab(1.0)
+    assert np.array_equal(frame.pixels, scene.frame(1, device.settings))
+
+
+def test_a_camera_of_several_is_chosen_by_serial(scene):
+    class Bus(VirtualUsb3Vision):
+        def enumerate_devices(self):
+            return iter((self, self))
+
+    bus = Bus(scene.expose, (48, 64), serial="A7")
+    with open_camera(bus, serial="A7") as camera:
+        assert camera.identity.serial == "A7"
+    with pytest.raises(NotFound, match="connected are A7; give the serial number"):
+        open_camera(bus)
+
+
+def test_a_camera_that_is_not_there(device):
+    with pytest.raises(NotFound, match="connected are 0001"):
+        open_camera(device, serial="B8")
+    device.enumerate_devices = lambda: iter(())
+    with pytest.raises(NotFound, match="no USB3 Vision camera is connected"):
+        open_camera(device)
+
+
+def test_without_permission_the_remedy_is_a_udev_rule(device):
+    def refuse(dev):
+        raise usb.core.USBError("Access denied", errno=errno.EACCES)
+
+    device.open_device = refuse
+    with pytest.raises(PermissionDenied, match='ATTR{idVendor}=="cafe".*/etc/udev/rules.d'):
+        open_camera(device)
+
+
+def test_one_that_is_open_is_busy(device, camera):
+    with pytest.raises(Busy, match="another program has it open"):
+        open_camera(device)
+    camera.close()
+    open_camera(device).close()
+
+
+def test_a_missing_library_is_named(monkeypatch):
+    monkeypatch.delitem(sys.modules, "thincam_jax.hardware.cameras.usb3_vision", raising=False)
+    monkeypatch.delitem(sys.modules, "thincam_jax.hardware.cameras.usb3_vision.camera", False)
+    monkeypatch.delitem(sys.modules, "thincam_jax.hardware.cameras.usb3_vision.link", False)
+    monkeypatch.setitem(sys.modules, "usb", None)
+    with pytest.raises(NotFound, match=r"pip install 'thincam-jax\[hardware\]'"):
+        open_device("cameras", "usb3_vision")
+
+
+def test_after_an_unplug_it_opens_again(device, camera, scene):
+    device.faults.inject("unplug")
+    with pytest.raises(Disconnected):
+        camera.trigger_and_grab(1.0)
+    camera.close()
+    with open_camera(device) as again:
+        again.configure(CameraSettings(0.01))
+        assert again.trigger_and_grab(1.0).pixels.shape == (48, 64)
+
+
+def test_waiting_has_an_end(device, camera):
+    camera.configure(CameraSettings(0.01))
+    device.faults.inject("dropped_frame")
+    with pytest.raises(Timeout, match=r"no frame within 0\.01 s"):
+        camera.trigger_and_grab(0.01)
+
+
+def test_endless_stale_frames_end_in_a_timeout(device, camera):
+    """A camera that runs freely with a clock that stands still."""
+    camera.configure(CameraSettings(0.01))
+    camera._features.write("TriggerMode", "Off")
+    camera._control.clock = lambda: 2**63
+    with pytest.raises(Timeout, match="older ones discarded"):
+        camera.trigger_and_grab(0.01)
+    assert device._number(TRIGGER_MODE) == 0
+
+
+def test_another_size_than_was_agreed_is_an_error(device, camera):
+    camera.configure(CameraSettings(0.01))
+    device._acquiring = False
+    camera._control.write_number(0x2008, 32)  # the width, behind the camera's back
+    device._acquiring = True
+    with pytest.raises(ProtocolError, match="agreed were"):
+        camera.trigger_and_grab(1.0)
