@@ -43,13 +43,15 @@ SBRM, SIRM, MANIFEST, FEATURES, XML = 0x1000, 0x1100, 0x1200, 0x2000, 0x10000
 (SENSOR_WIDTH, SENSOR_HEIGHT, WIDTH, HEIGHT, LEFT, TOP, PIXEL_FORMAT, PAYLOAD_SIZE) = range(
     FEATURES, FEATURES + 0x20, 4
 )
-EXPOSURE, GAIN = FEATURES + 0x20, FEATURES + 0x28  # float64: µs, dB
+EXPOSURE, GAIN, FRAME_RATE = range(FEATURES + 0x20, FEATURES + 0x38, 8)  # float64: µs, dB, Hz
 ACQUISITION_MODE, START, STOP, TRIGGER_SELECTOR, TRIGGER_MODE, TRIGGER_SOURCE, TRIGGER = range(
-    FEATURES + 0x30, FEATURES + 0x4C, 4
+    FEATURES + 0x40, FEATURES + 0x5C, 4
 )
-EXPOSURE_LIMITS, GAIN_LIMITS, LEAST_SIZE = (10.0, 1e7), (0.0, 24.0), 16
+LIMITS = {EXPOSURE: (10.0, 1e7), GAIN: (0.0, 24.0), FRAME_RATE: (0.1, 1000.0)}
+LEAST_SIZE = 16
 
-STRINGS = ("", "thincam_jax", "Virtual camera", "", "746863616d01")  # by their index; 3: serial
+# By their index in descriptors: language, vendor, model, serial, GUID, version, about the vendor.
+STRINGS = ("", "thincam_jax", "Virtual camera", "", "CAFE00000001", "1.0", "no hardware")
 
 
 def _descriptor(kind: str, *values: int, extra: bytes = b"") -> tuple[SimpleNamespace, bytes]:
@@ -87,7 +89,7 @@ def _descriptor(kind: str, *values: int, extra: bytes = b"") -> tuple[SimpleName
 _COMPANION = bytes((6, 0x30, 0, 0, 0, 0))
 _ASSOCIATION = bytes((8, 0x0B, 0, 2, 0xEF, 0x05, 0x00, 0))
 _U3V_INFO = struct.pack("<BBBII9B", 20, 0x24, 1, 0x0001_0003, 0x0001_0002,
-                        4, 1, 2, 0, 0, 0, 3, 0, 0x08)  # fmt: skip
+                        4, 1, 2, 0, 5, 6, 3, 0, 0x08)  # fmt: skip
 _DEVICE, DEVICE_BYTES = _descriptor(
     "device", 1, 0x0300, 0xEF, 0x02, 0x01, 9, 0xCAFE, 0x0001, 0x0100, 1, 2, 3, 1
 )
@@ -120,7 +122,7 @@ class VirtualUsb3Vision(IBackend):
 
     `expose(settings)` returns the counts (y, x), uint16, of the frame exposed at the trigger, of
     the size of `settings.region`, in an array that it does not change afterwards. Without a
-    trigger (TriggerMode Off) a frame is exposed whenever the client reads.
+    trigger (TriggerMode Off) frames are exposed when the client reads, at AcquisitionFrameRate.
     """
 
     def __init__(
@@ -141,11 +143,11 @@ class VirtualUsb3Vision(IBackend):
         self._answers: deque[tuple[float, bytes]] = deque()
         self._frames: deque[tuple[float, memoryview]] = deque()
         self._waiting, self._block, self._acquiring = 0, 0, False
+        self._due = 0.0  # when a free-running camera has its next frame
         self._last: tuple[memoryview, ...] = ()
-        self._pixels: np.ndarray | None = None
         memory = self._memory = bytearray(XML) + self._xml + bytes(-len(self._xml) % 4)
         texts = {Abrm.MANUFACTURER: STRINGS[1], Abrm.MODEL: STRINGS[2],
-                 Abrm.SERIAL: self._serial, Abrm.DEVICE_VERSION: "1.0"}  # fmt: skip
+                 Abrm.SERIAL: self._serial, Abrm.DEVICE_VERSION: STRINGS[5]}  # fmt: skip
         for address, text in texts.items():
             memory[address : address + len(text)] = text.encode()
         rows, columns = self._shape
@@ -154,14 +156,14 @@ class VirtualUsb3Vision(IBackend):
             (Abrm.CAPABILITY, "<Q", gencp.HAS_TIMESTAMP | gencp.HAS_SBRM),
             (Abrm.RESPONSE_TIME, "<I", 500),
             (Abrm.MANIFEST, "<QQ", MANIFEST, SBRM),
-            (SBRM + Sbrm.VERSION, "<I", 0x0001_0002),
+            (SBRM + Sbrm.VERSION, "<IQ", 0x0001_0002, gencp.HAS_SIRM),
             (SBRM + Sbrm.MAX_COMMAND, "<IIIQI", 1024, 1024, 1, SIRM, gencp.SIRM_LENGTH),
             (SBRM + Sbrm.CURRENT_SPEED, "<I", 0x08),
             (SIRM + Sirm.REQUIRED_LEADER, "<II", LEADER.size, TRAILER.size + 4),
             (MANIFEST, "<QIIQQ", 1, 0x0100_0000, 0x0101 << 16, XML, len(self._xml)),
             (SENSOR_WIDTH, "<6I", columns, rows, columns, rows, 0, 0),
             (PIXEL_FORMAT, "<I", PIXEL_FORMATS["Mono8"][0]),
-            (EXPOSURE, "<dd", 1e4, 0.0),
+            (EXPOSURE, "<ddd", 1e4, 0.0, 50.0),
         ):
             struct.pack_into(layout, memory, address, *values)
         self._derive()
@@ -170,6 +172,9 @@ class VirtualUsb3Vision(IBackend):
 
     def _number(self, address: int) -> int:
         return struct.unpack_from("<I", self._memory, address)[0]
+
+    def _frame_time(self) -> float:
+        return 1 / struct.unpack_from("<d", self._memory, FRAME_RATE)[0]
 
     @property
     def settings(self) -> CameraSettings:
@@ -225,7 +230,7 @@ class VirtualUsb3Vision(IBackend):
             raise _Refused(Status.NOT_IMPLEMENTED)
         (address,) = gencp.ADDRESS.unpack_from(command.data)
         data = command.data[gencp.ADDRESS.size :]
-        if address in (EXPOSURE, GAIN) and len(data) == 8:
+        if address in LIMITS and len(data) == 8:
             self._set_float(address, data)
         elif len(data) == 4:
             self._set_number(address, int.from_bytes(data, "little"), ready)
@@ -234,7 +239,7 @@ class VirtualUsb3Vision(IBackend):
         return gencp.RESERVED_AND_NUMBER.pack(0, len(data))
 
     def _set_float(self, address: int, data: bytes) -> None:
-        low, high = EXPOSURE_LIMITS if address == EXPOSURE else GAIN_LIMITS
+        low, high = LIMITS[address]
         if not low <= struct.unpack("<d", data)[0] <= high:
             raise _Refused(Status.INVALID_PARAMETER)
         self._memory[address : address + 8] = data
@@ -248,6 +253,7 @@ class VirtualUsb3Vision(IBackend):
             self._expose_frame(ready and ready + LATE)  # the frame is later than the answer
         elif address == START:
             self._acquiring, self._block = True, 0
+            self._due = monotonic() + self._frame_time()
         elif address == STOP:
             self._acquiring = False
         elif address == Abrm.TIMESTAMP_LATCH:
@@ -424,8 +430,9 @@ class VirtualUsb3Vision(IBackend):
         """The next transfer, or as much of it as fits; waits for it no longer than `timeout` ms."""
         self._alive(dev_handle)
         queue: deque[tuple[float, Any]] = self._answers if ep == CONTROL_IN else self._frames
-        if ep == STREAM_IN and not queue and not self._number(TRIGGER_MODE):
-            self._expose_frame()
+        if ep == STREAM_IN and not queue and self._acquiring and not self._number(TRIGGER_MODE):
+            self._expose_frame(self._due)
+            self._due = max(self._due, monotonic()) + self._frame_time()
         wait = queue[0][0] - monotonic() if queue else np.inf
         if wait > 0:
             sleep(min(wait, timeout * 1e-3))

@@ -28,15 +28,15 @@ class Scene:
         noise[0, :2] = number // 200, number % 200
         return noise.astype(np.uint16)
 
+    @staticmethod
+    def number_in(pixels: np.ndarray) -> int:
+        """Which exposure a frame says that it is."""
+        return int(pixels[0, 0]) * 200 + int(pixels[0, 1])
+
     def expose(self, settings: CameraSettings) -> np.ndarray:
         self.before_exposure()
         self.exposures += 1
         return self.frame(self.exposures - 1, settings)
-
-
-def number_in(pixels: np.ndarray) -> int:
-    """Which exposure a frame says that it is."""
-    return int(pixels[0, 0]) * 200 + int(pixels[0, 1])
 
 
 @pytest.fixture

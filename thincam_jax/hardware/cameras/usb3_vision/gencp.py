@@ -78,12 +78,16 @@ class Sbrm(IntEnum):
     """Registers of USB3 Vision, from the address that Abrm.SBRM holds."""
 
     VERSION = 0x00
+    CAPABILITY = 0x04  # u64
     MAX_COMMAND = 0x14  # bytes
     MAX_ACKNOWLEDGE = 0x18
     STREAM_CHANNELS = 0x1C
     SIRM = 0x20  # u64 address
     SIRM_LENGTH = 0x28
     CURRENT_SPEED = 0x40
+
+
+HAS_SIRM = 1  # of Sbrm.CAPABILITY
 
 
 class Sirm(IntEnum):

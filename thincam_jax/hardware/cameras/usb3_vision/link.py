@@ -192,6 +192,8 @@ class Control:
         self._patience = min(max(self.read_number(Abrm.RESPONSE_TIME) * 1e-3, 0.2), 5.0)
         self.has_clock = bool(self.read_number(Abrm.CAPABILITY, 8) & gencp.HAS_TIMESTAMP)
         sbrm = self.read_number(Abrm.SBRM, 8)
+        if not self.read_number(sbrm + Sbrm.CAPABILITY, 8) & gencp.HAS_SIRM:
+            raise link.broken("open", "it has no stream")
         largest = [self.read_number(sbrm + r) for r in (Sbrm.MAX_COMMAND, Sbrm.MAX_ACKNOWLEDGE)]
         if min(largest) < 32:
             raise link.broken("open", f"packets of {min(largest)} bytes can carry nothing")
