@@ -331,9 +331,11 @@ class VirtualUsb3Vision(IBackend):
         if settings.pixel_format == "Mono8":
             counts = counts.astype(np.uint8)
         elif settings.pixel_format == "Mono12p":
-            even, odd = np.append(counts, np.zeros(counts.size % 2, np.uint16)).reshape(-1, 2).T
-            packed = np.stack((even & 0xFF, even >> 8 | (odd & 0xF) << 4, odd >> 4), axis=1)
-            counts = packed.astype(np.uint8)
+            pairs = np.append(counts, np.zeros(counts.size % 2, np.uint16)).reshape(-1, 2)
+            even, odd = pairs[:, 0], pairs[:, 1]
+            counts = np.empty((len(pairs), 3), np.uint8)
+            for part, bits in enumerate((even, even >> 8 | odd << 4, odd >> 4)):
+                counts[:, part] = bits.astype(np.uint8)
         wire = np.ascontiguousarray(counts, "<u2" if counts.itemsize == 2 else np.uint8)
         data = wire.reshape(-1).view(np.uint8).data
         return data[: frame_bytes(settings.pixel_format, region)]
