@@ -152,6 +152,15 @@ def test_waiting_has_an_end(device, camera):
         camera.trigger_and_grab(0.01)
 
 
+def test_a_frame_that_comes_too_late_is_not_taken_for_the_next(device, camera, scene):
+    camera.configure(CameraSettings(0.001))
+    device.faults.inject("latency")
+    with pytest.raises(Timeout):
+        camera.trigger_and_grab(0.001)
+    frame = camera.trigger_and_grab(1.0)
+    assert (scene.number_in(frame.pixels), frame.number) == (1, 0)
+
+
 def test_endless_stale_frames_end_in_a_timeout(device, camera):
     """A camera that runs freely with a clock that stands still."""
     camera.configure(CameraSettings(0.01))

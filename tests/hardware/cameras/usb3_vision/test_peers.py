@@ -46,6 +46,19 @@ open(sys.argv[1], "wb").write(image.tobytes())
 camera.close()
 """
 
+OURSELVES = """
+import sys
+from thincam_jax.hardware import CameraSettings, Region
+from thincam_jax.hardware.cameras.usb3_vision import Usb3VisionCamera
+with Usb3VisionCamera.open(Usb3VisionCamera.Options(serial="0001")) as camera:
+    camera.configure(CameraSettings(2e-3, Region(4, 8, 20, 32), "Mono12"))
+    for _ in range(3):
+        camera.flush()
+        frame = camera.trigger_and_grab(5.0)
+    assert frame.number == 2
+open(sys.argv[1], "wb").write(frame.pixels.tobytes())
+"""
+
 SYSTEM_PYTHON = "/usr/bin/python3"  # Debian's bindings are for Debian's Python
 
 
@@ -56,8 +69,11 @@ def has_aravis_bindings() -> bool:
     return subprocess.run(asked, capture_output=True).returncode == 0
 
 
-@pytest.mark.parametrize("script", [ARAVIS, CAMELEON], ids=["aravis", "pycameleon"])
+@pytest.mark.parametrize(
+    "script", [ARAVIS, CAMELEON, OURSELVES], ids=["aravis", "pycameleon", "libusb"]
+)
 def test_a_peer_receives_every_pixel(script, device, scene, tmp_path):
+    """Two clients of others, and our own through libusb."""
     if script is ARAVIS and not has_aravis_bindings():
         pytest.skip("needs Debian's gir1.2-aravis-0.8 and python3-gi")
     if script is CAMELEON and not importlib.util.find_spec("pycameleon"):

@@ -73,7 +73,7 @@ class Usb3VisionCamera(Camera):
         ):
             self._features.write_if_there(name, value)
         self._settings = self.configure(
-            CameraSettings(self._features.read("ExposureTime") * 1e-6, pixel_format="Mono8")
+            CameraSettings(self._features.number("ExposureTime") * 1e-6, pixel_format="Mono8")
         )
 
     @property
@@ -85,7 +85,7 @@ class Usb3VisionCamera(Camera):
         names = ("SensorHeight", "SensorWidth")
         if not self._features.has(names[0]):
             names = ("HeightMax", "WidthMax")
-        return self._features.read(names[0]), self._features.read(names[1])
+        return self._features.integer(names[0]), self._features.integer(names[1])
 
     def configure(self, settings: CameraSettings) -> CameraSettings:
         features, (rows, columns) = self._features, self.sensor_shape
@@ -111,12 +111,12 @@ class Usb3VisionCamera(Camera):
         features.write_nearest("OffsetY", region.top, "pixels")
         features.write_nearest("ExposureTime", settings.exposure * 1e6, "µs")
         features.write_nearest("Gain", settings.gain, "dB")
-        taken = Region(*(features.read(n) for n in ("OffsetY", "OffsetX", "Height", "Width")))
+        taken = Region(*(features.integer(n) for n in ("OffsetY", "OffsetX", "Height", "Width")))
         self._settings = CameraSettings(
-            features.read("ExposureTime") * 1e-6,
+            features.number("ExposureTime") * 1e-6,
             taken,
-            features.read("PixelFormat"),
-            features.read("Gain"),
+            features.choice("PixelFormat"),
+            features.number("Gain"),
         )
         self._stream.prepare(self._settings.pixel_format, taken)
         self._start()

@@ -5,8 +5,11 @@ must not declare a document type, so that there are no entities to expand.
 """
 
 import io
+import operator
 import zipfile
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 from xml.etree.ElementTree import ParseError
 
@@ -16,11 +19,14 @@ from genicam import genapi
 
 from thincam_jax.hardware.cameras.usb3_vision import gencp
 from thincam_jax.hardware.cameras.usb3_vision.gencp import Abrm
-from thincam_jax.hardware.cameras.usb3_vision.link import Control, UsbLink
-from thincam_jax.hardware.errors import OutOfRange, ProtocolError
+from thincam_jax.hardware.cameras.usb3_vision.link import LARGEST_READ, Control, UsbLink
+from thincam_jax.hardware.errors import OutOfRange
 
-LARGEST_XML = 16 << 20  # bytes; those of cameras have up to 2 MiB
+LARGEST_XML = LARGEST_READ  # bytes; those of cameras have up to 2 MiB
 MOST_ENTRIES = 64
+
+# Names of these elements stand for a choice or a variable of a formula, not for a node.
+NO_NODES = ("EnumEntry", "pVariable", "Constant", "Expression")
 
 
 def fetch_xml(link: UsbLink, control: Control) -> str:
@@ -61,12 +67,29 @@ def check_xml(data: bytes) -> str:
     """The XML as text; `ValueError` where it is not well formed UTF-8 or declares entities."""
     data = data.rstrip(b"\0")  # registers come in multiples of four
     try:
-        fromstring(data, forbid_dtd=True)
-        return data.decode("utf-8-sig")
+        root = fromstring(data, forbid_dtd=True)
+        text = data.decode("utf-8-sig")
     except DefusedXmlException as error:
         raise ValueError(f"it declares a document type or entities ({error})") from error
     except (ParseError, UnicodeDecodeError, LookupError) as error:
         raise ValueError(f"it is not well formed: {error}") from error
+    _check_references(root)
+    return text
+
+
+def _check_references(root: Any) -> None:
+    """GenApi crashes, and the process with it, where a port stands for another node or so."""
+    kinds = {n.attrib["Name"]: _kind(n) for n in root.iter() if "Name" in n.attrib
+             and _kind(n) not in NO_NODES}  # fmt: skip
+    for element in root.iter():
+        reference, name = _kind(element), (element.text or "").strip()
+        if reference[:1] == "p" and reference[1:2].isupper() and name in kinds:
+            if (kinds[name] == "Port") != (reference == "pPort"):
+                raise ValueError(f"a {reference} names {name}, which is a {kinds[name]}")
+
+
+def _kind(node: Any) -> str:
+    return node.tag.rpartition("}")[2]
 
 
 class _Port(genapi.AbstractPort):
@@ -92,17 +115,18 @@ class Features:
     def __init__(self, link: UsbLink, control: Control, xml: str):
         self._link = link
         self._nodes, self._port = genapi.NodeMap(), _Port(control)
-        try:
+        with self._evaluating("read the XML"):
             self._nodes.load_xml_from_string(xml)
             self._nodes._connect(self._port, "Device")
-        except genapi.GenericException as error:
-            raise link.broken("read the XML", _first_line(error)) from error
 
-    def _node(self, name: str) -> Any:
+    @contextmanager
+    def _evaluating(self, operation: str) -> Iterator[None]:
+        """Names what GenApi raises, and what a feature of another kind than the SFNC's leads to."""
         try:
-            return self._nodes.get_node(name)
-        except genapi.GenericException as error:
-            raise self._failed("find", name, error) from error
+            yield
+        except (genapi.GenericException, AttributeError, TypeError, ValueError) as error:
+            cause = (str(error).strip() or type(error).__name__).splitlines()[0]
+            raise self._link.broken(operation, cause) from error
 
     def has(self, name: str) -> bool:
         """Whether the camera has this feature, and it may be used now."""
@@ -111,69 +135,52 @@ class Features:
         except genapi.GenericException:
             return False
 
-    def read(self, name: str) -> Any:
-        """The feature's value."""
-        try:
-            return self._node(name).value
-        except genapi.GenericException as error:
-            raise self._failed("read", name, error) from error
+    def integer(self, name: str) -> int:
+        """The value of a feature that is a whole number."""
+        with self._evaluating(f"read {name}"):
+            return operator.index(self._nodes.get_node(name).value)
 
-    def write(self, name: str, value: Any) -> None:
-        """Sets the feature; `OutOfRange` where it does not take this value."""
-        node = self._node(name)
-        try:
-            node.value = value
-        except (genapi.OutOfRangeException, genapi.InvalidArgumentException) as error:
-            allowed = _allowed(node)
-            raise OutOfRange(self._link.name, f"set {name}", f"{value} is not allowed",
-                             f"allowed: {allowed}") from error  # fmt: skip
-        except genapi.GenericException as error:
-            raise self._failed("set", name, error) from error
+    def number(self, name: str) -> float:
+        """The value of a feature that is a number."""
+        with self._evaluating(f"read {name}"):
+            return float(self._nodes.get_node(name).value)
 
-    def write_if_there(self, name: str, value: Any) -> None:
+    def choice(self, name: str) -> str:
+        """Which choice an enumeration is set to."""
+        with self._evaluating(f"read {name}"):
+            return str(self._nodes.get_node(name).value)
+
+    def choices(self, name: str) -> tuple[str, ...]:
+        """What an enumeration may be set to now."""
+        with self._evaluating(f"read {name}"):
+            return tuple(self._nodes.get_node(name).symbolics)
+
+    def write(self, name: str, value: float | int | str) -> None:
+        """Sets the feature."""
+        with self._evaluating(f"set {name}"):
+            self._nodes.get_node(name).value = value
+
+    def write_if_there(self, name: str, value: float | int | str) -> None:
         """Sets a feature that not every camera has."""
         if self.has(name):
             self.write(name, value)
 
     def write_nearest(self, name: str, value: float | int, unit: str = "") -> None:
         """Sets a number to the nearest step of the feature; `OutOfRange` beyond its limits."""
-        node = self._node(name)
-        try:
+        with self._evaluating(f"read the limits of {name}"):
+            node = self._nodes.get_node(name)
             low, high = node.min, node.max
             step = node.inc if isinstance(node, genapi.IInteger) else None
-        except genapi.GenericException as error:
-            raise self._failed("read the limits of", name, error) from error
-        rounding = 1e-9 * abs(value)  # a limit that was read may come back through other units
-        if not low - rounding <= value <= high + rounding:
-            raise OutOfRange(self._link.name, f"set {name}", f"{value:g} {unit}".rstrip(),
-                             f"allowed: {low:g} to {high:g} {unit}".rstrip())  # fmt: skip
-        value = min(max(value, low), high)
-        if step:
-            value = low + min(round((value - low) / step), (high - low) // step) * step
+            rounding = 1e-9 * abs(value)  # a limit that was read may come back through other units
+            if not low - rounding <= value <= high + rounding:
+                raise OutOfRange(self._link.name, f"set {name}", f"{value:g} {unit}".rstrip(),
+                                 f"allowed: {low:g} to {high:g} {unit}".rstrip())  # fmt: skip
+            value = min(max(value, low), high)
+            if step:
+                value = low + min(round((value - low) / step), (high - low) // step) * step
         self.write(name, value)
-
-    def choices(self, name: str) -> tuple[str, ...]:
-        """What an enumeration may be set to now."""
-        try:
-            return tuple(self._node(name).symbolics)
-        except genapi.GenericException as error:
-            raise self._failed("read", name, error) from error
 
     def execute(self, name: str) -> None:
         """Has the camera do what the command says."""
-        try:
-            self._node(name).execute()
-        except genapi.GenericException as error:
-            raise self._failed("execute", name, error) from error
-
-    def _failed(self, verb: str, name: str, error: Exception) -> ProtocolError:
-        return self._link.broken(f"{verb} {name}", _first_line(error))
-
-
-def _first_line(error: Exception) -> str:
-    return str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
-
-
-def _allowed(node: Any) -> str:
-    choices = getattr(node, "symbolics", None)
-    return ", ".join(choices) if choices else f"{node.min} to {node.max}"
+        with self._evaluating(f"execute {name}"):
+            self._nodes.get_node(name).execute()

@@ -34,6 +34,8 @@ CONTROL_INTERFACE = (0xEF, 0x05, 0x00)
 STREAM_INTERFACE = (0xEF, 0x05, 0x02)
 
 LONGEST_ANSWER = 10.0  # s, with all pending acknowledges and repetitions
+LONGEST_READ = 60.0  # s, of the whole XML
+LARGEST_READ = 16 << 20  # bytes
 LARGEST_PACKET = 64 << 10
 GONE = (errno.ENODEV, errno.ENOENT, errno.ESHUTDOWN, errno.EIO, errno.ENXIO)
 
@@ -58,9 +60,8 @@ def _endpoint(interface: Any, direction: int) -> Any:
     return None
 
 
-def _holder(device: Any) -> str:
-    """The process that has the device's file open, where the system tells."""
-    node = f"/dev/bus/usb/{device.bus or 0:03d}/{device.address or 0:03d}"
+def holder(node: str) -> str:
+    """The process that has a device's file open, where the system tells."""
     for link in Path("/proc").glob("[0-9]*/fd/*"):
         with suppress(OSError):
             if os.readlink(link) == node and (process := link.parts[2]) != str(os.getpid()):
@@ -140,8 +141,9 @@ class UsbLink:
             if error.errno == errno.EACCES:
                 raise self._refused(operation, error) from error
             if error.errno == errno.EBUSY:
-                raise Busy(self.name, operation, f"{_holder(self._device)} has it open",
-                           "close that program") from error  # fmt: skip
+                node = f"/dev/bus/usb/{self._device.bus or 0:03d}/{self._device.address or 0:03d}"
+                cause = f"{holder(node)} has it open"
+                raise Busy(self.name, operation, cause, "close that program") from error
             if error.errno in GONE:
                 remedy = "check cable and power, then open it again"
                 raise Disconnected(self.name, operation, "the camera has gone", remedy) from error
@@ -202,8 +204,9 @@ class Control:
 
     def read(self, address: int, length: int) -> bytes:
         """`length` bytes from `address`, in as many packets as it takes."""
+        self._check(address, length, "read")
         step = self._largest_answer - gencp.HEADER.size & ~3
-        parts = []
+        parts, end = [], monotonic() + LONGEST_READ
         for start in range(0, length, step):
             size = min(step, length - start)
             data = self._exchange(
@@ -214,11 +217,15 @@ class Control:
             if len(data) != size:
                 raise self._link.broken(f"read {size} bytes at {address + start:#x}",
                                         f"{len(data)} bytes came")  # fmt: skip
+            if monotonic() > end:
+                cause = f"{start + size} bytes came in {LONGEST_READ:g} s"
+                raise Timeout(self._link.name, f"read {length} bytes", cause, "try again")
             parts.append(data)
         return b"".join(parts)
 
     def write(self, address: int, data: bytes) -> None:
         """`data` to `address`, in as many packets as it takes."""
+        self._check(address, len(data), "write")
         step = self._largest_command - gencp.HEADER.size - gencp.ADDRESS.size & ~3
         for start in range(0, len(data), step):
             self._exchange(
@@ -228,6 +235,11 @@ class Control:
                 Command.WRITE_ACKNOWLEDGE,
                 f"write at {address + start:#x}",
             )
+
+    def _check(self, address: int, length: int, verb: str) -> None:
+        """The camera's XML names addresses and lengths, which may be any."""
+        if not (0 <= length <= LARGEST_READ and 0 <= address <= 2**64 - length):
+            raise self._link.broken(f"{verb} at {address:#x}", f"{length} bytes are not possible")
 
     def read_number(self, address: int, length: int = 4) -> int:
         """An unsigned register."""

@@ -1,0 +1,120 @@
+"""What comes from the wire may be anything: no crash, no hang, no allocation beyond the limits."""
+
+import io
+import os
+import struct
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+
+from helpers import ROOT
+from thincam_jax.hardware import ProtocolError
+from thincam_jax.hardware.cameras.usb3_vision import Usb3VisionCamera, features, gencp, stream
+from thincam_jax.hardware.virtual import usb3_vision
+from thincam_jax.hardware.virtual.usb3_vision import SIRM
+
+FUZZ = Path(__file__).with_name("fuzz.py")
+
+
+@pytest.mark.parametrize(
+    ("what", "count", "seconds"),
+    [
+        ("parsers", 10_000, 60),
+        ("client", 100, 60),
+        ("xml", 40, 60),
+        pytest.param("parsers", 1_000_000, 500, marks=pytest.mark.thorough),
+        pytest.param("client", 5_000, 500, marks=pytest.mark.thorough),
+        pytest.param("xml", 3_000, 500, marks=pytest.mark.thorough),
+    ],
+)
+def test_anything_may_come_from_the_wire(what, count, seconds):
+    """Right or refused: no crash, no hang, bounded memory; see fuzz.py."""
+    command = [sys.executable, str(FUZZ), what, str(count)]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    result = subprocess.run(
+        command, env=environment, capture_output=True, text=True, timeout=seconds
+    )
+    assert result.returncode == 0, result.stderr
+    taken, refused, grown = map(int, result.stdout.split())
+    print(f"{what}: {taken} taken, {refused} refused, {grown} MiB more memory")
+    assert min(taken, refused) > 0.02 * count
+    assert grown < 20 + (stream.LARGEST_PAYLOAD >> 20)
+
+
+VIRTUAL_XML = Path(usb3_vision.__file__).with_suffix(".xml").read_bytes()
+DECLARATION = b'<?xml version="1.0" encoding="utf-8"?>'
+LAUGHS = DECLARATION + b'<!DOCTYPE a [<!ENTITY b "ha"><!ENTITY c "&b;&b;&b;">]><a>&c;</a>'
+
+
+@pytest.mark.parametrize(
+    ("xml", "said"),
+    [
+        (LAUGHS, "document type or entities"),
+        (DECLARATION + b'<!DOCTYPE a SYSTEM "file:///etc/passwd"><a/>', "document type"),
+        (LAUGHS.decode().replace("utf-8", "utf-16").encode("utf-16"), "document type"),
+        (DECLARATION + b"<a>", "not well formed"),
+        (b'<?xml version="1.0" encoding="utf-16"?><a/>', "not well formed"),
+        (b"\xff\xfe\x00", "not well formed"),
+        (DECLARATION + b"<RegisterDescription/>", "."),
+        (
+            VIRTUAL_XML.replace(b"<pFeature>Gain</pFeature>", b"<pFeature>Device</pFeature>"),
+            "a pFeature names Device, which is a Port",
+        ),
+    ],
+    ids=["laughs", "file", "utf16", "open", "not_utf16", "no_text", "no_camera", "crash"],
+)
+def test_xml_that_is_not_to_be_trusted(xml, said, device):
+    device._xml = xml
+    device._power_on()
+    with pytest.raises(ProtocolError, match=said):
+        Usb3VisionCamera.open(Usb3VisionCamera.Options(backend=device))
+
+
+def zipped(content: bytes, **options) -> bytes:
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w", **options) as archive:
+        archive.writestr("camera.xml", content)
+    return file.getvalue()
+
+
+def test_a_zipped_xml_is_read(device):
+    xml = device._xml
+    device._xml = zipped(xml, compression=zipfile.ZIP_DEFLATED)
+    device._power_on()
+    struct.pack_into("<I", device._memory, 0x1200 + 12, 1 << 10)
+    with Usb3VisionCamera.open(Usb3VisionCamera.Options(backend=device)) as camera:
+        assert camera.trigger_and_grab(1.0).pixels.shape == (48, 64)
+
+
+@pytest.mark.parametrize(
+    ("data", "said"),
+    [
+        (b"no zip", "cannot be read"),
+        (zipped(bytes(features.LARGEST_XML + 1), compression=zipfile.ZIP_DEFLATED), "more than"),
+        (zipped(b"<a/>", compression=zipfile.ZIP_LZMA), "allowed: one, deflated"),
+    ],
+    ids=["none", "bomb", "lzma"],
+)
+def test_a_zip_that_is_not_to_be_trusted(data, said):
+    with pytest.raises(ValueError, match=said):
+        features.unzip(data)
+
+
+@pytest.mark.parametrize(
+    ("address", "layout", "value", "said"),
+    [
+        (0x1200, "<Q", 0, "a manifest of 0 entries"),
+        (0x1200 + 24, "<Q", 1 << 40, "allowed: 16777216"),
+        (0x1000 + gencp.Sbrm.MAX_ACKNOWLEDGE, "<I", 8, "packets of 8 bytes"),
+        (0x1000 + gencp.Sbrm.CAPABILITY, "<Q", 0, "it has no stream"),
+        (SIRM + gencp.Sirm.INFO, "<I", 31 << 24, "multiples of 2\\^31"),
+        (SIRM + gencp.Sirm.REQUIRED_LEADER, "<I", 1 << 30, "a leader of 1073741824"),
+    ],
+)
+def test_sizes_are_checked_before_they_are_used(address, layout, value, said, device):
+    struct.pack_into(layout, device._memory, address, value)
+    with pytest.raises(ProtocolError, match=said):
+        Usb3VisionCamera.open(Usb3VisionCamera.Options(backend=device))
