@@ -145,6 +145,22 @@ def test_after_an_unplug_it_opens_again(device, camera, scene):
         assert again.trigger_and_grab(1.0).pixels.shape == (48, 64)
 
 
+def test_a_halted_endpoint_is_used_again(device, camera):
+    cleared = []
+
+    def halted(dev_handle, ep, intf, buff, timeout):
+        device.bulk_read = type(device).bulk_read.__get__(device)
+        device.clear_halt = lambda dev_handle, ep: cleared.append(ep)
+        raise usb.core.USBError("Pipe error", errno=errno.EPIPE)
+
+    device.bulk_read = halted
+    with pytest.raises(ProtocolError):
+        camera.trigger_and_grab(1.0)
+    assert cleared[0] == 0x81
+    camera._control.read_number(0)  # the answer to what was asked before is passed over
+    assert camera.trigger_and_grab(1.0).pixels.shape == (48, 64)
+
+
 def test_waiting_has_an_end(device, camera):
     camera.configure(CameraSettings(0.01))
     device.faults.inject("dropped_frame")

@@ -65,8 +65,10 @@ class Usb3VisionCamera(Camera):
             ("ChunkModeActive", False),
             ("AcquisitionMode", "Continuous"),
             ("TriggerSelector", "FrameStart"),
-            ("TriggerMode", "On"),
+            ("TriggerMode", "Off"),  # some take another source only then
             ("TriggerSource", "Software"),
+            ("TriggerMode", "On"),
+            ("AcquisitionFrameRateEnable", False),
             ("ExposureMode", "Timed"),
             ("ExposureAuto", "Off"),
             ("GainAuto", "Off"),
@@ -104,7 +106,7 @@ class Usb3VisionCamera(Camera):
         self._stop()
         features.write("PixelFormat", settings.pixel_format)
         for name in ("OffsetX", "OffsetY"):  # leave room for the size that comes next
-            features.write(name, 0)
+            features.write_nearest(name, 0)
         features.write_nearest("Width", region.width, "pixels")
         features.write_nearest("Height", region.height, "pixels")
         features.write_nearest("OffsetX", region.left, "pixels")

@@ -167,7 +167,7 @@ class Features:
 
     def write_nearest(self, name: str, value: float | int, unit: str = "") -> None:
         """Sets a number to the nearest step of the feature; `OutOfRange` beyond its limits."""
-        with self._evaluating(f"read the limits of {name}"):
+        with self._evaluating(f"set {name}"):
             node = self._nodes.get_node(name)
             low, high = node.min, node.max
             step = node.inc if isinstance(node, genapi.IInteger) else None
@@ -178,7 +178,8 @@ class Features:
             value = min(max(value, low), high)
             if step:
                 value = low + min(round((value - low) / step), (high - low) // step) * step
-        self.write(name, value)
+            if node.value != value:  # an offset that can only be 0 may be locked
+                node.value = value
 
     def execute(self, name: str) -> None:
         """Has the camera do what the command says."""

@@ -168,7 +168,12 @@ class UsbLink:
     def receive(self, endpoint: int, buffer: array, timeout: float, operation: str) -> int:
         """Reads one transfer into `buffer` and returns its length; `timeout` in s."""
         with self._named(operation):
-            return self._device.read(endpoint, buffer, max(1, round(timeout * 1000)))
+            try:
+                return self._device.read(endpoint, buffer, max(1, round(timeout * 1000)))
+            except usb.core.USBError as error:
+                if error.errno == errno.EPIPE:  # the camera has halted it; it will be used again
+                    self._device.clear_halt(endpoint)
+                raise
 
     def clear_halt(self, endpoint: int) -> None:
         """Sets an endpoint back to where nothing is under way."""
