@@ -78,7 +78,7 @@ def check_xml(data: bytes) -> str:
 
 
 def _check_references(root: Any) -> None:
-    """GenApi crashes, and the process with it, where a port stands for another node or so."""
+    """GenApi crashes, with the process, where a port stands for a feature or the reverse."""
     kinds = {n.attrib["Name"]: _kind(n) for n in root.iter() if "Name" in n.attrib
              and _kind(n) not in NO_NODES}  # fmt: skip
     for element in root.iter():
