@@ -1,0 +1,160 @@
+"""`PylonCamera` on the emulator that Basler ships, as it is and fed with frames."""
+
+import numpy as np
+import pytest
+
+from thincam_jax.hardware import (
+    CameraSettings,
+    Disconnected,
+    IncompleteFrame,
+    NotFound,
+    OutOfRange,
+    Region,
+    Timeout,
+    open_device,
+)
+from thincam_jax.hardware.virtual.faults import Faults
+from thincam_jax.hardware.virtual.pylon import VirtualPylonCamera
+
+SENSOR = 24, 40
+SETTINGS = CameraSettings(exposure=1e-3, region=Region(4, 8, 12, 20))
+TIMEOUT = 2.0  # s
+
+
+class Scene:
+    """Random counts, a new frame at each exposure."""
+
+    def __init__(self):
+        self.random, self.shown = np.random.default_rng(5), np.zeros(0)
+
+    def expose(self, settings: CameraSettings) -> np.ndarray:
+        region, bits = settings.region, int(settings.pixel_format.removeprefix("Mono"))
+        assert region is not None
+        shape = region.height, region.width
+        self.shown = self.random.integers(0, 2**bits, shape).astype(np.uint16)
+        return self.shown
+
+
+@pytest.fixture
+def scene():
+    return Scene()
+
+
+@pytest.fixture
+def faults():
+    return Faults()
+
+
+@pytest.fixture
+def camera(scene, faults):
+    with VirtualPylonCamera(scene.expose, SENSOR, faults) as camera:
+        camera.configure(SETTINGS)
+        yield camera
+
+
+def test_the_vendors_emulator_says_what_it_is_set_to(monkeypatch):
+    monkeypatch.setenv("PYLON_CAMEMU", "1")
+    with open_device("cameras", "pylon", {"serial": "0815-0000"}) as camera:
+        assert camera.identity.vendor == "Basler" and camera.identity.serial == "0815-0000"
+        assert camera.sensor_shape == (4096, 4096)
+        asked = CameraSettings(0.0123456789, Region(3, 5, 7, 11), "Mono12", gain=6.0)
+        actual = camera.configure(asked)
+        assert actual.region == asked.region and actual.pixel_format == "Mono12"
+        assert actual.exposure == pytest.approx(asked.exposure, abs=1e-6)
+        assert actual.gain == pytest.approx(6.0, abs=0.1) and actual.gain != 6.0
+        frames = [camera.trigger_and_grab(TIMEOUT) for _ in range(3)]
+        assert [frame.number for frame in frames] == [0, 1, 2]
+        assert frames[0].pixels.shape == (7, 11) and frames[0].bit_depth == 12
+        assert frames[0].exposure == actual.exposure
+
+
+@pytest.mark.parametrize("pixel_format", ["Mono8", "Mono10", "Mono12", "Mono16"])
+def test_frames_are_exact(camera, scene, pixel_format):
+    camera.configure(CameraSettings(1e-3, SETTINGS.region, pixel_format))
+    for _ in range(4):
+        frame = camera.trigger_and_grab(TIMEOUT)
+        assert np.array_equal(frame.pixels, scene.shown)
+    assert f"Mono{frame.bit_depth}" == pixel_format
+
+
+def test_without_a_region_the_whole_sensor(camera):
+    assert camera.configure(CameraSettings(1e-3)).region == Region(0, 0, *SENSOR)
+    assert camera.trigger_and_grab(TIMEOUT).pixels.shape == SENSOR
+
+
+@pytest.mark.parametrize(
+    ("settings", "allowed"),
+    [
+        (CameraSettings(100.0), "1e-06 … 10 s"),
+        (CameraSettings(1e-3, Region(0, 0, 25, 40)), "24 × 40"),
+        (CameraSettings(1e-3, Region(0, -1, 2, 2)), "24 × 40"),
+        (CameraSettings(1e-3, pixel_format="RGB8"), "Mono8, Mono10, Mono12, Mono16"),
+        (CameraSettings(1e-3, gain=100.0), "0 … 48 dB"),
+    ],
+)
+def test_what_the_camera_lacks_is_refused_before_anything_is_written(camera, settings, allowed):
+    with pytest.raises(OutOfRange, match=allowed):
+        camera.configure(settings)
+    assert camera.trigger_and_grab(TIMEOUT).pixels.shape == (12, 20)
+
+
+def test_unknown_camera_and_no_settings(monkeypatch, scene):
+    monkeypatch.setenv("PYLON_CAMEMU", "1")
+    with pytest.raises(NotFound, match="found: 0815-0000"):
+        open_device("cameras", "pylon", {"serial": "none such"})
+    with VirtualPylonCamera(scene.expose, SENSOR) as camera:
+        with pytest.raises(OutOfRange, match="call configure"):
+            camera.trigger_and_grab(TIMEOUT)
+    with pytest.raises(OutOfRange, match="at most 4096"):
+        VirtualPylonCamera(scene.expose, (5000, 10))
+
+
+FAILURES = {
+    "latency": (),
+    "stale_frame": (),
+    "short_frame": (IncompleteFrame,),
+    "dropped_frame": (Timeout,),
+    "unplug": (Disconnected,),
+}
+
+
+def campaign(fault, times, scene, faults):
+    """As often as asked, after a random number of good frames: the right error, no wrong frame."""
+    camera, numbers = VirtualPylonCamera(scene.expose, SENSOR, faults), []
+    camera.configure(SETTINGS)
+
+    def good():
+        frame = camera.trigger_and_grab(TIMEOUT)
+        assert np.array_equal(frame.pixels, scene.shown)
+        numbers.append(frame.number)
+
+    for _ in range(times):
+        for _ in range(1 + scene.random.integers(2)):
+            good()
+        faults.inject(fault)
+        if FAILURES[fault]:
+            with pytest.raises(FAILURES[fault]):
+                camera.trigger_and_grab(0.05 if fault == "dropped_frame" else TIMEOUT)
+        else:
+            good()
+        assert not faults.waiting()
+        if fault == "unplug":
+            assert numbers == sorted(set(numbers))
+            camera.close()
+            camera, numbers = VirtualPylonCamera(scene.expose, SENSOR, faults), []
+            camera.configure(SETTINGS)
+        good()
+    assert numbers == sorted(set(numbers))
+    assert faults.happened[fault] == times
+    camera.close()
+
+
+@pytest.mark.parametrize("fault", FAILURES)
+def test_faults(fault, scene, faults):
+    campaign(fault, 2, scene, faults)
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("fault", FAILURES)
+def test_faults_a_hundred_times(fault, scene, faults):
+    campaign(fault, 100, scene, faults)

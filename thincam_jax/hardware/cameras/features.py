@@ -1,0 +1,140 @@
+"""GenICam's standard features (SFNC): what the cameras of all makers are set by.
+
+A library's camera becomes one of these by `Features`: features by name, without their types.
+"""
+
+from typing import Protocol, runtime_checkable
+
+from thincam_jax.hardware.base import CameraSettings, Region
+from thincam_jax.hardware.errors import OutOfRange
+
+BIT_DEPTHS = {"Mono8": 8, "Mono10": 10, "Mono12": 12, "Mono16": 16}
+Number = int | float
+Value = Number | str
+_MICROSECOND = 1e-6  # s; SFNC counts exposures in µs
+
+
+@runtime_checkable
+class Features(Protocol):
+    """The features of an open camera."""
+
+    def has(self, name: str) -> bool:
+        """Whether the camera has it, and it is available now."""
+        ...
+
+    def get(self, name: str) -> Value:
+        """Its value; of an enumeration the entry's name."""
+        ...
+
+    def set(self, name: str, value: Value) -> None:
+        """Writes a value, or an enumeration's entry."""
+        ...
+
+    def limits(self, name: str) -> tuple[Number, Number, Number]:
+        """Lowest, highest and step of a number; step 0 where there is none."""
+        ...
+
+    def choices(self, name: str) -> tuple[str, ...]:
+        """The entries of an enumeration that are available."""
+        ...
+
+
+def sensor_shape(features: Features) -> tuple[int, int]:
+    """Rows and columns of the largest region."""
+    rows, columns = ("HeightMax", "WidthMax")
+    if not features.has(rows):
+        rows, columns = ("SensorHeight", "SensorWidth")
+    return int(features.get(rows)), int(features.get(columns))
+
+
+def trigger_by_software(features: Features) -> None:
+    """One frame for each software trigger, nothing automatic."""
+    for name in ("ExposureAuto", "GainAuto"):
+        if features.has(name):
+            features.set(name, "Off")
+    if features.has("AcquisitionMode"):
+        features.set("AcquisitionMode", "Continuous")
+    for selector in features.choices("TriggerSelector"):
+        features.set("TriggerSelector", selector)
+        if features.has("TriggerMode"):
+            features.set("TriggerMode", "Off")
+    features.set("TriggerSelector", "FrameStart")
+    features.set("TriggerMode", "On")
+    features.set("TriggerSource", "Software")
+
+
+def configure(
+    features: Features, asked: CameraSettings, shape: tuple[int, int], device: str
+) -> CameraSettings:
+    """Sets a camera to what is nearest, and returns what it says it is set to.
+
+    `shape` is that of the sensor, `device` the camera's name in errors.
+
+    **Errors**: OutOfRange, before anything is written, for a region, format, exposure or gain that
+    the camera does not have.
+    """
+    _require(features, asked, shape, device)
+    features.set("PixelFormat", asked.pixel_format)
+    region = asked.region or Region(0, 0, *shape)
+    for offset in ("OffsetX", "OffsetY"):  # so that every size fits
+        if features.has(offset):
+            features.set(offset, features.limits(offset)[0])
+    for name, pixels in (
+        ("Width", region.width),
+        ("Height", region.height),
+        ("OffsetX", region.left),
+        ("OffsetY", region.top),
+    ):
+        if features.has(name):
+            features.set(name, _nearest(pixels, *features.limits(name)))
+    features.set(_exposure(features), asked.exposure / _MICROSECOND)
+    if features.has("Gain"):
+        features.set("Gain", asked.gain)
+    return read(features)
+
+
+def read(features: Features) -> CameraSettings:
+    """What the camera is set to now."""
+
+    def pixels(name: str) -> int:
+        return int(features.get(name)) if features.has(name) else 0
+
+    region = Region(pixels("OffsetY"), pixels("OffsetX"), pixels("Height"), pixels("Width"))
+    gain = float(features.get("Gain")) if features.has("Gain") else 0.0
+    exposure = float(features.get(_exposure(features))) * _MICROSECOND
+    return CameraSettings(exposure, region, str(features.get("PixelFormat")), gain)
+
+
+def _exposure(features: Features) -> str:
+    return "ExposureTime" if features.has("ExposureTime") else "ExposureTimeAbs"  # GigE before 2.0
+
+
+def _nearest(value: int, low: Number, high: Number, step: Number) -> int:
+    step = step or 1
+    last = low + (high - low) // step * step
+    return int(min(max(low + round((value - low) / step) * step, low), last))
+
+
+def _require(
+    features: Features, asked: CameraSettings, shape: tuple[int, int], device: str
+) -> None:
+    def refuse(what: str, allowed: str) -> OutOfRange:
+        return OutOfRange(device, "configure", what, f"give {allowed}")
+
+    formats = [name for name in features.choices("PixelFormat") if name in BIT_DEPTHS]
+    if asked.pixel_format not in formats:
+        raise refuse(f"no pixel format {asked.pixel_format}", f"one of {', '.join(formats)}")
+    region = asked.region or Region(0, 0, *shape)
+    bottom, right = region.top + region.height, region.left + region.width
+    inside = min(region.top, region.left) >= 0 and bottom <= shape[0] and right <= shape[1]
+    if not inside or min(region.height, region.width) < 1:
+        raise refuse(f"{region} lies outside of the sensor", f"a part of {shape[0]} × {shape[1]}")
+    for name, given, unit, scale in (
+        (_exposure(features), asked.exposure, "s", _MICROSECOND),
+        ("Gain", asked.gain, "dB", 1.0),
+    ):
+        low, high = 0.0, 0.0  # a camera whose gain is not in dB keeps the one it has
+        if features.has(name):
+            low, high = (limit * scale for limit in features.limits(name)[:2])
+        if not low <= given <= high:
+            raise refuse(f"{name} of {given:g} {unit}", f"{low:g} … {high:g} {unit}")

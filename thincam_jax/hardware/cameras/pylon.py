@@ -1,0 +1,229 @@
+"""Basler's cameras, and the emulator that their maker ships, by pypylon."""
+
+import time
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from typing import Any
+
+from thincam_jax.hardware.base import Camera, CameraSettings, Frame, Identity
+from thincam_jax.hardware.cameras import features as genicam_features
+from thincam_jax.hardware.cameras.features import BIT_DEPTHS, Number, Value
+from thincam_jax.hardware.errors import (
+    Busy,
+    Disconnected,
+    HardwareError,
+    IncompleteFrame,
+    NotFound,
+    OutOfRange,
+    PermissionDenied,
+    ProtocolError,
+    Timeout,
+)
+
+with warnings.catch_warnings():
+    # Raised as an error, SWIG's warning about its own types crashes the interpreter.
+    warnings.simplefilter("ignore", DeprecationWarning)
+    from pypylon import genicam, pylon
+
+
+@dataclass(frozen=True)
+class PylonOptions:
+    """Which camera: its `serial` number, or "" for the first one found."""
+
+    serial: str = ""
+
+
+class PylonCamera(Camera):
+    """A camera that pylon knows: USB3 Vision or GigE Vision, or its emulator (PYLON_CAMEMU=1).
+
+    Every frame answers a software trigger, which is sent once the camera is ready for it: pylon
+    loses earlier ones without a word. After a frame that failed, the stream starts anew, so that
+    a late one is never taken for the next.
+    """
+
+    Options = PylonOptions
+
+    def __init__(self, camera: Any):
+        self._camera, self._name = camera, "pylon camera"
+        self._settings: CameraSettings | None = None
+        self._first = self._next = 0  # number of the stream's first frame, and of the next one
+        try:
+            with self._told("open"):
+                camera.Open()
+                self._introduce()
+        except BaseException:
+            self.close()
+            raise
+
+    def _introduce(self) -> None:
+        self._features = features = _Features(self._camera.GetNodeMap())
+        info = self._camera.GetDeviceInfo()
+        version = features.text("DeviceFirmwareVersion")
+        self._identity = Identity(
+            info.GetVendorName(), info.GetModelName(), info.GetSerialNumber(), version
+        )
+        self._name = str(self._identity)
+        ticks = "GevTimestampTickFrequency"  # of GigE Vision; USB3 Vision counts nanoseconds
+        self._tick = 1 / float(features.get(ticks)) if features.has(ticks) else 1e-9
+        genicam_features.trigger_by_software(features)
+
+    @classmethod
+    def open(cls, options: PylonOptions) -> "PylonCamera":
+        """Opens a camera; NotFound, Busy or PermissionDenied where that fails."""
+        wanted = pylon.DeviceInfo()
+        if options.serial:
+            wanted.SetSerialNumber(options.serial)
+        return cls(_created(wanted, options.serial))
+
+    @property
+    def identity(self) -> Identity:
+        return self._identity
+
+    @property
+    def sensor_shape(self) -> tuple[int, int]:
+        with self._told("read the sensor's size"):
+            return genicam_features.sensor_shape(self._features)
+
+    def configure(self, settings: CameraSettings) -> CameraSettings:
+        self._stop()
+        shape = self.sensor_shape
+        with self._told("configure"):
+            self._settings = genicam_features.configure(self._features, settings, shape, self._name)
+        return self._settings
+
+    def flush(self) -> None:
+        with self._told("flush"):
+            while self._camera.IsGrabbing():
+                result = self._camera.RetrieveResult(0, pylon.TimeoutHandling_Return)
+                if not result.IsValid():
+                    return
+                result.Release()
+
+    def trigger_and_grab(self, timeout: float) -> Frame:
+        settings = self._settings
+        if settings is None:
+            raise OutOfRange(self._name, "grab", "it has no settings", "call configure before")
+        milliseconds = int(1e3 * (settings.exposure + timeout)) + 1
+        try:
+            with self._told("grab"):
+                if not self._camera.IsGrabbing():
+                    self._camera.StartGrabbing(pylon.GrabStrategy_OneByOne)
+                    self._first = self._next
+                self.flush()
+                self._camera.WaitForFrameTriggerReady(
+                    milliseconds, pylon.TimeoutHandling_ThrowException
+                )
+                self._trigger()
+                result = self._camera.RetrieveResult(milliseconds, pylon.TimeoutHandling_Return)
+                try:
+                    return self._frame(result, settings)
+                finally:
+                    result.Release()
+        except BaseException:
+            self._stop()
+            raise
+
+    def close(self) -> None:
+        self._stop()
+        with suppress(genicam.GenericException):
+            self._camera.Close()
+            self._camera.DestroyDevice()
+
+    def _trigger(self) -> None:
+        self._camera.ExecuteSoftwareTrigger()
+
+    def _frame(self, result: Any, settings: CameraSettings) -> Frame:
+        if not result.IsValid():
+            raise self._timeout("grab", "no frame came after the trigger")
+        if not result.GrabSucceeded():
+            cause = result.ErrorDescription or f"pylon's error {result.ErrorCode:#x}"
+            raise IncompleteFrame(self._name, "grab", cause, "take it again; check the cable")
+        pixels, region = result.Array, settings.region
+        if region is None or pixels.shape != (region.height, region.width):
+            cause = f"{pixels.shape} pixels, and {region} is set"
+            raise ProtocolError(self._name, "grab", cause, "configure the camera again")
+        number = self._first + result.BlockID
+        self._next = number + 1
+        # The emulator has no clock.
+        moment = result.TimeStamp * self._tick if result.TimeStamp else time.monotonic()
+        bits = BIT_DEPTHS[settings.pixel_format]
+        return Frame(pixels, number, moment, settings.exposure, bits)
+
+    def _stop(self) -> None:
+        with suppress(genicam.GenericException):
+            self._camera.StopGrabbing()
+
+    def _timeout(self, operation: str, cause: str) -> Timeout:
+        return Timeout(self._name, operation, cause, "try again, or allow more time")
+
+    @contextmanager
+    def _told(self, operation: str) -> Iterator[None]:
+        """Pylon's errors become ours, and a camera that has gone is `Disconnected`.
+
+        Much that is asked of a camera that has gone succeeds, hence the question at the end.
+        """
+        failure = None
+        try:
+            yield
+        except (genicam.GenericException, HardwareError) as error:
+            failure = error
+        if self._camera.IsCameraDeviceRemoved():
+            remedy = "connect it and open it again"
+            raise Disconnected(self._name, operation, "it was removed", remedy) from failure
+        if isinstance(failure, HardwareError):
+            raise failure
+        if failure is not None:
+            raise self._error(operation, failure) from failure
+
+    def _error(self, operation: str, failure: Exception) -> HardwareError:
+        cause = str(failure).split(" : ")[0].rstrip(".")
+        if isinstance(failure, genicam.TimeoutException):
+            return self._timeout(operation, cause)
+        if isinstance(failure, genicam.OutOfRangeException):
+            return OutOfRange(self._name, operation, cause, "give a value within the limits")
+        if operation == "open" and "another" in cause:
+            return Busy(self._name, operation, cause, "close the program that holds it")
+        if operation == "open" and "permission" in cause.lower():
+            remedy = "install pylon's udev rule (setup-usb.sh) and connect the camera again"
+            return PermissionDenied(self._name, operation, cause, remedy)
+        return ProtocolError(self._name, operation, cause, "open the camera again")
+
+
+def _created(wanted: Any, serial: str) -> Any:
+    factory = pylon.TlFactory.GetInstance()
+    try:
+        return pylon.InstantCamera(factory.CreateFirstDevice(wanted))
+    except genicam.GenericException as error:
+        found = [info.GetSerialNumber() for info in factory.EnumerateDevices()]
+        cause = f"no camera {serial}".rstrip()
+        remedy = f"connect one and switch it on; found: {', '.join(found) or 'none'}"
+        raise NotFound("pylon", "open", cause, remedy) from error
+
+
+class _Features:
+    """The nodes of a pylon camera."""
+
+    def __init__(self, nodes: Any):
+        self._nodes = nodes
+
+    def has(self, name: str) -> bool:
+        return genicam.IsAvailable(self._nodes.GetNode(name))
+
+    def get(self, name: str) -> Value:
+        return self._nodes.GetNode(name).Value
+
+    def set(self, name: str, value: Value) -> None:
+        self._nodes.GetNode(name).Value = value
+
+    def limits(self, name: str) -> tuple[Number, Number, Number]:
+        node = self._nodes.GetNode(name)
+        step = node.Inc if isinstance(node, genicam.IInteger) else 0.0
+        return node.Min, node.Max, step
+
+    def choices(self, name: str) -> tuple[str, ...]:
+        return tuple(self._nodes.GetNode(name).Symbolics) if self.has(name) else ()
+
+    def text(self, name: str) -> str:
+        return str(self.get(name)) if self.has(name) else ""
