@@ -39,6 +39,30 @@ class Features(Protocol):
         ...
 
 
+class FrameCount:
+    """A camera's count of frames, which goes on where the stream starts anew or 16 bits are full.
+
+    GigE Vision counts to 65535, then 1.
+    """
+
+    def __init__(self) -> None:
+        self._offset: int | None = 0
+        self._last, self._next = 0, 0
+
+    def restart(self) -> None:
+        """The next frame is the first of a new stream."""
+        self._offset = None
+
+    def number(self, counted: int) -> int:
+        """The frame's number, from what the camera counted."""
+        if self._offset is None:
+            self._offset = self._next - counted
+        elif self._last - counted > 2**15:
+            self._offset += 2**16 - 1
+        self._last, self._next = counted, self._offset + counted + 1
+        return self._offset + counted
+
+
 def sensor_shape(features: Features) -> tuple[int, int]:
     """Rows and columns of the largest region."""
     rows, columns = ("HeightMax", "WidthMax")

@@ -9,7 +9,7 @@ from typing import Any
 
 from thincam_jax.hardware.base import Camera, CameraSettings, Frame, Identity
 from thincam_jax.hardware.cameras import features as genicam_features
-from thincam_jax.hardware.cameras.features import BIT_DEPTHS, Number, Value
+from thincam_jax.hardware.cameras.features import BIT_DEPTHS, FrameCount, Number, Value
 from thincam_jax.hardware.errors import (
     Busy,
     Disconnected,
@@ -48,7 +48,7 @@ class PylonCamera(Camera):
     def __init__(self, camera: Any):
         self._camera, self._name = camera, "pylon camera"
         self._settings: CameraSettings | None = None
-        self._first = self._next = 0  # number of the stream's first frame, and of the next one
+        self._count = FrameCount()
         try:
             with self._told("open"):
                 camera.Open()
@@ -110,7 +110,7 @@ class PylonCamera(Camera):
             with self._told("grab"):
                 if not self._camera.IsGrabbing():
                     self._camera.StartGrabbing(pylon.GrabStrategy_OneByOne)
-                    self._first = self._next
+                    self._count.restart()
                 self.flush()
                 self._camera.WaitForFrameTriggerReady(
                     milliseconds, pylon.TimeoutHandling_ThrowException
@@ -144,12 +144,10 @@ class PylonCamera(Camera):
         if region is None or pixels.shape != (region.height, region.width):
             cause = f"{pixels.shape} pixels, and {region} is set"
             raise ProtocolError(self._name, "grab", cause, "configure the camera again")
-        number = self._first + result.BlockID
-        self._next = number + 1
         # The emulator has no clock.
         moment = result.TimeStamp * self._tick if result.TimeStamp else time.monotonic()
         bits = BIT_DEPTHS[settings.pixel_format]
-        return Frame(pixels, number, moment, settings.exposure, bits)
+        return Frame(pixels, self._count.number(result.BlockID), moment, settings.exposure, bits)
 
     def _stop(self) -> None:
         with suppress(genicam.GenericException):

@@ -1,0 +1,276 @@
+"""GigE Vision and USB3 Vision cameras by aravis, through GObject introspection."""
+
+import time
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from importlib import import_module
+from typing import Any
+
+import numpy as np
+
+from thincam_jax.hardware.base import Camera, CameraSettings, Frame, Identity
+from thincam_jax.hardware.cameras import features as genicam_features
+from thincam_jax.hardware.cameras.features import BIT_DEPTHS, FrameCount, Number, Value
+from thincam_jax.hardware.errors import (
+    Busy,
+    Disconnected,
+    HardwareError,
+    IncompleteFrame,
+    NotFound,
+    OutOfRange,
+    PermissionDenied,
+    ProtocolError,
+    Timeout,
+)
+
+_BUFFERS = 4
+
+
+@dataclass(frozen=True)
+class AravisOptions:
+    """Which camera: its `name` as `arv-tool-0.8` lists it, its address, or "" for the first."""
+
+    name: str = ""
+
+
+class AravisCamera(Camera):
+    """A camera that aravis knows, with one frame for each software trigger.
+
+    After a frame that failed, the stream starts anew, so that a late one is never taken for the
+    next. A camera that does not answer is `Disconnected`, 2.5 s after the question.
+    """
+
+    Options = AravisOptions
+
+    def __init__(self, name: str = ""):
+        self._aravis, self._glib = _libraries()
+        self._name, self._lost = name or "aravis camera", False
+        self._camera: Any = None
+        self._stream: Any = None
+        self._features: Any = None
+        self._settings: CameraSettings | None = None
+        self._count = FrameCount()
+        try:
+            with self._told("open"):
+                # The list is that of the last search: what was connected since is not in it.
+                self._aravis.update_device_list()
+                self._camera = self._aravis.Camera.new(name or None)
+                self._introduce()
+        except BaseException:
+            self.close()
+            raise
+
+    @classmethod
+    def open(cls, options: AravisOptions) -> "AravisCamera":
+        """Opens a camera; NotFound, Busy or PermissionDenied where that fails."""
+        return cls(options.name)
+
+    def _introduce(self) -> None:
+        device = self._camera.get_device()
+        features = self._features = _Features(self._aravis, device)
+        self._identity = Identity(
+            self._camera.get_vendor_name(),
+            self._camera.get_model_name(),
+            self._camera.get_device_serial_number() or "",
+            features.text("DeviceFirmwareVersion") or features.text("DeviceVersion"),
+        )
+        self._name = str(self._identity)
+        if isinstance(device, self._aravis.GvDevice) and not device.is_controller():
+            raise Busy(self._name, "open", "another program controls it", "close that program")
+        device.connect("control-lost", self._on_control_lost)
+        self._camera.set_range_check_policy(self._aravis.RangeCheckPolicy.ENABLE)
+        genicam_features.trigger_by_software(features)
+
+    @property
+    def identity(self) -> Identity:
+        return self._identity
+
+    @property
+    def sensor_shape(self) -> tuple[int, int]:
+        with self._told("read the sensor's size"):
+            return genicam_features.sensor_shape(self._features)
+
+    def configure(self, settings: CameraSettings) -> CameraSettings:
+        self._stop()
+        shape = self.sensor_shape
+        with self._told("configure"):
+            self._settings = genicam_features.configure(self._features, settings, shape, self._name)
+        return self._settings
+
+    def flush(self) -> None:
+        while self._stream is not None:
+            buffer = self._stream.try_pop_buffer()
+            if buffer is None:
+                return
+            self._stream.push_buffer(buffer)
+
+    def trigger_and_grab(self, timeout: float) -> Frame:
+        settings = self._settings
+        if settings is None:
+            raise OutOfRange(self._name, "grab", "it has no settings", "call configure before")
+        deadline = time.monotonic() + settings.exposure + timeout
+        try:
+            with self._told("grab"):
+                self._start()
+                self.flush()
+                self._wait_until_ready(deadline)
+                self._features.execute("TriggerSoftware")
+                left = max(deadline - time.monotonic(), 0.0)
+                buffer = self._stream.timeout_pop_buffer(int(1e6 * left))
+                if buffer is None:
+                    raise self._timeout("no frame came after the trigger")
+                frame = self._frame(buffer, settings)
+                self._stream.push_buffer(buffer)
+                return frame
+        except BaseException:
+            self._stop()
+            raise
+
+    def close(self) -> None:
+        self._stop()
+        self._camera = self._features = None
+
+    def _start(self) -> None:
+        if self._stream is not None:
+            return
+        self._stream = self._camera.create_stream(None, None)
+        payload = self._camera.get_payload()
+        for _ in range(_BUFFERS):
+            self._stream.push_buffer(self._aravis.Buffer.new_allocate(payload))
+        if self._features.has("AcquisitionStatusSelector"):
+            self._features.set("AcquisitionStatusSelector", "FrameTriggerWait")
+        self._count.restart()
+        self._camera.start_acquisition()
+
+    def _stop(self) -> None:
+        if self._stream is not None and not self._lost:  # one that has gone takes seconds to refuse
+            with suppress(self._glib.Error):
+                self._camera.stop_acquisition()
+        self._stream = None
+
+    def _wait_until_ready(self, deadline: float) -> None:
+        """A trigger that comes too early is lost; cameras that can, say when they are ready."""
+        while self._features.has("AcquisitionStatus"):
+            if self._features.get("AcquisitionStatus"):
+                return
+            if time.monotonic() > deadline:
+                raise self._timeout("the camera was not ready for a trigger")
+
+    def _frame(self, buffer: Any, settings: CameraSettings) -> Frame:
+        status = buffer.get_status()
+        if status != self._aravis.BufferStatus.SUCCESS:
+            cause = f"packets are missing ({status.value_nick})"
+            raise IncompleteFrame(self._name, "grab", cause, "take it again; check the network")
+        data, region = buffer.get_data(), settings.region
+        bits = BIT_DEPTHS[settings.pixel_format]
+        pixels = np.frombuffer(data, np.uint8 if bits == 8 else np.dtype("<u2"))
+        if region is None or pixels.size != region.height * region.width:
+            cause = f"{len(data)} bytes, and {region} of {settings.pixel_format} is set"
+            raise IncompleteFrame(self._name, "grab", cause, "take it again")
+        number = self._count.number(buffer.get_frame_id())
+        shaped = pixels.reshape(region.height, region.width)
+        return Frame(shaped, number, 1e-9 * buffer.get_timestamp(), settings.exposure, bits)
+
+    def _on_control_lost(self, *_: Any) -> None:
+        self._lost = True
+
+    def _timeout(self, cause: str) -> Timeout:
+        return Timeout(self._name, "grab", cause, "try again, or allow more time")
+
+    @contextmanager
+    def _told(self, operation: str) -> Iterator[None]:
+        """Aravis's errors become ours."""
+        if self._lost:
+            raise self._gone(operation, "its control was lost")
+        try:
+            yield
+        except self._glib.Error as failure:
+            raise self._error(operation, failure) from failure
+
+    def _gone(self, operation: str, cause: str) -> Disconnected:
+        return Disconnected(self._name, operation, cause, "connect it and open it again")
+
+    def _error(self, operation: str, failure: Any) -> HardwareError:
+        cause, codes = failure.message, self._aravis.DeviceError
+        code = failure.code if "device-error" in failure.domain else None
+        if code == codes.NOT_FOUND:
+            found = [self._aravis.get_device_id(k) for k in range(self._aravis.get_n_devices())]
+            remedy = f"connect one and switch it on; found: {', '.join(found) or 'none'}"
+            return NotFound(self._name, operation, cause, remedy)
+        if code in (codes.NOT_CONTROLLER, codes.PROTOCOL_ERROR_ACCESS_DENIED) or "BUSY" in cause:
+            return Busy(self._name, operation, cause, "close the program that holds it")
+        if "ACCESS" in cause:  # libusb's name of it
+            remedy = "install aravis's udev rule (aravis.rules) and connect the camera again"
+            return PermissionDenied(self._name, operation, cause, remedy)
+        silent = codes.TIMEOUT, codes.NOT_CONNECTED, codes.TRANSFER_ERROR, codes.NO_STREAM_CHANNEL
+        if code in silent:
+            self._lost = True
+            return self._gone(operation, cause)
+        if "bounds" in cause or "out of range" in cause:
+            return OutOfRange(self._name, operation, cause, "give a value within the limits")
+        return ProtocolError(self._name, operation, cause, "open the camera again")
+
+
+def _libraries() -> tuple[Any, Any]:
+    """Aravis and GLib; NotFound where they are not installed."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            import_module("gi").require_version("Aravis", "0.8")
+            return import_module("gi.repository.Aravis"), import_module("gi.repository.GLib")
+    except (ImportError, ValueError) as error:
+        remedy = (
+            "apt-get install gir1.2-aravis-0.8 python3-gi, and in a virtual environment "
+            "pip install 'PyGObject<3.51'"
+        )
+        raise NotFound("aravis", "open", f"its library is missing ({error})", remedy) from error
+
+
+class _Features:
+    """The features of an aravis device."""
+
+    def __init__(self, aravis: Any, device: Any):
+        self._aravis, self._device = aravis, device
+
+    def _is(self, name: str, *kinds: str) -> bool:
+        node = self._device.get_feature(name)
+        return isinstance(node, tuple(getattr(self._aravis, kind) for kind in kinds))
+
+    def has(self, name: str) -> bool:
+        return self._device.is_feature_available(name)
+
+    def get(self, name: str) -> Value:
+        if self._is(name, "GcBoolean"):
+            return int(self._device.get_boolean_feature_value(name))
+        if self._is(name, "GcEnumeration", "GcString"):
+            return self._device.get_string_feature_value(name)
+        if self._is(name, "GcFloat"):
+            return self._device.get_float_feature_value(name)
+        return self._device.get_integer_feature_value(name)
+
+    def set(self, name: str, value: Value) -> None:
+        if isinstance(value, str):
+            self._device.set_string_feature_value(name, value)
+        elif self._is(name, "GcFloat"):
+            self._device.set_float_feature_value(name, value)
+        else:
+            self._device.set_integer_feature_value(name, int(value))
+
+    def limits(self, name: str) -> tuple[Number, Number, Number]:
+        if self._is(name, "GcFloat"):
+            return *self._device.get_float_feature_bounds(name), 0.0
+        low, high = self._device.get_integer_feature_bounds(name)
+        return low, high, self._device.get_integer_feature_increment(name)
+
+    def choices(self, name: str) -> tuple[str, ...]:
+        if not self.has(name):
+            return ()
+        return tuple(self._device.dup_available_enumeration_feature_values_as_strings(name))
+
+    def execute(self, name: str) -> None:
+        self._device.execute_command(name)
+
+    def text(self, name: str) -> str:
+        return str(self.get(name)) if self.has(name) else ""
