@@ -1,0 +1,148 @@
+r"""Grey levels of a display made linear: the table that undoes its measured transmission.
+
+With the transmission T(level) that a camera measured, the pattern value v is shown as the level
+where
+
+.. math:: T(\mathrm{level}) = T_{min} + (T_{max} - T_{min})\, v / 255
+"""
+
+import json
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from importlib.metadata import version
+from os import PathLike
+from typing import Any
+
+import numpy as np
+from scipy.interpolate import PchipInterpolator
+from scipy.optimize import isotonic_regression
+
+from thincam_jax._core.files import read_regular, write_whole
+from thincam_jax.hardware.base import Camera, Display
+from thincam_jax.hardware.errors import Saturated
+
+LEVELS = 256
+_MOST_SATURATED = 1e-3  # of the pixels
+
+
+@dataclass(frozen=True)
+class GreyLevels:
+    """`table`: the level to show for each of the 256 pattern values; `provenance`: its origin."""
+
+    table: np.ndarray  # (256,) uint8
+    provenance: Mapping[str, Any]
+
+    def __post_init__(self):
+        if self.table.shape != (LEVELS,) or self.table.dtype != np.uint8:
+            raise ValueError(
+                f"a table of {self.table.dtype} {self.table.shape}; give 256 levels of uint8"
+            )
+        steps = np.diff(self.table.astype(int))
+        if np.any(steps > 0) and np.any(steps < 0):
+            raise ValueError("the table rises and falls; give one that does either")
+
+    def __call__(self, pattern: np.ndarray) -> np.ndarray:
+        """The levels to show for a pattern of uint8."""
+        return self.table[pattern]
+
+    def write(self, path: str | PathLike[str]) -> None:
+        """The table with its provenance, as a JSON file."""
+        content = {"table": self.table.tolist(), "provenance": dict(self.provenance)}
+        write_whole(path, json.dumps(content, indent=1) + "\n")
+
+    @classmethod
+    def read(cls, path: str | PathLike[str]) -> "GreyLevels":
+        """The table of a file; ValueError, one line, where it is none."""
+        try:
+            content = json.loads(read_regular(path))
+            table = np.asarray(content["table"])
+            if table.dtype.kind != "i" or np.any((table < 0) | (table >= LEVELS)):
+                raise ValueError("its levels are no whole numbers from 0 to 255")
+            return cls(table.astype(np.uint8), content["provenance"])
+        except (ValueError, KeyError, TypeError) as error:
+            raise ValueError(f"{path} holds no table of grey levels: {error}") from error
+
+
+def linear_levels(
+    levels: np.ndarray, transmission: np.ndarray, provenance: Mapping[str, Any] | None = None
+) -> GreyLevels:
+    """The table from transmissions (n,) measured at n ascending levels from 0 to 255.
+
+    Noise is taken out by the monotone curve nearest in the least squares; between the levels it is
+    interpolated monotonically. A display whose transmission falls has a falling table. The
+    provenance is completed by what was measured, the contrast T_max/T_min, the `departure` of the
+    measured values from a monotone curve and the `nonlinearity` that is left with the table,
+    both relative to T_max − T_min.
+
+    **Errors**: ValueError for levels that do not cover the display, and a constant transmission.
+    """
+    levels, transmission = np.asarray(levels), np.asarray(transmission, float)
+    ascending = levels.ndim == 1 and levels.size > 1 and bool(np.all(np.diff(levels) > 0))
+    if not ascending or (levels[0], levels[-1]) != (0, LEVELS - 1):
+        raise ValueError(f"levels {levels}: give ascending ones from 0 to {LEVELS - 1}")
+    if transmission.shape != levels.shape or not np.all(np.isfinite(transmission)):
+        raise ValueError(f"{levels.size} levels: give as many finite transmissions")
+    rising = bool(np.polyfit(levels, transmission, 1)[0] > 0)
+    monotone = isotonic_regression(transmission, increasing=rising).x
+    curve = PchipInterpolator(levels, monotone)(np.arange(LEVELS))
+    low, high = curve.min(), curve.max()
+    if not high > low:
+        raise ValueError("the transmission is the same at every level: the display does nothing")
+    wanted = low + (high - low) * np.arange(LEVELS) / (LEVELS - 1)
+    table = np.abs(curve[None, :] - wanted[:, None]).argmin(axis=1)
+    measured = {
+        "levels": levels.tolist(),
+        "transmission": transmission.tolist(),
+        "contrast": float(high / low) if low > 0 else None,
+        "departure": float(np.abs(monotone - transmission).max() / (high - low)),
+        "nonlinearity": float(np.abs(curve[table] - wanted).max() / (high - low)),
+    }
+    return GreyLevels(table.astype(np.uint8), {**(provenance or {}), **measured})
+
+
+def calibrate_grey_levels(
+    display: Display,
+    camera: Camera,
+    levels: tuple[int, ...] = (*range(0, LEVELS, 15),),
+    *,
+    settle: float,
+    frames: int = 4,
+    timeout: float = 1.0,
+) -> GreyLevels:
+    """Measures the transmission at `levels`, each shown alone, and gives the table.
+
+    The display must show levels as they are, without a table of its own. The camera is configured
+    before, and sees all of the display or any part of it: the mean of each frame counts. `settle`
+    is the display's settle time in s; of `frames` frames the mean is taken.
+
+    **Errors**: ValueError for a display that applies a table; Saturated; those of the devices.
+    """
+    if getattr(display, "grey_levels", None) is not None:
+        raise ValueError("the display applies a table already; open it without one")
+    transmission, exposure = [], None
+    for level in levels:
+        display.show(np.full(display.shape, level, np.uint8))
+        time.sleep(settle)
+        means = []
+        for _ in range(frames):
+            frame = camera.trigger_and_grab(timeout)
+            full = np.mean(frame.pixels >= 2**frame.bit_depth - 1)
+            if full > _MOST_SATURATED:
+                cause = f"{full:.1%} of the pixels at level {level}"
+                remedy = "shorten the exposure"
+                raise Saturated(str(camera.identity), "calibrate grey levels", cause, remedy)
+            exposure = frame.exposure
+            means.append(frame.pixels.mean(dtype=float))
+        transmission.append(np.mean(means))
+    provenance = {
+        "display": str(display.identity),
+        "camera": str(camera.identity),
+        "exposure": exposure,
+        "settle": settle,
+        "frames": frames,
+        "time": datetime.now(UTC).isoformat(timespec="seconds"),
+        "thincam_jax": version("thincam_jax"),
+    }
+    return linear_levels(np.asarray(levels), np.asarray(transmission), provenance)

@@ -1,0 +1,147 @@
+r"""How long a display has to stand before a frame sees nothing of the pattern before.
+
+Two patterns A and B are shown in turn. With D the difference of their frames at rest, a frame
+:math:`f` exposed a time t after A gave way to B holds the part
+
+.. math:: r(t) = \langle f - f_B,\, D \rangle / \langle D,\, D \rangle, \qquad D = f_A - f_B
+
+of A: 1 before anything has changed, 0 at rest. The frame's noise enters as that of a mean over all
+pixels, so that a part far below the noise of one pixel is seen.
+"""
+
+import time
+from dataclasses import dataclass
+
+import numpy as np
+
+from thincam_jax.hardware.base import Camera, Display
+from thincam_jax.hardware.errors import OutOfRange, Timeout
+
+_SHOTS = 4  # of each measured part
+_SWEEP = 8  # delays before bisection starts, so that a response that rings is followed to its end
+_BISECTIONS = 5
+_SIGMAS = 2.0
+
+
+@dataclass(frozen=True)
+class SettleTime:
+    """What `settle_calibrate` found.
+
+    After `time` (s) no more than `tolerance` of the pattern before is seen. Measurably more was
+    last seen `uncertainty` (s) before. `delays` and `parts` are what was measured, and
+    `noise` one part's standard deviation.
+    """
+
+    time: float
+    uncertainty: float
+    tolerance: float
+    delays: tuple[float, ...]
+    parts: tuple[float, ...]
+    noise: float
+
+
+def settle_calibrate(
+    display: Display,
+    camera: Camera,
+    patterns: tuple[np.ndarray, np.ndarray] | None = None,
+    *,
+    tolerance: float = 0.01,
+    longest: float = 0.5,
+    timeout: float = 1.0,
+) -> SettleTime:
+    """Finds the settle time, from the return of `show` to the trigger, in s.
+
+    Both directions count, black to white and back by default, or two `patterns` of the display's
+    shape. The frame is exposed from the trigger on: the time holds for the camera's exposure, or a
+    longer one. `longest` is that after which the display is taken to be at rest.
+
+    **Errors**: Timeout where it is not settled after `longest`; OutOfRange where the camera does
+    not tell the patterns apart, or not as well as the tolerance asks; those of the devices.
+    """
+    if patterns is None:
+        black = np.zeros(display.shape, np.uint8)
+        patterns = black, ~black
+    device, operation = f"{display.identity} seen by {camera.identity}", "find the settle time"
+    rig = _Rig(display, camera, patterns, longest, timeout)
+    if not np.any(rig.difference):
+        cause = "both patterns give the same frame"
+        raise OutOfRange(device, operation, cause, "check that the camera sees the display")
+    if _SIGMAS * rig.noise > tolerance / 2:
+        cause = f"noise of {rig.noise:.2g} of the patterns' contrast, tolerance {tolerance:g}"
+        raise OutOfRange(device, operation, cause, "expose longer or allow a larger tolerance")
+    shots: list[tuple[float, float]] = []
+
+    def settled(delay: float) -> tuple[float, int]:
+        """The delay in fact, and 1 for settled, −1 for not, 0 where noise leaves it open."""
+        actual, part = rig.part(delay)
+        shots.append((actual, part))
+        margin = _SIGMAS * rig.noise
+        return actual, int(part + margin <= tolerance) - int(part - margin > tolerance)
+
+    unsettled, undecided = 0.0, 0.0
+    time_found, verdict = settled(longest)
+    if verdict != 1:
+        cause = f"{shots[0][1]:.2g} of the pattern before after {longest:g} s"
+        raise Timeout(device, operation, cause, "give a larger `longest`")
+    for delay in np.linspace(longest, 0.0, _SWEEP + 1)[1:]:
+        actual, verdict = settled(float(delay))
+        if verdict != 1:
+            undecided = max(undecided, actual)
+            if verdict == -1:
+                unsettled = max(unsettled, actual)
+                break
+        elif not undecided:
+            time_found = actual
+    for _ in range(_BISECTIONS):
+        actual, verdict = settled((max(undecided, unsettled) + time_found) / 2)
+        if verdict == 1:
+            time_found = min(time_found, actual)
+        else:
+            undecided = max(undecided, actual)
+            unsettled = max(unsettled, actual) if verdict == -1 else unsettled
+    delays, parts = zip(*sorted(shots), strict=True)
+    return SettleTime(time_found, time_found - unsettled, tolerance, delays, parts, rig.noise)
+
+
+class _Rig:
+    """The two patterns at rest, and the part of the one that is left when the other is shown."""
+
+    def __init__(self, display: Display, camera: Camera, patterns, longest: float, timeout: float):
+        self._display, self._camera, self._patterns = display, camera, patterns
+        self._longest, self._timeout = longest, timeout
+        stacks = [self._at_rest(pattern) for pattern in patterns]
+        self._rest = [stack.mean(axis=0) for stack in stacks]
+        self.difference = self._rest[0] - self._rest[1]
+        energy = np.vdot(self.difference, self.difference)
+        self._probe = self.difference / energy if energy else self.difference
+        scatter = [np.tensordot(stack, self._probe, 2) for stack in stacks]
+        # One part is the mean of as many shots as its reference.
+        self.noise = float(np.sqrt(np.mean(np.var(scatter, axis=1, ddof=1)) * 2 / _SHOTS))
+
+    def part(self, delay: float) -> tuple[float, float]:
+        """The larger of both directions' parts, and the delay in fact, in s."""
+        parts, delays = np.zeros((2, _SHOTS)), []
+        for shot in range(_SHOTS):
+            for new, sign in ((1, 1.0), (0, -1.0)):
+                self._stand(1 - new, self._longest)
+                delays.append(self._stand(new, delay))
+                seen = self._grab() - self._rest[new]
+                parts[new, shot] = sign * np.vdot(seen, self._probe)
+        return float(np.mean(delays)), float(np.abs(parts.mean(axis=1)).max())
+
+    def _at_rest(self, pattern: np.ndarray) -> np.ndarray:
+        frames = []
+        for _ in range(2 + _SHOTS):
+            self._display.show(pattern)
+            time.sleep(self._longest)
+            frames.append(self._grab())
+        return np.stack(frames[2:])
+
+    def _stand(self, number: int, delay: float) -> float:
+        self._display.show(self._patterns[number])
+        start = time.perf_counter()
+        time.sleep(delay)
+        return time.perf_counter() - start
+
+    def _grab(self) -> np.ndarray:
+        return self._camera.trigger_and_grab(self._timeout).pixels.astype(float)

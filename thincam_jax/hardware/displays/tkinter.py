@@ -1,0 +1,88 @@
+"""A window on a monitor by tkinter, which comes with Python: where SDL cannot be used."""
+
+import tkinter
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+
+import numpy as np
+
+from thincam_jax.hardware.base import Identity
+from thincam_jax.hardware.displays.grey_levels import GreyLevels
+from thincam_jax.hardware.displays.screen import Screen
+from thincam_jax.hardware.errors import Disconnected, NotFound
+
+
+@dataclass(frozen=True)
+class TkinterOptions:
+    """Where the window lies; tkinter knows no monitors, only places on the desktop, in pixels.
+
+    `size` is (rows, columns), None for all of the first monitor; `grey_levels` a table's file.
+    """
+
+    left: int = 0
+    top: int = 0
+    size: tuple[int, int] | None = None
+    grey_levels: str = ""
+
+
+class TkinterDisplay(Screen):
+    """A window without a frame. It waits for the window system, not for the monitor's next image.
+
+    It is used by the thread that opened it.
+    """
+
+    Options = TkinterOptions
+
+    def __init__(self, options: TkinterOptions):
+        super().__init__(GreyLevels.read(options.grey_levels) if options.grey_levels else None)
+        try:
+            self._root = tkinter.Tk()
+        except tkinter.TclError as error:
+            remedy = "connect a monitor and set DISPLAY"
+            raise NotFound("tkinter", "open", str(error), remedy) from error
+        self._version = str(self._root.tk.call("info", "patchlevel"))
+        screen = self._root.winfo_screenheight(), self._root.winfo_screenwidth()
+        rows, columns = self._shape = tuple(options.size or screen)
+        self._root.overrideredirect(True)
+        self._root.geometry(f"{columns}x{rows}+{options.left}+{options.top}")
+        self._root.configure(cursor="none")
+        self._image = tkinter.PhotoImage(master=self._root, width=columns, height=rows)
+        label = tkinter.Label(self._root, image=self._image, borderwidth=0, highlightthickness=0)
+        label.place(x=0, y=0, width=columns, height=rows)
+        self._present(np.zeros(self._shape, np.uint8))
+
+    @classmethod
+    def open(cls, options: TkinterOptions) -> "TkinterDisplay":
+        """Opens the window; NotFound where there is no desktop."""
+        return cls(options)
+
+    @property
+    def identity(self) -> Identity:
+        return Identity("tkinter", "window", "", self._version)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        rows, columns = self._shape
+        return rows, columns
+
+    def close(self) -> None:
+        with suppress(tkinter.TclError):
+            self._root.destroy()
+
+    def _present(self, levels: np.ndarray) -> None:
+        with self._told():
+            header = f"P5 {levels.shape[1]} {levels.shape[0]} 255\n".encode()
+            self._image.configure(data=header + levels.tobytes(), format="ppm")
+            self._root.lift()
+            self._root.update()
+            # The window system answers in order: once it does, it has drawn.
+            self._root.winfo_pointerxy()
+
+    @contextmanager
+    def _told(self) -> Iterator[None]:
+        try:
+            yield
+        except tkinter.TclError as error:
+            remedy = "open the display again"
+            raise Disconnected("tkinter window", "show", str(error), remedy) from error
