@@ -4,8 +4,6 @@ Levels are in proportion to the irradiance that the display lets through, as the
 table of grey levels.
 """
 
-import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 
 from thincam_jax._core.grids import Grid
@@ -13,6 +11,7 @@ from thincam_jax.lensless.masks import FresnelZoneAperture
 from thincam_jax.measured.calibration.hadamard import HadamardSeries
 
 _BITS = 16
+_HARMONICS = 99  # what is left out of a profile's series is less than a level
 
 
 def zone_pattern(mask: FresnelZoneAperture, shape: tuple[int, int], pitch: float) -> np.ndarray:
@@ -40,8 +39,17 @@ def zone_pattern(mask: FresnelZoneAperture, shape: tuple[int, int], pitch: float
         raise ValueError(
             f"a mask of {sides[0]:g} × {sides[1]:g} pixels; the display has {shape[0]} × {shape[1]}"
         )
-    open_mask = eqx.tree_at(lambda m: m.fill_factor, mask, jnp.ones_like(mask.fill_factor))
-    amplitude = np.asarray(open_mask.sample(Grid(shape, pitch)))
+    shown = FresnelZoneAperture(
+        mask.beta,
+        mask.phase,
+        width=mask.width,
+        height=mask.height,
+        profile=mask.profile,
+        centre=mask.centre,
+        pixel_pitch=None if mask.pixels is None else pitch,
+        harmonics=_HARMONICS,
+    )
+    amplitude = np.asarray(shown.sample(Grid(shape, pitch)))
     if mask.profile == "binary":
         return np.where(amplitude > 0.5, 255, 0).astype(np.uint8)
     return np.rint(255 * np.clip(amplitude, 0.0, 1.0) ** 2).astype(np.uint8)
@@ -82,9 +90,10 @@ def with_number(pattern: np.ndarray, number: int, border: int) -> np.ndarray:
     framed = np.zeros_like(pattern)
     inner = slice(border, -border), slice(border, -border)
     framed[inner] = pattern[inner]
-    for bit, columns in enumerate(_blocks(pattern.shape[1])):
+    ends = np.linspace(0, pattern.shape[1], _BITS + 1).round().astype(int)
+    for bit in range(_BITS):
         edge = slice(0, border) if number >> bit & 1 else slice(-border, None)
-        framed[edge, columns] = 255
+        framed[edge, ends[bit] : ends[bit + 1]] = 255
     return framed
 
 
@@ -93,18 +102,16 @@ def read_number(image: np.ndarray, border: int) -> int:
 
     `border` is in the image's pixels. ValueError where it holds no number, or two.
     """
+    upper, lower = (part.mean(axis=0, dtype=float) for part in (image[:border], image[-border:]))
+    width = image.shape[1] / _BITS
+    half = max(width / 4, 0.5)  # the middle of a block, where no neighbour reaches
     differences = np.array(
         [
-            image[:border, columns].mean(dtype=float) - image[-border:, columns].mean(dtype=float)
-            for columns in _blocks(image.shape[1])
+            np.mean((upper - lower)[round(middle - half) : round(middle + half)])
+            for middle in width * (np.arange(_BITS) + 0.5)
         ]
     )
     largest = np.abs(differences).max()
     if not largest > 0 or np.any(np.abs(differences) < 0.7 * largest):
         raise ValueError("the border holds no number, or a mixture of two")
     return sum(1 << bit for bit, difference in enumerate(differences) if difference > 0)
-
-
-def _blocks(columns: int) -> list[slice]:
-    edges = np.linspace(0, columns, _BITS + 1).round().astype(int)
-    return [slice(int(a), int(b)) for a, b in zip(edges[:-1], edges[1:], strict=True)]

@@ -1,0 +1,56 @@
+"""A virtual panel, a camera that looks at it, and a clock that stands still between sleeps."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from thincam_jax.hardware import Camera, CameraSettings, Frame, Identity
+from thincam_jax.hardware.virtual.display import VirtualDisplay
+
+
+class Clock:
+    """In place of the module `time`."""
+
+    def __init__(self):
+        self.now = 0.0
+
+    def perf_counter(self) -> float:
+        return self.now
+
+    def sleep(self, seconds: float) -> None:
+        self.now += seconds
+
+
+class PanelCamera(Camera):
+    """A 12 bit camera, pixel by pixel of the panel; `counts` of its levels, with noise."""
+
+    def __init__(
+        self,
+        display: VirtualDisplay,
+        counts: Callable[[np.ndarray], np.ndarray],
+        noise: float = 2.0,
+    ):
+        self.display, self.counts, self.noise = display, counts, noise
+        self.random, self.number = np.random.default_rng(11), 0
+
+    identity = Identity("test", "camera", "1")
+
+    @property
+    def sensor_shape(self):
+        return self.display.shape
+
+    def configure(self, settings: CameraSettings) -> CameraSettings:
+        return settings
+
+    def flush(self) -> None:
+        pass
+
+    def close(self) -> None:
+        pass
+
+    def trigger_and_grab(self, timeout: float) -> Frame:
+        seen = self.counts(self.display.levels())
+        seen = seen + self.noise * self.random.standard_normal(seen.shape)
+        self.number += 1
+        pixels = np.clip(np.rint(seen), 0, 4095).astype(np.uint16)
+        return Frame(pixels, self.number, 0.0, 1e-3, 12)

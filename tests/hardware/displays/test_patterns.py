@@ -1,0 +1,104 @@
+"""Patterns against the masks and the Hadamard series that they show."""
+
+import numpy as np
+import pytest
+
+import thincam_jax as tc
+from thincam_jax.hardware.displays.patterns import (
+    hadamard_frame,
+    read_number,
+    with_number,
+    zone_pattern,
+)
+from thincam_jax.measured.calibration.hadamard import HadamardSeries
+
+PITCH = 0.036  # mm, the modulator of the thesis
+SHAPE = 24, 40
+
+
+def zones(profile, phase=0.4, pixels=(16, 32)):
+    rows, columns = pixels
+    return tc.FresnelZoneAperture(
+        beta=12.0,
+        phase=phase,
+        width=columns * PITCH,
+        height=rows * PITCH,
+        profile=profile,
+        pixel_pitch=PITCH,
+        fill_factor=0.6,
+    )
+
+
+@pytest.mark.parametrize("profile", ["cosine", "intensity", "binary"])
+def test_zones_are_those_of_the_formula(profile):
+    y, x = (PITCH * (np.arange(count) - (count - 1) / 2) for count in SHAPE)
+    wave = np.cos(12.0 * (y[:, None] ** 2 + x**2) + 0.4)
+    irradiance = {
+        "cosine": ((1 + wave) / 2) ** 2,  # of the amplitude (1 + cos)/2
+        "intensity": (1 + wave) / 2,
+        "binary": (wave > 0).astype(float),
+    }[profile]
+    outside = np.ones(SHAPE, bool)
+    outside[4:20, 4:36] = False
+    irradiance[outside] = 0
+    pattern = zone_pattern(zones(profile), SHAPE, PITCH)
+    assert pattern.dtype == np.uint8 and pattern.shape == SHAPE
+    assert np.abs(pattern - 255 * irradiance).max() < 1.0  # levels
+    if profile == "binary":
+        assert set(np.unique(pattern)) == {0, 255}
+
+
+def test_a_printed_masks_pattern_and_its_complement():
+    mask = tc.FresnelZoneAperture(beta=12.0, phase=0.0, width=0.7, profile="intensity")
+    other = tc.FresnelZoneAperture(beta=12.0, phase=np.pi, width=0.7, profile="intensity")
+    both = [zone_pattern(m, SHAPE, PITCH).astype(int) for m in (mask, other)]
+    inner = slice(3, -3), slice(12, -12)
+    assert np.abs(sum(both)[inner] - 255).max() <= 1
+
+
+@pytest.mark.parametrize(
+    ("mask", "pitch", "message"),
+    [
+        (zones("binary"), 0.03, "the display's have 0.03 mm"),
+        (zones("binary", pixels=(26, 32)), PITCH, "26 × 32 pixels; the display has 24 × 40"),
+        (zones("binary", pixels=(15, 32)), PITCH, "even or odd"),
+    ],
+)
+def test_masks_that_do_not_fit(mask, pitch, message):
+    with pytest.raises(ValueError, match=message):
+        zone_pattern(mask, SHAPE, pitch)
+
+
+def test_hadamard_frames_are_those_of_the_series():
+    series = HadamardSeries(object_shape=(2, 8), dark_frames=1)
+    for number in range(series.frame_count):
+        pattern = hadamard_frame(series, number, SHAPE, border=3)
+        assert read_number(pattern, 3) == number
+        cells = pattern[8:16, 4:36]  # 2 × 8 cells of 4 pixels: the border leaves 34 of 40
+        assert np.array_equal(cells, np.kron(255 * series.frame(number), np.ones((4, 4))))
+        assert not np.any(pattern[3:8]) and not np.any(pattern[16:21])
+    assert hadamard_frame(series, 0, SHAPE)[:, :].max() == 255
+    with pytest.raises(ValueError, match="do not fit into 24 × 40"):
+        hadamard_frame(HadamardSeries(object_shape=(32, 32)), 0, SHAPE)
+
+
+def test_numbers_are_read_from_an_image_of_the_display():
+    blank = np.zeros(SHAPE, np.uint8)
+    random = np.random.default_rng(7)
+    for number in (0, 1, 4097, 65535, *random.integers(0, 65536, 20)):
+        image = np.kron(with_number(blank, int(number), 4), np.ones((3, 2))) * 0.1 + 40.0
+        assert read_number(image + random.standard_normal(image.shape), 12) == number
+
+
+def test_a_mixture_of_two_numbers_is_no_number():
+    blank = np.zeros(SHAPE, np.uint8)
+    first, second = (with_number(blank, number, 4).astype(float) for number in (4095, 4096))
+    assert read_number(0.9 * first + 0.1 * second, 4) == 4095
+    for part in (0.5, 0.7):
+        with pytest.raises(ValueError, match="mixture of two"):
+            read_number(part * first + (1 - part) * second, 4)
+    with pytest.raises(ValueError, match="no number"):
+        read_number(blank, 4)
+    for number, border in ((-1, 4), (65536, 4), (5, 0), (5, 13)):
+        with pytest.raises(ValueError, match="give 0|no border"):
+            with_number(blank, number, border)

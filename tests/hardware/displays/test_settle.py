@@ -1,0 +1,67 @@
+"""The settle time of panels that follow exponentially: τ·ln(1/tolerance)."""
+
+import numpy as np
+import pytest
+from hardware.displays.rig import Clock, PanelCamera
+
+from thincam_jax.hardware import OutOfRange, Timeout
+from thincam_jax.hardware.displays import settle
+from thincam_jax.hardware.displays.settle import settle_calibrate
+from thincam_jax.hardware.virtual import display as virtual_display
+from thincam_jax.hardware.virtual.display import VirtualDisplay
+
+SHAPE = 12, 20
+RESPONSE, LONGEST = 0.02, 0.2  # s
+
+
+@pytest.fixture(autouse=True)
+def clock(monkeypatch):
+    clock = Clock()
+    monkeypatch.setattr(settle, "time", clock)
+    monkeypatch.setattr(virtual_display, "time", clock)
+    return clock
+
+
+def linear(levels):
+    return 100.0 + 14.0 * levels
+
+
+@pytest.mark.parametrize("tolerance", [0.05, 0.01])
+def test_it_is_found_with_its_uncertainty(tolerance):
+    display = VirtualDisplay(SHAPE, response=RESPONSE)
+    camera = PanelCamera(display, linear)
+    found = settle_calibrate(display, camera, tolerance=tolerance, longest=LONGEST)
+    expected = RESPONSE * np.log(1 / tolerance)
+    assert found.time - found.uncertainty <= expected <= found.time
+    assert found.uncertainty < LONGEST / 8
+    model = np.exp(-np.array(found.delays) / RESPONSE)
+    assert np.abs(np.array(found.parts) - model).max() < 5 * found.noise
+
+
+def test_patterns_of_ones_own_and_a_panel_without_inertia():
+    random = np.random.default_rng(4)
+    patterns = tuple(random.integers(0, 256, (2, *SHAPE), dtype=np.uint8))
+    display = VirtualDisplay(SHAPE)
+    camera = PanelCamera(display, linear)
+    found = settle_calibrate(display, camera, (patterns[0], patterns[1]), longest=LONGEST)
+    assert found.time == 0.0
+
+
+@pytest.mark.parametrize(
+    ("counts", "longest", "error", "message"),
+    [
+        (linear, 0.04, Timeout, "give a larger `longest`"),
+        (lambda levels: 100.0 + 0.05 * levels, LONGEST, OutOfRange, "expose longer"),
+    ],
+)
+def test_what_cannot_be_found(counts, longest, error, message):
+    display = VirtualDisplay(SHAPE, response=RESPONSE)
+    with pytest.raises(error, match=message):
+        settle_calibrate(display, PanelCamera(display, counts), longest=longest)
+
+
+def test_a_camera_that_does_not_see_the_display():
+    display = VirtualDisplay(SHAPE, response=RESPONSE)
+    camera = PanelCamera(display, lambda levels: np.full(SHAPE, 100.0), noise=0.0)
+    with pytest.raises(OutOfRange, match="both patterns give the same frame"):
+        settle_calibrate(display, camera, longest=LONGEST)
