@@ -2,7 +2,15 @@
 
 import numpy as np
 import pytest
-from hardware.displays.x_server import SCREEN, needs_x_server, wrong_pixels, x_server
+from hardware.displays.x_server import (
+    MONITOR,
+    SCREEN,
+    needs_two_monitors,
+    needs_x_server,
+    wrong_pixels,
+    x_server,
+    x_server_of_two_monitors,
+)
 from PIL import Image
 
 from thincam_jax.hardware import Disconnected, NotFound, OutOfRange, open_device
@@ -79,3 +87,17 @@ def test_no_wrong_pixel_on_an_x_server(size, monkeypatch):
         with open_device("displays", "sdl", {"size": size}) as display:
             assert display.shape == (size or SCREEN)
             assert wrong_pixels(display, name, (0, 0)) == 0
+
+
+@needs_two_monitors
+@pytest.mark.thorough
+def test_the_monitor_that_is_named(monkeypatch, tmp_path):
+    monkeypatch.setenv("SDL_VIDEODRIVER", "x11")
+    with x_server_of_two_monitors(tmp_path) as name:
+        monkeypatch.setenv("DISPLAY", name)
+        with pytest.raises(NotFound, match="found: 0 'DUMMY0', 1 'DUMMY1'"):
+            open_device("displays", "sdl")
+        for monitor, left in (("DUMMY1", MONITOR[1]), ("DUMMY0", 0), ("1", MONITOR[1])):
+            with open_device("displays", "sdl", {"monitor": monitor}) as display:
+                assert display.shape == MONITOR
+                assert wrong_pixels(display, name, (0, left), frames=5) == 0

@@ -17,6 +17,7 @@ with warnings.catch_warnings():
     warnings.simplefilter("ignore")  # it tells which of the SDL libraries it has found
     import sdl2
 
+_GREY = np.uint32(0x010101)  # red, green and blue alike
 _NOT_SHOWN = sdl2.SDL_WINDOW_HIDDEN | sdl2.SDL_WINDOW_MINIMIZED
 
 
@@ -92,12 +93,12 @@ class SdlDisplay(Screen):
         self._shape = self._output()
         self._texture = sdl2.SDL_CreateTexture(
             self._renderer,
-            sdl2.SDL_PIXELFORMAT_ARGB8888,
+            sdl2.SDL_PIXELFORMAT_RGB888,
             sdl2.SDL_TEXTUREACCESS_STREAMING,
             self._shape[1],
             self._shape[0],
         )
-        self._pixels = np.full((*self._shape, 4), 255, np.uint8)
+        self._pixels = np.empty(self._shape, np.uint32)
         self._present(np.zeros(self._shape, np.uint8))
 
     @property
@@ -118,7 +119,7 @@ class SdlDisplay(Screen):
 
     def _present(self, levels: np.ndarray) -> None:
         self._require_window()
-        self._pixels[..., :3] = levels[..., None]
+        np.multiply(levels, _GREY, out=self._pixels)
         data, pitch = self._pixels.ctypes.data_as(ctypes.c_void_p), self._pixels.strides[0]
         failed = sdl2.SDL_UpdateTexture(self._texture, None, data, pitch)
         # With vsync, the first may wait in a queue until the second is accepted.
