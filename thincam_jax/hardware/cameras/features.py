@@ -72,19 +72,23 @@ def sensor_shape(features: Features) -> tuple[int, int]:
 
 
 def trigger_by_software(features: Features) -> None:
-    """One frame for each software trigger, nothing automatic."""
-    for name in ("ExposureAuto", "GainAuto"):
-        if features.has(name):
-            features.set(name, "Off")
-    if features.has("AcquisitionMode"):
-        features.set("AcquisitionMode", "Continuous")
+    """One frame for each software trigger, nothing automatic.
+
+    What is set already is not written: some cameras hold it fixed.
+    """
+
+    def put(name: str, value: str) -> None:
+        if features.has(name) and features.get(name) != value:
+            features.set(name, value)
+
+    put("ExposureAuto", "Off")
+    put("GainAuto", "Off")
+    put("AcquisitionMode", "Continuous")
     for selector in features.choices("TriggerSelector"):
-        features.set("TriggerSelector", selector)
-        if features.has("TriggerMode"):
-            features.set("TriggerMode", "Off")
-    features.set("TriggerSelector", "FrameStart")
-    features.set("TriggerMode", "On")
-    features.set("TriggerSource", "Software")
+        put("TriggerSelector", selector)
+        put("TriggerMode", "On" if selector == "FrameStart" else "Off")
+    put("TriggerSelector", "FrameStart")
+    put("TriggerSource", "Software")
 
 
 def configure(

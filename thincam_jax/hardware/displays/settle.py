@@ -49,11 +49,12 @@ def settle_calibrate(
     longest: float = 0.5,
     timeout: float = 1.0,
 ) -> SettleTime:
-    """Finds the settle time, from the return of `show` to the trigger, in s.
+    """Finds the settle time, from the return of `show` to the call of `trigger_and_grab`, in s.
 
     Both directions count, black to white and back by default, or two `patterns` of the display's
-    shape. The frame is exposed from the trigger on: the time holds for the camera's exposure, or a
-    longer one. `longest` is that after which the display is taken to be at rest.
+    shape. What the camera's driver takes before it triggers is not in it, so that the time holds
+    for this camera, and for its exposure or a longer one. After `longest` the display is taken to
+    be at rest.
 
     **Errors**: Timeout where it is not settled after `longest`; OutOfRange where the camera does
     not tell the patterns apart, or not as well as the tolerance asks; those of the devices.
