@@ -9,7 +9,7 @@ os.environ.setdefault("JAX_PLATFORMS", "cpu")  # set it to run the tests on anot
 os.environ["MPLBACKEND"] = "Agg"
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # of programs that are loaded, not compiled
 os.environ["THINCAM_CACHE"] = "off"  # commands in tests leave no compiled programs with the user
-# There is a worker for each core: threads of NumPy's and XLA's own would wait for each other, busily.
+# There is a worker for each core: more threads in NumPy and XLA would wait busily for each other.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 # Most of the tests' time goes into compiling some 14,000 small programs. Without these emitters and
 # LLVM's optimisation, and with each program in one piece, it is a third of the time. What tests
