@@ -3,6 +3,7 @@
 A library's camera becomes one of these by `Features`: features by name, without their types.
 """
 
+from collections.abc import Collection
 from typing import Protocol, runtime_checkable
 
 from thincam_jax.hardware.base import CameraSettings, Region
@@ -72,14 +73,11 @@ def sensor_shape(features: Features) -> tuple[int, int]:
 
 
 def trigger_by_software(features: Features) -> None:
-    """One frame for each software trigger, nothing automatic.
-
-    What is set already is not written: some cameras hold it fixed.
-    """
+    """One frame for each software trigger, nothing automatic."""
 
     def put(name: str, value: str) -> None:
-        if features.has(name) and features.get(name) != value:
-            features.set(name, value)
+        if features.has(name):
+            _put(features, name, value)
 
     put("ExposureAuto", "Off")
     put("GainAuto", "Off")
@@ -92,21 +90,27 @@ def trigger_by_software(features: Features) -> None:
 
 
 def configure(
-    features: Features, asked: CameraSettings, shape: tuple[int, int], device: str
+    features: Features,
+    asked: CameraSettings,
+    shape: tuple[int, int],
+    device: str,
+    formats: Collection[str] = BIT_DEPTHS.keys(),
 ) -> CameraSettings:
     """Sets a camera to what is nearest, and returns what it says it is set to.
 
-    `shape` is that of the sensor, `device` the camera's name in errors.
+    `shape` is that of the sensor, `device` the camera's name in errors, `formats` what the driver
+    can read.
 
     **Errors**: OutOfRange, before anything is written, for a region, format, exposure or gain that
     the camera does not have.
     """
-    _require(features, asked, shape, device)
+    offered = [name for name in features.choices("PixelFormat") if name in formats]
+    _require(features, asked, shape, device, offered)
     features.set("PixelFormat", asked.pixel_format)
     region = asked.region or Region(0, 0, *shape)
     for offset in ("OffsetX", "OffsetY"):  # so that every size fits
         if features.has(offset):
-            features.set(offset, features.limits(offset)[0])
+            _put(features, offset, features.limits(offset)[0])
     for name, pixels in (
         ("Width", region.width),
         ("Height", region.height),
@@ -114,10 +118,10 @@ def configure(
         ("OffsetY", region.top),
     ):
         if features.has(name):
-            features.set(name, _nearest(pixels, *features.limits(name)))
-    features.set(_exposure(features), asked.exposure / _MICROSECOND)
+            _put(features, name, _nearest(pixels, *features.limits(name)))
+    _put_within(features, _exposure(features), asked.exposure / _MICROSECOND)
     if features.has("Gain"):
-        features.set("Gain", asked.gain)
+        _put_within(features, "Gain", asked.gain)
     return read(features)
 
 
@@ -143,13 +147,27 @@ def _nearest(value: int, low: Number, high: Number, step: Number) -> int:
     return int(min(max(low + round((value - low) / step) * step, low), last))
 
 
+def _put(features: Features, name: str, value: Value) -> None:
+    """What is set already is not written: some cameras hold it fixed."""
+    if features.get(name) != value:
+        features.set(name, value)
+
+
+def _put_within(features: Features, name: str, value: float) -> None:
+    low, high, _ = features.limits(name)
+    _put(features, name, min(max(value, low), high))
+
+
 def _require(
-    features: Features, asked: CameraSettings, shape: tuple[int, int], device: str
+    features: Features,
+    asked: CameraSettings,
+    shape: tuple[int, int],
+    device: str,
+    formats: list[str],
 ) -> None:
     def refuse(what: str, allowed: str) -> OutOfRange:
         return OutOfRange(device, "configure", what, f"give {allowed}")
 
-    formats = [name for name in features.choices("PixelFormat") if name in BIT_DEPTHS]
     if asked.pixel_format not in formats:
         raise refuse(f"no pixel format {asked.pixel_format}", f"one of {', '.join(formats)}")
     region = asked.region or Region(0, 0, *shape)
@@ -157,6 +175,9 @@ def _require(
     inside = min(region.top, region.left) >= 0 and bottom <= shape[0] and right <= shape[1]
     if not inside or min(region.height, region.width) < 1:
         raise refuse(f"{region} lies outside of the sensor", f"a part of {shape[0]} × {shape[1]}")
+    for name, pixels in (("Width", region.width), ("Height", region.height)):
+        if features.has(name) and pixels < (least := features.limits(name)[0]):
+            raise refuse(f"{name} of {pixels} pixels", f"at least {least}")
     for name, given, unit, scale in (
         (_exposure(features), asked.exposure, "s", _MICROSECOND),
         ("Gain", asked.gain, "dB", 1.0),
@@ -164,5 +185,6 @@ def _require(
         low, high = 0.0, 0.0  # a camera whose gain is not in dB keeps the one it has
         if features.has(name):
             low, high = (limit * scale for limit in features.limits(name)[:2])
-        if not low <= given <= high:
+        rounding = 1e-9 * abs(given)  # a limit that was read comes back through other units
+        if not low - rounding <= given <= high + rounding:
             raise refuse(f"{name} of {given:g} {unit}", f"{low:g} … {high:g} {unit}")

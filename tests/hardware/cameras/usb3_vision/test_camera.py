@@ -57,11 +57,14 @@ def test_settings_move_to_the_nearest(camera):
 @pytest.mark.parametrize(
     ("settings", "said"),
     [
-        (CameraSettings(1e-6), "allowed: 10 to 1e\\+07 µs"),
-        (CameraSettings(0.01, gain=30.0), "allowed: 0 to 24 dB"),
-        (CameraSettings(0.01, Region(0, 0, 49, 64)), "48 rows and 64 columns"),
-        (CameraSettings(0.01, Region(0, 0, 4, 64)), "allowed: 16 to 48 pixels"),
-        (CameraSettings(0.01, pixel_format="BayerRG8"), "use one of Mono8, Mono10"),
+        (CameraSettings(1e-6), "ExposureTime of 1e-06 s; give 1e-05 … 10 s"),
+        (CameraSettings(0.01, gain=30.0), "Gain of 30 dB; give 0 … 24 dB"),
+        (CameraSettings(0.01, Region(0, 0, 49, 64)), "a part of 48 × 64"),
+        (CameraSettings(0.01, Region(0, 0, 4, 64)), "Height of 4 pixels; give at least 16"),
+        (
+            CameraSettings(0.01, pixel_format="BayerRG8"),
+            "no pixel format BayerRG8; give one of Mono8, Mono10",
+        ),
     ],
 )
 def test_what_it_cannot_take_is_refused(camera, settings, said):
@@ -180,7 +183,7 @@ def test_a_frame_that_comes_too_late_is_not_taken_for_the_next(device, camera, s
 def test_endless_stale_frames_end_in_a_timeout(device, camera):
     """A camera that runs freely with a clock that stands still."""
     camera.configure(CameraSettings(0.01))
-    camera._features.write("TriggerMode", "Off")
+    camera._features.set("TriggerMode", "Off")
     camera._control.clock = lambda: 2**63
     with pytest.raises(Timeout, match="older ones discarded"):
         camera.trigger_and_grab(0.01)

@@ -5,13 +5,17 @@ from dataclasses import dataclass
 from time import monotonic
 from typing import Any
 
-from thincam_jax.hardware.base import Camera, CameraSettings, Frame, Identity, Region
+from thincam_jax.hardware.base import Camera, CameraSettings, Frame, Identity
+from thincam_jax.hardware.cameras import features
 from thincam_jax.hardware.cameras.usb3_vision import gencp
 from thincam_jax.hardware.cameras.usb3_vision.features import Features, fetch_xml
 from thincam_jax.hardware.cameras.usb3_vision.gencp import Abrm
 from thincam_jax.hardware.cameras.usb3_vision.link import Control, UsbLink
 from thincam_jax.hardware.cameras.usb3_vision.stream import PIXEL_FORMATS, Stream, unpack
-from thincam_jax.hardware.errors import HardwareError, OutOfRange, Timeout
+from thincam_jax.hardware.errors import HardwareError, Timeout
+
+# Frames of pixels alone, whenever they are triggered.
+_PLAIN = {"ChunkModeActive": False, "AcquisitionFrameRateEnable": False, "ExposureMode": "Timed"}
 
 
 class Usb3VisionCamera(Camera):
@@ -61,22 +65,13 @@ class Usb3VisionCamera(Camera):
         self._last_block, self._frames_before = -1, 0
         self._in_step = False
         self._stop()
-        for name, value in (
-            ("ChunkModeActive", False),
-            ("AcquisitionMode", "Continuous"),
-            ("TriggerSelector", "FrameStart"),
-            ("TriggerMode", "Off"),  # some take another source only then
-            ("TriggerSource", "Software"),
-            ("TriggerMode", "On"),
-            ("AcquisitionFrameRateEnable", False),
-            ("ExposureMode", "Timed"),
-            ("ExposureAuto", "Off"),
-            ("GainAuto", "Off"),
-        ):
-            self._features.write_if_there(name, value)
-        self._settings = self.configure(
-            CameraSettings(self._features.number("ExposureTime") * 1e-6, pixel_format="Mono8")
-        )
+        for name, value in _PLAIN.items():
+            if self._features.has(name):
+                self._features.set(name, value)
+        with self._features.evaluating("open"):
+            features.trigger_by_software(self._features)
+            exposure = features.read(self._features).exposure
+        self._settings = self.configure(CameraSettings(exposure, pixel_format="Mono8"))
 
     @property
     def identity(self) -> Identity:
@@ -84,45 +79,22 @@ class Usb3VisionCamera(Camera):
 
     @property
     def sensor_shape(self) -> tuple[int, int]:
-        names = ("SensorHeight", "SensorWidth")
-        if not self._features.has(names[0]):
-            names = ("HeightMax", "WidthMax")
-        return self._features.integer(names[0]), self._features.integer(names[1])
+        with self._features.evaluating("read the sensor's size"):
+            return features.sensor_shape(self._features)
 
     def configure(self, settings: CameraSettings) -> CameraSettings:
-        features, (rows, columns) = self._features, self.sensor_shape
-        region = settings.region or Region(0, 0, rows, columns)
-        if (
-            min(region.top, region.left) < 0 or min(region.height, region.width) < 1
-            or region.top + region.height > rows or region.left + region.width > columns
-        ):  # fmt: skip
-            raise OutOfRange(self._link.name, "configure", f"{region} lies outside of the sensor",
-                             f"it has {rows} rows and {columns} columns")  # fmt: skip
-        offered = [name for name in features.choices("PixelFormat") if name in PIXEL_FORMATS]
-        if settings.pixel_format not in offered:
-            raise OutOfRange(self._link.name, "configure", f"it has no {settings.pixel_format}",
-                             f"use one of {', '.join(offered)}")  # fmt: skip
         self._in_step = False
         self._stop()
-        features.write("PixelFormat", settings.pixel_format)
-        for name in ("OffsetX", "OffsetY"):  # leave room for the size that comes next
-            features.write_nearest(name, 0)
-        features.write_nearest("Width", region.width, "pixels")
-        features.write_nearest("Height", region.height, "pixels")
-        features.write_nearest("OffsetX", region.left, "pixels")
-        features.write_nearest("OffsetY", region.top, "pixels")
-        features.write_nearest("ExposureTime", settings.exposure * 1e6, "µs")
-        features.write_nearest("Gain", settings.gain, "dB")
-        taken = Region(*(features.integer(n) for n in ("OffsetY", "OffsetX", "Height", "Width")))
-        self._settings = CameraSettings(
-            features.number("ExposureTime") * 1e-6,
-            taken,
-            features.choice("PixelFormat"),
-            features.number("Gain"),
-        )
-        self._stream.prepare(self._settings.pixel_format, taken)
+        shape = self.sensor_shape
+        with self._features.evaluating("configure"):
+            taken = features.configure(
+                self._features, settings, shape, self._link.name, PIXEL_FORMATS
+            )
+        assert taken.region is not None
+        self._stream.prepare(taken.pixel_format, taken.region)
+        self._settings = taken
         self._start()
-        return self._settings
+        return taken
 
     def flush(self) -> None:
         if not (self._in_step and self._stream.is_empty()):
@@ -165,7 +137,11 @@ class Usb3VisionCamera(Camera):
     def _stop(self) -> None:
         self._features.execute("AcquisitionStop")
         self._stream.stop()
-        self._features.write_if_there("TLParamsLocked", 0)
+        self._lock(0)
+
+    def _lock(self, locked: int) -> None:
+        if self._features.has("TLParamsLocked"):
+            self._features.set("TLParamsLocked", locked)
 
     def _restart(self) -> None:
         self._stop()
@@ -175,7 +151,7 @@ class Usb3VisionCamera(Camera):
         """Begins the stream anew. The camera then counts from 0; the frames' numbers go on."""
         self._frames_before += self._last_block + 1
         self._last_block = -1
-        self._features.write_if_there("TLParamsLocked", 1)
+        self._lock(1)
         self._stream.start()
         self._features.execute("AcquisitionStart")
         self._in_step = True

@@ -5,7 +5,6 @@ must not declare a document type, so that there are no entities to expand.
 """
 
 import io
-import operator
 import zipfile
 import zlib
 from collections.abc import Iterator
@@ -17,10 +16,10 @@ from defusedxml import DefusedXmlException
 from defusedxml.ElementTree import fromstring
 from genicam import genapi
 
+from thincam_jax.hardware.cameras.features import Number, Value
 from thincam_jax.hardware.cameras.usb3_vision import gencp
 from thincam_jax.hardware.cameras.usb3_vision.gencp import Abrm
 from thincam_jax.hardware.cameras.usb3_vision.link import LARGEST_READ, Control, UsbLink
-from thincam_jax.hardware.errors import OutOfRange
 
 LARGEST_XML = LARGEST_READ  # bytes; those of cameras have up to 2 MiB
 MOST_ENTRIES = 64
@@ -110,17 +109,17 @@ class _Port(genapi.AbstractPort):
 
 
 class Features:
-    """The features of a camera; a value is a number, a text or a choice by its name."""
+    """The features of a camera, as `cameras.features` wants them."""
 
     def __init__(self, link: UsbLink, control: Control, xml: str):
         self._link = link
         self._nodes, self._port = genapi.NodeMap(), _Port(control)
-        with self._evaluating("read the XML"):
+        with self.evaluating("read the XML"):
             self._nodes.load_xml_from_string(xml)
             self._nodes._connect(self._port, "Device")
 
     @contextmanager
-    def _evaluating(self, operation: str) -> Iterator[None]:
+    def evaluating(self, operation: str) -> Iterator[None]:
         """Names what GenApi raises, and what a feature of another kind than the SFNC's leads to."""
         try:
             yield
@@ -135,53 +134,31 @@ class Features:
         except genapi.GenericException:
             return False
 
-    def integer(self, name: str) -> int:
-        """The value of a feature that is a whole number."""
-        with self._evaluating(f"read {name}"):
-            return operator.index(self._nodes.get_node(name).value)
+    def get(self, name: str) -> Value:
+        """Its value; of an enumeration the entry's name."""
+        with self.evaluating(f"read {name}"):
+            value = self._nodes.get_node(name).value
+            if not isinstance(value, int | float | str):
+                raise TypeError(f"it is a {type(value).__name__}, neither a number nor a text")
+            return value
 
-    def number(self, name: str) -> float:
-        """The value of a feature that is a number."""
-        with self._evaluating(f"read {name}"):
-            return float(self._nodes.get_node(name).value)
-
-    def choice(self, name: str) -> str:
-        """Which choice an enumeration is set to."""
-        with self._evaluating(f"read {name}"):
-            return str(self._nodes.get_node(name).value)
-
-    def choices(self, name: str) -> tuple[str, ...]:
-        """What an enumeration may be set to now."""
-        with self._evaluating(f"read {name}"):
-            return tuple(self._nodes.get_node(name).symbolics)
-
-    def write(self, name: str, value: float | int | str) -> None:
-        """Sets the feature."""
-        with self._evaluating(f"set {name}"):
+    def set(self, name: str, value: Value) -> None:
+        """Writes a value, or an enumeration's entry."""
+        with self.evaluating(f"set {name}"):
             self._nodes.get_node(name).value = value
 
-    def write_if_there(self, name: str, value: float | int | str) -> None:
-        """Sets a feature that not every camera has."""
-        if self.has(name):
-            self.write(name, value)
-
-    def write_nearest(self, name: str, value: float | int, unit: str = "") -> None:
-        """Sets a number to the nearest step of the feature; `OutOfRange` beyond its limits."""
-        with self._evaluating(f"set {name}"):
+    def limits(self, name: str) -> tuple[Number, Number, Number]:
+        """Lowest, highest and step of a number; step 0 where there is none."""
+        with self.evaluating(f"read {name}"):
             node = self._nodes.get_node(name)
-            low, high = node.min, node.max
-            step = node.inc if isinstance(node, genapi.IInteger) else None
-            rounding = 1e-9 * abs(value)  # a limit that was read may come back through other units
-            if not low - rounding <= value <= high + rounding:
-                raise OutOfRange(self._link.name, f"set {name}", f"{value:g} {unit}".rstrip(),
-                                 f"allowed: {low:g} to {high:g} {unit}".rstrip())  # fmt: skip
-            value = min(max(value, low), high)
-            if step:
-                value = low + min(round((value - low) / step), (high - low) // step) * step
-            if node.value != value:  # an offset that can only be 0 may be locked
-                node.value = value
+            return node.min, node.max, node.inc if isinstance(node, genapi.IInteger) else 0
+
+    def choices(self, name: str) -> tuple[str, ...]:
+        """The entries of an enumeration that are available."""
+        with self.evaluating(f"read {name}"):
+            return tuple(self._nodes.get_node(name).symbolics)
 
     def execute(self, name: str) -> None:
         """Has the camera do what the command says."""
-        with self._evaluating(f"execute {name}"):
+        with self.evaluating(f"execute {name}"):
             self._nodes.get_node(name).execute()
