@@ -8,6 +8,10 @@ from pathlib import Path
 from thincam_jax._core.memory import refuse_if_too_large
 
 
+class MeasurementError(ValueError):
+    """A measurement that cannot be used; one line says what was given and what to do."""
+
+
 class WriteError(OSError):
     """A file that could not be written, as on a full disk, in one line."""
 

@@ -6,12 +6,9 @@ import numpy as np
 from jaxtyping import Float64
 
 from thincam_jax._core.checks import Numbers
+from thincam_jax._core.files import MeasurementError
 
 MAX_CHANNELS = 4
-
-
-class MeasurementError(ValueError):
-    """A measurement that cannot be used; one line says what was given and what to do."""
 
 
 class CaptureFileError(MeasurementError):

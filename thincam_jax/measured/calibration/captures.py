@@ -1,14 +1,10 @@
 """The captures of a Hadamard calibration, on disk: written frame by frame, read by sensor rows.
 
-A Zarr store (version 3) with the array `frames` (frame, y, x) and, for each frame, a 64 bit digest
-of its pixels, 0 where it has not been captured. A chunk holds some frames of some rows, with a
-checksum of its own, so that both the rig, which writes a frame, and the recovery of the matrix,
-which reads all frames of some rows, touch few bytes too many. No compression: the last bits of a
-camera are noise.
+A chunk of the store holds 16 frames of some rows, so that both the rig, which writes a frame, and
+the recovery of the matrix, which reads all frames of some rows, touch few bytes too many.
 """
 
 import dataclasses
-import hashlib
 from pathlib import Path
 from typing import Any
 
@@ -18,20 +14,19 @@ import numpy as np
 from jaxtyping import Array, PRNGKeyArray, Real
 
 from thincam_jax._core import checks
+from thincam_jax._core.capture_store import (
+    CALIBRATION,
+    TOGETHER,
+    CaptureStore,
+    CaptureStoreError,
+    dtype_of_bits,
+    frame_digest,
+    listed,
+)
 from thincam_jax._core.checks import Shape
 from thincam_jax.imaging.operators import AbstractOperator
 from thincam_jax.imaging.operators.base import dtype_of
 from thincam_jax.measured.calibration.hadamard import HadamardSeries
-from thincam_jax.measured.raw import MeasurementError
-
-_KIND, _VERSION = "Hadamard captures", 1
-_TOGETHER = 16  # frames of a chunk, held until they are complete
-_CHUNK = 2**18  # bytes
-_NAMED = 8  # frames that a message lists
-
-
-class CaptureStoreError(MeasurementError):
-    """A store of captures that cannot be used; one line says which frames and what to do."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,6 +37,7 @@ class HadamardCaptures:
     - `sensor_shape`: (rows, columns).
     - `bits`: of the camera; None: any numbers.
     - `exposure`: time, s, if known.
+    - `stored_at`: where in the store each frame of the series is; None: where the series has it.
     """
 
     path: Path
@@ -49,25 +45,17 @@ class HadamardCaptures:
     sensor_shape: tuple[int, int]
     bits: int | None
     exposure: float | None
+    stored_at: tuple[int, ...] | None = None
 
     @property
     def block_rows(self) -> int:
         """Sensor rows that are stored together, good to read at once."""
-        return self._frames.chunks[1]
+        return _opened(self.path).frames.chunks[1]
 
     def rows(self, start: int, stop: int) -> Real[np.ndarray, "frame y x"]:
-        """All frames of some sensor rows."""
-        try:
-            return np.asarray(self._frames[:, start:stop])
-        except (ValueError, OSError) as error:  # a checksum or a length that does not fit
-            raise CaptureStoreError(
-                f"{self.path}: frames {', '.join(_damaged(self._frames))} are damaged "
-                f"({error}); capture them again"
-            ) from error
-
-    @property
-    def _frames(self) -> Any:
-        return _opened(self.path, "r")["frames"]
+        """All frames of some sensor rows, as the series numbers them."""
+        frames = _opened(self.path).read(slice(None), slice(start, stop))
+        return frames if self.stored_at is None else frames[list(self.stored_at)]
 
 
 class CaptureWriter:
@@ -77,12 +65,10 @@ class CaptureWriter:
     """
 
     def __init__(self, path: Path):
-        self._group = _opened(path, "r+")
-        # A chunk of black frames is written, too: one that is not there is missing.
-        self._frames = self._group["frames"].with_config({"write_empty_chunks": True})
-        self.captures = _described(path, self._group)
-        self._digests = np.asarray(self._group["digests"][:])
-        self._digests[sorted(_lost(path, self._frames))] = 0
+        self._store = _opened(path, "r+")
+        self.captures = _described(self._store)
+        self._digests = self._store.digests.copy()
+        self._digests[sorted(self._store.lost())] = 0
         self._waiting: dict[int, np.ndarray] = {}
 
     @property
@@ -109,16 +95,14 @@ class CaptureWriter:
             )
         pixels = self._checked(number, np.asarray(image))
         self._waiting[number] = pixels
-        self._digests[number] = _digest(pixels)
-        chunk = number // _TOGETHER
-        together = range(chunk * _TOGETHER, min((chunk + 1) * _TOGETHER, len(self._digests)))
-        if all(n in self._waiting for n in together):
-            self._write_out(together)
+        self._digests[number] = frame_digest(pixels)
+        if all(n in self._waiting for n in self._store.chunk(number)):
+            self._write_out(number)
 
     def close(self) -> None:
         """Write out what waits for the rest of its chunk."""
-        for chunk in sorted({number // _TOGETHER for number in self._waiting}):
-            self._write_out(range(chunk * _TOGETHER, (chunk + 1) * _TOGETHER))
+        while self._waiting:
+            self._write_out(min(self._waiting))
 
     def __enter__(self) -> "CaptureWriter":
         return self
@@ -126,19 +110,16 @@ class CaptureWriter:
     def __exit__(self, *error: object) -> None:
         self.close()
 
-    def _write_out(self, together: range) -> None:
-        ready = [n for n in together if n in self._waiting]
-        block = np.stack([self._waiting[n] for n in ready])
-        if ready == list(range(ready[0], ready[-1] + 1)):
-            self._frames[ready[0] : ready[-1] + 1] = block
-        else:
-            self._frames.oindex[np.array(ready)] = block
-        for number in ready:
-            del self._waiting[number]
+    def _write_out(self, number: int) -> None:
+        """Write what there is of the chunk of a frame."""
+        ready = [n for n in self._store.chunk(number) if n in self._waiting]
+        self._store.write({n: self._waiting[n] for n in ready})
+        for n in ready:
+            del self._waiting[n]
         # After the frames: what a digest announces is there.
         written = self._digests.copy()
         written[list(self._waiting)] = 0
-        self._group["digests"][:] = written
+        self._store.announce(written)
 
     def _checked(self, number: int, pixels: np.ndarray) -> np.ndarray:
         bits = self.captures.bits
@@ -156,7 +137,7 @@ class CaptureWriter:
                     f"{where} goes from {pixels.min():g} to {pixels.max():g}; a camera of {bits} "
                     f"bits gives whole numbers from 0 to {2**bits - 1}"
                 )
-        return pixels.astype(self._frames.dtype)
+        return pixels.astype(self._store.frames.dtype)
 
 
 def create_captures(
@@ -179,32 +160,18 @@ def create_captures(
         raise ValueError(f"bits = {bits}; give 1 to 16, or None for any numbers")
     if path.exists():
         raise CaptureStoreError(f"{path} exists; give another name, or resume_captures to go on")
-    kind = "float32" if bits is None else "uint8" if bits <= 8 else "uint16"
-    row = _TOGETHER * shape[1] * np.dtype(kind).itemsize
-    import zarr  # a second
-    from zarr.codecs import Crc32cCodec
-
-    group = zarr.create_group(
+    CaptureStore.create(
         path,
-        attributes={
-            "kind": _KIND,
-            "version": _VERSION,
+        (series.frame_count, *shape),
+        dtype_of_bits(bits),
+        {
+            "kind": CALIBRATION,
             **dataclasses.asdict(series),
             "sensor_shape": shape,
             "bits": bits,
             "exposure": exposure,
         },
     )
-    group.create_array(
-        "frames",
-        shape=(series.frame_count, *shape),
-        dtype=kind,
-        chunks=(_TOGETHER, min(shape[0], max(1, _CHUNK // row)), shape[1]),
-        compressors=[Crc32cCodec()],
-        dimension_names=("frame", "y", "x"),
-    )
-    digests = group.create_array("digests", shape=(series.frame_count,), dtype="uint64")
-    digests[:] = np.zeros(series.frame_count, np.uint64)
     return CaptureWriter(path)
 
 
@@ -221,27 +188,28 @@ def open_captures(path: str | Path) -> HadamardCaptures:
     read.
     """
     path = Path(path)
-    group = _opened(path, "r")
-    captures = _described(path, group)
-    digests = np.asarray(group["digests"][:])
-    lost, cut = _lost(path, group["frames"]), _lost(path, group["frames"], truncated=True)
+    store = _opened(path)
+    captures, digests = _described(store), store.digests
+    lost, cut = store.lost(), store.lost(truncated=True)
     missing = sorted(set(np.flatnonzero(digests == 0).tolist()) | (lost - cut))
     if missing:
         raise CaptureStoreError(
-            f"{path}: {len(missing)} of {len(digests)} frames are missing: {_listed(missing)}; "
+            f"{path}: {len(missing)} of {len(digests)} frames are missing: {listed(missing)}; "
             "capture them (resume_captures) or measure again"
         )
     if cut:
         raise CaptureStoreError(
-            f"{path}: {len(cut)} of {len(digests)} frames are truncated: {_listed(sorted(cut))}; "
+            f"{path}: {len(cut)} of {len(digests)} frames are truncated: {listed(sorted(cut))}; "
             "capture them again (resume_captures) or copy the store again"
         )
+    if captures.stored_at is not None:
+        digests = digests[list(captures.stored_at)]
     shown = digests[: captures.series.pattern_frames]
     _, first, counts = np.unique(shown, return_index=True, return_counts=True)
     for index in np.sort(first[counts > 1])[:1]:
         same = np.flatnonzero(shown == shown[index]).tolist()
         raise CaptureStoreError(
-            f"{path}: frames {_listed(same)} are the same capture, digit for digit: the camera has "
+            f"{path}: frames {listed(same)} are the same capture, digit for digit: the camera has "
             "sent an image twice, or sees nothing of the monitor; measure again"
         )
     return captures
@@ -269,8 +237,8 @@ def simulate_captures(
     if given != wanted:
         raise ValueError(f"the operator goes from {given[0]} to {given[1]}; give {wanted}")
     kind = dtype_of(operator)
-    for start in range(0, series.frame_count, _TOGETHER):
-        numbers = range(start, min(start + _TOGETHER, series.frame_count))
+    for start in range(0, series.frame_count, TOGETHER):
+        numbers = range(start, min(start + TOGETHER, series.frame_count))
         cells = np.stack([series.frame(number) for number in numbers]).astype(kind)
         noise = jax.random.normal(jax.random.fold_in(key, start), (len(numbers), *shape), kind)
         images = np.asarray(operator(jnp.asarray(cells)) + deviation * noise + offset)
@@ -282,71 +250,28 @@ def simulate_captures(
     return open_captures(captures.path)
 
 
-def _opened(path: Path, mode: str) -> Any:
-    import zarr
-
-    try:
-        group = zarr.open_group(path, mode=mode)  # pyright: ignore[reportArgumentType]
-        if group.attrs["kind"] != _KIND or group.attrs["version"] != _VERSION:
-            raise ValueError(f"{group.attrs['kind']}, version {group.attrs['version']}")
-        return group
-    except (OSError, ValueError, KeyError) as error:
-        raise CaptureStoreError(
-            f"{path} is no store of Hadamard captures ({type(error).__name__}: {error}); give one "
-            "that create_captures made"
-        ) from error
+def _opened(path: Path, mode: str = "r") -> CaptureStore:
+    return CaptureStore(path, mode, (CALIBRATION,))
 
 
-def _described(path: Path, group: Any) -> HadamardCaptures:
+def _described(store: CaptureStore) -> HadamardCaptures:
     """What the attributes say, once the arrays agree with it."""
-    attributes = dict(group.attrs)
+    path, attributes = store.path, store.attributes
     try:
         names = [field.name for field in dataclasses.fields(HadamardSeries)]
         values: dict[str, Any] = {name: attributes[name] for name in names}
         values["object_shape"] = tuple(values["object_shape"])
         series = HadamardSeries(**values)
         rows, columns = attributes["sensor_shape"]
-        shapes = [group[name].shape for name in ("frames", "digests")]
+        shapes = [store.frames.shape, store.digests.shape]
         expected = [(series.frame_count, rows, columns), (series.frame_count,)]
         if shapes != expected:
             raise ValueError(f"arrays of shapes {shapes}, but the series has {expected}")
         bits, exposure = attributes["bits"], attributes["exposure"]
+        stored_at = attributes.get("stored_at")
+        if stored_at is not None and sorted(stored_at) != list(range(series.frame_count)):
+            raise ValueError(f"stored_at does not name each of {series.frame_count} frames once")
     except (KeyError, TypeError, ValueError) as error:
         raise CaptureStoreError(f"{path} contradicts itself: {error}; measure again") from error
-    return HadamardCaptures(path, series, (rows, columns), bits, exposure)
-
-
-def _lost(path: Path, frames: Any, *, truncated: bool = False) -> set[int]:
-    """The frames of chunks that are not there or not whole; or only those of the latter."""
-    # A chunk at the edge is stored as large as the others; 4 bytes are the checksum.
-    whole = int(np.prod(frames.chunks)) * frames.dtype.itemsize + 4
-    counts = [-(-size // part) for size, part in zip(frames.shape, frames.chunks, strict=True)]
-    found = set()
-    for chunk, row in np.ndindex(*counts[:2]):
-        file = path / "frames" / "c" / str(chunk) / str(row) / "0"
-        there = file.is_file()
-        if there and file.stat().st_size != whole or not there and not truncated:
-            found.update(range(chunk * _TOGETHER, min((chunk + 1) * _TOGETHER, frames.shape[0])))
-    return found
-
-
-def _damaged(frames: Any) -> list[str]:
-    """The frames of each chunk that cannot be read."""
-    found = []
-    for first in range(0, frames.shape[0], _TOGETHER):
-        try:
-            _ = frames[first : first + _TOGETHER]
-        except (ValueError, OSError):
-            found.append(f"{first} … {min(first + _TOGETHER, frames.shape[0]) - 1}")
-    return found
-
-
-def _digest(pixels: np.ndarray) -> int:
-    """64 bits of the pixels' hash, never 0."""
-    digest = hashlib.blake2b(pixels.tobytes(), digest_size=8).digest()
-    return int.from_bytes(digest, "little") or 1
-
-
-def _listed(numbers: list[int]) -> str:
-    more = f" and {len(numbers) - _NAMED} more" if len(numbers) > _NAMED else ""
-    return ", ".join(map(str, numbers[:_NAMED])) + more
+    stored_at = None if stored_at is None else tuple(stored_at)
+    return HadamardCaptures(path, series, (rows, columns), bits, exposure, stored_at)

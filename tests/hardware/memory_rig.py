@@ -1,0 +1,226 @@
+"""A rig in memory: devices that do what the interfaces say, and with `Faults` what they must not.
+
+Each pattern carries a fiducial, its number in base 256 in the first pixels; the camera sees what is
+shown with a texture of its own, so that a frame tells of which pattern it is, whole. It imports no
+JAX: `python memory_rig.py STORE FRAMES` is the process that tests kill.
+"""
+
+import sys
+import time
+from dataclasses import replace
+
+import numpy as np
+
+from thincam_jax.hardware import (
+    Busy,
+    Camera,
+    CameraSettings,
+    Disconnected,
+    Display,
+    Frame,
+    Identity,
+    IncompleteFrame,
+    NotFound,
+    ProtocolError,
+    Region,
+    Stage,
+    Timeout,
+)
+from thincam_jax.hardware.acquisition.plan import BLACK, Pattern, Plan, Step
+from thincam_jax.hardware.acquisition.rig import Rig
+from thincam_jax.hardware.errors import OutOfRange
+from thincam_jax.hardware.virtual.faults import Faults
+
+SHAPE = (6, 9)  # of sensor and display
+BITS = 12
+SETTINGS = CameraSettings(exposure=0.01)
+TEXTURE = np.random.default_rng(3).integers(100, 2000, SHAPE).astype(np.uint16)
+
+
+class World:
+    """What the devices share: the pattern shown, where the stage is, and the faults to come."""
+
+    def __init__(self, shape=SHAPE, texture=TEXTURE, pause=0.0):
+        self.shape, self.texture, self.pause = shape, texture, pause
+        self.faults = Faults()
+        self.shown = np.zeros(shape, np.uint8)
+        self.position, self.homed = 0.0, True
+        self.opened = {"camera": 0, "display": 0, "stage": 0}
+        self.absent = 0  # how often a device that is opened again is not there yet
+        self.light = 1.0  # of the brightest pixel at 0.01 s; above 1 it saturates
+
+    def open(self, kind):
+        role = kind.__name__.removeprefix("Memory").lower()
+        if self.opened[role] and self.absent:
+            self.absent -= 1
+            raise NotFound(role, "open", "no such device", "plug it in")
+        self.opened[role] += 1
+        return kind(self)
+
+    def rig(self, stage=True):
+        return Rig(
+            lambda: self.open(MemoryCamera),
+            lambda: self.open(MemoryDisplay),
+            self.render,
+            (lambda: self.open(MemoryStage)) if stage else None,
+        )
+
+    def render(self, pattern: Pattern) -> np.ndarray:
+        levels = np.zeros(self.shape, np.uint8)
+        if pattern != BLACK:
+            number = int(pattern.numbers["number"]) + 1
+            levels[0, :4] = [number // 256**digit % 256 for digit in range(4)]
+        return levels
+
+    def see(self, exposure: float) -> np.ndarray:
+        """Counts of what is shown: the number in the first four pixels, a texture in the others."""
+        number = fiducial(self.shown)
+        if number < 0:
+            return np.zeros(self.shape, np.uint16)
+        lit = np.roll(self.texture, 7 * number).reshape(self.shape)
+        if self.light != 1.0 or exposure != SETTINGS.exposure:
+            lit = np.minimum(lit * (self.light * exposure / SETTINGS.exposure), 2**BITS - 1)
+        lit = lit.astype(np.uint16)
+        lit[0, :4] = self.shown[0, :4]
+        return lit
+
+    def unplugged(self, role: str) -> Disconnected:
+        return Disconnected(role, "use", "it is not there any more", "plug it in")
+
+
+def fiducial(pixels: np.ndarray) -> int:
+    """The number of the pattern that a frame shows, −1 for black."""
+    return sum(int(digit) * 256**place for place, digit in enumerate(pixels[0, :4])) - 1
+
+
+class MemoryDevice:
+    def __init__(self, world: World):
+        self.world, self.here = world, True
+        self.role = type(self).__name__.removeprefix("Memory").lower()
+
+    @property
+    def identity(self) -> Identity:
+        return Identity("thincam_jax", f"memory {self.role}", "1")
+
+    def close(self) -> None:
+        self.here = False
+
+    def play(self, *faults: str) -> None:
+        """What goes wrong with a command, of the faults that this device is asked for."""
+        if not self.here:
+            raise self.world.unplugged(self.role)
+        for fault in faults:
+            if not self.world.faults.due(fault):
+                continue
+            if fault == "latency":
+                time.sleep(0.002)
+            elif fault == "unplug":
+                self.here = False
+                raise self.world.unplugged(self.role)
+            elif fault == "busy":
+                raise Busy(self.role, "use", "it is not ready", "wait for it")
+            else:
+                raise ProtocolError(self.role, "use", f"it answered with a {fault}", "run again")
+
+
+class MemoryCamera(MemoryDevice, Camera):
+    def __init__(self, world):
+        super().__init__(world)
+        self.count, self.settings, self.last = 0, None, None
+
+    @property
+    def sensor_shape(self):
+        return self.world.shape
+
+    def configure(self, settings):
+        self.play("nak", "wrong_checksum")
+        if not 1e-5 <= settings.exposure <= 1:
+            raise OutOfRange("camera", "configure", f"{settings.exposure} s", "give 1e-5 … 1 s")
+        region = settings.region or Region(0, 0, *self.world.shape)
+        exposure = round(settings.exposure * 1e6) / 1e6
+        self.settings = replace(settings, exposure=exposure, region=region)
+        return self.settings
+
+    def flush(self):
+        self.play("unplug")
+
+    def trigger_and_grab(self, timeout):
+        self.play("latency", "busy", "unplug")
+        if self.settings is None:
+            raise ProtocolError("camera", "trigger", "it has not been set", "configure it")
+        if self.last is not None and self.world.faults.due("stale_frame"):
+            return self.last
+        if self.world.pause:
+            time.sleep(self.world.pause)
+        self.count += 1
+        if self.world.faults.due("dropped_frame"):
+            raise Timeout("camera", "trigger", f"no frame within {timeout} s", "wait longer")
+        pixels = self.world.see(self.settings.exposure)
+        region = self.settings.region
+        rows = slice(region.top, region.top + region.height)
+        pixels = pixels[rows, region.left : region.left + region.width]
+        if self.world.faults.due("short_frame"):
+            if self.count % 2:
+                raise IncompleteFrame("camera", "grab", "half of it is missing", "check the cable")
+            pixels = pixels[: len(pixels) // 2]
+        self.last = Frame(pixels, self.count, 0.01 * self.count, self.settings.exposure, BITS)
+        return self.last
+
+
+class MemoryDisplay(MemoryDevice, Display):
+    @property
+    def shape(self):
+        return self.world.shape
+
+    def show(self, pattern):
+        self.play("unplug")
+        self.world.shown = pattern
+
+
+class MemoryStage(MemoryDevice, Stage):
+    limits = (0.0, 50.0)
+
+    @property
+    def homed(self):
+        return self.world.homed
+
+    def home(self, timeout=60.0):
+        self.world.position, self.world.homed = 0.0, True
+
+    def move_to(self, position, timeout=60.0):
+        self.play("latency", "nak", "busy", "wrong_checksum", "unplug")
+        if not self.limits[0] <= position <= self.limits[1]:
+            raise OutOfRange("stage", "move", f"{position} mm", "stay within 0 … 50 mm")
+        self.world.position = position
+        if self.world.faults.due("lost_steps"):
+            self.world.position += 1.5
+            self.world.homed = False
+        return position
+
+    def position(self):
+        self.play()
+        return self.world.position
+
+    def stop(self):
+        self.play()
+
+
+def fiducial_plan(count: int, *, every: int = 5, dark_every: int = 0, stage: bool = True) -> Plan:
+    """Steps that show each its own number; the stage moves on after `every` of them."""
+    patterns = (*(Pattern("fiducial", {"number": number}) for number in range(count)), BLACK)
+    steps = []
+    for number in range(count):
+        place = float(number // every % 40) if stage else None
+        if dark_every and number % dark_every == 0:
+            steps.append(Step(count, place, dark=True))
+        steps.append(Step(number, place))
+    return Plan("fiducials", patterns, (SETTINGS,), tuple(steps))
+
+
+if __name__ == "__main__":
+    from thincam_jax.hardware.acquisition.acquire import acquire
+
+    assert "jax" not in sys.modules
+    with World(pause=0.001).rig() as rig:
+        done = acquire(fiducial_plan(int(sys.argv[2]), dark_every=16), rig, sys.argv[1])
+    print("complete" if done.complete else "stopped")

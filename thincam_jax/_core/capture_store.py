@@ -1,0 +1,171 @@
+"""Frames of a camera on disk, written frame by frame and read by sensor rows.
+
+A Zarr store (version 3) with the array `frames` (frame, y, x) and, for each frame, a 64 bit digest
+of its pixels, 0 where it has not been captured. A chunk holds some frames of some rows, with a
+checksum of its own. No compression: the last bits of a camera are noise.
+"""
+
+import hashlib
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from thincam_jax._core.files import MeasurementError
+
+CALIBRATION = "Hadamard captures"  # a store whose frames are those of a `HadamardSeries`
+CAPTURES = "captures"  # any other
+VERSION = 1
+TOGETHER = 16  # frames of a chunk, where all frames of some rows are to be read
+_CHUNK = 2**18  # bytes
+_NAMED = 8  # frames that a message lists
+
+
+class CaptureStoreError(MeasurementError):
+    """A store of captures that cannot be used; one line says which frames and what to do."""
+
+
+class CaptureStore:
+    """The arrays of a store that is open; `path` is its folder.
+
+    **Errors**: CaptureStoreError where there is no such store at `path`.
+    """
+
+    def __init__(self, path: Path, mode: str = "r", kinds: Sequence[str] = (CALIBRATION, CAPTURES)):
+        import zarr  # a second
+
+        self.path = path
+        try:
+            self.group: Any = zarr.open_group(path, mode=mode)  # pyright: ignore[reportArgumentType]
+            self.attributes = dict(self.group.attrs)
+            kind, version = self.attributes["kind"], self.attributes["version"]
+            if kind not in kinds or version != VERSION:
+                raise ValueError(f"{kind}, version {version}")
+            # A chunk of black frames is written, too: one that is not there is missing.
+            self.frames = self.group["frames"].with_config({"write_empty_chunks": True})
+            self.digests = np.asarray(self.group["digests"][:])
+        except (OSError, ValueError, KeyError) as error:
+            raise CaptureStoreError(
+                f"{path} is no store of {kinds[0]} ({type(error).__name__}: {error}); give one "
+                "that an acquisition or create_captures made"
+            ) from error
+
+    @classmethod
+    def create(
+        cls,
+        path: Path,
+        shape: tuple[int, int, int],
+        dtype: str,
+        attributes: Mapping[str, Any],
+        *,
+        together: int = TOGETHER,
+    ) -> "CaptureStore":
+        """A new store for frames of `shape` (frame, y, x) that says `attributes` of itself.
+
+        - `together`: frames of a chunk. With 1 a chunk is a whole frame, with more it is some rows.
+        """
+        import zarr
+        from zarr.codecs import Crc32cCodec
+
+        row = together * shape[2] * np.dtype(dtype).itemsize
+        rows = shape[1] if together == 1 else min(shape[1], max(1, _CHUNK // row))
+        group = zarr.create_group(path, attributes={"version": VERSION, **attributes})
+        group.create_array(
+            "frames",
+            shape=shape,
+            dtype=dtype,
+            chunks=(together, rows, shape[2]),
+            compressors=[Crc32cCodec()],
+            dimension_names=("frame", "y", "x"),
+        )
+        digests = group.create_array("digests", shape=shape[:1], dtype="uint64")
+        digests[:] = np.zeros(shape[0], np.uint64)
+        return cls(path, "r+")
+
+    @property
+    def together(self) -> int:
+        """Frames of a chunk."""
+        return self.frames.chunks[0]
+
+    def chunk(self, number: int) -> range:
+        """The frames that share a chunk with frame `number`."""
+        first = number - number % self.together
+        return range(first, min(first + self.together, len(self.digests)))
+
+    def write(self, images: Mapping[int, np.ndarray]) -> None:
+        """Write frames by their numbers."""
+        numbers = sorted(images)
+        block = np.stack([images[number] for number in numbers])
+        if numbers == list(range(numbers[0], numbers[-1] + 1)):
+            self.frames[numbers[0] : numbers[-1] + 1] = block
+        else:
+            self.frames.oindex[np.array(numbers)] = block
+
+    def announce(self, digests: np.ndarray) -> None:
+        """Write the digests: what they announce has to be there."""
+        self.digests = digests.copy()
+        self.group["digests"][:] = digests
+
+    def files(self, numbers: Iterable[int]) -> list[Path]:
+        """The files that hold frames, and their folders, as they have to reach the disk."""
+        chunks = sorted({number // self.together for number in numbers})
+        folders = [self.path / "frames" / "c" / str(chunk) for chunk in chunks]
+        rows = range(-(-self.frames.shape[1] // self.frames.chunks[1]))
+        files = [folder / str(row) / "0" for folder in folders for row in rows]
+        return [*files, *(file.parent for file in files), *folders, self.path / "frames" / "c"]
+
+    def lost(self, *, truncated: bool = False) -> set[int]:
+        """The frames of chunks that are not there or not whole; or only those of the latter."""
+        # A chunk at the edge is stored as large as the others; 4 bytes are the checksum.
+        whole = int(np.prod(self.frames.chunks)) * self.frames.dtype.itemsize + 4
+        found = set()
+        for first in range(0, len(self.digests), self.together):
+            folder = self.path / "frames" / "c" / str(first // self.together)
+            for row in range(-(-self.frames.shape[1] // self.frames.chunks[1])):
+                try:
+                    bad = os.stat(folder / str(row) / "0").st_size != whole
+                except FileNotFoundError:
+                    bad = not truncated
+                if bad:
+                    found.update(self.chunk(first))
+        return found
+
+    def damaged(self) -> list[str]:
+        """The frames of each chunk that cannot be read."""
+        found = []
+        for first in range(0, len(self.digests), self.together):
+            together = self.chunk(first)
+            try:
+                _ = self.frames[first : together.stop]
+            except (ValueError, OSError):
+                found.append(f"{first} … {together.stop - 1}" if len(together) > 1 else f"{first}")
+        return found
+
+    def read(self, frames: slice | int, rows: slice = slice(None)) -> np.ndarray:
+        """Frames, or some of their rows; CaptureStoreError where they are damaged."""
+        try:
+            return np.asarray(self.frames[frames, rows])
+        except (ValueError, OSError) as error:  # a checksum or a length that does not fit
+            raise CaptureStoreError(
+                f"{self.path}: frames {', '.join(self.damaged())} are damaged ({error}); capture "
+                "them again"
+            ) from error
+
+
+def frame_digest(pixels: np.ndarray) -> int:
+    """64 bits of the pixels' hash, never 0."""
+    digest = hashlib.blake2b(np.ascontiguousarray(pixels).data, digest_size=8).digest()
+    return int.from_bytes(digest, "little") or 1
+
+
+def dtype_of_bits(bits: int | None) -> str:
+    """What holds the counts of a camera of that many bits; None: any numbers."""
+    return "float32" if bits is None else "uint8" if bits <= 8 else "uint16"
+
+
+def listed(numbers: Sequence[int]) -> str:
+    """Numbers of frames for a message: the first ones and how many more."""
+    more = f" and {len(numbers) - _NAMED} more" if len(numbers) > _NAMED else ""
+    return ", ".join(map(str, numbers[:_NAMED])) + more

@@ -1,0 +1,252 @@
+"""What an acquisition is to do, step by step, as data: it is hashed, stored and compared.
+
+A plan holds a table of patterns, one of camera settings, and the steps, which point into both. Its
+SHA-256 is over canonical JSON, so that an acquisition is only ever resumed with the plan that it
+began with. The ready-made plans are those of the thesis: fringe scanning (Eq 3.14), method A
+(several mask-sensor distances), method B (pairs of phases of several β, Eq 3.49), a stack of PSFs
+by depth, and the calibration by Hadamard patterns (Eq 5.12–5.17).
+"""
+
+import dataclasses
+import hashlib
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+from thincam_jax.hardware.base import CameraSettings, Region
+
+if TYPE_CHECKING:  # it brings JAX
+    from thincam_jax.measured.calibration.hadamard import HadamardSeries
+
+HADAMARD = "hadamard"  # name of the plan that `open_captures` reads
+FRINGE_SCAN = (0.0, 0.5 * math.pi, math.pi, 1.5 * math.pi)  # phases, rad
+PHASE_PAIR = (0.0, 1.5 * math.pi)
+
+
+@dataclass(frozen=True)
+class Pattern:
+    """What a display shows: a kind and the numbers that it takes to draw it.
+
+    - "fza": `beta` rad/mm², `phase` rad, `width` mm, `profile` ("cosine", "intensity", "binary").
+    - "hadamard": `frame` of a `HadamardSeries` of `rows`, `columns`, `order`, `display`.
+    - "black": no numbers. Other kinds are the renderer's own.
+    """
+
+    kind: str
+    numbers: Mapping[str, float | int | str] = field(default_factory=dict)
+
+
+BLACK = Pattern("black")
+
+
+@dataclass(frozen=True)
+class Step:
+    """One frame: the pattern and the settings by their number in the plan, and the stage's place.
+
+    - `position`: mm; None: the stage stays where it is.
+    - `dark`: nothing is lit; the frame is subtracted from the others.
+    """
+
+    pattern: int
+    position: float | None = None
+    settings: int = 0
+    dark: bool = False
+
+
+@dataclass(frozen=True)
+class Plan:
+    """An ordered list of steps.
+
+    - `name`: what it is for, such as "method_b".
+    - `facts`: numbers and texts that a reader of the captures needs, kept with them. `stage_zero`
+      is the distance, mm, at the stage's position 0.
+
+    **Errors**: ValueError for no steps, numbers that point outside of the tables, and what JSON
+    cannot hold.
+    """
+
+    name: str
+    patterns: tuple[Pattern, ...]
+    settings: tuple[CameraSettings, ...]
+    steps: tuple[Step, ...]
+    facts: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self):
+        if not self.steps:
+            raise ValueError(f"the plan {self.name!r} has no steps; give at least one")
+        for number, step in enumerate(self.steps):
+            for what, index in (("patterns", step.pattern), ("settings", step.settings)):
+                if not 0 <= index < len(getattr(self, what)):
+                    raise ValueError(
+                        f"step {number} of the plan {self.name!r} points to number {index} of its "
+                        f"{len(getattr(self, what))} {what}; give 0 … "
+                        f"{len(getattr(self, what)) - 1}"
+                    )
+        _ = self.hash  # NaN and objects are refused here, not after the first frame
+
+    def pattern(self, step: Step) -> Pattern:
+        """What is shown in a step of this plan."""
+        return self.patterns[step.pattern]
+
+    @cached_property
+    def hash(self) -> str:
+        """SHA-256 over the plan's canonical JSON, in hexadecimal."""
+        return hashlib.sha256(self.as_json().encode()).hexdigest()
+
+    def as_json(self) -> str:
+        """The plan as JSON with sorted keys and no spaces: the same plan, the same text."""
+        plan = {
+            "name": self.name,
+            "patterns": [[p.kind, dict(p.numbers)] for p in self.patterns],
+            "settings": [dataclasses.asdict(s) for s in self.settings],
+            "steps": [[s.pattern, s.position, s.settings, s.dark] for s in self.steps],
+            "facts": dict(self.facts),
+        }
+        try:
+            return canonical_json(plan)
+        except (TypeError, ValueError) as error:
+            raise ValueError(
+                f"the plan {self.name!r} cannot be kept: {error}; give finite numbers and texts"
+            ) from error
+
+    @classmethod
+    def from_json(cls, text: str) -> "Plan":
+        """The plan of `as_json`; ValueError, KeyError or TypeError for anything else."""
+        plan = json.loads(text)
+        return cls(
+            name=plan["name"],
+            patterns=tuple(Pattern(kind, numbers) for kind, numbers in plan["patterns"]),
+            settings=tuple(settings_from(record) for record in plan["settings"]),
+            steps=tuple(Step(*step) for step in plan["steps"]),
+            facts=plan["facts"],
+        )
+
+
+def canonical_json(value: Any) -> str:
+    """JSON with sorted keys, no spaces and no NaN: equal values give equal texts."""
+    return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False)
+
+
+def settings_from(record: Mapping[str, Any]) -> CameraSettings:
+    """Camera settings from what `dataclasses.asdict` made of them."""
+    region = record["region"]
+    return CameraSettings(**{**record, "region": None if region is None else Region(**region)})
+
+
+def zone_plate(
+    beta: float, width: float, *, phase: float = 0.0, profile: str = "cosine"
+) -> Pattern:
+    """A Fresnel zone aperture for a light modulator; arguments as of `FresnelZoneAperture`."""
+    numbers = {"beta": float(beta), "phase": float(phase), "width": float(width)}
+    return Pattern("fza", {**numbers, "profile": profile})
+
+
+def fringe_scan(mask: Pattern, settings: CameraSettings, *, dark_every: int = 0) -> Plan:
+    """Four captures with the phases 0, π/2, π and 3π/2 of one zone plate (thesis Eq 3.14).
+
+    - `mask`: a `zone_plate`; its phase is replaced.
+    - `dark_every`: a dark frame first and after each that many captures; 0: none.
+    """
+    shots = [(_changed(mask, phase=phase), None) for phase in FRINGE_SCAN]
+    return _plan("fringe_scan", shots, settings, dark_every)
+
+
+def method_a(
+    mask: Pattern,
+    distances: Sequence[float],
+    settings: CameraSettings,
+    *,
+    stage_zero: float = 0.0,
+    dark_every: int = 0,
+) -> Plan:
+    """A fringe scan at each of several mask-sensor distances (thesis section 3.4).
+
+    - `distances`: mm; the stage moves to distance − `stage_zero`, the distance at its position 0.
+    """
+    shots = [
+        (_changed(mask, phase=phase), distance - stage_zero)
+        for distance in distances
+        for phase in FRINGE_SCAN
+    ]
+    return _plan("method_a", shots, settings, dark_every, {"stage_zero": float(stage_zero)})
+
+
+def method_b(
+    mask: Pattern, betas: Sequence[float], settings: CameraSettings, *, dark_every: int = 0
+) -> Plan:
+    """Captures with the phases 0 and 3π/2 for each of several β, rad/mm² (thesis Eq 3.49)."""
+    shots = [
+        (_changed(mask, beta=beta, phase=phase), None) for beta in betas for phase in PHASE_PAIR
+    ]
+    return _plan("method_b", shots, settings, dark_every)
+
+
+def psf_stack(
+    mask: Pattern,
+    depths: Sequence[float],
+    settings: CameraSettings,
+    *,
+    stage_zero: float = 0.0,
+    dark_every: int = 0,
+) -> Plan:
+    """The PSF of one pattern for a point source at several depths, mm, which the stage carries.
+
+    The stage moves to depth − `stage_zero`, the depth at its position 0.
+    """
+    shots = [(mask, depth - stage_zero) for depth in depths]
+    return _plan("psf_stack", shots, settings, dark_every, {"stage_zero": float(stage_zero)})
+
+
+def hadamard(series: "HadamardSeries", settings: CameraSettings) -> Plan:
+    """The frames of a calibration by Hadamard patterns, which `open_captures` reads.
+
+    The dark frames of the series are spread evenly among the patterns, the first one first.
+    """
+    described = dataclasses.asdict(series)
+    rows, columns = series.object_shape
+    numbers = {"rows": rows, "columns": columns, "order": series.order, "display": series.display}
+    shots = [
+        (Pattern("hadamard", {**numbers, "frame": frame}), None)
+        for frame in range(series.pattern_frames)
+    ]
+    dark = series.dark_frames
+    every = -(-series.pattern_frames // dark) if dark else 0
+    plan = _plan(HADAMARD, shots, settings, every)
+    # Of few patterns and many dark frames the last ones come together.
+    lacking = dark - sum(step.dark for step in plan.steps)
+    black = Step(len(plan.patterns) - 1, dark=True)
+    facts = {"series": {**described, "object_shape": [rows, columns]}}
+    return dataclasses.replace(plan, steps=plan.steps + (black,) * lacking, facts=facts)
+
+
+def _changed(mask: Pattern, **numbers: float) -> Pattern:
+    if mask.kind != "fza":
+        raise ValueError(f"a pattern of kind {mask.kind!r} has no phase; give a zone_plate")
+    changed = {name: float(number) for name, number in numbers.items()}
+    return Pattern(mask.kind, {**mask.numbers, **changed})
+
+
+def _plan(
+    name: str,
+    shots: Sequence[tuple[Pattern, float | None]],
+    settings: CameraSettings,
+    dark_every: int,
+    facts: Mapping[str, Any] | None = None,
+) -> Plan:
+    """Shots of patterns at positions, with a dark frame before each `dark_every` of them."""
+    if dark_every < 0:
+        raise ValueError(f"dark_every = {dark_every}; give a whole number, 0 for no dark frames")
+    patterns = {canonical_json([p.kind, dict(p.numbers)]): p for p, _ in shots}
+    index = {text: number for number, text in enumerate(patterns)}
+    steps = []
+    for number, (pattern, position) in enumerate(shots):
+        position = None if position is None else float(position)
+        if dark_every and number % dark_every == 0:
+            steps.append(Step(len(patterns), position, dark=True))
+        shown = index[canonical_json([pattern.kind, dict(pattern.numbers)])]
+        steps.append(Step(shown, position))
+    black = (BLACK,) if dark_every else ()
+    return Plan(name, (*patterns.values(), *black), (settings,), tuple(steps), facts or {})

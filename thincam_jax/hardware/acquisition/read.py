@@ -1,0 +1,121 @@
+"""What an acquisition has taken: frames, how each was taken, what a recording is made of."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from thincam_jax._core.capture_store import CaptureStore, CaptureStoreError, frame_digest, listed
+from thincam_jax.hardware.acquisition.journal import read_journal
+from thincam_jax.hardware.acquisition.plan import Pattern, Plan, settings_from
+from thincam_jax.hardware.acquisition.recorder import JOURNAL, PLAN
+from thincam_jax.hardware.base import CameraSettings
+
+
+@dataclass(frozen=True)
+class Acquisition:
+    """A store of an acquisition that is complete, as `read_acquisition` gives it.
+
+    - `settings`: what the camera was set to, one for each of `plan.settings`.
+    - `shots`: how each frame was taken, a record for each step: "digest", "taken" (UTC), the
+      camera's "number" and "time" (s), "exposure" (s), "position" (mm or None), "saturated"
+      (pixels), "retries".
+    - `provenance`: "devices", "versions", "procedure", "begun", "asked" (settings), "plan" (hash).
+    """
+
+    path: Path
+    plan: Plan
+    settings: tuple[CameraSettings, ...]
+    bits: int
+    sensor_shape: tuple[int, int]
+    shots: tuple[Mapping[str, Any], ...]
+    provenance: Mapping[str, Any]
+
+    @property
+    def lit(self) -> list[int]:
+        """The steps that are no dark frames: those of `captures`, `patterns` and `distances`."""
+        return [number for number, step in enumerate(self.plan.steps) if not step.dark]
+
+    @property
+    def patterns(self) -> list[Pattern]:
+        """What was shown for each capture."""
+        return [self.plan.pattern(self.plan.steps[number]) for number in self.lit]
+
+    @property
+    def distances(self) -> list[float | None]:
+        """The stage's position and the plan's `stage_zero`, mm, for each capture."""
+        zero = self.plan.facts.get("stage_zero", 0.0)
+        places = [self.shots[number]["position"] for number in self.lit]
+        return [None if place is None else place + zero for place in places]
+
+    def frame(self, step: int) -> np.ndarray:
+        """The counts (y, x) of a step; CaptureStoreError where they are not those taken."""
+        pixels = CaptureStore(self.path).read(step)
+        if f"{frame_digest(pixels):016x}" != self.shots[step]["digest"]:
+            raise CaptureStoreError(
+                f"{self.path}: frame {step} is not the one that was taken; capture again"
+            )
+        return pixels
+
+    def dark(self, settings: int = 0) -> np.ndarray | None:
+        """Mean of the dark frames that were taken with settings of that number, (y, x) counts."""
+        steps = enumerate(self.plan.steps)
+        numbers = [n for n, step in steps if step.dark and step.settings == settings]
+        if not numbers:
+            return None
+        total = np.zeros(self.sensor_shape)
+        for number in numbers:
+            total += self.frame(number)
+        return (total / len(numbers)).astype(np.float32)
+
+    def captures(self) -> np.ndarray:
+        """All captures (capture, y, x) in counts, float32, without the mean dark frame."""
+        dark = {n: self.dark(n) for n in range(len(self.settings))}
+        found = np.empty((len(self.lit), *self.sensor_shape), np.float32)
+        for place, number in enumerate(self.lit):
+            found[place] = self.frame(number)
+            offset = dark[self.plan.steps[number].settings]
+            if offset is not None:
+                found[place] -= offset
+        return found
+
+
+def read_acquisition(path: str | Path) -> Acquisition:
+    """A complete acquisition; that of a Hadamard plan is read by `open_captures`, too.
+
+    **Errors**: CaptureStoreError, one line, for another store, and for one that lacks frames.
+    """
+    path = Path(path)
+    store = CaptureStore(path)
+    attributes = store.attributes
+    try:
+        begun = dict(attributes["acquisition"])
+        plan = Plan.from_json((path / PLAN).read_text(encoding="utf-8"))
+        settings = tuple(settings_from(record) for record in begun.pop("settings"))
+        if begun["plan"] != plan.hash or len(store.digests) != len(plan.steps):
+            raise ValueError("its plan is another one")
+    except (OSError, KeyError, TypeError, ValueError) as error:
+        raise CaptureStoreError(
+            f"{path} is not what an acquisition made ({type(error).__name__}: {error}); give a "
+            "store of `acquire`"
+        ) from error
+    lines = [line for line in read_journal(path / JOURNAL) if "step" in line]
+    shots = {line["step"]: line for line in lines}
+    missing = sorted({n for n in range(len(plan.steps)) if n not in shots} | store.lost())
+    if missing:
+        raise CaptureStoreError(
+            f"{path}: {len(missing)} of {len(plan.steps)} frames are missing: {listed(missing)}; "
+            "run the same acquisition again to take them"
+        )
+    rows, columns = attributes["sensor_shape"]
+    return Acquisition(
+        path,
+        plan,
+        settings,
+        attributes["bits"],
+        (rows, columns),
+        tuple(shots[number] for number in range(len(plan.steps))),
+        begun,
+    )

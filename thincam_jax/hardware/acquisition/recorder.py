@@ -1,0 +1,171 @@
+"""A store that is being written: frames first, then the lines of the journal that announce them.
+
+Writing and waiting for the disk is done by a thread while the next frame is exposed. Frames reach
+the disk before their lines do, so that a line never announces a frame that is not there: what has
+no line is taken again.
+"""
+
+import os
+import platform
+import shutil
+from collections.abc import Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from filelock import FileLock
+from filelock import Timeout as LockTimeout
+
+from thincam_jax._core.capture_store import CaptureStore, CaptureStoreError, frame_digest
+from thincam_jax.hardware.acquisition.journal import Journal, sync_path
+
+JOURNAL, PLAN = "journal.jsonl", "plan.json"
+_HELD = 2**26  # bytes of frames that may wait for the disk
+_SYNCS = 8  # files at once: the disk writes its own journal once for all of them
+
+
+@dataclass(frozen=True)
+class Layout:
+    """What a new store is to hold.
+
+    - `shape`: (frame, y, x); `together`: frames of a chunk, 16 where rows are to be read.
+    - `attributes`: what the store says of itself, among it the provenance.
+    """
+
+    shape: tuple[int, int, int]
+    dtype: str
+    together: int
+    attributes: Mapping[str, Any]
+    plan: str
+
+
+class Lock:
+    """Keeps a second run from writing the same store; held until the process ends or `release`."""
+
+    def __init__(self, path: Path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self._lock = FileLock(path.with_name(f".{path.name}.lock"))
+        try:
+            self._lock.acquire(timeout=0)
+        except LockTimeout as error:
+            raise CaptureStoreError(
+                f"{path} is being written by another run; wait for it, or give another name"
+            ) from error
+
+    def __enter__(self) -> "Lock":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._lock.release()
+
+
+def create_store(path: Path, layout: Layout) -> None:
+    """A new store, which is there whole or not at all."""
+    partial = path.with_name(f".{path.name}.partial")
+    shutil.rmtree(partial, ignore_errors=True)  # of a run that was killed at this point
+    CaptureStore.create(
+        partial, layout.shape, layout.dtype, layout.attributes, together=layout.together
+    )
+    (partial / PLAN).write_text(layout.plan, encoding="utf-8")
+    for file in (*partial.rglob("*"), partial):
+        sync_path(file)
+    os.rename(partial, path)
+    sync_path(path.parent)
+
+
+def require_space(path: Path, size: int) -> None:
+    """CaptureStoreError, one line, where the disk has no room for so many bytes."""
+    free = shutil.disk_usage(path.parent).free
+    if size > free:
+        raise CaptureStoreError(
+            f"{path} needs {size / 1e9:.3g} GB more and {free / 1e9:.3g} GB are free; make room, "
+            "or give another folder"
+        )
+
+
+def versions() -> dict[str, str]:
+    """Of what took the frames."""
+    names = ("thincam_jax", "numpy", "zarr")
+    return {"python": platform.python_version(), **{name: version(name) for name in names}}
+
+
+def now() -> str:
+    """The time in UTC, ISO 8601."""
+    return datetime.now(UTC).isoformat(timespec="milliseconds")
+
+
+class Recorder:
+    """Takes the frames of a store in the order of its steps; a context manager.
+
+    `missing` are the steps that are still to be taken. Leaving the context writes out what waits.
+    """
+
+    def __init__(self, path: Path):
+        self.store = CaptureStore(path, "r+")
+        self._journal = Journal(path / JOURNAL)
+        digests = np.zeros_like(self.store.digests)
+        for record in self._journal.records:
+            if "step" in record:
+                digests[record["step"]] = int(record["digest"], 16)
+        digests[sorted(self.store.lost())] = 0
+        self._digests = digests
+        self.missing = [int(step) for step in np.flatnonzero(digests == 0)]
+        self._waiting: dict[int, tuple[np.ndarray, dict[str, Any]]] = {}
+        self._thread = ThreadPoolExecutor(1, "frames to disk")
+        self._syncing = ThreadPoolExecutor(_SYNCS, "fsync")
+        self._saving: Future[None] | None = None
+
+    def note(self, record: Mapping[str, Any]) -> None:
+        """A line that is no frame: a run that begins or ends."""
+        self._wait()
+        self._journal.append([record])
+
+    def add(self, step: int, pixels: np.ndarray, facts: Mapping[str, Any]) -> None:
+        """Take a frame; `facts` are what its line says of how it was taken.
+
+        **Errors**: OSError of an earlier frame that could not be written.
+        """
+        digest = frame_digest(pixels)
+        record = {"step": step, "digest": f"{digest:016x}", "taken": now(), **facts}
+        self._waiting[step] = (pixels, record)
+        whole = step == self.store.chunk(step)[-1]
+        full = len(self._waiting) * pixels.nbytes >= _HELD
+        idle = self._saving is None or self._saving.done()
+        if whole and (idle or full):
+            self._save()
+
+    def __enter__(self) -> "Recorder":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        try:
+            if self._waiting:
+                self._save()
+            self._wait()
+            self.store.announce(self._digests)
+        finally:
+            self._thread.shutdown()
+            self._syncing.shutdown()
+            self._journal.close()
+
+    def _wait(self) -> None:
+        if self._saving is not None:
+            saving, self._saving = self._saving, None
+            saving.result()
+
+    def _save(self) -> None:
+        self._wait()
+        waiting, self._waiting = self._waiting, {}
+        self._saving = self._thread.submit(self._write, waiting)
+
+    def _write(self, waiting: dict[int, tuple[np.ndarray, dict[str, Any]]]) -> None:
+        self.store.write({step: pixels for step, (pixels, _) in waiting.items()})
+        list(self._syncing.map(sync_path, self.store.files(waiting)))
+        records = [record for _, record in waiting.values()]
+        self._journal.append(records)
+        for record in records:
+            self._digests[record["step"]] = int(record["digest"], 16)

@@ -1,0 +1,74 @@
+"""The devices of an acquisition, each of which can be opened again."""
+
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import asdict
+from typing import Any, Literal
+
+import numpy as np
+
+from thincam_jax.hardware.acquisition.plan import Pattern
+from thincam_jax.hardware.base import Camera, Device, Display, Stage
+
+Role = Literal["camera", "display", "stage"]
+
+
+class Rig:
+    """Camera, display and, where there is one, stage; a context manager that closes them.
+
+    - `open_camera`, `open_display`, `open_stage`: open the device, now and again after it was
+      unplugged, such as `functools.partial(open_device, "cameras", "pylon", options)`.
+    - `render`: draws a pattern as levels (y, x), uint8, of the display's shape.
+
+    **Errors**: those of the drivers; what was opened before is closed.
+    """
+
+    camera: Camera
+    display: Display
+    stage: Stage | None
+
+    def __init__(
+        self,
+        open_camera: Callable[[], Camera],
+        open_display: Callable[[], Display],
+        render: Callable[[Pattern], np.ndarray],
+        open_stage: Callable[[], Stage] | None = None,
+    ):
+        self.render = render
+        self._openers = {"camera": open_camera, "display": open_display, "stage": open_stage}
+        with ExitStack() as opened:
+            self.camera = opened.enter_context(open_camera())
+            self.display = opened.enter_context(open_display())
+            self.stage = opened.enter_context(open_stage()) if open_stage else None
+            opened.pop_all()
+
+    def device(self, role: Role) -> Device:
+        """The open device of a role; ValueError for a stage that there is not."""
+        device = getattr(self, role)
+        if device is None:
+            raise ValueError("this rig has no stage; give open_stage, or a plan without positions")
+        return device
+
+    def reopen(self, role: Role) -> None:
+        """Close a device that has gone, and open it again."""
+        self.device(role).close()
+        opener = self._openers[role]
+        assert opener is not None  # for the type: `device` has refused a rig without a stage
+        setattr(self, role, opener())
+
+    def identities(self) -> dict[str, Any]:
+        """Vendor, model, serial number and firmware of each device."""
+        roles: tuple[Role, ...] = ("camera", "display", "stage")
+        return {role: asdict(self.device(role).identity) for role in roles if getattr(self, role)}
+
+    def close(self) -> None:
+        """Give the devices back."""
+        for device in (self.camera, self.display, self.stage):
+            if device is not None:
+                device.close()
+
+    def __enter__(self) -> "Rig":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
