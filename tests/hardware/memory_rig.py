@@ -47,7 +47,9 @@ class World:
         self.position, self.homed = 0.0, True
         self.opened = {"camera": 0, "display": 0, "stage": 0}
         self.absent = 0  # how often a device that is opened again is not there yet
-        self.light = 1.0  # of the brightest pixel at 0.01 s; above 1 it saturates
+        self.unplugs: str | None = None  # the device that "unplug" is for; None: any
+        self.light = 1.0
+        self.serial, self.limits = "1", (0.0, 50.0)
 
     def open(self, kind):
         role = kind.__name__.removeprefix("Memory").lower()
@@ -100,7 +102,7 @@ class MemoryDevice:
 
     @property
     def identity(self) -> Identity:
-        return Identity("thincam_jax", f"memory {self.role}", "1")
+        return Identity("thincam_jax", f"memory {self.role}", self.world.serial)
 
     def close(self) -> None:
         self.here = False
@@ -110,7 +112,8 @@ class MemoryDevice:
         if not self.here:
             raise self.world.unplugged(self.role)
         for fault in faults:
-            if not self.world.faults.due(fault):
+            elsewhere = fault == "unplug" and self.world.unplugs not in (None, self.role)
+            if elsewhere or not self.world.faults.due(fault):
                 continue
             if fault == "latency":
                 time.sleep(0.002)
@@ -178,7 +181,9 @@ class MemoryDisplay(MemoryDevice, Display):
 
 
 class MemoryStage(MemoryDevice, Stage):
-    limits = (0.0, 50.0)
+    @property
+    def limits(self):
+        return self.world.limits
 
     @property
     def homed(self):

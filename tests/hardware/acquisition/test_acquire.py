@@ -1,34 +1,272 @@
 """An acquisition takes the frames of its plan, and no others, whatever goes wrong."""
 
+import dataclasses
+import signal
+from collections import namedtuple
+
 import numpy as np
 import pytest
+from hardware.memory_rig import (
+    SETTINGS,
+    SHAPE,
+    MemoryCamera,
+    World,
+    fiducial,
+    fiducial_plan,
+)
 
-from hardware.memory_rig import SETTINGS, SHAPE, World, fiducial, fiducial_plan
+from thincam_jax._core.capture_store import CaptureStoreError
+from thincam_jax.hardware import Disconnected, Frame, IncompleteFrame, NotFound, NotHomed
+from thincam_jax.hardware.acquisition import recorder
 from thincam_jax.hardware.acquisition.acquire import Procedure, acquire
+from thincam_jax.hardware.acquisition.auto_exposure import AutoExposure
+from thincam_jax.hardware.acquisition.plan import hadamard
 from thincam_jax.hardware.acquisition.read import read_acquisition
+from thincam_jax.hardware.errors import OutOfRange, ProtocolError, Saturated
+from thincam_jax.measured.calibration import HadamardSeries, open_captures, recover_matrix
 
 QUICK = Procedure(timeout=0.001, reopen_wait=0.0)
+PLAN = fiducial_plan(20, dark_every=8)
 
 
-def shown(path):
-    """The fiducials of a store, in the order of its steps."""
+def run(world, path, plan=PLAN, procedure=QUICK, progress=None):
+    with world.rig() as rig:
+        return acquire(plan, rig, path, procedure=procedure, progress=progress)
+
+
+def stop_after(count):
+    """A progress callback that stands for Ctrl-C after so many frames."""
+    return lambda now: signal.raise_signal(signal.SIGINT) if now.done == count else None
+
+
+def require_whole(path, plan=PLAN):
     taken = read_acquisition(path)
-    return [fiducial(taken.frame(number)) for number in range(len(taken.plan.steps))]
+    shown = [fiducial(taken.frame(number)) for number in range(len(plan.steps))]
+    assert shown == [-1 if step.dark else step.pattern for step in plan.steps]
+    return taken
 
 
-def expected(plan):
-    return [-1 if step.dark else step.pattern for step in plan.steps]
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "a.zarr"
 
 
-def test_every_step_has_its_frame(tmp_path):
-    plan, heard = fiducial_plan(20, dark_every=8), []
-    with World().rig() as rig:
-        done = acquire(plan, rig, tmp_path / "a.zarr", procedure=QUICK, progress=heard.append)
+def test_every_step_has_its_frame(path):
+    heard = []
+    done = run(World(), path, progress=heard.append)
     assert done.complete and not done.recovered
-    assert [p.done for p in heard] == list(range(1, 24)) and heard[-1].remaining == 0
-    assert shown(tmp_path / "a.zarr") == expected(plan)
-    taken = read_acquisition(tmp_path / "a.zarr")
-    assert taken.plan == plan and taken.bits == 12 and taken.sensor_shape == SHAPE
-    assert taken.captures().shape == (20, *SHAPE)
+    assert set(done.seconds) == {"move", "show", "flush", "trigger", "check", "keep"}
+    assert [now.done for now in heard] == list(range(1, 24)) and heard[-1].remaining == 0
+    taken = require_whole(path)
+    assert taken.plan == PLAN and taken.bits == 12 and taken.sensor_shape == SHAPE
+    assert taken.captures().shape == (20, *SHAPE) and taken.dark().shape == SHAPE
     assert taken.distances[:7] == [0, 0, 0, 0, 0, 1, 1]
     assert taken.settings[0].exposure == SETTINGS.exposure
+    assert taken.settings[0].region.width == SHAPE[1]  # what the camera took, not what was asked
+    assert taken.provenance["devices"]["camera"]["serial"] == "1"
+    assert taken.provenance["versions"]["zarr"]
+
+
+@pytest.mark.parametrize("dark", [0, 3, 20])
+def test_a_hadamard_plan_is_read_as_a_calibration(path, dark):
+    series = HadamardSeries((4, 4), "sequency", "binary", dark_frames=dark)
+    plan, world = hadamard(series, SETTINGS), World()
+    matrix = np.random.default_rng(0).integers(0, 200, (54, 16))
+
+    def render(pattern):
+        cells = series.frame(int(pattern.numbers.get("frame", series.frame_count - 1)))
+        return cells if pattern.kind == "hadamard" else 0 * cells
+
+    world.see = lambda exposure: (matrix @ world.shown.ravel() + 7).reshape(SHAPE).astype("u2")
+    world.render = render
+    assert run(world, path, plan, progress=stop_after(11)).done == 11
+    assert run(world, path, plan).complete
+    captures = open_captures(path)
+    assert captures.series == series and captures.bits == 12
+    assert captures.exposure == SETTINGS.exposure
+    if dark:
+        # Dark frames lie among the patterns, and are the last ones of the series.
+        assert dark > 3 or captures.stored_at[-3:] == (0, 7, 14)
+        np.testing.assert_array_equal(captures.rows(0, 6)[16:], 7)
+        np.testing.assert_allclose(recover_matrix(captures).matrix, matrix, atol=1e-3)
+
+
+def test_a_stopped_run_goes_on(path):
+    world = World()
+    handler = signal.getsignal(signal.SIGINT)
+    assert run(world, path, progress=stop_after(6)).done == 6
+    assert signal.getsignal(signal.SIGINT) is handler
+    with pytest.raises(CaptureStoreError, match="17 of 23 frames are missing: 6, 7, 8"):
+        read_acquisition(path)
+    assert run(world, path).complete
+    require_whole(path)
+    assert run(world, path).complete  # there is nothing left to do
+    with pytest.raises(KeyboardInterrupt):
+        run(world, path.with_name("b.zarr"), progress=lambda now: [
+            signal.raise_signal(signal.SIGINT) for _ in range(2)
+        ])  # fmt: skip
+    assert run(world, path.with_name("b.zarr")).complete
+    require_whole(path.with_name("b.zarr"))
+
+
+def test_only_the_same_run_goes_on(path, monkeypatch):
+    run(World(), path, progress=stop_after(6))
+    with pytest.raises(
+        CaptureStoreError, match="was begun with another plan .*; give another name"
+    ):
+        run(World(), path, fiducial_plan(21, dark_every=8))
+    with World().rig(stage=False) as rig, pytest.raises(ValueError, match="the rig has none"):
+        acquire(PLAN, rig, path)
+    other = World()
+    other.serial = "2"
+    with pytest.raises(CaptureStoreError, match=r"begun with the camera .*\(1\), and .*\(2\)"):
+        run(other, path)
+    taken = MemoryCamera.configure
+    with monkeypatch.context() as changed:
+        changed.setattr(
+            MemoryCamera,
+            "configure",
+            lambda self, settings: dataclasses.replace(taken(self, settings), exposure=0.011),
+        )
+        with pytest.raises(ProtocolError, match="in place of .*; undo what has changed"):
+            run(World(), path)
+    (path / "plan.json").write_text("{}")
+    with pytest.raises(CaptureStoreError, match="not what an acquisition made"):
+        read_acquisition(path)
+
+
+def test_two_runs_cannot_write_one_store(path):
+    def second(_):
+        with pytest.raises(CaptureStoreError, match="is being written by another run; wait"):
+            run(World(), path)
+
+    run(World(), path, progress=second)
+    require_whole(path)
+
+
+def test_room_is_needed_first(path, monkeypatch):
+    usage = namedtuple("usage", "total used free")
+    with monkeypatch.context() as full:
+        full.setattr(recorder.shutil, "disk_usage", lambda _: usage(0, 0, 2483))
+        with pytest.raises(CaptureStoreError, match="needs 2.48e-06 GB more and 2.48e-06 GB are"):
+            run(World(), path)
+    run(World(), path)
+    require_whole(path)
+
+
+def test_a_torn_line_and_a_lost_chunk_are_taken_again(path):
+    run(World(), path)
+    journal = path / "journal.jsonl"
+    whole = journal.read_bytes()
+    for torn in (whole[:-1], whole[:-9], whole[:-9] + b"\0" * 9, whole[:-9] + b"\0" * 8 + b"\n"):
+        journal.write_bytes(torn)
+        with pytest.raises(CaptureStoreError, match="of 23 frames are missing: .*; run"):
+            read_acquisition(path)
+        assert run(World(), path).done == 23
+        require_whole(path)
+    chunk = path / "frames" / "c" / "7" / "0" / "0"
+    chunk.write_bytes(chunk.read_bytes()[:-9])
+    (path / "frames" / "c" / "9" / "0" / "0").unlink()
+    with pytest.raises(CaptureStoreError, match="2 of 23 frames are missing: 7, 9"):
+        read_acquisition(path)
+    assert run(World(), path).complete
+    taken = require_whole(path)
+    chunk.write_bytes((path / "frames" / "c" / "8" / "0" / "0").read_bytes())
+    with pytest.raises(CaptureStoreError, match="frame 7 is not the one that was taken"):
+        taken.frame(7)
+    lines = journal.read_bytes().splitlines(keepends=True)
+    journal.write_bytes(b"".join([lines[0], lines[1].replace(b"0", b"1"), *lines[2:]]))
+    with pytest.raises(CaptureStoreError, match="line 2 is damaged, and it is not the last"):
+        run(World(), path)
+
+
+@pytest.mark.parametrize(
+    ("change", "error"),
+    [
+        (lambda world: setattr(world, "light", 9.0), Saturated),
+        (lambda world: setattr(world, "limits", (0.0, 0.5)), OutOfRange),
+        (lambda world: setattr(world, "homed", False), NotHomed),
+        (lambda world: world.faults.inject("nak"), ProtocolError),
+    ],
+)
+def test_what_does_not_pass_is_not_tried_again(path, change, error):
+    world, calls = World(), []
+    run(world, path, progress=stop_after(5))
+    change(world)
+    with pytest.raises(error):
+        run(world, path, progress=calls.append)
+    assert len(calls) < 3
+    assert run(World(), path).complete
+    require_whole(path)
+
+
+def test_a_device_that_has_gone_is_opened_again(path):
+    for role in ("camera", "display", "stage"):
+        world = World()
+        world.unplugs, world.absent = role, 2
+        store = path.with_name(role)
+        done = run(world, store, progress=after_nine(world))
+        assert done.complete and done.recovered[0].startswith("Disconnected: ")
+        assert world.opened == {**dict.fromkeys(world.opened, 1), role: 2}
+        require_whole(store)
+    world = World()
+    world.absent = 9
+    with pytest.raises(Disconnected) as stopped:
+        run(world, path, progress=after_nine(world))
+    assert isinstance(stopped.value.__cause__, NotFound)
+
+    world = World()
+    pull = after_nine(world)
+    with pytest.raises(NotFound, match=r"\(2\) is there in its place; connect"):
+        run(
+            world,
+            path.with_name("b"),
+            progress=lambda now: [pull(now), vars(world).update(serial="2")],
+        )
+
+
+def exchange(world):
+    world.serial = "2"
+
+
+def after_nine(world):
+    """A progress callback that pulls the plug."""
+    return lambda now: world.faults.inject("unplug") if now.done == 9 else None
+
+
+def test_the_same_capture_twice_is_refused(path, monkeypatch):
+    """A driver that gives an old buffer a new number."""
+    world, taken = World(), MemoryCamera.trigger_and_grab
+    times = iter([0, 0, 0, 0, 1, 0] + [1] * 99)
+
+    def old(self, timeout):
+        last, frame = self.last, taken(self, timeout)
+        if next(times):
+            self.last = Frame(last.pixels, frame.number, frame.time, frame.exposure, 12)
+        return self.last
+
+    monkeypatch.setattr(MemoryCamera, "trigger_and_grab", old)
+    with pytest.raises(IncompleteFrame, match="that of the pattern before, digit for digit"):
+        run(world, path)
+    monkeypatch.undo()
+    assert run(world, path).complete
+    require_whole(path)
+
+
+def test_the_exposure_is_found_once(path):
+    wanted = AutoExposure(target=0.3, longest=0.05)
+    procedure = dataclasses.replace(QUICK, auto_exposure=wanted)
+    world = World()
+    world.light = 40.0
+    run(world, path, procedure=procedure, progress=stop_after(4))
+    run(world, path, procedure=procedure)
+    taken = read_acquisition(path)
+    assert 1e-5 < taken.settings[0].exposure < 0.001
+    assert np.quantile(taken.frame(3), 0.999) / 4095 == pytest.approx(0.3, rel=0.1)
+    for light, error in ((1e-3, OutOfRange), (1e9, Saturated)):
+        world.light = light
+        with pytest.raises(error, match="find the exposure: level .*0.3 wanted; change the light"):
+            run(world, path.with_name("b"), procedure=procedure)
+    two = dataclasses.replace(PLAN, settings=(SETTINGS, SETTINGS))
+    with pytest.raises(ValueError, match="has 2 settings; auto-exposure takes plans with one"):
+        run(world, path.with_name("c"), two, procedure)

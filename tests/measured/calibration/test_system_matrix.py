@@ -60,7 +60,7 @@ def test_noise_is_averaged_over_the_patterns(display, gain, tmp_path):
 
 
 def test_a_stored_matrix_is_that_in_memory(tmp_path, monkeypatch):
-    monkeypatch.setattr("thincam_jax.measured.calibration.captures._CHUNK", 16 * 4 * 10 * 5)
+    monkeypatch.setattr("thincam_jax._core.capture_store._CHUNK", 16 * 4 * 10 * 5)
     monkeypatch.setattr("thincam_jax.measured.calibration.system_matrix._BLOCK", 4 * 32 * 33)
     captures = simulated(tmp_path, SERIES[0])
     assert [pixels.stop for pixels, _ in matrix_blocks(captures)] == [50, 100, 120]

@@ -24,6 +24,7 @@ from thincam_jax._core.capture_store import (
     CaptureStore,
     CaptureStoreError,
     dtype_of_bits,
+    frame_digest,
 )
 from thincam_jax.hardware.acquisition.auto_exposure import AutoExposure, find_exposure
 from thincam_jax.hardware.acquisition.plan import HADAMARD, Plan, Step, settings_from
@@ -157,6 +158,7 @@ class _Run:
         self._forget()
         self._shape: tuple[int, int] | None = None  # of the frames, and their bits, once known
         self._bits: int | None = None
+        self._seen = (-1, 0)  # pattern and digest of the last frame
 
     @property
     def frame_bytes(self) -> int:
@@ -246,7 +248,7 @@ class _Run:
         """What the camera takes of the plan's settings, with the exposure that it needs."""
         asked, wanted = self.plan.settings, self.procedure.auto_exposure
         if wanted is not None:
-            if len(asked) > 1:
+            if len(asked) != 1:
                 raise ValueError(
                     f"the plan {self.plan.name!r} has {len(asked)} settings; auto-exposure takes "
                     "plans with one"
@@ -254,30 +256,27 @@ class _Run:
             lit = next((s for s in self.plan.steps if not s.dark), self.plan.steps[0])
 
             def level_at(exposure: float) -> float:
-                settings = self._persist(
-                    lambda: self.rig.camera.configure(replace(asked[0], exposure=exposure))
-                )
+                settings = self._persist(lambda: self._set(replace(asked[0], exposure=exposure)))
                 frame, _ = self.take(lit, settings, probe=True)
                 return float(np.quantile(frame.pixels, wanted.quantile)) / _full(frame)
 
             found = find_exposure(level_at, asked[0].exposure, wanted, self._name("camera"))
             asked = (replace(asked[0], exposure=found),)
-        self._configured = None
-        return tuple(self._persist(lambda one=one: self.rig.camera.configure(one)) for one in asked)
+        return tuple(self._persist(lambda one=one: self._set(one)) for one in asked)
 
     def take(
         self, step: Step, settings: CameraSettings, *, probe: bool = False
     ) -> tuple[Frame, dict[str, Any]]:
         """The frame of a step, and how it was taken. A `probe` may be saturated."""
         before = len(self.recovered)
-        frame, position = self._persist(lambda: self._once(step, settings, probe))
-        full = _full(frame)
+        frame, digest, position = self._persist(lambda: self._once(step, settings, probe))
         return frame, {
+            "digest": f"{digest:016x}",
             "number": int(frame.number),
             "time": float(frame.time),
             "exposure": float(frame.exposure),
             "position": position,
-            "saturated": int(np.count_nonzero(frame.pixels == full)),
+            "saturated": int(np.count_nonzero(frame.pixels == _full(frame))),
             "retries": len(self.recovered) - before,
         }
 
@@ -300,9 +299,9 @@ class _Run:
             self._reopen(role, error)
         elif isinstance(error, Timeout) and role == "camera":
             time.sleep(self.procedure.timeout)  # a frame that is late comes now, and is flushed
-        number = None if role == "camera" and isinstance(error, Disconnected) else self._last
+        last = None if role == "camera" and isinstance(error, Disconnected) else self._last
         self._forget()
-        self._last = number
+        self._last = last
 
     def _reopen(self, role: Role, error: Disconnected) -> None:
         failure: HardwareError = error
@@ -326,12 +325,13 @@ class _Run:
         """Nothing is known of the devices' state: all is set again."""
         self._last: int | None = None  # number of the last frame
         self._configured: CameraSettings | None = None
+        self._asked: float | None = None  # where the stage was sent, and where it says it is
         self._position: float | None = None
-        self._asked: float | None = None
 
     def _once(
         self, step: Step, settings: CameraSettings, probe: bool
-    ) -> tuple[Frame, float | None]:
+    ) -> tuple[Frame, int, float | None]:
+        """The frame of a step, its digest, and where the stage stands."""
         position = self._moved(step)
         with self.clock("show"):
             levels = self.rig.render(self.plan.pattern(step))
@@ -349,8 +349,10 @@ class _Run:
             frame = camera.trigger_and_grab(self.procedure.timeout)
         with self.clock("check"):
             self._check(frame, settings, probe)
+            digest = frame_digest(frame.pixels)
+            self._refuse_twin(step, digest)
         self._last = frame.number
-        return frame, position
+        return frame, digest, position
 
     def _moved(self, step: Step) -> float | None:
         """Where the stage stands after it moved, as it says itself; None for none."""
@@ -377,14 +379,28 @@ class _Run:
         """Set the camera as it was set when the store was begun."""
         if settings == self._configured:
             return
-        self._role = "camera"
-        taken = self.rig.camera.configure(settings)
+        taken = self._set(settings)
         if not _same(taken, settings):
             raise ProtocolError(
                 self._name("camera"), "configure", f"it took {taken} in place of {settings}",
                 "undo what has changed, or begin another store"
             )  # fmt: skip
         self._configured = settings
+
+    def _set(self, settings: CameraSettings) -> CameraSettings:
+        self._role, self._configured = "camera", None
+        return self.rig.camera.configure(settings)
+
+    def _refuse_twin(self, step: Step, digest: int) -> None:
+        """Noise makes frames differ: the same pixels for another pattern are an old frame."""
+        pattern, before = self._seen
+        if digest == before and step.pattern != pattern and not step.dark:
+            raise IncompleteFrame(
+                self._name("camera"), "trigger",
+                "the frame is that of the pattern before, digit for digit",
+                "see that the camera sees the display"
+            )  # fmt: skip
+        self._seen = step.pattern, digest
 
     def _check(self, frame: Frame, settings: CameraSettings, probe: bool) -> None:
         """Whether this is the frame that was asked for; a HardwareError says what it is not."""

@@ -1,8 +1,9 @@
-"""Which frames of an acquisition are on disk and how each was taken, a line for each.
+"""Which frames of an acquisition are on disk, and how each was taken.
 
-A line is a JSON object {"crc32": …, "record": …}; the checksum is that of the record's canonical
-JSON. A line is on disk (fsync) before the acquisition counts its frame as taken. After a power cut
-the last line may be torn: it is discarded, and its frame is taken again.
+Each line is a JSON object {"crc32": …, "records": […]}, with the checksum of the records' canonical
+JSON: those of the frames that reached the disk together. A line is on disk (fsync) before the next
+one is begun, so that a power cut can only tear the last: it is discarded, and its frames are taken
+again.
 """
 
 import json
@@ -26,8 +27,10 @@ class Journal:
         os.lseek(self._file, 0, os.SEEK_END)
 
     def append(self, records: Sequence[Any]) -> None:
-        """Write lines; they are on disk once this returns."""
-        data = b"".join(_line(record) for record in records)
+        """Write a line; it is on disk once this returns."""
+        text = canonical_json(list(records))
+        line = {"crc32": zlib.crc32(text.encode()), "records": list(records)}
+        data = canonical_json(line).encode() + b"\n"
         while data:
             data = data[os.write(self._file, data) :]
         os.fsync(self._file)
@@ -53,35 +56,30 @@ def sync_path(path: Path) -> None:
         os.close(handle)
 
 
-def _line(record: Any) -> bytes:
-    text = canonical_json(record)
-    return canonical_json({"crc32": zlib.crc32(text.encode()), "record": record}).encode() + b"\n"
-
-
 def _parsed(path: Path) -> tuple[list[Any], int]:
-    """The records, and how many bytes of the file they take."""
+    """The records of all whole lines, and how many bytes of the file these take."""
     data = path.read_bytes() if path.exists() else b""
     records, whole = [], 0
-    for number, line in enumerate(data.splitlines(keepends=True), 1):
-        record = _record(line)
-        if record is None:
-            if whole + len(line) < len(data):
-                raise CaptureStoreError(
-                    f"{path}: line {number} is damaged, and it is not the last one; restore the "
-                    "file from a copy, or start another store"
-                )
+    for number, line in enumerate(data.split(b"\n")[:-1], 1):
+        found = _records(line)
+        end = whole + len(line) + 1
+        if found is None and end < len(data):
+            raise CaptureStoreError(
+                f"{path}: line {number} is damaged, and it is not the last one; restore the file "
+                "from a copy, or begin another store"
+            )
+        if found is None:
             break
-        records.append(record)
-        whole += len(line)
+        records += found
+        whole = end
     return records, whole
 
 
-def _record(line: bytes) -> Any:
-    """The record of a line that is whole, else None."""
+def _records(line: bytes) -> list[Any] | None:
+    """The records of a line that is whole."""
     try:
         held = json.loads(line)
-        record = held["record"]
-        fits = line.endswith(b"\n") and held["crc32"] == zlib.crc32(canonical_json(record).encode())
-        return record if fits else None
+        records = held["records"]
+        return records if held["crc32"] == zlib.crc32(canonical_json(records).encode()) else None
     except (ValueError, KeyError, TypeError):
         return None

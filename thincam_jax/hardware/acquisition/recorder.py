@@ -20,7 +20,8 @@ import numpy as np
 from filelock import FileLock
 from filelock import Timeout as LockTimeout
 
-from thincam_jax._core.capture_store import CaptureStore, CaptureStoreError, frame_digest
+from thincam_jax._core.capture_store import CaptureStore, CaptureStoreError
+from thincam_jax._core.files import WriteError
 from thincam_jax.hardware.acquisition.journal import Journal, sync_path
 
 JOURNAL, PLAN = "journal.jsonl", "plan.json"
@@ -125,15 +126,14 @@ class Recorder:
         self._journal.append([record])
 
     def add(self, step: int, pixels: np.ndarray, facts: Mapping[str, Any]) -> None:
-        """Take a frame; `facts` are what its line says of how it was taken.
+        """Take a frame; `facts`, among them its digest, are what the journal says of it.
 
-        **Errors**: OSError of an earlier frame that could not be written.
+        **Errors**: WriteError for an earlier frame that could not be written.
         """
-        digest = frame_digest(pixels)
-        record = {"step": step, "digest": f"{digest:016x}", "taken": now(), **facts}
-        self._waiting[step] = (pixels, record)
+        kept = pixels.astype(self.store.frames.dtype)  # a copy: drivers use their buffers again
+        self._waiting[step] = kept, {"step": step, "taken": now(), **facts}
         whole = step == self.store.chunk(step)[-1]
-        full = len(self._waiting) * pixels.nbytes >= _HELD
+        full = len(self._waiting) * kept.nbytes >= _HELD
         idle = self._saving is None or self._saving.done()
         if whole and (idle or full):
             self._save()
@@ -155,7 +155,11 @@ class Recorder:
     def _wait(self) -> None:
         if self._saving is not None:
             saving, self._saving = self._saving, None
-            saving.result()
+            try:
+                saving.result()
+            except OSError as error:
+                cause = error.strerror or str(error)
+                raise WriteError(error.errno, cause, str(self.store.path)) from error
 
     def _save(self) -> None:
         self._wait()

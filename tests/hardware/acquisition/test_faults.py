@@ -1,0 +1,74 @@
+"""Whatever a device does wrong, no wrong, stale or repeated frame is in the store."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from hardware.acquisition.fault_campaign import STOPS, campaign, require_right
+from hardware.memory_rig import World, fiducial_plan
+
+from helpers import ROOT
+from thincam_jax.hardware.acquisition.acquire import acquire
+from thincam_jax.hardware.virtual.faults import FAULTS
+
+
+@pytest.mark.parametrize("times", [3, pytest.param(100, marks=pytest.mark.thorough)])
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_fault_is_recovered_from_or_stops_the_run(fault, times, tmp_path):
+    row = campaign(fault, times, tmp_path)
+    expected = (0, times) if fault in STOPS else (times, 0)
+    assert (row.injected, row.recovered, row.stopped) == (times, *expected)
+
+
+def frames_in(store):
+    journal = store / "journal.jsonl"
+    return journal.read_bytes().count(b'"step":') if journal.exists() else 0
+
+
+@pytest.mark.parametrize(
+    ("kills", "count"), [(2, 40), pytest.param(20, 500, marks=pytest.mark.thorough)]
+)
+def test_a_killed_run_goes_on(kills, count, tmp_path):
+    """A kill at the start may find no store, one while it runs finds frames half written."""
+    store, random = tmp_path / "store", np.random.default_rng(4)
+    plan = fiducial_plan(count, dark_every=16)
+    command = [sys.executable, str(ROOT / "tests" / "hardware" / "memory_rig.py"), str(store)]
+    paths = os.pathsep.join([str(ROOT), str(ROOT / "tests")])
+    for kill in range(kills):
+        before = frames_in(store)
+        process = subprocess.Popen(
+            [*command, str(count)], env={**os.environ, "PYTHONPATH": paths}, text=True,
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE
+        )  # fmt: skip
+        with process:
+            if kill % 5 == 4:
+                time.sleep(random.uniform(0.0, 1.0))  # before the first frame
+            else:
+                frames = before + random.integers(1, 1 + count // (2 * kills))
+                while process.poll() is None and frames_in(store) < frames:
+                    time.sleep(0.001)
+                time.sleep(random.uniform(0.0, 0.01))
+            assert process.poll() is None, process.communicate()
+            process.send_signal(signal.SIGKILL)
+    with World().rig() as rig:
+        assert acquire(plan, rig, store).complete
+    require_right(store, plan)
+
+
+def test_sigterm_stops_between_two_frames(tmp_path):
+    done = []
+    plan = fiducial_plan(9)
+    with World().rig() as rig:
+        for most in (4, 99):
+            run = acquire(
+                plan, rig, tmp_path / "store",
+                progress=lambda now, most=most: (
+                    done.append(now.done), now.done == most and os.kill(os.getpid(), 15)
+                ),
+            )  # fmt: skip
+    assert run.complete and done == list(range(1, 10))
+    require_right(tmp_path / "store", plan)
