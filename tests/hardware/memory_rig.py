@@ -226,6 +226,6 @@ if __name__ == "__main__":
     from thincam_jax.hardware.acquisition.acquire import acquire
 
     assert "jax" not in sys.modules
-    with World(pause=0.001).rig() as rig:
+    with World(pause=0.004).rig() as rig:
         done = acquire(fiducial_plan(int(sys.argv[2]), dark_every=16), rig, sys.argv[1])
     print("complete" if done.complete else "stopped")

@@ -97,7 +97,8 @@ class CaptureStore:
     def write(self, images: Mapping[int, np.ndarray]) -> None:
         """Write frames by their numbers."""
         numbers = sorted(images)
-        block = np.stack([images[number] for number in numbers])
+        first = images[numbers[0]]
+        block = first[None] if len(images) == 1 else np.stack([images[n] for n in numbers])
         if numbers == list(range(numbers[0], numbers[-1] + 1)):
             self.frames[numbers[0] : numbers[-1] + 1] = block
         else:

@@ -46,7 +46,7 @@ def test_a_killed_run_goes_on(kills, count, tmp_path):
         )  # fmt: skip
         with process:
             if kill % 5 == 4:
-                time.sleep(random.uniform(0.0, 1.0))  # before the first frame
+                time.sleep(random.uniform(0.0, 0.4))  # before the first frame
             else:
                 frames = before + random.integers(1, 1 + count // (2 * kills))
                 while process.poll() is None and frames_in(store) < frames:

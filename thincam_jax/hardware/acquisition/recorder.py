@@ -20,7 +20,7 @@ import numpy as np
 from filelock import FileLock
 from filelock import Timeout as LockTimeout
 
-from thincam_jax._core.capture_store import CaptureStore, CaptureStoreError
+from thincam_jax._core.capture_store import CaptureStore, CaptureStoreError, frame_digest
 from thincam_jax._core.files import WriteError
 from thincam_jax.hardware.acquisition.journal import Journal, sync_path
 
@@ -126,11 +126,11 @@ class Recorder:
         self._journal.append([record])
 
     def add(self, step: int, pixels: np.ndarray, facts: Mapping[str, Any]) -> None:
-        """Take a frame; `facts`, among them its digest, are what the journal says of it.
+        """Take a frame, which nobody may change now; `facts` are what the journal says of it.
 
         **Errors**: WriteError for an earlier frame that could not be written.
         """
-        kept = pixels.astype(self.store.frames.dtype)  # a copy: drivers use their buffers again
+        kept = pixels.astype(self.store.frames.dtype, copy=False)
         self._waiting[step] = kept, {"step": step, "taken": now(), **facts}
         whole = step == self.store.chunk(step)[-1]
         full = len(self._waiting) * kept.nbytes >= _HELD
@@ -169,7 +169,10 @@ class Recorder:
     def _write(self, waiting: dict[int, tuple[np.ndarray, dict[str, Any]]]) -> None:
         self.store.write({step: pixels for step, (pixels, _) in waiting.items()})
         list(self._syncing.map(sync_path, self.store.files(waiting)))
-        records = [record for _, record in waiting.values()]
+        records = [
+            {**record, "digest": f"{frame_digest(pixels):016x}"}
+            for pixels, record in waiting.values()
+        ]
         self._journal.append(records)
         for record in records:
             self._digests[record["step"]] = int(record["digest"], 16)
