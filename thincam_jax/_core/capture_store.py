@@ -89,6 +89,11 @@ class CaptureStore:
         """Frames of a chunk."""
         return self.frames.chunks[0]
 
+    @property
+    def frame_bytes(self) -> int:
+        """Bytes of a frame on the disk."""
+        return int(np.prod(self.frames.shape[1:])) * self.frames.dtype.itemsize
+
     def chunk(self, number: int) -> range:
         """The frames that share a chunk with frame `number`."""
         first = number - number % self.together

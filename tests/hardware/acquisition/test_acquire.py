@@ -1,6 +1,7 @@
 """An acquisition takes the frames of its plan, and no others, whatever goes wrong."""
 
 import dataclasses
+import errno
 import signal
 from collections import namedtuple
 
@@ -15,7 +16,8 @@ from hardware.memory_rig import (
     fiducial_plan,
 )
 
-from thincam_jax._core.capture_store import CaptureStoreError
+from thincam_jax._core.capture_store import CaptureStore, CaptureStoreError
+from thincam_jax._core.files import WriteError
 from thincam_jax.hardware import Disconnected, Frame, IncompleteFrame, NotFound, NotHomed
 from thincam_jax.hardware.acquisition import recorder
 from thincam_jax.hardware.acquisition.acquire import Procedure, acquire
@@ -270,3 +272,16 @@ def test_the_exposure_is_found_once(path):
     two = dataclasses.replace(PLAN, settings=(SETTINGS, SETTINGS))
     with pytest.raises(ValueError, match="has 2 settings; auto-exposure takes plans with one"):
         run(world, path.with_name("c"), two, procedure)
+
+
+def test_a_full_disk_stops_the_run(path, monkeypatch):
+    def full(self, images):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    world = World()
+    run(world, path, progress=stop_after(4))
+    with monkeypatch.context() as disk, pytest.raises(WriteError, match="cannot be written .No sp"):
+        disk.setattr(CaptureStore, "write", full)
+        run(world, path)
+    assert run(world, path).complete
+    require_whole(path)

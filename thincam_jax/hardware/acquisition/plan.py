@@ -239,14 +239,17 @@ def _plan(
     """Shots of patterns at positions, with a dark frame before each `dark_every` of them."""
     if dark_every < 0:
         raise ValueError(f"dark_every = {dark_every}; give a whole number, 0 for no dark frames")
-    patterns = {canonical_json([p.kind, dict(p.numbers)]): p for p, _ in shots}
-    index = {text: number for number, text in enumerate(patterns)}
+    patterns = {_key(pattern): pattern for pattern, _ in shots}
+    index = {key: number for number, key in enumerate(patterns)}
     steps = []
     for number, (pattern, position) in enumerate(shots):
         position = None if position is None else float(position)
         if dark_every and number % dark_every == 0:
             steps.append(Step(len(patterns), position, dark=True))
-        shown = index[canonical_json([pattern.kind, dict(pattern.numbers)])]
-        steps.append(Step(shown, position))
+        steps.append(Step(index[_key(pattern)], position))
     black = (BLACK,) if dark_every else ()
     return Plan(name, (*patterns.values(), *black), (settings,), tuple(steps), facts or {})
+
+
+def _key(pattern: Pattern) -> tuple[object, ...]:
+    return (pattern.kind, *sorted(pattern.numbers.items()))
