@@ -3,6 +3,7 @@
 import dataclasses
 import errno
 import signal
+import time
 from collections import namedtuple
 
 import numpy as np
@@ -11,6 +12,8 @@ from hardware.memory_rig import (
     SETTINGS,
     SHAPE,
     MemoryCamera,
+    MemoryDisplay,
+    MemoryStage,
     World,
     fiducial,
     fiducial_plan,
@@ -18,12 +21,21 @@ from hardware.memory_rig import (
 
 from thincam_jax._core.capture_store import CaptureStore, CaptureStoreError
 from thincam_jax._core.files import WriteError
-from thincam_jax.hardware import Disconnected, Frame, IncompleteFrame, NotFound, NotHomed
+from thincam_jax.hardware import (
+    Disconnected,
+    Frame,
+    IncompleteFrame,
+    NotFound,
+    NotHomed,
+    Region,
+    Timeout,
+)
 from thincam_jax.hardware.acquisition import recorder
 from thincam_jax.hardware.acquisition.acquire import Procedure, acquire
 from thincam_jax.hardware.acquisition.auto_exposure import AutoExposure
 from thincam_jax.hardware.acquisition.plan import hadamard
 from thincam_jax.hardware.acquisition.read import read_acquisition
+from thincam_jax.hardware.acquisition.rig import Rig
 from thincam_jax.hardware.errors import OutOfRange, ProtocolError, Saturated
 from thincam_jax.measured.calibration import HadamardSeries, open_captures, recover_matrix
 
@@ -127,6 +139,8 @@ def test_only_the_same_run_goes_on(path, monkeypatch):
     with monkeypatch.context() as changed:
         changed.setattr(
             MemoryCamera,
+            MemoryDisplay,
+            MemoryStage,
             "configure",
             lambda self, settings: dataclasses.replace(taken(self, settings), exposure=0.011),
         )
@@ -285,3 +299,54 @@ def test_a_full_disk_stops_the_run(path, monkeypatch):
         run(world, path)
     assert run(world, path).complete
     require_whole(path)
+
+
+class LateCamera(MemoryCamera):
+    """Its frames wait in a queue; that of the fifth trigger comes when nobody waits for it."""
+
+    def __init__(self, world):
+        super().__init__(world)
+        self.queue = []
+
+    def flush(self):
+        self.queue = [(ready, frame) for ready, frame in self.queue if ready > time.monotonic()]
+
+    def trigger_and_grab(self, timeout):
+        frame = super().trigger_and_grab(timeout)
+        late = 1.5 * timeout if frame.number == 5 else 0.0
+        self.queue.append((time.monotonic() + late, frame))
+        if self.queue[0][0] > time.monotonic() + timeout:
+            raise Timeout("camera", "trigger", "no frame", "wait longer")
+        return self.queue.pop(0)[1]
+
+
+def test_a_frame_that_comes_too_late_is_no_other_steps_frame(path):
+    world = World()
+    with Rig(
+        lambda: LateCamera(world), lambda: MemoryDisplay(world), world.render,
+        lambda: MemoryStage(world)
+    ) as rig:  # fmt: skip
+        done = acquire(PLAN, rig, path, procedure=QUICK)
+    assert len(done.recovered) == 1
+    require_whole(path)
+
+
+def test_the_first_frame_may_fail_too(path):
+    """A short one says nothing of the shape, which the store is made for."""
+    world = World()
+    for fault in ("short_frame", "dropped_frame", "unplug"):
+        world.faults.inject(fault)
+    assert len(run(world, path).recovered) == 3 and not world.faults.waiting()
+    require_whole(path)
+
+
+def test_frames_of_a_store_have_one_shape(path):
+    regions = [SETTINGS, dataclasses.replace(SETTINGS, region=Region(1, 2, 4, 5))]
+    steps = [dataclasses.replace(step, settings=n % 2) for n, step in enumerate(PLAN.steps)]
+    plan = dataclasses.replace(PLAN, settings=tuple(regions), steps=tuple(steps))
+    with pytest.raises(ValueError, match="regions of several sizes; give one size"):
+        run(World(), path, plan)
+    run(World(), path, dataclasses.replace(PLAN, settings=(regions[1],)))
+    assert read_acquisition(path).sensor_shape == (4, 5)
+    with pytest.raises(ValueError, match="retries = -1; give a finite number"):
+        Procedure(retries=-1)

@@ -122,9 +122,15 @@ def _begin(run: Taker, path: Path) -> tuple[CameraSettings, ...]:
     if path.exists():
         return _resumed(run, path)
     settings = _new_settings(run)
+    shape, *others = {run.shape(one) for one in settings}
+    if others:
+        raise ValueError(
+            f"the plan {run.plan.name!r} has regions of several sizes; give one size, or a plan "
+            "for each"
+        )
     first = run.plan.steps[0]
     frame, _ = run.take(first, settings[first.settings], probe=True)
-    shape, bits = frame.pixels.shape, frame.bit_depth
+    run.bits = bits = frame.bit_depth
     attributes = {
         "kind": CAPTURES,
         "sensor_shape": shape,
@@ -147,7 +153,6 @@ def _begin(run: Taker, path: Path) -> tuple[CameraSettings, ...]:
         together = TOGETHER
     whole = (len(run.plan.steps), *shape)
     create_store(path, Layout(whole, dtype_of_bits(bits), together, attributes, run.plan.as_json()))
-    run.expect(shape, bits)
     return settings
 
 
@@ -173,7 +178,7 @@ def _resumed(run: Taker, path: Path) -> tuple[CameraSettings, ...]:
     settings = tuple(settings_from(record) for record in begun["settings"])
     for one in settings:
         run.persist(lambda one=one: run.configure(one))
-    run.expect(store.frames.shape[1:], store.attributes["bits"])
+    run.bits = store.attributes["bits"]
     return settings
 
 
@@ -189,13 +194,13 @@ def _new_settings(run: Taker) -> tuple[CameraSettings, ...]:
         lit = next((s for s in run.plan.steps if not s.dark), run.plan.steps[0])
 
         def level_at(exposure: float) -> float:
-            settings = run.persist(lambda: run.set(replace(asked[0], exposure=exposure)))
+            settings = run.persist(lambda: run.set_near(replace(asked[0], exposure=exposure)))
             frame, _ = run.take(lit, settings, probe=True)
             return float(np.quantile(frame.pixels, wanted.quantile)) / full_scale(frame)
 
         found = find_exposure(level_at, asked[0].exposure, wanted, run.name("camera"))
         asked = (replace(asked[0], exposure=found),)
-    return tuple(run.persist(lambda one=one: run.set(one)) for one in asked)
+    return tuple(run.persist(lambda one=one: run.set_near(one)) for one in asked)
 
 
 def _stored_at(plan: Plan) -> list[int]:

@@ -52,6 +52,12 @@ class Procedure:
     position_tolerance: float = 0.01
     auto_exposure: AutoExposure | None = None
 
+    def __post_init__(self):
+        numbers = {name: value for name, value in vars(self).items() if name != "auto_exposure"}
+        for name, value in numbers.items():
+            if not 0 <= value < math.inf:
+                raise ValueError(f"{name} = {value}; give a finite number that is not negative")
+
 
 class Taker:
     """The devices of a run, and what is known of their state.
@@ -66,13 +72,13 @@ class Taker:
         self.identities = rig.identities()
         self._role: Role = "camera"  # of the device that is being used
         self._forget()
-        self._shape: tuple[int, int] | None = None  # of the frames, and their bits, once known
-        self._bits: int | None = None
+        self.bits: int | None = None  # of every frame, once the first has told it
         self._seen: tuple[int, np.ndarray] | None = None  # pattern and pixels of the last frame
 
-    def expect(self, shape: tuple[int, int], bits: int) -> None:
-        """From now on frames have to be of this shape (y, x) and of so many bits."""
-        self._shape, self._bits = shape, bits
+    def shape(self, settings: CameraSettings) -> tuple[int, int]:
+        """Rows and columns of a frame with these settings."""
+        region = settings.region
+        return (region.height, region.width) if region else self.rig.camera.sensor_shape
 
     @contextmanager
     def clock(self, what: str) -> Iterator[None]:
@@ -149,7 +155,7 @@ class Taker:
     def _once(
         self, step: Step, settings: CameraSettings, probe: bool
     ) -> tuple[Frame, dict[str, Any]]:
-        """The frame of a step, its digest, its full pixels, and where the stage stands."""
+        """The frame of a step, how many of its pixels are full, and where the stage stands."""
         position = self._moved(step)
         with self.clock("show"):
             levels = self.rig.render(self.plan.pattern(step))
@@ -195,10 +201,10 @@ class Taker:
         return float(self._position)  # pyright: ignore[reportArgumentType]
 
     def configure(self, settings: CameraSettings) -> None:
-        """Set the camera as it was set when the store was begun."""
+        """Set the camera as it was set when the store was begun; ProtocolError if it will not."""
         if settings == self._configured:
             return
-        taken = self.set(settings)
+        taken = self.set_near(settings)
         if not _same(taken, settings):
             raise ProtocolError(
                 self.name("camera"), "configure", f"it took {taken} in place of {settings}",
@@ -206,7 +212,8 @@ class Taker:
             )  # fmt: skip
         self._configured = settings
 
-    def set(self, settings: CameraSettings) -> CameraSettings:
+    def set_near(self, settings: CameraSettings) -> CameraSettings:
+        """Set the camera, and what it has taken instead."""
         self._role, self._configured = "camera", None
         return self.rig.camera.configure(settings)
 
@@ -234,11 +241,11 @@ class Taker:
         if last is not None and frame.number <= last:
             cause = f"frame {frame.number} came after frame {last}: a stale one"
             raise IncompleteFrame(name, "trigger", cause, again)
-        if self._shape is not None and pixels.shape != self._shape:
-            cause = f"the frame has the shape {pixels.shape}, not {self._shape}"
+        if pixels.shape != (shape := self.shape(settings)):
+            cause = f"the frame has the shape {pixels.shape}, not {shape}"
             raise IncompleteFrame(name, "trigger", cause, again)
-        if self._bits is not None and frame.bit_depth != self._bits:
-            cause = f"the frame has {frame.bit_depth} bits, not {self._bits}"
+        if self.bits is not None and frame.bit_depth != self.bits:
+            cause = f"the frame has {frame.bit_depth} bits, not {self.bits}"
             raise ProtocolError(name, "trigger", cause, again)
         if not math.isclose(frame.exposure, settings.exposure, rel_tol=0.01, abs_tol=2e-6):
             cause = f"exposed for {frame.exposure:g} s, not for {settings.exposure:g} s"
@@ -258,14 +265,17 @@ class Taker:
         return saturated
 
     def name(self, role: Role) -> str:
+        """What messages call a device."""
         return told(self.identities[role])
 
 
 def full_scale(frame: Frame) -> int:
+    """The largest count of a frame."""
     return 2**frame.bit_depth - 1
 
 
 def told(identity: dict[str, str] | None) -> str:
+    """A device's identity in a message."""
     if identity is None:
         return "none"
     return "{vendor} {model} ({serial})".format(**identity)
