@@ -5,17 +5,15 @@ of a Hadamard plan by rows, 16 together. The frames are on the disk (fsync) when
 what the disk takes for one fsync is printed beside it. The least of three runs counts.
 """
 
-import dataclasses
 import os
 import shutil
 import time
 
 import numpy as np
 import pytest
-from hardware.memory_rig import World, fiducial_plan
+from hardware.memory_rig import World, by_rows, fiducial_plan
 
 from thincam_jax.hardware.acquisition.acquire import acquire
-from thincam_jax.hardware.acquisition.plan import HADAMARD
 
 FRAMES = {512: 128, 2048: 32}
 
@@ -40,9 +38,7 @@ def test_overhead(side, kept, tmp_path):
     world.see = lambda exposure: see(world, texture)
     plan = fiducial_plan(FRAMES[side], every=16)
     if kept == "by rows":
-        order = {"object_shape": [FRAMES[side], 1], "order": "natural", "display": "binary"}
-        facts = {"series": {**order, "dark_frames": 0}}
-        plan = dataclasses.replace(plan, name=HADAMARD, facts=facts)
+        plan = by_rows(plan)
     overheads = [measure(world, plan, tmp_path / str(n)) for n in range(3)]
     world.pause = 0.015  # a camera that takes its time, in which frames reach the disk
     beside = measure(world, plan, tmp_path / "slow")

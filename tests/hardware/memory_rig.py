@@ -2,7 +2,7 @@
 
 Each pattern carries a fiducial, its number in base 256 in the first pixels; the camera sees what is
 shown with a texture of its own, so that a frame tells of which pattern it is, whole. It imports no
-JAX: `python memory_rig.py STORE FRAMES` is the process that tests kill.
+JAX: `python memory_rig.py STORE FRAMES [rows]` is the process that tests kill.
 """
 
 import sys
@@ -26,7 +26,7 @@ from thincam_jax.hardware import (
     Stage,
     Timeout,
 )
-from thincam_jax.hardware.acquisition.plan import BLACK, Pattern, Plan, Step
+from thincam_jax.hardware.acquisition.plan import BLACK, HADAMARD, Pattern, Plan, Step
 from thincam_jax.hardware.acquisition.rig import Rig
 from thincam_jax.hardware.errors import OutOfRange
 from thincam_jax.hardware.virtual.faults import Faults
@@ -222,10 +222,19 @@ def fiducial_plan(count: int, *, every: int = 5, dark_every: int = 0, stage: boo
     return Plan("fiducials", patterns, (SETTINGS,), tuple(steps))
 
 
+def by_rows(plan: Plan) -> Plan:
+    """The plan, 2^n patterns of it, as one of Hadamard patterns: 16 frames share a chunk."""
+    dark = sum(step.dark for step in plan.steps)
+    cells = {"object_shape": [len(plan.steps) - dark, 1], "order": "natural"}
+    series = {**cells, "display": "binary", "dark_frames": dark}
+    return replace(plan, name=HADAMARD, facts={"series": series})
+
+
 if __name__ == "__main__":
     from thincam_jax.hardware.acquisition.acquire import acquire
 
     assert "jax" not in sys.modules
+    plan = fiducial_plan(int(sys.argv[2]), dark_every=16)
     with World(pause=0.004).rig() as rig:
-        done = acquire(fiducial_plan(int(sys.argv[2]), dark_every=16), rig, sys.argv[1])
+        done = acquire(by_rows(plan) if "rows" in sys.argv else plan, rig, sys.argv[1])
     print("complete" if done.complete else "stopped")

@@ -9,7 +9,7 @@ import time
 import numpy as np
 import pytest
 from hardware.acquisition.fault_campaign import STOPS, campaign, require_right
-from hardware.memory_rig import World, fiducial_plan
+from hardware.memory_rig import World, by_rows, fiducial_plan
 
 from helpers import ROOT
 from thincam_jax.hardware.acquisition.acquire import acquire
@@ -30,18 +30,24 @@ def frames_in(store):
 
 
 @pytest.mark.parametrize(
-    ("kills", "count"), [(2, 40), pytest.param(20, 500, marks=pytest.mark.thorough)]
+    ("kills", "count", "kept"),
+    [
+        (2, 40, ""),
+        pytest.param(20, 500, "", marks=pytest.mark.thorough),
+        pytest.param(10, 512, "rows", marks=pytest.mark.thorough),
+    ],
 )
-def test_a_killed_run_goes_on(kills, count, tmp_path):
+def test_a_killed_run_goes_on(kills, count, kept, tmp_path):
     """A kill at the start may find no store, one while it runs finds frames half written."""
     store, random = tmp_path / "store", np.random.default_rng(4)
     plan = fiducial_plan(count, dark_every=16)
+    plan = by_rows(plan) if kept else plan
     command = [sys.executable, str(ROOT / "tests" / "hardware" / "memory_rig.py"), str(store)]
     paths = os.pathsep.join([str(ROOT), str(ROOT / "tests")])
     for kill in range(kills):
         before = frames_in(store)
         process = subprocess.Popen(
-            [*command, str(count)], env={**os.environ, "PYTHONPATH": paths}, text=True,
+            [*command, str(count), kept], env={**os.environ, "PYTHONPATH": paths}, text=True,
             stdout=subprocess.PIPE, stderr=subprocess.PIPE
         )  # fmt: skip
         with process:
