@@ -26,7 +26,7 @@ from thincam_jax.hardware import (
     Stage,
     Timeout,
 )
-from thincam_jax.hardware.acquisition.plan import BLACK, HADAMARD, Pattern, Plan, Step
+from thincam_jax.hardware.acquisition.plan import BLACK, Pattern, Plan, Step
 from thincam_jax.hardware.acquisition.rig import Rig
 from thincam_jax.hardware.errors import OutOfRange
 from thincam_jax.hardware.virtual.faults import Faults
@@ -227,7 +227,7 @@ def by_rows(plan: Plan) -> Plan:
     dark = sum(step.dark for step in plan.steps)
     cells = {"object_shape": [len(plan.steps) - dark, 1], "order": "natural"}
     series = {**cells, "display": "binary", "dark_frames": dark}
-    return replace(plan, name=HADAMARD, facts={"series": series})
+    return replace(plan, facts={"series": series})
 
 
 if __name__ == "__main__":

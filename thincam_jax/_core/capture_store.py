@@ -48,7 +48,7 @@ class CaptureStore:
             self.digests = np.asarray(self.group["digests"][:])
         except (OSError, ValueError, KeyError) as error:
             raise CaptureStoreError(
-                f"{path} is no store of {kinds[0]} ({type(error).__name__}: {error}); give one "
+                f"{path} is no store of {kinds[-1]} ({type(error).__name__}: {error}); give one "
                 "that an acquisition or create_captures made"
             ) from error
 
@@ -113,6 +113,12 @@ class CaptureStore:
         """Write the digests: what they announce has to be there."""
         self.digests = digests.copy()
         self.group["digests"][:] = digests
+
+    def tidy(self, numbers: Iterable[int]) -> None:
+        """Remove what a killed process left half written in the chunks of frames."""
+        for chunk in sorted({number // self.together for number in numbers}):
+            for partial in (self.path / "frames" / "c" / str(chunk)).rglob("*.partial"):
+                partial.unlink()
 
     def files(self, numbers: Iterable[int]) -> list[Path]:
         """The files that hold frames, and their folders, as they have to reach the disk."""

@@ -37,7 +37,12 @@ from thincam_jax.hardware.acquisition.plan import hadamard
 from thincam_jax.hardware.acquisition.read import read_acquisition
 from thincam_jax.hardware.acquisition.rig import Rig
 from thincam_jax.hardware.errors import OutOfRange, ProtocolError, Saturated
-from thincam_jax.measured.calibration import HadamardSeries, open_captures, recover_matrix
+from thincam_jax.measured.calibration import (
+    HadamardSeries,
+    open_captures,
+    recover_matrix,
+    resume_captures,
+)
 
 QUICK = Procedure(timeout=0.001, reopen_wait=0.0)
 PLAN = fiducial_plan(20, dark_every=8)
@@ -94,6 +99,9 @@ def test_a_hadamard_plan_is_read_as_a_calibration(path, dark):
     world.see = lambda exposure: (matrix @ world.shown.ravel() + 7).reshape(SHAPE).astype("u2")
     world.render = render
     assert run(world, path, plan, progress=stop_after(11)).done == 11
+    for reader in (open_captures, resume_captures):
+        with pytest.raises(CaptureStoreError, match="the same acquisition again"):
+            reader(path)
     assert run(world, path, plan).complete
     captures = open_captures(path)
     assert captures.series == series and captures.bits == 12
@@ -297,6 +305,11 @@ def test_a_full_disk_stops_the_run(path, monkeypatch):
         run(world, path)
     assert run(world, path).complete
     require_whole(path)
+    (path.parent / "file").touch()
+    with pytest.raises(WriteError, match="cannot be written"):
+        run(world, path.parent / "file" / "a.zarr")
+    with pytest.raises(CaptureStoreError, match="is no store of captures"):
+        run(world, path.parent / "file")
 
 
 class LateCamera(MemoryCamera):

@@ -63,6 +63,7 @@ def test_a_killed_run_goes_on(kills, count, kept, tmp_path):
     with World().rig() as rig:
         assert acquire(plan, rig, store).complete
     require_right(store, plan)
+    assert not list(tmp_path.rglob("*.partial"))
 
 
 def test_sigterm_stops_between_two_frames(tmp_path):

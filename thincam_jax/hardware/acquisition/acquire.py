@@ -23,7 +23,7 @@ from thincam_jax._core.capture_store import (
     dtype_of_bits,
 )
 from thincam_jax.hardware.acquisition.auto_exposure import find_exposure
-from thincam_jax.hardware.acquisition.plan import HADAMARD, Plan, settings_from
+from thincam_jax.hardware.acquisition.plan import Plan, settings_from
 from thincam_jax.hardware.acquisition.recorder import (
     Layout,
     Lock,
@@ -147,9 +147,9 @@ def _begin(run: Taker, path: Path) -> tuple[CameraSettings, ...]:
         },
     }
     together = 1
-    if run.plan.name == HADAMARD:
+    if series := run.plan.facts.get("series"):
         attributes |= {"kind": CALIBRATION, "exposure": settings[0].exposure}
-        attributes |= {"stored_at": _stored_at(run.plan), **run.plan.facts["series"]}
+        attributes |= {"stored_at": _stored_at(run.plan), **series}
         together = TOGETHER
     whole = (len(run.plan.steps), *shape)
     create_store(path, Layout(whole, dtype_of_bits(bits), together, attributes, run.plan.as_json()))

@@ -21,7 +21,6 @@ from thincam_jax.hardware.base import CameraSettings, Region
 if TYPE_CHECKING:  # it brings JAX
     from thincam_jax.measured.calibration.hadamard import HadamardSeries
 
-HADAMARD = "hadamard"  # name of the plan that `open_captures` reads
 FRINGE_SCAN = (0.0, 0.5 * math.pi, math.pi, 1.5 * math.pi)  # phases, rad
 PHASE_PAIR = (0.0, 1.5 * math.pi)
 
@@ -62,7 +61,8 @@ class Plan:
 
     - `name`: what it is for, such as "method_b".
     - `facts`: numbers and texts that a reader of the captures needs, kept with them. `stage_zero`
-      is the distance, mm, at the stage's position 0.
+      is the distance, mm, at the stage's position 0. With `series`, that of `hadamard`, the store
+      is one that `open_captures` reads.
 
     **Errors**: ValueError for no steps, numbers that point outside of the tables, and what JSON
     cannot hold.
@@ -214,7 +214,7 @@ def hadamard(series: "HadamardSeries", settings: CameraSettings) -> Plan:
     ]
     dark = series.dark_frames
     every = -(-series.pattern_frames // dark) if dark else 0
-    plan = _plan(HADAMARD, shots, settings, every)
+    plan = _plan("hadamard", shots, settings, every)
     # Of few patterns and many dark frames the last ones come together.
     lacking = dark - sum(step.dark for step in plan.steps)
     black = Step(len(plan.patterns) - 1, dark=True)

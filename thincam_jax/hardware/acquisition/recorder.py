@@ -8,8 +8,9 @@ no line is taken again.
 import os
 import platform
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib.metadata import version
@@ -44,18 +45,28 @@ class Layout:
     plan: str
 
 
+@contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """WriteError, one line, for what the system refuses within."""
+    try:
+        yield
+    except OSError as error:
+        raise WriteError(error.errno, error.strerror or str(error), str(path)) from error
+
+
 class Lock:
     """Keeps a second run from writing the same store; held until the process ends or `release`."""
 
     def __init__(self, path: Path):
-        path.parent.mkdir(parents=True, exist_ok=True)
         self._lock = FileLock(path.with_name(f".{path.name}.lock"))
-        try:
-            self._lock.acquire(timeout=0)
-        except LockTimeout as error:
-            raise CaptureStoreError(
-                f"{path} is being written by another run; wait for it, or give another name"
-            ) from error
+        with writing(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            try:
+                self._lock.acquire(timeout=0)
+            except LockTimeout as error:
+                raise CaptureStoreError(
+                    f"{path} is being written by another run; wait for it, or give another name"
+                ) from error
 
     def __enter__(self) -> "Lock":
         return self
@@ -68,14 +79,15 @@ def create_store(path: Path, layout: Layout) -> None:
     """A new store, which is there whole or not at all."""
     partial = path.with_name(f".{path.name}.partial")
     shutil.rmtree(partial, ignore_errors=True)  # of a run that was killed at this point
-    CaptureStore.create(
-        partial, layout.shape, layout.dtype, layout.attributes, together=layout.together
-    )
-    (partial / PLAN).write_text(layout.plan, encoding="utf-8")
-    for file in (*partial.rglob("*"), partial):
-        sync_path(file)
-    os.rename(partial, path)
-    sync_path(path.parent)
+    with writing(path):
+        CaptureStore.create(
+            partial, layout.shape, layout.dtype, layout.attributes, together=layout.together
+        )
+        (partial / PLAN).write_text(layout.plan, encoding="utf-8")
+        for file in (*partial.rglob("*"), partial):
+            sync_path(file)
+        os.rename(partial, path)
+        sync_path(path.parent)
 
 
 def require_space(path: Path, size: int) -> None:
@@ -115,6 +127,7 @@ class Recorder:
         digests[sorted(self.store.lost())] = 0
         self._digests = digests
         self.missing = [int(step) for step in np.flatnonzero(digests == 0)]
+        self.store.tidy(self.missing)
         self._waiting: dict[int, tuple[np.ndarray, dict[str, Any]]] = {}
         self._thread = ThreadPoolExecutor(1, "frames to disk")
         self._syncing = ThreadPoolExecutor(_SYNCS, "fsync")
@@ -146,7 +159,8 @@ class Recorder:
             if self._waiting:
                 self._save()
             self._wait()
-            self.store.announce(self._digests)
+            with writing(self.store.path):
+                self.store.announce(self._digests)
         finally:
             self._thread.shutdown()
             self._syncing.shutdown()
@@ -155,11 +169,8 @@ class Recorder:
     def _wait(self) -> None:
         if self._saving is not None:
             saving, self._saving = self._saving, None
-            try:
+            with writing(self.store.path):
                 saving.result()
-            except OSError as error:
-                cause = error.strerror or str(error)
-                raise WriteError(error.errno, cause, str(self.store.path)) from error
 
     def _save(self) -> None:
         self._wait()

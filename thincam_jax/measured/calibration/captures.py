@@ -66,6 +66,10 @@ class CaptureWriter:
 
     def __init__(self, path: Path):
         self._store = _opened(path, "r+")
+        if "acquisition" in self._store.attributes:
+            raise CaptureStoreError(
+                f"{path} was made by an acquisition; run the same acquisition again to go on"
+            )
         self.captures = _described(self._store)
         self._digests = self._store.digests.copy()
         self._digests[sorted(self._store.lost())] = 0
@@ -195,12 +199,12 @@ def open_captures(path: str | Path) -> HadamardCaptures:
     if missing:
         raise CaptureStoreError(
             f"{path}: {len(missing)} of {len(digests)} frames are missing: {listed(missing)}; "
-            "capture them (resume_captures) or measure again"
+            "capture them (resume_captures, or the same acquisition again)"
         )
     if cut:
         raise CaptureStoreError(
             f"{path}: {len(cut)} of {len(digests)} frames are truncated: {listed(sorted(cut))}; "
-            "capture them again (resume_captures) or copy the store again"
+            "capture them again (resume_captures, or the same acquisition) or copy the store again"
         )
     if captures.stored_at is not None:
         digests = digests[list(captures.stored_at)]
