@@ -27,7 +27,7 @@ from thincam_jax.hardware.acquisition.journal import Journal, sync_path
 
 JOURNAL, PLAN = "journal.jsonl", "plan.json"
 _HELD = 2**26  # bytes of frames that may wait for the disk
-_SYNCS = 8  # files at once: the disk writes its own journal once for all of them
+_AT_ONCE = 8  # files that are synced at once: the disk writes its own journal once for all of them
 
 
 @dataclass(frozen=True)
@@ -130,7 +130,7 @@ class Recorder:
         self.store.tidy(self.missing)
         self._waiting: dict[int, tuple[np.ndarray, dict[str, Any]]] = {}
         self._thread = ThreadPoolExecutor(1, "frames to disk")
-        self._syncing = ThreadPoolExecutor(_SYNCS, "fsync")
+        self._helpers = ThreadPoolExecutor(_AT_ONCE, "digests and fsync")
         self._saving: Future[None] | None = None
 
     def note(self, record: Mapping[str, Any]) -> None:
@@ -163,7 +163,7 @@ class Recorder:
                 self.store.announce(self._digests)
         finally:
             self._thread.shutdown()
-            self._syncing.shutdown()
+            self._helpers.shutdown()
             self._journal.close()
 
     def _wait(self) -> None:
@@ -178,11 +178,13 @@ class Recorder:
         self._saving = self._thread.submit(self._write, waiting)
 
     def _write(self, waiting: dict[int, tuple[np.ndarray, dict[str, Any]]]) -> None:
-        self.store.write({step: pixels for step, (pixels, _) in waiting.items()})
-        list(self._syncing.map(sync_path, self.store.files(waiting)))
+        images = {step: pixels for step, (pixels, _) in waiting.items()}
+        digests = self._helpers.map(frame_digest, images.values())  # while the frames are written
+        self.store.write(images)
+        list(self._helpers.map(sync_path, self.store.files(waiting)))
         records = [
-            {**record, "digest": f"{frame_digest(pixels):016x}"}
-            for pixels, record in waiting.values()
+            {**record, "digest": f"{digest:016x}"}
+            for digest, (_, record) in zip(digests, waiting.values(), strict=True)
         ]
         self._journal.append(records)
         for record in records:
