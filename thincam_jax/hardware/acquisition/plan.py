@@ -2,9 +2,9 @@
 
 A plan holds a table of patterns, one of camera settings, and the steps, which point into both. Its
 SHA-256 is over canonical JSON, so that an acquisition is only ever resumed with the plan that it
-began with. The ready-made plans are those of the thesis: fringe scanning (Eq 3.14), method A
-(several mask-sensor distances), method B (pairs of phases of several β, Eq 3.49), a stack of PSFs
-by depth, and the calibration by Hadamard patterns (Eq 5.12–5.17).
+began with. The ready-made plans are those of the thesis: fringe scanning, method A
+(several mask-sensor distances), method B (pairs of phases of several β), a stack of PSFs
+by depth, and the calibration by Hadamard patterns.
 """
 
 import dataclasses
@@ -145,7 +145,7 @@ def zone_plate(
 
 
 def fringe_scan(mask: Pattern, settings: CameraSettings, *, dark_every: int = 0) -> Plan:
-    """Four captures with the phases 0, π/2, π and 3π/2 of one zone plate (thesis Eq 3.14).
+    """Four captures with the phases 0, π/2, π and 3π/2 of one zone plate.
 
     - `mask`: a `zone_plate`; its phase is replaced.
     - `dark_every`: a dark frame first and after each that many captures; 0: none.
@@ -162,7 +162,7 @@ def method_a(
     stage_zero: float = 0.0,
     dark_every: int = 0,
 ) -> Plan:
-    """A fringe scan at each of several mask-sensor distances (thesis section 3.4).
+    """A fringe scan at each of several mask-sensor distances.
 
     - `distances`: mm; the stage moves to distance − `stage_zero`, the distance at its position 0.
     """
@@ -177,7 +177,7 @@ def method_a(
 def method_b(
     mask: Pattern, betas: Sequence[float], settings: CameraSettings, *, dark_every: int = 0
 ) -> Plan:
-    """Captures with the phases 0 and 3π/2 for each of several β, rad/mm² (thesis Eq 3.49)."""
+    """Captures with the phases 0 and 3π/2 for each of several β, rad/mm²."""
     shots = [
         (_changed(mask, beta=beta, phase=phase), None) for beta in betas for phase in PHASE_PAIR
     ]
