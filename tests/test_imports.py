@@ -48,7 +48,10 @@ def test_names_wait_for_no_library_of_analysis_or_plots(name):
 @pytest.mark.parametrize(
     "typed",
     ["--help", "--version", "run --help", "bench accuracy --help", "calibrate check --help"]
-    + [f"{command} --help" for command in ("reconstruct", "sweep", "design", "doctor", "init")],
+    + [
+        f"{command} --help"
+        for command in ("reconstruct", "sweep", "design", "doctor", "init", "capture")
+    ],
 )
 def test_help_of_a_command_waits_for_nothing(typed):
     modules = imported_by(as_command(typed))

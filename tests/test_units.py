@@ -150,7 +150,7 @@ def test_quantity_of_any_registry_is_accepted():
             "180 mm",
             "width",
             "'width' is not a kind of quantity: "
-            'use one of "length", "wavelength", "angle", "curvature"',
+            'use one of "length", "wavelength", "angle", "curvature", "time"',
         ),
     ],
 )

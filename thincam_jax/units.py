@@ -71,6 +71,9 @@ _KINDS = {
         'write a curvature such as "25 rad/mm^2"',
         '"25 rad/mm^2", "25 rad/mm**2" or "25 /mm^2"',
     ),
+    "time": _Kind(
+        "a time", {"second": "second"}, 'write a time such as "5 ms"', '"50 us", "5 ms" or "2 s"'
+    ),
 }
 
 # What a quantity of another kind is called, by its root units as pint writes them.
@@ -121,13 +124,13 @@ def parse_quantity(text: object, kind: str) -> float:
 
     - `text`: a string such as `"180 mm"`, `"61.2 deg"` or `"25 rad/mm^2"`, or a scalar pint
       quantity of any registry. A number without a unit is refused: no unit is guessed.
-    - `kind`: `"length"`, `"wavelength"`, `"angle"` or `"curvature"` (β of a Fresnel zone
-      aperture; the radian may be left out, `"25 /mm^2"`).
+    - `kind`: `"length"`, `"wavelength"`, `"angle"`, `"time"` or `"curvature"` (β of a Fresnel
+      zone aperture; the radian may be left out, `"25 /mm^2"`).
 
     **Returns:**
 
-    A float: millimetres for a length, radians for an angle, rad/mm² for a curvature. The sign is
-    kept; a range is the business of whoever takes the value.
+    A float: mm for a length, radians for an angle, s for a time, rad/mm² for a curvature. The
+    sign is kept; a range is the business of whoever takes the value.
 
     **Raises:**
 

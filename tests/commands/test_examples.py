@@ -1,6 +1,7 @@
 """`thincam init`: every shipped experiment file can be had, and nothing is overwritten."""
 
 import tomllib
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -8,6 +9,8 @@ from commands.test_cli import call, one_line
 
 from helpers import ROOT
 from thincam_jax.commands import examples
+from thincam_jax.commands.capture.config import CaptureConfig
+from thincam_jax.commands.checked_config import load_as
 from thincam_jax.commands.design.config import load_design
 from thincam_jax.commands.kinds import load_experiment
 
@@ -19,9 +22,10 @@ def test_a_file_that_its_command_takes(kind, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     result = call("init", kind)
     assert result.exit_code == 0, result.output
-    command = "design" if "design" in kind else "run"
+    command = examples.next_command(kind)
+    takes = {"design": load_design, "capture": partial(load_as, CaptureConfig)}
     assert result.stdout == f"{kind}.yaml; next: thincam {command} {kind}.yaml\n"
-    (load_design if command == "design" else load_experiment)(tmp_path / f"{kind}.yaml")
+    takes.get(command, load_experiment)(tmp_path / f"{kind}.yaml")
 
 
 def test_every_shipped_file_is_one(tmp_path):
@@ -42,7 +46,7 @@ def test_nothing_is_overwritten(tmp_path):
 
 def test_unknown_kind_and_missing_folder(tmp_path):
     line = one_line(call("init", "camera"))
-    assert line.startswith("init camera: choose one of study, refocus, design, design_both, ")
+    assert line.startswith("init camera: choose one of study, refocus, design, capture, design_both, ")
     assert "cannot be written (No such file" in one_line(
         call("init", "study", "--out", tmp_path / "no" / "study.yaml")
     )
@@ -56,4 +60,4 @@ def test_the_wheel_holds_them_where_they_are_looked_for(tmp_path, monkeypatch):
     (tmp_path / place / "camera.yaml").write_text("")
     module = Path(examples.__file__).relative_to(ROOT)
     monkeypatch.setattr(examples, "__file__", str(tmp_path / module))
-    assert examples.kinds() == ["study", "refocus", "design", "camera"]
+    assert examples.kinds() == ["study", "refocus", "design", "capture", "camera"]

@@ -10,6 +10,7 @@ import typer
 
 from thincam_jax.commands.accuracy.command import accuracy
 from thincam_jax.commands.cache import cache_state, keep_programs
+from thincam_jax.commands.capture.command import capture, known_drivers
 from thincam_jax.commands.design.command import design
 from thincam_jax.commands.examples import init
 from thincam_jax.commands.help import Grouped, InOrder, examples_text
@@ -46,6 +47,11 @@ app.command(
 app.command(
     epilog=examples_text("thincam design design.yaml", "thincam design design.yaml --out found"),
 )(design)
+app.command(
+    epilog=examples_text(
+        "thincam capture rig_virtual.yaml", "thincam capture rig.yaml --out frames.zarr --resume"
+    ),
+)(capture)
 # The callback keeps the name of a single command.
 calibrate = typer.Typer(no_args_is_help=True, help="Find out what a rig's own pictures say of it.")
 calibrate.callback()(lambda: None)
@@ -106,6 +112,8 @@ def doctor() -> None:
         print(f"optional {name} {version}")
     for name, purpose in doctoring.missing_parts().items():
         print(f"optional {name} is missing: {purpose}")
+    for line in known_drivers():
+        print(line)
 
 
 if __name__ == "__main__":

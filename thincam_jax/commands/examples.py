@@ -8,7 +8,12 @@ import typer
 from thincam_jax.commands.terminal import told
 
 # The quickest of each kind have short names; the other files have their own.
-_FILE_OF = {"study": "quick", "refocus": "fza_refocus", "design": "design_distances"}
+_FILE_OF = {
+    "study": "quick",
+    "refocus": "fza_refocus",
+    "design": "design_distances",
+    "capture": "rig_virtual",
+}
 
 
 def _folder() -> Path:
@@ -42,4 +47,10 @@ def init(
         if path.exists():
             raise ConfigError(f"{path} exists; give another --out, or delete it")
         write_whole(path, text)
-    print(f"{path}; next: thincam {'design' if kind.startswith('design') else 'run'} {path}")
+    print(f"{path}; next: thincam {next_command(kind)} {path}")
+
+
+def next_command(kind: str) -> str:
+    """What takes a file of that name."""
+    commands = {"design": "design", "capture": "capture", "rig": "capture"}
+    return commands.get(kind.partition("_")[0], "run")

@@ -18,6 +18,8 @@ def load_experiment(path: str | Path, overrides: tuple[str, ...] = ()) -> Experi
         return load_config(path, overrides)
     if kind == "design":
         raise ConfigError(f"{path}: kind: is a design; give it to 'thincam design'")
+    if kind == "capture":
+        raise ConfigError(f"{path}: kind: is a capture; give it to 'thincam capture'")
     if kind == "refocus":
         return load_as(RefocusConfig, path, overrides, "objects")
     if kind == "screen":

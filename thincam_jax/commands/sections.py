@@ -50,6 +50,7 @@ Position = Annotated[float, *quantity("length", "mm")]
 Wavelength = Annotated[float, *quantity("wavelength", "mm"), AfterValidator(_optical)]
 Curvature = Annotated[float, *quantity("curvature", "rad/mm^2", positive=True)]
 Angle = Annotated[float, *quantity("angle", "rad")]
+Time = Annotated[float, *quantity("time", "s", positive=True)]
 Name = Annotated[str, Field(min_length=1, max_length=60, pattern=r"^[\w .,()=+\-]+$")]
 
 

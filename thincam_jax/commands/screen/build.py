@@ -19,6 +19,7 @@ from thincam_jax.commands.screen.config import (
     ScreenConfig,
     ScreenMethodConfig,
     ScreenTargetConfig,
+    SeeThroughConfig,
 )
 from thincam_jax.commands.sections import VariationConfig
 from thincam_jax.commands.study.build import build_noise, middle_square, read_picture
@@ -97,7 +98,9 @@ def build_setup(config: ScreenConfig) -> Setup:
     return setup
 
 
-def build_camera(config: ScreenConfig, glass_thickness: float | None = None) -> wg.SeeThroughCamera:
+def build_camera(
+    config: SeeThroughConfig, glass_thickness: float | None = None
+) -> wg.SeeThroughCamera:
     """The camera, or one with another glass, mm."""
     film, plate = config.hologram, config.screen
     hologram = wg.VolumeHologram.record(

@@ -172,15 +172,13 @@ class CalibrationConfig(Section):
 MEASURED = "measured matrix"  # among the models
 
 
-class ScreenConfig(ExperimentConfig):
-    """Captures through a see-through screen, undone with right and wrong models of it.
+class SeeThroughConfig(Section):
+    """A see-through camera and the cells before it.
 
     - `orders`: of ghosts; `band_samples`: of the colours about each pixel's Bragg wavelength, None
       for that one alone.
-    - `calibration`: measures the camera of the first model, and reconstructs with that matrix too.
     """
 
-    kind: Literal["screen"]
     hologram: HologramConfig
     screen: PlateConfig
     lens: LensConfig
@@ -188,38 +186,9 @@ class ScreenConfig(ExperimentConfig):
     object: CellsConfig
     orders: Annotated[int, Field(ge=1, le=16)] = 4
     band_samples: Annotated[int, Field(ge=1, le=64)] | None = None
-    noise: NoiseConfig
-    methods: Annotated[tuple[ScreenMethodConfig, ...], Field(min_length=1)]
-    models: Annotated[tuple[ModelConfig, ...], Field(min_length=1)]
-    calibration: CalibrationConfig | None = None
-    targets: Annotated[tuple[ScreenTargetConfig, ...], Field(min_length=1)]
-    notes: tuple[str, ...] = ()
 
     @pydantic.model_validator(mode="after")
-    def _fits(self):
-        check_names(self, "methods", "models", "targets")
-        self._check_guided()
-        if self.calibration is not None:
-            try:
-                HadamardSeries(self.object.cells)
-            except ValueError as error:
-                raise misfit(str(error), "object", "cells") from None
-            for number, model in enumerate(self.models):
-                if model.name == MEASURED:
-                    message = f"{MEASURED!r} is the name of the calibration's; give another"
-                    raise misfit(message, "models", number, "name")
-        methods = [method.name for method in self.methods]
-        for number, target in enumerate(self.targets):
-            for name in target.published:
-                if name not in methods:
-                    message = f"{name!r} is no method; choose one of {', '.join(methods)}"
-                    raise misfit(message, "targets", number, "published", name)
-        if self.noise.read_noise is not None and not self.sensor.counts:
-            message = "read_noise counts electrons; give sensor.exposure, such as 0.9, or electrons"
-            raise misfit(message, "noise", "read_noise")
-        return self
-
-    def _check_guided(self) -> None:
+    def _guided(self):
         """Light along the axis is guided, and does not step over the bottom hologram."""
         film, plate = self.hologram, self.screen
         sine = film.index * math.sin(abs(film.reference_angle))
@@ -246,3 +215,42 @@ class ScreenConfig(ExperimentConfig):
                 "mm, so that guided light steps over it; give a higher one or a thinner glass"
             )
             raise misfit(message, "screen", "bottom", "height")
+        return self
+
+
+class ScreenConfig(SeeThroughConfig, ExperimentConfig):
+    """Captures through a see-through screen, undone with right and wrong models of it.
+
+    - `calibration`: measures the camera of the first model, and reconstructs with that matrix too.
+    """
+
+    kind: Literal["screen"]
+    noise: NoiseConfig
+    methods: Annotated[tuple[ScreenMethodConfig, ...], Field(min_length=1)]
+    models: Annotated[tuple[ModelConfig, ...], Field(min_length=1)]
+    calibration: CalibrationConfig | None = None
+    targets: Annotated[tuple[ScreenTargetConfig, ...], Field(min_length=1)]
+    notes: tuple[str, ...] = ()
+
+    @pydantic.model_validator(mode="after")
+    def _fits(self):
+        check_names(self, "methods", "models", "targets")
+        if self.calibration is not None:
+            try:
+                HadamardSeries(self.object.cells)
+            except ValueError as error:
+                raise misfit(str(error), "object", "cells") from None
+            for number, model in enumerate(self.models):
+                if model.name == MEASURED:
+                    message = f"{MEASURED!r} is the name of the calibration's; give another"
+                    raise misfit(message, "models", number, "name")
+        methods = [method.name for method in self.methods]
+        for number, target in enumerate(self.targets):
+            for name in target.published:
+                if name not in methods:
+                    message = f"{name!r} is no method; choose one of {', '.join(methods)}"
+                    raise misfit(message, "targets", number, "published", name)
+        if self.noise.read_noise is not None and not self.sensor.counts:
+            message = "read_noise counts electrons; give sensor.exposure, such as 0.9, or electrons"
+            raise misfit(message, "noise", "read_noise")
+        return self

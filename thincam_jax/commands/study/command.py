@@ -15,7 +15,7 @@ def run(
     ] = None,
     set_: Overrides = None,
 ) -> None:
-    """Simulate a study and reconstruct it.
+    """Simulate a study and reconstruct it; or reconstruct a store of 'thincam capture'.
 
     Writes images, metrics.json, figures and report.html. Ctrl-C keeps what is finished; the same
     command goes on from there.
@@ -28,7 +28,7 @@ def run(
         return f"interrupted; finished: {done}. The same command goes on from there."
 
     with told(finished):
-        from thincam_jax.commands.config_file import slug
+        from thincam_jax.commands.config_file import ConfigError, slug
         from thincam_jax.commands.kinds import load_experiment
         from thincam_jax.commands.refocus.config import RefocusConfig
         from thincam_jax.commands.refocus.console import refocus
@@ -37,6 +37,13 @@ def run(
         from thincam_jax.commands.study.build import build_study
         from thincam_jax.commands.study.run import run_study
 
+        if config.is_dir():
+            from thincam_jax.commands.capture.command import reconstruct_store
+
+            if set_:
+                raise ConfigError("--set is for experiment files; a store has its own settings")
+            print(f"report: {reconstruct_store(config, out) / 'report.html'}")
+            return
         asked = load_experiment(config, tuple(set_ or ()))
         folder = RunFolder(out or Path("runs") / slug(asked.name))
         if isinstance(asked, RefocusConfig):

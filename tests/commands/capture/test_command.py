@@ -1,0 +1,333 @@
+"""`thincam capture` on the virtual rig, through the protocols of its devices, and `thincam run`."""
+
+import errno
+import fcntl
+import json
+import os
+import signal
+import stat
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from commands.capture import tiny
+from commands.test_cli import call, one_line
+
+from helpers import ROOT
+from thincam_jax.commands.capture import command
+from thincam_jax.commands.capture.config import CaptureConfig
+from thincam_jax.commands.checked_config import load_as
+from thincam_jax.hardware.acquisition.read import read_acquisition
+from thincam_jax.hardware.virtual import devices
+from thincam_jax.hardware.virtual.rig import pattern_number, read_fiducial
+
+
+@pytest.fixture(scope="module")
+def method_b(tmp_path_factory):
+    """The file and the store of a capture, taken once."""
+    folder = tmp_path_factory.mktemp("rig")
+    file = tiny.write(folder)
+    result = call("capture", file, "--out", folder / "a.zarr")
+    assert result.exit_code == 0, result.output
+    assert f"{folder / 'a.zarr'}: 6 frames; next: thincam run" in result.stdout.replace("\n", "")
+    return file, folder / "a.zarr"
+
+
+def test_an_image_of_captures_agrees_with_direct_simulation(method_b, tmp_path):
+    """Frames and image, within the noise, by a model that the virtual rig does not use."""
+    result = call("run", method_b[1], "--out", tmp_path / "out")
+    assert result.exit_code == 0, result.output
+    found = json.loads((tmp_path / "out" / "metrics.json").read_text("utf-8"))
+    agreement = found["agreement"]
+    for residual, bias in zip(
+        agreement["frame_residual_over_noise"], agreement["frame_bias_over_noise"], strict=True
+    ):
+        assert abs(residual - 1) < 0.04  # 64·96 pixels: 0.009
+        assert abs(bias) < 0.15  # of the mean of two dark frames, and 0.013
+    assert abs(agreement["image_noise_over_simulated"] - 1) < 0.3
+    scores = found["psnr_db"]
+    assert abs(scores["captured"] - scores["simulated"]) < 1.5
+    assert scores["captured"] > 17
+    assert (tmp_path / "out" / "report.html").read_text("utf-8").count("data:image/png") == 4
+
+
+def test_a_matrix_of_captures_agrees_with_direct_simulation(tmp_path):
+    file = tiny.write(tmp_path, tiny.HADAMARD)
+    result = call("capture", file, "--out", tmp_path / "a.zarr")
+    assert result.exit_code == 0, result.output
+    result = call("run", tmp_path / "a.zarr", "--out", tmp_path / "out")
+    assert result.exit_code == 0, result.output
+    found = json.loads((tmp_path / "out" / "metrics.json").read_text("utf-8"))
+    assert found["frames"] == 2 * 8 * 16 + 2
+    assert found["matrix"] == [28 * 40, 8 * 16]
+    assert abs(found["agreement"]["matrix_residual_over_noise"] - 1) < 0.02
+    assert found["agreement"]["largest_counts"] > 100 * found["agreement"]["noise_counts"]
+    assert (tmp_path / "out" / "matrix.zarr").is_dir()
+
+
+@pytest.mark.parametrize("devices", ["zaber", "grbl", "pylon"], ids=lambda name: f"with_{name}")
+def test_each_frame_is_of_the_pattern_and_the_place_that_the_plan_says(devices, tmp_path):
+    """By any camera and stage: the fiducials of the frames, read back from the store."""
+    raw = yaml.safe_load(tiny.METHOD_B)
+    raw["virtual"]["fiducial"] = True
+    if devices == "pylon":
+        raw["camera"]["driver"] = "pylon"
+    else:
+        raw["stage"] = {"driver": devices}
+        raw["plan"] = {"kind": "method_a", "betas": ["60 rad/mm^2"], "width": "1.44 mm"}
+        raw["plan"]["distances"] = ["6.5 mm", "8 mm"]
+    file = tiny.write(tmp_path, yaml.safe_dump(raw))
+    result = call("capture", file, "--out", tmp_path / "a.zarr")
+    assert result.exit_code == 0, result.output
+    taken = read_acquisition(tmp_path / "a.zarr")
+    seen = set()
+    for number, step in enumerate(taken.plan.steps):
+        fiducial = read_fiducial(taken.frame(number), taken.bits)
+        shown = command.draw(taken.plan.pattern(step), (60, 80), 0.036)
+        assert fiducial.pattern == pattern_number(shown)
+        assert abs(fiducial.position / 1000 - (step.position or 0.0)) < 0.01
+        seen.add(fiducial)
+    assert len(seen) == len(taken.plan.steps)
+
+
+def test_a_store_is_not_written_over_and_a_missing_one_not_resumed(method_b, tmp_path):
+    file, store = method_b
+    assert "exists; --resume goes on" in one_line(call("capture", file, "--out", store))
+    none = one_line(call("capture", file, "--out", tmp_path / "b.zarr", "--resume"))
+    assert "there is nothing to resume" in none
+    other = call("capture", file, "--out", store, "--resume", "--set", "plan.dark_frames=1")
+    assert "another plan" in one_line(other)
+    assert call("capture", file, "--out", store, "--resume").exit_code == 0  # complete already
+
+
+def test_after_ctrl_c_the_store_is_kept_and_goes_on(method_b, tmp_path, monkeypatch):
+    """With the same frames as a capture that was not interrupted."""
+    file, whole = method_b
+    shown = []
+    present = devices.VirtualDisplay.show
+
+    def interrupted(display, pattern):
+        present(display, pattern)
+        shown.append(1)
+        if len(shown) == 4:
+            signal.raise_signal(signal.SIGINT)
+
+    store = tmp_path / "b.zarr"
+    with monkeypatch.context() as patch:
+        patch.setattr(devices.VirtualDisplay, "show", interrupted)
+        result = call("capture", file, "--out", store)
+    assert result.exit_code == 130
+    (line,) = result.stderr.splitlines()
+    assert "interrupted; 3 of 6 frames are kept; go on with: thincam capture" in line
+    assert line.endswith(f"--out {store} --resume")
+    assert call("capture", file, "--out", store, "--resume").exit_code == 0
+    first, second = read_acquisition(whole), read_acquisition(store)
+    lit = first.lit  # a dark frame is exposed again with other noise
+    assert all(np.array_equal(first.frame(n), second.frame(n)) for n in lit[1:])
+
+
+def test_an_error_of_a_device_is_one_line_and_how_to_go_on(tmp_path):
+    file = tiny.write(tmp_path)
+    store = tmp_path / "a.zarr"
+    result = call("capture", file, "--out", store, "--set", "virtual.electrons=1e9")
+    assert result.exit_code == command.STOPPED
+    error, remedy = result.stderr.splitlines()
+    assert "of the pixels are full" in error
+    assert "1 of 6 frames are kept; go on with: thincam capture" in remedy
+    assert remedy.endswith("--resume --set 'virtual.electrons=1e9'")
+
+
+@pytest.mark.parametrize(
+    ("asked", "line"),
+    [
+        ("camera.driver=kodak", "kodak: open: there is no virtual one among the cameras; use usb"),
+        ("camera.options={gray: 1}", "options: usb3_vision has no option gray; allowed: "),
+    ],
+)
+def test_a_rig_that_cannot_be_opened(asked, line, tmp_path):
+    file = tiny.write(tmp_path)
+    result = call("capture", file, "--out", tmp_path / "a.zarr", "--set", asked)
+    assert result.exit_code in (2, command.STOPPED)
+    (told,) = result.stderr.splitlines()
+    assert line in told
+    assert not (tmp_path / "a.zarr").exists()
+
+
+@pytest.mark.parametrize(
+    ("asked", "line"),
+    [
+        ("plan.betas=[25 rad/mm^2]", "plan.betas: method_b compares two β"),
+        ("plan.cells=[8, 8]", "plan.cells: a plan of kind method_b takes betas, width, profile"),
+        ("plan.kind=method_a", "plan.distances: a plan of kind method_a needs it"),
+        ("plan.kind=hadamard", "plan.cells: a plan of kind hadamard needs it"),
+        ("virtual=null", "virtual: rig: virtual needs this section"),
+        ("targets=[]", "targets: a virtual rig looks at one; give it"),
+        ("optics=null", "optics: a plan of kind method_b needs optics"),
+        ("camera.exposure=20", "camera.exposure: 20 has no unit"),
+    ],
+)
+def test_a_file_that_does_not_fit_together(asked, line, tmp_path):
+    file = tiny.write(tmp_path)
+    assert line in one_line(call("capture", file, "--set", asked))
+
+
+def test_files_go_to_the_command_that_takes_them(tmp_path):
+    assert "give it to 'thincam capture'" in one_line(call("run", tiny.write(tmp_path)))
+    assert "a folder without config.yaml" in one_line(call("run", tmp_path))
+
+
+@pytest.mark.parametrize(
+    ("plan", "positions"),
+    [
+        ({"kind": "fringe_scan", "dark_frames": 1}, [0.0] * 5),
+        ({"kind": "method_a", "distances": ["5 mm", "6.5 mm"]}, [-1.5] * 4 + [0.0] * 4),
+        ({"kind": "psf_stack", "distances": ["16.5 mm"], "phase": "1 rad"}, [10.0]),
+    ],
+)
+def test_plans_move_the_stage_from_where_the_optics_are_known(plan, positions, tmp_path):
+    raw = yaml.safe_load(tiny.METHOD_B)
+    raw |= {"stage": {"driver": "zaber"}}
+    raw["plan"] = {"betas": ["25 rad/mm^2"], "width": "1.44 mm", **plan}
+    config = load_as(CaptureConfig, tiny.write(tmp_path, yaml.safe_dump(raw)))
+    assert [step.position for step in command.build_plan(config).steps] == positions
+
+
+@pytest.mark.parametrize("name", ["rig_virtual", "rig_hadamard"])
+def test_shipped_files(name):
+    config = load_as(CaptureConfig, ROOT / "configs" / f"{name}.yaml")
+    plan = command.build_plan(config)
+    assert len(plan.steps) == {"rig_virtual": 5, "rig_hadamard": 1032}[name]
+
+
+PLUG_IN = """
+from dataclasses import dataclass
+import numpy as np
+from thincam_jax.hardware import Camera, Display, Frame, Identity, Region
+
+
+class Screen(Display):
+    shape, identity = (60, 80), Identity("Elsewhere", "screen", "7")
+
+    @dataclass(frozen=True)
+    class Options:
+        pass
+
+    @classmethod
+    def open(cls, options):
+        return cls()
+
+    def show(self, pattern):
+        Eye.seen = float(pattern.mean())
+
+    def close(self):
+        pass
+
+
+class Eye(Camera):
+    sensor_shape, identity, seen, count = (64, 96), Identity("Elsewhere", "eye", "8"), 0.0, 0
+
+    @dataclass(frozen=True)
+    class Options:
+        gain: float = 1.0
+
+    @classmethod
+    def open(cls, options):
+        return cls()
+
+    def configure(self, settings):
+        self.settings = settings
+        return settings
+
+    def flush(self):
+        pass
+
+    def trigger_and_grab(self, timeout):
+        self.count += 1
+        pixels = np.full(self.sensor_shape, 100 + round(self.seen), np.uint16)
+        pixels[0, 0] = self.count
+        return Frame(pixels, self.count, float(self.count), self.settings.exposure, 12)
+
+    def close(self):
+        pass
+"""
+
+
+def test_a_camera_of_another_package_is_told_of_and_works(tmp_path, monkeypatch):
+    """Found by its entry point, in 'thincam doctor' and in a file of a real rig."""
+    (tmp_path / "elsewhere.py").write_text(PLUG_IN)
+    info = tmp_path / "elsewhere-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: elsewhere\nVersion: 1.0\n")
+    points = "[thincam_jax.cameras]\neye = elsewhere:Eye\n"
+    points += "[thincam_jax.displays]\nscreen = elsewhere:Screen\nbroken = nowhere_at_all:Screen\n"
+    (info / "entry_points.txt").write_text(points)
+    monkeypatch.syspath_prepend(tmp_path)
+    lines = command.known_drivers()
+    assert "driver of cameras eye, from elsewhere" in lines
+    assert "driver of stages zaber" in lines
+    (broken,) = (line for line in lines if "broken" in line)
+    assert "its library is missing (No module named 'nowhere_at_all')" in broken
+    sets = ("--set", "rig=real", "--set", "camera.driver=eye", "--set", "display.driver=screen")
+    file = tiny.write(tmp_path)
+    result = call("capture", file, "--out", tmp_path / "a.zarr", *sets)
+    assert result.exit_code == 0, result.output
+    taken = read_acquisition(tmp_path / "a.zarr")
+    assert taken.provenance["devices"]["camera"]["vendor"] == "Elsewhere"
+    assert taken.frame(taken.lit[0]).max() > 100
+
+
+def test_nothing_listens_and_no_other_user_reaches_a_device(tmp_path):
+    """The sockets of this process are the same with the devices open, and a pseudo-terminal is its
+    user's alone, behind a folder of a name that cannot be guessed."""
+    raw = yaml.safe_load(tiny.METHOD_B)
+    config = load_as(
+        CaptureConfig,
+        tiny.write(tmp_path, yaml.safe_dump({**raw, "stage": {"driver": "zaber"}})),
+    )
+    before = sockets()
+    with devices.VirtualDevices(command.virtual_rig(config)) as virtual:
+        stage, camera = virtual.stage("zaber"), virtual.camera("usb3_vision")
+        try:
+            assert sockets() == before
+            port = Path(virtual._there["stage"].port)
+            assert stat.S_IMODE(port.parent.stat().st_mode) == 0o700
+            terminal = port.resolve()
+            mode = stat.S_IMODE(terminal.stat().st_mode)
+            assert not mode & (stat.S_IRWXO | stat.S_IRGRP), oct(mode)
+            assert terminal.stat().st_uid == os.getuid()
+            assert opened_by_one_only(terminal)
+        finally:
+            stage.close()
+            camera.close()
+    assert not port.exists()
+
+
+def opened_by_one_only(terminal):
+    """Whether a second opening is refused; root's is not, but sees that it would be."""
+    try:
+        handle = os.open(terminal, os.O_RDWR | os.O_NOCTTY)
+    except OSError as error:
+        return error.errno == errno.EBUSY
+    exclusive = fcntl.ioctl(handle, 0x80045440, bytes(4))  # TIOCGEXCL
+    os.close(handle)
+    return int.from_bytes(exclusive, sys.byteorder) == 1
+
+
+def sockets():
+    """The inodes of this process' sockets that listen or are bound to an address of a network."""
+    own = set()
+    for handle in Path("/proc/self/fd").iterdir():
+        try:
+            name = os.readlink(handle)
+        except OSError:
+            continue
+        if name.startswith("socket:["):
+            own.add(name[8:-1])
+    found = set()
+    for table in ("tcp", "tcp6", "udp", "udp6", "raw", "raw6"):
+        path = Path("/proc/self/net", table)
+        lines = path.read_text().splitlines()[1:] if path.exists() else []
+        found |= {inode for line in lines if (inode := line.split()[9]) in own}
+    return found

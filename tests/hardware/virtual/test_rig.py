@@ -1,0 +1,135 @@
+import math
+import time
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy
+
+import thincam_jax as tc
+from thincam_jax.hardware import CameraSettings, Region
+from thincam_jax.hardware.virtual.optics import ModulatorOptics, MonitorOptics, cells_shown
+from thincam_jax.hardware.virtual.rig import Electronics, VirtualRig, pattern_number, read_fiducial
+from thincam_jax.imaging.operators import Matrix, Sparse
+from thincam_jax.imaging.targets import usaf1951
+from thincam_jax.units import nm, um
+
+SIDE, PITCH, BETA = 40, 36 * um, 40.0  # of the mask on the modulator
+SETTINGS = CameraSettings(exposure=0.01)
+
+
+def shown_mask(phase, shape=(48, 60)):
+    """Levels of a Fresnel zone aperture in the middle of a display."""
+    place = (np.arange(SIDE) - (SIDE - 1) / 2) * PITCH
+    amplitude = (1 + np.cos(BETA * (place[:, None] ** 2 + place**2) + phase)) / 2
+    levels = 255 * amplitude**2
+    rows, columns = ((n - SIDE) // 2 for n in shape)
+    return np.pad(np.rint(levels), ((rows, rows), (columns, columns))).astype(np.uint8)
+
+
+def modulator(fill_factor=1.0):
+    picture = usaf1951((128, 128)).astype(np.float32)
+    scene = tc.Scene(tc.ImagePlane(picture, 250.0, 60.0), 532 * nm)
+    return ModulatorOptics(scene, tc.Sensor((64, 96), 22 * um), PITCH, 6.5, 1e5, fill_factor)
+
+
+@pytest.mark.parametrize("fill_factor", [1.0, 0.58])
+def test_the_pixels_shown_are_the_mask_of_a_direct_simulation(fill_factor):
+    """Within what 8 bits round off; a pattern of another phase is another capture."""
+    optics = modulator(fill_factor)
+    mask = tc.FresnelZoneAperture(
+        BETA, 0.7, width=SIDE * PITCH, pixel_pitch=PITCH, fill_factor=fill_factor
+    )
+    camera = tc.LenslessCamera(mask, optics.sensor, 6.75)
+    direct = 1e5 * np.asarray(tc.capture(camera, optics.scene))
+    modulation = np.linalg.norm(direct - direct.mean())
+    taken = optics(shown_mask(0.7), 0.25)
+    assert np.linalg.norm(taken - direct) < 3e-3 * modulation
+    assert np.linalg.norm(optics(shown_mask(0.9), 0.25) - direct) > 0.05 * modulation
+    assert np.linalg.norm(optics(shown_mask(0.7), 0.0) - direct) > 0.02 * modulation
+
+
+def test_a_black_pattern_is_a_dark_frame():
+    assert not modulator()(np.zeros((48, 60), np.uint8), 0.0).any()
+
+
+def system(sparse=True):
+    entries = scipy.sparse.random_array((20 * 30, 32), density=0.2, rng=np.random.default_rng(1))
+    if sparse:
+        return Sparse(entries, (4, 8), (20, 30))
+    return Matrix(jnp.asarray(entries.toarray()), (4, 8), (20, 30))
+
+
+@pytest.mark.parametrize("sparse", [True, False])
+def test_cells_of_a_monitor_are_seen_by_the_given_operator(sparse):
+    cells = np.random.default_rng(2).integers(0, 2, (4, 8))
+    shown = np.pad(np.kron(cells, np.full((5, 5), 255)), ((1, 2), (3, 4))).astype(np.uint8)
+    operator = system(sparse)
+    assert np.array_equal(cells_shown(shown, (4, 8)), cells)
+    direct = 1e4 * np.asarray(operator(jnp.asarray(cells, float)))
+    assert np.allclose(MonitorOptics(operator, 1e4)(shown, 0.0), direct, rtol=1e-5)
+
+
+def rig(**options):
+    return VirtualRig(MonitorOptics(system(), 1e6), display_shape=(4, 8), **options)
+
+
+def test_counts_follow_the_exposure_with_their_noise_and_saturate():
+    """Dark level, shot and read noise as the electronics say; full scale where the well is full."""
+    electronics = Electronics(full_well=10_000.0, read_noise=20.0, offset=100.0)
+    taken = rig(electronics=electronics)
+    dark = np.stack([taken.expose(SETTINGS) for _ in range(20)]).astype(float)
+    of_an_electron = (2**12 - 1 - 100) / 10_000
+    assert abs(dark.mean() - 100) < 0.2
+    assert abs(dark.std() / (20 * of_an_electron) - 1) < 0.03
+    white = np.full((4, 8), 255, np.uint8)
+    taken.on_show(white)
+    short = CameraSettings(exposure=0.001)
+    frames = np.stack([taken.expose(short) for _ in range(100)])
+    clean = taken.clean_counts(white, 0.0, short)
+    spread = of_an_electron * np.sqrt((clean - 100) / of_an_electron + 20**2)
+    unclipped = clean < 3500
+    error = (frames.mean(axis=0) - clean)[unclipped] / spread[unclipped]
+    assert abs(error.std() / math.sqrt(1 / 100) - 1) < 0.1
+    assert taken.expose(CameraSettings(exposure=10.0)).max() == 4095
+    eight = taken.expose(CameraSettings(exposure=0.001, pixel_format="Mono8"))
+    assert np.abs(eight - clean / 16).mean() < 4
+
+
+def test_a_region_and_a_repeated_exposure():
+    """The same pattern again has other noise; in another process it begins anew."""
+    taken, again = rig(), rig()
+    region = CameraSettings(0.001, Region(3, 5, 7, 11))
+    first, second = taken.expose(region), taken.expose(region)
+    assert first.shape == (7, 11)
+    assert not np.array_equal(first, second)
+    assert np.array_equal(again.expose(region), first)
+
+
+def test_a_frame_says_in_its_corner_what_it_was_exposed_of():
+    taken = rig(fiducial=True)
+    pattern = np.random.default_rng(3).integers(0, 255, (4, 8)).astype(np.uint8)
+    taken.on_show(pattern)
+    taken.on_move(-1.25)
+    for number in range(2):
+        found = read_fiducial(taken.expose(SETTINGS), 12)
+        assert found == (pattern_number(pattern), -1250, number)
+    taken.on_show(255 - pattern)
+    assert read_fiducial(taken.expose(SETTINGS), 12) == (pattern_number(255 - pattern), -1250, 0)
+
+
+def test_before_the_display_has_answered_the_pattern_before_is_seen(monkeypatch):
+    now = [100.0]
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
+    taken = rig(fiducial=True, response=0.02)
+    black, white = np.zeros((4, 8), np.uint8), np.full((4, 8), 255, np.uint8)
+    taken.on_show(white)
+    now[0] += 0.01
+    assert read_fiducial(taken.expose(SETTINGS), 12).pattern == pattern_number(black)
+    now[0] += 0.02
+    assert read_fiducial(taken.expose(SETTINGS), 12).pattern == pattern_number(white)
+
+
+def test_a_pattern_of_another_shape_is_refused():
+    with pytest.raises(ValueError, match=r"\(4, 8\)"):
+        rig().on_show(np.zeros((8, 4), np.uint8))

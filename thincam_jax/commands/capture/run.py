@@ -1,0 +1,244 @@
+"""What `thincam run` makes of a store of captures: an image or a system matrix, and a report."""
+
+import math
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from thincam_jax._core.grids import Grid
+from thincam_jax.commands.capture import figures
+from thincam_jax.commands.capture.build import build_study, field_shape, screen_system
+from thincam_jax.commands.capture.config import CaptureConfig
+from thincam_jax.commands.page import render_page
+from thincam_jax.commands.run_folder import Progress, RunFolder, Step, carry_out
+from thincam_jax.commands.study import build
+from thincam_jax.commands.study.evaluate import sample
+from thincam_jax.commands.study.study import Reconstructor, Study
+from thincam_jax.imaging.metrics import psnr
+from thincam_jax.measured.calibration import HadamardCaptures, write_matrix
+from thincam_jax.measured.calibration.system_matrix import stored_blocks
+from thincam_jax.reconstruction import Reconstruction
+from thincam_jax.reconstruction.noise import estimate_noise
+
+_SHOWN = 3  # cells whose columns are drawn
+
+
+@dataclass(frozen=True)
+class Simulated:
+    """What a virtual rig's camera does with light, to hold its frames against direct simulation.
+
+    - `counts`: of a unit of the noise-free image; `electron`: counts of an electron.
+    - `read_noise`: in electrons; `offset`: counts that were not subtracted.
+    """
+
+    counts: float
+    electron: float
+    read_noise: float
+    offset: float
+
+    def variance(self, counts: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+        """Of a frame whose noise-free counts, without the offset, are given."""
+        return self.electron * counts + (self.electron * self.read_noise) ** 2 + 1 / 12
+
+
+@dataclass(frozen=True)
+class Taken:
+    """What was captured.
+
+    - `frames`: (capture, y, x) counts without the mean dark frame; of a Hadamard plan some only.
+    - `labels`: what was shown for each. `seconds`: of the steps of the acquisition, by name.
+    - `simulated`: of a virtual rig. `dark_frames`: whose mean was subtracted.
+    - `pixels`: the part of the sensor that was read, rows and columns.
+    """
+
+    frames: np.ndarray
+    labels: list[str]
+    shown: list[np.ndarray]
+    pixels: tuple[slice, slice]
+    seconds: Mapping[str, float] = field(default_factory=dict)
+    simulated: Simulated | None = None
+    dark_frames: int = 0
+    hadamard: HadamardCaptures | None = None
+
+
+def run_captures(
+    config: CaptureConfig, taken: Taken, folder: RunFolder, progress: Progress
+) -> dict[str, Any]:
+    """Reconstruct, compare with direct simulation where the rig was virtual, and report.
+
+    An interrupted run is done anew. Returns (and writes) the metrics.
+    """
+    folder.claim(config)
+    run = _CaptureRun(config, taken, folder)
+    carry_out(run.work, progress)
+    return run.metrics
+
+
+class _CaptureRun:
+    """Captures on their way to an image or a matrix; `metrics` grows with the steps."""
+
+    def __init__(self, config: CaptureConfig, taken: Taken, folder: RunFolder):
+        self.config, self.taken, self.folder = config, taken, folder
+        self.started = time.time()
+        self._reconstructor: Reconstructor | None = None
+        self.metrics: dict[str, Any] = {
+            "study": config.name,
+            "kind": config.kind,
+            "rig": config.rig,
+            "plan": config.plan.kind,
+            "seconds": {name: round(s, 4) for name, s in taken.seconds.items()},
+        }
+        self.work = [Step("captures", self.show)]
+        if config.plan.kind == "hadamard":
+            self.work.append(Step("system matrix", self.recover))
+        elif config.plan.kind != "psf_stack":
+            self.work.append(Step("image", self.reconstruct))
+        self.work.append(Step("report", self.report))
+
+    def show(self) -> None:
+        figures.save_frames(self.folder, self.config, self.taken.frames, self.taken.labels)
+        figures.save_shown(self.folder, self.config, self.taken.shown, self.taken.labels)
+        if self.taken.seconds:
+            figures.save_seconds(self.folder, self.taken.seconds)
+
+    def reconstruct(self) -> None:
+        frames = self.taken.frames
+        study = build_study(self.config, (frames.shape[1], frames.shape[2]))
+        captured = self._image(study, frames)
+        images = {"captured": captured}
+        if self.taken.simulated is not None:
+            images = self._compare(study, captured)
+        figures.save_images(self.folder, images, self.metrics.get("psnr_db", {}))
+        self.metrics["status"] = captured.status
+        self.metrics["object_pixel_mm"] = float(np.asarray(captured.pitch))
+
+    def _image(self, study: Study, frames: np.ndarray) -> Reconstruction:
+        if self._reconstructor is None:
+            method, seen = study.methods[0], study.config.object.distance
+            shape = field_shape(self.config, method)
+            self._reconstructor = build.build_reconstructor(study, method, shape, seen)
+        captures = jnp.asarray(frames[:, None], jnp.float32)
+        return self._reconstructor(captures, estimate_noise(captures) ** 2)
+
+    def _compare(self, study: Study, captured: Reconstruction) -> dict[str, Reconstruction]:
+        """Frames and image against direct simulation, by another model than the virtual rig's."""
+        camera, target = self.taken.simulated, study.targets[0]
+        assert camera is not None
+        exposures = study.methods[0].exposures
+        clean = camera.counts * np.stack(
+            [np.asarray(build.noise_free(study, e, target.plane)) for e in exposures]
+        )
+        variance, dark = camera.variance(clean), np.zeros(clean.shape[1:])
+        if self.taken.dark_frames:
+            dark = camera.variance(dark) / self.taken.dark_frames
+        residual = (self.taken.frames - clean - camera.offset) / np.sqrt(variance + dark)
+        of_each = residual[:, figures.without_fiducial(self.config, dark.shape)]
+        random = np.random.default_rng(self.config.seed + 1)
+
+        def simulated(noise: float) -> Reconstruction:
+            frames = np.sqrt(variance) * random.standard_normal(clean.shape)
+            frames += np.sqrt(dark) * random.standard_normal(dark.shape)  # the same in all
+            frames = noise * frames + clean + camera.offset
+            return self._image(study, frames.astype(np.float32))
+
+        images = {"captured": captured}
+        images |= {"simulated": simulated(1.0), "without noise": simulated(0.0)}
+        pixels = {name: np.squeeze(np.asarray(one.image, float)) for name, one in images.items()}
+        grid = Grid(pixels["captured"].shape, jnp.asarray(captured.pitch))
+        truth = np.asarray(sample(target.plane, grid), float)
+        scores = {name: psnr(image, truth) for name, image in pixels.items()}
+        self.metrics["psnr_db"] = {
+            name: round(score, 3) if math.isfinite(score) else None
+            for name, score in scores.items()
+        }
+        noise = [np.std(pixels[n] - pixels["without noise"]) for n in ("captured", "simulated")]
+        self.metrics["agreement"] = {
+            "frame_residual_over_noise": [round(float(np.std(z)), 4) for z in of_each],
+            "frame_bias_over_noise": [round(float(np.mean(z)), 4) for z in of_each],
+            "image_noise_over_simulated": round(float(noise[0] / noise[1]), 4),
+        }
+        return images
+
+    def recover(self) -> None:
+        """The matrix into a store, block by block; of a virtual rig, beside the exact one."""
+        captures = self.taken.hadamard
+        assert captures is not None
+        path = self.folder.path / "matrix.zarr"
+        if path.exists():  # of an interrupted run
+            import shutil
+
+            shutil.rmtree(path)
+        began = time.perf_counter()
+        write_matrix(captures, path)
+        cells = _diagonal(captures.series.object_shape)
+        numbers = [row * captures.series.object_shape[1] + column for row, column in cells]
+        columns = np.empty((len(cells), math.prod(captures.sensor_shape)), np.float32)
+        exact = self._exact() if self.taken.simulated is not None else None
+        total, count = 0.0, 0
+        for pixels, block in stored_blocks(path):
+            columns[:, pixels] = block[:, numbers].T
+            if exact is not None:
+                matrix, deviation = exact
+                left = (block - matrix[pixels].toarray()) / deviation[pixels, None]
+                # The first column takes the offset and the white frame: it is told by the others.
+                total += float(np.sum(left[:, 1:] ** 2, dtype=np.float64))
+                count += left[:, 1:].size
+        images = {"measured": columns}
+        if exact is not None:
+            images["exact"] = np.asarray(exact[0][:, numbers].toarray(), np.float32).T
+            self.metrics["agreement"] = {
+                "matrix_residual_over_noise": round(math.sqrt(total / count), 4),
+                "largest_counts": round(float(abs(exact[0]).max()), 3),
+                "noise_counts": round(float(np.sqrt(np.mean(exact[1] ** 2))), 4),
+            }
+        shape = (len(cells), *captures.sensor_shape)
+        stacks = {name: image.reshape(shape) for name, image in images.items()}
+        figures.save_columns(self.folder, self.config, cells, stacks)
+        self.metrics |= {
+            "frames": captures.series.frame_count,
+            "matrix": [math.prod(captures.sensor_shape), captures.series.cell_count],
+            "matrix_seconds": round(time.perf_counter() - began, 2),
+        }
+
+    def _exact(self) -> tuple[Any, np.ndarray]:
+        """The matrix of direct simulation in counts, and the noise of each pixel's entries."""
+        import scipy
+
+        camera, captures = self.taken.simulated, self.taken.hadamard
+        assert camera is not None and captures is not None
+        system = screen_system(self.config)
+        entries = (np.asarray(x) for x in (system.values, system.rows, system.columns))
+        values, rows, columns = entries
+        shape = math.prod(system.out_shape), math.prod(system.in_shape)
+        inside = (rows < shape[0]) & (columns < shape[1])
+        places = rows[inside], columns[inside]
+        matrix = scipy.sparse.csr_array((camera.counts * values[inside], places), shape)
+        numbers = np.arange(shape[0]).reshape(system.out_shape)[self.taken.pixels]
+        matrix = matrix[numbers.ravel()]
+        mean = np.asarray(matrix.sum(axis=1), float).ravel() / 2  # half of the cells are lit
+        of_an_entry = 2 if captures.series.display == "complementary" else 4
+        variance = of_an_entry * camera.variance(mean) / captures.series.cell_count
+        return matrix, np.sqrt(variance)
+
+    def report(self) -> None:
+        page = partial(_render, self.config, self.folder, self.metrics)
+        self.folder.complete(self.metrics, self.config.seed, self.started, page)
+
+
+def _diagonal(shape: tuple[int, int]) -> list[tuple[int, int]]:
+    """Cells (row, column) spread along a diagonal of the object."""
+    rows, columns = ((2 * np.arange(_SHOWN) + 1) * n // (2 * _SHOWN) for n in shape)
+    return [(int(row), int(column)) for row, column in zip(rows, columns, strict=True)]
+
+
+def _render(
+    config: CaptureConfig, folder: RunFolder, metrics: dict[str, Any], environment: dict[str, Any]
+) -> str:
+    shown = {"command": "capture", "environment": environment, "metrics": metrics, "warnings": ()}
+    return render_page("capture", config, folder.path / "figures", shown)

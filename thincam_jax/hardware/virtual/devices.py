@@ -1,0 +1,81 @@
+"""The devices of a virtual rig, each behind the driver that a real one has.
+
+Cameras and stages speak their own protocols: USB3 Vision to a backend of pyusb in this process, the
+vendor's emulator for pylon, Zaber and GRBL on pseudo-terminals. Only a display has no protocol of
+its own. Nothing listens on a network.
+"""
+
+from collections.abc import Mapping
+from contextlib import ExitStack
+from typing import Any
+
+from thincam_jax.hardware.base import Camera, Display, Stage
+from thincam_jax.hardware.errors import NotFound
+from thincam_jax.hardware.registry import open_device
+from thincam_jax.hardware.virtual.display import VirtualDisplay
+from thincam_jax.hardware.virtual.faults import Faults
+from thincam_jax.hardware.virtual.rig import VirtualRig
+
+
+class VirtualDevices:
+    """The devices that see and change one `VirtualRig`; a context manager.
+
+    The methods `camera`, `stage` and `display` connect, again and again, as the openers of an
+    acquisition's rig do. A device that is opened again is the same one: a stage that was homed is
+    homed, as long as it has power. `faults` are those of each, by "camera", "stage" and "display".
+    """
+
+    def __init__(self, rig: VirtualRig):
+        self.rig = rig
+        self.faults = {role: Faults() for role in ("camera", "stage", "display")}
+        self._there: dict[str, Any] = {}
+        self._powered = ExitStack()
+
+    def camera(self, driver: str, options: Mapping[str, Any] | None = None) -> Camera:
+        """Of the driver usb3_vision or pylon; `options` but for what says where the camera is."""
+        shape, faults = self.rig.optics.sensor_shape, self.faults["camera"]
+        if driver == "pylon":
+            from thincam_jax.hardware.virtual.pylon import VirtualPylonCamera
+
+            return VirtualPylonCamera(self.rig.expose, shape, faults)
+        if driver != "usb3_vision":
+            raise _none_virtual("cameras", driver, "usb3_vision or pylon")
+        from thincam_jax.hardware.virtual.usb3_vision import VirtualUsb3Vision
+
+        if "camera" not in self._there:
+            self._there["camera"] = VirtualUsb3Vision(self.rig.expose, shape, faults=faults)
+        backend = self._there["camera"]
+        return open_device("cameras", driver, {**(options or {}), "serial": "", "backend": backend})
+
+    def stage(self, driver: str, options: Mapping[str, Any] | None = None) -> Stage:
+        """Of the driver zaber or grbl; `options` but for its port."""
+        if driver not in ("zaber", "grbl"):
+            raise _none_virtual("stages", driver, "zaber or grbl")
+        if "stage" not in self._there:
+            from thincam_jax.hardware.virtual.grbl import VirtualGrbl
+            from thincam_jax.hardware.virtual.zaber import VirtualZaber
+
+            kind = VirtualZaber if driver == "zaber" else VirtualGrbl
+            device = kind(faults=self.faults["stage"], on_move=self.rig.on_move)
+            self._there["stage"] = self._powered.enter_context(device)
+        port = str(self._there["stage"].port)
+        return open_device("stages", driver, {**(options or {}), "port": port})
+
+    def display(self) -> Display:
+        """Whatever the driver: what is shown goes to the rig."""
+        shape, faults = self.rig.display_shape, self.faults["display"]
+        return VirtualDisplay(shape, self.rig.on_show, faults=faults)
+
+    def close(self) -> None:
+        """Switch off what runs."""
+        self._powered.close()
+
+    def __enter__(self) -> "VirtualDevices":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def _none_virtual(kind: str, driver: str, known: str) -> NotFound:
+    return NotFound(driver, "open", f"there is no virtual one among the {kind}", f"use {known}")

@@ -1,0 +1,258 @@
+"""What a virtual camera sees: a scene through a light modulator, or a monitor's cells."""
+
+import functools
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy
+from jaxtyping import Array, Complex, Float, UInt8
+from numpy.polynomial.legendre import leggauss
+
+from thincam_jax._core.grids import Grid, centred_indices
+from thincam_jax._core.precision import as_complex, product
+from thincam_jax.imaging.operators import AbstractOperator, CropConvolution, Sparse, kernel_grid
+from thincam_jax.imaging.operators.base import dtype_of
+from thincam_jax.imaging.scene import Scene
+from thincam_jax.imaging.sensor import Sensor
+from thincam_jax.lensless.camera import LenslessCamera
+from thincam_jax.lensless.forward import project, projected_shape
+from thincam_jax.lensless.masks.sampled import SampledMask
+from thincam_jax.lensless.propagation.chirp import chirp_integral
+from thincam_jax.lensless.propagation.path import Path
+from thincam_jax.lensless.propagation.separable import pixel_nodes
+from thincam_jax.lensless.propagation.separable_sum import SeparableSum
+
+_TERMS = 4  # of a pattern that are averaged exactly
+_POINTS = 4  # along a pixel, for what is left
+
+
+@runtime_checkable
+class Optics(Protocol):
+    """What falls on the sensor, (y, x), in electrons per second, for the pixels that are shown."""
+
+    @property
+    def sensor_shape(self) -> tuple[int, int]: ...
+
+    def __call__(
+        self, shown: UInt8[np.ndarray, "v u"], position: float
+    ) -> Float[np.ndarray, "y x"]: ...
+
+
+@dataclass(frozen=True, eq=False)
+class ModulatorOptics:
+    """A scene through a light modulator, whose pixels are the mask, on a sensor that moves.
+
+    A pixel of level g passes g/255 of the irradiance, the amplitude √(g/255); the PSF of the
+    pixels is `pixelated_psf`.
+
+    - `pixel_pitch`: of the modulator, mm; its middle is on the axis.
+    - `distance`: from modulator to sensor, mm, with the stage at 0; the stage adds to it.
+    - `electrons`: per second, of a pixel from each mm² of open aperture before a white scene.
+    - `fill_factor`: open fraction of a modulator pixel's area.
+    """
+
+    scene: Scene
+    sensor: Sensor
+    pixel_pitch: float
+    distance: float
+    electrons: float
+    fill_factor: float = 1.0
+
+    @property
+    def sensor_shape(self) -> tuple[int, int]:
+        return self.sensor.shape
+
+    def __call__(
+        self, shown: UInt8[np.ndarray, "v u"], position: float
+    ) -> Float[np.ndarray, "y x"]:
+        image = np.zeros(self.sensor.shape, np.float32)
+        pixels = np.sqrt(_middle(shown) / 255)
+        if not pixels.any():
+            return image
+        # The transmittances stand for the size of the mask only; what they do is in the PSF.
+        mask = SampledMask(pixels, self.pixel_pitch)
+        camera = LenslessCamera(mask, self.sensor, self.distance + position)
+        grid, spectrum = self.sensor.grid, self.scene.spectrum
+        for plane in self.scene.planes:
+            shape = projected_shape(camera, plane)
+            kernels = [
+                weight
+                * pixelated_psf(
+                    pixels,
+                    kernel_grid(grid, shape),
+                    camera.path(wavelength, plane.distance),
+                    pixel_pitch=self.pixel_pitch,
+                    fill_factor=self.fill_factor,
+                )
+                for wavelength, weight in zip(spectrum.wavelengths, spectrum.weights, strict=True)
+            ]
+            kernel = functools.reduce(jnp.add, kernels)
+            convolution = CropConvolution(kernel, grid.pitch, grid.shape, shape)
+            image = image + np.asarray(convolution(project(camera, plane, shape)))
+        return (self.electrons * image).astype(np.float32)
+
+
+def _middle(shown: np.ndarray) -> np.ndarray:
+    """The smallest part about the middle that holds all pixels that are not black."""
+    sides = []
+    for axis, count in enumerate(shown.shape):
+        lit = np.flatnonzero(shown.any(axis=1 - axis))
+        margin = min(lit[0], count - 1 - lit[-1]) if len(lit) else 0
+        sides.append(slice(margin, count - margin))
+    return shown[sides[0], sides[1]]
+
+
+def pixelated_psf(
+    amplitude: Float[np.ndarray, "v u"],
+    grid: Grid,
+    path: Path,
+    *,
+    pixel_pitch: float,
+    fill_factor: float = 1.0,
+) -> Float[Array, "y x"]:
+    r"""Pixel averages of the PSF of a display of square pixels, each with one transmittance.
+
+    .. math::
+        U(x, y) = \sum_{vu} A_{vu} S_v(y) S_u(x), \qquad A = \sum_r \sigma_r a_r b_r^T
+
+    S_u is the Fresnel integral over the open part of pixel u, a slit: exact within the Fresnel
+    approximation. By the singular values of A the field is a sum of separable terms, three for a
+    Fresnel zone aperture in grey, and so is the irradiance of the largest ones, whose averages over
+    pixels are one-dimensional. What is left, such as the rounding to 8 bits, is averaged over a few
+    points of each pixel.
+    """
+    left, strength, right = np.linalg.svd(amplitude, full_matrices=False)
+    down, across = left[:, :_TERMS] * strength[:_TERMS], right[:_TERMS].T
+    dtype = grid.pitch.dtype
+    mask = SampledMask(amplitude, pixel_pitch)
+    nodes = pixel_nodes(mask, grid, path, "float64" if dtype == jnp.float64 else "float32")
+    places = np.concatenate([leggauss(nodes)[0], leggauss(_POINTS)[0]]) / 2
+    offsets = grid.pitch * jnp.asarray(places, dtype)[:, None]
+    slit = jnp.asarray(pixel_pitch, dtype), jnp.asarray(fill_factor, dtype)
+    x = jnp.concatenate([grid.y + offsets, grid.x + offsets], axis=1)
+    if down.shape[0] == across.shape[0]:  # both at once: half as much to compile
+        fields = _slit_fields(x, len(down), slit, path)
+        along = fields[:, : grid.shape[0]], fields[:, grid.shape[0] :]
+    else:
+        rows, columns = x[:, : grid.shape[0]], x[:, grid.shape[0] :]
+        along = (
+            _slit_fields(rows, len(down), slit, path),
+            _slit_fields(columns, len(across), slit, path),
+        )
+    terms = jnp.asarray(down, dtype), jnp.asarray(across, dtype)
+    rest = jnp.asarray(amplitude - down @ across.T, dtype)
+    return _averaged(along, terms, rest, grid)
+
+
+@functools.partial(jax.jit, static_argnames="count")
+def _slit_fields(
+    x: Float[Array, "node n"],
+    count: int,
+    slit: tuple[Float[Array, ""], Float[Array, ""]],
+    path: Path,
+) -> Complex[Array, "node n cell"]:
+    """The one-dimensional field at x behind each of the display's open pixels alone.
+
+    `slit`: the display's pitch and fill factor.
+    """
+    b, scale = path.fresnel_curvature, path.magnification
+    sites = centred_indices(count, x.dtype) * slit[0]
+    half = slit[0] * jnp.sqrt(slit[1]) / 2
+    at = x[..., None] / scale
+    cells = chirp_integral(jnp.zeros_like(b), b, at, sites - half, sites + half)
+    return cells * as_complex(jnp.sqrt(scale / (path.wavelength * path.distance)))
+
+
+@jax.jit
+def _averaged(
+    along: tuple[Complex[Array, "node y v"], Complex[Array, "node x u"]],
+    terms: tuple[Float[Array, "v term"], Float[Array, "u term"]],
+    rest: Float[Array, "v u"],
+    grid: Grid,
+) -> Float[Array, "y x"]:
+    """`along`: the slits' fields at the nodes of the exact average, and at those of the rest."""
+    nodes = len(along[0]) - _POINTS
+    lower, upper = np.triu_indices(terms[0].shape[1])
+    shares, few = (jnp.asarray(leggauss(n)[1] / 2, grid.pitch.dtype) for n in (nodes, _POINTS))
+
+    def pairs(fields, profiles):
+        """Averages of F_r conj(F_s), r ≤ s, of the terms' one-dimensional fields."""
+        one = product(fields[:nodes], as_complex(profiles))
+        products = one[..., lower] * jnp.conj(one[..., upper])
+        return jnp.tensordot(as_complex(shares), products, axes=1).T
+
+    rows, columns = (pairs(f, p) for f, p in zip(along, terms, strict=True))
+    weights = as_complex(jnp.asarray(np.where(lower == upper, 1.0, 2.0), grid.pitch.dtype))
+    largest = SeparableSum(weights[:, None] * rows, columns, grid).image()
+    down, across = (as_complex(profiles) for profiles in terms)
+
+    def add_row(total, node):
+        main, other = product(node[0], down), product(node[0], as_complex(rest))
+
+        def add(total, inner):
+            field = product(main, product(inner[0], across).T)
+            both = field + product(other, inner[0].T)
+            change = both.real**2 + both.imag**2 - field.real**2 - field.imag**2
+            return total + node[1] * inner[1] * change, None
+
+        return jax.lax.scan(add, total, (along[1][nodes:], few))[0], None
+
+    return jax.lax.scan(add_row, largest, (along[0][nodes:], few))[0]
+
+
+@dataclass(frozen=True, eq=False)
+class MonitorOptics:
+    """Cells on a monitor before a camera whose operator is known.
+
+    The cells are the largest squares of monitor pixels that fit, about its middle; a cell's
+    radiance is the mean of its pixels' levels over 255.
+
+    - `operator`: from the cells, 1 is white, to the sensor.
+    - `electrons`: per second, for each unit of what the operator gives.
+    """
+
+    operator: AbstractOperator
+    electrons: float
+
+    def __post_init__(self):
+        operator = self.operator
+        if isinstance(operator, Sparse):  # by rows: a tenth of the time of entries in any order
+            entries = (np.asarray(x) for x in (operator.values, operator.rows, operator.columns))
+            values, rows, columns = entries
+            shape = tuple(int(np.prod(s)) for s in (operator.out_shape, operator.in_shape))
+            inside = (rows < shape[0]) & (columns < shape[1])
+            values, rows, columns = values[inside], rows[inside], columns[inside]
+            by_rows = scipy.sparse.csr_array((values, (rows, columns)), shape)
+            object.__setattr__(self, "_rows", by_rows)
+
+    @property
+    def sensor_shape(self) -> tuple[int, int]:
+        rows, columns = self.operator.out_shape
+        return rows, columns
+
+    def __call__(
+        self, shown: UInt8[np.ndarray, "v u"], position: float
+    ) -> Float[np.ndarray, "y x"]:
+        rows, columns = self.operator.in_shape
+        cells = cells_shown(shown, (rows, columns)).astype(np.float32)
+        if isinstance(self.operator, Sparse):
+            image = (self._rows @ cells.ravel()).reshape(self.sensor_shape)  # pyright: ignore
+        else:
+            image = np.asarray(self.operator(jnp.asarray(cells, dtype_of(self.operator))))
+        return self.electrons * image.astype(np.float32)
+
+
+def cells_shown(
+    shown: UInt8[np.ndarray, "v u"], cells: tuple[int, int]
+) -> Float[np.ndarray, "y x"]:
+    """Mean level over 255 of each cell: squares of pixels about the monitor's middle."""
+    side = min(have // want for have, want in zip(shown.shape, cells, strict=True))
+    if side < 1:
+        raise ValueError(f"{cells} cells do not fit a display of {shown.shape} pixels")
+    top, left = ((have - side * want) // 2 for have, want in zip(shown.shape, cells, strict=True))
+    part = shown[top : top + side * cells[0], left : left + side * cells[1]]
+    blocks = part.reshape(cells[0], side, cells[1], side)
+    return blocks.mean(axis=(1, 3), dtype=np.float64) / 255

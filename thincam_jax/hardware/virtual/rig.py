@@ -1,0 +1,178 @@
+"""One state of the rig, the pattern shown, the stage's position and the exposure, and what the
+camera sees in it by this package's own optics.
+
+The optics take the pixels that are shown, not the plan that asked for them: a wrong pattern gives a
+wrong capture.
+"""
+
+import threading
+import time
+import zlib
+from collections import Counter, OrderedDict
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, UInt8, UInt16
+
+from thincam_jax.hardware.base import CameraSettings
+from thincam_jax.hardware.virtual.optics import Optics
+
+_KEPT = 8  # images that are not computed again
+
+
+@dataclass(frozen=True)
+class Electronics:
+    """From electrons to counts: shot and read noise, an offset, saturation at the full well.
+
+    - `full_well`: electrons of the largest count without gain; `read_noise`: in electrons.
+    - `offset`: counts of a dark frame, in those of 12 bits.
+    """
+
+    full_well: float = 13_500.0
+    read_noise: float = 8.0
+    offset: float = 60.0
+
+    def counts(
+        self, electrons: Float[np.ndarray, "y x"], settings: CameraSettings, seed: list[int]
+    ) -> UInt16[np.ndarray, "y x"]:
+        """Whole numbers of the pixel format's bits. The shot noise is Gaussian, of its variance."""
+        scale, offset = self.scale(settings)
+        random = np.random.default_rng(seed)
+        noise = random.standard_normal(electrons.shape, dtype=np.float32)
+        noise *= np.sqrt(electrons + np.float32(self.read_noise**2))
+        values = (electrons + noise) * np.float32(scale) + np.float32(offset)
+        return np.clip(np.rint(values), 0, 2 ** bits_of(settings) - 1).astype(np.uint16)
+
+    def scale(self, settings: CameraSettings) -> tuple[float, float]:
+        """Counts of an electron, and those of none."""
+        offset = self.offset * 2.0 ** (bits_of(settings) - 12)
+        room = 2 ** bits_of(settings) - 1 - offset
+        return 10 ** (settings.gain / 20) * room / self.full_well, offset
+
+
+def bits_of(settings: CameraSettings) -> int:
+    """Of a pixel format such as Mono12 or Mono12p."""
+    return int("".join(c for c in settings.pixel_format if c.isdigit()))
+
+
+class Fiducial(NamedTuple):
+    """What a frame was exposed of, written into its corner for tests.
+
+    - `pattern`: checksum of the pixels shown (`pattern_number`). `position`: the stage's, µm.
+    - `exposure`: counts the exposures of that pattern at that position, from 0.
+    """
+
+    pattern: int
+    position: int
+    exposure: int
+
+
+FIDUCIAL_SHAPE = (12, 8)  # a bit a pixel
+
+
+def pattern_number(shown: UInt8[np.ndarray, "v u"]) -> int:
+    """A checksum of 32 bits of the pixels shown."""
+    return zlib.crc32(np.ascontiguousarray(shown).data)
+
+
+def read_fiducial(pixels: UInt16[np.ndarray, "y x"], bit_depth: int) -> Fiducial:
+    """From the corner of a frame of a rig that writes one."""
+    rows, columns = FIDUCIAL_SHAPE
+    bits = pixels[:rows, :columns] > 2 ** (bit_depth - 2)
+    words = np.packbits(bits).view(">u4").astype(np.int64)
+    return Fiducial(int(words[0]), int(words[1]) - 2**31, int(words[2]))
+
+
+def _write_fiducial(pixels: UInt16[np.ndarray, "y x"], fiducial: Fiducial, bit_depth: int) -> None:
+    words = np.array([fiducial.pattern, fiducial.position + 2**31, fiducial.exposure], ">u4")
+    bits = np.unpackbits(words.view(np.uint8)).reshape(FIDUCIAL_SHAPE)
+    pixels[: FIDUCIAL_SHAPE[0], : FIDUCIAL_SHAPE[1]] = bits.astype(np.uint16) * 2 ** (bit_depth - 1)
+
+
+class VirtualRig:
+    """The state that virtual devices change and see; safe to use from their threads.
+
+    `on_show` is for a display, `on_move` for a stage, `expose` for a camera. The noise of an
+    exposure depends on the pattern, the position and how often both were exposed before, so that
+    an interrupted run ends with the same frames as one that was not.
+
+    - `response`: s that the display takes; before, the pattern before is seen.
+    - `fiducial`: each frame says in its corner what it was exposed of; the corner sees no light.
+    """
+
+    def __init__(
+        self,
+        optics: Optics,
+        electronics: Electronics | None = None,
+        *,
+        display_shape: tuple[int, int],
+        response: float = 0.0,
+        fiducial: bool = False,
+        seed: int = 0,
+    ):
+        self.optics, self.electronics = optics, electronics or Electronics()
+        self.display_shape, self.response = display_shape, response
+        self.fiducial, self.seed = fiducial, seed
+        black = np.zeros(display_shape, np.uint8)
+        self._shown = self._before = pattern_number(black), black
+        self._shown_at, self._position = -np.inf, 0.0
+        self._lock = threading.RLock()
+        self._known: OrderedDict[tuple[int, int], np.ndarray] = OrderedDict()
+        self._exposures: Counter[tuple[int, int]] = Counter()
+
+    def on_show(self, pattern: UInt8[np.ndarray, "v u"]) -> None:
+        """The display presents a pattern. Its image is computed here, where nobody waits."""
+        if pattern.shape != self.display_shape:
+            raise ValueError(f"a pattern of {pattern.shape} pixels; give {self.display_shape}")
+        shown = np.array(pattern, np.uint8)
+        with self._lock:
+            number = pattern_number(shown)
+            self._before, self._shown = self._shown, (number, shown)
+            self._image(number, shown)
+            self._shown_at = time.monotonic()
+
+    def on_move(self, position: float) -> None:
+        """The stage is at a position, mm, moving or not."""
+        with self._lock:
+            self._position = position
+
+    @property
+    def position(self) -> float:
+        """Of the stage, mm."""
+        return self._position
+
+    def expose(self, settings: CameraSettings) -> UInt16[np.ndarray, "y x"]:
+        """Counts of a frame that is exposed now, of the settings' region."""
+        with self._lock:
+            settled = time.monotonic() - self._shown_at >= self.response
+            number, shown = self._shown if settled else self._before
+            state = number, round(1000 * self._position)
+            electrons = settings.exposure * self._image(number, shown)
+            exposure = self._exposures[state]
+            self._exposures[state] += 1
+        region = settings.region
+        if region is not None:
+            down = slice(region.top, region.top + region.height)
+            electrons = electrons[down, region.left : region.left + region.width]
+        seed = [self.seed, number, state[1] + 2**31, exposure]
+        pixels = self.electronics.counts(electrons, settings, seed)
+        if self.fiducial:
+            _write_fiducial(pixels, Fiducial(*state, exposure), bits_of(settings))
+        return pixels
+
+    def clean_counts(
+        self, shown: UInt8[np.ndarray, "v u"], position: float, settings: CameraSettings
+    ) -> Float[np.ndarray, "y x"]:
+        """What a frame would be without noise, rounding and saturation."""
+        scale, offset = self.electronics.scale(settings)
+        return scale * settings.exposure * self.optics(shown, position) + offset
+
+    def _image(self, number: int, shown: np.ndarray) -> np.ndarray:
+        key = number, round(1000 * self._position)
+        if key not in self._known:
+            self._known[key] = self.optics(shown, self._position)
+        self._known.move_to_end(key)
+        while len(self._known) > _KEPT:
+            self._known.popitem(last=False)
+        return self._known[key]
