@@ -72,7 +72,8 @@ config = load_as(CaptureConfig, path)
 # %% [markdown]
 # ## The capture
 #
-# For each step of the plan: move, show, settle, flush, trigger, check, keep.
+# For each step of the plan: move, show, settle, flush, trigger, check, keep. The virtual rig computes
+# what its camera will see while the pattern is shown.
 
 # %%
 plan = build_plan(config)
@@ -133,7 +134,7 @@ figure.savefig(FIGURES / "images.png", dpi=110)
 figure, ax = plt.subplots(figsize=(7, 3), layout="constrained")
 times = {name: 1000 * seconds / outcome.total for name, seconds in outcome.seconds.items()}
 bars = ax.barh(list(times), list(times.values()), color="0.45")
-ax.bar_label(bars, fmt="%.2g ms", padding=3)
+ax.bar_label(bars, [f"{time:.1f} ms" for time in times.values()], padding=3)
 ax.set(xscale="log", xlabel="mean time of a frame (ms)", ylabel="step")
 ax.margins(x=0.2)
 ax.invert_yaxis()
