@@ -72,8 +72,8 @@ config = load_as(CaptureConfig, path)
 # %% [markdown]
 # ## The capture
 #
-# For each step of the plan: move, show, settle, flush, trigger, check, keep. The virtual rig computes
-# what its camera will see while the pattern is shown.
+# For each step of the plan: move, show, settle, flush, trigger, check, keep. The virtual rig
+# computes what its camera will see while the pattern is shown.
 
 # %%
 plan = build_plan(config)

@@ -46,7 +46,8 @@ def test_nothing_is_overwritten(tmp_path):
 
 def test_unknown_kind_and_missing_folder(tmp_path):
     line = one_line(call("init", "camera"))
-    assert line.startswith("init camera: choose one of study, refocus, design, capture, design_both, ")
+    named = "study, refocus, design, capture, design_both, "
+    assert line.startswith(f"init camera: choose one of {named}")
     assert "cannot be written (No such file" in one_line(
         call("init", "study", "--out", tmp_path / "no" / "study.yaml")
     )
