@@ -29,7 +29,7 @@ Count = Annotated[int, Field(ge=1, le=65536)]
 
 
 class RegionConfig(Section):
-    """Part of the sensor, in pixels."""
+    """Part of the sensor, in pixels; an image is that of a part about the axis."""
 
     top: Annotated[int, Field(ge=0)] = 0
     left: Annotated[int, Field(ge=0)] = 0
@@ -86,7 +86,8 @@ class PlanConfig(Section):
 
     - `betas`: β of the Fresnel zone apertures, two or more for method_b, else one; `width`,
       `profile`, `phase`: of all of them.
-    - `distances`: mask-sensor distances (method_a) or depths of a point (psf_stack).
+    - `distances`: mask-sensor distances (method_a) or those of
+      what the stage carries (psf_stack; the stage of a virtual rig carries the sensor).
     - `cells`, `order`, `display`: of the Hadamard patterns.
     - `dark_frames`: in all; they are spread over the plan.
     """

@@ -128,11 +128,14 @@ class _CaptureRun:
 
     def _compare(self, study: Study, captured: Reconstruction) -> dict[str, Reconstruction]:
         """Frames and image against direct simulation, by another model than the virtual rig's."""
-        camera, target = self.taken.simulated, study.targets[0]
-        assert camera is not None
-        exposures = study.methods[0].exposures
+        camera, virtual, target = self.taken.simulated, self.config.virtual, study.targets[0]
+        assert camera is not None and virtual is not None
+        whole, part = build_study(self.config, virtual.sensor), self.taken.pixels
         clean = camera.counts * np.stack(
-            [np.asarray(build.noise_free(study, e, target.plane)) for e in exposures]
+            [
+                np.asarray(build.noise_free(whole, exposure, target.plane))[part]
+                for exposure in whole.methods[0].exposures
+            ]
         )
         variance, dark = camera.variance(clean), np.zeros(clean.shape[1:])
         if self.taken.dark_frames:
