@@ -7,11 +7,12 @@ import pytest
 from waveguide.setting import hologram
 
 import thincam_jax as tc
+from helpers import relative_l2
 from thincam_jax import waveguide as wg
 from thincam_jax.imaging.metrics import psnr
 from thincam_jax.imaging.operators import adjoint_error
 from thincam_jax.imaging.targets import resize, sample_image
-from thincam_jax.units import um
+from thincam_jax.units import deg, nm, um
 
 SENSOR = tc.Sensor((22, 30), 70.4 * um)
 
@@ -79,3 +80,68 @@ def test_cells_that_are_too_small_are_refused():
     fine = wg.ObjectPlane((500, 500), 550.0, 20.0, (0.0, 27.0))
     with pytest.raises(ValueError, match="a pixel sees 164.* cells.*give cells of at least"):
         wg.system_operator(small(), fine)
+
+
+COLOURS = ((630 * nm, 60 * deg), (532 * nm, 61.2 * deg), (460 * nm, 62.5 * deg))
+
+
+def in_colours(sensor=SENSOR, width=5.0):
+    """The plate of BK7 with a hologram of each colour and its angle, in films shrunk by 3 %."""
+    glass = wg.bk7()
+    made = {"index": glass, "thickness": 16 * um, "index_modulation": 0.01}
+    films = [wg.VolumeHologram.record(c, 0.0, a, **made).processed(0.03) for c, a in COLOURS]
+    return [wg.SeeThroughCamera(wg.Screen(f, width, glass), sensor, 6.0, 10.0) for f in films]
+
+
+def test_every_colour_has_the_ghosts_of_its_wavelength():
+    """Of the sensor's middle in thick glass: 2wp/√(n² − p²), p = λ|K_y|/2π, by the Bragg λ."""
+    sensor = tc.Sensor((1, 1), 5 * um)
+    fine = wg.ObjectPlane((4096, 7), 550.0, 0.21, (0.0, 75.0))
+    operator = wg.system_operator(in_colours(sensor, 20.0), fine, 2)
+    assert operator.in_shape == (3, 1, 4096, 7) and operator.out_shape == (3, 1, 1)
+    lit = np.asarray(operator.adjoint(jnp.ones((3, 1, 1))))[:, 0].sum(axis=-1)
+    y = (np.arange(4096) - 2047.5) * 0.03 + 75
+    steps = []
+    for (colour, angle), row in zip(COLOURS, lit, strict=True):
+        recorded = 2 * np.pi * float(wg.bk7()(jnp.asarray(colour))) / colour
+        down, along = recorded * np.sin(angle), recorded * (1 + np.cos(angle)) / 0.97
+        wavelength = colour
+        for _ in range(50):  # a contraction: the index changes little
+            index = float(wg.bk7()(jnp.asarray(wavelength)))
+            wavelength = 4 * np.pi * index * along / (down**2 + along**2)
+        guided = wavelength * down / (2 * np.pi)
+        steps.append(2 * 20 * guided / np.sqrt(index**2 - guided**2))
+        image = y < steps[-1]  # at half a step and a bit, the ghost a step further
+        places = [np.average(y[part], weights=row[part]) for part in (image, ~image)]
+        assert np.diff(places)[0] == pytest.approx(steps[-1], abs=1e-3)
+    assert np.diff(steps).min() > 2
+
+
+def test_a_colour_picture_comes_back():
+    """Each colour by its own hologram: with that of green in place of all, captures are far off."""
+    seen = wg.ObjectPlane((12, 16), 550.0, 120.0, (0.0, 27.0))
+    cameras = in_colours()
+    operator = wg.system_operator(cameras, seen, 3)
+    assert adjoint_error(operator, jax.random.key(1)) < 1e-14
+    picture = np.moveaxis(resize(sample_image("astronaut"), (12, 16)), -1, 0)
+    capture = operator(jnp.asarray(picture)[:, None])
+    alone = [wg.system_operator(one, seen, 3)(jnp.asarray(picture)) for one in cameras]
+    for n, by_own in enumerate(alone):
+        np.testing.assert_allclose(capture[n], by_own[n], atol=1e-14)
+    assert relative_l2(alone[1], capture) > 0.01
+    noise = 1e-3 * jax.random.normal(jax.random.key(0), capture.shape)
+    found = tc.reconstruct(tc.Recording(capture + noise, operator, noise_variance=1e-6), tc.Ridge())
+    assert psnr(np.asarray(found.image), picture) > 30
+
+
+def test_planes_add_up():
+    """A scene of two planes: the sum of both captures."""
+    near = wg.ObjectPlane((12, 16), 300.0, 100.0, (10.0, 27.0))
+    images = jnp.asarray(np.random.default_rng(2).uniform(size=(2, 12, 16)))
+    both = wg.system_operator(small(), [plane(), near], 2)(images)
+    each = [
+        wg.system_operator(small(), p, 2)(i) for p, i in zip((plane(), near), images, strict=True)
+    ]
+    np.testing.assert_allclose(both, sum(each), atol=1e-14)
+    with pytest.raises(ValueError, match=r"planes have \[\(12, 16\), \(9, 8\)\] cells; give"):
+        wg.system_operator(small(), [plane(), plane((9, 8))])

@@ -19,7 +19,8 @@ class InverseProblem(eqx.Module):
         \qquad f \ge 0
 
     (thesis Eq 5.11 with the crop of the sensor in A). Images have the axes (*batch, channel, plane,
-    y, x). An operator whose `in_shape` is (y, x) or (plane, y, x) serves every channel alike.
+    y, x). An operator whose `in_shape` is (y, x) or (plane, y, x) serves every channel alike;
+    that of one with all four is (channel, plane, y, x), and its capture begins with the channel.
 
     τ is relative. Its unit u is the standard deviation of a pixel of the back-projected noise
     Σ Aᵀwn, if the weights are 1/variance:
@@ -277,11 +278,10 @@ def _floating(capture) -> Array:
 def _check_operators(operators, captures) -> None:
     fields = {(*o.in_shape[-3:-2], *o.in_shape[-2:]) for o in operators}
     for operator in operators:
-        most = 4 if isinstance(operator, CropConvolution) else 3
-        if not 2 <= len(operator.in_shape) <= most:
+        if not 2 <= len(operator.in_shape) <= 4:
             raise ValueError(
                 f"a {type(operator).__name__} takes images {operator.in_shape}; give it an "
-                "in_shape (y, x) or (plane, y, x)"
+                "in_shape (y, x), (plane, y, x) or (channel, plane, y, x)"
             )
     if len(fields) > 1:
         raise ValueError(

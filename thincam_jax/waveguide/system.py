@@ -1,6 +1,7 @@
 """The see-through-screen camera as a linear operator (thesis Eq 5.10)."""
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import equinox as eqx
@@ -101,7 +102,10 @@ def smeared_rays(
 
 
 def system_operator(
-    camera: SeeThroughCamera, plane: ObjectPlane, orders: int = 4, samples: int | None = None
+    camera: SeeThroughCamera | Sequence[SeeThroughCamera],
+    plane: ObjectPlane | Sequence[ObjectPlane],
+    orders: int = 4,
+    samples: int | None = None,
 ) -> Sparse:
     r"""The capture of a lit object as the sum of its ghosts.
 
@@ -116,26 +120,66 @@ def system_operator(
 
     **Arguments**
 
+    - `camera`: or a list of one for each colour of a full-colour hologram, which differ in their
+      hologram alone. The sensor keeps the colours apart; images are then (channel, plane, y, x)
+      and captures (channel, y, x), and the level is that of each channel.
+    - `plane`: or a list of planes of as many cells, whose light adds up: a near one hides nothing.
+      Images are then (plane, y, x).
     - `orders`: how many ghosts; those that leave the hologram or miss the object do not count.
     - `samples`: parts of the band of each pixel and order, as `trace_band` divides it; None for
       the Bragg wavelength alone, without the smear of the colours beside it.
 
     Vignetting by the lens and the pixel's own response are left out.
 
-    **Errors**: ValueError where no pixel has a guided ray, and for cells below a 64th of what a
-    pixel sees.
+    **Errors**: ValueError where no pixel has a guided ray, for planes of different cells and
+    sensors of different pixels, and for cells below a 64th of what a pixel sees.
     """
-    rays = smeared_rays(camera, pixel_centres(camera), plane, orders, samples)
-    level = float(jnp.mean(jnp.sum(rays.weight, axis=0)))
-    if level == 0:
-        raise ValueError(
-            "no light reaches the sensor by this screen; waveguide.check_screen says why"
-        )
-    return Sparse(
-        system_matrix(rays, plane, float(seen_size(camera, plane)), level),
-        plane.shape,
-        camera.sensor.shape,
-    )
+    if not isinstance(camera, SeeThroughCamera):
+        return colour_operator([system_operator(c, plane, orders, samples) for c in camera])
+    return planes_operator(camera, plane, (orders, samples))
+
+
+def planes_operator(
+    camera: SeeThroughCamera,
+    plane: ObjectPlane | Sequence[ObjectPlane],
+    counts: tuple[int, int | None],
+    level: float | None = None,
+) -> Sparse:
+    """`system_operator` of one colour; `level`: what weight, mm, is 1."""
+    planes = (plane,) if isinstance(plane, ObjectPlane) else tuple(plane)
+    shape = require_same("planes", "cells", [one.shape for one in planes])
+    matrices = []
+    for one in planes:
+        rays = smeared_rays(camera, pixel_centres(camera), one, *counts)
+        level = float(jnp.mean(jnp.sum(rays.weight, axis=0))) if level is None else level
+        if level == 0:
+            raise ValueError(
+                "no light reaches the sensor by this screen; waveguide.check_screen says why"
+            )
+        matrices.append(system_matrix(rays, one, float(seen_size(camera, one)), level))
+    whole = shape if isinstance(plane, ObjectPlane) else (len(planes), *shape)
+    return Sparse(scipy.sparse.hstack(matrices), whole, camera.sensor.shape)
+
+
+def colour_operator(channels: Sequence[Sparse]) -> Sparse:
+    """Colours side by side, from images (channel, plane, y, x) to captures (channel, y, x)."""
+    image = require_same("channels", "cells", [one.in_shape for one in channels])
+    capture = require_same("channels", "pixels", [one.out_shape for one in channels])
+    size = math.prod(capture), math.prod(image)
+    blocks = []
+    for one in channels:
+        values, rows, columns = (np.asarray(part) for part in (one.values, one.rows, one.columns))
+        blocks.append(scipy.sparse.coo_array((values, (rows, columns)), shape=size))
+    image = image if len(image) == 3 else (1, *image)
+    count = len(channels)
+    return Sparse(scipy.sparse.block_diag(blocks), (count, *image), (count, *capture))
+
+
+def require_same(what: str, parts: str, shapes: Sequence[tuple[int, ...]]) -> tuple[int, ...]:
+    """The shape of all of them, of which there is one at least."""
+    if len(set(shapes)) != 1:
+        raise ValueError(f"{what} have {list(shapes)} {parts}; give at least one, all of one shape")
+    return shapes[0]
 
 
 def system_matrix(rays: SmearedRays, plane: ObjectPlane, size: float, level: float):
