@@ -1,6 +1,7 @@
 """Plans: the cheapest model of what a screen's camera sees, within a tolerance."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -21,9 +22,10 @@ from thincam_jax.waveguide.system import (
     ObjectPlane,
     footprints,
     in_cells,
+    planes_operator,
+    require_same,
     seen_size,
     smeared_rays,
-    system_matrix,
 )
 
 # Numbers of ghosts and of parts of the band that are tried; the last is the reference.
@@ -60,7 +62,7 @@ class Plan:
 
     Print it for a table. It holds for images like the one that it was made for.
 
-    - `camera`, `plane`: that it was made for.
+    - `camera`, `plane` (or a tuple of planes): that it was made for.
     - `tolerance`, `predicted_error`: relative L2 of the noise-free capture.
     - `orders`: ghosts that are modelled, of `all_orders` that can meet the object.
     - `samples`: parts of the band of each pixel and order; None: the Bragg wavelength alone.
@@ -74,7 +76,7 @@ class Plan:
     """
 
     camera: SeeThroughCamera
-    plane: ObjectPlane
+    plane: ObjectPlane | tuple[ObjectPlane, ...]
     tolerance: float
     predicted_error: float
     orders: int
@@ -110,46 +112,51 @@ class Plan:
         return "\n".join(f"{name:<{width}}  {text}" for name, text in lines)
 
     def system(self) -> Sparse | Separable:
-        """The planned operator, from the plane's cells to the sensor."""
+        """The planned operator, from the cells of the plane or planes to the sensor."""
         camera = self.camera if self.dispersion else without_dispersion(self.camera)
         with allow(self.precision, camera):
             camera, plane = cast((camera, self.plane), self.precision)
-            size = float(seen_size(camera, plane))
             counts = self.orders, self.samples
-            if not self.field_dependent:
-                return _separable(camera, plane, size, counts, self.level)
-            rays = smeared_rays(camera, pixel_centres(camera), plane, *counts)
-            matrix = system_matrix(rays, plane, size, self.level)
-            return Sparse(matrix, plane.shape, camera.sensor.shape)
+            if self.field_dependent:
+                return planes_operator(camera, plane, counts, self.level)
+            assert isinstance(plane, ObjectPlane)  # of several, no rows and columns are apart
+            return _separable(camera, plane, float(seen_size(camera, plane)), counts, self.level)
 
 
-def plan(camera: SeeThroughCamera, scene: LitPlane, *, tolerance: float) -> Plan:
+def plan(
+    camera: SeeThroughCamera, scene: LitPlane | Sequence[LitPlane], *, tolerance: float
+) -> Plan:
     r"""How to model the capture of a scene to a relative error, at the least cost.
 
     The error is ‖g − g₀‖₂/‖g₀‖₂ of the noise-free capture. g₀ has every order that can meet the
     object, 64 parts of each band, dispersion, and double precision. What is decided: how many
     orders; whether the band's smear and dispersion are modelled, and with how many parts; whether
     rows and columns can be taken apart; the precision. All are compared with g₀ at 192 pixels
-    of 24 rows; no whole capture is computed.
+    of 24 rows; no whole capture is computed. Of a scene of several planes, each of as many cells,
+    the light adds up, and rows and columns stay together.
 
     A plane wave per pixel, thin holograms and Kogelnik's efficiency are common to all models, as is
     the end of each band at |ξ| = 10π, beyond which lie some 1e-3 of the light.
 
     **Errors**: ValueError for a tolerance that is not between 0 and 1 and where no light arrives;
-    TypeError for traced numbers and for a scene that is no `LitPlane`.
+    TypeError for traced numbers and for a scene that is no `LitPlane` and holds others.
     """
     tolerance = float(checks.positive("tolerance", tolerance, "parts of one"))
     if tolerance > 1:
         raise ValueError(f"tolerance = {tolerance:g} is relative: give at most 1 (0.01 is 1 %)")
-    if not isinstance(scene, LitPlane):
-        raise TypeError(f"scene is a {type(scene).__name__}; give a waveguide.LitPlane")
+    lit = (scene,) if isinstance(scene, LitPlane) else tuple(scene)
+    for one in lit:
+        if not isinstance(one, LitPlane):
+            raise TypeError(f"scene holds {type(one).__name__}; give waveguide.LitPlane")
+    require_same("planes", "cells", [one.plane.shape for one in lit])
+    plane = scene.plane if isinstance(scene, LitPlane) else tuple(one.plane for one in lit)
     if any(checks.is_traced(leaf) for leaf in jax.tree.leaves((camera, scene))):
         raise TypeError("plan needs known numbers: call it outside of jit and grad")
-    with allow("float64", camera, scene):
-        probe = _Probe(*cast((camera, scene), "float64"))
+    with allow("float64", camera, lit):
+        probe = _Probe(*cast((camera, lit), "float64"))
         share = 1.0
         while True:
-            made = probe.plan(camera, scene.plane, tolerance, share)
+            made = probe.plan(camera, plane, tolerance, share)
             if made.meets_tolerance or share < 0.05:
                 return made
             share /= 2
@@ -174,19 +181,20 @@ class _Rays(NamedTuple):
 class _Probe:
     """A scene at some pixels: the reference, and what other models are away from it."""
 
-    def __init__(self, camera: SeeThroughCamera, scene: LitPlane):
-        self.camera, self.plane = camera, scene.plane
+    def __init__(self, camera: SeeThroughCamera, scene: tuple[LitPlane, ...]):
+        self.camera, self.planes = camera, [one.plane for one in scene]
         screen = camera.screen
         indices = screen.hologram.index, screen.glass_index
         self.dispersive = not all(isinstance(index, ConstantIndex) for index in indices)
-        self.size = float(seen_size(camera, scene.plane))
-        footprints(np.zeros((1, 2)), scene.plane, self.size)  # refuses cells that are too small
-        rows, columns = scene.plane.shape
-        self.sums = np.zeros((rows + 1, columns + 1))
-        self.sums[1:, 1:] = np.cumsum(np.cumsum(np.asarray(scene.image), axis=0), axis=1)
+        self.sizes = [float(seen_size(camera, plane)) for plane in self.planes]
+        for plane, size in zip(self.planes, self.sizes, strict=True):
+            footprints(np.zeros((1, 2)), plane, size)  # refuses cells that are too small
+        images = [np.asarray(one.image) for one in scene]
+        self.sums = [np.pad(image.cumsum(axis=0).cumsum(axis=1), ((1, 0),) * 2) for image in images]
         # The middle first, for what is shift-invariant.
         self.pixels = np.concatenate([np.zeros((1, 2)), _spread(camera)])
-        seen = _orders_seen(camera, scene.plane, self.pixels)
+        each = [_orders_seen(camera, plane, self.pixels) for plane in self.planes]
+        seen = np.max(each, axis=0)
         self.all_orders = int(seen.max())
         self._traced: dict = {}
         rays = self.rays(True, "float64")
@@ -201,7 +209,7 @@ class _Probe:
         # Weights fall as i^(−3/2), so that all that follow are at most twice I times the last.
         beyond = np.clip(seen - _ORDERS[-1], 0, 2 * _ORDERS[-1])
         tail = rays.weight[-1] * beyond / self.level
-        brightness = float(np.sqrt(np.mean(scene.image**2)))
+        brightness = sum(float(np.sqrt(np.mean(image**2))) for image in images)
         self.tail = float(np.linalg.norm(tail)) * brightness / self.norm
 
     def rays(
@@ -211,13 +219,16 @@ class _Probe:
         samples: int | None = _SAMPLES[-1],
         pixels: np.ndarray | None = None,
     ) -> _Rays:
-        """All orders, at the probe's pixels or as many others; traced once for all samples."""
+        """All orders to the first plane, at the probe's pixels or as many others.
+
+        Traced once for all samples.
+        """
         key = dispersion, precision, samples is None, None if pixels is None else pixels.tobytes()
         if key not in self._traced:
             camera = self.camera if dispersion else without_dispersion(self.camera)
             places = jnp.asarray(self.pixels if pixels is None else pixels)
             most = None if samples is None else _SAMPLES[-1]
-            camera, places, plane = cast((camera, places, self.plane), precision)
+            camera, places, plane = cast((camera, places, self.planes[0]), precision)
             found = smeared_rays(camera, places, plane, _ORDERS[-1], most)
             self._traced[key] = _Rays(*(np.asarray(part, float) for part in found))
         return _grouped(self._traced[key], samples or 1)
@@ -225,13 +236,15 @@ class _Probe:
     def seen(self, rays: _Rays, orders: int | None = None) -> np.ndarray:
         """What the pixels but the middle see of the image, (order, pixel)."""
         points, weight = rays.points[:orders, 1:], rays.weight[:orders, 1:]
-        ratio = self.size / float(self.plane.pitch)
-        rows, columns = in_cells(points, self.plane)
-        total = 0.0
-        for down, across in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
-            corner = _bilinear(self.sums, rows + down * ratio / 2, columns + across * ratio / 2)
-            total = total + down * across * corner
-        return np.mean(total, axis=-1) / ratio**2 * weight / self.level
+        slope = -self.pixels[1:] / float(self.camera.focal_distance)  # in air, whatever the order
+        seen = 0.0
+        for plane, size, sums in zip(self.planes, self.sizes, self.sums, strict=True):
+            ratio, further = size / float(plane.pitch), plane.distance - self.planes[0].distance
+            rows, columns = in_cells(points + (float(further) * slope)[:, None], plane)
+            for down, across in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
+                corner = _bilinear(sums, rows + down * ratio / 2, columns + across * ratio / 2)
+                seen = seen + down * across * np.mean(corner, axis=-1) / ratio**2
+        return seen * weight / self.level
 
     def plan(self, camera, plane, tolerance: float, share: float) -> Plan:
         """The cheapest decisions, each within its part of what the tolerance leaves."""
@@ -274,7 +287,7 @@ class _Probe:
         found = capture(dispersion, precision, samples)
         simpler = {name: _APART * self._predicted(c, precision) for name, c in simpler.items()}
         predicted = self._predicted(found, precision)
-        apart_serves = simpler["separable"] <= tolerance
+        apart_serves = len(self.planes) == 1 and simpler["separable"] <= tolerance
         return Plan(
             camera=camera,
             plane=plane,
@@ -315,7 +328,7 @@ class _Probe:
     def _shift_invariant(self, dispersion: bool, samples: int | None, orders: int):
         """The capture with the ghosts of the sensor's middle for all pixels."""
         rays = self.rays(dispersion, "float64", samples)
-        scale = -float(self.camera.lens_distance + self.plane.distance)
+        scale = -float(self.camera.lens_distance + self.planes[0].distance)
         linear = scale / float(self.camera.focal_distance) * self.pixels
         points = rays.points[:, :1] + linear[None, :, None, :]
         weight = np.broadcast_to(rays.weight[:, :1], rays.weight.shape)

@@ -67,7 +67,7 @@ def trace(
     **Arguments**
 
     - `pixels`: (x, y) on the sensor, mm from its middle.
-    - `object_distance`: d2, from the plate's front surface, mm.
+    - `object_distance`: d2, from the plate's front surface, mm; of several planes by `jax.vmap`.
     - `orders`: how many ghosts, i = 0 … orders − 1, of 2i total reflections each.
     - `extent`: of the object, (x, y) mm from the camera's axis; None is infinite.
 
