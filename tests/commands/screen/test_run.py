@@ -15,6 +15,7 @@ from thincam_jax.commands.run_folder import RunFolder
 from thincam_jax.commands.screen.build import build_setup, mistaken_rays
 from thincam_jax.commands.screen.figures import srgb
 from thincam_jax.commands.screen.run import run_screen
+from thincam_jax.imaging.targets import load_image
 from thincam_jax.units import nm
 
 
@@ -47,6 +48,29 @@ def test_without_a_calibration_there_is_a_report(tmp_path):
     metrics = run_screen(build_setup(config), RunFolder(tmp_path / "out"), Told())
     page = (tmp_path / "out" / "report.html").read_text("utf-8")
     assert "calibration" not in metrics and "Hadamard" not in page
+
+
+def test_a_full_colour_hologram_gives_a_colour_picture(tmp_path):
+    """Each channel by its own hologram, and without ghosts it is worse."""
+    overrides = (
+        "hologram.wavelength=null",
+        "hologram.colours=[630 nm, 532 nm, 460 nm]",
+        "models=[{name: right}, {name: single, mistake: no_ghosts}]",
+        "methods=[{name: CGM, kind: ridge}]",
+        "targets=[{name: face, kind: photograph, image: astronaut}]",
+    )
+    with pytest.raises(ConfigError, match="calibration: takes a hologram of one colour"):
+        tiny.experiment(tmp_path, *overrides)
+    setup = build_setup(tiny.experiment(tmp_path, *overrides, "calibration=null"))
+    light = setup.wavelengths
+    np.testing.assert_allclose(light[0] / light[1], 630 / 532, rtol=1e-12)
+    metrics = run_screen(setup, RunFolder(tmp_path / "out"), Told())
+    right, single = (
+        metrics["models"][name]["methods"]["CGM"]["mean_psnr_db"] for name in ("right", "single")
+    )
+    assert right > 25 and right > single + 3
+    image = load_image(tmp_path / "out" / "images" / "face--cgm.png")
+    assert image.shape == (8, 16, 3) and np.ptp(image, axis=-1).max() > 0.1
 
 
 @pytest.mark.thorough
@@ -156,17 +180,8 @@ def test_colours_of_wavelengths():
 @pytest.mark.parametrize(
     ("override", "part"),
     [
-        (
-            "hologram.reference_angle=40 deg",
-            "hologram.reference_angle: 40 deg is below the critical angle of 41.81 deg: light "
-            "leaves the glass",
-        ),
-        ("screen.glass_index=1.3", "screen.glass_index: a glass of index 1.3 cannot carry light"),
-        (
-            "screen.bottom.height=12 mm",
-            "screen.bottom.height: a hologram 12 mm high is smaller than one bounce of 18.19 mm",
-        ),
         ("hologram.wavelength=532", "hologram.wavelength: "),
+        ("hologram.wavelength=null", "hologram.wavelength: give it, such as 532 nm, or three"),
         ("models.1.mistake=all", "models[1].mistake: 'all' is unknown; choose one of"),
         ("methods.0.variation.tau=2", "methods[0].variation: kind ridge does not take it"),
         (
@@ -196,8 +211,25 @@ def test_faults_are_told_in_one_line_with_their_place(override, part, tmp_path):
 
 
 def test_a_fault_in_the_file_is_told_with_its_line(tmp_path):
-    with pytest.raises(ConfigError, match=r"tiny.yaml:6: hologram.reference_angle: 41 deg is "):
-        tiny.experiment(tmp_path, text=tiny.TEXT.replace("61.2 deg", "41 deg"))
+    with pytest.raises(ConfigError, match=r"tiny.yaml:6: hologram.reference_angle: "):
+        tiny.experiment(tmp_path, text=tiny.TEXT.replace("61.2 deg", "91 deg"))
+
+
+@pytest.mark.parametrize(
+    ("override", "part"),
+    [
+        ("hologram.reference_angle=40 deg", "under the critical angle of 41.81°"),
+        ("screen.glass_index=1.3", "a glass of n = 1.3 cannot carry"),
+        (
+            "screen.bottom.height=12 mm",
+            r"smaller than one bounce of the guided light, \(0, 18.19\)",
+        ),
+    ],
+)
+def test_a_plate_that_guides_no_light_is_refused(override, part, tmp_path):
+    config = tiny.experiment(tmp_path, override)
+    with pytest.raises(ConfigError, match=rf"tiny.yaml:\d+: screen: .*{part}"):
+        build_setup(config)
 
 
 def test_cells_that_are_no_power_of_two_are_told_with_their_line(tmp_path):

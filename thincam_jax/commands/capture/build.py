@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from thincam_jax import waveguide as wg
 from thincam_jax.commands.capture.config import CaptureConfig
 from thincam_jax.commands.config_file import ConfigError
-from thincam_jax.commands.screen.build import build_camera
+from thincam_jax.commands.screen.build import build_cameras
 from thincam_jax.commands.sections import PHASES, MaskConfig, SensorConfig, Synthesis
 from thincam_jax.commands.study.build import read_targets
 from thincam_jax.commands.study.study import Exposure, Method, Study
@@ -75,7 +75,8 @@ def screen_system(config: CaptureConfig) -> Sparse:
     seen = config.virtual.screen
     centre = jnp.asarray([seen.object.x, seen.object.y])
     plane = wg.ObjectPlane(seen.object.cells, seen.object.distance, seen.object.width, centre)
-    system = wg.system_operator(build_camera(seen), plane, seen.orders, seen.band_samples)
+    (camera,) = build_cameras(seen)
+    system = wg.system_operator(camera, plane, seen.orders, seen.band_samples)
     assert isinstance(system, Sparse)
     brightest = float(jnp.max(system(jnp.ones(plane.shape, system.values.dtype))))
     if not brightest > 0:

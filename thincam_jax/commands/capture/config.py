@@ -230,6 +230,9 @@ class CaptureConfig(ExperimentConfig):
         seen = virtual.screen
         if seen is None:
             raise misfit("a virtual rig for a plan of kind hadamard needs it", "virtual", "screen")
+        if seen.hologram.colours is not None:
+            message = "a plan of kind hadamard takes one colour; give wavelength in their place"
+            raise misfit(message, "virtual", "screen", "hologram", "colours")
         if seen.object.cells != plan.cells:
             message = f"the plan shows {plan.cells}; give these"
             raise misfit(message, "virtual", "screen", "object", "cells")

@@ -36,7 +36,12 @@ from thincam_jax.reconstruction import (
 )
 from thincam_jax.waveguide.efficiency import directions
 from thincam_jax.waveguide.rays import bragg_rays
-from thincam_jax.waveguide.system import seen_size, smeared_rays, system_matrix
+from thincam_jax.waveguide.system import (
+    colour_operator,
+    seen_size,
+    smeared_rays,
+    system_matrix,
+)
 
 # Wrong models, and what is wrong with them.
 MISTAKES = {
@@ -50,7 +55,7 @@ MISTAKES = {
 
 
 class Shown(NamedTuple):
-    """A target on the cells of the monitor, radiance 0 to 1."""
+    """A target on the cells of the monitor, radiance 0 to 1: (y, x) or (y, x, channel)."""
 
     config: ScreenTargetConfig
     image: np.ndarray
@@ -58,17 +63,29 @@ class Shown(NamedTuple):
 
 @dataclass(frozen=True)
 class Setup:
-    """What is simulated: the camera, the monitor before it, and what it shows."""
+    """What is simulated: the camera of each colour, the monitor before it, and what it shows."""
 
     config: ScreenConfig
-    camera: wg.SeeThroughCamera
+    cameras: tuple[wg.SeeThroughCamera, ...]
     plane: wg.ObjectPlane
     targets: tuple[Shown, ...]
 
-    def rays(self) -> wg.Rays:
-        """Of every pixel and order."""
-        pixels = wg.pixel_centres(self.camera)
-        return wg.trace(self.camera, pixels, self.plane.distance, self.config.orders)
+    @property
+    def camera(self) -> wg.SeeThroughCamera:
+        """Of the middle colour, green."""
+        return self.cameras[len(self.cameras) // 2]
+
+    def rays(self, camera: wg.SeeThroughCamera | None = None) -> wg.Rays:
+        """Of every pixel and order; by default of `camera`."""
+        camera = camera or self.camera
+        pixels = wg.pixel_centres(camera)
+        return wg.trace(camera, pixels, self.plane.distance, self.config.orders)
+
+    @property
+    def wavelengths(self) -> np.ndarray:
+        """Of each pixel's image, mm, (y, x) or (channel, y, x)."""
+        found = np.stack([np.asarray(self.rays(camera).wavelength) for camera in self.cameras])
+        return found if self.config.hologram.colours else found[0]
 
 
 def build_setup(config: ScreenConfig) -> Setup:
@@ -79,13 +96,20 @@ def build_setup(config: ScreenConfig) -> Setup:
     targets, faults = [], []
     for number, target in enumerate(config.targets):
         try:
-            targets.append(Shown(target, _picture(target, config.object.cells)))
+            targets.append(Shown(target, _picture(target, config)))
         except (ValueError, FileNotFoundError) as error:
             place = config.place_of("targets", number, "path")
             faults.append(f"{place}targets[{number}]: {error}")
-    camera, seen = build_camera(config), config.object
+    cameras, seen = build_cameras(config), config.object
     plane = wg.ObjectPlane(seen.cells, seen.distance, seen.width, jnp.asarray([seen.x, seen.y]))
-    setup = Setup(config, camera, plane, tuple(targets))
+    setup = Setup(config, cameras, plane, tuple(targets))
+    try:
+        for camera in cameras:
+            wg.check_screen(camera)
+    except ValueError as error:
+        raise ConfigError(
+            "\n".join([*faults, f"{config.place_of('screen')}screen: {error}"])
+        ) from None
     status = np.asarray(setup.rays().status)
     if not (status == wg.RayStatus.OK).any():
         most = wg.RayStatus(int(np.bincount(status.ravel()).argmax())).name.lower()
@@ -98,13 +122,20 @@ def build_setup(config: ScreenConfig) -> Setup:
     return setup
 
 
-def build_camera(
+def build_cameras(
     config: SeeThroughConfig, glass_thickness: float | None = None
-) -> wg.SeeThroughCamera:
-    """The camera, or one with another glass, mm."""
+) -> tuple[wg.SeeThroughCamera, ...]:
+    """The camera of each colour, or those with another glass, mm."""
+    return tuple(
+        _camera(config, wavelength, glass_thickness or config.screen.glass_thickness)
+        for wavelength in config.hologram.recorded
+    )
+
+
+def _camera(config: SeeThroughConfig, wavelength: float, thickness: float) -> wg.SeeThroughCamera:
     film, plate = config.hologram, config.screen
     hologram = wg.VolumeHologram.record(
-        film.wavelength,
+        wavelength,
         film.object_angle,
         film.reference_angle,
         index=film.index,
@@ -113,7 +144,7 @@ def build_camera(
     ).processed(film.shrinkage)
     screen = wg.Screen(
         hologram,
-        glass_thickness or plate.glass_thickness,
+        thickness,
         plate.glass_index,
         _rectangle(plate.top),
         _rectangle(plate.bottom),
@@ -129,11 +160,14 @@ def _rectangle(part: RectangleConfig | None) -> wg.Rectangle | None:
     return wg.Rectangle(jnp.asarray([part.x, part.y]), jnp.asarray([part.width, part.height]))
 
 
-def _picture(target: ScreenTargetConfig, cells: tuple[int, int]) -> np.ndarray:
-    picture = np.atleast_3d(read_picture(target)).mean(axis=-1)
+def _picture(target: ScreenTargetConfig, config: ScreenConfig) -> np.ndarray:
+    picture = np.atleast_3d(read_picture(target))
     if target.crop < 1:
-        picture = middle_square(picture, round(target.crop * min(picture.shape)))
-    picture = resize(picture, cells)
+        picture = middle_square(picture, round(target.crop * min(picture.shape[:2])))
+    coloured = config.hologram.colours is not None
+    picture = resize(picture if coloured else picture.mean(axis=-1), config.object.cells)
+    if coloured:
+        picture = np.broadcast_to(picture, (*config.object.cells, len(config.hologram.recorded)))
     if target.binary:
         picture = (picture > picture.mean()).astype(float)
     if picture.min() == picture.max():
@@ -148,7 +182,7 @@ def build_models(setup: Setup) -> list[Sparse]:
     """
     models = [build_model(setup, model) for model in setup.config.models]
     most = max(model.values.size for model in models)
-    outside = math.prod(setup.camera.sensor.shape), math.prod(setup.plane.shape)
+    outside = math.prod(models[0].out_shape), math.prod(models[0].in_shape)
 
     def padded(model: Sparse) -> Sparse:
         entries = model.values, model.rows, model.columns
@@ -163,10 +197,16 @@ def build_models(setup: Setup) -> list[Sparse]:
 
 def build_model(setup: Setup, model: ModelConfig) -> Sparse:
     """One of them alone."""
-    camera, plane = setup.camera, setup.plane
+    cameras = setup.cameras
     if model.glass_thickness is not None:
-        camera = build_camera(setup.config, model.glass_thickness)
-    rays = mistaken_rays(setup, camera, model.mistake)
+        cameras = build_cameras(setup.config, model.glass_thickness)
+    channels = [_model(setup, camera, model.mistake) for camera in cameras]
+    return colour_operator(channels) if setup.config.hologram.colours else channels[0]
+
+
+def _model(setup: Setup, camera: wg.SeeThroughCamera, mistake: Mistake) -> Sparse:
+    plane = setup.plane
+    rays = mistaken_rays(setup, camera, mistake)
     level = float(jnp.mean(jnp.sum(rays.weight, axis=0)))
     matrix = system_matrix(rays, plane, float(seen_size(camera, plane)), level)
     return Sparse(matrix, plane.shape, camera.sensor.shape)
@@ -210,7 +250,8 @@ def _bounce(guided: Array, index: Array) -> Array:
 
 
 class Captured(NamedTuple):
-    """Captures (target, y, x), or what is left of them, and the variance of their noise."""
+    """Captures (target, y, x), or (target, channel, y, x), or what is left of them, and the
+    variance of their noise."""
 
     images: Array
     variance: Array
@@ -218,7 +259,9 @@ class Captured(NamedTuple):
 
 def capture(setup: Setup, system: Sparse) -> Captured:
     """Every target as the sensor reads it; each has noise of its own key."""
-    images = jnp.asarray([shown.image for shown in setup.targets], system.values.dtype)
+    images = np.stack([shown.image for shown in setup.targets])
+    images = np.moveaxis(images, -1, 1) if images.ndim == 4 else images
+    images = jnp.asarray(images.reshape(-1, *system.in_shape), system.values.dtype)
     clean, sensor = system(images), setup.camera.sensor
     noise = build_noise(setup.config.noise)
     assert noise is not None  # the section is needed
@@ -230,7 +273,7 @@ def capture(setup: Setup, system: Sparse) -> Captured:
 
 
 def undo(model: AbstractOperator, method: ScreenMethodConfig, captured: Captured) -> Reconstruction:
-    """All targets at once, (target, y, x)."""
+    """All targets at once, (target, y, x) or (target, channel, y, x)."""
     options = method.variation or VariationConfig()
     solver = Ridge(method.ridge or 1.0)
     if method.kind == "admm_tv":

@@ -18,7 +18,7 @@ from thincam_jax.commands.screen import figures
 from thincam_jax.commands.screen.build import (
     Captured,
     Setup,
-    build_camera,
+    build_cameras,
     build_model,
     capture,
     undo,
@@ -129,7 +129,7 @@ class Calibration:
         """The screen from the matrix, which is let go of: another of its size may be measured."""
         setup = self.setup
         began = time.perf_counter()
-        start = build_camera(setup.config, self.options.glass_thickness)
+        (start,) = build_cameras(setup.config, self.options.glass_thickness)
         fit = fit_screen(
             self.measured.matrix,
             start,
@@ -166,7 +166,7 @@ class Calibration:
         there = replace(self.setup, plane=plane)
         true = build_model(there, config.models[0])
         captured, samples = capture(there, true), config.band_samples
-        camera = build_camera(config, self.options.glass_thickness)
+        (camera,) = build_cameras(config, self.options.glass_thickness)
         fitted = self.fitted.system(plane, samples)
         assumed = wg.system_operator(camera, plane, config.orders, samples)
         assert isinstance(fitted.operator, Sparse)

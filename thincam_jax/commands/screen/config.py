@@ -23,22 +23,37 @@ from thincam_jax.commands.sections import (
 )
 from thincam_jax.measured.calibration.hadamard import Display, HadamardSeries, Order
 from thincam_jax.measured.calibration.screen_fit import DEFAULT, PARAMETERS
-from thincam_jax.units import deg
 
 Index = Annotated[float, Field(ge=1, le=4)]
 Acute = Annotated[Angle, Field(gt=-math.pi / 2, lt=math.pi / 2)]
 
 
 class HologramConfig(Section):
-    """How both holograms are recorded; angles are in the film, from its normal."""
+    """How both holograms are recorded; angles are in the film, from its normal.
 
-    wavelength: Wavelength
+    - `colours`: of a full-colour hologram, the wavelengths of red, green and blue in place of
+      `wavelength`, recorded one after the other at the same angles.
+    """
+
+    wavelength: Wavelength | None = None
+    colours: tuple[Wavelength, Wavelength, Wavelength] | None = None
     object_angle: Acute = 0.0
     reference_angle: Acute
     index: Index = 1.5
     thickness: Length
     index_modulation: Annotated[float, Field(gt=0, le=0.5)]
     shrinkage: Annotated[float, Field(gt=-1, lt=1)] = 0.0
+
+    @pydantic.model_validator(mode="after")
+    def _fits(self):
+        if (self.wavelength is None) == (self.colours is None):
+            raise misfit("give it, such as 532 nm, or three colours in its place", "wavelength")
+        return self
+
+    @property
+    def recorded(self) -> tuple[float, ...]:
+        """Wavelengths, one for each channel of the captures."""
+        return self.colours or (self.wavelength or 0.0,)
 
 
 class RectangleConfig(Section):
@@ -114,7 +129,7 @@ class MeasuredConfig(Section):
 
 
 class ScreenTargetConfig(TargetConfig):
-    """A picture on the monitor's cells, in grey.
+    """A picture on the monitor's cells, in grey before a hologram of one colour.
 
     - `crop`: takes the middle of a picture, that part of its shorter side; `binary`: black where
       it is below its mean, else white; `published`: by the method's name.
@@ -187,36 +202,6 @@ class SeeThroughConfig(Section):
     orders: Annotated[int, Field(ge=1, le=16)] = 4
     band_samples: Annotated[int, Field(ge=1, le=64)] | None = None
 
-    @pydantic.model_validator(mode="after")
-    def _guided(self):
-        """Light along the axis is guided, and does not step over the bottom hologram."""
-        film, plate = self.hologram, self.screen
-        sine = film.index * math.sin(abs(film.reference_angle))
-        if sine <= 1:
-            critical = math.asin(1 / film.index) / deg
-            message = (
-                f"{abs(film.reference_angle) / deg:.4g} deg is below the critical angle of "
-                f"{critical:.4g} deg: light leaves the glass in place of being guided; give a "
-                "larger angle, or a film of a higher index"
-            )
-            raise misfit(message, "hologram", "reference_angle")
-        if sine >= plate.glass_index:
-            message = (
-                f"a glass of index {plate.glass_index:g} cannot carry light of "
-                f"{abs(film.reference_angle) / deg:.4g} deg in a film of index {film.index:g}; "
-                f"give an index above {sine:.4g}"
-            )
-            raise misfit(message, "screen", "glass_index")
-        bounce = 2 * plate.glass_thickness * sine / math.sqrt(plate.glass_index**2 - sine**2)
-        part = plate.bottom
-        if part is not None and part.height < bounce:
-            message = (
-                f"a hologram {part.height:g} mm high is smaller than one bounce of {bounce:.4g} "
-                "mm, so that guided light steps over it; give a higher one or a thinner glass"
-            )
-            raise misfit(message, "screen", "bottom", "height")
-        return self
-
 
 class ScreenConfig(SeeThroughConfig, ExperimentConfig):
     """Captures through a see-through screen, undone with right and wrong models of it.
@@ -236,6 +221,8 @@ class ScreenConfig(SeeThroughConfig, ExperimentConfig):
     def _fits(self):
         check_names(self, "methods", "models", "targets")
         if self.calibration is not None:
+            if self.hologram.colours is not None:
+                raise misfit("takes a hologram of one colour; drop hologram.colours", "calibration")
             try:
                 HadamardSeries(self.object.cells)
             except ValueError as error:

@@ -36,9 +36,13 @@ def srgb(wavelength: np.ndarray) -> np.ndarray:
 
 
 def in_colour(capture: np.ndarray, wavelength: np.ndarray) -> np.ndarray:
-    """A capture as an eye would see it on the sensor, turned upright: sRGB with its gamma."""
+    """A capture as an eye would see it on the sensor, turned upright: sRGB with its gamma.
+
+    Of channels (channel, y, x), each in its own light, the sum.
+    """
     level = np.clip(capture / np.percentile(capture, 99.8), 0, 1)[..., None]
     linear = level * srgb(wavelength)
+    linear = np.clip(linear.sum(axis=0), 0, 1) if linear.ndim == 4 else linear
     encoded = np.where(linear < 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
     return encoded[::-1, ::-1]
 
@@ -145,7 +149,7 @@ def save_images(
 
 
 def _panel(ax: Axes, image: np.ndarray, label: str, title: str) -> None:
-    ax.imshow(image, cmap="gray", vmin=0, vmax=1)
+    ax.imshow(np.clip(image, 0, 1), cmap="gray", vmin=0, vmax=1)
     ax.set(xticks=[], yticks=[])
     ax.set_xlabel(label, fontsize=9)
     ax.set_title(title, fontsize=9)

@@ -122,7 +122,8 @@ class _ScreenRun:
     ) -> None:
         began = time.perf_counter()
         result = undo(system, method, captured)
-        images = np.asarray(result.image, float).reshape(-1, *self.setup.plane.shape)
+        images = np.asarray(result.image, float)
+        images = np.moveaxis(images, 1, -1) if images.ndim == 4 else images
         seconds = time.perf_counter() - began
         scores = [psnr(i, t.image) for i, t in zip(images, self.setup.targets, strict=True)]
         key = name, method.name
@@ -159,8 +160,7 @@ class _ScreenRun:
             self.calibration.save_figures()
         figures.save_rays(folder, setup)
         figures.save_field(folder, setup, rays)
-        light = np.asarray(rays.wavelength)
-        images = np.asarray(self.captured.images)
+        images, light = np.asarray(self.captured.images), setup.wavelengths
         figures.save_images(folder, setup, images, light, self.found, self.scores)
         figures.save_errors(folder, setup, self.scores)
         page = partial(render, setup.config, folder, self.metrics)
