@@ -36,7 +36,7 @@ _SAMPLES = (None, 1, 2, 4, 8, 16, 32, 64)
 # of the root mean square, of the largest, where few pixels hold the error, and of both where rows
 # and columns are taken apart, which is off most at the ends of few columns.
 _ROWS, _COLUMNS = 24, 8
-_MARGIN, _LARGEST, _APART = 1.2, 1.5, 1.6
+_MARGIN, _LARGEST, _APART = 1.2, 2.5, 1.6
 # Parts of the tolerance that the decisions may use, in the order in which they are taken.
 _SHARES = {"orders": 0.4, "smear": 0.6, "dispersion": 0.4, "precision": 0.4}
 # What the sums of a capture in float32 round.
@@ -285,8 +285,9 @@ class _Probe:
             "shift-invariant": self._shift_invariant(dispersion, samples, orders),
         }
         found = capture(dispersion, precision, samples)
-        simpler = {name: _APART * self._predicted(c, precision) for name, c in simpler.items()}
-        predicted = self._predicted(found, precision)
+        rounded = shares["precision"]
+        simpler = {name: _APART * self._predicted(c, rounded) for name, c in simpler.items()}
+        predicted = self._predicted(found, rounded)
         apart_serves = len(self.planes) == 1 and simpler["separable"] <= tolerance
         return Plan(
             camera=camera,
@@ -304,11 +305,11 @@ class _Probe:
             simpler=simpler,
         )
 
-    def _predicted(self, capture: np.ndarray, precision: Precision) -> float:
+    def _predicted(self, capture: np.ndarray, rounded: float) -> float:
+        """`rounded`: what float32 adds once more, as the operator does not round as the probe."""
         away = capture - self.reference.sum(axis=0)
         largest = float(np.abs(away).max()) / self.norm
-        rounding = _SUMS if precision == "float32" else 0.0
-        return _MARGIN * self._length(away) + _LARGEST * largest + self.tail + rounding
+        return _MARGIN * self._length(away) + _LARGEST * largest + self.tail + rounded
 
     def _length(self, difference: np.ndarray) -> float:
         return float(np.linalg.norm(difference)) / self.norm

@@ -21,11 +21,8 @@ from jaxtyping import Array, Float
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Number
 from thincam_jax.waveguide.camera import SeeThroughCamera
-from thincam_jax.waveguide.efficiency import band_about
+from thincam_jax.waveguide.efficiency import band_about, in_blocks, least_nodes
 from thincam_jax.waveguide.rays import RayStatus, bragg_rays, shift
-
-# Pixels whose bands are in memory together.
-_PIXELS = 384
 
 
 class SmearedRays(NamedTuple):
@@ -57,14 +54,10 @@ def trace_band(
     """
     checks.at_least_one({"orders": orders, "samples": samples})
     distance = checks.positive("object_distance", object_distance, "mm")
-    # Nodes that hold the integrand's frequencies in ξ, and some for every sample; for most numbers
-    # of both the same, so that fewer of them change nothing else.
-    nodes = max(20 * (4 + orders), 8 * samples, 720)
-    flat = pixels.reshape(-1, 2)
-    centres, parts, weight = jax.lax.map(
+    nodes = max(least_nodes(orders), 8 * samples)
+    centres, parts, weight = in_blocks(
         lambda pixel: _one(camera, pixel, distance, (orders, samples, nodes)),
-        flat,
-        batch_size=min(_PIXELS, flat.shape[0]),
+        pixels.reshape(-1, 2),
     )
     points = centres[:, None, None, :] + parts
     shape = pixels.shape[:-1]
