@@ -43,10 +43,10 @@ VALUES = {
 
 
 def ghosts(deviation, true=TRUE, orders=3):
-    """A dot for every order of twelve pixels, with an error of measurement."""
+    """A dot for every order of twelve pixels, the middle of its band, with an error."""
     random = np.random.default_rng(0)
     pixels = random.uniform(-1, 1, (12, 2))
-    seen = wg.trace(camera(**true), jnp.asarray(pixels), 550.0, orders).points[..., :2]
+    seen = wg.trace_band(camera(**true), jnp.asarray(pixels), 550.0, orders, 1).points[:, :, 0]
     points = (np.asarray(seen) - CENTRE).reshape(-1, 2)
     noisy = points + deviation * random.normal(size=points.shape)
     return GhostPositions(
@@ -66,13 +66,24 @@ def deviations(fit, truth):
 
 
 def test_a_screen_from_a_few_ghosts():
-    """Within the errors that it claims, which the noise explains."""
+    """Within the errors that it claims; without noise, up to what the nodes of the band resolve."""
     fit = fit_screen(ghosts(0.05), camera(), plane())
     assert np.abs(deviations(fit, VALUES)).max() < 4
     assert fit.standard_errors["glass_thickness"] < 0.1
     exact = fit_screen(ghosts(1e-7), camera(), plane())
     for name, value in VALUES.items():
-        assert float(exact.values[name]) == pytest.approx(value, abs=1e-4)
+        assert float(exact.values[name]) == pytest.approx(value, abs=5e-4)
+
+
+def test_the_smear_is_in_the_model():
+    """Without it the glass is off by many standard errors, and χ² says so."""
+    measured, names = ghosts(0.01), ("glass_thickness", "object_y")
+    start = camera(**TRUE | {"glass": 5.0}), plane(centre=CENTRE)
+    fit, without = (fit_screen(measured, *start, names, samples=s) for s in (4, None))
+    truth = {name: VALUES[name] for name in names}
+    assert fit.status == "ok" and np.abs(deviations(fit, truth)).max() < 4
+    assert without.status == "poor_fit" and np.abs(deviations(without, truth)).max() > 10
+    assert "does not explain the positions: χ² is" in without.reasons[0]
 
 
 @pytest.mark.parametrize(
@@ -84,7 +95,7 @@ def test_a_screen_from_a_few_ghosts():
     ],
 )
 def test_what_positions_cannot_tell_is_said(names, told):
-    fit = fit_screen(ghosts(0.05), camera(), plane(), names)
+    fit = fit_screen(ghosts(0.05), camera(), plane(), names, samples=None)
     assert any(told in line for line in fit.reasons)
 
 
@@ -95,8 +106,8 @@ def test_another_screen_is_told():
 
 @pytest.mark.thorough
 def test_a_screen_from_its_matrix():
-    """In any unit; noise of a tenth of the largest entries."""
-    true = wg.system_operator(camera(**TRUE), plane(centre=CENTRE))
+    """In any unit; noise of a tenth of the largest entries, and the colours' smear."""
+    true = wg.system_operator(camera(**TRUE), plane(centre=CENTRE), samples=8)
     measured = matrix(true, noise=0.01)
     scaled = Matrix(40 * measured.matrix, measured.in_shape, measured.out_shape)
     fit = fit_screen(scaled, camera(), plane())
@@ -117,7 +128,7 @@ def test_another_distance_without_measuring(distance):
     """From ghosts at 550 mm, within 1 dB of the matrix of the true screen at 30 dB."""
     fit = fit_screen(ghosts(0.05), camera(pixels=(55, 55), pitch=38.4 * um), plane())
     seen = plane(distance, (0.0, 27.0), (32, 32))
-    true = wg.system_operator(camera(**TRUE, pixels=(55, 55), pitch=38.4 * um), seen)
+    true = wg.system_operator(camera(**TRUE, pixels=(55, 55), pitch=38.4 * um), seen, samples=4)
     image = resize(sample_image("camera"), (32, 32))
     clean = true(jnp.asarray(image))
     deviation = float(jnp.sqrt(jnp.mean(clean**2))) * 10**-1.5

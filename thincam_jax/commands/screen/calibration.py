@@ -136,6 +136,7 @@ class Calibration:
             setup.plane,
             self.options.fitted,
             orders=setup.config.orders,
+            samples=setup.config.band_samples,
         )
         self.fitted, true = fit, _true_values(setup)
         self.metrics["fit"] = {
@@ -167,7 +168,7 @@ class Calibration:
         true = build_model(there, config.models[0])
         captured, samples = capture(there, true), config.band_samples
         (camera,) = build_cameras(config, self.options.glass_thickness)
-        fitted = self.fitted.system(plane, samples)
+        fitted = self.fitted.system(plane)
         assumed = wg.system_operator(camera, plane, config.orders, samples)
         assert isinstance(fitted.operator, Sparse)
         # All reduced, so that one compiled program serves them.

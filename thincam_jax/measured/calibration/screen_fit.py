@@ -25,10 +25,11 @@ from thincam_jax.waveguide import (
     SeeThroughCamera,
     pixel_centres,
     system_operator,
-    trace,
 )
+from thincam_jax.waveguide.efficiency import least_nodes
 from thincam_jax.waveguide.refractive_index import changed
-from thincam_jax.waveguide.system import seen_size
+from thincam_jax.waveguide.smear import SmearedRays, band_rays
+from thincam_jax.waveguide.system import seen_size, smeared_rays
 
 # What can be fitted, its unit, and a step that is small against what it does to an image.
 PARAMETERS = {
@@ -46,13 +47,16 @@ PARAMETERS = {
     "object_y": ("mm", 0.1),
 }
 DEFAULT = ("glass_thickness", "lens_distance", "slant", "tilt", "object_x", "object_y")
+_Counts = tuple[int, int | None, int]  # of orders, of parts of the band, and of its nodes
 Status = Literal["ok", "ambiguous", "poor_fit", "not_converged"]
 
+_NODES = 160  # of the band of each pixel of a matrix: fewer than for the light itself
 _PIXELS = 400  # of the sensor whose rows of the matrix are fitted
 _BLURS = (2.0, 0.7, 0.0)  # cells, one after another
+_STEPS = 60
 _TOLERANCE = 1e-5  # of steps that change the residual by a tenth, and of the squares
 _EXPLAINED = 0.5  # of the matrix' squares, or it is another camera's
-_UNEXPLAINED = 9.0  # mean squared residual of positions over their variance
+_UNEXPLAINED = 5.0  # standard deviations of χ² of positions above its mean
 # Of JᵀJ with a unit diagonal. At this smallest eigenvalue two numbers have a correlation of 0.999.
 _AMBIGUOUS = 1e-3
 
@@ -105,13 +109,11 @@ class ScreenFit(eqx.Module):
     status: Status = eqx.field(static=True)
     reasons: tuple[str, ...] = eqx.field(static=True)
     orders: int = eqx.field(static=True)
+    samples: int | None = eqx.field(static=True)
 
-    def system(self, plane: ObjectPlane, samples: int | None = None) -> Scaled:
-        """The matrix for an object at another distance, in the unit of the measured one.
-
-        - `samples`: of the band of each pixel and order, as of `system_operator`.
-        """
-        return Scaled(system_operator(self.camera, plane, self.orders, samples), self.gain)
+    def system(self, plane: ObjectPlane) -> Scaled:
+        """The matrix for an object at another distance, in the unit of the measured one."""
+        return Scaled(system_operator(self.camera, plane, self.orders, self.samples), self.gain)
 
 
 class _State(NamedTuple):
@@ -218,7 +220,7 @@ def fit_screen(
     parameters: Sequence[str] = DEFAULT,
     *,
     orders: int = 4,
-    max_steps: int = 60,
+    samples: int | None = 4,
 ) -> ScreenFit:
     r"""Fit rays to a measured matrix, or to ghosts' positions, by least squares.
 
@@ -226,10 +228,10 @@ def fit_screen(
         a_{pc}\big(\mathbf P_i(p)\big) \Big]^2
         \qquad \text{or} \qquad \sum_g \frac{|\mathbf P_{i_g}(p_g) - \mathbf P_g|^2}{\sigma^2}
 
-    with the rays of `trace` and the part a of a pixel's view that lies in a cell. Rows of the
-    matrix are first blurred over the cells, then less and less: from a start whose ghosts are a few
-    cells off. Levenberg-Marquardt (`optimistix`), in double precision, on 400 pixels spread over
-    the sensor.
+    with the rays of `trace`, for each part of the band, and the part a of a pixel's view that lies
+    in a cell; a ghost's position is the centroid of its band. Rows of the matrix are first blurred
+    over the cells, then less and less: from a start whose ghosts are a few cells off.
+    Levenberg-Marquardt (`optimistix`), in double precision, on 400 pixels spread over the sensor.
 
     **What the data can tell.** At one distance only d1 + d2 acts. Points depend on the fringes'
     direction, `slant` and `tilt`, not on their period: the two recording angles act by half their
@@ -245,7 +247,8 @@ def fit_screen(
       about the plate's normal), "shrinkage" (further, of the film), "film_thickness",
       "index_modulation", "object_distance", "object_x", "object_y". The gain of a matrix is always
       fitted. All others are held.
-    - `orders`: how many ghosts.
+    - `orders`: how many ghosts. `samples`: parts of the band of each pixel and order, as of
+      `system_operator`; None for a matrix without smear, such as a simulated one.
 
     **Errors**: MeasurementError (a ValueError), one line, for a matrix of other sizes than the
     plane and the sensor, fewer numbers than unknowns, and unknown parameters.
@@ -258,11 +261,12 @@ def fit_screen(
     if isinstance(measured, Matrix):
         _require_sizes(measured, camera, plane)
         names, blurs = (*names, "gain"), _BLURS
-    precision = precision_of(camera.lens_distance)
+    nodes = _NODES if isinstance(measured, Matrix) else least_nodes(orders)
+    precision, counts = precision_of(camera.lens_distance), (orders, samples, nodes)
     with allow("float64", camera):
         start = cast(_State(camera, plane, jnp.ones(()), jnp.zeros(())), "float64")
         if isinstance(measured, Matrix):
-            problem = _of_matrix(measured, start, orders)
+            problem = _of_matrix(measured, start, counts)
         else:
             problem = _of_positions(measured, start, orders)
         if problem.measured.size <= len(names):
@@ -273,12 +277,12 @@ def fit_screen(
         rows, converged = problem.measured, True
         for blur in blurs:
             problem = _blurred(problem, rows, blur)
-            problem = _scaled(problem, names, orders)
-            solution = _least_squares(problem, names, orders, max_steps)
+            problem = _scaled(problem, names, counts)
+            solution = _least_squares(problem, names, counts)
             converged = bool(solution.result == optx.RESULTS.successful)
             found = problem.start.moved(names, tuple(solution.value * problem.unit))
             problem = problem._replace(start=found)
-        return cast(_report(problem, names, orders, converged), precision)
+        return cast(_report(problem, names, counts, converged), precision)
 
 
 def _require_sizes(measured: Matrix, camera: SeeThroughCamera, plane: ObjectPlane) -> None:
@@ -293,14 +297,14 @@ def _require_sizes(measured: Matrix, camera: SeeThroughCamera, plane: ObjectPlan
             )
 
 
-def _of_matrix(measured: Matrix, start: _State, orders: int) -> _Problem:
+def _of_matrix(measured: Matrix, start: _State, counts: _Counts) -> _Problem:
     rows, columns = measured.out_shape
     step = max(1.0, (rows * columns / _PIXELS) ** 0.5)
     ys, xs = (np.unique(np.arange(step / 2, n, step).astype(int)) for n in (rows, columns))
     chosen = (ys[:, None] * columns + xs).ravel()
     kept = jnp.asarray(measured.matrix[chosen], jnp.float64).reshape(-1, *start.plane.shape)
     pixels = pixel_centres(start.camera)[ys[:, None], xs].reshape(-1, 2)
-    full = _mean_weight(start.camera, start.plane, pixels, orders)
+    full = _mean_weight(start.camera, start.plane, pixels, counts)
     if not (full > 0 and jnp.sum(kept**2) > 0):
         raise MeasurementError(
             "no ray of the start reaches the object, or the matrix is 0; give another start"
@@ -309,7 +313,7 @@ def _of_matrix(measured: Matrix, start: _State, orders: int) -> _Problem:
     problem = _Problem(start, kept, pixels, None, jnp.ones(1), jnp.ones(()), full, zero)
     # The gain is linear: what fits best at the start, at the widest blur.
     problem = _blurred(problem, kept, _BLURS[0])
-    model = _model(start, problem, orders)
+    model = _model(start, problem, counts)
     gain = jnp.sum(model * problem.measured) / jnp.sum(model**2)
     start = start._replace(gain=jnp.where(gain > 0, gain, 1.0))
     return problem._replace(start=start, measured=kept)
@@ -336,52 +340,52 @@ def _blurred(problem: _Problem, rows: Array, blur: float) -> _Problem:
     return problem._replace(measured=rows, blur=jnp.asarray(blur), scale=scale)
 
 
-def _scaled(problem: _Problem, names: tuple[str, ...], orders: int) -> _Problem:
+def _scaled(problem: _Problem, names: tuple[str, ...], counts: _Counts) -> _Problem:
     """With steps that each change the residual by a tenth of what was measured."""
     units = jnp.asarray([PARAMETERS[n][1] if n in PARAMETERS else 1.0 for n in names])
     unscaled = problem._replace(unit=units)
-    lengths = jnp.linalg.norm(_jacobian(unscaled, names, orders), axis=0)
+    lengths = jnp.linalg.norm(_jacobian(unscaled, names, counts), axis=0)
     size = 0.1 * jnp.linalg.norm(problem.measured * problem.scale)
     return problem._replace(unit=units * size / jnp.where(lengths > 0, lengths, size))
 
 
 def _residual(steps, args):
-    problem, names, orders = args
+    problem, names, counts = args
     state = problem.start.moved(names, tuple(steps * problem.unit))
-    return ((_model(state, problem, orders) - problem.measured) * problem.scale).reshape(-1)
+    return ((_model(state, problem, counts) - problem.measured) * problem.scale).reshape(-1)
 
 
 @eqx.filter_jit
-def _least_squares(problem: _Problem, names: tuple[str, ...], orders: int, max_steps: int):
+def _least_squares(problem: _Problem, names: tuple[str, ...], counts: _Counts):
     solver = optx.LevenbergMarquardt(rtol=_TOLERANCE, atol=_TOLERANCE)
-    args = (problem, names, orders)
+    args = (problem, names, counts)
     none = jnp.zeros_like(problem.unit)
     options = {"jac": "fwd"}
     return optx.least_squares(
-        _residual, solver, none, args, options=options, max_steps=max_steps, throw=False
+        _residual, solver, none, args, options=options, max_steps=_STEPS, throw=False
     )
 
 
 @eqx.filter_jit
-def _jacobian(problem: _Problem, names: tuple[str, ...], orders: int):
+def _jacobian(problem: _Problem, names: tuple[str, ...], counts: _Counts):
     none = jnp.zeros_like(problem.unit)
-    return jax.jacfwd(_residual)(none, (problem, names, orders))
+    return jax.jacfwd(_residual)(none, (problem, names, counts))
 
 
 @eqx.filter_jit
-def _model(state: _State, problem: _Problem, orders: int):
+def _model(state: _State, problem: _Problem, counts: _Counts):
     """The rows of the matrix, (pixel, y, x), or the points from the object's middle."""
-    camera, plane = state.camera, state.plane
-    rays = trace(camera, problem.pixels, plane.distance, orders)
+    plane = state.plane
+    rays = _rays(state.camera, plane, problem.pixels, counts)
     if problem.orders is not None:
         place = jnp.arange(problem.pixels.shape[0])
-        return rays.points[problem.orders, place, :2] - plane.centre
-    size = seen_size(camera, plane)
+        return jnp.mean(rays.points, axis=-2)[problem.orders, place] - plane.centre
+    size = seen_size(state.camera, plane)
     down, across = (
         _parts(rays.points[..., axis], plane, axis, size, problem.blur) for axis in (1, 0)
     )
-    weight = state.gain * rays.weight / problem.full
-    return jnp.einsum("op,opy,opx->pyx", weight, down, across)
+    weight = state.gain * rays.weight / problem.full / rays.points.shape[2]
+    return jnp.einsum("op,opsy,opsx->pyx", weight, down, across)
 
 
 def _parts(points, plane: ObjectPlane, axis: int, size, blur):
@@ -403,29 +407,41 @@ def _parts(points, plane: ObjectPlane, axis: int, size, blur):
     return jnp.diff(left, axis=-1) * plane.pitch / size
 
 
-def _mean_weight(camera: SeeThroughCamera, plane: ObjectPlane, pixels, orders: int):
+def _rays(camera: SeeThroughCamera, plane: ObjectPlane, pixels, counts: _Counts) -> SmearedRays:
+    orders, samples, nodes = counts
+    if samples is None:
+        return smeared_rays(camera, pixels, plane, orders, samples)
+    return band_rays(camera, pixels, plane.distance, (orders, samples, max(nodes, 8 * samples)))
+
+
+@eqx.filter_jit
+def _mean_weight(camera: SeeThroughCamera, plane: ObjectPlane, pixels, counts: _Counts):
     """Of a pixel's ghosts together, as `system_operator` takes it for 1."""
-    rays = trace(camera, pixels, plane.distance, orders)
-    return jnp.mean(jnp.sum(rays.weight, axis=0))
+    return jnp.mean(jnp.sum(_rays(camera, plane, pixels, counts).weight, axis=0))
 
 
-def _report(problem: _Problem, names, orders: int, converged: bool) -> ScreenFit:
-    found = problem.start
+def _report(problem: _Problem, names, counts: _Counts, converged: bool) -> ScreenFit:
+    found, (orders, samples, _) = problem.start, counts
     none = jnp.zeros_like(problem.unit)
-    residual = np.asarray(_residual(none, (problem, names, orders)))
-    slopes, squares = np.asarray(_jacobian(problem, names, orders)), float(residual @ residual)
+    residual = np.asarray(_residual(none, (problem, names, counts)))
+    slopes, squares = np.asarray(_jacobian(problem, names, counts)), float(residual @ residual)
     curvature = slopes.T @ slopes
     explained = 1 - squares / float(jnp.sum((problem.measured * problem.scale) ** 2))
     of_matrix = problem.orders is None
-    mean = squares / (residual.size - len(names))
+    freedom = residual.size - len(names)
+    mean = squares / freedom
     known: Covariance = covariance(curvature, mean if of_matrix else 1.0)
     errors = known.standard_errors * np.asarray(problem.unit)
     gain = found.gain
     if of_matrix:
-        everywhere = _mean_weight(found.camera, found.plane, pixel_centres(found.camera), orders)
+        everywhere = _mean_weight(found.camera, found.plane, pixel_centres(found.camera), counts)
         gain, errors[-1] = (float(everywhere / problem.full) * v for v in (gain, errors[-1]))
-    sound = explained >= _EXPLAINED if of_matrix else mean <= _UNEXPLAINED
-    status, reasons = _status(converged, sound, _alike(names, curvature), explained)
+    poor = ""
+    if of_matrix and explained < _EXPLAINED:
+        poor = f"the model explains {max(0.0, explained):.1%} of what was measured"
+    elif not of_matrix and mean > 1 + _UNEXPLAINED * (2 / freedom) ** 0.5:
+        poor = f"the model does not explain the positions: χ² is {mean:.3g} per degree of freedom"
+    status, reasons = _status(converged, poor, _alike(names, curvature))
     values = {n: jnp.asarray(found.value(n)) for n in names} | ({"gain": gain} if of_matrix else {})
     return ScreenFit(
         found.camera,
@@ -438,6 +454,7 @@ def _report(problem: _Problem, names, orders: int, converged: bool) -> ScreenFit
         status,
         reasons,
         orders,
+        samples,
     )
 
 
@@ -459,19 +476,17 @@ def _alike(names: tuple[str, ...], curvature: np.ndarray) -> list[str]:
     return lines
 
 
-def _status(
-    converged: bool, sound: bool, alike: list[str], explained: float
-) -> tuple[Status, tuple[str, ...]]:
+def _status(converged: bool, poor: str, alike: list[str]) -> tuple[Status, tuple[str, ...]]:
     status: Status = "ambiguous" if alike else "ok"
     reasons = list(alike)
-    if not sound:
+    if poor:
         status = "poor_fit"
         reasons.insert(
             0,
-            f"the model explains {max(0.0, explained):.1%} of what was measured, too little for "
-            "its noise: it is another camera, or further from the start than a few cells",
+            f"{poor}; it is another camera, further from the start than a few cells, or positions "
+            "are less accurate than their deviation says",
         )
     if not converged:
         status = "not_converged"
-        reasons.insert(0, "least squares did not converge; try max_steps, or fewer parameters")
+        reasons.insert(0, "least squares did not converge; try fewer parameters, or a nearer start")
     return status, tuple(reasons)
