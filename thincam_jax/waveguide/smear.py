@@ -55,23 +55,14 @@ def trace_band(
     checks.at_least_one({"orders": orders, "samples": samples})
     distance = checks.positive("object_distance", object_distance, "mm")
     nodes = max(least_nodes(orders), 8 * samples)
-    return band_rays(camera, pixels, distance, (orders, samples, nodes))
-
-
-def band_rays(
-    camera: SeeThroughCamera,
-    pixels: Float[Array, "*pixel 2"],
-    distance: Float[Array, ""],
-    counts: tuple[int, int, int],
-) -> SmearedRays:
-    """`trace_band` with `counts`: orders, samples, and nodes of the band."""
     centres, parts, weight = in_blocks(
-        lambda pixel: _one(camera, pixel, distance, counts), pixels.reshape(-1, 2)
+        lambda pixel: _one(camera, pixel, distance, (orders, samples, nodes)),
+        pixels.reshape(-1, 2),
     )
     points, shape = centres[:, None, None, :] + parts, pixels.shape[:-1]
     return SmearedRays(
-        jnp.moveaxis(points, 1, 0).reshape(counts[0], *shape, counts[1], 2),
-        weight.T.reshape(counts[0], *shape),
+        jnp.moveaxis(points, 1, 0).reshape(orders, *shape, samples, 2),
+        weight.T.reshape(orders, *shape),
     )
 
 

@@ -281,3 +281,8 @@ def undo(model: AbstractOperator, method: ScreenMethodConfig, captured: Captured
         solver = AdmmTV(options.tau, variation=variation, iterations=options.iterations)
     variance = captured.variance[None]
     return reconstruct(Recording(captured.images[None], [model], noise_variance=variance), solver)
+
+
+def rounded(score: float) -> float | None:
+    """A PSNR, dB, for metrics; None where nothing differs, which JSON has no number for."""
+    return round(score, 3) if math.isfinite(score) else None

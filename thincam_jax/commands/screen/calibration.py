@@ -21,6 +21,7 @@ from thincam_jax.commands.screen.build import (
     build_cameras,
     build_model,
     capture,
+    rounded,
     undo,
 )
 from thincam_jax.commands.screen.config import CalibrationConfig
@@ -186,9 +187,9 @@ class Calibration:
             self.images[f"{distance:g} mm"][name] = images
             found = [psnr(i, t.image) for i, t in zip(images, there.targets, strict=True)]
             scores[name] = {
-                "mean_psnr_db": round(float(np.mean(found)), 3),
+                "mean_psnr_db": rounded(float(np.mean(found))),
                 "targets": {
-                    t.config.name: round(score, 3) if math.isfinite(score) else None
+                    t.config.name: rounded(score)
                     for t, score in zip(there.targets, found, strict=True)
                 },
             }

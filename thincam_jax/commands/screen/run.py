@@ -1,6 +1,5 @@
 """Running a screen experiment: rays, captures, and what each model of the camera gives back."""
 
-import math
 import resource
 import sys
 import time
@@ -22,6 +21,7 @@ from thincam_jax.commands.screen.build import (
     build_models,
     build_setup,
     capture,
+    rounded,
     undo,
 )
 from thincam_jax.commands.screen.calibration import Calibration
@@ -129,13 +129,13 @@ class _ScreenRun:
         key = name, method.name
         self.found[key], self.scores[key] = images, scores
         self.models[name]["methods"][method.name] = {
-            "mean_psnr_db": round(float(np.mean(scores)), 3),
+            "mean_psnr_db": rounded(float(np.mean(scores))),
             "seconds_per_image": round(seconds / len(images), 3),
             "status": result.status,
             "iterations": result.iterations,
             "targets": {
                 target.config.name: {
-                    "psnr_db": round(score, 3) if math.isfinite(score) else None,
+                    "psnr_db": rounded(score),
                     "ssim": round(ssim(image, target.image), 4),
                 }
                 for target, score, image in zip(self.setup.targets, scores, images, strict=True)

@@ -25,11 +25,11 @@ from thincam_jax.waveguide import (
     SeeThroughCamera,
     pixel_centres,
     system_operator,
+    trace,
+    trace_band,
 )
-from thincam_jax.waveguide.efficiency import least_nodes
 from thincam_jax.waveguide.refractive_index import changed
-from thincam_jax.waveguide.smear import SmearedRays, band_rays
-from thincam_jax.waveguide.system import seen_size, smeared_rays
+from thincam_jax.waveguide.system import seen_size
 
 # What can be fitted, its unit, and a step that is small against what it does to an image.
 PARAMETERS = {
@@ -47,10 +47,8 @@ PARAMETERS = {
     "object_y": ("mm", 0.1),
 }
 DEFAULT = ("glass_thickness", "lens_distance", "slant", "tilt", "object_x", "object_y")
-_Counts = tuple[int, int | None, int]  # of orders, of parts of the band, and of its nodes
 Status = Literal["ok", "ambiguous", "poor_fit", "not_converged"]
 
-_NODES = 160  # of the band of each pixel of a matrix: fewer than for the light itself
 _PIXELS = 400  # of the sensor whose rows of the matrix are fitted
 _BLURS = (2.0, 0.7, 0.0)  # cells, one after another
 _STEPS = 60
@@ -201,6 +199,8 @@ class _Problem(NamedTuple):
     """Measured numbers and where they come from.
 
     `unit`: of steps. `scale`: one over the residual's unit. `full`: mean weight of a pixel.
+    `smear`: of equal parts of the band from the Bragg wavelength's points, mm. It changes by a
+    small part where the screen does: each blur takes it from its start.
     """
 
     start: _State
@@ -211,6 +211,7 @@ class _Problem(NamedTuple):
     scale: Array
     full: Array
     blur: Array
+    smear: Array
 
 
 def fit_screen(
@@ -257,16 +258,15 @@ def fit_screen(
         raise ValueError(f"parameters = {parameters!r}: give a tuple of different names")
     for name in parameters:
         checks.choice("a name in parameters", name, PARAMETERS)
-    names, blurs = tuple(parameters), (0.0,)
+    names, blurs = tuple(parameters), (0.0,) * 4
     if isinstance(measured, Matrix):
         _require_sizes(measured, camera, plane)
         names, blurs = (*names, "gain"), _BLURS
-    nodes = _NODES if isinstance(measured, Matrix) else least_nodes(orders)
-    precision, counts = precision_of(camera.lens_distance), (orders, samples, nodes)
+    precision = precision_of(camera.lens_distance)
     with allow("float64", camera):
         start = cast(_State(camera, plane, jnp.ones(()), jnp.zeros(())), "float64")
         if isinstance(measured, Matrix):
-            problem = _of_matrix(measured, start, counts)
+            problem = _of_matrix(measured, start, orders)
         else:
             problem = _of_positions(measured, start, orders)
         if problem.measured.size <= len(names):
@@ -276,13 +276,14 @@ def fit_screen(
             )
         rows, converged = problem.measured, True
         for blur in blurs:
+            problem = problem._replace(smear=_smear(problem, orders, samples))
             problem = _blurred(problem, rows, blur)
-            problem = _scaled(problem, names, counts)
-            solution = _least_squares(problem, names, counts)
+            problem = _scaled(problem, names, orders)
+            solution = _least_squares(problem, names, orders)
             converged = bool(solution.result == optx.RESULTS.successful)
             found = problem.start.moved(names, tuple(solution.value * problem.unit))
             problem = problem._replace(start=found)
-        return cast(_report(problem, names, counts, converged), precision)
+        return cast(_report(problem, names, (orders, samples), converged), precision)
 
 
 def _require_sizes(measured: Matrix, camera: SeeThroughCamera, plane: ObjectPlane) -> None:
@@ -297,23 +298,23 @@ def _require_sizes(measured: Matrix, camera: SeeThroughCamera, plane: ObjectPlan
             )
 
 
-def _of_matrix(measured: Matrix, start: _State, counts: _Counts) -> _Problem:
+def _of_matrix(measured: Matrix, start: _State, orders: int) -> _Problem:
     rows, columns = measured.out_shape
     step = max(1.0, (rows * columns / _PIXELS) ** 0.5)
     ys, xs = (np.unique(np.arange(step / 2, n, step).astype(int)) for n in (rows, columns))
     chosen = (ys[:, None] * columns + xs).ravel()
     kept = jnp.asarray(measured.matrix[chosen], jnp.float64).reshape(-1, *start.plane.shape)
     pixels = pixel_centres(start.camera)[ys[:, None], xs].reshape(-1, 2)
-    full = _mean_weight(start.camera, start.plane, pixels, counts)
+    full = _mean_weight(start.camera, start.plane, pixels, orders)
     if not (full > 0 and jnp.sum(kept**2) > 0):
         raise MeasurementError(
             "no ray of the start reaches the object, or the matrix is 0; give another start"
         )
-    zero = jnp.zeros(())
-    problem = _Problem(start, kept, pixels, None, jnp.ones(1), jnp.ones(()), full, zero)
+    zero, none = jnp.zeros(()), jnp.zeros((1, 1, 1, 2))
+    problem = _Problem(start, kept, pixels, None, jnp.ones(1), jnp.ones(()), full, zero, none)
     # The gain is linear: what fits best at the start, at the widest blur.
     problem = _blurred(problem, kept, _BLURS[0])
-    model = _model(start, problem, counts)
+    model = _model(start, problem, orders)
     gain = jnp.sum(model * problem.measured) / jnp.sum(model**2)
     start = start._replace(gain=jnp.where(gain > 0, gain, 1.0))
     return problem._replace(start=start, measured=kept)
@@ -324,10 +325,18 @@ def _of_positions(measured: GhostPositions, start: _State, orders: int) -> _Prob
     if most >= orders:
         raise MeasurementError(f"a ghost of order {most}, but orders = {orders}; give more orders")
     seen = cast(measured, "float64")
-    one = jnp.ones(())
-    return _Problem(
-        start, seen.points, seen.pixels, seen.orders, one[None], 1 / seen.deviation, one, one
-    )
+    one, none, scale = jnp.ones(()), jnp.zeros((1, 1, 1, 2)), 1 / seen.deviation
+    return _Problem(start, seen.points, seen.pixels, seen.orders, one[None], scale, one, one, none)
+
+
+def _smear(problem: _Problem, orders: int, samples: int | None) -> Array:
+    """Where parts of the band come from, less the Bragg wavelength, (order, pixel, sample, 2)."""
+    if samples is None:
+        return jnp.zeros((1, 1, 1, 2))
+    camera, distance = problem.start.camera, problem.start.plane.distance
+    band = trace_band(camera, problem.pixels, distance, orders, samples)
+    centre = trace(camera, problem.pixels, distance, orders).points[..., None, :2]
+    return jnp.where(band.weight[..., None, None] > 0, band.points - centre, 0)
 
 
 def _blurred(problem: _Problem, rows: Array, blur: float) -> _Problem:
@@ -340,25 +349,25 @@ def _blurred(problem: _Problem, rows: Array, blur: float) -> _Problem:
     return problem._replace(measured=rows, blur=jnp.asarray(blur), scale=scale)
 
 
-def _scaled(problem: _Problem, names: tuple[str, ...], counts: _Counts) -> _Problem:
+def _scaled(problem: _Problem, names: tuple[str, ...], orders: int) -> _Problem:
     """With steps that each change the residual by a tenth of what was measured."""
     units = jnp.asarray([PARAMETERS[n][1] if n in PARAMETERS else 1.0 for n in names])
     unscaled = problem._replace(unit=units)
-    lengths = jnp.linalg.norm(_jacobian(unscaled, names, counts), axis=0)
+    lengths = jnp.linalg.norm(_jacobian(unscaled, names, orders), axis=0)
     size = 0.1 * jnp.linalg.norm(problem.measured * problem.scale)
     return problem._replace(unit=units * size / jnp.where(lengths > 0, lengths, size))
 
 
 def _residual(steps, args):
-    problem, names, counts = args
+    problem, names, orders = args
     state = problem.start.moved(names, tuple(steps * problem.unit))
-    return ((_model(state, problem, counts) - problem.measured) * problem.scale).reshape(-1)
+    return ((_model(state, problem, orders) - problem.measured) * problem.scale).reshape(-1)
 
 
 @eqx.filter_jit
-def _least_squares(problem: _Problem, names: tuple[str, ...], counts: _Counts):
+def _least_squares(problem: _Problem, names: tuple[str, ...], orders: int):
     solver = optx.LevenbergMarquardt(rtol=_TOLERANCE, atol=_TOLERANCE)
-    args = (problem, names, counts)
+    args = (problem, names, orders)
     none = jnp.zeros_like(problem.unit)
     options = {"jac": "fwd"}
     return optx.least_squares(
@@ -367,24 +376,24 @@ def _least_squares(problem: _Problem, names: tuple[str, ...], counts: _Counts):
 
 
 @eqx.filter_jit
-def _jacobian(problem: _Problem, names: tuple[str, ...], counts: _Counts):
+def _jacobian(problem: _Problem, names: tuple[str, ...], orders: int):
     none = jnp.zeros_like(problem.unit)
-    return jax.jacfwd(_residual)(none, (problem, names, counts))
+    return jax.jacfwd(_residual)(none, (problem, names, orders))
 
 
 @eqx.filter_jit
-def _model(state: _State, problem: _Problem, counts: _Counts):
+def _model(state: _State, problem: _Problem, orders: int):
     """The rows of the matrix, (pixel, y, x), or the points from the object's middle."""
-    plane = state.plane
-    rays = _rays(state.camera, plane, problem.pixels, counts)
+    camera, plane = state.camera, state.plane
+    rays = trace(camera, problem.pixels, plane.distance, orders)
     if problem.orders is not None:
         place = jnp.arange(problem.pixels.shape[0])
-        return jnp.mean(rays.points, axis=-2)[problem.orders, place] - plane.centre
-    size = seen_size(state.camera, plane)
-    down, across = (
-        _parts(rays.points[..., axis], plane, axis, size, problem.blur) for axis in (1, 0)
-    )
-    weight = state.gain * rays.weight / problem.full / rays.points.shape[2]
+        centroid = rays.points[..., :2] + jnp.mean(problem.smear, axis=2)
+        return centroid[problem.orders, place] - plane.centre
+    size = seen_size(camera, plane)
+    points = rays.points[..., None, :2] + problem.smear
+    down, across = (_parts(points[..., axis], plane, axis, size, problem.blur) for axis in (1, 0))
+    weight = state.gain * rays.weight / problem.full / problem.smear.shape[2]
     return jnp.einsum("op,opsy,opsx->pyx", weight, down, across)
 
 
@@ -407,24 +416,17 @@ def _parts(points, plane: ObjectPlane, axis: int, size, blur):
     return jnp.diff(left, axis=-1) * plane.pitch / size
 
 
-def _rays(camera: SeeThroughCamera, plane: ObjectPlane, pixels, counts: _Counts) -> SmearedRays:
-    orders, samples, nodes = counts
-    if samples is None:
-        return smeared_rays(camera, pixels, plane, orders, samples)
-    return band_rays(camera, pixels, plane.distance, (orders, samples, max(nodes, 8 * samples)))
-
-
-@eqx.filter_jit
-def _mean_weight(camera: SeeThroughCamera, plane: ObjectPlane, pixels, counts: _Counts):
+def _mean_weight(camera: SeeThroughCamera, plane: ObjectPlane, pixels, orders: int):
     """Of a pixel's ghosts together, as `system_operator` takes it for 1."""
-    return jnp.mean(jnp.sum(_rays(camera, plane, pixels, counts).weight, axis=0))
+    rays = trace(camera, pixels, plane.distance, orders)
+    return jnp.mean(jnp.sum(rays.weight, axis=0))
 
 
-def _report(problem: _Problem, names, counts: _Counts, converged: bool) -> ScreenFit:
-    found, (orders, samples, _) = problem.start, counts
+def _report(problem: _Problem, names, counts, converged: bool) -> ScreenFit:
+    found, (orders, samples) = problem.start, counts
     none = jnp.zeros_like(problem.unit)
-    residual = np.asarray(_residual(none, (problem, names, counts)))
-    slopes, squares = np.asarray(_jacobian(problem, names, counts)), float(residual @ residual)
+    residual = np.asarray(_residual(none, (problem, names, orders)))
+    slopes, squares = np.asarray(_jacobian(problem, names, orders)), float(residual @ residual)
     curvature = slopes.T @ slopes
     explained = 1 - squares / float(jnp.sum((problem.measured * problem.scale) ** 2))
     of_matrix = problem.orders is None
@@ -434,7 +436,7 @@ def _report(problem: _Problem, names, counts: _Counts, converged: bool) -> Scree
     errors = known.standard_errors * np.asarray(problem.unit)
     gain = found.gain
     if of_matrix:
-        everywhere = _mean_weight(found.camera, found.plane, pixel_centres(found.camera), counts)
+        everywhere = _mean_weight(found.camera, found.plane, pixel_centres(found.camera), orders)
         gain, errors[-1] = (float(everywhere / problem.full) * v for v in (gain, errors[-1]))
     poor = ""
     if of_matrix and explained < _EXPLAINED:
