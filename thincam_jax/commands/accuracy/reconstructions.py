@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import sys
 from functools import partial
 from typing import Any
 
@@ -150,7 +151,9 @@ def solve(study: Study, method: Method, quantity: str, level: float) -> float | 
 
     def excess(logarithm: float) -> float:
         wrong = psfs_of(study, changed(method, quantity, math.exp(logarithm)))
-        return math.log(relative_error(wrong, reference) / level)
+        # A change may be too small to be seen.
+        error = max(relative_error(wrong, reference), sys.float_info.min)
+        return math.log(error / level)
 
     first, end = math.log(_FIRST), math.log(_LARGEST)
     guess = min(first - excess(first), end)  # small errors grow in proportion to what is wrong
