@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.ndimage
 
 import thincam_jax as tc
 from thincam_jax.measured.calibration import fit_psf, problem
@@ -77,6 +78,47 @@ def test_values_are_right_within_their_errors(seed):
     assert float(fit.standard_errors["distance"]) < 0.01
     noise = 10 ** (-30 / 20) * math.sqrt(np.mean(np.square(picture(TRUE, snr_db=300.0))))
     np.testing.assert_allclose(np.std(fit.residual), noise, rtol=0.03)
+
+
+@pytest.mark.parametrize(
+    "snr_db", [30.0, *(pytest.param(db, marks=pytest.mark.thorough) for db in (40.0, 10.0))]
+)
+def test_ripples_of_the_rims_hold_no_fit(snr_db):
+    """The waves of the rims make some hundred minima, each a few standard errors from the next.
+
+    At 10 dB least squares took 38 steps through them.
+    """
+    h = tc.psf(TRUE, pixel_integration=True, **LIGHT)
+    noise = np.random.default_rng(0).normal(size=h.shape)
+    image = h + 10 ** (-snr_db / 20) * np.sqrt(np.mean(h**2)) * noise
+    fit = fit_psf(image, START, max_steps=20, **LIGHT)
+    assert (fit.status, fit.reasons) == ("ok", ())
+    assert np.all(np.abs(deviations(fit, TRUE)) < 4.5)
+
+
+@pytest.mark.parametrize("left_out", ["blur", pytest.param("shade", marks=pytest.mark.thorough)])
+def test_what_a_wrong_model_leaves_of_a_number_is_told(left_out):
+    """A blur of half a pixel moves d by 5 %, 20 times what noise explains; β is right to 0.3 %."""
+    image = np.asarray(picture(TRUE))
+    if left_out == "blur":
+        image = scipy.ndimage.gaussian_filter(image, 0.5)
+    else:
+        image = image * (1 + 0.2 * np.linspace(-1, 1, image.shape[1]))
+    fit = fit_psf(image, START, **LIGHT)
+    assert fit.status == "ambiguous"
+    (reason,) = fit.reasons
+    assert reason.startswith("distance is uncertain by more than") and "blur" in reason
+    assert 0.005 < fit.standard_errors["distance"] / fit.values["distance"] < 0.02
+    np.testing.assert_allclose(fit.camera.mask.beta, 30.0, rtol=3e-3)
+
+
+@pytest.mark.thorough
+def test_a_number_that_leaves_its_search_is_told():
+    """A blur of a pixel is fitted best by a longer d: 4.0 in place of 3.0."""
+    image = scipy.ndimage.gaussian_filter(np.asarray(picture(TRUE)), 1.0)
+    fit = fit_psf(image, START, **LIGHT)
+    assert fit.status == "ambiguous"
+    assert any("distance" in line and "left the search of 12%" in line for line in fit.reasons)
 
 
 @pytest.mark.thorough

@@ -3,8 +3,9 @@ r"""Least squares towards a narrow minimum: coarse pixels and wide difference st
 The phase of the waves from the aperture's rims changes fast with d. They carry little light, so
 that the sum of squares is a smooth bowl in d with a narrow dip at the bottom, but they dominate its
 derivative: Levenberg-Marquardt with exact derivatives creeps, or stops in a ripple of the bowl.
-Finite differences over a step wide enough to average these waves out follow the bowl. The step is
-narrowed as long as it stays wide against the standard error that it gives.
+Finite differences over a step wide enough to average these waves out follow the bowl, and full
+Gauss-Newton steps walk through its ripples, where a search that must go down at each step stops.
+The differences are narrowed as long as they stay wide against the standard errors that they give.
 """
 
 import math
@@ -14,7 +15,6 @@ from typing import NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-import scipy
 from jaxtyping import Array, ArrayLike, Float
 
 from thincam_jax._core.grids import Grid, block_mean, central_blocks
@@ -35,12 +35,18 @@ _BLOCK = 0.35  # of √(λd): the side of a coarse pixel
 _FEWEST = 48  # coarse pixels along a side
 _TRIALS = 5  # on either side of the best so far
 _ROUNDS = 2  # each with a fifth of the steps of the one before
-_EVALUATIONS = 8  # of least squares at each width of the differences
+_STEPS = 8  # of Gauss-Newton at each width of the differences
+_NEAR_ENOUGH = 0.3  # of a standard error: a step that is the last one
+_DAMPING = 1e-4  # of the unit diagonal, where numbers cannot be told apart
+# The longest step, in widths of the differences: 1 rad at the rim for the fringes, 10 % for d.
+_LONGEST = {"background": math.inf, "gain": math.inf, "width": 5.0, "wavelength": 5.0}
+_LONGEST_OF_FRINGES = 50.0
 _WIDE, _NARROWER, _NARROWEST = 0.02, 0.25, 1e-6  # widths, in parts of one
 _NARROW_ENOUGH = 2e-4  # for a start
 # Only widths above this many standard errors are narrowed: the next, a quarter as wide, is then
 # still three of them, so that the bottom of the bowl lies within it.
 _AGAINST_ERROR = 12.0
+_PARTS = 8  # of the picture, along a side
 _FRINGE = 0.02  # rad, at the rim: differences of what moves the fringes
 # What the waves of the rims depend on, and so is differenced widely.
 _RIMS = ("width", "wavelength")
@@ -81,47 +87,62 @@ def descend(
     width = _WIDE
     while True:
         widths = difference_widths(best, width)
-        step = scipy.optimize.least_squares(
-            _residual,
-            np.zeros(len(names)),
-            jac=_slopes,  # pyright: ignore[reportArgumentType]
-            x_scale="jac",
-            max_nfev=_EVALUATIONS,
-            args=(measured, best, names, widths),
-        )
-        known = _errors(step.jac, 2 * step.cost)
-        turned = np.asarray(seen_by_steps(best, names, step.x))
-        best = best.moved(names, jnp.asarray(step.x))
+        best, known, turned = _gauss_newton(measured, best, names, widths)
         if width < _NARROW_ENOUGH or _too_narrow(known, turned, widths):
             return best
         width = width * _NARROWER
 
 
+def _gauss_newton(
+    measured: FitImage, start: FitState, names: tuple[str, ...], widths: np.ndarray
+) -> tuple[FitState, Covariance, np.ndarray]:
+    """The best of some full steps, what is known there, and the slopes of `SEEN`."""
+    here, none, tried = start, np.zeros(len(names)), []
+    for _ in range(_STEPS):
+        residual = _residual(measured, here, names)
+        turned = np.asarray(seen_by_steps(here, names, none))
+        jacobian = _seen_slopes(measured, here, turned, widths) @ turned
+        known = _errors(jacobian, float(residual @ residual))
+        tried.append((float(residual @ residual), here, known, turned))
+        norms = np.linalg.norm(jacobian, axis=0)
+        unit = jacobian / np.where(norms > 0, norms, 1.0)
+        damped = unit.T @ unit + _DAMPING * np.eye(len(names))
+        step = -np.linalg.solve(damped, unit.T @ residual) / np.where(norms > 0, norms, 1.0)
+        if np.all(np.abs(step) < _NEAR_ENOUGH * known.standard_errors):
+            break
+        longest = widths * [_LONGEST.get(name, _LONGEST_OF_FRINGES) for name in SEEN]
+        step /= max(1.0, float(np.max(np.abs(turned @ step) / longest)))
+        here = here.moved(names, jnp.asarray(step))
+    return min(tried, key=lambda one: one[0])[1:]
+
+
 def covariance_by_differences(
     measured: FitImage, found: FitState, names: tuple[str, ...]
-) -> Covariance:
+) -> tuple[Covariance, Covariance]:
     """Standard errors and correlations of the steps from `found`.
 
     By finite differences, narrowed as long as they are wide against the errors that they give:
-    exact derivatives would count on waves of the rims that the noise may hide.
+    exact derivatives would count on waves of the rims that the noise may hide. The second is what
+    `_PARTS` parts of the picture say together, each with an error of its own: the same where the
+    residual is white noise, more where the model leaves something out.
     """
-    none = np.zeros(len(names))
-    residual = _residual(none, measured, found, names, None)
+    residual = _residual(measured, found, names)
     squares, width, seen = float(residual @ residual), _WIDE, None
-    turned = np.asarray(seen_by_steps(found, names, none))
+    turned = np.asarray(seen_by_steps(found, names, np.zeros(len(names))))
     while True:
         widths = difference_widths(found, width)
         seen = _seen_slopes(measured, found, turned, widths, seen)
         known = _errors(seen @ turned, squares)
         if width < _NARROWEST or _too_narrow(known, turned, widths):
-            return known
+            return known, _errors_of_parts(seen @ turned, residual, measured.image.shape)
         width = width * _NARROWER
 
 
 def slope_norms(measured: FitImage, state: FitState, names: tuple[str, ...]) -> np.ndarray:
     """How far the image moves for a step of each unknown."""
     widths = difference_widths(state, _WIDE * _NARROWER)
-    norms = np.linalg.norm(_slopes(np.zeros(len(names)), measured, state, names, widths), axis=0)
+    turned = np.asarray(seen_by_steps(state, names, np.zeros(len(names))))
+    norms = np.linalg.norm(_seen_slopes(measured, state, turned, widths) @ turned, axis=0)
     return np.where(norms > 0, norms, 1.0)
 
 
@@ -155,14 +176,17 @@ def _errors(jacobian: np.ndarray, squares: float) -> Covariance:
     return covariance(jacobian.T @ jacobian, squares / max(1, pixels - unknowns))
 
 
-def _residual(steps, measured: FitImage, start: FitState, names, widths) -> np.ndarray:
-    return measured.model(start, names, steps) - measured.image.ravel()
+def _errors_of_parts(jacobian: np.ndarray, residual: np.ndarray, shape) -> Covariance:
+    """(JᵀJ)⁻¹ (Σ sᵢsᵢᵀ) (JᵀJ)⁻¹ with the slope sᵢ = Jᵢᵀrᵢ of each part (Liang and Zeger 1986)."""
+    down, across = (np.arange(n) * _PARTS // n for n in shape[-2:])
+    part = np.broadcast_to(down[:, None] * _PARTS + across, shape).ravel()
+    slopes = np.stack([np.bincount(part, column * residual) for column in jacobian.T], axis=1)
+    slopes -= slopes.mean(axis=0)
+    return covariance(jacobian.T @ jacobian, slopes.T @ slopes * _PARTS**2 / (_PARTS**2 - 1))
 
 
-def _slopes(steps, measured: FitImage, start: FitState, names, widths) -> np.ndarray:
-    """∂model/∂steps, through what the image depends on."""
-    turned = np.asarray(seen_by_steps(start, names, steps))
-    return _seen_slopes(measured, start.moved(names, jnp.asarray(steps)), turned, widths) @ turned
+def _residual(measured: FitImage, here: FitState, names) -> np.ndarray:
+    return measured.model(here, names, np.zeros(len(names))) - measured.image.ravel()
 
 
 def _seen_slopes(measured: FitImage, here: FitState, turned, widths, known=None) -> np.ndarray:

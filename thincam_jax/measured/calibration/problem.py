@@ -34,6 +34,10 @@ STEP = 30.0
 # Of the scaled steps, and of the weighted residual in any pixel. A million pixels at 30 dB
 # determine a scaled step to some 1e-6.
 _TOLERANCE = 1e-7
+# Of a standard error: less than that in `_STEPS` steps is the end of the least squares.
+CONVERGED = 0.1
+_STEPS = 10
+_FINEST = 1e-9  # a standard error of a step, where there is no noise
 
 
 def unknown_names(parameters: tuple[str, ...]) -> tuple[str, ...]:
@@ -209,10 +213,13 @@ class FitProblem(eqx.Module):
 
 
 class Solution(NamedTuple):
-    """What Levenberg-Marquardt found, whether it converged and after how many iterations."""
+    """What Levenberg-Marquardt found, after how many steps.
+
+    - `moved`: by how many of the standard errors the last `_STEPS` steps moved each unknown.
+    """
 
     scaled: Float[Array, " unknown"]
-    converged: bool
+    moved: Float[np.ndarray, " unknown"]
     iterations: int
 
 
@@ -303,18 +310,25 @@ def state_and_residual(
     return state_at(scaled, problem), -residual(scaled, problem) / problem.weight
 
 
-def solve(problem: FitProblem, max_steps: int) -> Solution:
-    """Levenberg-Marquardt from `problem.start`."""
-    solution = _least_squares(problem, max_steps)
-    converged = bool(solution.result == optx.RESULTS.successful)
-    return Solution(solution.value, converged, int(solution.stats["num_steps"]))
+def solve(problem: FitProblem, errors: Float[np.ndarray, " unknown"], max_steps: int) -> Solution:
+    """Levenberg-Marquardt from `problem.start`, as long as it moves by parts of the errors.
+
+    `errors`: standard errors of the steps from the start. Anew every few steps: where the waves of
+    the rims make the sum of squares ripple, the damping grows until nothing moves, minimum or not.
+    """
+    errors = np.maximum(errors, _FINEST) / np.asarray(problem.scale)
+    found, moved, iterations = jnp.zeros_like(problem.scale), np.inf * errors, 0
+    while iterations < max_steps and not np.all(moved < CONVERGED):
+        solution = _least_squares(problem, found)
+        moved = np.abs(np.asarray(solution.value - found)) / errors
+        found, iterations = solution.value, iterations + int(solution.stats["num_steps"])
+    return Solution(found, moved, iterations)
 
 
 @eqx.filter_jit
-def _least_squares(problem: FitProblem, max_steps: int):
+def _least_squares(problem: FitProblem, start: Float[Array, " unknown"]):
     solver = optx.LevenbergMarquardt(rtol=_TOLERANCE, atol=_TOLERANCE)
-    none = jnp.zeros_like(problem.scale)
-    return optx.least_squares(residual, solver, none, problem, max_steps=max_steps, throw=False)
+    return optx.least_squares(residual, solver, start, problem, max_steps=_STEPS, throw=False)
 
 
 # Two numbers of correlation ρ have standard errors 1/√(1−ρ²) times those they would have if the
@@ -332,20 +346,24 @@ class Covariance(NamedTuple):
     correlation: np.ndarray
 
 
-def covariance(curvature: np.ndarray, variance: float) -> Covariance:
-    """σ²(JᵀJ)⁻¹ as standard errors and correlations.
+def covariance(curvature: np.ndarray, variance: float | np.ndarray) -> Covariance:
+    """σ²(JᵀJ)⁻¹, or (JᵀJ)⁻¹V(JᵀJ)⁻¹, as standard errors and correlations.
 
-    `curvature`: JᵀJ. `variance`: σ² of a residual, taken as white. A direction that the data do not
-    see at all has, in place of an infinite error, that of an eigenvalue at the rounding's level:
-    about 1e6 times the error of a number that is seen.
+    `curvature`: JᵀJ. `variance`: σ² of a residual, taken as white, or V, that of Jᵀr. A direction
+    that the data do not see at all has, in place of an infinite error, that of an eigenvalue at the
+    rounding's level: about 1e6 times the error of a number that is seen.
     """
     norm = np.sqrt(np.diag(curvature))
     norm = np.where(norm > 0, norm, norm.max() * _SMALLEST or 1.0)
     values, vectors = np.linalg.eigh(curvature / np.outer(norm, norm))
     inverse = (vectors / np.maximum(values, _SMALLEST)) @ vectors.T
+    if np.ndim(variance):
+        inverse = inverse @ (variance / np.outer(norm, norm)) @ inverse
+    else:
+        inverse = inverse * variance
     spread = np.sqrt(np.diag(inverse))
     correlation = inverse / np.outer(spread, spread)
-    return Covariance(np.sqrt(variance) * spread / norm, np.clip(correlation, -1.0, 1.0))
+    return Covariance(spread / norm, np.clip(correlation, -1.0, 1.0))
 
 
 def of_values(steps: Covariance, slopes: np.ndarray) -> Covariance:

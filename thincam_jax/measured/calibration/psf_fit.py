@@ -21,6 +21,7 @@ from thincam_jax.measured.calibration.coarse import (
     slope_norms,
 )
 from thincam_jax.measured.calibration.problem import (
+    CONVERGED,
     PARAMETERS,
     STEP,
     FitProblem,
@@ -44,6 +45,11 @@ DEFAULT = ("beta", "phase", "centre", "distance", "background", "gain")
 FRINGE_SCANNED = {0.0: 1j, math.pi / 2: -1.0, math.pi: -1j, 3 * math.pi / 2: 1.0}
 # Part of the image's contrast that a fit must explain; less is another picture, or another turn.
 _EXPLAINED = 0.5
+# What has a relative error, and those up to which it is known. The parts of an image whose residual
+# is noise agree within a third of what noise explains; a blur or a shading brings a few times that,
+# and moves d by several of its errors.
+_POSITIVE = ("beta", "width", "distance", "object_distance", "wavelength")
+_KNOWN, _KNOWN_BY_PARTS, _DISAGREE = 0.03, 0.005, 1.5
 
 
 class PsfFit(eqx.Module):
@@ -54,13 +60,17 @@ class PsfFit(eqx.Module):
       gain·h, in the image's unit.
     - `names`: the numbers that were fitted, the order of `correlation`.
     - `values`, `standard_errors`: of each of them, in mm, rad/mm², rad and the image's unit. The
-      errors are those of white noise of the residual's own strength, √(σ²(JᵀJ)⁻¹); they hold what
-      the noise does, not what the model leaves out.
-    - `correlation`: of their errors.
+      errors are those of white noise of the residual's own strength, √(σ²(JᵀJ)⁻¹), or those by
+      which 64 parts of the image disagree, where that is more: the residual is then not noise, and
+      what the model leaves out may have moved the numbers further still.
+    - `correlation`: of their errors from noise.
     - `residual`: measured − model, (y, x); complex where the image is.
-    - `status`: "ok"; "ambiguous", where numbers cannot be told apart (`AMBIGUOUS`: a correlation
-      above 0.999); "poor_fit", where the model explains less than half of the image's contrast;
-      "not_converged". The first that applies, from the last to the first.
+    - `status`: "ok"; "ambiguous", where the image does not hold a number: two cannot be told apart
+      (`AMBIGUOUS`: a correlation above 0.999), the error of one is above 3 %, above 0.5 % where the
+      residual is not noise, or it left its `search`; "poor_fit", where the model explains less than
+      half of the image's contrast; "not_converged", where the last ten steps of the least squares
+      moved a number by more than a tenth of its standard error. The first that applies, from the
+      last to the first.
     - `reasons`: one line for each thing that is not as it should be.
     - `iterations`: of the least squares.
     """
@@ -165,9 +175,12 @@ def fit_psf(
         check_fringes(guess)
         start = start_near(image, guess, parameters, ranges, float(search), pixel_integration)
         names = unknown_names(parameters)
-        return _fit(
-            image, start, names, pixel_integration, max_steps, precision_of(camera.distance)
+        problem = _problem(image, start, names, pixel_integration)
+        known, _ = covariance_by_differences(
+            full_image(image, start, pixel_integration), start, names
         )
+        solution = solve(problem, known.standard_errors, max_steps)
+        return _report(problem, solution, guess, search, precision_of(camera.distance))
 
 
 def _check_parameters(parameters) -> tuple[str, ...]:
@@ -216,12 +229,6 @@ def _check_image(image, camera: LenslessCamera, synthesis: Synthesis | None) -> 
     return seen[0] if synthesis is None else np.stack(seen)
 
 
-def _fit(image, start: FitState, names, pixel_integration, max_steps, precision) -> PsfFit:
-    problem = _problem(image, start, names, pixel_integration)
-    solution = solve(problem, max_steps)
-    return _report(problem, solution, precision)
-
-
 def _problem(image, start: FitState, names, pixel_integration: bool) -> FitProblem:
     contrast = np.linalg.norm(image - image.mean())
     scale = STEP * contrast / slope_norms(full_image(image, start, pixel_integration), start, names)
@@ -231,15 +238,22 @@ def _problem(image, start: FitState, names, pixel_integration: bool) -> FitProbl
     )
 
 
-def _report(problem: FitProblem, solution: Solution, precision: Precision) -> PsfFit:
+def _report(
+    problem: FitProblem,
+    solution: Solution,
+    guess: FitState,
+    search: float | int,
+    precision: Precision,
+) -> PsfFit:
     names = problem.names
     found, residual = state_and_residual(solution.scaled, problem)
     measured = full_image(np.asarray(problem.image), found, problem.pixel_integration)
-    known = of_values(
-        covariance_by_differences(measured, found, names), _slopes_of_values(found, names)
-    )
+    steps, slopes = covariance_by_differences(measured, found, names), _of_values(found, names)
+    known, parts = (of_values(of_steps, slopes) for of_steps in steps)
     values = dict(zip(names, np.asarray(found.values(names)), strict=True))
-    errors = dict(zip(names, known.standard_errors, strict=True))
+    errors = np.maximum(known.standard_errors, parts.standard_errors)
+    disagree = errors > _DISAGREE * known.standard_errors
+    errors, disagree = (dict(zip(names, each, strict=True)) for each in (errors, disagree))
     distance, alike = np.inf, ambiguous_pairs(names, known.correlation)
     nearness = float(found.nearness)
     if nearness > 0:
@@ -249,8 +263,9 @@ def _report(problem: FitProblem, solution: Solution, precision: Precision) -> Ps
         if not any("object_distance" in line for line in alike):
             alike += _too_far(nearness, errors["object_distance"])
         errors["object_distance"] = errors["object_distance"] * distance**2
+    alike += _unknown(values, errors, disagree) + _left_search(values, errors, guess, search)
     explained = 1 - float(jnp.sum((residual * problem.weight) ** 2))
-    status, reasons = _status(solution, explained, alike)
+    status, reasons = _status(names, solution, explained, alike)
     if found.synthesis is not None:
         residual = residual[0] if len(residual) == 1 else jax.lax.complex(*residual)
     found_fit = PsfFit(
@@ -271,7 +286,7 @@ def _report(problem: FitProblem, solution: Solution, precision: Precision) -> Ps
     return cast(found_fit, precision)
 
 
-def _slopes_of_values(found: FitState, names) -> np.ndarray:
+def _of_values(found: FitState, names) -> np.ndarray:
     """Of the values in the steps; t falls where 1/t grows."""
     slopes = np.array(values_by_steps(found, names, jnp.zeros(len(names))))
     slopes[np.array(names) == "object_distance"] *= -1
@@ -288,8 +303,35 @@ def _too_far(nearness: float, error: float) -> list[str]:
     ]
 
 
+def _unknown(values, errors, disagree) -> list[str]:
+    """One line for each number that the image knows too little of."""
+    found = []
+    for name in (n for n in _POSITIVE if n in values):
+        part = float(errors[name] / values[name])
+        if disagree[name] and part > _KNOWN_BY_PARTS:
+            found.append(
+                f"{name} is uncertain by more than {part:.1%}: parts of the image disagree by more "
+                "than noise explains, so that the model leaves something out (blur, shading, tilt);"
+                " measure it otherwise and fix it"
+            )
+        elif part > _KNOWN:
+            found.append(f"{name} is known to {part:.1%} only: fix it, or give less noise")
+    return found
+
+
+def _left_search(values, errors, guess: FitState, search: float | int) -> list[str]:
+    """One line for each number that ended beyond its search; a search of 0 holds nothing."""
+    names = tuple(n for n in ("beta", "distance", "wavelength") if n in values and search > 0)
+    return [
+        f"{name} = {float(values[name]):.4g} has left the search of {search:.0%} around "
+        f"{float(first):.4g}: the image does not hold it; fix it, or start nearer"
+        for name, first in zip(names, guess.values(names), strict=True)
+        if abs(values[name] - first) > search * first + 2 * errors[name]
+    ]
+
+
 def _status(
-    solution: Solution, explained: float, alike: list[str]
+    names: tuple[str, ...], solution: Solution, explained: float, alike: list[str]
 ) -> tuple[Status, tuple[str, ...]]:
     status: Status = "ambiguous" if alike else "ok"
     reasons = list(alike)
@@ -300,7 +342,12 @@ def _status(
             f"the model explains {max(0.0, explained):.0%} of the image's contrast: it is not "
             "this camera's PSF, too noisy, or further from the start than search",
         )
-    if not solution.converged:
+    if not np.all(solution.moved < CONVERGED):
+        last = int(np.argmax(solution.moved))
         status = "not_converged"
-        reasons.insert(0, f"least squares stopped after {solution.iterations} steps; try max_steps")
+        reasons.insert(
+            0,
+            f"least squares stopped after {solution.iterations} steps, while {names[last]} moved "
+            f"by {solution.moved[last]:.2g} of its standard error; try max_steps",
+        )
     return status, tuple(reasons)
