@@ -7,7 +7,7 @@ import pytest
 
 import thincam_jax as tc
 from helpers import relative_l2
-from thincam_jax._core.precision import allow, cast
+from thincam_jax._core.precision import allow, cast, phasor
 
 SHAPE = (48, 80)
 CONDITIONS = {"wavelength": 500e-6, "object_distance": 250.0}
@@ -136,3 +136,21 @@ def test_the_switch_is_put_back_after_an_error():
             assert jnp.ones(1).dtype == jnp.float64
             raise RuntimeError
         assert jnp.ones(1).dtype == jnp.float32
+
+
+@pytest.mark.parametrize(("dtype", "largest"), [("float32", 1e5), ("float64", 1e6)])
+def test_phasor_has_all_digits_of_its_phase(dtype, largest):
+    """Against NumPy, with multiples of π/4 among the phases; and its slope j e^{jφ}."""
+    spread = np.random.default_rng(0).uniform(-1, 1, 20_000)
+    phases = np.concatenate([spread, 10 * spread, largest * spread, np.pi / 4 * np.arange(-40, 41)])
+    phases = phases.astype(dtype)
+    expected = np.exp(1j * phases.astype("float64"))
+    ones = jnp.ones(phases.shape, dtype)
+    value, slope = map(np.asarray, jax.jvp(phasor, (jnp.asarray(phases),), (ones,)))
+    # A thousandth of what the last digit of the phase itself stands for.
+    allowed = np.finfo(dtype).eps * (2 + 1e-3 * np.abs(phases))
+    assert np.all(np.abs(value - expected) < allowed)
+    assert np.all(np.abs(slope - 1j * expected) < allowed)
+    # A phase without digits has a modulus of one still; none has none.
+    lost = np.abs(phasor(jnp.asarray([1e30, -3e37, np.inf, np.nan], dtype)))
+    assert np.all(np.abs(lost[:2] - 1) < 0.01) and np.all(np.isnan(lost[2:]))
