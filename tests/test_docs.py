@@ -63,12 +63,12 @@ def test_accuracy_page(capsys):
 
 
 @pytest.mark.thorough
-def test_reconstruction_page(tmp_path, monkeypatch, capsys):
+def test_real_captures_page(tmp_path, monkeypatch, capsys):
     """The image is the scene, and the gradient is the slope of what it is said to be."""
     monkeypatch.chdir(tmp_path)
     simulated.bayer_files(tmp_path)
     with jax.enable_x64(False):  # the precision of a user
-        names = run_examples("docs/reconstruction.md")
+        names = run_examples("docs/real_captures.md")
     printed = capsys.readouterr().out
     assert "(3, 30, 38)" in printed
     assert "nan" not in printed

@@ -458,9 +458,12 @@ def test_naive_formula_is_right_elsewhere(name):
     assert naive_error(gentle, np.float64) < 2e-4
 
 
+PAGES = {"extreme": "extremes_values.md", "gradient at": "extremes_gradients.md"}
+
+
 def documented(first: str) -> dict[str, list[str]]:
-    """The rows of the page's table that begins with that cell, by their own first cell."""
-    page = (ROOT / "docs" / "extremes.md").read_text(encoding="utf-8")
+    """The rows of the table that begins with that cell, by their own first cell."""
+    page = (ROOT / "docs" / PAGES[first]).read_text(encoding="utf-8")
     table = page[page.index(f"| {first} |") :].split("\n\n")[0].splitlines()
     rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in table]
     assert len({len(row) for row in rows}) == 1
@@ -468,7 +471,7 @@ def documented(first: str) -> dict[str, list[str]]:
 
 
 def test_every_extreme_is_documented():
-    """The page's tables have all of them, in this order, and nothing else."""
+    """The pages' tables have all of them, in this order, and nothing else."""
     assert list(documented("extreme")) == [extreme.name for extreme in EXTREMES]
     assert len({extreme.name for extreme in EXTREMES}) == len(EXTREMES)
     assert list(documented("gradient at")) == list(GRADIENTS)

@@ -1,6 +1,6 @@
 """The default τ and those found by a rule, against the best, on captures like real ones.
 
-The thorough test prints the table of docs/reconstruction.md (`-s -m thorough`).
+The thorough test prints the table of docs/solver_figures.md (`-s -m thorough`).
 """
 
 import functools

@@ -2,7 +2,7 @@
 
 The images of a batch have only the operator in common, and so do colours whose variations are not
 coupled. On a CPU a part by itself stays in the cache, and cores that one part leaves idle between
-its transforms serve another (docs/reconstruction.md has the comparison). Each part then has units
+its transforms serve another (docs/solver_figures.md has the comparison). Each part then has units
 and penalties of its own.
 """
 

@@ -2,7 +2,7 @@
 
 An iteration is compiled; what stands between two chunks of iterations is not, so that it can
 report, stop early, adapt and be interrupted. Chunks are unrolled: on a CPU, XLA runs the transforms
-of a compiled loop on one core and those of a straight program on all (docs/reconstruction.md has
+of a compiled loop on one core and those of a straight program on all (docs/solver_figures.md has
 the comparison).
 """
 
