@@ -163,6 +163,16 @@ def test_citations_are_read(text, numbers):
     assert cited(text) == numbers
 
 
+def test_pages_are_short_and_listed():
+    """At most 900 words; the index and the menu lead to all of them."""
+    pages = {path.name: path.read_text("utf-8") for path in (ROOT / "docs").glob("*.md")}
+    assert not {name: len(page.split()) for name, page in pages.items() if len(page.split()) > 900}
+    menu = (ROOT / "mkdocs.yml").read_text("utf-8")
+    others = set(pages) - {"index.md"}
+    assert {name for name in others if f"]({name})" not in pages["index.md"]} == set()
+    assert {name for name in others if f": {name}\n" not in menu} == set()
+
+
 def test_picture_of_the_rooms_is_of_today(tmp_path):
     """Its imports are those of the source; the numbers of lines are of the day it was drawn."""
     script = runpy.run_path(str(ROOT / "docs/draw_rooms.py"))

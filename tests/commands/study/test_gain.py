@@ -1,4 +1,4 @@
-"""What total variation gains in the thesis' set-up at full size: figures of docs/experiments.md."""
+"""What total variation gains in the thesis' set-up at full size, as in docs/thesis_studies.md."""
 
 from pathlib import Path
 
@@ -16,7 +16,7 @@ CONFIG = Path(__file__).parents[2] / "configs" / "fza_admm_tv.yaml"
 def test_total_variation_beside_wiener(tmp_path):
     """The astronaut: 12 dB for a single capture, 2.4 dB for three contrasts of method B's captures.
 
-    3 dB were hoped for with methods A and B too; docs/experiments.md says why noise forbids them.
+    3 dB were hoped for with methods A and B too; docs/thesis_studies.md says why noise forbids it.
     """
     whole = load_config(CONFIG)
     wanted = ("single capture", "method B with contrasts", "method B, Wiener")
