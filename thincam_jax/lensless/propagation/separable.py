@@ -20,8 +20,8 @@ from thincam_jax.lensless.propagation.separable_sum import SeparableSum
 PIXEL_NODES = 24
 # Fewer, and the fringes a pixel up to which their averages are exact to 1e-7 and 1e-13.
 _FEWER: dict[Precision, dict[int, float]] = {
-    "float32": {8: 1.5, 12: 3.2, 16: 5.1},
-    "float64": {8: 0.6, 12: 1.7, 16: 3.2},
+    "float32": {4: 0.3, 6: 0.85, 8: 1.55, 10: 2.385, 12: 3.25, 14: 4.2, 16: 5.15, 20: 7.15},
+    "float64": {4: 0.05, 6: 0.25, 8: 0.6, 10: 1.15, 12: 1.75, 14: 2.45, 16: 3.2, 20: 4.85},
 }
 
 
