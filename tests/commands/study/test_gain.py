@@ -1,15 +1,14 @@
 """What total variation gains in the thesis' set-up at full size, as in docs/thesis_studies.md."""
 
-from pathlib import Path
-
 import pytest
 
+from helpers import ROOT
 from thincam_jax.commands.run_folder import RunFolder
 from thincam_jax.commands.study.build import build_study
 from thincam_jax.commands.study.config import load_config
 from thincam_jax.commands.study.run import run_study
 
-CONFIG = Path(__file__).parents[2] / "configs" / "fza_admm_tv.yaml"
+CONFIG = ROOT / "configs" / "fza_admm_tv.yaml"
 
 
 @pytest.mark.thorough
