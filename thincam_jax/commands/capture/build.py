@@ -76,6 +76,12 @@ def screen_system(config: CaptureConfig) -> Sparse:
     centre = jnp.asarray([seen.object.x, seen.object.y])
     plane = wg.ObjectPlane(seen.object.cells, seen.object.distance, seen.object.width, centre)
     (camera,) = build_cameras(seen)
+    try:
+        wg.check_screen(camera)
+    except ValueError as error:
+        raise ConfigError(
+            f"{config.place_of('virtual', 'screen')}virtual.screen: {error}"
+        ) from None
     system = wg.system_operator(camera, plane, seen.orders, seen.band_samples)
     assert isinstance(system, Sparse)
     brightest = float(jnp.max(system(jnp.ones(plane.shape, system.values.dtype))))
