@@ -284,7 +284,7 @@ def test_what_is_refused():
     for captures, seen_by, message in (
         (jnp.ones(5), operator, r"a capture has shape \(1, 5\); its operator takes"),
         ([jnp.ones(6)], [operator, operator], "for 2 cameras, PSFs or operators"),
-        (jnp.ones(6), Matrix(np.ones((6, 4)), (4,), (6,)), "in_shape \\(y, x\\) or"),
+        (jnp.ones(6), Matrix(np.ones((6, 4)), (4,), (6,)), "in_shape \\(y, x\\), \\(plane"),
     ):
         with pytest.raises(ValueError, match=message) as refused:
             tc.Recording(captures, seen_by, noise_variance=1.0).problem()

@@ -31,11 +31,11 @@ from thincam_jax.waveguide.system import (
 # Numbers of ghosts and of parts of the band that are tried; the last is the reference.
 _ORDERS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
 _SAMPLES = (None, 1, 2, 4, 8, 16, 32, 64)
-# Rows of the sensor, and pixels of each, at which the models are compared: along the rows little
-# changes. What keeps the error there above that of the whole sensor over random cameras: factors
-# of the root mean square, of the largest, where few pixels hold the error, and of both where rows
-# and columns are taken apart, which is off most at the ends of few columns.
-_ROWS, _COLUMNS = 24, 8
+# Pixels at which the models are compared, drawn from those of so many rows and columns.
+_PIXELS, _POOL = 192, (96, 32)
+# What keeps the error there above that of the whole sensor over random cameras: factors of the root
+# mean square, of the largest, where few pixels hold the error, and of both where rows and columns
+# are taken apart, which is off most at the ends of few columns.
 _MARGIN, _LARGEST, _APART = 1.2, 2.5, 1.6
 # Parts of the tolerance that the decisions may use, in the order in which they are taken.
 _SHARES = {"orders": 0.4, "smear": 0.6, "dispersion": 0.4, "precision": 0.4}
@@ -131,9 +131,9 @@ def plan(
     The error is ‖g − g₀‖₂/‖g₀‖₂ of the noise-free capture. g₀ has every order that can meet the
     object, 64 parts of each band, dispersion, and double precision. What is decided: how many
     orders; whether the band's smear and dispersion are modelled, and with how many parts; whether
-    rows and columns can be taken apart; the precision. All are compared with g₀ at 192 pixels
-    of 24 rows; no whole capture is computed. Of a scene of several planes, each of as many cells,
-    the light adds up, and rows and columns stay together.
+    rows and columns can be taken apart; the precision. All are compared with g₀ at 192 pixels,
+    half of them where the object's light arrives; no whole capture is computed. Of a scene of
+    several planes, each of as many cells, the light adds up, and rows and columns stay together.
 
     A plane wave per pixel, thin holograms and Kogelnik's efficiency are common to all models, as is
     the end of each band at |ξ| = 10π, beyond which lie some 1e-3 of the light.
@@ -191,18 +191,21 @@ class _Probe:
             footprints(np.zeros((1, 2)), plane, size)  # refuses cells that are too small
         images = [np.asarray(one.image) for one in scene]
         self.sums = [np.pad(image.cumsum(axis=0).cumsum(axis=1), ((1, 0),) * 2) for image in images]
+        pool = _spread(camera)
+        chosen, self.counts = _drawn(sum(self._lit(pool, plane) for plane in range(len(scene))))
         # The middle first, for what is shift-invariant.
-        self.pixels = np.concatenate([np.zeros((1, 2)), _spread(camera)])
+        self.pixels = np.concatenate([np.zeros((1, 2)), pool[chosen]])
         each = [_orders_seen(camera, plane, self.pixels) for plane in self.planes]
         seen = np.max(each, axis=0)
         self.all_orders = int(seen.max())
         self._traced: dict = {}
         rays = self.rays(True, "float64")
-        self.level = float(np.sum(rays.weight, axis=0)[1:].mean())
+        self.level = float(np.average(np.sum(rays.weight, axis=0)[1:], weights=self.counts))
         if self.level == 0:
             raise ValueError("no light reaches the sensor by this screen: see check_screen")
         self.reference = self.seen(rays)
-        self.norm = float(np.linalg.norm(self.reference.sum(axis=0)))
+        self.norm = 1.0
+        self.norm = self._length(self.reference.sum(axis=0))
         if self.norm == 0:
             raise ValueError("no pixel sees the object's light; give it another place")
         # Orders beyond the last that is computed.
@@ -210,7 +213,7 @@ class _Probe:
         beyond = np.clip(seen - _ORDERS[-1], 0, 2 * _ORDERS[-1])
         tail = rays.weight[-1] * beyond / self.level
         brightness = sum(float(np.sqrt(np.mean(image**2))) for image in images)
-        self.tail = float(np.linalg.norm(tail)) * brightness / self.norm
+        self.tail = self._length(tail[1:]) * brightness
 
     def rays(
         self,
@@ -238,13 +241,30 @@ class _Probe:
         points, weight = rays.points[:orders, 1:], rays.weight[:orders, 1:]
         slope = -self.pixels[1:] / float(self.camera.focal_distance)  # in air, whatever the order
         seen = 0.0
-        for plane, size, sums in zip(self.planes, self.sizes, self.sums, strict=True):
-            ratio, further = size / float(plane.pitch), plane.distance - self.planes[0].distance
-            rows, columns = in_cells(points + (float(further) * slope)[:, None], plane)
-            for down, across in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
-                corner = _bilinear(sums, rows + down * ratio / 2, columns + across * ratio / 2)
-                seen = seen + down * across * np.mean(corner, axis=-1) / ratio**2
+        for number, plane in enumerate(self.planes):
+            further = float(plane.distance - self.planes[0].distance)
+            seen = seen + np.mean(self._radiance(points + further * slope[:, None], number), -1)
         return seen * weight / self.level
+
+    def _radiance(self, points: np.ndarray, number: int) -> np.ndarray:
+        """Of a plane, the mean over what a pixel sees about each point (…, 2)."""
+        plane, sums = self.planes[number], self.sums[number]
+        ratio, found = self.sizes[number] / float(plane.pitch), 0.0
+        rows, columns = in_cells(points, plane)
+        for down, across in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
+            corner = _bilinear(sums, rows + down * ratio / 2, columns + across * ratio / 2)
+            found = found + down * across * corner / ratio**2
+        return np.asarray(found)
+
+    def _lit(self, pixels: np.ndarray, number: int) -> np.ndarray:
+        """About how much light of a plane each pixel gets in all orders together, relative."""
+        plane = self.planes[number]
+        rays = trace(self.camera, jnp.asarray(pixels), plane.distance, 2)
+        first, second = np.asarray(rays.points[..., :2], float)
+        order = np.arange(_ORDERS[-1])[:, None]
+        points = first + order[..., None] * (second - first)
+        light = np.sum(np.abs(self._radiance(points, number)) / (1 + order) ** 1.5, axis=0)
+        return np.where(rays.status[0] == RayStatus.OK, light, 0)
 
     def plan(self, camera, plane, tolerance: float, share: float) -> Plan:
         """The cheapest decisions, each within its part of what the tolerance leaves."""
@@ -306,13 +326,14 @@ class _Probe:
         )
 
     def _predicted(self, capture: np.ndarray, rounded: float) -> float:
-        """`rounded`: what float32 adds once more, as the operator does not round as the probe."""
+        """`rounded`: what float32 adds twice more, as the operator does not round as the probe."""
         away = capture - self.reference.sum(axis=0)
-        largest = float(np.abs(away).max()) / self.norm
-        return _MARGIN * self._length(away) + _LARGEST * largest + self.tail + rounded
+        largest = float((np.sqrt(self.counts) * np.abs(away)).max()) / self.norm
+        return _MARGIN * self._length(away) + _LARGEST * largest + self.tail + 2 * rounded
 
     def _length(self, difference: np.ndarray) -> float:
-        return float(np.linalg.norm(difference)) / self.norm
+        """Relative to the reference's, over all pixels that those of the probe stand for."""
+        return float(np.linalg.norm(np.sqrt(self.counts) * difference)) / self.norm
 
     def _separable(self, dispersion: bool, samples: int | None, orders: int):
         """The capture with rows and columns apart."""
@@ -389,13 +410,32 @@ def _grouped(rays: _Rays, samples: int) -> _Rays:
 def _spread(camera) -> np.ndarray:
     """Pixels (x, y), mm, each at random in its own part of the sensor."""
     pixels = np.asarray(pixel_centres(camera), float)
-    counts = [min(n, most) for n, most in zip(camera.sensor.shape, (_ROWS, _COLUMNS), strict=True)]
+    counts = [min(n, most) for n, most in zip(camera.sensor.shape, _POOL, strict=True)]
     random = np.random.default_rng(0)
     y, x = (
         ((np.indices(counts)[axis] + random.uniform(size=counts)) * size / counts[axis]).astype(int)
         for axis, size in enumerate(camera.sensor.shape)
     )
     return pixels[y, x].reshape(-1, 2)
+
+
+def _drawn(light: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Indices of `_PIXELS` pixels, and how many each stands for.
+
+    Drawn at even steps of a sum of probabilities: half of it alike for all, half by their light.
+    """
+    wanted = np.full(light.size, 0.5 / light.size)
+    wanted += 0.5 * light / light.sum() if light.any() else wanted
+    chance = np.minimum(1.0, _PIXELS * wanted)
+    for _ in range(20):  # what is certain leaves more to the others
+        free = chance < 1
+        if not free.any():
+            break
+        left = _PIXELS - np.count_nonzero(~free)
+        chance[free] = np.minimum(1.0, left * wanted[free] / wanted[free].sum())
+    steps = np.arange(round(chance.sum())) + np.random.default_rng(0).uniform()
+    chosen = np.minimum(np.searchsorted(np.cumsum(chance), steps), light.size - 1)
+    return chosen, 1 / chance[chosen]
 
 
 def _orders_seen(camera, plane, pixels) -> np.ndarray:
