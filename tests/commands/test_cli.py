@@ -79,7 +79,7 @@ class TestExitCode2:
         assert line == f"{tmp_path / 'no.yaml'} is missing; give the path of a YAML experiment file"
 
     def test_folder_for_a_file(self, tmp_path):
-        assert "is a folder without config.yaml; give" in one_line(call("run", tmp_path))
+        assert "is a folder; give the path" in one_line(call("run", tmp_path))
 
     def test_fault_in_the_file(self, file, tmp_path):
         text = file.read_text("utf-8").replace("width: 2 mm", "width: 2")

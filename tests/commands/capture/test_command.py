@@ -177,7 +177,7 @@ def test_a_file_that_does_not_fit_together(asked, line, tmp_path):
 
 def test_files_go_to_the_command_that_takes_them(tmp_path):
     assert "give it to 'thincam capture'" in one_line(call("run", tiny.write(tmp_path)))
-    assert "a folder without config.yaml" in one_line(call("run", tmp_path))
+    assert "a store that thincam capture has completed" in one_line(call("run", tmp_path))
 
 
 @pytest.mark.parametrize(

@@ -105,8 +105,8 @@ def reconstruct_store(store: Path, out: Path | None) -> Path:
 
     if not (store / _CONFIG).is_file():
         raise ConfigError(
-            f"{store} is a folder without {_CONFIG}; give an experiment file, or a store that "
-            "thincam capture completed"
+            f"{store} is a folder; give the path of an experiment file, or a store that thincam "
+            "capture has completed"
         )
     config = load_as(CaptureConfig, store / _CONFIG)
     folder = RunFolder(out or Path("runs") / slug(config.name))
