@@ -192,7 +192,8 @@ class _Probe:
         images = [np.asarray(one.image) for one in scene]
         self.sums = [np.pad(image.cumsum(axis=0).cumsum(axis=1), ((1, 0),) * 2) for image in images]
         pool = _spread(camera)
-        chosen, self.counts = _drawn(sum(self._lit(pool, plane) for plane in range(len(scene))))
+        light = [self._lit(pool, number) for number in range(len(scene))]
+        chosen, self.counts = _drawn(np.sum(light, axis=0))
         # The middle first, for what is shift-invariant.
         self.pixels = np.concatenate([np.zeros((1, 2)), pool[chosen]])
         each = [_orders_seen(camera, plane, self.pixels) for plane in self.planes]
