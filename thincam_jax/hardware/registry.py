@@ -63,10 +63,13 @@ def driver(kind: str, name: str) -> Driver[Any]:
                        f"use one of {', '.join(known)}")  # fmt: skip
     module, _, attribute = known[name].partition(":")
     try:
-        return getattr(import_module(module), attribute)
+        found = getattr(import_module(module), attribute)
     except ImportError as error:
         remedy = "pip install 'thincam-jax[hardware]'"
         raise NotFound(name, "open", f"its library is missing ({error})", remedy) from error
+    if hasattr(found, "require_libraries"):  # those that pip does not bring
+        found.require_libraries()
+    return found
 
 
 def open_device(kind: str, name: str, options: Mapping[str, Any] | None = None) -> Any:

@@ -7,6 +7,7 @@ import os
 import signal
 import stat
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -271,6 +272,8 @@ def test_a_camera_of_another_package_is_told_of_and_works(tmp_path, monkeypatch)
     assert "driver of stages zaber" in lines
     (broken,) = (line for line in lines if "broken" in line)
     assert "its library is missing (No module named 'nowhere_at_all')" in broken
+    (late,) = (line for line in lines if "aravis" in line)
+    assert late.endswith("aravis") == (find_spec("gi") is not None)
     sets = ("--set", "rig=real", "--set", "camera.driver=eye", "--set", "display.driver=screen")
     file = tiny.write(tmp_path)
     result = call("capture", file, "--out", tmp_path / "a.zarr", *sets)

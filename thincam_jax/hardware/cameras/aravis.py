@@ -62,6 +62,11 @@ class AravisCamera(Camera):
             self.close()
             raise
 
+    @staticmethod
+    def require_libraries() -> None:
+        """NotFound, with what to install, where they are missing."""
+        _libraries()
+
     @classmethod
     def open(cls, options: AravisOptions) -> "AravisCamera":
         """Opens a camera; NotFound, Busy or PermissionDenied where that fails."""
