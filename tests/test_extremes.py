@@ -41,13 +41,10 @@ def loss_and_psf(camera, pitch, centre, weights, shape, model, pixel_integration
 
 
 # Single precision is compiled as users have it: there the order of operations shows.
+gradient = jax.value_and_grad(loss_and_psf, has_aux=True)
 compiled = {
-    dtype: jax.jit(
-        jax.value_and_grad(loss_and_psf, has_aux=True),
-        static_argnames=STATIC,
-        compiler_options=options,
-    )
-    for dtype, options in ((np.float32, AS_IN_USE), (np.float64, None))
+    np.float32: jax.jit(gradient, static_argnames=STATIC, compiler_options=AS_IN_USE),
+    np.float64: jax.jit(gradient, static_argnames=STATIC),
 }
 
 

@@ -4,7 +4,6 @@ import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from matplotlib.colors import PowerNorm
 from matplotlib.figure import Figure
 
 from thincam_jax.commands.capture.config import CaptureConfig
@@ -49,8 +48,8 @@ def save_shown(
     _save_stack(folder, "shown", np.stack(shown), labels, place, ("on the display", "level"))
 
 
-def _save_stack(folder, name, images, labels, place, words, beside=_BESIDE) -> None:
-    columns = min(beside, len(images))
+def _save_stack(folder, name, images, labels, place, words) -> None:
+    columns = min(_BESIDE, len(images))
     rows = math.ceil(len(images) / columns)
     aspect = images.shape[1] / images.shape[2]
     size = (2.6 * columns + 1.0, rows * (2.3 * aspect + 0.7))
@@ -101,20 +100,3 @@ def save_seconds(folder: RunFolder, seconds: Mapping[str, float]) -> None:
     ax.margins(x=0.15)
     ax.invert_yaxis()
     save_figure(folder, "seconds", figure)
-
-
-def save_columns(
-    folder: RunFolder,
-    config: CaptureConfig,
-    cells: list[tuple[int, int]],
-    images: Mapping[str, np.ndarray],
-) -> None:
-    """What the sensor sees of some cells (row, column) alone, in counts; images (cell, y, x)."""
-    stacked = np.concatenate(list(images.values()))
-    labels = [f"cell {cell}, {name}" for name in images for cell in cells]
-    height, width = (n * config.camera.pitch / 2 for n in stacked.shape[1:])
-    # The grey goes as the square root, so that ghosts are seen beside the image.
-    norm = PowerNorm(0.5, 0, float(stacked.max()))
-    place = {"extent": (-width, width, height, -height), "norm": norm}
-    words = ("on the sensor", "counts")
-    _save_stack(folder, "columns", stacked, labels, place, words, beside=len(cells))

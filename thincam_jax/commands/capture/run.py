@@ -17,6 +17,7 @@ from thincam_jax.commands.capture.build import build_study, field_shape, screen_
 from thincam_jax.commands.capture.config import CaptureConfig
 from thincam_jax.commands.page import render_page
 from thincam_jax.commands.run_folder import Progress, RunFolder, Step, carry_out
+from thincam_jax.commands.screen.figures import save_columns
 from thincam_jax.commands.study import build
 from thincam_jax.commands.study.evaluate import sample
 from thincam_jax.commands.study.study import Reconstructor, Study
@@ -202,7 +203,7 @@ class _CaptureRun:
             }
         shape = (len(cells), *captures.sensor_shape)
         stacks = {name: image.reshape(shape) for name, image in images.items()}
-        figures.save_columns(self.folder, self.config, cells, stacks)
+        save_columns(self.folder, self.config.camera.pitch, cells, stacks)
         self.metrics |= {
             "frames": captures.series.frame_count,
             "matrix": [math.prod(captures.sensor_shape), captures.series.cell_count],

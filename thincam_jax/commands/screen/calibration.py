@@ -199,7 +199,8 @@ class Calibration:
         """Columns of the matrix, and the targets at other distances."""
         cells, measured, exact = self.columns
         images = {"measured": measured, "exact": exact}
-        figures.save_columns(self.folder, self.setup, cells, images)
+        pitch = float(self.setup.camera.sensor.pitch)
+        figures.save_columns(self.folder, pitch, cells, images)
         if self.images:
             figures.save_distances(self.folder, self.setup, self.images, self.metrics["distances"])
 

@@ -1,5 +1,7 @@
 """The pictures of a screen run, as PNG files in its folder."""
 
+from collections.abc import Mapping
+
 import jax.numpy as jnp
 import numpy as np
 from matplotlib.axes import Axes
@@ -173,17 +175,15 @@ def save_errors(
 
 def save_columns(
     folder: RunFolder,
-    setup: Setup,
+    pitch: float,
     cells: list[tuple[int, int]],
-    images: dict[str, np.ndarray],
+    images: Mapping[str, np.ndarray],
 ) -> None:
     """What the sensor sees of some cells (row, column) alone, in counts; images (cell, y, x).
 
     The grey goes as the square root, so that ghosts are seen beside the image.
     """
-    rows, columns = setup.camera.sensor.shape
-    pitch = float(setup.camera.sensor.pitch)
-    x, y = columns * pitch / 2, rows * pitch / 2
+    y, x = (n * pitch / 2 for n in next(iter(images.values())).shape[1:])
     most = max(stack.max() for stack in images.values())
     figure = Figure(figsize=(3.0 * len(cells) + 1, 3.0 * len(images)), layout="constrained")
     grid = figure.subplots(len(images), len(cells), sharex=True, sharey=True, squeeze=False)

@@ -10,9 +10,15 @@ from typing import Any
 
 import numpy as np
 
-from thincam_jax.hardware.base import Camera, CameraSettings, Frame, Identity
-from thincam_jax.hardware.cameras import features as genicam_features
-from thincam_jax.hardware.cameras.features import BIT_DEPTHS, FrameCount, Number, Value
+from thincam_jax.hardware.base import CameraSettings, Frame, Identity
+from thincam_jax.hardware.cameras.features import (
+    BIT_DEPTHS,
+    FeatureCamera,
+    FrameCount,
+    Number,
+    Value,
+    trigger_by_software,
+)
 from thincam_jax.hardware.errors import (
     Busy,
     Disconnected,
@@ -35,7 +41,7 @@ class AravisOptions:
     name: str = ""
 
 
-class AravisCamera(Camera):
+class AravisCamera(FeatureCamera):
     """A camera that aravis knows, with one frame for each software trigger.
 
     After a frame that failed, the stream starts anew, so that a late one is never taken for the
@@ -86,22 +92,10 @@ class AravisCamera(Camera):
             raise Busy(self._name, "open", "another program controls it", "close that program")
         device.connect("control-lost", self._on_control_lost)
         self._camera.set_range_check_policy(self._aravis.RangeCheckPolicy.ENABLE)
-        genicam_features.trigger_by_software(features)
-
-    @property
-    def identity(self) -> Identity:
-        return self._identity
-
-    @property
-    def sensor_shape(self) -> tuple[int, int]:
-        with self._told("read the sensor's size"):
-            return genicam_features.sensor_shape(self._features)
+        trigger_by_software(features)
 
     def configure(self, settings: CameraSettings) -> CameraSettings:
-        self._stop()
-        shape = self.sensor_shape
-        with self._told("configure"):
-            self._settings = genicam_features.configure(self._features, settings, shape, self._name)
+        self._settings = super().configure(settings)
         return self._settings
 
     def flush(self) -> None:

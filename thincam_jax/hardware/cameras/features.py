@@ -3,10 +3,12 @@
 A library's camera becomes one of these by `Features`: features by name, without their types.
 """
 
+from abc import abstractmethod
 from collections.abc import Collection
-from typing import Protocol, runtime_checkable
+from contextlib import AbstractContextManager
+from typing import Any, Protocol, runtime_checkable
 
-from thincam_jax.hardware.base import CameraSettings, Region
+from thincam_jax.hardware.base import Camera, CameraSettings, Identity, Region
 from thincam_jax.hardware.errors import OutOfRange
 
 BIT_DEPTHS = {"Mono8": 8, "Mono10": 10, "Mono12": 12, "Mono16": 16}
@@ -40,6 +42,38 @@ class Features(Protocol):
         ...
 
 
+class FeatureCamera(Camera):
+    """What the cameras share that are set by features, whatever library reaches them."""
+
+    _features: Any
+    _identity: Identity
+    _name: str  # in errors
+    _formats: Collection[str] = BIT_DEPTHS.keys()  # that the driver can read
+
+    @abstractmethod
+    def _stop(self) -> None:
+        """Ends the stream, if there is one: a camera is set while it stands still."""
+
+    @abstractmethod
+    def _told(self, operation: str) -> AbstractContextManager[None]:
+        """Errors of the library become ours."""
+
+    @property
+    def identity(self) -> Identity:
+        return self._identity
+
+    @property
+    def sensor_shape(self) -> tuple[int, int]:
+        with self._told("read the sensor's size"):
+            return _largest_shape(self._features)
+
+    def configure(self, settings: CameraSettings) -> CameraSettings:
+        self._stop()
+        shape = self.sensor_shape
+        with self._told("configure"):
+            return _set_to(self._features, settings, shape, self._name, self._formats)
+
+
 class FrameCount:
     """A camera's count of frames, which goes on where the stream starts anew or 16 bits are full.
 
@@ -64,7 +98,7 @@ class FrameCount:
         return self._offset + counted
 
 
-def sensor_shape(features: Features) -> tuple[int, int]:
+def _largest_shape(features: Features) -> tuple[int, int]:
     """Rows and columns of the largest region."""
     rows, columns = ("HeightMax", "WidthMax")
     if not features.has(rows):
@@ -89,12 +123,12 @@ def trigger_by_software(features: Features) -> None:
     put("TriggerSource", "Software")
 
 
-def configure(
+def _set_to(
     features: Features,
     asked: CameraSettings,
     shape: tuple[int, int],
     device: str,
-    formats: Collection[str] = BIT_DEPTHS.keys(),
+    formats: Collection[str],
 ) -> CameraSettings:
     """Sets a camera to what is nearest, and returns what it says it is set to.
 

@@ -7,9 +7,15 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import Any
 
-from thincam_jax.hardware.base import Camera, CameraSettings, Frame, Identity
-from thincam_jax.hardware.cameras import features as genicam_features
-from thincam_jax.hardware.cameras.features import BIT_DEPTHS, FrameCount, Number, Value
+from thincam_jax.hardware.base import CameraSettings, Frame, Identity
+from thincam_jax.hardware.cameras.features import (
+    BIT_DEPTHS,
+    FeatureCamera,
+    FrameCount,
+    Number,
+    Value,
+    trigger_by_software,
+)
 from thincam_jax.hardware.errors import (
     Busy,
     Disconnected,
@@ -35,7 +41,7 @@ class PylonOptions:
     serial: str = ""
 
 
-class PylonCamera(Camera):
+class PylonCamera(FeatureCamera):
     """A camera that pylon knows: USB3 Vision or GigE Vision, or its emulator (PYLON_CAMEMU=1).
 
     Every frame answers a software trigger, which is sent once the camera is ready for it: pylon
@@ -67,7 +73,7 @@ class PylonCamera(Camera):
         self._name = str(self._identity)
         ticks = "GevTimestampTickFrequency"  # of GigE Vision; USB3 Vision counts nanoseconds
         self._tick = 1 / float(features.get(ticks)) if features.has(ticks) else 1e-9
-        genicam_features.trigger_by_software(features)
+        trigger_by_software(features)
 
     @classmethod
     def open(cls, options: PylonOptions) -> "PylonCamera":
@@ -77,20 +83,8 @@ class PylonCamera(Camera):
             wanted.SetSerialNumber(options.serial)
         return cls(_created(wanted, options.serial))
 
-    @property
-    def identity(self) -> Identity:
-        return self._identity
-
-    @property
-    def sensor_shape(self) -> tuple[int, int]:
-        with self._told("read the sensor's size"):
-            return genicam_features.sensor_shape(self._features)
-
     def configure(self, settings: CameraSettings) -> CameraSettings:
-        self._stop()
-        shape = self.sensor_shape
-        with self._told("configure"):
-            self._settings = genicam_features.configure(self._features, settings, shape, self._name)
+        self._settings = super().configure(settings)
         return self._settings
 
     def flush(self) -> None:

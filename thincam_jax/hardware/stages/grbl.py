@@ -95,6 +95,8 @@ class GrblStage(SerialStage):
     raises an alarm at the limit switch's input, or home often.
     """
 
+    _protocol = "grbl"
+
     @dataclass(frozen=True)
     class Options:
         """What a config file may say of the stage."""
@@ -114,19 +116,8 @@ class GrblStage(SerialStage):
                     f"speed {self.speed} mm/s, answer_time {self.answer_time} s: give more than 0"
                 )
 
-    @classmethod
-    def open(cls, options: Options) -> "GrblStage":
-        """The stage; whatever moves is stopped."""
-        link = SerialLink("grbl", options.port, options.baud_rate, options.wire_log)
-        try:
-            return cls(link, options)
-        except BaseException:
-            link.close()
-            raise
-
     def __init__(self, link: SerialLink, options: Options):
-        super().__init__(link)
-        self._options = options
+        super().__init__(link, options)
         self._axis = "XYZ".index(options.axis)
         self._lost = "it was not homed since it was opened"
         self._homing = False

@@ -5,7 +5,7 @@ import threading
 import time
 from abc import abstractmethod
 from contextlib import suppress
-from typing import NamedTuple
+from typing import Any, ClassVar, NamedTuple, TypeVar
 
 from thincam_jax.hardware.base import Identity, Stage
 from thincam_jax.hardware.errors import (
@@ -21,6 +21,8 @@ POLL = 0.005  # s between two questions to a stage that moves
 GRACE = 0.5  # s that a stage may stand elsewhere before it starts, and after
 TRIES = 3  # every command is absolute: sent twice, it does the same
 
+Opened = TypeVar("Opened", bound="SerialStage")
+
 
 class Report(NamedTuple):
     """What a stage says of itself."""
@@ -32,16 +34,27 @@ class Report(NamedTuple):
 class SerialStage(Stage):
     """A stage on a serial line. One thread may move it and another stop it."""
 
+    _protocol: ClassVar[str]  # its name in errors
     _link: SerialLink
     _identity: Identity
     _limits: tuple[float, float]  # mm
     _resolution: float  # mm, the smallest step
 
-    def __init__(self, link: SerialLink):
-        self._link = link
+    def __init__(self, link: SerialLink, options: Any):
+        self._link, self._options = link, options
         self._lock = threading.RLock()  # one question and its answer
         self._stops = 0
         self._lost = ""  # why its position is not to be trusted until it is homed again
+
+    @classmethod
+    def open(cls: type[Opened], options: Any) -> Opened:
+        """The stage of the driver's `Options`. It is not moved; a machine that moves is stopped."""
+        link = SerialLink(cls._protocol, options.port, options.baud_rate, options.wire_log)
+        try:
+            return cls(link, options)
+        except BaseException:
+            link.close()
+            raise
 
     @abstractmethod
     def _start_move(self, position: float) -> None:

@@ -85,6 +85,8 @@ def _wrong(line: bytes, cause: str) -> ProtocolError:
 class ZaberStage(SerialStage):
     """One axis of a Zaber device. Open, it may already be homed."""
 
+    _protocol = "zaber"
+
     @dataclass(frozen=True)
     class Options:
         """What a config file may say of the stage."""
@@ -104,19 +106,8 @@ class ZaberStage(SerialStage):
                     "more than 0; the data sheet of the stage names its microstep"
                 )
 
-    @classmethod
-    def open(cls, options: Options) -> "ZaberStage":
-        """The stage; it is not moved."""
-        link = SerialLink("zaber", options.port, options.baud_rate, options.wire_log)
-        try:
-            return cls(link, options)
-        except BaseException:
-            link.close()
-            raise
-
     def __init__(self, link: SerialLink, options: Options):
-        super().__init__(link)
-        self._options = options
+        super().__init__(link, options)
         self._number = 0
         self._checked = False  # until the device is told to send checksums
         self._resolution = options.microstep

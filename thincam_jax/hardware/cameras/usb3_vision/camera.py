@@ -1,12 +1,12 @@
 """A USB3 Vision camera, triggered by software, one frame at a time."""
 
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass
 from time import monotonic
 from typing import Any
 
-from thincam_jax.hardware.base import Camera, CameraSettings, Frame, Identity
-from thincam_jax.hardware.cameras import features
+from thincam_jax.hardware.base import CameraSettings, Frame, Identity
+from thincam_jax.hardware.cameras.features import FeatureCamera, read, trigger_by_software
 from thincam_jax.hardware.cameras.usb3_vision import gencp
 from thincam_jax.hardware.cameras.usb3_vision.features import Features, fetch_xml
 from thincam_jax.hardware.cameras.usb3_vision.gencp import Abrm
@@ -18,13 +18,15 @@ from thincam_jax.hardware.errors import HardwareError, Timeout
 _PLAIN = {"ChunkModeActive": False, "AcquisitionFrameRateEnable": False, "ExposureMode": "Timed"}
 
 
-class Usb3VisionCamera(Camera):
+class Usb3VisionCamera(FeatureCamera):
     """A camera that speaks USB3 Vision.
 
     A frame answers a trigger if its block id is new and it was exposed after the camera's clock
     was read, right before the trigger; older frames are discarded. After any failure the stream is
     stopped and begun anew, so that a frame that comes late is not taken for the next one.
     """
+
+    _formats = PIXEL_FORMATS.keys()
 
     @dataclass(frozen=True)
     class Options:
@@ -58,7 +60,7 @@ class Usb3VisionCamera(Camera):
                 for register in (Abrm.MANUFACTURER, Abrm.MODEL, Abrm.SERIAL, Abrm.DEVICE_VERSION)
             )
         )
-        link.name = str(self._identity)
+        self._name = link.name = str(self._identity)
         self._compare_clocks = compare_clocks and control.has_clock
         self._features = Features(link, control, fetch_xml(link, control))
         self._stream = Stream(link, control, control.sirm)
@@ -68,28 +70,14 @@ class Usb3VisionCamera(Camera):
         for name, value in _PLAIN.items():
             if self._features.has(name):
                 self._features.set(name, value)
-        with self._features.evaluating("open"):
-            features.trigger_by_software(self._features)
-            exposure = features.read(self._features).exposure
+        with self._told("open"):
+            trigger_by_software(self._features)
+            exposure = read(self._features).exposure
         self._settings = self.configure(CameraSettings(exposure, pixel_format="Mono8"))
-
-    @property
-    def identity(self) -> Identity:
-        return self._identity
-
-    @property
-    def sensor_shape(self) -> tuple[int, int]:
-        with self._features.evaluating("read the sensor's size"):
-            return features.sensor_shape(self._features)
 
     def configure(self, settings: CameraSettings) -> CameraSettings:
         self._in_step = False
-        self._stop()
-        shape = self.sensor_shape
-        with self._features.evaluating("configure"):
-            taken = features.configure(
-                self._features, settings, shape, self._link.name, PIXEL_FORMATS
-            )
+        taken = super().configure(settings)
         assert taken.region is not None
         self._stream.prepare(taken.pixel_format, taken.region)
         self._settings = taken
@@ -131,8 +119,11 @@ class Usb3VisionCamera(Camera):
 
     def _no_frame(self, timeout: float, discarded: int) -> Timeout:
         cause = f"no frame within {timeout:g} s of the end of the exposure"
-        return Timeout(self._link.name, "trigger", f"{cause}, {discarded} older ones discarded",
+        return Timeout(self._name, "trigger", f"{cause}, {discarded} older ones discarded",
                        "trigger again, or allow more time")  # fmt: skip
+
+    def _told(self, operation: str) -> AbstractContextManager[None]:
+        return self._features.evaluating(operation)
 
     def _stop(self) -> None:
         self._features.execute("AcquisitionStop")
