@@ -1,5 +1,9 @@
 """The see-through-screen camera: holograms on a glass plate, rays and ghosts (thesis chapter 5)."""
 
+from thincam_jax.imaging.refractive_index import CauchyIndex as CauchyIndex
+from thincam_jax.imaging.refractive_index import ConstantIndex as ConstantIndex
+from thincam_jax.imaging.refractive_index import SellmeierIndex as SellmeierIndex
+from thincam_jax.imaging.refractive_index import bk7 as bk7
 from thincam_jax.waveguide.camera import Rectangle as Rectangle
 from thincam_jax.waveguide.camera import Screen as Screen
 from thincam_jax.waveguide.camera import SeeThroughCamera as SeeThroughCamera
@@ -15,10 +19,6 @@ from thincam_jax.waveguide.rays import RayStatus as RayStatus
 from thincam_jax.waveguide.rays import check_screen as check_screen
 from thincam_jax.waveguide.rays import pixel_centres as pixel_centres
 from thincam_jax.waveguide.rays import trace as trace
-from thincam_jax.waveguide.refractive_index import CauchyIndex as CauchyIndex
-from thincam_jax.waveguide.refractive_index import ConstantIndex as ConstantIndex
-from thincam_jax.waveguide.refractive_index import SellmeierIndex as SellmeierIndex
-from thincam_jax.waveguide.refractive_index import bk7 as bk7
 from thincam_jax.waveguide.smear import SmearedRays as SmearedRays
 from thincam_jax.waveguide.smear import trace_band as trace_band
 from thincam_jax.waveguide.system import ObjectPlane as ObjectPlane

@@ -11,9 +11,9 @@ from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Number, Numbers
+from thincam_jax.imaging.refractive_index import AbstractIndex, as_index
 from thincam_jax.imaging.sensor import Sensor
 from thincam_jax.waveguide.hologram import VolumeHologram
-from thincam_jax.waveguide.refractive_index import AbstractIndex, as_index
 
 
 class Rectangle(eqx.Module):

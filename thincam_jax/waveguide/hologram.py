@@ -23,7 +23,7 @@ from jaxtyping import Array, Bool, Float
 
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Number
-from thincam_jax.waveguide.refractive_index import AbstractIndex, ConstantIndex, as_index, changed
+from thincam_jax.imaging.refractive_index import AbstractIndex, ConstantIndex, as_index, changed
 
 
 class VolumeHologram(eqx.Module):

@@ -15,9 +15,9 @@ from thincam_jax._core import checks
 from thincam_jax._core.checks import Numbers
 from thincam_jax._core.precision import Precision, allow, cast
 from thincam_jax.imaging.operators import Separable, Sparse
+from thincam_jax.imaging.refractive_index import ConstantIndex
 from thincam_jax.waveguide.camera import SeeThroughCamera
 from thincam_jax.waveguide.rays import RayStatus, pixel_centres, trace
-from thincam_jax.waveguide.refractive_index import ConstantIndex
 from thincam_jax.waveguide.system import (
     ObjectPlane,
     footprints,

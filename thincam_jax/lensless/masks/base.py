@@ -7,6 +7,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
+from thincam_jax._core.checks import Number
 from thincam_jax._core.grids import Grid
 
 
@@ -27,8 +28,13 @@ class AbstractMask(eqx.Module):
         """Height and width of the open aperture, mm."""
 
     @abc.abstractmethod
-    def sample(self, grid: Grid) -> Complex[Array, "y x"] | Float[Array, "y x"]:
-        """Amplitude transmittance on a grid; cells cut by the aperture count by their open area."""
+    def sample(
+        self, grid: Grid, wavelength: Number | None = None
+    ) -> Complex[Array, "y x"] | Float[Array, "y x"]:
+        """Amplitude transmittance on a grid; cells cut by the aperture count by their open area.
+
+        `wavelength`: mm, of the light; a mask whose transmittance is the same for all takes none.
+        """
 
 
 class ZoneOrders(NamedTuple):

@@ -131,7 +131,7 @@ class FresnelZoneAperture(AbstractMask):
         half = pitch * jnp.sqrt(self.fill_factor) / 2
         return ZoneOrders(orders, coefficients, self.beta, sites - half, sites + half, sites)
 
-    def sample(self, grid: Grid) -> Float[Array, "y x"]:
+    def sample(self, grid: Grid, wavelength: Number | None = None) -> Float[Array, "y x"]:
         down, zones = axis_orders(self, "angular_spectrum")
         rows = axis_samples(down, grid.y - self.centre[0], grid.pitch)
         columns = axis_samples(zones, grid.x - self.centre[1], grid.pitch)

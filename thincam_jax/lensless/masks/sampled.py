@@ -64,7 +64,9 @@ class SampledMask(AbstractMask):
         place = np.searchsorted(below, below[-1] / 2)
         return float(frequency[order[place]] / np.asarray(self.pitch))
 
-    def sample(self, grid: Grid) -> Complex[Array, "y x"] | Float[Array, "y x"]:
+    def sample(
+        self, grid: Grid, wavelength: Number | None = None
+    ) -> Complex[Array, "y x"] | Float[Array, "y x"]:
         rows, columns = self.amplitude.shape
         dtype = self.amplitude.dtype
         down = _coverage(grid.y - self.centre[0], grid.pitch, rows, self.pitch).astype(dtype)

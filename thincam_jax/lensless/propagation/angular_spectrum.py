@@ -112,7 +112,7 @@ def angular_spectrum(
 def lit_mask(mask: AbstractMask, plane: Grid, path: Path) -> Complex[Array, "y x"]:
     """Field just behind the mask under the exact spherical wave, 1 on the axis, piston dropped."""
     lit = spherical_wave(plane, path)
-    return lit * mask.sample(plane).astype(lit.dtype)
+    return lit * mask.sample(plane, path.wavelength).astype(lit.dtype)
 
 
 def spherical_wave(plane: Grid, path: Path) -> Complex[Array, "y x"]:

@@ -18,6 +18,7 @@ from thincam_jax._core import checks
 from thincam_jax._core.checks import Numbers
 from thincam_jax._core.precision import allow, cast, precision_of
 from thincam_jax.imaging.operators import Matrix, Scaled
+from thincam_jax.imaging.refractive_index import changed
 from thincam_jax.measured.calibration.problem import Covariance, covariance
 from thincam_jax.measured.raw import MeasurementError
 from thincam_jax.waveguide import (
@@ -28,7 +29,6 @@ from thincam_jax.waveguide import (
     trace,
     trace_band,
 )
-from thincam_jax.waveguide.refractive_index import changed
 from thincam_jax.waveguide.system import seen_size
 
 # What can be fitted, its unit, and a step that is small against what it does to an image.
