@@ -18,6 +18,7 @@ from thincam_jax.hardware.virtual.faults import Faults
 
 _EMULATOR = "BaslerCamEmu"
 _LATENCY = 0.05  # s
+_DELIVERY = 5.0  # s, at most, until a frame has come: the emulator delivers in a thread of its own
 
 
 class VirtualPylonCamera(PylonCamera):
@@ -67,7 +68,9 @@ class VirtualPylonCamera(PylonCamera):
     def trigger_and_grab(self, timeout: float) -> Frame:
         if self._camera.IsGrabbing() and self._faults.due("stale_frame"):
             super()._trigger()  # a frame of before waits to be taken for the next one
-            self._camera.WaitForFrameTriggerReady(1000, pylon.TimeoutHandling_ThrowException)
+            last = time.monotonic() + _DELIVERY
+            while not self._camera.NumReadyBuffers.Value and time.monotonic() < last:
+                time.sleep(1e-3)
         return super().trigger_and_grab(timeout)
 
     def close(self) -> None:
