@@ -22,10 +22,13 @@ class WriteError(OSError):
         )
 
 
-def write_whole(path: str | os.PathLike[str], content: bytes | str) -> Path:
+def write_whole(
+    path: str | os.PathLike[str], content: bytes | str, *, on_disk: bool = False
+) -> Path:
     """Write `NAME.partial` beside the file and rename it; text as UTF-8.
 
-    After an error or Ctrl-C the old file is untouched and no partial one is left.
+    After an error or Ctrl-C the old file is untouched and no partial one is left. `on_disk`: the
+    content has reached the disk before it takes the name, so that a power cut leaves one of both.
 
     **Errors**: WriteError, one line, for what the system refuses.
     """
@@ -33,7 +36,11 @@ def write_whole(path: str | os.PathLike[str], content: bytes | str) -> Path:
     partial = path.with_name(path.name + ".partial")
     data = content.encode("utf-8") if isinstance(content, str) else content
     try:
-        partial.write_bytes(data)
+        with open(partial, "wb") as file:
+            file.write(data)
+            if on_disk:
+                file.flush()
+                os.fsync(file.fileno())
         os.replace(partial, path)
     except OSError as error:
         _drop(partial)

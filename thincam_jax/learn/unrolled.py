@@ -14,10 +14,10 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import optax
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from thincam_jax._core import checks
+from thincam_jax.design.adam import adam_method, adam_step
 from thincam_jax.reconstruction.admm import splitting_of
 from thincam_jax.reconstruction.drive import Outcome, Progress, Status
 from thincam_jax.reconstruction.problem import InverseProblem, objective, uniform_image
@@ -144,7 +144,7 @@ def train(
     """
     _check_pairs(problem, images, batch)
     rate = checks.positive("learning_rate", learning_rate, "a number").astype(images.dtype)
-    state = optax.scale_by_adam().init(model)  # type: ignore[arg-type]
+    state = adam_method().init(model)  # type: ignore[arg-type]
     best, lowest, losses = model, float(training_loss(model, problem, images)), []
     for n in range(steps):
         chosen = jax.random.choice(jax.random.fold_in(key, n), len(images), (batch,), replace=False)
@@ -193,11 +193,12 @@ def _descend(model: UnrolledAdmm, state, rate, problem: InverseProblem, images, 
     captures, weights = _elements(problem)
     some = jax.tree.map(lambda x: x[chosen], (captures, weights))
     problem = eqx.tree_at(lambda p: (p.captures, p.weights), problem, some)
-    loss, slope = jax.value_and_grad(training_loss)(model, problem, images[chosen])
-    # optax multiplies floats by integers, which strict promotion forbids.
-    with jax.numpy_dtype_promotion("standard"):
-        updates, state = optax.scale_by_adam().update(slope, state)
-    return jax.tree.map(lambda p, u: p - rate * u, model, updates), state, loss
+
+    def loss(model):
+        return training_loss(model, problem, images[chosen]), None
+
+    model, state, _, (value, _) = adam_step(loss, model, state, rate, adam_method())
+    return model, state, value
 
 
 @jax.jit

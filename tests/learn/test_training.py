@@ -1,0 +1,187 @@
+"""Training in general: it learns, survives what is no number, and goes on to the same bits."""
+
+import dataclasses
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from helpers import ROOT
+from thincam_jax.learn.checkpoint import CheckpointError
+from thincam_jax.learn.training import (
+    Task,
+    TrainingOptions,
+    TrainingState,
+    read_state,
+    train_model,
+    write_state,
+)
+
+OPTIONS = TrainingOptions(steps=40, rate=0.1, warm_up=5, check_every=10, averaging=0.8)
+
+
+class Line(eqx.Module):
+    """y = weight·x, and a number that is not trained."""
+
+    weight: jax.Array
+    fixed: jax.Array
+    name: str = eqx.field(static=True, default="line")
+
+
+def draw(key):
+    x = jax.random.normal(key, (8, 3))
+    return x, x @ jnp.asarray([1.0, -2.0, 0.5])
+
+
+def loss(model, examples):
+    x, y = examples
+    error = jnp.mean((x @ model.weight - model.fixed * y) ** 2)
+    return error, {"error": error}
+
+
+def is_weight(leaf):
+    return eqx.is_inexact_array(leaf) and leaf.ndim == 1
+
+
+TASK = Task(draw, loss, (draw(jax.random.key(7)),), is_weight)
+MODEL = Line(jnp.zeros(3), jnp.asarray(1.0))
+SETTINGS = dataclasses.asdict(OPTIONS)
+
+
+def test_it_learns_and_tells_how_it_goes():
+    told, kept = [], []
+    trained = train_model(TASK, MODEL, OPTIONS, keep=kept.append, callback=told.append)
+    assert trained.status == "finished" and [state.step for state in kept] == [10, 20, 30, 40]
+    state = trained.state
+    assert state.scores[-1] < 0.5 * state.scores[0] and np.isfinite(state.losses).all()
+    assert float(trained.model.fixed) == 1.0 and trained.model.name == "line"
+    # The best is what the lowest score was told of.
+    found = float(loss(trained.model, TASK.validation[0])[0])
+    assert found == pytest.approx(np.min(state.scores)) and found == pytest.approx(told[-1].score)
+    assert [progress.step for progress in told] == list(range(1, 41))
+    assert told[-1].seconds_left == 0 < told[5].seconds_left
+    assert told[0].parts == {"error": told[0].loss}
+
+
+def test_a_callback_stops_it():
+    trained = train_model(TASK, MODEL, OPTIONS, callback=lambda progress: progress.step == 15)
+    assert trained.status == "stopped" and trained.state.step == 15
+
+
+def test_states_go_through_files_and_go_on_to_the_same_bits(tmp_path):
+    file, kept = tmp_path / "state", []
+    whole = train_model(TASK, MODEL, OPTIONS, keep=kept.append).state
+    write_state(file, kept[1], SETTINGS)
+    begun = TrainingState.begin(MODEL, TASK, OPTIONS)
+    state = read_state(file, begun, SETTINGS)
+    assert state.step == 20
+    assert eqx.tree_equal(train_model(TASK, MODEL, OPTIONS, state=state).state, whole)
+    other = {**SETTINGS, "rate": 0.5}
+    with pytest.raises(CheckpointError, match=r"a training whose rate was 0\.1 and is 0\.5 here"):
+        read_state(file, begun, other)
+
+
+def with_faults(of_step):
+    """Examples that are no numbers at some steps, by how often these were tried."""
+    tried: dict[int, int] = {}
+    keys = {}
+    for step in range(OPTIONS.steps):
+        for retreats in range(6):
+            key = jax.random.fold_in(jax.random.fold_in(jax.random.key(0), step), retreats)
+            keys[jax.random.key_data(key).tobytes()] = step
+
+    def faulty(key):
+        step = keys[jax.random.key_data(key).tobytes()]
+        tried[step] = tried.get(step, 0) + 1
+        x, y = draw(key)
+        return x * (jnp.nan if of_step(step, tried[step]) else 1.0), y
+
+    return TASK._replace(draw=faulty)
+
+
+def test_a_step_that_is_no_number_changes_nothing():
+    task = with_faults(lambda step, _: step in (12, 13, 25))
+    state = train_model(task, MODEL, OPTIONS).state
+    assert (state.skipped, state.retreats) == (3, 0)
+    assert np.flatnonzero(np.isnan(state.losses)).tolist() == [12, 13, 25]
+    assert state.scores[-1] < 0.5 * state.scores[0]
+
+
+def test_three_in_a_row_go_back_at_half_the_rate():
+    task, seen = with_faults(lambda step, again: 12 <= step < 15 and again == 1), []
+    trained = train_model(task, MODEL, OPTIONS, callback=seen.append)
+    assert trained.status == "finished"
+    assert (trained.state.skipped, trained.state.retreats) == (3, 1)
+    assert [progress.step for progress in seen][13:17] == [14, 10, 11, 12]  # back to step 10
+    assert np.isfinite(trained.state.losses).all()
+
+
+def test_what_never_becomes_a_number_ends_with_the_best_so_far():
+    task = with_faults(lambda step, _: step >= 12)
+    trained = train_model(task, MODEL, OPTIONS)
+    assert trained.status == "diverged" and trained.state.skipped == 15
+    found = float(loss(trained.model, TASK.validation[0])[0])
+    assert found == pytest.approx(trained.state.scores[0])
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"steps": 0}, {"rate": 0.0}, {"averaging": 1.0}, {"warm_up": -1}, {"check_every": 0}]
+)
+def test_settings_out_of_range_are_told(wrong):
+    with pytest.raises(ValueError, match=next(iter(wrong))):
+        TrainingOptions(**wrong)
+
+
+CHILD = """
+import time, sys
+from learn import test_training as t
+from pathlib import Path
+file = Path(sys.argv[1])
+begun = t.TrainingState.begin(t.MODEL, t.TASK, t.OPTIONS)
+print("begins", flush=True)
+def keep(state):
+    t.write_state(file, state, t.SETTINGS)
+    print(state.step, flush=True)
+t.train_model(t.TASK, t.MODEL, t.OPTIONS, keep=keep, callback=lambda _: time.sleep(0.005))
+"""
+
+
+def killed_and_resumed(file, checks, delay):
+    """The end of a training whose process was killed some time after so many checks."""
+    env = {**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'tests'}"}
+    env |= {"JAX_ENABLE_X64": "1", "JAX_NUMPY_DTYPE_PROMOTION": "strict"}
+    command = [sys.executable, "-c", CHILD, file]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, env=env) as child:
+        assert child.stdout is not None
+        for _ in range(1 + checks):
+            assert child.stdout.readline()
+        time.sleep(delay)
+        child.send_signal(signal.SIGKILL)
+    begun = state = TrainingState.begin(MODEL, TASK, OPTIONS)
+    if file.exists():
+        state = read_state(file, begun, SETTINGS)
+        assert state.step >= 10 * checks
+    return train_model(TASK, MODEL, OPTIONS, state=state).state
+
+
+def test_a_killed_process_goes_on_to_the_same_bits(tmp_path):
+    whole = train_model(TASK, MODEL, OPTIONS).state
+    assert eqx.tree_equal(killed_and_resumed(tmp_path / "state", 2, 0.02), whole)
+
+
+@pytest.mark.thorough
+def test_a_process_killed_at_twenty_moments_goes_on_to_the_same_bits(tmp_path):
+    whole, moments = train_model(TASK, MODEL, OPTIONS).state, random.Random(3)
+    for number in range(20):
+        found = killed_and_resumed(
+            tmp_path / f"state-{number}", moments.randrange(4), moments.uniform(0, 0.08)
+        )
+        assert eqx.tree_equal(found, whole)
