@@ -10,6 +10,7 @@ from thincam_jax._core.checks import Shape
 from thincam_jax._core.grids import Grid
 from thincam_jax._core.precision import PRECISIONS, Precision, precision_of
 from thincam_jax.lensless.masks.base import AbstractMask
+from thincam_jax.lensless.masks.phase import PhaseMask
 from thincam_jax.lensless.propagation.angular_spectrum import require_odd
 from thincam_jax.lensless.propagation.separable import PIXEL_NODES
 
@@ -70,11 +71,19 @@ def psf_method(
             )
         return PsfMethod(model, precision, pixel_integration)
     if oversampling is None:
-        oversampling = 3 if pixel_integration else 1
+        oversampling = max(3 if pixel_integration else 1, _samples_of_cells(mask, grid))
     require_odd(oversampling)
     given = None if mask_shape is None else checks.shape2d("mask_shape", mask_shape)
     shape = given or _mask_plane(mask, grid)
     return PsfMethod(model, precision, pixel_integration, oversampling, shape)
+
+
+def _samples_of_cells(mask: AbstractMask, grid: Grid) -> int:
+    """Samples a pixel, odd, that are no larger than a phase mask's cells; 1 for traced sizes."""
+    if not isinstance(mask, PhaseMask) or any(map(checks.is_traced, (mask.pitch, grid.pitch))):
+        return 1
+    cells = float(np.asarray(grid.pitch) / np.asarray(mask.pitch))
+    return 2 * math.ceil((cells - 1e-4 - 1) / 2) + 1
 
 
 def _mask_plane(mask: AbstractMask, grid: Grid) -> tuple[int, int] | None:

@@ -25,6 +25,7 @@ from thincam_jax.lensless.propagation.path import Path
 from thincam_jax.lensless.propagation.rayleigh_sommerfeld import rayleigh_sommerfeld
 from thincam_jax.lensless.propagation.separable import PIXEL_NODES, pixel_nodes, separable
 from thincam_jax.lensless.propagation.separable_sum import SeparableSum, centre_phase
+from thincam_jax.lensless.sampling import require_phase_sampling
 
 
 def psf(
@@ -49,8 +50,9 @@ def psf(
       "rayleigh_sommerfeld"; each is documented in `thincam_jax.lensless.propagation`.
     - `pixel_integration`: average over each pixel in place of the value at its centre.
     - `grid`: where to evaluate; the sensor's pixels by default.
-    - `oversampling`: samples per pixel of the sampled models (odd; default 1, and 3 for pixel
-      averages); the others are closed forms and take none.
+    - `oversampling`: samples per pixel of the sampled models (odd; default 1, 3 for pixel
+      averages, and more where a phase mask's cells are smaller than that); the others are closed
+      forms and take none.
     - `mask_shape`: pixels of the plane on which the sampled models hold the mask; by default the
       smallest that does. Inside jit and grad, where the mask's size is not known, it is the
       sensor's: give it there if the mask is wider than the sensor.
@@ -167,6 +169,7 @@ def _otf(mask: AbstractMask, grid: Grid, path: Path, method: PsfMethod):
 def _evaluate(function, mask: AbstractMask, grid: Grid, path: Path, method: PsfMethod):
     """In the method's precision; the result comes back in the camera's."""
     own = precision_of(grid.pitch)
+    require_phase_sampling(mask, grid, path, method)
     if method.model == "separable" and method.pixel_integration:
         method = method._replace(nodes=pixel_nodes(mask, grid, path, method.precision))
     with allow(method.precision, mask, grid, path):

@@ -1,4 +1,4 @@
-"""Whether a sensor's pixels resolve what a mask casts on them."""
+"""Whether pixels resolve what a mask casts on them, and samples the phases of a mask."""
 
 import math
 import warnings
@@ -6,9 +6,15 @@ from collections.abc import Iterable
 from typing import Any
 
 import jax
+import numpy as np
 
 from thincam_jax._core import checks
+from thincam_jax._core.grids import Grid
 from thincam_jax.lensless.camera import LenslessCamera
+from thincam_jax.lensless.masks.base import AbstractMask
+from thincam_jax.lensless.masks.phase import PhaseMask
+from thincam_jax.lensless.method import PsfMethod
+from thincam_jax.lensless.propagation.path import Path
 
 
 class SamplingWarning(UserWarning):
@@ -45,3 +51,53 @@ def warn_if_unresolved(camera: LenslessCamera, distances: Iterable[Any]) -> None
         fault = unresolved(float(finest) / magnification, float(camera.sensor.pitch))
         if fault:
             warnings.warn(fault, SamplingWarning, stacklevel=3)
+
+
+def require_phase_sampling(mask: AbstractMask, grid: Grid, path: Path, method: PsfMethod) -> None:
+    r"""ValueError where samples do not hold the phases of a `PhaseMask`, with what does.
+
+    The light just behind the mask has the local frequency ν = |∂φ/∂x|/2π + ν_lit along an axis;
+    between samples Δ apart its phase turns by 2πΔν, which must stay below π. ν_lit is that of the
+    spherical wave at the mask's rim, r/(λ√(t² + r²)); the summand of `rayleigh_sommerfeld` has the
+    waves to the farthest pixel in it too, ρ/(λ√(d² + ρ²)). Cells need samples no larger than they.
+
+    Light steeper than the window's band limit is left out; with the padding of
+    `angular_spectrum` it misses the sensor. Wavelengths outside the material's band are refused,
+    too. Masks of other kinds and traced numbers pass.
+    """
+    known = not any(map(checks.is_traced, jax.tree.leaves((mask, grid, path))))
+    if not isinstance(mask, PhaseMask) or method.oversampling is None or not known:
+        return
+    wavelength, distance, away = (
+        float(n) for n in (path.wavelength, path.distance, path.object_distance)
+    )
+    low, high = mask.material.band
+    if not low <= wavelength <= high:
+        raise ValueError(
+            f"wavelength = {wavelength:g} mm is outside of the material's band; give {low:g} to "
+            f"{high:g} mm"
+        )
+    rims = np.abs(np.asarray(mask.centre)) + np.asarray([float(side) for side in mask.extent]) / 2
+    rim, pitch = float(rims.max()), float(grid.pitch)
+    lit = rim / math.hypot(away, rim) / wavelength if math.isfinite(away) else 0.0
+    if method.model == "rayleigh_sommerfeld":
+        reach = float(np.max(rims + np.asarray(grid.shape) * pitch / 2))
+        lit += reach / math.hypot(distance, reach) / wavelength
+    own = float(mask.steepest_frequency(wavelength))
+    highest = max(own, lit) if mask.interpolation == "cells" else own + lit
+    turned = 2 * pitch / method.samples * highest  # in units of π
+    if turned <= 1 + 1e-4:
+        return
+    enough = 2 * math.ceil((pitch * 2 * highest - 1e-4 - 1) / 2) + 1
+    samples = f"samples {pitch / method.samples * 1e3:.3g} um apart"
+    if mask.interpolation == "cells" and own >= lit:
+        fault = f"the mask's cells of {float(mask.pitch) * 1e3:.3g} um are finer than {samples}"
+    else:
+        fault = (
+            f"behind the mask the phase turns by up to {turned:.2g} π between {samples} "
+            f"({highest:.3g} cycles/mm), which hold less than π"
+        )
+    raise ValueError(
+        f"{fault}: give oversampling = {enough} or more, or a mask of coarser cells or gentler "
+        "slopes"
+    )

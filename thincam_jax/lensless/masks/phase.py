@@ -1,0 +1,193 @@
+r"""Phase masks: a relief of a transparent material that delays the light."""
+
+from typing import Any, Literal, get_args
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Complex, Float
+
+from thincam_jax._core import checks
+from thincam_jax._core.checks import Number, Numbers
+from thincam_jax._core.grids import Grid, cell_overlap
+from thincam_jax._core.precision import as_complex, turn_phasor
+from thincam_jax.imaging.refractive_index import AbstractIndex, as_index
+from thincam_jax.lensless.masks.base import AbstractMask
+from thincam_jax.lensless.masks.sampled import SampledMask
+
+Interpolation = Literal["cells", "bilinear"]
+# mm: above it a relief is no thin mask, and what is given in micrometres is above it too.
+HIGHEST = 0.1
+
+
+class PhaseMask(AbstractMask):
+    r"""A thin relief of heights h: it delays the light by (n − 1)h against air.
+
+    .. math:: t(x, y) = A(x, y)\, e^{2\pi j\,[n(\lambda) - 1]\, h(x, y)/\lambda}
+
+    Beyond the height map the mask is opaque. The element is thin: light passes it straight on,
+    which is right while the relief is much lower than its features are wide.
+
+    **Arguments**
+
+    - `height`: h at the cells' centres, (y, x), mm, from 0 to 0.1.
+    - `pitch`: distance of the centres, mm.
+    - `material`: refractive index, a number or one of `thincam_jax.imaging.refractive_index`.
+    - `amplitude`: A of each cell, (y, x), from 0 to 1; None is 1 everywhere.
+    - `centre`: (y, x) of the mask's centre, mm.
+    - `interpolation`: "cells", each of one height, with steps between them (what is written in
+      pixels); "bilinear" between the centres, constant beyond the outermost (smooth reliefs).
+      Samples hold the mean transmittance of their area of cells, the value at their centre of
+      bilinear ones, both times the open part at the rim. A is that of cells in both.
+
+    **Sampling.** `angular_spectrum` and `rayleigh_sommerfeld` hold a mask where its phase turns by
+    less than π between samples, cells where samples are no larger than they; `psf` refuses
+    the others (`thincam_jax.lensless.sampling.require_phase_sampling`).
+
+    **Errors**: ValueError or TypeError, one line, for what is out of range.
+    """
+
+    height: Float[Array, "y x"]
+    pitch: Float[Array, ""]
+    material: AbstractIndex
+    amplitude: Float[Array, "y x"] | None
+    centre: Float[Array, "2"]
+    interpolation: Interpolation = eqx.field(static=True)
+
+    def __init__(
+        self,
+        height: Any,
+        pitch: Number,
+        material: AbstractIndex | Number,
+        *,
+        amplitude: Any = None,
+        centre: Numbers | tuple[Number, Number] = (0.0, 0.0),
+        interpolation: Interpolation = "cells",
+    ):
+        self.height = _map("height", height, 0.0, HIGHEST, "mm, such as 1.2 * um")
+        self.pitch = checks.positive("pitch", pitch, "mm")
+        self.material = as_index("material", material)
+        self.amplitude = None
+        if amplitude is not None:
+            self.amplitude = _map("amplitude", amplitude, 0.0, 1.0, "parts of one")
+            if self.amplitude.shape != self.height.shape:
+                raise ValueError(
+                    f"amplitude has shape {self.amplitude.shape} and height {self.height.shape}; "
+                    "give one amplitude for each height"
+                )
+        self.centre = checks.finite("centre", centre, "mm", shape=(2,))
+        self.interpolation = checks.choice("interpolation", interpolation, get_args(Interpolation))  # pyright: ignore
+
+    def __repr__(self) -> str:
+        rows, columns = self.height.shape
+        cells = f"{rows}×{columns} cells of {checks.shown(self.pitch, 'µm', 1e-3)}"
+        highest = checks.shown(jnp.max(self.height), "µm", 1e-3)
+        return f"PhaseMask({cells}, up to {highest} high, {self.interpolation})"
+
+    @property
+    def extent(self) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        rows, columns = self.height.shape
+        return rows * self.pitch, columns * self.pitch
+
+    def turns(self, wavelength: Number) -> Float[Array, "y x"]:
+        """[n(λ) − 1]h/λ: the phase of each cell in turns."""
+        light = jnp.asarray(wavelength, self.height.dtype)
+        return self.height * ((self.material(light) - 1) / light)
+
+    def steepest_frequency(self, wavelength: Number) -> Float[Array, ""]:
+        """Highest local frequency of the light behind the mask along an axis, cycles/mm.
+
+        Of bilinear heights |∂φ/∂x|/2π; of cells that of their pitch, 1/(2 pitch).
+        """
+        if self.interpolation == "cells":
+            return 0.5 / self.pitch
+        turns = self.turns(wavelength)
+        steps = [jnp.max(jnp.abs(jnp.diff(turns, axis=axis)), initial=0.0) for axis in (0, 1)]
+        return jnp.maximum(*steps) / self.pitch
+
+    def sample(self, grid: Grid, wavelength: Number | None = None) -> Complex[Array, "y x"]:
+        if wavelength is None:
+            raise TypeError(
+                "a PhaseMask delays light and casts no shadow without its wavelength: model "
+                "'geometric' has none; use 'angular_spectrum' or 'rayleigh_sommerfeld'"
+            )
+        if self.interpolation == "cells":
+            cells = turn_phasor(self.turns(wavelength))
+            if self.amplitude is not None:
+                cells = cells * as_complex(self.amplitude)
+            return jnp.asarray(SampledMask(cells, self.pitch, centre=self.centre).sample(grid))
+        y, x = grid.y - self.centre[0], grid.x - self.centre[1]
+        turns = _between(_between(self.turns(wavelength), y / self.pitch).T, x / self.pitch).T
+        if self.amplitude is None:
+            down, across = (
+                cell_overlap(at, grid.pitch, -side[None] / 2, side[None] / 2) / grid.pitch
+                for at, side in zip((y, x), self.extent, strict=True)
+            )
+            passed = down * across.T
+        else:
+            passed = SampledMask(self.amplitude, self.pitch, centre=self.centre).sample(grid)
+        return turn_phasor(turns) * as_complex(jnp.real(passed))
+
+
+class MaskBlank(eqx.Module):
+    """What a relief is made in: its cells and its material.
+
+    - `shape`: (rows, columns) of cells. `pitch`: of the cells, mm.
+    - `material`: refractive index, a number or one of `thincam_jax.imaging.refractive_index`.
+    """
+
+    shape: tuple[int, int] = eqx.field(static=True)
+    pitch: Float[Array, ""]
+    material: AbstractIndex
+
+    def __init__(self, shape: Any, pitch: Number, material: AbstractIndex | Number):
+        self.shape = checks.shape2d("shape", shape)
+        self.pitch = checks.positive("pitch", pitch, "mm")
+        self.material = as_index("material", material)
+
+    @property
+    def grid(self) -> Grid:
+        """The cells' centres."""
+        return Grid(self.shape, self.pitch)
+
+    def wrap_height(self, wavelength: Number) -> Float[Array, ""]:
+        """λ/(n(λ) − 1), mm: the height that delays the light by one turn."""
+        light = checks.wavelength("wavelength", wavelength)
+        return light / (self.material(light) - 1)
+
+    def mask(self, height: Any, interpolation: Interpolation = "cells") -> PhaseMask:
+        """The blank with heights, mm."""
+        return PhaseMask(height, self.pitch, self.material, interpolation=interpolation)
+
+
+def _map(name: str, values: Any, lowest: float, highest: float, unit: str) -> Float[Array, "y x"]:
+    """A real (y, x) map within its limits, or one line that says what is out of them."""
+    array = jnp.asarray(values)
+    if array.ndim != 2 or 0 in array.shape:
+        raise ValueError(f"{name} has shape {array.shape}; give a non-empty array (y, x)")
+    if not jnp.issubdtype(array.dtype, jnp.floating):
+        if jnp.issubdtype(array.dtype, jnp.complexfloating):
+            raise TypeError(f"{name} is complex; give real numbers in {unit}")
+        array = array.astype(float)
+    if checks.is_traced(array):
+        return array
+    known = np.asarray(array)
+    if not np.isfinite(known).all():
+        raise ValueError(f"{name} holds NaN or infinity; give finite numbers in {unit}")
+    # In single precision a number may lie a rounding beyond its own limit.
+    slack = 1e-6 * (highest - lowest)
+    if known.min() < lowest - slack or known.max() > highest + slack:
+        raise ValueError(
+            f"{name} reaches from {known.min():.4g} to {known.max():.4g}; give {lowest:g} to "
+            f"{highest:g} {unit}"
+        )
+    return array
+
+
+def _between(values: Float[Array, "n m"], at: Float[Array, " k"]) -> Float[Array, "k m"]:
+    """Linear interpolation along the first axis, at centred indices; constant beyond the ends."""
+    count = len(values)
+    place = jnp.clip(at + (count - 1) / 2, 0.0, count - 1.0)
+    below = jnp.clip(jnp.floor(place).astype(int), 0, max(count - 2, 0))
+    part = (place - below.astype(place.dtype))[:, None]
+    return values[below] * (1 - part) + values[jnp.minimum(below + 1, count - 1)] * part
