@@ -237,9 +237,7 @@ def test_models_without_phases_are_refused_in_one_line(model):
 
 def test_cells_finer_than_the_samples_are_refused_and_held_by_default():
     here = camera(tc.PhaseMask(MAP, 2 * um, INDEX), (8, 10), 5 * um, 1.0)
-    with pytest.raises(
-        ValueError, match=r"cells of 2 um are finer than samples 5 um apart"
-    ):
+    with pytest.raises(ValueError, match=r"cells of 2 um are finer than samples 5 um apart"):
         psf(here, oversampling=1)
     np.testing.assert_array_equal(psf(here), psf(here, oversampling=3))
 
