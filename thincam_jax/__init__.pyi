@@ -16,6 +16,8 @@ from .lensless.capture import capture as capture
 from .lensless.masks.fza import FresnelZoneAperture as FresnelZoneAperture
 from .lensless.masks.phase import MaskBlank as MaskBlank
 from .lensless.masks.phase import PhaseMask as PhaseMask
+from .lensless.masks.reliefs import diffuser as diffuser
+from .lensless.masks.reliefs import voronoi_fresnel as voronoi_fresnel
 from .lensless.masks.sampled import SampledMask as SampledMask
 from .lensless.method import MODELS as MODELS
 from .lensless.phase_shift import fringe_scanned_otf as fringe_scanned_otf
