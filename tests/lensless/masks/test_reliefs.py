@@ -39,7 +39,7 @@ def test_a_diffuser_has_the_slope_and_the_correlation_it_is_asked_for(key):
 def test_a_diffuser_is_its_keys(key):
     other = jax.random.split(key)[0]
     first, again, another = (
-        np.asarray(diffuser(k, BLANK, correlation_length=0.02, rms_slope=0.1).height)
+        np.asarray(diffuser(k, BLANK, correlation_length=16 * um, rms_slope=0.1).height)
         for k in (key, key, other)
     )
     np.testing.assert_array_equal(first, again)
@@ -73,4 +73,4 @@ def test_refuses(key):
     with pytest.raises(ValueError, match=r"a lens reaches .* give more sites, a longer focal_len"):
         voronoi_fresnel(key, BLANK, sites=1, **lenses)
     with pytest.raises(ValueError, match=r"height reaches from 0 to .*; give 0 to 0.1 mm"):
-        diffuser(key, BLANK, correlation_length=0.3, rms_slope=1.0)
+        diffuser(key, BLANK, correlation_length=16 * um, rms_slope=10.0)

@@ -22,9 +22,9 @@ def diffuser(
     r"""A diffuser: Gaussian random heights, between whose samples is interpolated.
 
     Their autocovariance is :math:`\sigma^2 e^{-r^2/\ell^2}`, so that the slope along an axis has
-    the root mean square :math:`s = \sqrt2\,\sigma/\ell`: it bends light by about (n − 1)s, and its
-    caustics are sharpest near the focal length ℓ/[2√3 (n − 1)s] of its bumps (of the rms curvature
-    2√3 σ/ℓ²).
+    the root mean square :math:`s = \sqrt2\,\sigma/\ell`: it bends light by about (n − 1)s. Its
+    bumps have the rms curvature :math:`2\sqrt3\,\sigma/\ell^2`, and caustics are sharp near their
+    focal length :math:`\ell/[\sqrt6\,(n-1)s]`.
 
     - `correlation_length`: ℓ, mm, at least two cells.
     - `rms_slope`: s along an axis, dimensionless. The lowest height is 0.
