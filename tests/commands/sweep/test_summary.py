@@ -34,6 +34,12 @@ def test_lines_of_each_axis_and_a_map_of_two():
     assert mesh.get_array().filled(0).tolist() == [[20, 22, 0], [21, 24, 23]]
 
 
+def test_no_map_of_a_method_that_an_axis_does_not_change():
+    table = [row | {"mean_psnr_db/same": 10.0 + ord(row["model"])} for row in rows()]
+    methods = {"single": COLUMN, "same": "mean_psnr_db/same"}
+    assert [ax.get_title("left") for ax in _drawn(table, AXES, methods).axes[2:4]] == ["single", ""]
+
+
 @pytest.mark.parametrize("table", [{"seed": [1]}, {"seed": [1], COLUMN: [None]}])
 def test_nothing_to_tell(tmp_path, table):
     assert summarise(tmp_path, pa.table(table), ["seed"]) == ()

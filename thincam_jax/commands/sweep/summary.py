@@ -45,8 +45,9 @@ def summarise(folder: Path, table: pa.Table, axes: Sequence[str]) -> tuple[str, 
 
 
 def _drawn(rows: list[dict], axes: Sequence[str], methods: dict[str, str]) -> Figure:
-    """A panel of lines for each axis; of two axes also a map for each of the first methods."""
-    maps = list(methods.items())[:_MAPS] if len(axes) == 2 else []
+    """A panel of lines for each axis; of two axes also maps of methods that change along both."""
+    changing = [m for m in methods.items() if all(_changes(rows, p, axes, m[1]) for p in axes)]
+    maps = changing[:_MAPS] if len(axes) == 2 else []
     count = len(axes) + len(maps)
     columns = min(2, count)
     figure = Figure(figsize=(5.6 * columns, 3.9 * -(-count // columns)), layout="constrained")
@@ -59,7 +60,16 @@ def _drawn(rows: list[dict], axes: Sequence[str], methods: dict[str, str]) -> Fi
         shown = _draw_map(ax, rows, axes[0], axes[1], column)
         ax.set_title(method, fontsize=10, loc="left")
         figure.colorbar(shown, ax=ax, label="mean PSNR (dB)")
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper center", ncols=2)
     return figure
+
+
+def _changes(rows: list[dict], path: str, axes: Sequence[str], column: str) -> bool:
+    """Whether a method's PSNR depends on an axis, at any values of the others."""
+    seen: dict[tuple, set] = {}
+    for row in rows:
+        seen.setdefault(tuple(row[other] for other in axes if other != path), set()).add(row[column])
+    return any(len(values) > 1 for values in seen.values())
 
 
 def _draw_lines(
@@ -83,7 +93,6 @@ def _draw_lines(
         ax.set_title("mean over the other axes; bars: their range", fontsize=9, loc="left")
     _name_ticks(ax.xaxis, values, place)
     ax.grid(alpha=0.3)
-    ax.legend(fontsize=8)
 
 
 def _draw_map(ax: Axes, rows: list[dict], across: str, up: str, column: str) -> Any:

@@ -1,0 +1,153 @@
+"""Draws pictures of docs pages that no experiment draws: `python docs/draw_pages.py [NAME ...]`.
+
+Names are those of the functions below; without one all are drawn, in some minutes.
+"""
+
+import shutil
+import sys
+import tempfile
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from matplotlib.figure import Figure
+from typer.testing import CliRunner
+
+import thincam_jax as tc
+from thincam_jax import design
+from thincam_jax.commands.cli import app
+from thincam_jax.measured.calibration import fit_psf
+from thincam_jax.reconstruction import phase_pairs
+from thincam_jax.units import nm, um
+
+ROOT = Path(__file__).resolve().parents[1]
+IMAGES = ROOT / "docs/images"
+MASK = tc.FresnelZoneAperture(25.0, width=5.632)
+
+
+def models():
+    """Along a line, near the axis and at the shadow's edge."""
+    camera = tc.LenslessCamera(MASK, tc.Sensor((1, 8000), 6.2 / 8000), distance=6.5)
+    light = {"wavelength": 500 * nm, "object_distance": 250.0}
+    styles = {
+        "separable": ("k", "-"),
+        "closed_form": ("0.35", "--"),
+        "paraxial": ("0.55", "-."),
+        "geometric": ("0.6", ":"),
+    }
+    figure = Figure(figsize=(10, 3.4), layout="constrained")
+    panels = figure.subplots(1, 3, sharey=True)
+    titles = ("near the axis", "half way to the edge", "at the mask's edge")
+    for ax, low, title in zip(panels, (0.0, 1.4, 2.76), titles, strict=True):
+        for model, (grey, dashes) in styles.items():
+            line = tc.psf(camera, model=model, **light)[0]
+            ax.plot(camera.sensor.grid.x, line, color=grey, linestyle=dashes, label=model, lw=1.2)
+        ax.set(xlim=(low, low + 0.18), ylim=(0, 1.35), title=title, xlabel="x on the sensor (mm)")
+    panels[0].set_ylabel("irradiance (open aperture = 1)")
+    handles = panels[0].get_legend_handles_labels()
+    figure.legend(*handles, loc="outside upper center", ncols=4, frameon=False)
+    return figure
+
+
+def calibration():
+    """A noisy PSF, what is fitted to it, and what is left."""
+    sensor = tc.Sensor((192, 256), 22 * um)
+    true = tc.LenslessCamera(
+        tc.FresnelZoneAperture(12.3, 0.4, width=4.0, centre=(0.12, -0.2)), sensor, distance=6.62
+    )
+    light = {"wavelength": 500 * nm, "object_distance": 250.0}
+    exact = np.asarray(tc.psf(true, pixel_integration=True, **light))
+    noise = 0.05 * np.random.default_rng(0).normal(size=exact.shape)
+    measured = exact + noise
+    nominal = tc.LenslessCamera(tc.FresnelZoneAperture(12.0, width=4.0), sensor, distance=6.5)
+    fit = fit_psf(measured, nominal, **light)
+    told = {name: (float(v), float(fit.standard_errors[name])) for name, v in fit.values.items()}
+    print("true β 12.3 rad/mm², d 6.62 mm; fitted:", told, fit.status)
+    residual = np.asarray(fit.residual)
+    figure = Figure(figsize=(11, 3.2), layout="constrained")
+    panels = figure.subplots(1, 3, sharey=True)
+    images = {"measured": measured, "fitted": measured - residual, "measured − fitted": residual}
+    x, y = np.asarray(sensor.grid.x), np.asarray(sensor.grid.y)
+    for ax, (title, image) in zip(panels, images.items(), strict=True):
+        low, high = (-0.5, 0.5) if title == "measured − fitted" else (0, 1.2)
+        extent = (x[0], x[-1], y[-1], y[0])
+        shown = ax.imshow(image, cmap="gray", vmin=low, vmax=high, extent=extent)
+        ax.set(title=title, xlabel="x on the sensor (mm)")
+        figure.colorbar(shown, ax=ax, label="irradiance (open aperture = 1)", shrink=0.75)
+    panels[0].set_ylabel("y on the sensor (mm)")
+    return figure
+
+
+def _two_pitches():
+    """The thesis' camera with two pitches, and the data of their objective, as in design_python."""
+    setup = design.Setup(
+        pitch=5.5 * um,
+        sensor_width=5.632,
+        object_distance=250.0,
+        object_width=180.0,
+        noise=design.SignalNoise(30.0),
+        prior=design.PowerLaw(2.8),
+    )
+    pair = jnp.array([25.0, 21.0])
+    base = design.shots(pair, 6.5, (0.0, 1.5 * jnp.pi), wavelength=500 * nm, width=5.632)
+    free = [design.Variable("beta", 8.0, 36.0, which) for which in ((0, 1), (2, 3))]
+    space = design.DesignSpace(base, tuple(free))
+    return space, setup, jnp.asarray(phase_pairs(2))
+
+
+def suggest():
+    """A wanted response, which is that of a hidden design, and what the search finds for it."""
+    space, *data = _two_pitches()
+    rings = design.Polar(96.0, 128, 2)
+    hidden = design.shots(
+        jnp.array([17.0, 12.5]), 6.5, (0.0, 1.5 * jnp.pi), wavelength=500 * nm, width=5.632
+    )
+    wanted = design.ring_levels(design.channels(hidden, *data, rings), rings, 32)
+    best = design.match_response(space, wanted, *data, rings, key=jax.random.key(1))
+    thesis = design.channels(space.base, *data, rings)
+    figure = Figure(figsize=(6.4, 3.4), layout="constrained")
+    ax = figure.subplots()
+    cycles = (np.arange(32) + 0.5) * 96.0 / 32
+    ax.plot(cycles, wanted, "k--", label="wanted (of β 17 and 12.5 rad/mm²)", lw=3)
+    found = best.found[0].design
+    first, second = (float(found.beta[n]) for n in (0, 2))
+    found = design.channels(found, *data, rings)
+    name = f"found: β {first:.1f} and {second:.1f} rad/mm²"
+    ax.plot(cycles, design.ring_levels(found, rings, 32), "k-", label=name, lw=1)
+    levels = design.ring_levels(thesis, rings, 32)
+    ax.plot(cycles, levels, color="0.6", label="the thesis' pair, 25 and 21 rad/mm²")
+    ax.set(xlabel="frequency (cycles/rad)", ylabel="level (dB)", ylim=(0, None))
+    ax.legend()
+    return figure
+
+
+def depth():
+    """What `thincam run configs/fza_refocus.yaml` draws."""
+    return _by_command("figures/depth.png", "run", "configs/fza_refocus.yaml")
+
+
+def sweep():
+    """The summary of the example of docs/sweeps.md."""
+    axes = ("methods.3.shots.1.beta=17:23:4 rad/mm^2", "noise.snr_db=30,36")
+    grids = [word for axis in axes for word in ("--grid", axis)]
+    return _by_command("summary.png", "sweep", "configs/quick.yaml", *grids)
+
+
+def _by_command(picture: str, command: str, config: str, *options: str) -> Path:
+    out = Path(tempfile.mkdtemp()) / "out"
+    words = [command, str(ROOT / config), *options, "--out", str(out)]
+    done = CliRunner().invoke(app, words)
+    if done.exit_code:
+        raise SystemExit(done.output)
+    return out / picture
+
+
+PAGES = {f.__name__: f for f in (models, calibration, suggest, depth, sweep)}
+
+for name in sys.argv[1:] or PAGES:
+    picture, place = PAGES[name](), IMAGES / f"{name.replace('_', '-')}.png"
+    if isinstance(picture, Figure):
+        picture.savefig(place, dpi=100)
+    else:
+        shutil.copy(picture, place)
