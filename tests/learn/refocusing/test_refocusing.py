@@ -1,0 +1,147 @@
+"""Scenes with depth, and a network that is linear estimation and a lens' rendering untrained."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+import thincam_jax as tc
+from thincam_jax.learn.refocusing.cameras import RefocusCamera
+from thincam_jax.learn.refocusing.dead_leaves import dead_leaves
+from thincam_jax.learn.refocusing.lens_blur import lens_blur
+from thincam_jax.learn.refocusing.loss import loss
+from thincam_jax.learn.refocusing.network import NetworkOptions, RefocusNetwork
+from thincam_jax.learn.refocusing.planes import Planes
+from thincam_jax.learn.refocusing.scenes import Scene, SceneOptions, captured, draw_batch
+from thincam_jax.lensless.forward import imaging_operator
+from thincam_jax.units import nm, um
+
+SHAPE = (32, 28)
+SMALL = NetworkOptions(steps=2, widths=(8, 8), head_widths=(8, 8), reach=2)
+
+
+@pytest.fixture(scope="module")
+def camera() -> RefocusCamera:
+    mask = tc.FresnelZoneAperture(beta=3.2, width=5.0)
+    thin = tc.LenslessCamera(mask, tc.Sensor((64, 60), 176 * um), 7.5)
+    return RefocusCamera(thin, 532 * nm, field_shape=SHAPE, near=50.0, far=200.0, planes=4)
+
+
+@pytest.fixture(scope="module")
+def images():
+    return dead_leaves(1, 4, 64)
+
+
+def draw(camera, images, seed=0, **options):
+    return draw_batch(jax.random.key(seed), images, camera, SceneOptions(**options), size=2)
+
+
+def test_planes_are_the_exact_psfs(camera):
+    """What is cut off beside the mask's shadow is little."""
+    planes, thin = Planes(camera), camera.camera
+    image = jnp.asarray(np.random.default_rng(0).uniform(size=SHAPE))
+    distance = 1 / camera.inverse_distances[1]
+    whole = imaging_operator(thin, 532 * nm, distance, field_shape=SHAPE)(image)
+    stack = jnp.zeros((4, *SHAPE)).at[1].set(image)
+    np.testing.assert_allclose(planes.operator(stack), whole, atol=2e-3 * float(whole.max()))
+    np.testing.assert_allclose(planes.spectrum_at(distance), planes.spectra[1], atol=1e-9)
+
+
+def test_a_lens_blurs_to_a_disc_of_its_angle(camera):
+    """A point's image has the light of the point and the disc's mean square radius, R²/2."""
+    point = jnp.zeros((21, 17)).at[10, 8].set(1.0)
+    radius = camera.defocus_radius(1 / 60.0 - 1 / 150.0)
+    np.testing.assert_allclose(radius, 5.0 * 7.5 * 0.01 / 0.176 / 2, rtol=1e-6)
+    disc = lens_blur(point[None], jnp.asarray([4.0]), 6)[0]
+    y, x = np.mgrid[-10:11, -8:9].astype(float)
+    np.testing.assert_allclose(disc.sum(), 1, atol=1e-12)
+    np.testing.assert_allclose(np.sum(disc * (x**2 + y**2)), 8, rtol=0.05)
+    np.testing.assert_allclose(lens_blur(point[None], jnp.zeros(1), 6)[0], point, atol=1e-12)
+
+
+def two_layers(camera, near, far):
+    """A bright square before an even ground."""
+    cover = jnp.zeros((3, *SHAPE)).at[1, 10:20, 8:18].set(1.0).at[2].set(1.0)
+    radiance = jnp.zeros((3, *SHAPE)).at[1].set(1.0).at[2].set(0.5)
+    share = jnp.zeros((3, 3, *SHAPE)).at[:, 1].set(1.0)
+    inverse = jnp.broadcast_to(1 / jnp.asarray([near, near, far])[:, None], (3, 3))
+    return Scene(radiance, cover, share, inverse)
+
+
+def test_layers_hide_each_other(camera):
+    scene = two_layers(camera, 60.0, 150.0)
+    np.testing.assert_allclose(scene.all_in_focus[12, 12], 1.0)
+    np.testing.assert_allclose(scene.all_in_focus[2, 2], 0.5)
+    np.testing.assert_allclose(1 / scene.inverse_map[12, 12], 60.0)
+    np.testing.assert_allclose(1 / scene.inverse_map[2, 2], 150.0)
+    # Focused on the front its edge is sharp, and the light of an even ground stays as it is.
+    near = scene.focused(camera, 1 / 60.0)
+    np.testing.assert_allclose(near[10:20, 8:18], 1.0, atol=1e-9)
+    np.testing.assert_allclose(near[9, 12], 0.5, atol=1e-9)
+    # Focused on the back the front spreads over it and hides as much as it spreads.
+    far = scene.focused(camera, 1 / 150.0)
+    assert 0.5 < float(far[9, 12]) < 1.0
+    assert float(far.max()) <= 1 + 1e-9
+    # All of what reaches the mask is in front of it, once.
+    emission = scene.emission(camera)
+    assert emission.shape == (3, 3, *SHAPE)
+    np.testing.assert_allclose(jnp.sum(emission[2], axis=0)[15, 13], 0, atol=1e-9)
+    seen = captured(camera, emission, scene.inverse)
+    np.testing.assert_allclose(
+        seen, camera.operator(1 / scene.inverse[1:, 1])(jnp.sum(emission[1:], axis=1)), atol=1e-9
+    )
+
+
+def test_batches_are_those_of_their_key(camera, images):
+    batch = draw(camera, images)
+    again = draw(camera, images)
+    jax.tree.map(np.testing.assert_array_equal, batch, again)
+    other = draw(camera, images, seed=1)
+    assert not np.array_equal(batch.capture, other.capture)
+    assert np.all((batch.commanded >= 50 - 1e-6) & (batch.commanded <= 200 + 1e-6))
+    assert np.all((batch.distance > 49) & (batch.distance < 201))
+    for n, distance in enumerate(batch.commanded):
+        np.testing.assert_allclose(batch.target(camera, distance)[n], batch.image[n], atol=1e-9)
+    only = draw(camera, images, distances=(60.0, 120.0))
+    assert set(np.round(np.asarray(only.commanded), 6)) <= {60.0, 120.0}
+
+
+def test_a_network_is_trained_and_explains_its_captures(camera, images):
+    network = RefocusNetwork.create(camera, SMALL, key=jax.random.key(0))
+    batch = draw(camera, images, snr_db=(40.0, 40.0), poisson=0.0, layers=(1.0, 0.0, 0.0))
+    step, state = make_step(network)
+    weights, losses = network.weights, []
+    for _ in range(12):
+        weights, state, value, parts = step(weights, state, batch)
+        losses.append(float(value))
+    assert np.isfinite(losses).all() and losses[-1] < losses[0] - 0.1
+    trained = eqx.tree_at(lambda n: n.weights, network, weights)
+    maps = trained.distance(batch.capture, batch.deviation)
+    assert maps.distance.shape == (2, *SHAPE)
+    assert np.all((maps.confidence >= 0) & (maps.confidence <= 1))
+    sweep = trained.sweep(batch.capture, jnp.asarray([60.0, 120.0]), batch.deviation)
+    alone = trained.focus(batch.capture[1], 120.0, batch.deviation[1])
+    np.testing.assert_allclose(sweep[1, 1], alone, atol=1e-7)
+    # The image scales with the capture.
+    scaled = trained.focus(100 * batch.capture[1], 120.0, 100 * batch.deviation[1])
+    np.testing.assert_allclose(scaled, 100 * alone, atol=1e-5)
+    assert np.all(trained.consistency(batch.capture, batch.deviation) < 10)
+
+
+def make_step(network):
+    adam = optax.scale_by_adam()
+
+    @eqx.filter_jit
+    def step(weights, state, batch):
+        def of(weights):
+            return loss(eqx.tree_at(lambda n: n.weights, network, weights), batch)
+
+        (value, parts), slope = jax.value_and_grad(of, has_aux=True)(weights)
+        with jax.numpy_dtype_promotion("standard"):
+            updates, state = adam.update(slope, state)
+        weights = jax.tree.map(lambda w, u: w - 3e-3 * u, weights, updates)
+        return weights, state, value, parts
+
+    return step, adam.init(network.weights)

@@ -1,0 +1,1 @@
+"""Learned refocusing of lensless captures at any distance."""

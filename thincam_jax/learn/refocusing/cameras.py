@@ -1,0 +1,126 @@
+"""The camera that a refocusing network belongs to, and the distances it is trained for."""
+
+import math
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from thincam_jax._core import checks
+from thincam_jax._core.checks import Number
+from thincam_jax._core.grids import same_parity
+from thincam_jax.imaging.operators import CropConvolution, kernel_shape
+from thincam_jax.imaging.scene import Spectrum
+from thincam_jax.lensless.camera import LenslessCamera
+from thincam_jax.lensless.forward import spectral_psf
+from thincam_jax.lensless.method import MODELS, Model
+
+# Pixels that a PSF is kept beyond the mask's shadow: diffraction at its edge falls fast. For a zone
+# aperture on pixels of 44 µm what is cut off is 1e-3 of the light at most (tests/learn).
+_MARGIN = 8
+
+
+class RefocusCamera(eqx.Module):
+    """A camera, its light, its image and the range of distances on which it is to be focused.
+
+    - `camera`: mask, sensor and the distance d between them.
+    - `light`: a `Spectrum` or one wavelength in mm.
+    - `field_shape`: pixels (y, x) of the image, enlarged to the sensor's parity; pixel (i, j) looks
+      along one ray through the middle of the mask, whatever the distance.
+    - `near`, `far`: range of object distances t, mm.
+    - `planes`: number of planes of the stack, evenly spaced in 1/t.
+    - `pupil`: diameter D in mm of the lens that focused images are rendered for; default the width
+      of the mask.
+    - `model`: of the PSFs, see `thincam_jax.psf`.
+
+    The PSF is kept on `support` pixels, the mask's shadow from the nearest point with a margin; the
+    widest lens blur reaches `largest_blur` pixels from its middle. Both are sizes, so that the
+    camera is to be built outside of jit.
+
+    **Errors**: ValueError or TypeError, one line, for what is out of range.
+    """
+
+    camera: LenslessCamera
+    light: Spectrum
+    near: Float[Array, ""]
+    far: Float[Array, ""]
+    pupil: Float[Array, ""]
+    field_shape: tuple[int, int] = eqx.field(static=True)
+    planes: int = eqx.field(static=True)
+    model: Model = eqx.field(static=True)
+    support: tuple[int, int] = eqx.field(static=True)
+    largest_blur: int = eqx.field(static=True)
+
+    def __init__(
+        self,
+        camera: LenslessCamera,
+        light: Spectrum | Number,
+        *,
+        field_shape: tuple[int, int],
+        near: Number,
+        far: Number,
+        planes: int = 8,
+        pupil: Number | None = None,
+        model: Model = "separable",
+    ):
+        self.camera = camera
+        self.light = light if isinstance(light, Spectrum) else Spectrum(light)
+        dtype = camera.distance.dtype
+        self.near = checks.positive("near", near, "mm").astype(dtype)
+        self.far = checks.positive("far", far, "mm").astype(dtype)
+        if not checks.is_traced(self.near) and not self.near < self.far:
+            raise ValueError(f"near = {near} mm is not below far = {far} mm; swap them")
+        width = camera.mask.extent[1] if pupil is None else pupil
+        self.pupil = checks.positive("pupil", width, "mm").astype(dtype)
+        self.field_shape = same_parity(field_shape, camera.sensor.shape)
+        if planes < 2:
+            raise ValueError(f"planes = {planes}; give at least 2")
+        self.planes = planes
+        checks.choice("model", model, MODELS)
+        self.model = model
+        self.support = self._support()
+        self.largest_blur = math.ceil(float(self.defocus_radius(1 / self.near - 1 / self.far)) + 1)
+
+    @property
+    def inverse_distances(self) -> Float[Array, " plane"]:
+        """1/t of the planes, 1/mm, evenly spaced, the nearest first."""
+        return jnp.linspace(1 / self.near, 1 / self.far, self.planes)
+
+    @property
+    def step(self) -> Float[Array, ""]:
+        """Difference of 1/t between neighbouring planes, 1/mm."""
+        return (1 / self.near - 1 / self.far) / (self.planes - 1)
+
+    def defocus_radius(self, inverse_difference) -> Float[Array, "..."]:
+        """Radius, in pixels of the image, of the disc that a lens blurs a point to.
+
+        A lens with the pupil D, focused on t′, blurs a point at t over the angle D|1/t − 1/t′|,
+        that is over Dd|1/t − 1/t′|/p pixels of the pitch p/d.
+
+        `inverse_difference`: 1/t − 1/t′, 1/mm.
+        """
+        pitch = self.camera.sensor.pitch
+        return self.pupil * self.camera.distance / (2 * pitch) * jnp.abs(inverse_difference)
+
+    def operator(self, distances: Float[Array, " plane"]) -> CropConvolution:
+        """The noise-free capture of planes (plane, y, x) at these distances, mm, summed.
+
+        From the exact PSF of each, on its `support`; the distances may be traced.
+        """
+        grid = self.camera.sensor.grid.with_shape(self.support)
+        kernels = jax.vmap(lambda t: self._psf(t, grid))(distances)
+        pitch, shape = self.camera.sensor.pitch, self.camera.sensor.shape
+        return CropConvolution(kernels, pitch, shape, self.field_shape, summed=1)
+
+    def _support(self) -> tuple[int, int]:
+        whole = kernel_shape(self.camera.sensor.shape, self.field_shape)
+        scale = (1 + float(self.camera.distance / self.near)) / float(self.camera.sensor.pitch)
+        shadow = [math.ceil(float(side) * scale) + 2 * _MARGIN for side in self.camera.mask.extent]
+        rows, columns = (min(n + (n - w) % 2, w) for n, w in zip(shadow, whole, strict=True))
+        return rows, columns
+
+    def _psf(self, distance, grid):
+        light = zip(self.light.wavelengths, self.light.weights, strict=True)
+        how = {"model": self.model, "pixel_integration": True}
+        return spectral_psf(self.camera, light, distance, grid=grid, **how)

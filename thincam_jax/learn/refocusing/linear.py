@@ -1,0 +1,86 @@
+r"""The linear step of the network: the best linear estimate of all planes from one spectrum.
+
+.. math:: \Delta F_k = \frac{P_k H_k^*}{\sum_j P_j |H_j|^2 + \eta}\, R
+
+is the least-squares estimate of images with the power spectra P_k from R = Σ H_k F_k + noise of the
+spectrum η. In the unrolled ADMM it is the exact solution of the step that ties the planes to the
+data, with 1/P_k in place of its penalty. P_k and η are learnt.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Complex, Float
+
+from thincam_jax.reconstruction.fourier_splitting import squared_modulus
+
+
+class LinearStep(eqx.Module):
+    """Learnt powers P_k(ρ) = p_k/(ρ² + ρ₀²)^γ, ρ₀ one cycle over the field, and noise.
+
+    The fraction has the mean 1 over all frequencies.
+
+    - `power`: ln p_k, of scenes of mean radiance 1.
+    - `slope`: γ; photographs have about 1, what is left of them after a few steps less.
+    - `noise`: ln of the factor on the noise's own spectrum, and ln of what is added to it for all
+      that the model leaves out.
+    """
+
+    power: Float[Array, " plane"]
+    slope: Float[Array, ""]
+    noise: Float[Array, "2"]
+
+    def __init__(self, planes: int, *, power: float = 0.3, slope: float = 1.0):
+        self.power = jnp.full(planes, np.log(power / planes))
+        self.slope = jnp.asarray(slope)
+        self.noise = jnp.log(jnp.asarray([1.0, 1e-4]))
+
+    def __call__(
+        self,
+        residual: Complex[Array, "v u"],
+        spectra: Complex[Array, "plane v u"],
+        variance: Float[Array, ""],
+        sizes: "Sizes",
+    ) -> Complex[Array, "plane v u"]:
+        """What to add to the planes' spectra for a residual of the capture.
+
+        `variance`: of the residual's noise per sensor pixel, in the units of the residual.
+        """
+        dtype = variance.dtype
+        squared, corner = sizes.frequencies()
+        shape = (jnp.asarray(squared, dtype) + corner) ** -self.slope.astype(dtype)
+        shape = shape / sizes.mean(shape)
+        power = jnp.exp(self.power.astype(dtype))[:, None, None] * shape
+        factor, model = jnp.exp(self.noise.astype(dtype))
+        # Sums of squares of the transforms: of white noise on the sensor, of an image on the field.
+        ratio = (factor * variance + model) * sizes.sensor / sizes.field
+        total = jnp.sum(power * squared_modulus(spectra), axis=0) + ratio
+        filtered = residual * (1 / total).astype(residual.dtype)
+        return spectra.conj() * filtered * power.astype(residual.dtype)
+
+
+class Sizes(eqx.Module):
+    """Numbers of pixels that the spectra's units depend on."""
+
+    window: tuple[int, int] = eqx.field(static=True)
+    field_shape: tuple[int, int] = eqx.field(static=True)
+    sensor: int = eqx.field(static=True)
+
+    @property
+    def field(self) -> int:
+        """Pixels of the field."""
+        return self.field_shape[0] * self.field_shape[1]
+
+    def frequencies(self) -> tuple[np.ndarray, float]:
+        """ρ² on the half plane and ρ₀², (cycles per pixel)²."""
+        v, u = np.fft.fftfreq(self.window[0]), np.fft.rfftfreq(self.window[1])
+        return v[:, None] ** 2 + u**2, 1 / max(self.field_shape) ** 2
+
+    def mean(self, spectrum: Float[Array, "v u"]) -> Float[Array, ""]:
+        """Mean over the whole plane of what is given on the half plane."""
+        weights = np.full(spectrum.shape[-1], 2.0)
+        weights[0] = 1.0
+        if self.window[1] % 2 == 0:
+            weights[-1] = 1.0
+        weights = jnp.asarray(weights / (self.window[0] * self.window[1]), spectrum.dtype)
+        return jnp.sum(spectrum * weights)

@@ -1,0 +1,278 @@
+r"""Scenes with depth: layers that hide each other, as the camera and as a lens see them.
+
+A layer is a picture, how much of each pixel it covers, and a distance with some relief; light
+comes from (layer, part): a layer with relief is shared out between a few flat parts.
+
+A point behind a layer sends light past it to some of the mask. In the mean over the mask, which is
+a pupil of its width, it sees the share 1 − blur(cover), blurred by the defocus between both: that
+is what a captured layer is dimmed by. A lens focused elsewhere sees
+
+.. math:: I = \sum_l \mathrm{blur}_l(\alpha_l F_l)
+    \prod_{m\ \text{in front}} (1 - \mathrm{blur}_m(\alpha_m))
+
+which is exact for one layer over another when one of both is in focus.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
+
+from thincam_jax.learn.refocusing.cameras import RefocusCamera
+from thincam_jax.learn.refocusing.layouts import random_cover, random_relief
+from thincam_jax.learn.refocusing.lens_blur import lens_blur
+
+LAYERS = 3
+PARTS = 3  # flat parts that a layer with relief is shared out between
+
+
+class SceneOptions(NamedTuple):
+    """What scenes are drawn, and how they are captured.
+
+    - `layers`: chances of one, two and three layers.
+    - `dark`: chance that nothing is behind the last but one layer, objects on a dark ground.
+    - `relief`: chance of a layer not to be flat; its 1/t then varies by up to ± `depth` parts of
+      the range.
+    - `snr_db`: range of Gaussian noise, dB, of the mean square of the capture.
+    - `poisson`: chance of shot noise in its place; `electrons`, range of its mean number per pixel.
+    - `distances`: mm, the only ones that scenes stand at and images are focused on; default any.
+    """
+
+    layers: tuple[float, float, float] = (0.35, 0.45, 0.2)
+    dark: float = 0.1
+    relief: float = 0.3
+    depth: float = 0.12
+    snr_db: tuple[float, float] = (20.0, 45.0)
+    poisson: float = 0.2
+    electrons: tuple[float, float] = (50.0, 20000.0)
+    distances: tuple[float, ...] | None = None
+
+
+DEFAULT = SceneOptions()
+
+
+class Scene(eqx.Module):
+    """Layers from the front to the back, in directions: pixel (i, j) is one ray through the mask.
+
+    - `radiance`: F, (layer, y, x); `cover`: α, (layer, y, x), 0 to 1.
+    - `share`: of a pixel in each flat part of its layer, (layer, part, y, x), sum 1.
+    - `inverse`: 1/t of the parts, 1/mm, (layer, part).
+    """
+
+    radiance: Float[Array, "layer y x"]
+    cover: Float[Array, "layer y x"]
+    share: Float[Array, "layer part y x"]
+    inverse: Float[Array, "layer part"]
+
+    @property
+    def visible(self) -> Float[Array, "layer y x"]:
+        """Share of each layer in what a pinhole in the middle of the mask sees."""
+        return self.cover * _seen_past(self.cover)
+
+    @property
+    def all_in_focus(self) -> Float[Array, "y x"]:
+        """What a pinhole sees."""
+        return jnp.sum(self.visible * self.radiance, axis=0)
+
+    @property
+    def inverse_map(self) -> Float[Array, "y x"]:
+        """1/t of what each pixel of `all_in_focus` shows, 1/mm; on a dark ground the ground's."""
+        each = jnp.sum(self.share * self.inverse[:, :, None, None], axis=1)
+        visible = self.visible
+        total = jnp.sum(visible, axis=0)
+        known = jnp.sum(visible * each, axis=0) / jnp.maximum(total, 1e-3)
+        return jnp.where(total > 1e-3, known, each[-1])
+
+    def emission(self, camera: RefocusCamera) -> Float[Array, "layer part y x"]:
+        """The light of each part that reaches the mask, the rest hidden by what is in front."""
+        largest = camera.largest_blur
+        middle = jnp.mean(self.inverse, axis=1)
+        emitted = []
+        for layer in range(LAYERS):
+            seen = self.radiance[layer] * self.cover[layer]
+            if layer:
+                radius = camera.defocus_radius(middle[:layer] - middle[layer])
+                hidden = lens_blur(self.cover[:layer], radius, largest)
+                seen = seen * jnp.prod(1 - hidden, axis=0)
+            emitted.append(self.share[layer] * seen)
+        return jnp.stack(emitted)
+
+    def focused(self, camera: RefocusCamera, inverse) -> Float[Array, "y x"]:
+        """What a lens of the camera's pupil sees, focused on 1/t = `inverse`, 1/mm."""
+        radius = camera.defocus_radius(self.inverse - inverse)
+        covered = self.share * self.cover[:, None]
+        both = jnp.stack([covered, covered * self.radiance[:, None]])
+        blurred = lens_blur(both, jnp.stack([radius, radius]), camera.largest_blur)
+        cover, light = jnp.sum(blurred, axis=2)
+        return jnp.sum(light * _seen_past(cover), axis=0)
+
+
+class Batch(NamedTuple):
+    """Scenes, their captures, and what is to be made of them.
+
+    - `capture`: (element, y, x), in the camera's units.
+    - `deviation`: root mean square of the noise per pixel, the same units.
+    - `commanded`: t to focus on, mm, of each element; `image`: the scene as a lens focused there
+      sees it, (element, y, x).
+    - `all_in_focus`, `inverse`: (element, y, x), the latter 1/t, 1/mm.
+    - `emission`: light of the parts, (element, layer, part, y, x).
+    """
+
+    capture: Float[Array, "element y x"]
+    deviation: Float[Array, " element"]
+    commanded: Float[Array, " element"]
+    image: Float[Array, "element y x"]
+    all_in_focus: Float[Array, "element y x"]
+    inverse: Float[Array, "element y x"]
+    emission: Float[Array, "element layer part y x"]
+    scene: Scene
+
+    @property
+    def distance(self) -> Float[Array, "element y x"]:
+        """Distance of what each pixel shows, mm."""
+        return 1 / self.inverse
+
+    def target(self, camera: RefocusCamera, distance) -> Float[Array, "element y x"]:
+        """The scenes as a lens focused on one distance, mm, sees them."""
+        return jax.vmap(lambda scene: scene.focused(camera, 1 / distance))(self.scene)
+
+
+def draw_scene(
+    key: PRNGKeyArray,
+    images: Float[ArrayLike, "image side side"],
+    camera: RefocusCamera,
+    options: SceneOptions = DEFAULT,
+) -> Scene:
+    """A random scene of pictures cut out of `images` anywhere, at any scale."""
+    keys = jax.random.split(key, 6)
+    images = jnp.asarray(images)
+    dtype, shape = camera.near.dtype, camera.field_shape
+    number = 1 + jax.random.categorical(keys[0], jnp.log(jnp.asarray(options.layers)))
+    cuts = jax.random.split(keys[1], LAYERS)
+    radiance = jnp.stack([_cut_out(k, images, shape) for k in cuts]).astype(dtype)
+    covers = [random_cover(k, shape) for k in jax.random.split(keys[2], LAYERS - 1)]
+    cover = jnp.stack([*covers, jnp.ones(shape)]).astype(dtype)
+    behind = jnp.where((number > 1) & jax.random.bernoulli(keys[3], options.dark), 0.0, 1.0)
+    # Of `number` layers the last ones are there.
+    there = (jnp.arange(LAYERS) >= LAYERS - number).astype(dtype).at[-1].set(behind.astype(dtype))
+    cover = cover * there[:, None, None]
+    inverse, share = _depths(keys[4], camera, options)
+    return Scene(radiance, cover, share, inverse)
+
+
+def _depths(key, camera: RefocusCamera, options: SceneOptions):
+    """1/t of the parts, nearer layers in front, and the share of each pixel in them."""
+    where, is_relief, amount, relief = jax.random.split(key, 4)
+    near, far, dtype = 1 / camera.near, 1 / camera.far, camera.near.dtype
+    middle = _drawn_inverse(where, camera, options, (LAYERS,))
+    middle = jnp.sort(middle)[::-1]
+    size = jax.random.uniform(amount, (LAYERS,), dtype) * options.depth * (near - far)
+    size = jnp.where(jax.random.bernoulli(is_relief, options.relief, (LAYERS,)), size, 0)
+    if options.distances is not None:
+        size = jnp.zeros_like(size)
+    offsets = jnp.linspace(-1, 1, PARTS, dtype=dtype)
+    inverse = jnp.clip(middle[:, None] + size[:, None] * offsets, far, near)
+    keys = jax.random.split(relief, LAYERS)
+    maps = jnp.stack([random_relief(k, camera.field_shape) for k in keys]).astype(dtype)
+    places = offsets[:, None, None] - maps[:, None]
+    share = jnp.maximum(1 - jnp.abs(places) * ((PARTS - 1) / 2), 0)
+    # A flat layer is one part.
+    flat = jnp.zeros((PARTS, 1, 1), dtype).at[PARTS // 2].set(1)
+    return inverse, jnp.where(size[:, None, None, None] > 0, share, flat)
+
+
+def draw_batch(
+    key: PRNGKeyArray,
+    images: Float[ArrayLike, "image side side"],
+    camera: RefocusCamera,
+    options: SceneOptions = DEFAULT,
+    size: int = 4,
+) -> Batch:
+    """`size` scenes, captured: the same for the same key."""
+    return _draw_batch(key, jnp.asarray(images), camera, options, size)
+
+
+@eqx.filter_jit
+def _draw_batch(key, images, camera, options, size) -> Batch:
+    return jax.vmap(lambda k: _draw_one(k, images, camera, options))(jax.random.split(key, size))
+
+
+def _draw_one(key, images, camera: RefocusCamera, options: SceneOptions) -> Batch:
+    at_scene, layer, anywhere, drawn, noise = jax.random.split(key, 5)
+    scene = draw_scene(drawn, images, camera, options)
+    emission = scene.emission(camera)
+    clean = captured(camera, emission, scene.inverse)
+    capture, deviation = _noisy(noise, clean, options)
+    # What is there is as good a focus as any other distance.
+    objects = scene.inverse[jax.random.randint(layer, (), 0, LAYERS), PARTS // 2]
+    other = _drawn_inverse(anywhere, camera, options, ())
+    inverse = jnp.where(jax.random.bernoulli(at_scene), objects, other)
+    return Batch(
+        capture,
+        deviation,
+        1 / inverse,
+        scene.focused(camera, inverse),
+        scene.all_in_focus,
+        scene.inverse_map,
+        emission,
+        scene,
+    )
+
+
+def captured(camera: RefocusCamera, emission, inverse) -> Float[Array, "y x"]:
+    """The noise-free capture of the light of parts (layer, part, y, x) at 1/t (layer, part)."""
+    operator = camera.operator(1 / inverse.reshape(-1))
+    return operator(emission.reshape(-1, *camera.field_shape))
+
+
+def _noisy(key, clean, options: SceneOptions):
+    """The capture with noise, and the noise's root mean square."""
+    kind, level, draw = jax.random.split(key, 3)
+    share = jax.random.uniform(level, (), clean.dtype)
+    low, high = options.snr_db
+    gaussian = jnp.mean(clean**2) * 10 ** (-(low + (high - low) * share) / 10)
+    low, high = jnp.log(jnp.asarray(options.electrons, clean.dtype))
+    electrons = jnp.exp(low + (high - low) * share)
+    # Normal in place of Poisson numbers, which differ little from 50 electrons on.
+    mean = jnp.mean(clean)
+    shot = jnp.maximum(clean, 0) * mean / electrons
+    variance = jnp.where(jax.random.bernoulli(kind, options.poisson), shot, gaussian)
+    noise = jnp.sqrt(variance) * jax.random.normal(draw, clean.shape, clean.dtype)
+    return clean + noise, jnp.sqrt(jnp.mean(variance))
+
+
+def _drawn_inverse(key, camera: RefocusCamera, options: SceneOptions, shape):
+    """Random 1/t, 1/mm."""
+    if options.distances is not None:
+        return jax.random.choice(key, 1 / jnp.asarray(options.distances, camera.near.dtype), shape)
+    share = jax.random.uniform(key, shape, camera.near.dtype)
+    return 1 / camera.far + share * (1 / camera.near - 1 / camera.far)
+
+
+def _cut_out(key, images, shape):
+    """A part of one of the images, turned, mirrored, scaled, made darker."""
+    which, zoom, place, turn, gain = jax.random.split(key, 5)
+    image = images[jax.random.randint(which, (), 0, images.shape[0])]
+    flips = jax.random.bernoulli(turn, shape=(3,))
+    image = jnp.where(flips[0], image[::-1], image)
+    image = jnp.where(flips[1], image[:, ::-1], image)
+    image = jnp.where(flips[2], image.T, image)
+    side, largest = images.shape[-1], max(shape)
+    # From the whole image to as many of its pixels as the field has, or half the image.
+    low = largest / side
+    high = max(1.0, 2 * low)
+    scale = low * (high / low) ** jax.random.uniform(zoom, (), image.dtype)
+    slack = jnp.asarray(shape, image.dtype) - scale * side  # negative: what is left to cut away
+    shift = jax.random.uniform(place, (2,), image.dtype) * slack
+    scales = jnp.stack([scale, scale])
+    out = jax.image.scale_and_translate(image, shape, (0, 1), scales, shift, "linear")
+    out = jnp.clip(out, 0, 1)
+    return out * jax.random.uniform(gain, (), image.dtype, 0.4, 1.0)
+
+
+def _seen_past(cover):
+    """Of layers from the front: the share of each pixel that those in front leave free."""
+    left = jnp.cumprod(1 - cover, axis=0)
+    return jnp.concatenate([jnp.ones_like(cover[:1]), left[:-1]])

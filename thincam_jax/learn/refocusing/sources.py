@@ -1,0 +1,102 @@
+"""Images that scenes are made of: photographs, scikit-image's own, drawn ones."""
+
+import hashlib
+import os
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float32
+
+from thincam_jax.imaging.targets import load_image, resize, sample_image
+from thincam_jax.learn.refocusing.dead_leaves import dead_leaves
+
+_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
+# Photographs that ship with scikit-image.
+_SAMPLES = (
+    *("astronaut", "brick", "camera", "chelsea", "coffee", "coins", "grass", "gravel"),
+    *("rocket",),
+)
+_LICENCE_FILES = ("LICENSE", "LICENSE.txt", "LICENSE.md", "COPYING")
+
+
+class Entry(NamedTuple):
+    """One image of a source: its name, the SHA-256 of what it was read from, and its licence."""
+
+    name: str
+    sha256: str
+    licence: str
+
+
+class Source(NamedTuple):
+    """Images of equal size to draw scenes from, and where they are from.
+
+    - `images`: (image, side, side), linear radiance from 0 to 1.
+    - `manifest`: an entry for each; one for all drawn ones.
+    """
+
+    images: Float32[np.ndarray, "image side side"]
+    manifest: tuple[Entry, ...]
+
+    def __add__(self, other: "Source") -> "Source":  # type: ignore[override]
+        images = np.concatenate([self.images, other.images])
+        return Source(images, self.manifest + other.manifest)
+
+
+def photographs(folder: str | os.PathLike[str], side: int, *, licence: str = "") -> Source:
+    """The images of a folder, in the order of their names.
+
+    sRGB is linearised, colours become luminance, and the middle square is reduced to `side` pixels.
+    `licence`: default the first line of the folder's LICENSE file, else "unknown".
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise ValueError(f"{str(folder)!r} is no folder; give a folder of images")
+    files = sorted(p for p in folder.iterdir() if p.suffix.lower() in _SUFFIXES)
+    if not files:
+        raise ValueError(f"{str(folder)!r} holds no image; give a folder of {', '.join(_SUFFIXES)}")
+    licence = licence or _licence(folder)
+    hashes = [hashlib.sha256(path.read_bytes()).hexdigest() for path in files]
+    entries = zip(files, hashes, strict=True)
+    manifest = tuple(Entry(path.name, digest, licence) for path, digest in entries)
+    return Source(np.stack([_square(load_image(path), side) for path in files]), manifest)
+
+
+def samples(side: int) -> Source:
+    """scikit-image's own photographs, as `photographs`."""
+    images = [sample_image(name) for name in _SAMPLES]
+    digests = [hashlib.sha256(image.tobytes()).hexdigest() for image in images]
+    licence = "scikit-image's own (its data folder's README)"
+    pairs = zip(_SAMPLES, digests, strict=True)
+    manifest = tuple(Entry(f"skimage:{name}", digest, licence) for name, digest in pairs)
+    return Source(np.stack([_square(image, side) for image in images]), manifest)
+
+
+def drawn(seed: int, count: int, side: int) -> Source:
+    """`dead_leaves` as a source."""
+    images = dead_leaves(seed, count, side)
+    digest = hashlib.sha256(images.tobytes()).hexdigest()
+    return Source(images, (Entry(f"dead leaves, seed {seed}, {count} images", digest, "drawn"),))
+
+
+def linear_light(encoded: np.ndarray) -> np.ndarray:
+    """Radiance of sRGB values from 0 to 1 (IEC 61966-2-1)."""
+    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+
+
+def _square(image: np.ndarray, side: int) -> Float32[np.ndarray, "side side"]:
+    linear = linear_light(image)
+    if linear.ndim == 3:
+        linear = linear @ np.array([0.2126, 0.7152, 0.0722])  # luminance of sRGB's primaries
+    rows, columns = linear.shape
+    n = min(rows, columns)
+    top, left = (rows - n) // 2, (columns - n) // 2
+    return resize(linear[top : top + n, left : left + n], (side, side)).astype(np.float32)
+
+
+def _licence(folder: Path) -> str:
+    for name in _LICENCE_FILES:
+        if (folder / name).is_file():
+            lines = (folder / name).read_text(encoding="utf-8", errors="replace").splitlines()
+            return next((line.strip() for line in lines if line.strip()), "unknown")
+    return "unknown"
