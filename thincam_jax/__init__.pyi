@@ -13,12 +13,27 @@ from .lensless.accuracy import predict_error as predict_error
 from .lensless.accuracy import select_model as select_model
 from .lensless.camera import LenslessCamera as LenslessCamera
 from .lensless.capture import capture as capture
+from .lensless.masks.base import AbstractFactoredMask as AbstractFactoredMask
+from .lensless.masks.base import AbstractMask as AbstractMask
+from .lensless.masks.base import AxisFactors as AxisFactors
+from .lensless.masks.base import MaskTerms as MaskTerms
+from .lensless.masks.cells import SeparableMask as SeparableMask
+from .lensless.masks.cells import maximum_length_sequence as maximum_length_sequence
 from .lensless.masks.fza import FresnelZoneAperture as FresnelZoneAperture
+from .lensless.masks.lenslets import LensletArray as LensletArray
 from .lensless.masks.phase import MaskBlank as MaskBlank
 from .lensless.masks.phase import PhaseMask as PhaseMask
+from .lensless.masks.pinhole import Pinhole as Pinhole
+from .lensless.masks.pinhole import RadialMask as RadialMask
+from .lensless.masks.redundant_arrays import (
+    ModifiedUniformlyRedundantArray as ModifiedUniformlyRedundantArray,
+)
+from .lensless.masks.redundant_arrays import UniformlyRedundantArray as UniformlyRedundantArray
 from .lensless.masks.reliefs import diffuser as diffuser
 from .lensless.masks.reliefs import voronoi_fresnel as voronoi_fresnel
 from .lensless.masks.sampled import SampledMask as SampledMask
+from .lensless.masks.sampled import random_cells as random_cells
+from .lensless.masks.sampled import read_mask as read_mask
 from .lensless.method import MODELS as MODELS
 from .lensless.phase_shift import fringe_scanned_otf as fringe_scanned_otf
 from .lensless.phase_shift import phase_pair_otf as phase_pair_otf

@@ -370,11 +370,11 @@ def test_sizes_that_do_not_fit_are_refused_at_once():
         )
 
 
-def test_sampled_mask_needs_a_sampled_model():
-    camera = tc.LenslessCamera(tc.SampledMask(np.ones((3, 4)), 0.1), tc.Sensor((4, 5), 0.1), 5.0)
+def test_mask_without_terms_needs_a_sampled_model():
+    camera = tc.LenslessCamera(tc.RadialMask([1.0], 0.2), tc.Sensor((4, 5), 0.1), 5.0)
     for model in ("separable", "closed_form", "paraxial"):
         with pytest.raises(
-            TypeError, match=f"{model}.*SampledMask.*'angular_spectrum' or 'rayleigh_"
+            TypeError, match=f"{model}.*RadialMask.*'angular_spectrum' or 'rayleigh_"
         ):
             tc.psf(camera, wavelength=WAVELENGTH, model=model)
 

@@ -161,6 +161,20 @@ def fraction(name: str, value: Any) -> Array:
     return _require(real(name, value, "parts of one"), lambda known: 0 < known <= 1, message)
 
 
+def transmittances(name: str, values: Any) -> Array:
+    """A one-dimensional code of numbers from 0 to 1."""
+    array = finite(name, values, "parts of one", shape=np.shape(values))
+    if array.ndim != 1 or array.size == 0:
+        raise ValueError(f"{name} has shape {array.shape}; give a code: one row of transmittances")
+    known = _known(array)
+    if known is not None and (known.min() < 0 or known.max() > 1):
+        raise ValueError(
+            f"{name} runs from {known.min():g} to {known.max():g}; give transmittances of 0 to 1, "
+            "such as (s + 1)/2 of a code s of ±1"
+        )
+    return array
+
+
 def choice(name: str, value: Any, options: Iterable[str]) -> str:
     options = tuple(options)
     if value not in options:
@@ -174,6 +188,21 @@ def at_least_one(counts: dict[str, int]) -> None:
     for name, number in counts.items():
         if number < 1:
             raise ValueError(f"{name} = {number}; give at least 1")
+
+
+def whole_cells(name: str, side: Any, cell_name: str, cell: Any) -> int:
+    """How many cells make up a side, both in mm, or ValueError with the sides next to it."""
+    side = float(positive(name, side, "mm"))
+    cell = float(positive(cell_name, cell, "mm"))
+    cells = round(side / cell)
+    if cells < 1 or abs(cells * cell - side) > 1e-4 * cell:
+        low, high = max(1, int(side / cell)) * cell, (int(side / cell) + 1) * cell
+        nearest = f"{low:g} mm" if low == high else f"{low:g} or {high:g} mm"
+        raise ValueError(
+            f"{name} = {side:g} mm is not a whole number of cells of {cell_name} = {cell:g} mm; "
+            f"give {name} = {nearest}"
+        )
+    return cells
 
 
 def shape2d(name: str, value: Any) -> tuple[int, int]:

@@ -87,7 +87,7 @@ def _exact(
     factors: Complex[Array, "pair n"],
 ) -> Responses:
     u = frequencies.axis / path.distance
-    first, second, weights = pairs(zones)
+    first, second, weights = pairs(zones.coefficients)
     whole = _product(weights, factors)
     if not setup.crop:
         return Responses(whole, whole)
@@ -106,7 +106,7 @@ def _rings(zones: ZoneOrders, path: Path, setup: Setup, frequencies: Polar) -> R
     rho = frequencies.radius / path.distance
     along = [jnp.abs(f[:, None] * rho) for f in (frequencies.sine, frequencies.cosine)]
     whole = seen = jnp.zeros(along[0].shape, rho.dtype)
-    for i, j in zip(*pairs(zones)[:2], strict=True):
+    for i, j in zip(*pairs(zones.coefficients)[:2], strict=True):
         k, m = zones.orders[i], zones.orders[j]
         if k == m:
             continue
@@ -146,7 +146,7 @@ def _place(zones: ZoneOrders, k: int, m: int, path: Path, u):
 
 def _open(zones: ZoneOrders, k: int, m: int, path: Path, u, place):
     """1 where that point lies in the aperture's overlap with itself, 0 beyond, over one zone."""
-    half = (zones.upper[0] - zones.lower[0] - path.wavelength * path.distance * u) / 2
+    half = (zones.width - path.wavelength * path.distance * u) / 2
     zone = jnp.sqrt(jnp.pi / (abs(k - m) * zones.beta)) / 4
     return jax.nn.sigmoid((half - place) / zone)
 

@@ -9,15 +9,14 @@ from typing import NamedTuple
 
 from thincam_jax._core.grids import Grid, fast_shape
 from thincam_jax._core.precision import itemsize_of
-from thincam_jax.lensless.masks.base import AbstractMask
-from thincam_jax.lensless.masks.sampled import SampledMask
+from thincam_jax.lensless.masks.base import AbstractFactoredMask, AbstractMask, term_count
 from thincam_jax.lensless.method import SAMPLED, PsfMethod
 from thincam_jax.lensless.propagation.angular_spectrum import padded_shape
 
-# Real operations of one chirp integral (both edges in both their forms, with their phasors), of one
-# phasor, of one sample of a propagated field besides its transforms, and of one summand of the
-# Rayleigh-Sommerfeld integral.
-_CHIRP, _PHASOR, _WAVE, _SUMMAND = 1200, 40, 100, 60
+# Real operations of one chirp integral (both edges in both their forms, with their phasors), of the
+# wave of one edge, of one phasor, of one sample of a propagated field besides its transforms, and
+# of one summand of the Rayleigh-Sommerfeld integral.
+_CHIRP, _EDGE, _PHASOR, _WAVE, _SUMMAND = 1200, 250, 40, 100, 60
 # What any evaluation holds beside its arrays: its arguments and constants.
 _BASE = 4096
 # Samples of the sensor that the direct sum does at a time.
@@ -64,38 +63,27 @@ def _sampled(shape: tuple[int, int], method: PsfMethod) -> tuple[float, float]:
 
 def _separable_sum(mask, shape: tuple[int, int], method: PsfMethod) -> tuple[float, float]:
     """The same for the models that are a short sum of products of one-dimensional factors."""
-    orders = getattr(mask, "orders", None)
-    if orders is None:  # the geometric shadow of a mask given by numbers
-        height, width = mask.amplitude.shape if isinstance(mask, SampledMask) else shape
-        rows, columns = shape
-        products = rows * height * width + rows * width * columns
-        held = rows * (height + 2 * width + 2 * columns) + columns * width
-        return 4.0 * products, float(held)
+    if not isinstance(mask, AbstractFactoredMask):  # a geometric shadow, sampled
+        return 4.0 * math.prod(shape), 2.0 * math.prod(shape)
     length = sum(shape)
-    cells = max(getattr(mask, "pixels", None) or (1,))  # of the longer side
-    count = len(orders)
+    count, shadow, cells, chirped = term_count(mask)
     pairs = count * (count + 1) // 2
     if method.model == "separable":
         nodes = method.nodes if method.pixel_integration else 1
-        at_once = length * (count if cells == 1 else cells)
-        integrals = nodes * at_once
-        flops = _CHIRP * integrals + 4 * count * cells * length * nodes * (cells > 1)
+        at_once = length * (count * cells if chirped else cells + 1)
+        flops = nodes * (_CHIRP if chirped else _EDGE) * at_once
+        flops += nodes * 16 * count * cells * length * (not chirped)
         # One node after another; the orders' fields of all of them.
         fields = nodes * count * length if method.pixel_integration else 0
         held = max(5.5 * at_once + 2.5 * fields, 5.2 * pairs * length)
         terms = pairs
     else:
-        terms = pairs - count + 1 if method.model != "geometric" else _harmonics(orders)
+        terms = pairs - count + 1 if method.model != "geometric" else shadow
         work = _CHIRP if method.pixel_integration else _PHASOR
         flops = work * terms * length * cells
         per_factor = 12.0 if method.pixel_integration else 2.1
         held = per_factor * terms * length + (2.5 * cells * length if cells > 1 else 0)
     return float(flops + 4 * terms * math.prod(shape)), float(held)
-
-
-def _harmonics(orders: tuple[int, ...]) -> int:
-    """Number of different |k − l| of a mask's orders: the terms of its shadow."""
-    return len({abs(k - m) for k in orders for m in orders})
 
 
 def convolution_cost(

@@ -33,7 +33,7 @@ def require_digits(mask: AbstractMask, grid: Grid, path: Path, model: str) -> No
 def held_in_single(mask: AbstractMask, grid: Grid, path: Path, model: str) -> bool:
     """Whether float32 can represent the zones' phases; True for traced numbers."""
     numbers = jax.tree.leaves((mask, grid, path))
-    if not hasattr(mask, "orders") or any(checks.is_traced(n) for n in numbers):
+    if not hasattr(mask, "zone_orders") or any(checks.is_traced(n) for n in numbers):
         return True
     return largest_phase(mask, grid, path, model) <= _LARGEST
 

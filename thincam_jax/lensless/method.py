@@ -9,7 +9,12 @@ from thincam_jax._core import checks
 from thincam_jax._core.checks import Shape
 from thincam_jax._core.grids import Grid
 from thincam_jax._core.precision import PRECISIONS, Precision, precision_of
-from thincam_jax.lensless.masks.base import AbstractMask
+from thincam_jax.lensless.masks.base import (
+    AbstractFactoredMask,
+    AbstractMask,
+    term_count,
+    zone_orders,
+)
 from thincam_jax.lensless.masks.phase import PhaseMask
 from thincam_jax.lensless.propagation.angular_spectrum import require_odd
 from thincam_jax.lensless.propagation.separable import PIXEL_NODES
@@ -28,6 +33,25 @@ MODELS: tuple[Model, ...] = get_args(Model)
 UNBOUNDED: tuple[Model, ...] = ("paraxial", "closed_form")
 SAMPLED: tuple[Model, ...] = ("angular_spectrum", "rayleigh_sommerfeld")
 CLOSED: tuple[Model, ...] = tuple(model for model in MODELS if model not in SAMPLED)
+
+
+# Terms of a mask up to which `separable` is offered: its work grows as their square.
+_MOST_TERMS = 128
+
+
+def has_few_terms(mask: AbstractMask) -> bool:
+    """Whether the mask is a sum of so few products that `separable` serves it."""
+    return isinstance(mask, AbstractFactoredMask) and term_count(mask).terms <= _MOST_TERMS
+
+
+def models_of(mask: AbstractMask) -> tuple[Model, ...]:
+    """The models that can represent the mask."""
+    fits = {
+        **dict.fromkeys(UNBOUNDED, zone_orders(mask) is not None),
+        "separable": has_few_terms(mask),
+        "geometric": not mask.pure_phase,
+    }
+    return tuple(model for model in MODELS if fits.get(model, True))
 
 
 class PsfMethod(NamedTuple):

@@ -135,14 +135,14 @@ def closed_terms(
     pixel_integration: bool,
     nodes: int = PIXEL_NODES,
 ) -> SeparableSum:
-    """The PSF of a mask with zone orders by one of the closed forms, as separable terms.
+    """The PSF of a mask of separable terms by one of the closed forms, as separable terms.
 
     `nodes`: of the pixel average of `separable`.
     """
     h = _closed(mask, grid, path, model, pixel_integration, nodes)
     if isinstance(h, ChirpSum):
         h = h.sample(grid, pixel_integration=pixel_integration)
-    assert isinstance(h, SeparableSum)  # of a mask with zone orders
+    assert isinstance(h, SeparableSum)  # of a mask of terms
     return h
 
 

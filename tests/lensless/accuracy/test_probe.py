@@ -11,7 +11,7 @@ from lensless.accuracy import cameras
 import thincam_jax as tc
 from helpers import relative_l2
 from thincam_jax.lensless.accuracy.lines import fine_fields
-from thincam_jax.lensless.accuracy.probe import ZoneProbe
+from thincam_jax.lensless.accuracy.probe import MaskProbe
 from thincam_jax.lensless.method import PsfMethod
 from thincam_jax.lensless.propagation import Path
 from thincam_jax.lensless.propagation.angular_spectrum import angular_spectrum
@@ -30,7 +30,7 @@ def probe_of(case):
     conditions = dict(case.conditions)
     average = conditions.pop("pixel_integration")
     camera = case.camera
-    return ZoneProbe(
+    return MaskProbe(
         camera.mask, camera.sensor.grid, camera.path(**conditions), pixel_integration=average
     )
 

@@ -48,7 +48,7 @@ def test_rectangle():
         shown[inside], (0.5 * (1 + np.cos(30.0 * (y**2 + x**2) + 0.7)))[inside], atol=1e-13
     )
     assert (shown > 0).sum() <= 8 * 5
-    with pytest.raises(ValueError, match=r"height = 0\.75 mm is not a whole number of display"):
+    with pytest.raises(ValueError, match=r"height = 0\.75 mm is not a whole number of cells"):
         tc.FresnelZoneAperture(30.0, width=0.5, height=0.75, pixel_pitch=0.1)
 
 
@@ -112,7 +112,10 @@ def test_display_pixels():
         ({"fill_factor": 0.0}, "fill_factor = 0.0 is out of range"),
         ({"harmonics": 4}, "harmonics = 4: give an odd number from 1 to 99"),
         ({"harmonics": 101}, "harmonics = 101"),
-        ({"pixel_pitch": 0.03}, r"width = 1 mm is not a whole number of display pixels of 0.03"),
+        (
+            {"pixel_pitch": 0.03},
+            r"width = 1 mm is not a whole number of cells of pixel_pitch = 0.03",
+        ),
         ({"pixel_pitch": 0.03}, "give width = 0.99 or 1.02 mm"),
         ({"pixel_pitch": -0.1}, "pixel_pitch = -0.1 mm is not positive"),
         ({"beta": np.ones(3)}, r"beta has shape \(3,\); give one number in rad/mm\^2"),

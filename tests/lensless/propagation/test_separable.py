@@ -220,9 +220,9 @@ def test_energy(object_distance):
     assert 0 < 1 - arrived / passed < 1.8e-3
 
 
-def test_needs_zone_orders():
-    mask = tc.SampledMask(np.ones((3, 4)), 0.1)
-    with pytest.raises(TypeError, match="SampledMask use 'angular_spectrum'"):
+def test_needs_separable_terms():
+    mask = tc.RadialMask([1.0], 0.1)
+    with pytest.raises(TypeError, match="RadialMask use 'angular_spectrum'"):
         separable(mask, tc.Grid((3, 4), 0.1), Path(500e-6, 5.0))
 
 

@@ -205,7 +205,7 @@ def test_errors():
     path = Path(WAVELENGTH, DISTANCE)
     with pytest.raises(ValueError, match="has no display pixels; drop pixel_pitch"):
         response(mask_of(pixel_pitch=0.05), path)
-    with pytest.raises(TypeError, match="needs a mask made of zone orders"):
+    with pytest.raises(TypeError, match="needs the continuous zones"):
         response(tc.SampledMask(np.ones((3, 4)), 0.1), path)
 
 

@@ -14,13 +14,7 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 
 from thincam_jax._core.grids import Grid, centred_frequencies, centred_indices
 from thincam_jax._core.precision import as_complex, turn_phasor
-from thincam_jax.lensless.masks.base import (
-    AbstractMask,
-    axis_orders,
-    pairs,
-    require_zone_orders,
-)
-from thincam_jax.lensless.masks.fza import axis_samples
+from thincam_jax.lensless.masks.base import AbstractFactoredMask, pairs
 from thincam_jax.lensless.propagation.angular_spectrum import (
     padded_shape,
     planes,
@@ -106,7 +100,7 @@ def chosen(
     jax.jit, static_argnames=("shape", "pixel_integration", "mask_shape", "oversampling")
 )
 def angular_spectrum_terms(
-    mask: AbstractMask,
+    mask: AbstractFactoredMask,
     points: SparseGrid,
     path: Path,
     *,
@@ -116,22 +110,21 @@ def angular_spectrum_terms(
     oversampling: int,
 ) -> SeparableSum:
     """The PSF of `angular_spectrum` at some rows and columns of a grid of `shape`, as a product."""
-    both = axis_orders(mask, "angular_spectrum")
-    zones = both[1]
-    lower, upper, weights = pairs(zones)
+    coefficients, *both = mask.terms(path.wavelength)
+    lower, upper, weights = pairs(coefficients)
     plane, sensor = planes(Grid(shape, points.pitch), mask_shape, oversampling)
     half = oversampling // 2 if pixel_integration else 0
     factors = []
     for axis, indices in enumerate((points.row_indices, points.column_indices)):
         samples, line = plane.shape[axis], Grid((1, plane.shape[axis]), plane.pitch)
-        values = axis_samples(both[axis], line.x - mask.centre[axis], line.pitch)
+        values = both[axis].samples(line.x - mask.centre[axis], line.pitch)
         lit = values * spherical_wave(line, path)
         # Sensor samples of the chosen pixels, counted from the axis.
         fine = indices[:, None] * oversampling + jnp.arange(-half, half + 1, dtype=indices.dtype)
         across = sensor.shape[axis]
         size = padded_shape((samples, samples), (across, across), 2.0)[0]
         fields = _by_transform(lit, plane.pitch, path, size, fine.ravel())
-        fields = fields.reshape(len(zones.orders), *fine.shape)
+        fields = fields.reshape(-1, *fine.shape)
         fields = fields * as_complex(jnp.sqrt(path.magnification))
         factors.append(jnp.mean(fields[lower, :] * jnp.conj(fields[upper, :]), axis=-1))
     return SeparableSum(weights[:, None] * factors[0], factors[1], points)
@@ -148,23 +141,24 @@ def _by_transform(lit, pitch, path: Path, size: int, fine) -> Complex[Array, "or
 
 @functools.partial(jax.jit, static_argnames=("samples", "axis"))
 def fine_fields(
-    mask: AbstractMask,
+    mask: AbstractFactoredMask,
     path: Path,
     reach: Float[Array, ""],
     exact: Bool[Array, ""],
     samples: int,
     axis: int = 1,
 ) -> Complex[Array, "order n"]:
-    r"""Fields of the orders on a line along x (or y, axis 0), finely sampled, over ±`reach`.
+    r"""Fields of the terms on a line along x (or y, axis 0), finely sampled, over ±`reach`.
 
     `exact` takes the exact phases of the spherical wave and of the propagation, which Fresnel's
     approximation replaces by :math:`\pi\xi^2/(\lambda t)` and :math:`-\pi\lambda d u^2`; the
     difference of the two is what the approximation costs, while the sampling is common to both.
     """
-    zones = require_zone_orders(mask, "separable", axis)
+    terms = mask.terms(path.wavelength)
+    factors = terms.columns if axis else terms.rows
     pitch = 4 * reach / samples  # as much again on both sides, so that nothing wraps round
     x = centred_indices(samples, pitch.dtype) * pitch
-    values = axis_samples(zones, x, pitch)
+    values = factors.samples(x, pitch)
     parabolic = turn_phasor(x**2 / (2 * path.wavelength * path.object_distance))
     wave = jnp.where(exact, spherical_wave(Grid((1, samples), pitch), path)[0], parabolic)
     u = jnp.fft.ifftshift(centred_frequencies(samples, pitch))

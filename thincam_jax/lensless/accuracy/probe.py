@@ -21,7 +21,7 @@ from thincam_jax.lensless.accuracy.lines import (
     chosen,
     fine_fields,
 )
-from thincam_jax.lensless.masks.base import AbstractMask, pairs, require_zone_orders
+from thincam_jax.lensless.masks.base import AbstractFactoredMask, pairs
 from thincam_jax.lensless.method import Model, PsfMethod
 from thincam_jax.lensless.propagation.angular_spectrum import lit_mask, planes
 from thincam_jax.lensless.propagation.closed_form import in_focus
@@ -72,7 +72,7 @@ class Numbers(NamedTuple):
     largest_phase: float
 
 
-def lines_of(mask: AbstractMask, grid: Grid, path: Path) -> Lines:
+def lines_of(mask: AbstractFactoredMask, grid: Grid, path: Path) -> Lines:
     """Rows and columns of the grid, denser at the edges of the shadow."""
     pitch, scale = float(grid.pitch), float(path.magnification)
     zone = 3 * math.sqrt(float(path.wavelength * path.distance) * scale) / pitch
@@ -171,19 +171,19 @@ def rounding_distance(first: Factors, second: Factors) -> float:
     )
 
 
-class ZoneProbe:
-    """Errors of all models for one camera with a zone mask, by one-dimensional probes.
+class MaskProbe:
+    """Errors of all models for one camera with a mask of terms, by one-dimensional probes.
 
     The reference is `separable` in double precision, exact in the Fresnel approximation. Nothing
     two-dimensional is evaluated.
     """
 
     def __init__(
-        self, mask: AbstractMask, grid: Grid, path: Path, *, pixel_integration: bool
+        self, mask: AbstractFactoredMask, grid: Grid, path: Path, *, pixel_integration: bool
     ) -> None:
         self.shape, self.pixel_integration, self.path = grid.shape, pixel_integration, path
         self.lines = lines_of(mask, grid, path)
-        self.given: dict[Precision, tuple[AbstractMask, Array, Path]]
+        self.given: dict[Precision, tuple[AbstractFactoredMask, Array, Path]]
         with allow("float64", mask, grid, path):
             self.given = {p: cast((mask, grid.pitch, path), p) for p in PRECISIONS}
         self._cache: dict[tuple[Model, Precision, int], Factors] = {}
@@ -295,11 +295,11 @@ class ZoneProbe:
         """Sizes of the effects that the reasons name."""
         with allow("float64"):
             mask, pitch, path = self.given["float64"]
-            zones = require_zone_orders(mask, "separable")
-            epsilon = float(path.epsilon(zones.beta)) * max(abs(k) for k in zones.orders)
-            radius = max(float(extent) for extent in mask.extent) / 2
-            order = max(abs(k) for k in zones.orders)
-            phase = order * float(zones.beta) * radius**2
+            zones = getattr(mask, "zone_orders", None)
+            epsilon, phase, radius = 0.0, 0.0, max(float(extent) for extent in mask.extent) / 2
+            if zones is not None:
+                order, beta = max(abs(k) for k in zones().orders), zones().beta
+                epsilon, phase = order * float(path.epsilon(beta)), order * float(beta) * radius**2
             reach = max(self.shape) * float(pitch) / 2 / float(path.magnification) + radius
             return Numbers(
                 epsilon=epsilon,
@@ -320,38 +320,42 @@ class ZoneProbe:
     def paraxial_error(self) -> float:
         """Relative distance of the Fresnel approximation from exact scalar diffraction.
 
-        From fields on a line through the axis, point-sampled, with exact and with Fresnel's phases.
+        From fields on lines through the axis, point-sampled, with exact and with Fresnel's phases.
         The cross term of the two axes is left out: an estimate, not a bound.
         """
         with allow("float64"):
             mask, pitch, path = self.given["float64"]
-            longer = 0 if mask.extent[0] > mask.extent[1] else 1
+            coefficients, rows, columns = mask.terms(path.wavelength)
+            axes = (1,) if rows is columns else (0, 1)
             half_sensor = max(self.shape) * pitch / 2
             half_mask = jnp.max(jnp.stack(mask.extent)) / 2 + jnp.max(jnp.abs(mask.centre))
             reach = jnp.maximum(half_sensor, half_mask * path.magnification)
-            fields = [
-                np.asarray(
-                    fine_fields(mask, path, reach, jnp.asarray(exact), _FINE_SAMPLES, longer)
-                )
+            both = [
+                [
+                    np.asarray(
+                        fine_fields(mask, path, reach, jnp.asarray(exact), _FINE_SAMPLES, axis)
+                    )
+                    for axis in axes
+                ]
                 for exact in (True, False)
             ]
-            zones = require_zone_orders(mask, "separable")
-            lower, upper, weights = (np.asarray(v) for v in pairs(zones))
+            weighted_pairs = tuple(np.asarray(v) for v in pairs(coefficients))
         exact, fresnel = (
-            self._line_factors(field, float(reach), float(pitch), lower, upper, weights)
-            for field in fields
+            self._line_factors((fields[0], fields[-1]), float(reach), float(pitch), weighted_pairs)
+            for fields in both
         )
         size = norm(fresnel)
         return rounding_distance(exact, fresnel) / size if size else 0.0
 
-    def _line_factors(self, field, reach, pitch, lower, upper, weights) -> Factors:
-        """Pair products of a fine line's fields at the chosen pixels, averaged if pixels are."""
-        count = field.shape[-1]
+    def _line_factors(self, fields, reach, pitch, weighted_pairs) -> Factors:
+        """Pair products of fine lines' fields at the chosen pixels, averaged if pixels are."""
+        lower, upper, weights = weighted_pairs
+        count = fields[0].shape[-1]
         step = 2 * reach / count
         half = round(pitch / step / 2) if self.pixel_integration else 0
         inside = np.unique(np.linspace(-half, half, _IN_PIXEL).round()).astype(int)
         picked = []
-        for indices in (self.lines.rows, self.lines.columns):
+        for field, indices in zip(fields, (self.lines.rows, self.lines.columns), strict=True):
             position = np.round(indices * pitch / step + (count - 1) / 2).astype(int)
             found = field[:, np.clip(position[:, None] + inside, 0, count - 1)]
             picked.append(np.mean(found[lower] * found[upper].conj(), axis=-1))

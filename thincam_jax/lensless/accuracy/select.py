@@ -15,12 +15,18 @@ from thincam_jax._core.precision import (
     Precision,
     precision_of,
 )
-from thincam_jax.lensless.accuracy.probe import ZoneProbe
+from thincam_jax.lensless.accuracy.probe import MaskProbe
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.cost import Cost, psf_cost
 from thincam_jax.lensless.digits import held_in_single
-from thincam_jax.lensless.masks.base import AbstractMask
-from thincam_jax.lensless.method import MODELS, UNBOUNDED, Model, PsfMethod, psf_method
+from thincam_jax.lensless.masks.base import AbstractFactoredMask, AbstractMask
+from thincam_jax.lensless.method import (
+    Model,
+    PsfMethod,
+    has_few_terms,
+    models_of,
+    psf_method,
+)
 from thincam_jax.lensless.propagation.separable import PIXEL_NODES
 
 # Predictions are estimates from some rows and columns (or pixels, for the direct sum): what they
@@ -95,8 +101,8 @@ def select_model(
     **Arguments**: `wavelength`, `object_distance`, `pixel_integration` and `grid` as for `psf`;
     `tolerance` > 0. Numbers must be known: call it outside of jit and grad.
 
-    **Errors**: ValueError for what is out of range; TypeError for a mask without zone orders and
-    for traced numbers.
+    **Errors**: ValueError for what is out of range; TypeError for a mask without separable terms
+    and for traced numbers.
     """
     tolerance = tolerance_of(tolerance)
     probe = probe_of(camera, wavelength, object_distance, pixel_integration, grid)
@@ -141,7 +147,7 @@ def predict_error(
 
 
 def _prediction(
-    probe: ZoneProbe, mask: AbstractMask, grid: Grid, method: PsfMethod, cost: Cost
+    probe: MaskProbe, mask: AbstractMask, grid: Grid, method: PsfMethod, cost: Cost
 ) -> Prediction:
     error = predicted_error(probe, mask, grid, method)
     return Prediction(method.model, method.precision, method.oversampling, error, cost)
@@ -155,16 +161,18 @@ def tolerance_of(tolerance: float) -> float:
     return tolerance
 
 
-def require_camera(camera: LenslessCamera, function: str) -> None:
-    """A camera with a mask of zone orders, whose fields have one-dimensional factors."""
+def require_camera(camera: LenslessCamera, function: str) -> AbstractFactoredMask:
+    """The mask of a camera, if it has few terms: its fields then have one-dimensional factors."""
     if not isinstance(camera, LenslessCamera):
         raise TypeError(f"camera is a {type(camera).__name__}; give a thincam_jax.LenslessCamera")
-    if not hasattr(camera.mask, "zone_orders"):
+    mask = camera.mask
+    if not isinstance(mask, AbstractFactoredMask) or not has_few_terms(mask):
         raise TypeError(
-            f"{function} needs a mask made of zone orders, such as FresnelZoneAperture; for a "
-            f"{type(camera.mask).__name__} choose 'angular_spectrum' or 'rayleigh_sommerfeld' "
+            f"{function} needs a mask of few separable terms, such as FresnelZoneAperture; "
+            f"for this {type(mask).__name__} choose 'angular_spectrum' or 'rayleigh_sommerfeld' "
             "and their oversampling yourself"
         )
+    return mask
 
 
 def probe_of(
@@ -173,16 +181,16 @@ def probe_of(
     object_distance: Number,
     pixel_integration: bool,
     grid: Grid | None,
-) -> ZoneProbe:
+) -> MaskProbe:
     """The probe of a camera whose numbers are known."""
-    require_camera(camera, "select_model")
+    mask = require_camera(camera, "select_model")
     path = camera.path(wavelength, object_distance)
     grid = grid or camera.sensor.grid
     if any(checks.is_traced(leaf) for leaf in jax.tree.leaves((camera, path, grid))):
         raise TypeError(
             "the choice of a model needs known numbers: make it outside of jit and grad"
         )
-    return ZoneProbe(camera.mask, grid, path, pixel_integration=pixel_integration)
+    return MaskProbe(mask, grid, path, pixel_integration=pixel_integration)
 
 
 def candidates(
@@ -191,12 +199,10 @@ def candidates(
     """What fits into memory, cheapest first, up to the reference."""
     free = available_bytes()
     own = precision_of(grid.pitch)
-    displayed = getattr(mask, "pixels", None) is not None
     methods = [
         psf_method(mask, grid, model, pixel_integration, precision)
-        for model in MODELS
+        for model in models_of(mask)
         for precision in PRECISIONS
-        if not displayed or model not in UNBOUNDED
     ]
     costs = {method: psf_cost(mask, grid, method) for method in methods}
 
@@ -212,7 +218,7 @@ def candidates(
     return [(method, costs[method]) for method in fitting]
 
 
-def predicted_error(probe: ZoneProbe, mask: AbstractMask, grid: Grid, method: PsfMethod) -> float:
+def predicted_error(probe: MaskProbe, mask: AbstractMask, grid: Grid, method: PsfMethod) -> float:
     """Relative L2 error of a PSF, with the margin that keeps it above the true one."""
     model, precision = method.model, method.precision
     if precision == "float32" and not held_in_single(mask, grid, probe.path, model):
@@ -227,7 +233,7 @@ def predicted_error(probe: ZoneProbe, mask: AbstractMask, grid: Grid, method: Ps
     return _MARGIN_CLOSED * error + RESULT_ROUNDING[precision_of(grid.pitch)]
 
 
-def _reasons(probe: ZoneProbe, chosen: Prediction, paraxial_error: float) -> tuple[str, ...]:
+def _reasons(probe: MaskProbe, chosen: Prediction, paraxial_error: float) -> tuple[str, ...]:
     """What the chosen model leaves out, in words and numbers."""
     fresnel = (
         "errors are counted from the exact Fresnel field; exact scalar diffraction differs from "
@@ -246,16 +252,17 @@ def _reasons(probe: ZoneProbe, chosen: Prediction, paraxial_error: float) -> tup
     return (*_optics_left_out(probe, chosen.model), rounding, fresnel)
 
 
-def _optics_left_out(probe: ZoneProbe, model: Model) -> list[str]:
+def _optics_left_out(probe: MaskProbe, model: Model) -> list[str]:
     """Diffraction and edges that a closed form leaves out, in the steps of the ladder."""
     numbers = probe.numbers()
     zone = f"an edge zone of √(λd/M) = {numbers.edge_zone * 1e3:.3g} µm"
     if model == "geometric":
         size = probe.model_error("geometric")
-        return [
-            f"diffraction is left out (ε = {numbers.epsilon:.2g}, up to {numbers.first_order:.2g} "
-            f"rad at the mask's edge; {zone}): {size:.1e}"
-        ]
+        bent = ""
+        if numbers.epsilon:
+            phase = f"up to {numbers.first_order:.2g} rad at the mask's edge"
+            bent = f"ε = {numbers.epsilon:.2g}, {phase}; "
+        return [f"diffraction is left out ({bent}{zone}): {size:.1e}"]
     if model == "separable":
         if not probe.pixel_integration:
             return []

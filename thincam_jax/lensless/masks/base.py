@@ -1,14 +1,18 @@
 """What a mask must offer to the propagation models."""
 
 import abc
-from typing import NamedTuple
+import functools
+from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from thincam_jax._core.checks import Number
-from thincam_jax._core.grids import Grid
+from thincam_jax._core.grids import Grid, cell_overlap
+from thincam_jax._core.precision import as_complex, phasor, product
 
 
 class AbstractMask(eqx.Module):
@@ -17,7 +21,8 @@ class AbstractMask(eqx.Module):
     - `centre`: (y, x) of the mask's centre relative to the optical axis, mm.
 
     Every mask can be sampled on a grid; that is all that `angular_spectrum` and
-    `rayleigh_sommerfeld` ask for. Masks with separable zone orders also offer `zone_orders`.
+    `rayleigh_sommerfeld` ask for. Those that are a sum of products of one factor along y and one
+    along x are an `AbstractFactoredMask`, and have an exact PSF by `separable`.
     """
 
     centre: eqx.AbstractVar[Float[Array, "2"]]
@@ -36,51 +41,173 @@ class AbstractMask(eqx.Module):
         `wavelength`: mm, of the light; a mask whose transmittance is the same for all takes none.
         """
 
+    @property
+    def pure_phase(self) -> bool:
+        """Whether |t| = 1 all over the aperture: its shadow, the model "geometric", has no code."""
+        return False
+
+
+class AxisFactors(NamedTuple):
+    r"""The factors of a mask's terms along one axis, over an array of cells.
+
+    In cell i, between the edges i and i + 1, the factor of term k is
+
+    .. math:: v_{ki}\, e^{jg_k(\xi - o_i)^2}
+
+    and zero before the first edge and behind the last. A gap between open cells is a cell of zeros.
+
+    - `edges`: ascending, mm, relative to the mask's centre.
+    - `values`: v_ki.
+    - `curvatures`: g_k, rad/mm²; None where every cell is constant.
+    - `origins`: o_i, mm; None for zero.
+    """
+
+    edges: Float[Array, " edge"]
+    values: Complex[Array, "term cell"]
+    curvatures: Float[Array, " term"] | None = None
+    origins: Float[Array, " cell"] | None = None
+
+    def chirps(self, x: Float[Array, " n"]) -> Complex[Array, "term n cell"]:
+        """e^{jg(x − o)²} of every term and cell, at coordinates relative to the mask's centre."""
+        assert self.curvatures is not None
+        return phasor(self.curvatures[:, None, None] * self.from_origins(x) ** 2)
+
+    def from_origins(self, x: Float[Array, " n"]) -> Float[Array, "n #cell"]:
+        """x − o_i."""
+        return x[:, None] if self.origins is None else x[:, None] - self.origins
+
+    def samples(self, x: Float[Array, " n"], pitch: Float[Array, ""]) -> Complex[Array, "term n"]:
+        """The factors at samples `pitch` apart, each weighted by the open part of its length."""
+        covered = cell_overlap(x, pitch, self.edges[:-1], self.edges[1:]) / pitch
+        if self.curvatures is None:
+            return product(self.values, as_complex(covered.T))
+        return jnp.sum(self.values[:, None] * self.chirps(x) * as_complex(covered), axis=-1)
+
+    def products(self, first: np.ndarray, second: np.ndarray) -> "AxisFactors":
+        """The factors of the products of terms `first` with the conjugates of terms `second`."""
+        g = self.curvatures
+        return self._replace(
+            values=self.values[first] * self.values[second].conj(),
+            curvatures=None if g is None else g[first] - g[second],
+        )
+
+
+class MaskTerms(NamedTuple):
+    r"""A mask as a sum of products, :math:`t(x, y) = \sum_k c_k R_k(y)\, C_k(x)`.
+
+    - `coefficients`: the c_k.
+    - `rows`, `columns`: the R_k and the C_k; one object where both axes have the same.
+    """
+
+    coefficients: Complex[Array, " term"]
+    rows: AxisFactors
+    columns: AxisFactors
+
+
+class AbstractFactoredMask(AbstractMask):
+    """A mask that is a sum of products of one-dimensional factors: all classical coded apertures.
+
+    The field behind it is such a sum too, diffraction included, in closed form.
+    """
+
+    @abc.abstractmethod
+    def terms(self, wavelength: Number | None = None) -> MaskTerms:
+        """t(x, y), for light of a wavelength in mm where that matters."""
+
+    def irradiance(self, wavelength: Number | None = None) -> MaskTerms:
+        """|t|² = Re Σ_k w_k R_k(y) C_k(x)."""
+        coefficients, rows, columns = self.terms(wavelength)
+        first, second, weights = pairs(coefficients)
+        across = columns.products(first, second)
+        down = across if rows is columns else rows.products(first, second)
+        return MaskTerms(weights, down, across)
+
+    def sample(
+        self, grid: Grid, wavelength: Number | None = None
+    ) -> Complex[Array, "y x"] | Float[Array, "y x"]:
+        coefficients, down, across = self.terms(wavelength)
+        rows = down.samples(grid.y - self.centre[0], grid.pitch)
+        columns = across.samples(grid.x - self.centre[1], grid.pitch)
+        return product((coefficients[:, None] * rows).T, columns)
+
+
+class TermCount(NamedTuple):
+    """How many terms a mask has, how many its |t|², and the cells of its longer side."""
+
+    terms: int
+    shadow: int
+    cells: int
+    chirped: bool
+
+
+def term_count(mask: AbstractFactoredMask) -> TermCount:
+    """Known without the mask's numbers, also while they are traced."""
+    leaves, structure = jax.tree.flatten(mask)
+    return _count(structure, tuple((leaf.shape, leaf.dtype) for leaf in leaves))
+
+
+@functools.lru_cache(maxsize=256)
+def _count(structure: Any, leaves: tuple) -> TermCount:
+    mask = jax.tree.unflatten(structure, [jax.ShapeDtypeStruct(*leaf) for leaf in leaves])
+    colour = jax.ShapeDtypeStruct((), mask.centre.dtype)
+    terms = jax.eval_shape(lambda mask, w: mask.terms(w), mask, colour)
+    shadow = jax.eval_shape(lambda mask, w: mask.irradiance(w), mask, colour)
+    cells = max(axis.values.shape[1] for axis in (terms.rows, terms.columns))
+    counts = terms.coefficients.shape[0], shadow.coefficients.shape[0]
+    return TermCount(*counts, cells, terms.columns.curvatures is not None)
+
+
+def require_factored(mask: AbstractMask, model: str) -> AbstractFactoredMask:
+    """The mask, or one line that says which models can be used without terms."""
+    if not isinstance(mask, AbstractFactoredMask):
+        raise TypeError(
+            f"model {model!r} needs a mask of few separable terms, such as FresnelZoneAperture; "
+            f"for a {type(mask).__name__} use 'angular_spectrum' or 'rayleigh_sommerfeld'"
+        )
+    return mask
+
 
 class ZoneOrders(NamedTuple):
-    """A mask along one axis, as a finite sum of separable chirps over an array of open cells.
-
-    t(x, y) = Σ_k c_k Q_k(x) Q_k(y), Q_k(x) = exp(j k β x²) in the open part of the aperture. The
-    axes of a square share one; those of a rectangle differ in the cells alone.
+    """The unbounded zone plate Σ_k c_k e^{jkβr²}, and the width of the aperture that bounds it.
 
     - `orders`: the k, static.
     - `coefficients`: the c_k, complex.
     - `beta`: β, rad/mm².
-    - `lower`, `upper`: ends of the open cells along an axis, mm, relative to the mask's centre.
-    - `sites`: None where the chirp is continuous; else the coordinate of each cell, which has
-      the constant chirp value of that coordinate (a pixelated display).
+    - `width`: mm, along x.
     """
 
     orders: tuple[int, ...]
     coefficients: Complex[Array, " order"]
     beta: Float[Array, ""]
-    lower: Float[Array, " cell"]
-    upper: Float[Array, " cell"]
-    sites: Float[Array, " cell"] | None
+    width: Float[Array, ""]
 
 
-def require_zone_orders(mask: AbstractMask, model: str, axis: int = 1) -> ZoneOrders:
-    """The mask's zone orders along x (or y, axis 0), or one line that says which models can be used
-    without."""
-    zone_orders = getattr(mask, "zone_orders", None)
-    if zone_orders is None:
-        raise TypeError(
-            f"model {model!r} needs a mask made of zone orders, such as FresnelZoneAperture; for a "
-            f"{type(mask).__name__} use 'angular_spectrum' or 'rayleigh_sommerfeld'"
+def zone_orders(mask: AbstractMask) -> ZoneOrders | None:
+    """The orders of a printed zone plate; None of any other mask, one on a display included."""
+    orders = getattr(mask, "zone_orders", None)
+    return None if orders is None or getattr(mask, "pixels", None) is not None else orders()
+
+
+def require_zone_orders(mask: AbstractMask, model: str) -> ZoneOrders:
+    """The mask's zone orders, or one line that says which models can be used without."""
+    orders = zone_orders(mask)
+    if orders is not None:
+        return orders
+    instead = "'separable', 'geometric', 'angular_spectrum' or 'rayleigh_sommerfeld'"
+    if hasattr(mask, "zone_orders"):
+        raise ValueError(
+            f"{model!r} has no display pixels; drop pixel_pitch from the mask, or use {instead}"
         )
-    return zone_orders(axis)
+    raise TypeError(
+        f"{model!r} needs the continuous zones of a FresnelZoneAperture; for a "
+        f"{type(mask).__name__} use {instead}"
+    )
 
 
-def axis_orders(mask: AbstractMask, model: str) -> tuple[ZoneOrders, ZoneOrders]:
-    """The zone orders along y and along x; one object for both where the mask is a square."""
-    columns = require_zone_orders(mask, model)
-    square = getattr(mask, "height", None) is None
-    return columns if square else require_zone_orders(mask, model, axis=0), columns
-
-
-def pairs(zones: ZoneOrders) -> tuple[np.ndarray, np.ndarray, Complex[Array, " pair"]]:
-    """All pairs k ≤ l of orders and their weights, so that |Σ c_k A_k|² = Re Σ w_kl A_k A_l*."""
-    first, second = np.triu_indices(len(zones.orders))
-    c = zones.coefficients
-    double = np.where(first == second, 1.0, 2.0).astype(c.dtype)
-    return first, second, c[first] * c[second].conj() * double
+def pairs(
+    coefficients: Complex[Array, " term"],
+) -> tuple[np.ndarray, np.ndarray, Complex[Array, " pair"]]:
+    """All pairs k ≤ l of terms and their weights, so that |Σ c_k A_k|² = Re Σ w_kl A_k A_l*."""
+    first, second = np.triu_indices(coefficients.shape[0])
+    double = np.where(first == second, 1.0, 2.0).astype(coefficients.dtype)
+    return first, second, coefficients[first] * coefficients[second].conj() * double

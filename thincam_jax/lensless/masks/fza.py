@@ -9,16 +9,22 @@ from jaxtyping import Array, Complex, Float
 
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Number, Numbers
-from thincam_jax._core.grids import Grid, cell_overlap, centred_indices
-from thincam_jax._core.precision import as_complex, phasor, product
-from thincam_jax.lensless.masks.base import AbstractMask, ZoneOrders, axis_orders
+from thincam_jax._core.grids import Grid, centred_indices
+from thincam_jax._core.precision import as_complex, phasor
+from thincam_jax.lensless.masks.base import (
+    AbstractFactoredMask,
+    AxisFactors,
+    MaskTerms,
+    ZoneOrders,
+    pairs,
+)
 
 _HIGHEST_HARMONIC = 99
 Profile = Literal["cosine", "intensity", "binary"]
 PROFILES: tuple[Profile, ...] = get_args(Profile)
 
 
-class FresnelZoneAperture(AbstractMask):
+class FresnelZoneAperture(AbstractFactoredMask):
     r"""A square or rectangular Fresnel zone aperture.
 
     Amplitude transmittance of the cosine profile, :math:`r` from the mask's centre (thesis Eq 3.1,
@@ -92,8 +98,12 @@ class FresnelZoneAperture(AbstractMask):
         self.harmonics = harmonics
         self.pixels = None
         if pixel_pitch is not None:
-            columns = _whole_pixels("width", width, pixel_pitch)
-            rows = columns if height is None else _whole_pixels("height", height, pixel_pitch)
+            columns = checks.whole_cells("width", width, "pixel_pitch", pixel_pitch)
+            rows = (
+                columns
+                if height is None
+                else checks.whole_cells("height", height, "pixel_pitch", pixel_pitch)
+            )
             self.pixels = rows, columns
 
     def __repr__(self) -> str:
@@ -117,25 +127,54 @@ class FresnelZoneAperture(AbstractMask):
         """The diffraction orders k of the profile, without their weights."""
         return _series(self.profile, self.harmonics)[0]
 
-    def zone_orders(self, axis: int = 1) -> ZoneOrders:
-        """The mask as separable chirps along x (or y, axis 0): what the closed-form models take."""
+    def zone_orders(self) -> ZoneOrders:
+        """The unbounded zone plate: what `paraxial`, `closed_form` and its response are made of."""
+        orders, coefficients = self._orders()
+        return ZoneOrders(orders, coefficients, self.beta, self.width)
+
+    def terms(self, wavelength: Number | None = None) -> MaskTerms:
+        orders, coefficients = self._orders()
+        return self._terms(np.asarray(orders), coefficients)
+
+    def irradiance(self, wavelength: Number | None = None) -> MaskTerms:
+        """|t|² = Re Σ_m w_m e^{jmβr²} over the different m ≥ 0 only."""
+        orders, coefficients = self._orders()
+        first, second, weights = pairs(coefficients)
+        difference = np.asarray(orders)[first] - np.asarray(orders)[second]
+        # A pair and its conjugate carry the same real part: fold the negative orders.
+        folded = jnp.where(difference < 0, weights.conj(), weights)
+        different, position = np.unique(np.abs(difference), return_inverse=True)
+        total = jnp.zeros(len(different), weights.dtype).at[position].add(folded)
+        return self._terms(different, total)
+
+    def sample(self, grid: Grid, wavelength: Number | None = None) -> Float[Array, "y x"]:
+        return jnp.real(super().sample(grid, wavelength))
+
+    def _orders(self) -> tuple[tuple[int, ...], Complex[Array, " order"]]:
         orders, weights = _series(self.profile, self.harmonics)
         k = jnp.asarray(orders, dtype=self.beta.dtype)
         weights = jnp.asarray(weights, dtype=self.beta.dtype)
-        coefficients = as_complex(weights) * phasor(k * self.phase)
+        return orders, as_complex(weights) * phasor(k * self.phase)
+
+    def _terms(self, orders: np.ndarray, coefficients: Complex[Array, " order"]) -> MaskTerms:
+        columns = self._factors(orders, 1)
+        return MaskTerms(
+            coefficients, columns if self.height is None else self._factors(orders, 0), columns
+        )
+
+    def _factors(self, orders: np.ndarray, axis: int) -> AxisFactors:
+        curvatures = jnp.asarray(orders, dtype=self.beta.dtype) * self.beta
+        side = self.extent[axis]
         if self.pixels is None:
-            sites, half = None, self.extent[axis][None] / 2
-            return ZoneOrders(orders, coefficients, self.beta, -half, half, sites)
-        pitch = self.extent[axis] / self.pixels[axis]
+            whole = as_complex(jnp.ones_like(curvatures)[:, None])
+            return AxisFactors(jnp.stack([-side / 2, side / 2]), whole, curvatures)
+        pitch = side / self.pixels[axis]
         sites = centred_indices(self.pixels[axis], self.beta.dtype) * pitch
         half = pitch * jnp.sqrt(self.fill_factor) / 2
-        return ZoneOrders(orders, coefficients, self.beta, sites - half, sites + half, sites)
-
-    def sample(self, grid: Grid, wavelength: Number | None = None) -> Float[Array, "y x"]:
-        down, zones = axis_orders(self, "angular_spectrum")
-        rows = axis_samples(down, grid.y - self.centre[0], grid.pitch)
-        columns = axis_samples(zones, grid.x - self.centre[1], grid.pitch)
-        return jnp.real(product((zones.coefficients[:, None] * rows).T, columns))
+        shown = phasor(curvatures[:, None] * sites**2)
+        edges = jnp.stack([sites - half, sites + half], axis=-1).ravel()
+        with_gaps = jnp.stack([shown, jnp.zeros_like(shown)], axis=-1)
+        return AxisFactors(edges, with_gaps.reshape(len(orders), -1)[:, :-1])
 
 
 def edge_frequency(beta: Any, width: Any) -> Any:
@@ -152,27 +191,3 @@ def _series(profile: str, harmonics: int) -> tuple[tuple[int, ...], tuple[float,
         return tuple(every), tuple(2 / np.pi * (-1.0) ** (k + 1) / (4 * k * k - 1) for k in every)
     odd = [k for n in range(1, harmonics + 1, 2) for k in (n, -n)]
     return (0, *odd), (0.5, *(float(np.sin(k * np.pi / 2) / (k * np.pi)) for k in odd))
-
-
-def axis_samples(
-    zones: ZoneOrders, x: Float[Array, " n"], pitch: Float[Array, ""]
-) -> Complex[Array, "order n"]:
-    """Each order's one-dimensional factor, weighted by the open part of every sample's cell."""
-    k = jnp.asarray(zones.orders, dtype=x.dtype)[:, None]
-    open_part = cell_overlap(x, pitch, zones.lower, zones.upper) / pitch
-    if zones.sites is None:
-        return phasor(k * zones.beta * x**2) * as_complex(open_part[:, 0])
-    return product(phasor(k * zones.beta * zones.sites**2), as_complex(open_part.T))
-
-
-def _whole_pixels(name: str, width, pixel_pitch) -> int:
-    pitch = float(checks.positive("pixel_pitch", pixel_pitch, "mm"))
-    width = float(width)
-    pixels = round(width / pitch)
-    if pixels < 1 or abs(pixels * pitch - width) > 1e-4 * pitch:
-        low, high = max(1, int(width / pitch)) * pitch, (int(width / pitch) + 1) * pitch
-        raise ValueError(
-            f"{name} = {width:g} mm is not a whole number of display pixels of {pitch:g} mm; "
-            f"give {name} = {low:g} or {high:g} mm"
-        )
-    return pixels

@@ -89,6 +89,10 @@ class PhaseMask(AbstractMask):
         rows, columns = self.height.shape
         return rows * self.pitch, columns * self.pitch
 
+    @property
+    def pure_phase(self) -> bool:
+        return self.amplitude is None
+
     def turns(self, wavelength: Number) -> Float[Array, "y x"]:
         """[n(λ) − 1]h/λ: the phase of each cell in turns."""
         light = jnp.asarray(wavelength, self.height.dtype)

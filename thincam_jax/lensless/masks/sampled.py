@@ -1,20 +1,27 @@
 """A mask given by numbers: any pattern, measured or designed."""
 
+import os
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Array, Complex, Float, PRNGKeyArray
 
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Number, Numbers
 from thincam_jax._core.grids import Grid, cell_overlap, centred_indices
-from thincam_jax._core.precision import product
-from thincam_jax.lensless.masks.base import AbstractMask
+from thincam_jax._core.precision import as_complex, product
+from thincam_jax.imaging.targets.images import load_image
+from thincam_jax.lensless.masks.base import AbstractFactoredMask, AxisFactors, MaskTerms
+from thincam_jax.lensless.masks.cells import cell_edges
 
 
-class SampledMask(AbstractMask):
+class SampledMask(AbstractFactoredMask):
     """A mask of square cells, each with one complex amplitude transmittance.
+
+    It has a term for each row (or column, where these are fewer): with few, `separable` is exact
+    and fast, and its work grows as their square.
 
     **Arguments**
 
@@ -64,6 +71,22 @@ class SampledMask(AbstractMask):
         place = np.searchsorted(below, below[-1] / 2)
         return float(frequency[order[place]] / np.asarray(self.pitch))
 
+    def terms(self, wavelength: Number | None = None) -> MaskTerms:
+        return self._terms(self.amplitude)
+
+    def irradiance(self, wavelength: Number | None = None) -> MaskTerms:
+        return self._terms(jnp.abs(self.amplitude) ** 2)
+
+    def _terms(self, values) -> MaskTerms:
+        """A term for each row of the values, or for each column."""
+        rows, columns = values.shape
+        values = values if jnp.iscomplexobj(values) else as_complex(values)
+        each = jnp.eye(min(rows, columns), dtype=values.dtype)
+        down, across = (each, values) if rows <= columns else (values.T, each)
+        edges = (cell_edges(n, self.pitch) for n in (rows, columns))
+        factors = (AxisFactors(*both) for both in zip(edges, (down, across), strict=True))
+        return MaskTerms(jnp.ones_like(each[0]), *factors)
+
     def sample(
         self, grid: Grid, wavelength: Number | None = None
     ) -> Complex[Array, "y x"] | Float[Array, "y x"]:
@@ -78,3 +101,38 @@ def _coverage(x, pitch, cells: int, cell_pitch) -> Float[Array, "n cell"]:
     """Part of each sample's cell that each mask cell covers."""
     centres = centred_indices(cells, x.dtype) * cell_pitch
     return cell_overlap(x, pitch, centres - cell_pitch / 2, centres + cell_pitch / 2) / pitch
+
+
+def random_cells(
+    key: PRNGKeyArray,
+    width: Number,
+    cell: Number,
+    *,
+    height: Number | None = None,
+    open_fraction: Number = 0.5,
+) -> SampledMask:
+    """A mask of cells that are open or closed at random; of no low rank.
+
+    `width`, `height` (mm; None for a square) are whole numbers of cells; `open_fraction` is the
+    chance of a cell to be open.
+    """
+    columns = checks.whole_cells("width", width, "cell", cell)
+    rows = columns if height is None else checks.whole_cells("height", height, "cell", cell)
+    chance = checks.fraction("open_fraction", open_fraction)
+    opened = jax.random.bernoulli(key, chance, (rows, columns))
+    return SampledMask(opened.astype(float), cell)
+
+
+def read_mask(path: str | os.PathLike[str], cell: Number) -> SampledMask:
+    """A mask from a grey image: one cell a pixel, white open, a level in proportion to |t|².
+
+    **Errors**: FileNotFoundError; ValueError, one line, for a file that is no image, for one with
+    colours and for one that lets no light pass.
+    """
+    levels = load_image(path)
+    if levels.ndim == 3 and np.ptp(levels, axis=-1).max() > 0:
+        raise ValueError(f"{str(path)!r} is coloured; give a grey image, white where it is open")
+    levels = levels if levels.ndim == 2 else levels[..., 0]
+    if not levels.any():
+        raise ValueError(f"{str(path)!r} is black: no light passes; paint what is open white")
+    return SampledMask(np.sqrt(levels), cell)

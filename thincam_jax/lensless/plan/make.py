@@ -35,8 +35,8 @@ def plan(camera: LenslessCamera, scene: Scene, *, tolerance: float) -> Plan:
     `Plan.effects` lists obliquity, shot noise and what Fresnel's approximation leaves out, with
     their sizes.
 
-    **Errors**: ValueError for a tolerance that is not positive; TypeError for a mask without zone
-    orders, and for traced numbers.
+    **Errors**: ValueError for a tolerance that is not positive; TypeError for a mask without
+    separable terms, and for traced numbers.
     """
     tolerance = tolerance_of(tolerance)
     require_camera(camera, "plan")

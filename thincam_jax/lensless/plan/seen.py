@@ -13,7 +13,7 @@ from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.cost import Cost, convolution_cost, psf_cost
 from thincam_jax.lensless.digits import held_in_single
 from thincam_jax.lensless.forward import project, projected_shape
-from thincam_jax.lensless.method import CLOSED, UNBOUNDED, Model, PsfMethod
+from thincam_jax.lensless.method import SAMPLED, Model, PsfMethod, models_of
 from thincam_jax.lensless.plan.transfer import (
     TransferProbe,
     image_spectrum,
@@ -106,8 +106,7 @@ class SeenScene:
     @property
     def models(self) -> tuple[Model, ...]:
         """Closed forms that can represent the mask."""
-        displayed = getattr(self.camera.mask, "pixels", None) is not None
-        return tuple(m for m in CLOSED if not displayed or m not in UNBOUNDED)
+        return tuple(m for m in models_of(self.camera.mask) if m not in SAMPLED)
 
     def held_in_single(self, model: str) -> bool:
         """Whether float32 can represent the zones' phases on the kernel's grid for every plane."""

@@ -8,7 +8,6 @@ from jaxtyping import Array, Bool, Complex, Float
 
 from thincam_jax._core.grids import Grid
 from thincam_jax._core.precision import as_complex, phasor, turn_phasor
-from thincam_jax.lensless.masks.base import ZoneOrders
 from thincam_jax.lensless.propagation.chirp import chirp_average
 from thincam_jax.lensless.propagation.separable_sum import SeparableSum
 
@@ -72,13 +71,3 @@ def gather_constants(
         jnp.concatenate([total, weights[~constant]]),
         jnp.concatenate([none, curvatures[~constant]]),
     )
-
-
-def require_continuous(zones: ZoneOrders, model: str) -> ZoneOrders:
-    """Refuse display pixels, which a model of unbounded smooth chirps cannot hold."""
-    if zones.sites is not None:
-        raise ValueError(
-            f"model {model!r} has no display pixels; drop pixel_pitch from the mask, or use "
-            "'separable', 'geometric', 'angular_spectrum' or 'rayleigh_sommerfeld'"
-        )
-    return zones

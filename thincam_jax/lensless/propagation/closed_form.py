@@ -5,11 +5,7 @@ from jaxtyping import Array, Bool
 
 from thincam_jax._core.precision import as_complex
 from thincam_jax.lensless.masks.base import AbstractMask, pairs, require_zone_orders
-from thincam_jax.lensless.propagation.chirp_sum import (
-    ChirpSum,
-    gather_constants,
-    require_continuous,
-)
+from thincam_jax.lensless.propagation.chirp_sum import ChirpSum, gather_constants
 from thincam_jax.lensless.propagation.path import Path
 
 
@@ -28,11 +24,11 @@ def closed_form(mask: AbstractMask, path: Path) -> ChirpSum:
     order's image. Singular where an order focuses on the sensor (ε = 1 for the cosine profile): the
     unbounded mask then has no PSF. `psf` refuses that; the finite one is `separable`.
     """
-    zones = require_continuous(require_zone_orders(mask, "closed_form"), "closed_form")
+    zones = require_zone_orders(mask, "closed_form")
     epsilon = path.epsilon(zones.beta)
     k = jnp.asarray(zones.orders, dtype=zones.beta.dtype)
     gain = 1 / (1 + k * epsilon)
-    first, second, weights = pairs(zones)
+    first, second, weights = pairs(zones.coefficients)
     # Differences of the orders' curvatures in closed form, exact as ε → 0.
     curvatures = zones.beta * (k[first] - k[second]) * gain[first] * gain[second]
     scale = path.magnification

@@ -1,12 +1,11 @@
 r"""`geometric`: the mask's shadow, without diffraction."""
 
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from thincam_jax._core.grids import Grid
-from thincam_jax._core.precision import as_complex, phasor, product
-from thincam_jax.lensless.masks.base import AbstractMask, ZoneOrders, axis_orders, pairs
+from thincam_jax._core.precision import as_complex, product
+from thincam_jax.lensless.masks.base import AbstractFactoredMask, AbstractMask, AxisFactors
 from thincam_jax.lensless.propagation.chirp import chirp_average
 from thincam_jax.lensless.propagation.path import Path
 from thincam_jax.lensless.propagation.separable_sum import SeparableSum
@@ -23,53 +22,49 @@ def geometric(
 
     Point-sampled, the shadow's edge is a step, so that the derivative with respect to the width is
     zero; pixel averages are exact (Fresnel integrals) and differentiable in the width too.
-    A mask without zone orders is sampled on the shadow's grid, averaging over its cells.
+    A mask without separable terms is sampled on the shadow's grid, averaging over its cells.
+
+    **Errors**: TypeError for a pure phase mask, whose shadow is its open aperture.
     """
     scale = path.magnification
-    if not hasattr(mask, "zone_orders"):
-        shadow = mask.sample(Grid(grid.shape, grid.pitch / scale))
+    if mask.pure_phase:
+        raise TypeError(
+            f"model 'geometric' is the shadow |t|², which a {type(mask).__name__} does not have; "
+            "use 'separable' for a LensletArray, or 'angular_spectrum'"
+        )
+    if not isinstance(mask, AbstractFactoredMask):
+        shadow = mask.sample(Grid(grid.shape, grid.pitch / scale), path.wavelength)
         return jnp.abs(shadow) ** 2
-    down, across = axis_orders(mask, "geometric")
+    weights, down, across = mask.irradiance(path.wavelength)
     factor = _axis_averages if pixel_integration else _axis_values
-    orders, weights = _irradiance_orders(across)
     y, x = grid.y / scale - mask.centre[0], grid.x / scale - mask.centre[1]
     if down is across:
         # Both axes at once: half as much to compile.
-        both = factor(across, orders, jnp.concatenate([y, x]), grid.pitch / scale)
+        both = factor(across, jnp.concatenate([y, x]), grid.pitch / scale)
         rows, columns = jnp.split(both, [grid.shape[0]], axis=-1)
     else:
-        rows = factor(down, orders, y, grid.pitch / scale)
-        columns = factor(across, orders, x, grid.pitch / scale)
+        rows, columns = factor(down, y, grid.pitch / scale), factor(across, x, grid.pitch / scale)
     return SeparableSum(weights[:, None] * rows, columns, grid)
 
 
-def _irradiance_orders(zones: ZoneOrders) -> tuple[np.ndarray, Complex[Array, " term"]]:
-    """Orders m ≥ 0 and weights of |t|² = Σ_m Re{w_m e^{jmβr²}}."""
-    first, second, weights = pairs(zones)
-    k = np.asarray(zones.orders)
-    difference = k[first] - k[second]
-    # A pair and its conjugate carry the same real part: fold the negative orders onto the positive.
-    folded = jnp.where(difference < 0, weights.conj(), weights)
-    orders, position = np.unique(np.abs(difference), return_inverse=True)
-    return orders, jnp.zeros(len(orders), weights.dtype).at[position].add(folded)
+def _axis_values(factors: AxisFactors, x: Float[Array, " n"], pitch) -> Complex[Array, "term n"]:
+    offset = factors.edges - x[:, None]
+    # A point on an edge belongs to the cell behind it; on the last one, to the last cell.
+    before_end = (offset[:, 1:] > 0).at[:, -1].set(offset[:, -1] >= 0)
+    inside = (offset[:, :-1] <= 0) & before_end
+    if factors.curvatures is None:
+        return product(factors.values, as_complex(inside.T.astype(x.dtype)))
+    shown = factors.values[:, None] * factors.chirps(x)
+    return jnp.sum(jnp.where(inside, shown, 0.0), axis=-1)
 
 
-def _axis_values(zones: ZoneOrders, orders, x: Float[Array, " n"], pitch):
-    m = jnp.asarray(orders, dtype=x.dtype)[:, None]
-    inside = (x[:, None] >= zones.lower) & (x[:, None] <= zones.upper)
-    if zones.sites is None:
-        return jnp.where(inside[:, 0], phasor(m * zones.beta * x**2), 0.0)
-    values = phasor(m * zones.beta * zones.sites**2)
-    return product(values, as_complex(inside.T.astype(x.dtype)))
-
-
-def _axis_averages(zones: ZoneOrders, orders, x: Float[Array, " n"], pitch):
-    m = jnp.asarray(orders, dtype=x.dtype)[:, None]
+def _axis_averages(factors: AxisFactors, x: Float[Array, " n"], pitch) -> Complex[Array, "term n"]:
     # Ends relative to the pixel's centre: exact where the pixel is whole.
-    lower = jnp.maximum(-pitch / 2, zones.lower - x[:, None])
-    upper = jnp.maximum(jnp.minimum(pitch / 2, zones.upper - x[:, None]), lower)
-    if zones.sites is None:
-        middle, half = x + (lower + upper)[:, 0] / 2, (upper - lower)[:, 0] / 2
-        return chirp_average(m * zones.beta, middle, half) * as_complex(1 / pitch)
-    values = phasor(m * zones.beta * zones.sites**2)
-    return product(values, as_complex(((upper - lower) / pitch).T))
+    offset = factors.edges - x[:, None]
+    lower = jnp.maximum(-pitch / 2, offset[:, :-1])
+    upper = jnp.maximum(jnp.minimum(pitch / 2, offset[:, 1:]), lower)
+    if factors.curvatures is None:
+        return product(factors.values, as_complex(((upper - lower) / pitch).T))
+    middle, half = factors.from_origins(x) + (lower + upper) / 2, (upper - lower) / 2
+    averages = chirp_average(factors.curvatures[:, None, None], middle, half)
+    return jnp.sum(factors.values[:, None] * averages, axis=-1) * as_complex(1 / pitch)

@@ -5,11 +5,7 @@ from jaxtyping import Array, Float
 
 from thincam_jax._core.checks import Number, Numbers
 from thincam_jax.lensless.masks.base import AbstractMask, pairs, require_zone_orders
-from thincam_jax.lensless.propagation.chirp_sum import (
-    ChirpSum,
-    gather_constants,
-    require_continuous,
-)
+from thincam_jax.lensless.propagation.chirp_sum import ChirpSum, gather_constants
 from thincam_jax.lensless.propagation.path import Path
 
 
@@ -31,10 +27,10 @@ def paraxial(mask: AbstractMask, path: Path) -> ChirpSum:
     left out is ε²βr²: the model is for ε²β(width/2)² ≪ 1. The same expansion serves every pair of
     orders of the binary profile.
     """
-    zones = require_continuous(require_zone_orders(mask, "paraxial"), "paraxial")
+    zones = require_zone_orders(mask, "paraxial")
     epsilon = path.epsilon(zones.beta)
     k = jnp.asarray(zones.orders, dtype=zones.beta.dtype)
-    first, second, weights = pairs(zones)
+    first, second, weights = pairs(zones.coefficients)
     difference, total = k[first] - k[second], k[first] + k[second]
     curvatures = zones.beta * difference * (1 - total * epsilon)
     weights, curvatures = gather_constants(first == second, weights, curvatures)

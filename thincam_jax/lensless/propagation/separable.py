@@ -1,4 +1,4 @@
-r"""`separable`: the exact Fresnel field of a rectangular aperture, in closed form."""
+r"""`separable`: the exact Fresnel field of a mask of few separable terms, in closed form."""
 
 import jax
 import jax.numpy as jnp
@@ -8,9 +8,9 @@ from numpy.polynomial.legendre import leggauss
 
 from thincam_jax._core import checks
 from thincam_jax._core.grids import Grid
-from thincam_jax._core.precision import Precision, as_complex, phasor, product
-from thincam_jax.lensless.masks.base import AbstractMask, ZoneOrders, axis_orders, pairs
-from thincam_jax.lensless.propagation.chirp import chirp_integral
+from thincam_jax._core.precision import Precision, as_complex, product
+from thincam_jax.lensless.masks.base import AbstractMask, AxisFactors, pairs, require_factored
+from thincam_jax.lensless.propagation.chirp import chirp_integral, edge_wave
 from thincam_jax.lensless.propagation.path import Path
 from thincam_jax.lensless.propagation.separable_sum import SeparableSum
 
@@ -39,29 +39,37 @@ def pixel_nodes(mask: AbstractMask, grid: Grid, path: Path, precision: Precision
     return next((n for n, most in _FEWER[precision].items() if fringes <= most), PIXEL_NODES)
 
 
-def axis_fields(zones: ZoneOrders, path: Path, x: Float[Array, " n"]) -> Complex[Array, "order n"]:
-    r"""One-dimensional factor of every order's field, relative to the open aperture.
+def axis_fields(
+    factors: AxisFactors, path: Path, x: Float[Array, " n"]
+) -> Complex[Array, "term n"]:
+    r"""One-dimensional factor of every term's field, relative to the open aperture.
 
     .. math::
-        A_k(x) = \sqrt{\frac{M}{j\lambda d}} \int e^{jk\beta\xi^2 + jb(x/M-\xi)^2}\,d\xi,
+        A_k(x) = \sqrt{\frac{M}{\lambda d}} \int F_k(\xi) e^{jb(x/M-\xi)^2}\,d\xi,
         \qquad b = \frac{\pi M}{\lambda d}
 
-    over the open part of the aperture: Fresnel integrals (`chirp_integral`). The order with
-    kβ + b = 0 focuses on the sensor and is a sinc. `x` is given on the mask's scale, x/M. Written
-    with the spherical wave's curvature, :math:`\pi\xi^2/(\lambda t) + \pi(x-\xi)^2/(\lambda d)`,
-    every order would carry the phase πx²/(λ(t+d)) that all share: large where t is short.
+    for the factor F_k of the mask, in Fresnel integrals. Of a chirp (`chirp_integral`) the term
+    with g + b = 0 focuses on the sensor and is a sinc. Of constant cells it is the shadow and the
+    wave of every edge, times the step of F_k there (`edge_wave`): one Fresnel integral an edge for
+    all terms. `x` is given on the mask's scale, x/M. Written with the spherical wave's curvature,
+    :math:`\pi\xi^2/(\lambda t) + \pi(x-\xi)^2/(\lambda d)`, every term would carry the phase
+    πx²/(λ(t+d)) that all share: large where t is short.
     """
-    k = jnp.asarray(zones.orders, dtype=x.dtype)[:, None, None]
     b = path.fresnel_curvature
-    x = x[None, :, None]
-    if zones.sites is None:
-        field = chirp_integral(k * zones.beta, b, x, zones.lower, zones.upper)
-        field = field.sum(axis=-1)
-    else:
-        # A display pixel has one phase for each order and is a plain slit for the light.
-        cells = chirp_integral(jnp.zeros_like(b), b, x, zones.lower, zones.upper)[0]
-        values = phasor(k[:, 0] * zones.beta * zones.sites**2)
-        field = product(values, cells.T)
+    edges, values = factors.edges, factors.values
+    if factors.curvatures is None:
+        offset = edges[:, None] - x
+        lit = (offset[:-1] < 0) & (offset[1:] >= 0)  # as the waves' own steps have it
+        steps = jnp.diff(values, axis=1, prepend=0, append=0)
+        root_half = np.sqrt(0.5)
+        shadow = product(values, as_complex(lit.astype(x.dtype)))
+        waves = product(steps, edge_wave(b, offset))
+        return (shadow * (1 + 1j) + waves) * jnp.asarray(root_half, values.dtype)
+    g = factors.curvatures[:, None, None]
+    origins = 0.0 if factors.origins is None else factors.origins
+    lower, upper = edges[:-1] - origins, edges[1:] - origins
+    field = chirp_integral(g, b, factors.from_origins(x), lower, upper)
+    field = (values[:, None] * field).sum(axis=-1)
     return field * as_complex(jnp.sqrt(path.magnification / (path.wavelength * path.distance)))
 
 
@@ -73,35 +81,36 @@ def separable(
     pixel_integration: bool = False,
     nodes: int = PIXEL_NODES,
 ) -> SeparableSum:
-    r"""PSF of a mask with separable zone orders behind its rectangular aperture.
+    r"""PSF of a mask of separable terms: of a zone plate's orders, or of cells.
 
     .. math::
-        h = \Big|\sum_k c_k A_k(x) A_k(y)\Big|^2
-          = \sum_k |c_k|^2 |A_k|^2|A_k|^2
-          + 2\,\mathrm{Re} \sum_{k<l} c_k c_l^* (A_k A_l^*)(x)\,(A_k A_l^*)(y)
+        h = \Big|\sum_k c_k A_k(x) B_k(y)\Big|^2
+          = \sum_k |c_k|^2 |A_k|^2|B_k|^2
+          + 2\,\mathrm{Re} \sum_{k<l} c_k c_l^* (A_k A_l^*)(x)\,(B_k B_l^*)(y)
 
     exact within the Fresnel approximation: no sampling condition, any grid, any distance. The
     paraxial phase that is left out is about πλ³dν⁴/4 at the spatial frequency ν of the field.
-    Nine real separable terms for the cosine profile, (harmonics + 2)² for the binary one,
-    (2·harmonics + 1)² for that of the intensity.
+    n terms make n² real products: one for a pinhole, four for a redundant array, nine for the
+    cosine profile, (harmonics + 2)² for the binary one, (2·harmonics + 1)² for the intensity's.
 
     `pixel_integration` averages each axis over the pixel by Gauss-Legendre quadrature with `nodes`
     nodes: the average of a separable term is separable.
     """
-    down, across = axis_orders(mask, "separable")
+    factored = require_factored(mask, "separable")
+    coefficients, down, across = factored.terms(path.wavelength)
     scale = path.magnification
-    lower, upper, weights = pairs(across)
+    lower, upper, weights = pairs(coefficients)
 
-    def products(zones, x):
+    def products(factors, x):
         if not pixel_integration:
-            fields = axis_fields(zones, path, x)
+            fields = axis_fields(factors, path, x)
             return fields[lower, :] * jnp.conj(fields[upper, :])
         places, node_weights = leggauss(nodes)
         offsets = jnp.asarray(places, dtype=x.dtype) * (grid.pitch / scale) / 2
         # One node after another: all at once, the compiler fuses the fields into the products and
         # computes them for each pair of orders. Gradients compute a node's field again, which is
         # faster than to store and load all that leads to it.
-        one = jax.checkpoint(lambda offset: axis_fields(zones, path, x + offset))
+        one = jax.checkpoint(lambda offset: axis_fields(factors, path, x + offset))
         fields = jax.lax.map(one, offsets)
         average = as_complex(jnp.asarray(node_weights / 2, dtype=x.dtype))[:, None, None]
         return jnp.sum(average * fields[:, lower] * jnp.conj(fields[:, upper]), axis=0)

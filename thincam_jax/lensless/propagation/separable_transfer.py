@@ -21,7 +21,7 @@ from jaxtyping import Array, Complex, Float
 
 from thincam_jax._core.checks import Number
 from thincam_jax._core.precision import as_complex, phasor, product
-from thincam_jax.lensless.masks.base import AbstractMask, ZoneOrders, axis_orders, pairs
+from thincam_jax.lensless.masks.base import AbstractMask, ZoneOrders, pairs, require_zone_orders
 from thincam_jax.lensless.propagation.chirp import chirp_integral
 from thincam_jax.lensless.propagation.path import Path
 
@@ -56,35 +56,30 @@ def transfer_factors(
     the alias that sampling folds in. `pixel_pitch`: mm; averages over square pixels, a factor
     sinc(pv) sinc(pu).
 
-    **Errors**: ValueError for a mask of display pixels, TypeError for one without zone orders.
+    **Errors**: ValueError for a mask of display pixels, TypeError for one that is no zone plate.
     """
-    down, zones = axis_orders(mask, "separable")
-    if zones.sites is not None:
-        raise ValueError(
-            "the transfer function in closed form has no display pixels; drop pixel_pitch from "
-            "the mask, or use thincam_jax.otf"
-        )
-    weights = pairs(zones)[2]
+    zones = require_zone_orders(mask, "transfer_factors")
+    weights = pairs(zones.coefficients)[2]
 
-    def factors(zones, frequency):
-        values = overlaps(zones, path, frequency)
+    def factors(side, frequency):
+        values = overlaps(zones._replace(width=side), path, frequency)
         if pixel_pitch is not None:
             values = values * as_complex(jnp.sinc(pixel_pitch * frequency))
         return values
 
-    if down is zones:
-        both = factors(zones, jnp.concatenate([v, u]))
+    height, width = mask.extent
+    if height is width:
+        both = factors(width, jnp.concatenate([v, u]))
         rows, columns = jnp.split(both, [v.shape[0]], axis=-1)
     else:
-        rows, columns = factors(down, v), factors(zones, u)
+        rows, columns = factors(height, v), factors(width, u)
     return TransferFactors(weights[:, None] * rows, columns)
 
 
 def overlaps(zones: ZoneOrders, path: Path, u: Float[Array, " u"]) -> Complex[Array, "pair u"]:
     """T_kl(u) of the pairs k ≤ l of orders, mm; 0 beyond the aperture's cut-off w/(λd)."""
-    width = zones.upper[0] - zones.lower[0]
     shift = path.wavelength * path.distance * u
-    values = overlaps_of(zones.orders, zones.beta, width, shift, path.magnification * u)
+    values = overlaps_of(zones.orders, zones.beta, zones.width, shift, path.magnification * u)
     return values * as_complex(path.magnification)
 
 

@@ -1,0 +1,134 @@
+"""Masks of square cells that are a sum of few products of a pattern down and one across."""
+
+import abc
+from typing import Any, Literal, NamedTuple, get_args
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import scipy
+from jaxtyping import Array, Float
+
+from thincam_jax._core import checks
+from thincam_jax._core.checks import Number, Numbers
+from thincam_jax._core.precision import as_complex
+from thincam_jax.lensless.masks.base import AbstractFactoredMask, AxisFactors, MaskTerms
+
+Combination = Literal["product", "xor"]
+COMBINATIONS: tuple[Combination, ...] = get_args(Combination)
+_LONGEST_REGISTER = 16
+
+
+class Patterns(NamedTuple):
+    """The cells of a mask, Σ_k coefficients[k] · rows[k, i] · columns[k, j]."""
+
+    coefficients: Float[np.ndarray | Array, " term"]
+    rows: Float[np.ndarray | Array, "term row"]
+    columns: Float[np.ndarray | Array, "term column"]
+
+
+class AbstractCellMask(AbstractFactoredMask):
+    """A mask of open, closed or grey square cells, of low rank.
+
+    - `cell`: side of a cell, mm.
+    """
+
+    cell: eqx.AbstractVar[Float[Array, ""]]
+
+    @abc.abstractmethod
+    def patterns(self) -> Patterns:
+        """The cells' amplitude transmittances as products."""
+
+    @property
+    def cells(self) -> Float[Array, "row column"]:
+        """Amplitude transmittance of every cell."""
+        coefficients, rows, columns = self.patterns()
+        return jnp.asarray((coefficients[:, None] * rows).T @ columns, self.cell.dtype)
+
+    @property
+    def extent(self) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        _, rows, columns = self.patterns()
+        return rows.shape[1] * self.cell, columns.shape[1] * self.cell
+
+    @property
+    def finest_frequency(self) -> Float[Array, ""]:
+        """Of cells that alternate, cycles/mm."""
+        return 0.5 / self.cell
+
+    def terms(self, wavelength: Number | None = None) -> MaskTerms:
+        coefficients, *both = (
+            as_complex(jnp.asarray(part, self.cell.dtype)) for part in self.patterns()
+        )
+        rows, columns = (AxisFactors(cell_edges(v.shape[1], self.cell), v) for v in both)
+        return MaskTerms(coefficients, rows, columns)
+
+    def _repr(self, what: str) -> str:
+        return f"{type(self).__name__}({what}, cell {checks.shown(self.cell, 'µm', 1e-3)})"
+
+
+def cell_edges(count: int, cell: Float[Array, ""]) -> Float[Array, " edge"]:
+    """Edges of so many cells about the mask's centre, mm."""
+    return (jnp.arange(count + 1, dtype=cell.dtype) - count / 2) * cell
+
+
+class SeparableMask(AbstractCellMask):
+    r"""Two one-dimensional codes a (down) and b (across), as in FlatCam.
+
+    - "product": t_ij = a_i b_j, of rank 1.
+    - "xor": t_ij = a_i (1 − b_j) + (1 − a_i) b_j, open where one of two binary codes is: of rank 2,
+      and of half the light where a product of them has a quarter.
+
+    **Arguments**
+
+    - `rows`, `columns`: the codes, amplitudes of 0 to 1; of `maximum_length_sequence`, for one.
+    - `cell`: side of a cell, mm.
+    - `combine`: "product" or "xor".
+    - `centre`: (y, x) of the mask's centre, mm.
+    """
+
+    rows: Float[Array, " row"]
+    columns: Float[Array, " column"]
+    cell: Float[Array, ""]
+    centre: Float[Array, "2"]
+    combine: Combination = eqx.field(static=True)
+
+    def __init__(
+        self,
+        rows: Any,
+        columns: Any,
+        cell: Number,
+        *,
+        combine: Combination = "product",
+        centre: Numbers | tuple[Number, Number] = (0.0, 0.0),
+    ):
+        self.rows = checks.transmittances("rows", rows)
+        self.columns = checks.transmittances("columns", columns)
+        self.cell = checks.positive("cell", cell, "mm")
+        self.combine = checks.choice("combine", combine, COMBINATIONS)  # pyright: ignore
+        self.centre = checks.finite("centre", centre, "mm", shape=(2,))
+
+    def __repr__(self) -> str:
+        return self._repr(f"{self.rows.size}×{self.columns.size} {self.combine}")
+
+    def patterns(self) -> Patterns:
+        a, b = self.rows, self.columns
+        if self.combine == "product":
+            return Patterns(np.ones(1), a[None], b[None])
+        return Patterns(np.ones(2), jnp.stack([a, 1 - a]), jnp.stack([1 - b, b]))
+
+
+def maximum_length_sequence(length: int) -> Float[np.ndarray, " length"]:
+    """A binary code of 0 and 1 and of length N = 2^m − 1, half of it open.
+
+    The periodic autocorrelation of 2s − 1 is N at zero and −1 elsewhere: its spectrum is flat.
+
+    **Errors**: ValueError for another length, with those next to it.
+    """
+    register = int(length + 1).bit_length() - 1
+    if length != 2**register - 1 or not 2 <= register <= _LONGEST_REGISTER:
+        low = min(max(register, 2), _LONGEST_REGISTER - 1)
+        raise ValueError(
+            f"length = {length} is not 2^m − 1 with m from 2 to {_LONGEST_REGISTER}; "
+            f"give {2**low - 1} or {2 ** (low + 1) - 1}"
+        )
+    return scipy.signal.max_len_seq(register)[0].astype(float)

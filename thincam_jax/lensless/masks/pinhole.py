@@ -1,0 +1,128 @@
+"""Openings: the pinhole, square or round, and the round code of rings."""
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from thincam_jax._core import checks
+from thincam_jax._core.checks import Number, Numbers
+from thincam_jax._core.grids import Grid
+from thincam_jax.lensless.masks.base import (
+    AbstractFactoredMask,
+    AbstractMask,
+    AxisFactors,
+    MaskTerms,
+)
+
+
+class Pinhole(AbstractFactoredMask):
+    """A square or rectangular opening in an opaque sheet.
+
+    **Arguments**
+
+    - `width`: side, mm; of a rectangle that along x.
+    - `height`: side of a rectangle along y, mm; None for a square.
+    - `centre`: (y, x) of the opening's centre, mm.
+    """
+
+    width: Float[Array, ""]
+    height: Float[Array, ""] | None
+    centre: Float[Array, "2"]
+
+    def __init__(
+        self,
+        width: Number,
+        height: Number | None = None,
+        *,
+        centre: Numbers | tuple[Number, Number] = (0.0, 0.0),
+    ):
+        self.width = checks.positive("width", width, "mm")
+        self.height = None if height is None else checks.positive("height", height, "mm")
+        self.centre = checks.finite("centre", centre, "mm", shape=(2,))
+
+    def __repr__(self) -> str:
+        height, width = (checks.shown(side, "µm", 1e-3) for side in self.extent)
+        return f"Pinhole({width if self.height is None else f'{height} × {width}'})"
+
+    @property
+    def extent(self) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        return self.width if self.height is None else self.height, self.width
+
+    def terms(self, wavelength: Number | None = None) -> MaskTerms:
+        one = jnp.ones((1, 1), jnp.result_type(self.width, jnp.complex64))
+        rows, columns = (AxisFactors(jnp.stack([-s / 2, s / 2]), one) for s in self.extent)
+        return MaskTerms(one[0], columns if self.height is None else rows, columns)
+
+
+class RadialMask(AbstractMask):
+    r"""A code of concentric rings, the same in all directions; of one value, a round pinhole.
+
+    No sum of few products: for `angular_spectrum` and `rayleigh_sommerfeld`. On the axis behind an
+    opening of radius a lies the irradiance :math:`4\sin^2(\pi a^2/(2\lambda d))`.
+
+    **Arguments**
+
+    - `rings`: amplitude transmittance of each ring, 0 to 1, from the middle outwards.
+    - `ring`: width of a ring, mm.
+    - `centre`: (y, x) of the mask's centre, mm.
+    """
+
+    rings: Float[Array, " ring"]
+    ring: Float[Array, ""]
+    centre: Float[Array, "2"]
+
+    def __init__(
+        self,
+        rings: Any,
+        ring: Number,
+        *,
+        centre: Numbers | tuple[Number, Number] = (0.0, 0.0),
+    ):
+        self.rings = checks.transmittances("rings", rings)
+        self.ring = checks.positive("ring", ring, "mm")
+        self.centre = checks.finite("centre", centre, "mm", shape=(2,))
+
+    def __repr__(self) -> str:
+        return f"RadialMask({self.rings.size} rings of {checks.shown(self.ring, 'µm', 1e-3)})"
+
+    @property
+    def extent(self) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        side = 2 * self.rings.size * self.ring
+        return side, side
+
+    @property
+    def finest_frequency(self) -> Float[Array, ""]:
+        """Of rings that alternate, cycles/mm."""
+        return 0.5 / self.ring
+
+    def sample(self, grid: Grid, wavelength: Number | None = None) -> Float[Array, "y x"]:
+        """Every sample's mean over its square, exactly."""
+        y, x = (
+            jnp.append(points - grid.pitch / 2, points[-1] + grid.pitch / 2) - middle
+            for points, middle in zip((grid.y, grid.x), self.centre, strict=True)
+        )
+        total = jnp.zeros(grid.shape, self.ring.dtype)
+        steps = -jnp.diff(self.rings, append=0)
+        for number in range(self.rings.size):
+            area = _disc_area((number + 1) * self.ring, y[:, None], x)
+            total = total + steps[number] * jnp.diff(jnp.diff(area, axis=0), axis=1)
+        return total / grid.pitch**2
+
+
+def _disc_area(radius, y, x):
+    """Signed area of a disc's part between the axes through its centre and the lines at y and x."""
+    sign = jnp.sign(y) * jnp.sign(x)
+    y, x = jnp.minimum(jnp.abs(y), radius), jnp.minimum(jnp.abs(x), radius)
+    inside = x**2 + y**2 < radius**2
+    at = jnp.where(inside, x, jnp.sqrt(jnp.maximum(radius**2 - y**2, 0.0)))
+
+    def below_circle(x):
+        """∫₀ˣ √(R² − ξ²) dξ."""
+        u = jnp.minimum(x / radius, 1.0)
+        safe = jnp.where(u < 1, u, 0.0)
+        curve = safe * jnp.sqrt(1 - safe**2) + jnp.arcsin(safe)
+        return radius**2 / 2 * jnp.where(u < 1, curve, np.pi / 2)
+
+    return sign * (y * at + below_circle(x) - below_circle(at))

@@ -1,0 +1,176 @@
+"""Uniformly redundant arrays: codes whose correlation with a decoding pattern is one point."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Array, Float
+
+from thincam_jax._core import checks
+from thincam_jax._core.checks import Number, Numbers
+from thincam_jax.lensless.masks.cells import AbstractCellMask, Patterns
+
+_LARGEST = 4096
+
+
+class AbstractRedundantArray(AbstractCellMask):
+    r"""An array of r × s cells from quadratic residues, or several of them side by side.
+
+    With the Legendre symbol :math:`C_i = +1` for the squares :math:`i = n^2 \bmod p \neq 0`, −1 for
+    the rest and :math:`C_0 = 0`: a cell (i, j) is closed for i = 0, open for j = 0 ≠ i, else open
+    where :math:`C_i C_j = 1`. That is of rank 2,
+
+    .. math:: A = \tfrac12 (u w^T + c\, d^T), \quad u = (0, 1, \dots, 1),\ w = u + 2e_0
+
+    with the symbols c modulo r and d modulo s.
+    """
+
+    tiles: eqx.AbstractVar[tuple[int, int]]
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Cells (r, s) of one array."""
+        raise NotImplementedError
+
+    def patterns(self) -> Patterns:
+        symbols = [_legendre_symbols(p) for p in self.shape]
+        u, w = (np.where(s == 0, zero, 1.0) for s, zero in zip(symbols, (0, 2), strict=True))
+        rows, columns = (
+            np.tile(np.stack(both), tiles)
+            for both, tiles in zip(((u, symbols[0]), (w, symbols[1])), self.tiles, strict=True)
+        )
+        return Patterns(np.full(2, 0.5), rows, columns)
+
+    @property
+    def decoder(self) -> Float[Array, "row column"]:
+        """G = 2A − 1 of one array: its periodic correlation with A is flat but for one point."""
+        rows, columns = self.shape
+        return 2 * self.cells[:rows, :columns] - 1
+
+    def __repr__(self) -> str:
+        tiles = "" if self.tiles == (1, 1) else f", {self.tiles[0]}×{self.tiles[1]} tiles"
+        return self._repr(f"{self.shape[0]}×{self.shape[1]}{tiles}")
+
+
+class ModifiedUniformlyRedundantArray(AbstractRedundantArray):
+    r"""A MURA of p × p cells (Gottesman and Fenimore 1989), half of them open.
+
+    With :math:`G = 2A - 1` but :math:`G_{00} = +1` (`decoder`) the periodic correlation is a single
+    point, :math:`A \star G = \tfrac{p^2-1}{2}\,\delta`, and :math:`|\hat A|` is
+    :math:`(p \pm 1)/2` at every frequency but zero.
+
+    **Arguments**
+
+    - `order`: p, a prime of at least 5.
+    - `cell`: side of a cell, mm.
+    - `tiles`: how often the array is repeated, one number or (down, across). A mask that is to
+      throw one whole array from every direction has two.
+    - `centre`: (y, x) of the mask's centre, mm.
+
+    **Errors**: ValueError for a number that is no such prime, with the nearest two.
+    """
+
+    order: int = eqx.field(static=True)
+    tiles: tuple[int, int] = eqx.field(static=True)
+    cell: Float[Array, ""]
+    centre: Float[Array, "2"]
+
+    def __init__(
+        self,
+        order: int,
+        cell: Number,
+        *,
+        tiles: int | tuple[int, int] = 1,
+        centre: Numbers | tuple[Number, Number] = (0.0, 0.0),
+    ):
+        self.order, self.tiles = _prime_order(order), _tiles(tiles)
+        self.cell = checks.positive("cell", cell, "mm")
+        self.centre = checks.finite("centre", centre, "mm", shape=(2,))
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        return self.order, self.order
+
+    @property
+    def decoder(self) -> Float[Array, "row column"]:
+        """G = 2A − 1 with G₀₀ = +1: A ⋆ G is a point."""
+        return super().decoder.at[0, 0].set(1.0)
+
+
+class UniformlyRedundantArray(AbstractRedundantArray):
+    r"""A URA of r × s cells for twin primes r = s + 2 (Fenimore and Cannon 1978).
+
+    Its periodic autocorrelation has the peak (rs + 1)/2 and is (rs + 1)/4 everywhere else.
+
+    **Arguments**: as of `ModifiedUniformlyRedundantArray`, with `orders` = (r, s).
+
+    **Errors**: ValueError for orders that are no twin primes, with the nearest that are.
+    """
+
+    orders: tuple[int, int] = eqx.field(static=True)
+    tiles: tuple[int, int] = eqx.field(static=True)
+    cell: Float[Array, ""]
+    centre: Float[Array, "2"]
+
+    def __init__(
+        self,
+        orders: tuple[int, int],
+        cell: Number,
+        *,
+        tiles: int | tuple[int, int] = 1,
+        centre: Numbers | tuple[Number, Number] = (0.0, 0.0),
+    ):
+        self.orders, self.tiles = _twin_primes(orders), _tiles(tiles)
+        self.cell = checks.positive("cell", cell, "mm")
+        self.centre = checks.finite("centre", centre, "mm", shape=(2,))
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        return self.orders
+
+
+def _legendre_symbols(p: int) -> Float[np.ndarray, " p"]:
+    """C_i for i = 0 … p − 1."""
+    symbols = np.full(p, -1.0)
+    symbols[np.arange(1, p) ** 2 % p] = 1.0
+    symbols[0] = 0.0
+    return symbols
+
+
+def _is_prime(p: int) -> bool:
+    return p > 1 and all(p % n for n in range(2, int(p**0.5) + 1))
+
+
+def _prime_order(order: Any) -> int:
+    def fits(p):
+        return p >= 5 and _is_prime(p)
+
+    if isinstance(order, int) and fits(order) and order <= _LARGEST:
+        return order
+    raise ValueError(f"order = {order} is no prime from 5 to {_LARGEST}; give {_near(order, fits)}")
+
+
+def _twin_primes(orders: Any) -> tuple[int, int]:
+    def fits(s):
+        return _is_prime(s) and _is_prime(s + 2)
+
+    r, s = orders if np.shape(orders) == (2,) else (0, 0)
+    if r == s + 2 and s <= _LARGEST and fits(s):
+        return int(r), int(s)
+    near = _near(min(r, s), fits, lambda s: f"({s + 2}, {s})")
+    raise ValueError(f"orders = {orders} are no twin primes (s + 2, s); give {near}")
+
+
+def _near(number: Any, fits: Callable[[int], bool], text: Callable[[int], str] = str) -> str:
+    """The nearest that fit below and above, in words."""
+    at = min(max(int(number), 0), _LARGEST)
+    below = next((n for n in range(at, 0, -1) if fits(n)), None)
+    above = next((n for n in range(at + 1, _LARGEST + 1) if fits(n)), None)
+    return " or ".join(text(n) for n in (below, above) if n is not None)
+
+
+def _tiles(tiles: Any) -> tuple[int, int]:
+    down, across = (tiles, tiles) if isinstance(tiles, int) else tiles
+    checks.at_least_one({"tiles": min(down, across)})
+    return int(down), int(across)
