@@ -3,8 +3,8 @@ r"""Families of phase masks: the random diffuser and the Voronoi-Fresnel lenses.
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.spatial
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import PRNGKeyArray
+from scipy.spatial import KDTree
 
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Number
@@ -75,27 +75,22 @@ def voronoi_fresnel(
     if not 1 <= sites <= blank.shape[0] * blank.shape[1]:
         raise ValueError(f"sites = {sites}; give 1 to the number of cells of the blank")
     focal_length = checks.positive("focal_length", focal_length, "mm")
+    light = checks.wavelength("wavelength", wavelength)
     y, x = (np.asarray(a, float) for a in (blank.grid.y, blank.grid.x))
     cells = np.stack(np.meshgrid(y, x, indexing="ij"), axis=-1).reshape(-1, 2)
     half = np.array(blank.shape) * float(blank.pitch) / 2
     places = np.asarray(jax.random.uniform(key, (sites, 2), minval=-1.0, maxval=1.0)) * half
     for _ in range(relaxations):
-        owner = scipy.spatial.cKDTree(places).query(cells)[1]
+        owner = KDTree(places).query(cells)[1]
         count = np.bincount(owner, minlength=sites)[:, None]
         sums = [np.bincount(owner, cells[:, axis], sites) for axis in (0, 1)]
         places = np.where(count > 0, np.stack(sums, axis=-1) / np.maximum(count, 1), places)
-    squared = scipy.spatial.cKDTree(places).query(cells)[0].reshape(blank.shape) ** 2
-    _require_held(blank, float(np.sqrt(squared.max())), float(focal_length), float(wavelength))
-    detour = jnp.asarray(squared / (np.sqrt(squared + float(focal_length) ** 2) + focal_length))
-    return blank.mask(_wrapped(blank, -detour.astype(focal_length.dtype), wavelength))
-
-
-def _wrapped(
-    blank: MaskBlank, path: Float[Array, "y x"], wavelength: Number
-) -> Float[Array, "y x"]:
-    """Heights below one turn that delay the light by an optical path, mm, up to whole turns."""
-    turns = path / checks.wavelength("wavelength", wavelength)
-    return (turns - jnp.floor(turns)) * blank.wrap_height(wavelength)
+    squared = KDTree(places).query(cells)[0].reshape(blank.shape) ** 2
+    _require_held(blank, float(np.sqrt(squared.max())), float(focal_length), float(light))
+    f = float(focal_length)
+    turns = -squared / (np.sqrt(squared + f**2) + f) / float(light)
+    turns = jnp.asarray(turns - np.floor(turns), focal_length.dtype)
+    return blank.mask(turns * blank.wrap_height(light))
 
 
 def _require_held(blank: MaskBlank, reach: float, focal_length: float, wavelength: float) -> None:
