@@ -1,5 +1,6 @@
 """Finding the best camera by gradient: objectives, what is free, and the search."""
 
+from thincam_jax.design.contours import contour_target as contour_target
 from thincam_jax.design.design import Design as Design
 from thincam_jax.design.design import shots as shots
 from thincam_jax.design.end_to_end import drawn_error as drawn_error
@@ -16,6 +17,9 @@ from thincam_jax.design.objectives import mismatch_error as mismatch_error
 from thincam_jax.design.objectives import unevenness as unevenness
 from thincam_jax.design.objectives import worst_ratio_db as worst_ratio_db
 from thincam_jax.design.pareto import non_dominated as non_dominated
+from thincam_jax.design.phase_retrieval import Retrieval as Retrieval
+from thincam_jax.design.phase_retrieval import match_error as match_error
+from thincam_jax.design.phase_retrieval import retrieve_phase as retrieve_phase
 from thincam_jax.design.plate import FoundPlate as FoundPlate
 from thincam_jax.design.plate import Plate as Plate
 from thincam_jax.design.plate import PlateLimits as PlateLimits
