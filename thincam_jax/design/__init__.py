@@ -17,6 +17,16 @@ from thincam_jax.design.objectives import mismatch_error as mismatch_error
 from thincam_jax.design.objectives import unevenness as unevenness
 from thincam_jax.design.objectives import worst_ratio_db as worst_ratio_db
 from thincam_jax.design.pareto import non_dominated as non_dominated
+from thincam_jax.design.phase_mask import HeightLimits as HeightLimits
+from thincam_jax.design.phase_mask import MaskSetting as MaskSetting
+from thincam_jax.design.phase_mask import Refined as Refined
+from thincam_jax.design.phase_mask import linear_error as linear_error
+from thincam_jax.design.phase_mask import linear_objective as linear_objective
+from thincam_jax.design.phase_mask import mask_of_phase as mask_of_phase
+from thincam_jax.design.phase_mask import match_objective as match_objective
+from thincam_jax.design.phase_mask import one_turn as one_turn
+from thincam_jax.design.phase_mask import refine_mask as refine_mask
+from thincam_jax.design.phase_mask import restored_objective as restored_objective
 from thincam_jax.design.phase_retrieval import Retrieval as Retrieval
 from thincam_jax.design.phase_retrieval import match_error as match_error
 from thincam_jax.design.phase_retrieval import retrieve_phase as retrieve_phase

@@ -20,7 +20,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from thincam_jax._core.precision import as_complex
 from thincam_jax.design.design import Design
-from thincam_jax.design.training import Training, channels_of, relative_error
+from thincam_jax.design.training import Channel, Training, channels_of, relative_error
 
 
 def end_to_end_error(design: Design, training: Training) -> Float[Array, ""]:
@@ -40,7 +40,11 @@ def drawn_error(design: Design, training: Training, key: PRNGKeyArray) -> Float[
 
 def restore(design: Design, training: Training) -> Float[Array, "image v u"]:
     """The restored images; NaN where conjugate gradients did not reach the tolerance."""
-    cameras = channels_of(design, training)
+    return restore_by(channels_of(design, training), training)
+
+
+def restore_by(cameras: tuple[Channel, ...], training: Training) -> Float[Array, "image v u"]:
+    """The same by cameras of any kind, one for each row of the training's synthesis."""
 
     def one(image, noise):
         measured = [c.capture(image, n) for c, n in zip(cameras, noise, strict=True)]

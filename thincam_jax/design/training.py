@@ -132,7 +132,11 @@ def relative_error(restored: Float[Array, "image v u"], training: Training) -> F
 
 
 class Channel(eqx.Module):
-    """A sum of captures at one distance: A_c."""
+    """A sum of captures at one distance: A_c.
+
+    - `kernels`: their PSFs, on `kernel_grid(training.sensor.grid, training.field_shape)`.
+    - `weights`, `exposure`: of each; `distance`: mask to sensor, mm.
+    """
 
     captures: tuple[CropConvolution, ...]
     summed: CropConvolution
@@ -144,24 +148,22 @@ class Channel(eqx.Module):
 
     def __init__(
         self,
-        design: Design,
-        training: Training,
         kernels: Float[Array, "capture k l"],
-        row: Float[np.ndarray, " capture"],
+        weights: tuple[float, ...],
+        exposure: tuple[Float[Array, ""], ...],
+        distance: Float[Array, ""],
+        training: Training,
     ):
-        used = [int(k) for k in np.flatnonzero(row)]
-        self.weights = tuple(float(row[k]) for k in used)
-        self.distance = design.distance[used[0]]
-        self.exposure = tuple(design.exposure[k] for k in used)
+        self.weights, self.exposure, self.distance = weights, exposure, distance
         self.setup = training.setup
         sensor, field = training.sensor, training.field_shape
         self.grid = Grid(field, sensor.pitch)
-        whole = jnp.tensordot(jnp.asarray(row, kernels.dtype), kernels, axes=1)
 
         def convolution(kernel):
             return CropConvolution(kernel, sensor.pitch, sensor.shape, field)
 
-        self.captures = tuple(convolution(kernels[k]) for k in used)
+        self.captures = tuple(map(convolution, kernels))
+        whole = jnp.tensordot(jnp.asarray(weights, kernels.dtype), kernels, axes=1)
         self.summed = convolution(whole)
 
     def __call__(self, image: Float[Array, "v u"]) -> Float[Array, "y x"]:
@@ -212,9 +214,14 @@ def check_captures(design: Design, training: Training) -> None:
 def channels_of(design: Design, training: Training) -> tuple[Channel, ...]:
     """The sums of captures that the training's synthesis asks for."""
     check_captures(design, training)
-    rows = np.asarray(training.synthesis)
     kernels = _kernels(design, training)
-    return tuple(Channel(design, training, kernels, row) for row in rows)
+
+    def channel(row):
+        used = np.flatnonzero(row)
+        weights, exposure = tuple(row[k] for k in used), tuple(design.exposure[k] for k in used)
+        return Channel(kernels[used], weights, exposure, design.distance[used[0]], training)
+
+    return tuple(channel(row) for row in training.synthesis)
 
 
 def _kernels(design: Design, training: Training) -> Float[Array, "capture k l"]:

@@ -1,0 +1,195 @@
+"""Reliefs found by gradient keep their limits and beat the retrieved phase at equal levels."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import thincam_jax as tc
+from helpers import count_traces, finite_difference
+from thincam_jax.design import (
+    HeightLimits,
+    MaskSetting,
+    PhotonNoise,
+    PowerLaw,
+    Setup,
+    SignalNoise,
+    Training,
+    contour_target,
+    linear_error,
+    linear_objective,
+    mask_of_phase,
+    match_objective,
+    one_turn,
+    refine_mask,
+    restored_objective,
+    retrieve_phase,
+)
+from thincam_jax.imaging.operators import kernel_shape
+from thincam_jax.imaging.targets import siemens_star
+from thincam_jax.lensless.masks import MaskBlank
+from thincam_jax.lensless.propagation import Path
+from thincam_jax.units import nm, um
+
+GREEN, DISTANCE, PITCH = 532 * nm, 2.0, 4 * um
+BLANK = MaskBlank((32, 36), PITCH, 1.5)
+SENSOR = tc.Sensor((32, 36), PITCH)
+
+
+def setup(pitch=PITCH, noise=None):
+    return Setup(
+        pitch=pitch,
+        sensor_width=36 * PITCH,
+        object_distance=100.0,
+        object_width=5.0,
+        noise=noise or SignalNoise(20.0),
+        prior=PowerLaw(2.5),
+    )
+
+
+@pytest.fixture(scope="module")
+def retrieved():
+    """A target, and the mask of four levels that Gerchberg and Saxton's algorithm finds for it."""
+    key = jax.random.key(4)
+    target = contour_target(key, SENSOR.grid, feature=60 * um, line_width=8 * um)
+    path = Path(GREEN, DISTANCE)
+    phase = retrieve_phase(target, SENSOR.grid, path, shape=(32, 36), key=key, steps=40).phase
+    limits = one_turn(BLANK, GREEN, 4)
+    return target, mask_of_phase(phase, BLANK, GREEN, limits), limits
+
+
+SETTING = MaskSetting(BLANK, SENSOR, DISTANCE, wavelengths=[GREEN])
+
+
+def evaluated(objective, mask, data):
+    return float(jax.jit(objective)(mask, data, jax.random.key(0)))
+
+
+def test_levels_are_kept_and_derivatives_pass():
+    limits = HeightLimits(3e-3, 4)
+    given = jnp.asarray([[-1e-3, 0.4e-3, 0.6e-3, 2.4e-3, 2.6e-3, 9e-3]])
+    np.testing.assert_allclose(limits.nearest(given), [[0, 0, 1e-3, 2e-3, 3e-3, 3e-3]], atol=1e-12)
+    slope = jax.grad(lambda h: jnp.sum(limits.nearest(h)))(given)
+    np.testing.assert_array_equal(slope, [[0, 1, 1, 1, 1, 0]])
+
+
+def test_a_phase_becomes_the_nearest_height_up_to_whole_turns():
+    """Four levels are ¼ turn apart: 0.9 turns are nearer to 1 than to ¾, and 1 is 0."""
+    limits = one_turn(BLANK, GREEN, 4)
+    turns = np.tile([0.0, 0.1, 0.2, 0.8, 0.9, -0.2], (2, 1))
+    small = MaskBlank((2, 6), PITCH, 1.5)
+    mask = mask_of_phase(jnp.asarray(2 * np.pi * turns), small, GREEN, limits)
+    levels = np.asarray(mask.height) / float(BLANK.wrap_height(GREEN))
+    np.testing.assert_allclose(levels[1], [0, 0, 0.25, 0.75, 0, 0.75], atol=1e-9)
+
+
+@pytest.mark.parametrize("noise", [SignalNoise(20.0), PhotonNoise(5e6, 5.0)])
+def test_the_linear_error_is_that_of_the_posterior(noise):
+    """tr[(Σ⁻¹ + AᵀA/σ²)⁻¹]/tr Σ with dense matrices, for a cyclic blur in 5 × 6 pixels."""
+    h = np.random.default_rng(1).uniform(size=(5, 6)) * 3e3
+    here = setup(noise=noise)
+    v, u = (np.fft.fftfreq(n, PITCH) * DISTANCE for n in (5, 6))
+    prior = np.asarray(here.prior(jnp.asarray(v[:, None] ** 2 + u**2), here.field))
+    basis = np.stack([np.fft.fft2(e.reshape(5, 6)).ravel() for e in np.eye(30)], 1) / np.sqrt(30)
+    scene = (basis.conj().T * (prior / prior.mean() * 0.25).ravel()) @ basis
+    kernel = np.stack([np.roll(h, (i, j), (0, 1)).ravel() for i in range(5) for j in range(6)], 1)
+    blur = kernel * PITCH**2
+    signal = np.trace(blur @ scene @ blur.T).real / 30
+    variance = float(noise.variance(h.sum() * PITCH**2, signal, 1.0))
+    left = np.linalg.inv(np.linalg.inv(scene) + blur.T @ blur / variance)
+    found = jax.jit(linear_error)(jnp.asarray(h), here, jnp.asarray(DISTANCE))
+    np.testing.assert_allclose(found, np.trace(left).real / np.trace(scene).real, rtol=1e-6)
+
+
+def test_psfs_of_a_setting_are_the_cameras(retrieved):
+    """One for each depth and wavelength; together, their mean over the wavelengths."""
+    mask = retrieved[1]
+    light = {"wavelengths": [450 * nm, GREEN], "object_distances": [20.0, np.inf]}
+    apart = MaskSetting(BLANK, SENSOR, DISTANCE, **light)
+    several = jax.jit(lambda m: apart.psfs(m))(mask)
+    assert several.shape == (2, 2, 32, 36)
+    camera = tc.LenslessCamera(mask, SENSOR, DISTANCE)
+    of_psf = {"model": "angular_spectrum", "pixel_integration": True}
+    near_blue = tc.psf(camera, wavelength=450 * nm, object_distance=20.0, **of_psf)
+    np.testing.assert_allclose(several[0, 0], near_blue, rtol=1e-6, atol=1e-9)
+    together = MaskSetting(BLANK, SENSOR, DISTANCE, together=True, **light)
+    both = jax.jit(lambda m: together.psfs(m))(mask)
+    np.testing.assert_allclose(both, several.mean(axis=1, keepdims=True), atol=1e-9)
+
+
+def test_refinement_beats_the_retrieved_phase_at_equal_levels(retrieved):
+    """Expected error of the best linear image, four levels: less than Gerchberg and Saxton's."""
+    target, mask, limits = retrieved
+    key = jax.random.key(1)
+    by_error = refine_mask(linear_objective, mask, limits, (SETTING, setup()), key=key, steps=60)
+    step = limits.highest / 3
+    off = np.asarray(by_error.mask.height) / step
+    np.testing.assert_allclose(off, np.round(off), atol=1e-9)
+    assert by_error.skipped == 0 and off.max() == 3
+    before, after = (
+        evaluated(linear_objective, m, (SETTING, setup())) for m in (mask, by_error.mask)
+    )
+    assert after < 0.8 * before
+
+
+def test_refinement_comes_nearer_to_the_target(retrieved):
+    target, mask, limits = retrieved
+    found = refine_mask(
+        match_objective, mask, limits, (SETTING, target), key=jax.random.key(1), steps=60
+    )
+    before, after = (evaluated(match_objective, m, (SETTING, target)) for m in (mask, found.mask))
+    assert after < 0.8 * before
+
+
+@pytest.mark.thorough
+def test_refinement_end_to_end(retrieved):
+    """Through the solver: restored images, crop and noise included, come nearer to the truth."""
+    _, mask, limits = retrieved
+    images = np.stack([siemens_star((24, 24), n) for n in (6, 10)]) + 0.5
+    training = Training(
+        images,
+        setup(),
+        np.array([[1.0]]),
+        sensor_shape=(32, 36),
+        distances=(DISTANCE, DISTANCE),
+        key=jax.random.key(2),
+    )
+    sensor = tc.Sensor(kernel_shape((32, 36), training.field_shape), PITCH)
+    setting = MaskSetting(BLANK, sensor, DISTANCE, wavelengths=[GREEN], object_distances=[100.0])
+    data = (setting, training)
+    found = refine_mask(restored_objective, mask, limits, data, key=jax.random.key(1), steps=25)
+    assert found.skipped == 0
+    before, after = (evaluated(restored_objective, m, data) for m in (mask, found.mask))
+    assert after < before
+
+
+def test_gradient_and_traces():
+    """Of the linear error with respect to heights; other heights and limits of light: one trace."""
+    small = MaskBlank((6, 8), PITCH, 1.5)
+    setting = MaskSetting(small, tc.Sensor((9, 10), PITCH), 0.5, wavelengths=[GREEN])
+    counted = count_traces(linear_objective)
+    value = jax.jit(lambda h: counted(small.mask(h), (setting, setup()), jax.random.key(0)))
+    height = jnp.asarray(np.random.default_rng(2).uniform(0.1, 1.0, (6, 8)) * um)
+    along = jnp.asarray(np.random.default_rng(3).normal(size=(6, 8))) * um
+    expected = finite_difference(value, height, along, 1e-4)
+    slope = jax.grad(value)(height)
+    np.testing.assert_allclose(jnp.sum(slope * along), expected, rtol=1e-8)
+    value(height * 1.1)
+    assert counted.traces == 1
+
+
+def test_refusals(retrieved):
+    mask = retrieved[1]
+    data = (SETTING, setup())
+    for limits, told in (
+        (HeightLimits(0.2), "highest = 0.2 mm; give more than 0, up to 0.1"),
+        (HeightLimits(1e-3, 1), "levels = 1; give at least 2"),
+    ):
+        with pytest.raises(ValueError, match=told):
+            refine_mask(linear_objective, mask, limits, data, key=jax.random.key(0))
+    with pytest.raises(ValueError, match="steps = 1; give at least 2"):
+        refine_mask(
+            linear_objective, mask, HeightLimits(1e-3), data, key=jax.random.key(0), steps=1
+        )
+    with pytest.raises(ValueError, match="wavelengths = 500 mm is no light"):
+        MaskSetting(BLANK, SENSOR, DISTANCE, wavelengths=[500.0])

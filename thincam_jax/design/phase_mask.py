@@ -1,0 +1,268 @@
+r"""The relief of a phase mask by gradient: what it may be, what it is judged by, and the descent.
+
+A phase retrieved for one wavelength, rounded to the levels that can be made, is no longer the best
+one. Here the heights themselves are changed, with the limits inside: each is
+
+.. math:: h = q\big(h_{max} \sin^2 u\big)
+
+of a free number u, q the nearest level. Its derivative is taken as 1 (the straight-through
+estimator; Bengio, Léonard & Courville 2013), so that the optics see what will be made, and the
+descent what it would be between the levels.
+"""
+
+import functools
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from thincam_jax._core import checks
+from thincam_jax._core.checks import Number, Numbers
+from thincam_jax.design.adam import adam
+from thincam_jax.design.end_to_end import restore_by
+from thincam_jax.design.objectives import Channels, bayes_error
+from thincam_jax.design.phase_retrieval import match_error
+from thincam_jax.design.setup import Setup
+from thincam_jax.design.training import Channel, relative_error
+from thincam_jax.imaging.sensor import Sensor
+from thincam_jax.lensless.masks.phase import HIGHEST, MaskBlank, PhaseMask
+from thincam_jax.lensless.method import PsfMethod, psf_method
+from thincam_jax.lensless.propagation.angular_spectrum import angular_spectrum
+from thincam_jax.lensless.propagation.path import Path
+from thincam_jax.lensless.sampling import require_phase_sampling
+
+# Of the angle u, whose range from the lowest to the highest relief is π/2.
+_RATE = 0.03
+# As a part of the range: nearer to its ends sin² is flat, and a descent would not leave them.
+_INNER = 0.02
+
+# (mask, data, key) → what is to be small.
+MaskObjective = Callable[[PhaseMask, Any, PRNGKeyArray], Float[Array, ""]]
+
+
+class HeightLimits(NamedTuple):
+    """Heights that can be made. The smallest feature is a cell of the mask.
+
+    - `highest`: mm. `levels`: how many heights, evenly from 0 to the highest; None is any.
+    """
+
+    highest: float
+    levels: int | None = None
+
+    def checked(self) -> "HeightLimits":
+        """The same, or ValueError in one line."""
+        if not 0 < self.highest <= HIGHEST:
+            raise ValueError(f"highest = {self.highest:g} mm; give more than 0, up to {HIGHEST:g}")
+        if self.levels is not None and self.levels < 2:
+            raise ValueError(f"levels = {self.levels}; give at least 2, or None for any height")
+        return self
+
+    def nearest(self, height: Float[Array, "y x"]) -> Float[Array, "y x"]:
+        """The heights that can be made; derivatives pass as if any could."""
+        inside = jnp.clip(height, 0.0, self.highest)
+        if self.levels is None:
+            return inside
+        step = self.highest / (self.levels - 1)
+        return inside + jax.lax.stop_gradient(jnp.round(inside / step) * step - inside)
+
+
+def one_turn(blank: MaskBlank, wavelength: Number, levels: int | None = None) -> HeightLimits:
+    """Limits that hold every phase of one wavelength: λ/(n − 1), less the last of even levels."""
+    turn = float(blank.wrap_height(wavelength))
+    return HeightLimits(turn if levels is None else turn * (levels - 1) / levels, levels)
+
+
+def mask_of_phase(
+    phase: Float[Array, "y x"], blank: MaskBlank, wavelength: Number, limits: HeightLimits
+) -> PhaseMask:
+    """The mask that comes nearest to a phase (rad) at a wavelength, within the limits.
+
+    Phases are taken up to whole turns; what is higher than the limits becomes the highest or the
+    lowest height, whichever phase is nearer.
+    """
+    limits = limits.checked()
+    turn = blank.wrap_height(wavelength).astype(phase.dtype)
+    height = (phase / (2 * math.pi) - jnp.floor(phase / (2 * math.pi))) * turn
+    over = height - limits.highest
+    return blank.mask(limits.nearest(jnp.where(turn - height < over, 0.0, height)))
+
+
+class MaskSetting(eqx.Module):
+    """Where a mask is designed: its sensor, and the light that it meets.
+
+    - `sensor`, `distance`: mask to sensor, mm. `wavelengths`, `object_distances`: mm.
+    - `together`: the sensor sees all wavelengths as one grey image; else each has its own.
+    """
+
+    sensor: Sensor
+    distance: Float[Array, ""]
+    wavelengths: Float[Array, " colour"]
+    object_distances: Float[Array, " depth"]
+    together: bool = eqx.field(static=True)
+    method: PsfMethod = eqx.field(static=True)
+
+    def __init__(
+        self,
+        blank: MaskBlank,
+        sensor: Sensor,
+        distance: Number,
+        *,
+        wavelengths: Numbers | Sequence[float],
+        object_distances: Numbers | Sequence[float] = (math.inf,),
+        together: bool = False,
+    ):
+        self.sensor, self.together = sensor, together
+        self.distance = checks.positive("distance", distance, "mm")
+        dtype = self.distance.dtype
+        given = jnp.atleast_1d(jnp.asarray(wavelengths, dtype))
+        self.wavelengths = checks.wavelength("wavelengths", given)
+        self.object_distances = jnp.atleast_1d(jnp.asarray(object_distances, dtype))
+        flat = blank.mask(jnp.zeros(blank.shape, dtype))
+        self.method = psf_method(flat, sensor.grid, "angular_spectrum", pixel_integration=True)
+        for light in self.wavelengths:
+            for away in self.object_distances:
+                path = Path(light, self.distance, away)
+                require_phase_sampling(flat, sensor.grid, path, self.method)
+
+    def psfs(self, mask: PhaseMask) -> Float[Array, "depth colour y x"]:
+        """Averaged over the pixels; of all wavelengths together, the mean as one colour."""
+
+        def one(light):
+            return angular_spectrum(
+                mask,
+                self.sensor.grid,
+                Path(light[0], self.distance, light[1]),
+                mask_shape=self.method.mask_shape,
+                oversampling=self.method.samples,
+                pixel_integration=True,
+            )
+
+        depths, colours = len(self.object_distances), len(self.wavelengths)
+        away, light = jnp.meshgrid(self.object_distances, self.wavelengths, indexing="ij")
+        found = jax.lax.map(one, jnp.stack([light.ravel(), away.ravel()], axis=-1))
+        found = found.reshape(depths, colours, *self.sensor.shape)
+        return jnp.mean(found, axis=1, keepdims=True) if self.together else found
+
+
+def linear_error(
+    psfs: Float[Array, "*case y x"], setup: Setup, distance: Float[Array, ""]
+) -> Float[Array, "*case"]:
+    r"""Expected error of the best linear image of each PSF, as a part of the scene's variance.
+
+    `bayes_error` at the frequencies of the PSF's DFT: a sensor whose rims meet, so that nothing is
+    cut off. `setup`: noise and prior; its pitch is that of the PSFs. `distance`: mask to sensor.
+    """
+    shape = psfs.shape[-2:]
+    dtype = psfs.dtype
+    v, u = (jnp.asarray(np.fft.fftfreq(n), dtype) / setup.pitch * distance for n in shape)
+    weight = (distance / setup.pitch) ** 2 / (shape[0] * shape[1])
+    prior = setup.prior(v[:, None] ** 2 + u**2, setup.field)
+    density = prior * (setup.contrast**2 / (jnp.sum(prior) * weight))
+
+    def one(h):
+        response = jnp.abs(jnp.fft.fft2(h)) * setup.pitch**2
+        signal = jnp.sum(response**2 * density) * weight
+        noise = setup.noise.variance(response[0, 0], signal, 1.0) * setup.pitch**2
+        # Per area of the sensor the scene's density grows with the distance squared.
+        known = Channels(
+            (response * distance)[None],
+            jnp.full((1, *shape), noise),
+            density,
+            jnp.full(shape, weight),
+        )
+        return bayes_error(known)
+
+    flat = jax.vmap(one)(psfs.reshape(-1, *shape))
+    return flat.reshape(psfs.shape[:-2])
+
+
+def match_objective(mask: PhaseMask, data: Any, key: PRNGKeyArray) -> Float[Array, ""]:
+    """Mean `match_error` over wavelengths and depths. `data`: (MaskSetting, target)."""
+    setting, target = data
+    psfs = setting.psfs(mask).reshape(-1, *setting.sensor.shape)
+    return jnp.mean(jax.vmap(match_error, (0, None))(psfs, target))
+
+
+def linear_objective(mask: PhaseMask, data: Any, key: PRNGKeyArray) -> Float[Array, ""]:
+    """Mean `linear_error` over wavelengths and depths. `data`: (MaskSetting, Setup)."""
+    setting, setup = data
+    return jnp.mean(linear_error(setting.psfs(mask), setup, setting.distance))
+
+
+def restored_objective(mask: PhaseMask, data: Any, key: PRNGKeyArray) -> Float[Array, ""]:
+    """Mean error of restored training images over wavelengths and depths, end to end.
+
+    The best linear estimate by conjugate gradients, crop and noise included
+    (`thincam_jax.design.end_to_end`), with other noise at every key. `data`: (MaskSetting,
+    Training) of one capture; the setting's sensor is the PSF's
+    `kernel_grid(training.sensor.grid, training.field_shape)`.
+    """
+    setting, training = data
+    noise = jax.random.normal(key, training.noise.shape, training.noise.dtype)
+    training = eqx.tree_at(lambda t: t.noise, training, noise)
+    share = jnp.ones((), noise.dtype)
+
+    def one(kernel):
+        camera = Channel(kernel[None], (1.0,), (share,), setting.distance, training)
+        return relative_error(restore_by((camera,), training), training)
+
+    psfs = setting.psfs(mask).reshape(-1, *setting.sensor.shape)
+    return jnp.mean(jnp.stack([one(h) for h in psfs]))
+
+
+class Refined(NamedTuple):
+    """What `refine_mask` found.
+
+    - `mask`: of the last step. `history`: the objective at every step, before it.
+    - `skipped`: steps whose objective or gradient was not finite; they changed nothing.
+    """
+
+    mask: PhaseMask
+    history: Float[Array, " step"]
+    skipped: int
+
+
+def refine_mask(
+    objective: MaskObjective,
+    mask: PhaseMask,
+    limits: HeightLimits,
+    data: Any,
+    *,
+    key: PRNGKeyArray,
+    steps: int = 100,
+) -> Refined:
+    """A mask's heights, changed by Adam so that an objective falls; the limits are kept throughout.
+
+    - `objective`: (mask, data, key) → a number, at module level, such as `match_objective`,
+      `linear_objective` and `restored_objective`.
+    - `mask`: to begin with, such as `mask_of_phase` makes.
+
+    **Validity.** It finds a local minimum. With few levels the last steps may go up and down.
+
+    **Errors**: ValueError for limits and numbers of steps that are out of range.
+    """
+    limits = limits.checked()
+    if steps < 2:
+        raise ValueError(f"steps = {steps}; give at least 2")
+    end, history, skipped = _descend(objective, mask, limits, data, key, steps)
+    return Refined(eqx.tree_at(lambda m: m.height, mask, end), history, int(skipped))
+
+
+@functools.partial(jax.jit, static_argnames=("objective", "limits", "steps"))
+def _descend(objective, mask: PhaseMask, limits: HeightLimits, data, key, steps: int):
+    def heights(u):
+        return limits.nearest(limits.highest * jnp.sin(u) ** 2)
+
+    def loss(u, step_key):
+        value = objective(eqx.tree_at(lambda m: m.height, mask, heights(u)), data, step_key)
+        return value, value
+
+    part = jnp.clip(mask.height / limits.highest, _INNER, 1 - _INNER)
+    rate = jnp.asarray(_RATE, part.dtype)
+    end, history, skipped = adam(loss, jnp.arcsin(jnp.sqrt(part)), key, rate, steps)
+    return heights(end), history, skipped
