@@ -42,6 +42,7 @@ from .lensless.plan import plan as plan
 from .lensless.psf import otf as otf
 from .lensless.psf import psf as psf
 from .lensless.sampling import SamplingWarning as SamplingWarning
+from .lensless.separable_operator import separable_operator as separable_operator
 from .measured.calibration import fit_psf as fit_psf
 from .reconstruction import AdmmTV as AdmmTV
 from .reconstruction import Cameras as Cameras

@@ -63,13 +63,19 @@ class ImagePlane(eqx.Module):
         kept at any ratio of the pitches. A negative magnification turns the image by 180°, as a
         pinhole does (thesis Eq 3.6 with its sign corrected).
         """
+        down, across = self.weights(grid, magnification=magnification)
+        return product(product(down, self.image.astype(down.dtype)), across.T)
+
+    def weights(
+        self, grid: Grid, *, magnification: float | Float[Array, ""] = -1.0
+    ) -> tuple[Float[Array, "y m"], Float[Array, "x n"]]:
+        """What `sample` multiplies the image with, from above and from the right, transposed."""
+        scale = jnp.asarray(magnification, dtype=grid.pitch.dtype)
         rows, columns = self.image.shape[-2:]
-        scale = jnp.abs(jnp.asarray(magnification, dtype=grid.pitch.dtype))
-        down = _cell_average(grid.y, grid.pitch, rows, self.height * scale)
-        across = _cell_average(grid.x, grid.pitch, columns, self.width * scale)
-        image = self.image.astype(down.dtype)
-        turned = jnp.where(jnp.asarray(magnification) < 0, image[..., ::-1, ::-1], image)
-        return product(product(down, turned), across.T)
+        pairs = (grid.y, rows, self.height), (grid.x, columns, self.width)
+        both = [_cell_average(x, grid.pitch, n, size * jnp.abs(scale)) for x, n, size in pairs]
+        down, across = (jnp.where(scale < 0, part[:, ::-1], part) for part in both)
+        return down, across
 
 
 def _cell_average(x, pitch, count: int, width) -> Float[Array, "n count"]:

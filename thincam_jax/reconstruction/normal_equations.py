@@ -1,8 +1,9 @@
 r"""Solving :math:`(\sum_k A_k^T w_k A_k + \mu)\, z = b` by the structure of the operators.
 
-Dense: the Gram matrix once, a Cholesky factorisation for each μ. One separable pair with one
-weight: two small eigendecompositions, once; a `ReducedMatrix` brings its own. All else: conjugate
-gradients (`lineax.CG`).
+Dense: the Gram matrix once, a Cholesky factorisation for each μ. One separable term with one
+weight: its modes, once, or those that it has kept; a `ReducedMatrix` brings its own. All else:
+conjugate gradients (`lineax.CG`), preconditioned for convolutions and for separable cameras of
+several terms or weights.
 
 Factorisations are not differentiated: derivatives follow from the equation itself
 (`jax.lax.custom_linear_solve`), so that equal eigenvalues do no harm.
@@ -29,6 +30,7 @@ from thincam_jax.imaging.operators import (
 )
 from thincam_jax.imaging.operators.crop_convolution import cut, place
 from thincam_jax.imaging.operators.reduced import each_times
+from thincam_jax.imaging.operators.separable import SeparableModes
 from thincam_jax.reconstruction.problem import (
     InverseProblem,
     back_projected,
@@ -56,6 +58,13 @@ class AbstractNormal(eqx.Module):
     def shifted(self, shift: Float[Array, ""]) -> "AbstractNormal":
         """The same with another μ; what does not depend on it is kept."""
 
+    def variance(self) -> Float[Array, "*planes y x"]:
+        """The diagonal of (Σ AᵀwA + μ)⁻¹ in the shape of the operators' images."""
+        raise ValueError(
+            "the variance of each pixel has a closed form for dense matrices, for a ReducedMatrix "
+            "and for one separable term with one weight; this problem is none of those"
+        )
+
     def settled(self) -> "AbstractNormal":
         """The same where μ stays for hundreds of solutions."""
         return self
@@ -79,11 +88,16 @@ def normal_equations(problem: InverseProblem, shift: Float[Array, ""]) -> Abstra
     bare = [_bare(o) for o in fixed.operators]
     if all(same) and all(isinstance(o, Matrix) for o in bare):
         return DenseNormal(problem, shift, _gram(fixed))
-    if len(bare) == 1 and fixed.weights[0].size == 1:
-        if isinstance(bare[0], Separable):
-            return SeparableNormal(problem, shift, *_modes(fixed))
-        if isinstance(bare[0], ReducedMatrix):
-            return ReducedNormal(problem, shift)
+    if len(bare) == 1 and isinstance(bare[0], ReducedMatrix) and fixed.weights[0].size == 1:
+        return ReducedNormal(problem, shift)
+    if len(bare) == 1 and isinstance(bare[0], Separable):
+        modes = bare[0].modes or _with_modes(bare[0]).modes
+        assert modes is not None
+        values = jnp.abs(_gain(fixed.operators[0])) * modes.values
+        weighted = modes._replace(values=jnp.sqrt(jnp.mean(fixed.weights[0])) * values)
+        if bare[0].terms == 1 and fixed.weights[0].size == 1:
+            return SeparableNormal(problem, shift, weighted)
+        return IterativeNormal(problem, shift, weighted)
     return IterativeNormal(problem, shift)
 
 
@@ -106,23 +120,28 @@ class DenseNormal(AbstractNormal):
     def shifted(self, shift):
         return DenseNormal(self.problem, shift, self.gram)
 
+    def variance(self):
+        unit = jnp.eye(self.gram.shape[0], dtype=self.gram.dtype)
+        root = jax.scipy.linalg.solve_triangular(self.factor, unit, lower=True)
+        return jnp.sum(root**2, axis=0).reshape(self.problem.operators[0].in_shape)
+
 
 class SeparableNormal(AbstractNormal):
-    """By the eigenvectors of LᵀL and RᵀR, whose products are those of the whole."""
+    """By the modes of a separable camera, weight and gain included in their values."""
 
     problem: InverseProblem
     shift: Float[Array, ""]
-    rows: Float[Array, "m m"]
-    columns: Float[Array, "n n"]
-    power: Float[Array, "m n"]
+    modes: SeparableModes
 
     def solve(self, right):
-        modes = product(product(self.rows.T, right), self.columns)
-        modes = modes / (self.power + jax.lax.stop_gradient(self.shift))
-        return product(product(self.rows, modes), self.columns.T)
+        return _by_modes(self.modes, jax.lax.stop_gradient(self.shift), right)
 
     def shifted(self, shift):
-        return eqx.tree_at(lambda n: n.shift, self, shift)
+        return SeparableNormal(self.problem, shift, self.modes)
+
+    def variance(self):
+        inverse = 1 / (self.modes.values**2 + self.shift)
+        return product(product(self.modes.rows**2, inverse), (self.modes.columns**2).T)
 
 
 class ReducedNormal(AbstractNormal):
@@ -138,6 +157,10 @@ class ReducedNormal(AbstractNormal):
 
     def shifted(self, shift):
         return ReducedNormal(self.problem, shift)
+
+    def variance(self):
+        bare, power = self._powers()
+        return jnp.sum(bare.vectors**2 / power, axis=1).reshape(bare.in_shape)
 
     def settled(self):
         bare, power = self._powers()
@@ -169,10 +192,14 @@ class InverseNormal(AbstractNormal):
 
 
 class IterativeNormal(AbstractNormal):
-    """By conjugate gradients to `INNER_TOLERANCE`; convolutions are preconditioned."""
+    """By conjugate gradients to `INNER_TOLERANCE`.
+
+    Convolutions are preconditioned, and separable cameras by the `modes` that are given.
+    """
 
     problem: InverseProblem
     shift: Float[Array, ""]
+    modes: SeparableModes | None = None
 
     def solve(self, right):
         return self(right, jnp.zeros_like(right))
@@ -195,9 +222,12 @@ class IterativeNormal(AbstractNormal):
             lambda image: factor * self.applied(image), structure, tags
         )
         options = {"y0": guess / factor}
-        operators = convolutions(self.problem)
+        operators, filtered = convolutions(self.problem), None
         if operators is not None:
             filtered = functools.partial(self._uncropped, operators)
+        elif self.modes is not None:
+            filtered = functools.partial(_by_modes, self.modes, self.shift)
+        if filtered is not None:
             options["preconditioner"] = lineax.FunctionLinearOperator(filtered, structure, tags)
         size = jnp.sqrt(jnp.mean(right**2))
         solver = lineax.CG(
@@ -207,7 +237,7 @@ class IterativeNormal(AbstractNormal):
         return eqx.tree_at(lambda s: s.value, solution, factor * solution.value)
 
     def shifted(self, shift):
-        return IterativeNormal(self.problem, shift)
+        return IterativeNormal(self.problem, shift, self.modes)
 
     def _uncropped(self, operators, image):
         """(Σ w̄|Ĥ|² + μ)⁻¹ on the window, and cut: what the inverse were without the crop.
@@ -262,13 +292,11 @@ def _cholesky(gram, shift):
 
 
 @jax.jit
-def _modes(problem: InverseProblem):
-    """Eigenvectors of LᵀL and RᵀR, and the eigenvalues of the whole, weight included."""
-    (operator,), (weight,) = problem.operators, problem.weights
-    pair = _bare(operator)
-    assert isinstance(pair, Separable)
-    (first, rows), (second, columns) = (
-        jnp.linalg.eigh(product(m.T, m)) for m in (pair.left, pair.right)
-    )
-    power = weight.reshape(()) * _gain(operator) ** 2 * jnp.outer(first, second)
-    return rows, columns, jnp.maximum(power, 0)
+def _with_modes(operator: Separable) -> Separable:
+    return operator.with_modes()
+
+
+def _by_modes(modes: SeparableModes, shift, right):
+    """(AᵀA + μ)⁻¹ of an image in the modes of A."""
+    inside = product(product(modes.rows.T, right), modes.columns) / (modes.values**2 + shift)
+    return product(product(modes.rows, inside), modes.columns.T)

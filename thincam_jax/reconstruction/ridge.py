@@ -16,8 +16,9 @@ Stat. 4, 105, 1975), with the uniform image for a first fit. f̄ is that image.
 """
 
 import functools
+import operator
 import time
-from typing import ClassVar
+from typing import ClassVar, cast
 
 import equinox as eqx
 import jax
@@ -27,8 +28,13 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
+from thincam_jax.imaging.operators import Separable
 from thincam_jax.reconstruction.drive import Outcome, concluded
-from thincam_jax.reconstruction.normal_equations import IterativeNormal, normal_equations
+from thincam_jax.reconstruction.normal_equations import (
+    IterativeNormal,
+    SeparableNormal,
+    normal_equations,
+)
 from thincam_jax.reconstruction.problem import (
     InverseProblem,
     back_projected,
@@ -38,19 +44,23 @@ from thincam_jax.reconstruction.problem import (
     uniform_level,
 )
 from thincam_jax.reconstruction.scaled import ScaledProblem
+from thincam_jax.reconstruction.separable import RULES, Prior, Rule, choose_precision
 from thincam_jax.reconstruction.solver import AbstractSolver, as_synthesis, check_limits
 
 
 class Ridge(AbstractSolver):
     """The posterior mean under a white prior, linear in the captures; it may be negative.
 
-    Dense and separable operators are factorised, all others take conjugate gradients.
+    Dense and separable operators are factorised, all others take conjugate gradients. `deviation`
+    gives the error bars of its pixels.
 
     **Arguments**
 
     - `ridge`: noise variance over image variance, in parts of what the captures' mean brightness
       makes of it. 1 is right for pixels that vary independently by as much as their mean. More
-      draws the image to its mean, less lets more noise into it.
+      draws the image to its mean, less lets more noise into it. "gcv" (generalised
+      cross-validation) and "sure" (Stein's unbiased estimate of the risk, with the noise variance
+      of the recording) find it from the captures of a separable camera of one term.
     - `synthesis`: as of `AdmmTV`.
     - `iterations`: at most. `tolerance`: of the residual of the normal equations and of the last
       step, root mean square, relative to the right-hand side and the image.
@@ -59,20 +69,73 @@ class Ridge(AbstractSolver):
     """
 
     name: ClassVar[str] = "ridge"
-    ridge: float = eqx.field(static=True)
+    ridge: float | Rule = eqx.field(static=True)
+    correlation: tuple[float, ...] = eqx.field(static=True)
     synthesis: np.ndarray | None
     iterations: int = eqx.field(static=True)
     tolerance: float = eqx.field(static=True)
 
     def __init__(
-        self, ridge=1.0, *, synthesis=None, iterations: int = 300, tolerance: float = 1e-4
+        self,
+        ridge=1.0,
+        *,
+        correlation=0.0,
+        synthesis=None,
+        iterations: int = 300,
+        tolerance: float = 1e-4,
     ):
-        self.ridge = float(checks.positive("ridge", ridge, "noise variance / image variance"))
+        if isinstance(ridge, str):
+            self.ridge = cast(Rule, checks.choice("ridge", ridge, RULES))
+        else:
+            self.ridge = float(checks.positive("ridge", ridge, "noise variance / image variance"))
+        lengths = correlation if isinstance(correlation, tuple | list) else (correlation,)
+        self.correlation = tuple(
+            float(checks.non_negative("correlation", one, "pixels")) for one in lengths
+        )
+        if not self.correlation or (len(lengths) > 1 and not isinstance(self.ridge, str)):
+            raise ValueError(
+                f"correlation = {correlation} and ridge = {self.ridge}: give one length, or "
+                'several and ridge="sure" or "gcv", which choose among them'
+            )
         self.synthesis = as_synthesis(synthesis)
         check_limits(iterations, tolerance)
         self.iterations, self.tolerance = iterations, tolerance
 
     def solve(self, recording):
+        problem, white, mean, prior, precision = self._posed(recording)
+        outcome = solve_ridge(
+            white,
+            precision=precision,
+            mean=mean if prior is None else jnp.zeros_like(mean),
+            iterations=self.iterations,
+            tolerance=self.tolerance,
+        )
+        if prior is not None:
+            outcome = outcome._replace(image=mean + prior.image(outcome.image))
+        return recording.reconstruction(problem, outcome, self.name)
+
+    def deviation(self, recording) -> Float[Array, "*plane y x"]:
+        r"""The posterior standard deviation of each pixel, in the scene's unit.
+
+        .. math:: \sigma_i = \Big(\sum_k A_k^T w_k A_k + \rho\Big)^{-1/2}_{ii}
+
+        the same for every capture of this noise. Of all pixels, not of each, 95 % lie within
+        1.96 σ of the truth where the noise variance is right and the image varies as the prior
+        says: choose `ridge` by a rule, and `correlation` for an image that is not white, whose
+        errors a white prior takes for larger than they are. What the camera hardly sees has the
+        deviation of the prior, ρ^(−1/2).
+
+        **Errors**: ValueError for operators without a closed form: convolutions, several terms.
+        """
+        _, white, _, prior, precision = self._posed(recording)
+        scaled = ScaledProblem(white)
+        normal = normal_equations(scaled.problem, precision / scaled.curvature)
+        if prior is not None and isinstance(normal, SeparableNormal):
+            normal = SeparableNormal(normal.problem, normal.shift, prior.modes(normal.modes))
+        return jnp.sqrt(normal.variance() / scaled.curvature)
+
+    def _posed(self, recording):
+        """The problem, the one of what is white in its image, the mean, the prior, and ρ."""
         problem = recording.problem(synthesis=self.synthesis)
         # Sums in which the uniform light cancels do not tell how bright the scene is; the captures
         # do.
@@ -80,14 +143,40 @@ class Ridge(AbstractSolver):
         level = _level(plain)
         level = jnp.where(jnp.isfinite(level), level, 0)  # else the captures say what is wrong
         mean = jnp.maximum(level, 0)[..., None, None, None]
-        outcome = solve_ridge(
-            problem,
-            precision=self.ridge * image_precision(level),
-            mean=jnp.broadcast_to(mean, problem.image_shape),
-            iterations=self.iterations,
-            tolerance=self.tolerance,
+        mean = jnp.broadcast_to(mean, problem.image_shape)
+        given = 1.0 if isinstance(self.ridge, str) else self.ridge * image_precision(level)
+        tried = []
+        for correlation in self.correlation:
+            prior = _prior(problem, correlation)
+            white = problem if prior is None else _whitened(problem, mean, prior)
+            precision, value = given, 0.0
+            if isinstance(self.ridge, str):
+                start = mean if prior is None else jnp.zeros_like(mean)
+                precision, value = choose_precision(white, start, self.ridge)
+            tried.append((float(value), (problem, white, mean, prior, precision)))
+        return min(tried, key=operator.itemgetter(0))[1]
+
+
+def _prior(problem: InverseProblem, correlation: float) -> Prior | None:
+    """None for a white one, which every operator takes."""
+    if correlation == 0:
+        return None
+    first = problem.operators[0]
+    if len(problem.operators) > 1 or not isinstance(first, Separable):
+        raise ValueError(
+            f"correlation = {correlation:g} needs one separable camera; leave it out for a "
+            f"{type(first).__name__}"
         )
-        return recording.reconstruction(problem, outcome, self.name)
+    return Prior.of(first.in_shape, correlation, problem.captures[0].dtype)
+
+
+def _whitened(problem: InverseProblem, mean, prior: Prior) -> InverseProblem:
+    """The problem of z, f = f̄ + L z."""
+    (camera,), captures = problem.operators, [-r for r in residuals(problem, mean)]
+    assert isinstance(camera, Separable)
+    return eqx.tree_at(
+        lambda p: (p.operators, p.captures), problem, ((prior.seen_by(camera),), tuple(captures))
+    )
 
 
 def image_precision(level: Float[Array, "..."]) -> float:

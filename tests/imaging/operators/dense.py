@@ -85,6 +85,7 @@ def operators(dtype=jnp.float64) -> dict[str, AbstractOperator]:
         "planes": CropConvolution(kernel, pitch, OUT, IN, summed=1, window=(11, 9)),
         "matrix": matrix,
         "separable": separable,
+        "terms": Separable(real((3, 6, 3), 10), real((3, 2, 4), 11)),
         "sparse": Sparse(sparse_matrix().astype(dtype), IN, OUT),
         "stacked": stacked,
         "masked": Masked(matrix, valid),

@@ -14,5 +14,8 @@ from thincam_jax.imaging.operators.masked import Scaled as Scaled
 from thincam_jax.imaging.operators.matrix import Matrix as Matrix
 from thincam_jax.imaging.operators.reduced import ReducedMatrix as ReducedMatrix
 from thincam_jax.imaging.operators.separable import Separable as Separable
+from thincam_jax.imaging.operators.separable import Truncated as Truncated
+from thincam_jax.imaging.operators.separable import centred as centred
+from thincam_jax.imaging.operators.separable import orthogonal_terms as orthogonal_terms
 from thincam_jax.imaging.operators.sparse import Sparse as Sparse
 from thincam_jax.imaging.operators.stacked import Stacked as Stacked

@@ -1,0 +1,73 @@
+"""The operator of products of rows and columns: against `capture`, its terms, its gradient."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import thincam_jax as tc
+from helpers import finite_difference, relative_l2
+from thincam_jax.units import nm, um
+
+IMAGE = np.random.default_rng(0).uniform(size=(11, 14))
+LIGHT = tc.Spectrum(np.array([450.0, 620.0]) * nm, np.array([0.3, 0.7]))
+
+
+def camera(beta=40.0, dtype=float):
+    number = lambda x: np.asarray(x, dtype)  # noqa: E731
+    mask = tc.FresnelZoneAperture(
+        beta=jnp.asarray(beta, dtype), width=number(0.8), phase=number(0.4)
+    )
+    sensor = tc.Sensor(shape=(20, 26), pitch=number(40 * um))
+    return tc.LenslessCamera(mask=mask, sensor=sensor, distance=number(3.0))
+
+
+def scene(light=LIGHT):
+    """Of pixels that are no whole number of the sensor's."""
+    return tc.Scene(tc.ImagePlane(IMAGE, distance=200.0, width=49.3), light)
+
+
+def test_it_is_what_the_camera_captures():
+    """In two colours; with few terms it is off by what it says, for white scenes."""
+    found = tc.separable_operator(camera(), scene(), tolerance=1e-9)
+    expected = tc.capture(camera(), scene())
+    assert relative_l2(found.operator(jnp.asarray(IMAGE)), expected) < 1e-8
+    loose = tc.separable_operator(camera(), scene(), tolerance=0.2)
+    assert 1 <= loose.operator.terms < found.operator.terms
+    assert float(loose.error) <= 0.2 < float(loose.errors[loose.operator.terms - 2])
+    white = jnp.asarray(np.random.default_rng(1).normal(size=(300, *IMAGE.shape)))
+    seen = relative_l2(loose.operator(white), found.operator(white))
+    assert seen == pytest.approx(float(loose.error), rel=0.05)
+
+
+def test_single_precision_stays():
+    with jax.enable_x64(False):
+        found = tc.separable_operator(camera(dtype=jnp.float32), scene(550 * nm), tolerance=1e-6)
+        assert found.operator.left.dtype == jnp.float32
+        got = found.operator(jnp.asarray(IMAGE, jnp.float32))
+    expected = tc.capture(camera(), scene(550 * nm))
+    assert relative_l2(got, expected) < 3e-5
+
+
+def test_the_gradient_goes_through():
+    """With all terms: their number cannot follow from traced numbers."""
+
+    def light(beta):
+        found = tc.separable_operator(camera(beta), scene(550 * nm), pixel_integration=False)
+        return jnp.sum(found.operator(jnp.asarray(IMAGE)) ** 2)
+
+    slope = jax.jit(jax.grad(light))(jnp.asarray(40.0))
+    change = finite_difference(light, jnp.asarray(40.0), jnp.asarray(1.0), 1e-2)
+    assert float(slope) == pytest.approx(float(change), rel=2e-3)
+
+
+def test_what_has_no_terms_is_refused():
+    plain = tc.SampledMask(np.eye(4), 0.1)
+    other = tc.LenslessCamera(plain, camera().sensor, 3.0)
+    with pytest.raises(TypeError, match="SampledMask"):
+        tc.separable_operator(other, scene())
+    two = tc.Scene(scene().planes * 2, 550 * nm)
+    with pytest.raises(ValueError, match="the scene has 2 planes; give one"):
+        tc.separable_operator(camera(), two)
+    with pytest.raises(TypeError, match="scene is a ndarray; give"):
+        tc.separable_operator(camera(), IMAGE)

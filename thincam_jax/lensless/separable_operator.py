@@ -1,0 +1,107 @@
+"""A lensless camera as a short sum of products of its rows and columns: FlatCam, exactly."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from thincam_jax._core import checks
+from thincam_jax._core.checks import Number
+from thincam_jax._core.grids import Grid
+from thincam_jax._core.precision import precision_of, product
+from thincam_jax.imaging.operators import Separable, Truncated, kernel_grid, orthogonal_terms
+from thincam_jax.imaging.scene import Scene
+from thincam_jax.lensless.camera import LenslessCamera
+from thincam_jax.lensless.forward import projected_shape
+from thincam_jax.lensless.method import Model
+from thincam_jax.lensless.propagation.separable import pixel_nodes
+from thincam_jax.lensless.psf import closed_terms
+
+# Terms below this part of all are those of other terms again: rounding.
+_REDUNDANT = {"float32": 1e-6, "float64": 1e-12}
+
+
+def separable_operator(
+    camera: LenslessCamera,
+    scene: Any,
+    *,
+    tolerance: Number = 1e-2,
+    model: Model = "separable",
+    pixel_integration: bool = True,
+) -> Truncated:
+    r"""The operator from the image of a scene, upright, to its noise-free capture.
+
+    A PSF that is a sum of products, :math:`h = \sum_f Y_f(y)\,X_f(x)`, as that of every mask of
+    few products is with its diffraction, gives
+
+    .. math:: G = \sum_k P_k F Q_k^T,\qquad P_k = \Delta\, T[Y_k]\, B_y,\quad
+        Q_k = \Delta\, T[X_k]\, B_x
+
+    with the Toeplitz matrices T of the factors, cropped to the sensor, and the averages B of the
+    image's pixels, projected by d/t, over cells of the sensor's pitch Δ. It is what `capture` does
+    for one plane. The terms of all wavelengths are brought to the fewest orthogonal ones.
+
+    **Arguments**
+
+    - `scene`: one plane, for the numbers of its image's pixels, its width and distance, and the
+      light. The image itself plays no part.
+    - `tolerance`: what may be missed of captures of white scenes, relative Frobenius norm. The
+      uniform light is part of them: `operator.centred().truncated(…)` counts what is left without.
+      Inside jit and grad, where their number cannot follow from it, all terms are kept.
+    - `model`, `pixel_integration`: of the PSF, see `thincam_jax.psf`: one with separable terms.
+
+    **Returns** the operator, its error, and the errors of fewer terms.
+
+    **Errors**: TypeError for a mask without separable terms; ValueError for several planes.
+    """
+    if not isinstance(scene, Scene):
+        raise TypeError(
+            f"scene is a {type(scene).__name__}; give thincam_jax.Scene(ImagePlane(image, "
+            "distance=…, width=…), wavelength)"
+        )
+    if len(scene.planes) != 1:
+        raise ValueError(
+            f"the scene has {len(scene.planes)} planes; give one, an operator for each"
+        )
+    (plane,) = scene.planes
+    field = projected_shape(camera, plane)
+    grid, fine = camera.sensor.grid, Grid(field, camera.sensor.pitch)
+    rows, columns = _factors(camera, scene, kernel_grid(grid, field), model, pixel_integration)
+    down, across = plane.weights(fine, magnification=-camera.distance / plane.distance)
+    left, right = (
+        grid.pitch * product(_toeplitz(factors, size), weights.astype(factors.dtype))
+        for factors, size, weights in ((rows, field[0], down), (columns, field[1], across))
+    )
+    operator = Separable(left, right)
+    if checks.is_traced(left):
+        none = jnp.zeros((), left.dtype)
+        return Truncated(operator, none, none[None])
+    return operator.truncated(tolerance)
+
+
+def _factors(camera, scene: Scene, grid: Grid, model: Model, pixel_integration: bool):
+    """Σ_f Y_f X_f = h, the weighted sum over the light."""
+    (plane,), light = scene.planes, scene.spectrum
+    rows, columns = [], []
+    for wavelength, weight in zip(light.wavelengths, light.weights, strict=True):
+        path = camera.path(wavelength, plane.distance)
+        nodes = pixel_nodes(camera.mask, grid, path, precision_of(grid.pitch))
+        terms = closed_terms(camera.mask, grid, path, model, pixel_integration, nodes)
+        y, x = terms.real_factors()
+        rows.append(weight.astype(y.dtype) * y)
+        columns.append(x)
+    down, across = jnp.concatenate(rows), jnp.concatenate(columns)
+    if checks.is_traced(down) or checks.is_traced(across):
+        return down, across
+    down, across, errors = orthogonal_terms(down, across)
+    count = 1 + int(np.sum(np.asarray(errors) > _REDUNDANT[str(down.dtype)]))
+    return down[:count], across[:count]
+
+
+@jax.jit(static_argnames="size")
+def _toeplitz(factors: Float[Array, "k l"], size: int) -> Float[Array, "k y m"]:
+    """T_ym = factor(y − m) of `size` samples of the field."""
+    pixels = jnp.arange(factors.shape[1] - size + 1)
+    return factors[:, pixels[:, None] - jnp.arange(size) + size - 1]
