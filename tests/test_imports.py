@@ -50,7 +50,7 @@ def test_names_wait_for_no_library_of_analysis_or_plots(name):
     ["--help", "--version", "run --help", "bench accuracy --help", "calibrate check --help"]
     + [
         f"{command} --help"
-        for command in ("reconstruct", "sweep", "design", "doctor", "init", "capture")
+        for command in ("reconstruct", "sweep", "design", "doctor", "init", "capture", "train")
     ],
 )
 def test_help_of_a_command_waits_for_nothing(typed):

@@ -13,6 +13,7 @@ from thincam_jax.commands.capture.config import CaptureConfig
 from thincam_jax.commands.checked_config import load_as
 from thincam_jax.commands.design.config import load_design
 from thincam_jax.commands.kinds import load_experiment
+from thincam_jax.commands.learned.config import load_learned
 
 FILES = sorted((ROOT / "configs").glob("*.yaml"))
 
@@ -23,7 +24,11 @@ def test_a_file_that_its_command_takes(kind, tmp_path, monkeypatch):
     result = call("init", kind)
     assert result.exit_code == 0, result.output
     command = examples.next_command(kind)
-    takes = {"design": load_design, "capture": partial(load_as, CaptureConfig)}
+    takes = {
+        "design": load_design,
+        "capture": partial(load_as, CaptureConfig),
+        "train": load_learned,
+    }
     assert result.stdout == f"{kind}.yaml; next: thincam {command} {kind}.yaml\n"
     takes.get(command, load_experiment)(tmp_path / f"{kind}.yaml")
 
@@ -46,7 +51,7 @@ def test_nothing_is_overwritten(tmp_path):
 
 def test_unknown_kind_and_missing_folder(tmp_path):
     line = one_line(call("init", "camera"))
-    named = "study, refocus, design, capture, design_both, "
+    named = "study, refocus, design, capture, learned, design_both, "
     assert line.startswith(f"init camera: choose one of {named}")
     assert "cannot be written (No such file" in one_line(
         call("init", "study", "--out", tmp_path / "no" / "study.yaml")
@@ -61,4 +66,4 @@ def test_the_wheel_holds_them_where_they_are_looked_for(tmp_path, monkeypatch):
     (tmp_path / place / "camera.yaml").write_text("")
     module = Path(examples.__file__).relative_to(ROOT)
     monkeypatch.setattr(examples, "__file__", str(tmp_path / module))
-    assert examples.kinds() == ["study", "refocus", "design", "capture", "camera"]
+    assert examples.kinds() == ["study", "refocus", "design", "capture", "learned", "camera"]

@@ -14,6 +14,7 @@ from thincam_jax.commands.capture.command import capture, known_drivers
 from thincam_jax.commands.design.command import design
 from thincam_jax.commands.examples import init
 from thincam_jax.commands.help import Grouped, InOrder, examples_text
+from thincam_jax.commands.learned.command import train
 from thincam_jax.commands.photo.command import check, reconstruct
 from thincam_jax.commands.start import main
 from thincam_jax.commands.study.command import run
@@ -47,6 +48,9 @@ app.command(
 app.command(
     epilog=examples_text("thincam design design.yaml", "thincam design design.yaml --out found"),
 )(design)
+app.command(
+    epilog=examples_text("thincam train learned.yaml", "thincam train learned.yaml --resume"),
+)(train)
 app.command(
     epilog=examples_text(
         "thincam capture rig_virtual.yaml", "thincam capture rig.yaml --out frames.zarr --resume"

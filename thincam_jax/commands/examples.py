@@ -13,6 +13,7 @@ _FILE_OF = {
     "refocus": "fza_refocus",
     "design": "design_distances",
     "capture": "rig_virtual",
+    "learned": "learned_refocus",
 }
 
 
@@ -52,5 +53,5 @@ def init(
 
 def next_command(kind: str) -> str:
     """What takes a file of that name."""
-    commands = {"design": "design", "capture": "capture", "rig": "capture"}
+    commands = {"design": "design", "capture": "capture", "rig": "capture", "learned": "train"}
     return commands.get(kind.partition("_")[0], "run")

@@ -7,7 +7,10 @@ from typing import Any
 
 from typer.core import TyperCommand, TyperGroup
 
-ORDER = ("init", "run", "capture", "reconstruct", "calibrate", "sweep", "design", "bench", "doctor")
+ORDER = (
+    *("init", "run", "capture", "reconstruct", "calibrate", "sweep", "design", "train", "bench"),
+    "doctor",
+)
 # Of `thincam reconstruct`; what is in none stands first.
 GROUPS = {
     "Calibration": (

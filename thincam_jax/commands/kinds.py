@@ -20,6 +20,8 @@ def load_experiment(path: str | Path, overrides: tuple[str, ...] = ()) -> Experi
         raise ConfigError(f"{path}: kind: is a design; give it to 'thincam design'")
     if kind == "capture":
         raise ConfigError(f"{path}: kind: is a capture; give it to 'thincam capture'")
+    if kind == "learned":
+        raise ConfigError(f"{path}: kind: is a network; give it to 'thincam train'")
     if kind == "refocus":
         return load_as(RefocusConfig, path, overrides, "objects")
     if kind == "screen":

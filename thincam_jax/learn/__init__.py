@@ -1,5 +1,13 @@
-"""Learned parts: unrolled solvers and suggestions of designs."""
+"""Learned parts: unrolled solvers, refocusing networks and suggestions of designs."""
 
+from thincam_jax.learn.refocusing.cameras import RefocusCamera as RefocusCamera
+from thincam_jax.learn.refocusing.network import NetworkOptions as NetworkOptions
+from thincam_jax.learn.refocusing.network import RefocusNetwork as RefocusNetwork
+from thincam_jax.learn.refocusing.store import load as load
+from thincam_jax.learn.refocusing.store import save as save
+from thincam_jax.learn.refocusing.train import Lessons as Lessons
+from thincam_jax.learn.refocusing.train import train as train
+from thincam_jax.learn.refocusing.use import Learned as Learned
 from thincam_jax.learn.suggester_training import train_suggester as train_suggester
 from thincam_jax.learn.suggestions import Suggester as Suggester
 from thincam_jax.learn.suggestions import Suggestion as Suggestion
@@ -7,4 +15,5 @@ from thincam_jax.learn.suggestions import load_suggester as load_suggester
 from thincam_jax.learn.suggestions import propose as propose
 from thincam_jax.learn.suggestions import save_suggester as save_suggester
 from thincam_jax.learn.suggestions import suggest as suggest
+from thincam_jax.learn.training import TrainingOptions as TrainingOptions
 from thincam_jax.learn.unrolled import UnrolledAdmm as UnrolledAdmm

@@ -81,13 +81,13 @@ class Task(NamedTuple):
     - `loss`: (model, examples) → a number and a dictionary of its parts, for `grad`, at module
       level; it is compiled once.
     - `validation`: examples whose mean loss judges the model.
-    - `learned`: whether a leaf of the model is trained; by default all floating arrays are.
+    - `learned`: what of the model is trained, as of `equinox.filter`; by default floating arrays.
     """
 
     draw: Callable[[Any], Any]
     loss: Callable[[Any, Any], tuple[Any, dict[str, Any]]]
     validation: Sequence[Any] = ()
-    learned: Callable[[Any], Any] = eqx.is_inexact_array
+    learned: Any = eqx.is_inexact_array
 
 
 class TrainingState(eqx.Module):
@@ -112,7 +112,10 @@ class TrainingState(eqx.Module):
     @classmethod
     def begin(cls, model: Any, task: Task, options: TrainingOptions) -> "TrainingState":
         """Before the first step."""
-        weights = eqx.filter(model, task.learned)
+        # A plain number's weak type would be compiled for once more: steps return none.
+        weights = jax.tree.map(
+            lambda x: jax.lax.convert_element_type(x, x.dtype), eqx.filter(model, task.learned)
+        )
         checked = -(-options.steps // options.check_every)
         losses, scores = (np.full(n, np.nan) for n in (options.steps, checked))
         first = adam_method(options.longest_slope).init(weights)

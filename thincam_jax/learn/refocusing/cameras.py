@@ -103,6 +103,20 @@ class RefocusCamera(eqx.Module):
         pitch = self.camera.sensor.pitch
         return self.pupil * self.camera.distance / (2 * pitch) * jnp.abs(inverse_difference)
 
+    def within(self, distances) -> Float[Array, "..."]:
+        """Distances t, mm, that a network is trained for; ValueError for one outside."""
+        distances = jnp.asarray(distances, self.near.dtype)
+        if checks.is_traced(distances) or checks.is_traced(self.near):
+            return distances
+        near, far = float(self.near), float(self.far)
+        for distance in distances.ravel().tolist():
+            if not near * (1 - 1e-6) <= distance <= far * (1 + 1e-6):
+                raise ValueError(
+                    f"distance = {distance:g} mm lies outside of what the network was trained for, "
+                    f"{near:g} to {far:g} mm; give one within, or train one for it"
+                )
+        return distances
+
     def operator(self, distances: Float[Array, " plane"]) -> CropConvolution:
         """The noise-free capture of planes (plane, y, x) at these distances, mm, summed.
 

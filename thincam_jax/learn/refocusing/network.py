@@ -131,11 +131,11 @@ class RefocusNetwork(eqx.Module):
 
     def focus(self, captures, distance, deviation) -> Float[Array, "*batch y x"]:
         """Images as a lens of the camera's pupil, focused on `distance` (mm), would see them."""
-        return _batched(_focus, self, captures, deviation, jnp.asarray(distance))
+        return _batched(_focus, self, captures, deviation, self.camera.within(distance))
 
     def sweep(self, captures, distances, deviation) -> Float[Array, "distance *batch y x"]:
         """`focus` at each of `distances`; the captures are explained once."""
-        distances = jnp.asarray(distances)
+        distances = self.camera.within(distances)
         images = _batched(_sweep, self, captures, deviation, distances)
         return jnp.moveaxis(images, -3, 0)
 
@@ -145,7 +145,7 @@ class RefocusNetwork(eqx.Module):
 
     def distance(self, captures, deviation) -> DistanceMap:
         """The distance of what each pixel shows."""
-        return _batched(_distance, self, captures, deviation)
+        return _batched(distance_map, self, captures, deviation)
 
     def consistency(self, captures, deviation) -> Float[Array, "*batch"]:
         """Residual of the explained capture, root mean square, over the noise's deviation.
@@ -153,7 +153,7 @@ class RefocusNetwork(eqx.Module):
         About 1: the stack explains all that was seen but noise. Far more: the image is not of this
         capture. Far less: noise was explained, too.
         """
-        return _batched(_consistency, self, captures, deviation)
+        return _batched(consistency_of, self, captures, deviation)
 
 
 def explain(
@@ -275,8 +275,8 @@ def _constant(like, *values) -> Float[Array, "value y x"]:
     return jnp.stack([jnp.broadcast_to(jnp.asarray(v, like.dtype), shape) for v in values])
 
 
-def _batched(function, network: RefocusNetwork, captures, deviation, *distance):
-    """A function of one capture over all axes before the last two."""
+def flattened(network: RefocusNetwork, captures, deviation):
+    """Captures (element, y, x), the deviation of each, and the batch axes that they had."""
     captures = jnp.asarray(captures, network.planes.dtype)
     sensor = network.camera.camera.sensor.shape
     if captures.shape[-2:] != sensor:
@@ -285,7 +285,12 @@ def _batched(function, network: RefocusNetwork, captures, deviation, *distance):
         )
     batch = captures.shape[:-2]
     deviation = jnp.broadcast_to(jnp.asarray(deviation, captures.dtype), batch)
-    flat = captures.reshape(-1, *sensor), deviation.reshape(-1)
+    return captures.reshape(-1, *sensor), deviation.reshape(-1), batch
+
+
+def _batched(function, network: RefocusNetwork, captures, deviation, *distance):
+    """A function of one capture over all axes before the last two."""
+    *flat, batch = flattened(network, captures, deviation)
     out = _over_batch(function, network, *flat, *distance)
     return jax.tree.map(lambda x: x.reshape(*batch, *x.shape[1:]), out)
 
@@ -311,13 +316,16 @@ def _all_in_focus(network, explained):
     return explained.mean * mapped(network, explained).all_in_focus
 
 
-def _distance(network, explained):
+def distance_map(network: RefocusNetwork, explained: Explained) -> DistanceMap:
+    """Of one capture."""
     maps = mapped(network, explained)
     # Of a Laplace distribution with that mean absolute error.
     confidence = -jnp.expm1(-0.5 / maps.spread)
     return DistanceMap(1 / inverse_distance(network, maps), confidence)
 
 
-def _consistency(network, explained):
+def consistency_of(network: RefocusNetwork, explained: Explained) -> Float[Array, ""]:
+    """Of one capture."""
+    del network
     rms = jnp.sqrt(jnp.mean(explained.residual**2))
     return rms / jnp.where(explained.deviation > 0, explained.deviation, 1)

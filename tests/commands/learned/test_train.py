@@ -1,0 +1,103 @@
+"""The command `thincam train`: a training in its folder, gone on with, and what it refuses."""
+
+import json
+
+import pytest
+from learn import tiny_network as tiny
+from typer.testing import CliRunner
+
+from helpers import ROOT
+from thincam_jax.commands import cli
+from thincam_jax.commands.config_file import ConfigError
+from thincam_jax.commands.learned.build import build_camera, build_lessons
+from thincam_jax.commands.learned.config import load_learned
+from thincam_jax.learn.refocusing.store import described, load
+from thincam_jax.learn.refocusing.train import NETWORK
+
+FILE = """
+name: tiny
+kind: learned
+wavelength: 500 nm
+sensor: {shape: [16, 18], pitch: 44 um}
+mask: {beta: 13 rad/mm^2, width: 0.7 mm}
+distance: 7.5 mm
+focus: {nearest: 50 mm, farthest: 200 mm, shape: [14, 12], planes: 2}
+sources:
+  - {name: leaves, kind: drawn, count: 4}
+scenes: {side: 24}
+network: {steps: 1, widths: [4, 4], head_widths: [4, 4], reach: 1}
+training: {steps: 4, batch: 2, judged: 1, warm_up: 1, check_every: 2}
+"""
+
+
+def call(*arguments):
+    return CliRunner().invoke(cli.app, ["train", *(str(a) for a in arguments)])
+
+
+@pytest.fixture
+def file(tmp_path):
+    path = tmp_path / "tiny.yaml"
+    path.write_text(FILE)
+    return path
+
+
+def line(result):
+    assert result.exit_code == 2, result.output
+    (only,) = result.stderr.splitlines()
+    return only.removeprefix("thincam: ")
+
+
+def test_a_training_is_told_and_gone_on_with(file, tmp_path):
+    out = tmp_path / "out"
+    assert "--resume: " in line(call(file, "--out", out, "--resume"))
+    done = call(file, "--out", out)
+    assert done.exit_code == 0, done.output
+    assert "finished: focused images" in done.stdout and str(out / NETWORK) in done.stdout
+    result = json.loads((out / "training.json").read_text())
+    assert result["steps"] == 4 and len(result["losses"]) == 4 and result["skipped"] == 0
+    assert result["trained"]["focus_psnr_db"] > 0 and result["linear"]["consistency"] > 0
+    page = (out / "report.html").read_text()
+    assert "drawn" in page and page.count("data:image/") == 4
+    assert load(out / NETWORK, tiny.camera()).camera.planes == 2
+    # The folder of a training is not begun anew by accident; what is finished stays as it is.
+    assert "give --resume to go on with it" in line(call(file, "--out", out))
+    before = (out / NETWORK).read_bytes()
+    again = call(file, "--out", out, "--resume")
+    assert again.exit_code == 0 and (out / NETWORK).read_bytes() == before
+    other = line(call(file, "--out", out, "--resume", "--set", "training.rate=0.5"))
+    assert "holds a training of another configuration" in other
+    state = out / "training.state"
+    state.write_bytes(state.read_bytes()[:-1])
+    assert "is damaged or cut off" in line(call(file, "--out", out, "--resume"))
+
+
+def test_the_file_makes_the_camera(file):
+    config = load_learned(file)
+    assert described(build_camera(config)) == described(tiny.network().camera)
+
+
+@pytest.mark.parametrize(
+    ("changed", "told"),
+    [
+        ("focus.nearest=300mm", "nearest is not below farthest"),
+        ("sources.0.use=judge", "none of them is of use 'train'"),
+        ("sources.0.path=there", "kind drawn takes no 'path'"),
+        ("sources.0.kind=folder", "kind folder needs 'path'"),
+        ("network.depth=3", "unknown key; allowed here: steps, widths"),
+    ],
+)
+def test_a_fault_of_the_file_is_told(changed, told, file):
+    with pytest.raises(ConfigError, match=told):
+        load_learned(file, (changed,))
+
+
+def test_a_folder_that_is_not_there_is_told(file):
+    source = "sources.0={name: mine, kind: folder, path: nowhere}"
+    config = load_learned(file, (source,))
+    with pytest.raises(ConfigError, match=r"sources\[0\]: .*nowhere' is no folder"):
+        build_lessons(config)
+
+
+def test_the_shipped_file_is_whole():
+    config = load_learned(ROOT / "configs" / "learned_refocus.yaml")
+    assert build_camera(config).planes == 7

@@ -1,0 +1,158 @@
+"""Networks in files and in use: trained, gone on with, loaded for their camera and no other."""
+
+import dataclasses
+import re
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from learn import tiny_network as tiny
+
+import thincam_jax as tc
+from thincam_jax.learn.checkpoint import CheckpointError, write_arrays
+from thincam_jax.learn.refocusing.store import load, network_description, save
+from thincam_jax.learn.refocusing.train import NETWORK, STATE, train
+from thincam_jax.learn.refocusing.use import Learned, doubt
+from thincam_jax.units import nm
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """Two halves of a training in its folder, and the whole."""
+    folder = tmp_path_factory.mktemp("training")
+    given = tiny.network(), tiny.lessons(), tiny.TRAINING
+    whole = train(*given)
+    train(*given, folder=folder, callback=lambda progress: progress.step == 3)
+    return folder, train(*given, folder=folder), whole
+
+
+def test_training_goes_on_to_the_same_bits(trained):
+    folder, resumed, whole = trained
+    assert resumed.status == "finished" and whole.state.skipped == 0
+    assert eqx.tree_equal(resumed.state, whole.state)
+    assert not eqx.tree_equal(whole.model.weights, tiny.network().weights)
+    assert eqx.tree_equal(whole.model.planes, tiny.network().planes)
+    # As often as nothing is left to be done.
+    again = train(tiny.network(), tiny.lessons(), tiny.TRAINING, folder=folder)
+    assert eqx.tree_equal(again.state, whole.state)
+
+
+def test_a_state_belongs_to_its_training(trained):
+    folder, *_ = trained
+    other = dataclasses.replace(tiny.TRAINING, rate=1.0)
+    with pytest.raises(CheckpointError, match=r"whose training\.rate was 0\.003 and is 1\.0 here"):
+        train(tiny.network(), tiny.lessons(), other, folder=folder)
+
+
+def test_a_network_comes_back_for_its_camera(trained):
+    folder, _, whole = trained
+    told = network_description(folder / NETWORK)["training"]
+    assert told["steps"] == 4 and len(told["scores"]) == 2
+    (entry,) = told["images"]["trained on"]
+    assert entry["licence"] == "drawn" and re.fullmatch("[0-9a-f]{64}", entry["sha256"])
+    # Whatever its sensor makes of the light; as all it was trained for; or with its light.
+    seen = tc.Cameras([tiny.camera()], wavelength=500 * nm, object_distance=80.0)
+    for given in (tiny.camera(exposure=0.5), whole.model.camera, seen):
+        found = load(folder / NETWORK, given)
+        assert eqx.tree_equal(found.weights, whole.model.weights)
+    assert found.planes.spectra.shape == whole.model.planes.spectra.shape
+
+
+def test_another_camera_is_refused_with_both_numbers(trained):
+    file = trained[0] / NETWORK
+    with pytest.raises(CheckpointError, match=r"camera\.mask\.beta was 13\.0 and is 13\.1 here"):
+        load(file, tiny.camera(beta=13.1))
+    seen = tc.Cameras([tiny.camera()], wavelength=600 * nm)
+    with pytest.raises(CheckpointError, match=r"wavelengths\.0 was 0\.0005 and is 0\.0006 here"):
+        load(file, seen)
+    with pytest.raises(CheckpointError, match="takes one capture, not 2"):
+        load(file, tc.Cameras([tiny.camera()] * 2))
+
+
+def test_a_file_that_holds_something_else_is_told(trained, tmp_path):
+    folder, *_ = trained
+    with pytest.raises(CheckpointError, match="holds no refocusing network"):
+        load(folder / STATE, tiny.camera())
+    other = save(tmp_path / "other", tiny.network())
+    known = network_description(other)
+    known["camera"].pop("light")
+    known["kind"] = "refocusing network"
+    write_arrays(other, tiny.network().weights, known)
+    with pytest.raises(CheckpointError, match="tells no whole camera"):
+        load(other, tiny.camera())
+    known = network_description(folder / NETWORK)
+    known["options"]["wings"] = 2
+    write_arrays(other, tiny.network().weights, known)
+    with pytest.raises(CheckpointError, match="holds options of another version"):
+        load(other, tiny.camera())
+
+
+def recording(distance: object = 80.0, **more):
+    capture = tiny.network().planes.uniform * (1 + 0.1 * np.arange(18) / 18)
+    cameras = tc.Cameras([tiny.camera()], wavelength=500 * nm, object_distance=distance)
+    return tc.Recording([capture], cameras, noise_variance=1e-4, **more)
+
+
+def test_it_is_a_solver(trained):
+    network = trained[2].model
+    found = tc.reconstruct(recording(), Learned(network))
+    assert found.method == "learned" and found.status == "ok"
+    assert found.image.shape == found.confidence.shape == (14, 12)
+    assert float(found.pitch) == pytest.approx(0.044 * 80 / 7.5)
+    assert found.consistency.shape == ()
+    sharp = tc.reconstruct(recording(None), Learned(network, "all_in_focus"))
+    assert sharp.image.shape == (14, 12) and sharp.pitch is None
+
+
+@pytest.mark.thorough
+def test_several_distances_are_planes_and_all_is_as_the_network_says(trained):
+    network, capture = trained[2].model, recording().captures[0]
+    planes = tc.reconstruct(recording([80.0, 150.0]), Learned(network))
+    assert planes.has_planes and planes.image.shape == (2, 14, 12)
+    image = network.focus(capture, 80.0, 1e-2)
+    np.testing.assert_allclose(planes.image[0], image[::-1, ::-1], rtol=1e-5, atol=1e-7)
+    assert float(planes.consistency) == pytest.approx(float(network.consistency(capture, 1e-2)))
+
+
+def test_what_it_cannot_do_is_told_in_a_line(trained):
+    network = trained[2].model
+    for distance in (49.0, [80.0, 201.0]):
+        with pytest.raises(ValueError, match=r"distance = (49|201) mm lies .* 50 to 200"):
+            tc.reconstruct(recording(distance), Learned(network))
+    with pytest.raises(ValueError, match="distance = 49 mm lies outside"):
+        network.focus(recording().captures[0], 49.0, 0.01)
+    with pytest.raises(ValueError, match=r"captures have shape \(18, 16\)"):
+        network.focus(jnp.ones((18, 16)), 80.0, 0.01)
+    with pytest.raises(ValueError, match="takes every pixel of a capture"):
+        valid = jnp.ones((16, 18), bool).at[3, 4].set(False)
+        tc.reconstruct(recording(valid=valid), Learned(network))
+    with pytest.raises(ValueError, match=r"give a recording by tc\.Cameras"):
+        psfs = tc.Psfs(np.ones((1, 5, 5)))
+        tc.reconstruct(tc.Recording(np.ones((1, 16, 18)), psfs), Learned(network))
+
+
+def test_what_does_not_explain_its_capture_is_doubted():
+    assert doubt(1.1) == "" and "misses the capture by 3.0 times the noise" in doubt(3.0)
+
+
+@pytest.mark.thorough
+def test_a_short_training_beats_the_linear_start():
+    """32×32 pixels, in under a minute on two cores."""
+    from thincam_jax.learn.refocusing.cameras import RefocusCamera
+    from thincam_jax.learn.refocusing.network import NetworkOptions, RefocusNetwork
+    from thincam_jax.learn.refocusing.sources import drawn
+    from thincam_jax.learn.refocusing.train import Lessons
+    from thincam_jax.learn.training import TrainingOptions
+    from thincam_jax.units import um
+
+    aperture = tc.FresnelZoneAperture(13.0, width=1.4)
+    camera = tc.LenslessCamera(aperture, tc.Sensor((32, 32), 44 * um), 7.5)
+    whole = RefocusCamera(camera, 500 * nm, field_shape=(24, 24), near=50.0, far=200.0, planes=3)
+    options = NetworkOptions(steps=2, widths=(8, 12), head_widths=(8, 12), reach=1)
+    network = RefocusNetwork.create(whole, options, key=jax.random.key(1))
+    training = TrainingOptions(steps=150, rate=4e-3, warm_up=10, check_every=50)
+    state = train(network, Lessons(drawn(0, 32, 48), batch=4, judged=2), training).state
+    # 0.115 is 1 dB.
+    assert state.scores[-1] < state.scores[0] - 0.03 and np.isfinite(state.losses).all()

@@ -1,0 +1,81 @@
+"""From an experiment file of `kind: learned` to its camera, network and lessons."""
+
+import functools
+import operator
+
+import jax
+
+from thincam_jax.commands.config_file import ConfigError
+from thincam_jax.commands.learned.config import LearnedConfig, SourceConfig
+from thincam_jax.imaging.sensor import Sensor
+from thincam_jax.learn.refocusing.cameras import RefocusCamera
+from thincam_jax.learn.refocusing.network import NetworkOptions, RefocusNetwork
+from thincam_jax.learn.refocusing.scenes import SceneOptions
+from thincam_jax.learn.refocusing.sources import Source, drawn, photographs, samples
+from thincam_jax.learn.refocusing.train import Lessons
+from thincam_jax.learn.training import TrainingOptions
+from thincam_jax.lensless.camera import LenslessCamera
+from thincam_jax.lensless.masks.fza import FresnelZoneAperture
+
+
+def build_camera(config: LearnedConfig) -> RefocusCamera:
+    """**Errors**: ConfigError, one line, for numbers that do not make a camera."""
+    mask = {name: value for name, value in dict(config.mask).items() if name != "beta"}
+    focus = config.focus
+    try:
+        aperture = FresnelZoneAperture(config.mask.beta, **mask)
+        camera = LenslessCamera(aperture, Sensor(**dict(config.sensor)), config.distance)
+        return RefocusCamera(
+            camera,
+            config.wavelength,
+            field_shape=focus.shape,
+            near=focus.nearest,
+            far=focus.farthest,
+            planes=focus.planes,
+            pupil=focus.pupil,
+            model=config.model,
+        )
+    except (ValueError, TypeError) as error:
+        raise ConfigError(f"mask, sensor or focus: {error}") from None
+
+
+def build_network(config: LearnedConfig) -> RefocusNetwork:
+    """Untrained, by the seed of the file."""
+    options = NetworkOptions(**dict(config.network))
+    return RefocusNetwork.create(build_camera(config), options, key=jax.random.key(config.seed))
+
+
+def build_lessons(config: LearnedConfig) -> Lessons:
+    """**Errors**: ConfigError, one line for each source that cannot be read."""
+    faults: list[str] = []
+    of_use: dict[str, list[Source]] = {"train": [], "judge": []}
+    for number, source in enumerate(config.sources):
+        try:
+            of_use[source.use].append(_read(source, config.scenes.side))
+        except (ValueError, OSError) as error:
+            place = config.place_of("sources", number)
+            faults.append(f"{place}sources[{number}]: {error}")
+    if faults:
+        raise ConfigError("\n".join(faults))
+    train, judge = (functools.reduce(operator.add, s) if s else None for s in of_use.values())
+    assert train is not None  # the sections are checked
+    scenes = {name: value for name, value in dict(config.scenes).items() if name != "side"}
+    training = config.training
+    return Lessons(train, SceneOptions(**scenes), training.batch, training.judged, judge)
+
+
+def build_options(config: LearnedConfig) -> TrainingOptions:
+    """How long and how fast."""
+    names = ("steps", "rate", "warm_up", "averaging", "check_every")
+    settings = {name: getattr(config.training, name) for name in names}
+    return TrainingOptions(seed=config.seed, **settings)
+
+
+def _read(source: SourceConfig, side: int) -> Source:
+    if source.kind == "drawn":
+        assert source.count is not None  # the section is checked
+        return drawn(source.seed, source.count, side)
+    if source.kind == "samples":
+        return samples(side)
+    assert source.path is not None
+    return photographs(source.path, side, licence=source.licence)

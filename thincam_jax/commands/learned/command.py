@@ -1,0 +1,51 @@
+"""The command `thincam train`."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from thincam_jax.commands.terminal import Overrides, progress_bar, told
+
+if TYPE_CHECKING:
+    from thincam_jax.learn.training import TrainingProgress
+
+
+def train(
+    config: Annotated[Path, typer.Argument(help="Experiment file (YAML) of kind learned.")],
+    out: Annotated[
+        Path | None, typer.Option(help="Folder of the results; default runs/NAME of the network.")
+    ] = None,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on with the training that the folder holds.")
+    ] = False,
+    set_: Overrides = None,
+) -> None:
+    """Train a network that refocuses the captures of a camera.
+
+    Writes network.thincam, figures, training.json and report.html. Ctrl-C, or a power cut, loses
+    what was done since the last check; --resume goes on from there, to the same numbers.
+    """
+    goes_on = "interrupted; what the last check has written is kept: --resume goes on from there"
+    with told(lambda: goes_on):
+        from thincam_jax.commands.config_file import slug
+        from thincam_jax.commands.learned.config import load_learned
+        from thincam_jax.commands.learned.run import TrainingFolder, run_training
+
+        asked = load_learned(config, tuple(set_ or ()))
+        folder = TrainingFolder(out or Path("runs") / slug(asked.name))
+        with progress_bar("{task.fields[loss]}") as bar:
+            task = bar.add_task(asked.name, total=asked.training.steps, loss="")
+
+            def tell(progress: "TrainingProgress") -> None:
+                score = f", best {progress.score:.3f}" if progress.score == progress.score else ""
+                bar.update(task, completed=progress.step, loss=f"loss {progress.loss:.3f}{score}")
+                bar.start()
+
+            found = run_training(asked, folder, tell, resume=resume)
+    before, after = (found[name]["focus_psnr_db"] for name in ("linear", "trained"))
+    print(
+        f"{found['status']}: focused images have {after:.2f} dB, the linear start {before:.2f} dB"
+    )
+    print(f"network: {folder.path / found['network']}")
+    print(f"report: {folder.path / 'report.html'}")

@@ -1,0 +1,151 @@
+"""Networks in files, each with every number of its camera: none answers for another camera."""
+
+import dataclasses
+import hashlib
+import os
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from thincam_jax.imaging.scene import Spectrum
+from thincam_jax.learn.checkpoint import (
+    CheckpointError,
+    difference,
+    read_arrays,
+    read_description,
+    write_arrays,
+)
+from thincam_jax.learn.refocusing.cameras import RefocusCamera
+from thincam_jax.learn.refocusing.network import NetworkOptions, RefocusNetwork
+from thincam_jax.lensless.camera import LenslessCamera
+from thincam_jax.reconstruction.seen_by import Cameras
+
+_KIND = "refocusing network"
+# Arrays of more numbers are told by their sum.
+_LISTED = 64
+# What a sensor makes of light; a network takes captures in any unit.
+_ELECTRONIC = ("exposure", "electrons", "full_well", "bit_depth")
+
+
+def save(
+    path: str | os.PathLike[str], network: RefocusNetwork, told: dict[str, Any] | None = None
+) -> Path:
+    """Write a network: its camera, its options, what is `told` of its training, and its weights.
+
+    `told`: JSON, such as the manifest of the images, their licences, and scores.
+    """
+    description = {
+        "kind": _KIND,
+        "camera": described(network.camera),
+        "options": network.options._asdict(),
+        "training": told or {},
+    }
+    return write_arrays(path, network.weights, description)
+
+
+def load(
+    path: str | os.PathLike[str], cameras: LenslessCamera | RefocusCamera | Cameras
+) -> RefocusNetwork:
+    """Read a network that was trained for this camera.
+
+    **Arguments**
+
+    - `cameras`: what takes the captures: the camera; the camera with its light, as `Cameras`;
+      or all that the network was trained for. Its numbers are compared, to single precision.
+
+    **Errors**: CheckpointError, one line, for a damaged file, and for another camera with the
+    first number that differs and both its values; OSError for what cannot be read.
+    """
+    description = network_description(path)
+    given = same_camera(str(path), description["camera"], cameras)
+    try:
+        stored = {name: _as_tuple(value) for name, value in description["options"].items()}
+        options = NetworkOptions(**stored)
+        structure = eqx.filter_eval_shape(
+            lambda key: RefocusNetwork.create(given, options, key=key).weights, jax.random.key(0)
+        )
+    except (TypeError, ValueError, AttributeError) as error:
+        raise CheckpointError(f"{path}: holds options of another version ({error})") from None
+    weights = jax.tree.map(jnp.asarray, read_arrays(path, structure))
+    fresh = RefocusNetwork.create(given, options, key=jax.random.key(0))
+    return eqx.tree_at(lambda network: network.weights, fresh, weights)
+
+
+def network_description(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """What a file says of its network: `camera`, `options`, `training`."""
+    description = read_description(path)
+    parts = (description.get(name) for name in ("camera", "options", "training"))
+    if description.get("kind") != _KIND or not all(isinstance(part, dict) for part in parts):
+        raise CheckpointError(f"{path}: holds no {_KIND}; give a file that a training wrote")
+    return description
+
+
+def described(value: Any) -> Any:
+    """Every number of a module as JSON, by the names of its fields."""
+    if isinstance(value, eqx.Module):
+        fields = (field.name for field in dataclasses.fields(value))
+        numbers = {name: described(getattr(value, name)) for name in fields}
+        return {"type": type(value).__name__, **numbers}
+    if isinstance(value, jax.Array | np.ndarray):
+        array = np.asarray(value)
+        if array.size <= _LISTED and array.dtype.kind in "fiub":
+            return array.tolist()
+        digest = hashlib.sha256(np.ascontiguousarray(array).tobytes()).hexdigest()
+        return f"{array.dtype}{list(array.shape)}, SHA-256 {digest}"
+    if isinstance(value, tuple | list):
+        return [described(entry) for entry in value]
+    if value is None or isinstance(value, str | int | float):
+        return value
+    return getattr(value, "__name__", type(value).__name__)
+
+
+def same_camera(
+    name: str, there: dict[str, Any], cameras: LenslessCamera | RefocusCamera | Cameras
+) -> RefocusCamera:
+    """The camera that captures, with the rest of what the network `name` was trained for.
+
+    **Errors**: CheckpointError, one line, for any other than is described in `there`.
+    """
+    given = _as_trained(name, there, cameras)
+    other = difference(_optical(there), _optical(described(given)))
+    if other:
+        raise CheckpointError(
+            f"{name}: was trained for a camera {other}; give the network of this camera, or train "
+            "one by 'thincam train'"
+        )
+    return given
+
+
+def _as_trained(name: str, there: dict[str, Any], cameras) -> RefocusCamera:
+    if isinstance(cameras, RefocusCamera):
+        return cameras
+    if isinstance(cameras, Cameras) and cameras.count != 1:
+        raise CheckpointError(f"{name}: takes one capture, not {cameras.count}; give one camera")
+    camera = cameras.cameras[0] if isinstance(cameras, Cameras) else cameras
+    try:
+        light = Spectrum(*(np.asarray(there["light"][n]) for n in ("wavelengths", "weights")))
+        if isinstance(cameras, Cameras) and cameras.wavelength is not None:
+            light = Spectrum(cameras.wavelength)
+        return RefocusCamera(
+            camera,
+            light,
+            field_shape=tuple(there["field_shape"]),
+            **{name: there[name] for name in ("near", "far", "planes", "pupil", "model")},
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise CheckpointError(f"{name}: tells no whole camera ({error})") from None
+
+
+def _optical(camera: Any) -> Any:
+    """A description without what a sensor makes of the light."""
+    if not isinstance(camera, dict):
+        return camera
+    return {name: _optical(value) for name, value in camera.items() if name not in _ELECTRONIC}
+
+
+def _as_tuple(value: Any) -> Any:
+    return tuple(value) if isinstance(value, list) else value

@@ -1,0 +1,140 @@
+"""A trained network as a solver: `tc.reconstruct(recording, tc.Learned(network))`."""
+
+import time
+from typing import ClassVar, Literal, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from thincam_jax._core import checks
+from thincam_jax.learn.refocusing.network import (
+    RefocusNetwork,
+    consistency_of,
+    distance_map,
+    explain,
+    flattened,
+    focused,
+    mapped,
+)
+from thincam_jax.learn.refocusing.store import described, same_camera
+from thincam_jax.reconstruction.noise import estimate_variance, given_variances
+from thincam_jax.reconstruction.recording import Recording
+from thincam_jax.reconstruction.seen_by import Cameras
+from thincam_jax.reconstruction.solver import AbstractSolver, Reconstruction
+
+# Residual over noise from which an image is doubted.
+_DOUBTED = 1.5
+
+
+class Reading(NamedTuple):
+    """All that a network reads from captures that it has explained once; see `RefocusNetwork`."""
+
+    images: Float[Array, "*batch distance y x"]
+    all_in_focus: Float[Array, "*batch y x"]
+    distance: Float[Array, "*batch y x"]
+    confidence: Float[Array, "*batch y x"]
+    consistency: Float[Array, "*batch"]
+
+
+def read(network: RefocusNetwork, captures, distances, deviation) -> Reading:
+    """Images focused on each of `distances`, mm, and everything else, for captures (*batch, y, x).
+
+    `distances`: (distance,), or (*batch, distance) with their own for each capture.
+    """
+    captures, deviation, batch = flattened(network, captures, deviation)
+    count = jnp.shape(distances)[-1]
+    each = jnp.broadcast_to(network.camera.within(distances), (*batch, count))
+    found = _read(network, captures, deviation, each.reshape(-1, count))
+    return jax.tree.map(lambda a: a.reshape(*batch, *a.shape[1:]), found)
+
+
+@eqx.filter_jit
+def _read(network: RefocusNetwork, captures, deviations, distances) -> Reading:
+    return jax.vmap(lambda *one: _read_one(network, *one))(captures, deviations, distances)
+
+
+def _read_one(network: RefocusNetwork, capture, deviation, distances) -> Reading:
+    explained = explain(network, capture, deviation)
+    maps = mapped(network, explained)
+    images = jax.vmap(lambda t: focused(network, explained, t))(distances)
+    return Reading(
+        explained.mean * images,
+        explained.mean * maps.all_in_focus,
+        *distance_map(network, explained),
+        consistency_of(network, explained),
+    )
+
+
+class Learned(AbstractSolver):
+    """A refocusing network as a solver, for captures (*batch, y, x) of its camera.
+
+    Focused on the recording's object distances; several are planes of the result. What it gives
+    may be made up where the capture does not tell: see `Reconstruction.consistency` and
+    `Reconstruction.confidence`.
+
+    - `network`: trained, see `thincam_jax.learn.load`.
+    - `output`: "focus", or "all_in_focus", which needs no distance.
+
+    **Errors**: ValueError, one line, for another camera, a distance outside of what the network
+    was trained for, pixels that are not to be trusted, and a field of another size.
+    """
+
+    name: ClassVar[str] = "learned"
+    network: RefocusNetwork
+    output: Literal["focus", "all_in_focus"] = eqx.field(static=True, default="focus")
+
+    def __check_init__(self):
+        checks.choice("output", self.output, ("focus", "all_in_focus"))
+
+    def solve(self, recording: Recording) -> Reconstruction:
+        began, network, seen_by = time.perf_counter(), self.network, recording.seen_by
+        if not isinstance(seen_by, Cameras):
+            raise ValueError("a learned method knows its camera; give a recording by tc.Cameras")
+        camera = network.camera
+        same_camera("the network", described(camera), seen_by)
+        if seen_by.field_shape not in (None, camera.field_shape):
+            raise ValueError(
+                f"field_shape is {seen_by.field_shape} and the network's {camera.field_shape}; "
+                "leave it out"
+            )
+        if recording.valid is not None and not all(np.asarray(m).all() for m in recording.valid):
+            raise ValueError("the network takes every pixel of a capture; mend those not valid")
+        (capture,) = recording.captures
+        variance = recording.noise_variance
+        known = None if variance is None else given_variances(variance, recording.captures)
+        variance = estimate_variance(recording.captures) if known is None else known
+        is_focused, distance = self.output == "focus", camera.far
+        if is_focused:
+            seen_by.require("object_distance")
+            distance = seen_by.object_distance
+        distances = jnp.atleast_1d(jnp.asarray(distance))
+        found = read(network, capture, distances, jnp.sqrt(variance[0]))
+        image, pitch = found.all_in_focus, None
+        if is_focused:
+            planes = np.ndim(distance) == 1
+            image, pitch = found.images if planes else found.images[..., 0, :, :], seen_by.pitch
+        image, confidence = (
+            jax.block_until_ready(a)[..., ::-1, ::-1] for a in (image, found.confidence)
+        )
+        return Reconstruction(
+            image,
+            pitch,
+            self.name,
+            reason=doubt(float(jnp.max(found.consistency))),
+            seconds=time.perf_counter() - began,
+            consistency=found.consistency,
+            confidence=confidence,
+        )
+
+
+def doubt(consistency: float) -> str:
+    """In words, where an image does not explain its capture; else nothing."""
+    if consistency < _DOUBTED:
+        return ""
+    return (
+        f"what the network explains misses the capture by {consistency:.1f} times the noise: it "
+        "may be of another camera, of distances outside of the range, or not be true"
+    )
