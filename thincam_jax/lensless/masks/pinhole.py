@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Number, Numbers
 from thincam_jax._core.grids import Grid
+from thincam_jax._core.precision import as_complex
 from thincam_jax.lensless.masks.base import (
     AbstractFactoredMask,
     AbstractMask,
@@ -51,7 +52,7 @@ class Pinhole(AbstractFactoredMask):
         return self.width if self.height is None else self.height, self.width
 
     def terms(self, wavelength: Number | None = None) -> MaskTerms:
-        one = jnp.ones((1, 1), jnp.result_type(self.width, jnp.complex64))
+        one = as_complex(jnp.ones((1, 1), self.width.dtype))
         rows, columns = (AxisFactors(jnp.stack([-s / 2, s / 2]), one) for s in self.extent)
         return MaskTerms(one[0], columns if self.height is None else rows, columns)
 

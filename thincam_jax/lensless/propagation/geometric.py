@@ -3,6 +3,7 @@ r"""`geometric`: the mask's shadow, without diffraction."""
 import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
 
+from thincam_jax._core.checks import Number
 from thincam_jax._core.grids import Grid
 from thincam_jax._core.precision import as_complex, product
 from thincam_jax.lensless.masks.base import AbstractFactoredMask, AbstractMask, AxisFactors
@@ -45,6 +46,17 @@ def geometric(
     else:
         rows, columns = factor(down, y, grid.pitch / scale), factor(across, x, grid.pitch / scale)
     return SeparableSum(weights[:, None] * rows, columns, grid)
+
+
+def throughput(mask: AbstractFactoredMask, wavelength: Number | None = None) -> Float[Array, ""]:
+    """The part of the light on the mask's aperture that passes it, the mean of |t|²."""
+    weights, down, across = mask.irradiance(wavelength)
+    middle = jnp.zeros(1, weights.real.dtype)
+    rows, columns = (
+        _axis_averages(factors, middle, side)[:, 0]
+        for factors, side in zip((down, across), mask.extent, strict=True)
+    )
+    return jnp.sum(weights * rows * columns).real
 
 
 def _axis_values(factors: AxisFactors, x: Float[Array, " n"], pitch) -> Complex[Array, "term n"]:

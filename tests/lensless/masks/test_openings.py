@@ -1,0 +1,75 @@
+"""Pinholes, rings, lenslets and masks from numbers and files."""
+
+import jax
+import numpy as np
+import pytest
+
+import thincam_jax as tc
+
+
+def test_round_pinhole_on_the_axis():
+    """4 sin²(πa²/(2λd)) at a bright and at a dark distance, by the angular spectrum."""
+    a, wavelength = 0.1, 500e-6
+    mask = tc.RadialMask([1.0], a)
+    for zones in (1.0, 1.5, 2.0):
+        distance = a**2 / (wavelength * zones)
+        camera = tc.LenslessCamera(mask, tc.Sensor((1, 1), 0.202 / 301), distance)
+        h = tc.psf(camera, wavelength=wavelength, model="angular_spectrum", mask_shape=(301, 301))
+        assert float(h[0, 0]) == pytest.approx(4 * np.sin(np.pi * zones / 2) ** 2, abs=0.06)
+
+
+def test_rings_are_sampled_by_their_area():
+    rings = np.array([0.0, 1.0, 0.25])
+    mask = tc.RadialMask(rings, 0.1, centre=(0.013, -0.02))
+    value = np.asarray(mask.sample(tc.Grid((31, 34), 0.023)))
+    radii = 0.1 * np.arange(4)
+    expected = np.sum(rings * np.pi * np.diff(radii**2))
+    assert value.sum() * 0.023**2 == pytest.approx(expected, rel=1e-12)
+    y, x = ((np.arange(n) - (n - 1) / 2) * 0.023 for n in (31, 34))
+    inside = np.hypot(y[:, None] - 0.013, x + 0.02) < 0.1 - 0.023
+    assert np.abs(value[inside]).max() < 1e-12
+    assert repr(mask) == "RadialMask(3 rings of 100 µm)"
+
+
+def test_a_lens_focuses():
+    """At the focal length a square lens gives (w²/(λf))² sinc² sinc²."""
+    mask, wavelength, f, w = tc.LensletArray(4.0, 0.5), 500e-6, 4.0, 0.5
+    camera = tc.LenslessCamera(mask, tc.Sensor((9, 12), 1e-3), f)
+    found = tc.psf(camera, wavelength=wavelength)
+    y, x = ((np.arange(n) - (n - 1) / 2) * 1e-3 for n in (9, 12))
+    lobes = np.outer(*(np.sinc(w * v / (wavelength * f)) for v in (y, x)))
+    np.testing.assert_allclose(found, (w * w / (wavelength * f) * lobes) ** 2, rtol=1e-9, atol=1e-9)
+    with pytest.raises(ValueError, match="give wavelength in mm"):
+        mask.sample(camera.sensor.grid)
+
+
+def test_random_cells():
+    mask = tc.random_cells(jax.random.key(0), 1.2, 0.03, height=0.6, open_fraction=0.3)
+    assert mask.amplitude.shape == (20, 40)
+    assert abs(float(mask.amplitude.mean()) - 0.3) < 0.06
+    with pytest.raises(ValueError, match=r"width = 1 mm is not a whole .* give width = 2 mm$"):
+        tc.random_cells(jax.random.key(0), 1.0, 2.0)
+
+
+def test_masks_from_pictures(tmp_path):
+    import PIL.Image
+
+    def written(name, values):
+        path = tmp_path / name
+        PIL.Image.fromarray(np.asarray(values, np.uint8)).save(path)
+        return path
+
+    levels = np.array([[0, 255, 64], [255, 0, 0]])
+    mask = tc.read_mask(written("mask.png", levels), 0.03)
+    np.testing.assert_allclose(np.abs(mask.amplitude) ** 2, levels / 255, atol=1e-12)
+    coloured = np.zeros((2, 3, 3))
+    coloured[..., 0] = 200
+    (tmp_path / "text.png").write_text("no picture")
+    for path, message in (
+        (written("black.png", np.zeros((2, 3))), "is black: no light passes"),
+        (written("colour.png", coloured), "is coloured; give a grey image"),
+        (tmp_path / "text.png", "cannot be read as an image"),
+    ):
+        with pytest.raises(ValueError, match=message) as error:
+            tc.read_mask(path, 0.03)
+        assert "\n" not in str(error.value)

@@ -1,0 +1,118 @@
+"""Coded apertures' theory: correlations, spectra, noise of the decoded image, refusals."""
+
+import numpy as np
+import pytest
+from lensless.masks.families import redundant
+
+import thincam_jax as tc
+
+CELL = 0.03
+
+
+def correlation(first, second):
+    """Periodic, Σ_r first(r) second(r + s)."""
+    transforms = np.fft.fft2(first).conj() * np.fft.fft2(second)
+    return np.fft.ifft2(transforms).real
+
+
+@pytest.mark.parametrize("p", [5, 7, 11, 13])
+def test_mura_is_an_ideal_code(p):
+    """A ⋆ G = (p² − 1)/2 δ; |Â| = (p ± 1)/2 off zero frequency; (p² − 1)/2 open cells."""
+    mask = tc.ModifiedUniformlyRedundantArray(p, CELL)
+    a, g = np.asarray(mask.cells), np.asarray(mask.decoder)
+    np.testing.assert_array_equal(a, redundant(p, p))
+    assert a.sum() == (p * p - 1) / 2
+    expected = np.zeros((p, p))
+    expected[0, 0] = (p * p - 1) / 2
+    np.testing.assert_allclose(correlation(a, g), expected, atol=1e-9)
+    levels = np.unique(np.abs(np.fft.fft2(a)).ravel()[1:].round(9))
+    np.testing.assert_allclose(levels, [(p - 1) / 2, (p + 1) / 2], atol=1e-8)
+
+
+@pytest.mark.parametrize("orders", [(5, 3), (7, 5), (13, 11)])
+def test_ura_has_even_sidelobes(orders):
+    mask = tc.UniformlyRedundantArray(orders, CELL)
+    a, rs = np.asarray(mask.cells), orders[0] * orders[1]
+    np.testing.assert_array_equal(a, redundant(*orders))
+    expected = np.full(orders, (rs + 1) / 4)
+    expected[0, 0] = (rs + 1) / 2
+    np.testing.assert_allclose(correlation(a, a), expected, atol=1e-9)
+    decoded = correlation(a, np.asarray(mask.decoder))
+    np.testing.assert_allclose(decoded.ravel()[1:], 0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize("length", [3, 31, 255])
+def test_maximum_length_sequence(length):
+    code = tc.maximum_length_sequence(length)
+    assert set(code) == {0.0, 1.0} and code.sum() == (length + 1) / 2
+    s = 2 * code - 1
+    expected = np.full(length, -1.0)
+    expected[0] = length
+    np.testing.assert_allclose(correlation(s[None], s[None])[0], expected, atol=1e-9)
+
+
+def test_noise_of_the_decoded_image():
+    """Correlation with G, by 4000 draws: read noise Nσ²/M², shot noise I_T/M.
+
+    N cells, M = (N − 1)/2 of them open; the image in units of the object: Σ G n/M. Each count is
+    Poisson of the light that the open cells pass, and |G| = 1 adds up the variance of all.
+    """
+    p, draws, sigma, random = 7, 4000, 3.0, np.random.default_rng(0)
+    mask = tc.ModifiedUniformlyRedundantArray(p, CELL)
+    a, g, open_cells = np.asarray(mask.cells), np.asarray(mask.decoder), (p * p - 1) / 2
+    scene = random.uniform(0, 200.0, (p, p))
+    counts = np.fft.ifft2(np.fft.fft2(a) * np.fft.fft2(scene)).real
+    np.testing.assert_allclose(correlation(g, counts) / open_cells, scene, atol=1e-9)
+    decode = np.fft.fft2(g).conj() / open_cells
+
+    def variance(noise):
+        return np.fft.ifft2(decode * np.fft.fft2(noise)).real.var(axis=0).mean()
+
+    read = variance(random.normal(0, sigma, (draws, p, p)))
+    assert read == pytest.approx(p * p * sigma**2 / open_cells**2, rel=0.02)
+    shot = variance(random.poisson(counts, (draws, p, p)))
+    assert shot == pytest.approx(scene.sum() / open_cells, rel=0.02)
+
+
+@pytest.mark.parametrize("length", [31, 255])
+def test_xor_of_codes_inverts_with_little_noise(length):
+    """Mean of 1/|Â|² → 12/N², two thirds of it on the frequency axes."""
+    code = tc.maximum_length_sequence(length)
+    mask = tc.SeparableMask(code, code, CELL, combine="xor")
+    noise = 1 / np.abs(np.fft.fft2(np.asarray(mask.cells))) ** 2
+    noise[0, 0] = 0.0
+    total = noise.sum()
+    assert total / length**2 == pytest.approx(12 / length**2, rel=6 / length)
+    axes = noise[0].sum() + noise[:, 0].sum()
+    assert axes / total == pytest.approx(2 / 3, abs=2 / length)
+
+
+def test_tiles():
+    mask = tc.ModifiedUniformlyRedundantArray(5, CELL, tiles=(2, 3))
+    np.testing.assert_array_equal(mask.cells, np.tile(redundant(5, 5), (2, 3)))
+    np.testing.assert_allclose([float(side) for side in mask.extent], [10 * CELL, 15 * CELL])
+    assert mask.decoder.shape == (5, 5)
+    assert repr(mask) == "ModifiedUniformlyRedundantArray(5×5, 2×3 tiles, cell 30 µm)"
+    assert float(mask.finest_frequency) == pytest.approx(1 / 0.06)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: tc.ModifiedUniformlyRedundantArray(100, CELL), "order = 100 .* give 97 or 101$"),
+        (lambda: tc.ModifiedUniformlyRedundantArray(3, CELL), "order = 3 .* give 5$"),
+        (lambda: tc.ModifiedUniformlyRedundantArray(5, -CELL), "cell = -0.03 mm is not positive"),
+        (lambda: tc.ModifiedUniformlyRedundantArray(5, CELL, tiles=0), "tiles = 0; give at least"),
+        (
+            lambda: tc.UniformlyRedundantArray((11, 7), CELL),
+            r"orders = \(11, 7\) .* give \(7, 5\) or \(13, 11\)$",
+        ),
+        (lambda: tc.maximum_length_sequence(100), "length = 100 .* give 63 or 127$"),
+        (lambda: tc.SeparableMask([1.0, -1.0], [1.0], CELL), "rows runs from -1 to 1; give trans"),
+        (lambda: tc.SeparableMask([1.0], np.eye(2), CELL), r"columns has shape \(2, 2\); give a"),
+    ],
+)
+def test_refusals(make, message):
+    with pytest.raises(ValueError, match=message) as error:
+        make()
+    assert "\n" not in str(error.value)
