@@ -157,12 +157,18 @@ def _count(structure: Any, leaves: tuple) -> TermCount:
     return TermCount(*counts, cells, terms.columns.curvatures is not None)
 
 
+def other_models(mask: AbstractMask) -> str:
+    """The wave models that take the mask, in words."""
+    exact = "'separable', " if isinstance(mask, AbstractFactoredMask) else ""
+    return f"{exact}'angular_spectrum' or 'rayleigh_sommerfeld'"
+
+
 def require_factored(mask: AbstractMask, model: str) -> AbstractFactoredMask:
     """The mask, or one line that says which models can be used without terms."""
     if not isinstance(mask, AbstractFactoredMask):
         raise TypeError(
             f"model {model!r} needs a mask of few separable terms, such as FresnelZoneAperture; "
-            f"for a {type(mask).__name__} use 'angular_spectrum' or 'rayleigh_sommerfeld'"
+            f"for a {type(mask).__name__} use {other_models(mask)}"
         )
     return mask
 
@@ -193,7 +199,7 @@ def require_zone_orders(mask: AbstractMask, model: str) -> ZoneOrders:
     orders = zone_orders(mask)
     if orders is not None:
         return orders
-    instead = "'separable', 'geometric', 'angular_spectrum' or 'rayleigh_sommerfeld'"
+    instead = other_models(mask)
     if hasattr(mask, "zone_orders"):
         raise ValueError(
             f"{model!r} has no display pixels; drop pixel_pitch from the mask, or use {instead}"

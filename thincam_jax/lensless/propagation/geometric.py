@@ -6,7 +6,12 @@ from jaxtyping import Array, Complex, Float
 from thincam_jax._core.checks import Number
 from thincam_jax._core.grids import Grid
 from thincam_jax._core.precision import as_complex, product
-from thincam_jax.lensless.masks.base import AbstractFactoredMask, AbstractMask, AxisFactors
+from thincam_jax.lensless.masks.base import (
+    AbstractFactoredMask,
+    AbstractMask,
+    AxisFactors,
+    other_models,
+)
 from thincam_jax.lensless.propagation.chirp import chirp_average
 from thincam_jax.lensless.propagation.path import Path
 from thincam_jax.lensless.propagation.separable_sum import SeparableSum
@@ -31,7 +36,7 @@ def geometric(
     if mask.pure_phase:
         raise TypeError(
             f"model 'geometric' is the shadow |t|², which a {type(mask).__name__} does not have; "
-            "use 'separable' for a LensletArray, or 'angular_spectrum'"
+            f"use {other_models(mask)}"
         )
     if not isinstance(mask, AbstractFactoredMask):
         shadow = mask.sample(Grid(grid.shape, grid.pitch / scale), path.wavelength)
