@@ -37,6 +37,7 @@ from .lensless.masks.sampled import random_cells as random_cells
 from .lensless.masks.sampled import read_mask as read_mask
 from .lensless.method import MODELS as MODELS
 from .lensless.phase_shift import fringe_scanned_otf as fringe_scanned_otf
+from .lensless.phase_shift import harmonic_otf as harmonic_otf
 from .lensless.phase_shift import phase_pair_otf as phase_pair_otf
 from .lensless.plan import Plan as Plan
 from .lensless.plan import plan as plan

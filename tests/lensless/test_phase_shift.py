@@ -6,6 +6,7 @@ import pytest
 
 import thincam_jax as tc
 from helpers import relative_l2
+from thincam_jax.lensless.propagation.closed_form import harmonic_response
 
 # Weak diffraction (ε = 4e-5), so that ε in the chirps' curvatures does not show; the zero of
 # cos(πλdρ²) is made to lie in the band by a frequency grid that reaches far.
@@ -64,6 +65,73 @@ def test_shadow_of_a_finite_mask():
     )
     found = tc.fringe_scanned_otf(small, wavelength=WAVELENGTH, model="geometric")
     assert relative_l2(found, rows @ image @ columns * 0.02**2) < 1e-12
+
+
+class TestHarmonics:
+    """Of the captures over the mask's phase."""
+
+    def test_they_make_the_capture_of_any_phase(self):
+        """H(φ) = Σ H_m e^{jmφ}, with the finite mask; H_{-m} is that of the mirrored frequency."""
+        lens = camera(phase=0.9, profile="cosine")
+        light = {"wavelength": WAVELENGTH, "model": "separable"}
+        found = [tc.harmonic_otf(lens, m, **light) for m in (0, 1, 2)]
+        found = [np.asarray(h) for h in found]
+        whole = found[0] + 2 * np.real(found[1] * np.exp(0.9j) + found[2] * np.exp(1.8j))
+        # Symmetric masks have even responses: but for an even grid's first row.
+        assert relative_l2(whole[1:], tc.otf(lens, **light)[1:]) < 1e-10
+
+    @pytest.mark.parametrize(("profile", "present"), [("cosine", (1, 2)), ("binary", (2, 3, 6))])
+    def test_closed_form(self, profile, present):
+        """Against the phases of the same unbounded model."""
+        lens = camera(phase=0.0, profile=profile, harmonics=3)
+        path = lens.path(WAVELENGTH, 40.0)
+        rho2 = squared_frequency() + 1e-9  # beside the δ of zero frequency
+        for m in present:
+            found = harmonic_response(lens.mask, path, m, rho2)
+            expected = tc.harmonic_otf(
+                lens, m, wavelength=WAVELENGTH, object_distance=40.0, model="closed_form"
+            )
+            assert relative_l2(found, expected) < 1e-6
+
+    def test_of_the_binary_profile(self):
+        """j/(m²β) e^{-jX/m} times ±cos(πλdρ²) for odd m, ±sin for even m, which diffraction makes.
+
+        λd = 1/800 mm²: the cosine's first zero is at 20 cycles/mm, where the sine is 1.
+        """
+        mask = tc.FresnelZoneAperture(BETA, width=1.0, profile="binary", harmonics=99)
+        rho = np.linspace(0.5, 27.0, 300)
+        path = tc.LenslessCamera(mask, tc.Sensor((4, 5), 0.1), 50.0).path(2.5e-5, np.inf)
+        x, angle = np.pi**2 * rho**2 / BETA, np.pi * 2.5e-5 * 50.0 * rho**2
+        factors = {1: np.cos(angle), 2: np.sin(angle), 3: -np.cos(angle), 4: -np.sin(angle)}
+        for m, factor in factors.items():
+            reached = angle < m * np.pi / 2
+            expected = 1j / (m**2 * BETA) * np.exp(-1j * x / m) * factor
+            found = np.asarray(harmonic_response(mask, path, m, rho**2))
+            bound = 1e-12 if m % 2 else 0.03
+            assert relative_l2(found[reached], expected[reached]) < bound
+        assert abs(factors[1][np.argmin(abs(rho - 20))]) < 0.01
+
+    def test_a_finite_mask_ends_them(self):
+        """Each at mβR/π: nothing is left a little beyond; geometric amplitude as 1/m²."""
+        zone = tc.FresnelZoneAperture(20.0, width=4.0, profile="binary")
+        lens = tc.LenslessCamera(zone, tc.Sensor((1, 1601), 2.5e-3), 1e-3)
+        u = np.asarray(lens.sensor.grid.u)
+        level = {}
+        for m in (1, 3):
+            h = np.abs(tc.harmonic_otf(lens, m, wavelength=5e-4, model="geometric")[0])
+            end = m * 20.0 * 2.0 / np.pi
+            level[m] = np.mean(h[(u > 0.2 * end) & (u < 0.8 * end)])
+            assert np.mean(h[(u > 1.2 * end) & (u < 1.5 * end)]) < 0.1 * level[m]
+        # One row of a sensor: along u alone the chirp has √(π/mβ) in place of π/mβ.
+        assert level[1] / level[3] == pytest.approx(3**1.5, rel=0.03)
+
+    def test_bad_harmonics_are_refused(self):
+        with pytest.raises(ValueError, match="harmonic = -1; give a whole number"):
+            tc.harmonic_otf(camera(), -1, wavelength=WAVELENGTH)
+        path = camera().path(WAVELENGTH, np.inf)
+        with pytest.raises(ValueError, match="harmonic = 0; give a whole number from 1 on"):
+            harmonic_response(camera().mask, path, 0, 1.0)
+        assert harmonic_response(camera().mask, path, 3, 1.0) == 0  # a cosine has two
 
 
 def test_other_masks_are_refused():

@@ -8,7 +8,13 @@ import pytest
 import thincam_jax as tc
 from helpers import relative_l2
 from thincam_jax.lensless.propagation.paraxial import paraxial_response
-from thincam_jax.reconstruction import contrasts, fringe_scanning, phase_pairs, separate
+from thincam_jax.reconstruction import (
+    contrasts,
+    fringe_scanning,
+    harmonics,
+    phase_pairs,
+    separate,
+)
 from thincam_jax.units import nm, um
 
 BETA, DISTANCE, WAVELENGTH = 25.0, 6.5, 500 * nm
@@ -97,6 +103,26 @@ def test_first_zero_of_the_fringe_scanned_response():
         assert abs(u[near][np.argmin(size[near])] - zero) < 0.05
 
 
+def test_harmonics_are_those_of_the_responses():
+    """jK times what `harmonic_otf` gives, conjugate; of a cosine none but two."""
+    steps = [2 * math.pi * q / 7 for q in range(7)]
+    channels = np.tensordot(harmonics(1, 7, (1, 2, 3)), formula(steps), axes=1)
+    x, diffraction = angles()
+    expected = [
+        math.pi / (4 * BETA) * np.exp(1j * x) * np.cos(diffraction),
+        math.pi / (32 * BETA) * np.exp(0.5j * x),
+    ]
+    for m in (0, 1):
+        assert relative_l2(channels[2 * m] + 1j * channels[2 * m + 1], 7 * expected[m]) < 1e-12
+    assert np.abs(channels[4:]).max() < 1e-12
+
+
+@pytest.mark.parametrize(("steps", "orders"), [(8, (4,)), (8, ()), (4, (2,)), (5, (0, 1))])
+def test_harmonics_that_cannot_be_told_are_refused(steps, orders):
+    with pytest.raises(ValueError, match=f"of {steps} phases; give some from 1 to"):
+        harmonics(1, steps, orders)
+
+
 def test_groups_stay_apart():
     """Two distances, two β: each channel holds its own group's response only."""
     both = np.concatenate([formula(FOUR), formula(FOUR, distance=4.0)])
@@ -115,8 +141,13 @@ def test_separate_leaves_captures_as_they_are():
 
 def test_noise_of_the_channels_is_uncorrelated():
     """Rows orthogonal; the differences of two captures carry the noise of two."""
-    for matrix, power in ((separate(3), 1.0), (fringe_scanning(2), 2.0), (phase_pairs(3), 2.0)):
-        np.testing.assert_array_equal(matrix @ matrix.T, power * np.eye(len(matrix)))
+    for matrix, power in (
+        (separate(3), 1.0),
+        (fringe_scanning(2), 2.0),
+        (phase_pairs(3), 2.0),
+        (harmonics(2, 8, (1, 3)), 4.0),
+    ):
+        np.testing.assert_allclose(matrix @ matrix.T, power * np.eye(len(matrix)), atol=1e-14)
 
 
 @pytest.mark.parametrize("count", [2, 3, 7])

@@ -135,7 +135,7 @@ class NoiseConfig(Section):
 class ShotConfig(Section):
     """One setting of the camera; the phases of the synthesis are taken at each.
 
-    - `width`: of its masks; default that of the study.
+    - `width`, `profile`: of its masks; default those of the study.
     - `exposure`: of each of its captures, relative to that of the sensor.
     - `take`: 2 for a second exposure of a setting, which has noise of its own; and so on.
     """
@@ -144,6 +144,7 @@ class ShotConfig(Section):
     distance: Length
     wavelength: Wavelength | None = None
     width: Length | None = None
+    profile: Profile | None = None
     exposure: Annotated[float, Field(gt=0)] = 1.0
     take: Annotated[int, Field(ge=2)] | None = None
 
@@ -173,7 +174,7 @@ class VariationConfig(Section):
 
 
 MethodKind = Literal["fringe_scanning", "wiener", "admm_tv"]
-Synthesis = Literal["fringe_scanning", "phase_pairs", "contrasts", "separate"]
+Synthesis = Literal["fringe_scanning", "phase_pairs", "harmonics", "contrasts", "separate"]
 # The mask phases taken at each shot, rad, where the synthesis sets them.
 PHASES = {
     "fringe_scanning": (0.0, math.pi / 2, math.pi, 3 * math.pi / 2),
@@ -182,7 +183,11 @@ PHASES = {
 
 
 class MethodConfig(Section):
-    """A reconstruction and the captures that it takes."""
+    """A reconstruction and the captures that it takes.
+
+    - `steps`, `harmonics`: of the synthesis harmonics, how many phases of a turn it takes at each
+      shot, and the m that it keeps.
+    """
 
     name: Name
     kind: MethodKind
@@ -190,6 +195,8 @@ class MethodConfig(Section):
     synthesis: Synthesis = "fringe_scanning"
     shots: Annotated[tuple[ShotConfig, ...], Field(min_length=1)]
     phases: Annotated[tuple[Angle, ...], Field(min_length=1)] = (0.0,)
+    steps: Annotated[int, Field(ge=3, le=64)] = 8
+    harmonics: tuple[Annotated[int, Field(ge=1)], ...] = ()
     published: PublishedConfig = PublishedConfig()
 
     @pydantic.model_validator(mode="after")
@@ -200,11 +207,23 @@ class MethodConfig(Section):
             raise ValueError("kind fringe_scanning takes one shot and its own synthesis")
         if self.variation is not None and self.kind != "admm_tv":
             raise ValueError(f"kind {self.kind} has no total variation; drop 'variation'")
-        if self.synthesis in PHASES and self.phases != (0.0,):
+        if self.synthesis in (*PHASES, "harmonics") and self.phases != (0.0,):
             raise ValueError(f"synthesis {self.synthesis} sets the phases itself; drop 'phases'")
+        self._check_harmonics()
         if self.synthesis == "contrasts":
             self._check_contrasts()
         return self
+
+    def _check_harmonics(self) -> None:
+        if self.synthesis != "harmonics":
+            if self.harmonics:
+                raise misfit(f"synthesis {self.synthesis} has none; drop it", "harmonics")
+            return
+        most = (self.steps - 1) // 2
+        sound = self.harmonics and max(self.harmonics) <= most
+        if not sound or len(set(self.harmonics)) < len(self.harmonics):
+            message = f"{self.steps} steps tell 1 to {most} apart; give some of them, each once"
+            raise misfit(message, "harmonics")
 
     def _check_contrasts(self) -> None:
         if len(self.shots) * len(self.phases) < 2:
@@ -217,6 +236,8 @@ class MethodConfig(Section):
 
     def shot_phases(self) -> tuple[float, ...]:
         """The mask phases taken at each shot, rad."""
+        if self.synthesis == "harmonics":
+            return tuple(2 * math.pi * step / self.steps for step in range(self.steps))
         return PHASES.get(self.synthesis, self.phases)
 
 
@@ -321,7 +342,7 @@ def check_methods(config: CamerasConfig) -> None:
         # To the picometre: 5600 um and 5.6 mm differ by rounding.
         widths = [round(s.width or config.mask.width, 9) for s in method.shots]
         shots = [
-            (s.beta, s.distance, s.wavelength or config.wavelength, width)
+            (s.beta, s.distance, s.wavelength or config.wavelength, width, s.profile)
             # Between two exposures of one setting there is no contrast.
             + (() if method.synthesis == "contrasts" else (s.exposure, s.take))
             for s, width in zip(method.shots, widths, strict=True)

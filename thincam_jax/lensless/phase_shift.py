@@ -1,17 +1,56 @@
 r"""Responses of synthesised captures: what their sum carries of each frequency."""
 
+import functools
 import math
+import operator
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Complex
 
 from thincam_jax._core.checks import Number
 from thincam_jax._core.grids import Grid
 from thincam_jax.lensless.camera import LenslessCamera
+from thincam_jax.lensless.masks.base import require_zone_orders
 from thincam_jax.lensless.masks.fza import FresnelZoneAperture
 from thincam_jax.lensless.method import Model
 from thincam_jax.lensless.psf import otf
+
+
+def harmonic_otf(
+    camera: LenslessCamera,
+    harmonic: int,
+    *,
+    wavelength: Number,
+    object_distance: Number = math.inf,
+    model: Model = "separable",
+    pixel_integration: bool = False,
+) -> Complex[Array, "v u"]:
+    r"""Response of the m-th harmonic of the captures over the phase of a zone aperture, mm².
+
+    .. math::
+        H(\varphi) = \sum_m H_m e^{jm\varphi}, \qquad
+        H_m = \tfrac1K \sum_{q<K} H(2\pi q/K)\, e^{-2\pi jmq/K}
+
+    exact for K above the mask's highest difference of orders plus m; so many are computed. Fewer
+    captures fold the harmonics m ± K into it, with responses that are known as well
+    (`thincam_jax.reconstruction.harmonics`). What it is in closed form for a mask without an edge:
+    `thincam_jax.lensless.propagation.closed_form.harmonic_response`.
+
+    The phase of the camera's mask is not used. Other arguments and errors as for `otf`; TypeError
+    for masks that have no phase, ValueError for a harmonic below 0.
+    """
+    if int(harmonic) != harmonic or harmonic < 0:
+        raise ValueError(f"harmonic = {harmonic!r}; give a whole number from 0 on")
+    orders = require_zone_orders(_with_phase(camera, 0.0).mask, model).orders
+    steps = max(orders) - min(orders) + int(harmonic) + 1
+    given = (wavelength, object_distance, model, pixel_integration, None)
+    turns = np.arange(steps) / steps
+    weights = np.exp(-2j * np.pi * harmonic * turns) / steps
+    responses = (_otf(_with_phase(camera, turn), *given) for turn in turns)
+    terms = (h * h.dtype.type(w) for h, w in zip(responses, weights, strict=True))
+    return functools.reduce(operator.add, terms)
 
 
 def fringe_scanned_otf(

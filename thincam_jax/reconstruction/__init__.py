@@ -26,6 +26,7 @@ from thincam_jax.reconstruction.solver import Reconstruction as Reconstruction
 from thincam_jax.reconstruction.stream import Stream as Stream
 from thincam_jax.reconstruction.synthesis import contrasts as contrasts
 from thincam_jax.reconstruction.synthesis import fringe_scanning as fringe_scanning
+from thincam_jax.reconstruction.synthesis import harmonics as harmonics
 from thincam_jax.reconstruction.synthesis import phase_pairs as phase_pairs
 from thincam_jax.reconstruction.synthesis import separate as separate
 from thincam_jax.reconstruction.total_variation import TotalVariation as TotalVariation

@@ -24,7 +24,26 @@ def fringe_scanning(groups: int) -> np.ndarray:
     For each group the channels H(3π/2) − H(π/2) and H(0) − H(π), which are (π/β)cos X and
     (π/β)sin X times the diffraction term, X = π²ρ²/β: constant and second harmonic cancel.
     """
-    return np.kron(np.eye(groups), np.array([[0.0, -1.0, 0.0, 1.0], [1.0, 0.0, -1.0, 0.0]]))
+    return harmonics(groups, 4, (1,))
+
+
+def harmonics(groups: int, steps: int, orders: Sequence[int]) -> np.ndarray:
+    r"""Captures in groups of K phases 2πq/K: harmonics m of each group over the phase.
+
+    For each group and m the channels Σ_q −sin(mφ_q) H_q and Σ_q cos(mφ_q) H_q, the real and
+    imaginary part of jΣ H_q e^{jmφ_q} = jK H_{-m} (see `thincam_jax.harmonic_otf`; m ± K are folded
+    into it). Constant and all other harmonics cancel. ValueError for an m that K phases cannot tell
+    from another: 0 < m < K/2.
+    """
+    if not orders or not all(0 < 2 * m < steps for m in orders):
+        raise ValueError(
+            f"harmonics {list(orders)} of {steps} phases; give some from 1 to {(steps - 1) // 2}, "
+            "or more phases"
+        )
+    angles = 2 * np.pi * np.outer(orders, np.arange(steps)) / steps
+    rows = np.stack([-np.sin(angles), np.cos(angles)], axis=1).reshape(-1, steps)
+    # Exact zeros: a capture with one is not used.
+    return np.kron(np.eye(groups), np.where(np.abs(rows) < 1e-12, 0.0, rows))
 
 
 def phase_pairs(groups: int) -> np.ndarray:

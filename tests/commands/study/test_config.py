@@ -141,7 +141,7 @@ FAULTS = {
     ),
     "unknown synthesis": (
         *("synthesis: separate", "synthesis: pairs", "methods[1].synthesis"),
-        ["'pairs'", "'fringe_scanning', 'phase_pairs', 'contrasts' or 'separate'"],
+        ["'pairs'", "'phase_pairs', 'harmonics', 'contrasts' or 'separate'"],
     ),
     "unknown photograph": (
         *("image: coffee", "image: coffe", "targets[1]"),
@@ -177,6 +177,16 @@ FAULTS = {
     "phases given to fringe scanning": (
         *("synthesis: separate", "synthesis: fringe_scanning", "methods[1]"),
         ["synthesis fringe_scanning sets the phases itself; drop 'phases'"],
+    ),
+    "harmonics that so few phases cannot tell": (
+        BASE[BASE.index("synthesis: separate") : BASE.index("targets:")],
+        ONE_SHOT.replace("contrasts", "harmonics\n    harmonics: [1, 4]"),
+        *("methods[1].harmonics", ["8 steps tell 1 to 3 apart; give some of them, each once"]),
+    ),
+    "harmonics of another synthesis": (
+        "synthesis: separate",
+        "synthesis: separate\n    harmonics: [1]",
+        *("methods[1].harmonics", ["synthesis separate has none; drop it"]),
     ),
     "contrasts of one capture": (
         *(BASE[BASE.index("synthesis: separate") : BASE.index("targets:")], ONE_SHOT, "methods[1]"),
@@ -260,6 +270,8 @@ FAULTS = {
 
 # The line is that of the changed text where nothing else is said.
 LINES = {
+    "harmonics that so few phases cannot tell": "harmonics: [1",
+    "harmonics of another synthesis": "harmonics: [1",
     "unknown photograph": "- name: picture",
     "phases given to fringe scanning": "- name: wiener",
     "contrasts of one capture": "- name: wiener",

@@ -84,12 +84,19 @@ def as_method(config: CamerasConfig, method: MethodConfig) -> Method:
             shot.width or config.mask.width,
             shot.exposure,
             shot.take or 1,
+            shot.profile,
         )
         for shot in method.shots
         for phase in phases
     )
     return Method(
-        method.name, method.kind, method.synthesis, exposures, len(phases), method.variation
+        method.name,
+        method.kind,
+        method.synthesis,
+        exposures,
+        len(phases),
+        method.variation,
+        method.harmonics,
     )
 
 

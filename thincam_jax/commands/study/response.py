@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from thincam_jax.commands.study.study import Exposure, Method, Study, synthesis_matrix
+from thincam_jax.commands.study.study import Exposure, Method, Study
 from thincam_jax.imaging.metrics import cut_off, first_common_zero
 from thincam_jax.lensless.psf import otf
 
@@ -28,7 +28,8 @@ def method_response(study: Study, method: Method) -> Response:
     """The response with the finite mask, for a point on the axis, and its limits.
 
     - First zero crossing: the lowest frequency that no shot of the method carries. A fringe-scanned
-      response is real once its carrier e^{jX} is taken off. Every other response swings with its
+      response is real once its carrier e^{jX} is taken off, and so is a harmonic's without its
+      e^{jX/m}. Every other response swings with its
       carrier, sin X − cos X for a phase pair: its notches are narrower than the sensor can tell
       apart, no frequency band is missing, and there is no first zero (None).
     - Cut-off: where the magnitude stays under 5 % of its low-frequency value.
@@ -41,8 +42,10 @@ def method_response(study: Study, method: Method) -> Response:
         # A frequency on the reference plane is ratio times higher on this shot's sensor.
         power = np.sum(np.abs(channels) ** 2, axis=0)
         powers.append(np.interp(frequency * ratio, frequency, power, right=0.0))
-        if method.synthesis == "fringe_scanning":
-            response = _without_carrier(study, shot, frequency, channels)
+        orders = (1,) if method.synthesis == "fringe_scanning" else method.harmonics
+        parts = channels[0::2] + 1j * channels[1::2] if orders else ()
+        for order, part in zip(orders, parts, strict=True):
+            response = _without_carrier(study, shot, frequency, part, order)
             signed.append(np.interp(frequency * ratio, frequency, response, right=0.0))
     magnitude = np.sqrt(np.mean(powers, axis=0))
     limit = cut_off(frequency, magnitude)
@@ -71,7 +74,7 @@ def _groups(study: Study, method: Method) -> list[tuple[Exposure, np.ndarray]]:
     profiles = np.stack([_profile(study, exposure) for exposure in method.exposures])
     if method.synthesis == "contrasts":
         return [(method.shots[0], method.synthesis_matrix @ profiles)]
-    single = synthesis_matrix(method.synthesis, 1, method.phases)
+    single = method.weights(1)
     each = profiles.reshape(len(method.shots), method.phases, -1)
     return [(shot, single @ own) for shot, own in zip(method.shots, each, strict=True)]
 
@@ -90,9 +93,8 @@ def _profile(study: Study, exposure: Exposure) -> np.ndarray:
 
 
 def _without_carrier(
-    study: Study, shot: Exposure, u: np.ndarray, channels: np.ndarray
+    study: Study, shot: Exposure, u: np.ndarray, channel: np.ndarray, order: int
 ) -> np.ndarray:
-    """A fringe-scanned response over e^{jX}, X = π²u²/β on the sensor: real, cos(πλdu²)."""
+    """A response of a harmonic m over e^{jX/m}, X = π²u²/β on the sensor: real, cos(πλdu²)."""
     beta = shot.beta / (1 + shot.distance / study.object_distance) ** 2
-    scanned = channels[0] + 1j * channels[1]
-    return (scanned * np.exp(-1j * math.pi**2 * u**2 / beta)).real
+    return np.real(channel * np.exp(-1j * math.pi**2 * u**2 / (order * beta)))

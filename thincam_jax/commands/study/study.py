@@ -20,7 +20,7 @@ from thincam_jax.commands.sections import (
 from thincam_jax.imaging.scene import ImagePlane
 from thincam_jax.imaging.sensor import AbstractNoise, Sensor
 from thincam_jax.lensless.camera import LenslessCamera
-from thincam_jax.lensless.masks.fza import FresnelZoneAperture, edge_frequency
+from thincam_jax.lensless.masks.fza import FresnelZoneAperture, Profile, edge_frequency
 from thincam_jax.lensless.method import Model
 from thincam_jax.lensless.psf import psf
 from thincam_jax.lensless.sampling import unresolved
@@ -38,6 +38,7 @@ class Exposure(NamedTuple):
     - `distance`: mask to sensor, mm; `wavelength`: mm.
     - `share`: of the sensor's exposure time.
     - `take`: counts the exposures of a method that are equal in all else.
+    - `profile`: of the mask; None is that of the study.
     """
 
     beta: float
@@ -47,6 +48,7 @@ class Exposure(NamedTuple):
     width: float
     share: float = 1.0
     take: int = 1
+    profile: Profile | None = None
 
 
 class Capture(NamedTuple):
@@ -61,7 +63,7 @@ class Method:
     """A reconstruction and the exposures that it takes, in the order of its synthesis.
 
     - `phases`: how many exposures each shot has.
-    - `variation`: of admm_tv.
+    - `variation`: of admm_tv. `harmonics`: of the synthesis of that name.
     """
 
     name: str
@@ -70,6 +72,7 @@ class Method:
     exposures: tuple[Exposure, ...]
     phases: int
     variation: VariationConfig | None = None
+    harmonics: tuple[int, ...] = ()
 
     @property
     def shots(self) -> tuple[Exposure, ...]:
@@ -84,7 +87,13 @@ class Method:
     @property
     def synthesis_matrix(self) -> np.ndarray:
         """Real weights (channel, exposure)."""
-        return synthesis_matrix(self.synthesis, len(self.shots), self.phases)
+        return self.weights(len(self.shots))
+
+    def weights(self, shots: int) -> np.ndarray:
+        """Real weights (channel, exposure) of so many of its shots."""
+        if self.synthesis == "harmonics":
+            return syntheses.harmonics(shots, self.phases, self.harmonics)
+        return synthesis_matrix(self.synthesis, shots, self.phases)
 
 
 def synthesis_matrix(synthesis: Synthesis, shots: int, phases: int) -> np.ndarray:
@@ -166,6 +175,7 @@ class Study:
     def camera(self, exposure: Exposure) -> LenslessCamera:
         """The camera of an exposure."""
         mask, sensor = {**dict(self.mask), "width": exposure.width}, dict(self.sensor)
+        mask["profile"] = exposure.profile or self.mask.profile
         for level in ("exposure", "electrons"):
             sensor[level] = sensor[level] and sensor[level] * exposure.share
         aperture = FresnelZoneAperture(exposure.beta, exposure.phase, **mask)
