@@ -19,6 +19,9 @@ from thincam_jax.waveguide.rays import RayStatus as RayStatus
 from thincam_jax.waveguide.rays import check_screen as check_screen
 from thincam_jax.waveguide.rays import pixel_centres as pixel_centres
 from thincam_jax.waveguide.rays import trace as trace
+from thincam_jax.waveguide.screen_to_sensor import GhostImages as GhostImages
+from thincam_jax.waveguide.screen_to_sensor import ghost_images as ghost_images
+from thincam_jax.waveguide.screen_to_sensor import ghost_psfs as ghost_psfs
 from thincam_jax.waveguide.smear import SmearedRays as SmearedRays
 from thincam_jax.waveguide.smear import trace_band as trace_band
 from thincam_jax.waveguide.system import ObjectPlane as ObjectPlane

@@ -76,15 +76,9 @@ def trace(
     """
     checks.at_least_one({"orders": orders})
     screen, distance = camera.screen, checks.positive("object_distance", object_distance, "mm")
-    across, wavelength, guided, left, fault = bragg_rays(camera, pixels)
-    bounce = guided / jnp.sqrt(jnp.where(left > 0, left, 1))[..., None]
-    crossing = shift(across, screen.glass_index(wavelength))
-    width = screen.glass_thickness
-    slope = shift(across, jnp.ones_like(wavelength))
-    top = camera.lens_distance * slope + width * crossing
-    odd = 2 * jnp.arange(orders, dtype=top.dtype) + 1
-    bottom = top + jnp.expand_dims(odd, range(1, top.ndim + 1)) * width * bounce
-    ended = bottom + width * crossing + distance * slope
+    found = bragg_rays(camera, pixels)
+    across, wavelength, guided, _, fault = found
+    top, bottom, ended = object_points(camera, found, distance, orders)
 
     on_top = True if screen.top is None else screen.top.holds(top)
     on_bottom = True if screen.bottom is None else screen.bottom.holds(bottom)
@@ -99,7 +93,7 @@ def trace(
         # Only contacts with the hologram take a part of the light away.
         contacts = jnp.asarray(on_bottom).astype(int)
         weight = jnp.take_along_axis(weight, jnp.cumsum(contacts, axis=0) - contacts, axis=0)
-    end = camera.focal_distance + camera.lens_distance + width + distance
+    end = camera.focal_distance + camera.lens_distance + screen.glass_thickness + distance
     points = jnp.concatenate(
         [ended, jnp.broadcast_to(end, (*ended.shape[:-1], 1)).astype(ended.dtype)], axis=-1
     )
@@ -147,6 +141,29 @@ def bragg_rays(camera: SeeThroughCamera, pixels: Float[Array, "*pixel 2"]) -> Br
     ):
         fault = jnp.where(sound, fault, int(status))
     return BraggRays(across, wavelength, guided, left, fault)
+
+
+class Path(NamedTuple):
+    """Where rays meet the top hologram, (*pixel, 2), the bottom one and the object's plane, (order,
+    *pixel, 2), (x, y) mm."""
+
+    top: Float[Array, "*pixel 2"]
+    bottom: Float[Array, "order *pixel 2"]
+    ended: Float[Array, "order *pixel 2"]
+
+
+def object_points(
+    camera: SeeThroughCamera, rays: BraggRays, distance: Float[Array, ""], orders: int
+) -> Path:
+    """From the lens to the object, for each order."""
+    width = camera.screen.glass_thickness
+    bounce = rays.guided / jnp.sqrt(jnp.where(rays.left > 0, rays.left, 1))[..., None]
+    crossing = shift(rays.across, camera.screen.glass_index(rays.wavelength))
+    slope = shift(rays.across, jnp.ones_like(rays.wavelength))
+    top = camera.lens_distance * slope + width * crossing
+    odd = 2 * jnp.arange(orders, dtype=top.dtype) + 1
+    bottom = top + jnp.expand_dims(odd, range(1, top.ndim + 1)) * width * bounce
+    return Path(top, bottom, bottom + width * crossing + distance * slope)
 
 
 def shift(tangential: Float[Array, "*#ray 2"], index: Float[Array, "*#ray"]):
