@@ -12,7 +12,6 @@ from jaxtyping import Array, Complex
 from thincam_jax._core.checks import Number
 from thincam_jax._core.grids import Grid
 from thincam_jax.lensless.camera import LenslessCamera
-from thincam_jax.lensless.masks.base import require_zone_orders
 from thincam_jax.lensless.masks.fza import FresnelZoneAperture
 from thincam_jax.lensless.method import Model
 from thincam_jax.lensless.psf import otf
@@ -43,7 +42,7 @@ def harmonic_otf(
     """
     if int(harmonic) != harmonic or harmonic < 0:
         raise ValueError(f"harmonic = {harmonic!r}; give a whole number from 0 on")
-    orders = require_zone_orders(_with_phase(camera, 0.0).mask, model).orders
+    orders = _zone_plate(camera).orders
     steps = max(orders) - min(orders) + int(harmonic) + 1
     given = (wavelength, object_distance, model, pixel_integration, None)
     turns = np.arange(steps) / steps
@@ -113,10 +112,15 @@ def _otf(camera, wavelength, object_distance, model, pixel_integration, grid):
 
 def _with_phase(camera: LenslessCamera, turns: float) -> LenslessCamera:
     """The camera with another phase of its mask, in turns."""
+    phase = jnp.full_like(_zone_plate(camera).phase, 2 * jnp.pi * turns)
+    return eqx.tree_at(lambda c: c.mask.phase, camera, phase)
+
+
+def _zone_plate(camera: LenslessCamera) -> FresnelZoneAperture:
+    """The camera's mask, which has a phase."""
     mask = camera.mask
     if not isinstance(mask, FresnelZoneAperture):
         raise TypeError(
             f"phases are those of a FresnelZoneAperture; the camera has a {type(mask).__name__}"
         )
-    phase = jnp.full_like(mask.phase, 2 * jnp.pi * turns)
-    return eqx.tree_at(lambda c: c.mask.phase, camera, phase)
+    return mask

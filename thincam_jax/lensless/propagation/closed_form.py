@@ -65,7 +65,7 @@ def harmonic_response(
     The odd ones are so to all orders, since 0 is the only even order of the binary profile, and
     share their zeros. The even ones, which the geometric shadow lacks, are largest there.
     """
-    zones = require_continuous(require_zone_orders(mask, "closed_form"), "closed_form")
+    zones = require_zone_orders(mask, "closed_form")
     orders = zones.orders
     found = [
         (orders.index(low + harmonic), place)
