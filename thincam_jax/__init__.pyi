@@ -45,7 +45,9 @@ from .lensless.psf import otf as otf
 from .lensless.psf import psf as psf
 from .lensless.sampling import SamplingWarning as SamplingWarning
 from .lensless.separable_operator import separable_operator as separable_operator
+from .measured.calibration import calibrate_separable as calibrate_separable
 from .measured.calibration import fit_psf as fit_psf
+from .measured.calibration import fit_separable as fit_separable
 from .reconstruction import AdmmTV as AdmmTV
 from .reconstruction import Cameras as Cameras
 from .reconstruction import Fista as Fista

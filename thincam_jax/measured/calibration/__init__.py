@@ -20,6 +20,9 @@ from thincam_jax.measured.calibration.registration import (
 from thincam_jax.measured.calibration.screen_fit import GhostPositions as GhostPositions
 from thincam_jax.measured.calibration.screen_fit import ScreenFit as ScreenFit
 from thincam_jax.measured.calibration.screen_fit import fit_screen as fit_screen
+from thincam_jax.measured.calibration.separable import SeparableFit as SeparableFit
+from thincam_jax.measured.calibration.separable import calibrate_separable as calibrate_separable
+from thincam_jax.measured.calibration.separable import fit_separable as fit_separable
 from thincam_jax.measured.calibration.system_matrix import matrix_blocks as matrix_blocks
 from thincam_jax.measured.calibration.system_matrix import read_matrix as read_matrix
 from thincam_jax.measured.calibration.system_matrix import recover_matrix as recover_matrix

@@ -1,0 +1,139 @@
+"""FlatCam from stripes, Hadamard stripes and known images: noise, scale, sign, second terms."""
+
+import functools
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from helpers import relative_l2
+from thincam_jax.imaging.operators import Separable, centred
+from thincam_jax.measured.calibration.hadamard import hadamard_pattern
+from thincam_jax.measured.calibration.separable import calibrate_separable, fit_separable
+
+SENSOR, FIELD = (22, 27), (8, 16)
+
+
+@functools.cache
+def camera(terms=1, overfills=True):
+    """Of binary codes: with two terms the mask (1 + c dᵀ)/2, which may end on the sensor."""
+    rng = np.random.default_rng(4)
+
+    def shadows(size, scene):
+        places = np.arange(size)[:, None] - np.arange(scene) + scene
+        codes = [2.0 * rng.integers(0, 2, size + scene + 1) - 1]
+        uniform = np.ones(size + scene + 1)
+        if not overfills:
+            uniform[[*range(scene + 4), *range(size - 3, size + scene + 1)]] = 0
+        return np.stack([code[places] for code in [*codes, uniform][:terms]]) / size**0.5
+
+    return Separable(shadows(SENSOR[0], FIELD[0]), shadows(SENSOR[1], FIELD[1]))
+
+
+def stripes(operator, signs=lambda n: np.eye(n)):
+    """Captures of each row and of each column, or of patterns of them."""
+    m, n = FIELD
+    return [
+        np.asarray(operator(jnp.asarray(images)))
+        for images in (
+            np.repeat(signs(m)[:, :, None], n, axis=2),
+            np.repeat(signs(n)[:, None, :], m, axis=1),
+        )
+    ]
+
+
+def hadamard(n):
+    return np.stack([hadamard_pattern(k, (n, 1))[:, 0] for k in range(n)]).astype(float)
+
+
+def difference(found, truth):
+    """Of the products, since P and Q have a common scale."""
+    pairs = [np.einsum("kym,kxn->ymxn", o.left, o.right) for o in (found, truth)]
+    return relative_l2(*pairs)
+
+
+@pytest.mark.parametrize("shown", ["stripes", "hadamard"])
+def test_stripes_give_the_camera(shown):
+    """Exactly without noise, sign and scale included; in whole counts and float32 too."""
+    captures = stripes(camera(), hadamard if shown == "hadamard" else np.eye)
+    found = calibrate_separable(*captures, shown=shown)
+    assert difference(found.operator, camera()) < 1e-12
+    assert found.residual < 1e-7 and found.status == "ok" and not found.reason
+    single = calibrate_separable(*(c.astype(np.float32) for c in captures), shown=shown)
+    assert single.operator.left.dtype == jnp.float32
+    assert difference(single.operator, camera()) < 1e-5
+
+
+def test_the_shared_factor_holds_where_single_stripes_drown():
+    """And Hadamard stripes less than single ones, by about 2/√n for ±1 from two frames."""
+    rng = np.random.default_rng(1)
+    noise = 3 * np.std(stripes(camera())[0])
+
+    def noisy(signs):
+        return [c + noise * rng.normal(size=c.shape) for c in stripes(camera(), signs)]
+
+    single, several = noisy(np.eye), noisy(hadamard)
+    together = calibrate_separable(*single)
+    assert not together.reason
+    alone = []
+    for stack in (single[0], np.swapaxes(single[1], 1, 2)):
+        parts = [np.linalg.svd(c, full_matrices=False) for c in stack]
+        signs = [np.sign(v[0] @ parts[0][2][0]) for _, _, v in parts]
+        alone.append(
+            np.stack(
+                [k * u[:, 0] * s[0] for k, (u, s, _) in zip(signs, parts, strict=True)], axis=1
+            )
+        )
+    clean = [np.asarray(part[0]) for part in (camera().left, camera().right)]
+    ours = [np.asarray(part[0]) for part in (together.operator.left, together.operator.right)]
+    for mine, theirs, truth in zip(ours, alone, clean, strict=True):
+        assert off(mine, truth) < 0.9 * off(theirs, truth)
+    found = calibrate_separable(*several, shown="hadamard").operator
+    assert difference(found, camera()) < 0.6 * difference(together.operator, camera())
+
+
+def off(found, truth):
+    """Relative difference at the best scale."""
+    scale = np.sum(found * truth) / np.sum(found**2)
+    return np.linalg.norm(scale * found - truth) / np.linalg.norm(truth)
+
+
+@pytest.mark.parametrize("overfills", [True, False])
+def test_centring_is_right_only_if_the_shadow_overfills_the_sensor(overfills):
+    """Else a term is left; that is told, and two terms that are fitted have it."""
+    truth = camera(2, overfills)
+    plain = calibrate_separable(*stripes(truth))
+    assert "centre the captures" in plain.reason
+    rows, columns = (np.asarray(centred(jnp.asarray(c))) for c in stripes(truth))
+    found = calibrate_separable(rows, columns)
+    assert (not found.reason) == overfills
+    assert (difference(found.operator, truth.centred()) < 1e-10) == overfills
+
+
+def test_known_images_give_all_terms():
+    """From a camera that is a little off."""
+    truth, rng = camera(2, False), np.random.default_rng(2)
+    images = jnp.asarray(rng.uniform(size=(6, *FIELD)))
+    captures = truth(images)
+    near = [part * (1 + 0.1 * rng.normal(size=part.shape)) for part in (truth.left, truth.right)]
+    start = Separable(*near)
+    found = fit_separable(images, captures, start, tolerance=1e-9)
+    assert found.residual < 1e-4
+    assert difference(found.operator, truth) < 1e-2 * difference(start, truth)
+    few = fit_separable(images, captures, start, iterations=1)
+    assert few.status == "iterations_exhausted" and few.residual > found.residual
+
+
+def test_bad_input():
+    rows, columns = stripes(camera())
+    with pytest.raises(ValueError, match=r"shapes \(8, 22, 27\) and \(0, 22, 27\); give"):
+        calibrate_separable(rows, columns[:0])
+    with pytest.raises(ValueError, match="the captures are dark"):
+        calibrate_separable(0 * rows, 0 * columns)
+    with pytest.raises(ValueError, match="no power of two"):
+        calibrate_separable(rows[1:], columns, shown="hadamard")
+    images = jnp.ones((2, *FIELD))
+    with pytest.raises(ValueError, match="2 images do not tell one camera"):
+        fit_separable(images, camera()(images), camera())
+    with pytest.raises(ValueError, match=r"the camera takes \(j, 8, 16\)"):
+        fit_separable(images, images, camera())
