@@ -8,11 +8,17 @@ import optax
 import pytest
 
 import thincam_jax as tc
+from thincam_jax.learn.refocusing.baselines import wiener
 from thincam_jax.learn.refocusing.cameras import RefocusCamera
 from thincam_jax.learn.refocusing.dead_leaves import dead_leaves
+from thincam_jax.learn.refocusing.evaluation import (
+    flat_scene,
+    scores,
+    sub_aperture_capture,
+)
 from thincam_jax.learn.refocusing.lens_blur import lens_blur
 from thincam_jax.learn.refocusing.loss import loss
-from thincam_jax.learn.refocusing.network import NetworkOptions, RefocusNetwork
+from thincam_jax.learn.refocusing.network import NetworkOptions, RefocusNetwork, explain
 from thincam_jax.learn.refocusing.planes import Planes
 from thincam_jax.learn.refocusing.scenes import Scene, SceneOptions, captured, draw_batch
 from thincam_jax.lensless.forward import imaging_operator
@@ -104,13 +110,36 @@ def test_batches_are_those_of_their_key(camera, images):
     assert np.all((batch.distance > 49) & (batch.distance < 201))
     for n, distance in enumerate(batch.commanded):
         np.testing.assert_allclose(batch.target(camera, distance)[n], batch.image[n], atol=1e-9)
-    only = draw(camera, images, distances=(60.0, 120.0))
-    assert set(np.round(np.asarray(only.commanded), 6)) <= {60.0, 120.0}
 
 
+def test_untrained_it_renders_the_linear_estimate_of_all_planes(camera, images):
+    """What a lens sees of the estimate, in the capture's unit and with its light."""
+    network = RefocusNetwork.create(camera, SMALL, key=jax.random.key(0))
+    batch = draw(camera, images)
+    distances = jnp.asarray([60.0, 120.0])
+    sweep = network.sweep(batch.capture, distances, batch.deviation)
+    assert sweep.shape == (2, 2, *SHAPE)
+    # A bright capture beside another changes nothing, and its own image is as much brighter.
+    gains = jnp.asarray([1.0, 100.0])
+    brighter = batch.capture * gains[:, None, None]
+    scaled = network.sweep(brighter, distances, gains * batch.deviation)
+    np.testing.assert_allclose(scaled, sweep * gains[:, None, None], rtol=1e-4, atol=1e-4)
+    one = explain(network, batch.capture[0], batch.deviation[0])
+    difference = camera.inverse_distances - 1 / distances[0]
+    blurred = lens_blur(one.stack, camera.defocus_radius(difference), camera.largest_blur)
+    np.testing.assert_allclose(sweep[0, 0], one.mean * jnp.sum(blurred, axis=0), atol=1e-9)
+    mean = jnp.mean(batch.all_in_focus[0])
+    assert abs(float(one.mean / mean) - 1) < 0.3
+    # The stack explains the capture, up to what the linear estimate shrinks.
+    assert float(jnp.std(one.residual)) < 0.2 * float(jnp.std(one.capture))
+
+
+@pytest.mark.thorough
 def test_a_network_is_trained_and_explains_its_captures(camera, images):
     network = RefocusNetwork.create(camera, SMALL, key=jax.random.key(0))
-    batch = draw(camera, images, snr_db=(40.0, 40.0), poisson=0.0, layers=(1.0, 0.0, 0.0))
+    only: dict = {"distances": (60.0, 120.0)}
+    batch = draw(camera, images, snr_db=(40.0, 40.0), poisson=0.0, layers=(1.0, 0.0, 0.0), **only)
+    assert set(np.round(np.asarray(batch.commanded), 6)) <= {60.0, 120.0}
     step, state = make_step(network)
     weights, losses = network.weights, []
     for _ in range(12):
@@ -128,6 +157,37 @@ def test_a_network_is_trained_and_explains_its_captures(camera, images):
     scaled = trained.focus(100 * batch.capture[1], 120.0, 100 * batch.deviation[1])
     np.testing.assert_allclose(scaled, 100 * alone, atol=1e-5)
     assert np.all(trained.consistency(batch.capture, batch.deviation) < 10)
+
+
+def test_a_simulator_by_parts_of_the_mask_agrees_where_nothing_is_hidden(camera):
+    """It shares the optics; what is hidden it finds another way."""
+    rng = np.random.default_rng(3)
+    picture, cover = rng.uniform(size=SHAPE), np.zeros(SHAPE)
+    cover[10:20, 8:18] = 1
+    alone = flat_scene(camera, [picture], [np.ones(SHAPE)], [80.0])
+    by_parts = sub_aperture_capture(camera, alone, 3)
+    clean = captured(camera, alone.emission(camera), alone.inverse)
+    np.testing.assert_allclose(by_parts, clean, atol=1e-9 * float(clean.max()))
+    # An even scene behind a black screen: the light that passes is about the same.
+    both = flat_scene(camera, [0 * picture, 1 + 0 * picture], [cover, np.ones(SHAPE)], [60, 150.0])
+    by_parts = sub_aperture_capture(camera, both, 3)
+    clean = captured(camera, both.emission(camera), both.inverse)
+    np.testing.assert_allclose(by_parts.sum(), clean.sum(), rtol=5e-3)
+    assert float(jnp.max(jnp.abs(by_parts - clean))) < 0.05 * float(clean.max())
+
+
+def test_the_wiener_filter_finds_its_plane(camera):
+    """Focused where the scene stands it is closest to it, and its mean is the scene's."""
+    planes = Planes(camera)
+    picture = dead_leaves(5, 1, 32)[0][:, : SHAPE[1]]
+    scene = flat_scene(camera, [picture], [np.ones(SHAPE)], [60.0])
+    clean = captured(camera, scene.emission(camera), scene.inverse)
+    deviation = jnp.asarray(1e-3 * float(clean.mean()))
+    found = {
+        t: scores(wiener(planes, clean, deviation, jnp.asarray(t)), picture)["psnr"]
+        for t in (60.0, 100.0)
+    }
+    assert found[60.0] > found[100.0] + 3
 
 
 def make_step(network):

@@ -122,10 +122,13 @@ class RefocusCamera(eqx.Module):
 
         From the exact PSF of each, on its `support`; the distances may be traced.
         """
-        grid = self.camera.sensor.grid.with_shape(self.support)
-        kernels = jax.vmap(lambda t: self._psf(t, grid))(distances)
         pitch, shape = self.camera.sensor.pitch, self.camera.sensor.shape
-        return CropConvolution(kernels, pitch, shape, self.field_shape, summed=1)
+        return CropConvolution(self.kernels(distances), pitch, shape, self.field_shape, summed=1)
+
+    def kernels(self, distances: Float[Array, " plane"]) -> Float[Array, "plane k l"]:
+        """The PSFs at these distances, mm, on `support` pixels."""
+        grid = self.camera.sensor.grid.with_shape(self.support)
+        return jax.vmap(lambda t: self._psf(t, grid))(distances)
 
     def _support(self) -> tuple[int, int]:
         whole = kernel_shape(self.camera.sensor.shape, self.field_shape)

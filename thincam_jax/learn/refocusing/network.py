@@ -168,7 +168,7 @@ def explain(
     scale = 1 / (unit * jnp.where(mean > 0, mean, 1))
     capture, sigma = capture * scale, deviation * scale
     variance = sigma**2
-    level = jnp.log10(variance + 1e-8) / 2
+    level = noise_level(sigma)
 
     # A uniform scene first: its light is most of the capture, and not in the learnt powers.
     estimate = jnp.full((spectra.shape[0], *sizes.field_shape), 1 / spectra.shape[0], dtype)
@@ -182,7 +182,7 @@ def explain(
         solved = target + linear(residual, spectra, variance, sizes)
         noisy = planes.on_field(solved) + dual
         total = jnp.sum(noisy, axis=0, keepdims=True)
-        told = _constant(noisy, level, step / len(weights.linear))
+        told = constant_images(noisy, level, step / len(weights.linear))
         estimate = noisy + weights.prior(jnp.concatenate([noisy, total, told]))
         if step + 1 < len(weights.linear):
             dual = weights.dual[step].astype(dtype) * (noisy - estimate)
@@ -228,9 +228,9 @@ def focused(
 
     sharp = 1 + inverted(on_capture, explained.capture - uniform)
     missing = inverted(on_residual, explained.residual)
-    level = jnp.log10(variance + 1e-8) / 2
+    level = noise_level(explained.deviation)
     total = jnp.sum(explained.stack, axis=0)
-    told = _constant(relative, level)
+    told = constant_images(relative, level)
     parts = [relative, rendered[None], front[None], total[None], sharp, missing, told]
     return rendered + weights.focus(jnp.concatenate(parts))[0]
 
@@ -252,8 +252,8 @@ def mapped(network: RefocusNetwork, explained: Explained) -> Maps:
     """All in focus, and the distance of each pixel."""
     stack = explained.stack
     total = jnp.sum(stack, axis=0)
-    level = jnp.log10(explained.deviation**2 + 1e-8) / 2
-    parts = [stack, total[None], _constant(stack, level)]
+    level = noise_level(explained.deviation)
+    parts = [stack, total[None], constant_images(stack, level)]
     out = network.weights.maps(jnp.concatenate(parts))
     share = jax.nn.softmax(out[1:-1], axis=0)
     return Maps(total + out[0], share, jax.nn.softplus(out[-1]) + 0.02)
@@ -269,7 +269,12 @@ def sizes_of(planes: Planes) -> Sizes:
     return Sizes(planes.window, planes.operator.field_shape, rows * columns)
 
 
-def _constant(like, *values) -> Float[Array, "value y x"]:
+def noise_level(deviation: Float[Array, ""]) -> Float[Array, ""]:
+    """What a U-Net is told of the noise: log₁₀ of its deviation, in units of the scene's mean."""
+    return jnp.log10(deviation**2 + 1e-8) / 2
+
+
+def constant_images(like, *values) -> Float[Array, "value y x"]:
     """Constant images."""
     shape = like.shape[-2:]
     return jnp.stack([jnp.broadcast_to(jnp.asarray(v, like.dtype), shape) for v in values])

@@ -18,10 +18,16 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 
 from thincam_jax.learn.refocusing.cameras import RefocusCamera
-from thincam_jax.learn.refocusing.layouts import random_cover, random_relief
+from thincam_jax.learn.refocusing.layouts import (
+    COVER_NUMBERS,
+    RELIEF_NUMBERS,
+    random_cover,
+    random_relief,
+)
 from thincam_jax.learn.refocusing.lens_blur import lens_blur
 
 LAYERS = 3
@@ -51,6 +57,9 @@ class SceneOptions(NamedTuple):
 
 
 DEFAULT = SceneOptions()
+# Uniform random numbers of a layer: of its picture, its cover, its relief, and where it stands.
+_CUT, _LAYER = 8, 5
+_NUMBERS = (_CUT, COVER_NUMBERS, RELIEF_NUMBERS)
 
 
 class Scene(eqx.Module):
@@ -146,36 +155,31 @@ def draw_scene(
     options: SceneOptions = DEFAULT,
 ) -> Scene:
     """A random scene of pictures cut out of `images` anywhere, at any scale."""
-    keys = jax.random.split(key, 6)
-    images = jnp.asarray(images)
     dtype, shape = camera.near.dtype, camera.field_shape
-    number = 1 + jax.random.categorical(keys[0], jnp.log(jnp.asarray(options.layers)))
-    cuts = jax.random.split(keys[1], LAYERS)
-    radiance = jnp.stack([_cut_out(k, images, shape) for k in cuts]).astype(dtype)
-    covers = [random_cover(k, shape) for k in jax.random.split(keys[2], LAYERS - 1)]
-    cover = jnp.stack([*covers, jnp.ones(shape)]).astype(dtype)
-    behind = jnp.where((number > 1) & jax.random.bernoulli(keys[3], options.dark), 0.0, 1.0)
+    drawn = jax.random.uniform(key, (LAYERS, sum(_NUMBERS) + _LAYER), dtype)
+    cut, cover, relief, layer = jnp.split(drawn, np.cumsum(_NUMBERS), axis=1)
+    images = jnp.asarray(images, dtype)
+    radiance = jax.vmap(lambda n: _cut_out(n, images, shape))(cut)
+    cover = jax.vmap(lambda n: random_cover(n, shape))(cover).at[-1].set(1)
     # Of `number` layers the last ones are there.
-    there = (jnp.arange(LAYERS) >= LAYERS - number).astype(dtype).at[-1].set(behind.astype(dtype))
-    cover = cover * there[:, None, None]
-    inverse, share = _depths(keys[4], camera, options)
-    return Scene(radiance, cover, share, inverse)
+    number = 1 + jnp.sum(layer[0, 0] > np.cumsum(options.layers)[:-1] / sum(options.layers))
+    there = (jnp.arange(LAYERS) >= LAYERS - number).astype(dtype)
+    is_dark = (number > 1) & (layer[0, 1] < options.dark)
+    there = there.at[-1].set(jnp.where(is_dark, 0, 1).astype(dtype))
+    inverse, share = _depths(layer[:, 2:], relief, camera, options)
+    return Scene(radiance, cover * there[:, None, None], share, inverse)
 
 
-def _depths(key, camera: RefocusCamera, options: SceneOptions):
+def _depths(layer, relief, camera: RefocusCamera, options: SceneOptions):
     """1/t of the parts, nearer layers in front, and the share of each pixel in them."""
-    where, is_relief, amount, relief = jax.random.split(key, 4)
     near, far, dtype = 1 / camera.near, 1 / camera.far, camera.near.dtype
-    middle = _drawn_inverse(where, camera, options, (LAYERS,))
-    middle = jnp.sort(middle)[::-1]
-    size = jax.random.uniform(amount, (LAYERS,), dtype) * options.depth * (near - far)
-    size = jnp.where(jax.random.bernoulli(is_relief, options.relief, (LAYERS,)), size, 0)
-    if options.distances is not None:
-        size = jnp.zeros_like(size)
+    middle = jnp.sort(_inverse_of(layer[:, 0], camera, options))[::-1]
+    size = layer[:, 1] * options.depth * (near - far)
+    chance = options.relief if options.distances is None else 0.0
+    size = jnp.where(layer[:, 2] < chance, size, 0)
     offsets = jnp.linspace(-1, 1, PARTS, dtype=dtype)
     inverse = jnp.clip(middle[:, None] + size[:, None] * offsets, far, near)
-    keys = jax.random.split(relief, LAYERS)
-    maps = jnp.stack([random_relief(k, camera.field_shape) for k in keys]).astype(dtype)
+    maps = jax.vmap(lambda n: random_relief(n, camera.field_shape))(relief)
     places = offsets[:, None, None] - maps[:, None]
     share = jnp.maximum(1 - jnp.abs(places) * ((PARTS - 1) / 2), 0)
     # A flat layer is one part.
@@ -200,15 +204,17 @@ def _draw_batch(key, images, camera, options, size) -> Batch:
 
 
 def _draw_one(key, images, camera: RefocusCamera, options: SceneOptions) -> Batch:
-    at_scene, layer, anywhere, drawn, noise = jax.random.split(key, 5)
+    drawn, told, noise = jax.random.split(key, 3)
     scene = draw_scene(drawn, images, camera, options)
     emission = scene.emission(camera)
-    clean = captured(camera, emission, scene.inverse)
-    capture, deviation = _noisy(noise, clean, options)
+    numbers = jax.random.uniform(told, (5,), camera.near.dtype)
+    capture, deviation = _noisy(
+        numbers[:2], noise, captured(camera, emission, scene.inverse), options
+    )
     # What is there is as good a focus as any other distance.
-    objects = scene.inverse[jax.random.randint(layer, (), 0, LAYERS), PARTS // 2]
-    other = _drawn_inverse(anywhere, camera, options, ())
-    inverse = jnp.where(jax.random.bernoulli(at_scene), objects, other)
+    objects = scene.inverse[(LAYERS * numbers[2]).astype(int) % LAYERS, PARTS // 2]
+    other = _inverse_of(numbers[3], camera, options)
+    inverse = jnp.where(numbers[4] < 0.5, objects, other)
     return Batch(
         capture,
         deviation,
@@ -227,49 +233,45 @@ def captured(camera: RefocusCamera, emission, inverse) -> Float[Array, "y x"]:
     return operator(emission.reshape(-1, *camera.field_shape))
 
 
-def _noisy(key, clean, options: SceneOptions):
+def _noisy(numbers, key, clean, options: SceneOptions):
     """The capture with noise, and the noise's root mean square."""
-    kind, level, draw = jax.random.split(key, 3)
-    share = jax.random.uniform(level, (), clean.dtype)
+    share = numbers[0]
     low, high = options.snr_db
     gaussian = jnp.mean(clean**2) * 10 ** (-(low + (high - low) * share) / 10)
-    low, high = jnp.log(jnp.asarray(options.electrons, clean.dtype))
-    electrons = jnp.exp(low + (high - low) * share)
+    low, high = np.log(options.electrons)
+    electrons = jnp.exp(float(low) + float(high - low) * share)
     # Normal in place of Poisson numbers, which differ little from 50 electrons on.
-    mean = jnp.mean(clean)
-    shot = jnp.maximum(clean, 0) * mean / electrons
-    variance = jnp.where(jax.random.bernoulli(kind, options.poisson), shot, gaussian)
-    noise = jnp.sqrt(variance) * jax.random.normal(draw, clean.shape, clean.dtype)
+    shot = jnp.maximum(clean, 0) * jnp.mean(clean) / electrons
+    variance = jnp.where(numbers[1] < options.poisson, shot, gaussian)
+    noise = jnp.sqrt(variance) * jax.random.normal(key, clean.shape, clean.dtype)
     return clean + noise, jnp.sqrt(jnp.mean(variance))
 
 
-def _drawn_inverse(key, camera: RefocusCamera, options: SceneOptions, shape):
-    """Random 1/t, 1/mm."""
+def _inverse_of(number, camera: RefocusCamera, options: SceneOptions):
+    """1/t, 1/mm, of uniform numbers."""
     if options.distances is not None:
-        return jax.random.choice(key, 1 / jnp.asarray(options.distances, camera.near.dtype), shape)
-    share = jax.random.uniform(key, shape, camera.near.dtype)
-    return 1 / camera.far + share * (1 / camera.near - 1 / camera.far)
+        places = (len(options.distances) * number).astype(int) % len(options.distances)
+        return 1 / jnp.asarray(options.distances, camera.near.dtype)[places]
+    return 1 / camera.far + number * (1 / camera.near - 1 / camera.far)
 
 
-def _cut_out(key, images, shape):
+def _cut_out(numbers, images, shape):
     """A part of one of the images, turned, mirrored, scaled, made darker."""
-    which, zoom, place, turn, gain = jax.random.split(key, 5)
-    image = images[jax.random.randint(which, (), 0, images.shape[0])]
-    flips = jax.random.bernoulli(turn, shape=(3,))
-    image = jnp.where(flips[0], image[::-1], image)
-    image = jnp.where(flips[1], image[:, ::-1], image)
-    image = jnp.where(flips[2], image.T, image)
-    side, largest = images.shape[-1], max(shape)
+    which, zoom, gain, *turn = numbers[:6]
+    image = images[(len(images) * which).astype(int) % len(images)]
+    image = jnp.where(turn[0] < 0.5, image[::-1], image)
+    image = jnp.where(turn[1] < 0.5, image[:, ::-1], image)
+    image = jnp.where(turn[2] < 0.5, image.T, image)
+    side = images.shape[-1]
     # From the whole image to as many of its pixels as the field has, or half the image.
-    low = largest / side
+    low = max(shape) / side
     high = max(1.0, 2 * low)
-    scale = low * (high / low) ** jax.random.uniform(zoom, (), image.dtype)
+    scale = low * (high / low) ** zoom
     slack = jnp.asarray(shape, image.dtype) - scale * side  # negative: what is left to cut away
-    shift = jax.random.uniform(place, (2,), image.dtype) * slack
-    scales = jnp.stack([scale, scale])
-    out = jax.image.scale_and_translate(image, shape, (0, 1), scales, shift, "linear")
-    out = jnp.clip(out, 0, 1)
-    return out * jax.random.uniform(gain, (), image.dtype, 0.4, 1.0)
+    out = jax.image.scale_and_translate(
+        image, shape, (0, 1), jnp.stack([scale, scale]), numbers[6:8] * slack, "linear"
+    )
+    return jnp.clip(out, 0, 1) * (0.4 + 0.6 * gain)
 
 
 def _seen_past(cover):

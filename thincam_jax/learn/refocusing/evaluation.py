@@ -1,0 +1,119 @@
+"""Scenes to judge a refocusing network by, and how far an image is from them."""
+
+import itertools
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+from scipy import ndimage
+
+from thincam_jax.imaging.metrics import psnr, ssim
+from thincam_jax.imaging.operators import CropConvolution
+from thincam_jax.imaging.sensor import AbstractNoise
+from thincam_jax.learn.refocusing.cameras import RefocusCamera
+from thincam_jax.learn.refocusing.scenes import LAYERS, PARTS, Scene, captured
+
+
+def flat_scene(camera: RefocusCamera, pictures, covers, distances) -> Scene:
+    """Flat layers from the front to the back.
+
+    **Arguments**, up to three of each: `pictures` (y, x), radiance; `covers` (y, x), 0 to 1, that
+    of the last usually 1 everywhere; `distances`, mm.
+    """
+    missing = LAYERS - len(distances)
+    if missing < 0 or not len(pictures) == len(covers) == len(distances) > 0:
+        raise ValueError(
+            f"{len(pictures)} pictures, {len(covers)} covers, {len(distances)} distances; give one "
+            f"to {LAYERS} of each"
+        )
+    dtype, shape = camera.near.dtype, camera.field_shape
+    nothing = [np.zeros(shape)] * missing
+    inverse = 1 / np.asarray([*[distances[0]] * missing, *distances], float)
+    return Scene(
+        jnp.asarray(np.stack([*nothing, *pictures]), dtype),
+        jnp.asarray(np.stack([*nothing, *covers]), dtype),
+        jnp.zeros((LAYERS, PARTS, *shape), dtype).at[:, PARTS // 2].set(1),
+        jnp.asarray(np.repeat(inverse[:, None], PARTS, axis=1), dtype),
+    )
+
+
+def capture_scene(
+    camera: RefocusCamera, scene: Scene, noise: AbstractNoise, key: PRNGKeyArray
+) -> tuple[Float[Array, "y x"], Float[Array, ""]]:
+    """The capture of a scene, and the root mean square of its noise."""
+    return with_noise(captured(camera, scene.emission(camera), scene.inverse), noise, key)
+
+
+def with_noise(clean: Float[Array, "y x"], noise: AbstractNoise, key: PRNGKeyArray, electrons=None):
+    """A noise-free capture with noise, and the noise's root mean square.
+
+    `electrons`: mean number per pixel, for shot noise.
+    """
+    counted = None if electrons is None else (electrons / jnp.mean(clean)).reshape(1, 1)
+    deviation = jnp.sqrt(noise.variance(clean, counted))
+    return noise.add(key, clean, counted), deviation
+
+
+def sub_aperture_capture(
+    camera: RefocusCamera, scene: Scene, cells: int = 5
+) -> Float[Array, "y x"]:
+    """The noise-free capture of flat layers, each part of the mask with its own view.
+
+    Of the light of a point on the axis, what falls on the sensor's point Mm has come through the
+    mask at m. The PSF is cut into cells × cells parts accordingly. From m a layer in front stands
+    elsewhere before one behind: moved by d·m(1/t_front − 1/t_back) in the image. What it hides is
+    found for each cell, where a `Scene` takes the mean over the mask.
+    """
+    thin = camera.camera
+    shape, pitch = camera.field_shape, float(thin.sensor.pitch)
+    inverse = np.asarray(scene.inverse[:, PARTS // 2], float)
+    light = np.asarray(scene.radiance * scene.cover, float)
+    cover = np.asarray(scene.cover, float)
+    kernels = np.asarray(camera.kernels(jnp.asarray(1 / inverse)))
+    distance = float(thin.distance)
+    total = jnp.zeros(thin.sensor.shape, camera.near.dtype)
+    for layer, nearer in enumerate(inverse):
+        if not light[layer].any():
+            continue
+        scale = 1 + distance * nearer  # the shadow's
+        sides = [float(side) * scale for side in thin.mask.extent]
+        edges = [
+            _edges(n, pitch, side, cells) for n, side in zip(camera.support, sides, strict=True)
+        ]
+        for row, column in itertools.product(range(cells), repeat=2):
+            part = np.zeros(camera.support)
+            where = np.ix_(edges[0] == row, edges[1] == column)
+            part[where] = kernels[layer][where]
+            middles = [(n + 0.5 - cells / 2) / cells for n in (row, column)]
+            at = [m * float(side) for m, side in zip(middles, thin.mask.extent, strict=True)]
+            seen = light[layer]
+            for front in range(layer):
+                move = [distance * m * (inverse[front] - nearer) / pitch for m in at]
+                hidden = ndimage.shift(cover[front], move, order=1, mode="nearest")
+                seen = seen * (1 - hidden)
+            operator = CropConvolution(
+                jnp.asarray(part, camera.near.dtype), pitch, thin.sensor.shape, shape
+            )
+            total = total + operator(jnp.asarray(seen, camera.near.dtype))
+    return total
+
+
+def _edges(count: int, pitch: float, side: float, cells: int) -> np.ndarray:
+    """The cell of each sample along an axis; the outermost take what is beyond the shadow."""
+    x = (np.arange(count) - (count - 1) / 2) * pitch
+    return np.clip(np.floor((x / side + 0.5) * cells), 0, cells - 1).astype(int)
+
+
+def scores(image, target, region=None) -> dict[str, float]:
+    """PSNR and SSIM of an image, aligned to the target in gain and offset, whose peak is 1.
+
+    `region`: where to take the PSNR, (y, x) booleans; SSIM is that of the whole image.
+    """
+    target = np.asarray(target, float)
+    image = np.asarray(image, float) / max(target.max(), 1e-9)
+    target = target / max(target.max(), 1e-9)
+    inside = np.ones(target.shape, bool) if region is None else np.asarray(region)
+    return {
+        "psnr": psnr(image[inside][:, None], target[inside][:, None]),
+        "ssim": ssim(image, target),
+    }
