@@ -38,6 +38,9 @@ from thincam_jax.design.plate import find_plate as find_plate
 from thincam_jax.design.plate import judge_plate as judge_plate
 from thincam_jax.design.prior import PowerLaw as PowerLaw
 from thincam_jax.design.prior import fit_power_law as fit_power_law
+from thincam_jax.design.relief_files import read_height_map as read_height_map
+from thincam_jax.design.relief_files import write_height_map as write_height_map
+from thincam_jax.design.relief_files import write_stl as write_stl
 from thincam_jax.design.robust import Tolerances as Tolerances
 from thincam_jax.design.robust import robust_error as robust_error
 from thincam_jax.design.search import find_designs as find_designs
