@@ -13,7 +13,7 @@ from thincam_jax._core.grids import Grid
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.masks.base import AbstractMask
 from thincam_jax.lensless.masks.phase import PhaseMask
-from thincam_jax.lensless.method import PsfMethod
+from thincam_jax.lensless.method import Model, PsfMethod
 from thincam_jax.lensless.propagation.path import Path
 
 
@@ -68,31 +68,23 @@ def require_phase_sampling(mask: AbstractMask, grid: Grid, path: Path, method: P
     known = not any(map(checks.is_traced, jax.tree.leaves((mask, grid, path))))
     if not isinstance(mask, PhaseMask) or method.oversampling is None or not known:
         return
-    wavelength, distance, away = (
-        float(n) for n in (path.wavelength, path.distance, path.object_distance)
-    )
+    wavelength = float(path.wavelength)
     low, high = mask.material.band
     if not low <= wavelength <= high:
         raise ValueError(
             f"wavelength = {wavelength:g} mm is outside of the material's band; give {low:g} to "
             f"{high:g} mm"
         )
-    rims = np.abs(np.asarray(mask.centre)) + np.asarray([float(side) for side in mask.extent]) / 2
-    rim, pitch = float(rims.max()), float(grid.pitch)
-    lit = rim / math.hypot(away, rim) / wavelength if math.isfinite(away) else 0.0
-    if method.model == "rayleigh_sommerfeld":
-        reach = float(np.max(rims + np.asarray(grid.shape) * pitch / 2))
-        lit += reach / math.hypot(distance, reach) / wavelength
-    own = float(mask.steepest_frequency(wavelength))
-    highest = max(own, lit) if mask.interpolation == "cells" else own + lit
-    turned = 2 * pitch / method.samples * highest  # in units of π
-    if turned <= 1 + 1e-4:
+    own, highest = _frequencies(mask, grid, path, method.model)
+    pitch = float(grid.pitch)
+    enough = samples_needed(mask, grid, path, method.model)
+    if method.samples >= enough:
         return
-    enough = 2 * math.ceil((pitch * 2 * highest - 1e-4 - 1) / 2) + 1
     samples = f"samples {pitch / method.samples * 1e3:.3g} um apart"
-    if mask.interpolation == "cells" and own >= lit:
+    if mask.interpolation == "cells" and own == highest:
         fault = f"the mask's cells of {float(mask.pitch) * 1e3:.3g} um are finer than {samples}"
     else:
+        turned = 2 * pitch / method.samples * highest
         fault = (
             f"behind the mask the phase turns by up to {turned:.2g} π between {samples} "
             f"({highest:.3g} cycles/mm), which hold less than π"
@@ -101,3 +93,26 @@ def require_phase_sampling(mask: AbstractMask, grid: Grid, path: Path, method: P
         f"{fault}: give oversampling = {enough} or more, or a mask of coarser cells or gentler "
         "slopes"
     )
+
+
+def samples_needed(mask: AbstractMask, grid: Grid, path: Path, model: Model) -> int:
+    """Samples a pixel, odd, that hold the phases of a `PhaseMask`; 1 of other masks."""
+    if not isinstance(mask, PhaseMask):
+        return 1
+    turned = 2 * float(grid.pitch) * _frequencies(mask, grid, path, model)[1]
+    return 2 * math.ceil((turned - 1e-4 - 1) / 2) + 1
+
+
+def _frequencies(mask: PhaseMask, grid: Grid, path: Path, model: Model) -> tuple[float, float]:
+    """The highest local frequency that the relief makes, and that of the light, cycles/mm."""
+    wavelength, distance, away = (
+        float(n) for n in (path.wavelength, path.distance, path.object_distance)
+    )
+    rims = np.abs(np.asarray(mask.centre)) + np.asarray([float(side) for side in mask.extent]) / 2
+    rim = float(rims.max())
+    lit = rim / math.hypot(away, rim) / wavelength if math.isfinite(away) else 0.0
+    if model == "rayleigh_sommerfeld":
+        reach = float(np.max(rims + np.asarray(grid.shape) * float(grid.pitch) / 2))
+        lit += reach / math.hypot(distance, reach) / wavelength
+    own = float(mask.steepest_frequency(wavelength))
+    return own, max(own, lit) if mask.interpolation == "cells" else own + lit

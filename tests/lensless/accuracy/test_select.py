@@ -316,11 +316,12 @@ def test_traced_numbers_are_refused(call):
     assert "\n" not in str(error.value)
 
 
-def test_masks_without_zone_orders_are_refused():
+def test_predictions_are_of_masks_of_few_terms():
+    """The others have a choice of samples (test_sampled.py), and no reference to predict from."""
     mask = tc.RadialMask([1.0], 0.2)
     camera = tc.LenslessCamera(mask, tc.Sensor((8, 9), 0.1), 5.0)
     with pytest.raises(TypeError, match="of few separable terms") as error:
-        select(camera, 0.1)
+        tc.predict_error(camera, wavelength=500e-6, model="angular_spectrum")
     assert "\n" not in str(error.value)
 
 

@@ -1,6 +1,7 @@
 """The cheapest model that meets a tolerance, with its error predicted and the reasons in words."""
 
 import math
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import jax
@@ -16,6 +17,7 @@ from thincam_jax._core.precision import (
     precision_of,
 )
 from thincam_jax.lensless.accuracy.probe import MaskProbe
+from thincam_jax.lensless.accuracy.sampled import sampled_errors
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.cost import Cost, psf_cost
 from thincam_jax.lensless.digits import held_in_single
@@ -98,13 +100,22 @@ def select_model(
     `paraxial_error` and in the reasons: it is common to all the closed forms, is mostly the fringes
     far from the aperture's edges, and falls by orders of magnitude with `pixel_integration`.
 
+    Masks without few separable terms, such as phase masks, have no exact PSF. For them the choice
+    is among samples a pixel of `angular_spectrum`, by what more of them change in the mask's middle
+    (`thincam_jax.lensless.accuracy.sampled`).
+
     **Arguments**: `wavelength`, `object_distance`, `pixel_integration` and `grid` as for `psf`;
     `tolerance` > 0. Numbers must be known: call it outside of jit and grad.
 
-    **Errors**: ValueError for what is out of range; TypeError for a mask without separable terms
-    and for traced numbers.
+    **Errors**: ValueError for what is out of range; TypeError for traced numbers.
     """
     tolerance = tolerance_of(tolerance)
+    if isinstance(camera, LenslessCamera) and not _is_exact(camera.mask):
+        grid = grid or camera.sensor.grid
+        path = camera.path(wavelength, object_distance)
+        _require_known((camera, path, grid))
+        found = sampled_errors(camera.mask, grid, path, pixel_integration)
+        return _select_sampled(camera.mask, grid, found, tolerance)
     probe = probe_of(camera, wavelength, object_distance, pixel_integration, grid)
     sampling_grid = grid or camera.sensor.grid
     considered: list[Prediction] = []
@@ -153,6 +164,48 @@ def _prediction(
     return Prediction(method.model, method.precision, method.oversampling, error, cost)
 
 
+def _is_exact(mask: AbstractMask) -> bool:
+    """Whether the field of the mask has few terms, and so a PSF to compare the others with."""
+    return isinstance(mask, AbstractFactoredMask) and has_few_terms(mask)
+
+
+def _select_sampled(
+    mask: AbstractMask, grid: Grid, found: Iterator[tuple[PsfMethod, float]], tolerance: float
+) -> Selection:
+    """Among ever more samples of `angular_spectrum`, the fewest that are enough and fit."""
+    free, considered = available_bytes(), []
+    for method, error in found:
+        cost = psf_cost(mask, grid, method)
+        if considered and free is not None and cost.bytes > free:
+            break
+        considered.append(
+            Prediction(method.model, method.precision, method.oversampling, error, cost)
+        )
+        if error <= tolerance:
+            break
+    chosen = considered[-1]
+    reasons = (
+        f"a {type(mask).__name__} has no exact PSF: of 'angular_spectrum' with "
+        f"{chosen.oversampling}×{chosen.oversampling} samples a pixel, the mask's middle with more "
+        f"of them differs so that {chosen.predicted_error:.1e} is left",
+        "errors are counted from scalar diffraction without Fresnel's approximation",
+    )
+    return Selection(
+        **chosen._asdict(),
+        meets_tolerance=chosen.predicted_error <= tolerance,
+        paraxial_error=0.0,
+        reasons=reasons,
+        considered=tuple(considered),
+    )
+
+
+def _require_known(numbers) -> None:
+    if any(checks.is_traced(leaf) for leaf in jax.tree.leaves(numbers)):
+        raise TypeError(
+            "the choice of a model needs known numbers: make it outside of jit and grad"
+        )
+
+
 def tolerance_of(tolerance: float) -> float:
     """A relative error, at most 1."""
     tolerance = float(checks.positive("tolerance", tolerance, "parts of one"))
@@ -186,10 +239,7 @@ def probe_of(
     mask = require_camera(camera, "select_model")
     path = camera.path(wavelength, object_distance)
     grid = grid or camera.sensor.grid
-    if any(checks.is_traced(leaf) for leaf in jax.tree.leaves((camera, path, grid))):
-        raise TypeError(
-            "the choice of a model needs known numbers: make it outside of jit and grad"
-        )
+    _require_known((camera, path, grid))
     return MaskProbe(mask, grid, path, pixel_integration=pixel_integration)
 
 

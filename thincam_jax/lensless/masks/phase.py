@@ -111,10 +111,7 @@ class PhaseMask(AbstractMask):
 
     def sample(self, grid: Grid, wavelength: Number | None = None) -> Complex[Array, "y x"]:
         if wavelength is None:
-            raise TypeError(
-                "a PhaseMask delays light and casts no shadow without its wavelength: model "
-                "'geometric' has none; use 'angular_spectrum' or 'rayleigh_sommerfeld'"
-            )
+            raise TypeError("a PhaseMask delays light by its wavelength; give sample a wavelength")
         if self.interpolation == "cells":
             cells = turn_phasor(self.turns(wavelength))
             if self.amplitude is not None:

@@ -1,0 +1,60 @@
+"""What is predicted of a sampled PSF is at least what it is, and not far above."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import thincam_jax as tc
+from helpers import relative_l2
+from thincam_jax.lensless.masks import MaskBlank, diffuser, voronoi_fresnel
+from thincam_jax.units import nm, um
+
+WAVELENGTH = 532 * nm
+KEY = jax.random.key(11)
+BLANK = MaskBlank((40, 48), 5 * um, 1.5)
+MASKS = {
+    "diffuser": diffuser(KEY, BLANK, correlation_length=20 * um, rms_slope=0.02),
+    "lenses": voronoi_fresnel(KEY, BLANK, sites=3, focal_length=4.0, wavelength=WAVELENGTH),
+    "cells": BLANK.mask(np.random.default_rng(0).uniform(0, 1e-3, (40, 48))),
+}
+
+
+def camera(name):
+    return tc.LenslessCamera(MASKS[name], tc.Sensor((36, 40), 5 * um), 4.0)
+
+
+@pytest.mark.parametrize(
+    ("name", "average"),
+    [
+        ("diffuser", False),
+        pytest.param("lenses", True, marks=pytest.mark.thorough),
+        pytest.param("cells", False, marks=pytest.mark.thorough),
+        pytest.param("lenses", False, marks=pytest.mark.thorough),
+        pytest.param("cells", True, marks=pytest.mark.thorough),
+    ],
+)
+def test_predicted_errors_are_at_least_the_true_ones(name, average):
+    """Against 21 samples a pixel."""
+    here = camera(name)
+    light = {"wavelength": WAVELENGTH, "pixel_integration": average}
+    choice = tc.select_model(here, tolerance=0.02, **light)
+    assert choice.model == "angular_spectrum" and choice.meets_tolerance
+    best = tc.psf(here, model="angular_spectrum", oversampling=21, **light)
+    for tried in choice.considered:
+        found = tc.psf(here, model=tried.model, oversampling=tried.oversampling, **light)
+        true = relative_l2(found, best)
+        assert true < tried.predicted_error < 12 * true + 1e-6, (tried, true)
+    assert "has no exact PSF" in choice.reasons[0]
+
+
+@pytest.mark.thorough
+def test_a_choice_beyond_reach_says_so_and_traced_numbers_are_refused():
+    choice = tc.select_model(camera("diffuser"), wavelength=WAVELENGTH, tolerance=1e-9)
+    assert not choice.meets_tolerance
+    assert [p.oversampling for p in choice.considered] == [1, 3, 5, 7]
+    assert choice.predicted_error == choice.considered[-1].predicted_error
+    with pytest.raises(TypeError, match="the choice of a model needs known numbers"):
+        jax.jit(
+            lambda w: tc.select_model(camera("lenses"), wavelength=w, tolerance=0.1).cost.flops
+        )(jnp.asarray(WAVELENGTH))

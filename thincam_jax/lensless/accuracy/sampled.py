@@ -1,0 +1,79 @@
+r"""The error of a sampled PSF, for masks without an exact one: from finer samples of its middle.
+
+The mask's central part is propagated with n and with m > n samples a pixel. Its PSF has errors
+that fall with the samples as 1/n at worst, that of hard edges, so that (Richardson)
+
+.. math:: \frac{\|h_n - h\|}{\|h\|} \approx \frac{1}{1 - n/m}\, \frac{\|h_n - h_m\|}{\|h_m\|}
+
+The part's rim is an edge which the whole mask has not there, and has more of it: more is predicted
+than found.
+"""
+
+from collections.abc import Iterator
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from thincam_jax._core.grids import Grid
+from thincam_jax._core.precision import RESULT_ROUNDING, precision_of
+from thincam_jax.lensless.masks.base import AbstractMask
+from thincam_jax.lensless.method import PsfMethod, psf_method
+from thincam_jax.lensless.propagation.angular_spectrum import angular_spectrum
+from thincam_jax.lensless.propagation.path import Path
+from thincam_jax.lensless.sampling import samples_needed
+
+# Pixels of the part, along a side; samples as multiples of the fewest that hold the mask.
+_PART, _FINER = 48, (1, 3, 5, 7, 9)
+# What the part may miss of the whole, and what transforms and phases add to a result's rounding.
+_MARGIN, _TRANSFORMS = 1.3, 100.0
+
+
+def sampled_errors(
+    mask: AbstractMask, grid: Grid, path: Path, pixel_integration: bool
+) -> Iterator[tuple[PsfMethod, float]]:
+    """Methods of `angular_spectrum` with ever more samples, and the error predicted of each."""
+    fewest = samples_needed(mask, grid, path, "angular_spectrum")
+    fewest = max(fewest, 3 if pixel_integration else 1)
+    methods = [
+        psf_method(mask, grid, "angular_spectrum", pixel_integration, oversampling=fewest * finer)
+        for finer in _FINER
+    ]
+    rounding = _TRANSFORMS * RESULT_ROUNDING[precision_of(grid.pitch)]
+    before = _central(mask, grid, path, methods[0])
+    for method, finer in zip(methods, methods[1:], strict=False):
+        after = _central(mask, grid, path, finer)
+        off = float(jnp.linalg.norm(before - after) / jnp.linalg.norm(after))
+        yield method, _MARGIN * off / (1 - method.samples / finer.samples) + rounding
+        before = after
+
+
+class _Part(AbstractMask):
+    """The part of a mask that a plane of given sides around the axis holds."""
+
+    whole: AbstractMask
+    sides: tuple[Float[Array, ""], Float[Array, ""]]
+    centre: Float[Array, "2"]
+
+    @property
+    def extent(self):
+        return self.sides
+
+    def sample(self, grid, wavelength=None):
+        return self.whole.sample(grid, wavelength)
+
+
+@jax.jit(static_argnames="method")
+def _central(mask: AbstractMask, grid: Grid, path: Path, method: PsfMethod):
+    """The PSF of the middle of the mask on the middle of the sensor."""
+    rows, columns = (min(_PART, n) for n in method.mask_shape or grid.shape)
+    sides = rows * grid.pitch, columns * grid.pitch
+    part = _Part(whole=mask, sides=sides, centre=jnp.zeros_like(mask.centre))
+    return angular_spectrum(
+        part,
+        grid.with_shape((_PART, _PART)),
+        path,
+        mask_shape=(rows, columns),
+        oversampling=method.samples,
+        pixel_integration=method.pixel_integration,
+    )
