@@ -7,7 +7,8 @@ one. Here the heights themselves are changed, with the limits inside: each is
 
 of a free number u, q the nearest level. Its derivative is taken as 1 (the straight-through
 estimator; Bengio, Léonard & Courville 2013), so that the optics see what will be made, and the
-descent what it would be between the levels.
+descent what it would be between the levels. Heights are drawn to the levels in stages, from not at
+all to wholly: else few levels hold a descent where it begins.
 """
 
 import functools
@@ -37,12 +38,14 @@ from thincam_jax.lensless.propagation.path import Path
 from thincam_jax.lensless.sampling import require_phase_sampling
 
 # Of the angle u, whose range from the lowest to the highest relief is π/2.
-_RATE = 0.03
+_RATE = 0.05
 # Window over mask and sensor: nothing wraps round. The steep waves that it cuts are up to 3 % of
 # a small PSF, and twice as much takes four times as long.
 _PADDING = 1.0
-# As a part of the range: nearer to its ends sin² is flat, and a descent would not leave them.
+# How far from the ends of the range a descent begins, as a part of it: there sin² is flat.
 _INNER = 0.02
+# How far heights are drawn to their levels, stage by stage.
+_STAGES = (0.0, 0.4, 0.7, 0.9, 1.0)
 
 # (mask, data, key) → what is to be small.
 MaskObjective = Callable[[PhaseMask, Any, PRNGKeyArray], Float[Array, ""]]
@@ -65,13 +68,18 @@ class HeightLimits(NamedTuple):
             raise ValueError(f"levels = {self.levels}; give at least 2, or None for any height")
         return self
 
-    def nearest(self, height: Float[Array, "y x"]) -> Float[Array, "y x"]:
-        """The heights that can be made; derivatives pass as if any could."""
+    def nearest(
+        self, height: Float[Array, "y x"], drawn: float | Float[Array, ""] = 1.0
+    ) -> Float[Array, "y x"]:
+        """The heights that can be made; derivatives pass as if any could.
+
+        `drawn`: which part of the way to them, from 0 to 1.
+        """
         inside = jnp.clip(height, 0.0, self.highest)
         if self.levels is None:
             return inside
         step = self.highest / (self.levels - 1)
-        return inside + jax.lax.stop_gradient(jnp.round(inside / step) * step - inside)
+        return inside + drawn * jax.lax.stop_gradient(jnp.round(inside / step) * step - inside)
 
 
 def one_turn(blank: MaskBlank, wavelength: Number, levels: int | None = None) -> HeightLimits:
@@ -225,7 +233,8 @@ def restored_objective(mask: PhaseMask, data: Any, key: PRNGKeyArray) -> Float[A
 class Refined(NamedTuple):
     """What `refine_mask` found.
 
-    - `mask`: of the last step. `history`: the objective at every step, before it.
+    - `mask`: after the last step, or the one given where that is better. `history`: the objective
+      at every step, before it.
     - `skipped`: steps whose objective or gradient was not finite; they changed nothing.
     """
 
@@ -249,27 +258,48 @@ def refine_mask(
       `linear_objective` and `restored_objective`.
     - `mask`: to begin with, such as `mask_of_phase` makes.
 
-    **Validity.** It finds a local minimum. With few levels the last steps may go up and down.
+    **Validity.** It finds a local minimum.
 
     **Errors**: ValueError for limits and numbers of steps that are out of range.
     """
     limits = limits.checked()
-    if steps < 2:
-        raise ValueError(f"steps = {steps}; give at least 2")
-    end, history, skipped = _descend(objective, mask, limits, data, key, steps)
-    return Refined(eqx.tree_at(lambda m: m.height, mask, end), history, int(skipped))
+    stages = (1.0,) if limits.levels is None else _STAGES
+    each = steps // len(stages)
+    if each < 2:
+        raise ValueError(f"steps = {steps}; give at least {2 * len(stages)}")
+    part = jnp.clip(mask.height / limits.highest, _INNER, 1 - _INNER)
+    u, histories, skipped = jnp.arcsin(jnp.sqrt(part)), [], 0
+    for drawn, stage_key in zip(stages, jax.random.split(key, len(stages)), strict=True):
+        start = u, jnp.asarray(drawn, u.dtype), stage_key
+        u, history, failed = _descend(objective, mask, limits, data, start, each)
+        histories.append(history)
+        skipped += int(failed)
+    better = _better(objective, mask, limits, data, (u, key))
+    return Refined(better, jnp.concatenate(histories), skipped)
+
+
+def _relief(mask: PhaseMask, limits: HeightLimits, u, drawn=1.0) -> PhaseMask:
+    height = limits.nearest(limits.highest * jnp.sin(u) ** 2, drawn)
+    return eqx.tree_at(lambda m: m.height, mask, height)
 
 
 @functools.partial(jax.jit, static_argnames=("objective", "limits", "steps"))
-def _descend(objective, mask: PhaseMask, limits: HeightLimits, data, key, steps: int):
-    def heights(u):
-        return limits.nearest(limits.highest * jnp.sin(u) ** 2)
+def _descend(objective, mask: PhaseMask, limits: HeightLimits, data, start, steps: int):
+    u, drawn, key = start
 
     def loss(u, step_key):
-        value = objective(eqx.tree_at(lambda m: m.height, mask, heights(u)), data, step_key)
+        value = objective(_relief(mask, limits, u, drawn), data, step_key)
         return value, value
 
-    part = jnp.clip(mask.height / limits.highest, _INNER, 1 - _INNER)
-    rate = jnp.asarray(_RATE, part.dtype)
-    end, history, skipped = adam(loss, jnp.arcsin(jnp.sqrt(part)), key, rate, steps)
-    return heights(end), history, skipped
+    return adam(loss, u, key, jnp.asarray(_RATE, u.dtype), steps)
+
+
+@functools.partial(jax.jit, static_argnames=("objective", "limits"))
+def _better(objective, mask: PhaseMask, limits: HeightLimits, data, found) -> PhaseMask:
+    """What was found, or what was given."""
+    u, key = found
+    after = _relief(mask, limits, u)
+    before = eqx.tree_at(lambda m: m.height, mask, limits.nearest(mask.height))
+    improved = objective(after, data, key) < objective(before, data, key)
+    height = jnp.where(improved, after.height, before.height)
+    return eqx.tree_at(lambda m: m.height, mask, height)
