@@ -44,15 +44,14 @@ if os.environ["XLA_FLAGS"]:
 
 # Before the first import of the package: from here on every annotated call is checked.
 jaxtyping.install_import_hook("thincam_jax", "beartype.beartype")
-# The small images of tests take longer to compile for than to reconstruct.
-import_module("thincam_jax.reconstruction.drive").UNROLLED = 2
 
 
 def pytest_collection_finish():
-    """Tracing makes many short-lived objects: by default a tenth of the time is garbage collection.
-
-    What was imported stays, and need not be looked at again.
-    """
+    """Settings of what tests import: not of the process that only gives them to the workers."""
+    # The small images of tests take longer to compile for than to reconstruct.
+    import_module("thincam_jax.reconstruction.drive").UNROLLED = 2
+    # Tracing makes many short-lived objects: by default a tenth of the time is garbage collection.
+    # What was imported stays, and need not be looked at again.
     gc.collect()
     gc.freeze()
     gc.set_threshold(50_000, 20, 20)
