@@ -203,11 +203,14 @@ def test_gradients(kind, coupling):
     image = jnp.asarray(RNG.normal(size=(3, 2, 4, 5)))
     direction = jnp.asarray(RNG.normal(size=image.shape))
     variation = TotalVariation(kind, coupling, depth_weight=0.4)
-    slope = jnp.vdot(jax.grad(variation)(image), direction)
-    expected = finite_difference(variation, image, direction, 1e-5)
+    # Compiled: operation by operation each is a program of its own.
+    total, gradient = jax.jit(variation.__call__), jax.jit(jax.grad(variation))
+    slope = jnp.vdot(gradient(image), direction)
+    expected = finite_difference(total, image, direction, 1e-5)
     np.testing.assert_allclose(slope, expected, rtol=1e-7)
-    np.testing.assert_array_equal(jax.grad(variation)(jnp.ones_like(image)), 0)
+    np.testing.assert_array_equal(gradient(jnp.ones_like(image)), 0)
 
+    @jax.jit
     def shrunk(scale):
         slopes = tuple(scale * s for s in differences(image, 0.4))
         return sum(jnp.sum(v**3) for v in variation.shrink(slopes, 0.3 * scale**2))
@@ -262,6 +265,7 @@ def test_slope_of_the_prox_by_differences(kind, coupling):
     place, way = (jnp.asarray(rng.normal(size=(2, 3, 1, 4, 5))) for _ in range(2))
     place, way = tuple(place.at[:, :, 0, 1, 2].set(0.0)), tuple(way)
 
+    @jax.jit
     def along(t):
         moved = tuple(s[None] + t * w[None] for s, w in zip(place, way, strict=True))
         return jnp.stack(variation.shrink(moved, length + 0.7 * t))
@@ -272,16 +276,14 @@ def test_slope_of_the_prox_by_differences(kind, coupling):
     assert 0.1 < float(jnp.mean(jnp.abs(value) < 1e-12)) < 0.9
     np.testing.assert_allclose(slope, (along(1e-6) - along(-1e-6)) / 2e-6, atol=1e-8)
     # Symbolic zeros: only the step changes, or only one direction.
-    step = jax.jvp(lambda x: jnp.stack(variation.shrink(place, x)), (length,), (1.0,))[1]
-    both = (variation.shrink(place, length + x) for x in (1e-6, -1e-6))
-    up, down = (jnp.stack(b) for b in both)
+    shrink = jax.jit(lambda slopes, step: jnp.stack(variation.shrink(slopes, step)))
+    step = jax.jvp(lambda x: shrink(place, x), (length,), (1.0,))[1]
+    up, down = (shrink(place, length + x) for x in (1e-6, -1e-6))
     np.testing.assert_allclose(step, (up - down) / 2e-6, atol=1e-8)
-    first = jax.grad(lambda x: jnp.sum(jnp.stack(variation.shrink((x, place[1]), length)) ** 2))
+    energy = jax.jit(lambda x: jnp.sum(shrink((x, place[1]), length) ** 2))
+    first = jax.grad(energy)
     moved = jnp.sum(first(place[0]) * way[0])
-    sums = [
-        jnp.sum(jnp.stack(variation.shrink((place[0] + x * way[0], place[1]), length)) ** 2)
-        for x in (1e-6, -1e-6)
-    ]
-    assert float(moved) == pytest.approx(float(sums[0] - sums[1]) / 2e-6, rel=1e-6)
+    up, down = (energy(place[0] + x * way[0]) for x in (1e-6, -1e-6))
+    assert float(moved) == pytest.approx(float(up - down) / 2e-6, rel=1e-6)
     stacked = jax.jit(jax.vmap(first))(jnp.stack([place[0], way[0]]))
     np.testing.assert_allclose(stacked, [first(place[0]), first(way[0])], atol=1e-14)
