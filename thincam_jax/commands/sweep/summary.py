@@ -68,7 +68,9 @@ def _changes(rows: list[dict], path: str, axes: Sequence[str], column: str) -> b
     """Whether a method's PSNR depends on an axis, at any values of the others."""
     seen: dict[tuple, set] = {}
     for row in rows:
-        seen.setdefault(tuple(row[other] for other in axes if other != path), set()).add(row[column])
+        seen.setdefault(tuple(row[other] for other in axes if other != path), set()).add(
+            row[column]
+        )
     return any(len(values) > 1 for values in seen.values())
 
 
