@@ -48,6 +48,12 @@ def reconstruct(
         Path | None,
         Option(help="In place of --psf, a study (YAML) whose first shot took the capture."),
     ] = None,
+    network: Annotated[
+        Path | None, Option(help="Of 'thincam train', for that camera, in place of a method.")
+    ] = None,
+    distance: Annotated[
+        str | None, Option(help="To focus a network on, as 120mm. Default: the study's object.")
+    ] = None,
     set_: Overrides = None,
     background: Background = None,
     psf_background: PsfBackground = None,
@@ -111,6 +117,7 @@ def reconstruct(
     nothing = "interrupted; of the capture at work no image is there yet, nothing of it is kept"
     with told(lambda: nothing):
         from thincam_jax.commands.photo.console import (
+            known_camera,
             known_psf,
             read_background,
             read_corner,
@@ -123,7 +130,8 @@ def reconstruct(
         from thincam_jax.measured import MeasurementError, Preparation
 
         try:
-            known = known_psf(psf, camera, set_, background)
+            seen_by, focusing = known_camera(psf, camera, set_, network, distance)
+            known = known_psf(psf, seen_by, camera, background)
             sources = Sources(
                 known,
                 read_background(background),
@@ -152,8 +160,10 @@ def reconstruct(
                 flip=flip,
                 ridge=ridge,
                 noise=noise,
+                focusing=focusing,
             )
-            output = Output(out, linear, gamma, read_white_balance(white_balance))
+            balance, unsure = read_white_balance(white_balance), focusing is not None
+            output = Output(out, linear, gamma, balance, unsure)
             end = run_with_bar(plan_jobs(capture, sources, output), sources, recipe, output)
         except (MeasurementError, OSError) as error:
             fail(error)

@@ -5,14 +5,15 @@ from pathlib import Path
 import rich.markup
 import rich.progress
 
+from thincam_jax.commands.photo.camera import computed_psf, read_camera, read_network
 from thincam_jax.commands.photo.jobs import Job
-from thincam_jax.commands.photo.options import Background, Output, Recipe, Sources
-from thincam_jax.commands.photo.run import Failed, Finished, computed_psf, run_jobs
+from thincam_jax.commands.photo.options import Background, Focusing, Output, Recipe, Sources
+from thincam_jax.commands.photo.run import Failed, Finished, run_jobs
 from thincam_jax.commands.start import INTERRUPTED
 from thincam_jax.commands.terminal import WRONG_INPUT, in_a_line, progress_bar, tell
 from thincam_jax.measured import MeasurementError, Raw
 from thincam_jax.measured.write import WhiteBalance
-from thincam_jax.reconstruction import Progress
+from thincam_jax.reconstruction import Cameras, Progress
 from thincam_jax.reconstruction.depth.refocus import increasing
 from thincam_jax.units import parse_quantity
 
@@ -28,19 +29,14 @@ def read_background(text: str | None) -> Background:
 
 
 def known_psf(
-    psf: Path | None, camera: Path | None, overrides: list[str] | None, background: str | None
+    psf: Path | None, seen_by: Cameras | None, camera: Path | None, background: str | None
 ) -> Path | Raw:
     """The file of a measured PSF, or the PSF of a camera.
 
-    **Errors**: MeasurementError where not one of the two is given; ConfigError of the camera.
+    **Errors**: MeasurementError where a computed PSF comes without a background.
     """
-    if (psf is None) == (camera is None):
-        raise MeasurementError(
-            "give either --psf, a measured PSF, or --camera, a study with the camera's numbers"
-        )
-    if psf is not None:
-        if overrides:
-            raise MeasurementError("--set changes the file of --camera; leave it out with --psf")
+    if seen_by is None:
+        assert psf is not None
         return psf
     assert camera is not None
     if background is None:
@@ -48,7 +44,40 @@ def known_psf(
             "--camera: a computed PSF has no dark corner; give --background, a dark frame or a "
             "number of counts"
         )
-    return computed_psf(camera, overrides or ())
+    return computed_psf(camera, seen_by)
+
+
+def known_camera(
+    psf: Path | None,
+    camera: Path | None,
+    overrides: list[str] | None,
+    network: Path | None,
+    distance: str | None,
+) -> tuple[Cameras | None, Focusing | None]:
+    """The camera of a file, where one is given, and its network.
+
+    **Errors**: MeasurementError where not one of PSF and camera is given; ConfigError of the
+    camera and the network.
+    """
+    if (psf is None) == (camera is None):
+        raise MeasurementError(
+            "give either --psf, a measured PSF, or --camera, a study with the camera's numbers"
+        )
+    if camera is None:
+        if overrides:
+            raise MeasurementError("--set changes the file of --camera; leave it out with --psf")
+        if network is not None:
+            raise MeasurementError("--network is of a camera; give --camera in place of --psf")
+    if distance is not None and network is None:
+        raise MeasurementError("--distance is that of a --network; see --distances for others")
+    if camera is None:
+        return None, None
+    try:
+        focused = None if distance is None else parse_quantity(distance, "length")
+    except ValueError as error:
+        raise MeasurementError(f"--distance: {error}") from None
+    seen_by = read_camera(camera, overrides or (), focused)
+    return seen_by, None if network is None else read_network(network, seen_by)
 
 
 def read_distances(text: str | None, psf: Path | None) -> tuple[float, ...]:
@@ -156,6 +185,12 @@ def _summary(result: Finished) -> str:
         return f"{result.job.images[0]}: each part from the distance it is sharp at; {others}"
     done = result.record["reconstruction"]
     status, noise = done["status"].replace("_", " "), done["noise"]
+    if result.learned:
+        return (
+            f"{result.job.images[0]}: focused on {done['focused_on_mm']:g} mm, residual "
+            f"{done['consistency']:.2f} of the noise, not sure of {100 * done['unsure']:.0f} % of "
+            f"the pixels, {done['seconds']:.1f} s"
+        )
     return (
         f"{result.job.images[0]}: {status} after {done['iterations']} iterations, relative data "
         f"residual {float(done['relative_data_residual']):.3g}, {done['seconds']:.1f} s, noise "
@@ -165,6 +200,9 @@ def _summary(result: Finished) -> str:
 
 def _doubt(result: Finished, recipe: Recipe) -> str | None:
     """What is wrong with an image that does not explain its capture; None where it does."""
+    if result.learned:
+        words = result.record["reconstruction"]["doubt"]
+        return f"{result.job.images[0]}: {words}" if words else None
     residual = float(result.record["reconstruction"]["relative_data_residual"])
     if residual < _UNEXPLAINED:
         return None

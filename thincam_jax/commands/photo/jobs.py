@@ -72,7 +72,8 @@ def _jobs_of(capture: Path, path: Path, sources: Sources, output: Output) -> lis
     """One for each distance, and one of all of them; or the only one."""
     images = _images(path, output)
     if not sources.distances:
-        return [Job(capture, images)]
+        unsure = path.with_name(f"{path.stem}-unsure.png")
+        return [Job(capture, images, beside=(unsure,) if output.unsure else ())]
     jobs = []
     for focus, distance in enumerate(sources.distances):
         name = path.with_name(f"{path.stem}-{distance:g}mm{path.suffix}")

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Literal
 
 from thincam_jax._core import checks
+from thincam_jax.learn.refocusing.network import RefocusNetwork
 from thincam_jax.measured import MeasurementError, Preparation, Raw
 from thincam_jax.measured.read import image_files
 from thincam_jax.measured.write import WhiteBalance
@@ -49,6 +50,15 @@ class Sources:
 
 
 @dataclass(frozen=True)
+class Focusing:
+    """A network in place of a solver, and the distance that its images are focused on, mm."""
+
+    path: Path
+    network: RefocusNetwork
+    distance: float
+
+
+@dataclass(frozen=True)
 class Recipe:
     """How to reconstruct; see `thincam_jax.reconstruct`.
 
@@ -60,6 +70,7 @@ class Recipe:
     - `flip`: turn the image by 180°.
     - `ridge`: of the method "ridge", which has neither tau nor coupling; None: 1.
     - `noise`: standard deviation of a raw pixel's noise, counts; None: estimated.
+    - `focusing`: a network; `method` is then "learned", and nothing else of it is used.
 
     **Errors**: MeasurementError for what is unknown or out of range.
     """
@@ -72,6 +83,7 @@ class Recipe:
     flip: bool = False
     ridge: float | int | None = None
     noise: float | int | None = None
+    focusing: Focusing | None = None
 
     def __post_init__(self):
         self._check_method()
@@ -115,6 +127,11 @@ class Recipe:
 
     def _check_method(self) -> None:
         """Whether it is one, works from prepared captures, and uses what is given."""
+        if self.focusing is not None:
+            for name in ("coupling", "tau", "ridge"):
+                if getattr(self, name) is not None:
+                    raise MeasurementError(f"--network has no {name}; leave one of both out")
+            return
         able = f"choose one of {', '.join(repr(m) for m in PSF_METHODS)}"
         if self.method in ("wiener", "fringe_scanning"):
             raise MeasurementError(
@@ -143,12 +160,14 @@ class Output:
     - `path`: an image file; or a folder, in which each result has the name of its capture.
     - `linear`: format of the float image beside a PNG, "npy" or "tif"; "none" for none.
     - `gamma`, `white_balance`: of the PNG; see `measured.to_display`.
+    - `unsure`: also NAME-unsure.png, a learned image with what is not sure in red.
     """
 
     path: Path
     linear: Literal["npy", "tif", "none"] = "npy"
     gamma: float | int = 2.2
     white_balance: WhiteBalance = None
+    unsure: bool = False
 
     def __post_init__(self):
         try:

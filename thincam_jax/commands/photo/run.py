@@ -12,13 +12,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from thincam_jax._core.memory import refuse_if_too_large
-from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.doctor import environment
-from thincam_jax.commands.kinds import load_experiment
+from thincam_jax.commands.photo.camera import focus
 from thincam_jax.commands.photo.jobs import Job, write_job
 from thincam_jax.commands.photo.options import Background, Output, Recipe, Sources
-from thincam_jax.commands.study.build import assemble, check_study
-from thincam_jax.commands.study.config import StudyConfig
 from thincam_jax.imaging.operators import window_shape
 from thincam_jax.measured import (
     MeasurementError,
@@ -63,6 +60,11 @@ class Finished:
     def status(self) -> str:
         """See `Reconstruction.ending`."""
         return self.record.get("reconstruction", {}).get("status", "")
+
+    @property
+    def learned(self) -> bool:
+        """Whether a network made it."""
+        return self.record["reconstruction"]["method"] == "learned"
 
 
 @dataclass(frozen=True)
@@ -140,24 +142,6 @@ def _check_count(given: Path, psfs: list[Raw], distances: tuple[float, ...]) -> 
         )
 
 
-def computed_psf(config: Path, overrides: Sequence[str]) -> Raw:
-    """The PSF of a study's first shot, at the distance of its object.
-
-    **Errors**: ConfigError, as of `load_experiment`, and for a file of another kind.
-    """
-    experiment = load_experiment(config, tuple(overrides))
-    if not isinstance(experiment, StudyConfig):
-        raise ConfigError(f"{config}: is of kind {experiment.kind}; a camera is read from a study")
-    study = assemble(experiment, ())
-    check_study(study)
-    shot = study.exposures[0]
-    name = (
-        f"camera of {config}: {study.camera(shot)}, wavelength {shot.wavelength * 1e6:g} nm, "
-        f"object at {study.object_distance:g} mm"
-    )
-    return Raw(np.asarray(study.psf(shot)), name=name)
-
-
 def _background(given: Background, bits: int | None) -> Raw | float | None:
     return read_image(given, bits) if isinstance(given, Path) else given
 
@@ -166,7 +150,15 @@ def _run_job(job: Job, rig: Rig, recipe: Recipe, output: Output, told: Told | No
     began = time.perf_counter()
     ready = rig.prepare(job.capture, job.focus or 0)
     _check_channels(job, ready, recipe, output)
-    image, facts = _reconstruct(job, ready, recipe, told)
+    beside = None
+    if recipe.focusing is None:
+        image, facts = _reconstruct(job, ready, recipe, told)
+    else:
+        noise, how = _noise(ready, recipe)
+        image, facts, marked = focus(ready, recipe.focusing, noise)
+        facts["noise"] = {"counts": noise / _of_a_count(ready), "found": how}
+        image = image[:, ::-1, ::-1] if recipe.flip else image
+        beside = dict.fromkeys(job.beside, marked)
     shown = {"gamma": output.gamma, "white_balance": output.white_balance}
     record = {
         "capture": job.capture,
@@ -178,7 +170,7 @@ def _run_job(job: Job, rig: Rig, recipe: Recipe, output: Output, told: Told | No
         "display": shown if job.is_shown else None,
         "environment": environment(time.perf_counter() - began),
     }
-    return _written(job, image, record, output)
+    return _written(job, image, record, output, beside)
 
 
 def _join(job: Job, images: list[np.ndarray], rig: Rig, output: Output) -> Finished:

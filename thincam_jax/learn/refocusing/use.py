@@ -45,7 +45,7 @@ def read(network: RefocusNetwork, captures, distances, deviation) -> Reading:
     `distances`: (distance,), or (*batch, distance) with their own for each capture.
     """
     captures, deviation, batch = flattened(network, captures, deviation)
-    count = jnp.shape(distances)[-1]
+    count = np.shape(distances)[-1]
     each = jnp.broadcast_to(network.camera.within(distances), (*batch, count))
     found = _read(network, captures, deviation, each.reshape(-1, count))
     return jax.tree.map(lambda a: a.reshape(*batch, *a.shape[1:]), found)
