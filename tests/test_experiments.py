@@ -16,7 +16,13 @@ def test_the_scripts_are_there():
     assert {"first_image", "superresolution", "speed_for_accuracy"} <= {s.stem for s in SCRIPTS}
 
 
-@pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.stem)
+def marked(script):
+    """Training takes half a minute, even small."""
+    marks = [pytest.mark.thorough] if script.stem == "learned_refocus" else []
+    return pytest.param(script, id=script.stem, marks=marks)
+
+
+@pytest.mark.parametrize("script", map(marked, SCRIPTS))
 def test_a_script_runs_and_draws(script, monkeypatch, tmp_path):
     """In a user's precision. Every panel with a scale says what it shows, and in which unit."""
     monkeypatch.setenv("THINCAM_SIZE", "small")
