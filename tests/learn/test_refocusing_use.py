@@ -19,49 +19,48 @@ from thincam_jax.units import nm
 
 
 @pytest.fixture(scope="module")
-def trained(tmp_path_factory):
-    """Two halves of a training in its folder, and the whole."""
-    folder = tmp_path_factory.mktemp("training")
+def file(tmp_path_factory):
+    """An untrained network in a file."""
+    path = tmp_path_factory.mktemp("network") / NETWORK
+    return save(path, tiny.network(), tiny.lessons().manifest())
+
+
+def test_a_network_comes_back_for_its_camera(file):
+    (entry,) = network_description(file)["training"]["images"]["trained on"]
+    assert entry["licence"] == "drawn" and re.fullmatch("[0-9a-f]{64}", entry["sha256"])
+    # Whatever its sensor makes of the light; as all it was trained for; or with its light.
+    seen = tc.Cameras([tiny.camera()], wavelength=500 * nm, object_distance=80.0)
+    for given in (tiny.camera(exposure=0.5), tiny.network().camera, seen):
+        found = load(file, given)
+        assert eqx.tree_equal(found.weights, tiny.network().weights)
+    assert found.planes.spectra.shape == tiny.network().planes.spectra.shape
+
+
+@pytest.mark.thorough
+def test_training_goes_on_to_the_same_bits(tmp_path):
     given = tiny.network(), tiny.lessons(), tiny.TRAINING
     whole = train(*given)
-    train(*given, folder=folder, callback=lambda progress: progress.step == 3)
-    return folder, train(*given, folder=folder), whole
-
-
-def test_training_goes_on_to_the_same_bits(trained):
-    folder, resumed, whole = trained
+    stopped = train(*given, folder=tmp_path, callback=lambda progress: progress.step == 3)
+    assert stopped.status == "stopped" and (tmp_path / STATE).exists()
+    resumed = train(*given, folder=tmp_path)
     assert resumed.status == "finished" and whole.state.skipped == 0
     assert eqx.tree_equal(resumed.state, whole.state)
     assert not eqx.tree_equal(whole.model.weights, tiny.network().weights)
     assert eqx.tree_equal(whole.model.planes, tiny.network().planes)
+    found = load(tmp_path / NETWORK, tiny.camera())
+    assert eqx.tree_equal(found.weights, whole.model.weights)
+    told = network_description(tmp_path / NETWORK)["training"]
+    assert told["steps"] == 4 and len(told["scores"]) == 2
     # As often as nothing is left to be done.
-    again = train(tiny.network(), tiny.lessons(), tiny.TRAINING, folder=folder)
-    assert eqx.tree_equal(again.state, whole.state)
-
-
-def test_a_state_belongs_to_its_training(trained):
-    folder, *_ = trained
+    assert eqx.tree_equal(train(*given, folder=tmp_path).state, whole.state)
     other = dataclasses.replace(tiny.TRAINING, rate=1.0)
     with pytest.raises(CheckpointError, match=r"whose training\.rate was 0\.003 and is 1\.0 here"):
-        train(tiny.network(), tiny.lessons(), other, folder=folder)
+        train(tiny.network(), tiny.lessons(), other, folder=tmp_path)
+    with pytest.raises(CheckpointError, match="holds no refocusing network"):
+        load(tmp_path / STATE, tiny.camera())
 
 
-def test_a_network_comes_back_for_its_camera(trained):
-    folder, _, whole = trained
-    told = network_description(folder / NETWORK)["training"]
-    assert told["steps"] == 4 and len(told["scores"]) == 2
-    (entry,) = told["images"]["trained on"]
-    assert entry["licence"] == "drawn" and re.fullmatch("[0-9a-f]{64}", entry["sha256"])
-    # Whatever its sensor makes of the light; as all it was trained for; or with its light.
-    seen = tc.Cameras([tiny.camera()], wavelength=500 * nm, object_distance=80.0)
-    for given in (tiny.camera(exposure=0.5), whole.model.camera, seen):
-        found = load(folder / NETWORK, given)
-        assert eqx.tree_equal(found.weights, whole.model.weights)
-    assert found.planes.spectra.shape == whole.model.planes.spectra.shape
-
-
-def test_another_camera_is_refused_with_both_numbers(trained):
-    file = trained[0] / NETWORK
+def test_another_camera_is_refused_with_both_numbers(file):
     with pytest.raises(CheckpointError, match=r"camera\.mask\.beta was 13\.0 and is 13\.1 here"):
         load(file, tiny.camera(beta=13.1))
     seen = tc.Cameras([tiny.camera()], wavelength=600 * nm)
@@ -71,18 +70,17 @@ def test_another_camera_is_refused_with_both_numbers(trained):
         load(file, tc.Cameras([tiny.camera()] * 2))
 
 
-def test_a_file_that_holds_something_else_is_told(trained, tmp_path):
-    folder, *_ = trained
+def test_a_file_that_holds_something_else_is_told(file, tmp_path):
+    other = write_arrays(tmp_path / "other", tiny.network().weights, {"kind": "something else"})
     with pytest.raises(CheckpointError, match="holds no refocusing network"):
-        load(folder / STATE, tiny.camera())
-    other = save(tmp_path / "other", tiny.network())
+        load(other, tiny.camera())
+    save(other, tiny.network())
     known = network_description(other)
     known["camera"].pop("light")
-    known["kind"] = "refocusing network"
     write_arrays(other, tiny.network().weights, known)
     with pytest.raises(CheckpointError, match="tells no whole camera"):
         load(other, tiny.camera())
-    known = network_description(folder / NETWORK)
+    known = network_description(file)
     known["options"]["wings"] = 2
     write_arrays(other, tiny.network().weights, known)
     with pytest.raises(CheckpointError, match="holds options of another version"):
@@ -95,8 +93,8 @@ def recording(distance: object = 80.0, **more):
     return tc.Recording([capture], cameras, noise_variance=1e-4, **more)
 
 
-def test_it_is_a_solver(trained):
-    network = trained[2].model
+def test_it_is_a_solver():
+    network = tiny.network()
     found = tc.reconstruct(recording(), Learned(network))
     assert found.method == "learned" and found.status == "ok"
     assert found.image.shape == found.confidence.shape == (14, 12)
@@ -107,8 +105,8 @@ def test_it_is_a_solver(trained):
 
 
 @pytest.mark.thorough
-def test_several_distances_are_planes_and_all_is_as_the_network_says(trained):
-    network, capture = trained[2].model, recording().captures[0]
+def test_several_distances_are_planes_and_all_is_as_the_network_says():
+    network, capture = tiny.network(), recording().captures[0]
     planes = tc.reconstruct(recording([80.0, 150.0]), Learned(network))
     assert planes.has_planes and planes.image.shape == (2, 14, 12)
     image = network.focus(capture, 80.0, 1e-2)
@@ -116,8 +114,8 @@ def test_several_distances_are_planes_and_all_is_as_the_network_says(trained):
     assert float(planes.consistency) == pytest.approx(float(network.consistency(capture, 1e-2)))
 
 
-def test_what_it_cannot_do_is_told_in_a_line(trained):
-    network = trained[2].model
+def test_what_it_cannot_do_is_told_in_a_line():
+    network = tiny.network()
     for distance in (49.0, [80.0, 201.0]):
         with pytest.raises(ValueError, match=r"distance = (49|201) mm lies .* 50 to 200"):
             tc.reconstruct(recording(distance), Learned(network))

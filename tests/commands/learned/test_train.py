@@ -18,6 +18,7 @@ FILE = """
 name: tiny
 kind: learned
 wavelength: 500 nm
+model: geometric
 sensor: {shape: [16, 18], pitch: 44 um}
 mask: {beta: 13 rad/mm^2, width: 0.7 mm}
 distance: 7.5 mm
@@ -47,9 +48,15 @@ def line(result):
     return only.removeprefix("thincam: ")
 
 
+def test_what_is_there_is_not_lost_and_what_is_not_cannot_be_gone_on_with(file, tmp_path):
+    assert "holds no training yet" in line(call(file, "--out", tmp_path, "--resume"))
+    (tmp_path / "training.state").touch()
+    assert "give --resume to go on with it" in line(call(file, "--out", tmp_path))
+
+
+@pytest.mark.thorough
 def test_a_training_is_told_and_gone_on_with(file, tmp_path):
     out = tmp_path / "out"
-    assert "--resume: " in line(call(file, "--out", out, "--resume"))
     done = call(file, "--out", out)
     assert done.exit_code == 0, done.output
     assert "finished: focused images" in done.stdout and str(out / NETWORK) in done.stdout
