@@ -104,11 +104,80 @@ class ApertureConfig(Section):
         return self
 
 
-class MaskConfig(ApertureConfig):
-    """The same of a study: of a rectangle with its `height`, and which orders are computed."""
+Family = Literal["fza", "mura", "ura", "mls", "random", "pinhole", "lenslets", "file"]
+# What a mask of each family is made of, and what may be given besides.
+_NUMBERS: dict[Family, tuple[tuple[str, ...], tuple[str, ...]]] = {
+    "fza": (("width",), ("height", "profile", "pixel_pitch", "fill_factor", "harmonics")),
+    "mura": (("order", "cell"), ("tiles",)),
+    "ura": (("orders", "cell"), ("tiles",)),
+    "mls": (("length", "cell"), ()),
+    "random": (("width", "cell"), ("height", "seed")),
+    "pinhole": (("width",), ("height",)),
+    "lenslets": (("focal_length", "cell", "lenses"), ()),
+    "file": (("path", "width"), ()),
+}
 
+
+class MaskConfig(ApertureConfig):
+    """The mask of a study: a Fresnel zone aperture, or of another `family` with its numbers.
+
+    - `height`, `harmonics`: of a rectangle, and which orders of a zone plate are computed.
+    - `cell`: side of a cell or of a lens. Arrays have the `width` of their cells.
+    - `order`: p of a "mura"; `orders`: (r, s) of a "ura"; `length`: 2^m − 1 of an "mls", whose
+      code and itself are combined by xor; `tiles`: how often an array is repeated along each axis.
+    - `seed`: of "random" cells; `focal_length`, `lenses` (down, across): of "lenslets".
+    - `path`: of a grey image, a "file", whose pixels make up the `width`.
+    """
+
+    width: Length = 0.0
     height: Length | None = None
     harmonics: Annotated[int, Field(ge=1, le=99)] = 9
+    family: Family = "fza"
+    cell: Length | None = None
+    order: int | None = None
+    orders: tuple[int, int] | None = None
+    length: int | None = None
+    tiles: Annotated[int, Field(ge=1)] | None = None
+    seed: Annotated[int, Field(ge=0, lt=2**32)] | None = None
+    focal_length: Length | None = None
+    lenses: tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]] | None = None
+    path: str | None = None
+
+    @pydantic.model_validator(mode="after")
+    def _family_fits(self):
+        needed, also = _NUMBERS[self.family]
+        for key in needed:
+            if key not in self.model_fields_set:
+                raise misfit("missing; this key is needed", key)
+        known = {*needed, *also, "family", "width"}
+        for key in sorted(self.model_fields_set - known):
+            if getattr(self, key) != type(self).model_fields[key].default:
+                raise misfit(f"is no number of a mask of the family {self.family}; drop it", key)
+        across = self._cells_across()
+        if across is not None and self.cell is not None:
+            width = across * (self.tiles or 1) * self.cell
+            # A resolved file has the width too.
+            if "width" in self.model_fields_set and abs(self.width - width) > 1e-9:
+                raise misfit(f"the cells make {width:g} mm; drop it", "width")
+            object.__setattr__(self, "width", width)
+        return self
+
+    def _cells_across(self) -> int | None:
+        """Of one array, where they are known by its numbers."""
+        if self.orders is not None or self.lenses is not None:
+            return (self.orders or self.lenses or (0, 0))[1]
+        return self.order or self.length
+
+    @property
+    def label(self) -> str:
+        """In a line of a report: size and kind."""
+        if self.family == "fza":
+            height = f"×{self.height:g}" if self.height else ""
+            return f"{self.width:g}{height} mm ({self.profile})"
+        order = self.order or self.length or self.orders or self.lenses
+        numbers = [] if order is None else [str(order)]
+        cells = [] if self.cell is None else [f"cells of {1e3 * self.cell:g} µm"]
+        return ", ".join([" ".join([self.family, *numbers]), *cells, f"{self.width:g} mm wide"])
 
 
 class ObjectConfig(Section):
@@ -147,6 +216,12 @@ class ShotConfig(Section):
     profile: Profile | None = None
     exposure: Annotated[float, Field(gt=0)] = 1.0
     take: Annotated[int, Field(ge=2)] | None = None
+
+
+class MethodShotConfig(ShotConfig):
+    """The same of a method; masks of other families than the zone plate have no β."""
+
+    beta: Curvature | None = None  # pyright: ignore[reportIncompatibleVariableOverride]
 
 
 class PublishedConfig(Section):
@@ -193,7 +268,7 @@ class MethodConfig(Section):
     kind: MethodKind
     variation: VariationConfig | None = None
     synthesis: Synthesis = "fringe_scanning"
-    shots: Annotated[tuple[ShotConfig, ...], Field(min_length=1)]
+    shots: Annotated[tuple[MethodShotConfig, ...], Field(min_length=1)]
     phases: Annotated[tuple[Angle, ...], Field(min_length=1)] = (0.0,)
     steps: Annotated[int, Field(ge=3, le=64)] = 8
     harmonics: tuple[Annotated[int, Field(ge=1)], ...] = ()
@@ -335,8 +410,26 @@ def check_names(config: ExperimentConfig, *lists: str) -> None:
                 raise misfit(message, what, index, "name")
 
 
+def _check_family(config: CamerasConfig) -> None:
+    """Refuse methods that need zones where the mask has none, and zones without β."""
+    family = config.mask.family
+    for index, method in enumerate(config.methods):
+        place = "methods", index
+        if family != "fza" and (method.kind == "fringe_scanning" or method.synthesis != "separate"):
+            message = f"a mask of the family {family} has no phases; give synthesis: separate, with"
+            raise misfit(f"{message} wiener or admm_tv", *place, "synthesis")
+        for number, shot in enumerate(method.shots):
+            if family == "fza" and shot.beta is None:
+                raise misfit("missing; this key is needed", *place, "shots", number, "beta")
+            for key in ("beta", "width"):
+                if family != "fza" and getattr(shot, key) is not None:
+                    message = f"is of a zone plate; the mask is of the family {family}: drop it"
+                    raise misfit(message, *place, "shots", number, key)
+
+
 def check_methods(config: CamerasConfig) -> None:
     """Refuse methods whose captures or noise do not fit."""
+    _check_family(config)
     # A capture that is used twice would count its noise as two independent ones.
     for index, method in enumerate(config.methods):
         # To the picometre: 5600 um and 5.6 mm differ by rounding.

@@ -13,7 +13,7 @@ from thincam_jax._core.precision import allow
 from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.design.config import DesignConfig
 from thincam_jax.commands.design.problem import phases_of
-from thincam_jax.commands.sections import MaskConfig, MethodConfig, SensorConfig, ShotConfig
+from thincam_jax.commands.sections import MaskConfig, MethodConfig, MethodShotConfig, SensorConfig
 from thincam_jax.commands.study import build
 from thincam_jax.commands.study.config import StudyConfig
 from thincam_jax.commands.study.evaluate import Evaluation, evaluate
@@ -114,7 +114,7 @@ def as_study_config(study: Study) -> StudyConfig:
 
 def _method_config(config: DesignConfig, method: Method) -> MethodConfig:
     shots = tuple(
-        ShotConfig.model_construct(
+        MethodShotConfig.model_construct(
             beta=shot.beta,
             distance=shot.distance,
             wavelength=None if shot.wavelength == config.wavelength else shot.wavelength,

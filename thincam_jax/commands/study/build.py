@@ -77,7 +77,7 @@ def as_method(config: CamerasConfig, method: MethodConfig) -> Method:
     phases = method.shot_phases()
     exposures = tuple(
         Exposure(
-            shot.beta,
+            shot.beta or 0.0,  # of a mask without zones
             phase,
             shot.distance,
             shot.wavelength or config.wavelength,

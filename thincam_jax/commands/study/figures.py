@@ -108,7 +108,7 @@ def save_captures(
         ax.set_axis_off()
     for number, (ax, exposure) in enumerate(zip(axes, study.exposures, strict=False), 1):
         image = captures[exposure].image
-        title = f"{number}: β {exposure.beta:.3g} rad/mm², φ {exposure.phase:.2f},\n"
+        title = f"{number}: {study.mask_of(exposure)},\n"
         _show(ax, as_picture(image / image.max()), f"{title}d {exposure.distance:.3g} mm")
     save_figure(folder, f"captures-{slug(target.name)}", figure)
 
@@ -248,6 +248,5 @@ def save_psf(folder: RunFolder, study: Study) -> None:
     h = np.asarray(study.psf(exposure))
     grid = study.camera(exposure).sensor.grid
     figure = Figure(figsize=(8.5, 3.4), layout="constrained")
-    mask = f"β = {exposure.beta:g} rad/mm², φ = {exposure.phase:.2f} rad"
-    draw_psf(figure, h, grid, f"{mask}, d = {exposure.distance:g} mm")
+    draw_psf(figure, h, grid, f"{study.mask_of(exposure)}, d = {exposure.distance:g} mm")
     save_figure(folder, "psf", figure)

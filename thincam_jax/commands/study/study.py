@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 from jaxtyping import Array
 
@@ -20,7 +21,20 @@ from thincam_jax.commands.sections import (
 from thincam_jax.imaging.scene import ImagePlane
 from thincam_jax.imaging.sensor import AbstractNoise, Sensor
 from thincam_jax.lensless.camera import LenslessCamera
-from thincam_jax.lensless.masks.fza import FresnelZoneAperture, Profile, edge_frequency
+from thincam_jax.lensless.masks import (
+    AbstractMask,
+    FresnelZoneAperture,
+    LensletArray,
+    ModifiedUniformlyRedundantArray,
+    Pinhole,
+    SampledMask,
+    SeparableMask,
+    UniformlyRedundantArray,
+    maximum_length_sequence,
+    random_cells,
+    read_mask,
+)
+from thincam_jax.lensless.masks.fza import Profile, edge_frequency
 from thincam_jax.lensless.method import Model
 from thincam_jax.lensless.psf import psf
 from thincam_jax.lensless.sampling import unresolved
@@ -115,6 +129,39 @@ def unresolved_zones(
     return [fault] if fault else []
 
 
+def built_mask(config: MaskConfig, exposure: Exposure) -> AbstractMask:
+    """The mask of an exposure; ValueError for numbers that make none."""
+    cell, tiles, height = config.cell or 0.0, config.tiles or 1, config.height
+    family = config.family
+    if family == "fza":
+        return FresnelZoneAperture(
+            exposure.beta,
+            exposure.phase,
+            width=exposure.width,
+            height=height,
+            profile=exposure.profile or config.profile,
+            pixel_pitch=config.pixel_pitch,
+            fill_factor=config.fill_factor,
+            harmonics=config.harmonics,
+        )
+    if family == "mura":
+        return ModifiedUniformlyRedundantArray(config.order or 0, cell, tiles=tiles)
+    if family == "ura":
+        return UniformlyRedundantArray(config.orders or (0, 0), cell, tiles=tiles)
+    if family == "mls":
+        code = maximum_length_sequence(config.length or 0)
+        return SeparableMask(code, code, cell, combine="xor")
+    if family == "random":
+        key = jax.random.key(config.seed or 0)
+        return random_cells(key, config.width, cell, height=height)
+    if family == "pinhole":
+        return Pinhole(config.width, height)
+    if family == "lenslets":
+        return LensletArray(config.focal_length or 0.0, cell, config.lenses or (1, 1))
+    amplitude = read_mask(config.path or "", 1.0).amplitude
+    return SampledMask(amplitude, config.width / amplitude.shape[1])
+
+
 @dataclass(frozen=True)
 class Target:
     """What is seen: its place in the study, on which its noise depends; distance and width in mm.
@@ -164,8 +211,12 @@ class Study:
     def warnings(self) -> list[str]:
         """What a user is told before it runs, and in the report."""
         farthest = max((target.distance for target in self.targets), default=math.inf)
-        height = dict(self.mask).get("height")
-        return unresolved_zones(self.exposures, self.sensor.pitch, farthest, height)
+        if self.mask.family == "fza":
+            return unresolved_zones(self.exposures, self.sensor.pitch, farthest, self.mask.height)
+        finest = getattr(built_mask(self.mask, self.exposures[0]), "finest_frequency", 0.0)
+        nearest = min(exposure.distance for exposure in self.exposures)
+        fault = unresolved(float(finest) / (1 + nearest / farthest), self.sensor.pitch)
+        return [fault] if fault else []
 
     @property
     def object_distance(self) -> float:
@@ -174,12 +225,17 @@ class Study:
 
     def camera(self, exposure: Exposure) -> LenslessCamera:
         """The camera of an exposure."""
-        mask, sensor = {**dict(self.mask), "width": exposure.width}, dict(self.sensor)
-        mask["profile"] = exposure.profile or self.mask.profile
+        sensor = dict(self.sensor)
         for level in ("exposure", "electrons"):
             sensor[level] = sensor[level] and sensor[level] * exposure.share
-        aperture = FresnelZoneAperture(exposure.beta, exposure.phase, **mask)
-        return LenslessCamera(aperture, Sensor(**sensor), exposure.distance)
+        mask = built_mask(self.mask, exposure)
+        return LenslessCamera(mask, Sensor(**sensor), exposure.distance)
+
+    def mask_of(self, exposure: Exposure) -> str:
+        """The mask in a figure's words."""
+        if self.mask.family != "fza":
+            return self.mask.label
+        return f"β {exposure.beta:.4g} rad/mm², φ {exposure.phase:.2f} rad"
 
     def psf(self, exposure: Exposure) -> Array:
         """Of a point on the axis at the distance of the targets, (y, x)."""

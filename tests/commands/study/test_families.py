@@ -1,0 +1,86 @@
+"""Masks of other families than the zone plate in a study's file."""
+
+import numpy as np
+import pytest
+from commands.study import tiny
+
+import thincam_jax as tc
+from thincam_jax.commands.checked_config import dump_config
+from thincam_jax.commands.config_file import ConfigError
+from thincam_jax.commands.study.build import build_study
+from thincam_jax.commands.study.config import load_config
+
+HEAD, TAIL = tiny.TEXT.split("methods:")[0], "targets:" + tiny.TEXT.split("targets:")[1]
+METHOD = "{name: one, kind: wiener, synthesis: separate, shots: [{distance: 3 mm}]}"
+MURA = "{family: mura, order: 13, cell: 120 um}"
+
+
+def written(folder, mask=MURA, method=METHOD):
+    text = HEAD.replace("{width: 2 mm}", mask) + f"methods:\n  - {method}\n" + TAIL
+    return tiny.write(folder, text)
+
+
+@pytest.mark.parametrize(
+    ("mask", "expected"),
+    [
+        (MURA, tc.ModifiedUniformlyRedundantArray(13, 0.12)),
+        ("{family: ura, orders: [7, 5], cell: 120 um, tiles: 2}", "ura"),
+        ("{family: mls, length: 15, cell: 0.1 mm}", "mls"),
+        ("{family: random, width: 1.2 mm, cell: 0.1 mm, seed: 3}", "random"),
+        ("{family: pinhole, width: 0.2 mm}", tc.Pinhole(0.2)),
+    ],
+)
+def test_family(tmp_path, mask, expected):
+    path = written(tmp_path, mask)
+    config = load_config(path)
+    study = build_study(config)
+    (exposure,) = study.exposures
+    camera = study.camera(exposure)
+    if not isinstance(expected, str):
+        same = tc.LenslessCamera(expected, camera.sensor, 3.0)
+        h = tc.psf(same, wavelength=500e-6, object_distance=100.0, model="geometric")
+        np.testing.assert_allclose(study.psf(exposure), h, rtol=1e-6, atol=1e-7)
+    assert study.mask.label in study.mask_of(exposure)
+    path.write_text(dump_config(config))  # a resolved file is read back
+    assert load_config(path) == config
+
+
+def test_an_image_file_is_a_mask(tmp_path):
+    path = written(tmp_path, f"{{family: file, path: {tmp_path / 'picture.png'}, width: 2 mm}}")
+    with pytest.raises(ConfigError, match="mask, sensor or model: .*picture.png' is coloured") as e:
+        build_study(load_config(path))
+    assert "\n" not in str(e.value)
+
+
+@pytest.mark.parametrize(
+    ("mask", "method", "message"),
+    [
+        ("{family: mura, cell: 30 um}", METHOD, "mask.order: missing; this key"),
+        ("{family: mura, order: 5, cell: 30 um, beta: 3}", METHOD, "mask.beta"),
+        ("{family: pinhole, width: 1 mm, order: 5}", METHOD, "mask.order: is no number of a mask"),
+        ("{profile: cosine}", METHOD, "mask.width: missing"),
+        (MURA, METHOD.replace("separate", "phase_pairs"), "synthesis: a mask of the family mura"),
+        (MURA, METHOD.replace("3 mm", "3 mm, beta: 5 rad/mm^2"), "beta: is of a zone plate"),
+        ("{width: 2 mm}", METHOD, r"shots\[0\].beta: missing; this key is needed"),
+    ],
+)
+def test_refused_in_one_line(tmp_path, mask, method, message):
+    with pytest.raises(ConfigError, match=message) as error:
+        load_config(written(tmp_path, mask, method))
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("mask", "message"),
+    [
+        ("{family: mura, order: 100, cell: 30 um}", "order = 100 .* give 97 or 101"),
+        (
+            "{family: random, width: 1 mm, cell: 2 mm}",
+            "width = 1 mm is not a whole number of cells",
+        ),
+    ],
+)
+def test_masks_that_cannot_be_built(tmp_path, mask, message):
+    with pytest.raises(ConfigError, match=f"^mask, sensor or model: {message}") as error:
+        build_study(load_config(written(tmp_path, mask)))
+    assert "\n" not in str(error.value)
