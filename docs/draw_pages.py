@@ -143,7 +143,43 @@ def _by_command(picture: str, command: str, config: str, *options: str) -> Path:
     return out / picture
 
 
-PAGES = {f.__name__: f for f in (models, calibration, suggest, depth, sweep)}
+def masks():
+    """A contact sheet: masks 1.5 mm wide, and the PSF of each 2 mm behind it."""
+    code = tc.maximum_length_sequence(31)
+    rings = np.random.default_rng(4).integers(0, 2, 24)
+    sheet = {
+        "Fresnel zone aperture": tc.FresnelZoneAperture(80.0, width=1.5),
+        "MURA, 29": tc.ModifiedUniformlyRedundantArray(29, 1.5 / 29),
+        "URA, 31 × 29": tc.UniformlyRedundantArray((31, 29), 1.5 / 31),
+        "code of 31, xor": tc.SeparableMask(code, code, 1.5 / 31, combine="xor"),
+        "random cells": tc.random_cells(jax.random.key(0), 1.5, 0.05),
+        "pinhole": tc.Pinhole(50 * um),
+        "lenslets, f = 2 mm": tc.LensletArray(2.0, 0.5, (3, 3)),
+        "rings": tc.RadialMask(rings, 0.75 / 24),
+    }
+    sensor = tc.Sensor((360, 360), 5 * um)
+    figure = Figure(figsize=(13, 3.9), layout="constrained")
+    panels = figure.subplots(2, len(sheet))
+    end = 360 * 5 * um / 2
+    for column, (name, mask) in zip(panels.T, sheet.items(), strict=True):
+        model = "angular_spectrum" if isinstance(mask, tc.RadialMask) else "separable"
+        camera = tc.LenslessCamera(mask, sensor, 2.0)
+        h = tc.psf(camera, wavelength=550 * nm, model=model, pixel_integration=True)
+        t = mask.sample(sensor.grid, 550 * nm)
+        shown = np.angle(t) if jnp.iscomplexobj(t) else t
+        limit = float(np.quantile(h, 0.995))
+        for ax, image, most in zip(column, (shown, h), (None, limit), strict=True):
+            ax.imshow(image, cmap="gray", vmax=most, extent=(-end, end, end, -end))
+            ax.set(xticks=(-0.75, 0.75), yticks=())
+            ax.tick_params(labelsize=8)
+        column[0].set_title(name, fontsize=10)
+        column[1].set_xlabel("x (mm)", fontsize=9)
+    panels[0, 0].set_ylabel("mask")
+    panels[1, 0].set_ylabel("PSF")
+    return figure
+
+
+PAGES = {f.__name__: f for f in (models, calibration, suggest, depth, sweep, masks)}
 
 for name in sys.argv[1:] or PAGES:
     picture, place = PAGES[name](), IMAGES / f"{name.replace('_', '-')}.png"
