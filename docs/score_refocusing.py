@@ -1,0 +1,282 @@
+"""A refocusing network (docs/learned.md) against what it has to beat, in one table.
+
+`python docs/score_refocusing.py CONFIG NETWORK IMAGES TUNING [COUNT]`: a training's config and its
+network; a folder of photographs that no weight has seen, and one of the training's, on which the
+strengths of the baselines are tuned; how many scenes of each kind. Prints a Markdown table: PSNR in
+dB with the half width of its 95 % interval, and SSIM. All methods see the same captures.
+"""
+
+import sys
+import time
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import thincam_jax as tc
+from thincam_jax import learn
+from thincam_jax.commands.learned.build import build_camera
+from thincam_jax.commands.learned.config import load_learned
+from thincam_jax.learn.refocusing.baselines import wiener
+from thincam_jax.learn.refocusing.evaluation import (
+    capture_scene,
+    flat_scene,
+    scores,
+    sub_aperture_capture,
+    with_noise,
+)
+from thincam_jax.learn.refocusing.lens_blur import lens_blur
+from thincam_jax.learn.refocusing.scenes import captured
+from thincam_jax.learn.refocusing.sources import photographs
+
+STRENGTHS = {"Wiener": (0.03, 0.1, 0.3, 1.0, 3.0), "ADMM-TV": (0.25, 0.5, 1.0, 2.0)}
+NEAR, FAR, SNR = 60.0, 120.0, 30.0
+
+
+class Shot(NamedTuple):
+    """A scene, its capture, the capture's noise and where its layers stand."""
+
+    scene: Any
+    capture: Any
+    deviation: Any
+    distances: tuple[float, ...]
+
+    def target(self, camera, distance: float):
+        return np.asarray(_focused(self.scene, camera, distance))
+
+    def in_focus(self, distance: float):
+        """Where the layer at a distance shows: all of it without a layer there."""
+        if len(self.distances) == 1 or distance not in self.distances:
+            return None
+        front = np.asarray(self.scene.cover[-2]) > 0.5
+        return front if distance == self.distances[0] else ~front
+
+
+class Methods:
+    """What focuses a shot on a distance, by its name. `camera` is the one they are told of."""
+
+    def __init__(self, network, camera=None):
+        self.camera = camera or network.camera
+        self.network = network
+        if camera is not None:
+            planes = type(network.planes)(camera)
+            self.network = eqx.tree_at(lambda n: n.planes, network, planes)
+        self.strength = {"Wiener": 0.3, "ADMM-TV": 2.0}
+
+    def wiener(self, shot: Shot, distance: float):
+        strength = jnp.asarray(self.strength["Wiener"], jnp.float32)
+        planes = self.network.planes
+        return _wiener(planes, shot.capture, shot.deviation, jnp.float32(distance), strength)
+
+    def admm(self, shot: Shot, distance: float):
+        """The whole scene taken to stand there."""
+        return self._planes(shot, (distance,))
+
+    def oracle(self, shot: Shot, distance: float):
+        """Told where the planes stand; what a lens sees of them is rendered."""
+        stack = jnp.asarray(self._planes(shot, shot.distances))
+        stack = stack.reshape(-1, *self.camera.field_shape)
+        difference = 1 / jnp.asarray(shot.distances) - 1 / distance
+        radius = self.camera.defocus_radius(difference)
+        return jnp.sum(lens_blur(stack, radius, self.camera.largest_blur), axis=0)
+
+    def learned(self, shot: Shot, distance: float):
+        return self.network.focus(shot.capture, distance, shot.deviation)
+
+    def _planes(self, shot: Shot, distances):
+        cameras = tc.Cameras(
+            [self.camera.camera],
+            wavelength=float(self.camera.light.wavelengths[0]),
+            object_distance=distances[0] if len(distances) == 1 else list(distances),
+            field_shape=self.camera.field_shape,
+        )
+        variance = float(shot.deviation) ** 2
+        recording = tc.Recording([shot.capture], cameras, noise_variance=variance)
+        solver = tc.AdmmTV(tau=self.strength["ADMM-TV"], iterations=150)
+        return np.asarray(tc.reconstruct(recording, solver).image)[..., ::-1, ::-1]
+
+
+@eqx.filter_jit
+def _focused(scene, camera, distance):
+    return scene.focused(camera, 1 / distance)
+
+
+_wiener = jax.jit(wiener)
+
+
+@eqx.filter_jit
+def _taken(camera, scene, noise, key):
+    return capture_scene(camera, scene, noise, key)
+
+
+def shoot(camera, scene, distances, seed: int, snr: float = SNR) -> Shot:
+    noise = tc.GaussianNoise(jnp.float32(snr))
+    return Shot(scene, *_taken(camera, scene, noise, jax.random.key(seed)), distances)
+
+
+def one_plane(camera, picture, distance: float, seed: int, snr: float = SNR) -> Shot:
+    scene = flat_scene(camera, [picture], [np.ones(camera.field_shape)], [distance])
+    return shoot(camera, scene, (distance,), seed, snr)
+
+
+def two_planes(camera, front, back, cover, seed: int) -> Shot:
+    covers = [cover, np.ones(camera.field_shape)]
+    scene = flat_scene(camera, [front, back], covers, [NEAR, FAR])
+    return shoot(camera, scene, (NEAR, FAR), seed)
+
+
+def rectangle(shape, seed: int) -> np.ndarray:
+    """A turned rectangle somewhere in the middle of the frame."""
+    rng = np.random.default_rng(seed)
+    y, x = np.mgrid[: shape[0], : shape[1]].astype(float)
+    down, across = (rng.uniform(0.3, 0.7) * n for n in shape)
+    angle = rng.uniform(0, np.pi)
+    u = (x - across) * np.cos(angle) + (y - down) * np.sin(angle)
+    v = (y - down) * np.cos(angle) - (x - across) * np.sin(angle)
+    return 1.0 * ((abs(u) < 0.3 * max(shape)) & (abs(v) < 0.2 * max(shape)))
+
+
+def half(shape, is_left: bool) -> np.ndarray:
+    left = np.broadcast_to(np.arange(shape[1]) < shape[1] // 2, shape)
+    return 1.0 * (left if is_left else ~left)
+
+
+def tune(methods: Methods, pictures, count: int) -> None:
+    """The strength of each baseline that is best on the training's own images, in one plane."""
+    distances = [NEAR, FAR, 180.0]
+    shots = [
+        one_plane(methods.camera, pictures[n % len(pictures)], distances[n % 3], 900 + n)
+        for n in range(count)
+    ]
+    for name, run in (("Wiener", methods.wiener), ("ADMM-TV", methods.admm)):
+        found = {}
+        for strength in STRENGTHS[name]:
+            methods.strength[name] = strength
+            found[strength] = np.mean([_psnr(methods, run, s, s.distances[0]) for s in shots])
+        methods.strength[name] = max(found, key=lambda s: found[s])
+        print(f"{name}: strength {methods.strength[name]:g} of {list(found)}", flush=True)
+
+
+def _psnr(methods: Methods, run: Callable, shot: Shot, distance: float) -> float:
+    return scores(run(shot, distance), shot.target(methods.camera, distance))["psnr"]
+
+
+def row(name: str, camera, runs: dict[str, Callable], shots: list[Shot], distance: float) -> None:
+    """One line of the table."""
+    cells = []
+    for run in runs.values():
+        each = []
+        for shot in shots:
+            region = shot.in_focus(distance)
+            found = scores(run(shot, distance), shot.target(camera, distance), region)
+            each.append((found["psnr"], found["ssim"]))
+        quality, similarity = np.transpose(each)
+        spread = 1.96 * quality.std() / len(quality) ** 0.5
+        cells.append(f"{quality.mean():.2f} ± {spread:.2f} / {similarity.mean():.3f}")
+    print(f"| {name} | " + " | ".join(cells) + " |", flush=True)
+
+
+def table(network, pictures, tuning, count: int) -> None:
+    """All lines."""
+    methods, camera = Methods(network), network.camera
+    shape = camera.field_shape
+    tune(methods, tuning, min(count, 6))
+    runs = {"Wiener": methods.wiener, "ADMM-TV": methods.admm, "oracle": methods.oracle}
+    runs["network"] = methods.learned
+    fast = {"Wiener": methods.wiener, "network": methods.learned}
+    rows, count = range(count), len(pictures)
+
+    def head(columns):
+        print("\n| test | " + " | ".join(columns) + " |\n|" + "---|" * (len(columns) + 1))
+
+    head(runs)
+    for t in (NEAR, 85.0, FAR, 170.0):
+        shots = [one_plane(camera, pictures[n % count], t, n) for n in rows]
+        row(f"one plane, {t:g} mm", camera, runs, shots, t)
+    pairs = [(pictures[n % count], pictures[-1 - n % count]) for n in rows]
+    hiding = [two_planes(camera, *p, rectangle(shape, n), 100 + n) for n, p in enumerate(pairs)]
+    for t, name in ((NEAR, "near"), (FAR, "far")):
+        row(f"two planes, {name}", camera, runs, hiding, t)
+    head(fast)
+    for is_left in (True, False):
+        shots = [two_planes(camera, *p, half(shape, is_left), 200 + n) for n, p in enumerate(pairs)]
+        for t, name in ((NEAR, "near"), (FAR, "far")):
+            row(f"near half {'left' if is_left else 'right'}, {name}", camera, fast, shots, t)
+    for t in np.round(1 / np.linspace(1 / 52, 1 / 190, 15), 1):
+        shots = [one_plane(camera, pictures[n % count], float(t), 300 + n) for n in rows]
+        row(f"sweep, {t:g} mm", camera, fast, shots, float(t))
+    for snr in (20.0, 25.0, 35.0, 45.0):
+        shots = [one_plane(camera, pictures[n % count], 100.0, 400 + n, snr) for n in rows]
+        row(f"{snr:g} dB", camera, fast, shots, 100.0)
+    shots = [photons(s, 500 + n, camera) for n, s in enumerate(shots)]
+    row("100 electrons", camera, fast, shots, 100.0)
+    row("two planes, rendered by sub-apertures, near", camera, fast, apart(camera, hiding), NEAR)
+    row("two planes, rendered by sub-apertures, far", camera, fast, apart(camera, hiding), FAR)
+    errors(network, methods, pictures, rows)
+    times(runs, hiding[0])
+
+
+def photons(shot: Shot, seed: int, camera) -> Shot:
+    """The same scene with shot noise of 100 electrons per pixel in the mean."""
+    clean = captured(camera, shot.scene.emission(camera), shot.scene.inverse)
+    noise = tc.PoissonGaussianNoise(0.0)
+    seen = with_noise(clean, noise, jax.random.key(seed), jnp.float32(100.0))
+    return Shot(shot.scene, *seen, shot.distances)
+
+
+def apart(camera, shots: list[Shot]) -> list[Shot]:
+    """The same scenes, captured by sub-apertures."""
+    noise, found = tc.GaussianNoise(SNR), []
+    for n, shot in enumerate(shots):
+        clean = sub_aperture_capture(camera, shot.scene)
+        found.append(
+            Shot(shot.scene, *with_noise(clean, noise, jax.random.key(600 + n)), (NEAR, FAR))
+        )
+    return found
+
+
+def errors(network, methods: Methods, pictures, rows) -> None:
+    """What is told is wrong: the distance by parts of a depth of focus, β and d by 1 %."""
+    camera = network.camera
+    shots = [one_plane(camera, pictures[n % len(pictures)], 100.0, 700 + n) for n in rows]
+    focus = 3.14 / float(camera.camera.mask.beta * camera.camera.distance)
+    focus = focus / (float(camera.camera.mask.extent[1]) / 2) ** 2  # of 1/t, 1/mm
+    fast = {"Wiener": methods.wiener, "network": methods.learned}
+    for part in (0.25, 0.5, 1.0):
+        told = 1 / (1 / 100.0 + part * focus)
+        wrong = {k: (lambda s, t, run=run, told=told: run(s, told)) for k, run in fast.items()}
+        row(f"t off by {part:g} of the depth of focus", camera, wrong, shots, 100.0)
+    for name, where in (("β", lambda c: c.camera.mask.beta), ("d", lambda c: c.camera.distance)):
+        other = Methods(network, eqx.tree_at(where, camera, 1.01 * where(camera)))
+        other.strength = methods.strength
+        wrong = {"Wiener": other.wiener, "network": other.learned}
+        row(f"{name} told 1 % too large", camera, wrong, shots, 100.0)
+
+
+def times(runs: dict[str, Callable], shot: Shot) -> None:
+    """Seconds of an image, warm."""
+    for name, run in runs.items():
+        began = time.perf_counter(), time.process_time()
+        np.asarray(run(shot, NEAR))
+        took = time.perf_counter() - began[0], time.process_time() - began[1]
+        print(f"{name}: {took[0]:.2f} s, {took[1]:.2f} s of CPU", flush=True)
+
+
+def squares(folder: str, camera, side: int) -> list[np.ndarray]:
+    """The middle of each photograph at the field's size."""
+    rows, columns = camera.field_shape
+    top, left = (side - rows) // 2, (side - columns) // 2
+    images = photographs(folder, side).images[:, top : top + rows, left : left + columns]
+    return list(images.astype(float))
+
+
+if __name__ == "__main__":
+    config, path, images, tuned, *more = sys.argv[1:]
+    camera = build_camera(load_learned(config))
+    network = learn.load(path, camera)
+    side = 5 * max(camera.field_shape) // 4
+    pictures, known = (squares(folder, camera, side) for folder in (images, tuned))
+    table(network, pictures, known, int(more[0]) if more else 12)
