@@ -13,6 +13,7 @@ import pytest
 from commands.photo import simulated
 
 from helpers import ROOT
+from thincam_jax.imaging.metrics import psnr
 
 PACKAGE = ROOT / "thincam_jax"
 
@@ -161,6 +162,19 @@ def test_every_equation_that_a_file_cites_has_its_row():
 )
 def test_citations_are_read(text, numbers):
     assert cited(text) == numbers
+
+
+@pytest.mark.thorough
+def test_flatcam_page():
+    names = run_examples("docs/flatcam.md")
+    assert names["found"].operator.terms == 1 and names["sigma"].shape == (9, 12)
+    assert psnr(np.asarray(names["result"].image), names["photograph"]) > 15
+    found, truth = (
+        np.einsum("kym,kxn->ymxn", o.left, o.right)
+        for o in (names["calibrated"].operator, names["operator"])
+    )
+    np.testing.assert_allclose(found, truth, atol=1e-4 * np.abs(truth).max())
+    assert not names["calibrated"].reason
 
 
 def test_pages_are_short_and_listed():

@@ -17,8 +17,9 @@ def test_the_scripts_are_there():
 
 
 def marked(script):
-    """Training takes half a minute, even small."""
-    marks = [pytest.mark.thorough] if script.stem == "learned_refocus" else []
+    """Some take half a minute, even small."""
+    long = script.stem in ("flatcam", "learned_refocus")
+    marks = [pytest.mark.thorough] if long else []
     return pytest.param(script, id=script.stem, marks=marks)
 
 

@@ -49,6 +49,7 @@ def test_single_precision_stays():
     assert relative_l2(got, expected) < 3e-5
 
 
+@pytest.mark.thorough
 def test_the_gradient_goes_through():
     """With all terms: their number cannot follow from traced numbers."""
 

@@ -105,7 +105,7 @@ def test_the_modes_of_all_terms_precondition_conjugate_gradients():
         assert 3 * int(quick.stats["num_steps"]) < int(slow.stats["num_steps"])
 
 
-@pytest.mark.parametrize("rule", ["gcv", "sure"])
+@pytest.mark.parametrize("rule", ["gcv", pytest.param("sure", marks=pytest.mark.thorough)])
 def test_rules_find_the_least_of_their_criterion(rule):
     """By the influence matrix A(AᵀA + ρ)⁻¹Aᵀ itself; the image is nearly the best of all."""
     operator, noise = flatcam(), 0.02
@@ -148,7 +148,7 @@ def test_error_bars_are_the_diagonal_of_the_dense_inverse():
     np.testing.assert_allclose(tc.Ridge(0.5).deviation(other), sigma, rtol=1e-8)
 
 
-@pytest.mark.parametrize("terms", [1, 2])
+@pytest.mark.parametrize("terms", [1, pytest.param(2, marks=pytest.mark.thorough)])
 def test_a_correlated_image(terms):
     """Against the posterior of a Gaussian image with that covariance, written out."""
     operator = flatcam(terms)
@@ -188,6 +188,7 @@ def test_error_bars_cover_the_truth():
     assert 0.93 < covered[0] < 0.97 and covered[1] > covered[0] and errors[0] < 0.7 * errors[1]
 
 
+@pytest.mark.thorough
 def test_total_variation_of_several_terms():
     """The same image as with the whole matrix."""
     operator = flatcam(3)

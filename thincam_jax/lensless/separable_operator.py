@@ -16,7 +16,7 @@ from thincam_jax.imaging.scene import Scene
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.forward import projected_shape
 from thincam_jax.lensless.method import Model
-from thincam_jax.lensless.propagation.separable import pixel_nodes
+from thincam_jax.lensless.propagation.separable import PIXEL_NODES, pixel_nodes
 from thincam_jax.lensless.psf import closed_terms
 
 # Terms below this part of all are those of other terms again: rounding.
@@ -87,7 +87,9 @@ def _factors(camera, scene: Scene, grid: Grid, model: Model, pixel_integration: 
     rows, columns = [], []
     for wavelength, weight in zip(light.wavelengths, light.weights, strict=True):
         path = camera.path(wavelength, plane.distance)
-        nodes = pixel_nodes(camera.mask, grid, path, precision_of(grid.pitch))
+        nodes = PIXEL_NODES
+        if pixel_integration:
+            nodes = pixel_nodes(camera.mask, grid, path, precision_of(grid.pitch))
         terms = closed_terms(camera.mask, grid, path, model, pixel_integration, nodes)
         y, x = terms.real_factors()
         rows.append(weight.astype(y.dtype) * y)
