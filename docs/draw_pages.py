@@ -154,7 +154,7 @@ def masks():
         "code of 31, xor": tc.SeparableMask(code, code, 1.5 / 31, combine="xor"),
         "random cells": tc.random_cells(jax.random.key(0), 1.5, 0.05),
         "pinhole": tc.Pinhole(50 * um),
-        "lenslets, f = 2 mm": tc.LensletArray(2.0, 0.5, (3, 3)),
+        "lenslets, f = 2 mm": tc.LensletArray(2.0, 1.5 / 8, (8, 8)),
         "rings": tc.RadialMask(rings, 0.75 / 24),
     }
     sensor = tc.Sensor((360, 360), 5 * um)
@@ -166,7 +166,7 @@ def masks():
         camera = tc.LenslessCamera(mask, sensor, 2.0)
         h = tc.psf(camera, wavelength=550 * nm, model=model, pixel_integration=True)
         t = mask.sample(sensor.grid, 550 * nm)
-        shown = np.angle(t) if jnp.iscomplexobj(t) else t
+        shown = np.angle(t) if mask.pure_phase else np.abs(t)
         limit = float(np.quantile(h, 0.995))
         for ax, image, most in zip(column, (shown, h), (None, limit), strict=True):
             ax.imshow(image, cmap="gray", vmax=most, extent=(-end, end, end, -end))
