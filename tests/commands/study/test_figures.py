@@ -75,3 +75,7 @@ def test_methods_of_the_same_captures_and_sums_share_a_transfer_function(tmp_pat
     panels = _by_synthesis(other, responses)
     assert [title for title, _ in panels] == [f"{first.name}; twin", study.methods[1].name]
     assert panels[0][1] is responses[first.name]
+    # The same captures, but other sums of them.
+    odd, even = (dataclasses.replace(twin, harmonics=(m,)) for m in (1, 2))
+    both = dataclasses.replace(study, methods=(odd, even))
+    assert len(_by_synthesis(both, responses)) == 2

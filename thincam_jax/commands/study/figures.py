@@ -217,7 +217,9 @@ def _by_synthesis(study: Study, responses: dict[str, Response]) -> list[tuple[st
     """Titles and responses: the methods that take the same captures and sums of them as one."""
     names: dict[tuple, list[str]] = {}
     for method in study.methods:
-        names.setdefault((method.exposures, method.synthesis), []).append(method.name)
+        names.setdefault((method.exposures, method.synthesis, method.harmonics), []).append(
+            method.name
+        )
     return [("; ".join(group), responses[group[0]]) for group in names.values()]
 
 

@@ -7,6 +7,9 @@ from thincam_jax.commands.page import render_page
 from thincam_jax.commands.run_folder import RunFolder
 from thincam_jax.commands.study.config import StudyConfig
 
+# What two methods share that add and subtract the same captures in the same way.
+_CAPTURES = ("shots", "synthesis", "phases", "steps", "harmonics")
+
 
 def render(
     config: StudyConfig, folder: RunFolder, metrics: dict[str, Any], environment: dict[str, Any]
@@ -64,11 +67,7 @@ def _gains(config: StudyConfig, metrics: dict[str, Any]) -> list[str]:
     sentences = []
     for method in (m for m in config.methods if m.kind == "admm_tv"):
         for other in (m for m in config.methods if m.kind == "wiener"):
-            if (other.shots, other.synthesis, other.phases) != (
-                method.shots,
-                method.synthesis,
-                method.phases,
-            ):
+            if any(getattr(other, key) != getattr(method, key) for key in _CAPTURES):
                 continue
             pairs = (
                 (t.name, *(metrics["methods"][m.name]["targets"][t.name]["psnr_db"] for m in pair))
