@@ -118,28 +118,31 @@ _FRINGES, _NODES = 3, 20
 _AT_ONCE = 2**19
 
 
-def pixel_average(shape, pitch, *, orders, phase, centre, **geometry) -> np.ndarray:
+def pixel_average(shape, pitch, *, orders, phase, centre, height=None, **geometry) -> np.ndarray:
     r"""Σ_kl c_k c_l* ⟨A_k A_l*⟩(y) ⟨A_k A_l*⟩(x), each average by quadrature over the pixel.
 
     The irradiance's band ends at width/(λd), which says how finely a pixel is divided.
     """
-    fringes = pitch * geometry["width"] / (geometry["wavelength"] * geometry["distance"])
+    largest = max(geometry["width"], height or 0.0)
+    fringes = pitch * largest / (geometry["wavelength"] * geometry["distance"])
     pieces = math.ceil(fringes / _FRINGES)
     nodes, weights = np.polynomial.legendre.leggauss(_NODES)
     inside = (reference.centred(pieces, 2 / pieces)[:, None] + nodes / pieces).ravel()
     weights = np.tile(weights / 2 / pieces, pieces)
     c = np.array([w * np.exp(1j * k * phase) for k, w in orders.items()])
 
-    def axis(count, offset):
+    def axis(count, offset, side):
+        aperture = {**geometry, "width": side}
         together = max(1, _AT_ONCE // len(inside))
         x = reference.centred(count, pitch)
         found = []
         for part in np.array_split(x, math.ceil(count / together)):
             fine = (part[:, None] + inside * pitch / 2).ravel()
-            fields = [reference.axis_field(k, fine, centre=offset, **geometry) for k in orders]
+            fields = [reference.axis_field(k, fine, centre=offset, **aperture) for k in orders]
             fields = np.stack(fields).reshape(len(orders), len(part), -1)
             found.append(np.einsum("kpn,lpn,n->klp", fields, fields.conj(), weights, optimize=True))
         return np.concatenate(found, axis=-1).reshape(len(orders) ** 2, count)
 
-    rows, columns = (axis(n, o) for n, o in zip(shape, centre, strict=True))
+    sides = geometry["width"] if height is None else height, geometry["width"]
+    rows, columns = (axis(*given) for given in zip(shape, centre, sides, strict=True))
     return ((np.outer(c, c.conj()).ravel()[:, None] * rows).T @ columns).real
