@@ -161,6 +161,8 @@ class AdmmMethod(OptimistixMethod):
 
     def adapt(self, state, residuals):
         """Residual balancing: μ ← μ·√(primal/dual) of each split, by at most 3 at a time."""
+        if max(residuals.primal, residuals.dual) < self.arguments.settling:
+            return self, state
         factors = [math.sqrt(_ratio(*part)) for part in residuals.parts]
         if all(1 / _ENOUGH < f < _ENOUGH for f in factors):
             return self, state

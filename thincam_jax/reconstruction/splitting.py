@@ -16,7 +16,7 @@ How f is split follows from the operators: `fourier_splitting` for convolutions 
 """
 
 import abc
-from typing import TypeVar
+from typing import ClassVar, TypeVar
 
 import equinox as eqx
 import jax
@@ -53,8 +53,10 @@ class AbstractSplitting(eqx.Module):
 
     - `tau`: weight of the variation in these units.
     - `image_unit`: the image is that of `State`, times this.
+    - `settling`: penalties follow the residuals only while one is above this overall.
     """
 
+    settling: ClassVar[float] = 0.0
     penalties: eqx.AbstractVar[Penalties]
     tau: eqx.AbstractVar[Float[Array, ""]]
     variation: eqx.AbstractVar[TotalVariation]
