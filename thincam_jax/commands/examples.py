@@ -53,5 +53,9 @@ def init(
 
 def next_command(kind: str) -> str:
     """What takes a file of that name."""
-    commands = {"design": "design", "capture": "capture", "rig": "capture", "learned": "train"}
-    return commands.get(kind.partition("_")[0], "run")
+    from thincam_jax.commands.config_file import read_raw
+
+    found = read_raw(_folder() / f"{_FILE_OF.get(kind, kind)}.yaml")[0].get("kind")
+    commands = {"screen_design": "design", "learned": "train"}
+    commands |= {name: name for name in ("design", "capture")}
+    return commands.get(str(found), "run")

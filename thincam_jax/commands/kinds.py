@@ -16,7 +16,7 @@ def load_experiment(path: str | Path, overrides: tuple[str, ...] = ()) -> Experi
     kind = read_raw(Path(path))[0].get("kind")
     if kind is None:
         return load_config(path, overrides)
-    if kind == "design":
+    if kind in ("design", "screen_design"):
         raise ConfigError(f"{path}: kind: is a design; give it to 'thincam design'")
     if kind == "capture":
         raise ConfigError(f"{path}: kind: is a capture; give it to 'thincam capture'")

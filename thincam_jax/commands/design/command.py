@@ -9,7 +9,9 @@ from thincam_jax.commands.terminal import Overrides, counted, told, warn
 
 
 def design(
-    config: Annotated[Path, typer.Argument(help="Experiment file (YAML) of kind design.")],
+    config: Annotated[
+        Path, typer.Argument(help="Experiment file (YAML) of kind design or screen_design.")
+    ],
     out: Annotated[
         Path | None, typer.Option(help="Folder of the results; default runs/NAME of the design.")
     ] = None,
@@ -22,7 +24,11 @@ def design(
     """
     goes_on = "interrupted; the same command goes on with the targets that are not finished."
     with told(lambda: goes_on):
-        from thincam_jax.commands.config_file import slug
+        from thincam_jax.commands.config_file import read_raw, slug
+
+        if read_raw(config)[0].get("kind") == "screen_design":
+            _design_plate(config, out, tuple(set_ or ()))
+            return
         from thincam_jax.commands.design.config import load_design
         from thincam_jax.commands.design.run import DesignFolder, run_design
         from thincam_jax.commands.design.simulation import build_designs
@@ -34,6 +40,30 @@ def design(
         with counted(wanted.name) as progress:
             found = run_design(study, folder, progress)
     _print(found)
+    print(f"report: {folder.path / 'report.html'}")
+
+
+def _design_plate(path: Path, out: Path | None, overrides: tuple[str, ...]) -> None:
+    import rich
+    import rich.table
+
+    from thincam_jax.commands.config_file import slug
+    from thincam_jax.commands.plate.config import load_plate_design
+    from thincam_jax.commands.plate.run import NUMBERS, PlateFolder, design_plate
+
+    wanted = load_plate_design(path, overrides)
+    folder = PlateFolder(out or Path("runs") / slug(wanted.name))
+    with counted(wanted.name) as progress:
+        found = design_plate(wanted, folder, progress)
+    plates = found["plates"]
+    table = rich.table.Table("", *plates)
+    for name, (_, label) in NUMBERS.items():
+        table.add_row(label, *(f"{plate['numbers'][name]:.4g}" for plate in plates.values()))
+    table.add_row("expected error", *(f"{plate['error']:.3g}" for plate in plates.values()))
+    for target in wanted.targets:
+        scores = [plate["targets"][target.name]["psnr_db"] for plate in plates.values()]
+        table.add_row(f"{target.name}, dB", *(f"{s:.1f}" if s else "exact" for s in scores))
+    rich.print(table)
     print(f"report: {folder.path / 'report.html'}")
 
 

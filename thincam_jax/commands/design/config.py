@@ -472,6 +472,6 @@ def load_design(path: str | Path, overrides: tuple[str, ...] = ()) -> DesignConf
         told = "is a study" if kind is None else f"is of kind {kind!r}"
         raise ConfigError(
             f"{path}: kind: {told}, for 'thincam run'; a file for 'thincam design' has "
-            "'kind: design'"
+            "'kind: design' or 'kind: screen_design'"
         )
     return load_as(DesignConfig, path, overrides)

@@ -94,9 +94,10 @@ def build_setup(config: ScreenConfig) -> Setup:
     **Errors**: ConfigError, one line for each fault, beginning with its place.
     """
     targets, faults = [], []
+    channels = len(config.hologram.colours or ())
     for number, target in enumerate(config.targets):
         try:
-            targets.append(Shown(target, _picture(target, config)))
+            targets.append(Shown(target, picture(target, config.object.cells, channels)))
         except (ValueError, FileNotFoundError) as error:
             place = config.place_of("targets", number, "path")
             faults.append(f"{place}targets[{number}]: {error}")
@@ -160,14 +161,17 @@ def _rectangle(part: RectangleConfig | None) -> wg.Rectangle | None:
     return wg.Rectangle(jnp.asarray([part.x, part.y]), jnp.asarray([part.width, part.height]))
 
 
-def _picture(target: ScreenTargetConfig, config: ScreenConfig) -> np.ndarray:
+def picture(target: ScreenTargetConfig, cells: tuple[int, int], channels: int = 0) -> np.ndarray:
+    """A target on the cells, radiance 0 to 1: (y, x), or with so many channels (y, x, channel).
+
+    **Errors**: ValueError for a uniform picture, FileNotFoundError where there is none.
+    """
     picture = np.atleast_3d(read_picture(target))
     if target.crop < 1:
         picture = middle_square(picture, round(target.crop * min(picture.shape[:2])))
-    coloured = config.hologram.colours is not None
-    picture = resize(picture if coloured else picture.mean(axis=-1), config.object.cells)
-    if coloured:
-        picture = np.broadcast_to(picture, (*config.object.cells, len(config.hologram.recorded)))
+    picture = resize(picture if channels else picture.mean(axis=-1), cells)
+    if channels:
+        picture = np.broadcast_to(picture, (*cells, channels))
     if target.binary:
         picture = (picture > picture.mean()).astype(float)
     if picture.min() == picture.max():

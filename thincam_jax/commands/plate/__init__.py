@@ -1,0 +1,1 @@
+"""Designs of see-through screens: `thincam design` of a file of kind screen_design."""
