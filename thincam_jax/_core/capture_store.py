@@ -5,9 +5,10 @@ of its pixels, 0 where it has not been captured. A chunk holds some frames of so
 checksum of its own. No compression: the last bits of a camera are noise.
 """
 
+import contextlib
 import hashlib
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,33 @@ class CaptureStoreError(MeasurementError):
     """A store of captures that cannot be used; one line says which frames and what to do."""
 
 
+@contextlib.contextmanager
+def opened(
+    path: str | Path, kinds: Sequence[str], told: tuple[str, str], mode: str = "r"
+) -> Iterator[tuple[Any, dict[str, Any]]]:
+    """The Zarr group at `path` and its attributes, for a block that takes its arrays.
+
+    - `told`: what it is to be, and what makes one.
+
+    **Errors**: CaptureStoreError, one line, where it is of none of the `kinds` or of another
+    version, or where the block finds something missing (KeyError) or wrong (ValueError).
+    """
+    import zarr  # a second
+
+    try:
+        group: Any = zarr.open_group(path, mode=mode)  # pyright: ignore[reportArgumentType]
+        attributes: dict[str, Any] = dict(group.attrs)
+        kind, version = attributes["kind"], attributes["version"]
+        if kind not in kinds or version != VERSION:
+            raise ValueError(f"{kind}, version {version}")
+        yield group, attributes
+    except (OSError, ValueError, KeyError) as error:
+        raise CaptureStoreError(
+            f"{path} is no {told[0]} ({type(error).__name__}: {error}); give one that {told[1]} "
+            "made"
+        ) from error
+
+
 class CaptureStore:
     """The arrays of a store that is open; `path` is its folder.
 
@@ -34,23 +62,12 @@ class CaptureStore:
     """
 
     def __init__(self, path: Path, mode: str = "r", kinds: Sequence[str] = (CALIBRATION, CAPTURES)):
-        import zarr  # a second
-
         self.path = path
-        try:
-            self.group: Any = zarr.open_group(path, mode=mode)  # pyright: ignore[reportArgumentType]
-            self.attributes = dict(self.group.attrs)
-            kind, version = self.attributes["kind"], self.attributes["version"]
-            if kind not in kinds or version != VERSION:
-                raise ValueError(f"{kind}, version {version}")
+        told = f"store of {kinds[-1]}", "an acquisition or create_captures"
+        with opened(path, kinds, told, mode) as (self.group, self.attributes):
             # A chunk of black frames is written, too: one that is not there is missing.
             self.frames = self.group["frames"].with_config({"write_empty_chunks": True})
             self.digests = np.asarray(self.group["digests"][:])
-        except (OSError, ValueError, KeyError) as error:
-            raise CaptureStoreError(
-                f"{path} is no store of {kinds[-1]} ({type(error).__name__}: {error}); give one "
-                "that an acquisition or create_captures made"
-            ) from error
 
     @classmethod
     def create(

@@ -146,7 +146,10 @@ class _PlateRun:
         rays = wg.trace(camera, jnp.zeros((1, 2)), viewing.object_distance, ORDERS)
         middle = jnp.sum(rays.points[:, 0, 1] * rays.weight[:, 0]) / jnp.sum(rays.weight)
         plane = wg.ObjectPlane(
-            cells, viewing.object_distance, viewing.object_width, (0.0, float(middle))
+            cells,
+            viewing.object_distance,
+            viewing.object_width,
+            jnp.stack([jnp.zeros_like(middle), middle]),
         )
         system = wg.system_operator(camera, plane, ORDERS, BAND_SAMPLES)
         light = judge_plate(plate, viewing).light

@@ -19,12 +19,13 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from thincam_jax._core.capture_store import VERSION, opened
 from thincam_jax._core.memory import refuse_if_too_large
 from thincam_jax.imaging.operators import Matrix
 from thincam_jax.measured.calibration.captures import CaptureStoreError, HadamardCaptures
 from thincam_jax.measured.calibration.hadamard import natural_rows, walsh_hadamard
 
-_KIND, _VERSION = "system matrix", 1
+_KIND = "system matrix"
 _BLOCK = 2**22  # bytes of a chunk of a stored matrix
 _ALIGNED = 64  # bytes: an array that starts at a multiple becomes one of JAX without a copy
 
@@ -88,7 +89,7 @@ def write_matrix(captures: HadamardCaptures, path: str | Path) -> Path:
     # Last: a matrix that was not finished is none.
     group.attrs.update(
         kind=_KIND,
-        version=_VERSION,
+        version=VERSION,
         object_shape=series.object_shape,
         sensor_shape=captures.sensor_shape,
     )
@@ -158,22 +159,12 @@ def _operator(matrix: np.ndarray, object_shape, sensor_shape) -> Matrix:
 
 
 def _stored(path: str | Path) -> tuple[dict[str, Any], Any]:
-    import zarr
-
-    try:
-        group = zarr.open_group(path, mode="r")
-        attributes: dict[str, Any] = dict(group.attrs)
+    told = "finished system matrix", "write_matrix"
+    with opened(path, (_KIND,), told) as (group, attributes):
         array: Any = group["matrix"]
-        if attributes["kind"] != _KIND or attributes["version"] != _VERSION:
-            raise ValueError(f"{attributes['kind']}, version {attributes['version']}")
         shape = tuple(math.prod(attributes[name]) for name in ("sensor_shape", "object_shape"))
         if array.shape != shape:
             raise ValueError(f"the matrix has another shape than {shape}")
-    except (OSError, ValueError, KeyError) as error:
-        raise CaptureStoreError(
-            f"{path} is no finished system matrix ({type(error).__name__}: {error}); give one that "
-            "write_matrix made"
-        ) from error
     return attributes, array
 
 
