@@ -56,6 +56,6 @@ def next_command(kind: str) -> str:
     from thincam_jax.commands.config_file import read_raw
 
     found = read_raw(_folder() / f"{_FILE_OF.get(kind, kind)}.yaml")[0].get("kind")
-    commands = {"screen_design": "design", "learned": "train"}
-    commands |= {name: name for name in ("design", "capture")}
+    commands = {"design": "design", "screen_design": "design"}
+    commands |= {"capture": "capture", "learned": "train"}
     return commands.get(str(found), "run")
