@@ -3,8 +3,8 @@ r"""Families of phase masks: the random diffuser and the Voronoi-Fresnel lenses.
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jaxtyping import PRNGKeyArray
-from scipy.spatial import KDTree
 
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Number
@@ -81,11 +81,11 @@ def voronoi_fresnel(
     half = np.array(blank.shape) * float(blank.pitch) / 2
     places = np.asarray(jax.random.uniform(key, (sites, 2), minval=-1.0, maxval=1.0)) * half
     for _ in range(relaxations):
-        owner = KDTree(places).query(cells)[1]
+        owner = scipy.spatial.KDTree(places).query(cells)[1]
         count = np.bincount(owner, minlength=sites)[:, None]
         sums = [np.bincount(owner, cells[:, axis], sites) for axis in (0, 1)]
         places = np.where(count > 0, np.stack(sums, axis=-1) / np.maximum(count, 1), places)
-    squared = KDTree(places).query(cells)[0].reshape(blank.shape) ** 2
+    squared = scipy.spatial.KDTree(places).query(cells)[0].reshape(blank.shape) ** 2
     _require_held(blank, float(np.sqrt(squared.max())), float(focal_length), float(light))
     f = float(focal_length)
     turns = -squared / (np.sqrt(squared + f**2) + f) / float(light)

@@ -12,7 +12,6 @@ from thincam_jax._core import checks
 from thincam_jax._core.checks import Number, Numbers
 from thincam_jax._core.grids import Grid, cell_overlap, centred_indices
 from thincam_jax._core.precision import as_complex, product
-from thincam_jax.imaging.targets.images import load_image
 from thincam_jax.lensless.masks.base import AbstractFactoredMask, AxisFactors, MaskTerms
 from thincam_jax.lensless.masks.cells import cell_edges
 
@@ -129,6 +128,9 @@ def read_mask(path: str | os.PathLike[str], cell: Number) -> SampledMask:
     **Errors**: FileNotFoundError; ValueError, one line, for a file that is no image, for one with
     colours and for one that lets no light pass.
     """
+    # Here: a camera waits for no library that reads files.
+    from thincam_jax.imaging.targets.images import load_image
+
     levels = load_image(path)
     if levels.ndim == 3 and np.ptp(levels, axis=-1).max() > 0:
         raise ValueError(f"{str(path)!r} is coloured; give a grey image, white where it is open")
