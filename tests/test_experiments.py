@@ -18,12 +18,12 @@ def test_the_scripts_are_there():
 
 def marked(script):
     """Some take half a minute, even small."""
-    long = script.stem in ("flatcam", "learned_refocus")
+    long = script.stem in ("flatcam", "learned_refocus", "stis_camera")
     marks = [pytest.mark.thorough] if long else []
     return pytest.param(script, id=script.stem, marks=marks)
 
 
-@pytest.mark.parametrize("script", map(marked, SCRIPTS))
+@pytest.mark.parametrize("script", [marked(script) for script in SCRIPTS])
 def test_a_script_runs_and_draws(script, monkeypatch, tmp_path):
     """In a user's precision. Every panel with a scale says what it shows, and in which unit."""
     monkeypatch.setenv("THINCAM_SIZE", "small")

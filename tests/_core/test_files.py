@@ -1,4 +1,5 @@
 import os
+import resource
 
 import pytest
 
@@ -31,17 +32,16 @@ def test_crash_before_the_rename_leaves_the_old_file_alone(tmp_path, monkeypatch
     assert [p.name for p in tmp_path.iterdir()] == ["a.txt"]
 
 
-def test_crash_while_writing_leaves_nothing_half(tmp_path, monkeypatch):
+def test_crash_while_writing_leaves_nothing_half(tmp_path):
+    """A limit to the size of files ends the writing as a full disk does."""
     path = tmp_path / "a.txt"
-
-    def half(self, data):
-        with self.open("wb") as file:
-            file.write(data[: len(data) // 2])
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(type(path), "write_bytes", half)
-    with pytest.raises(OSError, match="No space left"):
-        files.write_whole(path, "new text")
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4, hard))
+    try:
+        with pytest.raises(files.WriteError, match="too large"):
+            files.write_whole(path, "new text")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert list(tmp_path.iterdir()) == []
 
 

@@ -260,7 +260,7 @@ class TestCheck:
         ("override", "part"),
         [
             ("mask.harmonics=4", "give an odd number"),
-            ("mask.pixel_pitch=0.3 mm", "not a whole number of display pixels"),
+            ("mask.pixel_pitch=0.3 mm", "not a whole number of cells of pixel_pitch"),
         ],
     )
     def test_camera_that_cannot_be_built(self, override, part, tmp_path):
