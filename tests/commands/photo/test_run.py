@@ -58,8 +58,8 @@ def test_folder_is_compiled_once(folder, tmp_path, compilations):
         assert isinstance(result, Finished)
         counts.append(len(compilations))
         shares.append(result.record["preparation"]["validity"]["valid_share"])
-    assert len(counts) == 3 and counts[0] > 0
-    assert counts[1] == counts[2] == counts[0]
+    # None at all where another test has compiled for these sizes before.
+    assert len(counts) == 3 and counts[1] == counts[2] == counts[0]
     assert shares[0] == shares[2] == 1 and shares[1] < 1
     assert sorted(p.stem for p in (tmp_path / "out").glob("*.png")) == ["first", "second", "third"]
 
