@@ -45,6 +45,12 @@ def test_names_wait_for_no_library_of_analysis_or_plots(name):
     assert modules.isdisjoint(f"scipy.{part}" for part in parts)
 
 
+def test_reconstructions_without_a_network_wait_for_no_learned_part():
+    modules = imported_by("import thincam_jax.commands.photo.console")
+    assert "thincam_jax.commands.photo.run" in modules
+    assert modules.isdisjoint(("thincam_jax.learn", "thincam_jax.design"))
+
+
 @pytest.mark.parametrize(
     "typed",
     ["--help", "--version", "run --help", "bench accuracy --help", "calibrate check --help"]

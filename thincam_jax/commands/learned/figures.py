@@ -6,10 +6,9 @@ from matplotlib.figure import Figure
 from thincam_jax.commands.refocus.figures import grey_levels, white_level
 from thincam_jax.learn.refocusing.network import RefocusNetwork
 from thincam_jax.learn.refocusing.scenes import Batch
-from thincam_jax.learn.refocusing.use import Reading
+from thincam_jax.learn.refocusing.use import SURE, Reading
 from thincam_jax.learn.training import TrainingState
 
-_SURE = 0.5  # confidence below which a pixel is marked
 _SMOOTHED = 25  # steps
 _SHOWN = 3  # scenes
 
@@ -55,7 +54,7 @@ def draw_scenes(network: RefocusNetwork, batch: Batch, reading: Reading) -> Figu
             ax.imshow(levels[::-1, ::-1], cmap="gray", vmin=0, vmax=1)
         row[5].set_title("distance", fontsize=9)
         row[6].set_title("network, distance", fontsize=9)
-        unsure = np.asarray(reading.confidence[number])[::-1, ::-1] < _SURE
+        unsure = np.asarray(reading.confidence[number])[::-1, ::-1] < SURE
         for ax, distance in zip(row[5:], (batch.distance, reading.distance), strict=True):
             inverse = 1 / np.asarray(distance[number])[::-1, ::-1]
             shown = ax.imshow(inverse, cmap="viridis", vmin=1 / far, vmax=1 / near)

@@ -5,7 +5,7 @@ from pathlib import Path
 import rich.markup
 import rich.progress
 
-from thincam_jax.commands.photo.camera import computed_psf, read_camera, read_network
+from thincam_jax.commands.photo.camera import computed_psf, read_camera
 from thincam_jax.commands.photo.jobs import Job
 from thincam_jax.commands.photo.options import Background, Focusing, Output, Recipe, Sources
 from thincam_jax.commands.photo.run import Failed, Finished, run_jobs
@@ -77,7 +77,11 @@ def known_camera(
     except ValueError as error:
         raise MeasurementError(f"--distance: {error}") from None
     seen_by = read_camera(camera, overrides or (), focused)
-    return seen_by, None if network is None else read_network(network, seen_by)
+    if network is None:
+        return seen_by, None
+    from thincam_jax.commands.photo.network import read_network
+
+    return seen_by, read_network(network, seen_by)
 
 
 def read_distances(text: str | None, psf: Path | None) -> tuple[float, ...]:

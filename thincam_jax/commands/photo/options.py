@@ -2,10 +2,9 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from thincam_jax._core import checks
-from thincam_jax.learn.refocusing.network import RefocusNetwork
 from thincam_jax.measured import MeasurementError, Preparation, Raw
 from thincam_jax.measured.read import image_files
 from thincam_jax.measured.write import WhiteBalance
@@ -51,10 +50,13 @@ class Sources:
 
 @dataclass(frozen=True)
 class Focusing:
-    """A network in place of a solver, and the distance that its images are focused on, mm."""
+    """A network in place of a solver, and the distance that its images are focused on, mm.
+
+    - `network`: a `RefocusNetwork`, not named here: other methods need not wait for its import.
+    """
 
     path: Path
-    network: RefocusNetwork
+    network: Any
     distance: float
 
 

@@ -13,7 +13,6 @@ from jaxtyping import Array, Float
 
 from thincam_jax._core.memory import refuse_if_too_large
 from thincam_jax.commands.doctor import environment
-from thincam_jax.commands.photo.camera import focus
 from thincam_jax.commands.photo.jobs import Job, write_job
 from thincam_jax.commands.photo.options import Background, Output, Recipe, Sources
 from thincam_jax.imaging.operators import window_shape
@@ -154,6 +153,8 @@ def _run_job(job: Job, rig: Rig, recipe: Recipe, output: Output, told: Told | No
     if recipe.focusing is None:
         image, facts = _reconstruct(job, ready, recipe, told)
     else:
+        from thincam_jax.commands.photo.network import focus
+
         noise, how = _noise(ready, recipe)
         image, facts, marked = focus(ready, recipe.focusing, noise)
         facts["noise"] = {"counts": noise / _of_a_count(ready), "found": how}

@@ -27,6 +27,8 @@ from thincam_jax.reconstruction.solver import AbstractSolver, Reconstruction
 
 # Residual over noise from which an image is doubted.
 _DOUBTED = 1.5
+# Confidence below which commands and reports mark a pixel.
+SURE = 0.5
 
 
 class Reading(NamedTuple):
