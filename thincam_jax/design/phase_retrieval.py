@@ -11,6 +11,7 @@ from thincam_jax._core import checks
 from thincam_jax._core.checks import Shape
 from thincam_jax._core.grids import Grid
 from thincam_jax._core.precision import as_complex, phasor
+from thincam_jax.imaging.operators.crop_convolution import cut, middle_corner, place
 from thincam_jax.lensless.propagation.angular_spectrum import (
     padded_shape,
     propagate,
@@ -83,35 +84,22 @@ def _to_and_fro(target, grid: Grid, path: Path, cells: tuple[int, int], key, ste
     window = padded_shape(cells, grid.shape, 1.0)
     # One more where halves would not agree.
     window = tuple(w + (w - m) % 2 for w, m in zip(window, cells, strict=True))
+    corner, seen_corner = (middle_corner(shape, window) for shape in (cells, grid.shape))
     amplitude = jnp.sqrt(target * (cells[0] * cells[1] / jnp.sum(target)))
     lit = spherical_wave(grid.with_shape(cells), path)
 
     def to_sensor(phase):
-        return propagate(_padded(lit * phasor(phase), window), grid.pitch, path)
+        return propagate(place(lit * phasor(phase), corner, window), grid.pitch, path)
 
     def step(phase, _):
         field = to_sensor(phase)
-        seen = _middle(field, grid.shape)
+        seen = cut(field, seen_corner, grid.shape)
         error = match_error(seen.real**2 + seen.imag**2, target)
         wanted = as_complex(amplitude) * phasor(jnp.angle(seen))
         # The adjoint of `propagate` runs light backwards: the conjugate of its conjugate's.
-        back = propagate(_padded(wanted, window).conj(), grid.pitch, path).conj()
-        return jnp.angle(_middle(back, cells) * lit.conj()), error
+        back = propagate(place(wanted, seen_corner, window).conj(), grid.pitch, path).conj()
+        return jnp.angle(cut(back, corner, cells) * lit.conj()), error
 
     first = jax.random.uniform(key, cells, target.dtype, maxval=2 * jnp.pi)
     phase, errors = jax.lax.scan(step, first, None, length=steps)
     return phase % (2 * jnp.pi), errors
-
-
-def _padded(field, window):
-    margins = [
-        ((w - n) // 2, w - n - (w - n) // 2) for w, n in zip(window, field.shape, strict=True)
-    ]
-    return jnp.pad(field, margins)
-
-
-def _middle(field, shape):
-    rows, columns = (
-        slice((w - n) // 2, (w - n) // 2 + n) for w, n in zip(field.shape, shape, strict=True)
-    )
-    return field[rows, columns]

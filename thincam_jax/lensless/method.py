@@ -1,7 +1,7 @@
 """The models of the PSF by name, and how one is computed."""
 
 import math
-from typing import Literal, NamedTuple, cast, get_args
+from typing import Literal, NamedTuple, TypeGuard, cast, get_args
 
 import numpy as np
 
@@ -39,7 +39,7 @@ CLOSED: tuple[Model, ...] = tuple(model for model in MODELS if model not in SAMP
 _MOST_TERMS = 128
 
 
-def has_few_terms(mask: AbstractMask) -> bool:
+def has_few_terms(mask: AbstractMask) -> TypeGuard[AbstractFactoredMask]:
     """Whether the mask is a sum of so few products that `separable` serves it."""
     return isinstance(mask, AbstractFactoredMask) and term_count(mask).terms <= _MOST_TERMS
 
@@ -106,8 +106,12 @@ def _samples_of_cells(mask: AbstractMask, grid: Grid) -> int:
     """Samples a pixel, odd, that are no larger than a phase mask's cells; 1 for traced sizes."""
     if not isinstance(mask, PhaseMask) or any(map(checks.is_traced, (mask.pitch, grid.pitch))):
         return 1
-    cells = float(np.asarray(grid.pitch) / np.asarray(mask.pitch))
-    return 2 * math.ceil((cells - 1e-4 - 1) / 2) + 1
+    return odd_from(float(np.asarray(grid.pitch) / np.asarray(mask.pitch)))
+
+
+def odd_from(number: float) -> int:
+    """The smallest odd count that is no less, but for rounding."""
+    return 2 * math.ceil((number - 1e-4 - 1) / 2) + 1
 
 
 def _mask_plane(mask: AbstractMask, grid: Grid) -> tuple[int, int] | None:

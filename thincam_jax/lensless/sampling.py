@@ -13,7 +13,7 @@ from thincam_jax._core.grids import Grid
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.masks.base import AbstractMask
 from thincam_jax.lensless.masks.phase import PhaseMask
-from thincam_jax.lensless.method import Model, PsfMethod
+from thincam_jax.lensless.method import Model, PsfMethod, odd_from
 from thincam_jax.lensless.propagation.path import Path
 
 
@@ -77,7 +77,7 @@ def require_phase_sampling(mask: AbstractMask, grid: Grid, path: Path, method: P
         )
     own, highest = _frequencies(mask, grid, path, method.model)
     pitch = float(grid.pitch)
-    enough = samples_needed(mask, grid, path, method.model)
+    enough = odd_from(2 * pitch * highest)
     if method.samples >= enough:
         return
     samples = f"samples {pitch / method.samples * 1e3:.3g} um apart"
@@ -99,8 +99,7 @@ def samples_needed(mask: AbstractMask, grid: Grid, path: Path, model: Model) -> 
     """Samples a pixel, odd, that hold the phases of a `PhaseMask`; 1 of other masks."""
     if not isinstance(mask, PhaseMask):
         return 1
-    turned = 2 * float(grid.pitch) * _frequencies(mask, grid, path, model)[1]
-    return 2 * math.ceil((turned - 1e-4 - 1) / 2) + 1
+    return odd_from(2 * float(grid.pitch) * _frequencies(mask, grid, path, model)[1])
 
 
 def _frequencies(mask: PhaseMask, grid: Grid, path: Path, model: Model) -> tuple[float, float]:

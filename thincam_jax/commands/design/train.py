@@ -26,7 +26,6 @@ from thincam_jax.commands.design.surroundings import (
     shown,
     straight,
 )
-from thincam_jax.commands.study.build import middle_square
 from thincam_jax.design import Design, DesignSpace, Setup, Training, end_to_end_error, wiener_error
 from thincam_jax.design.search import (
     APART,
@@ -38,7 +37,7 @@ from thincam_jax.design.search import (
     even_samples,
     without_repeats,
 )
-from thincam_jax.imaging.targets import resize, sample_image
+from thincam_jax.imaging.targets import middle_square, resize, sample_image
 
 # Single precision holds the error to some 1e-6 of itself.
 _TOLERANCE = 1e-4

@@ -18,7 +18,7 @@ from thincam_jax.commands.study.study import Capture, Exposure, Method, Study, T
 from thincam_jax.imaging.metrics import psnr
 from thincam_jax.imaging.metrics.image import SSIM_WINDOW
 from thincam_jax.imaging.scene import ImagePlane
-from thincam_jax.imaging.targets import resize
+from thincam_jax.imaging.targets import middle_square, resize
 from thincam_jax.reconstruction import Reconstruction
 from thincam_jax.reconstruction.depth import RefocusSweep, axial_resolution, refocus_distances
 from thincam_jax.reconstruction.depth.find import (
@@ -76,7 +76,7 @@ def _place(study: Study, number: int, placed: PlacedConfig) -> PlacedTarget:
     picture = np.atleast_3d(build.read_picture(placed)).astype(np.float32)
     picture = picture.astype(np.float64).mean(axis=-1)
     if placed.crop < 1:
-        picture = build.middle_square(picture, round(placed.crop * min(picture.shape)))
+        picture = middle_square(picture, round(placed.crop * min(picture.shape)))
     # Two pixels of the picture to one of the reconstruction.
     finest = max(_pixels_per_mm(study, method, placed) for method in study.methods)
     columns = max(8, round(2 * placed.width * finest))

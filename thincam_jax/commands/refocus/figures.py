@@ -13,9 +13,9 @@ from matplotlib.patches import Rectangle
 from thincam_jax.commands.config_file import slug
 from thincam_jax.commands.refocus.build import FoundObjects, object_box
 from thincam_jax.commands.run_folder import RunFolder
-from thincam_jax.commands.study.build import middle_square
 from thincam_jax.commands.study.figures import line_style, save_figure, save_image
 from thincam_jax.commands.study.study import Method, Study, Target
+from thincam_jax.imaging.targets import middle_square
 from thincam_jax.reconstruction.depth import DepthMap, RefocusSweep
 from thincam_jax.reconstruction.depth.focus import Measure
 

@@ -22,10 +22,10 @@ from thincam_jax.commands.screen.config import (
     SeeThroughConfig,
 )
 from thincam_jax.commands.sections import VariationConfig
-from thincam_jax.commands.study.build import build_noise, middle_square, read_picture
+from thincam_jax.commands.study.build import build_noise, read_picture
 from thincam_jax.imaging.operators import AbstractOperator, Sparse
 from thincam_jax.imaging.sensor import Sensor, electrons_per_unit, read_out
-from thincam_jax.imaging.targets import resize
+from thincam_jax.imaging.targets import middle_square, resize
 from thincam_jax.reconstruction import (
     AdmmTV,
     Reconstruction,

@@ -137,13 +137,6 @@ def read_picture(target: TargetConfig) -> np.ndarray:
     return getattr(drawn, target.kind)(shape)
 
 
-def middle_square(image: np.ndarray, side: int) -> np.ndarray:
-    """The middle (side, side, …) of an image, one pixel at least."""
-    side = max(1, side)
-    top, left = ((n - side) // 2 for n in image.shape[:2])
-    return image[top : top + side, left : left + side]
-
-
 def check_study(study: Study, unread: dict[int, str] | None = None) -> None:
     """Refuse cameras that cannot be built, images that cannot be read, and too few pixels.
 

@@ -95,12 +95,12 @@ class CropConvolution(AbstractOperator):
     @property
     def field_corner(self) -> tuple[int, int]:
         """Window sample of the field's first one."""
-        return _corner(self.field_shape, self.window)
+        return middle_corner(self.field_shape, self.window)
 
     @property
     def sensor_corner(self) -> tuple[int, int]:
         """Window sample of the sensor's first pixel."""
-        return _corner(self.sensor_shape, self.window)
+        return middle_corner(self.sensor_shape, self.window)
 
     def __call__(self, field: Float[Array, "*batch m n"]) -> Float[Array, "*channels y x"]:
         """The capture of a field (*batch, *channel, *summed, m, n)."""
@@ -191,7 +191,8 @@ def cut(
     return window[..., top : top + rows, left : left + columns]
 
 
-def _corner(shape, window) -> tuple[int, int]:
+def middle_corner(shape: Sequence[int], window: Sequence[int]) -> tuple[int, int]:
+    """Where what is in the middle of a window starts."""
     rows, columns = ((w - n) // 2 for n, w in zip(shape, window, strict=True))
     return rows, columns
 

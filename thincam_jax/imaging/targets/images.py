@@ -148,3 +148,10 @@ def _unit_range(pixels: np.ndarray, path: Path) -> np.ndarray:
         f"{str(path)!r} holds {pixels.dtype} from {pixels.min()} to {pixels.max()}; allowed are "
         "unsigned integers, or floats from 0 to 1: rescale it"
     )
+
+
+def middle_square(image: np.ndarray, side: int) -> np.ndarray:
+    """The middle (side, side, …) of an image, one pixel at least."""
+    side = max(1, side)
+    top, left = ((n - side) // 2 for n in image.shape[:2])
+    return image[top : top + side, left : left + side]

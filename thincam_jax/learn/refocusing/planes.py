@@ -1,7 +1,6 @@
 """A stack of planes at fixed distances, as the sensor sees it."""
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
 
@@ -14,7 +13,7 @@ class Planes(eqx.Module):
     """The exact spectra of the PSFs of a camera's planes, and those of any other distance.
 
     Images and captures are in units in which both are about 1: a capture is divided by the light
-    that a uniform scene of radiance 1 sends on average, `unit` (see `normalised`).
+    that a uniform scene of radiance 1 sends on average, `unit`.
 
     - `camera`: what they are of.
     - `operator`: from the stack (plane, y, x) to the capture (y, x), both as the camera has them.
@@ -86,7 +85,3 @@ class Planes(eqx.Module):
         inside = jnp.clip(inverse_distance, 1 / camera.far, 1 / camera.near)
         planes = camera.inverse_distances.reshape(-1, *(1,) * inside.ndim)
         return jnp.maximum(1 - jnp.abs(planes - inside) / camera.step, 0)
-
-    def stopped(self) -> "Planes":
-        """The same without derivatives, where only weights are learnt."""
-        return jax.tree.map(jax.lax.stop_gradient, self)

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float32
 
-from thincam_jax.imaging.targets import load_image, resize, sample_image
+from thincam_jax.imaging.targets import load_image, middle_square, resize, sample_image
 from thincam_jax.learn.refocusing.dead_leaves import dead_leaves
 
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
@@ -88,10 +88,8 @@ def _square(image: np.ndarray, side: int) -> Float32[np.ndarray, "side side"]:
     linear = linear_light(image)
     if linear.ndim == 3:
         linear = linear @ np.array([0.2126, 0.7152, 0.0722])  # luminance of sRGB's primaries
-    rows, columns = linear.shape
-    n = min(rows, columns)
-    top, left = (rows - n) // 2, (columns - n) // 2
-    return resize(linear[top : top + n, left : left + n], (side, side)).astype(np.float32)
+    square = middle_square(linear, min(linear.shape))
+    return resize(square, (side, side)).astype(np.float32)
 
 
 def _licence(folder: Path) -> str:

@@ -21,6 +21,7 @@ from thincam_jax.learn.checkpoint import (
 )
 from thincam_jax.learn.refocusing.cameras import RefocusCamera
 from thincam_jax.learn.refocusing.network import NetworkOptions, RefocusNetwork
+from thincam_jax.learn.refocusing.planes import Planes
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.reconstruction.seen_by import Cameras
 
@@ -71,8 +72,7 @@ def load(
     except (TypeError, ValueError, AttributeError) as error:
         raise CheckpointError(f"{path}: holds options of another version ({error})") from None
     weights = jax.tree.map(jnp.asarray, read_arrays(path, structure))
-    fresh = RefocusNetwork.create(given, options, key=jax.random.key(0))
-    return eqx.tree_at(lambda network: network.weights, fresh, weights)
+    return RefocusNetwork(weights, Planes(given), options)
 
 
 def network_description(path: str | os.PathLike[str]) -> dict[str, Any]:

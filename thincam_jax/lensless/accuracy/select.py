@@ -110,7 +110,7 @@ def select_model(
     **Errors**: ValueError for what is out of range; TypeError for traced numbers.
     """
     tolerance = tolerance_of(tolerance)
-    if isinstance(camera, LenslessCamera) and not _is_exact(camera.mask):
+    if isinstance(camera, LenslessCamera) and not has_few_terms(camera.mask):
         grid = grid or camera.sensor.grid
         path = camera.path(wavelength, object_distance)
         _require_known((camera, path, grid))
@@ -164,11 +164,6 @@ def _prediction(
     return Prediction(method.model, method.precision, method.oversampling, error, cost)
 
 
-def _is_exact(mask: AbstractMask) -> bool:
-    """Whether the field of the mask has few terms, and so a PSF to compare the others with."""
-    return isinstance(mask, AbstractFactoredMask) and has_few_terms(mask)
-
-
 def _select_sampled(
     mask: AbstractMask, grid: Grid, found: Iterator[tuple[PsfMethod, float]], tolerance: float
 ) -> Selection:
@@ -219,7 +214,7 @@ def require_camera(camera: LenslessCamera, function: str) -> AbstractFactoredMas
     if not isinstance(camera, LenslessCamera):
         raise TypeError(f"camera is a {type(camera).__name__}; give a thincam_jax.LenslessCamera")
     mask = camera.mask
-    if not isinstance(mask, AbstractFactoredMask) or not has_few_terms(mask):
+    if not has_few_terms(mask):
         raise TypeError(
             f"{function} needs a mask of few separable terms, such as FresnelZoneAperture; "
             f"for this {type(mask).__name__} choose 'angular_spectrum' or 'rayleigh_sommerfeld' "

@@ -1,5 +1,6 @@
 """Uniformly redundant arrays: codes whose correlation with a decoding pattern is one point."""
 
+import abc
 from collections.abc import Callable
 from typing import Any
 
@@ -29,9 +30,9 @@ class AbstractRedundantArray(AbstractCellMask):
     tiles: eqx.AbstractVar[tuple[int, int]]
 
     @property
+    @abc.abstractmethod
     def shape(self) -> tuple[int, int]:
         """Cells (r, s) of one array."""
-        raise NotImplementedError
 
     def patterns(self) -> Patterns:
         symbols = [_legendre_symbols(p) for p in self.shape]
