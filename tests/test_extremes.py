@@ -123,14 +123,25 @@ def difference(extreme: Extreme, name: str) -> tuple[float, float]:
     return float(slope) / step, rounding * float(spread) / step
 
 
-# In double precision each of these is the only one of a program that takes long to compile.
+# Each of these is the only one of a program that takes long to compile.
 ALONE = ("1×1 sensor", "16384×64 sensor", "closed_form: t = 0.1 mm, pixel average")
 
 
+def is_quick(extreme: Extreme, dtype) -> bool:
+    """Whether others share its program: in double precision those of the separable model do."""
+    shared = dtype is np.float32 or extreme.model == "separable"
+    return shared and extreme.name not in ALONE
+
+
 def case(extreme: Extreme, dtype: type = np.float64):
-    """A parameter of a test; thorough if it is of `ALONE`."""
-    marks = [pytest.mark.thorough] if extreme.name in ALONE and dtype is np.float64 else []
+    """A parameter of a test; thorough if its program takes long."""
+    marks = [] if is_quick(extreme, dtype) else [pytest.mark.thorough]
     return pytest.param(extreme, dtype, id=f"{extreme.name}-{dtype.__name__}", marks=marks)
+
+
+choices = pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=pytest.mark.thorough) if n in ALONE else n for n in CHOICES]
+)
 
 
 @pytest.mark.parametrize(("extreme", "dtype"), [case(e, d) for e in EXTREMES for d in DTYPES])
@@ -140,12 +151,7 @@ def test_value(extreme, dtype):
     assert error(extreme, dtype) < getattr(extreme, dtype.__name__)
 
 
-@pytest.mark.parametrize(
-    "dtype",
-    [DTYPES[0], *(pytest.param(d, marks=pytest.mark.thorough) for d in DTYPES[1:])],
-    ids=[dtype.__name__ for dtype in DTYPES],
-)
-@every_extreme
+@pytest.mark.parametrize(("extreme", "dtype"), [case(e, d) for e in EXTREMES for d in DTYPES])
 def test_gradient_is_finite(extreme, dtype):
     _, gradient = result(extreme, dtype)
     assert [name for name in PARAMETERS if not math.isfinite(gradient[name])] == []
@@ -174,7 +180,10 @@ def test_gradient_against_differences(extreme, dtype):
     [
         ("d = 1 nm", ("beta", "phase", "width", "distance", "wavelength"), 4e-5),
         ("β = 1e6", PARAMETERS, 1e-6),
-        ("closed_form: ε = 0.999", ("beta", "phase", "distance", "wavelength"), 1e-7),
+        pytest.param(
+            *("closed_form: ε = 0.999", ("beta", "phase", "distance", "wavelength"), 1e-7),
+            marks=pytest.mark.thorough,
+        ),
     ],
 )
 def test_gradient_against_the_reference(name, parameters, tolerance):
@@ -234,9 +243,10 @@ def gradient_errors(name: str) -> tuple[float | None, ...]:
     )
 
 
-@pytest.mark.parametrize("name", GRADIENTS)
-def test_gradient_in_single_precision(name):
+@pytest.mark.parametrize(("extreme", "dtype"), [case(find(name)) for name in GRADIENTS])
+def test_gradient_in_single_precision(extreme, dtype):
     """Within the stated bounds; where they say that it is lost, it is."""
+    name = extreme.name
     for parameter, error, bound in zip(
         PARAMETERS, gradient_errors(name), GRADIENTS[name], strict=True
     ):
@@ -263,6 +273,7 @@ def slope_in_double(camera, pitch, centre, weights, shape, model, pixel_integrat
     return jnp.sum(weights * h)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "name", ["d = 0.1 mm", "d = 1 µm", "t = 0.1 mm", "100 mm mask", "closed_form: ε = 0.999"]
 )
@@ -294,6 +305,7 @@ def fringe_error(extreme: Extreme, dtype) -> float | None:
     return relative_l2(value - value.mean(), fringes)
 
 
+@pytest.mark.thorough
 def test_fringes_in_single_precision():
     """No mean hides a loss but in one row; 4.0e-3 is the largest of the others."""
     errors = {e.name: fringe_error(e, np.float32) for e in EXTREMES}
@@ -350,7 +362,7 @@ def error_in_single(name: str) -> float:
     return relative_l2(h[:: extreme.every], expected(extreme, np.float64))
 
 
-@pytest.mark.parametrize("name", CHOICES)
+@choices
 def test_predicted_error(name):
     """Above the true error of float32 and below ten times that; measured 1.25 to 1.4 times."""
     camera, conditions = choice_of(name)
@@ -359,7 +371,7 @@ def test_predicted_error(name):
     assert true < predicted.predicted_error < 10 * true
 
 
-@pytest.mark.parametrize("name", CHOICES)
+@choices
 def test_choice_of_precision(name):
     """A tolerance that float32 cannot meet chooses float64, which does."""
     camera, conditions = choice_of(name)
@@ -369,6 +381,7 @@ def test_choice_of_precision(name):
     assert error(find(name), np.float64) < 1e-7 < error_in_single(name)
 
 
+@pytest.mark.thorough
 def test_predicted_error_where_the_nodes_of_an_average_fail():
     """Some 60 fringes a pixel are more than 24 nodes follow, in either precision: it is told."""
     camera, conditions = choice_of("d = 1 mm, pixel average")
@@ -380,7 +393,7 @@ def test_predicted_error_where_the_nodes_of_an_average_fail():
 
 def test_every_extreme_is_one_program():
     """One trace for each shape, model and precision: new numbers never compile again."""
-    both = [(e, dtype) for e in EXTREMES if e.name not in ALONE for dtype in DTYPES]
+    both = [(e, dtype) for e in EXTREMES for dtype in DTYPES if is_quick(e, dtype)]
     for extreme, dtype in both:
         result(extreme, dtype)
     programs = {(e.shape, e.model, e.pixel_integration, dtype) for e, dtype in both}
@@ -425,11 +438,10 @@ def naive_error(extreme: Extreme, dtype) -> float:
 
 
 @pytest.mark.parametrize(
-    "extreme", [e for e in EXTREMES if e.naive], ids=lambda extreme: extreme.name
+    ("extreme", "dtype"), [case(e, e.naive_dtype) for e in EXTREMES if e.naive]
 )
-def test_naive_formula_fails(extreme):
+def test_naive_formula_fails(extreme, dtype):
     """More than ten times the library's error in the same precision, or not finite."""
-    dtype = extreme.naive_dtype
     assert naive_error(extreme, dtype) > 10 * error(extreme, dtype)
 
 

@@ -30,7 +30,7 @@ def conditions(precision):
     return {k: jnp.asarray(np.float32(v), precision) for k, v in CONDITIONS.items()}
 
 
-@pytest.mark.parametrize("average", [False, True])
+@pytest.mark.parametrize("average", [False, pytest.param(True, marks=pytest.mark.thorough)])
 @pytest.mark.parametrize("model", MODELS)
 def test_double_precision_without_the_switch(model, average):
     """The float64 result, rounded once: bit by bit, while JAX knows float32 only."""
@@ -52,6 +52,7 @@ def test_double_precision_without_the_switch(model, average):
     )
 
 
+@pytest.mark.thorough
 def test_transfer_function_in_double_precision():
     """Complex results come back in the camera's precision as well."""
     single, double = single_camera()
@@ -102,6 +103,7 @@ def test_traced_numbers_need_the_switch(transform):
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("transform", [jax.jit, pytest.param(jax.grad, marks=pytest.mark.thorough)])
 def test_traced_numbers_with_the_switch(transform):
     """In float64 inside, in float32 outside; closer to the float64 result than float32 is."""

@@ -90,6 +90,7 @@ def test_a_source_between_the_pixels_moves_the_centroid():
     np.testing.assert_allclose(centroid, shadow, atol=0.06 * 20 * um)
 
 
+@pytest.mark.thorough
 def test_planes_and_wavelengths_add_with_their_weights():
     near, far = plane(photograph(), 80.0), plane(photograph((20, 27), 1), 150.0)
     how = {"model": "closed_form"}

@@ -29,7 +29,7 @@ def camera_of(shape=(20, 27), pitch=0.03, *, beta=200.0, phase=0.3, width=0.5, d
     [
         ("geometric", (20, 27)),  # a sum of separable terms, as "separable" is
         ("geometric", (1, 8)),
-        ("separable", (9, 12)),
+        pytest.param("separable", (9, 12), marks=pytest.mark.thorough),
         ("angular_spectrum", (21, 8)),
         ("angular_spectrum", (1, 1)),
     ],
@@ -213,18 +213,22 @@ def check_gradient(model, rtol, zero=(), **options):
         ("geometric", ("wavelength", "width")),  # a step at the edge of the shadow
         ("paraxial", ("width",)),  # the mask has no edge
         ("closed_form", ("width",)),
-        ("separable", ()),
+        # Its differences are those of tests/test_extremes.py, too.
+        pytest.param("separable", (), marks=pytest.mark.thorough),
     ],
 )
 def test_gradients_of_the_closed_forms(model, zero):
     check_gradient(model, 1e-7, zero)
 
 
-@pytest.mark.parametrize("model", ["angular_spectrum", "rayleigh_sommerfeld"])
+@pytest.mark.parametrize(
+    "model", ["angular_spectrum", pytest.param("rayleigh_sommerfeld", marks=pytest.mark.thorough)]
+)
 def test_gradients_of_the_sampled_models(model):
     check_gradient(model, 1e-7)
 
 
+@pytest.mark.thorough
 def test_gradient_of_pixel_averages():
     """Where every parameter moves by its own step, in forward mode: quick to compile."""
     function = jax.jit(lambda p: weighted(p, "separable", pixel_integration=True))
@@ -329,7 +333,7 @@ def test_text_for_a_length():
 
 
 @pytest.mark.parametrize("model", ["geometric", "paraxial", "closed_form", "separable"])
-@pytest.mark.parametrize("shape", [(1, 1), (1, 7)])
+@pytest.mark.parametrize("shape", [pytest.param((1, 1), marks=pytest.mark.thorough), (1, 7)])
 def test_thin_sensors_are_cuts_of_wide_ones(model, shape):
     wide = tc.psf(camera_of((5, 7)), wavelength=WAVELENGTH, model=model)
     thin = tc.psf(camera_of(shape), wavelength=WAVELENGTH, model=model)

@@ -146,7 +146,15 @@ def energy(given: Case, image) -> float:
     return dense.objective(flat, given.parts, given.tau, given.psi, given.kind, given.joint)
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize(
+    "name",
+    [
+        name
+        if name in ("colour", "planes_anisotropic")
+        else pytest.param(name, marks=pytest.mark.thorough)
+        for name in CASES
+    ],
+)
 def test_the_minimiser_is_that_of_another_method(name):
     """Crop, dead pixels (of value 1000), weights, sensors of two shapes, planes, colours."""
     given = case(name)
@@ -253,7 +261,9 @@ def driven(problem, *, iterations=1500, tolerance=1e-9, image=None, **settings):
     return drive.drive(method, image, iterations=iterations, tolerance=tolerance, **settings)
 
 
-@pytest.mark.parametrize("name", ["colour_anisotropic", "planes"])
+@pytest.mark.parametrize(
+    "name", ["colour_anisotropic", pytest.param("planes", marks=pytest.mark.thorough)]
+)
 def test_it_converges_to_the_minimum_of_another_method(name):
     """With its own penalties, which start 10 times too large for these problems and adapt."""
     given = case(name)

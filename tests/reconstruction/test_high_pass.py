@@ -265,6 +265,7 @@ def lowest(result):
     return min(p.objective for p in result.history)
 
 
+@pytest.mark.thorough
 def test_the_start_is_worth_its_iterations(wide_capture, monkeypatch):
     """After 60 iterations E is 33 000 with it and 57 000 without; the minimum is 30 000."""
     better = solve(wide_capture)
@@ -327,6 +328,7 @@ def test_a_first_part_that_converges_leaves_more_to_the_second(wide_capture):
     assert (result.status, result.iterations) == ("converged", 20)
 
 
+@pytest.mark.thorough
 def test_what_has_no_first_part(wide_capture, monkeypatch):
     """Few iterations, a start that is given, and other methods; none is longer than asked."""
     asked = []

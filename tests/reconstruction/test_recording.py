@@ -82,6 +82,7 @@ def test_sums_of_captures_take_sums_of_kernels():
         np.testing.assert_allclose(weight, 1 / variance, rtol=1e-12)
 
 
+@pytest.mark.thorough
 def test_two_distances_are_registered():
     """Method A: the nearer camera's capture enlarged; what lies beyond its rim is not used."""
     image = rig.picture(FIELD)

@@ -213,6 +213,7 @@ def test_registered_captures_agree_in_scale_and_gain():
     assert abs(gain - 1) < 0.03 and abs(offset) < 0.02
 
 
+@pytest.mark.thorough
 def test_noise_of_an_enlarged_capture(key):
     """Enlarging by r packs the noise of a channel into 1/r² of the band: the density is r²σ²."""
     ratio, variance = 1.3, 0.04
@@ -279,6 +280,7 @@ def test_one_capture_alone_and_its_steps_at_the_border():
     assert 0.8 < rig.correlation(alone, image) < rig.correlation(paired, image)
 
 
+@pytest.mark.thorough
 def test_three_colours_of_a_grey_scene():
     """Each wavelength loses other frequencies: together they beat each one, in their order only."""
     image = 0.5 + 0.2 * np.random.default_rng(3).normal(size=SMALL)

@@ -36,6 +36,7 @@ def method_b(tmp_path_factory):
     return file, folder / "a.zarr"
 
 
+@pytest.mark.thorough
 def test_an_image_of_captures_agrees_with_direct_simulation(method_b, tmp_path):
     """Frames and image, within the noise, by a model that the virtual rig does not use."""
     result = call("run", method_b[1], "--out", tmp_path / "out")

@@ -149,6 +149,7 @@ def again(whole, monkeypatch):
     return again
 
 
+@pytest.mark.thorough
 def test_interrupted_design_goes_on(whole, again, monkeypatch):
     """The finished target is not simulated again, and the figures are those of a whole run."""
     simulate, simulated = running.simulate, []

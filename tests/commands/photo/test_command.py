@@ -152,7 +152,10 @@ def test_ridge(grey, tmp_path):
     assert 0 < done["iterations"] <= 100 and done["relative_data_residual"] < 0.05
 
 
-@pytest.mark.parametrize(("psf", "coupling"), [("psf", "joint"), ("grey_psf", "opponent")])
+@pytest.mark.parametrize(
+    ("psf", "coupling"),
+    [pytest.param("psf", "joint", marks=pytest.mark.thorough), ("grey_psf", "opponent")],
+)
 def test_colours(tmp_path, psf, coupling):
     """8-bit PNG with a PSF of one and of three channels; colours are joined by default."""
     paths = simulated.colour_files(tmp_path)
@@ -186,6 +189,7 @@ def test_mosaic(tmp_path):
     assert record_of(out)["preparation"]["demosaicing"]["pattern"] == "RGGB"
 
 
+@pytest.mark.thorough
 def test_noise_of_a_mosaic(tmp_path):
     """Interpolated neighbours share their noise: it is that of each colour's own pixels."""
     paths = simulated.bayer_files(tmp_path)
@@ -409,6 +413,7 @@ def check(paths, *more, psf="psf"):
     return runner.invoke(cli.app, ["calibrate", "check", *map(str, given), *map(str, more)])
 
 
+@pytest.mark.thorough
 def test_check_names_a_turned_psf(grey, tmp_path):
     right = check(grey)
     assert right.exit_code == 0, right.output
@@ -466,6 +471,7 @@ class TestCamera:
         typed = ["reconstruct", *given, *known, *more]
         return runner.invoke(cli.app, [str(part) for part in typed])
 
+    @pytest.mark.thorough
     def test_it_is_as_good_as_a_perfect_measurement(self, files):
         by_psf = ("--psf", files["psf"], "--psf-background", 0, "--psf-bits", 12)
         by_camera = ("--camera", files["study"], "--set", "object.distance=40mm")

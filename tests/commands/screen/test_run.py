@@ -42,6 +42,7 @@ def test_the_right_model_is_the_best(run):
     assert min(means["right"]) > 25
 
 
+@pytest.mark.thorough
 def test_without_a_calibration_there_is_a_report(tmp_path):
     """Its page does not speak of one, and neither do the tables."""
     config = tiny.experiment(tmp_path, "calibration=null", "models=[{name: right}]")
@@ -50,6 +51,7 @@ def test_without_a_calibration_there_is_a_report(tmp_path):
     assert "calibration" not in metrics and "Hadamard" not in page
 
 
+@pytest.mark.thorough
 def test_a_full_colour_hologram_gives_a_colour_picture(tmp_path):
     """Each channel by its own hologram, and without ghosts it is worse."""
     overrides = (

@@ -362,7 +362,7 @@ LENGTHS = st.floats(1e-7, 1e7)
 WAVELENGTHS = st.floats(1e-5, 1.0)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=12, deadline=None)
 @given(
     WAVELENGTHS, LENGTHS, LENGTHS, st.floats(-100, 100), st.text("aÄ#:'\"\\{[ \n%-", max_size=150)
 )

@@ -102,6 +102,7 @@ def test_folder_holds_what_it_says_and_nothing_half(whole):
     assert environment["versions"]["jax"]
 
 
+@pytest.mark.thorough
 def test_same_seed_same_bytes_other_seed_other_noise(whole, home):
     again = RunFolder(home / "again")
     run_study(whole[0], again, tiny.ignore)

@@ -156,6 +156,7 @@ def test_help():
         assert part in result.stdout
 
 
+@pytest.mark.thorough
 def test_optional_parts_are_imported_by_sweeps_only():
     code = """
 import importlib, pkgutil, sys, thincam_jax

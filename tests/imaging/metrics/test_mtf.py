@@ -206,6 +206,7 @@ def test_first_zero_of_fringe_scanning(distant, method, expected):
     assert found == pytest.approx(expected, abs=0.3)
 
 
+@pytest.mark.thorough
 def test_two_distances_leave_no_zero(distant, near):
     for response in (distant[METHOD_A], near[METHOD_A]):
         assert response.metrics["first_zero_cycles_per_mm"] is None
@@ -330,6 +331,7 @@ def _scaled(powers, like):
     return magnitude * (magnitude @ like) / (magnitude @ magnitude)
 
 
+@pytest.mark.thorough
 def test_rows_belong_to_the_response():
     """v = 0 sums over the rows: a strip of 64 would give another first zero."""
     (whole,) = responses(1e6, (CONVENTIONAL_5,))

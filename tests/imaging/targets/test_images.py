@@ -64,7 +64,7 @@ def test_damaged_files_give_one_line(tmp_path, damage):
         load_image(path)
     assert "\n" not in str(caught.value)
     del caught
-    gc.collect()  # the decoders leave the file open; close it while that warning is ignored
+    gc.collect(0)  # the decoders leave the file open; close it while that warning is ignored
 
 
 @pytest.mark.filterwarnings("ignore:.*zero-size:UserWarning")

@@ -136,6 +136,7 @@ def test_choices_meet_their_tolerance(choices, capsys, tolerance):
     assert tolerance < 0.01 or any(choice.model != "separable" for choice, _ in own)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "choices", [8, pytest.param(25, marks=pytest.mark.thorough)], indirect=True
 )
@@ -190,6 +191,7 @@ def test_considered_are_the_cheaper_ways():
         assert alone == prediction
 
 
+@pytest.mark.thorough
 def test_choice_is_for_the_grid_and_the_average_asked_for():
     """A grid that reaches the mask's edge, and pixels that wash the zones out."""
     middle, edge = tc.Grid((48, 80), 5.5e-3), tc.Grid((48, 80), 0.1)
@@ -346,6 +348,7 @@ def test_single_precision_cameras_without_the_switch():
         assert ours.predicted_error == pytest.approx(theirs.predicted_error, rel=0.5, abs=4e-8)
 
 
+@pytest.mark.thorough
 def test_displays_are_chosen_among_the_models_that_hold_pixels():
     camera = camera_of(pitch=0.1, pixel_pitch=0.176)
     for tolerance in (0.3, 1e-4):

@@ -200,6 +200,7 @@ def test_models_are_selected(name):
     assert ("geometric" in offered) == (name != "lenslets")
 
 
+@pytest.mark.thorough
 def test_a_scene_is_planned():
     camera = tc.LenslessCamera(families.masks()["mura"], SENSOR, DISTANCE)
     image = np.random.default_rng(0).uniform(size=(8, 9))

@@ -66,6 +66,7 @@ def test_binary_profile_is_its_truncated_series():
     assert sorted(orders.orders) == [k for k in range(-99, 100) if k % 2 or k == 0]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("harmonics", [3, 9, 31])
 def test_intensity_profile_is_the_root_of_a_cosine(harmonics):
     settings = {"width": 2.0, "profile": "intensity", "harmonics": harmonics}

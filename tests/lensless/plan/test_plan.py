@@ -24,7 +24,7 @@ def deep(request):
 @pytest.mark.parametrize(
     ("deep", "tolerance", "most_psfs"),
     [
-        ((16, 11), 0.3, 1),
+        pytest.param((16, 11), 0.3, 1, marks=pytest.mark.thorough),
         ((16, 11), 1e-2, 20),
         pytest.param((32, 31), 0.1, 4, marks=pytest.mark.thorough),
         pytest.param((32, 31), 1e-2, 20, marks=pytest.mark.thorough),
@@ -179,6 +179,7 @@ def test_what_cannot_be_planned():
         jax.jit(inside)(6.5)
 
 
+@pytest.mark.thorough
 def test_a_dark_scene_has_a_plan():
     dark = tc.Scene(tc.ImagePlane(np.zeros((4, 6)), 200.0, 20.0), 500 * nm)
     plan = tc.plan(camera(), dark, tolerance=1e-2)
@@ -254,6 +255,7 @@ def test_odd_scenes_stay_within_their_prediction(name, tolerance):
     assert true <= plan.predicted_error <= tolerance
 
 
+@pytest.mark.thorough
 def test_phases_that_float32_does_not_hold_are_planned_in_float64():
     mask = tc.FresnelZoneAperture(1e3, width=100.0)
     own = tc.LenslessCamera(mask, tc.Sensor((64, 72), 1.0), 0.65)

@@ -41,7 +41,8 @@ def coordinates(shape, pitch):
 @pytest.mark.parametrize(
     ("shape", "pitch", "object_distance", "phase", "centre"),
     [
-        ((1000, 1024), PITCH, 250.0, 0.0, (0.0, 0.0)),  # the thesis' sensor, edges included
+        # The thesis' sensor, edges included.
+        pytest.param((1000, 1024), PITCH, 250.0, 0.0, (0.0, 0.0), marks=pytest.mark.thorough),
         (
             (96, 128),
             0.065,
@@ -50,7 +51,7 @@ def coordinates(shape, pitch):
             (0.31, -0.52),
         ),  # a coarse one that sees all round the shadow
         ((96, 128), 0.065, INF, -2.0, (-0.2, 0.1)),
-        ((1, 129), 0.045, 250.0, 4.712, (0.0, 0.0)),
+        pytest.param((1, 129), 0.045, 250.0, 4.712, (0.0, 0.0), marks=pytest.mark.thorough),
         ((1, 1), 0.045, 250.0, 0.0, (0.4, 0.3)),
     ],
 )
@@ -67,6 +68,7 @@ def test_against_scipy(shape, pitch, object_distance, phase, centre):
     assert relative_l2(value, expected) < 1e-12
 
 
+@pytest.mark.thorough
 def test_rectangle_against_scipy():
     """The product of the two axes is exact for it too, with the derivative along both sides."""
     small = {**SMALL, "object_distance": 300.0, "centre": (0.05, -0.1)}
@@ -146,6 +148,7 @@ def test_display_pixels():
     assert relative_l2(value, np.abs(field) ** 2) < 1e-12
 
 
+@pytest.mark.thorough
 def test_binary_profile():
     """Orders up to 5, their coefficients from quadrature of the open half of each period."""
     value = psf_of((24, 31), 0.025, SMALL, 60.0, phase=0.9, profile="binary", harmonics=5)
@@ -162,7 +165,7 @@ def test_binary_profile():
 @pytest.mark.parametrize(
     ("geometry", "pitch", "centre", "tolerance"),
     [
-        (SMALL, 0.03, (0.04, -0.1), 1e-8),
+        pytest.param(SMALL, 0.03, (0.04, -0.1), 1e-8, marks=pytest.mark.thorough),
         (
             {"beta": 25.0, "width": 2.0, "distance": 6.5, "wavelength": 500e-6},
             PITCH,
@@ -243,6 +246,7 @@ def test_pixel_nodes_follow_the_fringes_in_a_pixel():
     assert found == [10, 10, PIXEL_NODES, PIXEL_NODES]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "width",
     [

@@ -81,6 +81,7 @@ def test_against_quadrature(object_distance, kind):
     np.testing.assert_allclose(value[0, 0], light, rtol=1e-5)
 
 
+@pytest.mark.thorough
 def test_against_the_transform_of_the_psf():
     """The sampled transform differs by the tails beyond its grid: 1.2e-3, half with twice the grid.
 
@@ -182,6 +183,7 @@ def test_compiled_once_and_mapped(compiled):
     np.testing.assert_allclose(jax.jit(jax.vmap(weighted))(stacked), one_by_one, rtol=1e-12)
 
 
+@pytest.mark.thorough
 def test_second_derivative():
     """The slope of the chirp is written by hand; differentiated again it stays right."""
     numbers = {k: jnp.asarray(v) for k, v in NUMBERS.items()}
@@ -209,6 +211,7 @@ def test_errors():
         response(tc.SampledMask(np.ones((3, 4)), 0.1), path)
 
 
+@pytest.mark.thorough
 def test_rectangle_has_the_factors_of_two_squares():
     path = Path(WAVELENGTH, DISTANCE)
     given = [jnp.asarray(V), jnp.asarray(U)]
