@@ -43,6 +43,7 @@ def test_documentation(capsys):
     assert float(decibels) > 20
 
 
+@pytest.mark.thorough
 def test_accuracy_page(capsys):
     """The printed choice stands in the page, and the plan is within its tolerance."""
     names = run_examples("docs/accuracy.md")
@@ -196,12 +197,14 @@ def test_picture_of_the_rooms_is_of_today(tmp_path):
     assert script["imports_drawn"](tmp_path / "rooms.png") == today
 
 
+@pytest.mark.thorough
 def test_screen_page():
     names = run_examples("docs/screen.md")
     np.testing.assert_allclose(names["rays"].wavelength / 1e-6, [532, 564.729], atol=1e-3)
     assert names["result"].image.shape[-2:] == (64, 64)
 
 
+@pytest.mark.thorough
 def test_screen_calibration_page(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     names = run_examples("docs/screen_calibration.md")
@@ -218,6 +221,7 @@ def test_screen_reconstruction_page():
     np.testing.assert_allclose(names["image"], 1, atol=0.02)
 
 
+@pytest.mark.thorough
 def test_screen_models_page(capsys):
     names = run_examples("docs/screen_models.md")
     assert names["plan"].meets_tolerance and names["capture"].shape == (110, 110)

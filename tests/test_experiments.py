@@ -17,9 +17,9 @@ def test_the_scripts_are_there():
 
 
 def marked(script):
-    """Some take half a minute, even small."""
-    long = script.stem in ("flatcam", "learned_refocus", "stis_camera")
-    marks = [pytest.mark.thorough] if long else []
+    """Most take ten seconds and more, even small."""
+    quick = script.stem in ("first_image", "simulated_rig", "superresolution", "your_own_mask")
+    marks = [] if quick else [pytest.mark.thorough]
     return pytest.param(script, id=script.stem, marks=marks)
 
 

@@ -156,6 +156,7 @@ def test_restored_are_the_best_linear_estimates(noise):
     assert float(whole) == pytest.approx(error.mean(), rel=1e-9)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "noise",
     [SignalNoise(30.0), pytest.param(PhotonNoise(3000.0, 5.0), marks=pytest.mark.thorough)],
@@ -189,6 +190,7 @@ def test_more_noise_and_less_light_restore_less():
     assert float(compiled(chosen, few)[1]) > float(compiled(chosen, many)[1])
 
 
+@pytest.mark.thorough
 def test_too_few_steps_are_told():
     given = training(steps=2, synthesis=phase_pairs(1))
     assert jnp.isnan(compiled(design((9.0,), (5.03,)), given)[1])

@@ -45,6 +45,7 @@ def test_other_wishes_do_not_compile_again():
     assert _least_squares._cache_size() == before
 
 
+@pytest.mark.thorough
 def test_descents_are_better_than_samples():
     """Of a target that no design fulfils, too: and this is told."""
     result = match(jnp.full(RINGS, 30.0))

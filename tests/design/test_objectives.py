@@ -202,7 +202,7 @@ NAMES = ("beta", "phase", "distance", "wavelength", "width", "exposure")
 @pytest.mark.parametrize(
     ("frequencies", "noise"),
     [
-        (Polar(HIGHEST, 128, 2), SignalNoise(30.0)),
+        pytest.param(Polar(HIGHEST, 128, 2), SignalNoise(30.0), marks=pytest.mark.thorough),
         (Quadrant(HIGHEST, 33), PhotonNoise(2000.0, 8.0)),
         pytest.param(Polar(HIGHEST, 128, 2), PhotonNoise(2000.0, 8.0), marks=pytest.mark.thorough),
         pytest.param(Quadrant(HIGHEST, 33), SignalNoise(30.0), marks=pytest.mark.thorough),

@@ -23,6 +23,7 @@ def changed(plate=None, **numbers):
     return dataclasses.replace(Plate() if plate is None else plate, **given)
 
 
+@pytest.mark.thorough
 def test_gradient_against_finite_differences():
     slopes = eqx.filter_grad(lambda plate: judge_plate(plate, VIEWING).error)(Plate())
     for name, step in (

@@ -49,6 +49,7 @@ def test_without_tolerances_it_is_the_bayes_error():
     assert robust_one == exact
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "name, size", [pytest.param("beta", 2e-4, marks=pytest.mark.thorough), ("distance", 2e-3)]
 )
@@ -82,7 +83,7 @@ def test_the_mean_is_that_of_samples(name, size):
         Tolerances(distance=0.02),
         pytest.param(Tolerances(wavelength=5e-6), marks=pytest.mark.thorough),
         pytest.param(Tolerances(object_distance=5.0), marks=pytest.mark.thorough),
-        Tolerances(tilt=0.01),
+        pytest.param(Tolerances(tilt=0.01), marks=pytest.mark.thorough),
     ],
 )
 def test_every_tolerance_costs_and_more_of_it_costs_more(tolerances):

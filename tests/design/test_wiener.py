@@ -126,6 +126,7 @@ def test_restored_are_those_of_the_wiener_synthesis():
     assert float(error_of_all) == pytest.approx(whole, rel=1e-9)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "noise",
     [SignalNoise(30.0), pytest.param(PhotonNoise(3000.0, 5.0), marks=pytest.mark.thorough)],
@@ -166,6 +167,7 @@ def test_a_capture_with_its_bias_is_restored():
     assert 0 < float(compiled(design(), single)[1]) < 1
 
 
+@pytest.mark.thorough
 def test_new_values_are_not_traced_again():
     small = {"count": 12, "sensor": (20, 24)}
     compiled(design(), training(**small))

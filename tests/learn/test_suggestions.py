@@ -48,6 +48,7 @@ def proposals(suggester, targets):
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *each)
 
 
+@pytest.mark.thorough
 def test_training_learns(trained):
     """Both parts gain, and nothing was skipped; the guesses are not all one."""
     warm_up, history = np.asarray(trained.warm_up), np.asarray(trained.history)
@@ -60,6 +61,7 @@ def test_training_learns(trained):
     assert float(jnp.max(jnp.ptp(guesses, axis=0))) > 0.05
 
 
+@pytest.mark.thorough
 def test_nearer_than_random_designs(targets, proposals):
     """Medians over held-out designs: a random design, the network alone, two steps more."""
     random = np.median(np.sqrt(np.mean((targets[1] - targets[0]) ** 2, axis=-1)))
@@ -68,6 +70,7 @@ def test_nearer_than_random_designs(targets, proposals):
     assert refined < 0.5 * network
 
 
+@pytest.mark.thorough
 def test_newton_steps_never_make_worse(suggester, targets, proposals):
     """And what is told is the misfit of the design that is given."""
     assert np.all(proposals.misfit_db <= proposals.first_misfit_db)
@@ -78,6 +81,7 @@ def test_newton_steps_never_make_worse(suggester, targets, proposals):
         np.testing.assert_allclose(levels(proposals.point[k]), proposals.levels[k], atol=1e-9)
 
 
+@pytest.mark.thorough
 def test_suggestion(suggester, targets, proposals):
     """As `propose` over all targets says, and not compiled again for another."""
     suggest(suggester, targets[0][0])
@@ -103,6 +107,7 @@ def test_many_at_a_time_and_slopes(suggester, targets, proposals):
     np.testing.assert_allclose(jax.grad(told)(target) @ direction, expected, rtol=1e-4)
 
 
+@pytest.mark.thorough
 def test_unattainable_targets_are_told(suggester, targets):
     """30 dB everywhere, a response turned round, and 8 dB more than there is."""
     response = targets[0][0]
@@ -115,6 +120,7 @@ def test_unattainable_targets_are_told(suggester, targets):
     assert any(suggest(suggester, jnp.full(RINGS, level)).active for level in (0.0, 30.0, 60.0))
 
 
+@pytest.mark.thorough
 def test_no_number_is_told(suggester):
     broken = jax.tree.map(lambda leaf: leaf * jnp.nan, suggester)
     assert suggest(broken, np.full(RINGS, 3.0)).status == "non_finite"
@@ -141,6 +147,7 @@ def test_training_errors():
         train_suggester(SPACE, *DATA, key=jax.random.key(0), **(SMALL | {"guesses": 0}))
 
 
+@pytest.mark.thorough
 def test_saved_and_loaded_answers_are_the_same(suggester, targets, tmp_path):
     path = save_suggester(tmp_path / "two_betas.suggester", suggester)
     loaded = load_suggester(path, SPACE, *DATA)
@@ -152,6 +159,7 @@ def test_saved_and_loaded_answers_are_the_same(suggester, targets, tmp_path):
     assert propose._cache_size() == before
 
 
+@pytest.mark.thorough
 def test_files_of_something_else(suggester, tmp_path):
     path = save_suggester(tmp_path / "two_betas.suggester", suggester)
     one = DesignSpace(thesis_design(), (Variable("beta", 8.0, 36.0, (0, 1, 2, 3)),))

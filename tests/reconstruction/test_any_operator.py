@@ -132,7 +132,10 @@ NAMES = pytest.mark.parametrize("name", list(operators()))
 
 @pytest.mark.parametrize(
     "name",
-    [pytest.param(n, marks=[pytest.mark.thorough] * (n == "dense")) for n in operators()],
+    [
+        pytest.param(n, marks=[pytest.mark.thorough] * (n not in ("separable", "stacked")))
+        for n in operators()
+    ],
 )
 def test_total_variation_by_admm_and_fista(name):
     """Both are within 1e-6 of the minimiser, and report that they have converged."""
@@ -227,6 +230,7 @@ def test_implicit_gradients_of_a_dense_operator():
         assert float(slope) == pytest.approx(float(change), rel=1e-4)
 
 
+@pytest.mark.thorough
 def test_batches_and_planes():
     """A batch is its elements; an operator on (plane, y, x) has its planes in the image."""
     rng = np.random.default_rng(3)

@@ -67,6 +67,7 @@ def test_one_psf_for_all_colours_and_weights_that_broadcast():
     np.testing.assert_allclose(apart.objective(image), objective(whole, image), rtol=1e-12)
 
 
+@pytest.mark.thorough
 def test_the_minimum_is_that_of_the_whole_and_of_each_part_alone():
     problem, _ = scenes.problem(batch=(2,), channels=2, kernel=scenes.spots, tau=3e-3)
     problem = masked(problem)

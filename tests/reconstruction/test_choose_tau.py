@@ -76,6 +76,7 @@ def test_discrepancy_counts_valid_pixels_only():
     assert 2 * float(misfit(chosen.problem, chosen.image).sum()) == pytest.approx(15 * 37, rel=0.03)
 
 
+@pytest.mark.thorough
 def test_the_risk_estimate_finds_the_least_true_risk_on_the_sensor(key):
     problem, truth = posed()
     clean = problem.operators[0](truth)
@@ -145,6 +146,7 @@ def test_a_search_needs_a_positive_start():
         discrepancy_tau(with_tau(problem, 0.0), jnp.zeros(problem.image_shape))
 
 
+@pytest.mark.thorough
 def test_the_gradient_of_the_error_in_tau_is_that_of_differences():
     problem, truth = posed()
 

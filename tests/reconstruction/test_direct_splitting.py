@@ -71,7 +71,7 @@ def test_the_consensus_minimises_each_part(name):
         np.testing.assert_allclose(found, wanted, atol=1e-14)
 
 
-@pytest.mark.parametrize("name", ["dense", "separable"])
+@pytest.mark.parametrize("name", ["dense", pytest.param("separable", marks=pytest.mark.thorough)])
 def test_the_nearest_image_by_least_squares(name):
     """Of one plane and two: K f nearest to a target in the norm of the penalties."""
     problem = posed(name)
@@ -121,7 +121,10 @@ def test_a_state_stands_for_its_image():
         np.testing.assert_allclose(splitting.image(splitting.start(image)), expected, atol=1e-14)
 
 
-@pytest.mark.parametrize("name", OPERATORS)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(n, marks=[pytest.mark.thorough] * (n != "separable")) for n in OPERATORS],
+)
 def test_single_precision_stays_and_is_near_to_double(name):
     """Also with the settings of total variation in double precision, their default here.
 

@@ -116,7 +116,7 @@ def along(name: str) -> Parameters:
 @pytest.mark.parametrize(
     "name",
     [
-        "log_tau",
+        pytest.param("log_tau", marks=pytest.mark.thorough),
         "beta",
         pytest.param("distance", marks=pytest.mark.thorough),
         pytest.param("capture", marks=pytest.mark.thorough),
@@ -162,7 +162,7 @@ def settled(problem, factor=0.1, iterations=3000, tolerance=1e-11) -> tuple:
     return result.image, result.iterations, result.converged
 
 
-@pytest.mark.parametrize("name", ["planes", "colour"])
+@pytest.mark.parametrize("name", [pytest.param("planes", marks=pytest.mark.thorough), "colour"])
 def test_it_is_the_minimiser_of_the_other_methods(name):
     """Of the iteration driven from outside, and of the primal-dual method on dense matrices."""
     given = case(name)
@@ -211,6 +211,7 @@ def temporary(iterations: int, *, gradient: bool) -> int:
     return analysis.temp_size_in_bytes
 
 
+@pytest.mark.thorough
 def test_memory_does_not_grow_with_the_iterations():
     """Neither that of the run nor that of its gradient, to the byte.
 

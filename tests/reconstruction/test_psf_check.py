@@ -150,11 +150,13 @@ def test_wrong_scale_and_orientation_are_named(diffuser):
     assert len(found.reasons) == 2 and "times its size" in found.reasons[1]
 
 
+@pytest.mark.thorough
 def test_scale_beyond_the_search_is_said(diffuser):
     found = diffuser.check(diffuser.psf(scale=1.1), search=0.04)
     assert "or beyond: search farther" in " ".join(found.reasons)
 
 
+@pytest.mark.thorough
 def test_zones_have_no_orientation():
     rig = camera(2, zones(np.random.default_rng(2), SMALL), SMALL)
     assert rig.check(rig.psf()[::-1, ::-1]).orientation == "as given"

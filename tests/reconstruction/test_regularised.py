@@ -49,6 +49,7 @@ def test_total_variation_is_upright_and_nearer_than_the_filter():
     assert error < float(jnp.linalg.norm(filtered.image - picture))
 
 
+@pytest.mark.thorough
 def test_a_warm_start_is_given_upright_and_converges_sooner():
     """For cameras and for PSFs; what is given is the image that was returned."""
     psfs = tc.Psfs(jnp.asarray(rig.picture((9, 10)))[None], field_shape=(31, 32))
@@ -225,6 +226,7 @@ def hand():
     return raw, psf / psf.sum(), np.asarray(page, dtype=float)[23:239, 34:323]
 
 
+@pytest.mark.thorough
 def test_a_real_capture():
     """DiffuserCam's hand: like the published reconstruction; by the data only with its own PSF."""
     raw, psf, expected = hand()

@@ -29,7 +29,7 @@ def masked():
     return Masked(crop, RNG.random(SENSOR) > 0.1)
 
 
-@pytest.mark.parametrize("system", [reduced, masked])
+@pytest.mark.parametrize("system", [pytest.param(reduced, marks=pytest.mark.thorough), masked])
 def test_an_object_that_stands_still_is_reconstructed(system):
     """After another one, to the image that the solver alone finds; in the captures' unit."""
     system = system()

@@ -90,6 +90,7 @@ def median_of_blocks(image):
     return noise if noise > 0 else 1e-3 * np.sqrt(np.mean(image**2))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "case",
     [

@@ -143,6 +143,7 @@ def thin(glass, modulation=0.02):
     return wg.SeeThroughCamera(screen, tc.Sensor(SHAPE, 66 * um), 6.0, 10.0)
 
 
+@pytest.mark.thorough
 def test_what_a_scene_requires(scene):
     """A loose tolerance takes rows and columns apart, a strict one the whole band of all ghosts."""
     loose, strict = (wg.plan(thin(5.0), scene, tolerance=t) for t in (0.2, 1e-3))

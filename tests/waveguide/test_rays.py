@@ -118,7 +118,9 @@ def numbers(sts, pixel, distance):
     return jnp.sum(rays.points) + 1e5 * jnp.sum(rays.wavelength) + 1e5 * jnp.sum(rays.weight)
 
 
-@pytest.mark.parametrize("pixel", [(0.0, 0.0), (0.6, -0.9)])
+@pytest.mark.parametrize(
+    "pixel", [(0.0, 0.0), pytest.param((0.6, -0.9), marks=pytest.mark.thorough)]
+)
 @pytest.mark.parametrize("film", [1.5, wg.bk7()])
 def test_gradients(pixel, film):
     """In every number of the camera, in the pixel (on the axis too) and in the distance."""

@@ -132,6 +132,7 @@ def field_of(camera, shape, count):
     return jnp.asarray(np.stack(np.meshgrid(x, y), axis=-1))
 
 
+@pytest.mark.thorough
 def test_operator_against_rays_through_every_part_of_the_mask():
     camera, shape = behind(), (24, 20)
     grid = kernel_grid(camera.sensor.grid, shape)

@@ -141,6 +141,7 @@ class TestExitCode2:
         assert "give it to 'thincam design'" in one_line(call("run", file))
 
 
+@pytest.mark.thorough
 def test_coarse_pixels_are_told_once(file, asked, tmp_path):
     result = call("design", file, "--out", tmp_path / "out", "--set", "sensor.pitch=88um")
     assert result.exit_code == 0, result.output

@@ -66,6 +66,7 @@ def test_depth_map_and_image_that_is_sharp_everywhere(paths, tmp_path):
     assert [name[-8:] for name in record["psfs"]] == ["60mm.tif", "80mm.tif", "20mm.tif"]
 
 
+@pytest.mark.thorough
 def test_pages_of_a_file_are_psfs_too(paths, tmp_path):
     more = ("--distances", "60mm,80mm,120mm", *ALIKE, "--linear", "none")
     assert call(paths, tmp_path / "a.png", *more, psf="stack").exit_code == 0

@@ -140,6 +140,7 @@ def test_page_of_a_run_without_a_chart(run):
     assert row[1:3] == ["–", "–"]
 
 
+@pytest.mark.thorough
 def test_pixels_coarser_than_the_zones_are_told_once_here_and_on_the_terminal(tmp_path):
     out = tmp_path / "out"
     result = call("run", mini.write(tmp_path), "--out", out, "--set", "sensor.pitch=88um")

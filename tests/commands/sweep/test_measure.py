@@ -38,6 +38,7 @@ def test_columns_are_the_metrics_of_a_run(tmp_path, monkeypatch):
     assert any(name.startswith("mean_psnr_of_pictures_db/") for name in row)
 
 
+@pytest.mark.thorough
 def test_values_of_one_shape_are_compiled_once(tmp_path):
     """Counted by JAX's own events of its compiler."""
     compiled = []

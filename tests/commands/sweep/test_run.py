@@ -188,6 +188,7 @@ def check(path: Path, wanted: list[int]) -> None:
     assert all(5 < value < 30 for value in psnr)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("count", [24, pytest.param(200, marks=pytest.mark.thorough)])
 def test_sweep_that_is_killed_half_way(tmp_path, count):
     """It goes on with what is missing; with one point that always fails it has one row less."""

@@ -62,6 +62,7 @@ def test_adjoint_and_batches():
     np.testing.assert_allclose(operator(images), one_by_one, atol=1e-13)
 
 
+@pytest.mark.thorough
 def test_images_come_back():
     """By the solver of every camera; with one PSF for the whole field they do not."""
     image = np.zeros(FIELD)

@@ -44,8 +44,8 @@ def value(case, model, **arguments):
     [
         case_of((75, 120), 5.5e-3),  # the middle of the shadow
         case_of((75, 120), 0.07, centre=(0.3, -0.9)),  # all of it, and round it
-        case_of((75, 120), 0.07, profile="binary"),
-        case_of((75, 120), 0.07, height=3.3),
+        pytest.param(case_of((75, 120), 0.07, profile="binary"), marks=pytest.mark.thorough),
+        pytest.param(case_of((75, 120), 0.07, height=3.3), marks=pytest.mark.thorough),
         pytest.param(
             case_of((256, 100), 0.02, average=True, object_distance=20.0),
             marks=pytest.mark.thorough,
@@ -70,6 +70,7 @@ def test_small_images_are_known_exactly(case):
     assert probe.difference("geometric", "separable") > 1e-3
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("pitch", "distance", "average"),
     [(0.02, 6.5, False), (0.005, 1.0, False), (0.009, 30.0, False), (0.005, 6.5, True)],
@@ -88,7 +89,7 @@ def test_large_images_are_estimated(pitch, distance, average):
     ("precision", "average", "oversampling", "height"),
     [
         ("float32", False, 1, None),
-        ("float64", False, 3, 0.4),
+        pytest.param("float64", False, 3, 0.4, marks=pytest.mark.thorough),
         pytest.param("float32", True, 3, None, marks=pytest.mark.thorough),
     ],
 )
@@ -110,6 +111,7 @@ def test_sampled_models(precision, average, oversampling, height):
         assert predicted == pytest.approx(relative_l2(image, exact), rel=within)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("distance", "known"), [(2.0, 0.03), (1.0, 0.06)])
 def test_paraxial_error_of_a_small_aperture(distance, known):
     """How far Fresnel is from exact diffraction where that can be sampled finely in two dimensions.
@@ -195,6 +197,7 @@ def test_numbers_of_the_thesis_camera():
     assert binary.first_order == pytest.approx(81 * epsilon * phase)
 
 
+@pytest.mark.thorough
 def test_one_compilation_for_cameras_of_one_structure(caplog):
     """Other numbers and another shape of the sensor: nothing is compiled again."""
 

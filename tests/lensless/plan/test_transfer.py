@@ -25,7 +25,7 @@ def direct(h, frequencies):
 
 
 @pytest.mark.parametrize("model", CLOSED)
-@pytest.mark.parametrize("average", [False, True])
+@pytest.mark.parametrize("average", [False, pytest.param(True, marks=pytest.mark.thorough)])
 def test_exact_and_quick_agree_with_the_sum_over_the_psf(model, average):
     own = camera()
     frequencies = sample_frequencies(max(KERNEL))

@@ -75,6 +75,7 @@ def test_pixel_average():
     assert relative_l2(points, average) > 0.05
 
 
+@pytest.mark.thorough
 def test_steep_edge_waves_are_beyond_fresnel():
     """At d = 2 mm the edges' waves reach 8° and more: the Fresnel model `separable` is 2.5 % from
     the direct sum over the same samples, of which `angular_spectrum` is a few parts in 10,000."""
@@ -123,7 +124,7 @@ def test_nothing_wraps_round(padding, tolerance):
     assert (np.abs(wrapped[far]) ** 2).max() > 10 * expected[far].max()
 
 
-@pytest.mark.parametrize("shape", [(1, 1), (33, 2)])
+@pytest.mark.parametrize("shape", [(1, 1), pytest.param((33, 2), marks=pytest.mark.thorough)])
 def test_thin_sensors(shape):
     """Even against odd sizes, and sensors smaller than the mask: samples still coincide."""
     grid = tc.Grid(shape, 0.01)

@@ -80,6 +80,7 @@ def test_values_are_right_within_their_errors(seed):
     np.testing.assert_allclose(np.std(fit.residual), noise, rtol=0.03)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "snr_db", [30.0, *(pytest.param(db, marks=pytest.mark.thorough) for db in (40.0, 10.0))]
 )
@@ -96,6 +97,7 @@ def test_ripples_of_the_rims_hold_no_fit(snr_db):
     assert np.all(np.abs(deviations(fit, TRUE)) < 4.5)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("left_out", ["blur", pytest.param("shade", marks=pytest.mark.thorough)])
 def test_what_a_wrong_model_leaves_of_a_number_is_told(left_out):
     """A blur of half a pixel moves d by 5 %, 20 times what noise explains; β is right to 0.3 %."""
@@ -207,6 +209,7 @@ def test_another_picture_is_told():
     assert any("contrast" in line for line in fit.reasons)
 
 
+@pytest.mark.thorough
 def test_new_values_do_not_compile_again():
     fit_psf(picture(TRUE, 4), START, **LIGHT)
     sizes = [f._cached._cache_size() for f in (problem._least_squares, problem.model)]

@@ -46,7 +46,12 @@ class TestResample:
     """Against waves in closed form, and their derivatives."""
 
     @pytest.mark.parametrize(
-        ("scale", "shift"), [(1.07, (2.3, -4.6)), (1.3, (0.0, 0.5)), (1.0, (3.0, -2.0))]
+        ("scale", "shift"),
+        [
+            pytest.param(1.07, (2.3, -4.6), marks=pytest.mark.thorough),
+            (1.3, (0.0, 0.5)),
+            (1.0, (3.0, -2.0)),
+        ],
     )
     def test_values_and_derivatives(self, scale, shift):
         image = waves(1.0, (0.0, 0.0))

@@ -60,6 +60,7 @@ def test_each_object_is_in_its_own_plane(seen):
     )
 
 
+@pytest.mark.thorough
 def test_a_depth_weight_pulls_the_planes_together(seen):
     """Variation across planes suits what reaches through them, and not objects that do not."""
     weighted = reconstruct(seen, iterations=60, variation=TotalVariation(depth_weight=0.5))

@@ -85,6 +85,7 @@ def test_further_distances_compile_nothing(recording, name):
     assert compiled == []
 
 
+@pytest.mark.thorough
 def test_a_solver_is_chosen_once(recording):
     """And the noise, where it is not told, is estimated once."""
     sweep = refocus_sweep(recording, DISTANCES[:3])
