@@ -39,8 +39,8 @@ _PIXELS, _POOL = 192, (96, 32)
 _MARGIN, _LARGEST, _APART = 1.2, 2.5, 1.6
 # Parts of the tolerance that the decisions may use, in the order in which they are taken.
 _SHARES = {"orders": 0.4, "smear": 0.6, "dispersion": 0.4, "precision": 0.4}
-# What the sums of a capture in float32 round.
-_SUMS = 3e-7
+# What the sums of a capture round.
+_SUMS: dict[Precision, float] = {"float32": 3e-7, "float64": 1e-14}
 
 
 class LitPlane(eqx.Module):
@@ -298,9 +298,9 @@ class _Probe:
         shares["dispersion"] = 0.0 if dispersion else size
         left, so_far = left - shares["dispersion"], so_far if dispersion else found
         found = capture(dispersion, "float32", samples)
-        size = self._length(found - so_far) + _SUMS
+        size = self._length(found - so_far) + _SUMS["float32"]
         precision: Precision = "float32" if within(size, "precision") else "float64"
-        shares["precision"] = size if precision == "float32" else 0.0
+        shares["precision"] = size if precision == "float32" else _SUMS["float64"]
         simpler = {
             "separable": self._separable(dispersion, samples, orders),
             "shift-invariant": self._shift_invariant(dispersion, samples, orders),
@@ -327,7 +327,7 @@ class _Probe:
         )
 
     def _predicted(self, capture: np.ndarray, rounded: float) -> float:
-        """`rounded`: what float32 adds twice more, as the operator does not round as the probe."""
+        """`rounded`: what the precision adds, twice: the operator does not round as the probe."""
         away = capture - self.reference.sum(axis=0)
         largest = float((np.sqrt(self.counts) * np.abs(away)).max()) / self.norm
         return _MARGIN * self._length(away) + _LARGEST * largest + self.tail + 2 * rounded
