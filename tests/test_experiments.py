@@ -18,8 +18,7 @@ def test_the_scripts_are_there():
 
 def marked(script):
     """Most take ten seconds and more, even small."""
-    quick = script.stem in ("first_image", "simulated_rig", "superresolution", "your_own_mask")
-    marks = [] if quick else [pytest.mark.thorough]
+    marks = [] if script.stem == "your_own_mask" else [pytest.mark.thorough]
     return pytest.param(script, id=script.stem, marks=marks)
 
 

@@ -56,6 +56,7 @@ def test_descents_are_better_than_samples():
     assert match(tolerance_db=30.0).status == "matched"
 
 
+@pytest.mark.thorough
 def test_responses_without_a_number_are_told():
     bad = setup(prior=PowerLaw(2.8), contrast=1e200)
     result = match(data=(bad, *DATA[1:]))

@@ -19,7 +19,7 @@ respond = jax.jit(responses)
 tell = jax.jit(channels)
 
 
-@pytest.mark.parametrize("crop", [True, False])
+@pytest.mark.parametrize("crop", [pytest.param(True, marks=pytest.mark.thorough), False])
 def test_rings_against_the_exact_model(crop):
     """Signal to noise in 12 rings from the second on: measured within 13 %, on average 5 %.
 
@@ -37,7 +37,7 @@ def test_rings_against_the_exact_model(crop):
     np.testing.assert_allclose(errors[1], errors[0], rtol=0.05)
 
 
-@pytest.mark.parametrize("profile", ["cosine", "binary"])
+@pytest.mark.parametrize("profile", ["cosine", pytest.param("binary", marks=pytest.mark.thorough)])
 def test_the_exact_model_is_that_of_each_camera(profile):
     design, judged = thesis_design(profile), setup(crop=False)
     frequencies = Quadrant(HIGHEST, 24)
@@ -101,6 +101,7 @@ def test_errors():
         Polar(HIGHEST, 100, 0)
 
 
+@pytest.mark.thorough
 def test_single_precision_stays():
     design, judged = jax.tree.map(lambda x: x.astype(jnp.float32), (thesis_design(), setup()))
     highest = jnp.float32(HIGHEST)

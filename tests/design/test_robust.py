@@ -109,6 +109,7 @@ def test_the_worst_is_above_each_and_near_the_largest():
     assert max(errors) <= worst <= max(errors) + 0.04 * robust(Tolerances())
 
 
+@pytest.mark.thorough
 def test_a_tilt_counts_as_a_distance():
     tilt = 0.01
     depth = tilt * 5.632 / np.sqrt(12)

@@ -112,6 +112,7 @@ def test_restored_are_nearly_those_of_the_wiener_synthesis_at_two_distances():
     assert np.mean((found - expected) ** 2) < 0.08 * np.mean((expected - images) ** 2)
 
 
+@pytest.mark.thorough
 def test_restored_are_those_of_the_wiener_synthesis():
     given, chosen = training(), design()
     restored, error_of_all = compiled(chosen, given)

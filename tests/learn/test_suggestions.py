@@ -126,6 +126,7 @@ def test_no_number_is_told(suggester):
     assert suggest(broken, np.full(RINGS, 3.0)).status == "non_finite"
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("target", "message"),
     [

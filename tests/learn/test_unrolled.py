@@ -39,6 +39,7 @@ def test_untrained_it_is_admm():
     np.testing.assert_allclose(found, splitting.image(state), atol=1e-10)
 
 
+@pytest.mark.thorough
 def test_trained_it_beats_as_many_untrained_iterations_on_scenes_it_has_not_seen():
     seen, images = pairs(10, 100)
     unseen, others = pairs(8, 900)

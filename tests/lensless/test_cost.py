@@ -93,7 +93,7 @@ DTYPE = {"float32": jnp.float32, "float64": jnp.float64}
 @pytest.mark.parametrize(
     ("mask", "shape", "dtype", "model", "average"),
     spread_over(
-        4,
+        6,
         case={
             "tiny": (zones(), (7, 9), jnp.float32),
             "small": (zones(), (48, 80), jnp.float32),
@@ -114,7 +114,7 @@ def test_closed_forms(mask, shape, dtype, model, average):
 @pytest.mark.parametrize(
     ("cells", "profile", "shape", "dtype", "model", "average"),
     spread_over(
-        3,
+        5,
         display={
             "8 cells": (8, "cosine", (48, 80), jnp.float64),
             "128 cells": (128, "cosine", (700, 300), jnp.float32),
@@ -132,7 +132,7 @@ def test_display_pixels(cells, profile, shape, dtype, model, average):
 @pytest.mark.parametrize(
     ("mask", "shape", "average", "oversampling", "dtype", "model"),
     spread_over(
-        3,
+        5,
         case={
             "zones": (zones(width=0.5), (48, 80), False, 1),
             "display": (zones(width=0.5, pixel_pitch=0.01), (301, 200), True, 3),

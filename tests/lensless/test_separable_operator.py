@@ -40,6 +40,7 @@ def test_it_is_what_the_camera_captures():
     assert seen == pytest.approx(float(loose.error), rel=0.05)
 
 
+@pytest.mark.thorough
 def test_single_precision_stays():
     with jax.enable_x64(False):
         found = tc.separable_operator(camera(dtype=jnp.float32), scene(550 * nm), tolerance=1e-6)

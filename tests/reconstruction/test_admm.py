@@ -327,6 +327,7 @@ def test_residuals_are_what_their_names_say():
     assert float(state.inside.change) == pytest.approx(size(gap) / size(before), rel=1e-10)
 
 
+@pytest.mark.thorough
 def test_balance_moves_penalties_the_right_way():
     """From penalties far too large or too small, ten times nearer to the minimum with balance."""
     given = case("colour")

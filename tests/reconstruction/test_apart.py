@@ -94,6 +94,7 @@ def test_the_worst_part_counts():
     assert len({r.primal for r in found.apart}) == 2
 
 
+@pytest.mark.thorough
 def test_units_and_penalties_do_not_depend_on_the_batch():
     """Through the entry point: the same captures alone and beside a bright one."""
     cameras = rig.pair()

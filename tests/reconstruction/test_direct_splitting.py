@@ -121,10 +121,8 @@ def test_a_state_stands_for_its_image():
         np.testing.assert_allclose(splitting.image(splitting.start(image)), expected, atol=1e-14)
 
 
-@pytest.mark.parametrize(
-    "name",
-    [pytest.param(n, marks=[pytest.mark.thorough] * (n != "separable")) for n in OPERATORS],
-)
+@pytest.mark.thorough
+@pytest.mark.parametrize("name", OPERATORS)
 def test_single_precision_stays_and_is_near_to_double(name):
     """Also with the settings of total variation in double precision, their default here.
 

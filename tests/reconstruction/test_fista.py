@@ -80,6 +80,7 @@ def without_restart(problem, iterations):
     return values
 
 
+@pytest.mark.thorough
 def test_restart_reaches_in_70_iterations_what_takes_more_than_140_without():
     problem, _ = scenes.problem(
         kernel=scenes.spots, nonnegative=False, regulariser=Sparsity(Wavelet("haar", 2))

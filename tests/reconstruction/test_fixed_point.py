@@ -113,15 +113,8 @@ def along(name: str) -> Parameters:
     return zero._replace(**{name: direction})
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param("log_tau", marks=pytest.mark.thorough),
-        "beta",
-        pytest.param("distance", marks=pytest.mark.thorough),
-        pytest.param("capture", marks=pytest.mark.thorough),
-    ],
-)
+@pytest.mark.thorough
+@pytest.mark.parametrize("name", ["log_tau", "beta", "distance", "capture"])
 def test_the_gradient_of_a_psnr_by_differences(name):
     """τ, β, d and the capture, through at most 200 iterations, to one part in a thousand.
 

@@ -90,7 +90,7 @@ def test_mean_power_is_the_energy_of_the_kernel(window):
     assert float(operator.mean_power()) == pytest.approx(expected, rel=1e-12)
 
 
-@pytest.mark.parametrize("planes", [1, 3])
+@pytest.mark.parametrize("planes", [1, pytest.param(3, marks=pytest.mark.thorough)])
 def test_single_precision_and_gradients(planes):
     parts = operators(2, planes, window=(15, 20))
     shape = (1, planes, 15, 11)

@@ -276,6 +276,7 @@ def test_the_start_is_worth_its_iterations(wide_capture, monkeypatch):
     assert relative_l2(better.image[0], truth) < 0.8 * relative_l2(plain.image[0], truth)
 
 
+@pytest.mark.thorough
 def test_the_history_is_that_of_one_run(wide_capture):
     """The callback sees it; the objective is the whole problem's all along."""
     progress = []

@@ -13,7 +13,14 @@ compiled = jax.jit(estimate_noise)
 RNG = np.random.default_rng(9)
 
 
-@pytest.mark.parametrize("shape", [(64, 81), (111, 50), (7, 900)])
+@pytest.mark.parametrize(
+    "shape",
+    [
+        pytest.param((64, 81), marks=pytest.mark.thorough),
+        pytest.param((111, 50), marks=pytest.mark.thorough),
+        (7, 900),
+    ],
+)
 def test_white_noise_is_measured_without_bias(shape):
     """The mean of 40 estimates is right to 2 %, each one to 20 %; on a smooth picture, too."""
     y, x = (np.arange(n) for n in shape)

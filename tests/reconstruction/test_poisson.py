@@ -166,6 +166,7 @@ def test_what_the_solver_refuses():
     rig.refused(message, lambda: tc.reconstruct(apart, tc.PoissonTV()))
 
 
+@pytest.mark.thorough
 def test_recordings_at_the_extremes():
     extremes.check_recordings(tc.PoissonTV(iterations=30))
 
@@ -216,6 +217,7 @@ def test_the_tau_of_counts_is_that_of_their_mean():
     np.testing.assert_array_equal(made.weights[0], valid)
 
 
+@pytest.mark.thorough
 def test_poisson_of_few_counts():
     """Three a pixel: never negative, with its background as a frame; goes on from a start."""
     captures, psfs, truth = recording(3.0, background=1.0)
@@ -230,6 +232,7 @@ def test_poisson_of_few_counts():
     rig.refused("negative counts", lambda: tc.reconstruct(negative, tc.PoissonTV()))
 
 
+@pytest.mark.thorough
 def test_poisson_with_cameras_is_upright():
     """From a start given upright, too: that of the result is left after a step or two."""
     clean = rig.captures(rig.pair(), rig.picture())

@@ -100,6 +100,7 @@ def test_two_distances_are_registered():
     assert beyond.size > 60 and not beyond.any() and np.asarray(value[0])[~trusted].min() > 1e-3
 
 
+@pytest.mark.thorough
 def test_an_invalid_pixel_taints_what_is_interpolated_from_it():
     """What an invalid pixel changes by more than a hundredth of itself has no weight."""
     rigs = cameras(1, distance=3.0) + cameras(1, distance=2.4)

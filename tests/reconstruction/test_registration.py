@@ -18,7 +18,9 @@ def pixels(shape):
     return y[:, None], x[None, :]
 
 
-@pytest.mark.parametrize(("shape", "ratio"), [((38, 47), 1.3), ((41, 36), 1.031)])
+@pytest.mark.parametrize(
+    ("shape", "ratio"), [((38, 47), 1.3), pytest.param((41, 36), 1.031, marks=pytest.mark.thorough)]
+)
 def test_the_picture_is_enlarged_about_its_centre(shape, ratio):
     """A smooth function of (y, x) becomes that of (y, x)/ratio; off the sensor's rim."""
     value = register(jnp.asarray(blob(*pixels(shape))), ratio)

@@ -85,7 +85,7 @@ def test_endings():
     assert (once.status, once.iterations) == ("iterations_exhausted", 7)
 
 
-@pytest.mark.parametrize("kernel", [(9, 10), (60, 51)])
+@pytest.mark.parametrize("kernel", [(9, 10), pytest.param((60, 51), marks=pytest.mark.thorough)])
 def test_extremes_are_finite(kernel):
     """No light, saturated, one bright pixel, no variation, nothing but that."""
     shape = (30, 23)
@@ -109,6 +109,7 @@ def test_extremes_are_finite(kernel):
             np.testing.assert_array_equal(result.image, 0)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("factor", [1e-8, 1e8])
 def test_the_image_scales_with_the_captures(factor):
     """In single precision, with noise that is estimated; colours keep their axis."""
@@ -122,6 +123,7 @@ def test_the_image_scales_with_the_captures(factor):
     )
 
 
+@pytest.mark.thorough
 def test_planes_get_an_axis():
     planes = rig.seen_by(rig.pair(), object_distance=[80.0, 100.0])
     result = variation(noisy(), planes, iterations=5)
@@ -194,6 +196,7 @@ def test_a_regulariser_takes_the_place_of_total_variation():
     assert relative_l2(sparse.image, truth) < 0.6 * relative_l2(edges.image, truth)
 
 
+@pytest.mark.thorough
 def test_it_is_that_of_the_solver():
     """From a black image, for measured PSFs; the problem is that of the recording."""
     recording, _ = cosines()

@@ -176,7 +176,10 @@ def test_the_light_of_several_planes_adds_up(scene, tolerance):
         ({"scene": [lit((3, 4)), lit((4, 3))]}, ValueError, "planes have .* cells; give at least"),
         ({"scene": []}, ValueError, "planes have .* cells; give at least one"),
         ({"tolerance": 3.0}, ValueError, "tolerance = 3 is relative: give at most 1"),
-        ({"camera": thin(5.0, 0.0)}, ValueError, "no light reaches the sensor.*check_screen"),
+        pytest.param(
+            *({"camera": thin(5.0, 0.0)}, ValueError, "no light reaches the sensor.*check_screen"),
+            marks=pytest.mark.thorough,
+        ),
     ],
 )
 def test_errors(scene, change, error, message):

@@ -70,7 +70,12 @@ def test_a_matrix_of_captures_agrees_with_direct_simulation(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "devices", ["zaber", pytest.param("grbl", marks=pytest.mark.thorough), "pylon"]
+    "devices",
+    [
+        pytest.param("zaber", marks=pytest.mark.thorough),
+        pytest.param("grbl", marks=pytest.mark.thorough),
+        "pylon",
+    ],
 )
 def test_each_frame_is_of_the_pattern_and_the_place_that_the_plan_says(devices, tmp_path):
     """By any camera and stage: the fiducials of the frames, read back from the store."""

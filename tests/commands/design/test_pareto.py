@@ -55,6 +55,7 @@ def rising(values):
     return all(b >= a for a, b in zip(values, values[1:], strict=False))
 
 
+@pytest.mark.thorough
 def test_thickness_and_light_buy_resolution(on_a_grid, tmp_path):
     light = "pareto.light={bounds: [90, 9e5], points: 3}"
     told = Told()

@@ -51,6 +51,7 @@ def wide(level):
     return np.sqrt(sums / area.reshape(16, 4).sum(axis=1))
 
 
+@pytest.mark.thorough
 def test_sums_of_captures_against_simulated_point_spread_functions():
     """Transforms of the PSFs of each capture; measured within 3.8 %."""
     pitch = 0.02

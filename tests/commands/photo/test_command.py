@@ -109,6 +109,7 @@ def _displayed(image):
     return 255 * np.clip(image / np.percentile(image, 99.9), 0, 1) ** (1 / 2.2)
 
 
+@pytest.mark.thorough
 def test_noise_that_is_given(grey, tmp_path):
     """In counts of a raw pixel; blocks of four have half of it, in parts of the brightest."""
     out = tmp_path / "image.npy"
@@ -152,9 +153,10 @@ def test_ridge(grey, tmp_path):
     assert 0 < done["iterations"] <= 100 and done["relative_data_residual"] < 0.05
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("psf", "coupling"),
-    [pytest.param("psf", "joint", marks=pytest.mark.thorough), ("grey_psf", "opponent")],
+    [("psf", "joint"), ("grey_psf", "opponent")],
 )
 def test_colours(tmp_path, psf, coupling):
     """8-bit PNG with a PSF of one and of three channels; colours are joined by default."""

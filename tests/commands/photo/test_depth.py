@@ -45,6 +45,7 @@ def objects():
     return [squares * (np.hypot(rows - 30, columns - c) < 12) for c in (22, 54)]
 
 
+@pytest.mark.thorough
 def test_depth_map_and_image_that_is_sharp_everywhere(paths, tmp_path):
     result = call(
         paths, tmp_path / "a.png", "--distances", "60mm, 80mm, 12cm", *ALIKE, psf="folder"

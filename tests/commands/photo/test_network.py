@@ -37,6 +37,7 @@ def call(folder, *more, distance="80 mm"):
     return CliRunner().invoke(cli.app, ["reconstruct", *(str(part) for part in (*typed, *more))])
 
 
+@pytest.mark.thorough
 def test_a_capture_is_focused_and_what_is_not_sure_is_marked(files):
     result = call(files)
     assert result.exit_code == 0, result.output

@@ -105,6 +105,7 @@ def test_interrupt_keeps_what_has_ended(config, folder, at_once):
     assert run_sweep(mini.points(config, "seed=0:5:6"), folder, mini.ignore).rows == 6
 
 
+@pytest.mark.thorough
 def test_workers_that_die_and_points_that_raise(config, folder, monkeypatch):
     """On two processes; the points beside those that kill their worker are not lost."""
     paths = (ROOT, ROOT / "tests", *filter(None, [os.environ.get("PYTHONPATH")]))

@@ -112,6 +112,7 @@ def test_batches_are_those_of_their_key(camera, images):
         np.testing.assert_allclose(batch.target(camera, distance)[n], batch.image[n], atol=1e-9)
 
 
+@pytest.mark.thorough
 def test_untrained_it_renders_the_linear_estimate_of_all_planes(camera, images):
     """What a lens sees of the estimate, in the capture's unit and with its light."""
     network = RefocusNetwork.create(camera, SMALL, key=jax.random.key(0))

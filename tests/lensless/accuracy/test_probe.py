@@ -85,6 +85,7 @@ def test_large_images_are_estimated(pitch, distance, average):
         assert probe.difference(model, "separable") == pytest.approx(true, rel=0.15)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("precision", "average", "oversampling", "height"),
     [

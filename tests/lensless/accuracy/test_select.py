@@ -333,6 +333,7 @@ def test_unknown_model():
         tc.predict_error.__wrapped__(camera_of(), wavelength=500e-6, model="exact")
 
 
+@pytest.mark.thorough
 def test_single_precision_cameras_without_the_switch():
     """The same choice where JAX knows float32 only: its numbers themselves are rounded then, so
     that predictions of rounding differ somewhat, and results come back rounded."""

@@ -43,6 +43,7 @@ def test_error_is_within_the_tolerance_with_few_psfs(deep, tolerance, most_psfs)
     assert plan.cost.flops < 0.25 * plan.full_cost.flops
 
 
+@pytest.mark.thorough
 def test_a_coarse_tolerance_takes_a_cheaper_model(deep):
     whole, _ = deep
     plan = tc.plan(camera(), whole, tolerance=0.3)

@@ -24,7 +24,10 @@ def direct(h, frequencies):
     return np.einsum("km,mn,nk->k", down, np.asarray(h), across)
 
 
-@pytest.mark.parametrize("model", CLOSED)
+@pytest.mark.parametrize(
+    "model",
+    [pytest.param(m, marks=[pytest.mark.thorough] * (m == "separable")) for m in CLOSED],
+)
 @pytest.mark.parametrize("average", [False, pytest.param(True, marks=pytest.mark.thorough)])
 def test_exact_and_quick_agree_with_the_sum_over_the_psf(model, average):
     own = camera()

@@ -167,6 +167,7 @@ def test_energy_and_adjoint():
     assert relative_l2(forward, u) > 0.5
 
 
+@pytest.mark.thorough
 def test_sampling_predicate_tells_good_from_bad():
     """Local frequency βw/(2π) + w/(2λt) against Nyquist and against the window's band limit."""
     mask = tc.FresnelZoneAperture(200.0, width=0.5)

@@ -43,6 +43,7 @@ def test_is_the_magnified_mask(shape, t):
     np.testing.assert_allclose(psf_of(shape, 0.031, t=t), expected, rtol=0, atol=1e-13)
 
 
+@pytest.mark.thorough
 def test_rectangle():
     """Its points, and the means of its pixels, those at the edges too, by sampling them."""
     y, x = (reference.centred(n, 0.031) for n in (40, 53))
@@ -131,7 +132,7 @@ def test_sampled_mask():
     np.testing.assert_allclose(value, np.abs(amplitude) ** 2, rtol=0, atol=1e-14)
 
 
-@pytest.mark.parametrize("average", [False, True])
+@pytest.mark.parametrize("average", [False, pytest.param(True, marks=pytest.mark.thorough)])
 def test_gradient_in_width(average):
     """Zero where the PSF is point-sampled (a step); of the pixel average, exact.
 

@@ -102,6 +102,7 @@ def test_rectangle_against_scipy():
     assert relative_l2(value(sides, True), average) < 5e-3
 
 
+@pytest.mark.thorough
 def test_single_precision():
     """Within 3e-5 at the thesis' size, where edge waves turn by 1e4 rad; measured 7e-6."""
     exact = psf_of((1000, 1024), PITCH, THESIS, 250.0)

@@ -159,6 +159,7 @@ def synthesised(weights, seed=6):
     return sum(w * shot for w, shot in zip(weights.values(), shots, strict=True))
 
 
+@pytest.mark.thorough
 def test_model_of_a_synthesis_is_the_sum_of_pictures():
     """Here of two in quadrature, which keep a background; and its fringes as one picture."""
     weights = {0.0: 1.0, math.pi / 2: -1j}

@@ -65,6 +65,7 @@ def deviations(fit, truth):
     return np.array([float((fit.values[n] - truth[n]) / fit.standard_errors[n]) for n in truth])
 
 
+@pytest.mark.thorough
 def test_a_screen_from_a_few_ghosts():
     """Within the errors that it claims; without noise, up to what the nodes of the band resolve."""
     fit = fit_screen(ghosts(0.05), camera(), plane())

@@ -43,6 +43,7 @@ def test_planes_are_separable_by_the_formula():
         assert far - near > float(axial_resolution(camera, near))
 
 
+@pytest.mark.thorough
 def test_each_object_is_in_its_own_plane(seen):
     """Four phases, 30 dB, f ≥ 0 on black: over 90 % of the light, over 99 % of the energy."""
     result = reconstruct(seen, iterations=150)

@@ -132,6 +132,7 @@ def spots(scale, shape=(48, 64)):
     return psf / psf.sum()
 
 
+@pytest.mark.thorough
 def test_measured_psfs_tell_the_distances():
     """Two chequered boxes, each seen through the PSF measured at its distance."""
     distances = (12.0, 16.0, 24.0, 48.0)
