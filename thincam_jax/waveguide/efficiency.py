@@ -22,6 +22,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
+from thincam_jax._core.precision import phasor
 from thincam_jax.waveguide.hologram import VolumeHologram, directions
 
 Polarisation = Literal["TE", "TM"]
@@ -189,17 +190,7 @@ def _efficiency(strength, detuning, reflected):
     small = jnp.abs(x) < 1e-4
     root = jnp.sqrt(jnp.where(small, 1.0, jnp.abs(x)))
     grown = jnp.exp(jnp.minimum(root, 32.0))
-    ratio = jnp.where(x > 0, (grown - 1 / grown) / 2, _sine(root)) / root
+    ratio = jnp.where(x > 0, (grown - 1 / grown) / 2, phasor(root).imag) / root
     ratio = jnp.where(small, 1 + x / 6, ratio)
     coupled = strength**2 * ratio**2
     return jnp.where(reflected, coupled / (1 + coupled), 0.0)
-
-
-def _sine(angle):
-    """sin up to its sign by its series within ±π/2: XLA's takes five times as long on a CPU."""
-    turned = angle / math.pi
-    within = math.pi * (turned - jnp.round(turned))
-    square, total = within**2, 0.0
-    for k in range(10, 0, -1):
-        total = (1 + total) * -square / (2 * k * (2 * k + 1))
-    return within * (1 + total)

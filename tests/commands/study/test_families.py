@@ -3,10 +3,12 @@
 import numpy as np
 import pytest
 from commands.study import tiny
+from PIL import Image
 
 import thincam_jax as tc
 from thincam_jax.commands.checked_config import dump_config
 from thincam_jax.commands.config_file import ConfigError
+from thincam_jax.commands.study import study
 from thincam_jax.commands.study.build import build_study
 from thincam_jax.commands.study.config import load_config
 
@@ -33,14 +35,14 @@ def written(folder, mask=MURA, method=METHOD):
 def test_family(tmp_path, mask, expected):
     path = written(tmp_path, mask)
     config = load_config(path)
-    study = build_study(config)
-    (exposure,) = study.exposures
-    camera = study.camera(exposure)
+    built = build_study(config)
+    (exposure,) = built.exposures
+    camera = built.camera(exposure)
     if not isinstance(expected, str):
         same = tc.LenslessCamera(expected, camera.sensor, 3.0)
         h = tc.psf(same, wavelength=500e-6, object_distance=100.0, model="geometric")
-        np.testing.assert_allclose(study.psf(exposure), h, rtol=1e-6, atol=1e-7)
-    assert study.mask.label in study.mask_of(exposure)
+        np.testing.assert_allclose(built.psf(exposure), h, rtol=1e-6, atol=1e-7)
+    assert built.mask.label in built.mask_of(exposure)
     path.write_text(dump_config(config))  # a resolved file is read back
     assert load_config(path) == config
 
@@ -50,6 +52,20 @@ def test_an_image_file_is_a_mask(tmp_path):
     with pytest.raises(ConfigError, match="mask, sensor or model: .*picture.png' is coloured") as e:
         build_study(load_config(path))
     assert "\n" not in str(e.value)
+
+
+def test_an_image_file_is_read_once(tmp_path, monkeypatch):
+    """However many exposures there are, and for its warnings."""
+    picture = Image.fromarray(np.uint8(255 * np.eye(12)))
+    picture.save(tmp_path / "picture.png")
+    read, read_mask = [], study.read_mask
+    monkeypatch.setattr(study, "read_mask", lambda *a: read.append(a) or read_mask(*a))
+    shots = METHOD.replace("{distance: 3 mm}", "{distance: 3 mm}, {distance: 4 mm}")
+    mask = f"{{family: file, path: {tmp_path / 'picture.png'}, width: 2 mm}}"
+    built = build_study(load_config(written(tmp_path, mask, shots)))
+    assert built.warnings is not None and len(built.exposures) == 2
+    assert [built.camera(exposure).distance for exposure in built.exposures] == [3, 4]
+    assert len(read) == 1
 
 
 @pytest.mark.parametrize(

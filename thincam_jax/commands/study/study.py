@@ -207,13 +207,18 @@ class Study:
         """Of all methods, each once, in the order of first use."""
         return tuple(dict.fromkeys(e for m in self.methods for e in m.exposures))
 
+    @functools.cached_property
+    def _same_mask(self) -> AbstractMask:
+        """That of all exposures, where it is no zone plate; its file is read once."""
+        return built_mask(self.mask, self.exposures[0])
+
     @property
     def warnings(self) -> list[str]:
         """What a user is told before it runs, and in the report."""
         farthest = max((target.distance for target in self.targets), default=math.inf)
         if self.mask.family == "fza":
             return unresolved_zones(self.exposures, self.sensor.pitch, farthest, self.mask.height)
-        finest = getattr(built_mask(self.mask, self.exposures[0]), "finest_frequency", 0.0)
+        finest = getattr(self._same_mask, "finest_frequency", 0.0)
         nearest = min(exposure.distance for exposure in self.exposures)
         fault = unresolved(float(finest) / (1 + nearest / farthest), self.sensor.pitch)
         return [fault] if fault else []
@@ -228,7 +233,8 @@ class Study:
         sensor = dict(self.sensor)
         for level in ("exposure", "electrons"):
             sensor[level] = sensor[level] and sensor[level] * exposure.share
-        mask = built_mask(self.mask, exposure)
+        is_zone_plate = self.mask.family == "fza"
+        mask = built_mask(self.mask, exposure) if is_zone_plate else self._same_mask
         return LenslessCamera(mask, Sensor(**sensor), exposure.distance)
 
     def mask_of(self, exposure: Exposure) -> str:
