@@ -16,14 +16,17 @@ def picture(shape, seed=0):
     return np.random.default_rng(seed).uniform(0.1, 1.0, shape)
 
 
-def averages_by_running_totals(image, width, grid, magnification):
-    """Cell averages from the image's running total, interpolated linearly at the cells' edges."""
+def averages_by_running_totals(image, width, grid, magnification, shift=0.0):
+    """Cell averages from the image's running total, interpolated linearly at the cells' edges.
+
+    `shift`: of the image along +x, before it is scaled.
+    """
     rows, columns = image.shape
     pixel = width * abs(magnification) / columns
     turned = image[::-1, ::-1] if magnification < 0 else image
 
-    def along(values, count, samples):
-        edges = (np.arange(count + 1) - count / 2) * pixel
+    def along(values, count, samples, shift=0.0):
+        edges = (np.arange(count + 1) - count / 2) * pixel + shift
         total = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values, axis=0)])
         cells = (np.arange(samples + 1) - samples / 2) * float(grid.pitch)
         return np.stack(
@@ -31,7 +34,7 @@ def averages_by_running_totals(image, width, grid, magnification):
         ) * (pixel / float(grid.pitch))
 
     down = along(turned, rows, grid.shape[0])
-    return along(down.T, columns, grid.shape[1]).T
+    return along(down.T, columns, grid.shape[1], shift * magnification).T
 
 
 @pytest.mark.parametrize(("pitch", "magnification"), [(0.031, -1.0), (0.11, 0.37), (0.7, -2.6)])
@@ -58,6 +61,20 @@ def test_cells_hold_the_exact_average(shape, magnification):
     sampled = ImagePlane(image, 100.0, 1.8).sample(grid, magnification=magnification)
     expected = averages_by_running_totals(image, 1.8, grid, magnification)
     np.testing.assert_allclose(sampled, expected, rtol=1e-12, atol=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("moves", "magnification"), [((0.3, -0.9), -1.3), ((-0.2, -0.17), 0.9), ((0.3, 0.3), -0.4)]
+)
+def test_what_moves_is_the_mean_on_the_way(moves, magnification):
+    """Against a sum over many places; on the way less than a cell, and no way at all."""
+    image, grid = picture((6, 9)), Grid((9, 14), 0.13)
+    plane = ImagePlane(image, 100.0, 1.8, moves)
+    times = (np.arange(2000) + 0.5) / 2000
+    places = moves[0] + (moves[1] - moves[0]) * times
+    still = [averages_by_running_totals(image, 1.8, grid, magnification, x) for x in places]
+    sampled = plane.sample(grid, magnification=magnification)
+    np.testing.assert_allclose(sampled, np.mean(still, axis=0), atol=1e-6)
 
 
 def test_a_pinhole_turns_the_image_by_180_degrees():

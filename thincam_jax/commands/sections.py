@@ -387,6 +387,11 @@ class CamerasConfig(LenslessConfig):
     noise: NoiseConfig | None = None
     methods: Annotated[tuple[MethodConfig, ...], Field(min_length=1)]
 
+    @property
+    def motion(self) -> float:
+        """How far objects move during an exposure of the sensor's own time, mm."""
+        return 0.0
+
     @pydantic.model_validator(mode="after")
     def _methods_fit(self):
         check_names(self, "methods")

@@ -1,6 +1,6 @@
 """What the camera looks at: flat images at distances, and the light they send."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -19,13 +19,22 @@ class ImagePlane(eqx.Module):
     - `image`: radiance, (*batch, y, x), in any unit; a batch can hold the colour channels.
     - `distance`: to the mask, mm.
     - `width`: physical width of the image, mm; its pixels are square.
+    - `moves`: x of its middle when an exposure begins and when it ends, mm: it goes there at an
+      even speed, and what is captured is the mean on the way. None stays on the axis.
     """
 
     image: Float[Array, "*batch y x"]
     distance: Float[Array, ""]
     width: Float[Array, ""]
+    moves: Float[Array, "2"] | None
 
-    def __init__(self, image: Numbers, distance: Number, width: Number):
+    def __init__(
+        self,
+        image: Numbers,
+        distance: Number,
+        width: Number,
+        moves: Numbers | Sequence[float] | None = None,
+    ):
         if not checks.is_traced(image) and np.asarray(image).dtype.kind not in "fiub":
             raise TypeError(
                 f"image is a {type(image).__name__} of {np.asarray(image).dtype}; give an array of "
@@ -48,6 +57,7 @@ class ImagePlane(eqx.Module):
             )
         self.distance = checks.positive("distance", distance, "mm")
         self.width = checks.positive("width", width, "mm")
+        self.moves = None if moves is None else checks.finite("moves", moves, "mm", shape=(2,))
 
     @property
     def height(self) -> Float[Array, ""]:
@@ -72,16 +82,27 @@ class ImagePlane(eqx.Module):
         """What `sample` multiplies the image with, from above and from the right, transposed."""
         scale = jnp.asarray(magnification, dtype=grid.pitch.dtype)
         rows, columns = self.image.shape[-2:]
-        pairs = (grid.y, rows, self.height), (grid.x, columns, self.width)
-        both = [_cell_average(x, grid.pitch, n, size * jnp.abs(scale)) for x, n, size in pairs]
+        moves = None if self.moves is None else self.moves.astype(scale.dtype) * scale
+        both = (
+            _cell_average(grid.y, grid.pitch, rows, self.height * jnp.abs(scale)),
+            _cell_average(grid.x, grid.pitch, columns, self.width * jnp.abs(scale), moves),
+        )
         down, across = (jnp.where(scale < 0, part[:, ::-1], part) for part in both)
         return down, across
 
 
-def _cell_average(x, pitch, count: int, width) -> Float[Array, "n count"]:
+def _cell_average(x, pitch, count: int, width, moves=None) -> Float[Array, "n count"]:
     """Weights of `count` pixels that span `width` in the averages over cells of `pitch` at x."""
     edges = (jnp.arange(count + 1, dtype=x.dtype) / count - 0.5) * width
-    return cell_overlap(x, pitch, edges[:-1], edges[1:]) / pitch
+    if moves is None:
+        return cell_overlap(x, pitch, edges[:-1], edges[1:]) / pitch
+    # How much of a cell lies before an edge: its mean while the edge moves from `low` to `high`.
+    low, high = (edges + end - (x[:, None] - pitch / 2) for end in (jnp.min(moves), jnp.max(moves)))
+    first, last = (jnp.clip(end, 0.0, pitch) for end in (low, high))
+    beyond = jnp.maximum(high - jnp.maximum(low, pitch), 0.0)
+    way = jnp.where(high > low, high - low, 1.0)
+    mean = ((last - first) * (first + last) / 2 + pitch * beyond) / way
+    return jnp.diff(jnp.where(high > low, mean, first), axis=1) / pitch
 
 
 class Spectrum(eqx.Module):

@@ -22,6 +22,9 @@ from thincam_jax.lensless.cost import convolution_cost
 from thincam_jax.lensless.method import Model
 from thincam_jax.lensless.psf import psf
 
+# Pixels by which a field grows where an image moves.
+_STEP = 16
+
 
 def expose(
     camera: LenslessCamera,
@@ -100,7 +103,8 @@ def spectral_psf(
 
 def projected_shape(camera: LenslessCamera, plane: ImagePlane) -> tuple[int, int]:
     """Pixels that the plane's image covers on the sensor's pitch; needs untraced numbers."""
-    numbers = (camera.distance, plane.distance, camera.sensor.pitch, plane.width)
+    moves = 0.0 if plane.moves is None else plane.moves
+    numbers = (camera.distance, plane.distance, camera.sensor.pitch, plane.width, moves)
     if any(checks.is_traced(n) for n in numbers):
         raise TypeError(
             "capture needs the plane's width and distance and the camera's distance and pitch as "
@@ -108,10 +112,12 @@ def projected_shape(camera: LenslessCamera, plane: ImagePlane) -> tuple[int, int
             "use imaging_operator"
         )
     # In NumPy: inside jit, JAX would trace the product of known numbers too.
-    distance, object_distance, pitch, width = (np.asarray(n) for n in numbers)
+    distance, object_distance, pitch, width, moves = (np.asarray(n) for n in numbers)
     aspect = plane.image.shape[-2] / plane.image.shape[-1]
-    size = distance / object_distance / pitch * width * np.array([aspect, 1.0])
-    rows, columns = (max(1, math.ceil(n - 1e-3)) for n in size)
+    scale = distance / object_distance / pitch
+    rows, columns = (max(1, math.ceil(scale * n - 1e-3)) for n in (width * aspect, width))
+    # In steps, so that programs are shared along a way.
+    columns += 2 * _STEP * math.ceil(scale * np.abs(moves).max() / _STEP)
     return same_parity((rows, columns), camera.sensor.shape)
 
 

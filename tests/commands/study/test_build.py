@@ -6,6 +6,7 @@ from commands.study import tiny
 
 from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.study.build import expose, noise_free
+from thincam_jax.imaging.scene import ImagePlane
 
 ELECTRONS = ("sensor.electrons=2e5", "noise={read_noise: 2}")
 
@@ -89,3 +90,17 @@ def test_less_light_has_more_noise(tmp_path):
     for share, mean, variance in zip((1.0, 0.25), light, variances, strict=True):
         counted = 2e5 * share
         np.testing.assert_allclose(variance, mean / counted + (2 / counted) ** 2, rtol=1e-5)
+
+
+def test_a_moving_target_goes_on_from_capture_to_capture(tmp_path):
+    """Half way through a method's captures it is on the axis; what each sees is the mean."""
+    shot = "{beta: 21 rad/mm^2, distance: 3 mm, exposure: 0.5}"
+    study, method = pairs(tmp_path, shot, "object.motion=4 mm")
+    assert [e.moves for e in method.exposures] == [(-6, -2), (-2, 2), (2, 4), (4, 6)]
+    exposure, target = method.exposures[0], study.targets[0]
+    image, far, wide = target.plane.image, target.distance, target.width
+    at = [ImagePlane(image, far, wide, moves) for moves in (None, (4, 4), (-2, 2))]
+    still, beside, moving = (noise_free(study, exposure, plane) for plane in at)
+    # 4 mm on the object are 3 pixels on the sensor, the other way.
+    np.testing.assert_allclose(beside[..., :-3], still[..., 3:], rtol=1e-6)
+    np.testing.assert_allclose(moving.sum(), still.sum(), rtol=1e-3)

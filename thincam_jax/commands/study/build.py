@@ -1,6 +1,7 @@
 """From an experiment file to what is simulated: cameras, exposures, noise, targets and methods."""
 
 import functools
+import itertools
 import math
 import operator
 from collections.abc import Sequence
@@ -89,6 +90,11 @@ def as_method(config: CamerasConfig, method: MethodConfig) -> Method:
         for shot in method.shots
         for phase in phases
     )
+    if config.motion:
+        ends = np.cumsum([0.0, *(exposure.share for exposure in exposures)])
+        ends = config.motion * (ends - ends[-1] / 2)
+        ways = itertools.pairwise(ends.tolist())
+        exposures = tuple(e._replace(moves=w) for e, w in zip(exposures, ways, strict=True))
     return Method(
         method.name,
         method.kind,
@@ -237,8 +243,9 @@ def expose(study: Study, exposure: Exposure, clean: Array, number: int, trial: i
 
 
 def take(study: Study, exposure: Exposure, target: Target) -> Capture:
-    """One capture of a target."""
-    return expose(study, exposure, noise_free(study, exposure, target.plane), target.number)
+    """One capture of a target, which may move meanwhile."""
+    plane = ImagePlane(target.plane.image, target.distance, target.width, exposure.moves)
+    return expose(study, exposure, noise_free(study, exposure, plane), target.number)
 
 
 def stacked(captures: Sequence[Capture]) -> tuple[Array, Array]:

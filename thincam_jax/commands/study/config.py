@@ -7,15 +7,35 @@ import pydantic
 from pydantic import Field
 
 from thincam_jax.commands.checked_config import load_as
-from thincam_jax.commands.sections import CamerasConfig, ObjectConfig, TargetConfig, check_names
+from thincam_jax.commands.sections import (
+    CamerasConfig,
+    ObjectConfig,
+    Position,
+    TargetConfig,
+    check_names,
+)
+
+
+class MovingObjectConfig(ObjectConfig):
+    """Targets that may move.
+
+    - `motion`: how far across (+x) during an exposure of the sensor's own time. A method's captures
+      follow each other without a pause, and half way through them the targets are on the axis.
+    """
+
+    motion: Position = 0.0
 
 
 class StudyConfig(CamerasConfig):
     """A whole study: every method on every target."""
 
-    object: ObjectConfig
+    object: MovingObjectConfig
     targets: Annotated[tuple[TargetConfig, ...], Field(min_length=1)]
     notes: tuple[str, ...] = ()
+
+    @property
+    def motion(self) -> float:
+        return self.object.motion
 
     @pydantic.model_validator(mode="after")
     def _targets_fit(self):

@@ -53,6 +53,7 @@ class Exposure(NamedTuple):
     - `share`: of the sensor's exposure time.
     - `take`: counts the exposures of a method that are equal in all else.
     - `profile`: of the mask; None is that of the study.
+    - `moves`: of the target meanwhile, see `ImagePlane`.
     """
 
     beta: float
@@ -63,6 +64,7 @@ class Exposure(NamedTuple):
     share: float = 1.0
     take: int = 1
     profile: Profile | None = None
+    moves: tuple[float, float] | None = None
 
 
 class Capture(NamedTuple):
