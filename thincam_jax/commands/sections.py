@@ -11,6 +11,7 @@ from pydantic_core import PydanticCustomError
 
 from thincam_jax.commands.config_file import slug
 from thincam_jax.imaging.targets import sample_images
+from thincam_jax.lensless.masks.cells import Combination
 from thincam_jax.lensless.masks.fza import Profile
 from thincam_jax.lensless.method import Model
 from thincam_jax.reconstruction.spectra import Prior
@@ -104,13 +105,14 @@ class ApertureConfig(Section):
         return self
 
 
+_WIDEST = 300.0  # mask of a thin camera, mm
 Family = Literal["fza", "mura", "ura", "mls", "random", "pinhole", "lenslets", "file"]
 # What a mask of each family is made of, and what may be given besides.
 _NUMBERS: dict[Family, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "fza": (("width",), ("height", "profile", "pixel_pitch", "fill_factor", "harmonics")),
     "mura": (("order", "cell"), ("tiles",)),
     "ura": (("orders", "cell"), ("tiles",)),
-    "mls": (("length", "cell"), ()),
+    "mls": (("length", "cell"), ("combine",)),
     "random": (("width", "cell"), ("height", "seed")),
     "pinhole": (("width",), ("height",)),
     "lenslets": (("focal_length", "cell", "lenses"), ()),
@@ -123,8 +125,8 @@ class MaskConfig(ApertureConfig):
 
     - `height`, `harmonics`: of a rectangle, and which orders of a zone plate are computed.
     - `cell`: side of a cell or of a lens. Arrays have the `width` of their cells.
-    - `order`: p of a "mura"; `orders`: (r, s) of a "ura"; `length`: 2^m − 1 of an "mls", whose
-      code and itself are combined by xor; `tiles`: how often an array is repeated along each axis.
+    - `order`: p of a "mura"; `orders`: (r, s) of a "ura"; `length`: 2^m − 1 of an "mls", whose code
+      and itself `combine`; `tiles`: how often an array is repeated along each axis.
     - `seed`: of "random" cells; `focal_length`, `lenses` (down, across): of "lenslets".
     - `path`: of a grey image, a "file", whose pixels make up the `width`.
     """
@@ -137,6 +139,7 @@ class MaskConfig(ApertureConfig):
     order: int | None = None
     orders: tuple[int, int] | None = None
     length: int | None = None
+    combine: Combination = "xor"
     tiles: Annotated[int, Field(ge=1)] | None = None
     seed: Annotated[int, Field(ge=0, lt=2**32)] | None = None
     focal_length: Length | None = None
@@ -160,6 +163,10 @@ class MaskConfig(ApertureConfig):
             if "width" in self.model_fields_set and abs(self.width - width) > 1e-9:
                 raise misfit(f"the cells make {width:g} mm; drop it", "width")
             object.__setattr__(self, "width", width)
+        if self.width > _WIDEST:
+            key = "width" if across is None else "cell"
+            message = f"makes a mask of {self.width:g} mm, which is none; give at most {_WIDEST:g}"
+            raise misfit(message, key)
         return self
 
     def _cells_across(self) -> int | None:

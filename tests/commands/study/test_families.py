@@ -28,6 +28,10 @@ def written(folder, mask=MURA, method=METHOD):
         (MURA, tc.ModifiedUniformlyRedundantArray(13, 0.12)),
         ("{family: ura, orders: [7, 5], cell: 120 um, tiles: 2}", "ura"),
         ("{family: mls, length: 15, cell: 0.1 mm}", "mls"),
+        (
+            "{family: mls, length: 15, cell: 0.1 mm, combine: product}",
+            tc.SeparableMask(*2 * [tc.maximum_length_sequence(15)], 0.1),
+        ),
         ("{family: random, width: 1.2 mm, cell: 0.1 mm, seed: 3}", "random"),
         ("{family: pinhole, width: 0.2 mm}", tc.Pinhole(0.2)),
     ],
@@ -73,6 +77,8 @@ def test_an_image_file_is_read_once(tmp_path, monkeypatch):
     [
         ("{family: mura, cell: 30 um}", METHOD, "mask.order: missing; this key"),
         ("{family: mura, order: 5, cell: 30 um, beta: 3}", METHOD, "mask.beta"),
+        ("{family: mura, order: 101, cell: 30 mm}", METHOD, "mask.cell: makes a mask of 3030 mm"),
+        ("{width: 2 m}", METHOD, "mask.width: makes a mask of 2000 mm, .* give at most 300"),
         ("{family: pinhole, width: 1 mm, order: 5}", METHOD, "mask.order: is no number of a mask"),
         ("{profile: cosine}", METHOD, "mask.width: missing"),
         (MURA, METHOD.replace("separate", "phase_pairs"), "synthesis: a mask of the family mura"),

@@ -6,9 +6,9 @@ import pytest
 import thincam_jax as tc
 from thincam_jax.hardware.displays.patterns import (
     hadamard_frame,
+    mask_pattern,
     read_number,
     with_number,
-    zone_pattern,
 )
 from thincam_jax.measured.calibration.hadamard import HadamardSeries
 
@@ -41,7 +41,7 @@ def test_zones_are_those_of_the_formula(profile):
     outside = np.ones(SHAPE, bool)
     outside[4:20, 4:36] = False
     irradiance[outside] = 0
-    pattern = zone_pattern(zones(profile), SHAPE, PITCH)
+    pattern = mask_pattern(zones(profile), SHAPE, PITCH)
     assert pattern.dtype == np.uint8 and pattern.shape == SHAPE
     assert np.abs(pattern - 255 * irradiance).max() < 1.0  # levels
     if profile == "binary":
@@ -51,14 +51,23 @@ def test_zones_are_those_of_the_formula(profile):
 def test_a_printed_masks_pattern_and_its_complement():
     mask = tc.FresnelZoneAperture(beta=12.0, phase=0.0, width=0.7, profile="intensity")
     other = tc.FresnelZoneAperture(beta=12.0, phase=np.pi, width=0.7, profile="intensity")
-    both = [zone_pattern(m, SHAPE, PITCH).astype(int) for m in (mask, other)]
+    both = [mask_pattern(m, SHAPE, PITCH).astype(int) for m in (mask, other)]
     inner = slice(3, -3), slice(12, -12)
     assert np.abs(sum(both)[inner] - 255).max() <= 1
+
+
+def test_cells_are_squares_of_pixels():
+    mask = tc.SeparableMask([1, 0, 1], [0, 1, 1, 0.5], 4 * PITCH)
+    expected = np.zeros(SHAPE)
+    cells = np.outer([1, 0, 1], [0, 1, 1, 0.25])
+    expected[6:18, 12:28] = np.kron(255 * cells, np.ones((4, 4)))
+    np.testing.assert_array_equal(mask_pattern(mask, SHAPE, PITCH), np.rint(expected))
 
 
 @pytest.mark.parametrize(
     ("mask", "pitch", "message"),
     [
+        (tc.SeparableMask([1, 0], [1, 1], 1.4 * PITCH), PITCH, "mask for pixels of 0.0504 mm"),
         (zones("binary"), 0.03, "the display's have 0.03 mm"),
         (zones("binary", pixels=(26, 32)), PITCH, "26 × 32 pixels; the display has 24 × 40"),
         (zones("binary", pixels=(15, 32)), PITCH, "even or odd"),
@@ -66,7 +75,7 @@ def test_a_printed_masks_pattern_and_its_complement():
 )
 def test_masks_that_do_not_fit(mask, pitch, message):
     with pytest.raises(ValueError, match=message):
-        zone_pattern(mask, SHAPE, pitch)
+        mask_pattern(mask, SHAPE, pitch)
 
 
 def test_hadamard_frames_are_those_of_the_series():

@@ -127,7 +127,7 @@ def draw(pattern: Any, shape: tuple[int, int], pitch: float) -> Any:
     import numpy as np
 
     from thincam_jax.commands.config_file import ConfigError
-    from thincam_jax.hardware.displays.patterns import hadamard_frame, zone_pattern
+    from thincam_jax.hardware.displays.patterns import hadamard_frame, mask_pattern
     from thincam_jax.lensless.masks.fza import FresnelZoneAperture
     from thincam_jax.measured.calibration.hadamard import HadamardSeries
 
@@ -138,7 +138,7 @@ def draw(pattern: Any, shape: tuple[int, int], pitch: float) -> Any:
         cells, frame = (numbers.pop("rows"), numbers.pop("columns")), numbers.pop("frame")
         return hadamard_frame(HadamardSeries(cells, **numbers), frame, shape)
     try:
-        return zone_pattern(FresnelZoneAperture(**numbers, pixel_pitch=pitch), shape, pitch)
+        return mask_pattern(FresnelZoneAperture(**numbers, pixel_pitch=pitch), shape, pitch)
     except ValueError as error:
         raise ConfigError(f"plan.width: {error}") from None
 

@@ -152,7 +152,7 @@ def built_mask(config: MaskConfig, exposure: Exposure) -> AbstractMask:
         return UniformlyRedundantArray(config.orders or (0, 0), cell, tiles=tiles)
     if family == "mls":
         code = maximum_length_sequence(config.length or 0)
-        return SeparableMask(code, code, cell, combine="xor")
+        return SeparableMask(code, code, cell, combine=config.combine)
     if family == "random":
         key = jax.random.key(config.seed or 0)
         return random_cells(key, config.width, cell, height=height)

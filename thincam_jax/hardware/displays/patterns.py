@@ -1,4 +1,4 @@
-"""Patterns for a display, uint8 of its shape: zone plates, Hadamard frames, numbers to read back.
+"""Patterns for a display, uint8 of its shape: masks, Hadamard frames, numbers to read back.
 
 Levels are in proportion to the irradiance that the display lets through, as they are with its
 table of grey levels.
@@ -8,28 +8,35 @@ import numpy as np
 
 from thincam_jax._core.grids import Grid
 from thincam_jax.lensless.masks import FresnelZoneAperture
+from thincam_jax.lensless.masks.cells import AbstractCellMask
 from thincam_jax.measured.calibration.hadamard import HadamardSeries
 
 _BITS = 16
 _HARMONICS = 99  # what is left out of a profile's series is less than a level
 
 
-def zone_pattern(mask: FresnelZoneAperture, shape: tuple[int, int], pitch: float) -> np.ndarray:
-    """A Fresnel zone aperture in the display's centre, black around it.
+def mask_pattern(
+    mask: FresnelZoneAperture | AbstractCellMask, shape: tuple[int, int], pitch: float
+) -> np.ndarray:
+    """A Fresnel zone aperture or a mask of cells in the display's centre, black around it.
 
     The level is 255·t², with the mask's amplitude transmittance t at each pixel's centre; a mask of
     the profile "binary" has only 0 and 255. `pitch` is that of the display's pixels in mm. What
     their fill factor takes away, the display does itself.
 
-    **Errors**: ValueError for a mask of another pitch, too large, or half a pixel off the pixels.
+    **Errors**: ValueError for zones of another pitch, cells of no whole number of pixels, a mask
+    too large, or half a pixel off the pixels.
     """
-    if mask.pixels is None:
-        sides = tuple(float(side) / pitch for side in mask.extent)
-    else:
-        sides = mask.pixels
-        given = float(mask.extent[1]) / sides[1]
+    sides = tuple(float(side) / pitch for side in mask.extent)
+    given = None
+    if isinstance(mask, AbstractCellMask):
+        given = float(mask.cell) / max(1, round(float(mask.cell) / pitch))
+    elif mask.pixels is not None:
+        given = float(mask.extent[1]) / mask.pixels[1]
+    if given is not None:
         if abs(given - pitch) > 1e-4 * pitch:
             raise ValueError(f"a mask for pixels of {given:g} mm; the display's have {pitch:g} mm")
+        sides = tuple(round(side) for side in sides)
         if any((count - side) % 2 for count, side in zip(shape, sides, strict=True)):
             raise ValueError(
                 f"{sides[0]} × {sides[1]} pixels cannot be centred on {shape[0]} × {shape[1]}; "
@@ -39,18 +46,21 @@ def zone_pattern(mask: FresnelZoneAperture, shape: tuple[int, int], pitch: float
         raise ValueError(
             f"a mask of {sides[0]:g} × {sides[1]:g} pixels; the display has {shape[0]} × {shape[1]}"
         )
-    shown = FresnelZoneAperture(
-        mask.beta,
-        mask.phase,
-        width=mask.width,
-        height=mask.height,
-        profile=mask.profile,
-        centre=mask.centre,
-        pixel_pitch=None if mask.pixels is None else pitch,
-        harmonics=_HARMONICS,
-    )
-    amplitude = np.asarray(shown.sample(Grid(shape, pitch)))
-    if mask.profile == "binary":
+    shown, binary = mask, False
+    if isinstance(mask, FresnelZoneAperture):
+        binary = mask.profile == "binary"
+        shown = FresnelZoneAperture(
+            mask.beta,
+            mask.phase,
+            width=mask.width,
+            height=mask.height,
+            profile=mask.profile,
+            centre=mask.centre,
+            pixel_pitch=None if mask.pixels is None else pitch,
+            harmonics=_HARMONICS,
+        )
+    amplitude = np.real(shown.sample(Grid(shape, pitch)))
+    if binary:
         return np.where(amplitude > 0.5, 255, 0).astype(np.uint8)
     return np.rint(255 * np.clip(amplitude, 0.0, 1.0) ** 2).astype(np.uint8)
 
