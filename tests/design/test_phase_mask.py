@@ -16,6 +16,7 @@ from thincam_jax.design import (
     SignalNoise,
     Training,
     contour_target,
+    cropped_error,
     linear_error,
     linear_objective,
     mask_of_phase,
@@ -25,7 +26,7 @@ from thincam_jax.design import (
     restored_objective,
     retrieve_phase,
 )
-from thincam_jax.imaging.operators import kernel_shape
+from thincam_jax.imaging.operators import CropConvolution, kernel_shape
 from thincam_jax.imaging.targets import siemens_star
 from thincam_jax.lensless.masks import MaskBlank
 from thincam_jax.lensless.propagation import Path
@@ -101,6 +102,26 @@ def test_the_linear_error_is_that_of_the_posterior(noise):
     np.testing.assert_allclose(found, np.trace(left).real / np.trace(scene).real, rtol=1e-6)
 
 
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_the_cropped_error_is_that_of_the_posterior(dtype):
+    """tr[(Σ⁻¹ + AᵀA/σ²)⁻¹]/tr Σ of a cropped convolution; with much light in float32, too."""
+    field, seen = (4, 5), (7, 6)
+    h = np.random.default_rng(1).uniform(size=kernel_shape(seen, field))
+    here = setup(noise=PhotonNoise(1e11, 5.0))
+    v, u = (np.fft.fftfreq(n, PITCH) * DISTANCE for n in field)
+    prior = np.asarray(here.prior(jnp.asarray(v[:, None] ** 2 + u**2), here.field))
+    each = np.eye(20).reshape(20, *field)
+    basis = np.stack([np.fft.fft2(e).ravel() for e in each], 1) / np.sqrt(20)
+    scene = ((basis.conj().T * (prior / prior.mean() * 0.25).ravel()) @ basis).real
+    crop = CropConvolution(jnp.asarray(h), PITCH, seen, field)
+    blur = np.asarray(crop(jnp.asarray(each))).reshape(20, -1).T
+    variance = float(here.noise.variance(blur.sum(1).mean(), 0.0, 1.0))
+    left = np.linalg.inv(np.linalg.inv(scene) + blur.T @ blur / variance)
+    given = jax.tree.map(lambda a: jnp.asarray(a, dtype), (h, here, DISTANCE))
+    found = jax.jit(cropped_error, static_argnums=3)(*given, field)
+    np.testing.assert_allclose(found, np.trace(left) / np.trace(scene), rtol=2e-4)
+
+
 def test_psfs_of_a_setting_are_the_cameras(retrieved):
     """One for each depth and wavelength; together, their mean over the wavelengths."""
     mask = retrieved[1]
@@ -155,8 +176,8 @@ def test_refinement_end_to_end(retrieved):
         distances=(DISTANCE, DISTANCE),
         key=jax.random.key(2),
     )
-    sensor = tc.Sensor(kernel_shape((32, 36), training.field_shape), PITCH)
-    setting = MaskSetting(BLANK, sensor, DISTANCE, wavelengths=[GREEN], object_distances=[100.0])
+    light = {"wavelengths": [GREEN], "object_distances": [100.0]}
+    setting = MaskSetting(BLANK, SENSOR, DISTANCE, field_shape=training.field_shape, **light)
     data = (setting, training)
     found = refine_mask(restored_objective, mask, limits, data, key=jax.random.key(1), steps=25)
     assert found.skipped < 10  # where conjugate gradients do not reach the tolerance
@@ -192,5 +213,7 @@ def test_refusals(retrieved):
         refine_mask(
             linear_objective, mask, HeightLimits(1e-3), data, key=jax.random.key(0), steps=1
         )
+    with pytest.raises(ValueError, match="field_shape = .* has 4096 samples.*at most 2048"):
+        MaskSetting(BLANK, SENSOR, DISTANCE, wavelengths=[GREEN], field_shape=(64, 64))
     with pytest.raises(ValueError, match="wavelengths = 500 mm is no light"):
         MaskSetting(BLANK, SENSOR, DISTANCE, wavelengths=[500.0])

@@ -20,6 +20,7 @@ from thincam_jax.design.pareto import non_dominated as non_dominated
 from thincam_jax.design.phase_mask import HeightLimits as HeightLimits
 from thincam_jax.design.phase_mask import MaskSetting as MaskSetting
 from thincam_jax.design.phase_mask import Refined as Refined
+from thincam_jax.design.phase_mask import cropped_error as cropped_error
 from thincam_jax.design.phase_mask import linear_error as linear_error
 from thincam_jax.design.phase_mask import linear_objective as linear_objective
 from thincam_jax.design.phase_mask import mask_of_phase as mask_of_phase

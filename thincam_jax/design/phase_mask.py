@@ -20,16 +20,20 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Number, Numbers
+from thincam_jax._core.grids import Grid
+from thincam_jax._core.precision import as_complex
 from thincam_jax.design.adam import adam
 from thincam_jax.design.end_to_end import restore_by
 from thincam_jax.design.objectives import Channels, bayes_error
 from thincam_jax.design.phase_retrieval import match_error
 from thincam_jax.design.setup import Setup
 from thincam_jax.design.training import Channel, relative_error
+from thincam_jax.imaging.operators import kernel_grid
 from thincam_jax.imaging.sensor import Sensor
 from thincam_jax.lensless.masks.phase import HIGHEST, MaskBlank, PhaseMask
 from thincam_jax.lensless.method import PsfMethod, psf_method
@@ -46,6 +50,9 @@ _PADDING = 1.0
 _INNER = 0.02
 # How far heights are drawn to their levels, stage by stage.
 _STAGES = (0.0, 0.4, 0.7, 0.9, 1.0)
+
+# Of a field, whose full matrices take their square: 2048 are 16 MB and some seconds a step.
+_MOST_SAMPLES = 2048
 
 # (mask, data, key) → what is to be small.
 MaskObjective = Callable[[PhaseMask, Any, PRNGKeyArray], Float[Array, ""]]
@@ -108,6 +115,8 @@ class MaskSetting(eqx.Module):
 
     - `sensor`, `distance`: mask to sensor, mm. `wavelengths`, `object_distances`: mm.
     - `together`: the sensor sees all wavelengths as one grey image; else each has its own.
+    - `field_shape`: of the scene on the sensor's pitch, at most 2048 samples: what falls beside the
+      sensor is lost. None takes the sensor's rims to meet.
     """
 
     sensor: Sensor
@@ -115,6 +124,7 @@ class MaskSetting(eqx.Module):
     wavelengths: Float[Array, " colour"]
     object_distances: Float[Array, " depth"]
     together: bool = eqx.field(static=True)
+    field_shape: tuple[int, int] | None = eqx.field(static=True)
     method: PsfMethod = eqx.field(static=True)
 
     def __init__(
@@ -126,19 +136,33 @@ class MaskSetting(eqx.Module):
         wavelengths: Numbers | Sequence[float],
         object_distances: Numbers | Sequence[float] = (math.inf,),
         together: bool = False,
+        field_shape: tuple[int, int] | None = None,
     ):
         self.sensor, self.together = sensor, together
+        self.field_shape = None if field_shape is None else checks.shape2d("field", field_shape)
+        if self.field_shape and math.prod(self.field_shape) > _MOST_SAMPLES:
+            raise ValueError(
+                f"field_shape = {self.field_shape} has {math.prod(self.field_shape)} samples, each "
+                f"a row of a full matrix; give at most {_MOST_SAMPLES}, or larger pixels"
+            )
         self.distance = checks.positive("distance", distance, "mm")
         dtype = self.distance.dtype
         given = jnp.atleast_1d(jnp.asarray(wavelengths, dtype))
         self.wavelengths = checks.wavelength("wavelengths", given)
         self.object_distances = jnp.atleast_1d(jnp.asarray(object_distances, dtype))
         flat = blank.mask(jnp.zeros(blank.shape, dtype))
-        self.method = psf_method(flat, sensor.grid, "angular_spectrum", pixel_integration=True)
+        self.method = psf_method(flat, self.grid, "angular_spectrum", pixel_integration=True)
         for light in self.wavelengths:
             for away in self.object_distances:
                 path = Path(light, self.distance, away)
-                require_phase_sampling(flat, sensor.grid, path, self.method)
+                require_phase_sampling(flat, self.grid, path, self.method)
+
+    @property
+    def grid(self) -> Grid:
+        """Of the PSFs: the sensor's, or with a field what its points cast on the sensor."""
+        if self.field_shape is None:
+            return self.sensor.grid
+        return kernel_grid(self.sensor.grid, self.field_shape)
 
     def psfs(self, mask: PhaseMask) -> Float[Array, "depth colour y x"]:
         """Averaged over the pixels; of all wavelengths together, the mean as one colour.
@@ -149,7 +173,7 @@ class MaskSetting(eqx.Module):
         def one(light):
             return angular_spectrum(
                 mask,
-                self.sensor.grid,
+                self.grid,
                 Path(light[0], self.distance, light[1]),
                 mask_shape=self.method.mask_shape,
                 oversampling=self.method.samples,
@@ -160,7 +184,7 @@ class MaskSetting(eqx.Module):
         depths, colours = len(self.object_distances), len(self.wavelengths)
         away, light = jnp.meshgrid(self.object_distances, self.wavelengths, indexing="ij")
         found = jax.lax.map(one, jnp.stack([light.ravel(), away.ravel()], axis=-1))
-        found = found.reshape(depths, colours, *self.sensor.shape)
+        found = found.reshape(depths, colours, *self.grid.shape)
         return jnp.mean(found, axis=1, keepdims=True) if self.together else found
 
 
@@ -196,17 +220,67 @@ def linear_error(
     return flat.reshape(psfs.shape[:-2])
 
 
+def cropped_error(
+    psfs: Float[Array, "*case y x"],
+    setup: Setup,
+    distance: Float[Array, ""],
+    field_shape: tuple[int, int],
+) -> Float[Array, "*case"]:
+    r"""`linear_error` of a sensor that ends: of a field's samples, by full matrices.
+
+    .. math:: \operatorname{tr} S (1 + S A^T A S / \sigma^2)^{-1} S \,/ \operatorname{tr} S^2
+
+    A the convolution cropped to the sensor, S² the prior's covariance, periodic in the field.
+    `psfs`: on `kernel_grid` of sensor and field.
+    """
+    rows, columns = field_shape
+    count, dtype = rows * columns, psfs.dtype
+    seen = tuple(k - n + 1 for k, n in zip(psfs.shape[-2:], field_shape, strict=True))
+    v, u = (jnp.asarray(np.fft.fftfreq(n), dtype) / setup.pitch * distance for n in field_shape)
+    prior = setup.prior(v[:, None] ** 2 + u**2, setup.field)
+    root = as_complex(setup.contrast * jnp.sqrt(prior / jnp.mean(prior)))
+
+    def shaped(parts):
+        """S of each column."""
+        spectra = jnp.fft.fft2(parts.reshape(rows, columns, -1), axes=(0, 1))
+        return jnp.fft.ifft2(spectra * root[..., None], axes=(0, 1)).real.reshape(count, -1)
+
+    prior_root = shaped(jnp.eye(count, dtype=dtype))
+    corners = jnp.meshgrid(rows - 1 - jnp.arange(rows), columns - 1 - jnp.arange(columns))
+    y, x = (corner.T.ravel() for corner in corners)
+
+    def one(h):
+        cast = jax.vmap(lambda i, j: jax.lax.dynamic_slice(h, (i, j), seen))(y, x)
+        cast = cast.reshape(count, -1) * setup.pitch**2  # Aᵀ
+        across = shaped(cast)
+        light, signal = jnp.mean(jnp.sum(cast, axis=0)), jnp.mean(jnp.sum(across**2, axis=0))
+        deviation = jnp.sqrt(setup.noise.variance(light, signal, 1.0))
+        # Its triangle's square is 1 + S AᵀA S/σ², whose digits float32 could not hold.
+        stacked = jnp.concatenate([jnp.eye(count, dtype=dtype), across.T / deviation])
+        triangle = jnp.linalg.qr(stacked, mode="r")
+        left = solve_triangular(triangle.T, prior_root, lower=True)
+        return jnp.sum(left**2) / (count * setup.contrast**2)
+
+    return jax.lax.map(one, psfs.reshape(-1, *psfs.shape[-2:])).reshape(psfs.shape[:-2])
+
+
 def match_objective(mask: PhaseMask, data: Any, key: PRNGKeyArray) -> Float[Array, ""]:
     """Mean `match_error` over wavelengths and depths. `data`: (MaskSetting, target)."""
     setting, target = data
-    psfs = setting.psfs(mask).reshape(-1, *setting.sensor.shape)
+    psfs = setting.psfs(mask).reshape(-1, *setting.grid.shape)
     return jnp.mean(jax.vmap(match_error, (0, None))(psfs, target))
 
 
 def linear_objective(mask: PhaseMask, data: Any, key: PRNGKeyArray) -> Float[Array, ""]:
-    """Mean `linear_error` over wavelengths and depths. `data`: (MaskSetting, Setup)."""
+    """Mean expected error over wavelengths and depths. `data`: (MaskSetting, Setup).
+
+    `linear_error`, or `cropped_error` where the setting has a field.
+    """
     setting, setup = data
-    return jnp.mean(linear_error(setting.psfs(mask), setup, setting.distance))
+    given = setting.psfs(mask), setup, setting.distance
+    if setting.field_shape is None:
+        return jnp.mean(linear_error(*given))
+    return jnp.mean(cropped_error(*given, setting.field_shape))
 
 
 def restored_objective(mask: PhaseMask, data: Any, key: PRNGKeyArray) -> Float[Array, ""]:
@@ -214,8 +288,7 @@ def restored_objective(mask: PhaseMask, data: Any, key: PRNGKeyArray) -> Float[A
 
     The best linear estimate by conjugate gradients, crop and noise included
     (`thincam_jax.design.end_to_end`), with other noise at every key. `data`: (MaskSetting,
-    Training) of one capture; the setting's sensor is the PSF's
-    `kernel_grid(training.sensor.grid, training.field_shape)`.
+    Training) of one capture; the setting has the training's sensor and `field_shape`.
     """
     setting, training = data
     noise = jax.random.normal(key, training.noise.shape, training.noise.dtype)
@@ -226,7 +299,7 @@ def restored_objective(mask: PhaseMask, data: Any, key: PRNGKeyArray) -> Float[A
         camera = Channel(kernel[None], (1.0,), (share,), setting.distance, training)
         return relative_error(restore_by((camera,), training), training)
 
-    psfs = setting.psfs(mask).reshape(-1, *setting.sensor.shape)
+    psfs = setting.psfs(mask).reshape(-1, *setting.grid.shape)
     return jnp.mean(jnp.stack([one(h) for h in psfs]))
 
 
