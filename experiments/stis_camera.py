@@ -40,7 +40,7 @@ count, field_count, points, pitch, width, beta = {
     "small": (48, 24, 5, 86 * um, 2.6, 13.0),
 }[SIZE]
 distance, gap, orders = 6.5, 0.5, 4  # mm, mm, ghosts
-iterations = {"full": 80, "small": 40}[SIZE]
+iterations = {"full": 200, "small": 40}[SIZE]
 SNR = 40  # of the captures' contrast, dB
 far, near = 550.0, 250.0  # objects before the plate, mm
 hologram = wg.VolumeHologram.record(
@@ -292,13 +292,25 @@ def pinhole(centre):
 
 
 masks = {"zone plate": plate, "MURA": mura, "pinhole": pinhole}
-by_mask = {"zone plate": quality["in full"]}
+opened = {"zone plate": 3 / 8 * width**2, "MURA": 0.5 * 3.1**2, "pinhole": 0.1**2}  # mm²
+by_mask = {"zone plate": images["in full"]}
 for name in list(masks)[1:] if SIZE == "full" else ():
     of_mask = partial(shadow, masks[name], sensor, grid)
     whole, own_level = models(of_mask, far)
     taken, noise = captured(of_mask, far, own_level, deviation=variance**0.5)
-    by_mask[name] = scores(undone(whole["in full"], taken, noise))
-print(by_mask)
+    by_mask[name] = undone(whole["in full"], taken, noise)
+of_masks = {name: scores(found) for name, found in by_mask.items()}
+for name, values in of_masks.items():
+    print(f"{name}, {opened[name]:.2f} mm² open: {values[0]:.1f} and {values[1]:.1f} dB")
+figure, axes = plt.subplots(
+    2, len(by_mask), figsize=(3.2 * len(by_mask) + 0.5, 6), layout="constrained", squeeze=False
+)
+for column, (name, found) in zip(axes.T, by_mask.items(), strict=True):
+    for number, (ax, image) in enumerate(zip(column, found, strict=True)):
+        extent = (-half, half, half, -half)
+        ax.imshow(image[::-1, ::-1], cmap="gray", vmin=0, vmax=1, extent=extent)
+        ax.set(title=f"{name}: {of_masks[name][number]:.1f} dB", xlabel="x on the sensor (mm)")
+figure.savefig(FIGURES / "masks.png", dpi=110)
 
 # %% [markdown]
 # ## Beside the camera with a lens
@@ -309,10 +321,9 @@ print(by_mask)
 # %%
 depth_with_lens = 6.0 + 10.0 + 5.0
 depth = distance + gap + 5.0
-opened = 3 / 8 * width**2  # of the cosine profile
 aperture = np.pi * (6.0 / 2 / 2) ** 2  # of a lens at f/2
 print(f"depth {depth:g} mm, with a lens {depth_with_lens:g} mm")
-print(f"open area {opened:.1f} mm², of a lens at f/2 {aperture:.1f} mm²")
+print(f"open area {opened['zone plate']:.1f} mm², of a lens at f/2 {aperture:.1f} mm²")
 
 # %% [markdown]
 # The numbers above hold.
