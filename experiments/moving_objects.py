@@ -63,10 +63,10 @@ figure.savefig(FIGURES / "bar.png", dpi=110)
 #
 # The cameras and methods of `configs/moving.yaml`, with `object.motion` in place of its own. Told
 # is how far the scene moves in the whole sequence, in pixels of the sensor. Sensor, mask and scene
-# are half as wide, and the zones as fine.
+# are a quarter as wide, and the zones as fine.
 
 # %%
-count, ways = {"full": (256, (0, 1, 2, 4, 8, 16)), "small": (96, (0, 6))}[SIZE]
+count, ways = {"full": (128, (0, 1, 2, 4, 8, 16)), "small": (96, (0, 6))}[SIZE]
 part = 512 / count
 exposures, pitch, magnification = 8, 5.5 * um, 6.5 / 250.0
 settings = load_as(StudyConfig, FILE)
