@@ -8,9 +8,11 @@ import sys
 import tempfile
 from pathlib import Path
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from matplotlib.colors import BoundaryNorm
 from matplotlib.figure import Figure
 from typer.testing import CliRunner
 
@@ -96,6 +98,56 @@ def _two_pitches():
     return space, setup, jnp.asarray(phase_pairs(2))
 
 
+def _expected_error(chosen, data):
+    return design.bayes_error(design.channels(chosen, *data))
+
+
+def _decibels(error):
+    return 10 * np.log10(np.asarray(error))
+
+
+def design_landscape():
+    """The expected error over two pitches of the thesis' camera, and pairs of docs/designs.md."""
+    space, *data = _two_pitches()
+    count, (low, high) = 57, (8.0, 36.0)
+    _, error = design.landscape(_expected_error, space, (*data, design.Polar(290.0, 128, 2)), count)
+    level = _decibels(error / jnp.nanmin(error)).reshape(count, count)
+    figure = Figure(figsize=(6.4, 4.2), layout="constrained")
+    ax = figure.subplots()
+    axis = np.linspace(low, high, count)
+    steps = [0, 0.1, 0.2, 0.4, 0.8, 1.6, 3.2]
+    shades = {"cmap": "cividis", "norm": BoundaryNorm(steps, 256, extend="max")}
+    shown = ax.contourf(axis, axis, level.T, steps, extend="max", **shades)
+    figure.colorbar(shown, ax=ax, label="expected error (dB above the best)")
+    ax.plot(25, 21, "X", color="k", mec="w", ms=11, label="the thesis' pair")
+    ax.plot(20.18, 16.51, "o", color="w", mec="k", ms=9, label="found")
+    ax.set(xlabel="β of the first mask (rad/mm²)", ylabel="β of the second mask (rad/mm²)")
+    ax.set(xlim=(low, high), ylim=(low, high), aspect="equal")
+    ax.legend()
+    return figure
+
+
+def design_front():
+    """The expected error against the camera's thickness: pitches of the thesis, and the best."""
+    space, *data = _two_pitches()
+    data = (*data, design.Polar(290.0, 128, 2))
+    distances = np.linspace(3.0, 6.5, 8)
+    lines = {"β 25 and 21 rad/mm²": ("0.6", "s"), "the best β of each thickness": ("k", "o")}
+    levels = []
+    for distance in distances:
+        thesis = eqx.tree_at(lambda d: d.distance, space.base, jnp.full(4, distance))
+        moved = design.DesignSpace(thesis, space.variables)
+        _, found = design.landscape(_expected_error, moved, data, 29)
+        levels.append([_decibels(_expected_error(thesis, data)), _decibels(np.nanmin(found))])
+    figure = Figure(figsize=(6.4, 3.2), layout="constrained")
+    ax = figure.subplots()
+    for (name, (grey, marker)), line in zip(lines.items(), np.transpose(levels), strict=True):
+        ax.plot(distances, line, color=grey, marker=marker, label=name)
+    ax.set(xlabel="mask to sensor (mm)", ylabel="expected error (dB)")
+    ax.legend()
+    return figure
+
+
 def suggest():
     """A wanted response, which is that of a hidden design, and what the search finds for it."""
     space, *data = _two_pitches()
@@ -179,7 +231,8 @@ def masks():
     return figure
 
 
-PAGES = {f.__name__: f for f in (models, calibration, suggest, depth, sweep, masks)}
+_DRAWN = (models, calibration, design_landscape, design_front, suggest, depth, sweep, masks)
+PAGES = {f.__name__: f for f in _DRAWN}
 
 for name in sys.argv[1:] or PAGES:
     picture, place = PAGES[name](), IMAGES / f"{name.replace('_', '-')}.png"
