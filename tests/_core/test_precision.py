@@ -104,7 +104,7 @@ def test_traced_numbers_need_the_switch(transform):
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("transform", [jax.jit, pytest.param(jax.grad, marks=pytest.mark.thorough)])
+@pytest.mark.parametrize("transform", [jax.jit, jax.grad])
 def test_traced_numbers_with_the_switch(transform):
     """In float64 inside, in float32 outside; closer to the float64 result than float32 is."""
     single, double = single_camera()

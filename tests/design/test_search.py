@@ -182,7 +182,6 @@ def against_grid(frequencies, count, seeds):
     return excess, max(r.evaluations for r in results)
 
 
-@pytest.mark.slow
 @pytest.mark.thorough
 def test_bayes_error_against_a_grid():
     """5 searches, each at most 1030 evaluations, against 3721 points of a coarser objective."""

@@ -223,7 +223,6 @@ PROCESS = """
 
 
 @pytest.mark.thorough
-@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="needs Linux's /proc")
 @pytest.mark.parametrize(
     ("model", "size", "kind"),

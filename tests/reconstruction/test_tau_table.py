@@ -94,11 +94,9 @@ def median_of_blocks(image):
 @pytest.mark.parametrize(
     "case",
     [
-        pytest.param(("8 bits, 200 counts", 90, "right"), marks=pytest.mark.thorough),
+        ("8 bits, 200 counts", 90, "right"),
         ("8 bits, 12 counts", 60, "2 % too large"),
-        pytest.param(
-            ("12 bits, 3200 counts", 90, "blurred by 0.7 pixels"), marks=pytest.mark.thorough
-        ),
+        ("12 bits, 3200 counts", 90, "blurred by 0.7 pixels"),
     ],
 )
 def test_tau_is_near_the_best(case):

@@ -90,8 +90,8 @@ def test_large_images_are_estimated(pitch, distance, average):
     ("precision", "average", "oversampling", "height"),
     [
         ("float32", False, 1, None),
-        pytest.param("float64", False, 3, 0.4, marks=pytest.mark.thorough),
-        pytest.param("float32", True, 3, None, marks=pytest.mark.thorough),
+        ("float64", False, 3, 0.4),
+        ("float32", True, 3, None),
     ],
 )
 def test_sampled_models(precision, average, oversampling, height):

@@ -67,7 +67,7 @@ def errors(request):
     return {way: np.array(pairs).T for way, pairs in found.items()}
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("model", "precision", "count"),
     [
@@ -117,7 +117,6 @@ def choices(request):
 
 
 @pytest.mark.thorough
-@pytest.mark.slow
 @pytest.mark.parametrize("choices", [25], indirect=True)
 @pytest.mark.parametrize("tolerance", TOLERANCES)
 def test_choices_meet_their_tolerance(choices, capsys, tolerance):
@@ -137,9 +136,7 @@ def test_choices_meet_their_tolerance(choices, capsys, tolerance):
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize(
-    "choices", [8, pytest.param(25, marks=pytest.mark.thorough)], indirect=True
-)
+@pytest.mark.parametrize("choices", [8, 25], indirect=True)
 def test_a_looser_tolerance_never_costs_more(choices):
     def weight(choice):  # of cameras in float64, which it costs to leave
         double = choice.precision == "float64"

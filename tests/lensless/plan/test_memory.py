@@ -40,15 +40,15 @@ PROCESS = """
 """
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 @pytest.mark.skipif(
     not os.access("/proc/self/clear_refs", os.W_OK), reason="needs Linux's /proc/self/clear_refs"
 )
 @pytest.mark.parametrize(
     ("shape", "planes", "tolerance"),
     [
-        pytest.param((2400, 3200), 1, 1e-2, marks=pytest.mark.thorough),
-        pytest.param((1500, 2000), 6, 1e-3, marks=pytest.mark.thorough),
+        ((2400, 3200), 1, 1e-2),
+        ((1500, 2000), 6, 1e-3),
     ],
 )
 def test_peak_of_a_planned_capture(shape, planes, tolerance):

@@ -251,9 +251,9 @@ def test_pixel_nodes_follow_the_fringes_in_a_pixel():
 @pytest.mark.parametrize(
     "width",
     [
-        pytest.param(0.4, marks=pytest.mark.thorough),
+        0.4,
         0.9,
-        pytest.param(1.8, marks=pytest.mark.thorough),
+        1.8,
         3.0,
     ],
 )

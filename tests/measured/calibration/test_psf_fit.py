@@ -81,9 +81,7 @@ def test_values_are_right_within_their_errors(seed):
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize(
-    "snr_db", [30.0, *(pytest.param(db, marks=pytest.mark.thorough) for db in (40.0, 10.0))]
-)
+@pytest.mark.parametrize("snr_db", [30.0, *(db for db in (40.0, 10.0))])
 def test_ripples_of_the_rims_hold_no_fit(snr_db):
     """The waves of the rims make some hundred minima, each a few standard errors from the next.
 
@@ -98,7 +96,7 @@ def test_ripples_of_the_rims_hold_no_fit(snr_db):
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("left_out", ["blur", pytest.param("shade", marks=pytest.mark.thorough)])
+@pytest.mark.parametrize("left_out", ["blur", "shade"])
 def test_what_a_wrong_model_leaves_of_a_number_is_told(left_out):
     """A blur of half a pixel moves d by 5 %, 20 times what noise explains; β is right to 0.3 %."""
     image = np.asarray(picture(TRUE))
