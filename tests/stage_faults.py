@@ -58,13 +58,21 @@ def campaign(stage: str, fault: Fault, times: int, seed: int = 0) -> Counts:
                 error = _one(opened, device, fault, random_, counts)
                 if isinstance(error, Disconnected):
                     opened.close()
-                    opened = driver.open(options)
+                    opened = _open_again(driver, options)
                 if error is not None:
                     opened.home()
                     _check(opened.position(), device, counts)
         finally:
             opened.close()
     return counts
+
+
+def _open_again(driver, options) -> Stage:
+    """As a user does whose plug is not quite in yet."""
+    for _ in range(4):
+        with suppress(Disconnected):
+            return driver.open(options)
+    return driver.open(options)
 
 
 def _one(

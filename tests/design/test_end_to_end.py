@@ -129,6 +129,7 @@ def prior_matrix():
     return np.real(both.conj().T @ np.diag(power.ravel()) @ both)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "noise",
     [pytest.param(SignalNoise(25.0), marks=pytest.mark.thorough), PhotonNoise(3000.0, 5.0)],

@@ -74,6 +74,7 @@ def test_the_mean_is_that_of_samples(name, size):
     assert rise == pytest.approx(np.mean(pairs) - exact, rel=0.05, abs=3 * spread)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "tolerances",
     [

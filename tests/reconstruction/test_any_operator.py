@@ -132,10 +132,7 @@ NAMES = pytest.mark.parametrize("name", list(operators()))
 
 @pytest.mark.parametrize(
     "name",
-    [
-        pytest.param(n, marks=[pytest.mark.thorough] * (n not in ("separable", "stacked")))
-        for n in operators()
-    ],
+    [pytest.param(n, marks=[pytest.mark.thorough] * (n != "separable")) for n in operators()],
 )
 def test_total_variation_by_admm_and_fista(name):
     """Both are within 1e-6 of the minimiser, and report that they have converged."""

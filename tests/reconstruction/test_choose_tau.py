@@ -119,7 +119,7 @@ def test_the_entry_point_takes_a_rule(rule):
     assert errors[0] < 0.8 * errors[1]
 
 
-@pytest.mark.parametrize("rule", ["discrepancy", "sure"])
+@pytest.mark.parametrize("rule", ["discrepancy", pytest.param("sure", marks=pytest.mark.thorough)])
 def test_a_wrong_psf_is_told_and_does_not_lower_tau(rule):
     """No τ makes the residual as small as the noise: both fell to the border of 0.02."""
     problem, truth = posed()

@@ -56,7 +56,10 @@ def noise_like(state):
     return jax.tree.map(lambda q: jnp.asarray(RNG.normal(size=q.shape), q.dtype), state)
 
 
-@pytest.mark.parametrize("name", OPERATORS)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(n, marks=[pytest.mark.thorough] * (n != "separable")) for n in OPERATORS],
+)
 def test_the_consensus_minimises_each_part(name):
     """Of the data: no slope of ½ Σ w (Az − g)² + μ/2 ‖z − q‖² is left; of the image: z ≥ 0."""
     splitting = with_penalties(posed(name))

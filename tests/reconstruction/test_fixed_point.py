@@ -135,6 +135,7 @@ def test_the_gradient_of_a_psnr_by_differences(name):
     assert slope == pytest.approx(expected, rel=1e-3)
 
 
+@pytest.mark.thorough
 def test_new_values_compile_nothing():
     _, gradient, counted = compiled()
     for factor in (1.0, 1.01):

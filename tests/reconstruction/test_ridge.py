@@ -66,6 +66,7 @@ def test_too_few_iterations_have_a_status_and_yet_a_lower_objective():
     assert outcome.history[-1].objective < 0.3 * outcome.history[0].objective
 
 
+@pytest.mark.thorough
 def test_float32_of_many_pixels_does_not_break_down():
     """lineax takes curvatures below 100·eps·(unknowns) for zero unless they are scaled."""
     problem, _ = scenes.problem((150, 160), (140, 131), captures=1)

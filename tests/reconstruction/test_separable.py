@@ -72,7 +72,7 @@ def test_ridge_by_modes_is_the_dense_solution():
     assert float(jax.grad(length)(at)) == pytest.approx(float(change), rel=1e-6)
 
 
-@pytest.mark.parametrize("terms", [1, 3])
+@pytest.mark.parametrize("terms", [1, pytest.param(3, marks=pytest.mark.thorough)])
 def test_ridge_takes_the_modes_that_are_kept(terms):
     """The same image as without, and as of the whole matrix."""
     operator = flatcam(terms)
@@ -201,6 +201,7 @@ def test_total_variation_of_several_terms():
     assert relative_l2(*images) < 1e-3
 
 
+@pytest.mark.thorough
 def test_what_has_no_closed_form_is_refused():
     several = flatcam(3)
     captures, _ = captured(several)

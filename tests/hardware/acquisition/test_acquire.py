@@ -113,11 +113,18 @@ def test_a_hadamard_plan_is_read_as_a_calibration(path, dark):
         np.testing.assert_allclose(recover_matrix(captures).matrix, matrix, atol=1e-3)
 
 
-def test_a_stopped_run_goes_on(path):
+@pytest.fixture
+def ctrl_c():
+    """Ctrl-C interrupts, also where the tests run in the background of a shell."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield signal.default_int_handler
+    signal.signal(signal.SIGINT, before)
+
+
+def test_a_stopped_run_goes_on(path, ctrl_c):
     world = World()
-    handler = signal.getsignal(signal.SIGINT)
     assert run(world, path, progress=stop_after(6)).done == 6
-    assert signal.getsignal(signal.SIGINT) is handler
+    assert signal.getsignal(signal.SIGINT) is ctrl_c
     with pytest.raises(CaptureStoreError, match="17 of 23 frames are missing: 6, 7, 8"):
         read_acquisition(path)
     assert run(world, path).complete

@@ -29,7 +29,14 @@ def zones(profile, phase=0.4, pixels=(16, 32)):
     )
 
 
-@pytest.mark.parametrize("profile", ["cosine", "intensity", "binary"])
+@pytest.mark.parametrize(
+    "profile",
+    [
+        "cosine",
+        pytest.param("intensity", marks=pytest.mark.thorough),
+        pytest.param("binary", marks=pytest.mark.thorough),
+    ],
+)
 def test_zones_are_those_of_the_formula(profile):
     y, x = (PITCH * (np.arange(count) - (count - 1) / 2) for count in SHAPE)
     wave = np.cos(12.0 * (y[:, None] ** 2 + x**2) + 0.4)

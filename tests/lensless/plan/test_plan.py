@@ -82,6 +82,7 @@ def test_a_batch_is_planned_as_one():
     assert relative_l2(planned, tc.capture(camera(), colours)) <= plan.predicted_error
 
 
+@pytest.mark.thorough
 def test_table_names_every_decision(deep):
     plan = tc.plan(camera(), deep[0], tolerance=1e-2)
     table = str(plan)

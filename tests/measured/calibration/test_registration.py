@@ -49,7 +49,7 @@ class TestResample:
         ("scale", "shift"),
         [
             pytest.param(1.07, (2.3, -4.6), marks=pytest.mark.thorough),
-            (1.3, (0.0, 0.5)),
+            pytest.param(1.3, (0.0, 0.5), marks=pytest.mark.thorough),
             (1.0, (3.0, -2.0)),
         ],
     )

@@ -76,6 +76,7 @@ def test_a_screen_from_a_few_ghosts():
         assert float(exact.values[name]) == pytest.approx(value, abs=5e-4)
 
 
+@pytest.mark.thorough
 def test_the_smear_is_in_the_model():
     """Without it the glass is off by many standard errors, and χ² says so."""
     measured, names = ghosts(0.01), ("glass_thickness", "object_y")

@@ -69,6 +69,7 @@ def test_a_depth_weight_pulls_the_planes_together(seen):
     assert (shares(np.asarray(weighted.image), 1) < shares(np.asarray(plain.image), 1)).all()
 
 
+@pytest.mark.thorough
 def test_planes_in_another_order_change_places(seen):
     found = []
     for order in ((0, 1, 2), (2, 0, 1)):
