@@ -50,14 +50,28 @@ def to_plane(point, direction, z):
     return point + direction * (z - point[2]) / direction[2]
 
 
-def traced(pixel, order, distance, index=1.5, width=5.0):
-    """Surface by surface: lens, glass, hologram, 2i total reflections, hologram, glass, object."""
+TILT = (0.03, -0.05)  # rad, of the plate about x and y
+
+
+def turned(tilt):
+    """Rotations about x, then y; columns are the plate's axes."""
+    (cx, cy), (sx, sy) = np.cos(tilt), np.sin(tilt)
+    about_x = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
+    return np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]]) @ about_x
+
+
+def traced(pixel, order, distance, tilt=(0.0, 0.0), index=1.5, width=5.0):
+    """Surface by surface: lens, glass, hologram, 2i total reflections, hologram, glass, object.
+
+    Within a tilted plate in its own axes, from where the camera's axis meets its rear surface.
+    """
     k_recorded = 2 * np.pi * index / 532e-6
     angle = np.radians(61.2)
     fringes = k_recorded * np.array([0, -np.sin(angle), 1 + np.cos(angle)])
-    rear, front = 16.0, 16.0 + width
-    ray = unit(np.array([-pixel[0], -pixel[1], 6.0]))
-    point = to_plane(np.array([*pixel, 0.0]), ray, rear)
+    rear, front = 0.0, width
+    axes, corner = turned(tilt), np.array([0, 0, 16.0])
+    ray = axes.T @ unit(np.array([-pixel[0], -pixel[1], 6.0]))
+    point = to_plane(axes.T @ (np.array([*pixel, 0.0]) - corner), ray, rear)
     ray = snell(ray, 1.0, index)
     point = to_plane(point, ray, front)
     # The wavelength at which |k s − K| = k: the diffracted wave has the film's wavenumber.
@@ -69,16 +83,19 @@ def traced(pixel, order, distance, index=1.5, width=5.0):
     ray = (k * ray + fringes) / k
     point = to_plane(point, ray, front)
     ray = snell(ray, index, 1.0)
-    return to_plane(point, ray, front + distance), 2 * np.pi * index / k
+    ended = to_plane(corner + axes @ point, axes @ ray, 16.0 + width + distance)
+    return ended, 2 * np.pi * index / k
 
 
-def test_a_tracer_of_surfaces():
+@pytest.mark.parametrize("tilt", [(0.0, 0.0), TILT])
+def test_a_tracer_of_surfaces(tilt):
     random = np.random.default_rng(5)
     pixels = random.uniform(-1.2, 1.2, (300, 2))
-    rays = wg.trace(camera(), jnp.asarray(pixels), 550.0)
+    sts = eqx.tree_at(lambda c: c.tilt, camera(), jnp.asarray(tilt))
+    rays = wg.trace(sts, jnp.asarray(pixels), 550.0)
     assert not rays.status.any()
     for order in range(4):
-        expected = [traced(pixel, order, 550.0) for pixel in pixels]
+        expected = [traced(pixel, order, 550.0, tilt) for pixel in pixels]
         points, wavelengths = zip(*expected, strict=True)
         np.testing.assert_allclose(rays.points[order], points, rtol=0, atol=1e-10)
         np.testing.assert_allclose(rays.wavelength, wavelengths, rtol=1e-13)

@@ -7,6 +7,8 @@ surface with the top hologram a glass thickness w further, and objects d2 before
 """
 
 import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
@@ -66,15 +68,23 @@ class SeeThroughCamera(eqx.Module):
 
     - `focal_distance`: d0, from the sensor to the lens, mm; the lens is a pinhole here.
     - `lens_distance`: d1, from the lens to the plate's rear surface, mm.
+    - `tilt`: of the plate against the camera, about x and then about y, rad; None for none. It
+      turns about where the camera's axis meets its rear surface; the object's plane stays.
     """
 
     screen: Screen
     sensor: Sensor
     focal_distance: Float[Array, ""]
     lens_distance: Float[Array, ""]
+    tilt: Float[Array, "2"]
 
     def __init__(
-        self, screen: Screen, sensor: Sensor, focal_distance: Number, lens_distance: Number
+        self,
+        screen: Screen,
+        sensor: Sensor,
+        focal_distance: Number,
+        lens_distance: Number,
+        tilt: Numbers | None = None,
     ):
         if not isinstance(screen, Screen):
             raise TypeError(f"screen is a {type(screen).__name__}; give a waveguide.Screen")
@@ -83,3 +93,15 @@ class SeeThroughCamera(eqx.Module):
         self.screen, self.sensor = screen, sensor
         self.focal_distance = checks.positive("focal_distance", focal_distance, "mm")
         self.lens_distance = checks.positive("lens_distance", lens_distance, "mm")
+        self.tilt = checks.finite("tilt", np.zeros(2) if tilt is None else tilt, "rad", shape=(2,))
+
+    @property
+    def plate_axes(self) -> Float[Array, "3 3"]:
+        """Columns: the plate's axes and its normal, in the camera's x, y, z."""
+        (cos_x, cos_y), (sin_x, sin_y) = jnp.cos(self.tilt), jnp.sin(self.tilt)
+        rows = (
+            (cos_y, sin_y * sin_x, sin_y * cos_x),
+            (jnp.zeros_like(cos_x), cos_x, -sin_x),
+            (-sin_y, cos_y * sin_x, cos_y * cos_x),
+        )
+        return jnp.stack([jnp.stack(row) for row in rows])

@@ -7,7 +7,8 @@ object point of order i, of 2i total reflections, is then
 .. math:: \mathbf P_i = (d_1 + d_2)\frac{\mathbf t}{\sqrt{1-t^2}}
     + (2i+1)\,w\frac{\mathbf p}{\sqrt{n_g^2-p^2}} + 2w\frac{\mathbf t}{\sqrt{n_g^2-t^2}}
 
-without any angle, so that it has gradients on the axis too.
+without any angle, so that it has gradients on the axis too. Of a tilted plate **t** and **p** are
+in its own axes, and what it moves a ray sideways is brought to the object along the ray.
 """
 
 import enum
@@ -20,6 +21,7 @@ from jaxtyping import Array, Float, Int
 
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Number
+from thincam_jax._core.precision import product
 from thincam_jax.waveguide.camera import Rectangle, SeeThroughCamera
 from thincam_jax.waveguide.efficiency import weights_about
 from thincam_jax.waveguide.hologram import directions
@@ -77,7 +79,7 @@ def trace(
     checks.at_least_one({"orders": orders})
     screen, distance = camera.screen, checks.positive("object_distance", object_distance, "mm")
     found = bragg_rays(camera, pixels)
-    across, wavelength, guided, _, fault = found
+    wavelength, guided, fault = found.wavelength, found.guided, found.fault
     top, bottom, ended = object_points(camera, found, distance, orders)
 
     on_top = True if screen.top is None else screen.top.holds(top)
@@ -88,7 +90,7 @@ def trace(
     status = jnp.where(fault == RayStatus.OK, status, fault)
     status = jnp.broadcast_to(status, bottom.shape[:-1])
 
-    weight = weights_about(screen.hologram, across, wavelength, orders)
+    weight = weights_about(screen.hologram, found.across, wavelength, orders)
     if screen.bottom is not None:
         # Only contacts with the hologram take a part of the light away.
         contacts = jnp.asarray(on_bottom).astype(int)
@@ -103,13 +105,15 @@ def trace(
 class BraggRays(NamedTuple):
     """Rays of each pixel's Bragg wavelength up to where they are guided.
 
-    - `across`: direction cosines (x, y) in air, (*pixel, 2).
+    - `slope`: x/z and y/z before and after the plate, against the camera, (*pixel, 2).
+    - `across`: direction cosines (x, y) in air, against the plate, (*pixel, 2).
     - `wavelength`: mm, (*pixel).
     - `guided`: p, direction cosines of the guided light times its index, (*pixel, 2).
     - `left`: n_g² − p², of which the part along z is the root, (*pixel).
     - `fault`: the first `RayStatus` up to here, (*pixel).
     """
 
+    slope: Float[Array, "*pixel 2"]
     across: Float[Array, "*pixel 2"]
     wavelength: Float[Array, "*pixel"]
     guided: Float[Array, "*pixel 2"]
@@ -120,9 +124,9 @@ class BraggRays(NamedTuple):
 def bragg_rays(camera: SeeThroughCamera, pixels: Float[Array, "*pixel 2"]) -> BraggRays:
     """From pixels, (x, y) mm, through lens and rear surface to the top hologram."""
     hologram = camera.screen.hologram
-    across = -pixels / jnp.sqrt(
-        jnp.sum(pixels**2, axis=-1, keepdims=True) + camera.focal_distance**2
-    )
+    axes, slope = camera.plate_axes, -pixels / camera.focal_distance
+    across = product(slope, axes[:2, :2]) + axes[2, :2]
+    across = across / jnp.sqrt(jnp.sum(slope**2, axis=-1, keepdims=True) + 1)
     wavelength, matched = hologram.bragg_wavelength(across)
     film = hologram.index(wavelength)
     inside = directions(across, film)
@@ -140,7 +144,7 @@ def bragg_rays(camera: SeeThroughCamera, pixels: Float[Array, "*pixel 2"]) -> Br
         (RayStatus.NO_BRAGG_MATCH, matched),
     ):
         fault = jnp.where(sound, fault, int(status))
-    return BraggRays(across, wavelength, guided, left, fault)
+    return BraggRays(slope, across, wavelength, guided, left, fault)
 
 
 class Path(NamedTuple):
@@ -159,11 +163,32 @@ def object_points(
     width = camera.screen.glass_thickness
     bounce = rays.guided / jnp.sqrt(jnp.where(rays.left > 0, rays.left, 1))[..., None]
     crossing = shift(rays.across, camera.screen.glass_index(rays.wavelength))
-    slope = shift(rays.across, jnp.ones_like(rays.wavelength))
-    top = camera.lens_distance * slope + width * crossing
+    top = at_rear(camera, rays.across) + width * crossing
     odd = 2 * jnp.arange(orders, dtype=top.dtype) + 1
-    bottom = top + jnp.expand_dims(odd, range(1, top.ndim + 1)) * width * bounce
-    return Path(top, bottom, bottom + width * crossing + distance * slope)
+    guided = jnp.expand_dims(odd, range(1, top.ndim + 1)) * width * bounce
+    moved = on_object(camera, rays.slope, guided + 2 * width * crossing)
+    return Path(top, top + guided, straight_on(camera, rays.slope, distance) + moved)
+
+
+def at_rear(camera: SeeThroughCamera, across: Float[Array, "*ray 2"]) -> Float[Array, "*ray 2"]:
+    """Where rays from the lens meet the plate's rear surface, (x, y) on it, mm."""
+    normal = camera.plate_axes[2]
+    slope = shift(across, jnp.ones_like(across[..., 0]))
+    return camera.lens_distance * (normal[2] * slope - normal[:2])
+
+
+def straight_on(camera: SeeThroughCamera, slope, distance) -> Float[Array, "*ray 2"]:
+    """Where rays would meet the object if the plate moved none sideways, (x, y), mm."""
+    normal, width = camera.plate_axes[:, 2], camera.screen.glass_thickness
+    further = width * (normal[:2] + (1 - normal[2]) * slope)
+    return (camera.lens_distance + distance) * slope + further
+
+
+def on_object(camera: SeeThroughCamera, slope, sideways) -> Float[Array, "*ray 2"]:
+    """What a way along the plate, (x, y) mm, moves a ray of that slope on the object."""
+    axes = camera.plate_axes
+    along = product(sideways, axes[2, :2])[..., None] * slope
+    return product(sideways, axes[:2, :2].T) - along
 
 
 def shift(tangential: Float[Array, "*#ray 2"], index: Float[Array, "*#ray"]):
@@ -186,7 +211,7 @@ def check_screen(camera: SeeThroughCamera) -> None:
     shorter than the way 2wp/√(n_g² − p²) from one contact to the next, or light would pass it by.
     """
     screen = camera.screen
-    _, wavelength, guided, left, fault = bragg_rays(
+    _, _, wavelength, guided, left, fault = bragg_rays(
         camera, jnp.zeros_like(screen.hologram.grating[:2])
     )
     index, across = float(screen.glass_index(wavelength)), float(jnp.linalg.norm(guided))

@@ -22,7 +22,14 @@ from thincam_jax._core import checks
 from thincam_jax._core.checks import Number
 from thincam_jax.waveguide.camera import SeeThroughCamera
 from thincam_jax.waveguide.efficiency import band_about, in_blocks, least_nodes
-from thincam_jax.waveguide.rays import RayStatus, bragg_rays, shift
+from thincam_jax.waveguide.rays import (
+    RayStatus,
+    at_rear,
+    bragg_rays,
+    on_object,
+    shift,
+    straight_on,
+)
 
 
 class SmearedRays(NamedTuple):
@@ -71,7 +78,7 @@ def _one(camera, pixel, distance, counts):
     orders, samples, nodes = counts
     screen = camera.screen
     hologram, width = screen.hologram, screen.glass_thickness
-    across, centre, guided, left, fault = bragg_rays(camera, pixel)
+    slope, across, centre, guided, left, fault = bragg_rays(camera, pixel)
     band = band_about(hologram, across, centre, nodes)
     away = (centre - band.wavelengths)[:, None] * hologram.grating[:2] / (2 * jnp.pi)
     glass, at_centre = screen.glass_index(band.wavelengths), screen.glass_index(centre)
@@ -82,20 +89,19 @@ def _one(camera, pixel, distance, counts):
     carried = left > 0
     bounce = width * tangential / jnp.sqrt(jnp.where(carried, left, 1))[:, None]
     crossing = width * shift(across, glass)
-    slope = shift(across, jnp.ones_like(centre))
-    top = camera.lens_distance * slope + crossing
+    top = at_rear(camera, across) + crossing
     sound = _covered(left) * _covered(jnp.sum(tangential**2, -1) - 1) * _on(screen.top, top)
     sound = jnp.where(carried & (fault != RayStatus.NO_BRAGG_MATCH), sound, 0)
 
     def contact(passed, odd):
         met = _on(screen.bottom, top + odd * bounce)
         light = jnp.mean(band.eta**2 * passed, axis=0) * met * sound
-        ends = odd * bounce + 2 * crossing
+        ends = on_object(camera, slope, odd * bounce + 2 * crossing)
         return (1 - met * band.eta) * passed, _parts(light, ends, samples)
 
     odd = 2 * jnp.arange(orders, dtype=centre.dtype) + 1
     _, (parts, weight) = jax.lax.scan(contact, jnp.ones_like(band.eta), odd)
-    return (camera.lens_distance + distance) * slope, parts, weight * band.step
+    return straight_on(camera, slope, distance), parts, weight * band.step
 
 
 def _on(hologram, places):

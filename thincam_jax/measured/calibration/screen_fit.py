@@ -39,6 +39,8 @@ PARAMETERS = {
     "index": ("", 1e-3),
     "slant": ("rad", 1e-3),
     "tilt": ("rad", 1e-3),
+    "plate_x": ("rad", 1e-3),
+    "plate_y": ("rad", 1e-3),
     "shrinkage": ("", 1e-3),
     "film_thickness": ("mm", 1e-4),
     "index_modulation": ("", 1e-4),
@@ -143,6 +145,8 @@ class _State(NamedTuple):
             "index": lambda: screen.glass_index(colour),
             "slant": lambda: jnp.arctan2(jnp.hypot(grating[0], grating[1]), grating[2]),
             "tilt": lambda: jnp.arctan2(grating[0], -grating[1]),
+            "plate_x": lambda: self.camera.tilt[0],
+            "plate_y": lambda: self.camera.tilt[1],
             "film_thickness": lambda: screen.hologram.thickness,
             "index_modulation": lambda: screen.hologram.index_modulation,
             "object_distance": lambda: self.plane.distance,
@@ -156,8 +160,8 @@ class _State(NamedTuple):
 def _moved_plane(plane: ObjectPlane, name: str, step) -> ObjectPlane:
     if name == "object_distance":
         return eqx.tree_at(lambda p: p.distance, plane, plane.distance + step)
-    axis = 0 if name == "object_x" else 1
-    return eqx.tree_at(lambda p: p.centre, plane, plane.centre.at[axis].add(step))
+    centre = plane.centre.at[int(name == "object_y")].add(step)
+    return eqx.tree_at(lambda p: p.centre, plane, centre)
 
 
 def _moved_camera(camera: SeeThroughCamera, name: str, step) -> SeeThroughCamera:
@@ -173,6 +177,9 @@ def _moved_camera(camera: SeeThroughCamera, name: str, step) -> SeeThroughCamera
     if name in ("slant", "tilt"):
         turned = _turned(hologram.grating, name, step)
         return eqx.tree_at(lambda c: c.screen.hologram.grating, camera, turned)
+    if name in ("plate_x", "plate_y"):
+        angles = camera.tilt.at[int(name == "plate_y")].add(step)
+        return eqx.tree_at(lambda c: c.tilt, camera, angles)
     where = {
         "glass_thickness": lambda c: c.screen.glass_thickness,
         "lens_distance": lambda c: c.lens_distance,
@@ -184,12 +191,11 @@ def _moved_camera(camera: SeeThroughCamera, name: str, step) -> SeeThroughCamera
 
 
 def _turned(grating: Float[Array, "3"], name: str, angle) -> Float[Array, "3"]:
-    """K with its slant from the film's normal changed, or turned about the normal."""
+    """K with its slant from the film's normal changed in its own plane, or turned about it."""
     x, y, z = grating
     cos, sin = jnp.cos(angle), jnp.sin(angle)
     if name == "tilt":
         return jnp.stack([cos * x - sin * y, sin * x + cos * y, z])
-    # In the plane of recording, whatever its tilt.
     across = jnp.sqrt(x**2 + y**2)
     slanted = cos + sin * z / across
     return jnp.stack([x * slanted, y * slanted, cos * z - sin * across])
@@ -245,9 +251,9 @@ def fit_screen(
     - `camera`, `plane`: the start; the plane as it was when H was measured.
     - `parameters`: of "glass_thickness", "lens_distance", "focal_distance", "index" (of film and
       glass), "slant" (of the fringes' normal from the plate's), "tilt" (of the plane of recording
-      about the plate's normal), "shrinkage" (further, of the film), "film_thickness",
-      "index_modulation", "object_distance", "object_x", "object_y". The gain of a matrix is always
-      fitted. All others are held.
+      about the plate's normal), "plate_x", "plate_y" (the plate's own tilt, about x and y),
+      "shrinkage" (further, of the film), "film_thickness", "index_modulation", "object_distance",
+      "object_x", "object_y". The gain of a matrix is always fitted. All others are held.
     - `orders`: how many ghosts. `samples`: parts of the band of each pixel and order, as of
       `system_operator`; None for a matrix without smear, such as a simulated one.
 
