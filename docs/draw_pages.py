@@ -186,6 +186,11 @@ def sweep():
     return _by_command("summary.png", "sweep", "configs/quick.yaml", *grids)
 
 
+def which_mask():
+    """What `thincam run configs/masks.yaml` draws, in some ten minutes."""
+    return _by_command("figures/error.png", "run", "configs/masks.yaml")
+
+
 def _by_command(picture: str, command: str, config: str, *options: str) -> Path:
     out = Path(tempfile.mkdtemp()) / "out"
     words = [command, str(ROOT / config), *options, "--out", str(out)]
@@ -232,7 +237,7 @@ def masks():
 
 
 _DRAWN = (models, calibration, design_landscape, design_front, suggest, depth, sweep, masks)
-PAGES = {f.__name__: f for f in _DRAWN}
+PAGES = {f.__name__: f for f in (*_DRAWN, which_mask)}
 
 for name in sys.argv[1:] or PAGES:
     picture, place = PAGES[name](), IMAGES / f"{name.replace('_', '-')}.png"

@@ -4,11 +4,12 @@ from pathlib import Path
 
 from thincam_jax.commands.checked_config import load_as
 from thincam_jax.commands.config_file import ConfigError, read_raw
+from thincam_jax.commands.masks.config import MasksConfig
 from thincam_jax.commands.refocus.config import RefocusConfig
 from thincam_jax.commands.screen.config import ScreenConfig
 from thincam_jax.commands.study.config import StudyConfig, load_config
 
-Experiment = StudyConfig | RefocusConfig | ScreenConfig
+Experiment = StudyConfig | RefocusConfig | ScreenConfig | MasksConfig
 
 
 def load_experiment(path: str | Path, overrides: tuple[str, ...] = ()) -> Experiment:
@@ -26,7 +27,9 @@ def load_experiment(path: str | Path, overrides: tuple[str, ...] = ()) -> Experi
         return load_as(RefocusConfig, path, overrides, "objects")
     if kind == "screen":
         return load_as(ScreenConfig, path, overrides)
+    if kind == "masks":
+        return load_as(MasksConfig, path, overrides, "scenes")
     raise ConfigError(
-        f"{path}: kind: {kind!r} is unknown; write 'kind: refocus' or 'kind: screen', or leave it "
-        "out for a study"
+        f"{path}: kind: {kind!r} is unknown; write 'kind: refocus', 'kind: screen' or 'kind: "
+        "masks', or leave it out for a study"
     )

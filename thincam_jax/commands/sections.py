@@ -106,7 +106,9 @@ class ApertureConfig(Section):
 
 
 _WIDEST = 300.0  # mask of a thin camera, mm
-Family = Literal["fza", "mura", "ura", "mls", "random", "pinhole", "lenslets", "file"]
+Relief = Literal["diffuser", "voronoi_fresnel", "contours"]
+Cells = Literal["mura", "ura", "mls", "random"]
+Family = Literal["fza", Cells, "pinhole", "lenslets", "file", Relief]
 # What a mask of each family is made of, and what may be given besides.
 _NUMBERS: dict[Family, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "fza": (("width",), ("height", "profile", "pixel_pitch", "fill_factor", "harmonics")),
@@ -117,6 +119,9 @@ _NUMBERS: dict[Family, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "pinhole": (("width",), ("height",)),
     "lenslets": (("focal_length", "cell", "lenses"), ()),
     "file": (("path", "width"), ()),
+    "diffuser": (("width", "cell", "correlation_length", "rms_slope"), ("seed", "index")),
+    "voronoi_fresnel": (("width", "cell", "focal_length", "sites"), ("seed", "index")),
+    "contours": (("width", "cell", "feature", "line_width"), ("seed", "index")),
 }
 
 
@@ -127,8 +132,12 @@ class MaskConfig(ApertureConfig):
     - `cell`: side of a cell or of a lens. Arrays have the `width` of their cells.
     - `order`: p of a "mura"; `orders`: (r, s) of a "ura"; `length`: 2^m − 1 of an "mls", whose code
       and itself `combine`; `tiles`: how often an array is repeated along each axis.
-    - `seed`: of "random" cells; `focal_length`, `lenses` (down, across): of "lenslets".
+    - `seed`: of what is random; `focal_length`, `lenses` (down, across): of "lenslets".
     - `path`: of a grey image, a "file", whose pixels make up the `width`.
+    - `correlation_length`, `rms_slope`: of a "diffuser"; `sites`: lenses of "voronoi_fresnel", made
+      for the wavelength; `feature`, `line_width`: of the "contours" that are the PSF far away, at
+      the wavelength and distance of the first shot. `index`: of refraction, of all three, whose
+      PSFs are by "angular_spectrum".
     """
 
     width: Length = 0.0
@@ -145,6 +154,12 @@ class MaskConfig(ApertureConfig):
     focal_length: Length | None = None
     lenses: tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]] | None = None
     path: str | None = None
+    correlation_length: Length | None = None
+    rms_slope: Annotated[float, Field(gt=0, le=1)] | None = None
+    sites: Annotated[int, Field(ge=1)] | None = None
+    feature: Length | None = None
+    line_width: Length | None = None
+    index: Annotated[float, Field(gt=1, le=4)] = 1.52
 
     @pydantic.model_validator(mode="after")
     def _family_fits(self):

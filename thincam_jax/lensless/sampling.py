@@ -75,7 +75,8 @@ def require_phase_sampling(mask: AbstractMask, grid: Grid, path: Path, method: P
             f"wavelength = {wavelength:g} mm is outside of the material's band; give {low:g} to "
             f"{high:g} mm"
         )
-    own, highest = _frequencies(mask, grid, path, method.model)
+    with jax.ensure_compile_time_eval():  # they are known under jit, too
+        own, highest = _frequencies(mask, grid, path, method.model)
     pitch = float(grid.pitch)
     enough = odd_from(2 * pitch * highest)
     if method.samples >= enough:

@@ -1,5 +1,6 @@
 """Masks of other families than the zone plate in a study's file."""
 
+import jax
 import numpy as np
 import pytest
 from commands.study import tiny
@@ -49,6 +50,26 @@ def test_family(tmp_path, mask, expected):
     assert built.mask.label in built.mask_of(exposure)
     path.write_text(dump_config(config))  # a resolved file is read back
     assert load_config(path) == config
+
+
+def test_phase_masks(tmp_path):
+    """Heights are made once, of as many cells as the width holds."""
+    numbers = "width: 0.6 mm, cell: 20 um, index: 1.5, seed: 2"
+    masks = []
+    for own in (
+        "family: diffuser, correlation_length: 80 um, rms_slope: 0.008",
+        "family: voronoi_fresnel, sites: 5, focal_length: 20 mm",
+    ):
+        config = load_config(
+            written(tmp_path, f"{{{own}, {numbers}}}"), ("model=angular_spectrum",)
+        )
+        study = build_study(config)
+        masks.append(study.camera(study.exposures[0]).mask)
+    blank, key = tc.MaskBlank((30, 30), 0.02, 1.5), jax.random.key(2)
+    expected = tc.voronoi_fresnel(key, blank, sites=5, focal_length=20.0, wavelength=500e-6)
+    np.testing.assert_allclose(masks[1].height, expected.height)
+    assert [mask.interpolation for mask in masks] == ["bilinear", "cells"]
+    assert masks[0].height.shape == (30, 30) and float(masks[0].material(5e-4)) == 1.5
 
 
 def test_an_image_file_is_a_mask(tmp_path):

@@ -30,6 +30,7 @@ def run(
     with told(finished):
         from thincam_jax.commands.config_file import ConfigError, slug
         from thincam_jax.commands.kinds import load_experiment
+        from thincam_jax.commands.masks.config import MasksConfig
         from thincam_jax.commands.refocus.config import RefocusConfig
         from thincam_jax.commands.refocus.console import refocus
         from thincam_jax.commands.run_folder import RunFolder
@@ -53,6 +54,11 @@ def run(
             from thincam_jax.commands.screen.run import screen
 
             screen(asked, folder)
+            return
+        if isinstance(asked, MasksConfig):
+            from thincam_jax.commands.masks.run import compare_masks
+
+            compare_masks(asked, folder)
             return
         study = build_study(asked)
         warn(study.warnings)

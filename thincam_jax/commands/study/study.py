@@ -4,16 +4,18 @@ import functools
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_args
 
 import jax
 import numpy as np
 from jaxtyping import Array
 
+from thincam_jax._core import checks
 from thincam_jax.commands.sections import (
     PHASES,
     MaskConfig,
     MethodKind,
+    Relief,
     SensorConfig,
     Synthesis,
     VariationConfig,
@@ -25,17 +27,22 @@ from thincam_jax.lensless.masks import (
     AbstractMask,
     FresnelZoneAperture,
     LensletArray,
+    MaskBlank,
     ModifiedUniformlyRedundantArray,
+    PhaseMask,
     Pinhole,
     SampledMask,
     SeparableMask,
     UniformlyRedundantArray,
+    diffuser,
     maximum_length_sequence,
     random_cells,
     read_mask,
+    voronoi_fresnel,
 )
 from thincam_jax.lensless.masks.fza import Profile, edge_frequency
 from thincam_jax.lensless.method import Model
+from thincam_jax.lensless.propagation.path import Path
 from thincam_jax.lensless.psf import psf
 from thincam_jax.lensless.sampling import unresolved
 from thincam_jax.reconstruction import Reconstruction
@@ -160,8 +167,39 @@ def built_mask(config: MaskConfig, exposure: Exposure) -> AbstractMask:
         return Pinhole(config.width, height)
     if family == "lenslets":
         return LensletArray(config.focal_length or 0.0, cell, config.lenses or (1, 1))
+    if family in get_args(Relief):
+        smooth = family == "diffuser"
+        heights = _heights(config, exposure.wavelength, exposure.distance)
+        how = "bilinear" if smooth else "cells"
+        return PhaseMask(heights, cell, config.index, interpolation=how)
     amplitude = read_mask(config.path or "", 1.0).amplitude
     return SampledMask(amplitude, config.width / amplitude.shape[1])
+
+
+def _heights(config: MaskConfig, wavelength: float, distance: float) -> Array:
+    """Of a phase mask for objects far away, mm."""
+    from thincam_jax import design
+
+    cell = config.cell or 0.0
+    count = checks.whole_cells("width", config.width, "cell", cell)
+    blank = MaskBlank((count, count), cell, config.index)
+    key = jax.random.key(config.seed or 0)
+    if config.family == "diffuser":
+        length, slope = config.correlation_length or 0.0, config.rms_slope or 0.0
+        mask = diffuser(key, blank, correlation_length=length, rms_slope=slope)
+    elif config.family == "voronoi_fresnel":
+        focal_length, sites = config.focal_length or 0.0, config.sites or 0
+        mask = voronoi_fresnel(
+            key, blank, sites=sites, focal_length=focal_length, wavelength=wavelength
+        )
+    else:
+        feature, line_width = config.feature or 0.0, config.line_width or 0.0
+        lines = design.contour_target(key, blank.grid, feature=feature, line_width=line_width)
+        path = Path(*(np.asarray(n, lines.dtype) for n in (wavelength, distance, math.inf)))
+        found = design.retrieve_phase(lines, blank.grid, path, shape=blank.shape, key=key)
+        any_height = design.one_turn(blank, wavelength)
+        mask = design.mask_of_phase(found.phase, blank, wavelength, any_height)
+    return mask.height
 
 
 @dataclass(frozen=True)

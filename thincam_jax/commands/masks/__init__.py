@@ -1,0 +1,1 @@
+"""Experiments of `kind: masks`: one scene after another through masks of all families."""
