@@ -251,7 +251,7 @@ def photograph(name):
     return resize(whole[:side, :side], (120, 120))
 
 
-names = {"full": ("chelsea", "camera", "rocket"), "small": ("chelsea", "camera")}[SIZE]
+names = "chelsea", "camera", "rocket"
 plane = tc.ImagePlane(
     np.stack([photograph(name) for name in names]), object_distance, setup.object_width
 )
@@ -282,7 +282,7 @@ def restored(mask):
 TAUS = {"full": (1e-3, 1e-2, 1e-1), "small": (1e-2, 1e-1)}[SIZE]
 shown = {name: restored(masks[name]) for name in ("contours", "refined", "refined without crop")}
 by_seed = [(errors["contours"], errors["refined"], shown["contours"][1], shown["refined"][1])]
-for seed in {"full": (8, 9), "small": ()}[SIZE]:
+for seed in (8, 9):
     first, second, third = jax.random.split(jax.random.key(seed), 3)
     lines = contour_target(first, fine, feature=60 * um, line_width=1.5 * pitch)
     found = retrieve_phase(lines, fine, path, shape=cells, key=second, steps=rounds)
