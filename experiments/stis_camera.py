@@ -309,7 +309,11 @@ for column, (name, found) in zip(axes.T, by_mask.items(), strict=True):
     for number, (ax, image) in enumerate(zip(column, found, strict=True)):
         extent = (-half, half, half, -half)
         ax.imshow(image[::-1, ::-1], cmap="gray", vmin=0, vmax=1, extent=extent)
-        ax.set(title=f"{name}: {of_masks[name][number]:.1f} dB", xlabel="x on the sensor (mm)")
+        ax.set(
+            title=f"{name}: {of_masks[name][number]:.1f} dB", xlabel="x on the sensor, turned (mm)"
+        )
+for ax in axes[:, 0]:
+    ax.set_ylabel("y on the sensor, turned (mm)")
 figure.savefig(FIGURES / "masks.png", dpi=110)
 
 # %% [markdown]
