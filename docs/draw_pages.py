@@ -191,6 +191,20 @@ def which_mask():
     return _by_command("figures/error.png", "run", "configs/masks.yaml")
 
 
+def screen_design():
+    """What each number of two plates does, from a short search with few pixels."""
+    small = (
+        "sensor.shape=[44, 44]",
+        "sensor.pitch=48 um",
+        "object.cells=[16, 16]",
+        "search={starts: 1, samples: 16, steps: 8}",
+        "focal_distances=[]",
+        "method={name: ridge, kind: ridge}",
+    )
+    words = [word for text in small for word in ("--set", text)]
+    return _by_command("figures/slices.png", "design", "configs/sts_design.yaml", *words)
+
+
 def _by_command(picture: str, command: str, config: str, *options: str) -> Path:
     out = Path(tempfile.mkdtemp()) / "out"
     words = [command, str(ROOT / config), *options, "--out", str(out)]
@@ -236,8 +250,9 @@ def masks():
     return figure
 
 
-_DRAWN = (models, calibration, design_landscape, design_front, suggest, depth, sweep, masks)
-PAGES = {f.__name__: f for f in (*_DRAWN, which_mask)}
+_DESIGNS = (design_landscape, design_front, suggest, screen_design)
+_DRAWN = (models, calibration, *_DESIGNS, depth, sweep, masks, which_mask)
+PAGES = {f.__name__: f for f in _DRAWN}
 
 for name in sys.argv[1:] or PAGES:
     picture, place = PAGES[name](), IMAGES / f"{name.replace('_', '-')}.png"
