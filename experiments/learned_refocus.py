@@ -47,9 +47,7 @@ aperture = tc.FresnelZoneAperture(beta=13.0, width=width)
 thin = tc.LenslessCamera(aperture, tc.Sensor((pixels, pixels), 44 * um), distance=7.5)
 shape = (pixels // 2, pixels // 2)
 camera = learn.RefocusCamera(thin, 500 * nm, field_shape=shape, near=50.0, far=200.0, planes=planes)
-options = learn.NetworkOptions(
-    steps=2 if SIZE == "full" else 1, widths=widths, head_widths=widths[:2], reach=1
-)
+options = learn.NetworkOptions(steps=2 if SIZE == "full" else 1, widths=widths)
 untrained = learn.RefocusNetwork.create(camera, options, key=jax.random.key(0))
 
 # %% [markdown]
@@ -63,7 +61,8 @@ untrained = learn.RefocusNetwork.create(camera, options, key=jax.random.key(0))
 source, unseen = drawn(0, 64 if SIZE == "full" else 4, 2 * pixels), drawn(1, 8, 2 * pixels)
 two = SceneOptions(layers=(0.0, 1.0, 0.0), dark=0.0, relief=0.0, snr_db=(30.0, 30.0), poisson=0.0)
 kinds = SceneOptions() if SIZE == "full" else two
-lessons = learn.Lessons(source, kinds, batch=2, judged=1, held_out=unseen)
+pool = 100 if SIZE == "full" else 2  # pairs of scenes
+lessons = learn.Lessons(source, kinds, batch=2, pool=pool, judged=1, held_out=unseen)
 training = learn.TrainingOptions(steps=steps, rate=1e-3, check_every=max(2, steps // 10))
 if NETWORK.exists():
     network, state = learn.load(NETWORK, camera), None

@@ -33,7 +33,7 @@ def test_a_network_comes_back_for_its_camera(file):
     for given in (tiny.camera(exposure=0.5), tiny.network().camera, seen):
         found = load(file, given)
         assert eqx.tree_equal(found.weights, tiny.network().weights)
-    assert found.planes.spectra.shape == tiny.network().planes.spectra.shape
+    assert eqx.tree_equal(found.planes.operator, tiny.network().planes.operator)
 
 
 @pytest.mark.thorough
@@ -41,7 +41,7 @@ def test_training_goes_on_to_the_same_bits(tmp_path):
     given = tiny.network(), tiny.lessons(), tiny.TRAINING
     whole = train(*given)
     stopped = train(*given, folder=tmp_path, callback=lambda progress: progress.step == 3)
-    assert stopped.status == "stopped" and (tmp_path / STATE).exists()
+    assert stopped.status == "stopped" and (tmp_path / STATE.format(1)).exists()
     resumed = train(*given, folder=tmp_path)
     assert resumed.status == "finished" and whole.state.skipped == 0
     assert eqx.tree_equal(resumed.state, whole.state)
@@ -57,7 +57,7 @@ def test_training_goes_on_to_the_same_bits(tmp_path):
     with pytest.raises(CheckpointError, match=r"whose training\.rate was 0\.003 and is 1\.0 here"):
         train(tiny.network(), tiny.lessons(), other, folder=tmp_path)
     with pytest.raises(CheckpointError, match="holds no refocusing network"):
-        load(tmp_path / STATE, tiny.camera())
+        load(tmp_path / STATE.format(1), tiny.camera())
 
 
 def test_another_camera_is_refused_with_both_numbers(file):
@@ -148,9 +148,9 @@ def test_a_short_training_beats_the_linear_start():
     aperture = tc.FresnelZoneAperture(13.0, width=1.4)
     camera = tc.LenslessCamera(aperture, tc.Sensor((32, 32), 44 * um), 7.5)
     whole = RefocusCamera(camera, 500 * nm, field_shape=(24, 24), near=50.0, far=200.0, planes=3)
-    options = NetworkOptions(steps=2, widths=(8, 12), head_widths=(8, 12), reach=1)
+    options = NetworkOptions(steps=2, widths=(8, 12))
     network = RefocusNetwork.create(whole, options, key=jax.random.key(1))
-    training = TrainingOptions(steps=150, rate=4e-3, warm_up=10, check_every=50)
-    state = train(network, Lessons(drawn(0, 32, 48), batch=4, judged=2), training).state
+    training = TrainingOptions(steps=200, rate=4e-3, warm_up=10, check_every=50)
+    state = train(network, Lessons(drawn(0, 32, 48), batch=4, pool=32, judged=2), training).state
     # 0.115 is 1 dB.
     assert state.scores[-1] < state.scores[0] - 0.03 and np.isfinite(state.losses).all()

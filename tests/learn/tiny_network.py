@@ -29,10 +29,10 @@ def network():
     whole = RefocusCamera(
         camera(), 500 * nm, field_shape=(14, 12), near=50.0, far=200.0, planes=2, model="geometric"
     )
-    options = NetworkOptions(steps=1, widths=(4, 4), head_widths=(4, 4), reach=1)
+    options = NetworkOptions(steps=1, widths=(4, 4))
     return RefocusNetwork.create(whole, options, key=jax.random.key(1))
 
 
 @functools.cache
 def lessons():
-    return Lessons(drawn(0, 4, 24), batch=2, judged=1)
+    return Lessons(drawn(0, 4, 24), batch=2, pool=2, judged=1)

@@ -167,7 +167,7 @@ def _array(path, name: str, wanted: Any, data: memoryview) -> np.ndarray:
     except (ValueError, TypeError, SyntaxError, RecursionError, MemoryError) as error:
         raise CheckpointError(f"{path}: {name} is no array in NPY format 1.0") from error
     kind = np.dtype(wanted.dtype)
-    alike = dtype == kind or (dtype.kind == kind.kind == "f" and dtype.itemsize in (4, 8))
+    alike = dtype == kind or (dtype.kind == kind.kind == "f" and dtype.itemsize in (2, 4, 8))
     if dtype.hasobject or is_fortran or not alike or shape != tuple(wanted.shape):
         raise CheckpointError(
             f"{path}: {name} is {dtype}{list(shape)} and the model here has "

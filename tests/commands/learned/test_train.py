@@ -26,7 +26,7 @@ focus: {nearest: 50 mm, farthest: 200 mm, shape: [14, 12], planes: 2}
 sources:
   - {name: leaves, kind: drawn, count: 4}
 scenes: {side: 24}
-network: {steps: 1, widths: [4, 4], head_widths: [4, 4], reach: 1}
+network: {steps: 1, widths: [4, 4]}
 training: {steps: 4, batch: 2, judged: 1, warm_up: 1, check_every: 2}
 """
 
@@ -50,7 +50,7 @@ def line(result):
 
 def test_what_is_there_is_not_lost_and_what_is_not_cannot_be_gone_on_with(file, tmp_path):
     assert "holds no training yet" in line(call(file, "--out", tmp_path, "--resume"))
-    (tmp_path / "training.state").touch()
+    (tmp_path / "training-1.state").touch()
     assert "give --resume to go on with it" in line(call(file, "--out", tmp_path))
 
 
@@ -73,7 +73,7 @@ def test_a_training_is_told_and_gone_on_with(file, tmp_path):
     assert again.exit_code == 0 and (out / NETWORK).read_bytes() == before
     other = line(call(file, "--out", out, "--resume", "--set", "training.rate=0.5"))
     assert "holds a training of another configuration" in other
-    state = out / "training.state"
+    state = out / "training-1.state"
     state.write_bytes(state.read_bytes()[:-1])
     assert "is damaged or cut off" in line(call(file, "--out", out, "--resume"))
 

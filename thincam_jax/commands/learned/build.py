@@ -60,8 +60,8 @@ def build_lessons(config: LearnedConfig) -> Lessons:
     train, judge = (functools.reduce(operator.add, s) if s else None for s in of_use.values())
     assert train is not None  # the sections are checked
     scenes = {name: value for name, value in dict(config.scenes).items() if name != "side"}
-    training = config.training
-    return Lessons(train, SceneOptions(**scenes), training.batch, training.judged, judge)
+    told = {name: getattr(config.training, name) for name in ("batch", "pool", "judged")}
+    return Lessons(train, SceneOptions(**scenes), held_out=judge, **told)
 
 
 def build_options(config: LearnedConfig) -> TrainingOptions:

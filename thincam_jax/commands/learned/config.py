@@ -87,17 +87,16 @@ class ScenesConfig(Section):
 class NetworkConfig(Section):
     """See `learn.refocusing.NetworkOptions`."""
 
-    steps: Annotated[int, Field(ge=1, le=20)] = 4
+    steps: Annotated[int, Field(ge=1, le=20)] = 2
     widths: Widths = (40, 56, 72)
-    head_widths: Widths = (32, 48, 64)
-    reach: Annotated[int, Field(ge=1, le=20)] = 3
 
 
 class TrainingConfig(Section):
-    """See `learn.training.TrainingOptions`; `judged`: batches that judge the network."""
+    """See `learn.training.TrainingOptions`; `batch`, `pool`, `judged`: see `learn.Lessons`."""
 
     steps: Count = 2000
-    batch: Annotated[int, Field(ge=1, le=1024)] = 4
+    batch: Annotated[int, Field(ge=1, le=1024)] = 2
+    pool: Count = 256
     rate: Annotated[float, Field(gt=0)] = 1e-3
     warm_up: Annotated[int, Field(ge=0)] = 50
     averaging: Annotated[float, Field(ge=0, lt=1)] = 0.99

@@ -34,7 +34,8 @@ class TrainingFolder(RunFolder):
     """Files of one training, each written whole or not at all.
 
     - `config.yaml`: the resolved configuration.
-    - `network.thincam`: the best network until now; `training.state`: what `--resume` goes on from.
+    - `network.thincam`: the best network until now; `training-1.state` and so on: what
+      `--resume` goes on from.
     - `figures/`, `environment.json`, `report.html` and, last, `training.json`.
     """
 
@@ -55,7 +56,7 @@ def run_training(
     **Errors**: ConfigError where a folder holds a training and `resume` is not asked for, or the
     other way round, or holds a damaged state.
     """
-    started, state = time.time(), folder.path / STATE
+    started, state = time.time(), folder.path / STATE.format(1)
     if state.exists() and not resume:
         raise ConfigError(
             f"--out {folder.path}: holds a training; give --resume to go on with it, or another "
@@ -82,7 +83,7 @@ def _report(
     started: float,
 ) -> dict[str, Any]:
     network, state = trained.model, trained.state
-    batches = lessons.task(network, config.seed).validation
+    batches = lessons.validation(network, config.seed)
     linear, readings = ([read_batch(n, b) for b in batches] for n in (untrained, network))
     result = {
         "name": config.name,

@@ -61,12 +61,10 @@ class ControlCode(eqx.Module):
     ) -> Float[Array, "m n"]:
         """The image focused on a distance, mm, in the capture's unit."""
         camera, planes = self.planes.camera, self.planes
-        inverse = camera.inverse_distances
-        middle = 1 / jnp.mean(inverse)
-        image = _inverted(planes, self.step, capture, deviation, middle)
+        image = _inverted(planes, self.step, capture, deviation, camera.middle)
         mean = planes.mean(capture)
         unit = jnp.where(mean > 0, mean, 1)
-        code = (1 / distance - inverse[-1]) / (inverse[0] - inverse[-1])
+        code = (1 + camera.stand(distance).position) / 2
         level = noise_level(deviation / (unit * planes.unit))
         told = constant_images(image, code, level)
         return image[0] + unit * self.unet(jnp.concatenate([image / unit, told]))[0]
@@ -85,6 +83,6 @@ def _inverted(planes: Planes, step: LinearStep, capture, deviation, distance):
     unit = planes.unit * jnp.where(mean > 0, mean, 1)
     residual = (capture - mean * planes.uniform) / unit
     spectrum = jnp.fft.rfft2(planes.from_sensor(residual))
-    spectra = planes.spectrum_at(distance)[None]
+    spectra = planes.spectra_at(distance[None])
     added = step(spectrum, spectra, (deviation / unit) ** 2, sizes_of(planes))
     return mean * (1 + planes.on_field(added))

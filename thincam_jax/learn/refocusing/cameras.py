@@ -1,11 +1,12 @@
 """The camera that a refocusing network belongs to, and the distances it is trained for."""
 
 import math
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Number
@@ -21,6 +22,29 @@ from thincam_jax.lensless.method import MODELS, Model
 _MARGIN = 8
 
 
+class Stand(NamedTuple):
+    """Where the planes of a stack stand, one of them at a commanded distance.
+
+    - `inverse`: 1/t, 1/mm, the nearest first; `number`: of the commanded plane.
+    - `place`: 1 where a plane stands among the places relative to the commanded one, which is the
+      middle one of 2·planes − 1; (place, plane).
+    - `position`: of the commanded distance in the range of 1/t, from −1, far, to 1, near.
+    """
+
+    inverse: Float[Array, " plane"]
+    number: Int[Array, ""]
+    place: Float[Array, "place plane"]
+    position: Float[Array, ""]
+
+    def splat(self, inverse_distance: Float[Array, "*map"]) -> Float[Array, "plane *map"]:
+        """Weights of the planes in what stands at 1/t: linear in 1/t between neighbours, sum 1."""
+        planes = self.inverse.reshape(-1, *(1,) * inverse_distance.ndim)
+        inside = jnp.clip(inverse_distance, planes[-1], planes[0])
+        part = (inside - planes[1:]) / (planes[:-1] - planes[1:])  # of the nearer of two
+        part, beyond = jnp.clip(part, 0, 1), jnp.ones_like(part[:1])
+        return jnp.concatenate([part, beyond]) - jnp.concatenate([0 * beyond, part])
+
+
 class RefocusCamera(eqx.Module):
     """A camera, its light, its image and the range of distances on which it is to be focused.
 
@@ -29,7 +53,7 @@ class RefocusCamera(eqx.Module):
     - `field_shape`: pixels (y, x) of the image, enlarged to the sensor's parity; pixel (i, j) looks
       along one ray through the middle of the mask, whatever the distance.
     - `near`, `far`: range of object distances t, mm.
-    - `planes`: number of planes of the stack, evenly spaced in 1/t.
+    - `planes`: number of planes of a stack, evenly spaced in 1/t.
     - `pupil`: diameter D in mm of the lens that focused images are rendered for; default the width
       of the mask.
     - `model`: of the PSFs, see `thincam_jax.psf`.
@@ -91,6 +115,26 @@ class RefocusCamera(eqx.Module):
     def step(self) -> Float[Array, ""]:
         """Difference of 1/t between neighbouring planes, 1/mm."""
         return (1 / self.near - 1 / self.far) / (self.planes - 1)
+
+    @property
+    def middle(self) -> Float[Array, ""]:
+        """The distance in the middle of the range of 1/t, mm."""
+        return 2 / (1 / self.near + 1 / self.far)
+
+    def stand(self, distance: Float[Array, ""]) -> Stand:
+        """A stack with a plane at a distance, mm: evenly spaced planes, shifted there.
+
+        Planes that would be shifted out of the range stand at its end.
+        """
+        even, commanded = self.inverse_distances, 1 / distance
+        number = jnp.argmin(jnp.abs(even - commanded))
+        shifted = even + (commanded - even[number])
+        inverse = jnp.clip(shifted, 1 / self.far, 1 / self.near)
+        count = self.planes
+        places = jnp.arange(2 * count - 1)[:, None]
+        place = (places == jnp.arange(count) - number + count - 1).astype(inverse.dtype)
+        position = 2 * (commanded - 1 / self.middle) / (1 / self.near - 1 / self.far)
+        return Stand(inverse, number, place, position)
 
     def defocus_radius(self, inverse_difference) -> Float[Array, "..."]:
         """Radius, in pixels of the image, of the disc that a lens blurs a point to.

@@ -3,8 +3,8 @@ r"""The linear step of the network: the best linear estimate of all planes from 
 .. math:: \Delta F_k = \frac{P_k H_k^*}{\sum_j P_j |H_j|^2 + \eta}\, R
 
 is the least-squares estimate of images with the power spectra P_k from R = Σ H_k F_k + noise of the
-spectrum η. In the unrolled ADMM it is the exact solution of the step that ties the planes to the
-data, with 1/P_k in place of its penalty. P_k and η are learnt.
+spectrum η. In half-quadratic splitting it is the exact solution of the step that ties the planes to
+the data, with 1/P_k in place of its penalty. P_k and η are learnt.
 """
 
 import equinox as eqx
@@ -20,20 +20,20 @@ class LinearStep(eqx.Module):
 
     The fraction has the mean 1 over all frequencies.
 
-    - `power`: ln p_k, of scenes of mean radiance 1.
+    - `power`: ln p, of scenes of mean radiance 1, of each place where a plane may stand.
     - `slope`: γ; photographs have about 1, what is left of them after a few steps less.
     - `noise`: ln of the factor on the noise's own spectrum, and ln of what is added to it for all
       that the model leaves out.
     """
 
-    power: Float[Array, " plane"]
+    power: Float[Array, " place"]
     slope: Float[Array, ""]
     noise: Float[Array, "2"]
 
-    def __init__(self, planes: int, *, power: float = 0.3, slope: float = 1.0):
-        self.power = jnp.full(planes, np.log(power / planes))
+    def __init__(self, places: int, *, power: float = 0.3, slope=1.0, noise=1.0):
+        self.power = jnp.full(places, np.log(power / places))
         self.slope = jnp.asarray(slope)
-        self.noise = jnp.log(jnp.asarray([1.0, 1e-4]))
+        self.noise = jnp.log(jnp.asarray([noise, 1e-4]))
 
     def __call__(
         self,
@@ -41,16 +41,19 @@ class LinearStep(eqx.Module):
         spectra: Complex[Array, "plane v u"],
         variance: Float[Array, ""],
         sizes: "Sizes",
+        place: Float[Array, "place plane"] | None = None,
     ) -> Complex[Array, "plane v u"]:
         """What to add to the planes' spectra for a residual of the capture.
 
-        `variance`: of the residual's noise per sensor pixel, in the units of the residual.
+        `variance`: of the residual's noise per sensor pixel, in the units of the residual; `place`:
+        1 where a plane stands, default each at its own.
         """
         dtype = variance.dtype
         squared, corner = sizes.frequencies()
         shape = (jnp.asarray(squared, dtype) + corner) ** -self.slope.astype(dtype)
         shape = shape / sizes.mean(shape)
-        power = jnp.exp(self.power.astype(dtype))[:, None, None] * shape
+        power = jnp.exp(self.power.astype(dtype))
+        power = (power if place is None else power @ place)[:, None, None] * shape
         factor, model = jnp.exp(self.noise.astype(dtype))
         # Sums of squares of the transforms: of white noise on the sensor, of an image on the field.
         ratio = (factor * variance + model) * sizes.sensor / sizes.field

@@ -1,13 +1,13 @@
-r"""The network: unrolled ADMM over a stack of planes, and heads that read the stack.
+r"""The network: unrolled half-quadratic splitting over a stack of planes, one of them in focus.
 
-The scene is explained by a stack of planes at fixed distances, evenly spaced in 1/t. Its start is
-the joint linear estimate of all planes; then each of a few steps lets a U-Net that is shared by
-all of them clean the stack and ties the result to the capture again, by the exact optics and the
-sensor's crop. So light from all distances is in the model, whichever is focused on.
+The scene is explained by a stack of planes, evenly spaced in 1/t and shifted so that one of them
+stands exactly at the commanded distance. The start is the joint linear estimate of all planes. Each
+step then lets a U-Net clean the stack and ties the result to the capture again, by the exact
+optics and the sensor's crop. So light from all distances is in the model, whichever is focused on.
 
-Any distance follows from the stack: a lens focused there is rendered from it, and what that cannot
-hold, a small U-Net adds, which sees the stack *relative to the commanded distance* and inversions
-by the exact PSF at that distance. Trained distances are not special.
+U-Nets see the stack *relative to the commanded distance*: trained distances are not special. The
+last one says the rest, too: what a lens focused there sees beside what is rendered of the stack,
+the image in which all is sharp, and where each pixel stands.
 """
 
 from typing import NamedTuple
@@ -15,10 +15,9 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from thincam_jax.learn.refocusing.cameras import RefocusCamera
+from thincam_jax.learn.refocusing.cameras import RefocusCamera, Stand
 from thincam_jax.learn.refocusing.lens_blur import lens_blur
 from thincam_jax.learn.refocusing.linear import LinearStep, Sizes
 from thincam_jax.learn.refocusing.planes import Planes
@@ -28,34 +27,64 @@ from thincam_jax.learn.refocusing.unet import UNet
 class NetworkOptions(NamedTuple):
     """What a network is built with.
 
-    - `steps`: of the unrolled ADMM, each with one pass of the shared U-Net.
-    - `widths`: channels of that U-Net's levels; `head_widths`: of the two heads'.
-    - `reach`: planes to each side of the commanded distance that the focusing head tells apart.
+    - `steps`: unrolled steps, each with a U-Net of its own.
+    - `widths`: channels of the U-Nets' levels.
     """
 
-    steps: int = 4
+    steps: int = 2
     widths: tuple[int, ...] = (40, 56, 72)
-    head_widths: tuple[int, ...] = (32, 48, 64)
-    reach: int = 3
 
 
 DEFAULT = NetworkOptions()
 
 
-class Explained(NamedTuple):
-    """A capture explained by a stack of planes, from which everything else is read.
+class Cleaned(NamedTuple):
+    """What a U-Net reads from the images of a step, in units of the scene's mean.
 
-    - `stack`: (plane, y, x), radiance in units of the scene's mean.
-    - `residual`: capture − explained capture on the sensor, the same unit after optics.
-    - `mean`: the scene's mean radiance.
-    - `deviation`: standard deviation of the noise per pixel, in the residual's unit.
+    - `stack`: (plane, y, x), radiance.
+    - `image`: as a lens sees the scene that is focused on the commanded distance.
+    - `all_in_focus`: as a pinhole sees it.
+    - `share`: of each plane in what a pixel shows, (plane, y, x), sum 1.
+    - `spread`: mean absolute error of 1/t that is expected, in steps of the planes.
     """
 
     stack: Float[Array, "plane y x"]
-    capture: Float[Array, "y x"]
+    image: Float[Array, "y x"]
+    all_in_focus: Float[Array, "y x"]
+    share: Float[Array, "plane y x"]
+    spread: Float[Array, "y x"]
+
+    def inverse_distance(self, stand: Stand) -> Float[Array, "y x"]:
+        """1/t of each pixel, 1/mm: the planes' mean by their shares."""
+        return jnp.tensordot(stand.inverse, self.share, axes=1)
+
+
+class Step(NamedTuple):
+    """What a step of the unrolled splitting sees.
+
+    - `images`: for its U-Net, (image, y, x): the stack by the places relative to the commanded
+      distance, tied to the capture; what a lens and a pinhole see of it; the plane at the commanded
+      distance as if nothing stood elsewhere; two constants, the noise and the commanded distance.
+    - `residual`: of the capture before it, on the sensor, after optics in units of the mean.
+    - `stand`: where the planes are.
+    """
+
+    images: Float[Array, "image y x"]
     residual: Float[Array, "y x"]
+    stand: Stand
+
+
+class Explained(NamedTuple):
+    """A capture explained by a stack of planes: what the last U-Net has read, and how well.
+
+    - `mean`: the scene's mean radiance.
+    - `consistency`: root mean square of the explained capture's residual over the noise's.
+    """
+
+    cleaned: Cleaned
+    stand: Stand
     mean: Float[Array, ""]
-    deviation: Float[Array, ""]
+    consistency: Float[Array, ""]
 
 
 class DistanceMap(NamedTuple):
@@ -70,28 +99,22 @@ class DistanceMap(NamedTuple):
 
 
 class Weights(eqx.Module):
-    """All that is learnt.
+    """The numbers of each step.
 
-    - `linear`: the linear step before each U-Net pass; the first is the start.
-    - `data`: logit of the weight of the capture against its own explanation, after each step.
-    - `dual`: how much of what the U-Net took away is kept in mind, after each step.
-    - `prior`, `focus`, `maps`: U-Nets of the stack, focused images, all-in-focus and distance.
-    - `at_distance`: the linear step at the commanded distance, on the capture and on the residual.
+    - `joint`: the linear step of all planes, by their places relative to the commanded distance.
+    - `alone`: that of the plane at the commanded distance, as if nothing stood elsewhere.
+    - `prior`: the U-Net; all that is learnt.
     """
 
-    linear: tuple[LinearStep, ...]
-    data: Float[Array, " step"]
-    dual: Float[Array, " step"]
-    prior: UNet
-    focus: UNet
-    maps: UNet
-    at_distance: tuple[LinearStep, LinearStep]
+    joint: tuple[LinearStep, ...]
+    alone: tuple[LinearStep, ...]
+    prior: tuple[UNet, ...]
 
 
 class RefocusNetwork(eqx.Module):
     """A network and the camera whose captures it takes.
 
-    - `weights`: all that is learnt.
+    - `weights`: all that is learnt; the same for any number of pixels.
     - `planes`: of its camera; not learnt, and rebuilt from the camera when a network is loaded.
 
     Captures are (*batch, y, x) in any unit; `deviation` is the standard deviation of their noise
@@ -109,19 +132,17 @@ class RefocusNetwork(eqx.Module):
         camera: RefocusCamera, options: NetworkOptions = DEFAULT, *, key: PRNGKeyArray
     ) -> "RefocusNetwork":
         """An untrained network: its U-Nets add nothing."""
-        if options.steps < 1 or options.reach < 1:
-            raise ValueError(f"steps and reach are {options.steps} and {options.reach}; at least 1")
-        prior, focus, maps = jax.random.split(key, 3)
-        count, steps = camera.planes, options.steps
-        relative = 2 * options.reach + 1
+        steps, places = options.steps, 2 * camera.planes - 1
+        if steps < 1:
+            raise ValueError(f"steps = {steps}; give at least 1")
+        inputs, outputs = places + 5, 2 * places + 3
+        powers, slopes = [0.3] + [0.03] * (steps - 1), [1.0] + [0.5] * (steps - 1)
+        pairs = list(zip(powers, slopes, strict=True))
+        keys = jax.random.split(key, steps)
         weights = Weights(
-            linear=tuple(LinearStep(count, slope=1.0 if n == 0 else 0.5) for n in range(steps)),
-            data=jnp.zeros(steps - 1),
-            dual=jnp.full(steps - 1, 0.5),
-            prior=UNet(count + 3, count, options.widths, key=prior),
-            focus=UNet(relative + 6, 1, options.head_widths, key=focus),
-            maps=UNet(count + 2, count + 2, options.head_widths, key=maps),
-            at_distance=(LinearStep(1), LinearStep(1, power=0.1, slope=0.5)),
+            tuple(LinearStep(places, power=p, slope=s) for p, s in pairs),
+            tuple(LinearStep(1, power=p, slope=s, noise=0.3) for p, s in pairs),
+            tuple(UNet(inputs, outputs, options.widths, key=k) for k in keys),
         )
         return RefocusNetwork(weights, Planes(camera), options)
 
@@ -129,12 +150,22 @@ class RefocusNetwork(eqx.Module):
     def camera(self) -> RefocusCamera:
         return self.planes.camera
 
+    def first(self, steps: int) -> "RefocusNetwork":
+        """The network of the first steps alone, which is one, too."""
+        lists = (self.weights.joint, self.weights.alone, self.weights.prior)
+        weights = Weights(*(parts[:steps] for parts in lists))
+        return RefocusNetwork(weights, self.planes, self.options._replace(steps=steps))
+
+    def with_prior(self, number: int, prior: UNet) -> "RefocusNetwork":
+        """Another U-Net in a step."""
+        return eqx.tree_at(lambda n: n.weights.prior[number], self, prior)
+
     def focus(self, captures, distance, deviation) -> Float[Array, "*batch y x"]:
         """Images as a lens of the camera's pupil, focused on `distance` (mm), would see them."""
         return _batched(_focus, self, captures, deviation, self.camera.within(distance))
 
     def sweep(self, captures, distances, deviation) -> Float[Array, "distance *batch y x"]:
-        """`focus` at each of `distances`; the captures are explained once."""
+        """`focus` at each of `distances`."""
         distances = self.camera.within(distances)
         images = _batched(_sweep, self, captures, deviation, distances)
         return jnp.moveaxis(images, -3, 0)
@@ -145,7 +176,7 @@ class RefocusNetwork(eqx.Module):
 
     def distance(self, captures, deviation) -> DistanceMap:
         """The distance of what each pixel shows."""
-        return _batched(distance_map, self, captures, deviation)
+        return _batched(_distance, self, captures, deviation)
 
     def consistency(self, captures, deviation) -> Float[Array, "*batch"]:
         """Residual of the explained capture, root mean square, over the noise's deviation.
@@ -153,115 +184,83 @@ class RefocusNetwork(eqx.Module):
         About 1: the stack explains all that was seen but noise. Far more: the image is not of this
         capture. Far less: noise was explained, too.
         """
-        return _batched(consistency_of, self, captures, deviation)
+        return _batched(_consistency, self, captures, deviation)
 
 
 def explain(
-    network: RefocusNetwork, capture: Float[Array, "y x"], deviation: Float[Array, ""]
+    network: RefocusNetwork,
+    capture: Float[Array, "y x"],
+    deviation: Float[Array, ""],
+    distance: Float[Array, ""],
 ) -> Explained:
-    """The stack of planes that explains a capture."""
+    """The stack of planes that explains a capture, focused on a distance, mm."""
     weights, planes = network.weights, network.planes
-    dtype, spectra, sizes = planes.dtype, planes.spectra, sizes_of(planes)
-    unit = planes.unit.astype(dtype)
+    mean, capture, sigma = normalised(planes, capture, deviation)
+    stand = network.camera.stand(distance.astype(planes.dtype))
+    spectra = planes.spectra_at(1 / stand.inverse)
+    cleaned, stack = None, None
+    for number, prior in enumerate(weights.prior):
+        step = prepared(network, number, stack, (capture, sigma, stand, spectra))
+        cleaned = read_images(prior, step.images, stand)
+        stack = cleaned.stack
+    residual = capture - seen_of(planes, stack, spectra)
+    rms = jnp.sqrt(jnp.mean(residual**2))
+    return Explained(cleaned, stand, mean, rms / jnp.where(sigma > 0, sigma, 1))
+
+
+def normalised(planes: Planes, capture, deviation):
+    """The scene's mean, and capture and noise in units of it after optics."""
     mean = planes.mean(capture)
     # A dark capture has the mean 0 and stays dark.
-    scale = 1 / (unit * jnp.where(mean > 0, mean, 1))
-    capture, sigma = capture * scale, deviation * scale
-    variance = sigma**2
-    level = noise_level(sigma)
-
-    # A uniform scene first: its light is most of the capture, and not in the learnt powers.
-    estimate = jnp.full((spectra.shape[0], *sizes.field_shape), 1 / spectra.shape[0], dtype)
-    target = planes.from_field(estimate)
-    unseen = jnp.fft.irfft2(jnp.sum(target * spectra, axis=0), s=sizes.window)
-    # What the data's split takes the window to show: the capture on the sensor, a guess beside it.
-    split = unseen + planes.from_sensor(capture - planes.on_sensor(unseen))
-    data_dual, dual = jnp.zeros_like(capture), jnp.zeros_like(estimate)
-    for step, linear in enumerate(weights.linear):
-        residual = jnp.fft.rfft2(split) - jnp.sum(target * spectra, axis=0)
-        solved = target + linear(residual, spectra, variance, sizes)
-        noisy = planes.on_field(solved) + dual
-        total = jnp.sum(noisy, axis=0, keepdims=True)
-        told = constant_images(noisy, level, step / len(weights.linear))
-        estimate = noisy + weights.prior(jnp.concatenate([noisy, total, told]))
-        if step + 1 < len(weights.linear):
-            dual = weights.dual[step].astype(dtype) * (noisy - estimate)
-            target = planes.from_field(estimate - dual)
-            # The proximal map of the data: a weighted mean on the sensor, nothing beside it.
-            seen = jnp.fft.irfft2(jnp.sum(solved * spectra, axis=0), s=sizes.window)
-            gap = capture - planes.on_sensor(seen) - data_dual
-            gap = jax.nn.sigmoid(weights.data[step]).astype(dtype) * gap
-            split = seen + planes.from_sensor(data_dual + 2 * gap)
-            data_dual = -gap
-    explained = jnp.sum(planes.from_field(estimate) * spectra, axis=0)
-    return Explained(estimate, capture, capture - planes.seen(explained), mean, sigma)
+    scale = 1 / (planes.unit.astype(planes.dtype) * jnp.where(mean > 0, mean, 1))
+    return mean, capture * scale, deviation * scale
 
 
-def focused(
-    network: RefocusNetwork, explained: Explained, distance: Float[Array, ""]
-) -> Float[Array, "y x"]:
-    """The image of a lens focused on a distance, in units of the scene's mean."""
-    weights, planes, camera = network.weights, network.planes, network.camera
-    dtype = planes.dtype
-    inverse = 1 / distance.astype(dtype)
-    difference = camera.inverse_distances.astype(dtype) - inverse
-    radius = camera.defocus_radius(difference)
-    blurred = lens_blur(explained.stack, radius, camera.largest_blur)
-    rendered = jnp.sum(blurred, axis=0)
-    before = jax.nn.sigmoid(4 * difference / camera.step)  # what stands before the focus
-    front = jnp.tensordot(before, blurred, axes=1)
-    # The stack by its distance from the focus, in steps of the planes; the farthest taken together.
-    reach = network.options.reach
-    offset = jnp.clip(difference / camera.step, -reach, reach)
-    places = jnp.asarray(np.arange(-reach, reach + 1), dtype)[:, None]
-    nearness = jnp.maximum(1 - jnp.abs(offset - places), 0)
-    relative = jnp.einsum("rk,kyx->ryx", nearness, explained.stack)
+def prepared(network: RefocusNetwork, number: int, stack, given) -> Step:
+    """A step before its U-Net: the stack that the one before has left, tied to the capture.
 
-    spectra, sizes = planes.spectrum_at(distance.astype(dtype))[None], sizes_of(planes)
-    variance = explained.deviation**2
-    uniform = planes.uniform.astype(dtype) / planes.unit.astype(dtype)
-    on_capture, on_residual = weights.at_distance
-
-    def inverted(step: LinearStep, image) -> Float[Array, "1 y x"]:
-        spectrum = jnp.fft.rfft2(planes.from_sensor(image))
-        return planes.on_field(step(spectrum, spectra, variance, sizes))
-
-    sharp = 1 + inverted(on_capture, explained.capture - uniform)
-    missing = inverted(on_residual, explained.residual)
-    level = noise_level(explained.deviation)
-    total = jnp.sum(explained.stack, axis=0)
-    told = constant_images(relative, level)
-    parts = [relative, rendered[None], front[None], total[None], sharp, missing, told]
-    return rendered + weights.focus(jnp.concatenate(parts))[0]
-
-
-class Maps(NamedTuple):
-    """What the head of maps says, in units of the scene's mean and of the planes' step.
-
-    - `all_in_focus`: (y, x).
-    - `share`: of each plane in what a pixel shows, (plane, y, x), sum 1.
-    - `spread`: mean absolute error of 1/t that it expects, in steps of the planes.
+    `stack`: none before the first step; `given`: capture and noise, `normalised`, the planes and
+    their spectra.
     """
+    planes, camera = network.planes, network.camera
+    joint, alone = network.weights.joint[number], network.weights.alone[number]
+    capture, sigma, stand, spectra = given
+    sizes, variance = sizes_of(planes), sigma**2
+    if stack is None:
+        # A uniform scene first: its light is most of the capture, and not in the powers.
+        count = stand.inverse.size
+        stack = jnp.full((count, *sizes.field_shape), 1 / count, planes.dtype)
+        residual = capture - planes.uniform.astype(planes.dtype) / planes.unit.astype(planes.dtype)
+    else:
+        residual = capture - seen_of(planes, stack, spectra)
+    spectrum = jnp.fft.rfft2(planes.from_sensor(residual))
+    tied = stack + planes.on_field(joint(spectrum, spectra, variance, sizes, stand.place))
+    there = spectra[stand.number][None]
+    sharp = planes.on_field(alone(spectrum, there, variance, sizes))
+    radius = camera.defocus_radius(stand.inverse - stand.inverse[stand.number])
+    lens = jnp.sum(lens_blur(tied, radius, camera.largest_blur), axis=0, keepdims=True)
+    total = jnp.sum(tied, axis=0, keepdims=True)
+    relative = jnp.tensordot(stand.place, tied, axes=1)
+    told = constant_images(tied, noise_level(sigma), stand.position)
+    return Step(jnp.concatenate([relative, lens, total, sharp, told]), residual, stand)
 
-    all_in_focus: Float[Array, "y x"]
-    share: Float[Array, "plane y x"]
-    spread: Float[Array, "y x"]
+
+def read_images(prior: UNet, images: Float[Array, "image y x"], stand: Stand) -> Cleaned:
+    """What a U-Net makes of the images of a step."""
+    places, found = len(stand.place), prior(images)
+    shares = jnp.tensordot(stand.place.T, found[places:-3], axes=1)
+    return Cleaned(
+        jnp.tensordot(stand.place.T, images[:places] + found[:places], axes=1),
+        images[places] + found[-3],
+        images[places + 1] + found[-2],
+        jax.nn.softmax(shares, axis=0),
+        jax.nn.softplus(found[-1]) + 0.02,
+    )
 
 
-def mapped(network: RefocusNetwork, explained: Explained) -> Maps:
-    """All in focus, and the distance of each pixel."""
-    stack = explained.stack
-    total = jnp.sum(stack, axis=0)
-    level = noise_level(explained.deviation)
-    parts = [stack, total[None], constant_images(stack, level)]
-    out = network.weights.maps(jnp.concatenate(parts))
-    share = jax.nn.softmax(out[1:-1], axis=0)
-    return Maps(total + out[0], share, jax.nn.softplus(out[-1]) + 0.02)
-
-
-def inverse_distance(network: RefocusNetwork, maps: Maps) -> Float[Array, "y x"]:
-    """1/t of each pixel, 1/mm: the planes' mean by their shares."""
-    return jnp.tensordot(network.camera.inverse_distances, maps.share, axes=1)
+def seen_of(planes: Planes, stack, spectra) -> Float[Array, "y x"]:
+    """The capture of a stack."""
+    return planes.seen(jnp.sum(planes.from_field(stack) * spectra, axis=0))
 
 
 def sizes_of(planes: Planes) -> Sizes:
@@ -302,35 +301,35 @@ def _batched(function, network: RefocusNetwork, captures, deviation, *distance):
 
 @eqx.filter_jit
 def _over_batch(function, network, captures, deviation, *distance):
-    def one(capture, deviation):
-        return function(network, explain(network, capture, deviation), *distance)
-
-    return jax.vmap(one)(captures, deviation)
+    return jax.vmap(lambda *one: function(network, *one, *distance))(captures, deviation)
 
 
-def _focus(network, explained, distance):
-    return explained.mean * focused(network, explained, distance)
+def _focus(network, capture, deviation, distance):
+    explained = explain(network, capture, deviation, distance)
+    return explained.mean * explained.cleaned.image
 
 
-def _sweep(network, explained, distances):
+def _sweep(network, capture, deviation, distances):
     # Side by side: in a loop XLA runs convolutions slowly on a CPU.
-    return jax.vmap(lambda t: _focus(network, explained, t))(distances)
+    return jax.vmap(lambda t: _focus(network, capture, deviation, t))(distances)
 
 
-def _all_in_focus(network, explained):
-    return explained.mean * mapped(network, explained).all_in_focus
+def _all_in_focus(network, capture, deviation):
+    explained = explain(network, capture, deviation, network.camera.middle)
+    return explained.mean * explained.cleaned.all_in_focus
 
 
-def distance_map(network: RefocusNetwork, explained: Explained) -> DistanceMap:
+def _distance(network, capture, deviation):
+    return distance_map(explain(network, capture, deviation, network.camera.middle))
+
+
+def _consistency(network, capture, deviation):
+    return explain(network, capture, deviation, network.camera.middle).consistency
+
+
+def distance_map(explained: Explained) -> DistanceMap:
     """Of one capture."""
-    maps = mapped(network, explained)
+    cleaned = explained.cleaned
     # Of a Laplace distribution with that mean absolute error.
-    confidence = -jnp.expm1(-0.5 / maps.spread)
-    return DistanceMap(1 / inverse_distance(network, maps), confidence)
-
-
-def consistency_of(network: RefocusNetwork, explained: Explained) -> Float[Array, ""]:
-    """Of one capture."""
-    del network
-    rms = jnp.sqrt(jnp.mean(explained.residual**2))
-    return rms / jnp.where(explained.deviation > 0, explained.deviation, 1)
+    confidence = -jnp.expm1(-0.5 / cleaned.spread)
+    return DistanceMap(1 / cleaned.inverse_distance(explained.stand), confidence)

@@ -1,4 +1,4 @@
-"""A stack of planes at fixed distances, as the sensor sees it."""
+"""A stack of planes, as the sensor sees it."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -10,14 +10,14 @@ from thincam_jax.learn.refocusing.cameras import RefocusCamera
 
 
 class Planes(eqx.Module):
-    """The exact spectra of the PSFs of a camera's planes, and those of any other distance.
+    """Planes at any distance, by their exact PSFs.
 
     Images and captures are in units in which both are about 1: a capture is divided by the light
     that a uniform scene of radiance 1 sends on average, `unit`.
 
     - `camera`: what they are of.
-    - `operator`: from the stack (plane, y, x) to the capture (y, x), both as the camera has them.
-    - `uniform`: the capture of a uniform scene of radiance 1 in the middle plane.
+    - `operator`: from the image (y, x) of the plane in the middle of the range to the capture.
+    - `uniform`: its capture where its radiance is 1 everywhere.
     """
 
     camera: RefocusCamera
@@ -26,9 +26,8 @@ class Planes(eqx.Module):
 
     def __init__(self, camera: RefocusCamera):
         self.camera = camera
-        self.operator = camera.operator(1 / camera.inverse_distances)
-        middle = jnp.zeros((camera.planes, *camera.field_shape), self.dtype)
-        self.uniform = self.operator(middle.at[camera.planes // 2].set(1))
+        self.operator = camera.operator(camera.middle[None])
+        self.uniform = self.operator(jnp.ones((1, *camera.field_shape), self.dtype))
 
     @property
     def dtype(self):
@@ -41,18 +40,13 @@ class Planes(eqx.Module):
 
     @property
     def unit(self) -> Float[Array, ""]:
-        """Root mean square of the planes' transfer functions; spectra are divided by it."""
+        """Root mean square of the transfer function; spectra are divided by it."""
         return jnp.sqrt(self.operator.mean_power())
 
-    @property
-    def spectra(self) -> Complex[Array, "plane v u"]:
-        """Transfer functions of the planes, 1 in the root mean square."""
-        return self.operator.spectrum / self.unit.astype(self.operator.spectrum.dtype)
-
-    def spectrum_at(self, distance: Float[Array, ""]) -> Complex[Array, "v u"]:
-        """Transfer function of any distance, mm, from the exact PSF, in the same unit."""
-        spectrum = self.camera.operator(distance[None]).spectrum[0]
-        return spectrum / self.unit.astype(spectrum.dtype)
+    def spectra_at(self, distances: Float[Array, " plane"]) -> Complex[Array, "plane v u"]:
+        """Transfer functions of any distances, mm, from exact PSFs, 1 in the root mean square."""
+        spectra = self.camera.operator(distances).spectrum
+        return spectra / self.unit.astype(spectra.dtype)
 
     def mean(self, capture: Float[Array, "y x"]) -> Float[Array, ""]:
         """The scene's mean radiance, by least squares as if it were uniform."""
@@ -78,10 +72,3 @@ class Planes(eqx.Module):
     def from_field(self, images: Float[Array, "*planes y x"]) -> Complex[Array, "*planes v u"]:
         """Spectra of images that are dark beside the field."""
         return jnp.fft.rfft2(place(images, self.operator.field_corner, self.window))
-
-    def splat(self, inverse_distance: Float[Array, "*map"]) -> Float[Array, "plane *map"]:
-        """Weights of the planes in what stands at 1/t: linear in 1/t between neighbours, sum 1."""
-        camera = self.camera
-        inside = jnp.clip(inverse_distance, 1 / camera.far, 1 / camera.near)
-        planes = camera.inverse_distances.reshape(-1, *(1,) * inside.ndim)
-        return jnp.maximum(1 - jnp.abs(planes - inside) / camera.step, 0)

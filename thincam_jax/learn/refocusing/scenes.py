@@ -211,10 +211,10 @@ def _draw_one(key, images, camera: RefocusCamera, options: SceneOptions) -> Batc
     capture, deviation = _noisy(
         numbers[:2], noise, captured(camera, emission, scene.inverse), options
     )
-    # What is there is as good a focus as any other distance.
+    # What is there is mostly what one wants to see.
     objects = scene.inverse[(LAYERS * numbers[2]).astype(int) % LAYERS, PARTS // 2]
     other = _inverse_of(numbers[3], camera, options)
-    inverse = jnp.where(numbers[4] < 0.5, objects, other)
+    inverse = jnp.where(numbers[4] < 0.75, objects, other)
     return Batch(
         capture,
         deviation,

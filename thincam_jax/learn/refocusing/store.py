@@ -26,6 +26,9 @@ from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.reconstruction.seen_by import Cameras
 
 _KIND = "refocusing network"
+# By this name the network that comes with the package is known, of configs/learned_refocus.yaml.
+SHIPPED = "shipped"
+_SHIPPED_FILE = Path(__file__).with_name("shipped.thincam")
 # Arrays of more numbers are told by their sum.
 _LISTED = 64
 # What a sensor makes of light; a network takes captures in any unit.
@@ -55,12 +58,14 @@ def load(
 
     **Arguments**
 
+    - `path`: a file, or "shipped", the network that comes with the package.
     - `cameras`: what takes the captures: the camera; the camera with its light, as `Cameras`;
       or all that the network was trained for. Its numbers are compared, to single precision.
 
     **Errors**: CheckpointError, one line, for a damaged file, and for another camera with the
     first number that differs and both its values; OSError for what cannot be read.
     """
+    path = _SHIPPED_FILE if str(path) == SHIPPED else path
     description = network_description(path)
     given = same_camera(str(path), description["camera"], cameras)
     try:

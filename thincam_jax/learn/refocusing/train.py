@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -9,9 +10,9 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from thincam_jax.learn.refocusing.cameras import RefocusCamera
-from thincam_jax.learn.refocusing.loss import loss
+from thincam_jax.learn.refocusing.loss import Examples, examples, loss
 from thincam_jax.learn.refocusing.network import RefocusNetwork
 from thincam_jax.learn.refocusing.scenes import Batch, SceneOptions, draw_batch
 from thincam_jax.learn.refocusing.sources import Source
@@ -27,8 +28,8 @@ from thincam_jax.learn.training import (
     write_state,
 )
 
-NETWORK, STATE = "network.thincam", "training.state"
-# Of the seed's key: examples of training have the numbers of their steps.
+NETWORK, STATE = "network.thincam", "training-{}.state"
+# Of the seed's key: scenes of the pools have the numbers of their batches.
 _JUDGED = 2**31
 
 
@@ -36,26 +37,38 @@ class Lessons(NamedTuple):
     """What a network is trained on.
 
     - `source`: the images; `scenes`: what is drawn of them.
-    - `batch`: scenes of a step. `judged`: batches that judge the network at each check, drawn of
-      `held_out` images, which no step sees; by default of the same.
+    - `batch`: scenes of a step, taken out of a pool of so many batches, which is drawn once.
+    - `judged`: batches that judge the network at each check, drawn of `held_out` images, which no
+      step sees; by default of the same.
     """
 
     source: Source
     scenes: SceneOptions = SceneOptions()
-    batch: int = 4
+    batch: int = 2
+    pool: int = 256
     judged: int = 4
     held_out: Source | None = None
 
+    def drawn(self, network: RefocusNetwork, seed: int, count: int, first: int = 0):
+        """Batches of the camera of a network, one after another."""
+        source = self.source
+        if first >= _JUDGED and self.held_out is not None:
+            source = self.held_out
+        images, key = jnp.asarray(source.images), jax.random.key(seed)
+        for number in range(first, first + count):
+            one = jax.random.fold_in(key, number)
+            yield draw_batch(one, images, network.camera, self.scenes, self.batch)
+
+    def validation(self, network: RefocusNetwork, seed: int) -> list[Batch]:
+        """What judges a network."""
+        return list(self.drawn(network, seed, self.judged, _JUDGED))
+
     def task(self, network: RefocusNetwork, seed: int) -> Task:
-        """Of the camera of a network."""
-        images = jnp.asarray(self.source.images)
-        drawn = _Drawn(images, network.camera, self.scenes, self.batch)
-        unseen = images if self.held_out is None else jnp.asarray(self.held_out.images)
-        judge, key = drawn._replace(images=unseen), jax.random.key(seed)
-        keys = [jax.random.fold_in(key, _JUDGED + n) for n in range(self.judged)]
-        nothing = jax.tree.map(lambda _: False, network)
-        learned = eqx.tree_at(lambda n: n.weights, nothing, True)
-        return Task(drawn.draw, loss, [judge.draw(k) for k in keys], learned)
+        """Of the last U-Net of a network; those before it are as they are."""
+        pool = [examples(network, one) for one in self.drawn(network, seed, self.pool)]
+        pool = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *pool)
+        judged = [examples(network, one) for one in self.validation(network, seed)]
+        return Task(_Pool(pool, self.batch).draw, loss, judged)
 
     def manifest(self) -> dict[str, Any]:
         """The images as JSON, with their sums and licences; and how scenes are drawn."""
@@ -68,18 +81,25 @@ class Lessons(NamedTuple):
             },
             "scenes": self.scenes._asdict(),
             "batch": self.batch,
+            "pool": self.pool,
             "judged": self.judged,
         }
 
 
-class _Drawn(NamedTuple):
-    images: jax.Array
-    camera: RefocusCamera
-    scenes: SceneOptions
+class _Pool(NamedTuple):
+    all: Examples
     size: int
 
-    def draw(self, key) -> Batch:
-        return draw_batch(key, self.images, self.camera, self.scenes, self.size)
+    def draw(self, key) -> Examples:
+        return _taken(self.all, key, self.size)
+
+
+@eqx.filter_jit
+def _taken(pool: Examples, key, size: int) -> Examples:
+    chosen, mirrors = jax.random.split(key)
+    numbers = jax.random.randint(chosen, (size,), 0, len(pool.image))
+    rows, columns = jax.random.bernoulli(mirrors, shape=(2,))
+    return jax.tree.map(lambda leaf: leaf[numbers], pool).mirrored(rows, columns)
 
 
 def train(
@@ -90,36 +110,85 @@ def train(
     folder: str | os.PathLike[str] | None = None,
     callback: Callable[[TrainingProgress], object] | None = None,
 ) -> Trained:
-    """Train a network; see `thincam_jax.learn.training.train_model`.
+    """Train the U-Nets of a network one after another, each for its share of the steps.
+
+    What a U-Net sees of a scene depends on those before it alone, so that the optics are computed
+    once for each scene of the pool and not at every step. See `train_model` for one U-Net.
 
     **Arguments**
 
-    - `folder`: holds `network.thincam`, the best until now, and `training.state`; both are written
-      at each check, whole or not at all. Training goes on from a state that is there, and ends with
-      the same bits as without the interruption, on one machine.
+    - `folder`: holds `network.thincam`, the best until now, and a state for each U-Net; they are
+      written at each check, whole or not at all. Training goes on from states that are there, and
+      ends with the same bits as without the interruption, on one machine.
 
     **Errors**: CheckpointError, one line, for a state that is damaged or of another training.
     """
-    task = lessons.task(network, options.seed)
+    count = network.options.steps
+    each = dataclasses.replace(options, steps=-(-options.steps // count))
     told = {**lessons.manifest(), "training": dataclasses.asdict(options)}
-    state = begun = TrainingState.begin(network, task, options)
-    if folder is None:
-        return train_model(task, network, options, callback=callback)
-    folder = Path(folder)
     settings = {
         "camera": described(network.camera),
         "options": network.options._asdict(),
         **told,
     }
-    if (folder / STATE).exists():
-        state = read_state(folder / STATE, begun, settings)
+    losses, scores, trained = [], [], None
+    for number in range(count):
+        part = network.first(number + 1)
+        task, prior = lessons.task(part, options.seed), part.weights.prior[number]
+        state = begun = TrainingState.begin(prior, task, each)
+        keep, path = None, None if folder is None else Path(folder) / STATE.format(number + 1)
+        if path is not None:
+            keep = _Kept(path, part, {**settings, "step": number}, told)
+            if path.exists():
+                state = read_state(path, begun, keep.settings)
+        tell = None if callback is None else _Told(callback, number, count, time.perf_counter())
+        trained = train_model(task, prior, each, state=state, keep=keep, callback=tell)
+        network = network.with_prior(number, trained.model)
+        losses.append(trained.state.losses[: trained.state.step])
+        scores.append(trained.state.scores)
+        if trained.status != "finished":
+            break
+    assert trained is not None  # there is at least one step
+    known = {"losses": np.concatenate(losses), "scores": np.concatenate(scores)}
+    state = dataclasses.replace(trained.state, step=len(known["losses"]), **known)
+    return Trained(network.first(number + 1), state, trained.status)
 
-    def keep(state: TrainingState) -> None:
-        best = eqx.combine(state.best, network)
+
+class _Kept(NamedTuple):
+    """Writes what is to be kept of a U-Net's training."""
+
+    path: Path
+    network: RefocusNetwork
+    settings: dict[str, Any]
+    told: dict[str, Any]
+
+    def __call__(self, state: TrainingState) -> None:
+        number = self.network.options.steps - 1
+        best = self.network.with_prior(
+            number, eqx.combine(state.best, self.network.weights.prior[number])
+        )
         scores = [float(score) for score in state.scores if score == score]
         numbers = {"steps": state.step, "skipped": state.skipped, "retreats": state.retreats}
-        save(folder / NETWORK, best, {**told, "scores": scores, **numbers})
+        save(self.path.parent / NETWORK, best, {**self.told, "scores": scores, **numbers})
         # Last: it is what training goes on from.
-        write_state(folder / STATE, state, settings)
+        write_state(self.path, state, self.settings)
 
-    return train_model(task, network, options, state=state, keep=keep, callback=callback)
+
+class _Told(NamedTuple):
+    """Tells of the whole training in place of one U-Net's."""
+
+    callback: Callable[[TrainingProgress], object]
+    number: int
+    count: int
+    began: float
+
+    def __call__(self, progress: TrainingProgress) -> object:
+        steps, later = progress.steps, self.count - 1 - self.number
+        each = (time.perf_counter() - self.began) / progress.step
+        return self.callback(
+            progress._replace(
+                step=self.number * steps + progress.step,
+                steps=self.count * steps,
+                seconds_left=progress.seconds_left + later * steps * each,
+            )
+        )

@@ -12,14 +12,11 @@ from jaxtyping import Array, Float
 from thincam_jax._core import checks
 from thincam_jax.learn.refocusing.network import (
     RefocusNetwork,
-    consistency_of,
     distance_map,
     explain,
     flattened,
-    focused,
-    mapped,
 )
-from thincam_jax.learn.refocusing.store import described, same_camera
+from thincam_jax.learn.refocusing.store import SHIPPED, described, load, same_camera
 from thincam_jax.reconstruction.noise import estimate_variance, given_variances
 from thincam_jax.reconstruction.recording import Recording
 from thincam_jax.reconstruction.seen_by import Cameras
@@ -32,7 +29,10 @@ SURE = 0.5
 
 
 class Reading(NamedTuple):
-    """All that a network reads from captures that it has explained once; see `RefocusNetwork`."""
+    """All that a network reads from captures; see `RefocusNetwork`.
+
+    All but `images` is from the explanation that is focused on the first distance.
+    """
 
     images: Float[Array, "*batch distance y x"]
     all_in_focus: Float[Array, "*batch y x"]
@@ -59,14 +59,13 @@ def _read(network: RefocusNetwork, captures, deviations, distances) -> Reading:
 
 
 def _read_one(network: RefocusNetwork, capture, deviation, distances) -> Reading:
-    explained = explain(network, capture, deviation)
-    maps = mapped(network, explained)
-    images = jax.vmap(lambda t: focused(network, explained, t))(distances)
+    explained = jax.vmap(lambda t: explain(network, capture, deviation, t))(distances)
+    first = jax.tree.map(lambda leaf: leaf[0], explained)
     return Reading(
-        explained.mean * images,
-        explained.mean * maps.all_in_focus,
-        *distance_map(network, explained),
-        consistency_of(network, explained),
+        first.mean * explained.cleaned.image,
+        first.mean * first.cleaned.all_in_focus,
+        *distance_map(first),
+        first.consistency,
     )
 
 
@@ -77,7 +76,8 @@ class Learned(AbstractSolver):
     may be made up where the capture does not tell: see `Reconstruction.consistency` and
     `Reconstruction.confidence`.
 
-    - `network`: trained, see `thincam_jax.learn.load`.
+    - `network`: trained, see `thincam_jax.learn.load`; default the one that comes with the package,
+      for its camera.
     - `output`: "focus", or "all_in_focus", which needs no distance.
 
     **Errors**: ValueError, one line, for another camera, a distance outside of what the network
@@ -85,16 +85,17 @@ class Learned(AbstractSolver):
     """
 
     name: ClassVar[str] = "learned"
-    network: RefocusNetwork
+    network: RefocusNetwork | None = None
     output: Literal["focus", "all_in_focus"] = eqx.field(static=True, default="focus")
 
     def __check_init__(self):
         checks.choice("output", self.output, ("focus", "all_in_focus"))
 
     def solve(self, recording: Recording) -> Reconstruction:
-        began, network, seen_by = time.perf_counter(), self.network, recording.seen_by
+        began, seen_by = time.perf_counter(), recording.seen_by
         if not isinstance(seen_by, Cameras):
             raise ValueError("a learned method knows its camera; give a recording by tc.Cameras")
+        network = load(SHIPPED, seen_by) if self.network is None else self.network
         camera = network.camera
         same_camera("the network", described(camera), seen_by)
         if seen_by.field_shape not in (None, camera.field_shape):
