@@ -27,7 +27,7 @@ _LEAST = 1e-5  # of an image's mean square: an error below it counts for nothing
 class Examples(NamedTuple):
     """What a U-Net sees of scenes, and what it is to make of it; (element, …) each.
 
-    - `images`, `stand`: of a `Step`.
+    - `images`: as of `prepared`, for planes at `stand`.
     - `stack`: light of the planes; what stands between two is shared out between them.
     - `image`, `all_in_focus`: in units of the scene's mean; `inverse`: 1/t, 1/mm.
     """
@@ -66,12 +66,12 @@ def _example(network: RefocusNetwork, one: Batch) -> Examples:
     given = (capture, sigma, stand, planes.spectra_at(1 / stand.inverse))
     last = len(network.weights.prior) - 1
     for number in range(last):
-        step = prepared(network, number, stack, given)
-        stack = read_images(network.weights.prior[number], step.images, stand).stack
+        images = prepared(network, number, stack, given)
+        stack = read_images(network.weights.prior[number], images, stand).stack
     unit = jnp.where(mean > 0, mean, 1)
     shares = stand.splat(one.scene.inverse)  # (plane, layer, part)
     return Examples(
-        prepared(network, last, stack, given).images,
+        prepared(network, last, stack, given),
         stand,
         jnp.einsum("klp,lpyx->kyx", shares, one.emission) / unit,
         one.image / unit,

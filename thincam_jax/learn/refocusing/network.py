@@ -59,21 +59,6 @@ class Cleaned(NamedTuple):
         return jnp.tensordot(stand.inverse, self.share, axes=1)
 
 
-class Step(NamedTuple):
-    """What a step of the unrolled splitting sees.
-
-    - `images`: for its U-Net, (image, y, x): the stack by the places relative to the commanded
-      distance, tied to the capture; what a lens and a pinhole see of it; the plane at the commanded
-      distance as if nothing stood elsewhere; two constants, the noise and the commanded distance.
-    - `residual`: of the capture before it, on the sensor, after optics in units of the mean.
-    - `stand`: where the planes are.
-    """
-
-    images: Float[Array, "image y x"]
-    residual: Float[Array, "y x"]
-    stand: Stand
-
-
 class Explained(NamedTuple):
     """A capture explained by a stack of planes: what the last U-Net has read, and how well.
 
@@ -152,8 +137,8 @@ class RefocusNetwork(eqx.Module):
 
     def first(self, steps: int) -> "RefocusNetwork":
         """The network of the first steps alone, which is one, too."""
-        lists = (self.weights.joint, self.weights.alone, self.weights.prior)
-        weights = Weights(*(parts[:steps] for parts in lists))
+        all_ = self.weights
+        weights = Weights(all_.joint[:steps], all_.alone[:steps], all_.prior[:steps])
         return RefocusNetwork(weights, self.planes, self.options._replace(steps=steps))
 
     def with_prior(self, number: int, prior: UNet) -> "RefocusNetwork":
@@ -198,12 +183,11 @@ def explain(
     mean, capture, sigma = normalised(planes, capture, deviation)
     stand = network.camera.stand(distance.astype(planes.dtype))
     spectra = planes.spectra_at(1 / stand.inverse)
-    cleaned, stack = None, None
-    for number, prior in enumerate(weights.prior):
-        step = prepared(network, number, stack, (capture, sigma, stand, spectra))
-        cleaned = read_images(prior, step.images, stand)
-        stack = cleaned.stack
-    residual = capture - seen_of(planes, stack, spectra)
+    given = (capture, sigma, stand, spectra)
+    cleaned = read_images(weights.prior[0], prepared(network, 0, None, given), stand)
+    for number, prior in list(enumerate(weights.prior))[1:]:
+        cleaned = read_images(prior, prepared(network, number, cleaned.stack, given), stand)
+    residual = capture - seen_of(planes, cleaned.stack, spectra)
     rms = jnp.sqrt(jnp.mean(residual**2))
     return Explained(cleaned, stand, mean, rms / jnp.where(sigma > 0, sigma, 1))
 
@@ -216,8 +200,12 @@ def normalised(planes: Planes, capture, deviation):
     return mean, capture * scale, deviation * scale
 
 
-def prepared(network: RefocusNetwork, number: int, stack, given) -> Step:
-    """A step before its U-Net: the stack that the one before has left, tied to the capture.
+def prepared(network: RefocusNetwork, number: int, stack, given) -> Float[Array, "image y x"]:
+    """What the U-Net of a step sees, (image, y, x).
+
+    The stack that the step before has left, tied to the capture, by the places relative to the
+    commanded distance; what a lens and a pinhole see of it; the plane at the commanded distance as
+    if nothing stood elsewhere; two constants, the noise and the commanded distance.
 
     `stack`: none before the first step; `given`: capture and noise, `normalised`, the planes and
     their spectra.
@@ -242,7 +230,7 @@ def prepared(network: RefocusNetwork, number: int, stack, given) -> Step:
     total = jnp.sum(tied, axis=0, keepdims=True)
     relative = jnp.tensordot(stand.place, tied, axes=1)
     told = constant_images(tied, noise_level(sigma), stand.position)
-    return Step(jnp.concatenate([relative, lens, total, sharp, told]), residual, stand)
+    return jnp.concatenate([relative, lens, total, sharp, told])
 
 
 def read_images(prior: UNet, images: Float[Array, "image y x"], stand: Stand) -> Cleaned:

@@ -151,7 +151,7 @@ def train(
     assert trained is not None  # there is at least one step
     known = {"losses": np.concatenate(losses), "scores": np.concatenate(scores)}
     state = dataclasses.replace(trained.state, step=len(known["losses"]), **known)
-    return Trained(network.first(number + 1), state, trained.status)
+    return Trained(network.first(len(losses)), state, trained.status)
 
 
 class _Kept(NamedTuple):
@@ -179,16 +179,16 @@ class _Told(NamedTuple):
 
     callback: Callable[[TrainingProgress], object]
     number: int
-    count: int
+    parts: int
     began: float
 
     def __call__(self, progress: TrainingProgress) -> object:
-        steps, later = progress.steps, self.count - 1 - self.number
+        steps, later = progress.steps, self.parts - 1 - self.number
         each = (time.perf_counter() - self.began) / progress.step
         return self.callback(
             progress._replace(
                 step=self.number * steps + progress.step,
-                steps=self.count * steps,
+                steps=self.parts * steps,
                 seconds_left=progress.seconds_left + later * steps * each,
             )
         )
