@@ -3,23 +3,27 @@
 `python docs/score_refocusing.py CONFIG NETWORK IMAGES TUNING [COUNT]`: a training's config and its
 network; a folder of photographs that no weight has seen, and one of the training's, on which the
 strengths of the baselines are tuned; how many scenes of each kind. Prints a Markdown table: PSNR in
-dB with the half width of its 95 % interval, and SSIM. All methods see the same captures.
+dB with the half width of its 95 % interval, and SSIM. All methods see the same captures. Draws
+docs/images/learned_measured.png of pictures that no weight has seen, either.
 """
 
 import sys
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from matplotlib.figure import Figure
 
 import thincam_jax as tc
 from thincam_jax import learn
 from thincam_jax.commands.learned.build import build_camera
 from thincam_jax.commands.learned.config import load_learned
+from thincam_jax.imaging.targets import middle_square, resize, sample_image
 from thincam_jax.learn.refocusing.baselines import wiener
 from thincam_jax.learn.refocusing.evaluation import (
     capture_scene,
@@ -203,6 +207,7 @@ def table(network, pictures, tuning, count: int) -> None:
     for t, name in ((NEAR, "near"), (FAR, "far")):
         row(f"two planes, {name}", camera, runs, hiding, t)
     times(runs, hiding[0])
+    picture(methods)
     head(fast)
     for is_left in (True, False):
         shots = [two_planes(camera, *p, half(shape, is_left), 200 + n) for n, p in enumerate(pairs)]
@@ -276,6 +281,42 @@ def squares(folder: str, camera, side: int) -> list[np.ndarray]:
     top, left = (side - rows) // 2, (side - columns) // 2
     images = photographs(folder, side).images[:, top : top + rows, left : left + columns]
     return list(images.astype(float))
+
+
+def picture(methods: Methods) -> None:
+    """A photograph, a page of text, and one before the other; what the methods make of them."""
+    camera = methods.camera
+    clock, page = (
+        resize(middle_square(sample_image(name), 256), camera.field_shape)
+        for name in ("clock", "page")
+    )
+    both = two_planes(camera, page, clock, rectangle(camera.field_shape, 3), 800)
+    shots = [
+        (one_plane(camera, clock, 85.0, 801), 85.0),
+        (one_plane(camera, page, 85.0, 802), 85.0),
+        (both, NEAR),
+        (both, FAR),
+    ]
+    runs = {
+        "Wiener": methods.wiener,
+        "ADMM-TV, all\nat that distance": methods.admm,
+        "ADMM-TV, told\nthe planes": methods.oracle,
+        "network": methods.learned,
+    }
+    figure = Figure(figsize=(10, 8.4), layout="constrained")
+    for axes, (shot, distance) in zip(figure.subplots(4, 5), shots, strict=True):
+        target = shot.target(camera, distance)
+        images = {"lens": target, **{n: np.asarray(r(shot, distance)) for n, r in runs.items()}}
+        for ax, (name, image) in zip(axes, images.items(), strict=True):
+            level = np.clip(image / np.quantile(target, 0.998), 0, 1)[::-1, ::-1]
+            ax.imshow(level ** (1 / 2.2), cmap="gray", vmin=0, vmax=1)
+            ax.set(xticks=[], yticks=[])
+            if shot is shots[0][0]:
+                ax.set_title(name, fontsize=10)
+            if name != "lens":
+                ax.set_xlabel(f"{scores(image, target)['psnr']:.1f} dB", fontsize=9)
+        axes[0].set_ylabel(f"focused on {distance:g} mm", fontsize=9)
+    figure.savefig(Path(__file__).parent / "images/learned_measured.png", dpi=80)
 
 
 if __name__ == "__main__":

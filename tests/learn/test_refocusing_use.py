@@ -2,6 +2,7 @@
 
 import dataclasses
 import re
+from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -11,11 +12,26 @@ import pytest
 from learn import tiny_network as tiny
 
 import thincam_jax as tc
+from thincam_jax.commands.learned.build import build_camera
+from thincam_jax.commands.learned.config import load_learned
 from thincam_jax.learn.checkpoint import CheckpointError, write_arrays
-from thincam_jax.learn.refocusing.store import load, network_description, save
-from thincam_jax.learn.refocusing.train import NETWORK, STATE, train
+from thincam_jax.learn.refocusing.baselines import wiener
+from thincam_jax.learn.refocusing.cameras import RefocusCamera
+from thincam_jax.learn.refocusing.dead_leaves import dead_leaves
+from thincam_jax.learn.refocusing.evaluation import capture_scene, flat_scene, scores
+from thincam_jax.learn.refocusing.network import NetworkOptions, RefocusNetwork
+from thincam_jax.learn.refocusing.sources import drawn
+from thincam_jax.learn.refocusing.store import (
+    _SHIPPED_FILE,
+    SHIPPED,
+    load,
+    network_description,
+    save,
+)
+from thincam_jax.learn.refocusing.train import NETWORK, STATE, Lessons, train
 from thincam_jax.learn.refocusing.use import Learned, doubt
-from thincam_jax.units import nm
+from thincam_jax.learn.training import TrainingOptions
+from thincam_jax.units import nm, um
 
 
 @pytest.fixture(scope="module")
@@ -138,13 +154,6 @@ def test_what_does_not_explain_its_capture_is_doubted():
 @pytest.mark.thorough
 def test_a_short_training_beats_the_linear_start():
     """32×32 pixels, in under a minute on two cores."""
-    from thincam_jax.learn.refocusing.cameras import RefocusCamera
-    from thincam_jax.learn.refocusing.network import NetworkOptions, RefocusNetwork
-    from thincam_jax.learn.refocusing.sources import drawn
-    from thincam_jax.learn.refocusing.train import Lessons
-    from thincam_jax.learn.training import TrainingOptions
-    from thincam_jax.units import um
-
     aperture = tc.FresnelZoneAperture(13.0, width=1.4)
     camera = tc.LenslessCamera(aperture, tc.Sensor((32, 32), 44 * um), 7.5)
     whole = RefocusCamera(camera, 500 * nm, field_shape=(24, 24), near=50.0, far=200.0, planes=3)
@@ -154,3 +163,28 @@ def test_a_short_training_beats_the_linear_start():
     state = train(network, Lessons(drawn(0, 32, 48), batch=4, pool=32, judged=2), training).state
     # 0.115 is 1 dB.
     assert state.scores[-1] < state.scores[0] - 0.03 and np.isfinite(state.losses).all()
+
+
+def test_what_is_shipped_may_be_given_on():
+    """No photograph of a licence that binds those who use the weights, and few bytes."""
+    told = network_description(_SHIPPED_FILE)["training"]["images"]
+    licences = {entry["licence"] for entries in told.values() for entry in entries}
+    assert licences == {"scikit-image's own (its data folder's README)", "drawn", "CC0 1.0"}
+    assert _SHIPPED_FILE.stat().st_size < 4e6
+
+
+@pytest.mark.thorough
+def test_what_is_shipped_beats_a_wiener_filter():
+    """Whatever its strength, on a scene that it was not trained on."""
+    config = load_learned(Path(__file__).parents[2] / "configs/learned_refocus.yaml")
+    network = load(SHIPPED, build_camera(config))
+    planes, picture = network.planes, dead_leaves(7, 1, 384)[0][:128, :128]
+    scene = flat_scene(planes.camera, [picture], [np.ones(picture.shape)], [85.0])
+    noise = tc.GaussianNoise(30.0)
+    seen, deviation = capture_scene(planes.camera, scene, noise, jax.random.key(0))
+    found = scores(network.focus(seen, 85.0, deviation), picture)["psnr"]
+    linear = max(
+        scores(wiener(planes, seen, deviation, jnp.asarray(85.0), s), picture)["psnr"]
+        for s in (0.1, 0.3, 1.0)
+    )
+    assert found > linear

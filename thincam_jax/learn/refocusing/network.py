@@ -99,7 +99,7 @@ class Weights(eqx.Module):
 class RefocusNetwork(eqx.Module):
     """A network and the camera whose captures it takes.
 
-    - `weights`: all that is learnt; the same for any number of pixels.
+    - `weights`: all that is learnt.
     - `planes`: of its camera; not learnt, and rebuilt from the camera when a network is loaded.
 
     Captures are (*batch, y, x) in any unit; `deviation` is the standard deviation of their noise
