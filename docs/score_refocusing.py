@@ -308,7 +308,7 @@ def picture(methods: Methods) -> None:
         target = shot.target(camera, distance)
         images = {"lens": target, **{n: np.asarray(r(shot, distance)) for n, r in runs.items()}}
         for ax, (name, image) in zip(axes, images.items(), strict=True):
-            level = np.clip(image / np.quantile(target, 0.998), 0, 1)[::-1, ::-1]
+            level = np.clip(image / np.quantile(target, 0.998), 0, 1)
             ax.imshow(level ** (1 / 2.2), cmap="gray", vmin=0, vmax=1)
             ax.set(xticks=[], yticks=[])
             if shot is shots[0][0]:
