@@ -128,8 +128,9 @@ ALONE = ("1×1 sensor", "16384×64 sensor", "closed_form: t = 0.1 mm, pixel aver
 
 
 def is_quick(extreme: Extreme, dtype) -> bool:
-    """Whether others share its program: in double precision those of the separable model do."""
-    shared = dtype is np.float32 or extreme.model == "separable"
+    """Whether others share its program: in double precision points of the separable model do."""
+    points = extreme.model == "separable" and not extreme.pixel_integration
+    shared = dtype is np.float32 or points
     return shared and extreme.name not in ALONE
 
 

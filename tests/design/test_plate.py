@@ -42,11 +42,12 @@ def test_gradient_against_finite_differences():
         assert float(getattr(slopes, name)) == pytest.approx(expected, rel=1e-3), name
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "numbers",
     [
         {"index_modulation": 0.008, "film_thickness": 10 * um},
-        pytest.param({}, marks=pytest.mark.thorough),
+        {},
     ],
 )
 def test_expected_error_is_that_of_the_exact_system(numbers):

@@ -78,11 +78,11 @@ def test_the_mean_is_that_of_samples(name, size):
 @pytest.mark.parametrize(
     "tolerances",
     [
-        pytest.param(Tolerances(beta=1e-3), marks=pytest.mark.thorough),
+        Tolerances(beta=1e-3),
         Tolerances(distance=0.02),
-        pytest.param(Tolerances(wavelength=5e-6), marks=pytest.mark.thorough),
-        pytest.param(Tolerances(object_distance=5.0), marks=pytest.mark.thorough),
-        pytest.param(Tolerances(tilt=0.01), marks=pytest.mark.thorough),
+        Tolerances(wavelength=5e-6),
+        Tolerances(object_distance=5.0),
+        Tolerances(tilt=0.01),
     ],
 )
 def test_every_tolerance_costs_and_more_of_it_costs_more(tolerances):

@@ -332,7 +332,10 @@ def test_text_for_a_length():
         tc.psf(camera_of(), wavelength="500 nm")
 
 
-@pytest.mark.parametrize("model", ["geometric", "paraxial", "closed_form", "separable"])
+@pytest.mark.parametrize(
+    "model",
+    ["geometric", "paraxial", "closed_form", pytest.param("separable", marks=pytest.mark.thorough)],
+)
 @pytest.mark.parametrize("shape", [pytest.param((1, 1), marks=pytest.mark.thorough), (1, 7)])
 def test_thin_sensors_are_cuts_of_wide_ones(model, shape):
     wide = tc.psf(camera_of((5, 7)), wavelength=WAVELENGTH, model=model)

@@ -108,7 +108,7 @@ def test_learning_finds_the_least_error_of_known_images():
     assert error(float(factor)) < 1.02 * min(scan)
 
 
-@pytest.mark.parametrize("rule", ["discrepancy", "sure"])
+@pytest.mark.parametrize("rule", ["discrepancy", pytest.param("sure", marks=pytest.mark.thorough)])
 def test_the_entry_point_takes_a_rule(rule):
     """A τ a hundred times too small or found: the found one is nearer to the truth."""
     problem, truth = posed()

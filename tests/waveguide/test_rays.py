@@ -138,7 +138,7 @@ def numbers(sts, pixel, distance):
 @pytest.mark.parametrize(
     "pixel", [(0.0, 0.0), pytest.param((0.6, -0.9), marks=pytest.mark.thorough)]
 )
-@pytest.mark.parametrize("film", [1.5, wg.bk7()])
+@pytest.mark.parametrize("film", [1.5, pytest.param(wg.bk7(), marks=pytest.mark.thorough)])
 def test_gradients(pixel, film):
     """In every number of the camera, in the pixel (on the axis too) and in the distance."""
     sts = camera(hologram(film), film)

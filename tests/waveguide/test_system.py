@@ -25,7 +25,7 @@ def plane(shape=(12, 16)):
     return wg.ObjectPlane(shape, 550.0, 120.0, (0.0, 27.0))
 
 
-@pytest.mark.parametrize("shape", [(12, 16), (40, 37)])
+@pytest.mark.parametrize("shape", [(12, 16), pytest.param((40, 37), marks=pytest.mark.thorough)])
 def test_every_pixel_is_the_sum_of_its_ghosts(shape):
     """Cells larger and smaller than what a pixel sees: sampled finely in place of overlaps."""
     sts, seen = small(bottom=wg.Rectangle((0.0, 20.0), (60.0, 40.0))), plane(shape)

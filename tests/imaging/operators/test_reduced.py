@@ -72,7 +72,9 @@ class Chunked:
         return self.numbers[rows]
 
 
-@pytest.mark.parametrize("solver", [tc.AdmmTV(1.0, iterations=30), tc.Ridge()])
+@pytest.mark.parametrize(
+    "solver", [pytest.param(tc.AdmmTV(1.0, iterations=30), marks=pytest.mark.thorough), tc.Ridge()]
+)
 def test_reconstructions_are_those_of_the_whole_matrix(solver):
     """Of a batch, before convergence; the whole matrix's norm is approached from below."""
     scene = np.abs(numbers((3, *IN), 4))

@@ -24,14 +24,15 @@ def camera(name):
     return tc.LenslessCamera(MASKS[name], tc.Sensor((36, 40), 5 * um), 4.0)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("name", "average"),
     [
         ("diffuser", False),
-        pytest.param("lenses", True, marks=pytest.mark.thorough),
-        pytest.param("cells", False, marks=pytest.mark.thorough),
-        pytest.param("lenses", False, marks=pytest.mark.thorough),
-        pytest.param("cells", True, marks=pytest.mark.thorough),
+        ("lenses", True),
+        ("cells", False),
+        ("lenses", False),
+        ("cells", True),
     ],
 )
 def test_predicted_errors_are_at_least_the_true_ones(name, average):

@@ -84,7 +84,7 @@ def eqx_set(mask, **numbers):
     return copy
 
 
-@pytest.mark.parametrize("name", ["ura", "lenslets"])
+@pytest.mark.parametrize("name", ["ura", pytest.param("lenslets", marks=pytest.mark.thorough)])
 def test_vmap_is_a_loop(name):
     mask, distances = families.masks()[name], jnp.asarray([1.0, DISTANCE, 5.0])
     one = functools.partial(evaluate, mask, SENSOR)
