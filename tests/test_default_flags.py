@@ -11,7 +11,6 @@ from helpers import ROOT
 # Propagation, an operator, and iterations of ADMM: what other tests compile without optimisation.
 SAMPLE = (
     "tests/lensless/propagation/test_closed_form.py::test_is_the_thesis_formula",
-    "tests/lensless/propagation/test_closed_form.py::test_is_the_middle_of_the_finite_aperture[cosine]",
     "tests/imaging/operators/test_crop_convolution.py::test_it_is_the_integral_over_the_field",
     "tests/imaging/operators/test_crop_convolution.py::test_gradients",
     "tests/reconstruction/test_fourier_splitting.py::test_single_precision_and_gradients[1]",

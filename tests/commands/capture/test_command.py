@@ -55,6 +55,7 @@ def test_an_image_of_captures_agrees_with_direct_simulation(method_b, tmp_path):
     assert (tmp_path / "out" / "report.html").read_text("utf-8").count("data:image/png") == 4
 
 
+@pytest.mark.thorough
 def test_a_matrix_of_captures_agrees_with_direct_simulation(tmp_path):
     file = tiny.write(tmp_path, tiny.HADAMARD)
     result = call("capture", file, "--out", tmp_path / "a.zarr")
