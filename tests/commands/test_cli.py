@@ -332,7 +332,7 @@ with start.interruptible():
     try:
         gc.collect()
         gc.callbacks.clear()
-        time.sleep(20)
+        time.sleep(20)  # which the signal ends
     except KeyboardInterrupt:
         print("told", flush=True)
         os._exit(start.INTERRUPTED)

@@ -56,7 +56,9 @@ def _again(lost: "sys.UnraisableHookArgs") -> None:
         return
     import threading
 
-    threading.Timer(0.05, signal.raise_signal, (signal.SIGINT,)).start()
+    # To the main thread, which may be waiting in the system.
+    again = signal.pthread_kill, (threading.main_thread().ident, signal.SIGINT)
+    threading.Timer(0.05, *again).start()
 
 
 if __name__ == "__main__":

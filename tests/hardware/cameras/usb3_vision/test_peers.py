@@ -70,7 +70,13 @@ def has_aravis_bindings() -> bool:
 
 
 @pytest.mark.parametrize(
-    "script", [ARAVIS, CAMELEON, OURSELVES], ids=["aravis", "pycameleon", "libusb"]
+    "script",
+    [
+        pytest.param(ARAVIS, marks=pytest.mark.thorough),
+        pytest.param(CAMELEON, marks=pytest.mark.thorough),
+        OURSELVES,
+    ],
+    ids=["aravis", "pycameleon", "libusb"],
 )
 def test_a_peer_receives_every_pixel(script, device, scene, tmp_path):
     """Two clients of others, and our own through libusb."""
