@@ -187,7 +187,7 @@ def sweep():
 
 
 def which_mask():
-    """What `thincam run configs/masks.yaml` draws, in some ten minutes."""
+    """What `thincam run configs/masks.yaml` draws, in some six minutes."""
     return _by_command("figures/error.png", "run", "configs/masks.yaml")
 
 
