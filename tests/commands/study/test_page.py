@@ -54,6 +54,15 @@ def test_pictures_are_the_figures(run):
         assert picture[..., :3].std() > 5  # something is drawn
 
 
+def test_motion_is_told(run):
+    config, folder, metrics, page = run
+    assert "that moves" not in page
+    still = config.object
+    moving = config.model_copy(update={"object": still.model_copy(update={"motion": 0.25})})
+    page = render(moving, folder, metrics, environment())
+    assert "that moves 0.25 mm across during an exposure of 1, λ" in page
+
+
 def test_text_of_the_configuration_is_escaped(run):
     page = run[3]
     assert "<script" not in page

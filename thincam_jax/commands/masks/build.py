@@ -12,8 +12,8 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.masks.config import ComparedMaskConfig, MasksConfig, SceneConfig
-from thincam_jax.commands.screen.build import picture
 from thincam_jax.commands.sections import PHASES
+from thincam_jax.commands.study.build import picture
 from thincam_jax.commands.study.study import Exposure, built_mask, synthesis_matrix
 from thincam_jax.imaging.operators import CropConvolution, kernel_grid
 from thincam_jax.imaging.operators.crop_convolution import cut, place

@@ -5,7 +5,6 @@ from typing import Annotated, Literal
 import pydantic
 from pydantic import Field
 
-from thincam_jax.commands.screen.config import ScreenTargetConfig
 from thincam_jax.commands.sections import (
     Curvature,
     ExperimentConfig,
@@ -18,6 +17,7 @@ from thincam_jax.commands.sections import (
     check_names,
     misfit,
 )
+from thincam_jax.commands.study.config import PictureConfig
 from thincam_jax.imaging.metrics.image import SSIM_WINDOW
 from thincam_jax.reconstruction.spectra import Prior
 
@@ -45,7 +45,7 @@ class ComparedMaskConfig(Section):
         return self
 
 
-class SceneConfig(ScreenTargetConfig):
+class SceneConfig(PictureConfig):
     """A grey picture, and what the linear estimate takes for its spectrum."""
 
     prior: Prior = "inverse_square"

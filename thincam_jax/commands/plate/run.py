@@ -16,7 +16,8 @@ from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.page import render_page
 from thincam_jax.commands.plate.config import FoundConfig, PlateDesignConfig
 from thincam_jax.commands.run_folder import Progress, RunFolder, Step, carry_out
-from thincam_jax.commands.screen.build import Captured, picture, rounded, undo
+from thincam_jax.commands.screen.build import Captured, rounded, undo
+from thincam_jax.commands.study.build import picture
 from thincam_jax.commands.study.figures import line_style, save_figure
 from thincam_jax.design.plate import (
     Judged,

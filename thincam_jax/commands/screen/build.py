@@ -22,10 +22,9 @@ from thincam_jax.commands.screen.config import (
     SeeThroughConfig,
 )
 from thincam_jax.commands.sections import VariationConfig
-from thincam_jax.commands.study.build import build_noise, read_picture
+from thincam_jax.commands.study.build import build_noise, picture
 from thincam_jax.imaging.operators import AbstractOperator, Sparse
 from thincam_jax.imaging.sensor import Sensor, electrons_per_unit, read_out
-from thincam_jax.imaging.targets import middle_square, resize
 from thincam_jax.reconstruction import (
     AdmmTV,
     Reconstruction,
@@ -159,24 +158,6 @@ def _rectangle(part: RectangleConfig | None) -> wg.Rectangle | None:
     if part is None:
         return None
     return wg.Rectangle(jnp.asarray([part.x, part.y]), jnp.asarray([part.width, part.height]))
-
-
-def picture(target: ScreenTargetConfig, cells: tuple[int, int], channels: int = 0) -> np.ndarray:
-    """A target on the cells, radiance 0 to 1: (y, x), or with so many channels (y, x, channel).
-
-    **Errors**: ValueError for a uniform picture, FileNotFoundError where there is none.
-    """
-    picture = np.atleast_3d(read_picture(target))
-    if target.crop < 1:
-        picture = middle_square(picture, round(target.crop * min(picture.shape[:2])))
-    picture = resize(picture if channels else picture.mean(axis=-1), cells)
-    if channels:
-        picture = np.broadcast_to(picture, (*cells, channels))
-    if target.binary:
-        picture = (picture > picture.mean()).astype(float)
-    if picture.min() == picture.max():
-        raise ValueError("the image is uniform: there is nothing to reconstruct; give another one")
-    return picture
 
 
 def build_models(setup: Setup) -> list[Sparse]:

@@ -15,12 +15,12 @@ from thincam_jax.commands.sections import (
     Position,
     Section,
     SensorConfig,
-    TargetConfig,
     VariationConfig,
     Wavelength,
     check_names,
     misfit,
 )
+from thincam_jax.commands.study.config import PictureConfig
 from thincam_jax.measured.calibration.hadamard import Display, HadamardSeries, Order
 from thincam_jax.measured.calibration.screen_fit import DEFAULT, PARAMETERS
 
@@ -128,15 +128,12 @@ class MeasuredConfig(Section):
     seconds: Annotated[float, Field(gt=0)]
 
 
-class ScreenTargetConfig(TargetConfig):
+class ScreenTargetConfig(PictureConfig):
     """A picture on the monitor's cells, in grey before a hologram of one colour.
 
-    - `crop`: takes the middle of a picture, that part of its shorter side; `binary`: black where
-      it is below its mean, else white; `published`: by the method's name.
+    - `published`: by the method's name.
     """
 
-    crop: Annotated[float, Field(gt=0, le=1)] = 1.0
-    binary: bool = False
     published: dict[str, MeasuredConfig] = {}
 
 

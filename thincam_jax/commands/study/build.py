@@ -19,7 +19,7 @@ from thincam_jax.commands.sections import (
     TargetConfig,
     VariationConfig,
 )
-from thincam_jax.commands.study.config import StudyConfig
+from thincam_jax.commands.study.config import PictureConfig, StudyConfig
 from thincam_jax.commands.study.study import Capture, Exposure, Method, Reconstructor, Study, Target
 from thincam_jax.imaging import targets as drawn
 from thincam_jax.imaging.metrics.image import SSIM_WINDOW
@@ -143,6 +143,24 @@ def read_picture(target: TargetConfig) -> np.ndarray:
     return getattr(drawn, target.kind)(shape)
 
 
+def picture(target: PictureConfig, cells: tuple[int, int], channels: int = 0) -> np.ndarray:
+    """A target on cells, radiance 0 to 1: (y, x), or with so many channels (y, x, channel).
+
+    **Errors**: ValueError for a uniform picture, FileNotFoundError where there is none.
+    """
+    picture = np.atleast_3d(read_picture(target))
+    if target.crop < 1:
+        picture = drawn.middle_square(picture, round(target.crop * min(picture.shape[:2])))
+    picture = drawn.resize(picture if channels else picture.mean(axis=-1), cells)
+    if channels:
+        picture = np.broadcast_to(picture, (*cells, channels))
+    if target.binary:
+        picture = (picture > picture.mean()).astype(float)
+    if picture.min() == picture.max():
+        raise ValueError("the image is uniform: there is nothing to reconstruct; give another one")
+    return picture
+
+
 def check_study(study: Study, unread: dict[int, str] | None = None) -> None:
     """Refuse cameras that cannot be built, images that cannot be read, and too few pixels.
 
@@ -179,7 +197,7 @@ def _camera_fault(study: Study) -> str:
         jax.eval_shape(lambda: study.psf(study.exposures[0]))
     except MemoryError as error:
         return f"{place}sensor.shape: {error}"
-    except (ValueError, TypeError) as error:
+    except (ValueError, TypeError, FileNotFoundError) as error:
         return f"mask, sensor or model: {error}"
     return ""
 

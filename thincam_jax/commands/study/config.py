@@ -16,6 +16,17 @@ from thincam_jax.commands.sections import (
 )
 
 
+class PictureConfig(TargetConfig):
+    """A target that fills given cells.
+
+    - `crop`: takes the middle of a picture, that part of its shorter side; `binary`: black where it
+      is below its mean, else white.
+    """
+
+    crop: Annotated[float, Field(gt=0, le=1)] = 1.0
+    binary: bool = False
+
+
 class MovingObjectConfig(ObjectConfig):
     """Targets that may move.
 
