@@ -163,6 +163,23 @@ def test_light_is_kept():
 
 
 @pytest.mark.parametrize(
+    ("distance", "pitch", "model", "oversampling"),
+    [
+        (0.2, 5 * um, AS, 5),
+        pytest.param(10.0, 5 * um, AS, 1, marks=pytest.mark.thorough),
+        (1e3, 5 * um, "rayleigh_sommerfeld", 1),
+    ],
+)
+def test_one_cell_is_a_pinhole(distance, pitch, model, oversampling):
+    """Of any height, from near, where it casts its shadow, up to a metre away."""
+    mask = tc.PhaseMask([[0.3 * TURN]], 40 * um, INDEX)
+    here = camera(mask, (12, 14), pitch, distance)
+    exact = tc.LenslessCamera(tc.Pinhole(40 * um), here.sensor, distance)
+    found = psf(here, model=model, oversampling=oversampling, mask_shape=(64, 64))
+    assert relative_l2(found, np.asarray(tc.psf(exact, wavelength=WAVELENGTH))) < 0.03
+
+
+@pytest.mark.parametrize(
     "interpolation", ["bilinear", pytest.param("cells", marks=pytest.mark.thorough)]
 )
 def test_gradients(interpolation):

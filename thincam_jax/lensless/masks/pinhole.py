@@ -115,9 +115,10 @@ class RadialMask(AbstractMask):
 def _disc_area(radius, y, x):
     """Signed area of a disc's part between the axes through its centre and the lines at y and x."""
     sign = jnp.sign(y) * jnp.sign(x)
+    crosses = jnp.abs(y) < radius  # elsewhere no root, whose derivative at 0 is infinite
+    chord = jnp.where(crosses, jnp.sqrt(radius**2 - jnp.where(crosses, y, 0.0) ** 2), 0.0)
     y, x = jnp.minimum(jnp.abs(y), radius), jnp.minimum(jnp.abs(x), radius)
-    inside = x**2 + y**2 < radius**2
-    at = jnp.where(inside, x, jnp.sqrt(jnp.maximum(radius**2 - y**2, 0.0)))
+    at = jnp.minimum(x, chord)
 
     def below_circle(x):
         """∫₀ˣ √(R² − ξ²) dξ."""
