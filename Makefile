@@ -31,7 +31,7 @@ lint: .venv/.installed-dev ## Check the style, the formatting and the types.
 	@$(BIN)/pyright --pythonpath $(BIN)/python
 
 bench: .venv/.installed-bench ## Measure speed and accuracy.
-	@$(BIN)/python -m pytest benchmarks --benchmark-only --benchmark-columns=min,median,stddev,rounds $(ARGS)
+	@$(BIN)/python -m pytest benchmarks --benchmark-columns=min,median,stddev,rounds $(ARGS)
 
 # MkDocs refuses an output folder inside its input folder, hence the move.
 docs: .venv/.installed-docs ## Build the documentation into docs/_build.
