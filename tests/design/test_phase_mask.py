@@ -208,6 +208,9 @@ def test_refusals(retrieved):
     ):
         with pytest.raises(ValueError, match=told):
             refine_mask(linear_objective, mask, limits, data, key=jax.random.key(0))
+    for levels in (0, 1):
+        with pytest.raises(ValueError, match=f"levels = {levels}; give at least 2, or None"):
+            one_turn(BLANK, GREEN, levels)
     with pytest.raises(ValueError, match="steps = 1; give at least 2"):
         refine_mask(
             linear_objective, mask, HeightLimits(1e-3), data, key=jax.random.key(0), steps=1

@@ -59,6 +59,8 @@ def test_refusals(key):
         contour_target(key, GRID, feature=10 * um, line_width=8 * um)
     with pytest.raises(ValueError, match="no contour of the levels"):
         contour_target(key, GRID, feature=80 * um, line_width=8 * um, levels=(5.0,))
+    with pytest.raises(ValueError, match="line_width = 0.09 mm .* lines within the feature"):
+        contour_target(key, GRID, feature=80 * um, line_width=90 * um)
     flat = jnp.ones(GRID.shape)
     with pytest.raises(ValueError, match="have no common centre"):
         retrieve_phase(flat, GRID, PATH, shape=(41, 48), key=key)

@@ -195,7 +195,8 @@ def whole_cells(name: str, side: Any, cell_name: str, cell: Any) -> int:
     side = float(positive(name, side, "mm"))
     cell = float(positive(cell_name, cell, "mm"))
     cells = round(side / cell)
-    if cells < 1 or abs(cells * cell - side) > 1e-4 * cell:
+    rounding = 1e-4 * cell + 2.5e-7 * side  # both were rounded to single precision, it may be
+    if cells < 1 or abs(cells * cell - side) > rounding:
         low, high = max(1, int(side / cell)) * cell, (int(side / cell) + 1) * cell
         nearest = f"{low:g} mm" if low == high else f"{low:g} or {high:g} mm"
         raise ValueError(

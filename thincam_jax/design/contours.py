@@ -29,16 +29,16 @@ def contour_target(
 
     - `grid`: of the PSF; beyond it there is no light.
     - `feature`: distance of the noise's nodes, mm: how far lines are apart. At least four samples.
-    - `line_width`: w, mm, at least a sample.
+    - `line_width`: w, mm, from a sample to `feature`.
     - `levels`: the c; the noise has a standard deviation of about 0.25.
     """
     feature = checks.positive("feature", feature, "mm")
     width = checks.positive("line_width", line_width, "mm")
     pitch = float(grid.pitch)
-    if float(feature) < 4 * pitch or float(width) < pitch:
+    if float(feature) < 4 * pitch or not pitch <= float(width) <= float(feature):
         raise ValueError(
             f"feature = {float(feature):g} mm and line_width = {float(width):g} mm on samples of "
-            f"{pitch:g} mm; give at least {4 * pitch:g} and {pitch:g} mm"
+            f"{pitch:g} mm; give at least {4 * pitch:g} and {pitch:g} mm, lines within the feature"
         )
     noise, (down, across) = _noise(key, grid, feature)
     slope = jnp.sqrt(down**2 + across**2) + jnp.finfo(noise.dtype).eps

@@ -91,8 +91,8 @@ class HeightLimits(NamedTuple):
 
 def one_turn(blank: MaskBlank, wavelength: Number, levels: int | None = None) -> HeightLimits:
     """Limits that hold every phase of one wavelength: λ/(n − 1), less the last of even levels."""
-    turn = float(blank.wrap_height(wavelength))
-    return HeightLimits(turn if levels is None else turn * (levels - 1) / levels, levels)
+    limits = HeightLimits(float(blank.wrap_height(wavelength)), levels).checked()
+    return limits if levels is None else limits._replace(highest=limits.highest * (1 - 1 / levels))
 
 
 def mask_of_phase(

@@ -117,6 +117,7 @@ def test_refused_in_one_line(tmp_path, mask, method, message):
     ("mask", "message"),
     [
         ("{family: mura, order: 100, cell: 30 um}", "order = 100 .* give 97 or 101"),
+        ("{family: file, path: no.png, width: 1 mm}", "'no.png' does not exist; give the path"),
         (
             "{family: random, width: 1 mm, cell: 2 mm}",
             "width = 1 mm is not a whole number of cells",

@@ -74,3 +74,7 @@ def test_refuses(key):
         voronoi_fresnel(key, BLANK, sites=1, **lenses)
     with pytest.raises(ValueError, match=r"height reaches from 0 to .*; give 0 to 0.1 mm"):
         diffuser(key, BLANK, correlation_length=16 * um, rms_slope=10.0)
+    with pytest.raises(
+        ValueError, match=r"height has shape \(3, 4\) and the blank \(.*give as many"
+    ):
+        BLANK.mask(np.zeros((3, 4)))

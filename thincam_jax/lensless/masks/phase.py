@@ -157,8 +157,13 @@ class MaskBlank(eqx.Module):
         return light / (self.material(light) - 1)
 
     def mask(self, height: Any, interpolation: Interpolation = "cells") -> PhaseMask:
-        """The blank with heights, mm."""
-        return PhaseMask(height, self.pitch, self.material, interpolation=interpolation)
+        """The blank with heights, mm: one for each of its cells."""
+        mask = PhaseMask(height, self.pitch, self.material, interpolation=interpolation)
+        if mask.height.shape != self.shape:
+            raise ValueError(
+                f"height has shape {mask.height.shape} and the blank {self.shape}; give as many"
+            )
+        return mask
 
 
 def _map(name: str, values: Any, lowest: float, highest: float, unit: str) -> Float[Array, "y x"]:
