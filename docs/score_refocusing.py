@@ -2,8 +2,10 @@
 
 `python docs/score_refocusing.py CONFIG NETWORK IMAGES TUNING [COUNT]`: a training's config and its
 network; a folder of photographs that no weight has seen, and one of the training's, on which the
-strengths of the baselines are tuned; how many scenes of each kind. Prints a Markdown table: PSNR in
-dB with the half width of its 95 % interval, and SSIM. All methods see the same captures. Draws
+strengths of the baselines are tuned; how many scenes of each kind. Prints Markdown tables: PSNR in
+dB with the half width of its 95 % interval over the photographs, SSIM, MS-SSIM; in the first ones
+each photograph with three seeds of the noise, and what the network gains on each other method, by
+differences of the same captures. All methods see the same captures. Draws
 docs/images/learned_measured.png of pictures that no weight has seen, either.
 """
 
@@ -18,6 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
+from scipy import ndimage
 
 import thincam_jax as tc
 from thincam_jax import learn
@@ -38,6 +41,7 @@ from thincam_jax.learn.refocusing.sources import photographs
 
 STRENGTHS = {"Wiener": (0.03, 0.1, 0.3, 1.0, 3.0), "ADMM-TV": (0.25, 0.5, 1.0, 2.0)}
 NEAR, FAR, SNR = 60.0, 120.0, 30.0
+SEEDS = (0, 1000, 2000)  # added to the noise's
 
 
 class Shot(NamedTuple):
@@ -126,10 +130,11 @@ def one_plane(camera, picture, distance: float, seed: int, snr: float = SNR) -> 
     return shoot(camera, scene, (distance,), seed, snr)
 
 
-def two_planes(camera, front, back, cover, seed: int) -> Shot:
+def two_planes(camera, pair, cover, seed: int, distances=(NEAR, FAR)) -> Shot:
+    """The first of two pictures, where the cover is, before the second."""
     covers = [cover, np.ones(camera.field_shape)]
-    scene = flat_scene(camera, [front, back], covers, [NEAR, FAR])
-    return shoot(camera, scene, (NEAR, FAR), seed)
+    scene = flat_scene(camera, pair, covers, distances)
+    return shoot(camera, scene, distances, seed)
 
 
 def rectangle(shape, seed: int) -> np.ndarray:
@@ -143,9 +148,15 @@ def rectangle(shape, seed: int) -> np.ndarray:
     return 1.0 * ((abs(u) < 0.3 * max(shape)) & (abs(v) < 0.2 * max(shape)))
 
 
-def half(shape, is_left: bool) -> np.ndarray:
-    left = np.broadcast_to(np.arange(shape[1]) < shape[1] // 2, shape)
-    return 1.0 * (left if is_left else ~left)
+def halves(camera, pairs, is_left: bool) -> list[Shot]:
+    """The left half of the frame near, or all of that in a mirror, with the same seeds."""
+    rows, columns = camera.field_shape
+    cover = np.broadcast_to(1.0 * (np.arange(columns) < columns // 2), (rows, columns))
+    turn = slice(None, None, 1 if is_left else -1)
+    return [
+        two_planes(camera, [picture[:, turn] for picture in pair], cover[:, turn], 200 + n)
+        for n, pair in enumerate(pairs)
+    ]
 
 
 def tune(methods: Methods, pictures, count: int) -> None:
@@ -168,19 +179,32 @@ def _psnr(methods: Methods, run: Callable, shot: Shot, distance: float) -> float
     return scores(run(shot, distance), shot.target(methods.camera, distance))["psnr"]
 
 
-def row(name: str, camera, runs: dict[str, Callable], shots: list[Shot], distance: float) -> None:
-    """One line of the table."""
-    cells = []
+def row(
+    name: str, camera, runs: dict[str, Callable], shots: list[Shot], distance: float, seeds: int = 1
+) -> None:
+    """One line of the table. With seeds, a last column: the gain of the last method on each other.
+
+    `seeds`: so many shots of each scene, all scenes of a seed after those of the one before.
+    """
+    cells, means = [], []
     for run in runs.values():
         each = []
         for shot in shots:
             region = shot.in_focus(distance)
             found = scores(run(shot, distance), shot.target(camera, distance), region)
-            each.append((found["psnr"], found["ssim"]))
-        quality, similarity = np.transpose(each)
-        spread = 1.96 * quality.std() / len(quality) ** 0.5
-        cells.append(f"{quality.mean():.2f} ± {spread:.2f} / {similarity.mean():.3f}")
+            each.append((found["psnr"], found["ssim"], found["ms_ssim"]))
+        quality, similarity, multiscale = np.transpose(each)
+        means.append(quality.reshape(seeds, -1).mean(axis=0))
+        told = f"{similarity.mean():.3f} / {multiscale.mean():.3f}"
+        cells.append(f"{interval(means[-1])} / {told}")
+    if seeds > 1:
+        cells.append(", ".join(interval(means[-1] - mean, "+") for mean in means[:-1]))
     print(f"| {name} | " + " | ".join(cells) + " |", flush=True)
+
+
+def interval(values: np.ndarray, sign: str = "") -> str:
+    """The mean and half of its 95 % interval."""
+    return f"{values.mean():{sign}.2f} ± {1.96 * values.std(ddof=1) / len(values) ** 0.5:.2f}"
 
 
 def table(network, pictures, tuning, count: int) -> None:
@@ -197,33 +221,74 @@ def table(network, pictures, tuning, count: int) -> None:
     def head(columns):
         print("\n| test | " + " | ".join(columns) + " |\n|" + "---|" * (len(columns) + 1))
 
-    head(single)
+    gains = "gains on each"
+    head([*single, gains])
     for t in (NEAR, 85.0, FAR, 170.0):
-        shots = [one_plane(camera, pictures[n % count], t, n) for n in rows]
-        row(f"one plane, {t:g} mm", camera, single, shots, t)
-    head(runs)
+        shots = [one_plane(camera, pictures[n % count], t, n + s) for s in SEEDS for n in rows]
+        row(f"one plane, {t:g} mm", camera, single, shots, t, len(SEEDS))
+    head([*runs, gains])
     pairs = [(pictures[n % count], pictures[-1 - n % count]) for n in rows]
-    hiding = [two_planes(camera, *p, rectangle(shape, n), 100 + n) for n, p in enumerate(pairs)]
+    hiding = [
+        two_planes(camera, p, rectangle(shape, n), 100 + n + s)
+        for s in SEEDS
+        for n, p in enumerate(pairs)
+    ]
     for t, name in ((NEAR, "near"), (FAR, "far")):
-        row(f"two planes, {name}", camera, runs, hiding, t)
+        row(f"two planes, {name}", camera, runs, hiding, t, len(SEEDS))
+    hiding = hiding[: len(pairs)]
     times(runs, hiding[0])
     picture(methods)
+    swept(methods, hiding)
     head(fast)
     for is_left in (True, False):
-        shots = [two_planes(camera, *p, half(shape, is_left), 200 + n) for n, p in enumerate(pairs)]
+        shots = halves(camera, pairs, is_left)
         for t, name in ((NEAR, "near"), (FAR, "far")):
             row(f"near half {'left' if is_left else 'right'}, {name}", camera, fast, shots, t)
     for t in np.round(1 / np.linspace(1 / 52, 1 / 190, 15), 1):
         shots = [one_plane(camera, pictures[n % count], float(t), 300 + n) for n in rows]
         row(f"sweep, {t:g} mm", camera, fast, shots, float(t))
-    for snr in (20.0, 25.0, 35.0, 45.0):
-        shots = [one_plane(camera, pictures[n % count], 100.0, 400 + n, snr) for n in rows]
-        row(f"{snr:g} dB", camera, fast, shots, 100.0)
-    shots = [photons(s, 500 + n, camera) for n, s in enumerate(shots)]
-    row("100 electrons", camera, fast, shots, 100.0)
+    for t in (NEAR, 100.0, 170.0):
+        for snr in (20.0, 25.0, 35.0, 45.0):
+            shots = [one_plane(camera, pictures[n % count], t, 400 + n, snr) for n in rows]
+            row(f"{t:g} mm, {snr:g} dB", camera, fast, shots, t)
+        shots = [photons(s, 500 + n, camera) for n, s in enumerate(shots)]
+        row(f"{t:g} mm, 100 electrons", camera, fast, shots, t)
     row("two planes, rendered by sub-apertures, near", camera, fast, apart(camera, hiding), NEAR)
     row("two planes, rendered by sub-apertures, far", camera, fast, apart(camera, hiding), FAR)
     errors(network, methods, pictures, rows)
+
+
+def swept(methods: Methods, shots: list[Shot]) -> None:
+    """How far the two planes that the network finds stand from the true ones.
+
+    Found are the two highest peaks, a depth of focus apart, of the density of 1/t over the pixels,
+    each by its confidence.
+    """
+    camera, network = methods.camera, methods.network
+    focus, errors = depth_of_focus(camera), []
+    axis = np.linspace(1 / float(camera.far), 1 / float(camera.near), 2000)
+    for shot in shots:
+        found = network.distance(shot.capture, shot.deviation)
+        inverse, sure = 1 / np.ravel(found.distance), np.ravel(found.confidence)
+        counts, _ = np.histogram(inverse, len(axis), (axis[0], axis[-1]), weights=sure)
+        density = ndimage.gaussian_filter1d(counts, focus / 8 / (axis[1] - axis[0]))
+        first = axis[density.argmax()]
+        second = axis[np.where(abs(axis - first) > focus, density, 0).argmax()]
+        pairs = zip(sorted((first, second)), sorted(1 / np.asarray(shot.distances)), strict=True)
+        errors.append([abs(a - b) / focus for a, b in pairs])
+    far, near = np.median(errors, axis=0)
+    within = np.mean(np.asarray(errors) < 0.25)
+    print(
+        f"\nplanes found, parts of a depth of focus: near {near:.2f}, far {far:.2f} in the median;"
+    )
+    print(f"within a quarter {within:.0%}", flush=True)
+
+
+def depth_of_focus(camera) -> float:
+    """Of 1/t, 1/mm, for the finest detail."""
+    thin = camera.camera
+    radius = float(thin.mask.extent[1]) / 2
+    return np.pi / float(thin.mask.beta * thin.distance) / radius**2
 
 
 def photons(shot: Shot, seed: int, camera) -> Shot:
@@ -249,8 +314,7 @@ def errors(network, methods: Methods, pictures, rows) -> None:
     """What is told is wrong: the distance by parts of a depth of focus, β and d by 1 %."""
     camera = network.camera
     shots = [one_plane(camera, pictures[n % len(pictures)], 100.0, 700 + n) for n in rows]
-    focus = 3.14 / float(camera.camera.mask.beta * camera.camera.distance)
-    focus = focus / (float(camera.camera.mask.extent[1]) / 2) ** 2  # of 1/t, 1/mm
+    focus = depth_of_focus(camera)
     fast = {"Wiener": methods.wiener, "network": methods.learned}
     row("nothing told wrong", camera, fast, shots, 100.0)
     for part in (0.25, 0.5, 1.0, 2.0):
@@ -290,7 +354,7 @@ def picture(methods: Methods) -> None:
         resize(middle_square(sample_image(name), 256), camera.field_shape)
         for name in ("clock", "page")
     )
-    both = two_planes(camera, page, clock, rectangle(camera.field_shape, 3), 800)
+    both = two_planes(camera, (page, clock), rectangle(camera.field_shape, 3), 800)
     shots = [
         (one_plane(camera, clock, 85.0, 801), 85.0),
         (one_plane(camera, page, 85.0, 802), 85.0),

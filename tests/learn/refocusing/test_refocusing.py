@@ -13,6 +13,7 @@ from thincam_jax.learn.refocusing.cameras import RefocusCamera
 from thincam_jax.learn.refocusing.dead_leaves import dead_leaves
 from thincam_jax.learn.refocusing.evaluation import (
     flat_scene,
+    multiscale_ssim,
     scores,
     sub_aperture_capture,
 )
@@ -241,3 +242,30 @@ def make_step(prior):
         return jax.tree.map(lambda w, u: w - 3e-3 * u, prior, updates), state, value
 
     return step, adam.init(prior)
+
+
+def test_multiscale_ssim_is_that_of_the_formula():
+    """Wang et al. 2003, each window summed by itself; and equal images have 1."""
+    rng = np.random.default_rng(1)
+    target = rng.uniform(size=(24, 30))
+    image = 0.7 * target + 0.2 * rng.uniform(size=target.shape) + 0.05
+    y, x = np.mgrid[-5:6, -5:6]
+    window = np.exp(-(x**2 + y**2) / (2 * 1.5**2))
+    window /= window.sum()
+
+    def means(f, g):
+        luminance, structure = [], []
+        for i, j in np.ndindex(f.shape[0] - 10, f.shape[1] - 10):
+            a, b = f[i : i + 11, j : j + 11], g[i : i + 11, j : j + 11]
+            m, n = np.sum(window * a), np.sum(window * b)
+            both = np.sum(window * (a - m) * (b - n))
+            spread = np.sum(window * ((a - m) ** 2 + (b - n) ** 2))
+            structure.append((2 * both + 9e-4) / (spread + 9e-4))
+            luminance.append((2 * m * n + 1e-4) / (m**2 + n**2 + 1e-4) * structure[-1])
+        return np.mean(structure), np.mean(luminance)
+
+    halves = [f.reshape(12, 2, 15, 2).mean(axis=(1, 3)) for f in (image, target)]
+    fine, coarse = 0.0448 / 0.3304, 0.2856 / 0.3304
+    wanted = means(image, target)[0] ** fine * means(*halves)[1] ** coarse
+    np.testing.assert_allclose(multiscale_ssim(image, target), wanted, rtol=1e-9)
+    np.testing.assert_allclose(multiscale_ssim(target, target), 1)

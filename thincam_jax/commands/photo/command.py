@@ -49,7 +49,8 @@ def reconstruct(
         Option(help="In place of --psf, a study (YAML) whose first shot took the capture."),
     ] = None,
     network: Annotated[
-        Path | None, Option(help="Of 'thincam train', for that camera, in place of a method.")
+        Path | None,
+        Option(help="Of 'thincam train' for that camera, or 'shipped', in place of a method."),
     ] = None,
     distance: Annotated[
         str | None, Option(help="To focus a network on, as 120mm. Default: the study's object.")

@@ -4,10 +4,12 @@ import itertools
 
 import jax.numpy as jnp
 import numpy as np
+import skimage.measure
 from jaxtyping import Array, Float, PRNGKeyArray
 from scipy import ndimage
+from skimage.metrics import structural_similarity
 
-from thincam_jax.imaging.metrics import psnr, ssim
+from thincam_jax.imaging.metrics import align, psnr, ssim
 from thincam_jax.imaging.operators import CropConvolution
 from thincam_jax.imaging.sensor import AbstractNoise
 from thincam_jax.learn.refocusing.cameras import RefocusCamera
@@ -105,9 +107,9 @@ def _edges(count: int, pitch: float, side: float, cells: int) -> np.ndarray:
 
 
 def scores(image, target, region=None) -> dict[str, float]:
-    """PSNR and SSIM of an image, aligned to the target in gain and offset, whose peak is 1.
+    """PSNR, SSIM and MS-SSIM of an image, aligned to the target, whose peak is 1, by a line.
 
-    `region`: where to take the PSNR, (y, x) booleans; SSIM is that of the whole image.
+    `region`: where to take the PSNR, (y, x) booleans; the others are of the whole image.
     """
     target = np.asarray(target, float)
     image = np.asarray(image, float) / max(target.max(), 1e-9)
@@ -116,4 +118,30 @@ def scores(image, target, region=None) -> dict[str, float]:
     return {
         "psnr": psnr(image[inside][:, None], target[inside][:, None]),
         "ssim": ssim(image, target),
+        "ms_ssim": multiscale_ssim(align(image, target)[0], target),
     }
+
+
+# Exponents of the scales from the finest (Wang, Simoncelli and Bovik, Asilomar 2003, section 3.2).
+_SCALES = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
+
+
+def multiscale_ssim(image: np.ndarray, target: np.ndarray) -> float:
+    """Multi-scale structural similarity (Wang et al. 2003), peak 1, Gaussian windows of 1.5 pixels.
+
+    Contrast and structure at every scale, luminance at the coarsest. Images too small for five
+    scales of the window's 11 pixels have fewer, whose exponents then sum to 1 again.
+    """
+    count = min(len(_SCALES), int(np.log2(min(image.shape) / 11)) + 1)
+    exponents = np.asarray(_SCALES[:count]) / sum(_SCALES[:count])
+    small, found = 0.01**2, 1.0
+    options = {"gaussian_weights": True, "use_sample_covariance": False, "data_range": 1.0}
+    for scale, exponent in enumerate(exponents):
+        if scale:
+            image, target = (skimage.measure.block_reduce(x, 2, np.mean) for x in (image, target))
+        similarity = structural_similarity(target, image, full=True, **options)[1]
+        if scale < count - 1:
+            a, b = (ndimage.gaussian_filter(x, 1.5, truncate=3.5) for x in (image, target))
+            similarity = similarity * (a**2 + b**2 + small) / (2 * a * b + small)
+        found *= max(float(np.mean(similarity[5:-5, 5:-5])), 0.0) ** exponent
+    return found
