@@ -57,6 +57,22 @@ def test_without_a_calibration_there_is_a_report(tmp_path):
 
 
 @pytest.mark.thorough
+def test_a_tilted_plate_is_found(tmp_path):
+    """From a straight one, by the calibration; and the file's angle is the camera's."""
+    fitted = ("calibration.fitted=[plate_x, plate_y]", "calibration.glass_thickness=null")
+    config = tiny.experiment(
+        tmp_path, "screen.tilt=[0.4 deg, -0.2 deg]", *fitted, "calibration.distances=[]"
+    )
+    setup = build_setup(config)
+    tilt = np.deg2rad([0.4, -0.2])
+    np.testing.assert_allclose(setup.camera.tilt, tilt)
+    values = run_screen(setup, RunFolder(tmp_path / "out"), Told())["calibration"]["fit"]["values"]
+    for name, true in zip(("plate_x", "plate_y"), tilt, strict=True):
+        assert values[name]["true"] == pytest.approx(true)
+        assert values[name]["found"] == pytest.approx(true, abs=2e-4)
+
+
+@pytest.mark.thorough
 def test_a_full_colour_hologram_gives_a_colour_picture(tmp_path):
     """Each channel by its own hologram, and without ghosts it is worse."""
     overrides = (

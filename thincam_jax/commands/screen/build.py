@@ -151,7 +151,8 @@ def _camera(config: SeeThroughConfig, wavelength: float, thickness: float) -> wg
     )
     lens = config.lens
     sensor = Sensor(**dict(config.sensor))
-    return wg.SeeThroughCamera(screen, sensor, lens.focal_distance, lens.lens_distance)
+    distances = lens.focal_distance, lens.lens_distance
+    return wg.SeeThroughCamera(screen, sensor, *distances, tilt=plate.tilt)
 
 
 def _rectangle(part: RectangleConfig | None) -> wg.Rectangle | None:

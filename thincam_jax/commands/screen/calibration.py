@@ -7,6 +7,7 @@ from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -130,10 +131,9 @@ class Calibration:
         """The screen from the matrix, which is let go of: another of its size may be measured."""
         setup = self.setup
         began = time.perf_counter()
-        (start,) = build_cameras(setup.config, self.options.glass_thickness)
         fit = fit_screen(
             self.measured.matrix,
-            start,
+            self._assumed(),
             setup.plane,
             self.options.fitted,
             orders=setup.config.orders,
@@ -158,6 +158,12 @@ class Calibration:
         }
         del self.measured
 
+    def _assumed(self) -> wg.SeeThroughCamera:
+        """What the camera is taken for before the fit: straight where its tilt is to be found."""
+        (camera,) = build_cameras(self.setup.config, self.options.glass_thickness)
+        known = [name not in self.options.fitted for name in ("plate_x", "plate_y")]
+        return eqx.tree_at(lambda c: c.tilt, camera, jnp.where(jnp.asarray(known), camera.tilt, 0))
+
     def look_from(self, distance: float) -> None:
         """Targets at another distance, by the last method: from the fit, and measured there."""
         assert self.fitted is not None  # an earlier step
@@ -168,9 +174,8 @@ class Calibration:
         there = replace(self.setup, plane=plane)
         true = build_model(there, config.models[0])
         captured, samples = capture(there, true), config.band_samples
-        (camera,) = build_cameras(config, self.options.glass_thickness)
         fitted = self.fitted.system(plane)
-        assumed = wg.system_operator(camera, plane, config.orders, samples)
+        assumed = wg.system_operator(self._assumed(), plane, config.orders, samples)
         assert isinstance(fitted.operator, Sparse)
         # All reduced, so that one compiled program serves them.
         ways = {
@@ -230,6 +235,8 @@ def _true_values(setup: Setup) -> dict[str, float]:
         "tilt": math.atan2(x, -y),
         "film_thickness": float(hologram.thickness),
         "index_modulation": float(hologram.index_modulation),
+        "plate_x": float(camera.tilt[0]),
+        "plate_y": float(camera.tilt[1]),
         "object_distance": float(plane.distance),
         "object_x": float(plane.centre[0]),
         "object_y": float(plane.centre[1]),

@@ -66,10 +66,14 @@ class RectangleConfig(Section):
 
 
 class PlateConfig(Section):
-    """The glass plate; a hologram without an outline covers its whole surface."""
+    """The glass plate; a hologram without an outline covers its whole surface.
+
+    - `tilt`: against the camera, about x and then about y.
+    """
 
     glass_thickness: Length
     glass_index: Index = 1.5
+    tilt: tuple[Acute, Acute] = (0.0, 0.0)
     top: RectangleConfig | None = None
     bottom: RectangleConfig | None = None
 
@@ -150,7 +154,8 @@ class CalibrationConfig(Section):
     - `exposure`: part of the camera's range that a white monitor fills; `offset`: its dark level
       and `noise`: standard deviation of its white noise, in counts.
     - `keep_captures`: leaves the stores of the captures in the run's folder.
-    - `glass_thickness`: what the plate is taken for before the fit; `fitted`: what is found.
+    - `glass_thickness`: what the plate is taken for before the fit, and straight if its tilt is
+      fitted; `fitted`: what is found.
     - `distances`: of the object, for which the matrix is told from the fit and is measured anew.
     """
 
