@@ -1,7 +1,7 @@
 """Tools shared by the tests: data, trace counting, gradients by differences, relative errors."""
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,18 @@ def shared_data(name: str) -> Path:
     if not path.exists():
         pytest.skip(f"needs the data set {name} at ../shared/data/{name}, beside the checkout")
     return path
+
+
+def quick(values: Iterable, *places: int) -> list:
+    """Parameters of a test: those at `places` in every run, the others in the thorough one."""
+    return [
+        value
+        if place in places
+        else pytest.param(
+            *(value if isinstance(value, tuple) else (value,)), marks=pytest.mark.thorough
+        )
+        for place, value in enumerate(values)
+    ]
 
 
 def count_traces(function: Callable) -> Callable:

@@ -8,11 +8,11 @@ import pytest
 
 from helpers import ROOT
 
-# Propagation, an operator, and iterations of ADMM: what other tests compile without optimisation.
+# Propagation, an operator, a step of ADMM with its gradient: what others compile unoptimised.
 SAMPLE = (
-    "tests/lensless/propagation/test_closed_form.py::test_is_the_thesis_formula",
-    "tests/imaging/operators/test_crop_convolution.py::test_it_is_the_integral_over_the_field",
-    "tests/imaging/operators/test_crop_convolution.py::test_gradients",
+    "tests/lensless/propagation/test_closed_form.py::test_is_the_thesis_formula[6.5-inf]",
+    "tests/imaging/operators/test_crop_convolution.py"
+    "::test_it_is_the_integral_over_the_field[sensor1-field1]",
     "tests/reconstruction/test_fourier_splitting.py::test_single_precision_and_gradients[1]",
 )
 

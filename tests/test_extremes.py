@@ -16,7 +16,7 @@ from lensless.propagation.reference import chirp_by_quadrature
 from naive_formulas import NAIVE
 
 import thincam_jax as tc
-from helpers import AS_IN_USE, count_traces, finite_difference, relative_l2
+from helpers import AS_IN_USE, count_traces, finite_difference, quick, relative_l2
 
 DTYPES = (np.float32, np.float64)
 STATIC = ("shape", "model", "pixel_integration")
@@ -122,15 +122,15 @@ def difference(extreme: Extreme, name: str) -> tuple[float, float]:
     return float(slope) / step, rounding * float(spread) / step
 
 
-# Each of these is the only one of a program that takes long to compile.
-ALONE = ("1×1 sensor", "16384×64 sensor", "closed_form: t = 0.1 mm, pixel average")
+# Near and far, in focus, the finest zones and shadows larger than their mask: one program serves
+# these, in either precision. A pixel average of the shadow's edge is a program of its own.
+QUICK = ("the thesis' camera", "focus", "d = 1 µm", "t = 0.1 mm", "t = ∞", "β = 1e6")
+SINGLE = ("geometric: β at Nyquist, pixel average",)
 
 
 def is_quick(extreme: Extreme, dtype) -> bool:
-    """Whether others share its program: in double precision points of the separable model do."""
-    points = extreme.model == "separable" and not extreme.pixel_integration
-    shared = dtype is np.float32 or points
-    return shared and extreme.name not in ALONE
+    """Whether it is among those that every run looks at."""
+    return extreme.name in QUICK or (dtype is np.float32 and extreme.name in SINGLE)
 
 
 def case(extreme: Extreme, dtype: type = np.float64):
@@ -139,9 +139,7 @@ def case(extreme: Extreme, dtype: type = np.float64):
     return pytest.param(extreme, dtype, id=f"{extreme.name}-{dtype.__name__}", marks=marks)
 
 
-choices = pytest.mark.parametrize(
-    "name", [pytest.param(n, marks=pytest.mark.thorough) if n in ALONE else n for n in CHOICES]
-)
+choices = pytest.mark.parametrize("name", quick(CHOICES, 1))
 
 
 @pytest.mark.parametrize(("extreme", "dtype"), [case(e, d) for e in EXTREMES for d in DTYPES])
@@ -178,7 +176,10 @@ def test_gradient_against_differences(extreme, dtype):
 @pytest.mark.parametrize(
     ("name", "parameters", "tolerance"),
     [
-        ("d = 1 nm", ("beta", "phase", "width", "distance", "wavelength"), 4e-5),
+        pytest.param(
+            *("d = 1 nm", ("beta", "phase", "width", "distance", "wavelength"), 4e-5),
+            marks=pytest.mark.thorough,
+        ),
         ("β = 1e6", PARAMETERS, 1e-6),
         pytest.param(
             *("closed_form: ε = 0.999", ("beta", "phase", "distance", "wavelength"), 1e-7),

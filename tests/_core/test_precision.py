@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import thincam_jax as tc
-from helpers import relative_l2
+from helpers import quick, relative_l2
 from thincam_jax._core.precision import allow, cast, phasor
 
 SHAPE = (48, 80)
@@ -31,7 +31,7 @@ def conditions(precision):
 
 
 @pytest.mark.parametrize("average", [False, pytest.param(True, marks=pytest.mark.thorough)])
-@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize("model", quick(MODELS, 0, 3))
 def test_double_precision_without_the_switch(model, average):
     """The float64 result, rounded once: bit by bit, while JAX knows float32 only."""
     small = {"width": 0.5, "pitch": 0.01} if model == "angular_spectrum" else {}
@@ -65,7 +65,7 @@ def test_transfer_function_in_double_precision():
     assert error < 5e-8 < relative_l2(np.asarray(own, complex), expected)
 
 
-@pytest.mark.parametrize("model", MODELS[:-1])
+@pytest.mark.parametrize("model", quick(MODELS[:-1], 0, 3))
 def test_single_precision_of_a_double_camera(model):
     """Comes back in float64, with the error of float32: neither none, nor more than a few 1e-5."""
     expected = tc.psf(camera_of(), model=model, **CONDITIONS)

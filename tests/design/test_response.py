@@ -37,7 +37,8 @@ def test_rings_against_the_exact_model(crop):
     np.testing.assert_allclose(errors[1], errors[0], rtol=0.05)
 
 
-@pytest.mark.parametrize("profile", ["cosine", pytest.param("binary", marks=pytest.mark.thorough)])
+@pytest.mark.thorough
+@pytest.mark.parametrize("profile", ["cosine", "binary"])
 def test_the_exact_model_is_that_of_each_camera(profile):
     design, judged = thesis_design(profile), setup(crop=False)
     frequencies = Quadrant(HIGHEST, 24)

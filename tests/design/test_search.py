@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from design.setting import HIGHEST, error, setup, two_betas
 
+from helpers import quick
 from thincam_jax.design import DesignSpace, Polar, PowerLaw, Variable, find_designs, landscape
 from thincam_jax.design.search import _descend, _descend_in_box
 
@@ -44,6 +45,7 @@ def run(objective, data, seed=0, **options):
 
 
 SOLVERS = pytest.mark.parametrize("solver", ["bfgs", "lbfgsb"])
+ONE_SOLVER = pytest.mark.parametrize("solver", quick(["bfgs", "lbfgsb"], 0))
 
 
 @SOLVERS
@@ -80,7 +82,7 @@ def test_improved_on_the_exact_objective():
     assert objectives == sorted(objectives)
 
 
-@SOLVERS
+@ONE_SOLVER
 def test_on_the_faces(solver):
     result = run(slope, jnp.asarray(1.0), solver=solver)
     best = result.found[0]
@@ -91,7 +93,7 @@ def test_on_the_faces(solver):
     )
 
 
-@SOLVERS
+@ONE_SOLVER
 def test_regions_without_a_number(solver):
     """16 of 28 parts of the cube: counted among the samples, and the best is found beside them."""
     data = jnp.asarray(DEEPEST)
@@ -104,7 +106,7 @@ def test_regions_without_a_number(solver):
     assert nowhere.failed == 64 + 6
 
 
-@SOLVERS
+@ONE_SOLVER
 def test_evaluations_are_those_made(solver):
     """Counted from within. One start: the loop of several runs until the last has ended."""
     COUNT[0] = 0

@@ -98,6 +98,7 @@ def test_noise():
     np.testing.assert_allclose(counted, [(500 + 25) / 250**2, (750 + 25) / 250**2])
 
 
+@pytest.mark.thorough
 def test_a_wide_sensor_counts_all_variance():
     """The window takes away what varies over more than the sensor: nothing if it is endless."""
     design, judged = small()

@@ -53,6 +53,7 @@ def test_slopes():
     assert np.all(np.isfinite(slope(POINT, MODEL.levels(POINT))))
 
 
+@pytest.mark.thorough
 def test_order_of_captures_does_not_matter():
     np.testing.assert_allclose(MODEL.levels(POINT), MODEL.levels(POINT[::-1]), rtol=1e-9)
 

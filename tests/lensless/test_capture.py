@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import thincam_jax as tc
-from helpers import finite_difference, relative_l2
+from helpers import finite_difference, quick, relative_l2
 from thincam_jax.imaging.operators import kernel_grid
 from thincam_jax.lensless.forward import imaging_operator, projected_shape
 from thincam_jax.units import nm, um
@@ -42,10 +42,13 @@ def shifted_psf(own, shadow, **how):
 
 @pytest.mark.parametrize(
     ("sensor", "shape", "how"),
-    [
-        ((80, 96), (30, 40), {"model": "separable", "pixel_integration": True}),
-        ((81, 96), (23, 16), {"model": "closed_form", "pixel_integration": False}),
-    ],
+    quick(
+        [
+            ((80, 96), (30, 40), {"model": "separable", "pixel_integration": True}),
+            ((81, 96), (23, 16), {"model": "closed_form", "pixel_integration": False}),
+        ],
+        1,
+    ),
 )
 def test_a_point_at_m_gives_the_psf_at_minus_m_d_over_t(sensor, shape, how):
     own = camera(sensor=tc.Sensor(sensor, 20 * um))
@@ -170,7 +173,7 @@ def test_noise_without_a_key():
         )
 
 
-@pytest.mark.parametrize("shape", [(1, 1), (1, 9)])
+@pytest.mark.parametrize("shape", [pytest.param((1, 1), marks=pytest.mark.thorough), (1, 9)])
 def test_single_pixels_and_lines(shape):
     """Every pixel is the sum of the PSF times the turned scene, written out."""
     field = (5 + (shape[0] + 1) % 2, 7 + (shape[1] + 1) % 2)
@@ -270,6 +273,7 @@ def test_sizes_beyond_the_memory_are_refused_with_an_estimate(monkeypatch):
         tc.capture(camera(), tc.Scene(plane(photograph((100, 30, 40))), 500 * nm))
 
 
+@pytest.mark.thorough
 def test_camera_built_inside_jit():
     """Plain numbers stay known there, so that sizes can depend on them."""
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import thincam_jax as tc
+from helpers import quick
 from thincam_jax.units import um
 
 SCENE = tc.Scene(tc.ImagePlane(np.ones((3, 4)), distance=250.0, width=60.0), 5e-4)
@@ -19,7 +20,7 @@ def camera(mask, pitch):
 FZA = tc.FresnelZoneAperture(25.0, width=5.632)
 
 
-@pytest.mark.parametrize(("pitch", "quiet"), [(88 * um, False), (22 * um, True)])
+@pytest.mark.parametrize(("pitch", "quiet"), quick([(88 * um, False), (22 * um, True)], 0))
 def test_zones_finer_than_the_pixels_are_told_in_one_line(pitch, quiet):
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")

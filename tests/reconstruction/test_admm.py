@@ -1,5 +1,6 @@
 """ADMM against a primal-dual solver on dense matrices, and how its method gets to the minimum."""
 
+import itertools
 from typing import NamedTuple
 
 import equinox as eqx
@@ -11,7 +12,7 @@ import tifffile
 from reconstruction import dense, rig, scenes
 
 import thincam_jax as tc
-from helpers import count_traces, relative_l2, shared_data
+from helpers import count_traces, quick, relative_l2, shared_data
 from thincam_jax.imaging.operators import CropConvolution, kernel_shape, window_shape
 from thincam_jax.reconstruction import drive
 from thincam_jax.reconstruction.admm import AdmmMethod, splitting_of
@@ -149,9 +150,7 @@ def energy(given: Case, image) -> float:
 @pytest.mark.parametrize(
     "name",
     [
-        name
-        if name in ("colour", "planes_anisotropic")
-        else pytest.param(name, marks=pytest.mark.thorough)
+        name if name == "planes_anisotropic" else pytest.param(name, marks=pytest.mark.thorough)
         for name in CASES
     ],
 )
@@ -174,8 +173,10 @@ def test_the_minimiser_is_that_of_another_method(name):
         assert energy(given, other) > lowest
 
 
-@pytest.mark.parametrize("relaxation", [0.7, 1.0, 1.8])
-@pytest.mark.parametrize("factors", [(0.1, 0.1, 0.1), (0.3, 0.2, 0.05)])
+@pytest.mark.parametrize(
+    ("relaxation", "factors"),
+    quick(itertools.product([0.7, 1.0, 1.8], [(0.1, 0.1, 0.1), (0.3, 0.2, 0.05)]), 0, 5),
+)
 def test_relaxation_and_penalties_do_not_move_the_minimiser(relaxation, factors):
     given = case("two")
     expected = solved(given.problem)
@@ -261,9 +262,8 @@ def driven(problem, *, iterations=1500, tolerance=1e-9, image=None, **settings):
     return drive.drive(method, image, iterations=iterations, tolerance=tolerance, **settings)
 
 
-@pytest.mark.parametrize(
-    "name", ["colour_anisotropic", pytest.param("planes", marks=pytest.mark.thorough)]
-)
+@pytest.mark.thorough
+@pytest.mark.parametrize("name", ["colour_anisotropic", "planes"])
 def test_it_converges_to_the_minimum_of_another_method(name):
     """With its own penalties, which start 10 times too large for these problems and adapt."""
     given = case(name)

@@ -23,7 +23,7 @@ import scipy.sparse
 from reconstruction import dense, scenes
 
 import thincam_jax as tc
-from helpers import finite_difference, relative_l2
+from helpers import finite_difference, quick, relative_l2
 from thincam_jax.imaging.operators import (
     AbstractOperator,
     CropConvolution,
@@ -149,7 +149,7 @@ def test_total_variation_by_admm_and_fista(name):
     assert relative_l2(plain, expected(name)) > 1e-2
 
 
-@NAMES
+@pytest.mark.parametrize("name", quick(operators(), 0, 3))
 def test_ridge(name):
     """The posterior mean, by the normal equations as one dense system."""
     given = case(name)
@@ -197,6 +197,7 @@ def test_solvers_of_optimistix_take_the_problem():
         assert relative_l2(image, expected("separable")) < 1e-6
 
 
+@pytest.mark.thorough
 def test_implicit_gradients_of_a_dense_operator():
     """Of the image's brightness in a place, by matrix, captures and τ, against differences."""
     rng = np.random.default_rng(1)
@@ -249,6 +250,7 @@ def test_batches_and_planes():
     assert found.image.shape == shape and relative_l2(found.image, truth) < 1e-2
 
 
+@pytest.mark.thorough
 def test_captures_in_any_units_and_single_precision():
     """Captures times a number: the image times that number."""
     given = case("separable")

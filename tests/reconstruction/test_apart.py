@@ -9,7 +9,7 @@ import pytest
 from reconstruction import rig, scenes
 
 import thincam_jax as tc
-from helpers import relative_l2
+from helpers import quick, relative_l2
 from thincam_jax.reconstruction.admm import AdmmMethod
 from thincam_jax.reconstruction.apart import Apart, _together, parts, worth_taking_apart
 from thincam_jax.reconstruction.drive import drive
@@ -42,7 +42,7 @@ def masked(problem, seed=0):
     )
 
 
-@pytest.mark.parametrize("coupling, count", [("none", 6), ("joint", 3)])
+@pytest.mark.parametrize(("coupling", "count"), quick([("none", 6), ("joint", 3)], 1))
 def test_the_objective_of_the_parts_is_that_of_the_whole(coupling, count):
     """Whatever the axes along which the parts lie, with weights of every kind."""
     problem, _ = scenes.problem(

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from reconstruction import extremes, scenes
 
-from helpers import relative_l2
+from helpers import quick, relative_l2
 from thincam_jax.reconstruction import drive as module
 from thincam_jax.reconstruction import plug_and_play
 from thincam_jax.reconstruction.fista import solve_fista
@@ -28,7 +28,9 @@ class Smoother(eqx.Module):
         return image + self.strength.astype(image.dtype) * (around - image)
 
 
-@pytest.mark.parametrize("regulariser", [None, Sparsity(Cosines())], ids=["tv", "cosines"])
+@pytest.mark.parametrize(
+    "regulariser", quick([None, Sparsity(Cosines())], 0), ids=["tv", "cosines"]
+)
 def test_with_the_denoiser_of_a_regulariser_it_is_its_minimiser(regulariser):
     # Of cosines the proximal map is in closed form then, of total variation it is not.
     how = {"regulariser": regulariser, "nonnegative": regulariser is None}

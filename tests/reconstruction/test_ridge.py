@@ -11,7 +11,7 @@ import scipy.signal
 from reconstruction import extremes, rig, scenes
 
 import thincam_jax as tc
-from helpers import relative_l2
+from helpers import quick, relative_l2
 from thincam_jax.reconstruction import ridge as module
 from thincam_jax.reconstruction.ridge import image_precision, solve_ridge
 
@@ -34,7 +34,9 @@ def dense(problem, precision, mean):
     return np.linalg.solve(left, right).reshape(problem.image_shape)
 
 
-@pytest.mark.parametrize("more", [{}, {"channels": 2, "planes": 2}], ids=["grey", "planes"])
+@pytest.mark.parametrize(
+    "more", quick([{}, {"channels": 2, "planes": 2}], 1), ids=["grey", "planes"]
+)
 def test_it_is_the_dense_solution(more):
     problem, _ = scenes.problem((11, 9), (7, 8), **more)
     weights = tuple(
@@ -188,6 +190,7 @@ def test_ridge_of_a_difference_knows_the_brightness_of_the_captures():
     assert float(found.pitch) == pytest.approx(rig.OBJECT_PITCH)
 
 
+@pytest.mark.thorough
 def test_extremes():
     """Darkness, nothing trusted, a NaN pixel; single precision stays."""
     extremes.check_recordings(tc.Ridge(iterations=30))

@@ -10,7 +10,7 @@ import pytest
 from reconstruction import rig
 from scipy import optimize
 
-from helpers import count_traces, finite_difference, relative_l2
+from helpers import count_traces, finite_difference, quick, relative_l2
 from thincam_jax.reconstruction.total_variation import (
     OPPONENT,
     TotalVariation,
@@ -197,7 +197,7 @@ def test_moreau(kind, coupling):
     assert not shortened(slopes, 100.0, kind, coupling).any()
 
 
-@pytest.mark.parametrize(("kind", "coupling"), EVERY)
+@pytest.mark.parametrize(("kind", "coupling"), quick(EVERY, 1, 5))
 def test_gradients(kind, coupling):
     """Of the variation and of a prox, by differences; finite on an even image."""
     image = jnp.asarray(RNG.normal(size=(3, 2, 4, 5)))
@@ -255,8 +255,7 @@ def test_what_is_refused():
             TotalVariation(coupling="x")
 
 
-@pytest.mark.parametrize("kind", ["isotropic", "anisotropic"])
-@pytest.mark.parametrize("coupling", ["none", "joint", "opponent"])
+@pytest.mark.parametrize(("kind", "coupling"), quick(EVERY, 2, 4))
 def test_slope_of_the_prox_by_differences(kind, coupling):
     """In slopes and step; of vectors that are shortened and of those that vanish."""
     variation = TotalVariation(kind, coupling, chroma_weight=1.3)

@@ -118,6 +118,7 @@ def test_every_colour_has_the_ghosts_of_its_wavelength():
     assert np.diff(steps).min() > 2
 
 
+@pytest.mark.thorough
 def test_a_colour_picture_comes_back():
     """Each colour by its own hologram: with that of green in place of all, captures are far off."""
     seen = wg.ObjectPlane((12, 16), 550.0, 120.0, (0.0, 27.0))

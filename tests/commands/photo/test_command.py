@@ -44,6 +44,7 @@ def test_pixels_without_light_are_not_enough(grey, tmp_path):
     assert not (tmp_path / "image.png").exists()
 
 
+@pytest.mark.thorough
 def test_a_black_image_is_told(grey, tmp_path):
     out = tmp_path / "image.png"
     result = call(grey, out, "--background", grey["dark"], "--tau", 1e6, "--iterations", 20)
@@ -176,6 +177,7 @@ def test_colours(tmp_path, psf, coupling):
     assert means.max() < 1.6 * means.min()
 
 
+@pytest.mark.thorough
 def test_mosaic(tmp_path):
     paths = simulated.bayer_files(tmp_path)
     out = tmp_path / "image.png"

@@ -212,6 +212,7 @@ def test_two_distances_leave_no_zero(distant, near):
         assert response.metrics["first_zero_cycles_per_mm"] is None
 
 
+@pytest.mark.thorough
 def test_phase_pairs_have_no_first_zero(distant, near):
     """ERRATA 3.49, 3.5.1: where cos(πλdu²) vanishes the second harmonic is left. What crosses zero
     is the carrier sin X − cos X; where, depends on the sampling.

@@ -8,6 +8,7 @@ import scipy.fft
 import scipy.signal
 from imaging.operators.dense import numbers
 
+from helpers import quick
 from thincam_jax.imaging.operators import CropConvolution, adjoint_error, kernel_shape, window_shape
 
 PITCH = 0.05
@@ -54,7 +55,7 @@ KERNELS = [
 ]
 
 
-@pytest.mark.parametrize(("sensor", "kernel", "field"), KERNELS)
+@pytest.mark.parametrize(("sensor", "kernel", "field"), quick(KERNELS, 1, 5, 7, 9))
 def test_a_kernel_of_another_size(sensor, kernel, field, key):
     """Smaller is zero outside, larger is cut: the sum is that of all samples it has."""
     h, f = numbers(kernel), numbers(field, 1)
@@ -126,7 +127,7 @@ PLANES = [
 ]
 
 
-@pytest.mark.parametrize(("planes", "images", "summed", "channels"), PLANES)
+@pytest.mark.parametrize(("planes", "images", "summed", "channels"), quick(PLANES, 3, 4))
 def test_planes_add_up_and_channels_stay(planes, images, summed, channels, key):
     sensor, kernel, field = (5, 8), (4, 6), (6, 11)
     h, f = numbers((*planes, *kernel)), numbers((2, *images, *field), 1)

@@ -118,6 +118,7 @@ def test_layers_hide_each_other(camera):
     )
 
 
+@pytest.mark.thorough
 def test_batches_are_those_of_their_key(camera, images):
     batch = draw(camera, images)
     again = draw(camera, images)

@@ -164,6 +164,7 @@ def select(camera, tolerance, object_distance=250.0, **arguments):
     )
 
 
+@pytest.mark.thorough
 def test_considered_are_the_cheaper_ways():
     """Cheapest first, each of them refused but the last, which is the choice."""
     choice = select(camera_of(), 1e-6)

@@ -11,7 +11,7 @@ from lensless.masks import families
 from lensless.masks.families import DISTANCE, PITCH, SHAPE, WAVELENGTH
 
 import thincam_jax as tc
-from helpers import finite_difference, relative_l2
+from helpers import finite_difference, quick, relative_l2
 from thincam_jax.imaging.operators import adjoint_error
 
 INF = math.inf
@@ -40,7 +40,7 @@ def psf_of(mask, t=INF, **options):
     return np.asarray(evaluate(mask, sensor, *(jnp.asarray(n) for n in numbers), **options))
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", quick(NAMES, 0, 3, 4))
 def test_against_quadrature(name):
     """Within 1e-9 in double precision (measured 4e-14), 3e-5 in single (1e-6)."""
     mask = families.masks()[name]
@@ -112,7 +112,7 @@ def test_light_that_passes_arrives(name):
     assert 0 < 1 - arrived / passed < 0.03
 
 
-@pytest.mark.parametrize("name", SHADOWED)
+@pytest.mark.parametrize("name", quick(SHADOWED, 0, 3))
 def test_shadow(name):
     """`geometric` is |t|² of the cell, its pixel averages are exact, and it is the limit λ → 0."""
     mask = families.masks()[name]

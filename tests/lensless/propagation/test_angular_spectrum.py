@@ -124,7 +124,8 @@ def test_nothing_wraps_round(padding, tolerance):
     assert (np.abs(wrapped[far]) ** 2).max() > 10 * expected[far].max()
 
 
-@pytest.mark.parametrize("shape", [(1, 1), pytest.param((33, 2), marks=pytest.mark.thorough)])
+@pytest.mark.thorough
+@pytest.mark.parametrize("shape", [(1, 1), (33, 2)])
 def test_thin_sensors(shape):
     """Even against odd sizes, and sensors smaller than the mask: samples still coincide."""
     grid = tc.Grid(shape, 0.01)

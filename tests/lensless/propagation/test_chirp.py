@@ -135,6 +135,7 @@ def test_gradient_in_every_argument():
         assert error.max() < 2e-9, (i, cases[int(error.argmax())])
 
 
+@pytest.mark.thorough
 def test_jit_and_vmap_are_eager():
     cases = jnp.asarray(list(points()))[::5]
     together = chirp_integral(*cases.T)

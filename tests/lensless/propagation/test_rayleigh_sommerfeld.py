@@ -58,6 +58,7 @@ def test_against_quadrature():
     np.testing.assert_allclose(value[:, ::2], expected[:, ::2], rtol=2e-2)
 
 
+@pytest.mark.thorough
 def test_pixel_average_of_both_planes():
     """A small aperture, so that few samples do; the average is 10 % off the centre."""
     mask = tc.FresnelZoneAperture(2000.0, 0.3, width=0.11)

@@ -50,7 +50,7 @@ def coordinates(shape, pitch):
             0.7,
             (0.31, -0.52),
         ),  # a coarse one that sees all round the shadow
-        ((96, 128), 0.065, INF, -2.0, (-0.2, 0.1)),
+        pytest.param((96, 128), 0.065, INF, -2.0, (-0.2, 0.1), marks=pytest.mark.thorough),
         pytest.param((1, 129), 0.045, 250.0, 4.712, (0.0, 0.0), marks=pytest.mark.thorough),
         ((1, 1), 0.045, 250.0, 0.0, (0.4, 0.3)),
     ],

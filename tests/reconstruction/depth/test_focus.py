@@ -7,7 +7,7 @@ import pytest
 import scipy.ndimage as ndimage
 from reconstruction.rig import unchecked
 
-from helpers import count_traces, finite_difference
+from helpers import count_traces, finite_difference, quick
 from thincam_jax.reconstruction.depth import MEASURES, focus_measure
 from thincam_jax.reconstruction.depth.focus import gaussian_average
 
@@ -77,7 +77,7 @@ def test_sparsity_is_free_of_scale_and_one_for_nothing():
     assert float(focus_measure(np.full((9, 12), 0.5), "gradient_sparsity", smoothing=0)) == 1
 
 
-@pytest.mark.parametrize("measure", MEASURES)
+@pytest.mark.parametrize("measure", quick(MEASURES, 1))
 def test_slope_jit_and_batch(measure):
     images = jnp.stack([jnp.asarray(picture(seed=s)) for s in (1, 2)])
     counted = count_traces(lambda image: focus_measure(image, measure))
