@@ -372,6 +372,7 @@ def test_predicted_error(name):
     assert true < predicted.predicted_error < 10 * true
 
 
+@pytest.mark.thorough
 @choices
 def test_choice_of_precision(name):
     """A tolerance that float32 cannot meet chooses float64, which does."""

@@ -42,8 +42,13 @@ def file(tmp_path):
     return tiny.write(tmp_path)
 
 
-def test_run_prints_the_results_and_where_the_report_is(file, tmp_path):
+def test_run_prints_the_results_and_where_the_report_is(tmp_path):
     """All options at once; the same command a second time ends with the same figures."""
+    methods, targets = (
+        tiny.TEXT.split("  - name: pairs\n")[0],
+        "targets: [{name: chart, kind: usaf1951}]",
+    )
+    file = tiny.write(tmp_path, f"{methods}{targets}\n")
     command = ("run", file, "--out", tmp_path / "out", "--set", "seed=9", "--set", "title=T")
     first = call(*command)
     assert first.exit_code == 0, first.output
@@ -458,6 +463,7 @@ def test_completion_of_the_shell_that_asks(option, tmp_path):
     assert "complete -o default -F _thincam_completion thincam" in script
 
 
+@pytest.mark.thorough
 def test_as_a_process(file):
     """The whole way, exit code and streams included, in the precision of a user: float32."""
     kept = {k: v for k, v in os.environ.items() if not k.startswith("JAX_ENABLE")}

@@ -52,6 +52,7 @@ def test_the_exact_model_is_that_of_each_camera(profile):
         assert relative_l2(value, expected) < 1e-13
 
 
+@pytest.mark.thorough
 def test_without_crop_everything_is_seen():
     found = respond(thesis_design(), setup(crop=False), Polar(HIGHEST, 64, 2))
     np.testing.assert_array_equal(found.whole, found.seen)

@@ -39,6 +39,7 @@ def robust(tolerances, how="mean"):
     return float(compiled(DESIGN, SETUP, PAIRS, FREQUENCIES, tolerances, how=how))
 
 
+@pytest.mark.thorough
 def test_without_tolerances_it_is_the_bayes_error():
     @jax.jit
     def both(design):

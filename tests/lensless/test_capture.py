@@ -75,6 +75,7 @@ def test_a_point_between_two_rows_lights_both():
     assert relative_l2(value, 2.0 * (20 * um) ** 2 * h) < 1e-10
 
 
+@pytest.mark.thorough
 def test_a_source_between_the_pixels_moves_the_centroid():
     """The shadow of a small mask, of a source 2.5 pixels wide: its centroid is at −(d/t)·m.
 

@@ -95,6 +95,7 @@ class TestHarmonics:
             )
             assert relative_l2(found, expected) < 1e-6
 
+    @pytest.mark.thorough
     def test_of_the_binary_profile(self):
         """j/(m²β) e^{-jX/m} times ±cos(πλdρ²) for odd m, ±sin for even m, which diffraction makes.
 

@@ -187,6 +187,7 @@ def test_relaxation_and_penalties_do_not_move_the_minimiser(relaxation, factors)
     assert relative_l2(value, expected) < 1e-6
 
 
+@pytest.mark.thorough
 def test_the_minimiser_is_a_fixed_point():
     """At the end q stays, and z = Kf in all splits: no gap is left."""
     given = case("two")
@@ -380,6 +381,7 @@ def test_no_light_converges_at_once_and_nan_has_a_status():
     assert outcome.status == "non_finite"
 
 
+@pytest.mark.thorough
 def test_single_precision_and_no_new_compilation():
     """New captures, τ, relaxation and penalties of old shapes; all residuals are finite."""
     problem, _ = scenes.problem()

@@ -57,6 +57,7 @@ def test_the_objective_of_the_parts_is_that_of_the_whole(coupling, count):
         np.testing.assert_allclose(back, jnp.abs(image), atol=1e-12)
 
 
+@pytest.mark.thorough
 def test_one_psf_for_all_colours_and_weights_that_broadcast():
     problem, _ = scenes.problem(batch=(2,), channels=3)
     shared = [jax.tree.map(lambda s: s[:1], o) for o in problem.operators]

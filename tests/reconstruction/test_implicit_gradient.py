@@ -36,6 +36,7 @@ def sparse(tau):
     )
 
 
+@pytest.mark.thorough
 def test_with_a_proximal_map_in_closed_form_it_is_the_minimum_of_fista():
     problem, _ = sparse(0.05)
     own = solve_fista(problem, iterations=800, tolerance=1e-10)

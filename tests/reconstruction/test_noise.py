@@ -116,6 +116,7 @@ def test_images_too_small_have_none():
         np.testing.assert_array_equal(value, np.zeros(shape[:-2]))
 
 
+@pytest.mark.thorough
 def test_batches_and_compilation():
     images = jnp.asarray(RNG.normal(size=(2, 3, 20, 21)) * np.arange(1, 7).reshape(2, 3, 1, 1))
     counted = count_traces(estimate_noise)

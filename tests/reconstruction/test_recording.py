@@ -340,6 +340,7 @@ def test_operators_with_captures_of_any_shape():
             assert result.pitch is None
 
 
+@pytest.mark.thorough
 def test_masks_and_gains_of_operators_are_those_of_the_recording():
     """Before or around a stack, or said by the recording: one problem."""
     operators, shapes = [matrix(30), matrix(12, seed=4)], [(30,), (12,)]

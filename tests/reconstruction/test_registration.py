@@ -36,6 +36,7 @@ def test_the_picture_is_enlarged_about_its_centre(shape, ratio):
     assert np.abs(blob(y / ratio + 0.5, x / ratio)[inside] - expected[inside]).max() > 0.05
 
 
+@pytest.mark.thorough
 def test_batches_and_the_ratio_of_one():
     images = jnp.asarray(np.random.default_rng(0).normal(size=(2, 3, 8, 11)))
     assert register(images, 1.0) is images

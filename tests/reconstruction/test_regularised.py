@@ -85,6 +85,7 @@ def test_endings():
     assert (once.status, once.iterations) == ("iterations_exhausted", 7)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("kernel", [(9, 10), pytest.param((60, 51), marks=pytest.mark.thorough)])
 def test_extremes_are_finite(kernel):
     """No light, saturated, one bright pixel, no variation, nothing but that."""

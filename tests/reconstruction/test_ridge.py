@@ -53,6 +53,7 @@ def test_it_is_the_dense_solution(more):
         np.testing.assert_allclose(found.image, dense(problem, precision, mean), atol=1e-6)
 
 
+@pytest.mark.thorough
 def test_a_strong_ridge_gives_the_mean_and_a_weak_one_the_truth():
     problem, truth = scenes.problem((20, 21), (9, 8), noise=0.0, kernel=scenes.spots)
     mean = jnp.full(problem.image_shape, 0.25)
@@ -144,6 +145,7 @@ def test_ridge_is_the_posterior_mean(factor):
     np.testing.assert_allclose(found.image, expected.reshape(FIELD), atol=1e-6)
 
 
+@pytest.mark.thorough
 def test_one_is_the_best_ridge_for_a_white_image():
     """The mean squared error of many, with less and with more; one is the default."""
     kernel = psf()

@@ -90,6 +90,7 @@ def whole(operator):
     return Matrix(dense(operator), FIELD, SENSOR)
 
 
+@pytest.mark.thorough
 def test_the_modes_of_all_terms_precondition_conjugate_gradients():
     """Also those of one term with weights of each pixel, as of dead ones."""
     right = jnp.asarray(RNG.normal(size=(1, 1, *FIELD)))
@@ -169,14 +170,14 @@ def test_a_correlated_image(terms):
 
 
 def test_error_bars_cover_the_truth():
-    """95 % intervals hold 93 to 97 % of the pixels of a photograph, over 200 draws of the noise.
+    """95 % intervals hold 93 to 97 % of the pixels of a photograph, over 80 draws of the noise.
 
     A white prior takes its errors for larger, and makes larger ones.
     """
     sensor, field = (80, 90), (40, 50)
     operator, noise = flatcam(sensor=sensor, field=field), 0.1
     truth = resize(sample_image("camera")[60:300, 150:450], field)
-    draws = np.random.default_rng(1).normal(size=(200, *sensor))
+    draws = np.random.default_rng(1).normal(size=(80, *sensor))
     captures = operator(jnp.asarray(truth)) + noise * jnp.asarray(draws)
     recording = tc.Recording(captures, operator, noise_variance=noise**2)
     covered, errors = [], []

@@ -53,6 +53,7 @@ def test_details_of_a_polynomial_vanish_away_from_the_border(family):
     assert float(jnp.abs(Wavelet(family, 1).analyse(steeper)[0, 32 : 64 - taps]).max()) > 1e-9
 
 
+@pytest.mark.thorough
 def test_the_sparsity_of_an_even_image_is_nothing_and_of_a_pixel_is_known():
     even = jnp.full((1, 1, 8, 16), 3.0)
     pixel = jnp.zeros((1, 1, 4, 4)).at[0, 0, 1, 2].set(1.0)

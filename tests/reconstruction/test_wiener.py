@@ -320,6 +320,7 @@ def test_not_traced_again_for_other_captures_variances_and_cameras(monkeypatch):
     assert relative_l2(results[0], results[1]) > 0.1 and relative_l2(results[0], results[2]) > 1e-4
 
 
+@pytest.mark.thorough
 def test_gradient_in_beta_wavelength_and_variance():
     """The image in the β that is assumed; 2β(width/2)² = 60 rad is 2 rad per rad/mm² there."""
     sensor = tc.Sensor((24, 21), 100 * um)

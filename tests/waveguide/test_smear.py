@@ -90,6 +90,7 @@ def test_the_bragg_wavelength_alone():
     assert spread.max() < 0.02
 
 
+@pytest.mark.thorough
 def test_holograms_and_critical_angle_cut_the_band():
     """At its edge a hologram keeps a part of a contact's band, and the later contacts their own."""
     pixel = jnp.zeros((1, 2))

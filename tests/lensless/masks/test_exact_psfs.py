@@ -186,6 +186,7 @@ def test_zone_models_refuse_cells():
             psf_of(families.masks()["mura"], model=model)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", ["mura", pytest.param("lenslets", marks=pytest.mark.thorough)])
 def test_models_are_selected(name):
     """The prediction is kept, and the models offered are those that can hold the mask."""

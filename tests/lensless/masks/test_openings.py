@@ -20,6 +20,7 @@ def test_round_pinhole_on_the_axis():
         assert float(h[0, 0]) == pytest.approx(4 * np.sin(np.pi * zones / 2) ** 2, abs=0.06)
 
 
+@pytest.mark.thorough
 def test_rings_are_sampled_by_their_area():
     rings = np.array([0.0, 1.0, 0.25])
     mask = tc.RadialMask(rings, 0.1, centre=(0.013, -0.02))

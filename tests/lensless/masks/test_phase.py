@@ -151,6 +151,7 @@ def test_both_sampled_models_agree_and_dispersion_is_the_materials():
     np.testing.assert_allclose(red, np.exp(2j * np.pi * (n - 1) * height / 632.8e-6), atol=2e-4)
 
 
+@pytest.mark.thorough
 def test_light_is_kept():
     """All that passes the mask falls on a sensor that is wide enough, and a grey one takes its."""
     rng = np.random.default_rng(5)
@@ -209,6 +210,7 @@ def test_gradients(interpolation):
         np.testing.assert_allclose(jnp.sum(found * along), expected, rtol=1e-5, atol=1e-8)
 
 
+@pytest.mark.thorough
 def test_vmap_over_wavelengths_is_one_psf_each():
     mask = tc.PhaseMask(np.full((8, 9), 0.3 * TURN), 10 * um, bk7(), interpolation="bilinear")
     here = camera(mask, (10, 12), 5 * um, 1.0)

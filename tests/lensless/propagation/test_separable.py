@@ -52,7 +52,7 @@ def coordinates(shape, pitch):
         ),  # a coarse one that sees all round the shadow
         pytest.param((96, 128), 0.065, INF, -2.0, (-0.2, 0.1), marks=pytest.mark.thorough),
         pytest.param((1, 129), 0.045, 250.0, 4.712, (0.0, 0.0), marks=pytest.mark.thorough),
-        ((1, 1), 0.045, 250.0, 0.0, (0.4, 0.3)),
+        pytest.param((1, 1), 0.045, 250.0, 0.0, (0.4, 0.3), marks=pytest.mark.thorough),
     ],
 )
 def test_against_scipy(shape, pitch, object_distance, phase, centre):
@@ -193,6 +193,7 @@ def test_pixel_average(geometry, pitch, centre, tolerance):
     assert relative_l2(point_sampled, expected) > 20 * tolerance
 
 
+@pytest.mark.thorough
 def test_centre_moves_the_psf_magnified():
     """A mask off by 2 rows and −3 columns over M moves the PSF by just that: +y down, +x right."""
     t, pitch = 50.0, 0.02
@@ -203,6 +204,7 @@ def test_centre_moves_the_psf_magnified():
     np.testing.assert_allclose(moved[2:, :-3], still[:-2, 3:], rtol=0, atol=1e-12)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("object_distance", [INF, 40.0])
 def test_energy(object_distance):
     """What passes the mask arrives: Σ h pitch²/M² = ∬ |t|² dx dy.

@@ -116,6 +116,7 @@ def test_a_plate_that_leans():
     assert fit_screen(measured, *start, ("object_x", "object_y")).status == "poor_fit"
 
 
+@pytest.mark.thorough
 def test_another_screen_is_told():
     fit = fit_screen(ghosts(0.05, TRUE | {"glass": 9.0}), camera(), plane(), ("slant",))
     assert fit.status == "poor_fit"
