@@ -229,6 +229,7 @@ styles = dict(zip(reliefs, ("k--", "k-", "C0-", "k:"), strict=True))
 for name, values in spectra.items():
     axes[1].plot(band / nm, values, styles[name], label=f"{name}; all at once {grey[name]:.3f}")
 axes[1].set(xlabel="wavelength (nm)", ylabel="expected error (of the scene's variance)")
+axes[1].set_ylim(top=1.5 * max(map(np.max, spectra.values())))  # above it, the legend
 for ax in axes:
     ax.set_ylim(bottom=0)
     ax.grid(alpha=0.3)
@@ -256,7 +257,9 @@ plane = tc.ImagePlane(
     np.stack([photograph(name) for name in names]), object_distance, setup.object_width
 )
 scene = tc.Scene(plane, green)
-truths = np.asarray(plane.sample(tc.Grid((across, across), plane.width / across), magnification=1))
+truths = np.asarray(
+    plane.sample(tc.Grid((across, across), plane.width / across), magnification=1.0)
+)
 lit = tc.Sensor(pixels, pitch, electrons=1e4 / (height * width), full_well=1e8)
 noise = tc.PoissonGaussianNoise(8.0)
 
@@ -279,7 +282,7 @@ def restored(mask):
     return tried[best], quality[best]
 
 
-TAUS = {"full": (1e-3, 1e-2, 1e-1), "small": (1e-2, 1e-1)}[SIZE]
+TAUS = {"full": (1.0, 10.0, 100.0, 1000.0), "small": (10.0, 100.0)}[SIZE]
 shown = {name: restored(masks[name]) for name in ("contours", "refined", "refined without crop")}
 by_seed = [(errors["contours"], errors["refined"], shown["contours"][1], shown["refined"][1])]
 for seed in (8, 9):
@@ -305,7 +308,7 @@ half = float(plane.width) / 2
 for column, (name, (images, quality)) in zip(axes.T, columns.items(), strict=True):
     for number, (ax, image) in enumerate(zip(column, images, strict=True)):
         ax.imshow(image, cmap="gray", vmin=0, vmax=1, extent=(-half, half, half, -half))
-        ax.set(title=f"{name}: {quality[number]:.1f} dB" if quality else name)
+        ax.set(title=f"{name}\n{quality[number]:.1f} dB" if quality else name)
 for ax in axes[-1]:
     ax.set(xlabel="x on the object (mm)")
 for ax in axes[:, 0]:

@@ -124,7 +124,7 @@ for order, ax in enumerate(axes):
     drawn = ax.imshow(np.asarray(image), cmap="gray", extent=(-half, half, half, -half))
     part = weights[order] / weights.sum()
     nanometres = float(axis.wavelength[order, 0]) / nm
-    ax.set(xlabel="x (mm)", title=f"order {order}: {part:.0%} of the light, {nanometres:.0f} nm")
+    ax.set(xlabel="x (mm)", title=f"order {order}: {part:.0%} of the light\nat {nanometres:.0f} nm")
 axes[0].set_ylabel("y on the sensor (mm)")
 figure.colorbar(drawn, ax=axes, label="irradiance / open aperture")
 figure.savefig(FIGURES / "orders.png", dpi=110)
