@@ -134,7 +134,7 @@ def again(whole, monkeypatch):
     methods = load_config(path / "found.yaml").methods[1:]
     found = tuple(
         Candidate(one["name"], tiny.found([s.beta for s in m.shots]), 0.1, 0.09, RINGS)
-        for one, m in zip(design["found"][:2], methods, strict=True)
+        for one, m in zip(design["found"], methods, strict=False)
     )
     again = SimpleNamespace(study=study, folder=DesignFolder(path.parent / "again"), found=found)
 

@@ -44,7 +44,7 @@ search:
 targets:
   - {name: chart, kind: usaf1951, pixels: 120}
   - {name: picture, kind: file, path: PICTURE}
-validate: {seeds: 2, best: 2}
+validate: {seeds: 2, best: 1}
 """
 
 
