@@ -15,16 +15,23 @@ SLOW = ("jax", "matplotlib", "numpy", "rich", "scipy", "skimage", "yaml")
 
 def imported_by(code: str) -> set[str]:
     """The modules of a new process after `code`, by full name."""
+    return imported_in_turn(code)[0]
+
+
+def imported_in_turn(*codes: str) -> list[set[str]]:
+    """The modules of one new process after each of `codes`."""
+    told = "\nimport sys; print('MODULES', *sys.modules)\n"
     path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
     done = subprocess.run(
-        [sys.executable, "-c", f"{code}\nimport sys; print(*sys.modules)"],
+        [sys.executable, "-c", "".join(code + told for code in codes)],
         capture_output=True,
         text=True,
         env={**os.environ, "PYTHONPATH": path},
         timeout=120,
         check=True,
     )
-    return set(done.stdout.splitlines()[-1].split())
+    lines = [line for line in done.stdout.splitlines() if line.startswith("MODULES ")]
+    return [set(line.split()) for line in lines]
 
 
 def test_the_package_alone_is_light():
@@ -35,21 +42,18 @@ def test_units_are_light():
     assert imported_by("from thincam_jax.units import nm").isdisjoint(SLOW)
 
 
-def test_names_wait_for_no_library_of_analysis_or_plots():
+def test_names_wait_for_no_library_and_reconstructions_for_no_learned_part():
     """SciPy itself is there, of its parts only those that JAX's sparse matrices import."""
-    modules = imported_by(
-        "import thincam_jax as tc; tc.psf, tc.capture, tc.plan, tc.select_model, tc.reconstruct"
+    modules, of_command = imported_in_turn(
+        "import thincam_jax as tc; tc.psf, tc.capture, tc.plan, tc.select_model, tc.reconstruct",
+        "import thincam_jax.commands.photo.console",
     )
     assert "jax" in modules
     assert modules.isdisjoint(("matplotlib", "skimage", "jaxopt", "pydantic"))
     parts = ("fft", "ndimage", "optimize", "signal", "stats")
     assert modules.isdisjoint(f"scipy.{part}" for part in parts)
-
-
-def test_reconstructions_without_a_network_wait_for_no_learned_part():
-    modules = imported_by("import thincam_jax.commands.photo.console")
-    assert "thincam_jax.commands.photo.run" in modules
-    assert modules.isdisjoint(("thincam_jax.learn", "thincam_jax.design"))
+    assert "thincam_jax.commands.photo.run" in of_command
+    assert of_command.isdisjoint(("thincam_jax.learn", "thincam_jax.design"))
 
 
 @pytest.mark.parametrize(

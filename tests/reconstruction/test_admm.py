@@ -209,6 +209,7 @@ def test_units_do_not_matter(factor):
     assert relative_l2(value, factor * expected) < 1e-4
 
 
+@pytest.mark.thorough
 def test_single_precision_agrees_with_double():
     problem, truth = scenes.problem(planes=2)
     expected = solved(problem, iterations=100)

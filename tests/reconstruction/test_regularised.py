@@ -28,6 +28,7 @@ def noisy(count=2, noise=0.005):
     return captures + noise * captures.max() * jnp.asarray(errors)
 
 
+@pytest.mark.thorough
 def test_total_variation_is_upright_and_nearer_than_the_filter():
     """Two noisy captures with their bright backgrounds, which the sensor crops."""
     seen, picture = noisy(), rig.picture()

@@ -36,13 +36,22 @@ def home(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def whole(home):
+def taken():
+    """Of the uninterrupted run: exposures, channels and noise of all its captures."""
+    return []
+
+
+@pytest.fixture(scope="module")
+def whole(home, taken):
     """One uninterrupted run: the study, folder, metrics, the texts of its progress."""
     quoted = EVIL.replace("'", "''")
     told = (f"title='{quoted}'", f"notes=['{quoted}', A second note.]")
     study, texts = tiny.built(home, *told), tiny.Told()
     folder = RunFolder(home / "whole")
-    metrics = run_study(study, folder, texts)
+    with pytest.MonkeyPatch.context() as patch:
+        counting = counted(patch)
+        metrics = run_study(study, folder, texts)
+        taken.extend(counting)
     return study, folder.path, metrics, texts
 
 
@@ -173,11 +182,15 @@ def test_interrupted_run_goes_on_where_it_stopped(whole, home, monkeypatch):
     assert (folder.path / "figures" / "contrast.png").exists()
 
 
-def test_captures_that_methods_share_are_taken_once(whole, monkeypatch):
-    """In a complete run, which is not an interrupted one: it is done anew, with the same result."""
-    taken, metrics = counted(monkeypatch), (whole[1] / "metrics.json").read_bytes()
+@pytest.mark.thorough
+def test_a_complete_run_is_done_anew_with_the_same_result(whole, taken, monkeypatch):
+    again, metrics = counted(monkeypatch), (whole[1] / "metrics.json").read_bytes()
     run_study(whole[0], RunFolder(whole[1]), tiny.ignore)
     assert (whole[1] / "metrics.json").read_bytes() == metrics
+    assert again == taken
+
+
+def test_captures_that_methods_share_are_taken_once(whole, taken):
     for channels in (1, 3):
         settings = [(s.beta, round(s.phase, 6)) for s, c, _ in taken if c == channels]
         quarter = round(np.pi / 2, 6)

@@ -134,6 +134,7 @@ def test_shadow(name):
     assert relative_l2(waves, psf_of(mask, 40.0, model="geometric")) < 5e-3
 
 
+@pytest.mark.thorough
 def test_one_cell_is_a_pinhole_is_a_zone_plate_without_zones():
     opening = tc.Pinhole(families.CELL, centre=families.CENTRE)
     expected = psf_of(opening, 40.0)
