@@ -88,7 +88,7 @@ class NetworkConfig(Section):
     """See `learn.refocusing.NetworkOptions`."""
 
     steps: Annotated[int, Field(ge=1, le=20)] = 2
-    widths: Widths = (40, 56, 72)
+    widths: Widths = (40, 44, 44, 44, 40)
 
 
 class TrainingConfig(Section):

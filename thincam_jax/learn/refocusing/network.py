@@ -32,7 +32,7 @@ class NetworkOptions(NamedTuple):
     """
 
     steps: int = 2
-    widths: tuple[int, ...] = (40, 56, 72)
+    widths: tuple[int, ...] = (40, 44, 44, 44, 40)
 
 
 DEFAULT = NetworkOptions()
