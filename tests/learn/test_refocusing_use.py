@@ -175,16 +175,16 @@ def test_what_is_shipped_may_be_given_on():
 
 @pytest.mark.thorough
 def test_what_is_shipped_beats_a_wiener_filter():
-    """Whatever its strength, on a scene that it was not trained on."""
+    """By far, whatever its strength, on a scene that it was not trained on: by 2.3 dB when written."""
     config = load_learned(Path(__file__).parents[2] / "configs/learned_refocus.yaml")
     network = load(SHIPPED, build_camera(config))
     planes, picture = network.planes, dead_leaves(7, 1, 384)[0][:128, :128]
-    scene = flat_scene(planes.camera, [picture], [np.ones(picture.shape)], [85.0])
+    scene = flat_scene(planes.camera, [picture], [np.ones(picture.shape)], [60.0])
     noise = tc.GaussianNoise(30.0)
     seen, deviation = capture_scene(planes.camera, scene, noise, jax.random.key(0))
-    found = scores(network.focus(seen, 85.0, deviation), picture)["psnr"]
+    found = scores(network.focus(seen, 60.0, deviation), picture)["psnr"]
     linear = max(
-        scores(wiener(planes, seen, deviation, jnp.asarray(85.0), s), picture)["psnr"]
+        scores(wiener(planes, seen, deviation, jnp.asarray(60.0), s), picture)["psnr"]
         for s in (0.1, 0.3, 1.0)
     )
-    assert found > linear
+    assert found > linear + 1.5

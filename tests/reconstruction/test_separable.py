@@ -169,15 +169,16 @@ def test_a_correlated_image(terms):
         np.testing.assert_allclose(sigma.ravel(), np.sqrt(np.diag(posterior)), rtol=1e-8)
 
 
-def test_error_bars_cover_the_truth():
-    """95 % intervals hold 93 to 97 % of the pixels of a photograph, over 80 draws of the noise.
+@pytest.mark.parametrize("count", [80, pytest.param(200, marks=pytest.mark.thorough)])
+def test_error_bars_cover_the_truth(count):
+    """95 % intervals hold 93 to 97 % of the pixels of a photograph, over draws of the noise.
 
     A white prior takes its errors for larger, and makes larger ones.
     """
     sensor, field = (80, 90), (40, 50)
     operator, noise = flatcam(sensor=sensor, field=field), 0.1
     truth = resize(sample_image("camera")[60:300, 150:450], field)
-    draws = np.random.default_rng(1).normal(size=(80, *sensor))
+    draws = np.random.default_rng(1).normal(size=(count, *sensor))
     captures = operator(jnp.asarray(truth)) + noise * jnp.asarray(draws)
     recording = tc.Recording(captures, operator, noise_variance=noise**2)
     covered, errors = [], []
