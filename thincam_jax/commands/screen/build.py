@@ -152,7 +152,7 @@ def _camera(config: SeeThroughConfig, wavelength: float, thickness: float) -> wg
     lens = config.lens
     sensor = Sensor(**dict(config.sensor))
     distances = lens.focal_distance, lens.lens_distance
-    return wg.SeeThroughCamera(screen, sensor, *distances, tilt=plate.tilt)
+    return wg.SeeThroughCamera(screen, sensor, *distances, tilt=np.asarray(plate.tilt))
 
 
 def _rectangle(part: RectangleConfig | None) -> wg.Rectangle | None:
