@@ -30,7 +30,7 @@ def test_values_and_defaults(tmp_path):
     assert config.sensor.width == pytest.approx(48 * 0.04)
     assert config.search.free[0].bounds == (12.0, 30.0)
     assert config.search.objective == "bayes_error"
-    assert config.validation.best == 2
+    assert config.validation.best == 1
     assert config.reach("distance")[1] == 3.0
     without = tiny.TEXT.replace("prior:\n  exponent: 2.5\n", "")
     assert tiny.design(tmp_path, text=without).prior.measured
@@ -176,7 +176,7 @@ SHARED = ("search.free[0]", "all masks share the width; drop 'shared' and 'shots
         ("reference.shots.1.wavelength=600 nm", "reference.shots[1].wavelength", "whole file"),
         ("reference.shots.0.width=1 mm", "reference.shots[0].width", "whole file; drop this one"),
         ("reference.shots.0.exposure=2", "reference.shots[0].exposure", "whole file"),
-        ("reference.name=Found 2", "reference.name", "is what another or a found design is called"),
+        ("reference.name=Found 1", "reference.name", "is what another or a found design is called"),
         ("search.band=[0.1, 0.4]", "search", "objective bayes_error has no band"),
         ("validate.seeds=0", "validate.seeds", "greater than or equal to 1"),
         ("validate.runs=1", "validate.runs", "unknown key; allowed here: seeds, best"),
