@@ -123,10 +123,11 @@ def test_another_screen_is_told():
 
 
 @pytest.mark.thorough
-def test_a_screen_from_its_matrix():
-    """In any unit; noise of a tenth of the largest entries, and the colours' smear."""
+@pytest.mark.parametrize("noise", [0.01, 0.001])
+def test_a_screen_from_its_matrix(noise):
+    """In any unit; noise of a part of the largest entries, and the colours' smear."""
     true = wg.system_operator(camera(**TRUE), plane(centre=CENTRE), samples=8)
-    measured = matrix(true, noise=0.01)
+    measured = matrix(true, noise=noise)
     scaled = Matrix(40 * measured.matrix, measured.in_shape, measured.out_shape)
     fit = fit_screen(scaled, camera(), plane())
     assert np.abs(deviations(fit, VALUES | {"gain": 40.0})).max() < 4

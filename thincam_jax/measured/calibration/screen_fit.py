@@ -53,6 +53,7 @@ Status = Literal["ok", "ambiguous", "poor_fit", "not_converged"]
 
 _PIXELS = 400  # of the sensor whose rows of the matrix are fitted
 _BLURS = (2.0, 0.7, 0.0)  # cells, one after another
+_AGAIN = 8  # times at most, until the smear is that of the screen that is found
 _STEPS = 60
 _TOLERANCE = 1e-5  # of steps that change the residual by a tenth, and of the squares
 _EXPLAINED = 0.5  # of the matrix' squares, or it is another camera's
@@ -237,7 +238,8 @@ def fit_screen(
 
     with the rays of `trace`, for each part of the band, and the part a of a pixel's view that lies
     in a cell; a ghost's position is the centroid of its band. Rows of the matrix are first blurred
-    over the cells, then less and less: from a start whose ghosts are a few cells off.
+    over the cells, then less and less: from a start whose ghosts are a few cells off. The band's
+    smear is that of the start, so that it is fitted again until nothing moves.
     Levenberg-Marquardt (`optimistix`), in double precision, on 400 pixels spread over the sensor.
 
     **What the data can tell.** At one distance only d1 + d2 acts. Points depend on the fringes'
@@ -281,7 +283,7 @@ def fit_screen(
                 "ghosts, or fewer parameters"
             )
         rows, converged = problem.measured, True
-        for blur in blurs:
+        for number, blur in enumerate((*blurs, *(0.0,) * _AGAIN)):
             problem = problem._replace(smear=_smear(problem, orders, samples))
             problem = _blurred(problem, rows, blur)
             problem = _scaled(problem, names, orders)
@@ -289,6 +291,10 @@ def fit_screen(
             converged = bool(solution.result == optx.RESULTS.successful)
             found = problem.start.moved(names, tuple(solution.value * problem.unit))
             problem = problem._replace(start=found)
+            if number >= len(blurs) - 1 and not _moves(solution.value, problem, names, orders):
+                break
+        else:
+            converged = False
         return cast(_report(problem, names, (orders, samples), converged), precision)
 
 
@@ -426,6 +432,18 @@ def _mean_weight(camera: SeeThroughCamera, plane: ObjectPlane, pixels, orders: i
     """Of a pixel's ghosts together, as `system_operator` takes it for 1."""
     rays = trace(camera, pixels, plane.distance, orders)
     return jnp.mean(jnp.sum(rays.weight, axis=0))
+
+
+def _moves(steps: Array, problem: _Problem, names: tuple[str, ...], orders: int) -> bool:
+    """Whether the last steps were more than a part of the standard errors where they ended."""
+    none = jnp.zeros_like(problem.unit)
+    residual = np.asarray(_residual(none, (problem, names, orders)))
+    slopes = np.asarray(_jacobian(problem, names, orders))
+    of_matrix = problem.orders is None
+    scatter = residual @ residual / (residual.size - len(names)) if of_matrix else 1.0
+    known: Covariance = covariance(slopes.T @ slopes, scatter)
+    # Steps end at the solver's tolerance, whatever the noise.
+    return bool(np.any(np.abs(steps) > np.maximum(known.standard_errors / 3, 10 * _TOLERANCE)))
 
 
 def _report(problem: _Problem, names, counts, converged: bool) -> ScreenFit:
