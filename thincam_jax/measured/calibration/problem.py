@@ -339,6 +339,10 @@ AMBIGUOUS = 0.999
 _SMALLEST = 1e-13
 
 
+# Of JᵀJ with a unit diagonal. At this smallest eigenvalue two numbers have a correlation of 0.999.
+_HARDLY_SEEN = 1e-3
+
+
 class Covariance(NamedTuple):
     """Of the unknowns of a fit, in their order."""
 
@@ -387,3 +391,21 @@ def ambiguous_pairs(names: tuple[str, ...], correlation: np.ndarray) -> list[str
         if abs(rho) > AMBIGUOUS
     ]
     return [text + "; fix one of them" for _, text in sorted(found, reverse=True)]
+
+
+def alike(names: tuple[str, ...], curvature: np.ndarray) -> list[str]:
+    """One line for each combination of numbers that the data hardly see, the worst first."""
+    norm = np.sqrt(np.diag(curvature))
+    unseen = [names[index] for index in np.flatnonzero(norm == 0)]
+    lines = [f"these data do not see {name} at all; hold it" for name in unseen]
+    norm = np.where(norm > 0, norm, 1.0)
+    strengths, vectors = np.linalg.eigh(curvature / np.outer(norm, norm) + np.diag(norm == 0))
+    for strength, vector in zip(strengths, vectors.T, strict=True):
+        if strength < _HARDLY_SEEN:
+            together = [n for n, v in zip(names, vector, strict=True) if abs(v) > 0.2]
+            lines.append(
+                f"{', '.join(together[:-1])} and {together[-1]} cannot be told apart by these "
+                f"data: together their errors are {max(strength, 1e-15) ** -0.5:.0f} times those "
+                "of each alone; hold one of them"
+            )
+    return lines

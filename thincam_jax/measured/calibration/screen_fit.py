@@ -19,7 +19,7 @@ from thincam_jax._core.checks import Numbers
 from thincam_jax._core.precision import allow, cast, precision_of
 from thincam_jax.imaging.operators import Matrix, Scaled
 from thincam_jax.imaging.refractive_index import changed
-from thincam_jax.measured.calibration.problem import Covariance, covariance
+from thincam_jax.measured.calibration.problem import Covariance, alike, covariance
 from thincam_jax.measured.raw import MeasurementError
 from thincam_jax.waveguide import (
     ObjectPlane,
@@ -58,8 +58,6 @@ _STEPS = 60
 _TOLERANCE = 1e-5  # of steps that change the residual by a tenth, and of the squares
 _EXPLAINED = 0.5  # of the matrix' squares, or it is another camera's
 _UNEXPLAINED = 5.0  # standard deviations of χ² of positions above its mean
-# Of JᵀJ with a unit diagonal. At this smallest eigenvalue two numbers have a correlation of 0.999.
-_AMBIGUOUS = 1e-3
 
 
 class GhostPositions(eqx.Module):
@@ -291,8 +289,11 @@ def fit_screen(
             converged = bool(solution.result == optx.RESULTS.successful)
             found = problem.start.moved(names, tuple(solution.value * problem.unit))
             problem = problem._replace(start=found)
-            if number >= len(blurs) - 1 and not _moves(solution.value, problem, names, orders):
-                break
+            if number >= len(blurs) - 1:
+                # Steps end at the solver's tolerance, whatever the noise.
+                errors = _known(problem, names, orders)[-1].standard_errors
+                if np.all(np.abs(solution.value) < np.maximum(errors / 3, 10 * _TOLERANCE)):
+                    break
         else:
             converged = False
         return cast(_report(problem, names, (orders, samples), converged), precision)
@@ -434,29 +435,28 @@ def _mean_weight(camera: SeeThroughCamera, plane: ObjectPlane, pixels, orders: i
     return jnp.mean(jnp.sum(rays.weight, axis=0))
 
 
-def _moves(steps: Array, problem: _Problem, names: tuple[str, ...], orders: int) -> bool:
-    """Whether the last steps were more than a part of the standard errors where they ended."""
+def _known(problem: _Problem, names: tuple[str, ...], orders: int):
+    """JᵀJ, the residual's squares, its degrees of freedom, and what is known of the steps."""
     none = jnp.zeros_like(problem.unit)
     residual = np.asarray(_residual(none, (problem, names, orders)))
     slopes = np.asarray(_jacobian(problem, names, orders))
+    curvature, squares = slopes.T @ slopes, float(residual @ residual)
+    freedom = residual.size - len(names)
     of_matrix = problem.orders is None
-    scatter = residual @ residual / (residual.size - len(names)) if of_matrix else 1.0
-    known: Covariance = covariance(slopes.T @ slopes, scatter)
-    # Steps end at the solver's tolerance, whatever the noise.
-    return bool(np.any(np.abs(steps) > np.maximum(known.standard_errors / 3, 10 * _TOLERANCE)))
+    return (
+        curvature,
+        squares,
+        freedom,
+        covariance(curvature, squares / freedom if of_matrix else 1.0),
+    )
 
 
 def _report(problem: _Problem, names, counts, converged: bool) -> ScreenFit:
     found, (orders, samples) = problem.start, counts
-    none = jnp.zeros_like(problem.unit)
-    residual = np.asarray(_residual(none, (problem, names, orders)))
-    slopes, squares = np.asarray(_jacobian(problem, names, orders)), float(residual @ residual)
-    curvature = slopes.T @ slopes
+    known: Covariance
+    curvature, squares, freedom, known = _known(problem, names, orders)
     explained = 1 - squares / float(jnp.sum((problem.measured * problem.scale) ** 2))
-    of_matrix = problem.orders is None
-    freedom = residual.size - len(names)
-    mean = squares / freedom
-    known: Covariance = covariance(curvature, mean if of_matrix else 1.0)
+    of_matrix, mean = problem.orders is None, squares / freedom
     errors = known.standard_errors * np.asarray(problem.unit)
     gain = found.gain
     if of_matrix:
@@ -467,7 +467,7 @@ def _report(problem: _Problem, names, counts, converged: bool) -> ScreenFit:
         poor = f"the model explains {max(0.0, explained):.1%} of what was measured"
     elif not of_matrix and mean > 1 + _UNEXPLAINED * (2 / freedom) ** 0.5:
         poor = f"the model does not explain the positions: χ² is {mean:.3g} per degree of freedom"
-    status, reasons = _status(converged, poor, _alike(names, curvature))
+    status, reasons = _status(converged, poor, alike(names, curvature))
     values = {n: jnp.asarray(found.value(n)) for n in names} | ({"gain": gain} if of_matrix else {})
     return ScreenFit(
         found.camera,
@@ -482,24 +482,6 @@ def _report(problem: _Problem, names, counts, converged: bool) -> ScreenFit:
         orders,
         samples,
     )
-
-
-def _alike(names: tuple[str, ...], curvature: np.ndarray) -> list[str]:
-    """One line for each combination of numbers that the data hardly see, the worst first."""
-    norm = np.sqrt(np.diag(curvature))
-    unseen = [names[index] for index in np.flatnonzero(norm == 0)]
-    lines = [f"these data do not see {name} at all; hold it" for name in unseen]
-    norm = np.where(norm > 0, norm, 1.0)
-    strengths, vectors = np.linalg.eigh(curvature / np.outer(norm, norm) + np.diag(norm == 0))
-    for strength, vector in zip(strengths, vectors.T, strict=True):
-        if strength < _AMBIGUOUS:
-            together = [n for n, v in zip(names, vector, strict=True) if abs(v) > 0.2]
-            lines.append(
-                f"{', '.join(together[:-1])} and {together[-1]} cannot be told apart by these "
-                f"data: together their errors are {max(strength, 1e-15) ** -0.5:.0f} times those "
-                "of each alone; hold one of them"
-            )
-    return lines
 
 
 def _status(converged: bool, poor: str, alike: list[str]) -> tuple[Status, tuple[str, ...]]:
