@@ -15,13 +15,14 @@ import numpy as np
 
 import thincam_jax as tc
 from thincam_jax import learn
-from thincam_jax.imaging.metrics import psnr
 from thincam_jax.learn.refocusing.baselines import wiener
+from thincam_jax.learn.refocusing.evaluation import scores
 from thincam_jax.learn.refocusing.loss import examples, loss, relative_error
 from thincam_jax.learn.refocusing.network import RefocusNetwork
 from thincam_jax.learn.refocusing.planes import Planes
 from thincam_jax.learn.refocusing.scenes import SceneOptions, draw_batch
 from thincam_jax.learn.refocusing.sources import drawn
+from thincam_jax.learn.refocusing.use import read
 from thincam_jax.learn.training import Task, train_model
 from thincam_jax.units import nm, um
 
@@ -106,20 +107,16 @@ def judged(base, optics: Optics, source, steps: int) -> dict[str, float]:
     options = learn.TrainingOptions(steps=steps, rate=1e-3, check_every=max(1, steps // 5))
     network = learn.train(network, lessons, options).model
     batch = draw_batch(jax.random.key(77), drawn(9, 16, 64).images, camera, SCENES, 48)
-    images_ = [
-        network.focus(c, float(t), s)
-        for c, t, s in zip(batch.capture, batch.commanded, batch.deviation, strict=True)
-    ]
+    found = read(network, batch.capture, batch.commanded[:, None], batch.deviation).images[:, 0]
     strengths = [
-        quality(wiener_images(Planes(camera), batch, jnp.float32(s)), batch.image)
+        quality(wiener_images(network.planes, batch, jnp.float32(s)), batch.image)
         for s in (0.1, 0.3, 1.0, 3.0)
     ]
-    return {"network": quality(images_, batch.image), "Wiener": max(strengths)}
+    return {"network": quality(found, batch.image), "Wiener": max(strengths)}
 
 
 def quality(images, targets) -> float:
-    pairs = zip(np.asarray(images, float), np.asarray(targets, float), strict=True)
-    return float(np.mean([psnr(i, t, data_range=float(t.max())) for i, t in pairs]))
+    return float(np.mean([scores(i, t)["psnr"] for i, t in zip(images, targets, strict=True)]))
 
 
 def main(steps: int) -> None:

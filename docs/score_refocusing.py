@@ -11,7 +11,7 @@ docs/images/learned_measured.png of pictures that no weight has seen, either.
 
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -179,6 +179,12 @@ def _psnr(methods: Methods, run: Callable, shot: Shot, distance: float) -> float
     return scores(run(shot, distance), shot.target(methods.camera, distance))["psnr"]
 
 
+def head(columns: Iterable[str]) -> None:
+    """The head of a table."""
+    names = ["test", *columns]
+    print("\n| " + " | ".join(names) + " |\n|" + "---|" * len(names))
+
+
 def row(
     name: str, camera, runs: dict[str, Callable], shots: list[Shot], distance: float, seeds: int = 1
 ) -> None:
@@ -217,10 +223,6 @@ def table(network, pictures, tuning, count: int) -> None:
     fast = {"Wiener": methods.wiener, "network": methods.learned}
     single = {name: run for name, run in runs.items() if name != "oracle"}  # it is ADMM-TV then
     rows, count = range(count), len(pictures)
-
-    def head(columns):
-        print("\n| test | " + " | ".join(columns) + " |\n|" + "---|" * (len(columns) + 1))
-
     gains = "gains on each"
     head([*single, gains])
     for t in (NEAR, 85.0, FAR, 170.0):

@@ -9,7 +9,14 @@ from imaging.operators.dense import numbers
 
 import thincam_jax as tc
 from helpers import relative_l2
-from thincam_jax.imaging.operators import Matrix, ReducedMatrix, Sparse, adjoint_error, reduced
+from thincam_jax.imaging.operators import (
+    Matrix,
+    ReducedMatrix,
+    Scaled,
+    Sparse,
+    adjoint_error,
+    reduced,
+)
 
 IN, OUT = (4, 5), (9, 11)
 H = numbers((99, 20))
@@ -52,7 +59,12 @@ def test_rows_may_come_from_anywhere():
     few = scipy.sparse.random_array((99, 20), density=0.2, rng=3)
     dense, g = few.toarray(), numbers(OUT, 1)
     expected = ReducedMatrix.of(dense, IN)
-    for given in (few.tocsr(), Sparse(few, IN, OUT), Matrix(dense, IN, OUT), Chunked(dense)):
+    gain = 1 + numbers(OUT, 3) ** 2
+    brighter = few / gain.reshape(-1, 1)
+    scaled = [Scaled(Sparse(scipy.sparse.coo_array(brighter), IN, OUT), gain)]
+    scaled += [Scaled(Matrix(dense / 3, IN, OUT), 3.0)]
+    arrays = [few.tocsr(), Chunked(dense)]
+    for given in (*arrays, Sparse(few, IN, OUT), Matrix(dense, IN, OUT), *scaled):
         shape = None if hasattr(given, "in_shape") else IN
         found = ReducedMatrix.of(given, shape)
         np.testing.assert_allclose(found.values, expected.values, atol=1e-12)

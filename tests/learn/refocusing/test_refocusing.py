@@ -8,7 +8,7 @@ import optax
 import pytest
 
 import thincam_jax as tc
-from thincam_jax.learn.refocusing.baselines import wiener
+from thincam_jax.learn.refocusing.baselines import ControlCode, control_loss, wiener
 from thincam_jax.learn.refocusing.cameras import RefocusCamera
 from thincam_jax.learn.refocusing.dead_leaves import dead_leaves
 from thincam_jax.learn.refocusing.evaluation import (
@@ -232,12 +232,38 @@ def test_the_wiener_filter_finds_its_plane(camera):
     assert found[60.0] > found[100.0] + 2
 
 
-def make_step(prior):
+@pytest.mark.thorough
+def test_a_control_code_is_the_filter_at_the_middle_until_it_is_trained(camera, images):
+    """Then it focuses by the code: the loss falls, and near and far differ."""
+    batch, planes = draw(camera, images), Planes(camera)
+    capture, deviation = batch.capture[0], batch.deviation[0]
+    code = ControlCode.create(camera, (8, 8), key=jax.random.key(0))
+    near, far = (code.focus(capture, jnp.asarray(t), deviation) for t in (50.0, 200.0))
+    linear = wiener(planes, capture, deviation, camera.middle)
+    np.testing.assert_array_equal(near, far)
+    np.testing.assert_allclose(near, linear, atol=0.02 * float(linear.max()))
+    weights, rest = eqx.partition(code, eqx.is_inexact_array)
+
+    def of(weights, batch):
+        return control_loss(eqx.combine(weights, rest), batch)
+
+    step, state = make_step(weights, of)
+    values = []
+    for _ in range(30):
+        weights, state, value = step(weights, state, batch)
+        values.append(float(value))
+    assert values[-1] < values[0] - 0.05
+    trained = eqx.combine(weights, rest)
+    near, far = (trained.focus(capture, jnp.asarray(t), deviation) for t in (50.0, 200.0))
+    assert float(jnp.abs(near - far).max()) > 1e-3 * float(linear.max())
+
+
+def make_step(prior, of=loss):
     adam = optax.scale_by_adam()
 
     @eqx.filter_jit
     def step(prior, state, given):
-        (value, _), slope = jax.value_and_grad(loss, has_aux=True)(prior, given)
+        (value, _), slope = jax.value_and_grad(of, has_aux=True)(prior, given)
         with jax.numpy_dtype_promotion("standard"):
             updates, state = adam.update(slope, state)
         return jax.tree.map(lambda w, u: w - 3e-3 * u, prior, updates), state, value

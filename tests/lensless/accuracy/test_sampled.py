@@ -56,7 +56,8 @@ def test_a_choice_beyond_reach_says_so_and_traced_numbers_are_refused():
     assert not choice.meets_tolerance
     assert [p.oversampling for p in choice.considered] == [1, 3, 5, 7]
     assert choice.predicted_error == choice.considered[-1].predicted_error
+    lenses = camera("lenses")
     with pytest.raises(TypeError, match="the choice of a model needs known numbers"):
-        jax.jit(
-            lambda w: tc.select_model(camera("lenses"), wavelength=w, tolerance=0.1).cost.flops
-        )(jnp.asarray(WAVELENGTH))
+        jax.jit(lambda w: tc.select_model(lenses, wavelength=w, tolerance=0.1).cost.flops)(
+            jnp.asarray(WAVELENGTH)
+        )

@@ -393,7 +393,7 @@ def ambiguous_pairs(names: tuple[str, ...], correlation: np.ndarray) -> list[str
     return [text + "; fix one of them" for _, text in sorted(found, reverse=True)]
 
 
-def alike(names: tuple[str, ...], curvature: np.ndarray) -> list[str]:
+def hardly_seen(names: tuple[str, ...], curvature: np.ndarray) -> list[str]:
     """One line for each combination of numbers that the data hardly see, the worst first."""
     norm = np.sqrt(np.diag(curvature))
     unseen = [names[index] for index in np.flatnonzero(norm == 0)]

@@ -19,7 +19,7 @@ from thincam_jax._core.checks import Numbers
 from thincam_jax._core.precision import allow, cast, precision_of
 from thincam_jax.imaging.operators import Matrix, Scaled
 from thincam_jax.imaging.refractive_index import changed
-from thincam_jax.measured.calibration.problem import Covariance, alike, covariance
+from thincam_jax.measured.calibration.problem import Covariance, covariance, hardly_seen
 from thincam_jax.measured.raw import MeasurementError
 from thincam_jax.waveguide import (
     ObjectPlane,
@@ -264,7 +264,7 @@ def fit_screen(
         raise ValueError(f"parameters = {parameters!r}: give a tuple of different names")
     for name in parameters:
         checks.choice("a name in parameters", name, PARAMETERS)
-    names, blurs = tuple(parameters), (0.0,) * 4
+    names, blurs = tuple(parameters), (0.0,)
     if isinstance(measured, Matrix):
         _require_sizes(measured, camera, plane)
         names, blurs = (*names, "gain"), _BLURS
@@ -290,8 +290,10 @@ def fit_screen(
             found = problem.start.moved(names, tuple(solution.value * problem.unit))
             problem = problem._replace(start=found)
             if number >= len(blurs) - 1:
+                # Errors by the residual's own size: positions may be worse than their deviation.
+                curvature, squares, freedom, _ = _known(problem, names, orders)
+                errors = covariance(curvature, squares / freedom).standard_errors
                 # Steps end at the solver's tolerance, whatever the noise.
-                errors = _known(problem, names, orders)[-1].standard_errors
                 if np.all(np.abs(solution.value) < np.maximum(errors / 3, 10 * _TOLERANCE)):
                     break
         else:
@@ -442,13 +444,8 @@ def _known(problem: _Problem, names: tuple[str, ...], orders: int):
     slopes = np.asarray(_jacobian(problem, names, orders))
     curvature, squares = slopes.T @ slopes, float(residual @ residual)
     freedom = residual.size - len(names)
-    of_matrix = problem.orders is None
-    return (
-        curvature,
-        squares,
-        freedom,
-        covariance(curvature, squares / freedom if of_matrix else 1.0),
-    )
+    variance = squares / freedom if problem.orders is None else 1.0
+    return curvature, squares, freedom, covariance(curvature, variance)
 
 
 def _report(problem: _Problem, names, counts, converged: bool) -> ScreenFit:
@@ -467,7 +464,7 @@ def _report(problem: _Problem, names, counts, converged: bool) -> ScreenFit:
         poor = f"the model explains {max(0.0, explained):.1%} of what was measured"
     elif not of_matrix and mean > 1 + _UNEXPLAINED * (2 / freedom) ** 0.5:
         poor = f"the model does not explain the positions: χ² is {mean:.3g} per degree of freedom"
-    status, reasons = _status(converged, poor, alike(names, curvature))
+    status, reasons = _status(converged, poor, hardly_seen(names, curvature))
     values = {n: jnp.asarray(found.value(n)) for n in names} | ({"gain": gain} if of_matrix else {})
     return ScreenFit(
         found.camera,
