@@ -4,6 +4,7 @@ As the files `command.py`, it imports nothing at its head that `thincam --help` 
 """
 
 import contextlib
+import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NoReturn
@@ -57,10 +58,15 @@ def warn(warnings: list[str]) -> None:
 
 
 def in_a_line(error: BaseException) -> str:
-    """What a user is told of an error."""
+    """What a user is told of an error; `name='value'`, an argument in Python, as an option."""
     if _no_memory(error):
         return "out of memory; give fewer pixels (a larger --downsample or pitch) or close programs"
-    return str(error)
+    return re.sub(r"`(\w+)(?:='(\w+)')?`", _as_option, str(error))
+
+
+def _as_option(argument: re.Match[str]) -> str:
+    name, value = argument.groups()
+    return " ".join(filter(None, (f"--{name.replace('_', '-')}", value)))
 
 
 def tell(text: str) -> None:

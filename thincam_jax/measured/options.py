@@ -135,7 +135,7 @@ def _check_sizes(
         raise MeasurementError(
             f"the PSF ({psf.name}) has {_size(psf)} pixels and the capture ({capture.name}) "
             f"{_size(capture)}; give both from the same part of one sensor, equally binned, or "
-            "with psf_scale the ratio of their pixel pitches"
+            "with `psf_scale` the ratio of their pixel pitches"
         )
     if dead is not None and dead.shape != capture.pixels.shape[:2]:
         raise MeasurementError(
@@ -155,13 +155,13 @@ def _check_channels(psf: Raw, capture: Raw, options: Preparation) -> None:
             if options.demosaicing == "superpixel" and any(n % 2 for n in raw.pixels.shape[:2]):
                 raise MeasurementError(
                     f"'superpixel' joins 2×2 pixels and the {name} has {_size(raw)}: cut off the "
-                    "last row or column, or choose 'bilinear'"
+                    "last row or column, or leave bilinear interpolation"
                 )
     fits = psf.channels in (1, capture.channels) or options.psf_channels == "mean"
     if not fits:
         raise MeasurementError(
             f"the PSF ({psf.name}) has {psf.channels} channels and the capture ({capture.name}) "
-            f"{capture.channels}; give as many, or average the PSF's with psf_channels='mean'"
+            f"{capture.channels}; give as many, or average the PSF's with `psf_channels='mean'`"
         )
 
 

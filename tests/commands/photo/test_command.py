@@ -445,9 +445,20 @@ def test_psf_has_its_own_bits_corner_and_pixels(grey, tmp_path):
     assert simulated.correlation(np.load(out), expected) > 0.9
 
 
-def test_wrong_corner_is_one_line(grey, tmp_path):
-    line = one_line(call(grey, tmp_path / "image.npy", "--corner", "5-15"))
-    assert line == "--corner 5-15: give the first pixel and the one after the last, as 5:15"
+@pytest.mark.parametrize("corner", ["5-15", "7:5"])
+def test_wrong_corner_is_one_line(grey, tmp_path, corner):
+    line = one_line(call(grey, tmp_path / "image.npy", "--corner", corner))
+    assert line == f"--corner {corner}: give the first pixel and the one after the last, as 5:15"
+
+
+def test_advice_on_channels_is_in_options_and_can_be_followed(grey, tmp_path):
+    tifffile.imwrite(grey["psf"], np.stack([tifffile.imread(grey["psf"])] * 3, axis=-1))
+    advice = "or average the PSF's with --psf-channels mean"
+    small = ("--downsample", 2)  # refused, but later
+    for result in (check(grey, *small), call(grey, tmp_path / "image.npy", "--background", 40)):
+        assert one_line(result).endswith(advice)
+    followed = check(grey, *small, "--psf-background", 40, *advice.split()[-2:])
+    assert "give at least 32 a side" in one_line(followed)
 
 
 def test_check_of_files_too_small_is_one_line(grey):

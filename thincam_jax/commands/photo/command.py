@@ -27,6 +27,9 @@ PsfScale = Annotated[
     float | None,
     Option(help="Enlarge the PSF, of any size: pitch of its pixels over the capture's."),
 ]
+PsfChannels = Annotated[
+    Literal["each", "mean"], Option(help="each: a PSF for each colour; mean: one for all.")
+]
 Bayer = Annotated[
     Literal["RGGB", "BGGR", "GRBG", "GBRG"] | None,
     Option(help="Colours of the mosaic, from its upper left."),
@@ -75,9 +78,7 @@ def reconstruct(
     noise_threshold: Annotated[
         float | None, Option(help="Set the PSF to 0 below so many times its noise.")
     ] = None,
-    psf_channels: Annotated[
-        Literal["each", "mean"], Option(help="each: a PSF for each colour; mean: one for all.")
-    ] = "each",
+    psf_channels: PsfChannels = "each",
     method: Annotated[
         str, Option(help=f"One of {', '.join(METHODS)}.", autocompletion=lambda: METHODS)
     ] = "admm-tv",
@@ -187,6 +188,7 @@ def check(
     psf_scale: PsfScale = None,
     bayer: Bayer = None,
     dead: Dead = None,
+    psf_channels: PsfChannels = "each",
     search: Annotated[float, Option(help="How far to look for the scale, parts of one.")] = 0.06,
 ) -> None:
     """Tell whether a PSF is that of a capture.
@@ -213,6 +215,7 @@ def check(
                     downsample=1 if downsample is None else downsample,
                     corner=read_corner(corner),
                     psf_scale=psf_scale,
+                    psf_channels=psf_channels,
                 ),
                 psf_bits,
             )

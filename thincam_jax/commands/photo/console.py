@@ -107,6 +107,8 @@ def read_corner(text: str) -> tuple[int, int]:
     """
     try:
         first, last = (int(part) for part in text.split(":"))
+        if not 0 <= first < last:
+            raise ValueError
     except ValueError:
         raise MeasurementError(
             f"--corner {text}: give the first pixel and the one after the last, as 5:15"

@@ -99,7 +99,7 @@ def read_acquisition(path: str | Path) -> Acquisition:
     except (OSError, KeyError, TypeError, ValueError) as error:
         raise CaptureStoreError(
             f"{path} is not what an acquisition made ({type(error).__name__}: {error}); give a "
-            "store of `acquire`"
+            "store of acquire()"
         ) from error
     lines = [line for line in read_journal(path / JOURNAL) if "step" in line]
     shots = {line["step"]: line for line in lines}
