@@ -96,8 +96,9 @@ def check_psf(
     errors and 0.3 pixels at the edge, an orientation if the block's misfits agree on it by four
     standard errors and J falls by 2 %. A turn of a symmetric PSF changes nothing and is not named.
 
-    **What it does not tell**: a shifted PSF, which shifts the picture and fits as well; and blur,
-    or a scale more than `search` away.
+    **What it does not tell**: a shifted PSF, which shifts the picture and fits as well; blur, or a
+    scale more than `search` away; and any scale beside a quarter turn where the sensor is not
+    square: what was beside it is missing, and asks for another scale. Turn the PSF, then check it.
 
     **Arguments**
 
@@ -144,7 +145,8 @@ def check_psf(
     lowest = min(profile, key=lambda s: profile[s].objective)
     for scale in (lowest - pixel / 2, lowest + pixel / 2):
         profile[scale] = tried(turned[best], scale)
-    return _judged(ORIENTATIONS[best], profile, pixel, try_psf.pixels)
+    whole = best % 2 == 0 or shape[0] == shape[1]
+    return _judged(ORIENTATIONS[best], profile, pixel, try_psf.pixels, whole)
 
 
 class _Trial:
@@ -262,8 +264,13 @@ def _best_orientation(found: list[_Tried]) -> int:
 
 
 def _judged(
-    orientation: Orientation, profile: dict[float, _Tried], pixel: float, pixels: int
+    orientation: Orientation,
+    profile: dict[float, _Tried],
+    pixel: float,
+    pixels: int,
+    whole: bool,
 ) -> PsfCheck:
+    """`whole`: nothing of the PSF was cut off to turn it."""
     scales = np.array(sorted(profile))
     found = [profile[s] for s in scales]
     objectives = np.array([one.objective for one in found])
@@ -278,9 +285,9 @@ def _judged(
     scale = _vertex(scales[near], objectives[near])
     error = float(np.std(vertices))
     reasons = [] if orientation == "as given" else [f"it fits better {orientation}"]
-    if at_end:
+    if at_end and whole:
         reasons.append(f"it fits better at {scale:.4f} times its size, or beyond: search farther")
-    elif abs(scale - 1) > max(_LEAST_SCALE * pixel, _SIGNIFICANCE * error):
+    elif whole and abs(scale - 1) > max(_LEAST_SCALE * pixel, _SIGNIFICANCE * error):
         reasons.append(f"it fits better at {scale:.4f} ± {error:.4f} times its size")
     return PsfCheck(
         orientation,
