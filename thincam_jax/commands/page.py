@@ -7,6 +7,7 @@ from typing import Any
 
 import jinja2
 
+from thincam_jax._core.files import read_regular
 from thincam_jax.commands.checked_config import dump_config
 
 
@@ -42,5 +43,5 @@ def number(value: float | None, digits: int) -> str:
 
 def data_url(picture: Path) -> str:
     """An image file as an address that holds it; its suffix is its kind."""
-    content = base64.b64encode(picture.read_bytes()).decode("ascii")
+    content = base64.b64encode(read_regular(picture)).decode("ascii")
     return f"data:image/{picture.suffix[1:]};base64,{content}"

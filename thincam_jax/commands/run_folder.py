@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from thincam_jax._core.files import WriteError, write_whole
+from thincam_jax._core.files import WriteError, read_regular, write_whole
 from thincam_jax.commands.checked_config import dump_config
 from thincam_jax.commands.config_file import ConfigError, slug
 from thincam_jax.commands.doctor import environment
@@ -61,7 +61,7 @@ class RunFolder:
         """The stored results of a target, or None if it has not been finished."""
         path = self.path / "targets" / f"{slug(target)}.json"
         try:
-            return json.loads(path.read_text(encoding="utf-8"))
+            return json.loads(read_regular(path))
         except (OSError, json.JSONDecodeError):
             return None
 
@@ -95,7 +95,7 @@ def claim_folder(path: Path, name: str, text: str, kind: str, folders: Sequence[
         # A neighbour is all that is there where the first start was killed.
         foreign = any(p.name != f"{name}.partial" for p in path.iterdir())
         if held.exists():
-            if held.read_bytes() != text.encode("utf-8"):
+            if read_regular(held) != text.encode("utf-8"):
                 raise ConfigError(
                     f"--out {path}: holds a {kind} of another configuration (see {held}); "
                     "give another folder or delete this one"

@@ -10,7 +10,7 @@ from jaxtyping import Float32, Float64
 
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Number
-from thincam_jax._core.files import MeasurementError, write_whole
+from thincam_jax._core.files import MeasurementError, read_regular, write_whole
 from thincam_jax.imaging.display import png_bytes
 from thincam_jax.imaging.refractive_index import (
     AbstractIndex,
@@ -211,9 +211,9 @@ def _record(path: Path) -> dict[str, Any]:
             "counts mean"
         )
     try:
-        record = json.loads(path.read_text("utf-8"))
+        record = json.loads(read_regular(path))
         known = record["format"] == _FORMAT and len(record["shape"]) == 2
-    except (ValueError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError):
         record, known = {}, False
     if not known:
         raise MeasurementError(f"{path}: is no height map's; give one of write_height_map")

@@ -228,7 +228,7 @@ def load_suggester(
     **Errors**: ValueError, one line, for a file that is none, and for one that was trained for
     another space, camera, synthesis, frequencies or precision, with the first that differs.
     """
-    source = BytesIO(Path(path).read_bytes())
+    source = BytesIO(files.read_regular(path))
     header = _read_header(path, source.readline())
     network = header["network"]
     model = ResponseModel(space, setup, synthesis, frequencies, network["rings"])

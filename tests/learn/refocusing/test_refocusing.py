@@ -22,6 +22,7 @@ from thincam_jax.learn.refocusing.loss import examples, loss, relative_error
 from thincam_jax.learn.refocusing.network import NetworkOptions, RefocusNetwork, explain
 from thincam_jax.learn.refocusing.planes import Planes
 from thincam_jax.learn.refocusing.scenes import Scene, SceneOptions, captured, draw_batch
+from thincam_jax.learn.refocusing.sources import photographs
 from thincam_jax.lensless.forward import imaging_operator
 from thincam_jax.units import nm, um
 
@@ -296,3 +297,9 @@ def test_multiscale_ssim_is_that_of_the_formula():
     wanted = means(image, target)[0] ** fine * means(*halves)[1] ** coarse
     np.testing.assert_allclose(multiscale_ssim(image, target), wanted, rtol=1e-9)
     np.testing.assert_allclose(multiscale_ssim(target, target), 1)
+
+
+def test_a_device_among_the_photographs_is_refused(tmp_path):
+    (tmp_path / "zero.png").symlink_to("/dev/zero")
+    with pytest.raises(OSError, match="a device or a pipe"):
+        photographs(tmp_path, 32)

@@ -272,6 +272,7 @@ def _taken(store: Path, config: "CaptureConfig") -> Any:
     """What a store holds, and how it is to be compared."""
     import json
 
+    from thincam_jax._core.files import read_regular
     from thincam_jax.commands.capture.run import Simulated, Taken
     from thincam_jax.hardware.acquisition.read import read_acquisition
     from thincam_jax.hardware.virtual.rig import Electronics
@@ -309,7 +310,7 @@ def _taken(store: Path, config: "CaptureConfig") -> Any:
         [_label(pattern) for pattern in patterns],
         [draw(pattern, display, config.display.pitch) for pattern in patterns],
         pixels,
-        json.loads(seconds.read_text("utf-8")) if seconds.is_file() else {},
+        json.loads(read_regular(seconds)) if seconds.is_file() else {},
         simulated,
         darks,
         hadamard,

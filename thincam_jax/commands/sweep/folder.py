@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from thincam_jax._core.files import write_whole
+from thincam_jax._core.files import read_regular, write_whole
 from thincam_jax.commands.checked_config import dump_config
 from thincam_jax.commands.run_folder import claim_folder
 from thincam_jax.commands.study.config import StudyConfig
@@ -60,7 +60,7 @@ class SweepFolder:
             if row is not None:
                 rows.append((point.values, row))
             elif self._failure(point).exists():
-                failures.append(json.loads(self._failure(point).read_text(encoding="utf-8")))
+                failures.append(json.loads(read_regular(self._failure(point))))
         found = table.joined(rows) if rows else None
         for name, content in (
             ("results.parquet", None if found is None else table.parquet_bytes(found)),

@@ -8,6 +8,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from thincam_jax._core.files import read_regular
 from thincam_jax.commands.checked_config import check_as
 from thincam_jax.commands.config_file import ConfigError, set_entry
 from thincam_jax.commands.study.build import as_method
@@ -100,7 +101,7 @@ def _key(config: StudyConfig, text: str, double: bool) -> str:
     versions = f"{METRICS_VERSION} {metadata.version('thincam_jax')} {'double' if double else ''}"
     pictures = [Path(target.path) for target in config.targets if target.path]
     # A picture that is not there is the worker's to report.
-    contents = [hashlib.sha256(p.read_bytes()).hexdigest() for p in pictures if p.is_file()]
+    contents = [hashlib.sha256(read_regular(p)).hexdigest() for p in pictures if p.is_file()]
     return _digest("\n".join([versions, text, *contents]))
 
 

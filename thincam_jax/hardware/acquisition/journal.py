@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from thincam_jax._core.capture_store import CaptureStoreError
+from thincam_jax._core.files import read_regular
 from thincam_jax.hardware.acquisition.plan import canonical_json
 
 
@@ -58,7 +59,7 @@ def sync_path(path: Path) -> None:
 
 def _parsed(path: Path) -> tuple[list[Any], int]:
     """The records of all whole lines, and how many bytes of the file these take."""
-    data = path.read_bytes() if path.exists() else b""
+    data = read_regular(path) if path.exists() else b""
     records, whole = [], 0
     for number, line in enumerate(data.split(b"\n")[:-1], 1):
         found = _records(line)

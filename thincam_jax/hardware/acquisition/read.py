@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from thincam_jax._core.capture_store import CaptureStore, CaptureStoreError, frame_digest, listed
+from thincam_jax._core.files import read_regular
 from thincam_jax.hardware.acquisition.journal import read_journal
 from thincam_jax.hardware.acquisition.plan import Pattern, Plan, settings_from
 from thincam_jax.hardware.acquisition.recorder import JOURNAL, PLAN
@@ -92,7 +93,7 @@ def read_acquisition(path: str | Path) -> Acquisition:
     attributes = store.attributes
     try:
         begun = dict(attributes["acquisition"])
-        plan = Plan.from_json((path / PLAN).read_text(encoding="utf-8"))
+        plan = Plan.from_json(read_regular(path / PLAN).decode("utf-8"))
         settings = tuple(settings_from(record) for record in begun.pop("settings"))
         if begun["plan"] != plan.hash or len(store.digests) != len(plan.steps):
             raise ValueError("its plan is another one")

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float32
 
+from thincam_jax._core.files import read_regular
 from thincam_jax.imaging.targets import load_image, middle_square, resize, sample_image
 from thincam_jax.learn.refocusing.dead_leaves import dead_leaves
 
@@ -56,7 +57,7 @@ def photographs(folder: str | os.PathLike[str], side: int, *, licence: str = "")
     if not files:
         raise ValueError(f"{str(folder)!r} holds no image; give a folder of {', '.join(_SUFFIXES)}")
     licence = licence or _licence(folder)
-    hashes = [hashlib.sha256(path.read_bytes()).hexdigest() for path in files]
+    hashes = [hashlib.sha256(read_regular(path)).hexdigest() for path in files]
     entries = zip(files, hashes, strict=True)
     manifest = tuple(Entry(path.name, digest, licence) for path, digest in entries)
     return Source(np.stack([_square(load_image(path), side) for path in files]), manifest)
@@ -95,6 +96,6 @@ def _square(image: np.ndarray, side: int) -> Float32[np.ndarray, "side side"]:
 def _licence(folder: Path) -> str:
     for name in _LICENCE_FILES:
         if (folder / name).is_file():
-            lines = (folder / name).read_text(encoding="utf-8", errors="replace").splitlines()
+            lines = read_regular(folder / name).decode("utf-8", "replace").splitlines()
             return next((line.strip() for line in lines if line.strip()), "unknown")
     return "unknown"
