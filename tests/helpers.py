@@ -1,7 +1,9 @@
 """Tools shared by the tests: data, trace counting, gradients by differences, relative errors."""
 
+import contextlib
 import functools
-from collections.abc import Callable, Iterable
+import resource
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +26,17 @@ def shared_data(name: str) -> Path:
     if not path.exists():
         pytest.skip(f"needs the data set {name} at ../shared/data/{name}, beside the checkout")
     return path
+
+
+@contextlib.contextmanager
+def full_disk(size: int) -> Iterator[None]:
+    """No file takes more than so many bytes: writing ends as on a full disk."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
 def quick(values: Iterable, *places: int) -> list:

@@ -1,8 +1,8 @@
 import os
-import resource
 
 import pytest
 
+from helpers import full_disk
 from thincam_jax._core import files
 
 
@@ -33,15 +33,9 @@ def test_crash_before_the_rename_leaves_the_old_file_alone(tmp_path, monkeypatch
 
 
 def test_crash_while_writing_leaves_nothing_half(tmp_path):
-    """A limit to the size of files ends the writing as a full disk does."""
     path = tmp_path / "a.txt"
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (4, hard))
-    try:
-        with pytest.raises(files.WriteError, match="too large"):
-            files.write_whole(path, "new text")
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    with full_disk(4), pytest.raises(files.WriteError, match="too large"):
+        files.write_whole(path, "new text")
     assert list(tmp_path.iterdir()) == []
 
 

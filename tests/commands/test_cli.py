@@ -1,7 +1,6 @@
 """The command: exit codes, one clear line for what a user can put right, and how to go on."""
 
 import os
-import resource
 import shlex
 import shutil
 import subprocess
@@ -13,7 +12,7 @@ import pytest
 from commands.study import tiny
 from typer.testing import CliRunner
 
-from helpers import ROOT
+from helpers import ROOT, full_disk
 from thincam_jax.commands import cli, doctor, help
 from thincam_jax.commands.accuracy import run as benches
 from thincam_jax.commands.cache import cache_state
@@ -270,16 +269,7 @@ def test_interrupt(file, monkeypatch, tmp_path, done, hint):
     assert result.stderr.splitlines() == [expected]
 
 
-@pytest.fixture
-def full_disk():
-    """No file takes more than 3 kB."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (3_000, before[1]))
-    yield
-    resource.setrlimit(resource.RLIMIT_FSIZE, before)
-
-
-def test_full_disk(file, monkeypatch, tmp_path, full_disk):
+def test_full_disk(file, monkeypatch, tmp_path):
     """One line, and what was finished is there."""
 
     def fill(study, folder, progress):
@@ -290,12 +280,14 @@ def test_full_disk(file, monkeypatch, tmp_path, full_disk):
 
     monkeypatch.setattr(studies, "run_study", fill)
     out = tmp_path / "out"
-    line = one_line(call("run", file, "--out", out))
+    with full_disk(3_000):
+        line = one_line(call("run", file, "--out", out))
     assert line.startswith(f"{out}/figures/mtf.png: cannot be written (File too large); make room")
     assert RunFolder(out).finished("chart") is not None
     assert list((out / "figures").iterdir()) == []
     # What cannot even begin says so of its first file.
-    line = one_line(call("run", file, "--out", out / "other", "--set", f"title={'T' * 3_000}"))
+    with full_disk(3_000):
+        line = one_line(call("run", file, "--out", out / "other", "--set", f"title={'T' * 3_000}"))
     assert line.startswith(f"{out}/other/config.yaml: cannot be written")
 
 

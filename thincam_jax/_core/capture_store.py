@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from thincam_jax._core.files import MeasurementError
+from thincam_jax._core.files import MeasurementError, writing
 
 CALIBRATION = "Hadamard captures"  # a store whose frames are those of a `HadamardSeries`
 CAPTURES = "captures"  # any other
@@ -88,17 +88,18 @@ class CaptureStore:
 
         row = together * shape[2] * np.dtype(dtype).itemsize
         rows = shape[1] if together == 1 else min(shape[1], max(1, _CHUNK // row))
-        group = zarr.create_group(path, attributes={"version": VERSION, **attributes})
-        group.create_array(
-            "frames",
-            shape=shape,
-            dtype=dtype,
-            chunks=(together, rows, shape[2]),
-            compressors=[Crc32cCodec()],
-            dimension_names=("frame", "y", "x"),
-        )
-        digests = group.create_array("digests", shape=shape[:1], dtype="uint64")
-        digests[:] = np.zeros(shape[0], np.uint64)
+        with writing(path):
+            group = zarr.create_group(path, attributes={"version": VERSION, **attributes})
+            group.create_array(
+                "frames",
+                shape=shape,
+                dtype=dtype,
+                chunks=(together, rows, shape[2]),
+                compressors=[Crc32cCodec()],
+                dimension_names=("frame", "y", "x"),
+            )
+            digests = group.create_array("digests", shape=shape[:1], dtype="uint64")
+            digests[:] = np.zeros(shape[0], np.uint64)
         return cls(path, "r+")
 
     @property
@@ -117,19 +118,21 @@ class CaptureStore:
         return range(first, min(first + self.together, len(self.digests)))
 
     def write(self, images: Mapping[int, np.ndarray]) -> None:
-        """Write frames by their numbers."""
+        """Write frames by their numbers. **Errors**: WriteError, one line."""
         numbers = sorted(images)
         first = images[numbers[0]]
         block = first[None] if len(images) == 1 else np.stack([images[n] for n in numbers])
-        if numbers == list(range(numbers[0], numbers[-1] + 1)):
-            self.frames[numbers[0] : numbers[-1] + 1] = block
-        else:
-            self.frames.oindex[np.array(numbers)] = block
+        with writing(self.path):
+            if numbers == list(range(numbers[0], numbers[-1] + 1)):
+                self.frames[numbers[0] : numbers[-1] + 1] = block
+            else:
+                self.frames.oindex[np.array(numbers)] = block
 
     def announce(self, digests: np.ndarray) -> None:
         """Write the digests: what they announce has to be there."""
         self.digests = digests.copy()
-        self.group["digests"][:] = digests
+        with writing(self.path):
+            self.group["digests"][:] = digests
 
     def tidy(self, numbers: Iterable[int]) -> None:
         """Remove what a killed process left half written in the chunks of frames."""

@@ -1,8 +1,10 @@
 """Files that are written whole or not at all, and read only where their size is known."""
 
+import contextlib
 import errno
 import os
 import stat
+from collections.abc import Iterator
 from pathlib import Path
 
 from thincam_jax._core.memory import refuse_if_too_large
@@ -22,6 +24,15 @@ class WriteError(OSError):
         )
 
 
+@contextlib.contextmanager
+def writing(path: str | os.PathLike[str]) -> Iterator[None]:
+    """WriteError, one line with this path, for what the system refuses within."""
+    try:
+        yield
+    except OSError as error:
+        raise WriteError(error.errno, error.strerror or str(error), str(path)) from error
+
+
 def write_whole(
     path: str | os.PathLike[str], content: bytes | str, *, on_disk: bool = False
 ) -> Path:
@@ -36,24 +47,18 @@ def write_whole(
     partial = path.with_name(path.name + ".partial")
     data = content.encode("utf-8") if isinstance(content, str) else content
     try:
-        with open(partial, "wb") as file:
-            file.write(data)
-            if on_disk:
-                file.flush()
-                os.fsync(file.fileno())
-        os.replace(partial, path)
-    except OSError as error:
-        _drop(partial)
-        raise WriteError(error.errno, error.strerror or str(error), str(path)) from error
+        with writing(path):
+            with open(partial, "wb") as file:
+                file.write(data)
+                if on_disk:
+                    file.flush()
+                    os.fsync(file.fileno())
+            os.replace(partial, path)
     except BaseException:
-        _drop(partial)
+        if partial.is_file():
+            partial.unlink()
         raise
     return path
-
-
-def _drop(partial: Path) -> None:
-    if partial.is_file():
-        partial.unlink()
 
 
 def read_regular(path: str | os.PathLike[str]) -> bytes:

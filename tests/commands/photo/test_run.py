@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from commands.photo import simulated
 
-from helpers import relative_l2
+from helpers import full_disk, relative_l2
 from thincam_jax._core import memory
 from thincam_jax.commands.photo import jobs, run
 from thincam_jax.commands.photo.jobs import plan_jobs
@@ -99,25 +99,23 @@ def test_saturated_pixels_have_no_weight(folder, tmp_path):
     assert simulated.correlation(np.load(output.path), simulated.scene()[1]) > 0.9
 
 
-@pytest.mark.parametrize("failing", [1, 2])
-def test_nothing_is_left_of_a_write_that_fails(folder, tmp_path, monkeypatch, failing):
-    """Not even what stood there before is touched."""
+@pytest.mark.parametrize("room", [1_000, 10_000])
+def test_nothing_is_left_of_a_write_that_fails(folder, tmp_path, monkeypatch, room):
+    """Of the first or the last file. Not even what stood there before is touched."""
     output = Output(tmp_path / "first.png")
     output.path.write_text("before")
-    calls = []
 
-    def full(path, *rest, **more):
-        calls.append(path)
-        if len(calls) == failing:
-            raise OSError(28, "No space left on device")
-        return written(path, *rest, **more)
+    def limited(*given):
+        with full_disk(room):
+            jobs.write_job(*given)
 
-    written = jobs.write_image
-    monkeypatch.setattr(jobs, "write_image", full)
+    monkeypatch.setattr(run, "write_job", limited)
     planned = plan_jobs(folder / "first.tif", sources(folder), output)
     (result,) = run_jobs(planned, sources(folder), SHORT, output)
     assert isinstance(result, Failed)
-    assert str(result.error) == f"{output.path}: cannot be written (No space left on device)"
+    assert str(result.error).startswith(
+        f"{output.path}: cannot be written (File too large); make room or give another folder"
+    )
     assert sorted(p.name for p in tmp_path.iterdir()) == ["captures", "first.png"]
     assert output.path.read_text() == "before"
 

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 import thincam_jax as tc
+from helpers import full_disk
+from thincam_jax._core.files import WriteError
 from thincam_jax.imaging.operators import Matrix
 from thincam_jax.measured.calibration import (
     CaptureStoreError,
@@ -79,6 +81,11 @@ def test_a_stored_matrix_is_that_in_memory(tmp_path, monkeypatch):
         read_matrix(path)
     with pytest.raises(CaptureStoreError, match="no finished system matrix"):
         read_matrix(captures.path)
+    full = r"other\.zarr: cannot be written \(File too large\); make room"
+    with full_disk(1_500), pytest.raises(WriteError, match=full):
+        write_matrix(captures, tmp_path / "other.zarr")
+    with full_disk(100), pytest.raises(WriteError, match=full):
+        create_captures(tmp_path / "an-other.zarr", SERIES[0], SHAPE)
 
 
 def test_an_image_comes_back_by_the_measured_matrix(tmp_path):

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from thincam_jax._core.files import write_whole
 from thincam_jax.commands.photo.options import Output, Sources
 from thincam_jax.measured import CaptureFileError, MeasurementError, write_image
 from thincam_jax.measured.read import image_files
@@ -103,7 +104,7 @@ def write_job(
                 gamma=output.gamma,
             )
         for path, content in (beside or {}).items():
-            (Path(staging) / path.name).write_bytes(content)
+            write_whole(Path(staging) / path.name, content)
         for path in (job.record, *job.images, *job.beside):
             os.replace(Path(staging) / path.name, path)
 

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from thincam_jax._core.files import WriteError, writing
 from thincam_jax._core.memory import refuse_if_too_large
 from thincam_jax.commands.doctor import environment
 from thincam_jax.commands.photo.jobs import Job, write_job
@@ -71,7 +72,7 @@ class Failed:
     """A capture of which nothing was written, and why: one line."""
 
     job: Job
-    error: MeasurementError | MemoryError
+    error: MeasurementError | MemoryError | WriteError
 
 
 def run_jobs(
@@ -94,7 +95,7 @@ def run_jobs(
                 finished = _join(job, images, rig, output)
             else:
                 finished = _run_job(job, rig, recipe, output, told)
-        except (MeasurementError, MemoryError) as error:
+        except (MeasurementError, MemoryError, WriteError) as error:
             yield Failed(job, error)
             continue
         if sources.distances and job.focus is not None:
@@ -196,12 +197,8 @@ def _join(job: Job, images: list[np.ndarray], rig: Rig, output: Output) -> Finis
 
 
 def _written(job: Job, image: np.ndarray, record, output: Output, beside=None) -> Finished:
-    try:
+    with writing(job.images[0]):
         write_job(job, image, record, output, beside)
-    except OSError as error:
-        raise MeasurementError(
-            f"{job.images[0]}: cannot be written ({error.strerror or error})"
-        ) from None
     return Finished(job, record, image)
 
 

@@ -8,9 +8,8 @@ no line is taken again.
 import os
 import platform
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib.metadata import version
@@ -22,7 +21,7 @@ from filelock import FileLock
 from filelock import Timeout as LockTimeout
 
 from thincam_jax._core.capture_store import CaptureStore, CaptureStoreError, frame_digest
-from thincam_jax._core.files import WriteError
+from thincam_jax._core.files import write_whole, writing
 from thincam_jax.hardware.acquisition.journal import Journal, sync_path
 
 JOURNAL, PLAN = "journal.jsonl", "plan.json"
@@ -43,15 +42,6 @@ class Layout:
     together: int
     attributes: Mapping[str, Any]
     plan: str
-
-
-@contextmanager
-def writing(path: Path) -> Iterator[None]:
-    """WriteError, one line, for what the system refuses within."""
-    try:
-        yield
-    except OSError as error:
-        raise WriteError(error.errno, error.strerror or str(error), str(path)) from error
 
 
 class Lock:
@@ -83,7 +73,7 @@ def create_store(path: Path, layout: Layout) -> None:
         CaptureStore.create(
             partial, layout.shape, layout.dtype, layout.attributes, together=layout.together
         )
-        (partial / PLAN).write_text(layout.plan, encoding="utf-8")
+        write_whole(partial / PLAN, layout.plan)
         for file in (*partial.rglob("*"), partial):
             sync_path(file)
         os.rename(partial, path)
@@ -159,8 +149,7 @@ class Recorder:
             if self._waiting:
                 self._save()
             self._wait()
-            with writing(self.store.path):
-                self.store.announce(self._digests)
+            self.store.announce(self._digests)
         finally:
             self._thread.shutdown()
             self._helpers.shutdown()

@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Float
 
 from thincam_jax._core.capture_store import VERSION, opened
+from thincam_jax._core.files import writing
 from thincam_jax._core.memory import refuse_if_too_large
 from thincam_jax.imaging.operators import Matrix
 from thincam_jax.measured.calibration.captures import CaptureStoreError, HadamardCaptures
@@ -59,7 +60,8 @@ def recover_matrix(captures: HadamardCaptures) -> Matrix:
 def write_matrix(captures: HadamardCaptures, path: str | Path) -> Path:
     """H into a Zarr store, block by block, never whole in memory; `read_matrix` reads it.
 
-    **Errors**: CaptureStoreError, one line, where something is at `path` already.
+    **Errors**: CaptureStoreError, one line, where something is at `path` already; WriteError for
+    a full disk.
     """
     path, series = Path(path), captures.series
     if path.exists():
@@ -68,31 +70,32 @@ def write_matrix(captures: HadamardCaptures, path: str | Path) -> Path:
     from zarr.codecs import Crc32cCodec
 
     count, cells = math.prod(captures.sensor_shape), series.cell_count
-    group = zarr.create_group(path)
-    array = group.create_array(
-        "matrix",
-        shape=(count, cells),
-        dtype="float32",
-        chunks=(min(count, max(1, _BLOCK // (4 * cells))), cells),
-        compressors=[Crc32cCodec()],
-        config={"write_empty_chunks": True},
-        dimension_names=("pixel", "cell"),
-    )
-    # Written in whole chunks: what is left of a block goes with the next.
-    left, start = np.empty((0, cells), np.float32), 0
-    for _, block in matrix_blocks(captures):
-        left = np.concatenate([left, block])
-        whole = len(left) - len(left) % array.chunks[0]
-        array[start : start + whole] = left[:whole]
-        left, start = left[whole:], start + whole
-    array[start:] = left
-    # Last: a matrix that was not finished is none.
-    group.attrs.update(
-        kind=_KIND,
-        version=VERSION,
-        object_shape=series.object_shape,
-        sensor_shape=captures.sensor_shape,
-    )
+    with writing(path):
+        group = zarr.create_group(path)
+        array = group.create_array(
+            "matrix",
+            shape=(count, cells),
+            dtype="float32",
+            chunks=(min(count, max(1, _BLOCK // (4 * cells))), cells),
+            compressors=[Crc32cCodec()],
+            config={"write_empty_chunks": True},
+            dimension_names=("pixel", "cell"),
+        )
+        # Written in whole chunks: what is left of a block goes with the next.
+        left, start = np.empty((0, cells), np.float32), 0
+        for _, block in matrix_blocks(captures):
+            left = np.concatenate([left, block])
+            whole = len(left) - len(left) % array.chunks[0]
+            array[start : start + whole] = left[:whole]
+            left, start = left[whole:], start + whole
+        array[start:] = left
+        # Last: a matrix that was not finished is none.
+        group.attrs.update(
+            kind=_KIND,
+            version=VERSION,
+            object_shape=series.object_shape,
+            sensor_shape=captures.sensor_shape,
+        )
     return path
 
 
