@@ -54,13 +54,18 @@ class TestYaml:
         rows = ["a0: &a0 [x]"]
         rows += [f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 9)}]" for n in range(1, 11)]
         (line,) = faults(tmp_path, "\n".join(rows))
-        assert "its aliases stand for 8.34e+09 entries, at most 100000 are read" in line
+        assert "holds 8335593969 entries (an alias counts as all that it stands for)" in line
         merged = ["a0: &a0 {x: 1}"]
         merged += [f"a{n}: &a{n} {{<<: [{', '.join([f'*a{n - 1}'] * 9)}]}}" for n in range(1, 11)]
         (line,) = faults(tmp_path, "\n".join(merged))
-        assert "its aliases stand for" in line
-        with pytest.raises(ConfigError, match="--set title: its aliases stand for"):
+        assert "(an alias counts as all that it stands for), at most 100000 are read" in line
+        with pytest.raises(ConfigError, match="--set title: holds .* entries .an alias counts"):
             read_value("{" + ", ".join(rows) + "}", "--set title")
+
+    def test_too_many_entries_without_an_alias(self, monkeypatch):
+        monkeypatch.setattr("thincam_jax.commands.config_file._MOST_ENTRIES", 3)
+        with pytest.raises(ConfigError, match="^--set a: holds 4 entries .* at most 3 are read"):
+            read_value("[1, 2, 3]", "--set a")
 
     def test_unit_without_a_space(self, tmp_path):
         config = load(tmp_path, changed("pitch: 40 um", "pitch: 40um"))

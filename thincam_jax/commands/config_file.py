@@ -57,8 +57,8 @@ def _read_yaml(text: str) -> tuple[yaml.Node | None, Any]:
         count = 0 if node is None else _entries(node, {})
         if count > _MOST_ENTRIES:
             raise _TooLargeError(
-                f"its aliases stand for {count:.3g} entries, at most {_MOST_ENTRIES} are read; "
-                "write out what is meant"
+                f"holds {count} entries (an alias counts as all that it stands for), at most "
+                f"{_MOST_ENTRIES} are read; give fewer"
             )
         return node, yaml.safe_load(text)
     except RecursionError:

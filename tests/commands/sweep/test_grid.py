@@ -139,7 +139,7 @@ NINES = "9," * 99
         ("mask.width=1 mm:2 mm:3", "a unit stands once, at the end"),
         ("title=[a", "put texts in quotes"),
         # Counted as in files.
-        (f"seed=&a [{NINES}],&b [{'*a,' * 99}],[{'*b,' * 99}]", "its aliases stand for 9.9e+05"),
+        (f"seed=&a [{NINES}],&b [{'*a,' * 99}],[{'*b,' * 99}]", "entries (an alias counts as"),
         ("mask.*=1", "mask is no list"),
         ("*=1", "the file is no list"),
         ("methods.5.shots.*.beta=1", "methods.5.shots is no list"),
