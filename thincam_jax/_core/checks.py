@@ -147,14 +147,6 @@ def channels_first(name: str, shape: tuple[int, ...]) -> None:
         )
 
 
-def shown(value: Any, unit: str, scale: float = 1.0) -> str:
-    """A quantity as a repr shows it: four digits and its unit; "?" while it is traced."""
-    known = _known(value)
-    if known is None:
-        return f"? {unit}"
-    return f"{known / scale:.4g} {unit}" if known.ndim == 0 else f"{known.shape} × {unit}"
-
-
 def fraction(name: str, value: Any) -> Array:
     """A number above 0 and at most 1."""
     message = f"{name} = {{}} is out of range; give 0 < {name} <= 1"

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
+from thincam_jax._core.module import Module
 from thincam_jax.imaging.sensor import Sensor
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.masks.fza import FresnelZoneAperture, Profile
@@ -14,7 +15,7 @@ from thincam_jax.lensless.masks.fza import FresnelZoneAperture, Profile
 MOST_CAPTURES = 8
 
 
-class Design(eqx.Module):
+class Design(Module):
     """Captures with Fresnel zone apertures; every number may be searched for.
 
     - `beta`: β of each capture's mask, rad/mm².

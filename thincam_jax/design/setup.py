@@ -4,10 +4,11 @@ import equinox as eqx
 from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
+from thincam_jax._core.module import Module
 from thincam_jax.design.prior import PowerLaw
 
 
-class SignalNoise(eqx.Module):
+class SignalNoise(Module):
     """Gaussian noise at a signal-to-noise ratio, whatever the light.
 
     - `snr_db`: ratio of the capture's variance over the sensor to the noise's, dB. Dividing the
@@ -24,7 +25,7 @@ class SignalNoise(eqx.Module):
         return signal * 10 ** (-self.snr_db / 10)
 
 
-class PhotonNoise(eqx.Module):
+class PhotonNoise(Module):
     """Shot noise of the design's own light, and read noise.
 
     - `electrons`: of a pixel, from each mm² of open aperture, in an exposure of one share
@@ -45,7 +46,7 @@ class PhotonNoise(eqx.Module):
         return light / counted + (self.read_noise / counted) ** 2
 
 
-class Setup(eqx.Module):
+class Setup(Module):
     """A sensor before a scene of mean 1 and the variance `contrast`².
 
     - `pitch`: of the sensor's pixels, mm; `sensor_width`: mm.

@@ -8,9 +8,10 @@ from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Number, Numbers
+from thincam_jax._core.module import Module
 
 
-class AbstractIndex(eqx.Module):
+class AbstractIndex(Module):
     """A refractive index n(λ), λ in mm (of vacuum).
 
     - `band`: the wavelengths for which it holds, mm.

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable, Sequence
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -10,10 +9,11 @@ from jaxtyping import Array, Float
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Number, Numbers
 from thincam_jax._core.grids import Grid, cell_overlap
+from thincam_jax._core.module import Module
 from thincam_jax._core.precision import product
 
 
-class ImagePlane(eqx.Module):
+class ImagePlane(Module):
     """A flat, self-luminous image, centred on the optical axis, facing the camera.
 
     - `image`: radiance, (*batch, y, x), in any unit; a batch can hold the colour channels.
@@ -105,7 +105,7 @@ def _cell_average(x, pitch, count: int, width, moves=None) -> Float[Array, "n co
     return jnp.diff(jnp.where(high > low, mean, first), axis=1) / pitch
 
 
-class Spectrum(eqx.Module):
+class Spectrum(Module):
     """Wavelengths and their shares of the captured light.
 
     - `wavelengths`: mm.
@@ -130,7 +130,7 @@ class Spectrum(eqx.Module):
             raise ValueError(f"weights = {self.weights} has a negative share; give weights >= 0")
 
 
-class Scene(eqx.Module):
+class Scene(Module):
     """Image planes at distances, all with one spectrum. Planes do not hide each other.
 
     - `planes`: one `ImagePlane` or a sequence of them, with equal batch shapes.

@@ -11,9 +11,10 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Number, Shape
 from thincam_jax._core.grids import Grid
+from thincam_jax._core.module import Module
 
 
-class Sensor(eqx.Module):
+class Sensor(Module):
     """A monochrome image sensor of square pixels that are sensitive over their whole area.
 
     - `shape`: (rows, columns).
@@ -63,17 +64,13 @@ class Sensor(eqx.Module):
             raise ValueError("bit_depth needs an exposure: the converter's range is the full well")
         self.bit_depth = None if bit_depth is None else int(bit_depth)
 
-    def __repr__(self) -> str:
-        rows, columns = self.shape
-        return f"Sensor({rows}×{columns} pixels of {checks.shown(self.pitch, 'µm', 1e-3)})"
-
     @property
     def grid(self) -> Grid:
         """The pixel centres."""
         return Grid(self.shape, self.pitch)
 
 
-class AbstractNoise(eqx.Module):
+class AbstractNoise(Module):
     """Adds the randomness of a read-out to a noise-free image."""
 
     @abc.abstractmethod

@@ -3,18 +3,18 @@
 import functools
 from typing import Any
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Number
+from thincam_jax._core.module import Module
 from thincam_jax.imaging.sensor import Sensor
 from thincam_jax.lensless.masks.base import AbstractMask
 from thincam_jax.lensless.propagation.path import Path
 
 
-class LenslessCamera(eqx.Module):
+class LenslessCamera(Module):
     """A coded mask in the plane z = 0 and a sensor at z = `distance`; objects at z < 0.
 
     - `mask`: any mask; see `thincam_jax.lensless.masks`.
@@ -36,10 +36,6 @@ class LenslessCamera(eqx.Module):
         self.mask = mask
         self.sensor = sensor
         self.distance = checks.positive("distance", distance, "mm")
-
-    def __repr__(self) -> str:
-        distance = checks.shown(self.distance, "mm")
-        return f"LenslessCamera({self.mask}, {self.sensor}, distance {distance})"
 
     def path(self, wavelength: Number, object_distance: Number) -> Path:
         """The light's path from a point at `object_distance` (mm) in front of the mask."""

@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 from thincam_jax._core import checks
 from thincam_jax._core.grids import same_parity
 from thincam_jax._core.memory import refuse_if_too_large
+from thincam_jax._core.module import Module
 from thincam_jax.imaging.operators import (
     AbstractOperator,
     CropConvolution,
@@ -37,7 +38,7 @@ from thincam_jax.reconstruction.solver import Reconstruction
 from thincam_jax.reconstruction.synthesis import check_synthesis, separate
 
 
-class Recording(eqx.Module):
+class Recording(Module):
     """What was seen: captures, how they came about, their noise, and the pixels to trust.
 
     **Arguments**

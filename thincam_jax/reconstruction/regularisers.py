@@ -10,12 +10,13 @@ import jax.scipy.fft
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from thincam_jax._core.module import Module
 from thincam_jax.reconstruction.wavelet import Wavelet
 
 Parts = tuple[Float[Array, "..."], ...]
 
 
-class AbstractRegulariser(eqx.Module):
+class AbstractRegulariser(Module):
     r"""R(f) = φ(K f) of images (*batch, channel, plane, y, x), K linear, φ a norm or a seminorm."""
 
     @property

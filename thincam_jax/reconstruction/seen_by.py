@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
+from thincam_jax._core.module import Module
 from thincam_jax.imaging.operators import kernel_grid
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.method import MODELS, Model
@@ -18,7 +19,7 @@ from thincam_jax.reconstruction.registration import own_field, register
 _DARK = 0.3  # of a PSF's absolute sum
 
 
-class Cameras(eqx.Module):
+class Cameras(Module):
     """Cameras whose PSFs are computed, one for each capture, with the light that they saw.
 
     **Arguments**
@@ -103,7 +104,7 @@ class Cameras(eqx.Module):
         return kernels
 
 
-class Psfs(eqx.Module):
+class Psfs(Module):
     """Measured PSFs on the pixels of the captures, one for each capture.
 
     **Arguments**

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
+from thincam_jax._core.module import Module
 from thincam_jax.imaging.display import eight_bit, pictures, png_bytes
 from thincam_jax.reconstruction.drive import Callback, Progress
 
@@ -16,7 +17,7 @@ if TYPE_CHECKING:
     from thincam_jax.reconstruction.recording import Recording
 
 
-class Reconstruction(eqx.Module):
+class Reconstruction(Module):
     """A reconstructed image; with cameras upright as the scene is, otherwise as the captures are.
 
     - `image`: radiance, (*batch, y, x), in the scene's unit; (*batch, plane, y, x) with planes.
@@ -38,7 +39,7 @@ class Reconstruction(eqx.Module):
     method: str = eqx.field(static=True, default="")
     reason: str = eqx.field(static=True, default="")
     ending: str | None = eqx.field(static=True, default=None)
-    history: tuple[Progress, ...] = eqx.field(static=True, default=())
+    history: tuple[Progress, ...] = eqx.field(static=True, default=(), repr=False)
     iterations: int = eqx.field(static=True, default=0)
     seconds: float = eqx.field(static=True, default=0.0)
     tau: float | None = eqx.field(static=True, default=None)
@@ -63,7 +64,7 @@ class Reconstruction(eqx.Module):
         return png_bytes(eight_bit(np.concatenate(images, axis=1)))
 
 
-class AbstractSolver(eqx.Module):
+class AbstractSolver(Module):
     """What is done about a recording; its fields are all that can be asked of the method."""
 
     name: ClassVar[str]

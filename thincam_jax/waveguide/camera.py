@@ -6,19 +6,19 @@ surface with the top hologram a glass thickness w further, and objects d2 before
 5.5).
 """
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Number, Numbers
+from thincam_jax._core.module import Module
 from thincam_jax.imaging.refractive_index import AbstractIndex, as_index
 from thincam_jax.imaging.sensor import Sensor
 from thincam_jax.waveguide.hologram import VolumeHologram
 
 
-class Rectangle(eqx.Module):
+class Rectangle(Module):
     """A part of a plane: `centre` and `size` (x, y), mm."""
 
     centre: Float[Array, "2"]
@@ -35,7 +35,7 @@ class Rectangle(eqx.Module):
         return (abs(points - self.centre) <= self.size / 2).all(axis=-1)
 
 
-class Screen(eqx.Module):
+class Screen(Module):
     """A plane-parallel glass plate with the same hologram at the top and at the bottom.
 
     - `hologram`: on the front surface before the camera and on the rear surface before the object.
@@ -63,7 +63,7 @@ class Screen(eqx.Module):
         self.top, self.bottom = top, bottom
 
 
-class SeeThroughCamera(eqx.Module):
+class SeeThroughCamera(Module):
     """A screen and the camera behind its top hologram.
 
     - `focal_distance`: d0, from the sensor to the lens, mm; the lens is a pinhole here.

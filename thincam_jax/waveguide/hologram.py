@@ -15,7 +15,6 @@ the Bragg condition (Eq 5.5); with k = 2πn/λ this is a mirror reflection at th
 Directions are unit vectors (x, y, z) in the film; z is its normal.
 """
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optimistix
@@ -23,10 +22,11 @@ from jaxtyping import Array, Bool, Float
 
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Number
+from thincam_jax._core.module import Module
 from thincam_jax.imaging.refractive_index import AbstractIndex, ConstantIndex, as_index, changed
 
 
-class VolumeHologram(eqx.Module):
+class VolumeHologram(Module):
     """A reflection hologram of plane, equidistant fringes in a film.
 
     - `grating`: K, rad/mm, (x, y, z).

@@ -37,7 +37,6 @@ def test_rectangle():
     mask = tc.FresnelZoneAperture(1e-9, **sides, centre=(0.011, -0.02))
     value = np.asarray(sample(mask, tc.Grid((30, 41), 0.02)))
     np.testing.assert_allclose(value.sum() * 0.02**2, 0.513 * 0.27, rtol=1e-9)
-    assert "width 0.513 mm, height 0.27 mm" in repr(mask)
     tall = tc.FresnelZoneAperture(30.0, 0.7, width=0.5, height=0.8, pixel_pitch=0.1)
     assert tall.pixels == (8, 5)
     assert float(tall.finest_frequency) == pytest.approx(30.0 * 0.8 / (2 * np.pi))

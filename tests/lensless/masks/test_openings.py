@@ -31,7 +31,6 @@ def test_rings_are_sampled_by_their_area():
     y, x = ((np.arange(n) - (n - 1) / 2) * 0.023 for n in (31, 34))
     inside = np.hypot(y[:, None] - 0.013, x + 0.02) < 0.1 - 0.023
     assert np.abs(value[inside]).max() < 1e-12
-    assert repr(mask) == "RadialMask(3 rings of 100 µm)"
 
 
 def test_gradients_of_rings():

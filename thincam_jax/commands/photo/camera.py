@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
+import equinox as eqx
 import numpy as np
 
 from thincam_jax.commands.config_file import ConfigError, read_raw
@@ -52,8 +53,8 @@ def computed_psf(config: Path, seen_by: Cameras) -> Raw:
     (camera,), wavelength, distance = seen_by.cameras, seen_by.wavelength, seen_by.object_distance
     how = {"model": seen_by.model, "pixel_integration": seen_by.pixel_integration}
     image = psf(camera, wavelength=wavelength, object_distance=distance, **how)
+    told = eqx.tree_pformat(camera, width=10_000)  # in one line
     name = (
-        f"camera of {config}: {camera}, wavelength {wavelength * 1e6:g} nm, "
-        f"object at {distance:g} mm"
+        f"camera of {config}: {told}, wavelength {wavelength * 1e6:g} nm, object at {distance:g} mm"
     )
     return Raw(np.asarray(image), name=name)

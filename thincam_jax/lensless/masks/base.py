@@ -12,10 +12,11 @@ from jaxtyping import Array, Complex, Float
 
 from thincam_jax._core.checks import Number
 from thincam_jax._core.grids import Grid, cell_overlap
+from thincam_jax._core.module import Module
 from thincam_jax._core.precision import as_complex, phasor, product
 
 
-class AbstractMask(eqx.Module):
+class AbstractMask(Module):
     """A thin mask in the plane z = 0, given by its amplitude transmittance.
 
     - `centre`: (y, x) of the mask's centre relative to the optical axis, mm.

@@ -62,9 +62,6 @@ class AbstractCellMask(AbstractFactoredMask):
         rows, columns = (AxisFactors(cell_edges(v.shape[1], self.cell), v) for v in both)
         return MaskTerms(coefficients, rows, columns)
 
-    def _repr(self, what: str) -> str:
-        return f"{type(self).__name__}({what}, cell {checks.shown(self.cell, 'µm', 1e-3)})"
-
 
 def cell_edges(count: int, cell: Float[Array, ""]) -> Float[Array, " edge"]:
     """Edges of so many cells about the mask's centre, mm."""
@@ -106,9 +103,6 @@ class SeparableMask(AbstractCellMask):
         self.cell = checks.positive("cell", cell, "mm")
         self.combine = checks.choice("combine", combine, COMBINATIONS)  # pyright: ignore
         self.centre = checks.finite("centre", centre, "mm", shape=(2,))
-
-    def __repr__(self) -> str:
-        return self._repr(f"{self.rows.size}×{self.columns.size} {self.combine}")
 
     def patterns(self) -> Patterns:
         a, b = self.rows, self.columns

@@ -106,13 +106,6 @@ class FresnelZoneAperture(AbstractFactoredMask):
             )
             self.pixels = rows, columns
 
-    def __repr__(self) -> str:
-        beta, phase = checks.shown(self.beta, "rad/mm²"), checks.shown(self.phase, "rad")
-        width = checks.shown(self.width, "mm")
-        if self.height is not None:
-            width += f", height {checks.shown(self.height, 'mm')}"
-        return f"FresnelZoneAperture(β {beta}, phase {phase}, width {width}, {self.profile})"
-
     @property
     def extent(self) -> tuple[Float[Array, ""], Float[Array, ""]]:
         return self.width if self.height is None else self.height, self.width

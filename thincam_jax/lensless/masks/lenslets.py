@@ -45,13 +45,6 @@ class LensletArray(AbstractFactoredMask):
         self.shape = checks.shape2d("shape", shape)
         self.centre = checks.finite("centre", centre, "mm", shape=(2,))
 
-    def __repr__(self) -> str:
-        down, across = self.shape
-        focal_length = checks.shown(self.focal_length, "mm")
-        return (
-            f"LensletArray({down}×{across} of {checks.shown(self.pitch, 'mm')}, f {focal_length})"
-        )
-
     @property
     def extent(self) -> tuple[Float[Array, ""], Float[Array, ""]]:
         return self.shape[0] * self.pitch, self.shape[1] * self.pitch

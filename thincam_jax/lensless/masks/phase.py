@@ -78,12 +78,6 @@ class PhaseMask(AbstractMask):
         self.centre = checks.finite("centre", centre, "mm", shape=(2,))
         self.interpolation = checks.choice("interpolation", interpolation, get_args(Interpolation))  # pyright: ignore
 
-    def __repr__(self) -> str:
-        rows, columns = self.height.shape
-        cells = f"{rows}×{columns} cells of {checks.shown(self.pitch, 'µm', 1e-3)}"
-        highest = checks.shown(jnp.max(self.height), "µm", 1e-3)
-        return f"PhaseMask({cells}, up to {highest} high, {self.interpolation})"
-
     @property
     def extent(self) -> tuple[Float[Array, ""], Float[Array, ""]]:
         rows, columns = self.height.shape

@@ -43,10 +43,6 @@ class Pinhole(AbstractFactoredMask):
         self.height = None if height is None else checks.positive("height", height, "mm")
         self.centre = checks.finite("centre", centre, "mm", shape=(2,))
 
-    def __repr__(self) -> str:
-        height, width = (checks.shown(side, "µm", 1e-3) for side in self.extent)
-        return f"Pinhole({width if self.height is None else f'{height} × {width}'})"
-
     @property
     def extent(self) -> tuple[Float[Array, ""], Float[Array, ""]]:
         return self.width if self.height is None else self.height, self.width
@@ -84,9 +80,6 @@ class RadialMask(AbstractMask):
         self.rings = checks.transmittances("rings", rings)
         self.ring = checks.positive("ring", ring, "mm")
         self.centre = checks.finite("centre", centre, "mm", shape=(2,))
-
-    def __repr__(self) -> str:
-        return f"RadialMask({self.rings.size} rings of {checks.shown(self.ring, 'µm', 1e-3)})"
 
     @property
     def extent(self) -> tuple[Float[Array, ""], Float[Array, ""]]:

@@ -49,10 +49,6 @@ class AbstractRedundantArray(AbstractCellMask):
         rows, columns = self.shape
         return 2 * self.cells[:rows, :columns] - 1
 
-    def __repr__(self) -> str:
-        tiles = "" if self.tiles == (1, 1) else f", {self.tiles[0]}×{self.tiles[1]} tiles"
-        return self._repr(f"{self.shape[0]}×{self.shape[1]}{tiles}")
-
 
 class ModifiedUniformlyRedundantArray(AbstractRedundantArray):
     r"""A MURA of p × p cells (Gottesman and Fenimore 1989), half of them open.

@@ -1,0 +1,66 @@
+"""Modules that print the values of their numbers, with units."""
+
+import dataclasses
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import wadler_lindig as wl
+
+from thincam_jax._core import checks
+
+_MM = (
+    *("cell", "centre", "distance", "focal_distance", "focal_length", "glass_thickness", "height"),
+    *("lens_distance", "object_distance", "object_width", "pitch", "ring", "sensor_width", "size"),
+    *("thickness", "wavelength", "wavelengths", "width"),
+)
+_UNITS = dict.fromkeys(_MM, "mm") | {
+    "beta": "rad/mm²",
+    "electrons": "electrons/mm²",
+    "full_well": "electrons",
+    "grating": "rad/mm",
+    "phase": "rad",
+    "read_noise": "electrons",
+    "snr_db": "dB",
+    "tilt": "rad",
+}
+_LENGTHS = ((1.0, "mm", 0.1), (1e-3, "µm", 1e-3), (1e-6, "nm", 0.0))  # unit, name, from here on
+_MOST = 4  # numbers of an array that are shown, not counted
+
+
+class Module(eqx.Module):
+    """An `equinox.Module` whose repr shows scalars by value and unit; "?" while they are traced.
+
+    Larger arrays are shown by type and shape; what is None or as by default is left out.
+    """
+
+    def __pdoc__(self, **kwargs: Any) -> wl.AbstractDoc:
+        """What equinox's printer asks for, of this object or of one inside another."""
+        named = [(f, getattr(self, f.name, None)) for f in dataclasses.fields(self) if f.repr]
+        parts = [
+            wl.TextDoc(f"{f.name}=") + (_quantity(f.name, value) or wl.pdoc(value, **kwargs))
+            for f, value in named
+            if value is not None and value is not f.default
+        ]
+        name = wl.TextDoc(f"{type(self).__name__}(")
+        return wl.bracketed(name, parts, wl.comma, wl.TextDoc(")"), kwargs["indent"])
+
+
+def _quantity(name: str, value: Any) -> wl.AbstractDoc | None:
+    """A few real numbers with the unit of the field; None for anything else."""
+    if not isinstance(value, float | np.ndarray | jax.Array):
+        return None
+    if np.ndim(value) > 1 or np.size(value) > _MOST or not jnp.isrealobj(value):
+        return None
+    unit, numbers = _UNITS.get(name, ""), ["?"] * np.size(value)
+    if not checks.is_traced(value):
+        known = np.atleast_1d(np.asarray(value))
+        largest = np.abs(known).max(initial=0.0)
+        if unit == "mm" and largest > 0:
+            scale, unit = next((s, u) for s, u, least in _LENGTHS if largest >= least)
+            known = known / scale
+        numbers = [f"{number:.5g}" for number in known]
+    text = numbers[0] if np.ndim(value) == 0 else f"({', '.join(numbers)})"
+    return wl.TextDoc(f"{text} {unit}".rstrip())
