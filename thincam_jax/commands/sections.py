@@ -299,9 +299,11 @@ class MethodConfig(Section):
     @pydantic.model_validator(mode="after")
     def _fits(self):
         if self.kind == "fringe_scanning" and (
-            len(self.shots) != 1 or self.synthesis != "fringe_scanning"
+            len(self.shots) != 1 or self.synthesis not in PHASES
         ):
-            raise ValueError("kind fringe_scanning takes one shot and its own synthesis")
+            raise ValueError(
+                f"kind fringe_scanning takes one shot, at the phases of {' or '.join(PHASES)}"
+            )
         if self.variation is not None and self.kind != "admm_tv":
             raise ValueError(f"kind {self.kind} has no total variation; drop 'variation'")
         if self.synthesis in (*PHASES, "harmonics") and self.phases != (0.0,):

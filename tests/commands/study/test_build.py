@@ -5,7 +5,13 @@ import pytest
 from commands.study import tiny
 
 from thincam_jax.commands.config_file import ConfigError
-from thincam_jax.commands.study.build import expose, noise_free
+from thincam_jax.commands.study.build import (
+    build_reconstructor,
+    expose,
+    noise_free,
+    stacked,
+    take,
+)
 from thincam_jax.imaging.scene import ImagePlane
 
 ELECTRONS = ("sensor.electrons=2e5", "noise={read_noise: 2}")
@@ -104,3 +110,18 @@ def test_a_moving_target_goes_on_from_capture_to_capture(tmp_path):
     # 4 mm on the object are 3 pixels on the sensor, the other way.
     np.testing.assert_allclose(beside[..., :-3], still[..., 3:], rtol=1e-6)
     np.testing.assert_allclose(moving.sum(), still.sum(), rtol=1e-3)
+
+
+def test_two_phases_in_quadrature_are_fringe_scanned(tmp_path):
+    """Points come out as by four phases, but for the background that is left between them."""
+    images, phases = [], []
+    points = "targets.0={name: points, kind: point_grid, pixels: 120}"
+    for synthesis in ("fringe_scanning", "phase_pairs"):
+        study = tiny.built(tmp_path, points, f"methods.0.synthesis={synthesis}")
+        method, target = study.methods[0], study.targets[0]
+        captures = stacked([take(study, exposure, target) for exposure in method.exposures])
+        found = build_reconstructor(study, method, (30, 40), target.distance)(*captures)
+        images.append(np.ravel(found.image))
+        phases.append([exposure.phase / np.pi for exposure in method.exposures])
+    assert phases == [[0, 0.5, 1, 1.5], [0, 1.5]]
+    assert np.corrcoef(*images)[0, 1] > 0.5

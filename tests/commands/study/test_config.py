@@ -199,7 +199,7 @@ FAULTS = {
     ),
     "synthesis given to fringe scanning": (
         *("kind: fringe_scanning", "kind: fringe_scanning\n    synthesis: separate"),
-        *("methods[0]", ["takes one shot and its own synthesis"]),
+        *("methods[0]", ["takes one shot, at the phases of fringe_scanning or phase_pairs"]),
     ),
     "the same phase twice": (
         "[0 rad, 270 deg]",
