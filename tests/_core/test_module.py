@@ -7,6 +7,7 @@ import pytest
 
 import thincam_jax as tc
 from thincam_jax import waveguide as wg
+from thincam_jax.measured.calibration import PsfFit
 from thincam_jax.reconstruction import Reconstruction
 from thincam_jax.units import nm, um
 
@@ -16,6 +17,19 @@ CAMERA = tc.LenslessCamera(ZONES, SENSOR, 6.5)
 CELLS = tc.LenslessCamera(tc.SampledMask(np.ones((8, 9)), 30 * um), SENSOR, 6.5)
 HOLOGRAM = wg.VolumeHologram(jnp.array([0.0, -15.0, 26e3]), 1.5, 16 * um, 0.02)
 SCREEN = wg.Screen(hologram=HOLOGRAM, glass_thickness=5.0, glass_index=1.5)
+ONE = jnp.asarray(1.0)
+FIT = PsfFit(
+    CAMERA,
+    *(ONE,) * 4,
+    values={"beta": jnp.asarray(25.1), "centre_x": jnp.asarray(3 * um)},
+    standard_errors={},
+    correlation=jnp.eye(2),
+    residual=jnp.ones((3, 4)),
+    names=("beta", "centre_x"),
+    status="ok",
+    reasons=(),
+    iterations=1,
+)
 
 
 @pytest.mark.parametrize(
@@ -53,6 +67,7 @@ SCREEN = wg.Screen(hologram=HOLOGRAM, glass_thickness=5.0, glass_index=1.5)
             ("Reconstruction(image=f64[4,5], pitch=40 µm, seconds=1.5)",),
         ),
         (tc.AdmmTV(tau=2.0), ("AdmmTV(tau=2, ",)),
+        (FIT, ("{'beta': 25.1 rad/mm², 'centre_x': 3 µm}", "correlation=f64[2,2]")),
     ],
     ids=lambda value: type(value).__name__,
 )

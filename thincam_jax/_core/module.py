@@ -12,8 +12,18 @@ import wadler_lindig as wl
 from thincam_jax._core import checks
 
 _MM = (
-    *("cell", "centre", "distance", "focal_distance", "focal_length", "glass_thickness", "height"),
-    *("lens_distance", "object_distance", "object_width", "pitch", "ring", "sensor_width", "size"),
+    *("cell", "centre", "centre_x", "centre_y", "distance", "focal_distance", "focal_length"),
+    *(
+        "glass_thickness",
+        "height",
+        "lens_distance",
+        "object_distance",
+        "object_width",
+        "pitch",
+        "ring",
+        "sensor_width",
+        "size",
+    ),
     *("thickness", "wavelength", "wavelengths", "width"),
 )
 _UNITS = dict.fromkeys(_MM, "mm") | {
@@ -40,7 +50,7 @@ class Module(eqx.Module):
         """What equinox's printer asks for, of this object or of one inside another."""
         named = [(f, getattr(self, f.name, None)) for f in dataclasses.fields(self) if f.repr]
         parts = [
-            wl.TextDoc(f"{f.name}=") + (_quantity(f.name, value) or wl.pdoc(value, **kwargs))
+            wl.TextDoc(f"{f.name}=") + wl.pdoc(_shown(f.name, value), **kwargs)
             for f, value in named
             if value is not None and value is not f.default
         ]
@@ -48,12 +58,15 @@ class Module(eqx.Module):
         return wl.bracketed(name, parts, wl.comma, wl.TextDoc(")"), kwargs["indent"])
 
 
-def _quantity(name: str, value: Any) -> wl.AbstractDoc | None:
-    """A few real numbers with the unit of the field; None for anything else."""
+def _shown(name: str, value: Any) -> Any:
+    """A few numbers with the unit of the field, or of their keys; anything else as it is."""
+    if isinstance(value, dict):
+        return {key: _shown(str(key), one) for key, one in value.items()}
     if not isinstance(value, float | np.ndarray | jax.Array):
-        return None
-    if np.ndim(value) > 1 or np.size(value) > _MOST or not jnp.isrealobj(value):
-        return None
+        return value
+    is_number = jnp.issubdtype(jnp.result_type(value), jnp.number)
+    if np.ndim(value) > 1 or np.size(value) > _MOST or not is_number:
+        return value
     unit, numbers = _UNITS.get(name, ""), ["?"] * np.size(value)
     if not checks.is_traced(value):
         known = np.atleast_1d(np.asarray(value))

@@ -12,13 +12,14 @@ from jaxtyping import Array, Float, Int
 
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Number, Numbers, Shape
+from thincam_jax._core.module import Module
 from thincam_jax.imaging.operators import Sparse
 from thincam_jax.waveguide.camera import SeeThroughCamera
 from thincam_jax.waveguide.rays import pixel_centres, trace
 from thincam_jax.waveguide.smear import SmearedRays, trace_band
 
 
-class ObjectPlane(eqx.Module):
+class ObjectPlane(Module):
     """A flat object before the screen, of square cells of uniform radiance, as those of a monitor.
 
     - `shape`: (rows, columns) of cells.

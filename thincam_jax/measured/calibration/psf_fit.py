@@ -12,6 +12,7 @@ from jaxtyping import Array, ArrayLike, Float, Inexact
 
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Number, Numbers
+from thincam_jax._core.module import Module
 from thincam_jax._core.precision import Precision, allow, cast, precision_of
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.masks.fza import FresnelZoneAperture
@@ -52,7 +53,7 @@ _POSITIVE = ("beta", "width", "distance", "object_distance", "wavelength")
 _KNOWN, _KNOWN_BY_PARTS, _DISAGREE = 0.03, 0.005, 1.5
 
 
-class PsfFit(eqx.Module):
+class PsfFit(Module):
     """What `fit_psf` found.
 
     - `camera`: the camera with the fitted numbers, in the precision of the one given.

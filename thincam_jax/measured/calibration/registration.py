@@ -14,6 +14,7 @@ from jaxtyping import Array, Float
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Numbers
 from thincam_jax._core.grids import block_mean, block_sum, central_blocks, centred_indices
+from thincam_jax._core.module import Module
 from thincam_jax._core.precision import allow
 from thincam_jax.measured.raw import image_with_contrast
 
@@ -28,7 +29,7 @@ _TOLERANCE = 1e-6  # pixels
 _WEIGHT = 1e3  # of residuals: the solver starts with a damping of 1, which is to be weak
 
 
-class Registration(eqx.Module):
+class Registration(Module):
     """What `estimate_registration` found.
 
     - `scale`: of the image over the reference; `shift`: (y, x), pixels.

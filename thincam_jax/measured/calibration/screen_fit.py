@@ -16,6 +16,7 @@ from jaxtyping import Array, Float, Int
 
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Numbers
+from thincam_jax._core.module import Module
 from thincam_jax._core.precision import allow, cast, precision_of
 from thincam_jax.imaging.operators import Matrix, Scaled
 from thincam_jax.imaging.refractive_index import changed
@@ -84,7 +85,7 @@ class GhostPositions(eqx.Module):
         self.deviation = checks.positive("deviation", deviation, "mm")
 
 
-class ScreenFit(eqx.Module):
+class ScreenFit(Module):
     """What `fit_screen` found.
 
     - `camera`, `plane`: as given, with the fitted numbers. `gain`: the matrix over the model's.
