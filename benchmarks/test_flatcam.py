@@ -86,3 +86,4 @@ def test_four_channels(capsys):
             print(f"  {name:12s} {1e3 * seconds:8.1f} ms, {ratio:6.1f} times ours")
         print(f"  float32 against NumPy's float64: {error:.1e}")
     assert error < 1e-3
+    assert least["repeated"] > 15 * least["ours"] and least["kept"] > 1.3 * least["ours"]

@@ -123,13 +123,13 @@ def test_another_screen_is_told():
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("noise", [0.01, 0.001])
-def test_a_screen_from_its_matrix(noise):
-    """In any unit; noise of a part of the largest entries, and the colours' smear."""
-    true = wg.system_operator(camera(**TRUE), plane(centre=CENTRE), samples=8)
-    measured = matrix(true, noise=noise)
+def test_a_screen_from_its_matrix():
+    """In any unit; noise of 0.001 of the largest entries, and the colours' smear."""
+    few = {"pixels": (11, 15), "pitch": 140.8 * um}
+    true = wg.system_operator(camera(**TRUE, **few), plane(centre=CENTRE), samples=8)
+    measured = matrix(true, noise=0.001)
     scaled = Matrix(40 * measured.matrix, measured.in_shape, measured.out_shape)
-    fit = fit_screen(scaled, camera(), plane())
+    fit = fit_screen(scaled, camera(**few), plane())
     assert np.abs(deviations(fit, VALUES | {"gain": 40.0})).max() < 4
     found = matrix(fit.system(fit.plane)).matrix
     error = jnp.linalg.norm(found / 40 - matrix(true).matrix)
