@@ -23,6 +23,8 @@ from thincam_jax.commands.checked_config import load_as
 from thincam_jax.hardware.acquisition.read import read_acquisition
 from thincam_jax.hardware.virtual import devices
 from thincam_jax.hardware.virtual.rig import pattern_number, read_fiducial
+from thincam_jax.imaging.operators import ReducedMatrix
+from thincam_jax.measured.calibration import open_matrix, read_matrix
 
 
 @pytest.fixture(scope="module")
@@ -67,7 +69,11 @@ def test_a_matrix_of_captures_agrees_with_direct_simulation(tmp_path):
     assert found["matrix"] == [28 * 40, 8 * 16]
     assert abs(found["agreement"]["matrix_residual_over_noise"] - 1) < 0.02
     assert found["agreement"]["largest_counts"] > 100 * found["agreement"]["noise_counts"]
-    assert (tmp_path / "out" / "matrix.zarr").is_dir()
+    matrix = read_matrix(tmp_path / "out" / "matrix.zarr")
+    rows = open_matrix(tmp_path / "out" / "matrix.zarr")
+    reduced = ReducedMatrix.load(tmp_path / "out" / "reduced.npz", rows)
+    values = np.linalg.svd(np.asarray(matrix.matrix), compute_uv=False)
+    np.testing.assert_allclose(np.sort(reduced.values)[-20:], values[19::-1], rtol=1e-3)
 
 
 @pytest.mark.parametrize(

@@ -22,8 +22,13 @@ from thincam_jax.commands.study import build
 from thincam_jax.commands.study.evaluate import sample
 from thincam_jax.commands.study.study import Reconstructor, Study
 from thincam_jax.imaging.metrics import psnr
-from thincam_jax.measured.calibration import HadamardCaptures, write_matrix
-from thincam_jax.measured.calibration.system_matrix import stored_blocks
+from thincam_jax.imaging.operators import ReducedMatrix
+from thincam_jax.measured.calibration import (
+    HadamardCaptures,
+    open_matrix,
+    stored_blocks,
+    write_matrix,
+)
 from thincam_jax.reconstruction import Reconstruction
 from thincam_jax.reconstruction.noise import estimate_noise
 
@@ -170,7 +175,10 @@ class _CaptureRun:
         return images
 
     def recover(self) -> None:
-        """The matrix into a store, block by block; of a virtual rig, beside the exact one."""
+        """The matrix into a store, block by block, and what it is reduced to beside it.
+
+        Of a virtual rig: compared with the exact one.
+        """
         captures = self.taken.hadamard
         assert captures is not None
         path = self.folder.path / "matrix.zarr"
@@ -180,6 +188,9 @@ class _CaptureRun:
             shutil.rmtree(path)
         began = time.perf_counter()
         write_matrix(captures, path)
+        matrix = open_matrix(path)
+        reduced = ReducedMatrix.of(matrix, captures.series.object_shape)
+        reduced.save(self.folder.path / "reduced.npz", matrix)
         cells = _diagonal(captures.series.object_shape)
         numbers = [row * captures.series.object_shape[1] + column for row, column in cells]
         columns = np.empty((len(cells), math.prod(captures.sensor_shape)), np.float32)

@@ -24,6 +24,7 @@ from thincam_jax.measured.calibration.separable import SeparableFit as Separable
 from thincam_jax.measured.calibration.separable import calibrate_separable as calibrate_separable
 from thincam_jax.measured.calibration.separable import fit_separable as fit_separable
 from thincam_jax.measured.calibration.system_matrix import matrix_blocks as matrix_blocks
+from thincam_jax.measured.calibration.system_matrix import open_matrix as open_matrix
 from thincam_jax.measured.calibration.system_matrix import read_matrix as read_matrix
 from thincam_jax.measured.calibration.system_matrix import recover_matrix as recover_matrix
 from thincam_jax.measured.calibration.system_matrix import stored_blocks as stored_blocks

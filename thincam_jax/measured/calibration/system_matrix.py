@@ -99,6 +99,11 @@ def write_matrix(captures: HadamardCaptures, path: str | Path) -> Path:
     return path
 
 
+def open_matrix(path: str | Path) -> Any:
+    """A stored matrix as the Zarr array (pixel, cell) that it is: for `ReducedMatrix`, unread."""
+    return _stored(path)[1]
+
+
 def stored_blocks(path: str | Path) -> Iterator[Block]:
     """A stored matrix in blocks of its pixels, without ever holding it whole."""
     _, array = _stored(path)
