@@ -8,6 +8,8 @@ import jax.numpy as jnp
 import jaxopt
 from jaxtyping import Array, Bool, Float, Int
 
+from thincam_jax._core.checks import Number
+
 # Of a line search, each an evaluation for all starts that run together; and searches in vain
 # before a descent ends.
 _TRIALS, _IDLE = 8, 3
@@ -18,7 +20,7 @@ def descend_in_box(
     point: Float[Array, " variable"],
     data: Any,
     steps: int,
-    tolerance,
+    tolerance: Number,
 ) -> tuple[Float[Array, " variable"], Float[Array, ""], Int[Array, ""], Bool[Array, ""]]:
     """L-BFGS-B within the unit cube of a value of about 1.
 

@@ -1,12 +1,15 @@
 """What a design chooses: the captures of a lensless camera."""
 
+from collections.abc import Sequence
 from typing import get_args
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
+from thincam_jax._core.checks import Number, Numbers
 from thincam_jax._core.module import Module
 from thincam_jax.imaging.sensor import Sensor
 from thincam_jax.lensless.camera import LenslessCamera
@@ -36,13 +39,13 @@ class Design(Module):
 
     def __init__(
         self,
-        beta,
-        phase,
-        distance,
+        beta: Numbers,
+        phase: Numbers,
+        distance: Numbers,
         *,
-        wavelength,
-        width,
-        exposure=1.0,
+        wavelength: Numbers,
+        width: Number,
+        exposure: Numbers = 1.0,
         profile: Profile = "cosine",
     ):
         """Numbers, or one for each capture: they are broadcast against each other.
@@ -71,7 +74,7 @@ class Design(Module):
     def captures(self) -> int:
         return self.beta.shape[0]
 
-    def mask(self, beta, phase) -> FresnelZoneAperture:
+    def mask(self, beta: Number, phase: Number) -> FresnelZoneAperture:
         """The mask of a capture, of the width and the profile that all share."""
         return FresnelZoneAperture(beta, phase, width=self.width, profile=self.profile)
 
@@ -88,12 +91,12 @@ def _finite(name: str, value: Array, unit: str) -> Array:
 
 
 def shots(
-    beta,
-    distance,
-    phases,
+    beta: Numbers | Sequence[float | int],
+    distance: Numbers | Sequence[float | int],
+    phases: Sequence[float | int] | Float[Array, " phase"] | Float[np.ndarray, " phase"],
     *,
-    wavelength,
-    width,
+    wavelength: Numbers,
+    width: Number,
     profile: Profile = "cosine",
 ) -> Design:
     """Each setting (β, d) with each of the phases, in the order of a study's captures."""

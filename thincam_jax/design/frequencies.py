@@ -10,6 +10,8 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from numpy.polynomial.legendre import leggauss
 
+from thincam_jax._core.checks import Number
+
 
 class Quadrant(eqx.Module):
     r"""A square of frequencies ν_x, ν_y ≥ 0 that stands for the whole plane.
@@ -26,7 +28,7 @@ class Quadrant(eqx.Module):
     axis: Float[Array, " n"]
     weight: Float[Array, "n n"]
 
-    def __init__(self, highest, count: int = 512):
+    def __init__(self, highest: Number, count: int = 512):
         """`highest`: the band's end along an axis, cycles/rad; `count`: samples along it."""
         if count < 2:
             raise ValueError(f"count = {count}: give at least 2 frequencies")
@@ -66,7 +68,7 @@ class Polar(eqx.Module):
     sine: Float[Array, " m"]
     weight: Float[Array, "m n"]
 
-    def __init__(self, highest, count: int = 2048, directions: int = 4):
+    def __init__(self, highest: Number, count: int = 2048, directions: int = 4):
         """`highest`: the disc's radius, cycles/rad; `count`: radii, at the middles of rings."""
         if count < 2 or directions < 1:
             raise ValueError(

@@ -16,6 +16,7 @@ import optimistix
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from thincam_jax._core import checks
+from thincam_jax._core.checks import Numbers
 from thincam_jax.design.design import Design
 from thincam_jax.design.frequencies import Frequencies
 from thincam_jax.design.objectives import channels
@@ -65,7 +66,7 @@ class Match(NamedTuple):
 
 def match_response(
     space: DesignSpace,
-    target,
+    target: Numbers,
     setup: Setup,
     synthesis: Float[Array, "channel capture"] | Float[np.ndarray, "channel capture"],
     frequencies: Frequencies,

@@ -16,11 +16,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from thincam_jax._core.checks import Number
 from thincam_jax._core.grids import centred_indices
 from thincam_jax._core.precision import product
 
 
-def half_places(count: int, pitch) -> Float[Array, " place"]:
+def half_places(count: int, pitch: Number) -> Float[Array, " place"]:
     """Those of `count` centred samples that are not negative, ascending; in the pitch's unit."""
     step = jnp.asarray(pitch)
     return centred_indices(count, step.dtype)[count // 2 :] * step

@@ -25,9 +25,11 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from thincam_jax._core import checks
+from thincam_jax._core.checks import Number
 from thincam_jax.design.adam import adam
 from thincam_jax.design.prior import PowerLaw
 from thincam_jax.design.search import best_apart, even_samples, on_cube
+from thincam_jax.imaging.refractive_index import AbstractIndex
 from thincam_jax.imaging.sensor import Sensor
 from thincam_jax.units import deg, nm, um
 from thincam_jax.waveguide import Screen, SeeThroughCamera, VolumeHologram, trace_band
@@ -60,7 +62,9 @@ class Plate(eqx.Module):
     lens_distance: Float[Array, ""] = eqx.field(default=10.0, converter=_number)
     focal_distance: Float[Array, ""] = eqx.field(default=6.0, converter=_number)
 
-    def camera(self, sensor: Sensor, *, wavelength=532 * nm, index=1.5) -> SeeThroughCamera:
+    def camera(
+        self, sensor: Sensor, *, wavelength: Number = 532 * nm, index: AbstractIndex | Number = 1.5
+    ) -> SeeThroughCamera:
         """The camera with it: object wave along the normal, film and glass of one index."""
         hologram = VolumeHologram.record(
             wavelength,

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
+from thincam_jax._core.checks import Number
 
 
 class PowerLaw(eqx.Module):
@@ -22,7 +23,7 @@ class PowerLaw(eqx.Module):
     exponent: Float[Array, ""]
     corner: Float[Array, ""] | None
 
-    def __init__(self, exponent=2.0, corner=None):
+    def __init__(self, exponent: Number = 2.0, corner: Number | None = None):
         self.exponent = checks.non_negative("exponent", exponent, "powers of the frequency")
         self.corner = None if corner is None else checks.positive("corner", corner, "cycles/rad")
 

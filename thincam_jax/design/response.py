@@ -151,7 +151,7 @@ def _open(zones: ZoneOrders, k: int, m: int, path: Path, u, place):
     return jax.nn.sigmoid((half - place) / zone)
 
 
-def seen_part(place, path: Path, setup: Setup):
+def seen_part(place: Float[Array, "*place"], path: Path, setup: Setup):
     """q: the part of the object's width from which that light falls on the sensor."""
     middle = path.magnification * place
     shadow = setup.field * path.distance

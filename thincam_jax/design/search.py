@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix
 import scipy
+from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from thincam_jax._core import checks
@@ -245,7 +246,9 @@ def landscape(
     return points, evaluate(objective, space, data, points, at_a_time=at_a_time)
 
 
-def even_samples(dimensions: int, count: int, key, dtype) -> Float[Array, "point variable"]:
+def even_samples(
+    dimensions: int, count: int, key: PRNGKeyArray, dtype: DTypeLike
+) -> Float[Array, "point variable"]:
     """Scrambled Sobol points of the unit cube."""
     seed = int(jax.random.randint(key, (), 0, 2**31 - 1))
     power = max(0, (count - 1).bit_length())
@@ -277,7 +280,7 @@ def _scale(values: Float[Array, " start"]) -> Float[Array, " start"]:
     return jnp.where(jnp.isfinite(size) & (size > 0), size, 1.0)
 
 
-def on_cube(y):
+def on_cube(y: Float[Array, "..."]):
     """sin²: every number to [0, 1], smooth, and the faces are reached."""
     return jnp.sin(y) ** 2
 

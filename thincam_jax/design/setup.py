@@ -4,6 +4,7 @@ import equinox as eqx
 from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
+from thincam_jax._core.checks import Number, Numbers
 from thincam_jax._core.module import Module
 from thincam_jax.design.prior import PowerLaw
 
@@ -17,10 +18,10 @@ class SignalNoise(Module):
 
     snr_db: Float[Array, ""]
 
-    def __init__(self, snr_db=30.0):
+    def __init__(self, snr_db: Number = 30.0):
         self.snr_db = checks.finite("snr_db", snr_db, "dB")
 
-    def variance(self, light, signal, exposure):
+    def variance(self, light: Float[Array, "..."], signal: Float[Array, "..."], exposure: Numbers):
         """Of a pixel, mm⁴: from the capture's mean (mm²), its variance, the share of exposure."""
         return signal * 10 ** (-self.snr_db / 10)
 
@@ -36,11 +37,11 @@ class PhotonNoise(Module):
     electrons: Float[Array, ""]
     read_noise: Float[Array, ""]
 
-    def __init__(self, electrons=2_000.0, read_noise=8.0):
+    def __init__(self, electrons: Number = 2_000.0, read_noise: Number = 8.0):
         self.electrons = checks.positive("electrons", electrons, "electrons")
         self.read_noise = checks.non_negative("read_noise", read_noise, "electrons")
 
-    def variance(self, light, signal, exposure):
+    def variance(self, light: Float[Array, "..."], signal: Float[Array, "..."], exposure: Numbers):
         """Of a pixel, mm⁴: from the capture's mean (mm²), its variance, the share of exposure."""
         counted = self.electrons * exposure
         return light / counted + (self.read_noise / counted) ** 2
@@ -72,13 +73,13 @@ class Setup(Module):
     def __init__(
         self,
         *,
-        pitch,
-        sensor_width,
-        object_distance,
-        object_width,
+        pitch: Number,
+        sensor_width: Number,
+        object_distance: Number,
+        object_width: Number,
         noise: SignalNoise | PhotonNoise | None = None,
         prior: PowerLaw | None = None,
-        contrast=0.5,
+        contrast: Number = 0.5,
         pixel_integration: bool = True,
         crop: bool = True,
     ):

@@ -10,6 +10,7 @@ from typing import Literal, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from thincam_jax.design.design import MOST_CAPTURES, Design
@@ -153,7 +154,12 @@ class DesignSpace(eqx.Module):
         return exposure * (1 + rest * (scale - 1))
 
 
-def active_limits(space: DesignSpace, point, *, within: float = 1e-3) -> tuple[str, ...]:
+def active_limits(
+    space: DesignSpace,
+    point: Float[Array, " variable"] | Float[np.ndarray, " variable"],
+    *,
+    within: float = 1e-3,
+) -> tuple[str, ...]:
     """What a point of the unit cube lies against, in words."""
     words = []
     values = space.values(jnp.asarray(point))

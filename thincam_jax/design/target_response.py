@@ -13,9 +13,11 @@ fringes of the responses or average over many of them.
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
+from thincam_jax._core.checks import Numbers
 from thincam_jax.design.frequencies import Frequencies
 from thincam_jax.design.objectives import Channels, channels, ring_means
 from thincam_jax.design.setup import Setup
@@ -89,7 +91,7 @@ class ResponseModel(eqx.Module):
         return root_mean_square(self.levels(point) - target)
 
 
-def checked_levels(target, rings: int, dtype) -> Float[Array, " ring"]:
+def checked_levels(target: Numbers, rings: int, dtype: DTypeLike) -> Float[Array, " ring"]:
     """Wanted levels, looked at where they are known: ValueError, one line, for what is none."""
     if checks.is_traced(target):
         levels = jnp.asarray(target).astype(dtype)

@@ -9,6 +9,7 @@ captures and C the crop. What is made of them is told in `end_to_end` and `wiene
 """
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import equinox as eqx
@@ -18,6 +19,7 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from thincam_jax._core import checks
+from thincam_jax._core.checks import Number
 from thincam_jax._core.grids import Grid
 from thincam_jax.design.design import Design
 from thincam_jax.design.setup import Setup
@@ -169,7 +171,9 @@ class Channel(eqx.Module):
     def __call__(self, image: Float[Array, "v u"]) -> Float[Array, "y x"]:
         return self.summed(self._projected(image))
 
-    def capture(self, image, noise) -> tuple[Float[Array, "y x"], Float[Array, ""]]:
+    def capture(
+        self, image: Float[Array, "v u"], noise: Float[Array, "y x"]
+    ) -> tuple[Float[Array, "y x"], Float[Array, ""]]:
         """The sum of the noisy captures, and the variance of its noise."""
         projected = self._projected(image)
         clean = [own(projected) for own in self.captures]
@@ -182,7 +186,13 @@ class Channel(eqx.Module):
         return plane.sample(self.grid, magnification=self.distance / self.setup.object_distance)
 
 
-def noise_variance(clean, weights, exposure, setup: Setup, pitch) -> Float[Array, ""]:
+def noise_variance(
+    clean: Sequence[Float[Array, "y x"]],
+    weights: Sequence[float],
+    exposure: Sequence[Float[Array, ""]],
+    setup: Setup,
+    pitch: Number,
+) -> Float[Array, ""]:
     """Of a pixel of a sum of captures that are `clean` without it, pixels `pitch` (mm) wide."""
     variance = jnp.zeros((), clean[0].dtype)
     for capture, weight, share in zip(clean, weights, exposure, strict=True):

@@ -25,6 +25,7 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from thincam_jax._core import checks, files
+from thincam_jax._core.checks import Numbers
 from thincam_jax.design.design import Design
 from thincam_jax.design.frequencies import Frequencies
 from thincam_jax.design.match import MATCHED, MatchStatus, match_status
@@ -176,7 +177,7 @@ class Suggestion(NamedTuple):
     point: Float[Array, " variable"]
 
 
-def suggest(suggester: Suggester, target, *, tolerance_db: float = MATCHED) -> Suggestion:
+def suggest(suggester: Suggester, target: Numbers, *, tolerance_db: float = MATCHED) -> Suggestion:
     """A design whose levels are near to target ones, in some tens of milliseconds once compiled.
 
     **Arguments**

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from thincam_jax._core import checks
+from thincam_jax._core.checks import Number
 from thincam_jax.design.adam import adam_method, adam_step
 from thincam_jax.reconstruction.admm import splitting_of
 from thincam_jax.reconstruction.drive import Outcome, Progress, Status
@@ -128,7 +129,7 @@ def train(
     key: PRNGKeyArray,
     steps: int = 100,
     batch: int = 4,
-    learning_rate=0.05,
+    learning_rate: Number = 0.05,
 ) -> Training:
     """Fit a model to pairs of captures and images, by Adam (optax) on the mean squared error.
 

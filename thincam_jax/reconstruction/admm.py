@@ -10,8 +10,9 @@ import jax.numpy as jnp
 import optimistix
 from jaxtyping import Array, Float, PyTree
 
+from thincam_jax._core.checks import Number
 from thincam_jax.reconstruction.direct_splitting import DirectSplitting
-from thincam_jax.reconstruction.drive import OptimistixMethod
+from thincam_jax.reconstruction.drive import OptimistixMethod, Residuals, Running
 from thincam_jax.reconstruction.fourier_splitting import FourierSplitting
 from thincam_jax.reconstruction.problem import InverseProblem, convolutions, objective
 from thincam_jax.reconstruction.splitting import (
@@ -139,7 +140,7 @@ class AdmmMethod(OptimistixMethod):
         problem: InverseProblem,
         *,
         penalties: Penalties | None = None,
-        relaxation=RELAXATION,
+        relaxation: Number = RELAXATION,
     ):
         self.problem = problem
         splitting = splitting_of(problem)
@@ -147,19 +148,19 @@ class AdmmMethod(OptimistixMethod):
         self.solver = Admm(0.0, relaxation)
 
     @staticmethod
-    def function(value, arguments):
+    def function(value: State, arguments: AbstractSplitting):
         return admm_map(value, arguments), None
 
-    def value_of(self, image):
+    def value_of(self, image: Float[Array, "*batch channel plane y x"]):
         return self.arguments.start(image)
 
-    def image_of(self, value):
+    def image_of(self, value: State):
         return self.arguments.image(value)
 
-    def objective(self, image):
+    def objective(self, image: Float[Array, "*batch channel plane y x"]):
         return _objective(self.problem, image)
 
-    def adapt(self, state, residuals):
+    def adapt(self, state: Running, residuals: Residuals):
         """Residual balancing: μ ← μ·√(primal/dual) of each split, by at most 3 at a time."""
         if max(residuals.primal, residuals.dual) < self.arguments.settling:
             return self, state

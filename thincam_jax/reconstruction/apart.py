@@ -37,26 +37,26 @@ class Apart(AbstractMethod[tuple[Any, ...]]):
         self.shape = problem.image_shape
         self.methods = tuple(_together(method, parts(problem)))
 
-    def start(self, image):
+    def start(self, image: Float[Array, "*batch channel plane y x"]):
         return tuple(_together(lambda m, i: m.start(i), self.methods, self._split(image)))
 
-    def advance(self, state, count):
+    def advance(self, state: tuple[Any, ...], count: int):
         return tuple(_together(lambda m, s: m.advance(s, count), self.methods, state))
 
-    def image(self, state):
+    def image(self, state: tuple[Any, ...]):
         images = _together(lambda m, s: m.image(s), self.methods, state)
         return jnp.stack(images).reshape(self.shape)
 
-    def objective(self, image):
+    def objective(self, image: Float[Array, "*batch channel plane y x"]):
         values = _together(lambda m, i: m.objective(i), self.methods, self._split(image))
         return jnp.sum(jnp.stack(values).reshape(*self.shape[:-4], -1), axis=-1)
 
-    def residuals(self, state):
+    def residuals(self, state: tuple[Any, ...]):
         each = tuple(m.residuals(s) for m, s in zip(self.methods, state, strict=True))
         primal, dual = max(r.primal for r in each), max(r.dual for r in each)
         return Residuals(primal, dual, apart=each)
 
-    def adapt(self, state, residuals):
+    def adapt(self, state: tuple[Any, ...], residuals: Residuals):
         adapted = _together(lambda m, s, r: m.adapt(s, r), self.methods, state, residuals.apart)
         methods, states = zip(*adapted, strict=True)
         return eqx.tree_at(lambda a: a.methods, self, methods), states

@@ -214,7 +214,7 @@ def _full(problem: InverseProblem):
 class SearchInterrupted(KeyboardInterrupt):
     """Ctrl-C during a search; holds the best image of the solve that it ended."""
 
-    def __init__(self, image):
+    def __init__(self, image: Float[Array, "*batch channel plane y x"]):
         super().__init__()
         self.image = image
 

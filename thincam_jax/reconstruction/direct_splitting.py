@@ -63,25 +63,25 @@ class DirectSplitting(AbstractSplitting):
         self.penalties = Penalties(mean, mean, mean)
         self.normal = normal_equations(self.problem, self.penalties.data)
 
-    def with_captures(self, captures):
+    def with_captures(self, captures: tuple[Float[Array, "..."], ...]):
         pulled = back_projected(self.problem, [c / self.capture_unit for c in captures])
         return eqx.tree_at(lambda s: s.pulled, self, pulled)
 
-    def with_penalties(self, penalties):
+    def with_penalties(self, penalties: Penalties):
         normal = self.normal.shifted(penalties.data)
         return eqx.tree_at(lambda s: (s.penalties, s.normal), self, (penalties, normal))
 
     def settled(self):
         return eqx.tree_at(lambda s: s.normal, self, self.normal.settled())
 
-    def start(self, image):
+    def start(self, image: Float[Array, "*batch channel plane y x"]):
         return self._images(image / self.image_unit)
 
-    def image(self, state):
+    def image(self, state: State):
         image = jnp.maximum(state.image, 0) if self.nonnegative else state.image
         return image * self.image_unit
 
-    def reflected(self, state):
+    def reflected(self, state: State):
         (q,) = state.data
         data = self.normal(self.pulled + self.penalties.data * q, q)
         shrunk = self.variation.shrink(state.slopes, self.tau / self.penalties.variation)
@@ -89,7 +89,7 @@ class DirectSplitting(AbstractSplitting):
         allowed = jnp.abs(state.image) if self.nonnegative else state.image
         return State((2 * data - q,), slopes, allowed)
 
-    def nearest(self, target):
+    def nearest(self, target: State):
         (data,) = target.data
         penalties = self.penalties
         total = penalties.data * data + penalties.image * target.image

@@ -123,19 +123,19 @@ class OptimistixMethod(AbstractMethod[Running]):
     def image_of(self, value: PyTree[Array]) -> Float[Array, "*batch channel plane y x"]:
         """The image of a y."""
 
-    def start(self, image):
+    def start(self, image: Float[Array, "*batch channel plane y x"]):
         return _start(self, image)
 
-    def advance(self, state, count):
+    def advance(self, state: Running, count: int):
         run = _advance_donated if self.donated else _advance
         for size in [UNROLLED] * (count // UNROLLED) + [1] * (count % UNROLLED):
             state = run(self, state, size)
         return state
 
-    def image(self, state):
+    def image(self, state: Running):
         return _image(self, state)
 
-    def residuals(self, state):
+    def residuals(self, state: Running):
         inside = jax.device_get(state.inside)
         parts = tuple((float(p), float(d)) for p, d in getattr(inside, "parts", ()))
         return Residuals(float(inside.primal), float(inside.dual), parts)

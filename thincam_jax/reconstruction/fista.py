@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import optimistix
 from jaxtyping import Array, Float, PyTree
 
+from thincam_jax._core.checks import Number
 from thincam_jax.reconstruction.drive import Callback, OptimistixMethod, Outcome, drive
 from thincam_jax.reconstruction.problem import InverseProblem, objective, start_image, total_misfit
 from thincam_jax.reconstruction.regularisers import (
@@ -54,10 +55,10 @@ class RegulariserMap(AbstractProximalMap):
     nonnegative: bool = eqx.field(static=True)
     inner: int = eqx.field(static=True, default=10)
 
-    def start(self, image):
+    def start(self, image: Float[Array, "*batch channel plane y x"]):
         return no_dual(self.regulariser, image)
 
-    def __call__(self, image, kept):
+    def __call__(self, image: Float[Array, "*batch channel plane y x"], kept: Parts):
         asked = {"nonnegative": self.nonnegative, "iterations": self.inner}
         return prox(self.regulariser, image, self.tau, kept, **asked)
 
@@ -95,7 +96,7 @@ class AcceleratedProximalGradient(optimistix.AbstractMinimiser):
     atol: float = eqx.field(static=True)
     norm: Callable[[PyTree], Float[Array, ""]] = eqx.field(static=True)
 
-    def __init__(self, proximal: AbstractProximalMap, rtol):
+    def __init__(self, proximal: AbstractProximalMap, rtol: Number):
         # An array, so that another tolerance is not compiled anew.
         self.proximal, self.rtol = proximal, jnp.asarray(rtol)
         self.atol, self.norm = 0.0, optimistix.two_norm
@@ -120,7 +121,9 @@ class AcceleratedProximalGradient(optimistix.AbstractMinimiser):
         return y, aux, {}
 
 
-def relative_length(difference, reference) -> Float[Array, ""]:
+def relative_length(
+    difference: Float[Array, "*shape"], reference: Float[Array, "*shape"]
+) -> Float[Array, ""]:
     """‖difference‖/‖reference‖; zero if both are, infinite if only the reference is."""
     above, below = (jnp.sqrt(jnp.sum(x**2)) for x in (difference, reference))
     ratio = above / jnp.where(below > 0, below, 1)
@@ -150,16 +153,16 @@ class FistaMethod(OptimistixMethod):
         return self.scaled.problem
 
     @staticmethod
-    def function(value, arguments):
+    def function(value: Float[Array, "*batch channel plane y x"], arguments: InverseProblem):
         return total_misfit(value, arguments), None
 
-    def value_of(self, image):
+    def value_of(self, image: Float[Array, "*batch channel plane y x"]):
         return image / self.scaled.image_unit
 
-    def image_of(self, value):
+    def image_of(self, value: Float[Array, "*batch channel plane y x"]):
         return value * self.scaled.image_unit
 
-    def objective(self, image):
+    def objective(self, image: Float[Array, "*batch channel plane y x"]):
         return _objective(self.problem, image)
 
 

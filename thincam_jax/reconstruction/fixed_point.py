@@ -17,6 +17,7 @@ import lineax as lx
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from thincam_jax._core.checks import Number
 from thincam_jax.reconstruction.admm import RELAXATION, Admm, splitting_of
 from thincam_jax.reconstruction.problem import InverseProblem
 from thincam_jax.reconstruction.splitting import Penalties, admm_map
@@ -50,7 +51,9 @@ class NeumannSeries(lx.AbstractLinearSolver):
     def init(self, operator: lx.AbstractLinearOperator, options: dict[str, Any]):
         return lx.linearise(operator)
 
-    def compute(self, state, vector: PyTree[Array], options: dict[str, Any]):
+    def compute(
+        self, state: lx.AbstractLinearOperator, vector: PyTree[Array], options: dict[str, Any]
+    ):
         def unfinished(carry):
             _, change, count = carry
             return (change > self.tolerance) & (count < self.max_steps)
@@ -68,10 +71,10 @@ class NeumannSeries(lx.AbstractLinearSolver):
         solution, _, count = jax.lax.while_loop(unfinished, body, begin)
         return solution, lx.RESULTS.successful, {"num_steps": count, "max_steps": self.max_steps}
 
-    def transpose(self, state, options: dict[str, Any]):
+    def transpose(self, state: lx.AbstractLinearOperator, options: dict[str, Any]):
         return state.transpose(), options
 
-    def conj(self, state, options: dict[str, Any]):
+    def conj(self, state: lx.AbstractLinearOperator, options: dict[str, Any]):
         return lx.conj(state), options
 
     def assume_full_rank(self) -> bool:
@@ -84,7 +87,7 @@ def solve_fixed_point(
     *,
     iterations: int = 500,
     tolerance: float = 1e-6,
-    relaxation=RELAXATION,
+    relaxation: Number = RELAXATION,
     penalties: Penalties | None = None,
     adjoint: lx.AbstractLinearSolver | None = None,
 ) -> FixedPoint:

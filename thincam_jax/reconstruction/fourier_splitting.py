@@ -14,6 +14,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import DTypeLike
 from jaxtyping import Array, Complex, Float
 
 from thincam_jax._core.precision import as_complex
@@ -62,22 +63,22 @@ class FourierSplitting(AbstractSplitting):
         self.variation, self.nonnegative = variation, problem.nonnegative
         self.penalties = _default_penalties(self.operators, self.gains)
 
-    def with_captures(self, captures):
+    def with_captures(self, captures: tuple[Float[Array, "..."], ...]):
         scaled = tuple(g / self.image_unit * c for g, c in zip(self.gains, captures, strict=True))
         return eqx.tree_at(lambda s: s.captures, self, scaled)
 
-    def start(self, image):
+    def start(self, image: Float[Array, "*batch channel plane y x"]):
         operator = self.operators[0]
         field = place(image / self.image_unit, operator.field_corner, operator.window)
         return self._images(jnp.fft.rfft2(field))
 
-    def image(self, state):
+    def image(self, state: State):
         operator = self.operators[0]
         field = cut(state.image, operator.field_corner, operator.field_shape)
         image = jnp.maximum(field, 0) if self.nonnegative else field
         return image * self.image_unit
 
-    def reflected(self, state):
+    def reflected(self, state: State):
         operator, window = self.operators[0], self.operators[0].window
         masks = field_masks(operator.field_shape, window, operator.field_corner)
         data = [
@@ -93,7 +94,7 @@ class FourierSplitting(AbstractSplitting):
         allowed = jnp.abs(state.image) if self.nonnegative else state.image
         return State(tuple(data), tuple(slopes), jnp.where(y & x, allowed, -state.image))
 
-    def nearest(self, target):
+    def nearest(self, target: State):
         penalties = self.penalties
         image = penalties.image * target.image + penalties.variation * differences_adjoint(
             target.slopes, self.variation.depth_weight
@@ -183,7 +184,12 @@ class NormalInverse(eqx.Module):
     depth_weight: Float[Array, ""]
     window: tuple[int, int] = eqx.field(static=True)
 
-    def __init__(self, operators: tuple[CropConvolution, ...], gains, depth_weight):
+    def __init__(
+        self,
+        operators: tuple[CropConvolution, ...],
+        gains: tuple[Float[Array, ""], ...],
+        depth_weight: Float[Array, ""],
+    ):
         self.window = operators[0].window
         self.depth_weight = depth_weight
         if operators[0].spectrum.shape[-3] == 1:
@@ -198,7 +204,7 @@ class NormalInverse(eqx.Module):
             self.power = None
 
     def __call__(
-        self, spectrum: Complex[Array, "*batch channel plane v u"], penalties
+        self, spectrum: Complex[Array, "*batch channel plane v u"], penalties: Penalties
     ) -> Complex[Array, "*batch channel plane v u"]:
         smooth = penalties.variation * difference_symbol(self.window, spectrum.real.dtype)
         if self.power is not None:
@@ -242,7 +248,7 @@ def squared_modulus(spectrum: Complex[Array, "..."]) -> Float[Array, "..."]:
     return spectrum.real**2 + spectrum.imag**2
 
 
-def difference_symbol(window: tuple[int, int], dtype) -> Float[Array, "v u"]:
+def difference_symbol(window: tuple[int, int], dtype: DTypeLike) -> Float[Array, "v u"]:
     """4 sin²(πv) + 4 sin²(πu) on the half plane of a real transform: that of ΨᵀΨ."""
     v, u = np.fft.fftfreq(window[0]), np.fft.rfftfreq(window[1])
     down, right = (jnp.asarray(4 * np.sin(np.pi * f) ** 2, dtype) for f in (v, u))

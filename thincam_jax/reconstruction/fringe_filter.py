@@ -15,6 +15,7 @@ from thincam_jax._core.grids import Grid, fast_shape, same_parity
 from thincam_jax._core.precision import as_complex, phasor, turn_phasor
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.masks.fza import FresnelZoneAperture
+from thincam_jax.reconstruction.recording import Recording
 from thincam_jax.reconstruction.seen_by import Cameras
 from thincam_jax.reconstruction.solver import AbstractSolver, Reconstruction
 from thincam_jax.reconstruction.wiener import filtered_cameras
@@ -105,7 +106,7 @@ class FringeScanning(AbstractSolver):
         """The filter of these cameras, a function of the captures."""
         return FringeFilter(cameras)
 
-    def solve(self, recording):
+    def solve(self, recording: Recording):
         return self.prepare(filtered_cameras(recording, self.name))(jnp.stack(recording.captures))
 
 

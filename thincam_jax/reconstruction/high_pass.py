@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from thincam_jax.imaging.operators.crop_convolution import CropConvolution, cut, place
-from thincam_jax.reconstruction.drive import AbstractMethod
+from thincam_jax.reconstruction.drive import AbstractMethod, Residuals
 from thincam_jax.reconstruction.problem import (
     InverseProblem,
     convolutions,
@@ -91,22 +91,22 @@ class Judged(AbstractMethod[Any]):
     method: AbstractMethod
     problem: InverseProblem
 
-    def start(self, image):
+    def start(self, image: Float[Array, "*batch channel plane y x"]):
         return self.method.start(image)
 
-    def advance(self, state, count):
+    def advance(self, state: Any, count: int):
         return self.method.advance(state, count)
 
-    def image(self, state):
+    def image(self, state: Any):
         return self.method.image(state)
 
-    def residuals(self, state):
+    def residuals(self, state: Any):
         return self.method.residuals(state)
 
-    def objective(self, image):
+    def objective(self, image: Float[Array, "*batch channel plane y x"]):
         return _objective(self.problem, levelled(self.problem, image))
 
-    def adapt(self, state, residuals):
+    def adapt(self, state: Any, residuals: Residuals):
         method, state = self.method.adapt(state, residuals)
         return Judged(method, self.problem), state
 

@@ -22,6 +22,7 @@ from thincam_jax.reconstruction.solver import (
     AbstractIterativeSolver,
     AbstractSolver,
     Reconstruction,
+    Synthesis,
 )
 from thincam_jax.reconstruction.synthesis import check_synthesis, keep_bias, separate
 from thincam_jax.reconstruction.wiener import Wiener
@@ -87,7 +88,9 @@ def reconstruct(
     return dataclasses.replace(result, reason=reason) if reason else result
 
 
-def choose_solver(recording: Recording, synthesis=None) -> tuple[AbstractSolver, str]:
+def choose_solver(
+    recording: Recording, synthesis: Synthesis | None = None
+) -> tuple[AbstractSolver, str]:
     """`Wiener` or `AdmmTV`, and a sentence that says why.
 
     What decides is what the fast filter cannot do: see the crop of the sensor, which matters where

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from thincam_jax._core import checks
+from thincam_jax._core.checks import Number, Numbers
 
 # Classes of brightness of a photon-transfer curve, and the least details of one.
 _CLASSES, _LEAST = 32, 64
@@ -166,7 +167,8 @@ def estimate_variance(
 
 
 def given_variances(
-    noise_variance, captures: Sequence[Float[Array, "..."]] | Float[Array, "capture ..."]
+    noise_variance: Numbers | Sequence[Number],
+    captures: Sequence[Float[Array, "..."]] | Float[Array, "capture ..."],
 ) -> Float[Array, " capture"]:
     """The variance given, of each capture, averaged over its batch."""
     count = len(captures)

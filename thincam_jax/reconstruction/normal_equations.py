@@ -12,6 +12,7 @@ Factorisations are not differentiated: derivatives follow from the equation itse
 import abc
 import functools
 import math
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -20,6 +21,7 @@ import lineax
 import optimistix
 from jaxtyping import Array, Float
 
+from thincam_jax._core.checks import Number
 from thincam_jax._core.precision import product
 from thincam_jax.imaging.operators import (
     AbstractOperator,
@@ -69,13 +71,13 @@ class AbstractNormal(eqx.Module):
         """The same where μ stays for hundreds of solutions."""
         return self
 
-    def __call__(self, right, guess):
+    def __call__(self, right: Float[Array, "..."], guess: Float[Array, "..."]):
         """z of b, differentiable; `guess` is what an iterative solution begins with."""
         del guess
         symmetric = lambda _, b: self.solve(b)  # noqa: E731
         return jax.lax.custom_linear_solve(self.applied, right, symmetric, symmetric=True)
 
-    def applied(self, image):
+    def applied(self, image: Float[Array, "..."]):
         """(Σ AᵀwA + μ) z."""
         seen = tuple(see(operator, image) for operator in self.problem.operators)
         return back_projected(self.problem, seen) + self.shift * image
@@ -109,15 +111,15 @@ class DenseNormal(AbstractNormal):
     gram: Float[Array, "n n"]
     factor: Float[Array, "n n"]
 
-    def __init__(self, problem: InverseProblem, shift, gram):
+    def __init__(self, problem: InverseProblem, shift: Float[Array, ""], gram: Float[Array, "n n"]):
         self.problem, self.shift, self.gram = problem, shift, gram
         self.factor = _cholesky(gram, jax.lax.stop_gradient(shift))
 
-    def solve(self, right):
+    def solve(self, right: Float[Array, "..."]):
         flat = right.reshape(-1, self.gram.shape[0]).T
         return jax.scipy.linalg.cho_solve((self.factor, True), flat).T.reshape(right.shape)
 
-    def shifted(self, shift):
+    def shifted(self, shift: Float[Array, ""]):
         return DenseNormal(self.problem, shift, self.gram)
 
     def variance(self):
@@ -133,10 +135,10 @@ class SeparableNormal(AbstractNormal):
     shift: Float[Array, ""]
     modes: SeparableModes
 
-    def solve(self, right):
+    def solve(self, right: Float[Array, "..."]):
         return _by_modes(self.modes, jax.lax.stop_gradient(self.shift), right)
 
-    def shifted(self, shift):
+    def shifted(self, shift: Float[Array, ""]):
         return SeparableNormal(self.problem, shift, self.modes)
 
     def variance(self):
@@ -150,12 +152,12 @@ class ReducedNormal(AbstractNormal):
     problem: InverseProblem
     shift: Float[Array, ""]
 
-    def solve(self, right):
+    def solve(self, right: Float[Array, "..."]):
         bare, power = self._powers()
         modes = bare.modes(right.reshape(-1, bare.values.size)) / power
         return each_times(bare.vectors, modes).reshape(right.shape)
 
-    def shifted(self, shift):
+    def shifted(self, shift: Float[Array, ""]):
         return ReducedNormal(self.problem, shift)
 
     def variance(self):
@@ -183,11 +185,11 @@ class InverseNormal(AbstractNormal):
     shift: Float[Array, ""]
     inverse: Float[Array, "n n"]
 
-    def solve(self, right):
+    def solve(self, right: Float[Array, "..."]):
         flat = right.reshape(-1, self.inverse.shape[0])
         return each_times(jax.lax.stop_gradient(self.inverse), flat).reshape(right.shape)
 
-    def shifted(self, shift):
+    def shifted(self, shift: Float[Array, ""]):
         return normal_equations(self.problem, shift)
 
 
@@ -201,15 +203,17 @@ class IterativeNormal(AbstractNormal):
     shift: Float[Array, ""]
     modes: SeparableModes | None = None
 
-    def solve(self, right):
+    def solve(self, right: Float[Array, "..."]):
         return self(right, jnp.zeros_like(right))
 
-    def __call__(self, right, guess):
+    def __call__(self, right: Float[Array, "..."], guess: Float[Array, "..."]):
         limit = INNER_TOLERANCE[str(right.dtype)]
         solution = self.solution(right, guess, limit, INNER_STEPS)
         return solution.value
 
-    def solution(self, right, guess, tolerance, steps: int) -> lineax.Solution:
+    def solution(
+        self, right: Float[Array, "..."], guess: Float[Array, "..."], tolerance: Number, steps: int
+    ) -> lineax.Solution:
         """What lineax says; `tolerance` is relative to the right-hand side, root mean square."""
         structure = jax.ShapeDtypeStruct(right.shape, right.dtype)
         tags = lineax.positive_semidefinite_tag
@@ -221,7 +225,7 @@ class IterativeNormal(AbstractNormal):
         operator = lineax.FunctionLinearOperator(
             lambda image: factor * self.applied(image), structure, tags
         )
-        options = {"y0": guess / factor}
+        options: dict[str, Any] = {"y0": guess / factor}
         operators, filtered = convolutions(self.problem), None
         if operators is not None:
             filtered = functools.partial(self._uncropped, operators)
@@ -230,13 +234,12 @@ class IterativeNormal(AbstractNormal):
         if filtered is not None:
             options["preconditioner"] = lineax.FunctionLinearOperator(filtered, structure, tags)
         size = jnp.sqrt(jnp.mean(right**2))
-        solver = lineax.CG(
-            rtol=tolerance, atol=tolerance * size, norm=optimistix.rms_norm, max_steps=steps
-        )
+        limits: dict[str, Any] = {"rtol": tolerance, "atol": tolerance * size}
+        solver = lineax.CG(**limits, norm=optimistix.rms_norm, max_steps=steps)
         solution = lineax.linear_solve(operator, right, solver, options=options, throw=False)
         return eqx.tree_at(lambda s: s.value, solution, factor * solution.value)
 
-    def shifted(self, shift):
+    def shifted(self, shift: Float[Array, ""]):
         return IterativeNormal(self.problem, shift, self.modes)
 
     def _uncropped(self, operators, image):

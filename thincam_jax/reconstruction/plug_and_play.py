@@ -19,6 +19,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
+from thincam_jax._core.checks import Number
 from thincam_jax.reconstruction.drive import Callback, OptimistixMethod, Outcome, drive
 from thincam_jax.reconstruction.fista import (
     AbstractProximalMap,
@@ -30,7 +31,7 @@ from thincam_jax.reconstruction.problem import (
     start_image,
     total_misfit,
 )
-from thincam_jax.reconstruction.regularisers import AbstractRegulariser, denoise
+from thincam_jax.reconstruction.regularisers import AbstractRegulariser, Parts, denoise
 from thincam_jax.reconstruction.scaled import ScaledProblem
 
 Denoiser = Callable[[Array], Array]
@@ -69,10 +70,10 @@ class DenoiserMap(AbstractProximalMap):
     unit: Float[Array, ""]
     nonnegative: bool = eqx.field(static=True)
 
-    def start(self, image):
+    def start(self, image: Float[Array, "*batch channel plane y x"]):
         return ()
 
-    def __call__(self, image, kept):
+    def __call__(self, image: Float[Array, "*batch channel plane y x"], kept: Parts):
         image = self.denoiser(image * self.unit) / self.unit
         return (jnp.maximum(image, 0) if self.nonnegative else image), kept
 
@@ -95,16 +96,16 @@ class PlugAndPlay(OptimistixMethod):
         return self.scaled.problem
 
     @staticmethod
-    def function(value, arguments):
+    def function(value: Float[Array, "*batch channel plane y x"], arguments: InverseProblem):
         return total_misfit(value, arguments), None
 
-    def value_of(self, image):
+    def value_of(self, image: Float[Array, "*batch channel plane y x"]):
         return image / self.scaled.image_unit
 
-    def image_of(self, value):
+    def image_of(self, value: Float[Array, "*batch channel plane y x"]):
         return value * self.scaled.image_unit
 
-    def objective(self, image):
+    def objective(self, image: Float[Array, "*batch channel plane y x"]):
         return _distance(self, image)
 
 
@@ -113,7 +114,7 @@ def solve_plug_and_play(
     denoiser: Denoiser,
     *,
     image: Float[Array, "..."] | None = None,
-    brightness=1.0,
+    brightness: Number = 1.0,
     iterations: int = 200,
     callback: Callback | None = None,
 ) -> Outcome:

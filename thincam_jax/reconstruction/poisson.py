@@ -16,6 +16,7 @@ counts a pixel they do not.
 
 import functools
 import time
+from collections.abc import Sequence
 from typing import Any, ClassVar, Literal
 
 import equinox as eqx
@@ -26,7 +27,8 @@ import optimistix
 from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
-from thincam_jax.reconstruction.drive import Outcome, concluded
+from thincam_jax._core.checks import Number, Numbers
+from thincam_jax.reconstruction.drive import Callback, Outcome, concluded
 from thincam_jax.reconstruction.problem import (
     InverseProblem,
     detector_shape,
@@ -35,6 +37,7 @@ from thincam_jax.reconstruction.problem import (
     start_image,
     uniform_level,
 )
+from thincam_jax.reconstruction.recording import Recording
 from thincam_jax.reconstruction.registration import distance_ratios
 from thincam_jax.reconstruction.regularised import DEFAULT_TAU, first_image, of_kind
 from thincam_jax.reconstruction.seen_by import Cameras
@@ -71,8 +74,8 @@ class Counts(eqx.Module):
         self,
         problem: InverseProblem,
         *,
-        background=None,
-        smoothing=0.01,
+        background: Sequence[Numbers] | None = None,
+        smoothing: Number = 0.01,
         link: Link = "softplus",
     ):
         checks.choice("link", link, LINKS)
@@ -129,10 +132,10 @@ class PoissonTV(AbstractIterativeSolver):
 
     def __init__(
         self,
-        tau=DEFAULT_TAU,
+        tau: Number | str = DEFAULT_TAU,
         *,
         variation: TotalVariation | None = None,
-        background=None,
+        background: Numbers | Sequence[Numbers] | None = None,
         iterations: int = 300,
         tolerance: float = 1e-4,
     ):
@@ -146,7 +149,13 @@ class PoissonTV(AbstractIterativeSolver):
         check_limits(iterations, tolerance)
         self.iterations, self.tolerance = iterations, tolerance
 
-    def solve(self, recording, *, start=None, callback=None):
+    def solve(
+        self,
+        recording: Recording,
+        *,
+        start: Float[Array, "..."] | None = None,
+        callback: Callback | None = None,
+    ):
         if callback is not None:
             raise ValueError("method 'poisson' runs in one piece; leave out the callback")
         if isinstance(recording.seen_by, Cameras):
@@ -154,11 +163,13 @@ class PoissonTV(AbstractIterativeSolver):
         # The variance is that of the counts; no other needs to be estimated.
         counted = recording.with_noise(1.0)
         problem = counted.problem(tau=self.tau, regulariser=self.variation)
-        start = recording.oriented(start)
+        image = None
+        if start is not None:
+            image = first_image(problem, recording.oriented(start), uniform=True)
         outcome = solve_poisson(
             problem,
             background=_backgrounds(self.background, problem),
-            image=None if start is None else first_image(problem, start, uniform=True),
+            image=image,
             smoothing=_SMOOTHING,
             iterations=self.iterations,
             tolerance=self.tolerance,
@@ -169,10 +180,10 @@ class PoissonTV(AbstractIterativeSolver):
 def solve_poisson(
     problem: InverseProblem,
     *,
-    background=None,
+    background: Sequence[Numbers] | None = None,
     image: Float[Array, "..."] | None = None,
     link: Link = "softplus",
-    smoothing=0.01,
+    smoothing: Number = 0.01,
     iterations: int = 300,
     tolerance: float = 1e-4,
     memory: int = 10,
@@ -261,7 +272,9 @@ def half_deviance(counts: Float[Array, "..."], mean: Float[Array, "..."]) -> Flo
 
 
 def smooth_variation(
-    variation: TotalVariation, image: Float[Array, "*batch channel plane y x"], smoothing
+    variation: TotalVariation,
+    image: Float[Array, "*batch channel plane y x"],
+    smoothing: Float[Array, ""],
 ) -> Float[Array, "*batch"]:
     r"""The Moreau envelope of TV's norm: min over u of φ(u) + ‖u − Ψf‖²/(2ε).
 

@@ -1,11 +1,15 @@
 """What a reconstruction minimises: one problem for every camera that brings an operator."""
 
+from collections.abc import Sequence
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
+from thincam_jax._core.checks import Number, Numbers
 from thincam_jax.imaging.operators import AbstractOperator, CropConvolution, Masked, Scaled, Stacked
 from thincam_jax.imaging.operators.base import is_shape
 from thincam_jax.reconstruction.regularisers import AbstractRegulariser
@@ -55,11 +59,11 @@ class InverseProblem(eqx.Module):
 
     def __init__(
         self,
-        operators,
-        captures,
+        operators: AbstractOperator | Sequence[AbstractOperator],
+        captures: Numbers | Sequence[Any],
         *,
-        weights=None,
-        tau=2.0,
+        weights: Sequence[Any] | None = None,
+        tau: Number = 2.0,
         regulariser: AbstractRegulariser | None = None,
         nonnegative: bool = True,
     ):
@@ -112,7 +116,9 @@ class InverseProblem(eqx.Module):
         return (*leading, planes, *self.field_shape)
 
 
-def noise_in_the_image(operators, weights) -> Float[Array, ""]:
+def noise_in_the_image(
+    operators: Sequence[AbstractOperator], weights: Sequence[Float[Array, "..."]]
+) -> Float[Array, ""]:
     """u of `InverseProblem`: the standard deviation of a pixel of the back-projected noise."""
     parts = [o.mean_power() * jnp.max(w) for o, w in zip(operators, weights, strict=True)]
     return jnp.sqrt(sum(parts[1:], start=parts[0]))
@@ -142,7 +148,9 @@ def residuals(problem: InverseProblem, image: Float[Array, "*batch channel plane
     )
 
 
-def back_projected(problem: InverseProblem, differences) -> Float[Array, "..."]:
+def back_projected(
+    problem: InverseProblem, differences: Sequence[Float[Array, "..."]]
+) -> Float[Array, "..."]:
     r""":math:`\sum_k A_k^T w_k d_k`."""
     parts = zip(problem.operators, problem.weights, differences, strict=True)
     first, *others = [back_project(operator, w * d) for operator, w, d in parts]
@@ -186,7 +194,7 @@ def total_objective(
     return jnp.sum(objective(problem, image))
 
 
-def with_tau(problem: InverseProblem, tau) -> InverseProblem:
+def with_tau(problem: InverseProblem, tau: Number) -> InverseProblem:
     """The same problem with another relative τ."""
     return eqx.tree_at(lambda p: p.tau, problem, jnp.asarray(tau, problem.tau.dtype))
 

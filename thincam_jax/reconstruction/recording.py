@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
+from thincam_jax._core.checks import Number, Numbers
 from thincam_jax._core.grids import same_parity
 from thincam_jax._core.memory import refuse_if_too_large
 from thincam_jax._core.module import Module
@@ -151,18 +152,18 @@ class Recording(Module):
             tau=tau,
         )
 
-    def oriented(self, image):
+    def oriented(self, image: Float[Array, "..."]):
         """An image as the scene is: cameras turn it over; the other way it is the same."""
-        if image is None or not isinstance(self.seen_by, Cameras):
+        if not isinstance(self.seen_by, Cameras):
             return image
         return jnp.asarray(image)[..., ::-1, ::-1]
 
-    def with_noise(self, variance) -> "Recording":
+    def with_noise(self, variance: Numbers) -> "Recording":
         """The same recording with another noise variance."""
         none = {"is_leaf": lambda leaf: leaf is None}
         return eqx.tree_at(lambda recording: recording.noise_variance, self, variance, **none)
 
-    def focused(self, object_distance) -> "Recording":
+    def focused(self, object_distance: Numbers | Sequence[Number]) -> "Recording":
         """The same recording with its `Cameras` focused on another distance, mm."""
         if not isinstance(self.seen_by, Cameras):
             raise ValueError("a distance is that of computed PSFs; this recording has no Cameras")
@@ -340,7 +341,7 @@ def _convolutions(sums, variances, pitch, field_shape, settings) -> InverseProbl
     return InverseProblem(operators, [s.capture for s in sums], weights=weights, **settings)
 
 
-def middle(image: Float[Array, "*batch y x"], shape) -> Float[Array, "*batch v u"]:
+def middle(image: Float[Array, "*batch y x"], shape: Sequence[int]) -> Float[Array, "*batch v u"]:
     """The middle of an image."""
     corner = [(n - s) // 2 for n, s in zip(image.shape[-2:], shape, strict=True)]
     return cut(image, corner, shape)

@@ -54,7 +54,7 @@ def distance_ratios(cameras: Sequence[LenslessCamera]) -> list[float]:
     return [max(distances) / d for d in distances]
 
 
-def own_field(field_shape, ratio: float) -> tuple[int, int]:
+def own_field(field_shape: tuple[int, int], ratio: float) -> tuple[int, int]:
     """The field in samples of a camera's own scale, ratio times coarser; parity as the field's."""
     rows, columns = (n - 2 * math.floor((n - n / ratio) / 2 + 1e-6) for n in field_shape)
     return rows, columns

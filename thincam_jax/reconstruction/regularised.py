@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
+from thincam_jax._core.checks import Number
 from thincam_jax.imaging.operators.crop_convolution import place
 from thincam_jax.reconstruction.admm import AdmmMethod
 from thincam_jax.reconstruction.apart import Apart, worth_taking_apart
@@ -21,11 +22,13 @@ from thincam_jax.reconstruction.drive import CHUNK, AbstractMethod, Callback, Ou
 from thincam_jax.reconstruction.fista import solve_fista
 from thincam_jax.reconstruction.high_pass import Judged, high_passed, levelled
 from thincam_jax.reconstruction.problem import InverseProblem, uniform_level
+from thincam_jax.reconstruction.recording import Recording
 from thincam_jax.reconstruction.regularisers import AbstractRegulariser
 from thincam_jax.reconstruction.seen_by import Cameras
 from thincam_jax.reconstruction.solver import (
     AbstractIterativeSolver,
     Reconstruction,
+    Synthesis,
     as_synthesis,
     check_limits,
 )
@@ -66,7 +69,13 @@ class AbstractRegularised(AbstractIterativeSolver):
     def minimise(self, problem: InverseProblem, start: Start, callback: Callback | None) -> Outcome:
         """The minimiser of a problem."""
 
-    def solve(self, recording, *, start=None, callback=None) -> Reconstruction:
+    def solve(
+        self,
+        recording: Recording,
+        *,
+        start: Float[Array, "..."] | None = None,
+        callback: Callback | None = None,
+    ) -> Reconstruction:
         """The image of a recording, from the image given, a uniform one, or zero.
 
         A uniform image explains the bright background of a zone aperture's capture at once, which
@@ -81,7 +90,8 @@ class AbstractRegularised(AbstractIterativeSolver):
         )
         began = time.perf_counter()
         uniform = isinstance(recording.seen_by, Cameras)
-        image = first_image(problem, recording.oriented(start), uniform=uniform)
+        upright = None if start is None else recording.oriented(start)
+        image = first_image(problem, upright, uniform=uniform)
         if self.nonnegative:  # the best image so far may be this one
             image = jnp.maximum(image, 0)
         given = start is not None or not uniform
@@ -132,11 +142,11 @@ class AdmmTV(AbstractRegularised):
 
     def __init__(
         self,
-        tau=DEFAULT_TAU,
+        tau: Number | str = DEFAULT_TAU,
         *,
         variation: TotalVariation | None = None,
         nonnegative: bool = True,
-        synthesis=None,
+        synthesis: Synthesis | None = None,
         iterations: int = 100,
         tolerance: float = 1e-4,
     ):
@@ -150,7 +160,7 @@ class AdmmTV(AbstractRegularised):
     def prior(self):
         return self.variation
 
-    def minimise(self, problem, start, callback):
+    def minimise(self, problem: InverseProblem, start: Start, callback: Callback | None):
         """In two parts for a biased camera: first without the uniform light, then with all."""
         first = None if start.given else self._without_uniform_light(problem, start.image, callback)
         if first is None:
@@ -218,11 +228,11 @@ class Fista(AbstractRegularised):
 
     def __init__(
         self,
-        tau=DEFAULT_TAU,
+        tau: Number | str = DEFAULT_TAU,
         *,
         regulariser: AbstractRegulariser | None = None,
         nonnegative: bool = True,
-        synthesis=None,
+        synthesis: Synthesis | None = None,
         iterations: int = 100,
         tolerance: float = 1e-4,
     ):
@@ -241,7 +251,7 @@ class Fista(AbstractRegularised):
     def prior(self):
         return self.regulariser
 
-    def minimise(self, problem, start, callback):
+    def minimise(self, problem: InverseProblem, start: Start, callback: Callback | None):
         """By FISTA with restart."""
         return solve_fista(
             problem,
@@ -258,7 +268,7 @@ def admm_method(problem: InverseProblem) -> AbstractMethod:
 
 
 def first_image(
-    problem: InverseProblem, start, *, uniform: bool
+    problem: InverseProblem, start: Float[Array, "..."] | None, *, uniform: bool
 ) -> Float[Array, "*batch channel plane y x"]:
     """The start given, amid zeros where it is smaller than the field; else uniform, or zero."""
     shape, dtype = problem.image_shape, problem.captures[0].dtype
@@ -294,7 +304,7 @@ def checked_tau(tau: Any) -> Any:
     return checks.non_negative("tau", tau, "times the noise")
 
 
-def of_kind(name: str, value, kind: type):
+def of_kind(name: str, value: Any, kind: type):
     """A value of the kind that is asked for; by default one as the kind makes it."""
     if value is None:
         return kind()

@@ -8,8 +8,10 @@ import jax
 import jax.numpy as jnp
 import jax.scipy.fft
 import numpy as np
+from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float
 
+from thincam_jax._core.checks import Number
 from thincam_jax._core.module import Module
 from thincam_jax.reconstruction.wavelet import Wavelet
 
@@ -37,15 +39,17 @@ class AbstractRegulariser(Module):
         """Kᵀ of parts."""
 
     @abc.abstractmethod
-    def shrink(self, parts: Parts, step) -> Parts:
+    def shrink(self, parts: Parts, step: Number) -> Parts:
         """The parts u that minimise step·φ(u) + ½‖u − parts‖²."""
 
     @abc.abstractmethod
-    def squared_norm(self, dtype) -> Float[Array, ""]:
+    def squared_norm(self, dtype: DTypeLike) -> Float[Array, ""]:
         """A bound of ‖K‖²."""
 
 
-def no_dual(regulariser: AbstractRegulariser, image) -> Parts:
+def no_dual(
+    regulariser: AbstractRegulariser, image: Float[Array, "*batch channel plane y x"]
+) -> Parts:
     """The dual of an image that is left as it is, to start `prox` with."""
     shapes = jax.eval_shape(regulariser.analyse, image)
     return tuple(jnp.zeros(s.shape, s.dtype) for s in shapes)
@@ -54,7 +58,7 @@ def no_dual(regulariser: AbstractRegulariser, image) -> Parts:
 def prox(
     regulariser: AbstractRegulariser,
     image: Float[Array, "*batch channel plane y x"],
-    step,
+    step: Number,
     dual: Parts,
     *,
     nonnegative: bool,
@@ -126,7 +130,7 @@ def first_t(image: Float[Array, "*batch channel plane y x"]) -> Float[Array, "*b
 
 def denoise(
     image: Float[Array, "*batch channel plane y x"],
-    step,
+    step: Number,
     regulariser: AbstractRegulariser,
     *,
     nonnegative: bool = False,
@@ -181,23 +185,23 @@ class Sparsity(AbstractRegulariser):
     def orthonormal(self):
         return True
 
-    def __call__(self, image):
+    def __call__(self, image: Float[Array, "*batch channel plane y x"]):
         (details,) = self.analyse(image)
         counted = jnp.where(self._free(details.shape), 0, jnp.abs(details))
         return jnp.sum(counted, axis=(-4, -3, -2, -1))
 
-    def analyse(self, image):
+    def analyse(self, image: Float[Array, "*batch channel plane y x"]):
         return (self.basis.analyse(image),)
 
-    def synthesise(self, parts):
+    def synthesise(self, parts: Parts):
         return self.basis.synthesise(parts[0])
 
-    def shrink(self, parts, step):
+    def shrink(self, parts: Parts, step: Number):
         (details,) = parts
         shrunk = jnp.sign(details) * jnp.maximum(jnp.abs(details) - step, 0)
         return (jnp.where(self._free(details.shape), details, shrunk),)
 
-    def squared_norm(self, dtype):
+    def squared_norm(self, dtype: DTypeLike):
         return jnp.ones((), dtype)
 
     def _free(self, shape) -> Bool[Array, "y x"]:

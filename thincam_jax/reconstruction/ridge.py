@@ -18,6 +18,7 @@ Stat. 4, 105, 1975), with the uniform image for a first fit. f̄ is that image.
 import functools
 import operator
 import time
+from collections.abc import Sequence
 from typing import ClassVar, cast
 
 import equinox as eqx
@@ -28,6 +29,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
+from thincam_jax._core.checks import Number
 from thincam_jax.imaging.operators import Separable
 from thincam_jax.reconstruction.drive import Outcome, concluded
 from thincam_jax.reconstruction.normal_equations import (
@@ -43,9 +45,10 @@ from thincam_jax.reconstruction.problem import (
     start_image,
     uniform_level,
 )
+from thincam_jax.reconstruction.recording import Recording
 from thincam_jax.reconstruction.scaled import ScaledProblem
 from thincam_jax.reconstruction.separable import RULES, Prior, Rule, choose_precision
-from thincam_jax.reconstruction.solver import AbstractSolver, as_synthesis, check_limits
+from thincam_jax.reconstruction.solver import AbstractSolver, Synthesis, as_synthesis, check_limits
 
 
 class Ridge(AbstractSolver):
@@ -77,10 +80,10 @@ class Ridge(AbstractSolver):
 
     def __init__(
         self,
-        ridge=1.0,
+        ridge: Number | str = 1.0,
         *,
-        correlation=0.0,
-        synthesis=None,
+        correlation: Number | Sequence[float | int] = 0.0,
+        synthesis: Synthesis | None = None,
         iterations: int = 300,
         tolerance: float = 1e-4,
     ):
@@ -101,7 +104,7 @@ class Ridge(AbstractSolver):
         check_limits(iterations, tolerance)
         self.iterations, self.tolerance = iterations, tolerance
 
-    def solve(self, recording):
+    def solve(self, recording: Recording):
         problem, white, mean, prior, precision = self._posed(recording)
         outcome = solve_ridge(
             white,
@@ -114,7 +117,7 @@ class Ridge(AbstractSolver):
             outcome = outcome._replace(image=mean + prior.image(outcome.image))
         return recording.reconstruction(problem, outcome, self.name)
 
-    def deviation(self, recording) -> Float[Array, "*plane y x"]:
+    def deviation(self, recording: Recording) -> Float[Array, "*plane y x"]:
         r"""The posterior standard deviation of each pixel, in the scene's unit.
 
         .. math:: \sigma_i = \Big(\sum_k A_k^T w_k A_k + \rho\Big)^{-1/2}_{ii}
@@ -189,7 +192,7 @@ def image_precision(level: Float[Array, "..."]) -> float:
 def solve_ridge(
     problem: InverseProblem,
     *,
-    precision,
+    precision: Number,
     mean: Float[Array, "..."] | None = None,
     iterations: int = 300,
     tolerance: float = 1e-6,

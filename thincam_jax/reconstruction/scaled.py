@@ -26,11 +26,11 @@ class Seen(AbstractOperator):
     def out_shape(self) -> tuple[tuple[int, ...], ...]:
         return tuple(c.shape for c in self.problem.captures)
 
-    def __call__(self, image):
+    def __call__(self, image: Float[Array, "*batch channel plane y x"]):
         pairs = zip(self.problem.operators, self.problem.weights, strict=True)
         return tuple(jnp.sqrt(w) * see(operator, image) for operator, w in pairs)
 
-    def adjoint(self, capture):
+    def adjoint(self, capture: tuple[Float[Array, "..."], ...]):
         parts = zip(self.problem.operators, self.problem.weights, capture, strict=True)
         first, *others = [back_project(operator, jnp.sqrt(w) * c) for operator, w, c in parts]
         return sum(others, start=first)

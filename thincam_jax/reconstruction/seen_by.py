@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
+from thincam_jax._core.checks import Number, Numbers
 from thincam_jax._core.module import Module
 from thincam_jax.imaging.operators import kernel_grid
 from thincam_jax.lensless.camera import LenslessCamera
@@ -46,8 +47,8 @@ class Cameras(Module):
         self,
         cameras: Sequence[LenslessCamera],
         *,
-        wavelength=None,
-        object_distance=None,
+        wavelength: Numbers | Sequence[Number] | None = None,
+        object_distance: Numbers | Sequence[Number] | None = None,
         field_shape: tuple[int, int] | None = None,
         model: Model = "separable",
         pixel_integration: bool = True,
@@ -81,7 +82,9 @@ class Cameras(Module):
         if missing:
             raise ValueError(f"the Cameras have no {' and no '.join(missing)}; give it in mm")
 
-    def kernels(self, field: tuple[int, int], ratios) -> list[Float[Array, "1 plane k l"]]:
+    def kernels(
+        self, field: tuple[int, int], ratios: Sequence[float]
+    ) -> list[Float[Array, "1 plane k l"]]:
         """PSF of each camera and plane on the reference scale; enlarged by r, 1/r² as bright."""
         self.require("wavelength", "object_distance")
         distances = np.atleast_1d(np.asarray(self.object_distance, dtype=object))
@@ -118,7 +121,7 @@ class Psfs(Module):
     psfs: Float[Array, "capture channel plane k l"]
     field_shape: tuple[int, int] | None = eqx.field(static=True)
 
-    def __init__(self, psfs, *, field_shape: tuple[int, int] | None = None):
+    def __init__(self, psfs: Numbers, *, field_shape: tuple[int, int] | None = None):
         psfs = jnp.asarray(psfs)
         checks.channels_first("psfs", psfs.shape)
         _require_light(psfs)

@@ -1,6 +1,7 @@
 """What a reconstruction is asked for and what it returns: solvers as objects, results."""
 
 import abc
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, ClassVar
 
 import equinox as eqx
@@ -9,12 +10,16 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
+from thincam_jax._core.checks import Numbers
 from thincam_jax._core.module import Module
 from thincam_jax.imaging.display import eight_bit, pictures, png_bytes
 from thincam_jax.reconstruction.drive import Callback, Progress
 
 if TYPE_CHECKING:
     from thincam_jax.reconstruction.recording import Recording
+
+# Sums of captures to take in place of the captures: a real matrix (channel × capture).
+Synthesis = Numbers | Sequence[Sequence[float]]
 
 
 class Reconstruction(Module):
@@ -95,6 +100,6 @@ def check_limits(iterations: int, tolerance: float) -> None:
     checks.non_negative("tolerance", tolerance, "a ratio")
 
 
-def as_synthesis(synthesis) -> np.ndarray | None:
+def as_synthesis(synthesis: Synthesis | None) -> np.ndarray | None:
     """A synthesis as a matrix, (channel, capture)."""
     return None if synthesis is None else np.asarray(synthesis, dtype=float)

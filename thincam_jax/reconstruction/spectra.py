@@ -5,12 +5,13 @@ the half plane of a real DFT of the padded window.
 """
 
 import functools
+from collections.abc import Sequence
 from typing import Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from thincam_jax._core.grids import Grid
 
@@ -18,7 +19,7 @@ Prior = Literal["inverse_square", "flat"]
 
 
 @functools.partial(jax.jit, static_argnames=("prior", "field_shape"))
-def prior_spectrum(prior: Prior, grid: Grid, field_shape) -> Float[Array, "v u"]:
+def prior_spectrum(prior: Prior, grid: Grid, field_shape: tuple[int, int]) -> Float[Array, "v u"]:
     """Scene spectrum with a mean of 1 over all frequencies."""
     v = jnp.fft.ifftshift(grid.v)[:, None]
     u = jnp.fft.ifftshift(grid.u)
@@ -36,14 +37,18 @@ def _axis_distance(padded, sensor_shape) -> tuple[np.ndarray, np.ndarray]:
     return v[:, None], u[None, :]
 
 
-def inner_band(padded, sensor_shape) -> np.ndarray:
+def inner_band(padded: Sequence[int], sensor_shape: Sequence[int | float]) -> np.ndarray:
     """Frequencies away from both axes, where the sensor's edges leave no trace."""
     v, u = _axis_distance(padded, sensor_shape)
     inner = (v > 3) & (u > 3)
     return inner if inner.any() else np.ones_like(inner)  # a sensor of a few rows has no others
 
 
-def scene_power(signal, expected, inner) -> Float[Array, ""]:
+def scene_power(
+    signal: Float[Array, "channel v u"],
+    expected: Float[Array, "channel v u"],
+    inner: Bool[np.ndarray, "v u"],
+) -> Float[Array, ""]:
     """Variance of the scene: least-squares fit of its expected power to the captures' own.
 
     Weighted by what is expected, so that it rests on frequencies where the scene stands out.
@@ -53,7 +58,11 @@ def scene_power(signal, expected, inner) -> Float[Array, ""]:
     return jnp.maximum(jnp.sum(weight * signal), floor) / jnp.sum(weight * expected)
 
 
-def crop_noise(periodogram, padded, sensor_shape) -> Float[Array, "channel v u"]:
+def crop_noise(
+    periodogram: Float[Array, "channel v u"],
+    padded: Sequence[int],
+    sensor_shape: Sequence[int | float],
+) -> Float[Array, "channel v u"]:
     """Noise spectrum of the steps that a bright background leaves at the sensor's borders.
 
     A step across the border x = const has a spectrum that falls like 1/u² from the v axis; its

@@ -1,6 +1,7 @@
 r"""Total variation of an image, its proximal map, and the differences it is made of."""
 
 import functools
+from collections.abc import Sequence
 from typing import Literal
 
 import equinox as eqx
@@ -8,9 +9,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.custom_derivatives import SymbolicZero
+from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
+from thincam_jax._core.checks import Number
 from thincam_jax.reconstruction.regularisers import AbstractRegulariser
 
 Kind = Literal["isotropic", "anisotropic"]
@@ -51,8 +54,8 @@ class TotalVariation(AbstractRegulariser):
         kind: Kind = "isotropic",
         coupling: Coupling = "none",
         *,
-        depth_weight=0.0,
-        chroma_weight=1.5,
+        depth_weight: Number = 0.0,
+        chroma_weight: Number = 1.5,
     ):
         checks.choice("kind", kind, ("isotropic", "anisotropic"))
         checks.choice("coupling", coupling, ("none", "joint", "opponent"))
@@ -84,12 +87,12 @@ class TotalVariation(AbstractRegulariser):
         """The transpose of `analyse`."""
         return differences_adjoint(_inside(parts), self.depth_weight)
 
-    def squared_norm(self, dtype) -> Float[Array, ""]:
+    def squared_norm(self, dtype: DTypeLike) -> Float[Array, ""]:
         """Each of the directions takes differences of two samples: at most 2² = 4."""
         return 8 + 4 * self.depth_weight.astype(dtype) ** 2
 
     def shrink(
-        self, parts: tuple[Float[Array, "*batch channel plane y x"], ...], step
+        self, parts: tuple[Float[Array, "*batch channel plane y x"], ...], step: Number
     ) -> tuple[Float[Array, "*batch channel plane y x"], ...]:
         """The slopes u that minimise step·TV + ½‖u − parts‖²: each vector shortened by `step`."""
         rotated = self._rotate(parts)
@@ -128,7 +131,7 @@ class TotalVariation(AbstractRegulariser):
 
 
 def differences(
-    image: Float[Array, "*batch plane y x"], depth_weight
+    image: Float[Array, "*batch plane y x"], depth_weight: Number
 ) -> tuple[Float[Array, "*batch plane y x"], ...]:
     """Forward differences along y and x, round the window's end, and between planes.
 
@@ -143,7 +146,7 @@ def differences(
 
 
 def differences_adjoint(
-    slopes: tuple[Float[Array, "*batch plane y x"], ...], depth_weight
+    slopes: tuple[Float[Array, "*batch plane y x"], ...], depth_weight: Number
 ) -> Float[Array, "*batch plane y x"]:
     """The transpose of `differences`."""
     down, right, *depth = slopes
@@ -156,7 +159,9 @@ def differences_adjoint(
     return image
 
 
-def field_masks(field_shape, window, corner=(0, 0)) -> tuple[tuple[Array, Array], ...]:
+def field_masks(
+    field_shape: tuple[int, int], window: tuple[int, int], corner: tuple[int, int] = (0, 0)
+) -> tuple[tuple[Array, Array], ...]:
     """Where the differences down, right and behind lie inside of the field, on a window.
 
     A column and a row of booleans each, both of which hold there: no mask of the window's size
@@ -169,7 +174,7 @@ def field_masks(field_shape, window, corner=(0, 0)) -> tuple[tuple[Array, Array]
     return (y_down, x), (y, x_right), (y, x)
 
 
-def within_field(slopes, masks):
+def within_field(slopes: Sequence[Float[Array, "..."]], masks: Sequence[tuple[Array, Array]]):
     """Slopes with those that leave the field set to zero."""
     lines = [[m.astype(s.dtype) for m in pair] for pair, s in zip(masks, slopes, strict=False)]
     return tuple(s * y * x for s, (y, x) in zip(slopes, lines, strict=True))

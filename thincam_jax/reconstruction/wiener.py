@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from thincam_jax._core import checks
+from thincam_jax._core.checks import Numbers
 from thincam_jax._core.grids import Grid, fast_shape, same_parity
 from thincam_jax._core.precision import as_complex
 from thincam_jax.imaging.operators import CropConvolution, kernel_grid, kernel_shape
@@ -23,7 +24,12 @@ from thincam_jax.reconstruction.registration import (
     registered_shape,
 )
 from thincam_jax.reconstruction.seen_by import Cameras
-from thincam_jax.reconstruction.solver import AbstractSolver, Reconstruction, as_synthesis
+from thincam_jax.reconstruction.solver import (
+    AbstractSolver,
+    Reconstruction,
+    Synthesis,
+    as_synthesis,
+)
 from thincam_jax.reconstruction.spectra import (
     Prior,
     crop_noise,
@@ -78,7 +84,13 @@ class WienerSynthesis(eqx.Module):
     field_shape: tuple[int, int] = eqx.field(static=True)
     padded: tuple[int, int] = eqx.field(static=True)
 
-    def __init__(self, cameras: Cameras, *, synthesis=None, prior: Prior = "inverse_square"):
+    def __init__(
+        self,
+        cameras: Cameras,
+        *,
+        synthesis: Synthesis | None = None,
+        prior: Prior = "inverse_square",
+    ):
         checks.choice("prior", prior, ("inverse_square", "flat"))
         cameras.require("wavelength", "object_distance")
         each, count = cameras.cameras, cameras.count
@@ -116,7 +128,7 @@ class WienerSynthesis(eqx.Module):
         self.object_pitch = cameras.pitch
 
     def __call__(
-        self, captures: Float[Array, "capture *batch y x"], noise_variance
+        self, captures: Float[Array, "capture *batch y x"], noise_variance: Numbers
     ) -> Reconstruction:
         """The reconstruction of captures (capture, *batch, y, x).
 
@@ -192,7 +204,7 @@ class Wiener(AbstractSolver):
     synthesis: np.ndarray | None
     prior: Prior = eqx.field(static=True)
 
-    def __init__(self, *, synthesis=None, prior: Prior = "inverse_square"):
+    def __init__(self, *, synthesis: Synthesis | None = None, prior: Prior = "inverse_square"):
         checks.choice("prior", prior, ("inverse_square", "flat"))
         self.synthesis = as_synthesis(synthesis)
         self.prior = prior
@@ -201,7 +213,7 @@ class Wiener(AbstractSolver):
         """The filter of these cameras, a function of captures and noise variance."""
         return WienerSynthesis(cameras, synthesis=self.synthesis, prior=self.prior)
 
-    def solve(self, recording):
+    def solve(self, recording: Recording):
         cameras = filtered_cameras(recording, self.name)
         captures = jnp.stack(recording.captures)
         variance = recording.noise_variance

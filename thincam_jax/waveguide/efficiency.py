@@ -15,7 +15,8 @@ the Bragg condition.
 """
 
 import math
-from typing import Literal, NamedTuple
+from collections.abc import Callable
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -97,7 +98,7 @@ def least_nodes(orders: int) -> int:
     return max(20 * (4 + orders), 720)
 
 
-def in_blocks(function, *rays):
+def in_blocks(function: Callable[..., Any], *rays: Float[Array, "ray ..."]):
     """A function of one ray for all, (ray, …), some hundreds at a time for the memory."""
     count = rays[0].shape[0]
     blocks = max(1, math.ceil(count / _RAYS))

@@ -177,14 +177,18 @@ def at_rear(camera: SeeThroughCamera, across: Float[Array, "*ray 2"]) -> Float[A
     return camera.lens_distance * (normal[2] * slope - normal[:2])
 
 
-def straight_on(camera: SeeThroughCamera, slope, distance) -> Float[Array, "*ray 2"]:
+def straight_on(
+    camera: SeeThroughCamera, slope: Float[Array, "*ray 2"], distance: Float[Array, "..."]
+) -> Float[Array, "*ray 2"]:
     """Where rays would meet the object if the plate moved none sideways, (x, y), mm."""
     normal, width = camera.plate_axes[:, 2], camera.screen.glass_thickness
     further = width * (normal[:2] + (1 - normal[2]) * slope)
     return (camera.lens_distance + distance) * slope + further
 
 
-def on_object(camera: SeeThroughCamera, slope, sideways) -> Float[Array, "*ray 2"]:
+def on_object(
+    camera: SeeThroughCamera, slope: Float[Array, "*ray 2"], sideways: Float[Array, "*ray"]
+) -> Float[Array, "*ray 2"]:
     """What a way along the plate, (x, y) mm, moves a ray of that slope on the object."""
     axes = camera.plate_axes
     along = product(sideways, axes[2, :2])[..., None] * slope

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from thincam_jax._core.checks import Numbers
 from thincam_jax.commands.design.problem import phases_of
 from thincam_jax.design import Design, DesignSpace, Limits, Variable, landscape
 from thincam_jax.design.search import Found
@@ -56,7 +57,7 @@ def _shots_of(variable: Variable, design: Design) -> tuple[int, ...]:
     return tuple(sorted({c // phases + 1 for c in variable.captures}))
 
 
-def straight(space: DesignSpace, point) -> tuple[DesignSpace, Any, np.ndarray]:
+def straight(space: DesignSpace, point: Numbers) -> tuple[DesignSpace, Any, np.ndarray]:
     """A cube in which one number changes at a time, the point in it, and the lengths of its sides.
 
     In the search's own, the limit of a mask's pixels ties β to the width; here β ends where it does
@@ -69,7 +70,7 @@ def straight(space: DesignSpace, point) -> tuple[DesignSpace, Any, np.ndarray]:
     return alone, alone.point(design), spans
 
 
-def per_unit(slopes, curves, spans: np.ndarray) -> Derivatives:
+def per_unit(slopes: Numbers, curves: Numbers, spans: np.ndarray) -> Derivatives:
     """From derivatives along the sides of a cube."""
     known = np.where(spans > 0, spans, np.nan)
     return Derivatives(np.asarray(slopes, float) / known, np.asarray(curves, float) / known**2)
@@ -90,7 +91,7 @@ def _along(objective: Any, space: DesignSpace, data: Any, point):
     return jax.lax.map(one, jnp.eye(len(point), dtype=point.dtype))
 
 
-def derivatives(objective: Any, space: DesignSpace, data: Any, point) -> Derivatives:
+def derivatives(objective: Any, space: DesignSpace, data: Any, point: Numbers) -> Derivatives:
     """By forward differentiation, twice."""
     alone, place, spans = straight(space, point)
     slopes, curves = _along(objective, alone, data, place)

@@ -1,6 +1,7 @@
 """The camera that a refocusing network belongs to, and the distances it is trained for."""
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import equinox as eqx
@@ -9,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from thincam_jax._core import checks
-from thincam_jax._core.checks import Number
+from thincam_jax._core.checks import Number, Numbers
 from thincam_jax._core.grids import same_parity
 from thincam_jax.imaging.operators import CropConvolution, kernel_shape
 from thincam_jax.imaging.scene import Spectrum
@@ -136,7 +137,7 @@ class RefocusCamera(eqx.Module):
         position = 2 * (commanded - 1 / self.middle) / (1 / self.near - 1 / self.far)
         return Stand(inverse, number, place, position)
 
-    def defocus_radius(self, inverse_difference) -> Float[Array, "..."]:
+    def defocus_radius(self, inverse_difference: Float[Array, "..."]) -> Float[Array, "..."]:
         """Radius, in pixels of the image, of the disc that a lens blurs a point to.
 
         A lens with the pupil D, focused on t′, blurs a point at t over the angle D|1/t − 1/t′|,
@@ -147,7 +148,7 @@ class RefocusCamera(eqx.Module):
         pitch = self.camera.sensor.pitch
         return self.pupil * self.camera.distance / (2 * pitch) * jnp.abs(inverse_difference)
 
-    def within(self, distances) -> Float[Array, "..."]:
+    def within(self, distances: Numbers | Sequence[Number]) -> Float[Array, "..."]:
         """Distances t, mm, that a network is trained for; ValueError for one outside."""
         distances = jnp.asarray(distances, self.near.dtype)
         if checks.is_traced(distances) or checks.is_traced(self.near):

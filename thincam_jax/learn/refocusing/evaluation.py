@@ -1,11 +1,12 @@
 """Scenes to judge a refocusing network by, and how far an image is from them."""
 
 import itertools
+from collections.abc import Sequence
 
 import jax.numpy as jnp
 import numpy as np
 import skimage.measure
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, ArrayLike, Bool, Float, Num, PRNGKeyArray
 from scipy import ndimage
 from skimage.metrics import structural_similarity
 
@@ -16,7 +17,12 @@ from thincam_jax.learn.refocusing.cameras import RefocusCamera
 from thincam_jax.learn.refocusing.scenes import LAYERS, PARTS, Scene, captured
 
 
-def flat_scene(camera: RefocusCamera, pictures, covers, distances) -> Scene:
+def flat_scene(
+    camera: RefocusCamera,
+    pictures: Sequence[Num[ArrayLike, "y x"]],
+    covers: Sequence[Num[ArrayLike, "y x"]],
+    distances: Sequence[float | int],
+) -> Scene:
     """Flat layers from the front to the back.
 
     **Arguments**, up to three of each: `pictures` (y, x), radiance; `covers` (y, x), 0 to 1, that
@@ -46,7 +52,12 @@ def capture_scene(
     return with_noise(captured(camera, scene.emission(camera), scene.inverse), noise, key)
 
 
-def with_noise(clean: Float[Array, "y x"], noise: AbstractNoise, key: PRNGKeyArray, electrons=None):
+def with_noise(
+    clean: Float[Array, "y x"],
+    noise: AbstractNoise,
+    key: PRNGKeyArray,
+    electrons: float | Float[Array, ""] | None = None,
+):
     """A noise-free capture with noise, and the noise's root mean square.
 
     `electrons`: mean number per pixel, for shot noise.
@@ -106,14 +117,17 @@ def _edges(count: int, pitch: float, side: float, cells: int) -> np.ndarray:
     return np.clip(np.floor((x / side + 0.5) * cells), 0, cells - 1).astype(int)
 
 
-def scores(image, target, region=None) -> dict[str, float]:
+def scores(
+    image: Num[ArrayLike, "y x"],
+    target: Num[ArrayLike, "y x"],
+    region: Bool[ArrayLike, "y x"] | None = None,
+) -> dict[str, float]:
     """PSNR, SSIM and MS-SSIM of an image, aligned to the target, whose peak is 1, by a line.
 
     `region`: where to take the PSNR, (y, x) booleans; the others are of the whole image.
     """
-    target = np.asarray(target, float)
-    image = np.asarray(image, float) / max(target.max(), 1e-9)
-    target = target / max(target.max(), 1e-9)
+    peak = max(float(np.max(target)), 1e-9)
+    image, target = np.asarray(image, float) / peak, np.asarray(target, float) / peak
     inside = np.ones(target.shape, bool) if region is None else np.asarray(region)
     return {
         "psnr": psnr(image[inside][:, None], target[inside][:, None]),

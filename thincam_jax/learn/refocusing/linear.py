@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
+from thincam_jax._core.checks import Number
 from thincam_jax.reconstruction.fourier_splitting import squared_modulus
 
 
@@ -30,7 +31,9 @@ class LinearStep(eqx.Module):
     slope: Float[Array, ""]
     noise: Float[Array, "2"]
 
-    def __init__(self, places: int, *, power: float = 0.3, slope=1.0, noise=1.0):
+    def __init__(
+        self, places: int, *, power: float = 0.3, slope: Number = 1.0, noise: Number = 1.0
+    ):
         self.power = jnp.full(places, np.log(power / places))
         self.slope = jnp.asarray(slope)
         self.noise = jnp.log(jnp.asarray([noise, 1e-4]))

@@ -10,13 +10,15 @@ last one says the rest, too: what a lens focused there sees beside what is rende
 the image in which all is sharp, and where each pixel stands.
 """
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Complex, Float, PRNGKeyArray
 
+from thincam_jax._core.checks import Number, Numbers
 from thincam_jax.learn.refocusing.cameras import RefocusCamera, Stand
 from thincam_jax.learn.refocusing.lens_blur import lens_blur
 from thincam_jax.learn.refocusing.linear import LinearStep, Sizes
@@ -145,25 +147,29 @@ class RefocusNetwork(eqx.Module):
         """Another U-Net in a step."""
         return eqx.tree_at(lambda n: n.weights.prior[number], self, prior)
 
-    def focus(self, captures, distance, deviation) -> Float[Array, "*batch y x"]:
+    def focus(
+        self, captures: Numbers, distance: Number, deviation: Numbers
+    ) -> Float[Array, "*batch y x"]:
         """Images as a lens of the camera's pupil, focused on `distance` (mm), would see them."""
         return _batched(_focus, self, captures, deviation, self.camera.within(distance))
 
-    def sweep(self, captures, distances, deviation) -> Float[Array, "distance *batch y x"]:
+    def sweep(
+        self, captures: Numbers, distances: Numbers | Sequence[Number], deviation: Numbers
+    ) -> Float[Array, "distance *batch y x"]:
         """`focus` at each of `distances`."""
         distances = self.camera.within(distances)
         images = _batched(_sweep, self, captures, deviation, distances)
         return jnp.moveaxis(images, -3, 0)
 
-    def all_in_focus(self, captures, deviation) -> Float[Array, "*batch y x"]:
+    def all_in_focus(self, captures: Numbers, deviation: Numbers) -> Float[Array, "*batch y x"]:
         """Images in which everything is sharp, as a pinhole would see the scene."""
         return _batched(_all_in_focus, self, captures, deviation)
 
-    def distance(self, captures, deviation) -> DistanceMap:
+    def distance(self, captures: Numbers, deviation: Numbers) -> DistanceMap:
         """The distance of what each pixel shows."""
         return _batched(_distance, self, captures, deviation)
 
-    def consistency(self, captures, deviation) -> Float[Array, "*batch"]:
+    def consistency(self, captures: Numbers, deviation: Numbers) -> Float[Array, "*batch"]:
         """Residual of the explained capture, root mean square, over the noise's deviation.
 
         About 1: the stack explains all that was seen but noise. Far more: the image is not of this
@@ -192,7 +198,7 @@ def explain(
     return Explained(cleaned, stand, mean, rms / jnp.where(sigma > 0, sigma, 1))
 
 
-def normalised(planes: Planes, capture, deviation):
+def normalised(planes: Planes, capture: Float[Array, "y x"], deviation: Float[Array, ""]):
     """The scene's mean, and capture and noise in units of it after optics."""
     mean = planes.mean(capture)
     # A dark capture has the mean 0 and stays dark.
@@ -200,7 +206,12 @@ def normalised(planes: Planes, capture, deviation):
     return mean, capture * scale, deviation * scale
 
 
-def prepared(network: RefocusNetwork, number: int, stack, given) -> Float[Array, "image y x"]:
+def prepared(
+    network: RefocusNetwork,
+    number: int,
+    stack: Float[Array, "plane m n"] | None,
+    given: tuple[Any, ...],
+) -> Float[Array, "image y x"]:
     """What the U-Net of a step sees, (image, y, x).
 
     The stack that the step before has left, tied to the capture, by the places relative to the
@@ -246,7 +257,9 @@ def read_images(prior: UNet, images: Float[Array, "image y x"], stand: Stand) ->
     )
 
 
-def seen_of(planes: Planes, stack, spectra) -> Float[Array, "y x"]:
+def seen_of(
+    planes: Planes, stack: Float[Array, "plane m n"], spectra: Complex[Array, "plane v u"]
+) -> Float[Array, "y x"]:
     """The capture of a stack."""
     return planes.seen(jnp.sum(planes.from_field(stack) * spectra, axis=0))
 
@@ -261,13 +274,13 @@ def noise_level(deviation: Float[Array, ""]) -> Float[Array, ""]:
     return jnp.log10(deviation**2 + 1e-8) / 2
 
 
-def constant_images(like, *values) -> Float[Array, "value y x"]:
+def constant_images(like: Float[Array, "..."], *values: Number) -> Float[Array, "value y x"]:
     """Constant images."""
     shape = like.shape[-2:]
     return jnp.stack([jnp.broadcast_to(jnp.asarray(v, like.dtype), shape) for v in values])
 
 
-def flattened(network: RefocusNetwork, captures, deviation):
+def flattened(network: RefocusNetwork, captures: Numbers, deviation: Numbers):
     """Captures (element, y, x), the deviation of each, and the batch axes that they had."""
     captures = jnp.asarray(captures, network.planes.dtype)
     sensor = network.camera.camera.sensor.shape

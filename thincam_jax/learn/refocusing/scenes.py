@@ -21,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 
+from thincam_jax._core.checks import Number
 from thincam_jax.learn.refocusing.cameras import RefocusCamera
 from thincam_jax.learn.refocusing.layouts import (
     COVER_NUMBERS,
@@ -108,7 +109,7 @@ class Scene(eqx.Module):
             emitted.append(self.share[layer] * seen)
         return jnp.stack(emitted)
 
-    def focused(self, camera: RefocusCamera, inverse) -> Float[Array, "y x"]:
+    def focused(self, camera: RefocusCamera, inverse: Number) -> Float[Array, "y x"]:
         """What a lens of the camera's pupil sees, focused on 1/t = `inverse`, 1/mm."""
         radius = camera.defocus_radius(self.inverse - inverse)
         covered = self.share * self.cover[:, None]
@@ -143,7 +144,7 @@ class Batch(NamedTuple):
         """Distance of what each pixel shows, mm."""
         return 1 / self.inverse
 
-    def target(self, camera: RefocusCamera, distance) -> Float[Array, "element y x"]:
+    def target(self, camera: RefocusCamera, distance: Number) -> Float[Array, "element y x"]:
         """The scenes as a lens focused on one distance, mm, sees them."""
         return jax.vmap(lambda scene: scene.focused(camera, 1 / distance))(self.scene)
 
@@ -227,7 +228,11 @@ def _draw_one(key, images, camera: RefocusCamera, options: SceneOptions) -> Batc
     )
 
 
-def captured(camera: RefocusCamera, emission, inverse) -> Float[Array, "y x"]:
+def captured(
+    camera: RefocusCamera,
+    emission: Float[Array, "layer part m n"],
+    inverse: Float[Array, "layer part"],
+) -> Float[Array, "y x"]:
     """The noise-free capture of the light of parts (layer, part, y, x) at 1/t (layer, part)."""
     operator = camera.operator(1 / inverse.reshape(-1))
     return operator(emission.reshape(-1, *camera.field_shape))

@@ -1,5 +1,7 @@
 """A small U-Net of plain 3×3 convolutions."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -79,7 +81,7 @@ class UNet(eqx.Module):
         return _channels_to_blocks(self.leave(jax.nn.relu(x)))[:, :rows, :columns]
 
 
-def parameter_count(tree) -> int:
+def parameter_count(tree: Any) -> int:
     """Numbers that are learnt."""
     return sum(x.size for x in jax.tree.leaves(eqx.filter(tree, eqx.is_inexact_array)))
 

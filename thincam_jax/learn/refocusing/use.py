@@ -1,6 +1,7 @@
 """A trained network as a solver: `tc.reconstruct(recording, tc.Learned(network))`."""
 
 import time
+from collections.abc import Sequence
 from typing import ClassVar, Literal, NamedTuple
 
 import equinox as eqx
@@ -10,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
+from thincam_jax._core.checks import Number, Numbers
 from thincam_jax.learn.refocusing.network import (
     RefocusNetwork,
     distance_map,
@@ -41,14 +43,20 @@ class Reading(NamedTuple):
     consistency: Float[Array, "*batch"]
 
 
-def read(network: RefocusNetwork, captures, distances, deviation) -> Reading:
+def read(
+    network: RefocusNetwork,
+    captures: Numbers,
+    distances: Numbers | Sequence[Number],
+    deviation: Numbers,
+) -> Reading:
     """Images focused on each of `distances`, mm, and everything else, for captures (*batch, y, x).
 
     `distances`: (distance,), or (*batch, distance) with their own for each capture.
     """
     captures, deviation, batch = flattened(network, captures, deviation)
-    count = np.shape(distances)[-1]
-    each = jnp.broadcast_to(network.camera.within(distances), (*batch, count))
+    each = network.camera.within(distances)
+    count = each.shape[-1]
+    each = jnp.broadcast_to(each, (*batch, count))
     found = _read(network, captures, deviation, each.reshape(-1, count))
     return jax.tree.map(lambda a: a.reshape(*batch, *a.shape[1:]), found)
 

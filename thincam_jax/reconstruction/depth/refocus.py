@@ -1,12 +1,13 @@
 """Reconstructions of one set of captures over a list of object distances."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from thincam_jax._core.checks import Numbers
 from thincam_jax.reconstruction.methods import choose_solver, reconstruct
 from thincam_jax.reconstruction.noise import estimate_variance
 from thincam_jax.reconstruction.poisson import PoissonTV
@@ -43,7 +44,7 @@ class RefocusSweep(eqx.Module):
 
 def refocus_sweep(
     recording: Recording,
-    distances,
+    distances: Numbers | Sequence[float | int],
     solver: AbstractSolver | None = None,
     *,
     callback: Callable[[int], object] | None = None,
@@ -119,7 +120,7 @@ def _focused(recording: Recording, distances: list[float]) -> list[Recording]:
     ]
 
 
-def increasing(distances) -> list[float]:
+def increasing(distances: Numbers | Sequence[float | int]) -> list[float]:
     """The distances of a sweep, mm, checked: ValueError as of `refocus_sweep`."""
     values = np.asarray(distances, dtype=float)
     if values.ndim != 1 or values.size < _LEAST:

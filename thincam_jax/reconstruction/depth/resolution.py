@@ -4,11 +4,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
+from thincam_jax._core.checks import Number, Numbers
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.masks.fza import FresnelZoneAperture
 
 
-def axial_resolution(camera: LenslessCamera, object_distance) -> Float[Array, "*distance"]:
+def axial_resolution(camera: LenslessCamera, object_distance: Numbers) -> Float[Array, "*distance"]:
     r"""Change of object distance, mm, that takes an object out of focus.
 
     .. math:: \Delta t = \frac{\pi\, t\,(t+d)}{\beta\, d\, R^2}
@@ -45,7 +46,7 @@ def axial_resolution(camera: LenslessCamera, object_distance) -> Float[Array, "*
     return jnp.pi * t * (t + d) / (mask.beta * d * squared)
 
 
-def refocus_distances(nearest, farthest, count: int) -> Float[Array, " count"]:
+def refocus_distances(nearest: Number, farthest: Number, count: int) -> Float[Array, " count"]:
     """`count` distances from `nearest` to `farthest`, mm, evenly spaced in 1/t.
 
     Defocus is linear in 1/t, so that every step changes the sharpness alike.
