@@ -54,7 +54,7 @@ untrained = learn.RefocusNetwork.create(camera, options, key=jax.random.key(0))
 # ## Training
 #
 # Scenes are drawn: leaves of all sizes that hide each other, in layers at random distances, with
-# noise of 20 to 45 dB. A step that is no number is skipped; the folder holds all that a training
+# noise of 20 to 45 dB. A step that gives NaN is skipped; the folder holds all that a training
 # which was killed goes on from.
 
 # %%

@@ -116,5 +116,5 @@ def relative_l2(value: Any, reference: Any) -> float:
         raise ValueError(f"value has shape {value.shape}, reference has {reference.shape}")
     scale = np.linalg.norm(reference.ravel())
     if not scale > 0.0:
-        raise ValueError("a reference that is zero or not a number has no relative error")
+        raise ValueError("a reference that is zero or NaN has no relative error")
     return float(np.linalg.norm((value - reference).ravel()) / scale)

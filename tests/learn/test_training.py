@@ -1,4 +1,4 @@
-"""Training in general: it learns, survives what is no number, and goes on to the same bits."""
+"""Training in general: it learns, survives NaN, and goes on to the same bits."""
 
 import dataclasses
 import os
@@ -90,7 +90,7 @@ def test_states_go_through_files_and_go_on_to_the_same_bits(tmp_path):
 
 
 def with_faults(of_step):
-    """Examples that are no numbers at some steps, by how often these were tried."""
+    """Examples that are NaN at some steps, by how often these were tried."""
     tried: dict[int, int] = {}
     keys = {}
     for step in range(OPTIONS.steps):

@@ -1,4 +1,4 @@
-"""The start without the even light: exact on the pixels that are kept, and worth its iterations."""
+"""The start without uniform light: exact on the pixels that are kept, and worth its iterations."""
 
 import math
 
@@ -41,7 +41,7 @@ def kernels(channels=1, planes=1, phase=0.0):
 
 
 def fringes(channels=1, planes=1):
-    """The same without even light."""
+    """The same without uniform light."""
     return kernels(channels, planes) - kernels(channels, planes, phase=math.pi)
 
 

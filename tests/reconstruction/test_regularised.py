@@ -69,7 +69,7 @@ def test_a_warm_start_is_given_upright_and_converges_sooner():
 
 
 def test_endings():
-    """Stopped by a callback, interrupted, not a number: the best image until then."""
+    """Stopped by a callback, interrupted, NaN: the best image until then."""
     seen = noisy(1)[:, :40, :41]
     psf = tc.Psfs(jnp.asarray(rig.picture((9, 10)))[None])
     stopped = variation(seen, psf, callback=lambda p: p.iteration >= 20)

@@ -23,8 +23,8 @@ def adam(
 ):
     """The parameters after so many steps, what was kept of each, and how many changed nothing.
 
-    To be called inside jit. The rate falls to zero as a cosine; a step whose loss or slope is no
-    number is skipped. `most`: the largest norm of a slope, to which longer ones are shortened.
+    To be called inside jit. The rate falls to zero as a cosine; a step whose loss or slope is NaN
+    or infinite is skipped. `most`: the largest norm of a slope, to which longer ones are shortened.
     """
     method = adam_method(most)
     place = jnp.linspace(0.0, 1.0, steps, dtype=rate.dtype)
@@ -60,7 +60,7 @@ def adam_step(
 ) -> tuple[Any, Any, Bool[Array, ""], tuple[Any, Any]]:
     """Parameters and state after a step, whether it was one, and what `loss` gave before it.
 
-    Where the loss or its slope is no number, nothing changes.
+    Where the loss or its slope is NaN or infinite, nothing changes.
     """
     (value, kept), slope = jax.value_and_grad(loss, has_aux=True)(parameters)
     finite = [jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves((value, slope))]

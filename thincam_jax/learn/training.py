@@ -28,7 +28,7 @@ from thincam_jax.learn.checkpoint import (
     write_arrays,
 )
 
-# Steps in a row that are no numbers, after which training goes back; and how often it does.
+# Steps in a row that give NaN, after which training goes back; and how often it does.
 _IN_A_ROW, _MOST_RETREATS = 3, 4
 # Steps whose times tell what is left.
 _RECENT = 20
@@ -139,8 +139,8 @@ class TrainingProgress(NamedTuple):
 class Trained(NamedTuple):
     """The model with the best weights, and the state at the end.
 
-    - `status`: "finished", "stopped" by the callback, or "diverged": again and again no numbers
-      came out, at half the rate, too. The best weights until then are kept in each case.
+    - `status`: "finished", "stopped" by the callback, or "diverged": NaN again and again, at
+      half the rate, too. The best weights until then are kept in each case.
     """
 
     model: Any
@@ -166,7 +166,7 @@ def train_model(
     - `keep`: called with every state that is worth to be kept, at each check.
     - `callback`: called after every step; a true answer stops.
 
-    A step that is no number is skipped. After three in a row training goes back to the last state
+    A step that gives NaN is skipped. After three in a row training goes back to the last state
     that was kept, at half the rate and with other examples; after four such retreats it ends.
     """
     fixed = eqx.filter(model, task.learned, inverse=True)

@@ -70,7 +70,7 @@ def all_ways(operator, images, captures):
 
 @KINDS
 def test_shapes_batches_and_vmap(name):
-    """A batch is what its members are one by one, and what the matrix makes of them."""
+    """A batch is what its elements are one by one, and what the matrix makes of them."""
     operator, matrix = operators()[name], dense_of(name)
     image, capture = white(operator, (2, 3))
     seen, back, each = all_ways(operator, image, capture)

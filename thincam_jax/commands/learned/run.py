@@ -159,7 +159,7 @@ def render(
     """The page, with its pictures inside."""
     warnings = []
     if result["status"] == "diverged":
-        warnings.append("training met no numbers again and again; this is its best until then")
+        warnings.append("training met NaN again and again; this is its best until then")
     shown = {
         "command": "train",
         "environment": environment,
