@@ -1,5 +1,6 @@
 """`thincam init`: every shipped experiment file can be had, and nothing is overwritten."""
 
+import re
 import tomllib
 from functools import partial
 from pathlib import Path
@@ -42,6 +43,13 @@ def test_every_shipped_file_is_one(tmp_path):
     written = {path.read_text("utf-8") for path in tmp_path.iterdir()}
     assert len(examples.kinds()) == len(FILES)
     assert written == {path.read_text("utf-8") for path in FILES}
+
+
+def test_the_page_of_commands_lists_them():
+    page = (ROOT / "docs/commands.md").read_text("utf-8")
+    table = page.split("| kind | experiment |")[1].split("\n\n")[0]
+    cells = [line.split("|")[1] for line in table.splitlines() if line.startswith("| `")]
+    assert sorted(re.findall(r"`(\w+)`", " ".join(cells))) == sorted(examples.kinds())
 
 
 def test_nothing_is_overwritten(tmp_path):

@@ -15,7 +15,7 @@ def run(
     ] = None,
     set_: Overrides = None,
 ) -> None:
-    """Simulate a study and reconstruct it; or reconstruct a store of 'thincam capture'.
+    """Simulate an experiment and reconstruct it; or reconstruct a store of 'thincam capture'.
 
     Writes images, metrics.json, figures and report.html. Ctrl-C keeps what is finished; the same
     command goes on from there.
