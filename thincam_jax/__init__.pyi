@@ -63,6 +63,7 @@ from .reconstruction import TotalVariation as TotalVariation
 from .reconstruction import Wiener as Wiener
 from .reconstruction import check_psf as check_psf
 from .reconstruction import choose_solver as choose_solver
+from .reconstruction import implicit_proximal_gradient as implicit_proximal_gradient
 from .reconstruction import reconstruct as reconstruct
 from .reconstruction import solve_fixed_point as solve_fixed_point
 

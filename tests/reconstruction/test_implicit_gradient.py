@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from reconstruction import scenes
 
+import thincam_jax as tc
 from helpers import finite_difference, relative_l2
 from thincam_jax.reconstruction.fista import solve_fista
-from thincam_jax.reconstruction.implicit_gradient import implicit_proximal_gradient
 from thincam_jax.reconstruction.regularisers import Cosines, Sparsity
 
 
@@ -20,7 +20,7 @@ def zeros(problem):
 def test_it_finds_what_fista_finds():
     problem, _ = scenes.problem(kernel=scenes.spots, tau=3e-3)
     own = solve_fista(problem, iterations=60, tolerance=0.0, inner=30)
-    image = implicit_proximal_gradient(problem, zeros(problem), iterations=60, inner=200)
+    image = tc.implicit_proximal_gradient(problem, zeros(problem), iterations=60, inner=200)
     assert relative_l2(image, own.image) < 1e-2
 
 
@@ -40,7 +40,7 @@ def sparse(tau):
 def test_with_a_proximal_map_in_closed_form_it_is_the_minimum_of_fista():
     problem, _ = sparse(0.05)
     own = solve_fista(problem, iterations=800, tolerance=1e-10)
-    image = implicit_proximal_gradient(problem, zeros(problem), iterations=2000, tolerance=1e-12)
+    image = tc.implicit_proximal_gradient(problem, zeros(problem), iterations=2000, tolerance=1e-12)
     assert relative_l2(image, own.image) < 1e-6
 
 
@@ -50,7 +50,7 @@ def test_the_implicit_derivative_is_that_of_differences():
     @jax.jit
     def error(tau):
         own = scenes.absolute(problem, tau)
-        image = implicit_proximal_gradient(own, zeros(problem), iterations=2000, tolerance=1e-12)
+        image = tc.implicit_proximal_gradient(own, zeros(problem), iterations=2000, tolerance=1e-12)
         return jnp.sum((image - truth) ** 2)
 
     tau = jnp.asarray(0.05)
@@ -62,13 +62,14 @@ def test_the_implicit_derivative_is_that_of_differences():
 @pytest.mark.parametrize("factor", [1e-8, 1e8])
 def test_it_scales_with_the_captures_in_float32(factor):
     problem = scenes.single(scenes.problem()[0])
-    plain = implicit_proximal_gradient(problem, zeros(problem), iterations=10)
-    other = implicit_proximal_gradient(
+    plain = tc.implicit_proximal_gradient(problem, zeros(problem), iterations=10)
+    other = tc.implicit_proximal_gradient(
         scenes.rescaled(problem, factor), zeros(problem), iterations=10
     )
     assert other.dtype == jnp.float32
     assert relative_l2(np.asarray(other) / factor, plain) < 2e-3
     dark = scenes.rescaled(problem, 0.0)
     assert (
-        float(jnp.abs(implicit_proximal_gradient(dark, zeros(problem), iterations=10)).max()) == 0
+        float(jnp.abs(tc.implicit_proximal_gradient(dark, zeros(problem), iterations=10)).max())
+        == 0
     )

@@ -1,4 +1,4 @@
-"""Bounded quasi-Newton by jaxopt; the only file of this package that imports it."""
+"""Bounded quasi-Newton by jaxopt."""
 
 from collections.abc import Callable
 from typing import Any

@@ -1,10 +1,9 @@
-"""Proximal gradients by jaxopt, differentiated implicitly; no other file here imports jaxopt."""
+"""Proximal gradients by jaxopt, differentiated implicitly."""
 
 import functools
 
 import jax
 import jax.numpy as jnp
-import jaxopt
 from jaxtyping import Array, Float
 
 from thincam_jax.reconstruction.problem import InverseProblem, total_misfit
@@ -32,6 +31,8 @@ def implicit_proximal_gradient(
     - `image`: to start from.
     - `tolerance`: length of the last step, in units in which captures are about 1.
     """
+    import jaxopt  # slow to import, and nothing else of this room needs it
+
     scaled = ScaledProblem(problem)
     solver = jaxopt.ProximalGradient(
         fun=total_misfit,
