@@ -1,18 +1,15 @@
-"""Weights of the regularisation found from the captures: discrepancy principle, SURE, learning."""
+"""Weights of the regularisation found from the captures: discrepancy principle and SURE."""
 
 import math
-from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import optax
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from thincam_jax.reconstruction.admm import AdmmMethod
 from thincam_jax.reconstruction.drive import drive
-from thincam_jax.reconstruction.fixed_point import solve_fixed_point
 from thincam_jax.reconstruction.noise import local_noise
 from thincam_jax.reconstruction.problem import InverseProblem, misfit, residuals, see, with_tau
 
@@ -144,54 +141,6 @@ def sure_tau(
     )
     best = with_tau(problem, math.exp(found.x))
     return ChosenTau(best, _solve(best, image, iterations), tuple(tried))
-
-
-def learn_tau(
-    problems: Sequence[InverseProblem],
-    images: Sequence[Float[Array, "*batch channel plane y x"]],
-    *,
-    steps: int = 30,
-    learning_rate: float = 0.2,
-    iterations: int = 300,
-    loss: Callable | None = None,
-) -> tuple[Float[Array, ""], tuple[float, ...]]:
-    r"""One factor on all problems' τ that makes reconstructions of known images best.
-
-    Bilevel: the outer loss (default: the mean squared error) is minimised over log τ by Adam
-    (optax), its gradient taken through the minimiser by implicit differentiation
-    (`solve_fixed_point`). Returns the factor and the loss at every step.
-    """
-    measure = loss or mean_squared_error
-    optimiser = optax.adam(learning_rate)
-    logarithm = jnp.zeros((), problems[0].captures[0].dtype)
-    state, course = optimiser.init(logarithm), []
-    for _ in range(steps):
-        value, slope = jnp.zeros_like(logarithm), jnp.zeros_like(logarithm)
-        for problem, truth in zip(problems, images, strict=True):
-            one, its_slope = _loss_and_slope(logarithm, problem, truth, measure, iterations)
-            value, slope = value + one, slope + its_slope
-        course.append(float(value) / len(problems))
-        # Adam counts its steps in whole numbers.
-        with jax.numpy_dtype_promotion("standard"):
-            updates, state = optimiser.update(slope, state)
-        logarithm = jnp.asarray(optax.apply_updates(logarithm, updates))
-    return jnp.exp(logarithm), tuple(course)
-
-
-def mean_squared_error(image: Float[Array, "..."], truth: Float[Array, "..."]) -> Float[Array, ""]:
-    return jnp.mean((image - truth) ** 2)
-
-
-@eqx.filter_jit
-def _loss_and_slope(logarithm, problem, truth, measure, iterations: int):
-    return jax.value_and_grad(_outer)(logarithm, problem, truth, measure, iterations)
-
-
-def _outer(logarithm, problem, truth, measure, iterations: int):
-    scaled = with_tau(problem, problem.tau * jnp.exp(logarithm))
-    first = jnp.zeros(problem.image_shape, truth.dtype)
-    solution = solve_fixed_point(scaled, first, iterations=iterations, relaxation=1.5)
-    return measure(solution.image, truth)
 
 
 def _known_tau(problem: InverseProblem) -> float:
