@@ -179,6 +179,8 @@ variance = float(scenes.deviation[0] ** 2)
 recording = tc.Recording([scenes.capture], cameras, noise_variance=variance)
 result = tc.reconstruct(recording, tc.Learned(network))  # (capture, distance, y, x)
 print(result.status, "residual over noise:", result.consistency, result.reason)
+# The depths of focus above, mm, of the full mask.
+assert [round(np.pi * t * (t + 7.5) / (13.0 * 7.5 * 2.8**2)) for t in (60, 120)] == [17, 63]
 assert np.allclose(result.image[0], images[0], rtol=1e-3, atol=1e-3 * white)
 try:
     tc.reconstruct(recording.focused(30.0), tc.Learned(network))

@@ -156,7 +156,7 @@ figure.savefig(FIGURES / "images.png", dpi=110)
 # ## What this says
 #
 # Few rays meet a pixel, so nearly all of a measured matrix is noise. What is above the noise, or
-# the model that was fitted to it, is read a thousand times faster and reconstructs as well.
+# the model that was fitted to it, is read far faster (above) and reconstructs as well.
 
 # %%
 for name in ("half precision", "threshold", "ray model"):

@@ -1,5 +1,6 @@
 """The scripts of experiments/ at their reduced size: their own assertions, and their figures."""
 
+import re
 import runpy
 
 import jax
@@ -14,6 +15,13 @@ SCRIPTS = sorted((ROOT / "experiments").glob("*.py"))
 
 def test_the_scripts_are_there():
     assert {"first_image", "superresolution", "speed_for_accuracy"} <= {s.stem for s in SCRIPTS}
+
+
+def test_the_gallery_lists_them_all():
+    page = (ROOT / "docs/gallery.md").read_text("utf-8")
+    assert sorted(re.findall(r"^\| `(\w+)\.py` \|", page, re.MULTILINE)) == [
+        s.stem for s in SCRIPTS
+    ]
 
 
 def marked(script):
