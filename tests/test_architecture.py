@@ -216,6 +216,38 @@ def missing_docstrings(modules: list[Module]) -> list[str]:
     ]
 
 
+def missing_annotations(modules: list[Module]) -> list[str]:
+    """But of what optimistix names and annotates: the methods of its solvers, except `__init__`."""
+    return [
+        f"{module.path}:{function.lineno}: {function.name}: annotate {', '.join(bare)}"
+        for module in modules
+        for function, bare in bare_parameters(module.tree)
+        if bare
+    ]
+
+
+def bare_parameters(
+    scope: ast.Module | ast.ClassDef,
+) -> Iterator[tuple[ast.FunctionDef, list[str]]]:
+    """The public functions and methods, and their parameters that say not what they take."""
+    of_solver = any(
+        ast.unparse(base).startswith("optimistix.") for base in getattr(scope, "bases", ())
+    )
+    for node in scope.body:
+        dunder = getattr(node, "name", "").startswith("__")
+        if not dunder and getattr(node, "name", "_").startswith("_"):
+            continue
+        if isinstance(node, ast.ClassDef):
+            yield from bare_parameters(node)
+        elif isinstance(node, ast.FunctionDef) and (dunder or not of_solver):
+            given = node.args
+            every = [*given.posonlyargs, *given.args, given.vararg, *given.kwonlyargs, given.kwarg]
+            static = any(ast.unparse(d) == "staticmethod" for d in node.decorator_list)
+            own = isinstance(scope, ast.ClassDef) and not static  # `self`, `cls`
+            bare = [a.arg for a in every[own:] if a is not None and a.annotation is None]
+            yield node, bare
+
+
 RULES = (
     unknown_rooms,
     crowded_roots,
@@ -227,6 +259,7 @@ RULES = (
     star_imports,
     long_modules,
     missing_docstrings,
+    missing_annotations,
 )
 
 
@@ -285,6 +318,24 @@ BROKEN = [
     (long_modules, "lensless/psf.py", DOC + "x = 1\n" * MAX_LINES, "501 lines, 500 allowed"),
     (missing_docstrings, "lensless/psf.py", "x = 1", "begins with a docstring"),
     (missing_docstrings, "lensless/masks/__init__.py", "", "begins with a docstring"),
+    (
+        missing_annotations,
+        "lensless/psf.py",
+        "def f(x: int, *y, z=1): ...",
+        "psf.py:1: f: annotate y, z",
+    ),
+    (
+        missing_annotations,
+        "lensless/psf.py",
+        "class A:\n    def __call__(self, x): ...",
+        "annotate x",
+    ),
+    (
+        missing_annotations,
+        "lensless/psf.py",
+        "class A:\n    @staticmethod\n    def f(x): ...",
+        "f: ",
+    ),
 ]
 
 SOUND = [
@@ -294,6 +345,8 @@ SOUND = [
     ("lensless/masks/_pattern.py", "x = 1"),
     ("lensless/masks/__init__.py", DOC + "from .fza import Plate as Plate"),
     ("lensless/masks/fza.py", DOC + "from ..._core import grids\nfrom . import _pattern"),
+    ("design/adam.py", DOC + "class A(optimistix.B):\n    def step(self, x): ..."),
+    ("design/space.py", DOC + "class A:\n    def f(self, x: int):\n        def g(y): ..."),
     ("lensless/psf.py", DOC + "import rich_text, jaxoptics\n" + "x = 1\n" * (MAX_LINES - 2)),
     ("reconstruction/implicit_gradient.py", DOC + "import jaxopt"),
     ("commands/figures.py", DOC + "import matplotlib.pyplot, jinja2\nfrom ..learn import x"),
