@@ -74,6 +74,29 @@ def count_traces(function: Callable) -> Callable:
     return counted
 
 
+def compilations(run: Callable[[], Any]) -> int:
+    """How many programs JAX compiles, or loads, while `run` runs."""
+    heard = _heard()
+    before = len(heard)
+    run()
+    return len(heard) - before
+
+
+@functools.cache
+def _heard() -> list[str]:
+    """One entry for each program from the first call on, of the whole process."""
+    heard: list[str] = []
+
+    def listen(event: str, seconds: float, **_):
+        if "backend_compile" in event:
+            heard.append(event)
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    jax.jit(lambda x: jnp.sin(x) * 1.2345)(jnp.arange(3.0))
+    assert heard  # it hears
+    return heard
+
+
 def finite_difference(function: Callable, x: Any, direction: Any, step: float) -> Any:
     """The derivative of `function` at `x` along `direction`, by differences of fourth order.
 

@@ -66,7 +66,7 @@ class Counts(eqx.Module):
     problem: InverseProblem
     background: tuple[Float[Array, "..."], ...]
     unit: Float[Array, "*batch 1 1 1 1"]
-    smoothing: Float[Array, ""]
+    smoothing: Number
     floor: Float[Array, ""]
     link: Link = eqx.field(static=True)
 
@@ -274,7 +274,7 @@ def half_deviance(counts: Float[Array, "..."], mean: Float[Array, "..."]) -> Flo
 def smooth_variation(
     variation: TotalVariation,
     image: Float[Array, "*batch channel plane y x"],
-    smoothing: Float[Array, ""],
+    smoothing: Number,
 ) -> Float[Array, "*batch"]:
     r"""The Moreau envelope of TV's norm: min over u of φ(u) + ‖u − Ψf‖²/(2ε).
 
