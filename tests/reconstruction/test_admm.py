@@ -382,6 +382,18 @@ def test_no_light_converges_at_once_and_nan_has_a_status():
     assert outcome.status == "non_finite"
 
 
+def test_ten_iterations_in_one_program_are_five_times_two(monkeypatch):
+    """Users run programs of ten, these tests of two, which compile sooner."""
+    problem, _ = scenes.problem((9, 8), (6, 7), kernel=scenes.spots, captures=1)
+    method, images = AdmmMethod(problem), []
+    for size in (drive.UNROLLED, drive.CHUNK):
+        monkeypatch.setattr(drive, "UNROLLED", size)
+        state = method.start(jnp.zeros(problem.image_shape))
+        images.append(method.image(method.advance(state, drive.CHUNK)))
+    assert drive._advance_donated._cached._cache_size() > 1
+    np.testing.assert_allclose(*images, rtol=1e-10)
+
+
 @pytest.mark.thorough
 def test_single_precision_and_no_new_compilation():
     """New captures, τ, relaxation and penalties of old shapes; all residuals are finite."""
