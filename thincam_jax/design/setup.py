@@ -21,7 +21,7 @@ class SignalNoise(Module):
     def __init__(self, snr_db: Number = 30.0):
         self.snr_db = checks.finite("snr_db", snr_db, "dB")
 
-    def variance(self, light: Float[Array, "..."], signal: Float[Array, "..."], exposure: Numbers):
+    def variance(self, light: Numbers, signal: Numbers, exposure: Numbers):
         """Of a pixel, mm⁴: from the capture's mean (mm²), its variance, the share of exposure."""
         return signal * 10 ** (-self.snr_db / 10)
 
@@ -41,7 +41,7 @@ class PhotonNoise(Module):
         self.electrons = checks.positive("electrons", electrons, "electrons")
         self.read_noise = checks.non_negative("read_noise", read_noise, "electrons")
 
-    def variance(self, light: Float[Array, "..."], signal: Float[Array, "..."], exposure: Numbers):
+    def variance(self, light: Numbers, signal: Numbers, exposure: Numbers):
         """Of a pixel, mm⁴: from the capture's mean (mm²), its variance, the share of exposure."""
         counted = self.electrons * exposure
         return light / counted + (self.read_noise / counted) ** 2

@@ -187,7 +187,7 @@ def straight_on(
 
 
 def on_object(
-    camera: SeeThroughCamera, slope: Float[Array, "*ray 2"], sideways: Float[Array, "*ray"]
+    camera: SeeThroughCamera, slope: Float[Array, "*#ray 2"], sideways: Float[Array, "*#ray 2"]
 ) -> Float[Array, "*ray 2"]:
     """What a way along the plate, (x, y) mm, moves a ray of that slope on the object."""
     axes = camera.plate_axes

@@ -137,7 +137,7 @@ class RefocusCamera(eqx.Module):
         position = 2 * (commanded - 1 / self.middle) / (1 / self.near - 1 / self.far)
         return Stand(inverse, number, place, position)
 
-    def defocus_radius(self, inverse_difference: Float[Array, "..."]) -> Float[Array, "..."]:
+    def defocus_radius(self, inverse_difference: Numbers) -> Float[Array, "..."]:
         """Radius, in pixels of the image, of the disc that a lens blurs a point to.
 
         A lens with the pupil D, focused on t′, blurs a point at t over the angle D|1/t − 1/t′|,
