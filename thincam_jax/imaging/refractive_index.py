@@ -20,7 +20,7 @@ class AbstractIndex(Module):
     band: eqx.AbstractVar[tuple[float, float]]
 
     @abc.abstractmethod
-    def __call__(self, wavelength: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    def __call__(self, wavelength: Numbers) -> Float[Array, "..."]:
         """n at wavelengths in mm."""
 
 
@@ -34,7 +34,7 @@ class ConstantIndex(AbstractIndex):
         self.value = checks.positive("index", value, "(no unit)")
         self.band = (0.0, float("inf"))
 
-    def __call__(self, wavelength: Float[Array, "*shape"]):
+    def __call__(self, wavelength: Numbers):
         return jnp.broadcast_to(self.value, jnp.shape(wavelength))
 
 
@@ -55,7 +55,7 @@ class CauchyIndex(AbstractIndex):
         self.dispersion = checks.non_negative("dispersion", dispersion, "mm²")
         self.band = band
 
-    def __call__(self, wavelength: Float[Array, "*shape"]):
+    def __call__(self, wavelength: Numbers):
         return self.offset + self.dispersion / wavelength**2
 
 
@@ -74,7 +74,7 @@ class SellmeierIndex(AbstractIndex):
         self.resonances = checks.finite("resonances", resonances, "mm²", shape=(3,))
         self.band = band
 
-    def __call__(self, wavelength: Float[Array, "*shape"]):
+    def __call__(self, wavelength: Numbers):
         squared = jnp.asarray(wavelength)[..., None] ** 2
         terms = self.strengths * squared / (squared - self.resonances)
         return jnp.sqrt(1 + jnp.sum(terms, axis=-1))
@@ -106,7 +106,7 @@ class ChangedIndex(AbstractIndex):
     change: Float[Array, ""]
     band: tuple[float, float] = eqx.field(static=True)
 
-    def __call__(self, wavelength: Float[Array, "*shape"]):
+    def __call__(self, wavelength: Numbers):
         return self.before(wavelength) + self.change
 
 
