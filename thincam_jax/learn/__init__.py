@@ -15,5 +15,6 @@ from thincam_jax.learn.suggestions import load_suggester as load_suggester
 from thincam_jax.learn.suggestions import propose as propose
 from thincam_jax.learn.suggestions import save_suggester as save_suggester
 from thincam_jax.learn.suggestions import suggest as suggest
+from thincam_jax.learn.tau import learn_tau as learn_tau
 from thincam_jax.learn.training import TrainingOptions as TrainingOptions
 from thincam_jax.learn.unrolled import UnrolledAdmm as UnrolledAdmm
