@@ -22,7 +22,7 @@ test test-all: export PYTHONDONTWRITEBYTECODE =
 test: .venv/.installed-test ## Run the tests, e.g. make test ARGS="tests/test_units.py -k angle".
 	@$(BIN)/python -m pytest -n 2 --dist loadfile $(ARGS)
 
-test-all: .venv/.installed-test ## Run all tests, the thorough ones too (the better part of an hour).
+test-all: .venv/.installed-test ## Run all tests, the thorough ones too (some 45 minutes).
 	@$(BIN)/python -m pytest -n 2 --dist loadfile -m "thorough or not thorough" $(ARGS)
 
 lint: .venv/.installed-dev ## Check the style, the formatting and the types.

@@ -94,6 +94,8 @@ def test_recovery(benchmark, store, tmp_path, capsys):
         print(f"\n{CELLS} cells, {SHAPE} pixels: {seconds:.1f} s, {memory:.2f} GiB at the peak")
         print(f"error {error:.3f} counts, 2σ/√N = {2 * NOISE / 64:.3f}")
         print(f"440 pixels: {quick * 1e3:.0f} ms; butterflies {slow / quick:.1f} times as long")
+    assert seconds < 60 and memory < 6 and slow > 3 * quick
+    assert error < 1.2 * 2 * NOISE / 64
 
 
 def butterflies(values):

@@ -55,6 +55,7 @@ def test_fifty_iterations_against_scipy(capsys):
         for progress, other in zip(found.history[1:], course, strict=True):
             print(f"  {progress.iteration:9d} {progress.objective:11.6g} {other:11.6g}")
     assert found.history[-1].objective < 1.01 * course[-1]
+    assert theirs > 5 * ours
 
 
 def timed(function):
