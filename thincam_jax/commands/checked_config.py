@@ -77,8 +77,12 @@ def _place(location: tuple, places: dict, asked: dict, top: str) -> str:
 
 
 def _own(errors: list[Any]) -> list[Any]:
-    """Without the lists that pydantic calls too short because it dropped a faulty entry."""
-    return [
+    """Without the lists that pydantic calls too short because it dropped a faulty entry.
+
+    Of a file of another kind only that: its other keys are right for what it is.
+    """
+    other = [error for error in errors if error["loc"] == ("kind",)]
+    return other or [
         error
         for error in errors
         if error["type"] != "too_short"

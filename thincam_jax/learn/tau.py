@@ -37,7 +37,7 @@ def learn_tau(
     checks.at_least_one({"steps": steps, "iterations": iterations})
     logarithm = jnp.zeros((), images[0].dtype)
     state, course = adam_method().init(logarithm), []
-    step_size = checks.positive("rate", rate, "")
+    step_size = checks.positive("rate", rate, "a ratio")
     for _ in range(steps):
         logarithm, state, error = _stepped(
             logarithm, state, step_size, tuple(problems), tuple(images), iterations

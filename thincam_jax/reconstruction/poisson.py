@@ -143,7 +143,7 @@ class PoissonTV(AbstractIterativeSolver):
             raise ValueError(
                 f"tau = {tau!r} is found for Gaussian noise only; give a number, about 1 to 3"
             )
-        self.tau = checks.non_negative("tau", tau, "times the noise")
+        self.tau = checks.non_negative("tau", tau, "a ratio")
         self.variation = of_kind("variation", variation, TotalVariation)
         self.background = background
         check_limits(iterations, tolerance)

@@ -91,7 +91,7 @@ class InverseProblem(eqx.Module):
         )
         _check_operators(self.operators, self.captures)
         dtype = self.captures[0].dtype
-        self.tau = checks.non_negative("tau", tau, "times the noise").astype(dtype)
+        self.tau = checks.non_negative("tau", tau, "a ratio").astype(dtype)
         self.tau_unit = noise_in_the_image(self.operators, self.weights).astype(dtype)
         self.regulariser = TotalVariation() if regulariser is None else regulariser
         self.nonnegative = nonnegative

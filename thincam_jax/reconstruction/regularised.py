@@ -301,7 +301,7 @@ def checked_tau(tau: Any) -> Any:
     if isinstance(tau, str):
         checks.choice("tau", tau, get_args(TauRule))
         return tau
-    return checks.non_negative("tau", tau, "times the noise")
+    return checks.non_negative("tau", tau, "a ratio")
 
 
 def of_kind(name: str, value: Any, kind: type):

@@ -98,6 +98,11 @@ def test_a_fault_of_the_file_is_told(changed, told, file):
         load_learned(file, (changed,))
 
 
+def test_a_file_of_another_kind_is_told_as_that_alone():
+    told = line(call(ROOT / "configs" / "masks.yaml"))
+    assert "kind: 'masks' is unknown; choose one of 'learned'" in told
+
+
 def test_a_folder_that_is_not_there_is_told(file):
     source = "sources.0={name: mine, kind: folder, path: nowhere}"
     config = load_learned(file, (source,))
