@@ -37,12 +37,12 @@ def camera(name):
     ],
 )
 def test_predicted_errors_are_at_least_the_true_ones(name, average):
-    """Against 21 samples a pixel."""
+    """Against 11 samples a pixel and a window of three times the width."""
     here = camera(name)
     light = {"wavelength": WAVELENGTH, "pixel_integration": average}
-    choice = tc.select_model(here, tolerance=0.02, **light)
+    choice = tc.select_model(here, tolerance=0.05, **light)
     assert choice.model == "angular_spectrum" and choice.meets_tolerance
-    best = tc.psf(here, model="angular_spectrum", oversampling=21, **light)
+    best = tc.psf(here, model="angular_spectrum", oversampling=11, mask_shape=(120, 128), **light)
     for tried in choice.considered:
         found = tc.psf(here, model=tried.model, oversampling=tried.oversampling, **light)
         true = relative_l2(found, best)

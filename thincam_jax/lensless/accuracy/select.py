@@ -182,7 +182,8 @@ def _select_sampled(
     reasons = (
         f"a {type(mask).__name__} has no exact PSF: of 'angular_spectrum' with "
         f"{chosen.oversampling}×{chosen.oversampling} samples a pixel, the mask's middle with more "
-        f"of them differs so that {chosen.predicted_error:.1e} is left",
+        f"of them differs so that {chosen.predicted_error:.1e} is left; far behind a small mask "
+        "most of that is cut off by the window, and a larger mask_shape of psf cuts less",
         "errors are counted from scalar diffraction without Fresnel's approximation",
     )
     return Selection(
