@@ -145,7 +145,7 @@ def test_what_are_no_counts_is_refused():
 
 def test_what_the_solver_refuses():
     rig.refused("tau = 'sure' is found for Gaussian noise only", lambda: tc.PoissonTV("sure"))
-    rig.refused("tau = -1.0 .* is negative", lambda: tc.PoissonTV(-1.0))
+    rig.refused("tau = -1.0 is negative", lambda: tc.PoissonTV(-1.0))
     message = "variation is a Sparsity; give a TotalVariation"
     rig.refused(message, lambda: tc.PoissonTV(variation=Sparsity()))
     seen = tc.Recording(jnp.ones((1, 20, 21)), tc.Psfs(jnp.ones((1, 5, 6))))

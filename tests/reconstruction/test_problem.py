@@ -189,7 +189,7 @@ def test_what_is_refused():
         ([coloured], [a], {}, "1 channels and its PSF 3; give a PSF of 1 channel or of as many"),
         ([first, second], [a, jnp.ones((3, 4, 9))], {}, r"captures differ in batch .*\(1,\), \(3,"),
         ([first], [a], {"weights": [1.0, 1.0]}, "2 weights for 1 captures; give one for each"),
-        ([first], [a], {"tau": -1.0}, "tau = -1.0 .* is negative; give tau >= 0"),
+        ([first], [a], {"tau": -1.0}, "tau = -1.0 is negative; give tau >= 0"),
     ):
         with pytest.raises(ValueError, match=message):
             InverseProblem(operators, captures, **({"tau": 1.0} | settings))

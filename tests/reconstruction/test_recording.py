@@ -379,7 +379,7 @@ def test_what_is_refused():
             {},
             r"shape \[\(52, 61\), \(50, 61\)\] for 2",
         ),
-        (seen, jnp.ones((2, 4, 5)), {"tau": -1.0}, "tau = -1.0 .* is negative"),
+        (seen, jnp.ones((2, 4, 5)), {"tau": -1.0}, "tau = -1.0 is negative"),
         (seen, jnp.ones((2, 4, 5)), {"field_shape": (0, 4)}, "field_shape = .* at least 1"),
         (seen, jnp.ones((2, 4, 5)), {"noise_variance": [1.0] * 3}, "noise_variance has shape"),
         (seen, jnp.ones((2, 4, 5)), {"noise_variance": -1.0}, "noise_variance = -1.0 is negative"),
