@@ -13,18 +13,8 @@ from thincam_jax._core import checks
 
 _MM = (
     *("cell", "centre", "centre_x", "centre_y", "distance", "focal_distance", "focal_length"),
-    *(
-        "glass_thickness",
-        "height",
-        "lens_distance",
-        "object_distance",
-        "object_width",
-        "pitch",
-        "ring",
-        "sensor_width",
-        "size",
-    ),
-    *("thickness", "wavelength", "wavelengths", "width"),
+    *("glass_thickness", "height", "lens_distance", "object_distance", "object_width", "pitch"),
+    *("ring", "sensor_width", "size", "thickness", "wavelength", "wavelengths", "width"),
 )
 _UNITS = dict.fromkeys(_MM, "mm") | {
     "beta": "rad/mm²",

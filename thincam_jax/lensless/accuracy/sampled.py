@@ -24,6 +24,7 @@ from thincam_jax._core.precision import RESULT_ROUNDING, precision_of
 from thincam_jax.lensless.masks.base import AbstractMask
 from thincam_jax.lensless.method import PsfMethod, psf_method
 from thincam_jax.lensless.propagation.angular_spectrum import (
+    PADDING,
     angular_spectrum,
     lit_mask,
     padded_shape,
@@ -34,7 +35,7 @@ from thincam_jax.lensless.propagation.path import Path
 from thincam_jax.lensless.sampling import samples_needed
 
 # Of the mask's middle, along each axis; the window of a PSF, and one that cuts nothing of note.
-_LINES, _PADDED = 12, (2.0, 8.0)
+_LINES, _PADDED = 12, (PADDING, 4 * PADDING)
 # Pixels of the part, along a side; samples as multiples of the fewest that hold the mask.
 _PART, _FINER = 48, (1, 3, 5, 7, 9)
 # What the part may miss of the whole, and what transforms and phases add to a result's rounding.

@@ -12,6 +12,8 @@ from thincam_jax._core.precision import as_complex, turn_phasor
 from thincam_jax.lensless.masks.base import AbstractMask
 from thincam_jax.lensless.propagation.path import Path
 
+PADDING = 2.0  # the window of a PSF over mask and sensor side by side
+
 
 class Sampling(NamedTuple):
     """How well a field is sampled; each number should be at least 1.
@@ -79,7 +81,7 @@ def angular_spectrum(
     *,
     mask_shape: tuple[int, int] | None = None,
     oversampling: int = 1,
-    padding: float = 2.0,
+    padding: float = PADDING,
     pixel_integration: bool = False,
 ) -> Float[Array, "y x"]:
     r"""PSF of any mask by the band-limited angular spectrum; exact scalar diffraction when sampled.

@@ -337,10 +337,8 @@ def _least_squares(problem: FitProblem, start: Float[Array, " unknown"]):
 AMBIGUOUS = 0.999
 # The smallest eigenvalue, relative to the unit diagonal, that is not rounding.
 _SMALLEST = 1e-13
-
-
-# Of JᵀJ with a unit diagonal. At this smallest eigenvalue two numbers have a correlation of 0.999.
-_HARDLY_SEEN = 1e-3
+# Smallest eigenvalue of JᵀJ with a unit diagonal, where two numbers have that correlation.
+_HARDLY_SEEN = 1 - AMBIGUOUS
 
 
 class Covariance(NamedTuple):

@@ -292,7 +292,7 @@ def fit_screen(
             problem = problem._replace(start=found)
             if number >= len(blurs) - 1:
                 # Errors by the residual's own size: positions may be worse than their deviation.
-                curvature, squares, freedom, _ = _known(problem, names, orders)
+                curvature, squares, freedom = _known(problem, names, orders)
                 errors = covariance(curvature, squares / freedom).standard_errors
                 # Steps end at the solver's tolerance, whatever the noise.
                 if np.all(np.abs(solution.value) < np.maximum(errors / 3, 10 * _TOLERANCE)):
@@ -439,22 +439,20 @@ def _mean_weight(camera: SeeThroughCamera, plane: ObjectPlane, pixels, orders: i
 
 
 def _known(problem: _Problem, names: tuple[str, ...], orders: int):
-    """JᵀJ, the residual's squares, its degrees of freedom, and what is known of the steps."""
+    """JᵀJ, the residual's squares, and its degrees of freedom."""
     none = jnp.zeros_like(problem.unit)
     residual = np.asarray(_residual(none, (problem, names, orders)))
     slopes = np.asarray(_jacobian(problem, names, orders))
     curvature, squares = slopes.T @ slopes, float(residual @ residual)
-    freedom = residual.size - len(names)
-    variance = squares / freedom if problem.orders is None else 1.0
-    return curvature, squares, freedom, covariance(curvature, variance)
+    return curvature, squares, residual.size - len(names)
 
 
 def _report(problem: _Problem, names, counts, converged: bool) -> ScreenFit:
     found, (orders, samples) = problem.start, counts
-    known: Covariance
-    curvature, squares, freedom, known = _known(problem, names, orders)
+    curvature, squares, freedom = _known(problem, names, orders)
     explained = 1 - squares / float(jnp.sum((problem.measured * problem.scale) ** 2))
     of_matrix, mean = problem.orders is None, squares / freedom
+    known: Covariance = covariance(curvature, mean if of_matrix else 1.0)
     errors = known.standard_errors * np.asarray(problem.unit)
     gain = found.gain
     if of_matrix:

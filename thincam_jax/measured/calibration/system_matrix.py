@@ -106,7 +106,7 @@ def open_matrix(path: str | Path) -> Any:
 
 def stored_blocks(path: str | Path) -> Iterator[Block]:
     """A stored matrix in blocks of its pixels, without ever holding it whole."""
-    _, array = _stored(path)
+    array = open_matrix(path)
     step = array.chunks[0]
     for start in range(0, array.shape[0], step):
         pixels = slice(start, min(start + step, array.shape[0]))
