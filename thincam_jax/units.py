@@ -19,7 +19,8 @@ from __future__ import annotations
 import functools
 import math
 import re
-from typing import TYPE_CHECKING, Any, NamedTuple
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     import pint
@@ -34,7 +35,8 @@ mrad: float = 1e-3
 deg: float = math.pi / 180.0
 
 
-class _Kind(NamedTuple):
+@dataclass(frozen=True)
+class _Kind:
     """What one kind of quantity is called, accepts and turns into."""
 
     name: str  # with its article, as it stands in a sentence

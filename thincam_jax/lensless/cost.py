@@ -5,7 +5,7 @@ buffers that XLA allocates on a CPU (``compiled.memory_analysis()``) and from ti
 """
 
 import math
-from typing import NamedTuple
+from dataclasses import dataclass
 
 from thincam_jax._core.grids import Grid, fast_shape
 from thincam_jax._core.precision import itemsize_of
@@ -23,7 +23,8 @@ _BASE = 4096
 _BATCH = 64
 
 
-class Cost(NamedTuple):
+@dataclass(frozen=True)
+class Cost:
     """The cost of one evaluation.
 
     - `flops`: real operations, transcendental functions counted as the operations they take.
@@ -66,7 +67,8 @@ def _separable_sum(mask, shape: tuple[int, int], method: PsfMethod) -> tuple[flo
     if not isinstance(mask, AbstractFactoredMask):  # a geometric shadow, sampled
         return 4.0 * math.prod(shape), 2.0 * math.prod(shape)
     length = sum(shape)
-    count, shadow, cells, chirped = term_count(mask)
+    known = term_count(mask)
+    count, cells, chirped = known.terms, known.cells, known.chirped
     pairs = count * (count + 1) // 2
     if method.model == "separable":
         nodes = method.nodes if method.pixel_integration else 1
@@ -78,7 +80,7 @@ def _separable_sum(mask, shape: tuple[int, int], method: PsfMethod) -> tuple[flo
         held = max(5.5 * at_once + 2.5 * fields, 5.2 * pairs * length)
         terms = pairs
     else:
-        terms = pairs - count + 1 if method.model != "geometric" else shadow
+        terms = pairs - count + 1 if method.model != "geometric" else known.shadow
         work = _CHIRP if method.pixel_integration else _PHASOR
         flops = work * terms * length * cells
         per_factor = 12.0 if method.pixel_integration else 2.1

@@ -1,7 +1,8 @@
 """The models of the PSF by name, and how one is computed."""
 
 import math
-from typing import Literal, NamedTuple, TypeGuard, cast, get_args
+from dataclasses import dataclass
+from typing import Literal, TypeGuard, cast, get_args
 
 import numpy as np
 
@@ -54,7 +55,8 @@ def models_of(mask: AbstractMask) -> tuple[Model, ...]:
     return tuple(model for model in MODELS if fits.get(model, True))
 
 
-class PsfMethod(NamedTuple):
+@dataclass(frozen=True)
+class PsfMethod:
     """How a PSF is computed: all that is static where JAX compiles; arguments as of `psf`.
 
     - `samples`, `mask_shape`: samples a pixel, and pixels of the mask plane, of the models that

@@ -1,6 +1,7 @@
 """From a camera to its point spread function and optical transfer function."""
 
 import math
+from dataclasses import replace
 
 import equinox as eqx
 import jax
@@ -171,7 +172,7 @@ def _evaluate(function, mask: AbstractMask, grid: Grid, path: Path, method: PsfM
     own = precision_of(grid.pitch)
     require_phase_sampling(mask, grid, path, method)
     if method.model == "separable" and method.pixel_integration:
-        method = method._replace(nodes=pixel_nodes(mask, grid, path, method.precision))
+        method = replace(method, nodes=pixel_nodes(mask, grid, path, method.precision))
     with allow(method.precision, mask, grid, path):
         if method.precision != own:
             mask, grid, path = cast((mask, grid, path), method.precision)

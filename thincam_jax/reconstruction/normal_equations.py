@@ -12,6 +12,7 @@ Factorisations are not differentiated: derivatives follow from the equation itse
 import abc
 import functools
 import math
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -96,7 +97,7 @@ def normal_equations(problem: InverseProblem, shift: Float[Array, ""]) -> Abstra
         modes = bare[0].modes or _with_modes(bare[0]).modes
         assert modes is not None
         values = jnp.abs(_gain(fixed.operators[0])) * modes.values
-        weighted = modes._replace(values=jnp.sqrt(jnp.mean(fixed.weights[0])) * values)
+        weighted = replace(modes, values=jnp.sqrt(jnp.mean(fixed.weights[0])) * values)
         if bare[0].terms == 1 and fixed.weights[0].size == 1:
             return SeparableNormal(problem, shift, weighted)
         return IterativeNormal(problem, shift, weighted)

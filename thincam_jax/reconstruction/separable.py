@@ -18,8 +18,10 @@ with the squared residual r, N pixels of the captures and
 """
 
 import math
-from typing import Literal, NamedTuple
+from dataclasses import replace
+from typing import Literal
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -55,7 +57,7 @@ def ridge_by_modes(
     return product(product(modes.rows, inside), modes.columns.T)
 
 
-class Prior(NamedTuple):
+class Prior(eqx.Module):
     r"""Pixels that resemble their neighbours: covariance e^{−|y−y'|/ℓ − |x−x'|/ℓ} over ρ.
 
     The product of two Markov chains, the usual model of photographs (Jain, Proc. IEEE 69, 349,
@@ -91,8 +93,8 @@ class Prior(NamedTuple):
 
     def modes(self, modes: SeparableModes) -> SeparableModes:
         """Modes of z as images: those of `ridge_by_modes` under this prior, and no longer white."""
-        return modes._replace(
-            rows=product(self.rows, modes.rows), columns=product(self.columns, modes.columns)
+        return replace(
+            modes, rows=product(self.rows, modes.rows), columns=product(self.columns, modes.columns)
         )
 
 

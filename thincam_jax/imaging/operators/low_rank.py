@@ -1,7 +1,6 @@
 """A camera whose PSF changes slowly over the field."""
 
-from typing import NamedTuple
-
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import scipy
@@ -45,7 +44,7 @@ class LowRank(AbstractOperator):
         return jnp.sum(self.convolution.adjoint(capture) * self.weights, axis=-3)
 
 
-class LowRankFit(NamedTuple):
+class LowRankFit(eqx.Module):
     """An operator for a grid of PSFs, and how far it is from them.
 
     - `truncation_error`: of the PSFs at the grid's points, ‖difference‖₂/‖PSFs‖₂.

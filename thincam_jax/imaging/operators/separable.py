@@ -1,8 +1,8 @@
 """A camera whose rows and columns are coded independently, or that is a sum of few such cameras."""
 
 import math
-from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, DTypeLike, Float, PRNGKeyArray
@@ -13,7 +13,7 @@ from thincam_jax._core.precision import product
 from thincam_jax.imaging.operators.base import AbstractOperator, real_numbers, require_shape
 
 
-class SeparableModes(NamedTuple):
+class SeparableModes(eqx.Module):
     r"""The images that a separable camera sees apart from each other: F = v_i w_jᵀ.
 
     - `rows`: V, (m, m), and `columns`: W, (n, n), an orthonormal vector a column.
@@ -30,7 +30,7 @@ class SeparableModes(NamedTuple):
     seen_columns: Float[Array, "x n"] | None
 
 
-class Truncated(NamedTuple):
+class Truncated(eqx.Module):
     """A sum of fewer terms, and ‖difference‖_F/‖A‖_F: what it misses of captures of white scenes.
 
     `errors`: the same for 1, 2, … terms.

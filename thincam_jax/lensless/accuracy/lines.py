@@ -110,14 +110,15 @@ def angular_spectrum_terms(
     oversampling: int,
 ) -> SeparableSum:
     """The PSF of `angular_spectrum` at some rows and columns of a grid of `shape`, as a product."""
-    coefficients, *both = mask.terms(path.wavelength)
-    lower, upper, weights = pairs(coefficients)
+    terms = mask.terms(path.wavelength)
+    lower, upper, weights = pairs(terms.coefficients)
     plane, sensor = planes(Grid(shape, points.pitch), mask_shape, oversampling)
     half = oversampling // 2 if pixel_integration else 0
     factors = []
-    for axis, indices in enumerate((points.row_indices, points.column_indices)):
+    both = (terms.rows, points.row_indices), (terms.columns, points.column_indices)
+    for axis, (along, indices) in enumerate(both):
         samples, line = plane.shape[axis], Grid((1, plane.shape[axis]), plane.pitch)
-        values = both[axis].samples(line.x - mask.centre[axis], line.pitch)
+        values = along.samples(line.x - mask.centre[axis], line.pitch)
         lit = values * spherical_wave(line, path)
         # Sensor samples of the chosen pixels, counted from the axis.
         fine = indices[:, None] * oversampling + jnp.arange(-half, half + 1, dtype=indices.dtype)

@@ -6,7 +6,7 @@ With real factors R (term × row) and C (term × column) an image is RᵀC and
 
 import functools
 import math
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
@@ -44,7 +44,8 @@ _PRODUCT_ROUNDING: dict[Precision, float] = {"float32": 2e-7, "float64": 5e-16}
 _EPSILON: dict[Precision, float] = {"float32": 2.0**-24, "float64": 2.0**-53}
 
 
-class Lines(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Lines:
     """The rows and columns that are looked at, as centred indices, and what each stands for."""
 
     rows: Float[np.ndarray, " row"]
@@ -56,7 +57,8 @@ class Lines(NamedTuple):
         return SparseGrid(self.rows, self.columns, pitch)
 
 
-class Numbers(NamedTuple):
+@dataclass(frozen=True)
+class Numbers:
     """Sizes of the effects of a camera.
 
     - `epsilon`: |k|ε of the highest order k.
@@ -106,7 +108,8 @@ def _spread(count: int, most: int) -> Float[np.ndarray, " chosen"]:
     return np.floor(edges[:-1] + inside * np.diff(edges)) - (count - 1) / 2
 
 
-class Factors(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Factors:
     """Real factors of an image on chosen rows and columns, each scaled by the root of its weight.
 
     - `rows`, `columns`: factor × sample, in double precision.
@@ -325,8 +328,8 @@ class MaskProbe:
         """
         with allow("float64"):
             mask, pitch, path = self.given["float64"]
-            coefficients, rows, columns = mask.terms(path.wavelength)
-            axes = (1,) if rows is columns else (0, 1)
+            terms = mask.terms(path.wavelength)
+            axes = (1,) if terms.rows is terms.columns else (0, 1)
             half_sensor = max(self.shape) * pitch / 2
             half_mask = jnp.max(jnp.stack(mask.extent)) / 2 + jnp.max(jnp.abs(mask.centre))
             reach = jnp.maximum(half_sensor, half_mask * path.magnification)
@@ -339,7 +342,7 @@ class MaskProbe:
                 ]
                 for exact in (True, False)
             ]
-            weighted_pairs = tuple(np.asarray(v) for v in pairs(coefficients))
+            weighted_pairs = tuple(np.asarray(v) for v in pairs(terms.coefficients))
         exact, fresnel = (
             self._line_factors((fields[0], fields[-1]), float(reach), float(pitch), weighted_pairs)
             for fields in both

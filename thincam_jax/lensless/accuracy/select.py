@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import jax
 
@@ -39,7 +39,8 @@ _MARGIN_CLOSED = 1.25
 _CONVERSION = 1e7
 
 
-class Prediction(NamedTuple):
+@dataclass(frozen=True)
+class Prediction:
     """What a model gives and costs.
 
     - `model`, `precision`, `oversampling`: as `psf` takes them; oversampling is None for the
@@ -55,7 +56,8 @@ class Prediction(NamedTuple):
     cost: Cost
 
 
-class Selection(NamedTuple):
+@dataclass(frozen=True)
+class Selection:
     """The choice of `select_model`.
 
     - `model`, `precision`, `oversampling`: arguments for `psf`, `otf` and `capture`.
@@ -187,7 +189,11 @@ def _select_sampled(
         "errors are counted from scalar diffraction without Fresnel's approximation",
     )
     return Selection(
-        **chosen._asdict(),
+        model=chosen.model,
+        precision=chosen.precision,
+        oversampling=chosen.oversampling,
+        predicted_error=chosen.predicted_error,
+        cost=chosen.cost,
         meets_tolerance=chosen.predicted_error <= tolerance,
         paraxial_error=0.0,
         reasons=reasons,

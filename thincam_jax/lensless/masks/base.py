@@ -2,7 +2,8 @@
 
 import abc
 import functools
-from typing import Any, NamedTuple
+from dataclasses import dataclass, replace
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -48,7 +49,7 @@ class AbstractMask(Module):
         return False
 
 
-class AxisFactors(NamedTuple):
+class AxisFactors(Module):
     r"""The factors of a mask's terms along one axis, over an array of cells.
 
     In cell i, between the edges i and i + 1, the factor of term k is
@@ -87,13 +88,14 @@ class AxisFactors(NamedTuple):
     def products(self, first: np.ndarray, second: np.ndarray) -> "AxisFactors":
         """The factors of the products of terms `first` with the conjugates of terms `second`."""
         g = self.curvatures
-        return self._replace(
+        return replace(
+            self,
             values=self.values[first] * self.values[second].conj(),
             curvatures=None if g is None else g[first] - g[second],
         )
 
 
-class MaskTerms(NamedTuple):
+class MaskTerms(Module):
     r"""A mask as a sum of products, :math:`t(x, y) = \sum_k c_k R_k(y)\, C_k(x)`.
 
     - `coefficients`: the c_k.
@@ -117,22 +119,24 @@ class AbstractFactoredMask(AbstractMask):
 
     def irradiance(self, wavelength: Number | None = None) -> MaskTerms:
         """|t|² = Re Σ_k w_k R_k(y) C_k(x)."""
-        coefficients, rows, columns = self.terms(wavelength)
-        first, second, weights = pairs(coefficients)
-        across = columns.products(first, second)
-        down = across if rows is columns else rows.products(first, second)
+        terms = self.terms(wavelength)
+        first, second, weights = pairs(terms.coefficients)
+        across = terms.columns.products(first, second)
+        same = terms.rows is terms.columns
+        down = across if same else terms.rows.products(first, second)
         return MaskTerms(weights, down, across)
 
     def sample(
         self, grid: Grid, wavelength: Number | None = None
     ) -> Complex[Array, "y x"] | Float[Array, "y x"]:
-        coefficients, down, across = self.terms(wavelength)
-        rows = down.samples(grid.y - self.centre[0], grid.pitch)
-        columns = across.samples(grid.x - self.centre[1], grid.pitch)
-        return product((coefficients[:, None] * rows).T, columns)
+        terms = self.terms(wavelength)
+        rows = terms.rows.samples(grid.y - self.centre[0], grid.pitch)
+        columns = terms.columns.samples(grid.x - self.centre[1], grid.pitch)
+        return product((terms.coefficients[:, None] * rows).T, columns)
 
 
-class TermCount(NamedTuple):
+@dataclass(frozen=True)
+class TermCount:
     """How many terms a mask has, how many its |t|², and the cells of its longer side."""
 
     terms: int
@@ -174,16 +178,16 @@ def require_factored(mask: AbstractMask, model: str) -> AbstractFactoredMask:
     return mask
 
 
-class ZoneOrders(NamedTuple):
+class ZoneOrders(Module):
     """The unbounded zone plate Σ_k c_k e^{jkβr²}, and the width of the aperture that bounds it.
 
-    - `orders`: the k, static.
+    - `orders`: the k.
     - `coefficients`: the c_k, complex.
     - `beta`: β, rad/mm².
     - `width`: mm, along x.
     """
 
-    orders: tuple[int, ...]
+    orders: tuple[int, ...] = eqx.field(static=True)
     coefficients: Complex[Array, " order"]
     beta: Float[Array, ""]
     width: Float[Array, ""]

@@ -1,7 +1,7 @@
 """Masks of square cells that are a sum of few products of a pattern down and one across."""
 
 import abc
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, get_args
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -19,7 +19,7 @@ COMBINATIONS: tuple[Combination, ...] = get_args(Combination)
 _LONGEST_REGISTER = 16
 
 
-class Patterns(NamedTuple):
+class Patterns(eqx.Module):
     """The cells of a mask, Σ_k coefficients[k] · rows[k, i] · columns[k, j]."""
 
     coefficients: Float[np.ndarray | Array, " term"]
@@ -42,13 +42,14 @@ class AbstractCellMask(AbstractFactoredMask):
     @property
     def cells(self) -> Float[Array, "row column"]:
         """Amplitude transmittance of every cell."""
-        coefficients, rows, columns = self.patterns()
-        return jnp.asarray((coefficients[:, None] * rows).T @ columns, self.cell.dtype)
+        parts = self.patterns()
+        rows = parts.coefficients[:, None] * parts.rows
+        return jnp.asarray(rows.T @ parts.columns, self.cell.dtype)
 
     @property
     def extent(self) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        _, rows, columns = self.patterns()
-        return rows.shape[1] * self.cell, columns.shape[1] * self.cell
+        parts = self.patterns()
+        return parts.rows.shape[1] * self.cell, parts.columns.shape[1] * self.cell
 
     @property
     def finest_frequency(self) -> Float[Array, ""]:
@@ -56,8 +57,10 @@ class AbstractCellMask(AbstractFactoredMask):
         return 0.5 / self.cell
 
     def terms(self, wavelength: Number | None = None) -> MaskTerms:
+        parts = self.patterns()
         coefficients, *both = (
-            as_complex(jnp.asarray(part, self.cell.dtype)) for part in self.patterns()
+            as_complex(jnp.asarray(part, self.cell.dtype))
+            for part in (parts.coefficients, parts.rows, parts.columns)
         )
         rows, columns = (AxisFactors(cell_edges(v.shape[1], self.cell), v) for v in both)
         return MaskTerms(coefficients, rows, columns)

@@ -1,7 +1,7 @@
 """What a capture holds beside its model's optics, with sizes."""
 
 import math
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -10,7 +10,8 @@ from thincam_jax.lensless.accuracy.select import probe_of
 from thincam_jax.lensless.camera import LenslessCamera
 
 
-class Effect(NamedTuple):
+@dataclass(frozen=True)
+class Effect:
     """An effect of the camera and whether the plan models it.
 
     - `size`: relative to the capture; None where it is not known.

@@ -8,7 +8,7 @@ shows how an error of the PSF shows in the image of this scene.
 
 import functools
 import math
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
@@ -28,7 +28,8 @@ from thincam_jax.lensless.psf import closed_terms
 _RINGS, _IN_RING = 32, 16
 
 
-class Frequencies(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Frequencies:
     """Frequencies in cycles per sample, and the area that each stands for.
 
     - `v`, `u`: down and across; of a pair of opposite frequencies one stands for both.

@@ -1,7 +1,6 @@
 r"""`angular_spectrum`: band-limited plane-wave propagation of any sampled mask."""
 
 import math
-from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -15,7 +14,7 @@ from thincam_jax.lensless.propagation.path import Path
 PADDING = 2.0  # the window of a PSF over mask and sensor side by side
 
 
-class Sampling(NamedTuple):
+class Sampling(eqx.Module):
     """How well a field is sampled; each number should be at least 1.
 
     - `mask`: Nyquist frequency of the samples over the highest local frequency behind the mask.

@@ -12,7 +12,7 @@ product of two one-dimensional integrals
 
 import functools
 import math
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
@@ -35,7 +35,8 @@ _CENTRE = 2.0
 _SLOW_PHASE = 3.0
 
 
-class _Degrees(NamedTuple):
+@dataclass(frozen=True)
+class _Degrees:
     """Of the polynomials and series, enough for a precision."""
 
     near: int

@@ -41,7 +41,8 @@ def geometric(
     if not isinstance(mask, AbstractFactoredMask):
         shadow = mask.sample(Grid(grid.shape, grid.pitch / scale), path.wavelength)
         return jnp.abs(shadow) ** 2
-    weights, down, across = mask.irradiance(path.wavelength)
+    terms = mask.irradiance(path.wavelength)
+    down, across = terms.rows, terms.columns
     factor = _axis_averages if pixel_integration else _axis_values
     y, x = grid.y / scale - mask.centre[0], grid.x / scale - mask.centre[1]
     if down is across:
@@ -50,18 +51,18 @@ def geometric(
         rows, columns = jnp.split(both, [grid.shape[0]], axis=-1)
     else:
         rows, columns = factor(down, y, grid.pitch / scale), factor(across, x, grid.pitch / scale)
-    return SeparableSum(weights[:, None] * rows, columns, grid)
+    return SeparableSum(terms.coefficients[:, None] * rows, columns, grid)
 
 
 def throughput(mask: AbstractFactoredMask, wavelength: Number | None = None) -> Float[Array, ""]:
     """The part of the light on the mask's aperture that passes it, the mean of |t|²."""
-    weights, down, across = mask.irradiance(wavelength)
-    middle = jnp.zeros(1, weights.real.dtype)
+    terms = mask.irradiance(wavelength)
+    middle = jnp.zeros(1, terms.coefficients.real.dtype)
     rows, columns = (
         _axis_averages(factors, middle, side)[:, 0]
-        for factors, side in zip((down, across), mask.extent, strict=True)
+        for factors, side in zip((terms.rows, terms.columns), mask.extent, strict=True)
     )
-    return jnp.sum(weights * rows * columns).real
+    return jnp.sum(terms.coefficients * rows * columns).real
 
 
 def _axis_values(factors: AxisFactors, x: Float[Array, " n"], pitch) -> Complex[Array, "term n"]:

@@ -97,9 +97,10 @@ def separable(
     nodes: the average of a separable term is separable.
     """
     factored = require_factored(mask, "separable")
-    coefficients, down, across = factored.terms(path.wavelength)
+    terms = factored.terms(path.wavelength)
+    down, across = terms.rows, terms.columns
     scale = path.magnification
-    lower, upper, weights = pairs(coefficients)
+    lower, upper, weights = pairs(terms.coefficients)
 
     def products(factors, x):
         if not pixel_integration:

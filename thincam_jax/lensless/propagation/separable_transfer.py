@@ -13,6 +13,8 @@ which is a finite chirp for k ≠ l and a sinc for k = l. So the transfer functi
 pair of Fresnel integrals a frequency and pair of orders in place of a field on every pixel.
 """
 
+from dataclasses import replace
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -62,7 +64,7 @@ def transfer_factors(
     weights = pairs(zones.coefficients)[2]
 
     def factors(side, frequency):
-        values = overlaps(zones._replace(width=side), path, frequency)
+        values = overlaps(replace(zones, width=side), path, frequency)
         if pixel_pitch is not None:
             values = values * as_complex(jnp.sinc(pixel_pitch * frequency))
         return values
