@@ -20,6 +20,7 @@ from .lensless.masks.base import AxisFactors as AxisFactors
 from .lensless.masks.base import MaskTerms as MaskTerms
 from .lensless.masks.cells import SeparableMask as SeparableMask
 from .lensless.masks.cells import maximum_length_sequence as maximum_length_sequence
+from .lensless.masks.display import on_display as on_display
 from .lensless.masks.fza import FresnelZoneAperture as FresnelZoneAperture
 from .lensless.masks.lenslets import LensletArray as LensletArray
 from .lensless.masks.phase import MaskBlank as MaskBlank

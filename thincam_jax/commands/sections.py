@@ -109,9 +109,11 @@ _WIDEST = 300.0  # mask of a thin camera, mm
 Relief = Literal["diffuser", "voronoi_fresnel", "contours"]
 Cells = Literal["mura", "ura", "mls", "random"]
 Family = Literal["fza", Cells, "pinhole", "lenslets", "file", Relief]
+# Of any mask that a display shows.
+_DISPLAY = ("pixel_pitch", "fill_factor")
 # What a mask of each family is made of, and what may be given besides.
 _NUMBERS: dict[Family, tuple[tuple[str, ...], tuple[str, ...]]] = {
-    "fza": (("width",), ("height", "profile", "pixel_pitch", "fill_factor", "harmonics")),
+    "fza": (("width",), ("height", "profile", "harmonics")),
     "mura": (("order", "cell"), ("tiles",)),
     "ura": (("orders", "cell"), ("tiles",)),
     "mls": (("length", "cell"), ("combine",)),
@@ -167,7 +169,7 @@ class MaskConfig(ApertureConfig):
         for key in needed:
             if key not in self.model_fields_set:
                 raise misfit("missing; this key is needed", key)
-        known = {*needed, *also, "family", "width"}
+        known = {*needed, *also, *_DISPLAY, "family", "width"}
         for key in sorted(self.model_fields_set - known):
             if getattr(self, key) != type(self).model_fields[key].default:
                 raise misfit(f"is no number of a mask of the family {self.family}; drop it", key)

@@ -4,6 +4,7 @@ import functools
 import math
 import operator
 from collections.abc import Iterable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -80,22 +81,11 @@ def spectral_psf(
     camera: LenslessCamera,
     light: Iterable[tuple[Number, Float[Array, ""] | float]],
     object_distance: Number,
-    *,
-    model: Model,
-    pixel_integration: bool,
-    grid: Grid,
+    **how: Any,
 ) -> Float[Array, "y x"]:
-    """Sum of the PSFs of (wavelength, weight) pairs."""
+    """Sum of the PSFs of (wavelength, weight) pairs; `how`: the other arguments of `psf`."""
     parts = (
-        weight
-        * psf(
-            camera,
-            wavelength=wavelength,
-            object_distance=object_distance,
-            model=model,
-            pixel_integration=pixel_integration,
-            grid=grid,
-        )
+        weight * psf(camera, wavelength=wavelength, object_distance=object_distance, **how)
         for wavelength, weight in light
     )
     return functools.reduce(operator.add, parts)

@@ -36,6 +36,7 @@ from thincam_jax.lensless.masks import (
     UniformlyRedundantArray,
     diffuser,
     maximum_length_sequence,
+    on_display,
     random_cells,
     read_mask,
     voronoi_fresnel,
@@ -139,20 +140,28 @@ def unresolved_zones(
 
 
 def built_mask(config: MaskConfig, exposure: Exposure) -> AbstractMask:
-    """The mask of an exposure; ValueError for numbers that make none."""
-    cell, tiles, height = config.cell or 0.0, config.tiles or 1, config.height
-    family = config.family
-    if family == "fza":
+    """The mask of an exposure, on its display; ValueError for numbers that make none."""
+    if config.family == "fza":
         return FresnelZoneAperture(
             exposure.beta,
             exposure.phase,
             width=exposure.width,
-            height=height,
+            height=config.height,
             profile=exposure.profile or config.profile,
             pixel_pitch=config.pixel_pitch,
             fill_factor=config.fill_factor,
             harmonics=config.harmonics,
         )
+    printed = _printed(config, exposure)
+    if config.pixel_pitch is None:
+        return printed
+    return on_display(printed, config.pixel_pitch, config.fill_factor)
+
+
+def _printed(config: MaskConfig, exposure: Exposure) -> AbstractMask:
+    """Of the families without zones."""
+    cell, tiles, height = config.cell or 0.0, config.tiles or 1, config.height
+    family = config.family
     if family == "mura":
         return ModifiedUniformlyRedundantArray(config.order or 0, cell, tiles=tiles)
     if family == "ura":

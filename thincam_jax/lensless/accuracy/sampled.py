@@ -13,7 +13,7 @@ of the PSF at a Fresnel number w²/(λd) of 6, 10 % at 1. That is told by rows a
 mask's middle, propagated each by itself in a window of four times the width, too: to a factor of 3.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import jax
 import jax.numpy as jnp
@@ -38,26 +38,35 @@ from thincam_jax.lensless.sampling import samples_needed
 _LINES, _PADDED = 12, (PADDING, 4 * PADDING)
 # Pixels of the part, along a side; samples as multiples of the fewest that hold the mask.
 _PART, _FINER = 48, (1, 3, 5, 7, 9)
-# What the part may miss of the whole, and what transforms and phases add to a result's rounding.
-_MARGIN, _TRANSFORMS = 1.3, 100.0
+# What the part may miss of the whole.
+_MARGIN = 1.3
+# Relative, of a PSF: transforms and phases add to a result's rounding.
+SAMPLED_ROUNDING = {precision: 100 * rounding for precision, rounding in RESULT_ROUNDING.items()}
 
 
 def sampled_errors(
-    mask: AbstractMask, grid: Grid, path: Path, pixel_integration: bool
+    mask: AbstractMask,
+    grid: Grid,
+    path: Path,
+    pixel_integration: bool,
+    norm: Callable[[Float[Array, "y x"]], Float[Array, ""] | float] = jnp.linalg.norm,
 ) -> Iterator[tuple[PsfMethod, float]]:
-    """Methods of `angular_spectrum` with ever more samples, and the error predicted of each."""
+    """Methods of `angular_spectrum` with ever more samples, and the error predicted of each.
+
+    `norm`: in which PSFs of the mask's middle are compared.
+    """
     fewest = samples_needed(mask, grid, path, "angular_spectrum")
     fewest = max(fewest, 3 if pixel_integration else 1)
     methods = [
         psf_method(mask, grid, "angular_spectrum", pixel_integration, oversampling=fewest * finer)
         for finer in _FINER
     ]
-    rounding = _TRANSFORMS * RESULT_ROUNDING[precision_of(grid.pitch)]
+    rounding = SAMPLED_ROUNDING[precision_of(grid.pitch)]
     cut = _cut_by_window(mask, grid, path, methods[0])
     before = _central(mask, grid, path, methods[0])
     for method, finer in zip(methods, methods[1:], strict=False):
         after = _central(mask, grid, path, finer)
-        off = float(jnp.linalg.norm(before - after) / jnp.linalg.norm(after))
+        off = float(norm(before - after)) / float(norm(after))
         yield method, _MARGIN * off / (1 - method.samples / finer.samples) + cut + rounding
         before = after
 

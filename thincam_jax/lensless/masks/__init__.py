@@ -6,6 +6,7 @@ from thincam_jax.lensless.masks.base import AxisFactors as AxisFactors
 from thincam_jax.lensless.masks.base import MaskTerms as MaskTerms
 from thincam_jax.lensless.masks.cells import SeparableMask as SeparableMask
 from thincam_jax.lensless.masks.cells import maximum_length_sequence as maximum_length_sequence
+from thincam_jax.lensless.masks.display import on_display as on_display
 from thincam_jax.lensless.masks.fza import FresnelZoneAperture as FresnelZoneAperture
 from thincam_jax.lensless.masks.lenslets import LensletArray as LensletArray
 from thincam_jax.lensless.masks.phase import MaskBlank as MaskBlank

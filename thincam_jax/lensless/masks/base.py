@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from thincam_jax._core.checks import Number
-from thincam_jax._core.grids import Grid, cell_overlap
+from thincam_jax._core.grids import Grid, cell_overlap, centred_indices
 from thincam_jax._core.module import Module
 from thincam_jax._core.precision import as_complex, phasor, product
 
@@ -93,6 +93,17 @@ class AxisFactors(Module):
             values=self.values[first] * self.values[second].conj(),
             curvatures=None if g is None else g[first] - g[second],
         )
+
+
+def open_parts(
+    values: Complex[Array, "term cell"], pitch: Float[Array, ""], fill_factor: Float[Array, ""]
+) -> AxisFactors:
+    """Cells `pitch` apart about the mask's centre, open in their middle √fill_factor, else dark."""
+    centres = centred_indices(values.shape[1], pitch.dtype) * pitch
+    half = pitch * jnp.sqrt(fill_factor) / 2
+    edges = jnp.stack([centres - half, centres + half], axis=-1).ravel()
+    with_gaps = jnp.stack([values, jnp.zeros_like(values)], axis=-1)
+    return AxisFactors(edges, with_gaps.reshape(len(values), -1)[:, :-1])
 
 
 class MaskTerms(Module):

@@ -16,6 +16,7 @@ from thincam_jax.lensless.masks.base import (
     AxisFactors,
     MaskTerms,
     ZoneOrders,
+    open_parts,
     pairs,
 )
 
@@ -163,11 +164,8 @@ class FresnelZoneAperture(AbstractFactoredMask):
             return AxisFactors(jnp.stack([-side / 2, side / 2]), whole, curvatures)
         pitch = side / self.pixels[axis]
         sites = centred_indices(self.pixels[axis], self.beta.dtype) * pitch
-        half = pitch * jnp.sqrt(self.fill_factor) / 2
         shown = phasor(curvatures[:, None] * sites**2)
-        edges = jnp.stack([sites - half, sites + half], axis=-1).ravel()
-        with_gaps = jnp.stack([shown, jnp.zeros_like(shown)], axis=-1)
-        return AxisFactors(edges, with_gaps.reshape(len(orders), -1)[:, :-1])
+        return open_parts(shown, pitch, self.fill_factor)
 
 
 def edge_frequency(beta: Any, width: Any) -> Any:

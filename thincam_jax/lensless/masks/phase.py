@@ -39,6 +39,8 @@ class PhaseMask(AbstractMask):
       pixels); "bilinear" between the centres, constant beyond the outermost (smooth reliefs).
       Samples hold the mean transmittance of their area of cells, the value at their centre of
       bilinear ones, both times the open part at the rim. A is that of cells in both.
+    - `fill_factor`: part of a cell's area that is open, in its middle, of a display with dark gaps;
+      None for all of it. Of "cells" only.
 
     **Sampling.** `angular_spectrum` and `rayleigh_sommerfeld` hold a mask where its phase turns by
     less than π between samples, cells where samples are no larger than they; `psf` refuses
@@ -52,6 +54,7 @@ class PhaseMask(AbstractMask):
     material: AbstractIndex
     amplitude: Float[Array, "y x"] | None
     centre: Float[Array, "2"]
+    fill_factor: Float[Array, ""] | None
     interpolation: Interpolation = eqx.field(static=True)
 
     def __init__(
@@ -63,6 +66,7 @@ class PhaseMask(AbstractMask):
         amplitude: Any = None,
         centre: Numbers | tuple[Number, Number] = (0.0, 0.0),
         interpolation: Interpolation = "cells",
+        fill_factor: Number | None = None,
     ):
         self.height = _map("height", height, 0.0, HIGHEST, "mm, such as 1.2 * um")
         self.pitch = checks.positive("pitch", pitch, "mm")
@@ -77,6 +81,11 @@ class PhaseMask(AbstractMask):
                 )
         self.centre = checks.finite("centre", centre, "mm", shape=(2,))
         self.interpolation = checks.choice("interpolation", interpolation, get_args(Interpolation))  # pyright: ignore
+        self.fill_factor = None
+        if fill_factor is not None:
+            self.fill_factor = checks.fraction("fill_factor", fill_factor)
+            if self.interpolation != "cells":
+                raise ValueError("heights in between have no gaps: leave fill_factor out")
 
     @property
     def extent(self) -> tuple[Float[Array, ""], Float[Array, ""]]:
@@ -110,9 +119,10 @@ class PhaseMask(AbstractMask):
             cells = turn_phasor(self.turns(wavelength))
             if self.amplitude is not None:
                 cells = cells * as_complex(self.amplitude)
-            return jnp.asarray(SampledMask(cells, self.pitch, centre=self.centre).sample(grid))
+            shown = SampledMask(cells, self.pitch, centre=self.centre, fill_factor=self.fill_factor)
+            return jnp.asarray(shown.sample(grid))
         y, x = grid.y - self.centre[0], grid.x - self.centre[1]
-        turns = _between(_between(self.turns(wavelength), y / self.pitch).T, x / self.pitch).T
+        turns = self._at(self.turns(wavelength), grid)
         if self.amplitude is None:
             down, across = (
                 cell_overlap(at, grid.pitch, -side[None] / 2, side[None] / 2) / grid.pitch
@@ -122,6 +132,16 @@ class PhaseMask(AbstractMask):
         else:
             passed = SampledMask(self.amplitude, self.pitch, centre=self.centre).sample(grid)
         return turn_phasor(turns) * as_complex(jnp.real(passed))
+
+    def heights(self, grid: Grid) -> Float[Array, "y x"]:
+        """On a grid: between the centres, or the mean of the cells in each sample."""
+        if self.interpolation == "bilinear":
+            return self._at(self.height, grid)
+        return jnp.real(SampledMask(self.height, self.pitch, centre=self.centre).sample(grid))
+
+    def _at(self, values: Float[Array, "n m"], grid: Grid) -> Float[Array, "y x"]:
+        y, x = grid.y - self.centre[0], grid.x - self.centre[1]
+        return _between(_between(values, y / self.pitch).T, x / self.pitch).T
 
 
 class MaskBlank(eqx.Module):

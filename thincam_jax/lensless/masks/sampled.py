@@ -12,7 +12,12 @@ from thincam_jax._core import checks
 from thincam_jax._core.checks import Number, Numbers
 from thincam_jax._core.grids import Grid, cell_overlap, centred_indices
 from thincam_jax._core.precision import as_complex, product
-from thincam_jax.lensless.masks.base import AbstractFactoredMask, AxisFactors, MaskTerms
+from thincam_jax.lensless.masks.base import (
+    AbstractFactoredMask,
+    AxisFactors,
+    MaskTerms,
+    open_parts,
+)
 from thincam_jax.lensless.masks.cells import cell_edges
 
 
@@ -27,11 +32,13 @@ class SampledMask(AbstractFactoredMask):
     - `amplitude`: amplitude transmittance of each cell, (y, x); at most 1 for a passive mask.
     - `pitch`: side of a cell, mm.
     - `centre`: (y, x) of the mask's centre, mm.
+    - `fill_factor`: part of a cell's area that is open, in its middle; None for all of it.
     """
 
     amplitude: Complex[Array, "y x"] | Float[Array, "y x"]
     pitch: Float[Array, ""]
     centre: Float[Array, "2"]
+    fill_factor: Float[Array, ""] | None
 
     def __init__(
         self,
@@ -39,6 +46,7 @@ class SampledMask(AbstractFactoredMask):
         pitch: Number,
         *,
         centre: Numbers | tuple[Number, Number] = (0.0, 0.0),
+        fill_factor: Number | None = None,
     ):
         self.amplitude = jnp.asarray(amplitude)
         if self.amplitude.ndim != 2 or 0 in self.amplitude.shape:
@@ -51,6 +59,8 @@ class SampledMask(AbstractFactoredMask):
             self.amplitude = self.amplitude.astype(float)
         self.pitch = checks.positive("pitch", pitch, "mm")
         self.centre = checks.finite("centre", centre, "mm", shape=(2,))
+        open_part = None if fill_factor is None else checks.fraction("fill_factor", fill_factor)
+        self.fill_factor = open_part
 
     @property
     def extent(self) -> tuple[Float[Array, ""], Float[Array, ""]]:
@@ -82,24 +92,29 @@ class SampledMask(AbstractFactoredMask):
         values = values if jnp.iscomplexobj(values) else as_complex(values)
         each = jnp.eye(min(rows, columns), dtype=values.dtype)
         down, across = (each, values) if rows <= columns else (values.T, each)
-        edges = (cell_edges(n, self.pitch) for n in (rows, columns))
-        factors = (AxisFactors(*both) for both in zip(edges, (down, across), strict=True))
-        return MaskTerms(jnp.ones_like(each[0]), *factors)
+        return MaskTerms(jnp.ones_like(each[0]), self._factors(down), self._factors(across))
+
+    def _factors(self, values: Complex[Array, "term cell"]) -> AxisFactors:
+        if self.fill_factor is None:
+            return AxisFactors(cell_edges(values.shape[1], self.pitch), values)
+        return open_parts(values, self.pitch, self.fill_factor)
 
     def sample(
         self, grid: Grid, wavelength: Number | None = None
     ) -> Complex[Array, "y x"] | Float[Array, "y x"]:
         rows, columns = self.amplitude.shape
         dtype = self.amplitude.dtype
-        down = _coverage(grid.y - self.centre[0], grid.pitch, rows, self.pitch).astype(dtype)
-        across = _coverage(grid.x - self.centre[1], grid.pitch, columns, self.pitch).astype(dtype)
+        down = self._coverage(grid.y - self.centre[0], grid.pitch, rows).astype(dtype)
+        across = self._coverage(grid.x - self.centre[1], grid.pitch, columns).astype(dtype)
         return product(product(down, self.amplitude), across.T)
 
-
-def _coverage(x, pitch, cells: int, cell_pitch) -> Float[Array, "n cell"]:
-    """Part of each sample's cell that each mask cell covers."""
-    centres = centred_indices(cells, x.dtype) * cell_pitch
-    return cell_overlap(x, pitch, centres - cell_pitch / 2, centres + cell_pitch / 2) / pitch
+    def _coverage(self, x, pitch, cells: int) -> Float[Array, "n cell"]:
+        """Part of each sample's cell that the open part of each mask cell covers."""
+        centres = centred_indices(cells, x.dtype) * self.pitch
+        half = self.pitch / 2
+        if self.fill_factor is not None:
+            half = half * jnp.sqrt(self.fill_factor)
+        return cell_overlap(x, pitch, centres - half, centres + half) / pitch
 
 
 def random_cells(

@@ -1,13 +1,17 @@
 """The decisions of a plan: which model, which wavelengths, which planes."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import scipy.linalg
 from jaxtyping import Complex, Float
 
+from thincam_jax._core.precision import Precision, allow, cast
+from thincam_jax.lensless.accuracy.sampled import SAMPLED_ROUNDING, sampled_errors
 from thincam_jax.lensless.method import PsfMethod
 from thincam_jax.lensless.plan.seen import FULL, SeenScene
+from thincam_jax.lensless.plan.transfer import SampledProbe, TransferProbe, image_spectrum
 from thincam_jax.lensless.propagation.separable import PIXEL_NODES
 
 # Nodes of the pixel average where PSFs are compared with each other, and how far the tolerance must
@@ -21,6 +25,8 @@ _EVERYTHING = 3e-5
 
 def choose_psf(seen: SeenScene, tolerance: float) -> tuple[PsfMethod, float]:
     """The cheapest model, precision and pixel average within the tolerance at the corners."""
+    if isinstance(seen.probe, SampledProbe):
+        return _choose_samples(seen, tolerance)
     # Double precision is for where single cannot serve: a cheaper model would not help there.
     methods = [
         PsfMethod(model, "float32", average)
@@ -39,6 +45,37 @@ def choose_psf(seen: SeenScene, tolerance: float) -> tuple[PsfMethod, float]:
     return best
 
 
+def _choose_samples(seen: SeenScene, tolerance: float) -> tuple[PsfMethod, float]:
+    """The fewest samples of a mask without few terms, in the precision whose rounding allows it."""
+    single = 2 * seen.crop * SAMPLED_ROUNDING["float32"] <= tolerance
+    precision: Precision = "float32" if single else "float64"
+    tried = [_samples_at(seen, corner, precision, tolerance) for corner in seen.corners]
+    method = seen.sampled(max(method.samples for method, _ in tried))
+    return replace(method, precision=precision), max(error for _, error in tried)
+
+
+def _samples_at(
+    seen: SeenScene, corner: tuple[float, float], precision: Precision, tolerance: float
+) -> tuple[PsfMethod, float]:
+    """The fewest samples that serve one wavelength and distance, or the most, and their error.
+
+    Errors are those of this scene's capture, weighted with its spectrum.
+    """
+
+    def norm(psf) -> float:
+        spectrum = image_spectrum(np.asarray(psf, float)[None], seen.frequencies)[0]
+        return math.sqrt(float(np.sum(seen.power * np.abs(spectrum) ** 2)))
+
+    mask, grid, path = seen.camera.mask, seen.kernel_grid, seen.camera.path(*corner)
+    tried: list[tuple[PsfMethod, float]] = []
+    with allow(precision, mask, grid, path):
+        for method, error in sampled_errors(*cast((mask, grid, path), precision), True, norm):
+            tried.append((method, seen.crop * error))
+            if tried[-1][1] <= tolerance:
+                break
+    return tried[-1]
+
+
 def _speed(seen: SeenScene, method: PsfMethod) -> float:
     double = method.precision == "float64"
     return seen.psf_cost(method).flops * (2.0 if double else 1.0)
@@ -49,9 +86,8 @@ def _method_error(seen: SeenScene, method: PsfMethod) -> float:
         return 0.0
     worst = 0.0
     for (wavelength, distance), exact in zip(seen.corners, seen.references, strict=True):
-        found = seen.probe.exact(
-            wavelength, distance, method.model, method.precision, method.pixel_integration
-        )
+        assert isinstance(seen.probe, TransferProbe)
+        found = seen.probe.exact(wavelength, distance, method)
         error = seen.relative_of_all((found - exact) * seen.weights.sum())
         worst = max(worst, error if math.isfinite(error) else math.inf)
     rounding = _CONVOLUTION_ROUNDING * seen.crop if method.precision == "float32" else 0.0
@@ -84,8 +120,8 @@ def choose_wavelengths(
 
 def _quick(seen: SeenScene, method: PsfMethod, wavelength: float, distance: float):
     few = seen.tolerance > _ABOVE_EDGES * seen.edge_wave
-    nodes = _FEW_NODES if few else PIXEL_NODES
-    return seen.probe.quick(wavelength, distance, method.model, method.pixel_integration, nodes)
+    method = replace(method, nodes=_FEW_NODES if few else PIXEL_NODES)
+    return seen.probe.quick(wavelength, distance, method)
 
 
 def choose_planes(

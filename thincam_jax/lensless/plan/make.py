@@ -7,8 +7,9 @@ from thincam_jax._core.grids import fast_shape
 from thincam_jax._core.precision import RESULT_ROUNDING, precision_of
 from thincam_jax.imaging.operators import kernel_shape
 from thincam_jax.imaging.scene import Scene
-from thincam_jax.lensless.accuracy.select import require_camera, tolerance_of
+from thincam_jax.lensless.accuracy.select import tolerance_of
 from thincam_jax.lensless.camera import LenslessCamera
+from thincam_jax.lensless.method import has_few_terms
 from thincam_jax.lensless.plan.choose import choose_planes, choose_psf, choose_wavelengths
 from thincam_jax.lensless.plan.effects import effects_of
 from thincam_jax.lensless.plan.run import Plan
@@ -23,10 +24,11 @@ def plan(camera: LenslessCamera, scene: Scene, *, tolerance: float) -> Plan:
     r"""How to compute the capture of a scene to a relative error, at the least cost.
 
     The error is ‖g − g₀‖₂/‖g₀‖₂ of the noise-free capture, against every plane and wavelength
-    computed by `separable` in double precision, averaged over the pixels. What is decided, from the
+    computed by `separable` in double precision, averaged over the pixels, or by endlessly many
+    samples of `angular_spectrum` for masks without few separable terms. What is decided, from the
     PSFs' transfer functions at a few hundred frequencies, weighted with the scene's own spectrum:
 
-    - the model, the precision and whether pixels must be averaged;
+    - the model, the precision and whether pixels must be averaged, or the samples a pixel;
     - how many wavelengths: some of the spectrum's, with weights that reproduce its sum;
     - how many PSFs for the planes: each plane's PSF is a weighted sum of a few planes'
       (interpolative decomposition), and planes are added up with these weights *before* they are
@@ -35,11 +37,11 @@ def plan(camera: LenslessCamera, scene: Scene, *, tolerance: float) -> Plan:
     `Plan.effects` lists obliquity, shot noise and what Fresnel's approximation leaves out, with
     their sizes.
 
-    **Errors**: ValueError for a tolerance that is not positive; TypeError for a mask without
-    separable terms, and for traced numbers.
+    **Errors**: ValueError for a tolerance that is not positive; TypeError for traced numbers.
     """
     tolerance = tolerance_of(tolerance)
-    require_camera(camera, "plan")
+    if not isinstance(camera, LenslessCamera):
+        raise TypeError(f"camera is a {type(camera).__name__}; give a thincam_jax.LenslessCamera")
     if not isinstance(scene, Scene):
         raise TypeError(f"scene is a {type(scene).__name__}; give a thincam_jax.Scene")
     if any(checks.is_traced(leaf) for leaf in jax.tree.leaves((camera, scene))):
@@ -51,6 +53,7 @@ def plan(camera: LenslessCamera, scene: Scene, *, tolerance: float) -> Plan:
     colours, weights, colour_error = choose_wavelengths(seen, method, left * _WAVELENGTH_SHARE)
     left = max(tolerance - model_error - colour_error, 0.0)
     planes, mixing, plane_error = choose_planes(seen, method, colours, weights, left)
+    full = FULL if has_few_terms(camera.mask) else method
     shares = {"model": model_error, "wavelengths": colour_error, "planes": plane_error}
     window = fast_shape(kernel_shape(camera.sensor.shape, seen.field_shape), real=True)
     return Plan(
@@ -60,6 +63,8 @@ def plan(camera: LenslessCamera, scene: Scene, *, tolerance: float) -> Plan:
         model=method.model,
         precision=method.precision,
         pixel_integration=method.pixel_integration,
+        oversampling=method.oversampling,
+        mask_shape=method.mask_shape,
         distances=tuple(seen.distances[p] for p in planes),
         mixing=mixing,
         wavelengths=tuple(seen.wavelengths[c] for c in colours),
@@ -70,7 +75,7 @@ def plan(camera: LenslessCamera, scene: Scene, *, tolerance: float) -> Plan:
         field_shape=seen.field_shape,
         padded_shape=window,
         cost=seen.cost(method, len(planes), len(colours)),
-        full_cost=seen.cost(FULL, len(seen.distances), len(seen.wavelengths)),
+        full_cost=seen.cost(full, len(seen.distances), len(seen.wavelengths)),
         shares=shares,
         effects=effects_of(camera, scene, tolerance),
     )

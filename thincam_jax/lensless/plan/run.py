@@ -34,7 +34,7 @@ class Plan:
     - `camera`: that it was made for.
     - `tolerance`, `predicted_error`: relative L2 error of the noise-free capture, of a
       batch as a whole.
-    - `model`, `precision`, `pixel_integration`: arguments of `psf`.
+    - `model`, `precision`, `pixel_integration`, `oversampling`, `mask_shape`: arguments of `psf`.
     - `distances`: object distances in mm whose PSFs are computed, out of the scene's.
     - `mixing`: (distance, plane) weights: the PSF of a plane is this sum of the computed ones, so
       that planes are merged before they are convolved.
@@ -54,6 +54,8 @@ class Plan:
     model: Model
     precision: Precision
     pixel_integration: bool
+    oversampling: int | None
+    mask_shape: tuple[int, int] | None
     distances: tuple[float, ...]
     mixing: Float[np.ndarray, "distance plane"]
     wavelengths: tuple[float, ...]
@@ -75,6 +77,8 @@ class Plan:
 
     def __str__(self) -> str:
         average = "averaged over pixels" if self.pixel_integration else "at the pixels' centres"
+        if self.oversampling is not None:
+            average = f"{self.oversampling}×{self.oversampling} samples a pixel"
         planes, colours = len(self.scene_distances), len(self.scene_wavelengths)
         shares = self.shares
         rows, columns = self.field_shape
@@ -126,6 +130,8 @@ def run_plan(plan: Plan, camera: LenslessCamera, scene: Scene) -> Float[Array, "
                 distance,
                 model=plan.model,
                 pixel_integration=plan.pixel_integration,
+                oversampling=plan.oversampling,
+                mask_shape=plan.mask_shape,
                 grid=grid,
             )
             shapes = camera.sensor.shape, plan.field_shape

@@ -7,28 +7,36 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from thincam_jax._core.precision import itemsize_of
-from thincam_jax.imaging.operators import kernel_grid, kernel_shape
+from thincam_jax.imaging.operators import kernel_grid
 from thincam_jax.imaging.scene import Scene
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.cost import Cost, convolution_cost, psf_cost
 from thincam_jax.lensless.digits import held_in_single
 from thincam_jax.lensless.forward import project, projected_shape
-from thincam_jax.lensless.method import SAMPLED, Model, PsfMethod, models_of
+from thincam_jax.lensless.method import (
+    CLOSED,
+    Model,
+    PsfMethod,
+    has_few_terms,
+    models_of,
+    psf_method,
+)
 from thincam_jax.lensless.plan.transfer import (
+    SampledProbe,
     TransferProbe,
     image_spectrum,
     sample_frequencies,
 )
+from thincam_jax.lensless.sampling import samples_needed
 
 # Predictions come from some hundred random frequencies: what they are multiplied with.
 _MARGIN = 1.5
-# Nodes of the pixel average for the capture's energy, which fringes hardly change.
-_ENERGY_NODES = 6
 # Points across the shadow and the sensor at which the energy is counted.
 _POINTS = 96
 
-
 FULL = PsfMethod("separable", "float64", True)
+# For the capture's energy, which fringes hardly change: few nodes of the pixel average.
+_ROUGH = PsfMethod("separable", "float32", True, nodes=6)
 
 
 class SeenScene:
@@ -42,9 +50,11 @@ class SeenScene:
         self.wavelengths = tuple(float(w) for w in scene.spectrum.wavelengths)
         self.weights = np.asarray(scene.spectrum.weights, float)
         self.batch = math.prod(scene.planes[0].image.shape[:-2])
-        shape = kernel_shape(camera.sensor.shape, self.field_shape)
+        self.kernel_grid = kernel_grid(camera.sensor.grid, self.field_shape)
+        shape = self.kernel_grid.shape
         self.frequencies = sample_frequencies(max(shape))
-        self.probe = TransferProbe(camera, shape, self.frequencies)
+        probe_of = TransferProbe if has_few_terms(camera.mask) else SampledProbe
+        self.probe = probe_of(camera, shape, self.frequencies)
         fields = [
             np.asarray(project(camera, p, self.field_shape), float).reshape(-1, *self.field_shape)
             for p in scene.planes
@@ -69,10 +79,19 @@ class SeenScene:
 
     @functools.cached_property
     def references(self) -> list[Complex[np.ndarray, " k"]]:
-        return [
-            self.probe.exact(w, t, FULL.model, FULL.precision, FULL.pixel_integration)
-            for w, t in self.corners
-        ]
+        assert isinstance(self.probe, TransferProbe)
+        return [self.probe.exact(w, t, FULL) for w, t in self.corners]
+
+    @functools.cached_property
+    def rough(self) -> PsfMethod:
+        """What shows the capture's energy."""
+        return _ROUGH if isinstance(self.probe, TransferProbe) else self.sampled(1)
+
+    def sampled(self, least: int) -> PsfMethod:
+        """`angular_spectrum` with the samples that hold the mask for all light, or with more."""
+        mask, grid, model = self.camera.mask, self.kernel_grid, "angular_spectrum"
+        held = [samples_needed(mask, grid, self.camera.path(*c), model) for c in self.corners]
+        return psf_method(mask, grid, model, True, "float32", max(3, least, *held))
 
     def relative(self, error: Complex[np.ndarray, "*batch k"]) -> float:
         """Norm of an image given by its spectrum, relative to that of the capture."""
@@ -97,7 +116,7 @@ class SeenScene:
         """Of the capture, at the wavelength in the middle of the light."""
         middle = float(np.quantile(self.wavelengths, 0.5, method="nearest"))
         capture = sum(
-            self.probe.quick(middle, distance, "separable", True, _ENERGY_NODES) * spectrum
+            self.probe.quick(middle, distance, self.rough) * spectrum
             for distance, spectrum in zip(self.distances, self.spectra, strict=True)
         )
         light = self.weights.sum() ** 2
@@ -106,13 +125,12 @@ class SeenScene:
     @property
     def models(self) -> tuple[Model, ...]:
         """Closed forms that can represent the mask."""
-        return tuple(m for m in models_of(self.camera.mask) if m not in SAMPLED)
+        return tuple(m for m in models_of(self.camera.mask) if m in CLOSED)
 
     def held_in_single(self, model: str) -> bool:
         """Whether float32 can represent the zones' phases on the kernel's grid for every plane."""
-        grid = kernel_grid(self.camera.sensor.grid, self.field_shape)
         path = self.camera.path(min(self.wavelengths), max(self.distances))
-        return held_in_single(self.camera.mask, grid, path, model)
+        return held_in_single(self.camera.mask, self.kernel_grid, path, model)
 
     @property
     def edge_wave(self) -> float:
@@ -122,8 +140,7 @@ class SeenScene:
         return zone / (math.pi * width)
 
     def psf_cost(self, method: PsfMethod) -> Cost:
-        grid = kernel_grid(self.camera.sensor.grid, self.field_shape)
-        return psf_cost(self.camera.mask, grid, method)
+        return psf_cost(self.camera.mask, self.kernel_grid, method)
 
     def cost(self, method: PsfMethod, planes: int, colours: int) -> Cost:
         """Of a capture from so many PSFs, for all planes of the scene."""

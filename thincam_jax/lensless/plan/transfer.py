@@ -19,10 +19,9 @@ from thincam_jax._core.precision import Precision, allow, cast, product
 from thincam_jax.lensless.accuracy.lines import SparseGrid
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.masks.base import AbstractMask
-from thincam_jax.lensless.method import Model
+from thincam_jax.lensless.method import Model, PsfMethod
 from thincam_jax.lensless.propagation.path import Path
-from thincam_jax.lensless.propagation.separable import PIXEL_NODES
-from thincam_jax.lensless.psf import closed_terms
+from thincam_jax.lensless.psf import closed_terms, psf
 
 # Rings of frequencies, and frequencies in each.
 _RINGS, _IN_RING = 32, 16
@@ -89,7 +88,7 @@ def image_spectrum(
 
 
 class TransferProbe:
-    r"""H(v, u) of a camera with a zone mask at given frequencies, for any distance and wavelength.
+    r"""H(v, u) of a camera with a mask of few terms, at given frequencies.
 
     A separable sum transforms axis by axis, :math:`H = \sum_f \hat Y_f(v)\hat X_f(u)`: a thousandth
     of the work of an image and its transform. Frequencies are in cycles per sample of the kernel's
@@ -111,24 +110,12 @@ class TransferProbe:
         ]
 
     def exact(
-        self,
-        wavelength: float,
-        distance: float,
-        model: Model,
-        precision: Precision,
-        pixel_integration: bool,
+        self, wavelength: float, distance: float, method: PsfMethod
     ) -> Complex[np.ndarray, " k"]:
-        """H with factors in that precision, transformed in double precision."""
+        """H with factors in the method's precision, transformed in double precision."""
         with allow("float64"):
-            return self._transfer(
-                self._double_waves,
-                precision,
-                wavelength,
-                distance,
-                model,
-                pixel_integration,
-                PIXEL_NODES,
-            )
+            waves = self._double_waves
+            return self._transfer(waves, wavelength, distance, method, method.precision)
 
     @functools.cached_property
     def _double_waves(self) -> tuple[Float[Array, "n k2"], ...]:
@@ -139,27 +126,46 @@ class TransferProbe:
         return tuple(jnp.asarray(w, jnp.float32) for w in self.waves)
 
     def quick(
-        self, wavelength: float, distance: float, model: Model, pixel_integration: bool, nodes: int
+        self, wavelength: float, distance: float, method: PsfMethod
     ) -> Complex[np.ndarray, " k"]:
-        """H in single precision, with a chosen number of nodes a pixel, for many PSFs."""
-        return self._transfer(
-            self._single_waves,
-            "float32",
-            wavelength,
-            distance,
-            model,
-            pixel_integration,
-            nodes,
-        )
+        """H in single precision, with the method's nodes a pixel, for many PSFs."""
+        return self._transfer(self._single_waves, wavelength, distance, method, "float32")
 
     def _transfer(
-        self, waves_of, precision, wavelength, distance, model, pixel_integration, nodes
+        self, waves_of, wavelength: float, distance: float, method: PsfMethod, precision: Precision
     ) -> Complex[np.ndarray, " k"]:
         path = self.camera.path(float(wavelength), float(distance))
         mask, pitch, path = cast((self.camera.mask, self.camera.sensor.pitch, path), precision)
         points = SparseGrid(self.places[0], self.places[1], pitch)
-        transfer = _transfer(mask, points, path, *waves_of, model, pixel_integration, nodes)
-        return np.asarray(transfer, complex)
+        how = method.model, method.pixel_integration, method.nodes
+        return np.asarray(_transfer(mask, points, path, *waves_of, *how), complex)
+
+
+class SampledProbe:
+    """H(v, u) of a camera whose mask has no few terms, from its whole PSF, a wavelength a time."""
+
+    def __init__(
+        self, camera: LenslessCamera, kernel_shape: tuple[int, int], frequencies: Frequencies
+    ) -> None:
+        self.camera, self.frequencies = camera, frequencies
+        self.grid = camera.sensor.grid.with_shape(kernel_shape)
+
+    def quick(
+        self, wavelength: float, distance: float, method: PsfMethod
+    ) -> Complex[np.ndarray, " k"]:
+        """H of the PSF as a plan computes it."""
+        h = psf(
+            self.camera,
+            wavelength=wavelength,
+            object_distance=distance,
+            model=method.model,
+            pixel_integration=method.pixel_integration,
+            grid=self.grid,
+            oversampling=method.oversampling,
+            mask_shape=method.mask_shape,
+            precision=method.precision,
+        )
+        return image_spectrum(np.asarray(h, float)[None], self.frequencies)[0]
 
 
 @jax.jit(static_argnames=("model", "pixel_integration", "nodes"))
