@@ -5,7 +5,7 @@ import pytest
 from lensless.plan.scenes import camera
 
 import thincam_jax as tc
-from thincam_jax.lensless.method import CLOSED
+from thincam_jax.lensless.method import CLOSED, PsfMethod
 from thincam_jax.lensless.plan.transfer import (
     TransferProbe,
     _rounded_up,
@@ -43,9 +43,10 @@ def test_exact_and_quick_agree_with_the_sum_over_the_psf(model, average):
     )
     expected = direct(h, frequencies)
     scale = np.abs(expected).max()
-    exact = probe.exact(500 * nm, 250.0, model, "float64", average)
+    method = PsfMethod(model, "float64", average)
+    exact = probe.exact(500 * nm, 250.0, method)
     np.testing.assert_allclose(exact, expected, atol=1e-11 * scale)
-    quick = probe.quick(500 * nm, 250.0, model, average, 24)
+    quick = probe.quick(500 * nm, 250.0, method)
     np.testing.assert_allclose(quick, expected, atol=2e-5 * scale)
 
 
@@ -54,7 +55,8 @@ def test_six_nodes_serve_to_compare():
     own = camera()
     frequencies = sample_frequencies(max(KERNEL))
     probe = TransferProbe(own, KERNEL, frequencies)
-    few, many = (probe.quick(500 * nm, 250.0, "separable", True, n) for n in (6, 24))
+    methods = (PsfMethod("separable", "float32", True, nodes=n) for n in (6, 24))
+    few, many = (probe.quick(500 * nm, 250.0, method) for method in methods)
     energy = np.sum(frequencies.weights * np.abs(many) ** 2)
     moved = np.sum(frequencies.weights * np.abs(few - many) ** 2)
     assert 0 < np.sqrt(moved / energy) < 1.2e-2
