@@ -12,6 +12,7 @@ docs/images/learned_measured.png of pictures that no weight has seen, either.
 import sys
 import time
 from collections.abc import Callable, Iterable
+from itertools import cycle
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -130,11 +131,11 @@ def one_plane(camera, picture, distance: float, seed: int, snr: float = SNR) -> 
     return shoot(camera, scene, (distance,), seed, snr)
 
 
-def two_planes(camera, pair, cover, seed: int, distances=(NEAR, FAR)) -> Shot:
+def two_planes(camera, pair, cover, seed: int, distances=(NEAR, FAR), snr: float = SNR) -> Shot:
     """The first of two pictures, where the cover is, before the second."""
     covers = [cover, np.ones(camera.field_shape)]
     scene = flat_scene(camera, pair, covers, distances)
-    return shoot(camera, scene, distances, seed)
+    return shoot(camera, scene, distances, seed, snr)
 
 
 def rectangle(shape, seed: int) -> np.ndarray:
@@ -148,23 +149,24 @@ def rectangle(shape, seed: int) -> np.ndarray:
     return 1.0 * ((abs(u) < 0.3 * max(shape)) & (abs(v) < 0.2 * max(shape)))
 
 
-def halves(camera, pairs, is_left: bool) -> list[Shot]:
+def halves(
+    camera, pairs, is_left: bool, seed: int = 200, distances=(NEAR, FAR), snr: float = SNR
+) -> list[Shot]:
     """The left half of the frame near, or all of that in a mirror, with the same seeds."""
     rows, columns = camera.field_shape
     cover = np.broadcast_to(1.0 * (np.arange(columns) < columns // 2), (rows, columns))
     turn = slice(None, None, 1 if is_left else -1)
     return [
-        two_planes(camera, [picture[:, turn] for picture in pair], cover[:, turn], 200 + n)
+        two_planes(camera, [p[:, turn] for p in pair], cover[:, turn], seed + n, distances, snr)
         for n, pair in enumerate(pairs)
     ]
 
 
-def tune(methods: Methods, pictures, count: int) -> None:
+def tune(methods: Methods, pictures, count: int, distances=(NEAR, FAR, 180.0)) -> None:
     """The strength of each baseline that is best on the training's own images, in one plane."""
-    distances = [NEAR, FAR, 180.0]
     shots = [
-        one_plane(methods.camera, pictures[n % len(pictures)], distances[n % 3], 900 + n)
-        for n in range(count)
+        one_plane(methods.camera, picture, t, 900 + n)
+        for n, picture, t in zip(range(count), cycle(pictures), cycle(distances), strict=False)
     ]
     for name, run in (("Wiener", methods.wiener), ("ADMM-TV", methods.admm)):
         found = {}
@@ -187,12 +189,13 @@ def head(columns: Iterable[str]) -> None:
 
 def row(
     name: str, camera, runs: dict[str, Callable], shots: list[Shot], distance: float, seeds: int = 1
-) -> None:
+) -> np.ndarray:
     """One line of the table. With seeds, a last column: the gain of the last method on each other.
 
     `seeds`: so many shots of each scene, all scenes of a seed after those of the one before.
+    Returns the PSNR, (method, shot).
     """
-    cells, means = [], []
+    cells, means, qualities = [], [], []
     for run in runs.values():
         each = []
         for shot in shots:
@@ -200,12 +203,14 @@ def row(
             found = scores(run(shot, distance), shot.target(camera, distance), region)
             each.append((found["psnr"], found["ssim"], found["ms_ssim"]))
         quality, similarity, multiscale = np.transpose(each)
+        qualities.append(quality)
         means.append(quality.reshape(seeds, -1).mean(axis=0))
         told = f"{similarity.mean():.3f} / {multiscale.mean():.3f}"
         cells.append(f"{interval(means[-1])} / {told}")
     if seeds > 1:
         cells.append(", ".join(interval(means[-1] - mean, "+") for mean in means[:-1]))
     print(f"| {name} | " + " | ".join(cells) + " |", flush=True)
+    return np.stack(qualities)
 
 
 def interval(values: np.ndarray, sign: str = "") -> str:

@@ -12,8 +12,11 @@ import PIL.Image
 import pytest
 from commands.photo import simulated
 
+import thincam_jax as tc
 from helpers import ROOT
+from thincam_jax import learn
 from thincam_jax.imaging.metrics import psnr
+from thincam_jax.units import nm, um
 
 PACKAGE = ROOT / "thincam_jax"
 
@@ -203,6 +206,34 @@ def test_picture_of_the_rooms_can_be_drawn(tmp_path):
     today = {room: used for room, (_, used) in script["rooms_and_imports"]().items()}
     script["draw"](tmp_path / "rooms.png")
     assert script["imports_drawn"](tmp_path / "rooms.png") == today
+
+
+@pytest.mark.thorough
+def test_learned_compared_page(monkeypatch):
+    """What the page says of the optics of both cameras; at small size, too, the thesis' planes are
+    not told apart, and those here are."""
+    monkeypatch.syspath_prepend(str(ROOT / "docs"))
+    page = (ROOT / "docs/learned_compared.md").read_text("utf-8")
+    with jax.enable_x64(False), jax.numpy_dtype_promotion("standard"):  # as a user has it
+        script = runpy.run_path(str(ROOT / "docs/thesis_refocusing.py"))
+        thesis, optics = script["thesis_camera"], script["optics"]
+        here = script["build_camera"](script["load_learned"](ROOT / "configs/learned_refocus.yaml"))
+        for camera, distances in ((thesis(256), script["THESIS"]), (here, (60.0, 120.0))):
+            found = optics(camera, distances)
+            row = [f"{found['depth of focus']:.0f} mm", f"{found['wider']:.2g}"]
+            assert f"| {' | '.join(row)} | {found['difference']:.2f} |" in page
+        assert round(float(script["axial_resolution"](thesis(2048).camera, 160.0))) == 46
+        leaves = list(script["dead_leaves"](7, 4, 32).astype(float))
+
+        def lost(camera, distances):
+            runs = {"Wiener": script["baselines"](camera).wiener}
+            return np.mean(script["table"](camera, runs, leaves, 2, distances))
+
+        mask = tc.FresnelZoneAperture(beta=3.2, width=5.6)
+        thin = tc.LenslessCamera(mask, tc.Sensor((64, 64), 176 * um), 7.5)
+        able = learn.RefocusCamera(thin, 500 * nm, field_shape=(32, 32), near=50.0, far=200.0)
+        assert abs(lost(thesis(64), script["THESIS"])) < 0.05
+        assert lost(able, (60.0, 120.0)) > 0.5
 
 
 @pytest.mark.thorough
