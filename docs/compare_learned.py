@@ -1,28 +1,36 @@
 """What the distance in the optics is worth: networks trained alike, with it and without.
 
-`python docs/compare_learned.py CONFIG IMAGES TUNING [COUNT] [STEPS] [POOL]`, as
-docs/score_refocusing.py, for a camera of a quarter of the pixels. Networks
-and codes are trained on the same scenes, for the same CPU time:
+`python docs/compare_learned.py CONFIG IMAGES TUNING [COUNT] [STEPS] [POOL] [SEEDS]`, as
+docs/score_refocusing.py, for a camera of a quarter of the pixels. Networks and codes are trained
+on the same scenes, for the same CPU time (without compiling; the network's with drawing them),
+with so many seeds of scenes, weights and noise:
 
 - the network of the package, for any distance, and on scenes at 60 and 120 mm alone;
 - the control code of the thesis (chapter 4): a U-Net that is told the distance as a number beside
-  the linear inversion at the middle distance; trained on both, too;
+  the linear inversion at the middle distance; trained on both, too. What is trained on two
+  distances is so with the first seed alone;
 - `UnrolledAdmm`: five iterations of ADMM-TV with learnt penalties, which are few: 60 steps on 24
   flat scenes of TUNING.
+
+A table for each seed as it ends; then that of all, and what the network gains on the others.
 """
 
 import dataclasses
 import sys
 import time
+from collections.abc import Callable
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
+from scipy.stats import t as student
 from score_refocusing import (
     FAR,
     NEAR,
     Methods,
     Shot,
+    halves,
     head,
     one_plane,
     rectangle,
@@ -55,7 +63,8 @@ class Coded:
     def __init__(self, lessons, network, options, seconds: float):
         """Trained for some CPU time."""
         camera = network.camera
-        model = ControlCode.create(camera, (48, 64, 64, 64), key=jax.random.key(3))
+        key = jax.random.fold_in(jax.random.key(3), options.seed)
+        model = ControlCode.create(camera, (48, 64, 64, 64), key=key)
         batches = list(lessons.drawn(network, options.seed, lessons.pool))
 
         def draw(key):
@@ -70,9 +79,9 @@ class Coded:
         task = Task(draw, control_loss, lessons.validation(network, options.seed), learned)
         # The first run compiles, the second tells how long a step takes.
         short = dataclasses.replace(options, steps=20, check_every=20)
-        for _ in range(2):
-            began = time.process_time()
-            train_model(task, model, short)
+        train_model(task, model, short)
+        began = time.process_time()
+        train_model(task, model, short)
         steps = int(20 * seconds / (time.process_time() - began))
         whole = dataclasses.replace(options, steps=steps)
         self.model = train_model(task, model, whole).model
@@ -85,14 +94,17 @@ class Coded:
 class Unrolled:
     """`UnrolledAdmm` as a method: all of the scene stands at the distance."""
 
-    def __init__(self, camera, pictures):
+    def __init__(self, camera, pictures, seed: int):
         self.camera = camera
-        shots = [one_plane(camera, pictures[n % len(pictures)], 85.0, 5000 + n) for n in range(24)]
+        shots = [
+            one_plane(camera, pictures[n % len(pictures)], 85.0, 5000 + 100 * seed + n)
+            for n in range(24)
+        ]
         problem = self.problem(shots, 85.0)
         images = jnp.stack([shot.target(camera, 85.0) for shot in shots])[:, None, None]
         model = UnrolledAdmm(problem, 5)
-        trained = train(model, problem, images, key=jax.random.key(4), steps=60)
-        self.model = trained.model
+        key = jax.random.fold_in(jax.random.key(4), seed)
+        self.model = train(model, problem, images, key=key, steps=60).model
 
     def problem(self, shots, distance: float) -> InverseProblem:
         captures = jnp.stack([shot.capture for shot in shots])[:, None]
@@ -114,59 +126,111 @@ def _unrolled(model, problem):
     return model(problem)
 
 
-def trained_networks(config) -> tuple[dict, float]:
-    """The package's network on both kinds of scenes, and the CPU time of the first."""
-    options, lessons, found, took = build_options(config), build_lessons(config), {}, []
-    for name, kinds in kinds_of(lessons).items():
-        began = time.process_time()
-        network = build_network(config)
-        found[name] = learn.train(network, lessons._replace(scenes=kinds), options).model
-        took.append(time.process_time() - began)
-        print(f"network, {name}: {took[-1]:.0f} s of CPU", flush=True)
-    return found, took[0]
+def learned(config, known) -> dict[str, Callable]:
+    """All that is trained, by the seed of a config: `known` pictures for the iterations."""
+    network, options, lessons = build_network(config), build_options(config), build_lessons(config)
+    kinds = {"any distance": lessons.scenes}
+    if not config.seed:
+        kinds["60 and 120 mm"] = lessons.scenes._replace(distances=(NEAR, FAR))
+    runs = {"UnrolledAdmm": Unrolled(network.camera, known, config.seed).focus}
+    codes, networks = {}, {}
+    for name, scenes in kinds.items():
+        given, began = lessons._replace(scenes=scenes), time.process_time()
+        networks[f"network, {name}"] = Methods(learn.train(network, given, options).model).learned
+        seconds = time.process_time() - began
+        print(f"network, {name}: {seconds:.0f} s of CPU", flush=True)
+        codes[f"code, {name}"] = Coded(given, network, options, seconds).focus
+    return {**runs, **codes, **networks}
 
 
-def kinds_of(lessons) -> dict:
-    scenes = lessons.scenes
-    return {"any distance": scenes, "60 and 120 mm": scenes._replace(distances=(NEAR, FAR))}
+def table(camera, runs: dict[str, Callable], pictures, count: int, seed: int) -> dict:
+    """PSNR by test and method, (photograph); printed as it is found."""
+    noise, found = 1000 * seed, {}
+    pairs = [(pictures[n], pictures[-1 - n]) for n in range(count)]
 
+    def test(name, shots, t):
+        name = f"{name}, {t:g} mm"
+        found[name] = dict(zip(runs, row(name, camera, runs, shots, t), strict=True))
 
-def main(config, images: str, tuned: str, count: int) -> None:
-    networks, seconds = trained_networks(config)
-    network = networks["any distance"]
-    camera, options, lessons = network.camera, build_options(config), build_lessons(config)
-    side = 5 * max(camera.field_shape) // 4
-    pictures, known = (squares(folder, camera, side) for folder in (images, tuned))
-    methods = Methods(network)
-    tune(methods, known, min(count, 6))
-    runs = {"Wiener": methods.wiener, "ADMM-TV": methods.admm}
-    runs["UnrolledAdmm"] = Unrolled(camera, known).focus
-    for name, kinds in kinds_of(lessons).items():
-        coded = Coded(lessons._replace(scenes=kinds), network, options, seconds)
-        runs[f"code, {name}"] = coded.focus
-    for name, one in networks.items():
-        runs[f"network, {name}"] = Methods(one).learned
     head(runs)
     for t in (NEAR, FAR, *UNTRAINED):
-        shots = [one_plane(camera, pictures[n], t, n) for n in range(count)]
-        row(f"one plane, {t:g} mm", camera, runs, shots, t)
+        shots = [one_plane(camera, pictures[n], t, noise + n) for n in range(count)]
+        test("one plane", shots, t)
     for distances in ((NEAR, FAR), OTHERS):
         shots = [
-            two_planes(
-                camera,
-                (pictures[n], pictures[-1 - n]),
-                rectangle(camera.field_shape, n),
-                n,
-                distances,
-            )
-            for n in range(count)
+            two_planes(camera, pair, rectangle(camera.field_shape, n), noise + n, distances)
+            for n, pair in enumerate(pairs)
         ]
         for t in distances:
-            row(f"two planes, {t:g} mm", camera, runs, shots, t)
+            test("two planes", shots, t)
+    for is_left in (True, False):
+        shots = halves(camera, pairs, is_left, 200 + noise)
+        for t in (NEAR, FAR):
+            test(f"near half {'left' if is_left else 'right'}", shots, t)
+    return found
+
+
+def summary(tables: list[dict]) -> None:
+    """Means over photographs and seeds; what the network gains; what swapped halves change."""
+    names = list(tables[0][f"one plane, {NEAR:g} mm"])
+    best = "network, any distance"
+    every = [name for name in names if name in tables[-1][f"one plane, {NEAR:g} mm"]]
+    of = {
+        test: {name: np.stack([t[test][name] for t in tables if name in t[test]]) for name in names}
+        for test in tables[0]
+    }
+    head(names)
+    for test, found in of.items():
+        print(f"| {test} | " + " | ".join(f"{found[n].mean():.2f}" for n in names) + " |")
+    print(f"\nWhat '{best}' gains on each")
+    head(n for n in every if n != best)
+    groups = {
+        "one plane, mean": [test for test in of if test.startswith("one plane")],
+        "two planes, mean": [test for test in of if test.startswith("two planes")],
+    }
+    for test, members in {**{test: [test] for test in of}, **groups}.items():
+        gains = [
+            interval(np.mean([of[m][best] - of[m][n] for m in members], axis=0))
+            for n in every
+            if n != best
+        ]
+        print(f"| {test} | " + " | ".join(gains) + " |")
+    print("\nWhat a swap of the halves adds")
+    head(names)
+    for t in (NEAR, FAR):
+        left, right = (of[f"near half {side}, {t:g} mm"] for side in ("left", "right"))
+        print(f"| {t:g} mm | " + " | ".join(interval(right[n] - left[n]) for n in names) + " |")
+
+
+def interval(values: np.ndarray) -> str:
+    """The mean of (seed, photograph) and half of its 95 % interval, over both."""
+    halves = [
+        student.ppf(0.975, len(v) - 1) * v.std(ddof=1) / len(v) ** 0.5
+        for v in (values.mean(axis=0), values.mean(axis=1))
+        if len(v) > 1
+    ]
+    return f"{values.mean():+.2f} ± {np.hypot.reduce(halves):.2f}"
+
+
+def main(configs, images: str, tuned: str, count: int) -> None:
+    methods = Methods(build_network(configs[0]))
+    camera = methods.camera
+    side = 5 * max(camera.field_shape) // 4
+    pictures, known = (squares(folder, camera, side) for folder in (images, tuned))
+    tune(methods, known, min(count, 6))
+    plain, tables = {"Wiener": methods.wiener, "ADMM-TV": methods.admm}, []
+    # Compiled before any time is taken.
+    lessons, options = build_lessons(configs[0])._replace(pool=1), build_options(configs[0])
+    learn.train(methods.network, lessons, dataclasses.replace(options, steps=2, check_every=1))
+    for config in configs:
+        runs = {**plain, **learned(config, known)}
+        tables.append(table(camera, runs, pictures, count, config.seed))
+    summary(tables)
 
 
 if __name__ == "__main__":
     path, images, tuned, *more = sys.argv[1:]
-    count, steps, pool = more + ["8", "4000", "120"][len(more) :]
-    config = load_learned(path, (*SMALL, f"training.steps={steps}", f"training.pool={pool}"))
-    main(config, images, tuned, int(count))
+    count, steps, pool, seeds = more + ["8", "4000", "120", "3"][len(more) :]
+    told = (*SMALL, f"training.steps={steps}", f"training.pool={pool}")
+    configs = [load_learned(path, (*told, f"seed={seed}")) for seed in range(int(seeds))]
+    main(configs, images, tuned, int(count))
