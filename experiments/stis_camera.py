@@ -188,7 +188,8 @@ def models(mask_psf, object_distance):
     first = jax.tree.map(lambda part: part[:1, middle, middle], few)
     alone = wg.ghost_psfs(first, mask_psf) / level
     fit = low_rank_psf(psfs, pitch, sensor.shape, field, tolerance=1e-2)
-    print(f"{fit.operator.weights.shape[0]} convolutions, errors {fit[1]:.1e} and {fit[2]:.1e}")
+    errors = f"{fit.truncation_error:.1e} and {fit.interpolation_error:.1e}"
+    print(f"{fit.operator.weights.shape[0]} convolutions, errors {errors}")
     found = {
         "ghosts ignored": CropConvolution(alone, pitch, sensor.shape, field),
         "shift-invariant": CropConvolution(psfs[middle, middle], pitch, sensor.shape, field),
