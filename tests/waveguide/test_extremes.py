@@ -111,7 +111,7 @@ def error(name, dtype):
     found = np.asarray(rays.points[..., :2], float)
     assert np.isfinite(found).all() and np.isfinite(np.asarray(rays.weight)).all()
     band = wg.trace_band(sts, jnp.stack(pixel)[None], distance, 4, 8)
-    assert all(np.isfinite(np.asarray(part)).all() for part in band)
+    assert all(np.isfinite(np.asarray(part)).all() for part in (band.points, band.weight))
     return np.abs(found - expected).max() / np.abs(expected).max(), set(np.asarray(rays.status))
 
 

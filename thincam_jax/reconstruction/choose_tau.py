@@ -1,7 +1,7 @@
 """Weights of the regularisation found from the captures: discrepancy principle and SURE."""
 
 import math
-from typing import NamedTuple
+from dataclasses import replace
 
 import equinox as eqx
 import jax
@@ -20,7 +20,7 @@ _SPAN = (0.8, 4.0)
 _UNCERTAIN, _NOTICED = 0.3, 1.1
 
 
-class ChosenTau(NamedTuple):
+class ChosenTau(eqx.Module):
     """A problem with its τ found, its image, and (τ, criterion) of all that were tried.
 
     `reason` says what was noticed on the way.
@@ -57,7 +57,7 @@ def find_tau(rule: str, problem: InverseProblem, image: Float[Array, "..."]) -> 
         f"tau is at least {least:.3g}"
     )
     raised = with_tau(problem, max(tau, least))
-    return found._replace(problem=raised, reason=reason)
+    return replace(found, problem=raised, reason=reason)
 
 
 def discrepancy_tau(

@@ -10,7 +10,8 @@ import abc
 import math
 import time
 from collections.abc import Callable
-from typing import Any, ClassVar, Generic, Literal, NamedTuple, TypeVar
+from dataclasses import dataclass
+from typing import Any, ClassVar, Generic, Literal, TypeVar
 
 import equinox as eqx
 import jax
@@ -22,7 +23,8 @@ Method_State = TypeVar("Method_State")
 Status = Literal["converged", "iterations_exhausted", "stopped", "interrupted", "non_finite"]
 
 
-class Residuals(NamedTuple):
+@dataclass(frozen=True)
+class Residuals:
     """How far an iteration is from its end, each relative to what it is a residual of.
 
     - `parts`: the same of each of several splits, for methods that weigh them.
@@ -35,7 +37,8 @@ class Residuals(NamedTuple):
     apart: tuple["Residuals", ...] = ()
 
 
-class Progress(NamedTuple):
+@dataclass(frozen=True)
+class Progress:
     """What a callback sees, and the history keeps.
 
     - `objective`: of the image; summed over a batch.
@@ -48,7 +51,7 @@ class Progress(NamedTuple):
     dual: float
 
 
-class Outcome(NamedTuple):
+class Outcome(eqx.Module):
     """The image with the lowest objective among those looked at, and how it came about."""
 
     image: Float[Array, "*batch channel plane y x"]
@@ -178,7 +181,8 @@ def drive(
             state = method.advance(state, count)
             done += count
             residuals, current = method.residuals(state), method.image(state)
-            progress = Progress(done, float(jnp.sum(method.objective(current))), *residuals[:2])
+            objective = float(jnp.sum(method.objective(current)))
+            progress = Progress(done, objective, residuals.primal, residuals.dual)
             if not math.isfinite(progress.objective):
                 status = "non_finite"
                 break

@@ -9,7 +9,7 @@ whatever way q* was found. Neither iterations nor their number are stored. T is 
 series Σ Jⁿ that `NeumannSeries` sums converges as the iteration itself does.
 """
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -18,12 +18,13 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from thincam_jax._core.checks import Number
+from thincam_jax._core.module import Module
 from thincam_jax.reconstruction.admm import RELAXATION, Admm, splitting_of
 from thincam_jax.reconstruction.problem import InverseProblem
 from thincam_jax.reconstruction.splitting import Penalties, admm_map
 
 
-class FixedPoint(NamedTuple):
+class FixedPoint(Module):
     """An image, and whether it is one: iterations done, converged before they ran out."""
 
     image: Float[Array, "*batch channel plane y x"]

@@ -2,7 +2,8 @@ r"""Whether a measured PSF is that of a capture: other scales, turns and mirror 
 
 import math
 from collections.abc import Callable
-from typing import Literal, NamedTuple
+from dataclasses import dataclass
+from typing import Literal
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -42,7 +43,8 @@ _SIGNIFICANCE = 4.0  # standard errors
 _LEAST_GAIN = 0.02  # of the objective, for another orientation
 
 
-class PsfCheck(NamedTuple):
+@dataclass(frozen=True)
+class PsfCheck:
     """What `check_psf` found.
 
     - `orientation`: what the PSF given has to undergo to fit best; the turns are anticlockwise.
@@ -67,7 +69,8 @@ class PsfCheck(NamedTuple):
         return not self.reasons
 
 
-class _Tried(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class _Tried:
     """A PSF tried: the lowest objective, and ½ w r² summed over blocks of pixels."""
 
     objective: float

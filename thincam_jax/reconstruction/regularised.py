@@ -4,7 +4,7 @@ import abc
 import dataclasses
 import math
 import time
-from typing import Any, ClassVar, Literal, NamedTuple, get_args
+from typing import Any, ClassVar, Literal, get_args
 
 import equinox as eqx
 import jax
@@ -44,7 +44,7 @@ _BALANCED = 30
 _FIRST_PART = 0.4
 
 
-class Start(NamedTuple):
+class Start(eqx.Module):
     """A first image, and whether the user gave it."""
 
     image: Float[Array, "*batch channel plane y x"]
@@ -106,7 +106,7 @@ class AbstractRegularised(AbstractIterativeSolver):
             problem, reason = found.problem, found.reason
         outcome = self.minimise(problem, Start(image, given), callback)
         if rule:
-            outcome = outcome._replace(seconds=time.perf_counter() - began)
+            outcome = dataclasses.replace(outcome, seconds=time.perf_counter() - began)
         result = recording.reconstruction(problem, outcome, self.name, float(problem.tau))
         return dataclasses.replace(result, reason=reason) if reason else result
 
@@ -170,9 +170,11 @@ class AdmmTV(AbstractRegularised):
         try:
             second = self._by_admm(problem, first.image, callback, first.iterations)
         except KeyboardInterrupt:  # before its iterations, which keep their own best image
-            return first._replace(status="interrupted")
-        return second._replace(
-            history=first.history + second.history[1:], seconds=first.seconds + second.seconds
+            return dataclasses.replace(first, status="interrupted")
+        return dataclasses.replace(
+            second,
+            history=first.history + second.history[1:],
+            seconds=first.seconds + second.seconds,
         )
 
     def _by_admm(self, problem, image, callback, done: int = 0) -> Outcome:
@@ -203,7 +205,7 @@ class AdmmTV(AbstractRegularised):
             adapt_until=min(_BALANCED, count // 2),
             callback=callback,
         )
-        return outcome._replace(image=levelled(problem, outcome.image))
+        return dataclasses.replace(outcome, image=levelled(problem, outcome.image))
 
 
 class Fista(AbstractRegularised):

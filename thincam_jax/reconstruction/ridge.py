@@ -19,6 +19,7 @@ import functools
 import operator
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import ClassVar, cast
 
 import equinox as eqx
@@ -114,7 +115,7 @@ class Ridge(AbstractSolver):
             tolerance=self.tolerance,
         )
         if prior is not None:
-            outcome = outcome._replace(image=mean + prior.image(outcome.image))
+            outcome = replace(outcome, image=mean + prior.image(outcome.image))
         return recording.reconstruction(problem, outcome, self.name)
 
     def deviation(self, recording: Recording) -> Float[Array, "*plane y x"]:

@@ -16,8 +16,9 @@ the Bragg condition.
 
 import math
 from collections.abc import Callable
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -112,7 +113,7 @@ def in_blocks(function: Callable[..., Any], *rays: Float[Array, "ray ..."]):
     return jax.tree.map(lambda array: array.reshape(-1, *array.shape[2:])[:count], found)
 
 
-class Band(NamedTuple):
+class Band(eqx.Module):
     """The light that both holograms diffract towards a pixel, sampled evenly in wavelength.
 
     - `wavelengths`: (*ray, node), mm. `step`: between neighbours, mm, (*ray).

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -18,6 +17,7 @@ from thincam_jax.imaging.operators import Separable, Sparse
 from thincam_jax.imaging.refractive_index import ConstantIndex
 from thincam_jax.waveguide.camera import SeeThroughCamera
 from thincam_jax.waveguide.rays import RayStatus, pixel_centres, trace
+from thincam_jax.waveguide.smear import SmearedRays
 from thincam_jax.waveguide.system import (
     ObjectPlane,
     footprints,
@@ -171,7 +171,8 @@ def without_dispersion(camera: SeeThroughCamera) -> SeeThroughCamera:
     return eqx.tree_at(lambda c: (c.screen.hologram.index, c.screen.glass_index), camera, constant)
 
 
-class _Rays(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class _Rays:
     """`SmearedRays` as NumPy arrays in double precision."""
 
     points: Float[np.ndarray, "order pixel sample 2"]
@@ -234,7 +235,7 @@ class _Probe:
             most = None if samples is None else _SAMPLES[-1]
             camera, places, plane = cast((camera, places, self.planes[0]), precision)
             found = smeared_rays(camera, places, plane, _ORDERS[-1], most)
-            self._traced[key] = _Rays(*(np.asarray(part, float) for part in found))
+            self._traced[key] = _as_numpy(found)
         return _grouped(self._traced[key], samples or 1)
 
     def seen(self, rays: _Rays, orders: int | None = None) -> np.ndarray:
@@ -367,7 +368,7 @@ def _separable(camera, plane, size, counts, level) -> Separable:
     horizontal = smeared_rays(
         camera, jnp.stack([grid.x, jnp.full_like(grid.x, row)], -1), plane, *counts
     )
-    x = _mean_x(_Rays(*(np.asarray(part, float) for part in horizontal)), counts[0])
+    x = _mean_x(_as_numpy(horizontal), counts[0])
     places = np.stack([x, np.full_like(x, float(plane.centre[1]))], axis=-1)
     right = _overlaps(places[None, :, None], plane, size, 1)[0, :, 0]
     left = _overlaps(np.asarray(vertical.points), plane, size, 0)
@@ -379,7 +380,8 @@ def _separable(camera, plane, size, counts, level) -> Separable:
 
 def _overlaps(points, plane, size, axis):
     """Parts of the light of each point from every row (axis 0) or column of cells."""
-    first, parts = (part[axis] for part in footprints(points, plane, size))
+    seen = footprints(points, plane, size)
+    first, parts = seen.first[axis], seen.parts[axis]
     dense = np.zeros((*first.shape, plane.shape[axis]))
     for offset in range(parts.shape[-1]):
         cell = first + offset
@@ -399,6 +401,10 @@ def _mean_x(rays: _Rays, orders: int):
     weight, x = rays.weight[:orders], rays.points[:orders, ..., 0].mean(axis=-1)
     total = weight.sum(axis=0)
     return (weight * x).sum(axis=0) / np.where(total > 0, total, 1)
+
+
+def _as_numpy(rays: SmearedRays) -> _Rays:
+    return _Rays(np.asarray(rays.points, float), np.asarray(rays.weight, float))
 
 
 def _grouped(rays: _Rays, samples: int) -> _Rays:

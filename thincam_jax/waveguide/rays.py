@@ -13,7 +13,6 @@ in its own axes, and what it moves a ray sideways is brought to the object along
 
 import enum
 import math
-from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -80,7 +79,8 @@ def trace(
     screen, distance = camera.screen, checks.positive("object_distance", object_distance, "mm")
     found = bragg_rays(camera, pixels)
     wavelength, guided, fault = found.wavelength, found.guided, found.fault
-    top, bottom, ended = object_points(camera, found, distance, orders)
+    path = object_points(camera, found, distance, orders)
+    top, bottom, ended = path.top, path.bottom, path.ended
 
     on_top = True if screen.top is None else screen.top.holds(top)
     on_bottom = True if screen.bottom is None else screen.bottom.holds(bottom)
@@ -102,7 +102,7 @@ def trace(
     return Rays(points, wavelength, jnp.where(status == RayStatus.OK, weight, 0), guided, status)
 
 
-class BraggRays(NamedTuple):
+class BraggRays(eqx.Module):
     """Rays of each pixel's Bragg wavelength up to where they are guided.
 
     - `slope`: x/z and y/z before and after the plate, against the camera, (*pixel, 2).
@@ -147,7 +147,7 @@ def bragg_rays(camera: SeeThroughCamera, pixels: Float[Array, "*pixel 2"]) -> Br
     return BraggRays(slope, across, wavelength, guided, left, fault)
 
 
-class Path(NamedTuple):
+class Path(eqx.Module):
     """Where rays meet the top hologram, (*pixel, 2), the bottom one and the object's plane, (order,
     *pixel, 2), (x, y) mm."""
 
@@ -215,10 +215,9 @@ def check_screen(camera: SeeThroughCamera) -> None:
     shorter than the way 2wp/√(n_g² − p²) from one contact to the next, or light would pass it by.
     """
     screen = camera.screen
-    _, _, wavelength, guided, left, fault = bragg_rays(
-        camera, jnp.zeros_like(screen.hologram.grating[:2])
-    )
-    index, across = float(screen.glass_index(wavelength)), float(jnp.linalg.norm(guided))
+    middle = bragg_rays(camera, jnp.zeros_like(screen.hologram.grating[:2]))
+    guided, fault = middle.guided, middle.fault
+    index, across = float(screen.glass_index(middle.wavelength)), float(jnp.linalg.norm(guided))
     if fault == RayStatus.NO_BRAGG_MATCH:
         raise ValueError(
             "the hologram diffracts no wavelength of its index's band back to the sensor's middle; "
@@ -235,7 +234,7 @@ def check_screen(camera: SeeThroughCamera) -> None:
             f"light is diffracted to Θ' = {angle:.2f}° in the glass, under the critical angle of "
             f"{critical:.2f}° (n = {index:.4g}), and leaves it; give a larger reference angle"
         )
-    bounce = 2 * float(screen.glass_thickness) * guided / float(left) ** 0.5
+    bounce = 2 * float(screen.glass_thickness) * guided / float(middle.left) ** 0.5
     for name, hologram in (("top", screen.top), ("bottom", screen.bottom)):
         if hologram is not None and bool(jnp.any(hologram.size < jnp.abs(bounce))):
             size, step = (

@@ -29,7 +29,6 @@ the mask over that of the first image. Left out are the smear of the colours in 
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -46,7 +45,7 @@ MaskPsf = Callable[[Array, Array, Array], Array]
 _STEPS = 5
 
 
-class GhostImages(NamedTuple):
+class GhostImages(eqx.Module):
     """The images of object points by each order, through the middle of the mask.
 
     - `places`: (x, y) on the sensor, mm, (order, *point, 2).
@@ -125,7 +124,8 @@ def ghost_psfs(images: GhostImages, mask_psf: MaskPsf) -> Float[Array, "*point k
     """
     orders, *shape = images.weight.shape
     shifts = (images.places - images.places[:1]).reshape(orders, -1, 2)[..., ::-1]
-    flat = [part.reshape(orders, -1) for part in images[1:]]
+    parts = images.wavelength, images.distance, images.weight
+    flat = [part.reshape(orders, -1) for part in parts]
 
     def one(order_parts):
         def add(total, parts):

@@ -11,8 +11,6 @@ from other places. A pixel's ghost is smeared along the screen by what the path 
 p²) changes over the band, with the weight η²(1−η)^i of each wavelength.
 """
 
-from typing import NamedTuple
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -32,7 +30,7 @@ from thincam_jax.waveguide.rays import (
 )
 
 
-class SmearedRays(NamedTuple):
+class SmearedRays(eqx.Module):
     """Where a pixel's light of each order comes from.
 
     - `points`: (x, y) on the object's plane, mm, of equal parts of the light, (order, *pixel,
@@ -78,30 +76,31 @@ def _one(camera, pixel, distance, counts):
     orders, samples, nodes = counts
     screen = camera.screen
     hologram, width = screen.hologram, screen.glass_thickness
-    slope, across, centre, guided, left, fault = bragg_rays(camera, pixel)
+    rays = bragg_rays(camera, pixel)
+    across, centre, guided = rays.across, rays.wavelength, rays.guided
     band = band_about(hologram, across, centre, nodes)
     away = (centre - band.wavelengths)[:, None] * hologram.grating[:2] / (2 * jnp.pi)
     glass, at_centre = screen.glass_index(band.wavelengths), screen.glass_index(centre)
     tangential = guided + away
     # n_g² − p² from that of the Bragg wavelength, whose digits are not cancelled.
-    left = left + (glass - at_centre) * (glass + at_centre)
+    left = rays.left + (glass - at_centre) * (glass + at_centre)
     left = left - jnp.sum(away * (tangential + guided), axis=-1)
     carried = left > 0
     bounce = width * tangential / jnp.sqrt(jnp.where(carried, left, 1))[:, None]
     crossing = width * shift(across, glass)
     top = at_rear(camera, across) + crossing
     sound = _covered(left) * _covered(jnp.sum(tangential**2, -1) - 1) * _on(screen.top, top)
-    sound = jnp.where(carried & (fault != RayStatus.NO_BRAGG_MATCH), sound, 0)
+    sound = jnp.where(carried & (rays.fault != RayStatus.NO_BRAGG_MATCH), sound, 0)
 
     def contact(passed, odd):
         met = _on(screen.bottom, top + odd * bounce)
         light = jnp.mean(band.eta**2 * passed, axis=0) * met * sound
-        ends = on_object(camera, slope, odd * bounce + 2 * crossing)
+        ends = on_object(camera, rays.slope, odd * bounce + 2 * crossing)
         return (1 - met * band.eta) * passed, _parts(light, ends, samples)
 
     odd = 2 * jnp.arange(orders, dtype=centre.dtype) + 1
     _, (parts, weight) = jax.lax.scan(contact, jnp.ones_like(band.eta), odd)
-    return straight_on(camera, slope, distance), parts, weight * band.step
+    return straight_on(camera, rays.slope, distance), parts, weight * band.step
 
 
 def _on(hologram, places):

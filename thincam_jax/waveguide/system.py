@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -45,7 +45,8 @@ class ObjectPlane(Module):
         return self.width / self.shape[1]
 
 
-class Footprints(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Footprints:
     """The cells that pixels see along y and x, and what part of a pixel's light is from each.
 
     - `first`: index of the first cell, (y or x, *ray). It may lie beside the object.
@@ -193,9 +194,9 @@ def system_matrix(rays: SmearedRays, plane: ObjectPlane, size: float, level: flo
     total = scipy.sparse.csr_array((pixels, rows * columns), dtype=weight.dtype)
     # Order by order, for the memory; entries at the same place are added up.
     for number in range(orders):
-        first, parts = footprints(points[number], plane, size)
-        parts = parts.astype(weight.dtype)
-        down, across = first[..., None] + np.arange(parts.shape[-1], dtype=np.int32)
+        seen = footprints(points[number], plane, size)
+        parts = seen.parts.astype(weight.dtype)
+        down, across = seen.first[..., None] + np.arange(parts.shape[-1], dtype=np.int32)
         values = weight[number][..., None, None] * parts[0][..., None] * parts[1][..., None, :]
         inside = ((down >= 0) & (down < rows))[..., None] & ((across >= 0) & (across < columns))[
             ..., None, :

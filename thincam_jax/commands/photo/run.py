@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -305,7 +305,7 @@ def _facts(
         "iterations": found.iterations,
         "status": found.status,
         "relative_data_residual": _relative_residual(problem, found.image[:, None]),
-        "history": [step._asdict() for step in found.history],
+        "history": [asdict(step) for step in found.history],
         "seconds": round(found.seconds, 3),
     }
 

@@ -1,8 +1,7 @@
 """From an experiment file to a camera with two holograms, its targets, and models of it."""
 
 import math
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, replace
 
 import equinox as eqx
 import jax
@@ -53,7 +52,8 @@ MISTAKES = {
 }
 
 
-class Shown(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Shown:
     """A target on the cells of the monitor, radiance 0 to 1: (y, x) or (y, x, channel)."""
 
     config: ScreenTargetConfig
@@ -217,7 +217,7 @@ def mistaken_rays(setup: Setup, camera: wg.SeeThroughCamera, mistake: Mistake) -
     width, index = camera.screen.glass_thickness, camera.screen.glass_index(found.wavelength)
     bounce = _bounce(found.guided, index)
     if mistake == "ghost_index":
-        return rays._replace(points=rays.points - 2 * width * bounce[..., None, :])
+        return replace(rays, points=rays.points - 2 * width * bounce[..., None, :])
     hologram, angles = camera.screen.hologram, config.hologram
     film = hologram.index(found.wavelength)
     toward, reference = math.cos(angles.object_angle), math.cos(angles.reference_angle)
@@ -226,7 +226,7 @@ def mistaken_rays(setup: Setup, camera: wg.SeeThroughCamera, mistake: Mistake) -
     guided = film[..., None] * printed.diffracted(directions(found.across, film))[..., :2]
     odd = (2 * jnp.arange(config.orders, dtype=pixels.dtype) + 1)[:, None, None, None]
     moved = odd * width * (_bounce(guided, index) - bounce)
-    return rays._replace(points=rays.points + moved[..., None, :])
+    return replace(rays, points=rays.points + moved[..., None, :])
 
 
 def _bounce(guided: Array, index: Array) -> Array:
@@ -235,7 +235,7 @@ def _bounce(guided: Array, index: Array) -> Array:
     return guided / jnp.sqrt(jnp.maximum(left, 1e-6))[..., None]
 
 
-class Captured(NamedTuple):
+class Captured(eqx.Module):
     """Captures (target, y, x), or (target, channel, y, x), or what is left of them, and the
     variance of their noise."""
 

@@ -3,9 +3,9 @@
 import math
 import shutil
 import time
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -41,7 +41,7 @@ from thincam_jax.measured.calibration.screen_fit import PARAMETERS
 _SHOWN = 3  # cells whose columns are drawn, and say how large the noise is
 
 
-class Known(NamedTuple):
+class Known(eqx.Module):
     """A matrix, measured or modelled, and what reconstructions need of it.
 
     - `matrix`: a `Matrix` or `Sparse`. `counts`: its unit, where a model has 1.
@@ -92,7 +92,8 @@ def _series(setup: Setup) -> HadamardSeries:
     return HadamardSeries(setup.plane.shape, options.order, options.display, options.dark_frames)
 
 
-class Columns(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Columns:
     """What the sensor sees of some cells alone, in counts, measured and exact.
 
     - `cells`: (row, column) of each.
@@ -202,10 +203,9 @@ class Calibration:
 
     def save_figures(self) -> None:
         """Columns of the matrix, and the targets at other distances."""
-        cells, measured, exact = self.columns
-        images = {"measured": measured, "exact": exact}
+        images = {"measured": self.columns.measured, "exact": self.columns.exact}
         pitch = float(self.setup.camera.sensor.pitch)
-        figures.save_columns(self.folder, pitch, cells, images)
+        figures.save_columns(self.folder, pitch, self.columns.cells, images)
         if self.images:
             figures.save_distances(self.folder, self.setup, self.images, self.metrics["distances"])
 

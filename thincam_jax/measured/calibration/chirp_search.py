@@ -18,7 +18,7 @@ NumPy: a search of a few hundredths of a second, once a fit.
 """
 
 import math
-from typing import NamedTuple
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -29,7 +29,8 @@ _STEP = 0.5
 _WEAK = 0.5  # ε above which order −1 is too near its focus for this picture of the fringes
 
 
-class Chirp(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Chirp:
     """The fringes' numbers on the sensor.
 
     - `curvature`: γ = β/M², rad/mm².
@@ -44,7 +45,8 @@ class Chirp(NamedTuple):
     phase: float
 
 
-class Ranges(NamedTuple):
+@dataclass(frozen=True)
+class Ranges:
     """How far from the guess to look: γ and ε in parts of one, the centre in mm; 0 is known."""
 
     curvature: float
@@ -65,7 +67,7 @@ def find_chirp(image: np.ndarray, pitch: float, guess: Chirp, ranges: Ranges) ->
     places = _axis(ranges.centre, _STEP * math.pi / (2 * guess.curvature * blocks.reach))
     maps = np.abs(blocks.correlate(gammas, guess.centre, places))
     _, row, column = np.unravel_index(np.argmax(maps), maps.shape)
-    found = guess._replace(centre=guess.centre + np.array([places[row], places[column]]))
+    found = replace(guess, centre=guess.centre + np.array([places[row], places[column]]))
     half = np.array([ranges.curvature, ranges.epsilon]) * (guess.curvature, guess.epsilon)
     fine = 0.2 * math.pi / blocks.reach**2
     found = _curvature_and_epsilon(blocks, found, half, fine)
@@ -74,12 +76,12 @@ def find_chirp(image: np.ndarray, pitch: float, guess: Chirp, ranges: Ranges) ->
         places = _axis(places[1] - places[0], (places[1] - places[0]) / 10)
         peak = np.abs(blocks.match(found, places))
         row, column = np.unravel_index(np.argmax(peak), peak.shape)
-        found = found._replace(centre=found.centre + np.array([places[row], places[column]]))
-        ahead = guess._replace(centre=found.centre)
+        found = replace(found, centre=found.centre + np.array([places[row], places[column]]))
+        ahead = replace(guess, centre=found.centre)
         found = _curvature_and_epsilon(blocks, ahead, half, fine)
     around = np.minimum(half, (fine, fine / guess.curvature))
     found = _curvature_and_epsilon(blocks, found, around, fine / 20)
-    return found._replace(phase=float(np.angle(blocks.match(found, np.zeros(1))[0, 0])))
+    return replace(found, phase=float(np.angle(blocks.match(found, np.zeros(1))[0, 0])))
 
 
 class _Blocks:
@@ -144,7 +146,7 @@ def _curvature_and_epsilon(blocks: _Blocks, chirp: Chirp, half, fine: float) -> 
     power = blocks.values.size * (gains[0] ** 2 + gains[1] ** 2) + 2 * gains[0] * gains[1] * beat
     score = np.abs(matched) ** 2 / power
     row, column = np.unravel_index(np.argmax(score), score.shape)
-    return chirp._replace(curvature=float(gammas[row]), epsilon=float(epsilons[column]))
+    return replace(chirp, curvature=float(gammas[row]), epsilon=float(epsilons[column]))
 
 
 def _gains(epsilon):

@@ -10,7 +10,7 @@ The differences are narrowed as long as they stay wide against the standard erro
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -52,7 +52,8 @@ _FRINGE = 0.02  # rad, at the rim: differences of what moves the fringes
 _RIMS = ("width", "wavelength")
 
 
-class FitImage(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class FitImage:
     """An image and its grid, whose middle is `offset` (y, x, mm) off the axis."""
 
     image: np.ndarray

@@ -2,7 +2,8 @@
 
 import functools
 import operator
-from typing import NamedTuple, cast
+from dataclasses import dataclass
+from typing import cast
 
 import equinox as eqx
 import jax
@@ -212,7 +213,7 @@ class FitProblem(eqx.Module):
     pixel_integration: bool = eqx.field(static=True)
 
 
-class Solution(NamedTuple):
+class Solution(eqx.Module):
     """What Levenberg-Marquardt found, after how many steps.
 
     - `moved`: by how many of the standard errors the last `_STEPS` steps moved each unknown.
@@ -341,7 +342,8 @@ _SMALLEST = 1e-13
 _HARDLY_SEEN = 1 - AMBIGUOUS
 
 
-class Covariance(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Covariance:
     """Of the unknowns of a fit, in their order."""
 
     standard_errors: np.ndarray

@@ -1,7 +1,8 @@
 r"""How much larger one image of a scene is than another, and how far it is moved."""
 
 import math
-from typing import Literal, NamedTuple
+from dataclasses import dataclass
+from typing import Literal
 
 import equinox as eqx
 import jax
@@ -118,7 +119,8 @@ def estimate_registration(
         return _report(capture, reference, place, fit)
 
 
-class Place(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Place:
     """Scale, and shift (y, x) in pixels."""
 
     scale: float
@@ -135,7 +137,7 @@ class Pair(eqx.Module):
     shift: Float[Array, "2"]
 
 
-class Fit(NamedTuple):
+class Fit(eqx.Module):
     """A pair, the unknowns found for it and whether the solver converged."""
 
     pair: Pair

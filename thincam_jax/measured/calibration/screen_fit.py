@@ -4,7 +4,8 @@ A matrix holds for the distance at which it was measured. The rays that explain 
 """
 
 from collections.abc import Sequence
-from typing import Literal, NamedTuple
+from dataclasses import replace
+from typing import Literal
 
 import equinox as eqx
 import jax
@@ -116,14 +117,14 @@ class ScreenFit(Module):
         return Scaled(system_operator(self.camera, plane, self.orders, self.samples), self.gain)
 
 
-class _State(NamedTuple):
+class _State(eqx.Module):
     camera: SeeThroughCamera
     plane: ObjectPlane
     gain: Array
     shrinkage: Array
 
     def moved(self, names: tuple[str, ...], steps) -> "_State":
-        camera, plane, gain, shrinkage = self
+        camera, plane, gain, shrinkage = self.camera, self.plane, self.gain, self.shrinkage
         for name, step in zip(names, steps, strict=True):
             if name == "gain":
                 gain = gain + step
@@ -201,7 +202,7 @@ def _turned(grating: Float[Array, "3"], name: str, angle) -> Float[Array, "3"]:
     return jnp.stack([x * slanted, y * slanted, cos * z - sin * across])
 
 
-class _Problem(NamedTuple):
+class _Problem(eqx.Module):
     """Measured numbers and where they come from.
 
     `unit`: of steps. `scale`: one over the residual's unit. `full`: mean weight of a pixel.
@@ -283,13 +284,13 @@ def fit_screen(
             )
         rows, converged = problem.measured, True
         for number, blur in enumerate((*blurs, *(0.0,) * _AGAIN)):
-            problem = problem._replace(smear=_smear(problem, orders, samples))
+            problem = replace(problem, smear=_smear(problem, orders, samples))
             problem = _blurred(problem, rows, blur)
             problem = _scaled(problem, names, orders)
             solution = _least_squares(problem, names, orders)
             converged = bool(solution.result == optx.RESULTS.successful)
             found = problem.start.moved(names, tuple(solution.value * problem.unit))
-            problem = problem._replace(start=found)
+            problem = replace(problem, start=found)
             if number >= len(blurs) - 1:
                 # Errors by the residual's own size: positions may be worse than their deviation.
                 curvature, squares, freedom = _known(problem, names, orders)
@@ -332,8 +333,8 @@ def _of_matrix(measured: Matrix, start: _State, orders: int) -> _Problem:
     problem = _blurred(problem, kept, _BLURS[0])
     model = _model(start, problem, orders)
     gain = jnp.sum(model * problem.measured) / jnp.sum(model**2)
-    start = start._replace(gain=jnp.where(gain > 0, gain, 1.0))
-    return problem._replace(start=start, measured=kept)
+    start = replace(start, gain=jnp.where(gain > 0, gain, 1.0))
+    return replace(problem, start=start, measured=kept)
 
 
 def _of_positions(measured: GhostPositions, start: _State, orders: int) -> _Problem:
@@ -362,16 +363,16 @@ def _blurred(problem: _Problem, rows: Array, blur: float) -> _Problem:
     if blur > 0:
         rows = jnp.asarray(scipy.ndimage.gaussian_filter(rows, (0, blur, blur), mode="constant"))
     scale = 1 / jnp.linalg.norm(rows)
-    return problem._replace(measured=rows, blur=jnp.asarray(blur), scale=scale)
+    return replace(problem, measured=rows, blur=jnp.asarray(blur), scale=scale)
 
 
 def _scaled(problem: _Problem, names: tuple[str, ...], orders: int) -> _Problem:
     """With steps that each change the residual by a tenth of what was measured."""
     units = jnp.asarray([PARAMETERS[n][1] if n in PARAMETERS else 1.0 for n in names])
-    unscaled = problem._replace(unit=units)
+    unscaled = replace(problem, unit=units)
     lengths = jnp.linalg.norm(_jacobian(unscaled, names, orders), axis=0)
     size = 0.1 * jnp.linalg.norm(problem.measured * problem.scale)
-    return problem._replace(unit=units * size / jnp.where(lengths > 0, lengths, size))
+    return replace(problem, unit=units * size / jnp.where(lengths > 0, lengths, size))
 
 
 def _residual(steps, args):

@@ -9,7 +9,8 @@ those of P, their rows those of Q. All stripes of one direction share a factor, 
 decomposition of all of them finds it, also where a single stripe drowns in noise.
 """
 
-from typing import Literal, NamedTuple, get_args
+from dataclasses import dataclass
+from typing import Literal, get_args
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +18,7 @@ import numpy as np
 from jaxtyping import Array, Float, Num
 
 from thincam_jax._core import checks
+from thincam_jax._core.module import Module
 from thincam_jax.imaging.operators import Separable
 from thincam_jax.measured.calibration.hadamard import natural_rows, walsh_hadamard
 
@@ -27,7 +29,7 @@ _NOTICED, _WORTH = 1.5, 0.02
 _HOLD = {"float32": 1e-5, "float64": 1e-9}
 
 
-class SeparableFit(NamedTuple):
+class SeparableFit(Module):
     """A separable camera that was measured.
 
     - `operator`: for images of 1 where the monitor is white; light adds up linearly.
@@ -169,7 +171,8 @@ def _solved(images, captures, other, last):
     return found.reshape(terms, m, rows).swapaxes(1, 2)
 
 
-class _Factor(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class _Factor:
     """Stripes as products with one vector that all share.
 
     - `own`: (y, stripe). `shared`: (x), of length 1. `whole`, `rest`: lengths of the captures and

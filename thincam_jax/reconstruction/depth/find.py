@@ -1,6 +1,6 @@
 """Distances of the objects, from the maxima of the focus curves of a sweep."""
 
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import jax.numpy as jnp
 import numpy as np
@@ -12,7 +12,8 @@ from thincam_jax.reconstruction.depth.focus import Measure, focus_measure, gauss
 from thincam_jax.reconstruction.depth.refocus import RefocusSweep
 
 
-class FocusPeak(NamedTuple):
+@dataclass(frozen=True)
+class FocusPeak:
     """A maximum of a region's focus curve.
 
     - `region`: its label.
@@ -29,7 +30,8 @@ class FocusPeak(NamedTuple):
     at_end: bool
 
 
-class FocusCurves(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class FocusCurves:
     """Focus measure of each region over the sweep, and what follows.
 
     - `labels`: (region,), `curves`: (region, distance).

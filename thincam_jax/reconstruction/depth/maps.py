@@ -1,7 +1,6 @@
 """A distance for every pixel, and one picture in which everything is sharp."""
 
-from typing import NamedTuple
-
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -12,7 +11,7 @@ from thincam_jax.reconstruction.depth.refocus import RefocusSweep
 _FAINT = 0.02  # of the strongest focus: below, a pixel shows noise rather than a picture
 
 
-class DepthMap(NamedTuple):
+class DepthMap(eqx.Module):
     """Distances per pixel.
 
     - `distance`: mm, (*batch, y, x), where the focus measure around the pixel is largest.
