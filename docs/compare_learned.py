@@ -72,7 +72,9 @@ class Coded:
             batch = batches[int(jax.random.randint(chosen, (), 0, len(batches)))]
             turns = tuple(1 - 2 * int(m) for m in jax.random.bernoulli(mirrors, shape=(2,)))
             turned = (slice(None), *(slice(None, None, turn) for turn in turns))
-            return batch._replace(capture=batch.capture[turned], image=batch.image[turned])
+            return dataclasses.replace(
+                batch, capture=batch.capture[turned], image=batch.image[turned]
+            )
 
         nothing = jax.tree.map(lambda _: False, model)
         learned = eqx.tree_at(lambda m: (m.step, m.unet), nothing, (True, True))
@@ -131,11 +133,11 @@ def learned(config, known) -> dict[str, Callable]:
     network, options, lessons = build_network(config), build_options(config), build_lessons(config)
     kinds = {"any distance": lessons.scenes}
     if not config.seed:
-        kinds["60 and 120 mm"] = lessons.scenes._replace(distances=(NEAR, FAR))
+        kinds["60 and 120 mm"] = dataclasses.replace(lessons.scenes, distances=(NEAR, FAR))
     runs = {"UnrolledAdmm": Unrolled(network.camera, known, config.seed).focus}
     codes, networks = {}, {}
     for name, scenes in kinds.items():
-        given, began = lessons._replace(scenes=scenes), time.process_time()
+        given, began = dataclasses.replace(lessons, scenes=scenes), time.process_time()
         networks[f"network, {name}"] = Methods(learn.train(network, given, options).model).learned
         seconds = time.process_time() - began
         print(f"network, {name}: {seconds:.0f} s of CPU", flush=True)
@@ -220,7 +222,10 @@ def main(configs, images: str, tuned: str, count: int) -> None:
     tune(methods, known, min(count, 6))
     plain, tables = {"Wiener": methods.wiener, "ADMM-TV": methods.admm}, []
     # Compiled before any time is taken.
-    lessons, options = build_lessons(configs[0])._replace(pool=1), build_options(configs[0])
+    lessons, options = (
+        dataclasses.replace(build_lessons(configs[0]), pool=1),
+        build_options(configs[0]),
+    )
     learn.train(methods.network, lessons, dataclasses.replace(options, steps=2, check_every=1))
     for config in configs:
         runs = {**plain, **learned(config, known)}

@@ -1,6 +1,7 @@
 """Objectives: against linear algebra, random draws, made-up channels and differences."""
 
 import math
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -88,7 +89,7 @@ def test_mismatch():
 def test_more_noise_is_worse():
     known = made_up()
     errors = [
-        float(bayes_error(known._replace(noise=known.noise * f))) for f in (0, 0.5, 1, 2, 1e9)
+        float(bayes_error(replace(known, noise=known.noise * f))) for f in (0, 0.5, 1, 2, 1e9)
     ]
     assert errors == sorted(errors)
     assert errors[0] < 1e-12
@@ -127,7 +128,7 @@ def test_unevenness():
 
     known = of_ratio(ratio)
     np.testing.assert_allclose(unevenness(known, FREQUENCIES, (0.25, 0.75)), 2.0, rtol=1e-6)
-    steep = known._replace(density=1e3 / (1 + FREQUENCIES.squared))
+    steep = replace(known, density=1e3 / (1 + FREQUENCIES.squared))
     np.testing.assert_allclose(unevenness(steep, FREQUENCIES, (0.25, 0.75)), 2.0, rtol=1e-6)
     flat = of_ratio(lambda p: 5.0 + 0 * p)
     assert float(unevenness(flat, FREQUENCIES, (0.25, 0.75))) < 1e-6

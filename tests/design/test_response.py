@@ -109,4 +109,4 @@ def test_single_precision_stays():
     highest = jnp.float32(HIGHEST)
     for frequencies in (Quadrant(highest, 16), Polar(highest, 16, 2)):
         found = tell(design, judged, jnp.asarray(phase_pairs(2)), frequencies)
-        assert {leaf.dtype for leaf in found} == {jnp.dtype(jnp.float32)}
+        assert {leaf.dtype for leaf in jax.tree.leaves(found)} == {jnp.dtype(jnp.float32)}

@@ -1,5 +1,7 @@
 """Levels of a response, and the misfit of two."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -26,10 +28,10 @@ def test_levels_are_means_over_rings():
         inside = slice(8 * ring, 8 * ring + 8)
         mean = np.sum((ratio * weight)[:, inside]) / np.sum(weight[:, inside])
         np.testing.assert_allclose(levels[ring], 10 * np.log10(1 + mean), rtol=1e-12)
-    loud = KNOWN._replace(response=1e3 * KNOWN.response)
+    loud = replace(KNOWN, response=1e3 * KNOWN.response)
     gained = ring_levels(loud, FREQUENCIES, 16) - levels
     np.testing.assert_allclose(gained[:2], 60.0, atol=0.2)
-    quiet = KNOWN._replace(response=1e-6 * KNOWN.response)
+    quiet = replace(KNOWN, response=1e-6 * KNOWN.response)
     assert np.all(ring_levels(quiet, FREQUENCIES, 16) < 1e-3)
 
 

@@ -104,7 +104,7 @@ def with_faults(of_step):
         x, y = draw(key)
         return x * (jnp.nan if of_step(step, tried[step]) else 1.0), y
 
-    return TASK._replace(draw=faulty)
+    return dataclasses.replace(TASK, draw=faulty)
 
 
 def test_a_step_that_is_no_number_changes_nothing():

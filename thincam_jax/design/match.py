@@ -7,7 +7,7 @@ and R levels say more of where to go than their sum.
 """
 
 import functools
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +17,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Numbers
+from thincam_jax._core.module import Module
 from thincam_jax.design.design import Design
 from thincam_jax.design.frequencies import Frequencies
 from thincam_jax.design.objectives import channels
@@ -46,7 +47,7 @@ MATCHED = 1.0
 _WEIGHT = 100.0
 
 
-class Match(NamedTuple):
+class Match(Module):
     """What `match_response` found.
 
     - `found`: local optima, best first, without repetitions; their `objective` is the misfit, dB.

@@ -9,8 +9,9 @@ responses H_k, noise spectra η_k and the synthesis W (`reconstruction.synthesis
 where H̄ is what the sensor sees of H, and η^crop what it cuts off (`thincam_jax.design.response`).
 """
 
-from typing import NamedTuple
+from dataclasses import replace
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -23,7 +24,7 @@ from thincam_jax.design.setup import Setup
 from thincam_jax.design.signal import capture_light, signal_variance, spectral_density
 
 
-class Channels(NamedTuple):
+class Channels(eqx.Module):
     """The sums of captures that a reconstruction starts from, at each frequency.
 
     - `response`: of each, H̄, as seen at one distance: mm²·mm.
@@ -68,7 +69,7 @@ def channels(
     light = capture_light(design, setup)
     noise = setup.noise.variance(light, signal, design.exposure) * setup.pitch**2
     # Per area of the sensor the scene's density grows with the distance squared, noise does not.
-    whole, seen = (_sums(matrix * design.distance, h) for h in found)
+    whole, seen = (_sums(matrix * design.distance, h) for h in (found.whole, found.seen))
     cut_off = jnp.maximum(whole * seen - seen**2, 0.0) * density
     return Channels(seen, (matrix**2 @ noise)[:, None, None] + cut_off, density, frequencies.weight)
 
@@ -143,7 +144,7 @@ def unevenness(
 
     The thesis asks for a flat amplitude (after Eq 3.48): no frequency is amplified into noise.
     """
-    flat = known._replace(density=jnp.ones_like(known.density))
+    flat = replace(known, density=jnp.ones_like(known.density))
     level = 10 * jnp.log10(ring_means(flat, frequencies, rings) + _tiny(known))
     inside = _in_band(band, rings, level.dtype)
     count = jnp.sum(inside).astype(level.dtype)

@@ -14,7 +14,8 @@ all to wholly: else few levels hold a descent where it begins.
 import functools
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from dataclasses import dataclass, replace
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -26,6 +27,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Number, Numbers
 from thincam_jax._core.grids import Grid
+from thincam_jax._core.module import Module
 from thincam_jax._core.precision import as_complex
 from thincam_jax.design.adam import adam
 from thincam_jax.design.end_to_end import restore_by
@@ -58,7 +60,8 @@ _MOST_SAMPLES = 2048
 MaskObjective = Callable[[PhaseMask, Any, PRNGKeyArray], Float[Array, ""]]
 
 
-class HeightLimits(NamedTuple):
+@dataclass(frozen=True)
+class HeightLimits:
     """Heights that can be made. The smallest feature is a cell of the mask.
 
     - `highest`: mm. `levels`: how many heights, evenly from 0 to the highest; None is any.
@@ -92,7 +95,7 @@ class HeightLimits(NamedTuple):
 def one_turn(blank: MaskBlank, wavelength: Number, levels: int | None = None) -> HeightLimits:
     """Limits that hold every phase of one wavelength: λ/(n − 1), less the last of even levels."""
     limits = HeightLimits(float(blank.wrap_height(wavelength)), levels).checked()
-    return limits if levels is None else limits._replace(highest=limits.highest * (1 - 1 / levels))
+    return limits if levels is None else replace(limits, highest=limits.highest * (1 - 1 / levels))
 
 
 def mask_of_phase(
@@ -303,7 +306,7 @@ def restored_objective(mask: PhaseMask, data: Any, key: PRNGKeyArray) -> Float[A
     return jnp.mean(jnp.stack([one(h) for h in psfs]))
 
 
-class Refined(NamedTuple):
+class Refined(Module):
     """What `refine_mask` found.
 
     - `mask`: after the last step, or the one given where that is better. `history`: the objective

@@ -1,7 +1,6 @@
 r"""From the PSF that is wanted to the phase of a mask: the algorithm of Gerchberg and Saxton."""
 
 import functools
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -10,6 +9,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Shape
 from thincam_jax._core.grids import Grid
+from thincam_jax._core.module import Module
 from thincam_jax._core.precision import as_complex, phasor
 from thincam_jax.imaging.operators.crop_convolution import cut, middle_corner, place
 from thincam_jax.lensless.propagation.angular_spectrum import (
@@ -20,7 +20,7 @@ from thincam_jax.lensless.propagation.angular_spectrum import (
 from thincam_jax.lensless.propagation.path import Path
 
 
-class Retrieval(NamedTuple):
+class Retrieval(Module):
     """What `retrieve_phase` found.
 
     - `phase`: of each cell of the mask, rad, from 0 to 2π.

@@ -16,7 +16,7 @@ object, and what changes over a few ghosts' distance, are left out.
 """
 
 import functools
-from typing import NamedTuple
+from dataclasses import replace
 
 import equinox as eqx
 import jax
@@ -26,6 +26,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Number
+from thincam_jax._core.module import Module
 from thincam_jax.design.adam import adam
 from thincam_jax.design.prior import PowerLaw
 from thincam_jax.design.search import best_apart, even_samples, on_cube
@@ -78,7 +79,7 @@ class Plate(eqx.Module):
         return SeeThroughCamera(screen, sensor, self.focal_distance, self.lens_distance)
 
 
-class PlateLimits(NamedTuple):
+class PlateLimits(eqx.Module):
     """Between which plates can be made; equal ends fix a number."""
 
     lower: Plate
@@ -86,12 +87,12 @@ class PlateLimits(NamedTuple):
 
     def plate(self, point: Float[Array, "6"]) -> Plate:
         """That of a point of the unit cube, its axes in the order of the fields of `Plate`."""
-        low, high = (jnp.stack(jax.tree.leaves(end)) for end in self)
+        low, high = (jnp.stack(jax.tree.leaves(end)) for end in (self.lower, self.upper))
         values = low + point.astype(low.dtype) * (high - low)
         return jax.tree.unflatten(jax.tree.structure(self.lower), list(values))
 
 
-class Viewing(NamedTuple):
+class Viewing(eqx.Module):
     """What the plate is to see.
 
     - `sensor`: its pixels. `object_distance`, `object_width`: mm. `cell`: the finest detail, mm,
@@ -111,7 +112,7 @@ class Viewing(NamedTuple):
     prior: PowerLaw | None = None
 
 
-class Judged(NamedTuple):
+class Judged(Module):
     """A plate's worth.
 
     - `error`: expected, as a part of the object's variance. `light`: mean weight ∑W_i, mm.
@@ -178,14 +179,14 @@ def _rays(plate: Plate, viewing: Viewing):
     rays = trace_band(camera, pixels, viewing.object_distance, 4, 6)
     guided = bragg_rays(camera, pixels).guided
     above = jnp.sqrt(jnp.sum(guided**2, axis=-1)) - 1
-    return rays._replace(weight=rays.weight * jax.nn.sigmoid((above - _MARGIN) / (_MARGIN / 4)))
+    return replace(rays, weight=rays.weight * jax.nn.sigmoid((above - _MARGIN) / (_MARGIN / 4)))
 
 
 def _light(rays) -> Float[Array, ""]:
     return jnp.mean(jnp.sum(rays.weight, axis=0))
 
 
-class FoundPlate(NamedTuple):
+class FoundPlate(Module):
     """The best plate of a search, its error, and that of each step of the descent that met it."""
 
     plate: Plate
@@ -208,7 +209,7 @@ def find_plate(
     """
     checks.at_least_one({"starts": starts, "samples": samples, "steps": steps})
     for name in Plate.__dataclass_fields__:
-        low, high = (float(getattr(end, name)) for end in limits)
+        low, high = (float(getattr(end, name)) for end in (limits.lower, limits.upper))
         if not 0 < low <= high:
             raise ValueError(
                 f"limits of {name} are {low:g} to {high:g}; give the lower one first, above 0"

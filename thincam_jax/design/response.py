@@ -21,8 +21,7 @@ What is seen of it is q H; what is cut off, q(1 − q) |H|² η_f, is noise to a
 the same for every point of the object. It is what makes small β worse than their response promises.
 """
 
-from typing import NamedTuple
-
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
@@ -36,15 +35,15 @@ from thincam_jax.lensless.propagation.path import Path
 from thincam_jax.lensless.propagation.separable_transfer import TransferFactors, overlaps_of
 
 
-class Responses(NamedTuple):
-    """Of each capture at each frequency, mm².
+class Responses(eqx.Module):
+    """Of a capture, or of each of many, at each frequency, mm².
 
     - `whole`: H(ν/d), of a sensor without end.
     - `seen`: q H, what falls on the sensor on average over the object.
     """
 
-    whole: Float[Array, "capture *point"]
-    seen: Float[Array, "capture *point"]
+    whole: Float[Array, "*capture row column"]
+    seen: Float[Array, "*capture row column"]
 
 
 def responses(design: Design, setup: Setup, frequencies: Frequencies) -> Responses:

@@ -1,6 +1,7 @@
 r"""How much a design loses when it is not built, or not known, exactly."""
 
-from typing import Literal, NamedTuple
+from dataclasses import dataclass
+from typing import Literal
 
 import equinox as eqx
 import jax
@@ -14,7 +15,8 @@ from thincam_jax.design.objectives import bayes_error, channels, mismatch_error
 from thincam_jax.design.setup import Setup
 
 
-class Tolerances(NamedTuple):
+@dataclass(frozen=True)
+class Tolerances:
     """Standard deviations of what the reconstruction takes for known; 0 is exact.
 
     - `beta`: relative, of each capture's mask on its own.

@@ -7,8 +7,9 @@ descended on is an approximation, the best few are then improved on the exact ob
 
 import functools
 from collections.abc import Callable, Iterable
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -18,6 +19,7 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from thincam_jax._core import checks
+from thincam_jax._core.module import Module
 from thincam_jax.design.design import Design
 from thincam_jax.design.space import DesignSpace, active_limits
 
@@ -29,16 +31,16 @@ APART = 0.02
 Status = Literal["converged", "iterations_exhausted", "non_finite"]
 
 
-class Descents(NamedTuple):
-    """Where each start ended, and how many evaluations of the objective it took."""
+class Descents(eqx.Module):
+    """Where a start ended, or each of many, and how many evaluations of the objective it took."""
 
-    points: Float[Array, "start variable"]
-    values: Float[Array, " start"]
-    evaluations: Int[Array, " start"]
-    converged: Bool[Array, " start"]
+    points: Float[Array, "*start variable"]
+    values: Float[Array, "*start"]
+    evaluations: Int[Array, "*start"]
+    converged: Bool[Array, "*start"]
 
 
-class Found(NamedTuple):
+class Found(Module):
     """A local optimum.
 
     - `design`; `values`: its free numbers, in the order of the space's variables.
@@ -56,7 +58,7 @@ class Found(NamedTuple):
     point: Float[Array, " variable"]
 
 
-class Search(NamedTuple):
+class Search(Module):
     """The optima found, best first, without those that repeat a better one.
 
     - `evaluations`: of the objective, with or without its gradient: of all samples, of each

@@ -5,7 +5,7 @@ every limit, those that tie two variables together too, so that no solver has to
 """
 
 import math
-from typing import Literal, NamedTuple
+from dataclasses import dataclass
 
 import equinox as eqx
 import jax
@@ -15,7 +15,6 @@ from jaxtyping import Array, Float
 
 from thincam_jax.design.design import MOST_CAPTURES, Design
 
-Name = Literal["beta", "phase", "distance", "wavelength", "exposure", "width"]
 UNITS: dict[str, str] = {
     "beta": "rad/mm^2",
     "phase": "rad",
@@ -26,15 +25,16 @@ UNITS: dict[str, str] = {
 }
 
 
-class Variable(NamedTuple):
+@dataclass(frozen=True)
+class Variable:
     """One free number of a design.
 
-    - `name`: of the numbers of `Design`.
+    - `name`: of the numbers of `Design`; `DesignSpace` refuses any other.
     - `lower`, `upper`: its bounds, in the design's units.
     - `captures`: which captures share it; for the width, which all share, nothing.
     """
 
-    name: Name
+    name: str
     lower: float
     upper: float
     captures: tuple[int, ...] = ()
@@ -45,7 +45,8 @@ class Variable(NamedTuple):
         return f"{self.name} of capture {listed}" if self.captures else self.name
 
 
-class Limits(NamedTuple):
+@dataclass(frozen=True)
+class Limits:
     """What a rig can do, beside the bounds of single variables.
 
     - `mask_pixel`: of the display or printer, mm: the zones at the mask's edge keep a period of two

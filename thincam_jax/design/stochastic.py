@@ -2,12 +2,13 @@
 
 import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from thincam_jax._core.module import Module
 from thincam_jax.design.adam import adam
 from thincam_jax.design.design import Design
 from thincam_jax.design.search import on_cube
@@ -16,7 +17,7 @@ from thincam_jax.design.space import DesignSpace
 StochasticObjective = Callable[[Design, Any, PRNGKeyArray], Float[Array, ""]]
 
 
-class Descent(NamedTuple):
+class Descent(Module):
     """Where a stochastic descent ended.
 
     - `design`, `values`, `point`: of the mean of the second half of the steps, in the cube.

@@ -10,7 +10,7 @@ captures and C the crop. What is made of them is told in `end_to_end` and `wiene
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import equinox as eqx
 import jax
@@ -30,7 +30,8 @@ from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.psf import psf
 
 
-class Window(NamedTuple):
+@dataclass(frozen=True)
+class Window:
     """A square of angles, and its samples: what a discrete spectrum of the scene belongs to.
 
     - `angle`: its side, rad: the sensor as seen through the mask at the shortest distance, and the

@@ -21,8 +21,7 @@ frequencies tell the strength, errors differ by up to 1.5 dB. Where designs rank
 the full simulation decides.
 """
 
-from typing import NamedTuple
-
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -95,7 +94,7 @@ def _frequencies(training: Training) -> Float[Array, " frequency"]:
     return jnp.asarray(np.fft.rfftfreq(window.samples, window.angle / window.samples), float)
 
 
-class _SceneWaves(NamedTuple):
+class _SceneWaves(eqx.Module):
     """Along either axis of an image: averaged over its pixels, and at their middles."""
 
     seen: Float[Array, "2 pixel frequency"]
@@ -109,7 +108,7 @@ def _scene_waves(training: Training, at: Float[Array, " frequency"]) -> _SceneWa
     return _SceneWaves(middles * jnp.sinc(pixel * at) * pixel, middles)
 
 
-class _Channel(NamedTuple):
+class _Channel(eqx.Module):
     """A sum of captures at one distance.
 
     - `each`: H, mm², of its captures; `summed`: H d², mm⁴, of their sum.

@@ -13,7 +13,6 @@ Two parts, both with Adam (optax):
 """
 
 import functools
-from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -22,6 +21,7 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from thincam_jax._core import checks
+from thincam_jax._core.module import Module
 from thincam_jax.design.adam import adam
 from thincam_jax.design.frequencies import Frequencies
 from thincam_jax.design.search import even_samples
@@ -44,7 +44,7 @@ _RANDOM = 0.1
 _BEND, _COSINES = 2.0, 4
 
 
-class TrainedSuggester(NamedTuple):
+class TrainedSuggester(Module):
     """What training gave.
 
     - `suggester`: the network after the last step.

@@ -14,9 +14,9 @@ model judges every guess, so the misfit that is told is the design's, not the ne
 import json
 import os
 from collections.abc import Iterator
+from dataclasses import asdict
 from io import BytesIO
 from pathlib import Path
-from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -26,6 +26,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from thincam_jax._core import checks, files
 from thincam_jax._core.checks import Numbers
+from thincam_jax._core.module import Module
 from thincam_jax.design.design import Design
 from thincam_jax.design.frequencies import Frequencies
 from thincam_jax.design.match import MATCHED, MatchStatus, match_status
@@ -78,7 +79,7 @@ class Suggester(eqx.Module):
         return jax.nn.sigmoid(self.layers[-1](signal)).reshape(self.guesses, -1)
 
 
-class Proposal(NamedTuple):
+class Proposal(eqx.Module):
     """What `propose` finds: points of the unit cube and their misfits, dB.
 
     - `first_point`, `first_misfit_db`: the best guess of the network alone.
@@ -154,7 +155,7 @@ def _or_infinite(misfits: Float[Array, " point"]) -> Float[Array, " point"]:
     return jnp.where(jnp.isfinite(misfits), misfits, jnp.inf)
 
 
-class Suggestion(NamedTuple):
+class Suggestion(Module):
     """A design for a target response.
 
     - `design`; `values`: its free numbers, in the order of the space's variables.
@@ -266,8 +267,8 @@ def _header(suggester: Suggester) -> dict:
             "width": suggester.layers[0].out_features,
             "depth": len(suggester.layers) - 1,
         },
-        "variables": [v._asdict() for v in space.variables],
-        "limits": space.limits._asdict(),
+        "variables": [asdict(v) for v in space.variables],
+        "limits": asdict(space.limits),
         "captures": [space.base.captures, space.base.profile],
         "models": [
             type(setup.noise).__name__,

@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
@@ -74,7 +74,8 @@ class TrainingOptions:
         return self.rate * rising * 0.5 * (1 + math.cos(math.pi * step / self.steps))
 
 
-class Task(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Task:
     """What is to be learned.
 
     - `draw`: examples for a step, from its key; the same key gives the same ones.
@@ -122,7 +123,8 @@ class TrainingState(eqx.Module):
         return cls(weights, first, weights, weights, losses, scores)
 
 
-class TrainingProgress(NamedTuple):
+@dataclass(frozen=True)
+class TrainingProgress:
     """What is told after every step.
 
     - `score`: the lowest so far, NaN before the first check; `seconds_left`: estimated.
@@ -136,7 +138,7 @@ class TrainingProgress(NamedTuple):
     seconds_left: float
 
 
-class Trained(NamedTuple):
+class Trained(eqx.Module):
     """The model with the best weights, and the state at the end.
 
     - `status`: "finished", "stopped" by the callback, or "diverged": NaN again and again, at

@@ -9,7 +9,6 @@ is: 5 numbers an iteration are learned, so that some tens of pairs suffice.
 import functools
 import math
 import time
-from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -109,7 +108,7 @@ def _elements(problem: InverseProblem):
     return captures, weights
 
 
-class Training(NamedTuple):
+class Training(eqx.Module):
     """The best model by its loss, and the loss before each step.
 
     - `status`: "converged" never: "iterations_exhausted", or "non_finite" if a loss was NaN,

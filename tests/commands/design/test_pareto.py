@@ -1,6 +1,7 @@
 """Fronts of thickness, captures and light: what costs more is never worse, and what is divided."""
 
 import inspect
+from dataclasses import replace
 
 import equinox as eqx
 import jax
@@ -124,7 +125,7 @@ def exposed(study, count):
     np.testing.assert_allclose(given.space.base.exposure, 2 / count if divided else 1.0)
     setup = eqx.tree_at(lambda s: s.sensor_width, given.data.setup, jnp.asarray(50.0))
     # Rings are compiled faster than the exact response.
-    return float(pareto._exactly(given.space.base, given.data._replace(setup=setup))[1])
+    return float(pareto._exactly(given.space.base, replace(given.data, setup=setup))[1])
 
 
 def test_captures_share_the_exposure(tmp_path):
@@ -236,7 +237,7 @@ def test_an_objective_that_is_nan_is_refused():
     bad = FrontPoint(np.nan, tiny.found([25.0]), np.nan, "", np.nan)
     with pytest.raises(ConfigError, match="NaN at any start"):
         pareto._known([bad])
-    assert pareto._known([bad, bad._replace(error=0.1)]) == [bad._replace(error=0.1)]
+    assert pareto._known([bad, replace(bad, error=0.1)]) == [replace(bad, error=0.1)]
 
 
 def hand_made():
@@ -253,7 +254,7 @@ def hand_made():
     )
     reference = point(3.0, 11.0, 0.08)
     line = Front(lines, reference)
-    front = Front(captures, reference._replace(cost=4.0))
+    front = Front(captures, replace(reference, cost=4.0))
     return Fronts({"thickness": line, "captures": front, "light": line}, 18.75, 0.04)
 
 

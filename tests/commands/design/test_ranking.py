@@ -47,7 +47,7 @@ def study(tmp_path_factory):
 
 def bowl(study):
     """A problem whose objective is known in closed form."""
-    return build_problem(study)._replace(objective=BOWL)
+    return dataclasses.replace(build_problem(study), objective=BOWL)
 
 
 def found_at(problem, *values) -> Found:
@@ -71,7 +71,8 @@ def scored(monkeypatch):
 
 def test_the_setup_is_that_of_the_file(study):
     problem = build_problem(study)
-    setup, synthesis, frequencies = problem.exact
+    setup, frequencies = problem.exact.setup, problem.exact.frequencies
+    synthesis = problem.exact.synthesis
     assert float(setup.sensor_width) == pytest.approx(48 * 0.04)  # the shorter side
     assert float(setup.noise.snr_db) == 30
     assert float(setup.prior.exponent) == 2.5
@@ -164,7 +165,7 @@ class Slope(DesignObjective):
 def test_the_tolerance_of_a_width_holds_beta(tmp_path):
     """Mask pixels tie β to the width in the search's cube, and not in a tolerance."""
     study = tiny.built(tmp_path, *WIDTH, "search.limits.mask_pixel=80 um")
-    problem = build_problem(study)._replace(objective=Slope("bayes_error"))
+    problem = dataclasses.replace(build_problem(study), objective=Slope("bayes_error"))
     finest = np.pi / 0.08 / 1.5
     point = jnp.asarray([(1.5 - 1) / 1.5, (14.0 - 12) / (finest - 12)])
     design, values = problem.space.design(point), problem.space.values(point)
@@ -245,7 +246,8 @@ def test_tolerances_cost_something(tmp_path):
     base = robust.space.base
     exact = float(DesignObjective("bayes_error")(base, robust.data))
     found = float(robust.objective(base, robust.data))
-    expected = robust_error(base, *robust.data, Tolerances(beta=0.002, distance=0.03))
+    given = robust.data.setup, robust.data.synthesis, robust.data.frequencies
+    expected = robust_error(base, *given, Tolerances(beta=0.002, distance=0.03))
     assert found == pytest.approx(float(expected), rel=1e-12)
     assert found > 1.001 * exact
     assert robust.objective.told(found) == pytest.approx(10 * np.log10(found))

@@ -2,6 +2,7 @@
 
 import inspect
 import json
+from dataclasses import astuple, replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -140,7 +141,7 @@ def again(whole, monkeypatch):
 
     class Finder:
         def __init__(self, _):
-            reference = again.found[0]._replace(name="pairs")
+            reference = replace(again.found[0], name="pairs")
             objective, found = DesignObjective("bayes_error"), again.found
             self.result = FoundDesigns(objective, reference, found, 1, 0, 2.5, 9.0, None)
             self.work = []
@@ -170,7 +171,7 @@ def test_interrupted_design_goes_on(whole, again, monkeypatch):
     assert simulated == ["chart"]
     # Other designs are not taken for those that were simulated.
     same = again.found
-    again.found = tuple(one._replace(design=tiny.found([20.0, 15.5])) for one in same)
+    again.found = tuple(replace(one, design=tiny.found([20.0, 15.5])) for one in same)
     interrupted()
     again.found = same
     simulated.clear()
@@ -300,7 +301,7 @@ def test_found_numbers_reach_the_simulation(tmp_path):
     found = tiny.found([20.0], 2.5, width=1.49, wavelength=6e-4, exposure=0.7)
     study = with_designs(tiny.built(tmp_path, *given), {"found 1": found})
     exposure = study.methods[1].exposures[0]
-    assert exposure[:7] == pytest.approx((20.0, 0.0, 2.5, 6e-4, 1.45, 0.7, 1))
+    assert astuple(exposure)[:7] == pytest.approx((20.0, 0.0, 2.5, 6e-4, 1.45, 0.7, 1))
     assert exposure.profile is None
     camera = study.camera(exposure)
     assert (camera.mask.pixels, float(camera.mask.width)) == ((29, 29), pytest.approx(1.45))
@@ -320,7 +321,7 @@ class TestPictures:
             np.ones(64),
             (FreeValue("beta", (1,), 20.0, 0.1), FreeValue("beta", (2,), 17.0, None)),
         )
-        old = found._replace(name="pairs", design=tiny.found(reference))
+        old = replace(found, name="pairs", design=tiny.found(reference))
         axis = np.linspace(12, 30, 7)
         named = tuple(("beta", (n,)) for n in range(1, axes + 1))
         level = np.linspace(0.09, 0.4, 7**axes).reshape((7,) * axes)
@@ -358,7 +359,7 @@ class TestPictures:
         levels = np.linspace(1e-2, 1e-4, 64)
         sums = (((1,), (2,)), ((3,), (4,)))
         transfer = Transfer(np.stack([levels, levels / 2]), levels * 50, sums)
-        result = self.result()._replace(transfers=(transfer, transfer))
+        result = replace(self.result(), transfers=(transfer, transfer))
         figure = draw_mtf(result, 100.0)
         assert [ax.get_title() for ax in figure.axes] == ["pairs", "found 1"]
         left, right = figure.axes
@@ -384,7 +385,7 @@ class TestPictures:
         named = (("width", ()), ("wavelength", (2,)))
         level = np.linspace(0.09, 0.4, 49).reshape(7, 7)
         ax = draw_landscape(
-            result._replace(landscape=Landscape(named, (np.linspace(1, 3, 7), axis), level)), 1
+            replace(result, landscape=Landscape(named, (np.linspace(1, 3, 7), axis), level)), 1
         ).axes[0]
         assert (ax.get_xlabel(), ax.get_ylabel()) == ("mask width, mm", "wavelength of shot 2, nm")
         assert ax.lines[0].get_xydata()[0] == pytest.approx([2.0, 500.0])

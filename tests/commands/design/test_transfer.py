@@ -1,5 +1,7 @@
 """Contrast transfer of a design: against simulated PSFs, and against what noise does to it."""
 
+from dataclasses import replace
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -95,7 +97,7 @@ def test_of_even_responses_in_closed_form(monkeypatch):
 
     monkeypatch.setattr(transfer, "channels", even)
     # Of a size of its own, which is not compiled yet.
-    found = modulation_transfer(DESIGN, data()._replace(frequencies=Quadrant(jnp.asarray(9.0), 80)))
+    found = modulation_transfer(DESIGN, replace(data(), frequencies=Quadrant(jnp.asarray(9.0), 80)))
     np.testing.assert_allclose(found.chain, 6 / 7)
     np.testing.assert_allclose(found.channels, 2 / 4)
     assert found.channels.shape == (2, 64)
@@ -112,4 +114,4 @@ def test_differences_are_named_by_what_is_added():
 def test_rings_without_the_even_light_are_refused():
     with pytest.raises(TypeError, match="give a Quadrant"):
         polar = Polar(jnp.asarray(HIGHEST), 64, 1)
-        modulation_transfer(DESIGN, data()._replace(frequencies=polar))
+        modulation_transfer(DESIGN, replace(data(), frequencies=polar))

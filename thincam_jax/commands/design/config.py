@@ -1,6 +1,7 @@
 """Experiment files of `kind: design`: what is free, what is wanted, and the design to beat."""
 
 import math
+from dataclasses import fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -200,7 +201,7 @@ class TolerancesConfig(Section):
 
     def tolerances(self) -> Tolerances:
         """As numbers, 0 for what is exact."""
-        return Tolerances(*(getattr(self, name) or 0.0 for name in Tolerances._fields))
+        return Tolerances(*(getattr(self, field.name) or 0.0 for field in fields(Tolerances)))
 
 
 class FrequenciesConfig(Section):

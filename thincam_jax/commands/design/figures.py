@@ -2,7 +2,8 @@
 
 import operator
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -34,7 +35,8 @@ _LABELS = {
 }
 
 
-class _DrawnLandscape(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class _DrawnLandscape:
     """A landscape, what it is of, and the value of a design as drawn and as told."""
 
     around: Landscape

@@ -10,7 +10,6 @@ import dataclasses
 import math
 from collections.abc import Iterable
 from functools import cached_property, partial
-from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -46,7 +45,7 @@ _TOLD = {
 }
 
 
-class FrontPoint(NamedTuple):
+class FrontPoint(eqx.Module):
     """The best design found at one cost.
 
     - `cost`: the thickness allowed, mm; how many captures; or electrons from each mm² of open
@@ -69,14 +68,14 @@ class FrontPoint(NamedTuple):
         return shots_of_design(self.design)
 
 
-class Front(NamedTuple):
+class Front(eqx.Module):
     """The points in the order of their cost, and the design to beat at its own."""
 
     points: tuple[FrontPoint, ...]
     reference: FrontPoint
 
 
-class Fronts(NamedTuple):
+class Fronts(eqx.Module):
     """Those that were asked for: thickness, captures, light.
 
     - `edge`: the highest frequency of all, cycles/rad.
@@ -125,18 +124,18 @@ class FrontSearches:
             near = None if beside is None else best[beside].design
             if near is not None and name == "captures":
                 near = _longer(near, problem.space.base)
-            best[place] = self._best(problem, near, best.get(place))._replace(cost=cost)
+            best[place] = dataclasses.replace(self._best(problem, near, best.get(place)), cost=cost)
 
     def _problem(self, name: str, cost: float) -> DesignProblem:
         if name == "captures":
             return _of_shots(self.config, self.problem, round(cost) // self.phases)
-        given = self.problem._replace(objective=DesignObjective("limit"))
+        given = dataclasses.replace(self.problem, objective=DesignObjective("limit"))
         if name == "light":
             return _lit(given, cost)
         is_distance = jnp.asarray([v.name == "distance" for v in given.space.variables])
         upper = given.space.upper
         thin = jnp.where(is_distance, jnp.minimum(upper, cost), upper)
-        return given._replace(space=eqx.tree_at(lambda s: s.upper, given.space, thin))
+        return dataclasses.replace(given, space=eqx.tree_at(lambda s: s.upper, given.space, thin))
 
     def _best(
         self, problem: DesignProblem, near: Design | None, own: FrontPoint | None
@@ -152,7 +151,9 @@ class FrontSearches:
             spaces.append(_near(problem.space, place))
             designs.append(problem.space.design(place))
         for space in spaces:
-            searched = search_problem(problem._replace(space=space), self.asked, self.config.seed)
+            searched = search_problem(
+                dataclasses.replace(problem, space=space), self.asked, self.config.seed
+            )
             designs += [found.design for found in searched.found[:_TRIED]]
         judged = [_judge(design, problem.exact) for design in designs]
         judged = _known(judged if own is None else [own, *judged])
@@ -169,7 +170,7 @@ class FrontSearches:
             for target in study.targets
             if target.is_picture
         )
-        self.best["captures"][place] = point._replace(simulated=simulated)
+        self.best["captures"][place] = dataclasses.replace(point, simulated=simulated)
 
     def result(self) -> Fronts:
         """When all work is done."""
@@ -181,7 +182,10 @@ class FrontSearches:
         with allow("float64"):
             reference = _judge(self.problem.space.base, self.problem.exact)
         fronts = {
-            name: Front(tuple(best[n] for n in sorted(best)), reference._replace(cost=costs[name]))
+            name: Front(
+                tuple(best[n] for n in sorted(best)),
+                dataclasses.replace(reference, cost=costs[name]),
+            )
             for name, best in self.best.items()
         }
         variance = _variance(self.study) if "captures" in fronts else None
@@ -217,8 +221,8 @@ def _of_shots(config: DesignConfig, problem: DesignProblem, count: int) -> Desig
     return DesignProblem(
         DesignObjective("bayes_error"),
         space,
-        problem.data._replace(synthesis=matrix),
-        problem.exact._replace(synthesis=matrix),
+        dataclasses.replace(problem.data, synthesis=matrix),
+        dataclasses.replace(problem.exact, synthesis=matrix),
     )
 
 
@@ -229,11 +233,12 @@ def _lit(problem: DesignProblem, electrons: float) -> DesignProblem:
         noise = data.setup.noise
         assert isinstance(noise, PhotonNoise)  # for the type checker; the file was checked
         number = jnp.asarray(electrons, noise.electrons.dtype)
-        return data._replace(
+        return dataclasses.replace(
+            data,
             setup=eqx.tree_at(lambda s: s.noise.electrons, data.setup, number),
         )
 
-    return problem._replace(data=lit(problem.data), exact=lit(problem.exact))
+    return dataclasses.replace(problem, data=lit(problem.data), exact=lit(problem.exact))
 
 
 def _longer(design: Design, base: Design) -> Design:

@@ -1,9 +1,10 @@
 """What is searched for: the objective as a function of designs, and the numbers it takes."""
 
 import math
-from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from dataclasses import dataclass, fields
+from typing import Any, Literal
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -46,7 +47,8 @@ RISE, _RISE_DB = 0.01, 0.0432
 _MARGIN, _FEWEST = 1.1, 128  # of the samples that fringes need; at least
 
 
-class Shot(NamedTuple):
+@dataclass(frozen=True, order=True)
+class Shot:
     """β in rad/mm²; distance, wavelength and mask's width in mm; exposure in the reference's."""
 
     beta: float
@@ -63,13 +65,13 @@ def phases_of(design: Design) -> int:
 
 def shots_of_design(design: Design) -> tuple[Shot, ...]:
     """The numbers of each shot."""
-    numbers = (getattr(design, name) for name in Shot._fields)
+    numbers = (getattr(design, field.name) for field in fields(Shot))
     each = np.broadcast_arrays(*(np.asarray(n, dtype=float) for n in numbers))
     rows = zip(*(n[:: phases_of(design)].tolist() for n in each), strict=True)
     return tuple(Shot(*row) for row in rows)
 
 
-class ObjectiveData(NamedTuple):
+class ObjectiveData(eqx.Module):
     """What an objective takes beside the design."""
 
     setup: Setup
@@ -97,8 +99,8 @@ class DesignObjective:
 
     def _value(self, design: Design, data: Any) -> Float[Array, ""]:
         if self.name == "robust_error":
-            setup, synthesis, at = data
-            return robust_error(design, setup, synthesis, at, self.tolerances, how=self.how)
+            given = data.setup, data.synthesis, data.frequencies
+            return robust_error(design, *given, self.tolerances, how=self.how)
         known = channels(design, data.setup, data.synthesis, data.frequencies)
         if self.name == "bayes_error":
             return bayes_error(known)
@@ -152,7 +154,7 @@ class DesignObjective:
         return _RISE_DB if self.has_band else RISE * abs(value)
 
 
-class DesignProblem(NamedTuple):
+class DesignProblem(eqx.Module):
     """A search: `data` for the many evaluations, `exact` for the designs that were found."""
 
     objective: DesignObjective

@@ -1,8 +1,8 @@
 """The search, its designs ranked and re-scored exactly, and what surrounds them."""
 
 from collections.abc import Iterable
+from dataclasses import fields, replace
 from functools import partial
-from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -39,7 +39,7 @@ from thincam_jax.design.search import APART, Found, Search
 _KEPT = 10  # designs that are re-scored and listed
 
 
-class Candidate(NamedTuple):
+class Candidate(eqx.Module):
     """A design, its objective (smaller is better) as searched and exactly, and its ring means.
 
     - `level`: signal-to-noise ratio of each ring.
@@ -62,7 +62,7 @@ class Candidate(NamedTuple):
         return shots_of_design(self.design)
 
 
-class FoundDesigns(NamedTuple):
+class FoundDesigns(eqx.Module):
     """What a search gave.
 
     - `edge`: of the frequencies looked at, cycles/rad.
@@ -139,7 +139,7 @@ class Finder:
         with allow("float64"):
             reference = Candidate(self.config.reference.name, base, *_score(problem, base))
             if self.trained is not None:
-                reference = reference._replace(trained=self.trained.reference)
+                reference = replace(reference, trained=self.trained.reference)
             given = (problem.objective, problem.space, problem.data)
             self.result = FoundDesigns(
                 problem.objective,
@@ -181,7 +181,7 @@ def rescored(problem: DesignProblem, kept: tuple[Found, ...]) -> tuple[Candidate
     candidates = []
     for one in kept:
         unmeasured = _candidate(problem, one, ())
-        candidates.append(unmeasured._replace(values=tolerances(problem, one, unmeasured.exact)))
+        candidates.append(replace(unmeasured, values=tolerances(problem, one, unmeasured.exact)))
     return _named(sorted(candidates, key=lambda candidate: candidate.exact))
 
 
@@ -192,9 +192,9 @@ def rank_trained(problem: DesignProblem, trained: Trained) -> tuple[Candidate, .
     candidates = []
     for one in distinct(space, trained.found):
         point = jnp.asarray(np.asarray(one.point), space.lower.dtype)
-        exact = one._replace(design=space.design(point), values=space.values(point), point=point)
+        exact = replace(one, design=space.design(point), values=space.values(point), point=point)
         values = free_values(space, exact, near[id(one)], RISE * one.objective)
-        candidates.append(_candidate(problem, exact, values)._replace(trained=one.objective))
+        candidates.append(replace(_candidate(problem, exact, values), trained=one.objective))
     return _named(candidates)
 
 
@@ -203,12 +203,12 @@ def _candidate(problem: DesignProblem, one: Found, values: tuple[FreeValue, ...]
 
 
 def _named(candidates: Iterable[Candidate]) -> tuple[Candidate, ...]:
-    return tuple(c._replace(name=found_name(k)) for k, c in enumerate(candidates, 1))
+    return tuple(replace(c, name=found_name(k)) for k, c in enumerate(candidates, 1))
 
 
 def _alike(space: DesignSpace, one: Found, other: Found) -> bool:
     """Whether two designs have the same shots, in whatever order."""
-    spans = dict.fromkeys(Shot._fields, 0.0)
+    spans = dict.fromkeys((field.name for field in fields(Shot)), 0.0)
     for v, lower, upper in zip(space.variables, space.lower, space.upper, strict=True):
         spans[v.name] = max(spans[v.name], float(upper - lower))
     pairs = zip(*(sorted(shots_of_design(f.design)) for f in (one, other)), strict=True)

@@ -1,6 +1,7 @@
 """Running a design: the search, the simulation of what it found, and a report."""
 
 import time
+from dataclasses import astuple
 from functools import cached_property, partial
 from typing import Any
 
@@ -80,7 +81,9 @@ class _DesignRun:
     def simulate(self, target: Target) -> None:
         """From before an interruption where the designs are still the same."""
         self.folder.write("found.yaml", dump_config(as_study_config(self.simulated)))
-        designs = [[list(e) for e in method.exposures] for method in self.simulated.methods]
+        designs = [
+            [list(astuple(e)) for e in method.exposures] for method in self.simulated.methods
+        ]
         stored = self.folder.finished(target.name)
         if stored is None or stored["designs"] != designs:
             shown: dict[str, Evaluation] = {}

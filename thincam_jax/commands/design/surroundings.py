@@ -2,7 +2,8 @@
 
 import functools
 import math
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -15,7 +16,8 @@ from thincam_jax.design import Design, DesignSpace, Limits, Variable, landscape
 from thincam_jax.design.search import Found
 
 
-class FreeValue(NamedTuple):
+@dataclass(frozen=True)
+class FreeValue:
     """A free number of a found design.
 
     - `shots`: that it belongs to, from 1; none for the width, which all share.
@@ -28,7 +30,8 @@ class FreeValue(NamedTuple):
     tolerance: float | None
 
 
-class Derivatives(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Derivatives:
     """First and second derivative of an objective by each free number; NaN where it has no room."""
 
     slopes: np.ndarray
@@ -111,7 +114,8 @@ def least_change(slope: float, curve: float, rise: float) -> float | None:
     return 2 * rise / (slope + math.sqrt(root))
 
 
-class Landscape(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Landscape:
     """The objective over one or two free numbers, the others as in the best design.
 
     - `variables`: their names and shots (none for the width); `axes`: their values.

@@ -7,7 +7,7 @@ counts which the frequency-wise objectives leave out.
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -65,7 +65,7 @@ class TrainingObjective:
         return 10 * np.log10(np.asarray(value, dtype=float))
 
 
-class Trained(NamedTuple):
+class Trained(eqx.Module):
     """Designs by their training error, best first.
 
     - `objective`: what was made small; `landscape`: around the best of them.

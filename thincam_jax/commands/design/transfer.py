@@ -17,7 +17,7 @@ of what the scene holds (`thincam_jax.design.objectives`): the contrast of the w
 for the noise and the prior of the setup, on average over the object's points.
 """
 
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import equinox as eqx
 import jax
@@ -32,7 +32,8 @@ from thincam_jax.design.objectives import over_rings
 RINGS = 64
 
 
-class Transfer(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Transfer:
     """Contrast transfer against frequency, over rings of equal width up to the highest frequency.
 
     - `channels`: root mean square of MTF_c over each ring, for each sum of captures.

@@ -1,10 +1,12 @@
 """What the numbers of designs are called, and how they are written, in tables and pictures."""
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any
 
 
-class Quantity(NamedTuple):
+@dataclass(frozen=True)
+class Quantity:
     """A number of a shot.
 
     - `label`: with its unit; `key`: in design.json's shots.

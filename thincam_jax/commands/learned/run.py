@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -140,7 +141,7 @@ def swept(network: RefocusNetwork, batch: Batch) -> RefocusSweep:
     first = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf[:1], leaf.shape), batch)
     # As many at a time as the batch has, which is compiled for.
     rounds = np.resize(np.asarray(distances), (-(-_SWEPT // size), size))
-    images = [read_batch(network, first._replace(commanded=jnp.asarray(t))) for t in rounds]
+    images = [read_batch(network, replace(first, commanded=jnp.asarray(t))) for t in rounds]
     images = jnp.concatenate([found.images[:, 0] for found in images])[:_SWEPT, ::-1, ::-1]
     slope = camera.camera.sensor.pitch / camera.camera.distance
     return RefocusSweep(images, jnp.asarray(distances, images.dtype), slope, "learned")

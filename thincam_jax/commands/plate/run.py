@@ -99,7 +99,7 @@ class _PlateRun:
             self.result["plates"][name] = _told(plate, judge_plate(plate, self.viewing))
 
     def slices(self) -> None:
-        ends = zip(*(jax.tree.leaves(end) for end in self.limits), strict=True)
+        ends = zip(*map(jax.tree.leaves, (self.limits.lower, self.limits.upper)), strict=True)
         free = [(n, *e) for n, e in zip(NUMBERS, ends, strict=True) if e[0] < e[1]]
         figure = Figure(figsize=(3.2 * max(1, len(free)), 3.4), layout="constrained")
         axes = figure.subplots(1, max(1, len(free)), sharey=True, squeeze=False)[0]
@@ -124,7 +124,8 @@ class _PlateRun:
     def front(self) -> None:
         points = []
         for focal in self.config.focal_distances:
-            ends = [dataclasses.replace(end, focal_distance=focal) for end in self.limits]
+            limits = self.limits.lower, self.limits.upper
+            ends = [dataclasses.replace(end, focal_distance=focal) for end in limits]
             default = judge_plate(Plate(focal_distance=focal), self.viewing)
             errors = float(default.error), self.found_within(PlateLimits(*ends)).error
             points.append((float(default.field_of_view) / deg, *errors))

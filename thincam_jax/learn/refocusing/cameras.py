@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -23,7 +22,7 @@ from thincam_jax.lensless.method import MODELS, Model
 _MARGIN = 8
 
 
-class Stand(NamedTuple):
+class Stand(eqx.Module):
     """Where the planes of a stack stand, one of them at a commanded distance.
 
     - `inverse`: 1/t, 1/mm, the nearest first; `number`: of the commanded plane.

@@ -1,6 +1,6 @@
 r"""What the U-Nets of a refocusing network are trained for."""
 
-from typing import NamedTuple
+from dataclasses import replace
 
 import equinox as eqx
 import jax
@@ -24,20 +24,20 @@ _SHARES = {"focus": 1.0, "all_in_focus": 0.3, "planes": 0.1, "distance": 0.1}
 _LEAST = 1e-5  # of an image's mean square: an error below it counts for nothing
 
 
-class Examples(NamedTuple):
-    """What a U-Net sees of scenes, and what it is to make of it; (element, …) each.
+class Examples(eqx.Module):
+    """What a U-Net sees of a scene or, (element, …), of many, and what it is to make of it.
 
     - `images`: as of `prepared`, for planes at `stand`.
     - `stack`: light of the planes; what stands between two is shared out between them.
     - `image`, `all_in_focus`: in units of the scene's mean; `inverse`: 1/t, 1/mm.
     """
 
-    images: Float[Array, "element image y x"]
+    images: Float[Array, "*element image y x"]
     stand: Stand
-    stack: Float[Array, "element plane y x"]
-    image: Float[Array, "element y x"]
-    all_in_focus: Float[Array, "element y x"]
-    inverse: Float[Array, "element y x"]
+    stack: Float[Array, "*element plane y x"]
+    image: Float[Array, "*element y x"]
+    all_in_focus: Float[Array, "*element y x"]
+    inverse: Float[Array, "*element y x"]
 
     def mirrored(self, rows: Array, columns: Array) -> "Examples":
         """Upside down where `rows` is true, left to right where `columns` is.
@@ -50,7 +50,7 @@ class Examples(NamedTuple):
             return jnp.where(columns, leaf[..., ::-1], leaf)
 
         names = ("images", "stack", "image", "all_in_focus", "inverse")
-        return self._replace(**{name: turned(getattr(self, name)) for name in names})
+        return replace(self, **{name: turned(getattr(self, name)) for name in names})
 
 
 @eqx.filter_jit

@@ -11,7 +11,8 @@ the image in which all is sharp, and where each pixel stands.
 """
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from dataclasses import dataclass, replace
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -19,6 +20,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float, PRNGKeyArray
 
 from thincam_jax._core.checks import Number, Numbers
+from thincam_jax._core.module import Module
 from thincam_jax.learn.refocusing.cameras import RefocusCamera, Stand
 from thincam_jax.learn.refocusing.lens_blur import lens_blur
 from thincam_jax.learn.refocusing.linear import LinearStep, Sizes
@@ -26,7 +28,8 @@ from thincam_jax.learn.refocusing.planes import Planes
 from thincam_jax.learn.refocusing.unet import UNet
 
 
-class NetworkOptions(NamedTuple):
+@dataclass(frozen=True)
+class NetworkOptions:
     """What a network is built with.
 
     - `steps`: unrolled steps, each with a U-Net of its own.
@@ -40,7 +43,7 @@ class NetworkOptions(NamedTuple):
 DEFAULT = NetworkOptions()
 
 
-class Cleaned(NamedTuple):
+class Cleaned(eqx.Module):
     """What a U-Net reads from the images of a step, in units of the scene's mean.
 
     - `stack`: (plane, y, x), radiance.
@@ -61,7 +64,7 @@ class Cleaned(NamedTuple):
         return jnp.tensordot(stand.inverse, self.share, axes=1)
 
 
-class Explained(NamedTuple):
+class Explained(eqx.Module):
     """A capture explained by a stack of planes: what the last U-Net has read, and how well.
 
     - `mean`: the scene's mean radiance.
@@ -74,7 +77,7 @@ class Explained(NamedTuple):
     consistency: Float[Array, ""]
 
 
-class DistanceMap(NamedTuple):
+class DistanceMap(Module):
     """Distances per pixel.
 
     - `distance`: mm.
@@ -141,7 +144,7 @@ class RefocusNetwork(eqx.Module):
         """The network of the first steps alone, which is one, too."""
         all_ = self.weights
         weights = Weights(all_.joint[:steps], all_.alone[:steps], all_.prior[:steps])
-        return RefocusNetwork(weights, self.planes, self.options._replace(steps=steps))
+        return RefocusNetwork(weights, self.planes, replace(self.options, steps=steps))
 
     def with_prior(self, number: int, prior: UNet) -> "RefocusNetwork":
         """Another U-Net in a step."""

@@ -13,7 +13,7 @@ is what a captured layer is dimmed by. A lens focused elsewhere sees
 which is exact for one layer over another when one of both is in focus.
 """
 
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import equinox as eqx
 import jax
@@ -35,7 +35,8 @@ LAYERS = 3
 PARTS = 3  # flat parts that a layer with relief is shared out between
 
 
-class SceneOptions(NamedTuple):
+@dataclass(frozen=True)
+class SceneOptions:
     """What scenes are drawn, and how they are captured.
 
     - `layers`: chances of one, two and three layers.
@@ -119,8 +120,8 @@ class Scene(eqx.Module):
         return jnp.sum(light * _seen_past(cover), axis=0)
 
 
-class Batch(NamedTuple):
-    """Scenes, their captures, and what is to be made of them.
+class Batch(eqx.Module):
+    """Scenes, their captures, and what is to be made of them; a single one has no axis of elements.
 
     - `capture`: (element, y, x), in the camera's units.
     - `deviation`: root mean square of the noise per pixel, the same units.
@@ -130,17 +131,17 @@ class Batch(NamedTuple):
     - `emission`: light of the parts, (element, layer, part, y, x).
     """
 
-    capture: Float[Array, "element y x"]
-    deviation: Float[Array, " element"]
-    commanded: Float[Array, " element"]
-    image: Float[Array, "element y x"]
-    all_in_focus: Float[Array, "element y x"]
-    inverse: Float[Array, "element y x"]
-    emission: Float[Array, "element layer part y x"]
+    capture: Float[Array, "*element rows columns"]
+    deviation: Float[Array, "*element"]
+    commanded: Float[Array, "*element"]
+    image: Float[Array, "*element y x"]
+    all_in_focus: Float[Array, "*element y x"]
+    inverse: Float[Array, "*element y x"]
+    emission: Float[Array, "*element layer part y x"]
     scene: Scene
 
     @property
-    def distance(self) -> Float[Array, "element y x"]:
+    def distance(self) -> Float[Array, "*element y x"]:
         """Distance of what each pixel shows, mm."""
         return 1 / self.inverse
 

@@ -2,8 +2,8 @@
 
 import hashlib
 import os
+from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float32
@@ -21,7 +21,8 @@ _SAMPLES = (
 _LICENCE_FILES = ("LICENSE", "LICENSE.txt", "LICENSE.md", "COPYING")
 
 
-class Entry(NamedTuple):
+@dataclass(frozen=True)
+class Entry:
     """One image of a source: its name, the SHA-256 of what it was read from, and its licence."""
 
     name: str
@@ -29,7 +30,8 @@ class Entry(NamedTuple):
     licence: str
 
 
-class Source(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Source:
     """Images of equal size to draw scenes from, and where they are from.
 
     - `images`: (image, side, side), linear radiance from 0 to 1.
@@ -39,7 +41,7 @@ class Source(NamedTuple):
     images: Float32[np.ndarray, "image side side"]
     manifest: tuple[Entry, ...]
 
-    def __add__(self, other: "Source") -> "Source":  # type: ignore[override]
+    def __add__(self, other: "Source") -> "Source":
         images = np.concatenate([self.images, other.images])
         return Source(images, self.manifest + other.manifest)
 

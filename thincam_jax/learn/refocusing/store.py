@@ -45,7 +45,7 @@ def save(
     description = {
         "kind": _KIND,
         "camera": described(network.camera),
-        "options": network.options._asdict(),
+        "options": dataclasses.asdict(network.options),
         "training": told or {},
     }
     return write_arrays(path, network.weights, description)

@@ -5,7 +5,7 @@ import os
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -33,7 +33,8 @@ NETWORK, STATE = "network.thincam", "training-{}.state"
 _JUDGED = 2**31
 
 
-class Lessons(NamedTuple):
+@dataclasses.dataclass(frozen=True, eq=False)
+class Lessons:
     """What a network is trained on.
 
     - `source`: the images; `scenes`: what is drawn of them.
@@ -75,18 +76,19 @@ class Lessons(NamedTuple):
         sources = {"trained on": self.source, "judged on": self.held_out}
         return {
             "images": {
-                use: [entry._asdict() for entry in source.manifest]
+                use: [dataclasses.asdict(entry) for entry in source.manifest]
                 for use, source in sources.items()
                 if source is not None
             },
-            "scenes": self.scenes._asdict(),
+            "scenes": dataclasses.asdict(self.scenes),
             "batch": self.batch,
             "pool": self.pool,
             "judged": self.judged,
         }
 
 
-class _Pool(NamedTuple):
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Pool:
     all: Examples
     size: int
 
@@ -128,7 +130,7 @@ def train(
     told = {**lessons.manifest(), "training": dataclasses.asdict(options)}
     settings = {
         "camera": described(network.camera),
-        "options": network.options._asdict(),
+        "options": dataclasses.asdict(network.options),
         **told,
     }
     losses, scores, trained = [], [], None
@@ -154,7 +156,8 @@ def train(
     return Trained(network.first(len(losses)), state, trained.status)
 
 
-class _Kept(NamedTuple):
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Kept:
     """Writes what is to be kept of a U-Net's training."""
 
     path: Path
@@ -174,7 +177,8 @@ class _Kept(NamedTuple):
         write_state(self.path, state, self.settings)
 
 
-class _Told(NamedTuple):
+@dataclasses.dataclass(frozen=True)
+class _Told:
     """Tells of the whole training in place of one U-Net's."""
 
     callback: Callable[[TrainingProgress], object]
@@ -186,7 +190,8 @@ class _Told(NamedTuple):
         steps, later = progress.steps, self.parts - 1 - self.number
         each = (time.perf_counter() - self.began) / progress.step
         return self.callback(
-            progress._replace(
+            dataclasses.replace(
+                progress,
                 step=self.number * steps + progress.step,
                 steps=self.parts * steps,
                 seconds_left=progress.seconds_left + later * steps * each,

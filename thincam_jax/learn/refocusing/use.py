@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Sequence
-from typing import ClassVar, Literal, NamedTuple
+from typing import ClassVar, Literal
 
 import equinox as eqx
 import jax
@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Number, Numbers
+from thincam_jax._core.module import Module
 from thincam_jax.learn.refocusing.network import (
     RefocusNetwork,
     distance_map,
@@ -30,7 +31,7 @@ _DOUBTED = 1.5
 SURE = 0.5
 
 
-class Reading(NamedTuple):
+class Reading(Module):
     """All that a network reads from captures; see `RefocusNetwork`.
 
     All but `images` is from the explanation that is focused on the first distance.
@@ -69,10 +70,12 @@ def _read(network: RefocusNetwork, captures, deviations, distances) -> Reading:
 def _read_one(network: RefocusNetwork, capture, deviation, distances) -> Reading:
     explained = jax.vmap(lambda t: explain(network, capture, deviation, t))(distances)
     first = jax.tree.map(lambda leaf: leaf[0], explained)
+    seen = distance_map(first)
     return Reading(
         first.mean * explained.cleaned.image,
         first.mean * first.cleaned.all_in_focus,
-        *distance_map(first),
+        seen.distance,
+        seen.confidence,
         first.consistency,
     )
 
