@@ -190,6 +190,17 @@ def bare_files(modules: list[Module]) -> list[str]:
     ]
 
 
+def named_tuples(modules: list[Module]) -> list[str]:
+    """A record is a module or a frozen dataclass; a tuple could be unpacked, indexed and added."""
+    return [
+        f"{module.path}:{node.lineno}: a named tuple: make it an equinox.Module where JAX sees it, "
+        "a frozen dataclass elsewhere"
+        for module in modules
+        for node in ast.walk(module.tree)
+        if getattr(node, "id", getattr(node, "attr", "")) in ("NamedTuple", "namedtuple")
+    ]
+
+
 def star_imports(modules: list[Module]) -> list[str]:
     return [
         f"{module.path}:{line}: star import: name what is imported"
@@ -256,6 +267,7 @@ RULES = (
     jaxopt_outside_its_files,
     front_end_libraries_in_the_core,
     bare_files,
+    named_tuples,
     star_imports,
     long_modules,
     missing_docstrings,
@@ -313,6 +325,8 @@ BROKEN = [
     (front_end_libraries_in_the_core, "__init__.py", "import rich, jinja2", "jinja2"),
     (bare_files, "measured/read.py", "data = path.read_bytes()", "use read_regular"),
     (bare_files, "_core/files.py", "path.write_text('β')", "use write_whole"),
+    (named_tuples, "lensless/psf.py", "class A(NamedTuple): ...", "psf.py:1: a named tuple"),
+    (named_tuples, "units.py", "A = collections.namedtuple('A', 'x')", "units.py:1: "),
     (star_imports, "lensless/psf.py", "from .camera import *", "star import"),
     (star_imports, "lensless/psf.py", "from numpy import *", "star import"),
     (long_modules, "lensless/psf.py", DOC + "x = 1\n" * MAX_LINES, "501 lines, 500 allowed"),
@@ -339,7 +353,7 @@ BROKEN = [
 ]
 
 SOUND = [
-    ("units.py", DOC + "import math"),
+    ("units.py", DOC + "import math\n\n\n@dataclass(frozen=True)\nclass A:\n    x: int"),
     ("_core/memory.py", "x = Path('/proc/meminfo').read_text()"),
     ("_core/grids.py", DOC + "from ..units import mm"),
     ("lensless/masks/_pattern.py", "x = 1"),

@@ -3,8 +3,9 @@
 import json
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from thincam_jax._core.files import WriteError, read_regular, write_whole
 from thincam_jax.commands.checked_config import dump_config
@@ -16,7 +17,8 @@ from thincam_jax.commands.sections import Section
 Progress = Callable[[str, int], object]
 
 
-class Step(NamedTuple):
+@dataclass(frozen=True)
+class Step:
     """A part of a run: what is told as it begins, and what does it."""
 
     text: str

@@ -236,7 +236,9 @@ def robust_problem(folder):
 def test_tolerances_reach_the_goal(tmp_path):
     goal = robust_problem(tmp_path).objective
     assert (goal.name, goal.how) == ("robust_error", "mean")
-    assert goal.tolerances == Tolerances(beta=0.002, distance=pytest.approx(0.03))
+    expected = Tolerances(beta=0.002, distance=0.03)
+    found = dataclasses.astuple(goal.tolerances)
+    assert found == pytest.approx(dataclasses.astuple(expected))
     assert goal != DesignObjective("robust_error")
 
 

@@ -1,5 +1,7 @@
 """From a study's file to exposures and cameras."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from commands.study import tiny
@@ -64,7 +66,7 @@ def test_a_second_take_has_noise_of_its_own(tmp_path):
     study = tiny.built(tmp_path, f"methods.1.shots.1={again}")
     method = study.methods[1]
     first, second = method.exposures[0], method.exposures[2]
-    assert second == first._replace(take=2)
+    assert second == replace(first, take=2)
     plane = study.targets[0].plane
     clean = noise_free(study, first, plane)
     np.testing.assert_array_equal(clean, noise_free(study, second, plane))

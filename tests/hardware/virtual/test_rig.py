@@ -9,7 +9,13 @@ import scipy
 import thincam_jax as tc
 from thincam_jax.hardware import CameraSettings, Region
 from thincam_jax.hardware.virtual.optics import ModulatorOptics, MonitorOptics, cells_shown
-from thincam_jax.hardware.virtual.rig import Electronics, VirtualRig, pattern_number, read_fiducial
+from thincam_jax.hardware.virtual.rig import (
+    Electronics,
+    Fiducial,
+    VirtualRig,
+    pattern_number,
+    read_fiducial,
+)
 from thincam_jax.imaging.operators import Matrix, Sparse
 from thincam_jax.imaging.targets import usaf1951
 from thincam_jax.units import nm, um
@@ -113,9 +119,10 @@ def test_a_frame_says_in_its_corner_what_it_was_exposed_of():
     taken.on_move(-1.25)
     for number in range(2):
         found = read_fiducial(taken.expose(SETTINGS), 12)
-        assert found == (pattern_number(pattern), -1250, number)
+        assert found == Fiducial(pattern_number(pattern), -1250, number)
     taken.on_show(255 - pattern)
-    assert read_fiducial(taken.expose(SETTINGS), 12) == (pattern_number(255 - pattern), -1250, 0)
+    last = read_fiducial(taken.expose(SETTINGS), 12)
+    assert last == Fiducial(pattern_number(255 - pattern), -1250, 0)
 
 
 def test_before_the_display_has_answered_the_pattern_before_is_seen(monkeypatch):

@@ -2,8 +2,8 @@
 
 import dataclasses
 from dataclasses import dataclass
-from typing import NamedTuple
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Num
@@ -72,7 +72,7 @@ def _check(option: str, size: int, own: int) -> None:
         )
 
 
-class Conditions(NamedTuple):
+class Conditions(eqx.Module):
     """Camera, wavelength (mm) and object distance (mm) in one precision."""
 
     camera: LenslessCamera
@@ -104,12 +104,12 @@ def psf_of(
 ) -> np.ndarray:
     """PSF on the sensor, or on `shape` of its pixels; by default the one that errors count from."""
     with allow(precision):
-        camera, wavelength, distance = conditions_of(study, exposure)[precision]
-        grid = camera.sensor.grid
+        given = conditions_of(study, exposure)[precision]
+        grid = given.camera.sensor.grid
         h = psf(
-            camera,
-            wavelength=wavelength,
-            object_distance=float(distance),
+            given.camera,
+            wavelength=given.wavelength,
+            object_distance=float(given.object_distance),
             model=model,
             pixel_integration=study.config.pixel_integration,
             grid=Grid(shape, grid.pitch) if shape else grid,

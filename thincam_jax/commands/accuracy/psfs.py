@@ -3,8 +3,9 @@
 import statistics
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
@@ -88,7 +89,9 @@ class PsfErrors:
     @cached_property
     def _exact(self) -> tuple[Any, np.ndarray]:
         """Where errors are predicted from, and the PSF that they count from."""
-        probe = probe_of(*self.given["float64"], self.study.config.pixel_integration, None)
+        given = self.given["float64"]
+        numbers = given.camera, given.wavelength, given.object_distance
+        probe = probe_of(*numbers, self.study.config.pixel_integration, None)
         return probe, psf_of(self.study, self.exposure)
 
     def _add(self, method: PsfMethod, cost: Cost) -> None:
@@ -162,7 +165,7 @@ def _measured(given: Conditions, method: PsfMethod, reference: np.ndarray) -> di
             precision=method.precision,
         )
 
-    timing = measure(compute, *given)
+    timing = measure(compute, given.camera, given.wavelength, given.object_distance)
     return {
         "true_error": relative_error(timing.result, reference),
         "seconds": timing.seconds,
@@ -171,7 +174,8 @@ def _measured(given: Conditions, method: PsfMethod, reference: np.ndarray) -> di
     }
 
 
-class Timing(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Timing:
     """How long one call takes, and what it gives.
 
     - `result`: of the call.

@@ -130,7 +130,7 @@ class ReconstructionErrors:
 def changed(method: Method, quantity: str, part: float) -> Method:
     """The method with one quantity of all its exposures multiplied by 1 + part."""
     exposures = tuple(
-        exposure._replace(**{quantity: getattr(exposure, quantity) * (1 + part)})
+        dataclasses.replace(exposure, **{quantity: getattr(exposure, quantity) * (1 + part)})
         for exposure in method.exposures
     )
     return dataclasses.replace(method, exposures=exposures)

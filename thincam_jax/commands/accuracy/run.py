@@ -1,8 +1,9 @@
 """The benchmark of accuracy: errors and times of all models, and what an error costs."""
 
 import platform
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 
@@ -37,7 +38,8 @@ class BenchFolder:
         write_whole(self.path / "accuracy.json", to_json(results))
 
 
-class Sizes(NamedTuple):
+@dataclass(frozen=True)
+class Sizes:
     """What a user may choose.
 
     - `sizes`: pixels along the sensor's longer side, for the PSFs; empty for the default ones.
@@ -48,7 +50,8 @@ class Sizes(NamedTuple):
     capture_size: int | None = None
 
 
-class Benchmark(NamedTuple):
+@dataclass(frozen=True)
+class Benchmark:
     """A checked benchmark: the study, the sizes, and what is captured."""
 
     study: Study

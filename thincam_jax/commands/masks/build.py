@@ -3,8 +3,8 @@
 import math
 import time
 from dataclasses import dataclass
-from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -51,7 +51,7 @@ class Setup:
     scenes: dict[str, Scene]
 
 
-class Seen(NamedTuple):
+class Seen(eqx.Module):
     """What is known of scenes from their captures.
 
     - `channels`: sums of captures; `variance`: of their noise, for each scene.
@@ -175,11 +175,11 @@ def best_linear(
     conjugate gradients, preconditioned by the filter without crop and borders.
     """
     spectra = jnp.stack([camera.spectrum[0] for camera in cameras])
-    return _best_linear(cameras[0], spectra, *seen, precision)
+    return _best_linear(cameras[0], spectra, seen, precision)
 
 
 @jax.jit
-def _best_linear(camera: CropConvolution, spectra, channels, variance, levels, precision):
+def _best_linear(camera: CropConvolution, spectra, seen: Seen, precision):
     corner, window = camera.field_corner, camera.window
     variation = TotalVariation()
 
@@ -192,10 +192,10 @@ def _best_linear(camera: CropConvolution, spectra, channels, variance, levels, p
         spectrum = jnp.fft.rfft2(place(image, corner, window)) * transfer.astype(spectra.dtype)
         return cut(jnp.fft.irfft2(spectrum, s=window), corner, camera.field_shape)
 
-    back = jax.linear_transpose(see, jax.ShapeDtypeStruct(camera.field_shape, channels.dtype))
+    back = jax.linear_transpose(see, jax.ShapeDtypeStruct(camera.field_shape, seen.channels.dtype))
     power = jnp.sum(spectra.real**2 + spectra.imag**2, axis=0)
-    symbol = difference_symbol(window, channels.dtype)
-    uniform = see(jnp.ones(camera.field_shape, channels.dtype))
+    symbol = difference_symbol(window, seen.channels.dtype)
+    uniform = see(jnp.ones(camera.field_shape, seen.channels.dtype))
 
     def one(measured, noise, mean, prior):
         slope, level = prior
@@ -214,7 +214,7 @@ def _best_linear(camera: CropConvolution, spectra, channels, variance, levels, p
         )
         return found + mean
 
-    return jax.vmap(one)(channels, variance, levels, precision)
+    return jax.vmap(one)(seen.channels, seen.variance, seen.level, precision)
 
 
 def total_variation(
@@ -236,7 +236,8 @@ def total_variation(
     return result.image.reshape(start.shape) * unit
 
 
-class Strength(NamedTuple):
+@dataclass(frozen=True)
+class Strength:
     """What a mask does with the light, from its PSF: parts of one; `weakest_at` in cycles/mm.
 
     - `throughput`: light of the open width that falls on sensor and surroundings.

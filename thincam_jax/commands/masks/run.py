@@ -1,6 +1,7 @@
 """Running a comparison of masks: captures and reconstructions of each, figures, words, a page."""
 
 import time
+from dataclasses import asdict, astuple
 from functools import partial
 from typing import Any
 
@@ -117,7 +118,7 @@ class _MasksRun:
             "family": entry.mask.family,
             "label": entry.mask.label,
             "captures": len(psfs),
-            **{name: float(f"{value:.4g}") for name, value in found._asdict().items()},
+            **{name: float(f"{value:.4g}") for name, value in asdict(found).items()},
             "detail_in_shot_noise": float(f"{found.in_shot_noise:.4g}"),
             "detail_in_read_noise": float(f"{found.in_read_noise:.4g}"),
             "tau": chosen,
@@ -150,7 +151,7 @@ class _MasksRun:
 
     def keep(self, case: Case, image: np.ndarray, truth: np.ndarray) -> None:
         score, similarity = psnr(image, truth), ssim(image, truth)
-        self.metrics["cases"].append([*case, round(score, 3), round(similarity, 4)])
+        self.metrics["cases"].append([*astuple(case), round(score, 3), round(similarity, 4)])
         if case.method == "total variation":
             self.images[case] = image
 

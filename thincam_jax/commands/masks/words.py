@@ -1,7 +1,8 @@
 """What a comparison of masks says in words: who wins where, and why."""
 
 from collections.abc import Callable, Iterable
-from typing import Any, NamedTuple, get_args
+from dataclasses import dataclass
+from typing import Any, get_args
 
 import numpy as np
 
@@ -12,7 +13,8 @@ from thincam_jax.commands.sections import Cells
 _EVEN = 0.3
 
 
-class Case(NamedTuple):
+@dataclass(frozen=True)
+class Case:
     """Of which image a score is; `electrons` a pixel of the bare sensor, `distance` in mm."""
 
     mask: str

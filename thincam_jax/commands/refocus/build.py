@@ -3,7 +3,7 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -147,7 +147,8 @@ def join_sweep(study: Study, distances: list[float], focused: list[Reconstructio
     return RefocusSweep(images, jnp.asarray(distances, images.dtype), slope, method)
 
 
-class FoundObjects(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class FoundObjects:
     """Regions of a sweep, their focus curves, and which region each object is (None: none)."""
 
     regions: np.ndarray

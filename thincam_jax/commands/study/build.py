@@ -5,6 +5,7 @@ import itertools
 import math
 import operator
 from collections.abc import Sequence
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -94,7 +95,7 @@ def as_method(config: CamerasConfig, method: MethodConfig) -> Method:
         ends = np.cumsum([0.0, *(exposure.share for exposure in exposures)])
         ends = config.motion * (ends - ends[-1] / 2)
         ways = itertools.pairwise(ends.tolist())
-        exposures = tuple(e._replace(moves=w) for e, w in zip(exposures, ways, strict=True))
+        exposures = tuple(replace(e, moves=w) for e, w in zip(exposures, ways, strict=True))
     return Method(
         method.name,
         method.kind,
@@ -268,8 +269,8 @@ def take(study: Study, exposure: Exposure, target: Target) -> Capture:
 
 def stacked(captures: Sequence[Capture]) -> tuple[Array, Array]:
     """Images (capture, *channel, y, x) and variances (capture, *channel)."""
-    images, variances = (np.stack(values) for values in zip(*captures, strict=True))
-    return jnp.asarray(images), jnp.asarray(variances)
+    images, variances = [c.image for c in captures], [c.variance for c in captures]
+    return jnp.asarray(np.stack(images)), jnp.asarray(np.stack(variances))
 
 
 def build_reconstructor(

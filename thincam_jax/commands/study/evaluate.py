@@ -2,7 +2,8 @@
 
 import math
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any
 
 import equinox as eqx
 import numpy as np
@@ -17,7 +18,8 @@ from thincam_jax.imaging.targets import line_pair, usaf1951_elements
 from thincam_jax.reconstruction import Reconstruction
 
 
-class Evaluation(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Evaluation:
     """A reconstruction beside its scene, both (y, x) or (y, x, channel) on one grid.
 
     - `image`: the reconstruction after the least-squares gain and offset.

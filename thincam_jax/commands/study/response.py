@@ -1,7 +1,8 @@
 r"""Transfer functions of whole methods: what a synthesis of captures carries of each frequency."""
 
 import math
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -10,7 +11,8 @@ from thincam_jax.imaging.metrics import cut_off, first_common_zero
 from thincam_jax.lensless.psf import otf
 
 
-class Response(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Response:
     """A method's transfer function along u, v = 0, on its reference plane.
 
     - `frequency`: cycles/mm, ≥ 0.

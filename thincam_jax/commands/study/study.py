@@ -4,7 +4,7 @@ import functools
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, get_args
+from typing import Any, get_args
 
 import jax
 import numpy as np
@@ -53,7 +53,8 @@ from thincam_jax.reconstruction.spectra import Prior
 Reconstructor = Callable[[Array, Array], Reconstruction]
 
 
-class Exposure(NamedTuple):
+@dataclass(frozen=True)
+class Exposure:
     """One exposure; those that are equal are taken once for all methods.
 
     - `beta`, `phase`, `width`: of the mask, rad/mm², rad and mm.
@@ -75,7 +76,8 @@ class Exposure(NamedTuple):
     moves: tuple[float, float] | None = None
 
 
-class Capture(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Capture:
     """What was read out (*channel, y, x), and the variance of its noise (*channel,)."""
 
     image: np.ndarray

@@ -3,8 +3,9 @@
 import math
 import re
 from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import product
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -21,7 +22,8 @@ _RANGE = re.compile(rf"\s*({_NUMBER})\s*:\s*({_NUMBER})\s*:\s*(\d+)\s*(:\s*log\b
 _WITH_UNIT = re.compile(rf"{_NUMBER}\s*([^\d\s.].*)")
 
 
-class Axis(NamedTuple):
+@dataclass(frozen=True)
+class Axis:
     """One --grid.
 
     - `text`: as given, for messages.

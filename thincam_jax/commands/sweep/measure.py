@@ -2,7 +2,8 @@
 
 import time
 import traceback
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any
 
 import jax
 import numpy as np
@@ -16,7 +17,8 @@ from thincam_jax.commands.study.evaluate import evaluate_targets, mean_psnr_of_p
 _USER_ERRORS = (ConfigError, FileNotFoundError, PermissionError, MemoryError)
 
 
-class Outcome(NamedTuple):
+@dataclass(frozen=True)
+class Outcome:
     """The metrics of a point by column; or why there are none, in one line, and the traceback."""
 
     metrics: dict[str, Any] | None

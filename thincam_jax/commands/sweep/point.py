@@ -4,9 +4,10 @@ import copy
 import hashlib
 import json
 from collections.abc import Sequence
+from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from thincam_jax._core.files import read_regular
 from thincam_jax.commands.checked_config import check_as
@@ -20,7 +21,8 @@ from thincam_jax.commands.sweep.grid import Axis, grid_values
 METRICS_VERSION = 1
 
 
-class GridPoint(NamedTuple):
+@dataclass(frozen=True)
+class GridPoint:
     """A configuration of the grid.
 
     - `key`: what its results are recognised by, from all that they depend on.

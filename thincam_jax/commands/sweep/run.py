@@ -2,7 +2,8 @@
 
 import contextlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any
 
 from thincam_jax.commands.sweep.folder import SweepFolder
 from thincam_jax.commands.sweep.measure import Outcome, measure_point, one_line
@@ -13,7 +14,8 @@ from thincam_jax.commands.sweep.workers import Died, Outcomes, local_workers
 Progress = Callable[[int, int], object]
 
 
-class Swept(NamedTuple):
+@dataclass(frozen=True)
+class Swept:
     """How a sweep ended: points, rows of the table, what failed, and the best points in words."""
 
     points: int

@@ -5,7 +5,8 @@ import threading
 import time
 from abc import abstractmethod
 from contextlib import suppress
-from typing import Any, ClassVar, NamedTuple, TypeVar
+from dataclasses import dataclass
+from typing import Any, ClassVar, TypeVar
 
 from thincam_jax.hardware.base import Identity, Stage
 from thincam_jax.hardware.errors import (
@@ -24,7 +25,8 @@ TRIES = 3  # every command is absolute: sent twice, it does the same
 Opened = TypeVar("Opened", bound="SerialStage")
 
 
-class Report(NamedTuple):
+@dataclass(frozen=True)
+class Report:
     """What a stage says of itself."""
 
     moving: bool

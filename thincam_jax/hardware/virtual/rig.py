@@ -10,7 +10,6 @@ import time
 import zlib
 from collections import Counter, OrderedDict
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, UInt8, UInt16
@@ -56,7 +55,8 @@ def bits_of(settings: CameraSettings) -> int:
     return int("".join(c for c in settings.pixel_format if c.isdigit()))
 
 
-class Fiducial(NamedTuple):
+@dataclass(frozen=True)
+class Fiducial:
     """What a frame was exposed of, written into its corner for tests.
 
     - `pattern`: checksum of the pixels shown (`pattern_number`). `position`: the stage's, µm.
