@@ -17,10 +17,10 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 # rounding is compiled `helpers.AS_IN_USE`; tests/test_default_flags.py runs a sample without flags.
 os.environ.setdefault(
     "XLA_FLAGS",
-    "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0"
-    " --xla_llvm_disable_expensive_passes=true --xla_cpu_parallel_codegen_split_count=1"
+    "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
     " --xla_cpu_multi_thread_eigen=false",
 )
+os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = "1" if os.environ["XLA_FLAGS"] else "0"
 
 import jax
 import jaxtyping
@@ -70,6 +70,17 @@ def pytest_collection_finish():
 def key() -> jax.Array:
     """A PRNG key, the same in every run; split it for more."""
     return jax.random.key(20260)
+
+
+@pytest.fixture(scope="module")
+def optimised():
+    """For tests that compute for minutes: programs are compiled as in use."""
+    before = jax.config.jax_disable_most_optimizations
+    jax.clear_caches()
+    jax.config.update("jax_disable_most_optimizations", False)
+    yield
+    jax.clear_caches()
+    jax.config.update("jax_disable_most_optimizations", before)
 
 
 @pytest.fixture(autouse=True, scope="module")

@@ -185,8 +185,8 @@ def against_grid(frequencies, count, seeds):
 
 
 @pytest.mark.thorough
-def test_95_of_100_searches_find_the_best_of_a_fine_grid():
-    """Within 0.1 %, in a hundredth of its 321² evaluations; measured: 99, in at most 988."""
-    excess, most = against_grid(Polar(HIGHEST, 512, 3), 321, 100)
-    assert np.sum(excess < 1e-3) >= 95
-    assert most < 321**2 / 100
+def test_19_of_20_searches_find_the_best_of_a_fine_grid():
+    """Within 0.1 %; in full, a hundred of them, in benchmarks/test_design.py."""
+    excess, most = against_grid(Polar(HIGHEST, 128, 2), 161, 20)
+    assert np.sum(excess < 1e-3) >= 19
+    assert most <= 1030

@@ -187,7 +187,7 @@ def test_what_cannot_be_checked_is_said(diffuser):
 
 
 @pytest.mark.thorough
-def test_rates_over_random_cameras():
+def test_rates_over_random_cameras(optimised):
     """Wrong scales from 1 % on, turns and mirror images: 95 % named; 2 % false alarms at most."""
     wrong, missed, right, alarms = rates(60)
     assert len(missed) <= 0.05 * wrong, missed

@@ -66,7 +66,8 @@ def sampled_errors(
     before = _central(mask, grid, path, methods[0])
     for method, finer in zip(methods, methods[1:], strict=False):
         after = _central(mask, grid, path, finer)
-        off = float(norm(before - after)) / float(norm(after))
+        size = float(norm(after))
+        off = float(norm(before - after)) / size if size > 0 else 0.0  # a dark scene
         yield method, _MARGIN * off / (1 - method.samples / finer.samples) + cut + rounding
         before = after
 

@@ -69,7 +69,8 @@ def _samples_at(
     mask, grid, path = seen.camera.mask, seen.kernel_grid, seen.camera.path(*corner)
     tried: list[tuple[PsfMethod, float]] = []
     with allow(precision, mask, grid, path):
-        for method, error in sampled_errors(*cast((mask, grid, path), precision), True, norm):
+        mask, grid, path = cast((mask, grid, path), precision)
+        for method, error in sampled_errors(mask, grid, path, True, norm):
             tried.append((method, seen.crop * error))
             if tried[-1][1] <= tolerance:
                 break
