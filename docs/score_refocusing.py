@@ -322,7 +322,8 @@ def errors(network, methods: Methods, pictures, rows) -> None:
     camera = network.camera
     shots = [one_plane(camera, pictures[n % len(pictures)], 100.0, 700 + n) for n in rows]
     focus = depth_of_focus(camera)
-    fast = {"Wiener": methods.wiener, "network": methods.learned}
+    fast = {"Wiener": methods.wiener, "ADMM-TV": methods.admm, "network": methods.learned}
+    head(fast)
     row("nothing told wrong", camera, fast, shots, 100.0)
     for part in (0.25, 0.5, 1.0, 2.0):
         told = 1 / (1 / 100.0 + part * focus)
@@ -333,7 +334,7 @@ def errors(network, methods: Methods, pictures, rows) -> None:
     for name, where in (("β", lambda c: c.camera.mask.beta), ("d", lambda c: c.camera.distance)):
         other = Methods(network, eqx.tree_at(where, camera, 1.01 * where(camera)))
         other.strength = methods.strength
-        wrong = {"Wiener": other.wiener, "network": other.learned}
+        wrong = {"Wiener": other.wiener, "ADMM-TV": other.admm, "network": other.learned}
         row(f"{name} told 1 % too large", camera, wrong, shots, 100.0)
 
 
