@@ -50,7 +50,7 @@ def test_patterns_of_ones_own_and_a_panel_without_inertia():
 @pytest.mark.parametrize(
     ("counts", "longest", "error", "message"),
     [
-        (linear, 0.04, Timeout, "give a larger longest"),
+        (linear, 0.04, Timeout, "raise longest"),
         (lambda levels: 100.0 + 0.05 * levels, LONGEST, OutOfRange, "expose longer"),
     ],
 )

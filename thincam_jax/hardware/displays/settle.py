@@ -83,7 +83,7 @@ def settle_calibrate(
     time_found, verdict = settled(longest)
     if verdict != 1:
         cause = f"{shots[0][1]:.2g} of the pattern before after {longest:g} s"
-        raise Timeout(device, operation, cause, "give a larger longest")
+        raise Timeout(device, operation, cause, "raise longest")
     for delay in np.linspace(longest, 0.0, _SWEEP + 1)[1:]:
         actual, verdict = settled(float(delay))
         if verdict != 1:
