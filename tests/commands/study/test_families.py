@@ -35,6 +35,10 @@ def written(folder, mask=MURA, method=METHOD):
         ),
         ("{family: random, width: 1.2 mm, cell: 0.1 mm, seed: 3}", "random"),
         ("{family: pinhole, width: 0.2 mm}", tc.Pinhole(0.2)),
+        (
+            MURA[:-1] + ", pixel_pitch: 40 um, fill_factor: 0.6}",
+            tc.on_display(tc.ModifiedUniformlyRedundantArray(13, 0.12), 0.04, 0.6),
+        ),
     ],
 )
 def test_family(tmp_path, mask, expected):
@@ -121,6 +125,10 @@ def test_refused_in_one_line(tmp_path, mask, method, message):
         (
             "{family: random, width: 1 mm, cell: 2 mm}",
             "width = 1 mm is not a whole number of cells",
+        ),
+        (
+            MURA[:-1] + ", pixel_pitch: 50 um}",
+            "height = 1.56 mm is not a whole number of cells of pixel_pitch = 0.05 mm; give height",
         ),
     ],
 )
