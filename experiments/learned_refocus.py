@@ -14,6 +14,7 @@
 import os
 from pathlib import Path
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
@@ -91,7 +92,7 @@ scenes = draw_batch(jax.random.key(5), jnp.asarray(unseen.images), camera, two, 
 distances = np.asarray(refocus_distances(50.0, 200.0, 15))
 reading = read(network, scenes.capture, distances, scenes.deviation)
 images = np.asarray(reading.images)[..., ::-1, ::-1]  # upright
-focused = jax.jit(scenes.target)
+focused = eqx.filter_jit(scenes.target)
 truths = np.stack([focused(camera, t) for t in distances], axis=1)[..., ::-1, ::-1]
 white = np.percentile(truths[0], 99.8)
 

@@ -88,7 +88,8 @@ def test_the_mean_is_that_of_samples(name, size):
 )
 def test_every_tolerance_costs_and_more_of_it_costs_more(tolerances):
     exact = robust(Tolerances())
-    once, twice = robust(tolerances), robust(Tolerances(*(2 * t for t in tolerances)))
+    doubled = Tolerances(**{name: 2 * size for name, size in vars(tolerances).items()})
+    once, twice = robust(tolerances), robust(doubled)
     assert exact < once < twice
 
 
