@@ -75,7 +75,7 @@ def key() -> jax.Array:
 @pytest.fixture(scope="module")
 def optimised():
     """For tests that compute for minutes: programs are compiled as in use."""
-    before = jax.config.jax_disable_most_optimizations
+    before = jax.config.values["jax_disable_most_optimizations"]
     jax.clear_caches()
     jax.config.update("jax_disable_most_optimizations", False)
     yield

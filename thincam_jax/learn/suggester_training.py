@@ -55,7 +55,7 @@ class TrainedSuggester(Module):
 
     suggester: Suggester
     warm_up: Float[Array, " step"]
-    history: Float[Array, " step"]
+    history: Float[Array, " tandem_step"]
     skipped: int
 
 

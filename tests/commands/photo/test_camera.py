@@ -41,7 +41,7 @@ def test_it_is_as_good_as_a_perfect_measurement(files):
     assert relative_l2(images[1], images[0]) < 0.01
     assert relative_l2(images[2], images[0]) > 0.1  # focused on 100 mm
     psf = record_of(files["study"].with_name("image.npy"))["sources"]["psf"]
-    assert "β 25 rad/mm²" in psf and "distance 3 mm" in psf and "object at 100 mm" in psf
+    assert "beta=25 rad/mm²" in psf and "distance=3 mm" in psf and "object at 100 mm" in psf
 
 
 def test_what_does_not_go_together(files):
