@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import Literal, TypeGuard, cast, get_args
+from typing import Any, Literal, TypeGuard, cast, get_args
 
 import numpy as np
 
@@ -75,6 +75,17 @@ class PsfMethod:
     def oversampling(self) -> int | None:
         """As `psf` takes it."""
         return self.samples if self.model in SAMPLED else None
+
+    @property
+    def arguments(self) -> dict[str, Any]:
+        """Those of `psf`."""
+        return {
+            "model": self.model,
+            "precision": self.precision,
+            "pixel_integration": self.pixel_integration,
+            "oversampling": self.oversampling,
+            "mask_shape": self.mask_shape,
+        }
 
 
 def psf_method(

@@ -158,11 +158,7 @@ def _measured(given: Conditions, method: PsfMethod, reference: np.ndarray) -> di
             camera,
             wavelength=wavelength,
             object_distance=object_distance,
-            model=method.model,
-            pixel_integration=method.pixel_integration,
-            oversampling=method.oversampling,
-            mask_shape=method.mask_shape,
-            precision=method.precision,
+            **method.arguments,
         )
 
     timing = measure(compute, given.camera, given.wavelength, given.object_distance)

@@ -129,12 +129,8 @@ def select_model(
     chosen = considered[-1] if considered[-1].predicted_error <= tolerance else best
     paraxial_error = probe.paraxial_error()
     return Selection(
-        model=chosen.model,
-        precision=chosen.precision,
-        oversampling=chosen.oversampling,
-        predicted_error=chosen.predicted_error,
+        **vars(chosen),
         meets_tolerance=chosen.predicted_error <= tolerance,
-        cost=chosen.cost,
         paraxial_error=paraxial_error,
         reasons=_reasons(probe, chosen, paraxial_error),
         considered=tuple(considered),
@@ -189,11 +185,7 @@ def _select_sampled(
         "errors are counted from scalar diffraction without Fresnel's approximation",
     )
     return Selection(
-        model=chosen.model,
-        precision=chosen.precision,
-        oversampling=chosen.oversampling,
-        predicted_error=chosen.predicted_error,
-        cost=chosen.cost,
+        **vars(chosen),
         meets_tolerance=chosen.predicted_error <= tolerance,
         paraxial_error=0.0,
         reasons=reasons,

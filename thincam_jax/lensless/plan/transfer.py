@@ -158,12 +158,8 @@ class SampledProbe:
             self.camera,
             wavelength=wavelength,
             object_distance=distance,
-            model=method.model,
-            pixel_integration=method.pixel_integration,
             grid=self.grid,
-            oversampling=method.oversampling,
-            mask_shape=method.mask_shape,
-            precision=method.precision,
+            **method.arguments,
         )
         return image_spectrum(np.asarray(h, float)[None], self.frequencies)[0]
 
