@@ -23,7 +23,7 @@ test: .venv/.installed-test ## Run the tests, e.g. make test ARGS="tests/test_un
 	@$(BIN)/python -m pytest -n 2 --dist loadfile $(ARGS)
 
 test-all: .venv/.installed-test ## Run all tests, the thorough ones too (some 45 minutes).
-	@$(BIN)/python -m pytest -n 2 --dist loadfile -m "thorough or not thorough" $(ARGS)
+	@$(BIN)/python -m pytest -n 2 --dist loadfile -m "not full_size" $(ARGS)
 
 lint: .venv/.installed-dev ## Check the style, the formatting and the types.
 	@$(BIN)/ruff check .

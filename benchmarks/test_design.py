@@ -12,16 +12,12 @@ import numpy as np
 import pytest
 
 from thincam_jax.design import (
-    DesignSpace,
     Polar,
     PowerLaw,
     Quadrant,
     Setup,
-    Variable,
     bayes_error,
     channels,
-    find_designs,
-    landscape,
     shots,
 )
 from thincam_jax.reconstruction import phase_pairs
@@ -89,22 +85,3 @@ def test_many_starts(benchmark, dtype):
     slopes = jax.vmap(jax.value_and_grad(error), in_axes=(0, None))
     value = measure(benchmark, slopes, (designs, data), 5)
     assert value.shape == (256,)
-
-
-@pytest.mark.benchmark(group="100 searches")
-def test_95_of_100_searches_find_the_best_of_a_fine_grid(benchmark):
-    """Within 0.1 %, each in a hundredth of its 321² evaluations; measured: 99, in at most 988."""
-    design, data = problem("polar 512x3", "float64")
-    space = DesignSpace(
-        design,
-        (Variable("beta", 8.0, 36.0, (0, 1)), Variable("beta", 8.0, 36.0, (2, 3))),
-    )
-    lowest = float(jnp.min(landscape(error, space, data, 321)[1]))
-
-    def searches():
-        return [find_designs(error, space, data, key=jax.random.key(s)) for s in range(100)]
-
-    results = benchmark.pedantic(searches, rounds=1)
-    excess = np.array([r.found[0].objective / lowest - 1 for r in results])
-    assert np.sum(excess < 1e-3) >= 95
-    assert max(r.evaluations for r in results) < 321**2 / 100

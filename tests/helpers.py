@@ -51,6 +51,14 @@ def quick(values: Iterable, *places: int) -> list:
     ]
 
 
+def in_full(small: Any, large: Any) -> list:
+    """Sizes of a test: that of the thorough run, and that whose figures the docs quote."""
+    return [
+        pytest.param(*(size if isinstance(size, tuple) else (size,)), marks=mark)
+        for size, mark in ((small, pytest.mark.thorough), (large, pytest.mark.full_size))
+    ]
+
+
 def count_traces(function: Callable) -> Callable:
     """Wrap a function so that `wrapped.traces` says how often its Python body ran.
 

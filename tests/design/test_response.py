@@ -19,7 +19,8 @@ respond = jax.jit(responses)
 tell = jax.jit(channels)
 
 
-@pytest.mark.parametrize("crop", [pytest.param(True, marks=pytest.mark.thorough), False])
+@pytest.mark.thorough
+@pytest.mark.parametrize("crop", [True, False])
 def test_rings_against_the_exact_model(crop):
     """Signal to noise in 12 rings from the second on: measured within 13 %, on average 5 %.
 

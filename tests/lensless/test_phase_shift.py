@@ -70,6 +70,7 @@ def test_shadow_of_a_finite_mask():
 class TestHarmonics:
     """Of the captures over the mask's phase."""
 
+    @pytest.mark.thorough
     def test_they_make_the_capture_of_any_phase(self):
         """H(φ) = Σ H_m e^{jmφ}, with the finite mask; H_{-m} is that of the mirrored frequency."""
         lens = camera(phase=0.9, profile="cosine")

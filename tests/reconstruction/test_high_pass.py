@@ -288,9 +288,8 @@ def test_the_history_is_that_of_one_run(wide_capture):
     assert objectives[0] > objectives[1] > objectives[2] > 3 * objectives[3]
 
 
-@pytest.mark.parametrize(
-    "ending", [pytest.param("stopped", marks=pytest.mark.thorough), "interrupted"]
-)
+@pytest.mark.thorough
+@pytest.mark.parametrize("ending", ["stopped", "interrupted"])
 def test_it_can_end_in_the_first_part(wide_capture, ending):
     """With the image so far, levelled: its objective is the last of the history."""
 

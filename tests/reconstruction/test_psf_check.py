@@ -8,6 +8,7 @@ import pytest
 import scipy
 
 import thincam_jax as tc
+from helpers import in_full
 from thincam_jax.reconstruction.psf_check import ORIENTATIONS
 
 SHAPE = (96, 128)
@@ -186,10 +187,10 @@ def test_what_cannot_be_checked_is_said(diffuser):
         jax.jit(lambda g: tc.check_psf(tc.Recording(g, tc.Psfs(psf[None]))))(diffuser.capture[None])
 
 
-@pytest.mark.thorough
-def test_rates_over_random_cameras(optimised):
+@pytest.mark.parametrize("count", in_full(20, 60))
+def test_rates_over_random_cameras(optimised, count):
     """Wrong scales from 1 % on, turns and mirror images: 95 % named; 2 % false alarms at most."""
-    wrong, missed, right, alarms = rates(60)
+    wrong, missed, right, alarms = rates(count)
     assert len(missed) <= 0.05 * wrong, missed
     assert len(alarms) <= 0.02 * right, alarms
 

@@ -169,7 +169,8 @@ def test_a_correlated_image(terms):
         np.testing.assert_allclose(sigma.ravel(), np.sqrt(np.diag(posterior)), rtol=1e-8)
 
 
-@pytest.mark.parametrize("count", [80, pytest.param(200, marks=pytest.mark.thorough)])
+@pytest.mark.thorough
+@pytest.mark.parametrize("count", [80, 200])
 def test_error_bars_cover_the_truth(count):
     """95 % intervals hold 93 to 97 % of the pixels of a photograph, over draws of the noise.
 

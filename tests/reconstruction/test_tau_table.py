@@ -1,6 +1,6 @@
 """The default τ and those found by a rule, against the best, on captures like real ones.
 
-The thorough test prints the table of docs/solver_figures.md (`-s -m thorough`).
+The test in full prints the table of docs/solver_figures.md (`-s -m full_size`).
 """
 
 import functools
@@ -106,7 +106,7 @@ def test_tau_is_near_the_best(case):
     assert found["before"] < -4
 
 
-@pytest.mark.thorough
+@pytest.mark.full_size
 def test_the_table(optimised):
     """Within 0.5 dB of the best in nine of ten cells, never 1 dB worse than with the old noise."""
     cells = [cell(*case) for case in itertools.product(LIGHT, BLACK, WRONG)]

@@ -9,7 +9,7 @@ import pytest
 from waveguide.setting import hologram
 
 import thincam_jax as tc
-from helpers import AS_IN_USE, relative_l2
+from helpers import AS_IN_USE, in_full, relative_l2
 from thincam_jax import waveguide as wg
 from thincam_jax.imaging.operators import Separable, Sparse
 from thincam_jax.imaging.targets import resize, sample_image
@@ -30,7 +30,7 @@ def all_optimised(camera, pixels, plane, orders, samples):
 
 
 @pytest.fixture(autouse=True)
-def optimised(monkeypatch):
+def long_programs_optimised(monkeypatch):
     monkeypatch.setattr(planning, "smeared_rays", all_optimised)
 
 
@@ -98,8 +98,7 @@ def random_case(random):
         return sts, wg.LitPlane(plane, image), 10 ** random.uniform(-3.5, -0.5)
 
 
-@pytest.mark.thorough
-@pytest.mark.parametrize(("count", "seed"), [(2, 12), (200, 34)])
+@pytest.mark.parametrize(("count", "seed"), in_full((50, 34), (200, 34)))
 def test_predictions_hold_over_random_cameras(capsys, count, seed):
     """True ≤ predicted in 99 % of cameras, predicted ≤ 10·true in 80 %."""
     random, pairs, met, kinds = np.random.default_rng(seed), [], [], []

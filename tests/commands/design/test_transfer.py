@@ -77,6 +77,7 @@ def test_sums_of_captures_against_simulated_point_spread_functions():
     assert alone.sums == (((1,), ()), ((3,), ()))
 
 
+@pytest.mark.thorough
 def test_noise_takes_the_contrast_of_the_chain():
     """Nearly all is there without noise; below it, ten times the noise leaves a tenth."""
     levels = [modulation_transfer(DESIGN, data(snr)).chain for snr in (120.0, 30.0, -50.0, -60.0)]

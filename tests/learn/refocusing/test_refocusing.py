@@ -156,6 +156,7 @@ def test_untrained_it_renders_the_linear_estimate_of_all_planes(camera, images):
     assert float(one.consistency) < 5
 
 
+@pytest.mark.thorough
 def test_what_it_is_trained_on_is_what_it_does(camera, images):
     """The loss of examples is that of the images which the network gives for their captures."""
     network = RefocusNetwork.create(camera, SMALL, key=jax.random.key(0))

@@ -116,6 +116,7 @@ def test_gradients_and_vmap():
     np.testing.assert_allclose(some, [value(each) for each in several], rtol=1e-9)
 
 
+@pytest.mark.thorough
 def test_models_and_plans():
     camera = tc.LenslessCamera(
         tc.on_display(tc.ModifiedUniformlyRedundantArray(5, 0.06), PITCH, FILL), SENSOR, DISTANCE

@@ -90,7 +90,8 @@ gradient = at_64_points(jax.vmap(jax.grad(weighted, argnums=(0, 1, 2, 3, 4))))
 values = at_64_points(weighted)
 
 
-@pytest.mark.parametrize("x", [pytest.param(0.0, marks=pytest.mark.thorough), 0.21])
+@pytest.mark.thorough
+@pytest.mark.parametrize("x", [0.0, 0.21])
 def test_smooth_through_focus(x):
     """Value and gradient do not feel a = 0; the slope there is that of differences across it."""
     b, ends = 150.0, (-0.4, 0.6)

@@ -5,7 +5,7 @@ import pytest
 from lensless.propagation import reference
 
 import thincam_jax as tc
-from helpers import quick, relative_l2
+from helpers import relative_l2
 
 WAVELENGTH = 500e-6
 
@@ -38,7 +38,8 @@ def test_is_the_thesis_formula(distance, t):
     np.testing.assert_allclose(value, expected, rtol=0, atol=1e-12 * am**2)
 
 
-@pytest.mark.parametrize("profile", quick(["cosine", "binary"], 0))
+@pytest.mark.thorough
+@pytest.mark.parametrize("profile", ["cosine", "binary"])
 def test_is_the_middle_of_the_finite_aperture(profile):
     """The difference is the edges' waves, √(λd)/(π·width) of the amplitude each, so it halves as
     the aperture doubles, give or take the fringe that the grid happens to see; with four edges

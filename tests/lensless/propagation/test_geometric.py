@@ -57,6 +57,7 @@ def test_rectangle():
     assert np.abs(found - average).mean() < 2e-3
 
 
+@pytest.mark.thorough
 def test_is_the_limit_of_short_waves():
     """The error falls like √λ: what is left are the waves of the edges, √(λd)/(2π·distance).
 

@@ -77,6 +77,7 @@ def test_regions_are_the_bright_objects_from_left_to_right():
     assert not object_regions(sweep, least=5000).any()
 
 
+@pytest.mark.thorough
 def test_objects_before_a_camera_are_found():
     """Two chequered boxes at 20 and 45 mm, 30 dB: to 5 %, with regions found by themselves."""
     cams = rig.cameras()
