@@ -3,6 +3,7 @@
 Traced values cannot be looked at and pass; they were checked when the object was built.
 """
 
+import functools
 from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -102,6 +103,26 @@ def positive_all(name: str, value: Array, unit: str) -> Array:
     array = finite(name, value, unit, shape=value.shape)
     message = f"{name} = {{}} {unit} must be positive; give {name} > 0 in {unit}"
     return _require(array, lambda known: known > 0, message)
+
+
+def length(name: str) -> Callable[[Any], Array]:
+    """`positive` of a field in mm, as `eqx.field(converter=…)` takes it."""
+    return functools.partial(positive, name, unit="mm")
+
+
+def named(check: Callable[..., Any], name: str, *given: Any, **how: Any) -> Callable[[Any], Any]:
+    """Another check of a field of that name."""
+    return lambda value: check(name, value, *given, **how)
+
+
+def optional(check: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    """The check of a field that may be None."""
+    return lambda value: None if value is None else check(value)
+
+
+def centre(value: Any) -> Array:
+    """The check of a field: a point of two coordinates, mm."""
+    return finite("centre", value, "mm", shape=(2,))
 
 
 def _after(unit: str) -> str:

@@ -33,7 +33,8 @@ _MOST = 4  # numbers of an array that are shown, not counted
 class Module(eqx.Module):
     """An `equinox.Module` whose repr shows scalars by value and unit; "?" while they are traced.
 
-    Larger arrays are shown by type and shape; what is None or as by default is left out.
+    Larger arrays are shown by type and shape. None is left out, and so is what is as by default,
+    unless a converter says that it was to be chosen.
     """
 
     def __pdoc__(self, **kwargs: Any) -> wl.AbstractDoc:
@@ -42,7 +43,7 @@ class Module(eqx.Module):
         parts = [
             wl.TextDoc(f"{f.name}=") + wl.pdoc(_shown(f.name, value), **kwargs)
             for f, value in named
-            if value is not None and value is not f.default
+            if value is not None and ("converter" in f.metadata or value is not f.default)
         ]
         name = wl.TextDoc(f"{type(self).__name__}(")
         return wl.bracketed(name, parts, wl.comma, wl.TextDoc(")"), kwargs["indent"])

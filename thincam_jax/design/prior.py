@@ -7,7 +7,6 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
-from thincam_jax._core.checks import Number
 
 
 class PowerLaw(eqx.Module):
@@ -20,12 +19,14 @@ class PowerLaw(eqx.Module):
     - `corner`: ν₀, cycles/rad; default one cycle over the object.
     """
 
-    exponent: Float[Array, ""]
-    corner: Float[Array, ""] | None
-
-    def __init__(self, exponent: Number = 2.0, corner: Number | None = None):
-        self.exponent = checks.non_negative("exponent", exponent, "powers of the frequency")
-        self.corner = None if corner is None else checks.positive("corner", corner, "cycles/rad")
+    exponent: Float[Array, ""] = eqx.field(
+        default=2.0,
+        converter=checks.named(checks.non_negative, "exponent", "powers of the frequency"),
+    )
+    corner: Float[Array, ""] | None = eqx.field(
+        default=None,
+        converter=checks.optional(checks.named(checks.positive, "corner", "cycles/rad")),
+    )
 
     def __call__(
         self, frequency_squared: Float[Array, "*shape"], field: Float[Array, ""]

@@ -4,7 +4,7 @@ import equinox as eqx
 from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
-from thincam_jax._core.checks import Number, Numbers
+from thincam_jax._core.checks import Numbers
 from thincam_jax._core.module import Module
 from thincam_jax.design.prior import PowerLaw
 
@@ -16,10 +16,9 @@ class SignalNoise(Module):
       exposure among captures does not change it.
     """
 
-    snr_db: Float[Array, ""]
-
-    def __init__(self, snr_db: Number = 30.0):
-        self.snr_db = checks.finite("snr_db", snr_db, "dB")
+    snr_db: Float[Array, ""] = eqx.field(
+        default=30.0, converter=checks.named(checks.finite, "snr_db", "dB")
+    )
 
     def variance(self, light: Numbers, signal: Numbers, exposure: Numbers):
         """Of a pixel, mm⁴: from the capture's mean (mm²), its variance, the share of exposure."""
@@ -34,12 +33,12 @@ class PhotonNoise(Module):
     - `read_noise`: standard deviation, electrons, of each capture.
     """
 
-    electrons: Float[Array, ""]
-    read_noise: Float[Array, ""]
-
-    def __init__(self, electrons: Number = 2_000.0, read_noise: Number = 8.0):
-        self.electrons = checks.positive("electrons", electrons, "electrons")
-        self.read_noise = checks.non_negative("read_noise", read_noise, "electrons")
+    electrons: Float[Array, ""] = eqx.field(
+        default=2_000.0, converter=checks.named(checks.positive, "electrons", "electrons")
+    )
+    read_noise: Float[Array, ""] = eqx.field(
+        default=8.0, converter=checks.named(checks.non_negative, "read_noise", "electrons")
+    )
 
     def variance(self, light: Numbers, signal: Numbers, exposure: Numbers):
         """Of a pixel, mm⁴: from the capture's mean (mm²), its variance, the share of exposure."""
@@ -60,38 +59,21 @@ class Setup(Module):
       `thincam_jax.design.response`.
     """
 
-    pitch: Float[Array, ""]
-    sensor_width: Float[Array, ""]
-    object_distance: Float[Array, ""]
-    object_width: Float[Array, ""]
-    contrast: Float[Array, ""]
-    noise: SignalNoise | PhotonNoise
-    prior: PowerLaw
-    pixel_integration: bool = eqx.field(static=True)
-    crop: bool = eqx.field(static=True)
-
-    def __init__(
-        self,
-        *,
-        pitch: Number,
-        sensor_width: Number,
-        object_distance: Number,
-        object_width: Number,
-        noise: SignalNoise | PhotonNoise | None = None,
-        prior: PowerLaw | None = None,
-        contrast: Number = 0.5,
-        pixel_integration: bool = True,
-        crop: bool = True,
-    ):
-        self.pitch = checks.positive("pitch", pitch, "mm")
-        self.sensor_width = checks.positive("sensor_width", sensor_width, "mm")
-        self.object_distance = checks.positive("object_distance", object_distance, "mm")
-        self.object_width = checks.positive("object_width", object_width, "mm")
-        self.contrast = checks.positive("contrast", contrast, "parts of the mean")
-        self.noise = SignalNoise() if noise is None else noise
-        self.prior = PowerLaw() if prior is None else prior
-        self.pixel_integration = pixel_integration
-        self.crop = crop
+    pitch: Float[Array, ""] = eqx.field(converter=checks.length("pitch"))
+    sensor_width: Float[Array, ""] = eqx.field(converter=checks.length("sensor_width"))
+    object_distance: Float[Array, ""] = eqx.field(converter=checks.length("object_distance"))
+    object_width: Float[Array, ""] = eqx.field(converter=checks.length("object_width"))
+    contrast: Float[Array, ""] = eqx.field(
+        default=0.5, converter=checks.named(checks.positive, "contrast", "parts of the mean")
+    )
+    noise: SignalNoise | PhotonNoise = eqx.field(
+        default=None, converter=lambda given: SignalNoise() if given is None else given
+    )
+    prior: PowerLaw = eqx.field(
+        default=None, converter=lambda given: PowerLaw() if given is None else given
+    )
+    pixel_integration: bool = eqx.field(default=True, converter=bool, static=True)
+    crop: bool = eqx.field(default=True, converter=bool, static=True)
 
     @property
     def field(self) -> Float[Array, ""]:

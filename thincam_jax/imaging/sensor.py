@@ -100,14 +100,12 @@ class GaussianNoise(AbstractNoise):
     - "without_mean": its variance: what is left of a lensless capture once its bias is removed.
     """
 
-    snr_db: Float[Array, ""]
-    signal_power: Literal["total", "without_mean"] = eqx.field(static=True)
-
-    def __init__(self, snr_db: Number, signal_power: Literal["total", "without_mean"] = "total"):
-        self.snr_db = checks.finite("snr_db", snr_db, "dB")
-        self.signal_power = checks.choice(  # pyright: ignore[reportAttributeAccessIssue]
-            "signal_power", signal_power, ("total", "without_mean")
-        )
+    snr_db: Float[Array, ""] = eqx.field(converter=checks.named(checks.finite, "snr_db", "dB"))
+    signal_power: Literal["total", "without_mean"] = eqx.field(
+        default="total",
+        converter=checks.named(checks.choice, "signal_power", ("total", "without_mean")),
+        static=True,
+    )
 
     def variance(
         self,
@@ -138,10 +136,9 @@ class PoissonGaussianNoise(AbstractNoise):
     The number of electrons follows from the sensor's full well and exposure.
     """
 
-    read_noise: Float[Array, ""]
-
-    def __init__(self, read_noise: Number = 8.0):
-        self.read_noise = checks.non_negative("read_noise", read_noise, "electrons")
+    read_noise: Float[Array, ""] = eqx.field(
+        default=8.0, converter=checks.named(checks.non_negative, "read_noise", "electrons")
+    )
 
     def variance(
         self,

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
-from thincam_jax._core.checks import Number, Numbers
+from thincam_jax._core.checks import Numbers
 from thincam_jax._core.module import Module
 from thincam_jax.imaging.operators import kernel_grid
 from thincam_jax.lensless.camera import LenslessCamera
@@ -18,6 +18,20 @@ from thincam_jax.lensless.psf import psf
 from thincam_jax.reconstruction.registration import own_field, register
 
 _DARK = 0.3  # of a PSF's absolute sum
+
+
+def _cameras(given: Sequence[LenslessCamera]) -> tuple[LenslessCamera, ...]:
+    if isinstance(given, LenslessCamera):
+        raise TypeError("cameras is one camera; give a list, [camera], one for each capture")
+    cameras = tuple(given)
+    if not cameras:
+        raise ValueError("cameras is empty; give one camera for each capture")
+    if not all(isinstance(camera, LenslessCamera) for camera in cameras):
+        raise TypeError("cameras holds something else; give LenslessCameras, or use Psfs")
+    return cameras
+
+
+_model = checks.named(checks.choice, "model", MODELS)
 
 
 class Cameras(Module):
@@ -36,34 +50,12 @@ class Cameras(Module):
     - `model`, `pixel_integration`: of the PSFs, see `thincam_jax.psf`.
     """
 
-    cameras: tuple[LenslessCamera, ...]
-    wavelength: Any
-    object_distance: Any
-    field_shape: tuple[int, int] | None = eqx.field(static=True)
-    model: Model = eqx.field(static=True)
-    pixel_integration: bool = eqx.field(static=True)
-
-    def __init__(
-        self,
-        cameras: Sequence[LenslessCamera],
-        *,
-        wavelength: Numbers | Sequence[Number] | None = None,
-        object_distance: Numbers | Sequence[Number] | None = None,
-        field_shape: tuple[int, int] | None = None,
-        model: Model = "separable",
-        pixel_integration: bool = True,
-    ):
-        if isinstance(cameras, LenslessCamera):
-            raise TypeError("cameras is one camera; give a list, [camera], one for each capture")
-        self.cameras = tuple(cameras)
-        if not self.cameras:
-            raise ValueError("cameras is empty; give one camera for each capture")
-        if not all(isinstance(camera, LenslessCamera) for camera in self.cameras):
-            raise TypeError("cameras holds something else; give LenslessCameras, or use Psfs")
-        checks.choice("model", model, MODELS)
-        self.wavelength, self.object_distance = wavelength, object_distance
-        self.field_shape, self.model = field_shape, model
-        self.pixel_integration = pixel_integration
+    cameras: tuple[LenslessCamera, ...] = eqx.field(converter=_cameras)
+    wavelength: Any = eqx.field(default=None, kw_only=True)
+    object_distance: Any = eqx.field(default=None, kw_only=True)
+    field_shape: tuple[int, int] | None = eqx.field(default=None, static=True, kw_only=True)
+    model: Model = eqx.field(default="separable", converter=_model, static=True, kw_only=True)
+    pixel_integration: bool = eqx.field(default=True, converter=bool, static=True, kw_only=True)
 
     @property
     def count(self) -> int:

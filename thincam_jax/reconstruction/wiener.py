@@ -201,13 +201,13 @@ class Wiener(AbstractSolver):
     """
 
     name: ClassVar[str] = "wiener"
-    synthesis: np.ndarray | None
-    prior: Prior = eqx.field(static=True)
-
-    def __init__(self, *, synthesis: Synthesis | None = None, prior: Prior = "inverse_square"):
-        checks.choice("prior", prior, ("inverse_square", "flat"))
-        self.synthesis = as_synthesis(synthesis)
-        self.prior = prior
+    synthesis: np.ndarray | None = eqx.field(default=None, converter=as_synthesis, kw_only=True)
+    prior: Prior = eqx.field(
+        default="inverse_square",
+        converter=checks.named(checks.choice, "prior", ("inverse_square", "flat")),
+        static=True,
+        kw_only=True,
+    )
 
     def prepare(self, cameras: Cameras) -> WienerSynthesis:
         """The filter of these cameras, a function of captures and noise variance."""

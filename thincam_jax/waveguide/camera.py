@@ -6,6 +6,7 @@ surface with the top hologram a glass thickness w further, and objects d2 before
 5.5).
 """
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -21,12 +22,12 @@ from thincam_jax.waveguide.hologram import VolumeHologram
 class Rectangle(Module):
     """A part of a plane: `centre` and `size` (x, y), mm."""
 
-    centre: Float[Array, "2"]
-    size: Float[Array, "2"]
+    centre: Float[Array, "2"] = eqx.field(converter=checks.centre)
+    size: Float[Array, "2"] = eqx.field(
+        converter=checks.named(checks.finite, "size", "mm", shape=(2,))
+    )
 
-    def __init__(self, centre: Numbers, size: Numbers):
-        self.centre = checks.finite("centre", centre, "mm", shape=(2,))
-        self.size = checks.finite("size", size, "mm", shape=(2,))
+    def __check_init__(self):
         if not checks.is_traced(self.size) and not (self.size > 0).all():
             raise ValueError(f"size = {self.size} mm; give a width and a height above 0")
 
@@ -44,23 +45,10 @@ class Screen(Module):
     """
 
     hologram: VolumeHologram
-    glass_thickness: Float[Array, ""]
-    glass_index: AbstractIndex
-    top: Rectangle | None
-    bottom: Rectangle | None
-
-    def __init__(
-        self,
-        hologram: VolumeHologram,
-        glass_thickness: Number,
-        glass_index: AbstractIndex | Number,
-        top: Rectangle | None = None,
-        bottom: Rectangle | None = None,
-    ):
-        self.hologram = hologram
-        self.glass_thickness = checks.positive("glass_thickness", glass_thickness, "mm")
-        self.glass_index = as_index("glass_index", glass_index)
-        self.top, self.bottom = top, bottom
+    glass_thickness: Float[Array, ""] = eqx.field(converter=checks.length("glass_thickness"))
+    glass_index: AbstractIndex = eqx.field(converter=checks.named(as_index, "glass_index"))
+    top: Rectangle | None = None
+    bottom: Rectangle | None = None
 
 
 class SeeThroughCamera(Module):

@@ -15,6 +15,7 @@ the Bragg condition (Eq 5.5); with k = 2πn/λ this is a mirror reflection at th
 Directions are unit vectors (x, y, z) in the film; z is its normal.
 """
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optimistix
@@ -36,22 +37,14 @@ class VolumeHologram(Module):
     - `index_modulation`: Δn, the amplitude of n + Δn·cos(K·r).
     """
 
-    grating: Float[Array, "3"]
-    index: AbstractIndex
-    thickness: Float[Array, ""]
-    index_modulation: Float[Array, ""]
-
-    def __init__(
-        self,
-        grating: Float[Array, "3"],
-        index: AbstractIndex | Number,
-        thickness: Number,
-        index_modulation: Number,
-    ):
-        self.grating = checks.finite("grating", grating, "rad/mm", shape=(3,))
-        self.index = as_index("index", index)
-        self.thickness = checks.positive("thickness", thickness, "mm")
-        self.index_modulation = checks.non_negative("index_modulation", index_modulation, "n")
+    grating: Float[Array, "3"] = eqx.field(
+        converter=checks.named(checks.finite, "grating", "rad/mm", shape=(3,))
+    )
+    index: AbstractIndex = eqx.field(converter=checks.named(as_index, "index"))
+    thickness: Float[Array, ""] = eqx.field(converter=checks.length("thickness"))
+    index_modulation: Float[Array, ""] = eqx.field(
+        converter=checks.named(checks.non_negative, "index_modulation", "n")
+    )
 
     @staticmethod
     def record(

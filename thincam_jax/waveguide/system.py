@@ -11,7 +11,6 @@ import scipy
 from jaxtyping import Array, Float, Int
 
 from thincam_jax._core import checks
-from thincam_jax._core.checks import Number, Numbers, Shape
 from thincam_jax._core.module import Module
 from thincam_jax.imaging.operators import Sparse
 from thincam_jax.waveguide.camera import SeeThroughCamera
@@ -28,16 +27,10 @@ class ObjectPlane(Module):
     - `centre`: (x, y) of its middle from the camera's axis, mm; +y is down.
     """
 
-    shape: tuple[int, int] = eqx.field(static=True)
-    distance: Float[Array, ""]
-    width: Float[Array, ""]
-    centre: Float[Array, "2"]
-
-    def __init__(self, shape: Shape, distance: Number, width: Number, centre: Numbers):
-        self.shape = checks.shape2d("shape", shape)
-        self.distance = checks.positive("distance", distance, "mm")
-        self.width = checks.positive("width", width, "mm")
-        self.centre = checks.finite("centre", centre, "mm", shape=(2,))
+    shape: tuple[int, int] = eqx.field(converter=checks.named(checks.shape2d, "shape"), static=True)
+    distance: Float[Array, ""] = eqx.field(converter=checks.length("distance"))
+    width: Float[Array, ""] = eqx.field(converter=checks.length("width"))
+    centre: Float[Array, "2"] = eqx.field(converter=checks.centre)
 
     @property
     def pitch(self) -> Float[Array, ""]:

@@ -1,7 +1,7 @@
 """Masks of square cells that are a sum of few products of a pattern down and one across."""
 
 import abc
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -10,7 +10,7 @@ import scipy
 from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
-from thincam_jax._core.checks import Number, Numbers
+from thincam_jax._core.checks import Number
 from thincam_jax._core.precision import as_complex
 from thincam_jax.lensless.masks.base import AbstractFactoredMask, AxisFactors, MaskTerms
 
@@ -86,26 +86,18 @@ class SeparableMask(AbstractCellMask):
     - `centre`: (y, x) of the mask's centre, mm.
     """
 
-    rows: Float[Array, " row"]
-    columns: Float[Array, " column"]
-    cell: Float[Array, ""]
-    centre: Float[Array, "2"]
-    combine: Combination = eqx.field(static=True)
-
-    def __init__(
-        self,
-        rows: Any,
-        columns: Any,
-        cell: Number,
-        *,
-        combine: Combination = "product",
-        centre: Numbers | tuple[Number, Number] = (0.0, 0.0),
-    ):
-        self.rows = checks.transmittances("rows", rows)
-        self.columns = checks.transmittances("columns", columns)
-        self.cell = checks.positive("cell", cell, "mm")
-        self.combine = checks.choice("combine", combine, COMBINATIONS)  # pyright: ignore
-        self.centre = checks.finite("centre", centre, "mm", shape=(2,))
+    rows: Float[Array, " row"] = eqx.field(converter=checks.named(checks.transmittances, "rows"))
+    columns: Float[Array, " column"] = eqx.field(
+        converter=checks.named(checks.transmittances, "columns")
+    )
+    cell: Float[Array, ""] = eqx.field(converter=checks.length("cell"))
+    centre: Float[Array, "2"] = eqx.field(default=(0, 0), converter=checks.centre, kw_only=True)
+    combine: Combination = eqx.field(
+        default="product",
+        converter=checks.named(checks.choice, "combine", COMBINATIONS),
+        static=True,
+        kw_only=True,
+    )
 
     def patterns(self) -> Patterns:
         a, b = self.rows, self.columns

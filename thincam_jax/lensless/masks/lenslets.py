@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
-from thincam_jax._core.checks import Number, Numbers, Shape
+from thincam_jax._core.checks import Number
 from thincam_jax._core.precision import as_complex
 from thincam_jax.lensless.masks.base import AbstractFactoredMask, AxisFactors, MaskTerms
 from thincam_jax.lensless.masks.cells import cell_edges
@@ -27,23 +27,12 @@ class LensletArray(AbstractFactoredMask):
     - `centre`: (y, x) of the array's centre, mm.
     """
 
-    focal_length: Float[Array, ""]
-    pitch: Float[Array, ""]
-    shape: tuple[int, int] = eqx.field(static=True)
-    centre: Float[Array, "2"]
-
-    def __init__(
-        self,
-        focal_length: Number,
-        pitch: Number,
-        shape: Shape = (1, 1),
-        *,
-        centre: Numbers | tuple[Number, Number] = (0.0, 0.0),
-    ):
-        self.focal_length = checks.positive("focal_length", focal_length, "mm")
-        self.pitch = checks.positive("pitch", pitch, "mm")
-        self.shape = checks.shape2d("shape", shape)
-        self.centre = checks.finite("centre", centre, "mm", shape=(2,))
+    focal_length: Float[Array, ""] = eqx.field(converter=checks.length("focal_length"))
+    pitch: Float[Array, ""] = eqx.field(converter=checks.length("pitch"))
+    shape: tuple[int, int] = eqx.field(
+        default=(1, 1), converter=checks.named(checks.shape2d, "shape"), static=True
+    )
+    centre: Float[Array, "2"] = eqx.field(default=(0, 0), converter=checks.centre, kw_only=True)
 
     @property
     def extent(self) -> tuple[Float[Array, ""], Float[Array, ""]]:

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from thincam_jax._core import checks
-from thincam_jax._core.checks import Number, Numbers
+from thincam_jax._core.checks import Number
 from thincam_jax._core.grids import Grid, cell_overlap
 from thincam_jax._core.precision import as_complex, turn_phasor
 from thincam_jax.imaging.refractive_index import AbstractIndex, as_index
@@ -18,6 +18,36 @@ from thincam_jax.lensless.masks.sampled import SampledMask
 Interpolation = Literal["cells", "bilinear"]
 # mm: above it a relief is no thin mask, and what is given in micrometres is above it too.
 HIGHEST = 0.1
+
+
+def _map(name: str, values: Any, lowest: float, highest: float, unit: str) -> Float[Array, "y x"]:
+    """A real (y, x) map within its limits, or one line that says what is out of them."""
+    array = jnp.asarray(values)
+    if array.ndim != 2 or 0 in array.shape:
+        raise ValueError(f"{name} has shape {array.shape}; give a non-empty array (y, x)")
+    if not jnp.issubdtype(array.dtype, jnp.floating):
+        if jnp.issubdtype(array.dtype, jnp.complexfloating):
+            raise TypeError(f"{name} is complex; give real numbers in {unit}")
+        array = array.astype(float)
+    if checks.is_traced(array):
+        return array
+    known = np.asarray(array)
+    if not np.isfinite(known).all():
+        raise ValueError(f"{name} holds NaN or infinity; give finite numbers in {unit}")
+    # In single precision a number may lie a rounding beyond its own limit.
+    slack = 1e-6 * (highest - lowest)
+    if known.min() < lowest - slack or known.max() > highest + slack:
+        raise ValueError(
+            f"{name} reaches from {known.min():.4g} to {known.max():.4g}; give {lowest:g} to "
+            f"{highest:g} {unit}"
+        )
+    return array
+
+
+_heights = checks.named(_map, "height", 0.0, HIGHEST, "mm, such as 1.2 * um")
+_amplitudes = checks.named(_map, "amplitude", 0.0, 1.0, "parts of one")
+_material = checks.named(as_index, "material")
+_interpolation = checks.named(checks.choice, "interpolation", get_args(Interpolation))
 
 
 class PhaseMask(AbstractMask):
@@ -49,43 +79,30 @@ class PhaseMask(AbstractMask):
     **Errors**: ValueError or TypeError, one line, for what is out of range.
     """
 
-    height: Float[Array, "y x"]
-    pitch: Float[Array, ""]
-    material: AbstractIndex
-    amplitude: Float[Array, "y x"] | None
-    centre: Float[Array, "2"]
-    fill_factor: Float[Array, ""] | None
-    interpolation: Interpolation = eqx.field(static=True)
+    height: Float[Array, "y x"] = eqx.field(converter=_heights)
+    pitch: Float[Array, ""] = eqx.field(converter=checks.length("pitch"))
+    material: AbstractIndex = eqx.field(converter=_material)
+    amplitude: Float[Array, "y x"] | None = eqx.field(
+        default=None, converter=checks.optional(_amplitudes), kw_only=True
+    )
+    centre: Float[Array, "2"] = eqx.field(default=(0, 0), converter=checks.centre, kw_only=True)
+    fill_factor: Float[Array, ""] | None = eqx.field(
+        default=None,
+        converter=checks.optional(checks.named(checks.fraction, "fill_factor")),
+        kw_only=True,
+    )
+    interpolation: Interpolation = eqx.field(
+        default="cells", converter=_interpolation, static=True, kw_only=True
+    )
 
-    def __init__(
-        self,
-        height: Any,
-        pitch: Number,
-        material: AbstractIndex | Number,
-        *,
-        amplitude: Any = None,
-        centre: Numbers | tuple[Number, Number] = (0.0, 0.0),
-        interpolation: Interpolation = "cells",
-        fill_factor: Number | None = None,
-    ):
-        self.height = _map("height", height, 0.0, HIGHEST, "mm, such as 1.2 * um")
-        self.pitch = checks.positive("pitch", pitch, "mm")
-        self.material = as_index("material", material)
-        self.amplitude = None
-        if amplitude is not None:
-            self.amplitude = _map("amplitude", amplitude, 0.0, 1.0, "parts of one")
-            if self.amplitude.shape != self.height.shape:
-                raise ValueError(
-                    f"amplitude has shape {self.amplitude.shape} and height {self.height.shape}; "
-                    "give one amplitude for each height"
-                )
-        self.centre = checks.finite("centre", centre, "mm", shape=(2,))
-        self.interpolation = checks.choice("interpolation", interpolation, get_args(Interpolation))  # pyright: ignore
-        self.fill_factor = None
-        if fill_factor is not None:
-            self.fill_factor = checks.fraction("fill_factor", fill_factor)
-            if self.interpolation != "cells":
-                raise ValueError("heights in between have no gaps: leave fill_factor out")
+    def __check_init__(self):
+        if self.amplitude is not None and self.amplitude.shape != self.height.shape:
+            raise ValueError(
+                f"amplitude has shape {self.amplitude.shape} and height {self.height.shape}; "
+                "give one amplitude for each height"
+            )
+        if self.fill_factor is not None and self.interpolation != "cells":
+            raise ValueError("heights in between have no gaps: leave fill_factor out")
 
     @property
     def extent(self) -> tuple[Float[Array, ""], Float[Array, ""]]:
@@ -151,14 +168,9 @@ class MaskBlank(eqx.Module):
     - `material`: refractive index, a number or one of `thincam_jax.imaging.refractive_index`.
     """
 
-    shape: tuple[int, int] = eqx.field(static=True)
-    pitch: Float[Array, ""]
-    material: AbstractIndex
-
-    def __init__(self, shape: Any, pitch: Number, material: AbstractIndex | Number):
-        self.shape = checks.shape2d("shape", shape)
-        self.pitch = checks.positive("pitch", pitch, "mm")
-        self.material = as_index("material", material)
+    shape: tuple[int, int] = eqx.field(converter=checks.named(checks.shape2d, "shape"), static=True)
+    pitch: Float[Array, ""] = eqx.field(converter=checks.length("pitch"))
+    material: AbstractIndex = eqx.field(converter=_material)
 
     @property
     def grid(self) -> Grid:
@@ -178,30 +190,6 @@ class MaskBlank(eqx.Module):
                 f"height has shape {mask.height.shape} and the blank {self.shape}; give as many"
             )
         return mask
-
-
-def _map(name: str, values: Any, lowest: float, highest: float, unit: str) -> Float[Array, "y x"]:
-    """A real (y, x) map within its limits, or one line that says what is out of them."""
-    array = jnp.asarray(values)
-    if array.ndim != 2 or 0 in array.shape:
-        raise ValueError(f"{name} has shape {array.shape}; give a non-empty array (y, x)")
-    if not jnp.issubdtype(array.dtype, jnp.floating):
-        if jnp.issubdtype(array.dtype, jnp.complexfloating):
-            raise TypeError(f"{name} is complex; give real numbers in {unit}")
-        array = array.astype(float)
-    if checks.is_traced(array):
-        return array
-    known = np.asarray(array)
-    if not np.isfinite(known).all():
-        raise ValueError(f"{name} holds NaN or infinity; give finite numbers in {unit}")
-    # In single precision a number may lie a rounding beyond its own limit.
-    slack = 1e-6 * (highest - lowest)
-    if known.min() < lowest - slack or known.max() > highest + slack:
-        raise ValueError(
-            f"{name} reaches from {known.min():.4g} to {known.max():.4g}; give {lowest:g} to "
-            f"{highest:g} {unit}"
-        )
-    return array
 
 
 def _between(values: Float[Array, "n m"], at: Float[Array, " k"]) -> Float[Array, "k m"]:

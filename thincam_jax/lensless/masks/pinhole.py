@@ -1,13 +1,12 @@
 """Openings: the pinhole, square or round, and the round code of rings."""
 
-from typing import Any
-
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
-from thincam_jax._core.checks import Number, Numbers
+from thincam_jax._core.checks import Number
 from thincam_jax._core.grids import Grid
 from thincam_jax._core.precision import as_complex
 from thincam_jax.lensless.masks.base import (
@@ -28,20 +27,11 @@ class Pinhole(AbstractFactoredMask):
     - `centre`: (y, x) of the opening's centre, mm.
     """
 
-    width: Float[Array, ""]
-    height: Float[Array, ""] | None
-    centre: Float[Array, "2"]
-
-    def __init__(
-        self,
-        width: Number,
-        height: Number | None = None,
-        *,
-        centre: Numbers | tuple[Number, Number] = (0.0, 0.0),
-    ):
-        self.width = checks.positive("width", width, "mm")
-        self.height = None if height is None else checks.positive("height", height, "mm")
-        self.centre = checks.finite("centre", centre, "mm", shape=(2,))
+    width: Float[Array, ""] = eqx.field(converter=checks.length("width"))
+    height: Float[Array, ""] | None = eqx.field(
+        default=None, converter=checks.optional(checks.length("height"))
+    )
+    centre: Float[Array, "2"] = eqx.field(default=(0, 0), converter=checks.centre, kw_only=True)
 
     @property
     def extent(self) -> tuple[Float[Array, ""], Float[Array, ""]]:
@@ -66,20 +56,9 @@ class RadialMask(AbstractMask):
     - `centre`: (y, x) of the mask's centre, mm.
     """
 
-    rings: Float[Array, " ring"]
-    ring: Float[Array, ""]
-    centre: Float[Array, "2"]
-
-    def __init__(
-        self,
-        rings: Any,
-        ring: Number,
-        *,
-        centre: Numbers | tuple[Number, Number] = (0.0, 0.0),
-    ):
-        self.rings = checks.transmittances("rings", rings)
-        self.ring = checks.positive("ring", ring, "mm")
-        self.centre = checks.finite("centre", centre, "mm", shape=(2,))
+    rings: Float[Array, " ring"] = eqx.field(converter=checks.named(checks.transmittances, "rings"))
+    ring: Float[Array, ""] = eqx.field(converter=checks.length("ring"))
+    centre: Float[Array, "2"] = eqx.field(default=(0, 0), converter=checks.centre, kw_only=True)
 
     @property
     def extent(self) -> tuple[Float[Array, ""], Float[Array, ""]]:

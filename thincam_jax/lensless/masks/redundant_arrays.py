@@ -9,7 +9,6 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
-from thincam_jax._core.checks import Number, Numbers
 from thincam_jax.lensless.masks.cells import AbstractCellMask, Patterns
 
 _LARGEST = 4096
@@ -50,91 +49,6 @@ class AbstractRedundantArray(AbstractCellMask):
         return 2 * self.cells[:rows, :columns] - 1
 
 
-class ModifiedUniformlyRedundantArray(AbstractRedundantArray):
-    r"""A MURA of p × p cells (Gottesman and Fenimore 1989), half of them open.
-
-    With :math:`G = 2A - 1` but :math:`G_{00} = +1` (`decoder`) the periodic correlation is a single
-    point, :math:`A \star G = \tfrac{p^2-1}{2}\,\delta`, and :math:`|\hat A|` is
-    :math:`(p \pm 1)/2` at every frequency but zero.
-
-    **Arguments**
-
-    - `order`: p, a prime of at least 5.
-    - `cell`: side of a cell, mm.
-    - `tiles`: how often the array is repeated, one number or (down, across). A mask that is to
-      throw one whole array from every direction has two.
-    - `centre`: (y, x) of the mask's centre, mm.
-
-    **Errors**: ValueError for a number that is no such prime, with the nearest two.
-    """
-
-    order: int = eqx.field(static=True)
-    tiles: tuple[int, int] = eqx.field(static=True)
-    cell: Float[Array, ""]
-    centre: Float[Array, "2"]
-
-    def __init__(
-        self,
-        order: int,
-        cell: Number,
-        *,
-        tiles: int | tuple[int, int] = 1,
-        centre: Numbers | tuple[Number, Number] = (0.0, 0.0),
-    ):
-        self.order, self.tiles = _prime_order(order), _tiles(tiles)
-        self.cell = checks.positive("cell", cell, "mm")
-        self.centre = checks.finite("centre", centre, "mm", shape=(2,))
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        return self.order, self.order
-
-    @property
-    def decoder(self) -> Float[Array, "row column"]:
-        """G = 2A − 1 with G₀₀ = +1: A ⋆ G is a point."""
-        return super().decoder.at[0, 0].set(1.0)
-
-
-class UniformlyRedundantArray(AbstractRedundantArray):
-    r"""A URA of r × s cells for twin primes r = s + 2 (Fenimore and Cannon 1978).
-
-    Its periodic autocorrelation has the peak (rs + 1)/2 and is (rs + 1)/4 everywhere else.
-
-    **Arguments**: as of `ModifiedUniformlyRedundantArray`, with `orders` = (r, s).
-
-    **Errors**: ValueError for orders that are no twin primes, with the nearest that are.
-    """
-
-    orders: tuple[int, int] = eqx.field(static=True)
-    tiles: tuple[int, int] = eqx.field(static=True)
-    cell: Float[Array, ""]
-    centre: Float[Array, "2"]
-
-    def __init__(
-        self,
-        orders: tuple[int, int],
-        cell: Number,
-        *,
-        tiles: int | tuple[int, int] = 1,
-        centre: Numbers | tuple[Number, Number] = (0.0, 0.0),
-    ):
-        self.orders, self.tiles = _twin_primes(orders), _tiles(tiles)
-        self.cell = checks.positive("cell", cell, "mm")
-        self.centre = checks.finite("centre", centre, "mm", shape=(2,))
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        return self.orders
-
-
-def _legendre_symbols(p: int) -> Float[np.ndarray, " p"]:
-    """C_i for i = 0 … p − 1."""
-    symbols = np.full(p, -1.0)
-    symbols[np.arange(1, p) ** 2 % p] = 1.0
-    symbols[0] = 0.0
-    return symbols
-
-
 def _is_prime(p: int) -> bool:
     return p > 1 and all(p % n for n in range(2, int(p**0.5) + 1))
 
@@ -171,3 +85,64 @@ def _tiles(tiles: Any) -> tuple[int, int]:
     down, across = (tiles, tiles) if isinstance(tiles, int) else tiles
     checks.at_least_one({"tiles": min(down, across)})
     return int(down), int(across)
+
+
+class ModifiedUniformlyRedundantArray(AbstractRedundantArray):
+    r"""A MURA of p × p cells (Gottesman and Fenimore 1989), half of them open.
+
+    With :math:`G = 2A - 1` but :math:`G_{00} = +1` (`decoder`) the periodic correlation is a single
+    point, :math:`A \star G = \tfrac{p^2-1}{2}\,\delta`, and :math:`|\hat A|` is
+    :math:`(p \pm 1)/2` at every frequency but zero.
+
+    **Arguments**
+
+    - `order`: p, a prime of at least 5.
+    - `cell`: side of a cell, mm.
+    - `tiles`: how often the array is repeated, one number or (down, across). A mask that is to
+      throw one whole array from every direction has two.
+    - `centre`: (y, x) of the mask's centre, mm.
+
+    **Errors**: ValueError for a number that is no such prime, with the nearest two.
+    """
+
+    order: int = eqx.field(converter=_prime_order, static=True)
+    tiles: tuple[int, int] = eqx.field(default=1, converter=_tiles, static=True, kw_only=True)
+    cell: Float[Array, ""] = eqx.field(converter=checks.length("cell"))
+    centre: Float[Array, "2"] = eqx.field(default=(0, 0), converter=checks.centre, kw_only=True)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        return self.order, self.order
+
+    @property
+    def decoder(self) -> Float[Array, "row column"]:
+        """G = 2A − 1 with G₀₀ = +1: A ⋆ G is a point."""
+        return super().decoder.at[0, 0].set(1.0)
+
+
+class UniformlyRedundantArray(AbstractRedundantArray):
+    r"""A URA of r × s cells for twin primes r = s + 2 (Fenimore and Cannon 1978).
+
+    Its periodic autocorrelation has the peak (rs + 1)/2 and is (rs + 1)/4 everywhere else.
+
+    **Arguments**: as of `ModifiedUniformlyRedundantArray`, with `orders` = (r, s).
+
+    **Errors**: ValueError for orders that are no twin primes, with the nearest that are.
+    """
+
+    orders: tuple[int, int] = eqx.field(converter=_twin_primes, static=True)
+    tiles: tuple[int, int] = eqx.field(default=1, converter=_tiles, static=True, kw_only=True)
+    cell: Float[Array, ""] = eqx.field(converter=checks.length("cell"))
+    centre: Float[Array, "2"] = eqx.field(default=(0, 0), converter=checks.centre, kw_only=True)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        return self.orders
+
+
+def _legendre_symbols(p: int) -> Float[np.ndarray, " p"]:
+    """C_i for i = 0 … p − 1."""
+    symbols = np.full(p, -1.0)
+    symbols[np.arange(1, p) ** 2 % p] = 1.0
+    symbols[0] = 0.0
+    return symbols

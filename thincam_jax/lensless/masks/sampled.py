@@ -3,13 +3,14 @@
 import os
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, PRNGKeyArray
 
 from thincam_jax._core import checks
-from thincam_jax._core.checks import Number, Numbers
+from thincam_jax._core.checks import Number
 from thincam_jax._core.grids import Grid, cell_overlap, centred_indices
 from thincam_jax._core.precision import as_complex, product
 from thincam_jax.lensless.masks.base import (
@@ -19,6 +20,15 @@ from thincam_jax.lensless.masks.base import (
     open_parts,
 )
 from thincam_jax.lensless.masks.cells import cell_edges
+
+
+def _amplitudes(given: Any) -> Complex[Array, "y x"] | Float[Array, "y x"]:
+    amplitude = jnp.asarray(given)
+    if amplitude.ndim != 2 or 0 in amplitude.shape:
+        raise ValueError(f"amplitude has shape {amplitude.shape}; give a non-empty array (y, x)")
+    if not checks.is_traced(amplitude) and not np.isfinite(amplitude).all():
+        raise ValueError("amplitude holds NaN or infinity; give finite transmittances")
+    return amplitude if jnp.issubdtype(amplitude.dtype, jnp.inexact) else amplitude.astype(float)
 
 
 class SampledMask(AbstractFactoredMask):
@@ -35,32 +45,14 @@ class SampledMask(AbstractFactoredMask):
     - `fill_factor`: part of a cell's area that is open, in its middle; None for all of it.
     """
 
-    amplitude: Complex[Array, "y x"] | Float[Array, "y x"]
-    pitch: Float[Array, ""]
-    centre: Float[Array, "2"]
-    fill_factor: Float[Array, ""] | None
-
-    def __init__(
-        self,
-        amplitude: Any,
-        pitch: Number,
-        *,
-        centre: Numbers | tuple[Number, Number] = (0.0, 0.0),
-        fill_factor: Number | None = None,
-    ):
-        self.amplitude = jnp.asarray(amplitude)
-        if self.amplitude.ndim != 2 or 0 in self.amplitude.shape:
-            raise ValueError(
-                f"amplitude has shape {self.amplitude.shape}; give a non-empty array (y, x)"
-            )
-        if not checks.is_traced(self.amplitude) and not np.isfinite(self.amplitude).all():
-            raise ValueError("amplitude holds NaN or infinity; give finite transmittances")
-        if not jnp.issubdtype(self.amplitude.dtype, jnp.inexact):
-            self.amplitude = self.amplitude.astype(float)
-        self.pitch = checks.positive("pitch", pitch, "mm")
-        self.centre = checks.finite("centre", centre, "mm", shape=(2,))
-        open_part = None if fill_factor is None else checks.fraction("fill_factor", fill_factor)
-        self.fill_factor = open_part
+    amplitude: Complex[Array, "y x"] | Float[Array, "y x"] = eqx.field(converter=_amplitudes)
+    pitch: Float[Array, ""] = eqx.field(converter=checks.length("pitch"))
+    centre: Float[Array, "2"] = eqx.field(default=(0, 0), converter=checks.centre, kw_only=True)
+    fill_factor: Float[Array, ""] | None = eqx.field(
+        default=None,
+        converter=checks.optional(checks.named(checks.fraction, "fill_factor")),
+        kw_only=True,
+    )
 
     @property
     def extent(self) -> tuple[Float[Array, ""], Float[Array, ""]]:

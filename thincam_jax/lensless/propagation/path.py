@@ -5,7 +5,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
-from thincam_jax._core.checks import Number
 
 
 class Path(eqx.Module):
@@ -19,16 +18,14 @@ class Path(eqx.Module):
     - `object_distance`: t, mm, > 0; infinity is a plane wave.
     """
 
-    wavelength: Float[Array, ""]
-    distance: Float[Array, ""]
-    object_distance: Float[Array, ""]
-
-    def __init__(self, wavelength: Number, distance: Number, object_distance: Number = jnp.inf):
-        self.wavelength = checks.wavelength("wavelength", wavelength)
-        self.distance = checks.positive("distance", distance, "mm")
-        self.object_distance = checks.positive(
-            "object_distance", object_distance, "mm", allow_infinity=True
-        )
+    wavelength: Float[Array, ""] = eqx.field(
+        converter=checks.named(checks.wavelength, "wavelength")
+    )
+    distance: Float[Array, ""] = eqx.field(converter=checks.length("distance"))
+    object_distance: Float[Array, ""] = eqx.field(
+        default=jnp.inf,
+        converter=checks.named(checks.positive, "object_distance", "mm", allow_infinity=True),
+    )
 
     @property
     def magnification(self) -> Float[Array, ""]:
