@@ -14,7 +14,8 @@ from thincam_jax._core.checks import Number
 from thincam_jax.reconstruction.direct_splitting import DirectSplitting
 from thincam_jax.reconstruction.drive import OptimistixMethod, Residuals, Running
 from thincam_jax.reconstruction.fourier_splitting import FourierSplitting
-from thincam_jax.reconstruction.problem import InverseProblem, convolutions, objective
+from thincam_jax.reconstruction.problem import InverseProblem, convolutions, worth
+from thincam_jax.reconstruction.regularisers import Image
 from thincam_jax.reconstruction.splitting import (
     AbstractSplitting,
     Penalties,
@@ -151,14 +152,14 @@ class AdmmMethod(OptimistixMethod):
     def function(value: State, arguments: AbstractSplitting):
         return admm_map(value, arguments), None
 
-    def value_of(self, image: Float[Array, "*batch channel plane y x"]):
+    def value_of(self, image: Image):
         return self.arguments.start(image)
 
     def image_of(self, value: State):
         return self.arguments.image(value)
 
-    def objective(self, image: Float[Array, "*batch channel plane y x"]):
-        return _objective(self.problem, image)
+    def objective(self, image: Image):
+        return worth(self.problem, image)
 
     def adapt(self, state: Running, residuals: Residuals):
         """Residual balancing: μ ← μ·√(primal/dual) of each split, by at most 3 at a time."""
@@ -183,11 +184,6 @@ def _ratio(primal: float, dual: float) -> float:
     if not (primal > 0 and dual > 0):
         return 1.0
     return min(9.0, max(1 / 9.0, primal / dual))
-
-
-@jax.jit
-def _objective(problem: InverseProblem, image):
-    return objective(problem, image)
 
 
 _rescaled = eqx.filter_jit(rescaled)

@@ -16,11 +16,11 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
 from thincam_jax.imaging.operators import CropConvolution
 from thincam_jax.reconstruction.drive import AbstractMethod, Residuals
 from thincam_jax.reconstruction.problem import InverseProblem, convolutions
+from thincam_jax.reconstruction.regularisers import Image
 from thincam_jax.reconstruction.total_variation import TotalVariation
 
 
@@ -37,7 +37,7 @@ class Apart(AbstractMethod[tuple[Any, ...]]):
         self.shape = problem.image_shape
         self.methods = tuple(_together(method, parts(problem)))
 
-    def start(self, image: Float[Array, "*batch channel plane y x"]):
+    def start(self, image: Image):
         return tuple(_together(lambda m, i: m.start(i), self.methods, self._split(image)))
 
     def advance(self, state: tuple[Any, ...], count: int):
@@ -47,7 +47,7 @@ class Apart(AbstractMethod[tuple[Any, ...]]):
         images = _together(lambda m, s: m.image(s), self.methods, state)
         return jnp.stack(images).reshape(self.shape)
 
-    def objective(self, image: Float[Array, "*batch channel plane y x"]):
+    def objective(self, image: Image):
         values = _together(lambda m, i: m.objective(i), self.methods, self._split(image))
         return jnp.sum(jnp.stack(values).reshape(*self.shape[:-4], -1), axis=-1)
 
@@ -61,7 +61,7 @@ class Apart(AbstractMethod[tuple[Any, ...]]):
         methods, states = zip(*adapted, strict=True)
         return eqx.tree_at(lambda a: a.methods, self, methods), states
 
-    def _split(self, image: Float[Array, "*batch channel plane y x"]):
+    def _split(self, image: Image):
         return list(image.reshape(len(self.methods), -1, *self.shape[-3:]))
 
 

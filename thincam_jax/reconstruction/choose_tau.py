@@ -12,6 +12,7 @@ from thincam_jax.reconstruction.admm import AdmmMethod
 from thincam_jax.reconstruction.drive import drive
 from thincam_jax.reconstruction.noise import local_noise
 from thincam_jax.reconstruction.problem import InverseProblem, misfit, residuals, see, with_tau
+from thincam_jax.reconstruction.regularisers import Image
 
 # What `find_tau` searches, in parts of the problem's own τ. A smaller one is never worth much, and
 # where the PSF is a little wrong, both rules ask for one that spoils the image.
@@ -27,7 +28,7 @@ class ChosenTau(eqx.Module):
     """
 
     problem: InverseProblem
-    image: Float[Array, "*batch channel plane y x"]
+    image: Image
     tried: tuple[tuple[float, float], ...]
     reason: str = ""
 
@@ -62,7 +63,7 @@ def find_tau(rule: str, problem: InverseProblem, image: Float[Array, "..."]) -> 
 
 def discrepancy_tau(
     problem: InverseProblem,
-    image: Float[Array, "*batch channel plane y x"],
+    image: Image,
     *,
     iterations: int = 50,
     solves: int = 8,
@@ -96,7 +97,7 @@ def discrepancy_tau(
 
 def sure_tau(
     problem: InverseProblem,
-    image: Float[Array, "*batch channel plane y x"],
+    image: Image,
     key: PRNGKeyArray,
     *,
     iterations: int = 100,
@@ -163,7 +164,7 @@ def _full(problem: InverseProblem):
 class SearchInterrupted(KeyboardInterrupt):
     """Ctrl-C during a search; holds the best image of the solve that it ended."""
 
-    def __init__(self, image: Float[Array, "*batch channel plane y x"]):
+    def __init__(self, image: Image):
         super().__init__()
         self.image = image
 

@@ -21,6 +21,7 @@ from jaxtyping import Array, Float
 
 from thincam_jax.reconstruction.normal_equations import AbstractNormal, normal_equations
 from thincam_jax.reconstruction.problem import InverseProblem, back_projected
+from thincam_jax.reconstruction.regularisers import Image
 from thincam_jax.reconstruction.scaled import ScaledProblem, or_one
 from thincam_jax.reconstruction.splitting import AbstractSplitting, Penalties, State
 from thincam_jax.reconstruction.total_variation import TotalVariation
@@ -40,7 +41,7 @@ class DirectSplitting(AbstractSplitting):
     settling: ClassVar[float] = 0.6
     problem: InverseProblem
     normal: AbstractNormal
-    pulled: Float[Array, "*batch channel plane y x"]
+    pulled: Image
     tau: Float[Array, ""]
     variation: TotalVariation
     image_unit: Float[Array, ""]
@@ -74,7 +75,7 @@ class DirectSplitting(AbstractSplitting):
     def settled(self):
         return eqx.tree_at(lambda s: s.normal, self, self.normal.settled())
 
-    def start(self, image: Float[Array, "*batch channel plane y x"]):
+    def start(self, image: Image):
         return self._images(image / self.image_unit)
 
     def image(self, state: State):

@@ -19,6 +19,8 @@ import jax.numpy as jnp
 import optimistix
 from jaxtyping import Array, Float, PyTree
 
+from thincam_jax.reconstruction.regularisers import Image
+
 Method_State = TypeVar("Method_State")
 Status = Literal["converged", "iterations_exhausted", "stopped", "interrupted", "non_finite"]
 
@@ -54,7 +56,7 @@ class Progress:
 class Outcome(eqx.Module):
     """The image with the lowest objective among those looked at, and how it came about."""
 
-    image: Float[Array, "*batch channel plane y x"]
+    image: Image
     status: Status
     history: tuple[Progress, ...]
     iterations: int
@@ -65,7 +67,7 @@ class AbstractMethod(eqx.Module, Generic[Method_State]):
     """An iterative method with its problem, as `drive` wants it."""
 
     @abc.abstractmethod
-    def start(self, image: Float[Array, "*batch channel plane y x"]) -> Method_State:
+    def start(self, image: Image) -> Method_State:
         """The state of an image."""
 
     @abc.abstractmethod
@@ -73,11 +75,11 @@ class AbstractMethod(eqx.Module, Generic[Method_State]):
         """`count` iterations on; the state given is used up."""
 
     @abc.abstractmethod
-    def image(self, state: Method_State) -> Float[Array, "*batch channel plane y x"]:
+    def image(self, state: Method_State) -> Image:
         """The image that a state stands for."""
 
     @abc.abstractmethod
-    def objective(self, image: Float[Array, "*batch channel plane y x"]) -> Float[Array, "*batch"]:
+    def objective(self, image: Image) -> Float[Array, "*batch"]:
         """What is to be small."""
 
     @abc.abstractmethod
@@ -119,14 +121,14 @@ class OptimistixMethod(AbstractMethod[Running]):
         """What the solver is to solve, and nothing beside it."""
 
     @abc.abstractmethod
-    def value_of(self, image: Float[Array, "*batch channel plane y x"]) -> PyTree[Array]:
+    def value_of(self, image: Image) -> PyTree[Array]:
         """y of an image."""
 
     @abc.abstractmethod
-    def image_of(self, value: PyTree[Array]) -> Float[Array, "*batch channel plane y x"]:
+    def image_of(self, value: PyTree[Array]) -> Image:
         """The image of a y."""
 
-    def start(self, image: Float[Array, "*batch channel plane y x"]):
+    def start(self, image: Image):
         return _start(self, image)
 
     def advance(self, state: Running, count: int):
@@ -155,7 +157,7 @@ UNROLLED = CHUNK
 
 def drive(
     method: AbstractMethod,
-    image: Float[Array, "*batch channel plane y x"],
+    image: Image,
     *,
     iterations: int,
     tolerance: float,
@@ -163,6 +165,7 @@ def drive(
     adapt_until: int = 0,
     callback: Callback | None = None,
     done: int = 0,
+    objective: Callable[[Image], Float[Array, "*batch"]] | None = None,
 ) -> Outcome:
     """Iterate until both residuals are below `tolerance`, or `iterations` are done.
 
@@ -170,9 +173,14 @@ def drive(
     (a true answer stops the run) and, up to iteration `adapt_until`, the method may adapt as long
     as the objective falls: parameters that follow misleading residuals would spoil it. Ctrl-C ends
     the run with what was best until then. Iterations count from `done`, those of a run before.
+    `objective`: that images are judged by, in place of the method's.
     """
     began = time.perf_counter()
-    best, history = image, [_look_at(method, image, done)]
+
+    def judged(image) -> float:
+        return float(jnp.sum((objective or method.objective)(image)))
+
+    best, history = image, [Progress(done, judged(image), math.nan, math.nan)]
     status: Status = "iterations_exhausted"
     try:
         state = method.start(image)
@@ -181,8 +189,7 @@ def drive(
             state = method.advance(state, count)
             done += count
             residuals, current = method.residuals(state), method.image(state)
-            objective = float(jnp.sum(method.objective(current)))
-            progress = Progress(done, objective, residuals.primal, residuals.dual)
+            progress = Progress(done, judged(current), residuals.primal, residuals.dual)
             if not math.isfinite(progress.objective):
                 status = "non_finite"
                 break
@@ -201,11 +208,6 @@ def drive(
     except KeyboardInterrupt:
         status = "interrupted"
     return Outcome(best, status, tuple(history), done, time.perf_counter() - began)
-
-
-def _look_at(method: AbstractMethod, image, done: int) -> Progress:
-    nan = math.nan
-    return Progress(done, float(jnp.sum(method.objective(image))), nan, nan)
 
 
 @eqx.filter_jit
@@ -242,8 +244,8 @@ def _image(method: OptimistixMethod, state: Running):
 
 
 def concluded(
-    start: Float[Array, "*batch channel plane y x"],
-    image: Float[Array, "*batch channel plane y x"],
+    start: Image,
+    image: Image,
     objective: Callable[[Array], Array],
     *,
     converged: bool,

@@ -11,16 +11,16 @@ from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import optimistix
 from jaxtyping import Array, Float, PyTree
 
 from thincam_jax._core.checks import Number
 from thincam_jax.reconstruction.drive import Callback, OptimistixMethod, Outcome, drive
-from thincam_jax.reconstruction.problem import InverseProblem, objective, start_image, total_misfit
+from thincam_jax.reconstruction.problem import InverseProblem, start_image, total_misfit, worth
 from thincam_jax.reconstruction.regularisers import (
     AbstractRegulariser,
+    Image,
     Parts,
     first_t,
     no_dual,
@@ -34,13 +34,11 @@ class AbstractProximalMap(eqx.Module):
     """What follows each gradient step: x from v, with whatever it keeps from step to step."""
 
     @abc.abstractmethod
-    def start(self, image: Float[Array, "*batch channel plane y x"]) -> Parts:
+    def start(self, image: Image) -> Parts:
         """What is kept, of a first image."""
 
     @abc.abstractmethod
-    def __call__(
-        self, image: Float[Array, "*batch channel plane y x"], kept: Parts
-    ) -> tuple[Float[Array, "*batch channel plane y x"], Parts]:
+    def __call__(self, image: Image, kept: Parts) -> tuple[Image, Parts]:
         """x, and what to keep."""
 
 
@@ -55,10 +53,10 @@ class RegulariserMap(AbstractProximalMap):
     nonnegative: bool = eqx.field(static=True)
     inner: int = eqx.field(static=True, default=10)
 
-    def start(self, image: Float[Array, "*batch channel plane y x"]):
+    def start(self, image: Image):
         return no_dual(self.regulariser, image)
 
-    def __call__(self, image: Float[Array, "*batch channel plane y x"], kept: Parts):
+    def __call__(self, image: Image, kept: Parts):
         asked = {"nonnegative": self.nonnegative, "iterations": self.inner}
         return prox(self.regulariser, image, self.tau, kept, **asked)
 
@@ -73,7 +71,7 @@ class FistaState(eqx.Module):
       image moved, ‖x⁺ − x‖/‖x⁺‖.
     """
 
-    lead: Float[Array, "*batch channel plane y x"]
+    lead: Image
     t: Float[Array, "*batch 1 1 1 1"]
     kept: Parts
     primal: Float[Array, ""]
@@ -130,7 +128,27 @@ def relative_length(
     return jnp.where(below > 0, ratio, jnp.where(above > 0, jnp.inf, 0))
 
 
-class FistaMethod(OptimistixMethod):
+class AbstractScaledMethod(OptimistixMethod):
+    """Steps on the misfit of a problem in units in which a gradient step of length 1 is right."""
+
+    scaled: eqx.AbstractVar[ScaledProblem]
+
+    @property
+    def arguments(self):
+        return self.scaled.problem
+
+    @staticmethod
+    def function(value: Image, arguments: InverseProblem):
+        return total_misfit(value, arguments), None
+
+    def value_of(self, image: Image):
+        return image / self.scaled.image_unit
+
+    def image_of(self, value: Image):
+        return value * self.scaled.image_unit
+
+
+class FistaMethod(AbstractScaledMethod):
     """FISTA for a problem.
 
     - `inner`: iterations of a proximal map that has no closed form.
@@ -148,22 +166,8 @@ class FistaMethod(OptimistixMethod):
         )
         self.solver = AcceleratedProximalGradient(proximal, 0.0)
 
-    @property
-    def arguments(self):
-        return self.scaled.problem
-
-    @staticmethod
-    def function(value: Float[Array, "*batch channel plane y x"], arguments: InverseProblem):
-        return total_misfit(value, arguments), None
-
-    def value_of(self, image: Float[Array, "*batch channel plane y x"]):
-        return image / self.scaled.image_unit
-
-    def image_of(self, value: Float[Array, "*batch channel plane y x"]):
-        return value * self.scaled.image_unit
-
-    def objective(self, image: Float[Array, "*batch channel plane y x"]):
-        return _objective(self.problem, image)
+    def objective(self, image: Image):
+        return worth(self.problem, image)
 
 
 def solve_fista(
@@ -191,8 +195,3 @@ def solve_fista(
         tolerance=tolerance,
         callback=callback,
     )
-
-
-@jax.jit
-def _objective(problem: InverseProblem, image):
-    return objective(problem, image)

@@ -21,13 +21,14 @@ from thincam_jax._core.checks import Number
 from thincam_jax._core.module import Module
 from thincam_jax.reconstruction.admm import RELAXATION, Admm, splitting_of
 from thincam_jax.reconstruction.problem import InverseProblem
+from thincam_jax.reconstruction.regularisers import Image
 from thincam_jax.reconstruction.splitting import Penalties, admm_map
 
 
 class FixedPoint(Module):
     """An image, and whether it is one: iterations done, converged before they ran out."""
 
-    image: Float[Array, "*batch channel plane y x"]
+    image: Image
     iterations: Int[Array, ""]
     converged: Bool[Array, ""]
 
@@ -84,7 +85,7 @@ class NeumannSeries(lx.AbstractLinearSolver):
 
 def solve_fixed_point(
     problem: InverseProblem,
-    image: Float[Array, "*batch channel plane y x"],
+    image: Image,
     *,
     iterations: int = 500,
     tolerance: float = 1e-6,

@@ -21,6 +21,7 @@ from thincam_jax._core.precision import as_complex
 from thincam_jax.imaging.operators import CropConvolution
 from thincam_jax.imaging.operators.crop_convolution import cut, place
 from thincam_jax.reconstruction.problem import InverseProblem
+from thincam_jax.reconstruction.regularisers import Image
 from thincam_jax.reconstruction.scaled import or_one
 from thincam_jax.reconstruction.splitting import AbstractSplitting, Penalties, State
 from thincam_jax.reconstruction.total_variation import (
@@ -67,7 +68,7 @@ class FourierSplitting(AbstractSplitting):
         scaled = tuple(g / self.image_unit * c for g, c in zip(self.gains, captures, strict=True))
         return eqx.tree_at(lambda s: s.captures, self, scaled)
 
-    def start(self, image: Float[Array, "*batch channel plane y x"]):
+    def start(self, image: Image):
         operator = self.operators[0]
         field = place(image / self.image_unit, operator.field_corner, operator.window)
         return self._images(jnp.fft.rfft2(field))

@@ -13,8 +13,6 @@ frequencies it is weaker than is counted. What is lost is the brightness of the 
 outermost pixels, and so the image found is the start for the problem with all of the data.
 """
 
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -22,14 +20,14 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from thincam_jax.imaging.operators.crop_convolution import CropConvolution, cut, place
-from thincam_jax.reconstruction.drive import AbstractMethod, Residuals
 from thincam_jax.reconstruction.problem import (
     InverseProblem,
     convolutions,
-    objective,
     residuals,
     uniform_level,
+    worth,
 )
+from thincam_jax.reconstruction.regularisers import Image
 from thincam_jax.reconstruction.scaled import or_one
 
 # A camera is biased if its response at zero frequency is that many times the root mean square of
@@ -85,36 +83,8 @@ def whole_windows(
     return whole
 
 
-class Judged(AbstractMethod[Any]):
-    """A method for one problem whose images are judged by another's objective."""
-
-    method: AbstractMethod
-    problem: InverseProblem
-
-    def start(self, image: Float[Array, "*batch channel plane y x"]):
-        return self.method.start(image)
-
-    def advance(self, state: Any, count: int):
-        return self.method.advance(state, count)
-
-    def image(self, state: Any):
-        return self.method.image(state)
-
-    def residuals(self, state: Any):
-        return self.method.residuals(state)
-
-    def objective(self, image: Float[Array, "*batch channel plane y x"]):
-        return _objective(self.problem, levelled(self.problem, image))
-
-    def adapt(self, state: Any, residuals: Residuals):
-        method, state = self.method.adapt(state, residuals)
-        return Judged(method, self.problem), state
-
-
 @jax.jit
-def levelled(
-    problem: InverseProblem, image: Float[Array, "*batch channel plane y x"]
-) -> Float[Array, "*batch channel plane y x"]:
+def levelled(problem: InverseProblem, image: Image) -> Image:
     """The image with the uniform light added that explains the captures best, f ≥ 0 if asked."""
     missing = tuple(-r for r in residuals(problem, image))
     level = uniform_level(eqx.tree_at(lambda p: p.captures, problem, missing))
@@ -122,7 +92,9 @@ def levelled(
     return jnp.maximum(image, 0) if problem.nonnegative else image
 
 
-_objective = jax.jit(objective)
+def levelled_objective(problem: InverseProblem, image: Image) -> Float[Array, "*batch"]:
+    """What an image without its uniform light is worth to the problem that has it."""
+    return worth(problem, levelled(problem, image))
 
 
 @jax.jit

@@ -4,22 +4,21 @@ import functools
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
 from thincam_jax.reconstruction.problem import InverseProblem, total_misfit
-from thincam_jax.reconstruction.regularisers import no_dual, prox
+from thincam_jax.reconstruction.regularisers import Image, no_dual, prox
 from thincam_jax.reconstruction.scaled import ScaledProblem
 
 
 @functools.partial(jax.jit, static_argnames=("iterations", "tolerance", "inner"))
 def implicit_proximal_gradient(
     problem: InverseProblem,
-    image: Float[Array, "*batch channel plane y x"],
+    image: Image,
     *,
     iterations: int = 500,
     tolerance: float = 1e-8,
     inner: int = 50,
-) -> Float[Array, "*batch channel plane y x"]:
+) -> Image:
     r"""The minimiser of a problem with any regulariser, as a differentiable function of it.
 
     `jaxopt.ProximalGradient` run to the end. Its derivative with respect to captures, weights, τ

@@ -24,13 +24,7 @@ from jaxtyping import Array, Float
 
 from thincam_jax._core.checks import Number
 from thincam_jax._core.precision import product
-from thincam_jax.imaging.operators import (
-    AbstractOperator,
-    Matrix,
-    ReducedMatrix,
-    Scaled,
-    Separable,
-)
+from thincam_jax.imaging.operators import AbstractOperator, Matrix, ReducedMatrix, Scaled, Separable
 from thincam_jax.imaging.operators.crop_convolution import cut, place
 from thincam_jax.imaging.operators.reduced import each_times
 from thincam_jax.imaging.operators.separable import SeparableModes

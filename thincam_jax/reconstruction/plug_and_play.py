@@ -20,18 +20,14 @@ from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Number
-from thincam_jax.reconstruction.drive import Callback, OptimistixMethod, Outcome, drive
+from thincam_jax.reconstruction.drive import Callback, Outcome, drive
 from thincam_jax.reconstruction.fista import (
     AbstractProximalMap,
+    AbstractScaledMethod,
     AcceleratedProximalGradient,
 )
-from thincam_jax.reconstruction.problem import (
-    InverseProblem,
-    gradient,
-    start_image,
-    total_misfit,
-)
-from thincam_jax.reconstruction.regularisers import AbstractRegulariser, Parts, denoise
+from thincam_jax.reconstruction.problem import InverseProblem, gradient, start_image
+from thincam_jax.reconstruction.regularisers import AbstractRegulariser, Image, Parts, denoise
 from thincam_jax.reconstruction.scaled import ScaledProblem
 
 Denoiser = Callable[[Array], Array]
@@ -50,7 +46,7 @@ class RegulariserDenoiser(eqx.Module):
         self.regulariser, self.nonnegative = problem.regulariser, problem.nonnegative
         self.iterations = iterations
 
-    def __call__(self, image: Float[Array, "*batch channel plane y x"]):
+    def __call__(self, image: Image):
         return denoise(
             image,
             self.strength,
@@ -70,15 +66,15 @@ class DenoiserMap(AbstractProximalMap):
     unit: Float[Array, ""]
     nonnegative: bool = eqx.field(static=True)
 
-    def start(self, image: Float[Array, "*batch channel plane y x"]):
+    def start(self, image: Image):
         return ()
 
-    def __call__(self, image: Float[Array, "*batch channel plane y x"], kept: Parts):
+    def __call__(self, image: Image, kept: Parts):
         image = self.denoiser(image * self.unit) / self.unit
         return (jnp.maximum(image, 0) if self.nonnegative else image), kept
 
 
-class PlugAndPlay(OptimistixMethod):
+class PlugAndPlay(AbstractScaledMethod):
     """The iteration of a denoiser plugged into a problem.
 
     There is no objective: what is to be small is how far an image is from a fixed point,
@@ -91,21 +87,7 @@ class PlugAndPlay(OptimistixMethod):
     def __init__(self, scaled: ScaledProblem, solver: AcceleratedProximalGradient):
         self.scaled, self.solver = scaled, solver
 
-    @property
-    def arguments(self):
-        return self.scaled.problem
-
-    @staticmethod
-    def function(value: Float[Array, "*batch channel plane y x"], arguments: InverseProblem):
-        return total_misfit(value, arguments), None
-
-    def value_of(self, image: Float[Array, "*batch channel plane y x"]):
-        return image / self.scaled.image_unit
-
-    def image_of(self, value: Float[Array, "*batch channel plane y x"]):
-        return value * self.scaled.image_unit
-
-    def objective(self, image: Float[Array, "*batch channel plane y x"]):
+    def objective(self, image: Image):
         return _distance(self, image)
 
 

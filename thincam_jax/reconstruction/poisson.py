@@ -39,9 +39,10 @@ from thincam_jax.reconstruction.problem import (
 )
 from thincam_jax.reconstruction.recording import Recording
 from thincam_jax.reconstruction.registration import distance_ratios
-from thincam_jax.reconstruction.regularised import DEFAULT_TAU, first_image, of_kind
+from thincam_jax.reconstruction.regularised import DEFAULT_TAU, as_variation, first_image, of_kind
+from thincam_jax.reconstruction.regularisers import Image
 from thincam_jax.reconstruction.seen_by import Cameras
-from thincam_jax.reconstruction.solver import AbstractIterativeSolver, check_limits
+from thincam_jax.reconstruction.solver import AbstractIterativeSolver, at_most, small_enough
 from thincam_jax.reconstruction.total_variation import TotalVariation
 
 # Of the variation, in parts of the mean brightness. At 0.01 many counts are smoothed visibly more
@@ -92,17 +93,25 @@ class Counts(eqx.Module):
         self.smoothing = checks.positive("smoothing", smoothing, "parts of the mean").astype(dtype)
         self.unit, self.floor = _unit(problem, self.background)
 
-    def image(self, theta: Float[Array, "*batch channel plane y x"]):
+    def image(self, theta: Image):
         """f of θ."""
         return self.unit * positive(self.link, theta.astype(self.unit.dtype))
 
-    def theta(self, image: Float[Array, "*batch channel plane y x"]):
+    def theta(self, image: Image):
         """θ of an image; what is below a thousandth of s is raised to that.
 
         In the default precision, in which solvers keep their memory whatever that of θ.
         """
         theta = unlinked(self.link, jnp.maximum(image / self.unit, 1e-3))
         return theta.astype(jnp.result_type(float))
+
+
+def _number(tau: Any) -> Float[Array, ""]:
+    if isinstance(tau, str):
+        raise ValueError(
+            f"tau = {tau!r} is found for Gaussian noise only; give a number, about 1 to 3"
+        )
+    return checks.non_negative("tau", tau, "a ratio")
 
 
 class PoissonTV(AbstractIterativeSolver):
@@ -124,30 +133,11 @@ class PoissonTV(AbstractIterativeSolver):
     """
 
     name: ClassVar[str] = "poisson"
-    tau: Float[Array, ""]
-    variation: TotalVariation
-    background: Any
-    iterations: int = eqx.field(static=True)
-    tolerance: float = eqx.field(static=True)
-
-    def __init__(
-        self,
-        tau: Number | str = DEFAULT_TAU,
-        *,
-        variation: TotalVariation | None = None,
-        background: Numbers | Sequence[Numbers] | None = None,
-        iterations: int = 300,
-        tolerance: float = 1e-4,
-    ):
-        if isinstance(tau, str):
-            raise ValueError(
-                f"tau = {tau!r} is found for Gaussian noise only; give a number, about 1 to 3"
-            )
-        self.tau = checks.non_negative("tau", tau, "a ratio")
-        self.variation = of_kind("variation", variation, TotalVariation)
-        self.background = background
-        check_limits(iterations, tolerance)
-        self.iterations, self.tolerance = iterations, tolerance
+    tau: Float[Array, ""] = eqx.field(default=DEFAULT_TAU, converter=_number)
+    variation: TotalVariation = eqx.field(default=None, converter=as_variation, kw_only=True)
+    background: Any = eqx.field(default=None, kw_only=True)
+    iterations: int = eqx.field(default=300, converter=at_most, static=True, kw_only=True)
+    tolerance: float = eqx.field(default=1e-4, converter=small_enough, static=True, kw_only=True)
 
     def solve(
         self,
@@ -233,9 +223,7 @@ def poisson_loss(theta: Float[Array, "..."], counts: Counts) -> Float[Array, ""]
 
 
 @jax.jit
-def poisson_objective(
-    counts: Counts, image: Float[Array, "*batch channel plane y x"]
-) -> Float[Array, "*batch"]:
+def poisson_objective(counts: Counts, image: Image) -> Float[Array, "*batch"]:
     """−log L + τ TV_ε of each batch element."""
     parts = [
         jnp.sum(w * half_deviance(y, m), axis=tuple(range(-1 - len(detector_shape(o)), 0)))
@@ -254,7 +242,7 @@ def poisson_objective(
     return sum(parts[1:], start=parts[0]) + counts.problem.absolute_tau * scale * rough
 
 
-def mean_counts(counts: Counts, image: Float[Array, "*batch channel plane y x"]):
+def mean_counts(counts: Counts, image: Image):
     """m = Hf + b of each capture."""
     return tuple(
         # Rounding in the transforms can bring a dark pixel below zero.
@@ -272,9 +260,7 @@ def half_deviance(counts: Float[Array, "..."], mean: Float[Array, "..."]) -> Flo
 
 
 def smooth_variation(
-    variation: TotalVariation,
-    image: Float[Array, "*batch channel plane y x"],
-    smoothing: Number,
+    variation: TotalVariation, image: Image, smoothing: Number
 ) -> Float[Array, "*batch"]:
     r"""The Moreau envelope of TV's norm: min over u of φ(u) + ‖u − Ψf‖²/(2ε).
 
@@ -302,7 +288,7 @@ def unlinked(link: Link, value: Float[Array, "..."]) -> Float[Array, "..."]:
     return jnp.log(value) if link == "exponential" else jnp.sqrt(value)
 
 
-def uniform_start(counts: Counts) -> Float[Array, "*batch channel plane y x"]:
+def uniform_start(counts: Counts) -> Image:
     """The uniform image of brightness s."""
     return jnp.broadcast_to(counts.unit, counts.problem.image_shape)
 

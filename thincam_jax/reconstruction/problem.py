@@ -12,7 +12,7 @@ from thincam_jax._core import checks
 from thincam_jax._core.checks import Number, Numbers
 from thincam_jax.imaging.operators import AbstractOperator, CropConvolution, Masked, Scaled, Stacked
 from thincam_jax.imaging.operators.base import is_shape
-from thincam_jax.reconstruction.regularisers import AbstractRegulariser
+from thincam_jax.reconstruction.regularisers import AbstractRegulariser, Image
 from thincam_jax.reconstruction.total_variation import TotalVariation
 
 
@@ -140,7 +140,7 @@ def back_project(operator: AbstractOperator, capture: Float[Array, "..."]) -> Fl
     return image[..., None, :, :] if len(operator.in_shape) == 2 else image
 
 
-def residuals(problem: InverseProblem, image: Float[Array, "*batch channel plane y x"]):
+def residuals(problem: InverseProblem, image: Image):
     """A_k f − g_k of every capture."""
     return tuple(
         see(operator, image) - capture
@@ -157,12 +157,12 @@ def back_projected(
     return sum(others, start=first)
 
 
-def gradient(problem: InverseProblem, image: Float[Array, "*batch channel plane y x"]):
+def gradient(problem: InverseProblem, image: Image):
     r"""That of the misfit: :math:`\sum_k A_k^T w_k (A_k f - g_k)`."""
     return back_projected(problem, residuals(problem, image))
 
 
-def misfit(problem: InverseProblem, image: Float[Array, "*batch channel plane y x"]):
+def misfit(problem: InverseProblem, image: Image):
     """½ Σ w (A f − g)² of each batch element."""
     parts = [
         jnp.sum(w * r**2, axis=tuple(range(-1 - len(detector_shape(o)), 0)))
@@ -173,23 +173,21 @@ def misfit(problem: InverseProblem, image: Float[Array, "*batch channel plane y 
     return sum(parts[1:], start=parts[0]) / 2
 
 
-def objective(
-    problem: InverseProblem, image: Float[Array, "*batch channel plane y x"]
-) -> Float[Array, "*batch"]:
+def objective(problem: InverseProblem, image: Image) -> Float[Array, "*batch"]:
     """E(f) of each batch element; it says nothing of f ≥ 0."""
     return misfit(problem, image) + problem.absolute_tau * problem.regulariser(image)
 
 
-def total_misfit(
-    image: Float[Array, "*batch channel plane y x"], problem: InverseProblem
-) -> Float[Array, ""]:
+# Compiled, for what stands between two chunks of iterations.
+worth = jax.jit(objective)
+
+
+def total_misfit(image: Image, problem: InverseProblem) -> Float[Array, ""]:
     """½ Σ w (A f − g)² over the batch, as optimistix calls it: image first, problem second."""
     return jnp.sum(misfit(problem, image))
 
 
-def total_objective(
-    image: Float[Array, "*batch channel plane y x"], problem: InverseProblem
-) -> Float[Array, ""]:
+def total_objective(image: Image, problem: InverseProblem) -> Float[Array, ""]:
     """E(f) over the batch, for `optimistix.minimise(total_objective, …, args=problem)`."""
     return jnp.sum(objective(problem, image))
 
@@ -215,15 +213,13 @@ def uniform_level(problem: InverseProblem) -> Float[Array, "*batch channel"]:
 
 
 @jax.jit
-def uniform_image(problem: InverseProblem) -> Float[Array, "*batch channel plane y x"]:
+def uniform_image(problem: InverseProblem) -> Image:
     """The uniform image that explains the captures best, not below zero: a good start."""
     level = jnp.maximum(uniform_level(problem), 0)[..., None, None, None]
     return jnp.broadcast_to(level, problem.image_shape)
 
 
-def start_image(
-    problem: InverseProblem, image: Float[Array, "..."] | None
-) -> Float[Array, "*batch channel plane y x"]:
+def start_image(problem: InverseProblem, image: Float[Array, "..."] | None) -> Image:
     """The image given, checked, or the uniform one."""
     if image is None:
         return uniform_image(problem)

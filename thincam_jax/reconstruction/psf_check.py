@@ -2,7 +2,7 @@ r"""Whether a measured PSF is that of a capture: other scales, turns and mirror 
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import equinox as eqx
@@ -166,12 +166,8 @@ class _Trial:
     def __call__(self, psf: np.ndarray) -> _Tried:
         seen_by = self.recording.seen_by
         assert isinstance(seen_by, Psfs)
-        problem = Recording(
-            self.recording.captures,
-            Psfs(psf, field_shape=seen_by.field_shape),
-            noise_variance=self.recording.noise_variance,
-            valid=self.recording.valid,
-        ).problem(tau=self.tau)
+        tried = replace(self.recording, seen_by=replace(seen_by, psfs=psf))
+        problem = tried.problem(tau=self.tau)
         problem = eqx.tree_at(
             lambda p: (p.weights, p.tau_unit), problem, (self.weights, self.tau_unit)
         )
@@ -267,11 +263,7 @@ def _best_orientation(found: list[_Tried]) -> int:
 
 
 def _judged(
-    orientation: Orientation,
-    profile: dict[float, _Tried],
-    pixel: float,
-    pixels: int,
-    whole: bool,
+    orientation: Orientation, profile: dict[float, _Tried], pixel: float, pixels: int, whole: bool
 ) -> PsfCheck:
     """`whole`: nothing of the PSF was cut off to turn it."""
     scales = np.array(sorted(profile))

@@ -1,5 +1,6 @@
 """What was seen: captures with all that is known of how they were taken."""
 
+import dataclasses
 import functools
 import math
 import operator
@@ -167,15 +168,8 @@ class Recording(Module):
         """The same recording with its `Cameras` focused on another distance, mm."""
         if not isinstance(self.seen_by, Cameras):
             raise ValueError("a distance is that of computed PSFs; this recording has no Cameras")
-        focused = eqx.tree_at(
-            lambda cameras: cameras.object_distance,
-            self.seen_by,
-            object_distance,
-            is_leaf=lambda leaf: leaf is None,
-        )
-        return Recording(
-            self.captures, focused, noise_variance=self.noise_variance, valid=self.valid
-        )
+        focused = dataclasses.replace(self.seen_by, object_distance=object_distance)
+        return dataclasses.replace(self, seen_by=focused)
 
     def _check_captures(self, given) -> None:
         """As many as were seen; what cameras and PSFs see are images of one shape."""

@@ -2,6 +2,7 @@
 
 import abc
 import dataclasses
+import functools
 import math
 import time
 from typing import Any, ClassVar, Literal, get_args
@@ -13,24 +14,23 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
-from thincam_jax._core.checks import Number
 from thincam_jax.imaging.operators.crop_convolution import place
 from thincam_jax.reconstruction.admm import AdmmMethod
 from thincam_jax.reconstruction.apart import Apart, worth_taking_apart
 from thincam_jax.reconstruction.choose_tau import SearchInterrupted, find_tau
 from thincam_jax.reconstruction.drive import CHUNK, AbstractMethod, Callback, Outcome, drive
 from thincam_jax.reconstruction.fista import solve_fista
-from thincam_jax.reconstruction.high_pass import Judged, high_passed, levelled
+from thincam_jax.reconstruction.high_pass import high_passed, levelled, levelled_objective
 from thincam_jax.reconstruction.problem import InverseProblem, uniform_level
 from thincam_jax.reconstruction.recording import Recording
-from thincam_jax.reconstruction.regularisers import AbstractRegulariser
+from thincam_jax.reconstruction.regularisers import AbstractRegulariser, Image
 from thincam_jax.reconstruction.seen_by import Cameras
 from thincam_jax.reconstruction.solver import (
     AbstractIterativeSolver,
     Reconstruction,
-    Synthesis,
     as_synthesis,
-    check_limits,
+    at_most,
+    small_enough,
 )
 from thincam_jax.reconstruction.total_variation import TotalVariation
 
@@ -47,18 +47,44 @@ _FIRST_PART = 0.4
 class Start(eqx.Module):
     """A first image, and whether the user gave it."""
 
-    image: Float[Array, "*batch channel plane y x"]
+    image: Image
     given: bool
+
+
+def checked_tau(tau: Any) -> Any:
+    """τ ≥ 0, or the name of a rule that finds it."""
+    if isinstance(tau, str):
+        checks.choice("tau", tau, get_args(TauRule))
+        return tau
+    return checks.non_negative("tau", tau, "a ratio")
+
+
+def of_kind(name: str, value: Any, kind: type):
+    """A value of the kind that is asked for; by default one as the kind makes it."""
+    if value is None:
+        return kind()
+    if not isinstance(value, kind):
+        wanted = kind.__name__.removeprefix("Abstract")
+        raise ValueError(f"{name} is a {type(value).__name__}; give a {wanted}")
+    return value
+
+
+as_variation = functools.partial(of_kind, "variation", kind=TotalVariation)
+
+
+def as_regulariser(value: Any) -> AbstractRegulariser:
+    """The regulariser given; total variation by default."""
+    return TotalVariation() if value is None else of_kind("regulariser", value, AbstractRegulariser)
 
 
 class AbstractRegularised(AbstractIterativeSolver):
     """A solver that minimises ½ Σ w (Af − g)² + τ R(f)."""
 
-    tau: eqx.AbstractVar[Any]
-    nonnegative: eqx.AbstractVar[bool]
-    synthesis: eqx.AbstractVar[np.ndarray | None]
-    iterations: eqx.AbstractVar[int]
-    tolerance: eqx.AbstractVar[float]
+    tau: Float[Array, ""] | str = eqx.field(default=DEFAULT_TAU, converter=checked_tau)
+    nonnegative: bool = eqx.field(default=True, converter=bool, static=True, kw_only=True)
+    synthesis: np.ndarray | None = eqx.field(default=None, converter=as_synthesis, kw_only=True)
+    iterations: int = eqx.field(default=100, converter=at_most, static=True, kw_only=True)
+    tolerance: float = eqx.field(default=1e-4, converter=small_enough, static=True, kw_only=True)
 
     @property
     @abc.abstractmethod
@@ -133,28 +159,7 @@ class AdmmTV(AbstractRegularised):
     """
 
     name: ClassVar[str] = "admm_tv"
-    tau: Float[Array, ""] | str
-    variation: TotalVariation
-    nonnegative: bool = eqx.field(static=True)
-    synthesis: np.ndarray | None
-    iterations: int = eqx.field(static=True)
-    tolerance: float = eqx.field(static=True)
-
-    def __init__(
-        self,
-        tau: Number | str = DEFAULT_TAU,
-        *,
-        variation: TotalVariation | None = None,
-        nonnegative: bool = True,
-        synthesis: Synthesis | None = None,
-        iterations: int = 100,
-        tolerance: float = 1e-4,
-    ):
-        self.tau = checked_tau(tau)
-        self.variation = of_kind("variation", variation, TotalVariation)
-        self.nonnegative, self.synthesis = nonnegative, as_synthesis(synthesis)
-        check_limits(iterations, tolerance)
-        self.iterations, self.tolerance = iterations, tolerance
+    variation: TotalVariation = eqx.field(default=None, converter=as_variation, kw_only=True)
 
     @property
     def prior(self):
@@ -198,8 +203,9 @@ class AdmmTV(AbstractRegularised):
         if easier is None:
             return None
         outcome = drive(
-            Judged(admm_method(easier), problem),
+            admm_method(easier),
             image,
+            objective=functools.partial(levelled_objective, problem),
             iterations=count,
             tolerance=self.tolerance,
             adapt_until=min(_BALANCED, count // 2),
@@ -221,33 +227,15 @@ class Fista(AbstractRegularised):
     """
 
     name: ClassVar[str] = "fista"
-    tau: Float[Array, ""] | str
-    regulariser: AbstractRegulariser
-    nonnegative: bool = eqx.field(static=True)
-    synthesis: np.ndarray | None
-    iterations: int = eqx.field(static=True)
-    tolerance: float = eqx.field(static=True)
+    regulariser: AbstractRegulariser = eqx.field(
+        default=None, converter=as_regulariser, kw_only=True
+    )
 
-    def __init__(
-        self,
-        tau: Number | str = DEFAULT_TAU,
-        *,
-        regulariser: AbstractRegulariser | None = None,
-        nonnegative: bool = True,
-        synthesis: Synthesis | None = None,
-        iterations: int = 100,
-        tolerance: float = 1e-4,
-    ):
-        self.tau = checked_tau(tau)
-        kind = AbstractRegulariser if regulariser is not None else TotalVariation
-        self.regulariser = of_kind("regulariser", regulariser, kind)
+    def __check_init__(self):
         if isinstance(self.tau, str) and not isinstance(self.regulariser, TotalVariation):
             raise ValueError(
-                f"tau = {tau!r} is found for total variation only; give a number, about 1 to 3"
+                f"tau = {self.tau!r} is found for total variation only; give a number, about 1 to 3"
             )
-        self.nonnegative, self.synthesis = nonnegative, as_synthesis(synthesis)
-        check_limits(iterations, tolerance)
-        self.iterations, self.tolerance = iterations, tolerance
 
     @property
     def prior(self):
@@ -271,7 +259,7 @@ def admm_method(problem: InverseProblem) -> AbstractMethod:
 
 def first_image(
     problem: InverseProblem, start: Float[Array, "..."] | None, *, uniform: bool
-) -> Float[Array, "*batch channel plane y x"]:
+) -> Image:
     """The start given, amid zeros where it is smaller than the field; else uniform, or zero."""
     shape, dtype = problem.image_shape, problem.captures[0].dtype
     if start is None:
@@ -296,21 +284,3 @@ def first_image(
 
 
 _level = jax.jit(uniform_level)
-
-
-def checked_tau(tau: Any) -> Any:
-    """τ ≥ 0, or the name of a rule that finds it."""
-    if isinstance(tau, str):
-        checks.choice("tau", tau, get_args(TauRule))
-        return tau
-    return checks.non_negative("tau", tau, "a ratio")
-
-
-def of_kind(name: str, value: Any, kind: type):
-    """A value of the kind that is asked for; by default one as the kind makes it."""
-    if value is None:
-        return kind()
-    if not isinstance(value, kind):
-        wanted = kind.__name__.removeprefix("Abstract")
-        raise ValueError(f"{name} is a {type(value).__name__}; give a {wanted}")
-    return value

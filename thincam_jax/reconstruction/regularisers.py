@@ -15,6 +15,8 @@ from thincam_jax._core.checks import Number
 from thincam_jax._core.module import Module
 from thincam_jax.reconstruction.wavelet import Wavelet
 
+# What an image is to every solver.
+Image = Float[Array, "*batch channel plane y x"]
 Parts = tuple[Float[Array, "..."], ...]
 
 
@@ -27,15 +29,15 @@ class AbstractRegulariser(Module):
         """Whether KᵀK = KKᵀ = 1, which gives a proximal map in closed form."""
 
     @abc.abstractmethod
-    def __call__(self, image: Float[Array, "*batch channel plane y x"]) -> Float[Array, "*batch"]:
+    def __call__(self, image: Image) -> Float[Array, "*batch"]:
         """R of each batch element."""
 
     @abc.abstractmethod
-    def analyse(self, image: Float[Array, "*batch channel plane y x"]) -> Parts:
+    def analyse(self, image: Image) -> Parts:
         """K f."""
 
     @abc.abstractmethod
-    def synthesise(self, parts: Parts) -> Float[Array, "*batch channel plane y x"]:
+    def synthesise(self, parts: Parts) -> Image:
         """Kᵀ of parts."""
 
     @abc.abstractmethod
@@ -47,9 +49,7 @@ class AbstractRegulariser(Module):
         """A bound of ‖K‖²."""
 
 
-def no_dual(
-    regulariser: AbstractRegulariser, image: Float[Array, "*batch channel plane y x"]
-) -> Parts:
+def no_dual(regulariser: AbstractRegulariser, image: Image) -> Parts:
     """The dual of an image that is left as it is, to start `prox` with."""
     shapes = jax.eval_shape(regulariser.analyse, image)
     return tuple(jnp.zeros(s.shape, s.dtype) for s in shapes)
@@ -57,13 +57,13 @@ def no_dual(
 
 def prox(
     regulariser: AbstractRegulariser,
-    image: Float[Array, "*batch channel plane y x"],
+    image: Image,
     step: Number,
     dual: Parts,
     *,
     nonnegative: bool,
     iterations: int,
-) -> tuple[Float[Array, "*batch channel plane y x"], Parts]:
+) -> tuple[Image, Parts]:
     r"""The x that minimises step·R(x) + ½‖x − image‖², with x ≥ 0 where asked, and its dual.
 
     In closed form, x = Kᵀ shrink(K image), if K is orthonormal and no sign is asked. Shrinking and
@@ -123,19 +123,19 @@ def run_on(
     return ahead, later
 
 
-def first_t(image: Float[Array, "*batch channel plane y x"]) -> Float[Array, "*batch 1 1 1 1"]:
+def first_t(image: Image) -> Float[Array, "*batch 1 1 1 1"]:
     """The t to start `run_on` with."""
     return jnp.ones((*image.shape[:-4], 1, 1, 1, 1), image.dtype)
 
 
 def denoise(
-    image: Float[Array, "*batch channel plane y x"],
+    image: Image,
     step: Number,
     regulariser: AbstractRegulariser,
     *,
     nonnegative: bool = False,
     iterations: int = 100,
-) -> Float[Array, "*batch channel plane y x"]:
+) -> Image:
     r"""The image x that minimises ½‖x − image‖² + step·R(x), with x ≥ 0 where asked.
 
     With R = TV it is denoising by Rudin, Osher and Fatemi. The larger `step` is against the
@@ -185,12 +185,12 @@ class Sparsity(AbstractRegulariser):
     def orthonormal(self):
         return True
 
-    def __call__(self, image: Float[Array, "*batch channel plane y x"]):
+    def __call__(self, image: Image):
         (details,) = self.analyse(image)
         counted = jnp.where(self._free(details.shape), 0, jnp.abs(details))
         return jnp.sum(counted, axis=(-4, -3, -2, -1))
 
-    def analyse(self, image: Float[Array, "*batch channel plane y x"]):
+    def analyse(self, image: Image):
         return (self.basis.analyse(image),)
 
     def synthesise(self, parts: Parts):

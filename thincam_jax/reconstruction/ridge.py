@@ -47,9 +47,16 @@ from thincam_jax.reconstruction.problem import (
     uniform_level,
 )
 from thincam_jax.reconstruction.recording import Recording
+from thincam_jax.reconstruction.regularisers import Image
 from thincam_jax.reconstruction.scaled import ScaledProblem
 from thincam_jax.reconstruction.separable import RULES, Prior, Rule, choose_precision
-from thincam_jax.reconstruction.solver import AbstractSolver, Synthesis, as_synthesis, check_limits
+from thincam_jax.reconstruction.solver import (
+    AbstractSolver,
+    Synthesis,
+    as_synthesis,
+    at_most,
+    small_enough,
+)
 
 
 class Ridge(AbstractSolver):
@@ -102,8 +109,7 @@ class Ridge(AbstractSolver):
                 'several and ridge="sure" or "gcv", which choose among them'
             )
         self.synthesis = as_synthesis(synthesis)
-        check_limits(iterations, tolerance)
-        self.iterations, self.tolerance = iterations, tolerance
+        self.iterations, self.tolerance = at_most(iterations), small_enough(tolerance)
 
     def solve(self, recording: Recording):
         problem, white, mean, prior, precision = self._posed(recording)
@@ -225,10 +231,7 @@ def solve_ridge(
 
 @jax.jit
 def ridge_objective(
-    problem: InverseProblem,
-    precision: Float[Array, ""],
-    mean: Float[Array, "*batch channel plane y x"],
-    image: Float[Array, "*batch channel plane y x"],
+    problem: InverseProblem, precision: Float[Array, ""], mean: Image, image: Image
 ) -> Float[Array, "*batch"]:
     """The misfit plus ρ/2 ‖f − f̄‖² of each batch element."""
     gap = jnp.sum((image - mean) ** 2, axis=(-4, -3, -2, -1))

@@ -7,6 +7,7 @@ from jaxtyping import Array, Float
 
 from thincam_jax.imaging.operators import AbstractOperator, CropConvolution, Scaled
 from thincam_jax.reconstruction.problem import InverseProblem, back_project, convolutions, see
+from thincam_jax.reconstruction.regularisers import Image
 
 # The power method approaches the largest singular value from below.
 MARGIN = 1.05
@@ -26,7 +27,7 @@ class Seen(AbstractOperator):
     def out_shape(self) -> tuple[tuple[int, ...], ...]:
         return tuple(c.shape for c in self.problem.captures)
 
-    def __call__(self, image: Float[Array, "*batch channel plane y x"]):
+    def __call__(self, image: Image):
         pairs = zip(self.problem.operators, self.problem.weights, strict=True)
         return tuple(jnp.sqrt(w) * see(operator, image) for operator, w in pairs)
 

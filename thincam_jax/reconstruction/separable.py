@@ -33,6 +33,7 @@ from thincam_jax.imaging.operators import Separable
 from thincam_jax.imaging.operators.separable import SeparableModes
 from thincam_jax.reconstruction.normal_equations import SeparableNormal, normal_equations
 from thincam_jax.reconstruction.problem import InverseProblem, residuals
+from thincam_jax.reconstruction.regularisers import Image
 
 Rule = Literal["gcv", "sure"]
 RULES: tuple[Rule, ...] = ("gcv", "sure")
@@ -99,7 +100,7 @@ class Prior(eqx.Module):
 
 
 def choose_precision(
-    problem: InverseProblem, mean: Float[Array, "*batch channel plane y x"], rule: Rule
+    problem: InverseProblem, mean: Image, rule: Rule
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """ρ of least GCV or SURE, one for all batch elements and channels, and that least value.
 

@@ -93,11 +93,17 @@ class AbstractIterativeSolver(AbstractSolver):
         """The image of a scene from captures of it; see `reconstruct`."""
 
 
-def check_limits(iterations: int, tolerance: float) -> None:
-    """When to end: how many iterations at most, and how small the residuals must be."""
+def at_most(iterations: int) -> int:
+    """How many iterations there may be, checked."""
     if isinstance(iterations, bool) or not isinstance(iterations, int) or iterations < 1:
         raise ValueError(f"iterations = {iterations}; give a whole number of at least 1")
+    return iterations
+
+
+def small_enough(tolerance: float) -> float:
+    """How small residuals must be at the end, checked."""
     checks.non_negative("tolerance", tolerance, "a ratio")
+    return tolerance
 
 
 def as_synthesis(synthesis: Synthesis | None) -> np.ndarray | None:

@@ -23,6 +23,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from thincam_jax.reconstruction.regularisers import Image
 from thincam_jax.reconstruction.total_variation import TotalVariation
 
 
@@ -64,11 +65,11 @@ class AbstractSplitting(eqx.Module):
     nonnegative: eqx.AbstractVar[bool]
 
     @abc.abstractmethod
-    def start(self, image: Float[Array, "*batch channel plane y x"]) -> State:
+    def start(self, image: Image) -> State:
         """The state of an image, with no forces yet."""
 
     @abc.abstractmethod
-    def image(self, state: State) -> Float[Array, "*batch channel plane y x"]:
+    def image(self, state: State) -> Image:
         """The image that a state stands for: non-negative if that is asked."""
 
     @abc.abstractmethod

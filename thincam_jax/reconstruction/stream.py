@@ -1,5 +1,6 @@
 """Moving objects: captures that follow one another, each from where the one before has come to."""
 
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -86,10 +87,7 @@ def _posed(recording: Recording, solver: AdmmTV) -> InverseProblem:
 @eqx.filter_jit
 def _next(stream: Stream, captures: tuple[Array, ...]):
     first, method, state = stream.recording, stream.method, stream.state
-    seen = Recording(
-        captures, first.seen_by, noise_variance=first.noise_variance, valid=first.valid
-    )
-    problem = _posed(seen, stream.solver)
+    problem = _posed(replace(first, captures=captures), stream.solver)
     splitting = method.arguments.with_captures(problem.captures)
     for _ in range(stream.steps):
         mapped = admm_map(state, splitting)

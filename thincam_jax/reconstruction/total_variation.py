@@ -14,7 +14,8 @@ from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Number
-from thincam_jax.reconstruction.regularisers import AbstractRegulariser
+from thincam_jax._core.precision import flat_root
+from thincam_jax.reconstruction.regularisers import AbstractRegulariser, Image
 
 Kind = Literal["isotropic", "anisotropic"]
 Coupling = Literal["none", "joint", "opponent"]
@@ -63,7 +64,7 @@ class TotalVariation(AbstractRegulariser):
         self.depth_weight = checks.non_negative("depth_weight", depth_weight, "parts of one")
         self.chroma_weight = checks.non_negative("chroma_weight", chroma_weight, "parts of one")
 
-    def __call__(self, image: Float[Array, "*batch channel plane y x"]) -> Float[Array, "*batch"]:
+    def __call__(self, image: Image) -> Float[Array, "*batch"]:
         """The total variation."""
         rotated = self._rotate(self.analyse(image))
         lengths = self._length(rotated) * self._channel_weights(image.dtype)
@@ -75,15 +76,11 @@ class TotalVariation(AbstractRegulariser):
         """Differences are not: the proximal map of an image takes inner iterations."""
         return False
 
-    def analyse(
-        self, image: Float[Array, "*batch channel plane y x"]
-    ) -> tuple[Float[Array, "*batch channel plane y x"], ...]:
+    def analyse(self, image: Image) -> tuple[Image, ...]:
         """The differences inside of the image."""
         return _inside(differences(image, self.depth_weight))
 
-    def synthesise(
-        self, parts: tuple[Float[Array, "*batch channel plane y x"], ...]
-    ) -> Float[Array, "*batch channel plane y x"]:
+    def synthesise(self, parts: tuple[Image, ...]) -> Image:
         """The transpose of `analyse`."""
         return differences_adjoint(_inside(parts), self.depth_weight)
 
@@ -91,9 +88,7 @@ class TotalVariation(AbstractRegulariser):
         """Each of the directions takes differences of two samples: at most 2² = 4."""
         return 8 + 4 * self.depth_weight.astype(dtype) ** 2
 
-    def shrink(
-        self, parts: tuple[Float[Array, "*batch channel plane y x"], ...], step: Number
-    ) -> tuple[Float[Array, "*batch channel plane y x"], ...]:
+    def shrink(self, parts: tuple[Image, ...], step: Number) -> tuple[Image, ...]:
         """The slopes u that minimise step·TV + ½‖u − parts‖²: each vector shortened by `step`."""
         rotated = self._rotate(parts)
         weights = self._channel_weights(parts[0].dtype)
@@ -190,9 +185,7 @@ def _norm(slopes, *, channels: bool):
     squared = sum(s * s for s in slopes)
     if channels:
         squared = jnp.sum(squared, axis=-4, keepdims=True)
-    # The root's derivative at zero is infinite: keep it out of reach.
-    zero = squared == 0
-    return jnp.where(zero, 0, jnp.sqrt(jnp.where(zero, 1, squared)))
+    return flat_root(squared)
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(2,))

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, DTypeLike, Float, PRNGKeyArray, PyTree
 
 from thincam_jax._core import checks
+from thincam_jax._core.precision import flat_root
 
 Shapes = PyTree[tuple[int, ...]]
 
@@ -55,6 +56,10 @@ class AbstractOperator(eqx.Module):
         """
         if iterations < 1:
             raise ValueError(f"iterations = {iterations} finds no norm; give at least 1")
+        return self._norm(iterations, key, dtype)
+
+    def _norm(self, iterations: int, key: PRNGKeyArray | None, dtype: DTypeLike | None):
+        """What `norm` returns; an operator that knows its own says so here."""
         key = jax.random.key(0) if key is None else key
         # An operator of non-negative numbers, as every PSF is, has a non-negative top vector.
         start = jnp.abs(jax.random.normal(key, self.in_shape, dtype or dtype_of(self)))
@@ -68,6 +73,21 @@ class AbstractOperator(eqx.Module):
         says so.
         """
         return _mean_power(self)
+
+
+class AbstractPixelMap(AbstractOperator):
+    """An operator between the pixels of an image and of a capture, both read row by row."""
+
+    image_shape: tuple[int, ...] = eqx.field(static=True)
+    capture_shape: tuple[int, ...] = eqx.field(static=True)
+
+    @property
+    def in_shape(self) -> tuple[int, ...]:
+        return self.image_shape
+
+    @property
+    def out_shape(self) -> tuple[int, ...]:
+        return self.capture_shape
 
 
 _PROBES = 16
@@ -92,7 +112,7 @@ def _power_iteration(operator: AbstractOperator, start: Array, iterations: int):
 
     initial = (start / _length([start]), jnp.zeros((), start.dtype))
     _, squared = jax.lax.fori_loop(0, iterations, body, initial)
-    return _root(squared)
+    return flat_root(squared)  # the norm of an operator that is zero is at its minimum
 
 
 def adjoint_error(
@@ -195,9 +215,4 @@ def _require_result(who: str, given: list, expected: list) -> None:
 
 
 def _length(arrays: list) -> Float[Array, ""]:
-    return _root(sum(jnp.sum(a**2) for a in arrays))
-
-
-def _root(value) -> Float[Array, ""]:
-    """√ whose slope at 0 is 0: the norm of an operator that is zero is at its minimum."""
-    return jnp.where(value == 0, 0, jnp.sqrt(jnp.where(value == 0, 1, value)))
+    return flat_root(sum(jnp.sum(a**2) for a in arrays))

@@ -1,5 +1,8 @@
 """Pixels of a capture that do not count, or count with a gain of their own."""
 
+import abc
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, DTypeLike, Float, PRNGKeyArray, PyTree
@@ -14,7 +17,32 @@ from thincam_jax.imaging.operators.base import (
 )
 
 
-class Masked(AbstractOperator):
+class AbstractAround(AbstractOperator):
+    """An operator with something done to each number of its captures."""
+
+    operator: AbstractOperator
+
+    @property
+    def in_shape(self) -> tuple[int, ...]:
+        return self.operator.in_shape
+
+    @property
+    def out_shape(self) -> Shapes:
+        return self.operator.out_shape
+
+    @abc.abstractmethod
+    def _weighted(self, capture: Any) -> Any:
+        """What is done, the same on the way back."""
+
+    def __call__(self, image: Float[Array, "..."]) -> PyTree[Float[Array, "..."]]:
+        return self._weighted(self.operator(image))
+
+    def adjoint(self, capture: PyTree[Float[Array, "..."]]) -> Float[Array, "..."]:
+        _require_capture(capture, self.out_shape)
+        return self.operator.adjoint(self._weighted(capture))
+
+
+class Masked(AbstractAround):
     r"""An operator whose dead or saturated pixels read zero.
 
     .. math:: A f = V\,(B f), \qquad A^T g = B^T (V g), \qquad V = \mathrm{diag}(v)
@@ -28,30 +56,17 @@ class Masked(AbstractOperator):
       capture is a tuple: a tuple of masks, or one for all.
     """
 
-    operator: AbstractOperator
     valid: PyTree[Bool[Array, "..."]]
 
     def __init__(self, operator: AbstractOperator, valid: PyTree[Numbers]):
         self.operator = operator
         self.valid = _per_capture("valid", valid, operator.out_shape, _boolean)
 
-    @property
-    def in_shape(self) -> tuple[int, ...]:
-        return self.operator.in_shape
-
-    @property
-    def out_shape(self) -> Shapes:
-        return self.operator.out_shape
-
-    def __call__(self, image: Float[Array, "..."]) -> PyTree[Float[Array, "..."]]:
-        return jax.tree.map(_where_valid, self.operator(image), self.valid)
-
-    def adjoint(self, capture: PyTree[Float[Array, "..."]]) -> Float[Array, "..."]:
-        _require_capture(capture, self.out_shape)
-        return self.operator.adjoint(jax.tree.map(_where_valid, capture, self.valid))
+    def _weighted(self, capture: Any) -> Any:
+        return jax.tree.map(lambda part, valid: jnp.where(valid, part, 0), capture, self.valid)
 
 
-class Scaled(AbstractOperator):
+class Scaled(AbstractAround):
     r"""An operator whose capture is multiplied by a gain.
 
     .. math:: A f = c\,(B f), \qquad A^T g = B^T (c\,g)
@@ -66,7 +81,6 @@ class Scaled(AbstractOperator):
       tuple of gains, or one for all.
     """
 
-    operator: AbstractOperator
     gain: PyTree[Float[Array, "..."]]
 
     def __init__(self, operator: AbstractOperator, gain: PyTree[Numbers]):
@@ -78,42 +92,17 @@ class Scaled(AbstractOperator):
             self.gain = real_numbers("gain", gain)
             _per_capture("gain", self.gain, operator.out_shape, real_numbers)
 
-    @property
-    def in_shape(self) -> tuple[int, ...]:
-        return self.operator.in_shape
-
-    @property
-    def out_shape(self) -> Shapes:
-        return self.operator.out_shape
-
-    def __call__(self, image: Float[Array, "..."]) -> PyTree[Float[Array, "..."]]:
-        return self._amplified(self.operator(image))
-
-    def adjoint(self, capture: PyTree[Float[Array, "..."]]) -> Float[Array, "..."]:
-        _require_capture(capture, self.out_shape)
-        return self.operator.adjoint(self._amplified(capture))
-
-    def norm(
-        self,
-        *,
-        iterations: int = 30,
-        key: PRNGKeyArray | None = None,
-        dtype: DTypeLike | None = None,
-    ) -> Float[Array, ""]:
+    def _norm(self, iterations: int, key: PRNGKeyArray | None, dtype: DTypeLike | None):
         """The largest singular value: |c|·‖B‖ where c is one number, else by power iteration."""
         if isinstance(self.gain, tuple) or self.gain.ndim > 0:
-            return super().norm(iterations=iterations, key=key, dtype=dtype)
+            return super()._norm(iterations, key, dtype)
         norm = self.operator.norm(iterations=iterations, key=key, dtype=dtype)
         return jnp.abs(self.gain).astype(norm.dtype) * norm
 
-    def _amplified(self, capture):
+    def _weighted(self, capture: Any) -> Any:
         if isinstance(self.gain, tuple):
             return jax.tree.map(_times, capture, self.gain)
         return jax.tree.map(lambda part: _times(part, self.gain), capture)
-
-
-def _where_valid(capture, valid):
-    return jnp.where(valid, capture, 0)
 
 
 def _times(capture, gain):

@@ -1,6 +1,5 @@
 """A camera known by its whole matrix."""
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -8,14 +7,14 @@ from jaxtyping import Array, Float
 from thincam_jax._core.checks import Numbers, Shape
 from thincam_jax._core.precision import product
 from thincam_jax.imaging.operators.base import (
-    AbstractOperator,
+    AbstractPixelMap,
     real_matrix,
     require_shape,
     require_size,
 )
 
 
-class Matrix(AbstractOperator):
+class Matrix(AbstractPixelMap):
     r"""A dense matrix between an image and a capture, both read row by row.
 
     .. math:: g_i = \sum_j H_{ij} f_j
@@ -31,22 +30,12 @@ class Matrix(AbstractOperator):
     """
 
     matrix: Float[Array, "i j"]
-    image_shape: tuple[int, ...] = eqx.field(static=True)
-    capture_shape: tuple[int, ...] = eqx.field(static=True)
 
     def __init__(self, matrix: Numbers, in_shape: Shape, out_shape: Shape):
         self.matrix = real_matrix("matrix", matrix)
         rows, columns = self.matrix.shape
         self.image_shape = require_size("in_shape", in_shape, columns, "columns")
         self.capture_shape = require_size("out_shape", out_shape, rows, "rows")
-
-    @property
-    def in_shape(self) -> tuple[int, ...]:
-        return self.image_shape
-
-    @property
-    def out_shape(self) -> tuple[int, ...]:
-        return self.capture_shape
 
     def mean_power(self) -> Float[Array, ""]:
         """Mean squared length of a column, exactly."""

@@ -101,13 +101,7 @@ class ReducedMatrix(AbstractOperator):
         """Vᵀf of images as rows of pixels."""
         return each_times(self.transposed, flat)
 
-    def norm(
-        self,
-        *,
-        iterations: int = 30,
-        key: PRNGKeyArray | None = None,
-        dtype: DTypeLike | None = None,
-    ) -> Float[Array, ""]:
+    def _norm(self, iterations: int, key: PRNGKeyArray | None, dtype: DTypeLike | None):
         """The largest singular value, exactly."""
         return jnp.max(self.values).astype(dtype or self.values.dtype)
 

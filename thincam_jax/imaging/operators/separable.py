@@ -96,16 +96,10 @@ class Separable(AbstractOperator):
         require_shape("capture", capture, self.out_shape)
         return _between(jnp.swapaxes(self.left, 1, 2), capture, self.right)
 
-    def norm(
-        self,
-        *,
-        iterations: int = 30,
-        key: PRNGKeyArray | None = None,
-        dtype: DTypeLike | None = None,
-    ) -> Float[Array, ""]:
+    def _norm(self, iterations: int, key: PRNGKeyArray | None, dtype: DTypeLike | None):
         """The largest singular value: of one term exactly, without an iteration."""
         if self.terms > 1:
-            return super().norm(iterations=iterations, key=key, dtype=dtype)
+            return super()._norm(iterations, key, dtype)
         if self.modes is not None:
             return jnp.max(self.modes.values).astype(dtype or self.left.dtype)
         return jnp.linalg.norm(self.left[0], 2) * jnp.linalg.norm(self.right[0], 2)

@@ -4,7 +4,6 @@ import functools
 import math
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import scipy
@@ -13,14 +12,14 @@ from jaxtyping import Array, Float, Int
 
 from thincam_jax._core.checks import Shape
 from thincam_jax.imaging.operators.base import (
-    AbstractOperator,
+    AbstractPixelMap,
     real_numbers,
     require_shape,
     require_size,
 )
 
 
-class Sparse(AbstractOperator):
+class Sparse(AbstractPixelMap):
     r"""A sparse matrix between an image and a capture, both read row by row.
 
     .. math:: g_i = \sum_j H_{ij} f_j
@@ -40,21 +39,11 @@ class Sparse(AbstractOperator):
     values: Float[Array, " entry"]
     rows: Int[Array, " entry"]
     columns: Int[Array, " entry"]
-    image_shape: tuple[int, ...] = eqx.field(static=True)
-    capture_shape: tuple[int, ...] = eqx.field(static=True)
 
     def __init__(self, matrix: Any, in_shape: Shape, out_shape: Shape):
         self.values, self.rows, self.columns = _entries(matrix)
         self.image_shape = require_size("in_shape", in_shape, matrix.shape[1], "columns")
         self.capture_shape = require_size("out_shape", out_shape, matrix.shape[0], "rows")
-
-    @property
-    def in_shape(self) -> tuple[int, ...]:
-        return self.image_shape
-
-    @property
-    def out_shape(self) -> tuple[int, ...]:
-        return self.capture_shape
 
     def __call__(self, image: Float[Array, "..."]) -> Float[Array, "..."]:
         require_shape("image", image, self.in_shape)

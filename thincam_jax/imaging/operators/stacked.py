@@ -57,14 +57,8 @@ class Stacked(AbstractOperator):
             total = total + operator.adjoint(part)
         return total
 
-    def norm(
-        self,
-        *,
-        iterations: int = 30,
-        key: PRNGKeyArray | None = None,
-        dtype: DTypeLike | None = None,
-    ) -> Float[Array, ""]:
+    def _norm(self, iterations: int, key: PRNGKeyArray | None, dtype: DTypeLike | None):
         """The largest singular value: by power iteration, but of one operator its own."""
         if len(self.operators) == 1:
             return self.operators[0].norm(iterations=iterations, key=key, dtype=dtype)
-        return super().norm(iterations=iterations, key=key, dtype=dtype)
+        return super()._norm(iterations, key, dtype)

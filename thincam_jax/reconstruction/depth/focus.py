@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from thincam_jax._core import checks
-from thincam_jax._core.precision import product
+from thincam_jax._core.precision import flat_root, product
 
 Measure = Literal["laplacian_variance", "gradient_energy", "gradient_sparsity"]
 MEASURES: tuple[Measure, ...] = get_args(Measure)
@@ -58,9 +58,9 @@ def focus_measure(
     squared = _squared_gradient(smooth)
     if measure == "gradient_energy":
         return average(squared)
-    energy, length = average(squared), average(_root(squared))
+    energy, length = average(squared), average(flat_root(squared))
     flat = length == 0
-    return jnp.where(flat, 1, _root(energy) / jnp.where(flat, 1, length))
+    return jnp.where(flat, 1, flat_root(energy) / jnp.where(flat, 1, length))
 
 
 def gaussian_average(
@@ -126,9 +126,3 @@ def _squared_gradient(image):
     across = (across[..., :-2, :] + 2 * across[..., 1:-1, :] + across[..., 2:, :]) / 4
     down = (down[..., :-2] + 2 * down[..., 1:-1] + down[..., 2:]) / 4
     return across**2 + down**2
-
-
-def _root(squared):
-    """The square root, with a slope of zero at zero."""
-    zero = squared == 0
-    return jnp.where(zero, 0, jnp.sqrt(jnp.where(zero, 1, squared)))

@@ -1,6 +1,7 @@
 """Reconstructions of one set of captures over a list of object distances."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -109,15 +110,7 @@ def _focused(recording: Recording, distances: list[float]) -> list[Recording]:
             f"{len(distances)} distances; give one for each"
         )
     stacks = [seen_by.psfs[:, :, k : k + 1] for k in range(planes)]
-    return [
-        Recording(
-            recording.captures,
-            Psfs(stack, field_shape=seen_by.field_shape),
-            noise_variance=recording.noise_variance,
-            valid=recording.valid,
-        )
-        for stack in stacks
-    ]
+    return [replace(recording, seen_by=replace(seen_by, psfs=stack)) for stack in stacks]
 
 
 def increasing(distances: Numbers | Sequence[float | int]) -> list[float]:
