@@ -227,12 +227,7 @@ def evaluate(
 
 
 def landscape(
-    objective: Objective,
-    space: DesignSpace,
-    data: Any,
-    count: int,
-    *,
-    at_a_time: int = _AT_A_TIME,
+    objective: Objective, space: DesignSpace, data: Any, count: int, *, at_a_time: int = _AT_A_TIME
 ) -> tuple[Float[Array, "point variable"], Float[Array, " point"]]:
     """The objective on an even grid over the cube, `count` points along each variable.
 
@@ -299,12 +294,7 @@ def _descend(objective, space, data, points, scales, steps: int, tolerance) -> D
             return objective(space.design(on_cube(y)), given) / scale
 
         solution = optimistix.minimise(
-            loss,
-            solver,
-            jnp.arcsin(jnp.sqrt(point)),
-            args=data,
-            max_steps=steps,
-            throw=False,
+            loss, solver, jnp.arcsin(jnp.sqrt(point)), args=data, max_steps=steps, throw=False
         )
         ended = on_cube(solution.value)
         value = objective(space.design(ended), data)

@@ -13,6 +13,9 @@ from thincam_jax._core.checks import Number, Shape
 from thincam_jax._core.grids import Grid
 from thincam_jax._core.module import Module
 
+Pictures = Float[Array, "*batch y x"]
+Electrons = Float[Array, "*batch 1 1"]  # per unit of each picture
+
 
 class Sensor(Module):
     """A monochrome image sensor of square pixels that are sensitive over their whole area.
@@ -74,19 +77,12 @@ class AbstractNoise(Module):
     """Adds the randomness of a read-out to a noise-free image."""
 
     @abc.abstractmethod
-    def add(
-        self,
-        key: PRNGKeyArray,
-        image: Float[Array, "*batch y x"],
-        electrons: Float[Array, "*batch 1 1"] | None,
-    ) -> Float[Array, "*batch y x"]:
+    def add(self, key: PRNGKeyArray, image: Pictures, electrons: Electrons | None) -> Pictures:
         """The noisy image. `electrons` is the number per unit of the image; None if unknown."""
 
     @abc.abstractmethod
     def variance(
-        self,
-        image: Float[Array, "*batch y x"],
-        electrons: Float[Array, "*batch 1 1"] | None = None,
+        self, image: Pictures, electrons: Electrons | None = None
     ) -> Float[Array, "*batch"]:
         """Noise variance of a pixel, averaged over each image, in the image's unit squared."""
 
@@ -108,9 +104,7 @@ class GaussianNoise(AbstractNoise):
     )
 
     def variance(
-        self,
-        image: Float[Array, "*batch y x"],
-        electrons: Float[Array, "*batch 1 1"] | None = None,
+        self, image: Pictures, electrons: Electrons | None = None
     ) -> Float[Array, "*batch"]:
         if self.signal_power == "total":
             power = jnp.mean(image**2, axis=(-2, -1))
@@ -118,12 +112,7 @@ class GaussianNoise(AbstractNoise):
             power = jnp.var(image, axis=(-2, -1))
         return power * 10 ** (-self.snr_db.astype(image.dtype) / 10)
 
-    def add(
-        self,
-        key: PRNGKeyArray,
-        image: Float[Array, "*batch y x"],
-        electrons: Float[Array, "*batch 1 1"] | None,
-    ) -> Float[Array, "*batch y x"]:
+    def add(self, key: PRNGKeyArray, image: Pictures, electrons: Electrons | None) -> Pictures:
         sigma = jnp.sqrt(self.variance(image))[..., None, None]
         return image + sigma * jax.random.normal(key, image.shape, image.dtype)
 
@@ -141,9 +130,7 @@ class PoissonGaussianNoise(AbstractNoise):
     )
 
     def variance(
-        self,
-        image: Float[Array, "*batch y x"],
-        electrons: Float[Array, "*batch 1 1"] | None = None,
+        self, image: Pictures, electrons: Electrons | None = None
     ) -> Float[Array, "*batch"]:
         if electrons is None:
             raise ValueError("PoissonGaussianNoise counts electrons: give their number")
@@ -151,12 +138,7 @@ class PoissonGaussianNoise(AbstractNoise):
         read = self.read_noise.astype(image.dtype) ** 2
         return (mean + read) / electrons[..., 0, 0] ** 2
 
-    def add(
-        self,
-        key: PRNGKeyArray,
-        image: Float[Array, "*batch y x"],
-        electrons: Float[Array, "*batch 1 1"] | None,
-    ) -> Float[Array, "*batch y x"]:
+    def add(self, key: PRNGKeyArray, image: Pictures, electrons: Electrons | None) -> Pictures:
         if electrons is None:
             raise ValueError(
                 "PoissonGaussianNoise counts electrons: give the Sensor an exposure, such as 0.9, "
@@ -171,9 +153,7 @@ class PoissonGaussianNoise(AbstractNoise):
         return (counts + read) / electrons
 
 
-def electrons_per_unit(
-    sensor: Sensor, image: Float[Array, "*batch y x"]
-) -> Float[Array, "*batch 1 1"] | None:
+def electrons_per_unit(sensor: Sensor, image: Pictures) -> Electrons | None:
     """Electrons per unit of each image at the sensor's exposure; None for an ideal sensor."""
     if sensor.electrons is not None:
         counted = sensor.electrons.astype(image.dtype)
@@ -186,12 +166,8 @@ def electrons_per_unit(
 
 
 def read_out(
-    sensor: Sensor,
-    image: Float[Array, "*batch y x"],
-    *,
-    noise: AbstractNoise | None = None,
-    key: Any = None,
-) -> Float[Array, "*batch y x"]:
+    sensor: Sensor, image: Pictures, *, noise: AbstractNoise | None = None, key: Any = None
+) -> Pictures:
     """What the sensor reports for a noise-free image, in the image's own units.
 
     Noise, then saturation at the full well, then quantisation, as `sensor` and `noise` ask for.

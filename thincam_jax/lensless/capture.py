@@ -60,11 +60,7 @@ def capture(
         whole = True if pixel_integration is None else pixel_integration
         parts = (
             expose(
-                camera,
-                plane,
-                scene.spectrum,
-                model=model or "separable",
-                pixel_integration=whole,
+                camera, plane, scene.spectrum, model=model or "separable", pixel_integration=whole
             )
             for plane in scene.planes
         )

@@ -21,12 +21,7 @@ from thincam_jax.lensless.propagation.angular_spectrum import require_odd
 from thincam_jax.lensless.propagation.separable import PIXEL_NODES
 
 Model = Literal[
-    "geometric",
-    "paraxial",
-    "closed_form",
-    "separable",
-    "angular_spectrum",
-    "rayleigh_sommerfeld",
+    "geometric", "paraxial", "closed_form", "separable", "angular_spectrum", "rayleigh_sommerfeld"
 ]
 MODELS: tuple[Model, ...] = get_args(Model)
 # Those of unbounded chirps, which cannot hold an edge or the pixels of a display; and those that

@@ -20,14 +20,7 @@ from thincam_jax._core import checks
 from thincam_jax._core.checks import Number
 from thincam_jax.waveguide.camera import SeeThroughCamera
 from thincam_jax.waveguide.efficiency import band_about, in_blocks, least_nodes
-from thincam_jax.waveguide.rays import (
-    RayStatus,
-    at_rear,
-    bragg_rays,
-    on_object,
-    shift,
-    straight_on,
-)
+from thincam_jax.waveguide.rays import RayStatus, at_rear, bragg_rays, on_object, shift, straight_on
 
 
 class SmearedRays(eqx.Module):
@@ -61,8 +54,7 @@ def trace_band(
     distance = checks.positive("object_distance", object_distance, "mm")
     nodes = max(least_nodes(orders), 8 * samples)
     centres, parts, weight = in_blocks(
-        lambda pixel: _one(camera, pixel, distance, (orders, samples, nodes)),
-        pixels.reshape(-1, 2),
+        lambda pixel: _one(camera, pixel, distance, (orders, samples, nodes)), pixels.reshape(-1, 2)
     )
     points, shape = centres[:, None, None, :] + parts, pixels.shape[:-1]
     return SmearedRays(

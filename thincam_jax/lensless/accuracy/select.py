@@ -10,25 +10,14 @@ from thincam_jax._core import checks
 from thincam_jax._core.checks import Number
 from thincam_jax._core.grids import Grid
 from thincam_jax._core.memory import available_bytes
-from thincam_jax._core.precision import (
-    PRECISIONS,
-    RESULT_ROUNDING,
-    Precision,
-    precision_of,
-)
+from thincam_jax._core.precision import PRECISIONS, RESULT_ROUNDING, Precision, precision_of
 from thincam_jax.lensless.accuracy.probe import MaskProbe
 from thincam_jax.lensless.accuracy.sampled import sampled_errors
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.cost import Cost, psf_cost
 from thincam_jax.lensless.digits import held_in_single
 from thincam_jax.lensless.masks.base import AbstractFactoredMask, AbstractMask
-from thincam_jax.lensless.method import (
-    Model,
-    PsfMethod,
-    has_few_terms,
-    models_of,
-    psf_method,
-)
+from thincam_jax.lensless.method import Model, PsfMethod, has_few_terms, models_of, psf_method
 from thincam_jax.lensless.propagation.separable import PIXEL_NODES
 
 # Predictions are estimates from some rows and columns (or pixels, for the direct sum): what they
@@ -57,25 +46,17 @@ class Prediction:
 
 
 @dataclass(frozen=True)
-class Selection:
+class Selection(Prediction):
     """The choice of `select_model`.
 
-    - `model`, `precision`, `oversampling`: arguments for `psf`, `otf` and `capture`.
-    - `predicted_error`: relative L2 error of the PSF on the sensor.
     - `meets_tolerance`: False if no model does; the choice is then the most accurate.
-    - `cost`: operations and peak memory of the choice.
     - `paraxial_error`: estimate of how far exact scalar diffraction is from the Fresnel field that
       errors are counted from.
     - `reasons`: one sentence for every effect left out, with its size.
     - `considered`: the predictions that the choice was made from, cheapest first.
     """
 
-    model: Model
-    precision: Precision
-    oversampling: int | None
-    predicted_error: float
     meets_tolerance: bool
-    cost: Cost
     paraxial_error: float
     reasons: tuple[str, ...]
     considered: tuple[Prediction, ...]
@@ -122,8 +103,9 @@ def select_model(
     sampling_grid = grid or camera.sensor.grid
     considered: list[Prediction] = []
     for method, cost in candidates(camera.mask, sampling_grid, pixel_integration):
-        considered.append(_prediction(probe, camera.mask, sampling_grid, method, cost))
-        if considered[-1].predicted_error <= tolerance:
+        error = predicted_error(probe, camera.mask, sampling_grid, method)
+        considered.append(_prediction(method, error, cost))
+        if error <= tolerance:
             break
     best = min(considered, key=lambda p: p.predicted_error)
     chosen = considered[-1] if considered[-1].predicted_error <= tolerance else best
@@ -152,13 +134,11 @@ def predict_error(
     probe = probe_of(camera, wavelength, object_distance, pixel_integration, grid)
     grid = grid or camera.sensor.grid
     method = psf_method(camera.mask, grid, model, pixel_integration, precision, oversampling)
-    return _prediction(probe, camera.mask, grid, method, psf_cost(camera.mask, grid, method))
+    error = predicted_error(probe, camera.mask, grid, method)
+    return _prediction(method, error, psf_cost(camera.mask, grid, method))
 
 
-def _prediction(
-    probe: MaskProbe, mask: AbstractMask, grid: Grid, method: PsfMethod, cost: Cost
-) -> Prediction:
-    error = predicted_error(probe, mask, grid, method)
+def _prediction(method: PsfMethod, error: float, cost: Cost) -> Prediction:
     return Prediction(method.model, method.precision, method.oversampling, error, cost)
 
 
@@ -171,9 +151,7 @@ def _select_sampled(
         cost = psf_cost(mask, grid, method)
         if considered and free is not None and cost.bytes > free:
             break
-        considered.append(
-            Prediction(method.model, method.precision, method.oversampling, error, cost)
-        )
+        considered.append(_prediction(method, error, cost))
         if error <= tolerance:
             break
     chosen = considered[-1]

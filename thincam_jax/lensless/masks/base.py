@@ -16,6 +16,8 @@ from thincam_jax._core.grids import Grid, cell_overlap, centred_indices
 from thincam_jax._core.module import Module
 from thincam_jax._core.precision import as_complex, phasor, product
 
+Transmittance = Complex[Array, "y x"] | Float[Array, "y x"]
+
 
 class AbstractMask(Module):
     """A thin mask in the plane z = 0, given by its amplitude transmittance.
@@ -35,9 +37,7 @@ class AbstractMask(Module):
         """Height and width of the open aperture, mm."""
 
     @abc.abstractmethod
-    def sample(
-        self, grid: Grid, wavelength: Number | None = None
-    ) -> Complex[Array, "y x"] | Float[Array, "y x"]:
+    def sample(self, grid: Grid, wavelength: Number | None = None) -> Transmittance:
         """Amplitude transmittance on a grid; cells cut by the aperture count by their open area.
 
         `wavelength`: mm, of the light; a mask whose transmittance is the same for all takes none.
@@ -137,9 +137,7 @@ class AbstractFactoredMask(AbstractMask):
         down = across if same else terms.rows.products(first, second)
         return MaskTerms(weights, down, across)
 
-    def sample(
-        self, grid: Grid, wavelength: Number | None = None
-    ) -> Complex[Array, "y x"] | Float[Array, "y x"]:
+    def sample(self, grid: Grid, wavelength: Number | None = None) -> Transmittance:
         terms = self.terms(wavelength)
         rows = terms.rows.samples(grid.y - self.centre[0], grid.pitch)
         columns = terms.columns.samples(grid.x - self.centre[1], grid.pitch)

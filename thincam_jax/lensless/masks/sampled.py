@@ -17,12 +17,13 @@ from thincam_jax.lensless.masks.base import (
     AbstractFactoredMask,
     AxisFactors,
     MaskTerms,
+    Transmittance,
     open_parts,
 )
 from thincam_jax.lensless.masks.cells import cell_edges
 
 
-def _amplitudes(given: Any) -> Complex[Array, "y x"] | Float[Array, "y x"]:
+def _amplitudes(given: Any) -> Transmittance:
     amplitude = jnp.asarray(given)
     if amplitude.ndim != 2 or 0 in amplitude.shape:
         raise ValueError(f"amplitude has shape {amplitude.shape}; give a non-empty array (y, x)")
@@ -45,7 +46,7 @@ class SampledMask(AbstractFactoredMask):
     - `fill_factor`: part of a cell's area that is open, in its middle; None for all of it.
     """
 
-    amplitude: Complex[Array, "y x"] | Float[Array, "y x"] = eqx.field(converter=_amplitudes)
+    amplitude: Transmittance = eqx.field(converter=_amplitudes)
     pitch: Float[Array, ""] = eqx.field(converter=checks.length("pitch"))
     centre: Float[Array, "2"] = eqx.field(default=(0, 0), converter=checks.centre, kw_only=True)
     fill_factor: Float[Array, ""] | None = eqx.field(
@@ -91,9 +92,7 @@ class SampledMask(AbstractFactoredMask):
             return AxisFactors(cell_edges(values.shape[1], self.pitch), values)
         return open_parts(values, self.pitch, self.fill_factor)
 
-    def sample(
-        self, grid: Grid, wavelength: Number | None = None
-    ) -> Complex[Array, "y x"] | Float[Array, "y x"]:
+    def sample(self, grid: Grid, wavelength: Number | None = None) -> Transmittance:
         rows, columns = self.amplitude.shape
         dtype = self.amplitude.dtype
         down = self._coverage(grid.y - self.centre[0], grid.pitch, rows).astype(dtype)

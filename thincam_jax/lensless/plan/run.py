@@ -87,10 +87,7 @@ class Plan:
             ("tolerance", f"{self.tolerance:.1e}, predicted {self.predicted_error:.1e}{met}"),
             ("model", f"{self.model}, {self.precision}, {average}: {shares['model']:.1e}"),
             ("depth planes", f"{planes} by {len(self.distances)} PSFs: {shares['planes']:.1e}"),
-            (
-                "wavelengths",
-                f"{colours} by {len(self.wavelengths)}: {shares['wavelengths']:.1e}",
-            ),
+            ("wavelengths", f"{colours} by {len(self.wavelengths)}: {shares['wavelengths']:.1e}"),
             (
                 "convolution",
                 f"field {rows}×{columns}, window {self.padded_shape[0]}×{self.padded_shape[1]}",

@@ -43,9 +43,7 @@ def angular_spectrum_sampling(
     nyquist = 1 / (2 * pitch)
     limit = _band_limit(path, count * pitch)
     return Sampling(
-        nyquist / frequency,
-        limit / frequency,
-        (nyquist >= frequency) & (limit >= frequency),
+        nyquist / frequency, limit / frequency, (nyquist >= frequency) & (limit >= frequency)
     )
 
 
