@@ -54,7 +54,7 @@ class Design(Module):
         """
         given = (
             checks.positive_all("beta", jnp.asarray(beta, float), "rad/mm^2"),
-            _finite("phase", jnp.asarray(phase, float), "rad"),
+            checks.finite("phase", jnp.asarray(phase, float), "rad", shape=jnp.shape(phase)),
             checks.positive_all("distance", jnp.asarray(distance, float), "mm"),
             checks.positive_all("wavelength", jnp.asarray(wavelength, float), "mm"),
             checks.positive_all("exposure", jnp.asarray(exposure, float), "shares"),
@@ -84,10 +84,6 @@ class Design(Module):
             LenslessCamera(self.mask(b, p), sensor, d)
             for b, p, d in zip(self.beta, self.phase, self.distance, strict=True)
         ]
-
-
-def _finite(name: str, value: Array, unit: str) -> Array:
-    return checks.finite(name, value, unit, shape=value.shape)
 
 
 def shots(

@@ -15,6 +15,8 @@ from jaxtyping import Array, Float
 
 from thincam_jax.design.design import MOST_CAPTURES, Design
 
+# As near to a limit, in the cube, a point lies against it.
+_WITHIN = 1e-3
 UNITS: dict[str, str] = {
     "beta": "rad/mm^2",
     "phase": "rad",
@@ -158,25 +160,23 @@ class DesignSpace(eqx.Module):
 def active_limits(
     space: DesignSpace,
     point: Float[Array, " variable"] | Float[np.ndarray, " variable"],
-    *,
-    within: float = 1e-3,
 ) -> tuple[str, ...]:
     """What a point of the unit cube lies against, in words."""
     words = []
     values = space.values(jnp.asarray(point))
     for variable, place, value in zip(space.variables, jax.device_get(point), values, strict=True):
         unit = UNITS[variable.name]
-        if place <= within:
+        if place <= _WITHIN:
             words.append(f"{variable.label()} ≥ {float(value):.6g} {unit}")
-        elif place >= 1 - within:
-            reason = _reason(space, variable, value, within)
+        elif place >= 1 - _WITHIN:
+            reason = _reason(space, variable, value)
             words.append(f"{variable.label()} ≤ {float(value):.6g} {unit}{reason}")
     return tuple(words)
 
 
-def _reason(space: DesignSpace, variable: Variable, value, within: float) -> str:
+def _reason(space: DesignSpace, variable: Variable, value) -> str:
     # As near to its own bound as what calls it active: no limit is needed to explain it.
-    if float(value) >= variable.upper - (within + 1e-6) * (variable.upper - variable.lower):
+    if float(value) >= variable.upper - (_WITHIN + 1e-6) * (variable.upper - variable.lower):
         return ""
     # A space that was narrowed since lies against its own bounds only.
     limit = space.limits.thickness if variable.name == "distance" else space.limits.mask_pixel

@@ -61,14 +61,18 @@ def restore_by_wiener(design: Design, training: Training) -> Float[Array, "image
     check_captures(design, training)
     at = _frequencies(training)
     channels = tuple(_channel(design, training, row, at) for row in training.synthesis)
-    scene = _scene_waves(training, at)
+    count = training.images.shape[-1]
+    pixel = training.setup.field / count
+    # Along either axis of an image: at the middles of its pixels, and averaged over them.
+    middles = waves(half_places(count, pixel), at)
+    averaged = middles * jnp.sinc(pixel * at) * pixel
     # The mean's part in each capture: the prior concerns the contrast only.
-    even = transform(fold(jnp.ones_like(training.images[0])), *[scene.seen] * 2)
+    even = transform(fold(jnp.ones_like(training.images[0])), averaged, averaged)
     means = [[_captured(even, h, c, training, at) for h in c.each] for c in channels]
 
     def one(given):
         image, noise = given
-        contrast = transform(fold(image - 1), *[scene.seen] * 2)
+        contrast = transform(fold(image - 1), averaged, averaged)
         spectra, variances = [], []
         for channel, mean, drawn in zip(channels, means, noise, strict=True):
             parts = [_captured(contrast, h, channel, training, at) for h in channel.each]
@@ -82,7 +86,7 @@ def restore_by_wiener(design: Design, training: Training) -> Float[Array, "image
             spectra.append(transform(fold(noisy), channel.rows, channel.columns) * area)
             variances.append(variance)
         found = _filtered(channels, jnp.stack(spectra), jnp.stack(variances), training, at)
-        return unfold(series(found * _measure(at), *[scene.shown] * 2), image.shape) + 1
+        return unfold(series(found * _measure(at), middles, middles), image.shape) + 1
 
     # One after the other: an image's spectra are larger than itself.
     return jax.lax.map(one, (training.images, training.noise))
@@ -92,20 +96,6 @@ def _frequencies(training: Training) -> Float[Array, " frequency"]:
     """Those of the window that are not negative, cycles/rad, the same along v and u."""
     window = training.window
     return jnp.asarray(np.fft.rfftfreq(window.samples, window.angle / window.samples), float)
-
-
-class _SceneWaves(eqx.Module):
-    """Along either axis of an image: averaged over its pixels, and at their middles."""
-
-    seen: Float[Array, "2 pixel frequency"]
-    shown: Float[Array, "2 pixel frequency"]
-
-
-def _scene_waves(training: Training, at: Float[Array, " frequency"]) -> _SceneWaves:
-    count = training.images.shape[-1]
-    pixel = training.setup.field / count
-    middles = waves(half_places(count, pixel), at)
-    return _SceneWaves(middles * jnp.sinc(pixel * at) * pixel, middles)
 
 
 class _Channel(eqx.Module):

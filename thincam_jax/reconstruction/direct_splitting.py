@@ -42,12 +42,7 @@ class DirectSplitting(AbstractSplitting):
     problem: InverseProblem
     normal: AbstractNormal
     pulled: Image
-    tau: Float[Array, ""]
-    variation: TotalVariation
-    image_unit: Float[Array, ""]
     capture_unit: Float[Array, ""]
-    penalties: Penalties
-    nonnegative: bool = eqx.field(static=True)
 
     def __init__(self, problem: InverseProblem, variation: TotalVariation):
         scaled = ScaledProblem(problem)

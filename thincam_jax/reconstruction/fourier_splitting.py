@@ -44,12 +44,7 @@ class FourierSplitting(AbstractSplitting):
     gains: tuple[Float[Array, ""], ...]
     captures: tuple[Float[Array, "*batch channel y x"], ...]
     weights: tuple[Float[Array, "..."], ...]
-    tau: Float[Array, ""]
-    variation: TotalVariation
     normal: "NormalInverse"
-    image_unit: Float[Array, ""]
-    penalties: Penalties
-    nonnegative: bool = eqx.field(static=True)
 
     def __init__(
         self,

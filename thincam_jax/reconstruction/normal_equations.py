@@ -44,16 +44,16 @@ INNER_STEPS = 500
 class AbstractNormal(eqx.Module):
     """The normal equations of a problem with a shift μ > 0, made ready to be solved."""
 
-    problem: eqx.AbstractVar[InverseProblem]
-    shift: eqx.AbstractVar[Float[Array, ""]]
+    problem: InverseProblem
+    shift: Float[Array, ""]
 
     @abc.abstractmethod
     def solve(self, right: Float[Array, "..."]) -> Float[Array, "..."]:
         """z of a right-hand side b (*batch, channel, plane, y, x)."""
 
-    @abc.abstractmethod
     def shifted(self, shift: Float[Array, ""]) -> "AbstractNormal":
         """The same with another μ; what does not depend on it is kept."""
+        return replace(self, shift=shift)
 
     def variance(self) -> Float[Array, "*planes y x"]:
         """The diagonal of (Σ AᵀwA + μ)⁻¹ in the shape of the operators' images."""
@@ -101,8 +101,6 @@ def normal_equations(problem: InverseProblem, shift: Float[Array, ""]) -> Abstra
 class DenseNormal(AbstractNormal):
     """By the Cholesky factor of the Gram matrix (pixel, pixel) plus μ."""
 
-    problem: InverseProblem
-    shift: Float[Array, ""]
     gram: Float[Array, "n n"]
     factor: Float[Array, "n n"]
 
@@ -126,15 +124,10 @@ class DenseNormal(AbstractNormal):
 class SeparableNormal(AbstractNormal):
     """By the modes of a separable camera, weight and gain included in their values."""
 
-    problem: InverseProblem
-    shift: Float[Array, ""]
     modes: SeparableModes
 
     def solve(self, right: Float[Array, "..."]):
         return _by_modes(self.modes, jax.lax.stop_gradient(self.shift), right)
-
-    def shifted(self, shift: Float[Array, ""]):
-        return SeparableNormal(self.problem, shift, self.modes)
 
     def variance(self):
         inverse = 1 / (self.modes.values**2 + self.shift)
@@ -144,16 +137,10 @@ class SeparableNormal(AbstractNormal):
 class ReducedNormal(AbstractNormal):
     """By the eigenvectors that a reduced matrix has, whatever μ."""
 
-    problem: InverseProblem
-    shift: Float[Array, ""]
-
     def solve(self, right: Float[Array, "..."]):
         bare, power = self._powers()
         modes = bare.modes(right.reshape(-1, bare.values.size)) / power
         return each_times(bare.vectors, modes).reshape(right.shape)
-
-    def shifted(self, shift: Float[Array, ""]):
-        return ReducedNormal(self.problem, shift)
 
     def variance(self):
         bare, power = self._powers()
@@ -176,8 +163,6 @@ class ReducedNormal(AbstractNormal):
 class InverseNormal(AbstractNormal):
     """By the inverse matrix itself: one product a solution."""
 
-    problem: InverseProblem
-    shift: Float[Array, ""]
     inverse: Float[Array, "n n"]
 
     def solve(self, right: Float[Array, "..."]):
@@ -194,8 +179,6 @@ class IterativeNormal(AbstractNormal):
     Convolutions are preconditioned, and separable cameras by the `modes` that are given.
     """
 
-    problem: InverseProblem
-    shift: Float[Array, ""]
     modes: SeparableModes | None = None
 
     def solve(self, right: Float[Array, "..."]):
@@ -233,9 +216,6 @@ class IterativeNormal(AbstractNormal):
         solver = lineax.CG(**limits, norm=optimistix.rms_norm, max_steps=steps)
         solution = lineax.linear_solve(operator, right, solver, options=options, throw=False)
         return eqx.tree_at(lambda s: s.value, solution, factor * solution.value)
-
-    def shifted(self, shift: Float[Array, ""]):
-        return IterativeNormal(self.problem, shift, self.modes)
 
     def _uncropped(self, operators, image):
         """(Σ w̄|Ĥ|² + μ)⁻¹ on the window, and cut: what the inverse were without the crop.

@@ -149,7 +149,11 @@ class PoissonTV(AbstractIterativeSolver):
         if callback is not None:
             raise ValueError("method 'poisson' runs in one piece; leave out the callback")
         if isinstance(recording.seen_by, Cameras):
-            _check_one_scale(recording.seen_by)
+            if max(distance_ratios(recording.seen_by.cameras)) > 1:
+                raise ValueError(
+                    "method 'poisson' needs all cameras at one distance, since captures that are "
+                    "enlarged are no counts; use AdmmTV"
+                )
         # The variance is that of the counts; no other needs to be estimated.
         counted = recording.with_noise(1.0)
         problem = counted.problem(tau=self.tau, regulariser=self.variation)
@@ -197,7 +201,8 @@ def solve_poisson(
     """
     began = time.perf_counter()
     counts = Counts(problem, background=background, smoothing=smoothing, link=link)
-    start = uniform_start(counts) if image is None else start_image(problem, image)
+    uniform = jnp.broadcast_to(counts.unit, counts.problem.image_shape)
+    start = uniform if image is None else start_image(problem, image)
     limit = jnp.asarray(tolerance, float)
     solution = optimistix.minimise(
         poisson_loss,
@@ -288,11 +293,6 @@ def unlinked(link: Link, value: Float[Array, "..."]) -> Float[Array, "..."]:
     return jnp.log(value) if link == "exponential" else jnp.sqrt(value)
 
 
-def uniform_start(counts: Counts) -> Image:
-    """The uniform image of brightness s."""
-    return jnp.broadcast_to(counts.unit, counts.problem.image_shape)
-
-
 @jax.jit
 def _unit(problem: InverseProblem, background):
     captures = tuple(c - b for c, b in zip(problem.captures, background, strict=True))
@@ -343,15 +343,6 @@ def mean_count(capture: Float[Array, "..."], weight: Float[Array, "..."]) -> Flo
         jnp.sum(trusted.astype(capture.dtype)), 1
     )
     return jnp.where(mean > 0, mean, 1)
-
-
-def _check_one_scale(cameras: Cameras) -> None:
-    """Counts that are interpolated are counts no more."""
-    if max(distance_ratios(cameras.cameras)) > 1:
-        raise ValueError(
-            "method 'poisson' needs all cameras at one distance, since captures that are enlarged "
-            "are no counts; use AdmmTV"
-        )
 
 
 def _backgrounds(background, problem: InverseProblem) -> list[Float[Array, "..."]] | None:

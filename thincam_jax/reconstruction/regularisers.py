@@ -2,6 +2,7 @@ r"""What is asked of an image besides its captures: R(f) = φ(Kf), and its proxi
 
 import abc
 import functools
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -23,10 +24,8 @@ Parts = tuple[Float[Array, "..."], ...]
 class AbstractRegulariser(Module):
     r"""R(f) = φ(K f) of images (*batch, channel, plane, y, x), K linear, φ a norm or a seminorm."""
 
-    @property
-    @abc.abstractmethod
-    def orthonormal(self) -> bool:
-        """Whether KᵀK = KKᵀ = 1, which gives a proximal map in closed form."""
+    # Whether KᵀK = KKᵀ = 1, which gives a proximal map in closed form.
+    orthonormal: ClassVar[bool]
 
     @abc.abstractmethod
     def __call__(self, image: Image) -> Float[Array, "*batch"]:
@@ -176,14 +175,11 @@ class Sparsity(AbstractRegulariser):
     - `basis`: `Wavelet` or `Cosines`.
     """
 
+    orthonormal: ClassVar[bool] = True
     basis: Wavelet | Cosines
 
     def __init__(self, basis: Wavelet | Cosines | None = None):
         self.basis = Wavelet() if basis is None else basis
-
-    @property
-    def orthonormal(self):
-        return True
 
     def __call__(self, image: Image):
         (details,) = self.analyse(image)

@@ -58,11 +58,11 @@ class AbstractSplitting(eqx.Module):
     """
 
     settling: ClassVar[float] = 0.0
-    penalties: eqx.AbstractVar[Penalties]
-    tau: eqx.AbstractVar[Float[Array, ""]]
-    variation: eqx.AbstractVar[TotalVariation]
-    image_unit: eqx.AbstractVar[Float[Array, ""]]
-    nonnegative: eqx.AbstractVar[bool]
+    penalties: Penalties
+    tau: Float[Array, ""]
+    variation: TotalVariation
+    image_unit: Float[Array, ""]
+    nonnegative: bool = eqx.field(static=True)
 
     @abc.abstractmethod
     def start(self, image: Image) -> State:

@@ -2,7 +2,7 @@ r"""Total variation of an image, its proximal map, and the differences it is mad
 
 import functools
 from collections.abc import Sequence
-from typing import Literal
+from typing import ClassVar, Literal
 
 import equinox as eqx
 import jax
@@ -45,6 +45,8 @@ class TotalVariation(AbstractRegulariser):
     - `chroma_weight`: weight of the two colour differences with "opponent".
     """
 
+    # The proximal map of an image takes inner iterations.
+    orthonormal: ClassVar[bool] = False
     depth_weight: Float[Array, ""]
     chroma_weight: Float[Array, ""]
     kind: Kind = eqx.field(static=True)
@@ -70,11 +72,6 @@ class TotalVariation(AbstractRegulariser):
         lengths = self._length(rotated) * self._channel_weights(image.dtype)
         axes = (-4, -3, -2, -1)
         return jnp.sum(lengths, axis=axes)
-
-    @property
-    def orthonormal(self) -> bool:
-        """Differences are not: the proximal map of an image takes inner iterations."""
-        return False
 
     def analyse(self, image: Image) -> tuple[Image, ...]:
         """The differences inside of the image."""

@@ -236,7 +236,10 @@ class _Probe:
             camera, places, plane = cast((camera, places, self.planes[0]), precision)
             found = smeared_rays(camera, places, plane, _ORDERS[-1], most)
             self._traced[key] = _as_numpy(found)
-        return _grouped(self._traced[key], samples or 1)
+        points, weight = self._traced[key].points, self._traced[key].weight
+        # Fewer parts of the band, each the mean of as many neighbours.
+        groups = points.reshape(*points.shape[:2], samples or 1, -1, 2)
+        return _Rays(groups.mean(axis=-2), weight)
 
     def seen(self, rays: _Rays, orders: int | None = None) -> np.ndarray:
         """What the pixels but the middle see of the image, (order, pixel)."""
@@ -405,13 +408,6 @@ def _mean_x(rays: _Rays, orders: int):
 
 def _as_numpy(rays: SmearedRays) -> _Rays:
     return _Rays(np.asarray(rays.points, float), np.asarray(rays.weight, float))
-
-
-def _grouped(rays: _Rays, samples: int) -> _Rays:
-    """Fewer parts of the band, each the mean of as many neighbours."""
-    points = rays.points
-    groups = points.reshape(*points.shape[:2], samples, -1, 2)
-    return _Rays(groups.mean(axis=-2), rays.weight)
 
 
 def _spread(camera) -> np.ndarray:

@@ -37,12 +37,15 @@ def choose_psf(seen: SeenScene, tolerance: float) -> tuple[PsfMethod, float]:
     methods += [PsfMethod("separable", "float64", average) for average in (False, True)]
     if _method_error(seen, PsfMethod("separable", "float32", False)) > max(tolerance, 1e-3):
         methods = [method for method in methods if method.pixel_integration]
-    best: tuple[PsfMethod, float] = (FULL, 0.0)
-    for method in sorted(methods, key=lambda m: _speed(seen, m)):
+
+    def work(method: PsfMethod) -> float:
+        return seen.psf_cost(method).flops * (2.0 if method.precision == "float64" else 1.0)
+
+    for method in sorted(methods, key=work):
         error = _method_error(seen, method)
         if error <= tolerance:
             return method, error
-    return best
+    return FULL, 0.0
 
 
 def _choose_samples(seen: SeenScene, tolerance: float) -> tuple[PsfMethod, float]:
@@ -75,11 +78,6 @@ def _samples_at(
             if tried[-1][1] <= tolerance:
                 break
     return tried[-1]
-
-
-def _speed(seen: SeenScene, method: PsfMethod) -> float:
-    double = method.precision == "float64"
-    return seen.psf_cost(method).flops * (2.0 if double else 1.0)
 
 
 def _method_error(seen: SeenScene, method: PsfMethod) -> float:
