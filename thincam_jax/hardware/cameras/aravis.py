@@ -17,6 +17,7 @@ from thincam_jax.hardware.cameras.features import (
     FrameCount,
     Number,
     Value,
+    text,
     trigger_by_software,
 )
 from thincam_jax.hardware.errors import (
@@ -28,17 +29,9 @@ from thincam_jax.hardware.errors import (
     OutOfRange,
     PermissionDenied,
     ProtocolError,
-    Timeout,
 )
 
 _BUFFERS = 4
-
-
-@dataclass(frozen=True)
-class AravisOptions:
-    """Which camera: its `name` as `arv-tool-0.8` lists it, its address, or "" for the first."""
-
-    name: str = ""
 
 
 class AravisCamera(FeatureCamera):
@@ -48,15 +41,18 @@ class AravisCamera(FeatureCamera):
     next. A camera that does not answer is `Disconnected`, 2.5 s after the question.
     """
 
-    Options = AravisOptions
+    @dataclass(frozen=True)
+    class Options:
+        """Which camera: its `name` as `arv-tool-0.8` lists it, its address, or "" for the first."""
 
-    def __init__(self, name: str = ""):
+        name: str = ""
+
+    def __init__(self, name: str):
         self._aravis, self._glib = _libraries()
         self._name, self._lost = name or "aravis camera", False
         self._camera: Any = None
         self._stream: Any = None
         self._features: Any = None
-        self._settings: CameraSettings | None = None
         self._count = FrameCount()
         try:
             with self._told("open"):
@@ -74,7 +70,7 @@ class AravisCamera(FeatureCamera):
         _libraries()
 
     @classmethod
-    def open(cls, options: AravisOptions) -> "AravisCamera":
+    def open(cls, options: Options) -> "AravisCamera":
         """Opens a camera; NotFound, Busy or PermissionDenied where that fails."""
         return cls(options.name)
 
@@ -85,7 +81,7 @@ class AravisCamera(FeatureCamera):
             self._camera.get_vendor_name(),
             self._camera.get_model_name(),
             self._camera.get_device_serial_number() or "",
-            features.text("DeviceFirmwareVersion") or features.text("DeviceVersion"),
+            text(features, "DeviceFirmwareVersion") or text(features, "DeviceVersion"),
         )
         self._name = str(self._identity)
         if isinstance(device, self._aravis.GvDevice) and not device.is_controller():
@@ -93,10 +89,6 @@ class AravisCamera(FeatureCamera):
         device.connect("control-lost", self._on_control_lost)
         self._camera.set_range_check_policy(self._aravis.RangeCheckPolicy.ENABLE)
         trigger_by_software(features)
-
-    def configure(self, settings: CameraSettings) -> CameraSettings:
-        self._settings = super().configure(settings)
-        return self._settings
 
     def flush(self) -> None:
         while self._stream is not None:
@@ -106,9 +98,7 @@ class AravisCamera(FeatureCamera):
             self._stream.push_buffer(buffer)
 
     def trigger_and_grab(self, timeout: float) -> Frame:
-        settings = self._settings
-        if settings is None:
-            raise OutOfRange(self._name, "grab", "it has no settings", "call configure before")
+        settings = self._require_settings()
         deadline = time.monotonic() + settings.exposure + timeout
         try:
             with self._told("grab"):
@@ -119,7 +109,7 @@ class AravisCamera(FeatureCamera):
                 left = max(deadline - time.monotonic(), 0.0)
                 buffer = self._stream.timeout_pop_buffer(int(1e6 * left))
                 if buffer is None:
-                    raise self._timeout("no frame came after the trigger")
+                    raise self._timeout("grab", "no frame came after the trigger")
                 frame = self._frame(buffer, settings)
                 self._stream.push_buffer(buffer)
                 return frame
@@ -155,7 +145,7 @@ class AravisCamera(FeatureCamera):
             if self._features.get("AcquisitionStatus"):
                 return
             if time.monotonic() > deadline:
-                raise self._timeout("the camera was not ready for a trigger")
+                raise self._timeout("grab", "the camera was not ready for a trigger")
 
     def _frame(self, buffer: Any, settings: CameraSettings) -> Frame:
         status = buffer.get_status()
@@ -174,9 +164,6 @@ class AravisCamera(FeatureCamera):
 
     def _on_control_lost(self, *_: Any) -> None:
         self._lost = True
-
-    def _timeout(self, cause: str) -> Timeout:
-        return Timeout(self._name, "grab", cause, "try again, or allow more time")
 
     @contextmanager
     def _told(self, operation: str) -> Iterator[None]:
@@ -270,6 +257,3 @@ class _Features:
 
     def execute(self, name: str) -> None:
         self._device.execute_command(name)
-
-    def text(self, name: str) -> str:
-        return str(self.get(name)) if self.has(name) else ""

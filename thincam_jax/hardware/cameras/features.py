@@ -9,7 +9,7 @@ from contextlib import AbstractContextManager
 from typing import Any, Protocol, runtime_checkable
 
 from thincam_jax.hardware.base import Camera, CameraSettings, Identity, Region
-from thincam_jax.hardware.errors import OutOfRange
+from thincam_jax.hardware.errors import OutOfRange, Timeout
 
 BIT_DEPTHS = {"Mono8": 8, "Mono10": 10, "Mono12": 12, "Mono16": 16}
 Number = int | float
@@ -49,6 +49,7 @@ class FeatureCamera(Camera):
     _identity: Identity
     _name: str  # in errors
     _formats: Collection[str] = BIT_DEPTHS.keys()  # that the driver can read
+    _settings: CameraSettings | None = None
 
     @abstractmethod
     def _stop(self) -> None:
@@ -65,13 +66,57 @@ class FeatureCamera(Camera):
     @property
     def sensor_shape(self) -> tuple[int, int]:
         with self._told("read the sensor's size"):
-            return _largest_shape(self._features)
+            rows, columns = ("HeightMax", "WidthMax")
+            if not self._features.has(rows):
+                rows, columns = ("SensorHeight", "SensorWidth")
+            return int(self._features.get(rows)), int(self._features.get(columns))
 
     def configure(self, settings: CameraSettings) -> CameraSettings:
         self._stop()
         shape = self.sensor_shape
         with self._told("configure"):
-            return _set_to(self._features, settings, shape, self._name, self._formats)
+            self._require(settings, shape)
+            self._settings = _set_to(self._features, settings, shape)
+        return self._settings
+
+    def _require_settings(self) -> CameraSettings:
+        if self._settings is None:
+            raise OutOfRange(self._name, "grab", "it has no settings", "call configure before")
+        return self._settings
+
+    def _timeout(self, operation: str, cause: str) -> Timeout:
+        return Timeout(self._name, operation, cause, "try again, or allow more time")
+
+    def _require(self, asked: CameraSettings, shape: tuple[int, int]) -> None:
+        """OutOfRange for a region, format, exposure or gain that the camera does not have."""
+
+        def refuse(what: str, allowed: str) -> OutOfRange:
+            return OutOfRange(self._name, "configure", what, f"give {allowed}")
+
+        features = self._features
+        formats = [name for name in features.choices("PixelFormat") if name in self._formats]
+        if asked.pixel_format not in formats:
+            raise refuse(f"no pixel format {asked.pixel_format}", f"one of {', '.join(formats)}")
+        region = asked.region or Region(0, 0, *shape)
+        bottom, right = region.top + region.height, region.left + region.width
+        inside = min(region.top, region.left) >= 0 and bottom <= shape[0] and right <= shape[1]
+        if not inside or min(region.height, region.width) < 1:
+            raise refuse(
+                f"{region} lies outside of the sensor", f"a part of {shape[0]} × {shape[1]}"
+            )
+        for name, pixels in (("Width", region.width), ("Height", region.height)):
+            if features.has(name) and pixels < (least := features.limits(name)[0]):
+                raise refuse(f"{name} of {pixels} pixels", f"at least {least}")
+        for name, given, unit, scale in (
+            (_exposure(features), asked.exposure, "s", _MICROSECOND),
+            ("Gain", asked.gain, "dB", 1.0),
+        ):
+            low, high = 0.0, 0.0  # a camera whose gain is not in dB keeps the one it has
+            if features.has(name):
+                low, high = (limit * scale for limit in features.limits(name)[:2])
+            rounding = 1e-9 * abs(given)  # a limit that was read comes back through other units
+            if not low - rounding <= given <= high + rounding:
+                raise refuse(f"{name} of {given:g} {unit}", f"{low:g} … {high:g} {unit}")
 
 
 class FrameCount:
@@ -98,14 +143,6 @@ class FrameCount:
         return self._offset + counted
 
 
-def _largest_shape(features: Features) -> tuple[int, int]:
-    """Rows and columns of the largest region."""
-    rows, columns = ("HeightMax", "WidthMax")
-    if not features.has(rows):
-        rows, columns = ("SensorHeight", "SensorWidth")
-    return int(features.get(rows)), int(features.get(columns))
-
-
 def trigger_by_software(features: Features) -> None:
     """One frame for each software trigger, nothing automatic."""
 
@@ -123,23 +160,8 @@ def trigger_by_software(features: Features) -> None:
     put("TriggerSource", "Software")
 
 
-def _set_to(
-    features: Features,
-    asked: CameraSettings,
-    shape: tuple[int, int],
-    device: str,
-    formats: Collection[str],
-) -> CameraSettings:
-    """Sets a camera to what is nearest, and returns what it says it is set to.
-
-    `shape` is that of the sensor, `device` the camera's name in errors, `formats` what the driver
-    can read.
-
-    **Errors**: OutOfRange, before anything is written, for a region, format, exposure or gain that
-    the camera does not have.
-    """
-    offered = [name for name in features.choices("PixelFormat") if name in formats]
-    _require(features, asked, shape, device, offered)
+def _set_to(features: Features, asked: CameraSettings, shape: tuple[int, int]) -> CameraSettings:
+    """Sets a camera with a sensor of that shape to what is nearest, and returns what it took."""
     features.set("PixelFormat", asked.pixel_format)
     region = asked.region or Region(0, 0, *shape)
     for offset in ("OffsetX", "OffsetY"):  # so that every size fits
@@ -192,33 +214,6 @@ def _put_within(features: Features, name: str, value: float) -> None:
     _put(features, name, min(max(value, low), high))
 
 
-def _require(
-    features: Features,
-    asked: CameraSettings,
-    shape: tuple[int, int],
-    device: str,
-    formats: list[str],
-) -> None:
-    def refuse(what: str, allowed: str) -> OutOfRange:
-        return OutOfRange(device, "configure", what, f"give {allowed}")
-
-    if asked.pixel_format not in formats:
-        raise refuse(f"no pixel format {asked.pixel_format}", f"one of {', '.join(formats)}")
-    region = asked.region or Region(0, 0, *shape)
-    bottom, right = region.top + region.height, region.left + region.width
-    inside = min(region.top, region.left) >= 0 and bottom <= shape[0] and right <= shape[1]
-    if not inside or min(region.height, region.width) < 1:
-        raise refuse(f"{region} lies outside of the sensor", f"a part of {shape[0]} × {shape[1]}")
-    for name, pixels in (("Width", region.width), ("Height", region.height)):
-        if features.has(name) and pixels < (least := features.limits(name)[0]):
-            raise refuse(f"{name} of {pixels} pixels", f"at least {least}")
-    for name, given, unit, scale in (
-        (_exposure(features), asked.exposure, "s", _MICROSECOND),
-        ("Gain", asked.gain, "dB", 1.0),
-    ):
-        low, high = 0.0, 0.0  # a camera whose gain is not in dB keeps the one it has
-        if features.has(name):
-            low, high = (limit * scale for limit in features.limits(name)[:2])
-        rounding = 1e-9 * abs(given)  # a limit that was read comes back through other units
-        if not low - rounding <= given <= high + rounding:
-            raise refuse(f"{name} of {given:g} {unit}", f"{low:g} … {high:g} {unit}")
+def text(features: Features, name: str) -> str:
+    """A feature's value in a name, "" where the camera does not have it."""
+    return str(features.get(name)) if features.has(name) else ""

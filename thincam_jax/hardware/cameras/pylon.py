@@ -14,6 +14,7 @@ from thincam_jax.hardware.cameras.features import (
     FrameCount,
     Number,
     Value,
+    text,
     trigger_by_software,
 )
 from thincam_jax.hardware.errors import (
@@ -25,20 +26,12 @@ from thincam_jax.hardware.errors import (
     OutOfRange,
     PermissionDenied,
     ProtocolError,
-    Timeout,
 )
 
 with warnings.catch_warnings():
     # Raised as an error, SWIG's warning about its own types crashes the interpreter.
     warnings.simplefilter("ignore", DeprecationWarning)
     from pypylon import genicam, pylon
-
-
-@dataclass(frozen=True)
-class PylonOptions:
-    """Which camera: its `serial` number, or "" for the first one found."""
-
-    serial: str = ""
 
 
 class PylonCamera(FeatureCamera):
@@ -49,11 +42,14 @@ class PylonCamera(FeatureCamera):
     a late one is never taken for the next.
     """
 
-    Options = PylonOptions
+    @dataclass(frozen=True)
+    class Options:
+        """Which camera: its `serial` number, or "" for the first one found."""
+
+        serial: str = ""
 
     def __init__(self, camera: Any):
         self._camera, self._name = camera, "pylon camera"
-        self._settings: CameraSettings | None = None
         self._count = FrameCount()
         try:
             with self._told("open"):
@@ -66,26 +62,20 @@ class PylonCamera(FeatureCamera):
     def _introduce(self) -> None:
         self._features = features = _Features(self._camera.GetNodeMap())
         info = self._camera.GetDeviceInfo()
-        version = features.text("DeviceFirmwareVersion")
-        self._identity = Identity(
-            info.GetVendorName(), info.GetModelName(), info.GetSerialNumber(), version
-        )
+        maker, version = info.GetVendorName(), text(features, "DeviceFirmwareVersion")
+        self._identity = Identity(maker, info.GetModelName(), info.GetSerialNumber(), version)
         self._name = str(self._identity)
         ticks = "GevTimestampTickFrequency"  # of GigE Vision; USB3 Vision counts nanoseconds
         self._tick = 1 / float(features.get(ticks)) if features.has(ticks) else 1e-9
         trigger_by_software(features)
 
     @classmethod
-    def open(cls, options: PylonOptions) -> "PylonCamera":
+    def open(cls, options: Options) -> "PylonCamera":
         """Opens a camera; NotFound, Busy or PermissionDenied where that fails."""
         wanted = pylon.DeviceInfo()
         if options.serial:
             wanted.SetSerialNumber(options.serial)
         return cls(_created(wanted, options.serial))
-
-    def configure(self, settings: CameraSettings) -> CameraSettings:
-        self._settings = super().configure(settings)
-        return self._settings
 
     def flush(self) -> None:
         with self._told("flush"):
@@ -96,9 +86,7 @@ class PylonCamera(FeatureCamera):
                 result.Release()
 
     def trigger_and_grab(self, timeout: float) -> Frame:
-        settings = self._settings
-        if settings is None:
-            raise OutOfRange(self._name, "grab", "it has no settings", "call configure before")
+        settings = self._require_settings()
         milliseconds = int(1e3 * (settings.exposure + timeout)) + 1
         try:
             with self._told("grab"):
@@ -146,9 +134,6 @@ class PylonCamera(FeatureCamera):
     def _stop(self) -> None:
         with suppress(genicam.GenericException):
             self._camera.StopGrabbing()
-
-    def _timeout(self, operation: str, cause: str) -> Timeout:
-        return Timeout(self._name, operation, cause, "try again, or allow more time")
 
     @contextmanager
     def _told(self, operation: str) -> Iterator[None]:
@@ -216,6 +201,3 @@ class _Features:
 
     def choices(self, name: str) -> tuple[str, ...]:
         return tuple(self._nodes.GetNode(name).Symbolics) if self.has(name) else ()
-
-    def text(self, name: str) -> str:
-        return str(self.get(name)) if self.has(name) else ""

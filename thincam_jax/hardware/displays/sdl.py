@@ -21,19 +21,6 @@ _GREY = np.uint32(0x010101)  # red, green and blue alike
 _NOT_SHOWN = sdl2.SDL_WINDOW_HIDDEN | sdl2.SDL_WINDOW_MINIMIZED
 
 
-@dataclass(frozen=True)
-class SdlOptions:
-    """Which monitor, by its name or number; "" where there is only one.
-
-    `size` is (rows, columns) of a window in the monitor's upper left corner, None for all of the
-    monitor; `grey_levels` a file with the table of grey levels.
-    """
-
-    monitor: str = ""
-    size: tuple[int, int] | None = None
-    grey_levels: str = ""
-
-
 class SdlDisplay(Screen):
     """A window without a frame, pixel by pixel, without a cursor.
 
@@ -41,9 +28,19 @@ class SdlDisplay(Screen):
     used by the thread that opened it. The monitor must not scale: its mode has to be the panel's.
     """
 
-    Options = SdlOptions
+    @dataclass(frozen=True)
+    class Options:
+        """Which monitor, by its name or number; "" where there is only one.
 
-    def __init__(self, options: SdlOptions):
+        `size` is (rows, columns) of a window in the monitor's upper left corner, None for all of
+        the monitor; `grey_levels` a file with the table of grey levels.
+        """
+
+        monitor: str = ""
+        size: tuple[int, int] | None = None
+        grey_levels: str = ""
+
+    def __init__(self, options: Options):
         super().__init__(GreyLevels.read(options.grey_levels) if options.grey_levels else None)
         self._window: Any = None
         for hint, value in (
@@ -62,11 +59,11 @@ class SdlDisplay(Screen):
             raise
 
     @classmethod
-    def open(cls, options: SdlOptions) -> "SdlDisplay":
+    def open(cls, options: Options) -> "SdlDisplay":
         """Opens the window; NotFound where there is no such monitor."""
         return cls(options)
 
-    def _open(self, options: SdlOptions) -> None:
+    def _open(self, options: Options) -> None:
         names = _monitors()
         number = _chosen(options.monitor, names)
         bounds = sdl2.SDL_Rect()

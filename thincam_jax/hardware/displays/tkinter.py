@@ -13,28 +13,25 @@ from thincam_jax.hardware.displays.screen import Screen
 from thincam_jax.hardware.errors import Disconnected, NotFound
 
 
-@dataclass(frozen=True)
-class TkinterOptions:
-    """Where the window lies; tkinter knows no monitors, only places on the desktop, in pixels.
-
-    `size` is (rows, columns), None for all of the first monitor; `grey_levels` a table's file.
-    """
-
-    left: int = 0
-    top: int = 0
-    size: tuple[int, int] | None = None
-    grey_levels: str = ""
-
-
 class TkinterDisplay(Screen):
     """A window without a frame. It waits for the window system, not for the monitor's next image.
 
     It is used by the thread that opened it.
     """
 
-    Options = TkinterOptions
+    @dataclass(frozen=True)
+    class Options:
+        """Where the window lies; tkinter knows no monitors, only places on the desktop, in pixels.
 
-    def __init__(self, options: TkinterOptions):
+        `size` is (rows, columns), None for all of the first monitor; `grey_levels` a table's file.
+        """
+
+        left: int = 0
+        top: int = 0
+        size: tuple[int, int] | None = None
+        grey_levels: str = ""
+
+    def __init__(self, options: Options):
         super().__init__(GreyLevels.read(options.grey_levels) if options.grey_levels else None)
         try:
             self._root = tkinter.Tk()
@@ -53,7 +50,7 @@ class TkinterDisplay(Screen):
         self._present(np.zeros(self._shape, np.uint8))
 
     @classmethod
-    def open(cls, options: TkinterOptions) -> "TkinterDisplay":
+    def open(cls, options: Options) -> "TkinterDisplay":
         """Opens the window; NotFound where there is no desktop."""
         return cls(options)
 

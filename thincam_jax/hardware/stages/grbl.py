@@ -13,15 +13,15 @@ from dataclasses import dataclass
 from typing import Literal, TypeVar
 
 from thincam_jax.hardware.base import Identity
-from thincam_jax.hardware.errors import (
-    Busy,
-    Disconnected,
-    HardwareError,
-    ProtocolError,
-    Timeout,
-)
+from thincam_jax.hardware.errors import Busy, Disconnected, HardwareError, ProtocolError, Timeout
 from thincam_jax.hardware.stages.serial_link import LONGEST_LINE, SerialLink
-from thincam_jax.hardware.stages.serial_stage import POLL, TRIES, Report, SerialStage
+from thincam_jax.hardware.stages.serial_stage import (
+    POLL,
+    TRIES,
+    Report,
+    SerialOptions,
+    SerialStage,
+)
 
 T = TypeVar("T")
 
@@ -98,15 +98,11 @@ class GrblStage(SerialStage):
     _protocol = "grbl"
 
     @dataclass(frozen=True)
-    class Options:
-        """What a config file may say of the stage."""
+    class Options(SerialOptions):
+        """Also `axis`, and `speed`, mm/s; None: as fast as the machine allows."""
 
-        port: str  # "/dev/ttyUSB0", "COM3"
-        baud_rate: int = 115200
         axis: Literal["X", "Y", "Z"] = "X"
-        speed: float | None = None  # mm/s; None: as fast as the machine allows
-        answer_time: float = 1.0  # s allowed for an answer
-        wire_log: str | None = None  # file for all that is sent and received
+        speed: float | None = None
 
         def __post_init__(self) -> None:
             if self.axis not in ("X", "Y", "Z"):

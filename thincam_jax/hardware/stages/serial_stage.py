@@ -33,6 +33,16 @@ class Report:
     position: float  # mm
 
 
+@dataclass(frozen=True)
+class SerialOptions:
+    """What a config file may say of a stage."""
+
+    port: str  # "/dev/ttyUSB0", "COM3"
+    baud_rate: int = 115200
+    answer_time: float = 1.0  # s allowed for an answer
+    wire_log: str | None = None  # file for all that is sent and received
+
+
 class SerialStage(Stage):
     """A stage on a serial line. One thread may move it and another stop it."""
 

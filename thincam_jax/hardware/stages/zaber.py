@@ -12,7 +12,13 @@ from dataclasses import dataclass
 from thincam_jax.hardware.base import Identity
 from thincam_jax.hardware.errors import Busy, NotHomed, ProtocolError, Timeout
 from thincam_jax.hardware.stages.serial_link import LONGEST_LINE, SerialLink
-from thincam_jax.hardware.stages.serial_stage import POLL, TRIES, Report, SerialStage
+from thincam_jax.hardware.stages.serial_stage import (
+    POLL,
+    TRIES,
+    Report,
+    SerialOptions,
+    SerialStage,
+)
 
 LONGEST_REFUSAL = 2.0  # s for which "not now" is asked again
 NOT_NOW = ("AGAIN", "STATUSBUSY")
@@ -88,16 +94,12 @@ class ZaberStage(SerialStage):
     _protocol = "zaber"
 
     @dataclass(frozen=True)
-    class Options:
-        """What a config file may say of the stage."""
+    class Options(SerialOptions):
+        """Also where the stage is in the chain, and what its positions count."""
 
-        port: str  # "/dev/ttyUSB0", "COM3"
-        baud_rate: int = 115200
-        device: int = 1  # number in the chain
+        device: int = 1
         axis: int = 1
         microstep: float = 0.0001905  # mm; the data sheet names it, here of an X-LSM
-        answer_time: float = 1.0  # s allowed for an answer
-        wire_log: str | None = None  # file for all that is sent and received
 
         def __post_init__(self) -> None:
             if not (self.microstep > 0 and self.answer_time > 0):

@@ -54,12 +54,9 @@ class Usb3VisionCamera(FeatureCamera):
     def __init__(self, link: UsbLink, compare_clocks: bool):
         self._link, control = link, Control(link)
         self._control = control
-        self._identity = Identity(
-            *(
-                gencp.text(control.read(register, gencp.TEXT_LENGTH))
-                for register in (Abrm.MANUFACTURER, Abrm.MODEL, Abrm.SERIAL, Abrm.DEVICE_VERSION)
-            )
-        )
+        registers = Abrm.MANUFACTURER, Abrm.MODEL, Abrm.SERIAL, Abrm.DEVICE_VERSION
+        texts = (gencp.text(control.read(register, gencp.TEXT_LENGTH)) for register in registers)
+        self._identity = Identity(*texts)
         self._name = link.name = str(self._identity)
         self._compare_clocks = compare_clocks and control.has_clock
         self._features = Features(link, control, fetch_xml(link, control))
@@ -73,14 +70,13 @@ class Usb3VisionCamera(FeatureCamera):
         with self._told("open"):
             trigger_by_software(self._features)
             exposure = read(self._features).exposure
-        self._settings = self.configure(CameraSettings(exposure, pixel_format="Mono8"))
+        self.configure(CameraSettings(exposure, pixel_format="Mono8"))
 
     def configure(self, settings: CameraSettings) -> CameraSettings:
         self._in_step = False
         taken = super().configure(settings)
         assert taken.region is not None
         self._stream.prepare(taken.pixel_format, taken.region)
-        self._settings = taken
         self._start()
         return taken
 
@@ -89,12 +85,13 @@ class Usb3VisionCamera(FeatureCamera):
             self._restart()
 
     def trigger_and_grab(self, timeout: float) -> Frame:
+        settings = self._require_settings()
         if not self._in_step:
             self._restart()
         self._in_step = False
         before = self._control.clock() if self._compare_clocks else 0
         self._features.execute("TriggerSoftware")
-        deadline = monotonic() + self._settings.exposure + timeout
+        deadline = monotonic() + settings.exposure + timeout
         discarded = 0
         while True:
             try:
@@ -108,13 +105,13 @@ class Usb3VisionCamera(FeatureCamera):
             if monotonic() > deadline:
                 raise self._no_frame(timeout, discarded)
         self._last_block, self._in_step = leader.block, True
-        _, bit_depth = PIXEL_FORMATS[self._settings.pixel_format]
+        shape = leader.region.height, leader.region.width
         return Frame(
-            unpack(data, self._settings.pixel_format, (leader.region.height, leader.region.width)),
+            unpack(data, settings.pixel_format, shape),
             self._frames_before + leader.block,
             leader.time * 1e-9,
-            self._settings.exposure,
-            bit_depth,
+            settings.exposure,
+            PIXEL_FORMATS[settings.pixel_format][1],
         )
 
     def _no_frame(self, timeout: float, discarded: int) -> Timeout:

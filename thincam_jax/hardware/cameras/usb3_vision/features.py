@@ -128,14 +128,12 @@ class Features:
             raise self._link.broken(operation, cause) from error
 
     def has(self, name: str) -> bool:
-        """Whether the camera has this feature, and it may be used now."""
         try:
             return genapi.is_available(self._nodes.get_node(name).node.get_access_mode())
         except genapi.GenericException:
             return False
 
     def get(self, name: str) -> Value:
-        """Its value; of an enumeration the entry's name."""
         with self.evaluating(f"read {name}"):
             value = self._nodes.get_node(name).value
             if not isinstance(value, int | float | str):
@@ -143,22 +141,18 @@ class Features:
             return value
 
     def set(self, name: str, value: Value) -> None:
-        """Writes a value, or an enumeration's entry."""
         with self.evaluating(f"set {name}"):
             self._nodes.get_node(name).value = value
 
     def limits(self, name: str) -> tuple[Number, Number, Number]:
-        """Lowest, highest and step of a number; step 0 where there is none."""
         with self.evaluating(f"read {name}"):
             node = self._nodes.get_node(name)
             return node.min, node.max, node.inc if isinstance(node, genapi.IInteger) else 0
 
     def choices(self, name: str) -> tuple[str, ...]:
-        """The entries of an enumeration that are available."""
         with self.evaluating(f"read {name}"):
             return tuple(self._nodes.get_node(name).symbolics)
 
     def execute(self, name: str) -> None:
-        """Has the camera do what the command says."""
         with self.evaluating(f"execute {name}"):
             self._nodes.get_node(name).execute()
