@@ -25,10 +25,9 @@ from thincam_jax._core.capture_store import (
 from thincam_jax.hardware.acquisition.auto_exposure import find_exposure
 from thincam_jax.hardware.acquisition.plan import Plan, settings_from
 from thincam_jax.hardware.acquisition.recorder import (
-    Layout,
-    Lock,
     Recorder,
     create_store,
+    locked,
     now,
     require_space,
     versions,
@@ -88,7 +87,7 @@ def acquire(
     not help against, or after which none makes sense: OutOfRange, NotHomed, Saturated and others.
     """
     path, procedure = Path(path).absolute(), procedure or Procedure()
-    with _stop_asked() as stop, Lock(path):
+    with _stop_asked() as stop, locked(path):
         run = Taker(plan, rig, procedure)
         settings = _begin(run, path)
         with Recorder(path) as recorder:
@@ -152,7 +151,8 @@ def _begin(run: Taker, path: Path) -> tuple[CameraSettings, ...]:
         attributes |= {"stored_at": _stored_at(run.plan), **series}
         together = TOGETHER
     whole = (len(run.plan.steps), *shape)
-    create_store(path, Layout(whole, dtype_of_bits(bits), together, attributes, run.plan.as_json()))
+    layout = whole, dtype_of_bits(bits), attributes
+    create_store(path, run.plan.as_json(), *layout, together=together)
     return settings
 
 

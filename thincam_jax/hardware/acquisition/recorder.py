@@ -8,9 +8,9 @@ no line is taken again.
 import os
 import platform
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from contextlib import contextmanager
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
@@ -29,51 +29,31 @@ _HELD = 2**26  # bytes of frames that may wait for the disk
 _AT_ONCE = 8  # files that are synced at once: the disk writes its own journal once for all of them
 
 
-@dataclass(frozen=True)
-class Layout:
-    """What a new store is to hold.
-
-    - `shape`: (frame, y, x); `together`: frames of a chunk, 16 where rows are to be read.
-    - `attributes`: what the store says of itself, among it the provenance.
-    """
-
-    shape: tuple[int, int, int]
-    dtype: str
-    together: int
-    attributes: Mapping[str, Any]
-    plan: str
-
-
-class Lock:
-    """Keeps a second run from writing the same store; held until the process ends or `release`."""
-
-    def __init__(self, path: Path):
-        self._lock = FileLock(path.with_name(f".{path.name}.lock"))
-        with writing(path):
-            path.parent.mkdir(parents=True, exist_ok=True)
-            try:
-                self._lock.acquire(timeout=0)
-            except LockTimeout as error:
-                raise CaptureStoreError(
-                    f"{path} is being written by another run; wait for it, or give another name"
-                ) from error
-
-    def __enter__(self) -> "Lock":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._lock.release()
+@contextmanager
+def locked(path: Path) -> Iterator[None]:
+    """Keeps a second run from writing the same store, until this one has left or ended."""
+    lock = FileLock(path.with_name(f".{path.name}.lock"))
+    with writing(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            lock.acquire(timeout=0)
+        except LockTimeout as error:
+            raise CaptureStoreError(
+                f"{path} is being written by another run; wait for it, or give another name"
+            ) from error
+    try:
+        yield
+    finally:
+        lock.release()
 
 
-def create_store(path: Path, layout: Layout) -> None:
-    """A new store, which is there whole or not at all."""
+def create_store(path: Path, plan: str, *layout: Any, together: int) -> None:
+    """A new store, which is there whole or not at all; `layout` as of `CaptureStore.create`."""
     partial = path.with_name(f".{path.name}.partial")
     shutil.rmtree(partial, ignore_errors=True)  # of a run that was killed at this point
     with writing(path):
-        CaptureStore.create(
-            partial, layout.shape, layout.dtype, layout.attributes, together=layout.together
-        )
-        write_whole(partial / PLAN, layout.plan)
+        CaptureStore.create(partial, *layout, together=together)
+        write_whole(partial / PLAN, plan)
         for file in (*partial.rglob("*"), partial):
             sync_path(file)
         os.rename(partial, path)

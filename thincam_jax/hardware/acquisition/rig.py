@@ -8,7 +8,7 @@ from typing import Any, Literal
 import numpy as np
 
 from thincam_jax.hardware.acquisition.plan import Pattern
-from thincam_jax.hardware.base import Camera, Device, Display, Stage
+from thincam_jax.hardware.base import Camera, Display, Stage
 
 Role = Literal["camera", "display", "stage"]
 
@@ -35,31 +35,25 @@ class Rig:
         open_stage: Callable[[], Stage] | None = None,
     ):
         self.render = render
-        self._openers = {"camera": open_camera, "display": open_display, "stage": open_stage}
+        self._openers: dict[str, Any] = {"camera": open_camera, "display": open_display}
         with ExitStack() as opened:
             self.camera = opened.enter_context(open_camera())
             self.display = opened.enter_context(open_display())
-            self.stage = opened.enter_context(open_stage()) if open_stage else None
+            self.stage = None
+            if open_stage is not None:
+                self._openers["stage"] = open_stage
+                self.stage = opened.enter_context(open_stage())
             opened.pop_all()
-
-    def device(self, role: Role) -> Device:
-        """The open device of a role; ValueError for a stage that there is not."""
-        device = getattr(self, role)
-        if device is None:
-            raise ValueError("this rig has no stage; give open_stage, or a plan without positions")
-        return device
 
     def reopen(self, role: Role) -> None:
         """Close a device that has gone, and open it again."""
-        self.device(role).close()
-        opener = self._openers[role]
-        assert opener is not None  # for the type: `device` has refused a rig without a stage
-        setattr(self, role, opener())
+        getattr(self, role).close()
+        setattr(self, role, self._openers[role]())
 
     def identities(self) -> dict[str, Any]:
         """Vendor, model, serial number and firmware of each device."""
-        roles: tuple[Role, ...] = ("camera", "display", "stage")
-        return {role: asdict(self.device(role).identity) for role in roles if getattr(self, role)}
+        there = {role: getattr(self, role) for role in self._openers}
+        return {role: asdict(device.identity) for role, device in there.items() if device}
 
     def close(self) -> None:
         """Give the devices back."""

@@ -8,7 +8,7 @@ import math
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -133,7 +133,7 @@ class Taker:
             time.sleep(self.procedure.reopen_wait)
             try:
                 self.rig.reopen(role)
-                is_now = asdict(self.rig.device(role).identity)
+                is_now = self.rig.identities()[role]
             except HardwareError as again:
                 failure = again
                 continue
