@@ -64,6 +64,17 @@ class Cleaned(eqx.Module):
         return jnp.tensordot(stand.inverse, self.share, axes=1)
 
 
+class DistanceMap(Module):
+    """Distances per pixel.
+
+    - `distance`: mm.
+    - `confidence`: probability, as learnt, that 1/t is right within half a step of the planes.
+    """
+
+    distance: Float[Array, "*batch y x"]
+    confidence: Float[Array, "*batch y x"]
+
+
 class Explained(eqx.Module):
     """A capture explained by a stack of planes: what the last U-Net has read, and how well.
 
@@ -76,16 +87,19 @@ class Explained(eqx.Module):
     mean: Float[Array, ""]
     consistency: Float[Array, ""]
 
+    @property
+    def image(self) -> Float[Array, "y x"]:
+        return self.mean * self.cleaned.image
 
-class DistanceMap(Module):
-    """Distances per pixel.
+    @property
+    def all_in_focus(self) -> Float[Array, "y x"]:
+        return self.mean * self.cleaned.all_in_focus
 
-    - `distance`: mm.
-    - `confidence`: probability, as learnt, that 1/t is right within half a step of the planes.
-    """
-
-    distance: Float[Array, "*batch y x"]
-    confidence: Float[Array, "*batch y x"]
+    @property
+    def distance(self) -> DistanceMap:
+        # Of a Laplace distribution with that mean absolute error.
+        confidence = -jnp.expm1(-0.5 / self.cleaned.spread)
+        return DistanceMap(1 / self.cleaned.inverse_distance(self.stand), confidence)
 
 
 class Weights(eqx.Module):
@@ -154,23 +168,23 @@ class RefocusNetwork(eqx.Module):
         self, captures: Numbers, distance: Number, deviation: Numbers
     ) -> Float[Array, "*batch y x"]:
         """Images as a lens of the camera's pupil, focused on `distance` (mm), would see them."""
-        return _batched(_focus, self, captures, deviation, self.camera.within(distance))
+        return _batched("image", self, captures, deviation, self.camera.within(distance))
 
     def sweep(
         self, captures: Numbers, distances: Numbers | Sequence[Number], deviation: Numbers
     ) -> Float[Array, "distance *batch y x"]:
         """`focus` at each of `distances`."""
         distances = self.camera.within(distances)
-        images = _batched(_sweep, self, captures, deviation, distances)
+        images = _batched("image", self, captures, deviation, distances)
         return jnp.moveaxis(images, -3, 0)
 
     def all_in_focus(self, captures: Numbers, deviation: Numbers) -> Float[Array, "*batch y x"]:
         """Images in which everything is sharp, as a pinhole would see the scene."""
-        return _batched(_all_in_focus, self, captures, deviation)
+        return _batched("all_in_focus", self, captures, deviation)
 
     def distance(self, captures: Numbers, deviation: Numbers) -> DistanceMap:
         """The distance of what each pixel shows."""
-        return _batched(_distance, self, captures, deviation)
+        return _batched("distance", self, captures, deviation)
 
     def consistency(self, captures: Numbers, deviation: Numbers) -> Float[Array, "*batch"]:
         """Residual of the explained capture, root mean square, over the noise's deviation.
@@ -178,7 +192,7 @@ class RefocusNetwork(eqx.Module):
         About 1: the stack explains all that was seen but noise. Far more: the image is not of this
         capture. Far less: noise was explained, too.
         """
-        return _batched(_consistency, self, captures, deviation)
+        return _batched("consistency", self, captures, deviation)
 
 
 def explain(
@@ -296,44 +310,18 @@ def flattened(network: RefocusNetwork, captures: Numbers, deviation: Numbers):
     return captures.reshape(-1, *sensor), deviation.reshape(-1), batch
 
 
-def _batched(function, network: RefocusNetwork, captures, deviation, *distance):
-    """A function of one capture over all axes before the last two."""
+def _batched(what: str, network: RefocusNetwork, captures, deviation, distance=None):
+    """A property of the explanation of each capture, focused on the same distance or distances."""
     *flat, batch = flattened(network, captures, deviation)
-    out = _over_batch(function, network, *flat, *distance)
+    out = _explained(what, network, *flat, network.camera.middle if distance is None else distance)
     return jax.tree.map(lambda x: x.reshape(*batch, *x.shape[1:]), out)
 
 
 @eqx.filter_jit
-def _over_batch(function, network, captures, deviation, *distance):
-    return jax.vmap(lambda *one: function(network, *one, *distance))(captures, deviation)
+def _explained(what: str, network: RefocusNetwork, captures, deviations, distance):
+    def one(capture, deviation, distance):
+        return getattr(explain(network, capture, deviation, distance), what)
 
-
-def _focus(network, capture, deviation, distance):
-    explained = explain(network, capture, deviation, distance)
-    return explained.mean * explained.cleaned.image
-
-
-def _sweep(network, capture, deviation, distances):
     # Side by side: in a loop XLA runs convolutions slowly on a CPU.
-    return jax.vmap(lambda t: _focus(network, capture, deviation, t))(distances)
-
-
-def _all_in_focus(network, capture, deviation):
-    explained = explain(network, capture, deviation, network.camera.middle)
-    return explained.mean * explained.cleaned.all_in_focus
-
-
-def _distance(network, capture, deviation):
-    return distance_map(explain(network, capture, deviation, network.camera.middle))
-
-
-def _consistency(network, capture, deviation):
-    return explain(network, capture, deviation, network.camera.middle).consistency
-
-
-def distance_map(explained: Explained) -> DistanceMap:
-    """Of one capture."""
-    cleaned = explained.cleaned
-    # Of a Laplace distribution with that mean absolute error.
-    confidence = -jnp.expm1(-0.5 / cleaned.spread)
-    return DistanceMap(1 / cleaned.inverse_distance(explained.stand), confidence)
+    several = one if distance.ndim == 0 else jax.vmap(one, in_axes=(None, None, 0))
+    return jax.vmap(several, in_axes=(0, 0, None))(captures, deviations, distance)

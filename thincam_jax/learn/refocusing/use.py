@@ -13,12 +13,7 @@ from jaxtyping import Array, Float
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Number, Numbers
 from thincam_jax._core.module import Module
-from thincam_jax.learn.refocusing.network import (
-    RefocusNetwork,
-    distance_map,
-    explain,
-    flattened,
-)
+from thincam_jax.learn.refocusing.network import RefocusNetwork, explain, flattened
 from thincam_jax.learn.refocusing.store import SHIPPED, described, load, same_camera
 from thincam_jax.reconstruction.noise import estimate_variance, given_variances
 from thincam_jax.reconstruction.recording import Recording
@@ -70,10 +65,10 @@ def _read(network: RefocusNetwork, captures, deviations, distances) -> Reading:
 def _read_one(network: RefocusNetwork, capture, deviation, distances) -> Reading:
     explained = jax.vmap(lambda t: explain(network, capture, deviation, t))(distances)
     first = jax.tree.map(lambda leaf: leaf[0], explained)
-    seen = distance_map(first)
+    seen = first.distance
     return Reading(
         first.mean * explained.cleaned.image,
-        first.mean * first.cleaned.all_in_focus,
+        first.all_in_focus,
         seen.distance,
         seen.confidence,
         first.consistency,

@@ -12,7 +12,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
@@ -278,17 +277,11 @@ def _with_linear(measured: FitImage, state: FitState, parameters: Sequence[str])
     flat = np.broadcast_to(np.asarray(state.flat), measured.image.shape).ravel()
     columns = {"background": flat, "gain": h}
     free = [name for name in columns if name in parameters]
-    found = dict.fromkeys(columns, 0.0) | {"gain": 1.0}
+    found = {"background": 0.0, "gain": 1.0}
     if free:
         rest = values if "gain" in free else values - h
         solution = np.linalg.lstsq(np.stack([columns[n] for n in free], axis=1), rest)[0]
         found |= dict(zip(free, solution, strict=True))
-    background, gain = found["background"], found["gain"]
-    if not gain > 0:  # not the picture of this camera; some gain, so that there is a slope
-        gain = values.std() / h.std()
-    numbers = (jnp.asarray(background, jnp.float64), jnp.asarray(gain, jnp.float64))
-    return eqx.tree_at(_offset_and_gain, state, numbers)
-
-
-def _offset_and_gain(state: FitState):
-    return state.background, state.gain
+    if not found["gain"] > 0:  # not the picture of this camera; some gain, so that it has a slope
+        found["gain"] = values.std() / h.std()
+    return state.with_numbers(**{name: jnp.asarray(n, jnp.float64) for name, n in found.items()})

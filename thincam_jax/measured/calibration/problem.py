@@ -2,8 +2,9 @@
 
 import functools
 import operator
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import cast
+from typing import Literal, cast
 
 import equinox as eqx
 import jax
@@ -17,18 +18,20 @@ from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.masks.fza import FresnelZoneAperture
 from thincam_jax.lensless.psf import psf
 
-# What a fit may be asked for, in the order of the result's tables.
-PARAMETERS = (
-    "beta",
-    "phase",
-    "centre",
-    "width",
-    "distance",
-    "object_distance",
-    "wavelength",
-    "background",
-    "gain",
-)
+# What a fit may be asked for, in the order of the result's tables, and where a `FitState` has it.
+WHERE = {
+    "beta": operator.attrgetter("camera.mask.beta"),
+    "phase": operator.attrgetter("camera.mask.phase"),
+    "centre": operator.attrgetter("camera.mask.centre"),
+    "width": operator.attrgetter("camera.mask.width"),
+    "distance": operator.attrgetter("camera.distance"),
+    "object_distance": operator.attrgetter("nearness"),
+    "wavelength": operator.attrgetter("wavelength"),
+    "background": operator.attrgetter("background"),
+    "gain": operator.attrgetter("gain"),
+}
+PARAMETERS = tuple(WHERE)
+Status = Literal["ok", "ambiguous", "poor_fit", "not_converged"]
 # How far a scaled step of 1 moves the image, in parts of its contrast. The solver's damping starts
 # at 1; from a start within a fraction of a fringe that would be slow, 1/STEP² is not.
 STEP = 30.0
@@ -131,67 +134,38 @@ class FitState(eqx.Module):
         if "beta" in s:
             grown = (1 + distance * nearness) / self.magnification
             beta = beta * jnp.exp(s["beta"]) * grown**2
-        replaced = (
-            beta,
-            mask.phase + s.get("phase", none),
-            mask.width * jnp.exp(s.get("width", none)),
-            mask.centre + offset * pitch,
-            distance,
-            self.wavelength * jnp.exp(s.get("wavelength", none)),
-            nearness,
-            self.background + s.get("background", none),
-            self.gain + s.get("gain", none),
+        return self.with_numbers(
+            beta=beta,
+            phase=mask.phase + s.get("phase", none),
+            centre=mask.centre + offset * pitch,
+            width=mask.width * jnp.exp(s.get("width", none)),
+            distance=distance,
+            object_distance=nearness,
+            wavelength=self.wavelength * jnp.exp(s.get("wavelength", none)),
+            background=self.background + s.get("background", none),
+            gain=self.gain + s.get("gain", none),
         )
-        return eqx.tree_at(_numbers, self, replaced)
+
+    def with_numbers(self, **numbers: Array) -> "FitState":
+        """With other numbers by their names in `PARAMETERS`; for object_distance 1/t."""
+        return eqx.tree_at(
+            lambda s: [WHERE[name](s) for name in numbers], self, [*numbers.values()]
+        )
 
     def values(self, names: tuple[str, ...]) -> Float[Array, " unknown"]:
         """The named numbers: mm, rad/mm², rad; for object_distance 1/t in 1/mm."""
-        mask = self.mask
-        every = {
-            "beta": mask.beta,
-            "phase": mask.phase,
-            "centre_y": mask.centre[0],
-            "centre_x": mask.centre[1],
-            "width": mask.width,
-            "distance": self.camera.distance,
-            "object_distance": self.nearness,
-            "wavelength": self.wavelength,
-            "background": self.background,
-            "gain": self.gain,
-        }
+        every = {name: where(self) for name, where in WHERE.items()}
+        every["centre_y"], every["centre_x"] = every["centre"]
         return jnp.stack([every[name] for name in names])
-
-
-# Where a state keeps what is found by trial.
-WHERE = {
-    "width": operator.attrgetter("camera.mask.width"),
-    "distance": operator.attrgetter("camera.distance"),
-    "wavelength": operator.attrgetter("wavelength"),
-}
-
-
-def _numbers(state: FitState):
-    mask = state.mask
-    return (
-        mask.beta,
-        mask.phase,
-        mask.width,
-        mask.centre,
-        state.camera.distance,
-        state.wavelength,
-        state.nearness,
-        state.background,
-        state.gain,
-    )
 
 
 def with_fringes_held(state: FitState, name: str, value: float, hold: bool) -> FitState:
     """With another width, distance or wavelength; `hold`: with the β that keeps β/M²."""
-    there = eqx.tree_at(WHERE[name], state, jnp.asarray(value, state.nearness.dtype))
+    there = state.with_numbers(**{name: jnp.asarray(value, state.nearness.dtype)})
     if not hold:
         return there
     ratio = there.magnification / state.magnification
-    return eqx.tree_at(lambda s: s.camera.mask.beta, there, there.mask.beta * ratio**2)
+    return there.with_numbers(beta=there.mask.beta * ratio**2)
 
 
 class FitProblem(eqx.Module):
@@ -247,23 +221,13 @@ def model(
     """The image after the steps, on a grid whose middle is `offset` (y, x, mm) off the sensor's."""
     state = start.moved(names, steps)
     # The grid's middle is its origin: the mask moves the other way.
-    centre = state.camera.mask.centre - offset / state.magnification
-    state = eqx.tree_at(lambda s: s.camera.mask.centre, state, centre)
+    state = state.with_numbers(centre=state.mask.centre - offset / state.magnification)
     return state.image(pixel_integration, grid)
 
 
 # What the image depends on, each moved by its own step: β/M², φ, M·centre, M·width, λdM, and what
 # is linear. d and t act through M and λdM only, so that λ's step stands for that of λdM.
-SEEN = (
-    "beta",
-    "phase",
-    "centre_y",
-    "centre_x",
-    "width",
-    "wavelength",
-    "background",
-    "gain",
-)
+SEEN = ("beta", "phase", "centre_y", "centre_x", "width", "wavelength", "background", "gain")
 
 
 @eqx.filter_jit
@@ -377,6 +341,22 @@ def of_values(steps: Covariance, slopes: np.ndarray) -> Covariance:
     errors = np.sqrt(np.diag(whole))
     safe = np.where(errors > 0, errors, 1.0)
     return Covariance(errors, np.clip(whole / np.outer(safe, safe), -1.0, 1.0))
+
+
+def verdict(
+    alike: Sequence[str], poor: str = "", unfinished: str = ""
+) -> tuple[Status, tuple[str, ...]]:
+    """A fit's status and its reasons, the worst first.
+
+    `alike`: one line for each number that the data do not hold; `poor`: why it is another picture;
+    `unfinished`: how the least squares stopped.
+    """
+    status: Status = "ambiguous" if alike else "ok"
+    if poor:
+        status = "poor_fit"
+    if unfinished:
+        status = "not_converged"
+    return status, tuple(filter(None, (unfinished, poor, *alike)))
 
 
 def ambiguous_pairs(names: tuple[str, ...], correlation: np.ndarray) -> list[str]:

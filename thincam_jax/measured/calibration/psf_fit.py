@@ -2,7 +2,6 @@ r"""`fit_psf`: the numbers of a camera from a picture of a point source."""
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Literal
 
 import equinox as eqx
 import jax
@@ -28,6 +27,7 @@ from thincam_jax.measured.calibration.problem import (
     FitProblem,
     FitState,
     Solution,
+    Status,
     Synthesis,
     ambiguous_pairs,
     of_values,
@@ -35,12 +35,12 @@ from thincam_jax.measured.calibration.problem import (
     state_and_residual,
     unknown_names,
     values_by_steps,
+    verdict,
 )
 from thincam_jax.measured.calibration.start import check_fringes, given, search_ranges, start_near
 from thincam_jax.measured.raw import image_with_contrast
 
 Weights = Mapping[float, complex | float | int]
-Status = Literal["ok", "ambiguous", "poor_fit", "not_converged"]
 DEFAULT = ("beta", "phase", "centre", "distance", "background", "gain")
 # The phase and weight of each capture of a fringe-scanned one, as in `fringe_scanned_otf`.
 FRINGE_SCANNED = {0.0: 1j, math.pi / 2: -1.0, math.pi: -1j, 3 * math.pi / 2: 1.0}
@@ -266,7 +266,19 @@ def _report(
         errors["object_distance"] = errors["object_distance"] * distance**2
     alike += _unknown(values, errors, disagree) + _left_search(values, errors, guess, search)
     explained = 1 - float(jnp.sum((residual * problem.weight) ** 2))
-    status, reasons = _status(names, solution, explained, alike)
+    poor = unfinished = ""
+    if not explained >= _EXPLAINED:
+        poor = (
+            f"the model explains {max(0.0, explained):.0%} of the image's contrast: it is not "
+            "this camera's PSF, too noisy, or further from the start than search"
+        )
+    if not np.all(solution.moved < CONVERGED):
+        last = int(np.argmax(solution.moved))
+        unfinished = (
+            f"least squares stopped after {solution.iterations} steps, while {names[last]} moved "
+            f"by {solution.moved[last]:.2g} of its standard error; try max_steps"
+        )
+    status, reasons = verdict(alike, poor, unfinished)
     if found.synthesis is not None:
         residual = residual[0] if len(residual) == 1 else jax.lax.complex(*residual)
     found_fit = PsfFit(
@@ -329,26 +341,3 @@ def _left_search(values, errors, guess: FitState, search: float | int) -> list[s
         for name, first in zip(names, guess.values(names), strict=True)
         if abs(values[name] - first) > search * first + 2 * errors[name]
     ]
-
-
-def _status(
-    names: tuple[str, ...], solution: Solution, explained: float, alike: list[str]
-) -> tuple[Status, tuple[str, ...]]:
-    status: Status = "ambiguous" if alike else "ok"
-    reasons = list(alike)
-    if not explained >= _EXPLAINED:
-        status = "poor_fit"
-        reasons.insert(
-            0,
-            f"the model explains {max(0.0, explained):.0%} of the image's contrast: it is not "
-            "this camera's PSF, too noisy, or further from the start than search",
-        )
-    if not np.all(solution.moved < CONVERGED):
-        last = int(np.argmax(solution.moved))
-        status = "not_converged"
-        reasons.insert(
-            0,
-            f"least squares stopped after {solution.iterations} steps, while {names[last]} moved "
-            f"by {solution.moved[last]:.2g} of its standard error; try max_steps",
-        )
-    return status, tuple(reasons)

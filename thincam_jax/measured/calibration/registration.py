@@ -2,7 +2,6 @@ r"""How much larger one image of a scene is than another, and how far it is move
 
 import math
 from dataclasses import dataclass
-from typing import Literal
 
 import equinox as eqx
 import jax
@@ -17,9 +16,8 @@ from thincam_jax._core.checks import Numbers
 from thincam_jax._core.grids import block_mean, block_sum, central_blocks, centred_indices
 from thincam_jax._core.module import Module
 from thincam_jax._core.precision import allow
+from thincam_jax.measured.calibration.problem import Status, verdict
 from thincam_jax.measured.raw import image_with_contrast
-
-Status = Literal["ok", "poor_fit", "not_converged"]
 
 _LOBES = 5  # of the interpolation's kernel (Lanczos) on either side
 _COARSE = 128  # pixels a side, about, of the images in which the start is searched
@@ -266,17 +264,14 @@ def _report(capture, reference, place: Place, fit: Fit) -> Registration:
     correlation = 0.0
     if np.ptp(registered[inside]) > 0:
         correlation = float(np.corrcoef(registered[inside], capture[inside])[0, 1])
-    status: Status = "ok"
-    reasons = []
+    poor = unfinished = ""
     if correlation < _LEAST_CORRELATION:
-        status = "poor_fit"
-        reasons.append(
+        poor = (
             f"the images correlate by {correlation:.2f} only: they show different scenes, too much "
             "noise, or are further apart than search"
         )
     if not fit.converged:
-        status = "not_converged"
-        reasons.insert(0, "least squares did not converge; try max_steps")
+        unfinished = "least squares did not converge; try max_steps"
     edge = max(capture.shape) / 2
     return Registration(
         jnp.asarray(place.scale),
@@ -285,8 +280,7 @@ def _report(capture, reference, place: Place, fit: Fit) -> Registration:
         jnp.asarray(error[1:3]),
         jnp.asarray(correlation),
         jnp.asarray(registered),
-        status,
-        tuple(reasons),
+        *verdict((), poor, unfinished),
     )
 
 

@@ -3,9 +3,9 @@ r"""`fit_screen`: the numbers of a see-through screen from its matrix, or a few 
 A matrix holds for the distance at which it was measured. The rays that explain it hold for all.
 """
 
+import operator
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Literal
 
 import equinox as eqx
 import jax
@@ -21,7 +21,7 @@ from thincam_jax._core.module import Module
 from thincam_jax._core.precision import allow, cast, precision_of
 from thincam_jax.imaging.operators import Matrix, Scaled
 from thincam_jax.imaging.refractive_index import changed
-from thincam_jax.measured.calibration.problem import Covariance, covariance, hardly_seen
+from thincam_jax.measured.calibration.problem import Status, covariance, hardly_seen, verdict
 from thincam_jax.measured.raw import MeasurementError
 from thincam_jax.waveguide import (
     ObjectPlane,
@@ -51,7 +51,6 @@ PARAMETERS = {
     "object_y": ("mm", 0.1),
 }
 DEFAULT = ("glass_thickness", "lens_distance", "slant", "tilt", "object_x", "object_y")
-Status = Literal["ok", "ambiguous", "poor_fit", "not_converged"]
 
 _PIXELS = 400  # of the sensor whose rows of the matrix are fitted
 _BLURS = (2.0, 0.7, 0.0)  # cells, one after another
@@ -117,6 +116,22 @@ class ScreenFit(Module):
         return Scaled(system_operator(self.camera, plane, self.orders, self.samples), self.gain)
 
 
+# Where a state has what a step is added to, and which entry of a vector it is.
+_PLACES = {
+    "glass_thickness": ("camera.screen.glass_thickness", ...),
+    "lens_distance": ("camera.lens_distance", ...),
+    "focal_distance": ("camera.focal_distance", ...),
+    "plate_x": ("camera.tilt", 0),
+    "plate_y": ("camera.tilt", 1),
+    "film_thickness": ("camera.screen.hologram.thickness", ...),
+    "index_modulation": ("camera.screen.hologram.index_modulation", ...),
+    "object_distance": ("plane.distance", ...),
+    "object_x": ("plane.centre", 0),
+    "object_y": ("plane.centre", 1),
+    "gain": ("gain", ...),
+}
+
+
 class _State(eqx.Module):
     camera: SeeThroughCamera
     plane: ObjectPlane
@@ -124,71 +139,43 @@ class _State(eqx.Module):
     shrinkage: Array
 
     def moved(self, names: tuple[str, ...], steps) -> "_State":
-        camera, plane, gain, shrinkage = self.camera, self.plane, self.gain, self.shrinkage
+        state = self
         for name, step in zip(names, steps, strict=True):
-            if name == "gain":
-                gain = gain + step
-            elif name.startswith("object_"):
-                plane = _moved_plane(plane, name, step)
-            else:
-                camera = _moved_camera(camera, name, step)
-            if name == "shrinkage":
-                shrinkage = shrinkage + (1 - shrinkage) * step
-        return _State(camera, plane, gain, shrinkage)
+            state = state._stepped(name, step)
+        return state
+
+    def _stepped(self, name: str, step) -> "_State":
+        screen, hologram = self.camera.screen, self.camera.screen.hologram
+        if name in _PLACES:
+            path, entry = _PLACES[name]
+            where = operator.attrgetter(path)
+            old = where(self)
+            new = old + step if entry is ... else old.at[entry].add(step)
+            return eqx.tree_at(where, self, new)
+        if name == "index":
+            indices = changed(hologram.index, step), changed(screen.glass_index, step)
+            return eqx.tree_at(_indices, self, indices)
+        if name == "shrinkage":
+            processed = hologram.processed(step), self.shrinkage + (1 - self.shrinkage) * step
+            return eqx.tree_at(lambda s: (s.camera.screen.hologram, s.shrinkage), self, processed)
+        turned = _turned(hologram.grating, name, step)
+        return eqx.tree_at(lambda s: s.camera.screen.hologram.grating, self, turned)
 
     def value(self, name: str) -> Array:
         screen, grating = self.camera.screen, self.camera.screen.hologram.grating
-        colour = jnp.asarray(532e-6, grating.dtype)
+        if name in _PLACES:
+            path, entry = _PLACES[name]
+            return operator.attrgetter(path)(self)[entry]
         return {
-            "glass_thickness": lambda: screen.glass_thickness,
-            "lens_distance": lambda: self.camera.lens_distance,
-            "focal_distance": lambda: self.camera.focal_distance,
-            "index": lambda: screen.glass_index(colour),
-            "slant": lambda: jnp.arctan2(jnp.hypot(grating[0], grating[1]), grating[2]),
-            "tilt": lambda: jnp.arctan2(grating[0], -grating[1]),
-            "plate_x": lambda: self.camera.tilt[0],
-            "plate_y": lambda: self.camera.tilt[1],
-            "film_thickness": lambda: screen.hologram.thickness,
-            "index_modulation": lambda: screen.hologram.index_modulation,
-            "object_distance": lambda: self.plane.distance,
-            "object_x": lambda: self.plane.centre[0],
-            "object_y": lambda: self.plane.centre[1],
-            "shrinkage": lambda: self.shrinkage,
-            "gain": lambda: self.gain,
-        }[name]()
+            "index": screen.glass_index(jnp.asarray(532e-6, grating.dtype)),
+            "slant": jnp.arctan2(jnp.hypot(grating[0], grating[1]), grating[2]),
+            "tilt": jnp.arctan2(grating[0], -grating[1]),
+            "shrinkage": self.shrinkage,
+        }[name]
 
 
-def _moved_plane(plane: ObjectPlane, name: str, step) -> ObjectPlane:
-    if name == "object_distance":
-        return eqx.tree_at(lambda p: p.distance, plane, plane.distance + step)
-    centre = plane.centre.at[int(name == "object_y")].add(step)
-    return eqx.tree_at(lambda p: p.centre, plane, centre)
-
-
-def _moved_camera(camera: SeeThroughCamera, name: str, step) -> SeeThroughCamera:
-    hologram, screen = camera.screen.hologram, camera.screen
-    if name == "index":
-        return eqx.tree_at(
-            lambda c: (c.screen.hologram.index, c.screen.glass_index),
-            camera,
-            (changed(hologram.index, step), changed(screen.glass_index, step)),
-        )
-    if name == "shrinkage":
-        return eqx.tree_at(lambda c: c.screen.hologram, camera, hologram.processed(step))
-    if name in ("slant", "tilt"):
-        turned = _turned(hologram.grating, name, step)
-        return eqx.tree_at(lambda c: c.screen.hologram.grating, camera, turned)
-    if name in ("plate_x", "plate_y"):
-        angles = camera.tilt.at[int(name == "plate_y")].add(step)
-        return eqx.tree_at(lambda c: c.tilt, camera, angles)
-    where = {
-        "glass_thickness": lambda c: c.screen.glass_thickness,
-        "lens_distance": lambda c: c.lens_distance,
-        "focal_distance": lambda c: c.focal_distance,
-        "film_thickness": lambda c: c.screen.hologram.thickness,
-        "index_modulation": lambda c: c.screen.hologram.index_modulation,
-    }[name]
-    return eqx.tree_at(where, camera, where(camera) + step)
+def _indices(state: _State):
+    return state.camera.screen.hologram.index, state.camera.screen.glass_index
 
 
 def _turned(grating: Float[Array, "3"], name: str, angle) -> Float[Array, "3"]:
@@ -205,6 +192,7 @@ def _turned(grating: Float[Array, "3"], name: str, angle) -> Float[Array, "3"]:
 class _Problem(eqx.Module):
     """Measured numbers and where they come from.
 
+    `names`: of what is fitted; `count`: of ghosts' orders.
     `unit`: of steps. `scale`: one over the residual's unit. `full`: mean weight of a pixel.
     `smear`: of equal parts of the band from the Bragg wavelength's points, mm. It changes by a
     small part where the screen does: each blur takes it from its start.
@@ -219,6 +207,11 @@ class _Problem(eqx.Module):
     full: Array
     blur: Array
     smear: Array
+    names: tuple[str, ...] = eqx.field(static=True)
+    count: int = eqx.field(static=True)
+
+    def state(self, steps: Array) -> _State:
+        return self.start.moved(self.names, tuple(steps * self.unit))
 
 
 def fit_screen(
@@ -274,9 +267,9 @@ def fit_screen(
     with allow("float64", camera):
         start = cast(_State(camera, plane, jnp.ones(()), jnp.zeros(())), "float64")
         if isinstance(measured, Matrix):
-            problem = _of_matrix(measured, start, orders)
+            problem = _of_matrix(measured, start, names, orders)
         else:
-            problem = _of_positions(measured, start, orders)
+            problem = _of_positions(measured, start, names, orders)
         if problem.measured.size <= len(names):
             raise MeasurementError(
                 f"{problem.measured.size} measured numbers for {len(names)} unknowns: give more "
@@ -284,23 +277,21 @@ def fit_screen(
             )
         rows, converged = problem.measured, True
         for number, blur in enumerate((*blurs, *(0.0,) * _AGAIN)):
-            problem = replace(problem, smear=_smear(problem, orders, samples))
-            problem = _blurred(problem, rows, blur)
-            problem = _scaled(problem, names, orders)
-            solution = _least_squares(problem, names, orders)
+            problem = replace(problem, smear=_smear(problem, samples))
+            problem = _scaled(_blurred(problem, rows, blur))
+            solution = _least_squares(problem)
             converged = bool(solution.result == optx.RESULTS.successful)
-            found = problem.start.moved(names, tuple(solution.value * problem.unit))
-            problem = replace(problem, start=found)
+            problem = replace(problem, start=problem.state(solution.value))
             if number >= len(blurs) - 1:
                 # Errors by the residual's own size: positions may be worse than their deviation.
-                curvature, squares, freedom = _known(problem, names, orders)
+                curvature, squares, freedom = _known(problem)
                 errors = covariance(curvature, squares / freedom).standard_errors
                 # Steps end at the solver's tolerance, whatever the noise.
                 if np.all(np.abs(solution.value) < np.maximum(errors / 3, 10 * _TOLERANCE)):
                     break
         else:
             converged = False
-        return cast(_report(problem, names, (orders, samples), converged), precision)
+        return cast(_report(problem, samples, converged), precision)
 
 
 def _require_sizes(measured: Matrix, camera: SeeThroughCamera, plane: ObjectPlane) -> None:
@@ -315,7 +306,7 @@ def _require_sizes(measured: Matrix, camera: SeeThroughCamera, plane: ObjectPlan
             )
 
 
-def _of_matrix(measured: Matrix, start: _State, orders: int) -> _Problem:
+def _of_matrix(measured: Matrix, start: _State, names: tuple[str, ...], orders: int) -> _Problem:
     rows, columns = measured.out_shape
     step = max(1.0, (rows * columns / _PIXELS) ** 0.5)
     ys, xs = (np.unique(np.arange(step / 2, n, step).astype(int)) for n in (rows, columns))
@@ -327,32 +318,35 @@ def _of_matrix(measured: Matrix, start: _State, orders: int) -> _Problem:
         raise MeasurementError(
             "no ray of the start reaches the object, or the matrix is 0; give another start"
         )
-    zero, none = jnp.zeros(()), jnp.zeros((1, 1, 1, 2))
-    problem = _Problem(start, kept, pixels, None, jnp.ones(1), jnp.ones(()), full, zero, none)
+    zero, one, none = jnp.zeros(()), jnp.ones(()), jnp.zeros((1, 1, 1, 2))
+    problem = _Problem(start, kept, pixels, None, one[None], one, full, zero, none, names, orders)
     # The gain is linear: what fits best at the start, at the widest blur.
     problem = _blurred(problem, kept, _BLURS[0])
-    model = _model(start, problem, orders)
+    model = _model(start, problem)
     gain = jnp.sum(model * problem.measured) / jnp.sum(model**2)
     start = replace(start, gain=jnp.where(gain > 0, gain, 1.0))
     return replace(problem, start=start, measured=kept)
 
 
-def _of_positions(measured: GhostPositions, start: _State, orders: int) -> _Problem:
+def _of_positions(
+    measured: GhostPositions, start: _State, names: tuple[str, ...], orders: int
+) -> _Problem:
     most = int(measured.orders.max())
     if most >= orders:
         raise MeasurementError(f"a ghost of order {most}, but orders = {orders}; give more orders")
     seen = cast(measured, "float64")
     one, none, scale = jnp.ones(()), jnp.zeros((1, 1, 1, 2)), 1 / seen.deviation
-    return _Problem(start, seen.points, seen.pixels, seen.orders, one[None], scale, one, one, none)
+    data = seen.points, seen.pixels, seen.orders
+    return _Problem(start, *data, one[None], scale, one, one, none, names, orders)
 
 
-def _smear(problem: _Problem, orders: int, samples: int | None) -> Array:
+def _smear(problem: _Problem, samples: int | None) -> Array:
     """Where parts of the band come from, less the Bragg wavelength, (order, pixel, sample, 2)."""
     if samples is None:
         return jnp.zeros((1, 1, 1, 2))
     camera, distance = problem.start.camera, problem.start.plane.distance
-    band = trace_band(camera, problem.pixels, distance, orders, samples)
-    centre = trace(camera, problem.pixels, distance, orders).points[..., None, :2]
+    band = trace_band(camera, problem.pixels, distance, problem.count, samples)
+    centre = trace(camera, problem.pixels, distance, problem.count).points[..., None, :2]
     return jnp.where(band.weight[..., None, None] > 0, band.points - centre, 0)
 
 
@@ -366,43 +360,38 @@ def _blurred(problem: _Problem, rows: Array, blur: float) -> _Problem:
     return replace(problem, measured=rows, blur=jnp.asarray(blur), scale=scale)
 
 
-def _scaled(problem: _Problem, names: tuple[str, ...], orders: int) -> _Problem:
+def _scaled(problem: _Problem) -> _Problem:
     """With steps that each change the residual by a tenth of what was measured."""
-    units = jnp.asarray([PARAMETERS[n][1] if n in PARAMETERS else 1.0 for n in names])
-    unscaled = replace(problem, unit=units)
-    lengths = jnp.linalg.norm(_jacobian(unscaled, names, orders), axis=0)
+    units = jnp.asarray([PARAMETERS[n][1] if n in PARAMETERS else 1.0 for n in problem.names])
+    lengths = jnp.linalg.norm(_jacobian(replace(problem, unit=units)), axis=0)
     size = 0.1 * jnp.linalg.norm(problem.measured * problem.scale)
     return replace(problem, unit=units * size / jnp.where(lengths > 0, lengths, size))
 
 
-def _residual(steps, args):
-    problem, names, orders = args
-    state = problem.start.moved(names, tuple(steps * problem.unit))
-    return ((_model(state, problem, orders) - problem.measured) * problem.scale).reshape(-1)
+def _residual(steps, problem: _Problem):
+    model = _model(problem.state(steps), problem)
+    return ((model - problem.measured) * problem.scale).reshape(-1)
 
 
 @eqx.filter_jit
-def _least_squares(problem: _Problem, names: tuple[str, ...], orders: int):
+def _least_squares(problem: _Problem):
     solver = optx.LevenbergMarquardt(rtol=_TOLERANCE, atol=_TOLERANCE)
-    args = (problem, names, orders)
-    none = jnp.zeros_like(problem.unit)
-    options = {"jac": "fwd"}
+    none, options = jnp.zeros_like(problem.unit), {"jac": "fwd"}
     return optx.least_squares(
-        _residual, solver, none, args, options=options, max_steps=_STEPS, throw=False
+        _residual, solver, none, problem, options=options, max_steps=_STEPS, throw=False
     )
 
 
 @eqx.filter_jit
-def _jacobian(problem: _Problem, names: tuple[str, ...], orders: int):
-    none = jnp.zeros_like(problem.unit)
-    return jax.jacfwd(_residual)(none, (problem, names, orders))
+def _jacobian(problem: _Problem):
+    return jax.jacfwd(_residual)(jnp.zeros_like(problem.unit), problem)
 
 
 @eqx.filter_jit
-def _model(state: _State, problem: _Problem, orders: int):
+def _model(state: _State, problem: _Problem):
     """The rows of the matrix, (pixel, y, x), or the points from the object's middle."""
     camera, plane = state.camera, state.plane
-    rays = trace(camera, problem.pixels, plane.distance, orders)
+    rays = trace(camera, problem.pixels, plane.distance, problem.count)
     if problem.orders is not None:
         place = jnp.arange(problem.pixels.shape[0])
         centroid = rays.points[..., :2] + jnp.mean(problem.smear, axis=2)
@@ -439,21 +428,20 @@ def _mean_weight(camera: SeeThroughCamera, plane: ObjectPlane, pixels, orders: i
     return jnp.mean(jnp.sum(rays.weight, axis=0))
 
 
-def _known(problem: _Problem, names: tuple[str, ...], orders: int):
+def _known(problem: _Problem):
     """JᵀJ, the residual's squares, and its degrees of freedom."""
-    none = jnp.zeros_like(problem.unit)
-    residual = np.asarray(_residual(none, (problem, names, orders)))
-    slopes = np.asarray(_jacobian(problem, names, orders))
+    residual = np.asarray(_residual(jnp.zeros_like(problem.unit), problem))
+    slopes = np.asarray(_jacobian(problem))
     curvature, squares = slopes.T @ slopes, float(residual @ residual)
-    return curvature, squares, residual.size - len(names)
+    return curvature, squares, residual.size - len(problem.names)
 
 
-def _report(problem: _Problem, names, counts, converged: bool) -> ScreenFit:
-    found, (orders, samples) = problem.start, counts
-    curvature, squares, freedom = _known(problem, names, orders)
+def _report(problem: _Problem, samples: int | None, converged: bool) -> ScreenFit:
+    found, names, orders = problem.start, problem.names, problem.count
+    curvature, squares, freedom = _known(problem)
     explained = 1 - squares / float(jnp.sum((problem.measured * problem.scale) ** 2))
     of_matrix, mean = problem.orders is None, squares / freedom
-    known: Covariance = covariance(curvature, mean if of_matrix else 1.0)
+    known = covariance(curvature, mean if of_matrix else 1.0)
     errors = known.standard_errors * np.asarray(problem.unit)
     gain = found.gain
     if of_matrix:
@@ -464,7 +452,13 @@ def _report(problem: _Problem, names, counts, converged: bool) -> ScreenFit:
         poor = f"the model explains {max(0.0, explained):.1%} of what was measured"
     elif not of_matrix and mean > 1 + _UNEXPLAINED * (2 / freedom) ** 0.5:
         poor = f"the model does not explain the positions: χ² is {mean:.3g} per degree of freedom"
-    status, reasons = _status(converged, poor, hardly_seen(names, curvature))
+    if poor:
+        poor += (
+            "; it is another camera, further from the start than a few cells, or positions "
+            "are less accurate than their deviation says"
+        )
+    stopped = "least squares did not converge; try fewer parameters, or a nearer start"
+    alike = hardly_seen(names, curvature)
     values = {n: jnp.asarray(found.value(n)) for n in names} | ({"gain": gain} if of_matrix else {})
     return ScreenFit(
         found.camera,
@@ -474,24 +468,7 @@ def _report(problem: _Problem, names, counts, converged: bool) -> ScreenFit:
         {n: jnp.asarray(e) for n, e in zip(names, errors, strict=True)},
         jnp.asarray(known.correlation),
         jnp.asarray(explained),
-        status,
-        reasons,
+        *verdict(alike, poor, "" if converged else stopped),
         orders,
         samples,
     )
-
-
-def _status(converged: bool, poor: str, alike: list[str]) -> tuple[Status, tuple[str, ...]]:
-    status: Status = "ambiguous" if alike else "ok"
-    reasons = list(alike)
-    if poor:
-        status = "poor_fit"
-        reasons.insert(
-            0,
-            f"{poor}; it is another camera, further from the start than a few cells, or positions "
-            "are less accurate than their deviation says",
-        )
-    if not converged:
-        status = "not_converged"
-        reasons.insert(0, "least squares did not converge; try fewer parameters, or a nearer start")
-    return status, tuple(reasons)

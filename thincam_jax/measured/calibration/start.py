@@ -3,7 +3,6 @@
 import math
 from collections.abc import Sequence
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
@@ -143,21 +142,10 @@ def _with_fringes(
     phase = float(mask.phase)
     if "phase" in parameters:
         phase = phase + math.remainder(fringes.phase - phase, 2 * math.pi)
-    numbers = (beta, phase, centre, distance, wavelength, nearness)
-    return eqx.tree_at(_searched, guess, tuple(jnp.asarray(n, jnp.float64) for n in numbers))
+    numbers = {"beta": beta, "phase": phase, "centre": centre, "distance": distance}
+    numbers |= {"wavelength": wavelength, "object_distance": nearness}
+    return guess.with_numbers(**{name: jnp.asarray(n, jnp.float64) for name, n in numbers.items()})
 
 
 def _within(value: float, guess, search: float) -> float:
     return min(max(value, float(guess) * (1 - search)), float(guess) * (1 + search))
-
-
-def _searched(state: FitState):
-    camera, mask = state.camera, state.mask
-    return (
-        mask.beta,
-        mask.phase,
-        mask.centre,
-        camera.distance,
-        state.wavelength,
-        state.nearness,
-    )
