@@ -13,10 +13,9 @@ model judges every guess, so the misfit that is told is the design's, not the ne
 
 import json
 import os
-from collections.abc import Iterator
 from dataclasses import asdict
-from io import BytesIO
 from pathlib import Path
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -24,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from thincam_jax._core import checks, files
+from thincam_jax._core import checks
 from thincam_jax._core.checks import Numbers
 from thincam_jax._core.module import Module
 from thincam_jax.design.design import Design
@@ -33,6 +32,12 @@ from thincam_jax.design.match import MATCHED, MatchStatus, match_status
 from thincam_jax.design.setup import Setup
 from thincam_jax.design.space import DesignSpace, active_limits
 from thincam_jax.design.target_response import ResponseModel, checked_levels, root_mean_square
+from thincam_jax.learn.checkpoint import (
+    CheckpointError,
+    read_arrays,
+    read_description,
+    write_arrays,
+)
 
 STEPS = 2
 # Parts of the diagonal of JᵀJ that are tried beside each other in every step. Ripples of the
@@ -207,15 +212,12 @@ def suggest(suggester: Suggester, target: Numbers, *, tolerance_db: float = MATC
     )
 
 
-_FORMAT = "thincam_jax suggester 1"
+_KIND = "suggester"
 
 
 def save_suggester(path: str | os.PathLike[str], suggester: Suggester) -> Path:
-    """Write a trained suggester: one line of JSON, then its numbers. Whole or not at all."""
-    content = BytesIO()
-    content.write(json.dumps(_header(suggester)).encode("utf-8") + b"\n")
-    eqx.tree_serialise_leaves(content, suggester)
-    return files.write_whole(path, content.getvalue())
+    """Write a trained suggester with its camera; whole or not at all."""
+    return write_arrays(path, suggester, _described(suggester))
 
 
 def load_suggester(
@@ -227,83 +229,52 @@ def load_suggester(
 ) -> Suggester:
     """Read a suggester that was trained for this space and camera.
 
-    **Errors**: ValueError, one line, for a file that is none, and for one that was trained for
-    another space, camera, synthesis, frequencies or precision, with the first that differs.
+    **Errors**: CheckpointError (a ValueError), one line, for a file that is none or is damaged, and
+    for one that was trained for another space, camera, synthesis or frequencies, with the first
+    number that differs.
     """
-    source = BytesIO(files.read_regular(path))
-    header = _read_header(path, source.readline())
-    network = header["network"]
-    model = ResponseModel(space, setup, synthesis, frequencies, network["rings"])
-    fresh = Suggester(
-        model,
-        key=jax.random.key(0),
-        guesses=network["guesses"],
-        width=network["width"],
-        depth=network["depth"],
-    )
-    for name, here in json.loads(json.dumps(_header(fresh))).items():
-        if header.get(name) != here:
-            raise ValueError(
-                f"{path} was trained for other {name}: {json.dumps(header.get(name))}, and here "
+    there = read_description(path)
+    if there.get("kind") != _KIND:
+        raise CheckpointError(f"{path} is no suggester; give a file written by save_suggester")
+    model = ResponseModel(space, setup, synthesis, frequencies, there["rings"])
+    fresh = Suggester(model, key=jax.random.key(0), **there["network"])
+    for name, here in json.loads(json.dumps(_described(fresh))).items():
+        if there.get(name) != here:
+            raise CheckpointError(
+                f"{path} was trained for other {name}: {json.dumps(there.get(name))}, and here "
                 f"they are {json.dumps(here)}; train a suggester for these"
             )
-    try:
-        loaded = eqx.tree_deserialise_leaves(source, fresh)
-    except (ValueError, RuntimeError, EOFError, OSError) as error:
-        raise ValueError(f"{path} is cut off or damaged; train and save it again") from error
+    loaded = jax.tree.map(jnp.asarray, read_arrays(path, fresh))
     _check_numbers(path, loaded.model, model)
     return loaded
 
 
-def _header(suggester: Suggester) -> dict:
+def _described(suggester: Suggester) -> dict[str, Any]:
     """What must agree before the numbers can be read."""
-    model = suggester.model
+    model, layers = suggester.model, suggester.layers
     space, setup = model.space, model.setup
+    width, depth = layers[0].out_features, len(layers) - 1
+    kinds = (type(part).__name__ for part in (setup.noise, model.frequencies))
     return {
-        "format": _FORMAT,
-        "network": {
-            "rings": model.rings,
-            "guesses": suggester.guesses,
-            "width": suggester.layers[0].out_features,
-            "depth": len(suggester.layers) - 1,
-        },
+        "kind": _KIND,
+        "rings": model.rings,
+        "network": {"guesses": suggester.guesses, "width": width, "depth": depth},
         "variables": [asdict(v) for v in space.variables],
         "limits": asdict(space.limits),
         "captures": [space.base.captures, space.base.profile],
-        "models": [
-            type(setup.noise).__name__,
-            type(model.frequencies).__name__,
-            setup.pixel_integration,
-            setup.crop,
-        ],
-        "numbers": [f"{name} {n.dtype}{list(n.shape)}" for name, n in _numbers(model)],
+        "models": [*kinds, setup.pixel_integration, setup.crop],
     }
-
-
-def _read_header(path, line: bytes) -> dict:
-    try:
-        header = json.loads(line)
-        known = header["format"] == _FORMAT and isinstance(header["network"], dict)
-    except (ValueError, KeyError, TypeError):
-        known, header = False, {}
-    if not known:
-        raise ValueError(f"{path} is no suggester; give a file written by save_suggester")
-    return header
-
-
-def _numbers(model: ResponseModel) -> Iterator[tuple[str, Array]]:
-    for keys, leaf in jax.tree_util.tree_flatten_with_path(model)[0]:
-        yield jax.tree_util.keystr(keys).lstrip("."), leaf
 
 
 def _check_numbers(path, trained: ResponseModel, given: ResponseModel) -> None:
     """A suggester answers for the camera that it was trained for, and for no other."""
-    for (name, there), (_, here) in zip(_numbers(trained), _numbers(given), strict=True):
-        if not np.allclose(there, here, rtol=1e-5, atol=0.0):
-            at = np.unravel_index(
-                np.argmax(~np.isclose(there, here, rtol=1e-5, atol=0.0)), here.shape
-            )
-            raise ValueError(
+    leaves = jax.tree_util.tree_flatten_with_path(trained)[0]
+    for (keys, there), here in zip(leaves, jax.tree.leaves(given), strict=True):
+        same = np.isclose(there, here, rtol=1e-5, atol=0.0)
+        if not same.all():
+            at = np.unravel_index(np.argmin(same), here.shape)
+            name = jax.tree_util.keystr(keys).lstrip(".")
+            raise CheckpointError(
                 f"{path} was trained for another camera: {name} was {float(there[at]):.6g} and is "
                 f"{float(here[at]):.6g}; train a suggester for this one"
             )
