@@ -194,7 +194,7 @@ def train_model(
             if state.retreats > _MOST_RETREATS:
                 status = "diverged"
                 break
-        elif not bad and _is_checked(state.step, options):
+        elif not bad and (state.step % options.check_every == 0 or state.step == options.steps):
             state = good = _judged(task, fixed, state, losses, options)
             if keep is not None:
                 keep(good)
@@ -236,10 +236,6 @@ def read_state(
     if not whole or description["step"] > len(begun.losses):
         raise CheckpointError(f"{path}: is no state of a training; give one that it wrote")
     return replace(state, **counts)
-
-
-def _is_checked(step: int, options: TrainingOptions) -> bool:
-    return step % options.check_every == 0 or step == options.steps
 
 
 def _lowest(state: TrainingState) -> float:

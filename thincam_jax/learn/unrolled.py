@@ -51,7 +51,7 @@ class UnrolledAdmm(eqx.Module):
         penalties = splitting.penalties
 
         def repeated(value):
-            return jnp.full(iterations, _before_softplus(value))
+            return jnp.full(iterations, value + jnp.log(-jnp.expm1(-value)))  # softplus⁻¹
 
         self.data = repeated(penalties.data)
         self.variation = repeated(penalties.variation)
@@ -207,10 +207,6 @@ def _followed(model: UnrolledAdmm, problem: InverseProblem):
     images = model.images(problem)
     values = [jnp.sum(objective(problem, f)) for f in (uniform_image(problem), *images)]
     return jnp.stack(values), images[-1]
-
-
-def _before_softplus(value: Float[Array, ""]) -> Float[Array, ""]:
-    return value + jnp.log(-jnp.expm1(-value))
 
 
 def _check_pairs(problem: InverseProblem, images: Array, batch: int) -> None:

@@ -1,7 +1,7 @@
 """What is to be done with a measured PSF and capture, and whether they go together."""
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -10,7 +10,16 @@ from thincam_jax.measured.bayer import METHODS, PATTERNS, Demosaicing, Pattern
 from thincam_jax.measured.raw import MeasurementError, Raw
 
 Centre = Literal["centroid", "peak", "symmetry"]
-CENTRES = ("centroid", "peak", "symmetry")
+_CHOICES = {
+    "bayer": PATTERNS,
+    "demosaicing": METHODS,
+    "centre": get_args(Centre),
+    "psf_channels": ("each", "mean"),
+    "psf_sum": ("each", "joint"),
+    "capture_scale": ("maximum", "norm", "none"),
+}
+_OPTIONAL = ("bayer", "centre")
+_LARGEST = {"saturation": 1.0, "threshold": 1.0, "noise_threshold": 1e6, "psf_scale": 100.0}
 
 
 @dataclass(frozen=True)
@@ -62,14 +71,9 @@ class Preparation:
     capture_scale: Literal["maximum", "norm", "none"] = "maximum"
 
     def __post_init__(self):
-        if self.bayer is not None:
-            _choose("bayer", self.bayer, PATTERNS)
-        _choose("demosaicing", self.demosaicing, METHODS)
-        if self.centre is not None:
-            _choose("centre", self.centre, CENTRES)
-        _choose("psf_channels", self.psf_channels, ("each", "mean"))
-        _choose("psf_sum", self.psf_sum, ("each", "joint"))
-        _choose("capture_scale", self.capture_scale, ("maximum", "norm", "none"))
+        for name, options in _CHOICES.items():
+            if getattr(self, name) is not None or name not in _OPTIONAL:
+                _choose(name, getattr(self, name), options)
         if not _whole(self.downsample) or self.downsample < 1:
             raise MeasurementError(
                 f"downsample = {self.downsample!r}: give a whole number of at least 1"
@@ -79,10 +83,10 @@ class Preparation:
             raise MeasurementError(
                 f"corner = {self.corner!r}: give two whole numbers, 0 <= first < last, as (5, 15)"
             )
-        _in_range("saturation", self.saturation, 0.0, 1.0)
-        _in_range("threshold", self.threshold, 0.0, 1.0)
-        _in_range("noise_threshold", self.noise_threshold, 0.0, 1e6)
-        _in_range("psf_scale", self.psf_scale, 0.0, 100.0)
+        for name, high in _LARGEST.items():
+            value = getattr(self, name)
+            if value is not None and not 0 < value <= high:
+                raise MeasurementError(f"{name} = {value!r}: give a number above 0, up to {high:g}")
 
 
 def _choose(name: str, value: Any, options: tuple[str, ...]) -> None:
@@ -94,11 +98,6 @@ def _choose(name: str, value: Any, options: tuple[str, ...]) -> None:
 
 def _whole(value: Any) -> bool:
     return isinstance(value, int) and not isinstance(value, bool)
-
-
-def _in_range(name: str, value: float | int | None, low: float, high: float) -> None:
-    if value is not None and not low < value <= high:
-        raise MeasurementError(f"{name} = {value!r}: give a number above {low:g}, up to {high:g}")
 
 
 def check_match(

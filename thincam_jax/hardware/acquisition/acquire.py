@@ -148,7 +148,9 @@ def _begin(run: Taker, path: Path) -> tuple[CameraSettings, ...]:
     together = 1
     if series := run.plan.facts.get("series"):
         attributes |= {"kind": CALIBRATION, "exposure": settings[0].exposure}
-        attributes |= {"stored_at": _stored_at(run.plan), **series}
+        # The store of a series counts the dark frames last.
+        order = sorted(range(len(run.plan.steps)), key=lambda n: run.plan.steps[n].dark)
+        attributes |= {"stored_at": order, **series}
         together = TOGETHER
     whole = (len(run.plan.steps), *shape)
     layout = whole, dtype_of_bits(bits), attributes
@@ -201,12 +203,6 @@ def _new_settings(run: Taker) -> tuple[CameraSettings, ...]:
         found = find_exposure(level_at, asked[0].exposure, wanted, run.name("camera"))
         asked = (replace(asked[0], exposure=found),)
     return tuple(run.persist(lambda one=one: run.set_near(one)) for one in asked)
-
-
-def _stored_at(plan: Plan) -> list[int]:
-    """Where the store has each frame of a Hadamard series, which counts the dark ones last."""
-    steps = range(len(plan.steps))
-    return sorted(steps, key=lambda number: plan.steps[number].dark)
 
 
 @contextmanager

@@ -72,10 +72,17 @@ class PylonCamera(FeatureCamera):
     @classmethod
     def open(cls, options: Options) -> "PylonCamera":
         """Opens a camera; NotFound, Busy or PermissionDenied where that fails."""
-        wanted = pylon.DeviceInfo()
+        wanted, factory = pylon.DeviceInfo(), pylon.TlFactory.GetInstance()
         if options.serial:
             wanted.SetSerialNumber(options.serial)
-        return cls(_created(wanted, options.serial))
+        try:
+            camera = pylon.InstantCamera(factory.CreateFirstDevice(wanted))
+        except genicam.GenericException as error:
+            found = [info.GetSerialNumber() for info in factory.EnumerateDevices()]
+            cause = f"no camera {options.serial}".rstrip()
+            remedy = f"connect one and switch it on; found: {', '.join(found) or 'none'}"
+            raise NotFound("pylon", "open", cause, remedy) from error
+        return cls(camera)
 
     def flush(self) -> None:
         with self._told("flush"):
@@ -166,17 +173,6 @@ class PylonCamera(FeatureCamera):
             remedy = "install pylon's udev rule (setup-usb.sh) and connect the camera again"
             return PermissionDenied(self._name, operation, cause, remedy)
         return ProtocolError(self._name, operation, cause, "open the camera again")
-
-
-def _created(wanted: Any, serial: str) -> Any:
-    factory = pylon.TlFactory.GetInstance()
-    try:
-        return pylon.InstantCamera(factory.CreateFirstDevice(wanted))
-    except genicam.GenericException as error:
-        found = [info.GetSerialNumber() for info in factory.EnumerateDevices()]
-        cause = f"no camera {serial}".rstrip()
-        remedy = f"connect one and switch it on; found: {', '.join(found) or 'none'}"
-        raise NotFound("pylon", "open", cause, remedy) from error
 
 
 class _Features:

@@ -64,7 +64,8 @@ class SdlDisplay(Screen):
         return cls(options)
 
     def _open(self, options: Options) -> None:
-        names = _monitors()
+        count = sdl2.SDL_GetNumVideoDisplays()
+        names = [(sdl2.SDL_GetDisplayName(k) or b"").decode(errors="replace") for k in range(count)]
         number = _chosen(options.monitor, names)
         bounds = sdl2.SDL_Rect()
         sdl2.SDL_GetDisplayBounds(number, ctypes.byref(bounds))
@@ -147,11 +148,6 @@ class SdlDisplay(Screen):
         columns, rows = ctypes.c_int(), ctypes.c_int()
         sdl2.SDL_GetRendererOutputSize(self._renderer, ctypes.byref(columns), ctypes.byref(rows))
         return rows.value, columns.value
-
-
-def _monitors() -> list[str]:
-    count = sdl2.SDL_GetNumVideoDisplays()
-    return [(sdl2.SDL_GetDisplayName(k) or b"").decode(errors="replace") for k in range(count)]
 
 
 def _chosen(wanted: str, names: list[str]) -> int:

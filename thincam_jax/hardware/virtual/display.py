@@ -14,10 +14,6 @@ from thincam_jax.hardware.virtual.faults import Faults
 _LATENCY = 0.05  # s
 
 
-def _nothing(levels: np.ndarray) -> None:
-    """Without a rig that looks at it."""
-
-
 class VirtualDisplay(Screen):
     """A panel whose levels follow exponentially: of the pattern before, exp(−t/`response`) is left.
 
@@ -29,7 +25,7 @@ class VirtualDisplay(Screen):
     def __init__(
         self,
         shape: tuple[int, int],
-        on_show: Callable[[np.ndarray], None] = _nothing,
+        on_show: Callable[[np.ndarray], None] | None = None,
         *,
         response: float = 0.0,
         faults: Faults | None = None,
@@ -64,4 +60,5 @@ class VirtualDisplay(Screen):
             time.sleep(_LATENCY)
         self._before, self._target = self.levels(), levels.astype(np.float32)
         self._presented = time.perf_counter()
-        self._on_show(levels)
+        if self._on_show is not None:
+            self._on_show(levels)

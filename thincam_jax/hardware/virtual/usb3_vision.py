@@ -181,11 +181,11 @@ class VirtualUsb3Vision(IBackend):
         """What the camera is set to."""
         exposure, gain = struct.unpack_from("<dd", self._memory, EXPOSURE)
         region = Region(*(self._number(a) for a in (TOP, LEFT, HEIGHT, WIDTH)))
-        return CameraSettings(exposure * 1e-6, region, self._pixel_format(), gain)
-
-    def _pixel_format(self) -> str:
-        code = self._number(PIXEL_FORMAT)
-        return next(name for name, (known, _) in PIXEL_FORMATS.items() if known == code)
+        names, code = (
+            {n: name for name, (n, _) in PIXEL_FORMATS.items()},
+            self._number(PIXEL_FORMAT),
+        )
+        return CameraSettings(exposure * 1e-6, region, names[code], gain)
 
     def _derive(self) -> None:
         settings = self.settings
@@ -231,18 +231,15 @@ class VirtualUsb3Vision(IBackend):
         (address,) = gencp.ADDRESS.unpack_from(command.data)
         data = command.data[gencp.ADDRESS.size :]
         if address in LIMITS and len(data) == 8:
-            self._set_float(address, data)
+            low, high = LIMITS[address]
+            if not low <= struct.unpack("<d", data)[0] <= high:
+                raise _Refused(Status.INVALID_PARAMETER)
+            self._memory[address : address + 8] = data
         elif len(data) == 4:
             self._set_number(address, int.from_bytes(data, "little"), ready)
         else:
             raise _Refused(Status.BAD_ALIGNMENT)
         return gencp.RESERVED_AND_NUMBER.pack(0, len(data))
-
-    def _set_float(self, address: int, data: bytes) -> None:
-        low, high = LIMITS[address]
-        if not low <= struct.unpack("<d", data)[0] <= high:
-            raise _Refused(Status.INVALID_PARAMETER)
-        self._memory[address : address + 8] = data
 
     def _set_number(self, address: int, value: int, ready: float) -> None:
         if address in (WIDTH, HEIGHT, LEFT, TOP, PIXEL_FORMAT):

@@ -312,8 +312,9 @@ def flattened(network: RefocusNetwork, captures: Numbers, deviation: Numbers):
 
 def _batched(what: str, network: RefocusNetwork, captures, deviation, distance=None):
     """A property of the explanation of each capture, focused on the same distance or distances."""
-    *flat, batch = flattened(network, captures, deviation)
-    out = _explained(what, network, *flat, network.camera.middle if distance is None else distance)
+    captures, deviation, batch = flattened(network, captures, deviation)
+    distance = network.camera.middle if distance is None else distance
+    out = _explained(what, network, captures, deviation, distance)
     return jax.tree.map(lambda x: x.reshape(*batch, *x.shape[1:]), out)
 
 

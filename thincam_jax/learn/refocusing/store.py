@@ -69,12 +69,12 @@ def load(
     description = network_description(path)
     given = same_camera(str(path), description["camera"], cameras)
     try:
-        stored = {name: _as_tuple(value) for name, value in description["options"].items()}
-        options = NetworkOptions(**stored)
+        stored = description["options"]
+        options = NetworkOptions(**{**stored, "widths": tuple(stored["widths"])})
         structure = eqx.filter_eval_shape(
             lambda key: RefocusNetwork.create(given, options, key=key).weights, jax.random.key(0)
         )
-    except (TypeError, ValueError, AttributeError) as error:
+    except (TypeError, ValueError, AttributeError, KeyError) as error:
         raise CheckpointError(f"{path}: holds options of another version ({error})") from None
     weights = jax.tree.map(jnp.asarray, read_arrays(path, structure))
     return RefocusNetwork(weights, Planes(given), options)
@@ -150,7 +150,3 @@ def _optical(camera: Any) -> Any:
     if not isinstance(camera, dict):
         return camera
     return {name: _optical(value) for name, value in camera.items() if name not in _ELECTRONIC}
-
-
-def _as_tuple(value: Any) -> Any:
-    return tuple(value) if isinstance(value, list) else value

@@ -1,6 +1,7 @@
 """Training of a refocusing network on drawn scenes, in a folder that it goes on from."""
 
 import dataclasses
+import functools
 import os
 import time
 from collections.abc import Callable
@@ -69,7 +70,7 @@ class Lessons:
         pool = [examples(network, one) for one in self.drawn(network, seed, self.pool)]
         pool = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *pool)
         judged = [examples(network, one) for one in self.validation(network, seed)]
-        return Task(_Pool(pool, self.batch).draw, loss, judged)
+        return Task(functools.partial(_taken, pool, self.batch), loss, judged)
 
     def manifest(self) -> dict[str, Any]:
         """The images as JSON, with their sums and licences; and how scenes are drawn."""
@@ -87,17 +88,8 @@ class Lessons:
         }
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class _Pool:
-    all: Examples
-    size: int
-
-    def draw(self, key) -> Examples:
-        return _taken(self.all, key, self.size)
-
-
 @eqx.filter_jit
-def _taken(pool: Examples, key, size: int) -> Examples:
+def _taken(pool: Examples, size: int, key) -> Examples:
     chosen, mirrors = jax.random.split(key)
     numbers = jax.random.randint(chosen, (size,), 0, len(pool.image))
     rows, columns = jax.random.bernoulli(mirrors, shape=(2,))
@@ -138,12 +130,14 @@ def train(
         part = network.first(number + 1)
         task, prior = lessons.task(part, options.seed), part.weights.prior[number]
         state = begun = TrainingState.begin(prior, task, each)
-        keep, path = None, None if folder is None else Path(folder) / STATE.format(number + 1)
-        if path is not None:
-            keep = _Kept(path, part, {**settings, "step": number}, told)
+        keep = tell = None
+        if folder is not None:
+            path, own = Path(folder) / STATE.format(number + 1), {**settings, "step": number}
+            keep = functools.partial(_keep, path, part, own, told)
             if path.exists():
-                state = read_state(path, begun, keep.settings)
-        tell = None if callback is None else _Told(callback, number, count, time.perf_counter())
+                state = read_state(path, begun, own)
+        if callback is not None:
+            tell = functools.partial(_tell, callback, number, count, time.perf_counter())
         trained = train_model(task, prior, each, state=state, keep=keep, callback=tell)
         network = network.with_prior(number, trained.model)
         losses.append(trained.state.losses[: trained.state.step])
@@ -156,44 +150,25 @@ def train(
     return Trained(network.first(len(losses)), state, trained.status)
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class _Kept:
-    """Writes what is to be kept of a U-Net's training."""
-
-    path: Path
-    network: RefocusNetwork
-    settings: dict[str, Any]
-    told: dict[str, Any]
-
-    def __call__(self, state: TrainingState) -> None:
-        number = self.network.options.steps - 1
-        best = self.network.with_prior(
-            number, eqx.combine(state.best, self.network.weights.prior[number])
-        )
-        scores = [float(score) for score in state.scores if score == score]
-        numbers = {"steps": state.step, "skipped": state.skipped, "retreats": state.retreats}
-        save(self.path.parent / NETWORK, best, {**self.told, "scores": scores, **numbers})
-        # Last: it is what training goes on from.
-        write_state(self.path, state, self.settings)
+def _keep(path: Path, network: RefocusNetwork, settings, told, state: TrainingState) -> None:
+    """Writes what is to be kept of the training of a network's last U-Net."""
+    number = network.options.steps - 1
+    best = network.with_prior(number, eqx.combine(state.best, network.weights.prior[number]))
+    scores = [float(score) for score in state.scores if score == score]
+    numbers = {"steps": state.step, "skipped": state.skipped, "retreats": state.retreats}
+    save(path.parent / NETWORK, best, {**told, "scores": scores, **numbers})
+    # Last: it is what training goes on from.
+    write_state(path, state, settings)
 
 
-@dataclasses.dataclass(frozen=True)
-class _Told:
-    """Tells of the whole training in place of one U-Net's."""
-
-    callback: Callable[[TrainingProgress], object]
-    number: int
-    parts: int
-    began: float
-
-    def __call__(self, progress: TrainingProgress) -> object:
-        steps, later = progress.steps, self.parts - 1 - self.number
-        each = (time.perf_counter() - self.began) / progress.step
-        return self.callback(
-            dataclasses.replace(
-                progress,
-                step=self.number * steps + progress.step,
-                steps=self.parts * steps,
-                seconds_left=progress.seconds_left + later * steps * each,
-            )
-        )
+def _tell(callback, number: int, parts: int, began: float, progress: TrainingProgress) -> object:
+    """Tells of the whole training in place of that of U-Net `number` of its `parts`."""
+    steps, later = progress.steps, parts - 1 - number
+    each = (time.perf_counter() - began) / progress.step
+    whole = dataclasses.replace(
+        progress,
+        step=number * steps + progress.step,
+        steps=parts * steps,
+        seconds_left=progress.seconds_left + later * steps * each,
+    )
+    return callback(whole)

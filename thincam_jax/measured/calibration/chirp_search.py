@@ -63,7 +63,9 @@ def find_chirp(image: np.ndarray, pitch: float, guess: Chirp, ranges: Ranges) ->
     if guess.epsilon * (1 + ranges.epsilon) > _WEAK:
         return guess
     blocks = _Blocks(image, pitch, guess, ranges)
-    gammas = _curvatures(blocks.reach, guess, ranges)
+    lowest, highest = _bounds(guess, ranges)
+    count = 2 + math.ceil((highest - lowest) / (_STEP * math.pi / blocks.reach**2))
+    gammas = np.linspace(lowest, highest, count)
     places = _axis(ranges.centre, _STEP * math.pi / (2 * guess.curvature * blocks.reach))
     maps = np.abs(blocks.correlate(gammas, guess.centre, places))
     _, row, column = np.unravel_index(np.argmax(maps), maps.shape)
@@ -158,12 +160,6 @@ def _bounds(guess: Chirp, ranges: Ranges) -> tuple[float, float]:
     epsilon = guess.epsilon * (1 + ranges.epsilon)
     low, high = (guess.curvature * (1 + s * ranges.curvature) for s in (-1, 1))
     return low / (1 + epsilon), high / (1 - epsilon)
-
-
-def _curvatures(reach: float, guess: Chirp, ranges: Ranges) -> np.ndarray:
-    lowest, highest = _bounds(guess, ranges)
-    step = _STEP * math.pi / reach**2
-    return np.linspace(lowest, highest, 2 + math.ceil((highest - lowest) / step))
 
 
 def _axis(half_range: float, step: float) -> np.ndarray:

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 import numpy as np
+import scipy
 from jaxtyping import Float, Int8, Integer, Real, UInt8
 
 from thincam_jax._core import checks
@@ -92,8 +93,8 @@ def hadamard_pattern(
     count = _require_power_of_two(object_shape)
     if not 0 <= index < count:
         raise ValueError(f"index = {index}: there are {count} patterns; give 0 … {count - 1}")
-    row = natural_rows(count, order)[index]
-    return (1 - 2 * _shared_parity(row, np.arange(count))).astype(np.int8).reshape(object_shape)
+    shared = np.bitwise_count(natural_rows(count, order)[index] & np.arange(count))
+    return (1 - 2 * (shared & 1).astype(np.int8)).reshape(object_shape)
 
 
 def natural_rows(count: int, order: Order) -> Integer[np.ndarray, " pattern"]:
@@ -125,7 +126,8 @@ def walsh_hadamard(
         dtype = np.result_type(values, np.float32) if values.dtype.kind == "f" else np.float32
         out = np.empty((pixels, count), dtype)
     bits = count.bit_length() - 1
-    first, second = (_sylvester(2**k, out.dtype) for k in (bits // 2, bits - bits // 2))
+    halves = bits // 2, bits - bits // 2
+    first, second = (scipy.linalg.hadamard(2**k, out.dtype) for k in halves)
     a, b = len(first), len(second)
     for start in range(0, pixels, _AT_ONCE):
         part = values[:, start : start + _AT_ONCE].astype(out.dtype)
@@ -138,16 +140,6 @@ def walsh_hadamard(
 
 
 _AT_ONCE = 256  # pixels whose 4096 numbers stay in a CPU's cache: half the time of 8000
-
-
-def _sylvester(count: int, dtype) -> np.ndarray:
-    numbers = np.arange(count)
-    return (1 - 2 * _shared_parity(numbers[:, None], numbers)).astype(dtype)
-
-
-def _shared_parity(first, second):
-    """1 where two numbers have an odd number of bits in common."""
-    return (np.bitwise_count(first & second) & 1).astype(int)
 
 
 def _require_power_of_two(object_shape: tuple[int, int]) -> int:

@@ -260,11 +260,7 @@ def values_by_steps(
     start: FitState, names: tuple[str, ...], steps: Float[ArrayLike, " step"]
 ) -> Float[Array, "value step"]:
     """The derivative of `FitState.values` in the steps from `start`."""
-    return jax.jacfwd(_values)(steps, start, names)
-
-
-def _values(steps, start: FitState, names):
-    return start.moved(names, steps).values(names)
+    return jax.jacfwd(lambda s: start.moved(names, s).values(names))(steps)
 
 
 @eqx.filter_jit

@@ -165,7 +165,11 @@ def fit_psf(
     and another mask.
     """
     synthesis = _check_weights(psf_image, weights)
-    parameters = _check_parameters(parameters)
+    if isinstance(parameters, str) or not parameters:
+        raise ValueError(f"parameters = {parameters!r}: give a tuple of at least one name")
+    for name in parameters:
+        checks.choice("a name in parameters", name, PARAMETERS)
+    parameters = tuple(parameters)
     if synthesis is not None and not np.any(np.abs(synthesis.weights.sum(axis=1)) > 1e-6):
         parameters = tuple(name for name in parameters if name != "background")
     image = _check_image(psf_image, camera, synthesis)
@@ -182,14 +186,6 @@ def fit_psf(
         )
         solution = solve(problem, known.standard_errors, max_steps)
         return _report(problem, solution, guess, search, precision_of(camera.distance))
-
-
-def _check_parameters(parameters) -> tuple[str, ...]:
-    if isinstance(parameters, str) or not parameters:
-        raise ValueError(f"parameters = {parameters!r}: give a tuple of at least one name")
-    for name in parameters:
-        checks.choice("a name in parameters", name, PARAMETERS)
-    return tuple(parameters)
 
 
 def _check_weights(image, weights: Weights | None) -> Synthesis | None:
@@ -249,7 +245,9 @@ def _report(
     names = problem.names
     found, residual = state_and_residual(solution.scaled, problem)
     measured = full_image(np.asarray(problem.image), found, problem.pixel_integration)
-    steps, slopes = covariance_by_differences(measured, found, names), _of_values(found, names)
+    slopes = np.array(values_by_steps(found, names, jnp.zeros(len(names))))
+    slopes[np.array(names) == "object_distance"] *= -1  # t falls where 1/t grows
+    steps = covariance_by_differences(measured, found, names)
     known, parts = (of_values(of_steps, slopes) for of_steps in steps)
     values = dict(zip(names, np.asarray(found.values(names)), strict=True))
     errors = np.maximum(known.standard_errors, parts.standard_errors)
@@ -297,13 +295,6 @@ def _report(
         solution.iterations,
     )
     return cast(found_fit, precision)
-
-
-def _of_values(found: FitState, names) -> np.ndarray:
-    """Of the values in the steps; t falls where 1/t grows."""
-    slopes = np.array(values_by_steps(found, names, jnp.zeros(len(names))))
-    slopes[np.array(names) == "object_distance"] *= -1
-    return slopes
 
 
 def _too_far(nearness: float, error: float) -> list[str]:

@@ -111,10 +111,10 @@ def estimate_registration(
     small, other = (block_mean(image[inner], block) for image in (capture, reference))
     with allow("float64"):
         start = _phase_correlation(small, other, scale, search)
-        start, _ = _fit(small, other, start, 1.0, max_steps)
+        start, *_ = _fit(small, other, start, 1.0, max_steps)
         start = Place(start.scale, start.shift * block)
-        place, fit = _fit(capture, reference, start, smoothing, max_steps)
-        return _report(capture, reference, place, fit)
+        place, pair, found, converged = _fit(capture, reference, start, smoothing, max_steps)
+        return _report(capture, reference, place, pair, found, converged)
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,14 +133,6 @@ class Pair(eqx.Module):
     weights: Float[Array, "y x"]
     scale: Float[Array, ""]
     shift: Float[Array, "2"]
-
-
-class Fit(eqx.Module):
-    """A pair, the unknowns found for it and whether the solver converged."""
-
-    pair: Pair
-    unknowns: Float[Array, "5"]
-    converged: bool
 
 
 def residual(unknowns: Float[Array, "5"], pair: Pair) -> Float[Array, "y x"]:
@@ -204,8 +196,11 @@ def _least_squares(pair: Pair, max_steps: int):
     return optx.least_squares(residual, solver, start, pair, max_steps=max_steps, throw=False)
 
 
-def _fit(capture, reference, start: Place, smoothing: float, max_steps: int) -> tuple[Place, Fit]:
-    """Least squares from `start` on images of unit contrast, smoothed on the scene's scale."""
+def _fit(capture, reference, start: Place, smoothing: float, max_steps: int):
+    """Least squares from `start` on images of unit contrast, smoothed on the scene's scale.
+
+    The place, the pair, the unknowns found for it and whether the solver converged.
+    """
     smooth = [
         scipy.ndimage.gaussian_filter(image, sigma, mode="nearest")
         for image, sigma in ((capture, smoothing * start.scale), (reference, smoothing))
@@ -219,7 +214,7 @@ def _fit(capture, reference, start: Place, smoothing: float, max_steps: int) -> 
     solution = _least_squares(pair, max_steps)
     converged = bool(solution.result == optx.RESULTS.successful)
     scale, shift = _place(solution.value, pair)
-    return Place(float(scale), np.asarray(shift)), Fit(pair, solution.value, converged)
+    return Place(float(scale), np.asarray(shift)), pair, solution.value, converged
 
 
 def _phase_correlation(capture, reference, scale: float, search: float) -> Place:
@@ -254,9 +249,10 @@ def _phase_correlation(capture, reference, scale: float, search: float) -> Place
 _resampled = eqx.filter_jit(resample)
 
 
-def _report(capture, reference, place: Place, fit: Fit) -> Registration:
-    error = _standard_errors(fit)
-    pair = fit.pair
+def _report(
+    capture, reference, place: Place, pair: Pair, unknowns: Array, converged: bool
+) -> Registration:
+    error = _standard_errors(pair, unknowns)
     registered = np.asarray(
         _resampled(jnp.asarray(reference), jnp.asarray(place.scale), jnp.asarray(place.shift))
     )
@@ -270,7 +266,7 @@ def _report(capture, reference, place: Place, fit: Fit) -> Registration:
             f"the images correlate by {correlation:.2f} only: they show different scenes, too much "
             "noise, or are further apart than search"
         )
-    if not fit.converged:
+    if not converged:
         unfinished = "least squares did not converge; try max_steps"
     edge = max(capture.shape) / 2
     return Registration(
@@ -284,9 +280,9 @@ def _report(capture, reference, place: Place, fit: Fit) -> Registration:
     )
 
 
-def _standard_errors(fit: Fit) -> np.ndarray:
+def _standard_errors(pair: Pair, unknowns: Array) -> np.ndarray:
     """Of the unknowns: (JᵀJ)⁻¹ S (JᵀJ)⁻¹ with S = Σ_block (Jᵀr)(Jᵀr)ᵀ, r summed over blocks."""
-    jacobian, values = (np.asarray(v) for v in _linearised(fit.unknowns, fit.pair))
+    jacobian, values = (np.asarray(v) for v in _linearised(unknowns, pair))
     scores = jacobian * values[..., None]
     rows, columns = (n - n % _BLOCK for n in values.shape)
     blocks = block_sum(np.moveaxis(scores, -1, 0)[:, :rows, :columns], _BLOCK)

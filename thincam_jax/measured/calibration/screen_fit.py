@@ -154,7 +154,10 @@ class _State(eqx.Module):
             return eqx.tree_at(where, self, new)
         if name == "index":
             indices = changed(hologram.index, step), changed(screen.glass_index, step)
-            return eqx.tree_at(_indices, self, indices)
+            places = operator.attrgetter(
+                "camera.screen.hologram.index", "camera.screen.glass_index"
+            )
+            return eqx.tree_at(places, self, indices)
         if name == "shrinkage":
             processed = hologram.processed(step), self.shrinkage + (1 - self.shrinkage) * step
             return eqx.tree_at(lambda s: (s.camera.screen.hologram, s.shrinkage), self, processed)
@@ -172,10 +175,6 @@ class _State(eqx.Module):
             "tilt": jnp.arctan2(grating[0], -grating[1]),
             "shrinkage": self.shrinkage,
         }[name]
-
-
-def _indices(state: _State):
-    return state.camera.screen.hologram.index, state.camera.screen.glass_index
 
 
 def _turned(grating: Float[Array, "3"], name: str, angle) -> Float[Array, "3"]:

@@ -71,16 +71,16 @@ def calibrate_separable(
         )
     dtype = np.result_type(*stacks, np.float32)
     down, across = (_decoded(s.astype(dtype), shown) for s in stacks)
-    left = _one_factor(down)
-    right = _one_factor(np.swapaxes(across, 1, 2))
+    left = _one_factor(down, "rows")
+    right = _one_factor(np.swapaxes(across, 1, 2), "columns")
     # Both are |P1||Q1|, with the sign that the two factors' signs leave.
     scale = (left.shared @ right.own.sum(axis=1) + right.shared @ left.own.sum(axis=1)) / 2
     if scale == 0:
         raise ValueError("the captures are dark; light the stripes, or expose for longer")
     operator = Separable(left.own, right.own / scale)
     missed = np.hypot(left.rest, right.rest) / np.hypot(left.whole, right.whole)
-    reasons = [_reason(f, what) for f, what in ((left, "rows"), (right, "columns"))]
-    return SeparableFit(operator, float(missed), "ok", "; ".join(filter(None, reasons)))
+    reason = "; ".join(filter(None, (left.reason, right.reason)))
+    return SeparableFit(operator, float(missed), "ok", reason)
 
 
 def fit_separable(
@@ -176,19 +176,18 @@ class _Factor:
     """Stripes as products with one vector that all share.
 
     - `own`: (y, stripe). `shared`: (x), of length 1. `whole`, `rest`: lengths of the captures and
-      of what is left of them. `second`, `noise`: the second singular value, and that of noise.
+      of what is left of them. `reason`: what is seen of a second term.
     """
 
     own: np.ndarray
     shared: np.ndarray
     whole: float
     rest: float
-    second: float
-    noise: float
+    reason: str
 
 
-def _one_factor(captures: Float[np.ndarray, "n y x"]) -> _Factor:
-    """The nearest captures of the form p_i vᵀ."""
+def _one_factor(captures: Float[np.ndarray, "n y x"], what: str) -> _Factor:
+    """The nearest captures of the form p_i vᵀ, of stripes along `what`."""
     flat = captures.reshape(-1, captures.shape[2])
     squares, vectors = np.linalg.eigh(flat.T @ flat)
     shared = vectors[:, -1]
@@ -196,27 +195,17 @@ def _one_factor(captures: Float[np.ndarray, "n y x"]) -> _Factor:
     # White noise has its largest singular value at σ(√rows + √columns); half of them are below the
     # median, which few terms do not move.
     rows, columns = flat.shape
-    sigma = np.sqrt(np.median(squares) / rows)
-    return _Factor(
-        (captures @ shared).T,
-        shared,
-        float(np.sqrt(squares.sum())),
-        float(np.sqrt(squares[:-1].sum())),
-        float(np.sqrt(squares[-2])) if columns > 1 else 0.0,
-        float(sigma * (np.sqrt(rows) + np.sqrt(columns))),
-    )
-
-
-def _reason(factor: _Factor, what: str) -> str:
-    """Whether more than one term is seen."""
-    first = np.sqrt(max(factor.whole**2 - factor.rest**2, 1e-300))
-    if factor.second < max(_NOTICED * factor.noise, _WORTH * first):
-        return ""
-    return (
-        f"stripes along {what} are no products of two vectors: a second one has "
-        f"{100 * factor.second / first:.0f} % of the first; centre the captures if the shadow "
-        "overfills the sensor, else fit_separable with two terms"
-    )
+    noise = np.sqrt(np.median(squares) / rows) * (np.sqrt(rows) + np.sqrt(columns))
+    *_, second, first = np.sqrt([0.0, *squares])
+    first, reason = max(first, 1e-150), ""
+    if second >= max(_NOTICED * noise, _WORTH * first):
+        reason = (
+            f"stripes along {what} are no products of two vectors: a second one has "
+            f"{100 * second / first:.0f} % of the first; centre the captures if the shadow "
+            "overfills the sensor, else fit_separable with two terms"
+        )
+    whole, rest = (float(np.sqrt(part.sum())) for part in (squares, squares[:-1]))
+    return _Factor((captures @ shared).T, shared, whole, rest, reason)
 
 
 def _decoded(captures: Float[np.ndarray, "n y x"], shown: Shown) -> Float[np.ndarray, "n y x"]:

@@ -108,22 +108,17 @@ class Sirm(IntEnum):
 
 SIRM_LENGTH = 0x30
 MANIFEST_ENTRY = struct.Struct("<IIQQ")  # version, schema, address, size; 64 bytes with the rest
-MANIFEST_STRIDE = 64
 ZIPPED = 1  # bits 10 … 15 of an entry's schema: 0 plain, 1 zip
 
 
 @dataclass(frozen=True)
 class Packet:
-    """A decoded packet; `flags` of a command stand where an answer has its `status`."""
+    """A decoded packet; a command has flags where an answer has its `status`."""
 
-    flags: int
+    status: int
     command: int
     request: int
     data: bytes
-
-    @property
-    def status(self) -> int:
-        return self.flags
 
 
 def read_command(address: int, length: int, request: int) -> bytes:
