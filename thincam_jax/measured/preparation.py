@@ -91,9 +91,11 @@ def prepare(
     log: dict[str, Any] = {"full_scale": {name: _facts(raw) for name, raw in raws.items()}}
     planes = {name: _in_full_scale(raw) for name, raw in raws.items()}
     saturated = {name: _saturated(raw, planes[name], options) for name, raw in raws.items()}
-    corner = _corner(planes["psf"], options)
+    square = slice(None), slice(*options.corner), slice(*options.corner)
+    corner = planes["psf"][square].mean(axis=(1, 2), keepdims=True, dtype=np.float64)
+    corner = corner.astype(np.float32)
     levels = {n: _level(b, raws[n], corner) for n, b in backgrounds.items()}
-    noise = _noise(planes["psf"] - levels["psf"], options)
+    noise = _noise((planes["psf"] - levels["psf"])[square].astype(np.float64), options)
     log["background"] = {n: _background_facts(b, levels[n]) for n, b in backgrounds.items()}
     planes = {n: planes[n] - levels[n] for n in planes}
     log["clipping"] = {n: int(np.count_nonzero(p < 0)) for n, p in planes.items()}
@@ -101,7 +103,10 @@ def prepare(
     frames = {
         n: _Frame(np.maximum(p, 0), saturated[n], _known(known, p.shape)) for n, p in planes.items()
     }
-    log["validity"] = {n: _counts(f, raws[n]) for n, f in frames.items()}
+    log["validity"] = {
+        n: {"saturated": int(f.saturated.sum()), "dead": int((~f.known).sum()) // raws[n].channels}
+        for n, f in frames.items()
+    }
     if options.bayer is not None:
         frames = {n: _demosaiced(f, options) for n, f in frames.items()}
     how = options.demosaicing if options.bayer else None
@@ -148,20 +153,8 @@ def _saturated(raw: Raw, planes: np.ndarray, options: Preparation) -> np.ndarray
     return planes >= np.float32(options.saturation or 1.0)
 
 
-def _corner(psf: np.ndarray, options: Preparation) -> np.ndarray:
-    """The mean of each channel in the corner, (channel, 1, 1)."""
-    part = _corner_part(psf, options)
-    return part.mean(axis=(1, 2), keepdims=True, dtype=np.float64).astype(np.float32)
-
-
-def _corner_part(psf: np.ndarray, options: Preparation) -> np.ndarray:
-    box = slice(*options.corner)
-    return psf[:, box, box]
-
-
-def _noise(psf: np.ndarray, options: Preparation) -> np.ndarray:
-    """Standard deviation of a pixel after block means, one a channel, from the corner."""
-    part = _corner_part(psf, options).astype(np.float64)
+def _noise(part: np.ndarray, options: Preparation) -> np.ndarray:
+    """Standard deviation of a pixel after block means, one a channel, from a dark part."""
     if options.bayer is None:
         spread = part.std(axis=(1, 2))
     else:  # of each colour's own pixels: their means may differ
@@ -184,13 +177,6 @@ def _background_facts(background: Background, level: np.ndarray) -> dict[str, An
     if isinstance(background, Raw):
         kind = f"dark frame {background.name}"
     return {"kind": kind, "level": level.mean(axis=(1, 2), dtype=np.float64).tolist()}
-
-
-def _counts(frame: _Frame, raw: Raw) -> dict[str, int]:
-    return {
-        "saturated": int(np.count_nonzero(frame.saturated)),
-        "dead": int(np.count_nonzero(~frame.known)) // raw.channels,
-    }
 
 
 def _demosaiced(frame: _Frame, options: Preparation) -> _Frame:

@@ -8,6 +8,7 @@ where
 
 import json
 import time
+from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -21,7 +22,7 @@ from scipy.optimize import isotonic_regression
 
 from thincam_jax._core.files import read_regular, write_whole
 from thincam_jax.hardware.base import Camera, Display
-from thincam_jax.hardware.errors import Saturated
+from thincam_jax.hardware.errors import OutOfRange, Saturated
 
 LEVELS = 256
 _MOST_SATURATED = 1e-3  # of the pixels
@@ -63,6 +64,24 @@ class GreyLevels:
             return cls(table.astype(np.uint8), content["provenance"])
         except (ValueError, KeyError, TypeError) as error:
             raise ValueError(f"{path} holds no table of grey levels: {error}") from error
+
+
+class Screen(Display):
+    """A display of 256 levels; with `grey_levels`, in equal steps of the irradiance."""
+
+    def __init__(self, grey_levels: GreyLevels | None = None):
+        self.grey_levels = grey_levels
+
+    def show(self, pattern: np.ndarray) -> None:
+        if pattern.shape != self.shape or pattern.dtype != np.uint8:
+            cause = f"a pattern {pattern.shape} of {pattern.dtype}"
+            remedy = f"give uint8 levels of shape {self.shape}"
+            raise OutOfRange(str(self.identity), "show", cause, remedy)
+        self._present(pattern if self.grey_levels is None else self.grey_levels(pattern))
+
+    @abstractmethod
+    def _present(self, levels: np.ndarray) -> None:
+        """Presents levels as they are, and returns once they are."""
 
 
 def linear_levels(

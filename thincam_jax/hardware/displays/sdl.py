@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 
 from thincam_jax.hardware.base import Identity
-from thincam_jax.hardware.displays.grey_levels import GreyLevels
-from thincam_jax.hardware.displays.screen import Screen
+from thincam_jax.hardware.displays.grey_levels import GreyLevels, Screen
 from thincam_jax.hardware.errors import Disconnected, NotFound, ProtocolError
 
 with warnings.catch_warnings():

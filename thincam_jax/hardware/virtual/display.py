@@ -7,8 +7,7 @@ from importlib.metadata import version
 import numpy as np
 
 from thincam_jax.hardware.base import Identity
-from thincam_jax.hardware.displays.grey_levels import GreyLevels
-from thincam_jax.hardware.displays.screen import Screen
+from thincam_jax.hardware.displays.grey_levels import GreyLevels, Screen
 from thincam_jax.hardware.virtual.faults import Faults
 
 _LATENCY = 0.05  # s

@@ -181,11 +181,8 @@ class VirtualUsb3Vision(IBackend):
         """What the camera is set to."""
         exposure, gain = struct.unpack_from("<dd", self._memory, EXPOSURE)
         region = Region(*(self._number(a) for a in (TOP, LEFT, HEIGHT, WIDTH)))
-        names, code = (
-            {n: name for name, (n, _) in PIXEL_FORMATS.items()},
-            self._number(PIXEL_FORMAT),
-        )
-        return CameraSettings(exposure * 1e-6, region, names[code], gain)
+        names = {code: name for name, (code, _) in PIXEL_FORMATS.items()}
+        return CameraSettings(exposure * 1e-6, region, names[self._number(PIXEL_FORMAT)], gain)
 
     def _derive(self) -> None:
         settings = self.settings

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from thincam_jax.learn.refocusing.cameras import RefocusCamera
 from thincam_jax.learn.refocusing.linear import LinearStep
 from thincam_jax.learn.refocusing.loss import Parts, relative_error
-from thincam_jax.learn.refocusing.network import constant_images, noise_level, sizes_of
+from thincam_jax.learn.refocusing.network import constant_images, noise_level
 from thincam_jax.learn.refocusing.planes import Planes
 from thincam_jax.learn.refocusing.scenes import Batch
 from thincam_jax.learn.refocusing.unet import UNet
@@ -84,5 +84,5 @@ def _inverted(planes: Planes, step: LinearStep, capture, deviation, distance):
     residual = (capture - mean * planes.uniform) / unit
     spectrum = jnp.fft.rfft2(planes.from_sensor(residual))
     spectra = planes.spectra_at(distance[None])
-    added = step(spectrum, spectra, (deviation / unit) ** 2, sizes_of(planes))
+    added = step(spectrum, spectra, (deviation / unit) ** 2, planes)
     return mean * (1 + planes.on_field(added))

@@ -7,12 +7,15 @@ spectrum η. In half-quadratic splitting it is the exact solution of the step th
 the data, with 1/P_k in place of its penalty. P_k and η are learnt.
 """
 
+import math
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from thincam_jax._core.checks import Number
+from thincam_jax.learn.refocusing.planes import Planes
 from thincam_jax.reconstruction.fourier_splitting import squared_modulus
 
 
@@ -43,7 +46,7 @@ class LinearStep(eqx.Module):
         residual: Complex[Array, "v u"],
         spectra: Complex[Array, "plane v u"],
         variance: Float[Array, ""],
-        sizes: "Sizes",
+        planes: Planes,
         place: Float[Array, "place plane"] | None = None,
     ) -> Complex[Array, "plane v u"]:
         """What to add to the planes' spectra for a residual of the capture.
@@ -52,41 +55,27 @@ class LinearStep(eqx.Module):
         1 where a plane stands, default each at its own.
         """
         dtype = variance.dtype
-        squared, corner = sizes.frequencies()
+        window, field = planes.window, planes.operator.field_shape
+        v, u = np.fft.fftfreq(window[0]), np.fft.rfftfreq(window[1])
+        squared, corner = v[:, None] ** 2 + u**2, 1 / max(field) ** 2  # ρ², ρ₀²
         shape = (jnp.asarray(squared, dtype) + corner) ** -self.slope.astype(dtype)
-        shape = shape / sizes.mean(shape)
+        shape = shape / _mean(shape, window)
         power = jnp.exp(self.power.astype(dtype))
         power = (power if place is None else power @ place)[:, None, None] * shape
         factor, model = jnp.exp(self.noise.astype(dtype))
         # Sums of squares of the transforms: of white noise on the sensor, of an image on the field.
-        ratio = (factor * variance + model) * sizes.sensor / sizes.field
+        pixels = math.prod(planes.operator.sensor_shape)
+        ratio = (factor * variance + model) * pixels / math.prod(field)
         total = jnp.sum(power * squared_modulus(spectra), axis=0) + ratio
         filtered = residual * (1 / total).astype(residual.dtype)
         return spectra.conj() * filtered * power.astype(residual.dtype)
 
 
-class Sizes(eqx.Module):
-    """Numbers of pixels that the spectra's units depend on."""
-
-    window: tuple[int, int] = eqx.field(static=True)
-    field_shape: tuple[int, int] = eqx.field(static=True)
-    sensor: int = eqx.field(static=True)
-
-    @property
-    def field(self) -> int:
-        """Pixels of the field."""
-        return self.field_shape[0] * self.field_shape[1]
-
-    def frequencies(self) -> tuple[np.ndarray, float]:
-        """ρ² on the half plane and ρ₀², (cycles per pixel)²."""
-        v, u = np.fft.fftfreq(self.window[0]), np.fft.rfftfreq(self.window[1])
-        return v[:, None] ** 2 + u**2, 1 / max(self.field_shape) ** 2
-
-    def mean(self, spectrum: Float[Array, "v u"]) -> Float[Array, ""]:
-        """Mean over the whole plane of what is given on the half plane."""
-        weights = np.full(spectrum.shape[-1], 2.0)
-        weights[0] = 1.0
-        if self.window[1] % 2 == 0:
-            weights[-1] = 1.0
-        weights = jnp.asarray(weights / (self.window[0] * self.window[1]), spectrum.dtype)
-        return jnp.sum(spectrum * weights)
+def _mean(spectrum: Float[Array, "v u"], window: tuple[int, int]) -> Float[Array, ""]:
+    """Mean over the whole plane of what is given on the half plane."""
+    weights = np.full(spectrum.shape[-1], 2.0)
+    weights[0] = 1.0
+    if window[1] % 2 == 0:
+        weights[-1] = 1.0
+    weights = jnp.asarray(weights / math.prod(window), spectrum.dtype)
+    return jnp.sum(spectrum * weights)

@@ -23,7 +23,7 @@ from thincam_jax._core.checks import Number, Numbers
 from thincam_jax._core.module import Module
 from thincam_jax.learn.refocusing.cameras import RefocusCamera, Stand
 from thincam_jax.learn.refocusing.lens_blur import lens_blur
-from thincam_jax.learn.refocusing.linear import LinearStep, Sizes
+from thincam_jax.learn.refocusing.linear import LinearStep
 from thincam_jax.learn.refocusing.planes import Planes
 from thincam_jax.learn.refocusing.unet import UNet
 
@@ -241,18 +241,18 @@ def prepared(
     planes, camera = network.planes, network.camera
     joint, alone = network.weights.joint[number], network.weights.alone[number]
     capture, sigma, stand, spectra = given
-    sizes, variance = sizes_of(planes), sigma**2
+    variance = sigma**2
     if stack is None:
         # A uniform scene first: its light is most of the capture, and not in the powers.
         count = stand.inverse.size
-        stack = jnp.full((count, *sizes.field_shape), 1 / count, planes.dtype)
+        stack = jnp.full((count, *camera.field_shape), 1 / count, planes.dtype)
         residual = capture - planes.uniform.astype(planes.dtype) / planes.unit.astype(planes.dtype)
     else:
         residual = capture - seen_of(planes, stack, spectra)
     spectrum = jnp.fft.rfft2(planes.from_sensor(residual))
-    tied = stack + planes.on_field(joint(spectrum, spectra, variance, sizes, stand.place))
+    tied = stack + planes.on_field(joint(spectrum, spectra, variance, planes, stand.place))
     there = spectra[stand.number][None]
-    sharp = planes.on_field(alone(spectrum, there, variance, sizes))
+    sharp = planes.on_field(alone(spectrum, there, variance, planes))
     radius = camera.defocus_radius(stand.inverse - stand.inverse[stand.number])
     lens = jnp.sum(lens_blur(tied, radius, camera.largest_blur), axis=0, keepdims=True)
     total = jnp.sum(tied, axis=0, keepdims=True)
@@ -279,11 +279,6 @@ def seen_of(
 ) -> Float[Array, "y x"]:
     """The capture of a stack."""
     return planes.seen(jnp.sum(planes.from_field(stack) * spectra, axis=0))
-
-
-def sizes_of(planes: Planes) -> Sizes:
-    rows, columns = planes.operator.sensor_shape
-    return Sizes(planes.window, planes.operator.field_shape, rows * columns)
 
 
 def noise_level(deviation: Float[Array, ""]) -> Float[Array, ""]:

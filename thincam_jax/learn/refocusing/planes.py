@@ -54,10 +54,7 @@ class Planes(eqx.Module):
 
     def seen(self, spectrum: Complex[Array, "v u"]) -> Float[Array, "y x"]:
         """What the sensor sees of an image on the window, given by its spectrum."""
-        return self.on_sensor(jnp.fft.irfft2(spectrum, s=self.window))
-
-    def on_sensor(self, image: Float[Array, "v u"]) -> Float[Array, "y x"]:
-        """The sensor's part of the window."""
+        image = jnp.fft.irfft2(spectrum, s=self.window)
         return cut(image, self.operator.sensor_corner, self.operator.sensor_shape)
 
     def from_sensor(self, capture: Float[Array, "y x"]) -> Float[Array, "v u"]:

@@ -154,10 +154,8 @@ class _State(eqx.Module):
             return eqx.tree_at(where, self, new)
         if name == "index":
             indices = changed(hologram.index, step), changed(screen.glass_index, step)
-            places = operator.attrgetter(
-                "camera.screen.hologram.index", "camera.screen.glass_index"
-            )
-            return eqx.tree_at(places, self, indices)
+            paths = "camera.screen.hologram.index", "camera.screen.glass_index"
+            return eqx.tree_at(operator.attrgetter(*paths), self, indices)
         if name == "shrinkage":
             processed = hologram.processed(step), self.shrinkage + (1 - self.shrinkage) * step
             return eqx.tree_at(lambda s: (s.camera.screen.hologram, s.shrinkage), self, processed)
