@@ -92,7 +92,8 @@ def test_counts_follow_the_exposure_with_their_noise_and_saturate():
     taken.on_show(white)
     short = CameraSettings(exposure=0.001)
     frames = np.stack([taken.expose(short) for _ in range(100)])
-    clean = taken.clean_counts(white, 0.0, short)
+    scale, offset = taken.electronics.scale(short)
+    clean = scale * short.exposure * taken.optics(white, 0.0) + offset
     spread = of_an_electron * np.sqrt((clean - 100) / of_an_electron + 20**2)
     unclipped = clean < 3500
     error = (frames.mean(axis=0) - clean)[unclipped] / spread[unclipped]

@@ -48,6 +48,7 @@ def test_padding_of_a_bcoo_is_left_out():
     )
     operator = Sparse(broken, IN, OUT)
     np.testing.assert_allclose(dense(operator), H, atol=1e-14)
+    np.testing.assert_allclose(operator.by_rows().toarray(), H, atol=1e-14)
     g = jnp.asarray(numbers(OUT))
     np.testing.assert_allclose(operator.adjoint(g).ravel(), np.ravel(g) @ H, atol=1e-13)
     slope = eqx.filter_grad(lambda o: jnp.sum(o(jnp.ones(IN)) ** 2))(operator)

@@ -223,19 +223,11 @@ class _CaptureRun:
 
     def _exact(self) -> tuple[Any, np.ndarray]:
         """The matrix of direct simulation in counts, and the noise of each pixel's entries."""
-        import scipy
-
         camera, captures = self.taken.simulated, self.taken.hadamard
         assert camera is not None and captures is not None
         system = screen_system(self.config)
-        entries = (np.asarray(x) for x in (system.values, system.rows, system.columns))
-        values, rows, columns = entries
-        shape = math.prod(system.out_shape), math.prod(system.in_shape)
-        inside = (rows < shape[0]) & (columns < shape[1])
-        places = rows[inside], columns[inside]
-        matrix = scipy.sparse.csr_array((camera.counts * values[inside], places), shape)
-        numbers = np.arange(shape[0]).reshape(system.out_shape)[self.taken.pixels]
-        matrix = matrix[numbers.ravel()]
+        numbers = np.arange(math.prod(system.out_shape)).reshape(system.out_shape)
+        matrix = camera.counts * system.by_rows()[numbers[self.taken.pixels].ravel()]
         mean = np.asarray(matrix.sum(axis=1), float).ravel() / 2  # half of the cells are lit
         of_an_entry = 2 if captures.series.display == "complementary" else 4
         variance = of_an_entry * camera.variance(mean) / captures.series.cell_count

@@ -10,7 +10,7 @@ import platform
 import shutil
 from collections.abc import Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
@@ -81,7 +81,7 @@ def now() -> str:
     return datetime.now(UTC).isoformat(timespec="milliseconds")
 
 
-class Recorder:
+class Recorder(AbstractContextManager["Recorder"]):
     """Takes the frames of a store in the order of its steps; a context manager.
 
     `missing` are the steps that are still to be taken. Leaving the context writes out what waits.
@@ -120,9 +120,6 @@ class Recorder:
         idle = self._saving is None or self._saving.done()
         if whole and (idle or full):
             self._save()
-
-    def __enter__(self) -> "Recorder":
-        return self
 
     def __exit__(self, *_: object) -> None:
         try:

@@ -1,7 +1,7 @@
 """The devices of an acquisition, each of which can be opened again."""
 
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import asdict
 from typing import Any, Literal
 
@@ -13,7 +13,7 @@ from thincam_jax.hardware.base import Camera, Display, Stage
 Role = Literal["camera", "display", "stage"]
 
 
-class Rig:
+class Rig(AbstractContextManager["Rig"]):
     """Camera, display and, where there is one, stage; a context manager that closes them.
 
     - `open_camera`, `open_display`, `open_stage`: open the device, now and again after it was
@@ -60,9 +60,6 @@ class Rig:
         for device in (self.camera, self.display, self.stage):
             if device is not None:
                 device.close()
-
-    def __enter__(self) -> "Rig":
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()

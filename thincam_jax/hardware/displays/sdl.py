@@ -98,14 +98,6 @@ class SdlDisplay(Screen):
         self._pixels = np.empty(self._shape, np.uint32)
         self._present(np.zeros(self._shape, np.uint8))
 
-    @property
-    def identity(self) -> Identity:
-        return self._identity
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        return self._shape
-
     def close(self) -> None:
         if self._window:
             sdl2.SDL_DestroyWindow(self._window)  # with its renderer and texture

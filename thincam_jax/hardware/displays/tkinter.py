@@ -37,9 +37,11 @@ class TkinterDisplay(Screen):
         except tkinter.TclError as error:
             remedy = "connect a monitor and set DISPLAY"
             raise NotFound("tkinter", "open", str(error), remedy) from error
-        self._version = str(self._root.tk.call("info", "patchlevel"))
+        version = str(self._root.tk.call("info", "patchlevel"))
+        self._identity = Identity("tkinter", "window", "", version)
         screen = self._root.winfo_screenheight(), self._root.winfo_screenwidth()
-        rows, columns = self._shape = tuple(options.size or screen)
+        rows, columns = options.size or screen
+        self._shape = rows, columns
         self._root.overrideredirect(True)
         self._root.geometry(f"{columns}x{rows}+{options.left}+{options.top}")
         self._root.configure(cursor="none")
@@ -52,15 +54,6 @@ class TkinterDisplay(Screen):
     def open(cls, options: Options) -> "TkinterDisplay":
         """Opens the window; NotFound where there is no desktop."""
         return cls(options)
-
-    @property
-    def identity(self) -> Identity:
-        return Identity("tkinter", "window", "", self._version)
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        rows, columns = self._shape
-        return rows, columns
 
     def close(self) -> None:
         with suppress(tkinter.TclError):

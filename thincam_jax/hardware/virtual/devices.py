@@ -6,7 +6,7 @@ its own. Nothing listens on a network.
 """
 
 from collections.abc import Mapping
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack
 from typing import Any
 
 from thincam_jax.hardware.base import Camera, Display, Stage
@@ -17,7 +17,7 @@ from thincam_jax.hardware.virtual.faults import Faults
 from thincam_jax.hardware.virtual.rig import VirtualRig
 
 
-class VirtualDevices:
+class VirtualDevices(AbstractContextManager["VirtualDevices"]):
     """The devices that see and change one `VirtualRig`; a context manager.
 
     The methods `camera`, `stage` and `display` connect, again and again, as the openers of an
@@ -69,9 +69,6 @@ class VirtualDevices:
     def close(self) -> None:
         """Switch off what runs."""
         self._powered.close()
-
-    def __enter__(self) -> "VirtualDevices":
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()

@@ -31,18 +31,12 @@ class VirtualDisplay(Screen):
         grey_levels: GreyLevels | None = None,
     ):
         super().__init__(grey_levels)
+        own = version("thincam_jax")
+        self._identity = Identity("thincam_jax", "virtual display", "virtual", own)
         self._shape, self._on_show, self._response = shape, on_show, response
         self._faults = faults or Faults()
         self._before = self._target = np.zeros(shape, np.float32)
         self._presented = time.perf_counter()
-
-    @property
-    def identity(self) -> Identity:
-        return Identity("thincam_jax", "virtual display", "virtual", version("thincam_jax"))
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        return self._shape
 
     def levels(self) -> np.ndarray:
         """What the panel shows at this moment, float32 from 0 to 255."""

@@ -161,13 +161,6 @@ class VirtualRig:
             _write_fiducial(pixels, Fiducial(*state, exposure), bits_of(settings))
         return pixels
 
-    def clean_counts(
-        self, shown: UInt8[np.ndarray, "v u"], position: float, settings: CameraSettings
-    ) -> Float[np.ndarray, "y x"]:
-        """What a frame would be without noise, rounding and saturation."""
-        scale, offset = self.electronics.scale(settings)
-        return scale * settings.exposure * self.optics(shown, position) + offset
-
     def _image(self, number: int, shown: np.ndarray) -> np.ndarray:
         key = number, round(1000 * self._position)
         if key not in self._known:

@@ -186,9 +186,7 @@ def _rows(matrix: Any) -> Any:
     if isinstance(matrix, Matrix):
         return matrix.matrix
     if isinstance(matrix, Sparse):
-        shape = (math.prod(matrix.out_shape), math.prod(matrix.in_shape))
-        places = np.asarray(matrix.rows), np.asarray(matrix.columns)
-        return scipy.sparse.csr_array((np.asarray(matrix.values), places), shape=shape)
+        return matrix.by_rows()
     if isinstance(matrix, Scaled):
         rows = _rows(matrix.operator)
         gain = np.broadcast_to(matrix.gain, matrix.out_shape).ravel().astype(rows.dtype)

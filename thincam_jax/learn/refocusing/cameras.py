@@ -172,7 +172,9 @@ class RefocusCamera(eqx.Module):
     def kernels(self, distances: Float[Array, " plane"]) -> Float[Array, "plane k l"]:
         """The PSFs at these distances, mm, on `support` pixels."""
         grid = self.camera.sensor.grid.with_shape(self.support)
-        return jax.vmap(lambda t: self._psf(t, grid))(distances)
+        how = {"grid": grid, "model": self.model, "pixel_integration": True}
+        light = list(zip(self.light.wavelengths, self.light.weights, strict=True))
+        return jax.vmap(lambda t: spectral_psf(self.camera, light, t, **how))(distances)
 
     def _support(self) -> tuple[int, int]:
         whole = kernel_shape(self.camera.sensor.shape, self.field_shape)
@@ -180,8 +182,3 @@ class RefocusCamera(eqx.Module):
         shadow = [math.ceil(float(side) * scale) + 2 * _MARGIN for side in self.camera.mask.extent]
         rows, columns = (min(n + (n - w) % 2, w) for n, w in zip(shadow, whole, strict=True))
         return rows, columns
-
-    def _psf(self, distance, grid):
-        light = zip(self.light.wavelengths, self.light.weights, strict=True)
-        how = {"model": self.model, "pixel_integration": True}
-        return spectral_psf(self.camera, light, distance, grid=grid, **how)

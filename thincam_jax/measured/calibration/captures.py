@@ -5,6 +5,7 @@ the recovery of the matrix, which reads all frames of some rows, touch few bytes
 """
 
 import dataclasses
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -58,7 +59,7 @@ class HadamardCaptures:
         return frames if self.stored_at is None else frames[list(self.stored_at)]
 
 
-class CaptureWriter:
+class CaptureWriter(AbstractContextManager["CaptureWriter"]):
     """Takes the frames of a calibration in any order; a context manager.
 
     Frames are written out when the 16 of a chunk are there, the others when it is closed.
@@ -107,9 +108,6 @@ class CaptureWriter:
         """Write out what waits for the rest of its chunk."""
         while self._waiting:
             self._write_out(min(self._waiting))
-
-    def __enter__(self) -> "CaptureWriter":
-        return self
 
     def __exit__(self, *error: object) -> None:
         self.close()

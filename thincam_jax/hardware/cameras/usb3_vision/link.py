@@ -9,6 +9,7 @@ import struct
 from array import array
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path
 from time import monotonic, sleep
 from typing import Any
@@ -214,14 +215,11 @@ class Control:
         parts, end = [], monotonic() + LONGEST_READ
         for start in range(0, length, step):
             size = min(step, length - start)
-            data = self._exchange(
-                lambda request, a=address + start, n=size: gencp.read_command(a, n, request),
-                Command.READ_ACKNOWLEDGE,
-                f"read {size} bytes at {address + start:#x}",
-            )
+            encode = partial(gencp.read_command, address + start, size)
+            operation = f"read {size} bytes at {address + start:#x}"
+            data = self._exchange(encode, Command.READ_ACKNOWLEDGE, operation)
             if len(data) != size:
-                raise self._link.broken(f"read {size} bytes at {address + start:#x}",
-                                        f"{len(data)} bytes came")  # fmt: skip
+                raise self._link.broken(operation, f"{len(data)} bytes came")
             if monotonic() > end:
                 cause = f"{start + size} bytes came in {LONGEST_READ:g} s"
                 raise Timeout(self._link.name, f"read {length} bytes", cause, "try again")
@@ -233,13 +231,9 @@ class Control:
         self._check(address, len(data), "write")
         step = self._largest_command - gencp.HEADER.size - gencp.ADDRESS.size & ~3
         for start in range(0, len(data), step):
-            self._exchange(
-                lambda request, a=address + start, part=data[start : start + step]: (
-                    gencp.write_command(a, part, request)
-                ),
-                Command.WRITE_ACKNOWLEDGE,
-                f"write at {address + start:#x}",
-            )
+            encode = partial(gencp.write_command, address + start, data[start : start + step])
+            operation = f"write at {address + start:#x}"
+            self._exchange(encode, Command.WRITE_ACKNOWLEDGE, operation)
 
     def _check(self, address: int, length: int, verb: str) -> None:
         """The camera's XML names addresses and lengths, which may be any."""
