@@ -308,13 +308,14 @@ def flattened(network: RefocusNetwork, captures: Numbers, deviation: Numbers):
 def _batched(what: str, network: RefocusNetwork, captures, deviation, distance=None):
     """A property of the explanation of each capture, focused on the same distance or distances."""
     captures, deviation, batch = flattened(network, captures, deviation)
-    distance = network.camera.middle if distance is None else distance
     out = _explained(what, network, captures, deviation, distance)
     return jax.tree.map(lambda x: x.reshape(*batch, *x.shape[1:]), out)
 
 
 @eqx.filter_jit
 def _explained(what: str, network: RefocusNetwork, captures, deviations, distance):
+    distance = network.camera.middle if distance is None else distance
+
     def one(capture, deviation, distance):
         return getattr(explain(network, capture, deviation, distance), what)
 
