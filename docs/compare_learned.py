@@ -41,8 +41,9 @@ from score_refocusing import (
 )
 
 from thincam_jax import learn
+from thincam_jax.commands.checked_config import load_as
 from thincam_jax.commands.learned.build import build_lessons, build_network, build_options
-from thincam_jax.commands.learned.config import load_learned
+from thincam_jax.commands.learned.config import LearnedConfig
 from thincam_jax.learn.refocusing.baselines import ControlCode, control_loss
 from thincam_jax.learn.refocusing.unet import parameter_count
 from thincam_jax.learn.training import Task, train_model
@@ -237,5 +238,5 @@ if __name__ == "__main__":
     path, images, tuned, *more = sys.argv[1:]
     count, steps, pool, seeds = more + ["8", "4000", "120", "3"][len(more) :]
     told = (*SMALL, f"training.steps={steps}", f"training.pool={pool}")
-    configs = [load_learned(path, (*told, f"seed={seed}")) for seed in range(int(seeds))]
+    configs = [load_as(LearnedConfig, path, (*told, f"seed={seed}")) for seed in range(int(seeds))]
     main(configs, images, tuned, int(count))

@@ -25,8 +25,9 @@ from scipy import ndimage
 
 import thincam_jax as tc
 from thincam_jax import learn
+from thincam_jax.commands.checked_config import load_as
 from thincam_jax.commands.learned.build import build_camera
-from thincam_jax.commands.learned.config import load_learned
+from thincam_jax.commands.learned.config import LearnedConfig
 from thincam_jax.imaging.targets import middle_square, resize, sample_image
 from thincam_jax.learn.refocusing.baselines import wiener
 from thincam_jax.learn.refocusing.evaluation import (
@@ -393,7 +394,7 @@ def picture(methods: Methods) -> None:
 
 if __name__ == "__main__":
     config, path, images, tuned, *more = sys.argv[1:]
-    camera = build_camera(load_learned(config))
+    camera = build_camera(load_as(LearnedConfig, config))
     network = learn.load(path, camera)
     side = 5 * max(camera.field_shape) // 4
     pictures, known = (squares(folder, camera, side) for folder in (images, tuned))

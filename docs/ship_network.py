@@ -11,14 +11,15 @@ import jax
 import jax.numpy as jnp
 
 from thincam_jax import learn
+from thincam_jax.commands.checked_config import load_as
 from thincam_jax.commands.learned.build import build_camera
-from thincam_jax.commands.learned.config import load_learned
+from thincam_jax.commands.learned.config import LearnedConfig
 from thincam_jax.learn.refocusing.store import network_description
 
 PLACE = Path(__file__).parents[1] / "thincam_jax/learn/refocusing/shipped.thincam"
 
 config, path = sys.argv[1:]
-network = learn.load(path, build_camera(load_learned(config)))
+network = learn.load(path, build_camera(load_as(LearnedConfig, config)))
 half = jax.tree.map(lambda leaf: leaf.astype(jnp.float16), network.weights)
 told = network_description(path)["training"]
 learn.save(PLACE, eqx.tree_at(lambda n: n.weights, network, half), told)

@@ -18,8 +18,9 @@ from score_refocusing import FAR, NEAR, SNR, Methods, halves, head, interval, ro
 
 import thincam_jax as tc
 from thincam_jax import learn
+from thincam_jax.commands.checked_config import load_as
 from thincam_jax.commands.learned.build import build_camera
-from thincam_jax.commands.learned.config import load_learned
+from thincam_jax.commands.learned.config import LearnedConfig
 from thincam_jax.imaging.targets import siemens_star
 from thincam_jax.learn.refocusing.dead_leaves import dead_leaves
 from thincam_jax.reconstruction.depth import axial_resolution
@@ -86,7 +87,7 @@ def baselines(camera) -> Methods:
 
 
 def main(config: str, images: str, tuned: str, count: int) -> None:
-    here = build_camera(load_learned(config))
+    here = build_camera(load_as(LearnedConfig, config))
     cameras = {
         "the thesis' camera": (thesis_camera(256), THESIS),
         "the camera here": (here, (NEAR, FAR)),

@@ -14,7 +14,8 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import numpy as np
 
-from thincam_jax.commands.plate.config import load_plate_design
+from thincam_jax.commands.checked_config import load_as
+from thincam_jax.commands.plate.config import PlateDesignConfig
 from thincam_jax.commands.plate.run import NUMBERS, PlateFolder, design_plate
 
 SIZE = os.environ.get("THINCAM_SIZE", "full")  # "small": fewer pixels, cells and steps
@@ -39,7 +40,7 @@ small = (
     "focal_distances=[4 mm, 8 mm]",
     "method={name: ridge, kind: ridge}",
 )
-config = load_plate_design(CONFIG, small if SIZE == "small" else ())
+config = load_as(PlateDesignConfig, CONFIG, small if SIZE == "small" else ())
 result = design_plate(config, PlateFolder(FIGURES / "run"), lambda step, _: print(step))
 plates = result["plates"]
 for name, plate in plates.items():

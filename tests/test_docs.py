@@ -217,7 +217,8 @@ def test_learned_thesis_page(monkeypatch):
     with jax.enable_x64(False), jax.numpy_dtype_promotion("standard"):  # as a user has it
         script = runpy.run_path(str(ROOT / "docs/thesis_refocusing.py"))
         thesis, optics = script["thesis_camera"], script["optics"]
-        here = script["build_camera"](script["load_learned"](ROOT / "configs/learned_refocus.yaml"))
+        path = ROOT / "configs/learned_refocus.yaml"
+        here = script["build_camera"](script["load_as"](script["LearnedConfig"], path))
         for camera, distances in ((thesis(256), script["THESIS"]), (here, (60.0, 120.0))):
             found = optics(camera, distances)
             row = [f"{found['depth of focus']:.0f} mm", f"{found['wider']:.2g}"]

@@ -168,7 +168,7 @@ class TestBenchAccuracy:
         options = ("--size", 64, "--size", 32, "--capture-size", 48, "--set", "name=Other")
         assert call("bench", "accuracy", file, *options).exit_code == 0
         ((plan, folder),) = seen
-        assert (plan.sizes, plan.capture_size) == ((32, 64), 48)
+        assert (plan.sizes, max(plan.case.study.sensor.shape)) == ((32, 64), 48)
         assert folder.path.as_posix() == "runs/other-accuracy"
 
     def test_fault_in_the_file(self, file):

@@ -12,8 +12,9 @@ import pytest
 from learn import tiny_network as tiny
 
 import thincam_jax as tc
+from thincam_jax.commands.checked_config import load_as
 from thincam_jax.commands.learned.build import build_camera
-from thincam_jax.commands.learned.config import load_learned
+from thincam_jax.commands.learned.config import LearnedConfig
 from thincam_jax.learn.checkpoint import CheckpointError, write_arrays
 from thincam_jax.learn.refocusing.baselines import wiener
 from thincam_jax.learn.refocusing.cameras import RefocusCamera
@@ -176,7 +177,7 @@ def test_what_is_shipped_may_be_given_on():
 @pytest.mark.thorough
 def test_what_is_shipped_beats_a_wiener_filter():
     """By 2.3 dB when written, whatever its strength, on a scene that it was not trained on."""
-    config = load_learned(Path(__file__).parents[2] / "configs/learned_refocus.yaml")
+    config = load_as(LearnedConfig, Path(__file__).parents[2] / "configs/learned_refocus.yaml")
     network = load(SHIPPED, build_camera(config))
     planes, picture = network.planes, dead_leaves(7, 1, 384)[0][:128, :128]
     scene = flat_scene(planes.camera, [picture], [np.ones(picture.shape)], [60.0])

@@ -7,7 +7,7 @@ import pydantic
 import yaml
 
 from thincam_jax.commands.config_file import ConfigError, override, read_raw
-from thincam_jax.commands.sections import ExperimentConfig
+from thincam_jax.commands.sections import ExperimentConfig, Places
 
 Config = TypeVar("Config", bound=pydantic.BaseModel)
 Experiment = TypeVar("Experiment", bound=ExperimentConfig)
@@ -17,11 +17,10 @@ def load_as(
     model: type[Experiment],
     path: str | Path,
     overrides: tuple[str, ...] = (),
-    seen: str = "targets",
 ) -> Experiment:
     """Read an experiment file of the given sections; `overrides` are "a.b=value" texts.
 
-    `seen` is the list whose image files are named from the folder of the experiment file.
+    Image files of the list `model.pictured` are named from the folder of the experiment file.
 
     **Errors**: ConfigError with one line for each fault: file and line, field, what was given,
     what is allowed. FileNotFoundError where there is no such file.
@@ -30,13 +29,14 @@ def load_as(
     raw, places = read_raw(path)
     asked = {override(raw, text): f"--set {shortened(text)}" for text in overrides}
     config = check_as(model, raw, places, asked, f"{path}:1")
-    config = config.found_at(lambda location: _place(location, places, asked, f"{path}:1"))
     folder = path.resolve().parent
     named = tuple(
         entry.model_copy(update={"path": str(folder / entry.path)}) if entry.path else entry
-        for entry in getattr(config, seen)
+        for entry in getattr(config, model.pictured)
     )
-    return config.model_copy(update={seen: named})
+    config = config.model_copy(update={model.pictured: named})
+    config._places = Places(lambda location: _place(location, places, asked, f"{path}:1"))
+    return config
 
 
 def check_as(

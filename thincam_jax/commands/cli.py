@@ -25,43 +25,30 @@ app = typer.Typer(
     no_args_is_help=True, pretty_exceptions_enable=False, rich_markup_mode=None, cls=InOrder
 )
 bench = typer.Typer(no_args_is_help=True, help="Measure what the models of a study cost.")
-bench.command(
-    epilog=examples_text("thincam bench accuracy study.yaml --size 64 --size 128"),
-)(accuracy)
-app.command(epilog=examples_text("thincam init study", "thincam init design --out mine.yaml"))(init)
-app.command(
-    epilog=examples_text("thincam run study.yaml", "thincam run study.yaml --set noise.snr_db=40"),
-)(run)
-app.command(
-    cls=Grouped,
-    epilog=examples_text(
-        "thincam reconstruct --psf PSF.tif --capture RAW.tif --downsample 4 --out IMAGE.png",
-        "thincam reconstruct --psf PSF.png --capture CAPTURES --background DARK.png --out IMAGES",
-    ),
-)(reconstruct)
-app.command(
-    epilog=examples_text(
-        "thincam sweep study.yaml --grid seed=0:4:5",
-        'thincam sweep study.yaml --grid "methods.*.shots.*.beta=15:30:4 rad/mm^2"',
-    ),
-)(sweep)
-app.command(
-    epilog=examples_text("thincam design design.yaml", "thincam design design.yaml --out found"),
-)(design)
-app.command(
-    epilog=examples_text("thincam train learned.yaml", "thincam train learned.yaml --resume"),
-)(train)
-app.command(
-    epilog=examples_text(
-        "thincam capture rig_virtual.yaml", "thincam capture rig.yaml --out frames.zarr --resume"
-    ),
-)(capture)
 # The callback keeps the name of a single command.
 calibrate = typer.Typer(no_args_is_help=True, help="Find out what a rig's own pictures say of it.")
 calibrate.callback()(lambda: None)
-calibrate.command(
-    epilog=examples_text("thincam calibrate check --psf PSF.tif --capture RAW.tif"),
-)(check)
+for group, command, *examples in (
+    (bench, accuracy, "bench accuracy study.yaml --size 64 --size 128"),
+    (app, init, "init study", "init design --out mine.yaml"),
+    (app, run, "run study.yaml", "run study.yaml --set noise.snr_db=40"),
+    (
+        *(app, reconstruct),
+        "reconstruct --psf PSF.tif --capture RAW.tif --downsample 4 --out IMAGE.png",
+        "reconstruct --psf PSF.png --capture CAPTURES --background DARK.png --out IMAGES",
+    ),
+    (
+        *(app, sweep),
+        "sweep study.yaml --grid seed=0:4:5",
+        'sweep study.yaml --grid "methods.*.shots.*.beta=15:30:4 rad/mm^2"',
+    ),
+    (app, design, "design design.yaml", "design design.yaml --out found"),
+    (app, train, "train learned.yaml", "train learned.yaml --resume"),
+    (app, capture, "capture rig_virtual.yaml", "capture rig.yaml --out frames.zarr --resume"),
+    (calibrate, check, "calibrate check --psf PSF.tif --capture RAW.tif"),
+):
+    layout = Grouped if command is reconstruct else None
+    group.command(cls=layout, epilog=examples_text(*examples))(command)
 app.add_typer(bench, name="bench")
 app.add_typer(calibrate, name="calibrate")
 
@@ -112,10 +99,12 @@ def doctor() -> None:
     print(f"compiled programs: {cache_state()}")
     for name, version in found["versions"].items():
         print(f"{name} {version or 'NOT INSTALLED'}")
-    for name, version in doctoring.optional_versions().items():
+    optional = doctoring.installed(doctoring.OPTIONAL)
+    for name, version in optional.items():
         print(f"optional {name} {version}")
-    for name, purpose in doctoring.missing_parts().items():
-        print(f"optional {name} is missing: {purpose}")
+    for name, purpose in doctoring.OPTIONAL.items():
+        if name not in optional:
+            print(f"optional {name} is missing: {purpose}")
     for line in known_drivers():
         print(line)
 

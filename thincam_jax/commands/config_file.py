@@ -9,6 +9,13 @@ import yaml
 from thincam_jax._core.files import read_regular
 
 _MOST_ENTRIES = 100_000
+# Of the kinds that are not for 'thincam run': the command, and what such a file is.
+COMMANDS = {
+    "design": ("design", "a design"),
+    "screen_design": ("design", "a design"),
+    "capture": ("capture", "a capture"),
+    "learned": ("train", "a network"),
+}
 
 
 class ConfigError(ValueError):
@@ -22,7 +29,8 @@ def read_raw(path: Path) -> tuple[dict, dict[tuple, str]]:
         raise FileNotFoundError(f"{path} is {what}; give the path of a YAML experiment file")
     try:
         node, raw = _read_yaml(read_regular(path).decode("utf-8"))
-        places = {location: f"{path}:{line}" for location, line in _lines(node)}
+        twice: set[tuple[int, str]] = set()  # an aliased part is reported once
+        places = {location: f"{path}:{line}" for location, line in _lines(node, twice)}
     except UnicodeDecodeError as error:
         raise ConfigError(f"{path}: not a text file in UTF-8 ({error.reason})") from None
     except yaml.YAMLError as error:
@@ -36,9 +44,8 @@ def read_raw(path: Path) -> tuple[dict, dict[tuple, str]]:
         raise ConfigError(f"{path}: not valid YAML: {error}; put texts in quotes") from None
     if not isinstance(raw, dict):
         raise ConfigError(f"{path}:1: give a mapping of 'key: value' lines, beginning with 'name:'")
-    twice = [f"{path}:{line}: {message}" for line, message in _repeated_keys(node)]
     if twice:
-        raise ConfigError("\n".join(twice))
+        raise ConfigError("\n".join(f"{path}:{line}: {told}" for line, told in sorted(twice)))
     return raw, places
 
 
@@ -75,43 +82,28 @@ def _entries(node: yaml.Node, known: dict[int, int]) -> int:
     return known.get(id(node), 1)
 
 
-def _repeated_keys(node) -> list[tuple[int, str]]:
-    """Keys that stand twice in one mapping; PyYAML takes the last without a word."""
-    # An aliased part is reported once.
-    return sorted({entry for mapping in _mappings(node) for entry in _repeated_in(mapping)})
+def _lines(node, twice: set[tuple[int, str]], location: tuple = ()):
+    """(location, line) of every entry of a composed YAML document.
 
-
-def _mappings(node):
-    if isinstance(node, yaml.MappingNode):
-        yield node
-    if isinstance(node, yaml.CollectionNode):
-        for entry in node.value:
-            yield from _mappings(entry[1] if isinstance(entry, tuple) else entry)
-
-
-def _repeated_in(mapping: yaml.MappingNode):
-    first: dict[str, int] = {}
-    for key, _ in mapping.value:
-        line = key.start_mark.line + 1
-        if key.value in first:
-            before = f"first in line {first[key.value]}"
-            yield line, f"{key.value}: this key stands twice ({before}); keep one"
-        first.setdefault(key.value, line)
-
-
-def _lines(node, location: tuple = ()):
-    """(location, line) of every entry of a composed YAML document."""
+    `twice` is given the keys that repeat one of their mapping; PyYAML takes the last of them.
+    """
     if node is None:
         return
     yield location, node.start_mark.line + 1
     if isinstance(node, yaml.MappingNode):
+        first: dict[str, int] = {}
         for key, value in node.value:
             # Of a section, a reader looks for the line of its key.
-            yield (*location, key.value, "(key)"), key.start_mark.line + 1
-            yield from _lines(value, (*location, key.value))
+            line = key.start_mark.line + 1
+            yield (*location, key.value, "(key)"), line
+            if key.value in first:
+                before = f"first in line {first[key.value]}"
+                twice.add((line, f"{key.value}: this key stands twice ({before}); keep one"))
+            first.setdefault(key.value, line)
+            yield from _lines(value, twice, (*location, key.value))
     elif isinstance(node, yaml.SequenceNode):
         for index, value in enumerate(node.value):
-            yield from _lines(value, (*location, index))
+            yield from _lines(value, twice, (*location, index))
 
 
 def override(raw: Any, text: str) -> tuple:

@@ -4,6 +4,7 @@ import contextlib
 import os
 import platform
 import sys
+from collections.abc import Iterable
 from importlib import metadata
 from typing import Any
 
@@ -30,12 +31,7 @@ OPTIONAL = {
 
 def environment(seconds: float | None = None) -> dict[str, Any]:
     """Versions and machine of a run."""
-    versions = {}
-    for name in PACKAGES:
-        try:
-            versions[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            versions[name] = None
+    versions = dict.fromkeys(PACKAGES) | installed(PACKAGES)
     return {
         "python": platform.python_version(),
         "platform": f"{platform.system()} {platform.machine()}",
@@ -99,16 +95,10 @@ def _of_channels(response, capture, noise):
     return (response / noise * capture).sum(1) / ((response**2 / noise).sum(1) + 1)
 
 
-def optional_versions() -> dict[str, str]:
-    """Of the optional packages that are installed."""
+def installed(packages: Iterable[str]) -> dict[str, str]:
+    """The versions of those that are."""
     found = {}
-    for name in OPTIONAL:
+    for name in packages:
         with contextlib.suppress(metadata.PackageNotFoundError):
             found[name] = metadata.version(name)
     return found
-
-
-def missing_parts() -> dict[str, str]:
-    """Optional packages that are not installed, and what they are for."""
-    found = optional_versions()
-    return {name: purpose for name, purpose in OPTIONAL.items() if name not in found}

@@ -53,9 +53,7 @@ def init(
 
 def next_command(kind: str) -> str:
     """What takes a file of that name."""
-    from thincam_jax.commands.config_file import read_raw
+    from thincam_jax.commands.config_file import COMMANDS, read_raw
 
     found = read_raw(_folder() / f"{_FILE_OF.get(kind, kind)}.yaml")[0].get("kind")
-    commands = {"design": "design", "screen_design": "design"}
-    commands |= {"capture": "capture", "learned": "train"}
-    return commands.get(str(found), "run")
+    return COMMANDS.get(str(found), ("run",))[0]

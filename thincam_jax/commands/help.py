@@ -14,21 +14,10 @@ ORDER = (
 # Of `thincam reconstruct`; what is in none stands first.
 GROUPS = {
     "Calibration": (
-        "background",
-        "psf_background",
-        "dead",
-        "bits",
-        "psf_bits",
-        "saturation",
-        "noise",
+        *("background", "psf_background", "dead", "bits", "psf_bits", "saturation", "noise"),
     ),
     "Preparation": (
-        "downsample",
-        "bayer",
-        "demosaic",
-        "noise_threshold",
-        "psf_channels",
-        "psf_scale",
+        *("downsample", "bayer", "demosaic", "noise_threshold", "psf_channels", "psf_scale"),
         "corner",
     ),
     "Reconstruction": ("method", "tau", "ridge", "iterations", "coupling"),
@@ -38,7 +27,7 @@ GROUPS = {
 
 def examples_text(*lines: str) -> str:
     """The end of a help text, its lines kept as they are."""
-    return "\n".join(["\b", "Examples:", *(f"  {line}" for line in lines)])
+    return "\n".join(["\b", "Examples:", *(f"  thincam {line}" for line in lines)])
 
 
 class InOrder(TyperGroup):

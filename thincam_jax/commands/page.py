@@ -9,12 +9,18 @@ import jinja2
 
 from thincam_jax._core.files import read_regular
 from thincam_jax.commands.checked_config import dump_config
+from thincam_jax.commands.config_file import slug
 
 
-def render_page(room: str, config: Any, pictures: Path, shown: dict[str, Any]) -> str:
-    """The page of a room, from its template: the experiment, what is `shown`, how it was computed.
+def render_page(
+    room: str, config: Any, pictures: Path, metrics: dict[str, Any], **shown: Any
+) -> str:
+    """The page of a room, from its template: the experiment, its metrics, how it was computed.
 
-    `pictures`: the folder of its figures. Texts are escaped; a name that is missing is an error.
+    - `pictures`: the folder of its figures.
+    - `shown`: the `environment`, what else the template takes, and the `command` of the experiment.
+
+    Texts are escaped; a name that is missing is an error.
     """
     engine = jinja2.Environment(
         loader=jinja2.FunctionLoader(_template),
@@ -23,13 +29,14 @@ def render_page(room: str, config: Any, pictures: Path, shown: dict[str, Any]) -
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    engine.globals["number"] = number
+    engine.globals |= {"number": number, "slug": slug}
 
     def picture(name: str) -> str | None:
         return data_url(pictures / name) if (pictures / name).exists() else None
 
-    page = engine.get_template(f"{room}/page.html.jinja")
-    return page.render(config=config, yaml=dump_config(config), picture=picture, **shown)
+    given = {"command": "run", "warnings": metrics.get("warnings", ()), **shown}
+    given |= {"config": config, "metrics": metrics, "yaml": dump_config(config), "picture": picture}
+    return engine.get_template(f"{room}/page.html.jinja").render(**given)
 
 
 def _template(name: str) -> str:

@@ -4,6 +4,7 @@ import json
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,8 @@ from thincam_jax._core.files import WriteError, read_regular, write_whole
 from thincam_jax.commands.checked_config import dump_config
 from thincam_jax.commands.config_file import ConfigError, slug
 from thincam_jax.commands.doctor import environment
-from thincam_jax.commands.sections import Section
+from thincam_jax.commands.page import render_page
+from thincam_jax.commands.sections import ExperimentConfig, Section
 
 # Called as a step begins, with its text and with the number of all steps.
 Progress = Callable[[str, int], object]
@@ -43,6 +45,7 @@ class RunFolder:
 
     kind = "run"
     folders: tuple[str, ...] = ("targets", "images", "figures")
+    pictures = "figures"
     result = "metrics.json"
 
     def __init__(self, path: str | Path):
@@ -75,13 +78,46 @@ class RunFolder:
         return write_whole(self.path / name, content)
 
     def complete(
-        self, result: dict[str, Any], seed: int, started: float, page: Callable[[dict], str]
+        self,
+        room: str,
+        config: ExperimentConfig,
+        metrics: dict[str, Any],
+        started: float,
+        **shown: Any,
     ) -> None:
-        """Write what surrounds the run, its page made of that, and what marks it as complete."""
+        """Write what surrounds the run, the page of its room, and what marks it as complete."""
         surroundings = environment(time.time() - started)
-        self.write("environment.json", to_json({**surroundings, "seed": seed}))
-        self.write("report.html", page(surroundings))
-        self.write(self.result, to_json(result))
+        self.write("environment.json", to_json({**surroundings, "seed": config.seed}))
+        pictures = self.path / self.pictures
+        page = render_page(room, config, pictures, metrics, environment=surroundings, **shown)
+        self.write("report.html", page)
+        self.write(self.result, to_json(metrics))
+
+
+class Run:
+    """An experiment on its way: its `work`, which ends with a report, fills `metrics`.
+
+    Claims the folder. An interrupted run is done anew, but for what the folder holds of it.
+    """
+
+    def __init__(self, config: Any, folder: RunFolder):
+        self.config, self.folder, self.started = config, folder, time.time()
+        self.metrics: dict[str, Any] = {}
+        self.work: list[Step] = []
+        folder.claim(config)
+
+    def add(self, text: str, do: Callable[..., object], *arguments: Any) -> None:
+        """A step to the work."""
+        self.work.append(Step(text, partial(do, *arguments)))
+
+    def carry_out(self, progress: Progress) -> dict[str, Any]:
+        """Do the work; returns the metrics, which its report has written."""
+        carry_out(self.work, progress)
+        return self.metrics
+
+    def complete(self, room: str, **shown: Any) -> None:
+        """The page of a room with the metrics and what is `shown`, and all that ends the folder."""
+        self.folder.complete(room, self.config, self.metrics, self.started, **shown)
 
 
 def claim_folder(path: Path, name: str, text: str, kind: str, folders: Sequence[str] = ()) -> None:

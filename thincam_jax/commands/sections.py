@@ -1,9 +1,9 @@
 """Sections of experiment files that several kinds share, with the units of their numbers."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Annotated, Literal, TypeVar
+from typing import Annotated, Any, ClassVar, Literal
 
 import pydantic
 from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, PlainSerializer
@@ -40,10 +40,7 @@ def quantity(kind: str, unit: str, *, positive: bool = False):
         return value
 
     # A resolved file is read back, so it is written in the unit of the package, with every digit.
-    return (
-        BeforeValidator(read),
-        PlainSerializer(lambda value: f"{value!r} {unit}"),
-    )
+    return BeforeValidator(read), PlainSerializer(lambda value: f"{value!r} {unit}")
 
 
 Length = Annotated[float, *quantity("length", "mm", positive=True)]
@@ -88,10 +85,7 @@ class SensorConfig(Section):
 
 
 class ApertureConfig(Section):
-    """What all Fresnel zone apertures share.
-
-    - `pixel_pitch`, `fill_factor`: of a display that shows them.
-    """
+    """What all Fresnel zone apertures share; `pixel_pitch`, `fill_factor`: of a display."""
 
     width: Length
     profile: Profile = "cosine"
@@ -109,8 +103,7 @@ _WIDEST = 300.0  # mask of a thin camera, mm
 Relief = Literal["diffuser", "voronoi_fresnel", "contours"]
 Cells = Literal["mura", "ura", "mls", "random"]
 Family = Literal["fza", Cells, "pinhole", "lenslets", "file", Relief]
-# Of any mask that a display shows.
-_DISPLAY = ("pixel_pitch", "fill_factor")
+_DISPLAY = ("pixel_pitch", "fill_factor")  # of any mask that a display shows
 # What a mask of each family is made of, and what may be given besides.
 _NUMBERS: dict[Family, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "fza": (("width",), ("height", "profile", "harmonics")),
@@ -374,12 +367,10 @@ class Places:
     find: Callable[[tuple], str] | None = field(default=None, compare=False)
 
 
-Own = TypeVar("Own", bound="ExperimentConfig")
-
-
 class ExperimentConfig(Section):
     """What every kind of experiment file begins with."""
 
+    pictured: ClassVar[str] = "targets"  # the list that has image files
     name: Name
     title: str = ""
     seed: Annotated[int, Field(ge=0, lt=2**32, strict=True)] = 0
@@ -388,12 +379,6 @@ class ExperimentConfig(Section):
     def place_of(self, *location: str | int) -> str:
         """File and line of an entry, or the option that set it, with a colon; else nothing."""
         return "" if self._places.find is None else f"{self._places.find(location)}: "
-
-    def found_at(self: Own, find: Callable[[tuple], str]) -> Own:
-        """The same, told by `find` where its entries come from."""
-        copy = self.model_copy()
-        copy._places = Places(find)
-        return copy
 
 
 class LenslessConfig(ExperimentConfig):
@@ -423,6 +408,19 @@ class CamerasConfig(LenslessConfig):
         check_names(self, "methods")
         check_methods(self)
         return self
+
+
+def check_known(name: str, what: str, names: Sequence[str], *place: str | int) -> None:
+    """Refuse a name that is none of those of a list."""
+    if name not in names:
+        raise misfit(f"{name!r} is no {what}; choose one of {', '.join(names)}", *place)
+
+
+def check_noise(config: Any) -> None:
+    """Refuse noise that counts electrons, where it is not known how many there are."""
+    if config.noise and config.noise.read_noise is not None and not config.sensor.counts:
+        message = "read_noise counts electrons; give sensor.exposure, such as 0.9, or electrons"
+        raise misfit(message, "noise", "read_noise")
 
 
 def check_names(config: ExperimentConfig, *lists: str) -> None:
@@ -491,6 +489,4 @@ def check_methods(config: CamerasConfig) -> None:
                     "this is relative to the sensor's; give sensor.exposure or sensor.electrons"
                 )
                 raise misfit(message, "methods", index, "shots", number, "exposure")
-    if config.noise and config.noise.read_noise is not None and not config.sensor.counts:
-        message = "read_noise counts electrons; give sensor.exposure, such as 0.9, or electrons"
-        raise misfit(message, "noise", "read_noise")
+    check_noise(config)

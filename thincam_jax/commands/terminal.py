@@ -5,9 +5,9 @@ As the files `command.py`, it imports nothing at its head that `thincam --help` 
 
 import contextlib
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 
@@ -15,6 +15,7 @@ from thincam_jax.commands.start import INTERRUPTED, interruptible
 
 if TYPE_CHECKING:
     import rich.progress
+    import rich.table
 
 WRONG_INPUT = 2
 
@@ -82,6 +83,22 @@ def fail(error: BaseException) -> NoReturn:
     """End for an error that a user can put right."""
     tell(in_a_line(error))
     raise typer.Exit(WRONG_INPUT)
+
+
+def numbers(rows: Sequence[Sequence[str]], **how: Any) -> "rich.table.Table":
+    """Rows, the first of headings, as a table of right-aligned numbers with their names before.
+
+    `how`: as of `rich.table.Table`.
+    """
+    from rich.table import Table
+
+    (first, *headings), *rest = rows
+    table = Table(first, **how)
+    for heading in headings:
+        table.add_column(heading, justify="right")
+    for row in rest:
+        table.add_row(*row)
+    return table
 
 
 @contextlib.contextmanager

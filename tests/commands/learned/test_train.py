@@ -8,9 +8,10 @@ from typer.testing import CliRunner
 
 from helpers import ROOT
 from thincam_jax.commands import cli
+from thincam_jax.commands.checked_config import load_as
 from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.learned.build import build_camera, build_lessons
-from thincam_jax.commands.learned.config import load_learned
+from thincam_jax.commands.learned.config import LearnedConfig
 from thincam_jax.learn.refocusing.store import described, load
 from thincam_jax.learn.refocusing.train import NETWORK
 
@@ -79,7 +80,7 @@ def test_a_training_is_told_and_gone_on_with(file, tmp_path):
 
 
 def test_the_file_makes_the_camera(file):
-    config = load_learned(file)
+    config = load_as(LearnedConfig, file)
     assert described(build_camera(config)) == described(tiny.network().camera)
 
 
@@ -95,7 +96,7 @@ def test_the_file_makes_the_camera(file):
 )
 def test_a_fault_of_the_file_is_told(changed, told, file):
     with pytest.raises(ConfigError, match=told):
-        load_learned(file, (changed,))
+        load_as(LearnedConfig, file, (changed,))
 
 
 def test_a_file_of_another_kind_is_told_as_that_alone():
@@ -105,11 +106,11 @@ def test_a_file_of_another_kind_is_told_as_that_alone():
 
 def test_a_folder_that_is_not_there_is_told(file):
     source = "sources.0={name: mine, kind: folder, path: nowhere}"
-    config = load_learned(file, (source,))
+    config = load_as(LearnedConfig, file, (source,))
     with pytest.raises(ConfigError, match=r"sources\[0\]: .*nowhere' is no folder"):
         build_lessons(config)
 
 
 def test_the_shipped_file_is_whole():
-    config = load_learned(ROOT / "configs" / "learned_refocus.yaml")
+    config = load_as(LearnedConfig, ROOT / "configs" / "learned_refocus.yaml")
     assert build_camera(config).planes == 7

@@ -262,7 +262,7 @@ class TestInterrupt:
         def interrupted(*_, **__):
             raise KeyboardInterrupt
 
-        monkeypatch.setattr("thincam_jax.commands.photo.run.prepare", interrupted)
+        monkeypatch.setattr("thincam_jax.measured.prepare", interrupted)
         result = call(grey, tmp_path / "image.png", "--bits", 12)
         assert result.exit_code == 130
         assert "nothing of it is kept" in result.stderr

@@ -7,9 +7,10 @@ import pytest
 from typer.testing import CliRunner
 
 from helpers import ROOT
+from thincam_jax.commands.checked_config import load_as
 from thincam_jax.commands.cli import app
 from thincam_jax.commands.config_file import read_raw
-from thincam_jax.commands.plate.config import load_plate_design
+from thincam_jax.commands.plate.config import PlateDesignConfig
 from thincam_jax.commands.screen.config import HologramConfig
 
 PATH = ROOT / "configs" / "sts_design.yaml"
@@ -26,7 +27,7 @@ SMALL = (
 
 
 def test_the_shipped_file_is_read():
-    config = load_plate_design(PATH)
+    config = load_as(PlateDesignConfig, PATH)
     assert config.plate.glass_thickness == (5.0, 5.0)  # one value stays
     assert config.plate.film_thickness == pytest.approx((0.008, 0.025))
 

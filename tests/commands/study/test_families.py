@@ -87,8 +87,8 @@ def test_an_image_file_is_read_once(tmp_path, monkeypatch):
     """However many exposures there are, and for its warnings."""
     picture = Image.fromarray(np.uint8(255 * np.eye(12)))
     picture.save(tmp_path / "picture.png")
-    read, read_mask = [], study.read_mask
-    monkeypatch.setattr(study, "read_mask", lambda *a: read.append(a) or read_mask(*a))
+    read, read_mask = [], study.masks.read_mask
+    monkeypatch.setattr(study.masks, "read_mask", lambda *a: read.append(a) or read_mask(*a))
     shots = METHOD.replace("{distance: 3 mm}", "{distance: 3 mm}, {distance: 4 mm}")
     mask = f"{{family: file, path: {tmp_path / 'picture.png'}, width: 2 mm}}"
     built = build_study(load_config(written(tmp_path, mask, shots)))

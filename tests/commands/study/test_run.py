@@ -18,14 +18,14 @@ from commands.test_cli import call
 
 from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.doctor import environment
+from thincam_jax.commands.page import render_page
 from thincam_jax.commands.run_folder import RunFolder
 from thincam_jax.commands.study import run as running
 from thincam_jax.commands.study.build import build_study, take
 from thincam_jax.commands.study.config import load_config
 from thincam_jax.commands.study.evaluate import evaluate_method
-from thincam_jax.commands.study.page import findings, render
 from thincam_jax.commands.study.response import method_response
-from thincam_jax.commands.study.run import run_study
+from thincam_jax.commands.study.run import findings, run_study
 
 EVIL = "<script>alert(1)</script> & \"quoted\" <img src='http://example.org/x.png'>"
 
@@ -328,6 +328,12 @@ def run(whole, tmp_path):
     return study.config, RunFolder(tmp_path / "copy"), copy.deepcopy(metrics), page
 
 
+def rendered(config, folder, metrics):
+    """The page made anew."""
+    shown = {"environment": environment(), "findings": findings(config, metrics)}
+    return render_page("study", config, folder.path / "figures", metrics, **shown)
+
+
 def test_no_reference_outside_the_page(run):
     page = run[3]
     tags = " ".join(re.findall(r"<[^>]+>", page))
@@ -357,7 +363,7 @@ def test_motion_is_told(run):
     assert "that moves" not in page
     still = config.object
     moving = config.model_copy(update={"object": still.model_copy(update={"motion": 0.25})})
-    page = render(moving, folder, metrics, environment())
+    page = rendered(moving, folder, metrics)
     assert "that moves 0.25 mm across during an exposure of 1, λ" in page
 
 
@@ -441,7 +447,7 @@ def test_page_of_a_run_without_a_chart(run):
     for entry in metrics["methods"].values():
         entry["targets"]["chart"]["resolved"] = None
     (folder.path / "figures" / "contrast.png").rename(folder.path / "figures" / "contrast.away")
-    page = render(config, folder, metrics, environment())
+    page = rendered(config, folder, metrics)
     assert page.count("<img ") == 6
     (row,) = [r for r in rows(page) if r[0] == "conventional" and len(r) == 8]
     assert row[1:3] == ["–", "–"]

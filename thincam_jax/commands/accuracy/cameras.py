@@ -24,19 +24,14 @@ DEFAULT_SIZES = (128, 256, 512)  # pixels along the longer side
 DEFAULT_CAPTURE_SIZE = 256
 
 
-def own_size(sensor: SensorConfig) -> int:
-    """Pixels along the longer side of the study's own sensor."""
-    return max(sensor.shape)
-
-
 def sizes_of(sensor: SensorConfig, asked: tuple[int, ...]) -> tuple[int, ...]:
     """The sizes asked for, or the default ones and the study's own; each once, smallest first.
 
     **Errors**: ConfigError for a size that is not positive or above the study's own.
     """
+    own = max(sensor.shape)
     for size in asked:
-        _check("--size", size, own_size(sensor))
-    own = own_size(sensor)
+        _check("--size", size, own)
     wanted = asked or (*(s for s in DEFAULT_SIZES if s < own), own)
     return tuple(sorted(set(wanted)))
 
@@ -44,8 +39,8 @@ def sizes_of(sensor: SensorConfig, asked: tuple[int, ...]) -> tuple[int, ...]:
 def capture_size_of(sensor: SensorConfig, asked: int | None) -> int:
     """The size for captures and reconstructions; errors as for `sizes_of`."""
     if asked is None:
-        return min(DEFAULT_CAPTURE_SIZE, own_size(sensor))
-    _check("--capture-size", asked, own_size(sensor))
+        return min(DEFAULT_CAPTURE_SIZE, max(sensor.shape))
+    _check("--capture-size", asked, max(sensor.shape))
     return asked
 
 
@@ -55,7 +50,7 @@ def binned(study: Study, size: int) -> Study:
     The pitch grows by the same ratio, so that the sensor keeps its area: along the longer side
     exactly, along the shorter one to half a pixel. The mask stays as it is.
     """
-    ratio = own_size(study.sensor) / size
+    ratio = max(study.sensor.shape) / size
     rows, columns = (max(1, round(n / ratio)) for n in study.sensor.shape)
     sensor = study.sensor.model_copy(
         update={"shape": (rows, columns), "pitch": study.sensor.pitch * ratio}
@@ -148,14 +143,9 @@ class Case:
     skipped: str | None
 
     @property
-    def exposures(self) -> tuple[Exposure, ...]:
-        """The method's exposures."""
-        return self.method.exposures
-
-    @property
     def kernel_shape(self) -> tuple[int, int]:
         """Pixels of the PSF that the first capture takes: more than the sensor's by the scene's."""
-        camera = self.study.camera(self.exposures[0])
+        camera = self.study.camera(self.method.exposures[0])
         return kernel_shape(camera.sensor.shape, projected_shape(camera, self.target.plane))
 
 

@@ -44,13 +44,13 @@ class CaptureErrors:
     @cached_property
     def _exact(self) -> tuple[np.ndarray, list[np.ndarray]]:
         """The capture, and the PSF over the sensor and over all that the capture takes."""
-        exposure = self.case.exposures[0]
+        exposure = self.case.method.exposures[0]
         shapes = (None, self.case.kernel_shape)
         psfs = [psf_of(self.case.study, exposure, shape=shape) for shape in shapes]
         return clean_capture(self.case, exposure), psfs
 
     def _add(self, model: Model) -> None:
-        exposure, reach = self.case.exposures[0], self.case.kernel_shape
+        exposure, reach = self.case.method.exposures[0], self.case.kernel_shape
         reason = kernel_reason(self.case, exposure, model)
         row: dict[str, Any] = {"model": model, "status": "not run", "reason": reason}
         if reason is None:

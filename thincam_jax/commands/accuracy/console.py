@@ -5,6 +5,7 @@ from typing import Any
 from rich.table import Table
 
 from thincam_jax.commands.accuracy.psfs import label, words
+from thincam_jax.commands.terminal import numbers
 
 
 def accuracy_table(results: dict[str, Any]) -> Table:
@@ -12,46 +13,39 @@ def accuracy_table(results: dict[str, Any]) -> Table:
     largest = max((row["shape"] for row in results["psfs"]), key=max)
     rows = [row for row in results["psfs"] if row["shape"] == largest]
     rows.sort(key=lambda row: row["seconds"] or float("inf"))
-    table = Table("PSF", title=f"{largest[0]}×{largest[1]} pixels", title_justify="left")
-    for heading in ("error", "predicted", "time ms", "compile s", "worth it"):
-        table.add_column(heading, justify="right")
+    told = [["PSF", "error", "predicted", "time ms", "compile s", "worth it"]]
     for row in rows:
         name = label(row["model"], row["precision"], row["oversampling"])
         if row["status"] != "run":
-            table.add_row(name, "not run", *["–"] * 4)
+            told.append([name, "not run", *["–"] * 4])
             continue
-        table.add_row(
-            name,
-            "reference" if row["true_error"] == 0 else f"{row['true_error']:.1e}",
-            f"{row['predicted_error']:.1e}",
-            f"{1000 * row['seconds']:.2f}",
-            f"{row['compile_seconds']:.1f}",
-            "yes" if row["worth_choosing"] else "",
-        )
-    return table
+        error = "reference" if row["true_error"] == 0 else _error(row["true_error"])
+        times = f"{1000 * row['seconds']:.2f}", f"{row['compile_seconds']:.1f}"
+        worth = "yes" if row["worth_choosing"] else ""
+        told.append([name, error, _error(row["predicted_error"]), *times, worth])
+    return numbers(told, title=f"{largest[0]}×{largest[1]} pixels", title_justify="left")
 
 
 def cost_table(results: dict[str, Any]) -> Table:
     """What the errors do to captures and reconstructions."""
     rows, columns = results["settings"]["capture_shape"]
     title = f"{results['settings']['target']} at {rows}×{columns} pixels"
-    table = Table("assumed", title=title, title_justify="left")
-    for heading in ("PSF error", "capture error", "without mean", "PSNR lost dB"):
-        table.add_column(heading, justify="right")
+    told = [["assumed", "PSF error", "capture error", "without mean", "PSNR lost dB"]]
     found = results["reconstructions"]
     lost = {row["model"]: row.get("psnr_lost_db") for row in found["models"]}
     for row in results["captures"]:
         if row["status"] != "run":
-            table.add_row(words(row["model"]), "not run", "–", "–", "–")
+            told.append([words(row["model"]), "not run", "–", "–", "–"])
             continue
         errors = (row["psf_error"], row["error"], row["contrast_error"])
-        table.add_row(words(row["model"]), *map(_error, errors), _decibels(lost.get(row["model"])))
+        loss = _decibels(lost.get(row["model"]))
+        told.append([words(row["model"]), *map(_error, errors), loss])
     for row in found["controlled"]:
         if row["status"] == "run":
             name = f"exact, {_NAMES[row['wrong']]} wrong by {row['change']:.1e}"
             errors = (row["psf_error"], row["capture_error"], row["capture_contrast_error"])
-            table.add_row(name, *map(_error, errors), _decibels(row["psnr_lost_db"]))
-    return table
+            told.append([name, *map(_error, errors), _decibels(row["psnr_lost_db"])])
+    return numbers(told, title=title, title_justify="left")
 
 
 _NAMES = {"beta": "β", "distance": "d"}

@@ -1,14 +1,13 @@
 """The picture of the benchmark: errors against times, and what an error costs."""
 
-import io
 from typing import Any
 
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from thincam_jax.commands.accuracy.psfs import label, words
+from thincam_jax.commands.study.figures import as_png
 
 # Models are told apart by marker, precisions by filling, sizes by grey.
 _MARKERS = {
@@ -35,7 +34,6 @@ Point = tuple[float, float]
 def draw(results: dict[str, Any]) -> bytes:
     """The figure as a PNG file."""
     figure = Figure(figsize=(13.5, 7.6), layout="constrained")
-    FigureCanvasAgg(figure)
     panels = figure.subplot_mosaic(
         [["times", "captures"], ["times", "losses"]], width_ratios=(1.45, 1)
     )
@@ -44,9 +42,7 @@ def draw(results: dict[str, Any]) -> bytes:
     _draw_captures(panels["captures"], results)
     _draw_losses(panels["losses"], results)
     figure.legend(handles=_legend(results), loc="outside lower center", ncols=5, fontsize=9)
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=110)
-    return buffer.getvalue()
+    return as_png(figure)
 
 
 def _draw_times(ax: Axes, results: dict[str, Any]) -> None:

@@ -3,7 +3,6 @@
 import statistics
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import Any
 
@@ -161,33 +160,17 @@ def _measured(given: Conditions, method: PsfMethod, reference: np.ndarray) -> di
             **method.arguments,
         )
 
-    timing = measure(compute, given.camera, given.wavelength, given.object_distance)
-    return {
-        "true_error": relative_error(timing.result, reference),
-        "seconds": timing.seconds,
-        "compile_seconds": timing.compile_seconds,
-        "calls": timing.calls,
-    }
+    result, told = measure(compute, given.camera, given.wavelength, given.object_distance)
+    return {"true_error": relative_error(result, reference), **told}
 
 
-@dataclass(frozen=True, eq=False)
-class Timing:
-    """How long one call takes, and what it gives.
+def measure(function: Callable, *arguments: Any) -> tuple[np.ndarray, dict[str, Any]]:
+    """What a function of arrays gives, and how long it takes.
 
-    - `result`: of the call.
     - `seconds`: median over `calls` calls after one that does not count, each waited for; of a
       call that takes more than a second, that of the first.
     - `compile_seconds`: tracing and compilation, once, s.
     """
-
-    result: np.ndarray
-    seconds: float
-    compile_seconds: float
-    calls: int
-
-
-def measure(function: Callable, *arguments: Any) -> Timing:
-    """Compile a function of arrays and time it."""
     start = time.perf_counter()
     compiled = jax.jit(function).lower(*arguments).compile()
     compile_seconds = time.perf_counter() - start
@@ -195,7 +178,8 @@ def measure(function: Callable, *arguments: Any) -> Timing:
     taken = [first] if first > _LONG else []
     while len(taken) < _MOST_CALLS and sum(taken) < _SECONDS:
         taken.append(_timed(compiled, arguments)[1])
-    return Timing(np.asarray(result), statistics.median(taken), compile_seconds, len(taken))
+    seconds = {"seconds": statistics.median(taken), "compile_seconds": compile_seconds}
+    return np.asarray(result), {**seconds, "calls": len(taken)}
 
 
 def _timed(compiled, arguments) -> tuple[Any, float]:

@@ -68,15 +68,15 @@ class ReconstructionErrors:
 
     def _capture(self) -> None:
         case = self.case
-        self.captures = stacked([take(case.study, e, case.target) for e in case.exposures])
+        self.captures = stacked([take(case.study, e, case.target) for e in case.method.exposures])
         self.psfs = psfs_of(case.study, case.method)  # exact
-        self.clean = clean_capture(case, case.exposures[0])
+        self.clean = clean_capture(case, case.method.exposures[0])
         exact = self._reconstruct(case.method, "separable")
         self.pitch = exact.pitch
         self.exact_psnr_db = self._psnr(exact)
 
     def _add_model(self, model: Model) -> None:
-        exposures = self.case.exposures
+        exposures = self.case.method.exposures
         reasons = [kernel_reason(self.case, exposure, model) for exposure in exposures]
         reason = next((r for r in reasons if r), None)
         row: dict[str, Any] = {"model": model, "status": "not run", "reason": reason}
@@ -100,7 +100,7 @@ class ReconstructionErrors:
         """PSF and capture error of a change, and the PSNR lost by it in the worse direction."""
         case = self.case
         up, down = (changed(case.method, quantity, p) for p in (part, -part))
-        wrong = clean_capture(case, case.exposures[0], assumed=up.exposures[0])
+        wrong = clean_capture(case, case.method.exposures[0], assumed=up.exposures[0])
         both = [self._lost(self._reconstruct(method, "separable")) for method in (up, down)]
         worse = max(both, key=lambda lost: lost["psnr_lost_db"])
         return {

@@ -56,7 +56,6 @@ class Benchmark:
 
     study: Study
     sizes: tuple[int, ...]
-    capture_size: int
     case: Case
 
 
@@ -70,7 +69,7 @@ def check(config: StudyConfig, options: Sizes) -> Benchmark:
     sizes = sizes_of(config.sensor, options.sizes)
     capture_size = capture_size_of(config.sensor, options.capture_size)
     study = build_study(config)
-    return Benchmark(study, sizes, capture_size, make_case(study, capture_size))
+    return Benchmark(study, sizes, make_case(study, capture_size))
 
 
 def run_accuracy(plan: Benchmark, folder: BenchFolder, progress: Progress) -> dict[str, Any]:
@@ -118,7 +117,7 @@ def _settings(plan: Benchmark) -> dict[str, Any]:
         "pixel_integration": config.pixel_integration,
         "capture_shape": list(plan.case.study.sensor.shape),
         "target": plan.case.target.name,
-        "captured": _numbers(plan.case.exposures[0]),
+        "captured": _numbers(plan.case.method.exposures[0]),
     }
 
 

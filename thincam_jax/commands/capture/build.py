@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from thincam_jax import waveguide as wg
 from thincam_jax.commands.capture.config import CaptureConfig
 from thincam_jax.commands.config_file import ConfigError
-from thincam_jax.commands.screen.build import build_cameras
+from thincam_jax.commands.screen.build import build_cameras, build_plane
 from thincam_jax.commands.sections import PHASES, MaskConfig, SensorConfig, Synthesis
 from thincam_jax.commands.study.build import read_targets
 from thincam_jax.commands.study.study import Exposure, Method, Study
@@ -73,9 +73,7 @@ def screen_system(config: CaptureConfig) -> Sparse:
     """From the cells of a virtual rig to its sensor: 1 where a white monitor is brightest."""
     assert config.virtual is not None and config.virtual.screen is not None
     seen = config.virtual.screen
-    centre = jnp.asarray([seen.object.x, seen.object.y])
-    plane = wg.ObjectPlane(seen.object.cells, seen.object.distance, seen.object.width, centre)
-    (camera,) = build_cameras(seen)
+    plane, (camera,) = build_plane(seen), build_cameras(seen)
     try:
         wg.check_screen(camera)
     except ValueError as error:

@@ -56,12 +56,9 @@ def capture(
             raise ConfigError(f"--out {store}: there is nothing to resume; leave out --resume")
         plan = build_plan(asked)
         kept = f"0 of {len(plan.steps)} frames are kept"
-        procedure = Procedure(
-            settle=asked.display.settle,
-            timeout=asked.acquisition.timeout,
-            retries=asked.acquisition.retries,
-            saturated_share=asked.acquisition.saturated,
-        )
+        how = asked.acquisition
+        given = {"timeout": how.timeout, "retries": how.retries, "saturated_share": how.saturated}
+        procedure = Procedure(settle=asked.display.settle, **given)
         try:
             store.parent.mkdir(parents=True, exist_ok=True)
             with opened(asked) as rig, progress_bar("{task.fields[rate]}") as bar:

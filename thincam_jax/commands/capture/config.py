@@ -5,7 +5,7 @@ from typing import Annotated, Any, Literal
 import pydantic
 from pydantic import Field
 
-from thincam_jax.commands.screen.config import SeeThroughConfig
+from thincam_jax.commands.screen.config import SeeThroughConfig, check_cells
 from thincam_jax.commands.sections import (
     Angle,
     Curvature,
@@ -65,19 +65,12 @@ class DisplayConfig(DeviceConfig):
 PlanKind = Literal["fringe_scan", "method_a", "method_b", "psf_stack", "hadamard"]
 # What each kind needs, and what it may have beside the dark frames.
 _ZONES = ("betas", "width")
-_NEEDS: dict[PlanKind, tuple[str, ...]] = {
-    "fringe_scan": _ZONES,
-    "method_a": (*_ZONES, "distances"),
-    "method_b": _ZONES,
-    "psf_stack": (*_ZONES, "distances"),
-    "hadamard": ("cells",),
-}
-_MAY: dict[PlanKind, tuple[str, ...]] = {
-    "fringe_scan": ("profile",),
-    "method_a": ("profile",),
-    "method_b": ("profile",),
-    "psf_stack": ("profile", "phase"),
-    "hadamard": ("order", "display"),
+_NUMBERS: dict[PlanKind, tuple[tuple[str, ...], tuple[str, ...]]] = {
+    "fringe_scan": (_ZONES, ("profile",)),
+    "method_a": ((*_ZONES, "distances"), ("profile",)),
+    "method_b": (_ZONES, ("profile",)),
+    "psf_stack": ((*_ZONES, "distances"), ("profile", "phase")),
+    "hadamard": (("cells",), ("order", "display")),
 }
 
 
@@ -109,7 +102,8 @@ class PlanConfig(Section):
         fields = {key: field.default for key, field in type(self).model_fields.items()}
         given = {key for key, usual in fields.items() if getattr(self, key) != usual}
         given -= {"kind", "dark_frames"}
-        needed, allowed = _NEEDS[self.kind], (*_NEEDS[self.kind], *_MAY[self.kind])
+        needed, also = _NUMBERS[self.kind]
+        allowed = (*needed, *also)
         for key in needed:
             if not getattr(self, key):
                 raise misfit(f"a plan of kind {self.kind} needs it", key)
@@ -122,10 +116,7 @@ class PlanConfig(Section):
         if len(set(self.betas)) < len(self.betas) or len(set(self.distances)) < len(self.distances):
             raise misfit("an entry stands twice; give each once", "betas")
         if self.cells is not None:
-            try:
-                HadamardSeries(self.cells)
-            except ValueError as error:
-                raise misfit(str(error), "cells") from None
+            check_cells(self.cells, "cells")
         return self
 
     @property

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 
 from thincam_jax.commands.capture.config import CaptureConfig
 from thincam_jax.commands.run_folder import RunFolder
-from thincam_jax.commands.study.figures import save_figure, save_image
+from thincam_jax.commands.study.figures import drawing, save_figure, save_image
 from thincam_jax.reconstruction import Reconstruction
 
 _CORNER = (12, 8)  # pixels of a fiducial, which see no light
@@ -53,11 +53,9 @@ def _save_stack(folder, name, images, labels, place, words) -> None:
     rows = math.ceil(len(images) / columns)
     aspect = images.shape[1] / images.shape[2]
     size = (2.6 * columns + 1.0, rows * (2.3 * aspect + 0.7))
-    figure = Figure(figsize=size, layout="constrained")
-    axes = figure.subplots(rows, columns, squeeze=False)
-    drawn = None
+    figure, axes = drawing(size, rows, columns, squeeze=False)
     for ax, image, label in zip(axes.ravel(), images, labels, strict=False):
-        drawn = ax.imshow(image, cmap="gray", **place)
+        ax.imshow(image, cmap="gray", **place)
         ax.set_title(label, fontsize=9)
     for ax in axes.ravel()[len(images) :]:
         ax.set_axis_off()
@@ -65,8 +63,7 @@ def _save_stack(folder, name, images, labels, place, words) -> None:
         ax.set_xlabel(f"x {words[0]} (mm)", fontsize=9)
     for ax in axes[:, 0]:
         ax.set_ylabel(f"y {words[0]} (mm)", fontsize=9)
-    assert drawn is not None
-    figure.colorbar(drawn, ax=axes, label=words[1])
+    figure.colorbar(axes[0, 0].images[0], ax=axes, label=words[1])
     save_figure(folder, name, figure)
 
 
@@ -92,8 +89,7 @@ def save_images(
 
 def save_seconds(folder: RunFolder, seconds: Mapping[str, float]) -> None:
     """Time that the steps of the acquisition took in all."""
-    figure = Figure(figsize=(6.5, 2.6), layout="constrained")
-    ax = figure.subplots()
+    figure, ax = drawing((6.5, 2.6))
     bars = ax.barh(list(seconds), list(seconds.values()), color="0.45")
     ax.bar_label(bars, fmt="%.3g s", padding=3, fontsize=9)
     ax.set_xlabel("time of all frames (s)")

@@ -1,10 +1,10 @@
 """What `thincam run` makes of a store of captures: an image or a system matrix, and a report."""
 
 import math
+import shutil
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import partial
 from typing import Any
 
 import jax.numpy as jnp
@@ -15,24 +15,17 @@ from thincam_jax._core.grids import Grid
 from thincam_jax.commands.capture import figures
 from thincam_jax.commands.capture.build import build_study, field_shape, screen_system
 from thincam_jax.commands.capture.config import CaptureConfig
-from thincam_jax.commands.page import render_page
-from thincam_jax.commands.run_folder import Progress, RunFolder, Step, carry_out
+from thincam_jax.commands.run_folder import Progress, Run, RunFolder
+from thincam_jax.commands.screen.calibration import diagonal
 from thincam_jax.commands.screen.figures import save_columns
 from thincam_jax.commands.study import build
-from thincam_jax.commands.study.evaluate import sample
+from thincam_jax.commands.study.evaluate import rounded, sample
 from thincam_jax.commands.study.study import Reconstructor, Study
 from thincam_jax.imaging.metrics import psnr
 from thincam_jax.imaging.operators import ReducedMatrix
-from thincam_jax.measured.calibration import (
-    HadamardCaptures,
-    open_matrix,
-    stored_blocks,
-    write_matrix,
-)
+from thincam_jax.measured import calibration
 from thincam_jax.reconstruction import Reconstruction
 from thincam_jax.reconstruction.noise import estimate_noise
-
-_SHOWN = 3  # cells whose columns are drawn
 
 
 @dataclass(frozen=True)
@@ -70,7 +63,7 @@ class Taken:
     seconds: Mapping[str, float] = field(default_factory=dict)
     simulated: Simulated | None = None
     dark_frames: int = 0
-    hadamard: HadamardCaptures | None = None
+    hadamard: calibration.HadamardCaptures | None = None
 
 
 def run_captures(
@@ -78,34 +71,31 @@ def run_captures(
 ) -> dict[str, Any]:
     """Reconstruct, compare with direct simulation where the rig was virtual, and report.
 
-    An interrupted run is done anew. Returns (and writes) the metrics.
+    Returns (and writes) the metrics.
     """
-    folder.claim(config)
-    run = _CaptureRun(config, taken, folder)
-    carry_out(run.work, progress)
-    return run.metrics
+    return _CaptureRun(config, taken, folder).carry_out(progress)
 
 
-class _CaptureRun:
+class _CaptureRun(Run):
     """Captures on their way to an image or a matrix; `metrics` grows with the steps."""
 
     def __init__(self, config: CaptureConfig, taken: Taken, folder: RunFolder):
-        self.config, self.taken, self.folder = config, taken, folder
-        self.started = time.time()
+        super().__init__(config, folder)
+        self.taken = taken
         self._reconstructor: Reconstructor | None = None
-        self.metrics: dict[str, Any] = {
+        self.metrics |= {
             "study": config.name,
             "kind": config.kind,
             "rig": config.rig,
             "plan": config.plan.kind,
             "seconds": {name: round(s, 4) for name, s in taken.seconds.items()},
         }
-        self.work = [Step("captures", self.show)]
+        self.add("captures", self.show)
         if config.plan.kind == "hadamard":
-            self.work.append(Step("system matrix", self.recover))
+            self.add("system matrix", self.recover)
         elif config.plan.kind != "psf_stack":
-            self.work.append(Step("image", self.reconstruct))
-        self.work.append(Step("report", self.report))
+            self.add("image", self.reconstruct)
+        self.add("report", self.complete, "capture")
 
     def show(self) -> None:
         figures.save_frames(self.folder, self.config, self.taken.frames, self.taken.labels)
@@ -162,10 +152,7 @@ class _CaptureRun:
         grid = Grid(pixels["captured"].shape, jnp.asarray(captured.pitch))
         truth = np.asarray(sample(target.plane, grid), float)
         scores = {name: psnr(image, truth) for name, image in pixels.items()}
-        self.metrics["psnr_db"] = {
-            name: round(score, 3) if math.isfinite(score) else None
-            for name, score in scores.items()
-        }
+        self.metrics["psnr_db"] = {name: rounded(score) for name, score in scores.items()}
         noise = [np.std(pixels[n] - pixels["without noise"]) for n in ("captured", "simulated")]
         self.metrics["agreement"] = {
             "frame_residual_over_noise": [round(float(np.std(z)), 4) for z in of_each],
@@ -182,21 +169,18 @@ class _CaptureRun:
         captures = self.taken.hadamard
         assert captures is not None
         path = self.folder.path / "matrix.zarr"
-        if path.exists():  # of an interrupted run
-            import shutil
-
-            shutil.rmtree(path)
+        shutil.rmtree(path, ignore_errors=True)  # of an interrupted run
         began = time.perf_counter()
-        write_matrix(captures, path)
-        matrix = open_matrix(path)
+        calibration.write_matrix(captures, path)
+        matrix = calibration.open_matrix(path)
         reduced = ReducedMatrix.of(matrix, captures.series.object_shape)
         reduced.save(self.folder.path / "reduced.npz", matrix)
-        cells = _diagonal(captures.series.object_shape)
+        cells = diagonal(captures.series.object_shape)
         numbers = [row * captures.series.object_shape[1] + column for row, column in cells]
         columns = np.empty((len(cells), math.prod(captures.sensor_shape)), np.float32)
         exact = self._exact() if self.taken.simulated is not None else None
         total, count = 0.0, 0
-        for pixels, block in stored_blocks(path):
+        for pixels, block in calibration.stored_blocks(path):
             columns[:, pixels] = block[:, numbers].T
             if exact is not None:
                 matrix, deviation = exact
@@ -232,20 +216,3 @@ class _CaptureRun:
         of_an_entry = 2 if captures.series.display == "complementary" else 4
         variance = of_an_entry * camera.variance(mean) / captures.series.cell_count
         return matrix, np.sqrt(variance)
-
-    def report(self) -> None:
-        page = partial(_render, self.config, self.folder, self.metrics)
-        self.folder.complete(self.metrics, self.config.seed, self.started, page)
-
-
-def _diagonal(shape: tuple[int, int]) -> list[tuple[int, int]]:
-    """Cells (row, column) spread along a diagonal of the object."""
-    rows, columns = ((2 * np.arange(_SHOWN) + 1) * n // (2 * _SHOWN) for n in shape)
-    return [(int(row), int(column)) for row, column in zip(rows, columns, strict=True)]
-
-
-def _render(
-    config: CaptureConfig, folder: RunFolder, metrics: dict[str, Any], environment: dict[str, Any]
-) -> str:
-    shown = {"command": "capture", "environment": environment, "metrics": metrics, "warnings": ()}
-    return render_page("capture", config, folder.path / "figures", shown)

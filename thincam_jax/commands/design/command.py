@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from thincam_jax.commands.terminal import Overrides, counted, told, warn
+from thincam_jax.commands.terminal import Overrides, counted, numbers, told, warn
 
 
 def design(
@@ -47,11 +47,12 @@ def _design_plate(path: Path, out: Path | None, overrides: tuple[str, ...]) -> N
     import rich
     import rich.table
 
+    from thincam_jax.commands.checked_config import load_as
     from thincam_jax.commands.config_file import slug
-    from thincam_jax.commands.plate.config import load_plate_design
+    from thincam_jax.commands.plate.config import PlateDesignConfig
     from thincam_jax.commands.plate.run import NUMBERS, PlateFolder, design_plate
 
-    wanted = load_plate_design(path, overrides)
+    wanted = load_as(PlateDesignConfig, path, overrides)
     folder = PlateFolder(out or Path("runs") / slug(wanted.name))
     with counted(wanted.name) as progress:
         found = design_plate(wanted, folder, progress)
@@ -69,7 +70,6 @@ def _design_plate(path: Path, out: Path | None, overrides: tuple[str, ...]) -> N
 
 def _print(found: dict) -> None:
     import rich
-    import rich.table
 
     from thincam_jax.commands.design.words import in_words, told_of
 
@@ -77,23 +77,18 @@ def _print(found: dict) -> None:
     designs = (found["reference"], *found["compare"], *found["found"])
     names = told_of(designs)
     unit = found["objective"]["told"].rpartition("(")[2].rstrip(")")
-    table = rich.table.Table("design", show_lines=True)
-    table.add_column(f"predicted\ngain, {unit}", justify="right")
-    for target in validation["pictures"]:
-        table.add_column(f"{target}\ngain, dB", justify="right")
-    for target in validation["charts"]:
-        table.add_column(f"{target}\ngain, elements", justify="right")
+    pictures = (f"{target}\ngain, dB" for target in validation["pictures"])
+    charts = (f"{target}\ngain, elements" for target in validation["charts"])
+    rows = [["design", f"predicted\ngain, {unit}", *pictures, *charts]]
     for one in designs:
         simulated = validation["methods"].get(one["name"])
         if simulated is None:
             continue
-        table.add_row(
-            "\n".join([one["name"], *in_words(one, names)]),
-            f"{one['predicted_gain']:+.2f}" if "predicted_gain" in one else "–",
-            *(_gain(simulated[name], "gain_db") for name in validation["pictures"]),
-            *(_gain(simulated[name], "gain_elements") for name in validation["charts"]),
-        )
-    rich.print(table)
+        predicted = f"{one['predicted_gain']:+.2f}" if "predicted_gain" in one else "–"
+        gains = [_gain(simulated[name], "gain_db") for name in validation["pictures"]]
+        gains += [_gain(simulated[name], "gain_elements") for name in validation["charts"]]
+        rows.append(["\n".join([one["name"], *in_words(one, names)]), predicted, *gains])
+    rich.print(numbers(rows, show_lines=True))
     name = found["reference"]["name"]
     levels = {t: validation["methods"][name][t]["psnr_db"] for t in validation["pictures"]}
     known = [f"{target} {psnr['mean']:.2f} dB" for target, psnr in levels.items() if psnr]

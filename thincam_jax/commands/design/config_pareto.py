@@ -3,6 +3,7 @@
 import math
 from typing import Annotated, Any, Literal
 
+import numpy as np
 import pydantic
 from pydantic import AfterValidator, Field
 
@@ -31,9 +32,7 @@ class ThicknessConfig(Section):
 
     def costs(self) -> list[float]:
         """The thicknesses, mm, evenly apart."""
-        lower, upper = self.bounds
-        step = (upper - lower) / (self.points - 1)
-        return [*(lower + n * step for n in range(self.points - 1)), upper]
+        return np.linspace(*self.bounds, self.points).tolist()
 
 
 class CapturesConfig(Section):
@@ -57,9 +56,7 @@ class LightConfig(Section):
 
     def costs(self) -> list[float]:
         """The electrons, each by the same factor more than the one before."""
-        lower, upper = self.bounds
-        factor = (upper / lower) ** (1 / (self.points - 1))
-        return [*(lower * factor**n for n in range(self.points - 1)), upper]
+        return np.geomspace(*self.bounds, self.points).tolist()
 
 
 class ParetoConfig(Section):

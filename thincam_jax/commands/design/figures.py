@@ -1,6 +1,5 @@
 """The pictures of a design: the objective's landscape, responses, contrast transfer and fronts."""
 
-import operator
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -19,7 +18,7 @@ from thincam_jax.commands.design.train import TrainingObjective
 from thincam_jax.commands.design.transfer import Transfer
 from thincam_jax.commands.design.words import QUANTITIES, first, free_number
 from thincam_jax.commands.study.figures import as_png as as_png
-from thincam_jax.commands.study.figures import line_style
+from thincam_jax.commands.study.figures import drawing, line_style
 from thincam_jax.commands.study.study import Study
 
 _ROOM = 0.06  # around points, as a part of an axis
@@ -37,15 +36,15 @@ _LABELS = {
 
 @dataclass(frozen=True, eq=False)
 class _DrawnLandscape:
-    """A landscape, what it is of, and the value of a design as drawn and as told."""
+    """A landscape, what it is of, and which value of a design is drawn and which is told."""
 
     around: Landscape
     objective: DesignObjective | TrainingObjective
-    drawn: Callable[[Candidate], float | None]
-    told: Callable[[Candidate], float | None]
+    drawn: str
+    told: str
 
     def name(self, one: Candidate) -> str:
-        value = self.told(one)
+        value = getattr(one, self.told)
         if value is None:
             return one.name
         return f"{one.name} ({float(self.objective.told(value)):.2f} {self.objective.unit})"
@@ -58,8 +57,7 @@ def draw_masks(study: Study, best: str) -> Figure:
     """The first mask of each shot and its PSF, of the reference and of the best design, in rows."""
     methods = [study.methods[0], next(m for m in study.methods if m.name == best)]
     shots = max(len(method.shots) for method in methods)
-    figure = Figure(figsize=(5.2 * shots, 6.2), layout="constrained")
-    rows = figure.subplots(2, 2 * shots, squeeze=False)
+    figure, rows = drawing((5.2 * shots, 6.2), 2, 2 * shots, squeeze=False)
     for axes, method in zip(rows, methods, strict=True):
         for ax in axes:
             ax.set_axis_off()
@@ -86,25 +84,21 @@ def draw_landscape(result: FoundDesigns, count: int) -> Figure | None:
     """
     if result.landscape is None:
         return None
-    searched, exact = operator.attrgetter("searched"), operator.attrgetter("exact")
-    return _draw(
-        _DrawnLandscape(result.landscape, result.objective, searched, exact), result, count
-    )
+    view = _DrawnLandscape(result.landscape, result.objective, "searched", "exact")
+    return _draw(view, result, count)
 
 
 def draw_training(result: FoundDesigns, count: int) -> Figure | None:
     """The same of the training error; None without training."""
     if result.training is None or result.training.landscape is None:
         return None
-    trained = operator.attrgetter("trained")
-    view = _DrawnLandscape(result.training.landscape, result.training.objective, trained, trained)
-    return _draw(view, result, count)
+    given = result.training.landscape, result.training.objective
+    return _draw(_DrawnLandscape(*given, "trained", "trained"), result, count)
 
 
 def _draw(view: _DrawnLandscape, result: FoundDesigns, count: int) -> Figure:
     points = (result.reference, *result.found[:count])
-    figure = Figure(figsize=(7.6, 6.0), layout="constrained")
-    ax = figure.subplots()
+    figure, ax = drawing((7.6, 6.0))
     if len(view.around.axes) == 1:
         _draw_line(ax, view, points)
     else:
@@ -168,12 +162,8 @@ def _draw_line(ax, view: _DrawnLandscape, points: tuple[Candidate, ...]) -> None
     around, objective = view.around, view.objective
     ax.plot(_axes(around)[0], objective.told(around.values), color="black", linewidth=1)
     for number, one in enumerate(points):
-        level = view.drawn(one)
-        assert level is not None  # for the type checker; what is drawn was scored
-        place = _place(around, one)
-        ax.plot(
-            *place, float(objective.told(level)), label=view.name(one), zorder=5, **_marker(number)
-        )
+        point = *_place(around, one), float(objective.told(getattr(one, view.drawn)))
+        ax.plot(*point, label=view.name(one), zorder=5, **_marker(number))
     ax.set(xlabel=free_number(*around.variables[0]), ylabel=objective.label)
     ax.grid(alpha=0.3)
 
@@ -214,8 +204,7 @@ def draw_mtf(result: FoundDesigns, object_distance: float) -> Figure | None:
     """
     if result.transfers is None:
         return None
-    figure = Figure(figsize=(11.0, 5.6), layout="constrained")
-    panels = figure.subplots(1, 2, sharex=True, sharey=True)
+    figure, panels = drawing((11.0, 5.6), 1, 2, sharex=True, sharey=True)
     shown = (result.reference, result.found[0])
     for ax, one, transfer in zip(panels, shown, result.transfers, strict=True):
         _draw_transfer(ax, one, transfer, result.edge)

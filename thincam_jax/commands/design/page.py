@@ -2,42 +2,22 @@
 
 from typing import Any
 
-from thincam_jax.commands.config_file import slug
-from thincam_jax.commands.design.config import DesignConfig
+from thincam_jax.commands.design import words
 from thincam_jax.commands.design.record import COSTS
-from thincam_jax.commands.design.words import (
-    QUANTITIES,
-    cells,
-    found_number,
-    free_number,
-    in_words,
-    of_shots,
-    told_of,
-)
-from thincam_jax.commands.page import number, render_page
-from thincam_jax.commands.run_folder import RunFolder
+from thincam_jax.commands.page import number
 
 
-def render(
-    config: DesignConfig, folder: RunFolder, design: dict[str, Any], environment: dict[str, Any]
-) -> str:
-    """The page, with its pictures inside."""
+def shown(design: dict[str, Any]) -> dict[str, Any]:
+    """What the page takes beside the record, made of it."""
     free = [(value["variable"], value["shots"]) for value in design["found"][0]["values"]]
-    shown = {
-        "command": "design",
-        "environment": environment,
-        "design": design,
-        "warnings": design["warnings"],
-        "free": [free_number(*one) for one in free],
-        "reference": [of_shots(design["reference"], *one) for one in free],
-        "numbers": [[found_number(v) for v in one["values"]] for one in design["found"]],
-        "validated": list(design["validation"]["methods"]),
-        "slug": slug,
+    return {
+        "free": [words.free_number(*one) for one in free],
+        "reference": [words.of_shots(design["reference"], *one) for one in free],
+        "numbers": [[words.found_number(v) for v in one["values"]] for one in design["found"]],
         "unit": _unit(design),
         "findings": findings(design),
         "fronts": fronts(design),
     }
-    return render_page("design", config, folder.path, shown)
 
 
 def _unit(design: dict[str, Any]) -> str:
@@ -48,12 +28,12 @@ def _unit(design: dict[str, Any]) -> str:
 def findings(design: dict[str, Any]) -> list[str]:
     """What the numbers say, in sentences."""
     best, reference = design["found"][0], design["reference"]
-    names = told_of([best, reference])
+    names = words.told_of([best, reference])
     by = "training" if design["training"] else design["objective"]["name"]
     sentences = [
-        f"The best design by {by} is {' and '.join(in_words(best, names))}. The objective "
+        f"The best design by {by} is {' and '.join(words.in_words(best, names))}. The objective "
         f"predicts {best['predicted_gain']:+.3g} {_unit(design)} over {reference['name']} "
-        f"({' and '.join(in_words(reference, names))})."
+        f"({' and '.join(words.in_words(reference, names))})."
     ]
     if best["training_gain_db"] is not None:
         sentences.append(f"On the training images it gains {best['training_gain_db']:+.2f} dB.")
@@ -96,8 +76,8 @@ def fronts(design: dict[str, Any]) -> list[dict[str, Any]]:
 
 def _front(name: str, front: dict[str, Any], reference: str) -> dict[str, Any]:
     label, cost = COSTS[name]
-    names = told_of([*front["points"], front["reference"]])
-    labels = [QUANTITIES[name].label for name in names]
+    names = words.told_of([*front["points"], front["reference"]])
+    labels = [words.QUANTITIES[name].label for name in names]
     points = [(_cost(p[cost]), p) for p in front["points"]]
     points.append((f"{reference}: {_cost(front['reference'][cost])}", front["reference"]))
     kept = {True: "no", False: "yes", None: ""}
@@ -114,7 +94,7 @@ def _front(name: str, front: dict[str, Any], reference: str) -> dict[str, Any]:
             ],
             "rows": [
                 [
-                    *(text, *cells(p, names), f"{p['predicted_psnr_db']:.2f}"),
+                    *(text, *words.cells(p, names), f"{p['predicted_psnr_db']:.2f}"),
                     *(number(p.get("simulated_psnr_db", {}).get(n), 2) for n in pictures),
                     kept[p.get("dominated")],
                 ]
@@ -130,7 +110,7 @@ def _front(name: str, front: dict[str, Any], reference: str) -> dict[str, Any]:
         "labels": [label, *labels, "cycles/rad", "line pairs/mm on the object", "", "front"],
         "rows": [
             [
-                *(text, *cells(p, names)),
+                *(text, *words.cells(p, names)),
                 f"{p['resolution_cycles_per_rad']:.1f}",
                 f"{p['resolution_line_pairs_per_mm']:.3f}",
                 p["resolution_ends"] or "",

@@ -18,19 +18,9 @@ from jaxtyping import Array, Float
 
 from thincam_jax._core.precision import allow
 from thincam_jax.commands.config_file import ConfigError
+from thincam_jax.commands.design import problem as problems
 from thincam_jax.commands.design.config import DesignConfig, found_name
 from thincam_jax.commands.design.config_pareto import ParetoConfig, with_shots
-from thincam_jax.commands.design.problem import (
-    DesignObjective,
-    DesignProblem,
-    ObjectiveData,
-    Shot,
-    build_problem,
-    phases_of,
-    search_problem,
-    shots_of_design,
-    synthesis_of,
-)
 from thincam_jax.commands.design.simulation import simulate, with_designs
 from thincam_jax.commands.run_folder import Step
 from thincam_jax.commands.study.study import Study
@@ -64,8 +54,8 @@ class FrontPoint(eqx.Module):
     simulated: tuple[tuple[str, float | None], ...] = ()
 
     @property
-    def shots(self) -> tuple[Shot, ...]:
-        return shots_of_design(self.design)
+    def shots(self) -> tuple[problems.Shot, ...]:
+        return problems.shots_of_design(self.design)
 
 
 class Front(eqx.Module):
@@ -112,9 +102,9 @@ class FrontSearches:
             self.work.append(Step(f"{cost:g} captures, simulated", partial(self.simulate, place)))
 
     @cached_property
-    def problem(self) -> DesignProblem:
+    def problem(self) -> problems.DesignProblem:
         """On the frequencies of the reference, which all points share."""
-        return build_problem(self.study)
+        return problems.build_problem(self.study)
 
     def search(self, name: str, place: int, beside: int | None) -> None:
         """A point of a front, near that of another place or over the whole space."""
@@ -126,10 +116,10 @@ class FrontSearches:
                 near = _longer(near, problem.space.base)
             best[place] = dataclasses.replace(self._best(problem, near, best.get(place)), cost=cost)
 
-    def _problem(self, name: str, cost: float) -> DesignProblem:
+    def _problem(self, name: str, cost: float) -> problems.DesignProblem:
         if name == "captures":
             return _of_shots(self.config, self.problem, round(cost) // self.phases)
-        given = dataclasses.replace(self.problem, objective=DesignObjective("limit"))
+        given = dataclasses.replace(self.problem, objective=problems.DesignObjective("limit"))
         if name == "light":
             return _lit(given, cost)
         is_distance = jnp.asarray([v.name == "distance" for v in given.space.variables])
@@ -138,7 +128,7 @@ class FrontSearches:
         return dataclasses.replace(given, space=eqx.tree_at(lambda s: s.upper, given.space, thin))
 
     def _best(
-        self, problem: DesignProblem, near: Design | None, own: FrontPoint | None
+        self, problem: problems.DesignProblem, near: Design | None, own: FrontPoint | None
     ) -> FrontPoint:
         """The best of a search near another design, of that design, and of `own`.
 
@@ -151,7 +141,7 @@ class FrontSearches:
             spaces.append(_near(problem.space, place))
             designs.append(problem.space.design(place))
         for space in spaces:
-            searched = search_problem(
+            searched = problems.search_problem(
                 dataclasses.replace(problem, space=space), self.asked, self.config.seed
             )
             designs += [found.design for found in searched.found[:_TRIED]]
@@ -207,29 +197,31 @@ def _variance(study: Study) -> float:
     return float(np.exp(np.mean([np.log(np.mean(np.var(i, axis=(-2, -1)))) for i in images])))
 
 
-def _of_shots(config: DesignConfig, problem: DesignProblem, count: int) -> DesignProblem:
+def _of_shots(
+    config: DesignConfig, problem: problems.DesignProblem, count: int
+) -> problems.DesignProblem:
     """The search for designs of so many shots, on the frequencies of the others.
 
     With noise that counts electrons they divide the exposure of the reference's captures evenly.
     """
     space = with_shots(config, count).space()
-    matrix = jnp.asarray(synthesis_of(space.base, config), float)
+    matrix = jnp.asarray(problems.synthesis_of(space.base, config), float)
     if config.noise.electrons is not None:
         captures = space.base.captures
         share = jnp.full(captures, problem.space.base.captures / captures, space.lower.dtype)
         space = eqx.tree_at(lambda s: s.base.exposure, space, share)
-    return DesignProblem(
-        DesignObjective("bayes_error"),
+    return problems.DesignProblem(
+        problems.DesignObjective("bayes_error"),
         space,
         dataclasses.replace(problem.data, synthesis=matrix),
         dataclasses.replace(problem.exact, synthesis=matrix),
     )
 
 
-def _lit(problem: DesignProblem, electrons: float) -> DesignProblem:
+def _lit(problem: problems.DesignProblem, electrons: float) -> problems.DesignProblem:
     """With so many electrons."""
 
-    def lit(data: ObjectiveData) -> ObjectiveData:
+    def lit(data: problems.ObjectiveData) -> problems.ObjectiveData:
         noise = data.setup.noise
         assert isinstance(noise, PhotonNoise)  # for the type checker; the file was checked
         number = jnp.asarray(electrons, noise.electrons.dtype)
@@ -243,7 +235,7 @@ def _lit(problem: DesignProblem, electrons: float) -> DesignProblem:
 
 def _longer(design: Design, base: Design) -> Design:
     """A design with its last shot taken again, as often as `base` has captures more."""
-    phases = phases_of(base)
+    phases = problems.phases_of(base)
     last = range(design.captures - phases, design.captures)
     more = (base.captures - design.captures) // phases
     order = jnp.asarray([*range(design.captures), *(list(last) * more)])
@@ -276,7 +268,7 @@ def _near(space: DesignSpace, place: Float[Array, " variable"]) -> DesignSpace:
     return eqx.tree_at(lambda s: (s.lower, s.upper), space, (lower, upper))
 
 
-def _judge(design: Design, data: ObjectiveData) -> FrontPoint:
+def _judge(design: Design, data: problems.ObjectiveData) -> FrontPoint:
     """Resolution and error by the exact response; no resolution beyond what the pixels sample."""
     found, error = (float(value) for value in _exactly(design, data))
     edge = float(data.frequencies.highest)
@@ -288,6 +280,8 @@ def _judge(design: Design, data: ObjectiveData) -> FrontPoint:
 
 
 @eqx.filter_jit
-def _exactly(design: Design, data: ObjectiveData) -> tuple[Float[Array, ""], Float[Array, ""]]:
+def _exactly(
+    design: Design, data: problems.ObjectiveData
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
     known = channels(design, data.setup, data.synthesis, data.frequencies)
     return limit(known, data.frequencies), bayes_error(known)

@@ -105,7 +105,7 @@ class Finder:
             self.work.append(Step("training, samples", partial(self.sample, wanted)))
             for number in range(wanted.starts):
                 text = f"training {number + 1} of {wanted.starts}"
-                self.work.append(Step(text, partial(self.descend, number)))
+                self.work.append(Step(text, lambda n=number: self.descents.descend(n)))
             self.work.append(Step("around the trained designs", self.finish_training))
         self.work += [Step("found designs", self.rank), Step("landscape", self.surround)]
 
@@ -120,9 +120,6 @@ class Finder:
         points = [np.asarray(one.point) for one in self.kept]
         setup = self.problem.data.setup
         self.descents = TrainingDescents(self.config, wanted, setup, points)
-
-    def descend(self, number: int) -> None:
-        self.descents.descend(number)
 
     def finish_training(self) -> None:
         self.trained = self.descents.finish()

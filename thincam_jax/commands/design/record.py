@@ -9,7 +9,6 @@ from thincam_jax.commands.design.config import DesignConfig
 from thincam_jax.commands.design.pareto import Front, FrontPoint, Fronts
 from thincam_jax.commands.design.problem import Shot
 from thincam_jax.commands.design.ranking import Candidate, FoundDesigns
-from thincam_jax.commands.design.surroundings import FreeValue
 from thincam_jax.commands.design.words import QUANTITIES
 from thincam_jax.commands.sections import ShotConfig
 from thincam_jax.commands.study.study import Study
@@ -101,7 +100,16 @@ def _found(result: FoundDesigns, one: Candidate) -> dict[str, Any]:
         **_candidate(result, one),
         "predicted_gain": _round(result.objective.gain(result.reference.exact, one.exact)),
         "training_gain_db": _training_gain(result.reference, one),
-        "values": [_value(value) for value in one.values],
+        "values": [
+            {
+                "variable": value.variable,
+                "shots": list(value.shots),
+                "value": _round(value.value),
+                "tolerance": _round(value.tolerance),
+                "unit": UNITS[value.variable],
+            }
+            for value in one.values
+        ],
         "status": one.status,
         "active_limits": list(one.active),
     }
@@ -191,16 +199,6 @@ def _given(config: DesignConfig, shot: ShotConfig) -> dict[str, float | None]:
 
 def _shot(shot: Shot) -> dict[str, float | None]:
     return {q.key: _round(getattr(shot, name) * q.scale) for name, q in QUANTITIES.items()}
-
-
-def _value(value: FreeValue) -> dict[str, Any]:
-    return {
-        "variable": value.variable,
-        "shots": list(value.shots),
-        "value": _round(value.value),
-        "tolerance": _round(value.tolerance),
-        "unit": UNITS[value.variable],
-    }
 
 
 def _round(value: float | None) -> float | None:

@@ -1,26 +1,18 @@
 """Running a design: the search, the simulation of what it found, and a report."""
 
-import time
 from dataclasses import astuple
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any
 
 from thincam_jax.commands.checked_config import dump_config
 from thincam_jax.commands.config_file import slug
-from thincam_jax.commands.design import figures
+from thincam_jax.commands.design import figures, simulation
 from thincam_jax.commands.design.config import DesignConfig
-from thincam_jax.commands.design.page import render
+from thincam_jax.commands.design.page import shown as shown_on_page
 from thincam_jax.commands.design.pareto import FrontSearches
 from thincam_jax.commands.design.ranking import Finder
 from thincam_jax.commands.design.record import record, record_fronts
-from thincam_jax.commands.design.simulation import (
-    Trials,
-    as_study_config,
-    compare,
-    simulate,
-    with_designs,
-)
-from thincam_jax.commands.run_folder import Progress, RunFolder, Step, carry_out
+from thincam_jax.commands.run_folder import Progress, Run, RunFolder
 from thincam_jax.commands.study.evaluate import Evaluation
 from thincam_jax.commands.study.figures import draw_found
 from thincam_jax.commands.study.study import Study, Target
@@ -37,7 +29,7 @@ class DesignFolder(RunFolder):
       `environment.json`, `report.html`, `design.json`: written at the end.
     """
 
-    kind, folders, result = "design", ("targets",), "design.json"
+    kind, folders, pictures, result = "design", ("targets",), "", "design.json"
 
 
 def run_design(study: Study, folder: DesignFolder, progress: Progress) -> dict[str, Any]:
@@ -46,48 +38,46 @@ def run_design(study: Study, folder: DesignFolder, progress: Progress) -> dict[s
     `study` holds the designs of the file. The same configuration gives the same on the same
     machine.
     """
-    folder.claim(study.config)
-    run = _DesignRun(study, folder)
-    carry_out(run.work, progress)
-    return run.design
+    return _DesignRun(study, folder).carry_out(progress)
 
 
-class _DesignRun:
-    """A design on its way.
+class _DesignRun(Run):
+    """A design on its way: search, simulation of each target, fronts."""
 
-    `work` holds the search, the simulation of each target, the fronts and the report.
-    """
+    config: DesignConfig
 
     def __init__(self, study: Study, folder: DesignFolder):
-        self.study, self.folder, self.started = study, folder, time.time()
-        self.config: DesignConfig = study.config
-        self.design: dict[str, Any] = {}
-        self.trials: dict[str, Trials] = {}
+        super().__init__(study.config, folder)
+        self.study = study
+        self.trials: dict[str, simulation.Trials] = {}
         self.finder = Finder(study)
         self.fronts = None
-        self.work = [*self.finder.work]
-        self.work += [Step(t.name, partial(self.simulate, t)) for t in study.targets]
+        self.work += self.finder.work
+        for target in study.targets:
+            self.add(target.name, self.simulate, target)
         if self.config.pareto is not None:
             self.fronts = FrontSearches(study, self.config.pareto)
             self.work += self.fronts.work
-        self.work.append(Step("report", self.report))
+        self.add("report", self.report)
 
     @cached_property
     def simulated(self) -> Study:
         """The designs of the file and the best of those found."""
         best = self.finder.result.found[: self.config.validation.best]
-        return with_designs(self.study, {one.name: one.design for one in best})
+        return simulation.with_designs(self.study, {one.name: one.design for one in best})
 
     def simulate(self, target: Target) -> None:
         """From before an interruption where the designs are still the same."""
-        self.folder.write("found.yaml", dump_config(as_study_config(self.simulated)))
+        self.folder.write("found.yaml", dump_config(simulation.as_study_config(self.simulated)))
         designs = [
             [list(astuple(e)) for e in method.exposures] for method in self.simulated.methods
         ]
         stored = self.folder.finished(target.name)
         if stored is None or stored["designs"] != designs:
             shown: dict[str, Evaluation] = {}
-            trials = simulate(self.simulated, target, self.config.validation.seeds, shown)
+            trials = simulation.simulate(
+                self.simulated, target, self.config.validation.seeds, shown
+            )
             figure, *_ = draw_found(target, shown)
             name = f"reconstructions-{slug(target.name)}.png"
             self.folder.write(name, figures.as_png(figure))
@@ -97,10 +87,10 @@ class _DesignRun:
 
     def report(self) -> None:
         result, folder = self.finder.result, self.folder
-        self.design = record(result, self.simulated, compare(self.trials))
-        self.design["warnings"] = self.simulated.warnings
+        self.metrics = record(result, self.simulated, simulation.compare(self.trials))
+        self.metrics["warnings"] = self.simulated.warnings
         if self.fronts is not None:
-            self.design["pareto"] = record_fronts(self.config, self.fronts.result())
+            self.metrics["pareto"] = record_fronts(self.config, self.fronts.result())
         count, distance = self.config.validation.best, self.config.object.distance
         pictures = {
             "masks.png": figures.draw_masks(self.simulated, result.found[0].name),
@@ -111,9 +101,8 @@ class _DesignRun:
         }
         if self.fronts is not None:
             name = result.reference.name
-            pictures["pareto.png"] = figures.draw_fronts(self.design["pareto"], name, distance)
+            pictures["pareto.png"] = figures.draw_fronts(self.metrics["pareto"], name, distance)
         for name, figure in pictures.items():
             if figure is not None:
                 folder.write(name, figures.as_png(figure))
-        page = partial(render, self.config, folder, self.design)
-        folder.complete(self.design, self.config.seed, self.started, page)
+        self.complete("design", command="design", **shown_on_page(self.metrics))

@@ -73,8 +73,9 @@ def with_designs(study: Study, designs: Mapping[str, Design]) -> Study:
 def _method(config: DesignConfig, name: str, design: Design) -> Method:
     numbers = (design.beta, design.phase, design.distance, design.wavelength)
     width = float(design.width)
-    if width != config.mask.width:
-        width = _shown(width, config.mask.pixel_pitch)
+    pixel = config.mask.pixel_pitch
+    if width != config.mask.width and pixel is not None:  # a display shows whole pixels
+        width = max(1, math.floor(width / pixel + 1e-6)) * pixel
     rows = np.stack([*numbers, np.full(design.captures, width), design.exposure], axis=-1)
     # Captures that coincide are several exposures of one setting.
     taken, exposures = Counter(), []
@@ -83,11 +84,6 @@ def _method(config: DesignConfig, name: str, design: Design) -> Method:
         exposures.append(Exposure(*row, take=taken[row]))
     synthesis = config.reference.synthesis
     return Method(name, "wiener", synthesis, tuple(exposures), phases_of(design))
-
-
-def _shown(width: float, pixel: float | None) -> float:
-    """A display shows whole pixels."""
-    return width if pixel is None else max(1, math.floor(width / pixel + 1e-6)) * pixel
 
 
 def as_study_config(study: Study) -> StudyConfig:

@@ -16,27 +16,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from thincam_jax.commands.config_file import ConfigError
+from thincam_jax.commands.design import surroundings
 from thincam_jax.commands.design.config import DesignConfig, TrainingConfig
 from thincam_jax.commands.design.problem import synthesis_of
-from thincam_jax.commands.design.surroundings import (
-    Derivatives,
-    Landscape,
-    landscape_of,
-    per_unit,
-    shown,
-    straight,
-)
 from thincam_jax.design import Design, DesignSpace, Setup, Training, end_to_end_error, wiener_error
-from thincam_jax.design.search import (
-    APART,
-    Found,
-    Search,
-    best_apart,
-    descend,
-    evaluate,
-    even_samples,
-    without_repeats,
-)
+from thincam_jax.design import search as searches
 from thincam_jax.imaging.targets import middle_square, resize, sample_image
 
 # Single precision holds the error to some 1e-6 of itself.
@@ -76,13 +60,13 @@ class Trained(eqx.Module):
     """
 
     objective: TrainingObjective
-    found: tuple[Found, ...]
-    near: tuple[Derivatives, ...]
+    found: tuple[searches.Found, ...]
+    near: tuple[surroundings.Derivatives, ...]
     reference: float
     evaluations: int
     failed: int
     pixels: int
-    landscape: Landscape | None
+    landscape: surroundings.Landscape | None
 
 
 class TrainingDescents:
@@ -100,24 +84,28 @@ class TrainingDescents:
         self.starts, self.evaluations = start_points(
             self.space, self._values, points, wanted, config.seed
         )
-        self.ended: list[Search] = []
+        self.ended: list[searches.Search] = []
 
     def _values(self, points: Array) -> np.ndarray:
-        return np.asarray(evaluate(self.objective, self.space, self.training, points, at_a_time=1))
+        return np.asarray(
+            searches.evaluate(self.objective, self.space, self.training, points, at_a_time=1)
+        )
 
     def descend(self, number: int) -> None:
         """From the start of that number, if there are so many."""
         start = self.starts[number : number + 1]
         if len(start):
             given = (self.objective, self.space, self.training, start)
-            self.ended.append(descend(*given, steps=self.wanted.steps, tolerance=_TOLERANCE))
+            self.ended.append(
+                searches.descend(*given, steps=self.wanted.steps, tolerance=_TOLERANCE)
+            )
 
     def finish(self) -> Trained:
         """What the descents ended in, and what surrounds it.
 
         **Errors**: ConfigError where the error is NaN at every start.
         """
-        found = without_repeats(one for ended in self.ended for one in ended.found)
+        found = searches.without_repeats(one for ended in self.ended for one in ended.found)
         if not found:
             raise ConfigError(
                 "train: the error of the training images is NaN at any start; give "
@@ -125,7 +113,7 @@ class TrainingDescents:
             )
         given = (self.objective, self.space, self.training)
         # Coarser than the search's landscape: an evaluation takes some tenths of a second.
-        count = min(self.config.search.grid, _GRID[max(1, len(shown(self.space)))])
+        count = min(self.config.search.grid, _GRID[max(1, len(surroundings.shown(self.space)))])
         return Trained(
             self.objective,
             found,
@@ -134,7 +122,7 @@ class TrainingDescents:
             self.evaluations + sum(ended.evaluations for ended in self.ended),
             sum(ended.failed for ended in self.ended),
             self.training.sensor.shape[0],
-            landscape_of(*given, found[0].design, count, at_a_time=1),
+            surroundings.landscape_of(*given, found[0].design, count, at_a_time=1),
         )
 
 
@@ -152,10 +140,10 @@ def start_points(
     own = _reference_point(space)
     dtype, key = space.lower.dtype, jax.random.key(seed)
     given = jnp.asarray(np.stack([*points, *([] if own is None else [own])]), dtype)
-    every = jnp.concatenate([given, even_samples(space.size, wanted.samples, key, dtype)])
+    every = jnp.concatenate([given, searches.even_samples(space.size, wanted.samples, key, dtype)])
     values = values_at(every)
     known = np.flatnonzero(np.isfinite(values)) if np.isfinite(values).any() else slice(None)
-    best = best_apart(np.asarray(every)[known], values[known], wanted.starts, least=_BASIN)
+    best = searches.best_apart(np.asarray(every)[known], values[known], wanted.starts, least=_BASIN)
     return every[known][best], len(every)
 
 
@@ -212,18 +200,20 @@ def _reference_point(space: DesignSpace) -> np.ndarray | None:
 
 
 def _derivatives(
-    objective: TrainingObjective, space: DesignSpace, training: Training, found: Found
-) -> Derivatives:
+    objective: TrainingObjective, space: DesignSpace, training: Training, found: searches.Found
+) -> surroundings.Derivatives:
     """By differences as wide as optima are apart: the error has finer ripples, of some 0.01 dB.
 
     At a bound, those of the nearest point that has room on either side.
     """
     size = space.size
-    space, place, spans = straight(space, found.point)
-    middle = np.clip(np.asarray(place, float), APART, 1 - APART)
-    steps = APART * np.eye(size)
+    space, place, spans = surroundings.straight(space, found.point)
+    middle = np.clip(np.asarray(place, float), searches.APART, 1 - searches.APART)
+    steps = searches.APART * np.eye(size)
     points = np.concatenate([middle[None], middle + steps, middle - steps])
     points = jnp.asarray(points, space.lower.dtype)
-    values = evaluate(objective, space, training, points, at_a_time=1)
+    values = searches.evaluate(objective, space, training, points, at_a_time=1)
     level, up, down = np.split(np.asarray(values, float), [1, 1 + size])
-    return per_unit((up - down) / (2 * APART), (up - 2 * level + down) / APART**2, spans)
+    return surroundings.per_unit(
+        (up - down) / (2 * searches.APART), (up - 2 * level + down) / searches.APART**2, spans
+    )

@@ -28,11 +28,12 @@ def train(
     """
     goes_on = "interrupted; what the last check has written is kept: --resume goes on from there"
     with told(lambda: goes_on):
+        from thincam_jax.commands.checked_config import load_as
         from thincam_jax.commands.config_file import slug
-        from thincam_jax.commands.learned.config import load_learned
+        from thincam_jax.commands.learned.config import LearnedConfig
         from thincam_jax.commands.learned.run import TrainingFolder, run_training
 
-        asked = load_learned(config, tuple(set_ or ()))
+        asked = load_as(LearnedConfig, config, tuple(set_ or ()))
         folder = TrainingFolder(out or Path("runs") / slug(asked.name))
         with progress_bar("{task.fields[loss]}") as bar:
             task = bar.add_task(asked.name, total=asked.training.steps, loss="")

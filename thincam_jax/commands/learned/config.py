@@ -1,12 +1,11 @@
 """Experiment files of `kind: learned`: a camera, images to learn from, a network, its training."""
 
-from pathlib import Path
 from typing import Annotated, Literal
 
 import pydantic
 from pydantic import Field
 
-from thincam_jax.commands.checked_config import load_as
+from thincam_jax.commands.refocus.config import RangeConfig
 from thincam_jax.commands.sections import (
     ApertureConfig,
     Curvature,
@@ -31,20 +30,12 @@ class ZonesConfig(ApertureConfig):
     beta: Curvature
 
 
-class FocusConfig(Section):
+class FocusConfig(RangeConfig):
     """Images that are to be had: see `learn.refocusing.RefocusCamera`."""
 
-    nearest: Length
-    farthest: Length
     shape: tuple[Count, Count]
     planes: Annotated[int, Field(ge=2, le=64)] = 8
     pupil: Length | None = None
-
-    @pydantic.model_validator(mode="after")
-    def _ordered(self):
-        if not self.nearest < self.farthest:
-            raise ValueError("nearest is not below farthest; swap them")
-        return self
 
 
 class SourceConfig(Section):
@@ -104,14 +95,10 @@ class TrainingConfig(Section):
     judged: Annotated[int, Field(ge=1, le=1000)] = 4
 
 
-def load_learned(path: str | Path, overrides: tuple[str, ...] = ()) -> "LearnedConfig":
-    """Read an experiment file of kind learned; errors as of `load_as`."""
-    return load_as(LearnedConfig, path, overrides, "sources")
-
-
 class LearnedConfig(LenslessConfig):
     """A network that refocuses the captures of one camera."""
 
+    pictured = "sources"
     kind: Literal["learned"]
     sensor: SensorConfig
     mask: ZonesConfig

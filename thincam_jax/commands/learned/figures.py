@@ -4,6 +4,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from thincam_jax.commands.refocus.figures import grey_levels, white_level
+from thincam_jax.commands.study.figures import drawing
 from thincam_jax.learn.refocusing.network import RefocusNetwork
 from thincam_jax.learn.refocusing.scenes import Batch
 from thincam_jax.learn.refocusing.use import SURE, Reading
@@ -15,8 +16,7 @@ _SHOWN = 3  # scenes
 
 def draw_losses(state: TrainingState, check_every: int) -> Figure:
     """The loss of every step and of every check."""
-    figure = Figure(figsize=(7, 3.6), layout="constrained")
-    ax = figure.subplots()
+    figure, ax = drawing((7, 3.6))
     losses = state.losses[: state.step]
     steps = np.arange(1, len(losses) + 1)
     ax.plot(steps, losses, color="0.8", linewidth=0.8, label="loss of a step")
@@ -33,9 +33,7 @@ def draw_losses(state: TrainingState, check_every: int) -> Figure:
 def draw_scenes(network: RefocusNetwork, batch: Batch, reading: Reading) -> Figure:
     """Scenes: capture, what a lens would see and what the network makes of it; distances."""
     rows = min(_SHOWN, len(batch.capture))
-    figure = Figure(figsize=(2.1 * 7, 2.35 * rows), layout="constrained")
-    axes = figure.subplots(rows, 7, squeeze=False)
-    shown = None
+    figure, axes = drawing((2.1 * 7, 2.35 * rows), rows, 7, squeeze=False)
     near, far = float(network.camera.near), float(network.camera.far)
     for number, row in enumerate(axes):
         place = f"focused on {float(batch.commanded[number]):.0f} mm"
@@ -57,12 +55,11 @@ def draw_scenes(network: RefocusNetwork, batch: Batch, reading: Reading) -> Figu
         unsure = np.asarray(reading.confidence[number])[::-1, ::-1] < SURE
         for ax, distance in zip(row[5:], (batch.distance, reading.distance), strict=True):
             inverse = 1 / np.asarray(distance[number])[::-1, ::-1]
-            shown = ax.imshow(inverse, cmap="viridis", vmin=1 / far, vmax=1 / near)
+            ax.imshow(inverse, cmap="viridis", vmin=1 / far, vmax=1 / near)
         row[6].contourf(unsure, levels=[0.5, 1.5], colors="none", hatches=["////"])
         row[6].set_xlabel("hatched: unsure", fontsize=8)
-    if shown is not None:
-        bar = figure.colorbar(shown, ax=axes, shrink=0.8)
-        places = np.linspace(1 / far, 1 / near, 5)
-        bar.set_ticks(places.tolist(), labels=[f"{1 / p:.0f}" for p in places])
-        bar.set_label("distance (mm)")
+    bar = figure.colorbar(axes[0, 5].images[0], ax=axes, shrink=0.8)
+    places = np.linspace(1 / far, 1 / near, 5)
+    bar.set_ticks(places.tolist(), labels=[f"{1 / p:.0f}" for p in places])
+    bar.set_label("distance (mm)")
     return figure

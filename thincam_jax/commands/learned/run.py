@@ -3,7 +3,6 @@
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import jax
@@ -14,7 +13,6 @@ from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.learned import figures
 from thincam_jax.commands.learned.build import build_lessons, build_network, build_options
 from thincam_jax.commands.learned.config import LearnedConfig
-from thincam_jax.commands.page import render_page
 from thincam_jax.commands.refocus.figures import draw_sweep, save_animation
 from thincam_jax.commands.run_folder import RunFolder
 from thincam_jax.commands.study.figures import save_figure
@@ -107,8 +105,9 @@ def _report(
     sweep = swept(network, batches[0])
     save_figure(folder, "sweep", draw_sweep(sweep, {}))
     save_animation(folder, sweep)
-    page = partial(render, config, folder, result)
-    folder.complete(result, config.seed, started, page)
+    told = "training met NaN again and again; this is its best until then"
+    warnings = [told] if trained.status == "diverged" else []
+    folder.complete("learned", config, result, started, command="train", warnings=warnings)
     return result
 
 
@@ -149,22 +148,3 @@ def swept(network: RefocusNetwork, batch: Batch) -> RefocusSweep:
 
 def _rounded(value: Any) -> float | None:
     return round(float(value), 4) if np.isfinite(value) else None
-
-
-def render(
-    config: LearnedConfig,
-    folder: TrainingFolder,
-    result: dict[str, Any],
-    environment: dict[str, Any],
-) -> str:
-    """The page, with its pictures inside."""
-    warnings = []
-    if result["status"] == "diverged":
-        warnings.append("training met NaN again and again; this is its best until then")
-    shown = {
-        "command": "train",
-        "environment": environment,
-        "result": result,
-        "warnings": warnings,
-    }
-    return render_page("learned", config, folder.path / "figures", shown)

@@ -14,6 +14,7 @@ from thincam_jax.commands.sections import (
     Section,
     SensorConfig,
     Wavelength,
+    check_known,
     check_names,
     misfit,
 )
@@ -71,6 +72,7 @@ class MasksConfig(ExperimentConfig):
     - `object_distances`: the first is that of all comparisons but the one of distances.
     """
 
+    pictured = "scenes"
     kind: Literal["masks"]
     wavelength: Wavelength
     band: Annotated[tuple[Wavelength, ...], Field(min_length=2)]
@@ -93,9 +95,7 @@ class MasksConfig(ExperimentConfig):
         if list(self.light) != sorted(set(self.light)):
             raise misfit(f"{list(self.light)} do not rise; give the weakest first", "light")
         names = [scene.name for scene in self.scenes]
-        if self.tuning.scene not in names:
-            message = f"{self.tuning.scene!r} is no scene; choose one of {', '.join(names)}"
-            raise misfit(message, "tuning", "scene")
+        check_known(self.tuning.scene, "scene", names, "tuning", "scene")
         for index, entry in enumerate(self.masks):
             if entry.mask.family != "pinhole" and abs(entry.mask.width - self.width) > 1e-9:
                 message = (

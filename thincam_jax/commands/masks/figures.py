@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from thincam_jax.commands.masks.build import Setup
 from thincam_jax.commands.masks.words import Case, Results
 from thincam_jax.commands.run_folder import RunFolder
-from thincam_jax.commands.study.figures import save_figure
+from thincam_jax.commands.study.figures import drawing, save_figure
 from thincam_jax.imaging.metrics.image import align
 
 # Dash and grey tell the sort of a mask, and the marker which it is: read without colours.
@@ -73,8 +73,7 @@ def save_sheet(
     asked.append((first, strong, {"colours": "broadband"}))
     asked.append((first, strong, {"distance": config.object_distances[1]}))
     columns, rows = 2 + len(asked), len(config.masks)
-    figure = Figure(figsize=(1.5 * columns, 1.62 * rows + 0.5), layout="constrained")
-    axes = figure.subplots(rows, columns, squeeze=False)
+    figure, axes = drawing((1.5 * columns, 1.62 * rows + 0.5), rows, columns, squeeze=False)
     for row, entry in zip(axes, config.masks, strict=True):
         camera = setup.cameras[entry.name][0]
         grid = camera.sensor.grid

@@ -1,87 +1,62 @@
 """Running a comparison of masks: captures and reconstructions of each, figures, words, a page."""
 
-import time
 from dataclasses import asdict, astuple
-from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import rich
-import rich.table
+from rich.table import Table
 
-from thincam_jax.commands.masks import figures
-from thincam_jax.commands.masks.build import (
-    Setup,
-    best_linear,
-    build_setup,
-    capture,
-    channels_of,
-    kernels,
-    strength,
-    total_variation,
-)
+from thincam_jax.commands.masks import build, figures
 from thincam_jax.commands.masks.config import ComparedMaskConfig, MasksConfig
 from thincam_jax.commands.masks.words import Case, Results, findings
-from thincam_jax.commands.page import render_page
-from thincam_jax.commands.run_folder import Progress, RunFolder, Step, carry_out
-from thincam_jax.commands.terminal import counted, told
+from thincam_jax.commands.run_folder import Progress, Run, RunFolder
+from thincam_jax.commands.terminal import numbers
 from thincam_jax.imaging.metrics import psnr, ssim
 
 
-def compare_masks(config: MasksConfig, folder: RunFolder) -> None:
-    """Run the experiment with a progress bar and print what was found."""
-    with told(lambda: "interrupted; the same command starts anew."):
-        setup = build_setup(config)
-        with counted(config.name) as progress:
-            results = Results(run_masks(setup, folder, progress), config)
-    light = config.light[-1]
-    table = rich.table.Table("mask", title=f"dB at {light:,.0f} electrons, total variation")
-    for scene in results.scenes:
-        table.add_column(scene, justify="right")
+def table(config: MasksConfig, metrics: dict[str, Any]) -> Table:
+    """Every mask on every scene, at the strongest light."""
+    results, light = Results(metrics, config), config.light[-1]
+    rows = [["mask", *results.scenes]]
     for name in results.masks:
         scores = (results.score(name, scene, light) for scene in results.scenes)
-        table.add_row(name, *(f"{score:.1f}" for score in scores))
-    rich.print(table)
-    print(f"report: {folder.path / 'report.html'}")
+        rows.append([name, *(f"{score:.1f}" for score in scores)])
+    return numbers(rows, title=f"dB at {light:,.0f} electrons, total variation")
 
 
-def run_masks(setup: Setup, folder: RunFolder, progress: Progress) -> dict[str, Any]:
+def run_masks(setup: build.Setup, folder: RunFolder, progress: Progress) -> dict[str, Any]:
     """Capture, reconstruct, report; returns (and writes) the metrics.
 
-    All but the times is the same at every run of a configuration. An interrupted run is done anew.
+    All but the times is the same at every run of a configuration.
     """
-    folder.claim(setup.config)
-    run = _MasksRun(setup, folder)
-    carry_out(run.work, progress)
-    return run.metrics
+    return _MasksRun(setup, folder).carry_out(progress)
 
 
-class _MasksRun:
+class _MasksRun(Run):
     """A comparison on its way; `images` of total variation are by `Case`."""
 
-    def __init__(self, setup: Setup, folder: RunFolder):
-        self.setup, self.folder, self.started = setup, folder, time.time()
-        config = setup.config
+    def __init__(self, setup: build.Setup, folder: RunFolder):
+        super().__init__(setup.config, folder)
+        self.setup, config = setup, setup.config
         self.lights = {"one wavelength": (config.wavelength,), "broadband": config.band}
         self.images: dict[Case, np.ndarray] = {}
         self.psfs: dict[str, Any] = {}  # far away, in one wavelength
-        self.metrics: dict[str, Any] = {
+        self.metrics |= {
             "study": config.name,
             "kind": config.kind,
             "seed": config.seed,
             "masks": {},
             "cases": [],
         }
-        self.work = []
         for entry in config.masks:
-            self.work.append(Step(f"{entry.name}: tau", partial(self.tune, entry)))
+            self.add(f"{entry.name}: tau", self.tune, entry)
             for distance in config.object_distances:
                 for colours in self.lights:
-                    seen = partial(self.reconstruct, entry, distance, colours)
-                    self.work.append(Step(f"{entry.name}: {distance:g} mm, {colours}", seen))
-        self.work.append(Step("report", self.report))
+                    text = f"{entry.name}: {distance:g} mm, {colours}"
+                    self.add(text, self.reconstruct, entry, distance, colours)
+        self.add("report", self.report)
 
     def key(self, *numbers: int):
         """The same noise for every mask: a better image is a better mask."""
@@ -99,21 +74,22 @@ class _MasksRun:
     def tune(self, entry: ComparedMaskConfig) -> None:
         """τ at each light, far away and in one wavelength, and what the PSF says by itself."""
         setup, config = self.setup, self.setup.config
-        psfs = kernels(setup, entry.name, (config.wavelength,), config.object_distances[0])
+        psfs = build.kernels(setup, entry.name, (config.wavelength,), config.object_distances[0])
         self.psfs[entry.name] = psfs
-        cameras, asked = channels_of(setup, entry, psfs), config.tuning
+        cameras, asked = build.channels_of(setup, entry, psfs), config.tuning
         scene, precision = self.stack([asked.scene])
         chosen = {}
         for number, electrons in enumerate(config.light):
             key = self.key(number, len(config.scenes))
-            seen = capture(setup, entry, psfs, scene, electrons, key)
-            start = best_linear(cameras, seen, precision)
+            seen = build.capture(setup, entry, psfs, scene, electrons, key)
+            start = build.best_linear(cameras, seen, precision)
             tried = [
-                total_variation(cameras, seen, start, tau, asked.iterations) for tau in asked.tau
+                build.total_variation(cameras, seen, start, tau, asked.iterations)
+                for tau in asked.tau
             ]
             scores = [psnr(np.asarray(image[0]), np.asarray(scene[0])) for image in tried]
             chosen[f"{electrons:g}"] = asked.tau[int(np.argmax(scores))]
-        found = strength(setup, entry, psfs)
+        found = build.strength(setup, entry, psfs)
         self.metrics["masks"][entry.name] = {
             "family": entry.mask.family,
             "label": entry.mask.label,
@@ -130,20 +106,20 @@ class _MasksRun:
         near, alone = config.object_distances[1], colours == "one wavelength"
         psfs = self.psfs[entry.name]
         if distance == near or not alone:
-            psfs = kernels(setup, entry.name, self.lights[colours], distance)
-        cameras, names = channels_of(setup, entry, psfs), [s.name for s in config.compared]
+            psfs = build.kernels(setup, entry.name, self.lights[colours], distance)
+        cameras, names = build.channels_of(setup, entry, psfs), [s.name for s in config.compared]
         scenes, precision = self.stack(names)
         tau = self.metrics["masks"][entry.name]["tau"]
         for number, electrons in enumerate(config.light):
             key = self.key(number, distance == near, alone)
-            seen = capture(setup, entry, psfs, scenes, electrons, key)
-            linear = best_linear(cameras, seen, precision)
+            seen = build.capture(setup, entry, psfs, scenes, electrons, key)
+            linear = build.best_linear(cameras, seen, precision)
             options = tau[f"{electrons:g}"], config.tuning.iterations
-            found = total_variation(cameras, seen, linear, *options)
+            found = build.total_variation(cameras, seen, linear, *options)
             methods = {"linear": linear, "total variation": found}
             if distance == near and alone and electrons == config.light[-1]:
-                far = channels_of(setup, entry, self.psfs[entry.name])
-                methods["focused far"] = best_linear(far, seen, precision)
+                far = build.channels_of(setup, entry, self.psfs[entry.name])
+                methods["focused far"] = build.best_linear(far, seen, precision)
             for method, images in methods.items():
                 for name, image, truth in zip(names, images, scenes, strict=True):
                     case = Case(entry.name, name, electrons, distance, colours, method)
@@ -161,13 +137,4 @@ class _MasksRun:
         self.metrics["findings"] = findings(results)
         figures.save_error(folder, results)
         figures.save_sheet(folder, setup, self.psfs, self.images, results)
-        page = partial(render, setup.config, folder, results)
-        folder.complete(self.metrics, setup.config.seed, self.started, page)
-
-
-def render(
-    config: MasksConfig, folder: RunFolder, results: Results, environment: dict[str, Any]
-) -> str:
-    """The page, with its pictures inside."""
-    shown = {"command": "run", "environment": environment, "results": results, "warnings": ()}
-    return render_page("masks", config, folder.path / "figures", shown)
+        self.complete("masks", results=results)

@@ -79,7 +79,7 @@ class Results:
 
 def findings(results: Results) -> list[str]:
     """Sentences, made of the numbers alone."""
-    parts = (_winners, _why, _literature, _pinhole, _colours, _distance, _phases, _solvers)
+    parts = (_winners, _why, _literature, _pinhole, _costs, _phases, _solvers)
     return [sentence for part in parts for sentence in part(results)]
 
 
@@ -160,11 +160,9 @@ def _pinhole(results: Results) -> Iterable[str]:
     )
 
 
-def _colours(results: Results) -> Iterable[str]:
+def _costs(results: Results) -> Iterable[str]:
+    """Of colours and distance."""
     yield _extremes(results, results.broadband, "a band of wavelengths costs")
-
-
-def _distance(results: Results) -> Iterable[str]:
     near = results.config.object_distances[1]
     yield _extremes(results, results.near, f"an object at {near:g} mm, its PSF known, costs")
     text = f"the PSF of the wrong distance costs a linear image at {near:g} mm"
@@ -215,5 +213,5 @@ def _extremes(results: Results, cost: Callable[[str], float], text: str) -> str:
 
 def _rank_correlation(first: list[float], second: list[float]) -> float:
     """Spearman's: 1 where both are in one order."""
-    a, b = (np.argsort(np.argsort(values)) - (len(values) - 1) / 2 for values in (first, second))
-    return float(a @ b / np.sqrt((a @ a) * (b @ b)))
+    a, b = (np.argsort(np.argsort(values)) for values in (first, second))
+    return float(np.corrcoef(a, b)[0, 1])

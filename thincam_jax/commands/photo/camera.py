@@ -25,10 +25,11 @@ def read_camera(config: Path, overrides: Sequence[str], distance: float | None) 
     """
     if read_raw(config)[0].get("kind") == "learned":
         # Here: other captures need not wait for the learned parts.
+        from thincam_jax.commands.checked_config import load_as
         from thincam_jax.commands.learned.build import build_camera
-        from thincam_jax.commands.learned.config import load_learned
+        from thincam_jax.commands.learned.config import LearnedConfig
 
-        whole = build_camera(load_learned(config, tuple(overrides)))
+        whole = build_camera(load_as(LearnedConfig, config, tuple(overrides)))
         if distance is None:
             raise ConfigError(f"{config}: tells no object's distance; give a --distance")
         light = {"wavelength": float(whole.light.wavelengths[0]), "model": whole.model}

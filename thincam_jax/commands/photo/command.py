@@ -118,40 +118,32 @@ def reconstruct(
     """
     nothing = "interrupted; of the capture at work no image is there yet, nothing of it is kept"
     with told(lambda: nothing):
-        from thincam_jax.commands.photo.console import (
-            known_camera,
-            known_psf,
-            read_background,
-            read_corner,
-            read_distances,
-            read_white_balance,
-            run_with_bar,
-        )
+        from thincam_jax.commands.photo import console
         from thincam_jax.commands.photo.jobs import plan_jobs
         from thincam_jax.commands.photo.options import Output, Recipe, Sources
         from thincam_jax.measured import MeasurementError, Preparation
 
         try:
-            seen_by, focusing = known_camera(psf, camera, set_, network, distance)
-            known = known_psf(psf, seen_by, camera, background)
+            given = psf, camera, set_, network, distance, background
+            known, focusing = console.known_psf(*given)
             sources = Sources(
                 known,
-                read_background(background),
-                0.0 if camera else read_background(psf_background),
+                console.read_background(background),
+                0.0 if camera else console.read_background(psf_background),
                 dead,
                 bits,
                 Preparation(
                     bayer=bayer,
                     demosaicing=demosaic,
                     downsample=downsample,
-                    corner=read_corner(corner),
+                    corner=console.read_corner(corner),
                     psf_scale=psf_scale,
                     saturation=saturation,
                     noise_threshold=noise_threshold,
                     psf_channels=psf_channels,
                 ),
                 psf_bits,
-                read_distances(distances, psf),
+                console.read_distances(distances, psf),
             )
             recipe = Recipe(
                 method=method.replace("-", "_"),
@@ -164,9 +156,9 @@ def reconstruct(
                 noise=noise,
                 focusing=focusing,
             )
-            balance, unsure = read_white_balance(white_balance), focusing is not None
+            balance, unsure = console.read_white_balance(white_balance), focusing is not None
             output = Output(out, linear, gamma, balance, unsure)
-            end = run_with_bar(plan_jobs(capture, sources, output), sources, recipe, output)
+            end = console.run_with_bar(plan_jobs(capture, sources, output), sources, recipe, output)
         except (MeasurementError, OSError) as error:
             fail(error)
     if end:
@@ -197,8 +189,8 @@ def check(
     better.
     """
     with told(lambda: "interrupted; nothing is known of the PSF"):
+        from thincam_jax.commands.photo import console
         from thincam_jax.commands.photo.check import check_files, enough_blocks
-        from thincam_jax.commands.photo.console import read_background, read_corner
         from thincam_jax.commands.photo.options import Sources
         from thincam_jax.commands.terminal import progress_bar
         from thincam_jax.measured import MeasurementError, Preparation
@@ -206,14 +198,14 @@ def check(
         try:
             sources = Sources(
                 psf,
-                read_background(background),
-                read_background(psf_background),
+                console.read_background(background),
+                console.read_background(psf_background),
                 dead,
                 bits,
                 Preparation(
                     bayer=bayer,
                     downsample=1 if downsample is None else downsample,
-                    corner=read_corner(corner),
+                    corner=console.read_corner(corner),
                     psf_scale=psf_scale,
                     psf_channels=psf_channels,
                 ),

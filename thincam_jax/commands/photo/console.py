@@ -13,7 +13,7 @@ from thincam_jax.commands.start import INTERRUPTED
 from thincam_jax.commands.terminal import WRONG_INPUT, in_a_line, progress_bar, tell
 from thincam_jax.measured import MeasurementError, Raw
 from thincam_jax.measured.write import WhiteBalance
-from thincam_jax.reconstruction import Cameras, Progress
+from thincam_jax.reconstruction import Progress
 from thincam_jax.reconstruction.depth.refocus import increasing
 from thincam_jax.units import parse_quantity
 
@@ -29,35 +29,17 @@ def read_background(text: str | None) -> Background:
 
 
 def known_psf(
-    psf: Path | None, seen_by: Cameras | None, camera: Path | None, background: str | None
-) -> Path | Raw:
-    """The file of a measured PSF, or the PSF of a camera.
-
-    **Errors**: MeasurementError where a computed PSF comes without a background.
-    """
-    if seen_by is None:
-        assert psf is not None
-        return psf
-    assert camera is not None
-    if background is None:
-        raise MeasurementError(
-            "--camera: a computed PSF has no dark corner; give --background, a dark frame or a "
-            "number of counts"
-        )
-    return computed_psf(camera, seen_by)
-
-
-def known_camera(
     psf: Path | None,
     camera: Path | None,
     overrides: list[str] | None,
     network: Path | None,
     distance: str | None,
-) -> tuple[Cameras | None, Focusing | None]:
-    """The camera of a file, where one is given, and its network.
+    background: str | None,
+) -> tuple[Path | Raw, Focusing | None]:
+    """The file of a measured PSF; or the PSF of a camera, and its network.
 
-    **Errors**: MeasurementError where not one of PSF and camera is given; ConfigError of the
-    camera and the network.
+    **Errors**: MeasurementError where not one of PSF and camera is given, and where a computed PSF
+    comes without a background; ConfigError of the camera and the network.
     """
     if (psf is None) == (camera is None):
         raise MeasurementError(
@@ -70,18 +52,25 @@ def known_camera(
             raise MeasurementError("--network is of a camera; give --camera in place of --psf")
     if distance is not None and network is None:
         raise MeasurementError("--distance is that of a --network; see --distances for others")
-    if camera is None:
-        return None, None
+    if psf is not None or camera is None:
+        assert psf is not None  # one of the two is given
+        return psf, None
     try:
         focused = None if distance is None else parse_quantity(distance, "length")
     except ValueError as error:
         raise MeasurementError(f"--distance: {error}") from None
     seen_by = read_camera(camera, overrides or (), focused)
-    if network is None:
-        return seen_by, None
-    from thincam_jax.commands.photo.network import read_network
+    focusing = None
+    if network is not None:
+        from thincam_jax.commands.photo.network import read_network
 
-    return seen_by, read_network(network, seen_by)
+        focusing = read_network(network, seen_by)
+    if background is None:
+        raise MeasurementError(
+            "--camera: a computed PSF has no dark corner; give --background, a dark frame or a "
+            "number of counts"
+        )
+    return computed_psf(camera, seen_by), focusing
 
 
 def read_distances(text: str | None, psf: Path | None) -> tuple[float, ...]:

@@ -6,12 +6,11 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from matplotlib.figure import Figure
 
 from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.photo.options import Focusing
 from thincam_jax.commands.refocus.figures import grey_levels, white_level
-from thincam_jax.commands.study.figures import as_png
+from thincam_jax.commands.study.figures import as_png, drawing
 from thincam_jax.learn.refocusing.store import load
 from thincam_jax.learn.refocusing.use import SURE, doubt, read
 from thincam_jax.measured import MeasurementError, Prepared
@@ -65,8 +64,7 @@ def focus(
 def _marked(image: np.ndarray, unsure: np.ndarray) -> bytes:
     """The mean of an image's colours, with what is not sure of any in red."""
     image, unsure = np.mean(image, axis=0), np.any(unsure, axis=0)
-    figure = Figure(figsize=(5, 5 * image.shape[0] / image.shape[1] + 0.4), layout="constrained")
-    ax = figure.subplots()
+    figure, ax = drawing((5, 5 * image.shape[0] / image.shape[1] + 0.4))
     ax.set(xticks=[], yticks=[])
     ax.imshow(grey_levels(image, white_level(image)) ** (1 / 2.2), cmap="gray", vmin=0, vmax=1)
     shade = np.zeros((*unsure.shape, 4))

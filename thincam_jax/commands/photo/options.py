@@ -90,8 +90,6 @@ class Recipe:
     def __post_init__(self):
         self._check_method()
         try:
-            checks.choice("coupling", self.coupling or "none", ("none", "joint", "opponent"))
-            checks.choice("field", self.field, ("sensor", "full"))
             checks.non_negative("tau", self.relative_tau, "parts of one")
             if self.ridge is not None:
                 checks.positive("ridge", self.ridge, "parts of one")
@@ -170,9 +168,3 @@ class Output:
     gamma: float | int = 2.2
     white_balance: WhiteBalance = None
     unsure: bool = False
-
-    def __post_init__(self):
-        try:
-            checks.choice("linear", self.linear, ("npy", "tif", "none"))
-        except ValueError as error:
-            raise MeasurementError(str(error)) from None

@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,22 +12,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from thincam_jax import measured
 from thincam_jax._core.files import WriteError, writing
 from thincam_jax._core.memory import refuse_if_too_large
 from thincam_jax.commands.doctor import environment
 from thincam_jax.commands.photo.jobs import Job, write_job
 from thincam_jax.commands.photo.options import Background, Output, Recipe, Sources
 from thincam_jax.imaging.operators import window_shape
-from thincam_jax.measured import (
-    MeasurementError,
-    Prepared,
-    Raw,
-    prepare,
-    read_image,
-    read_images,
-    read_mask,
-    to_display,
-)
 from thincam_jax.reconstruction import (
     InverseProblem,
     Progress,
@@ -45,7 +37,7 @@ from thincam_jax.reconstruction.regularised import AbstractRegularised
 # Real arrays of the window's size that a reconstruction holds at its peak, for each channel.
 _WINDOWS = 28
 
-Told = Callable[[str, Progress], object]
+Told = Callable[[str, Progress], None]
 
 
 @dataclass(frozen=True)
@@ -72,7 +64,7 @@ class Failed:
     """A capture of which nothing was written, and why: one line."""
 
     job: Job
-    error: MeasurementError | MemoryError | WriteError
+    error: measured.MeasurementError | MemoryError | WriteError
 
 
 def run_jobs(
@@ -95,7 +87,7 @@ def run_jobs(
                 finished = _join(job, images, rig, output)
             else:
                 finished = _run_job(job, rig, recipe, output, told)
-        except (MeasurementError, MemoryError, WriteError) as error:
+        except (measured.MeasurementError, MemoryError, WriteError) as error:
             yield Failed(job, error)
             continue
         if sources.distances and job.focus is not None:
@@ -112,21 +104,25 @@ class Rig:
         self.sources = sources
         psf_bits = sources.bits if sources.psf_bits is None else sources.psf_bits
         given = sources.psf
-        if isinstance(given, Raw):
+        if isinstance(given, measured.Raw):
             self.psfs = [given]
         elif sources.distances:
-            self.psfs = read_images(given, psf_bits)
-            _check_count(given, self.psfs, sources.distances)
+            self.psfs = measured.read_images(given, psf_bits)
+            if len(self.psfs) != len(sources.distances):
+                raise measured.MeasurementError(
+                    f"{given}: holds {len(self.psfs)} PSFs for {len(sources.distances)} distances; "
+                    "give one for each, nearest first"
+                )
         else:
-            self.psfs = [read_image(given, psf_bits)]
+            self.psfs = [measured.read_image(given, psf_bits)]
         self.background = _background(sources.background, sources.bits)
         self.psf_background = _background(sources.psf_background, psf_bits)
-        self.dead = None if sources.dead is None else read_mask(sources.dead)
+        self.dead = None if sources.dead is None else measured.read_mask(sources.dead)
 
-    def prepare(self, capture: Path, focus: int = 0) -> Prepared:
-        return prepare(
+    def prepare(self, capture: Path, focus: int = 0) -> measured.Prepared:
+        return measured.prepare(
             self.psfs[focus],
-            read_image(capture, self.sources.bits),
+            measured.read_image(capture, self.sources.bits),
             self.background,
             self.sources.preparation,
             psf_background=self.psf_background,
@@ -134,16 +130,8 @@ class Rig:
         )
 
 
-def _check_count(given: Path, psfs: list[Raw], distances: tuple[float, ...]) -> None:
-    if len(psfs) != len(distances):
-        raise MeasurementError(
-            f"{given}: holds {len(psfs)} PSFs for {len(distances)} distances; give one for each, "
-            "nearest first"
-        )
-
-
-def _background(given: Background, bits: int | None) -> Raw | float | None:
-    return read_image(given, bits) if isinstance(given, Path) else given
+def _background(given: Background, bits: int | None) -> measured.Raw | float | None:
+    return measured.read_image(given, bits) if isinstance(given, Path) else given
 
 
 def _run_job(job: Job, rig: Rig, recipe: Recipe, output: Output, told: Told | None) -> Finished:
@@ -167,7 +155,13 @@ def _run_job(job: Job, rig: Rig, recipe: Recipe, output: Output, told: Told | No
         "sources": _told(rig.sources),
         "preparation": ready.log,
         "reconstruction": facts,
-        "image": _image_facts(image, recipe),
+        "image": {
+            "shape": image.shape,
+            "field": recipe.field,
+            "turned_by_180_degrees": recipe.flip,
+            "minimum": image.min(),
+            "maximum": image.max(),
+        },
         "files": {path.suffix[1:].lower(): path.name for path in job.images},
         "display": shown if job.is_shown else None,
         "environment": environment(time.perf_counter() - began),
@@ -181,7 +175,7 @@ def _join(job: Job, images: list[np.ndarray], rig: Rig, output: Output) -> Finis
 
     began, distances = time.perf_counter(), rig.sources.distances
     if len(images) != len(distances):
-        raise MeasurementError(
+        raise measured.MeasurementError(
             f"{job.images[0]}: is not made, nor a depth map: {len(images)} of {len(distances)} "
             "distances could be reconstructed"
         )
@@ -205,29 +199,40 @@ def _written(job: Job, image: np.ndarray, record, output: Output, beside=None) -
 def _told(sources: Sources) -> dict[str, Any]:
     """All but the preparation, which tells its own."""
     names = ("background", "psf_background", "dead", "bits", "psf_bits")
-    psf = sources.psf.name if isinstance(sources.psf, Raw) else sources.psf
+    psf = sources.psf.name if isinstance(sources.psf, measured.Raw) else sources.psf
     told = {"psf": psf, **{name: getattr(sources, name) for name in names}}
     return told | ({"distances_mm": sources.distances} if sources.distances else {})
 
 
 def _reconstruct(
-    job: Job, ready: Prepared, recipe: Recipe, told: Told | None
+    job: Job, ready: measured.Prepared, recipe: Recipe, told: Told | None
 ) -> tuple[Float[np.ndarray, "channel y x"], dict[str, Any]]:
     """The image, and what was done for it."""
     # The mask is given even where all is valid, so that one compilation serves a whole folder.
     capture, psf, valid = (jnp.asarray(a)[None] for a in (ready.capture, ready.psf, ready.valid))
     *_, channels, rows, columns = capture.shape  # those of the PSF as well
     sensor, field = (rows, columns), (2 * rows - 1, 2 * columns - 1)
-    _check_memory(job, window_shape(sensor, field, sensor), channels)
+    window = window_shape(sensor, field, sensor)
+    refuse_if_too_large(
+        f"{job.capture}: its reconstruction on {window[0]}×{window[1]} samples",
+        4 * _WINDOWS * channels * window[0] * window[1],
+        "give a larger downsample",
+    )
     noise, how = _noise(ready, recipe)
     seen_by = Psfs(psf, field_shape=field)
     recording = Recording(capture, seen_by, valid=valid, noise_variance=noise**2)
     solver = recipe.solver(channels)
     # Conjugate gradients run in one piece: there is nothing to tell of before the end.
-    callback = None if told is None or recipe.is_ridge else _Teller(told, job.name)
+    callback = None if told is None or recipe.is_ridge else partial(told, job.name)
     found = reconstruct(recording, solver, callback=callback)
     if found.status == "non_finite":
-        raise MeasurementError(_lost(job, found, recipe))
+        weight = (
+            ("ridge", recipe.relative_ridge) if recipe.is_ridge else ("tau", recipe.relative_tau)
+        )
+        raise measured.MeasurementError(
+            f"{job.capture}: the image became NaN or infinite after {found.iterations} iterations; "
+            f"give a {weight[0]} (now {weight[1]:g}) that is nearer to 1"
+        )
     if found.status == "interrupted" and not found.iterations:
         raise KeyboardInterrupt
     problem = recording.problem(
@@ -241,7 +246,7 @@ def _reconstruct(
     return image[:, ::-1, ::-1] if recipe.flip else image, facts
 
 
-def _noise(ready: Prepared, recipe: Recipe) -> tuple[float, str]:
+def _noise(ready: measured.Prepared, recipe: Recipe) -> tuple[float, str]:
     """Standard deviation of a prepared pixel's noise, and how it was found."""
     if recipe.noise is not None:
         return recipe.noise * _of_a_count(ready), "given"
@@ -258,29 +263,11 @@ def _noise(ready: Prepared, recipe: Recipe) -> tuple[float, str]:
     return float(jnp.sqrt(estimate_variance([light], [valid])[0])), how
 
 
-def _of_a_count(ready: Prepared) -> float:
+def _of_a_count(ready: measured.Prepared) -> float:
     """What a raw pixel's standard deviation of one count is in the prepared capture."""
     log = ready.log
     full_scale = log["full_scale"]["capture"]["full_scale"]
     return 1 / (full_scale * log["downsampling"]["factor"] * log["scaling"]["capture_divisor"])
-
-
-def _lost(job: Job, found: Reconstruction, recipe: Recipe) -> str:
-    now = ("ridge", recipe.relative_ridge) if recipe.is_ridge else ("tau", recipe.relative_tau)
-    return (
-        f"{job.capture}: the image became NaN or infinite after {found.iterations} iterations; "
-        f"give a {now[0]} (now {now[1]:g}) that is nearer to 1"
-    )
-
-
-class _Teller:
-    """Progress with the name of the capture that it is of; asks for no stop."""
-
-    def __init__(self, told: Told, name: str):
-        self.told, self.name = told, name
-
-    def __call__(self, progress: Progress) -> None:
-        self.told(self.name, progress)
 
 
 def _facts(
@@ -322,43 +309,25 @@ def _relative_residual(
     )
 
 
-def _image_facts(image: Float[np.ndarray, "channel y x"], recipe: Recipe) -> dict[str, Any]:
-    return {
-        "shape": image.shape,
-        "field": recipe.field,
-        "turned_by_180_degrees": recipe.flip,
-        "minimum": image.min(),
-        "maximum": image.max(),
-    }
-
-
-def _check_channels(job: Job, ready: Prepared, recipe: Recipe, output: Output) -> None:
+def _check_channels(job: Job, ready: measured.Prepared, recipe: Recipe, output: Output) -> None:
     """What would else be noticed when the work is done."""
     channels = ready.capture.shape[0]
     if recipe.coupling == "opponent" and channels != 3:
-        raise MeasurementError(
+        raise measured.MeasurementError(
             f"{job.capture}: has {channels} channels and coupling 'opponent' is for 3; "
             "choose 'joint' or 'none'"
         )
     if job.is_shown:
         if channels not in (1, 3):
-            raise MeasurementError(
+            raise measured.MeasurementError(
                 f"{job.capture}: has {channels} channels and a PNG shows 1 or 3; give an output "
                 "with the suffix .npy or .tif"
             )
-        to_display(
+        measured.to_display(
             np.ones((channels, 1, 1)), white_balance=output.white_balance, gamma=output.gamma
         )
     if not (ready.valid & (ready.capture > 0)).any(axis=(1, 2)).all():
-        raise MeasurementError(
+        raise measured.MeasurementError(
             f"{job.capture}: has a channel without a trusted pixel that holds light; all others "
             "are saturated or dead: give a larger saturation, or expose less"
         )
-
-
-def _check_memory(job: Job, window: tuple[int, int], channels: int) -> None:
-    refuse_if_too_large(
-        f"{job.capture}: its reconstruction on {window[0]}×{window[1]} samples",
-        4 * _WINDOWS * channels * window[0] * window[1],
-        "give a larger downsample",
-    )

@@ -1,19 +1,18 @@
 """Experiment files of `kind: screen_design`: the plate of a see-through screen, within limits."""
 
 import math
-from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import pydantic
 from pydantic import BeforeValidator, Field
 
-from thincam_jax.commands.checked_config import load_as
 from thincam_jax.commands.screen.config import (
     HologramConfig,
     LensConfig,
     PlateConfig,
     ScreenMethodConfig,
     ScreenTargetConfig,
+    SeenConfig,
 )
 from thincam_jax.commands.sections import (
     Angle,
@@ -49,14 +48,6 @@ class LimitsConfig(Section):
             if low > high:
                 raise misfit(f"[{low:g}, {high:g}] crosses; give the lower limit first", name)
         return self
-
-
-class SeenConfig(Section):
-    """The object: so many cells (rows, columns) of a monitor of that width."""
-
-    cells: tuple[Annotated[int, Field(ge=7, le=512)], Annotated[int, Field(ge=7, le=512)]]
-    distance: Length
-    width: Length
 
 
 class SearchConfig(Section):
@@ -100,8 +91,3 @@ class FoundConfig(Section):
     hologram: HologramConfig
     screen: PlateConfig
     lens: LensConfig
-
-
-def load_plate_design(path: str | Path, overrides: tuple[str, ...] = ()) -> PlateDesignConfig:
-    """Read and check a file; errors as of `load_as`."""
-    return load_as(PlateDesignConfig, path, overrides)

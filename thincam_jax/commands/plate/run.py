@@ -1,8 +1,6 @@
 """Searching for a plate, what each of its numbers does, and captures through it."""
 
 import dataclasses
-import time
-from functools import partial
 from typing import Any
 
 import jax
@@ -13,21 +11,13 @@ from matplotlib.figure import Figure
 from thincam_jax import waveguide as wg
 from thincam_jax.commands.checked_config import dump_config
 from thincam_jax.commands.config_file import ConfigError
-from thincam_jax.commands.page import render_page
 from thincam_jax.commands.plate.config import FoundConfig, PlateDesignConfig
-from thincam_jax.commands.run_folder import Progress, RunFolder, Step, carry_out
-from thincam_jax.commands.screen.build import Captured, rounded, undo
+from thincam_jax.commands.run_folder import Progress, Run, RunFolder
+from thincam_jax.commands.screen.build import Captured, undo
 from thincam_jax.commands.study.build import picture
-from thincam_jax.commands.study.figures import line_style, save_figure
-from thincam_jax.design.plate import (
-    Judged,
-    Plate,
-    PlateLimits,
-    Viewing,
-    find_plate,
-    judge_plate,
-    noise_variance,
-)
+from thincam_jax.commands.study.evaluate import rounded
+from thincam_jax.commands.study.figures import drawing, line_style, save_figure
+from thincam_jax.design import plate as plates
 from thincam_jax.imaging.metrics import psnr, ssim
 from thincam_jax.imaging.sensor import Sensor
 from thincam_jax.units import deg, nm, um
@@ -59,44 +49,44 @@ def design_plate(
 
     **Errors**: ConfigError where a target cannot be read.
     """
-    run = _PlateRun(config, folder)
-    folder.claim(config)
-    carry_out(run.work, progress)
-    return run.result
+    return _PlateRun(config, folder).carry_out(progress)
 
 
-class _PlateRun:
+class _PlateRun(Run):
     def __init__(self, config: PlateDesignConfig, folder: PlateFolder):
-        self.config, self.folder, self.started = config, folder, time.time()
         try:
             self.scenes = [picture(target, config.object.cells) for target in config.targets]
         except (ValueError, FileNotFoundError) as error:
             raise ConfigError(f"{config.place_of('targets')}targets: {error}") from None
+        super().__init__(config, folder)
         sensor, seen = Sensor(config.sensor.shape, config.sensor.pitch), config.object
         cell = seen.width / seen.cells[1]
-        self.viewing = Viewing(sensor, seen.distance, seen.width, cell, config.snr_db)
+        self.viewing = plates.Viewing(sensor, seen.distance, seen.width, cell, config.snr_db)
         names = list(NUMBERS)
         low, high = ([getattr(config.plate, name)[end] for name in names] for end in (0, 1))
-        self.limits = PlateLimits(Plate(*low), Plate(*high))
-        focal = low[-1] if low[-1] == high[-1] else Plate().focal_distance
-        self.plates = {"default": Plate(focal_distance=focal)}
+        self.limits = plates.PlateLimits(plates.Plate(*low), plates.Plate(*high))
+        focal = low[-1] if low[-1] == high[-1] else plates.Plate().focal_distance
+        self.plates = {"default": plates.Plate(focal_distance=focal)}
         self.images: dict[str, np.ndarray] = {}
-        self.result: dict[str, Any] = {"name": config.name, "kind": config.kind, "plates": {}}
-        self.work = [Step("search", self.search), Step("what each number does", self.slices)]
+        self.metrics |= {"name": config.name, "kind": config.kind, "plates": {}}
+        self.add("search", self.search)
+        self.add("what each number does", self.slices)
         if config.focal_distances:
-            self.work.append(Step("field of view against error", self.front))
+            self.add("field of view against error", self.front)
         for name in ("default", "found"):
-            self.work.append(Step(f"captures of {name}", partial(self.simulate, name)))
-        self.work.append(Step("report", self.report))
+            self.add(f"captures of {name}", self.simulate, name)
+        self.add("report", self.report)
 
-    def found_within(self, limits: PlateLimits):
+    def found_within(self, limits: plates.PlateLimits):
         counts = self.config.search.model_dump()
-        return find_plate(self.viewing, limits, key=jax.random.key(self.config.seed), **counts)
+        return plates.find_plate(
+            self.viewing, limits, key=jax.random.key(self.config.seed), **counts
+        )
 
     def search(self) -> None:
         self.plates["found"] = self.found_within(self.limits).plate
         for name, plate in self.plates.items():
-            self.result["plates"][name] = _told(plate, judge_plate(plate, self.viewing))
+            self.metrics["plates"][name] = _told(plate, plates.judge_plate(plate, self.viewing))
 
     def slices(self) -> None:
         ends = zip(*map(jax.tree.leaves, (self.limits.lower, self.limits.upper)), strict=True)
@@ -117,24 +107,23 @@ class _PlateRun:
         axes[0].legend()
         save_figure(self.folder, "slices", figure)
 
-    def error(self, plate: Plate, number: str, value: float) -> float:
+    def error(self, plate: plates.Plate, number: str, value: float) -> float:
         changed = dataclasses.replace(plate, **{number: value})
-        return float(judge_plate(changed, self.viewing).error)
+        return float(plates.judge_plate(changed, self.viewing).error)
 
     def front(self) -> None:
         points = []
         for focal in self.config.focal_distances:
             limits = self.limits.lower, self.limits.upper
             ends = [dataclasses.replace(end, focal_distance=focal) for end in limits]
-            default = judge_plate(Plate(focal_distance=focal), self.viewing)
-            errors = float(default.error), self.found_within(PlateLimits(*ends)).error
+            default = plates.judge_plate(plates.Plate(focal_distance=focal), self.viewing)
+            errors = float(default.error), self.found_within(plates.PlateLimits(*ends)).error
             points.append((float(default.field_of_view) / deg, *errors))
-        self.result["front"] = [
+        self.metrics["front"] = [
             {"focal_distance_mm": f, "field_of_view_deg": v, "default_error": d, "found_error": e}
             for f, (v, d, e) in zip(self.config.focal_distances, points, strict=True)
         ]
-        figure = Figure(figsize=(6, 4), layout="constrained")
-        ax = figure.subplots()
+        figure, ax = drawing((6, 4))
         fields, default, found = zip(*sorted(points), strict=True)
         ax.semilogy(fields, default, label="default but for the lens", **line_style(0))
         ax.semilogy(fields, found, label="found at that field of view", **line_style(1))
@@ -154,14 +143,14 @@ class _PlateRun:
             jnp.stack([jnp.zeros_like(middle), middle]),
         )
         system = wg.system_operator(camera, plane, ORDERS, BAND_SAMPLES)
-        light = judge_plate(plate, viewing).light
-        variance = noise_variance(viewing, light) / light**2
+        light = plates.judge_plate(plate, viewing).light
+        variance = plates.noise_variance(viewing, light) / light**2
         clean = system(jnp.stack([jnp.asarray(s, light.dtype) for s in self.scenes]))
         key = jax.random.key(self.config.seed)
         captures = clean + jnp.sqrt(variance) * jax.random.normal(key, clean.shape, clean.dtype)
         found = undo(system, self.config.method, Captured(captures, variance))
         self.images[name] = np.asarray(found.image, float)
-        self.result["plates"][name]["targets"] = {
+        self.metrics["plates"][name]["targets"] = {
             target.name: {"psnr_db": rounded(psnr(image, scene)), "ssim": ssim(image, scene)}
             for target, image, scene in zip(
                 self.config.targets, self.images[name], self.scenes, strict=True
@@ -171,24 +160,18 @@ class _PlateRun:
     def report(self) -> None:
         save_figure(self.folder, "images", self.draw_images())
         self.folder.write("found.yaml", dump_config(self.found_config()))
-        self.folder.complete(self.result, self.config.seed, self.started, self.page)
-
-    def page(self, environment: dict[str, Any]) -> str:
-        shown = {"command": "design", "design": self.result, "numbers": NUMBERS, "warnings": ()}
-        shown["environment"] = environment
-        return render_page("plate", self.config, self.folder.path / "figures", shown)
+        self.complete("plate", command="design", numbers=NUMBERS)
 
     def draw_images(self) -> Figure:
         count, half = len(self.scenes), self.viewing.object_width / 2
-        figure = Figure(figsize=(8.4, 2.9 * count), layout="constrained")
-        rows = figure.subplots(count, 3, squeeze=False)
+        figure, rows = drawing((8.4, 2.9 * count), count, 3, squeeze=False)
         for number, (row, target) in enumerate(zip(rows, self.config.targets, strict=True)):
             pictures = {"scene": self.scenes[number]}
             pictures |= {name: images[number] for name, images in self.images.items()}
             for ax, (name, image) in zip(row, pictures.items(), strict=True):
                 down = half * image.shape[0] / image.shape[1]
                 ax.imshow(image, cmap="gray", vmin=0, vmax=1, extent=(-half, half, down, -down))
-                scores = self.result["plates"].get(name, {}).get("targets", {})
+                scores = self.metrics["plates"].get(name, {}).get("targets", {})
                 score = scores.get(target.name, {}).get("psnr_db")
                 told = f"{target.name}, scene" if name == "scene" else f"{name}, {score:.1f} dB"
                 ax.set_title(told, fontsize="medium")
@@ -196,7 +179,7 @@ class _PlateRun:
         return figure
 
     def found_config(self) -> FoundConfig:
-        found = self.result["plates"]["found"]["numbers"]
+        found = self.metrics["plates"]["found"]["numbers"]
         glass, angle, film, modulation, lens, focal = (
             found[name] * unit for name, (unit, _) in NUMBERS.items()
         )
@@ -215,7 +198,7 @@ class _PlateRun:
         )
 
 
-def _told(plate: Plate, judged: Judged) -> dict[str, Any]:
+def _told(plate: plates.Plate, judged: plates.Judged) -> dict[str, Any]:
     return {
         "numbers": {n: float(getattr(plate, n)) / unit for n, (unit, _) in NUMBERS.items()},
         "error": float(judged.error),

@@ -13,7 +13,7 @@ from thincam_jax._core.grids import Grid
 from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.refocus.config import PlacedConfig, RefocusConfig
 from thincam_jax.commands.study import build
-from thincam_jax.commands.study.evaluate import sample
+from thincam_jax.commands.study.evaluate import rounded, sample
 from thincam_jax.commands.study.study import Capture, Exposure, Method, Study, Target
 from thincam_jax.imaging.metrics import psnr
 from thincam_jax.imaging.metrics.image import SSIM_WINDOW
@@ -21,12 +21,7 @@ from thincam_jax.imaging.scene import ImagePlane
 from thincam_jax.imaging.targets import middle_square, resize
 from thincam_jax.reconstruction import Reconstruction
 from thincam_jax.reconstruction.depth import RefocusSweep, axial_resolution, refocus_distances
-from thincam_jax.reconstruction.depth.find import (
-    FocusCurves,
-    FocusPeak,
-    find_distances,
-    object_regions,
-)
+from thincam_jax.reconstruction.depth import find as finding
 
 _MARGIN = 1.15  # the field over what the objects cover
 
@@ -152,10 +147,10 @@ class FoundObjects:
     """Regions of a sweep, their focus curves, and which region each object is (None: none)."""
 
     regions: np.ndarray
-    curves: FocusCurves | None
+    curves: finding.FocusCurves | None
     region_of: dict[str, int | None]
 
-    def peak(self, name: str) -> FocusPeak | None:
+    def peak(self, name: str) -> finding.FocusPeak | None:
         """The focus of an object."""
         region = self.region_of[name]
         return None if region is None or self.curves is None else self.curves.distance_of(region)
@@ -163,11 +158,11 @@ class FoundObjects:
 
 def find_objects(study: Study, sweep: RefocusSweep) -> FoundObjects:
     """Regions of the picture and their distances; objects are named by where they were placed."""
-    regions, asked = object_regions(sweep), study.config.sweep
+    regions, asked = finding.object_regions(sweep), study.config.sweep
     boxes = {t.name: object_box(study, sweep_method(study), t) for t in study.targets}
     if not regions.any():
         return FoundObjects(regions, None, dict.fromkeys(boxes))
-    curves = find_distances(
+    curves = finding.find_distances(
         sweep, measure=asked.measure, smoothing=asked.smoothing, regions=regions
     )
     return FoundObjects(
@@ -206,7 +201,7 @@ def psnr_of_objects(
         box = object_box(study, method, placed)
         grid = Grid(image.shape, 1 / _pixels_per_mm(study, method, placed))
         score = psnr(image[box], np.asarray(sample(placed.plane, grid), dtype=float)[box])
-        scores[placed.name] = round(score, 3) if math.isfinite(score) else None
+        scores[placed.name] = rounded(score)
     return scores
 
 

@@ -12,6 +12,7 @@ from thincam_jax.commands.sections import (
     Position,
     Section,
     TargetConfig,
+    check_known,
     check_names,
     misfit,
 )
@@ -31,16 +32,11 @@ class PlacedConfig(TargetConfig):
     crop: Annotated[float, Field(gt=0, le=1)] = 1.0
 
 
-class SweepConfig(Section):
-    """Over which distances, by which method, and what is called sharp."""
+class RangeConfig(Section):
+    """Distances of objects."""
 
     nearest: Length
     farthest: Length
-    count: Annotated[int, Field(ge=5, le=200)] = 25
-    method: Name
-    measure: Measure = "laplacian_variance"
-    smoothing: Annotated[float, Field(ge=0, le=50)] = 1.0
-    window: Annotated[float, Field(ge=0.5, le=100)] = 6.0
 
     @pydantic.model_validator(mode="after")
     def _ordered(self):
@@ -49,9 +45,20 @@ class SweepConfig(Section):
         return self
 
 
+class SweepConfig(RangeConfig):
+    """Over which distances, by which method, and what is called sharp."""
+
+    count: Annotated[int, Field(ge=5, le=200)] = 25
+    method: Name
+    measure: Measure = "laplacian_variance"
+    smoothing: Annotated[float, Field(ge=0, le=50)] = 1.0
+    window: Annotated[float, Field(ge=0.5, le=100)] = 6.0
+
+
 class RefocusConfig(CamerasConfig):
     """A scene of several objects, captured once, and focused afterwards."""
 
+    pictured = "objects"
     kind: Literal["refocus"]
     objects: Annotated[tuple[PlacedConfig, ...], Field(min_length=1)]
     sweep: SweepConfig
@@ -61,9 +68,7 @@ class RefocusConfig(CamerasConfig):
     def _objects_fit(self):
         check_names(self, "objects")
         names = [method.name for method in self.methods]
-        if self.sweep.method not in names:
-            message = f"{self.sweep.method!r} is no method; choose one of {', '.join(names)}"
-            raise misfit(message, "sweep", "method")
+        check_known(self.sweep.method, "method", names, "sweep", "method")
         for index, placed in enumerate(self.objects):
             if not self.sweep.nearest < placed.distance < self.sweep.farthest:
                 message = (

@@ -13,7 +13,7 @@ from matplotlib.patches import Rectangle
 from thincam_jax.commands.config_file import slug
 from thincam_jax.commands.refocus.build import FoundObjects, object_box
 from thincam_jax.commands.run_folder import RunFolder
-from thincam_jax.commands.study.figures import line_style, save_figure, save_image
+from thincam_jax.commands.study.figures import drawing, line_style, save_figure, save_image, sheet
 from thincam_jax.commands.study.study import Method, Study, Target
 from thincam_jax.imaging.targets import middle_square
 from thincam_jax.reconstruction.depth import DepthMap, RefocusSweep
@@ -47,15 +47,8 @@ def draw_sweep(sweep: RefocusSweep, objects: dict[str, Any]) -> Figure:
         int(np.argmin(np.abs(distances - o["distance_mm"]))): name for name, o in objects.items()
     }
     picked = _spread(len(distances), _SHOWN, list(nearest))
-    columns = min(5, len(picked))
-    rows = -(-len(picked) // columns)
-    aspect = images.shape[-2] / images.shape[-1]
-    size = (2.2 * columns, rows * (2.2 * aspect + 0.35))
-    figure = Figure(figsize=size, layout="constrained")
-    axes = figure.subplots(rows, columns, squeeze=False).ravel()
-    for ax in axes:
-        ax.set_axis_off()
-    for ax, index in zip(axes, picked, strict=False):
+    figure, axes = sheet(len(picked), 5, 2.2, images.shape[-2] / images.shape[-1], 0.35)
+    for ax, index in zip(axes, picked, strict=True):
         ax.imshow(grey_levels(images[index], white), cmap="gray", vmin=0, vmax=1)
         name = nearest.get(index)
         text = f"{distances[index]:.4g} mm" + (f" – {name}" if name else "")
@@ -112,8 +105,7 @@ def save_curves(
     objects: dict[str, Any],
 ) -> None:
     """Focus measure of each object over the sweep, with where it stands and where it was found."""
-    figure = Figure(figsize=(8.5, 4.0), layout="constrained")
-    ax = figure.subplots()
+    figure, ax = drawing((8.5, 4.0))
     distances = np.asarray(sweep.distances)
     for index, (name, values) in enumerate(objects.items()):
         region, style = found.region_of[name], line_style(index + 2)
@@ -146,8 +138,7 @@ def draw_depth(sweep: RefocusSweep, depth: DepthMap, sharp: np.ndarray) -> Figur
     if sweep.slope is not None:
         slope, names = float(sweep.slope), ("direction x/t", "direction y/t")
     extent = (-columns / 2 * slope, columns / 2 * slope, rows / 2 * slope, -rows / 2 * slope)
-    figure = Figure(figsize=(12, 3.4 * rows / columns * 1.15 + 1.5), layout="constrained")
-    axes = figure.subplots(1, 3, sharey=True)
+    figure, axes = drawing((12, 3.4 * rows / columns * 1.15 + 1.5), 1, 3, sharey=True)
     shown = np.ma.masked_where(confidence < _SURE, distance)
     span = (float(sweep.distances[0]), float(sweep.distances[-1]))
     panels = [

@@ -1,27 +1,17 @@
 """Running a refocus experiment: one set of captures, a sweep of the focus, a report."""
 
-import time
-from functools import partial
 from typing import Any
 
 import numpy as np
+from rich.table import Table
 
-from thincam_jax.commands.page import render_page
-from thincam_jax.commands.refocus import figures
-from thincam_jax.commands.refocus.build import (
-    find_objects,
-    focus_on,
-    join_sweep,
-    object_metrics,
-    psnr_of_objects,
-    sweep_distances,
-    sweep_method,
-    take_scene,
-)
+from thincam_jax.commands.page import number
+from thincam_jax.commands.refocus import build, figures
 from thincam_jax.commands.refocus.config import RefocusConfig
-from thincam_jax.commands.run_folder import Progress, RunFolder, Step, carry_out
+from thincam_jax.commands.run_folder import Progress, Run, RunFolder
 from thincam_jax.commands.study.figures import save_figure, save_image
 from thincam_jax.commands.study.study import Capture, Exposure, Method, Study
+from thincam_jax.commands.terminal import numbers
 from thincam_jax.reconstruction import Reconstruction
 from thincam_jax.reconstruction.depth import all_in_focus, depth_map
 
@@ -29,68 +19,66 @@ from thincam_jax.reconstruction.depth import all_in_focus, depth_map
 def run_refocus(study: Study, folder: RunFolder, progress: Progress) -> dict[str, Any]:
     """Capture, sweep, reconstruct and report; returns (and writes) the metrics.
 
-    The same configuration gives the same metrics. An interrupted run is done anew.
+    The same configuration gives the same metrics.
     """
-    folder.claim(study.config)
-    run = _RefocusRun(study, folder)
-    carry_out(run.work, progress)
-    return run.metrics
+    return _RefocusRun(study, folder).carry_out(progress)
 
 
-class _RefocusRun:
-    """A refocus experiment on its way.
+def table(config: RefocusConfig, metrics: dict[str, Any]) -> Table:
+    """Where objects were placed, and where they were found."""
+    rows = [["object", "distance mm", "found mm", "error %", "axial resolution mm"]]
+    keys = ("distance_mm", "found_mm", "error_percent", "axial_resolution_mm")
+    for name, found in metrics["objects"].items():
+        rows.append([name, *(number(found[key], 1) for key in keys)])
+    return numbers(rows)
 
-    `work` holds the captures, the distances of the sweep, each method focused on each object, and
-    the report.
-    """
+
+class _RefocusRun(Run):
+    """A refocus experiment on its way."""
 
     def __init__(self, study: Study, folder: RunFolder):
-        self.study, self.folder, self.started = study, folder, time.time()
+        super().__init__(study.config, folder)
+        self.study = study
         self.captures: dict[Exposure, Capture] = {}
         self.swept: list[Reconstruction] = []
         self.pictures: dict[tuple[str, float], np.ndarray] = {}
         self.methods: dict[str, Any] = {
             m.name: {"captures": len(m.exposures), "focused_on_mm": {}} for m in study.methods
         }
-        self.metrics: dict[str, Any] = {}
-        self.work = [
-            Step(f"capture {number}", partial(self.capture, exposure))
-            for number, exposure in enumerate(study.exposures, 1)
-        ]
-        name = study.config.sweep.method
-        for number, distance in enumerate(sweep_distances(study), 1):
-            self.work.append(Step(f"{name}: distance {number}", partial(self.sweep, distance)))
+        for count, exposure in enumerate(study.exposures, 1):
+            self.add(f"capture {count}", self.capture, exposure)
+        for count, distance in enumerate(build.sweep_distances(study), 1):
+            self.add(f"{study.config.sweep.method}: distance {count}", self.sweep, distance)
         for method in study.methods:
             for distance in (target.distance for target in study.targets):
-                focus = partial(self.focus, method, distance)
-                self.work.append(Step(f"{method.name}: {distance:g} mm", focus))
-        self.work.append(Step("report", self.report))
+                self.add(f"{method.name}: {distance:g} mm", self.focus, method, distance)
+        self.add("report", self.report)
 
     def capture(self, exposure: Exposure) -> None:
-        self.captures[exposure] = take_scene(self.study, exposure)
+        self.captures[exposure] = build.take_scene(self.study, exposure)
 
     def sweep(self, distance: float) -> None:
-        method = sweep_method(self.study)
-        self.swept.append(focus_on(self.study, method, self.captures, distance))
+        method = build.sweep_method(self.study)
+        self.swept.append(build.focus_on(self.study, method, self.captures, distance))
 
     def focus(self, method: Method, distance: float) -> None:
-        result = focus_on(self.study, method, self.captures, distance)
+        result = build.focus_on(self.study, method, self.captures, distance)
         self.pictures[method.name, distance] = np.asarray(result.image)
         self.methods[method.name]["focused_on_mm"][f"{distance:g}"] = {
-            "psnr_db": psnr_of_objects(self.study, method, result),
+            "psnr_db": build.psnr_of_objects(self.study, method, result),
             "status": result.status,
             "iterations": result.iterations or None,
         }
 
     def report(self) -> None:
         study, folder, asked = self.study, self.folder, self.study.config.sweep
-        sweep = join_sweep(study, sweep_distances(study), self.swept)
-        found = find_objects(study, sweep)
+        sweep = build.join_sweep(study, build.sweep_distances(study), self.swept)
+        found = build.find_objects(study, sweep)
         self.metrics = {
             "study": study.config.name,
             "kind": study.config.kind,
             "seed": study.config.seed,
-            "objects": object_metrics(study, found),
+            "objects": build.object_metrics(study, found),
             "sweep": _sweep_metrics(study, sweep, found),
             "methods": self.methods,
             "warnings": study.warnings,
@@ -106,8 +94,7 @@ class _RefocusRun:
         save_image(folder, "all-in-focus", figures.grey_levels(sharp, white))
         save_figure(folder, "depth", figures.draw_depth(sweep, depth, sharp))
         figures.save_methods(folder, study, self.pictures, self.methods)
-        page = partial(render, study.config, folder, self.metrics)
-        folder.complete(self.metrics, study.config.seed, self.started, page)
+        self.complete("refocus", findings=findings(study.config, self.metrics))
 
 
 def _sweep_metrics(study: Study, sweep, found) -> dict[str, Any]:
@@ -126,20 +113,6 @@ def _sweep_metrics(study: Study, sweep, found) -> dict[str, Any]:
             if region is not None
         },
     }
-
-
-def render(
-    config: RefocusConfig, folder: RunFolder, metrics: dict[str, Any], environment: dict[str, Any]
-) -> str:
-    """The page, with its pictures inside."""
-    shown = {
-        "command": "run",
-        "environment": environment,
-        "metrics": metrics,
-        "warnings": metrics["warnings"],
-        "findings": findings(config, metrics),
-    }
-    return render_page("refocus", config, folder.path / "figures", shown)
 
 
 def findings(config: RefocusConfig, metrics: dict[str, Any]) -> list[str]:

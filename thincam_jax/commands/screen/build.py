@@ -17,7 +17,6 @@ from thincam_jax.commands.screen.config import (
     RectangleConfig,
     ScreenConfig,
     ScreenMethodConfig,
-    ScreenTargetConfig,
     SeeThroughConfig,
 )
 from thincam_jax.commands.sections import VariationConfig
@@ -52,22 +51,17 @@ MISTAKES = {
 }
 
 
-@dataclass(frozen=True, eq=False)
-class Shown:
-    """A target on the cells of the monitor, radiance 0 to 1: (y, x) or (y, x, channel)."""
-
-    config: ScreenTargetConfig
-    image: np.ndarray
-
-
 @dataclass(frozen=True)
 class Setup:
-    """What is simulated: the camera of each colour, the monitor before it, and what it shows."""
+    """What is simulated: the camera of each colour, the monitor before it, and what it shows.
+
+    - `targets`: by name, radiance 0 to 1 on the cells of the monitor, (y, x) or (y, x, channel).
+    """
 
     config: ScreenConfig
     cameras: tuple[wg.SeeThroughCamera, ...]
     plane: wg.ObjectPlane
-    targets: tuple[Shown, ...]
+    targets: dict[str, np.ndarray]
 
     @property
     def camera(self) -> wg.SeeThroughCamera:
@@ -92,17 +86,16 @@ def build_setup(config: ScreenConfig) -> Setup:
 
     **Errors**: ConfigError, one line for each fault, beginning with its place.
     """
-    targets, faults = [], []
+    targets, faults = {}, []
     channels = len(config.hologram.colours or ())
     for number, target in enumerate(config.targets):
         try:
-            targets.append(Shown(target, picture(target, config.object.cells, channels)))
+            targets[target.name] = picture(target, config.object.cells, channels)
         except (ValueError, FileNotFoundError) as error:
             place = config.place_of("targets", number, "path")
             faults.append(f"{place}targets[{number}]: {error}")
-    cameras, seen = build_cameras(config), config.object
-    plane = wg.ObjectPlane(seen.cells, seen.distance, seen.width, jnp.asarray([seen.x, seen.y]))
-    setup = Setup(config, cameras, plane, tuple(targets))
+    cameras = build_cameras(config)
+    setup = Setup(config, cameras, build_plane(config), targets)
     try:
         for camera in cameras:
             wg.check_screen(camera)
@@ -120,6 +113,12 @@ def build_setup(config: ScreenConfig) -> Setup:
     if faults:
         raise ConfigError("\n".join(faults))
     return setup
+
+
+def build_plane(config: SeeThroughConfig) -> wg.ObjectPlane:
+    """The cells before the camera."""
+    seen = config.object
+    return wg.ObjectPlane(seen.cells, seen.distance, seen.width, jnp.asarray([seen.x, seen.y]))
 
 
 def build_cameras(
@@ -245,7 +244,7 @@ class Captured(eqx.Module):
 
 def capture(setup: Setup, system: Sparse) -> Captured:
     """Every target as the sensor reads it; each has noise of its own key."""
-    images = np.stack([shown.image for shown in setup.targets])
+    images = np.stack(list(setup.targets.values()))
     images = np.moveaxis(images, -1, 1) if images.ndim == 4 else images
     images = jnp.asarray(images.reshape(-1, *system.in_shape), system.values.dtype)
     clean, sensor = system(images), setup.camera.sensor
@@ -267,8 +266,3 @@ def undo(model: AbstractOperator, method: ScreenMethodConfig, captured: Captured
         solver = AdmmTV(options.tau, variation=variation, iterations=options.iterations)
     variance = captured.variance[None]
     return reconstruct(Recording(captured.images[None], [model], noise_variance=variance), solver)
-
-
-def rounded(score: float) -> float | None:
-    """A PSNR, dB, for metrics; None where nothing differs, which JSON has no number for."""
-    return round(score, 3) if math.isfinite(score) else None

@@ -17,7 +17,9 @@ from thincam_jax.commands.sections import (
     SensorConfig,
     VariationConfig,
     Wavelength,
+    check_known,
     check_names,
+    check_noise,
     misfit,
 )
 from thincam_jax.commands.study.config import PictureConfig
@@ -85,12 +87,25 @@ class LensConfig(Section):
     lens_distance: Length
 
 
-class CellsConfig(Section):
-    """The object: a monitor of square cells (rows, columns), its middle at (x, y)."""
+class SeenConfig(Section):
+    """The object: so many square cells (rows, columns) of a monitor of that width."""
 
     cells: tuple[Annotated[int, Field(ge=7, le=512)], Annotated[int, Field(ge=7, le=512)]]
     distance: Length
     width: Length
+
+
+def check_cells(cells: tuple[int, int], *place: str) -> None:
+    """Refuse cells that there are no Hadamard patterns of."""
+    try:
+        HadamardSeries(cells)
+    except ValueError as error:
+        raise misfit(str(error), *place) from None
+
+
+class CellsConfig(SeenConfig):
+    """The same with its middle at (x, y)."""
+
     x: Position = 0.0
     y: Position = 0.0
 
@@ -225,10 +240,7 @@ class ScreenConfig(SeeThroughConfig, ExperimentConfig):
         if self.calibration is not None:
             if self.hologram.colours is not None:
                 raise misfit("takes a hologram of one colour; drop hologram.colours", "calibration")
-            try:
-                HadamardSeries(self.object.cells)
-            except ValueError as error:
-                raise misfit(str(error), "object", "cells") from None
+            check_cells(self.object.cells, "object", "cells")
             for number, model in enumerate(self.models):
                 if model.name == MEASURED:
                     message = f"{MEASURED!r} is the name of the calibration's; give another"
@@ -236,10 +248,6 @@ class ScreenConfig(SeeThroughConfig, ExperimentConfig):
         methods = [method.name for method in self.methods]
         for number, target in enumerate(self.targets):
             for name in target.published:
-                if name not in methods:
-                    message = f"{name!r} is no method; choose one of {', '.join(methods)}"
-                    raise misfit(message, "targets", number, "published", name)
-        if self.noise.read_noise is not None and not self.sensor.counts:
-            message = "read_noise counts electrons; give sensor.exposure, such as 0.9, or electrons"
-            raise misfit(message, "noise", "read_noise")
+                check_known(name, "method", methods, "targets", number, "published", name)
+        check_noise(self)
         return self

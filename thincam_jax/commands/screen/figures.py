@@ -6,13 +6,12 @@ import jax.numpy as jnp
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import PowerNorm
-from matplotlib.figure import Figure
 
 from thincam_jax import waveguide as wg
 from thincam_jax.commands.config_file import slug
 from thincam_jax.commands.run_folder import RunFolder
 from thincam_jax.commands.screen.build import Setup
-from thincam_jax.commands.study.figures import line_style, save_figure, save_image
+from thincam_jax.commands.study.figures import drawing, line_style, save_figure, save_image
 from thincam_jax.units import nm
 
 # Centres, widths below and above (nm) and heights of lobes whose sums are the CIE 1931 matching
@@ -63,8 +62,7 @@ def save_rays(folder: RunFolder, setup: Setup) -> None:
     crossing = width * sines / np.sqrt(index**2 - sines**2)
     along = np.asarray(rays.guided)
     bounce = width * along[:, 1] / np.sqrt(index**2 - np.sum(along**2, axis=-1))
-    figure = Figure(figsize=(9.5, 4.6), layout="constrained")
-    ax = figure.subplots()
+    figure, ax = drawing((9.5, 4.6))
     ahead = 5 * width
     for n, (pixel, light) in enumerate(zip(pixels[:, 1], rays.wavelength, strict=True)):
         style = line_style(n + 1)
@@ -101,8 +99,7 @@ def save_field(folder: RunFolder, setup: Setup, rays: wg.Rays) -> None:
         shift = np.asarray(rays.points[1] - rays.points[0])
         maps.append((shift[..., 1], "first ghost: seen further down (mm)"))
         maps.append((shift[..., 0], "first ghost: seen further right (mm)"))
-    figure = Figure(figsize=(3.1 * (len(maps) + 1), 3.9), layout="constrained")
-    axes = figure.subplots(1, len(maps) + 1)
+    figure, axes = drawing((3.1 * (len(maps) + 1), 3.9), 1, len(maps) + 1)
     for ax, (values, label) in zip(axes, maps, strict=False):
         drawn = ax.imshow(values, cmap="gray", extent=(-x, x, y, -y))
         lines = ax.contour(values, levels=6, colors="#d08020", extent=(-x, x, -y, y))
@@ -134,10 +131,9 @@ def save_images(
     for name, panels in (("images", right), ("models", wrong)):
         shown = 2 if name == "images" else 1
         size = (1.75 * (len(panels) + shown), 1.95 * len(setup.targets))
-        figure = Figure(figsize=size, layout="constrained")
-        rows = figure.subplots(len(setup.targets), len(panels) + shown, squeeze=False)
+        figure, rows = drawing(size, len(setup.targets), len(panels) + shown, squeeze=False)
         for number, (target, axes) in enumerate(zip(setup.targets, rows, strict=True)):
-            _panel(axes[0], target.image, target.config.name, "" if number else "target")
+            _panel(axes[0], setup.targets[target], target, "" if number else "target")
             if shown == 2:
                 colour = in_colour(captures[number], wavelength)
                 _panel(axes[1], colour, "", "" if number else "capture, turned")
@@ -147,7 +143,7 @@ def save_images(
         save_figure(folder, name, figure)
     for number, target in enumerate(setup.targets):
         for title, key in right:
-            save_image(folder, f"{slug(target.config.name)}--{slug(title)}", found[key][number])
+            save_image(folder, f"{slug(target)}--{slug(title)}", found[key][number])
 
 
 def _panel(ax: Axes, image: np.ndarray, label: str, title: str) -> None:
@@ -161,12 +157,10 @@ def save_errors(
     folder: RunFolder, setup: Setup, scores: dict[tuple[str, str], list[float]]
 ) -> None:
     """PSNR of every target by the last method with each model."""
-    figure = Figure(figsize=(9, 3.8), layout="constrained")
-    ax = figure.subplots()
-    names = [target.config.name for target in setup.targets]
+    figure, ax = drawing((9, 3.8))
     last = [key for key in scores if key[1] == setup.config.methods[-1].name]
     for index, key in enumerate(last):
-        ax.plot(names, scores[key], label=key[0], **line_style(index))
+        ax.plot(list(setup.targets), scores[key], label=key[0], **line_style(index))
     ax.set(ylabel="PSNR (dB)", xlabel="target")
     ax.grid(alpha=0.3)
     figure.legend(loc="outside right center", fontsize=9)
@@ -185,19 +179,17 @@ def save_columns(
     """
     y, x = (n * pitch / 2 for n in next(iter(images.values())).shape[1:])
     most = max(stack.max() for stack in images.values())
-    figure = Figure(figsize=(3.0 * len(cells) + 1, 3.0 * len(images)), layout="constrained")
-    grid = figure.subplots(len(images), len(cells), sharex=True, sharey=True, squeeze=False)
-    drawn = None
+    size, count = (3.0 * len(cells) + 1, 3.0 * len(images)), (len(images), len(cells))
+    figure, grid = drawing(size, *count, sharex=True, sharey=True, squeeze=False)
     for line, (name, stack) in zip(grid, images.items(), strict=True):
         for (row, column), ax, image in zip(cells, line, stack, strict=True):
             norm = PowerNorm(0.5, 0, most)
-            drawn = ax.imshow(image, cmap="gray_r", norm=norm, extent=(-x, x, y, -y))
+            ax.imshow(image, cmap="gray_r", norm=norm, extent=(-x, x, y, -y))
             ax.set_title(f"cell ({row}, {column}), {name}", fontsize=10)
         line[0].set_ylabel("y on the sensor (mm)")
     for ax in grid[-1]:
         ax.set_xlabel("x on the sensor (mm)")
-    assert drawn is not None
-    figure.colorbar(drawn, ax=grid, label="counts for a white cell")
+    figure.colorbar(grid[0, 0].images[0], ax=grid, label="counts for a white cell")
     save_figure(folder, "columns", figure)
 
 
@@ -208,16 +200,17 @@ def save_distances(
     scores: dict[str, dict[str, dict]],
 ) -> None:
     """One target at other distances, by each matrix, in grey with its PSNR."""
-    target = next((t for t in setup.targets if not t.config.binary), setup.targets[0])
-    number = setup.targets.index(target)
+    asked = setup.config.targets
+    number = next((n for n, target in enumerate(asked) if not target.binary), 0)
+    target = asked[number].name
     ways = list(next(iter(images.values())))
-    figure = Figure(figsize=(2.1 * (len(ways) + 1), 2.4 * len(images)), layout="constrained")
-    grid = figure.subplots(len(images), len(ways) + 1, squeeze=False)
+    rows, columns = len(images), len(ways) + 1
+    figure, grid = drawing((2.1 * columns, 2.4 * rows), rows, columns, squeeze=False)
     for row, ((distance, found), line) in enumerate(zip(images.items(), grid, strict=True)):
-        _panel(line[0], target.image, target.config.name, "" if row else "target")
+        _panel(line[0], setup.targets[target], target, "" if row else "target")
         line[0].set_ylabel(f"object at {distance}")
         for name, ax in zip(ways, line[1:], strict=True):
-            score = scores[distance][name]["targets"][target.config.name]
+            score = scores[distance][name]["targets"][target]
             label = "" if score is None else f"{score:.1f} dB"
             _panel(ax, found[name][number], label, "" if row else name)
     save_figure(folder, "distances", figure)

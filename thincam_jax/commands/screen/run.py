@@ -3,129 +3,103 @@
 import resource
 import sys
 import time
-from functools import partial
 from typing import Any
 
 import numpy as np
-import rich
-import rich.table
+from rich.table import Table
 
 from thincam_jax import waveguide as wg
-from thincam_jax.commands.page import render_page
-from thincam_jax.commands.run_folder import Progress, RunFolder, Step, carry_out
-from thincam_jax.commands.screen import figures
-from thincam_jax.commands.screen.build import (
-    MISTAKES,
-    Captured,
-    Setup,
-    build_models,
-    build_setup,
-    capture,
-    rounded,
-    undo,
-)
+from thincam_jax.commands.run_folder import Progress, Run, RunFolder
+from thincam_jax.commands.screen import build, figures
 from thincam_jax.commands.screen.calibration import Calibration
 from thincam_jax.commands.screen.config import MEASURED, ScreenConfig, ScreenMethodConfig
-from thincam_jax.commands.terminal import counted, told
+from thincam_jax.commands.study.evaluate import rounded
+from thincam_jax.commands.terminal import numbers
 from thincam_jax.imaging.metrics import psnr, ssim
 from thincam_jax.imaging.operators import AbstractOperator, Sparse
 from thincam_jax.units import deg, nm
 
 
-def screen(config: ScreenConfig, folder: RunFolder) -> None:
-    """Run the experiment with a progress bar and print what was found."""
-    with told(lambda: "interrupted; the same command starts anew."):
-        setup = build_setup(config)
-        with counted(config.name) as progress:
-            metrics = run_screen(setup, folder, progress)
-    table = rich.table.Table("model")
-    for method in config.methods:
-        table.add_column(f"{method.name}, mean dB", justify="right")
+def table(config: ScreenConfig, metrics: dict[str, Any]) -> Table:
+    """Every model by every method."""
+    rows = [["model", *(f"{method.name}, mean dB" for method in config.methods)]]
     for name, model in metrics["models"].items():
-        means = [result["mean_psnr_db"] for result in model["methods"].values()]
-        table.add_row(name, *(f"{mean:.1f}" for mean in means))
-    rich.print(table)
-    print(f"report: {folder.path / 'report.html'}")
+        means = (found["mean_psnr_db"] for found in model["methods"].values())
+        rows.append([name, *(f"{mean:.1f}" for mean in means)])
+    return numbers(rows)
 
 
-def run_screen(setup: Setup, folder: RunFolder, progress: Progress) -> dict[str, Any]:
-    """Trace, capture, undo and report; returns (and writes) the metrics.
-
-    An interrupted run is done anew.
-    """
-    folder.claim(setup.config)
-    run = _ScreenRun(setup, folder)
-    carry_out(run.work, progress)
-    return run.metrics
+def run_screen(setup: build.Setup, folder: RunFolder, progress: Progress) -> dict[str, Any]:
+    """Trace, capture, undo and report; returns (and writes) the metrics."""
+    return _ScreenRun(setup, folder).carry_out(progress)
 
 
-class _ScreenRun:
+class _ScreenRun(Run):
     """A screen experiment on its way; images and scores are by model and method."""
 
-    def __init__(self, setup: Setup, folder: RunFolder):
-        self.setup, self.folder, self.started = setup, folder, time.time()
+    captured: build.Captured
+    calibration: Calibration
+
+    def __init__(self, setup: build.Setup, folder: RunFolder):
+        super().__init__(setup.config, folder)
+        self.setup = setup
         self.systems: list[Sparse] = []
-        self.captured: Captured | None = None
-        self.calibration: Calibration | None = None
         self.found: dict[tuple[str, str], np.ndarray] = {}
         self.scores: dict[tuple[str, str], list[float]] = {}
-        self.metrics: dict[str, Any] = {}
         self.models: dict[str, Any] = {}
-        self.work = [Step("rays and captures", self.capture)]
+        self.add("rays and captures", self.capture)
         for number, model in enumerate(setup.config.models):
-            does = MISTAKES[model.mistake]
+            does = build.MISTAKES[model.mistake]
             if model.glass_thickness is not None:
                 does = f"{does}, with a glass of {model.glass_thickness:g} mm"
             self.models[model.name] = {"mistake": does, "methods": {}}
             for method in setup.config.methods:
-                undone = partial(self.undo_by_model, number, method)
-                self.work.append(Step(f"{model.name}: {method.name}", undone))
+                self.add(f"{model.name}: {method.name}", self.undo_by_model, number, method)
         if setup.config.calibration is not None:
             self.models[MEASURED] = {"mistake": "by Hadamard patterns, with noise", "methods": {}}
-            self.work.append(Step("captures of Hadamard patterns", self.calibrate))
+            self.add("captures of Hadamard patterns", self.calibrate)
             for method in setup.config.methods:
-                undone = partial(self.undo_by_matrix, method)
-                self.work.append(Step(f"{MEASURED}: {method.name}", undone))
-            self.work.append(Step("fit of the screen", self.fit))
+                self.add(f"{MEASURED}: {method.name}", self.undo_by_matrix, method)
+            self.add("fit of the screen", self.fit)
             for distance in setup.config.calibration.distances:
-                seen = partial(self.look_from, distance)
-                self.work.append(Step(f"object at {distance:g} mm", seen))
-        self.work.append(Step("report", self.report))
+                self.add(f"object at {distance:g} mm", self.look_from, distance)
+        self.add("report", self.report)
 
     def capture(self) -> None:
-        self.systems = build_models(self.setup)
-        self.captured = capture(self.setup, self.systems[0])
+        self.systems = build.build_models(self.setup)
+        self.captured = build.capture(self.setup, self.systems[0])
 
     def calibrate(self) -> None:
         self.calibration = Calibration(self.setup, self.systems[0], self.folder)
 
     def fit(self) -> None:
-        assert self.calibration is not None  # an earlier step
         self.calibration.fit_screen()
 
     def look_from(self, distance: float) -> None:
-        assert self.calibration is not None
         self.calibration.look_from(distance)
 
     def undo_by_model(self, number: int, method: ScreenMethodConfig) -> None:
-        assert self.captured is not None  # the first step
         name = self.setup.config.models[number].name
         self.undo(name, self.systems[number], method, self.captured)
 
     def undo_by_matrix(self, method: ScreenMethodConfig) -> None:
-        assert self.captured is not None and self.calibration is not None
         measured = self.calibration.measured
         self.undo(MEASURED, measured.reduced, method, measured.seen(self.captured))
 
     def undo(
-        self, name: str, system: AbstractOperator, method: ScreenMethodConfig, captured: Captured
+        self,
+        name: str,
+        system: AbstractOperator,
+        method: ScreenMethodConfig,
+        captured: build.Captured,
     ) -> None:
         began = time.perf_counter()
-        result = undo(system, method, captured)
+        result = build.undo(system, method, captured)
         images = np.asarray(result.image, float)
         images = np.moveaxis(images, 1, -1) if images.ndim == 4 else images
         seconds = time.perf_counter() - began
-        scores = [psnr(i, t.image) for i, t in zip(images, self.setup.targets, strict=True)]
+        targets = self.setup.targets
+        scores = [psnr(i, truth) for i, truth in zip(images, targets.values(), strict=True)]
         key = name, method.name
         self.found[key], self.scores[key] = images, scores
         self.models[name]["methods"][method.name] = {
@@ -134,18 +108,16 @@ class _ScreenRun:
             "status": result.status,
             "iterations": result.iterations,
             "targets": {
-                target.config.name: {
-                    "psnr_db": rounded(score),
-                    "ssim": round(ssim(image, target.image), 4),
-                }
-                for target, score, image in zip(self.setup.targets, scores, images, strict=True)
+                target: {"psnr_db": rounded(score), "ssim": round(ssim(image, truth), 4)}
+                for (target, truth), score, image in zip(
+                    targets.items(), scores, images, strict=True
+                )
             },
         }
 
     def report(self) -> None:
         setup, folder = self.setup, self.folder
-        assert self.captured is not None
-        rays = setup.rays()
+        rays, peak = setup.rays(), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         self.metrics = {
             "study": setup.config.name,
             "kind": setup.config.kind,
@@ -153,9 +125,9 @@ class _ScreenRun:
             "rays": ray_metrics(setup, rays),
             "models": self.models,
             "entries_of_the_system": int(self.systems[0].values.size),
-            "peak_memory_gb": round(_peak_memory(), 2),
+            "peak_memory_gb": round(peak * (1 if sys.platform == "darwin" else 1024) / 1e9, 2),
         }
-        if self.calibration is not None:
+        if setup.config.calibration is not None:
             self.metrics["calibration"] = self.calibration.metrics
             self.calibration.save_figures()
         figures.save_rays(folder, setup)
@@ -163,17 +135,10 @@ class _ScreenRun:
         images, light = np.asarray(self.captured.images), setup.wavelengths
         figures.save_images(folder, setup, images, light, self.found, self.scores)
         figures.save_errors(folder, setup, self.scores)
-        page = partial(render, setup.config, folder, self.metrics)
-        folder.complete(self.metrics, setup.config.seed, self.started, page)
+        self.complete("screen")
 
 
-def _peak_memory() -> float:
-    """Of the process so far, GB."""
-    unit = 1 if sys.platform == "darwin" else 1024
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e9
-
-
-def ray_metrics(setup: Setup, rays: wg.Rays) -> dict[str, Any]:
+def ray_metrics(setup: build.Setup, rays: wg.Rays) -> dict[str, Any]:
     """Colours, angles of the guided light, shifts of the first ghost, and how rays ended."""
     status = np.asarray(rays.status)
     index = np.asarray(setup.camera.screen.glass_index(rays.wavelength))
@@ -198,11 +163,3 @@ def ray_metrics(setup: Setup, rays: wg.Rays) -> dict[str, Any]:
         if (status == kind).any()
     }
     return found
-
-
-def render(
-    config: ScreenConfig, folder: RunFolder, metrics: dict[str, Any], environment: dict[str, Any]
-) -> str:
-    """The page, with its pictures inside."""
-    shown = {"command": "run", "environment": environment, "metrics": metrics, "warnings": ()}
-    return render_page("screen", config, folder.path / "figures", shown)

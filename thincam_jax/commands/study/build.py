@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from thincam_jax import reconstruction
 from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.sections import (
     CamerasConfig,
@@ -34,16 +35,6 @@ from thincam_jax.imaging.sensor import (
     read_out,
 )
 from thincam_jax.lensless import forward
-from thincam_jax.reconstruction import (
-    AdmmTV,
-    Cameras,
-    FringeScanning,
-    Reconstruction,
-    Recording,
-    TotalVariation,
-    Wiener,
-    reconstruct,
-)
 
 # The scene's power is read off frequencies above three cycles a sensor (`spectra.inner_band`).
 _MINIMUM_ROWS = 7
@@ -277,7 +268,7 @@ def build_reconstructor(
     study: Study, method: Method, shape: tuple[int, int], object_distance: float
 ) -> Reconstructor:
     """A function of the captures (capture, channel, y, x) and variances (capture, channel)."""
-    cameras = Cameras(
+    cameras = reconstruction.Cameras(
         [study.camera(exposure) for exposure in method.exposures],
         wavelength=[exposure.wavelength for exposure in method.exposures],
         object_distance=object_distance,
@@ -287,23 +278,23 @@ def build_reconstructor(
     )
     synthesis = method.synthesis_matrix
     if method.kind == "fringe_scanning":
-        scanning = FringeScanning().prepare(cameras)
+        scanning = reconstruction.FringeScanning().prepare(cameras)
         return lambda captures, variances: scanning(captures)
     if method.kind == "wiener":
-        return Wiener(synthesis=synthesis, prior=study.prior).prepare(cameras)
+        return reconstruction.Wiener(synthesis=synthesis, prior=study.prior).prepare(cameras)
     options = method.variation or VariationConfig()
 
-    def total_variation(captures: Array, variances: Array) -> Reconstruction:
+    def total_variation(captures: Array, variances: Array) -> reconstruction.Reconstruction:
         """On the crop model; without noise in the study it is estimated."""
-        variation = TotalVariation(
+        variation = reconstruction.TotalVariation(
             options.kind,
             options.coupling_of(captures.shape[1]),
             chroma_weight=options.chroma_weight,
         )
         noise_variance = None if study.noise is None else variances
-        return reconstruct(
-            Recording(captures, cameras, noise_variance=noise_variance),
-            AdmmTV(
+        return reconstruction.reconstruct(
+            reconstruction.Recording(captures, cameras, noise_variance=noise_variance),
+            reconstruction.AdmmTV(
                 options.tau,
                 variation=variation,
                 synthesis=synthesis,

@@ -1,7 +1,8 @@
 """The command `thincam run`."""
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -20,23 +21,21 @@ def run(
     Writes images, metrics.json, figures and report.html. Ctrl-C keeps what is finished; the same
     command goes on from there.
     """
-    folder, targets = None, ()
+    asked: Any = None
+    folder: Any = None
 
-    def finished() -> str:
-        names = [t.name for t in targets if folder and folder.finished(t.name) is not None]
-        done = ", ".join(names) if names else "no target yet"
+    def interrupted() -> str:
+        if _kind(asked) != "study":
+            return "interrupted; the same command starts anew."
+        targets = asked.targets if folder else ()
+        done = ", ".join(t.name for t in targets if folder.finished(t.name) is not None)
+        done = done or "no target yet"
         return f"interrupted; finished: {done}. The same command goes on from there."
 
-    with told(finished):
+    with told(interrupted):
         from thincam_jax.commands.config_file import ConfigError, slug
         from thincam_jax.commands.kinds import load_experiment
-        from thincam_jax.commands.masks.config import MasksConfig
-        from thincam_jax.commands.refocus.config import RefocusConfig
-        from thincam_jax.commands.refocus.console import refocus
         from thincam_jax.commands.run_folder import RunFolder
-        from thincam_jax.commands.screen.config import ScreenConfig
-        from thincam_jax.commands.study.build import build_study
-        from thincam_jax.commands.study.run import run_study
 
         if config.is_dir():
             from thincam_jax.commands.capture.command import reconstruct_store
@@ -47,49 +46,40 @@ def run(
             return
         asked = load_experiment(config, tuple(set_ or ()))
         folder = RunFolder(out or Path("runs") / slug(asked.name))
-        if isinstance(asked, RefocusConfig):
-            refocus(asked, folder)
-            return
-        if isinstance(asked, ScreenConfig):
-            from thincam_jax.commands.screen.run import screen
-
-            screen(asked, folder)
-            return
-        if isinstance(asked, MasksConfig):
-            from thincam_jax.commands.masks.run import compare_masks
-
-            compare_masks(asked, folder)
-            return
-        study = build_study(asked)
-        warn(study.warnings)
-        targets = asked.targets
+        build, simulate, table = _parts(_kind(asked))
+        setup = build(asked)
+        warn(getattr(setup, "warnings", []))
         with counted(asked.name) as progress:
-            metrics = run_study(study, folder, progress)
-    _print_results(metrics)
+            metrics = simulate(setup, folder, progress)
+    import rich
+
+    rich.print(table(asked, metrics))
     print(f"report: {folder.path / 'report.html'}")
 
 
-def _print_results(metrics: dict) -> None:
-    import rich
-    import rich.table
-
-    table = rich.table.Table("method")
-    headings = ("PSNR dB", "published", "resolved mm", "published", "cut-off /mm")
-    for heading in headings:
-        table.add_column(heading, justify="right")
-    for name, method in metrics["methods"].items():
-        resolved = [t["resolved"] for t in method["targets"].values() if t["resolved"]]
-        published = method["published"]
-        table.add_row(
-            name,
-            _number(method["mean_psnr_of_pictures_db"], 1),
-            _number(published["psnr_db"], 1),
-            _number(resolved[0]["object_mm"] if resolved else None, 2),
-            _number(published["resolved_object_mm"], 2),
-            _number(method["limits"]["cut_off_cycles_per_mm"], 1),
-        )
-    rich.print(table)
+def _kind(asked: Any) -> str:
+    """Of an experiment; a study's file does not name it."""
+    return getattr(asked, "kind", "study")
 
 
-def _number(value: float | None, digits: int) -> str:
-    return "–" if value is None else f"{value:.{digits}f}"
+def _parts(kind: str) -> tuple[Callable, Callable, Callable]:
+    """What builds an experiment of a kind, what runs it, and what makes a table of its metrics."""
+    if kind == "refocus":
+        from thincam_jax.commands.refocus import build
+        from thincam_jax.commands.refocus import run as refocus
+
+        return build.build_refocus, refocus.run_refocus, refocus.table
+    if kind == "screen":
+        from thincam_jax.commands.screen import build
+        from thincam_jax.commands.screen import run as screen
+
+        return build.build_setup, screen.run_screen, screen.table
+    if kind == "masks":
+        from thincam_jax.commands.masks import build
+        from thincam_jax.commands.masks import run as masks
+
+        return build.build_setup, masks.run_masks, masks.table
+    from thincam_jax.commands.study import build
+    from thincam_jax.commands.study import run as study
+
+    return build.build_study, study.run_study, study.table

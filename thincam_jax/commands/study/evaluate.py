@@ -74,11 +74,12 @@ def evaluate(method: Method, target: Target, reconstruction: Reconstruction) -> 
     """PSNR and SSIM after alignment, over the target's area; the resolved element of a chart."""
     image = np.asarray(reconstruction.image, dtype=float)
     rows, columns = image.shape[-2:]
-    grid = Grid((rows, columns), _known_pitch(reconstruction))
+    assert reconstruction.pitch is not None  # those of a study's cameras have one
+    grid = Grid((rows, columns), reconstruction.pitch)
     truth = np.asarray(sample(target.plane, grid), dtype=float)
     image, truth = (as_picture(i) for i in (image, truth))
     metrics: dict[str, Any] = {
-        "psnr_db": _finite(round(psnr(image, truth), 4)),
+        "psnr_db": rounded(psnr(image, truth), 4),
         "ssim": round(ssim(image, truth), 5),
         "object_pixel_mm": round(float(grid.pitch), 6),
         "resolved": None,
@@ -89,15 +90,9 @@ def evaluate(method: Method, target: Target, reconstruction: Reconstruction) -> 
     return Evaluation(align(image, truth)[0], truth, metrics, contrast)
 
 
-def _known_pitch(reconstruction: Reconstruction):
-    if reconstruction.pitch is None:
-        raise ValueError("a reconstruction from PSFs alone has no pitch on the object")
-    return reconstruction.pitch
-
-
-def _finite(value: float) -> float | None:
-    """JSON has no infinity: an exact reconstruction has no PSNR."""
-    return value if math.isfinite(value) else None
+def rounded(score: float, digits: int = 3) -> float | None:
+    """A PSNR, dB, for metrics; None where nothing differs, which JSON has no number for."""
+    return round(score, digits) if math.isfinite(score) else None
 
 
 @eqx.filter_jit

@@ -2,6 +2,7 @@
 
 import io
 import math
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -32,6 +33,14 @@ def line_style(index: int) -> dict:
     return dict(_LINES[index % len(_LINES)])
 
 
+def drawing(
+    size: tuple[float | int, float | int], rows: int = 1, columns: int = 1, **how: Any
+) -> Any:
+    """A figure of a size in inches, and its axes as of `Figure.subplots`."""
+    figure = Figure(figsize=size, layout="constrained")
+    return figure, figure.subplots(rows, columns, **how)
+
+
 def as_png(figure: Figure) -> bytes:
     """The file's content."""
     buffer = io.BytesIO()
@@ -42,6 +51,23 @@ def as_png(figure: Figure) -> bytes:
 def save_figure(folder: RunFolder, name: str, figure: Figure) -> None:
     """A figure as figures/NAME.png."""
     folder.write(f"figures/{name}.png", as_png(figure))
+
+
+def sheet(
+    count: int, most: int, side: float, aspect: float, room: float
+) -> tuple[Figure, list[Axes]]:
+    """A figure with so many places for pictures, at most `most` beside each other, without axes.
+
+    `side`: width of a place; `aspect`: height of its picture over that; `room`: above it.
+    """
+    columns = min(most, count)
+    rows = math.ceil(count / columns)
+    size = (side * columns, rows * (side * aspect + room))
+    figure, axes = drawing(size, rows, columns, squeeze=False)
+    axes = axes.ravel()
+    for ax in axes:
+        ax.set_axis_off()
+    return figure, list(axes[:count])
 
 
 def save_image(folder: RunFolder, name: str, image: np.ndarray) -> None:
@@ -98,15 +124,9 @@ def save_captures(
     folder: RunFolder, study: Study, target: Target, captures: dict[Exposure, Capture]
 ) -> None:
     """All captures of a target, each from black to its own maximum."""
-    columns = min(_BESIDE, len(captures))
-    rows = math.ceil(len(captures) / columns)
     aspect = study.sensor.shape[0] / study.sensor.shape[1]
-    size = (2.2 * columns, rows * (2.2 * aspect + 0.6))
-    figure = Figure(figsize=size, layout="constrained")
-    axes = figure.subplots(rows, columns, squeeze=False).ravel()
-    for ax in axes:
-        ax.set_axis_off()
-    for number, (ax, exposure) in enumerate(zip(axes, study.exposures, strict=False), 1):
+    figure, axes = sheet(len(captures), _BESIDE, 2.2, aspect, 0.6)
+    for number, (ax, exposure) in enumerate(zip(axes, study.exposures, strict=True), 1):
         image = captures[exposure].image
         title = f"{number}: {study.mask_of(exposure)},\n"
         _show(ax, as_picture(image / image.max()), f"{title}d {exposure.distance:.3g} mm")
@@ -122,8 +142,9 @@ def _pairs_of_axes(count: int, aspect: float):
     bands = math.ceil(count / _BESIDE)
     columns = math.ceil(count / bands)
     size = (2.75 * columns, bands * (2.75 * (aspect + 1) + 1.25))
-    figure = Figure(figsize=size, layout="constrained")
-    axes = figure.subplots(2 * bands, columns, gridspec_kw={"height_ratios": (aspect, 1) * bands})
+    figure, axes = drawing(
+        size, 2 * bands, columns, gridspec_kw={"height_ratios": (aspect, 1) * bands}
+    )
     wholes, details = axes[::2].ravel(), axes[1::2].ravel()
     for ax in axes.ravel():
         ax.set(xticks=[], yticks=[])
@@ -225,8 +246,7 @@ def _by_synthesis(study: Study, responses: dict[str, Response]) -> list[tuple[st
 
 def save_contrasts(folder: RunFolder, contrasts: dict[str, list]) -> None:
     """Contrast of every chart element against its period, for each method."""
-    figure = Figure(figsize=(8.5, 4.2), layout="constrained")
-    ax = figure.subplots()
+    figure, ax = drawing((8.5, 4.2))
     for index, (name, records) in enumerate(contrasts.items()):
         periods = sorted({period for period, _, _ in records}, reverse=True)
         worst = [min(c for p, _, c in records if p == period) for period in periods]

@@ -37,7 +37,8 @@ def method_response(study: Study, method: Method) -> Response:
     - Cut-off: where the magnitude stays under 5 % of its low-frequency value.
     """
     reference = method.distance
-    frequency = _frequencies(study)
+    columns = study.sensor.shape[1]
+    frequency = np.arange(columns - columns // 2) / (columns * study.sensor.pitch)
     signed, powers = [], []
     for shot, channels in _groups(study, method):
         ratio = reference / shot.distance
@@ -63,12 +64,6 @@ def method_response(study: Study, method: Method) -> Response:
             "cut_off_object_mm": round(magnification / limit, 3),
         },
     )
-
-
-def _frequencies(study: Study) -> np.ndarray:
-    """Frequencies ≥ 0 of the sensor's columns, cycles/mm."""
-    columns = study.sensor.shape[1]
-    return np.arange(columns - columns // 2) / (columns * study.sensor.pitch)
 
 
 def _groups(study: Study, method: Method) -> list[tuple[Exposure, np.ndarray]]:

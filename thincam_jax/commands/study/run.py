@@ -1,16 +1,21 @@
 """Running a study: every target through every method, into a run folder."""
 
-import time
-from functools import partial
 from typing import Any
 
-from thincam_jax.commands.run_folder import Progress, RunFolder, Step, carry_out
+from rich.table import Table
+
+from thincam_jax.commands.page import number
+from thincam_jax.commands.run_folder import Progress, Run, RunFolder
 from thincam_jax.commands.study import figures
 from thincam_jax.commands.study.build import take
+from thincam_jax.commands.study.config import StudyConfig
 from thincam_jax.commands.study.evaluate import Evaluation, evaluate_method, mean_psnr_of_pictures
-from thincam_jax.commands.study.page import render
 from thincam_jax.commands.study.response import Response, method_response
 from thincam_jax.commands.study.study import Capture, Exposure, Method, Study, Target
+from thincam_jax.commands.terminal import numbers
+
+# What two methods share that add and subtract the same captures in the same way.
+_CAPTURES = ("shots", "synthesis", "phases", "steps", "harmonics")
 
 
 def run_study(study: Study, folder: RunFolder, progress: Progress) -> dict[str, Any]:
@@ -19,47 +24,47 @@ def run_study(study: Study, folder: RunFolder, progress: Progress) -> dict[str, 
     The same configuration gives the same metrics: every capture's noise has its own key, from the
     seed and the capture's place in the study.
     """
-    folder.claim(study.config)
-    run = _StudyRun(study, folder)
-    carry_out(run.work, progress)
-    return run.metrics
+    return _StudyRun(study, folder).carry_out(progress)
 
 
-class _StudyRun:
-    """A study on its way; `results` are by target, `evaluations` those of the target at hand.
+def table(config: StudyConfig, metrics: dict[str, Any]) -> Table:
+    """Every method beside what was published of it."""
+    rows = [["method", "PSNR dB", "published", "resolved mm", "published", "cut-off /mm"]]
+    for name, method in metrics["methods"].items():
+        published = method["published"]
+        told = [
+            number(method["mean_psnr_of_pictures_db"], 1),
+            number(published["psnr_db"], 1),
+            number(resolved(method), 2),
+            number(published["resolved_object_mm"], 2),
+            number(method["limits"]["cut_off_cycles_per_mm"], 1),
+        ]
+        rows.append([name, *told])
+    return numbers(rows)
 
-    `work` holds every capture and method of each target that the folder has no results of, the
-    transfer functions and the report.
-    """
+
+class _StudyRun(Run):
+    """A study on its way; `results` are by target, `evaluations` those of the target at hand."""
 
     def __init__(self, study: Study, folder: RunFolder):
-        self.study, self.folder, self.started = study, folder, time.time()
+        super().__init__(study.config, folder)
+        self.study = study
         self.captures: dict[Exposure, Capture] = {}
         self.evaluations: dict[str, Evaluation] = {}
         self.results: dict[str, dict[str, Any]] = {}
         self.responses: dict[str, Response] = {}
-        self.metrics: dict[str, Any] = {}
-        self.work: list[Step] = []
         for target in study.targets:
             stored = folder.finished(target.name)
-            if stored is None:
-                self.work += self._work_on(target)
-            else:
+            if stored is not None:
                 self.results[target.name] = stored
+                continue
+            for count, exposure in enumerate(study.exposures, 1):
+                self.add(f"{target.name}: capture {count}", self.capture, target, exposure)
+            for method in study.methods:
+                self.add(f"{target.name}: {method.name}", self.reconstruct, target, method)
         for method in study.methods:
-            text = f"transfer function of {method.name}"
-            self.work.append(Step(text, partial(self.transfer, method)))
-        self.work.append(Step("report", self.report))
-
-    def _work_on(self, target: Target) -> list[Step]:
-        captures = [
-            Step(f"{target.name}: capture {number}", partial(self.capture, target, exposure))
-            for number, exposure in enumerate(self.study.exposures, 1)
-        ]
-        return captures + [
-            Step(f"{target.name}: {method.name}", partial(self.reconstruct, target, method))
-            for method in self.study.methods
-        ]
+            self.add(f"transfer function of {method.name}", self.transfer, method)
+        self.add("report", self.report)
 
     def capture(self, target: Target, exposure: Exposure) -> None:
         self.captures[exposure] = take(self.study, exposure, target)
@@ -95,8 +100,7 @@ class _StudyRun:
         if contrasts:
             figures.save_contrasts(folder, contrasts)
         figures.save_psf(folder, study)
-        page = partial(render, study.config, folder, self.metrics)
-        folder.complete(self.metrics, study.config.seed, self.started, page)
+        self.complete("study", findings=findings(study.config, self.metrics))
 
     def collected(self) -> dict[str, Any]:
         """What goes into metrics.json."""
@@ -120,3 +124,58 @@ class _StudyRun:
             "methods": methods,
             "warnings": study.warnings,
         }
+
+
+def findings(config: StudyConfig, metrics: dict[str, Any]) -> list[str]:
+    """What the numbers say, in sentences, beside what was published."""
+    sentences = []
+    for name, method in metrics["methods"].items():
+        published = method["published"]
+        mean, stated = method["mean_psnr_of_pictures_db"], published["psnr_db"]
+        if mean is not None and stated is not None:
+            sentences.append(
+                f"{name}: {mean:.1f} dB on average over the pictures, published {stated:.1f} dB "
+                f"({mean - stated:+.1f} dB)."
+            )
+        own, stated = resolved(method), published["resolved_object_mm"]
+        if own is not None and stated is not None:
+            word = "finer" if own < 0.97 * stated else "coarser"
+            word = "the same within 3 %" if abs(own / stated - 1) <= 0.03 else word
+            sentences.append(
+                f"{name}: resolves a line pair of {own:.2f} mm on the object, published "
+                f"{stated:.2f} mm: {word}."
+            )
+    sentences += _gains(config, metrics)
+    ranked = sorted(
+        (r, name) for name, m in metrics["methods"].items() if (r := resolved(m)) is not None
+    )
+    if len(ranked) > 1:
+        order = ", ".join(f"{name} ({period:.2f} mm)" for period, name in ranked)
+        sentences.append(f"From finest to coarsest on the chart: {order}.")
+    return sentences
+
+
+def resolved(method: dict[str, Any]) -> float | None:
+    """The finest line pair on the object that a method resolves, mm; of the first chart."""
+    for target in method["targets"].values():
+        if target["resolved"] is not None:
+            return target["resolved"]["object_mm"]
+    return None
+
+
+def _gains(config: StudyConfig, metrics: dict[str, Any]) -> list[str]:
+    """What total variation adds to the Wiener synthesis of the same captures."""
+    sentences = []
+    for method in (m for m in config.methods if m.kind == "admm_tv"):
+        for other in (m for m in config.methods if m.kind == "wiener"):
+            if any(getattr(other, key) != getattr(method, key) for key in _CAPTURES):
+                continue
+            pairs = (
+                (t.name, *(metrics["methods"][m.name]["targets"][t.name]["psnr_db"] for m in pair))
+                for t in config.targets
+                for pair in [(method, other)]
+            )
+            gains = [f"{a - b:+.1f} dB on {t}" for t, a, b in pairs if None not in (a, b)]
+            if gains:
+                sentences.append(f"{method.name}: {', '.join(gains)} over {other.name}.")
+    return sentences

@@ -22,25 +22,8 @@ from thincam_jax.commands.sections import (
 )
 from thincam_jax.imaging.scene import ImagePlane
 from thincam_jax.imaging.sensor import AbstractNoise, Sensor
+from thincam_jax.lensless import masks
 from thincam_jax.lensless.camera import LenslessCamera
-from thincam_jax.lensless.masks import (
-    AbstractMask,
-    FresnelZoneAperture,
-    LensletArray,
-    MaskBlank,
-    ModifiedUniformlyRedundantArray,
-    PhaseMask,
-    Pinhole,
-    SampledMask,
-    SeparableMask,
-    UniformlyRedundantArray,
-    diffuser,
-    maximum_length_sequence,
-    on_display,
-    random_cells,
-    read_mask,
-    voronoi_fresnel,
-)
 from thincam_jax.lensless.masks.fza import Profile, edge_frequency
 from thincam_jax.lensless.method import Model
 from thincam_jax.lensless.propagation.path import Path
@@ -141,10 +124,10 @@ def unresolved_zones(
     return [fault] if fault else []
 
 
-def built_mask(config: MaskConfig, exposure: Exposure) -> AbstractMask:
+def built_mask(config: MaskConfig, exposure: Exposure) -> masks.AbstractMask:
     """The mask of an exposure, on its display; ValueError for numbers that make none."""
     if config.family == "fza":
-        return FresnelZoneAperture(
+        return masks.FresnelZoneAperture(
             exposure.beta,
             exposure.phase,
             width=exposure.width,
@@ -157,34 +140,34 @@ def built_mask(config: MaskConfig, exposure: Exposure) -> AbstractMask:
     printed = _printed(config, exposure)
     if config.pixel_pitch is None:
         return printed
-    return on_display(printed, config.pixel_pitch, config.fill_factor)
+    return masks.on_display(printed, config.pixel_pitch, config.fill_factor)
 
 
-def _printed(config: MaskConfig, exposure: Exposure) -> AbstractMask:
+def _printed(config: MaskConfig, exposure: Exposure) -> masks.AbstractMask:
     """Of the families without zones."""
     cell, tiles, height = config.cell or 0.0, config.tiles or 1, config.height
     family = config.family
     if family == "mura":
-        return ModifiedUniformlyRedundantArray(config.order or 0, cell, tiles=tiles)
+        return masks.ModifiedUniformlyRedundantArray(config.order or 0, cell, tiles=tiles)
     if family == "ura":
-        return UniformlyRedundantArray(config.orders or (0, 0), cell, tiles=tiles)
+        return masks.UniformlyRedundantArray(config.orders or (0, 0), cell, tiles=tiles)
     if family == "mls":
-        code = maximum_length_sequence(config.length or 0)
-        return SeparableMask(code, code, cell, combine=config.combine)
+        code = masks.maximum_length_sequence(config.length or 0)
+        return masks.SeparableMask(code, code, cell, combine=config.combine)
     if family == "random":
         key = jax.random.key(config.seed or 0)
-        return random_cells(key, config.width, cell, height=height)
+        return masks.random_cells(key, config.width, cell, height=height)
     if family == "pinhole":
-        return Pinhole(config.width, height)
+        return masks.Pinhole(config.width, height)
     if family == "lenslets":
-        return LensletArray(config.focal_length or 0.0, cell, config.lenses or (1, 1))
+        return masks.LensletArray(config.focal_length or 0.0, cell, config.lenses or (1, 1))
     if family in get_args(Relief):
         smooth = family == "diffuser"
         heights = _heights(config, exposure.wavelength, exposure.distance)
         how = "bilinear" if smooth else "cells"
-        return PhaseMask(heights, cell, config.index, interpolation=how)
-    amplitude = read_mask(config.path or "", 1.0).amplitude
-    return SampledMask(amplitude, config.width / amplitude.shape[1])
+        return masks.PhaseMask(heights, cell, config.index, interpolation=how)
+    amplitude = masks.read_mask(config.path or "", 1.0).amplitude
+    return masks.SampledMask(amplitude, config.width / amplitude.shape[1])
 
 
 def _heights(config: MaskConfig, wavelength: float, distance: float) -> Array:
@@ -193,14 +176,14 @@ def _heights(config: MaskConfig, wavelength: float, distance: float) -> Array:
 
     cell = config.cell or 0.0
     count = checks.whole_cells("width", config.width, "cell", cell)
-    blank = MaskBlank((count, count), cell, config.index)
+    blank = masks.MaskBlank((count, count), cell, config.index)
     key = jax.random.key(config.seed or 0)
     if config.family == "diffuser":
         length, slope = config.correlation_length or 0.0, config.rms_slope or 0.0
-        mask = diffuser(key, blank, correlation_length=length, rms_slope=slope)
+        mask = masks.diffuser(key, blank, correlation_length=length, rms_slope=slope)
     elif config.family == "voronoi_fresnel":
         focal_length, sites = config.focal_length or 0.0, config.sites or 0
-        mask = voronoi_fresnel(
+        mask = masks.voronoi_fresnel(
             key, blank, sites=sites, focal_length=focal_length, wavelength=wavelength
         )
     else:
@@ -259,7 +242,7 @@ class Study:
         return tuple(dict.fromkeys(e for m in self.methods for e in m.exposures))
 
     @functools.cached_property
-    def _same_mask(self) -> AbstractMask:
+    def _same_mask(self) -> masks.AbstractMask:
         """That of all exposures, where it is no zone plate; its file is read once."""
         return built_mask(self.mask, self.exposures[0])
 

@@ -1,6 +1,5 @@
 """The command `thincam sweep`."""
 
-from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any
@@ -42,8 +41,13 @@ def sweep(
     are kept in failures.jsonl with the reason. However a sweep ends, the same command goes on with
     the points that have no row.
     """
-    ended = _Ended()
-    with told(lambda: f"interrupted; {ended.told()}. The same command goes on from there."):
+    rows = 0
+
+    def interrupted() -> str:
+        kept = f"{rows} points are kept" if rows else "no point is kept yet"
+        return f"interrupted; {kept}. The same command goes on from there."
+
+    with told(interrupted):
         _check(scheduler, workers)
         import jax
 
@@ -53,6 +57,7 @@ def sweep(
         from thincam_jax.commands.sweep.folder import SweepFolder
         from thincam_jax.commands.sweep.grid import read_axes
         from thincam_jax.commands.sweep.point import make_points
+        from thincam_jax.commands.sweep.run import run_sweep
 
         study = load_experiment(config, tuple(set_ or ()))
         if not isinstance(study, StudyConfig):
@@ -62,20 +67,17 @@ def sweep(
         folder = SweepFolder(out or Path("runs") / f"{slug(study.name)}-sweep")
         folder.claim(study)
         warn(_warnings(points))
-        swept = _run(study.name, points, folder, scheduler, workers, ended)
+        with progress_bar("{task.fields[failed]}") as bar:
+            task = bar.add_task(study.name, total=len(points), failed="")
+
+            def progress(ended: int, failed: int) -> None:
+                nonlocal rows
+                rows = ended - failed
+                bar.update(task, completed=ended, failed=f"{failed} failed" if failed else "")
+                bar.start()
+
+            swept = run_sweep(points, folder, progress, scheduler=scheduler, workers=workers)
     _print(swept, folder.path)
-
-
-@dataclass
-class _Ended:
-    """How far a sweep has come."""
-
-    ended: int = 0
-    failed: int = 0
-
-    def told(self) -> str:
-        rows = self.ended - self.failed
-        return f"{rows} points are kept" if rows else "no point is kept yet"
 
 
 def _check(scheduler: str | None, workers: int | None) -> None:
@@ -96,43 +98,25 @@ def _check(scheduler: str | None, workers: int | None) -> None:
 
 def _warnings(points: list) -> list[str]:
     """What is said of the first point that has something said of it, and of how many."""
+    from thincam_jax.commands.sweep.point import told as told_values
+
     doubtful = [point for point in points if point.warnings]
     if not doubtful:
         return []
-    values = ", ".join(f"{name}={value}" for name, value in doubtful[0].values.items())
     first = "; ".join(doubtful[0].warnings)
+    values = told_values(doubtful[0].values)
     return [f"{len(doubtful)} of {len(points)} points; the first ({values}): {first}"]
 
 
-def _run(
-    name: str,
-    points: list,
-    folder: Any,
-    scheduler: str | None,
-    workers: int | None,
-    so_far: _Ended,
-) -> Any:
-    """With a progress bar."""
-    from thincam_jax.commands.sweep.run import run_sweep
-
-    with progress_bar("{task.fields[failed]}") as bar:
-        task = bar.add_task(name, total=len(points), failed="")
-
-        def progress(ended: int, failed: int) -> None:
-            so_far.ended, so_far.failed = ended, failed
-            bar.update(task, completed=ended, failed=f"{failed} failed" if failed else "")
-            bar.start()
-
-        return run_sweep(points, folder, progress, scheduler=scheduler, workers=workers)
-
-
 def _print(swept: Any, path: Path) -> None:
+    from thincam_jax.commands.sweep.point import told as told_values
+
     table = f"{swept.rows} of {swept.points} points: {path / 'results.parquet'}"
     if swept.rows:
         print("\n".join([table, *swept.best]))
     if swept.failures:
         first = swept.failures[0]
-        values = ", ".join(f"{name}={value}" for name, value in first["values"].items())
+        values = told_values(first["values"])
         tell(
             f"{len(swept.failures)} of {swept.points} points failed; the first ({values}): "
             f"{first['reason']}; all are in {path / 'failures.jsonl'}. "

@@ -5,13 +5,18 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import pyarrow as pa
+import pyarrow.parquet as pq
+from pyarrow import csv
+
 from thincam_jax._core.files import read_regular, write_whole
 from thincam_jax.commands.checked_config import dump_config
 from thincam_jax.commands.run_folder import claim_folder
 from thincam_jax.commands.study.config import StudyConfig
-from thincam_jax.commands.sweep import table
 from thincam_jax.commands.sweep.measure import Outcome
 from thincam_jax.commands.sweep.point import GridPoint
+
+_PLAIN = ("point", "seconds")  # columns that are neither a swept value nor NAME/METHOD…
 
 
 class SweepFolder:
@@ -36,7 +41,7 @@ class SweepFolder:
 
     def has(self, point: GridPoint) -> bool:
         """Whether the point has succeeded before; a row that cannot be read does not count."""
-        return table.read_row(self._row(point)) is not None
+        return read_row(self._row(point)) is not None
 
     def keep(self, point: GridPoint, outcome: Outcome) -> None:
         """Write what became of a point."""
@@ -47,24 +52,22 @@ class SweepFolder:
             write_whole(self._failure(point), json.dumps(told, ensure_ascii=False) + "\n")
         else:
             row = {**point.values, "point": point.key, **outcome.metrics}
-            write_whole(self._row(point), table.row_bytes(row))
+            write_whole(self._row(point), row_bytes(row))
             self._failure(point).unlink(missing_ok=True)
 
-    def collect(
-        self, points: Sequence[GridPoint]
-    ) -> tuple[table.pa.Table | None, list[dict[str, Any]]]:
+    def collect(self, points: Sequence[GridPoint]) -> tuple[pa.Table | None, list[dict[str, Any]]]:
         """Write the tables of what has ended; that of the rows, and the failures."""
         rows, failures = [], []
         for point in points:
-            row = table.read_row(self._row(point))
+            row = read_row(self._row(point))
             if row is not None:
                 rows.append((point.values, row))
             elif self._failure(point).exists():
                 failures.append(json.loads(read_regular(self._failure(point))))
-        found = table.joined(rows) if rows else None
+        found = joined(rows) if rows else None
         for name, content in (
-            ("results.parquet", None if found is None else table.parquet_bytes(found)),
-            ("results.csv", None if found is None else table.csv_bytes(found)),
+            ("results.parquet", None if found is None else parquet_bytes(found)),
+            ("results.csv", None if found is None else csv_bytes(found)),
             ("failures.jsonl", "".join(json.dumps(f, ensure_ascii=False) + "\n" for f in failures)),
         ):
             if content:
@@ -78,3 +81,61 @@ class SweepFolder:
 
     def _failure(self, point: GridPoint) -> Path:
         return self.path / "points" / f"{point.key}.failed.json"
+
+
+def row_bytes(row: dict[str, Any]) -> bytes:
+    """One row as a Parquet file, without what helps only with many rows."""
+    return parquet_bytes(
+        pa.Table.from_pylist([row]),
+        write_statistics=False,
+        store_schema=False,
+        use_dictionary=False,
+        compression="none",
+    )
+
+
+def read_row(path: Path) -> pa.Table | None:
+    """A row that `row_bytes` made; None where there is none that can be read."""
+    try:
+        return pq.ParquetFile(path, memory_map=False).read()
+    except (OSError, pa.ArrowException):
+        return None
+
+
+def joined(rows: Sequence[tuple[dict[str, Any], pa.Table]]) -> pa.Table:
+    """One table of rows, each with its swept values.
+
+    The values are those given here: the row may have been written for a grid of other axes.
+    """
+    own = [
+        row.select([name for name in row.column_names if "/" in name or name in _PLAIN])
+        for _, row in rows
+    ]
+    measured = pa.concat_tables(own, promote_options="permissive")
+    columns = {path: _column([values[path] for values, _ in rows]) for path in rows[0][0]}
+    for name in sorted(measured.column_names, key=lambda name: name == "seconds"):
+        column = measured.column(name)
+        # Nothing but missing values, as the PSNR of exact reconstructions: numbers all the same.
+        columns[name] = column.cast(pa.float64()) if pa.types.is_null(column.type) else column
+    return pa.table(columns)
+
+
+def parquet_bytes(table: pa.Table, **options: Any) -> bytes:
+    """A table as a Parquet file."""
+    sink = pa.BufferOutputStream()
+    pq.write_table(table, sink, **options)
+    return sink.getvalue().to_pybytes()
+
+
+def csv_bytes(table: pa.Table) -> bytes:
+    """A table as comma-separated values with a line of headings."""
+    sink = pa.BufferOutputStream()
+    csv.write_csv(table, sink)
+    return sink.getvalue().to_pybytes()
+
+
+def _column(values: list[Any]) -> pa.Array:
+    try:
+        return pa.array(values)
+    except (pa.ArrowInvalid, pa.ArrowTypeError):  # numbers and texts
+        return pa.array([None if value is None else str(value) for value in values])

@@ -42,16 +42,24 @@ def run_sweep(
     **Errors**: ConfigError where the scheduler cannot be reached or goes away.
     """
     todo = {point.key: point for point in points if not folder.has(point)}
-    count = _Count(len(points) - len(todo), progress)
+    done, failed = len(points) - len(todo), 0
+    progress(done, failed)
+
+    def keep(point: GridPoint, outcome: Outcome) -> None:
+        nonlocal done, failed
+        done, failed = done + 1, failed + (outcome.metrics is None)
+        progress(done, failed)
+        folder.keep(point, outcome)
+
     runnable = {key: (p.config, p.double) for key, p in todo.items() if p.config is not None}
     try:
         for point in todo.values():
             if point.config is None:
-                folder.keep(point, count.ended(Outcome(None, point.reason)))
+                keep(point, Outcome(None, point.reason))
         if runnable:
             with connected(scheduler, workers, len(runnable)) as outcomes:
                 for key, result in _tried_twice(outcomes, measure, runnable):
-                    folder.keep(todo[key], count.ended(_outcome(result)))
+                    keep(todo[key], _outcome(result))
     finally:
         table, failures = folder.collect(points)
     if table is None:
@@ -86,20 +94,6 @@ def _tried_twice(
             yield name, result
     for name in suspects:
         yield from outcomes(measure, {name: tasks[name]})
-
-
-class _Count:
-    """How many points have ended; every change is reported to `progress`."""
-
-    def __init__(self, before: int, progress: Progress):
-        self.done, self.failed, self.progress = before, 0, progress
-        progress(before, 0)
-
-    def ended(self, outcome: Outcome) -> Outcome:
-        self.done += 1
-        self.failed += outcome.metrics is None
-        self.progress(self.done, self.failed)
-        return outcome
 
 
 def _outcome(result: Any) -> Outcome:
