@@ -72,7 +72,7 @@ def key() -> jax.Array:
     return jax.random.key(20260)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def optimised():
     """For tests that compute for minutes: programs are compiled as in use."""
     before = jax.config.values["jax_disable_most_optimizations"]

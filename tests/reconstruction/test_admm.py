@@ -448,7 +448,7 @@ def hand(bin_by):
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("bin_by, most", [(8, 100), (4, 130)])
-def test_what_500_plain_iterations_reach_in_a_quarter_of_them(bin_by, most):
+def test_what_500_plain_iterations_reach_in_a_quarter_of_them(optimised, bin_by, most):
     """A measured capture, with the relaxation and the balance of `AdmmTV`: 80 and 110."""
     recording = hand(bin_by)
     plain = driven(

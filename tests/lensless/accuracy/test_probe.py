@@ -94,7 +94,7 @@ def test_large_images_are_estimated(pitch, distance, average):
         ("float32", True, 3, None),
     ],
 )
-def test_sampled_models(precision, average, oversampling, height):
+def test_sampled_models(optimised, precision, average, oversampling, height):
     """The angular spectrum's error within 5 % from one-dimensional transforms; the direct sum's
     within 30 % from 14×14 of 48×80 pixels."""
     sides = {"width": 0.6, "height": height}

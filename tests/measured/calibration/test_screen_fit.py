@@ -123,7 +123,7 @@ def test_another_screen_is_told():
 
 
 @pytest.mark.thorough
-def test_a_screen_from_its_matrix():
+def test_a_screen_from_its_matrix(optimised):
     """In any unit; noise of 0.001 of the largest entries, and the colours' smear."""
     few = {"pixels": (11, 15), "pitch": 140.8 * um}
     true = wg.system_operator(camera(**TRUE, **few), plane(centre=CENTRE), samples=8)
