@@ -52,9 +52,10 @@ class Design(Module):
 
         **Errors**: ValueError for no capture, more than eight, or a number out of range.
         """
+        phase = jnp.asarray(phase, float)
         given = (
             checks.positive_all("beta", jnp.asarray(beta, float), "rad/mm^2"),
-            checks.finite("phase", jnp.asarray(phase, float), "rad", shape=jnp.shape(phase)),
+            checks.finite("phase", phase, "rad", shape=phase.shape),
             checks.positive_all("distance", jnp.asarray(distance, float), "mm"),
             checks.positive_all("wavelength", jnp.asarray(wavelength, float), "mm"),
             checks.positive_all("exposure", jnp.asarray(exposure, float), "shares"),

@@ -15,6 +15,7 @@ from thincam_jax.commands.checked_config import dump_config
 from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.design import problem as problem_of_search
 from thincam_jax.commands.design import run as running
+from thincam_jax.commands.design import simulation
 from thincam_jax.commands.design.figures import as_png, draw_landscape, draw_mtf, draw_responses
 from thincam_jax.commands.design.page import findings
 from thincam_jax.commands.design.pareto import Front, FrontPoint, Fronts
@@ -153,7 +154,7 @@ def again(whole, monkeypatch):
 @pytest.mark.thorough
 def test_interrupted_design_goes_on(whole, again, monkeypatch):
     """The finished target is not simulated again, and the figures are those of a whole run."""
-    simulate, simulated = running.simulate, []
+    simulate, simulated = simulation.simulate, []
 
     def one_only(study, target, *more):
         if simulated:
@@ -166,7 +167,7 @@ def test_interrupted_design_goes_on(whole, again, monkeypatch):
             run_design(again.study, again.folder, tiny.ignore)
         assert not (again.folder.path / "design.json").exists()
 
-    monkeypatch.setattr(running, "simulate", one_only)
+    monkeypatch.setattr(simulation, "simulate", one_only)
     interrupted()
     assert simulated == ["chart"]
     # Other designs are not taken for those that were simulated.
