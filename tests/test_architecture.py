@@ -22,6 +22,7 @@ FLOORS = (
     ("lensless", "waveguide"),
     ("reconstruction", "measured"),
     ("design",),
+    ("studies",),
     ("learn",),
     ("commands",),
 )
@@ -30,7 +31,7 @@ OUTSIDE, OUTSIDE_USES = "hardware", "measured"
 ROOMS = (*(room for floor in FLOORS for room in floor), OUTSIDE)
 FLOOR = {room: height for height, floor in enumerate(FLOORS) for room in floor}
 ENTRY = ("__init__", "__main__")  # they stand above all rooms but the one outside
-MOST_ENTRIES = 12
+MOST_ENTRIES = 13
 MAX_LINES = 500
 
 JAXOPT_FILES = ("reconstruction/implicit_gradient.py", "design/_jaxopt.py")
@@ -121,7 +122,8 @@ def imports_against_the_floors(modules: list[Module]) -> list[str]:
             if target == module.top or module.top not in (*ROOMS, *ENTRY):
                 continue  # a room without a floor is told by the rule above
             if target == OUTSIDE:
-                if not may_use_the_rig(module, line):
+                lazy = module.path == "__init__.pyi" and parts[2:] == []
+                if not lazy and not may_use_the_rig(module, line):
                     complaints.append(
                         f"{where}: imports {OUTSIDE}, which only its command may, inside a function"
                     )
@@ -388,7 +390,7 @@ def test_rule_sees_what_breaks_it(rule, path, source, complaint, tmp_path):
 
 def test_a_crowded_root_is_seen(tmp_path):
     files = [(f"room_{n}.py", DOC) for n in range(MOST_ENTRIES + 1)]
-    assert "13 entries, 12 allowed" in crowded_roots(write_package(tmp_path, files))[0]
+    assert "14 entries, 13 allowed" in crowded_roots(write_package(tmp_path, files))[0]
 
 
 def test_rules_pass_a_sound_package(tmp_path):

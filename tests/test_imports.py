@@ -93,6 +93,16 @@ def test_every_name_of_the_package_is_there():
         assert getattr(tc, name) is not None
 
 
+def test_sub_packages_are_attributes_and_wait_for_their_use():
+    rooms = ("design", "hardware", "imaging", "learn", "measured", "studies", "units", "waveguide")
+    before, after = imported_in_turn(
+        "import thincam_jax as tc", "; ".join(f"tc.{room}.__doc__" for room in rooms)
+    )
+    loaded = {f"thincam_jax.{room}" for room in rooms}
+    assert before.isdisjoint(loaded)
+    assert loaded <= after
+
+
 def test_a_name_that_is_not_there():
     with pytest.raises(AttributeError, match="no_such_camera"):
         _ = tc.no_such_camera  # pyright: ignore

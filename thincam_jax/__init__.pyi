@@ -1,5 +1,15 @@
 """The names of `thincam_jax`; `__init__.py` reads them from here."""
 
+from . import design as design
+from . import hardware as hardware
+from . import imaging as imaging
+from . import learn as learn
+from . import lensless as lensless
+from . import measured as measured
+from . import reconstruction as reconstruction
+from . import studies as studies
+from . import units as units
+from . import waveguide as waveguide
 from ._core.grids import Grid as Grid
 from .commands import plot as plot
 from .imaging.scene import ImagePlane as ImagePlane

@@ -1,0 +1,1 @@
+"""Studies in memory: simulated captures, their reconstructions, and how good these are."""
