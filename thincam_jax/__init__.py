@@ -14,8 +14,4 @@ def __getattr__(name: str):
         from importlib.metadata import version
 
         return version("thincam_jax")
-    if name == "plot":
-        from importlib import import_module
-
-        return import_module("thincam_jax.commands.plot")
     return _attribute(name)

@@ -6,12 +6,12 @@ from . import imaging as imaging
 from . import learn as learn
 from . import lensless as lensless
 from . import measured as measured
+from . import plot as plot
 from . import reconstruction as reconstruction
 from . import studies as studies
 from . import units as units
 from . import waveguide as waveguide
 from ._core.grids import Grid as Grid
-from .commands import plot as plot
 from .imaging.scene import ImagePlane as ImagePlane
 from .imaging.scene import Scene as Scene
 from .imaging.scene import Spectrum as Spectrum

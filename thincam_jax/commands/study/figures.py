@@ -9,7 +9,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from thincam_jax.commands.config_file import slug
-from thincam_jax.commands.plot import draw_psf
 from thincam_jax.commands.run_folder import RunFolder
 from thincam_jax.commands.study.evaluate import Evaluation, as_picture
 from thincam_jax.commands.study.response import Response
@@ -17,6 +16,7 @@ from thincam_jax.commands.study.study import Capture, Exposure, Study, Target
 from thincam_jax.imaging.display import png_bytes
 from thincam_jax.imaging.metrics import low_frequency_value
 from thincam_jax.imaging.targets import middle_square
+from thincam_jax.plot.cameras import draw_psf
 
 # Told apart by dash and marker as well as by colour, so that they read in grey.
 _LINES = (

@@ -28,17 +28,6 @@ def closed():
     pyplot.close("all")
 
 
-def test_a_psf_lies_on_the_sensor_in_mm():
-    mask = tc.FresnelZoneAperture(25.0, width=1.0)
-    camera = tc.LenslessCamera(mask, tc.Sensor((24, 30), 0.05), distance=3.0)
-    figure = tc.plot.psf(camera, wavelength=5e-4, model="geometric", pixel_integration=False)
-    image, line = figure.axes[:2]
-    assert image.images[0].get_extent() == pytest.approx([-0.75, 0.75, 0.6, -0.6])
-    expected = tc.psf(camera, wavelength=5e-4, model="geometric")
-    np.testing.assert_array_equal(image.images[0].get_array(), expected)
-    np.testing.assert_array_equal(line.lines[0].get_ydata(), expected[12])
-
-
 def test_images_are_compared_with_the_truth():
     found = result(2 * IMAGE + 0.1 * RNG.normal(size=IMAGE.shape))
     figure = tc.plot.compare({"scene": IMAGE, "ridge": found}, truth="scene")
@@ -72,3 +61,30 @@ def test_a_result_shows_itself(shape, pitch, shown):
 def test_a_result_that_is_not_finite_is_shown_too():
     broken = np.where(IMAGE > 0.9, np.nan, IMAGE)
     assert result(broken)._repr_png_()[:4] == b"\x89PNG"
+
+
+def test_a_capture_lies_on_its_sensor_in_mm():
+    sensor = tc.Sensor((9, 13), 0.02)
+    grey, colour = tc.plot.capture(IMAGE, sensor), tc.plot.capture(np.stack([IMAGE] * 3), 0.02)
+    for figure in (grey, colour):
+        assert figure.axes[0].images[0].get_extent() == pytest.approx([-0.13, 0.13, 0.09, -0.09])
+        assert figure.axes[0].get_xlabel() == "x (mm)"
+    assert grey.axes[1].get_ylabel() == "pixel value"
+    with pytest.raises(ValueError, match="pitch = 5.5 mm is no pixel"):
+        tc.plot.capture(IMAGE, 5.5)
+
+
+def test_a_reconstruction_has_axes_in_mm_on_the_object():
+    figure = tc.plot.compare({"ridge": result(IMAGE, 0.5), "scene": IMAGE})
+    assert figure.axes[0].images[0].get_extent() == pytest.approx([-3.25, 3.25, 2.25, -2.25])
+    assert not figure.axes[1].get_xticks().size
+
+
+def test_a_notebook_shows_a_figure_once():
+    figure = tc.plot.capture(IMAGE, 0.02)
+    assert figure._ipython_display_() is None  # pyplot shows it at the end of the cell
+    from matplotlib import pyplot
+
+    pyplot.close(figure)
+    with pytest.raises(NotImplementedError):  # it is shown as the value of a later cell
+        figure._ipython_display_()

@@ -1,0 +1,48 @@
+"""Figures of numbers: a solver's history, and an objective over two parameters."""
+
+import jax.numpy as jnp
+import matplotlib
+import numpy as np
+import pytest
+
+import thincam_jax as tc
+from thincam_jax.reconstruction import Psfs, Reconstruction
+
+matplotlib.use("Agg")
+
+
+@pytest.fixture(autouse=True)
+def closed():
+    from matplotlib import pyplot
+
+    yield
+    pyplot.close("all")
+
+
+def test_a_history_shows_what_the_solver_noted():
+    random = np.random.default_rng(0)
+    recording = tc.Recording(
+        random.uniform(size=(1, 12, 16)), Psfs(random.uniform(size=(1, 12, 16)))
+    )
+    result = tc.reconstruct(recording, tc.AdmmTV(2.0, iterations=20))
+    objective, residuals = tc.plot.history(result).axes
+    noted = [(entry.iteration, entry.objective) for entry in result.history]
+    np.testing.assert_allclose(objective.lines[0].get_xydata(), noted)
+    assert [line.get_label() for line in residuals.lines] == ["primal", "dual"]
+    closed_form = Reconstruction(jnp.zeros((3, 4)), None, method="wiener")
+    with pytest.raises(ValueError, match="by wiener has no iterations; give the result of an iter"):
+        tc.plot.history(closed_form)
+
+
+def test_a_landscape_marks_its_minimum():
+    across, down = np.linspace(10, 30, 7), np.linspace(5, 15, 4)
+    values = (across - 20) ** 2 + (down[:, None] - 5) ** 2
+    labels = ("β₁ (rad/mm²)", "β₂ (rad/mm²)", "error (dB)")
+    figure = tc.plot.landscape(values, across, down, labels=labels)
+    axes, bar = figure.axes
+    assert (axes.get_xlabel(), axes.get_ylabel(), bar.get_ylabel()) == labels
+    cross = next(line for line in axes.lines if line.get_marker() == "x")
+    np.testing.assert_allclose(cross.get_xydata(), [[20, 5]])
+    for wrong in (values.T, np.full_like(values, np.nan)):
+        with pytest.raises(ValueError, match=r"give finite values of shape \(4, 7\)"):
+            tc.plot.landscape(wrong, across, down, labels=labels)

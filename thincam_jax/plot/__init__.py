@@ -1,0 +1,14 @@
+"""Figures of cameras, captures and results, as `tc.plot`, with axes in mm or cycles/mm.
+
+Each function draws a figure of pyplot and returns it. A notebook shows it once, a script shows it
+with `matplotlib.pyplot.show()` and keeps it with `figure.savefig("psf.png")`.
+"""
+
+from thincam_jax.plot.cameras import draw_psf as draw_psf
+from thincam_jax.plot.cameras import mask as mask
+from thincam_jax.plot.cameras import otf as otf
+from thincam_jax.plot.cameras import psf as psf
+from thincam_jax.plot.curves import history as history
+from thincam_jax.plot.curves import landscape as landscape
+from thincam_jax.plot.images import capture as capture
+from thincam_jax.plot.images import compare as compare

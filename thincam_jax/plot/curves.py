@@ -1,0 +1,66 @@
+"""Figures of numbers: the history of a solver, and an objective over two parameters."""
+
+from typing import Any
+
+import numpy as np
+
+from thincam_jax.plot.frame import Figure, new_figure
+from thincam_jax.reconstruction import Reconstruction
+
+
+def history(result: Reconstruction) -> Figure:
+    """Objective and residuals of an iterative reconstruction over its iterations.
+
+    **Errors**: ValueError where the method is a closed form and has no iterations.
+    """
+    if not result.history:
+        raise ValueError(
+            f"the reconstruction by {result.method or 'this method'} has no iterations; give the "
+            "result of an iterative solver, such as tc.AdmmTV()"
+        )
+    iterations = [entry.iteration for entry in result.history]
+    figure = new_figure(8.5, 3.2)
+    objective, residuals = figure.subplots(1, 2)
+    values = [entry.objective for entry in result.history]
+    objective.plot(iterations, values, color="black", marker=".")
+    objective.set(xlabel="iteration", ylabel="objective")
+    for name, style in (("primal", "-"), ("dual", "--")):
+        values = np.array([getattr(entry, name) for entry in result.history], dtype=float)
+        if np.isfinite(values).any():
+            residuals.semilogy(iterations, values, style, color="black", marker=".", label=name)
+    residuals.set(xlabel="iteration", ylabel="relative residual")
+    if residuals.lines:
+        residuals.legend(frameon=False)
+    objective.set_title(f"{result.method}, {result.status}", fontsize=9)
+    return figure
+
+
+def landscape(
+    values: Any, across: Any, down: Any, *, labels: tuple[str, str, str] = ("", "", "")
+) -> Figure:
+    """An objective over two parameters, as grey levels with contours; a cross marks its minimum.
+
+    - `values`: (down, across); values that are not finite stay white.
+    - `across`, `down`: the parameters' values, ascending.
+    - `labels`: of both axes and of the values, with units: ("β₁ (rad/mm²)", "β₂ (rad/mm²)",
+      "error (dB)").
+
+    **Errors**: ValueError where the shapes do not fit, or no value is finite.
+    """
+    values, across, down = (np.asarray(v, dtype=float) for v in (values, across, down))
+    if values.shape != (down.size, across.size) or not np.isfinite(values).any():
+        raise ValueError(
+            f"values of shape {values.shape} over {across.size} values across and {down.size} "
+            f"down; give finite values of shape ({down.size}, {across.size})"
+        )
+    figure = new_figure(5.2, 4.0)
+    axes = figure.subplots()
+    shown = axes.pcolormesh(across, down, values, cmap="gray", shading="nearest")
+    figure.colorbar(shown, ax=axes, label=labels[2])
+    if min(values.shape) > 1 and np.nanmin(values) < np.nanmax(values):
+        lines = axes.contour(across, down, values, levels=6, colors="tab:blue", linewidths=0.7)
+        axes.clabel(lines, fontsize=7)
+    row, column = np.unravel_index(np.nanargmin(values), values.shape)
+    axes.plot(across[column], down[row], "x", color="tab:red", markersize=9)
+    axes.set(xlabel=labels[0], ylabel=labels[1])
+    return figure

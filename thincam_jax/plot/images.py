@@ -1,0 +1,79 @@
+"""Figures of images: a capture, and reconstructions beside each other."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from thincam_jax._core.checks import Number, pixel_pitch
+from thincam_jax.imaging.display import eight_bit, pictures
+from thincam_jax.imaging.metrics import psnr
+from thincam_jax.imaging.sensor import Sensor
+from thincam_jax.plot.frame import Figure, new_figure, show_image
+from thincam_jax.reconstruction import Reconstruction
+
+
+def capture(image: Any, sensor: Sensor | Number) -> Figure:
+    """A capture on its sensor, from zero to its own maximum.
+
+    - `image`: (y, x) or (3, y, x); of a batch the first is shown.
+    - `sensor`: the sensor, or the pitch of its pixels in mm.
+    """
+    pitch = sensor.pitch if isinstance(sensor, Sensor) else pixel_pitch("pitch", sensor)
+    shown = pictures(image)[0]
+    figure = new_figure(5.0, 4.0)
+    axes = figure.subplots()
+    if shown.ndim == 3:
+        show_image(axes, np.clip(shown / (shown.max() or 1), 0, 1), float(pitch))
+    else:
+        grey = show_image(axes, shown, float(pitch), vmin=min(0.0, shown.min()))
+        figure.colorbar(grey, ax=axes, label="pixel value")
+    return figure
+
+
+def compare(images: Mapping[str, Any], *, truth: str | None = None) -> Figure:
+    """Images beside each other, each from black to its own white, with gamma 2.2.
+
+    Axes are in mm on the object where a reconstruction knows its pitch.
+
+    - `images`: by name, (y, x) or (3, y, x), or what `tc.reconstruct` returns. Of several in a
+      batch the first is shown.
+    - `truth`: the name of the reference; the others' PSNR is reported against it, after the best
+      gain and offset.
+
+    **Errors**: ValueError for no image, and a `truth` that is not among them or of other pixels.
+    """
+    if not images or (truth is not None and truth not in images):
+        raise ValueError(
+            f"truth = {truth!r} with the images {list(images)}: give images by name, and the name "
+            "of one of them"
+        )
+    arrays = {
+        name: pictures(getattr(one, "image", one), planes=_has_planes(one))[0]
+        for name, one in images.items()
+    }
+    for name, image in arrays.items():
+        if truth is not None and image.shape != arrays[truth].shape:
+            raise ValueError(
+                f"{name!r} has shape {image.shape}, the truth {arrays[truth].shape}; give the "
+                "truth on the same pixels, as by ImagePlane.sample"
+            )
+    figure = new_figure(3.2 * len(arrays), 3.4)
+    panels = figure.subplots(1, len(arrays), squeeze=False)[0]
+    for ax, (name, image) in zip(panels, arrays.items(), strict=True):
+        pitch = getattr(images[name], "pitch", None)
+        if pitch is None:
+            ax.imshow(eight_bit(image), cmap="gray", interpolation="nearest")
+            ax.set(xticks=[], yticks=[])
+        else:
+            show_image(ax, eight_bit(image), float(np.ravel(pitch)[0]))
+        title = name
+        if truth is not None and name != truth:
+            target = arrays[truth]
+            title += f", {psnr(image, target, float(np.ptp(target))):.1f} dB"
+        ax.set_title(title, fontsize=9)
+    return figure
+
+
+def _has_planes(one: Any) -> bool:
+    return isinstance(one, Reconstruction) and one.has_planes
