@@ -1,15 +1,14 @@
 """What the report pages share: their frame, and pictures inside of the page."""
 
-import base64
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
 import jinja2
 
-from thincam_jax._core.files import read_regular
 from thincam_jax.commands.checked_config import dump_config
 from thincam_jax.commands.config_file import slug
+from thincam_jax.commands.report import data_url, number
 
 
 def render_page(
@@ -41,14 +40,3 @@ def render_page(
 
 def _template(name: str) -> str:
     return resources.files("thincam_jax.commands").joinpath(name).read_text(encoding="utf-8")
-
-
-def number(value: float | None, digits: int) -> str:
-    """With so many decimals; a dash for none."""
-    return "–" if value is None else f"{value:.{digits}f}"
-
-
-def data_url(picture: Path) -> str:
-    """An image file as an address that holds it; its suffix is its kind."""
-    content = base64.b64encode(read_regular(picture)).decode("ascii")
-    return f"data:image/{picture.suffix[1:]};base64,{content}"

@@ -13,6 +13,7 @@ from thincam_jax.commands.checked_config import dump_config
 from thincam_jax.commands.config_file import ConfigError, slug
 from thincam_jax.commands.doctor import environment
 from thincam_jax.commands.page import render_page
+from thincam_jax.commands.report import Page, render_report
 from thincam_jax.commands.sections import ExperimentConfig, Section
 
 # Called as a step begins, with its text and with the number of all steps.
@@ -79,17 +80,20 @@ class RunFolder:
 
     def complete(
         self,
-        room: str,
+        room: str | Page,
         config: ExperimentConfig,
         metrics: dict[str, Any],
         started: float,
         **shown: Any,
     ) -> None:
-        """Write what surrounds the run, the page of its room, and what marks it as complete."""
+        """Write what surrounds the run, its page or that of its room, and its result, last."""
         surroundings = environment(time.time() - started)
         self.write("environment.json", to_json({**surroundings, "seed": config.seed}))
         pictures = self.path / self.pictures
-        page = render_page(room, config, pictures, metrics, environment=surroundings, **shown)
+        if isinstance(room, Page):
+            page = render_report(room, config, pictures, surroundings)
+        else:
+            page = render_page(room, config, pictures, metrics, environment=surroundings, **shown)
         self.write("report.html", page)
         self.write(self.result, to_json(metrics))
 
@@ -115,7 +119,7 @@ class Run:
         carry_out(self.work, progress)
         return self.metrics
 
-    def complete(self, room: str, **shown: Any) -> None:
+    def complete(self, room: str | Page, **shown: Any) -> None:
         """The page of a room with the metrics and what is `shown`, and all that ends the folder."""
         self.folder.complete(room, self.config, self.metrics, self.started, **shown)
 

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from thincam_jax._core.grids import Grid
-from thincam_jax.commands.capture import figures
+from thincam_jax.commands.capture import figures, report
 from thincam_jax.commands.capture.build import build_study, field_shape, screen_system
 from thincam_jax.commands.capture.config import CaptureConfig
 from thincam_jax.commands.run_folder import Progress, Run, RunFolder
@@ -95,7 +95,10 @@ class _CaptureRun(Run):
             self.add("system matrix", self.recover)
         elif config.plan.kind != "psf_stack":
             self.add("image", self.reconstruct)
-        self.add("report", self.complete, "capture")
+        self.add("report", self.report)
+
+    def report(self) -> None:
+        self.complete(report.page(self.config, self.metrics))
 
     def show(self) -> None:
         figures.save_frames(self.folder, self.config, self.taken.frames, self.taken.labels)

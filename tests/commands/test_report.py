@@ -1,0 +1,76 @@
+"""A report's texts, tables and figures, as a page and in a terminal."""
+
+import io
+import re
+
+import numpy as np
+import pytest
+import rich.console
+
+from thincam_jax.commands.report import Page, Part, Picture, Sentences, Table, render_report
+from thincam_jax.commands.sections import ExperimentConfig
+from thincam_jax.imaging.display import png_bytes
+
+ENVIRONMENT = {
+    "precision": "float32",
+    "devices": ["cpu"],
+    "platform": "none",
+    "python": "3.11",
+    "seconds": 3.2,
+    "versions": {"numpy": "2.4", "dask": None},
+}
+TABLE = Table(("method", "PSNR\ndB", "others"), [("A <b>", "30.1", "29.0")], published=(2,))
+
+
+def rendered(page, tmp_path):
+    (tmp_path / "psf.png").write_bytes(png_bytes(np.zeros((2, 3), np.uint8)))
+    config = ExperimentConfig(name="a test", title="Title & more", seed=7)
+    return render_report(page, config, tmp_path, ENVIRONMENT)
+
+
+def test_a_page_holds_what_it_is_given_and_leaves_out_what_is_empty(tmp_path):
+    parts = (
+        Part("Results of it all", (TABLE, "Of `tc.psf` & others."), short="Results"),
+        Part("Nothing", ()),
+        Part("Nothing drawn", (Picture("absent.png", "Absent"), Sentences(()), "")),
+        Part("PSF", (Picture("psf.png", "A PSF", "Its `caption`.", folded="all of it"),)),
+    )
+    page = rendered(
+        Page(("Lead.", Sentences(("one", "two"))), parts, warnings=("too few",)), tmp_path
+    )
+    assert (
+        "<title>Title &amp; more</title>" in page and "<strong>Warning:</strong> too few." in page
+    )
+    assert re.findall(r'href="#([\w-]+)"', page) == re.findall(r'<h2 id="([\w-]+)">', page)
+    assert re.findall(r'<h2 id="([\w-]+)">', page) == [
+        "results",
+        "nothing-drawn",
+        "psf",
+        "computed",
+    ]
+    assert "<th>PSNR<br>dB</th>" in page and "<td>A &lt;b&gt;</td>" in page
+    assert '<td class="published">29.0</td>' in page
+    assert "<p>Of <code>tc.psf</code> &amp; others.</p>" in page
+    assert "<ul><li>one</li><li>two</li></ul>" in page and page.count("<ul>") == 1
+    figure = (
+        r'<summary>all of it</summary><figure><img src="data:image/png;base64,[^"]+" alt="A PSF">'
+    )
+    assert re.search(figure, page) and page.count("<img") == 1
+    assert "<figcaption>Its <code>caption</code>.</figcaption>" in page
+    assert "seed: 7" in page and "not installed" in page
+
+
+def test_a_page_of_one_part_needs_no_contents(tmp_path):
+    assert "<nav>" not in rendered(Page(("Lead.",), (Part("Only", ("Text.",)),)), tmp_path)
+
+
+def test_a_table_is_the_same_in_a_terminal():
+    console = rich.console.Console(file=io.StringIO(), width=80)
+    console.print(TABLE.in_terminal())
+    shown = console.file.getvalue()
+    assert all(text in shown for text in ("method", "PSNR dB", "A <b>", "30.1", "29.0"))
+
+
+def test_a_row_fits_its_headings():
+    with pytest.raises(ValueError, match="2 cells under 3 headings"):
+        Table(("a", "b", "c"), [("1", "2")])
