@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from helpers import ROOT
+from thincam_jax._core.quantity import UNITS
 
 PACKAGE = "thincam_jax"
 
@@ -204,6 +205,28 @@ def bare_files(modules: list[Module]) -> list[str]:
     ]
 
 
+def tables_of_units(modules: list[Module]) -> list[str]:
+    """A unit stands at its field; labels and readers ask the field's quantity for it."""
+    units = {*UNITS, *(unit.replace("^2", "²") for unit in UNITS)}
+
+    def is_unit(value: ast.AST) -> bool:
+        inside = value.elts if isinstance(value, ast.Tuple) else [value]
+        texts = [str(n.value) for n in inside if isinstance(n, ast.Constant)]
+        return any(text in units or text.rpartition(", ")[2] in units for text in texts)
+
+    def is_table(node: ast.AST) -> bool:
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
+            return node.func.attr == "fromkeys" and any(map(is_unit, node.args))
+        return isinstance(node, ast.Dict) and sum(map(is_unit, node.values)) > 1
+
+    return [
+        f"{module.path}:{node.lineno}: a table of units: ask the fields for their quantities"
+        for module in modules
+        for node in ast.walk(module.tree)
+        if isinstance(node, ast.Dict | ast.Call) and is_table(node)
+    ]
+
+
 def named_tuples(modules: list[Module]) -> list[str]:
     """A record is a module or a frozen dataclass; a tuple could be unpacked, indexed and added."""
     return [
@@ -281,6 +304,7 @@ RULES = (
     jaxopt_outside_its_files,
     front_end_libraries_in_the_core,
     bare_files,
+    tables_of_units,
     named_tuples,
     star_imports,
     long_modules,
@@ -342,6 +366,24 @@ BROKEN = [
     (front_end_libraries_in_the_core, "__init__.py", "import rich, jinja2", "jinja2"),
     (bare_files, "measured/read.py", "data = path.read_bytes()", "use read_regular"),
     (bare_files, "_core/files.py", "path.write_text('β')", "use write_whole"),
+    (
+        tables_of_units,
+        "design/space.py",
+        "U = {'beta': 'rad/mm^2', 'width': 'mm'}",
+        "space.py:1: a",
+    ),
+    (
+        tables_of_units,
+        "commands/words.py",
+        "L = {'a': (1, 'glass, mm'), 'b': ('s',)}",
+        "words.py:1: ",
+    ),
+    (
+        tables_of_units,
+        "_core/module.py",
+        "U = dict.fromkeys(('cell', 'width'), 'mm')",
+        "module.py:1",
+    ),
     (named_tuples, "lensless/psf.py", "class A(NamedTuple): ...", "psf.py:1: a named tuple"),
     (named_tuples, "units.py", "A = collections.namedtuple('A', 'x')", "units.py:1: "),
     (star_imports, "lensless/psf.py", "from .camera import *", "star import"),

@@ -39,32 +39,38 @@ deg: float = math.pi / 180.0
 class _Kind:
     """What one kind of quantity is called, accepts and turns into."""
 
+    unit: str  # of the package, as a file has it
     name: str  # with its article, as it stands in a sentence
     target: dict[str, str]  # root units, as pint writes them -> the package's unit for them
     advice: str  # for a missing unit or a wrong dimension
     examples: str  # for an unknown unit
 
 
-_KINDS = {
+# The one table of what files write with a unit; `_core.quantity` has the rest.
+KINDS = {
     "length": _Kind(
+        "mm",
         "a length",
         {"meter": "millimeter"},
         'write a length such as "180 mm"',
         '"500 nm", "5.5 um", "180 mm" or "0.25 m"',
     ),
     "wavelength": _Kind(
+        "mm",
         "a wavelength",
         {"meter": "millimeter"},
         'write a wavelength such as "500 nm"',
         '"500 nm" or "0.5 um"',
     ),
     "angle": _Kind(
+        "rad",
         "an angle",
         {"radian": "radian"},
         'write an angle such as "61.2 deg"',
         '"61.2 deg", "30 arcmin", "5 mrad" or "1.07 rad"',
     ),
     "curvature": _Kind(
+        "rad/mm^2",
         "a curvature",
         {
             "radian / meter ** 2": "radian / millimeter ** 2",
@@ -74,7 +80,11 @@ _KINDS = {
         '"25 rad/mm^2", "25 rad/mm**2" or "25 /mm^2"',
     ),
     "time": _Kind(
-        "a time", {"second": "second"}, 'write a time such as "5 ms"', '"50 us", "5 ms" or "2 s"'
+        "s",
+        "a time",
+        {"second": "second"},
+        'write a time such as "5 ms"',
+        '"50 us", "5 ms" or "2 s"',
     ),
 }
 
@@ -139,10 +149,10 @@ def parse_quantity(text: object, kind: str) -> float:
     - `ValueError`, one line that says what was given and what to write: no unit, a unit of another
       dimension, an unknown unit, a value that is not finite, or text that is no quantity.
     """
-    if kind not in _KINDS:
-        allowed = ", ".join(f'"{name}"' for name in _KINDS)
+    if kind not in KINDS:
+        allowed = ", ".join(f'"{name}"' for name in KINDS)
         raise ValueError(f"{kind!r} is not a kind of quantity: use one of {allowed}")
-    wanted = _KINDS[kind]
+    wanted = KINDS[kind]
     if isinstance(text, str):
         text = " ".join(text.split())
         if len(text) > _LONGEST:

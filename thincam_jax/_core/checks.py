@@ -3,7 +3,6 @@
 Traced values cannot be looked at and pass; they were checked when the object was built.
 """
 
-import functools
 from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -105,26 +104,6 @@ def positive_all(name: str, value: Array, unit: str) -> Array:
     return _require(array, lambda known: known > 0, message)
 
 
-def length(name: str) -> Callable[[Any], Array]:
-    """`positive` of a field in mm, as `eqx.field(converter=…)` takes it."""
-    return functools.partial(positive, name, unit="mm")
-
-
-def named(check: Callable[..., Any], name: str, *given: Any, **how: Any) -> Callable[[Any], Any]:
-    """Another check of a field of that name."""
-    return lambda value: check(name, value, *given, **how)
-
-
-def optional(check: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    """The check of a field that may be None."""
-    return lambda value: None if value is None else check(value)
-
-
-def centre(value: Any) -> Array:
-    """The check of a field: a point of two coordinates, mm."""
-    return finite("centre", value, "mm", shape=(2,))
-
-
 def _after(unit: str) -> str:
     return "" if unit in _RATIOS else f" {unit}"
 
@@ -194,6 +173,15 @@ def choice(name: str, value: Any, options: Iterable[str]) -> str:
         listed = ", ".join(repr(o) for o in options)
         raise ValueError(f"{name} = {value!r} is unknown; choose one of {listed}")
     return value
+
+
+def whole(name: str, value: Any, least: int, most: int | None = None) -> int:
+    """A whole number within limits."""
+    number = int(value)
+    if number != value or number < least or (most is not None and number > most):
+        limits = f"of at least {least}" if most is None else f"from {least} to {most}"
+        raise ValueError(f"{name} = {value!r}: give a whole number {limits}")
+    return number
 
 
 def at_least_one(counts: dict[str, int]) -> None:

@@ -9,6 +9,8 @@ import pydantic
 from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, PlainSerializer
 from pydantic_core import PydanticCustomError
 
+from thincam_jax._core import checks
+from thincam_jax._core.quantity import Quantity, quantity
 from thincam_jax.commands.config_file import slug
 from thincam_jax.imaging.targets import sample_images
 from thincam_jax.lensless.masks.cells import Combination
@@ -32,23 +34,27 @@ def _optical(value: float) -> float:
     return value
 
 
-def quantity(kind: str, unit: str, *, positive: bool = False):
+def written(given: Quantity):
+    """How a number with a unit is read and written in a file."""
+
     def read(text: object) -> float:
-        value = parse_quantity(text, kind)
-        if positive and not value > 0:
+        value = parse_quantity(text, given.kind)
+        if given.positive and not value > 0:
             raise ValueError(f'"{text}" is not positive; give a value above zero')
         return value
 
     # A resolved file is read back, so it is written in the unit of the package, with every digit.
-    return BeforeValidator(read), PlainSerializer(lambda value: f"{value!r} {unit}")
+    return BeforeValidator(read), PlainSerializer(lambda value: f"{value!r} {given.unit}")
 
 
-Length = Annotated[float, *quantity("length", "mm", positive=True)]
-Position = Annotated[float, *quantity("length", "mm")]
-Wavelength = Annotated[float, *quantity("wavelength", "mm"), AfterValidator(_optical)]
-Curvature = Annotated[float, *quantity("curvature", "rad/mm^2", positive=True)]
-Angle = Annotated[float, *quantity("angle", "rad")]
-Time = Annotated[float, *quantity("time", "s", positive=True)]
+Length = Annotated[float, *written(quantity("mm", positive=True))]
+Position = Annotated[float, *written(quantity("mm"))]
+Wavelength = Annotated[
+    float, *written(quantity("mm", check=checks.wavelength)), AfterValidator(_optical)
+]
+Curvature = Annotated[float, *written(quantity("rad/mm^2", positive=True))]
+Angle = Annotated[float, *written(quantity("rad"))]
+Time = Annotated[float, *written(quantity("s", positive=True))]
 Name = Annotated[str, Field(min_length=1, max_length=60, pattern=r"^[\w .,()=+\-]+$")]
 
 

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Number, Numbers
 from thincam_jax._core.module import Module
+from thincam_jax._core.quantity import unchecked
 from thincam_jax.imaging.sensor import Sensor
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.masks.fza import FresnelZoneAperture, Profile
@@ -29,12 +30,12 @@ class Design(Module):
     - `width`: of all masks, mm.
     """
 
-    beta: Float[Array, " capture"]
-    phase: Float[Array, " capture"]
-    distance: Float[Array, " capture"]
-    wavelength: Float[Array, " capture"]
-    exposure: Float[Array, " capture"]
-    width: Float[Array, ""]
+    beta: Float[Array, " capture"] = eqx.field(converter=unchecked("rad/mm^2"))
+    phase: Float[Array, " capture"] = eqx.field(converter=unchecked("rad"))
+    distance: Float[Array, " capture"] = eqx.field(converter=unchecked("mm"))
+    wavelength: Float[Array, " capture"] = eqx.field(converter=unchecked("mm"))
+    exposure: Float[Array, " capture"] = eqx.field(converter=unchecked("shares"))
+    width: Float[Array, ""] = eqx.field(converter=unchecked("mm"))
     profile: Profile = eqx.field(static=True)
 
     def __init__(

@@ -17,6 +17,7 @@ object, and what changes over a few ghosts' distance, are left out.
 
 import functools
 from dataclasses import replace
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -27,6 +28,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Number
 from thincam_jax._core.module import Module
+from thincam_jax._core.quantity import quantity
 from thincam_jax.design.adam import adam
 from thincam_jax.design.prior import PowerLaw
 from thincam_jax.design.search import best_apart, even_samples, on_cube
@@ -45,23 +47,33 @@ _FREQUENCIES = (32, 16)
 _MARGIN = 0.02
 
 
-def _number(value) -> Float[Array, ""]:
+def _number(name: str, value: Any) -> Float[Array, ""]:
     # Not weakly typed, so that every plate is of one compiled program.
     return value if isinstance(value, jax.Array) else jnp.asarray(value, float)
 
 
-class Plate(eqx.Module):
+class Plate(Module):
     """What of a see-through-screen camera is chosen; lengths in mm, the angle in rad.
 
     The defaults are those of ERRATA.md, for what the thesis does not give.
     """
 
-    glass_thickness: Float[Array, ""] = eqx.field(default=5.0, converter=_number)
-    reference_angle: Float[Array, ""] = eqx.field(default=61.2 * deg, converter=_number)
-    film_thickness: Float[Array, ""] = eqx.field(default=16 * um, converter=_number)
-    index_modulation: Float[Array, ""] = eqx.field(default=0.02, converter=_number)
-    lens_distance: Float[Array, ""] = eqx.field(default=10.0, converter=_number)
-    focal_distance: Float[Array, ""] = eqx.field(default=6.0, converter=_number)
+    glass_thickness: Float[Array, ""] = eqx.field(
+        default=5.0, converter=quantity("mm", check=_number)
+    )
+    reference_angle: Float[Array, ""] = eqx.field(
+        default=61.2 * deg, converter=quantity("rad", check=_number)
+    )
+    film_thickness: Float[Array, ""] = eqx.field(
+        default=16 * um, converter=quantity("mm", check=_number)
+    )
+    index_modulation: Float[Array, ""] = eqx.field(default=0.02, converter=quantity(check=_number))
+    lens_distance: Float[Array, ""] = eqx.field(
+        default=10.0, converter=quantity("mm", check=_number)
+    )
+    focal_distance: Float[Array, ""] = eqx.field(
+        default=6.0, converter=quantity("mm", check=_number)
+    )
 
     def camera(
         self, sensor: Sensor, *, wavelength: Number = 532 * nm, index: AbstractIndex | Number = 1.5

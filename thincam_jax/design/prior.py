@@ -6,10 +6,11 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
 
-from thincam_jax._core import checks
+from thincam_jax._core.module import Module
+from thincam_jax._core.quantity import quantity
 
 
-class PowerLaw(eqx.Module):
+class PowerLaw(Module):
     r"""Spectral density :math:`\propto (\nu^2 + \nu_0^2)^{-\gamma/2}`, ν in cycles/rad.
 
     γ = 2 is the 1/f² of the reconstruction's prior (`thincam_jax.reconstruct`), with as much
@@ -21,11 +22,11 @@ class PowerLaw(eqx.Module):
 
     exponent: Float[Array, ""] = eqx.field(
         default=2.0,
-        converter=checks.named(checks.non_negative, "exponent", "powers of the frequency"),
+        converter=quantity("powers of the frequency", non_negative=True),
     )
     corner: Float[Array, ""] | None = eqx.field(
         default=None,
-        converter=checks.optional(checks.named(checks.positive, "corner", "cycles/rad")),
+        converter=quantity("cycles/rad", positive=True, optional=True),
     )
 
     def __call__(

@@ -3,9 +3,9 @@ r"""What a design is judged in: sensor, scene and noise."""
 import equinox as eqx
 from jaxtyping import Array, Float
 
-from thincam_jax._core import checks
 from thincam_jax._core.checks import Numbers
 from thincam_jax._core.module import Module
+from thincam_jax._core.quantity import quantity
 from thincam_jax.design.prior import PowerLaw
 
 
@@ -16,9 +16,7 @@ class SignalNoise(Module):
       exposure among captures does not change it.
     """
 
-    snr_db: Float[Array, ""] = eqx.field(
-        default=30.0, converter=checks.named(checks.finite, "snr_db", "dB")
-    )
+    snr_db: Float[Array, ""] = eqx.field(default=30.0, converter=quantity("dB"))
 
     def variance(self, light: Numbers, signal: Numbers, exposure: Numbers):
         """Of a pixel, mm⁴: from the capture's mean (mm²), its variance, the share of exposure."""
@@ -34,10 +32,10 @@ class PhotonNoise(Module):
     """
 
     electrons: Float[Array, ""] = eqx.field(
-        default=2_000.0, converter=checks.named(checks.positive, "electrons", "electrons")
+        default=2_000.0, converter=quantity("electrons", positive=True)
     )
     read_noise: Float[Array, ""] = eqx.field(
-        default=8.0, converter=checks.named(checks.non_negative, "read_noise", "electrons")
+        default=8.0, converter=quantity("electrons", non_negative=True)
     )
 
     def variance(self, light: Numbers, signal: Numbers, exposure: Numbers):
@@ -59,12 +57,12 @@ class Setup(Module):
       `thincam_jax.design.response`.
     """
 
-    pitch: Float[Array, ""] = eqx.field(converter=checks.length("pitch"))
-    sensor_width: Float[Array, ""] = eqx.field(converter=checks.length("sensor_width"))
-    object_distance: Float[Array, ""] = eqx.field(converter=checks.length("object_distance"))
-    object_width: Float[Array, ""] = eqx.field(converter=checks.length("object_width"))
+    pitch: Float[Array, ""] = eqx.field(converter=quantity("mm", positive=True))
+    sensor_width: Float[Array, ""] = eqx.field(converter=quantity("mm", positive=True))
+    object_distance: Float[Array, ""] = eqx.field(converter=quantity("mm", positive=True))
+    object_width: Float[Array, ""] = eqx.field(converter=quantity("mm", positive=True))
     contrast: Float[Array, ""] = eqx.field(
-        default=0.5, converter=checks.named(checks.positive, "contrast", "parts of the mean")
+        default=0.5, converter=quantity("parts of the mean", positive=True)
     )
     noise: SignalNoise | PhotonNoise = eqx.field(
         default=None, converter=lambda given: SignalNoise() if given is None else given

@@ -13,18 +13,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from thincam_jax._core.quantity import quantities
 from thincam_jax.design.design import MOST_CAPTURES, Design
 
 # As near to a limit, in the cube, a point lies against it.
 _WITHIN = 1e-3
-UNITS: dict[str, str] = {
-    "beta": "rad/mm^2",
-    "phase": "rad",
-    "distance": "mm",
-    "wavelength": "mm",
-    "exposure": "shares",
-    "width": "mm",
-}
+# What may be free.
+QUANTITIES = quantities(Design)
 
 
 @dataclass(frozen=True)
@@ -40,6 +35,11 @@ class Variable:
     lower: float
     upper: float
     captures: tuple[int, ...] = ()
+
+    @property
+    def unit(self) -> str:
+        """Of its values."""
+        return QUANTITIES[self.name].unit
 
     def label(self) -> str:
         """Its name, with the captures that it belongs to."""
@@ -165,7 +165,7 @@ def active_limits(
     words = []
     values = space.values(jnp.asarray(point))
     for variable, place, value in zip(space.variables, jax.device_get(point), values, strict=True):
-        unit = UNITS[variable.name]
+        unit = variable.unit
         if place <= _WITHIN:
             words.append(f"{variable.label()} ≥ {float(value):.6g} {unit}")
         elif place >= 1 - _WITHIN:
@@ -192,17 +192,17 @@ def _check_variables(base: Design, variables: tuple[Variable, ...]) -> None:
         raise ValueError("no variable is free; give at least one to search for")
     taken: set[tuple[str, int]] = set()
     for v in variables:
-        if v.name not in UNITS:
-            raise ValueError(f"variable {v.name!r} is unknown; choose one of {', '.join(UNITS)}")
+        if v.name not in QUANTITIES:
+            known = ", ".join(QUANTITIES)
+            raise ValueError(f"variable {v.name!r} is unknown; choose one of {known}")
         if not (math.isfinite(v.lower) and math.isfinite(v.upper) and v.lower <= v.upper):
             raise ValueError(
-                f"bounds of {v.label()} cross: {v.lower:g} to {v.upper:g} {UNITS[v.name]}; "
+                f"bounds of {v.label()} cross: {v.lower:g} to {v.upper:g} {v.unit}; "
                 "give the lower one first"
             )
         if v.lower <= 0 and v.name != "phase":
             raise ValueError(
-                f"bounds of {v.label()} begin at {v.lower:g} {UNITS[v.name]}; give a lower bound "
-                "above 0"
+                f"bounds of {v.label()} begin at {v.lower:g} {v.unit}; give a lower bound above 0"
             )
         if bool(v.captures) == (v.name == "width"):
             raise ValueError(

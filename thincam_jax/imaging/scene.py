@@ -1,7 +1,9 @@
 """What the camera looks at: flat images at distances, and the light they send."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
+from typing import Any
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -11,6 +13,29 @@ from thincam_jax._core.checks import Number, Numbers
 from thincam_jax._core.grids import Grid, cell_overlap
 from thincam_jax._core.module import Module
 from thincam_jax._core.precision import product
+from thincam_jax._core.quantity import quantity
+
+
+def _radiances(given: Any) -> Float[Array, "*batch y x"]:
+    """The check of an image: floating, finite, not negative."""
+    if not checks.is_traced(given) and np.asarray(given).dtype.kind not in "fiub":
+        raise TypeError(
+            f"image is a {type(given).__name__} of {np.asarray(given).dtype}; give an array of "
+            "real radiances"
+        )
+    image = jnp.asarray(given)
+    if not jnp.issubdtype(image.dtype, jnp.floating):
+        image = image.astype(float)
+    if image.ndim < 2 or 0 in image.shape:
+        raise ValueError(f"image has shape {image.shape}; give a non-empty (…, y, x) array")
+    if not checks.is_traced(image) and not np.isfinite(np.asarray(image)).all():
+        raise ValueError("image holds NaN or infinity; give finite radiances")
+    checks.channels_first("image", image.shape)
+    if not checks.is_traced(image) and (np.asarray(image) < 0).any():
+        raise ValueError(
+            f"image holds {np.asarray(image).min():.3g}, a negative radiance; give radiances >= 0"
+        )
+    return image
 
 
 class ImagePlane(Module):
@@ -23,41 +48,12 @@ class ImagePlane(Module):
       even speed, and what is captured is the mean on the way. None stays on the axis.
     """
 
-    image: Float[Array, "*batch y x"]
-    distance: Float[Array, ""]
-    width: Float[Array, ""]
-    moves: Float[Array, "2"] | None
-
-    def __init__(
-        self,
-        image: Numbers,
-        distance: Number,
-        width: Number,
-        moves: Numbers | Sequence[float] | None = None,
-    ):
-        if not checks.is_traced(image) and np.asarray(image).dtype.kind not in "fiub":
-            raise TypeError(
-                f"image is a {type(image).__name__} of {np.asarray(image).dtype}; give an array of "
-                "real radiances"
-            )
-        self.image = jnp.asarray(image)
-        if not jnp.issubdtype(self.image.dtype, jnp.floating):
-            self.image = self.image.astype(float)
-        if self.image.ndim < 2 or 0 in self.image.shape:
-            raise ValueError(
-                f"image has shape {self.image.shape}; give a non-empty (…, y, x) array"
-            )
-        if not checks.is_traced(self.image) and not np.isfinite(np.asarray(self.image)).all():
-            raise ValueError("image holds NaN or infinity; give finite radiances")
-        checks.channels_first("image", self.image.shape)
-        if not checks.is_traced(self.image) and (np.asarray(self.image) < 0).any():
-            raise ValueError(
-                f"image holds {np.asarray(self.image).min():.3g}, a negative radiance; give "
-                "radiances >= 0"
-            )
-        self.distance = checks.positive("distance", distance, "mm")
-        self.width = checks.positive("width", width, "mm")
-        self.moves = None if moves is None else checks.finite("moves", moves, "mm", shape=(2,))
+    image: Float[Array, "*batch y x"] = eqx.field(converter=_radiances)
+    distance: Float[Array, ""] = eqx.field(converter=quantity("mm", positive=True))
+    width: Float[Array, ""] = eqx.field(converter=quantity("mm", positive=True))
+    moves: Float[Array, "2"] | None = eqx.field(
+        default=None, converter=quantity("mm", shape=(2,), optional=True)
+    )
 
     @property
     def height(self) -> Float[Array, ""]:
@@ -112,7 +108,7 @@ class Spectrum(Module):
     - `weights`: non-negative; used as given, so that they sum to 1 for a plain average.
     """
 
-    wavelengths: Float[Array, " n"]
+    wavelengths: Float[Array, " n"] = eqx.field(converter=quantity("mm", check=checks.wavelength))
     weights: Float[Array, " n"]
 
     def __init__(self, wavelengths: Numbers, weights: Numbers | None = None):

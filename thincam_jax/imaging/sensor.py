@@ -9,9 +9,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from thincam_jax._core import checks
-from thincam_jax._core.checks import Number, Shape
 from thincam_jax._core.grids import Grid
 from thincam_jax._core.module import Module
+from thincam_jax._core.quantity import FieldError, choice, quantity, whole
 
 Pictures = Float[Array, "*batch y x"]
 Electrons = Float[Array, "*batch 1 1"]  # per unit of each picture
@@ -32,45 +32,47 @@ class Sensor(Module):
       not quantise. Needs an `exposure` or `electrons`.
     """
 
-    shape: tuple[int, int] = eqx.field(static=True)
-    pitch: Float[Array, ""]
-    full_well: Float[Array, ""]
-    exposure: Float[Array, ""] | None
-    electrons: Float[Array, ""] | None
-    bit_depth: int | None = eqx.field(static=True)
+    shape: tuple[int, int] = eqx.field(converter=quantity(check=checks.shape2d), static=True)
+    pitch: Float[Array, ""] = eqx.field(converter=quantity("mm", check=checks.pixel_pitch))
+    full_well: Float[Array, ""] = eqx.field(
+        default=13_500.0, converter=quantity("electrons", positive=True), kw_only=True
+    )
+    exposure: Float[Array, ""] | None = eqx.field(
+        default=None,
+        converter=quantity("parts of the full well", positive=True, optional=True),
+        kw_only=True,
+    )
+    electrons: Float[Array, ""] | None = eqx.field(
+        default=None,
+        converter=quantity("electrons/mm^2", positive=True, optional=True),
+        kw_only=True,
+    )
+    bit_depth: int | None = eqx.field(
+        default=None, converter=whole(1, 24, optional=True), static=True, kw_only=True
+    )
 
-    def __init__(
-        self,
-        shape: Shape,
-        pitch: Number,
-        *,
-        full_well: Number = 13_500.0,
-        exposure: Number | None = None,
-        electrons: Number | None = None,
-        bit_depth: float | int | None = None,
-    ):
-        self.shape = checks.shape2d("shape", shape)
-        self.pitch = checks.pixel_pitch("pitch", pitch)
-        self.full_well = checks.positive("full_well", full_well, "electrons")
-        if exposure is not None and electrons is not None:
-            raise ValueError(
-                "exposure and electrons both say how long the sensor is exposed; give one"
+    def __check_init__(self):
+        if self.exposure is not None and self.electrons is not None:
+            raise FieldError(
+                "exposure and electrons both say how long the sensor is exposed; give one",
+                "electrons",
             )
-        self.exposure = self.electrons = None
-        if exposure is not None:
-            self.exposure = checks.positive("exposure", exposure, "parts of the full well")
-        if electrons is not None:
-            self.electrons = checks.positive("electrons", electrons, "electrons from each mm²")
-        if bit_depth is not None and (int(bit_depth) != bit_depth or not 1 <= bit_depth <= 24):
-            raise ValueError(f"bit_depth = {bit_depth!r}: give a whole number from 1 to 24")
-        if bit_depth is not None and exposure is None and electrons is None:
-            raise ValueError("bit_depth needs an exposure: the converter's range is the full well")
-        self.bit_depth = None if bit_depth is None else int(bit_depth)
+        if self.bit_depth is not None and self.exposure is None and self.electrons is None:
+            raise FieldError(
+                "bit_depth needs an exposure: the converter's range is the full well", "bit_depth"
+            )
 
     @property
     def grid(self) -> Grid:
         """The pixel centres."""
         return Grid(self.shape, self.pitch)
+
+
+def as_sensor(given: Any) -> Sensor:
+    """The check of a field that is a sensor."""
+    if not isinstance(given, Sensor):
+        raise TypeError(f"sensor is a {type(given).__name__}; give a thincam_jax.Sensor")
+    return given
 
 
 class AbstractNoise(Module):
@@ -96,10 +98,10 @@ class GaussianNoise(AbstractNoise):
     - "without_mean": its variance: what is left of a lensless capture once its bias is removed.
     """
 
-    snr_db: Float[Array, ""] = eqx.field(converter=checks.named(checks.finite, "snr_db", "dB"))
+    snr_db: Float[Array, ""] = eqx.field(converter=quantity("dB"))
     signal_power: Literal["total", "without_mean"] = eqx.field(
         default="total",
-        converter=checks.named(checks.choice, "signal_power", ("total", "without_mean")),
+        converter=choice(("total", "without_mean")),
         static=True,
     )
 
@@ -126,7 +128,7 @@ class PoissonGaussianNoise(AbstractNoise):
     """
 
     read_noise: Float[Array, ""] = eqx.field(
-        default=8.0, converter=checks.named(checks.non_negative, "read_noise", "electrons")
+        default=8.0, converter=quantity("electrons", non_negative=True)
     )
 
     def variance(

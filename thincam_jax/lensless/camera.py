@@ -3,15 +3,24 @@
 import functools
 from typing import Any
 
+import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
 
-from thincam_jax._core import checks
 from thincam_jax._core.checks import Number
 from thincam_jax._core.module import Module
-from thincam_jax.imaging.sensor import Sensor
+from thincam_jax._core.quantity import quantity
+from thincam_jax.imaging.sensor import Sensor, as_sensor
 from thincam_jax.lensless.masks.base import AbstractMask
 from thincam_jax.lensless.propagation.path import Path
+
+
+def _mask(given: Any) -> AbstractMask:
+    if not isinstance(given, AbstractMask):
+        raise TypeError(
+            f"mask is a {type(given).__name__}; give a mask, such as a FresnelZoneAperture"
+        )
+    return given
 
 
 class LenslessCamera(Module):
@@ -22,20 +31,9 @@ class LenslessCamera(Module):
     - `distance`: mask-sensor distance d, mm, > 0.
     """
 
-    mask: AbstractMask
-    sensor: Sensor
-    distance: Float[Array, ""]
-
-    def __init__(self, mask: Any, sensor: Any, distance: Number):
-        if not isinstance(mask, AbstractMask):
-            raise TypeError(
-                f"mask is a {type(mask).__name__}; give a mask, such as a FresnelZoneAperture"
-            )
-        if not isinstance(sensor, Sensor):
-            raise TypeError(f"sensor is a {type(sensor).__name__}; give a thincam_jax.Sensor")
-        self.mask = mask
-        self.sensor = sensor
-        self.distance = checks.positive("distance", distance, "mm")
+    mask: AbstractMask = eqx.field(converter=_mask)
+    sensor: Sensor = eqx.field(converter=as_sensor)
+    distance: Float[Array, ""] = eqx.field(converter=quantity("mm", positive=True))
 
     def path(self, wavelength: Number, object_distance: Number) -> Path:
         """The light's path from a point at `object_distance` (mm) in front of the mask."""

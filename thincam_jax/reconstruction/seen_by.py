@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Numbers
 from thincam_jax._core.module import Module
+from thincam_jax._core.quantity import choice, unchecked
 from thincam_jax.imaging.operators import kernel_grid
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.method import MODELS, Model
@@ -31,9 +32,6 @@ def _cameras(given: Sequence[LenslessCamera]) -> tuple[LenslessCamera, ...]:
     return cameras
 
 
-_model = checks.named(checks.choice, "model", MODELS)
-
-
 class Cameras(Module):
     """Cameras whose PSFs are computed, one for each capture, with the light that they saw.
 
@@ -51,10 +49,12 @@ class Cameras(Module):
     """
 
     cameras: tuple[LenslessCamera, ...] = eqx.field(converter=_cameras)
-    wavelength: Any = eqx.field(default=None, kw_only=True)
-    object_distance: Any = eqx.field(default=None, kw_only=True)
+    wavelength: Any = eqx.field(default=None, converter=unchecked("mm"), kw_only=True)
+    object_distance: Any = eqx.field(default=None, converter=unchecked("mm"), kw_only=True)
     field_shape: tuple[int, int] | None = eqx.field(default=None, static=True, kw_only=True)
-    model: Model = eqx.field(default="separable", converter=_model, static=True, kw_only=True)
+    model: Model = eqx.field(
+        default="separable", converter=choice(MODELS), static=True, kw_only=True
+    )
     pixel_integration: bool = eqx.field(default=True, converter=bool, static=True, kw_only=True)
 
     @property

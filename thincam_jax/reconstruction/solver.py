@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Numbers
 from thincam_jax._core.module import Module
+from thincam_jax._core.quantity import unchecked
 from thincam_jax.imaging.display import eight_bit, pictures, png_bytes
 from thincam_jax.reconstruction.drive import Callback, Progress
 
@@ -40,7 +41,7 @@ class Reconstruction(Module):
     """
 
     image: Float[Array, "*batch y x"]
-    pitch: Float[Array, "*plane"] | None
+    pitch: Float[Array, "*plane"] | None = eqx.field(converter=unchecked("mm"))
     method: str = eqx.field(static=True, default="")
     reason: str = eqx.field(static=True, default="")
     ending: str | None = eqx.field(static=True, default=None)

@@ -13,6 +13,7 @@ from thincam_jax._core import checks
 from thincam_jax._core.checks import Numbers
 from thincam_jax._core.grids import Grid, fast_shape, same_parity
 from thincam_jax._core.precision import as_complex
+from thincam_jax._core.quantity import choice
 from thincam_jax.imaging.operators import CropConvolution, kernel_grid, kernel_shape
 from thincam_jax.lensless.psf import psf
 from thincam_jax.reconstruction.noise import estimate_variance
@@ -204,7 +205,7 @@ class Wiener(AbstractSolver):
     synthesis: np.ndarray | None = eqx.field(default=None, converter=as_synthesis, kw_only=True)
     prior: Prior = eqx.field(
         default="inverse_square",
-        converter=checks.named(checks.choice, "prior", ("inverse_square", "flat")),
+        converter=choice(("inverse_square", "flat")),
         static=True,
         kw_only=True,
     )

@@ -6,26 +6,26 @@ surface with the top hologram a glass thickness w further, and objects d2 before
 5.5).
 """
 
+from typing import Any
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
-from thincam_jax._core.checks import Number, Numbers
 from thincam_jax._core.module import Module
+from thincam_jax._core.quantity import quantity
 from thincam_jax.imaging.refractive_index import AbstractIndex, as_index
-from thincam_jax.imaging.sensor import Sensor
+from thincam_jax.imaging.sensor import Sensor, as_sensor
 from thincam_jax.waveguide.hologram import VolumeHologram
 
 
 class Rectangle(Module):
     """A part of a plane: `centre` and `size` (x, y), mm."""
 
-    centre: Float[Array, "2"] = eqx.field(converter=checks.centre)
-    size: Float[Array, "2"] = eqx.field(
-        converter=checks.named(checks.finite, "size", "mm", shape=(2,))
-    )
+    centre: Float[Array, "2"] = eqx.field(converter=quantity("mm", shape=(2,)))
+    size: Float[Array, "2"] = eqx.field(converter=quantity("mm", shape=(2,)))
 
     def __check_init__(self):
         if not checks.is_traced(self.size) and not (self.size > 0).all():
@@ -45,10 +45,20 @@ class Screen(Module):
     """
 
     hologram: VolumeHologram
-    glass_thickness: Float[Array, ""] = eqx.field(converter=checks.length("glass_thickness"))
-    glass_index: AbstractIndex = eqx.field(converter=checks.named(as_index, "glass_index"))
+    glass_thickness: Float[Array, ""] = eqx.field(converter=quantity("mm", positive=True))
+    glass_index: AbstractIndex = eqx.field(converter=quantity(check=as_index))
     top: Rectangle | None = None
     bottom: Rectangle | None = None
+
+
+def _screen(given: Any) -> Screen:
+    if not isinstance(given, Screen):
+        raise TypeError(f"screen is a {type(given).__name__}; give a waveguide.Screen")
+    return given
+
+
+def _tilt(name: str, value: Any) -> Array:
+    return checks.finite(name, np.zeros(2) if value is None else value, "rad", shape=(2,))
 
 
 class SeeThroughCamera(Module):
@@ -60,28 +70,11 @@ class SeeThroughCamera(Module):
       turns about where the camera's axis meets its rear surface; the object's plane stays.
     """
 
-    screen: Screen
-    sensor: Sensor
-    focal_distance: Float[Array, ""]
-    lens_distance: Float[Array, ""]
-    tilt: Float[Array, "2"]
-
-    def __init__(
-        self,
-        screen: Screen,
-        sensor: Sensor,
-        focal_distance: Number,
-        lens_distance: Number,
-        tilt: Numbers | None = None,
-    ):
-        if not isinstance(screen, Screen):
-            raise TypeError(f"screen is a {type(screen).__name__}; give a waveguide.Screen")
-        if not isinstance(sensor, Sensor):
-            raise TypeError(f"sensor is a {type(sensor).__name__}; give a thincam_jax.Sensor")
-        self.screen, self.sensor = screen, sensor
-        self.focal_distance = checks.positive("focal_distance", focal_distance, "mm")
-        self.lens_distance = checks.positive("lens_distance", lens_distance, "mm")
-        self.tilt = checks.finite("tilt", np.zeros(2) if tilt is None else tilt, "rad", shape=(2,))
+    screen: Screen = eqx.field(converter=_screen)
+    sensor: Sensor = eqx.field(converter=as_sensor)
+    focal_distance: Float[Array, ""] = eqx.field(converter=quantity("mm", positive=True))
+    lens_distance: Float[Array, ""] = eqx.field(converter=quantity("mm", positive=True))
+    tilt: Float[Array, "2"] = eqx.field(default=None, converter=quantity("rad", check=_tilt))
 
     @property
     def plate_axes(self) -> Float[Array, "3 3"]:

@@ -24,6 +24,7 @@ from jaxtyping import Array, Bool, Float
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Number
 from thincam_jax._core.module import Module
+from thincam_jax._core.quantity import quantity
 from thincam_jax.imaging.refractive_index import AbstractIndex, ConstantIndex, as_index, changed
 
 
@@ -37,14 +38,10 @@ class VolumeHologram(Module):
     - `index_modulation`: Δn, the amplitude of n + Δn·cos(K·r).
     """
 
-    grating: Float[Array, "3"] = eqx.field(
-        converter=checks.named(checks.finite, "grating", "rad/mm", shape=(3,))
-    )
-    index: AbstractIndex = eqx.field(converter=checks.named(as_index, "index"))
-    thickness: Float[Array, ""] = eqx.field(converter=checks.length("thickness"))
-    index_modulation: Float[Array, ""] = eqx.field(
-        converter=checks.named(checks.non_negative, "index_modulation", "n")
-    )
+    grating: Float[Array, "3"] = eqx.field(converter=quantity("rad/mm", shape=(3,)))
+    index: AbstractIndex = eqx.field(converter=quantity(check=as_index))
+    thickness: Float[Array, ""] = eqx.field(converter=quantity("mm", positive=True))
+    index_modulation: Float[Array, ""] = eqx.field(converter=quantity("n", non_negative=True))
 
     @staticmethod
     def record(

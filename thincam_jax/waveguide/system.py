@@ -12,6 +12,7 @@ from jaxtyping import Array, Float, Int
 
 from thincam_jax._core import checks
 from thincam_jax._core.module import Module
+from thincam_jax._core.quantity import quantity
 from thincam_jax.imaging.operators import Sparse
 from thincam_jax.waveguide.camera import SeeThroughCamera
 from thincam_jax.waveguide.rays import pixel_centres, trace
@@ -27,10 +28,10 @@ class ObjectPlane(Module):
     - `centre`: (x, y) of its middle from the camera's axis, mm; +y is down.
     """
 
-    shape: tuple[int, int] = eqx.field(converter=checks.named(checks.shape2d, "shape"), static=True)
-    distance: Float[Array, ""] = eqx.field(converter=checks.length("distance"))
-    width: Float[Array, ""] = eqx.field(converter=checks.length("width"))
-    centre: Float[Array, "2"] = eqx.field(converter=checks.centre)
+    shape: tuple[int, int] = eqx.field(converter=quantity(check=checks.shape2d), static=True)
+    distance: Float[Array, ""] = eqx.field(converter=quantity("mm", positive=True))
+    width: Float[Array, ""] = eqx.field(converter=quantity("mm", positive=True))
+    centre: Float[Array, "2"] = eqx.field(converter=quantity("mm", shape=(2,)))
 
     @property
     def pitch(self) -> Float[Array, ""]:

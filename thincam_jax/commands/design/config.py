@@ -28,15 +28,13 @@ from thincam_jax.commands.sections import (
     misfit,
 )
 from thincam_jax.design import Design, DesignSpace, Limits, Tolerances, Variable, shots
-from thincam_jax.design.space import UNITS
+from thincam_jax.design.space import QUANTITIES
 from thincam_jax.imaging.targets import sample_images
 from thincam_jax.units import parse_quantity
 
 ObjectiveName = Literal["bayes_error", "robust_error", "worst_ratio", "limit", "unevenness"]
 Part = Annotated[float, Field(ge=0, le=1)]
 Free = Literal["beta", "distance", "wavelength", "width", "exposure"]
-# What has a unit in a file; a share of the exposure has none.
-_KINDS = {"beta": "curvature", "distance": "length", "wavelength": "length", "width": "length"}
 # A band has to hold some of the 64 rings that the objectives average over.
 _NARROWEST_BAND = 1 / 16
 
@@ -135,7 +133,7 @@ class FreeConfig(Section):
         if not isinstance(given, list | tuple) or len(given) != 2:
             raise ValueError(f"{given!r} is no pair; give [lowest, highest]")
         variable = info.data["variable"]
-        unit = UNITS[variable]
+        unit = QUANTITIES[variable].unit
         lower, upper = (_number(variable, text) for text in given)
         if not (math.isfinite(lower) and math.isfinite(upper) and lower > 0):
             raise ValueError(f"{lower:g} to {upper:g} {unit}; give bounds above zero")
@@ -147,9 +145,9 @@ class FreeConfig(Section):
 
     @pydantic.field_serializer("bounds")
     def _write(self, bounds: tuple[float, float]) -> list[str | float]:
-        if self.variable not in _KINDS:
+        if not QUANTITIES[self.variable].kind:
             return list(bounds)
-        return [f"{value!r} {UNITS[self.variable]}" for value in bounds]
+        return [f"{value!r} {QUANTITIES[self.variable].unit}" for value in bounds]
 
     @pydantic.model_validator(mode="after")
     def _belongs(self):
@@ -162,8 +160,8 @@ class FreeConfig(Section):
 
 def _number(variable: str, given: Any) -> float:
     """In the package's unit."""
-    if variable in _KINDS:
-        return parse_quantity(given, _KINDS[variable])
+    if QUANTITIES[variable].kind:  # a share of the exposure stands alone
+        return parse_quantity(given, QUANTITIES[variable].kind)
     if isinstance(given, bool) or not isinstance(given, int | float):
         raise ValueError(f"{given!r} is no number; give parts of the reference's, such as 0.5")
     return float(given)

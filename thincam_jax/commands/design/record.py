@@ -13,7 +13,7 @@ from thincam_jax.commands.design.words import QUANTITIES
 from thincam_jax.commands.sections import ShotConfig
 from thincam_jax.commands.study.study import Study
 from thincam_jax.design import non_dominated
-from thincam_jax.design.space import UNITS
+from thincam_jax.design.space import QUANTITIES as FREE
 
 # Of each front what its cost is called in words, and in design.json.
 COSTS = {
@@ -106,7 +106,7 @@ def _found(result: FoundDesigns, one: Candidate) -> dict[str, Any]:
                 "shots": list(value.shots),
                 "value": _round(value.value),
                 "tolerance": _round(value.tolerance),
-                "unit": UNITS[value.variable],
+                "unit": FREE[value.variable].unit,
             }
             for value in one.values
         ],

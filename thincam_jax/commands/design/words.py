@@ -4,27 +4,41 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from thincam_jax.design.space import QUANTITIES as FREE
+from thincam_jax.units import nm
+
 
 @dataclass(frozen=True)
 class Quantity:
     """A number of a shot.
 
-    - `label`: with its unit; `key`: in design.json's shots.
-    - `scale`: from the unit of the package; `form`: how it is written.
+    - `what`: its name; `unit`: in which it is written, as `scale`, from the package's; `form`: how.
     """
 
-    label: str
-    key: str
+    name: str
+    what: str
+    unit: str
     scale: float = 1.0
     form: str = ".2f"
 
+    @property
+    def label(self) -> str:
+        """With its unit."""
+        return f"{self.what}, {self.unit}" if self.unit else self.what
+
+    @property
+    def key(self) -> str:
+        """In design.json's shots."""
+        unit = self.unit.replace("/", "_per_").replace("²", "2")
+        return f"{self.name}_{unit}" if unit else self.name
+
 
 QUANTITIES = {
-    "beta": Quantity("β, rad/mm²", "beta_rad_per_mm2"),
-    "distance": Quantity("distance, mm", "distance_mm"),
-    "wavelength": Quantity("wavelength, nm", "wavelength_nm", 1e6, ".0f"),
-    "width": Quantity("mask width, mm", "width_mm"),
-    "exposure": Quantity("exposure", "exposure"),
+    "beta": Quantity("beta", "β", FREE["beta"].symbol),
+    "distance": Quantity("distance", "distance", FREE["distance"].symbol),
+    "wavelength": Quantity("wavelength", "wavelength", "nm", 1 / nm, ".0f"),
+    "width": Quantity("width", "mask width", FREE["width"].symbol),
+    "exposure": Quantity("exposure", "exposure", FREE["exposure"].symbol),
 }
 _ALWAYS = ("beta", "distance")
 

@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from thincam_jax import waveguide as wg
+from thincam_jax._core.quantity import quantities
 from thincam_jax.commands.checked_config import dump_config
 from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.plate.config import FoundConfig, PlateDesignConfig
@@ -23,13 +24,14 @@ from thincam_jax.imaging.sensor import Sensor
 from thincam_jax.units import deg, nm, um
 
 # Of each number of a plate: its unit, and how it is told.
+_QUANTITIES = quantities(plates.Plate)
 NUMBERS = {
-    "glass_thickness": (1.0, "glass, mm"),
+    "glass_thickness": (1.0, _QUANTITIES["glass_thickness"].label("glass")),
     "reference_angle": (deg, "recording angle, degrees"),
     "film_thickness": (um, "film, µm"),
     "index_modulation": (1.0, "index modulation"),
-    "lens_distance": (1.0, "lens to plate, mm"),
-    "focal_distance": (1.0, "sensor to lens, mm"),
+    "lens_distance": (1.0, _QUANTITIES["lens_distance"].label("lens to plate")),
+    "focal_distance": (1.0, _QUANTITIES["focal_distance"].label("sensor to lens")),
 }
 ORDERS, BAND_SAMPLES = 4, 6
 

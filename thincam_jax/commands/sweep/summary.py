@@ -10,16 +10,21 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from thincam_jax._core.files import write_whole
+from thincam_jax._core.quantity import quantities
 from thincam_jax.commands.study.figures import as_png, line_style
 from thincam_jax.commands.sweep.point import told
+from thincam_jax.imaging.scene import ImagePlane
+from thincam_jax.imaging.sensor import GaussianNoise, PoissonGaussianNoise, Sensor
+from thincam_jax.lensless.masks.fza import FresnelZoneAperture
+from thincam_jax.lensless.propagation.path import Path as LightPath
 
 _MEASURE = "mean_psnr_db/"  # of each method, over all targets
 _MAPS = 4  # of methods, at most
 # Of the swept values that are numbers, by the last key of their path.
-_UNITS = {
-    **dict.fromkeys(("distance", "width", "pitch", "wavelength", "pixel_pitch"), "mm"),
-    **{"beta": "rad/mm²", "phases": "rad", "snr_db": "dB", "read_noise": "electrons"},
-}
+_QUANTITIES = quantities(
+    *(FresnelZoneAperture, LightPath, Sensor, GaussianNoise, PoissonGaussianNoise, ImagePlane)
+)
+_QUANTITIES["phases"] = _QUANTITIES["phase"]
 
 
 def summarise(folder: Path, table: pa.Table, axes: Sequence[str]) -> tuple[str, ...]:
@@ -127,5 +132,5 @@ def _short(value: Any) -> str:
 
 
 def _label(path: str) -> str:
-    unit = _UNITS.get(path.rpartition(".")[2])
-    return f"{path} ({unit})" if unit else path
+    quantity = _QUANTITIES.get(path.rpartition(".")[2])
+    return f"{path} ({quantity.symbol})" if quantity and quantity.symbol else path

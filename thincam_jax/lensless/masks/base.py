@@ -15,6 +15,7 @@ from thincam_jax._core.checks import Number
 from thincam_jax._core.grids import Grid, cell_overlap, centred_indices
 from thincam_jax._core.module import Module
 from thincam_jax._core.precision import as_complex, phasor, product
+from thincam_jax._core.quantity import unchecked
 
 Transmittance = Complex[Array, "y x"] | Float[Array, "y x"]
 
@@ -198,8 +199,8 @@ class ZoneOrders(Module):
 
     orders: tuple[int, ...] = eqx.field(static=True)
     coefficients: Complex[Array, " order"]
-    beta: Float[Array, ""]
-    width: Float[Array, ""]
+    beta: Float[Array, ""] = eqx.field(converter=unchecked("rad/mm^2"))
+    width: Float[Array, ""] = eqx.field(converter=unchecked("mm"))
 
 
 def zone_orders(mask: AbstractMask) -> ZoneOrders | None:

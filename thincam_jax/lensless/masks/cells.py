@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Number
 from thincam_jax._core.precision import as_complex
+from thincam_jax._core.quantity import choice, quantity
 from thincam_jax.lensless.masks.base import AbstractFactoredMask, AxisFactors, MaskTerms
 
 Combination = Literal["product", "xor"]
@@ -86,15 +87,15 @@ class SeparableMask(AbstractCellMask):
     - `centre`: (y, x) of the mask's centre, mm.
     """
 
-    rows: Float[Array, " row"] = eqx.field(converter=checks.named(checks.transmittances, "rows"))
-    columns: Float[Array, " column"] = eqx.field(
-        converter=checks.named(checks.transmittances, "columns")
+    rows: Float[Array, " row"] = eqx.field(converter=quantity(check=checks.transmittances))
+    columns: Float[Array, " column"] = eqx.field(converter=quantity(check=checks.transmittances))
+    cell: Float[Array, ""] = eqx.field(converter=quantity("mm", positive=True))
+    centre: Float[Array, "2"] = eqx.field(
+        default=(0, 0), converter=quantity("mm", shape=(2,)), kw_only=True
     )
-    cell: Float[Array, ""] = eqx.field(converter=checks.length("cell"))
-    centre: Float[Array, "2"] = eqx.field(default=(0, 0), converter=checks.centre, kw_only=True)
     combine: Combination = eqx.field(
         default="product",
-        converter=checks.named(checks.choice, "combine", COMBINATIONS),
+        converter=choice(COMBINATIONS),
         static=True,
         kw_only=True,
     )

@@ -8,6 +8,7 @@ from jaxtyping import Array, Float
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Number
 from thincam_jax._core.grids import Grid, centred_indices
+from thincam_jax._core.quantity import unchecked
 from thincam_jax.lensless.masks.base import (
     AbstractFactoredMask,
     AbstractMask,
@@ -24,8 +25,8 @@ class DisplayedMask(AbstractFactoredMask):
     """A mask of few terms in the pixels of a display; made by `on_display`."""
 
     mask: AbstractFactoredMask
-    centre: Float[Array, "2"]
-    pixel_pitch: Float[Array, ""]
+    centre: Float[Array, "2"] = eqx.field(converter=unchecked("mm"))
+    pixel_pitch: Float[Array, ""] = eqx.field(converter=unchecked("mm"))
     fill_factor: Float[Array, ""]
     pixels: tuple[int, int] = eqx.field(static=True)
 

@@ -1,6 +1,6 @@
 r"""The Fresnel zone aperture (FZA), thesis Eq 3.1."""
 
-from typing import Any, Literal, get_args
+from typing import Annotated, Any, Literal, get_args
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -11,6 +11,7 @@ from thincam_jax._core import checks
 from thincam_jax._core.checks import Number, Numbers
 from thincam_jax._core.grids import Grid, centred_indices
 from thincam_jax._core.precision import as_complex, phasor
+from thincam_jax._core.quantity import choice, quantity
 from thincam_jax.lensless.masks.base import (
     AbstractFactoredMask,
     AxisFactors,
@@ -23,6 +24,15 @@ from thincam_jax.lensless.masks.base import (
 _HIGHEST_HARMONIC = 99
 Profile = Literal["cosine", "intensity", "binary"]
 PROFILES: tuple[Profile, ...] = get_args(Profile)
+
+
+PIXEL_PITCH = quantity("mm", positive=True, optional=True)
+
+
+def _odd(name: str, value: int) -> int:
+    if value % 2 == 0 or not 1 <= value <= _HIGHEST_HARMONIC:
+        raise ValueError(f"{name} = {value}: give an odd number from 1 to {_HIGHEST_HARMONIC}")
+    return value
 
 
 class FresnelZoneAperture(AbstractFactoredMask):
@@ -62,15 +72,17 @@ class FresnelZoneAperture(AbstractFactoredMask):
     **Errors**: ValueError or TypeError, one line, for what is out of range.
     """
 
-    beta: Float[Array, ""]
-    phase: Float[Array, ""]
-    width: Float[Array, ""]
-    height: Float[Array, ""] | None
-    centre: Float[Array, "2"]
-    fill_factor: Float[Array, ""]
-    profile: Profile = eqx.field(static=True)
+    beta: Float[Array, ""] = eqx.field(converter=quantity("rad/mm^2", positive=True))
+    phase: Float[Array, ""] = eqx.field(converter=quantity("rad"))
+    width: Float[Array, ""] = eqx.field(converter=quantity("mm", positive=True))
+    height: Float[Array, ""] | None = eqx.field(
+        converter=quantity("mm", positive=True, optional=True)
+    )
+    centre: Float[Array, "2"] = eqx.field(converter=quantity("mm", shape=(2,)))
+    fill_factor: Float[Array, ""] = eqx.field(converter=quantity(check=checks.fraction))
+    profile: Profile = eqx.field(converter=choice(PROFILES), static=True)
     pixels: tuple[int, int] | None = eqx.field(static=True)
-    harmonics: int = eqx.field(static=True)
+    harmonics: int = eqx.field(converter=quantity(check=_odd), static=True)
 
     def __init__(
         self,
@@ -81,22 +93,13 @@ class FresnelZoneAperture(AbstractFactoredMask):
         height: Number | None = None,
         profile: Profile = "cosine",
         centre: Numbers | tuple[Number, Number] = (0.0, 0.0),
-        pixel_pitch: Number | None = None,
+        pixel_pitch: Annotated[Number | None, PIXEL_PITCH] = None,
         fill_factor: Number = 1.0,
         harmonics: int = 9,
     ):
-        self.beta = checks.positive("beta", beta, "rad/mm^2")
-        self.phase = checks.finite("phase", phase, "rad")
-        self.width = checks.positive("width", width, "mm")
-        self.height = None if height is None else checks.positive("height", height, "mm")
-        self.centre = checks.finite("centre", centre, "mm", shape=(2,))
-        self.profile = checks.choice("profile", profile, PROFILES)  # pyright: ignore
-        self.fill_factor = checks.fraction("fill_factor", fill_factor)
-        if harmonics % 2 == 0 or not 1 <= harmonics <= _HIGHEST_HARMONIC:
-            raise ValueError(
-                f"harmonics = {harmonics}: give an odd number from 1 to {_HIGHEST_HARMONIC}"
-            )
-        self.harmonics = harmonics
+        given: Any = beta, phase, width, height, centre, fill_factor  # converted afterwards
+        self.beta, self.phase, self.width, self.height, self.centre, self.fill_factor = given
+        self.profile, self.harmonics = profile, harmonics
         self.pixels = None
         if pixel_pitch is not None:
             columns = checks.whole_cells("width", width, "pixel_pitch", pixel_pitch)

@@ -7,6 +7,7 @@ from jaxtyping import Array, Float
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Number
 from thincam_jax._core.precision import as_complex
+from thincam_jax._core.quantity import quantity
 from thincam_jax.lensless.masks.base import AbstractFactoredMask, AxisFactors, MaskTerms
 from thincam_jax.lensless.masks.cells import cell_edges
 
@@ -27,12 +28,14 @@ class LensletArray(AbstractFactoredMask):
     - `centre`: (y, x) of the array's centre, mm.
     """
 
-    focal_length: Float[Array, ""] = eqx.field(converter=checks.length("focal_length"))
-    pitch: Float[Array, ""] = eqx.field(converter=checks.length("pitch"))
+    focal_length: Float[Array, ""] = eqx.field(converter=quantity("mm", positive=True))
+    pitch: Float[Array, ""] = eqx.field(converter=quantity("mm", positive=True))
     shape: tuple[int, int] = eqx.field(
-        default=(1, 1), converter=checks.named(checks.shape2d, "shape"), static=True
+        default=(1, 1), converter=quantity(check=checks.shape2d), static=True
     )
-    centre: Float[Array, "2"] = eqx.field(default=(0, 0), converter=checks.centre, kw_only=True)
+    centre: Float[Array, "2"] = eqx.field(
+        default=(0, 0), converter=quantity("mm", shape=(2,)), kw_only=True
+    )
 
     @property
     def extent(self) -> tuple[Float[Array, ""], Float[Array, ""]]:

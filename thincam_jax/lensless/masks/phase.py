@@ -1,5 +1,6 @@
 r"""Phase masks: a relief of a transparent material that delays the light."""
 
+import functools
 from typing import Any, Literal, get_args
 
 import equinox as eqx
@@ -10,7 +11,9 @@ from jaxtyping import Array, Complex, Float
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Number
 from thincam_jax._core.grids import Grid, cell_overlap
+from thincam_jax._core.module import Module
 from thincam_jax._core.precision import as_complex, turn_phasor
+from thincam_jax._core.quantity import choice, quantity
 from thincam_jax.imaging.refractive_index import AbstractIndex, as_index
 from thincam_jax.lensless.masks.base import AbstractMask
 from thincam_jax.lensless.masks.sampled import SampledMask
@@ -44,10 +47,8 @@ def _map(name: str, values: Any, lowest: float, highest: float, unit: str) -> Fl
     return array
 
 
-_heights = checks.named(_map, "height", 0.0, HIGHEST, "mm, such as 1.2 * um")
-_amplitudes = checks.named(_map, "amplitude", 0.0, 1.0, "parts of one")
-_material = checks.named(as_index, "material")
-_interpolation = checks.named(checks.choice, "interpolation", get_args(Interpolation))
+_HEIGHT = functools.partial(_map, lowest=0.0, highest=HIGHEST, unit="mm, such as 1.2 * um")
+_AMPLITUDE = functools.partial(_map, lowest=0.0, highest=1.0, unit="parts of one")
 
 
 class PhaseMask(AbstractMask):
@@ -79,20 +80,22 @@ class PhaseMask(AbstractMask):
     **Errors**: ValueError or TypeError, one line, for what is out of range.
     """
 
-    height: Float[Array, "y x"] = eqx.field(converter=_heights)
-    pitch: Float[Array, ""] = eqx.field(converter=checks.length("pitch"))
-    material: AbstractIndex = eqx.field(converter=_material)
+    height: Float[Array, "y x"] = eqx.field(converter=quantity("mm", check=_HEIGHT))
+    pitch: Float[Array, ""] = eqx.field(converter=quantity("mm", positive=True))
+    material: AbstractIndex = eqx.field(converter=quantity(check=as_index))
     amplitude: Float[Array, "y x"] | None = eqx.field(
-        default=None, converter=checks.optional(_amplitudes), kw_only=True
+        default=None, converter=quantity(check=_AMPLITUDE, optional=True), kw_only=True
     )
-    centre: Float[Array, "2"] = eqx.field(default=(0, 0), converter=checks.centre, kw_only=True)
+    centre: Float[Array, "2"] = eqx.field(
+        default=(0, 0), converter=quantity("mm", shape=(2,)), kw_only=True
+    )
     fill_factor: Float[Array, ""] | None = eqx.field(
         default=None,
-        converter=checks.optional(checks.named(checks.fraction, "fill_factor")),
+        converter=quantity(check=checks.fraction, optional=True),
         kw_only=True,
     )
     interpolation: Interpolation = eqx.field(
-        default="cells", converter=_interpolation, static=True, kw_only=True
+        default="cells", converter=choice(get_args(Interpolation)), static=True, kw_only=True
     )
 
     def __check_init__(self):
@@ -161,16 +164,16 @@ class PhaseMask(AbstractMask):
         return _between(_between(values, y / self.pitch).T, x / self.pitch).T
 
 
-class MaskBlank(eqx.Module):
+class MaskBlank(Module):
     """What a relief is made in: its cells and its material.
 
     - `shape`: (rows, columns) of cells. `pitch`: of the cells, mm.
     - `material`: refractive index, a number or one of `thincam_jax.imaging.refractive_index`.
     """
 
-    shape: tuple[int, int] = eqx.field(converter=checks.named(checks.shape2d, "shape"), static=True)
-    pitch: Float[Array, ""] = eqx.field(converter=checks.length("pitch"))
-    material: AbstractIndex = eqx.field(converter=_material)
+    shape: tuple[int, int] = eqx.field(converter=quantity(check=checks.shape2d), static=True)
+    pitch: Float[Array, ""] = eqx.field(converter=quantity("mm", positive=True))
+    material: AbstractIndex = eqx.field(converter=quantity(check=as_index))
 
     @property
     def grid(self) -> Grid:

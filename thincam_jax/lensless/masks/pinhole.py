@@ -9,6 +9,7 @@ from thincam_jax._core import checks
 from thincam_jax._core.checks import Number
 from thincam_jax._core.grids import Grid
 from thincam_jax._core.precision import as_complex
+from thincam_jax._core.quantity import quantity
 from thincam_jax.lensless.masks.base import (
     AbstractFactoredMask,
     AbstractMask,
@@ -27,11 +28,13 @@ class Pinhole(AbstractFactoredMask):
     - `centre`: (y, x) of the opening's centre, mm.
     """
 
-    width: Float[Array, ""] = eqx.field(converter=checks.length("width"))
+    width: Float[Array, ""] = eqx.field(converter=quantity("mm", positive=True))
     height: Float[Array, ""] | None = eqx.field(
-        default=None, converter=checks.optional(checks.length("height"))
+        default=None, converter=quantity("mm", positive=True, optional=True)
     )
-    centre: Float[Array, "2"] = eqx.field(default=(0, 0), converter=checks.centre, kw_only=True)
+    centre: Float[Array, "2"] = eqx.field(
+        default=(0, 0), converter=quantity("mm", shape=(2,)), kw_only=True
+    )
 
     @property
     def extent(self) -> tuple[Float[Array, ""], Float[Array, ""]]:
@@ -56,9 +59,11 @@ class RadialMask(AbstractMask):
     - `centre`: (y, x) of the mask's centre, mm.
     """
 
-    rings: Float[Array, " ring"] = eqx.field(converter=checks.named(checks.transmittances, "rings"))
-    ring: Float[Array, ""] = eqx.field(converter=checks.length("ring"))
-    centre: Float[Array, "2"] = eqx.field(default=(0, 0), converter=checks.centre, kw_only=True)
+    rings: Float[Array, " ring"] = eqx.field(converter=quantity(check=checks.transmittances))
+    ring: Float[Array, ""] = eqx.field(converter=quantity("mm", positive=True))
+    centre: Float[Array, "2"] = eqx.field(
+        default=(0, 0), converter=quantity("mm", shape=(2,)), kw_only=True
+    )
 
     @property
     def extent(self) -> tuple[Float[Array, ""], Float[Array, ""]]:

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
+from thincam_jax._core.quantity import quantity
 from thincam_jax.lensless.masks.cells import AbstractCellMask, Patterns
 
 _LARGEST = 4096
@@ -107,8 +108,10 @@ class ModifiedUniformlyRedundantArray(AbstractRedundantArray):
 
     order: int = eqx.field(converter=_prime_order, static=True)
     tiles: tuple[int, int] = eqx.field(default=1, converter=_tiles, static=True, kw_only=True)
-    cell: Float[Array, ""] = eqx.field(converter=checks.length("cell"))
-    centre: Float[Array, "2"] = eqx.field(default=(0, 0), converter=checks.centre, kw_only=True)
+    cell: Float[Array, ""] = eqx.field(converter=quantity("mm", positive=True))
+    centre: Float[Array, "2"] = eqx.field(
+        default=(0, 0), converter=quantity("mm", shape=(2,)), kw_only=True
+    )
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -132,8 +135,10 @@ class UniformlyRedundantArray(AbstractRedundantArray):
 
     orders: tuple[int, int] = eqx.field(converter=_twin_primes, static=True)
     tiles: tuple[int, int] = eqx.field(default=1, converter=_tiles, static=True, kw_only=True)
-    cell: Float[Array, ""] = eqx.field(converter=checks.length("cell"))
-    centre: Float[Array, "2"] = eqx.field(default=(0, 0), converter=checks.centre, kw_only=True)
+    cell: Float[Array, ""] = eqx.field(converter=quantity("mm", positive=True))
+    centre: Float[Array, "2"] = eqx.field(
+        default=(0, 0), converter=quantity("mm", shape=(2,)), kw_only=True
+    )
 
     @property
     def shape(self) -> tuple[int, int]:

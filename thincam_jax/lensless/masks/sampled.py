@@ -13,6 +13,7 @@ from thincam_jax._core import checks
 from thincam_jax._core.checks import Number
 from thincam_jax._core.grids import Grid, cell_overlap, centred_indices
 from thincam_jax._core.precision import as_complex, product
+from thincam_jax._core.quantity import quantity
 from thincam_jax.lensless.masks.base import (
     AbstractFactoredMask,
     AxisFactors,
@@ -47,11 +48,13 @@ class SampledMask(AbstractFactoredMask):
     """
 
     amplitude: Transmittance = eqx.field(converter=_amplitudes)
-    pitch: Float[Array, ""] = eqx.field(converter=checks.length("pitch"))
-    centre: Float[Array, "2"] = eqx.field(default=(0, 0), converter=checks.centre, kw_only=True)
+    pitch: Float[Array, ""] = eqx.field(converter=quantity("mm", positive=True))
+    centre: Float[Array, "2"] = eqx.field(
+        default=(0, 0), converter=quantity("mm", shape=(2,)), kw_only=True
+    )
     fill_factor: Float[Array, ""] | None = eqx.field(
         default=None,
-        converter=checks.optional(checks.named(checks.fraction, "fill_factor")),
+        converter=quantity(check=checks.fraction, optional=True),
         kw_only=True,
     )
 

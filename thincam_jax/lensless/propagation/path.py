@@ -1,13 +1,19 @@
 """The light's path: point source, mask, sensor."""
 
+import functools
+
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
+from thincam_jax._core.module import Module
+from thincam_jax._core.quantity import quantity
+
+_positive_or_infinite = functools.partial(checks.positive, unit="mm", allow_infinity=True)
 
 
-class Path(eqx.Module):
+class Path(Module):
     """A point source on the axis at distance t before the mask, a sensor at d behind it.
 
     In the Fresnel approximation a spherical wave from t over d acts like a plane wave over d/M,
@@ -18,13 +24,11 @@ class Path(eqx.Module):
     - `object_distance`: t, mm, > 0; infinity is a plane wave.
     """
 
-    wavelength: Float[Array, ""] = eqx.field(
-        converter=checks.named(checks.wavelength, "wavelength")
-    )
-    distance: Float[Array, ""] = eqx.field(converter=checks.length("distance"))
+    wavelength: Float[Array, ""] = eqx.field(converter=quantity("mm", check=checks.wavelength))
+    distance: Float[Array, ""] = eqx.field(converter=quantity("mm", positive=True))
     object_distance: Float[Array, ""] = eqx.field(
         default=jnp.inf,
-        converter=checks.named(checks.positive, "object_distance", "mm", allow_infinity=True),
+        converter=quantity("mm", check=_positive_or_infinite),
     )
 
     @property

@@ -13,8 +13,10 @@ from thincam_jax._core import checks
 from thincam_jax._core.checks import Number, Numbers
 from thincam_jax._core.module import Module
 from thincam_jax._core.precision import Precision, allow, cast, precision_of
+from thincam_jax._core.quantity import quantities, unchecked
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.masks.fza import FresnelZoneAperture
+from thincam_jax.lensless.propagation.path import Path
 from thincam_jax.measured.calibration.coarse import (
     covariance_by_differences,
     full_image,
@@ -53,6 +55,11 @@ _POSITIVE = ("beta", "width", "distance", "object_distance", "wavelength")
 _KNOWN, _KNOWN_BY_PARTS, _DISAGREE = 0.03, 0.005, 1.5
 
 
+# Of what can be fitted; of a centre, (y, x) are two numbers.
+_QUANTITIES = quantities(FresnelZoneAperture, LenslessCamera, Path)
+_QUANTITIES |= dict.fromkeys(("centre_x", "centre_y"), _QUANTITIES["centre"])
+
+
 class PsfFit(Module):
     """What `fit_psf` found.
 
@@ -77,12 +84,12 @@ class PsfFit(Module):
     """
 
     camera: LenslessCamera
-    object_distance: Float[Array, ""]
-    wavelength: Float[Array, ""]
+    object_distance: Float[Array, ""] = eqx.field(converter=unchecked("mm"))
+    wavelength: Float[Array, ""] = eqx.field(converter=unchecked("mm"))
     background: Float[Array, ""]
     gain: Float[Array, ""]
-    values: dict[str, Float[Array, ""]]
-    standard_errors: dict[str, Float[Array, ""]]
+    values: dict[str, Float[Array, ""]] = eqx.field(converter=unchecked(parts=_QUANTITIES))
+    standard_errors: dict[str, Float[Array, ""]] = eqx.field(converter=unchecked(parts=_QUANTITIES))
     correlation: Float[Array, "unknown unknown"]
     residual: Inexact[Array, "y x"]
     names: tuple[str, ...] = eqx.field(static=True)

@@ -19,6 +19,7 @@ from thincam_jax._core import checks
 from thincam_jax._core.checks import Numbers
 from thincam_jax._core.module import Module
 from thincam_jax._core.precision import allow, cast, precision_of
+from thincam_jax._core.quantity import unchecked
 from thincam_jax.imaging.operators import Matrix, Scaled
 from thincam_jax.imaging.refractive_index import changed
 from thincam_jax.measured.calibration.problem import Status, covariance, hardly_seen, verdict
@@ -35,21 +36,22 @@ from thincam_jax.waveguide.system import seen_size
 
 # What can be fitted, its unit, and a step that is small against what it does to an image.
 PARAMETERS = {
-    "glass_thickness": ("mm", 0.01),
-    "lens_distance": ("mm", 0.1),
-    "focal_distance": ("mm", 0.001),
-    "index": ("", 1e-3),
-    "slant": ("rad", 1e-3),
-    "tilt": ("rad", 1e-3),
-    "plate_x": ("rad", 1e-3),
-    "plate_y": ("rad", 1e-3),
-    "shrinkage": ("", 1e-3),
-    "film_thickness": ("mm", 1e-4),
-    "index_modulation": ("", 1e-4),
-    "object_distance": ("mm", 1.0),
-    "object_x": ("mm", 0.1),
-    "object_y": ("mm", 0.1),
+    "glass_thickness": (unchecked("mm"), 0.01),
+    "lens_distance": (unchecked("mm"), 0.1),
+    "focal_distance": (unchecked("mm"), 0.001),
+    "index": (unchecked(), 1e-3),
+    "slant": (unchecked("rad"), 1e-3),
+    "tilt": (unchecked("rad"), 1e-3),
+    "plate_x": (unchecked("rad"), 1e-3),
+    "plate_y": (unchecked("rad"), 1e-3),
+    "shrinkage": (unchecked(), 1e-3),
+    "film_thickness": (unchecked("mm"), 1e-4),
+    "index_modulation": (unchecked(), 1e-4),
+    "object_distance": (unchecked("mm"), 1.0),
+    "object_x": (unchecked("mm"), 0.1),
+    "object_y": (unchecked("mm"), 0.1),
 }
+_QUANTITIES = {name: unit for name, (unit, _) in PARAMETERS.items()}
 DEFAULT = ("glass_thickness", "lens_distance", "slant", "tilt", "object_x", "object_y")
 
 _PIXELS = 400  # of the sensor whose rows of the matrix are fitted
@@ -102,8 +104,8 @@ class ScreenFit(Module):
     camera: SeeThroughCamera
     plane: ObjectPlane
     gain: Float[Array, ""]
-    values: dict[str, Float[Array, ""]]
-    standard_errors: dict[str, Float[Array, ""]]
+    values: dict[str, Float[Array, ""]] = eqx.field(converter=unchecked(parts=_QUANTITIES))
+    standard_errors: dict[str, Float[Array, ""]] = eqx.field(converter=unchecked(parts=_QUANTITIES))
     correlation: Float[Array, "unknown unknown"]
     explained: Float[Array, ""]
     status: Status = eqx.field(static=True)

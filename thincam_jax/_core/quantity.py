@@ -1,0 +1,144 @@
+"""What a number is, stated once at its field: unit, range, choices.
+
+    beta: Float[Array, ""] = eqx.field(converter=quantity("rad/mm^2", positive=True))
+
+The quantity checks what is given; printers, readers of files, options, labels of axes and tables
+ask it for the unit. A parameter without a field has it in its annotation,
+`Annotated[Number, quantity("mm", positive=True)]`.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from thincam_jax._core import checks
+from thincam_jax.units import KINDS
+
+# A number in one of the first stands with its unit in a file, in one of the others alone. Further
+# texts, such as "parts of one", are words for messages.
+_WRITTEN = {kind.unit: name for name, kind in reversed(KINDS.items())}
+UNITS = (*_WRITTEN, "rad/mm", "cycles/rad", "electrons", "electrons/mm^2", "dB")
+_IN_WORDS = {"electrons/mm^2": "electrons from each mm²"}
+# Lengths are printed in the largest of these that they reach: in mm, name, smallest value.
+_LENGTHS = ((1.0, "mm", 0.1), (1e-3, "µm", 1e-3), (1e-6, "nm", 0.0))
+
+
+class FieldError(ValueError):
+    """A fault between fields: `field` is the one to change."""
+
+    def __init__(self, message: str, field: str):
+        super().__init__(message)
+        self.field = field
+
+
+@dataclass(eq=False)
+class Quantity:
+    """One number or choice, made by `quantity` or `choice`; called, it is the field's converter.
+
+    - `unit`: one of `UNITS`, or words for messages.
+    - `check`: of a name and a value: the value to keep, or ValueError or TypeError in one line.
+    - `positive`, `optional`: above 0; may be None.
+    - `choices`: all that are allowed; empty for numbers.
+    - `parts`: of a dictionary, by its keys.
+    - `name`: of the field; a `Module` tells it.
+    """
+
+    unit: str
+    check: Callable[[str, Any], Any] | None
+    positive: bool = False
+    optional: bool = False
+    choices: tuple[str, ...] = ()
+    parts: Mapping[str, "Quantity"] = dataclasses.field(default_factory=dict)
+    name: str = "value"
+
+    def __call__(self, value: Any) -> Any:
+        if self.check is None or (value is None and self.optional):
+            return value
+        return self.check(self.name, value)
+
+    @property
+    def kind(self) -> str:
+        """Of `units.parse_quantity`; empty for what stands without a unit in a file."""
+        return "wavelength" if self.check is checks.wavelength else _WRITTEN.get(self.unit, "")
+
+    @property
+    def symbol(self) -> str:
+        """The unit as it is printed, "rad/mm²"; empty for none."""
+        return self.unit.replace("^2", "²") if self.unit in UNITS else ""
+
+    def label(self, name: str) -> str:
+        """A name with the unit, for tables: "distance, mm"."""
+        return f"{name}, {self.symbol}" if self.symbol else name
+
+    def text(self, value: Any) -> str:
+        """One number or a list with its unit, lengths also in µm and nm; "?" while it is traced."""
+        unit, numbers = self.symbol, ["?"] * np.size(value)
+        if not checks.is_traced(value):
+            known = np.atleast_1d(np.asarray(value))
+            largest = np.abs(known).max(initial=0.0)
+            if unit == "mm" and largest > 0:
+                scale, unit = next((s, u) for s, u, least in _LENGTHS if largest >= least)
+                known = known / scale
+            numbers = [f"{number:.5g}" for number in known]
+        text = numbers[0] if np.ndim(value) == 0 else f"({', '.join(numbers)})"
+        return f"{text} {unit}".rstrip()
+
+
+def quantity(
+    unit: str = "",
+    *,
+    positive: bool = False,
+    non_negative: bool = False,
+    shape: tuple[int, ...] = (),
+    optional: bool = False,
+    check: Callable[..., Any] | None = None,
+) -> Quantity:
+    """A finite number, or an array of a shape, in a unit.
+
+    - `unit`: one of `UNITS`; other texts are for messages only.
+    - `check`: in place of the ranges: called with the name and the value.
+    """
+    words = _IN_WORDS.get(unit, unit)
+    if check is None and positive:
+        check = functools.partial(checks.positive, unit=words)
+    elif check is None and non_negative:
+        check = functools.partial(checks.non_negative, unit=words)
+    elif check is None:
+        check = functools.partial(checks.finite, unit=words, shape=shape)
+    return Quantity(unit, check, positive, optional)
+
+
+def whole(least: int, most: int | None = None, *, optional: bool = False) -> Quantity:
+    """A whole number within limits."""
+    return Quantity("", functools.partial(checks.whole, least=least, most=most), optional=optional)
+
+
+def choice(options: Iterable[str], *, optional: bool = False) -> Quantity:
+    """One of several words."""
+    options = tuple(options)
+    check = functools.partial(checks.choice, options=options)
+    return Quantity("", check, optional=optional, choices=options)
+
+
+def unchecked(unit: str = "", parts: Mapping[str, Quantity] | None = None) -> Quantity:
+    """The unit of what a computation made, or the parts of a dictionary."""
+    return Quantity(unit, None, parts=parts or {})
+
+
+def quantities(*owners: Any) -> dict[str, Quantity]:
+    """The quantities of the fields of classes and of the parameters of functions, by name."""
+    found: dict[str, Quantity] = {}
+    for owner in owners:
+        if dataclasses.is_dataclass(owner):
+            given = {f.name: f.metadata.get("converter") for f in dataclasses.fields(owner)}
+            found |= {name: one for name, one in given.items() if isinstance(one, Quantity)}
+        function = owner.__init__ if isinstance(owner, type) else owner
+        for name, annotation in getattr(function, "__annotations__", {}).items():
+            for one in getattr(annotation, "__metadata__", ()):
+                if isinstance(one, Quantity):
+                    found[name] = dataclasses.replace(one, name=name)
+    return found
