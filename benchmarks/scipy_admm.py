@@ -1,6 +1,6 @@
 """ADMM-TV with the crop of the sensor in NumPy and scipy.fft, as carefully as we know how.
 
-The same problem and the same iteration as `thincam_jax.reconstruction.fourier_splitting`, in single
+The same problem and the same iteration as `thincam_jax.reconstruction.splittings`, in single
 precision: what can be computed once is, arrays are reused, transforms are real and run on all
 cores.
 """

@@ -22,10 +22,10 @@ sys.path.insert(0, str(Path(__file__).parent))
 from scipy_admm import ScipyAdmm
 
 from thincam_jax.reconstruction import Psfs, Recording
-from thincam_jax.reconstruction.admm import RELAXATION, AdmmMethod
-from thincam_jax.reconstruction.apart import Apart
-from thincam_jax.reconstruction.drive import CHUNK, _advance_donated
-from thincam_jax.reconstruction.regularised import admm_method
+from thincam_jax.reconstruction.admm import RELAXATION
+from thincam_jax.reconstruction.iterate import CHUNK, _advance_donated
+from thincam_jax.reconstruction.parallel import ParallelMethod, in_parallel
+from thincam_jax.reconstruction.splittings import admm_method
 
 DATA = Path(__file__).parents[2] / "shared" / "data" / "diffusercam-hand"
 
@@ -150,7 +150,7 @@ def transforms_time(problem, rounds):
 def test_admm(benchmark, capsys, case):
     captures, psfs, count = case()
     problem = posed(captures, psfs)
-    method, whole = admm_method(problem), AdmmMethod(problem)
+    method, whole = in_parallel(problem, admm_method), admm_method(problem)
     rounds = 5
     own = [float(p) for p in jax.tree.leaves(whole.arguments.penalties)]
     lines = []
@@ -185,7 +185,7 @@ def test_admm(benchmark, capsys, case):
         f"({transforms * 1e3:.1f} ms)"
     )
     lines.append(memory_line(whole))
-    if isinstance(method, Apart):
+    if isinstance(method, ParallelMethod):
         lines.append(apart_line(whole, problem, one))
     if case is hand:
         lines.append(batch_line(captures, psfs, one))

@@ -23,7 +23,7 @@ from thincam_jax.commands.learned.build import build_camera
 from thincam_jax.commands.learned.config import LearnedConfig
 from thincam_jax.imaging.targets import siemens_star
 from thincam_jax.learn.refocusing.dead_leaves import dead_leaves
-from thincam_jax.reconstruction.depth import axial_resolution
+from thincam_jax.reconstruction.depth.refocus import axial_resolution
 from thincam_jax.units import nm, um
 
 THESIS = (160.0, 200.0)  # mm

@@ -108,10 +108,10 @@ cameras = [
     for pattern in taken.patterns
 ]
 field = round(130 * 6.5 / 250 / float(sensor.pitch))
-seen_by = tc.Cameras(
+imaging_model = tc.Cameras(
     cameras, wavelength=config.optics.wavelength, object_distance=250.0, field_shape=(field, field)
 )
-recording = tc.Recording(frames, seen_by, noise_variance=estimate_noise(frames) ** 2)
+recording = tc.Recording(frames, imaging_model, noise_variance=estimate_noise(frames) ** 2)
 result = tc.reconstruct(recording, tc.Wiener(synthesis=phase_pairs(2)))
 image = np.squeeze(np.asarray(result.image))
 

@@ -113,7 +113,7 @@ for name, mask in masks.items():
         camera = tc.LenslessCamera(mask, strong, distance)
         noise = tc.PoissonGaussianNoise(3.0)
         capture = tc.capture(camera, scene, noise=noise, key=keys[2], model=model_of(mask))
-        seen_by = tc.Cameras(
+        imaging_model = tc.Cameras(
             [camera],
             wavelength=green,
             object_distance=away,
@@ -121,7 +121,7 @@ for name, mask in masks.items():
             model=model_of(mask),
         )
         variance = noise.variance(capture, strong.electrons.reshape(1, 1))
-        recording = tc.Recording(capture[None], seen_by, noise_variance=variance)
+        recording = tc.Recording(capture[None], imaging_model, noise_variance=variance)
         result = tc.reconstruct(recording, tc.AdmmTV(tau=1.0, iterations=iterations))
         images[name, electrons] = np.asarray(result.image)
         scores[name].append(psnr(images[name, electrons], truth))

@@ -57,7 +57,7 @@ jaxtyping.install_import_hook("thincam_jax", "beartype.beartype")
 def pytest_collection_finish():
     """Settings of what tests import: not of the process that only gives them to the workers."""
     # The small images of tests take longer to compile for than to reconstruct.
-    import_module("thincam_jax.reconstruction.drive").UNROLLED = 2
+    import_module("thincam_jax.reconstruction.iterate").UNROLLED = 2
     # Tracing makes many short-lived objects: by default a tenth of the time is garbage collection.
     # What was imported stays, and need not be looked at again.
     gc.collect()

@@ -13,7 +13,7 @@ SAMPLE = (
     "tests/lensless/propagation/test_closed_form.py::test_is_the_thesis_formula[6.5-inf]",
     "tests/imaging/operators/test_crop_convolution.py"
     "::test_it_is_the_integral_over_the_field[sensor1-field1]",
-    "tests/reconstruction/test_fourier_splitting.py::test_single_precision_and_gradients[1]",
+    "tests/reconstruction/test_splittings.py::test_single_precision_and_gradients[1]",
 )
 
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import PIL.Image
 import pytest
-from commands.photo import simulated
+from commands.reconstruct import simulated
 
 import thincam_jax as tc
 from helpers import ROOT

@@ -46,13 +46,13 @@ def test_names_wait_for_no_library_and_reconstructions_for_no_learned_part():
     """SciPy itself is there, of its parts only those that JAX's sparse matrices import."""
     modules, of_command = imported_in_turn(
         "import thincam_jax as tc; tc.psf, tc.capture, tc.plan, tc.select_model, tc.reconstruct",
-        "import thincam_jax.commands.photo.console",
+        "import thincam_jax.commands.reconstruct.console",
     )
     assert "jax" in modules
     assert modules.isdisjoint(("matplotlib", "skimage", "jaxopt", "pydantic"))
     parts = ("fft", "ndimage", "optimize", "signal", "stats")
     assert modules.isdisjoint(f"scipy.{part}" for part in parts)
-    assert "thincam_jax.commands.photo.run" in of_command
+    assert "thincam_jax.commands.reconstruct.run" in of_command
     assert of_command.isdisjoint(("thincam_jax.learn", "thincam_jax.design"))
 
 
@@ -80,7 +80,7 @@ def as_command(typed: str) -> str:
     return f"""
 import sys
 sys.argv = ["thincam", *{typed.split()}]
-from thincam_jax.commands.cli import main
+from thincam_jax.commands.start import main
 try:
     main()
 except SystemExit as end:

@@ -441,7 +441,7 @@ def test_completion_of_the_shell_that_asks(option, tmp_path):
     bash = shutil.which("bash")
     if bash is None:
         pytest.skip("needs bash")
-    command = f"{shlex.quote(sys.executable)} -m thincam_jax.commands.cli {option}; exit $?"
+    command = f"{shlex.quote(sys.executable)} -m thincam_jax.commands.start {option}; exit $?"
     path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
     environment = {**os.environ, "PYTHONPATH": path, "HOME": str(tmp_path)}
     done = subprocess.run(
@@ -463,7 +463,7 @@ def test_as_a_process(file):
     command = [
         sys.executable,
         "-m",
-        "thincam_jax.commands.cli",
+        "thincam_jax.commands.start",
         "run",
         str(file),
         "--set",

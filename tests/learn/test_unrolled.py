@@ -12,9 +12,9 @@ from reconstruction import extremes, scenes
 from helpers import finite_difference
 from thincam_jax.learn import unrolled as module
 from thincam_jax.learn.unrolled import UnrolledAdmm, solve_unrolled, train, training_loss
-from thincam_jax.reconstruction.admm import splitting_of
+from thincam_jax.reconstruction.admm import admm_map
 from thincam_jax.reconstruction.problem import uniform_image
-from thincam_jax.reconstruction.splitting import admm_map
+from thincam_jax.reconstruction.splittings import splitting_of
 
 
 def pairs(count, seed):

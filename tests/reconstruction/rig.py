@@ -58,7 +58,7 @@ def captures(cameras, image, *, model="geometric", **where):
     return jnp.stack([tc.capture(c, view, model=model, pixel_integration=False) for c in cameras])
 
 
-def seen_by(cameras, **settings) -> tc.Cameras:
+def imaging_model(cameras, **settings) -> tc.Cameras:
     """Cameras in the light of `scene`, with the PSFs that `captures` is made with."""
     usual = {
         "wavelength": WAVELENGTH,

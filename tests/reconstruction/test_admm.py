@@ -15,10 +15,11 @@ from reconstruction import dense, rig, scenes
 import thincam_jax as tc
 from helpers import count_traces, quick, relative_l2, shared_data
 from thincam_jax.imaging.operators import CropConvolution, kernel_shape, window_shape
-from thincam_jax.reconstruction import drive
-from thincam_jax.reconstruction.admm import AdmmMethod, splitting_of
+from thincam_jax.reconstruction import iterate as module
+from thincam_jax.reconstruction.admm import AdmmMethod, Penalties, admm_map, consensus
+from thincam_jax.reconstruction.iterate import Schedule, iterate
 from thincam_jax.reconstruction.problem import InverseProblem, objective
-from thincam_jax.reconstruction.splitting import Penalties, admm_map, consensus
+from thincam_jax.reconstruction.splittings import admm_method, splitting_of
 from thincam_jax.reconstruction.total_variation import TotalVariation
 
 FIELD = (6, 11)
@@ -113,7 +114,7 @@ def relaxed(splitting, relaxation, state):
 
 
 @jax.jit
-def iterate(splitting, relaxation, state, count):
+def stepped(splitting, relaxation, state, count):
     return jax.lax.fori_loop(0, count, lambda _, s: relaxed(splitting, relaxation, s), state)
 
 
@@ -128,7 +129,7 @@ def solved(problem, *, relaxation=1.8, factors=(0.1, 0.1, 0.1), iterations=1500,
     splitting = weighed(problem, factors)
     image = jnp.zeros(problem.image_shape, problem.tau.dtype) if image is None else image
     relaxation = jnp.asarray(relaxation, problem.tau.dtype)
-    return splitting.image(iterate(splitting, relaxation, splitting.start(image), iterations))
+    return splitting.image(stepped(splitting, relaxation, splitting.start(image), iterations))
 
 
 def reference(given: Case) -> np.ndarray:
@@ -194,7 +195,7 @@ def test_the_minimiser_is_a_fixed_point():
     given = case("two")
     splitting = weighed(given.problem, (0.1, 0.1, 0.1))
     begin = splitting.start(jnp.zeros(given.problem.image_shape))
-    state = iterate(splitting, jnp.asarray(1.8), begin, 2000)
+    state = stepped(splitting, jnp.asarray(1.8), begin, 2000)
     after = admm_map(state, splitting)
     for before, now in zip(jax.tree.leaves(state), jax.tree.leaves(after), strict=True):
         np.testing.assert_allclose(now, before, atol=1e-10)
@@ -259,10 +260,10 @@ def test_extremes_are_finite():
 
 
 def driven(problem, *, iterations=1500, tolerance=1e-9, image=None, **settings):
-    method = AdmmMethod(problem, relaxation=settings.pop("relaxation", 1.7))
+    method = admm_method(problem, relaxation=settings.pop("relaxation", 1.7))
     image = jnp.zeros(problem.image_shape, problem.tau.dtype) if image is None else image
     settings = {"adapt_until": iterations // 2} | settings
-    return drive.drive(method, image, iterations=iterations, tolerance=tolerance, **settings)
+    return iterate(method, image, Schedule(iterations, tolerance, **settings))
 
 
 @pytest.mark.thorough
@@ -286,7 +287,7 @@ def test_the_best_image_is_that_of_the_lowest_objective():
     problem, _ = scenes.problem()
     outcome = driven(problem, iterations=40, tolerance=0.0)
     assert outcome.status == "iterations_exhausted"
-    method = AdmmMethod(problem)
+    method = admm_method(problem)
     best = min(p.objective for p in outcome.history)
     assert float(method.objective(outcome.image)) == pytest.approx(best, rel=1e-12)
 
@@ -294,7 +295,7 @@ def test_the_best_image_is_that_of_the_lowest_objective():
 def test_residuals_are_what_their_names_say():
     """Primal: Kf − z against the larger of the two; dual: how far z moved, against the forces."""
     problem, _ = scenes.problem()
-    method = AdmmMethod(problem, relaxation=1.3)
+    method = admm_method(problem, relaxation=1.3)
     splitting = method.arguments
     state = method.advance(method.start(jnp.full(problem.image_shape, 0.3)), 7)
     before = jax.tree.map(jnp.copy, state.value)
@@ -337,18 +338,19 @@ def test_balance_moves_penalties_the_right_way():
     lowest = energy(given, reference(given))
     for factor in (300.0, 1 / 300.0):
         bad = weighed(given.problem, (factor,) * 3).penalties
-        method = AdmmMethod(given.problem, penalties=bad, relaxation=1.5)
+        splitting = splitting_of(given.problem).with_penalties(bad)
+        method = AdmmMethod(given.problem, splitting, 1.5)
         first = jnp.zeros(given.problem.image_shape)
         errors = []
         for until in (0, 150):
-            run = drive.drive(method, first, iterations=300, tolerance=0.0, adapt_until=until)
+            run = iterate(method, first, Schedule(300, 0.0, adapt_until=until))
             errors.append(energy(given, run.image) / lowest - 1)
         assert errors[1] < 0.1 * errors[0]
 
 
 def test_balanced_penalties_keep_the_image():
     problem, _ = scenes.problem()
-    method = AdmmMethod(problem)
+    method = admm_method(problem)
     state = method.advance(method.start(jnp.full(problem.image_shape, 0.3)), 1)
     residuals = method.residuals(state)
     uneven = replace(residuals, parts=((4.0, 1.0), (1.0, 100.0), (1.0, 1.0)))
@@ -386,12 +388,12 @@ def test_no_light_converges_at_once_and_nan_has_a_status():
 def test_ten_iterations_in_one_program_are_five_times_two(monkeypatch):
     """Users run programs of ten, these tests of two, which compile sooner."""
     problem, _ = scenes.problem((9, 8), (6, 7), kernel=scenes.spots, captures=1)
-    method, images = AdmmMethod(problem), []
-    for size in (drive.UNROLLED, drive.CHUNK):
-        monkeypatch.setattr(drive, "UNROLLED", size)
+    method, images = admm_method(problem), []
+    for size in (module.UNROLLED, module.CHUNK):
+        monkeypatch.setattr(module, "UNROLLED", size)
         state = method.start(jnp.zeros(problem.image_shape))
-        images.append(method.image(method.advance(state, drive.CHUNK)))
-    assert drive._advance_donated._cached._cache_size() > 1
+        images.append(method.image(method.advance(state, module.CHUNK)))
+    assert module._advance_donated._cached._cache_size() > 1
     np.testing.assert_allclose(*images, rtol=1e-10)
 
 
@@ -404,13 +406,13 @@ def test_single_precision_and_no_new_compilation():
     assert value.image.dtype == jnp.float32
     assert relative_l2(value.image, expected.image) < 1e-4
     assert all(np.isfinite(astuple(p)).all() for p in value.history[1:])
-    size = drive._advance_donated._cached._cache_size()
+    size = module._advance_donated._cached._cache_size()
     other = scenes.absolute(scenes.rescaled(problem, 3.0), 0.1)
     driven(other, iterations=30, tolerance=0.0, relaxation=1.1)
     penalties = weighed(problem, (0.3, 2.0, 1.5)).penalties
-    method = AdmmMethod(problem, penalties=penalties)
+    method = AdmmMethod(problem, splitting_of(problem).with_penalties(penalties))
     method.advance(method.start(expected.image), 20)
-    assert drive._advance_donated._cached._cache_size() == size
+    assert module._advance_donated._cached._cache_size() == size
     assert rig.correlation(expected.image, value.image) > 0.999
 
 
@@ -422,7 +424,7 @@ def test_a_warm_start_goes_on_where_the_image_was():
     again = driven(given.problem, image=done.image, iterations=10, tolerance=0.0)
     assert again.history[0].objective == pytest.approx(lowest, rel=1e-12)
     assert energy(given, again.image) <= lowest * (1 + 1e-12)
-    method = AdmmMethod(given.problem)
+    method = admm_method(given.problem)
     back = method.image(method.start(done.image))
     np.testing.assert_allclose(back, done.image, atol=1e-12)
 

@@ -34,7 +34,7 @@ from thincam_jax.imaging.operators import (
     Stacked,
     kernel_shape,
 )
-from thincam_jax.reconstruction.admm import Admm, splitting_of
+from thincam_jax.reconstruction.admm import Admm, admm_map
 from thincam_jax.reconstruction.normal_equations import (
     DenseNormal,
     IterativeNormal,
@@ -42,7 +42,7 @@ from thincam_jax.reconstruction.normal_equations import (
 )
 from thincam_jax.reconstruction.problem import total_objective, uniform_level
 from thincam_jax.reconstruction.ridge import image_precision
-from thincam_jax.reconstruction.splitting import admm_map
+from thincam_jax.reconstruction.splittings import splitting_of
 
 FIELD = (9, 12)
 TAU = 5.0
@@ -273,7 +273,7 @@ def test_new_values_compile_nothing(name):
     """
     given = case(name).recording
     captures, variances = [3 * c for c in given.captures], [2 * v for v in given.noise_variance]
-    other = tc.Recording(captures, given.seen_by, noise_variance=variances)
+    other = tc.Recording(captures, given.imaging_model, noise_variance=variances)
     tc.reconstruct(given, tc.AdmmTV(TAU, iterations=20))
     again = tc.AdmmTV(0.5 * TAU, iterations=20, tolerance=1e-5)
     assert compilations(lambda: tc.reconstruct(other, again)) == 0
@@ -281,13 +281,13 @@ def test_new_values_compile_nothing(name):
 
 def test_what_is_refused():
     operator = Matrix(np.ones((6, 4)), (2, 2), (6,))
-    for captures, seen_by, message in (
+    for captures, imaging_model, message in (
         (jnp.ones(5), operator, r"a capture has shape \(1, 5\); its operator takes"),
         ([jnp.ones(6)], [operator, operator], "for 2 cameras, PSFs or operators"),
         (jnp.ones(6), Matrix(np.ones((6, 4)), (4,), (6,)), "in_shape \\(y, x\\), \\(plane"),
     ):
         with pytest.raises(ValueError, match=message) as refused:
-            tc.Recording(captures, seen_by, noise_variance=1.0).problem()
+            tc.Recording(captures, imaging_model, noise_variance=1.0).problem()
         assert "\n" not in str(refused.value)
     with pytest.raises(ValueError, match="give noise_variance"):
         tc.reconstruct(tc.Recording(jnp.ones(6), operator), tc.AdmmTV())

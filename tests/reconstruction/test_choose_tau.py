@@ -7,13 +7,13 @@ import pytest
 
 import thincam_jax as tc
 from thincam_jax.reconstruction import InverseProblem
-from thincam_jax.reconstruction.admm import AdmmMethod
 from thincam_jax.reconstruction.choose_tau import (
     discrepancy_tau,
     sure_tau,
 )
-from thincam_jax.reconstruction.drive import drive
+from thincam_jax.reconstruction.iterate import Schedule, iterate
 from thincam_jax.reconstruction.problem import misfit, with_tau
+from thincam_jax.reconstruction.splittings import admm_method
 
 SENSOR, SIGMA = (30, 37), 0.02
 
@@ -53,9 +53,9 @@ def posed(seed=0, tau=2.0):
 
 
 def solved(problem, iterations=200):
-    method = AdmmMethod(problem, relaxation=1.5)
+    method = admm_method(problem, relaxation=1.5)
     first = jnp.zeros(problem.image_shape)
-    return drive(method, first, iterations=iterations, tolerance=1e-7).image
+    return iterate(method, first, Schedule(iterations, 1e-7)).image
 
 
 def test_discrepancy_makes_the_residual_as_large_as_the_noise():

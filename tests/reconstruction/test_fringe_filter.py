@@ -125,7 +125,7 @@ def test_not_traced_again_for_other_captures_and_cameras(monkeypatch):
 def test_through_the_entry_point():
     cameras = rig.phases(beta=50.0)
     taken = rig.captures(cameras, rig.picture())
-    recording = tc.Recording(list(taken), rig.seen_by(cameras))
+    recording = tc.Recording(list(taken), rig.imaging_model(cameras))
     value = tc.reconstruct(recording, tc.FringeScanning())
     np.testing.assert_array_equal(value.image, scanning(cameras)(taken).image)
     assert value.status == "ok" and value.method == "fringe_scanning"

@@ -1,7 +1,5 @@
 """Poisson likelihood: its pieces against scipy, its gradient, what its τ means, few counts."""
 
-import functools
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -14,7 +12,6 @@ from reconstruction import extremes, rig, scenes
 import thincam_jax as tc
 from helpers import finite_difference, quick, relative_l2
 from thincam_jax.reconstruction import Sparsity
-from thincam_jax.reconstruction.fista import solve_fista
 from thincam_jax.reconstruction.poisson import (
     LINKS,
     Counts,
@@ -26,8 +23,9 @@ from thincam_jax.reconstruction.poisson import (
     solve_poisson,
     unlinked,
 )
-from thincam_jax.reconstruction.problem import noise_in_the_image, with_tau
-from thincam_jax.reconstruction.recording import middle
+from thincam_jax.reconstruction.problem import backprojected_noise, with_tau
+from thincam_jax.reconstruction.proximal_gradient import solve_fista
+from thincam_jax.reconstruction.recording import centred_crop
 from thincam_jax.reconstruction.total_variation import TotalVariation
 
 
@@ -90,7 +88,7 @@ def test_it_beats_least_squares_at_three_counts_a_pixel(seed):
     problem, truth = photons(background=background, seed=seed)
     level = float(truth.mean())
     likely = [
-        solve_poisson(weighing(problem, t / level), background=[background], link="square")
+        solve_poisson(Counts(weighing(problem, t / level), background=[background], link="square"))
         for t in (0.1, 0.2, 0.3, 0.5)
     ]
     clear = eqx.tree_at(lambda p: p.captures, problem, (problem.captures[0] - background,))
@@ -109,7 +107,7 @@ def test_links_agree_on_the_minimum():
     problem, _ = photons(mean=30.0, sensor=(13, 12), field=(9, 10))
     tau = weighing(problem, 0.02)
     values = [
-        solve_poisson(tau, background=[0.1], link=link, iterations=800, tolerance=1e-6)
+        solve_poisson(Counts(tau, background=[0.1], link=link), iterations=800, tolerance=1e-6)
         for link in LINKS
     ]
     lowest = min(v.history[-1].objective for v in values)
@@ -120,7 +118,9 @@ def test_links_agree_on_the_minimum():
 
 @pytest.mark.thorough
 def test_it_stands_extremes():
-    solve = functools.partial(solve_poisson, iterations=20)
+    def solve(problem, **settings):
+        return solve_poisson(Counts(problem), iterations=20, **settings)
+
     extremes.check_shapes(solve, noise=0.0)
     # Without a count the image is of at most what would have given about one.
     problem, _ = photons()
@@ -135,16 +135,16 @@ def test_it_stands_extremes():
 def test_what_are_no_counts_is_refused():
     problem, _ = scenes.problem()
     negative = eqx.tree_at(lambda p: p.captures, problem, tuple(c - 100 for c in problem.captures))
-    rig.refused("a capture has negative counts", lambda: solve_poisson(negative))
+    rig.refused("a capture has negative counts", lambda: Counts(negative))
     message = "1 backgrounds for 2 captures; give one for each"
-    rig.refused(message, lambda: solve_poisson(problem, background=[0.1]))
+    rig.refused(message, lambda: Counts(problem, background=[0.1]))
     sparse = eqx.tree_at(lambda p: p.regulariser, problem, Sparsity())
     message = "regulariser is a Sparsity; give a TotalVariation"
-    rig.refused(message, lambda: solve_poisson(sparse))
+    rig.refused(message, lambda: Counts(sparse))
 
 
 def test_what_the_solver_refuses():
-    rig.refused("tau = 'sure' is found for Gaussian noise only", lambda: tc.PoissonTV("sure"))
+    rig.refused("tau = 'sure' is for Gaussian noise only", lambda: tc.PoissonTV("sure"))
     rig.refused("tau = -1.0 is negative", lambda: tc.PoissonTV(-1.0))
     message = "variation is a Sparsity; give a TotalVariation"
     rig.refused(message, lambda: tc.PoissonTV(variation=Sparsity()))
@@ -160,7 +160,7 @@ def test_what_the_solver_refuses():
         rig.refused(message, lambda s=solver: tc.reconstruct(seen, s))
     message = "method 'poisson' runs in one piece; leave out the callback"
     rig.refused(message, lambda: tc.reconstruct(seen, tc.PoissonTV(), callback=print))
-    cameras = rig.seen_by([rig.camera(), rig.camera(distance=2.5)])
+    cameras = rig.imaging_model([rig.camera(), rig.camera(distance=2.5)])
     apart = tc.Recording(jnp.ones((2, *rig.SENSOR.shape)), cameras)
     message = "needs all cameras at one distance"
     rig.refused(message, lambda: tc.reconstruct(apart, tc.PoissonTV()))
@@ -196,7 +196,7 @@ def test_poisson_of_many_counts_is_total_variation_of_gaussian_noise(mean, gap):
     for tau in (1.4, 2.0, 2.8):
         gaussian = tc.Recording(captures - background, psfs, noise_variance=captures.mean())
         squares = tc.reconstruct(gaussian, tc.AdmmTV(tau, iterations=600, tolerance=1e-5))
-        seen = (middle(jnp.asarray(r.image), captures.shape[-2:]) for r in (likely, squares))
+        seen = (centred_crop(jnp.asarray(r.image), captures.shape[-2:]) for r in (likely, squares))
         gaps[tau] = relative_l2(*seen)
     assert gaps[2.0] < gap
     assert gaps[2.0] < 0.75 * min(gaps[1.4], gaps[2.8])
@@ -210,7 +210,7 @@ def test_the_tau_of_counts_is_that_of_their_mean():
     problem = tc.Recording(captures, psfs, valid=valid, noise_variance=7.0).problem(tau=1.5)
     made = counts_problem(problem)
     mean = captures[0].ravel()[1:].mean()
-    expected = 1.5 * noise_in_the_image(problem.operators, [1 / mean])
+    expected = 1.5 * backprojected_noise(problem.operators, [1 / mean])
     assert float(made.absolute_tau) == pytest.approx(float(expected))
     np.testing.assert_array_equal(made.weights[0], valid)
 
@@ -236,7 +236,7 @@ def test_poisson_with_cameras_is_upright():
     clean = rig.captures(rig.pair(), rig.picture())
     gain = 300.0 / float(clean.mean())
     counts = jnp.asarray(np.random.default_rng(5).poisson(gain * clean).astype(float))
-    seen, once = tc.Recording(counts, rig.seen_by(rig.pair())), tc.PoissonTV(iterations=1)
+    seen, once = tc.Recording(counts, rig.imaging_model(rig.pair())), tc.PoissonTV(iterations=1)
     found = tc.reconstruct(seen, tc.PoissonTV())
     assert rig.correlation(found.image, rig.picture()) > 0.97
     assert float(found.image.mean()) == pytest.approx(gain * rig.picture().mean(), rel=0.05)

@@ -22,7 +22,7 @@ from thincam_jax.imaging.operators import (
     kernel_shape,
 )
 from thincam_jax.reconstruction import InverseProblem
-from thincam_jax.reconstruction.drive import Outcome
+from thincam_jax.reconstruction.iterate import Outcome
 from thincam_jax.reconstruction.problem import residuals, total_objective
 
 SENSOR, FIELD = tc.Sensor((52, 61), rig.SENSOR.pitch), (28, 33)
@@ -35,15 +35,15 @@ def cameras(count=2, **settings):
 
 def camera_problem(captures, lenses, *, synthesis=None, noise_variance=None, valid=None, **light):
     """The problem of captures by cameras in the light of `rig.scene`."""
-    seen_by = rig.seen_by(lenses, **({"field_shape": FIELD} | light))
-    recording = tc.Recording(captures, seen_by, noise_variance=noise_variance, valid=valid)
+    imaging_model = rig.imaging_model(lenses, **({"field_shape": FIELD} | light))
+    recording = tc.Recording(captures, imaging_model, noise_variance=noise_variance, valid=valid)
     return recording.problem(synthesis=synthesis)
 
 
 def psf_problem(captures, psfs, *, field_shape=None, tau=2.0, **known):
     """The problem of captures with measured PSFs."""
-    seen_by = tc.Psfs(psfs, field_shape=field_shape)
-    return tc.Recording(captures, seen_by, **known).problem(tau=tau)
+    imaging_model = tc.Psfs(psfs, field_shape=field_shape)
+    return tc.Recording(captures, imaging_model, **known).problem(tau=tau)
 
 
 def projected(image) -> jax.Array:
@@ -151,7 +151,7 @@ def test_planes_at_several_distances():
     assert max(share(problem, both)) < 1e-6
     assert min(share(problem, both[:, ::-1])) > 1e-3
     np.testing.assert_allclose(
-        rig.seen_by(cameras(), object_distance=jnp.asarray(distances)).pitch,
+        rig.imaging_model(cameras(), object_distance=jnp.asarray(distances)).pitch,
         SENSOR.pitch * np.array(distances) / 3.0,
     )
 
@@ -323,14 +323,14 @@ def test_operators_with_captures_of_any_shape():
     one, two = matrix(30), Separable(jnp.ones((6, 4)), jnp.ones((7, 5)))
     for batch in ((), (3,), (2, 3)):
         taken = [jnp.ones((*batch, 30)), jnp.ones((*batch, 6, 7))]
-        for captures, seen_by in (
+        for captures, imaging_model in (
             (taken[0], one),
             ([taken[0]], [one]),
             (taken, [one, two]),
             (taken, Stacked([one, two])),
             ([taken[0], taken], [one, Stacked([one, two])]),
         ):
-            recording = tc.Recording(captures, seen_by, noise_variance=1.0)
+            recording = tc.Recording(captures, imaging_model, noise_variance=1.0)
             problem = recording.problem()
             assert problem.image_shape == (*(batch or (1,)), 1, 4, 5)
             image = jnp.asarray(RNG.uniform(size=problem.image_shape))
@@ -348,8 +348,8 @@ def test_masks_and_gains_of_operators_are_those_of_the_recording():
     masks = [jnp.ones(s, bool).at[3].set(False) for s in shapes]
     inside = [Masked(o, m) for o, m in zip(operators, masks, strict=True)]
     problems = [
-        tc.Recording(captures, seen_by, noise_variance=[1.0, 4.0], valid=valid).problem()
-        for seen_by, valid in (
+        tc.Recording(captures, imaging_model, noise_variance=[1.0, 4.0], valid=valid).problem()
+        for imaging_model, valid in (
             (operators, masks),
             (inside, None),
             (Stacked(inside), None),
@@ -416,7 +416,7 @@ def test_what_has_seen_the_captures_is_one_of_three():
     for value, message in (
         (cameras(), r"does not say in which light; give tc.Cameras\(cameras, wavelength="),
         (jnp.ones((2, 4, 5)), r"were seen by a ArrayImpl; give tc.Cameras\(…\), tc.Psfs\(…\), or"),
-        ([matrix(30), 3], "seen_by holds something else than operators"),
+        ([matrix(30), 3], "imaging_model holds objects that are no operators"),
     ):
         rig.refused(message, lambda v=value: tc.Recording(seen, v), TypeError)
     rig.refused("operators is empty", lambda: tc.Recording(seen, []))
@@ -460,8 +460,8 @@ def test_captures_that_cannot_be_meant(captures, psfs, more, error, message):
 
 
 def test_a_field_that_does_not_fit_is_refused_before_any_work():
-    seen_by = tc.Psfs(np.ones((1, 3, 3)), field_shape=(200_000, 200_000))
-    recording = tc.Recording(np.ones((1, 6, 7)), seen_by)
+    imaging_model = tc.Psfs(np.ones((1, 3, 3)), field_shape=(200_000, 200_000))
+    recording = tc.Recording(np.ones((1, 6, 7)), imaging_model)
     with pytest.raises(MemoryError, match="a field of 200000×199999 pixels needs about .* smaller"):
         tc.reconstruct(recording, tc.Ridge())
 

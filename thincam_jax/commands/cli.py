@@ -15,8 +15,7 @@ from thincam_jax.commands.design.command import design
 from thincam_jax.commands.examples import init
 from thincam_jax.commands.help import Grouped, InOrder, examples_text
 from thincam_jax.commands.learned.command import train
-from thincam_jax.commands.photo.command import check, reconstruct
-from thincam_jax.commands.start import main
+from thincam_jax.commands.reconstruct.command import check, reconstruct
 from thincam_jax.commands.study.command import run
 from thincam_jax.commands.sweep.command import sweep
 
@@ -107,7 +106,3 @@ def doctor() -> None:
             print(f"optional {name} is missing: {purpose}")
     for line in known_drivers():
         print(line)
-
-
-if __name__ == "__main__":
-    main()

@@ -16,7 +16,7 @@ from thincam_jax.imaging.targets import sample_images
 from thincam_jax.lensless.masks.cells import Combination
 from thincam_jax.lensless.masks.fza import Profile
 from thincam_jax.lensless.method import Model
-from thincam_jax.reconstruction.spectra import Prior
+from thincam_jax.reconstruction.wiener import Prior
 from thincam_jax.units import parse_quantity
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 
-from thincam_jax.commands.start import INTERRUPTED, interruptible
+from thincam_jax.commands.interrupt import INTERRUPTED, interruptible
 
 if TYPE_CHECKING:
     import rich.progress

@@ -41,8 +41,8 @@ from thincam_jax.design.prior import PowerLaw
 from thincam_jax.design.training import Training, check_captures, noise_variance, relative_error
 from thincam_jax.lensless.propagation.path import Path
 from thincam_jax.lensless.propagation.separable_transfer import transfer_factors
-from thincam_jax.reconstruction.spectra import crop_noise, inner_band, scene_power
 from thincam_jax.reconstruction.synthesis import keep_bias
+from thincam_jax.reconstruction.wiener import crop_noise, inner_band, scene_power
 
 
 def wiener_error(design: Design, training: Training) -> Float[Array, ""]:

@@ -18,10 +18,10 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Number
 from thincam_jax.design.adam import adam_method, adam_step
-from thincam_jax.reconstruction.admm import splitting_of
-from thincam_jax.reconstruction.drive import Outcome, Progress, Status
+from thincam_jax.reconstruction.admm import AbstractSplitting, Penalties, State, admm_map
+from thincam_jax.reconstruction.iterate import Outcome, Progress, Status
 from thincam_jax.reconstruction.problem import InverseProblem, objective, uniform_image
-from thincam_jax.reconstruction.splitting import AbstractSplitting, Penalties, State, admm_map
+from thincam_jax.reconstruction.splittings import splitting_of
 
 
 class UnrolledAdmm(eqx.Module):

@@ -1,8 +1,23 @@
-"""ADMM-TV as a fixed-point solver of optimistix, and as a method that `drive` steps."""
+r"""ADMM for total variation: the map that is iterated, whatever the structure of the operators.
 
+The image f is split so that each part of the objective has a proximal map in closed form. With
+K f the parts, penalties μ (diagonal M) and the scaled duals λ, only q = Kf + λ is carried along, in
+the Douglas–Rachford form of ADMM (Eckstein and Bertsekas, Math. Program. 55, 293, 1992),
+
+.. math:: z = \mathrm{prox}(q),\quad f = (K^T M K)^{-1} K^T M (2z - q),\quad
+    T(q) = q + K f - z .
+
+The minimiser is a fixed point of T, which is averaged: q ← q + α (T(q) − q) converges for
+0 < α < 2. α = 1 is plain ADMM, 1 < α < 2 over-relaxes. This needs half of the usual arrays, and
+implicit differentiation needs such a map.
+
+The operators determine how f is split, see `splittings.py`.
+"""
+
+import abc
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar, TypeVar
 
 import equinox as eqx
 import jax
@@ -11,31 +26,119 @@ import optimistix
 from jaxtyping import Array, Float, PyTree
 
 from thincam_jax._core.checks import Number
-from thincam_jax.reconstruction.direct_splitting import DirectSplitting
-from thincam_jax.reconstruction.drive import OptimistixMethod, Residuals, Running
-from thincam_jax.reconstruction.fourier_splitting import FourierSplitting
-from thincam_jax.reconstruction.problem import InverseProblem, convolutions, worth
+from thincam_jax.reconstruction.iterate import OptimistixMethod, Residuals, SolverState
+from thincam_jax.reconstruction.problem import InverseProblem, compiled_objective
 from thincam_jax.reconstruction.regularisers import Image
-from thincam_jax.reconstruction.splitting import (
-    AbstractSplitting,
-    Penalties,
-    State,
-    admm_map,
-    consensus,
-    rescaled,
-    squared_sizes,
-)
 from thincam_jax.reconstruction.total_variation import TotalVariation
 
-# α of over-relaxation where nothing else is said.
+# Default α of over-relaxation.
 RELAXATION = 1.8
 
 
+class Penalties(eqx.Module):
+    """Penalties μ of the three splits, in the units of the splitting."""
+
+    data: Float[Array, ""]
+    variation: Float[Array, ""]
+    image: Float[Array, ""]
+
+
+class State(eqx.Module):
+    """q of the three splits: data, differences and image."""
+
+    data: tuple[Float[Array, "..."], ...]
+    slopes: tuple[Float[Array, "..."], ...]
+    image: Float[Array, "..."]
+
+
+Splitting = TypeVar("Splitting", bound="AbstractSplitting")
+
+
+class AbstractSplitting(eqx.Module):
+    """A problem split for ADMM, in units in which captures, operators and weights are about 1.
+
+    Iterations compute the same numbers whatever the units of the captures, and the image scales
+    with the captures.
+
+    - `tau`: weight of the variation in these units.
+    - `image_unit`: the image is that of `State`, times this.
+    - `settling`: penalties adapt only while an overall residual is above this.
+    """
+
+    settling: ClassVar[float] = 0.0
+    penalties: Penalties
+    tau: Float[Array, ""]
+    variation: TotalVariation
+    image_unit: Float[Array, ""]
+    nonnegative: bool = eqx.field(static=True)
+
+    @abc.abstractmethod
+    def start(self, image: Image) -> State:
+        """The state of a start image, with dual variables zero."""
+
+    @abc.abstractmethod
+    def image(self, state: State) -> Image:
+        """The image of a state, non-negative if constrained."""
+
+    @abc.abstractmethod
+    def reflected(self, state: State) -> State:
+        """2z − q, where z minimises each part of the objective plus μ/2 ‖z − q‖²."""
+
+    @abc.abstractmethod
+    def nearest(self, target: State) -> State:
+        """K f of the f whose K f is nearest to the target in the norm of the penalties."""
+
+    @abc.abstractmethod
+    def with_captures(self: Splitting, captures: tuple[Float[Array, "..."], ...]) -> Splitting:
+        """This splitting, with its units, for other captures g."""
+
+    def with_penalties(self: Splitting, penalties: Penalties) -> Splitting:
+        """This splitting with other penalties."""
+        return eqx.tree_at(lambda s: s.penalties, self, penalties)
+
+    def settled(self: Splitting) -> Splitting:
+        """This splitting prepared for hundreds of iterations with fixed penalties."""
+        return self
+
+
+def admm_map(state: State, splitting: AbstractSplitting) -> State:
+    """T(q), for `optimistix.fixed_point(admm_map, …, args=splitting)`."""
+    # The barrier makes XLA compute it once: it enters the sum of differences and the update below.
+    mirrored = jax.lax.optimization_barrier(splitting.reflected(state))
+    images = splitting.nearest(mirrored)
+    return jax.tree.map(lambda q, m, k: q + (k - 0.5 * (q + m)), state, mirrored, images)
+
+
+def consensus(splitting: AbstractSplitting, state: State) -> State:
+    """z of a state."""
+    return jax.tree.map(lambda q, r: 0.5 * (q + r), state, splitting.reflected(state))
+
+
+def rescaled(splitting: AbstractSplitting, state: State, factors: Penalties) -> State:
+    """The state that keeps image and forces when penalties are multiplied: q = z + λ, λ ∝ 1/μ."""
+    settled = consensus(splitting, state)
+
+    def scaled(part, factor):
+        return jax.tree.map(lambda q, z: z + (q - z) / factor, *part)
+
+    return State(
+        scaled((state.data, settled.data), factors.data),
+        scaled((state.slopes, settled.slopes), factors.variation),
+        scaled((state.image, settled.image), factors.image),
+    )
+
+
+def squared_sizes(state: State) -> Float[Array, "3"]:
+    """Squared norms of the three splits."""
+    parts = (state.data, state.slopes, state.image)
+    return jnp.stack([sum(jnp.sum(x**2) for x in jax.tree.leaves(part)) for part in parts])
+
+
 class AdmmState(eqx.Module):
-    """What is known of the last iteration, all of it relative.
+    """Relative residuals of the last iteration.
 
     - `change`: ‖T(q) − q‖/‖q‖ in the norm of the penalties.
-    - `primal`, `dual`: residuals overall; `parts`: (primal, dual) of the three splits.
+    - `primal`, `dual`: overall; `parts`: (primal, dual) of the three splits.
     """
 
     change: Float[Array, ""]
@@ -48,10 +151,10 @@ class Admm(optimistix.AbstractFixedPointSolver):
     """q ← q + α (T(q) − q) for `admm_map` and its splitting, until T moves q little.
 
     `optimistix.fixed_point(admm_map, Admm(rtol=1e-6), splitting.start(image), args=splitting)`.
-    `drive` ends by the residuals in the state instead, those of Boyd et al. (Found. Trends Mach.
-    Learn. 3, 1, 2011, section 3.3.1), each relative to what it is a residual of, so that they do
-    not depend on units (Wohlberg, arXiv:1704.06209). They take another proximal map, which the
-    compiler drops from a loop that ends by the change: it holds 13 arrays of the window, not 23.
+    `iterate` ends by the residuals in the state instead, those of Boyd et al. (Found. Trends Mach.
+    Learn. 3, 1, 2011, section 3.3.1), relative, so that they do not depend on units (Wohlberg,
+    arXiv:1704.06209). They take another proximal map, which the compiler drops from a loop that
+    ends by the change: it holds 13 arrays of the window, not 23.
 
     - `rtol`: `AdmmState.change` must fall below it. `atol` and `norm` are not used.
     - `relaxation`: α, 0 < α < 2.
@@ -63,7 +166,7 @@ class Admm(optimistix.AbstractFixedPointSolver):
     norm: Callable[[PyTree], Float[Array, ""]] = eqx.field(static=True)
 
     def __init__(self, rtol: Any, relaxation: Any = RELAXATION):
-        # Arrays, so that another value is not compiled anew.
+        # Arrays, so that another value does not recompile.
         self.rtol, self.relaxation = jnp.asarray(rtol), jnp.asarray(relaxation)
         self.atol, self.norm = 0.0, optimistix.rms_norm
 
@@ -87,7 +190,7 @@ class Admm(optimistix.AbstractFixedPointSolver):
 
 
 def _judged(splitting: AbstractSplitting, before: State, after: State, relaxation):
-    """Of a step: how far K f is from z, and how far z has moved, relative to the forces."""
+    """Residuals of a step: distance of K f from z, and change of z, relative to the duals."""
     old, new = consensus(splitting, before), consensus(splitting, after)
     gap = jax.tree.map(lambda a, b: (a - b) / relaxation, after, before)
     image = jax.tree.map(jnp.add, old, gap)  # K f
@@ -102,7 +205,7 @@ def _judged(splitting: AbstractSplitting, before: State, after: State, relaxatio
 
     moving, length = weights @ gaps, weights @ squared_sizes(before)
     return AdmmState(
-        # Away from zero every change is large.
+        # From zero every change is large.
         jnp.where((length == 0) & (moving > 0), jnp.inf, over(moving, length)),
         over(moving, weights @ size),
         over(weights @ moved, weights @ force),
@@ -110,24 +213,9 @@ def _judged(splitting: AbstractSplitting, before: State, after: State, relaxatio
     )
 
 
-def splitting_of(problem: InverseProblem) -> AbstractSplitting:
-    """The splitting that suits the operators of a problem."""
-    variation = problem.regulariser
-    if not isinstance(variation, TotalVariation):
-        raise ValueError(
-            f"ADMM is for total variation; the regulariser is a {type(variation).__name__}: use "
-            "Fista"
-        )
-    operators = convolutions(problem)
-    if operators is None:
-        return DirectSplitting(problem, variation)
-    return FourierSplitting(problem, operators, variation)
-
-
 class AdmmMethod(OptimistixMethod):
-    """ADMM for a problem, its penalties balanced by the residuals.
+    """ADMM for a problem and its splitting; residual balancing adapts the penalties.
 
-    - `penalties`: to start with; default those of the splitting.
     - `relaxation`: α, 0 < α < 2.
     """
 
@@ -139,13 +227,10 @@ class AdmmMethod(OptimistixMethod):
     def __init__(
         self,
         problem: InverseProblem,
-        *,
-        penalties: Penalties | None = None,
+        splitting: AbstractSplitting,
         relaxation: Number = RELAXATION,
     ):
-        self.problem = problem
-        splitting = splitting_of(problem)
-        self.arguments = splitting if penalties is None else splitting.with_penalties(penalties)
+        self.problem, self.arguments = problem, splitting
         self.solver = Admm(0.0, relaxation)
 
     @staticmethod
@@ -159,9 +244,9 @@ class AdmmMethod(OptimistixMethod):
         return self.arguments.image(value)
 
     def objective(self, image: Image):
-        return worth(self.problem, image)
+        return compiled_objective(self.problem, image)
 
-    def adapt(self, state: Running, residuals: Residuals):
+    def adapt(self, state: SolverState, residuals: Residuals):
         """Residual balancing: μ ← μ·√(primal/dual) of each split, by at most 3 at a time."""
         if max(residuals.primal, residuals.dual) < self.arguments.settling:
             return self, state

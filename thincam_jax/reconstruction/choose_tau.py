@@ -1,4 +1,4 @@
-"""Weights of the regularisation found from the captures: discrepancy principle and SURE."""
+"""Choose τ from the captures: discrepancy principle and SURE."""
 
 import math
 from dataclasses import replace
@@ -8,23 +8,23 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from thincam_jax.reconstruction.admm import AdmmMethod
-from thincam_jax.reconstruction.drive import drive
+from thincam_jax.reconstruction.iterate import Schedule, iterate
 from thincam_jax.reconstruction.noise import local_noise
-from thincam_jax.reconstruction.problem import InverseProblem, misfit, residuals, see, with_tau
+from thincam_jax.reconstruction.problem import InverseProblem, forward, misfit, residuals, with_tau
 from thincam_jax.reconstruction.regularisers import Image
+from thincam_jax.reconstruction.splittings import admm_method
 
-# What `find_tau` searches, in parts of the problem's own τ. A smaller one is never worth much, and
-# where the PSF is a little wrong, both rules ask for one that spoils the image.
+# Range of `find_tau` relative to the problem's own τ. A smaller τ never gains much, and with a
+# slightly wrong PSF both rules choose one that spoils the image.
 _SPAN = (0.8, 4.0)
-# Residuals over noise, as variances: what the estimate of noise leaves open, and what is told.
+# Ratios of residual to noise variance: uncertainty of the noise estimate, and what is reported.
 _UNCERTAIN, _NOTICED = 0.3, 1.1
 
 
 class ChosenTau(eqx.Module):
-    """A problem with its τ found, its image, and (τ, criterion) of all that were tried.
+    """A problem with the chosen τ, its image, and (τ, criterion) of all trials.
 
-    `reason` says what was noticed on the way.
+    `reason` is a warning, or empty.
     """
 
     problem: InverseProblem
@@ -34,14 +34,13 @@ class ChosenTau(eqx.Module):
 
 
 def find_tau(rule: str, problem: InverseProblem, image: Float[Array, "..."]) -> ChosenTau:
-    r"""τ by "discrepancy" or "sure", where a PSF may be wrong and the noise is an estimate.
+    r"""Choose τ by "discrepancy" or "sure", robust to a wrong PSF and an estimated noise.
 
-    Both rules take what they cannot explain for noise of a known size. If the PSF is a little
-    wrong, more is left than the noise, and they ask for a τ at which the image explains it all the
-    same. So they search near the problem's own τ, and the residual may differ from the noise by as
-    much as an estimate of noise does. Where it stays above, the difference is taken for the model's
-    error and added to the noise: τ becomes at least its own :math:`\sqrt{\sum w\,(Hf - g)^2/n}`
-    times.
+    Both rules assume that the residual is noise of known variance. With a slightly wrong PSF the
+    residual is larger, and they choose a τ at which the image fits it nevertheless. So the search
+    is limited to near the problem's own τ, and the residual may differ from the noise by as much as
+    an estimate of noise does. If it remains above, the excess is counted as noise: τ becomes at
+    least the problem's own times :math:`\sqrt{\sum w\,(Hf - g)^2/n}`.
     """
     own = _known_tau(problem)
     if rule == "discrepancy":
@@ -54,7 +53,7 @@ def find_tau(rule: str, problem: InverseProblem, image: Float[Array, "..."]) -> 
     tau, least = float(found.problem.tau), own * math.sqrt(excess)
     reason = (
         f"the residual is {math.sqrt(excess):.3g} times the noise at tau = {tau:.3g}: the PSF is "
-        "not quite right, or the noise is more than was estimated or given; taken as more noise, "
+        "not quite right, or the noise is more than was estimated or given; counted as more noise, "
         f"tau is at least {least:.3g}"
     )
     raised = with_tau(problem, max(tau, least))
@@ -73,10 +72,9 @@ def discrepancy_tau(
     r"""The τ with which the residual is as large as the noise: Σ w (Hf − g)² = number of pixels.
 
     Morozov's discrepancy principle; the weights w must be 1/variance. The misfit grows with τ, so
-    that a bisection of log τ finds it, each solve starting from the image of the one before. It
-    begins with the problem's own τ, and ends where the two agree within `tolerance`, or at a border
-    of the `span`, in parts of that τ, where the noise lies beyond. It smooths a little too much,
-    because a fitted image also takes up some of the noise.
+    a bisection of log τ finds it, each solve starting from the previous image. It begins with the
+    problem's own τ, and ends when the two agree within `tolerance`, or at a limit of the `span`,
+    relative to that τ. It smooths slightly too much, because the image also fits some of the noise.
 
     **Arguments**: `image`, the first; `iterations` of each of `solves` reconstructions.
     """
@@ -122,7 +120,7 @@ def sure_tau(
 
     def criterion(log_tau: float) -> float:
         current = with_tau(problem, math.exp(log_tau))
-        # All from the same image: else each would come nearer than the one before, whatever its τ.
+        # All from the same image: otherwise each would converge further than the last, whatever τ.
         seen = _solve(current, image, iterations)
         moved = eqx.tree_at(
             lambda p: p.captures,
@@ -135,7 +133,7 @@ def sure_tau(
         return value
 
     low, high = (math.log(own * factor) for factor in span)
-    import scipy.optimize  # at once is too early: it takes a tenth of a second
+    import scipy.optimize  # here, since it takes a tenth of a second
 
     found = scipy.optimize.minimize_scalar(
         criterion, bounds=(low, high), method="bounded", options={"maxiter": solves}
@@ -152,7 +150,7 @@ def _known_tau(problem: InverseProblem) -> float:
 
 
 def _expected(problem: InverseProblem) -> float:
-    """The misfit that noise of variance 1/w has."""
+    """The expected misfit of noise of variance 1/w."""
     return float(sum(jnp.sum(w > 0) for w in _full(problem))) / 2
 
 
@@ -162,7 +160,7 @@ def _full(problem: InverseProblem):
 
 
 class SearchInterrupted(KeyboardInterrupt):
-    """Ctrl-C during a search; holds the best image of the solve that it ended."""
+    """Ctrl-C during a search, with the best image of the interrupted solve."""
 
     def __init__(self, image: Image):
         super().__init__()
@@ -170,15 +168,15 @@ class SearchInterrupted(KeyboardInterrupt):
 
 
 def _solve(problem: InverseProblem, image, iterations: int):
-    method = AdmmMethod(problem, relaxation=1.5)
-    outcome = drive(method, image, iterations=iterations, tolerance=1e-5)
+    method = admm_method(problem, relaxation=1.5)
+    outcome = iterate(method, image, Schedule(iterations, 1e-5))
     if outcome.status == "interrupted":
         raise SearchInterrupted(outcome.image)
     return outcome.image
 
 
 def _probes(problem: InverseProblem, key: PRNGKeyArray):
-    """±1 in units of a tenth of the local noise, 0 where a pixel counts nothing."""
+    """±1 in units of a tenth of the local noise, 0 in pixels of weight 0."""
     keys = jax.random.split(key, len(problem.captures))
     parts = zip(keys, _full(problem), problem.captures, strict=True)
     return tuple(
@@ -196,7 +194,7 @@ def _risk(problem: InverseProblem, image, moved, probes):
     for operator, weight, probe, residual in zip(
         problem.operators, _full(problem), probes, residuals(problem, image), strict=True
     ):
-        response = see(operator, moved - image)
+        response = forward(operator, moved - image)
         size = 0.01  # of the probe's square in units of the variance
         divergence = jnp.sum(weight * probe * response) / size
         known = jnp.sum((weight > 0).astype(weight.dtype))

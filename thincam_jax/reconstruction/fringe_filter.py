@@ -15,10 +15,10 @@ from thincam_jax._core.grids import Grid, fast_shape, same_parity
 from thincam_jax._core.precision import as_complex, phasor, turn_phasor
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.masks.fza import FresnelZoneAperture
-from thincam_jax.reconstruction.recording import Recording
-from thincam_jax.reconstruction.seen_by import Cameras
-from thincam_jax.reconstruction.solver import AbstractSolver, Reconstruction
-from thincam_jax.reconstruction.wiener import filtered_cameras
+from thincam_jax.reconstruction.imaging_model import Cameras
+from thincam_jax.reconstruction.recording import Reconstruction, Recording
+from thincam_jax.reconstruction.solver import AbstractSolver
+from thincam_jax.reconstruction.wiener import require_cameras
 
 
 class FringeFilter(eqx.Module):
@@ -28,15 +28,15 @@ class FringeFilter(eqx.Module):
         G_{FS} = j\,(G_0 - G_\pi) + (G_{3\pi/2} - G_{\pi/2}),\qquad
         \hat F = G_{FS}\, \frac{\beta'}{\pi} \exp(-j\pi^2\rho^2/\beta'),\quad \beta' = \beta/M^2
 
-    (thesis Eq 3.14-3.17 with the dropped factor π/β and the magnification M restored). It knows
-    nothing of diffraction, and so shows the zeros of cos(πλdρ²/…) as missing frequencies. Where the
-    filter's chirp turns by more than π between frequencies of the padded window it is set to
-    zero; for a mask no larger than the sensor nothing but noise lies there.
+    (thesis Eq 3.14-3.17 with the dropped factor π/β and the magnification M restored). It neglects
+    diffraction, and so the zeros of cos(πλdρ²/…) are missing frequencies. Where the filter's chirp
+    turns by more than π between frequencies of the padded window it is set to zero; for a mask no
+    larger than the sensor these frequencies hold only noise.
 
     Of two phases, 0 and 3π/2, it is
     :math:`G = 2j\,[(G_0 - \bar G_0) - j\,(G_{3\pi/2} - \bar G_{3\pi/2})]`, with +j for 0 and π/2.
-    Only the mean of the background is taken away, where four phases cancel all of it: a few bright
-    things on black come out as well as by four, a bright field does not; use `AdmmTV` for that.
+    Only the mean of the background is subtracted, while four phases cancel all of it: good for few
+    bright objects on black, not for a bright field; use `AdmmTV` for that.
 
     **Arguments**: `cameras`, of one sensor, distance and β, with the phases 0, π/2, π, 3π/2, or 0
     and one of π/2 and 3π/2, in any order, that of the captures. Their wavelength is not used.
@@ -107,7 +107,7 @@ class FringeScanning(AbstractSolver):
         return FringeFilter(cameras)
 
     def solve(self, recording: Recording):
-        return self.prepare(filtered_cameras(recording, self.name))(jnp.stack(recording.captures))
+        return self.prepare(require_cameras(recording, self.name))(jnp.stack(recording.captures))
 
 
 @jax.jit

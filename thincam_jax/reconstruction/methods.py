@@ -1,40 +1,69 @@
-"""`reconstruct`, the solvers by their names, and which of them suits a recording."""
+"""`reconstruct`, the solvers for regularised least squares, and the choice of a solver."""
 
+import abc
 import dataclasses
-from collections.abc import Sequence
+import functools
+import time
+from typing import ClassVar
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from thincam_jax._core import checks
-from thincam_jax.lensless.camera import LenslessCamera
-from thincam_jax.reconstruction.drive import Callback
+from thincam_jax.imaging.operators.crop_convolution import CropConvolution, cut, place
+from thincam_jax.reconstruction.choose_tau import SearchInterrupted, find_tau
 from thincam_jax.reconstruction.fringe_filter import FringeScanning
-from thincam_jax.reconstruction.noise import estimate_variance, given_variances
+from thincam_jax.reconstruction.imaging_model import Cameras
+from thincam_jax.reconstruction.iterate import CHUNK, Callback, Outcome, Schedule, iterate
+from thincam_jax.reconstruction.parallel import in_parallel
 from thincam_jax.reconstruction.poisson import PoissonTV
-from thincam_jax.reconstruction.recording import Recording
-from thincam_jax.reconstruction.registration import distance_ratios
-from thincam_jax.reconstruction.regularised import AdmmTV, Fista
+from thincam_jax.reconstruction.problem import (
+    InverseProblem,
+    compiled_objective,
+    convolutions,
+    or_one,
+    residuals,
+    uniform_level,
+)
+from thincam_jax.reconstruction.proximal_gradient import solve_fista
+from thincam_jax.reconstruction.recording import Reconstruction, Recording
+from thincam_jax.reconstruction.regularisers import AbstractRegulariser, Image
 from thincam_jax.reconstruction.ridge import Ridge
-from thincam_jax.reconstruction.seen_by import Cameras, Psfs
 from thincam_jax.reconstruction.solver import (
+    DEFAULT_TAU,
     AbstractIterativeSolver,
     AbstractSolver,
-    Reconstruction,
     Synthesis,
+    as_regulariser,
+    as_synthesis,
+    as_variation,
+    at_most,
+    checked_tau,
+    first_image,
+    small_enough,
 )
-from thincam_jax.reconstruction.synthesis import check_synthesis, keep_bias, separate
-from thincam_jax.reconstruction.wiener import Wiener
+from thincam_jax.reconstruction.splittings import admm_method
+from thincam_jax.reconstruction.total_variation import TotalVariation
+from thincam_jax.reconstruction.wiener import Wiener, filter_suffices
 
-# The words of experiment files and commands, `method: admm_tv`.
-SOLVERS: dict[str, type[AbstractSolver]] = {
-    solver.name: solver for solver in (Wiener, FringeScanning, AdmmTV, Fista, Ridge, PoissonTV)
-}
+# Iterations during which penalties adapt. Later changes make the objective jump: on the captures of
+# tests/reconstruction/test_admm.py ADMM then needs 1.4 to twice the iterations.
+_BALANCED = 30
+# Share of the iterations that a biased camera spends without its uniform light.
+_FIRST_PART = 0.4
+# A camera is biased if its response at zero frequency is this many times the root mean square of
+# all: for a zone aperture 0.7 times its width in pixels, almost nothing where the background
+# cancels. At 30 dB this start harms or changes nothing up to 100, and gains from 190 on.
+_BIASED = 150.0
 
-# Contrast of a channel over its noise from which a filter is trusted. A judgement: total variation
-# gains 0.5 to 2.5 dB at 1 to 3 (configs/fza_admm_tv.yaml), and next to nothing without noise.
-_CLEAN = 30.0
+# Shorter side of the sensor over the side of the high-pass window, and the smallest window.
+_PART, _SMALLEST = 8, 5
+
+# Least share of the valid pixels that must remain.
+_ENOUGH = 0.25
 
 
 def reconstruct(
@@ -44,25 +73,26 @@ def reconstruct(
     start: Float[Array, "..."] | None = None,
     callback: Callback | None = None,
 ) -> Reconstruction:
-    """The image of a scene from captures of it.
+    """Reconstruct the image of a scene from captures of it.
 
     **Arguments**
 
-    - `recording`: what was seen, see `Recording`.
-    - `solver`: what is done about it: `Wiener`, `FringeScanning` (filters, for `Cameras`),
-      `AdmmTV`, `Fista`, `Ridge` or `PoissonTV`. Default: the one of `choose_solver`, whose reason
-      the result tells.
-    - `start`: a first image, such as an earlier result. By default it is uniform with cameras and
-      for `PoissonTV`, else black. Where it is given `AdmmTV` has no first part without the
+    - `recording`: captures with their imaging model and noise, see `Recording`.
+    - `solver`: the method with its settings: `Wiener`, `FringeScanning` (filters, for `Cameras`),
+      `AdmmTV`, `Fista`, `Ridge` or `PoissonTV`. Default: the one of `choose_solver`; the result
+      has its reason.
+    - `start`: a start image, such as an earlier result. By default it is uniform with cameras and
+      for `PoissonTV`, else black. With a start image `AdmmTV` omits its first part without the
       uniform light, see docs/reconstruction.md.
-    - `callback`: called with `Progress` every tenth iteration of `AdmmTV` and `Fista`; a true
-      answer stops the run. Ctrl-C returns the best image so far, with status "interrupted".
+    - `callback`: called with `Progress` every tenth iteration of `AdmmTV` and `Fista`; it stops
+      the run by returning a true value. Ctrl-C returns the best image so far, with the status
+      "interrupted".
 
-    Images of a batch are reconstructed together. To reconstruct many recordings by a filter call
-    its `prepare` once. Under jit, grad or vmap use `solve_fixed_point`.
+    Images of a batch are reconstructed together. To filter many recordings call `prepare` of the
+    filter once. Under jit, grad or vmap use `solve_fixed_point`.
 
-    **Errors**: ValueError and TypeError, one line, for captures that do not fit what has seen
-    them, and for a start or callback of a solver that runs in one piece.
+    **Errors**: ValueError and TypeError, one line, for a recording, start or callback that the
+    solver cannot use.
     """
     if not isinstance(recording, Recording):
         raise TypeError(
@@ -75,7 +105,7 @@ def reconstruct(
     if isinstance(solver, AbstractIterativeSolver):
         if any(checks.is_traced(capture) for capture in recording.captures):
             raise TypeError(
-                f"{type(solver).__name__} looks at its numbers between the iterations: call it "
+                f"{type(solver).__name__} checks its convergence between iterations: call it "
                 "outside of jit, grad and vmap, or use tc.solve_fixed_point there"
             )
         result = solver.solve(recording, start=start, callback=callback)
@@ -91,68 +121,298 @@ def reconstruct(
 def choose_solver(
     recording: Recording, synthesis: Synthesis | None = None
 ) -> tuple[AbstractSolver, str]:
-    """`Wiener` or `AdmmTV`, and a sentence that says why.
+    """Choose `Wiener` or `AdmmTV`, and give the reason in a sentence.
 
-    What decides is what the fast filter cannot do: see the crop of the sensor, which matters where
-    the captures keep a bright background or a PSF is as large as the sensor, and tell noise from
-    edges.
+    The fast filter is chosen where it is as good, see `filter_suffices`.
 
-    - `synthesis`: sums of captures that the solver is to take; see `AdmmTV`.
+    - `synthesis`: sums of captures for the solver; see `AdmmTV`.
     """
-    method, reason = _choice(recording, synthesis)
-    return (Wiener if method == "wiener" else AdmmTV)(synthesis=synthesis), reason
+    suffices, reason = filter_suffices(recording, synthesis)
+    return (Wiener if suffices else AdmmTV)(synthesis=synthesis), reason
 
 
-def _choice(recording: Recording, synthesis) -> tuple[str, str]:
-    seen_by = recording.seen_by
-    if not isinstance(seen_by, Cameras):
-        if isinstance(seen_by, Psfs):
-            return "admm_tv", "PSFs were measured: light falls beside the sensor, which it models"
-        return "admm_tv", "operators were given, and a filter is made of cameras"
-    if recording.valid is not None:
-        return "admm_tv", "some pixels are not to be trusted, which a filter cannot leave out"
-    if np.ndim(seen_by.object_distance) > 0:
-        return "admm_tv", "several planes are asked for, which a filter does not tell apart"
-    cameras, noise_variance = seen_by.cameras, recording.noise_variance
-    captures = jnp.stack(recording.captures)
-    matrix = separate(len(cameras)) if synthesis is None else np.asarray(synthesis, dtype=float)
-    check_synthesis(matrix, cameras, distance_ratios(cameras))
-    biased = keep_bias(matrix)
-    biased |= np.array([_backgrounds_differ(row, cameras) for row in matrix])
-    if biased.any():
-        return "admm_tv", (
-            f"{int(biased.sum())} of {len(matrix)} channels keep the bright background of their "
-            "captures, which the sensor crops; a filter would ring at its borders"
+class Start(eqx.Module):
+    """A start image, and whether it was given."""
+
+    image: Image
+    given: bool
+
+
+class AbstractRegularised(AbstractIterativeSolver):
+    """A solver that minimises ½ Σ w (Af − g)² + τ R(f), with R its `prior`."""
+
+    tau: Float[Array, ""] | str = eqx.field(default=DEFAULT_TAU, converter=checked_tau)
+    nonnegative: bool = eqx.field(default=True, converter=bool, static=True, kw_only=True)
+    synthesis: np.ndarray | None = eqx.field(default=None, converter=as_synthesis, kw_only=True)
+    iterations: int = eqx.field(default=100, converter=at_most, static=True, kw_only=True)
+    tolerance: float = eqx.field(default=1e-4, converter=small_enough, static=True, kw_only=True)
+
+    @property
+    @abc.abstractmethod
+    def prior(self) -> AbstractRegulariser:
+        """R."""
+
+    @abc.abstractmethod
+    def minimise(self, problem: InverseProblem, start: Start, callback: Callback | None) -> Outcome:
+        """Minimise a problem."""
+
+    def solve(
+        self,
+        recording: Recording,
+        *,
+        start: Float[Array, "..."] | None = None,
+        callback: Callback | None = None,
+    ) -> Reconstruction:
+        """Reconstruct from the start image; by default uniform with cameras, else zero.
+
+        A uniform image explains the bright background of a zone aperture's capture at once, which
+        would otherwise take hundreds of iterations; a mostly dark field is nearer to zero.
+        """
+        rule, reason = (self.tau if isinstance(self.tau, str) else None), ""
+        problem = recording.problem(
+            tau=DEFAULT_TAU if rule else self.tau,
+            regulariser=self.prior,
+            nonnegative=self.nonnegative,
+            synthesis=self.synthesis,
         )
-    contrast = _contrast(captures, matrix, noise_variance)
-    if not contrast >= _CLEAN:
-        return "admm_tv", (
-            f"the channels' contrast is {contrast:.2g} times their noise; total variation tells "
-            "edges from noise where a filter cannot"
+        began = time.perf_counter()
+        uniform = isinstance(recording.imaging_model, Cameras)
+        upright = None if start is None else recording.oriented(start)
+        image = first_image(problem, upright, uniform=uniform)
+        if self.nonnegative:  # it is returned if no iterate is better
+            image = jnp.maximum(image, 0)
+        given = start is not None or not uniform
+        if rule:
+            try:
+                found = find_tau(rule, problem, image)
+            except SearchInterrupted as end:
+                seconds = time.perf_counter() - began
+                outcome = Outcome(end.image, "interrupted", (), 0, seconds)
+                return recording.reconstruction(problem, outcome, self.name, float(problem.tau))
+            # From the same start as a solver with this τ, and so to the same image.
+            problem, reason = found.problem, found.reason
+        outcome = self.minimise(problem, Start(image, given), callback)
+        if rule:
+            outcome = dataclasses.replace(outcome, seconds=time.perf_counter() - began)
+        result = recording.reconstruction(problem, outcome, self.name, float(problem.tau))
+        return dataclasses.replace(result, reason=reason) if reason else result
+
+
+class AdmmTV(AbstractRegularised):
+    """Least squares with total variation by ADMM, with the crop of the sensor in the model.
+
+    Convolutions are diagonalised by Fourier transforms, a separable or dense operator is
+    factorised once, any other takes conjugate gradients in each iteration.
+
+    **Arguments**
+
+    - `tau`: weight of the variation relative to the noise, about 1 to 3; see `InverseProblem`.
+      "discrepancy" (up to 5 times the time) or "sure" (some 20 times) choose it between 0.8 and 4
+      times the default, or above if the residual shows that the PSF is wrong; see
+      `choose_tau.find_tau`.
+    - `variation`: its kind and the coupling of colours, see `TotalVariation`.
+    - `nonnegative`: whether to constrain f ≥ 0.
+    - `synthesis`: sums of captures in place of the captures, see
+      `thincam_jax.reconstruction.synthesis`; for `Cameras` only.
+    - `iterations`: at most. `tolerance`: of the relative residuals.
+
+    **Errors**: ValueError, one line, for values out of range.
+    """
+
+    name: ClassVar[str] = "admm_tv"
+    variation: TotalVariation = eqx.field(default=None, converter=as_variation, kw_only=True)
+
+    @property
+    def prior(self):
+        return self.variation
+
+    def minimise(self, problem: InverseProblem, start: Start, callback: Callback | None):
+        """Minimise by ADMM; a biased camera begins without its uniform light."""
+        first = None if start.given else self._without_uniform_light(problem, start.image, callback)
+        if first is None:
+            return self._by_admm(problem, start.image, callback)
+        if first.status in ("stopped", "interrupted", "non_finite"):
+            return first
+        try:
+            second = self._by_admm(problem, first.image, callback, first.iterations)
+        except KeyboardInterrupt:  # before its iterations, which keep their own best image
+            return dataclasses.replace(first, status="interrupted")
+        return dataclasses.replace(
+            second,
+            history=first.history + second.history[1:],
+            seconds=first.seconds + second.seconds,
         )
-    return "wiener", (
-        f"no channel keeps a background and their contrast is {contrast:.2g} times the noise: the "
-        "Wiener synthesis is as good, in closed form"
+
+    def _by_admm(self, problem, image, callback, done: int = 0) -> Outcome:
+        until = done + min(_BALANCED, (self.iterations - done) // 2)
+        schedule = Schedule(self.iterations, self.tolerance, adapt_until=until, done=done)
+        return iterate(in_parallel(problem, admm_method), image, schedule, callback=callback)
+
+    def _without_uniform_light(self, problem, image, callback) -> Outcome | None:
+        """The first part of the iterations; None for an unbiased camera or too few iterations.
+
+        Whole chunks between two checks, so that a callback sees every tenth iteration throughout.
+        """
+        count = CHUNK * round(_FIRST_PART * self.iterations / CHUNK)
+        easier = without_uniform_light(problem) if count else None
+        if easier is None:
+            return None
+        outcome = iterate(
+            in_parallel(easier, admm_method),
+            image,
+            Schedule(count, self.tolerance, adapt_until=min(_BALANCED, count // 2)),
+            callback=callback,
+            objective=functools.partial(objective_with_uniform_light, problem),
+        )
+        return dataclasses.replace(outcome, image=with_uniform_light(problem, outcome.image))
+
+
+class Fista(AbstractRegularised):
+    """Least squares with any regulariser by accelerated proximal gradients.
+
+    Operators need A and Aᵀ only, and there are no penalties. With total variation the minimiser
+    is that of `AdmmTV`, after more iterations.
+
+    **Arguments**: as of `AdmmTV`, and
+
+    - `regulariser`: R, such as `TotalVariation`, the default, or `Sparsity` in wavelets or cosines,
+      with the same τ: a coefficient of an orthonormal basis has the noise of a pixel.
+    """
+
+    name: ClassVar[str] = "fista"
+    regulariser: AbstractRegulariser = eqx.field(
+        default=None, converter=as_regulariser, kw_only=True
+    )
+
+    def __check_init__(self):
+        if isinstance(self.tau, str) and not isinstance(self.regulariser, TotalVariation):
+            raise ValueError(
+                f"tau = {self.tau!r} is for total variation only; give a number, about 1 to 3"
+            )
+
+    @property
+    def prior(self):
+        return self.regulariser
+
+    def minimise(self, problem: InverseProblem, start: Start, callback: Callback | None):
+        """Minimise by FISTA with restart."""
+        return solve_fista(
+            problem,
+            image=start.image,
+            iterations=self.iterations,
+            tolerance=self.tolerance,
+            callback=callback,
+        )
+
+
+# The words of experiment files and commands, `method: admm_tv`.
+SOLVERS: dict[str, type[AbstractSolver]] = {
+    solver.name: solver for solver in (Wiener, FringeScanning, AdmmTV, Fista, Ridge, PoissonTV)
+}
+
+
+def without_uniform_light(problem: InverseProblem) -> InverseProblem | None:
+    r"""The problem with biased cameras high-passed; None without any, or if few pixels remain.
+
+    A zone aperture passes a good part of the light evenly. One frequency of its response, zero, is
+    then hundreds of times as strong as the others, and an iteration that must fit it moves the
+    others little. A high-pass p removes the uniform light exactly, since it is constant over the
+    window of p, and commutes with the camera: with g = C(h ∗ f), C the crop to the sensor,
+
+    .. math:: p * g = C'\big((p * h) * f\big), \qquad p = \delta - w,\quad \sum w = 1
+
+    on the pixels C′ whose window w lies on the sensor. Only the noise is approximated: at the
+    lowest frequencies it is weaker than assumed. The brightness of the whole and the outermost
+    pixels are lost, so the image found is the start for the problem with all of the data.
+
+    The captures keep their shape: pixels near the border, or near an invalid one, have weight 0.
+    """
+    operators = convolutions(problem)
+    if operators is None:
+        return None
+    rows = tuple(bool(bias > _BIASED) for bias in jax.device_get(_biases(operators)))
+    shortest = min(min(c.shape[-2:]) for c in problem.captures)
+    length = 2 * (shortest // (2 * _PART)) + 1
+    if not any(rows) or length < _SMALLEST:
+        return None
+    weights, captures = list(problem.weights), list(problem.captures)
+    for index, row in enumerate(rows):
+        if row:
+            weight, capture = weights[index], captures[index]
+            shape = jnp.broadcast_shapes(weight.shape, capture.shape[-2:])
+            valid = np.broadcast_to(np.asarray(weight) > 0, shape)
+            whole = full_windows(valid, length)
+            if whole.sum() < _ENOUGH * valid.sum():
+                return None
+            weights[index] = weight * jnp.asarray(whole, weight.dtype)
+            # Invalid pixels may be huge, and rounding would spread them over the sensor.
+            captures[index] = jnp.where(weight > 0, capture, 0)
+    problem = eqx.tree_at(
+        lambda p: (p.weights, p.captures), problem, (tuple(weights), tuple(captures))
+    )
+    return _high_passed(problem, rows, length)
+
+
+def full_windows(
+    valid: Bool[np.ndarray, "*batch y x"], length: int
+) -> Bool[np.ndarray, "*batch y x"]:
+    """Pixels whose whole window, `length` on a side, is on the sensor and valid."""
+    margin = length // 2
+    whole = np.pad(valid, [(0, 0)] * (valid.ndim - 2) + [(margin, margin)] * 2)
+    for axis in (-2, -1):
+        whole = np.min(np.lib.stride_tricks.sliding_window_view(whole, length, axis=axis), axis=-1)
+    return whole
+
+
+@jax.jit
+def with_uniform_light(problem: InverseProblem, image: Image) -> Image:
+    """The image plus the uniform light that explains the captures best, f ≥ 0 if constrained."""
+    missing = tuple(-r for r in residuals(problem, image))
+    level = uniform_level(eqx.tree_at(lambda p: p.captures, problem, missing))
+    image = image + level[..., None, None, None]
+    return jnp.maximum(image, 0) if problem.nonnegative else image
+
+
+def objective_with_uniform_light(problem: InverseProblem, image: Image) -> Float[Array, "*batch"]:
+    """Objective of an image after adding the uniform light."""
+    return compiled_objective(problem, with_uniform_light(problem, image))
+
+
+@jax.jit
+def _biases(operators: tuple[CropConvolution, ...]) -> list[Float[Array, ""]]:
+    even = [jnp.max(jnp.abs(o.spectrum[..., 0, 0])) for o in operators]
+    return [e / jnp.sqrt(or_one(o.mean_power())) for e, o in zip(even, operators, strict=True)]
+
+
+@eqx.filter_jit
+def _high_passed(problem: InverseProblem, rows: tuple[bool, ...], length: int):
+    """High-pass the spectra and captures of the given rows."""
+    operators, captures = list(convolutions(problem) or ()), list(problem.captures)
+    window = operators[0].window
+    transfer = jnp.asarray(1 - _window_transfer(length, window), problem.captures[0].dtype)
+
+    def filtered(capture, corner):
+        spectrum = jnp.fft.rfft2(place(capture, corner, window))
+        whole = jnp.fft.irfft2(spectrum * transfer.astype(spectrum.dtype), s=window)
+        return cut(whole, corner, capture.shape[-2:])
+
+    for index, row in enumerate(rows):
+        if row:
+            operator = operators[index]
+            spectrum = operator.spectrum * transfer.astype(operator.spectrum.dtype)
+            operators[index] = eqx.tree_at(lambda o: o.spectrum, operator, spectrum)
+            captures[index] = filtered(captures[index], operator.sensor_corner)
+    return eqx.tree_at(
+        lambda p: (p.operators, p.captures), problem, (tuple(operators), tuple(captures))
     )
 
 
-def _backgrounds_differ(row: np.ndarray, cameras: Sequence[LenslessCamera]) -> bool:
-    """Apertures of unlike widths let unlike light through, which no difference takes away."""
-    used = [camera.mask for weight, camera in zip(row, cameras, strict=True) if weight]
-    return len({float(getattr(mask, "width", 0)) for mask in used}) > 1
+def _window_transfer(length: int, window: tuple[int, int]) -> np.ndarray:
+    """Transfer function of a Hann window of sum 1 in both directions, centred: real."""
+    hann = np.hanning(length + 2)[1:-1]
+    places = np.arange(length) - length // 2
 
+    def along(frequencies):
+        return np.cos(2 * np.pi * np.outer(frequencies, places)) @ hann / hann.sum()
 
-def _contrast(captures, matrix: np.ndarray, noise_variance) -> float:
-    """Root mean square of the channels over their noise, of the clearest one."""
-    flat = captures.reshape(captures.shape[0], -1, *captures.shape[-2:])
-    if noise_variance is None:
-        variances = estimate_variance(flat)
-    else:
-        variances = given_variances(noise_variance, flat)
-    ratios = []
-    for row in matrix:
-        channel = jnp.tensordot(jnp.asarray(row, flat.dtype), flat, axes=1)
-        noise = jnp.sum(jnp.asarray(row**2, flat.dtype) * variances)
-        power = jnp.maximum(jnp.mean(channel**2) - noise, 0)
-        ratios.append(float(jnp.sqrt(power / noise)) if noise > 0 else float("inf"))
-    return max(ratios)
+    return np.outer(along(np.fft.fftfreq(window[0])), along(np.fft.rfftfreq(window[1])))

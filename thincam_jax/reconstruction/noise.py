@@ -66,6 +66,20 @@ def estimate_noise(
     return jnp.where(step > 0, jnp.sqrt(variance / jnp.maximum(count, 1)), 0)
 
 
+def demosaiced_noise(
+    capture: Float[Array, "channel y x"], valid: Bool[Array, "channel y x"]
+) -> Float[Array, ""]:
+    """Root mean square of the noise of a bilinearly demosaiced capture, 0 if none is found.
+
+    Neighbours share their noise, but every second pixel has its own, largest where the colour was
+    measured: `estimate_noise` of the four subsets of each colour, the largest, averaged over
+    colours.
+    """
+    parts = [np.s_[:, i::2, j::2] for i in range(2) for j in range(2)]
+    each = jnp.stack([estimate_noise(capture[part], valid[part]) for part in parts])
+    return jnp.sqrt(jnp.mean(jnp.max(each, axis=0) ** 2))
+
+
 def local_noise(capture: Float[Array, "..."], valid: Bool[Array, "..."]) -> Float[Array, "..."]:
     """The noise around each pixel over its root mean square, from the finest detail of 9×9 pixels.
 

@@ -33,7 +33,7 @@ from thincam_jax.reconstruction.problem import (
     back_projected,
     convolutions,
     detector_shape,
-    see,
+    forward,
 )
 
 # Of conjugate gradients within an iteration, relative to the right-hand side.
@@ -74,7 +74,7 @@ class AbstractNormal(eqx.Module):
 
     def applied(self, image: Float[Array, "..."]):
         """(Σ AᵀwA + μ) z."""
-        seen = tuple(see(operator, image) for operator in self.problem.operators)
+        seen = tuple(forward(operator, image) for operator in self.problem.operators)
         return back_projected(self.problem, seen) + self.shift * image
 
 

@@ -28,25 +28,31 @@ from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Number, Numbers
-from thincam_jax.reconstruction.drive import Callback, Outcome, concluded
+from thincam_jax.reconstruction.imaging_model import Cameras, distance_ratios
+from thincam_jax.reconstruction.iterate import Callback, Outcome, outcome_of_run
 from thincam_jax.reconstruction.problem import (
     InverseProblem,
+    backprojected_noise,
     detector_shape,
-    noise_in_the_image,
-    see,
+    forward,
     start_image,
     uniform_level,
 )
 from thincam_jax.reconstruction.recording import Recording
-from thincam_jax.reconstruction.registration import distance_ratios
-from thincam_jax.reconstruction.regularised import DEFAULT_TAU, as_variation, first_image, of_kind
 from thincam_jax.reconstruction.regularisers import Image
-from thincam_jax.reconstruction.seen_by import Cameras
-from thincam_jax.reconstruction.solver import AbstractIterativeSolver, at_most, small_enough
+from thincam_jax.reconstruction.solver import (
+    DEFAULT_TAU,
+    AbstractIterativeSolver,
+    as_variation,
+    at_most,
+    first_image,
+    of_kind,
+    small_enough,
+)
 from thincam_jax.reconstruction.total_variation import TotalVariation
 
-# Of the variation, in parts of the mean brightness. At 0.01 many counts are smoothed visibly more
-# than by `AdmmTV`; at 0.001 the two agree as well as their weights let them, in twice the steps.
+# Smoothing of the variation over the mean brightness. At 0.01 high counts are smoothed visibly more
+# than by `AdmmTV`; at 0.001 the two agree as well as their weights allow, in twice the steps.
 _SMOOTHING = 0.001
 
 Link = Literal["softplus", "exponential", "square"]
@@ -54,14 +60,18 @@ LINKS: tuple[Link, ...] = ("softplus", "exponential", "square")
 
 
 class Counts(eqx.Module):
-    """Counts with what is known of them, for module-level losses.
+    """A problem of photon counts, with its background.
 
-    - `problem`: its captures are counts, its weights 1, or 0 where a pixel is dead or saturated;
-      the unit of its τ is that of counts, see `counts_problem`.
-    - `background`: b of each capture, counts.
+    - `problem`: its captures are counts (photo-electrons, not digital numbers), background
+      included; of its weights only 0 counts, in dead or saturated pixels. Its regulariser is total
+      variation, with τ in the unit of `counts_problem`.
+    - `background`: b of each capture, counts; default none.
+    - `smoothing`: ε of TV over s: smaller differences are smoothed, not kept as edges.
+    - `link`: φ: "softplus", log(1 + e^θ); "exponential"; "square", θ².
     - `unit`: s, (*batch, 1, 1, 1, 1), brightness at which θ is about 1.
-    - `smoothing`: ε in parts of s: differences below it are smoothed, not kept as edges.
-    - `floor`: a mean count below which no pixel is thought to be, so that log m exists.
+    - `floor`: least mean count of a pixel, so that log m exists.
+
+    **Errors**: ValueError, one line, for negative counts and backgrounds that do not fit.
     """
 
     problem: InverseProblem
@@ -94,11 +104,11 @@ class Counts(eqx.Module):
         self.unit, self.floor = _unit(problem, self.background)
 
     def image(self, theta: Image):
-        """f of θ."""
+        """The image f of θ."""
         return self.unit * positive(self.link, theta.astype(self.unit.dtype))
 
     def theta(self, image: Image):
-        """θ of an image; what is below a thousandth of s is raised to that.
+        """θ of an image, whose values are raised to at least s/1000.
 
         In the default precision, in which solvers keep their memory whatever that of θ.
         """
@@ -108,9 +118,7 @@ class Counts(eqx.Module):
 
 def _number(tau: Any) -> Float[Array, ""]:
     if isinstance(tau, str):
-        raise ValueError(
-            f"tau = {tau!r} is found for Gaussian noise only; give a number, about 1 to 3"
-        )
+        raise ValueError(f"tau = {tau!r} is for Gaussian noise only; give a number, about 1 to 3")
     return checks.non_negative("tau", tau, "a ratio")
 
 
@@ -126,8 +134,8 @@ class PoissonTV(AbstractIterativeSolver):
       one a pixel; default none.
     - `iterations`: at most. `tolerance`: relative change of objective and image at which to end.
 
-    The captures are counts (photo-electrons), and so have no synthesis: sums are no counts. It
-    takes no callback, since it runs in one piece.
+    The captures are counts (photo-electrons), and so have no synthesis: differences are not. It
+    takes no callback, since it is one compiled program.
 
     **Errors**: ValueError, one line, for values out of range.
     """
@@ -148,23 +156,22 @@ class PoissonTV(AbstractIterativeSolver):
     ):
         if callback is not None:
             raise ValueError("method 'poisson' runs in one piece; leave out the callback")
-        if isinstance(recording.seen_by, Cameras):
-            if max(distance_ratios(recording.seen_by.cameras)) > 1:
+        if isinstance(recording.imaging_model, Cameras):
+            if max(distance_ratios(recording.imaging_model.cameras)) > 1:
                 raise ValueError(
-                    "method 'poisson' needs all cameras at one distance, since captures that are "
-                    "enlarged are no counts; use AdmmTV"
+                    "method 'poisson' needs all cameras at one distance, since enlarged captures "
+                    "are no counts; use AdmmTV"
                 )
-        # The variance is that of the counts; no other needs to be estimated.
+        # The variance is that of the counts, and need not be estimated.
         counted = recording.with_noise(1.0)
         problem = counted.problem(tau=self.tau, regulariser=self.variation)
         image = None
         if start is not None:
             image = first_image(problem, recording.oriented(start), uniform=True)
+        background = _backgrounds(self.background, problem)
         outcome = solve_poisson(
-            problem,
-            background=_backgrounds(self.background, problem),
+            Counts(problem, background=background, smoothing=_SMOOTHING),
             image=image,
-            smoothing=_SMOOTHING,
             iterations=self.iterations,
             tolerance=self.tolerance,
         )
@@ -172,36 +179,28 @@ class PoissonTV(AbstractIterativeSolver):
 
 
 def solve_poisson(
-    problem: InverseProblem,
+    counts: Counts,
     *,
-    background: Sequence[Numbers] | None = None,
     image: Float[Array, "..."] | None = None,
-    link: Link = "softplus",
-    smoothing: Number = 0.01,
     iterations: int = 300,
     tolerance: float = 1e-4,
     memory: int = 10,
 ) -> Outcome:
     """The most probable image of counts, by L-BFGS (optimistix), always non-negative.
 
-    One piece of compiled code: there is no progress to be watched.
+    One compiled program, without progress.
 
     **Arguments**
 
-    - `problem`: its captures are counts (photo-electrons, not digital numbers), background
-      included; of its weights it counts whether they are 0. Its regulariser is total variation.
-    - `background`: b, for each capture an array that broadcasts to it; default none.
+    - `counts`: the problem with its background, link and smoothing.
     - `image`: to start from; default the uniform image.
-    - `link`: φ: "softplus", log(1 + e^θ); "exponential"; "square", θ².
-    - `smoothing`: ε of TV, in parts of the mean brightness.
     - `tolerance`: relative change of the objective and of θ at which to end.
-    - `memory`: how many steps L-BFGS remembers.
+    - `memory`: number of steps that L-BFGS keeps.
 
-    **Errors**: ValueError, one line, for negative counts and backgrounds that do not fit.
+    **Errors**: ValueError, one line, for a start image of another shape.
     """
-    began = time.perf_counter()
-    counts = Counts(problem, background=background, smoothing=smoothing, link=link)
-    uniform = jnp.broadcast_to(counts.unit, counts.problem.image_shape)
+    began, problem = time.perf_counter(), counts.problem
+    uniform = jnp.broadcast_to(counts.unit, problem.image_shape)
     start = uniform if image is None else start_image(problem, image)
     limit = jnp.asarray(tolerance, float)
     solution = optimistix.minimise(
@@ -212,7 +211,7 @@ def solve_poisson(
         max_steps=iterations,
         throw=False,
     )
-    return concluded(
+    return outcome_of_run(
         start,
         counts.image(solution.value),
         eqx.Partial(poisson_objective, counts),
@@ -251,7 +250,7 @@ def mean_counts(counts: Counts, image: Image):
     """m = Hf + b of each capture."""
     return tuple(
         # Rounding in the transforms can bring a dark pixel below zero.
-        jnp.maximum(see(operator, image), 0) + b + counts.floor
+        jnp.maximum(forward(operator, image), 0) + b + counts.floor
         for operator, b in zip(counts.problem.operators, counts.background, strict=True)
     )
 
@@ -298,9 +297,9 @@ def _unit(problem: InverseProblem, background):
     captures = tuple(c - b for c, b in zip(problem.captures, background, strict=True))
     level = uniform_level(eqx.tree_at(lambda p: p.captures, problem, captures))
     level = jnp.mean(jnp.maximum(level, 0), axis=-1)
-    # Without a single count, the brightness that would have given one in each capture.
+    # Without any count, the brightness that gives one in each capture.
     uniform = jnp.ones(problem.image_shape[-4:], level.dtype)
-    light = sum(jnp.sum(see(operator, uniform)) for operator in problem.operators)
+    light = sum(jnp.sum(forward(operator, uniform)) for operator in problem.operators)
     least = jnp.where(light > 0, 1 / jnp.where(light > 0, light, 1), 1)
     mean = jnp.mean(jnp.stack([jnp.mean(c) for c in problem.captures]))
     unit = jnp.maximum(level, least)[..., None, None, None, None]
@@ -309,7 +308,7 @@ def _unit(problem: InverseProblem, background):
 
 def _check_counts(problem: InverseProblem) -> None:
     for capture in problem.captures:
-        # Simulated means may be below zero by rounding; that counts as none.
+        # Simulated means may be negative by rounding.
         rounding = 1e-6 * jnp.max(jnp.abs(capture))
         if not checks.is_traced(capture) and bool((capture < -rounding).any()):
             raise ValueError(
@@ -328,7 +327,7 @@ def counts_problem(problem: InverseProblem) -> InverseProblem:
     captures = tuple(jnp.where(w > 0, c, 0) for c, w in pairs)
     weights = tuple((w > 0).astype(c.dtype) for c, w in pairs)
     means = [mean_count(c, w) for c, w in zip(captures, weights, strict=True)]
-    unit = noise_in_the_image(problem.operators, [1 / mean for mean in means])
+    unit = backprojected_noise(problem.operators, [1 / mean for mean in means])
     return eqx.tree_at(
         lambda p: (p.captures, p.weights, p.tau_unit),
         problem,

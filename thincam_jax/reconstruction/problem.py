@@ -1,4 +1,4 @@
-"""What a reconstruction minimises: one problem for every camera that brings an operator."""
+"""The inverse problem of a reconstruction, for any camera with a linear operator."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -17,34 +17,34 @@ from thincam_jax.reconstruction.total_variation import TotalVariation
 
 
 class InverseProblem(eqx.Module):
-    r"""Captures g_k of one image f through linear operators A_k, and what is asked of the image.
+    r"""Least squares for an image f from captures g_k through linear operators A_k, regularised.
 
     .. math:: E(f) = \tfrac12 \sum_k \big\|\sqrt{w_k}\,(A_k f - g_k)\big\|^2 + \tau\,u\,R(f),
         \qquad f \ge 0
 
     (thesis Eq 5.11 with the crop of the sensor in A). Images have the axes (*batch, channel, plane,
-    y, x). An operator whose `in_shape` is (y, x) or (plane, y, x) serves every channel alike;
-    that of one with all four is (channel, plane, y, x), and its capture begins with the channel.
+    y, x). An operator whose `in_shape` is (y, x) or (plane, y, x) applies to every channel; one of
+    (channel, plane, y, x) has a capture that begins with the channel.
 
     τ is relative. Its unit u is the standard deviation of a pixel of the back-projected noise
     Σ Aᵀwn, if the weights are 1/variance:
 
     .. math:: u = \Big(\sum_k \max(w_k)\,\|A_k\|_F^2 / N\Big)^{1/2}
 
-    with N numbers in the image. A step between two pixels costs what noise alone would pay for it
-    if τ were 1; 1 to 3 suit most scenes, whatever the camera.
+    with N numbers in the image. At τ = 1 a step between two pixels costs as much as noise alone
+    gains by it; 1 to 3 suit most scenes, whatever the camera.
 
     **Arguments**
 
     - `operators`: one for each capture, or one `Stacked`. `Stacked`, `Masked` and `Scaled` are
-      resolved into plain operators, captures and weights, so that what is inside of them keeps its
-      structure. Masked pixels leave the objective.
+      resolved into the operators inside of them, captures and weights, so that solvers can use
+      their structure. Masked pixels get weight 0.
     - `captures`: g_k, (*batch, channel, …), then the axes of the operator's capture.
     - `weights`: w_k that broadcast to the captures: 1/variance up to a common factor, 0 where a
       pixel is dead or saturated; default 1.
     - `tau`: τ ≥ 0, relative.
     - `regulariser`: R; default isotropic total variation.
-    - `nonnegative`: whether f ≥ 0 is asked.
+    - `nonnegative`: whether to constrain f ≥ 0.
 
     **Errors**: ValueError, one line, where operators and captures do not fit.
     """
@@ -92,7 +92,7 @@ class InverseProblem(eqx.Module):
         _check_operators(self.operators, self.captures)
         dtype = self.captures[0].dtype
         self.tau = checks.non_negative("tau", tau, "a ratio").astype(dtype)
-        self.tau_unit = noise_in_the_image(self.operators, self.weights).astype(dtype)
+        self.tau_unit = backprojected_noise(self.operators, self.weights).astype(dtype)
         self.regulariser = TotalVariation() if regulariser is None else regulariser
         self.nonnegative = nonnegative
 
@@ -116,7 +116,7 @@ class InverseProblem(eqx.Module):
         return (*leading, planes, *self.field_shape)
 
 
-def noise_in_the_image(
+def backprojected_noise(
     operators: Sequence[AbstractOperator], weights: Sequence[Float[Array, "..."]]
 ) -> Float[Array, ""]:
     """u of `InverseProblem`: the standard deviation of a pixel of the back-projected noise."""
@@ -129,7 +129,7 @@ def detector_shape(operator: AbstractOperator) -> tuple[int, ...]:
     return operator.out_shape[1:] if len(operator.in_shape) == 4 else operator.out_shape
 
 
-def see(operator: AbstractOperator, image: Float[Array, "..."]) -> Float[Array, "..."]:
+def forward(operator: AbstractOperator, image: Float[Array, "..."]) -> Float[Array, "..."]:
     """A f of an image (*batch, channel, plane, y, x)."""
     return operator(image[..., 0, :, :] if len(operator.in_shape) == 2 else image)
 
@@ -143,7 +143,7 @@ def back_project(operator: AbstractOperator, capture: Float[Array, "..."]) -> Fl
 def residuals(problem: InverseProblem, image: Image):
     """A_k f − g_k of every capture."""
     return tuple(
-        see(operator, image) - capture
+        forward(operator, image) - capture
         for operator, capture in zip(problem.operators, problem.captures, strict=True)
     )
 
@@ -158,7 +158,7 @@ def back_projected(
 
 
 def gradient(problem: InverseProblem, image: Image):
-    r"""That of the misfit: :math:`\sum_k A_k^T w_k (A_k f - g_k)`."""
+    r"""Gradient of the misfit, :math:`\sum_k A_k^T w_k (A_k f - g_k)`."""
     return back_projected(problem, residuals(problem, image))
 
 
@@ -174,16 +174,27 @@ def misfit(problem: InverseProblem, image: Image):
 
 
 def objective(problem: InverseProblem, image: Image) -> Float[Array, "*batch"]:
-    """E(f) of each batch element; it says nothing of f ≥ 0."""
+    """E(f) of each batch element, without the constraint f ≥ 0."""
     return misfit(problem, image) + problem.absolute_tau * problem.regulariser(image)
 
 
-# Compiled, for what stands between two chunks of iterations.
-worth = jax.jit(objective)
+# For checks between two chunks of iterations.
+compiled_objective = jax.jit(objective)
+
+
+@jax.jit
+def relative_residual(problem: InverseProblem, image: Image) -> Float[Array, ""]:
+    """‖Af − g‖/‖g‖ over the pixels of positive weight."""
+    parts = list(zip(residuals(problem, image), problem.captures, problem.weights, strict=True))
+    missing, known = (
+        jnp.concatenate([jnp.where(w > 0, part[n], 0).ravel() for *part, w in parts])
+        for n in (0, 1)
+    )
+    return jnp.linalg.norm(missing) / jnp.linalg.norm(known)
 
 
 def total_misfit(image: Image, problem: InverseProblem) -> Float[Array, ""]:
-    """½ Σ w (A f − g)² over the batch, as optimistix calls it: image first, problem second."""
+    """½ Σ w (A f − g)² over the batch, for `optimistix.minimise(total_misfit, …, args=problem)`."""
     return jnp.sum(misfit(problem, image))
 
 
@@ -193,7 +204,7 @@ def total_objective(image: Image, problem: InverseProblem) -> Float[Array, ""]:
 
 
 def with_tau(problem: InverseProblem, tau: Number) -> InverseProblem:
-    """The same problem with another relative τ."""
+    """This problem with another relative τ."""
     return eqx.tree_at(lambda p: p.tau, problem, jnp.asarray(tau, problem.tau.dtype))
 
 
@@ -205,7 +216,7 @@ def uniform_level(problem: InverseProblem) -> Float[Array, "*batch channel"]:
         problem.operators, problem.captures, problem.weights, strict=True
     ):
         axes = tuple(range(-len(detector_shape(operator)), 0))
-        flat = see(operator, uniform)
+        flat = forward(operator, uniform)
         seen = seen + jnp.sum(weight * flat * capture, axis=axes)
         light = light + jnp.sum(weight * flat * flat, axis=axes)
     light = jnp.broadcast_to(light, jnp.shape(seen))
@@ -214,13 +225,13 @@ def uniform_level(problem: InverseProblem) -> Float[Array, "*batch channel"]:
 
 @jax.jit
 def uniform_image(problem: InverseProblem) -> Image:
-    """The uniform image that explains the captures best, not below zero: a good start."""
+    """The non-negative uniform image that explains the captures best: a good start."""
     level = jnp.maximum(uniform_level(problem), 0)[..., None, None, None]
     return jnp.broadcast_to(level, problem.image_shape)
 
 
 def start_image(problem: InverseProblem, image: Float[Array, "..."] | None) -> Image:
-    """The image given, checked, or the uniform one."""
+    """Check a start image; by default the uniform one."""
     if image is None:
         return uniform_image(problem)
     if image.shape != problem.image_shape:
@@ -232,7 +243,7 @@ def start_image(problem: InverseProblem, image: Float[Array, "..."] | None) -> I
 
 
 def convolutions(problem: InverseProblem) -> tuple[CropConvolution, ...] | None:
-    """The operators if all are convolutions on one window, which transforms diagonalise."""
+    """The operators if all are convolutions on one window, diagonal in the Fourier domain."""
     found = tuple(o for o in problem.operators if isinstance(o, CropConvolution))
     layouts = {(o.window, o.field_shape, o.spectrum.shape[-3]) for o in found}
     return found if len(found) == len(problem.operators) and len(layouts) == 1 else None
@@ -245,7 +256,7 @@ def _plain(operator: AbstractOperator, capture, weight) -> list[tuple]:
         parts = zip(operator.operators, _each(capture, count), _each(weight, count), strict=True)
         return [plain for part in parts for plain in _plain(*part)]
     if isinstance(operator, Masked | Scaled):
-        change = _trusted if isinstance(operator, Masked) else _rescaled
+        change = _masked if isinstance(operator, Masked) else _rescaled
         values = operator.valid if isinstance(operator, Masked) else operator.gain
         if is_shape(operator.out_shape):
             return _plain(operator.operator, *change(capture, weight, values))
@@ -258,13 +269,13 @@ def _plain(operator: AbstractOperator, capture, weight) -> list[tuple]:
     return [(operator, capture, weight)]
 
 
-def _trusted(capture, weight, valid):
-    """A masked pixel may hold NaN; its weight is 0."""
+def _masked(capture, weight, valid):
+    """Capture and weight with masked pixels, which may be NaN, set to 0."""
     return jnp.where(valid, jnp.asarray(capture), 0), jnp.where(valid, weight, 0)
 
 
 def _rescaled(capture, weight, gain):
-    """w (c A f − g)² = w c² (A f − g/c)²."""
+    """Capture and weight without the gain: w (c A f − g)² = w c² (A f − g/c)²."""
     inverse = jnp.where(gain == 0, 0, 1 / jnp.where(gain == 0, 1, gain))
     return capture * inverse, weight * gain**2
 
@@ -311,3 +322,126 @@ def _check_operators(operators, captures) -> None:
         raise ValueError(
             f"captures differ in batch or channels: {sorted(leading)}; they show one image"
         )
+
+
+# The power method approaches the largest singular value from below.
+MARGIN = 1.05
+
+POWER_ITERATIONS = 40
+
+
+class WeightedOperator(AbstractOperator):
+    r"""Weighted operators of a problem and its batch, :math:`f \mapsto (\sqrt{w_k}\, A_k f)_k`."""
+
+    problem: InverseProblem
+
+    @property
+    def in_shape(self) -> tuple[int, ...]:
+        return self.problem.image_shape
+
+    @property
+    def out_shape(self) -> tuple[tuple[int, ...], ...]:
+        return tuple(c.shape for c in self.problem.captures)
+
+    def __call__(self, image: Image):
+        pairs = zip(self.problem.operators, self.problem.weights, strict=True)
+        return tuple(jnp.sqrt(w) * forward(operator, image) for operator, w in pairs)
+
+    def adjoint(self, capture: tuple[Float[Array, "..."], ...]):
+        parts = zip(self.problem.operators, self.problem.weights, capture, strict=True)
+        first, *others = [back_project(operator, jnp.sqrt(w) * c) for operator, w, c in parts]
+        return sum(others, start=first)
+
+
+class ScaledProblem(eqx.Module):
+    r"""A problem rescaled so that the gradient of its misfit has Lipschitz constant 1.
+
+    Captures are about 1, weights at most 1, and :math:`\|\sqrt{w}A\| \le 1`. τ is scaled for a
+    regulariser with R(sf) = sR(f), such as a norm. Iterations compute the same numbers whatever
+    the units of captures, pixels and weights.
+
+    - `image_unit`: times this, an image of `problem` is one of the problem given; `capture_unit`:
+      the same for captures.
+    - `curvature`: Lipschitz constant of the problem given, with a margin.
+    """
+
+    problem: InverseProblem
+    image_unit: Float[Array, ""]
+    capture_unit: Float[Array, ""]
+    curvature: Float[Array, ""]
+
+    def __init__(self, problem: InverseProblem):
+        # The minimiser does not depend on these units, nor do its derivatives on theirs.
+        operator_unit, captured, heaviest = _units(jax.lax.stop_gradient(problem))
+        self.problem = _divided(problem, operator_unit, captured, heaviest)
+        self.image_unit, self.capture_unit = captured / operator_unit, captured
+        self.curvature = heaviest * operator_unit**2
+
+
+@jax.jit
+def _units(problem: InverseProblem):
+    """Units of operators, captures and weights."""
+    heaviest = or_one(jnp.stack([jnp.max(w) for w in problem.weights]).max())
+    strongest = or_one(jnp.stack([_strength(o) for o in problem.operators]).max())
+    captured = _root_mean_square(problem.captures)
+    norm = _norm(_divided(problem, strongest, captured, heaviest))
+    return strongest * norm, captured, heaviest
+
+
+def or_one(value: Float[Array, "..."]) -> Float[Array, "..."]:
+    """The value where it is positive, else 1: a safe divisor."""
+    return jnp.where(value > 0, value, 1)
+
+
+def _strength(operator: AbstractOperator) -> Float[Array, ""]:
+    """A rough estimate of ‖A‖, which keeps squares within the range of the precision."""
+    if isinstance(operator, CropConvolution):
+        return jnp.max(jnp.abs(operator.spectrum))
+    return operator.norm(iterations=3)
+
+
+def _divided(problem: InverseProblem, operator_unit, capture_unit, weight_unit) -> InverseProblem:
+    operators = tuple(_times(o, 1 / operator_unit) for o in problem.operators)
+    captures = tuple(c / capture_unit for c in problem.captures)
+    weights = tuple(w / weight_unit for w in problem.weights)
+    tau_unit = problem.tau_unit / weight_unit / operator_unit / capture_unit
+    return eqx.tree_at(
+        lambda p: (p.operators, p.captures, p.weights, p.tau_unit),
+        problem,
+        (operators, captures, weights, tau_unit),
+    )
+
+
+def _times(operator: AbstractOperator, factor) -> AbstractOperator:
+    """An operator times a number, without a copy of a dense matrix."""
+    if isinstance(operator, CropConvolution):
+        spectrum = operator.spectrum * factor.astype(operator.spectrum.dtype)
+        return eqx.tree_at(lambda o: o.spectrum, operator, spectrum)
+    return Scaled(operator, factor)
+
+
+def _norm(problem: InverseProblem) -> Float[Array, ""]:
+    """‖√w A‖ with a margin, by the power method, at most the bound of the spectra."""
+    dtype = problem.captures[0].dtype
+    (first, *others), (weight, *_) = problem.operators, problem.weights
+    if not others and weight.size == 1:  # the operator may know its own norm
+        found = jnp.sqrt(weight.reshape(())) * first.norm(iterations=POWER_ITERATIONS, dtype=dtype)
+    else:
+        found = WeightedOperator(problem).norm(iterations=POWER_ITERATIONS, dtype=dtype)
+    found = MARGIN * found
+    operators = convolutions(problem)
+    if operators is None:
+        return or_one(found)
+    # Placing on the window and cropping have norm 1: the transfer functions bound the norm.
+    power = sum(
+        jnp.max(w) * jnp.sum(o.spectrum.real**2 + o.spectrum.imag**2, axis=-3)
+        for o, w in zip(operators, problem.weights, strict=True)
+    )
+    return or_one(jnp.minimum(found, jnp.sqrt(jnp.max(power))))
+
+
+def _root_mean_square(arrays) -> Float[Array, ""]:
+    """Root mean square of all arrays, without overflow or underflow of squares."""
+    largest = or_one(jnp.stack([jnp.max(jnp.abs(a)) for a in arrays]).max())
+    means = [jnp.mean((a / largest) ** 2) for a in arrays]
+    return or_one(largest * jnp.sqrt(sum(means) / len(means)))

@@ -1,4 +1,4 @@
-r"""Whether a measured PSF is that of a capture: other scales, turns and mirror images, tried."""
+r"""Check a measured PSF against a capture: other scales, rotations and mirror images."""
 
 import math
 from collections.abc import Callable
@@ -13,11 +13,13 @@ from jaxtyping import Float
 
 from thincam_jax._core import checks
 from thincam_jax._core.grids import block_sum
-from thincam_jax.reconstruction.drive import drive
+from thincam_jax.reconstruction.imaging_model import Psfs
+from thincam_jax.reconstruction.iterate import Schedule, iterate
+from thincam_jax.reconstruction.parallel import in_parallel
 from thincam_jax.reconstruction.problem import InverseProblem, objective, residuals
 from thincam_jax.reconstruction.recording import Recording
-from thincam_jax.reconstruction.regularised import admm_method, first_image
-from thincam_jax.reconstruction.seen_by import Psfs
+from thincam_jax.reconstruction.solver import first_image
+from thincam_jax.reconstruction.splittings import admm_method
 
 Orientation = Literal[
     "as given",
@@ -32,7 +34,7 @@ Orientation = Literal[
 ORIENTATIONS: tuple[Orientation, ...] = Orientation.__args__  # type: ignore[attr-defined]
 
 _ITERATIONS = 50
-_BLOCKS = 8  # along the longer side, for what chance does to the misfit
+_BLOCKS = 8  # along the longer side, for the bootstrap of the misfit
 _RESAMPLED = 200
 _RINGS = 32  # of spatial frequency, per cycle/pixel
 # Of the change of sharpness by a scale that is taken back. Without, wrong PSFs win by being sharper
@@ -45,14 +47,14 @@ _LEAST_GAIN = 0.02  # of the objective, for another orientation
 
 @dataclass(frozen=True)
 class PsfCheck:
-    """What `check_psf` found.
+    """Result of `check_psf`.
 
-    - `orientation`: what the PSF given has to undergo to fit best; the turns are anticlockwise.
+    - `orientation`: of the best fit relative to the PSF given; turns are anticlockwise.
     - `scale`: of the PSF that fits best over the one given; `scale_error`: its standard error.
     - `scales`, `objectives`: the profile: scales tried in the best orientation, and the lowest
       objective at each, relative to the lowest of all.
     - `noise_ratio`: rms of the residual of the best PSF over the noise; near 1 it explains all.
-    - `reasons`: one line for each thing that is wrong; empty where the PSF fits as it is.
+    - `reasons`: one line for each fault; empty if the PSF fits as it is.
     """
 
     orientation: Orientation
@@ -65,7 +67,7 @@ class PsfCheck:
 
     @property
     def fits(self) -> bool:
-        """Whether no other scale or orientation fits better than the one given."""
+        """Whether no other scale or orientation fits better."""
         return not self.reasons
 
 
@@ -84,7 +86,7 @@ def check_psf(
     tau: float | int = 2.0,
     callback: Callable[[int, int], object] | None = None,
 ) -> PsfCheck:
-    r"""Tell a PSF of a wrong scale, turned or mirrored, from the capture itself.
+    r"""Detect a PSF of a wrong scale or orientation from the capture itself.
 
     For each orientation o and scale s of the PSF h the scene is reconstructed, non-negative and
     with total variation R, and the lowest objective is noted:
@@ -92,29 +94,29 @@ def check_psf(
     .. math:: J(o, s) = \min_{f \ge 0} \tfrac12 \sum w\,(h_{o,s} * f - g)^2 + \tau R(f).
 
     A wrong PSF explains a capture nearly as well as the right one, by an image full of artefacts:
-    the residual alone is 1 to 2 times as large. J counts the artefacts, too. The eight turns and
-    mirror images come first, then scales about the best of them, in steps of half a pixel at the
-    edge; s is at the lowest point of the parabola through them. Its standard error is that of
-    bootstrap over blocks of pixels. A scale is named wrong if it is off by more than four standard
-    errors and 0.3 pixels at the edge, an orientation if the block's misfits agree on it by four
-    standard errors and J falls by 2 %. A turn of a symmetric PSF changes nothing and is not named.
+    the residual alone is 1 to 2 times as large. J includes the artefacts. The eight orientations
+    are tried first, then scales of the best one, in steps of half a pixel at the edge; s is at the
+    minimum of the parabola through them, with a standard error by bootstrap over blocks of pixels.
+    A scale is reported wrong if it is off by more than four standard errors and 0.3 pixels at the
+    edge, an orientation if the misfits of the blocks agree by four standard errors and J falls by
+    2 %. A symmetric PSF has no wrong orientation.
 
-    **What it does not tell**: a shifted PSF, which shifts the picture and fits as well; blur, or a
-    scale more than `search` away; and any scale beside a quarter turn where the sensor is not
-    square: what was beside it is missing, and asks for another scale. Turn the PSF, then check it.
+    **Not detected**: a shifted PSF, which shifts the image and fits as well; blur, or a scale
+    more than `search` away; and the scale with a quarter turn if the sensor is not square, since
+    part of the PSF is then missing. Turn the PSF, then check it again.
 
     **Arguments**
 
     - `recording`: captures of at least 32 pixels a side with `Psfs` of one plane. Some 20
       reconstructions are made: average blocks of pixels until the longer side is 100 to 200.
-    - `search`: how far to look for the scale, in parts of one, at most 0.5.
+    - `search`: range of the scale about 1, at most 0.5.
     - `tau`: as of `AdmmTV`.
-    - `callback`: called with the number of PSFs tried and of those to try.
+    - `callback`: called with the number of PSFs tried and their total.
 
     **Errors**: ValueError, one line, for recordings without measured PSFs, and numbers out of
     range; TypeError inside jit.
     """
-    if not isinstance(recording.seen_by, Psfs) or recording.seen_by.psfs.shape[2] != 1:
+    if not isinstance(recording.imaging_model, Psfs) or recording.imaging_model.psfs.shape[2] != 1:
         raise ValueError("a check takes measured PSFs of one plane; give a recording with tc.Psfs")
     if checks.is_traced(recording.captures[0]):
         raise TypeError("check_psf searches: call it outside jit and grad")
@@ -124,7 +126,7 @@ def check_psf(
     search = float(checks.positive("search", search, "parts of one"))
     if search > 0.5:
         raise ValueError(f"search = {search:g} is too wide; give at most 0.5")
-    given = np.asarray(recording.seen_by.psfs)
+    given = np.asarray(recording.imaging_model.psfs)
     try_psf = _Trial(recording, float(tau))
     pixel = 2 / max(shape)
     wide = math.ceil(search / pixel)
@@ -153,7 +155,7 @@ def check_psf(
 
 
 class _Trial:
-    """Reconstructs with one PSF after the other, all else kept as it is with the one given."""
+    """Reconstructs with a PSF, with the weights and the unit of τ of the PSF given."""
 
     def __init__(self, recording: Recording, tau: float):
         self.recording, self.tau = recording, tau
@@ -164,19 +166,17 @@ class _Trial:
         self.block = max(4, max(recording.captures[0].shape[-2:]) // _BLOCKS)
 
     def __call__(self, psf: np.ndarray) -> _Tried:
-        seen_by = self.recording.seen_by
-        assert isinstance(seen_by, Psfs)
-        tried = replace(self.recording, seen_by=replace(seen_by, psfs=psf))
+        model = self.recording.imaging_model
+        assert isinstance(model, Psfs)
+        tried = replace(self.recording, imaging_model=replace(model, psfs=psf))
         problem = tried.problem(tau=self.tau)
         problem = eqx.tree_at(
             lambda p: (p.weights, p.tau_unit), problem, (self.weights, self.tau_unit)
         )
-        outcome = drive(
-            admm_method(problem),
+        outcome = iterate(
+            in_parallel(problem, admm_method),
             first_image(problem, None, uniform=False),
-            iterations=_ITERATIONS,
-            tolerance=1e-6,
-            adapt_until=_ITERATIONS // 2,
+            Schedule(_ITERATIONS, 1e-6, adapt_until=_ITERATIONS // 2),
         )
         return _Tried(*_values(problem, outcome.image, self.block))
 
@@ -199,7 +199,7 @@ def _parts(problem: InverseProblem, image):
 
 
 def _oriented(psf: np.ndarray, number: int) -> np.ndarray:
-    """The PSF in one of `ORIENTATIONS`, cut or filled up with zeros to its own shape."""
+    """The PSF in one of `ORIENTATIONS`, cropped or zero-padded to its own shape."""
     mirrored = psf[..., ::-1] if number >= 4 else psf
     turned = np.rot90(mirrored, number % 4, axes=(-2, -1))
     for axis in (-2, -1):
@@ -214,10 +214,10 @@ def _oriented(psf: np.ndarray, number: int) -> np.ndarray:
 
 
 def _scaled(psf: np.ndarray, scale: float) -> Float[np.ndarray, "capture channel plane k l"]:
-    """The PSF enlarged about its middle, by cubic splines, of the sum and near the sharpness given.
+    """The PSF enlarged about its centre, by cubic splines, with its sum and nearly its sharpness.
 
-    A sharper PSF asks for less detail in the image, and so explains a capture at a lower cost,
-    right or wrong: its power over spatial frequency is brought towards that of the one given.
+    A sharper PSF needs less detail in the image, and so explains a capture at a lower cost, right
+    or wrong: its power spectrum is adjusted towards that of the PSF given.
     """
     if scale == 1:
         return psf
@@ -240,7 +240,7 @@ def _scaled(psf: np.ndarray, scale: float) -> Float[np.ndarray, "capture channel
 
 
 def _sharpness(wanted: np.ndarray, found: np.ndarray, frequency: np.ndarray) -> np.ndarray:
-    """exp(a + b ν²) that brings one spectrum to the power of another, 1 at ν = 0."""
+    """The gain exp(a + b ν²) that matches the power of one spectrum to another, 1 at ν = 0."""
     ring = np.round(frequency * _RINGS).astype(int).ravel()
     power, other = (np.bincount(ring, np.abs(s.ravel()) ** 2)[1:] for s in (wanted, found))
     radius = np.arange(1, len(power) + 1) / _RINGS
@@ -253,7 +253,7 @@ def _sharpness(wanted: np.ndarray, found: np.ndarray, frequency: np.ndarray) -> 
 
 
 def _best_orientation(found: list[_Tried]) -> int:
-    """The one with the lowest objective, if it is better than the one given beyond chance."""
+    """The orientation of lowest objective, if significantly better than the one given."""
     best = min(range(len(found)), key=lambda k: found[k].objective)
     gains = found[0].misfits - found[best].misfits
     spread = np.std(gains) * math.sqrt(gains.size)
@@ -265,7 +265,7 @@ def _best_orientation(found: list[_Tried]) -> int:
 def _judged(
     orientation: Orientation, profile: dict[float, _Tried], pixel: float, pixels: int, whole: bool
 ) -> PsfCheck:
-    """`whole`: nothing of the PSF was cut off to turn it."""
+    """`whole`: nothing of the PSF was cropped to turn it."""
     scales = np.array(sorted(profile))
     found = [profile[s] for s in scales]
     objectives = np.array([one.objective for one in found])

@@ -1,9 +1,7 @@
-"""What was seen: captures with all that is known of how they were taken."""
+"""Recordings, captures with what is known of how they were taken; and reconstructed images."""
 
 import dataclasses
-import functools
 import math
-import operator
 from collections.abc import Sequence
 from typing import Any
 
@@ -18,6 +16,8 @@ from thincam_jax._core.checks import Number, Numbers
 from thincam_jax._core.grids import same_parity
 from thincam_jax._core.memory import refuse_if_too_large
 from thincam_jax._core.module import Module
+from thincam_jax._core.quantity import unchecked
+from thincam_jax.imaging.display import eight_bit, pictures, png_bytes
 from thincam_jax.imaging.operators import (
     AbstractOperator,
     CropConvolution,
@@ -30,69 +30,121 @@ from thincam_jax.imaging.operators import (
 from thincam_jax.imaging.operators.base import is_shape, shapes_of
 from thincam_jax.imaging.operators.crop_convolution import cut
 from thincam_jax.lensless.camera import LenslessCamera
-from thincam_jax.reconstruction.drive import Outcome
+from thincam_jax.reconstruction.imaging_model import Cameras, Psfs, distance_ratios
+from thincam_jax.reconstruction.iterate import Outcome, Progress
 from thincam_jax.reconstruction.noise import estimate_variance, given_variances
 from thincam_jax.reconstruction.problem import InverseProblem
-from thincam_jax.reconstruction.registration import distance_ratios, register
 from thincam_jax.reconstruction.regularisers import AbstractRegulariser
-from thincam_jax.reconstruction.seen_by import Cameras, Psfs
-from thincam_jax.reconstruction.solver import Reconstruction
-from thincam_jax.reconstruction.synthesis import check_synthesis, separate
+from thincam_jax.reconstruction.synthesis import Channel, check_synthesis, separate, with_channel
+
+
+class Reconstruction(Module):
+    """A reconstructed image; with cameras upright as the scene is, otherwise as the captures are.
+
+    - `image`: radiance, (*batch, y, x), in the scene's unit; (*batch, plane, y, x) with planes.
+    - `pitch`: distance of its pixels on the object, mm (of each plane); None without cameras.
+    - `method`, `reason`: how it was made, and why so if that was left to `choose_solver`, or what
+      was noticed when τ was left to a rule.
+    - `ending`: how an iteration ended: "converged", "iterations_exhausted", "stopped" by the
+      callback, "interrupted" by Ctrl-C or "non_finite"; None for methods in closed form.
+    - `history`: objective and residuals along the way; see `Progress`.
+    - `iterations`, `seconds`: done and taken; compilation is part of the time.
+    - `tau`: the relative τ used, as given or found; None for methods without.
+    - `consistency`, `confidence`: of a learned method, which may make things up: residual of the
+      explained capture, root mean square, over the noise's deviation, for each element of the
+      batch; and how sure it is of each pixel, 0 to 1, (*batch, y, x).
+    """
+
+    image: Float[Array, "*batch y x"]
+    pitch: Float[Array, "*plane"] | None = eqx.field(converter=unchecked("mm"))
+    method: str = eqx.field(static=True, default="")
+    reason: str = eqx.field(static=True, default="")
+    ending: str | None = eqx.field(static=True, default=None)
+    history: tuple[Progress, ...] = eqx.field(static=True, default=(), repr=False)
+    iterations: int = eqx.field(static=True, default=0)
+    seconds: float = eqx.field(static=True, default=0.0)
+    tau: float | None = eqx.field(static=True, default=None)
+    consistency: Float[Array, "*capture"] | None = None
+    confidence: Float[Array, "*capture y x"] | None = None
+
+    @property
+    def status(self) -> str:
+        """`ending`, or "ok" without one; "non_finite" for NaN or infinity. Unknown inside jit."""
+        if not bool(jnp.isfinite(self.image).all()):
+            return "non_finite"
+        return self.ending or "ok"
+
+    @property
+    def has_planes(self) -> bool:
+        """Whether the images of several distances are known to be behind each other."""
+        return self.pitch is not None and self.pitch.ndim > 0
+
+    def _repr_png_(self) -> bytes:
+        """What a notebook shows: the image with gamma 2.2; planes and a batch beside each other."""
+        images = pictures(self.image, planes=self.has_planes)
+        return png_bytes(eight_bit(np.concatenate(images, axis=1)))
 
 
 class Recording(Module):
-    """What was seen: captures, how they came about, their noise, and the pixels to trust.
+    """Captures with their imaging model, their noise and the mask of valid pixels.
 
     **Arguments**
 
-    - `captures`: (capture, *batch, y, x), or a list of (*batch, y, x), one for each of `seen_by`.
-      The last batch axis is the colour channel. With operators (*batch, …) of each, with the axes
-      that the operator's captures have.
-    - `seen_by`: `Cameras`, whose PSFs are computed; `Psfs`, which were measured; or an operator of
-      `thincam_jax.imaging.operators`, or a list of them, which all see one image.
-    - `noise_variance`: one number, or one for each capture, in the captures' units squared;
-      estimated where it is not given (see `estimate_variance`), which takes captures that are
-      images.
-    - `valid`: mask of the pixels to trust, that broadcasts to the captures.
+    - `captures`: (capture, *batch, y, x), or a list of (*batch, y, x), one for each camera, PSF or
+      operator of `imaging_model`. The last batch axis is the colour channel. With operators
+      (*batch, …), with the axes that the operator's captures have.
+    - `imaging_model`: `Cameras`, whose PSFs are computed; `Psfs`, which were measured; or an
+      operator of `thincam_jax.imaging.operators`, or a list of operators of one image.
+    - `noise_variance`: one number, or one for each capture, in the captures' units squared. By
+      default it is estimated by `estimate_variance`, which needs captures that are images.
+    - `valid`: mask of the valid pixels, that broadcasts to the captures.
 
-    **Errors**: ValueError, one line, for captures that do not fit what has seen them.
+    **Errors**: ValueError, one line, for captures that do not fit the imaging model.
     """
 
     captures: tuple[Float[Array, "..."], ...]
-    seen_by: Cameras | Psfs | Stacked
+    imaging_model: Cameras | Psfs | Stacked
     noise_variance: Any
     valid: tuple[Array, ...] | None
 
     def __init__(
-        self, captures: Any, seen_by: Any, *, noise_variance: Any = None, valid: Any = None
+        self, captures: Any, imaging_model: Any, *, noise_variance: Any = None, valid: Any = None
     ):
-        if isinstance(seen_by, Sequence) and seen_by and isinstance(seen_by[0], LenslessCamera):
+        if (
+            isinstance(imaging_model, Sequence)
+            and imaging_model
+            and isinstance(imaging_model[0], LenslessCamera)
+        ):
             raise TypeError(
                 "a list of cameras does not say in which light; give tc.Cameras(cameras, "
                 "wavelength=…, object_distance=…)"
             )
-        if isinstance(seen_by, AbstractOperator):
-            if is_shape(seen_by.out_shape):
+        if isinstance(imaging_model, AbstractOperator):
+            if is_shape(imaging_model.out_shape):
                 captures, valid = [captures], None if valid is None else [valid]
-            seen_by = [seen_by]
-        if isinstance(seen_by, Sequence):
-            if not all(isinstance(one, AbstractOperator) for one in seen_by):
-                raise TypeError("seen_by holds something else than operators; give operators only")
-            seen_by = Stacked([part for one in seen_by for part in _apart(one)])
+            imaging_model = [imaging_model]
+        if isinstance(imaging_model, Sequence):
+            if not all(isinstance(one, AbstractOperator) for one in imaging_model):
+                raise TypeError(
+                    "imaging_model holds objects that are no operators; give operators only"
+                )
+            imaging_model = Stacked(
+                [part for one in imaging_model for part in _single_captures(one)]
+            )
             captures, valid = (_flat(parts) for parts in (captures, valid))
-        if not isinstance(seen_by, Cameras | Psfs | Stacked):
+        if not isinstance(imaging_model, Cameras | Psfs | Stacked):
             raise TypeError(
-                f"the captures were seen by a {type(seen_by).__name__}; give tc.Cameras(…), "
+                f"imaging_model is a {type(imaging_model).__name__}; give tc.Cameras(…), "
                 "tc.Psfs(…), or operators"
             )
-        self.seen_by = seen_by
+        self.imaging_model = imaging_model
         self.captures = tuple(_floating(c) for c in captures)
         self._check_captures(getattr(captures, "shape", [c.shape for c in self.captures]))
         self.noise_variance = noise_variance
         self.valid = None if valid is None else self._masks(valid)
         if self.valid and not any(checks.is_traced(m) or np.asarray(m).any() for m in self.valid):
             raise ValueError("valid is False everywhere; give a mask with pixels to trust")
-        if not isinstance(seen_by, Stacked):  # operators may have masks of their own
+        if not isinstance(imaging_model, Stacked):  # operators may have masks of their own
             self._require_finite()
 
     def problem(
@@ -103,42 +155,46 @@ class Recording(Module):
         nonnegative: bool = True,
         synthesis: Any = None,
     ) -> InverseProblem:
-        """What an iterative method is to minimise; see `InverseProblem` for the arguments.
+        """The problem that an iterative method minimises; see `InverseProblem` for the arguments.
 
         - `synthesis`: real matrix (channel × capture) of sums of captures that are reconstructed in
           place of the captures; default: the captures. Sums in which the bright background cancels
           converge much faster.
         """
-        captures, valid = self._trusted()
+        captures, valid = self._masked_captures()
         settings = {"tau": tau, "regulariser": regulariser, "nonnegative": nonnegative}
-        if isinstance(self.seen_by, Stacked):
+        if isinstance(self.imaging_model, Stacked):
             _no_synthesis(synthesis, "operators")
             variances = self._variances(np.eye(len(captures)), captures, valid)
-            shapes = shapes_of(self.seen_by.out_shape)
-            lengths = [len(s) - _channels(o) for s, o in self._detectors(shapes)]
-            captures = [_with_channel(c, n) for c, n in zip(captures, lengths, strict=True)]
+            shapes = shapes_of(self.imaging_model.out_shape)
+            lengths = [len(s) - _channel_axes(o) for s, o in self._detectors(shapes)]
+            captures = [with_channel(c, n) for c, n in zip(captures, lengths, strict=True)]
             weights = [
-                1 / v if m is None else _with_channel(m.astype(c.dtype), n) / v
+                1 / v if m is None else with_channel(m.astype(c.dtype), n) / v
                 for m, v, c, n in zip(valid, variances, captures, lengths, strict=True)
             ]
-            return InverseProblem(self.seen_by.operators, captures, weights=weights, **settings)
-        matrix, sums = self._sums(synthesis, captures, valid)
+            return InverseProblem(
+                self.imaging_model.operators, captures, weights=weights, **settings
+            )
+        matrix, channels = self._channels(synthesis, captures, valid)
         variances = [
-            variance * s.ratio**2
-            for variance, s in zip(self._variances(matrix, captures, valid), sums, strict=True)
+            variance * c.ratio**2
+            for variance, c in zip(self._variances(matrix, captures, valid), channels, strict=True)
         ]
         pitch = self._pitch(captures[0].dtype)
-        return _convolutions(sums, variances, pitch, self._field(), settings)
+        return _convolutions(channels, variances, pitch, self._field(), settings)
 
     def reconstruction(
         self, problem: InverseProblem, outcome: Outcome, method: str, tau: float | None = None
     ) -> Reconstruction:
-        """The image of an outcome with the axes of the captures, upright, and how it came about."""
+        """The image of an outcome, upright and with the axes of the captures, with its history."""
         image, pitch = outcome.image, None
-        if isinstance(self.seen_by, Cameras):
-            pitch = self.seen_by.pitch
-        elif isinstance(self.seen_by, Psfs) and self.seen_by.field_shape is None:
-            image = middle(image, self.captures[0].shape[-2:])  # the part in front of the sensor
+        if isinstance(self.imaging_model, Cameras):
+            pitch = self.imaging_model.pitch
+        elif isinstance(self.imaging_model, Psfs) and self.imaging_model.field_shape is None:
+            image = centred_crop(
+                image, self.captures[0].shape[-2:]
+            )  # the part in front of the sensor
         planes = image.shape[-3]
         batch = image.shape[:-3] if self._has_channel() else image.shape[:-4]
         image = image.reshape(*batch, *((planes,) if planes > 1 else ()), *image.shape[-2:])
@@ -154,58 +210,60 @@ class Recording(Module):
         )
 
     def oriented(self, image: Float[Array, "..."]):
-        """An image as the scene is: cameras turn it over; the other way it is the same."""
-        if not isinstance(self.seen_by, Cameras):
+        """The upright image of the scene: cameras turn it by 180°. It is its own inverse."""
+        if not isinstance(self.imaging_model, Cameras):
             return image
         return jnp.asarray(image)[..., ::-1, ::-1]
 
     def with_noise(self, variance: Numbers) -> "Recording":
-        """The same recording with another noise variance."""
+        """This recording with another noise variance."""
         none = {"is_leaf": lambda leaf: leaf is None}
         return eqx.tree_at(lambda recording: recording.noise_variance, self, variance, **none)
 
     def focused(self, object_distance: Numbers | Sequence[Number]) -> "Recording":
-        """The same recording with its `Cameras` focused on another distance, mm."""
-        if not isinstance(self.seen_by, Cameras):
-            raise ValueError("a distance is that of computed PSFs; this recording has no Cameras")
-        focused = dataclasses.replace(self.seen_by, object_distance=object_distance)
-        return dataclasses.replace(self, seen_by=focused)
+        """This recording with its `Cameras` focused on another distance, mm."""
+        if not isinstance(self.imaging_model, Cameras):
+            raise ValueError("only Cameras can be focused; give a recording with tc.Cameras(…)")
+        focused = dataclasses.replace(self.imaging_model, object_distance=object_distance)
+        return dataclasses.replace(self, imaging_model=focused)
 
     def _check_captures(self, given) -> None:
-        """As many as were seen; what cameras and PSFs see are images of one shape."""
-        seen_by, shapes = self.seen_by, [c.shape for c in self.captures]
-        count = len(seen_by.operators) if isinstance(seen_by, Stacked) else seen_by.count
+        """Require one capture for each model; those of cameras and PSFs are images of one shape."""
+        model, shapes = self.imaging_model, [c.shape for c in self.captures]
+        count = len(model.operators) if isinstance(model, Stacked) else model.count
         unlike = len(set(shapes)) > 1 or any(len(shape) < 2 for shape in shapes)
-        if len(shapes) != count or (unlike and not isinstance(seen_by, Stacked)):
+        if len(shapes) != count or (unlike and not isinstance(model, Stacked)):
             raise ValueError(
                 f"captures have shape {given} for {count} cameras, PSFs or operators; give "
                 f"({count}, …, y, x)"
             )
-        if not isinstance(seen_by, Stacked):
+        if not isinstance(model, Stacked):
             checks.channels_first("a capture", shapes[0])
-        if isinstance(seen_by, Cameras):
-            sensor, pixels = seen_by.cameras[0].sensor.shape, shapes[0][-2:]
+        if isinstance(model, Cameras):
+            sensor, pixels = model.cameras[0].sensor.shape, shapes[0][-2:]
             if pixels != sensor:
                 raise ValueError(f"captures have {pixels} pixels, the cameras' sensor {sensor}")
 
     def _require_finite(self) -> None:
-        """Trusted pixels are numbers."""
-        for number, (capture, valid) in enumerate(zip(*self._trusted(), strict=True)):
+        """Require finite values in valid pixels."""
+        for number, (capture, valid) in enumerate(zip(*self._masked_captures(), strict=True)):
             known = not checks.is_traced(capture) and not checks.is_traced(valid)
             if known and not bool(jnp.isfinite(capture).all()):
                 raise ValueError(
-                    f"captures[{number}] holds NaN or infinity; mend it, or leave such pixels out "
+                    f"captures[{number}] holds NaN or infinity; repair it, or exclude such pixels "
                     "with valid=numpy.isfinite(captures)"
                 )
 
     def _detectors(self, shapes):
-        return zip(shapes, self.seen_by.operators, strict=True)  # type: ignore[union-attr]
+        return zip(shapes, self.imaging_model.operators, strict=True)  # type: ignore[union-attr]
 
     def _has_channel(self) -> bool:
         """Whether the captures have an axis before those of the detector."""
-        if isinstance(self.seen_by, Stacked):
-            shape = shapes_of(self.seen_by.out_shape)[0]
-            return self.captures[0].ndim > len(shape) - _channels(self.seen_by.operators[0])
+        if isinstance(self.imaging_model, Stacked):
+            shape = shapes_of(self.imaging_model.out_shape)[0]
+            return self.captures[0].ndim > len(shape) - _channel_axes(
+                self.imaging_model.operators[0]
+            )
         return self.captures[0].ndim > 2
 
     def _masks(self, valid: Any) -> tuple[Array, ...]:
@@ -225,15 +283,15 @@ class Recording(Module):
                 f"valid has shapes {given}; give a mask for each capture, of shapes {shapes}"
             ) from None
 
-    def _trusted(self) -> tuple[list[Array], list[Array | None]]:
-        """Captures and masks; what is neither valid nor finite becomes 0."""
+    def _masked_captures(self) -> tuple[list[Array], list[Array | None]]:
+        """Captures and masks; pixels that are neither valid nor finite become 0."""
         if self.valid is None:
             return list(self.captures), [None] * len(self.captures)
         pairs = list(zip(self.captures, self.valid, strict=True))
         return [jnp.where(m | jnp.isfinite(c), c, 0) for c, m in pairs], [m for _, m in pairs]
 
     def _variances(self, matrix: np.ndarray, captures, valid) -> list[Float[Array, ""]]:
-        """Variances of sums of captures: as given, or estimated where that is nothing or zero."""
+        """Variances of sums of captures: as given, or estimated where none or zero is given."""
         squares = [jnp.asarray(row**2, captures[0].dtype) for row in matrix]
         if self.noise_variance is None:
             each = self._estimated(captures, valid)
@@ -248,148 +306,129 @@ class Recording(Module):
         return [jnp.where(t > 0, t, jnp.sum(s * each)) for t, s in pairs]
 
     def _estimated(self, captures, valid) -> Float[Array, " capture"]:
-        seen_by = self.seen_by
-        if isinstance(seen_by, Stacked) and any(len(s) < 2 for s in shapes_of(seen_by.out_shape)):
-            raise ValueError("give noise_variance: captures that are no images do not show it")
+        model = self.imaging_model
+        if isinstance(model, Stacked) and any(len(s) < 2 for s in shapes_of(model.out_shape)):
+            raise ValueError("give noise_variance: it is estimated from captures that are images")
         return estimate_variance(captures, None if valid[0] is None else valid)
 
     def _pitch(self, dtype) -> Float[Array, ""]:
-        if isinstance(self.seen_by, Cameras):
-            return self.seen_by.cameras[0].sensor.pitch
+        if isinstance(self.imaging_model, Cameras):
+            return self.imaging_model.cameras[0].sensor.pitch
         return jnp.ones((), dtype)
 
     def _field(self) -> tuple[int, int]:
-        seen_by, sensor = self.seen_by, self.captures[0].shape[-2:]
-        if isinstance(seen_by, Cameras):
-            grid = seen_by.cameras[0].sensor.grid
-            return same_parity(seen_by.field_shape or grid.shape, grid.shape)
-        kernel = seen_by.psfs.shape[-2:]  # type: ignore[union-attr]
+        model, sensor = self.imaging_model, self.captures[0].shape[-2:]
+        if isinstance(model, Cameras):
+            grid = model.cameras[0].sensor.grid
+            return same_parity(model.field_shape or grid.shape, grid.shape)
+        kernel = model.psfs.shape[-2:]  # type: ignore[union-attr]
         whole = tuple(s + k - 1 for s, k in zip(sensor, kernel, strict=True))
-        return _fitting_field(seen_by.field_shape or whole, sensor, kernel)  # type: ignore
+        return _fitting_field(model.field_shape or whole, sensor, kernel)  # type: ignore
 
-    def _sums(self, synthesis, captures, valid) -> tuple[np.ndarray, list["_Sum"]]:
-        """The rows of a synthesis with their kernels and captures."""
-        seen_by = self.seen_by
+    def _channels(self, synthesis, captures, valid) -> tuple[np.ndarray, list[Channel]]:
+        """The channels of a synthesis."""
+        model = self.imaging_model
         count = len(captures)
         matrix = separate(count) if synthesis is None else np.asarray(synthesis, dtype=float)
-        if isinstance(seen_by, Cameras):
-            ratios = distance_ratios(seen_by.cameras)
-            check_synthesis(matrix, seen_by.cameras, ratios)
-            kernels = seen_by.kernels(self._field(), ratios)
+        if isinstance(model, Cameras):
+            ratios = distance_ratios(model.cameras)
+            check_synthesis(matrix, model.cameras, ratios)
+            kernels = model.kernels(self._field(), ratios)
         else:
             _no_synthesis(synthesis, "measured PSFs")
             ratios = [1.0] * count
-            kernels = list(seen_by.psfs.astype(captures[0].dtype))  # type: ignore[union-attr]
-        return matrix, [_Sum(row, kernels, captures, valid, ratios) for row in matrix]
+            kernels = list(model.psfs.astype(captures[0].dtype))  # type: ignore[union-attr]
+        return matrix, [Channel(row, kernels, captures, valid, ratios) for row in matrix]
 
 
-class _Sum:
-    """One row of a synthesis: its kernel, its capture, and where this is to be trusted."""
-
-    def __init__(self, row: np.ndarray, kernels, captures, valid, ratios):
-        used = [(float(w), k) for k, w in enumerate(row) if w]
-        self.ratio = ratios[used[0][1]]
-        self.kernel = functools.reduce(operator.add, [w * kernels[k] for w, k in used])
-        whole = functools.reduce(operator.add, [w * captures[k] for w, k in used])
-        self.capture = _with_channel(register(whole, self.ratio), 2)
-        self.valid = None
-        if valid[0] is not None or self.ratio > 1:
-            both = jnp.ones(captures[0].shape, bool)
-            if valid[0] is not None:
-                both = jnp.all(jnp.stack([valid[k] for _, k in used]), axis=0)
-            # A pixel that an invalid one, or the dark beyond the sensor, has been interpolated into
-            # is not trusted either; the interpolation overshoots, too.
-            seen = register(both.astype(captures[0].dtype), self.ratio)
-            self.valid = _with_channel(jnp.abs(seen - 1) < 0.01, 2)
-
-
-def _convolutions(sums, variances, pitch, field_shape, settings) -> InverseProblem:
-    """Operators on one window, and their weights."""
-    dtype = sums[0].capture.dtype
+def _convolutions(channels, variances, pitch, field_shape, settings) -> InverseProblem:
+    """The problem of convolutions on one window."""
+    dtype = channels[0].capture.dtype
     windows = [
-        window_shape(s.capture.shape[-2:], field_shape, _reach(s.kernel, s.capture, field_shape))
-        for s in sums
+        window_shape(
+            c.capture.shape[-2:],
+            field_shape,
+            _kernel_extent(c.kernel, c.capture.shape[-2:], field_shape),
+        )
+        for c in channels
     ]
     window = (max(w[0] for w in windows), max(w[1] for w in windows))
     # Captures, kernels and a field, each with its transform, at the least.
     refuse_if_too_large(
         f"a reconstruction on a field of {field_shape[0]}×{field_shape[1]} pixels",
-        dtype.itemsize * math.prod(window) * (2 * len(sums) + 3),
+        dtype.itemsize * math.prod(window) * (2 * len(channels) + 3),
         "give a smaller field_shape, fewer pixels or fewer captures",
     )
     operators = [
         CropConvolution(
-            s.kernel.astype(dtype),
+            c.kernel.astype(dtype),
             pitch.astype(dtype),
-            s.capture.shape[-2:],
+            c.capture.shape[-2:],
             field_shape,
             summed=1,
             window=window,
         )
-        for s in sums
+        for c in channels
     ]
     weights = [
-        (1.0 if s.valid is None else s.valid.astype(dtype)) / v
-        for s, v in zip(sums, variances, strict=True)
+        (1.0 if c.valid is None else c.valid.astype(dtype)) / v
+        for c, v in zip(channels, variances, strict=True)
     ]
-    return InverseProblem(operators, [s.capture for s in sums], weights=weights, **settings)
+    return InverseProblem(operators, [c.capture for c in channels], weights=weights, **settings)
 
 
-def middle(image: Float[Array, "*batch y x"], shape: Sequence[int]) -> Float[Array, "*batch v u"]:
-    """The middle of an image."""
+def centred_crop(
+    image: Float[Array, "*batch y x"], shape: Sequence[int]
+) -> Float[Array, "*batch v u"]:
+    """The central part of an image, of this shape."""
     corner = [(n - s) // 2 for n, s in zip(image.shape[-2:], shape, strict=True)]
     return cut(image, corner, shape)
 
 
 def _floating(capture) -> Array:
-    """Raw counts are taken as they are, but as real numbers."""
+    """A capture as floating point numbers; complex ones are refused."""
     capture = jnp.asarray(capture)
     if jnp.issubdtype(capture.dtype, jnp.complexfloating):
         raise TypeError(f"a capture is {capture.dtype}; give real numbers")
     return capture if jnp.issubdtype(capture.dtype, jnp.floating) else capture.astype(float)
 
 
-def _apart(operator: AbstractOperator) -> list[AbstractOperator]:
-    """Operators of one capture each in place of one of several, with its masks and gains."""
+def _single_captures(operator: AbstractOperator) -> list[AbstractOperator]:
+    """An operator of several captures as operators of one each, with their masks and gains."""
     if isinstance(operator, Stacked):
-        return [part for one in operator.operators for part in _apart(one)]
+        return [part for one in operator.operators for part in _single_captures(one)]
     if is_shape(operator.out_shape) or not isinstance(operator, Masked | Scaled):
         return [operator]
     given = operator.valid if isinstance(operator, Masked) else operator.gain
-    inside = _apart(operator.operator)
+    inside = _single_captures(operator.operator)
     values = jax.tree.leaves(given) if isinstance(given, tuple) else [given] * len(inside)
     return [type(operator)(one, value) for one, value in zip(inside, values, strict=True)]
 
 
 def _flat(parts: Any) -> Any:
-    """The arrays of a nested tuple; one array of several captures, or None, as it is."""
+    """The arrays of a nested tuple; an array of several captures, or None, unchanged."""
     return jax.tree.leaves(parts) if isinstance(parts, tuple | list) else parts
 
 
-def _channels(operator: AbstractOperator) -> int:
-    """1 if the operator's own axes begin with the colour channel."""
+def _channel_axes(operator: AbstractOperator) -> int:
+    """1 if the axes of the operator's images begin with the colour channel, else 0."""
     return int(len(operator.in_shape) == 4)
-
-
-def _with_channel(capture: Array, axes: int) -> Array:
-    """A capture with an axis for the colour before its own axes."""
-    return capture[None] if capture.ndim == axes else capture
 
 
 def _no_synthesis(synthesis, what: str) -> None:
     if synthesis is not None:
-        raise ValueError(f"a synthesis adds captures of known cameras; leave it out with {what}")
+        raise ValueError(f"a synthesis needs Cameras; leave it out with {what}")
 
 
-def _reach(kernel, capture, field_shape) -> tuple[int, int]:
-    """What of a kernel can send light from the field to the sensor."""
-    most = kernel_shape(capture.shape[-2:], field_shape)
+def _kernel_extent(kernel, sensor, field_shape) -> tuple[int, int]:
+    """Kernel extent that reaches the sensor from the field."""
+    most = kernel_shape(sensor, field_shape)
     rows, columns = (min(k, m) for k, m in zip(kernel.shape[-2:], most, strict=True))
     return rows, columns
 
 
 def _fitting_field(field_shape, sensor, kernel) -> tuple[int, int]:
-    """A field whose centre fits the sensor's and the PSF's samples: smaller by one if need be."""
+    """The field, smaller by one where its centre would not fit the sensor's and PSF's samples."""
     shape = checks.shape2d("field_shape", field_shape)
     sizes = zip(shape, sensor, kernel, strict=True)
     rows, columns = (max(f - (s + f - 1 - k) % 2, 1) for f, s, k in sizes)

@@ -1,8 +1,9 @@
-r"""What is asked of an image besides its captures: R(f) = φ(Kf), and its proximal map."""
+r"""Regularisers R(f) = φ(Kf), their proximal maps, and orthonormal bases for sparsity."""
 
 import abc
 import functools
-from typing import ClassVar
+import math
+from typing import ClassVar, Literal
 
 import equinox as eqx
 import jax
@@ -12,13 +13,36 @@ import numpy as np
 from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float
 
+from thincam_jax._core import checks
 from thincam_jax._core.checks import Number
 from thincam_jax._core.module import Module
-from thincam_jax.reconstruction.wavelet import Wavelet
 
-# What an image is to every solver.
+# Images in all solvers.
 Image = Float[Array, "*batch channel plane y x"]
+
 Parts = tuple[Float[Array, "..."], ...]
+
+Family = Literal["haar", "daubechies4", "daubechies8"]
+
+_ROOT3 = math.sqrt(3.0)
+
+# Scaling filters: the number is their length; vanishing moments are half as many.
+FILTERS: dict[str, tuple[float, ...]] = {
+    "haar": (math.sqrt(0.5), math.sqrt(0.5)),
+    "daubechies4": tuple(
+        c / (4 * math.sqrt(2.0)) for c in (1 + _ROOT3, 3 + _ROOT3, 3 - _ROOT3, 1 - _ROOT3)
+    ),
+    "daubechies8": (
+        0.23037781330885523,
+        0.7148465705525415,
+        0.6308807679295904,
+        -0.02798376941698385,
+        -0.18703481171888114,
+        0.030841381835986965,
+        0.032883011666982945,
+        -0.010597401784997278,
+    ),
+}
 
 
 class AbstractRegulariser(Module):
@@ -48,8 +72,8 @@ class AbstractRegulariser(Module):
         """A bound of ‖K‖²."""
 
 
-def no_dual(regulariser: AbstractRegulariser, image: Image) -> Parts:
-    """The dual of an image that is left as it is, to start `prox` with."""
+def zero_dual(regulariser: AbstractRegulariser, image: Image) -> Parts:
+    """The zero dual, to start `prox` with."""
     shapes = jax.eval_shape(regulariser.analyse, image)
     return tuple(jnp.zeros(s.shape, s.dtype) for s in shapes)
 
@@ -63,21 +87,21 @@ def prox(
     nonnegative: bool,
     iterations: int,
 ) -> tuple[Image, Parts]:
-    r"""The x that minimises step·R(x) + ½‖x − image‖², with x ≥ 0 where asked, and its dual.
+    r"""The x that minimises step·R(x) + ½‖x − image‖², with x ≥ 0 if constrained, and its dual.
 
-    In closed form, x = Kᵀ shrink(K image), if K is orthonormal and no sign is asked. Shrinking and
-    cutting off what is negative do not commute, so that together there is no closed form. As for
-    total variation, the dual problem then is solved, whose solution gives that of both at once,
+    In closed form, x = Kᵀ shrink(K image), if K is orthonormal and the sign is free. Shrinking and
+    clipping do not commute, so with x ≥ 0 there is no closed form. Then, as for total variation,
+    the dual problem is solved,
 
     .. math:: x = P(v - K^T p),\qquad
         p = \arg\min_{\varphi^*(p / step) \le 1} \tfrac12\|P(v - K^T p)\|^2 + \dots
 
-    by accelerated projected gradients, with P the projection on what is allowed (Beck and Teboulle,
-    IEEE Trans. Image Process. 18, 2419, 2009, algorithm FGP). The projection of p is what
-    `shrink` takes away (Moreau).
+    by accelerated projected gradients, with P the projection on the constraint (Beck and Teboulle,
+    IEEE Trans. Image Process. 18, 2419, 2009, algorithm FGP). The projection of p is the part that
+    `shrink` removes (Moreau).
 
-    After a fixed number of `iterations` x is inexact. Within an outer iteration hand the `dual`
-    of the last call back in: the inner problems change little, and the error goes to zero.
+    After a fixed number of `iterations` x is inexact. In an outer iteration pass the `dual` of the
+    last call: the inner problems change little, and the error goes to zero.
     """
     if regulariser.orthonormal and not nonnegative:
         return regulariser.synthesise(regulariser.shrink(regulariser.analyse(image), step)), dual
@@ -93,21 +117,21 @@ def prox(
         moved = tuple(p + rate * s for p, s in zip(lead, slopes, strict=True))
         shrunk = regulariser.shrink(moved, step)
         after = tuple(m - s for m, s in zip(moved, shrunk, strict=True))
-        # Without restart: a map cut short stays continuous, which outer iterations ask for.
-        return after, *run_on(before, lead, after, t, restart=False)
+        # Without restart: a truncated map stays continuous, which outer iterations need.
+        return after, *extrapolated(before, lead, after, t, restart=False)
 
-    start = (dual, dual, first_t(image))
+    start = (dual, dual, first_momentum(image))
     dual, _, _ = jax.lax.fori_loop(0, iterations, body, start)
     return allowed(dual), dual
 
 
-def run_on(
+def extrapolated(
     before: Parts, lead: Parts, after: Parts, t: Float[Array, "..."], *, restart: bool = True
 ) -> tuple[Parts, Float[Array, "..."]]:
-    r"""Where the next gradient is taken, beyond a step from `lead` to `after`, and the next t.
+    r"""The point of the next gradient after a step from `lead` to `after`, and the next t.
 
-    Nesterov's momentum in the sequence of Beck and Teboulle (SIAM J. Imaging Sci. 2, 183, 2009). It
-    starts anew where it points uphill, ⟨lead − after, after − before⟩ > 0: the gradient scheme of
+    Nesterov's momentum with the t of Beck and Teboulle (SIAM J. Imaging Sci. 2, 183, 2009). It
+    restarts where it points uphill, ⟨lead − after, after − before⟩ > 0: the gradient scheme of
     O'Donoghue and Candès (Found. Comput. Math. 15, 715, 2015). Near the minimum, where an
     objective is about quadratic, convergence is then linear at the best rate. Each batch
     element has its own t, (*batch, 1, 1, 1, 1).
@@ -122,8 +146,8 @@ def run_on(
     return ahead, later
 
 
-def first_t(image: Image) -> Float[Array, "*batch 1 1 1 1"]:
-    """The t to start `run_on` with."""
+def first_momentum(image: Image) -> Float[Array, "*batch 1 1 1 1"]:
+    """The initial t of `extrapolated`."""
     return jnp.ones((*image.shape[:-4], 1, 1, 1, 1), image.dtype)
 
 
@@ -135,10 +159,10 @@ def denoise(
     nonnegative: bool = False,
     iterations: int = 100,
 ) -> Image:
-    r"""The image x that minimises ½‖x − image‖² + step·R(x), with x ≥ 0 where asked.
+    r"""Denoise: the x that minimises ½‖x − image‖² + step·R(x), with x ≥ 0 if constrained.
 
-    With R = TV it is denoising by Rudin, Osher and Fatemi. The larger `step` is against the
-    differences in the image, the more of them it takes; `step` has the unit of the image.
+    With R = TV it is the denoising of Rudin, Osher and Fatemi. `step` has the unit of the image; a
+    larger one removes larger differences.
     """
     step = jnp.asarray(step, image.dtype)
     return _denoise(image, step, regulariser, nonnegative, iterations)
@@ -146,8 +170,56 @@ def denoise(
 
 @functools.partial(jax.jit, static_argnames=("nonnegative", "iterations"))
 def _denoise(image, step, regulariser, nonnegative: bool, iterations: int):
-    dual = no_dual(regulariser, image)
+    dual = zero_dual(regulariser, image)
     return prox(regulariser, image, step, dual, nonnegative=nonnegative, iterations=iterations)[0]
+
+
+class Wavelet(eqx.Module):
+    r"""An orthonormal wavelet transform over the last two axes, for images of any size.
+
+    A line x of even length n is split in two halves by a filter h and its mirror,
+
+    .. math:: a_k = \sum_m h_m x_{(2k + m) \bmod n},\qquad
+        d_k = \sum_m (-1)^m h_{M-1-m} x_{(2k + m) \bmod n},
+
+    an orthonormal map, periodic at the border (Daubechies, Commun. Pure Appl. Math. 41, 909, 1988).
+    The last sample of a line of odd length joins the coarse half unchanged, so that the map is
+    orthonormal for every length. Lines and columns are split in turn; then the coarse quarter
+    again. The coefficients have the shape of the image, with the coarse ones of `coarse_shape` in
+    the upper left corner.
+
+    - `family`: "haar", for edges along the axes; "daubechies4" and "daubechies8", for smoother
+      images.
+    - `levels`: how often the coarse part is split, at most until one sample is left.
+    """
+
+    family: Family = eqx.field(static=True)
+    levels: int = eqx.field(static=True)
+
+    def __init__(self, family: Family = "daubechies4", levels: int = 4):
+        self.family = checks.choice("family", family, tuple(FILTERS))  # type: ignore[assignment]
+        if levels < 1:
+            raise ValueError(f"levels = {levels}: give at least 1")
+        self.levels = levels
+
+    def analyse(self, image: Float[Array, "*batch y x"]) -> Float[Array, "*batch y x"]:
+        """The coefficients of an image."""
+        return _analyse(image, self.family, self._shapes(_size(image)))
+
+    def synthesise(self, coefficients: Float[Array, "*batch y x"]) -> Float[Array, "*batch y x"]:
+        """The image of coefficients: the transpose and inverse of `analyse`."""
+        return _synthesise(coefficients, self.family, self._shapes(_size(coefficients)))
+
+    def coarse_shape(self, shape: tuple[int, int]) -> tuple[int, int]:
+        """Size of the coarse part after all splits."""
+        return _half(self._shapes(shape)[-1])
+
+    def _shapes(self, shape: tuple[int, int]) -> tuple[tuple[int, int], ...]:
+        """Sizes of the coarse part before each split."""
+        shapes = [shape]
+        for _ in range(self.levels - 1):
+            shapes.append(_half(shapes[-1]))
+        return tuple(shapes)
 
 
 class Cosines(eqx.Module):
@@ -162,15 +234,15 @@ class Cosines(eqx.Module):
         return jax.scipy.fft.idctn(coefficients, axes=(-2, -1), norm="ortho")
 
     def coarse_shape(self, shape: tuple[int, int]) -> tuple[int, int]:
-        """The mean is one coefficient."""
+        """Size of the coarse part: the mean is one coefficient."""
         return 1, 1
 
 
 class Sparsity(AbstractRegulariser):
     r"""R(f) = Σ |details of f| in an orthonormal basis, each plane and channel by itself.
 
-    The coarse coefficients (of cosines: the mean) are free, so that an even image costs nothing and
-    its brightness is not drawn to zero. R is a seminorm.
+    The coarse coefficients (of cosines: the mean) are not penalised, so that R of a uniform image
+    is 0 and its brightness is not drawn to zero. R is a seminorm.
 
     - `basis`: `Wavelet` or `Cosines`.
     """
@@ -201,7 +273,65 @@ class Sparsity(AbstractRegulariser):
         return jnp.ones((), dtype)
 
     def _free(self, shape) -> Bool[Array, "y x"]:
-        """Where the coarse coefficients stand."""
+        """Mask of the coarse coefficients."""
         sizes = zip(shape[-2:], self.basis.coarse_shape(shape[-2:]), strict=True)
         y, x = (jnp.asarray(np.arange(n) < coarse) for n, coarse in sizes)
         return y[:, None] & x
+
+
+@functools.partial(jax.jit, static_argnames=("family", "shapes"))
+def _analyse(image, family: str, shapes):
+    result = image
+    for rows, columns in shapes:
+        coarse = _split(_split(result[..., :rows, :columns], family, -2), family, -1)
+        result = result.at[..., :rows, :columns].set(coarse)
+    return result
+
+
+@functools.partial(jax.jit, static_argnames=("family", "shapes"))
+def _synthesise(coefficients, family: str, shapes):
+    result = coefficients
+    for rows, columns in reversed(shapes):
+        fine = _join(_join(result[..., :rows, :columns], family, -1), family, -2)
+        result = result.at[..., :rows, :columns].set(fine)
+    return result
+
+
+def _size(image: Array) -> tuple[int, int]:
+    rows, columns = image.shape[-2:]
+    return rows, columns
+
+
+def _half(shape: tuple[int, int]) -> tuple[int, int]:
+    rows, columns = shape
+    return (rows + 1) // 2, (columns + 1) // 2
+
+
+def _split(line: Float[Array, "..."], family: str, axis: int) -> Float[Array, "..."]:
+    """Coarse and detail halves of the lines along an axis, concatenated."""
+    line = jnp.moveaxis(line, axis, -1)
+    even = line.shape[-1] // 2 * 2
+    body, rest = line[..., :even], line[..., even:]
+    coarse = detail = jnp.zeros_like(body[..., ::2])
+    for m, (low, high) in enumerate(_filters(family)):
+        taken = jnp.roll(body, -m, axis=-1)[..., ::2]
+        coarse, detail = coarse + low * taken, detail + high * taken
+    return jnp.moveaxis(jnp.concatenate([coarse, rest, detail], axis=-1), -1, axis)
+
+
+def _join(line: Float[Array, "..."], family: str, axis: int) -> Float[Array, "..."]:
+    """The transpose of `_split`."""
+    line = jnp.moveaxis(line, axis, -1)
+    half = line.shape[-1] // 2
+    coarse, rest, detail = jnp.split(line, [half, line.shape[-1] - half], axis=-1)
+    body = jnp.zeros((*line.shape[:-1], 2 * half), line.dtype)
+    for m, (low, high) in enumerate(_filters(family)):
+        spread = jnp.zeros_like(body).at[..., ::2].set(low * coarse + high * detail)
+        body = body + jnp.roll(spread, m, axis=-1)
+    return jnp.moveaxis(jnp.concatenate([body, rest], axis=-1), -1, axis)
+
+
+def _filters(family: str) -> list[tuple[float, float]]:
+    low = np.array(FILTERS[family])
+    high = low[::-1] * (-1.0) ** np.arange(len(low))
+    return list(zip(low.tolist(), high.tolist(), strict=True))

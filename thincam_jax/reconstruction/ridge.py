@@ -4,35 +4,54 @@ r"""Ridge (Tikhonov) regression: the posterior mean under a white prior.
     + \tfrac{\rho}{2}\|f - \bar f\|^2, \qquad
     \Big(\sum_k A_k^T w_k A_k + \rho\Big)(f - \bar f) = \sum_k A_k^T w_k (g_k - A_k \bar f)
 
-It is linear in the captures and knows the crop of the sensor and the weight of every pixel, which a
-Wiener filter does not. With weights 1/σ² and a white Gaussian prior of mean f̄ and variance s²,
-f is the mean of the posterior if ρ = 1/s². s is not known. It is taken as large as the brightness
-of the uniform image that explains the captures best (`uniform_level`), a scene of full contrast:
+It is linear in the captures and models the crop of the sensor and the weight of every pixel, which
+a Wiener filter does not. With weights 1/σ² and a white Gaussian prior of mean f̄ and variance s²,
+f is the posterior mean if ρ = 1/s². s is unknown and taken as the brightness of the uniform image
+that explains the captures best (`uniform_level`), as in a scene of full contrast:
 
 .. math:: \rho = \rho_{rel} / s^2,\qquad s^2 = \mathrm{mean}\,\mathrm{level}^2
 
 over batch and channels. It is the rule k = σ² / mean β² of Hoerl, Kennard and Baldwin (Commun.
 Stat. 4, 105, 1975), with the uniform image for a first fit. f̄ is that image.
+
+With the singular value decompositions :math:`P = U_P S V^T, Q = U_Q T W^T` of a separable camera
+(FlatCam) of one term, a white prior of variance 1/ρ and noise of variance 1, the modes decouple:
+
+.. math:: \hat g = U_P^T (g - A\bar f)\, U_Q,\qquad
+    f = \bar f + V \Big[\frac{s_i t_j}{s_i^2 t_j^2 + \rho}\,\hat g_{ij}\Big] W^T
+
+(Asif et al., IEEE Trans. Comput. Imaging 3, 384, 2017). So do the rules that choose ρ: generalised
+cross-validation (Golub, Heath and Wahba, Technometrics 21, 215, 1979), which needs no variance of
+the noise, and Stein's unbiased estimate of the risk (Ann. Stat. 9, 1135, 1981), which does:
+
+.. math:: \mathrm{GCV} = \frac{N\,r(\rho)}{(N - n(\rho))^2},\qquad
+    \mathrm{SURE} = r(\rho) - N + 2\,n(\rho)
+
+with the squared residual r, N pixels of the captures and
+:math:`n = \sum s^2t^2/(s^2t^2 + \rho)` degrees of freedom.
 """
 
 import functools
+import math
 import operator
 import time
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import ClassVar, cast
+from typing import ClassVar, Literal, cast
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import lineax
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, DTypeLike, Float
 
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Number
+from thincam_jax._core.precision import product
 from thincam_jax.imaging.operators import Separable
-from thincam_jax.reconstruction.drive import Outcome, concluded
+from thincam_jax.imaging.operators.separable import SeparableModes
+from thincam_jax.reconstruction.iterate import Outcome, outcome_of_run
 from thincam_jax.reconstruction.normal_equations import (
     IterativeNormal,
     SeparableNormal,
@@ -40,6 +59,7 @@ from thincam_jax.reconstruction.normal_equations import (
 )
 from thincam_jax.reconstruction.problem import (
     InverseProblem,
+    ScaledProblem,
     back_projected,
     misfit,
     residuals,
@@ -48,8 +68,6 @@ from thincam_jax.reconstruction.problem import (
 )
 from thincam_jax.reconstruction.recording import Recording
 from thincam_jax.reconstruction.regularisers import Image
-from thincam_jax.reconstruction.scaled import ScaledProblem
-from thincam_jax.reconstruction.separable import RULES, Prior, Rule, choose_precision
 from thincam_jax.reconstruction.solver import (
     AbstractSolver,
     Synthesis,
@@ -57,6 +75,14 @@ from thincam_jax.reconstruction.solver import (
     at_most,
     small_enough,
 )
+
+Rule = Literal["gcv", "sure"]
+
+RULES: tuple[Rule, ...] = ("gcv", "sure")
+
+# ρ is searched on a grid from 1e-12 to 1e4 of the largest eigenvalue of AᵀA, then between the
+# neighbours of the best, twice: to 0.2 %.
+_STEPS, _ZOOMS, _DECADES = 33, 3, (-12.0, 4.0)
 
 
 class Ridge(AbstractSolver):
@@ -68,10 +94,10 @@ class Ridge(AbstractSolver):
     **Arguments**
 
     - `ridge`: noise variance over image variance, in parts of what the captures' mean brightness
-      makes of it. 1 is right for pixels that vary independently by as much as their mean. More
-      draws the image to its mean, less lets more noise into it. "gcv" (generalised
-      cross-validation) and "sure" (Stein's unbiased estimate of the risk, with the noise variance
-      of the recording) find it from the captures of a separable camera of one term.
+      predicts. 1 suits pixels that vary independently by as much as their mean. More draws the
+      image to its mean, less lets more noise into it. "gcv" (generalised cross-validation) and
+      "sure" (Stein's unbiased estimate of the risk, with the noise variance of the recording)
+      choose it from the captures of a separable camera of one term.
     - `synthesis`: as of `AdmmTV`.
     - `iterations`: at most. `tolerance`: of the residual of the normal equations and of the last
       step, root mean square, relative to the right-hand side and the image.
@@ -129,10 +155,10 @@ class Ridge(AbstractSolver):
 
         .. math:: \sigma_i = \Big(\sum_k A_k^T w_k A_k + \rho\Big)^{-1/2}_{ii}
 
-        the same for every capture of this noise. Of all pixels, not of each, 95 % lie within
-        1.96 σ of the truth where the noise variance is right and the image varies as the prior
-        says: choose `ridge` by a rule, and `correlation` for an image that is not white, whose
-        errors a white prior takes for larger than they are. What the camera hardly sees has the
+        the same for every capture of this noise. On average over all pixels, 95 % lie within
+        1.96 σ of the truth if the noise variance is right and the image varies as in the prior:
+        choose `ridge` by a rule, and a `correlation` for an image that is not white, whose errors
+        a white prior overestimates. Components that the camera hardly transmits have the
         deviation of the prior, ρ^(−1/2).
 
         **Errors**: ValueError for operators without a closed form: convolutions, several terms.
@@ -145,13 +171,12 @@ class Ridge(AbstractSolver):
         return jnp.sqrt(normal.variance() / scaled.curvature)
 
     def _posed(self, recording):
-        """The problem, the one of what is white in its image, the mean, the prior, and ρ."""
+        """The problem, the whitened problem, the mean, the prior and ρ."""
         problem = recording.problem(synthesis=self.synthesis)
-        # Sums in which the uniform light cancels do not tell how bright the scene is; the captures
-        # do.
+        # Sums in which the uniform light cancels do not show how bright the scene is; captures do.
         plain = problem if self.synthesis is None else recording.problem()
         level = _level(plain)
-        level = jnp.where(jnp.isfinite(level), level, 0)  # else the captures say what is wrong
+        level = jnp.where(jnp.isfinite(level), level, 0)  # the solve reports such captures
         mean = jnp.maximum(level, 0)[..., None, None, None]
         mean = jnp.broadcast_to(mean, problem.image_shape)
         given = 1.0 if isinstance(self.ridge, str) else self.ridge * image_precision(level)
@@ -167,8 +192,8 @@ class Ridge(AbstractSolver):
         return min(tried, key=operator.itemgetter(0))[1]
 
 
-def _prior(problem: InverseProblem, correlation: float) -> Prior | None:
-    """None for a white one, which every operator takes."""
+def _prior(problem: InverseProblem, correlation: float) -> "MarkovPrior | None":
+    """The prior of this correlation; None if white, for any operator."""
     if correlation == 0:
         return None
     first = problem.operators[0]
@@ -177,21 +202,23 @@ def _prior(problem: InverseProblem, correlation: float) -> Prior | None:
             f"correlation = {correlation:g} needs one separable camera; leave it out for a "
             f"{type(first).__name__}"
         )
-    return Prior.of(first.in_shape, correlation, problem.captures[0].dtype)
+    return MarkovPrior.of(first.in_shape, correlation, problem.captures[0].dtype)
 
 
-def _whitened(problem: InverseProblem, mean, prior: Prior) -> InverseProblem:
+def _whitened(problem: InverseProblem, mean, prior: "MarkovPrior") -> InverseProblem:
     """The problem of z, f = f̄ + L z."""
     (camera,), captures = problem.operators, [-r for r in residuals(problem, mean)]
     assert isinstance(camera, Separable)
     return eqx.tree_at(
-        lambda p: (p.operators, p.captures), problem, ((prior.seen_by(camera),), tuple(captures))
+        lambda p: (p.operators, p.captures),
+        problem,
+        ((prior.whitened(camera),), tuple(captures)),
     )
 
 
 def image_precision(level: Float[Array, "..."]) -> float:
-    """1/s² of a scene of full contrast and this brightness; 1 of a dark one."""
-    # In double precision of NumPy: squares of small brightnesses leave float32.
+    """1/s² of a scene of full contrast and this brightness; 1 if dark."""
+    # In float64: squares of small brightnesses underflow in float32.
     variance = float(np.mean(np.asarray(level, dtype=np.float64) ** 2))
     return 1.0 / (variance if variance > 0 else 1.0)
 
@@ -204,14 +231,14 @@ def solve_ridge(
     iterations: int = 300,
     tolerance: float = 1e-6,
 ) -> Outcome:
-    """The ridge reconstruction of a problem; its τ, R and sign are not used.
+    """The ridge reconstruction of a problem; its τ, R and constraint are not used.
 
-    One piece of compiled code: there is no progress to be watched.
+    One compiled program, without progress.
 
     **Arguments**
 
     - `precision`: ρ > 0, 1/variance of the image, where the weights are 1/variance of the noise.
-    - `mean`: f̄, what the image is drawn to; default the uniform image that explains the captures.
+    - `mean`: f̄; default the uniform image that explains the captures.
     - `iterations`, `tolerance`: of conjugate gradients, see `Ridge`.
     """
     began = time.perf_counter()
@@ -219,7 +246,7 @@ def solve_ridge(
     rho = checks.positive("precision", precision, "1/variance of the image").astype(dtype)
     mean = start_image(problem, mean)
     image, converged, steps = _solve(problem, rho, mean, jnp.asarray(tolerance, dtype), iterations)
-    return concluded(
+    return outcome_of_run(
         mean,
         image,
         functools.partial(ridge_objective, problem, rho, mean),
@@ -255,3 +282,119 @@ def _solve(problem: InverseProblem, precision, mean, tolerance, iterations: int)
 
 
 _level = jax.jit(uniform_level)
+
+
+@jax.jit
+def ridge_by_modes(
+    modes: SeparableModes, captures: Float[Array, "*batch y x"], precision: Float[Array, ""]
+) -> Float[Array, "*batch m n"]:
+    """The ridge reconstruction with mean 0, for captures whose noise has variance 1.
+
+    Four matrix products a capture: for videos and channels of one camera, whose modes
+    `Separable.with_modes` keeps. `Ridge` does the same for a recording, with its mean.
+
+    - `precision`: ρ > 0, 1/variance of the image where noise has variance 1.
+    """
+    seen = _seen(modes, captures)
+    inside = seen * modes.values / (modes.values**2 + precision)
+    return product(product(modes.rows, inside), modes.columns.T)
+
+
+class MarkovPrior(eqx.Module):
+    r"""Prior of correlated pixels: covariance e^{−|y−y'|/ℓ − |x−x'|/ℓ} over ρ.
+
+    The product of two Markov chains, the usual model of photographs (Jain, Proc. IEEE 69, 349,
+    1981). It is L Lᵀ with the lower triangular L = `rows` ⊗ `columns`, so that z = L⁻¹(f − f̄) is
+    white and a separable camera of f is one of z.
+    """
+
+    rows: Float[Array, "m m"]
+    columns: Float[Array, "n n"]
+
+    @classmethod
+    def of(cls, shape: tuple[int, int], correlation: float, dtype: DTypeLike) -> "MarkovPrior":
+        """The prior of images of a shape. `correlation`: ℓ ≥ 0, pixels; 0 is white."""
+        near = math.exp(-1 / correlation) if correlation > 0 else 0.0
+
+        def root(count):
+            steps = np.subtract.outer(np.arange(count), np.arange(count))
+            chain = np.where(steps >= 0, near ** np.abs(steps), 0)
+            chain[:, 1:] *= math.sqrt(1 - near**2)
+            return jnp.asarray(chain, dtype)
+
+        return cls(root(shape[0]), root(shape[1]))
+
+    def whitened(self, operator: Separable) -> Separable:
+        """The operator of the white image z."""
+        return Separable(
+            product(operator.left, self.rows), product(operator.right, self.columns)
+        ).with_modes()
+
+    def image(self, white: Float[Array, "*batch m n"]) -> Float[Array, "*batch m n"]:
+        """L z."""
+        return product(product(self.rows, white), self.columns.T)
+
+    def modes(self, modes: SeparableModes) -> SeparableModes:
+        """Modes of z as images: modes for `ridge_by_modes` under this prior."""
+        return replace(
+            modes, rows=product(self.rows, modes.rows), columns=product(self.columns, modes.columns)
+        )
+
+
+def choose_precision(
+    problem: InverseProblem, mean: Image, rule: Rule
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """ρ of least GCV or SURE, one for all batch elements and channels, and that least value.
+
+    - `mean`: f̄ of the ridge.
+
+    **Errors**: ValueError unless the problem is of one separable term with one weight.
+    """
+    checks.choice("rule", rule, RULES)
+    unit = jnp.ones((), problem.captures[0].dtype)
+    normal = normal_equations(problem, unit)
+    if not isinstance(normal, SeparableNormal):
+        raise ValueError(
+            f"ridge = {rule!r} needs the modes of one separable term with one weight; give a "
+            "number, or a Separable of one term (truncated(terms=1)) and no dead pixels"
+        )
+    (difference,) = residuals(problem, mean)
+    weighted = -jnp.sqrt(problem.weights[0]) * difference
+    return _least(normal.modes, weighted, rule)
+
+
+@jax.jit(static_argnames="rule")
+def _least(modes: SeparableModes, captures, rule: Rule):
+    """The minimum over log ρ, by three grids of decreasing range."""
+    seen = _seen(modes, captures)
+    power = (modes.values / jnp.max(modes.values)) ** 2
+    assert modes.seen_rows is not None and modes.seen_columns is not None
+    beside = captures - product(product(modes.seen_rows, seen), modes.seen_columns.T)
+    beside, squares = jnp.sum(beside**2), jnp.sum(seen**2, axis=tuple(range(seen.ndim - 2)))
+    images = captures.size // (captures.shape[-2] * captures.shape[-1])
+    count = captures.size
+
+    def criterion(exponent):
+        kept = power / (power + 10.0**exponent)
+        residual = jnp.sum(squares * (1 - kept) ** 2) + beside
+        freedom = images * jnp.sum(kept)
+        if rule == "gcv":
+            # Avoids 0/0 if nothing is filtered out.
+            return count * residual / jnp.maximum(count - freedom, 0.5) ** 2
+        return residual - count + 2 * freedom
+
+    lower, upper = _DECADES
+    lower, upper = (jnp.asarray(e, captures.dtype) for e in (lower, upper))
+    for _ in range(_ZOOMS):
+        tried = jnp.linspace(lower, upper, _STEPS, dtype=captures.dtype)
+        best = jnp.argmin(jax.lax.map(criterion, tried)).astype(jnp.int32)
+        lower, upper = tried[jnp.maximum(best - 1, 0)], tried[jnp.minimum(best + 1, _STEPS - 1)]
+    middle = (lower + upper) / 2
+    return jnp.max(modes.values) ** 2 * 10.0**middle, criterion(middle)
+
+
+def _seen(modes: SeparableModes, captures):
+    """ĝ, the coefficient of each mode in the captures."""
+    if modes.seen_rows is None or modes.seen_columns is None:
+        raise ValueError("these are modes of several terms; give those of one, truncated(terms=1)")
+    return product(product(modes.seen_rows.T, captures), modes.seen_columns)

@@ -1,10 +1,12 @@
-"""What a reconstruction is asked for and what it returns: solvers as objects, results."""
+"""Solvers as objects: their base classes and the checks of their settings."""
 
 import abc
+import functools
+import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, ClassVar
+from typing import Any, ClassVar, Literal, get_args
 
-import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -12,97 +14,54 @@ from jaxtyping import Array, Float
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Numbers
 from thincam_jax._core.module import Module
-from thincam_jax._core.quantity import unchecked
-from thincam_jax.imaging.display import eight_bit, pictures, png_bytes
-from thincam_jax.reconstruction.drive import Callback, Progress
+from thincam_jax.imaging.operators.crop_convolution import place
+from thincam_jax.reconstruction.iterate import Callback
+from thincam_jax.reconstruction.problem import InverseProblem, uniform_level
+from thincam_jax.reconstruction.recording import Reconstruction, Recording
+from thincam_jax.reconstruction.regularisers import AbstractRegulariser, Image
+from thincam_jax.reconstruction.total_variation import TotalVariation
 
-if TYPE_CHECKING:
-    from thincam_jax.reconstruction.recording import Recording
-
-# Sums of captures to take in place of the captures: a real matrix (channel × capture).
+# A real matrix (channel × capture): sums of captures, reconstructed in place of the captures.
 Synthesis = Numbers | Sequence[Sequence[float]]
 
+TauRule = Literal["discrepancy", "sure"]
 
-class Reconstruction(Module):
-    """A reconstructed image; with cameras upright as the scene is, otherwise as the captures are.
-
-    - `image`: radiance, (*batch, y, x), in the scene's unit; (*batch, plane, y, x) with planes.
-    - `pitch`: distance of its pixels on the object, mm (of each plane); None without cameras.
-    - `method`, `reason`: how it was made, and why so if that was left to `choose_solver`, or what
-      was noticed when τ was left to a rule.
-    - `ending`: how an iteration ended: "converged", "iterations_exhausted", "stopped" by the
-      callback, "interrupted" by Ctrl-C or "non_finite"; None for methods in closed form.
-    - `history`: objective and residuals along the way; see `Progress`.
-    - `iterations`, `seconds`: done and taken; compilation is part of the time.
-    - `tau`: the relative τ used, as given or found; None for methods without.
-    - `consistency`, `confidence`: of a learned method, which may make things up: residual of the
-      explained capture, root mean square, over the noise's deviation, for each element of the
-      batch; and how sure it is of each pixel, 0 to 1, (*batch, y, x).
-    """
-
-    image: Float[Array, "*batch y x"]
-    pitch: Float[Array, "*plane"] | None = eqx.field(converter=unchecked("mm"))
-    method: str = eqx.field(static=True, default="")
-    reason: str = eqx.field(static=True, default="")
-    ending: str | None = eqx.field(static=True, default=None)
-    history: tuple[Progress, ...] = eqx.field(static=True, default=(), repr=False)
-    iterations: int = eqx.field(static=True, default=0)
-    seconds: float = eqx.field(static=True, default=0.0)
-    tau: float | None = eqx.field(static=True, default=None)
-    consistency: Float[Array, "*capture"] | None = None
-    confidence: Float[Array, "*capture y x"] | None = None
-
-    @property
-    def status(self) -> str:
-        """`ending`, or "ok" without one; "non_finite" for NaN or infinity. Unknown inside jit."""
-        if not bool(jnp.isfinite(self.image).all()):
-            return "non_finite"
-        return self.ending or "ok"
-
-    @property
-    def has_planes(self) -> bool:
-        """Whether the images of several distances are known to be behind each other."""
-        return self.pitch is not None and self.pitch.ndim > 0
-
-    def _repr_png_(self) -> bytes:
-        """What a notebook shows: the image with gamma 2.2; planes and a batch beside each other."""
-        images = pictures(self.image, planes=self.has_planes)
-        return png_bytes(eight_bit(np.concatenate(images, axis=1)))
+DEFAULT_TAU = 2.0
 
 
 class AbstractSolver(Module):
-    """What is done about a recording; its fields are all that can be asked of the method."""
+    """A reconstruction method; its fields are all of its settings."""
 
     name: ClassVar[str]
 
     @abc.abstractmethod
-    def solve(self, recording: "Recording") -> Reconstruction:
-        """The image of a scene from captures of it."""
+    def solve(self, recording: Recording) -> Reconstruction:
+        """Reconstruct the image of a recording."""
 
 
 class AbstractIterativeSolver(AbstractSolver):
-    """A solver that goes from image to image, and so can begin with one and be watched."""
+    """A solver that iterates: it accepts a start image and reports its progress."""
 
     @abc.abstractmethod
     def solve(
         self,
-        recording: "Recording",
+        recording: Recording,
         *,
         start: Float[Array, "..."] | None = None,
         callback: Callback | None = None,
     ) -> Reconstruction:
-        """The image of a scene from captures of it; see `reconstruct`."""
+        """Reconstruct the image of a recording; see `reconstruct` for the arguments."""
 
 
 def at_most(iterations: int) -> int:
-    """How many iterations there may be, checked."""
+    """Check a number of iterations."""
     if isinstance(iterations, bool) or not isinstance(iterations, int) or iterations < 1:
         raise ValueError(f"iterations = {iterations}; give a whole number of at least 1")
     return iterations
 
 
 def small_enough(tolerance: float) -> float:
-    """How small residuals must be at the end, checked."""
+    """Check a tolerance of residuals."""
     checks.non_negative("tolerance", tolerance, "a ratio")
     return tolerance
 
@@ -110,3 +69,58 @@ def small_enough(tolerance: float) -> float:
 def as_synthesis(synthesis: Synthesis | None) -> np.ndarray | None:
     """A synthesis as a matrix, (channel, capture)."""
     return None if synthesis is None else np.asarray(synthesis, dtype=float)
+
+
+def checked_tau(tau: Any) -> Any:
+    """Check τ ≥ 0, or the name of a rule that chooses it."""
+    if isinstance(tau, str):
+        checks.choice("tau", tau, get_args(TauRule))
+        return tau
+    return checks.non_negative("tau", tau, "a ratio")
+
+
+def of_kind(name: str, value: Any, kind: type):
+    """Check the type of a value; by default an instance of that type with its defaults."""
+    if value is None:
+        return kind()
+    if not isinstance(value, kind):
+        wanted = kind.__name__.removeprefix("Abstract")
+        raise ValueError(f"{name} is a {type(value).__name__}; give a {wanted}")
+    return value
+
+
+as_variation = functools.partial(of_kind, "variation", kind=TotalVariation)
+
+
+def as_regulariser(value: Any) -> AbstractRegulariser:
+    """The regulariser given; total variation by default."""
+    return TotalVariation() if value is None else of_kind("regulariser", value, AbstractRegulariser)
+
+
+def first_image(
+    problem: InverseProblem, start: Float[Array, "..."] | None, *, uniform: bool
+) -> Image:
+    """The start image, padded with zeros to the field; by default uniform, or zero."""
+    shape, dtype = problem.image_shape, problem.captures[0].dtype
+    if start is None:
+        level = _level(problem)[..., None, None, None] if uniform else jnp.zeros((), dtype)
+        return jnp.broadcast_to(level, shape)
+    start = jnp.asarray(start, dtype)
+    if start.ndim < 2 or start.size != math.prod((*shape[:-2], *start.shape[-2:])):
+        raise ValueError(
+            f"start has shape {start.shape}; give an image of the result's batch and planes, "
+            f"{shape[:-2]}, and its rows and columns"
+        )
+    rows, columns = start.shape[-2:]
+    start = start.reshape(*shape[:-2], rows, columns)
+    if (rows, columns) == problem.field_shape:
+        return start
+    corner = [(f - n) // 2 for f, n in zip(problem.field_shape, (rows, columns), strict=True)]
+    if min(corner) < 0:
+        raise ValueError(
+            f"start has {rows}×{columns} pixels, more than the field's {problem.field_shape}"
+        )
+    return place(start, corner, problem.field_shape)
+
+
+_level = jax.jit(uniform_level)

@@ -1,4 +1,4 @@
-"""Moving objects: captures that follow one another, each from where the one before has come to."""
+"""Moving objects: successive captures, each reconstructed from the state of the last."""
 
 from dataclasses import replace
 from typing import Any
@@ -8,21 +8,21 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from thincam_jax.reconstruction.admm import RELAXATION, AdmmMethod
-from thincam_jax.reconstruction.drive import CHUNK, Outcome
+from thincam_jax.reconstruction.admm import RELAXATION, AdmmMethod, State, admm_map
+from thincam_jax.reconstruction.iterate import CHUNK, Outcome
+from thincam_jax.reconstruction.methods import AdmmTV
 from thincam_jax.reconstruction.problem import InverseProblem
 from thincam_jax.reconstruction.recording import Recording
-from thincam_jax.reconstruction.regularised import AdmmTV
-from thincam_jax.reconstruction.splitting import State, admm_map
+from thincam_jax.reconstruction.splittings import admm_method
 
 
 class Stream(eqx.Module):
-    r"""ADMM-TV of one capture after the other, a few iterations each, image and forces kept.
+    r"""ADMM-TV of successive captures, a few iterations each, with image and duals kept.
 
     .. math:: q_t = T^m(q_{t-1};\, g_t)
 
-    with T of `thincam_jax.reconstruction.splitting`. An object that stands still is reconstructed
-    to convergence, one that moves to what m iterations reach::
+    with T of `thincam_jax.reconstruction.admm`. A static object is reconstructed to convergence, a
+    moving one as far as m iterations reach::
 
         stream = tc.Stream(recording, tc.AdmmTV(0.5), steps=4)   # of the first capture
         stream, image = stream.next(captures)                    # of each that follows
@@ -33,10 +33,10 @@ class Stream(eqx.Module):
     **Arguments**
 
     - `recording`: of the first capture.
-    - `solver`: τ a number; its iterations are spent on the first capture.
-    - `steps`: m, iterations for each that follows.
+    - `solver`: with τ a number; its iterations are those of the first capture.
+    - `steps`: m, iterations for each later capture.
 
-    **Errors**: ValueError, one line, for steps below 1, a τ to be found, or captures of another
+    **Errors**: ValueError, one line, for steps below 1, a τ given by a rule, or captures of another
     shape than the first.
     """
 
@@ -50,10 +50,10 @@ class Stream(eqx.Module):
         if isinstance(steps, bool) or not isinstance(steps, int) or steps < 1:
             raise ValueError(f"steps = {steps}; give a whole number of at least 1")
         if isinstance(solver.tau, str):
-            raise ValueError(f"tau = {solver.tau!r} is found for one capture; give a number")
+            raise ValueError(f"tau = {solver.tau!r} is a rule for one capture; give a number")
         self.recording, self.solver, self.steps = recording, solver, steps
         problem = _posed(recording, solver)
-        method: Any = AdmmMethod(problem)
+        method: Any = admm_method(problem)
         running = method.start(jnp.zeros(problem.image_shape, problem.captures[0].dtype))
         for done in range(CHUNK, solver.iterations + CHUNK, CHUNK):
             running = method.advance(running, CHUNK)
@@ -63,13 +63,13 @@ class Stream(eqx.Module):
         self.state = running.value
 
     def next(self, captures: Any) -> tuple["Stream", Float[Array, "*batch y x"]]:
-        """The stream after captures like those of the first recording, and their image."""
+        """The stream after the next captures, and their image."""
         wanted = [c.shape for c in self.recording.captures]
         given = captures if len(wanted) > 1 or jnp.shape(captures) != wanted[0] else [captures]
         if [jnp.shape(c) for c in given] != wanted:
             raise ValueError(
                 f"captures have shapes {[jnp.shape(c) for c in given]}, the first recording's "
-                f"{wanted}; give captures of the same camera, or begin another stream"
+                f"{wanted}; give captures of the same camera, or start another stream"
             )
         state, image = _next(self, tuple(jnp.asarray(c) for c in given))
         return eqx.tree_at(lambda s: s.state, self, state), image

@@ -5,12 +5,18 @@ A synthesis is a real matrix W (channel × capture): the channel c is Σ_k W_ck 
 two real channels here, so that results are real without a projection and noise is counted right.
 """
 
+import functools
+import operator
 from collections.abc import Sequence
+from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 import scipy
+from jaxtyping import Array
 
 from thincam_jax.lensless.camera import LenslessCamera
+from thincam_jax.reconstruction.imaging_model import register
 
 
 def separate(count: int) -> np.ndarray:
@@ -93,3 +99,35 @@ def check_synthesis(
     grids = {(c.sensor.shape, float(c.sensor.pitch)) for c in cameras}
     if len(grids) > 1:
         raise ValueError(f"cameras have different sensors {sorted(grids)}; use one sensor")
+
+
+class Channel:
+    """A row of a synthesis: its kernel, its capture and the mask of its valid pixels."""
+
+    def __init__(
+        self,
+        row: np.ndarray,
+        kernels: Sequence[Array],
+        captures: Sequence[Array],
+        valid: Sequence[Any],
+        ratios: Sequence[float],
+    ):
+        used = [(float(w), k) for k, w in enumerate(row) if w]
+        self.ratio = ratios[used[0][1]]
+        self.kernel = functools.reduce(operator.add, [w * kernels[k] for w, k in used])
+        whole = functools.reduce(operator.add, [w * captures[k] for w, k in used])
+        self.capture = with_channel(register(whole, self.ratio), 2)
+        self.valid = None
+        if valid[0] is not None or self.ratio > 1:
+            both = jnp.ones(captures[0].shape, bool)
+            if valid[0] is not None:
+                both = jnp.all(jnp.stack([valid[k] for _, k in used]), axis=0)
+            # A pixel interpolated from an invalid one, or from beyond the sensor, is invalid, too;
+            # the interpolation also overshoots.
+            seen = register(both.astype(captures[0].dtype), self.ratio)
+            self.valid = with_channel(jnp.abs(seen - 1) < 0.01, 2)
+
+
+def with_channel(capture: Array, axes: int) -> Array:
+    """A capture with a channel axis before its own axes."""
+    return capture[None] if capture.ndim == axes else capture

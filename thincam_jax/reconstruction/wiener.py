@@ -1,13 +1,18 @@
-r"""Wiener synthesis of K captures into one image (thesis Eq 3.44, corrected)."""
+r"""Wiener synthesis of K captures into one image (thesis Eq 3.44, corrected); where it suffices.
+
+Spectra of scene and noise are per sample: a white image of variance σ² has the spectrum σ² at every
+frequency. They lie on the half plane of a real DFT of the padded window.
+"""
 
 import functools
-from typing import ClassVar
+from collections.abc import Sequence
+from typing import ClassVar, Literal
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Array, Bool, Complex, Float
 
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Numbers
@@ -15,34 +20,30 @@ from thincam_jax._core.grids import Grid, fast_shape, same_parity
 from thincam_jax._core.precision import as_complex
 from thincam_jax._core.quantity import choice
 from thincam_jax.imaging.operators import CropConvolution, kernel_grid, kernel_shape
+from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.psf import psf
-from thincam_jax.reconstruction.noise import estimate_variance
-from thincam_jax.reconstruction.recording import Recording
-from thincam_jax.reconstruction.registration import (
+from thincam_jax.reconstruction.imaging_model import (
+    Cameras,
+    Psfs,
     distance_ratios,
     own_field,
     register,
     registered_shape,
 )
-from thincam_jax.reconstruction.seen_by import Cameras
-from thincam_jax.reconstruction.solver import (
-    AbstractSolver,
-    Reconstruction,
-    Synthesis,
-    as_synthesis,
-)
-from thincam_jax.reconstruction.spectra import (
-    Prior,
-    crop_noise,
-    inner_band,
-    prior_spectrum,
-    scene_power,
-)
+from thincam_jax.reconstruction.noise import estimate_variance, given_variances
+from thincam_jax.reconstruction.recording import Reconstruction, Recording
+from thincam_jax.reconstruction.solver import AbstractSolver, Synthesis, as_synthesis
 from thincam_jax.reconstruction.synthesis import check_synthesis, keep_bias, separate
+
+Prior = Literal["inverse_square", "flat"]
+
+# Contrast of a channel over its noise from which a filter suffices. A judgement: total variation
+# gains 0.5 to 2.5 dB at 1 to 3 (configs/fza_admm_tv.yaml), and next to nothing without noise.
+_CLEAN = 30.0
 
 
 class WienerSynthesis(eqx.Module):
-    r"""The best linear reconstruction from several captures, ready to be applied.
+    r"""The best linear reconstruction from several captures, as a function of the captures.
 
     With the channels :math:`G_c = H_c F + N_c` (sums of captures, see
     `thincam_jax.reconstruction.synthesis`), noise spectra η_c and scene spectrum η_f,
@@ -53,13 +54,13 @@ class WienerSynthesis(eqx.Module):
     3.46). One channel is a single capture's Wiener filter; channels at several distances are the
     thesis' method A, pairs of β its method B, wavelengths its colour synthesis.
 
-    The scene's mean is estimated from the raw captures by least squares, and its response is taken
-    away before the filter and given back after, so that the prior concerns the contrast only. The
-    prior's strength is found from the captures' own power. Captures at other distances than the
-    largest are enlarged to its scale, and their responses with them.
+    The scene's mean is estimated from the raw captures by least squares; its response is subtracted
+    before the filter and the mean added after it, so that the prior is one of contrast only. The
+    prior's strength is estimated from the power of the captures. Captures at other distances than
+    the largest are enlarged to its scale, and their responses with them.
 
     The filter treats captures as if nothing had been cropped. Where a channel keeps the bias of the
-    captures, the steps at the sensor's borders are counted as noise (`spectra.crop_noise`); a
+    captures, the steps at the sensor's borders are counted as noise (`crop_noise`); a
     single capture therefore loses its lowest frequencies, which synthesised ones do not.
 
     Differentiable in all numbers of the cameras but the distances, which set array sizes.
@@ -182,8 +183,8 @@ class WienerSynthesis(eqx.Module):
         periodogram = jnp.abs(spectra) ** 2 / (squared * pixels)
         expected = jnp.abs(self.spectra) ** 2 * self.prior
         inner = inner_band(self.padded, self.sensor_shape)
-        # Per captured sample, though the scene may cover fewer: taken per scene sample the power is
-        # higher and the result 0.3 dB worse, because what the crop hides is noise left uncounted.
+        # Per captured sample, though the scene may cover fewer: per scene sample the power is
+        # higher and the result 0.3 dB worse, because the crop adds noise that is not modelled.
         scene = self.prior * scene_power(periodogram - density, expected, inner)
         biased = keep_bias(np.asarray(self.weights))
         if biased.any():
@@ -195,7 +196,7 @@ class WienerSynthesis(eqx.Module):
 class Wiener(AbstractSolver):
     """The Wiener synthesis of all captures, in closed form; see `WienerSynthesis`.
 
-    It needs `Cameras`. Noise that the recording does not tell is estimated. To reconstruct many
+    It needs `Cameras`. The noise is estimated if the recording has no variance. To reconstruct many
     scenes with the same cameras call `prepare(cameras)` once, and its result on each.
 
     - `synthesis`, `prior`: as of `WienerSynthesis`.
@@ -215,7 +216,7 @@ class Wiener(AbstractSolver):
         return WienerSynthesis(cameras, synthesis=self.synthesis, prior=self.prior)
 
     def solve(self, recording: Recording):
-        cameras = filtered_cameras(recording, self.name)
+        cameras = require_cameras(recording, self.name)
         captures = jnp.stack(recording.captures)
         variance = recording.noise_variance
         if variance is None:
@@ -223,9 +224,9 @@ class Wiener(AbstractSolver):
         return self.prepare(cameras)(captures, variance)
 
 
-def filtered_cameras(recording: Recording, method: str) -> Cameras:
-    """What a filter is made of, or one line on why this recording has none."""
-    if not isinstance(recording.seen_by, Cameras):
+def require_cameras(recording: Recording, method: str) -> Cameras:
+    """The cameras of a recording, required by filters."""
+    if not isinstance(recording.imaging_model, Cameras):
         raise ValueError(
             f"method {method!r} needs cameras; with measured PSFs or operators use AdmmTV, Fista, "
             "Ridge or PoissonTV"
@@ -235,11 +236,11 @@ def filtered_cameras(recording: Recording, method: str) -> Cameras:
             f"method {method!r} cannot leave out pixels that are not valid; use AdmmTV, Fista, "
             "Ridge or PoissonTV"
         )
-    return recording.seen_by
+    return recording.imaging_model
 
 
 def _coverage(own_field, field_shape, ratio: float) -> np.ndarray:
-    """How much of each own sample the field covers: the outermost ones lie partly outside."""
+    """Share of each own sample that the field covers: the outermost lie partly outside."""
     sides = []
     for count, whole in zip(own_field, field_shape, strict=True):
         distance = np.abs(np.arange(count) - (count - 1) / 2)
@@ -248,13 +249,13 @@ def _coverage(own_field, field_shape, ratio: float) -> np.ndarray:
 
 
 def _padded(sensor_shape, field_shape, ratio: float) -> tuple[int, int]:
-    """A window in which neither the enlarged captures nor the enlarged kernels wrap round."""
+    """A window without wrap-around of the enlarged captures and kernels."""
     largest = registered_shape(kernel_shape(sensor_shape, own_field(field_shape, ratio)), ratio)
     return fast_shape(largest, real=True)
 
 
 def _used(row: np.ndarray, kernels: list[Array]) -> tuple[Array, Array]:
-    """The kernels that a channel uses, and their weights."""
+    """Weights and kernels of a channel."""
     used = [(w, k) for w, k in zip(row, kernels, strict=True) if w]
     stacked = jnp.stack([k for _, k in used])
     return jnp.asarray([w for w, _ in used], dtype=stacked.dtype), stacked
@@ -283,7 +284,128 @@ def _embedded_spectrum(image: Float[Array, "y x"], padded) -> Complex[Array, "v 
 
 
 def crop_field(full: Float[Array, "v u"], field_shape: tuple[int, int]) -> Float[Array, "y x"]:
-    """The field around sample 0, in the order of the image."""
+    """The field around sample 0, centred."""
     rows, columns = field_shape
     rolled = jnp.roll(full, ((rows - 1) // 2, (columns - 1) // 2), axis=(0, 1))
     return rolled[:rows, :columns]
+
+
+@functools.partial(jax.jit, static_argnames=("prior", "field_shape"))
+def prior_spectrum(prior: Prior, grid: Grid, field_shape: tuple[int, int]) -> Float[Array, "v u"]:
+    """Scene spectrum with a mean of 1 over all frequencies."""
+    v = jnp.fft.ifftshift(grid.v)[:, None]
+    u = jnp.fft.ifftshift(grid.u)
+    if prior == "flat":
+        return jnp.ones((v.shape[0], grid.shape[1] // 2 + 1), v.dtype)
+    corner = 1 / (max(field_shape) * grid.pitch)
+    spectrum = 1 / (u**2 + v**2 + corner**2)
+    return (spectrum / jnp.mean(spectrum))[:, : grid.shape[1] // 2 + 1]
+
+
+def _axis_distance(padded, sensor_shape) -> tuple[np.ndarray, np.ndarray]:
+    """|v| and |u| in units of the frequency of one cycle over the sensor."""
+    v = np.abs(np.fft.fftfreq(padded[0])) * sensor_shape[0]
+    u = np.fft.rfftfreq(padded[1]) * sensor_shape[1]
+    return v[:, None], u[None, :]
+
+
+def inner_band(padded: Sequence[int], sensor_shape: Sequence[int | float]) -> np.ndarray:
+    """Frequencies off both axes, which the sensor's edges do not affect."""
+    v, u = _axis_distance(padded, sensor_shape)
+    inner = (v > 3) & (u > 3)
+    return inner if inner.any() else np.ones_like(inner)  # a sensor of a few rows has none
+
+
+def scene_power(
+    signal: Float[Array, "channel v u"],
+    expected: Float[Array, "channel v u"],
+    inner: Bool[np.ndarray, "v u"],
+) -> Float[Array, ""]:
+    """Variance of the scene: least-squares fit of its expected power to that of the captures.
+
+    Weighted by the expected power, and so by frequencies at which the scene exceeds the noise.
+    """
+    weight = jnp.where(inner, expected, 0.0)
+    floor = 1e-6 * jnp.sum(weight * jnp.abs(signal))
+    return jnp.maximum(jnp.sum(weight * signal), floor) / jnp.sum(weight * expected)
+
+
+def crop_noise(
+    periodogram: Float[Array, "channel v u"],
+    padded: Sequence[int],
+    sensor_shape: Sequence[int | float],
+) -> Float[Array, "channel v u"]:
+    """Noise spectrum of the steps of a bright background at the sensor's borders.
+
+    A step across the border x = const has a spectrum that falls like 1/u² from the v axis; its
+    strength is read off that axis, row by row, and so for the other border.
+    """
+    v, u = _axis_distance(padded, sensor_shape)
+    on_v = jnp.mean(
+        periodogram, axis=-1, where=np.broadcast_to(u <= 1, periodogram.shape), keepdims=True
+    )
+    on_u = jnp.mean(
+        periodogram, axis=-2, where=np.broadcast_to(v <= 1, periodogram.shape), keepdims=True
+    )
+    across, down = (jnp.asarray(1 / (1 + f**2), dtype=periodogram.dtype) for f in (u, v))
+    return on_v * across + on_u * down
+
+
+def filter_suffices(recording: Recording, synthesis: Synthesis | None) -> tuple[bool, str]:
+    """Whether the Wiener synthesis is as good as total variation, and the reason in a sentence.
+
+    It does not model the crop of the sensor, which matters if the captures keep a bright background
+    or a PSF is as large as the sensor, and it does not tell noise from edges.
+    """
+    model = recording.imaging_model
+    if isinstance(model, Psfs):
+        return False, "PSFs were measured: light falls beside the sensor, which it models"
+    if not isinstance(model, Cameras):
+        return False, "operators were given, and a filter is made of cameras"
+    if recording.valid is not None:
+        return False, "some pixels are not to be trusted, which a filter cannot leave out"
+    if np.ndim(model.object_distance) > 0:
+        return False, "several planes are asked for, which a filter does not tell apart"
+    cameras, noise_variance = model.cameras, recording.noise_variance
+    captures = jnp.stack(recording.captures)
+    matrix = separate(len(cameras)) if synthesis is None else np.asarray(synthesis, dtype=float)
+    check_synthesis(matrix, cameras, distance_ratios(cameras))
+    biased = keep_bias(matrix)
+    biased |= np.array([_backgrounds_differ(row, cameras) for row in matrix])
+    if biased.any():
+        return False, (
+            f"{int(biased.sum())} of {len(matrix)} channels keep the bright background of their "
+            "captures, which the sensor crops; a filter would ring at its borders"
+        )
+    contrast = _contrast(captures, matrix, noise_variance)
+    if not contrast >= _CLEAN:
+        return False, (
+            f"the channels' contrast is {contrast:.2g} times their noise; total variation tells "
+            "edges from noise where a filter cannot"
+        )
+    return True, (
+        f"no channel keeps a background and their contrast is {contrast:.2g} times the noise: the "
+        "Wiener synthesis is as good, in closed form"
+    )
+
+
+def _backgrounds_differ(row: np.ndarray, cameras: Sequence[LenslessCamera]) -> bool:
+    """Whether a row combines apertures of different widths, whose backgrounds do not cancel."""
+    used = [camera.mask for weight, camera in zip(row, cameras, strict=True) if weight]
+    return len({float(getattr(mask, "width", 0)) for mask in used}) > 1
+
+
+def _contrast(captures, matrix: np.ndarray, noise_variance) -> float:
+    """Root mean square over the noise of the channel with the most contrast."""
+    flat = captures.reshape(captures.shape[0], -1, *captures.shape[-2:])
+    if noise_variance is None:
+        variances = estimate_variance(flat)
+    else:
+        variances = given_variances(noise_variance, flat)
+    ratios = []
+    for row in matrix:
+        channel = jnp.tensordot(jnp.asarray(row, flat.dtype), flat, axes=1)
+        noise = jnp.sum(jnp.asarray(row**2, flat.dtype) * variances)
+        power = jnp.maximum(jnp.mean(channel**2) - noise, 0)
+        ratios.append(float(jnp.sqrt(power / noise)) if noise > 0 else float("inf"))
+    return max(ratios)

@@ -124,7 +124,15 @@ def test_workers_that_die_and_points_that_raise(config, folder, monkeypatch):
 
 def command(file: Path, out: Path, *grid: str) -> list[str]:
     return [
-        *(sys.executable, "-m", "thincam_jax.commands.cli", "sweep", str(file), "--out", str(out)),
+        *(
+            sys.executable,
+            "-m",
+            "thincam_jax.commands.start",
+            "sweep",
+            str(file),
+            "--out",
+            str(out),
+        ),
         *("--workers", "2", *(part for axis in grid for part in ("--grid", axis))),
     ]
 

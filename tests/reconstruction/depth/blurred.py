@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.ndimage as ndimage
 
-from thincam_jax.reconstruction.depth import RefocusSweep, refocus_distances
+from thincam_jax.reconstruction.depth.refocus import RefocusSweep, refocus_distances
 
 DISTANCES = np.asarray(refocus_distances(100.0, 220.0, 15))
 LEFT, RIGHT = 127.0, 178.0  # between the steps

@@ -52,7 +52,7 @@ def captures(cams, planes, *, snr_db=30.0, seed=0, model="separable"):
     )
 
 
-def seen_by(cams, **settings) -> tc.Cameras:
+def imaging_model(cams, **settings) -> tc.Cameras:
     """Cameras in the light of `captures`, focused where a sweep or a test says."""
     usual = {"wavelength": WAVELENGTH, "field_shape": FIELD, "pixel_integration": False}
     return tc.Cameras(cams, **(usual | settings))

@@ -1,4 +1,4 @@
-"""Distances: of blurred textures, whose focus is known, and of objects before a camera."""
+"""Distances of objects, and of every pixel."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -8,15 +8,16 @@ from reconstruction.rig import unchecked
 
 import thincam_jax as tc
 from thincam_jax.reconstruction import fringe_scanning
-from thincam_jax.reconstruction.depth import (
-    MEASURES,
-    RefocusSweep,
+from thincam_jax.reconstruction.depth.find import (
+    all_in_focus,
+    depth_map,
+    depth_of_colours,
     find_distances,
     object_regions,
-    refocus_distances,
-    refocus_sweep,
+    vertex,
 )
-from thincam_jax.reconstruction.depth.find import vertex
+from thincam_jax.reconstruction.depth.focus import MEASURES
+from thincam_jax.reconstruction.depth.refocus import RefocusSweep, refocus_distances, refocus_sweep
 
 
 @pytest.mark.parametrize("measure", MEASURES)
@@ -85,7 +86,7 @@ def test_objects_before_a_camera_are_found():
     planes = [rig.plane(rig.checks(b), t) for b, t in zip(boxes, (20.0, 45.0), strict=True)]
     seen = rig.captures(cams, planes)
     variance = float(np.mean(np.asarray(seen) ** 2)) * 1e-3
-    recording = tc.Recording(seen, rig.seen_by(cams), noise_variance=variance)
+    recording = tc.Recording(seen, rig.imaging_model(cams), noise_variance=variance)
     wiener = tc.Wiener(synthesis=fringe_scanning(1))
     sweep = refocus_sweep(recording, refocus_distances(15.0, 90.0, 16), wiener)
     regions = object_regions(sweep)
@@ -102,3 +103,72 @@ def test_objects_before_a_camera_are_found():
 def test_bad_regions_are_refused(regions, part):
     with unchecked(), pytest.raises(ValueError, match=part):
         find_distances(blurred.sweep(), regions=regions)
+
+
+@pytest.mark.parametrize("measure", MEASURES[:2])
+def test_every_pixel_has_the_distance_of_its_half(measure):
+    depth = depth_map(blurred.sweep(noise=0.002), measure=measure, window=5)
+    halves, distance = blurred.halves(), np.asarray(depth.distance)
+    for label, place in ((1, blurred.LEFT), (2, blurred.RIGHT)):
+        inside = distance[halves == label]
+        assert np.median(inside) == pytest.approx(place, rel=0.02)
+        assert np.mean(np.abs(inside / place - 1) < 0.1) > 0.9
+
+
+def test_confidence_is_where_there_is_a_picture():
+    sweep = blurred.sweep(noise=0.002)
+    images = np.asarray(sweep.images).copy()
+    images[:, :, blurred.SPLIT :] = 1 + images[:, :, blurred.SPLIT :] * 1e-3
+    dim = RefocusSweep(jnp.asarray(images), sweep.distances, sweep.slope)
+    confidence = np.asarray(depth_map(dim, window=3).confidence)
+    halves = blurred.halves()
+    assert np.median(confidence[halves == 1]) > 0.3
+    assert np.median(confidence[halves == 2]) < 0.05
+    assert 0 <= confidence.min() <= confidence.max() <= 1
+
+
+def test_flat_sweep_has_no_confidence_and_no_nan():
+    sweep = RefocusSweep(jnp.ones((4, 9, 13)), jnp.asarray([1.0, 2.0, 3.0, 4.0]), jnp.asarray(0.1))
+    depth = depth_map(sweep)
+    np.testing.assert_allclose(depth.confidence, 0, atol=1e-6)
+    assert np.isfinite(np.asarray(depth.distance)).all()
+    np.testing.assert_allclose(all_in_focus(sweep, depth), 1, rtol=1e-12)
+
+
+def test_all_in_focus_is_sharper_than_any_image_of_the_sweep():
+    sweep = blurred.sweep(noise=0.002)
+    picture = np.asarray(all_in_focus(sweep, depth_map(sweep)))
+    halves = blurred.halves() > 0
+    truth = blurred.sweep(left=100.0, right=100.0).images[0]  # all of it in focus
+    errors = [
+        np.linalg.norm((np.asarray(image) - np.asarray(truth))[halves])
+        for image in (*sweep.images, picture)
+    ]
+    assert errors[-1] < 0.6 * min(errors[:-1])
+
+
+def test_single_precision_and_a_batch():
+    sweep = blurred.sweep(noise=0.002, batch=(2,))
+    single = RefocusSweep(
+        sweep.images.astype(jnp.float32),
+        sweep.distances.astype(jnp.float32),
+        sweep.slope.astype(jnp.float32),
+    )
+    depth, exact = depth_map(single), depth_map(sweep)
+    assert depth.distance.dtype == jnp.float32
+    assert depth.distance.shape == (2, *blurred.SHAPE)
+    np.testing.assert_allclose(depth.distance[0], depth.distance[1], rtol=1e-5)
+    sure = np.asarray(exact.confidence) > 0.3
+    close = np.abs(np.asarray(depth.distance) - np.asarray(exact.distance))[sure] < 0.5
+    assert close.mean() > 0.98
+    picture = all_in_focus(single, depth)
+    assert picture.dtype == jnp.float32
+    assert picture.shape == (2, *blurred.SHAPE)
+
+
+def test_colours_share_one_depth_map():
+    images = np.random.default_rng(0).normal(size=(3, 1, 12, 14)).astype(np.float32)
+    colours = jnp.asarray(np.concatenate([images, 2 * images, -images], axis=1))
+    _, depth, sharp = depth_of_colours(colours, (60.0, 80.0, 120.0))
+    assert depth.distance.shape == (12, 14)
+    np.testing.assert_allclose(sharp[1:], np.stack([2 * sharp[0], -sharp[0]]), atol=1e-6)

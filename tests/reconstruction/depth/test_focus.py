@@ -8,8 +8,7 @@ import scipy.ndimage as ndimage
 from reconstruction.rig import unchecked
 
 from helpers import count_traces, finite_difference, quick
-from thincam_jax.reconstruction.depth import MEASURES, focus_measure
-from thincam_jax.reconstruction.depth.focus import gaussian_average
+from thincam_jax.reconstruction.depth.focus import MEASURES, focus_measure, gaussian_average
 
 
 def picture(shape=(31, 44), seed=1):

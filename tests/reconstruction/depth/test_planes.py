@@ -8,7 +8,7 @@ from reconstruction.depth import rig
 
 import thincam_jax as tc
 from thincam_jax.reconstruction import TotalVariation, fringe_scanning
-from thincam_jax.reconstruction.depth import axial_resolution
+from thincam_jax.reconstruction.depth.refocus import axial_resolution
 
 PLANES = (20.0, 45.0, 150.0)
 
@@ -22,7 +22,7 @@ def seen():
 
 def reconstruct(seen, planes=PLANES, **settings):
     cams, captures = seen
-    recording = tc.Recording(captures, rig.seen_by(cams, object_distance=list(planes)))
+    recording = tc.Recording(captures, rig.imaging_model(cams, object_distance=list(planes)))
     return tc.reconstruct(recording, tc.AdmmTV(1.0, synthesis=fringe_scanning(1), **settings))
 
 

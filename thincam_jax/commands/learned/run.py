@@ -24,7 +24,7 @@ from thincam_jax.learn.refocusing.train import NETWORK, STATE, Lessons, train
 from thincam_jax.learn.refocusing.unet import parameter_count
 from thincam_jax.learn.refocusing.use import Reading, read
 from thincam_jax.learn.training import Trained, TrainingProgress
-from thincam_jax.reconstruction.depth import RefocusSweep, refocus_distances
+from thincam_jax.reconstruction.depth.refocus import RefocusSweep, refocus_distances
 
 _SWEPT = 15  # distances of the report's sweep
 

@@ -22,7 +22,7 @@ from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.forward import spectral_psf
 from thincam_jax.lensless.method import has_few_terms
 from thincam_jax.reconstruction import AdmmTV, Recording
-from thincam_jax.reconstruction.fourier_splitting import difference_symbol
+from thincam_jax.reconstruction.splittings import difference_symbol
 from thincam_jax.reconstruction.total_variation import TotalVariation
 
 # Of conjugate gradients: relative residual, and at most so many.

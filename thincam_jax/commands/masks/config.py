@@ -20,7 +20,7 @@ from thincam_jax.commands.sections import (
 )
 from thincam_jax.commands.study.config import PictureConfig
 from thincam_jax.imaging.metrics.image import SSIM_WINDOW
-from thincam_jax.reconstruction.spectra import Prior
+from thincam_jax.reconstruction.wiener import Prior
 
 Pixels = Annotated[int, Field(ge=2 * SSIM_WINDOW, le=2048)]
 Electrons = Annotated[float, Field(gt=0, le=1e8)]

@@ -20,8 +20,12 @@ from thincam_jax.imaging.metrics.image import SSIM_WINDOW
 from thincam_jax.imaging.scene import ImagePlane
 from thincam_jax.imaging.targets import middle_square, resize
 from thincam_jax.reconstruction import Reconstruction
-from thincam_jax.reconstruction.depth import RefocusSweep, axial_resolution, refocus_distances
 from thincam_jax.reconstruction.depth import find as finding
+from thincam_jax.reconstruction.depth.refocus import (
+    RefocusSweep,
+    axial_resolution,
+    refocus_distances,
+)
 
 _MARGIN = 1.15  # the field over what the objects cover
 

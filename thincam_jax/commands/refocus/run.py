@@ -13,7 +13,7 @@ from thincam_jax.commands.study.figures import save_figure, save_image
 from thincam_jax.commands.study.study import Capture, Exposure, Method, Study
 from thincam_jax.commands.terminal import numbers
 from thincam_jax.reconstruction import Reconstruction
-from thincam_jax.reconstruction.depth import all_in_focus, depth_map
+from thincam_jax.reconstruction.depth.find import all_in_focus, depth_map
 
 
 def run_refocus(study: Study, folder: RunFolder, progress: Progress) -> dict[str, Any]:

@@ -31,7 +31,7 @@ from thincam_jax.lensless.psf import psf
 from thincam_jax.lensless.sampling import unresolved
 from thincam_jax.reconstruction import Reconstruction
 from thincam_jax.reconstruction import synthesis as syntheses
-from thincam_jax.reconstruction.spectra import Prior
+from thincam_jax.reconstruction.wiener import Prior
 
 Reconstructor = Callable[[Array, Array], Reconstruction]
 

@@ -23,7 +23,7 @@ from thincam_jax.learn.refocusing.cameras import RefocusCamera
 from thincam_jax.learn.refocusing.network import NetworkOptions, RefocusNetwork
 from thincam_jax.learn.refocusing.planes import Planes
 from thincam_jax.lensless.camera import LenslessCamera
-from thincam_jax.reconstruction.seen_by import Cameras
+from thincam_jax.reconstruction.imaging_model import Cameras
 
 _KIND = "refocusing network"
 # By this name the network that comes with the package is known, of configs/learned_refocus.yaml.

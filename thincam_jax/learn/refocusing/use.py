@@ -15,10 +15,10 @@ from thincam_jax._core.checks import Number, Numbers
 from thincam_jax._core.module import Module
 from thincam_jax.learn.refocusing.network import RefocusNetwork, explain, flattened
 from thincam_jax.learn.refocusing.store import SHIPPED, described, load, same_camera
+from thincam_jax.reconstruction.imaging_model import Cameras
 from thincam_jax.reconstruction.noise import estimate_variance, given_variances
-from thincam_jax.reconstruction.recording import Recording
-from thincam_jax.reconstruction.seen_by import Cameras
-from thincam_jax.reconstruction.solver import AbstractSolver, Reconstruction
+from thincam_jax.reconstruction.recording import Reconstruction, Recording
+from thincam_jax.reconstruction.solver import AbstractSolver
 
 # Residual over noise from which an image is doubted.
 _DOUBTED = 1.5
@@ -98,15 +98,15 @@ class Learned(AbstractSolver):
         checks.choice("output", self.output, ("focus", "all_in_focus"))
 
     def solve(self, recording: Recording) -> Reconstruction:
-        began, seen_by = time.perf_counter(), recording.seen_by
-        if not isinstance(seen_by, Cameras):
+        began, model = time.perf_counter(), recording.imaging_model
+        if not isinstance(model, Cameras):
             raise ValueError("a learned method knows its camera; give a recording by tc.Cameras")
-        network = load(SHIPPED, seen_by) if self.network is None else self.network
+        network = load(SHIPPED, model) if self.network is None else self.network
         camera = network.camera
-        same_camera("the network", described(camera), seen_by)
-        if seen_by.field_shape not in (None, camera.field_shape):
+        same_camera("the network", described(camera), model)
+        if model.field_shape not in (None, camera.field_shape):
             raise ValueError(
-                f"field_shape is {seen_by.field_shape} and the network's {camera.field_shape}; "
+                f"field_shape is {model.field_shape} and the network's {camera.field_shape}; "
                 "leave it out"
             )
         if recording.valid is not None and not all(np.asarray(m).all() for m in recording.valid):
@@ -117,14 +117,14 @@ class Learned(AbstractSolver):
         variance = estimate_variance(recording.captures) if known is None else known
         is_focused, distance = self.output == "focus", camera.far
         if is_focused:
-            seen_by.require("object_distance")
-            distance = seen_by.object_distance
+            model.require("object_distance")
+            distance = model.object_distance
         distances = jnp.atleast_1d(jnp.asarray(distance))
         found = read(network, capture, distances, jnp.sqrt(variance[0]))
         image, pitch = found.all_in_focus, None
         if is_focused:
             planes = np.ndim(distance) == 1
-            image, pitch = found.images if planes else found.images[..., 0, :, :], seen_by.pitch
+            image, pitch = found.images if planes else found.images[..., 0, :, :], model.pitch
         image, confidence = (
             jax.block_until_ready(a)[..., ::-1, ::-1] for a in (image, found.confidence)
         )

@@ -1,0 +1,59 @@
+"""`thincam reconstruct --camera`: a camera's numbers in place of a measured PSF."""
+
+import numpy as np
+import pytest
+from commands.reconstruct import simulated
+from commands.reconstruct.test_command import one_line, record_of, runner
+from commands.study import tiny
+
+from helpers import ROOT, relative_l2
+from thincam_jax.commands import cli
+from thincam_jax.commands.study.build import take
+
+
+@pytest.fixture
+def files(tmp_path):
+    """A study, a capture of 12 bit by its first shot, and that shot's PSF as a file."""
+    study = tiny.built(tmp_path, "object.distance=40 mm")
+    seen = np.asarray(take(study, study.exposures[0], study.targets[1]).image)[1]
+    simulated.write_tiff(tmp_path / "capture.tif", simulated.counts(seen))
+    np.save(tmp_path / "psf.npy", np.asarray(study.psf(study.exposures[0])))
+    names = {"study": "tiny.yaml", "capture": "capture.tif", "psf": "psf.npy"}
+    return {name: tmp_path / file for name, file in names.items()}
+
+
+def reconstruct(files, *more):
+    given = ("--capture", files["capture"], "--out", files["study"].with_name("image.npy"))
+    known = ("--bits", 12, "--background", simulated.DARK, "--method", "ridge")
+    typed = ["reconstruct", *given, *known, *more]
+    return runner.invoke(cli.app, [str(part) for part in typed])
+
+
+@pytest.mark.thorough
+def test_it_is_as_good_as_a_perfect_measurement(files):
+    by_psf = ("--psf", files["psf"], "--psf-background", 0, "--psf-bits", 12)
+    by_camera = ("--camera", files["study"], "--set", "object.distance=40mm")
+    images = []
+    for known in (by_psf[:4], by_camera, by_camera[:2]):
+        result = reconstruct(files, *known)
+        assert result.exit_code == 0, result.output
+        images.append(np.load(files["study"].with_name("image.npy")))
+    assert relative_l2(images[1], images[0]) < 0.01
+    assert relative_l2(images[2], images[0]) > 0.1  # focused on 100 mm
+    psf = record_of(files["study"].with_name("image.npy"))["sources"]["psf"]
+    assert "beta=25 rad/mm²" in psf and "distance=3 mm" in psf and "object at 100 mm" in psf
+
+
+def test_what_does_not_go_together(files):
+    for known, message in (
+        ((), "give either --psf, a measured PSF, or --camera"),
+        (("--psf", files["psf"], "--camera", files["study"]), "give either --psf"),
+        (("--psf", files["psf"], "--set", "seed=1"), "--set changes the file of --camera"),
+        (("--camera", files["study"], "--set", "sensor.shape=[64,64]"), "has 64×64 pixels and"),
+        (("--camera", ROOT / "configs" / "fza_refocus.yaml"), "a camera is read from a study"),
+    ):
+        assert message in one_line(reconstruct(files, *known))
+    given = ("--capture", files["capture"], "--out", files["study"].with_name("a.png"))
+    typed = ("reconstruct", *given, "--camera", files["study"])
+    result = runner.invoke(cli.app, [str(part) for part in typed])
+    assert "a computed PSF has no dark corner; give --background" in one_line(result)

@@ -1,0 +1,201 @@
+"""Working through captures: one compilation for a folder, failures apart, nothing half-written."""
+
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from commands.reconstruct import simulated
+
+from helpers import full_disk, relative_l2
+from thincam_jax._core import memory
+from thincam_jax.commands.reconstruct import jobs, run
+from thincam_jax.commands.reconstruct.jobs import plan_jobs
+from thincam_jax.commands.reconstruct.options import Output, Recipe, Sources
+from thincam_jax.commands.reconstruct.run import Failed, Finished, run_jobs
+from thincam_jax.measured import MeasurementError, Preparation
+from thincam_jax.reconstruction import Reconstruction
+
+SHORT = Recipe(iterations=16)  # steps of ten and of one
+
+
+@pytest.fixture
+def folder(tmp_path):
+    folder = tmp_path / "captures"
+    folder.mkdir()
+    simulated.grey_files(folder, ("first", "second", "third"))
+    return folder
+
+
+def sources(folder, **more):
+    return Sources(folder / "psf.tif", folder / "dark.tif", bits=12, **more)
+
+
+@pytest.fixture
+def compilations():
+    """The durations of all compilations so far."""
+    seen = []
+
+    def listen(event: str, duration_secs: float, **kwargs: str | int) -> None:
+        if event == "/jax/core/compile/backend_compile_duration":
+            seen.append(duration_secs)
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    yield seen
+    jax.monitoring.unregister_event_duration_listener(listen)
+
+
+def test_folder_is_compiled_once(folder, tmp_path, compilations):
+    """For captures of other brightness and another mask of valid pixels too."""
+    bright = np.asarray(simulated.counts(simulated.psf(), seed=9, full=4300), dtype=np.uint16)
+    np.save(folder / "second.npy", bright)
+    (folder / "second.tif").unlink()
+    output = Output(tmp_path / "out", linear="none")
+    counts, shares = [], []
+    planned = plan_jobs(folder, sources(folder), output)
+    for result in run_jobs(planned, sources(folder), SHORT, output):
+        assert isinstance(result, Finished)
+        counts.append(len(compilations))
+        shares.append(result.record["preparation"]["validity"]["valid_share"])
+    # None at all where another test has compiled for these sizes before.
+    assert len(counts) == 3 and counts[1] == counts[2] == counts[0]
+    assert shares[0] == shares[2] == 1 and shares[1] < 1
+    assert sorted(p.stem for p in (tmp_path / "out").glob("*.png")) == ["first", "second", "third"]
+
+
+def test_same_image_as_step_by_step(folder, tmp_path):
+    """With the relative residual from its definition, by a direct convolution."""
+    output = Output(tmp_path / "first.npy")
+    planned = plan_jobs(folder / "first.tif", sources(folder), output)
+    whole = Recipe(iterations=16, field="full")
+    (result,) = run_jobs(planned, sources(folder), whole, output)
+    assert isinstance(result, Finished)
+    image = np.load(output.path)
+    ready = run.Rig(sources(folder)).prepare(folder / "first.tif")
+    rows, columns = simulated.SHAPE
+    light = simulated.scipy.signal.fftconvolve(image, ready.psf[0], mode="valid")
+    assert light.shape == (rows, columns)
+    expected = relative_l2(light, ready.capture[0])
+    written = json.loads((tmp_path / "first.json").read_text("utf-8"))
+    told = written["reconstruction"]["relative_data_residual"]
+    assert told == pytest.approx(expected, rel=1e-3)
+    assert float(result.record["reconstruction"]["relative_data_residual"]) == pytest.approx(told)
+
+
+def test_saturated_pixels_have_no_weight(folder, tmp_path):
+    """A residual over the others only, and an image as of the capture without them."""
+    capture = folder / "first.tif"
+    raw = simulated.tifffile.imread(capture)
+    raw[20:24, 30:40] = 4095
+    simulated.tifffile.imwrite(capture, raw)
+    output = Output(tmp_path / "first.npy")
+    planned = plan_jobs(capture, sources(folder), output)
+    (result,) = run_jobs(planned, sources(folder), SHORT, output)
+    assert isinstance(result, Finished)
+    record = result.record
+    assert record["preparation"]["validity"]["capture"]["saturated"] == 40
+    assert float(record["reconstruction"]["relative_data_residual"]) < 0.1
+    assert simulated.correlation(np.load(output.path), simulated.scene()[1]) > 0.9
+
+
+@pytest.mark.parametrize("room", [1_000, 10_000])
+def test_nothing_is_left_of_a_write_that_fails(folder, tmp_path, monkeypatch, room):
+    """Of the first or the last file. Not even what stood there before is touched."""
+    output = Output(tmp_path / "first.png")
+    output.path.write_text("before")
+
+    def limited(*given):
+        with full_disk(room):
+            jobs.write_job(*given)
+
+    monkeypatch.setattr(run, "write_job", limited)
+    planned = plan_jobs(folder / "first.tif", sources(folder), output)
+    (result,) = run_jobs(planned, sources(folder), SHORT, output)
+    assert isinstance(result, Failed)
+    assert str(result.error).startswith(
+        f"{output.path}: cannot be written (File too large); make room or give another folder"
+    )
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["captures", "first.png"]
+    assert output.path.read_text() == "before"
+
+
+def test_what_overflows_is_not_written(folder, tmp_path, monkeypatch):
+    lost = Reconstruction(jnp.full((1, 2, 3), jnp.nan), None, ending="iterations_exhausted")
+    monkeypatch.setattr(run, "reconstruct", lambda *_, **__: lost)
+    output = Output(tmp_path / "first.png")
+    planned = plan_jobs(folder / "first.tif", sources(folder), output)
+    (result,) = run_jobs(planned, sources(folder), Recipe(tau=1e5), output)
+    assert isinstance(result, Failed)
+    assert "became NaN or infinite" in str(result.error) and "tau (now 100000)" in str(result.error)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["captures"]
+
+
+def test_more_than_the_memory(folder, tmp_path, monkeypatch):
+    monkeypatch.setattr(memory, "available_bytes", lambda: 10**6)
+    output = Output(tmp_path / "first.png")
+    planned = plan_jobs(folder / "first.tif", sources(folder), output)
+    (result,) = run_jobs(planned, sources(folder), SHORT, output)
+    assert isinstance(result, Failed) and isinstance(result.error, MemoryError)
+    assert "its reconstruction on" in str(result.error)
+    assert str(result.error).endswith("give a larger downsample")
+
+
+def test_all_saturated(folder, tmp_path):
+    output = Output(tmp_path / "first.png")
+    planned = plan_jobs(folder / "first.tif", sources(folder), output)
+    low = sources(folder, preparation=Preparation(saturation=1e-3))
+    (result,) = run_jobs(planned, low, SHORT, output)
+    assert isinstance(result, Failed) and "without a trusted pixel" in str(result.error)
+
+
+class TestPlan:
+    def test_captures_are_all_images_but_the_sources(self, folder, tmp_path):
+        """Hidden files, folders and other files are none."""
+        for name in (".hidden.tif", "notes.txt"):
+            (folder / name).write_bytes(b"")
+        (folder / "folder.tif").mkdir()
+        planned = plan_jobs(folder, sources(folder), Output(tmp_path / "out", linear="tif"))
+        assert [job.capture.name for job in planned] == ["first.tif", "second.tif", "third.tif"]
+        names = [path.relative_to(tmp_path).as_posix() for path in planned[0].images]
+        assert names == ["out/first.png", "out/first.tif"]
+        assert not (tmp_path / "out").exists()
+        plan_jobs(folder, sources(folder), Output(tmp_path / "more" / "out"))  # can be made
+
+    def test_folder_for_one_capture(self, folder, tmp_path):
+        (job,) = plan_jobs(folder / "second.tif", sources(folder), Output(tmp_path))
+        assert job.record == tmp_path / "second.json"
+
+    @pytest.mark.parametrize(
+        ("out", "message"),
+        [
+            ("captures", "holds the captures"),
+            ("captures/../captures", "holds the captures"),
+            ("file.png", "is a file; for a folder of captures give a folder"),
+            ("file.png/out", "file.png: is no folder; give another"),
+        ],
+    )
+    def test_output_of_a_folder(self, folder, tmp_path, out, message):
+        (tmp_path / "file.png").write_text("mine")
+        with pytest.raises(MeasurementError, match=message):
+            plan_jobs(folder, sources(folder), Output(tmp_path / out))
+        assert (tmp_path / "file.png").read_text() == "mine"
+
+    def test_two_of_one_name(self, folder, tmp_path):
+        (folder / "second.png").write_bytes(b"")
+        with pytest.raises(MeasurementError, match=r"second.tif and second.png would both become"):
+            plan_jobs(folder, sources(folder), Output(tmp_path / "out"))
+
+    def test_empty_folder(self, folder, tmp_path):
+        (tmp_path / "empty").mkdir()
+        with pytest.raises(MeasurementError, match="holds no capture"):
+            plan_jobs(tmp_path / "empty", sources(folder), Output(tmp_path / "out"))
+
+    def test_output_beside_that_is_taken(self, folder, tmp_path):
+        """By an input, or by a folder."""
+        with pytest.raises(MeasurementError, match="first.tif: is read as an input"):
+            output = Output(folder / "first.png", linear="tif")
+            plan_jobs(folder / "first.tif", sources(folder), output)
+        (tmp_path / "image.npy").mkdir()
+        with pytest.raises(MeasurementError, match=r"image\.npy: is a folder"):
+            plan_jobs(folder / "first.tif", sources(folder), Output(tmp_path / "image.png"))

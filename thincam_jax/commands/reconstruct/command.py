@@ -1,0 +1,224 @@
+"""The command `thincam reconstruct`."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+from typer import Option
+
+from thincam_jax.commands.terminal import Overrides, fail, told
+
+# Known without importing JAX; the tests hold them to `options.PSF_METHODS`.
+METHODS = ("auto", "admm-tv", "fista", "ridge")
+
+
+Psf = Annotated[Path, Option(help="Measured PSF: TIFF, PNG or NPY.")]
+Background = Annotated[
+    str | None,
+    Option(help="Dark frame, or a number of counts. Default: a corner of the PSF."),
+]
+PsfBackground = Annotated[
+    str | None, Option(help="That of the PSF, where it was exposed otherwise.")
+]
+Bits = Annotated[int | None, Option(help="Bit depth, as 12 where 16 are stored.")]
+PsfBits = Annotated[int | None, Option(help="That of the PSF, where it is another.")]
+Corner = Annotated[str, Option(help="Rows and columns of the PSF's dark corner, FIRST:AFTER_LAST.")]
+PsfScale = Annotated[
+    float | None,
+    Option(help="Enlarge the PSF, of any size: pitch of its pixels over the capture's."),
+]
+PsfChannels = Annotated[
+    Literal["each", "mean"], Option(help="each: a PSF for each colour; mean: one for all.")
+]
+Bayer = Annotated[
+    Literal["RGGB", "BGGR", "GRBG", "GBRG"] | None,
+    Option(help="Colours of the mosaic, from its upper left."),
+]
+Dead = Annotated[Path | None, Option(help="Map of dead pixels, not zero where dead.")]
+
+
+def reconstruct(
+    capture: Annotated[Path, Option(help="Capture of the same size; or a folder of captures.")],
+    out: Annotated[
+        Path, Option(help="Image (.png, .npy, .tif); a folder for a folder of captures.")
+    ],
+    psf: Annotated[Path | None, Option(help="Measured PSF: TIFF, PNG or NPY.")] = None,
+    distances: Annotated[
+        str | None,
+        Option(help="60mm,80mm,100mm: refocus; --psf is a folder or TIFF of a PSF for each."),
+    ] = None,
+    camera: Annotated[
+        Path | None,
+        Option(help="In place of --psf, a study (YAML) whose first shot took the capture."),
+    ] = None,
+    network: Annotated[
+        Path | None,
+        Option(help="Of 'thincam train' for that camera, or 'shipped', in place of a method."),
+    ] = None,
+    distance: Annotated[
+        str | None, Option(help="To focus a network on, as 120mm. Default: the study's object.")
+    ] = None,
+    set_: Overrides = None,
+    background: Background = None,
+    psf_background: PsfBackground = None,
+    downsample: Annotated[int, Option(help="Side of the blocks of pixels that are averaged.")] = 1,
+    bits: Bits = None,
+    psf_bits: PsfBits = None,
+    corner: Corner = "5:15",
+    psf_scale: PsfScale = None,
+    bayer: Bayer = None,
+    demosaic: Annotated[
+        Literal["bilinear", "superpixel"],
+        Option(help="superpixel joins 2×2 pixels: half the size."),
+    ] = "bilinear",
+    dead: Dead = None,
+    saturation: Annotated[
+        float | None, Option(help="Saturated from this part of full scale on.")
+    ] = None,
+    noise_threshold: Annotated[
+        float | None, Option(help="Set the PSF to 0 below so many times its noise.")
+    ] = None,
+    psf_channels: PsfChannels = "each",
+    method: Annotated[
+        str, Option(help=f"One of {', '.join(METHODS)}.", autocompletion=lambda: METHODS)
+    ] = "admm-tv",
+    tau: Annotated[
+        float | None,
+        Option(help="Weight of total variation relative to noise, about 1 to 3. Default: 2."),
+    ] = None,
+    ridge: Annotated[
+        float | None,
+        Option(help="Of ridge: noise over image variance, in parts of the expected. Default: 1."),
+    ] = None,
+    noise: Annotated[
+        float | None,
+        Option(help="Of a raw pixel, standard deviation in counts. Default: estimated."),
+    ] = None,
+    iterations: Annotated[int, Option(help="At most.")] = 100,
+    coupling: Annotated[
+        Literal["none", "joint", "opponent"] | None,
+        Option(help="Of colours, in total variation. Default: joint."),
+    ] = None,
+    field: Annotated[
+        Literal["sensor", "full"], Option(help="sensor: what is in front of it; full: all it sees.")
+    ] = "sensor",
+    flip: Annotated[bool, Option("--flip", help="Turn the image by 180°.")] = False,
+    linear: Annotated[
+        Literal["npy", "tif", "none"], Option(help="Format of the float image beside a PNG.")
+    ] = "npy",
+    gamma: Annotated[float, Option(help="Of the PNG.")] = 2.2,
+    white_balance: Annotated[
+        str | None, Option(help="Of the PNG: grey-world, or gains as 1.8,1,1.4.")
+    ] = None,
+) -> None:
+    """Reconstruct captures with a measured PSF, or with that of a camera's numbers.
+
+    Takes one, or all of a folder. Writes the image, its linear values and a JSON record of all that
+    was done. Ctrl-C keeps the best image so far.
+    """
+    nothing = "interrupted; of the capture at work no image is there yet, nothing of it is kept"
+    with told(lambda: nothing):
+        from thincam_jax.commands.reconstruct import console
+        from thincam_jax.commands.reconstruct.jobs import plan_jobs
+        from thincam_jax.commands.reconstruct.options import Output, Recipe, Sources
+        from thincam_jax.measured import MeasurementError, Preparation
+
+        try:
+            given = psf, camera, set_, network, distance, background
+            known, focusing = console.known_psf(*given)
+            sources = Sources(
+                known,
+                console.read_background(background),
+                0.0 if camera else console.read_background(psf_background),
+                dead,
+                bits,
+                Preparation(
+                    bayer=bayer,
+                    demosaicing=demosaic,
+                    downsample=downsample,
+                    corner=console.read_corner(corner),
+                    psf_scale=psf_scale,
+                    saturation=saturation,
+                    noise_threshold=noise_threshold,
+                    psf_channels=psf_channels,
+                ),
+                psf_bits,
+                console.read_distances(distances, psf),
+            )
+            recipe = Recipe(
+                method=method.replace("-", "_"),
+                tau=tau,
+                iterations=iterations,
+                coupling=coupling,
+                field=field,
+                flip=flip,
+                ridge=ridge,
+                noise=noise,
+                focusing=focusing,
+            )
+            balance, unsure = console.read_white_balance(white_balance), focusing is not None
+            output = Output(out, linear, gamma, balance, unsure)
+            end = console.run_with_bar(plan_jobs(capture, sources, output), sources, recipe, output)
+        except (MeasurementError, OSError) as error:
+            fail(error)
+    if end:
+        raise typer.Exit(end)
+
+
+def check(
+    psf: Psf,
+    capture: Annotated[Path, Option(help="Capture of the same size.")],
+    background: Background = None,
+    psf_background: PsfBackground = None,
+    downsample: Annotated[
+        int | None,
+        Option(help="Side of the blocks that are averaged. Default: 160 pixels are left."),
+    ] = None,
+    bits: Bits = None,
+    psf_bits: PsfBits = None,
+    corner: Corner = "5:15",
+    psf_scale: PsfScale = None,
+    bayer: Bayer = None,
+    dead: Dead = None,
+    psf_channels: PsfChannels = "each",
+    search: Annotated[float, Option(help="How far to look for the scale, parts of one.")] = 0.06,
+) -> None:
+    """Tell whether a PSF is that of a capture.
+
+    Tries other scales, turns and mirror images of it. The exit code is 1 if one of them fits
+    better.
+    """
+    with told(lambda: "interrupted; nothing is known of the PSF"):
+        from thincam_jax.commands.reconstruct import console
+        from thincam_jax.commands.reconstruct.options import Sources
+        from thincam_jax.commands.reconstruct.run import check_files, enough_blocks
+        from thincam_jax.commands.terminal import progress_bar
+        from thincam_jax.measured import MeasurementError, Preparation
+
+        try:
+            sources = Sources(
+                psf,
+                console.read_background(background),
+                console.read_background(psf_background),
+                dead,
+                bits,
+                Preparation(
+                    bayer=bayer,
+                    downsample=1 if downsample is None else downsample,
+                    corner=console.read_corner(corner),
+                    psf_scale=psf_scale,
+                    psf_channels=psf_channels,
+                ),
+                psf_bits,
+            )
+            sources = enough_blocks(sources) if downsample is None else sources
+            with progress_bar() as bar:
+                task = bar.add_task("PSFs", total=None)
+                lines, fits = check_files(
+                    sources, capture, search, lambda n, of: bar.update(task, completed=n, total=of)
+                )
+        except (MeasurementError, OSError) as error:
+            fail(error)
+    print("\n".join(lines))
+    if not fits:
+        raise typer.Exit(1)

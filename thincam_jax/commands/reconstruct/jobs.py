@@ -1,0 +1,174 @@
+"""Which captures are to be reconstructed, and into which files; told before any work."""
+
+import os
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from thincam_jax._core.files import write_whole
+from thincam_jax.commands.reconstruct.options import Output, Sources
+from thincam_jax.measured import CaptureFileError, MeasurementError, write_image
+from thincam_jax.measured.read import image_files
+from thincam_jax.measured.write import LINEAR
+
+
+@dataclass(frozen=True)
+class Job:
+    """One capture and the images to be made of it; the record stands beside them as NAME.json.
+
+    - `focus`: which of the distances, where there are any; None: all that were before, as one
+      image that is sharp everywhere.
+    - `label`: that distance, for messages.
+    - `beside`: further files.
+    """
+
+    capture: Path
+    images: tuple[Path, ...]
+    focus: int | None = 0
+    label: str = ""
+    beside: tuple[Path, ...] = ()
+
+    @property
+    def name(self) -> str:
+        return self.capture.name + self.label
+
+    @property
+    def record(self) -> Path:
+        return self.images[0].with_suffix(".json")
+
+    @property
+    def is_shown(self) -> bool:
+        """Whether one of the images is for looking at."""
+        return self.images[0].suffix.lower() == ".png"
+
+
+def plan_jobs(capture: Path, sources: Sources, output: Output) -> list[Job]:
+    """What is to be made of a capture, or of each capture in a folder.
+
+    Files of the folder that `sources` names are no captures. Nothing is written yet, but whether
+    something can be is tried.
+
+    **Errors**: MeasurementError, one line, for a folder without captures or that is also the
+    output's, an output that cannot be written or that would overwrite an input, and two captures of
+    the same name.
+    """
+    batch = capture.is_dir()
+    captures = _captures_in(capture, sources) if batch else [capture]
+    folder = output.path if batch or output.path.is_dir() else output.path.parent
+    if batch:
+        _check_batch_folder(capture, folder)
+    names = [output.path if folder != output.path else folder / f"{c.stem}.png" for c in captures]
+    planned = zip(captures, names, strict=True)
+    jobs = [job for c, n in planned for job in _jobs_of(c, n, sources, output)]
+    _check_names(jobs, sources)
+    _check_writable(folder)
+    return jobs
+
+
+def _jobs_of(capture: Path, path: Path, sources: Sources, output: Output) -> list[Job]:
+    """One for each distance, and one of all of them; or the only one."""
+    images = _images(path, output)
+    if not sources.distances:
+        unsure = path.with_name(f"{path.stem}-unsure.png")
+        return [Job(capture, images, beside=(unsure,) if output.unsure else ())]
+    jobs = []
+    for focus, distance in enumerate(sources.distances):
+        name = path.with_name(f"{path.stem}-{distance:g}mm{path.suffix}")
+        jobs.append(Job(capture, _images(name, output), focus, f" at {distance:g} mm"))
+    drawn = (path.with_name(f"{path.stem}-{name}.png") for name in ("sweep", "depth"))
+    linear = (p.with_name(f"{p.stem}-depth{p.suffix}") for p in images if p.suffix != ".png")
+    return [*jobs, Job(capture, images, None, beside=(*drawn, *linear))]
+
+
+def write_job(
+    job: Job,
+    image: np.ndarray,
+    record: dict[str, Any],
+    output: Output,
+    beside: Mapping[Path, bytes] | None = None,
+) -> None:
+    """All files of a job, complete before the first of them takes its name; the record first."""
+    folder = job.record.parent
+    folder.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=".thincam-", dir=folder) as staging:
+        for path in job.images:
+            write_image(
+                Path(staging) / path.name,
+                image,
+                record,
+                white_balance=output.white_balance,
+                gamma=output.gamma,
+            )
+        for path, content in (beside or {}).items():
+            write_whole(Path(staging) / path.name, content)
+        for path in (job.record, *job.images, *job.beside):
+            os.replace(Path(staging) / path.name, path)
+
+
+def _captures_in(folder: Path, sources: Sources) -> list[Path]:
+    used = {os.path.realpath(path) for path in sources.paths()}
+    captures = [path for path in image_files(folder) if os.path.realpath(path) not in used]
+    if not captures:
+        raise CaptureFileError(f"{folder}: holds no capture beside the PSF and what is subtracted")
+    return captures
+
+
+def _images(path: Path, output: Output) -> tuple[Path, ...]:
+    """The image files of a result that is asked for as `path`."""
+    suffix = path.suffix.lower()
+    if suffix in LINEAR:
+        return (path,)
+    if suffix != ".png":
+        raise MeasurementError(
+            f"{path}: images are written as .png (for looking at), .npy or .tif (linear); give one "
+            "of these suffixes, or a folder that exists"
+        )
+    return (path,) if output.linear == "none" else (path, path.with_suffix(f".{output.linear}"))
+
+
+def _check_batch_folder(captures: Path, folder: Path) -> None:
+    if folder.exists() and not folder.is_dir():
+        raise MeasurementError(f"{folder}: is a file; for a folder of captures give a folder")
+    if os.path.realpath(folder) == os.path.realpath(captures):
+        raise MeasurementError(
+            f"{folder}: holds the captures, among which the results would be lost; give another "
+            "folder"
+        )
+
+
+def _check_names(jobs: list[Job], sources: Sources) -> None:
+    read = (*sources.paths(), *(job.capture for job in jobs))
+    inputs = {os.path.realpath(path) for path in read}  # also of links in a circle
+    taken: dict[Path, Path] = {}
+    for job in jobs:
+        for path in (job.record, *job.images, *job.beside):
+            if os.path.realpath(path) in inputs:
+                raise MeasurementError(
+                    f"{path}: is read as an input and would be overwritten; give another output"
+                )
+            if path.is_dir():
+                raise MeasurementError(f"{path}: is a folder; give another output")
+        other = taken.setdefault(job.record, job.capture)
+        if other != job.capture:
+            raise MeasurementError(
+                f"{job.capture} and {other.name} would both become {job.images[0].name}; "
+                "rename one of them"
+            )
+
+
+def _check_writable(folder: Path) -> None:
+    """Try it, or what is to hold it: what the system says of permissions is not the whole truth."""
+    tried = next(path for path in (folder, *folder.absolute().parents) if path.exists())
+    if not tried.is_dir():
+        raise MeasurementError(f"{tried}: is no folder; give another output")
+    try:
+        with tempfile.TemporaryDirectory(prefix=".thincam-", dir=tried):
+            pass
+    except OSError as error:
+        raise MeasurementError(
+            f"{tried}: cannot be written into ({error.strerror or error}); give another folder"
+        ) from None

@@ -1,0 +1,201 @@
+"""Imaging models: cameras whose PSFs are computed, or PSFs that were measured."""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from thincam_jax._core import checks
+from thincam_jax._core.checks import Numbers
+from thincam_jax._core.module import Module
+from thincam_jax._core.quantity import choice, unchecked
+from thincam_jax.imaging.operators import kernel_grid
+from thincam_jax.lensless.camera import LenslessCamera
+from thincam_jax.lensless.method import MODELS, Model
+from thincam_jax.lensless.psf import psf
+
+_DARK = 0.3  # share of a PSF's absolute sum
+
+
+def _cameras(given: Sequence[LenslessCamera]) -> tuple[LenslessCamera, ...]:
+    if isinstance(given, LenslessCamera):
+        raise TypeError("cameras is one camera; give a list, [camera], one for each capture")
+    cameras = tuple(given)
+    if not cameras:
+        raise ValueError("cameras is empty; give one camera for each capture")
+    if not all(isinstance(camera, LenslessCamera) for camera in cameras):
+        raise TypeError(
+            "cameras holds objects that are no LenslessCamera; give cameras, or use Psfs"
+        )
+    return cameras
+
+
+class Cameras(Module):
+    """Cameras whose PSFs are computed, one for each capture, with wavelength and object distance.
+
+    **Arguments**
+
+    - `cameras`: one for each capture. Captures at several mask-sensor distances are enlarged to
+      the scale of the largest (`register`), and their PSFs with them.
+    - `wavelength`: mm, one or one for each camera.
+    - `object_distance`: t, mm, of the focus. Several give as many planes, each in its own
+      projection: the same pixel of all planes lies on one ray through the mask.
+    - `field_shape`: pixels of the image, default those of the sensor; the scene is taken as black
+      outside. Its pixels are p·t/d apart on the object, d the largest distance.
+    - `model`, `pixel_integration`: of the PSFs, see `thincam_jax.psf`.
+    """
+
+    cameras: tuple[LenslessCamera, ...] = eqx.field(converter=_cameras)
+    wavelength: Any = eqx.field(default=None, converter=unchecked("mm"), kw_only=True)
+    object_distance: Any = eqx.field(default=None, converter=unchecked("mm"), kw_only=True)
+    field_shape: tuple[int, int] | None = eqx.field(default=None, static=True, kw_only=True)
+    model: Model = eqx.field(
+        default="separable", converter=choice(MODELS), static=True, kw_only=True
+    )
+    pixel_integration: bool = eqx.field(default=True, converter=bool, static=True, kw_only=True)
+
+    @property
+    def count(self) -> int:
+        """Number of captures."""
+        return len(self.cameras)
+
+    @property
+    def pitch(self) -> Float[Array, "*plane"]:
+        """Distance of the image's pixels on the object, mm: p·t/d of the largest d."""
+        furthest = max(self.cameras, key=lambda c: float(c.distance))
+        return furthest.sensor.pitch * jnp.asarray(self.object_distance) / furthest.distance
+
+    def require(self, *names: str) -> None:
+        """Require fields that are None by default."""
+        missing = [name for name in names if getattr(self, name) is None]
+        if missing:
+            raise ValueError(f"the Cameras have no {' and no '.join(missing)}; give it in mm")
+
+    def kernels(
+        self, field: tuple[int, int], ratios: Sequence[float]
+    ) -> list[Float[Array, "1 plane k l"]]:
+        """PSF of each camera and plane on the reference scale; enlarged by r, 1/r² as bright."""
+        self.require("wavelength", "object_distance")
+        distances = np.atleast_1d(np.asarray(self.object_distance, dtype=object))
+        wavelengths = jnp.broadcast_to(jnp.asarray(self.wavelength), (self.count,))
+        kernels = []
+        for camera, wavelength, ratio in zip(self.cameras, wavelengths, ratios, strict=True):
+            grid = kernel_grid(camera.sensor.grid, own_field(field, ratio))
+            planes = [
+                psf(
+                    camera,
+                    wavelength=wavelength,
+                    object_distance=distance,
+                    grid=grid,
+                    model=self.model,
+                    pixel_integration=self.pixel_integration,
+                )
+                for distance in distances
+            ]
+            kernels.append(jnp.stack([register(k, ratio) / ratio**2 for k in planes])[None])
+        return kernels
+
+
+class Psfs(Module):
+    """Measured PSFs on the pixels of the captures, one for each capture.
+
+    **Arguments**
+
+    - `psfs`: (capture, k, l), (capture, channel, k, l) or (capture, channel, plane, k, l), the
+      channel axis of length 1 or that of the captures.
+    - `field_shape`: pixels of the field; default the extent that reaches the sensor, sensor +
+      PSF − 1, of which the image is the part in front of the sensor.
+    """
+
+    psfs: Float[Array, "capture channel plane k l"]
+    field_shape: tuple[int, int] | None = eqx.field(static=True)
+
+    def __init__(self, psfs: Numbers, *, field_shape: tuple[int, int] | None = None):
+        psfs = jnp.asarray(psfs)
+        checks.channels_first("psfs", psfs.shape)
+        _require_light(psfs)
+        if not 3 <= psfs.ndim <= 5:
+            raise ValueError(
+                f"PSFs have shape {psfs.shape}; give (capture, k, l), such as psf[None] for one, "
+                "(capture, channel, k, l) or (capture, channel, plane, k, l)"
+            )
+        self.psfs = psfs.reshape(*psfs.shape[:-2], *(1,) * (5 - psfs.ndim), *psfs.shape[-2:])
+        self.field_shape = field_shape
+
+    @property
+    def count(self) -> int:
+        """Number of captures."""
+        return self.psfs.shape[0]
+
+
+def _require_light(psfs: Array) -> None:
+    """Require finite PSFs that are not mostly negative."""
+    if checks.is_traced(psfs):
+        return
+    values = np.asarray(psfs)
+    if not np.isfinite(values).all():
+        raise ValueError("the PSFs hold NaN or infinity; give finite irradiances")
+    if not values.any():
+        raise ValueError("the PSFs are zero everywhere; give positive irradiances")
+    light = values.sum(axis=(-2, -1), dtype=float)
+    # Differences of PSFs have sums of about zero, of either sign.
+    if (light < -_DARK * np.abs(values).sum(axis=(-2, -1), dtype=float)).any():
+        raise ValueError(
+            f"a PSF sums to {light.min():.3g}, which is negative: too large a background was "
+            "subtracted, or its sign is wrong; give PSFs of positive irradiance"
+        )
+
+
+def registered_shape(shape: tuple[int, int], ratio: float) -> tuple[int, int]:
+    """Shape of a capture enlarged by `ratio` ≥ 1, of the same parity."""
+    rows, columns = (n + 2 * math.ceil((n * ratio - n) / 2 - 1e-6) for n in shape)
+    return rows, columns
+
+
+def register(image: Float[Array, "*batch y x"], ratio: float) -> Float[Array, "*batch v u"]:
+    """A capture enlarged about its centre by `ratio` = d_ref/d ≥ 1, at the same pitch.
+
+    A scene point's shadow moves by d/t, so the enlarged capture is on the scale of one at d_ref.
+    Lanczos interpolation (``jax.image.scale_and_translate``); outside the sensor it is zero.
+    """
+    if ratio < 1:
+        raise ValueError(
+            f"ratio = {ratio:g}: captures are only enlarged; give a ratio of at least 1"
+        )
+    if ratio == 1:
+        return image
+    rows, columns = image.shape[-2:]
+    shape = registered_shape((rows, columns), ratio)
+    scale = jnp.full(2, ratio, dtype=image.dtype)
+    offsets = [(m - n * ratio) / 2 for m, n in zip(shape, image.shape[-2:], strict=True)]
+    enlarged = jax.image.scale_and_translate(
+        image,
+        (*image.shape[:-2], *shape),
+        (image.ndim - 2, image.ndim - 1),
+        scale,
+        jnp.asarray(np.array(offsets), dtype=image.dtype),
+        method="lanczos5",
+        antialias=False,
+    )
+    return enlarged
+
+
+def distance_ratios(cameras: Sequence[LenslessCamera]) -> list[float]:
+    """Enlargement of each camera's captures: largest distance over its own."""
+    if any(checks.is_traced(c.distance) for c in cameras):
+        raise TypeError(
+            "the cameras' distances are traced, but set array sizes: give them as known numbers"
+        )
+    distances = [float(c.distance) for c in cameras]
+    return [max(distances) / d for d in distances]
+
+
+def own_field(field_shape: tuple[int, int], ratio: float) -> tuple[int, int]:
+    """The field in samples of a camera's own scale, `ratio` times coarser, of the same parity."""
+    rows, columns = (n - 2 * math.floor((n - n / ratio) / 2 + 1e-6) for n in field_shape)
+    return rows, columns

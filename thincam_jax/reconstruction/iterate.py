@@ -1,0 +1,290 @@
+"""Iterate a method in compiled chunks, checking convergence between them.
+
+Between two chunks of iterations a run can report, stop early, adapt and be interrupted. Chunks are
+unrolled: on a CPU, XLA runs the transforms of a compiled loop on one core and those of a straight
+program on all (docs/solver_figures.md has the comparison).
+"""
+
+import abc
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, ClassVar, Generic, Literal, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optimistix
+from jaxtyping import Array, Float, PyTree
+
+from thincam_jax.reconstruction.regularisers import Image
+
+Method_State = TypeVar("Method_State")
+
+Status = Literal["converged", "iterations_exhausted", "stopped", "interrupted", "non_finite"]
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """Relative residuals of an iteration.
+
+    - `parts`: (primal, dual) of each split, for methods that balance them.
+    - `elements`: the residuals of each problem that is iterated in parallel.
+    """
+
+    primal: float
+    dual: float
+    parts: tuple[tuple[float, float], ...] = ()
+    elements: tuple["Residuals", ...] = ()
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Progress of a run, for its callback and its history.
+
+    - `objective`: of the image, summed over a batch.
+    - `primal`, `dual`: relative residuals, see the method; NaN if it has none.
+    """
+
+    iteration: int
+    objective: float
+    primal: float
+    dual: float
+
+
+class Outcome(eqx.Module):
+    """The image with the lowest objective among those checked, and the history of the run."""
+
+    image: Image
+    status: Status
+    history: tuple[Progress, ...]
+    iterations: int
+    seconds: float
+
+
+class AbstractMethod(eqx.Module, Generic[Method_State]):
+    """An iterative method with its problem, for `iterate`."""
+
+    @abc.abstractmethod
+    def start(self, image: Image) -> Method_State:
+        """The state of a start image."""
+
+    @abc.abstractmethod
+    def advance(self, state: Method_State, count: int) -> Method_State:
+        """The state after `count` more iterations; the state given must not be used again."""
+
+    @abc.abstractmethod
+    def image(self, state: Method_State) -> Image:
+        """The image of a state."""
+
+    @abc.abstractmethod
+    def objective(self, image: Image) -> Float[Array, "*batch"]:
+        """Objective to minimise."""
+
+    @abc.abstractmethod
+    def residuals(self, state: Method_State) -> Residuals:
+        """Residuals of the last iteration."""
+
+    def adapt(
+        self, state: Method_State, residuals: Residuals
+    ) -> tuple["AbstractMethod[Method_State]", Method_State]:
+        """The method and the state after adapting the method's parameters to the residuals."""
+        return self, state
+
+
+class SolverState(eqx.Module):
+    """Iterate of an optimistix solver: y, and the solver's own state."""
+
+    value: PyTree[Array]
+    inside: Any
+
+
+class OptimistixMethod(AbstractMethod[SolverState]):
+    """A method that iterates by the steps of an optimistix solver.
+
+    The solver is stepped through its interactive interface, `init`, `step` and `postprocess`;
+    `optimistix.fixed_point` and `optimistix.minimise` run the same object in one compiled loop. The
+    solver's state has the residuals `primal` and `dual`, and `parts` if it has several splits.
+
+    - `solver`, and `arguments` of its function.
+    - `donated`: whether the next state reuses the memory of the last.
+    """
+
+    solver: eqx.AbstractVar[Any]
+    arguments: eqx.AbstractVar[Any]
+    donated: ClassVar[bool] = False
+
+    @staticmethod
+    @abc.abstractmethod
+    def function(value: PyTree[Array], arguments: Any) -> tuple[Any, None]:
+        """The function to solve, without auxiliary output."""
+
+    @abc.abstractmethod
+    def value_of(self, image: Image) -> PyTree[Array]:
+        """y of an image."""
+
+    @abc.abstractmethod
+    def image_of(self, value: PyTree[Array]) -> Image:
+        """The image of a y."""
+
+    def start(self, image: Image):
+        return _start(self, image)
+
+    def advance(self, state: SolverState, count: int):
+        run = _advance_donated if self.donated else _advance
+        for size in [UNROLLED] * (count // UNROLLED) + [1] * (count % UNROLLED):
+            state = run(self, state, size)
+        return state
+
+    def image(self, state: SolverState):
+        return _image(self, state)
+
+    def residuals(self, state: SolverState):
+        inside = jax.device_get(state.inside)
+        parts = tuple((float(p), float(d)) for p, d in getattr(inside, "parts", ()))
+        return Residuals(float(inside.primal), float(inside.dual), parts)
+
+
+Callback = Callable[[Progress], object]
+
+# Iterations between two checks.
+CHUNK = 10
+# Iterations in one program. Each run of a program allocates its memory anew, which takes time for
+# large windows; shared by ten iterations it does not matter. Fewer compile faster.
+UNROLLED = CHUNK
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """When a run is checked, adapted and ended.
+
+    - `iterations`: at most, counted from `done`, those of an earlier run.
+    - `tolerance`: both residuals must fall below it.
+    - `check_every`: iterations between two checks.
+    - `adapt_until`: last iteration after which the method may adapt.
+    """
+
+    iterations: int
+    tolerance: float
+    check_every: int = CHUNK
+    adapt_until: int = 0
+    done: int = 0
+
+
+def iterate(
+    method: AbstractMethod,
+    image: Image,
+    schedule: Schedule,
+    *,
+    callback: Callback | None = None,
+    objective: Callable[[Image], Float[Array, "*batch"]] | None = None,
+) -> Outcome:
+    """Iterate from a start image until both residuals are small, or the iterations exhausted.
+
+    At each check the objective and the residuals are computed, `callback` is called (it stops the
+    run by returning a true value), and the method may adapt while the objective falls: parameters
+    that follow misleading residuals would spoil it. Ctrl-C ends the run with the best image so far.
+
+    - `objective`: by which images are compared; default that of the method.
+    """
+    done = schedule.done
+    began = time.perf_counter()
+
+    def judged(image) -> float:
+        return float(jnp.sum((objective or method.objective)(image)))
+
+    best, history = image, [Progress(done, judged(image), math.nan, math.nan)]
+    status: Status = "iterations_exhausted"
+    try:
+        state = method.start(image)
+        while done < schedule.iterations:
+            count = min(schedule.check_every, schedule.iterations - done)
+            state = method.advance(state, count)
+            done += count
+            residuals, current = method.residuals(state), method.image(state)
+            progress = Progress(done, judged(current), residuals.primal, residuals.dual)
+            if not math.isfinite(progress.objective):
+                status = "non_finite"
+                break
+            falling = progress.objective <= min(p.objective for p in history)
+            if falling:
+                best = current
+            history.append(progress)
+            if max(progress.primal, progress.dual) < schedule.tolerance:
+                status = "converged"
+                break
+            if callback is not None and callback(progress):
+                status = "stopped"
+                break
+            if done <= schedule.adapt_until and falling:
+                method, state = method.adapt(state, residuals)
+    except KeyboardInterrupt:
+        status = "interrupted"
+    return Outcome(best, status, tuple(history), done, time.perf_counter() - began)
+
+
+@eqx.filter_jit
+def _start(method: OptimistixMethod, image) -> SolverState:
+    value = method.value_of(image)
+    structure, nothing = jax.eval_shape(method.function, value, method.arguments)
+    tags = frozenset()
+    inside = method.solver.init(
+        method.function, value, method.arguments, {}, structure, nothing, tags
+    )
+    return SolverState(value, inside)
+
+
+def _steps(method: OptimistixMethod, state: SolverState, count: int) -> SolverState:
+    for _ in range(count):
+        value, inside, _ = method.solver.step(
+            method.function, state.value, method.arguments, {}, state.inside, frozenset()
+        )
+        state = SolverState(value, inside)
+    return state
+
+
+_advance = eqx.filter_jit(_steps)
+
+_advance_donated = eqx.filter_jit(_steps, donate="all-except-first")
+
+
+@eqx.filter_jit
+def _image(method: OptimistixMethod, state: SolverState):
+    value, _, _ = method.solver.postprocess(
+        *(method.function, state.value, None, method.arguments, {}, state.inside, frozenset()),
+        optimistix.RESULTS.successful,
+    )
+    return method.image_of(value)
+
+
+def outcome_of_run(
+    start: Image,
+    image: Image,
+    objective: Callable[[Array], Array],
+    *,
+    converged: bool,
+    iterations: int,
+    began: float,
+) -> Outcome:
+    """Outcome of a run in one compiled program: objective before and after, no progress.
+
+    As of `iterate`, the image is the start if the result is not finite.
+
+    - `began`: `time.perf_counter()` at the start.
+    """
+    nan = math.nan
+    before, after = (
+        Progress(n, float(jnp.sum(objective(x))), nan, nan)
+        for n, x in ((0, start), (iterations, image))
+    )
+    # From captures with NaN a linear solver may return a clean zero.
+    finite = bool(jnp.isfinite(image).all()) and math.isfinite(after.objective)
+    status: Status = "converged" if converged else "iterations_exhausted"
+    return Outcome(
+        image if finite else start,
+        status if finite else "non_finite",
+        (before, after),
+        iterations,
+        time.perf_counter() - began,
+    )
