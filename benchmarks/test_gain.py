@@ -4,16 +4,14 @@ from pathlib import Path
 
 import pytest
 
-from thincam_jax.commands.run_folder import RunFolder
 from thincam_jax.commands.study.build import build_study
 from thincam_jax.commands.study.config import load_config
-from thincam_jax.commands.study.run import run_study
 
 CONFIG = Path(__file__).parents[1] / "configs" / "fza_admm_tv.yaml"
 
 
 @pytest.mark.benchmark(group="gain")
-def test_total_variation_beside_wiener(benchmark, tmp_path):
+def test_total_variation_beside_wiener(benchmark):
     """The astronaut: 12 dB for a single capture, 2.4 dB for three contrasts of method B's captures.
 
     3 dB were hoped for with methods A and B too; docs/thesis_studies.md says why noise forbids it.
@@ -26,9 +24,8 @@ def test_total_variation_beside_wiener(benchmark, tmp_path):
             "targets": whole.targets[:1],
         }
     )
-    study, folder = build_study(config), RunFolder(tmp_path / "gain")
-    metrics = benchmark.pedantic(lambda: run_study(study, folder, lambda *_: None), rounds=1)
-    psnr = {n: m["targets"]["astronaut"]["psnr_db"] for n, m in metrics["methods"].items()}
+    found = benchmark.pedantic(build_study(config).run, rounds=1)
+    psnr = {name: e.scores.psnr_db for name, e in found.evaluations["astronaut"].items()}
     assert psnr["single capture, ADMM-TV"] > psnr["single capture, Wiener"] + 10
     assert psnr["single capture, ADMM-TV"] > psnr["method B, Wiener"]
     assert psnr["method B with contrasts, Wiener"] > psnr["method B, Wiener"] + 0.4

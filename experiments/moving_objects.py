@@ -7,22 +7,19 @@
 
 # %%
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
 
 import thincam_jax as tc
-from thincam_jax.commands.checked_config import load_as
-from thincam_jax.commands.study.build import build_study, take
-from thincam_jax.commands.study.config import StudyConfig
-from thincam_jax.commands.study.evaluate import evaluate_method
+from thincam_jax.studies import Method, Study, Target, evaluate_target
 from thincam_jax.units import nm, um
 
 SIZE = os.environ.get("THINCAM_SIZE", "full")  # "small": a narrower camera, in seconds
 FIGURES = Path(os.environ.get("THINCAM_FIGURES", "runs/experiments")) / "moving_objects"
 FIGURES.mkdir(parents=True, exist_ok=True)
-FILE = Path(__file__).parents[1] / "configs/moving.yaml"
 
 # %% [markdown]
 # ## A capture of what moves
@@ -61,51 +58,63 @@ figure.savefig(FIGURES / "bar.png", dpi=110)
 # %% [markdown]
 # ## Speeds
 #
-# The cameras and methods of `configs/moving.yaml`, with `object.motion` in place of its own. Told
-# is how far the scene moves in the whole sequence, in pixels of the sensor. Sensor, mask and scene
-# are a quarter as wide, and the zones as fine.
+# The cameras and methods of `configs/moving.yaml`; sensor, mask and scene are a quarter as wide, and
+# the zones as fine. All but the short capture take the light of eight exposures. The scene's way in
+# the whole sequence is given in pixels of the sensor.
 
 # %%
 count, ways = {"full": (128, (0, 1, 2, 4, 8, 16)), "small": (96, (0, 6))}[SIZE]
 part = 512 / count
 exposures, pitch, magnification = 8, 5.5 * um, 6.5 / 250.0
-settings = load_as(StudyConfig, FILE)
-narrower = [
-    f"sensor.shape=[{count}, {count}]",
-    f"sensor.electrons={16000 * part**2}",
-    f"sensor.full_well={500_000 * part**2}",
-    f"mask.width={2.816 / part} mm",
-    f"object.width={90 / part} mm",
+sensor = tc.Sensor((count, count), pitch, electrons=16000 * part**2, full_well=500_000 * part**2)
+zones = tc.FresnelZoneAperture(50.0 * part, width=2.816 / part)
+place = 250.0, 90 / part
+charts = [
+    Target.usaf1951(*place),
+    *(Target.photograph(name, *place) for name in ("camera", "coins")),
 ]
-for number, method in enumerate(settings.methods):
-    for place, shot in enumerate(method.shots):
-        beta = (shot.beta or 0.0) * part
-        narrower.append(f"methods.{number}.shots.{place}.beta={beta} rad/mm^2")
+variation, wiener = tc.AdmmTV(0.3, iterations=60), tc.Wiener()
+
+
+def shot(relative_time, beta=50.0, distance=6.5):
+    """A setting of the camera, or several."""
+    betas = np.multiply(beta, part)
+    light = {"wavelength": 500 * nm, "width": 2.816 / part}
+    return tc.Exposures(betas, distance, relative_time=relative_time, **light)
+
+
+both = shot(1, distance=[5.0, 6.5]).fringe_scanned()
+methods = [
+    Method("1 capture, TV", shot(8), variation),
+    Method("1 short capture, TV", shot(1), variation),
+    Method("4 captures, TV", shot(2).fringe_scanned(), variation, "fringe_scanning"),
+    Method("1 capture", shot(8), wiener),
+    Method("2 captures, a pair", shot(4).phase_pairs(), wiener, "phase_pairs"),
+    Method("4 captures, scanned", shot(2).fringe_scanned(), wiener, "fringe_scanning"),
+    Method("4 captures, method B", shot(2, [50.0, 42.0]).phase_pairs(), wiener, "phase_pairs"),
+    Method("8 captures, method A", both, wiener, "fringe_scanning"),
+]
 
 
 def studied(pixels):
     """Every method on every target, when the scene moves so far in the sequence."""
-    motion = pixels * pitch / magnification / exposures
-    study = build_study(load_as(StudyConfig, FILE, (*narrower, f"object.motion={motion} mm")))
-    found = {}
-    for target in study.targets:
-        captures = {exposure: take(study, exposure, target) for exposure in study.exposures}
-        found[target.name] = {
-            method.name: evaluate_method(study, method, target, captures)
-            for method in study.methods
-        }
+    speed = pixels * pitch / magnification / exposures
+    moving = [replace(m, exposures=m.exposures.of_moving(speed)) if speed else m for m in methods]
+    noise = tc.PoissonGaussianNoise(2.0)
+    study = Study(zones, sensor, tuple(moving), tuple(charts), object_distance=250.0, noise=noise)
+    found = {target.name: evaluate_target(study, target) for target in study.targets}
     print(f"{pixels} pixels: done", flush=True)
     return found
 
 
 by_way = {pixels: studied(pixels) for pixels in ways}
-names = [method.name for method in settings.methods]
-targets = [target.name for target in settings.targets]
+names = [method.name for method in methods]
+targets = [target.name for target in charts]
 
 
 def decibels(name, *on):
     """Mean PSNR of targets along the ways."""
-    return [np.mean([by_way[p][t][name].metrics["psnr_db"] for t in on]) for p in ways]
+    return [np.mean([by_way[p][t][name].scores.psnr_db for t in on]) for p in ways]
 
 
 for target in targets:
@@ -142,7 +151,7 @@ for row, pixels in zip(axes, shown, strict=True):
         rows, across = found.image.shape
         middle = found.image[rows // 4 : -(rows // 4), across // 4 : -(across // 4)]
         ax.imshow(middle, cmap="gray", vmin=0, vmax=1)
-        ax.set(xticks=[], yticks=[], xlabel=f"{found.metrics['psnr_db']:.1f} dB")
+        ax.set(xticks=[], yticks=[], xlabel=f"{found.scores.psnr_db:.1f} dB")
         if pixels == shown[0]:
             ax.set_title(name)
     row[0].set_ylabel(f"{pixels} pixels")

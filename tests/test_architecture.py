@@ -71,12 +71,21 @@ class Module:
         names = Path(self.path).with_suffix("").parts
         return all(name in ENTRY or not name.startswith("_") for name in names)
 
-    def imports(self) -> Iterator[tuple[int, str]]:
+    def imports(self, *, at_run_time: bool = False) -> Iterator[tuple[int, str]]:
         """Line and absolute dotted name of each import, wherever in the file it stands.
 
-        `from a import b` counts as `a.b`, whether b is a module or a name in one.
+        `from a import b` counts as `a.b`, whether b is a module or a name in one. `at_run_time`:
+        without those for annotations, under `if TYPE_CHECKING`.
         """
+        guards = [
+            n
+            for n in ast.walk(self.tree)
+            if isinstance(n, ast.If) and ast.unparse(n.test) == "TYPE_CHECKING"
+        ]
+        left_out = {n for guard in guards for n in guard.body} if at_run_time else set()
         for node in ast.walk(self.tree):
+            if node in left_out:
+                continue
             if isinstance(node, ast.Import):
                 for alias in node.names:
                     yield node.lineno, alias.name
@@ -185,7 +194,7 @@ def front_end_libraries_in_the_core(modules: list[Module]) -> list[str]:
     return [
         f"{module.path}:{line}: imports {name.split('.')[0]}; only {FRONT_END} may"
         for module in modules
-        for line, name in module.imports()
+        for line, name in module.imports(at_run_time=True)
         if name.split(".")[0] in FRONT_END_LIBRARIES
         and module.top != FRONT_END
         and (module.top, name.split(".")[0]) != (PLOT, "matplotlib")
@@ -328,6 +337,43 @@ def test_package_keeps(rule, package):
     assert not complaints, "\n" + "\n".join(complaints)
 
 
+# Scripts of users and of the docs that still need a command's parts. Shorter is better.
+SCRIPTS_ON_COMMANDS = {
+    *("docs/compare_learned.py", "docs/draw_pages.py", "docs/score_refocusing.py"),
+    *("docs/ship_network.py", "docs/thesis_refocusing.py"),
+    *("experiments/simulated_rig.py", "experiments/sts_design.py"),
+}
+
+
+def scripts_on_commands(scripts: list[Module]) -> set[str]:
+    return {
+        script.path
+        for script in scripts
+        for _, name in script.imports()
+        if name.startswith(f"{PACKAGE}.{FRONT_END}")
+    }
+
+
+def read_scripts(root: Path) -> list[Module]:
+    paths = [path for folder in ("docs", "experiments") for path in (root / folder).glob("*.py")]
+    texts = [(path.relative_to(root).as_posix(), path.read_text("utf-8")) for path in paths]
+    return [Module(name, text, ast.parse(text)) for name, text in texts]
+
+
+def test_scripts_use_the_library():
+    """The list says exactly which do not: one that does is taken off it."""
+    assert scripts_on_commands(read_scripts(ROOT)) == SCRIPTS_ON_COMMANDS
+
+
+@pytest.mark.parametrize(
+    "line", ["from thincam_jax.commands.cli import app", "import thincam_jax.commands"]
+)
+def test_a_script_on_commands_is_seen(tmp_path, line):
+    (tmp_path / "docs").mkdir()
+    (tmp_path / "docs/draw.py").write_text(f"import thincam_jax as tc\n{line}\n")
+    assert scripts_on_commands(read_scripts(tmp_path)) == {"docs/draw.py"}
+
+
 DOC = '"""What it is."""\n'
 
 # rule, file, source, part of the complaint
@@ -364,6 +410,24 @@ BROKEN = [
     (front_end_libraries_in_the_core, "units.py", "from pydantic import BaseModel", "pydantic"),
     (front_end_libraries_in_the_core, "hardware/stage.py", "import typer", "typer"),
     (front_end_libraries_in_the_core, "__init__.py", "import rich, jinja2", "jinja2"),
+    (
+        front_end_libraries_in_the_core,
+        "studies/plot.py",
+        "from matplotlib.figure import Figure",
+        "studies/plot.py:1: imports matplotlib",
+    ),
+    (
+        front_end_libraries_in_the_core,
+        "studies/result.py",
+        "def f():\n    import matplotlib",
+        "studies/result.py:2: imports matplotlib",
+    ),
+    (
+        front_end_libraries_in_the_core,
+        "studies/plot.py",
+        "def f():\n    import rich",
+        "studies/plot.py:2: imports rich",
+    ),
     (bare_files, "measured/read.py", "data = path.read_bytes()", "use read_regular"),
     (bare_files, "_core/files.py", "path.write_text('β')", "use write_whole"),
     (
@@ -425,6 +489,10 @@ SOUND = [
     ("plot/curves.py", DOC + "import matplotlib.figure"),
     ("design/landscape.py", DOC + "def plot():\n    from ..plot import curves"),
     ("commands/figures.py", DOC + "import matplotlib.pyplot, jinja2\nfrom ..learn import x"),
+    (
+        "studies/result.py",
+        DOC + "if TYPE_CHECKING:\n    from matplotlib.figure import Figure\n",
+    ),
     ("commands/rig/command.py", DOC + "def run():\n    from ...hardware import stage"),
     ("hardware/stage.py", DOC + "from thincam_jax.measured.read import x\nfrom .bus import y"),
     ("__init__.py", DOC + "from .lensless.psf import psf as psf\nfrom . import commands"),

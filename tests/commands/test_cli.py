@@ -19,6 +19,7 @@ from thincam_jax.commands.cache import cache_state
 from thincam_jax.commands.examples import kinds
 from thincam_jax.commands.run_folder import RunFolder
 from thincam_jax.commands.study import run as studies
+from thincam_jax.studies import StudyScores
 
 runner = CliRunner()
 
@@ -65,11 +66,14 @@ def test_run_prints_the_results_and_where_the_report_is(tmp_path):
     assert row in again.stdout
 
 
+NOTHING = StudyScores("", 0, {}, [])
+
+
 def test_default_folder_is_named_after_the_study(file, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     folders = []
     monkeypatch.setattr(
-        studies, "run_study", lambda _, folder, __: folders.append(folder.path) or {"methods": {}}
+        studies, "run_study", lambda _, folder, __: folders.append(folder.path) or NOTHING
     )
     assert call("run", file).exit_code == 0
     # A name of dots does not lead out of the folder.

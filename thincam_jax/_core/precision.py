@@ -7,6 +7,7 @@ from typing import Any, Literal, get_args
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from thincam_jax._core import checks
@@ -43,6 +44,15 @@ def allow(precision: Precision, *numbers: Any) -> Iterator[None]:
         )
     with jax.enable_x64(True):
         yield
+
+
+def decimal_value(value: Any) -> Any:
+    """The decimal number behind a stored one: 0.0055 for the float32 0.005499999970197678.
+
+    Sizes that are counted from plain numbers come out the same whatever the precision in between.
+    A traced value is returned as it is.
+    """
+    return value if checks.is_traced(value) else float(str(np.asarray(value)[()]))
 
 
 def product(first: Any, second: Any) -> Any:

@@ -7,7 +7,7 @@ from commands.study import tiny
 
 from thincam_jax.commands.design.config import DesignConfig, load_design
 from thincam_jax.commands.design.simulation import build_designs
-from thincam_jax.commands.study.study import Study
+from thincam_jax.commands.study.build import FileStudy
 from thincam_jax.design import Design
 
 TEXT = """\
@@ -57,7 +57,7 @@ def design(folder: Path, *overrides: str, text: str = TEXT) -> DesignConfig:
     return load_design(write(folder, text), overrides)
 
 
-def built(folder: Path, *overrides: str, text: str = TEXT) -> Study:
+def built(folder: Path, *overrides: str, text: str = TEXT) -> FileStudy:
     return build_designs(design(folder, *overrides, text=text))
 
 

@@ -8,7 +8,7 @@ from commands.study import tiny
 
 from helpers import ROOT, relative_l2
 from thincam_jax.commands import cli
-from thincam_jax.commands.study.build import take
+from thincam_jax.studies import take
 
 
 @pytest.fixture

@@ -7,14 +7,8 @@ import pytest
 from commands.study import tiny
 
 from thincam_jax.commands.config_file import ConfigError
-from thincam_jax.commands.study.build import (
-    build_reconstructor,
-    expose,
-    noise_free,
-    stacked,
-    take,
-)
 from thincam_jax.imaging.scene import ImagePlane
+from thincam_jax.studies import expose, noise_free, reconstructor, stacked, take
 
 ELECTRONS = ("sensor.electrons=2e5", "noise={read_noise: 2}")
 
@@ -28,7 +22,9 @@ def pairs(folder, shot, *overrides):
 def test_a_shot_may_have_its_own_mask_and_exposure(tmp_path):
     shot = "{beta: 25 rad/mm^2, distance: 3 mm, width: 1.2 mm, exposure: 0.5}"
     study, method = pairs(tmp_path, shot)
-    assert [(e.width, e.share) for e in method.exposures] == [(2.0, 1.0)] * 2 + [(1.2, 0.5)] * 2
+    assert [(e.width, e.relative_time) for e in method.exposures] == [(2.0, 1.0)] * 2 + [
+        (1.2, 0.5)
+    ] * 2
     camera = study.camera(method.exposures[2])
     assert float(camera.mask.width) == pytest.approx(1.2)
     assert float(camera.sensor.electrons) == pytest.approx(1e5)
@@ -122,7 +118,7 @@ def test_two_phases_in_quadrature_are_fringe_scanned(tmp_path):
         study = tiny.built(tmp_path, points, f"methods.0.synthesis={synthesis}")
         method, target = study.methods[0], study.targets[0]
         captures = stacked([take(study, exposure, target) for exposure in method.exposures])
-        found = build_reconstructor(study, method, (30, 40), target.distance)(*captures)
+        found = reconstructor(study, method, (30, 40), target.distance)(*captures)
         images.append(np.ravel(found.image))
         phases.append([exposure.phase / np.pi for exposure in method.exposures])
     assert phases == [[0, 0.5, 1, 1.5], [0, 1.5]]

@@ -9,7 +9,7 @@ from PIL import Image
 import thincam_jax as tc
 from thincam_jax.commands.checked_config import dump_config
 from thincam_jax.commands.config_file import ConfigError
-from thincam_jax.commands.study import study
+from thincam_jax.commands.study import mask as masks
 from thincam_jax.commands.study.build import build_study
 from thincam_jax.commands.study.config import load_config
 
@@ -51,7 +51,7 @@ def test_family(tmp_path, mask, expected):
         same = tc.LenslessCamera(expected, camera.sensor, 3.0)
         h = tc.psf(same, wavelength=500e-6, object_distance=100.0, model="geometric")
         np.testing.assert_allclose(built.psf(exposure), h, rtol=1e-6, atol=1e-7)
-    assert built.mask.label in built.mask_of(exposure)
+    assert config.mask.label in built.mask_of(exposure)
     path.write_text(dump_config(config))  # a resolved file is read back
     assert load_config(path) == config
 
@@ -87,8 +87,8 @@ def test_an_image_file_is_read_once(tmp_path, monkeypatch):
     """However many exposures there are, and for its warnings."""
     picture = Image.fromarray(np.uint8(255 * np.eye(12)))
     picture.save(tmp_path / "picture.png")
-    read, read_mask = [], study.masks.read_mask
-    monkeypatch.setattr(study.masks, "read_mask", lambda *a: read.append(a) or read_mask(*a))
+    read, read_mask = [], masks.masks.read_mask
+    monkeypatch.setattr(masks.masks, "read_mask", lambda *a: read.append(a) or read_mask(*a))
     shots = METHOD.replace("{distance: 3 mm}", "{distance: 3 mm}, {distance: 4 mm}")
     mask = f"{{family: file, path: {tmp_path / 'picture.png'}, width: 2 mm}}"
     built = build_study(load_config(written(tmp_path, mask, shots)))

@@ -5,8 +5,6 @@ import pytest
 from helpers import ROOT
 from thincam_jax.commands.study.build import build_study
 from thincam_jax.commands.study.config import load_config
-from thincam_jax.commands.study.evaluate import evaluate_targets
-from thincam_jax.commands.study.response import method_response
 
 # A quarter of the width and four times the β: the zeros and the cut-offs stay where they are.
 SMALL = (
@@ -29,13 +27,12 @@ def test_even_harmonics_see_what_odd_ones_miss():
         shots = (shot.model_copy(update={"beta": 100.0}),)
         chosen.append(method.model_copy(update={"shots": shots}))
     study = build_study(config.model_copy(update={"methods": tuple(chosen)}))
-    found = {name: of["chart"] for name, of in evaluate_targets(study).items()}
-    quality = [of["psnr_db"] for of in found.values()]
-    finest = [of["resolved"]["object_mm"] for of in found.values()]
+    found = study.run().scores.methods.values()
+    quality = [of.targets["chart"].psnr_db for of in found]
+    finest = [of.resolved_mm for of in found]
     assert len(study.exposures) == 8  # all methods share them
     assert quality[2] > quality[1] + 1
     assert finest[2] < 0.8 * min(finest[:2])
-    limits = [method_response(study, method).metrics for method in study.methods]
-    zeros = [limit["first_zero_cycles_per_mm"] for limit in limits]
+    zeros = [of.limits.first_zero_cycles_per_mm for of in found]
     assert abs(zeros[0] - 12.4) < 1  # 1/√(2λd), where the second harmonic is largest
     assert zeros[2] is None or zeros[2] > 2 * zeros[0]

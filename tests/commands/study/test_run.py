@@ -8,6 +8,7 @@ import io
 import json
 import re
 import shutil
+from dataclasses import asdict
 
 import numpy as np
 import pytest
@@ -21,11 +22,20 @@ from thincam_jax.commands.doctor import environment
 from thincam_jax.commands.page import render_page
 from thincam_jax.commands.run_folder import RunFolder
 from thincam_jax.commands.study import run as running
-from thincam_jax.commands.study.build import build_study, take
+from thincam_jax.commands.study.build import build_study
 from thincam_jax.commands.study.config import load_config
-from thincam_jax.commands.study.evaluate import evaluate_method
-from thincam_jax.commands.study.response import method_response
 from thincam_jax.commands.study.run import findings, run_study
+from thincam_jax.studies import (
+    Limits,
+    MethodScores,
+    Published,
+    Resolved,
+    Scores,
+    StudyScores,
+    evaluate_method,
+    method_response,
+    take,
+)
 
 EVIL = "<script>alert(1)</script> & \"quoted\" <img src='http://example.org/x.png'>"
 
@@ -50,7 +60,7 @@ def whole(home, taken):
     folder = RunFolder(home / "whole")
     with pytest.MonkeyPatch.context() as patch:
         counting = counted(patch)
-        metrics = run_study(study, folder, texts)
+        metrics = asdict(run_study(study, folder, texts))
         taken.extend(counting)
     return study, folder.path, metrics, texts
 
@@ -132,7 +142,7 @@ def test_same_seed_same_bytes_other_seed_other_noise(whole, home):
     bytes_of = (whole[1] / "metrics.json").read_bytes()
     assert (again.path / "metrics.json").read_bytes() == bytes_of
     other = RunFolder(home / "other")
-    metrics = run_study(tiny.built(home, "seed=4"), other, tiny.ignore)
+    metrics = asdict(run_study(tiny.built(home, "seed=4"), other, tiny.ignore))
     for name, method in metrics["methods"].items():
         for target, found in method["targets"].items():
             before = whole[2]["methods"][name]["targets"][target]["psnr_db"]
@@ -172,7 +182,7 @@ def test_interrupted_run_goes_on_where_it_stopped(whole, home, monkeypatch):
 
     taken.clear()
     progress = tiny.Told()
-    assert run_study(study, folder, progress) == metrics
+    assert asdict(run_study(study, folder, progress)) == metrics
     assert len(taken) == tiny.CAPTURES
     assert {channels for _, channels, _ in taken} == {3}  # the chart, in grey, was not redone
     assert progress == [text for text in texts if not text.startswith("chart: ")]
@@ -301,9 +311,9 @@ def test_pictures_alone_give_a_report(tmp_path, home):
     """Without a chart nothing is resolved; a target may be called like one of the figures."""
     only = f"targets=[{{name: mtf, kind: file, path: {tmp_path / 'picture.png'}}}]"
     folder = RunFolder(tmp_path / "out")
-    metrics = run_study(tiny.built(tmp_path, only), folder, tiny.ignore)
-    for method in metrics["methods"].values():
-        assert method["targets"]["mtf"]["resolved"] is None
+    scores = run_study(tiny.built(tmp_path, only), folder, tiny.ignore)
+    for method in scores.methods.values():
+        assert method.targets["mtf"].resolved is None and method.resolved_mm is None
     assert not (folder.path / "figures" / "contrast.png").exists()
     figures = {(folder.path / "figures" / n).read_bytes() for n in ("mtf.png", "target-mtf.png")}
     assert len(figures) == 2
@@ -315,8 +325,8 @@ def test_smallest_sensor_that_is_let_through_gives_finite_results(tmp_path):
     study = tiny.built(tmp_path, "sensor.shape=[7, 42]", "seed=1")
     method, target = study.methods[1], study.targets[0]
     captures = {exposure: take(study, exposure, target) for exposure in method.exposures}
-    assert np.isfinite(evaluate_method(study, method, target, captures).metrics["psnr_db"])
-    assert np.isfinite(method_response(study, method).metrics["cut_off_cycles_per_mm"])
+    assert np.isfinite(evaluate_method(study, method, target, captures).scores.psnr_db)
+    assert np.isfinite(method_response(study, method).limits.cut_off_cycles_per_mm)
 
 
 @pytest.fixture
@@ -325,12 +335,12 @@ def run(whole, tmp_path):
     study, path, metrics, _ = whole
     shutil.copytree(path, tmp_path / "copy")
     page = (path / "report.html").read_text("utf-8")
-    return study.config, RunFolder(tmp_path / "copy"), copy.deepcopy(metrics), page
+    return study, RunFolder(tmp_path / "copy"), copy.deepcopy(metrics), page
 
 
 def rendered(config, folder, metrics):
     """The page made anew."""
-    shown = {"environment": environment(), "findings": findings(config, metrics)}
+    shown = {"environment": environment(), "findings": ["A finding."]}
     return render_page("study", config, folder.path / "figures", metrics, **shown)
 
 
@@ -359,9 +369,9 @@ def test_pictures_are_the_figures(run):
 
 
 def test_motion_is_told(run):
-    config, folder, metrics, page = run
+    study, folder, metrics, page = run
     assert "that moves" not in page
-    still = config.object
+    config, still = study.config, study.config.object
     moving = config.model_copy(update={"object": still.model_copy(update={"motion": 0.25})})
     page = rendered(moving, folder, metrics)
     assert "that moves 0.25 mm across during an exposure of 1, λ" in page
@@ -404,33 +414,33 @@ def test_tables_hold_the_metrics(run):
 
 
 def test_configuration_versions_and_seed_are_shown(run):
-    config, folder, _, page = run
+    study, folder, _, page = run
     shown = re.search(r"<pre>(.*?)</pre>", page, re.DOTALL).group(1)
     held = (folder.path / "config.yaml").read_text("utf-8")
     assert html.unescape(shown).strip() == held.strip()
-    assert f"seed {config.seed}" in page
+    assert f"seed {study.config.seed}" in page
     assert environment()["versions"]["jax"] in page
 
 
 def method(psnr, published_psnr, resolved, published_resolved):
-    element = None if resolved is None else {"object_mm": resolved}
-    return {
-        "mean_psnr_of_pictures_db": psnr,
-        "targets": {"picture": {"resolved": None}, "chart": {"resolved": element}},
-        "published": {"psnr_db": published_psnr, "resolved_object_mm": published_resolved},
-    }
+    chart = None if resolved is None else Resolved(0, 1, resolved, 1.0)
+    return MethodScores(
+        4,
+        psnr,
+        Limits(None, None, 9.0, 3.7),
+        {"picture": Scores(20.0, 0.5, 0.1), "chart": Scores(20.0, 0.5, 0.1, chart)},
+        Published(published_psnr, published_resolved),
+    )
 
 
 def test_findings_say_how_the_numbers_lie_to_the_published_ones(run):
-    metrics = {
-        "methods": {
-            "better": method(24.54, 20.3, 1.0, 1.6),
-            "worse": method(18.0, 20.0, 4.0, 3.2),
-            "equal": method(None, None, 2.0, 2.02),
-            "alone": method(20.0, None, None, None),
-        }
+    methods = {
+        "better": method(24.54, 20.3, 1.0, 1.6),
+        "worse": method(18.0, 20.0, 4.0, 3.2),
+        "equal": method(None, None, 2.0, 2.02),
+        "alone": method(20.0, None, None, None),
     }
-    assert findings(run[0], metrics) == [
+    assert findings(run[0], StudyScores("tiny", 3, methods, [])) == [
         "better: 24.5 dB on average over the pictures, published 20.3 dB (+4.2 dB).",
         "better: resolves a line pair of 1.00 mm on the object, published 1.60 mm: finer.",
         "worse: 18.0 dB on average over the pictures, published 20.0 dB (-2.0 dB).",
@@ -443,11 +453,11 @@ def test_findings_say_how_the_numbers_lie_to_the_published_ones(run):
 
 def test_page_of_a_run_without_a_chart(run):
     """Nothing resolved and no contrast figure: the page is still whole."""
-    config, folder, metrics, _ = run
+    study, folder, metrics, _ = run
     for entry in metrics["methods"].values():
         entry["targets"]["chart"]["resolved"] = None
     (folder.path / "figures" / "contrast.png").rename(folder.path / "figures" / "contrast.away")
-    page = rendered(config, folder, metrics)
+    page = rendered(study.config, folder, metrics)
     assert page.count("<img ") == 6
     (row,) = [r for r in rows(page) if r[0] == "conventional" and len(r) == 8]
     assert row[1:3] == ["–", "–"]

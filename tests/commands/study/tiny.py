@@ -6,12 +6,11 @@ cycles/mm, an object of 80 mm at 100 mm that fills 60 of the 64 columns at d = 3
 
 from pathlib import Path
 
-import numpy as np
 import skimage.io
+from studies.tiny import picture
 
-from thincam_jax.commands.study.build import build_study
+from thincam_jax.commands.study.build import FileStudy, build_study
 from thincam_jax.commands.study.config import StudyConfig, load_config
-from thincam_jax.commands.study.study import Study
 
 TEXT = """\
 name: tiny
@@ -45,15 +44,6 @@ targets:
 CAPTURES = 6
 
 
-def picture() -> np.ndarray:
-    """Blobs in colour, 45×60, no symmetry."""
-    y, x = np.mgrid[:45, :60]
-    image = np.full((45, 60, 3), 0.2)
-    for channel, (row, column) in enumerate([(12, 15), (30, 40), (20, 45)]):
-        image[..., channel] += 0.7 * np.exp(-((y - row) ** 2 + (x - column) ** 2) / 60)
-    return np.round(image * 255).astype(np.uint8)
-
-
 def write(folder: Path, text: str = TEXT) -> Path:
     """The study's file and its picture in a folder."""
     image = folder / "picture.png"
@@ -68,7 +58,7 @@ def study(folder: Path, *overrides: str, text: str = TEXT) -> StudyConfig:
     return load_config(write(folder, text), overrides)
 
 
-def built(folder: Path, *overrides: str, text: str = TEXT) -> Study:
+def built(folder: Path, *overrides: str, text: str = TEXT) -> FileStudy:
     return build_study(study(folder, *overrides, text=text))
 
 

@@ -1,19 +1,17 @@
 """One point: its columns, that they are those of a run, and what is compiled anew."""
 
+from dataclasses import asdict
+
 import jax
 import pytest
 from commands.study import tiny
 from commands.sweep import mini
 
-from thincam_jax.commands.run_folder import RunFolder
 from thincam_jax.commands.study.build import build_study
-from thincam_jax.commands.study.run import run_study
 from thincam_jax.commands.sweep.measure import measure_point
 
 
-def test_columns_are_the_metrics_of_a_run(tmp_path, monkeypatch):
-    for name in ("save_target", "save_captures", "save_responses", "save_contrasts", "save_psf"):
-        monkeypatch.setattr(f"thincam_jax.commands.study.figures.{name}", lambda *_: None)
+def test_columns_are_the_metrics_of_a_run(tmp_path):
     targets = tiny.TEXT[tiny.TEXT.index("  - {name: chart") :]
     config = tiny.study(tmp_path, text=mini.TEXT[: mini.TEXT.index("  - {name: star")] + targets)
     (point,) = mini.points(config, "seed=0", double=True)
@@ -23,7 +21,7 @@ def test_columns_are_the_metrics_of_a_run(tmp_path, monkeypatch):
     assert row is not None
     assert row.pop("seconds") > 0
     expected, study = {}, build_study(config)
-    methods = run_study(study, RunFolder(tmp_path / "run"), tiny.ignore)["methods"]
+    methods = asdict(study.run().scores)["methods"]
     for name, method in methods.items():
         mean = sum(target["psnr_db"] for target in method["targets"].values()) / 2
         expected[f"mean_psnr_db/{name}"] = pytest.approx(mean, abs=1e-4)
@@ -76,7 +74,7 @@ def test_camera_that_cannot_be_built_is_a_reason(tmp_path):
     assert measured.traceback is None
 
 
-def test_defect_is_a_reason_with_its_traceback(tmp_path, monkeypatch):
+def test_defect_is_a_reason_with_its_traceback(tmp_path):
     def broken(_):
         raise ZeroDivisionError("a\n  defect")
 

@@ -9,7 +9,6 @@ import scipy.special
 from helpers import ROOT, relative_l2
 from thincam_jax.commands.study.build import assemble
 from thincam_jax.commands.study.config import load_config
-from thincam_jax.commands.study.response import method_response
 from thincam_jax.imaging.metrics import (
     cut_off,
     first_common_zero,
@@ -17,6 +16,7 @@ from thincam_jax.imaging.metrics import (
     zero_crossings,
 )
 from thincam_jax.imaging.metrics.mtf import MINIMUM_COLUMNS
+from thincam_jax.studies import method_response
 
 WAVELENGTH = 5e-4
 STEP = 0.05
@@ -186,7 +186,7 @@ def distant():
     """All four responses for an object at 1 km, where the magnification is 1."""
     found = responses(1e6, range(4))
     for name, response in zip(("5.0 mm", "6.5 mm", "A", "B"), found, strict=True):
-        print(f"distant object, {name}: {response.metrics}")
+        print(f"distant object, {name}: {response.limits}")
     return found
 
 
@@ -195,21 +195,21 @@ def near():
     """All four for the thesis' object at 250 mm."""
     found = responses(250, range(4))
     for name, response in zip(("5.0 mm", "6.5 mm", "A", "B"), found, strict=True):
-        print(f"object at 250 mm, {name}: {response.metrics}")
+        print(f"object at 250 mm, {name}: {response.limits}")
     return found
 
 
 @pytest.mark.parametrize(("method", "expected"), [(CONVENTIONAL_6, 12.40), (CONVENTIONAL_5, 14.14)])
 def test_first_zero_of_fringe_scanning(distant, method, expected):
     """cos(πλdu²) = 0; the finite mask's ripple moves it by some 0.1."""
-    found = distant[method].metrics["first_zero_cycles_per_mm"]
+    found = distant[method].limits.first_zero_cycles_per_mm
     assert found == pytest.approx(expected, abs=0.3)
 
 
 @pytest.mark.thorough
 def test_two_distances_leave_no_zero(distant, near):
     for response in (distant[METHOD_A], near[METHOD_A]):
-        assert response.metrics["first_zero_cycles_per_mm"] is None
+        assert response.limits.first_zero_cycles_per_mm is None
 
 
 @pytest.mark.thorough
@@ -218,8 +218,8 @@ def test_phase_pairs_have_no_first_zero(distant, near):
     is the carrier sin X − cos X; where, depends on the sampling.
     """
     for response in (distant[METHOD_B], near[METHOD_B]):
-        assert response.metrics["first_zero_cycles_per_mm"] is None
-        assert response.metrics["first_zero_object_mm"] is None
+        assert response.limits.first_zero_cycles_per_mm is None
+        assert response.limits.first_zero_object_mm is None
         for zero in (12.4, 21.5):
             around = np.abs(response.frequency - zero) < 0.4
             level = low_frequency_value(response.frequency, response.magnitude)
@@ -227,31 +227,31 @@ def test_phase_pairs_have_no_first_zero(distant, near):
 
 
 def test_object_side_limits_are_the_sensor_side_ones_magnified(near):
-    limits = near[CONVENTIONAL_5].metrics  # on its own plane: t/d = 50
-    assert limits["first_zero_object_mm"] == pytest.approx(
-        50 / limits["first_zero_cycles_per_mm"], abs=1e-3
+    limits = near[CONVENTIONAL_5].limits  # on its own plane: t/d = 50
+    assert limits.first_zero_object_mm == pytest.approx(
+        50 / limits.first_zero_cycles_per_mm, abs=1e-3
     )
-    limits = near[METHOD_A].metrics  # on the plane of the larger distance
-    assert limits["cut_off_object_mm"] == pytest.approx(
-        250 / 6.5 / limits["cut_off_cycles_per_mm"], abs=1e-3
+    limits = near[METHOD_A].limits  # on the plane of the larger distance
+    assert limits.cut_off_object_mm == pytest.approx(
+        250 / 6.5 / limits.cut_off_cycles_per_mm, abs=1e-3
     )
 
 
 def test_cut_off_of_method_a_is_the_aperture(near):
     """βR/π = 22.4 cycles/mm (ERRATA 3.5.1), and no zero at 22.9."""
-    assert near[METHOD_A].metrics["cut_off_cycles_per_mm"] == pytest.approx(22.4, abs=1.0)
+    assert near[METHOD_A].limits.cut_off_cycles_per_mm == pytest.approx(22.4, abs=1.0)
 
 
 def test_cut_off_of_method_b_is_its_second_harmonic(distant):
     """2βR/π = 44.8 cycles/mm, twice that of method A, where the order still has 12 %."""
-    assert distant[METHOD_B].metrics["cut_off_cycles_per_mm"] >= 42
-    assert distant[METHOD_B].metrics["cut_off_cycles_per_mm"] == pytest.approx(44.8, abs=1.0)
+    assert distant[METHOD_B].limits.cut_off_cycles_per_mm >= 42
+    assert distant[METHOD_B].limits.cut_off_cycles_per_mm == pytest.approx(44.8, abs=1.0)
 
 
 def test_near_object_lowers_the_cut_off_by_the_magnification(near):
     """2βR/(πM²) for the part of the shadow on the sensor: 42.6 at the larger β."""
     limit = 2 * 25 / (1 + 6.5 / 250) ** 2 * 5.632 / 2 / math.pi
-    assert near[METHOD_B].metrics["cut_off_cycles_per_mm"] == pytest.approx(limit, abs=1.0)
+    assert near[METHOD_B].limits.cut_off_cycles_per_mm == pytest.approx(limit, abs=1.0)
 
 
 def test_edge_tail_of_method_a_for_a_distant_object(distant):
@@ -266,7 +266,7 @@ def test_edge_tail_of_method_a_for_a_distant_object(distant):
     width = edge / (2.816 * math.sqrt(2 * 25 / math.pi))  # Δu of s = 1
     assert cut_off(response.frequency, response.magnitude, 0.1) == pytest.approx(edge, abs=width)
     tail = edge * (1 + 1 / (math.sqrt(2) * math.pi * 0.05) / (edge / width))
-    assert edge + width < response.metrics["cut_off_cycles_per_mm"] < tail
+    assert edge + width < response.limits.cut_off_cycles_per_mm < tail
 
 
 def fields(beta, distance, x, half_width):
@@ -337,8 +337,8 @@ def test_rows_belong_to_the_response():
     """v = 0 sums over the rows: a strip of 64 would give another first zero."""
     (whole,) = responses(1e6, (CONVENTIONAL_5,))
     (strip,) = responses(1e6, (CONVENTIONAL_5,), **{"sensor.shape": "[64, 1024]"})
-    key = "first_zero_cycles_per_mm"
-    assert abs(whole.metrics[key] - strip.metrics[key]) > 0.2
+    zeros = [response.limits.first_zero_cycles_per_mm for response in (whole, strip)]
+    assert abs(zeros[0] - zeros[1]) > 0.2
 
 
 def test_both_cut_offs_of_an_object_at_350_mm():
@@ -346,6 +346,6 @@ def test_both_cut_offs_of_an_object_at_350_mm():
     tail of the aperture's edge: method A ends at βR/π and method B above 42 in one set-up.
     """
     method_a, method_b = responses(350, (METHOD_A, METHOD_B))
-    print(f"object at 350 mm: {method_a.metrics}, {method_b.metrics}")
-    assert method_a.metrics["cut_off_cycles_per_mm"] == pytest.approx(22.4, abs=1.0)
-    assert method_b.metrics["cut_off_cycles_per_mm"] >= 42
+    print(f"object at 350 mm: {method_a.limits}, {method_b.limits}")
+    assert method_a.limits.cut_off_cycles_per_mm == pytest.approx(22.4, abs=1.0)
+    assert method_b.limits.cut_off_cycles_per_mm >= 42

@@ -12,13 +12,14 @@ from thincam_jax._core.grids import Grid
 from thincam_jax._core.precision import PRECISIONS, Precision, allow, cast
 from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.sections import SensorConfig
-from thincam_jax.commands.study.build import check_study
-from thincam_jax.commands.study.study import Exposure, Method, Study, Target
+from thincam_jax.commands.study.build import FileStudy, check_study
 from thincam_jax.imaging.operators import kernel_shape
 from thincam_jax.lensless.camera import LenslessCamera
+from thincam_jax.lensless.exposures import Exposure
 from thincam_jax.lensless.forward import projected_shape
 from thincam_jax.lensless.method import Model
 from thincam_jax.lensless.psf import psf
+from thincam_jax.studies.study import Method, Study, Target
 
 DEFAULT_SIZES = (128, 256, 512)  # pixels along the longer side
 DEFAULT_CAPTURE_SIZE = 256
@@ -44,7 +45,7 @@ def capture_size_of(sensor: SensorConfig, asked: int | None) -> int:
     return asked
 
 
-def binned(study: Study, size: int) -> Study:
+def binned(study: FileStudy, size: int) -> FileStudy:
     """The study with its pixels binned so that the sensor's longer side has `size` of them.
 
     The pitch grows by the same ratio, so that the sensor keeps its area: along the longer side
@@ -52,9 +53,7 @@ def binned(study: Study, size: int) -> Study:
     """
     ratio = max(study.sensor.shape) / size
     rows, columns = (max(1, round(n / ratio)) for n in study.sensor.shape)
-    sensor = study.sensor.model_copy(
-        update={"shape": (rows, columns), "pitch": study.sensor.pitch * ratio}
-    )
+    sensor = dataclasses.replace(study.sensor, shape=(rows, columns), pitch=study.pitch * ratio)
     return dataclasses.replace(study, sensor=sensor)
 
 
@@ -106,7 +105,7 @@ def psf_of(
             wavelength=given.wavelength,
             object_distance=float(given.object_distance),
             model=model,
-            pixel_integration=study.config.pixel_integration,
+            pixel_integration=study.pixel_integration,
             grid=Grid(shape, grid.pitch) if shape else grid,
             precision=precision,
         )
@@ -137,7 +136,7 @@ class Case:
     - `skipped`: why nothing is reconstructed; None where something is.
     """
 
-    study: Study
+    study: FileStudy
     method: Method
     target: Target
     skipped: str | None
@@ -149,7 +148,7 @@ class Case:
         return kernel_shape(camera.sensor.shape, projected_shape(camera, self.target.plane))
 
 
-def make_case(study: Study, size: int) -> Case:
+def make_case(study: FileStudy, size: int) -> Case:
     """The first picture (else the first target) and the first Wiener method (else the first).
 
     **Errors**: ConfigError where the size is too small to reconstruct.
@@ -160,7 +159,7 @@ def make_case(study: Study, size: int) -> Case:
     except ConfigError as error:
         raise ConfigError(f"--capture-size {size}: {str(error).splitlines()[0]}") from None
     pictures = [target for target in study.targets if target.is_picture]
-    wiener = [method for method in study.methods if method.kind == "wiener"]
+    wiener = [method for method in study.methods if method.solver.name == "wiener"]
     method = (wiener or study.methods)[0]
     skipped = None if wiener else f"{method.name}: fringe scanning assumes no PSF"
     return Case(study, method, (pictures or list(study.targets))[0], skipped)

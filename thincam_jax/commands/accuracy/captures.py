@@ -17,9 +17,9 @@ from thincam_jax.commands.accuracy.cameras import (
 )
 from thincam_jax.commands.accuracy.psfs import why_not, words
 from thincam_jax.commands.run_folder import Step
-from thincam_jax.commands.study.study import Exposure
 from thincam_jax.imaging.scene import Spectrum
 from thincam_jax.lensless.cost import psf_cost
+from thincam_jax.lensless.exposures import Exposure
 from thincam_jax.lensless.forward import imaging_operator, project, projected_shape
 from thincam_jax.lensless.method import MODELS, Model, psf_method
 
@@ -90,7 +90,7 @@ def clean_capture(
             blurring.object_distance,
             field_shape=shape,
             model=model,
-            pixel_integration=case.study.config.pixel_integration,
+            pixel_integration=case.study.pixel_integration,
         )
         return np.asarray(convolution(project(camera, plane, shape)))
 
@@ -99,7 +99,7 @@ def kernel_reason(case: Case, exposure: Exposure, model: Model) -> str | None:
     """Why a model is not run for a capture; None where it is."""
     with allow("float64"):
         given = conditions_of(case.study, exposure)["float64"]
-        whole = case.study.config.pixel_integration
+        whole = case.study.pixel_integration
         grid = Grid(case.kernel_shape, jnp.asarray(given.camera.sensor.pitch))
         method = psf_method(given.camera.mask, grid, model, whole, "float32")
         return why_not(model, psf_cost(given.camera.mask, grid, method), given)

@@ -19,10 +19,11 @@ from thincam_jax.commands.accuracy.cameras import (
     relative_error,
 )
 from thincam_jax.commands.run_folder import Step
-from thincam_jax.commands.study.study import Exposure, Study
+from thincam_jax.commands.study.build import FileStudy
 from thincam_jax.lensless.accuracy.select import predicted_error, probe_of
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.cost import Cost, psf_cost
+from thincam_jax.lensless.exposures import Exposure
 from thincam_jax.lensless.method import MODELS, SAMPLED, Model, PsfMethod, psf_method
 from thincam_jax.lensless.propagation.closed_form import in_focus
 from thincam_jax.lensless.psf import psf
@@ -72,11 +73,11 @@ class PsfErrors:
     left out. `work` fills `rows`.
     """
 
-    def __init__(self, study: Study, exposure: Exposure, size: int):
+    def __init__(self, study: FileStudy, exposure: Exposure, size: int):
         self.study, self.exposure, self.rows = binned(study, size), exposure, []
         self.given = conditions_of(self.study, exposure)
         with allow("float64"):
-            found = candidates(self.given["float64"].camera, study.config.pixel_integration)
+            found = candidates(self.given["float64"].camera, study.pixel_integration)
         self.work = [
             Step(
                 f"{size} pixels: {label(method.model, method.precision, method.oversampling)}",
@@ -90,7 +91,7 @@ class PsfErrors:
         """Where errors are predicted from, and the PSF that they count from."""
         given = self.given["float64"]
         numbers = given.camera, given.wavelength, given.object_distance
-        probe = probe_of(*numbers, self.study.config.pixel_integration, None)
+        probe = probe_of(*numbers, self.study.pixel_integration, None)
         return probe, psf_of(self.study, self.exposure)
 
     def _add(self, method: PsfMethod, cost: Cost) -> None:
@@ -131,10 +132,12 @@ def words(model: str) -> str:
     return model.replace("rayleigh_s", "Rayleigh-S").replace("_", " ")
 
 
-def _described(study: Study, method: PsfMethod, cost: Cost, reason: str | None) -> dict[str, Any]:
+def _described(
+    study: FileStudy, method: PsfMethod, cost: Cost, reason: str | None
+) -> dict[str, Any]:
     return {
         "shape": list(study.sensor.shape),
-        "pitch_mm": study.sensor.pitch,
+        "pitch_mm": study.pitch,
         "model": method.model,
         "precision": method.precision,
         "oversampling": method.oversampling,

@@ -18,12 +18,12 @@ from thincam_jax.commands.accuracy.cameras import (
 from thincam_jax.commands.accuracy.captures import clean_capture, kernel_reason
 from thincam_jax.commands.accuracy.psfs import words
 from thincam_jax.commands.run_folder import Step
-from thincam_jax.commands.study.build import build_reconstructor, field_shape, stacked, take
-from thincam_jax.commands.study.evaluate import evaluate
-from thincam_jax.commands.study.study import Method, Study
 from thincam_jax.imaging.metrics import psnr
 from thincam_jax.lensless.method import MODELS, Model
 from thincam_jax.reconstruction import Reconstruction
+from thincam_jax.studies.evaluate import evaluate, field_shape, reconstructor
+from thincam_jax.studies.simulate import stacked, take
+from thincam_jax.studies.study import Method, Study
 
 # What is wrong: the mask's curvature β, or its distance d from the sensor.
 QUANTITIES = ("beta", "distance")
@@ -118,7 +118,7 @@ class ReconstructionErrors:
     def _reconstruct(self, method: Method, model: Model) -> Reconstruction:
         study, target = dataclasses.replace(self.case.study, model=model), self.case.target
         shape = field_shape(study, self.case.method, target)
-        return build_reconstructor(study, method, shape, target.distance)(*self.captures)
+        return reconstructor(study, method, shape, target.distance)(*self.captures)
 
     def _psnr(self, found: Reconstruction) -> float:
         """dB, of the same pixels of the object whatever camera was assumed."""
@@ -129,11 +129,8 @@ class ReconstructionErrors:
 
 def changed(method: Method, quantity: str, part: float) -> Method:
     """The method with one quantity of all its exposures multiplied by 1 + part."""
-    exposures = tuple(
-        dataclasses.replace(exposure, **{quantity: getattr(exposure, quantity) * (1 + part)})
-        for exposure in method.exposures
-    )
-    return dataclasses.replace(method, exposures=exposures)
+    other = {quantity: getattr(method.exposures, quantity) * (1 + part)}
+    return dataclasses.replace(method, exposures=dataclasses.replace(method.exposures, **other))
 
 
 def psfs_of(study: Study, method: Method) -> np.ndarray:

@@ -17,9 +17,9 @@ from thincam_jax.commands.checked_config import dump_config
 from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.doctor import usable_cores
 from thincam_jax.commands.run_folder import Progress, Step, carry_out, claim_folder, to_json
-from thincam_jax.commands.study.build import build_study
+from thincam_jax.commands.study.build import FileStudy, build_study
 from thincam_jax.commands.study.config import StudyConfig
-from thincam_jax.commands.study.study import Exposure, Study
+from thincam_jax.lensless.exposures import Exposure
 
 
 class BenchFolder:
@@ -54,7 +54,7 @@ class Sizes:
 class Benchmark:
     """A checked benchmark: the study, the sizes, and what is captured."""
 
-    study: Study
+    study: FileStudy
     sizes: tuple[int, ...]
     case: Case
 

@@ -1,5 +1,6 @@
 """From the file of a capture to what a study has: cameras, a method, and the object."""
 
+import itertools
 from dataclasses import replace
 
 import equinox as eqx
@@ -9,14 +10,15 @@ from thincam_jax import waveguide as wg
 from thincam_jax.commands.capture.config import CaptureConfig
 from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.screen.build import build_cameras, build_plane
-from thincam_jax.commands.sections import PHASES, MaskConfig, SensorConfig, Synthesis
-from thincam_jax.commands.study.build import read_targets
-from thincam_jax.commands.study.study import Exposure, Method, Study
+from thincam_jax.commands.sections import PHASES, MaskConfig, SensorConfig
+from thincam_jax.commands.study.build import FileStudy, build_optics, build_solver, read_targets
 from thincam_jax.imaging.operators import Sparse
 from thincam_jax.imaging.scene import ImagePlane
+from thincam_jax.lensless.exposures import Exposures
+from thincam_jax.studies.study import Method, Synthesis
 
 
-def build_study(config: CaptureConfig, shape: tuple[int, int]) -> Study:
+def build_study(config: CaptureConfig, shape: tuple[int, int]) -> FileStudy:
     """The cameras of a lensless plan, for frames of a shape, with the one method of its file.
 
     **Errors**: ConfigError for a picture that cannot be read.
@@ -28,13 +30,14 @@ def build_study(config: CaptureConfig, shape: tuple[int, int]) -> Study:
         synthesis = "separate"
     phases = PHASES.get(synthesis, (plan.phase,))
     distances = plan.distances if plan.kind == "method_a" else (optics.distance,)
-    exposures = tuple(
-        Exposure(beta, phase, distance, optics.wavelength, plan.width)
-        for distance in distances
-        for beta in plan.betas
-        for phase in phases
-    )
-    kind, variation = config.reconstruction.kind, config.reconstruction.variation
+    settings = list(itertools.product(distances, plan.betas))
+    exposures = Exposures(
+        [beta for _, beta in settings],
+        [distance for distance, _ in settings],
+        wavelength=optics.wavelength,
+        width=plan.width,
+    ).at_phases(phases)
+    solver = build_solver(config.reconstruction.kind, config.reconstruction.variation)
     targets, unread = read_targets(config.targets, optics.object.distance, optics.object.width)
     if unread:
         raise ConfigError(f"{config.place_of('targets', 0)}targets[0]: {unread[0]}")
@@ -50,14 +53,15 @@ def build_study(config: CaptureConfig, shape: tuple[int, int]) -> Study:
         fill_factor=display.fill_factor,
     )
     pitch = f"{config.camera.pitch!r} mm"
-    return Study(
-        optics,
-        SensorConfig(shape=shape, pitch=pitch),  # pyright: ignore[reportArgumentType]
-        mask,
-        None,
-        (Method(plan.kind, kind, synthesis, exposures, len(phases), variation),),
+    sensor = SensorConfig(shape=shape, pitch=pitch)  # pyright: ignore[reportArgumentType]
+    return FileStudy(
+        *build_optics(mask, sensor, exposures[0]),
+        (Method(plan.kind, exposures, solver, synthesis, len(phases)),),
         tuple(grey),
-        optics.model,
+        object_distance=optics.object.distance,
+        model=optics.model,
+        pixel_integration=optics.pixel_integration,
+        config=optics,
     )
 
 

@@ -18,14 +18,14 @@ from thincam_jax.commands.capture.config import CaptureConfig
 from thincam_jax.commands.run_folder import Progress, Run, RunFolder
 from thincam_jax.commands.screen.calibration import diagonal
 from thincam_jax.commands.screen.figures import save_columns
-from thincam_jax.commands.study import build
-from thincam_jax.commands.study.evaluate import rounded, sample
-from thincam_jax.commands.study.study import Reconstructor, Study
 from thincam_jax.imaging.metrics import psnr
 from thincam_jax.imaging.operators import ReducedMatrix
 from thincam_jax.measured import calibration
 from thincam_jax.reconstruction import Reconstruction
 from thincam_jax.reconstruction.noise import estimate_noise
+from thincam_jax.studies.evaluate import Reconstructor, reconstructor, rounded, sample
+from thincam_jax.studies.simulate import noise_free
+from thincam_jax.studies.study import Study
 
 
 @dataclass(frozen=True)
@@ -119,9 +119,9 @@ class _CaptureRun(Run):
 
     def _image(self, study: Study, frames: np.ndarray) -> Reconstruction:
         if self._reconstructor is None:
-            method, seen = study.methods[0], study.config.object.distance
+            method, seen = study.methods[0], study.object_distance
             shape = field_shape(self.config, method)
-            self._reconstructor = build.build_reconstructor(study, method, shape, seen)
+            self._reconstructor = reconstructor(study, method, shape, seen)
         captures = jnp.asarray(frames[:, None], jnp.float32)
         return self._reconstructor(captures, estimate_noise(captures) ** 2)
 
@@ -132,7 +132,7 @@ class _CaptureRun(Run):
         whole, part = build_study(self.config, virtual.sensor), self.taken.pixels
         clean = camera.counts * np.stack(
             [
-                np.asarray(build.noise_free(whole, exposure, target.plane))[part]
+                np.asarray(noise_free(whole, exposure, target.plane))[part]
                 for exposure in whole.methods[0].exposures
             ]
         )

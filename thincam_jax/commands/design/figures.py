@@ -17,9 +17,9 @@ from thincam_jax.commands.design.surroundings import Landscape
 from thincam_jax.commands.design.train import TrainingObjective
 from thincam_jax.commands.design.transfer import Transfer
 from thincam_jax.commands.design.words import QUANTITIES, first, free_number
+from thincam_jax.commands.study.build import FileStudy
 from thincam_jax.commands.study.figures import as_png as as_png
 from thincam_jax.commands.study.figures import drawing, line_style
-from thincam_jax.commands.study.study import Study
 
 _ROOM = 0.06  # around points, as a part of an axis
 _SHADED = 85  # per cent of the landscape that the shades tell apart; the worst is one shade
@@ -53,7 +53,7 @@ class _DrawnLandscape:
 _MASK_SAMPLES = 600  # along a side of a drawn mask
 
 
-def draw_masks(study: Study, best: str) -> Figure:
+def draw_masks(study: FileStudy, best: str) -> Figure:
     """The first mask of each shot and its PSF, of the reference and of the best design, in rows."""
     methods = [study.methods[0], next(m for m in study.methods if m.name == best)]
     shots = max(len(method.shots) for method in methods)
@@ -67,7 +67,7 @@ def draw_masks(study: Study, best: str) -> Figure:
             mask = np.abs(np.asarray(camera.mask.sample(grid)))
             ax.imshow(mask, cmap="gray", vmin=0, vmax=1, extent=(-half, half, half, -half))
             h = np.asarray(study.psf(shot))
-            y, x = (n * study.sensor.pitch / 2 for n in h.shape)
+            y, x = (n * study.pitch / 2 for n in h.shape)
             beside.imshow(h, cmap="gray", extent=(-x, x, y, -y))
             for drawn, what in ((ax, "mask"), (beside, "its PSF")):
                 drawn.set_axis_on()

@@ -23,7 +23,7 @@ from thincam_jax.commands.design.config import DesignConfig, found_name
 from thincam_jax.commands.design.config_pareto import ParetoConfig, with_shots
 from thincam_jax.commands.design.simulation import simulate, with_designs
 from thincam_jax.commands.run_folder import Step
-from thincam_jax.commands.study.study import Study
+from thincam_jax.commands.study.build import FileStudy
 from thincam_jax.design import Design, DesignSpace, PhotonNoise, bayes_error, channels, limit
 
 _TRIED = 3  # of the designs of a search, are scored exactly
@@ -87,7 +87,7 @@ class FrontSearches:
     **Errors**: ConfigError where the objective was NaN at every start.
     """
 
-    def __init__(self, study: Study, asked: ParetoConfig):
+    def __init__(self, study: FileStudy, asked: ParetoConfig):
         self.study, self.asked = study, asked
         self.config: DesignConfig = study.config
         self.phases = len(self.config.reference.phases)
@@ -191,7 +191,7 @@ def _order(name: str, count: int) -> list[tuple[int, int | None]]:
     return [*alone, *back, *((n, n - 1) for n in range(1, count))]
 
 
-def _variance(study: Study) -> float:
+def _variance(study: FileStudy) -> float:
     planes = (target.plane for target in study.targets if target.is_picture)
     images = (np.asarray(plane.image, dtype=float) for plane in planes)
     return float(np.exp(np.mean([np.log(np.mean(np.var(i, axis=(-2, -1)))) for i in images])))

@@ -17,7 +17,7 @@ from thincam_jax.commands.design.config import (
     SearchConfig,
 )
 from thincam_jax.commands.design.config_pareto import ParetoConfig
-from thincam_jax.commands.study.study import Study, synthesis_matrix
+from thincam_jax.commands.study.build import FileStudy
 from thincam_jax.design import (
     Design,
     DesignSpace,
@@ -39,6 +39,7 @@ from thincam_jax.design import (
 )
 from thincam_jax.design.frequencies import Frequencies
 from thincam_jax.design.search import Search
+from thincam_jax.studies.study import synthesis_matrix
 
 DEFAULT_BAND = (0.05, 0.5)
 # What is called worse by 1 %: 10 log10(1.01) dB for what is in dB.
@@ -169,7 +170,7 @@ def synthesis_of(design: Design, config: DesignConfig) -> np.ndarray:
     return synthesis_matrix(config.reference.synthesis, design.captures // phases, phases)
 
 
-def build_problem(study: Study) -> DesignProblem:
+def build_problem(study: FileStudy) -> DesignProblem:
     """In the precision that JAX is set to; looks at the photographs where the prior needs them."""
     config: DesignConfig = study.config
     setup, space = _setup(study), config.space()
@@ -205,7 +206,7 @@ def _exact_count(config: DesignConfig, highest) -> int:
     return max(_FEWEST, math.ceil(_MARGIN * 2 * shadow * float(highest)) + 1)
 
 
-def _setup(study: Study) -> Setup:
+def _setup(study: FileStudy) -> Setup:
     config: DesignConfig = study.config
     return Setup(
         pitch=config.sensor.pitch,
@@ -225,7 +226,7 @@ def _noise(noise: DesignNoiseConfig) -> SignalNoise | PhotonNoise:
     return PhotonNoise(noise.electrons or 0.0, noise.read_noise or 0.0)
 
 
-def _prior(study: Study) -> PowerLaw:
+def _prior(study: FileStudy) -> PowerLaw:
     if study.config.prior.exponent is not None:
         return PowerLaw(study.config.prior.exponent)
     planes = (target.plane for target in study.targets if target.is_picture)

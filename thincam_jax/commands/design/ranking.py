@@ -31,7 +31,7 @@ from thincam_jax.commands.design.surroundings import (
 from thincam_jax.commands.design.train import Trained, TrainingDescents
 from thincam_jax.commands.design.transfer import RINGS, Transfer, modulation_transfer
 from thincam_jax.commands.run_folder import Step
-from thincam_jax.commands.study.study import Study
+from thincam_jax.commands.study.build import FileStudy
 from thincam_jax.design import Design, DesignSpace, channels
 from thincam_jax.design.objectives import ring_means
 from thincam_jax.design.search import APART, Found, Search
@@ -97,7 +97,7 @@ class Finder:
     found: tuple[Candidate, ...]
     result: FoundDesigns
 
-    def __init__(self, study: Study):
+    def __init__(self, study: FileStudy):
         self.study = study
         self.config: DesignConfig = study.config
         self.work = [Step("search", self.search)]

@@ -11,7 +11,7 @@ from thincam_jax.commands.design.problem import Shot
 from thincam_jax.commands.design.ranking import Candidate, FoundDesigns
 from thincam_jax.commands.design.words import QUANTITIES
 from thincam_jax.commands.sections import ShotConfig
-from thincam_jax.commands.study.study import Study
+from thincam_jax.commands.study.build import FileStudy
 from thincam_jax.design import non_dominated
 from thincam_jax.design.space import QUANTITIES as FREE
 
@@ -23,7 +23,7 @@ COSTS = {
 }
 
 
-def record(result: FoundDesigns, study: Study, validation: dict) -> dict:
+def record(result: FoundDesigns, study: FileStudy, validation: dict) -> dict:
     """The designs, best first, and the validation of those of them that were simulated."""
     config, objective = study.config, result.objective
     return {

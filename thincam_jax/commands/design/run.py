@@ -13,9 +13,10 @@ from thincam_jax.commands.design.pareto import FrontSearches
 from thincam_jax.commands.design.ranking import Finder
 from thincam_jax.commands.design.record import record, record_fronts
 from thincam_jax.commands.run_folder import Progress, Run, RunFolder
-from thincam_jax.commands.study.evaluate import Evaluation
-from thincam_jax.commands.study.figures import draw_found
-from thincam_jax.commands.study.study import Study, Target
+from thincam_jax.commands.study.build import FileStudy
+from thincam_jax.studies.evaluate import Evaluation
+from thincam_jax.studies.plot import draw_found
+from thincam_jax.studies.study import Target
 
 
 class DesignFolder(RunFolder):
@@ -32,7 +33,7 @@ class DesignFolder(RunFolder):
     kind, folders, pictures, result = "design", ("targets",), "", "design.json"
 
 
-def run_design(study: Study, folder: DesignFolder, progress: Progress) -> dict[str, Any]:
+def run_design(study: FileStudy, folder: DesignFolder, progress: Progress) -> dict[str, Any]:
     """Search, simulate and report; returns (and writes) what goes into design.json.
 
     `study` holds the designs of the file. The same configuration gives the same on the same
@@ -46,7 +47,7 @@ class _DesignRun(Run):
 
     config: DesignConfig
 
-    def __init__(self, study: Study, folder: DesignFolder):
+    def __init__(self, study: FileStudy, folder: DesignFolder):
         super().__init__(study.config, folder)
         self.study = study
         self.trials: dict[str, simulation.Trials] = {}
@@ -61,7 +62,7 @@ class _DesignRun(Run):
         self.add("report", self.report)
 
     @cached_property
-    def simulated(self) -> Study:
+    def simulated(self) -> FileStudy:
         """The designs of the file and the best of those found."""
         best = self.finder.result.found[: self.config.validation.best]
         return simulation.with_designs(self.study, {one.name: one.design for one in best})

@@ -1,9 +1,8 @@
 """Designs in the full simulation, side by side, over the noise of several seeds."""
 
 import math
-from collections import Counter
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -15,10 +14,14 @@ from thincam_jax.commands.design.config import DesignConfig
 from thincam_jax.commands.design.problem import phases_of
 from thincam_jax.commands.sections import MaskConfig, MethodConfig, MethodShotConfig, SensorConfig
 from thincam_jax.commands.study import build
+from thincam_jax.commands.study.build import FileStudy
 from thincam_jax.commands.study.config import StudyConfig
-from thincam_jax.commands.study.evaluate import Evaluation, evaluate
-from thincam_jax.commands.study.study import Exposure, Method, Study, Target
 from thincam_jax.design import Design
+from thincam_jax.lensless.exposures import Exposure, Exposures
+from thincam_jax.reconstruction import Wiener
+from thincam_jax.studies.evaluate import Evaluation, evaluate, field_shape, reconstructor
+from thincam_jax.studies.simulate import expose, noise_free, stacked
+from thincam_jax.studies.study import Method, Study, Target
 
 # Electrons of a full well that no pixel fills: the search knows of no saturation.
 _FULL_WELL = 1e9
@@ -28,30 +31,29 @@ _STEPS = 6  # elements of a group of the USAF chart, which is an octave
 Trials = dict[str, list[dict[str, Any]]]  # by method, the metrics of each seed
 
 
-def build_designs(config: DesignConfig) -> Study:
+def build_designs(config: DesignConfig) -> FileStudy:
     """The designs that the file gives, as methods of a study, the one to beat first.
 
     **Errors**: ConfigError as of `build_study`, and for pictures too small for a measured prior.
     """
-    sensor = dict(config.sensor)
-    if config.noise.electrons is not None:
-        sensor |= {"full_well": _FULL_WELL, "electrons": config.noise.electrons}
     with allow("float64"):
         given = {one.name: config.design(one) for one in (config.reference, *config.compare)}
     targets, unread = build.read_targets(
         config.targets, config.object.distance, config.object.width
     )
-    study = Study(
-        config,
-        # Of numbers that the design's file has had checked.
-        SensorConfig.model_construct(**sensor),
-        MaskConfig.model_construct(**dict(config.mask)),
-        build.build_noise(config.noise.simulated()),
-        (),
+    methods = tuple(_method(config, name, design) for name, design in given.items())
+    study = FileStudy(
+        *build.build_optics(_mask(config), _sensor(config), methods[0].exposures[0]),
+        methods,
         tuple(targets),
-        config.model,
+        object_distance=config.object.distance,
+        noise=build.build_noise(config.noise.simulated()),
+        model=config.model,
+        pixel_integration=config.pixel_integration,
+        seed=config.seed,
+        name=config.name,
+        config=config,
     )
-    study = with_designs(study, given)
     build.check_study(study, unread)
     for target in study.targets:
         rows, columns = target.plane.image.shape[-2:]
@@ -64,29 +66,41 @@ def build_designs(config: DesignConfig) -> Study:
     return study
 
 
-def with_designs(study: Study, designs: Mapping[str, Design]) -> Study:
+def _sensor(config: DesignConfig) -> SensorConfig:
+    """Of numbers that the design's file has had checked."""
+    sensor = dict(config.sensor)
+    if config.noise.electrons is not None:
+        sensor |= {"full_well": _FULL_WELL, "electrons": config.noise.electrons}
+    return SensorConfig.model_construct(**sensor)
+
+
+def _mask(config: DesignConfig) -> MaskConfig:
+    return MaskConfig.model_construct(**dict(config.mask))
+
+
+def with_designs(study: FileStudy, designs: Mapping[str, Design]) -> FileStudy:
     """The study with further designs as methods, by name."""
     more = tuple(_method(study.config, name, design) for name, design in designs.items())
     return replace(study, methods=study.methods + more)
 
 
 def _method(config: DesignConfig, name: str, design: Design) -> Method:
-    numbers = (design.beta, design.phase, design.distance, design.wavelength)
     width = float(design.width)
     pixel = config.mask.pixel_pitch
     if width != config.mask.width and pixel is not None:  # a display shows whole pixels
         width = max(1, math.floor(width / pixel + 1e-6)) * pixel
-    rows = np.stack([*numbers, np.full(design.captures, width), design.exposure], axis=-1)
-    # Captures that coincide are several exposures of one setting.
-    taken, exposures = Counter(), []
-    for row in (tuple(r) for r in rows.tolist()):
-        taken[row] += 1
-        exposures.append(Exposure(*row, take=taken[row]))
-    synthesis = config.reference.synthesis
-    return Method(name, "wiener", synthesis, tuple(exposures), phases_of(design))
+    exposures = Exposures(
+        np.asarray(design.beta),
+        np.asarray(design.distance),
+        phase=np.asarray(design.phase),
+        wavelength=np.asarray(design.wavelength),
+        width=width,
+        relative_time=np.asarray(design.exposure),
+    )
+    return Method(name, exposures, Wiener(), config.reference.synthesis, phases_of(design))
 
 
-def as_study_config(study: Study) -> StudyConfig:
+def as_study_config(study: FileStudy) -> StudyConfig:
     """The same designs for `thincam run`; what all shots share is left out of them.
 
     Nothing is checked again: its numbers were.
@@ -99,8 +113,8 @@ def as_study_config(study: Study) -> StudyConfig:
         wavelength=config.wavelength,
         model=config.model,
         pixel_integration=config.pixel_integration,
-        sensor=study.sensor,
-        mask=study.mask,
+        sensor=_sensor(config),
+        mask=_mask(config),
         object=config.object,
         noise=config.noise.simulated(),
         methods=tuple(_method_config(config, method) for method in study.methods),
@@ -115,13 +129,13 @@ def _method_config(config: DesignConfig, method: Method) -> MethodConfig:
             distance=shot.distance,
             wavelength=None if shot.wavelength == config.wavelength else shot.wavelength,
             width=None if shot.width == config.mask.width else shot.width,
-            exposure=shot.share,
+            exposure=shot.relative_time,
             take=None if shot.take == 1 else shot.take,
         )
         for shot in method.shots
     )
     return MethodConfig.model_construct(
-        name=method.name, kind=method.kind, synthesis=method.synthesis, shots=shots
+        name=method.name, kind=method.solver.name, synthesis=method.synthesis, shots=shots
     )
 
 
@@ -138,16 +152,14 @@ def simulate(
     for number, method in enumerate(study.methods):
         for exposure in method.exposures:
             if exposure not in clean:
-                clean[exposure] = build.noise_free(study, exposure, target.plane)
-        shape = build.field_shape(study, method, target)
-        reconstructor = build.build_reconstructor(study, method, shape, target.distance)
+                clean[exposure] = noise_free(study, exposure, target.plane)
+        shape = field_shape(study, method, target)
+        solve = reconstructor(study, method, shape, target.distance)
         trials[method.name] = []
         for trial in range(seeds):
-            captures = [
-                build.expose(study, e, clean[e], target.number, trial) for e in method.exposures
-            ]
-            found = evaluate(method, target, reconstructor(*build.stacked(captures)))
-            trials[method.name].append(found.metrics)
+            captures = [expose(study, e, clean[e], target.number, trial) for e in method.exposures]
+            found = evaluate(method, target, solve(*stacked(captures)))
+            trials[method.name].append(asdict(found.scores))
             if shown is not None:
                 shown.setdefault(method.name, found)
         later = {exposure for m in study.methods[number + 1 :] for exposure in m.exposures}

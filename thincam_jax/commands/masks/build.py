@@ -14,16 +14,18 @@ from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.masks.config import ComparedMaskConfig, MasksConfig, SceneConfig
 from thincam_jax.commands.sections import PHASES
 from thincam_jax.commands.study.build import picture
-from thincam_jax.commands.study.study import Exposure, built_mask, synthesis_matrix
+from thincam_jax.commands.study.mask import built_mask
 from thincam_jax.imaging.operators import CropConvolution, kernel_grid
 from thincam_jax.imaging.operators.crop_convolution import cut, place
 from thincam_jax.imaging.sensor import PoissonGaussianNoise, Sensor, read_out
 from thincam_jax.lensless.camera import LenslessCamera
+from thincam_jax.lensless.exposures import Exposure
 from thincam_jax.lensless.forward import spectral_psf
 from thincam_jax.lensless.method import has_few_terms
 from thincam_jax.reconstruction import AdmmTV, Recording
 from thincam_jax.reconstruction.splittings import difference_symbol
 from thincam_jax.reconstruction.total_variation import TotalVariation
+from thincam_jax.studies.study import synthesis_matrix
 
 # Of conjugate gradients: relative residual, and at most so many.
 _TOLERANCE, _STEPS = 1e-3, 400

@@ -16,11 +16,11 @@ from thincam_jax.commands.plate.config import FoundConfig, PlateDesignConfig
 from thincam_jax.commands.run_folder import Progress, Run, RunFolder
 from thincam_jax.commands.screen.build import Captured, undo
 from thincam_jax.commands.study.build import picture
-from thincam_jax.commands.study.evaluate import rounded
 from thincam_jax.commands.study.figures import drawing, line_style, save_figure
 from thincam_jax.design import plate as plates
 from thincam_jax.imaging.metrics import psnr, ssim
 from thincam_jax.imaging.sensor import Sensor
+from thincam_jax.studies.evaluate import rounded
 from thincam_jax.units import deg, nm, um
 
 # Of each number of a plate: its unit, and how it is told.

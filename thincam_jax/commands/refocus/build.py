@@ -13,12 +13,12 @@ from thincam_jax._core.grids import Grid
 from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.refocus.config import PlacedConfig, RefocusConfig
 from thincam_jax.commands.study import build
-from thincam_jax.commands.study.evaluate import rounded, sample
-from thincam_jax.commands.study.study import Capture, Exposure, Method, Study, Target
+from thincam_jax.commands.study.build import FileStudy
 from thincam_jax.imaging.metrics import psnr
 from thincam_jax.imaging.metrics.image import SSIM_WINDOW
 from thincam_jax.imaging.scene import ImagePlane
 from thincam_jax.imaging.targets import middle_square, resize
+from thincam_jax.lensless.exposures import Exposure
 from thincam_jax.reconstruction import Reconstruction
 from thincam_jax.reconstruction.depth import find as finding
 from thincam_jax.reconstruction.depth.refocus import (
@@ -26,6 +26,10 @@ from thincam_jax.reconstruction.depth.refocus import (
     axial_resolution,
     refocus_distances,
 )
+from thincam_jax.studies import simulate
+from thincam_jax.studies.evaluate import reconstructor, rounded, sample
+from thincam_jax.studies.simulate import Capture
+from thincam_jax.studies.study import Method, Study, Target
 
 _MARGIN = 1.15  # the field over what the objects cover
 
@@ -43,7 +47,7 @@ class PlacedTarget(Target):
         return float(self.plane.height) - 2 * abs(self.y)
 
 
-def build_refocus(config: RefocusConfig) -> Study:
+def build_refocus(config: RefocusConfig) -> FileStudy:
     """Cameras and methods, and the objects as targets at their distances.
 
     **Errors**: ConfigError, one line for each fault, beginning with the field.
@@ -53,7 +57,7 @@ def build_refocus(config: RefocusConfig) -> Study:
         for exposure in study.exposures:
             study.camera(exposure)
     except (ValueError, TypeError) as error:
-        faults.append(f"mask or sensor: {error}")
+        faults.append(f"mask, sensor or model: {error}")
     for number, placed in enumerate(config.objects):
         try:
             objects.append(_place(study, number, placed))
@@ -93,15 +97,15 @@ def _place(study: Study, number: int, placed: PlacedConfig) -> PlacedTarget:
 
 def _pixels_per_mm(study: Study, method: Method, placed: PlacedConfig | Target) -> float:
     """Of a reconstruction, on an object."""
-    return method.distance / placed.distance / study.sensor.pitch
+    return method.distance / placed.distance / study.pitch
 
 
-def sweep_method(study: Study) -> Method:
+def sweep_method(study: FileStudy) -> Method:
     """The method that the sweep reconstructs with."""
     return next(m for m in study.methods if m.name == study.config.sweep.method)
 
 
-def sweep_distances(study: Study) -> list[float]:
+def sweep_distances(study: FileStudy) -> list[float]:
     """The distances of the sweep, mm, evenly spaced in 1/t."""
     sweep = study.config.sweep
     return np.asarray(refocus_distances(sweep.nearest, sweep.farthest, sweep.count)).tolist()
@@ -110,12 +114,12 @@ def sweep_distances(study: Study) -> list[float]:
 def take_scene(study: Study, exposure: Exposure) -> Capture:
     """One capture of all objects together, (y, x)."""
     planes = [target.plane for target in study.targets]
-    return build.expose(study, exposure, build.noise_free(study, exposure, planes), 0)
+    return simulate.expose(study, exposure, simulate.noise_free(study, exposure, planes), 0)
 
 
 def field_shape(study: Study, method: Method) -> tuple[int, int]:
     """Pixels of a reconstruction: the directions of all objects, about the axis, and a margin."""
-    scale = _MARGIN * method.distance / study.sensor.pitch
+    scale = _MARGIN * method.distance / study.pitch
     planes = [t.plane for t in study.targets]
     extents = [(float(p.height), float(p.width)) for p in planes]
     angles = np.asarray(extents) / np.asarray([[float(p.distance)] for p in planes])
@@ -131,18 +135,20 @@ def focus_on(
     distance: float,
 ) -> Reconstruction:
     """A method's reconstruction (y, x) focused on one distance."""
-    images, variances = build.stacked([captures[exposure] for exposure in method.exposures])
-    reconstructor = build.build_reconstructor(study, method, field_shape(study, method), distance)
-    result = reconstructor(images[:, None], variances[:, None])
+    images, variances = simulate.stacked([captures[exposure] for exposure in method.exposures])
+    focused = reconstructor(study, method, field_shape(study, method), distance)
+    result = focused(images[:, None], variances[:, None])
     return jax.tree.map(lambda leaf: leaf[0] if leaf.ndim == 3 else leaf, result)
 
 
-def join_sweep(study: Study, distances: list[float], focused: list[Reconstruction]) -> RefocusSweep:
+def join_sweep(
+    study: FileStudy, distances: list[float], focused: list[Reconstruction]
+) -> RefocusSweep:
     """Reconstructions that are focused on each of the distances, as one sweep."""
     images = jnp.stack([result.image for result in focused])
     # p·t/d of any image over its t.
     slope = jnp.reshape(jnp.asarray(focused[-1].pitch, images.dtype), ()) / distances[-1]
-    method = sweep_method(study).kind
+    method = sweep_method(study).solver.name
     return RefocusSweep(images, jnp.asarray(distances, images.dtype), slope, method)
 
 
@@ -160,7 +166,7 @@ class FoundObjects:
         return None if region is None or self.curves is None else self.curves.distance_of(region)
 
 
-def find_objects(study: Study, sweep: RefocusSweep) -> FoundObjects:
+def find_objects(study: FileStudy, sweep: RefocusSweep) -> FoundObjects:
     """Regions of the picture and their distances; objects are named by where they were placed."""
     regions, asked = finding.object_regions(sweep), study.config.sweep
     boxes = {t.name: object_box(study, sweep_method(study), t) for t in study.targets}
@@ -209,7 +215,7 @@ def psnr_of_objects(
     return scores
 
 
-def object_metrics(study: Study, found: FoundObjects) -> dict[str, Any]:
+def object_metrics(study: FileStudy, found: FoundObjects) -> dict[str, Any]:
     """Distance of each object as placed and as found."""
     metrics: dict[str, Any] = {}
     cameras = [study.camera(exposure) for exposure in sweep_method(study).exposures]

@@ -14,11 +14,11 @@ from thincam_jax.commands.config_file import slug
 from thincam_jax.commands.refocus.build import FoundObjects, object_box
 from thincam_jax.commands.run_folder import RunFolder
 from thincam_jax.commands.study.figures import drawing, line_style, save_figure, save_image, sheet
-from thincam_jax.commands.study.study import Method, Study, Target
 from thincam_jax.imaging.targets import middle_square
 from thincam_jax.reconstruction.depth.find import DepthMap
 from thincam_jax.reconstruction.depth.focus import Measure
 from thincam_jax.reconstruction.depth.refocus import RefocusSweep
+from thincam_jax.studies.study import Method, Study, Target
 
 _SHOWN = 15  # images on the contact sheet, in rows of five
 _HELD = 160  # ms of an image of the animation

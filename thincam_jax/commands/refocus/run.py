@@ -9,14 +9,17 @@ from thincam_jax.commands.page import number
 from thincam_jax.commands.refocus import build, figures
 from thincam_jax.commands.refocus.config import RefocusConfig
 from thincam_jax.commands.run_folder import Progress, Run, RunFolder
+from thincam_jax.commands.study.build import FileStudy
 from thincam_jax.commands.study.figures import save_figure, save_image
-from thincam_jax.commands.study.study import Capture, Exposure, Method, Study
 from thincam_jax.commands.terminal import numbers
+from thincam_jax.lensless.exposures import Exposure
 from thincam_jax.reconstruction import Reconstruction
 from thincam_jax.reconstruction.depth.find import all_in_focus, depth_map
+from thincam_jax.studies.simulate import Capture
+from thincam_jax.studies.study import Method
 
 
-def run_refocus(study: Study, folder: RunFolder, progress: Progress) -> dict[str, Any]:
+def run_refocus(study: FileStudy, folder: RunFolder, progress: Progress) -> dict[str, Any]:
     """Capture, sweep, reconstruct and report; returns (and writes) the metrics.
 
     The same configuration gives the same metrics.
@@ -36,7 +39,7 @@ def table(config: RefocusConfig, metrics: dict[str, Any]) -> Table:
 class _RefocusRun(Run):
     """A refocus experiment on its way."""
 
-    def __init__(self, study: Study, folder: RunFolder):
+    def __init__(self, study: FileStudy, folder: RunFolder):
         super().__init__(study.config, folder)
         self.study = study
         self.captures: dict[Exposure, Capture] = {}
@@ -97,7 +100,7 @@ class _RefocusRun(Run):
         self.complete("refocus", findings=findings(study.config, self.metrics))
 
 
-def _sweep_metrics(study: Study, sweep, found) -> dict[str, Any]:
+def _sweep_metrics(study: FileStudy, sweep, found) -> dict[str, Any]:
     """The focus curves as numbers."""
     curves = {}
     if found.curves is not None:

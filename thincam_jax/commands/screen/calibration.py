@@ -17,11 +17,11 @@ from thincam_jax import waveguide as wg
 from thincam_jax.commands.run_folder import RunFolder
 from thincam_jax.commands.screen import build, figures
 from thincam_jax.commands.screen.config import CalibrationConfig
-from thincam_jax.commands.study.evaluate import rounded
 from thincam_jax.imaging.metrics import psnr
 from thincam_jax.imaging.operators import Matrix, ReducedMatrix, Scaled, Sparse
 from thincam_jax.measured import calibration as measuring
 from thincam_jax.measured.calibration.screen_fit import PARAMETERS
+from thincam_jax.studies.evaluate import rounded
 
 _SHOWN = 3  # cells whose columns are drawn, and say how large the noise is
 

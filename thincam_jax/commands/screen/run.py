@@ -13,10 +13,10 @@ from thincam_jax.commands.run_folder import Progress, Run, RunFolder
 from thincam_jax.commands.screen import build, figures
 from thincam_jax.commands.screen.calibration import Calibration
 from thincam_jax.commands.screen.config import MEASURED, ScreenConfig, ScreenMethodConfig
-from thincam_jax.commands.study.evaluate import rounded
 from thincam_jax.commands.terminal import numbers
 from thincam_jax.imaging.metrics import psnr, ssim
 from thincam_jax.imaging.operators import AbstractOperator, Sparse
+from thincam_jax.studies.evaluate import rounded
 from thincam_jax.units import deg, nm
 
 

@@ -1,101 +1,143 @@
-"""From an experiment file to what is simulated: cameras, exposures, noise, targets and methods."""
+"""From an experiment file to a study: cameras, exposures, noise, targets and methods."""
 
-import functools
-import itertools
 import math
-import operator
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 
 from thincam_jax import reconstruction
 from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.sections import (
     CamerasConfig,
+    MaskConfig,
     MethodConfig,
     NoiseConfig,
+    SensorConfig,
     TargetConfig,
     VariationConfig,
 )
 from thincam_jax.commands.study.config import PictureConfig, StudyConfig
-from thincam_jax.commands.study.study import Capture, Exposure, Method, Reconstructor, Study, Target
+from thincam_jax.commands.study.mask import built_mask
 from thincam_jax.imaging import targets as drawn
 from thincam_jax.imaging.metrics.image import SSIM_WINDOW
 from thincam_jax.imaging.metrics.mtf import MINIMUM_COLUMNS
-from thincam_jax.imaging.scene import ImagePlane, Scene
 from thincam_jax.imaging.sensor import (
     AbstractNoise,
     GaussianNoise,
     PoissonGaussianNoise,
-    electrons_per_unit,
-    read_out,
+    Sensor,
 )
-from thincam_jax.lensless import forward
+from thincam_jax.lensless import masks
+from thincam_jax.lensless.exposures import Exposure, Exposures
+from thincam_jax.reconstruction.solver import AbstractSolver
+from thincam_jax.reconstruction.spectra import Prior
+from thincam_jax.studies.evaluate import field_shape
+from thincam_jax.studies.study import Method, Published, Study, Target
 
 # The scene's power is read off frequencies above three cycles a sensor (`spectra.inner_band`).
 _MINIMUM_ROWS = 7
 
 
-def build_study(config: StudyConfig) -> Study:
+@dataclass(frozen=True, eq=False)
+class FileStudy(Study):
+    """A study with the file that it was read from."""
+
+    config: Any = None
+
+
+def build_study(config: StudyConfig) -> FileStudy:
     """All that a study needs, images read and everything checked, before the first capture.
 
     **Errors**: ConfigError, one line for each fault, beginning with the field.
     """
     targets, unread = read_targets(config.targets, config.object.distance, config.object.width)
-    study = assemble(config, targets)
+    try:
+        study = assemble(config, targets)
+    except ConfigError as error:
+        raise ConfigError("\n".join([str(error), *_lines(config, unread)])) from None
     check_study(study, unread)
     return study
 
 
-def assemble(config: CamerasConfig, targets: Sequence[Target]) -> Study:
-    """Cameras, noise and methods of a file, before targets."""
-    return Study(
-        config,
-        config.sensor,
-        config.mask,
-        build_noise(config.noise),
-        tuple(as_method(config, method) for method in config.methods),
+def assemble(config: CamerasConfig, targets: Sequence[Target]) -> FileStudy:
+    """Cameras, noise and methods of a file, before targets.
+
+    **Errors**: ConfigError for a mask or a sensor that cannot be built.
+    """
+    methods = tuple(as_method(config, method) for method in config.methods)
+    mask, sensor = build_optics(config.mask, config.sensor, methods[0].exposures[0])
+    return FileStudy(
+        mask,
+        sensor,
+        methods,
         tuple(targets),
-        config.model,
-        config.prior,
+        object_distance=config.object.distance if isinstance(config, StudyConfig) else math.inf,
+        noise=build_noise(config.noise),
+        model=config.model,
+        pixel_integration=config.pixel_integration,
+        seed=config.seed,
+        name=config.name,
+        mask_name=config.mask.label,
+        config=config,
     )
+
+
+def build_optics(
+    mask: MaskConfig, sensor: SensorConfig, exposure: Exposure
+) -> tuple[masks.AbstractMask, Sensor]:
+    """The mask of an exposure, and the sensor. **Errors**: ConfigError where one is none."""
+    try:
+        return built_mask(mask, exposure), Sensor(**dict(sensor))
+    except (ValueError, TypeError, FileNotFoundError) as error:
+        raise ConfigError(f"mask, sensor or model: {error}") from None
 
 
 def as_method(config: CamerasConfig, method: MethodConfig) -> Method:
     """A method of a file, with all of its exposures."""
-    phases = method.shot_phases()
-    exposures = tuple(
-        Exposure(
-            shot.beta or 0.0,  # of a mask without zones
-            phase,
-            shot.distance,
-            shot.wavelength or config.wavelength,
-            shot.width or config.mask.width,
-            shot.exposure,
-            shot.take or 1,
-            shot.profile,
-        )
-        for shot in method.shots
-        for phase in phases
-    )
-    if config.motion:
-        ends = np.cumsum([0.0, *(exposure.share for exposure in exposures)])
-        ends = config.motion * (ends - ends[-1] / 2)
-        ways = itertools.pairwise(ends.tolist())
-        exposures = tuple(replace(e, moves=w) for e, w in zip(exposures, ways, strict=True))
+    published = method.published
     return Method(
         method.name,
-        method.kind,
+        exposures_of(config, method),
+        build_solver(method.kind, method.variation, config.prior),
         method.synthesis,
-        exposures,
-        len(phases),
-        method.variation,
+        len(method.shot_phases()),
         method.harmonics,
+        Published(published.psnr_db, published.resolved, published.limit_cycles_per_mm),
     )
+
+
+def exposures_of(config: CamerasConfig, method: MethodConfig) -> Exposures:
+    """Each shot of a method at each of its phases; one after another where the object moves."""
+    shots = method.shots
+    settings = Exposures(
+        [shot.beta or 0.0 for shot in shots],  # 0: of a mask without zones
+        [shot.distance for shot in shots],
+        wavelength=[shot.wavelength or config.wavelength for shot in shots],
+        width=[shot.width or config.mask.width for shot in shots],
+        relative_time=[shot.exposure for shot in shots],
+        profile=[shot.profile for shot in shots],
+        take=[shot.take or 1 for shot in shots],
+    )
+    exposures = settings.at_phases(method.shot_phases())
+    return exposures.of_moving(config.motion) if config.motion else exposures
+
+
+def build_solver(
+    kind: str, variation: VariationConfig | None, prior: Prior = "inverse_square"
+) -> AbstractSolver:
+    """The solver of a method's kind."""
+    if kind == "fringe_scanning":
+        return reconstruction.FringeScanning()
+    if kind == "wiener":
+        return reconstruction.Wiener(prior=prior)
+    asked = variation or VariationConfig()
+    total = reconstruction.TotalVariation(
+        asked.kind, asked.coupling or "opponent", chroma_weight=asked.chroma_weight
+    )
+    return reconstruction.AdmmTV(asked.tau, variation=total, iterations=asked.iterations)
 
 
 def build_noise(noise: NoiseConfig | None) -> AbstractNoise | None:
@@ -114,12 +156,12 @@ def read_targets(
     targets, unread = [], {}
     for number, entry in enumerate(entries):
         try:
-            image = np.moveaxis(np.atleast_3d(read_picture(entry)), -1, 0)
+            image = read_picture(entry)
         except (ValueError, FileNotFoundError) as error:
             unread[number] = str(error)
             continue
-        plane = ImagePlane(image.astype(np.float32), distance, width)
-        targets.append(Target(number, entry.name, entry.kind, distance, width, plane))
+        target = Target.of_image(entry.name, image, distance, width, entry.kind)
+        targets.append(replace(target, number=number))
     return targets, unread
 
 
@@ -153,7 +195,7 @@ def picture(target: PictureConfig, cells: tuple[int, int], channels: int = 0) ->
     return picture
 
 
-def check_study(study: Study, unread: dict[int, str] | None = None) -> None:
+def check_study(study: FileStudy, unread: dict[int, str] | None = None) -> None:
     """Refuse cameras that cannot be built, images that cannot be read, and too few pixels.
 
     `unread`: why images could not be read, by the target's place.
@@ -162,18 +204,22 @@ def check_study(study: Study, unread: dict[int, str] | None = None) -> None:
     """
     known = {target.number: _target_fault(study, target) for target in study.targets}
     known |= unread or {}
-    place_of = study.config.place_of
-    faults = [
-        f"{place_of('targets', number, 'path')}targets[{number}]: {fault}"
-        for number, fault in sorted(known.items())
-        if fault
-    ]
+    faults = _lines(study.config, known)
     camera = _camera_fault(study)
     if camera or faults:
         raise ConfigError("\n".join([*filter(None, [camera]), *faults]))
 
 
-def _camera_fault(study: Study) -> str:
+def _lines(config: Any, faults: dict[int, str]) -> list[str]:
+    """Faults of targets, by their place."""
+    return [
+        f"{config.place_of('targets', number, 'path')}targets[{number}]: {fault}"
+        for number, fault in sorted(faults.items())
+        if fault
+    ]
+
+
+def _camera_fault(study: FileStudy) -> str:
     """Empty for none."""
     rows, columns = study.sensor.shape
     place = study.config.place_of("sensor", "shape")
@@ -207,99 +253,3 @@ def _target_fault(study: Study, target: Target) -> str:
                 "smaller sensor.pitch"
             )
     return ""
-
-
-def field_shape(study: Study, method: Method, target: Target) -> tuple[int, int]:
-    """Pixels of the reconstruction: what covers the target at the object pitch."""
-    scale = method.distance / target.distance / study.sensor.pitch
-    rows, columns = (
-        max(1, math.ceil(float(size) * scale - 1e-3))
-        for size in (target.plane.height, target.plane.width)
-    )
-    return rows, columns
-
-
-def noise_free(study: Study, exposure: Exposure, planes: ImagePlane | list[ImagePlane]) -> Array:
-    """What falls on the sensor, (*channel, y, x): without saturation."""
-    scene = Scene(planes, exposure.wavelength)
-    images = (
-        forward.expose(
-            study.camera(exposure),
-            plane,
-            scene.spectrum,
-            model=study.model,
-            pixel_integration=study.config.pixel_integration,
-        )
-        for plane in scene.planes
-    )
-    return functools.reduce(operator.add, images)
-
-
-def expose(study: Study, exposure: Exposure, clean: Array, number: int, trial: int = 0) -> Capture:
-    """What is read out of a noise-free image of the target of a place in the study.
-
-    The noise is that of the image; its random key is the same however a study is interrupted, and
-    another one for each further trial.
-    """
-    seed = jax.random.key((study.config.seed + trial) % 2**32)
-    place = study.exposures.index(exposure)
-    key = jax.random.fold_in(jax.random.fold_in(seed, number), place)
-    sensor, noise = study.camera(exposure).sensor, study.noise
-    if noise is None:
-        variance = np.zeros(clean.shape[:-2], clean.dtype)
-    else:
-        variance = np.asarray(noise.variance(clean, electrons_per_unit(sensor, clean)))
-    return Capture(np.asarray(read_out(sensor, clean, noise=noise, key=key)), variance)
-
-
-def take(study: Study, exposure: Exposure, target: Target) -> Capture:
-    """One capture of a target, which may move meanwhile."""
-    plane = ImagePlane(target.plane.image, target.distance, target.width, exposure.moves)
-    return expose(study, exposure, noise_free(study, exposure, plane), target.number)
-
-
-def stacked(captures: Sequence[Capture]) -> tuple[Array, Array]:
-    """Images (capture, *channel, y, x) and variances (capture, *channel)."""
-    images, variances = [c.image for c in captures], [c.variance for c in captures]
-    return jnp.asarray(np.stack(images)), jnp.asarray(np.stack(variances))
-
-
-def build_reconstructor(
-    study: Study, method: Method, shape: tuple[int, int], object_distance: float
-) -> Reconstructor:
-    """A function of the captures (capture, channel, y, x) and variances (capture, channel)."""
-    cameras = reconstruction.Cameras(
-        [study.camera(exposure) for exposure in method.exposures],
-        wavelength=[exposure.wavelength for exposure in method.exposures],
-        object_distance=object_distance,
-        field_shape=shape,
-        model=study.model,
-        pixel_integration=study.config.pixel_integration,
-    )
-    synthesis = method.synthesis_matrix
-    if method.kind == "fringe_scanning":
-        scanning = reconstruction.FringeScanning().prepare(cameras)
-        return lambda captures, variances: scanning(captures)
-    if method.kind == "wiener":
-        return reconstruction.Wiener(synthesis=synthesis, prior=study.prior).prepare(cameras)
-    options = method.variation or VariationConfig()
-
-    def total_variation(captures: Array, variances: Array) -> reconstruction.Reconstruction:
-        """On the crop model; without noise in the study it is estimated."""
-        variation = reconstruction.TotalVariation(
-            options.kind,
-            options.coupling_of(captures.shape[1]),
-            chroma_weight=options.chroma_weight,
-        )
-        noise_variance = None if study.noise is None else variances
-        return reconstruction.reconstruct(
-            reconstruction.Recording(captures, cameras, noise_variance=noise_variance),
-            reconstruction.AdmmTV(
-                options.tau,
-                variation=variation,
-                synthesis=synthesis,
-                iterations=options.iterations,
-            ),
-        )
-
-    return total_variation

@@ -1,62 +1,70 @@
 """Running a study: every target through every method, into a run folder."""
 
+from collections.abc import Mapping
+from dataclasses import asdict
 from typing import Any
 
 from rich.table import Table
 
-from thincam_jax.commands.page import number
 from thincam_jax.commands.run_folder import Progress, Run, RunFolder
 from thincam_jax.commands.study import figures
-from thincam_jax.commands.study.build import take
+from thincam_jax.commands.study.build import FileStudy
 from thincam_jax.commands.study.config import StudyConfig
-from thincam_jax.commands.study.evaluate import Evaluation, evaluate_method, mean_psnr_of_pictures
-from thincam_jax.commands.study.response import Response, method_response
-from thincam_jax.commands.study.study import Capture, Exposure, Method, Study, Target
 from thincam_jax.commands.terminal import numbers
+from thincam_jax.lensless.exposures import Exposure
+from thincam_jax.plot import studies as plot
+from thincam_jax.studies.evaluate import (
+    Contrasts,
+    Evaluation,
+    Resolved,
+    Scores,
+    evaluate_method,
+)
+from thincam_jax.studies.response import Response, method_response
+from thincam_jax.studies.result import StudyScores, summarise
+from thincam_jax.studies.simulate import Capture, take
+from thincam_jax.studies.study import Method, Study, Target
 
-# What two methods share that add and subtract the same captures in the same way.
-_CAPTURES = ("shots", "synthesis", "phases", "steps", "harmonics")
 
+def run_study(study: FileStudy, folder: RunFolder, progress: Progress) -> StudyScores:
+    """Run what the folder does not hold yet; returns (and writes) the scores.
 
-def run_study(study: Study, folder: RunFolder, progress: Progress) -> dict[str, Any]:
-    """Run what the folder does not hold yet; returns (and writes) the metrics.
-
-    The same configuration gives the same metrics: every capture's noise has its own key, from the
+    The same configuration gives the same scores: every capture's noise has its own key, from the
     seed and the capture's place in the study.
     """
-    return _StudyRun(study, folder).carry_out(progress)
+    run = _StudyRun(study, folder)
+    run.carry_out(progress)
+    return run.scores
 
 
-def table(config: StudyConfig, metrics: dict[str, Any]) -> Table:
+def table(config: StudyConfig, scores: StudyScores) -> Table:
     """Every method beside what was published of it."""
-    rows = [["method", "PSNR dB", "published", "resolved mm", "published", "cut-off /mm"]]
-    for name, method in metrics["methods"].items():
-        published = method["published"]
-        told = [
-            number(method["mean_psnr_of_pictures_db"], 1),
-            number(published["psnr_db"], 1),
-            number(resolved(method), 2),
-            number(published["resolved_object_mm"], 2),
-            number(method["limits"]["cut_off_cycles_per_mm"], 1),
-        ]
-        rows.append([name, *told])
-    return numbers(rows)
+    return numbers(scores.table().text())
 
 
 class _StudyRun(Run):
-    """A study on its way; `results` are by target, `evaluations` those of the target at hand."""
+    """A study on its way; `evaluations` are those of the target at hand, by method."""
 
-    def __init__(self, study: Study, folder: RunFolder):
+    scores: StudyScores
+
+    def __init__(self, study: FileStudy, folder: RunFolder):
         super().__init__(study.config, folder)
         self.study = study
         self.captures: dict[Exposure, Capture] = {}
         self.evaluations: dict[str, Evaluation] = {}
-        self.results: dict[str, dict[str, Any]] = {}
+        self.found: dict[str, dict[str, Scores]] = {}  # by target and method
+        self.contrasts: dict[str, dict[str, Contrasts]] = {}
         self.responses: dict[str, Response] = {}
         for target in study.targets:
             stored = folder.finished(target.name)
             if stored is not None:
-                self.results[target.name] = stored
+                self.found[target.name] = {
+                    name: _scores(metrics) for name, metrics in stored["metrics"].items()
+                }
+                self.contrasts[target.name] = {
+                    name: [(period, direction, contrast) for period, direction, contrast in rows]
+                    for name, rows in stored["contrasts"].items()
+                }
                 continue
             for count, exposure in enumerate(study.exposures, 1):
                 self.add(f"{target.name}: capture {count}", self.capture, target, exposure)
@@ -76,14 +84,20 @@ class _StudyRun(Run):
             self.finish(target)
 
     def finish(self, target: Target) -> None:
-        first = self.captures[self.study.exposures[0]].image
-        figures.save_target(self.folder, self.study, target, first, self.evaluations)
-        figures.save_captures(self.folder, self.study, target, self.captures)
-        found = self.evaluations.items()
-        contrasts = {name: e.contrast for name, e in found if e.contrast is not None}
-        metrics = {name: e.metrics for name, e in found}
-        self.results[target.name] = {"metrics": metrics, "contrasts": contrasts}
-        self.folder.finish(target.name, self.results[target.name])
+        study, folder, found = self.study, self.folder, self.evaluations
+        first = self.captures[study.exposures[0]].image
+        figures.save_images(folder, target, found)
+        # No target's name can be taken for one of the study's own figures.
+        for kind, figure in (
+            ("target", plot.draw_target(study, target, first, found)),
+            ("captures", plot.draw_captures(study, self.captures)),
+        ):
+            figures.save_figure(folder, f"{kind}-{figures.slug(target.name)}", figure)
+        contrasts = {name: e.contrast for name, e in found.items() if e.contrast is not None}
+        scores = {name: e.scores for name, e in found.items()}
+        self.found[target.name], self.contrasts[target.name] = scores, contrasts
+        metrics = {name: asdict(one) for name, one in scores.items()}
+        folder.finish(target.name, {"metrics": metrics, "contrasts": contrasts})
         self.captures, self.evaluations = {}, {}
 
     def transfer(self, method: Method) -> None:
@@ -91,53 +105,36 @@ class _StudyRun(Run):
 
     def report(self) -> None:
         study, folder = self.study, self.folder
-        self.metrics = self.collected()
-        figures.save_responses(folder, study, self.responses)
+        self.scores = summarise(study, study.targets, self.found, self.responses)
+        self.metrics = asdict(self.scores)
+        figures.save_figure(folder, "mtf", plot.draw_responses(study, self.responses))
         # Of several charts the last.
-        contrasts: dict[str, list] = {}
+        contrasts: dict[str, Contrasts] = {}
         for target in study.targets:
-            contrasts |= self.results[target.name]["contrasts"]
+            contrasts |= self.contrasts[target.name]
         if contrasts:
-            figures.save_contrasts(folder, contrasts)
+            figures.save_figure(folder, "contrast", plot.draw_contrasts(contrasts))
         figures.save_psf(folder, study)
-        self.complete("study", findings=findings(study.config, self.metrics))
-
-    def collected(self) -> dict[str, Any]:
-        """What goes into metrics.json."""
-        study, methods = self.study, {}
-        for method, entry in zip(study.methods, study.config.methods, strict=True):
-            targets = {t.name: self.results[t.name]["metrics"][method.name] for t in study.targets}
-            methods[method.name] = {
-                "captures": len(method.exposures),
-                "mean_psnr_of_pictures_db": mean_psnr_of_pictures(study, targets),
-                "limits": self.responses[method.name].metrics,
-                "targets": targets,
-                "published": {
-                    "psnr_db": entry.published.psnr_db,
-                    "resolved_object_mm": entry.published.resolved,
-                    "limit_cycles_per_mm": entry.published.limit_cycles_per_mm,
-                },
-            }
-        return {
-            "study": study.config.name,
-            "seed": study.config.seed,
-            "methods": methods,
-            "warnings": study.warnings,
-        }
+        self.complete("study", findings=findings(study, self.scores))
 
 
-def findings(config: StudyConfig, metrics: dict[str, Any]) -> list[str]:
+def _scores(metrics: Mapping[str, Any]) -> Scores:
+    """The scores that a folder holds."""
+    resolved = metrics["resolved"]
+    return Scores(**{**metrics, "resolved": resolved and Resolved(**resolved)})
+
+
+def findings(study: Study, scores: StudyScores) -> list[str]:
     """What the numbers say, in sentences, beside what was published."""
     sentences = []
-    for name, method in metrics["methods"].items():
-        published = method["published"]
-        mean, stated = method["mean_psnr_of_pictures_db"], published["psnr_db"]
+    for name, method in scores.methods.items():
+        mean, stated = method.mean_psnr_of_pictures_db, method.published.psnr_db
         if mean is not None and stated is not None:
             sentences.append(
                 f"{name}: {mean:.1f} dB on average over the pictures, published {stated:.1f} dB "
                 f"({mean - stated:+.1f} dB)."
             )
-        own, stated = resolved(method), published["resolved_object_mm"]
+        own, stated = method.resolved_mm, method.published.resolved_object_mm
         if own is not None and stated is not None:
             word = "finer" if own < 0.97 * stated else "coarser"
             word = "the same within 3 %" if abs(own / stated - 1) <= 0.03 else word
@@ -145,9 +142,11 @@ def findings(config: StudyConfig, metrics: dict[str, Any]) -> list[str]:
                 f"{name}: resolves a line pair of {own:.2f} mm on the object, published "
                 f"{stated:.2f} mm: {word}."
             )
-    sentences += _gains(config, metrics)
+    sentences += _gains(study, scores)
     ranked = sorted(
-        (r, name) for name, m in metrics["methods"].items() if (r := resolved(m)) is not None
+        (one.resolved_mm, name)
+        for name, one in scores.methods.items()
+        if one.resolved_mm is not None
     )
     if len(ranked) > 1:
         order = ", ".join(f"{name} ({period:.2f} mm)" for period, name in ranked)
@@ -155,27 +154,23 @@ def findings(config: StudyConfig, metrics: dict[str, Any]) -> list[str]:
     return sentences
 
 
-def resolved(method: dict[str, Any]) -> float | None:
-    """The finest line pair on the object that a method resolves, mm; of the first chart."""
-    for target in method["targets"].values():
-        if target["resolved"] is not None:
-            return target["resolved"]["object_mm"]
-    return None
+def _sums(method: Method) -> tuple:
+    """What two methods share that add and subtract the same captures in the same way."""
+    return tuple(method.exposures), method.synthesis, method.phases, method.harmonics
 
 
-def _gains(config: StudyConfig, metrics: dict[str, Any]) -> list[str]:
+def _gains(study: Study, scores: StudyScores) -> list[str]:
     """What total variation adds to the Wiener synthesis of the same captures."""
     sentences = []
-    for method in (m for m in config.methods if m.kind == "admm_tv"):
-        for other in (m for m in config.methods if m.kind == "wiener"):
-            if any(getattr(other, key) != getattr(method, key) for key in _CAPTURES):
+    for method in (m for m in study.methods if m.solver.name == "admm_tv"):
+        for other in (m for m in study.methods if m.solver.name == "wiener"):
+            if _sums(method) != _sums(other):
                 continue
-            pairs = (
-                (t.name, *(metrics["methods"][m.name]["targets"][t.name]["psnr_db"] for m in pair))
-                for t in config.targets
-                for pair in [(method, other)]
-            )
-            gains = [f"{a - b:+.1f} dB on {t}" for t, a, b in pairs if None not in (a, b)]
+            both = [scores.methods[one.name].targets for one in (method, other)]
+            pairs = ((name, *(of[name].psnr_db for of in both)) for name in both[0])
+            gains = [
+                f"{a - b:+.1f} dB on {t}" for t, a, b in pairs if a is not None and b is not None
+            ]
             if gains:
                 sentences.append(f"{method.name}: {', '.join(gains)} over {other.name}.")
     return sentences

@@ -2,7 +2,7 @@
 
 import time
 import traceback
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import jax
@@ -11,7 +11,8 @@ import numpy as np
 from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.study.build import build_study
 from thincam_jax.commands.study.config import StudyConfig
-from thincam_jax.commands.study.evaluate import evaluate_targets, mean_psnr_of_pictures
+from thincam_jax.studies.evaluate import Scores
+from thincam_jax.studies.result import evaluate_target, mean_psnr_of_pictures
 
 # What a user can put right: the message says all.
 _USER_ERRORS = (ConfigError, FileNotFoundError, PermissionError, MemoryError)
@@ -45,15 +46,16 @@ def one_line(error: BaseException) -> str:
 def _measure(config: StudyConfig) -> dict[str, Any]:
     started, row = time.perf_counter(), {}
     study = build_study(config)
-    found = evaluate_targets(study)
+    found: dict[str, dict[str, Scores]] = {method.name: {} for method in study.methods}
     for target in study.targets:
-        for method, targets in found.items():
-            row |= _columns(f"{method}/{target.name}", targets[target.name])
+        for method, evaluation in evaluate_target(study, target).items():
+            found[method][target.name] = evaluation.scores
+            row |= _columns(f"{method}/{target.name}", asdict(evaluation.scores))
     for method, targets in found.items():
-        psnr_db = [metrics["psnr_db"] for metrics in targets.values()]
+        psnr_db = [scores.psnr_db for scores in targets.values()]
         known = [value for value in psnr_db if value is not None]
         row[f"mean_psnr_db/{method}"] = round(float(np.mean(known)), 4) if known else None
-        pictures = mean_psnr_of_pictures(study, targets)
+        pictures = mean_psnr_of_pictures(study.targets, targets)
         if pictures is not None:
             row[f"mean_psnr_of_pictures_db/{method}"] = pictures
     return {**row, "seconds": round(time.perf_counter() - started, 4)}

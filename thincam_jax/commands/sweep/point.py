@@ -12,10 +12,10 @@ from typing import Any
 from thincam_jax._core.files import read_regular
 from thincam_jax.commands.checked_config import check_as
 from thincam_jax.commands.config_file import ConfigError, set_entry
-from thincam_jax.commands.study.build import as_method
+from thincam_jax.commands.study.build import exposures_of
 from thincam_jax.commands.study.config import StudyConfig
-from thincam_jax.commands.study.study import unresolved_zones
 from thincam_jax.commands.sweep.grid import Axis, grid_values
+from thincam_jax.studies.study import unresolved_zones
 
 # Part of every point's key: to be raised when the same configuration is to give other metrics.
 METRICS_VERSION = 1
@@ -82,7 +82,7 @@ def _make_point(raw: dict, axes: Sequence[Axis], values: tuple, double: bool) ->
         return GridPoint(key, given, None, double, "; ".join(str(error).splitlines()))
     text = config.model_dump_json(exclude_none=True)
     resolved = {axis.path: _entry(config, axis.places[0]) for axis in axes}
-    exposures = [e for method in config.methods for e in as_method(config, method).exposures]
+    exposures = [e for method in config.methods for e in exposures_of(config, method)]
     numbers = config.sensor.pitch, config.object.distance, config.mask.height
     warnings = unresolved_zones(exposures, *numbers)
     return GridPoint(_key(config, text, double), resolved, text, double, None, tuple(warnings))

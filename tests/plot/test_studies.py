@@ -4,14 +4,12 @@ import dataclasses
 
 import numpy as np
 import pytest
-from commands.study import tiny
+from studies import tiny
 
-from thincam_jax.commands.run_folder import RunFolder
-from thincam_jax.commands.study import figures
-from thincam_jax.commands.study.figures import _by_synthesis, _detail, _pairs_of_axes
-from thincam_jax.commands.study.response import Response
 from thincam_jax.imaging.targets import usaf1951
 from thincam_jax.imaging.targets.usaf import usaf1951_elements
+from thincam_jax.plot.studies import _by_synthesis, _detail, _pairs_of_axes, draw_responses
+from thincam_jax.studies import Limits, Response
 
 
 @pytest.mark.parametrize(
@@ -34,9 +32,9 @@ def test_many_methods_go_into_several_bands(count, rows, columns):
     assert len(hidden) == rows * columns - 2 * count
 
 
-def test_the_detail_of_a_chart_holds_its_fine_groups(tmp_path):
+def test_the_detail_of_a_chart_holds_its_fine_groups():
     """All sets of its second layer and none of the first, whose bars are four times as wide."""
-    chart, picture = tiny.built(tmp_path).targets
+    chart, picture = tiny.study().targets
     image = usaf1951((320, 320))
     fine, label = _detail(image, chart)
     assert label == "fine groups, 20 mm"
@@ -46,36 +44,34 @@ def test_the_detail_of_a_chart_holds_its_fine_groups(tmp_path):
     assert _detail(image, picture)[1] == "middle 27 mm"
 
 
-def test_panels_of_transfer_functions_share_a_scale_and_show_limits(tmp_path, monkeypatch):
-    drawn = []
-    monkeypatch.setattr(figures, "save_figure", lambda *given: drawn.append(given[-1]))
-    study = tiny.built(tmp_path)
-    limits = {"first_zero_cycles_per_mm": None, "cut_off_cycles_per_mm": 9.0}
+def test_panels_of_transfer_functions_share_a_scale_and_show_limits():
+    study = tiny.study()
+    limits = Limits(None, None, 9.0, 3.7)
     found = {
         m.name: Response(np.arange(50.0) / 4, np.linspace(1, 3 - 2 * n, 50), limits)
         for n, m in enumerate(study.methods)
     }
-    figures.save_responses(RunFolder(tmp_path), study, found)
-    panels = drawn[0].axes
+    panels = draw_responses(study, found).axes
     assert len({ax.get_ylim() for ax in panels}) == len({ax.get_xlim() for ax in panels}) == 1
     first, second = ([t.get_text() for t in ax.get_legend().get_texts()] for ax in panels)
     assert first == ["cut-off 9.0", "Nyquist 12.5", "published limit 10.8"]
     assert second == ["cut-off 9.0", "Nyquist 12.5"]
 
 
-def test_methods_of_the_same_captures_and_sums_share_a_transfer_function(tmp_path):
-    study = tiny.built(tmp_path)
+def test_methods_of_the_same_captures_and_sums_share_a_transfer_function():
+    study = tiny.study()
     first = study.methods[0]
     twin = dataclasses.replace(first, name="twin")
     other = dataclasses.replace(study, methods=(*study.methods, twin))
     responses = {
-        m.name: Response(np.arange(3.0), np.full(3, float(n)), {})
+        m.name: Response(np.arange(3.0), np.full(3, float(n)), Limits(None, None, 1.0, 1.0))
         for n, m in enumerate(other.methods)
     }
     panels = _by_synthesis(other, responses)
     assert [title for title, _ in panels] == [f"{first.name}; twin", study.methods[1].name]
     assert panels[0][1] is responses[first.name]
     # The same captures, but other sums of them.
-    odd, even = (dataclasses.replace(twin, harmonics=(m,)) for m in (1, 2))
+    odd, even = (dataclasses.replace(twin, name=str(m), harmonics=(m,)) for m in (1, 2))
     both = dataclasses.replace(study, methods=(odd, even))
-    assert len(_by_synthesis(both, responses)) == 2
+    either = {method.name: responses["twin"] for method in both.methods}
+    assert len(_by_synthesis(both, either)) == 2

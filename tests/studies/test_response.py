@@ -2,25 +2,20 @@
 
 import numpy as np
 import pytest
-from commands.study import tiny
+from studies import tiny
 
 import thincam_jax as tc
-from thincam_jax.commands.study.response import method_response
+from thincam_jax.studies import Method, method_response
 
 
 @pytest.mark.parametrize(
-    ("betas", "phases"), [((25, 21), ["0 deg", "270 deg"]), ((25, 23, 20), ["0 deg"])]
+    ("betas", "phases"), [((25, 21), (0.0, 3 * np.pi / 2)), ((25, 23, 20), (0.0,))]
 )
-def test_contrasts_carry_all_but_the_common_part(betas, phases, tmp_path):
+def test_contrasts_carry_all_but_the_common_part(betas, phases):
     """Σ|contrast|² = Σ|H|² − |ΣH|²/n, over all captures; also with one phase a shot."""
-    shots = [{"beta": f"{b} rad/mm^2", "distance": "3 mm"} for b in betas]
-    study = tiny.built(
-        tmp_path,
-        "methods.1.synthesis=contrasts",
-        f"methods.1.phases={phases}",
-        f"methods.1.shots={shots}",
-    )
-    method = study.methods[1]
+    exposures = tc.Exposures(betas, 3.0, **tiny.LIGHT).at_phases(phases)
+    method = Method("one", exposures, tc.Wiener(), "contrasts", len(phases))
+    study = tiny.study(methods=(method,))
     found = method_response(study, method)
     count = len(betas) * len(phases)
     each = [
@@ -37,4 +32,4 @@ def test_contrasts_carry_all_but_the_common_part(betas, phases, tmp_path):
     profiles = np.stack(each)
     expected = (np.abs(profiles) ** 2).sum(0) - np.abs(profiles.sum(0)) ** 2 / count
     np.testing.assert_allclose(found.magnitude**2, expected, atol=1e-9 * expected.max())
-    assert found.metrics["first_zero_cycles_per_mm"] is None
+    assert found.limits.first_zero_cycles_per_mm is None

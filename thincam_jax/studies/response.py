@@ -2,13 +2,23 @@ r"""Transfer functions of whole methods: what a synthesis of captures carries of
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-from thincam_jax.commands.study.study import Exposure, Method, Study
 from thincam_jax.imaging.metrics import cut_off, first_common_zero
+from thincam_jax.lensless.exposures import Exposure
 from thincam_jax.lensless.psf import otf
+from thincam_jax.studies.study import Method, Study
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Where a response has its first zero crossing (None: it has none) and where it ends."""
+
+    first_zero_cycles_per_mm: float | None
+    first_zero_object_mm: float | None
+    cut_off_cycles_per_mm: float
+    cut_off_object_mm: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -18,12 +28,11 @@ class Response:
     - `frequency`: cycles/mm, ≥ 0.
     - `magnitude`: root of the mean over the shots of Σ|H|² of a shot's channels, mm²; contrasts
       belong to all shots together.
-    - `metrics`: its two limits, for metrics.json.
     """
 
     frequency: np.ndarray
     magnitude: np.ndarray
-    metrics: dict[str, Any]
+    limits: Limits
 
 
 def method_response(study: Study, method: Method) -> Response:
@@ -38,7 +47,7 @@ def method_response(study: Study, method: Method) -> Response:
     """
     reference = method.distance
     columns = study.sensor.shape[1]
-    frequency = np.arange(columns - columns // 2) / (columns * study.sensor.pitch)
+    frequency = np.arange(columns - columns // 2) / (columns * study.pitch)
     signed, powers = [], []
     for shot, channels in _groups(study, method):
         ratio = reference / shot.distance
@@ -57,12 +66,12 @@ def method_response(study: Study, method: Method) -> Response:
     return Response(
         frequency,
         magnitude,
-        {
-            "first_zero_cycles_per_mm": None if zero is None else round(zero, 3),
-            "first_zero_object_mm": None if zero is None else round(magnification / zero, 3),
-            "cut_off_cycles_per_mm": round(limit, 3),
-            "cut_off_object_mm": round(magnification / limit, 3),
-        },
+        Limits(
+            None if zero is None else round(zero, 3),
+            None if zero is None else round(magnification / zero, 3),
+            round(limit, 3),
+            round(magnification / limit, 3),
+        ),
     )
 
 
@@ -83,7 +92,7 @@ def _profile(study: Study, exposure: Exposure) -> np.ndarray:
         wavelength=exposure.wavelength,
         object_distance=study.object_distance,
         model=study.model,
-        pixel_integration=study.config.pixel_integration,
+        pixel_integration=study.pixel_integration,
     )
     rows, columns = study.sensor.shape
     return np.asarray(response[rows // 2, columns // 2 :])

@@ -1,0 +1,129 @@
+"""Studies in memory: their scores are those of a file's run; what a study refuses."""
+
+import json
+from dataclasses import asdict
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from commands.study import tiny as file
+from matplotlib import pyplot
+from studies import tiny
+
+import thincam_jax as tc
+from helpers import ROOT
+from thincam_jax.commands.run_folder import RunFolder
+from thincam_jax.commands.study.build import build_study
+from thincam_jax.commands.study.config import load_config
+from thincam_jax.commands.study.run import run_study
+from thincam_jax.studies import Method, Target
+from thincam_jax.studies.evaluate import coupled
+
+
+@pytest.fixture(scope="module")
+def result():
+    return tiny.study().run()
+
+
+def test_scores_are_those_of_the_file(result, tmp_path):
+    folder = RunFolder(tmp_path / "run")
+    run_study(file.built(tmp_path), folder, file.ignore)
+    assert json.loads((folder.path / "metrics.json").read_text("utf-8")) == asdict(result.scores)
+
+
+def test_some_targets_alone_have_the_same_scores(result):
+    """The noise is that of the target's number."""
+    study = tiny.study()
+    picture = study.targets[1]
+    alone = study.run([picture])
+    assert list(alone.evaluations) == ["picture"]
+    for name, found in alone.evaluations["picture"].items():
+        assert found.scores == result.evaluations["picture"][name].scores
+
+
+def test_table_has_a_row_for_each_method(result):
+    table = result.table()
+    (name, psnr, published, resolved, *_), _ = table.rows
+    assert (name, published, resolved) == ("conventional", 20.3, 5.0)
+    lines = str(table).splitlines()
+    assert len(lines) == 4 and len({len(line) for line in lines}) == 1
+    assert lines[2].startswith(f"| conventional | {psnr:7.1f} |") and "–" in lines[3]
+
+
+def test_figures_are_those_of_pyplot(result):
+    try:
+        figures = result.plot(), result.plot("picture"), result.plot_responses()
+        assert len(pyplot.get_fignums()) == 3
+        titles = [ax.get_title().splitlines()[0] for ax in figures[1].axes[:3]]
+        assert titles == ["scene", "conventional", "pairs"]
+        assert [ax.get_title(loc="left") for ax in figures[2].axes] == ["conventional", "pairs"]
+        with pytest.raises(ValueError, match="'no' is no target of this result; choose one of"):
+            result.plot("no")
+    finally:
+        pyplot.close("all")
+
+
+def test_the_study_of_the_thesis_is_that_of_its_file():
+    """Cameras, sums, solvers and noise; the scores follow from them."""
+    built = tc.studies.superresolution()
+    config = load_config(ROOT / "configs" / "fza_superresolution.yaml")
+    read = build_study(config)
+    assert built.exposures == read.exposures and len(built.exposures) == 8 + 2
+    for one, other in zip(built.methods, read.methods, strict=True):
+        assert (one.name, one.published, one.synthesis) == (
+            other.name,
+            other.published,
+            other.synthesis,
+        )
+        assert tuple(one.exposures) == tuple(other.exposures)
+        assert str(one.solver) == str(other.solver)
+    for one, other in zip(built.targets, read.targets, strict=True):
+        assert (one.number, one.name, one.distance) == (other.number, other.name, other.distance)
+        np.testing.assert_array_equal(one.plane.image, other.plane.image)
+    for name in ("sensor", "noise", "model", "pixel_integration", "seed", "name"):
+        assert str(getattr(built, name)) == str(getattr(read, name))
+    assert str(built.camera(built.exposures[0])) == str(read.camera(read.exposures[0]))
+
+
+def test_a_study_of_the_thesis_with_other_numbers():
+    target = Target.usaf1951(100.0, 40.0, 64)
+    study = tc.studies.superresolution(
+        (50.0, 42.0), (3.0, 4.0), sensor=tc.Sensor((32, 48), 0.05), targets=[target], noise=None
+    )
+    assert [m.name for m in study.methods][:2] == [
+        "conventional, d = 3.0 mm",
+        "conventional, d = 4.0 mm",
+    ]
+    assert {round(e.width, 9) for e in study.exposures} == {2.4}
+    assert {e.beta for e in study.exposures} == {50.0, 42.0}
+    assert study.noise is None and study.object_distance == 100.0
+
+
+def test_any_solver_reconstructs():
+    """The single capture by FISTA sees more of the picture than the mean of the scene."""
+    exposures = tc.Exposures(25.0, 3.0, **tiny.LIGHT)
+    method = Method("one", exposures, tc.Fista(tau=1.0, iterations=20))
+    study = tiny.study(methods=(method,))
+    found = study.run(study.targets[1:]).evaluations["picture"]["one"]
+    assert found.scores.psnr_db is not None and found.scores.psnr_db > 10
+
+
+def test_total_variation_is_coupled_as_suits_the_colours():
+    solver = tc.AdmmTV(variation=tc.TotalVariation(coupling="opponent", chroma_weight=2.0))
+    found = [coupled(solver, channels).variation for channels in (1, 2, 3)]  # pyright: ignore
+    assert [one.coupling for one in found] == ["none", "joint", "opponent"]
+    assert jnp.all(jnp.stack([one.chroma_weight for one in found]) == 2.0)
+    assert coupled(tc.Wiener(), 3) == tc.Wiener()
+
+
+def test_refused_in_one_line():
+    exposures = tc.Exposures(25.0, [3.0, 4.0], **tiny.LIGHT)
+    for given, message in (
+        ((exposures, tc.Wiener(), "fringe_scanning"), "takes 4 at each shot: give a multiple"),
+        ((exposures, tc.Wiener(synthesis=np.eye(2))), "has a synthesis of its own; give its name"),
+        ((exposures, tc.PoissonTV(), "contrasts"), "PoissonTV of method 'one' takes no sums"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            Method("one", *given)
+    with pytest.raises(ValueError, match="two of the methods .* have one name"):
+        tiny.study(methods=tiny.methods() * 2)

@@ -1,0 +1,250 @@
+"""The figures of a study: reconstructions, captures, transfer functions and contrast."""
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from thincam_jax.imaging.metrics import low_frequency_value
+from thincam_jax.imaging.targets import middle_square
+from thincam_jax.lensless.exposures import Exposure
+from thincam_jax.studies.evaluate import Contrasts, Evaluation, as_picture
+from thincam_jax.studies.response import Response
+from thincam_jax.studies.simulate import Capture
+from thincam_jax.studies.study import Study, Target
+
+# Told apart by dash and marker as well as by colour, so that they read in grey.
+_LINES = (
+    {"color": "#9a9a9a", "linestyle": "-", "marker": "o"},
+    {"color": "#d08020", "linestyle": "--", "marker": "s"},
+    {"color": "#1060a0", "linestyle": "-", "marker": "^"},
+    {"color": "#000000", "linestyle": ":", "marker": "D"},
+    {"color": "#7030a0", "linestyle": "-.", "marker": "v"},
+)
+
+
+def line_style(index: int) -> dict:
+    """Colour, dash and marker of the curve of that number."""
+    return dict(_LINES[index % len(_LINES)])
+
+
+def drawing(
+    size: tuple[float | int, float | int],
+    rows: int = 1,
+    columns: int = 1,
+    *,
+    figure: Figure | None = None,
+    **how: Any,
+) -> Any:
+    """A figure of a size in inches, the one given or a new one, and its axes.
+
+    `how`: as of `Figure.subplots`.
+    """
+    figure = Figure() if figure is None else figure
+    figure.set_size_inches(*size)
+    figure.set_layout_engine("constrained")
+    return figure, figure.subplots(rows, columns, **how)
+
+
+def sheet(
+    count: int, most: int, side: float, aspect: float, room: float
+) -> tuple[Figure, list[Axes]]:
+    """A figure with so many places for pictures, at most `most` beside each other, without axes.
+
+    `side`: width of a place; `aspect`: height of its picture over that; `room`: above it.
+    """
+    columns = min(most, count)
+    rows = math.ceil(count / columns)
+    size = (side * columns, rows * (side * aspect + room))
+    figure, axes = drawing(size, rows, columns, squeeze=False)
+    axes = axes.ravel()
+    for ax in axes:
+        ax.set_axis_off()
+    return figure, list(axes[:count])
+
+
+def draw_target(
+    study: Study, target: Target, capture: np.ndarray, evaluations: Mapping[str, Evaluation]
+) -> Figure:
+    """A target's scene, one raw capture and all reconstructions, whole and enlarged."""
+    figure, whole, detail = draw_found(target, evaluations, with_capture=True)
+    raw = as_picture(capture / capture.max())
+    _show(whole, raw, "first raw capture")
+    _show_detail_of_capture(detail, raw, study)
+    return figure
+
+
+def truth_of(evaluations: Mapping[str, Evaluation]) -> np.ndarray:
+    """The scene on the pixels of the last method."""
+    return list(evaluations.values())[-1].truth
+
+
+def draw_found(
+    target: Target,
+    evaluations: Mapping[str, Evaluation],
+    *,
+    with_capture: bool = False,
+    figure: Figure | None = None,
+) -> tuple[Figure, Axes, Axes]:
+    """A target's scene and its reconstructions, whole and enlarged, and the first two axes.
+
+    These are left free for a capture, where there is to be one.
+    """
+    truth = truth_of(evaluations)
+    panels = [("scene", truth, "")]
+    panels += [(name, one.image, _caption(one)) for name, one in evaluations.items()]
+    first, aspect = int(with_capture), truth.shape[0] / truth.shape[1]
+    drawn, wholes, details = _pairs_of_axes(first + len(panels), aspect, figure)
+    axes = zip(wholes[first:], details[first:], panels, strict=True)
+    for ax, detail, (name, image, caption) in axes:
+        _show(ax, image, f"{name}\n{caption}" if caption else name)
+        part, label = _detail(image, target)
+        _show(detail, part, "")
+        detail.set_xlabel(label, fontsize=9)
+    return drawn, wholes[0], details[0]
+
+
+def draw_captures(study: Study, captures: Mapping[Exposure, Capture]) -> Figure:
+    """All captures of a target, each from black to its own maximum."""
+    aspect = study.sensor.shape[0] / study.sensor.shape[1]
+    figure, axes = sheet(len(captures), _BESIDE, 2.2, aspect, 0.6)
+    for number, (ax, exposure) in enumerate(zip(axes, study.exposures, strict=True), 1):
+        image = captures[exposure].image
+        title = f"{number}: {study.mask_of(exposure)},\n"
+        _show(ax, as_picture(image / image.max()), f"{title}d {exposure.distance:.3g} mm")
+    return figure
+
+
+# More beside each other are too small to be read on a page.
+_BESIDE = 6
+
+
+def _pairs_of_axes(count: int, aspect: float, figure: Figure | None = None) -> Any:
+    """A figure with `count` places for a picture and, below each, its detail."""
+    bands = math.ceil(count / _BESIDE)
+    columns = math.ceil(count / bands)
+    size = (2.75 * columns, bands * (2.75 * (aspect + 1) + 1.25))
+    ratios = {"height_ratios": (aspect, 1) * bands}
+    figure, axes = drawing(size, 2 * bands, columns, figure=figure, gridspec_kw=ratios)
+    wholes, details = axes[::2].ravel(), axes[1::2].ravel()
+    for ax in axes.ravel():
+        ax.set(xticks=[], yticks=[])
+    for ax in (*wholes[count:], *details[count:]):
+        ax.set_axis_off()
+    return figure, wholes[:count], details[:count]
+
+
+def _caption(evaluation: Evaluation) -> str:
+    scores = evaluation.scores
+    exact = scores.psnr_db is None
+    text = "exact" if exact else f"{scores.psnr_db:.1f} dB, SSIM {scores.ssim:.2f}"
+    if scores.resolved is not None:
+        text += f"\nresolves {scores.resolved.object_mm:.2f} mm"
+    return text
+
+
+def _show(ax, image: np.ndarray, title: str) -> None:
+    ax.imshow(np.clip(image, 0, 1), cmap="gray", vmin=0, vmax=1, interpolation="nearest")
+    if title:
+        ax.set_title(title, fontsize=9)
+
+
+def _show_detail_of_capture(ax, raw: np.ndarray, study: Study) -> None:
+    detail = _middle(raw)
+    low, high = detail.min(axis=(0, 1)), detail.max(axis=(0, 1))
+    _show(ax, (detail - low) / np.where(high > low, high - low, 1), "")
+    width = study.sensor.shape[1] * study.pitch / 3
+    ax.set_xlabel(f"middle {width:.2g} mm of the sensor,\nstretched", fontsize=9)
+
+
+# The second layer of the USAF chart, with the finer ones inside: place of its centre down and right
+# of the chart's, and its side, as parts of the chart (see `thincam_jax.imaging.targets.usaf`).
+_FINE = (-2.5 / 32, 2.25 / 32, 8 / 32)
+
+
+def _detail(image: np.ndarray, target: Target) -> tuple[np.ndarray, str]:
+    """The part of a picture that is enlarged, and what it is."""
+    if target.kind != "usaf1951":
+        return _middle(image), f"middle {target.width / 3:.0f} mm"
+    down, right, part = _FINE
+    side = min(image.shape[:2])
+    half = max(1, round(side * part / 2))
+    row, column = (
+        round(n / 2 + side * s) for n, s in zip(image.shape, (down, right), strict=False)
+    )
+    fine = image[row - half : row + half, column - half : column + half]
+    return fine, f"fine groups, {target.width * part:.0f} mm"
+
+
+def _middle(image: np.ndarray) -> np.ndarray:
+    """The central square whose side is a third of the width."""
+    rows, columns = image.shape[:2]
+    return middle_square(image, 2 * min(columns // 6, rows // 2))
+
+
+def draw_responses(
+    study: Study, responses: Mapping[str, Response], figure: Figure | None = None
+) -> Figure:
+    """Transfer functions of all methods on one scale; methods of one synthesis share a panel.
+
+    With their limits, those that are published, and the pixels' Nyquist frequency.
+    """
+    published = {m.name: m.published.limit_cycles_per_mm for m in study.methods}
+    nyquist = 0.5 / study.pitch
+    panels = _by_synthesis(study, responses)
+    size = (8.5, 2.1 * len(panels) + 0.8)
+    drawn, axes = drawing(size, len(panels), 1, figure=figure, sharex=True)
+    axes = np.atleast_1d(axes)
+    end = 1.08 * max(nyquist, *(limit or 0 for limit in published.values()))
+    levels = [r.magnitude[1:] / low_frequency_value(r.frequency, r.magnitude) for _, r in panels]
+    top = 1.05 * max(1.3, *(float(level.max()) for level in levels))
+    for index, (ax, (name, response)) in enumerate(zip(axes, panels, strict=True)):
+        style = line_style(index) | {"marker": "", "linestyle": "-"}
+        ax.plot(response.frequency[1:], levels[index], linewidth=1.1, **style)
+        ax.axvspan(nyquist, end, color="#d8d8d8", linewidth=0)
+        limits = response.limits
+        zero, cut = limits.first_zero_cycles_per_mm, limits.cut_off_cycles_per_mm
+        stated = {limit for own in name.split("; ") if (limit := published.get(own))}
+        marks = [("first zero", zero, ":"), ("cut-off", cut, "--"), ("Nyquist", nyquist, "-")]
+        marks += [("published limit", limit, "-.") for limit in sorted(stated)]
+        for what, at, dash in marks:
+            if at is not None:
+                label = f"{what} {at:.1f}"
+                ax.axvline(at, color="black", linestyle=dash, linewidth=1, label=label)
+        ax.legend(fontsize=8, loc="upper right", framealpha=0.9)
+        ax.set(xlim=(0, end), ylim=(0, top), ylabel="relative MTF")
+        ax.set_title(name, fontsize=10, loc="left")
+    axes[-1].set_xlabel("spatial frequency u on the reference sensor plane (cycles/mm), v = 0")
+    return drawn
+
+
+def _by_synthesis(study: Study, responses: Mapping[str, Response]) -> list[tuple[str, Response]]:
+    """Titles and responses: the methods that take the same captures and sums of them as one."""
+    names: dict[tuple, list[str]] = {}
+    for method in study.methods:
+        sums = tuple(method.exposures), method.synthesis, method.harmonics
+        names.setdefault(sums, []).append(method.name)
+    return [("; ".join(group), responses[group[0]]) for group in names.values()]
+
+
+def draw_contrasts(contrasts: Mapping[str, Contrasts]) -> Figure:
+    """Contrast of every chart element against its period, for each method."""
+    figure, ax = drawing((8.5, 4.2))
+    for index, (name, records) in enumerate(contrasts.items()):
+        periods = sorted({period for period, _, _ in records}, reverse=True)
+        worst = [min(c for p, _, c in records if p == period) for period in periods]
+        ax.plot(periods, worst, label=name, markersize=4, linewidth=1.2, **line_style(index))
+    ax.axhline(0, color="black", linewidth=0.8)
+    ax.set_xscale("log")
+    ax.invert_xaxis()
+    ticks = [10, 5, 2, 1, 0.5, 0.2]
+    ax.set_xticks(ticks, [f"{t:g}" for t in ticks])
+    ax.minorticks_off()
+    contrast = "contrast of the three bars,\nworse direction"
+    ax.set(ylim=(-1.05, 1.1), xlabel="line pair on the object (mm)", ylabel=contrast)
+    ax.legend(fontsize=9, loc="lower left")
+    ax.grid(alpha=0.3)
+    return figure

@@ -1,0 +1,191 @@
+"""Reconstructions of a study: agreement with the scene, and what is resolved of it."""
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Array
+
+from thincam_jax._core.grids import Grid
+from thincam_jax.imaging.metrics import align, psnr, resolved_element, ssim, usaf_contrast
+from thincam_jax.imaging.scene import ImagePlane
+from thincam_jax.imaging.targets import line_pair, usaf1951_elements
+from thincam_jax.lensless.exposures import Exposure
+from thincam_jax.reconstruction import (
+    AdmmTV,
+    Cameras,
+    FringeScanning,
+    Reconstruction,
+    Recording,
+    Wiener,
+    reconstruct,
+)
+from thincam_jax.reconstruction.solver import AbstractSolver
+from thincam_jax.studies.simulate import Capture, stacked
+from thincam_jax.studies.study import Method, Study, Target
+
+Reconstructor = Callable[[Array, Array], Reconstruction]
+Contrasts = list[tuple[float, str, float]]
+
+
+@dataclass(frozen=True)
+class Resolved:
+    """The finest chart element that is resolved in both directions."""
+
+    group: int
+    element: int
+    object_mm: float
+    sensor_cycles_per_mm: float
+
+
+@dataclass(frozen=True)
+class Scores:
+    """Figures of merit of a reconstruction; None for the PSNR of an exact one.
+
+    - `object_pixel_mm`: its pixels on the object. `resolved`: of a chart.
+    """
+
+    psnr_db: float | None
+    ssim: float
+    object_pixel_mm: float
+    resolved: Resolved | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """A reconstruction beside its scene, both (y, x) or (y, x, channel) on one grid.
+
+    - `image`: the reconstruction after the least-squares gain and offset.
+    - `truth`: the scene averaged over the same pixels.
+    - `contrast`: (period in mm, direction, contrast) of every chart element; None without a chart.
+    """
+
+    image: np.ndarray
+    truth: np.ndarray
+    scores: Scores
+    contrast: Contrasts | None
+
+
+def field_shape(study: Study, method: Method, target: Target) -> tuple[int, int]:
+    """Pixels of the reconstruction: what covers the target at the object pitch."""
+    scale = method.distance / target.distance / study.pitch
+    rows, columns = (
+        max(1, math.ceil(float(size) * scale - 1e-3))
+        for size in (target.plane.height, target.plane.width)
+    )
+    return rows, columns
+
+
+def reconstructor(
+    study: Study, method: Method, shape: tuple[int, int], object_distance: float
+) -> Reconstructor:
+    """A function of the captures (capture, channel, y, x) and variances (capture, channel)."""
+    cameras = Cameras(
+        [study.camera(exposure) for exposure in method.exposures],
+        wavelength=[exposure.wavelength for exposure in method.exposures],
+        object_distance=object_distance,
+        field_shape=shape,
+        model=study.model,
+        pixel_integration=study.pixel_integration,
+    )
+    if isinstance(method.solver, FringeScanning):
+        scanning = method.solver.prepare(cameras)
+        return lambda captures, variances: scanning(captures)
+    solver: Any = method.solver
+    if hasattr(solver, "synthesis"):
+        solver = replace(solver, synthesis=method.synthesis_matrix)
+    if isinstance(solver, Wiener):
+        return solver.prepare(cameras)
+
+    def solved(captures: Array, variances: Array) -> Reconstruction:
+        """On the crop model; without noise in the study it is estimated."""
+        noise_variance = None if study.noise is None else variances
+        recording = Recording(captures, cameras, noise_variance=noise_variance)
+        return reconstruct(recording, coupled(solver, captures.shape[1]))
+
+    return solved
+
+
+def coupled(solver: AbstractSolver, channels: int) -> AbstractSolver:
+    """The solver with its total variation coupled as suits so many colour channels."""
+    if not isinstance(solver, AdmmTV):
+        return solver
+    coupling = solver.variation.coupling
+    if channels == 1:
+        coupling = "none"
+    elif coupling == "opponent" and channels != 3:
+        coupling = "joint"
+    return replace(solver, variation=replace(solver.variation, coupling=coupling))
+
+
+def evaluate_method(
+    study: Study,
+    method: Method,
+    target: Target,
+    captures: Mapping[Exposure, Capture],
+) -> Evaluation:
+    """Reconstruct a target from the method's captures, and judge what comes out."""
+    shape, prepared = field_shape(study, method, target), study._reconstructors
+    key = (method.name, shape, target.distance)
+    if key not in prepared:
+        prepared[key] = reconstructor(study, method, shape, target.distance)
+    used = stacked([captures[exposure] for exposure in method.exposures])
+    return evaluate(method, target, prepared[key](*used))
+
+
+def evaluate(method: Method, target: Target, reconstruction: Reconstruction) -> Evaluation:
+    """PSNR and SSIM after alignment, over the target's area; the resolved element of a chart."""
+    image = np.asarray(reconstruction.image, dtype=float)
+    rows, columns = image.shape[-2:]
+    assert reconstruction.pitch is not None  # those of a study's cameras have one
+    grid = Grid((rows, columns), reconstruction.pitch)
+    truth = np.asarray(sample(target.plane, grid), dtype=float)
+    image, truth = (as_picture(i) for i in (image, truth))
+    resolved, contrast = None, None
+    if target.kind == "usaf1951":
+        resolved, contrast = _resolution(method, target, image, float(grid.pitch))
+    scores = Scores(
+        rounded(psnr(image, truth), 4),
+        round(ssim(image, truth), 5),
+        round(float(grid.pitch), 6),
+        resolved,
+    )
+    return Evaluation(align(image, truth)[0], truth, scores, contrast)
+
+
+def rounded(score: float, digits: int = 3) -> float | None:
+    """A PSNR, dB, for metrics; None where nothing differs, which JSON has no number for."""
+    return round(score, digits) if math.isfinite(score) else None
+
+
+@eqx.filter_jit
+def sample(plane: ImagePlane, grid: Grid) -> Array:
+    """The scene averaged over the pixels of an upright reconstruction."""
+    return plane.sample(grid, magnification=1.0)
+
+
+def as_picture(image: np.ndarray) -> np.ndarray:
+    """From (channel, y, x) to (y, x) or (y, x, channel)."""
+    picture = np.moveaxis(image, 0, -1)
+    return picture[..., 0] if picture.shape[-1] == 1 else picture
+
+
+def _resolution(
+    method: Method, target: Target, image: np.ndarray, pitch: float
+) -> tuple[Resolved | None, Contrasts]:
+    """The finest element resolved in both directions, and the contrast of all."""
+    records = usaf_contrast(image, usaf1951_elements(), target.width / pitch)
+    contrast = [
+        (line_pair(r.element, target.width), r.element.orientation, float(r.contrast))
+        for r in records
+    ]
+    element = resolved_element(records)
+    if element is None:
+        return None, contrast
+    period = line_pair(element, target.width)
+    magnification = target.distance / method.distance
+    on_the_sensor = round(magnification / period, 3)
+    return Resolved(element.group, element.element, round(period, 4), on_the_sensor), contrast

@@ -1,0 +1,150 @@
+"""Results of a study: the scores of every method on every target, as records, table and figures."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from thincam_jax._core.table import Table
+from thincam_jax.studies.evaluate import Evaluation, Scores, evaluate_method
+from thincam_jax.studies.response import Limits, Response, method_response
+from thincam_jax.studies.simulate import take
+from thincam_jax.studies.study import Method, Published, Study, Target
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+@dataclass(frozen=True)
+class MethodScores:
+    """A method's figures of merit; `targets` by name, beside what was `published`."""
+
+    captures: int
+    mean_psnr_of_pictures_db: float | None
+    limits: Limits
+    targets: dict[str, Scores]
+    published: Published
+
+    @property
+    def resolved_mm(self) -> float | None:
+        """The finest line pair resolved on the object, mm; of the first chart."""
+        found = (scores.resolved for scores in self.targets.values())
+        return next((one.object_mm for one in found if one is not None), None)
+
+
+@dataclass(frozen=True)
+class StudyScores:
+    """The figures of merit of all methods, by name."""
+
+    study: str
+    seed: int
+    methods: dict[str, MethodScores]
+    warnings: list[str]
+
+    def table(self) -> Table:
+        """Every method beside what was published of it."""
+        return Table(
+            ("method", "PSNR dB", "published", "resolved mm", "published", "cut-off /mm"),
+            (1, 1, 2, 2, 1),
+            tuple(
+                (
+                    name,
+                    one.mean_psnr_of_pictures_db,
+                    one.published.psnr_db,
+                    one.resolved_mm,
+                    one.published.resolved_object_mm,
+                    one.limits.cut_off_cycles_per_mm,
+                )
+                for name, one in self.methods.items()
+            ),
+        )
+
+
+def mean_psnr_of_pictures(targets: Sequence[Target], scores: Mapping[str, Scores]) -> float | None:
+    """The mean over photographs and files, dB, from scores by target; None without any.
+
+    Drawn targets are left out, and exact reconstructions, which have no PSNR.
+    """
+    pictures = [scores[target.name].psnr_db for target in targets if target.is_picture]
+    known = [value for value in pictures if value is not None]
+    return round(float(np.mean(known)), 4) if known else None
+
+
+def summarise(
+    study: Study,
+    targets: Sequence[Target],
+    scores: Mapping[str, Mapping[str, Scores]],
+    responses: Mapping[str, Response],
+) -> StudyScores:
+    """The scores, by target and method, and the limits of the methods' responses as one record."""
+
+    def of_method(method: Method) -> MethodScores:
+        own = {target.name: scores[target.name][method.name] for target in targets}
+        return MethodScores(
+            len(method.exposures),
+            mean_psnr_of_pictures(targets, own),
+            responses[method.name].limits,
+            own,
+            method.published,
+        )
+
+    methods = {method.name: of_method(method) for method in study.methods}
+    return StudyScores(study.name, study.seed, methods, study.warnings)
+
+
+@dataclass(frozen=True, eq=False)
+class StudyResult:
+    """All that a study found: `evaluations` by target and method, `responses` by method."""
+
+    study: Study
+    targets: tuple[Target, ...]
+    evaluations: dict[str, dict[str, Evaluation]]
+    responses: dict[str, Response]
+
+    @property
+    def scores(self) -> StudyScores:
+        """The figures of merit, without images."""
+        scores = {
+            target: {name: found.scores for name, found in methods.items()}
+            for target, methods in self.evaluations.items()
+        }
+        return summarise(self.study, self.targets, scores, self.responses)
+
+    def table(self) -> Table:
+        """Every method beside what was published of it."""
+        return self.scores.table()
+
+    def plot(self, target: str | None = None) -> "Figure":
+        """The scene and every reconstruction of it, whole and enlarged; by default the first."""
+        name = self.targets[0].name if target is None else target
+        if name not in self.evaluations:
+            listed = ", ".join(self.evaluations)
+            raise ValueError(f"{name!r} is no target of this result; choose one of {listed}")
+        chosen = next(one for one in self.targets if one.name == name)
+        from thincam_jax.plot import studies as plot
+        from thincam_jax.plot.frame import new_figure
+
+        return plot.draw_found(chosen, self.evaluations[name], figure=new_figure(1, 1))[0]
+
+    def plot_responses(self) -> "Figure":
+        """The transfer function of every method, with its limits and those published."""
+        from thincam_jax.plot import studies as plot
+        from thincam_jax.plot.frame import new_figure
+
+        return plot.draw_responses(self.study, self.responses, figure=new_figure(1, 1))
+
+
+def run(study: Study, targets: Sequence[Target]) -> StudyResult:
+    """Every method on every target, and the methods' transfer functions."""
+    evaluations = {target.name: evaluate_target(study, target) for target in targets}
+    responses = {method.name: method_response(study, method) for method in study.methods}
+    return StudyResult(study, tuple(targets), evaluations, responses)
+
+
+def evaluate_target(study: Study, target: Target) -> dict[str, Evaluation]:
+    """Every method on one target; captures that methods share are taken once."""
+    captures = {exposure: take(study, exposure, target) for exposure in study.exposures}
+    return {
+        method.name: evaluate_method(study, method, target, captures) for method in study.methods
+    }

@@ -1,0 +1,256 @@
+"""Studies: cameras before targets, and the methods that reconstruct their captures."""
+
+import functools
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from jaxtyping import Array
+
+from thincam_jax._core.precision import decimal_value
+from thincam_jax.imaging import targets as drawn
+from thincam_jax.imaging.scene import ImagePlane
+from thincam_jax.imaging.sensor import AbstractNoise, Sensor
+from thincam_jax.lensless.camera import LenslessCamera
+from thincam_jax.lensless.exposures import Exposure, Exposures
+from thincam_jax.lensless.masks.base import AbstractMask
+from thincam_jax.lensless.masks.fza import FresnelZoneAperture, edge_frequency
+from thincam_jax.lensless.method import Model
+from thincam_jax.lensless.psf import psf
+from thincam_jax.lensless.sampling import unresolved
+from thincam_jax.reconstruction import FringeScanning
+from thincam_jax.reconstruction import synthesis as syntheses
+from thincam_jax.reconstruction.solver import AbstractSolver
+
+if TYPE_CHECKING:
+    from thincam_jax.studies.result import StudyResult
+
+Synthesis = Literal["fringe_scanning", "phase_pairs", "harmonics", "contrasts", "separate"]
+# The mask phases at each shot where the synthesis sets their number.
+_PHASES = {"fringe_scanning": 4, "phase_pairs": 2}
+
+
+def synthesis_matrix(synthesis: Synthesis, shots: int, phases: int) -> np.ndarray:
+    """Real weights (channel, exposure) of so many shots with so many phases each."""
+    # Those that set the phases themselves treat each shot alike.
+    return getattr(syntheses, synthesis)(shots if synthesis in _PHASES else shots * phases)
+
+
+@dataclass(frozen=True)
+class Published:
+    """Figures that a publication gives for a method; None where it gives none."""
+
+    psnr_db: float | None = None
+    resolved_object_mm: float | None = None
+    limit_cycles_per_mm: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Method:
+    """A reconstruction and the exposures that it takes.
+
+    - `exposures`: in the order of the synthesis, phase by phase and shot by shot.
+    - `solver`: `FringeScanning`, `Wiener`, `AdmmTV` or another one. With "opponent" total variation
+      grey targets have no coupling, and colours of another number than three a joint one.
+    - `synthesis`: the sums of captures that are reconstructed, by the name of the function in
+      `thincam_jax.reconstruction.synthesis`.
+    - `phases`: exposures of each shot; 4 for fringe scanning, 2 for phase pairs.
+    - `harmonics`: of the synthesis of that name.
+    """
+
+    name: str
+    exposures: Exposures
+    solver: AbstractSolver
+    synthesis: Synthesis = "separate"
+    phases: int = 1
+    harmonics: tuple[int, ...] = ()
+    published: Published = Published()
+
+    def __post_init__(self):
+        object.__setattr__(self, "phases", _PHASES.get(self.synthesis, self.phases))
+        if len(self.exposures) % self.phases:
+            raise ValueError(
+                f"method {self.name!r} has {len(self.exposures)} exposures; its synthesis "
+                f"{self.synthesis} takes {self.phases} at each shot: give a multiple"
+            )
+        if getattr(self.solver, "synthesis", None) is not None:
+            raise ValueError(
+                f"the solver of method {self.name!r} has a synthesis of its own; give its name to "
+                "the Method, such as synthesis='phase_pairs'"
+            )
+        if self.synthesis != "separate" and not hasattr(self.solver, "synthesis"):
+            if not isinstance(self.solver, FringeScanning):
+                raise ValueError(
+                    f"{type(self.solver).__name__} of method {self.name!r} takes no sums of "
+                    "captures; leave out the synthesis, or use Wiener, AdmmTV or Fista"
+                )
+
+    @property
+    def shots(self) -> tuple[Exposure, ...]:
+        """The first exposure of each shot."""
+        return tuple(self.exposures)[:: self.phases]
+
+    @property
+    def distance(self) -> float:
+        """The largest mask-sensor distance, on whose scale the method reconstructs, mm."""
+        return max(float(exposure.distance) for exposure in self.exposures)
+
+    @property
+    def synthesis_matrix(self) -> np.ndarray:
+        """Real weights (channel, exposure)."""
+        return self.weights(len(self.exposures) // self.phases)
+
+    def weights(self, shots: int) -> np.ndarray:
+        """Real weights (channel, exposure) of so many of its shots."""
+        if self.synthesis == "harmonics":
+            return syntheses.harmonics(shots, self.phases, self.harmonics)
+        return synthesis_matrix(self.synthesis, shots, self.phases)
+
+
+@dataclass(frozen=True, eq=False)
+class Target:
+    """A scene at one distance, in mm as its width.
+
+    - `number`: of its noise, its place in a study.
+    - `kind`: "usaf1951", whose resolved element is found, "photograph" or "file", whose PSNR is
+      averaged, or another word.
+    - `plane`: the colour channels are a batch, (channel, y, x).
+    """
+
+    number: int
+    name: str
+    kind: str
+    distance: float
+    width: float
+    plane: ImagePlane
+
+    @classmethod
+    def of_image(
+        cls, name: str, image: Any, distance: float, width: float, kind: str = "file"
+    ) -> "Target":
+        """A target from an image (y, x) or (y, x, channel)."""
+        channels = np.moveaxis(np.atleast_3d(np.asarray(image)), -1, 0).astype(np.float32)
+        return cls(0, name, kind, distance, width, ImagePlane(channels, distance, width))
+
+    @classmethod
+    def usaf1951(cls, distance: float, width: float, pixels: int = 1700) -> "Target":
+        """The USAF-1951 chart, drawn on a square of so many pixels."""
+        image = drawn.usaf1951((pixels, pixels))
+        return cls.of_image("USAF-1951", image, distance, width, "usaf1951")
+
+    @classmethod
+    def photograph(cls, name: str, distance: float, width: float) -> "Target":
+        """A photograph of scikit-image, such as "astronaut"."""
+        return cls.of_image(name, drawn.sample_image(name), distance, width, "photograph")
+
+    @property
+    def is_picture(self) -> bool:
+        """Whether it is a photograph or an image file, and not drawn."""
+        return self.kind in ("photograph", "file")
+
+
+def numbered(targets: Iterable[Target]) -> tuple[Target, ...]:
+    """The targets, numbered by their place where two have one number."""
+    targets = tuple(targets)
+    if len({target.number for target in targets}) == len(targets):
+        return targets
+    return tuple(replace(target, number=place) for place, target in enumerate(targets))
+
+
+def unresolved_zones(
+    exposures: Iterable[Exposure], pitch: float, object_distance: float, height: float | None
+) -> list[str]:
+    """A warning where pixels of a pitch, mm, do not resolve the finest zones of masks that may have
+    a height."""
+    finest = max(
+        edge_frequency(e.beta, max(e.width, height or 0)) / (1 + e.distance / object_distance)
+        for e in exposures
+    )
+    fault = unresolved(finest, pitch)
+    return [fault] if fault else []
+
+
+@dataclass(frozen=True, eq=False)
+class Study:
+    """Cameras before targets, and the methods that reconstruct their captures.
+
+    - `mask`: what the masks of all exposures share, see `Exposures.cameras`.
+    - `object_distance`: of the point whose PSF and transfer functions are shown, mm.
+    - `noise`: None leaves captures as they are.
+    - `model`, `pixel_integration`: of the PSFs, see `thincam_jax.psf`.
+    - `seed`: of the noise: each capture of each target has a random key of its own.
+    - `mask_name`: of a mask without zones, in figures.
+    """
+
+    mask: AbstractMask
+    sensor: Sensor
+    methods: tuple[Method, ...]
+    targets: tuple[Target, ...] = ()
+    object_distance: float = math.inf
+    noise: AbstractNoise | None = None
+    model: Model = "separable"
+    pixel_integration: bool = True
+    seed: int = 0
+    name: str = "study"
+    mask_name: str = ""
+    # Filters of methods by the method's name and the shape of the field.
+    _reconstructors: dict[tuple, Any] = field(default_factory=dict, init=False, repr=False)
+
+    def __post_init__(self):
+        object.__setattr__(self, "targets", numbered(self.targets))
+        for what, names in (
+            ("methods", [method.name for method in self.methods]),
+            ("targets", [target.name for target in self.targets]),
+        ):
+            if len(set(names)) < len(names):
+                raise ValueError(f"two of the {what} {names} have one name; give each its own")
+
+    def run(self, targets: Sequence[Target] | None = None) -> "StudyResult":
+        """Every method on every target, by default on the study's own."""
+        from thincam_jax.studies.result import run
+
+        return run(self, self.targets if targets is None else numbered(targets))
+
+    @functools.cached_property
+    def exposures(self) -> tuple[Exposure, ...]:
+        """Of all methods, each once, in the order of first use."""
+        return tuple(dict.fromkeys(e for m in self.methods for e in m.exposures))
+
+    @functools.cached_property
+    def pitch(self) -> float:
+        """Of the pixels, mm."""
+        return decimal_value(self.sensor.pitch)
+
+    @property
+    def warnings(self) -> list[str]:
+        """What a user should know before it runs, and in the report."""
+        farthest = max((target.distance for target in self.targets), default=math.inf)
+        if isinstance(self.mask, FresnelZoneAperture):
+            height = None if self.mask.height is None else decimal_value(self.mask.height)
+            return unresolved_zones(self.exposures, self.pitch, farthest, height)
+        finest = getattr(self.mask, "finest_frequency", 0.0)
+        nearest = min(float(exposure.distance) for exposure in self.exposures)
+        fault = unresolved(float(finest) / (1 + nearest / farthest), self.pitch)
+        return [fault] if fault else []
+
+    def camera(self, exposure: Exposure) -> LenslessCamera:
+        """The camera of an exposure."""
+        return exposure.camera(self.sensor, self.mask)
+
+    def mask_of(self, exposure: Exposure) -> str:
+        """The mask in a figure's words."""
+        if not isinstance(self.mask, FresnelZoneAperture):
+            return self.mask_name or type(self.mask).__name__
+        return f"β {exposure.beta:.4g} rad/mm², φ {exposure.phase:.2f} rad"
+
+    def psf(self, exposure: Exposure) -> Array:
+        """Of a point on the axis at the distance of the targets, (y, x)."""
+        return psf(
+            self.camera(exposure),
+            wavelength=exposure.wavelength,
+            object_distance=self.object_distance,
+            model=self.model,
+            pixel_integration=self.pixel_integration,
+        )
