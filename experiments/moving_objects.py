@@ -58,8 +58,8 @@ figure.savefig(FIGURES / "bar.png", dpi=110)
 # %% [markdown]
 # ## Speeds
 #
-# The cameras and methods of `configs/moving.yaml`; sensor, mask and scene are a quarter as wide, and
-# the zones as fine. All but the short capture take the light of eight exposures. The scene's way in
+# The cameras and methods of `configs/moving.yaml`; sensor, mask and scene are a quarter as wide,
+# and the zones as fine. All but the short capture take the light of eight exposures. The scene's way in
 # the whole sequence is given in pixels of the sensor.
 
 # %%

@@ -55,5 +55,6 @@ def computed_psf(config: Path, cameras: Cameras) -> Raw:
     how = {"model": cameras.model, "pixel_integration": cameras.pixel_integration}
     image = psf(camera, wavelength=wavelength, object_distance=distance, **how)
     numbers = eqx.tree_pformat(camera, width=10_000)  # in one line
-    name = f"camera of {config}: {numbers}, wavelength {wavelength * 1e6:g} nm, object at {distance:g} mm"
+    light = f"wavelength {wavelength * 1e6:g} nm, object at {distance:g} mm"
+    name = f"camera of {config}: {numbers}, {light}"
     return Raw(np.asarray(image), name=name)

@@ -33,7 +33,7 @@ from thincam_jax.imaging.sensor import (
 from thincam_jax.lensless import masks
 from thincam_jax.lensless.exposures import Exposure, Exposures
 from thincam_jax.reconstruction.solver import AbstractSolver
-from thincam_jax.reconstruction.spectra import Prior
+from thincam_jax.reconstruction.wiener import Prior
 from thincam_jax.studies.evaluate import field_shape
 from thincam_jax.studies.study import Method, Published, Study, Target
 
