@@ -40,7 +40,7 @@ def show_image(axes: Axes, image: Any, pitch: float, **options: Any) -> AxesImag
     """
     image = np.asarray(image)
     rows, columns = (n * pitch / 2 for n in image.shape[:2])
-    given = {"cmap": "gray", "interpolation": "nearest", **options}
-    shown = axes.imshow(image, extent=(-columns, columns, rows, -rows), **given)
+    extent = (-columns, columns, rows, -rows)
+    shown = axes.imshow(image, extent=extent, **{"cmap": "gray", **options})
     axes.set(xlabel="x (mm)", ylabel="y (mm)")
     return shown

@@ -14,8 +14,8 @@ from thincam_jax.commands.design.ranking import Finder
 from thincam_jax.commands.design.record import record, record_fronts
 from thincam_jax.commands.run_folder import Progress, Run, RunFolder
 from thincam_jax.commands.study.build import FileStudy
-from thincam_jax.studies.evaluate import Evaluation
 from thincam_jax.plot.studies import draw_found
+from thincam_jax.studies.evaluate import Evaluation
 from thincam_jax.studies.study import Target
 
 

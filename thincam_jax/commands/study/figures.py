@@ -9,6 +9,7 @@ from thincam_jax.commands.config_file import slug
 from thincam_jax.commands.run_folder import RunFolder
 from thincam_jax.imaging.display import png_bytes
 from thincam_jax.plot import studies as plot
+from thincam_jax.plot.cameras import draw_psf
 from thincam_jax.plot.studies import drawing as drawing
 from thincam_jax.plot.studies import line_style as line_style
 from thincam_jax.plot.studies import sheet as sheet
