@@ -74,7 +74,7 @@ def test_camera_that_cannot_be_built_is_a_reason(tmp_path):
     assert measured.traceback is None
 
 
-def test_defect_is_a_reason_with_its_traceback(tmp_path):
+def test_defect_is_a_reason_with_its_traceback(tmp_path, monkeypatch):
     def broken(_):
         raise ZeroDivisionError("a\n  defect")
 

@@ -1,4 +1,4 @@
-"""Which captures are to be reconstructed, and into which files; told before any work."""
+"""Plan which captures are reconstructed into which files, checked before any work."""
 
 import os
 import tempfile
