@@ -291,6 +291,6 @@ def test_what_is_refused():
         assert "\n" not in str(refused.value)
     with pytest.raises(ValueError, match="give noise_variance"):
         tc.reconstruct(tc.Recording(jnp.ones(6), operator), tc.AdmmTV())
-    with pytest.raises(ValueError, match="synthesis adds captures of known cameras"):
+    with pytest.raises(ValueError, match="a synthesis needs Cameras; leave it out with operators"):
         recording = tc.Recording(jnp.ones(6), operator, noise_variance=1.0)
         tc.reconstruct(recording, tc.AdmmTV(synthesis=np.eye(1)))

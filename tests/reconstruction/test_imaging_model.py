@@ -52,5 +52,5 @@ def test_registered_shape_holds_the_enlarged_picture_and_its_parity(shape, ratio
 
 
 def test_captures_are_never_made_smaller():
-    with pytest.raises(ValueError, match=r"ratio = 0.8: captures are enlarged"):
+    with pytest.raises(ValueError, match=r"ratio = 0.8: captures are only enlarged"):
         register(jnp.ones((4, 5)), 0.8)

@@ -56,5 +56,5 @@ def test_bad_input():
     recording = tc.Recording(jnp.ones((5, 6)), system, noise_variance=1.0)
     with pytest.raises(ValueError, match="steps = 0; give a whole number of at least 1"):
         tc.Stream(recording, tc.AdmmTV(1.0), steps=0)
-    with pytest.raises(ValueError, match="tau = 'sure' is found for one capture; give a number"):
+    with pytest.raises(ValueError, match="tau = 'sure' is a rule for one capture; give a number"):
         tc.Stream(recording, tc.AdmmTV("sure"))

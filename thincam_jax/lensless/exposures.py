@@ -18,6 +18,7 @@ from thincam_jax._core import checks
 from thincam_jax._core.checks import Numbers
 from thincam_jax._core.module import Module
 from thincam_jax._core.precision import decimal_value
+from thincam_jax._core.quantity import quantities, unchecked
 from thincam_jax.imaging.sensor import Sensor
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.masks.base import AbstractMask
@@ -121,12 +122,12 @@ class Exposures(Module):
     ```
     """
 
-    beta: Each
-    phase: Each
-    distance: Each
-    wavelength: Each
-    width: Each
-    relative_time: Each
+    beta: Each = eqx.field(converter=unchecked("rad/mm^2"))
+    phase: Each = eqx.field(converter=unchecked("rad"))
+    distance: Each = eqx.field(converter=unchecked("mm"))
+    wavelength: Each = eqx.field(converter=unchecked("mm"))
+    width: Each = eqx.field(converter=unchecked("mm"))
+    relative_time: Each = eqx.field(converter=unchecked("a ratio"))
     moves: Float[Array, "exposure 2"] | Float[np.ndarray, "exposure 2"] | None
     take: tuple[int, ...] = eqx.field(static=True)
     profile: tuple[Profile | None, ...] = eqx.field(static=True)
@@ -243,17 +244,13 @@ def _as_stored(one: Any) -> Any:
     return one if isinstance(one, Array) else float(one)
 
 
-# Of what is no length.
-_UNITS = {"beta": "rad/mm^2", "phase": "rad", "relative_time": "a ratio"}
-
-
 def _numbers(name: str, given: Any) -> Array | np.ndarray:
     """One number or several, checked: plain ones in NumPy's float64, those of JAX as they are."""
     of_jax = any(isinstance(leaf, Array) for leaf in jax.tree.leaves(given))
     array = jnp.asarray(given) if of_jax else np.asarray(given)
     if array.ndim > 1:
         raise ValueError(f"{name} has shape {array.shape}; give one number, or one for each")
-    unit = _UNITS.get(name, "mm")
+    unit = quantities(Exposures)[name].unit
     checked = checks.finite(name, array, unit, shape=array.shape)
     if name == "beta":
         if not checks.is_traced(checked) and (np.asarray(checked) < 0).any():
