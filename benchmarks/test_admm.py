@@ -4,7 +4,7 @@ Equal objective, not equal iterations: SciPy runs its number of iterations; ours
 image is no worse. SciPy is given three settings: the penalties of the DiffuserCam tutorial, ours in
 plain ADMM, and ours with our relaxation, so that little but the speed of an iteration differs.
 Medians after a warm-up; compilation apart. Neither side computes its objective while it is timed;
-`drive` does so every tenth iteration.
+`iterate` does so every tenth iteration.
 """
 
 import sys
@@ -74,7 +74,7 @@ def _frequencies(count):
 
 
 def run(method, state, iterations):
-    """As `drive` does between two looks."""
+    """As `iterate` does between two checks."""
     return jax.block_until_ready(method.advance(state, iterations))
 
 

@@ -378,7 +378,7 @@ def test_regularisers_that_a_solver_cannot_take_are_refused():
     rig.refused(
         "regulariser is a Wavelet; give a Regulariser", lambda: tc.Fista(regulariser=Wavelet())
     )
-    message = "tau = 'sure' is found for total variation only; give a number, about 1 to 3"
+    message = "tau = 'sure' is for total variation only; give a number, about 1 to 3"
     rig.refused(message, lambda: tc.Fista("sure", regulariser=Sparsity()))
     assert tc.Fista("sure", regulariser=tc.TotalVariation()).tau == "sure"
 

@@ -405,7 +405,7 @@ def test_what_cameras_refuse():
         rig.refused(message, lambda c=captures, s=settings: camera_problem(c, two, **s))
     for value, message in (
         (two[0], r"cameras is one camera; give a list, \[camera\]"),
-        ([two[0], 3], "cameras holds something else; give LenslessCameras, or use Psfs"),
+        ([two[0], 3], "cameras holds objects that are no LenslessCamera; give cameras, or use Psfs"),
     ):
         rig.refused(message, lambda v=value: tc.Cameras(v), TypeError)
     rig.refused("cameras is empty; give one camera", lambda: tc.Cameras([]))
@@ -415,7 +415,7 @@ def test_what_has_seen_the_captures_is_one_of_three():
     seen = jnp.ones((2, *SENSOR.shape))
     for value, message in (
         (cameras(), r"does not say in which light; give tc.Cameras\(cameras, wavelength="),
-        (jnp.ones((2, 4, 5)), r"were seen by a ArrayImpl; give tc.Cameras\(…\), tc.Psfs\(…\), or"),
+        (jnp.ones((2, 4, 5)), r"imaging_model is a ArrayImpl; give tc.Cameras\(…\), tc.Psfs\(…\), or"),
         ([matrix(30), 3], "imaging_model holds objects that are no operators"),
     ):
         rig.refused(message, lambda v=value: tc.Recording(seen, v), TypeError)
@@ -423,11 +423,11 @@ def test_what_has_seen_the_captures_is_one_of_three():
     one, two = [jnp.ones(30)], [matrix(30)] * 2
     rig.refused(r"captures have shape \[\(30,\)\] for 2 c", lambda: tc.Recording(one, two))
     vectors = tc.Recording(jnp.ones(30), matrix(30))
-    rig.refused("give noise_variance: captures that are no images", vectors.problem)
+    rig.refused("give noise_variance: it is estimated from captures", vectors.problem)
     known = tc.Recording(jnp.ones(30), matrix(30), noise_variance=1.0)
     psfs = tc.Recording(seen, tc.Psfs(jnp.ones((2, 4, 5))))
     for recording in (known, psfs):
-        message = "a synthesis adds captures of known cameras; leave it out with"
+        message = "a synthesis needs Cameras; leave it out with"
         rig.refused(message, lambda r=recording: r.problem(synthesis=np.eye(1)))
 
 

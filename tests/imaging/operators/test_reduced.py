@@ -98,7 +98,7 @@ def test_reconstructions_are_those_of_the_whole_matrix(solver):
     expected = tc.reconstruct(whole, solver)
     assert found.image.shape == (3, *IN)
     assert relative_l2(found.image, expected.image) < 5e-4
-    with pytest.raises(ValueError, match="give noise_variance: captures that are no images"):
+    with pytest.raises(ValueError, match="give noise_variance: it is estimated from captures"):
         tc.reconstruct(tc.Recording(projected, system), solver)
 
 

@@ -110,7 +110,7 @@ def test_what_has_no_distance_and_what_does_not_compare_is_refused(recording):
     psfs = tc.Recording(jnp.ones((1, 20, 21)), tc.Psfs(jnp.ones((1, 5, 6))))
     message = r"the PSFs have 1 planes, .* for 4 distances; give one for each"
     refused(message, lambda: refocus_sweep(psfs, DISTANCES))
-    refused("a distance is that of computed PSFs", lambda: psfs.focused(20.0))
+    refused("only Cameras can be focused", lambda: psfs.focused(20.0))
     message = "tau = 'sure' would be another number at each distance"
     refused(message, lambda: refocus_sweep(recording, DISTANCES, tc.AdmmTV("sure")))
 
