@@ -20,7 +20,7 @@ os.environ.setdefault(
     "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
     " --xla_cpu_multi_thread_eigen=false",
 )
-os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = "1" if os.environ["XLA_FLAGS"] else "0"
+os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1" if os.environ["XLA_FLAGS"] else "0")
 
 import jax
 import jaxtyping

@@ -244,9 +244,25 @@ def gradient_errors(name: str) -> tuple[float | None, ...]:
     )
 
 
+@functools.partial(jax.jit, compiler_options=AS_IN_USE)
+def residue(factor, rounded):
+    return factor * factor - rounded
+
+
+def has_fused_multiply_add() -> bool:
+    """Whether a product is rounded only after something is added to it."""
+    factor = np.float32(1 + 2**-12)
+    return bool(residue(factor, factor * factor))
+
+
 @pytest.mark.parametrize(("extreme", "dtype"), [case(find(name)) for name in GRADIENTS])
 def test_gradient_in_single_precision(extreme, dtype):
-    """Within the stated bounds; where they say that it is lost, it is."""
+    """Within the stated bounds; where they say that it is lost, it is.
+
+    Without fused multiply-adds ab − ba is zero, with them it is the rounding of a product, which is
+    more than these gradients: one may be lost on the one processor and not on the other.
+    """
+    fused = has_fused_multiply_add()
     name = extreme.name
     for parameter, error, bound in zip(
         PARAMETERS, gradient_errors(name), GRADIENTS[name], strict=True
@@ -254,7 +270,7 @@ def test_gradient_in_single_precision(extreme, dtype):
         assert (error is None) == (bound is None), parameter
         if error is not None and bound is not None:
             assert error < bound, parameter
-            assert bound < LOST or error > LOST / 4, parameter
+            assert bound < LOST or error > LOST / 4 or not fused, parameter
 
 
 @functools.partial(jax.jit, static_argnames=STATIC)

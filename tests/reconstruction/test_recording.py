@@ -405,7 +405,10 @@ def test_what_cameras_refuse():
         rig.refused(message, lambda c=captures, s=settings: camera_problem(c, two, **s))
     for value, message in (
         (two[0], r"cameras is one camera; give a list, \[camera\]"),
-        ([two[0], 3], "cameras holds objects that are no LenslessCamera; give cameras, or use Psfs"),
+        (
+            [two[0], 3],
+            "cameras holds objects that are no LenslessCamera; give cameras, or use Psfs",
+        ),
     ):
         rig.refused(message, lambda v=value: tc.Cameras(v), TypeError)
     rig.refused("cameras is empty; give one camera", lambda: tc.Cameras([]))
@@ -415,7 +418,10 @@ def test_what_has_seen_the_captures_is_one_of_three():
     seen = jnp.ones((2, *SENSOR.shape))
     for value, message in (
         (cameras(), r"does not say in which light; give tc.Cameras\(cameras, wavelength="),
-        (jnp.ones((2, 4, 5)), r"imaging_model is a ArrayImpl; give tc.Cameras\(…\), tc.Psfs\(…\), or"),
+        (
+            jnp.ones((2, 4, 5)),
+            r"imaging_model is a ArrayImpl; give tc.Cameras\(…\), tc.Psfs\(…\), or",
+        ),
         ([matrix(30), 3], "imaging_model holds objects that are no operators"),
     ):
         rig.refused(message, lambda v=value: tc.Recording(seen, v), TypeError)

@@ -25,42 +25,52 @@ def weak(scale):
     return wg.VolumeHologram(film.grating * scale, 1.5, film.thickness, film.index_modulation)
 
 
-def case(film=None, width=5.0, distance=550.0, pixel=PIXEL):
+def case(film=None, width=5.0, distance=550.0, pixel=PIXEL, top=None):
     sts = camera(film)
-    screen = wg.Screen(sts.screen.hologram, width, 1.5)
+    screen = wg.Screen(sts.screen.hologram, width, 1.5, top=top)
     return wg.SeeThroughCamera(screen, sts.sensor, 6.0, 10.0), pixel, distance
 
 
 # Air at 89.9° from the normal, and the object wave of the recording beside it.
 GRAZING = np.arcsin(np.sin(89.9 * deg) / 1.5)
+# 2 mm of hologram where that light meets it: the way from the pinhole, and through the glass.
+MET = 10.0 * np.tan(89.9 * deg) + 5.0 * np.tan(GRAZING)
 
 # name: (camera, pixel, object distance), bounds of the points in float32 and float64, status.
 BESIDE, MIDDLE = (0.0, -6.0 * np.tan(89.9 * deg)), (0.0, 0.0)
+OBLIQUE = (0.0, -6.0 * np.tan(np.arcsin(1.5 * np.sin(10.0 * deg))))
 
 EXTREMES = {
     "the default": (case(), 3e-7, 1.2e-15, 0),
     "in air at 89.9°": (
-        case(recorded(60.0, GRAZING), pixel=BESIDE),
-        2.2e-2,
-        1e-10,
+        case(recorded(60.0, GRAZING), pixel=BESIDE, top=wg.Rectangle((0.0, MET), (2.0, 2.0))),
+        3e-7,
+        1.2e-15,
         0,
     ),
     "Θ′ at the critical angle + 0.001°": (
         case(recorded(CRITICAL + 1e-3), pixel=MIDDLE),
-        4e-7,
+        5e-7,
         1.2e-15,
         0,
     ),
     "Θ′ at the critical angle − 0.001°": (
         case(recorded(CRITICAL - 1e-3), pixel=MIDDLE),
-        4e-7,
+        5e-7,
         1.2e-15,
         3,
     ),
-    "Θ′ = 89.9°": (case(recorded(89.9), pixel=MIDDLE), 1.2e-4, 3e-13, 0),
-    "Θ′ = 89.9999°": (case(recorded(89.9999), pixel=MIDDLE), 1.7e-1, 3.5e-12, 0),
+    "Θ′ = 89.9°": (case(recorded(89.9), pixel=MIDDLE), 3e-7, 1.2e-15, 0),
+    "Θ′ = 89.9999°": (case(recorded(89.9999), pixel=MIDDLE), 4e-7, 1.2e-15, 0),
+    # The rounding of four numbers in s′_z, half a unit in the last place each, over s′_z = 1/573.
+    "Θ′ = 89.9°, light at 10°": (
+        case(recorded(89.9, 10.0 * deg), pixel=OBLIQUE),
+        1.4e-4,
+        2.5e-13,
+        0,
+    ),
     "w = 1e-6 mm": (case(width=1e-6, pixel=MIDDLE), 3e-7, 1.2e-15, 0),
-    "w = 50 mm": (case(width=50.0), 3e-7, 1.8e-15, 0),
+    "w = 50 mm": (case(width=50.0), 4e-7, 1.8e-15, 0),
     "d2 = 1e9 mm": (case(distance=1e9), 3e-7, 1.2e-15, 0),
     "K by 1e-6": (case(weak(1e-6)), 3e-7, 1.2e-15, 0),
     "K by 1e-15": (case(weak(1e-15)), 4e-7, 1.2e-15, 0),

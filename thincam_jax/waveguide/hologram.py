@@ -92,11 +92,27 @@ class VolumeHologram(Module):
         return VolumeHologram(grating, index, thickness, self.index_modulation)
 
     def diffracted(self, direction: Float[Array, "*ray 3"]) -> Float[Array, "*ray 3"]:
-        """s′ of Bragg-matched light of direction s: the reflection at the fringes."""
+        r"""s′ of Bragg-matched light of direction s: the reflection at the fringes.
+
+        Near grazing most digits of s − 2(s·K̂)K̂ cancel in z. There it is computed as
+
+        .. math:: s'_z = \frac{s_z(K_x^2 + K_y^2 - K_z^2) - 2K_z(s_xK_x + s_yK_y)}{|\mathbf K|^2}
+
+        with the difference of squares as a product: of light along the normal and fringes tilted
+        about x or y no digit is lost, of other light the rounding of s and K divided by s′_z.
+        """
+        tangential, normal = self.grating[:2], self.grating[2]
+        projected = jnp.sum(direction[..., :2] * tangential, axis=-1, keepdims=True)
+        swapped = jnp.abs(tangential[0]) > jnp.abs(tangential[1])
+        less, more = jnp.where(swapped, tangential[::-1], tangential)
+        difference = less**2 + (more - normal) * (more + normal)
         power = jnp.sum(self.grating**2)
-        unit = self.grating / jnp.sqrt(jnp.where(power > 0, power, 1))
-        along = jnp.sum(direction * unit, axis=-1, keepdims=True)
-        return direction - 2 * along * unit
+        fringes = power > 0  # without any, s′ is s
+        difference, power = jnp.where(fringes, difference, 1), jnp.where(fringes, power, 1)
+        along = projected + direction[..., 2:] * normal
+        across = direction[..., :2] - 2 * along / power * tangential
+        depth = (direction[..., 2:] * difference - 2 * normal * projected) / power
+        return jnp.concatenate([across, depth], axis=-1)
 
     def bragg_wavelength(
         self, tangential: Float[Array, "*ray 2"]

@@ -163,18 +163,19 @@ def object_points(
     width = camera.screen.glass_thickness
     bounce = rays.guided / jnp.sqrt(jnp.where(rays.left > 0, rays.left, 1))[..., None]
     crossing = shift(rays.across, camera.screen.glass_index(rays.wavelength))
-    top = at_rear(camera, rays.across) + width * crossing
+    top = at_rear(camera, rays.slope) + width * crossing
     odd = 2 * jnp.arange(orders, dtype=top.dtype) + 1
     guided = jnp.expand_dims(odd, range(1, top.ndim + 1)) * width * bounce
     moved = on_object(camera, rays.slope, guided + 2 * width * crossing)
     return Path(top, top + guided, straight_on(camera, rays.slope, distance) + moved)
 
 
-def at_rear(camera: SeeThroughCamera, across: Float[Array, "*ray 2"]) -> Float[Array, "*ray 2"]:
+def at_rear(camera: SeeThroughCamera, slope: Float[Array, "*ray 2"]) -> Float[Array, "*ray 2"]:
     """Where rays from the lens meet the plate's rear surface, (x, y) on it, mm."""
-    normal = camera.plate_axes[2]
-    slope = shift(across, jnp.ones_like(across[..., 0]))
-    return camera.lens_distance * (normal[2] * slope - normal[:2])
+    axes = camera.plate_axes
+    tangential = product(slope, axes[:2, :2]) + axes[2, :2]
+    normal = product(slope, axes[:2, 2]) + axes[2, 2]
+    return camera.lens_distance * (axes[2, 2] * tangential / normal[..., None] - axes[2, :2])
 
 
 def straight_on(

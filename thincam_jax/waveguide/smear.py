@@ -80,7 +80,7 @@ def _one(camera, pixel, distance, counts):
     carried = left > 0
     bounce = width * tangential / jnp.sqrt(jnp.where(carried, left, 1))[:, None]
     crossing = width * shift(across, glass)
-    top = at_rear(camera, across) + crossing
+    top = at_rear(camera, rays.slope) + crossing
     sound = _covered(left) * _covered(jnp.sum(tangential**2, -1) - 1) * _on(screen.top, top)
     sound = jnp.where(carried & (rays.fault != RayStatus.NO_BRAGG_MATCH), sound, 0)
 

@@ -3,6 +3,7 @@ r"""The Fresnel zone aperture (FZA), thesis Eq 3.1."""
 from typing import Annotated, Any, Literal, get_args
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
@@ -151,7 +152,9 @@ class FresnelZoneAperture(AbstractFactoredMask):
         orders, weights = _series(self.profile, self.harmonics)
         k = jnp.asarray(orders, dtype=self.beta.dtype)
         weights = jnp.asarray(weights, dtype=self.beta.dtype)
-        return orders, as_complex(weights) * phasor(k * self.phase)
+        # Not `phasor`, whose multiples of π/2 are exact up to 1e5 rad only.
+        phase = k * self.phase
+        return orders, as_complex(weights) * jax.lax.complex(jnp.cos(phase), jnp.sin(phase))
 
     def _terms(self, orders: np.ndarray, coefficients: Complex[Array, " order"]) -> MaskTerms:
         columns = self._factors(orders, 1)
