@@ -1,7 +1,7 @@
 """A see-through screen calibrated with Hadamard patterns: its matrix, a fit, other distances.
 
 The matrix that patterns on a monitor measure holds for the distance at which it was measured
-(thesis Eq 5.12 to 5.17). The rays that are fitted to it hold for all.
+(thesis section 5.3). The rays that are fitted to it hold for all.
 """
 
 import contextlib
