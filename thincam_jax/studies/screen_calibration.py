@@ -289,7 +289,7 @@ class CalibrationRun:
         errors = self.fit.standard_errors
         values = {
             name: FittedValue(
-                float(value), float(errors[name]), true.get(name), PARAMETERS[name][0]
+                float(value), float(errors[name]), true.get(name), PARAMETERS[name][0].unit
             )
             for name, value in self.fit.values.items()
             if name != "gain"
