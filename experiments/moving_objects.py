@@ -59,8 +59,8 @@ figure.savefig(FIGURES / "bar.png", dpi=110)
 # ## Speeds
 #
 # The cameras and methods of `configs/moving.yaml`; sensor, mask and scene are a quarter as wide,
-# and the zones as fine. All but the short capture take the light of eight exposures. The scene's way
-# in the whole sequence is given in pixels of the sensor.
+# and the zones as fine. All but the short capture take the light of eight exposures. The scene's
+# way in the whole sequence is given in pixels of the sensor.
 
 # %%
 count, ways = {"full": (128, (0, 1, 2, 4, 8, 16)), "small": (96, (0, 6))}[SIZE]
