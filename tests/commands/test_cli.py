@@ -20,6 +20,13 @@ from thincam_jax.commands.examples import kinds
 from thincam_jax.commands.run_folder import RunFolder
 from thincam_jax.commands.study import run as studies
 from thincam_jax.studies import StudyScores
+from thincam_jax.studies.psf_accuracy import PsfAccuracy
+from thincam_jax.studies.psf_error_cost import (
+    AccuracyResult,
+    CaptureError,
+    ControlledCost,
+    ReconstructionCosts,
+)
 
 runner = CliRunner()
 
@@ -154,20 +161,20 @@ class TestExitCode2:
 
 
 class TestBenchAccuracy:
-    def test_prints_the_results_and_where_the_figure_is(self, file, tmp_path, monkeypatch):
-        monkeypatch.setattr(benches, "run_accuracy", lambda *_: RESULTS)
+    def test_prints_the_results_and_where_they_are(self, file, tmp_path, monkeypatch):
+        monkeypatch.setattr(benches, "run_accuracy", lambda *_: RESULT)
         result = call("bench", "accuracy", file, "--out", tmp_path / "out", "--size", 32)
         assert result.exit_code == 0, result.output
         row = next(line for line in result.stdout.splitlines() if "separable" in line)
         assert "reference" in row
         assert "a PSF error of 1 % costs pairs 0.2500 dB by a wrong β" in result.stdout
-        assert f"figure: {tmp_path / 'out' / 'accuracy.png'}" in result.stdout
+        assert f"results: {tmp_path / 'out' / 'accuracy.json'}" in result.stdout
 
     def test_default_folder_and_options(self, file, tmp_path, monkeypatch):
         monkeypatch.chdir(tmp_path)
         seen = []
         monkeypatch.setattr(
-            benches, "run_accuracy", lambda *given: seen.append(given[:2]) or RESULTS
+            benches, "run_accuracy", lambda *given: seen.append(given[:2]) or RESULT
         )
         options = ("--size", 64, "--size", 32, "--capture-size", 48, "--set", "name=Other")
         assert call("bench", "accuracy", file, *options).exit_code == 0
@@ -208,42 +215,33 @@ class TestBenchAccuracy:
         assert result.stderr.splitlines() == ["thincam: interrupted; nothing is kept."]
 
 
-# As little as the command prints from.
-RESULTS = {
-    "settings": {"capture_shape": [48, 64], "target": "picture"},
-    "psfs": [
-        {
-            "shape": [24, 32],
-            "model": "separable",
-            "precision": "float64",
-            "oversampling": None,
-            "status": "run",
-            "true_error": 0.0,
-            "predicted_error": 1e-15,
-            "seconds": 0.01,
-            "compile_seconds": 1.0,
-            "worth_choosing": True,
-        }
-    ],
-    "captures": [{"model": "rayleigh_sommerfeld", "status": "not run", "reason": "slow"}],
-    "reconstructions": {
-        "method": "pairs",
-        "skipped": None,
-        "models": [],
-        "controlled": [
-            {
-                "wrong": "beta",
-                "level": 0.01,
-                "status": "run",
-                "change": 1e-4,
-                "psf_error": 0.01,
-                "capture_error": 1e-4,
-                "capture_contrast_error": 1e-3,
-                "psnr_lost_db": 0.25,
-            }
-        ],
-    },
-}
+SEPARABLE = PsfAccuracy(
+    shape=(24, 32),
+    pitch_mm=0.04,
+    model="separable",
+    precision="float64",
+    oversampling=None,
+    status="run",
+    reason=None,
+    true_error=0.0,
+    predicted_error=1e-15,
+    seconds=0.01,
+    compile_seconds=1.0,
+    calls=3,
+    flops=1e6,
+    bytes=1000,
+)
+RESULT = AccuracyResult(
+    (SEPARABLE,),
+    (CaptureError("rayleigh_sommerfeld", "not run", "slow"),),
+    ReconstructionCosts(
+        "pairs",
+        None,
+        30.0,
+        (),
+        (ControlledCost("beta", 0.01, "run", None, 1e-4, 0.01, 1e-4, 1e-3, 29.75, 0.25),),
+    ),
+)
 
 
 def test_defect_keeps_its_traceback(file, monkeypatch, tmp_path):

@@ -3,36 +3,18 @@
 import json
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from thincam_jax._core.files import WriteError, read_regular, write_whole
+from thincam_jax._core.steps import Progress, Step, carry_out
 from thincam_jax.commands.checked_config import dump_config
 from thincam_jax.commands.config_file import ConfigError, slug
 from thincam_jax.commands.doctor import environment
 from thincam_jax.commands.page import render_page
 from thincam_jax.commands.report import Page, render_report
 from thincam_jax.commands.sections import ExperimentConfig, Section
-
-# Called as a step begins, with its text and with the number of all steps.
-Progress = Callable[[str, int], object]
-
-
-@dataclass(frozen=True)
-class Step:
-    """A part of a run: what is told as it begins, and what does it."""
-
-    text: str
-    do: Callable[[], object]
-
-
-def carry_out(work: Sequence[Step], progress: Progress) -> None:
-    """Do what is listed, in its order."""
-    for step in work:
-        progress(step.text, len(work))
-        step.do()
 
 
 class RunFolder:

@@ -24,13 +24,19 @@ def accuracy(
 ) -> None:
     """Measure every model's error and time.
 
-    And what an error of the PSF costs in PSNR. Writes accuracy.json and accuracy.png.
+    And what an error of the PSF costs in PSNR. Writes accuracy.json.
     """
     with told(lambda: "interrupted; nothing is kept."):
         import rich
 
-        from thincam_jax.commands.accuracy.console import accuracy_table, cost_table, verdict
-        from thincam_jax.commands.accuracy.run import BenchFolder, Sizes, check, run_accuracy
+        from thincam_jax.commands.accuracy.run import (
+            BenchFolder,
+            Sizes,
+            check,
+            run_accuracy,
+            table,
+            verdict,
+        )
         from thincam_jax.commands.config_file import slug
         from thincam_jax.commands.study.config import load_config
 
@@ -38,8 +44,7 @@ def accuracy(
         plan = check(study, Sizes(tuple(size or ()), capture_size))
         folder = BenchFolder(out or Path("runs") / f"{slug(study.name)}-accuracy")
         with counted(study.name) as progress:
-            results = run_accuracy(plan, folder, progress)
-    rich.print(accuracy_table(results))
-    rich.print(cost_table(results))
-    for line in (*verdict(results), f"figure: {folder.path / 'accuracy.png'}"):
-        print(line)
+            result = run_accuracy(plan, folder, progress)
+    rich.print(table(result))
+    print(verdict(result.reconstructions))
+    print(f"results: {folder.path / 'accuracy.json'}")

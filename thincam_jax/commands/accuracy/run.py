@@ -1,29 +1,39 @@
 """The benchmark of accuracy: errors and times of all models, and what an error costs."""
 
 import platform
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import jax
+from rich.table import Table
 
 from thincam_jax._core.files import write_whole
-from thincam_jax.commands.accuracy.cameras import Case, capture_size_of, make_case, sizes_of
-from thincam_jax.commands.accuracy.captures import CaptureErrors
-from thincam_jax.commands.accuracy.figures import draw
-from thincam_jax.commands.accuracy.psfs import PsfErrors
-from thincam_jax.commands.accuracy.reconstructions import ReconstructionErrors
+from thincam_jax._core.steps import Progress, Step, carry_out
 from thincam_jax.commands.checked_config import dump_config
 from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.doctor import usable_cores
-from thincam_jax.commands.run_folder import Progress, Step, carry_out, claim_folder, to_json
-from thincam_jax.commands.study.build import FileStudy, build_study
+from thincam_jax.commands.run_folder import claim_folder, to_json
+from thincam_jax.commands.sections import SensorConfig
+from thincam_jax.commands.study.build import FileStudy, build_study, check_study
 from thincam_jax.commands.study.config import StudyConfig
+from thincam_jax.commands.terminal import numbers
 from thincam_jax.lensless.exposures import Exposure
+from thincam_jax.studies.psf_accuracy import label
+from thincam_jax.studies.psf_error_cost import (
+    AccuracyResult,
+    AccuracyRun,
+    Case,
+    ReconstructionCosts,
+    make_case,
+)
+
+_SIZES, _CAPTURE_SIZE = (128, 256, 512), 256  # by default
+_NAMES = {"beta": "β", "distance": "d"}
 
 
 class BenchFolder:
-    """`config.yaml`, `accuracy.json` and `accuracy.png`, each written whole or not at all."""
+    """`config.yaml` and `accuracy.json`, each written whole or not at all."""
 
     def __init__(self, path: str | Path):
         self.path = Path(path)
@@ -32,15 +42,14 @@ class BenchFolder:
         """Make the folder; ConfigError for one that holds anything but this configuration's."""
         claim_folder(self.path, "config.yaml", dump_config(config), "benchmark")
 
-    def finish(self, results: dict[str, Any], figure: bytes) -> None:
-        """Write both files; the table last, because it marks the benchmark as complete."""
-        write_whole(self.path / "accuracy.png", figure)
+    def finish(self, results: dict[str, Any]) -> None:
+        """Write the results, which mark the benchmark as complete."""
         write_whole(self.path / "accuracy.json", to_json(results))
 
 
 @dataclass(frozen=True)
 class Sizes:
-    """What a user may choose.
+    """The sizes that a user may choose.
 
     - `sizes`: pixels along the sensor's longer side, for the PSFs; empty for the default ones.
     - `capture_size`: the same for captures and reconstructions; None for the default.
@@ -48,6 +57,32 @@ class Sizes:
 
     sizes: tuple[int, ...] = ()
     capture_size: int | None = None
+
+    def of_psfs(self, sensor: SensorConfig) -> tuple[int, ...]:
+        """Those given, or the default ones and the sensor's own; each once, smallest first.
+
+        **Errors**: ConfigError for a size that is not positive or above the sensor's own.
+        """
+        own = max(sensor.shape)
+        for size in self.sizes:
+            _check("--size", size, own)
+        return tuple(sorted(set(self.sizes or (*(s for s in _SIZES if s < own), own))))
+
+    def of_captures(self, sensor: SensorConfig) -> int:
+        """The size for captures and reconstructions; errors as of `of_psfs`."""
+        if self.capture_size is None:
+            return min(_CAPTURE_SIZE, max(sensor.shape))
+        _check("--capture-size", self.capture_size, max(sensor.shape))
+        return self.capture_size
+
+
+def _check(option: str, size: int, own: int) -> None:
+    if size < 1:
+        raise ConfigError(f"{option} {size}: give a number of pixels above zero")
+    if size > own:
+        raise ConfigError(
+            f"{option} {size}: the study's own sensor has {own} pixels; give at most {own}"
+        )
 
 
 @dataclass(frozen=True)
@@ -59,51 +94,50 @@ class Benchmark:
     case: Case
 
 
-def check(config: StudyConfig, options: Sizes) -> Benchmark:
+def check(config: StudyConfig, sizes: Sizes) -> Benchmark:
     """Refuse what cannot be run, before anything is; ConfigError, one line for each fault."""
     if config.mask.pixel_pitch is not None:
         raise ConfigError(
             "mask.pixel_pitch: the benchmark compares models that have no display pixels; leave it "
             "out of the file"
         )
-    sizes = sizes_of(config.sensor, options.sizes)
-    capture_size = capture_size_of(config.sensor, options.capture_size)
+    of_psfs, of_captures = sizes.of_psfs(config.sensor), sizes.of_captures(config.sensor)
     study = build_study(config)
-    return Benchmark(study, sizes, make_case(study, capture_size))
+    case = make_case(study, of_captures)
+    try:
+        check_study(case.study)  # pyright: ignore[reportArgumentType]
+    except ConfigError as error:
+        first = str(error).splitlines()[0]
+        raise ConfigError(f"--capture-size {of_captures}: {first}") from None
+    return Benchmark(study, of_psfs, case)
 
 
-def run_accuracy(plan: Benchmark, folder: BenchFolder, progress: Progress) -> dict[str, Any]:
-    """Run the benchmark into a folder; returns what `accuracy.json` holds.
+def run_accuracy(plan: Benchmark, folder: BenchFolder, progress: Progress) -> AccuracyResult:
+    """Run the benchmark into a folder."""
+    folder.claim(plan.study.config)
+    run = AccuracyRun(plan.study, plan.sizes, plan.case)
+    last = Step("results", lambda: folder.finish(_record(plan, run.result)))
+    carry_out([*run.work, last], progress)
+    return run.result
 
-    The camera is that of the study's first exposure; the captures and reconstructions are of its
-    first picture and first Wiener method.
-    """
-    study, exposure, results = plan.study, plan.study.exposures[0], {}
-    folder.claim(study.config)
-    psfs = [PsfErrors(study, exposure, size) for size in plan.sizes]
-    captures, reconstructions = CaptureErrors(plan.case), ReconstructionErrors(plan.case)
 
-    def report() -> None:
-        results.update(
-            bench="accuracy",
-            config=dump_config(study.config),
-            settings=_settings(plan),
-            machine=_machine(),
-            psfs=[row for errors in psfs for row in errors.rows],
-            captures=captures.rows,
-            reconstructions={
-                "method": plan.case.method.name,
-                "skipped": plan.case.skipped,
-                "exact_psnr_db": reconstructions.exact_psnr_db,
-                "models": reconstructions.models,
-                "controlled": reconstructions.controlled,
-            },
-        )
-        folder.finish(results, draw(results))
+def _record(plan: Benchmark, result: AccuracyResult) -> dict[str, Any]:
+    costs = asdict(result.reconstructions)
+    return {
+        "bench": "accuracy",
+        "config": dump_config(plan.study.config),
+        "settings": _settings(plan),
+        "machine": _machine(),
+        "psfs": [asdict(row) for row in result.psfs],
+        "captures": [_run_only(asdict(row)) for row in result.captures],
+        "reconstructions": costs
+        | {name: [_run_only(row) for row in costs[name]] for name in ("models", "controlled")},
+    }
 
-    work = [step for errors in (*psfs, captures, reconstructions) for step in errors.work]
-    carry_out([*work, Step("figure", report)], progress)
-    return results
+
+def _run_only(row: dict[str, Any]) -> dict[str, Any]:
+    """Without the figures of a row that was not run."""
+    return {key: v for key, v in row.items() if v is not None or key == "reason"}
 
 
 def _settings(plan: Benchmark) -> dict[str, Any]:
@@ -121,7 +155,7 @@ def _settings(plan: Benchmark) -> dict[str, Any]:
     }
 
 
-def _numbers(exposure: Exposure) -> dict[str, float]:
+def _numbers(exposure: Exposure) -> dict[str, Any]:
     return {
         "beta_rad_per_mm2": exposure.beta,
         "phase_rad": exposure.phase,
@@ -131,7 +165,7 @@ def _numbers(exposure: Exposure) -> dict[str, float]:
 
 
 def _machine() -> dict[str, Any]:
-    """What the times were measured on."""
+    """The machine that the times were measured on."""
     device = jax.devices()[0]
     return {
         "platform": f"{platform.system()} {platform.machine()}",
@@ -140,3 +174,35 @@ def _machine() -> dict[str, Any]:
         "cores": usable_cores(),
         "jax": jax.__version__,
     }
+
+
+def table(result: AccuracyResult) -> Table:
+    """Every candidate at the largest size, the fastest first; those worth choosing are marked."""
+    largest = max((row.shape for row in result.psfs), key=max)
+    rows = [row for row in result.psfs if row.shape == largest]
+    shown = [["PSF", "error", "predicted", "time ms", "compile s", "worth it"]]
+    for row in sorted(rows, key=lambda row: row.seconds or float("inf")):
+        name = label(row.model, row.precision, row.oversampling)
+        numbers_of = row.true_error, row.predicted_error, row.seconds, row.compile_seconds
+        if None in numbers_of:
+            shown.append([name, "not run", *["–"] * 4])
+            continue
+        error, predicted, seconds, compiling = (float(number or 0) for number in numbers_of)
+        told = "reference" if error == 0 else f"{error:.1e}"
+        worth = "yes" if row.worth_choosing else ""
+        times = f"{1000 * seconds:.2f}", f"{compiling:.1f}"
+        shown.append([name, told, f"{predicted:.1e}", *times, worth])
+    return numbers(shown, title=f"{largest[0]}×{largest[1]} pixels", title_justify="left")
+
+
+def verdict(costs: ReconstructionCosts) -> str:
+    """What a PSF error of 1 % costs, or why nothing was reconstructed."""
+    if costs.skipped:
+        return f"no reconstruction: {costs.skipped}"
+    lost = [
+        f"{row.psnr_lost_db:.4f}".replace("-", "−") + f" dB by a wrong {_NAMES[row.wrong]}"
+        for row in costs.controlled
+        if row.level == 0.01 and row.status == "run"
+    ]
+    text = " and ".join(lost) if lost else "an unknown amount"
+    return f"a PSF error of 1 % costs {costs.method} {text}"

@@ -16,14 +16,15 @@ from thincam_jax.commands.capture import figures, report
 from thincam_jax.commands.capture.build import build_study, field_shape, screen_system
 from thincam_jax.commands.capture.config import CaptureConfig
 from thincam_jax.commands.run_folder import Progress, Run, RunFolder
-from thincam_jax.commands.screen.calibration import diagonal
-from thincam_jax.commands.screen.figures import save_columns
+from thincam_jax.commands.screen.figures import draw_columns
+from thincam_jax.commands.study.figures import save_figure
 from thincam_jax.imaging.metrics import psnr
 from thincam_jax.imaging.operators import ReducedMatrix
 from thincam_jax.measured import calibration
 from thincam_jax.reconstruction import Reconstruction
 from thincam_jax.reconstruction.noise import estimate_noise
 from thincam_jax.studies.evaluate import Reconstructor, reconstructor, rounded, sample
+from thincam_jax.studies.screen_calibration import diagonal_cells
 from thincam_jax.studies.simulate import noise_free
 from thincam_jax.studies.study import Study
 
@@ -178,7 +179,7 @@ class _CaptureRun(Run):
         matrix = calibration.open_matrix(path)
         reduced = ReducedMatrix.of(matrix, captures.series.object_shape)
         reduced.save(self.folder.path / "reduced.npz", matrix)
-        cells = diagonal(captures.series.object_shape)
+        cells = diagonal_cells(captures.series.object_shape)
         numbers = [row * captures.series.object_shape[1] + column for row, column in cells]
         columns = np.empty((len(cells), math.prod(captures.sensor_shape)), np.float32)
         exact = self._exact() if self.taken.simulated is not None else None
@@ -201,7 +202,7 @@ class _CaptureRun(Run):
             }
         shape = (len(cells), *captures.sensor_shape)
         stacks = {name: image.reshape(shape) for name, image in images.items()}
-        save_columns(self.folder, self.config.camera.pitch, cells, stacks)
+        save_figure(self.folder, "columns", draw_columns(self.config.camera.pitch, cells, stacks))
         self.metrics |= {
             "frames": captures.series.frame_count,
             "matrix": [math.prod(captures.sensor_shape), captures.series.cell_count],

@@ -13,7 +13,7 @@ from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.learned import figures
 from thincam_jax.commands.learned.build import build_lessons, build_network, build_options
 from thincam_jax.commands.learned.config import LearnedConfig
-from thincam_jax.commands.refocus.figures import draw_sweep, save_animation
+from thincam_jax.commands.refocus.figures import animate_sweep, draw_sweep
 from thincam_jax.commands.run_folder import RunFolder
 from thincam_jax.commands.study.figures import save_figure
 from thincam_jax.imaging.metrics import psnr, ssim
@@ -104,7 +104,7 @@ def _report(
     save_figure(folder, "scenes", figures.draw_scenes(network, batches[0], readings[0]))
     sweep = swept(network, batches[0])
     save_figure(folder, "sweep", draw_sweep(sweep, {}))
-    save_animation(folder, sweep)
+    folder.write("figures/sweep.webp", animate_sweep(sweep))
     told = "training met NaN again and again; this is its best until then"
     warnings = [told] if trained.status == "diverged" else []
     folder.complete("learned", config, result, started, command="train", warnings=warnings)

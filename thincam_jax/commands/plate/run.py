@@ -14,13 +14,14 @@ from thincam_jax.commands.checked_config import dump_config
 from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.plate.config import FoundConfig, PlateDesignConfig
 from thincam_jax.commands.run_folder import Progress, Run, RunFolder
-from thincam_jax.commands.screen.build import Captured, undo
+from thincam_jax.commands.screen.build import build_solver
 from thincam_jax.commands.study.build import picture
 from thincam_jax.commands.study.figures import drawing, line_style, save_figure
 from thincam_jax.design import plate as plates
 from thincam_jax.imaging.metrics import psnr, ssim
 from thincam_jax.imaging.sensor import Sensor
 from thincam_jax.studies.evaluate import rounded
+from thincam_jax.studies.screen import ScreenCaptures, reconstruct_targets
 from thincam_jax.units import deg, nm, um
 
 # Of each number of a plate: its unit, and how it is told.
@@ -150,7 +151,8 @@ class _PlateRun(Run):
         clean = system(jnp.stack([jnp.asarray(s, light.dtype) for s in self.scenes]))
         key = jax.random.key(self.config.seed)
         captures = clean + jnp.sqrt(variance) * jax.random.normal(key, clean.shape, clean.dtype)
-        found = undo(system, self.config.method, Captured(captures, variance))
+        solver = build_solver(self.config.method)
+        found = reconstruct_targets(system, solver, ScreenCaptures(captures, variance))
         self.images[name] = np.asarray(found.image, float)
         self.metrics["plates"][name]["targets"] = {
             target.name: {"psnr_db": rounded(psnr(image, scene)), "ssim": ssim(image, scene)}

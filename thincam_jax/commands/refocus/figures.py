@@ -1,7 +1,7 @@
-"""The pictures of a refocus run, as PNG files and one animation in its folder."""
+"""Figures of a refocusing study: the sweep, focus curves, depth map, and all methods."""
 
 import io
-from typing import Any
+from collections.abc import Mapping
 
 import numpy as np
 import PIL.Image
@@ -10,15 +10,12 @@ import PIL.ImageFont
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from thincam_jax.commands.config_file import slug
-from thincam_jax.commands.refocus.build import FoundObjects, object_box
-from thincam_jax.commands.run_folder import RunFolder
-from thincam_jax.commands.study.figures import drawing, line_style, save_figure, save_image, sheet
+from thincam_jax.commands.study.figures import drawing, line_style, sheet
 from thincam_jax.imaging.targets import middle_square
 from thincam_jax.reconstruction.depth.find import DepthMap
-from thincam_jax.reconstruction.depth.focus import Measure
 from thincam_jax.reconstruction.depth.refocus import RefocusSweep
-from thincam_jax.studies.study import Method, Study, Target
+from thincam_jax.studies.refocus import PlacedTarget, RefocusResult
+from thincam_jax.studies.study import Method
 
 _SHOWN = 15  # images on the contact sheet, in rows of five
 _HELD = 160  # ms of an image of the animation
@@ -40,13 +37,14 @@ def white_level(images: np.ndarray) -> float:
     return float(np.percentile(images, 99.8))
 
 
-def draw_sweep(sweep: RefocusSweep, objects: dict[str, Any]) -> Figure:
-    """Contact sheet of the sweep, each image with the distance it is focused on."""
+def draw_sweep(sweep: RefocusSweep, places: Mapping[str, float]) -> Figure:
+    """Contact sheet of the sweep, each image with the distance it is focused on.
+
+    `places`: distances of objects, mm, whose nearest images are titled in bold.
+    """
     images, distances = np.asarray(sweep.images), np.asarray(sweep.distances)
     white = white_level(images)
-    nearest = {
-        int(np.argmin(np.abs(distances - o["distance_mm"]))): name for name, o in objects.items()
-    }
+    nearest = {int(np.argmin(np.abs(distances - t))): name for name, t in places.items()}
     picked = _spread(len(distances), _SHOWN, list(nearest))
     figure, axes = sheet(len(picked), 5, 2.2, images.shape[-2] / images.shape[-1], 0.35)
     for ax, index in zip(axes, picked, strict=True):
@@ -68,7 +66,7 @@ def _spread(count: int, most: int, wanted: list[int]) -> list[int]:
     return sorted(picked)
 
 
-def save_animation(folder: RunFolder, sweep: RefocusSweep) -> None:
+def animate_sweep(sweep: RefocusSweep) -> bytes:
     """The sweep there and back as an animated WebP, the distance written below."""
     images, distances = np.asarray(sweep.images), np.asarray(sweep.distances)
     white = white_level(images)
@@ -84,7 +82,7 @@ def save_animation(folder: RunFolder, sweep: RefocusSweep) -> None:
         loop=0,
         quality=70,
     )
-    folder.write("figures/sweep.webp", buffer.getvalue())
+    return buffer.getvalue()
 
 
 def _frame(image: np.ndarray, distance: float) -> PIL.Image.Image:
@@ -98,33 +96,24 @@ def _frame(image: np.ndarray, distance: float) -> PIL.Image.Image:
     return frame
 
 
-def save_curves(
-    folder: RunFolder,
-    measure: Measure,
-    sweep: RefocusSweep,
-    found: FoundObjects,
-    objects: dict[str, Any],
-) -> None:
+def draw_curves(result: RefocusResult) -> Figure:
     """Focus measure of each object over the sweep, with where it stands and where it was found."""
     figure, ax = drawing((8.5, 4.0))
-    distances = np.asarray(sweep.distances)
-    for index, (name, values) in enumerate(objects.items()):
-        region, style = found.region_of[name], line_style(index + 2)
-        if region is not None and found.curves is not None:
-            curve = found.curves.curves[found.curves.labels.index(region)]
+    distances = np.asarray(result.sweep.distances)
+    for index, (name, scores) in enumerate(result.objects.items()):
+        curve, style = result.found.curve(name), line_style(index + 2)
+        if curve is not None:
             label = name
-            if values["found_mm"] is not None:
-                label += (
-                    f": found at {values['found_mm']:.1f} mm ({values['error_percent']:+.1f} %)"
-                )
+            if scores.found_mm is not None:
+                label += f": found at {scores.found_mm:.1f} mm ({scores.error_percent:+.1f} %)"
             ax.plot(distances, curve / curve.max(), label=label, markersize=4, **style)
-        ax.axvline(values["distance_mm"], color=style["color"], linestyle=style["linestyle"])
-        ax.text(values["distance_mm"], 1.1, f" placed at {values['distance_mm']:g} mm", fontsize=9)
-    measured = f"{_MEASURED[measure]},\nrelative to its largest"
+        ax.axvline(scores.distance_mm, color=style["color"], linestyle=style["linestyle"])
+        ax.text(scores.distance_mm, 1.1, f" placed at {scores.distance_mm:g} mm", fontsize=9)
+    measured = f"{_MEASURED[result.refocusing.sweep.measure]},\nrelative to its largest"
     ax.set(ylim=(0, 1.18), xlabel="focused on the distance t (mm)", ylabel=measured)
     ax.grid(alpha=0.3)
     figure.legend(fontsize=9, loc="outside upper center", ncols=2)
-    save_figure(folder, "focus", figure)
+    return figure
 
 
 def draw_depth(sweep: RefocusSweep, depth: DepthMap, sharp: np.ndarray) -> Figure:
@@ -156,46 +145,39 @@ def draw_depth(sweep: RefocusSweep, depth: DepthMap, sharp: np.ndarray) -> Figur
     return figure
 
 
-def save_methods(
-    folder: RunFolder,
-    study: Study,
-    pictures: dict[tuple[str, float], np.ndarray],
-    metrics: dict[str, Any],
-) -> None:
+def draw_methods(result: RefocusResult) -> Figure:
     """Every method focused on every object; below each, the objects enlarged."""
-    columns, objects = len(study.methods), study.targets
-    aspect = max(p.shape[0] / p.shape[1] for p in pictures.values())
+    methods, objects = result.refocusing.study.methods, result.refocusing.objects
+    aspect = max(p.shape[0] / p.shape[1] for p in result.images.values())
     width = 3.1
     # A row of whole pictures and one of details for each focus.
     heights = [width * aspect, width / len(objects)] * len(objects)
-    size = (width * columns, sum(heights) + 0.42 * len(objects))
+    size = (width * len(methods), sum(heights) + 0.42 * len(objects))
     figure = Figure(figsize=size, layout="constrained")
     axes = figure.subplots(
-        2 * len(objects), columns, squeeze=False, gridspec_kw={"height_ratios": heights}
+        2 * len(objects), len(methods), squeeze=False, gridspec_kw={"height_ratios": heights}
     )
-    for column, method in enumerate(study.methods):
+    for column, method in enumerate(methods):
         for row, focused in enumerate(objects):
-            image, distance = pictures[method.name, focused.distance], f"{focused.distance:g}"
-            whole_image = grey_levels(image, white_level(image))
-            save_image(folder, f"{slug(method.name)}--{distance}mm", whole_image)
-            scores = metrics[method.name]["focused_on_mm"][distance]["psnr_db"]
+            image = result.images[method.name, focused.distance]
+            distance = f"{focused.distance:g}"
             whole, detail = axes[2 * row, column], axes[2 * row + 1, column]
-            whole.imshow(whole_image, cmap="gray", vmin=0, vmax=1)
-            _frame_objects(whole, study, method, focused)
+            whole.imshow(grey_levels(image, white_level(image)), cmap="gray", vmin=0, vmax=1)
+            _frame_objects(whole, result, method, focused)
             title = f"focused on {distance} mm"
             whole.set_title(f"{method.name}\n{title}" if row == 0 else title, fontsize=10)
-            _show_details(detail, study, method, image, focused)
-            score = scores[focused.name]
+            _show_details(detail, result, method, focused)
+            score = result.methods[method.name].focused_on_mm[distance].psnr_db[focused.name]
             sharp = "exact" if score is None else f"{score:.1f} dB"
             detail.set_xlabel(f"in focus: {focused.name}, {sharp}", fontsize=9)
-    save_figure(folder, "methods", figure)
+    return figure
 
 
-def _frame_objects(ax, study: Study, method: Method, focused: Target) -> None:
+def _frame_objects(ax, result: RefocusResult, method: Method, focused: PlacedTarget) -> None:
     """The object in focus in a solid box, the others in dashed ones."""
     ax.set(xticks=[], yticks=[])
-    for placed in study.targets:
-        rows, columns = object_box(study, method, placed)
+    for placed in result.refocusing.objects:
+        rows, columns = result.refocusing.object_box(method, placed)
         corner = (columns.start - 4, rows.start - 4)
         sides = (columns.stop - columns.start + 7, rows.stop - rows.start + 7)
         dash = "-" if placed is focused else (0, (2, 3))
@@ -204,11 +186,12 @@ def _frame_objects(ax, study: Study, method: Method, focused: Target) -> None:
         ax.add_patch(frame)
 
 
-def _show_details(ax, study: Study, method: Method, image: np.ndarray, focused: Target) -> None:
+def _show_details(ax, result: RefocusResult, method: Method, focused: PlacedTarget) -> None:
     """The middle of each object, enlarged, side by side; a frame round that in focus."""
+    image, objects = result.images[method.name, focused.distance], result.refocusing.objects
     white = white_level(image)
-    for index, placed in enumerate(study.targets):
-        rows, columns = object_box(study, method, placed)
+    for index, placed in enumerate(objects):
+        rows, columns = result.refocusing.object_box(method, placed)
         part = image[rows, columns]
         part = grey_levels(middle_square(part, round(0.6 * min(part.shape))), white)
         left = index + 0.02
@@ -216,5 +199,5 @@ def _show_details(ax, study: Study, method: Method, image: np.ndarray, focused: 
         if placed is focused:
             frame = Rectangle((left, 0.02), 0.96, 0.96, fill=False, color="black", linewidth=2)
             ax.add_patch(frame)
-    ax.set(xlim=(0, len(study.targets)), ylim=(1, 0), aspect="equal", xticks=[], yticks=[])
+    ax.set(xlim=(0, len(objects)), ylim=(1, 0), aspect="equal", xticks=[], yticks=[])
     ax.spines[:].set_visible(False)

@@ -25,6 +25,8 @@ from thincam_jax.commands.sections import (
 from thincam_jax.commands.study.config import PictureConfig
 from thincam_jax.measured.calibration.hadamard import Display, HadamardSeries, Order
 from thincam_jax.measured.calibration.screen_fit import DEFAULT, PARAMETERS
+from thincam_jax.studies.screen import Mistake
+from thincam_jax.studies.screen_calibration import MEASURED
 
 Index = Annotated[float, Field(ge=1, le=4)]
 Acute = Annotated[Angle, Field(gt=-math.pi / 2, lt=math.pi / 2)]
@@ -126,14 +128,8 @@ class ScreenMethodConfig(Section):
         return self
 
 
-Mistake = Literal["none", "grating", "ghost_index", "shift_invariant", "no_ghosts", "no_smear"]
-
-
 class ModelConfig(Section):
-    """What the reconstruction takes the camera for.
-
-    - `mistake`: one of `build.MISTAKES`; `glass_thickness`: another than the plate has.
-    """
+    """`thincam_jax.studies.screen.ScreenModel`."""
 
     name: Name
     mistake: Mistake = "none"
@@ -163,16 +159,7 @@ def _fitted(name: str) -> str:
 
 
 class CalibrationConfig(Section):
-    """The matrix measured with Hadamard patterns, and the rays that are fitted to it.
-
-    - `order`, `display`, `dark_frames`: of `HadamardSeries`; `bits`: of the camera.
-    - `exposure`: part of the camera's range that a white monitor fills; `offset`: its dark level
-      and `noise`: standard deviation of its white noise, in counts.
-    - `keep_captures`: leaves the stores of the captures in the run's folder.
-    - `glass_thickness`: what the plate is taken for before the fit, and straight if its tilt is
-      fitted; `fitted`: what is found.
-    - `distances`: of the object, for which the matrix is told from the fit and is measured anew.
-    """
+    """`thincam_jax.studies.screen_calibration.Calibration`."""
 
     order: Order = "sequency"
     display: Display = "complementary"
@@ -199,9 +186,6 @@ class CalibrationConfig(Section):
             message = "a binary display with an offset needs dark frames; give 8, or offset: 0"
             raise misfit(message, "display")
         return self
-
-
-MEASURED = "measured matrix"  # among the models
 
 
 class SeeThroughConfig(Section):

@@ -1,17 +1,17 @@
-"""The pictures of a screen run, as PNG files in its folder."""
+"""Figures of a see-through screen: its rays, and what its models reconstruct."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import jax.numpy as jnp
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import PowerNorm
+from matplotlib.figure import Figure
 
 from thincam_jax import waveguide as wg
-from thincam_jax.commands.config_file import slug
-from thincam_jax.commands.run_folder import RunFolder
-from thincam_jax.commands.screen.build import Setup
-from thincam_jax.commands.study.figures import drawing, line_style, save_figure, save_image
+from thincam_jax.commands.study.figures import drawing, line_style
+from thincam_jax.studies.screen import Reconstructed, ScreenResult, ScreenStudy
+from thincam_jax.studies.screen_calibration import CalibrationResult
 from thincam_jax.units import nm
 
 # Centres, widths below and above (nm) and heights of lobes whose sums are the CIE 1931 matching
@@ -48,12 +48,12 @@ def in_colour(capture: np.ndarray, wavelength: np.ndarray) -> np.ndarray:
     return encoded[::-1, ::-1]
 
 
-def save_rays(folder: RunFolder, setup: Setup) -> None:
+def draw_rays(study: ScreenStudy) -> Figure:
     """Side view: rays of three pixels from the sensor through the plate to its front."""
-    camera, screen = setup.camera, setup.camera.screen
+    camera, screen = study.camera, study.camera.screen
     half = 0.43 * camera.sensor.shape[0] * float(camera.sensor.pitch)
     pixels = np.array([[0.0, -half], [0.0, 0.0], [0.0, half]])
-    rays = wg.trace(camera, jnp.asarray(pixels), setup.plane.distance, setup.config.orders)
+    rays = wg.trace(camera, jnp.asarray(pixels), study.plane.distance, study.orders)
     d0, d1 = float(camera.focal_distance), float(camera.lens_distance)
     width, start = float(screen.glass_thickness), d0 + d1
     slopes = -pixels[:, 1] / d0
@@ -69,11 +69,11 @@ def save_rays(folder: RunFolder, setup: Setup) -> None:
         del style["marker"]
         top = d1 * slopes[n] + crossing[n]
         path = [(0, pixel), (d0, 0), (start, d1 * slopes[n]), (start + width, top)]
-        count = 2 * setup.config.orders - 1
+        count = 2 * study.orders - 1
         path += [(start + width * (m % 2), top + (m + 1) * bounce[n]) for m in range(count)]
         name = f"pixel at y = {pixel:.2g} mm: {float(light) / nm:.0f} nm"
         ax.plot(*zip(*path, strict=True), label=name, **style)
-        for order in range(setup.config.orders):
+        for order in range(study.orders):
             bottom = top + (2 * order + 1) * bounce[n]
             out = bottom + crossing[n]
             line = [(start, bottom), (start + width, out)]
@@ -85,17 +85,17 @@ def save_rays(folder: RunFolder, setup: Setup) -> None:
     ax.set_xlim(0, start + width + ahead)
     ax.invert_yaxis()
     ax.legend(loc="lower left", fontsize=9)
-    save_figure(folder, "rays", figure)
+    return figure
 
 
-def save_field(folder: RunFolder, setup: Setup, rays: wg.Rays) -> None:
-    """Colour and ghost shift of every pixel, in false grey with contours, and as an eye sees it."""
-    rows, columns = setup.camera.sensor.shape
-    pitch = float(setup.camera.sensor.pitch)
+def draw_field(study: ScreenStudy, rays: wg.Rays) -> Figure:
+    """Colour and ghost shift of every pixel, in grey with contours, and the colours as seen."""
+    rows, columns = study.camera.sensor.shape
+    pitch = float(study.camera.sensor.pitch)
     x, y = columns * pitch / 2, rows * pitch / 2
     light = np.asarray(rays.wavelength)
     maps = [(light / nm, "Bragg wavelength (nm)")]
-    if setup.config.orders > 1:
+    if study.orders > 1:
         shift = np.asarray(rays.points[1] - rays.points[0])
         maps.append((shift[..., 1], "first ghost: seen further down (mm)"))
         maps.append((shift[..., 0], "first ghost: seen further right (mm)"))
@@ -111,39 +111,45 @@ def save_field(folder: RunFolder, setup: Setup, rays: wg.Rays) -> None:
     for ax in axes:
         ax.set_xlabel("x on the sensor (mm)", fontsize=9)
     axes[0].set_ylabel("y on the sensor (mm)", fontsize=9)
-    save_figure(folder, "field", figure)
+    return figure
 
 
-def save_images(
-    folder: RunFolder,
-    setup: Setup,
-    captures: np.ndarray,
-    wavelength: np.ndarray,
-    found: dict[tuple[str, str], np.ndarray],
-    scores: dict[tuple[str, str], list[float]],
-) -> None:
-    """Targets, captures and what comes back: with the first model by all methods, and by the last
-    method with all models; `found` and `scores` are by model and method."""
-    config = setup.config
-    first, last = config.models[0].name, config.methods[-1].name
-    right = [(method.name, (first, method.name)) for method in config.methods]
-    wrong = [(model, (model, method)) for model, method in found if method == last]
-    for name, panels in (("images", right), ("models", wrong)):
-        shown = 2 if name == "images" else 1
-        size = (1.75 * (len(panels) + shown), 1.95 * len(setup.targets))
-        figure, rows = drawing(size, len(setup.targets), len(panels) + shown, squeeze=False)
-        for number, (target, axes) in enumerate(zip(setup.targets, rows, strict=True)):
-            _panel(axes[0], setup.targets[target], target, "" if number else "target")
-            if shown == 2:
-                colour = in_colour(captures[number], wavelength)
-                _panel(axes[1], colour, "", "" if number else "capture, turned")
-            for ax, (title, key) in zip(axes[shown:], panels, strict=True):
-                label = f"{scores[key][number]:.1f} dB"
-                _panel(ax, found[key][number], label, "" if number else title)
-        save_figure(folder, name, figure)
-    for number, target in enumerate(setup.targets):
-        for title, key in right:
-            save_image(folder, f"{slug(target)}--{slug(title)}", found[key][number])
+def draw_images(result: ScreenResult) -> Figure:
+    """Targets, captures, and what the first model reconstructs by every solver."""
+    study, (first, *_) = result.study, result.models.items()
+    captures, light = np.asarray(study.captures.images), study.wavelengths
+    colours = [in_colour(capture, light) for capture in captures]
+    columns = [("capture, turned", colours, [""] * len(colours))]
+    columns += [(name, list(one.images), _labels(one)) for name, one in first[1].methods.items()]
+    return _sheet(study, columns)
+
+
+def draw_models(result: ScreenResult) -> Figure:
+    """Targets, and what every model reconstructs by the last solver."""
+    last = list(result.study.solvers)[-1]
+    found = {name: model.methods[last] for name, model in result.models.items()}
+    return _sheet(result.study, [(n, list(one.images), _labels(one)) for n, one in found.items()])
+
+
+def _labels(found: Reconstructed) -> list[str]:
+    return [_decibels(score.psnr_db) for score in found.scores.targets.values()]
+
+
+def _decibels(score: float | None) -> str:
+    return "" if score is None else f"{score:.1f} dB"
+
+
+def _sheet(
+    study: ScreenStudy, columns: Sequence[tuple[str, list[np.ndarray], list[str]]]
+) -> Figure:
+    """A row for each target; columns of a title, images and their labels beside it."""
+    size = (1.75 * (len(columns) + 1), 1.95 * len(study.targets))
+    figure, rows = drawing(size, len(study.targets), len(columns) + 1, squeeze=False)
+    for number, ((target, truth), axes) in enumerate(zip(study.targets.items(), rows, strict=True)):
+        _panel(axes[0], truth, target, "" if number else "target")
+        for ax, (title, images, labels) in zip(axes[1:], columns, strict=True):
+            _panel(ax, images[number], labels[number], "" if number else title)
+    return figure
 
 
 def _panel(ax: Axes, image: np.ndarray, label: str, title: str) -> None:
@@ -153,29 +159,26 @@ def _panel(ax: Axes, image: np.ndarray, label: str, title: str) -> None:
     ax.set_title(title, fontsize=9)
 
 
-def save_errors(
-    folder: RunFolder, setup: Setup, scores: dict[tuple[str, str], list[float]]
-) -> None:
-    """PSNR of every target by the last method with each model."""
+def draw_errors(result: ScreenResult) -> Figure:
+    """PSNR of every target by the last solver with each model."""
     figure, ax = drawing((9, 3.8))
-    last = [key for key in scores if key[1] == setup.config.methods[-1].name]
-    for index, key in enumerate(last):
-        ax.plot(list(setup.targets), scores[key], label=key[0], **line_style(index))
+    last = list(result.study.solvers)[-1]
+    for index, (name, model) in enumerate(result.models.items()):
+        scores = model.methods[last].scores.targets
+        levels = [score.psnr_db for score in scores.values()]
+        ax.plot(list(scores), levels, label=name, **line_style(index))
     ax.set(ylabel="PSNR (dB)", xlabel="target")
     ax.grid(alpha=0.3)
     figure.legend(loc="outside right center", fontsize=9)
-    save_figure(folder, "errors", figure)
+    return figure
 
 
-def save_columns(
-    folder: RunFolder,
-    pitch: float,
-    cells: list[tuple[int, int]],
-    images: Mapping[str, np.ndarray],
-) -> None:
-    """What the sensor sees of some cells (row, column) alone, in counts; images (cell, y, x).
+def draw_columns(
+    pitch: float, cells: list[tuple[int, int]], images: Mapping[str, np.ndarray]
+) -> Figure:
+    """Captures (cell, y, x) of some cells (row, column) alone, in counts, on pixels of a pitch, mm.
 
-    The grey goes as the square root, so that ghosts are seen beside the image.
+    The grey goes with the square root, so that ghosts are seen beside the image.
     """
     y, x = (n * pitch / 2 for n in next(iter(images.values())).shape[1:])
     most = max(stack.max() for stack in images.values())
@@ -190,27 +193,22 @@ def save_columns(
     for ax in grid[-1]:
         ax.set_xlabel("x on the sensor (mm)")
     figure.colorbar(grid[0, 0].images[0], ax=grid, label="counts for a white cell")
-    save_figure(folder, "columns", figure)
+    return figure
 
 
-def save_distances(
-    folder: RunFolder,
-    setup: Setup,
-    images: dict[str, dict[str, np.ndarray]],
-    scores: dict[str, dict[str, dict]],
-) -> None:
-    """One target at other distances, by each matrix, in grey with its PSNR."""
-    asked = setup.config.targets
-    number = next((n for n, target in enumerate(asked) if not target.binary), 0)
-    target = asked[number].name
+def draw_distances(result: CalibrationResult) -> Figure:
+    """The first target in halftones at other distances, by each matrix, in grey with its PSNR."""
+    targets, images = result.study.targets, result.images
+    halftones = (n for n, truth in enumerate(targets.values()) if len(np.unique(truth)) > 2)
+    number = next(halftones, 0)
+    target = list(targets)[number]
     ways = list(next(iter(images.values())))
     rows, columns = len(images), len(ways) + 1
     figure, grid = drawing((2.1 * columns, 2.4 * rows), rows, columns, squeeze=False)
     for row, ((distance, found), line) in enumerate(zip(images.items(), grid, strict=True)):
-        _panel(line[0], setup.targets[target], target, "" if row else "target")
+        _panel(line[0], targets[target], target, "" if row else "target")
         line[0].set_ylabel(f"object at {distance}")
         for name, ax in zip(ways, line[1:], strict=True):
-            score = scores[distance][name]["targets"][target]
-            label = "" if score is None else f"{score:.1f} dB"
-            _panel(ax, found[name][number], label, "" if row else name)
-    save_figure(folder, "distances", figure)
+            score = result.scores.distances[distance][name].targets[target]
+            _panel(ax, found[name][number], _decibels(score), "" if row else name)
+    return figure

@@ -73,7 +73,7 @@ def _parts(kind: str) -> tuple[Callable, Callable, Callable]:
         from thincam_jax.commands.screen import build
         from thincam_jax.commands.screen import run as screen
 
-        return build.build_setup, screen.run_screen, screen.table
+        return build.build_screen, screen.run_screen, screen.table
     if kind == "masks":
         from thincam_jax.commands.masks import build
         from thincam_jax.commands.masks import run as masks

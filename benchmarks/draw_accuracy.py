@@ -1,13 +1,21 @@
-"""The picture of the benchmark: errors against times, and what an error costs."""
+"""The figure and the table of costs of `thincam bench accuracy`, from its accuracy.json.
 
+    python benchmarks/draw_accuracy.py runs/NAME-accuracy/accuracy.json
+
+prints what errors do to captures and reconstructions, and draws accuracy.png beside the file:
+errors against times, and what an error costs.
+"""
+
+import json
+import sys
+from pathlib import Path
 from typing import Any
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from thincam_jax.commands.accuracy.psfs import label, words
-from thincam_jax.commands.study.figures import as_png
+from thincam_jax.studies.psf_accuracy import label, words
 
 # Models are told apart by marker, precisions by filling, sizes by grey.
 _MARKERS = {
@@ -31,8 +39,8 @@ _LINEAR_DB = 0.01  # losses below this are drawn to a linear scale
 Point = tuple[float, float]
 
 
-def draw(results: dict[str, Any]) -> bytes:
-    """The figure as a PNG file."""
+def draw(results: dict[str, Any]) -> Figure:
+    """Errors against times, and errors of captures and PSNR lost against the PSF's error."""
     figure = Figure(figsize=(13.5, 7.6), layout="constrained")
     panels = figure.subplot_mosaic(
         [["times", "captures"], ["times", "losses"]], width_ratios=(1.45, 1)
@@ -42,7 +50,7 @@ def draw(results: dict[str, Any]) -> bytes:
     _draw_captures(panels["captures"], results)
     _draw_losses(panels["losses"], results)
     figure.legend(handles=_legend(results), loc="outside lower center", ncols=5, fontsize=9)
-    return as_png(figure)
+    return figure
 
 
 def _draw_times(ax: Axes, results: dict[str, Any]) -> None:
@@ -202,3 +210,36 @@ def _finish_cost(ax: Axes) -> None:
     ax.grid(alpha=0.25)
     if ax.get_legend_handles_labels()[0]:
         ax.legend(fontsize=8.5, loc="upper left", framealpha=1)
+
+
+def costs(results: dict[str, Any]) -> list[str]:
+    """A line for each PSF that was assumed: errors of the PSF and the capture, and PSNR lost."""
+    found = results["reconstructions"]
+    lost = {row["model"]: row.get("psnr_lost_db") for row in found["models"]}
+    lines = [
+        "| assumed | PSF error | capture error | without mean | PSNR lost dB |",
+        "|---|---|---|---|---|",
+    ]
+    for row in results["captures"]:
+        if row["status"] == "run":
+            errors = (row["psf_error"], row["error"], row["contrast_error"])
+            lines.append(_line(words(row["model"]), errors, lost.get(row["model"])))
+    for row in found["controlled"]:
+        if row["status"] == "run":
+            wrong = _WRONG[row["wrong"]]["label"]
+            errors = (row["psf_error"], row["capture_error"], row["capture_contrast_error"])
+            name = f"exact, {wrong} by {row['change']:.1e}"
+            lines.append(_line(name, errors, row["psnr_lost_db"]))
+    return lines
+
+
+def _line(name: str, errors: tuple[float, ...], lost: float | None) -> str:
+    loss = "–" if lost is None else f"{lost:.4f}".replace("-", "−")
+    return f"| {' | '.join([name, *(f'{error:.1e}' for error in errors), loss])} |"
+
+
+if __name__ == "__main__":
+    path = Path(sys.argv[1])
+    recorded = json.loads(path.read_text("utf-8"))
+    print(*costs(recorded), sep="\n")
+    draw(recorded).savefig(path.with_name("accuracy.png"), dpi=110)

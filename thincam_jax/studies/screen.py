@@ -1,0 +1,391 @@
+"""Captures through a see-through screen, reconstructed with right and wrong models of it.
+
+The screen guides the light of an object to a camera at its edge, once for each reflection: the
+capture is a sum of ghosts, whose shifts and weights differ from pixel to pixel (thesis section
+5.3). What does a wrong model of the screen cost the image?
+"""
+
+import math
+import time
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from typing import Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from thincam_jax import waveguide as wg
+from thincam_jax._core.steps import Progress, Step, carry_out
+from thincam_jax.imaging.metrics import psnr, ssim
+from thincam_jax.imaging.operators import AbstractOperator, Sparse
+from thincam_jax.imaging.sensor import AbstractNoise, electrons_per_unit, read_out
+from thincam_jax.reconstruction import AbstractSolver, Reconstruction, Recording, reconstruct
+from thincam_jax.studies.evaluate import rounded
+from thincam_jax.units import deg, nm
+from thincam_jax.waveguide.hologram import directions
+from thincam_jax.waveguide.rays import bragg_rays
+from thincam_jax.waveguide.system import colour_operator, seen_size, smeared_rays, system_matrix
+
+Mistake = Literal["none", "grating", "ghost_index", "shift_invariant", "no_ghosts", "no_smear"]
+MISTAKES: dict[Mistake, str] = {
+    "none": "as the camera is",
+    "grating": "K as printed in thesis Eq 5.4, with cos Θ_O − cos Θ_R: a transmission hologram",
+    "ghost_index": "i of thesis Eq 5.9 counted from 0, as its text has it",
+    "shift_invariant": "the ghosts of the axis everywhere: a convolution",
+    "no_ghosts": "the first image alone",
+    "no_smear": "each pixel's Bragg wavelength alone, without the band about it",
+}
+
+
+@dataclass(frozen=True)
+class ScreenModel:
+    """A model of the camera, with which captures are reconstructed.
+
+    - `mistake`: a key of `MISTAKES`.
+    - `glass_thickness`: mm; None for that of the camera.
+    """
+
+    name: str
+    mistake: Mistake = "none"
+    glass_thickness: float | None = None
+
+    @property
+    def description(self) -> str:
+        """The mistake in words."""
+        words = MISTAKES[self.mistake]
+        if self.glass_thickness is None:
+            return words
+        return f"{words}, with a glass of {self.glass_thickness:g} mm"
+
+
+class ScreenCaptures(eqx.Module):
+    """Captures (target, *channel, y, x), or reduced ones, and the variance of their noise."""
+
+    images: Array
+    variance: Array
+
+
+@dataclass(frozen=True, eq=False)
+class ScreenStudy:
+    """A see-through camera, the object before it, and the models that reconstruct its captures.
+
+    - `cameras`: one, or one for each channel of a full-colour hologram, which differ in their
+      hologram alone.
+    - `plane`: cells that show the targets.
+    - `targets`: by name, radiance 0 to 1 on the cells, (y, x), or (y, x, channel) with a
+      full-colour hologram.
+    - `noise`: of the captures; each target has noise of its own key.
+    - `solvers`: by name.
+    - `models`: the first one takes the captures.
+    - `orders`: of ghosts; `band_samples`: as of `waveguide.system_operator`.
+    - `recording_angles`: of the object and the reference wave in the film, rad, which the mistake
+      "grating" needs.
+
+    ```python
+    import thincam_jax as tc
+    from thincam_jax import waveguide as wg
+    from thincam_jax.imaging.targets import siemens_star
+    from thincam_jax.studies.screen import ScreenModel, ScreenStudy
+    from thincam_jax.units import deg, nm, um
+
+    film = wg.VolumeHologram.record(
+        532 * nm, 0.0, 61.2 * deg, index=1.5, thickness=16 * um, index_modulation=0.02
+    )
+    sensor = tc.Sensor(shape=(22, 30), pitch=70.4 * um)
+    study = ScreenStudy(
+        cameras=(wg.SeeThroughCamera(wg.Screen(film, 5.0, 1.5), sensor, 6.0, 10.0),),
+        plane=wg.ObjectPlane((8, 16), distance=550.0, width=120.0, centre=(0.0, 27.0)),
+        targets={"star": siemens_star((8, 16), 4)},
+        noise=tc.GaussianNoise(snr_db=40.0),
+        solvers={"ridge": tc.Ridge(1.0)},
+        models=(ScreenModel("right"), ScreenModel("one image", "no_ghosts")),
+    )
+    result = study.run()
+    print(result.models["right"].methods["ridge"].scores.mean_psnr_db)
+    ```
+    """
+
+    cameras: tuple[wg.SeeThroughCamera, ...]
+    plane: wg.ObjectPlane
+    targets: dict[str, np.ndarray]
+    noise: AbstractNoise
+    solvers: dict[str, AbstractSolver]
+    models: tuple[ScreenModel, ...] = (ScreenModel("exact rays"),)
+    orders: int = 4
+    band_samples: int | None = None
+    recording_angles: tuple[float, float] | None = None
+    seed: int = 0
+    name: str = "screen"
+
+    @property
+    def camera(self) -> wg.SeeThroughCamera:
+        """The camera of the middle colour, green."""
+        return self.cameras[len(self.cameras) // 2]
+
+    def rays(self, camera: wg.SeeThroughCamera | None = None) -> wg.Rays:
+        """Rays of every pixel and order of a camera; by default of `camera`."""
+        camera = camera or self.camera
+        return wg.trace(camera, wg.pixel_centres(camera), self.plane.distance, self.orders)
+
+    @property
+    def wavelengths(self) -> np.ndarray:
+        """Of each pixel's image, mm, (y, x), or (channel, y, x) of several cameras."""
+        found = np.stack([np.asarray(self.rays(camera).wavelength) for camera in self.cameras])
+        return found if len(self.cameras) > 1 else found[0]
+
+    def check(self) -> None:
+        """Refuse a screen that guides no light to the sensor; ValueError says why."""
+        for camera in self.cameras:
+            wg.check_screen(camera)
+        status = np.asarray(self.rays().status)
+        if not (status == wg.RayStatus.OK).any():
+            most = wg.RayStatus(int(np.bincount(status.ravel()).argmax())).name.lower()
+            raise ValueError(
+                f"no ray from the sensor reaches the object's plane (most: "
+                f"{most.replace('_', ' ')}); see docs/screen.md for what a status means"
+            )
+
+    @cached_property
+    def systems(self) -> list[Sparse]:
+        """The matrix of each model.
+
+        All have as many entries as the largest, the others in no pixel, for one compiled program.
+        """
+        systems = [self.system(model) for model in self.models]
+        most = max(system.values.size for system in systems)
+        outside = math.prod(systems[0].out_shape), math.prod(systems[0].in_shape)
+
+        def padded(system: Sparse) -> Sparse:
+            entries = system.values, system.rows, system.columns
+            longer = [
+                jnp.pad(entry, (0, most - entry.size), constant_values=value)
+                for entry, value in zip(entries, (0, *outside), strict=True)
+            ]
+            return eqx.tree_at(lambda s: (s.values, s.rows, s.columns), system, longer)
+
+        return [padded(system) for system in systems]
+
+    def system(self, model: ScreenModel) -> Sparse:
+        """The matrix of one model, from the cells to the sensor."""
+        cameras = self.cameras
+        if model.glass_thickness is not None:
+            cameras = [with_glass(camera, model.glass_thickness) for camera in cameras]
+        channels = []
+        for camera in cameras:
+            rays = mistaken_rays(self, camera, model.mistake)
+            level = float(jnp.mean(jnp.sum(rays.weight, axis=0)))
+            matrix = system_matrix(rays, self.plane, float(seen_size(camera, self.plane)), level)
+            channels.append(Sparse(matrix, self.plane.shape, camera.sensor.shape))
+        return colour_operator(channels) if len(channels) > 1 else channels[0]
+
+    @cached_property
+    def captures(self) -> ScreenCaptures:
+        """Every target as the sensor reads it."""
+        return self.captured_through(self.systems[0])
+
+    def captured_through(self, system: Sparse) -> ScreenCaptures:
+        """Every target as the sensor of a camera with that matrix reads it."""
+        images = np.stack(list(self.targets.values()))
+        images = np.moveaxis(images, -1, 1) if images.ndim == 4 else images
+        images = jnp.asarray(images.reshape(-1, *system.in_shape), system.values.dtype)
+        clean, sensor = system(images), self.camera.sensor
+        keys = [jax.random.fold_in(jax.random.key(self.seed), n) for n in range(len(images))]
+        read = [
+            read_out(sensor, one, noise=self.noise, key=key)
+            for one, key in zip(clean, keys, strict=True)
+        ]
+        variance = self.noise.variance(clean, electrons_per_unit(sensor, clean))
+        return ScreenCaptures(jnp.stack(read), variance)
+
+    def run(self, progress: Progress | None = None) -> "ScreenResult":
+        """Reconstruct the captures of all targets with every model by every solver."""
+        run = ScreenRun(self)
+        carry_out(run.work, progress)
+        return run.result
+
+
+def with_glass(camera: wg.SeeThroughCamera, thickness: float) -> wg.SeeThroughCamera:
+    """The camera behind a plate of another glass thickness, mm."""
+    return replace(camera, screen=replace(camera.screen, glass_thickness=thickness))
+
+
+def mistaken_rays(
+    study: ScreenStudy, camera: wg.SeeThroughCamera, mistake: Mistake
+) -> wg.SmearedRays:
+    """The rays of a camera, followed with one of `MISTAKES`.
+
+    **Errors**: ValueError for "grating" in a study without `recording_angles`.
+    """
+    plane, pixels = study.plane, wg.pixel_centres(camera)
+    samples = None if mistake == "no_smear" else study.band_samples
+    rays = smeared_rays(camera, pixels, plane, study.orders, samples)
+    if mistake == "no_ghosts":
+        return wg.SmearedRays(rays.points[:1], rays.weight[:1])
+    if mistake == "shift_invariant":
+        middle = jnp.zeros((1, 1, 2), pixels.dtype)
+        axis = smeared_rays(camera, middle, plane, study.orders, samples)
+        scale = (camera.lens_distance + plane.distance) / camera.focal_distance
+        points = axis.points - scale * pixels[..., None, :]
+        return wg.SmearedRays(points, jnp.broadcast_to(axis.weight, rays.weight.shape))
+    if mistake not in ("ghost_index", "grating"):
+        return rays
+    found = bragg_rays(camera, pixels)
+    width, index = camera.screen.glass_thickness, camera.screen.glass_index(found.wavelength)
+    bounce = _bounce(found.guided, index)
+    if mistake == "ghost_index":
+        return replace(rays, points=rays.points - 2 * width * bounce[..., None, :])
+    if study.recording_angles is None:
+        raise ValueError(
+            "the mistake 'grating' is one of the recording; give the study recording_angles"
+        )
+    hologram = camera.screen.hologram
+    film = hologram.index(found.wavelength)
+    toward, reference = (math.cos(angle) for angle in study.recording_angles)
+    along = hologram.grating.at[2].multiply((toward - reference) / (toward + reference))
+    printed = eqx.tree_at(lambda h: h.grating, hologram, along)
+    guided = film[..., None] * printed.diffracted(directions(found.across, film))[..., :2]
+    odd = (2 * jnp.arange(study.orders, dtype=pixels.dtype) + 1)[:, None, None, None]
+    moved = odd * width * (_bounce(guided, index) - bounce)
+    return replace(rays, points=rays.points + moved[..., None, :])
+
+
+def _bounce(guided: Array, index: Array) -> Array:
+    """How far guided light travels along a glass of thickness 1 between its surfaces."""
+    left = index**2 - jnp.sum(guided**2, axis=-1)
+    return guided / jnp.sqrt(jnp.maximum(left, 1e-6))[..., None]
+
+
+def reconstruct_targets(
+    system: AbstractOperator, solver: AbstractSolver, captures: ScreenCaptures
+) -> Reconstruction:
+    """All targets at once, (target, *channel, y, x)."""
+    variance = captures.variance[None]
+    return reconstruct(Recording(captures.images[None], [system], noise_variance=variance), solver)
+
+
+@dataclass(frozen=True)
+class TargetScores:
+    """Agreement of a reconstruction with its target; the PSNR of an exact one is None."""
+
+    psnr_db: float | None
+    ssim: float
+
+
+@dataclass(frozen=True)
+class MethodScores:
+    """Figures of merit of a solver with a model; `targets` by name. The time has compilation."""
+
+    mean_psnr_db: float | None
+    seconds_per_image: float
+    status: str
+    iterations: int
+    targets: dict[str, TargetScores]
+
+
+@dataclass(frozen=True, eq=False)
+class Reconstructed:
+    """The targets as a solver reconstructs them with a model, and their scores."""
+
+    images: Float[np.ndarray, "target y x *channel"]
+    scores: MethodScores
+
+
+@dataclass(frozen=True, eq=False)
+class ModelResult:
+    """What a model gives: its mistake in words, and the reconstructions by name of the solver."""
+
+    mistake: str
+    methods: dict[str, Reconstructed]
+
+
+@dataclass(frozen=True, eq=False)
+class ScreenResult:
+    """A study and what each of its models gives, by name."""
+
+    study: ScreenStudy
+    models: dict[str, ModelResult]
+
+
+class ScreenRun:
+    """A screen study step by step: `work` fills `models`."""
+
+    def __init__(self, study: ScreenStudy):
+        self.study = study
+        self.models = {model.name: ModelResult(model.description, {}) for model in study.models}
+        self.work = [Step("rays and captures", lambda: study.captures)]
+        for number, model in enumerate(study.models):
+            self.work += [
+                Step(f"{model.name}: {name}", partial(self._reconstruct, number, name))
+                for name in study.solvers
+            ]
+
+    @property
+    def result(self) -> ScreenResult:
+        """All that is done."""
+        return ScreenResult(self.study, self.models)
+
+    def _reconstruct(self, number: int, name: str) -> None:
+        study = self.study
+        found = reconstructed(study, study.solvers[name], study.systems[number], study.captures)
+        self.models[study.models[number].name].methods[name] = found
+
+
+def reconstructed(
+    study: ScreenStudy, solver: AbstractSolver, system: AbstractOperator, captures: ScreenCaptures
+) -> Reconstructed:
+    """Reconstruct the targets of a study from captures by a matrix, and score them."""
+    began = time.perf_counter()
+    found = reconstruct_targets(system, solver, captures)
+    images = np.asarray(found.image, float)
+    images = np.moveaxis(images, 1, -1) if images.ndim == 4 else images
+    seconds = time.perf_counter() - began
+    pairs = list(zip(images, study.targets.values(), strict=True))
+    scores = [psnr(image, truth) for image, truth in pairs]
+    of_targets = {
+        name: TargetScores(rounded(score), round(ssim(image, truth), 4))
+        for name, score, (image, truth) in zip(study.targets, scores, pairs, strict=True)
+    }
+    means = rounded(float(np.mean(scores))), round(seconds / len(images), 3)
+    return Reconstructed(images, MethodScores(*means, found.status, found.iterations, of_targets))
+
+
+@dataclass(frozen=True)
+class RaySummary:
+    """Least and largest values over the field, and how rays ended, in per cent by status.
+
+    - `first_ghost_down_mm`, `first_ghost_right_mm`: how much further a pixel sees by it. None where
+      there is one order only, or no ray.
+    """
+
+    wavelength_nm: tuple[float, float] | None
+    guided_angle_deg: tuple[float, float] | None
+    first_ghost_down_mm: tuple[float, float] | None
+    first_ghost_right_mm: tuple[float, float] | None
+    status_percent: dict[str, float]
+
+
+def summarise_rays(study: ScreenStudy, rays: wg.Rays) -> RaySummary:
+    """Colours, angles of the guided light, shifts of the first ghost, and how rays ended."""
+    status = np.asarray(rays.status)
+    index = np.asarray(study.camera.screen.glass_index(rays.wavelength))
+    sines = np.sqrt(np.sum(np.asarray(rays.guided) ** 2, axis=-1)) / index
+    ranges = [np.asarray(rays.wavelength) / nm, np.arcsin(np.minimum(sines, 1)) / deg]
+    sound = status[0] == wg.RayStatus.OK
+    if study.orders > 1:
+        shift = np.asarray(rays.points[1] - rays.points[0])
+        ranges += [shift[..., 1], shift[..., 0]]
+        sound = sound & (status[1] == wg.RayStatus.OK)
+    found: list[tuple[float, float] | None] = [None] * 4
+    if sound.any():
+        for number, values in enumerate(ranges):
+            low, high = values[sound].min(), values[sound].max()
+            found[number] = round(float(low), 3), round(float(high), 3)
+    endings = {
+        kind.name.lower(): round(100 * float(np.mean(status == kind)), 2)
+        for kind in wg.RayStatus
+        if (status == kind).any()
+    }
+    return RaySummary(found[0], found[1], found[2], found[3], endings)
