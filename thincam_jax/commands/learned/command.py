@@ -37,7 +37,7 @@ def train(
         from thincam_jax.commands.learned.run import TrainingFolder, run_training
 
         is_denoiser = read_raw(config)[0].get("kind") == "denoiser"
-        kind, run = (DenoiserConfig, run_denoiser) if is_denoiser else (LearnedConfig, run_training)
+        kind = DenoiserConfig if is_denoiser else LearnedConfig
         asked = load_as(kind, config, tuple(set_ or ()))
         folder = TrainingFolder(out or Path("runs") / slug(asked.name))
         with progress_bar("{task.fields[loss]}") as bar:
@@ -48,7 +48,10 @@ def train(
                 bar.update(task, completed=progress.step, loss=f"loss {progress.loss:.3f}{score}")
                 bar.start()
 
-            found = run(asked, folder, tell, resume=resume)
+            if isinstance(asked, DenoiserConfig):
+                found = run_denoiser(asked, folder, tell, resume=resume)
+            else:
+                found = run_training(asked, folder, tell, resume=resume)
     if is_denoiser:
         print(f"{found['status']}: loss {found['loss']:.4f} on pictures held out")
     else:

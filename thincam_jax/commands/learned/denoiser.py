@@ -126,6 +126,9 @@ def build_network(config: DenoiserConfig) -> DenoisingUNet:
         return create(options, key=jax.random.key(config.seed))
     try:
         network = load_network(config.start)
+    except FileNotFoundError:
+        told = f"{config.start}: is missing; give a network's file, or 'shipped'"
+        raise ConfigError(f"{config.place_of('start')}start: {told}") from None
     except (CheckpointError, OSError) as error:
         raise ConfigError(f"{config.place_of('start')}start: {error}") from None
     if network.shape != (options.widths, options.blocks):
@@ -150,6 +153,8 @@ def build_lessons(config: DenoiserConfig) -> DenoisingLessons:
         except (ValueError, OSError) as error:
             place = config.place_of("sources", number)
             faults.append(f"{place}sources[{number}]: {error}")
+    if not train and not faults:
+        faults.append(f"{config.place_of('sources')}sources: none is left to train on; give one")
     if faults:
         raise ConfigError("\n".join(faults))
     told = {name: getattr(config.training, name) for name in ("batch", "crop", "judged")}

@@ -125,7 +125,7 @@ def _stroke(ink: np.ndarray, start: np.ndarray, end: np.ndarray, weight: float) 
     low = np.floor(np.minimum(start, end) - weight - 1).clip(0).astype(int)
     high = np.ceil(np.maximum(start, end) + weight + 2).astype(int)
     part = ink[low[0] : high[0], low[1] : high[1]]
-    place = np.stack(np.mgrid[0 : part.shape[0], 0 : part.shape[1]], axis=-1) + low - start
+    place = np.moveaxis(np.indices(part.shape), 0, -1) + low - start
     along = end - start
     share = (place @ along / max(float(along @ along), 1e-6)).clip(0, 1)
     distance = np.linalg.norm(place - share[..., None] * along, axis=-1)

@@ -86,13 +86,15 @@ def parameter_count(tree: Any) -> int:
     return sum(x.size for x in jax.tree.leaves(eqx.filter(tree, eqx.is_inexact_array)))
 
 
-def blocks_to_channels(x):
+def blocks_to_channels(x: Float[Array, "c y x"]) -> Float[Array, "c4 y2 x2"]:
+    """2×2 pixels of each channel as four channels, at half the resolution."""
     c, rows, columns = x.shape
     x = x.reshape(c, rows // 2, 2, columns // 2, 2)
     return jnp.transpose(x, (0, 2, 4, 1, 3)).reshape(4 * c, rows // 2, columns // 2)
 
 
-def channels_to_blocks(x):
+def channels_to_blocks(x: Float[Array, "c4 y2 x2"]) -> Float[Array, "c y x"]:
+    """The inverse of `blocks_to_channels`."""
     c, rows, columns = x.shape
     x = x.reshape(c // 4, 2, 2, rows, columns)
     return jnp.transpose(x, (0, 3, 1, 4, 2)).reshape(c // 4, 2 * rows, 2 * columns)
