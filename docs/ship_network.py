@@ -1,6 +1,7 @@
 """A trained network as it comes with the package: its weights in half precision.
 
-`python docs/ship_network.py CONFIG NETWORK`: a training's config and its network.
+`python docs/ship_network.py NETWORK`: a denoiser. `python docs/ship_network.py NETWORK CONFIG`: a
+refocusing network and the config of its training.
 """
 
 import sys
@@ -14,13 +15,23 @@ from thincam_jax import learn
 from thincam_jax.commands.checked_config import load_as
 from thincam_jax.commands.learned.build import build_camera
 from thincam_jax.commands.learned.config import LearnedConfig
+from thincam_jax.learn.denoiser.network import load_network, network_card, save_network
 from thincam_jax.learn.refocusing.store import network_description
 
-PLACE = Path(__file__).parents[1] / "thincam_jax/learn/refocusing/shipped.thincam"
+ROOM = Path(__file__).parents[1] / "thincam_jax/learn"
 
-config, path = sys.argv[1:]
-network = learn.load(path, build_camera(load_as(LearnedConfig, config)))
-half = jax.tree.map(lambda leaf: leaf.astype(jnp.float16), network.weights)
-told = network_description(path)["training"]
-learn.save(PLACE, eqx.tree_at(lambda n: n.weights, network, half), told)
-print(f"{PLACE}: {PLACE.stat().st_size / 1e6:.1f} MB")
+
+def halved(weights):
+    return jax.tree.map(lambda leaf: leaf.astype(jnp.float16), weights)
+
+
+path, *config = sys.argv[1:]
+if config:
+    place = ROOM / "refocusing/shipped.thincam"
+    network = learn.load(path, build_camera(load_as(LearnedConfig, config[0])))
+    half = eqx.tree_at(lambda n: n.weights, network, halved(network.weights))
+    learn.save(place, half, network_description(path)["training"])
+else:
+    place = ROOM / "denoiser/shipped.thincam"
+    save_network(place, halved(load_network(path)), network_card(path)["training"])
+print(f"{place}: {place.stat().st_size / 1e6:.1f} MB")

@@ -15,6 +15,7 @@ COMMANDS = {
     "screen_design": ("design", "a design"),
     "capture": ("capture", "a capture"),
     "learned": ("train", "a network"),
+    "denoiser": ("train", "a denoiser"),
 }
 
 

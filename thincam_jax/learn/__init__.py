@@ -1,5 +1,6 @@
-"""Learned parts: unrolled solvers, refocusing networks and suggestions of designs."""
+"""Learned parts: a denoiser, unrolled solvers, refocusing networks, suggestions of designs."""
 
+from thincam_jax.learn.denoiser.network import Denoiser as Denoiser
 from thincam_jax.learn.refocusing.cameras import RefocusCamera as RefocusCamera
 from thincam_jax.learn.refocusing.network import NetworkOptions as NetworkOptions
 from thincam_jax.learn.refocusing.network import RefocusNetwork as RefocusNetwork

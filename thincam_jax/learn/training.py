@@ -42,7 +42,8 @@ class TrainingOptions:
     """How long and how fast.
 
     - `steps`, `seed`: of the training.
-    - `rate`: of Adam; it rises over `warm_up` steps and falls to zero as a cosine.
+    - `rate`: of Adam; it rises over `warm_up` steps and falls to zero as a cosine, over the last
+      `falling` part of the steps.
     - `longest_slope`: norm to which longer gradients are shortened.
     - `averaging`: what is judged and kept is a running mean of the weights over some
       1/(1 − averaging) steps; 0: the weights themselves.
@@ -58,6 +59,7 @@ class TrainingOptions:
     averaging: float = 0.99
     check_every: int = 100
     seed: int = 0
+    falling: float = 1.0
 
     def __post_init__(self):
         checks.at_least_one({"steps": self.steps, "check_every": self.check_every})
@@ -65,13 +67,16 @@ class TrainingOptions:
             checks.positive(name, getattr(self, name), "a number")
         if not 0 <= self.averaging < 1:
             raise ValueError(f"averaging = {self.averaging}: give 0 to below 1")
+        if not 0 < self.falling <= 1:
+            raise ValueError(f"falling = {self.falling}: give above 0 to 1")
         if self.warm_up < 0:
             raise ValueError(f"warm_up = {self.warm_up}: give at least 0 steps")
 
     def rate_at(self, step: int) -> float:
         """Of the step of that number, counted from 0."""
         rising = min(1.0, (step + 1) / (self.warm_up + 1))
-        return self.rate * rising * 0.5 * (1 + math.cos(math.pi * step / self.steps))
+        place = max(0.0, (step / self.steps - 1 + self.falling) / self.falling)
+        return self.rate * rising * 0.5 * (1 + math.cos(math.pi * place))
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,7 +12,9 @@ if TYPE_CHECKING:
 
 
 def train(
-    config: Annotated[Path, typer.Argument(help="Experiment file (YAML) of kind learned.")],
+    config: Annotated[
+        Path, typer.Argument(help="Experiment file (YAML) of kind learned or denoiser.")
+    ],
     out: Annotated[
         Path | None, typer.Option(help="Folder of the results; default runs/NAME of the network.")
     ] = None,
@@ -21,19 +23,22 @@ def train(
     ] = False,
     set_: Overrides = None,
 ) -> None:
-    """Train a network that refocuses the captures of a camera.
+    """Train a network that refocuses the captures of a camera, or a denoiser.
 
-    Writes network.thincam, figures, training.json and report.html. Ctrl-C, or a power cut, loses
-    what was done since the last check; --resume goes on from there, to the same numbers.
+    Writes network.thincam, figures and training.json. Ctrl-C, or a power cut, loses what was done
+    since the last check; --resume goes on from there, to the same numbers.
     """
     goes_on = "interrupted; what the last check has written is kept: --resume goes on from there"
     with told(lambda: goes_on):
         from thincam_jax.commands.checked_config import load_as
-        from thincam_jax.commands.config_file import slug
+        from thincam_jax.commands.config_file import read_raw, slug
         from thincam_jax.commands.learned.config import LearnedConfig
+        from thincam_jax.commands.learned.denoiser import DenoiserConfig, run_denoiser
         from thincam_jax.commands.learned.run import TrainingFolder, run_training
 
-        asked = load_as(LearnedConfig, config, tuple(set_ or ()))
+        is_denoiser = read_raw(config)[0].get("kind") == "denoiser"
+        kind = DenoiserConfig if is_denoiser else LearnedConfig
+        asked = load_as(kind, config, tuple(set_ or ()))
         folder = TrainingFolder(out or Path("runs") / slug(asked.name))
         with progress_bar("{task.fields[loss]}") as bar:
             task = bar.add_task(asked.name, total=asked.training.steps, loss="")
@@ -43,10 +48,17 @@ def train(
                 bar.update(task, completed=progress.step, loss=f"loss {progress.loss:.3f}{score}")
                 bar.start()
 
-            found = run_training(asked, folder, tell, resume=resume)
-    before, after = (found[name]["focus_psnr_db"] for name in ("linear", "trained"))
-    print(
-        f"{found['status']}: focused images have {after:.2f} dB, the linear start {before:.2f} dB"
-    )
+            if isinstance(asked, DenoiserConfig):
+                found = run_denoiser(asked, folder, tell, resume=resume)
+            else:
+                found = run_training(asked, folder, tell, resume=resume)
+    if is_denoiser:
+        print(f"{found['status']}: loss {found['loss']:.4f} on pictures held out")
+    else:
+        before, after = (found[name]["focus_psnr_db"] for name in ("linear", "trained"))
+        print(
+            f"{found['status']}: focused images have {after:.2f} dB, the linear start "
+            f"{before:.2f} dB"
+        )
+        print(f"report: {folder.path / 'report.html'}")
     print(f"network: {folder.path / found['network']}")
-    print(f"report: {folder.path / 'report.html'}")

@@ -55,14 +55,8 @@ def run_training(
     **Errors**: ConfigError where a folder holds a training and `resume` is not asked for, or the
     other way round, or holds a damaged state.
     """
-    started, state = time.time(), folder.path / STATE.format(1)
-    if state.exists() and not resume:
-        raise ConfigError(
-            f"--out {folder.path}: holds a training; give --resume to go on with it, or another "
-            "folder"
-        )
-    if resume and not state.exists():
-        raise ConfigError(f"--resume: {folder.path} holds no training yet; leave it out")
+    started = time.time()
+    check_resume(folder, STATE.format(1), resume)
     network, lessons = build_network(config), build_lessons(config)
     folder.claim(config)
     try:
@@ -71,6 +65,19 @@ def run_training(
     except CheckpointError as error:
         raise ConfigError(str(error)) from None
     return _report(config, folder, lessons, network, trained, started)
+
+
+def check_resume(folder: TrainingFolder, name: str, resume: bool) -> None:
+    """**Errors**: ConfigError where the folder's state of that name is there and `resume` is not
+    asked for, or the other way round."""
+    state = folder.path / name
+    if state.exists() and not resume:
+        raise ConfigError(
+            f"--out {folder.path}: holds a training; give --resume to go on with it, or another "
+            "folder"
+        )
+    if resume and not state.exists():
+        raise ConfigError(f"--resume: {folder.path} holds no training yet; leave it out")
 
 
 def _report(

@@ -52,6 +52,14 @@ def photographs(folder: str | os.PathLike[str], side: int, *, licence: str = "")
     sRGB is linearised, colours become luminance, and the middle square is reduced to `side` pixels.
     `licence`: default the first line of the folder's LICENSE file, else "unknown".
     """
+    images, entries = zip(*read_photographs(folder, licence), strict=True)
+    return Source(np.stack([_square(image, side) for image in images]), entries)
+
+
+def read_photographs(
+    folder: str | os.PathLike[str], licence: str = ""
+) -> list[tuple[np.ndarray, Entry]]:
+    """The images of a folder as in their files, from 0 to 1; see `photographs`."""
     folder = Path(folder)
     if not folder.is_dir():
         raise ValueError(f"{str(folder)!r} is no folder; give a folder of images")
@@ -60,19 +68,24 @@ def photographs(folder: str | os.PathLike[str], side: int, *, licence: str = "")
         raise ValueError(f"{str(folder)!r} holds no image; give a folder of {', '.join(_SUFFIXES)}")
     licence = licence or _licence(folder)
     hashes = [hashlib.sha256(read_regular(path)).hexdigest() for path in files]
-    entries = zip(files, hashes, strict=True)
-    manifest = tuple(Entry(path.name, digest, licence) for path, digest in entries)
-    return Source(np.stack([_square(load_image(path), side) for path in files]), manifest)
+    entries = [Entry(p.name, digest, licence) for p, digest in zip(files, hashes, strict=True)]
+    return [(load_image(path), entry) for path, entry in zip(files, entries, strict=True)]
 
 
 def samples(side: int) -> Source:
     """scikit-image's own photographs, as `photographs`."""
+    images, entries = zip(*read_samples(), strict=True)
+    return Source(np.stack([_square(image, side) for image in images]), entries)
+
+
+def read_samples() -> list[tuple[np.ndarray, Entry]]:
+    """scikit-image's own photographs as in their files, from 0 to 1."""
     images = [sample_image(name) for name in _SAMPLES]
     digests = [hashlib.sha256(image.tobytes()).hexdigest() for image in images]
     licence = "scikit-image's own (its data folder's README)"
-    pairs = zip(_SAMPLES, digests, strict=True)
-    manifest = tuple(Entry(f"skimage:{name}", digest, licence) for name, digest in pairs)
-    return Source(np.stack([_square(image, side) for image in images]), manifest)
+    named = zip(_SAMPLES, digests, strict=True)
+    entries = [Entry(f"skimage:{name}", digest, licence) for name, digest in named]
+    return list(zip(images, entries, strict=True))
 
 
 def drawn(seed: int, count: int, side: int) -> Source:

@@ -71,14 +71,14 @@ class UNet(eqx.Module):
         rows, columns = images.shape[-2:]
         factor = 2 ** (len(self.down) + 1)
         images = jnp.pad(images, ((0, 0), (0, -rows % factor), (0, -columns % factor)), "edge")
-        x = self.before[0](self.enter(_blocks_to_channels(images)))
+        x = self.before[0](self.enter(blocks_to_channels(images)))
         levels = []
         for down, before in zip(self.down, self.before[1:], strict=True):
             levels.append(x)
             x = before(jax.nn.relu(down(_halved(x))))
         for up, after, level in zip(self.up[::-1], self.after[::-1], levels[::-1], strict=True):
             x = after(level + _doubled(up(x)))
-        return _channels_to_blocks(self.leave(jax.nn.relu(x)))[:, :rows, :columns]
+        return channels_to_blocks(self.leave(jax.nn.relu(x)))[:, :rows, :columns]
 
 
 def parameter_count(tree: Any) -> int:
@@ -86,13 +86,15 @@ def parameter_count(tree: Any) -> int:
     return sum(x.size for x in jax.tree.leaves(eqx.filter(tree, eqx.is_inexact_array)))
 
 
-def _blocks_to_channels(x):
+def blocks_to_channels(x: Float[Array, "c y x"]) -> Float[Array, "c4 y2 x2"]:
+    """2×2 pixels of each channel as four channels, at half the resolution."""
     c, rows, columns = x.shape
     x = x.reshape(c, rows // 2, 2, columns // 2, 2)
     return jnp.transpose(x, (0, 2, 4, 1, 3)).reshape(4 * c, rows // 2, columns // 2)
 
 
-def _channels_to_blocks(x):
+def channels_to_blocks(x: Float[Array, "c4 y2 x2"]) -> Float[Array, "c y x"]:
+    """The inverse of `blocks_to_channels`."""
     c, rows, columns = x.shape
     x = x.reshape(c // 4, 2, 2, rows, columns)
     return jnp.transpose(x, (0, 3, 1, 4, 2)).reshape(c // 4, 2 * rows, 2 * columns)

@@ -1,0 +1,134 @@
+"""The denoiser: what holds by construction, what it refuses, its file."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from helpers import count_traces, finite_difference, relative_l2
+from thincam_jax.learn.checkpoint import CheckpointError
+from thincam_jax.learn.denoiser import network as room
+from thincam_jax.learn.denoiser.network import (
+    Denoiser,
+    DenoiserOptions,
+    create,
+    load_network,
+    network_card,
+    save_network,
+)
+
+OPTIONS = DenoiserOptions((4, 6), (1, 1))
+
+
+@pytest.fixture(scope="module")
+def network():
+    """Not trained, but with a last convolution that is not zero."""
+    made = create(OPTIONS, key=jax.random.key(0))
+    leave = 0.1 * jax.random.normal(jax.random.key(1), made.leave.shape)
+    return eqx.tree_at(lambda n: n.leave, made, leave)
+
+
+@pytest.fixture(scope="module")
+def image():
+    return jax.random.uniform(jax.random.key(2), (2, 11, 14))
+
+
+def test_images_of_any_size_and_batch(network, image):
+    denoiser = Denoiser(network)
+    found = denoiser(image, 0.1)
+    assert found.shape == image.shape and relative_l2(found, image) > 1e-3
+    each = denoiser(image, jnp.asarray([0.1, 0.2]))
+    assert relative_l2(each[0], found[0]) < 1e-12 and relative_l2(each[1], found[1]) > 1e-4
+    assert denoiser(image[0, :1, :1], 0.1).shape == (1, 1)
+    assert denoiser(image.astype(jnp.float32), 0.1).dtype == jnp.float32
+
+
+def test_units_and_offsets_do_not_matter(network, image):
+    """D(a y + b, a σ) = a D(y, σ) + b, and the noise of a uniform image without any is none."""
+    denoiser = Denoiser(network)
+    scaled = denoiser(3.5 * image - 2.0, 0.35)
+    assert relative_l2(scaled, 3.5 * denoiser(image, 0.1) - 2.0) < 1e-12
+
+
+def test_an_image_is_padded_by_its_own_reflection(network):
+    """A side that does not halve: the padded image gives the same inside."""
+    odd = jax.random.uniform(jax.random.key(3), (11, 14))
+    padded = jnp.pad(odd, ((0, 1), (0, 2)), "reflect")
+    centre = jnp.mean(odd)[None]
+    sigma = jnp.full(1, 0.1)
+    found = room.denoised(network, padded[None], sigma, centre)[0, :11, :14]
+    assert relative_l2(Denoiser(network)(odd, 0.1), found) < 1e-12
+
+
+def test_gradients(network, image):
+    weights = jax.random.normal(jax.random.key(4), image.shape)
+
+    def value(given):
+        y, sigma = given
+        return jnp.sum(weights * Denoiser(network)(y, sigma))
+
+    given = image, jnp.asarray(0.1)
+    ways = jax.random.normal(jax.random.key(5), image.shape), jnp.asarray(0.3)
+    slope = jax.grad(value)(given)
+    along = sum(jnp.sum(a * b) for a, b in zip(slope, ways, strict=True))
+    assert float(along) == pytest.approx(float(finite_difference(value, given, ways, 1e-7)), 1e-5)
+
+
+def test_new_values_are_not_compiled_again(network, image):
+    counted = count_traces(lambda d, y, sigma: d(y, sigma))
+    compiled = eqx.filter_jit(counted)
+    one = compiled(Denoiser(network), image, jnp.asarray(0.1))
+    compiled(Denoiser(jax.tree.map(lambda leaf: 2 * leaf, network)), 2 * image, jnp.asarray(0.2))
+    assert counted.traces == 1
+    assert relative_l2(one, Denoiser(network)(image, 0.1)) < 1e-12
+    mapped = jax.vmap(Denoiser(network), (0, None))(image, 0.1)
+    assert relative_l2(mapped, one) < 1e-12
+
+
+@pytest.mark.parametrize(
+    ("image", "sigma", "told"),
+    [
+        (jnp.ones(3), 0.1, r"shape \(3,\); give finite numbers of shape \(\*batch, y, x\)"),
+        (jnp.ones((0, 3)), 0.1, "not empty"),
+        (jnp.full((3, 4), jnp.nan), 0.1, "holds NaN or infinity; give finite"),
+        (jnp.ones((3, 4), complex), 0.1, "complex128 is not real; give finite"),
+        (jnp.ones((3, 4)), 0.0, "give sigma > 0"),
+        (jnp.ones((3, 4)), jnp.nan, "sigma is NaN; give a number"),
+        (jnp.ones((2, 3, 4)), jnp.ones(3), r"shape \(3,\); give one number, or one an image"),
+    ],
+)
+def test_wrong_input_is_told(network, image, sigma, told):
+    with pytest.raises((ValueError, TypeError), match=told) as error:
+        Denoiser(network)(image, sigma)
+    assert "\n" not in str(error.value)
+
+
+def test_a_file_comes_back(network, image, tmp_path):
+    file = save_network(tmp_path / "net.thincam", network, {"steps": 3})
+    card = network_card(file)
+    assert card["training"] == {"steps": 3} and card["options"]["widths"] == [4, 6]
+    assert relative_l2(Denoiser(file)(image, 0.1), Denoiser(network)(image, 0.1)) < 1e-6
+
+
+def test_a_file_of_no_use_is_told(network, tmp_path):
+    file = tmp_path / "net.thincam"
+    spoilt = eqx.tree_at(lambda n: n.leave, network, network.leave.at[0, 0, 1, 1].set(jnp.nan))
+    save_network(file, spoilt)
+    with pytest.raises(CheckpointError, match="weights that are not finite; give an earlier file"):
+        load_network(file)
+    save_network(file, network)
+    file.write_bytes(file.read_bytes()[:-1])
+    with pytest.raises(CheckpointError, match="is damaged or cut off"):
+        load_network(file)
+
+
+@pytest.mark.parametrize("wrong", [((), ()), ((4, 6), (1,)), ((0,), (1,)), ((4,), (-1,))])
+def test_sizes_that_do_not_fit_are_told(wrong):
+    with pytest.raises(ValueError, match="give"):
+        DenoiserOptions(*wrong)
+
+
+def test_untrained_it_changes_nothing(image):
+    untrained = create(OPTIONS, key=jax.random.key(0))
+    np.testing.assert_array_equal(Denoiser(untrained)(image, 0.1), image)

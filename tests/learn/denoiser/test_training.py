@@ -1,0 +1,139 @@
+"""Training of a denoiser: its pictures and crops, and how it is gone on with after a kill."""
+
+import dataclasses
+import os
+import signal
+import subprocess
+import sys
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import PIL.Image
+import pytest
+
+from helpers import ROOT, quick
+from thincam_jax.learn.checkpoint import CheckpointError
+from thincam_jax.learn.denoiser.network import LEAST, MOST, DenoiserOptions, create, load_network
+from thincam_jax.learn.denoiser.pictures import TILE, drawn, photographs, split
+from thincam_jax.learn.denoiser.train import (
+    NETWORK,
+    STATE,
+    DenoisingLessons,
+    draw_crops,
+    loss,
+    train_denoiser,
+)
+from thincam_jax.learn.training import TrainingOptions
+
+OPTIONS = TrainingOptions(steps=60, rate=2e-2, warm_up=5, check_every=20, averaging=0.9)
+LESSONS = DenoisingLessons(drawn(0, 6), drawn(1, 4), batch=8, crop=16, judged=4)
+
+
+def untrained():
+    return create(DenoiserOptions((16, 16), (1, 0)), key=jax.random.key(0))
+
+
+def test_crops_have_the_noise_that_they_say():
+    crops = draw_crops(jnp.asarray(LESSONS.pictures.tiles), 32, 64, jax.random.key(3))
+    noise = np.std(np.asarray(crops.noisy - crops.clean), axis=(1, 2))
+    sigma = np.asarray(crops.sigma)
+    np.testing.assert_allclose(noise / sigma, 1, atol=0.06)
+    assert sigma.min() > LEAST and sigma.max() < MOST and (np.diff(sigma) > 0).all()
+    assert float(crops.clean.min()) >= 0 and crops.clean.shape == (32, 64, 64)
+    spread = np.std(np.asarray(crops.centre) - np.asarray(crops.noisy).mean(axis=(1, 2)))
+    assert 0.05 < spread < 0.3
+
+
+def test_tiles_cover_a_picture_at_several_scales(tmp_path):
+    y, x = np.mgrid[:200, :300]
+    levels = np.uint8(np.stack([y, x * 0.8, 0 * x], axis=-1))
+    PIL.Image.fromarray(levels).save(tmp_path / "ramp.png")
+    PIL.Image.fromarray(levels[..., 0]).save(tmp_path / "grey.png")
+    (tmp_path / "LICENSE").write_text("CC0 1.0\n")
+    found = photographs(tmp_path)
+    tiles = found["ramp"].tiles
+    assert tiles.shape == (4, TILE, TILE, 3)  # two by two: smaller scales hold no tile
+    assert tiles[..., 0].min() == 0 and tiles[0, -1, -1, 1] < tiles[1, -1, -1, 1]
+    assert found["ramp"].manifest[0].licence == "CC0 1.0"
+    assert (np.ptp(found["grey"].tiles, axis=-1) == 0).all()
+    (kept,), (held_out,) = split(found, ["ramp"])
+    assert held_out is found["ramp"] and kept is found["grey"]
+    with pytest.raises(ValueError, match="held_out names 'ramps'; there are grey, ramp"):
+        split(found, ["ramps"])
+
+
+def test_drawn_pictures_are_the_same_for_the_same_seed():
+    one = drawn(0, 4).tiles
+    assert (one == drawn(0, 4).tiles).all() and (one != drawn(2, 4).tiles).any()
+    assert one.shape == (4, TILE, TILE, 3) and one.min() >= 0 and one.max() <= 1
+    assert (one.std(axis=(1, 2, 3)) > 0.01).all()
+
+
+@pytest.fixture(scope="module")
+def whole():
+    return train_denoiser(untrained(), LESSONS, OPTIONS)
+
+
+def test_it_learns_what_holds_for_pictures_that_it_has_not_seen(whole):
+    validation = LESSONS.task(0).validation
+    before, after = (
+        np.asarray([float(loss(net, crops)[0]) for crops in validation])
+        for net in (jax.tree.map(jnp.asarray, untrained()), whole.model)
+    )
+    gain = before - after
+    assert before == pytest.approx(0.0, abs=0.03)  # the noise as it is
+    assert gain.mean() > 0.12 and gain.mean() > 4 * gain.std() / np.sqrt(len(gain))  # 1 dB
+
+
+CHILD = """
+import sys
+from learn.denoiser import test_training as t
+t.train_denoiser(t.untrained(), t.LESSONS, t.OPTIONS, folder=sys.argv[1],
+                 callback=lambda p: print(p.step, flush=True))
+"""
+
+
+def stopped(folder):
+    train_denoiser(
+        untrained(), LESSONS, OPTIONS, folder=folder, callback=lambda progress: progress.step == 27
+    )
+
+
+def killed(folder):
+    env = {**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'tests'}"}
+    env |= {"JAX_ENABLE_X64": "1", "JAX_NUMPY_DTYPE_PROMOTION": "strict"}
+    command = [sys.executable, "-c", CHILD, folder]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, env=env) as child:
+        assert child.stdout is not None
+        while int(child.stdout.readline()) < 27:
+            pass
+        child.send_signal(signal.SIGKILL)
+
+
+@pytest.mark.parametrize("interrupted", quick([stopped, killed], 0))
+def test_an_interrupted_training_ends_with_the_same_numbers(interrupted, whole, tmp_path):
+    interrupted(tmp_path)
+    steps = []
+    resumed = train_denoiser(
+        untrained(), LESSONS, OPTIONS, folder=tmp_path, callback=lambda p: steps.append(p.step)
+    )
+    assert steps[0] == 21 and steps[-1] == 60
+    assert eqx.tree_equal(resumed.state, whole.state)
+    single = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), whole.model)
+    assert eqx.tree_equal(load_network(tmp_path / NETWORK), single)
+    # The state is of this training alone, and whole.
+    other = dataclasses.replace(OPTIONS, rate=1e-3)
+    with pytest.raises(CheckpointError, match=r"training\.rate was 0\.02 and is 0\.001 here"):
+        train_denoiser(untrained(), LESSONS, other, folder=tmp_path)
+    state = tmp_path / STATE
+    state.write_bytes(state.read_bytes()[:-1])
+    with pytest.raises(CheckpointError, match="is damaged or cut off"):
+        train_denoiser(untrained(), LESSONS, OPTIONS, folder=tmp_path)
+
+
+@pytest.mark.parametrize("wrong", [{"crop": 0}, {"crop": TILE + 1}, {"batch": 0}])
+def test_lessons_out_of_range_are_told(wrong):
+    with pytest.raises(ValueError, match=next(iter(wrong))):
+        dataclasses.replace(LESSONS, **wrong)

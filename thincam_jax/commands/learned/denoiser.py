@@ -1,0 +1,171 @@
+"""Experiment files of `kind: denoiser`: pictures, a network and its training in a folder."""
+
+from collections.abc import Callable
+from typing import Annotated, Any, Literal
+
+import jax
+import numpy as np
+import pydantic
+from pydantic import Field
+
+from thincam_jax.commands.config_file import ConfigError
+from thincam_jax.commands.learned.config import Count, SourceConfig, Widths
+from thincam_jax.commands.learned.figures import draw_losses
+from thincam_jax.commands.learned.run import TrainingFolder, check_resume
+from thincam_jax.commands.run_folder import to_json
+from thincam_jax.commands.sections import ExperimentConfig, Section, check_names, misfit
+from thincam_jax.commands.study.figures import save_figure
+from thincam_jax.learn.checkpoint import CheckpointError
+from thincam_jax.learn.denoiser.network import DenoiserOptions, create, load_network
+from thincam_jax.learn.denoiser.pictures import Pictures, drawn, photographs, samples, split, united
+from thincam_jax.learn.denoiser.train import NETWORK, STATE, DenoisingLessons, train_denoiser
+from thincam_jax.learn.denoiser.unet import DenoisingUNet
+from thincam_jax.learn.refocusing.unet import parameter_count
+from thincam_jax.learn.training import TrainingOptions, TrainingProgress
+
+Blocks = Annotated[tuple[Annotated[int, Field(ge=0, le=64)], ...], Field(min_length=1)]
+
+
+class PicturesConfig(SourceConfig):
+    """Pictures of a source; those `held_out`, by their names, judge the network."""
+
+    held_out: tuple[str, ...] = ()
+
+
+class DenoiserNetworkConfig(Section):
+    """See `learn.denoiser.network.DenoiserOptions`."""
+
+    widths: Widths = (32, 48, 64, 64)
+    blocks: Blocks = (1, 1, 1, 1)
+
+
+class DenoiserTrainingConfig(Section):
+    """See `learn.training.TrainingOptions` and `learn.denoiser.train.DenoisingLessons`."""
+
+    steps: Count = 20000
+    batch: Annotated[int, Field(ge=1, le=1024)] = 16
+    crop: Annotated[int, Field(ge=8, le=192)] = 64
+    rate: Annotated[float, Field(gt=0)] = 1e-3
+    warm_up: Annotated[int, Field(ge=0)] = 100
+    falling: Annotated[float, Field(gt=0, le=1)] = 0.5
+    averaging: Annotated[float, Field(ge=0, lt=1)] = 0.999
+    check_every: Count = 500
+    judged: Annotated[int, Field(ge=1, le=1000)] = 16
+
+
+class DenoiserConfig(ExperimentConfig):
+    """A denoiser; `start`: a network's file, or "shipped", that training goes on from."""
+
+    pictured = "sources"
+    kind: Literal["denoiser"]
+    sources: Annotated[tuple[PicturesConfig, ...], Field(min_length=1)]
+    start: str | None = None
+    network: DenoiserNetworkConfig = DenoiserNetworkConfig()
+    training: DenoiserTrainingConfig = DenoiserTrainingConfig()
+    notes: tuple[str, ...] = ()
+
+    @pydantic.model_validator(mode="after")
+    def _fits(self):
+        check_names(self, "sources")
+        if not any(source.use == "train" for source in self.sources):
+            raise misfit("none of them is of use 'train'; give one", "sources")
+        if len(self.network.widths) != len(self.network.blocks):
+            raise misfit("give as many as widths, one for each level", "network", "blocks")
+        return self
+
+
+def run_denoiser(
+    config: DenoiserConfig,
+    folder: TrainingFolder,
+    callback: Callable[[TrainingProgress], object],
+    *,
+    resume: bool = False,
+) -> dict[str, Any]:
+    """Train a denoiser; returns, and writes, what goes into training.json.
+
+    `resume` and errors as of `run_training`.
+    """
+    check_resume(folder, STATE, resume)
+    lessons, network = build_lessons(config), build_network(config)
+    folder.claim(config)
+    settings = {
+        name: getattr(config.training, name)
+        for name in ("steps", "rate", "warm_up", "falling", "averaging", "check_every")
+    }
+    options = TrainingOptions(seed=config.seed, **settings)
+    try:
+        trained = train_denoiser(network, lessons, options, folder=folder.path, callback=callback)
+    except CheckpointError as error:
+        raise ConfigError(str(error)) from None
+    state = trained.state
+    result = {
+        "name": config.name,
+        "kind": config.kind,
+        "status": trained.status,
+        "steps": state.step,
+        "skipped": state.skipped,
+        "retreats": state.retreats,
+        "loss": float(np.nanmin(state.scores)),
+        "scores": [None if score != score else round(float(score), 5) for score in state.scores],
+        "learned_numbers": parameter_count(network),
+        "images": lessons.manifest()["images"],
+        "network": NETWORK,
+    }
+    save_figure(folder, "loss", draw_losses(state, config.training.check_every))
+    folder.write(folder.result, to_json(result))
+    return result
+
+
+def build_network(config: DenoiserConfig) -> DenoisingUNet:
+    """New by the seed of the file, or the one that training starts from.
+
+    **Errors**: ConfigError, one line, for a file of no use or of another size.
+    """
+    options = DenoiserOptions(**dict(config.network))
+    if config.start is None:
+        return create(options, key=jax.random.key(config.seed))
+    try:
+        network = load_network(config.start)
+    except FileNotFoundError:
+        told = f"{config.start}: is missing; give a network's file, or 'shipped'"
+        raise ConfigError(f"{config.place_of('start')}start: {told}") from None
+    except (CheckpointError, OSError) as error:
+        raise ConfigError(f"{config.place_of('start')}start: {error}") from None
+    if network.shape != (options.widths, options.blocks):
+        widths, blocks = network.shape
+        raise ConfigError(
+            f"{config.place_of('start')}start: {config.start} has widths {list(widths)} and blocks "
+            f"{list(blocks)}; give these in the section network"
+        )
+    return network
+
+
+def build_lessons(config: DenoiserConfig) -> DenoisingLessons:
+    """**Errors**: ConfigError, one line for each source that cannot be read."""
+    faults: list[str] = []
+    train: list[Pictures] = []
+    judge: list[Pictures] = []
+    for number, source in enumerate(config.sources):
+        try:
+            kept, held_out = split(_read(source), source.held_out)
+            (train if source.use == "train" else judge).extend(kept)
+            judge.extend(held_out)
+        except (ValueError, OSError) as error:
+            place = config.place_of("sources", number)
+            faults.append(f"{place}sources[{number}]: {error}")
+    if not train and not faults:
+        faults.append(f"{config.place_of('sources')}sources: none is left to train on; give one")
+    if faults:
+        raise ConfigError("\n".join(faults))
+    told = {name: getattr(config.training, name) for name in ("batch", "crop", "judged")}
+    return DenoisingLessons(united(train), united(judge) if judge else None, **told)
+
+
+def _read(source: PicturesConfig) -> dict[str, Pictures]:
+    if source.kind == "drawn":
+        assert source.count is not None  # the section is checked
+        return {source.name: drawn(source.seed, source.count)}
+    if source.kind == "samples":
+        return samples()
+    assert source.path is not None
+    return photographs(source.path, licence=source.licence)

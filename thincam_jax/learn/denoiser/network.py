@@ -1,0 +1,172 @@
+"""The denoiser: an image and its noise level in, the image without noise out; and its file."""
+
+import dataclasses
+import os
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from thincam_jax._core import checks
+from thincam_jax._core.checks import Numbers
+from thincam_jax._core.module import Module
+from thincam_jax.learn.checkpoint import (
+    CheckpointError,
+    read_arrays,
+    read_description,
+    write_arrays,
+)
+from thincam_jax.learn.denoiser.unet import DenoisingUNet
+
+_KIND = "denoiser"
+SHIPPED = "shipped"
+_SHIPPED_FILE = Path(__file__).with_name("shipped.thincam")
+# Noise levels of the training, relative to a range of 1.
+LEAST, MOST = 1 / 255, 100 / 255
+
+
+@dataclasses.dataclass(frozen=True)
+class DenoiserOptions:
+    """Size of the network: see `DenoisingUNet`.
+
+    **Errors**: ValueError for levels that do not fit each other.
+    """
+
+    widths: tuple[int, ...] = (32, 48, 64, 64)
+    blocks: tuple[int, ...] = (1, 1, 1, 1)
+
+    def __post_init__(self):
+        if not self.widths or len(self.widths) != len(self.blocks) or min(self.widths) < 1:
+            raise ValueError(
+                f"widths = {self.widths}, blocks = {self.blocks}; give both for each level, at "
+                "least one channel"
+            )
+        if min(self.blocks) < 0:
+            raise ValueError(f"blocks = {self.blocks}; give 0 or more for each level")
+
+
+class Denoiser(Module):
+    r"""Remove white Gaussian noise of known standard deviation from grey images of any size.
+
+    The network N estimates the noise: :math:`D(y, \sigma) = y - N(y - \bar y, \sigma)`, with the
+    mean :math:`\bar y` of the image. N has no biases, hence :math:`D(a y + b, a \sigma) =
+    a D(y, \sigma) + b` for every a > 0 and b: images may be in any unit, with any offset. It was
+    trained on linear light, for σ from 1/255 to 100/255 of the image's range.
+
+    **Arguments**: `network`, a file that a training wrote, "shipped", the one that comes with the
+    package, or a `DenoisingUNet`.
+
+    **Errors**: CheckpointError, one line, for a damaged file; OSError for what cannot be read.
+
+    >>> denoiser = Denoiser()
+    >>> denoiser(jnp.zeros((3, 20, 31)), 0.1).shape
+    (3, 20, 31)
+    """
+
+    network: DenoisingUNet
+
+    def __init__(self, network: str | os.PathLike[str] | DenoisingUNet = SHIPPED):
+        if not isinstance(network, DenoisingUNet):
+            network = load_network(network)
+        self.network = network
+
+    def __call__(self, image: Numbers, sigma: Numbers) -> Float[Array, "*batch y x"]:
+        """The denoised image.
+
+        **Arguments**
+
+        - `image`: (*batch, y, x); colours are a batch, each is denoised by itself.
+        - `sigma`: standard deviation of the noise, in the unit of the image; one number, or one
+          for each image of the batch.
+
+        **Errors**: ValueError or TypeError, one line, for an image of other dimensions, numbers
+        that are not finite, and a sigma that is not positive or does not fit the batch.
+        """
+        image, sigma = _checked(image, sigma)
+        return _denoised(self.network, image, sigma)
+
+
+def _checked(image: Numbers, sigma: Numbers) -> tuple[Array, Array]:
+    wanted = "give finite numbers of shape (*batch, y, x)"
+    if jnp.ndim(image) < 2 or 0 in jnp.shape(image):
+        raise ValueError(f"image has shape {jnp.shape(image)}; {wanted}, not empty")
+    if jnp.result_type(image).kind not in "fiu":
+        raise TypeError(f"image of {jnp.result_type(image)} is not real; {wanted}")
+    if not checks.is_traced(image) and not np.isfinite(np.asarray(image)).all():
+        raise ValueError(f"image holds NaN or infinity; {wanted}")
+    image = jnp.asarray(image)
+    if not jnp.issubdtype(image.dtype, jnp.floating):
+        image = image.astype(float)
+    batch, shape = image.shape[:-2], jnp.shape(sigma)
+    if shape not in ((), batch):
+        raise ValueError(f"sigma has shape {shape}; give one number, or one an image: {batch}")
+    sigma = checks.positive_all("sigma", jnp.asarray(sigma, image.dtype), "the image's unit")
+    return image, jnp.broadcast_to(sigma, batch)
+
+
+@eqx.filter_jit
+def _denoised(network: DenoisingUNet, image: Array, sigma: Array) -> Array:
+    images = image.reshape(-1, *image.shape[-2:])
+    centre = jnp.mean(images, axis=(1, 2))
+    return denoised(network, images, sigma.reshape(-1), centre).reshape(image.shape)
+
+
+def denoised(
+    network: DenoisingUNet,
+    images: Float[Array, "image y x"],
+    sigma: Float[Array, " image"],
+    centre: Float[Array, " image"],
+) -> Float[Array, "image y x"]:
+    """Images minus the noise that the network finds in them once their `centre` is taken out."""
+    return images - jax.vmap(network)(images - centre[:, None, None], sigma)
+
+
+def create(options: DenoiserOptions = DenoiserOptions(), *, key: PRNGKeyArray) -> DenoisingUNet:
+    """An untrained network, which finds no noise."""
+    return DenoisingUNet(options.widths, options.blocks, key=key)
+
+
+def save_network(
+    path: str | os.PathLike[str], network: DenoisingUNet, told: dict[str, Any] | None = None
+) -> Path:
+    """Write a network, its options, and what is `told` of its training: JSON."""
+    description = {
+        "kind": _KIND,
+        "options": dict(zip(("widths", "blocks"), network.shape, strict=True)),
+        "training": told or {},
+    }
+    return write_arrays(path, network, description)
+
+
+def load_network(path: str | os.PathLike[str]) -> DenoisingUNet:
+    """Read a network; `path` may be "shipped".
+
+    **Errors**: CheckpointError, one line, for a damaged file, one of another kind, and weights
+    that are not finite; OSError for what cannot be read.
+    """
+    path = _SHIPPED_FILE if str(path) == SHIPPED else path
+    stored = network_card(path)["options"]
+    try:
+        options = DenoiserOptions(tuple(stored["widths"]), tuple(stored["blocks"]))
+        like = eqx.filter_eval_shape(lambda key: create(options, key=key), jax.random.key(0))
+    except (TypeError, ValueError, KeyError) as error:
+        raise CheckpointError(f"{path}: holds options of another version ({error})") from None
+    like = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, jnp.float32), like)
+    weights = read_arrays(path, like)
+    if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(weights)):
+        raise CheckpointError(f"{path}: holds weights that are not finite; give an earlier file")
+    return jax.tree.map(jnp.asarray, weights)
+
+
+def network_card(path: str | os.PathLike[str] = SHIPPED) -> dict[str, Any]:
+    """What a file says of its network: `options` and `training`, with the images' licences."""
+    path = _SHIPPED_FILE if str(path) == SHIPPED else path
+    description = read_description(path)
+    parts = (description.get(name) for name in ("options", "training"))
+    if description.get("kind") != _KIND or not all(isinstance(part, dict) for part in parts):
+        raise CheckpointError(f"{path}: holds no {_KIND}; give a file that a training wrote")
+    return description
