@@ -323,18 +323,18 @@ start.main()
 """
 _SWALLOWED = """
 import gc, os, signal, sys, time
-from thincam_jax.commands import start
-signal.signal(signal.SIGINT, start.leave)
-sys.unraisablehook = start._again
+from thincam_jax.commands import interrupt
+signal.signal(signal.SIGINT, interrupt.leave)
+sys.unraisablehook = interrupt._again
 gc.callbacks.append(lambda phase, _: phase == "stop" and os.kill(os.getpid(), signal.SIGINT))
-with start.interruptible():
+with interrupt.interruptible():
     try:
         gc.collect()
         gc.callbacks.clear()
         time.sleep(20)  # which the signal ends
     except KeyboardInterrupt:
         print("told", flush=True)
-        os._exit(start.INTERRUPTED)
+        os._exit(interrupt.INTERRUPTED)
 """
 
 
