@@ -184,9 +184,9 @@ def test_flatcam_page():
 
 
 def test_pages_are_short_and_listed():
-    """At most 900 words; the index and the menu lead to all of them."""
+    """At most 940 words; the index and the menu lead to all of them."""
     pages = {path.name: path.read_text("utf-8") for path in (ROOT / "docs").glob("*.md")}
-    assert not {name: len(page.split()) for name, page in pages.items() if len(page.split()) > 900}
+    assert not {name: len(page.split()) for name, page in pages.items() if len(page.split()) > 940}
     menu = (ROOT / "mkdocs.yml").read_text("utf-8")
     others = set(pages) - {"index.md"}
     assert {name for name in others if f"]({name})" not in pages["index.md"]} == set()

@@ -65,7 +65,7 @@ def test_nothing_is_overwritten(tmp_path):
 
 def test_unknown_kind_and_missing_folder(tmp_path):
     line = one_line(call("init", "camera"))
-    named = "study, refocus, design, capture, learned, design_both, "
+    named = "study, refocus, design, capture, learned, denoiser, design_both, "
     assert line.startswith(f"init camera: choose one of {named}")
     assert "cannot be written (No such file" in one_line(
         call("init", "study", "--out", tmp_path / "no" / "study.yaml")

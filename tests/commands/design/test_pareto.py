@@ -157,7 +157,7 @@ def test_captures_are_simulated_with_their_part_of_the_light(on_a_grid, tmp_path
 
     def simulate(study, target, seeds):
         (method,) = study.methods
-        asked.append((method.exposures[0].share, target.number, target.name, seeds))
+        asked.append((method.exposures[0].relative_time, target.number, target.name, seeds))
         assert study.sensor.electrons == study.config.noise.electrons
         return {method.name: [{"psnr_db": 20.0 + len(asked)}]}
 
