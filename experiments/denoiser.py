@@ -151,7 +151,7 @@ figure.savefig(FIGURES / "psnr.png", dpi=110)
 # %% [markdown]
 # ## A noise level that is wrong
 #
-# The denoiser is told σ. What if it is told another?
+# The denoiser needs σ. What does a wrong σ cost?
 
 # %%
 factors, sigma = np.asarray([0.5, 0.7, 0.85, 1.0, 1.2, 1.4, 2.0]), LEVELS[1]
@@ -161,7 +161,7 @@ told = [
 ]
 figure, ax = plt.subplots(figsize=(5, 3.4), layout="constrained")
 ax.plot(factors, told, "ko-")
-ax.set(xlabel="σ told over σ", ylabel="PSNR (dB)", xscale="log", title="σ = 25/255, linear light")
+ax.set(xlabel="σ given over σ", ylabel="PSNR (dB)", xscale="log", title="σ = 25/255, linear light")
 figure.savefig(FIGURES / "told.png", dpi=110)
 
 # %%

@@ -42,7 +42,7 @@ FRONT_END = "commands"
 PLOT = "plot"  # draws with matplotlib; what has a `plot` method imports it in that method
 # They read what is the package's own, and what the system says of itself.
 READ_OWN = (
-    *("_core/memory.py", "commands/page.py", "commands/report.py", "commands/examples.py"),
+    *("_core/memory.py", "commands/report.py", "commands/examples.py"),
     "hardware/virtual/",
     *("hardware/cameras/usb3_vision/link.py", "hardware/stages/serial_link.py"),
 )

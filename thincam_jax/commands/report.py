@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import jinja2
 
 from thincam_jax._core.files import read_regular
+from thincam_jax._core.table import number as number
 from thincam_jax.commands.checked_config import dump_config
 from thincam_jax.commands.config_file import slug
 
@@ -104,6 +105,14 @@ def render_report(page: Page, config: Any, pictures: Path, environment: dict[str
 
     Texts are escaped; a name that is missing is an error.
     """
+    kinds = {Table: "table", Picture: "picture", Sentences: "sentences", str: "text"}
+    parts = [part for part in page.parts if any(part.contents)]
+    given = {"kind_of": lambda content: kinds[type(content)], "environment": environment}
+    return render("report.html.jinja", config, pictures, page=page, parts=parts, **given)
+
+
+def render(template: str, config: Any, pictures: Path, **shown: Any) -> str:
+    """Render a template of the commands with `config`, its `yaml`, `picture` by file, `shown`."""
     engine = jinja2.Environment(
         loader=jinja2.FunctionLoader(_template),
         autoescape=True,
@@ -111,25 +120,17 @@ def render_report(page: Page, config: Any, pictures: Path, environment: dict[str
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    kinds = {Table: "table", Picture: "picture", Sentences: "sentences", str: "text"}
-    engine.globals |= {"kind_of": lambda content: kinds[type(content)]}
+    engine.globals |= {"number": number, "slug": slug}
 
     def picture(name: str) -> str | None:
         return data_url(pictures / name) if (pictures / name).exists() else None
 
-    given = {"config": config, "yaml": dump_config(config), "environment": environment}
-    parts = [part for part in page.parts if any(part.contents)]
-    given |= {"page": page, "parts": parts, "picture": picture}
-    return engine.get_template("report.html.jinja").render(**given)
+    given = {"config": config, "yaml": dump_config(config), "picture": picture, **shown}
+    return engine.get_template(template).render(**given)
 
 
 def _template(name: str) -> str:
     return resources.files("thincam_jax.commands").joinpath(name).read_text(encoding="utf-8")
-
-
-def number(value: float | None, digits: int) -> str:
-    """With so many decimals; a dash for none."""
-    return "–" if value is None else f"{value:.{digits}f}"
 
 
 def data_url(picture: Path) -> str:

@@ -131,13 +131,13 @@ def create(options: DenoiserOptions = DenoiserOptions(), *, key: PRNGKeyArray) -
 
 
 def save_network(
-    path: str | os.PathLike[str], network: DenoisingUNet, told: dict[str, Any] | None = None
+    path: str | os.PathLike[str], network: DenoisingUNet, training: dict[str, Any] | None = None
 ) -> Path:
-    """Write a network, its options, and what is `told` of its training: JSON."""
+    """Write a network, its options, and a record of its training: JSON."""
     description = {
         "kind": _KIND,
         "options": dict(zip(("widths", "blocks"), network.shape, strict=True)),
-        "training": told or {},
+        "training": training or {},
     }
     return write_arrays(path, network, description)
 

@@ -41,8 +41,8 @@ NETWORK, STATE = "network.thincam", "training.state"
 _JUDGED = 2**31
 # ln of the exponents and factors that change the contrast of a crop.
 _GAMMA, _GAIN = (-0.9, 0.3), (-0.8, 0.5)
-# Standard deviation of what is taken out of a crop beside its mean: parts of a large image are
-# farther from its mean than the pixels of a crop from theirs.
+# Standard deviation of an offset subtracted from a crop beside its mean: in a large image, local
+# means differ from the mean of the whole.
 _OFFSET = 0.15
 # Squared error relative to σ² below which a crop counts as solved: flat ones have no more to learn.
 _SOLVED = 1e-3
@@ -191,7 +191,7 @@ def _seconds(path: Path) -> float:
 
 
 def _keep(path: Path, settings, told, before: float, state: TrainingState) -> None:
-    """Writes the best network, with what is told of its training, and what to go on from."""
+    """Write the best network with its training record, and the state from which to resume."""
     scores = [round(float(score), 5) for score in state.scores if score == score]
     numbers = {"steps": state.step, "skipped": state.skipped, "retreats": state.retreats}
     seconds = round(before + time.process_time(), 1)
