@@ -36,7 +36,7 @@ MAX_LINES = 500
 
 JAXOPT_FILES = ("reconstruction/implicit_gradient.py", "design/_jaxopt.py")
 FRONT_END_LIBRARIES = ("matplotlib", "pydantic", "typer", "rich", "jinja2")
-FRONT_END = "commands"
+FRONT_END, DRAWS = "commands", "matplotlib"
 # They read what is the package's own, and what the system says of itself.
 READ_OWN = (
     *("_core/memory.py", "commands/page.py", "commands/examples.py", "hardware/virtual/"),
@@ -142,9 +142,8 @@ def imports_against_the_floors(modules: list[Module]) -> list[str]:
 
 def may_use_the_rig(module: Module, line: int) -> bool:
     """A command's file may, where the import waits for the command to be called."""
-    functions = [n for n in ast.walk(module.tree) if isinstance(n, ast.FunctionDef)]
-    inside = any(f.lineno < line <= (f.end_lineno or f.lineno) for f in functions)
-    return module.top == FRONT_END and Path(module.path).name == "command.py" and inside
+    is_command = module.top == FRONT_END and Path(module.path).name == "command.py"
+    return is_command and waits(module, line)
 
 
 def modules_hidden_by_names(modules: list[Module]) -> list[str]:
@@ -171,12 +170,24 @@ def jaxopt_outside_its_files(modules: list[Module]) -> list[str]:
 
 
 def front_end_libraries_in_the_core(modules: list[Module]) -> list[str]:
+    """A result may draw itself: matplotlib is then imported in the function, or for types only."""
     return [
         f"{module.path}:{line}: imports {name.split('.')[0]}; only {FRONT_END} may"
         for module in modules
         for line, name in module.imports()
         if name.split(".")[0] in FRONT_END_LIBRARIES and module.top != FRONT_END
+        if not (name.split(".")[0] == DRAWS and waits(module, line))
     ]
+
+
+def waits(module: Module, line: int) -> bool:
+    """Whether an import waits for a function's call, or is the type checker's alone."""
+    blocks = (n for n in ast.walk(module.tree) if isinstance(n, (ast.FunctionDef, ast.If)))
+    return any(
+        block.lineno < line <= (block.end_lineno or block.lineno)
+        for block in blocks
+        if isinstance(block, ast.FunctionDef) or ast.unparse(block.test) == "TYPE_CHECKING"
+    )
 
 
 def bare_files(modules: list[Module]) -> list[str]:
@@ -322,6 +333,7 @@ BROKEN = [
     (jaxopt_outside_its_files, "reconstruction/tv.py", "import jaxopt", "and design/_jaxopt.py"),
     (jaxopt_outside_its_files, "_jaxopt.py", "from jaxopt.projection import x", "imports jaxopt"),
     (front_end_libraries_in_the_core, "lensless/psf.py", "import matplotlib.pyplot", "matplotlib"),
+    (front_end_libraries_in_the_core, "design/a.py", "def f():\n    import rich", "rich"),
     (front_end_libraries_in_the_core, "units.py", "from pydantic import BaseModel", "pydantic"),
     (front_end_libraries_in_the_core, "hardware/stage.py", "import typer", "typer"),
     (front_end_libraries_in_the_core, "__init__.py", "import rich, jinja2", "jinja2"),
@@ -365,6 +377,8 @@ SOUND = [
     ("design/space.py", DOC + "class A:\n    def f(self, x: int):\n        def g(y): ..."),
     ("lensless/psf.py", DOC + "import rich_text, jaxoptics\n" + "x = 1\n" * (MAX_LINES - 2)),
     ("reconstruction/implicit_gradient.py", DOC + "import jaxopt"),
+    ("design/landscape.py", DOC + "def plot():\n    import matplotlib.pyplot as plt"),
+    ("design/curve.py", DOC + "if TYPE_CHECKING:\n    from matplotlib.axes import Axes"),
     ("commands/figures.py", DOC + "import matplotlib.pyplot, jinja2\nfrom ..learn import x"),
     ("commands/rig/command.py", DOC + "def run():\n    from ...hardware import stage"),
     ("hardware/stage.py", DOC + "from thincam_jax.measured.read import x\nfrom .bus import y"),

@@ -12,7 +12,6 @@ from jaxtyping import Array
 from thincam_jax._core.precision import allow
 from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.design.config import DesignConfig
-from thincam_jax.commands.design.problem import phases_of
 from thincam_jax.commands.sections import MaskConfig, MethodConfig, MethodShotConfig, SensorConfig
 from thincam_jax.commands.study import build
 from thincam_jax.commands.study.config import StudyConfig
@@ -83,7 +82,7 @@ def _method(config: DesignConfig, name: str, design: Design) -> Method:
         taken[row] += 1
         exposures.append(Exposure(*row, take=taken[row]))
     synthesis = config.reference.synthesis
-    return Method(name, "wiener", synthesis, tuple(exposures), phases_of(design))
+    return Method(name, "wiener", synthesis, tuple(exposures), design.phases)
 
 
 def as_study_config(study: Study) -> StudyConfig:
