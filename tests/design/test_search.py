@@ -163,7 +163,6 @@ def tiny(design, data):
         ({"starts": 0}, "starts = 0; give at least 1"),
         ({"samples": 0}, "samples = 0"),
         ({"steps": -1}, "steps = -1"),
-        ({"solver": "newton"}, "solver = 'newton'"),
     ],
 )
 def test_errors(options, message):
