@@ -38,8 +38,8 @@ MAX_LINES = 500
 
 JAXOPT_FILES = ("reconstruction/implicit_gradient.py", "design/_jaxopt.py")
 FRONT_END_LIBRARIES = ("matplotlib", "pydantic", "typer", "rich", "jinja2")
-FRONT_END = "commands"
-PLOT = "plot"  # draws with matplotlib; what has a `plot` method imports it in that method
+PLOT = "plot"  # draws with matplotlib; others import that in a function
+FRONT_END, DRAWS = "commands", "matplotlib"
 # They read what is the package's own, and what the system says of itself.
 READ_OWN = (
     *("_core/memory.py", "commands/page.py", "commands/report.py", "commands/examples.py"),
@@ -159,12 +159,7 @@ def imports_against_the_floors(modules: list[Module]) -> list[str]:
 def may_use_the_rig(module: Module, line: int) -> bool:
     """A command's file may, where the import waits for the command to be called."""
     is_command = module.top == FRONT_END and Path(module.path).name == "command.py"
-    return is_command and inside_a_function(module, line)
-
-
-def inside_a_function(module: Module, line: int) -> bool:
-    functions = [n for n in ast.walk(module.tree) if isinstance(n, ast.FunctionDef)]
-    return any(f.lineno < line <= (f.end_lineno or f.lineno) for f in functions)
+    return is_command and waits(module, line)
 
 
 def modules_hidden_by_names(modules: list[Module]) -> list[str]:
@@ -191,14 +186,24 @@ def jaxopt_outside_its_files(modules: list[Module]) -> list[str]:
 
 
 def front_end_libraries_in_the_core(modules: list[Module]) -> list[str]:
+    """A result may draw itself: matplotlib is then imported in the function, or for types only."""
     return [
         f"{module.path}:{line}: imports {name.split('.')[0]}; only {FRONT_END} may"
         for module in modules
-        for line, name in module.imports(at_run_time=True)
-        if name.split(".")[0] in FRONT_END_LIBRARIES
-        and module.top != FRONT_END
-        and (module.top, name.split(".")[0]) != (PLOT, "matplotlib")
+        for line, name in module.imports()
+        if name.split(".")[0] in FRONT_END_LIBRARIES and module.top != FRONT_END
+        if name.split(".")[0] != DRAWS or not (module.top == PLOT or waits(module, line))
     ]
+
+
+def waits(module: Module, line: int) -> bool:
+    """Whether an import waits for a function's call, or is the type checker's alone."""
+    blocks = (n for n in ast.walk(module.tree) if isinstance(n, (ast.FunctionDef, ast.If)))
+    return any(
+        block.lineno < line <= (block.end_lineno or block.lineno)
+        for block in blocks
+        if isinstance(block, ast.FunctionDef) or ast.unparse(block.test) == "TYPE_CHECKING"
+    )
 
 
 def bare_files(modules: list[Module]) -> list[str]:
@@ -407,6 +412,7 @@ BROKEN = [
     (jaxopt_outside_its_files, "_jaxopt.py", "from jaxopt.projection import x", "imports jaxopt"),
     (front_end_libraries_in_the_core, "lensless/psf.py", "import matplotlib.pyplot", "matplotlib"),
     (front_end_libraries_in_the_core, "plot/curves.py", "import rich", "imports rich"),
+    (front_end_libraries_in_the_core, "design/a.py", "def f():\n    import rich", "rich"),
     (front_end_libraries_in_the_core, "units.py", "from pydantic import BaseModel", "pydantic"),
     (front_end_libraries_in_the_core, "hardware/stage.py", "import typer", "typer"),
     (front_end_libraries_in_the_core, "__init__.py", "import rich, jinja2", "jinja2"),
@@ -488,6 +494,8 @@ SOUND = [
     ("reconstruction/implicit_gradient.py", DOC + "import jaxopt"),
     ("plot/curves.py", DOC + "import matplotlib.figure"),
     ("design/landscape.py", DOC + "def plot():\n    from ..plot import curves"),
+    ("design/landscape.py", DOC + "def plot():\n    import matplotlib.pyplot as plt"),
+    ("design/curve.py", DOC + "if TYPE_CHECKING:\n    from matplotlib.axes import Axes"),
     ("commands/figures.py", DOC + "import matplotlib.pyplot, jinja2\nfrom ..learn import x"),
     (
         "studies/result.py",
