@@ -149,7 +149,7 @@ def imports_against_the_floors(modules: list[Module]) -> list[str]:
                 complaints.append(f"{where}: {OUTSIDE} imports {target}, above {OUTSIDE_USES}")
             elif module.top in FLOOR and FLOOR[target] >= FLOOR[module.top]:
                 if {module.top, target} != {"units", "_core"}:
-                    if target != PLOT or not inside_a_function(module, line):
+                    if target != PLOT or not waits(module, line):
                         complaints.append(
                             f"{where}: {module.top} imports {target}, which is no lower"
                         )
