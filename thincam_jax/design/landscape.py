@@ -78,9 +78,9 @@ class Landscape:
         - `ax`: to draw in; by default of a new figure of pyplot, which a notebook shows.
         """
         if ax is None:
-            import matplotlib.pyplot as plt
+            from thincam_jax.plot.frame import new_figure
 
-            _, ax = plt.subplots(figsize=(7.6, 6.0), layout="constrained")
+            ax = new_figure(7.6, 6.0).subplots()
         scaled = zip(self.variables, self.axes, strict=True)
         axes = [axis * REPORTED[name].scale for (name, _), axis in scaled]
         labels = [REPORTED[name].of_shots(shots) for name, shots in self.variables]
