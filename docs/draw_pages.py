@@ -3,6 +3,8 @@
 Names are those of the functions below; without one all are drawn, in some minutes.
 """
 
+import os
+import runpy
 import shutil
 import sys
 import tempfile
@@ -110,7 +112,8 @@ def design_landscape():
     """The expected error over two pitches of the thesis' camera, and pairs of docs/designs.md."""
     space, *data = _two_pitches()
     count, (low, high) = 57, (8.0, 36.0)
-    _, error = design.landscape(_expected_error, space, (*data, design.Polar(290.0, 128, 2)), count)
+    data = (*data, design.Polar(290.0, 128, 2))
+    _, error = design.evaluate_grid(_expected_error, space, data, count)
     level = _decibels(error / jnp.nanmin(error)).reshape(count, count)
     figure = Figure(figsize=(6.4, 4.2), layout="constrained")
     ax = figure.subplots()
@@ -137,7 +140,7 @@ def design_front():
     for distance in distances:
         thesis = eqx.tree_at(lambda d: d.distance, space.base, jnp.full(4, distance))
         moved = design.DesignSpace(thesis, space.variables)
-        _, found = design.landscape(_expected_error, moved, data, 29)
+        _, found = design.evaluate_grid(_expected_error, moved, data, 29)
         levels.append([_decibels(_expected_error(thesis, data)), _decibels(np.nanmin(found))])
     figure = Figure(figsize=(6.4, 3.2), layout="constrained")
     ax = figure.subplots()
@@ -192,17 +195,15 @@ def which_mask():
 
 
 def screen_design():
-    """What each number of two plates does, from a short search with few pixels."""
-    small = (
-        "sensor.shape=[44, 44]",
-        "sensor.pitch=48 um",
-        "object.cells=[16, 16]",
-        "search={starts: 1, samples: 16, steps: 8}",
-        "focal_distances=[]",
-        "method={name: ridge, kind: ridge}",
-    )
-    words = [word for text in small for word in ("--set", text)]
-    return _by_command("figures/slices.png", "design", "configs/sts_design.yaml", *words)
+    """What each number of two plates does, from the small size of its experiment."""
+    return _by_script("sts_design", "slices.png")
+
+
+def _by_script(name: str, picture: str) -> Path:
+    out = Path(tempfile.mkdtemp())
+    os.environ |= {"THINCAM_SIZE": "small", "THINCAM_FIGURES": str(out)}
+    runpy.run_path(str(ROOT / "experiments" / f"{name}.py"))
+    return out / name / picture
 
 
 def _by_command(picture: str, command: str, config: str, *options: str) -> Path:

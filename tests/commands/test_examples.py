@@ -16,7 +16,6 @@ from thincam_jax.commands.design.config import load_design
 from thincam_jax.commands.kinds import load_experiment
 from thincam_jax.commands.learned.config import LearnedConfig
 from thincam_jax.commands.learned.denoiser import DenoiserConfig
-from thincam_jax.commands.plate.config import PlateDesignConfig
 
 FILES = sorted((ROOT / "configs").glob("*.yaml"))
 
@@ -34,8 +33,6 @@ def test_a_file_that_its_command_takes(kind, tmp_path, monkeypatch):
     }
     if kind == "denoiser":
         takes["train"] = partial(load_as, DenoiserConfig)
-    if kind == "sts_design":
-        takes["design"] = partial(load_as, PlateDesignConfig)
     assert result.stdout == f"{kind}.yaml; next: thincam {command} {kind}.yaml\n"
     takes.get(command, load_experiment)(tmp_path / f"{kind}.yaml")
 

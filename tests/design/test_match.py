@@ -9,8 +9,7 @@ import pytest
 from design.setting import setup, two_betas
 
 from thincam_jax.design import Polar, PowerLaw, match_response
-from thincam_jax.design.match import _least_squares
-from thincam_jax.design.target_response import ResponseModel
+from thincam_jax.design.match import ResponseModel, _least_squares
 from thincam_jax.reconstruction import phase_pairs
 
 RINGS = 16

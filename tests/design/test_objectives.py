@@ -7,20 +7,28 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from design import small
 from design.setting import HIGHEST, setup
 
 from helpers import count_traces, finite_difference
 from thincam_jax.design import (
+    BayesError,
     Design,
     PhotonNoise,
     Polar,
     PowerLaw,
     Quadrant,
+    ResolutionLimit,
+    RobustError,
     SignalNoise,
+    Tolerances,
+    Unevenness,
+    WorstRatio,
     bayes_error,
     channels,
     limit,
     mismatch_error,
+    robust_error,
     unevenness,
     worst_ratio_db,
 )
@@ -257,3 +265,39 @@ def test_gradients(noise, frequencies):
 def test_synthesis_must_fit():
     with pytest.raises(ValueError, match=r"give \(channel, 4\), one column for each"):
         channels(TESTED, setup(), jnp.ones((2, 3)), FREQUENCIES)
+
+
+def test_objectives_are_minimised_and_reported_in_their_sense():
+    problem, band = small.problem(), (0.1, 0.6)
+    data, design = problem.data, problem.space.base
+    known = data.channels(design)
+    error, edge, uneven, ratio = BayesError(), ResolutionLimit(), Unevenness(band), WorstRatio(band)
+    cost = float(error(design, data))
+    assert cost == pytest.approx(float(bayes_error(known)))
+    assert error.reported(cost) == pytest.approx(10 * np.log10(cost))
+    assert error.gain(0.2, 0.1) == pytest.approx(3.0103, abs=1e-4)
+    assert error.increase(0.2) == pytest.approx(0.002)
+    cost = float(edge(design, data))
+    assert cost == pytest.approx(-float(limit(known, data.frequencies)))
+    expected = float(unevenness(known, data.frequencies, band))
+    assert float(uneven(design, data)) == pytest.approx(expected)
+    assert edge.reported(cost) == -cost > 0
+    assert edge.gain(-10.0, -12.0) == pytest.approx(2.0)
+    assert uneven.gain(3.0, 2.0) == pytest.approx(1.0)
+    assert ratio.gain(-10.0, -12.0) == pytest.approx(2.0)
+    assert ratio.increase(40.0) == pytest.approx(10 * np.log10(1.01), abs=1e-4)
+    assert hash(ratio) == hash(WorstRatio(band))  # compiled once
+    assert WorstRatio(band) == ratio != WorstRatio()
+    assert edge.label == "limit of resolution (cycles/rad)"
+
+
+@pytest.mark.thorough
+def test_tolerances_cost_something():
+    tolerances = Tolerances(beta=0.002, distance=0.03)
+    robust, problem = RobustError(tolerances), small.problem()
+    base, data = problem.space.base, problem.data
+    found = float(robust(base, data))
+    given = data.setup, data.synthesis, data.frequencies
+    assert found == pytest.approx(float(robust_error(base, *given, tolerances)), rel=1e-12)
+    assert found > 1.001 * float(BayesError()(base, data))
+    assert robust.reported(found) == pytest.approx(10 * np.log10(found))

@@ -7,7 +7,14 @@ import pytest
 from design.setting import HIGHEST, error, setup, two_betas
 
 from helpers import in_full, quick
-from thincam_jax.design import DesignSpace, Polar, PowerLaw, Variable, find_designs, landscape
+from thincam_jax.design import (
+    DesignProblem,
+    Polar,
+    PowerLaw,
+    SearchSettings,
+    evaluate_grid,
+    find_designs,
+)
 from thincam_jax.design.search import _descend, _descend_in_box
 
 SPACE = two_betas()
@@ -40,8 +47,9 @@ def counted(design, data):
 
 
 def run(objective, data, seed=0, **options):
-    options = {"starts": 6, "samples": 64} | options
-    return find_designs(objective, SPACE, data, key=jax.random.key(seed), **options)
+    problem = DesignProblem(objective, SPACE, data, options.pop("exact", None))
+    settings = SearchSettings(**({"starts": 6, "samples": 64} | options))
+    return find_designs(problem, settings, key=jax.random.key(seed))
 
 
 SOLVERS = pytest.mark.parametrize("solver", ["bfgs", "lbfgsb"])
@@ -149,14 +157,6 @@ def tiny(design, data):
     return 1e-9 * waves(design, data)
 
 
-def test_landscape():
-    space = DesignSpace(SPACE.base, (Variable("beta", 8.0, 36.0, (0, 1)),))
-    points, values = landscape(waves, space, jnp.asarray([22.0, 21.0]), 57)
-    assert points.shape == (57, 1)
-    assert int(jnp.argmin(values)) == 28
-    np.testing.assert_allclose(values[28], 0.2, rtol=1e-12)
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -170,11 +170,6 @@ def test_errors(options, message):
         run(waves, jnp.asarray(DEEPEST), **options)
 
 
-def test_landscape_is_small():
-    with pytest.raises(ValueError, match="2 or more a side and at most 10 million"):
-        landscape(waves, SPACE, jnp.asarray(DEEPEST), 4000)
-
-
 @pytest.mark.parametrize(
     ("frequencies", "grid", "seeds"),
     in_full((Polar(HIGHEST, 128, 2), 161, 20), (Polar(HIGHEST, 512, 3), 321, 100)),
@@ -182,8 +177,9 @@ def test_landscape_is_small():
 def test_95_per_cent_of_searches_find_the_best_of_a_fine_grid(optimised, frequencies, grid, seeds):
     """Within 0.1 %; of a hundred 99 do, each in a hundredth of the grid's evaluations."""
     data = (setup(prior=PowerLaw(2.8)), frequencies)
-    lowest = float(jnp.min(landscape(error, SPACE, data, grid)[1]))
-    results = [find_designs(error, SPACE, data, key=jax.random.key(s)) for s in range(seeds)]
+    lowest = float(jnp.min(evaluate_grid(error, SPACE, data, grid)[1]))
+    problem = DesignProblem(error, SPACE, data)
+    results = [find_designs(problem, key=jax.random.key(s)) for s in range(seeds)]
     excess = np.array([r.found[0].objective / lowest - 1 for r in results])
     assert np.sum(excess < 1e-3) >= 0.95 * seeds
     assert max(r.evaluations for r in results) <= 1030

@@ -1,6 +1,7 @@
-"""What a design chooses: the captures of a lensless camera."""
+"""Designs: the captures of a lensless camera with Fresnel zone apertures."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass, fields
 from typing import get_args
 
 import equinox as eqx
@@ -17,6 +18,21 @@ from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.masks.fza import FresnelZoneAperture, Profile
 
 MOST_CAPTURES = 8
+
+
+@dataclass(frozen=True, order=True)
+class Shot:
+    """Captures of a design that differ in phase only.
+
+    - `beta`: rad/mm²; `distance`, `wavelength`, `width` of the mask: mm.
+    - `exposure`: of each capture, relative to the others.
+    """
+
+    beta: float
+    distance: float
+    wavelength: float
+    width: float
+    exposure: float = 1.0
 
 
 class Design(Module):
@@ -75,6 +91,19 @@ class Design(Module):
     @property
     def captures(self) -> int:
         return self.beta.shape[0]
+
+    @property
+    def phases(self) -> int:
+        """Captures of each shot: every shot has the same, different phases."""
+        return len(np.unique(np.asarray(self.phase)))
+
+    @property
+    def shots(self) -> tuple[Shot, ...]:
+        """The numbers of each shot, in the order of the captures."""
+        numbers = (getattr(self, field.name) for field in fields(Shot))
+        each = np.broadcast_arrays(*(np.asarray(n, dtype=float) for n in numbers))
+        rows = zip(*(n[:: self.phases].tolist() for n in each), strict=True)
+        return tuple(Shot(*row) for row in rows)
 
     def mask(self, beta: Number, phase: Number) -> FresnelZoneAperture:
         """The mask of a capture, of the width and the profile that all share."""

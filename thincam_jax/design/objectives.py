@@ -1,15 +1,17 @@
-r"""What makes a design good: pure functions of it, differentiable in every number.
+r"""Objectives of a design: pure functions, differentiable in every number of it, and their objects.
 
-All but the end-to-end ones rest on what the captures say of each frequency of the scene. With
-responses H_k, noise spectra η_k and the synthesis W (`reconstruction.synthesis`) this is
+All rest on what the captures tell of each frequency of the scene. With responses H_k, noise spectra
+η_k and the synthesis W (`reconstruction.synthesis`) this is
 
 .. math:: J(\nu) = \sum_c \frac{|\sum_k W_{ck} \bar H_k|^2}
     {\sum_k W_{ck}^2 \eta_k + \eta_c^{crop}}
 
 where H̄ is what the sensor sees of H, and η^crop what it cuts off (`thincam_jax.design.response`).
+An `AbstractObjective` makes a cost to minimise of them, and knows how to report it.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Literal
 
 import equinox as eqx
 import jax
@@ -17,11 +19,20 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from thincam_jax._core import checks
 from thincam_jax.design.design import Design
 from thincam_jax.design.frequencies import Frequencies
-from thincam_jax.design.response import responses
+from thincam_jax.design.response import (
+    capture_light,
+    responses,
+    signal_variance,
+    spectral_density,
+)
 from thincam_jax.design.setup import Setup
-from thincam_jax.design.signal import capture_light, signal_variance, spectral_density
+
+DEFAULT_BAND = (0.05, 0.5)  # of the highest frequency
+# Increase counted as 1 % worse, and 10 log10(1.01) dB for values in dB.
+_ONE_PERCENT, _ONE_PERCENT_DB = 0.01, 0.0432
 
 
 class Channels(eqx.Module):
@@ -55,7 +66,7 @@ def channels(
     synthesis: Float[Array, "channel capture"],
     frequencies: Frequencies,
 ) -> Channels:
-    """From a design to what its captures tell; `synthesis`: a matrix with orthogonal rows."""
+    """Sums of a design's captures; `synthesis`: a matrix with orthogonal rows."""
     matrix = jnp.asarray(synthesis, design.beta.dtype)
     if matrix.ndim != 2 or matrix.shape[1] != design.captures:
         raise ValueError(
@@ -93,7 +104,7 @@ def bayes_error(known: Channels) -> Float[Array, ""]:
 
 
 def mismatch_error(known: Channels, actual: Channels) -> Float[Array, ""]:
-    r"""Error of the same, if the camera is not what the reconstruction takes it for.
+    r"""Error of that reconstruction where the camera differs from the assumed one.
 
     .. math:: \int \eta_f\Big(1 - \sum_c P_c H'_c\Big)^2 + \sum_c P_c^2\,\eta'_c,
         \qquad P_c = \frac{H_c/\eta_c}{1/\eta_f + J}
@@ -178,3 +189,225 @@ def _in_band(band: tuple[float, float], rings: int, dtype) -> Bool[Array, " ring
 
 def _tiny(known: Channels):
     return jnp.finfo(known.density.dtype).tiny
+
+
+@dataclass(frozen=True)
+class Tolerances:
+    """Standard deviations of the numbers that a reconstruction assumes; 0 is exact.
+
+    - `beta`: relative, of each capture's mask on its own.
+    - `distance`: mm, of each capture on its own; `wavelength`: mm, `object_distance`: mm, of all.
+    - `tilt`: of the mask against the sensor, rad. Over a mask of width w it makes the distance
+      vary evenly with a standard deviation of tilt·w/√12, and is counted as an error of that size.
+    """
+
+    beta: float = 0.0
+    distance: float = 0.0
+    wavelength: float = 0.0
+    object_distance: float = 0.0
+    tilt: float = 0.0
+
+
+def robust_error(
+    design: Design,
+    setup: Setup,
+    synthesis: Float[Array, "channel capture"],
+    frequencies: Frequencies,
+    tolerances: Tolerances,
+    *,
+    how: Literal["mean", "worst"] = "mean",
+) -> Float[Array, ""]:
+    r"""`mismatch_error` over the tolerances, of a reconstruction made for the exact design.
+
+    "mean": its expectation for independent errors, to second order,
+    :math:`E_0 + \sum_i [\tfrac12(E_{+i} + E_{-i}) - E_0]` with each number moved by its standard
+    deviation. "worst": the largest of all E±i, as a soft maximum. The scale of the image on the
+    sensor is taken to be registered.
+    """
+    checks.choice("how", how, ("mean", "worst"))
+    known = channels(design, setup, synthesis, frequencies)
+    exact = bayes_error(known)
+    moved = list(_moved(design, setup, tolerances))
+    if not moved:
+        return exact
+
+    def error(one: tuple[Design, Setup]):
+        actual = channels(one[0], one[1], synthesis, frequencies)
+        return mismatch_error(known, actual)
+
+    # Stacked, they are one program in place of one for each.
+    every = jax.vmap(error)(jax.tree.map(lambda *leaves: jnp.stack(leaves), *moved))
+    if how == "mean":
+        return exact + jnp.sum(every - exact) / 2
+    # Soft to a hundredth of the error: smooth where two tolerances cost the same.
+    scale = 100 / exact
+    return jax.nn.logsumexp(scale * jnp.append(every, exact)) / scale
+
+
+def _moved(design: Design, setup: Setup, tolerances: Tolerances):
+    """The design and the setup with one number moved, either way."""
+    captures = range(design.captures)
+    for sign in (-1.0, 1.0):
+        for k in captures:
+            if tolerances.beta:
+                beta = design.beta.at[k].multiply(1 + sign * tolerances.beta)
+                yield eqx.tree_at(lambda d: d.beta, design, beta), setup
+            if tolerances.distance:
+                yield _farther(design, design.distance.at[k].add(sign * tolerances.distance)), setup
+        if tolerances.tilt:
+            depth = (
+                sign * tolerances.tilt * design.width / jnp.sqrt(12.0).astype(design.width.dtype)
+            )
+            yield _farther(design, design.distance + depth), setup
+        if tolerances.wavelength:
+            wavelength = design.wavelength + sign * tolerances.wavelength
+            yield eqx.tree_at(lambda d: d.wavelength, design, wavelength), setup
+        if tolerances.object_distance:
+            there = setup.object_distance + sign * tolerances.object_distance
+            yield design, eqx.tree_at(lambda s: s.object_distance, setup, there)
+
+
+def _farther(design: Design, distance: Float[Array, " capture"]) -> Design:
+    return eqx.tree_at(lambda d: d.distance, design, distance)
+
+
+class ObjectiveData(eqx.Module):
+    """Setup, synthesis and frequencies that an objective is evaluated with.
+
+    - `synthesis`: real weights of the captures, a matrix with orthogonal rows.
+    """
+
+    setup: Setup
+    synthesis: Float[Array, "channel capture"]
+    frequencies: Frequencies
+
+    def channels(self, design: Design) -> Channels:
+        """`channels` of a design."""
+        return channels(design, self.setup, self.synthesis, self.frequencies)
+
+
+class AbstractObjective:
+    """Objective of a design: its cost to minimise, and how its value is reported.
+
+    A subclass is a frozen dataclass of its settings, so that equal objectives are compiled once.
+    It defines `value`, and as class variables:
+
+    - `name`: in experiment files; `quantity`: in words; `unit`: of the reported value.
+    - `maximised`: whether larger values are better; the cost is then the negative value.
+    """
+
+    name: ClassVar[str]
+    quantity: ClassVar[str]
+    unit: ClassVar[str] = "dB"
+    maximised: ClassVar[bool] = False
+
+    def value(self, design: Design, data: Any) -> Float[Array, ""]:
+        """Value of a design; `data` is `ObjectiveData` but for objectives of training images."""
+        raise NotImplementedError
+
+    def __call__(self, design: Design, data: Any) -> Float[Array, ""]:
+        """Cost to minimise."""
+        value = self.value(design, data)
+        return -value if self.maximised else value
+
+    @property
+    def label(self) -> str:
+        """Quantity and unit of the reported value."""
+        return f"{self.quantity} ({self.unit})"
+
+    def reported(self, cost: Any) -> Any:
+        """Value that is reported for a cost, in `unit`."""
+        cost = np.asarray(cost, dtype=float)
+        return -cost if self.maximised else cost
+
+    def gain(self, reference: float, found: float) -> float:
+        """Improvement of the cost `found` over that of a reference, in `unit`."""
+        gain = float(self.reported(reference) - self.reported(found))
+        return -gain if self.maximised else gain
+
+    def increase(self, cost: float) -> float:
+        """Increase of a cost that counts as 1 % worse."""
+        return _ONE_PERCENT * abs(cost)
+
+
+class _RelativeError(AbstractObjective):
+    """An error as a part of a variance, reported in dB."""
+
+    def reported(self, cost: Any) -> Any:
+        return 10 * np.log10(np.asarray(cost, dtype=float))
+
+
+class _OfBand(AbstractObjective):
+    """A level in dB of a band of frequencies."""
+
+    def increase(self, cost: float) -> float:
+        return _ONE_PERCENT_DB
+
+
+@dataclass(frozen=True)
+class BayesError(_RelativeError):
+    """`bayes_error`."""
+
+    name: ClassVar[str] = "bayes_error"
+    quantity: ClassVar[str] = "predicted error over the scene's variance"
+
+    def value(self, design: Design, data: ObjectiveData) -> Float[Array, ""]:
+        return bayes_error(data.channels(design))
+
+
+@dataclass(frozen=True)
+class RobustError(_RelativeError):
+    """`robust_error` with these tolerances."""
+
+    name: ClassVar[str] = "robust_error"
+    quantity: ClassVar[str] = "predicted error with the tolerances"
+    tolerances: Tolerances = Tolerances()
+    how: Literal["mean", "worst"] = "mean"
+
+    def value(self, design: Design, data: ObjectiveData) -> Float[Array, ""]:
+        given = data.setup, data.synthesis, data.frequencies
+        return robust_error(design, *given, self.tolerances, how=self.how)
+
+
+@dataclass(frozen=True)
+class WorstRatio(_OfBand):
+    """`worst_ratio_db` of a band."""
+
+    name: ClassVar[str] = "worst_ratio"
+    quantity: ClassVar[str] = "lowest signal-to-noise ratio of the band"
+    maximised: ClassVar[bool] = True
+    band: tuple[float, float] = DEFAULT_BAND
+
+    def value(self, design: Design, data: ObjectiveData) -> Float[Array, ""]:
+        return worst_ratio_db(data.channels(design), data.frequencies, self.band)
+
+
+@dataclass(frozen=True)
+class Unevenness(_OfBand):
+    """`unevenness` of a band."""
+
+    name: ClassVar[str] = "unevenness"
+    quantity: ClassVar[str] = "unevenness of the band"
+    band: tuple[float, float] = DEFAULT_BAND
+
+    def value(self, design: Design, data: ObjectiveData) -> Float[Array, ""]:
+        return unevenness(data.channels(design), data.frequencies, self.band)
+
+
+@dataclass(frozen=True)
+class ResolutionLimit(AbstractObjective):
+    """`limit` of resolution."""
+
+    name: ClassVar[str] = "limit"
+    quantity: ClassVar[str] = "limit of resolution"
+    unit: ClassVar[str] = "cycles/rad"
+    maximised: ClassVar[bool] = True
+
+    def value(self, design: Design, data: ObjectiveData) -> Float[Array, ""]:
+        return limit(data.channels(design), data.frequencies)
+
+
+OBJECTIVES = {
+    objective.name: objective
+    for objective in (BayesError, RobustError, WorstRatio, ResolutionLimit, Unevenness)
+}

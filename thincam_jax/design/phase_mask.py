@@ -29,11 +29,11 @@ from thincam_jax._core.checks import Number, Numbers
 from thincam_jax._core.grids import Grid
 from thincam_jax._core.module import Module
 from thincam_jax._core.precision import as_complex
-from thincam_jax.design.adam import adam
 from thincam_jax.design.end_to_end import restore_by
 from thincam_jax.design.objectives import Channels, bayes_error
 from thincam_jax.design.phase_retrieval import match_error
 from thincam_jax.design.setup import Setup
+from thincam_jax.design.stochastic import adam
 from thincam_jax.design.training import Channel, relative_error
 from thincam_jax.imaging.operators import kernel_grid
 from thincam_jax.imaging.sensor import Sensor

@@ -29,9 +29,9 @@ from thincam_jax._core import checks
 from thincam_jax._core.checks import Number
 from thincam_jax._core.module import Module
 from thincam_jax._core.quantity import quantity
-from thincam_jax.design.adam import adam
-from thincam_jax.design.prior import PowerLaw
 from thincam_jax.design.search import best_apart, even_samples, on_cube
+from thincam_jax.design.setup import PowerLaw
+from thincam_jax.design.stochastic import adam
 from thincam_jax.imaging.refractive_index import AbstractIndex
 from thincam_jax.imaging.sensor import Sensor
 from thincam_jax.units import deg, nm, um

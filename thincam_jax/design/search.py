@@ -1,4 +1,4 @@
-r"""The best design by gradient: many starts at a time, in one compiled program.
+r"""Search for the best design by gradient: many starts at a time, in one compiled program.
 
 Objectives of a design have many local optima: fringes of several captures beat against each other.
 So the cube is first sampled evenly, and descents begin at the best of the samples. Where what is
@@ -7,7 +7,8 @@ descended on is an approximation, the best few are then improved on the exact ob
 
 import functools
 from collections.abc import Callable, Iterable
-from typing import Any, Literal
+from dataclasses import dataclass
+from typing import Any, Literal, get_args
 
 import equinox as eqx
 import jax
@@ -21,14 +22,46 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from thincam_jax._core import checks
 from thincam_jax._core.module import Module
 from thincam_jax.design.design import Design
+from thincam_jax.design.problem import DesignProblem, Objective
 from thincam_jax.design.space import DesignSpace, active_limits
 
-Objective = Callable[[Design, Any], Float[Array, ""]]
 Solver = Literal["bfgs", "lbfgsb"]
 # Optima closer than this in the unit cube are one.
 APART = 0.02
 
 Status = Literal["converged", "iterations_exhausted", "non_finite"]
+
+
+@dataclass(frozen=True)
+class SearchSettings:
+    """How long to search, and by which solver.
+
+    - `starts`: descents; `samples`: of the even (scrambled Sobol) sampling before, from which
+      those start that are lowest among their neighbours; at least `starts`.
+    - `steps`: at most, of each descent.
+    - `solver`: "bfgs" (optimistix), under the smooth map sin² onto the cube, or "lbfgsb" (jaxopt)
+      within its faces.
+    - `tolerance`: relative change of the objective and absolute change in the cube at the end.
+    - `apart`: optima closer than this in the cube are one.
+
+    **Errors**: ValueError for numbers of starts, samples or steps below 1.
+    """
+
+    starts: int = 16
+    samples: int = 512
+    steps: int = 60
+    solver: Solver = "bfgs"
+    tolerance: float = 1e-6
+    apart: float = APART
+
+    def __post_init__(self):
+        counts = {"starts": self.starts, "samples": self.samples, "steps": self.steps}
+        checks.at_least_one(counts)
+        checks.choice("solver", self.solver, get_args(Solver))
+
+
+class NonFiniteObjectiveError(ValueError):
+    """The objective is NaN or infinite at every start of a search."""
 
 
 class Descents(eqx.Module):
@@ -72,54 +105,31 @@ class Search(Module):
 
 
 def find_designs(
-    objective: Objective,
-    space: DesignSpace,
-    data: Any,
-    *,
-    key: PRNGKeyArray,
-    starts: int = 16,
-    samples: int = 512,
-    steps: int = 60,
-    solver: Solver = "bfgs",
-    tolerance: float = 1e-6,
-    apart: float = APART,
-    exact: Any = None,
+    problem: DesignProblem, settings: SearchSettings | None = None, *, key: PRNGKeyArray
 ) -> Search:
-    """The designs of a space where an objective is smallest.
+    """Designs of a space where an objective is smallest.
 
-    **Arguments**
-
-    - `objective`: (design, data) → a number, at module level, so that it is compiled once.
-    - `starts`: descents; `samples`: of the even (scrambled Sobol) sampling before, from which
-      those start that are lowest among their neighbours; at least `starts`.
-    - `steps`: at most, of each descent.
-    - `solver`: "bfgs" (optimistix), under the smooth map sin² onto the cube, or "lbfgsb" (jaxopt)
-      within its faces.
-    - `tolerance`: relative change of the objective and absolute change in the cube at the end.
-    - `apart`: optima closer than this in the cube are one.
-    - `exact`: where `data` give an approximation, those of the exact objective. The best few optima
-      and the best sample are improved on it, and all found are ranked by it.
-
-    **Errors**: ValueError for numbers of starts, samples or steps below 1.
+    Where the problem has `exact` data, the best few optima and the best sample are improved on
+    them, and all designs found are ranked by them.
     """
-    checks.at_least_one({"starts": starts, "samples": samples, "steps": steps})
-    checks.choice("solver", solver, ("bfgs", "lbfgsb"))
-    points = even_samples(space.size, max(samples, starts), key, space.lower.dtype)
+    settings = settings or SearchSettings()
+    objective, space, data = problem.objective, problem.space, problem.data
+    samples = max(settings.samples, settings.starts)
+    points = even_samples(space.size, samples, key, space.lower.dtype)
     values = evaluate(objective, space, data, points)
-    chosen = best_apart(np.asarray(points), np.asarray(values), starts)
-    descend = _descend if solver == "bfgs" else _descend_in_box
-    ended = descend(
-        objective, space, data, points[chosen], _scale(values[chosen]), steps, tolerance
-    )
+    chosen = best_apart(np.asarray(points), np.asarray(values), settings.starts)
+    descend = _descend if settings.solver == "bfgs" else _descend_in_box
+    lengths = settings.steps, settings.tolerance
+    ended = descend(objective, space, data, points[chosen], _scale(values[chosen]), *lengths)
     ended = jax.device_get(ended)
     failed = sum(int(np.sum(~np.isfinite(v))) for v in (np.asarray(values), ended.values))
     used = len(points) + int(np.sum(ended.evaluations))
-    found = ranked(space, ended, apart)
-    if exact is None or not found:
+    found = ranked(space, ended, settings.apart)
+    if problem.exact is None or not found:
         return Search(found, used, failed)
     begun = np.stack([*(one.point for one in found), points[chosen[0]]])
-    better, more = _improved(objective, space, exact, begun, [one.status for one in found])
-    return Search(without_repeats(better, apart), used + more, failed)
+    better, more = _improved(problem, begun, [one.status for one in found])
+    return Search(without_repeats(better, settings.apart), used + more, failed)
 
 
 # How many optima are improved on the exact objective, and how: from the best of so many even
@@ -131,17 +141,18 @@ _SIDE, _LEAST_STEP, _LEAST_GAIN, _MOST = 0.02, 1e-3, 1e-5, 50
 
 
 def _improved(
-    objective: Objective, space: DesignSpace, exact: Any, starts: np.ndarray, statuses: list[Status]
+    problem: DesignProblem, starts: np.ndarray, statuses: list[Status]
 ) -> tuple[list[Found], int]:
     """The last start and the best of the others improved, the others as they are; evaluations.
 
     Without the gradient: an evaluation is costly, its gradient costs more to compile than all.
     """
-    count = len(starts)
+    count, space = len(starts), problem.space
 
     def values(points: np.ndarray) -> np.ndarray:
         given = jnp.asarray(points, space.lower.dtype)
-        found = np.asarray(evaluate(objective, space, exact, given, at_a_time=1), float)
+        given = problem.objective, space, problem.exact, given
+        found = np.asarray(evaluate(*given, at_a_time=1), float)
         return np.where(np.isfinite(found), found, np.inf)
 
     known = values(starts)
@@ -179,34 +190,25 @@ def _improve(
 
 
 def descend(
-    objective: Objective,
-    space: DesignSpace,
-    data: Any,
+    problem: DesignProblem,
     points: Float[Array, "start variable"],
     *,
     steps: int = 60,
     tolerance: float = 1e-6,
-    apart: float = APART,
-    told: Callable[[int], object] | None = None,
 ) -> Search:
-    """Descents from given points of the unit cube, one after the other: for costly objectives.
-
-    By BFGS; arguments and result as of `search`. `told` is called with the place of each point as
-    its descent begins.
-    """
+    """Descents by BFGS from points of the unit cube, one after the other: for costly objectives."""
+    objective, space, data = problem.objective, problem.space, problem.data
     ended = []
-    for place, point in enumerate(points):
-        if told is not None:
-            told(place)
+    for point in points:
         value = evaluate(objective, space, data, point[None])
         ended.append(_descend(objective, space, data, point[None], _scale(value), steps, tolerance))
     stacked = jax.device_get(jax.tree.map(lambda *parts: jnp.concatenate(parts), *ended))
     failed = int(np.sum(~np.isfinite(stacked.values)))
-    return Search(ranked(space, stacked, apart), int(np.sum(stacked.evaluations)), failed)
+    return Search(ranked(space, stacked, APART), int(np.sum(stacked.evaluations)), failed)
 
 
 # Points of the unit cube that are evaluated at a time.
-_AT_A_TIME = 32
+AT_A_TIME = 32
 
 
 @functools.partial(jax.jit, static_argnames=("objective", "at_a_time"))
@@ -216,7 +218,7 @@ def evaluate(
     data: Any,
     points: Float[Array, "point variable"],
     *,
-    at_a_time: int = _AT_A_TIME,
+    at_a_time: int = AT_A_TIME,
 ) -> Float[Array, " point"]:
     """The objective at points of the unit cube, so many at a time."""
 
@@ -224,23 +226,6 @@ def evaluate(
         return objective(space.design(point), data)
 
     return jax.lax.map(at, points, batch_size=at_a_time)
-
-
-def landscape(
-    objective: Objective, space: DesignSpace, data: Any, count: int, *, at_a_time: int = _AT_A_TIME
-) -> tuple[Float[Array, "point variable"], Float[Array, " point"]]:
-    """The objective on an even grid over the cube, `count` points along each variable.
-
-    Feasible for two or three variables; the grid's best is what a search can be checked against.
-    """
-    if count < 2 or count**space.size > 10_000_000:
-        raise ValueError(
-            f"a grid of {count}^{space.size} points; give 2 or more a side and at most 10 million"
-        )
-    axis = jnp.linspace(0.0, 1.0, count, dtype=space.lower.dtype)
-    mesh = jnp.meshgrid(*[axis] * space.size, indexing="ij")
-    points = jnp.stack([m.ravel() for m in mesh], axis=-1)
-    return points, evaluate(objective, space, data, points, at_a_time=at_a_time)
 
 
 def even_samples(

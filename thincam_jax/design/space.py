@@ -1,10 +1,11 @@
-r"""What of a design is free, and within which limits.
+r"""Design spaces: the numbers of a design that are free, within bounds and limits.
 
 A search happens in the unit cube: `DesignSpace.design` maps each point of it to a design that keeps
 every limit, those that tie two variables together too, so that no solver has to know them.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import equinox as eqx
@@ -16,10 +17,44 @@ from jaxtyping import Array, Float
 from thincam_jax._core.quantity import quantities
 from thincam_jax.design.design import MOST_CAPTURES, Design
 
-# As near to a limit, in the cube, a point lies against it.
-_WITHIN = 1e-3
-# What may be free.
-QUANTITIES = quantities(Design)
+_WITHIN = 1e-3  # distance in the cube below which a limit is active
+QUANTITIES = quantities(Design)  # what may be free
+
+
+@dataclass(frozen=True)
+class ReportedNumber:
+    """How a number of a shot is reported.
+
+    - `name`, `unit`: in tables and on axes; `scale`: from the package's unit; `form`: its digits.
+    """
+
+    name: str
+    unit: str = ""
+    scale: float = 1.0
+    form: str = ".2f"
+
+    @property
+    def label(self) -> str:
+        """Name and unit: "distance, mm"."""
+        return self.of_shots(())
+
+    def of_shots(self, shots: Sequence[int]) -> str:
+        """Name, shots (from 1; none for what all share) and unit: "β of shot 1, rad/mm²"."""
+        unit = f", {self.unit}" if self.unit else ""
+        if not shots:
+            return f"{self.name}{unit}"
+        word = "shot" if len(shots) == 1 else "shots"
+        return f"{self.name} of {word} {', '.join(str(s) for s in shots)}{unit}"
+
+
+REPORTED = {
+    "beta": ReportedNumber("β", "rad/mm²"),
+    "phase": ReportedNumber("phase", "rad"),
+    "distance": ReportedNumber("distance", "mm"),
+    "wavelength": ReportedNumber("wavelength", "nm", 1e6, ".0f"),
+    "width": ReportedNumber("mask width", "mm"),
+    "exposure": ReportedNumber("exposure"),
+}
 
 
 @dataclass(frozen=True)
@@ -45,6 +80,10 @@ class Variable:
         """Its name, with the captures that it belongs to."""
         listed = ", ".join(str(c + 1) for c in self.captures)
         return f"{self.name} of capture {listed}" if self.captures else self.name
+
+    def shots(self, design: Design) -> tuple[int, ...]:
+        """Shots of a design that share it, counted from 1; none for the width."""
+        return tuple(sorted({c // design.phases + 1 for c in self.captures}))
 
 
 @dataclass(frozen=True)
@@ -133,6 +172,14 @@ class DesignSpace(eqx.Module):
         finest = math.pi / self.limits.mask_pixel / width
         is_beta = jnp.asarray([v.name == "beta" for v in self.variables])
         return jnp.where(is_beta, jnp.minimum(self.upper, finest), self.upper)
+
+    def reach(self, name: str) -> tuple[float, float]:
+        """Least and largest value of a number: of the base's captures and within the bounds."""
+        given = np.asarray(getattr(self.base, name), dtype=float).ravel().tolist()
+        bounds = [end for v in self.variables if v.name == name for end in (v.lower, v.upper)]
+        if name == "distance":
+            bounds = [min(end, self.limits.thickness or math.inf) for end in bounds]
+        return min([*given, *bounds]), max([*given, *bounds])
 
     def _with_values(self, values: Float[Array, " variable"]) -> Design:
         design = self.base

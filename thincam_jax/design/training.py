@@ -5,7 +5,7 @@ Each image f on the object gives captures
 .. math:: g_c = A_c f + n_c, \qquad A_c f = C\,(h_c * R_{d} f)
 
 with R_d the projection onto the pixels of a sensor at the distance d, h_c the PSF of a sum of
-captures and C the crop. What is made of them is told in `end_to_end` and `wiener`.
+captures and C the crop. `end_to_end` and `wiener` restore the images.
 """
 
 import math

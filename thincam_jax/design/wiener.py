@@ -12,7 +12,7 @@ over the solid angle Ω_c = Np²/d_c² that a sensor's N pixels cover: η_c = E|
 for noise of variance σ_c², and η_f ∝ 1/(ν² + ν₀²) of a strength that is found from the captures'
 own power |G_c|²/Ω_c. As there, the filter takes captures as if nothing had been cropped, and what
 that costs is in the error. H_c is even, so that all of it is done in real numbers for the even and
-odd parts of the images (`thincam_jax.design.parity`).
+odd parts of the images (`thincam_jax.design.cosine_transforms`).
 
 It is not the same to the last digit: `WienerSynthesis` interpolates shorter captures, estimates
 the mean, and finds the strength on its own window. In the thesis' camera the gain of one pair of
@@ -27,8 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from thincam_jax.design.design import Design
-from thincam_jax.design.parity import (
+from thincam_jax.design.cosine_transforms import (
     both_signs,
     fold,
     half_places,
@@ -37,7 +36,8 @@ from thincam_jax.design.parity import (
     unfold,
     waves,
 )
-from thincam_jax.design.prior import PowerLaw
+from thincam_jax.design.design import Design
+from thincam_jax.design.setup import PowerLaw
 from thincam_jax.design.training import Training, check_captures, noise_variance, relative_error
 from thincam_jax.lensless.propagation.path import Path
 from thincam_jax.lensless.propagation.separable_transfer import transfer_factors

@@ -22,12 +22,12 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from thincam_jax._core import checks
 from thincam_jax._core.module import Module
-from thincam_jax.design.adam import adam
 from thincam_jax.design.frequencies import Frequencies
+from thincam_jax.design.match import ResponseModel
 from thincam_jax.design.search import even_samples
 from thincam_jax.design.setup import Setup
 from thincam_jax.design.space import DesignSpace
-from thincam_jax.design.target_response import ResponseModel
+from thincam_jax.design.stochastic import adam
 from thincam_jax.learn.suggestions import Suggester
 
 # Designs whose levels are computed at a time.

@@ -1,6 +1,6 @@
 r"""A design for a target response, from a network and two Gauss–Newton steps.
 
-The network maps target levels (`thincam_jax.design.target_response`) to points p of a space's unit
+The network maps target levels (`thincam_jax.design.match`) to points p of a space's unit
 cube. The map has many values: captures may be exchanged, and different designs have like responses.
 So it gives several guesses; two Gauss–Newton steps refine each within the cube,
 
@@ -28,10 +28,16 @@ from thincam_jax._core.checks import Numbers
 from thincam_jax._core.module import Module
 from thincam_jax.design.design import Design
 from thincam_jax.design.frequencies import Frequencies
-from thincam_jax.design.match import MATCHED, MatchStatus, match_status
+from thincam_jax.design.match import (
+    MATCHED,
+    MatchStatus,
+    ResponseModel,
+    checked_levels,
+    match_status,
+    root_mean_square,
+)
 from thincam_jax.design.setup import Setup
 from thincam_jax.design.space import DesignSpace, active_limits
-from thincam_jax.design.target_response import ResponseModel, checked_levels, root_mean_square
 from thincam_jax.learn.checkpoint import (
     CheckpointError,
     read_arrays,

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
-from thincam_jax.design.adam import adam_method, adam_step
+from thincam_jax.design.stochastic import adam_method, adam_step
 from thincam_jax.reconstruction.implicit_gradient import solve_fixed_point
 from thincam_jax.reconstruction.problem import InverseProblem, with_tau
 

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from thincam_jax._core import checks
-from thincam_jax.design.adam import adam_method, adam_step
+from thincam_jax.design.stochastic import adam_method, adam_step
 from thincam_jax.learn.checkpoint import (
     CheckpointError,
     difference,

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Number
-from thincam_jax.design.adam import adam_method, adam_step
+from thincam_jax.design.stochastic import adam_method, adam_step
 from thincam_jax.reconstruction.admm import AbstractSplitting, Penalties, State, admm_map
 from thincam_jax.reconstruction.iterate import Outcome, Progress, Status
 from thincam_jax.reconstruction.problem import InverseProblem, objective, uniform_image

@@ -11,7 +11,7 @@ from thincam_jax.commands.design import run as designs
 FOUND = {
     "reference": {"name": "pairs", "shots": [{"beta_rad_per_mm2": 25.0, "distance_mm": 3.0}]},
     "compare": [],
-    "objective": {"told": "predicted error over the scene's variance (dB)"},
+    "objective": {"name": "bayes_error"},
     "found": [
         {
             "name": f"found {rank}",

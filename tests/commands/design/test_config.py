@@ -31,7 +31,6 @@ def test_values_and_defaults(tmp_path):
     assert config.search.free[0].bounds == (12.0, 30.0)
     assert config.search.objective == "bayes_error"
     assert config.validation.best == 1
-    assert config.reach("distance")[1] == 3.0
     without = tiny.TEXT.replace("prior:\n  exponent: 2.5\n", "")
     assert tiny.design(tmp_path, text=without).prior.measured
 
@@ -75,8 +74,8 @@ def test_width_wavelength_and_exposure(tmp_path):
         ("exposure", 0.4, 1.6, (2, 3)),
     ]
     assert space.limits.exposure == 4
-    assert config.reach("width")[1] == 2.4
-    assert tiny.design(tmp_path).reach("width")[1] == 2.0
+    assert space.reach("width")[1] == 2.4
+    assert tiny.design(tmp_path).space().reach("width")[1] == 2.0
     path = tmp_path / "again.yaml"
     path.write_text(dump_config(config), encoding="utf-8")
     assert load_design(path) == config
@@ -114,13 +113,6 @@ def test_fringe_scanning_takes_four_captures_a_shot(tmp_path):
     )
     captures = [v.captures for v in config.space().variables]
     assert captures == [(0, 1, 2, 3), (4, 5, 6, 7)]
-
-
-def test_the_farthest_distance_keeps_the_thickness(tmp_path):
-    free = "search.free=[{variable: distance, bounds: [2 mm, 9 mm]}]"
-    assert tiny.design(tmp_path, free).reach("distance")[1] == 9.0
-    assert tiny.design(tmp_path, free, "search.limits.thickness=5 mm").reach("distance")[1] == 5.0
-    assert tiny.design(tmp_path, free, "search.limits.thickness=2.5 mm").reach("distance")[1] == 3.0
 
 
 SHARED = ("search.free[0]", "all masks share the width; drop 'shared' and 'shots'")

@@ -9,9 +9,7 @@ from thincam_jax.commands.terminal import Overrides, counted, numbers, told, war
 
 
 def design(
-    config: Annotated[
-        Path, typer.Argument(help="Experiment file (YAML) of kind design or screen_design.")
-    ],
+    config: Annotated[Path, typer.Argument(help="Experiment file (YAML) of kind design.")],
     out: Annotated[
         Path | None, typer.Option(help="Folder of the results; default runs/NAME of the design.")
     ] = None,
@@ -24,11 +22,7 @@ def design(
     """
     goes_on = "interrupted; the same command goes on with the targets that are not finished."
     with told(lambda: goes_on):
-        from thincam_jax.commands.config_file import read_raw, slug
-
-        if read_raw(config)[0].get("kind") == "screen_design":
-            _design_plate(config, out, tuple(set_ or ()))
-            return
+        from thincam_jax.commands.config_file import slug
         from thincam_jax.commands.design.config import load_design
         from thincam_jax.commands.design.run import DesignFolder, run_design
         from thincam_jax.commands.design.simulation import build_designs
@@ -43,40 +37,15 @@ def design(
     print(f"report: {folder.path / 'report.html'}")
 
 
-def _design_plate(path: Path, out: Path | None, overrides: tuple[str, ...]) -> None:
-    import rich
-    import rich.table
-
-    from thincam_jax.commands.checked_config import load_as
-    from thincam_jax.commands.config_file import slug
-    from thincam_jax.commands.plate.config import PlateDesignConfig
-    from thincam_jax.commands.plate.run import NUMBERS, PlateFolder, design_plate
-
-    wanted = load_as(PlateDesignConfig, path, overrides)
-    folder = PlateFolder(out or Path("runs") / slug(wanted.name))
-    with counted(wanted.name) as progress:
-        found = design_plate(wanted, folder, progress)
-    plates = found["plates"]
-    table = rich.table.Table("", *plates)
-    for name, (_, label) in NUMBERS.items():
-        table.add_row(label, *(f"{plate['numbers'][name]:.4g}" for plate in plates.values()))
-    table.add_row("expected error", *(f"{plate['error']:.3g}" for plate in plates.values()))
-    for target in wanted.targets:
-        scores = [plate["targets"][target.name]["psnr_db"] for plate in plates.values()]
-        table.add_row(f"{target.name}, dB", *(f"{s:.1f}" if s else "exact" for s in scores))
-    rich.print(table)
-    print(f"report: {folder.path / 'report.html'}")
-
-
 def _print(found: dict) -> None:
     import rich
 
-    from thincam_jax.commands.design.words import in_words, told_of
+    from thincam_jax.commands.design.page import in_words, objective_unit, reported_names
 
     validation = found["validation"]
     designs = (found["reference"], *found["compare"], *found["found"])
-    names = told_of(designs)
-    unit = found["objective"]["told"].rpartition("(")[2].rstrip(")")
+    names = reported_names(designs)
+    unit = objective_unit(found)
     pictures = (f"{target}\ngain, dB" for target in validation["pictures"])
     charts = (f"{target}\ngain, elements" for target in validation["charts"])
     rows = [["design", f"predicted\ngain, {unit}", *pictures, *charts]]

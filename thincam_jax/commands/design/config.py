@@ -27,7 +27,15 @@ from thincam_jax.commands.sections import (
     check_names,
     misfit,
 )
-from thincam_jax.design import Design, DesignSpace, Limits, Tolerances, Variable, shots
+from thincam_jax.design import (
+    Design,
+    DesignSpace,
+    Limits,
+    Tolerances,
+    Variable,
+    found_name,
+    shots,
+)
 from thincam_jax.design.space import QUANTITIES
 from thincam_jax.imaging.targets import sample_images
 from thincam_jax.units import parse_quantity
@@ -350,21 +358,6 @@ class DesignConfig(LenslessConfig):
         """Whether the search chooses it, of some shot."""
         return any(free.variable == variable for free in self.search.free)
 
-    def reach(self, variable: Literal["beta", "distance", "width"]) -> tuple[float, float]:
-        """The least and the largest that is looked at, of the reference and within the bounds."""
-        given = [self.mask.width]
-        if variable != "width":
-            given = [getattr(shot, variable) for shot in self.reference.shots]
-        bounds = [end for f in self.search.free if f.variable == variable for end in f.bounds]
-        if variable == "distance":
-            bounds = [min(end, self.search.limits.thickness or math.inf) for end in bounds]
-        return min([*given, *bounds]), max([*given, *bounds])
-
-
-def found_name(rank: int) -> str:
-    """What the found design of a rank, from 1, is called."""
-    return f"found {rank}"
-
 
 def _variables(config: DesignConfig):
     """The free numbers, each with the captures it belongs to."""
@@ -471,6 +464,6 @@ def load_design(path: str | Path, overrides: tuple[str, ...] = ()) -> DesignConf
         told = "is a study" if kind is None else f"is of kind {kind!r}"
         raise ConfigError(
             f"{path}: kind: {told}, for 'thincam run'; a file for 'thincam design' has "
-            "'kind: design' or 'kind: screen_design'"
+            "'kind: design'"
         )
     return load_as(DesignConfig, path, overrides)

@@ -1,7 +1,6 @@
 """The pictures of a design: the objective's landscape, responses, contrast transfer and fronts."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -10,19 +9,12 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.ticker import FixedLocator, NullLocator
 
 from thincam_jax._core.grids import Grid
-from thincam_jax.commands.design.problem import DesignObjective, Shot, phases_of
-from thincam_jax.commands.design.ranking import Candidate, FoundDesigns
-from thincam_jax.commands.design.record import COSTS
-from thincam_jax.commands.design.surroundings import Landscape
-from thincam_jax.commands.design.train import TrainingObjective
-from thincam_jax.commands.design.transfer import Transfer
-from thincam_jax.commands.design.words import QUANTITIES, first, free_number
+from thincam_jax.commands.design.record import COSTS, FoundDesigns
 from thincam_jax.commands.study.build import FileStudy
 from thincam_jax.commands.study.figures import as_png as as_png
 from thincam_jax.commands.study.figures import drawing, line_style
+from thincam_jax.design import Landscape, ModulationTransfer, RankedDesign, Shot, TrainingError
 
-_ROOM = 0.06  # around points, as a part of an axis
-_SHADED = 85  # per cent of the landscape that the shades tell apart; the worst is one shade
 _LEAST_CONTRAST = 1e-5
 _FLOOR_DB = -30.0  # what is further below the noise is not drawn
 _FACE = {True: "white", False: "black"}  # of points that are dominated, and of the front's
@@ -32,22 +24,6 @@ _LABELS = {
     "captures": "captures",
     "light": "light: electrons from each mm² of open aperture",
 }
-
-
-@dataclass(frozen=True, eq=False)
-class _DrawnLandscape:
-    """A landscape, what it is of, and which value of a design is drawn and which is told."""
-
-    around: Landscape
-    objective: DesignObjective | TrainingObjective
-    drawn: str
-    told: str
-
-    def name(self, one: Candidate) -> str:
-        value = getattr(one, self.told)
-        if value is None:
-            return one.name
-        return f"{one.name} ({float(self.objective.told(value)):.2f} {self.objective.unit})"
 
 
 _MASK_SAMPLES = 600  # along a side of a drawn mask
@@ -82,90 +58,32 @@ def draw_landscape(result: FoundDesigns, count: int) -> Figure | None:
 
     None where the search's bounds leave no room to draw.
     """
-    if result.landscape is None:
-        return None
-    view = _DrawnLandscape(result.landscape, result.objective, "searched", "exact")
-    return _draw(view, result, count)
+    designs = (result.reference, *result.found[:count])
+    costs = [(one, one.searched, one.exact) for one in designs]
+    return _marked(result.landscape, result.objective.unit, costs)
 
 
 def draw_training(result: FoundDesigns, count: int) -> Figure | None:
     """The same of the training error; None without training."""
-    if result.training is None or result.training.landscape is None:
+    if result.training is None:
         return None
-    given = result.training.landscape, result.training.objective
-    return _draw(_DrawnLandscape(*given, "trained", "trained"), result, count)
+    designs = (result.reference, *result.found[:count])
+    costs = [(one, one.trained or 0.0, one.trained or 0.0) for one in designs]
+    return _marked(result.training.landscape, TrainingError.unit, costs)
 
 
-def _draw(view: _DrawnLandscape, result: FoundDesigns, count: int) -> Figure:
-    points = (result.reference, *result.found[:count])
+def _marked(
+    landscape: Landscape | None, unit: str, costs: list[tuple[RankedDesign, float, float]]
+) -> Figure | None:
+    """With designs, each with the cost where it is drawn, and that of the legend."""
+    if landscape is None:
+        return None
+    names = [f"{one.name} ({float(landscape.reported(c)):.2f} {unit})" for one, _, c in costs]
+    designs = {name: one.design for name, (one, _, _) in zip(names, costs, strict=True)}
+    drawn = {name: cost for name, (_, cost, _) in zip(names, costs, strict=True)}
     figure, ax = drawing((7.6, 6.0))
-    if len(view.around.axes) == 1:
-        _draw_line(ax, view, points)
-    else:
-        _draw_map(figure, ax, view, points)
-    ax.legend(fontsize=9, loc="upper center", bbox_to_anchor=(0.5, -0.1), ncols=2, frameon=False)
+    landscape.plot(designs, drawn, ax=ax)
     return figure
-
-
-def _place(landscape: Landscape, one: Candidate) -> list[float]:
-    """Where a design lies on the landscape's axes, as drawn."""
-    return [
-        getattr(one.shots[first(shots)], name) * QUANTITIES[name].scale
-        for name, shots in landscape.variables
-    ]
-
-
-def _axes(landscape: Landscape) -> list[np.ndarray]:
-    """As drawn."""
-    named = zip(landscape.variables, landscape.axes, strict=True)
-    return [axis * QUANTITIES[name].scale for (name, _), axis in named]
-
-
-def _marker(number: int) -> dict:
-    """Of the reference, number 0, and of what was found: told apart by shape."""
-    face, edge, size = ("white", "black", 10) if number else ("black", "white", 12)
-    style = {"marker": "Xo^Ds"[number % 5], "markersize": size, "linestyle": "none"}
-    return style | {"color": face, "markeredgecolor": edge, "markeredgewidth": 1.3}
-
-
-def _draw_map(figure: Figure, ax, view: _DrawnLandscape, points: tuple[Candidate, ...]) -> None:
-    around, objective = view.around, view.objective
-    x, y = _axes(around)
-    told = objective.told(around.values).T
-    worst = np.nanpercentile(told, 100 - _SHADED if objective.wants_more else _SHADED)
-    steps = {"vmin" if objective.wants_more else "vmax": worst}
-    extend = "min" if objective.wants_more else "max"
-    shown = ax.pcolormesh(x, y, told, cmap="cividis", shading="nearest", rasterized=True, **steps)
-    figure.colorbar(shown, ax=ax, label=objective.label, extend=extend)
-    # Grounds beside the map are not allowed, or not looked at.
-    ax.set_facecolor("#e8e8e8")
-    places = np.array([_place(around, p) for p in points])
-    for set_limits, axis, own in ((ax.set_xlim, x, places[:, 0]), (ax.set_ylim, y, places[:, 1])):
-        set_limits(*_reach(axis, own))
-    for number, (one, place) in enumerate(zip(points, places, strict=True)):
-        ax.plot(*place, label=view.name(one), clip_on=False, zorder=5, **_marker(number))
-    names = [free_number(*variable) for variable in around.variables]
-    ax.set(xlabel=names[0], ylabel=names[1])
-
-
-def _reach(axis: np.ndarray, own: np.ndarray) -> tuple[float, float]:
-    """The axis, and room for points that lie beyond it."""
-    half = (axis[1] - axis[0]) / 2
-    low, high = axis[0] - half, axis[-1] + half
-    room = _ROOM * (high - low)
-    low = min(low, own.min() - room) if own.min() < low else low
-    high = max(high, own.max() + room) if own.max() > high else high
-    return float(low), float(high)
-
-
-def _draw_line(ax, view: _DrawnLandscape, points: tuple[Candidate, ...]) -> None:
-    around, objective = view.around, view.objective
-    ax.plot(_axes(around)[0], objective.told(around.values), color="black", linewidth=1)
-    for number, one in enumerate(points):
-        point = *_place(around, one), float(objective.told(getattr(one, view.drawn)))
-        ax.plot(*point, label=view.name(one), zorder=5, **_marker(number))
-    ax.set(xlabel=free_number(*around.variables[0]), ylabel=objective.label)
-    ax.grid(alpha=0.3)
 
 
 def draw_responses(result: FoundDesigns, count: int, pitch: float) -> Figure:
@@ -202,7 +120,7 @@ def draw_mtf(result: FoundDesigns, object_distance: float) -> Figure | None:
 
     `object_distance` in mm. None for a result without transfers.
     """
-    if result.transfers is None:
+    if not result.transfers:
         return None
     figure, panels = drawing((11.0, 5.6), 1, 2, sharex=True, sharey=True)
     shown = (result.reference, result.found[0])
@@ -215,11 +133,11 @@ def draw_mtf(result: FoundDesigns, object_distance: float) -> Figure | None:
     return figure
 
 
-def _draw_transfer(ax, one: Candidate, transfer: Transfer, edge: float) -> None:
+def _draw_transfer(ax, one: RankedDesign, transfer: ModulationTransfer, edge: float) -> None:
     frequency = (np.arange(len(transfer.chain)) + 0.5) / len(transfer.chain) * edge
     chain = {"color": "black", "linewidth": 2.2, "label": "camera and reconstruction"}
     ax.plot(frequency, transfer.chain, **chain)
-    phases = phases_of(one.design)
+    phases = one.design.phases
     for number, (level, sums) in enumerate(zip(transfer.channels, transfer.sums, strict=True)):
         style = line_style(number) | {"markersize": 4, "markevery": (2 * number, 8)}
         shot = one.shots[(sums[0][0] - 1) // phases]
@@ -297,11 +215,11 @@ def _draw_captures(ax, front: dict[str, Any], reference: str) -> None:
     ]
     for chosen, value, flag, label, dash, shape, colour in lines:
         _steps(ax, chosen, "captures", value, flag, dash)
-        for beaten, told in ((False, label), (True, f"{label}; dominated")):
+        for beaten, name in ((False, label), (True, f"{label}; dominated")):
             group = [p for p in chosen if p[flag] == beaten]
             if group:
                 face = "white" if beaten else colour
-                _marks(ax, group, "captures", value, told, marker=shape, markerfacecolor=face)
+                _marks(ax, group, "captures", value, name, marker=shape, markerfacecolor=face)
     _mark_reference(
         ax, front["reference"], "captures", "predicted_psnr_db", f"{reference}, predicted"
     )

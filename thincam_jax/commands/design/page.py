@@ -1,39 +1,44 @@
-"""The report of a design: one HTML page that stands alone."""
+"""Page of a design: its tables and sentences, made of design.json."""
 
+from collections.abc import Sequence
 from typing import Any
 
-from thincam_jax.commands.design import words
-from thincam_jax.commands.design.record import COSTS
+from thincam_jax.commands.design.record import COSTS, SHOT_KEYS
 from thincam_jax.commands.page import number
+from thincam_jax.design import FreeValue
+from thincam_jax.design.objectives import OBJECTIVES
+from thincam_jax.design.space import REPORTED
+
+_ALWAYS = ("beta", "distance")
 
 
 def shown(design: dict[str, Any]) -> dict[str, Any]:
     """What the page takes beside the record, made of it."""
     free = [(value["variable"], value["shots"]) for value in design["found"][0]["values"]]
     return {
-        "free": [words.free_number(*one) for one in free],
-        "reference": [words.of_shots(design["reference"], *one) for one in free],
-        "numbers": [[words.found_number(v) for v in one["values"]] for one in design["found"]],
-        "unit": _unit(design),
+        "free": [REPORTED[name].of_shots(shots) for name, shots in free],
+        "reference": [of_shots(design["reference"], *one) for one in free],
+        "numbers": [[found_number(v) for v in one["values"]] for one in design["found"]],
+        "unit": objective_unit(design),
         "findings": findings(design),
         "fronts": fronts(design),
     }
 
 
-def _unit(design: dict[str, Any]) -> str:
-    """In which the objective is told."""
-    return design["objective"]["told"].rpartition("(")[2].rstrip(")")
+def objective_unit(design: dict[str, Any]) -> str:
+    """Unit of the objective."""
+    return OBJECTIVES[design["objective"]["name"]].unit
 
 
 def findings(design: dict[str, Any]) -> list[str]:
     """What the numbers say, in sentences."""
     best, reference = design["found"][0], design["reference"]
-    names = words.told_of([best, reference])
+    names = reported_names([best, reference])
     by = "training" if design["training"] else design["objective"]["name"]
     sentences = [
-        f"The best design by {by} is {' and '.join(words.in_words(best, names))}. The objective "
-        f"predicts {best['predicted_gain']:+.3g} {_unit(design)} over {reference['name']} "
-        f"({' and '.join(words.in_words(reference, names))})."
+        f"The best design by {by} is {' and '.join(in_words(best, names))}. The objective "
+        f"predicts {best['predicted_gain']:+.3g} {objective_unit(design)} over {reference['name']} "
+        f"({' and '.join(in_words(reference, names))})."
     ]
     if best["training_gain_db"] is not None:
         sentences.append(f"On the training images it gains {best['training_gain_db']:+.2f} dB.")
@@ -70,14 +75,14 @@ _LIMIT = (
 
 def fronts(design: dict[str, Any]) -> list[dict[str, Any]]:
     """Of each Pareto front its table: title, labels of the columns, rows of texts, a sentence."""
-    told = design.get("pareto", {})
-    return [_front(name, told[name], design["reference"]["name"]) for name in COSTS if name in told]
+    known, reference = design.get("pareto", {}), design["reference"]["name"]
+    return [_front(name, known[name], reference) for name in COSTS if name in known]
 
 
 def _front(name: str, front: dict[str, Any], reference: str) -> dict[str, Any]:
     label, cost = COSTS[name]
-    names = words.told_of([*front["points"], front["reference"]])
-    labels = [words.QUANTITIES[name].label for name in names]
+    names = reported_names([*front["points"], front["reference"]])
+    labels = [REPORTED[name].label for name in names]
     points = [(_cost(p[cost]), p) for p in front["points"]]
     points.append((f"{reference}: {_cost(front['reference'][cost])}", front["reference"]))
     kept = {True: "no", False: "yes", None: ""}
@@ -94,13 +99,13 @@ def _front(name: str, front: dict[str, Any], reference: str) -> dict[str, Any]:
             ],
             "rows": [
                 [
-                    *(text, *words.cells(p, names), f"{p['predicted_psnr_db']:.2f}"),
+                    *(text, *cells(p, names), f"{p['predicted_psnr_db']:.2f}"),
                     *(number(p.get("simulated_psnr_db", {}).get(n), 2) for n in pictures),
                     kept[p.get("dominated")],
                 ]
                 for text, p in points
             ],
-            "told": f"The exposure is {front['exposure']}. Predicted from the error of the best "
+            "note": f"The exposure is {front['exposure']}. Predicted from the error of the best "
             "linear reconstruction and the mean variance of the pictures; simulated in full at one "
             "seed. The front is that of the prediction. Where distances differ, so do the object's "
             "pixels, and simulated PSNR compares to some tenths of a dB only.",
@@ -110,7 +115,7 @@ def _front(name: str, front: dict[str, Any], reference: str) -> dict[str, Any]:
         "labels": [label, *labels, "cycles/rad", "line pairs/mm on the object", "", "front"],
         "rows": [
             [
-                *(text, *words.cells(p, names)),
+                *(text, *cells(p, names)),
                 f"{p['resolution_cycles_per_rad']:.1f}",
                 f"{p['resolution_line_pairs_per_mm']:.3f}",
                 p["resolution_ends"] or "",
@@ -118,7 +123,7 @@ def _front(name: str, front: dict[str, Any], reference: str) -> dict[str, Any]:
             ]
             for text, p in points
         ],
-        "told": _LIMIT,
+        "note": _LIMIT,
     }
 
 
@@ -138,3 +143,46 @@ def _spread(spread: dict[str, Any], digits: int) -> str:
     if spread["deviation"] is not None:
         text += f" ± {spread['deviation']:.{digits}f}"
     return text
+
+
+def of_shots(one: dict[str, Any], name: str, shots: Sequence[int]) -> str:
+    """A number of a design of design.json, of the first of these shots; of all, where none is."""
+    first = one["shots"][shots[0] - 1 if shots else 0]
+    return f"{first[SHOT_KEYS[name]]:{REPORTED[name].form}}"
+
+
+def found_number(value: dict[str, Any]) -> str:
+    """A free number of design.json, with its tolerance."""
+    return str(FreeValue(value["variable"], (), value["value"], value["tolerance"]))
+
+
+def reported_names(designs: Sequence[dict[str, Any]]) -> tuple[str, ...]:
+    """β and distance, and what else is not the same in all shots of all designs."""
+    every = [shot for one in designs for shot in one["shots"]]
+    return tuple(
+        name
+        for name, key in SHOT_KEYS.items()
+        if name in _ALWAYS or len({shot.get(key) for shot in every}) > 1
+    )
+
+
+def cells(one: dict[str, Any], names: Sequence[str]) -> list[str]:
+    """Each number of all shots; one that all share stands once, but for β."""
+    row = []
+    for name in names:
+        texts = [of_shots(one, name, [shot]) for shot in range(1, len(one["shots"]) + 1)]
+        row.append(", ".join(texts if len(set(texts)) > 1 or name == "beta" else texts[:1]))
+    return row
+
+
+def in_words(one: dict[str, Any], names: Sequence[str]) -> list[str]:
+    """Each shot of a design: "β 25.00 at 5.00 mm", "β 21.00 at 6.50 mm"."""
+    each = []
+    for shot in range(1, len(one["shots"]) + 1):
+        words = f"β {of_shots(one, 'beta', [shot])} at {of_shots(one, 'distance', [shot])} mm"
+        for name in names:
+            if name not in _ALWAYS:
+                number = REPORTED[name]
+                words += f", {number.name} {of_shots(one, name, [shot])} {number.unit}".rstrip()
+        each.append(words)
+    return each

@@ -1,26 +1,85 @@
-"""What goes into design.json."""
+"""Record of a design: design.json."""
 
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from thincam_jax.commands.design.config import DesignConfig
-from thincam_jax.commands.design.pareto import Front, FrontPoint, Fronts
-from thincam_jax.commands.design.problem import Shot
-from thincam_jax.commands.design.ranking import Candidate, FoundDesigns
-from thincam_jax.commands.design.words import QUANTITIES
 from thincam_jax.commands.sections import ShotConfig
 from thincam_jax.commands.study.build import FileStudy
-from thincam_jax.design import non_dominated
-from thincam_jax.design.space import QUANTITIES as FREE
+from thincam_jax.design import (
+    AbstractObjective,
+    FrontPoint,
+    Landscape,
+    ModulationTransfer,
+    RankedDesign,
+    Shot,
+    TrainedDesigns,
+    non_dominated,
+)
+from thincam_jax.design.space import REPORTED
 
-# Of each front what its cost is called in words, and in design.json.
+# Keys of the numbers of a shot in design.json, in the units of reports.
+SHOT_KEYS = {
+    "beta": "beta_rad_per_mm2",
+    "distance": "distance_mm",
+    "wavelength": "wavelength_nm",
+    "width": "width_mm",
+    "exposure": "exposure",
+}
+# Name of the cost of each front, and its key in design.json.
 COSTS = {
     "thickness": ("thickness, mm", "thickness_mm"),
     "captures": ("captures", "captures"),
     "light": ("electrons from each mm²", "electrons_per_mm2"),
 }
+
+
+@dataclass(frozen=True, eq=False)
+class FoundDesigns:
+    """Result of a search.
+
+    - `edge`: of the frequencies looked at, cycles/rad; `exponent`: of the prior.
+    - `transfers`: of the reference and of the best design.
+    - `training`: the trained designs; None without training.
+    """
+
+    objective: AbstractObjective
+    reference: RankedDesign
+    found: tuple[RankedDesign, ...]
+    evaluations: int
+    failed: int
+    exponent: float
+    edge: float
+    landscape: Landscape | None
+    transfers: tuple[ModulationTransfer, ...] = ()
+    training: TrainedDesigns | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Front:
+    """The points in the order of their cost, and the design to beat at its own."""
+
+    points: tuple[FrontPoint, ...]
+    reference: FrontPoint
+
+
+@dataclass(frozen=True, eq=False)
+class Fronts:
+    """Those that were asked for: thickness, captures, light.
+
+    - `edge`: the highest frequency of all, cycles/rad.
+    - `picture_variance`: geometric mean over the pictures, whose values end at 1; of captures.
+    - `simulated`: PSNR of each picture, dB, of each point of captures.
+    """
+
+    fronts: dict[str, Front]
+    edge: float
+    picture_variance: float | None
+    simulated: tuple[tuple[tuple[str, float | None], ...], ...] = ()
 
 
 def record(result: FoundDesigns, study: FileStudy, validation: dict) -> dict:
@@ -31,9 +90,9 @@ def record(result: FoundDesigns, study: FileStudy, validation: dict) -> dict:
         "seed": config.seed,
         "objective": {
             "name": objective.name,
-            "better": "higher" if objective.wants_more else "lower",
+            "better": "higher" if objective.maximised else "lower",
             "told": objective.label,
-            "band": list(objective.band) if objective.has_band else None,
+            "band": _band(objective),
             "highest_cycles_per_rad": _round(result.edge),
             "prior_exponent": _round(result.exponent),
         },
@@ -63,10 +122,15 @@ def record(result: FoundDesigns, study: FileStudy, validation: dict) -> dict:
     }
 
 
+def _band(objective: AbstractObjective) -> list[float] | None:
+    band = getattr(objective, "band", None)
+    return None if band is None else list(band)
+
+
 def _approximation_off(result: FoundDesigns) -> float:
-    """How far the value as searched lies from the exact one at most, in the unit it is told in."""
-    told = result.objective.told
-    return max(abs(float(told(one.searched) - told(one.exact))) for one in result.found)
+    """How far the value as searched lies from the exact one at most, in the reported unit."""
+    reported = result.objective.reported
+    return max(abs(float(reported(one.searched) - reported(one.exact))) for one in result.found)
 
 
 def _training(config: DesignConfig, result: FoundDesigns) -> dict[str, Any] | None:
@@ -83,19 +147,19 @@ def _training(config: DesignConfig, result: FoundDesigns) -> dict[str, Any] | No
     }
 
 
-def _candidate(result: FoundDesigns, one: Candidate) -> dict[str, Any]:
-    sign = -1 if result.objective.wants_more else 1
+def _candidate(result: FoundDesigns, one: RankedDesign) -> dict[str, Any]:
+    sign = -1 if result.objective.maximised else 1
     return {
         "name": one.name,
         "shots": [_shot(shot) for shot in one.shots],
         "objective": _round(sign * one.searched),
         "objective_exact": _round(sign * one.exact),
-        "told": _round(float(result.objective.told(one.exact))),
+        "told": _round(float(result.objective.reported(one.exact))),
         "training_error": _round(one.trained),
     }
 
 
-def _found(result: FoundDesigns, one: Candidate) -> dict[str, Any]:
+def _found(result: FoundDesigns, one: RankedDesign) -> dict[str, Any]:
     return {
         **_candidate(result, one),
         "predicted_gain": _round(result.objective.gain(result.reference.exact, one.exact)),
@@ -106,7 +170,7 @@ def _found(result: FoundDesigns, one: Candidate) -> dict[str, Any]:
                 "shots": list(value.shots),
                 "value": _round(value.value),
                 "tolerance": _round(value.tolerance),
-                "unit": FREE[value.variable].unit,
+                "unit": value.unit,
             }
             for value in one.values
         ],
@@ -115,7 +179,7 @@ def _found(result: FoundDesigns, one: Candidate) -> dict[str, Any]:
     }
 
 
-def _training_gain(reference: Candidate, one: Candidate) -> float | None:
+def _training_gain(reference: RankedDesign, one: RankedDesign) -> float | None:
     if reference.trained is None or one.trained is None:
         return None
     if not (reference.trained > 0 and one.trained > 0):  # NaN, or a perfect image
@@ -125,14 +189,14 @@ def _training_gain(reference: Candidate, one: Candidate) -> float | None:
 
 def record_fronts(config: DesignConfig, fronts: Fronts) -> dict[str, Any]:
     """The fronts, each with its points in the order of their cost, and which of them count."""
-    told: dict[str, Any] = {"highest_cycles_per_rad": _round(fronts.edge)}
+    recorded: dict[str, Any] = {"highest_cycles_per_rad": _round(fronts.edge)}
     for name, front in fronts.fronts.items():
         if name == "captures":
             assert fronts.picture_variance is not None  # for the type checker
-            told[name] = _captures(config, front, fronts.picture_variance)
+            recorded[name] = _captures(config, front, fronts.picture_variance, fronts.simulated)
         else:
-            told[name] = _front(config, front, COSTS[name][1])
-    return told
+            recorded[name] = _front(config, front, COSTS[name][1])
+    return recorded
 
 
 def _front(config: DesignConfig, front: Front, cost: str) -> dict[str, Any]:
@@ -146,23 +210,28 @@ def _front(config: DesignConfig, front: Front, cost: str) -> dict[str, Any]:
     }
 
 
-def _captures(config: DesignConfig, front: Front, variance: float) -> dict[str, Any]:
+def _captures(
+    config: DesignConfig,
+    front: Front,
+    variance: float,
+    simulated: Sequence[tuple[tuple[str, float | None], ...]],
+) -> dict[str, Any]:
     """Captures against PSNR, predicted and simulated."""
 
     def predicted(point: FrontPoint) -> dict[str, Any]:
         size = point.error * variance
         level = -10 * math.log10(size) if size > 0 else math.nan
-        told = _point(config, point, "captures")
-        return {**told, "captures": round(point.cost), "predicted_psnr_db": _round(level)}
+        own = _point(config, point, "captures")
+        return {**own, "captures": round(point.cost), "predicted_psnr_db": _round(level)}
 
     points = []
-    for point in front.points:
-        known = [psnr for _, psnr in point.simulated if psnr is not None]
-        whole = len(known) == len(point.simulated)
+    for point, levels in zip(front.points, simulated, strict=True):
+        known = [psnr for _, psnr in levels if psnr is not None]
+        whole = len(known) == len(levels)
         points.append(
             {
                 **predicted(point),
-                "simulated_psnr_db": dict(point.simulated),
+                "simulated_psnr_db": dict(levels),
                 "simulated_mean_db": _round(float(np.mean(known))) if whole else None,
             }
         )
@@ -198,7 +267,9 @@ def _given(config: DesignConfig, shot: ShotConfig) -> dict[str, float | None]:
 
 
 def _shot(shot: Shot) -> dict[str, float | None]:
-    return {q.key: _round(getattr(shot, name) * q.scale) for name, q in QUANTITIES.items()}
+    return {
+        key: _round(getattr(shot, name) * REPORTED[name].scale) for name, key in SHOT_KEYS.items()
+    }
 
 
 def _round(value: float | None) -> float | None:

@@ -11,7 +11,6 @@ from jaxtyping import Array
 from thincam_jax._core.precision import allow
 from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.design.config import DesignConfig
-from thincam_jax.commands.design.problem import phases_of
 from thincam_jax.commands.sections import MaskConfig, MethodConfig, MethodShotConfig, SensorConfig
 from thincam_jax.commands.study import build
 from thincam_jax.commands.study.build import FileStudy
@@ -97,7 +96,7 @@ def _method(config: DesignConfig, name: str, design: Design) -> Method:
         width=width,
         relative_time=np.asarray(design.exposure),
     )
-    return Method(name, exposures, Wiener(), config.reference.synthesis, phases_of(design))
+    return Method(name, exposures, Wiener(), config.reference.synthesis, design.phases)
 
 
 def as_study_config(study: FileStudy) -> StudyConfig:

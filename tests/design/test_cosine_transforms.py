@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from thincam_jax.design.parity import (
+from thincam_jax.design.cosine_transforms import (
     both_signs,
     fold,
     half_places,

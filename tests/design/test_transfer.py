@@ -7,10 +7,17 @@ import numpy as np
 import pytest
 
 from thincam_jax._core.grids import Grid
-from thincam_jax.commands.design import transfer
-from thincam_jax.commands.design.problem import ObjectiveData
-from thincam_jax.commands.design.transfer import modulation_transfer
-from thincam_jax.design import Polar, Quadrant, Setup, SignalNoise, shots
+from thincam_jax.design import (
+    ObjectiveData,
+    Polar,
+    Quadrant,
+    Setup,
+    SignalNoise,
+    modulation_transfer,
+    objectives,
+    shots,
+    transfer,
+)
 from thincam_jax.design.objectives import Channels
 from thincam_jax.imaging.sensor import Sensor
 from thincam_jax.lensless.psf import psf
@@ -96,6 +103,7 @@ def test_of_even_responses_in_closed_form(monkeypatch):
         full = (jnp.full(shape, value) for value in (2.0, 8.0))
         return Channels(*full, jnp.full(shape[1:], 6.0), frequencies.weight)
 
+    monkeypatch.setattr(objectives, "channels", even)
     monkeypatch.setattr(transfer, "channels", even)
     # Of a size of its own, which is not compiled yet.
     found = modulation_transfer(DESIGN, replace(data(), frequencies=Quadrant(jnp.asarray(9.0), 80)))

@@ -1,4 +1,4 @@
-r"""Images by parts that are even or odd in y and x, and their Fourier transforms as real products.
+r"""Fourier transforms of the even and odd parts of an image, as real products.
 
 A response that is even in both frequencies, as that of every mask here, keeps the parity of what it
 acts on. So an image is taken apart once,

@@ -10,7 +10,7 @@ from design.setting import setup, thesis_design, two_betas
 
 from helpers import finite_difference
 from thincam_jax.design import Polar, PowerLaw, channels, response_misfit, ring_levels
-from thincam_jax.design.target_response import ResponseModel, checked_levels
+from thincam_jax.design.match import ResponseModel, checked_levels
 from thincam_jax.reconstruction import phase_pairs
 
 FREQUENCIES = Polar(96.0, 128, 2)

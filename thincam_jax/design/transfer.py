@@ -25,20 +25,20 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from thincam_jax.commands.design.problem import ObjectiveData
-from thincam_jax.design import Design, Quadrant, channels
-from thincam_jax.design.objectives import over_rings
+from thincam_jax.design.design import Design
+from thincam_jax.design.frequencies import Quadrant
+from thincam_jax.design.objectives import ObjectiveData, channels, over_rings
 
 RINGS = 64
 
 
 @dataclass(frozen=True, eq=False)
-class Transfer:
+class ModulationTransfer:
     """Contrast transfer against frequency, over rings of equal width up to the highest frequency.
 
     - `channels`: root mean square of MTF_c over each ring, for each sum of captures.
     - `chain`: mean of S/(1 + S) over each ring.
-    - `sums`: of each sum, which captures it adds and which it takes away, from 1.
+    - `sums`: of each sum, the captures it adds and those it subtracts, from 1.
     """
 
     channels: np.ndarray
@@ -46,7 +46,7 @@ class Transfer:
     sums: tuple[tuple[tuple[int, ...], tuple[int, ...]], ...]
 
 
-def modulation_transfer(design: Design, data: ObjectiveData) -> Transfer:
+def modulation_transfer(design: Design, data: ObjectiveData) -> ModulationTransfer:
     """The contrast transfer of a design, by the exact response of the square aperture.
 
     `data`: with frequencies on a `Quadrant`. Channels are (channel, ring), the chain (ring,), both
@@ -62,7 +62,7 @@ def modulation_transfer(design: Design, data: ObjectiveData) -> Transfer:
         (_numbers(row > 0), _numbers(row < 0)) if np.any(row > 0) else (_numbers(row < 0), ())
         for row in rows
     )
-    return Transfer(np.asarray(each), np.asarray(chain), sums)
+    return ModulationTransfer(np.asarray(each), np.asarray(chain), sums)
 
 
 def _numbers(used: np.ndarray) -> tuple[int, ...]:
@@ -73,7 +73,7 @@ def _numbers(used: np.ndarray) -> tuple[int, ...]:
 def _means(
     design: Design, data: ObjectiveData
 ) -> tuple[Float[Array, "channel ring"], Float[Array, " ring"]]:
-    known = channels(design, data.setup, data.synthesis, data.frequencies)
+    known = data.channels(design)
     # Each capture by itself, at zero frequency: all that its mask lets through.
     alone = jnp.eye(design.captures, dtype=data.synthesis.dtype)
     origin = Quadrant(data.frequencies.highest, 2)

@@ -10,8 +10,7 @@ import pytest
 
 import thincam_jax as tc
 from thincam_jax.design import Design, PhotonNoise, Polar, PowerLaw, Quadrant, Setup, SignalNoise
-from thincam_jax.design.response import responses
-from thincam_jax.design.signal import capture_light, signal_variance, spectral_density
+from thincam_jax.design.response import capture_light, responses, signal_variance, spectral_density
 
 respond = jax.jit(responses)
 PITCH, DISTANCE, FAR, CELLS = 0.03, 5.0, 100.0, 240

@@ -1,0 +1,78 @@
+"""From a design's file to its search problem."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from commands.design import tiny
+
+from thincam_jax.commands.design.build import build_problem, front_problems
+from thincam_jax.commands.design.config_pareto import with_shots
+from thincam_jax.design import ResolutionLimit, RobustError, Tolerances, WorstRatio
+
+LIGHT = "noise={read_noise: 4, electrons: 900}"
+
+
+def test_the_setup_is_that_of_the_file(tmp_path):
+    problem = build_problem(tiny.built(tmp_path))
+    setup, frequencies = problem.exact.setup, problem.exact.frequencies
+    assert float(setup.sensor_width) == pytest.approx(48 * 0.04)  # the shorter side
+    assert float(setup.noise.snr_db) == 30
+    assert float(setup.prior.exponent) == 2.5
+    assert not setup.pixel_integration
+    assert problem.exact.synthesis.shape == (2, 4)
+    # Half of the pixels' Nyquist frequency, 12.5 cycles/mm, at 3 mm.
+    assert float(frequencies.highest) == pytest.approx(3.0 * 12.5 / 2)
+    assert frequencies.axis.shape == problem.data.frequencies.radius.shape == (64,)
+
+
+def test_measured_prior_and_photon_noise(tmp_path):
+    setup = build_problem(tiny.built(tmp_path, "prior={measured: true}", LIGHT)).data.setup
+    assert 2.6 < float(setup.prior.exponent) < 9  # smooth blobs fall off faster than photographs
+    assert (float(setup.noise.electrons), float(setup.noise.read_noise)) == (900, 4)
+
+
+def test_objectives_have_the_settings_of_the_file(tmp_path):
+    asked = "search.tolerances={distance: 30 um, beta: 0.002}"
+    robust = build_problem(tiny.built(tmp_path, "search.objective=robust_error", asked)).objective
+    assert isinstance(robust, RobustError) and robust.how == "mean"
+    expected = dataclasses.astuple(Tolerances(beta=0.002, distance=0.03))
+    assert dataclasses.astuple(robust.tolerances) == pytest.approx(expected)
+    worst = "search.objective=worst_ratio"
+    assert build_problem(tiny.built(tmp_path, worst)).objective == WorstRatio()
+    banded = tiny.built(tmp_path, worst, "search.band=[0.1, 0.4]")
+    assert build_problem(banded).objective == WorstRatio((0.1, 0.4))
+
+
+def test_problems_of_fronts(tmp_path):
+    """Thickness and light buy resolution, on one band; captures share the exposure."""
+    free = (
+        "search.free=[{variable: beta, bounds: [12 rad/mm^2, 30 rad/mm^2]}, "
+        "{variable: distance, bounds: [2 mm, 3 mm], shared: true}]"
+    )
+    study = tiny.built(tmp_path, free, LIGHT, "search.limits.captures=8")
+    config, problem = study.config, build_problem(study)
+    thin = front_problems(config, problem, "thickness", [2.0, 3.0])
+    assert [float(p.space.upper[-1]) for p in thin.values()] == [2.0, 3.0]
+    lit = front_problems(config, problem, "light", [90.0])[90.0]
+    assert float(lit.exact.setup.noise.electrons) == 90
+    assert thin[2.0].objective == lit.objective == ResolutionLimit()
+    captures = front_problems(config, problem, "captures", [2.0, 4.0, 8.0])
+    assert [p.space.base.captures for p in captures.values()] == [2, 4, 8]
+    assert [float(p.space.base.exposure[0]) for p in captures.values()] == [2.0, 1.0, 0.5]
+    assert [p.data.synthesis.shape for p in captures.values()] == [(1, 2), (2, 4), (4, 8)]
+    for one in (*thin.values(), lit, *captures.values()):
+        np.testing.assert_array_equal(one.exact.frequencies.axis, problem.exact.frequencies.axis)
+
+
+def test_further_shots_are_as_the_last(tmp_path):
+    free = (
+        "search.free=[{variable: beta, bounds: [12 /mm^2, 30 /mm^2], shots: [2]}, "
+        "{variable: distance, bounds: [2 mm, 3 mm], shots: [1]}]"
+    )
+    config = tiny.design(tmp_path, free)
+    more = with_shots(config, 4)
+    assert [s.beta for s in more.reference.shots] == [25, 21, 21, 21]
+    assert [f.shots for f in more.search.free] == [(2, 3, 4), (1,)]
+    assert [f.variable for f in with_shots(config, 1).search.free] == ["distance"]
+    assert with_shots(config, 2) == config

@@ -1,1 +1,0 @@
-"""Designs of see-through screens: `thincam design` of a file of kind screen_design."""
