@@ -35,7 +35,7 @@ class PicturesConfig(SourceConfig):
 class DenoiserNetworkConfig(Section):
     """See `learn.denoiser.network.DenoiserOptions`."""
 
-    widths: Widths = (32, 48, 64, 64)
+    widths: Widths = (48, 56, 56, 56)
     blocks: Blocks = (1, 1, 1, 1)
 
 

@@ -36,7 +36,7 @@ class DenoiserOptions:
     **Errors**: ValueError for levels that do not fit each other.
     """
 
-    widths: tuple[int, ...] = (32, 48, 64, 64)
+    widths: tuple[int, ...] = (48, 56, 56, 56)
     blocks: tuple[int, ...] = (1, 1, 1, 1)
 
     def __post_init__(self):

@@ -44,8 +44,8 @@ _GAMMA, _GAIN = (-0.9, 0.3), (-0.8, 0.5)
 # Standard deviation of an offset subtracted from a crop beside its mean: in a large image, local
 # means differ from the mean of the whole.
 _OFFSET = 0.15
-# Squared error relative to σ² below which a crop counts as solved: flat ones have no more to learn.
-_SOLVED = 1e-3
+# Added to MSE/σ²: the root's slope stays finite.
+_LEAST_ERROR = 1e-4
 
 
 class Crops(eqx.Module):
@@ -141,10 +141,13 @@ def draw_crops(
 
 
 def loss(network: DenoisingUNet, crops: Crops) -> tuple[Array, dict[str, Array]]:
-    """Mean of ½ ln(MSE/σ² + 10⁻³): all noise levels weigh the same, and 0.115 less is 1 dB."""
+    """Mean of RMSE/√σ: what good denoisers leave grows about as √σ, so all levels weigh the same.
+
+    A logarithm of the error would weigh flat crops as much as those with detail.
+    """
     found = denoised(network, crops.noisy, crops.sigma, crops.centre)
     error = jnp.mean((found - crops.clean) ** 2, axis=(1, 2)) / crops.sigma**2
-    value = jnp.mean(0.5 * jnp.log(error + _SOLVED))
+    value = jnp.mean(jnp.sqrt((error + _LEAST_ERROR) * crops.sigma))
     return value, {"error": jnp.mean(error)}
 
 
