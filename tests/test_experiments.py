@@ -1,5 +1,6 @@
 """The scripts of experiments/ at their reduced size: their own assertions, and their figures."""
 
+import os
 import re
 import runpy
 
@@ -24,9 +25,17 @@ def test_the_gallery_lists_them_all():
     ]
 
 
+# XLA converts float16 by F16C only, which processors have since 2012.
+WITHOUT_HALF = pytest.mark.skipif(
+    "SSE4_2" in os.environ["XLA_FLAGS"], reason="XLA has no float16 in these instructions"
+)
+
+
 def marked(script):
     """Most take ten seconds and more, even small."""
     marks = [] if script.stem == "your_own_mask" else [pytest.mark.thorough]
+    if "float16" in script.read_text("utf-8"):
+        marks.append(WITHOUT_HALF)
     return pytest.param(script, id=script.stem, marks=marks)
 
 

@@ -402,7 +402,7 @@ def test_what_has_no_closed_form_is_refused():
     recording = tc.Recording(captures, several, noise_variance=4e-4)
     with pytest.raises(ValueError, match="'gcv' needs the modes of one separable term"):
         tc.reconstruct(recording, tc.Ridge("gcv"))
-    with pytest.raises(ValueError, match="closed form for dense_camera matrices"):
+    with pytest.raises(ValueError, match="closed form for dense matrices"):
         tc.Ridge().deviation(recording)
     with pytest.raises(ValueError, match="modes of several terms"):
         ridge_by_modes(several.modes, captures, jnp.asarray(1.0))

@@ -64,7 +64,10 @@ def cell(light, black, wrong):
     (bits, peak, electrons, read), (extent, radius) = LIGHT[light], BLACK[black]
     psf, truth, random = diffuser(extent), disc(radius), np.random.default_rng(5)
     seen = scipy.signal.fftconvolve(truth, psf)
-    seen = np.maximum(seen[36 : 36 + SHAPE[0], 48 : 48 + SHAPE[1]], 0)
+    seen = seen[36 : 36 + SHAPE[0], 48 : 48 + SHAPE[1]]
+    # Black is 0 and not ±1e-17 of the FFT: Poisson noise draws no number for a mean of 0, so that
+    # signs of rounding errors would decide which noise the other pixels have.
+    seen = np.where(seen > 1e-9 * seen.max(), seen, 0)
     counts = random.poisson(electrons * peak * seen / seen.max()) / electrons
     counts = np.round(counts + read * random.normal(size=SHAPE)).clip(0, 2**bits - 1)
     capture = jnp.asarray(counts / counts.max(), jnp.float32)[None, None]
@@ -94,16 +97,19 @@ def median_of_blocks(image):
 @pytest.mark.parametrize(
     "case",
     [
-        ("8 bits, 200 counts", 90, "right"),
+        ("8 bits, 12 counts", 90, "right"),
         ("8 bits, 12 counts", 60, "2 % too large"),
         ("12 bits, 3200 counts", 90, "blurred by 0.7 pixels"),
     ],
 )
 def test_tau_is_near_the_best(case):
-    """Where most is black, and where the PSF is wrong: `before` lost 8 dB and more."""
+    """Where most is black, and where the PSF is wrong: `before` loses 8 dB and more.
+
+    One draw of the noise moves a rule by some 0.3 dB.
+    """
     found = cell(*case)
-    assert min(found[rule] for rule in RULES) > -0.7
-    assert found["before"] < -4
+    assert min(found[rule] for rule in RULES) > -1
+    assert found["before"] < -7
 
 
 @pytest.mark.full_size
