@@ -82,7 +82,7 @@ lens:
   focal_distance: {float(best.focal_distance)} mm
   lens_distance: {float(best.lens_distance)} mm
 """
-(FIGURES / "found.yaml").write_text(sections)
+(FIGURES / "found.yaml").write_text(sections, "utf-8")
 print(sections)
 
 # %% [markdown]

@@ -62,7 +62,7 @@ def test_what_the_user_has_told_jax_stands(environment, monkeypatch, tmp_path):
 
 
 def test_folder_that_cannot_be_made(environment, monkeypatch, tmp_path):
-    (tmp_path / "thincam_jax").write_text("mine")
+    (tmp_path / "thincam_jax").write_text("mine", "utf-8")
     cache.keep_programs()
     assert "JAX_COMPILATION_CACHE_DIR" not in os.environ
     assert cache.cache_state() == f"{environment}, not in use"

@@ -196,13 +196,13 @@ class TestBenchAccuracy:
         assert not out.exists()
 
     def test_folder_of_somebody_else(self, file, tmp_path):
-        (tmp_path / "file").write_text("mine")
+        (tmp_path / "file").write_text("mine", "utf-8")
         for out, hint in (
             (tmp_path, "is not empty"),
             (tmp_path / "file", "cannot be made a folder"),
         ):
             assert hint in one_line(call("bench", "accuracy", file, "--out", out))
-        assert (tmp_path / "file").read_text() == "mine"
+        assert (tmp_path / "file").read_text("utf-8") == "mine"
 
     def test_interrupt(self, file, tmp_path, monkeypatch):
         def interrupted(plan, folder, progress):
@@ -452,8 +452,8 @@ def test_completion_of_the_shell_that_asks(option, tmp_path):
     assert done.returncode == 0, done.stderr
     script = done.stdout
     if option == "--install-completion":
-        line = (tmp_path / ".bashrc").read_text().strip()
-        script = Path(line.removeprefix("source ").strip("'")).read_text()
+        line = (tmp_path / ".bashrc").read_text("utf-8").strip()
+        script = Path(line.removeprefix("source ").strip("'")).read_text(encoding="utf-8")
     assert "complete -o default -F _thincam_completion thincam" in script
 
 

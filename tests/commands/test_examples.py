@@ -55,9 +55,9 @@ def test_the_page_of_commands_lists_them():
 def test_nothing_is_overwritten(tmp_path):
     path = tmp_path / "mine.yaml"
     assert call("init", "study", "--out", path).exit_code == 0
-    path.write_text("mine")
+    path.write_text("mine", "utf-8")
     assert one_line(call("init", "study", "--out", path)).startswith(f"{path} exists; give another")
-    assert path.read_text() == "mine"
+    assert path.read_text("utf-8") == "mine"
 
 
 def test_unknown_kind_and_missing_folder(tmp_path):
@@ -74,7 +74,7 @@ def test_the_wheel_holds_them_where_they_are_looked_for(tmp_path, monkeypatch):
     wheel = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["tool"]["hatch"]["build"]
     place = wheel["targets"]["wheel"]["force-include"]["configs"]
     (tmp_path / place).mkdir(parents=True)
-    (tmp_path / place / "camera.yaml").write_text("")
+    (tmp_path / place / "camera.yaml").write_text("", "utf-8")
     module = Path(examples.__file__).relative_to(ROOT)
     monkeypatch.setattr(examples, "__file__", str(tmp_path / module))
     assert examples.kinds() == ["study", "refocus", "design", "capture", "learned", "camera"]

@@ -12,7 +12,7 @@ def available_bytes() -> int | None:
     if device.platform == "cpu":
         try:
             # Linux: what the cache of files holds is free, too, but not among the free pages.
-            for line in Path("/proc/meminfo").read_text().splitlines():
+            for line in Path("/proc/meminfo").read_text(encoding="utf-8").splitlines():
                 if line.startswith("MemAvailable:"):
                     return int(line.split()[1]) * 1024
         except OSError:

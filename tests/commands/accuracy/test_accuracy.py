@@ -83,10 +83,10 @@ class TestFolder:
 
     @pytest.mark.parametrize("name", ["thesis.txt", "accuracy.json"])
     def test_foreign_files_stay(self, config, tmp_path, name):
-        (tmp_path / name).write_text("mine")
+        (tmp_path / name).write_text("mine", "utf-8")
         with pytest.raises(ConfigError, match="is not empty and holds no benchmark"):
             accuracy.BenchFolder(tmp_path).claim(config)
-        assert (tmp_path / name).read_text() == "mine"
+        assert (tmp_path / name).read_text("utf-8") == "mine"
         assert [p.name for p in tmp_path.iterdir()] == [name]
 
     def test_done_anew_only_with_the_same_configuration(self, config, tmp_path):
@@ -98,6 +98,6 @@ class TestFolder:
             folder.claim(config.model_copy(update={"seed": 7}))
 
     def test_a_file_in_the_way(self, config, tmp_path):
-        (tmp_path / "file").write_text("mine")
+        (tmp_path / "file").write_text("mine", "utf-8")
         with pytest.raises(ConfigError, match="cannot be made a folder"):
             accuracy.BenchFolder(tmp_path / "file").claim(config)

@@ -272,13 +272,15 @@ class Eye(Camera):
 
 def test_a_camera_of_another_package_is_told_of_and_works(tmp_path, monkeypatch):
     """Found by its entry point, in 'thincam doctor' and in a file of a real rig."""
-    (tmp_path / "elsewhere.py").write_text(PLUG_IN)
+    (tmp_path / "elsewhere.py").write_text(PLUG_IN, "utf-8")
     info = tmp_path / "elsewhere-1.0.dist-info"
     info.mkdir()
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: elsewhere\nVersion: 1.0\n")
+    (info / "METADATA").write_text(
+        "Metadata-Version: 2.1\nName: elsewhere\nVersion: 1.0\n", "utf-8"
+    )
     points = "[thincam_jax.cameras]\neye = elsewhere:Eye\n"
     points += "[thincam_jax.displays]\nscreen = elsewhere:Screen\nbroken = nowhere_at_all:Screen\n"
-    (info / "entry_points.txt").write_text(points)
+    (info / "entry_points.txt").write_text(points, "utf-8")
     monkeypatch.syspath_prepend(tmp_path)
     lines = command.known_drivers()
     assert "driver of cameras eye, from elsewhere" in lines
@@ -347,6 +349,6 @@ def sockets():
     found = set()
     for table in ("tcp", "tcp6", "udp", "udp6", "raw", "raw6"):
         path = Path("/proc/self/net", table)
-        lines = path.read_text().splitlines()[1:] if path.exists() else []
+        lines = path.read_text(encoding="utf-8").splitlines()[1:] if path.exists() else []
         found |= {inode for line in lines if (inode := line.split()[9]) in own}
     return found

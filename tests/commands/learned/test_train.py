@@ -39,7 +39,7 @@ def call(*arguments):
 @pytest.fixture
 def file(tmp_path):
     path = tmp_path / "tiny.yaml"
-    path.write_text(FILE)
+    path.write_text(FILE, "utf-8")
     return path
 
 
@@ -61,10 +61,10 @@ def test_a_training_is_told_and_gone_on_with(file, tmp_path):
     done = call(file, "--out", out)
     assert done.exit_code == 0, done.output
     assert "finished: focused images" in done.stdout and str(out / NETWORK) in done.stdout
-    result = json.loads((out / "training.json").read_text())
+    result = json.loads((out / "training.json").read_text("utf-8"))
     assert result["steps"] == 4 and len(result["losses"]) == 4 and result["skipped"] == 0
     assert result["trained"]["focus_psnr_db"] > 0 and result["linear"]["consistency"] > 0
-    page = (out / "report.html").read_text()
+    page = (out / "report.html").read_text("utf-8")
     assert "drawn" in page and page.count("data:image/") == 4
     assert load(out / NETWORK, tiny.camera()).camera.planes == 2
     # The folder of a training is not begun anew by accident; what is finished stays as it is.

@@ -21,7 +21,7 @@ training: {steps: 4, batch: 2, crop: 8, judged: 1, check_every: 2, warm_up: 1}
 @pytest.fixture
 def file(tmp_path):
     path = tmp_path / "tiny.yaml"
-    path.write_text(FILE)
+    path.write_text(FILE, "utf-8")
     return path
 
 
@@ -30,7 +30,7 @@ def test_a_training_is_told_and_gone_on_with(file, tmp_path):
     done = call(file, "--out", out)
     assert done.exit_code == 0, done.output
     assert "finished: loss" in done.stdout and str(out / NETWORK) in done.stdout
-    result = json.loads((out / "training.json").read_text())
+    result = json.loads((out / "training.json").read_text("utf-8"))
     assert result["steps"] == 4 and len(result["scores"]) == 2
     card = network_card(out / NETWORK)["training"]
     assert card["images"]["trained on"][0]["licence"] == "drawn" and card["cpu_seconds"] > 0
@@ -45,7 +45,8 @@ def test_a_training_is_told_and_gone_on_with(file, tmp_path):
     assert "has widths [4] and blocks [1]; give these in the section network" in other
     on = call(file, "--out", tmp_path / "c", *start)
     assert (
-        on.exit_code == 0 and json.loads((tmp_path / "c/training.json").read_text())["steps"] == 4
+        on.exit_code == 0
+        and json.loads((tmp_path / "c/training.json").read_text("utf-8"))["steps"] == 4
     )
 
 

@@ -171,7 +171,7 @@ def test_what_the_psf_says(run):
 @pytest.mark.thorough
 def test_files(run):
     results, path = run
-    stored = json.loads((path / "metrics.json").read_text())
+    stored = json.loads((path / "metrics.json").read_text("utf-8"))
     # Masks × scenes × lights × distances × colours × methods, and the wrong focus.
     assert len(stored["cases"]) == 6 * 2 * (2 * 2 * 2 * 2 + 1)
     assert len(stored["findings"]) == 12

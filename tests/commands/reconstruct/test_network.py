@@ -20,7 +20,7 @@ from thincam_jax.learn.refocusing.store import save
 def files(tmp_path_factory):
     """A camera, its network and a capture of 12 bit of a square at 80 mm."""
     folder, network = tmp_path_factory.mktemp("network"), tiny.network()
-    (folder / "camera.yaml").write_text(FILE)
+    (folder / "camera.yaml").write_text(FILE, "utf-8")
     save(folder / "net.thincam", network)
     scene = np.zeros((1, 14, 12))
     scene[0, 4:9, 3:8] = 1
@@ -43,7 +43,7 @@ def test_a_capture_is_focused_and_what_is_not_sure_is_marked(files):
     assert result.exit_code == 0, result.output
     assert "image.png: focused on 80 mm, residual" in result.stdout
     assert np.load(files / "image.npy").shape == (14, 12)
-    done = json.loads((files / "image.json").read_text())["reconstruction"]
+    done = json.loads((files / "image.json").read_text("utf-8"))["reconstruction"]
     assert done["method"] == "learned" and done["focused_on_mm"] == 80.0
     assert done["network"].endswith("net.thincam") and 0 <= done["unsure"] <= 1
     assert skimage.io.imread(files / "image-unsure.png").std() > 1

@@ -103,7 +103,7 @@ def test_saturated_pixels_have_no_weight(folder, tmp_path):
 def test_nothing_is_left_of_a_write_that_fails(folder, tmp_path, monkeypatch, room):
     """Of the first or the last file. Not even what stood there before is touched."""
     output = Output(tmp_path / "first.png")
-    output.path.write_text("before")
+    output.path.write_text("before", "utf-8")
 
     def limited(*given):
         with full_disk(room):
@@ -117,7 +117,7 @@ def test_nothing_is_left_of_a_write_that_fails(folder, tmp_path, monkeypatch, ro
         f"{output.path}: cannot be written (File too large); make room or give another folder"
     )
     assert sorted(p.name for p in tmp_path.iterdir()) == ["captures", "first.png"]
-    assert output.path.read_text() == "before"
+    assert output.path.read_text("utf-8") == "before"
 
 
 def test_what_overflows_is_not_written(folder, tmp_path, monkeypatch):
@@ -176,10 +176,10 @@ class TestPlan:
         ],
     )
     def test_output_of_a_folder(self, folder, tmp_path, out, message):
-        (tmp_path / "file.png").write_text("mine")
+        (tmp_path / "file.png").write_text("mine", "utf-8")
         with pytest.raises(MeasurementError, match=message):
             plan_jobs(folder, sources(folder), Output(tmp_path / out))
-        assert (tmp_path / "file.png").read_text() == "mine"
+        assert (tmp_path / "file.png").read_text("utf-8") == "mine"
 
     def test_two_of_one_name(self, folder, tmp_path):
         (folder / "second.png").write_bytes(b"")

@@ -143,7 +143,9 @@ def environment(file: Path) -> dict[str, str]:
     without = file.parent / "without"
     without.mkdir(exist_ok=True)
     # Not dask itself, which pint imports where it is installed.
-    (without / "distributed.py").write_text("raise ImportError('local sweeps do without')\n")
+    (without / "distributed.py").write_text(
+        "raise ImportError('local sweeps do without')\n", "utf-8"
+    )
     path = os.pathsep.join(filter(None, [str(without), str(ROOT), kept.get("PYTHONPATH")]))
     cache = {
         "JAX_COMPILATION_CACHE_DIR": str(file.parent / "compiled"),

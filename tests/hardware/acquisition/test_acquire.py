@@ -159,7 +159,7 @@ def test_only_the_same_run_goes_on(path, monkeypatch):
         )
         with pytest.raises(ProtocolError, match="in place of .*; undo what has changed"):
             run(World(), path)
-    (path / "plan.json").write_text("{}")
+    (path / "plan.json").write_text("{}", "utf-8")
     with pytest.raises(CaptureStoreError, match="not what an acquisition made"):
         read_acquisition(path)
 

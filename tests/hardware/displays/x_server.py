@@ -74,7 +74,7 @@ def x_server() -> Iterator[str]:
 def x_server_of_two_monitors(folder: Path) -> Iterator[str]:
     """DUMMY0, and DUMMY1 to its right."""
     config = folder / "xorg.conf"
-    config.write_text(TWO_MONITORS)
+    config.write_text(TWO_MONITORS, "utf-8")
     log = str(folder / "xorg.log")
     with serving("Xorg", "-config", str(config), "-logfile", log, "-noreset") as name:
         for arguments in (

@@ -76,10 +76,10 @@ def test_nothing_is_known_and_nothing_moves_before_it_is_homed(device, stage):
 @pytest.mark.parametrize("position", [-0.001, 10.001, math.nan, math.inf])
 def test_outside_of_its_limits_nothing_is_sent(stage, tmp_path, position):
     stage.home()
-    sent = (tmp_path / "wire.txt").read_text()
+    sent = (tmp_path / "wire.txt").read_text("utf-8")
     with pytest.raises(OutOfRange, match="give a position from 0 to 10 mm"):
         stage.move_to(position)
-    assert (tmp_path / "wire.txt").read_text() == sent
+    assert (tmp_path / "wire.txt").read_text("utf-8") == sent
 
 
 def test_stopped_from_another_thread_it_knows_where_it_stands():

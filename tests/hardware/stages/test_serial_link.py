@@ -73,7 +73,7 @@ def test_what_is_sent_arrives_and_is_logged_with_what_came(line, tmp_path):
     os.write(far, b"ok\xff\n")
     link.read_line(soon())
     assert os.read(far, 10) == b"?\n"
-    sent, received = (tmp_path / "log" / "wire.txt").read_text().splitlines()
+    sent, received = (tmp_path / "log" / "wire.txt").read_text("utf-8").splitlines()
     assert sent.split(" ", 1)[1] == r"> b'?\n'" and received.split(" ", 1)[1] == r"< b'ok\xff'"
     assert sent.startswith("20") and "+00:00" in sent
 
@@ -141,7 +141,7 @@ def test_a_port_that_goes_is_disconnected_for_all_that_follows(terminal):
 
 
 def test_what_is_no_port_is_not_found_and_the_ports_are_named(tmp_path):
-    (tmp_path / "file").write_text("")
+    (tmp_path / "file").write_text("", "utf-8")
     for path in ("absent", "file", "file/absent", "."):
         with pytest.raises(NotFound, match="ports here: "):
             SerialLink("stage", str(tmp_path / path), 115200)
@@ -178,7 +178,7 @@ def test_a_program_that_asks_for_no_lock_cannot_open_it_either(terminal):
 
 
 def test_a_wire_log_that_cannot_be_written_is_told_before_the_port_is_opened(terminal, tmp_path):
-    (tmp_path / "file").write_text("")
+    (tmp_path / "file").write_text("", "utf-8")
     with pytest.raises(PermissionDenied, match="no wire log at .*name a file"):
         SerialLink("stage", terminal[1], 115200, str(tmp_path / "file" / "wire.txt"))
     SerialLink("stage", terminal[1], 115200).close()

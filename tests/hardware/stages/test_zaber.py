@@ -71,15 +71,17 @@ def test_nothing_is_known_and_nothing_moves_before_it_is_homed(device, stage):
 @pytest.mark.parametrize("position", [-0.001, 10.001, math.nan, math.inf])
 def test_outside_of_its_limits_nothing_is_sent(stage, tmp_path, position):
     stage.home()
-    sent = (tmp_path / "wire.txt").read_text()
+    sent = (tmp_path / "wire.txt").read_text("utf-8")
     with pytest.raises(OutOfRange, match="give a position from 0 to 9.99"):
         stage.move_to(position)
-    assert (tmp_path / "wire.txt").read_text() == sent
+    assert (tmp_path / "wire.txt").read_text("utf-8") == sent
 
 
 def test_every_message_has_a_number_and_a_checksum_both_ways(stage, tmp_path):
     stage.home()
-    lines = (tmp_path / "wire.txt").read_text().splitlines()[2:]  # after checksums are switched on
+    lines = (
+        (tmp_path / "wire.txt").read_text("utf-8").splitlines()[2:]
+    )  # after checksums are switched on
     sent = [eval(line.split(" ", 2)[2]).strip() for line in lines if " > " in line]
     received = [eval(line.split(" ", 2)[2]).strip() for line in lines if " < " in line]
     assert all(parse_command(line).words for line in sent)

@@ -51,7 +51,7 @@ def test_tiles_cover_a_picture_at_several_scales(tmp_path):
     levels = np.uint8(np.stack([y, x * 0.8, 0 * x], axis=-1))
     PIL.Image.fromarray(levels).save(tmp_path / "ramp.png")
     PIL.Image.fromarray(levels[..., 0]).save(tmp_path / "grey.png")
-    (tmp_path / "LICENSE").write_text("CC0 1.0\n")
+    (tmp_path / "LICENSE").write_text("CC0 1.0\n", "utf-8")
     found = photographs(tmp_path)
     tiles = found["ramp"].tiles
     assert tiles.shape == (4, TILE, TILE, 3)  # two by two: smaller scales hold no tile

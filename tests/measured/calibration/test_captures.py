@@ -97,7 +97,7 @@ def test_what_is_no_store_is_refused(tmp_path):
     with pytest.raises(CaptureStoreError, match="is no store of Hadamard captures"):
         open_captures(tmp_path / "b.zarr")
     about = path / "zarr.json"
-    text = about.read_text()
+    text = about.read_text("utf-8")
     about.write_text(text.replace('"dark_frames": 3', '"dark_frames": 4'))
     with pytest.raises(CaptureStoreError, match="contradicts itself: arrays of shapes"):
         open_captures(path)

@@ -172,7 +172,7 @@ def port_holder(port: str) -> str:
     for process in Path("/proc").glob("[0-9]*"):
         try:
             if any(os.path.realpath(file) == wanted for file in (process / "fd").iterdir()):
-                return f"{(process / 'comm').read_text().strip()} (process {process.name})"
+                return f"{(process / 'comm').read_text('utf-8').strip()} (process {process.name})"
         except OSError:
             continue  # another user's process, or one that has ended
     return ""

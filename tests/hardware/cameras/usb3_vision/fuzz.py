@@ -151,7 +151,7 @@ def xml(count: int) -> tuple[int, int]:
 
 def memory() -> int:
     """Most memory that this process has held, in MiB; getrusage would count its parent's, too."""
-    lines = Path("/proc/self/status").read_text().splitlines()
+    lines = Path("/proc/self/status").read_text(encoding="utf-8").splitlines()
     return next(int(line.split()[1]) >> 10 for line in lines if line.startswith("VmHWM"))
 
 

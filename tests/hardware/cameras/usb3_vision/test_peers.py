@@ -100,7 +100,7 @@ def test_a_peer_receives_every_pixel(script, device, scene, tmp_path):
 @pytest.mark.parametrize("mode", ["sync", "async"])
 def test_the_test_program_of_aravis_finds_no_fault(mode, device, tmp_path):
     settings = "[thincam_jax:Virtual camera]\nChunksSupport=false\nSensorSize=64;48\n"
-    (tmp_path / "settings").write_text(settings)
+    (tmp_path / "settings").write_text(settings, "utf-8")
     with presented(device) as run:
         result = run("arv-test-0.8", "-n", "thincam_jax*", "-s", mode,
                      "-c", str(tmp_path / "settings"))  # fmt: skip

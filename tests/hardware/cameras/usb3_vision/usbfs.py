@@ -147,7 +147,7 @@ def _show(root: Path) -> None:
     }  # fmt: skip
     system.mkdir(parents=True)
     for name, text in attributes.items():
-        (system / name).write_text(text)
+        (system / name).write_text(text, "utf-8")
     (system / "descriptors").write_bytes(DEVICE_BYTES + CONFIGURATION_BYTES)
     for path in ("sys/bus/usb/devices", "sys/class", "dev/.node", "run/udev/data", "ioctl"):
         (root / path).mkdir(parents=True)

@@ -66,7 +66,8 @@ def holder(node: str) -> str:
     for link in Path("/proc").glob("[0-9]*/fd/*"):
         with suppress(OSError):
             if os.readlink(link) == node and (process := link.parts[2]) != str(os.getpid()):
-                return f"{Path('/proc', process, 'comm').read_text().strip()}, process {process},"
+                name = Path("/proc", process, "comm").read_text("utf-8").strip()
+                return f"{name}, process {process},"
     return "another program"
 
 
