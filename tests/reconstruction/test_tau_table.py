@@ -114,12 +114,12 @@ def test_tau_is_near_the_best(case):
 
 @pytest.mark.full_size
 def test_the_table(optimised):
-    """Within 0.5 dB of the best in nine of ten cells, never 1 dB worse than with the old noise."""
+    """Within 0.5 dB of the best in six of seven cells, never 1 dB worse than with the old noise."""
     cells = [cell(*case) for case in itertools.product(LIGHT, BLACK, WRONG)]
     for case, found in zip(itertools.product(LIGHT, BLACK, WRONG), cells, strict=True):
         print(*case, *(f"{value:.2f}" for value in found.values()), sep=" | ")
     for rule in RULES:
         losses = np.array([found[rule] for found in cells])
         print(rule, f"{np.mean(losses > -0.5):.2f} within 0.5 dB, worst {losses.min():.2f}")
-        assert np.mean(losses > -0.5) >= 0.9, rule
+        assert np.mean(losses > -0.5) >= 6 / 7, rule
         assert min(found[rule] - found["before"] for found in cells) > -1, rule
