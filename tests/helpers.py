@@ -39,6 +39,12 @@ def full_disk(size: int) -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
+def recipe(name: str) -> str:
+    """The code of "## Adding …" in CONTRIBUTING.md."""
+    text = (ROOT / "CONTRIBUTING.md").read_text("utf-8").split(f"## Adding {name}\n")[1]
+    return text.split("```python\n")[1].split("```")[0]
+
+
 def quick(values: Iterable, *places: int) -> list:
     """Parameters of a test: those at `places` in every run, the others in the thorough one."""
     return [

@@ -16,7 +16,7 @@ import yaml
 from commands.capture import tiny
 from commands.test_cli import call, one_line
 
-from helpers import ROOT
+from helpers import ROOT, recipe
 from thincam_jax.commands.capture import command
 from thincam_jax.commands.capture.config import CaptureConfig
 from thincam_jax.commands.checked_config import load_as
@@ -217,57 +217,7 @@ def test_shipped_files(name):
     assert len(plan.steps) == {"rig_virtual": 5, "rig_hadamard": 1032}[name]
 
 
-PLUG_IN = """
-from dataclasses import dataclass
-import numpy as np
-from thincam_jax.hardware import Camera, Display, Frame, Identity, Region
-
-
-class Screen(Display):
-    shape, identity = (60, 80), Identity("Elsewhere", "screen", "7")
-
-    @dataclass(frozen=True)
-    class Options:
-        pass
-
-    @classmethod
-    def open(cls, options):
-        return cls()
-
-    def show(self, pattern):
-        Eye.seen = float(pattern.mean())
-
-    def close(self):
-        pass
-
-
-class Eye(Camera):
-    sensor_shape, identity, seen, count = (64, 96), Identity("Elsewhere", "eye", "8"), 0.0, 0
-
-    @dataclass(frozen=True)
-    class Options:
-        gain: float = 1.0
-
-    @classmethod
-    def open(cls, options):
-        return cls()
-
-    def configure(self, settings):
-        self.settings = settings
-        return settings
-
-    def flush(self):
-        pass
-
-    def trigger_and_grab(self, timeout):
-        self.count += 1
-        pixels = np.full(self.sensor_shape, 100 + round(self.seen), np.uint16)
-        pixels[0, 0] = self.count
-        return Frame(pixels, self.count, float(self.count), self.settings.exposure, 12)
-
-    def close(self):
-        pass
-"""
+PLUG_IN = recipe("a device")
 
 
 def test_a_camera_of_another_package_is_told_of_and_works(tmp_path, monkeypatch):
