@@ -193,7 +193,7 @@ def frame_digest(pixels: np.ndarray) -> int:
 
 
 def dtype_of_bits(bits: int | None) -> str:
-    """What holds the counts of a camera of that many bits; None: any numbers."""
+    """Integer type for the counts of a camera of that many bits; None: any numbers."""
     return "float32" if bits is None else "uint8" if bits <= 8 else "uint16"
 
 

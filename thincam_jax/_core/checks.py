@@ -192,7 +192,7 @@ def at_least_one(counts: dict[str, int]) -> None:
 
 
 def whole_cells(name: str, side: Any, cell_name: str, cell: Any) -> int:
-    """How many cells make up a side, both in mm, or ValueError with the sides next to it."""
+    """Number of cells that make up a side, both in mm; ValueError names the sides next to it."""
     side = float(positive(name, side, "mm"))
     cell = float(positive(cell_name, cell, "mm"))
     cells = round(side / cell)

@@ -30,7 +30,7 @@ class Module(eqx.Module):
                 converter.name = name
 
     def __pdoc__(self, **kwargs: Any) -> wl.AbstractDoc:
-        """What equinox's printer asks for, of this object or of one inside another."""
+        """Document for equinox's printer, of this object or of one inside another."""
         named = [(f, getattr(self, f.name, None)) for f in dataclasses.fields(self) if f.repr]
         parts = [
             wl.TextDoc(f"{f.name}=") + wl.pdoc(_shown(f.metadata.get("converter"), value), **kwargs)

@@ -1,4 +1,4 @@
-"""What a number is, stated once at its field: unit, range, choices.
+"""Unit, range and choices of a number, stated once at its field.
 
     beta: Float[Array, ""] = eqx.field(converter=quantity("rad/mm^2", positive=True))
 

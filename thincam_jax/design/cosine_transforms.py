@@ -65,7 +65,7 @@ def series(
 
 
 def both_signs(count: int) -> np.ndarray:
-    """How often each frequency 0 … N/2 of N, an even number, stands in a sum over all N."""
+    """Multiplicity of each frequency 0 … N/2 in a sum over all N, an even number."""
     times = np.full(count // 2 + 1, 2.0)
     times[[0, -1]] = 1.0
     return times
@@ -83,7 +83,7 @@ def _fold(image, axis: int):
 
 
 def _unfold(parts, count: int, axis: int):
-    """What has these even and odd parts, the first axis, along an axis of each."""
+    """Array with these even and odd parts, given along the first axis, along `axis` of each."""
     even, odd = parts
     lower = jnp.flip(even - odd, axis - 1)
     lower = jax.lax.slice_in_dim(lower, 0, count // 2, axis=axis - 1)

@@ -44,7 +44,7 @@ class Landscape:
 
     @property
     def label(self) -> str:
-        """What the values are, with their unit."""
+        """Label of the values, with their unit."""
         if isinstance(self.objective, AbstractObjective):
             return self.objective.label
         return "objective to minimise"

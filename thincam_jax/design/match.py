@@ -33,7 +33,7 @@ from thincam_jax.design.design import Design
 from thincam_jax.design.frequencies import Frequencies
 from thincam_jax.design.objectives import Channels, channels, ring_means
 from thincam_jax.design.search import (
-    APART,
+    SEPARATION,
     Descents,
     Found,
     best_apart,
@@ -144,7 +144,7 @@ _WEIGHT = 100.0
 
 
 class Match(Module):
-    """What `match_response` found.
+    """Result of `match_response`.
 
     - `found`: local optima, best first, without repetitions; their `objective` is the misfit, dB.
     - `misfit_db`: the best of them; infinite if there is none.
@@ -174,7 +174,7 @@ def match_response(
     steps: int = 30,
     tolerance: float = 1e-4,
     tolerance_db: float = MATCHED,
-    apart: float = APART,
+    separation: float = SEPARATION,
 ) -> Match:
     """The designs of a space whose levels are nearest to target ones.
 
@@ -187,7 +187,7 @@ def match_response(
     - `steps`: at most, of each descent; it ends where a step changes the misfit by less than
       `tolerance` of itself.
     - `tolerance_db`: misfits up to here are "matched".
-    - `apart`: optima closer than this in the cube are one.
+    - `separation`: optima closer than this in the cube are one.
 
     **Validity.** The response has many local optima; more starts and samples find better ones. A
     target that no design fulfils has the status "not_attained".
@@ -204,14 +204,14 @@ def match_response(
     chosen = best_apart(np.asarray(points), np.asarray(values), starts)
     ended = jax.device_get(_least_squares(model, levels, points[chosen], steps, tolerance))
     failed = sum(int(np.sum(~np.isfinite(v))) for v in (np.asarray(values), ended.values))
-    found = ranked(space, ended, apart)
+    found = ranked(space, ended, separation)
     best = found[0].objective if found else np.inf
     used = len(points) + int(np.sum(ended.evaluations))
     return Match(found, best, match_status(best, tolerance_db), used, failed)
 
 
 def match_status(misfit_db: float, tolerance_db: float) -> MatchStatus:
-    """What a misfit is called."""
+    """Name of the misfit."""
     if not np.isfinite(misfit_db):
         return "non_finite"
     return "matched" if misfit_db <= tolerance_db else "not_attained"

@@ -307,7 +307,7 @@ def restored_objective(mask: PhaseMask, data: Any, key: PRNGKeyArray) -> Float[A
 
 
 class Refined(Module):
-    """What `refine_mask` found.
+    """Result of `refine_mask`.
 
     - `mask`: after the last step, or the one given where that is better. `history`: the objective
       at every step, before it.
@@ -372,7 +372,7 @@ def _descend(objective, mask: PhaseMask, limits: HeightLimits, data, start, step
 
 @functools.partial(jax.jit, static_argnames=("objective", "limits"))
 def _better(objective, mask: PhaseMask, limits: HeightLimits, data, found) -> PhaseMask:
-    """What was found, or what was given."""
+    """The mask found, or the one given."""
     u, key = found
     after = _relief(mask, limits, u)
     before = eqx.tree_at(lambda m: m.height, mask, limits.nearest(mask.height))

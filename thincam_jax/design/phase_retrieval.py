@@ -24,7 +24,7 @@ from thincam_jax.lensless.propagation.path import Path
 
 
 class Retrieval(Module):
-    """What `retrieve_phase` found.
+    """Result of `retrieve_phase`.
 
     - `phase`: of each cell of the mask, rad, from 0 to 2π.
     - `error`: `match_error` of the PSF at the beginning of every step.
@@ -77,7 +77,7 @@ def retrieve_phase(
 
 
 def match_error(psf: Float[Array, "y x"], target: Float[Array, "y x"]) -> Float[Array, ""]:
-    """How far two PSFs differ in shape: 1 − ⟨h, T⟩²/(‖h‖²‖T‖²), 0 where one is a multiple."""
+    """Difference of two PSFs in shape: 1 − ⟨h, T⟩²/(‖h‖²‖T‖²), 0 where one is a multiple."""
     both = jnp.sum(psf * target) ** 2
     return 1 - both / (jnp.sum(psf**2) * jnp.sum(target**2))
 

@@ -53,7 +53,7 @@ def _number(name: str, value: Any) -> Float[Array, ""]:
 
 
 class Plate(Module):
-    """What of a see-through-screen camera is chosen; lengths in mm, the angle in rad.
+    """Free parameters of a see-through-screen camera; lengths in mm, the angle in rad.
 
     The defaults are those of ERRATA.md, for what the thesis does not give.
     """
@@ -105,7 +105,7 @@ class PlateLimits(eqx.Module):
 
 
 class Viewing(eqx.Module):
-    """What the plate is to see.
+    """Requirements on what the plate images.
 
     - `sensor`: its pixels. `object_distance`, `object_width`: mm. `cell`: the finest detail, mm,
       whose Nyquist frequency ends the integral.

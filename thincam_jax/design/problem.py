@@ -81,7 +81,7 @@ class DesignProblem(eqx.Module):
 
 @dataclasses.dataclass(frozen=True)
 class FrequencyCounts:
-    """How finely responses are sampled: radii and directions in a search, the square of `exact`.
+    """Sampling of responses: radii and directions in a search, the square of `exact`.
 
     - `exact`: along each axis; None: as many as the fringes of the responses need.
     """

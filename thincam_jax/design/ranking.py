@@ -10,7 +10,7 @@ import numpy as np
 from thincam_jax.design.design import Design, Shot
 from thincam_jax.design.objectives import ObjectiveData, ring_means
 from thincam_jax.design.problem import DesignProblem, Objective
-from thincam_jax.design.search import APART, Found, NonFiniteObjectiveError
+from thincam_jax.design.search import SEPARATION, Found, NonFiniteObjectiveError
 from thincam_jax.design.sensitivity import (
     FreeValue,
     derivatives,
@@ -115,7 +115,7 @@ def _alike(space: DesignSpace, one: Found, other: Found) -> bool:
     spans.pop("phase", None)
     pairs = zip(*(sorted(f.design.shots) for f in (one, other)), strict=True)
     return all(
-        abs(getattr(a, name) - getattr(b, name)) <= APART * span
+        abs(getattr(a, name) - getattr(b, name)) <= SEPARATION * span
         for a, b in pairs
         for name, span in spans.items()
     )

@@ -203,7 +203,7 @@ def signal_variance(
 
 
 def _even_variance(design: Design, setup: Setup, distance) -> Float[Array, ""]:
-    """What the uniform background casts: the object through a square opening, without its mean."""
+    """Response to the uniform background: the object through a square opening, without its mean."""
     shadow = design.width * (1 + distance / setup.object_distance)
     end = _LOBES / shadow
     nodes, weights = leggauss(_NODES)

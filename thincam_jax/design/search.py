@@ -27,14 +27,14 @@ from thincam_jax.design.space import DesignSpace, active_limits
 
 Solver = Literal["bfgs", "lbfgsb"]
 # Optima closer than this in the unit cube are one.
-APART = 0.02
+SEPARATION = 0.02
 
 Status = Literal["converged", "iterations_exhausted", "non_finite"]
 
 
 @dataclass(frozen=True)
 class SearchSettings:
-    """How long to search, and by which solver.
+    """Length of a search, and its solver.
 
     - `starts`: descents; `samples`: of the even (scrambled Sobol) sampling before, from which
       those start that are lowest among their neighbours; at least `starts`.
@@ -42,7 +42,7 @@ class SearchSettings:
     - `solver`: "bfgs" (optimistix), under the smooth map sin² onto the cube, or "lbfgsb" (jaxopt)
       within its faces.
     - `tolerance`: relative change of the objective and absolute change in the cube at the end.
-    - `apart`: optima closer than this in the cube are one.
+    - `separation`: optima closer than this in the cube are one.
 
     **Errors**: ValueError for numbers of starts, samples or steps below 1.
     """
@@ -52,7 +52,7 @@ class SearchSettings:
     steps: int = 60
     solver: Solver = "bfgs"
     tolerance: float = 1e-6
-    apart: float = APART
+    separation: float = SEPARATION
 
     def __post_init__(self):
         counts = {"starts": self.starts, "samples": self.samples, "steps": self.steps}
@@ -124,12 +124,12 @@ def find_designs(
     ended = jax.device_get(ended)
     failed = sum(int(np.sum(~np.isfinite(v))) for v in (np.asarray(values), ended.values))
     used = len(points) + int(np.sum(ended.evaluations))
-    found = ranked(space, ended, settings.apart)
+    found = ranked(space, ended, settings.separation)
     if problem.exact is None or not found:
         return Search(found, used, failed)
     begun = np.stack([*(one.point for one in found), points[chosen[0]]])
     better, more = _improved(problem, begun, [one.status for one in found])
-    return Search(without_repeats(better, settings.apart), used + more, failed)
+    return Search(without_repeats(better, settings.separation), used + more, failed)
 
 
 # How many optima are improved on the exact objective, and how: from the best of so many even
@@ -204,7 +204,7 @@ def descend(
         ended.append(_descend(objective, space, data, point[None], _scale(value), steps, tolerance))
     stacked = jax.device_get(jax.tree.map(lambda *parts: jnp.concatenate(parts), *ended))
     failed = int(np.sum(~np.isfinite(stacked.values)))
-    return Search(ranked(space, stacked, APART), int(np.sum(stacked.evaluations)), failed)
+    return Search(ranked(space, stacked, SEPARATION), int(np.sum(stacked.evaluations)), failed)
 
 
 # Points of the unit cube that are evaluated at a time.
@@ -257,7 +257,7 @@ def best_apart(
 
 
 def _scale(values: Float[Array, " start"]) -> Float[Array, " start"]:
-    """What each descent's tolerance is relative to: the objective at its start."""
+    """Scale of each descent's tolerance: the objective at its start."""
     size = jnp.abs(values)
     return jnp.where(jnp.isfinite(size) & (size > 0), size, 1.0)
 
@@ -303,14 +303,14 @@ def _descend_in_box(objective, space, data, points, scales, steps: int, toleranc
     return jax.vmap(one)(points, scales)
 
 
-def ranked(space: DesignSpace, ended: Descents, apart: float) -> tuple[Found, ...]:
-    """The optima, best first, without those nearer than `apart` to a better one."""
+def ranked(space: DesignSpace, ended: Descents, separation: float) -> tuple[Found, ...]:
+    """The optima, best first, without those nearer than `separation` to a better one."""
     found = []
     for place, value, converged in zip(ended.points, ended.values, ended.converged, strict=True):
         if np.isfinite(value):
             status: Status = "converged" if converged else "iterations_exhausted"
             found.append(_found(space, place, value, status))
-    return without_repeats(found, apart)
+    return without_repeats(found, separation)
 
 
 def _found(space: DesignSpace, place, value, status: Status) -> Found:
@@ -319,10 +319,10 @@ def _found(space: DesignSpace, place, value, status: Status) -> Found:
     return Found(space.design(point), space.values(point), float(value), status, active, point)
 
 
-def without_repeats(found: Iterable[Found], apart: float = APART) -> tuple[Found, ...]:
-    """Best first, without those nearer than `apart` to a better one."""
+def without_repeats(found: Iterable[Found], separation: float = SEPARATION) -> tuple[Found, ...]:
+    """Best first, without those nearer than `separation` to a better one."""
     kept: list[Found] = []
     for one in sorted(found, key=lambda one: one.objective):
-        if all(np.max(np.abs(one.point - other.point)) >= apart for other in kept):
+        if all(np.max(np.abs(one.point - other.point)) >= separation for other in kept):
             kept.append(one)
     return tuple(kept)

@@ -23,7 +23,7 @@ QUANTITIES = quantities(Design)  # what may be free
 
 @dataclass(frozen=True)
 class ReportedNumber:
-    """How a number of a shot is reported.
+    """Format in which a number of a shot is reported.
 
     - `name`, `unit`: in tables and on axes; `scale`: from the package's unit; `form`: its digits.
     """
@@ -88,7 +88,7 @@ class Variable:
 
 @dataclass(frozen=True)
 class Limits:
-    """What a rig can do, beside the bounds of single variables.
+    """Limits of a rig, beside the bounds of single variables.
 
     - `mask_pixel`: of the display or printer, mm: the zones at the mask's edge keep a period of two
       of them, β·width ≤ π/mask_pixel.
@@ -137,7 +137,7 @@ class DesignSpace(eqx.Module):
 
     @property
     def size(self) -> int:
-        """How many numbers are free."""
+        """Number of free numbers."""
         return len(self.variables)
 
     def design(self, point: Float[Array, " variable"]) -> Design:
@@ -208,7 +208,7 @@ def active_limits(
     space: DesignSpace,
     point: Float[Array, " variable"] | Float[np.ndarray, " variable"],
 ) -> tuple[str, ...]:
-    """What a point of the unit cube lies against, in words."""
+    """Active limits at a point of the unit cube, in words."""
     words = []
     values = space.values(jnp.asarray(point))
     for variable, place, value in zip(space.variables, jax.device_get(point), values, strict=True):

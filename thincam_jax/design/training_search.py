@@ -21,7 +21,7 @@ from thincam_jax.design.landscape import Landscape, drawn_variables, landscape_i
 from thincam_jax.design.objectives import AbstractObjective
 from thincam_jax.design.problem import DesignProblem, Objective
 from thincam_jax.design.search import (
-    APART,
+    SEPARATION,
     Found,
     NonFiniteObjectiveError,
     Search,
@@ -68,7 +68,7 @@ class TrainingError(AbstractObjective):
 
 @dataclass(frozen=True)
 class TrainingSettings:
-    """How long to train: `steps` of descents from the best `starts` of even `samples` and others.
+    """Length of a training: descents of `steps` from the best `starts` of even `samples`.
 
     - `grid`: points along each side of the landscape, at most.
     """
@@ -215,13 +215,13 @@ def differences(problem: DesignProblem, found: Found) -> Derivatives:
     """
     size = problem.space.size
     space, place, spans = uncoupled(problem.space, found.point)
-    middle = np.clip(np.asarray(place, float), APART, 1 - APART)
-    steps = APART * np.eye(size)
+    middle = np.clip(np.asarray(place, float), SEPARATION, 1 - SEPARATION)
+    steps = SEPARATION * np.eye(size)
     points = np.concatenate([middle[None], middle + steps, middle - steps])
     points = jnp.asarray(points, space.lower.dtype)
     values = evaluate(problem.objective, space, problem.data, points, at_a_time=1)
     level, up, down = np.split(np.asarray(values, float), [1, 1 + size])
-    return per_unit((up - down) / (2 * APART), (up - 2 * level + down) / APART**2, spans)
+    return per_unit((up - down) / (2 * SEPARATION), (up - 2 * level + down) / SEPARATION**2, spans)
 
 
 def build_training(

@@ -144,7 +144,7 @@ def _captured(scene, response, channel: _Channel, training: Training, at) -> Flo
 
 
 def _measure(at: Float[Array, " frequency"]) -> Float[Array, "v u"]:
-    """What a sum over the window's frequencies, of either sign, weighs each with, 1/rad²."""
+    """Weight of each of the window's frequencies, of either sign, in a sum, 1/rad²."""
     along = jnp.asarray(both_signs(2 * len(at) - 2), at.dtype) * (at[1] - at[0])
     return along[:, None] * along
 

@@ -1,4 +1,4 @@
-"""What a camera, a stage and a display promise, whoever made them.
+"""Interfaces of cameras, stages and displays, whoever made them.
 
 Units are millimetres and seconds. Each device is a context manager: leaving it stops what moves or
 streams and gives the device back. A driver raises `HardwareError` and nothing else.
@@ -57,7 +57,7 @@ class Region:
 
 @dataclass(frozen=True)
 class CameraSettings:
-    """What a camera is set to, or is asked for: `Camera.configure` returns what it took."""
+    """Settings of a camera, or those asked for: `Camera.configure` returns what it accepted."""
 
     exposure: float  # s
     region: Region | None = None  # None: the whole sensor

@@ -1,4 +1,4 @@
-"""What can go wrong with a device, each with what was tried, why it failed and what to do."""
+"""Errors of devices, each with what was tried, why it failed and what to do."""
 
 
 class HardwareError(Exception):

@@ -1,1 +1,1 @@
-"""What every camera shares: scenes, sensors, targets, operators, metrics."""
+"""Parts that all cameras share: scenes, sensors, targets, operators, metrics."""

@@ -1,4 +1,4 @@
-"""What the camera looks at: flat images at distances, and the light they send."""
+"""Scenes: flat images at distances, and the light they send."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -75,7 +75,7 @@ class ImagePlane(Module):
     def weights(
         self, grid: Grid, *, magnification: float | Float[Array, ""] = -1.0
     ) -> tuple[Float[Array, "y m"], Float[Array, "x n"]]:
-        """What `sample` multiplies the image with, from above and from the right, transposed."""
+        """Matrices, left and (transposed) right, by which `sample` multiplies the image."""
         scale = jnp.asarray(magnification, dtype=grid.pitch.dtype)
         rows, columns = self.image.shape[-2:]
         moves = None if self.moves is None else self.moves.astype(scale.dtype) * scale

@@ -170,7 +170,7 @@ def electrons_per_unit(sensor: Sensor, image: Pictures) -> Electrons | None:
 def read_out(
     sensor: Sensor, image: Pictures, *, noise: AbstractNoise | None = None, key: Any = None
 ) -> Pictures:
-    """What the sensor reports for a noise-free image, in the image's own units.
+    """Reading of the sensor for a noise-free image, in the image's own units.
 
     Noise, then saturation at the full well, then quantisation, as `sensor` and `noise` ask for.
     Every (y, x) image of a batch is exposed on its own.

@@ -46,7 +46,7 @@ def write_arrays(path: str | os.PathLike[str], tree: Any, description: dict[str,
 
 
 def read_description(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """What is to be known of a file's arrays, after all sums have been checked.
+    """Description of a file's arrays, after all sums have been checked.
 
     **Errors**: CheckpointError, one line; OSError for what cannot be read.
     """

@@ -45,7 +45,7 @@ _BEND, _COSINES = 2.0, 4
 
 
 class TrainedSuggester(Module):
-    """What training gave.
+    """Result of a training.
 
     - `suggester`: the network after the last step.
     - `warm_up`: distance of the nearest guess in the cube, root mean square, at every step.

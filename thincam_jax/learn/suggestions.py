@@ -91,7 +91,7 @@ class Suggester(eqx.Module):
 
 
 class Proposal(eqx.Module):
-    """What `propose` finds: points of the unit cube and their misfits, dB.
+    """Result of `propose`: points of the unit cube and their misfits, dB.
 
     - `first_point`, `first_misfit_db`: the best guess of the network alone.
     - `point`, `misfit_db`: after the Gauss–Newton steps; never worse.
@@ -256,7 +256,7 @@ def load_suggester(
 
 
 def _described(suggester: Suggester) -> dict[str, Any]:
-    """What must agree before the numbers can be read."""
+    """Description that must agree before the numbers can be read."""
     model, layers = suggester.model, suggester.layers
     space, setup = model.space, model.setup
     width, depth = layers[0].out_features, len(layers) - 1

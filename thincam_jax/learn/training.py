@@ -39,7 +39,7 @@ TrainingStatus = Literal["finished", "stopped", "diverged"]
 
 @dataclass(frozen=True)
 class TrainingOptions:
-    """How long and how fast.
+    """Length and rate of a training.
 
     - `steps`, `seed`: of the training.
     - `rate`: of Adam; it rises over `warm_up` steps and falls to zero as a cosine, over the last
@@ -81,7 +81,7 @@ class TrainingOptions:
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """What is to be learned.
+    """Learning task.
 
     - `draw`: examples for a step, from its key; the same key gives the same ones.
     - `loss`: (model, examples) → a number and a dictionary of its parts, for `grad`, at module
@@ -130,7 +130,7 @@ class TrainingState(eqx.Module):
 
 @dataclass(frozen=True)
 class TrainingProgress:
-    """What is told after every step.
+    """Progress, reported after every step.
 
     - `score`: the lowest so far, NaN before the first check; `seconds_left`: estimated.
     """

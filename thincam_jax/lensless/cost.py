@@ -1,4 +1,4 @@
-r"""What an evaluation costs before it is done: arithmetic and peak memory.
+r"""Cost of an evaluation before it is done: arithmetic and peak memory.
 
 The laws follow the arrays that each model forms; their constants are measured once, from the
 buffers that XLA allocates on a CPU (``compiled.memory_analysis()``) and from timings.

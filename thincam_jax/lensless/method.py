@@ -52,7 +52,7 @@ def models_of(mask: AbstractMask) -> tuple[Model, ...]:
 
 @dataclass(frozen=True)
 class PsfMethod:
-    """How a PSF is computed: all that is static where JAX compiles; arguments as of `psf`.
+    """Method for computing a PSF: all that is static where JAX compiles; arguments as of `psf`.
 
     - `samples`, `mask_shape`: samples a pixel, and pixels of the mask plane, of the models that
       sample the mask; 1 and None for the closed forms, and None for a mask of traced size.

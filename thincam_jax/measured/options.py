@@ -1,4 +1,4 @@
-"""What is to be done with a measured PSF and capture, and whether they go together."""
+"""Preparation options of a measured PSF and capture, and checks that they go together."""
 
 from dataclasses import dataclass
 from typing import Any, Literal, get_args

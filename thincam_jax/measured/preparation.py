@@ -164,7 +164,7 @@ def _noise(part: np.ndarray, options: Preparation) -> np.ndarray:
 
 
 def _level(background: Background, raw: Raw, corner: np.ndarray) -> np.ndarray:
-    """What is subtracted, in parts of full scale."""
+    """Level to subtract, in parts of full scale."""
     if isinstance(background, Raw):
         return _in_full_scale(background)
     if isinstance(background, str):

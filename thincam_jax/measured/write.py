@@ -142,7 +142,7 @@ def linear_bytes(image: np.ndarray, suffix: str) -> bytes:
 
 
 def _plain(value: Any) -> Any:
-    """What JSON can hold."""
+    """Convert to values that JSON can hold."""
     if isinstance(value, Mapping):
         return {str(key): _plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):

@@ -1,4 +1,4 @@
-"""How noisy a capture is, from the capture alone."""
+"""Noise of a capture, estimated from the capture alone."""
 
 import math
 from collections.abc import Sequence

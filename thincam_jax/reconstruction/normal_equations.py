@@ -192,7 +192,7 @@ class IterativeNormal(AbstractNormal):
     def solution(
         self, right: Float[Array, "..."], guess: Float[Array, "..."], tolerance: Number, steps: int
     ) -> lineax.Solution:
-        """What lineax says; `tolerance` is relative to the right-hand side, root mean square."""
+        """Status by lineax; `tolerance` is relative to the right-hand side, root mean square."""
         structure = jax.ShapeDtypeStruct(right.shape, right.dtype)
         tags = lineax.positive_semidefinite_tag
         # lineax takes a curvature pᵀAp/‖r‖² below 100·eps·(number of unknowns) for a breakdown,
@@ -239,7 +239,7 @@ def _weighted(problem: InverseProblem):
 
 
 def _bare(operator: AbstractOperator) -> AbstractOperator:
-    """What a `ScaledProblem` has put a unit around."""
+    """The operator that a `ScaledProblem` has put a unit around."""
     return operator.operator if isinstance(operator, Scaled) else operator
 
 

@@ -80,7 +80,7 @@ class Reconstruction(Module):
         return self.pitch is not None and self.pitch.ndim > 0
 
     def _repr_png_(self) -> bytes:
-        """What a notebook shows: the image with gamma 2.2; planes and a batch beside each other."""
+        """Picture for notebooks: the image with gamma 2.2; planes and a batch beside each other."""
         images = pictures(self.image, planes=self.has_planes)
         return png_bytes(eight_bit(np.concatenate(images, axis=1)))
 

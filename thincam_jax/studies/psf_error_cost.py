@@ -1,4 +1,4 @@
-"""What a wrong PSF costs: errors of captures, and PSNR of reconstructions that assume it."""
+"""Cost of a wrong PSF: errors of captures, and PSNR of reconstructions that assume it."""
 
 import dataclasses
 import math
@@ -140,7 +140,7 @@ def clean_capture(
     precision: Precision = "float64",
     assumed: Exposure | None = None,
 ) -> np.ndarray:
-    """What falls on the sensor, (channel, y, x), without noise or saturation.
+    """Light on the sensor, (channel, y, x), without noise or saturation.
 
     With `assumed`, the PSF is that of another camera; where the scene falls stays as it is.
     """
@@ -172,7 +172,7 @@ def kernel_reason(case: Case, exposure: Exposure, model: Model) -> str | None:
 
 @dataclass(frozen=True)
 class ModelCost:
-    """What a reconstruction loses that assumes a model in place of the exact one.
+    """Loss of a reconstruction that assumes a model in place of the exact one.
 
     - `psf_error`: relative, over the sensor and all the method's exposures.
     - `psnr_db`: against the scene; `psnr_lost_db`: against what the exact model reaches.
@@ -188,7 +188,7 @@ class ModelCost:
 
 @dataclass(frozen=True)
 class ControlledCost:
-    """What a PSF error of a `level` costs: the exact model of a slightly wrong camera.
+    """Cost of a PSF error of a `level`: the exact model of a slightly wrong camera.
 
     - `wrong`: "beta" or "distance", whose relative `change` gives that error.
     - `psnr_lost_db`: the worse of a change up and down: by chance, one of them can gain a little.

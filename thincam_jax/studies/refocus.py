@@ -145,7 +145,7 @@ class RefocusStudy:
 
     @property
     def objects(self) -> tuple[PlacedTarget, ...]:
-        """What the scene holds."""
+        """Contents of the scene."""
         return tuple(one for one in self.study.targets if isinstance(one, PlacedTarget))
 
     @property

@@ -253,7 +253,7 @@ def mistaken_rays(
 
 
 def _bounce(guided: Array, index: Array) -> Array:
-    """How far guided light travels along a glass of thickness 1 between its surfaces."""
+    """Path of guided light along a glass of thickness 1 between its surfaces."""
     left = index**2 - jnp.sum(guided**2, axis=-1)
     return guided / jnp.sqrt(jnp.maximum(left, 1e-6))[..., None]
 

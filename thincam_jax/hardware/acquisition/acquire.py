@@ -50,7 +50,7 @@ class Progress:
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a run ended.
+    """End of a run.
 
     - `done`, `total`: frames in the store, and of the plan.
     - `recovered`: the errors that a retry helped against, one line each.
@@ -159,7 +159,7 @@ def _begin(run: Taker, path: Path) -> tuple[CameraSettings, ...]:
 
 
 def _resumed(run: Taker, path: Path) -> tuple[CameraSettings, ...]:
-    """What the camera was set to when the store was begun, once all agrees with it."""
+    """Camera settings when the store was begun, once all agrees with it."""
     store = CaptureStore(path)
     begun = store.attributes.get("acquisition")
     if begun is None:
@@ -185,7 +185,7 @@ def _resumed(run: Taker, path: Path) -> tuple[CameraSettings, ...]:
 
 
 def _new_settings(run: Taker) -> tuple[CameraSettings, ...]:
-    """What the camera takes of the plan's settings, with the exposure that it needs."""
+    """Settings of the plan that the camera accepts, with the exposure that it needs."""
     asked, wanted = run.plan.settings, run.procedure.auto_exposure
     if wanted is not None:
         if len(asked) != 1:

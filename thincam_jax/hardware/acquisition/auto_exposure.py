@@ -11,7 +11,7 @@ _REMEDY = "change the light or the limits of the auto-exposure"
 
 @dataclass(frozen=True)
 class AutoExposure:
-    """What is searched: `quantile` of the pixels at `target` of full scale, within `tolerance`.
+    """Target of the search: `quantile` of the pixels at `target` of full scale, within `tolerance`.
 
     - `shortest`, `longest`: limits of the exposure, s. `attempts`: frames at most.
     """

@@ -1,4 +1,4 @@
-"""What an acquisition is to do, step by step, as data: it is hashed, stored and compared.
+"""Steps of an acquisition as data, which is hashed, stored and compared.
 
 A plan holds a table of patterns, one of camera settings, and the steps, which point into both. Its
 SHA-256 is over canonical JSON, so that an acquisition is only ever resumed with the plan that it
@@ -27,7 +27,7 @@ PHASE_PAIR = (0.0, 1.5 * math.pi)
 
 @dataclass(frozen=True)
 class Pattern:
-    """What a display shows: a kind and the numbers that it takes to draw it.
+    """Pattern on a display: a kind and the numbers that it takes to draw it.
 
     - "fza": `beta` rad/mm², `phase` rad, `width` mm, `profile` ("cosine", "intensity", "binary").
     - "hadamard": `frame` of a `HadamardSeries` of `rows`, `columns`, `order`, `display`.
@@ -88,7 +88,7 @@ class Plan:
         _ = self.hash  # NaN and objects are refused here, not after the first frame
 
     def pattern(self, step: Step) -> Pattern:
-        """What is shown in a step of this plan."""
+        """Pattern shown in a step of this plan."""
         return self.patterns[step.pattern]
 
     @cached_property

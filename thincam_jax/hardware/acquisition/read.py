@@ -1,4 +1,4 @@
-"""What an acquisition has taken: frames, how each was taken, what a recording is made of."""
+"""Frames of an acquisition, how each was taken, and recordings made of them."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -41,7 +41,7 @@ class Acquisition:
 
     @property
     def patterns(self) -> list[Pattern]:
-        """What was shown for each capture."""
+        """Pattern shown for each capture."""
         return [self.plan.pattern(self.plan.steps[number]) for number in self.lit]
 
     @property

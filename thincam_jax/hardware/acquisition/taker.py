@@ -33,7 +33,7 @@ PASSES = (IncompleteFrame, Timeout, Disconnected)  # a step that fails so is don
 
 @dataclass(frozen=True)
 class Procedure:
-    """How frames are taken, and what is done when one fails.
+    """Procedure by which frames are taken, and recovery where one fails.
 
     - `settle`: time, s, that the display takes after a pattern is shown.
     - `timeout`: s, beyond the exposure, that a frame may take.
@@ -105,7 +105,7 @@ class Taker:
         }
 
     def persist(self, action: Callable[[], Any]) -> Any:
-        """What `action` gives; what passes is recovered from, a few times."""
+        """Result of `action`; transient faults are recovered from, a few times."""
         for left in reversed(range(self.procedure.retries + 1)):
             try:
                 return action()
@@ -235,7 +235,7 @@ class Taker:
         self._seen = step.pattern, pixels
 
     def _check(self, frame: Frame, settings: CameraSettings, probe: bool) -> int:
-        """How many pixels are full; a HardwareError where it is not the frame asked for."""
+        """Number of saturated pixels; HardwareError where it is not the frame asked for."""
         pixels, last = frame.pixels, self._last
         name, again = self.name("camera"), "check the cable and its driver"
         if last is not None and frame.number <= last:
@@ -265,7 +265,7 @@ class Taker:
         return saturated
 
     def name(self, role: Role) -> str:
-        """What messages call a device."""
+        """Name of a device in messages."""
         return told(self.identities[role])
 
 

@@ -43,7 +43,7 @@ class Features(Protocol):
 
 
 class FeatureCamera(Camera):
-    """What the cameras share that are set by features, whatever library reaches them."""
+    """Base of the cameras that are set by features, whatever library reaches them."""
 
     _features: Any
     _identity: Identity
@@ -182,7 +182,7 @@ def _set_to(features: Features, asked: CameraSettings, shape: tuple[int, int]) -
 
 
 def read(features: Features) -> CameraSettings:
-    """What the camera is set to now."""
+    """Present settings of the camera."""
 
     def pixels(name: str) -> int:
         return int(features.get(name)) if features.has(name) else 0
@@ -204,7 +204,7 @@ def _nearest(value: int, low: Number, high: Number, step: Number) -> int:
 
 
 def _put(features: Features, name: str, value: Value) -> None:
-    """What is set already is not written: some cameras hold it fixed."""
+    """Write a feature unless it has that value: some cameras hold it fixed."""
     if features.get(name) != value:
         features.set(name, value)
 

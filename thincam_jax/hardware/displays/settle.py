@@ -1,4 +1,4 @@
-r"""How long a display has to stand before a frame sees nothing of the pattern before.
+r"""Settling time of a display, after which a frame sees nothing of the pattern before.
 
 Two patterns A and B are shown in turn. With D the difference of their frames at rest, a frame
 :math:`f` exposed a time t after A gave way to B holds the part
@@ -25,7 +25,7 @@ _SIGMAS = 2.0
 
 @dataclass(frozen=True)
 class SettleTime:
-    """What `settle_calibrate` found.
+    """Result of `settle_calibrate`.
 
     After `time` (s) no more than `tolerance` of the pattern before is seen. Measurably more was
     last seen `uncertainty` (s) before. `delays` and `parts` are what was measured, and

@@ -227,7 +227,7 @@ class GrblStage(SerialStage):
         return found[1], found[2], bool(options and "Z" in options[1])
 
     def _twice(self, read: Callable[[], T]) -> T:
-        """What was read twice alike."""
+        """Answer that was read twice alike."""
         value = read()
         for _ in range(MOST_READINGS):
             before, value = value, read()

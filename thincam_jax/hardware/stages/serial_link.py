@@ -106,7 +106,7 @@ class SerialLink:
                     file.close()
 
     def _receive(self, seconds: float) -> bytes:
-        """What has come, waiting so long for the first byte; a serial port may give less."""
+        """Bytes received, waiting so long for the first one; a serial port may give fewer."""
         with _translated(lambda error: self._why_gone("read", error)):
             self._serial.timeout = seconds
             return self._serial.read(min(max(1, self._serial.in_waiting), READ_AT_ONCE))
@@ -126,7 +126,7 @@ class SerialLink:
 
 @contextmanager
 def _translated(why: Callable[[Exception], HardwareError]) -> Iterator[None]:
-    """What pyserial and the system raise, as an error of a device."""
+    """Turn errors of pyserial and of the system into errors of a device."""
     try:
         yield
     # termios.error is no OSError; a port closed meanwhile has no file descriptor: a TypeError
@@ -153,7 +153,7 @@ def _why_not_open(name: str, port: str, error: Exception) -> HardwareError:
 
 
 def _way_in(port: str) -> str:
-    """What lets a user open the port: the group that it belongs to, else a udev rule."""
+    """Advice that lets a user open the port: the group that it belongs to, else a udev rule."""
     rule = 'a udev rule with SUBSYSTEM=="tty", MODE="0660", GROUP="dialout"'
     try:
         import grp

@@ -1,4 +1,4 @@
-"""What the stages on a serial line share: nothing is sent before it is checked, and a position
+"""Base of the stages on a serial line: nothing is sent before it is checked, and a position
 counts only where the stage stands and knows where it is."""
 
 import threading
@@ -27,7 +27,7 @@ Opened = TypeVar("Opened", bound="SerialStage")
 
 @dataclass(frozen=True)
 class Report:
-    """What a stage says of itself."""
+    """Identity of a stage and its state."""
 
     moving: bool
     position: float  # mm
@@ -35,7 +35,7 @@ class Report:
 
 @dataclass(frozen=True)
 class SerialOptions:
-    """What a config file may say of a stage."""
+    """Options of a stage in a config file."""
 
     port: str  # "/dev/ttyUSB0", "COM3"
     baud_rate: int = 115200

@@ -42,7 +42,7 @@ _MESSAGE = re.compile(
 
 @dataclass(frozen=True)
 class ZaberMessage:
-    """What a device sent: an answer "@", an alert "!" or information "#"."""
+    """Message of a device: an answer "@", an alert "!" or information "#"."""
 
     kind: str
     device: int

@@ -62,7 +62,7 @@ class VirtualDevices(AbstractContextManager["VirtualDevices"]):
         return open_device("stages", driver, {**(options or {}), "port": port})
 
     def display(self) -> Display:
-        """Whatever the driver: what is shown goes to the rig."""
+        """Show a pattern: whatever the driver, it goes to the rig."""
         shape, faults = self.rig.display_shape, self.faults["display"]
         return VirtualDisplay(shape, self.rig.on_show, faults=faults)
 

@@ -39,7 +39,7 @@ class VirtualDisplay(Screen):
         self._presented = time.perf_counter()
 
     def levels(self) -> np.ndarray:
-        """What the panel shows at this moment, float32 from 0 to 255."""
+        """Levels of the panel at this moment, float32 from 0 to 255."""
         if not self._response:
             return self._target
         left = np.float32(np.exp((self._presented - time.perf_counter()) / self._response))

@@ -1,4 +1,4 @@
-"""What a virtual camera sees: a scene through a light modulator, or a monitor's cells."""
+"""Optics of a virtual camera: a scene through a light modulator, or a monitor's cells."""
 
 import functools
 from dataclasses import dataclass
@@ -30,7 +30,7 @@ _POINTS = 4  # along a pixel, for what is left
 
 @runtime_checkable
 class Optics(Protocol):
-    """What falls on the sensor, (y, x), in electrons per second, for the pixels that are shown."""
+    """Light on the sensor, (y, x), in electrons per second, for the pixels that are shown."""
 
     @property
     def sensor_shape(self) -> tuple[int, int]: ...

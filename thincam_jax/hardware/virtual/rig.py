@@ -57,7 +57,7 @@ def bits_of(settings: CameraSettings) -> int:
 
 @dataclass(frozen=True)
 class Fiducial:
-    """What a frame was exposed of, written into its corner for tests.
+    """Conditions of a frame's exposure, written into its corner for tests.
 
     - `pattern`: checksum of the pixels shown (`pattern_number`). `position`: the stage's, µm.
     - `exposure`: counts the exposures of that pattern at that position, from 0.

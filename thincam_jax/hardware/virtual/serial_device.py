@@ -31,7 +31,7 @@ Virtual = TypeVar("Virtual", bound="VirtualSerialDevice")
 
 @dataclass(frozen=True)
 class Motion:
-    """How a virtual stage moves, and how late it answers where that fault is played."""
+    """Motion of a virtual stage, and the delay of its answers where that fault is played."""
 
     travel: float = 50.0  # mm
     speed: float = 100.0  # mm/s

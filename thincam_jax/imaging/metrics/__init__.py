@@ -1,4 +1,4 @@
-"""How good an image is: agreement with a reference, and resolution read off a chart.
+"""Image quality: agreement with a reference, and resolution read off a chart.
 
 These are eager NumPy functions for judging results. They are not differentiable and do not belong
 inside a jitted function; losses for optimisation live with the solvers.

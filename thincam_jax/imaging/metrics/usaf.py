@@ -21,7 +21,7 @@ _SAMPLES = 16  # of the profile within that
 
 @dataclass(frozen=True)
 class UsafContrast:
-    """How one three-bar set came out, on a scale where the chart's dark is 0 and its bright is 1.
+    """Reading of one three-bar set, on a scale where the chart's dark is 0 and its bright is 1.
 
     - `element`: the set.
     - `contrast`: (mean of bars − mean of gaps)/(mean of bars + mean of gaps), in [−1, 1]; negative
@@ -145,7 +145,7 @@ def _levels(scaled: np.ndarray, element: UsafElement, pixels_per_chart: float) -
 
 
 def _layer_count(elements: tuple[UsafElement, ...]) -> int:
-    """How many layers the chart must have to hold the finest of the elements."""
+    """Number of layers that the chart needs to hold the finest of the elements."""
     coarsest = usaf1951_elements(layers=1)[0].bar
     octaves = np.log2(coarsest / min(element.bar for element in elements))
     return int(octaves + 1e-6) // 2 + 1

@@ -1,4 +1,4 @@
-"""What every linear operator of a camera can do."""
+"""Interface of all linear operators of cameras."""
 
 import abc
 import math
@@ -59,7 +59,7 @@ class AbstractOperator(eqx.Module):
         return self._norm(iterations, key, dtype)
 
     def _norm(self, iterations: int, key: PRNGKeyArray | None, dtype: DTypeLike | None):
-        """What `norm` returns; an operator that knows its own says so here."""
+        """Value of `norm`; an operator with a norm in closed form overrides it."""
         key = jax.random.key(0) if key is None else key
         # An operator of non-negative numbers, as every PSF is, has a non-negative top vector.
         start = jnp.abs(jax.random.normal(key, self.in_shape, dtype or dtype_of(self)))
@@ -118,7 +118,7 @@ def _power_iteration(operator: AbstractOperator, start: Array, iterations: int):
 def adjoint_error(
     operator: AbstractOperator, key: PRNGKeyArray, *, dtype: DTypeLike | None = None
 ) -> Float[Array, ""]:
-    r"""How far an operator's adjoint is from its transpose.
+    r"""Distance of an operator's adjoint from its transpose.
 
     :math:`|\langle A f, g\rangle - \langle f, A^T g\rangle| / (\|A f\|\,\|g\|)` for white random f
     and g. A right adjoint gives some multiple of the rounding error, a wrong one about

@@ -32,7 +32,7 @@ class AbstractAround(AbstractOperator):
 
     @abc.abstractmethod
     def _weighted(self, capture: Any) -> Any:
-        """What is done, the same on the way back."""
+        """Masking, the same on the way back."""
 
     def __call__(self, image: Float[Array, "..."]) -> PyTree[Float[Array, "..."]]:
         return self._weighted(self.operator(image))

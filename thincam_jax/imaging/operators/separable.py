@@ -85,7 +85,7 @@ class Separable(AbstractOperator):
 
     @property
     def terms(self) -> int:
-        """How many products are summed."""
+        """Number of products in the sum."""
         return len(self.left)
 
     def __call__(self, image: Float[Array, "..."]) -> Float[Array, "..."]:

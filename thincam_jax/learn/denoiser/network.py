@@ -163,7 +163,7 @@ def load_network(path: str | os.PathLike[str]) -> DenoisingUNet:
 
 
 def network_card(path: str | os.PathLike[str] = SHIPPED) -> dict[str, Any]:
-    """What a file says of its network: `options` and `training`, with the images' licences."""
+    """Card of a network's file: `options` and `training`, with the images' licences."""
     path = _SHIPPED_FILE if str(path) == SHIPPED else path
     description = read_description(path)
     parts = (description.get(name) for name in ("options", "training"))

@@ -59,7 +59,7 @@ class Crops(eqx.Module):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class DenoisingLessons:
-    """What a denoiser is trained on.
+    """Training set of a denoiser.
 
     - `pictures`: of each step; `held_out`: those that judge the network, which no step sees;
       by default the same.

@@ -1,4 +1,4 @@
-"""What a refocusing network is compared with: a linear filter, and a network told a code.
+"""Baselines of refocusing networks: a linear filter, and a network given a distance code.
 
 `thincam_jax.AdmmTV` and `thincam_jax.learn.UnrolledAdmm` are the others.
 """

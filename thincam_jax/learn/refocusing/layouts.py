@@ -15,7 +15,7 @@ COVER_NUMBERS = RELIEF_NUMBERS + 9
 
 
 def random_cover(numbers: Float[Array, " number"], shape: tuple[int, int]) -> Float[Array, "y x"]:
-    """How much of each pixel an object covers, 0 to 1, with edges soft over about a pixel.
+    """Part of each pixel that an object covers, 0 to 1, with edges soft over about a pixel.
 
     With equal chances a turned ellipse or rectangle somewhere, a half plane of any direction, or
     blobs: where a sum of long waves is above a level. `numbers`: `COVER_NUMBERS` of them.

@@ -1,4 +1,4 @@
-"""What a lens makes of a plane that is out of its focus: uniform discs."""
+"""Blur of a lens for a plane that is out of focus: uniform discs."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float

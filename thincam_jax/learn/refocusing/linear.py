@@ -49,7 +49,7 @@ class LinearStep(eqx.Module):
         planes: Planes,
         place: Float[Array, "place plane"] | None = None,
     ) -> Complex[Array, "plane v u"]:
-        """What to add to the planes' spectra for a residual of the capture.
+        """Correction of the planes' spectra for a residual of the capture.
 
         `variance`: of the residual's noise per sensor pixel, in the units of the residual; `place`:
         1 where a plane stands, default each at its own.

@@ -1,4 +1,4 @@
-r"""What the U-Nets of a refocusing network are trained for."""
+r"""Training loss of the U-Nets of a refocusing network."""
 
 from dataclasses import replace
 
@@ -25,7 +25,7 @@ _LEAST = 1e-5  # of an image's mean square: an error below it counts for nothing
 
 
 class Examples(eqx.Module):
-    """What a U-Net sees of a scene or, (element, …), of many, and what it is to make of it.
+    """Input and target of a U-Net for one scene or, (element, …), for many.
 
     - `images`: as of `prepared`, for planes at `stand`.
     - `stack`: light of the planes; what stands between two is shared out between them.
@@ -55,7 +55,7 @@ class Examples(eqx.Module):
 
 @eqx.filter_jit
 def examples(network: RefocusNetwork, batch: Batch) -> Examples:
-    """What the last U-Net of a network sees of a batch, and what it is to make of it."""
+    """Input and target of a network's last U-Net for a batch."""
     return jax.vmap(lambda one: _example(network, one))(batch)
 
 

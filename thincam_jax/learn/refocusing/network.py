@@ -30,7 +30,7 @@ from thincam_jax.learn.refocusing.unet import UNet
 
 @dataclass(frozen=True)
 class NetworkOptions:
-    """What a network is built with.
+    """Architecture of a network.
 
     - `steps`: unrolled steps, each with a U-Net of its own.
     - `widths`: channels of the U-Nets' levels.
@@ -44,7 +44,7 @@ DEFAULT = NetworkOptions()
 
 
 class Cleaned(eqx.Module):
-    """What a U-Net reads from the images of a step, in units of the scene's mean.
+    """Input of a U-Net from the images of a step, in units of the scene's mean.
 
     - `stack`: (plane, y, x), radiance.
     - `image`: as a lens sees the scene that is focused on the commanded distance.
@@ -229,7 +229,7 @@ def prepared(
     stack: Float[Array, "plane m n"] | None,
     given: tuple[Any, ...],
 ) -> Float[Array, "image y x"]:
-    """What the U-Net of a step sees, (image, y, x).
+    """Input of the U-Net of a step, (image, y, x).
 
     The stack that the step before has left, tied to the capture, by the places relative to the
     commanded distance; what a lens and a pinhole see of it; the plane at the commanded distance as
@@ -262,7 +262,7 @@ def prepared(
 
 
 def read_images(prior: UNet, images: Float[Array, "image y x"], stand: Stand) -> Cleaned:
-    """What a U-Net makes of the images of a step."""
+    """Output of a U-Net for the images of a step."""
     places, found = len(stand.place), prior(images)
     shares = jnp.tensordot(stand.place.T, found[places:-3], axes=1)
     return Cleaned(
@@ -282,7 +282,7 @@ def seen_of(
 
 
 def noise_level(deviation: Float[Array, ""]) -> Float[Array, ""]:
-    """What a U-Net is told of the noise: log₁₀ of its deviation, in units of the scene's mean."""
+    """Noise level as a U-Net reads it: log₁₀ of its deviation, in units of the scene's mean."""
     return jnp.log10(deviation**2 + 1e-8) / 2
 
 

@@ -53,7 +53,7 @@ class Planes(eqx.Module):
         return jnp.sum(capture * self.uniform) / jnp.sum(self.uniform**2)
 
     def seen(self, spectrum: Complex[Array, "v u"]) -> Float[Array, "y x"]:
-        """What the sensor sees of an image on the window, given by its spectrum."""
+        """Capture of an image on the window, given by its spectrum."""
         image = jnp.fft.irfft2(spectrum, s=self.window)
         return cut(image, self.operator.sensor_corner, self.operator.sensor_shape)
 

@@ -37,7 +37,7 @@ PARTS = 3  # flat parts that a layer with relief is shared out between
 
 @dataclass(frozen=True)
 class SceneOptions:
-    """What scenes are drawn, and how they are captured.
+    """Range of drawn scenes and of their captures.
 
     - `layers`: chances of one, two and three layers.
     - `dark`: chance that nothing is behind the last but one layer, objects on a dark ground.
@@ -84,7 +84,7 @@ class Scene(eqx.Module):
 
     @property
     def all_in_focus(self) -> Float[Array, "y x"]:
-        """What a pinhole sees."""
+        """Image of a pinhole camera."""
         return jnp.sum(self.visible * self.radiance, axis=0)
 
     @property
@@ -111,7 +111,7 @@ class Scene(eqx.Module):
         return jnp.stack(emitted)
 
     def focused(self, camera: RefocusCamera, inverse: Number) -> Float[Array, "y x"]:
-        """What a lens of the camera's pupil sees, focused on 1/t = `inverse`, 1/mm."""
+        """Image by a lens of the camera's pupil, focused on 1/t = `inverse`, 1/mm."""
         radius = camera.defocus_radius(self.inverse - inverse)
         covered = self.share * self.cover[:, None]
         both = jnp.stack([covered, covered * self.radiance[:, None]])

@@ -81,7 +81,7 @@ def load(
 
 
 def network_description(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """What a file says of its network: `camera`, `options`, `training`."""
+    """Card of a network's file: `camera`, `options`, `training`."""
     description = read_description(path)
     parts = (description.get(name) for name in ("camera", "options", "training"))
     if description.get("kind") != _KIND or not all(isinstance(part, dict) for part in parts):

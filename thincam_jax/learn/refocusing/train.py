@@ -36,7 +36,7 @@ _JUDGED = 2**31
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Lessons:
-    """What a network is trained on.
+    """Training set of a network.
 
     - `source`: the images; `scenes`: what is drawn of them.
     - `batch`: scenes of a step, taken out of a pool of so many batches, which is drawn once.
@@ -62,7 +62,7 @@ class Lessons:
             yield draw_batch(one, images, network.camera, self.scenes, self.batch)
 
     def validation(self, network: RefocusNetwork, seed: int) -> list[Batch]:
-        """What judges a network."""
+        """Validation set of a network."""
         return list(self.drawn(network, seed, self.judged, _JUDGED))
 
     def task(self, network: RefocusNetwork, seed: int) -> Task:

@@ -1,4 +1,4 @@
-r"""What each model gives on a few rows and columns, and how far that is from the best model.
+r"""PSF of each model on a few rows and columns, and its distance from the best model's.
 
 With real factors R (term × row) and C (term × column) an image is RᵀC and
 :math:`\|R^TC\|_F^2 = \sum (RR^T)\circ(CC^T)`: the error of a whole PSF costs what its axes cost.
@@ -243,7 +243,7 @@ class MaskProbe:
         return distance(first, second) / self.scale
 
     def rounding(self, model: Model, precision: Precision) -> float:
-        """What the precision costs a closed form; in float64, scaled from that of float32."""
+        """Error of a closed form by its precision; in float64, scaled from that of float32."""
         single, double = (self.closed(model, p) for p in PRECISIONS)
         measured = rounding_distance(single, double) / self.scale
         size = norm(double) / self.scale

@@ -30,7 +30,7 @@ _CONVERSION = 1e7
 
 @dataclass(frozen=True)
 class Prediction:
-    """What a model gives and costs.
+    """Error and cost of a model.
 
     - `model`, `precision`, `oversampling`: as `psf` takes them; oversampling is None for the
       closed forms.
@@ -218,7 +218,7 @@ def probe_of(
 def candidates(
     mask: AbstractMask, grid: Grid, pixel_integration: bool
 ) -> list[tuple[PsfMethod, Cost]]:
-    """What fits into memory, cheapest first, up to the reference."""
+    """Candidates that fit into memory, cheapest first, up to the reference."""
     free = available_bytes()
     own = precision_of(grid.pitch)
     methods = [
@@ -256,7 +256,7 @@ def predicted_error(probe: MaskProbe, mask: AbstractMask, grid: Grid, method: Ps
 
 
 def _reasons(probe: MaskProbe, chosen: Prediction, paraxial_error: float) -> tuple[str, ...]:
-    """What the chosen model leaves out, in words and numbers."""
+    """Effects that the chosen model leaves out, in words and numbers."""
     fresnel = (
         "errors are counted from the exact Fresnel field; exact scalar diffraction differs from "
         f"that by about {paraxial_error:.1e}"

@@ -1,4 +1,4 @@
-"""What a mask must offer to the propagation models."""
+"""Interface of masks to the propagation models."""
 
 import abc
 import functools
@@ -147,7 +147,7 @@ class AbstractFactoredMask(AbstractMask):
 
 @dataclass(frozen=True)
 class TermCount:
-    """How many terms a mask has, how many its |t|², and the cells of its longer side."""
+    """Number of terms of a mask and of its |t|², and the cells of its longer side."""
 
     terms: int
     shadow: int

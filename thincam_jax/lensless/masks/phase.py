@@ -165,7 +165,7 @@ class PhaseMask(AbstractMask):
 
 
 class MaskBlank(Module):
-    """What a relief is made in: its cells and its material.
+    """Blank of a relief: its cells and its material.
 
     - `shape`: (rows, columns) of cells. `pitch`: of the cells, mm.
     - `material`: refractive index, a number or one of `thincam_jax.imaging.refractive_index`.

@@ -1,4 +1,4 @@
-"""What a capture holds beside its model's optics, with sizes."""
+"""Effects in a capture beside its model's optics, with sizes."""
 
 import math
 from dataclasses import dataclass

@@ -21,7 +21,7 @@ _MODEL_SHARE, _WAVELENGTH_SHARE = 0.35, 0.6
 
 
 def plan(camera: LenslessCamera, scene: Scene, *, tolerance: float) -> Plan:
-    r"""How to compute the capture of a scene to a relative error, at the least cost.
+    r"""Plan the capture of a scene to a relative error at the least cost.
 
     The error is ‖g − g₀‖₂/‖g₀‖₂ of the noise-free capture, against every plane and wavelength
     computed by `separable` in double precision, averaged over the pixels, or by endlessly many

@@ -25,7 +25,7 @@ _NEAR = 0.01
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """How `capture` computes a scene within a tolerance; made by `thincam_jax.plan`.
+    """Plan by which `capture` computes a scene within a tolerance; made by `thincam_jax.plan`.
 
     Print it for a table. It holds for scenes with the same planes and wavelengths as the one that
     it was made for and images like its, and for cameras within 1 % of its own, at any phase of the

@@ -84,7 +84,7 @@ class SeenScene:
 
     @functools.cached_property
     def rough(self) -> PsfMethod:
-        """What shows the capture's energy."""
+        """Estimate of the capture's energy."""
         return _ROUGH if isinstance(self.probe, TransferProbe) else self.sampled(1)
 
     def sampled(self, least: int) -> PsfMethod:

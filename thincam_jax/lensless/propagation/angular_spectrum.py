@@ -15,7 +15,7 @@ PADDING = 2.0  # the window of a PSF over mask and sensor side by side
 
 
 class Sampling(eqx.Module):
-    """How well a field is sampled; each number should be at least 1.
+    """Sampling quality of a field; each number should be at least 1.
 
     - `mask`: Nyquist frequency of the samples over the highest local frequency behind the mask.
     - `transfer`: band limit of the transfer function on this window over that frequency.

@@ -1,4 +1,4 @@
-"""What a rig's own pictures say of it: PSF fits, registration, matrices by Hadamard patterns."""
+"""Calibration from a rig's own pictures: PSF fits, registration, Hadamard patterns."""
 
 from thincam_jax.measured.calibration.captures import CaptureStoreError as CaptureStoreError
 from thincam_jax.measured.calibration.captures import CaptureWriter as CaptureWriter

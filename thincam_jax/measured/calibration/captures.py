@@ -257,7 +257,7 @@ def _opened(path: Path, mode: str = "r") -> CaptureStore:
 
 
 def _described(store: CaptureStore) -> HadamardCaptures:
-    """What the attributes say, once the arrays agree with it."""
+    """Contents of the attributes, once the arrays agree with them."""
     path, attributes = store.path, store.attributes
     try:
         names = [field.name for field in dataclasses.fields(HadamardSeries)]

@@ -47,7 +47,7 @@ class Chirp:
 
 @dataclass(frozen=True)
 class Ranges:
-    """How far from the guess to look: γ and ε in parts of one, the centre in mm; 0 is known."""
+    """Search range about the guess: γ and ε in parts of one, the centre in mm; 0 is known."""
 
     curvature: float
     epsilon: float

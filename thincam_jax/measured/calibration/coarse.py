@@ -139,7 +139,7 @@ def covariance_by_differences(
 
 
 def slope_norms(measured: FitImage, state: FitState, names: tuple[str, ...]) -> np.ndarray:
-    """How far the image moves for a step of each unknown."""
+    """Shift of the image for a step of each unknown."""
     widths = difference_widths(state, _WIDE * _NARROWER)
     turned = np.asarray(seen_by_steps(state, names, np.zeros(len(names))))
     norms = np.linalg.norm(_seen_slopes(measured, state, turned, widths) @ turned, axis=0)

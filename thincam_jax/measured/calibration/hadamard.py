@@ -26,7 +26,7 @@ Display = Literal["complementary", "binary"]
 
 @dataclass(frozen=True)
 class HadamardSeries:
-    """What a monitor shows for a calibration, frame by frame.
+    """Sequence of patterns that a monitor shows for a calibration.
 
     - `object_shape`: (rows, columns) of cells, N in all, a power of two.
     - `order`: "sequency", by the number of changes of sign, or "natural" (Sylvester's).

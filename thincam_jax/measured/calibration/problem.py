@@ -89,7 +89,7 @@ class FitState(eqx.Module):
 
     @property
     def flat(self) -> Float[Array, "*part"]:
-        """What a background of 1 in every picture is in the image."""
+        """Image of a background of 1 in every picture."""
         if self.synthesis is None:
             return jnp.ones_like(self.background)
         return jnp.sum(self.synthesis.weights, axis=1)[:, None, None]
@@ -188,7 +188,7 @@ class FitProblem(eqx.Module):
 
 
 class Solution(eqx.Module):
-    """What Levenberg-Marquardt found, after how many steps.
+    """Result of Levenberg-Marquardt, with its number of steps.
 
     - `moved`: by how many of the standard errors the last `_STEPS` steps moved each unknown.
     """
@@ -234,7 +234,7 @@ SEEN = ("beta", "phase", "centre_y", "centre_x", "width", "wavelength", "backgro
 def seen_by_steps(
     start: FitState, names: tuple[str, ...], steps: Float[ArrayLike, " step"]
 ) -> Float[Array, "seen step"]:
-    """How far each of `SEEN` moves with each step: exact, also where steps cannot be told apart."""
+    """Shift of each of `SEEN` with each step: exact, also for steps of equal effect."""
     return jax.jacfwd(_seen)(steps, start, names)
 
 

@@ -61,7 +61,7 @@ _QUANTITIES |= dict.fromkeys(("centre_x", "centre_y"), _QUANTITIES["centre"])
 
 
 class PsfFit(Module):
-    """What `fit_psf` found.
+    """Result of `fit_psf`.
 
     - `camera`: the camera with the fitted numbers, in the precision of the one given.
     - `object_distance`: t, mm; `wavelength`: λ, mm; `background` and `gain`: image = background +
@@ -196,7 +196,7 @@ def fit_psf(
 
 
 def _check_weights(image, weights: Weights | None) -> Synthesis | None:
-    """How the picture was put together; None for one capture."""
+    """Assembly of the picture; None for one capture."""
     is_complex = np.iscomplexobj(image)
     if weights is None and not is_complex:
         return None
@@ -305,7 +305,7 @@ def _report(
 
 
 def _too_far(nearness: float, error: float) -> list[str]:
-    """What there is to say of a point whose 1/t may as well be zero."""
+    """Warning for a point whose 1/t may as well be zero."""
     if nearness > 2 * error:
         return []
     nearest = 1 / (max(nearness, 0.0) + 2 * error) if error > 0 else math.inf

@@ -1,4 +1,4 @@
-r"""How much larger one image of a scene is than another, and how far it is moved."""
+r"""Scale and shift between two images of one scene."""
 
 import math
 from dataclasses import dataclass
@@ -29,7 +29,7 @@ _WEIGHT = 1e3  # of residuals: the solver starts with a damping of 1, which is t
 
 
 class Registration(Module):
-    """What `estimate_registration` found.
+    """Result of `estimate_registration`.
 
     - `scale`: of the image over the reference; `shift`: (y, x), pixels.
     - `scale_error`, `shift_error`: their standard errors.

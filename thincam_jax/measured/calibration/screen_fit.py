@@ -88,7 +88,7 @@ class GhostPositions(eqx.Module):
 
 
 class ScreenFit(Module):
-    """What `fit_screen` found.
+    """Result of `fit_screen`.
 
     - `camera`, `plane`: as given, with the fitted numbers. `gain`: the matrix over the model's.
     - `values`, `standard_errors`: of what was fitted. The errors are √(σ²(JᵀJ)⁻¹) with the
@@ -403,7 +403,7 @@ def _model(state: _State, problem: _Problem):
 
 
 def _parts(points, plane: ObjectPlane, axis: int, size, blur):
-    """What part of an interval of that size about each point lies in each cell of an axis.
+    """Part of an interval of that size about each point that lies in each cell of an axis.
 
     The second difference of F(u) = ∫ Φ(v/σ) dv with the normal distribution Φ, max(u, 0) for σ = 0.
     """

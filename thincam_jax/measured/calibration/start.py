@@ -39,7 +39,7 @@ def given(
 def search_ranges(
     camera: LenslessCamera, parameters: Sequence[str], search: Number, centre_search: Number | None
 ) -> Ranges:
-    """How far the fringes on the sensor may be from those of the camera given."""
+    """Possible distance of the sensor's fringes from those of the camera given."""
     search = float(checks.non_negative("search", search, "parts of one"))
     if search > _WIDEST:
         raise ValueError(f"search = {search:g} is too wide; give at most {_WIDEST:g}")

@@ -27,7 +27,7 @@ def focus_measure(
     window: float | int | None = None,
     region: Bool[Array, "y x"] | Bool[np.ndarray, "y x"] | None = None,
 ) -> Float[Array, "..."]:
-    r"""How sharp an image is; the larger, the sharper.
+    r"""Sharpness of an image; the larger, the sharper.
 
     - "laplacian_variance": :math:`\langle (\Delta f)^2\rangle - \langle \Delta f\rangle^2`, the
       power of the finest detail, which has the most parallax: the narrowest curve.

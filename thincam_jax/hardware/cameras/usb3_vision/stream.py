@@ -43,7 +43,7 @@ TRANSFER = 1 << 20  # bytes of one read; the kernel holds 16 MiB for all of USB
 
 @dataclass(frozen=True)
 class Leader:
-    """What is to come: `time` in ns on the camera's clock, `pixel_format` a PFNC number."""
+    """Leader of a frame: `time` in ns on the camera's clock, `pixel_format` a PFNC number."""
 
     block: int
     time: int
@@ -120,7 +120,7 @@ class Transfers:
 
 
 def plan_transfers(registers: bytes, expected: int) -> Transfers:
-    """How to read frames of `expected` bytes, from what the stream's registers require.
+    """Transfer sizes for frames of `expected` bytes, from what the stream's registers require.
 
     `ValueError` where they contradict themselves, or would have more allocated than the limits.
     """
