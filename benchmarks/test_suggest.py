@@ -82,14 +82,14 @@ def answers(kind):
     """Misfits and times of all ways, of both kinds of targets."""
     space, *data = problem(kind)
     start = time.perf_counter()
-    suggester = learn.train_suggester(space, *data, key=jax.random.key(0)).suggester
+    model = design.ResponseModel(space, *data)
+    suggester = learn.train_suggester(model, key=jax.random.key(0)).suggester
     jax.block_until_ready(suggester)
     training = time.perf_counter() - start
-    model = suggester.model
     examples = _examples(model, 4096, jax.random.key(1))
 
     def search(target):
-        return design.match_response(space, target, *data, key=jax.random.key(4))
+        return design.match_response(model, target, key=jax.random.key(4))
 
     rows = []
     for name, target in zip(("attainable", "others"), targets(model), strict=True):

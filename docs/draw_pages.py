@@ -159,7 +159,9 @@ def suggest():
         jnp.array([17.0, 12.5]), 6.5, (0.0, 1.5 * jnp.pi), wavelength=500 * nm, width=5.632
     )
     wanted = design.ring_levels(design.channels(hidden, *data, rings), rings, 32)
-    best = design.match_response(space, wanted, *data, rings, key=jax.random.key(1))
+    best = design.match_response(
+        design.ResponseModel(space, *data, rings), wanted, key=jax.random.key(1)
+    )
     thesis = design.channels(space.base, *data, rings)
     figure = Figure(figsize=(6.4, 3.4), layout="constrained")
     ax = figure.subplots()

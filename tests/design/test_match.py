@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from design.setting import setup, two_betas
 
-from thincam_jax.design import Polar, PowerLaw, match_response
-from thincam_jax.design.match import ResponseModel, _least_squares
+from thincam_jax.design import MatchSettings, Polar, PowerLaw, ResponseModel, match_response
+from thincam_jax.design.match import _least_squares
 from thincam_jax.reconstruction import phase_pairs
 
 RINGS = 16
@@ -24,10 +24,10 @@ def wanted():
     return MODEL.levels(POINT)
 
 
-def match(target=None, seed=0, data=DATA, **options):
-    options = {"starts": 4, "samples": 64} | options
+def match(target=None, seed=0, model=MODEL, **options):
+    settings = MatchSettings(**{"starts": 4, "samples": 64} | options)
     target = wanted() if target is None else target
-    return match_response(SPACE, target, *data, key=jax.random.key(seed), **options)
+    return match_response(model, target, settings, key=jax.random.key(seed))
 
 
 @pytest.mark.thorough
@@ -65,7 +65,7 @@ def test_descents_are_better_than_samples():
 @pytest.mark.thorough
 def test_responses_without_a_number_are_told():
     bad = setup(prior=PowerLaw(2.8), contrast=1e200)
-    result = match(data=(bad, *DATA[1:]))
+    result = match(model=ResponseModel(SPACE, bad, *DATA[1:], RINGS))
     assert (result.status, result.found) == ("non_finite", ())
     assert result.failed == 64 + 4
     assert result.misfit_db == np.inf
@@ -75,8 +75,7 @@ def test_responses_without_a_number_are_told():
     ("target", "options", "message"),
     [
         (np.full(RINGS, np.nan), {}, "target level of ring 1 is nan, no finite number"),
-        (np.full((2, 2), 1.0), {}, r"target has shape \(2, 2\); give \(4,\)"),
-        (np.full(300, 1.0), {}, "rings = 300, and the frequencies lie in 128 of them"),
+        (np.full((2, 2), 1.0), {}, r"target has shape \(2, 2\); give \(16,\)"),
         (np.full(RINGS, -3.0), {}, "is -3, below 0 dB; give levels"),
         (np.full(RINGS, 1.0), {"starts": 0}, "starts = 0; give at least 1"),
     ],

@@ -9,24 +9,31 @@ import pytest
 from design.setting import setup, thesis_design, two_betas
 
 from helpers import finite_difference
-from thincam_jax.design import DesignSpace, Polar, PowerLaw, Variable
-from thincam_jax.learn import load_suggester, propose, save_suggester, suggest, train_suggester
+from thincam_jax.design import DesignSpace, Polar, PowerLaw, ResponseModel, Variable
+from thincam_jax.learn import (
+    SuggesterTraining,
+    load_suggester,
+    propose,
+    save_suggester,
+    suggest,
+    train_suggester,
+)
 from thincam_jax.learn.suggester_training import _levels
 from thincam_jax.reconstruction import phase_pairs
 
 RINGS = 16
 SPACE = two_betas()
 DATA = (setup(prior=PowerLaw(2.8)), jnp.asarray(phase_pairs(2)), Polar(96.0, 128, 2))
-SMALL = {"rings": RINGS, "samples": 256, "guesses": 3, "width": 48, "depth": 2, "batch": 32}
+MODEL = ResponseModel(SPACE, *DATA, RINGS)
+SMALL = {"samples": 256, "guesses": 3, "width": 48, "depth": 2, "batch": 32}
 WARM_UP, STEPS = 400, 40
 HELD_OUT = 40
 
 
 @pytest.fixture(scope="module")
 def trained():
-    return train_suggester(
-        SPACE, *DATA, key=jax.random.key(3), **SMALL, warm_up=WARM_UP, steps=STEPS
-    )
+    settings = SuggesterTraining(**SMALL, warm_up=WARM_UP, steps=STEPS)
+    return train_suggester(MODEL, settings, key=jax.random.key(3))
 
 
 @pytest.fixture(scope="module")
@@ -145,15 +152,15 @@ def test_errors(suggester, target, message):
 
 def test_training_errors():
     with pytest.raises(ValueError, match="batch = 0; give at least 1"):
-        train_suggester(SPACE, *DATA, key=jax.random.key(0), batch=0)
+        SuggesterTraining(batch=0)
     with pytest.raises(ValueError, match="guesses = 0; give at least 1"):
-        train_suggester(SPACE, *DATA, key=jax.random.key(0), **(SMALL | {"guesses": 0}))
+        SuggesterTraining(guesses=0)
 
 
 @pytest.mark.thorough
 def test_saved_and_loaded_answers_are_the_same(suggester, targets, tmp_path):
     path = save_suggester(tmp_path / "two_betas.suggester", suggester)
-    loaded = load_suggester(path, SPACE, *DATA)
+    loaded = load_suggester(path, MODEL)
     target = targets[0][0]
     expected = propose(suggester, target)
     before = propose._cache_size()
@@ -184,5 +191,5 @@ def test_files_of_something_else(suggester, tmp_path):
     )
     for file, space, data, message in cases:
         with pytest.raises(ValueError, match=message) as told:
-            load_suggester(file, space, *data)
+            load_suggester(file, ResponseModel(space, *data, RINGS))
         assert "\n" not in str(told.value)

@@ -17,6 +17,8 @@ from thincam_jax.design.landscape import Landscape as Landscape
 from thincam_jax.design.landscape import evaluate_grid as evaluate_grid
 from thincam_jax.design.landscape import landscape_around as landscape_around
 from thincam_jax.design.match import Match as Match
+from thincam_jax.design.match import MatchSettings as MatchSettings
+from thincam_jax.design.match import ResponseModel as ResponseModel
 from thincam_jax.design.match import match_response as match_response
 from thincam_jax.design.match import response_misfit as response_misfit
 from thincam_jax.design.match import ring_levels as ring_levels

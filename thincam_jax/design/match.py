@@ -16,6 +16,7 @@ and R levels say more of the direction than their sum.
 """
 
 import functools
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import equinox as eqx
@@ -72,7 +73,9 @@ class ResponseModel(eqx.Module):
     """From points of a space's unit cube to the levels that their designs give.
 
     - `space`: what is free; `setup`, `synthesis`, `frequencies`: as of `channels`.
-    - `rings`: how many levels.
+    - `rings`: number of levels.
+
+    **Errors**: ValueError for rings below 1, or of which some hold no frequency.
     """
 
     space: DesignSpace
@@ -87,7 +90,7 @@ class ResponseModel(eqx.Module):
         setup: Setup,
         synthesis: Float[Array, "channel capture"] | Float[np.ndarray, "channel capture"],
         frequencies: Frequencies,
-        rings: int,
+        rings: int = 32,
     ):
         if rings < 1:
             raise ValueError(f"rings = {rings}; give at least 1")
@@ -143,6 +146,32 @@ MATCHED = 1.0
 _WEIGHT = 100.0
 
 
+@dataclass(frozen=True)
+class MatchSettings:
+    """Length of a search for a response.
+
+    - `starts`: descents (optimistix' Levenberg-Marquardt under the smooth map sin² onto the cube);
+      `samples`: of the even sampling before, from the best of which they start.
+    - `steps`: at most, of each descent; it ends where a step changes the misfit by less than
+      `tolerance` of itself.
+    - `tolerance_db`: misfits up to here are "matched".
+    - `separation`: optima closer than this in the cube are one.
+
+    **Errors**: ValueError for numbers of starts, samples or steps below 1.
+    """
+
+    starts: int = 8
+    samples: int = 256
+    steps: int = 30
+    tolerance: float = 1e-4
+    tolerance_db: float = MATCHED
+    separation: float = SEPARATION
+
+    def __post_init__(self):
+        counts = {"starts": self.starts, "samples": self.samples, "steps": self.steps}
+        checks.at_least_one(counts)
+
+
 class Match(Module):
     """Result of `match_response`.
 
@@ -162,52 +191,37 @@ class Match(Module):
 
 
 def match_response(
-    space: DesignSpace,
+    model: ResponseModel,
     target: Numbers,
-    setup: Setup,
-    synthesis: Float[Array, "channel capture"] | Float[np.ndarray, "channel capture"],
-    frequencies: Frequencies,
+    settings: MatchSettings = MatchSettings(),
     *,
     key: PRNGKeyArray,
-    starts: int = 8,
-    samples: int = 256,
-    steps: int = 30,
-    tolerance: float = 1e-4,
-    tolerance_db: float = MATCHED,
-    separation: float = SEPARATION,
 ) -> Match:
     """The designs of a space whose levels are nearest to target ones.
 
     **Arguments**
 
+    - `model`: the space, the camera and the rings.
     - `target`: levels in dB, one for each ring from zero frequency up (`ring_levels`), at least 0.
-    - `setup`, `synthesis`, `frequencies`: as of `channels`.
-    - `starts`: descents (optimistix' Levenberg-Marquardt under the smooth map sin² onto the cube);
-      `samples`: of the even sampling before, from the best of which they start.
-    - `steps`: at most, of each descent; it ends where a step changes the misfit by less than
-      `tolerance` of itself.
-    - `tolerance_db`: misfits up to here are "matched".
-    - `separation`: optima closer than this in the cube are one.
 
     **Validity.** The response has many local optima; more starts and samples find better ones. A
     target that no design fulfils has the status "not_attained".
 
-    **Errors**: ValueError for target levels that are not finite or below 0, and for numbers of
-    starts, samples or steps below 1.
+    **Errors**: ValueError for target levels that are not finite or below 0.
     """
-    checks.at_least_one({"starts": starts, "samples": samples, "steps": steps})
-    dtype = space.lower.dtype
-    levels = checked_levels(target, np.size(target), dtype)
-    model = ResponseModel(space, setup, synthesis, frequencies, len(levels))
-    points = even_samples(space.size, max(samples, starts), key, dtype)
+    space = model.space
+    levels = checked_levels(target, model.rings, space.lower.dtype)
+    count = max(settings.samples, settings.starts)
+    points = even_samples(space.size, count, key, space.lower.dtype)
     values = evaluate(_misfit, space, (model, levels), points)
-    chosen = best_apart(np.asarray(points), np.asarray(values), starts)
-    ended = jax.device_get(_least_squares(model, levels, points[chosen], steps, tolerance))
+    chosen = best_apart(np.asarray(points), np.asarray(values), settings.starts)
+    lengths = settings.steps, settings.tolerance
+    ended = jax.device_get(_least_squares(model, levels, points[chosen], *lengths))
     failed = sum(int(np.sum(~np.isfinite(v))) for v in (np.asarray(values), ended.values))
-    found = ranked(space, ended, separation)
+    found = ranked(space, ended, settings.separation)
     best = found[0].objective if found else np.inf
     used = len(points) + int(np.sum(ended.evaluations))
-    return Match(found, best, match_status(best, tolerance_db), used, failed)
+    return Match(found, best, match_status(best, settings.tolerance_db), used, failed)
 
 
 def match_status(misfit_db: float, tolerance_db: float) -> MatchStatus:

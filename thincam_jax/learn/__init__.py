@@ -9,6 +9,7 @@ from thincam_jax.learn.refocusing.store import save as save
 from thincam_jax.learn.refocusing.train import Lessons as Lessons
 from thincam_jax.learn.refocusing.train import train as train
 from thincam_jax.learn.refocusing.use import Learned as Learned
+from thincam_jax.learn.suggester_training import SuggesterTraining as SuggesterTraining
 from thincam_jax.learn.suggester_training import train_suggester as train_suggester
 from thincam_jax.learn.suggestions import Suggester as Suggester
 from thincam_jax.learn.suggestions import Suggestion as Suggestion

@@ -13,6 +13,7 @@ Two parts, both with Adam (optax):
 """
 
 import functools
+from dataclasses import dataclass, fields
 
 import equinox as eqx
 import jax
@@ -22,11 +23,8 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from thincam_jax._core import checks
 from thincam_jax._core.module import Module
-from thincam_jax.design.frequencies import Frequencies
 from thincam_jax.design.match import ResponseModel
 from thincam_jax.design.search import even_samples
-from thincam_jax.design.setup import Setup
-from thincam_jax.design.space import DesignSpace
 from thincam_jax.design.stochastic import adam
 from thincam_jax.learn.suggestions import Suggester
 
@@ -59,52 +57,52 @@ class TrainedSuggester(Module):
     skipped: int
 
 
-def train_suggester(
-    space: DesignSpace,
-    setup: Setup,
-    synthesis: Float[Array, "channel capture"] | Float[np.ndarray, "channel capture"],
-    frequencies: Frequencies,
-    *,
-    key: PRNGKeyArray,
-    rings: int = 32,
-    samples: int = 16384,
-    guesses: int = 4,
-    width: int = 128,
-    depth: int = 3,
-    warm_up: int = 6000,
-    steps: int = 400,
-    batch: int = 64,
-    rate: float = 4e-3,
-) -> TrainedSuggester:
-    """A network that answers `suggest` for one camera.
+@dataclass(frozen=True)
+class SuggesterTraining:
+    """Size of a network that suggests designs, and its training.
 
-    **Arguments**
-
-    - `space`: what is free; `setup`, `synthesis`, `frequencies`: as of `channels`.
-    - `rings`: how many levels a target has.
     - `samples`: designs, sampled evenly, whose levels are the examples.
     - `guesses`, `width`, `depth`: points that the network gives, and its hidden layers.
     - `warm_up`, `steps`: of the two parts; a tandem step costs some 8·`batch` responses.
     - `rate`: of Adam, falling to zero as a cosine in each part; the tandem begins at a tenth.
 
-    **Errors**: ValueError for numbers below 1, for rings without frequencies, and where no
-    sampled design has a finite response.
+    **Errors**: ValueError for numbers below 1, and for a rate that is not positive.
     """
-    counts = {"samples": samples, "warm_up": warm_up, "steps": steps, "batch": batch}
-    checks.at_least_one(counts)
-    dtype = space.lower.dtype
-    highest_rate = checks.positive("rate", rate, "a number").astype(dtype)
-    model = ResponseModel(space, setup, synthesis, frequencies, rings)
+
+    samples: int = 16384
+    guesses: int = 4
+    width: int = 128
+    depth: int = 3
+    warm_up: int = 6000
+    steps: int = 400
+    batch: int = 64
+    rate: float = 4e-3
+
+    def __post_init__(self):
+        counts = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "rate"}
+        checks.at_least_one(counts)
+        checks.positive("rate", self.rate, "a number")
+
+
+def train_suggester(
+    model: ResponseModel, settings: SuggesterTraining = SuggesterTraining(), *, key: PRNGKeyArray
+) -> TrainedSuggester:
+    """A network that answers `suggest` for one camera and the space of a `ResponseModel`.
+
+    **Errors**: ValueError where no sampled design has a finite response.
+    """
+    dtype = model.space.lower.dtype
     of_samples, of_network, of_steps = jax.random.split(key, 3)
-    points, levels = _examples(model, samples, of_samples)
-    fresh = Suggester(model, key=of_network, guesses=guesses, width=width, depth=depth)
+    points, levels = _examples(model, settings.samples, of_samples)
+    size = {"guesses": settings.guesses, "width": settings.width, "depth": settings.depth}
+    fresh = Suggester(model, key=of_network, **size)
     scale = jnp.maximum(jnp.std(levels, axis=0), _LEAST_SCALE)
     fresh = eqx.tree_at(lambda s: (s.mean, s.scale), fresh, (jnp.mean(levels, axis=0), scale))
-    layers, distances, misfits, skipped = _train(
-        fresh, points, levels, of_steps, highest_rate, warm_up, steps, batch
-    )
+    rate = jnp.asarray(settings.rate, dtype)
+    layers, distances, misfits, skipped = _train(fresh, points, levels, of_steps, rate, settings)
     suggester = eqx.tree_at(lambda s: s.layers, fresh, layers)
-    return TrainedSuggester(suggester, distances, misfits, int(skipped) + samples - len(points))
+    failed = settings.samples - len(points)
+    return TrainedSuggester(suggester, distances, misfits, int(skipped) + failed)
 
 
 def _examples(model: ResponseModel, samples: int, key):
@@ -126,8 +124,10 @@ def _levels(
     return jax.lax.map(model.levels, points, batch_size=_AT_A_TIME)
 
 
-@functools.partial(jax.jit, static_argnames=("warm_up", "steps", "batch"))
-def _train(suggester: Suggester, points, levels, key, rate, warm_up: int, steps: int, batch: int):
+@functools.partial(jax.jit, static_argnames="settings")
+def _train(suggester: Suggester, points, levels, key, rate, settings: SuggesterTraining):
+    batch = settings.batch
+
     def with_layers(layers) -> Suggester:
         return eqx.tree_at(lambda s: s.layers, suggester, layers)
 
@@ -147,8 +147,9 @@ def _train(suggester: Suggester, points, levels, key, rate, warm_up: int, steps:
 
     first, second = jax.random.split(key)
     start = suggester.layers
-    layers, distances, in_vain = adam(towards_designs, start, first, rate, warm_up, most=1.0)
-    layers, misfits, skipped = adam(towards_levels, layers, second, rate / 10, steps, most=1.0)
+    lengths = settings.warm_up, settings.steps
+    layers, distances, in_vain = adam(towards_designs, start, first, rate, lengths[0], most=1.0)
+    layers, misfits, skipped = adam(towards_levels, layers, second, rate / 10, lengths[1], most=1.0)
     return layers, distances, misfits, in_vain + skipped
 
 

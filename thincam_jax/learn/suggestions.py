@@ -27,7 +27,6 @@ from thincam_jax._core import checks
 from thincam_jax._core.checks import Numbers
 from thincam_jax._core.module import Module
 from thincam_jax.design.design import Design
-from thincam_jax.design.frequencies import Frequencies
 from thincam_jax.design.match import (
     MATCHED,
     MatchStatus,
@@ -36,8 +35,7 @@ from thincam_jax.design.match import (
     match_status,
     root_mean_square,
 )
-from thincam_jax.design.setup import Setup
-from thincam_jax.design.space import DesignSpace, active_limits
+from thincam_jax.design.space import active_limits
 from thincam_jax.learn.checkpoint import (
     CheckpointError,
     read_arrays,
@@ -226,14 +224,8 @@ def save_suggester(path: str | os.PathLike[str], suggester: Suggester) -> Path:
     return write_arrays(path, suggester, _described(suggester))
 
 
-def load_suggester(
-    path: str | os.PathLike[str],
-    space: DesignSpace,
-    setup: Setup,
-    synthesis: Float[Array, "channel capture"] | Float[np.ndarray, "channel capture"],
-    frequencies: Frequencies,
-) -> Suggester:
-    """Read a suggester that was trained for this space and camera.
+def load_suggester(path: str | os.PathLike[str], model: ResponseModel) -> Suggester:
+    """Read a suggester that was trained for the space and camera of `model`.
 
     **Errors**: CheckpointError (a ValueError), one line, for a file that is none or is damaged, and
     for one that was trained for another space, camera, synthesis or frequencies, with the first
@@ -242,7 +234,6 @@ def load_suggester(
     there = read_description(path)
     if there.get("kind") != _KIND:
         raise CheckpointError(f"{path} is no suggester; give a file written by save_suggester")
-    model = ResponseModel(space, setup, synthesis, frequencies, there["rings"])
     fresh = Suggester(model, key=jax.random.key(0), **there["network"])
     for name, here in json.loads(json.dumps(_described(fresh))).items():
         if there.get(name) != here:
