@@ -28,7 +28,7 @@ from pydantic_core import PydanticCustomError
 from thincam_jax._core.quantity import FieldError, Quantity, quantities
 from thincam_jax.units import KINDS, parse_quantity
 
-_WITH_UNIT = r"^\s*[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?\s*[^\d\s.].*$"
+_WITH_UNIT = r"^\s*[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?\s*[^\d\s.eE].*$"
 _NEEDED = inspect.Parameter.empty
 
 
@@ -41,6 +41,18 @@ class Section(pydantic.BaseModel):
     """A part of an experiment file: unknown keys are refused."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    @classmethod
+    def __get_pydantic_json_schema__(cls, core_schema: Any, handler: Any) -> dict[str, Any]:
+        """For editors: each key with what the docstring says of it."""
+        form = handler.resolve_ref_schema(handler(core_schema))
+        about = descriptions(cls)
+        for key, entry in form.get("properties", {}).items():
+            entry.pop("title", None)
+            if key in about:
+                entry["description"] = about[key]
+        form["description"] = (cls.__doc__ or "").partition("\n")[0]
+        return form
 
 
 class ObjectSection(Section):
@@ -166,6 +178,14 @@ def _checked(check: Callable[[Any], Any]) -> Callable[[Any], Any]:
     return as_it_is
 
 
+def form_of(kind: str) -> dict[str, Any]:
+    """The JSON Schema of a number with a unit; `kind` as of `units.parse_quantity`."""
+    about = KINDS[kind]
+    examples = re.findall(r'"(.*?)"', about.examples)
+    form = {"type": "string", "pattern": _WITH_UNIT, "examples": examples}
+    return form | {"description": f"{about.name}: {about.advice}"}
+
+
 def written(given: Quantity) -> tuple[Any, ...]:
     """How a number with a unit is read and written in a file."""
 
@@ -175,11 +195,9 @@ def written(given: Quantity) -> tuple[Any, ...]:
             raise ValueError(f'"{text}" is not positive; give a value above zero')
         return value
 
-    kind = KINDS[given.kind]
-    form = {"type": "string", "pattern": _WITH_UNIT, "description": f"{kind.name}: {kind.advice}"}
     # A resolved file is read back, so it is written in the unit of the package, with every digit.
     write = PlainSerializer(lambda value: f"{value!r} {given.unit}")
-    return BeforeValidator(read), write, WithJsonSchema(form)
+    return BeforeValidator(read), write, WithJsonSchema(form_of(given.kind))
 
 
 def descriptions(maker: Callable[..., Any]) -> dict[str, str]:

@@ -3,7 +3,7 @@
 import math
 from dataclasses import fields
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 import pydantic
 from pydantic import Field
@@ -11,7 +11,7 @@ from pydantic import Field
 from thincam_jax.commands.checked_config import load_as
 from thincam_jax.commands.config_file import ConfigError, read_raw, slug
 from thincam_jax.commands.design.config_pareto import ParetoConfig, check_pareto
-from thincam_jax.commands.schema import section
+from thincam_jax.commands.schema import form_of, section
 from thincam_jax.commands.sections import (
     LIGHT,
     PHASES,
@@ -149,6 +149,19 @@ class FreeConfig(Section):
             raise ValueError(f"{lower:g} to {upper:g} mm; give bounds from 10 nm to 1 mm")
         return (lower, upper)
 
+    @classmethod
+    def __get_pydantic_json_schema__(cls, core_schema: Any, handler: Any) -> dict[str, Any]:
+        form = super().__get_pydantic_json_schema__(core_schema, handler)
+        form["properties"]["bounds"] |= {"prefixItems": [{}, {}]}
+        form["allOf"] = [
+            {
+                "if": {"properties": {"variable": {"const": variable}}},
+                "then": {"properties": {"bounds": {"items": _form(variable)}}},
+            }
+            for variable in get_args(Free)
+        ]
+        return form
+
     @pydantic.field_serializer("bounds")
     def _write(self, bounds: tuple[float, float]) -> list[str | float]:
         if not QUANTITIES[self.variable].kind:
@@ -162,6 +175,12 @@ class FreeConfig(Section):
         if self.variable == "width" and (self.shared or self.shots is not None):
             raise ValueError("all masks share the width; drop 'shared' and 'shots'")
         return self
+
+
+def _form(variable: str) -> dict[str, Any]:
+    """JSON Schema of a bound."""
+    kind = QUANTITIES[variable].kind
+    return form_of(kind) if kind else {"type": "number"}
 
 
 def _number(variable: str, given: Any) -> float:
