@@ -45,6 +45,27 @@ def test_schema_takes_it_and_no_number_without_its_unit(path):
     assert not validator.is_valid(raw | {"colour": 1})
 
 
+@pytest.mark.parametrize("kind", ["quick", "mura", "fza_refocus", "sts_camera", "masks"])
+def test_dry_run(kind, tmp_path):
+    out = tmp_path / "out"
+    result = call("run", ROOT / f"configs/{kind}.yaml", "--out", out, "--dry-run")
+    assert result.exit_code == 0, result.output
+    *computed, written, end = result.stdout.splitlines()
+    assert any(re.match("[0-9]+ (methods|masks): ", line) for line in computed)
+    assert written.startswith(f"writes to {out}: config.yaml, targets/, images/, figures/, ")
+    assert end == "dry run: nothing was done"
+    assert not out.exists()
+
+
+def test_dry_run_refuses_what_a_run_would(tmp_path):
+    study = ROOT / "configs/quick.yaml"
+    (tmp_path / "mine.txt").write_text("mine")
+    line = one_line(call("run", study, "--out", tmp_path, "--dry-run"))
+    assert line.startswith(f"--out {tmp_path}: is not empty and holds no run")
+    fault = one_line(call("run", study, "--set", "targets.0.pixels=1", "--dry-run"))
+    assert fault.startswith("--set targets.0.pixels=1: targets[0].pixels: ")
+
+
 def with_units(data):
     """Section and key, or list and index, of every number with a unit."""
     for key, value in data.items() if isinstance(data, dict) else enumerate(data):

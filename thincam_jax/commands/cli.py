@@ -33,7 +33,7 @@ for group, command, *examples in (
     (app, init, "init study", "init design --out mine.yaml"),
     (app, schema, "schema study > study.schema.json"),
     (app, explain, "explain study.yaml", "explain study.yaml --set noise.snr_db=40"),
-    (app, run, "run study.yaml", "run study.yaml --set noise.snr_db=40"),
+    (app, run, "run study.yaml", "run study.yaml --set noise.snr_db=40 --dry-run"),
     (
         *(app, reconstruct),
         "reconstruct --psf PSF.tif --capture RAW.tif --downsample 4 --out IMAGE.png",

@@ -107,6 +107,16 @@ def _entries(data: Any, location: tuple = ()) -> Iterator[tuple[tuple, str]]:
             yield (*location, key), str(value)
 
 
+def work_of(asked: Any) -> Iterator[str]:
+    """Lines that say what a run computes: the names of each list of the file, and its PSFs."""
+    for key in type(asked).model_fields:
+        entries = getattr(asked, key)
+        if isinstance(entries, tuple) and all(hasattr(entry, "name") for entry in entries):
+            if entries:
+                yield f"{len(entries)} {key}: {'; '.join(entry.name for entry in entries)}"
+    yield from psf_costs(asked)
+
+
 def psf_costs(asked: Any) -> Iterator[str]:
     """A line for the PSF of each exposure of a study: model, predicted error, memory, work."""
     from thincam_jax.commands.sections import CamerasConfig
