@@ -189,7 +189,7 @@ class TestOverrides:
         text = changed("pitch: 40 um", "pitch: 40")
         lines = faults(tmp_path, text, "sensor.shape.0=0")
         assert [line.split(": ")[:2] for line in lines] == [
-            ["--set sensor.shape.0=0", "sensor.shape[0]"],
+            ["--set sensor.shape.0=0", "sensor.shape"],
             [str(line_of(text, "pitch: 40")), "sensor.pitch"],
         ]
 

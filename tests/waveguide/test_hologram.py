@@ -80,7 +80,7 @@ def test_glass():
     [
         ({"index": 0.9}, "index = 0.9 is below that of vacuum; give at least 1"),
         ({"thickness": -1.0}, "thickness = -1.0 mm is not positive"),
-        ({"index_modulation": -0.1}, "index_modulation = -0.1 n is negative"),
+        ({"index_modulation": -0.1}, "index_modulation = -0.1 is out of range; give 0 to 0.5"),
     ],
 )
 def test_errors(change, message):

@@ -147,6 +147,19 @@ def channels_first(name: str, shape: tuple[int, ...]) -> None:
         )
 
 
+def between(name: str, value: Any, unit: str, least: float, most: float) -> Array:
+    """A number within limits, which are allowed."""
+    after = _after(unit)
+    message = f"{name} = {{}}{after} is out of range; give {least:g} to {most:g}{after}"
+    array = finite(name, value, unit)
+    return _require(array, lambda known: (least <= known) & (known <= most), message)
+
+
+def decibels(name: str, value: Any) -> Array:
+    """A signal-to-noise ratio, dB."""
+    return between(name, value, "dB", -60.0, 200.0)
+
+
 def fraction(name: str, value: Any) -> Array:
     """A number above 0 and at most 1."""
     message = f"{name} = {{}} is out of range; give 0 < {name} <= 1"

@@ -35,8 +35,21 @@ def load_as(
         for entry in getattr(config, model.pictured)
     )
     config = config.model_copy(update={model.pictured: named})
-    config._places = Places(lambda location: _place(location, places, asked, f"{path}:1"))
+    config._places = Places(
+        lambda location: _place(location, places, asked, f"{path}:1"),
+        lambda location: _holds(raw, location),
+    )
     return config
+
+
+def _holds(raw: Any, location: tuple) -> bool:
+    """Whether raw data have an entry."""
+    for part in location:
+        try:
+            raw = raw[part]
+        except (KeyError, IndexError, TypeError):
+            return False
+    return True
 
 
 def check_as(
@@ -65,10 +78,11 @@ def _place(location: tuple, places: dict, asked: dict, top: str) -> str:
     for part in parts:  # an override stands in for whatever the file has there
         if part in asked:
             return asked[part]
-    if location not in places:
-        for path, override in asked.items():
-            if location and path[: len(location)] == location:
-                return override
+    for path, option in asked.items():
+        inside = location and path[: len(location)] == location
+        # An entry that was set is what is wrong with its list.
+        if inside and (location not in places or isinstance(path[len(location)], int)):
+            return option
     for part in parts:
         for known in ((*part, "(key)"), part):
             if known in places:

@@ -13,6 +13,7 @@ from thincam_jax.commands.cache import cache_state, keep_programs
 from thincam_jax.commands.capture.command import capture, known_drivers
 from thincam_jax.commands.design.command import design
 from thincam_jax.commands.examples import init
+from thincam_jax.commands.explain import explain, schema
 from thincam_jax.commands.help import Grouped, InOrder, examples_text
 from thincam_jax.commands.learned.command import train
 from thincam_jax.commands.reconstruct.command import check, reconstruct
@@ -30,7 +31,9 @@ calibrate.callback()(lambda: None)
 for group, command, *examples in (
     (bench, accuracy, "bench accuracy study.yaml --size 64 --size 128"),
     (app, init, "init study", "init design --out mine.yaml"),
-    (app, run, "run study.yaml", "run study.yaml --set noise.snr_db=40"),
+    (app, schema, "schema study > study.schema.json"),
+    (app, explain, "explain study.yaml", "explain study.yaml --set noise.snr_db=40"),
+    (app, run, "run study.yaml", "run study.yaml --set noise.snr_db=40 --dry-run"),
     (
         *(app, reconstruct),
         "reconstruct --psf PSF.tif --capture RAW.tif --downsample 4 --out IMAGE.png",

@@ -8,8 +8,8 @@ from typing import Any
 from typer.core import TyperCommand, TyperGroup
 
 ORDER = (
-    *("init", "run", "capture", "reconstruct", "calibrate", "sweep", "design", "train", "bench"),
-    "doctor",
+    *("init", "explain", "run", "capture", "reconstruct", "calibrate", "sweep", "design", "train"),
+    *("bench", "schema", "doctor"),
 )
 # Of `thincam reconstruct`; what is in none stands first.
 GROUPS = {

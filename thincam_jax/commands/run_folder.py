@@ -45,6 +45,14 @@ class RunFolder:
                 finished.unlink()
             (self.path / self.result).unlink()
 
+    def outcome(self, config: Section) -> str:
+        """What a run would write, in a line; ConfigError where `claim` would refuse the folder."""
+        if self.path.exists():
+            refuse_foreign(self.path, "config.yaml", dump_config(config), self.kind)
+        folders = [f"{folder}/" for folder in self.folders]
+        files = ("config.yaml", *folders, "environment.json", "report.html", self.result)
+        return f"writes to {self.path}: {', '.join(files)}"
+
     def finished(self, target: str) -> dict[str, Any] | None:
         """The stored results of a target, or None if it has not been finished."""
         path = self.path / "targets" / f"{slug(target)}.json"
@@ -116,16 +124,7 @@ def claim_folder(path: Path, name: str, text: str, kind: str, folders: Sequence[
     held = path / name
     try:
         path.mkdir(parents=True, exist_ok=True)
-        # A neighbour is all that is there where the first start was killed.
-        foreign = any(p.name != f"{name}.partial" for p in path.iterdir())
-        if held.exists():
-            if read_regular(held) != text.encode("utf-8"):
-                raise ConfigError(
-                    f"--out {path}: holds a {kind} of another configuration (see {held}); "
-                    "give another folder or delete this one"
-                )
-        elif foreign:
-            raise ConfigError(f"--out {path}: is not empty and holds no {kind}; give a new folder")
+        refuse_foreign(path, name, text, kind)
         write_whole(held, text)
         for folder in folders:
             (path / folder).mkdir(exist_ok=True)
@@ -133,6 +132,21 @@ def claim_folder(path: Path, name: str, text: str, kind: str, folders: Sequence[
         raise
     except OSError as error:
         raise ConfigError(f"--out {path}: cannot be made a folder ({error.strerror})") from None
+
+
+def refuse_foreign(path: Path, name: str, text: str, kind: str) -> None:
+    """ConfigError where an existing folder holds what `claim_folder` may not go on with."""
+    held = path / name
+    # A neighbour is all that is there where the first start was killed.
+    foreign = any(p.name != f"{name}.partial" for p in path.iterdir())
+    if held.exists():
+        if read_regular(held) != text.encode("utf-8"):
+            raise ConfigError(
+                f"--out {path}: holds a {kind} of another configuration (see {held}); "
+                "give another folder or delete this one"
+            )
+    elif foreign:
+        raise ConfigError(f"--out {path}: is not empty and holds no {kind}; give a new folder")
 
 
 def to_json(data: Any) -> str:

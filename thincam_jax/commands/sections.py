@@ -6,24 +6,19 @@ from dataclasses import dataclass, field
 from typing import Annotated, Any, ClassVar, Literal
 
 import pydantic
-from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, PlainSerializer
-from pydantic_core import PydanticCustomError
+from pydantic import AfterValidator, Field
 
 from thincam_jax._core import checks
-from thincam_jax._core.quantity import Quantity, quantity
+from thincam_jax._core.quantity import quantity
 from thincam_jax.commands.config_file import slug
+from thincam_jax.commands.schema import Section, misfit, section, written
+from thincam_jax.imaging.sensor import AbstractNoise, GaussianNoise, PoissonGaussianNoise, Sensor
 from thincam_jax.imaging.targets import sample_images
 from thincam_jax.lensless.masks.cells import Combination
 from thincam_jax.lensless.masks.fza import Profile
 from thincam_jax.lensless.method import Model
+from thincam_jax.reconstruction import AdmmTV, TotalVariation
 from thincam_jax.reconstruction.wiener import Prior
-from thincam_jax.units import parse_quantity
-
-
-def misfit(message: str, *place: str | int) -> PydanticCustomError:
-    """A fault between entries, reported at one of them."""
-    return PydanticCustomError("misfit", "{message}", {"message": message, "place": place})
-
 
 LIGHT = (1e-5, 1.0)  # the wavelengths that are taken for light, mm
 
@@ -32,19 +27,6 @@ def _optical(value: float) -> float:
     if not LIGHT[0] <= value <= LIGHT[1]:
         raise ValueError(f"{value:g} mm is no wavelength of light; give 10 nm to 1 mm")
     return value
-
-
-def written(given: Quantity):
-    """How a number with a unit is read and written in a file."""
-
-    def read(text: object) -> float:
-        value = parse_quantity(text, given.kind)
-        if given.positive and not value > 0:
-            raise ValueError(f'"{text}" is not positive; give a value above zero')
-        return value
-
-    # A resolved file is read back, so it is written in the unit of the package, with every digit.
-    return BeforeValidator(read), PlainSerializer(lambda value: f"{value!r} {given.unit}")
 
 
 Length = Annotated[float, *written(quantity("mm", positive=True))]
@@ -58,31 +40,8 @@ Time = Annotated[float, *written(quantity("s", positive=True))]
 Name = Annotated[str, Field(min_length=1, max_length=60, pattern=r"^[\w .,()=+\-]+$")]
 
 
-class Section(pydantic.BaseModel):
-    """A part of an experiment file: unknown keys are refused."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-
-class SensorConfig(Section):
+class SensorConfig(section(Sensor)):
     """`thincam_jax.Sensor`."""
-
-    shape: tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]]
-    pitch: Length
-    full_well: Annotated[float, Field(gt=0)] = 13_500.0
-    exposure: Annotated[float, Field(gt=0)] | None = None
-    electrons: Annotated[float, Field(gt=0)] | None = None
-    bit_depth: Annotated[int, Field(ge=1, le=24)] | None = None
-
-    @pydantic.model_validator(mode="after")
-    def _one(self):
-        if self.exposure is not None and self.electrons is not None:
-            message = "both this and exposure say how long the sensor is exposed; give one"
-            raise misfit(message, "electrons")
-        if self.bit_depth is not None and not self.counts:
-            message = "needs an exposure, such as 0.9; give it, or electrons"
-            raise misfit(message, "bit_depth")
-        return self
 
     @property
     def counts(self) -> bool:
@@ -210,18 +169,23 @@ class ObjectConfig(Section):
     width: Length
 
 
-class NoiseConfig(Section):
-    """Gaussian noise at an SNR, or shot noise with a read noise in electrons."""
+_EITHER = {"snr_db": None, "read_noise": None}
 
-    snr_db: Annotated[float, Field(ge=-60, le=200)] | None = None
-    signal_power: Literal["total", "without_mean"] = "total"
-    read_noise: Annotated[float, Field(ge=0)] | None = None
+
+class NoiseConfig(section(GaussianNoise, PoissonGaussianNoise, defaults=_EITHER)):
+    """Gaussian noise at an SNR, or shot noise with a read noise in electrons."""
 
     @pydantic.model_validator(mode="after")
     def _one(self):
         if (self.snr_db is None) == (self.read_noise is None):
             raise ValueError("give either snr_db (Gaussian noise) or read_noise (shot noise too)")
         return self
+
+    def build(self, **others: Any) -> AbstractNoise:
+        """The noise that is given."""
+        if self.snr_db is None:
+            return PoissonGaussianNoise(self.read_noise)
+        return GaussianNoise(self.snr_db, self.signal_power)
 
 
 class ShotConfig(Section):
@@ -255,14 +219,14 @@ class PublishedConfig(Section):
     limit_cycles_per_mm: Annotated[float, Field(gt=0)] | None = None
 
 
-class VariationConfig(Section):
-    """Total variation of an admm_tv method; see `thincam_jax.reconstruct`."""
+_VARIATION = {
+    "only": ("tau", "iterations", "kind", "coupling", "chroma_weight"),
+    "defaults": {"coupling": None, "chroma_weight": 2.0},
+}
 
-    tau: Annotated[float, Field(ge=0)] = 2.0
-    iterations: Annotated[int, Field(ge=1, le=100_000)] = 100
-    kind: Literal["isotropic", "anisotropic"] = "isotropic"
-    coupling: Literal["none", "joint", "opponent"] | None = None
-    chroma_weight: Annotated[float, Field(ge=0)] = 2.0
+
+class VariationConfig(section(AdmmTV, TotalVariation, **_VARIATION)):
+    """Total variation of an admm_tv method; see `thincam_jax.reconstruct`."""
 
     def coupling_of(self, channels: int) -> Literal["none", "joint", "opponent"]:
         """As given; else what suits the number of colour channels."""
@@ -371,6 +335,7 @@ class Places:
     """Where the entries of a file come from, which makes no difference to what they are."""
 
     find: Callable[[tuple], str] | None = field(default=None, compare=False)
+    gives: Callable[[tuple], bool] = field(default=lambda location: False, compare=False)
 
 
 class ExperimentConfig(Section):
@@ -385,6 +350,10 @@ class ExperimentConfig(Section):
     def place_of(self, *location: str | int) -> str:
         """File and line of an entry, or the option that set it, with a colon; else nothing."""
         return "" if self._places.find is None else f"{self._places.find(location)}: "
+
+    def gives(self, *location: str | int) -> bool:
+        """Whether the file or an option has an entry, which is a default otherwise."""
+        return self._places.gives(location)
 
 
 class LenslessConfig(ExperimentConfig):

@@ -10,8 +10,9 @@ where H̄ is what the sensor sees of H, and η^crop what it cuts off (`thincam_j
 An `AbstractObjective` makes a cost to minimise of them, and knows how to report it.
 """
 
+import functools
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import equinox as eqx
 import jax
@@ -20,6 +21,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from thincam_jax._core import checks
+from thincam_jax._core.quantity import quantity
 from thincam_jax.design.design import Design
 from thincam_jax.design.frequencies import Frequencies
 from thincam_jax.design.response import (
@@ -33,6 +35,8 @@ from thincam_jax.design.setup import Setup
 DEFAULT_BAND = (0.05, 0.5)  # of the highest frequency
 # Increase counted as 1 % worse, and 10 log10(1.01) dB for values in dB.
 _ONE_PERCENT, _ONE_PERCENT_DB = 0.01, 0.0432
+_LENGTH = quantity("mm", non_negative=True)
+_PART = quantity(check=functools.partial(checks.between, unit="a ratio", least=0.0, most=0.5))
 
 
 class Channels(eqx.Module):
@@ -201,11 +205,11 @@ class Tolerances:
       vary evenly with a standard deviation of tilt·w/√12, and is counted as an error of that size.
     """
 
-    beta: float = 0.0
-    distance: float = 0.0
-    wavelength: float = 0.0
-    object_distance: float = 0.0
-    tilt: float = 0.0
+    beta: Annotated[float, _PART] = 0.0
+    distance: Annotated[float, _LENGTH] = 0.0
+    wavelength: Annotated[float, _LENGTH] = 0.0
+    object_distance: Annotated[float, _LENGTH] = 0.0
+    tilt: Annotated[float, quantity("rad", non_negative=True)] = 0.0
 
 
 def robust_error(

@@ -6,6 +6,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
 
+from thincam_jax._core import checks
 from thincam_jax._core.checks import Numbers
 from thincam_jax._core.module import Module
 from thincam_jax._core.quantity import quantity
@@ -77,7 +78,9 @@ class SignalNoise(Module):
       exposure among captures does not change it.
     """
 
-    snr_db: Float[Array, ""] = eqx.field(default=30.0, converter=quantity("dB"))
+    snr_db: Float[Array, ""] = eqx.field(
+        default=30.0, converter=quantity("dB", check=checks.decibels)
+    )
 
     def variance(self, light: Numbers, signal: Numbers, exposure: Numbers):
         """Of a pixel, mm⁴: from the capture's mean (mm²), its variance, the share of exposure."""
@@ -93,7 +96,7 @@ class PhotonNoise(Module):
     """
 
     electrons: Float[Array, ""] = eqx.field(
-        default=2_000.0, converter=quantity("electrons", positive=True)
+        default=2_000.0, converter=quantity("electrons/mm^2", positive=True)
     )
     read_noise: Float[Array, ""] = eqx.field(
         default=8.0, converter=quantity("electrons", non_negative=True)

@@ -7,6 +7,7 @@ every limit, those that tie two variables together too, so that no solver has to
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import equinox as eqx
 import jax
@@ -14,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from thincam_jax._core.quantity import quantities
+from thincam_jax._core.quantity import quantities, quantity, whole
 from thincam_jax.design.design import MOST_CAPTURES, Design
 
 _WITHIN = 1e-3  # distance in the cube below which a limit is active
@@ -98,9 +99,9 @@ class Limits:
       others as their own shares are.
     """
 
-    mask_pixel: float | None = None
-    thickness: float | None = None
-    captures: int = MOST_CAPTURES
+    mask_pixel: Annotated[float | None, quantity("mm", positive=True, optional=True)] = None
+    thickness: Annotated[float | None, quantity("mm", positive=True, optional=True)] = None
+    captures: Annotated[int, whole(1, MOST_CAPTURES)] = MOST_CAPTURES
     exposure: float | None = None
 
 

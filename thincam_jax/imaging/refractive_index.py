@@ -96,6 +96,8 @@ def as_index(name: str, value: AbstractIndex | Number) -> AbstractIndex:
     number = checks.real(name, value, "(no unit)")
     if not checks.is_traced(number) and not float(number) >= 1:
         raise ValueError(f"{name} = {float(number):g} is below that of vacuum; give at least 1")
+    if not checks.is_traced(number) and not float(number) <= 5:
+        raise ValueError(f"{name} = {float(number):g} is above that of any film; give at most 5")
     return ConstantIndex(number)
 
 

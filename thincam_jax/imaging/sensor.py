@@ -59,7 +59,9 @@ class Sensor(Module):
             )
         if self.bit_depth is not None and self.exposure is None and self.electrons is None:
             raise FieldError(
-                "bit_depth needs an exposure: the converter's range is the full well", "bit_depth"
+                "bit_depth needs an exposure, such as 0.9, or electrons: the converter's range is "
+                "the full well",
+                "bit_depth",
             )
 
     @property
@@ -98,7 +100,7 @@ class GaussianNoise(AbstractNoise):
     - "without_mean": its variance: what is left of a lensless capture once its bias is removed.
     """
 
-    snr_db: Float[Array, ""] = eqx.field(converter=quantity("dB"))
+    snr_db: Float[Array, ""] = eqx.field(converter=quantity("dB", check=checks.decibels))
     signal_power: Literal["total", "without_mean"] = eqx.field(
         default="total",
         converter=choice(("total", "without_mean")),

@@ -2,7 +2,7 @@ r"""Total variation of an image, its proximal map, and the differences it is mad
 
 import functools
 from collections.abc import Sequence
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, get_args
 
 import equinox as eqx
 import jax
@@ -12,9 +12,9 @@ from jax.custom_derivatives import SymbolicZero
 from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
-from thincam_jax._core import checks
 from thincam_jax._core.checks import Number
 from thincam_jax._core.precision import flat_root
+from thincam_jax._core.quantity import choice, quantity
 from thincam_jax.reconstruction.regularisers import AbstractRegulariser, Image
 
 Kind = Literal["isotropic", "anisotropic"]
@@ -47,24 +47,16 @@ class TotalVariation(AbstractRegulariser):
 
     # The proximal map of an image takes inner iterations.
     orthonormal: ClassVar[bool] = False
-    depth_weight: Float[Array, ""]
-    chroma_weight: Float[Array, ""]
-    kind: Kind = eqx.field(static=True)
-    coupling: Coupling = eqx.field(static=True)
-
-    def __init__(
-        self,
-        kind: Kind = "isotropic",
-        coupling: Coupling = "none",
-        *,
-        depth_weight: Number = 0.0,
-        chroma_weight: Number = 1.5,
-    ):
-        checks.choice("kind", kind, ("isotropic", "anisotropic"))
-        checks.choice("coupling", coupling, ("none", "joint", "opponent"))
-        self.kind, self.coupling = kind, coupling
-        self.depth_weight = checks.non_negative("depth_weight", depth_weight, "parts of one")
-        self.chroma_weight = checks.non_negative("chroma_weight", chroma_weight, "parts of one")
+    kind: Kind = eqx.field(default="isotropic", converter=choice(get_args(Kind)), static=True)
+    coupling: Coupling = eqx.field(
+        default="none", converter=choice(get_args(Coupling)), static=True
+    )
+    depth_weight: Float[Array, ""] = eqx.field(
+        default=0.0, converter=quantity("parts of one", non_negative=True), kw_only=True
+    )
+    chroma_weight: Float[Array, ""] = eqx.field(
+        default=1.5, converter=quantity("parts of one", non_negative=True), kw_only=True
+    )
 
     def __call__(self, image: Image) -> Float[Array, "*batch"]:
         """The total variation."""

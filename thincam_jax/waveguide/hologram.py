@@ -15,6 +15,9 @@ the Bragg condition (Eq 5.5); with k = 2πn/λ this is a mirror reflection at th
 Directions are unit vectors (x, y, z) in the film; z is its normal.
 """
 
+import functools
+from typing import Annotated
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -26,6 +29,20 @@ from thincam_jax._core.checks import Number
 from thincam_jax._core.module import Module
 from thincam_jax._core.quantity import quantity
 from thincam_jax.imaging.refractive_index import AbstractIndex, ConstantIndex, as_index, changed
+
+
+def _acute(name: str, angle: Number) -> Float[Array, ""]:
+    value = checks.real(name, angle, "rad")
+    if not checks.is_traced(value) and not abs(float(value)) < jnp.pi / 2:
+        raise ValueError(
+            f"{name} = {float(value):g} rad is not acute; give the angle from the film's normal, "
+            "between −π/2 and π/2, such as 61.2 * deg"
+        )
+    return value
+
+
+_ACUTE = quantity("rad", check=_acute)
+_MODULATION = quantity(check=functools.partial(checks.between, unit="a ratio", least=0.0, most=0.5))
 
 
 class VolumeHologram(Module):
@@ -41,17 +58,17 @@ class VolumeHologram(Module):
     grating: Float[Array, "3"] = eqx.field(converter=quantity("rad/mm", shape=(3,)))
     index: AbstractIndex = eqx.field(converter=quantity(check=as_index))
     thickness: Float[Array, ""] = eqx.field(converter=quantity("mm", positive=True))
-    index_modulation: Float[Array, ""] = eqx.field(converter=quantity("n", non_negative=True))
+    index_modulation: Float[Array, ""] = eqx.field(converter=_MODULATION)
 
     @staticmethod
     def record(
-        wavelength: Number,
-        object_angle: Number,
-        reference_angle: Number,
+        wavelength: Annotated[Number, quantity("mm", check=checks.wavelength)],
+        object_angle: Annotated[Number, _ACUTE],
+        reference_angle: Annotated[Number, _ACUTE],
         *,
-        index: AbstractIndex | Number,
-        thickness: Number,
-        index_modulation: Number,
+        index: Annotated[AbstractIndex | Number, quantity(check=as_index)],
+        thickness: Annotated[Number, quantity("mm", positive=True)],
+        index_modulation: Annotated[Number, _MODULATION],
     ) -> "VolumeHologram":
         """The reflection hologram that two plane waves in the plane x = 0 record.
 
@@ -195,13 +212,3 @@ def _bracketed(wavelength, data):
     """`_mismatch`, or a line through the middle of the band where it has no root."""
     *given, found, middle = data
     return jnp.where(found, _mismatch(wavelength, given), wavelength - middle)
-
-
-def _acute(name: str, angle: Number) -> Float[Array, ""]:
-    value = checks.real(name, angle, "rad")
-    if not checks.is_traced(value) and not abs(float(value)) < jnp.pi / 2:
-        raise ValueError(
-            f"{name} = {float(value):g} rad is not acute; give the angle from the film's normal, "
-            "between −π/2 and π/2, such as 61.2 * deg"
-        )
-    return value

@@ -104,7 +104,7 @@ class TestExitCode2:
         [
             ("search.free.0.bounds=[9 /mm^2, 8 /mm^2]", "bounds cross: 9 to 8 rad/mm^2"),
             ("search.limits.mask_pixel=0.2 mm", "no design is feasible: beta of capture 1, 2 ≥ 12"),
-            ("search.limits.captures=0", "greater than or equal to 1"),
+            ("search.limits.captures=0", "a whole number from 1 to 8"),
             ("targets.1.path=missing.png", "targets[1]: "),
             ("pareto.light.bounds=[10, 100]", "pareto.light: light needs noise that counts elec"),
             ("pareto.thickness.bounds=[2 mm, 3 mm]", "pareto.thickness: no distance is free"),

@@ -46,7 +46,7 @@ def build_problem(study: FileStudy) -> DesignProblem:
 def build_objective(asked: SearchConfig) -> AbstractObjective:
     """The objective that a file names."""
     if asked.tolerances is not None:
-        return RobustError(asked.tolerances.tolerances(), asked.tolerances.how)
+        return RobustError(asked.tolerances.build(), asked.tolerances.how)
     kind = OBJECTIVES[asked.objective]
     if asked.band is not None and issubclass(kind, WorstRatio | Unevenness):
         return kind(asked.band)

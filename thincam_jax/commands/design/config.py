@@ -3,7 +3,7 @@
 import math
 from dataclasses import fields
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 import pydantic
 from pydantic import Field
@@ -11,12 +11,11 @@ from pydantic import Field
 from thincam_jax.commands.checked_config import load_as
 from thincam_jax.commands.config_file import ConfigError, read_raw, slug
 from thincam_jax.commands.design.config_pareto import ParetoConfig, check_pareto
+from thincam_jax.commands.schema import form_of, section
 from thincam_jax.commands.sections import (
     LIGHT,
     PHASES,
-    Angle,
     ApertureConfig,
-    Length,
     LenslessConfig,
     Name,
     NoiseConfig,
@@ -31,12 +30,15 @@ from thincam_jax.design import (
     Design,
     DesignSpace,
     Limits,
+    PhotonNoise,
+    SignalNoise,
     Tolerances,
     Variable,
     found_name,
     shots,
 )
 from thincam_jax.design.space import QUANTITIES
+from thincam_jax.imaging.sensor import Sensor
 from thincam_jax.imaging.targets import sample_images
 from thincam_jax.units import parse_quantity
 
@@ -47,11 +49,8 @@ Free = Literal["beta", "distance", "wavelength", "width", "exposure"]
 _NARROWEST_BAND = 1 / 16
 
 
-class PixelsConfig(Section):
+class PixelsConfig(section(Sensor, only=("shape", "pitch"))):
     """The sensor; of its two sides the search takes the shorter one."""
-
-    shape: tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]]
-    pitch: Length
 
     @property
     def width(self) -> float:
@@ -59,15 +58,14 @@ class PixelsConfig(Section):
         return min(self.shape) * self.pitch
 
 
-class DesignNoiseConfig(Section):
+_EITHER = {"snr_db": None, "read_noise": None, "electrons": None}
+
+
+class DesignNoiseConfig(section(SignalNoise, PhotonNoise, defaults=_EITHER)):
     """Gaussian noise at an SNR of the captures' variance, or shot and read noise.
 
     `electrons` are those of a pixel from each mm² of open aperture, before a white scene.
     """
-
-    snr_db: Annotated[float, Field(ge=-60, le=200)] | None = None
-    read_noise: Annotated[float, Field(ge=0)] | None = None
-    electrons: Annotated[float, Field(gt=0)] | None = None
 
     @pydantic.model_validator(mode="after")
     def _one(self):
@@ -151,6 +149,19 @@ class FreeConfig(Section):
             raise ValueError(f"{lower:g} to {upper:g} mm; give bounds from 10 nm to 1 mm")
         return (lower, upper)
 
+    @classmethod
+    def __get_pydantic_json_schema__(cls, core_schema: Any, handler: Any) -> dict[str, Any]:
+        form = super().__get_pydantic_json_schema__(core_schema, handler)
+        form["properties"]["bounds"] |= {"prefixItems": [{}, {}]}
+        form["allOf"] = [
+            {
+                "if": {"properties": {"variable": {"const": variable}}},
+                "then": {"properties": {"bounds": {"items": _form(variable)}}},
+            }
+            for variable in get_args(Free)
+        ]
+        return form
+
     @pydantic.field_serializer("bounds")
     def _write(self, bounds: tuple[float, float]) -> list[str | float]:
         if not QUANTITIES[self.variable].kind:
@@ -166,6 +177,12 @@ class FreeConfig(Section):
         return self
 
 
+def _form(variable: str) -> dict[str, Any]:
+    """JSON Schema of a bound."""
+    kind = QUANTITIES[variable].kind
+    return form_of(kind) if kind else {"type": "number"}
+
+
 def _number(variable: str, given: Any) -> float:
     """In the package's unit."""
     if QUANTITIES[variable].kind:  # a share of the exposure stands alone
@@ -175,39 +192,24 @@ def _number(variable: str, given: Any) -> float:
     return float(given)
 
 
-class LimitsConfig(Section):
-    """`thincam_jax.design.Limits`."""
-
-    mask_pixel: Length | None = None
-    thickness: Length | None = None
-    captures: Annotated[int, Field(ge=1, le=8)] = 8
+# How all captures divide their exposure follows from what is free.
+LimitsConfig = section(Limits, without=("exposure",))
+_EXACT = dict.fromkeys(field.name for field in fields(Tolerances))
 
 
-class TolerancesConfig(Section):
+class TolerancesConfig(section(Tolerances, defaults=_EXACT)):
     """`thincam_jax.design.Tolerances`: what the reconstruction does not know, of `robust_error`.
 
     `beta`: as a part of itself; `how`: the mean over the tolerances, or the worst of them.
     """
 
-    beta: Annotated[float, Field(gt=0, lt=0.5)] | None = None
-    distance: Length | None = None
-    wavelength: Length | None = None
-    object_distance: Length | None = None
-    tilt: Angle | None = None
     how: Literal["mean", "worst"] = "mean"
 
     @pydantic.model_validator(mode="after")
     def _some(self):
-        given = self.model_dump(exclude={"how"}, exclude_none=True)
-        if not given:
+        if not any(getattr(self, name) for name in self.parameters):
             raise ValueError("no tolerance is given; give at least one, such as distance: 20 um")
-        if self.tilt is not None and not self.tilt > 0:
-            raise ValueError(f"tilt is {self.tilt:g} rad; give an angle above 0")
         return self
-
-    def tolerances(self) -> Tolerances:
-        """As numbers, 0 for what is exact."""
-        return Tolerances(*(getattr(self, field.name) or 0.0 for field in fields(Tolerances)))
 
 
 class FrequenciesConfig(Section):
@@ -229,7 +231,7 @@ class SearchConfig(Section):
     """
 
     free: Annotated[tuple[FreeConfig, ...], Field(min_length=1)]
-    limits: LimitsConfig = LimitsConfig()
+    limits: LimitsConfig = LimitsConfig()  # pyright: ignore[reportInvalidTypeForm]
     objective: ObjectiveName = "bayes_error"
     band: tuple[Part, Part] | None = None
     tolerances: TolerancesConfig | None = None
@@ -352,7 +354,7 @@ class DesignConfig(LenslessConfig):
         given, base = self.search.limits, self.design(self.reference)
         # The reference's captures have a share of 1 each; what is found shares the same.
         total = float(base.captures) if self.frees("exposure") else None
-        return DesignSpace(base, tuple(_variables(self)), Limits(**dict(given), exposure=total))
+        return DesignSpace(base, tuple(_variables(self)), given.build(exposure=total))
 
     def frees(self, variable: Free) -> bool:
         """Whether the search chooses it, of some shot."""

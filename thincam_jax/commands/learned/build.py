@@ -7,7 +7,6 @@ import jax
 
 from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.learned.config import LearnedConfig, SourceConfig
-from thincam_jax.imaging.sensor import Sensor
 from thincam_jax.learn.refocusing.cameras import RefocusCamera
 from thincam_jax.learn.refocusing.network import NetworkOptions, RefocusNetwork
 from thincam_jax.learn.refocusing.scenes import SceneOptions
@@ -24,7 +23,7 @@ def build_camera(config: LearnedConfig) -> RefocusCamera:
     focus = config.focus
     try:
         aperture = FresnelZoneAperture(config.mask.beta, **mask)
-        camera = LenslessCamera(aperture, Sensor(**dict(config.sensor)), config.distance)
+        camera = LenslessCamera(aperture, config.sensor.build(), config.distance)
         return RefocusCamera(
             camera,
             config.wavelength,

@@ -17,7 +17,6 @@ from thincam_jax.commands.screen.config import (
 )
 from thincam_jax.commands.sections import VariationConfig
 from thincam_jax.commands.study.build import build_noise, picture
-from thincam_jax.imaging.sensor import Sensor
 from thincam_jax.reconstruction import AbstractSolver, AdmmTV, Ridge, TotalVariation
 from thincam_jax.studies.screen import ScreenModel, ScreenStudy
 from thincam_jax.studies.screen_calibration import Calibration
@@ -86,14 +85,7 @@ def build_cameras(config: SeeThroughConfig) -> tuple[wg.SeeThroughCamera, ...]:
 
 def _camera(config: SeeThroughConfig, wavelength: float) -> wg.SeeThroughCamera:
     film, plate = config.hologram, config.screen
-    hologram = wg.VolumeHologram.record(
-        wavelength,
-        film.object_angle,
-        film.reference_angle,
-        index=film.index,
-        thickness=film.thickness,
-        index_modulation=film.index_modulation,
-    ).processed(film.shrinkage)
+    hologram = film.build(wavelength=wavelength).processed(film.shrinkage)
     screen = wg.Screen(
         hologram,
         plate.glass_thickness,
@@ -102,7 +94,7 @@ def _camera(config: SeeThroughConfig, wavelength: float) -> wg.SeeThroughCamera:
         _rectangle(plate.bottom),
     )
     lens = config.lens
-    sensor = Sensor(**dict(config.sensor))
+    sensor = config.sensor.build()
     distances = lens.focal_distance, lens.lens_distance
     return wg.SeeThroughCamera(screen, sensor, *distances, tilt=np.asarray(plate.tilt))
 

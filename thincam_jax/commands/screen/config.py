@@ -6,6 +6,8 @@ from typing import Annotated, Literal
 import pydantic
 from pydantic import Field
 
+from thincam_jax import waveguide as wg
+from thincam_jax.commands.schema import section
 from thincam_jax.commands.sections import (
     Angle,
     ExperimentConfig,
@@ -28,24 +30,20 @@ from thincam_jax.measured.calibration.screen_fit import DEFAULT, PARAMETERS
 from thincam_jax.studies.screen import Mistake
 from thincam_jax.studies.screen_calibration import MEASURED
 
-Index = Annotated[float, Field(ge=1, le=4)]
 Acute = Annotated[Angle, Field(gt=-math.pi / 2, lt=math.pi / 2)]
 
 
-class HologramConfig(Section):
+_HOLOGRAM = {"wavelength": None, "object_angle": 0.0, "index": 1.5}
+
+
+class HologramConfig(section(wg.VolumeHologram.record, defaults=_HOLOGRAM)):
     """How both holograms are recorded; angles are in the film, from its normal.
 
     - `colours`: of a full-colour hologram, the wavelengths of red, green and blue in place of
       `wavelength`, recorded one after the other at the same angles.
     """
 
-    wavelength: Wavelength | None = None
     colours: tuple[Wavelength, Wavelength, Wavelength] | None = None
-    object_angle: Acute = 0.0
-    reference_angle: Acute
-    index: Index = 1.5
-    thickness: Length
-    index_modulation: Annotated[float, Field(gt=0, le=0.5)]
     shrinkage: Annotated[float, Field(gt=-1, lt=1)] = 0.0
 
     @pydantic.model_validator(mode="after")
@@ -69,24 +67,22 @@ class RectangleConfig(Section):
     y: Position = 0.0
 
 
-class PlateConfig(Section):
+_GLASS = {"glass_index": 1.5}
+
+
+class PlateConfig(section(wg.Screen, only=("glass_thickness", "glass_index"), defaults=_GLASS)):
     """The glass plate; a hologram without an outline covers its whole surface.
 
     - `tilt`: against the camera, about x and then about y.
     """
 
-    glass_thickness: Length
-    glass_index: Index = 1.5
     tilt: tuple[Acute, Acute] = (0.0, 0.0)
     top: RectangleConfig | None = None
     bottom: RectangleConfig | None = None
 
 
-class LensConfig(Section):
+class LensConfig(section(wg.SeeThroughCamera, only=("focal_distance", "lens_distance"))):
     """From sensor to lens (d0), and from lens to the plate (d1)."""
-
-    focal_distance: Length
-    lens_distance: Length
 
 
 class SeenConfig(Section):

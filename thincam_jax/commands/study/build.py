@@ -24,12 +24,7 @@ from thincam_jax.commands.study.mask import built_mask
 from thincam_jax.imaging import targets as drawn
 from thincam_jax.imaging.metrics.image import SSIM_WINDOW
 from thincam_jax.imaging.metrics.mtf import MINIMUM_COLUMNS
-from thincam_jax.imaging.sensor import (
-    AbstractNoise,
-    GaussianNoise,
-    PoissonGaussianNoise,
-    Sensor,
-)
+from thincam_jax.imaging.sensor import AbstractNoise, Sensor
 from thincam_jax.lensless import masks
 from thincam_jax.lensless.exposures import Exposure, Exposures
 from thincam_jax.reconstruction.solver import AbstractSolver
@@ -90,7 +85,7 @@ def build_optics(
 ) -> tuple[masks.AbstractMask, Sensor]:
     """The mask of an exposure, and the sensor. **Errors**: ConfigError where one is none."""
     try:
-        return built_mask(mask, exposure), Sensor(**dict(sensor))
+        return built_mask(mask, exposure), sensor.build()
     except (ValueError, TypeError, FileNotFoundError) as error:
         raise ConfigError(f"mask, sensor or model: {error}") from None
 
@@ -141,12 +136,7 @@ def build_solver(
 
 
 def build_noise(noise: NoiseConfig | None) -> AbstractNoise | None:
-    if noise is None:
-        return None
-    if noise.read_noise is not None:
-        return PoissonGaussianNoise(noise.read_noise)
-    assert noise.snr_db is not None  # one of the two is given
-    return GaussianNoise(noise.snr_db, noise.signal_power)
+    return None if noise is None else noise.build()
 
 
 def read_targets(

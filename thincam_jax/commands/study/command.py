@@ -15,6 +15,10 @@ def run(
         Path | None, typer.Option(help="Run folder; default runs/NAME of the study.")
     ] = None,
     set_: Overrides = None,
+    dry_run: Annotated[
+        bool,
+        typer.Option("--dry-run", help="Check all and tell what would be done, without doing it."),
+    ] = False,
 ) -> None:
     """Simulate an experiment and reconstruct it; or reconstruct a store of 'thincam capture'.
 
@@ -40,8 +44,9 @@ def run(
         if config.is_dir():
             from thincam_jax.commands.capture.command import reconstruct_store
 
-            if set_:
-                raise ConfigError("--set is for experiment files; a store has its own settings")
+            if set_ or dry_run:
+                option = "--set" if set_ else "--dry-run"
+                raise ConfigError(f"{option} is for experiment files; a store has its own settings")
             print(f"report: {reconstruct_store(config, out) / 'report.html'}")
             return
         asked = load_experiment(config, tuple(set_ or ()))
@@ -49,6 +54,11 @@ def run(
         build, simulate, table = _parts(_kind(asked))
         setup = build(asked)
         warn(getattr(setup, "warnings", []))
+        if dry_run:
+            from thincam_jax.commands.explain import work_of
+
+            print("\n".join([*work_of(asked), folder.outcome(asked), "dry run: nothing was done"]))
+            return
         with counted(asked.name) as progress:
             metrics = simulate(setup, folder, progress)
     import rich

@@ -1,0 +1,108 @@
+"""Every shipped experiment file: what it resolves to, its JSON Schema, and `thincam explain`."""
+
+import json
+import re
+
+import pytest
+import yaml
+from commands.test_cli import call, one_line
+from jsonschema import Draft202012Validator
+
+from helpers import ROOT
+from thincam_jax.commands.explain import load_any
+
+FILES = sorted((ROOT / "configs").glob("*.yaml"))
+# Of each file, without its texts for readers; a changed default or reading of a unit shows.
+RESOLVED = json.loads((ROOT / "tests/commands/resolved.json").read_text("utf-8"))
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
+def test_resolved_values(path):
+    config = load_any(path)
+    data = config.model_dump(mode="json", exclude_none=True, by_alias=True)
+    text = json.dumps(data).replace(str((ROOT / "configs").resolve()), "configs")
+    found = {key: value for key, value in json.loads(text).items() if key not in ("title", "notes")}
+    assert found == RESOLVED[path.stem]
+
+
+def test_every_file_is_recorded():
+    assert sorted(RESOLVED) == [path.stem for path in FILES]
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
+def test_schema_takes_it_and_no_number_without_its_unit(path):
+    raw = yaml.safe_load(path.read_text("utf-8"))
+    result = call("schema", raw.get("kind", "study"))
+    assert result.exit_code == 0, result.output
+    schema = json.loads(result.stdout)
+    Draft202012Validator.check_schema(schema)
+    validator = Draft202012Validator(schema)
+    assert [error.message for error in validator.iter_errors(raw)] == []
+    for entries, key in with_units(raw):
+        given, entries[key] = entries[key], 5.5
+        assert not validator.is_valid(raw), f"{key} without its unit"
+        entries[key] = given
+    assert not validator.is_valid(raw | {"colour": 1})
+
+
+@pytest.mark.parametrize("kind", ["quick", "mura", "fza_refocus", "sts_camera", "masks"])
+def test_dry_run(kind, tmp_path):
+    out = tmp_path / "out"
+    result = call("run", ROOT / f"configs/{kind}.yaml", "--out", out, "--dry-run")
+    assert result.exit_code == 0, result.output
+    *computed, written, end = result.stdout.splitlines()
+    assert any(re.match("[0-9]+ (methods|masks): ", line) for line in computed)
+    assert written.startswith(f"writes to {out}: config.yaml, targets/, images/, figures/, ")
+    assert end == "dry run: nothing was done"
+    assert not out.exists()
+
+
+def test_dry_run_refuses_what_a_run_would(tmp_path):
+    study = ROOT / "configs/quick.yaml"
+    (tmp_path / "mine.txt").write_text("mine")
+    line = one_line(call("run", study, "--out", tmp_path, "--dry-run"))
+    assert line.startswith(f"--out {tmp_path}: is not empty and holds no run")
+    fault = one_line(call("run", study, "--set", "targets.0.pixels=1", "--dry-run"))
+    assert fault.startswith("--set targets.0.pixels=1: targets[0].pixels: ")
+
+
+def with_units(data):
+    """Section and key, or list and index, of every number with a unit."""
+    for key, value in data.items() if isinstance(data, dict) else enumerate(data):
+        if isinstance(value, (dict, list)):
+            yield from with_units(value)
+        elif re.fullmatch(r"-?[\d.]+ ?(nm|um|mm|m|ms|s|deg|rad|(rad)?/mm\^2)", str(value)):
+            yield data, key
+
+
+def test_schema_says_what_a_key_is():
+    schema = json.loads(call("schema", "study").stdout)
+    pitch = schema["$defs"]["SensorConfig"]["properties"]["pitch"]
+    assert pitch["description"] == "pixel pitch, mm."
+    assert "5.5 um" in pitch["examples"]
+    assert schema["$defs"]["MaskConfig"]["properties"]["profile"]["enum"][0] == "cosine"
+    assert one_line(call("schema", "lens")).startswith("kind: 'lens' is unknown; choose one of")
+
+
+class TestExplain:
+    def test_places(self):
+        path = ROOT / "configs/quick.yaml"
+        result = call("explain", path, "--set", "noise.snr_db=40")
+        assert result.exit_code == 0, result.output
+        rows = dict(re.split(r" +# ", line) for line in result.stdout.splitlines() if "#" in line)
+        given = path.read_text("utf-8").splitlines()
+        line = next(n for n, text in enumerate(given, 1) if text.startswith("  pitch: 11 um"))
+        assert rows["sensor.pitch: 0.011 mm"] == f"{path}:{line}"
+        assert rows["sensor.full_well: 13500.0"] == "default"
+        assert rows["noise.snr_db: 40.0"] == "--set noise.snr_db=40"
+
+    def test_costs_of_its_cameras(self):
+        lines = call("explain", ROOT / "configs/quick.yaml").stdout.splitlines()
+        costs = [line for line in lines if line.startswith("PSF at ")]
+        assert len(costs) == 3  # two distances, and another β at one of them
+        assert all("separable, predicted error 0.0" in line and "MiB" in line for line in costs)
+
+    def test_faults(self, tmp_path):
+        path = tmp_path / "lens.yaml"
+        path.write_text("kind: lens")
+        assert one_line(call("explain", path)).startswith(f"{path}: kind: 'lens' is unknown; ")
