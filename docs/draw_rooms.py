@@ -14,7 +14,8 @@ from PIL import Image
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.append(str(ROOT / "tests"))
-from test_architecture import FLOORS, OUTSIDE, OUTSIDE_USES, PACKAGE, read_package  # noqa: E402
+from source_tree import PACKAGE, read_package  # noqa: E402
+from test_architecture import FLOORS, OUTSIDE, OUTSIDE_USES  # noqa: E402
 
 PICTURE = ROOT / "docs/images/rooms.png"
 WIDTH, HEIGHT = 0.96, 0.64  # of a box, in steps
@@ -29,7 +30,7 @@ def rooms_and_imports() -> dict[str, tuple[int, list[str]]]:
     rooms, package = {}, read_package(ROOT / PACKAGE)
     for name in names:
         modules = [module for module in package if module.top == name]
-        imported = {tuple(to.split(".")[:2]) for module in modules for _, to in module.imports()}
+        imported = {tuple(to.split(".")[:2]) for module in modules for _, to in module.imports}
         used = [other for other in names if other != name and (PACKAGE, other) in imported]
         if modules:
             rooms[name] = (sum(len(module.text.splitlines()) for module in modules), used)

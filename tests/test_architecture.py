@@ -1,20 +1,24 @@
-"""The rules of the package's structure, checked by reading its source.
+"""The order of the package's rooms, checked by reading its source.
 
 Each rule is a function from the parsed modules to a list of complaints. It is applied to the
 package and, below, to small packages that break it: a rule that has gone blind is noticed.
 """
 
-import ast
-from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from source_tree import (
+    DOC,
+    ENTRY,
+    PACKAGE,
+    SOUND,
+    Module,
+    read_package,
+    read_scripts,
+    write_package,
+)
 
 from helpers import ROOT
-from thincam_jax._core.quantity import UNITS
-
-PACKAGE = "thincam_jax"
 
 # A room imports only from the floors below it and from itself, never from a room beside it.
 FLOORS = (
@@ -32,79 +36,12 @@ FLOORS = (
 OUTSIDE, OUTSIDE_USES = "hardware", "measured"
 ROOMS = (*(room for floor in FLOORS for room in floor), OUTSIDE)
 FLOOR = {room: height for height, floor in enumerate(FLOORS) for room in floor}
-ENTRY = ("__init__", "__main__")  # they stand above all rooms but the one outside
 MOST_ENTRIES = 14
-MAX_LINES = 500
 
 JAXOPT_FILES = ("reconstruction/implicit_gradient.py", "design/_jaxopt.py")
 FRONT_END_LIBRARIES = ("matplotlib", "pydantic", "typer", "rich", "jinja2")
 PLOT = "plot"  # draws with matplotlib; what has a `plot` method imports it in that method
 FRONT_END = "commands"
-# They read what is the package's own, and what the system says of itself.
-READ_OWN = (
-    *("_core/memory.py", "commands/report.py", "commands/examples.py"),
-    "hardware/virtual/",
-    *("hardware/cameras/usb3_vision/link.py", "hardware/stages/serial_link.py"),
-)
-
-
-@dataclass(frozen=True)
-class Module:
-    """One source file: its path inside the package, its text and its syntax tree."""
-
-    path: str  # "lensless/psf.py"
-    text: str
-    tree: ast.Module
-
-    @property
-    def top(self) -> str:
-        """The room it belongs to: "lensless"."""
-        return Path(Path(self.path).parts[0]).stem
-
-    @property
-    def package(self) -> list[str]:
-        """The package that relative imports start from: ["thincam_jax", "lensless"]."""
-        return [PACKAGE, *Path(self.path).parts[:-1]]
-
-    @property
-    def is_public(self) -> bool:
-        names = Path(self.path).with_suffix("").parts
-        return all(name in ENTRY or not name.startswith("_") for name in names)
-
-    def imports(self, *, at_run_time: bool = False) -> Iterator[tuple[int, str]]:
-        """Line and absolute dotted name of each import, wherever in the file it stands.
-
-        `from a import b` counts as `a.b`, whether b is a module or a name in one. `at_run_time`:
-        without those for annotations, under `if TYPE_CHECKING`.
-        """
-        guards = [
-            n
-            for n in ast.walk(self.tree)
-            if isinstance(n, ast.If) and ast.unparse(n.test) == "TYPE_CHECKING"
-        ]
-        left_out = {n for guard in guards for n in guard.body} if at_run_time else set()
-        for node in ast.walk(self.tree):
-            if node in left_out:
-                continue
-            if isinstance(node, ast.Import):
-                for alias in node.names:
-                    yield node.lineno, alias.name
-            elif isinstance(node, ast.ImportFrom):
-                base = self.package[: len(self.package) - node.level + 1] if node.level else []
-                base = [*base, node.module] if node.module else base
-                for alias in node.names:
-                    yield node.lineno, ".".join([*base, alias.name])
-
-
-def read_package(folder: Path) -> list[Module]:
-    modules = []
-    for path in sorted(folder.rglob("*.py*")):
-        if path.suffix not in (".py", ".pyi"):  # a stub holds the names of a lazy package
-            continue
-        text = path.read_text(encoding="utf-8")
-        name = path.relative_to(folder).as_posix()
-        modules.append(Module(name, text, ast.parse(text, str(path))))
-    return modules
 
 
 def unknown_rooms(modules: list[Module]) -> list[str]:
@@ -126,7 +63,7 @@ def crowded_roots(modules: list[Module]) -> list[str]:
 def imports_against_the_floors(modules: list[Module]) -> list[str]:
     complaints = []
     for module in modules:
-        for line, name in module.imports():
+        for line, name in module.imports:
             parts = name.split(".")
             if parts[0] != PACKAGE:
                 continue
@@ -170,7 +107,7 @@ def modules_hidden_by_names(modules: list[Module]) -> list[str]:
         f"{module.path}:{line}: {name.split('.')[-1]} hides the module of that name"
         for module in modules
         if Path(module.path).stem == "__init__"
-        for line, name in module.imports()
+        for line, name in module.imports
         if (Path(module.path).parent / name.split(".")[-1]).as_posix() in paths
         and name != ".".join([*module.package, name.split(".")[-1]])
     ]
@@ -180,7 +117,7 @@ def jaxopt_outside_its_files(modules: list[Module]) -> list[str]:
     return [
         f"{module.path}:{line}: imports jaxopt; only {' and '.join(JAXOPT_FILES)} may"
         for module in modules
-        for line, name in module.imports()
+        for line, name in module.imports
         if name.split(".")[0] == "jaxopt" and module.path not in JAXOPT_FILES
     ]
 
@@ -190,7 +127,7 @@ def front_end_libraries_in_the_core(modules: list[Module]) -> list[str]:
     return [
         f"{module.path}:{line}: imports {name.split('.')[0]}; only {FRONT_END} may"
         for module in modules
-        for line, name in module.imports(at_run_time=True)
+        for line, name in module.imports_at_run_time
         if name.split(".")[0] in FRONT_END_LIBRARIES
         and module.top != FRONT_END
         and (module.top, name.split(".")[0]) != (PLOT, "matplotlib")
@@ -199,116 +136,7 @@ def front_end_libraries_in_the_core(modules: list[Module]) -> list[str]:
 
 def waits(module: Module, line: int) -> bool:
     """Whether an import waits for a function's call, or is the type checker's alone."""
-    blocks = (n for n in ast.walk(module.tree) if isinstance(n, (ast.FunctionDef, ast.If)))
-    return any(
-        block.lineno < line <= (block.end_lineno or block.lineno)
-        for block in blocks
-        if isinstance(block, ast.FunctionDef) or ast.unparse(block.test) == "TYPE_CHECKING"
-    )
-
-
-def bare_files(modules: list[Module]) -> list[str]:
-    """A device in place of a file is read for ever; of a full disk only the system's words say."""
-    use = {"read": "read_regular", "write": "write_whole"}
-    bare = {f"{what}_{kind}": name for what, name in use.items() for kind in ("bytes", "text")}
-    return [
-        f"{module.path}:{node.lineno}: {node.attr}: use {bare[node.attr]} of _core/files.py"
-        for module in modules
-        if not module.path.startswith(READ_OWN)
-        for node in ast.walk(module.tree)
-        if isinstance(node, ast.Attribute) and node.attr in bare
-    ]
-
-
-def tables_of_units(modules: list[Module]) -> list[str]:
-    """A unit stands at its field; labels and readers ask the field's quantity for it."""
-    units = {*UNITS, *(unit.replace("^2", "²") for unit in UNITS)}
-
-    def is_unit(value: ast.AST) -> bool:
-        inside = value.elts if isinstance(value, ast.Tuple) else [value]
-        texts = [str(n.value) for n in inside if isinstance(n, ast.Constant)]
-        return any(text in units or text.rpartition(", ")[2] in units for text in texts)
-
-    def is_table(node: ast.AST) -> bool:
-        if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
-            return node.func.attr == "fromkeys" and any(map(is_unit, node.args))
-        return isinstance(node, ast.Dict) and sum(map(is_unit, node.values)) > 1
-
-    return [
-        f"{module.path}:{node.lineno}: a table of units: ask the fields for their quantities"
-        for module in modules
-        for node in ast.walk(module.tree)
-        if isinstance(node, ast.Dict | ast.Call) and is_table(node)
-    ]
-
-
-def named_tuples(modules: list[Module]) -> list[str]:
-    """A record is a module or a frozen dataclass; a tuple could be unpacked, indexed and added."""
-    return [
-        f"{module.path}:{node.lineno}: a named tuple: make it an equinox.Module where JAX sees it, "
-        "a frozen dataclass elsewhere"
-        for module in modules
-        for node in ast.walk(module.tree)
-        if getattr(node, "id", getattr(node, "attr", "")) in ("NamedTuple", "namedtuple")
-    ]
-
-
-def star_imports(modules: list[Module]) -> list[str]:
-    return [
-        f"{module.path}:{line}: star import: name what is imported"
-        for module in modules
-        for line, name in module.imports()
-        if name.split(".")[-1] == "*"
-    ]
-
-
-def long_modules(modules: list[Module]) -> list[str]:
-    counts = [(module.path, len(module.text.splitlines())) for module in modules]
-    return [
-        f"{path}: {lines} lines, {MAX_LINES} allowed: split it"
-        for path, lines in counts
-        if lines > MAX_LINES
-    ]
-
-
-def missing_docstrings(modules: list[Module]) -> list[str]:
-    return [
-        f"{module.path}: a public module begins with a docstring"
-        for module in modules
-        if module.is_public and not (ast.get_docstring(module.tree) or "").strip()
-    ]
-
-
-def missing_annotations(modules: list[Module]) -> list[str]:
-    """But of what optimistix names and annotates: the methods of its solvers, except `__init__`."""
-    return [
-        f"{module.path}:{function.lineno}: {function.name}: annotate {', '.join(bare)}"
-        for module in modules
-        for function, bare in bare_parameters(module.tree)
-        if bare
-    ]
-
-
-def bare_parameters(
-    scope: ast.Module | ast.ClassDef,
-) -> Iterator[tuple[ast.FunctionDef, list[str]]]:
-    """The public functions and methods, and their parameters that say not what they take."""
-    of_solver = any(
-        ast.unparse(base).startswith("optimistix.") for base in getattr(scope, "bases", ())
-    )
-    for node in scope.body:
-        dunder = getattr(node, "name", "").startswith("__")
-        if not dunder and getattr(node, "name", "_").startswith("_"):
-            continue
-        if isinstance(node, ast.ClassDef):
-            yield from bare_parameters(node)
-        elif isinstance(node, ast.FunctionDef) and (dunder or not of_solver):
-            given = node.args
-            every = [*given.posonlyargs, *given.args, given.vararg, *given.kwonlyargs, given.kwarg]
-            static = any(ast.unparse(d) == "staticmethod" for d in node.decorator_list)
-            own = isinstance(scope, ast.ClassDef) and not static  # `self`, `cls`
-            bare = [a.arg for a in every[own:] if a is not None and a.annotation is None]
-            yield node, bare
+    return any(block.lineno < line <= (block.end_lineno or block.lineno) for block in module.blocks)
 
 
 RULES = (
@@ -318,13 +146,6 @@ RULES = (
     modules_hidden_by_names,
     jaxopt_outside_its_files,
     front_end_libraries_in_the_core,
-    bare_files,
-    tables_of_units,
-    named_tuples,
-    star_imports,
-    long_modules,
-    missing_docstrings,
-    missing_annotations,
 )
 
 
@@ -355,15 +176,9 @@ def scripts_on_commands(scripts: list[Module]) -> set[str]:
     return {
         script.path
         for script in scripts
-        for _, name in script.imports()
+        for _, name in script.imports
         if name.startswith(f"{PACKAGE}.{FRONT_END}")
     }
-
-
-def read_scripts(root: Path) -> list[Module]:
-    paths = [path for folder in ("docs", "experiments") for path in (root / folder).glob("*.py")]
-    texts = [(path.relative_to(root).as_posix(), path.read_text("utf-8")) for path in paths]
-    return [Module(name, text, ast.parse(text)) for name, text in texts]
 
 
 def test_scripts_use_the_library():
@@ -379,8 +194,6 @@ def test_a_script_on_commands_is_seen(tmp_path, line):
     (tmp_path / "docs/draw.py").write_text(f"import thincam_jax as tc\n{line}\n")
     assert scripts_on_commands(read_scripts(tmp_path)) == {"docs/draw.py"}
 
-
-DOC = '"""What it is."""\n'
 
 # rule, file, source, part of the complaint
 UP = imports_against_the_floors
@@ -435,84 +248,7 @@ BROKEN = [
         "def f():\n    import rich",
         "studies/plot.py:2: imports rich",
     ),
-    (bare_files, "measured/read.py", "data = path.read_bytes()", "use read_regular"),
-    (bare_files, "_core/files.py", "path.write_text('β')", "use write_whole"),
-    (
-        tables_of_units,
-        "design/space.py",
-        "U = {'beta': 'rad/mm^2', 'width': 'mm'}",
-        "space.py:1: a",
-    ),
-    (
-        tables_of_units,
-        "commands/words.py",
-        "L = {'a': (1, 'glass, mm'), 'b': ('s',)}",
-        "words.py:1: ",
-    ),
-    (
-        tables_of_units,
-        "_core/module.py",
-        "U = dict.fromkeys(('cell', 'width'), 'mm')",
-        "module.py:1",
-    ),
-    (named_tuples, "lensless/psf.py", "class A(NamedTuple): ...", "psf.py:1: a named tuple"),
-    (named_tuples, "units.py", "A = collections.namedtuple('A', 'x')", "units.py:1: "),
-    (star_imports, "lensless/psf.py", "from .camera import *", "star import"),
-    (star_imports, "lensless/psf.py", "from numpy import *", "star import"),
-    (long_modules, "lensless/psf.py", DOC + "x = 1\n" * MAX_LINES, "501 lines, 500 allowed"),
-    (missing_docstrings, "lensless/psf.py", "x = 1", "begins with a docstring"),
-    (missing_docstrings, "lensless/masks/__init__.py", "", "begins with a docstring"),
-    (
-        missing_annotations,
-        "lensless/psf.py",
-        "def f(x: int, *y, z=1): ...",
-        "psf.py:1: f: annotate y, z",
-    ),
-    (
-        missing_annotations,
-        "lensless/psf.py",
-        "class A:\n    def __call__(self, x): ...",
-        "annotate x",
-    ),
-    (
-        missing_annotations,
-        "lensless/psf.py",
-        "class A:\n    @staticmethod\n    def f(x): ...",
-        "f: ",
-    ),
 ]
-
-SOUND = [
-    ("units.py", DOC + "import math\n\n\n@dataclass(frozen=True)\nclass A:\n    x: int"),
-    ("_core/memory.py", "x = Path('/proc/meminfo').read_text()"),
-    ("_core/grids.py", DOC + "from ..units import mm"),
-    ("lensless/masks/_pattern.py", "x = 1"),
-    ("lensless/masks/__init__.py", DOC + "from .fza import Plate as Plate"),
-    ("lensless/masks/fza.py", DOC + "from ..._core import grids\nfrom . import _pattern"),
-    ("design/adam.py", DOC + "class A(optimistix.B):\n    def step(self, x): ..."),
-    ("design/space.py", DOC + "class A:\n    def f(self, x: int):\n        def g(y): ..."),
-    ("lensless/psf.py", DOC + "import rich_text, jaxoptics\n" + "x = 1\n" * (MAX_LINES - 2)),
-    ("reconstruction/implicit_gradient.py", DOC + "import jaxopt"),
-    ("plot/curves.py", DOC + "import matplotlib.figure"),
-    ("design/landscape.py", DOC + "def plot():\n    from ..plot import curves"),
-    ("design/curve.py", DOC + "if TYPE_CHECKING:\n    from matplotlib.axes import Axes"),
-    ("commands/figures.py", DOC + "import matplotlib.pyplot, jinja2\nfrom ..learn import x"),
-    (
-        "studies/result.py",
-        DOC + "if TYPE_CHECKING:\n    from matplotlib.figure import Figure\n",
-    ),
-    ("commands/rig/command.py", DOC + "def run():\n    from ...hardware import stage"),
-    ("hardware/stage.py", DOC + "from thincam_jax.measured.read import x\nfrom .bus import y"),
-    ("__init__.py", DOC + "from .lensless.psf import psf as psf\nfrom . import commands"),
-    ("__main__.py", DOC + "from .commands.cli import main"),
-]
-
-
-def write_package(folder: Path, files: list[tuple[str, str]]) -> list[Module]:
-    for path, source in files:
-        (folder / path).parent.mkdir(parents=True, exist_ok=True)
-        (folder / path).write_text(source, encoding="utf-8")
-    return read_package(folder)
 
 
 @pytest.mark.parametrize(("rule", "path", "source", "complaint"), BROKEN)

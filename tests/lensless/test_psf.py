@@ -211,7 +211,8 @@ def check_gradient(model, rtol, zero=(), **options):
     ("model", "zero"),
     [
         ("geometric", ("wavelength", "width")),  # a step at the edge of the shadow
-        ("paraxial", ("width",)),  # the mask has no edge
+        # The mask has no edge.
+        pytest.param("paraxial", ("width",), marks=pytest.mark.thorough),
         ("closed_form", ("width",)),
         # Its differences are those of tests/test_extremes.py, too.
         pytest.param("separable", (), marks=pytest.mark.thorough),
@@ -334,10 +335,7 @@ def test_text_for_a_length():
         tc.psf(camera_of(), wavelength="500 nm")
 
 
-@pytest.mark.parametrize(
-    "model",
-    ["geometric", "paraxial", "closed_form", pytest.param("separable", marks=pytest.mark.thorough)],
-)
+@pytest.mark.parametrize("model", quick(["geometric", "paraxial", "closed_form", "separable"], 2))
 @pytest.mark.parametrize("shape", [pytest.param((1, 1), marks=pytest.mark.thorough), (1, 7)])
 def test_thin_sensors_are_cuts_of_wide_ones(model, shape):
     wide = tc.psf(camera_of((5, 7)), wavelength=WAVELENGTH, model=model)

@@ -130,13 +130,7 @@ def expected(name: str) -> np.ndarray:
 NAMES = pytest.mark.parametrize("name", list(operators()))
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param(n, marks=[pytest.mark.thorough] * (n not in ("separable", "small")))
-        for n in operators()
-    ],
-)
+@pytest.mark.parametrize("name", quick(operators(), 1))  # whose minimiser another test needs, too
 def test_total_variation_by_admm_and_fista(name):
     """Both are within 1e-6 of the minimiser, and report that they have converged."""
     for solver in (
@@ -152,7 +146,7 @@ def test_total_variation_by_admm_and_fista(name):
     assert relative_l2(plain, expected(name)) > 1e-2
 
 
-@pytest.mark.parametrize("name", quick(operators(), 0, 3))
+@pytest.mark.parametrize("name", quick(operators(), 3))  # dense and separable
 def test_ridge(name):
     """The posterior mean, by the normal equations as one dense system."""
     given = case(name)

@@ -1,5 +1,6 @@
 """Bringing captures to one scale: enlargement about the centre, sizes, parities."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -23,7 +24,7 @@ def pixels(shape):
 )
 def test_the_picture_is_enlarged_about_its_centre(shape, ratio):
     """A smooth function of (y, x) becomes that of (y, x)/ratio; off the sensor's rim."""
-    value = register(jnp.asarray(blob(*pixels(shape))), ratio)
+    value = jax.jit(lambda picture: register(picture, ratio))(blob(*pixels(shape)))
     assert value.shape == registered_shape(shape, ratio)
     y, x = pixels(value.shape)
     expected = blob(y / ratio, x / ratio)

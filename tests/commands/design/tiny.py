@@ -20,7 +20,7 @@ model: geometric  # it compiles fastest
 pixel_integration: false
 sensor: {shape: [48, 64], pitch: 40 um}
 mask: {width: 2 mm}
-object: {distance: 100 mm, width: 60 mm}
+object: {distance: 100 mm, width: 80 mm}
 noise: {snr_db: 30}
 prior:
   exponent: 2.5

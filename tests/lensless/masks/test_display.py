@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import thincam_jax as tc
-from helpers import finite_difference, relative_l2
+from helpers import finite_difference, quick, relative_l2
 from thincam_jax.lensless.masks import MaskBlank
 from thincam_jax.units import nm, um
 
@@ -63,7 +63,7 @@ def test_many_cells_are_a_sampled_mask_with_gaps():
     assert float(shadow.sum()) * 0.031**2 == pytest.approx(light, rel=1e-9)
 
 
-@pytest.mark.parametrize("height", [None, 0.9])
+@pytest.mark.parametrize("height", quick([None, 0.9], 1))
 def test_zones_are_those_of_a_zone_plate_with_pixels(height):
     numbers = {"width": 1.2, "height": height, "centre": CENTRE}
     own = tc.FresnelZoneAperture(25.0, 0.3, pixel_pitch=PITCH, fill_factor=FILL, **numbers)
@@ -79,13 +79,16 @@ def relief(fill):
 
 @pytest.mark.parametrize(
     "shown",
-    [lambda fill: tc.on_display(tc.RadialMask([1.0, 0.3, 0.8], 0.2), PITCH, fill), relief],
+    quick(
+        [lambda fill: tc.on_display(tc.RadialMask([1.0, 0.3, 0.8], 0.2), PITCH, fill), relief], 1
+    ),
     ids=["rings", "relief"],
 )
 def test_gaps_take_their_part_of_the_light(shown):
     grid = SENSOR.grid.with_shape((240, 360))
     grid = type(grid)(grid.shape, jnp.asarray(PITCH / 6))
-    whole, gaps = (np.asarray(shown(f).sample(grid, WAVELENGTH)) for f in (1.0, FILL))
+    sample = jax.jit(lambda mask: mask.sample(grid, WAVELENGTH))
+    whole, gaps = (np.asarray(sample(shown(fill))) for fill in (1.0, FILL))
     # Rows of six samples: 0.8 of a pixel is open, so that the outermost are open in part.
     middle = np.kron(np.ones((40, 60)), np.outer(*[[0.4, 1, 1, 1, 1, 0.4]] * 2))
     np.testing.assert_allclose(gaps, whole * middle, atol=1e-12)

@@ -101,9 +101,9 @@ def test_table_names_every_decision(deep):
     assert max(len(line) for line in table.splitlines()) < 100
 
 
-def test_effects_have_the_sizes_of_the_physics(deep):
+def test_effects_have_the_sizes_of_the_physics():
     """cos⁴θ over fields of 0.15 rad, and 1/√(0.9·13500) of shot noise."""
-    sizes = {e.name: e.size for e in tc.plan(camera(), deep[0], tolerance=0.1).effects}
+    sizes = {e.name: e.size for e in tc.plan(camera(), scene(16, 11), tolerance=0.1).effects}
     y, x = np.meshgrid(np.linspace(-0.5, 0.5, 401) * 0.1125, np.linspace(-0.5, 0.5, 401) * 0.15)
     fall = 1 - (1 + y**2 + x**2) ** -2
     assert sizes["shift-variance"] == pytest.approx(np.sqrt(np.mean(fall**2)), rel=0.1)

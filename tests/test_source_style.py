@@ -1,0 +1,206 @@
+"""The style of the package's source, checked by reading it: as tests/test_architecture.py."""
+
+import ast
+from collections.abc import Iterator
+
+import pytest
+from source_tree import DOC, MAX_LINES, PACKAGE, SOUND, Module, read_package, write_package
+
+from helpers import ROOT
+from thincam_jax._core.quantity import UNITS
+
+# They read what is the package's own, and what the system says of itself.
+READ_OWN = (
+    *("_core/memory.py", "commands/report.py", "commands/examples.py"),
+    "hardware/virtual/",
+    *("hardware/cameras/usb3_vision/link.py", "hardware/stages/serial_link.py"),
+)
+
+
+def bare_files(modules: list[Module]) -> list[str]:
+    """A device in place of a file is read for ever; of a full disk only the system's words say."""
+    use = {"read": "read_regular", "write": "write_whole"}
+    bare = {f"{what}_{kind}": name for what, name in use.items() for kind in ("bytes", "text")}
+    return [
+        f"{module.path}:{node.lineno}: {node.attr}: use {bare[node.attr]} of _core/files.py"
+        for module in modules
+        if not module.path.startswith(READ_OWN)
+        for node in module.nodes
+        if isinstance(node, ast.Attribute) and node.attr in bare
+    ]
+
+
+def tables_of_units(modules: list[Module]) -> list[str]:
+    """A unit stands at its field; labels and readers ask the field's quantity for it."""
+    units = {*UNITS, *(unit.replace("^2", "²") for unit in UNITS)}
+
+    def is_unit(value: ast.AST) -> bool:
+        inside = value.elts if isinstance(value, ast.Tuple) else [value]
+        texts = [str(n.value) for n in inside if isinstance(n, ast.Constant)]
+        return any(text in units or text.rpartition(", ")[2] in units for text in texts)
+
+    def is_table(node: ast.AST) -> bool:
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
+            return node.func.attr == "fromkeys" and any(map(is_unit, node.args))
+        return isinstance(node, ast.Dict) and sum(map(is_unit, node.values)) > 1
+
+    return [
+        f"{module.path}:{node.lineno}: a table of units: ask the fields for their quantities"
+        for module in modules
+        for node in module.nodes
+        if isinstance(node, ast.Dict | ast.Call) and is_table(node)
+    ]
+
+
+def named_tuples(modules: list[Module]) -> list[str]:
+    """A record is a module or a frozen dataclass; a tuple could be unpacked, indexed and added."""
+    return [
+        f"{module.path}:{node.lineno}: a named tuple: make it an equinox.Module where JAX sees it, "
+        "a frozen dataclass elsewhere"
+        for module in modules
+        for node in module.nodes
+        if getattr(node, "id", getattr(node, "attr", "")) in ("NamedTuple", "namedtuple")
+    ]
+
+
+def star_imports(modules: list[Module]) -> list[str]:
+    return [
+        f"{module.path}:{line}: star import: name what is imported"
+        for module in modules
+        for line, name in module.imports
+        if name.split(".")[-1] == "*"
+    ]
+
+
+def long_modules(modules: list[Module]) -> list[str]:
+    counts = [(module.path, len(module.text.splitlines())) for module in modules]
+    return [
+        f"{path}: {lines} lines, {MAX_LINES} allowed: split it"
+        for path, lines in counts
+        if lines > MAX_LINES
+    ]
+
+
+def missing_docstrings(modules: list[Module]) -> list[str]:
+    return [
+        f"{module.path}: a public module begins with a docstring"
+        for module in modules
+        if module.is_public and not (ast.get_docstring(module.tree) or "").strip()
+    ]
+
+
+def missing_annotations(modules: list[Module]) -> list[str]:
+    """But of what optimistix names and annotates: the methods of its solvers, except `__init__`."""
+    return [
+        f"{module.path}:{function.lineno}: {function.name}: annotate {', '.join(bare)}"
+        for module in modules
+        for function, bare in bare_parameters(module.tree)
+        if bare
+    ]
+
+
+def bare_parameters(
+    scope: ast.Module | ast.ClassDef,
+) -> Iterator[tuple[ast.FunctionDef, list[str]]]:
+    """The public functions and methods, and their parameters that say not what they take."""
+    of_solver = any(
+        ast.unparse(base).startswith("optimistix.") for base in getattr(scope, "bases", ())
+    )
+    for node in scope.body:
+        dunder = getattr(node, "name", "").startswith("__")
+        if not dunder and getattr(node, "name", "_").startswith("_"):
+            continue
+        if isinstance(node, ast.ClassDef):
+            yield from bare_parameters(node)
+        elif isinstance(node, ast.FunctionDef) and (dunder or not of_solver):
+            given = node.args
+            every = [*given.posonlyargs, *given.args, given.vararg, *given.kwonlyargs, given.kwarg]
+            static = any(ast.unparse(d) == "staticmethod" for d in node.decorator_list)
+            own = isinstance(scope, ast.ClassDef) and not static  # `self`, `cls`
+            bare = [a.arg for a in every[own:] if a is not None and a.annotation is None]
+            yield node, bare
+
+
+RULES = (
+    bare_files,
+    tables_of_units,
+    named_tuples,
+    star_imports,
+    long_modules,
+    missing_docstrings,
+    missing_annotations,
+)
+
+
+@pytest.fixture(scope="module")
+def package() -> list[Module]:
+    return read_package(ROOT / PACKAGE)
+
+
+@pytest.mark.parametrize("rule", RULES, ids=lambda rule: rule.__name__)
+def test_package_keeps(rule, package):
+    complaints = rule(package)
+    assert not complaints, "\n" + "\n".join(complaints)
+
+
+# rule, file, source, part of the complaint
+BROKEN = [
+    (bare_files, "measured/read.py", "data = path.read_bytes()", "use read_regular"),
+    (bare_files, "_core/files.py", "path.write_text('β')", "use write_whole"),
+    (
+        tables_of_units,
+        "design/space.py",
+        "U = {'beta': 'rad/mm^2', 'width': 'mm'}",
+        "space.py:1: a",
+    ),
+    (
+        tables_of_units,
+        "commands/words.py",
+        "L = {'a': (1, 'glass, mm'), 'b': ('s',)}",
+        "words.py:1: ",
+    ),
+    (
+        tables_of_units,
+        "_core/module.py",
+        "U = dict.fromkeys(('cell', 'width'), 'mm')",
+        "module.py:1",
+    ),
+    (named_tuples, "lensless/psf.py", "class A(NamedTuple): ...", "psf.py:1: a named tuple"),
+    (named_tuples, "units.py", "A = collections.namedtuple('A', 'x')", "units.py:1: "),
+    (star_imports, "lensless/psf.py", "from .camera import *", "star import"),
+    (star_imports, "lensless/psf.py", "from numpy import *", "star import"),
+    (long_modules, "lensless/psf.py", DOC + "x = 1\n" * MAX_LINES, "501 lines, 500 allowed"),
+    (missing_docstrings, "lensless/psf.py", "x = 1", "begins with a docstring"),
+    (missing_docstrings, "lensless/masks/__init__.py", "", "begins with a docstring"),
+    (
+        missing_annotations,
+        "lensless/psf.py",
+        "def f(x: int, *y, z=1): ...",
+        "psf.py:1: f: annotate y, z",
+    ),
+    (
+        missing_annotations,
+        "lensless/psf.py",
+        "class A:\n    def __call__(self, x): ...",
+        "annotate x",
+    ),
+    (
+        missing_annotations,
+        "lensless/psf.py",
+        "class A:\n    @staticmethod\n    def f(x): ...",
+        "f: ",
+    ),
+]
+
+
+@pytest.mark.parametrize(("rule", "path", "source", "complaint"), BROKEN)
+def test_rule_sees_what_breaks_it(rule, path, source, complaint, tmp_path):
+    modules = write_package(tmp_path, [*SOUND, (path, source)])
+    complaints = [text for text in rule(modules) if text.startswith(path)]
+    assert complaints
+    assert complaint in "\n".join(complaints)
+
+
+def test_rules_pass_a_sound_package(tmp_path):
+    modules = write_package(tmp_path, SOUND)
+    assert [text for rule in RULES for text in rule(modules)] == []
