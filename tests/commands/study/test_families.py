@@ -105,6 +105,7 @@ def test_an_image_file_is_read_once(tmp_path, monkeypatch):
         ("{family: mura, order: 5, cell: 30 um, beta: 3}", METHOD, "mask.beta"),
         ("{family: mura, order: 101, cell: 30 mm}", METHOD, "mask.cell: makes a mask of 3030 mm"),
         ("{width: 2 m}", METHOD, "mask.width: makes a mask of 2000 mm, .* give at most 300"),
+        ("{width: 2 mm, harmonics: 4}", METHOD, "mask.harmonics: .* give an odd number from 1"),
         ("{family: pinhole, width: 1 mm, order: 5}", METHOD, "mask.order: is no number of a mask"),
         ("{profile: cosine}", METHOD, "mask.width: missing"),
         (MURA, METHOD.replace("separate", "phase_pairs"), "synthesis: a mask of the family mura"),
