@@ -14,7 +14,7 @@ from thincam_jax.commands.config_file import slug
 from thincam_jax.commands.schema import Section, misfit, section, written
 from thincam_jax.imaging.sensor import AbstractNoise, GaussianNoise, PoissonGaussianNoise, Sensor
 from thincam_jax.imaging.targets import sample_images
-from thincam_jax.lensless.masks.cells import Combination
+from thincam_jax.lensless import masks
 from thincam_jax.lensless.masks.fza import Profile
 from thincam_jax.lensless.method import Model
 from thincam_jax.reconstruction import AdmmTV, TotalVariation
@@ -49,13 +49,11 @@ class SensorConfig(section(Sensor)):
         return self.exposure is not None or self.electrons is not None
 
 
-class ApertureConfig(Section):
-    """What all Fresnel zone apertures share; `pixel_pitch`, `fill_factor`: of a display."""
+_APERTURE = ("width", "profile", "pixel_pitch", "fill_factor")
 
-    width: Length
-    profile: Profile = "cosine"
-    pixel_pitch: Length | None = None
-    fill_factor: Annotated[float, Field(gt=0, le=1)] = 1.0
+
+class ApertureConfig(section(masks.FresnelZoneAperture, only=_APERTURE)):
+    """What all Fresnel zone apertures share; `pixel_pitch`, `fill_factor`: of a display."""
 
     @pydantic.model_validator(mode="after")
     def _display(self):
@@ -85,7 +83,19 @@ _NUMBERS: dict[Family, tuple[tuple[str, ...], tuple[str, ...]]] = {
 }
 
 
-class MaskConfig(ApertureConfig):
+_ARRAYS = (
+    *(masks.ModifiedUniformlyRedundantArray, masks.UniformlyRedundantArray),
+    *(masks.LensletArray, masks.SeparableMask),
+)
+# Left out where the family has none.
+_OTHERS = dict.fromkeys(("order", "orders", "focal_length", "cell")) | {"combine": "xor"}
+
+
+class MaskConfig(
+    section(*_ARRAYS, only=tuple(_OTHERS), defaults=_OTHERS),
+    section(masks.FresnelZoneAperture, only=("height", "harmonics")),
+    ApertureConfig,  # the keys of the last come first
+):
     """The mask of a study: a Fresnel zone aperture, or of another `family` with its numbers.
 
     - `height`, `harmonics`: of a rectangle, and which orders of a zone plate are computed.
@@ -101,17 +111,10 @@ class MaskConfig(ApertureConfig):
     """
 
     width: Length = 0.0
-    height: Length | None = None
-    harmonics: Annotated[int, Field(ge=1, le=99)] = 9
     family: Family = "fza"
-    cell: Length | None = None
-    order: int | None = None
-    orders: tuple[int, int] | None = None
     length: int | None = None
-    combine: Combination = "xor"
     tiles: Annotated[int, Field(ge=1)] | None = None
     seed: Annotated[int, Field(ge=0, lt=2**32)] | None = None
-    focal_length: Length | None = None
     lenses: tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]] | None = None
     path: str | None = None
     correlation_length: Length | None = None

@@ -108,7 +108,7 @@ def test_faults_are_told_in_one_line(override, part, tmp_path):
     ("override", "part"),
     [
         ("objects.0.width=0.1 mm", "objects[0]: covers 1 pixels of a reconstruction"),
-        ("mask.harmonics=4", "mask, sensor or model: "),
+        ("mask.pixel_pitch=0.7 mm", "mask, sensor or model: "),
     ],
 )
 def test_what_only_building_shows_is_refused(override, part, tmp_path):

@@ -101,9 +101,11 @@ def test_an_image_file_is_read_once(tmp_path, monkeypatch):
     ("mask", "method", "message"),
     [
         ("{family: mura, cell: 30 um}", METHOD, "mask.order: missing; this key"),
+        ("{family: mura, order: 100, cell: 30 um}", METHOD, "mask.order: .* give 97 or 101"),
         ("{family: mura, order: 5, cell: 30 um, beta: 3}", METHOD, "mask.beta"),
         ("{family: mura, order: 101, cell: 30 mm}", METHOD, "mask.cell: makes a mask of 3030 mm"),
         ("{width: 2 m}", METHOD, "mask.width: makes a mask of 2000 mm, .* give at most 300"),
+        ("{width: 2 mm, harmonics: 4}", METHOD, "mask.harmonics: .* give an odd number from 1"),
         ("{family: pinhole, width: 1 mm, order: 5}", METHOD, "mask.order: is no number of a mask"),
         ("{profile: cosine}", METHOD, "mask.width: missing"),
         (MURA, METHOD.replace("separate", "phase_pairs"), "synthesis: a mask of the family mura"),
@@ -120,7 +122,6 @@ def test_refused_in_one_line(tmp_path, mask, method, message):
 @pytest.mark.parametrize(
     ("mask", "message"),
     [
-        ("{family: mura, order: 100, cell: 30 um}", "order = 100 .* give 97 or 101"),
         ("{family: file, path: no.png, width: 1 mm}", "'no.png' does not exist; give the path"),
         (
             "{family: random, width: 1 mm, cell: 2 mm}",

@@ -294,17 +294,10 @@ class TestCheck:
         assert "targets[0]: 'conventional' reconstructs it on 6×6 pixels" in first
         assert "targets[1]: 'conventional' reconstructs it on 4×6 pixels" in second
 
-    @pytest.mark.parametrize(
-        ("override", "part"),
-        [
-            ("mask.harmonics=4", "give an odd number"),
-            ("mask.pixel_pitch=0.3 mm", "not a whole number of cells of pixel_pitch"),
-        ],
-    )
-    def test_camera_that_cannot_be_built(self, override, part, tmp_path):
-        line = self.line(tiny.study(tmp_path, override))
+    def test_camera_that_cannot_be_built(self, tmp_path):
+        line = self.line(tiny.study(tmp_path, "mask.pixel_pitch=0.3 mm"))
         assert line.startswith("mask, sensor or model: ")
-        assert part in line
+        assert "not a whole number of cells of pixel_pitch" in line
 
 
 def test_pictures_alone_give_a_report(tmp_path, home):
