@@ -9,13 +9,6 @@ import yaml
 from thincam_jax._core.files import read_regular
 
 _MOST_ENTRIES = 100_000
-# Of the kinds that are not for 'thincam run': the command, and what such a file is.
-COMMANDS = {
-    "design": ("design", "a design"),
-    "capture": ("capture", "a capture"),
-    "learned": ("train", "a network"),
-    "denoiser": ("train", "a denoiser"),
-}
 
 
 class ConfigError(ValueError):

@@ -5,16 +5,11 @@ from typing import Annotated
 
 import typer
 
+from thincam_jax.commands.kinds import KINDS, read_kind
 from thincam_jax.commands.terminal import told
 
-# The quickest of each kind have short names; the other files have their own.
-_FILE_OF = {
-    "study": "quick",
-    "refocus": "fza_refocus",
-    "design": "design_distances",
-    "capture": "rig_virtual",
-    "learned": "learned_refocus",
-}
+# The quickest of each kind have its name; the other files have their own.
+_FILE_OF = {name: kind.example for name, kind in KINDS.items() if kind.example not in ("", name)}
 
 
 def _folder() -> Path:
@@ -53,7 +48,4 @@ def init(
 
 def next_command(kind: str) -> str:
     """What takes a file of that name."""
-    from thincam_jax.commands.config_file import COMMANDS, read_raw
-
-    found = read_raw(_folder() / f"{_FILE_OF.get(kind, kind)}.yaml")[0].get("kind")
-    return COMMANDS.get(str(found), ("run",))[0]
+    return read_kind(_folder() / f"{_FILE_OF.get(kind, kind)}.yaml").command

@@ -9,61 +9,34 @@ from typing import Annotated, Any
 
 import typer
 
+from thincam_jax.commands.kinds import KINDS
 from thincam_jax.commands.terminal import ConfigFile, Overrides, told
-
-# Where the sections of each kind of file are; a study's file does not name its kind.
-_SECTIONS = {
-    "study": "study.config.StudyConfig",
-    "refocus": "refocus.config.RefocusConfig",
-    "screen": "screen.config.ScreenConfig",
-    "masks": "masks.config.MasksConfig",
-    "design": "design.config.DesignConfig",
-    "capture": "capture.config.CaptureConfig",
-    "learned": "learned.config.LearnedConfig",
-    "denoiser": "learned.denoiser.DenoiserConfig",
-}
-
-
-def file_kinds() -> list[str]:
-    """The kinds of experiment files."""
-    return list(_SECTIONS)
-
-
-def sections_of(kind: str) -> Any:
-    """The checked sections of a kind of file. **Errors**: ConfigError for another kind."""
-    import importlib
-
-    from thincam_jax.commands.config_file import ConfigError
-
-    if kind not in _SECTIONS:
-        raise ConfigError(f"kind: {kind!r} is unknown; choose one of {', '.join(_SECTIONS)}")
-    module, _, name = _SECTIONS[kind].rpartition(".")
-    return getattr(importlib.import_module(f"thincam_jax.commands.{module}"), name)
 
 
 def load_any(path: Path, overrides: tuple[str, ...] = ()) -> Any:
     """Read and check an experiment file of any kind; errors as of `checked_config.load_as`."""
     from thincam_jax.commands.checked_config import load_as
-    from thincam_jax.commands.config_file import ConfigError, read_raw
+    from thincam_jax.commands.kinds import read_kind
 
-    kind = str(read_raw(path)[0].get("kind", "study"))
-    try:
-        sections = sections_of(kind)
-    except ConfigError as error:
-        raise ConfigError(f"{path}: {error}") from None
-    return load_as(sections, path, overrides)
+    kind = read_kind(path)
+    return load_as(kind.part(kind.section), path, overrides)
 
 
 def schema(
     kind: Annotated[
-        str, typer.Argument(help=f"One of {', '.join(_SECTIONS)}.", autocompletion=file_kinds)
+        str, typer.Argument(help=f"One of {', '.join(KINDS)}.", autocompletion=lambda: list(KINDS))
     ],
 ) -> None:
     """Print the JSON Schema of a kind of experiment file, with which editors complete and check."""
     with told(lambda: "interrupted"):
         import json
 
-        text = json.dumps(sections_of(kind).model_json_schema(), indent=2, ensure_ascii=False)
+        from thincam_jax.commands.config_file import ConfigError
+
+        if kind not in KINDS:
+            raise ConfigError(f"kind: {kind!r} is unknown; choose one of {', '.join(KINDS)}")
+        sections = KINDS[kind].part(KINDS[kind].section)
+        text = json.dumps(sections.model_json_schema(), indent=2, ensure_ascii=False)
     print(text)
 
 

@@ -1,28 +1,84 @@
-"""The kinds of experiment files that `thincam run` takes."""
+"""The kinds of experiment files: what each is, which command takes it, and where its parts are."""
 
+from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
-
-from thincam_jax.commands.checked_config import load_as
-from thincam_jax.commands.config_file import COMMANDS, ConfigError, read_raw
-from thincam_jax.commands.masks.config import MasksConfig
-from thincam_jax.commands.refocus.config import RefocusConfig
-from thincam_jax.commands.screen.config import ScreenConfig
-from thincam_jax.commands.study.config import StudyConfig
-
-Experiment = StudyConfig | RefocusConfig | ScreenConfig | MasksConfig
+from typing import Any
 
 
-def load_experiment(path: str | Path, overrides: tuple[str, ...] = ()) -> Experiment:
-    """Read and check an experiment file of any kind; errors as of `load_as`."""
-    kind = read_raw(Path(path))[0].get("kind")
-    if str(kind) in COMMANDS:
-        command, what = COMMANDS[str(kind)]
-        raise ConfigError(f"{path}: kind: is {what}; give it to 'thincam {command}'")
-    models = {None: StudyConfig, "refocus": RefocusConfig, "screen": ScreenConfig}
-    models |= {"masks": MasksConfig}
-    if isinstance(kind, str | None) and kind in models:
-        return load_as(models[kind], path, overrides)
+@dataclass(frozen=True)
+class Kind:
+    """One kind of experiment file.
+
+    - `noun`: what such a file is. `command`: of `thincam`, that takes it.
+    - `section`: its configuration, as MODULE:NAME in `thincam_jax.commands`.
+    - `example`: the file of `configs/` that `thincam init` writes under the kind's name.
+    - `build`, `run`: of those for `thincam run`, what makes objects of the configuration, and what
+      runs these into a folder; its result has a `table`.
+    """
+
+    noun: str
+    command: str
+    section: str
+    example: str = ""
+    build: str = ""
+    run: str = ""
+
+    def part(self, place: str) -> Any:
+        """What is at MODULE:NAME, imported when it is needed."""
+        module, name = place.split(":")
+        return getattr(import_module(f"thincam_jax.commands.{module}"), name)
+
+
+def _run(room: str, section: str, name: str, example: str = "") -> Kind:
+    """A kind for `thincam run`, whose parts are where those of its room are."""
+    parts = f"{room}.build:build_{room}", f"{room}.run:run_{room}"
+    return Kind(name, "run", f"{room}.config:{section}", example, *parts)
+
+
+# By the `kind` of their files; a study's file does not name it.
+KINDS = {
+    "study": _run("study", "StudyConfig", "a study", "quick"),
+    "refocus": _run("refocus", "RefocusConfig", "a refocusing", "fza_refocus"),
+    "screen": _run("screen", "ScreenConfig", "a see-through screen"),
+    "design": Kind("a design", "design", "design.config:DesignConfig", "design_distances"),
+    "capture": Kind("a capture", "capture", "capture.config:CaptureConfig", "rig_virtual"),
+    "learned": Kind("a network", "train", "learned.config:LearnedConfig", "learned_refocus"),
+    "denoiser": Kind("a denoiser", "train", "learned.denoiser:DenoiserConfig", "denoiser"),
+}
+
+
+def kind_of(config: Any) -> Kind:
+    """The kind of a configuration."""
+    return KINDS[getattr(config, "kind", "study")]
+
+
+def read_kind(path: str | Path) -> Kind:
+    """The kind of an experiment file.
+
+    **Errors**: ConfigError for an unknown one.
+    """
+    from thincam_jax.commands.config_file import ConfigError, read_raw
+
+    given = read_raw(Path(path))[0].get("kind")
+    named = {name: kind for name, kind in KINDS.items() if name != "study"}
+    if given is None:
+        return KINDS["study"]
+    if isinstance(given, str) and given in named:
+        return named[given]
+    *others, last = (f"'kind: {name}'" for name, kind in named.items() if kind.command == "run")
     raise ConfigError(
-        f"{path}: kind: {kind!r} is unknown; write 'kind: refocus', 'kind: screen' or 'kind: "
-        "masks', or leave it out for a study"
+        f"{path}: kind: {given!r} is unknown; write {', '.join(others)} or {last}, or leave it out "
+        "for a study"
     )
+
+
+def load_experiment(path: str | Path, overrides: tuple[str, ...] = (), command: str = "run") -> Any:
+    """Read and check an experiment file that a command takes; errors as of `load_as`."""
+    from thincam_jax.commands.checked_config import load_as
+    from thincam_jax.commands.config_file import ConfigError
+
+    kind = read_kind(path)
+    if kind.command != command:
+        raise ConfigError(f"{path}: kind: is {kind.noun}; give it to 'thincam {kind.command}'")
+    return load_as(kind.part(kind.section), path, overrides)

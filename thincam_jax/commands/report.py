@@ -5,44 +5,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jinja2
 
 from thincam_jax._core.files import read_regular
-from thincam_jax._core.table import number as number
+from thincam_jax._core.table import Table
 from thincam_jax.commands.checked_config import dump_config
 from thincam_jax.commands.config_file import slug
-
-if TYPE_CHECKING:
-    import rich.table
-
-
-@dataclass(frozen=True)
-class Table:
-    """Rows of texts under headings; the first column names the rows.
-
-    - `headings`: one a column; a line break stays one on a page.
-    - `published`: columns of others' figures, set in grey.
-    - `words`: columns of words, which are set to the left and may be long.
-    """
-
-    headings: Sequence[str]
-    rows: Sequence[Sequence[str]]
-    published: Sequence[int] = ()
-    words: Sequence[int] = ()
-
-    def __post_init__(self):
-        for row in self.rows:
-            if len(row) != len(self.headings):
-                raise ValueError(f"{len(row)} cells under {len(self.headings)} headings: {row}")
-
-    def in_terminal(self) -> "rich.table.Table":
-        """The same for a terminal."""
-        from thincam_jax.commands.terminal import numbers
-
-        headings = [heading.replace("\n", " ") for heading in self.headings]
-        return numbers([headings, *self.rows])
+from thincam_jax.commands.sections import CamerasConfig
 
 
 @dataclass(frozen=True)
@@ -97,6 +68,23 @@ class Page:
     warnings: Sequence[str] = ()
 
 
+def pixels_of(sensor: Any) -> str:
+    """A section with the shape and pitch of a sensor, in words."""
+    rows, columns = sensor.shape
+    return f"Sensor {rows}×{columns} pixels of {sensor.pitch * 1000:g} µm"
+
+
+def optics_of(config: CamerasConfig) -> str:
+    """Light, PSF model, noise and seed of lensless cameras, in words."""
+    noise = ""
+    if config.noise is not None and config.noise.snr_db is not None:
+        without = config.noise.signal_power == "without_mean"
+        power = "signal power without the mean" if without else "total signal power"
+        noise = f", Gaussian noise at {config.noise.snr_db:g} dB ({power})"
+    light = f"λ = {config.wavelength * 1e6:g} nm, PSF model `{config.model}`"
+    return f"{light}{noise}, seed {config.seed}."
+
+
 def render_report(page: Page, config: Any, pictures: Path, environment: dict[str, Any]) -> str:
     """A page as HTML, with the experiment's configuration and how it was computed at its end.
 
@@ -105,14 +93,6 @@ def render_report(page: Page, config: Any, pictures: Path, environment: dict[str
 
     Texts are escaped; a name that is missing is an error.
     """
-    kinds = {Table: "table", Picture: "picture", Sentences: "sentences", str: "text"}
-    parts = [part for part in page.parts if any(part.contents)]
-    given = {"kind_of": lambda content: kinds[type(content)], "environment": environment}
-    return render("report.html.jinja", config, pictures, page=page, parts=parts, **given)
-
-
-def render(template: str, config: Any, pictures: Path, **shown: Any) -> str:
-    """Render a template of the commands with `config`, its `yaml`, `picture` by file, `shown`."""
     engine = jinja2.Environment(
         loader=jinja2.FunctionLoader(_template),
         autoescape=True,
@@ -120,13 +100,20 @@ def render(template: str, config: Any, pictures: Path, **shown: Any) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    engine.globals |= {"number": number, "slug": slug}
+    kinds = {Table: "table", Picture: "picture", Sentences: "sentences", str: "text"}
 
     def picture(name: str) -> str | None:
         return data_url(pictures / name) if (pictures / name).exists() else None
 
-    given = {"config": config, "yaml": dump_config(config), "picture": picture, **shown}
-    return engine.get_template(template).render(**given)
+    return engine.get_template("report.html.jinja").render(
+        kind_of=lambda content: kinds[type(content)],
+        page=page,
+        parts=[part for part in page.parts if any(part.contents)],
+        picture=picture,
+        config=config,
+        yaml=dump_config(config),
+        environment=environment,
+    )
 
 
 def _template(name: str) -> str:

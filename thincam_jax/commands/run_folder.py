@@ -12,7 +12,6 @@ from thincam_jax._core.steps import Progress, Step, carry_out
 from thincam_jax.commands.checked_config import dump_config
 from thincam_jax.commands.config_file import ConfigError, slug
 from thincam_jax.commands.doctor import environment
-from thincam_jax.commands.page import render_page
 from thincam_jax.commands.report import Page, render_report
 from thincam_jax.commands.sections import ExperimentConfig, Section
 
@@ -69,22 +68,13 @@ class RunFolder:
         return write_whole(self.path / name, content)
 
     def complete(
-        self,
-        room: str | Page,
-        config: ExperimentConfig,
-        metrics: dict[str, Any],
-        started: float,
-        **shown: Any,
+        self, page: Page, config: ExperimentConfig, metrics: dict[str, Any], started: float
     ) -> None:
-        """Write what surrounds the run, its page or that of its room, and its result, last."""
+        """Write what surrounds the run, its page, and its result, last."""
         surroundings = environment(time.time() - started)
         self.write("environment.json", to_json({**surroundings, "seed": config.seed}))
         pictures = self.path / self.pictures
-        if isinstance(room, Page):
-            page = render_report(room, config, pictures, surroundings)
-        else:
-            page = render_page(room, config, pictures, metrics, environment=surroundings, **shown)
-        self.write("report.html", page)
+        self.write("report.html", render_report(page, config, pictures, surroundings))
         self.write(self.result, to_json(metrics))
 
 
@@ -109,9 +99,9 @@ class Run:
         carry_out(self.work, progress)
         return self.metrics
 
-    def complete(self, room: str | Page, **shown: Any) -> None:
-        """The page of a room with the metrics and what is `shown`, and all that ends the folder."""
-        self.folder.complete(room, self.config, self.metrics, self.started, **shown)
+    def complete(self, page: Page) -> None:
+        """The page, the metrics, and all that ends the folder."""
+        self.folder.complete(page, self.config, self.metrics, self.started)
 
 
 def claim_folder(path: Path, name: str, text: str, kind: str, folders: Sequence[str] = ()) -> None:

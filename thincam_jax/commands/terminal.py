@@ -5,9 +5,9 @@ As the files `command.py`, it imports nothing at its head that `thincam --help` 
 
 import contextlib
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
@@ -15,7 +15,8 @@ from thincam_jax.commands.interrupt import INTERRUPTED, interruptible
 
 if TYPE_CHECKING:
     import rich.progress
-    import rich.table
+
+    from thincam_jax._core.table import Table
 
 WRONG_INPUT = 2
 
@@ -85,20 +86,20 @@ def fail(error: BaseException) -> NoReturn:
     raise typer.Exit(WRONG_INPUT)
 
 
-def numbers(rows: Sequence[Sequence[str]], **how: Any) -> "rich.table.Table":
-    """Rows, the first of headings, as a table of right-aligned numbers with their names before.
+def show(table: "Table") -> None:
+    """Print a table; its cells are set to the right but for the first of each row."""
+    import rich
+    from rich.table import Table as Lines
+    from rich.text import Text
 
-    `how`: as of `rich.table.Table`.
-    """
-    from rich.table import Table
-
-    (first, *headings), *rest = rows
-    table = Table(first, **how)
-    for heading in headings:
-        table.add_column(heading, justify="right")
-    for row in rest:
-        table.add_row(*row)
-    return table
+    rows, title = table.texts(), table.title or None
+    several = any("\n" in cell for row in rows for cell in row)
+    shown = Lines(title=title, title_justify="left", show_lines=several)
+    for column, heading in enumerate(table.headings):
+        shown.add_column(heading, justify="right" if column else "left")
+    for row in rows:
+        shown.add_row(*map(Text, row))
+    rich.print(shown)
 
 
 @contextlib.contextmanager

@@ -8,6 +8,13 @@ from thincam_jax.studies.evaluate import Scores as Scores
 from thincam_jax.studies.evaluate import evaluate_method as evaluate_method
 from thincam_jax.studies.evaluate import field_shape as field_shape
 from thincam_jax.studies.evaluate import reconstructor as reconstructor
+from thincam_jax.studies.mask_captures import ComparedMask as ComparedMask
+from thincam_jax.studies.mask_captures import Setting as Setting
+from thincam_jax.studies.mask_captures import Strength as Strength
+from thincam_jax.studies.mask_comparison import ComparedScene as ComparedScene
+from thincam_jax.studies.mask_comparison import MaskComparison as MaskComparison
+from thincam_jax.studies.mask_comparison import MaskComparisonResult as MaskComparisonResult
+from thincam_jax.studies.mask_comparison import Tuning as Tuning
 from thincam_jax.studies.response import Limits as Limits
 from thincam_jax.studies.response import Response as Response
 from thincam_jax.studies.response import method_response as method_response

@@ -18,6 +18,7 @@ from jaxtyping import Float
 
 from thincam_jax._core.grids import Grid
 from thincam_jax._core.steps import Progress, Step, carry_out
+from thincam_jax._core.table import Table
 from thincam_jax.imaging.metrics import psnr
 from thincam_jax.imaging.metrics.image import SSIM_WINDOW
 from thincam_jax.imaging.scene import ImagePlane
@@ -317,6 +318,15 @@ class RefocusResult:
     objects: dict[str, ObjectScores]
     methods: dict[str, RefocusedMethod]
     images: dict[tuple[str, float], np.ndarray]
+
+    def table(self) -> Table:
+        """Where objects were placed, and where they were found."""
+        rows = [
+            (name, one.distance_mm, one.found_mm, one.error_percent, one.axial_resolution_mm)
+            for name, one in self.objects.items()
+        ]
+        headings = ("object", "distance mm", "found mm", "error %", "axial resolution mm")
+        return Table(headings, rows, (1,) * 4)
 
 
 class RefocusRun:

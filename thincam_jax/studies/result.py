@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thincam_jax._core.table import Table
-from thincam_jax.studies.evaluate import Evaluation, Scores, evaluate_method
+from thincam_jax.studies.evaluate import Evaluation, Resolved, Scores, evaluate_method
 from thincam_jax.studies.response import Limits, Response, method_response
 from thincam_jax.studies.simulate import take
 from thincam_jax.studies.study import Method, Published, Study, Target
@@ -27,10 +27,15 @@ class MethodScores:
     published: Published
 
     @property
-    def resolved_mm(self) -> float | None:
-        """The finest line pair resolved on the object, mm; of the first chart."""
+    def resolved(self) -> Resolved | None:
+        """The finest element resolved; of the first chart."""
         found = (scores.resolved for scores in self.targets.values())
-        return next((one.object_mm for one in found if one is not None), None)
+        return next((one for one in found if one is not None), None)
+
+    @property
+    def resolved_mm(self) -> float | None:
+        """Its line pair on the object, mm."""
+        return None if self.resolved is None else self.resolved.object_mm
 
 
 @dataclass(frozen=True)
@@ -46,7 +51,6 @@ class StudyScores:
         """Every method beside what was published of it."""
         return Table(
             ("method", "PSNR dB", "published", "resolved mm", "published", "cut-off /mm"),
-            (1, 1, 2, 2, 1),
             tuple(
                 (
                     name,
@@ -58,6 +62,7 @@ class StudyScores:
                 )
                 for name, one in self.methods.items()
             ),
+            (1, 1, 2, 2, 1),
         )
 
 

@@ -19,6 +19,7 @@ from jaxtyping import Array, Float
 
 from thincam_jax import waveguide as wg
 from thincam_jax._core.steps import Progress, Step, carry_out
+from thincam_jax._core.table import Table
 from thincam_jax.imaging.metrics import psnr, ssim
 from thincam_jax.imaging.operators import AbstractOperator, Sparse
 from thincam_jax.imaging.sensor import AbstractNoise, electrons_per_unit, read_out
@@ -307,6 +308,15 @@ class ScreenResult:
 
     study: ScreenStudy
     models: dict[str, ModelResult]
+
+    def table(self) -> Table:
+        """Mean PSNR of every model by every method."""
+        rows = [
+            (name, *(one.scores.mean_psnr_db for one in model.methods.values()))
+            for name, model in self.models.items()
+        ]
+        headings = ("model", *(f"{name}, mean dB" for name in self.study.solvers))
+        return Table(headings, rows, (1,) * len(self.study.solvers))
 
 
 class ScreenRun:

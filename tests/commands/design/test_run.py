@@ -14,8 +14,8 @@ from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.design import run as running
 from thincam_jax.commands.design import simulation
 from thincam_jax.commands.design.figures import as_png, draw_landscape, draw_mtf, draw_responses
-from thincam_jax.commands.design.page import cells, findings, in_words, reported_names
 from thincam_jax.commands.design.record import FoundDesigns
+from thincam_jax.commands.design.report import cells, findings, in_words, reported_names
 from thincam_jax.commands.design.run import DesignFolder, Finder, run_design
 from thincam_jax.commands.design.simulation import as_study_config, compare, with_designs
 from thincam_jax.commands.run_folder import carry_out

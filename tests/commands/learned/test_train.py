@@ -100,8 +100,8 @@ def test_a_fault_of_the_file_is_told(changed, told, file):
 
 
 def test_a_file_of_another_kind_is_told_as_that_alone():
-    told = line(call(ROOT / "configs" / "masks.yaml"))
-    assert "kind: 'masks' is unknown; choose one of 'learned'" in told
+    told = line(call(ROOT / "configs" / "fza_refocus.yaml"))
+    assert told.endswith("kind: is a refocusing; give it to 'thincam run'")
 
 
 def test_a_folder_that_is_not_there_is_told(file):

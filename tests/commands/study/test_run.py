@@ -1,14 +1,13 @@
 """Runs: what they leave behind, that they repeat and go on after an interruption; their report."""
 
 import base64
-import copy
 import gc
 import html
 import io
 import json
 import re
 import shutil
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
@@ -19,8 +18,9 @@ from commands.test_cli import call
 
 from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.doctor import environment
-from thincam_jax.commands.page import render_page
+from thincam_jax.commands.report import render_report
 from thincam_jax.commands.run_folder import RunFolder
+from thincam_jax.commands.study import report
 from thincam_jax.commands.study import run as running
 from thincam_jax.commands.study.build import build_study
 from thincam_jax.commands.study.config import load_config
@@ -53,21 +53,22 @@ def taken():
 
 @pytest.fixture(scope="module")
 def whole(home, taken):
-    """One uninterrupted run: the study, folder, metrics, the texts of its progress."""
+    """One uninterrupted run: the study, folder, scores, the texts of its progress."""
     quoted = EVIL.replace("'", "''")
     told = (f"title='{quoted}'", f"notes=['{quoted}', A second note.]")
     study, texts = tiny.built(home, *told), tiny.Told()
     folder = RunFolder(home / "whole")
     with pytest.MonkeyPatch.context() as patch:
         counting = counted(patch)
-        metrics = asdict(run_study(study, folder, texts))
+        scores = run_study(study, folder, texts)
         taken.extend(counting)
-    return study, folder.path, metrics, texts
+    return study, folder.path, scores, texts
 
 
 def test_metrics_hold_every_method_and_target(whole):
-    _, path, metrics, _ = whole
-    assert json.loads((path / "metrics.json").read_text("utf-8")) == metrics
+    _, path, scores, _ = whole
+    metrics = json.loads((path / "metrics.json").read_text("utf-8"))
+    assert metrics == asdict(scores)
     assert metrics["study"] == "tiny"
     assert metrics["seed"] == 3
     assert list(metrics["methods"]) == ["conventional", "pairs"]
@@ -95,9 +96,9 @@ def test_metrics_hold_every_method_and_target(whole):
 
 
 def test_resolved_element_is_given_on_the_object_and_on_the_sensor(whole):
-    resolved = whole[2]["methods"]["conventional"]["targets"]["chart"]["resolved"]
-    assert resolved["object_mm"] == 5.0  # the coarsest: a sixteenth of 80 mm
-    assert resolved["sensor_cycles_per_mm"] == pytest.approx(100 / 3 / 5.0, abs=1e-3)
+    resolved = whole[2].methods["conventional"].resolved
+    assert resolved.object_mm == 5.0  # the coarsest: a sixteenth of 80 mm
+    assert resolved.sensor_cycles_per_mm == pytest.approx(100 / 3 / 5.0, abs=1e-3)
 
 
 def test_reconstruction_is_upright(whole):
@@ -145,7 +146,7 @@ def test_same_seed_same_bytes_other_seed_other_noise(whole, home):
     metrics = asdict(run_study(tiny.built(home, "seed=4"), other, tiny.ignore))
     for name, method in metrics["methods"].items():
         for target, found in method["targets"].items():
-            before = whole[2]["methods"][name]["targets"][target]["psnr_db"]
+            before = whole[2].methods[name].targets[target].psnr_db
             assert found["psnr_db"] != before
             assert found["psnr_db"] == pytest.approx(before, abs=4)  # noise, no other physics
 
@@ -164,7 +165,7 @@ def counted(monkeypatch):
 
 
 def test_interrupted_run_goes_on_where_it_stopped(whole, home, monkeypatch):
-    study, path, metrics, texts = whole
+    study, path, scores, texts = whole
     folder = RunFolder(home / "interrupted")
     taken = counted(monkeypatch)
 
@@ -182,7 +183,7 @@ def test_interrupted_run_goes_on_where_it_stopped(whole, home, monkeypatch):
 
     taken.clear()
     progress = tiny.Told()
-    assert asdict(run_study(study, folder, progress)) == metrics
+    assert run_study(study, folder, progress) == scores
     assert len(taken) == tiny.CAPTURES
     assert {channels for _, channels, _ in taken} == {3}  # the chart, in grey, was not redone
     assert progress == [text for text in texts if not text.startswith("chart: ")]
@@ -324,17 +325,17 @@ def test_smallest_sensor_that_is_let_through_gives_finite_results(tmp_path):
 
 @pytest.fixture
 def run(whole, tmp_path):
-    """Config, folder, metrics and report of a copy of the run."""
-    study, path, metrics, _ = whole
+    """Study, folder, scores and report of a copy of the run."""
+    study, path, scores, _ = whole
     shutil.copytree(path, tmp_path / "copy")
     page = (path / "report.html").read_text("utf-8")
-    return study, RunFolder(tmp_path / "copy"), copy.deepcopy(metrics), page
+    return study, RunFolder(tmp_path / "copy"), scores, page
 
 
-def rendered(config, folder, metrics):
+def rendered(config, folder, scores):
     """The page made anew."""
-    shown = {"environment": environment(), "findings": ["A finding."]}
-    return render_page("study", config, folder.path / "figures", metrics, **shown)
+    shown = report.page(config, scores, ["A finding."])
+    return render_report(shown, config, folder.path / "figures", environment())
 
 
 def test_no_reference_outside_the_page(run):
@@ -362,11 +363,11 @@ def test_pictures_are_the_figures(run):
 
 
 def test_motion_is_told(run):
-    study, folder, metrics, page = run
+    study, folder, scores, page = run
     assert "that moves" not in page
     config, still = study.config, study.config.object
     moving = config.model_copy(update={"object": still.model_copy(update={"motion": 0.25})})
-    page = rendered(moving, folder, metrics)
+    page = rendered(moving, folder, scores)
     assert "that moves 0.25 mm across during an exposure of 1, λ" in page
 
 
@@ -389,7 +390,8 @@ def rows(page):
 
 
 def test_tables_hold_the_metrics(run):
-    _, _, metrics, page = run
+    _, _, scores, page = run
+    metrics = asdict(scores)
     table = rows(page)
     for name, method in metrics["methods"].items():
         quality, resolution = [row for row in table if row[0] == name]
@@ -446,11 +448,13 @@ def test_findings_say_how_the_numbers_lie_to_the_published_ones(run):
 
 def test_page_of_a_run_without_a_chart(run):
     """Nothing resolved and no contrast figure: the page is still whole."""
-    study, folder, metrics, _ = run
-    for entry in metrics["methods"].values():
-        entry["targets"]["chart"]["resolved"] = None
+    study, folder, scores, _ = run
+    unresolved = {
+        name: replace(one, targets={t: replace(s, resolved=None) for t, s in one.targets.items()})
+        for name, one in scores.methods.items()
+    }
     (folder.path / "figures" / "contrast.png").rename(folder.path / "figures" / "contrast.away")
-    page = rendered(study.config, folder, metrics)
+    page = rendered(study.config, folder, replace(scores, methods=unresolved))
     assert page.count("<img ") == 6
     (row,) = [r for r in rows(page) if r[0] == "conventional" and len(r) == 8]
     assert row[1:3] == ["–", "–"]

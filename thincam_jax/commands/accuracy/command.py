@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from thincam_jax.commands.terminal import ConfigFile, Overrides, counted, told
+from thincam_jax.commands.terminal import ConfigFile, Overrides, counted, show, told
 
 
 def accuracy(
@@ -27,8 +27,6 @@ def accuracy(
     And what an error of the PSF costs in PSNR. Writes accuracy.json.
     """
     with told(lambda: "interrupted; nothing is kept."):
-        import rich
-
         from thincam_jax.commands.accuracy.run import (
             BenchFolder,
             Sizes,
@@ -45,6 +43,6 @@ def accuracy(
         folder = BenchFolder(out or Path("runs") / f"{slug(study.name)}-accuracy")
         with counted(study.name) as progress:
             result = run_accuracy(plan, folder, progress)
-    rich.print(table(result))
+    show(table(result))
     print(verdict(result.reconstructions))
     print(f"results: {folder.path / 'accuracy.json'}")

@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import Any
 
 import jax
-from rich.table import Table
 
 from thincam_jax._core.files import write_whole
 from thincam_jax._core.steps import Progress, Step, carry_out
+from thincam_jax._core.table import Table
 from thincam_jax.commands.checked_config import dump_config
 from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.doctor import usable_cores
@@ -17,7 +17,6 @@ from thincam_jax.commands.run_folder import claim_folder, to_json
 from thincam_jax.commands.sections import SensorConfig
 from thincam_jax.commands.study.build import FileStudy, build_study, check_study
 from thincam_jax.commands.study.config import StudyConfig
-from thincam_jax.commands.terminal import numbers
 from thincam_jax.lensless.exposures import Exposure
 from thincam_jax.studies.psf_accuracy import label
 from thincam_jax.studies.psf_error_cost import (
@@ -180,19 +179,20 @@ def table(result: AccuracyResult) -> Table:
     """Every candidate at the largest size, the fastest first; those worth choosing are marked."""
     largest = max((row.shape for row in result.psfs), key=max)
     rows = [row for row in result.psfs if row.shape == largest]
-    shown = [["PSF", "error", "predicted", "time ms", "compile s", "worth it"]]
+    shown = []
     for row in sorted(rows, key=lambda row: row.seconds or float("inf")):
         name = label(row.model, row.precision, row.oversampling)
         numbers_of = row.true_error, row.predicted_error, row.seconds, row.compile_seconds
         if None in numbers_of:
-            shown.append([name, "not run", *["–"] * 4])
+            shown.append([name, "not run", *[None] * 4])
             continue
         error, predicted, seconds, compiling = (float(number or 0) for number in numbers_of)
         told = "reference" if error == 0 else f"{error:.1e}"
         worth = "yes" if row.worth_choosing else ""
         times = f"{1000 * seconds:.2f}", f"{compiling:.1f}"
         shown.append([name, told, f"{predicted:.1e}", *times, worth])
-    return numbers(shown, title=f"{largest[0]}×{largest[1]} pixels", title_justify="left")
+    headings = ("PSF", "error", "predicted", "time ms", "compile s", "worth it")
+    return Table(headings, shown, title=f"{largest[0]}×{largest[1]} pixels")
 
 
 def verdict(costs: ReconstructionCosts) -> str:

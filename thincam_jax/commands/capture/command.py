@@ -41,14 +41,14 @@ def capture(
 
     with told(lambda: f"interrupted; {go_on()}" if kept else "interrupted; nothing was taken."):
         from thincam_jax._core.files import MeasurementError, write_whole
-        from thincam_jax.commands.capture.config import CaptureConfig
-        from thincam_jax.commands.checked_config import dump_config, load_as
+        from thincam_jax.commands.checked_config import dump_config
         from thincam_jax.commands.config_file import ConfigError, slug
+        from thincam_jax.commands.kinds import load_experiment
         from thincam_jax.commands.run_folder import to_json
         from thincam_jax.hardware.acquisition.acquire import Procedure, acquire
         from thincam_jax.hardware.errors import HardwareError
 
-        asked = load_as(CaptureConfig, config, tuple(set_ or ()))
+        asked = load_experiment(config, tuple(set_ or ()), "capture")
         store = out or Path("runs") / f"{slug(asked.name)}.zarr"
         if store.exists() and not resume:
             raise ConfigError(f"--out {store} exists; --resume goes on with it, else give another")

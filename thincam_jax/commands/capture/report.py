@@ -2,8 +2,9 @@
 
 from typing import Any
 
+from thincam_jax._core.table import Table
 from thincam_jax.commands.capture.config import CaptureConfig
-from thincam_jax.commands.report import Page, Part, Picture, Table
+from thincam_jax.commands.report import Page, Part, Picture
 
 _MATRIX = (
     "The matrix is in matrix.zarr; a capture of another picture, less the dark frame, is "

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from thincam_jax.commands.terminal import Overrides, counted, numbers, told, warn
+from thincam_jax.commands.terminal import Overrides, counted, show, told, warn
 
 
 def design(
@@ -38,9 +38,8 @@ def design(
 
 
 def _print(found: dict) -> None:
-    import rich
-
-    from thincam_jax.commands.design.page import in_words, objective_unit, reported_names
+    from thincam_jax._core.table import Table
+    from thincam_jax.commands.design.report import in_words, objective_unit, reported_names
 
     validation = found["validation"]
     designs = (found["reference"], *found["compare"], *found["found"])
@@ -48,22 +47,22 @@ def _print(found: dict) -> None:
     unit = objective_unit(found)
     pictures = (f"{target}\ngain, dB" for target in validation["pictures"])
     charts = (f"{target}\ngain, elements" for target in validation["charts"])
-    rows = [["design", f"predicted\ngain, {unit}", *pictures, *charts]]
+    rows = []
     for one in designs:
         simulated = validation["methods"].get(one["name"])
         if simulated is None:
             continue
-        predicted = f"{one['predicted_gain']:+.2f}" if "predicted_gain" in one else "–"
+        predicted = f"{one['predicted_gain']:+.2f}" if "predicted_gain" in one else None
         gains = [_gain(simulated[name], "gain_db") for name in validation["pictures"]]
         gains += [_gain(simulated[name], "gain_elements") for name in validation["charts"]]
         rows.append(["\n".join([one["name"], *in_words(one, names)]), predicted, *gains])
-    rich.print(numbers(rows, show_lines=True))
+    show(Table(("design", f"predicted\ngain, {unit}", *pictures, *charts), rows))
     name = found["reference"]["name"]
     levels = {t: validation["methods"][name][t]["psnr_db"] for t in validation["pictures"]}
     known = [f"{target} {psnr['mean']:.2f} dB" for target, psnr in levels.items() if psnr]
     print(f"gains are over {name}, whose PSNR is: {', '.join(known) or 'that of exact images'}")
 
 
-def _gain(simulated: dict, key: str) -> str:
+def _gain(simulated: dict, key: str) -> str | None:
     gain = simulated.get(key)
-    return f"{gain['mean']:+.2f}" if gain else "–"
+    return f"{gain['mean']:+.2f}" if gain else None

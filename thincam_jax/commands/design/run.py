@@ -12,10 +12,9 @@ import numpy as np
 from thincam_jax._core.precision import allow
 from thincam_jax.commands.checked_config import dump_config
 from thincam_jax.commands.config_file import ConfigError, slug
-from thincam_jax.commands.design import build, figures, simulation
+from thincam_jax.commands.design import build, figures, report, simulation
 from thincam_jax.commands.design.config import DesignConfig
 from thincam_jax.commands.design.config_pareto import ParetoConfig
-from thincam_jax.commands.design.page import shown as shown_on_page
 from thincam_jax.commands.design.record import (
     FoundDesigns,
     Front,
@@ -144,7 +143,7 @@ class _DesignRun(Run):
         for name, figure in pictures.items():
             if figure is not None:
                 folder.write(name, figures.as_png(figure))
-        self.complete("design", command="design", **shown_on_page(self.metrics))
+        self.complete(report.page(self.config, self.metrics))
 
 
 class Finder:

@@ -30,15 +30,13 @@ def train(
     """
     goes_on = "interrupted; what the last check has written is kept: --resume goes on from there"
     with told(lambda: goes_on):
-        from thincam_jax.commands.checked_config import load_as
-        from thincam_jax.commands.config_file import read_raw, slug
-        from thincam_jax.commands.learned.config import LearnedConfig
+        from thincam_jax.commands.config_file import slug
+        from thincam_jax.commands.kinds import load_experiment
         from thincam_jax.commands.learned.denoiser import DenoiserConfig, run_denoiser
         from thincam_jax.commands.learned.run import TrainingFolder, run_training
 
-        is_denoiser = read_raw(config)[0].get("kind") == "denoiser"
-        kind = DenoiserConfig if is_denoiser else LearnedConfig
-        asked = load_as(kind, config, tuple(set_ or ()))
+        asked = load_experiment(config, tuple(set_ or ()), "train")
+        is_denoiser = isinstance(asked, DenoiserConfig)
         folder = TrainingFolder(out or Path("runs") / slug(asked.name))
         with progress_bar("{task.fields[loss]}") as bar:
             task = bar.add_task(asked.name, total=asked.training.steps, loss="")
@@ -48,7 +46,7 @@ def train(
                 bar.update(task, completed=progress.step, loss=f"loss {progress.loss:.3f}{score}")
                 bar.start()
 
-            if isinstance(asked, DenoiserConfig):
+            if is_denoiser:
                 found = run_denoiser(asked, folder, tell, resume=resume)
             else:
                 found = run_training(asked, folder, tell, resume=resume)

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from thincam_jax.commands.config_file import ConfigError
-from thincam_jax.commands.learned import figures
+from thincam_jax.commands.learned import figures, report
 from thincam_jax.commands.learned.build import build_lessons, build_network, build_options
 from thincam_jax.commands.learned.config import LearnedConfig
 from thincam_jax.commands.refocus.figures import animate_sweep, draw_sweep
@@ -112,9 +112,7 @@ def _report(
     sweep = swept(network, batches[0])
     save_figure(folder, "sweep", draw_sweep(sweep, {}))
     folder.write("figures/sweep.webp", animate_sweep(sweep))
-    told = "training met NaN again and again; this is its best until then"
-    warnings = [told] if trained.status == "diverged" else []
-    folder.complete("learned", config, result, started, command="train", warnings=warnings)
+    folder.complete(report.page(config, result), config, result, started)
     return result
 
 

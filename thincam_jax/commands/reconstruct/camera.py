@@ -6,8 +6,8 @@ from pathlib import Path
 import equinox as eqx
 import numpy as np
 
-from thincam_jax.commands.config_file import ConfigError, read_raw
-from thincam_jax.commands.kinds import load_experiment
+from thincam_jax.commands.config_file import ConfigError
+from thincam_jax.commands.kinds import KINDS, load_experiment, read_kind
 from thincam_jax.commands.study.build import assemble, check_study
 from thincam_jax.commands.study.config import StudyConfig
 from thincam_jax.lensless.psf import psf
@@ -23,13 +23,11 @@ def read_camera(config: Path, overrides: Sequence[str], distance: float | None) 
     **Errors**: ConfigError, as of `load_experiment`, and for a file of another kind or without
     a distance.
     """
-    if read_raw(config)[0].get("kind") == "learned":
+    if read_kind(config) is KINDS["learned"]:
         # Here: other captures need not wait for the learned parts.
-        from thincam_jax.commands.checked_config import load_as
         from thincam_jax.commands.learned.build import build_camera
-        from thincam_jax.commands.learned.config import LearnedConfig
 
-        whole = build_camera(load_as(LearnedConfig, config, tuple(overrides)))
+        whole = build_camera(load_experiment(config, tuple(overrides), "train"))
         if distance is None:
             raise ConfigError(f"{config}: tells no object's distance; give a --distance")
         light = {"wavelength": float(whole.light.wavelengths[0]), "model": whole.model}

@@ -4,34 +4,20 @@ from dataclasses import asdict
 from typing import Any
 
 import numpy as np
-from rich.table import Table
 
 from thincam_jax.commands.config_file import slug
-from thincam_jax.commands.page import number
-from thincam_jax.commands.refocus import figures
+from thincam_jax.commands.refocus import figures, report
 from thincam_jax.commands.refocus.build import FileRefocus
-from thincam_jax.commands.refocus.config import RefocusConfig
 from thincam_jax.commands.run_folder import Progress, Run, RunFolder
 from thincam_jax.commands.study.figures import save_figure, save_image
-from thincam_jax.commands.terminal import numbers
 from thincam_jax.studies.refocus import RefocusResult, RefocusRun
 
 
-def run_refocus(refocusing: FileRefocus, folder: RunFolder, progress: Progress) -> dict[str, Any]:
-    """Capture, sweep, reconstruct and report; returns (and writes) the metrics.
-
-    The same configuration gives the same metrics.
-    """
-    return _RefocusRun(refocusing, folder).carry_out(progress)
-
-
-def table(config: RefocusConfig, metrics: dict[str, Any]) -> Table:
-    """Where objects were placed, and where they were found."""
-    rows = [["object", "distance mm", "found mm", "error %", "axial resolution mm"]]
-    keys = ("distance_mm", "found_mm", "error_percent", "axial_resolution_mm")
-    for name, found in metrics["objects"].items():
-        rows.append([name, *(number(found[key], 1) for key in keys)])
-    return numbers(rows)
+def run_refocus(refocusing: FileRefocus, folder: RunFolder, progress: Progress) -> RefocusResult:
+    """Capture, sweep, reconstruct and report; the same configuration gives the same metrics."""
+    run = _RefocusRun(refocusing, folder)
+    run.carry_out(progress)
+    return run.running.result
 
 
 class _RefocusRun(Run):
@@ -66,7 +52,7 @@ class _RefocusRun(Run):
             shown = figures.grey_levels(image, figures.white_level(image))
             save_image(folder, f"{slug(name)}--{distance:g}mm", shown)
         save_figure(folder, "methods", figures.draw_methods(result))
-        self.complete("refocus", findings=findings(result))
+        self.complete(report.page(self.config, result, findings(result)))
 
 
 def _sweep_metrics(result: RefocusResult) -> dict[str, Any]:

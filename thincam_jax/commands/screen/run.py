@@ -6,35 +6,27 @@ from dataclasses import asdict
 from typing import Any
 
 import numpy as np
-from rich.table import Table
 
 from thincam_jax.commands.config_file import slug
 from thincam_jax.commands.run_folder import Progress, Run, RunFolder
-from thincam_jax.commands.screen import figures
+from thincam_jax.commands.screen import figures, report
 from thincam_jax.commands.screen.build import FileScreen, build_calibration
-from thincam_jax.commands.screen.config import ScreenConfig
 from thincam_jax.commands.study.figures import save_figure, save_image
-from thincam_jax.commands.terminal import numbers
 from thincam_jax.studies.screen import ModelResult, ScreenResult, ScreenRun, summarise_rays
 from thincam_jax.studies.screen_calibration import MEASURED, CalibrationRun
 
 
-def table(config: ScreenConfig, metrics: dict[str, Any]) -> Table:
-    """Every model by every method."""
-    rows = [["model", *(f"{method.name}, mean dB" for method in config.methods)]]
-    for name, model in metrics["models"].items():
-        means = (found["mean_psnr_db"] for found in model["methods"].values())
-        rows.append([name, *(f"{mean:.1f}" for mean in means)])
-    return numbers(rows)
-
-
-def run_screen(study: FileScreen, folder: RunFolder, progress: Progress) -> dict[str, Any]:
-    """Run a study into a folder; returns (and writes) the metrics."""
-    return _ScreenRun(study, folder).carry_out(progress)
+def run_screen(study: FileScreen, folder: RunFolder, progress: Progress) -> ScreenResult:
+    """Run a study into a folder; its result has the model that a calibration measured, too."""
+    run = _ScreenRun(study, folder)
+    run.carry_out(progress)
+    return run.result
 
 
 class _ScreenRun(Run):
     """A study, its calibration where the file has one, and their report."""
+
+    result: ScreenResult
 
     def __init__(self, study: FileScreen, folder: RunFolder):
         super().__init__(study.config, folder)
@@ -53,16 +45,18 @@ class _ScreenRun(Run):
         if self.calibration is not None:
             calibrated = self.calibration.result
             found[MEASURED] = ModelResult("by Hadamard patterns, with noise", calibrated.methods)
-        result = ScreenResult(study, found)
-        summary = asdict(summarise_rays(study, rays))
+        result = self.result = ScreenResult(study, found)
+        summary = summarise_rays(study, rays)
+        ranges = {name: value for name, value in asdict(summary).items() if value is not None}
+        memory = round(peak * (1 if sys.platform == "darwin" else 1024) / 1e9, 2)
         self.metrics = {
             "study": study.name,
             "kind": self.config.kind,
             "seed": study.seed,
-            "rays": {name: value for name, value in summary.items() if value is not None},
+            "rays": ranges,
             "models": {name: _scores(model) for name, model in found.items()},
             "entries_of_the_system": int(study.systems[0].values.size),
-            "peak_memory_gb": round(peak * (1 if sys.platform == "darwin" else 1024) / 1e9, 2),
+            "peak_memory_gb": memory,
         }
         drawn = {
             "rays": figures.draw_rays(study),
@@ -82,7 +76,8 @@ class _ScreenRun(Run):
         for name, one in found[study.models[0].name].methods.items():
             for target, image in zip(study.targets, one.images, strict=True):
                 save_image(self.folder, f"{slug(target)}--{slug(name)}", np.asarray(image))
-        self.complete("screen")
+        scores = None if calibrated is None else calibrated.scores
+        self.complete(report.page(self.config, result, summary, scores, memory))
 
 
 def _scores(model: ModelResult) -> dict[str, Any]:

@@ -1,12 +1,11 @@
 """The command `thincam run`."""
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from thincam_jax.commands.terminal import ConfigFile, Overrides, counted, told, warn
+from thincam_jax.commands.terminal import ConfigFile, Overrides, counted, show, told, warn
 
 
 def run(
@@ -29,7 +28,7 @@ def run(
     folder: Any = None
 
     def interrupted() -> str:
-        if _kind(asked) != "study":
+        if getattr(asked, "kind", "study") != "study":
             return "interrupted; the same command starts anew."
         targets = asked.targets if folder else ()
         done = ", ".join(t.name for t in targets if folder.finished(t.name) is not None)
@@ -38,7 +37,7 @@ def run(
 
     with told(interrupted):
         from thincam_jax.commands.config_file import ConfigError, slug
-        from thincam_jax.commands.kinds import load_experiment
+        from thincam_jax.commands.kinds import kind_of, load_experiment
         from thincam_jax.commands.run_folder import RunFolder
 
         if config.is_dir():
@@ -51,8 +50,8 @@ def run(
             return
         asked = load_experiment(config, tuple(set_ or ()))
         folder = RunFolder(out or Path("runs") / slug(asked.name))
-        build, simulate, table = _parts(_kind(asked))
-        setup = build(asked)
+        kind = kind_of(asked)
+        setup = kind.part(kind.build)(asked)
         warn(getattr(setup, "warnings", []))
         if dry_run:
             from thincam_jax.commands.explain import work_of
@@ -60,36 +59,6 @@ def run(
             print("\n".join([*work_of(asked), folder.outcome(asked), "dry run: nothing was done"]))
             return
         with counted(asked.name) as progress:
-            metrics = simulate(setup, folder, progress)
-    import rich
-
-    rich.print(table(asked, metrics))
+            found = kind.part(kind.run)(setup, folder, progress)
+    show(found.table())
     print(f"report: {folder.path / 'report.html'}")
-
-
-def _kind(asked: Any) -> str:
-    """Of an experiment; a study's file does not name it."""
-    return getattr(asked, "kind", "study")
-
-
-def _parts(kind: str) -> tuple[Callable, Callable, Callable]:
-    """What builds an experiment of a kind, what runs it, and what makes a table of its metrics."""
-    if kind == "refocus":
-        from thincam_jax.commands.refocus import build
-        from thincam_jax.commands.refocus import run as refocus
-
-        return build.build_refocus, refocus.run_refocus, refocus.table
-    if kind == "screen":
-        from thincam_jax.commands.screen import build
-        from thincam_jax.commands.screen import run as screen
-
-        return build.build_screen, screen.run_screen, screen.table
-    if kind == "masks":
-        from thincam_jax.commands.masks import build
-        from thincam_jax.commands.masks import run as masks
-
-        return build.build_setup, masks.run_masks, masks.table
-    from thincam_jax.commands.study import build
-    from thincam_jax.commands.study import run as study
-
-    return build.build_study, study.run_study, study.table

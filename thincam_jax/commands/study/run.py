@@ -4,13 +4,9 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
 
-from rich.table import Table
-
 from thincam_jax.commands.run_folder import Progress, Run, RunFolder
-from thincam_jax.commands.study import figures
+from thincam_jax.commands.study import figures, report
 from thincam_jax.commands.study.build import FileStudy
-from thincam_jax.commands.study.config import StudyConfig
-from thincam_jax.commands.terminal import numbers
 from thincam_jax.lensless.exposures import Exposure
 from thincam_jax.plot import studies as plot
 from thincam_jax.studies.evaluate import (
@@ -35,11 +31,6 @@ def run_study(study: FileStudy, folder: RunFolder, progress: Progress) -> StudyS
     run = _StudyRun(study, folder)
     run.carry_out(progress)
     return run.scores
-
-
-def table(config: StudyConfig, scores: StudyScores) -> Table:
-    """Every method beside what was published of it."""
-    return numbers(scores.table().text())
 
 
 class _StudyRun(Run):
@@ -115,7 +106,8 @@ class _StudyRun(Run):
         if contrasts:
             figures.save_figure(folder, "contrast", plot.draw_contrasts(contrasts))
         figures.save_psf(folder, study)
-        self.complete("study", findings=findings(study, self.scores))
+        told = findings(study, self.scores)
+        self.complete(report.page(study.config, self.scores, told))
 
 
 def _scores(metrics: Mapping[str, Any]) -> Scores:

@@ -1,4 +1,4 @@
-"""Cameras of all masks, their captures in equal light, and two reconstructions of these."""
+"""Captures of masks in equal light, and two reconstructions of these."""
 
 import math
 import time
@@ -10,47 +10,70 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from thincam_jax.commands.config_file import ConfigError
-from thincam_jax.commands.masks.config import ComparedMaskConfig, MasksConfig, SceneConfig
-from thincam_jax.commands.sections import PHASES
-from thincam_jax.commands.study.build import picture
-from thincam_jax.commands.study.mask import built_mask
 from thincam_jax.imaging.operators import CropConvolution, kernel_grid
 from thincam_jax.imaging.operators.crop_convolution import cut, place
 from thincam_jax.imaging.sensor import PoissonGaussianNoise, Sensor, read_out
 from thincam_jax.lensless.camera import LenslessCamera
-from thincam_jax.lensless.exposures import Exposure
 from thincam_jax.lensless.forward import spectral_psf
+from thincam_jax.lensless.masks import AbstractMask
 from thincam_jax.lensless.method import has_few_terms
 from thincam_jax.reconstruction import AdmmTV, Recording
 from thincam_jax.reconstruction.splittings import difference_symbol
 from thincam_jax.reconstruction.total_variation import TotalVariation
-from thincam_jax.studies.study import synthesis_matrix
+from thincam_jax.studies.study import Synthesis, synthesis_matrix
 
 # Of conjugate gradients: relative residual, and at most so many.
 _TOLERANCE, _STEPS = 1e-3, 400
 
 
-@dataclass(frozen=True)
-class Scene:
-    """A scene on the field's pixels (y, x), 0 to 1, as it is cast on the sensor.
+@dataclass(frozen=True, eq=False)
+class ComparedMask:
+    """One mask, or the several that a camera takes one after the other.
 
-    `precision`: a and b of its prior exp{−½(a‖∇f‖² + b‖f − f̄‖²)}, which fits its own mean square
-    of differences or, of a flat spectrum, its variance.
+    - `masks`: one for each capture; the captures share the light.
+    - `synthesis`: what is made of the captures; "fringe_scanning" takes the phases 0, π/2, π, 3π/2.
+    - `sort`: of which sort it is, for plots.
+
+    **Errors**: ValueError for a number of masks that the synthesis does not take.
     """
 
-    config: SceneConfig
-    image: np.ndarray
-    precision: tuple[float, float]
+    masks: tuple[AbstractMask, ...]
+    sort: str = "mask"
+    synthesis: Synthesis = "separate"
+
+    def __post_init__(self):
+        if self.weights.shape[1] != len(self.masks):
+            raise ValueError(
+                f"masks: {len(self.masks)} are given; synthesis {self.synthesis} takes "
+                f"{self.weights.shape[1]}"
+            )
+
+    @property
+    def weights(self) -> np.ndarray:
+        """Weights (channel, capture) of the captures."""
+        return synthesis_matrix(self.synthesis, 1, 1)
 
 
-@dataclass(frozen=True)
-class Setup:
-    """All that is known before the first capture; `cameras`: one for each phase of a mask."""
+@dataclass(frozen=True, eq=False)
+class Setting:
+    """What all masks have in common.
 
-    config: MasksConfig
-    cameras: dict[str, tuple[LenslessCamera, ...]]
-    scenes: dict[str, Scene]
+    - `sensor`: shape and pitch; how long it is exposed follows from the light.
+    - `distance`: mask to sensor, mm; `field`: pixels (rows, columns) that the scene covers there.
+    - `width`: of the masks, mm; pinholes are smaller.
+    - `read_noise`: electrons.
+    """
+
+    sensor: Sensor
+    distance: float
+    field: tuple[int, int]
+    width: float
+    read_noise: float = 3.0
+
+    @property
+    def pitch(self) -> float:
+        """Of the sensor, mm."""
+        return float(self.sensor.pitch)
 
 
 class Seen(eqx.Module):
@@ -66,78 +89,37 @@ class Seen(eqx.Module):
     level: Float[Array, " scene"]
 
 
-def build_setup(config: MasksConfig) -> Setup:
-    """Masks and scenes. **Errors**: ConfigError, a line for each that cannot be made."""
-    cameras, scenes, faults = {}, {}, []
-    for index, entry in enumerate(config.masks):
-        try:
-            cameras[entry.name] = _cameras(config, entry)
-        except (ValueError, TypeError, FileNotFoundError) as error:
-            faults.append(f"masks[{index}]: {error}")
-    for index, scene in enumerate(config.scenes):
-        try:
-            scenes[scene.name] = _scene(scene, config.field)
-        except (ValueError, FileNotFoundError) as error:
-            faults.append(f"scenes[{index}]: {error}")
-    if faults:
-        raise ConfigError("\n".join(faults))
-    return Setup(config, cameras, scenes)
-
-
-def _cameras(config: MasksConfig, entry: ComparedMaskConfig) -> tuple[LenslessCamera, ...]:
-    sensor, mask = Sensor(config.sensor.shape, config.sensor.pitch), entry.mask
-    beta, given = entry.beta or 0.0, (config.distance, config.wavelength, mask.width)
-    phases = PHASES.get(entry.synthesis, (0.0,))
-    masks = (built_mask(mask, Exposure(beta, phase, *given)) for phase in phases)
-    return tuple(LenslessCamera(one, sensor, config.distance) for one in masks)
-
-
-def _scene(config: SceneConfig, field: tuple[int, int]) -> Scene:
-    image = picture(config, field)
-    squares = sum(np.sum(np.diff(image, axis=axis) ** 2) for axis in (0, 1))
-    if config.prior == "flat":
-        precision = 0.0, 1 / float(image.var())
-    else:
-        slope = image.size / float(squares)
-        precision = slope, slope * (2 * math.pi / max(field)) ** 2
-    return Scene(config, image, precision)
-
-
 def kernels(
-    setup: Setup, name: str, light: tuple[float, ...], object_distance: float
+    setting: Setting, compared: ComparedMask, light: tuple[float, ...], object_distance: float
 ) -> Float[Array, "capture k l"]:
     """The PSF of each capture in light of several wavelengths of equal weight."""
-    config = setup.config
 
-    def one(camera: LenslessCamera):
+    def one(mask: AbstractMask):
+        camera = LenslessCamera(mask, setting.sensor, setting.distance)
         return spectral_psf(
             camera,
             [(wavelength, 1 / len(light)) for wavelength in light],
             object_distance,
-            model="separable" if has_few_terms(camera.mask) else "angular_spectrum",
+            model="separable" if has_few_terms(mask) else "angular_spectrum",
             pixel_integration=True,
-            grid=kernel_grid(camera.sensor.grid, config.field),
+            grid=kernel_grid(camera.sensor.grid, setting.field),
         )
 
-    return jnp.stack([one(camera) for camera in setup.cameras[name]])
+    return jnp.stack([one(mask) for mask in compared.masks])
 
 
-def synthesis_of(entry: ComparedMaskConfig) -> np.ndarray:
-    """Weights (channel, capture) of the captures of a mask."""
-    return synthesis_matrix(entry.synthesis, 1, 1)
-
-
-def channels_of(setup: Setup, entry: ComparedMaskConfig, psfs: Array) -> list[CropConvolution]:
+def channels_of(
+    setting: Setting, compared: ComparedMask, psfs: Float[Array, "capture k l"]
+) -> list[CropConvolution]:
     """The camera of each sum of captures."""
-    config = setup.config
-    sums = jnp.tensordot(jnp.asarray(synthesis_of(entry), psfs.dtype), psfs, axes=1)
-    pitch = config.sensor.pitch
-    return [CropConvolution(h[None], pitch, config.sensor.shape, config.field) for h in sums]
+    sums = jnp.tensordot(jnp.asarray(compared.weights, psfs.dtype), psfs, axes=1)
+    shape = setting.sensor.shape
+    return [CropConvolution(h[None], setting.pitch, shape, setting.field) for h in sums]
 
 
 def capture(
-    setup: Setup,
-    entry: ComparedMaskConfig,
+    setting: Setting,
+    compared: ComparedMask,
     psfs: Float[Array, "capture k l"],
     scenes: Float[Array, "scene m n"],
     electrons: float,
@@ -148,19 +130,18 @@ def capture(
     Before a white scene the bare sensor gets Σf Δ² of the field. Pixels never saturate: strong
     light is that of many exposures.
     """
-    config = setup.config
-    sensor, pitch = config.sensor, config.sensor.pitch
-    area = config.field[0] * config.field[1] * pitch**2
+    shape, pitch, field = setting.sensor.shape, setting.pitch, setting.field
+    area = field[0] * field[1] * pitch**2
     counted = electrons / area / len(psfs)
-    exposed = Sensor(sensor.shape, pitch, electrons=counted, full_well=1e3 * electrons)
-    noise = PoissonGaussianNoise(config.read_noise)
-    camera = CropConvolution(psfs, pitch, sensor.shape, config.field)
-    clean = camera(jnp.broadcast_to(scenes[:, None], (len(scenes), len(psfs), *config.field)))
+    exposed = Sensor(shape, pitch, electrons=counted, full_well=1e3 * electrons)
+    noise = PoissonGaussianNoise(setting.read_noise)
+    camera = CropConvolution(psfs, pitch, shape, field)
+    clean = camera(jnp.broadcast_to(scenes[:, None], (len(scenes), len(psfs), *field)))
     images = read_out(exposed, clean, noise=noise, key=key)
     each = noise.variance(clean, jnp.full((*clean.shape[:2], 1, 1), counted, clean.dtype))
-    matrix = jnp.asarray(synthesis_of(entry), images.dtype)
+    matrix = jnp.asarray(compared.weights, images.dtype)
     variance = jnp.mean(each @ matrix.T**2, axis=-1)
-    even = camera(jnp.ones((len(psfs), *config.field), images.dtype))
+    even = camera(jnp.ones((len(psfs), *field), images.dtype))
     level = jnp.einsum("kyx,skyx->s", even, images) / jnp.sum(even**2)
     return Seen(jnp.einsum("ck,skyx->scyx", matrix, images), variance, level)
 
@@ -168,7 +149,7 @@ def capture(
 def best_linear(
     cameras: list[CropConvolution], seen: Seen, precision: Float[Array, "scene 2"]
 ) -> Float[Array, "scene m n"]:
-    r"""The best linear estimate, which knows noise, crop, and the prior of `Scene`.
+    r"""The best linear estimate, which knows noise, crop, and the prior of `ComparedScene`.
 
     .. math:: \Big(\sum_c A_c^T A_c/\sigma^2 + a \nabla^T\nabla + b\Big)(f - \bar f)
         = \sum_c A_c^T (g_c - A_c \bar f)/\sigma^2
@@ -268,31 +249,33 @@ class Strength:
 
 
 def strength(
-    setup: Setup, entry: ComparedMaskConfig, psfs: Float[Array, "capture k l"]
+    setting: Setting,
+    compared: ComparedMask,
+    psfs: Float[Array, "capture k l"],
+    wavelength: float,
+    object_distance: float,
 ) -> Strength:
     """Of captures that share the light, the sums that are made of them count."""
-    config = setup.config
-    pitch, distance = config.sensor.pitch, config.object_distances[0]
-    open_light = (config.width * (1 + config.distance / distance)) ** 2
+    pitch = setting.pitch
+    open_light = (setting.width * (1 + setting.distance / object_distance)) ** 2
     light = float(jnp.mean(jnp.sum(psfs, axis=(-2, -1)))) * pitch**2
-    cameras = channels_of(setup, entry, psfs)
+    cameras = channels_of(setting, compared, psfs)
     spectra = np.stack([np.abs(np.asarray(camera.spectrum[0])) for camera in cameras])
     # A capture has 1/K of the light; W of them are summed, of which noise grows as the root.
-    share = float(np.mean(np.sum(synthesis_of(entry) ** 2, axis=1))) * len(psfs)
+    share = float(np.mean(np.sum(compared.weights**2, axis=1))) * len(psfs)
     response = np.sqrt(np.sum(spectra**2, axis=0) / share)
     v, u = np.fft.fftfreq(cameras[0].window[0]), np.fft.rfftfreq(cameras[0].window[1])
     frequency = np.hypot(v[:, None], u)
-    band = (frequency >= 1 / max(config.field)) & (frequency <= 0.25)
+    band = (frequency >= 1 / max(setting.field)) & (frequency <= 0.25)
     inside, at = response[band], frequency[band]
     size = float(np.sqrt(np.mean(inside**2)))
     began = time.perf_counter()
-    kernels(setup, entry.name, (config.wavelength,), distance).block_until_ready()
-    seconds = (time.perf_counter() - began) / len(psfs)
+    kernels(setting, compared, (wavelength,), object_distance).block_until_ready()
     return Strength(
         light / open_light,
         size / light,
         float(np.exp(np.mean(np.log(np.maximum(inside, 1e-12))))) / size,
         float(inside.min()) / size,
         float(at[inside.argmin()]) / pitch,
-        seconds,
+        (time.perf_counter() - began) / len(psfs),
     )

@@ -1,0 +1,36 @@
+"""The registry of kinds: every part that it names is there, and files go where they belong."""
+
+import pytest
+
+from helpers import ROOT
+from thincam_jax.commands.config_file import ConfigError
+from thincam_jax.commands.kinds import KINDS, kind_of, load_experiment, read_kind
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_its_parts_are_there(name):
+    kind = KINDS[name]
+    section = kind.part(kind.section)
+    declared = section.model_fields.get("kind")
+    assert (declared is None) == (name == "study")
+    assert declared is None or declared.annotation.__args__ == (name,)
+    assert (kind.command == "run") == bool(kind.build and kind.run)
+    assert all(callable(kind.part(place)) for place in (kind.build, kind.run) if place)
+    assert not kind.example or read_kind(ROOT / f"configs/{kind.example}.yaml") is kind
+
+
+def test_a_file_goes_to_its_command():
+    config = load_experiment(ROOT / "configs/rig_virtual.yaml", command="capture")
+    assert kind_of(config) is KINDS["capture"]
+    with pytest.raises(ConfigError, match="kind: is a study; give it to 'thincam run'"):
+        load_experiment(ROOT / "configs/quick.yaml", command="train")
+
+
+def test_an_unknown_kind_is_told(tmp_path):
+    path = tmp_path / "a.yaml"
+    path.write_text("name: a\nkind: masks\n")
+    told = (
+        "'masks' is unknown; write 'kind: refocus' or 'kind: screen', or leave it out for a study"
+    )
+    with pytest.raises(ConfigError, match=told):
+        load_experiment(path)

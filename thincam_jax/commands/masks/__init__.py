@@ -1,1 +1,0 @@
-"""Experiments of `kind: masks`: one scene after another through masks of all families."""

@@ -1,0 +1,331 @@
+"""Which mask for which scene: masks of every family before one sensor, in equal light."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from typing import TYPE_CHECKING, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from thincam_jax._core.steps import Progress, Step, carry_out
+from thincam_jax._core.table import Table, number
+from thincam_jax.imaging.metrics import psnr, ssim
+from thincam_jax.imaging.targets import resize
+from thincam_jax.reconstruction.wiener import Prior
+from thincam_jax.studies.mask_captures import (
+    ComparedMask,
+    Setting,
+    Strength,
+    best_linear,
+    capture,
+    channels_of,
+    kernels,
+    strength,
+    total_variation,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Colours = Literal["one wavelength", "broadband"]
+Estimate = Literal["total variation", "linear", "focused far"]
+
+
+@dataclass(frozen=True, eq=False)
+class ComparedScene:
+    """A scene on the field's pixels (y, x), 0 to 1, as it is cast on the sensor.
+
+    - `prior`: what the linear estimate takes for its spectrum.
+    """
+
+    image: Float[np.ndarray, "y x"]
+    prior: Prior = "inverse_square"
+
+    @classmethod
+    def of_picture(
+        cls,
+        picture: Float[np.ndarray, "row column *channel"],
+        shape: tuple[int, int],
+        prior: Prior = "inverse_square",
+    ) -> "ComparedScene":
+        """A picture, grey or the mean of its colours, on so many pixels."""
+        return cls(resize(np.atleast_3d(picture).mean(axis=-1), shape), prior)
+
+    @property
+    def precision(self) -> tuple[float, float]:
+        """a and b of its prior exp{−½(a‖∇f‖² + b‖f − f̄‖²)}.
+
+        They fit its own mean square of differences or, of a flat spectrum, its variance.
+        """
+        if self.prior == "flat":
+            return 0.0, 1 / float(self.image.var())
+        squares = sum(np.sum(np.diff(self.image, axis=axis) ** 2) for axis in (0, 1))
+        slope = self.image.size / float(squares)
+        return slope, slope * (2 * math.pi / max(self.image.shape)) ** 2
+
+
+@dataclass(frozen=True, eq=False)
+class Tuning:
+    """τ of total variation, for each mask and light: the best of `tau` on a scene of its own."""
+
+    scene: ComparedScene
+    tau: tuple[float | int, ...] = (0.5, 1, 2, 4)
+    iterations: int = 60
+
+
+@dataclass(frozen=True)
+class Case:
+    """Of which image a score is; `electrons` a pixel of the bare sensor, `distance` in mm."""
+
+    mask: str
+    scene: str
+    electrons: float
+    distance: float
+    colours: Colours = "one wavelength"
+    estimate: Estimate = "total variation"
+
+
+@dataclass(frozen=True, eq=False)
+class MaskComparison:
+    """Masks of one width before one sensor, all in the same light.
+
+    - `masks`, `scenes`: by name.
+    - `wavelength`, and a `band` of several of equal weight, mm.
+    - `light`: electrons a pixel of the bare sensor before a white scene, the weakest first.
+    - `object_distances`: mm; the first is that of all comparisons but the one of distances.
+
+    ```python
+    import thincam_jax as tc
+    from thincam_jax.imaging.targets import point_grid, sample_image
+    from thincam_jax.studies import (
+        ComparedMask, ComparedScene, MaskComparison, Setting, Tuning
+    )
+    from thincam_jax.units import nm, um
+
+    field = (24, 28)
+    comparison = MaskComparison(
+        Setting(tc.Sensor((48, 56), 24 * um), distance=2.0, field=field, width=0.744),
+        masks={
+            "pinhole": ComparedMask((tc.Pinhole(48 * um),)),
+            "MURA": ComparedMask((tc.ModifiedUniformlyRedundantArray(31, 24 * um),)),
+        },
+        scenes={"points": ComparedScene.of_picture(point_grid((28, 28), (9, 9)), field, "flat")},
+        tuning=Tuning(ComparedScene.of_picture(sample_image("astronaut"), field), (1.0, 4.0), 20),
+        wavelength=550 * nm,
+        band=(500 * nm, 600 * nm),
+        light=(1e3, 1e5),
+        object_distances=(300.0, 20.0),
+    )
+    print(comparison.run().table())
+    ```
+
+    **Errors**: ValueError for lights that do not rise, and a scene of another size than the field.
+    """
+
+    setting: Setting
+    masks: Mapping[str, ComparedMask]
+    scenes: Mapping[str, ComparedScene]
+    tuning: Tuning
+    wavelength: float
+    band: tuple[float, ...]
+    light: tuple[float, ...]
+    object_distances: tuple[float, float]
+    seed: int = 0
+
+    def __post_init__(self):
+        if list(self.light) != sorted(set(self.light)):
+            raise ValueError(f"light: {list(self.light)} do not rise; give the weakest first")
+        for name, scene in {**self.scenes, "of the tuning": self.tuning.scene}.items():
+            if scene.image.shape != self.setting.field:
+                raise ValueError(
+                    f"scene {name}: has {scene.image.shape} pixels; give those of the field, "
+                    f"{self.setting.field}"
+                )
+
+    def run(self, progress: Progress | None = None) -> "MaskComparisonResult":
+        """All masks on all scenes; all but the times of PSFs is the same at every run."""
+        result = MaskComparisonResult(self)
+        work: list[Step] = []
+        for name in self.masks:
+            work.append(Step(f"{name}: tau", partial(self._tune, result, name)))
+            for distance in self.object_distances:
+                for colours in ("one wavelength", "broadband"):
+                    text = f"{name}: {distance:g} mm, {colours}"
+                    do = partial(self._reconstruct, result, name, distance, colours)
+                    work.append(Step(text, do))
+        carry_out(work, progress)
+        return result
+
+    def _key(self, *numbers: int) -> PRNGKeyArray:
+        """The same noise for every mask: a better image is a better mask."""
+        key = jax.random.key(self.seed)
+        for given in numbers:
+            key = jax.random.fold_in(key, given)
+        return key
+
+    def _tune(self, result: "MaskComparisonResult", name: str) -> None:
+        """τ at each light, far away and in one wavelength, and what the PSF says by itself."""
+        setting, compared, far = self.setting, self.masks[name], self.object_distances[0]
+        psfs = kernels(setting, compared, (self.wavelength,), far)
+        cameras, asked = channels_of(setting, compared, psfs), self.tuning
+        scene, precision = _stack([asked.scene])
+        for place, electrons in enumerate(self.light):
+            key = self._key(place, len(self.scenes) + 1)
+            seen = capture(setting, compared, psfs, scene, electrons, key)
+            start = best_linear(cameras, seen, precision)
+            tried = [
+                total_variation(cameras, seen, start, tau, asked.iterations) for tau in asked.tau
+            ]
+            scores = [psnr(np.asarray(image[0]), np.asarray(scene[0])) for image in tried]
+            result.tau[name, electrons] = asked.tau[int(np.argmax(scores))]
+        result.psfs[name] = psfs
+        result.strengths[name] = strength(setting, compared, psfs, self.wavelength, far)
+
+    def _reconstruct(
+        self, result: "MaskComparisonResult", name: str, distance: float, colours: Colours
+    ) -> None:
+        """All scenes at every light, by both estimates."""
+        setting, compared, far_psfs = self.setting, self.masks[name], result.psfs[name]
+        near, alone = distance == self.object_distances[1], colours == "one wavelength"
+        light = (self.wavelength,) if alone else self.band
+        other = near or not alone
+        psfs = kernels(setting, compared, light, distance) if other else far_psfs
+        cameras = channels_of(setting, compared, psfs)
+        scenes, precision = _stack(list(self.scenes.values()))
+        for place, electrons in enumerate(self.light):
+            key = self._key(place, near, alone)
+            seen = capture(setting, compared, psfs, scenes, electrons, key)
+            linear = best_linear(cameras, seen, precision)
+            options = result.tau[name, electrons], self.tuning.iterations
+            found = total_variation(cameras, seen, linear, *options)
+            estimates: dict[Estimate, Array] = {"linear": linear, "total variation": found}
+            if near and alone and electrons == self.light[-1]:
+                far = channels_of(setting, compared, far_psfs)
+                estimates["focused far"] = best_linear(far, seen, precision)
+            for estimate, images in estimates.items():
+                for scene, image in zip(self.scenes, np.asarray(images), strict=True):
+                    case = Case(name, scene, electrons, distance, colours, estimate)
+                    truth = np.asarray(self.scenes[scene].image, image.dtype)
+                    scores = round(psnr(image, truth), 3), round(ssim(image, truth), 4)
+                    result.scores[case] = scores
+                    result.images[case] = image
+
+
+def _stack(scenes: Sequence[ComparedScene]) -> tuple[Array, Array]:
+    """Images and precisions of scenes."""
+    images = jnp.asarray(np.stack([scene.image for scene in scenes]), float)
+    return images, jnp.asarray([scene.precision for scene in scenes], images.dtype)
+
+
+@dataclass(frozen=True, eq=False)
+class MaskComparisonResult:
+    """What a comparison found.
+
+    - `scores`: PSNR in dB, and SSIM, of each case; `images`: its reconstruction (y, x).
+    - `tau`: by mask and light. `strengths`, `psfs`: by mask, far away in one wavelength.
+    """
+
+    comparison: MaskComparison
+    scores: dict[Case, tuple[float, float]] = field(default_factory=dict)
+    images: dict[Case, np.ndarray] = field(default_factory=dict)
+    tau: dict[tuple[str, float], float] = field(default_factory=dict)
+    strengths: dict[str, Strength] = field(default_factory=dict)
+    psfs: dict[str, Array] = field(default_factory=dict)
+
+    def case(
+        self,
+        mask: str,
+        scene: str,
+        electrons: float,
+        *,
+        colours: Colours = "one wavelength",
+        near: bool = False,
+        estimate: Estimate = "total variation",
+    ) -> Case:
+        """One of the cases; by default of total variation, far away, in one wavelength."""
+        distance = self.comparison.object_distances[near]
+        return Case(mask, scene, electrons, distance, colours, estimate)
+
+    def mean(
+        self,
+        mask: str,
+        *,
+        colours: Colours = "one wavelength",
+        near: bool = False,
+        estimate: Estimate = "total variation",
+    ) -> float:
+        """Mean PSNR of the scenes in the strongest light, dB."""
+        light, given = self.comparison.light[-1], {"near": near, "estimate": estimate}
+        of_scene = partial(self.case, mask, electrons=light, colours=colours, **given)
+        cases = [of_scene(scene=scene) for scene in self.comparison.scenes]
+        return float(np.mean([self.scores[case][0] for case in cases]))
+
+    def broadband(self, mask: str) -> float:
+        """dB that a band of wavelengths costs."""
+        return self.mean(mask) - self.mean(mask, colours="broadband")
+
+    def near(self, mask: str) -> float:
+        """dB that the scenes lose at the other distance, whose PSF is known."""
+        return self.mean(mask) - self.mean(mask, near=True)
+
+    def unfocused(self, mask: str) -> float:
+        """dB that the PSF of the first distance costs the linear estimate at the other one."""
+        right = self.mean(mask, near=True, estimate="linear")
+        return right - self.mean(mask, near=True, estimate="focused far")
+
+    def table(self, estimate: Estimate = "total variation") -> Table:
+        """PSNR and SSIM of every mask on every scene in each light."""
+        cases = [(scene, at) for scene in self.comparison.scenes for at in self.comparison.light]
+        rows = []
+        for name in self.comparison.masks:
+            found = [self.scores[self.case(name, *one, estimate=estimate)] for one in cases]
+            rows.append((name, *(f"{number(p, 1)} / {number(s, 2)}" for p, s in found)))
+        headings = ("mask", *(f"{scene}\n{at:,.0f}" for scene, at in cases))
+        return Table(headings, rows, title=f"PSNR dB / SSIM by {estimate}, at electrons a pixel")
+
+    def strength_table(self) -> Table:
+        """What the PSF of every mask says by itself; see `Strength`."""
+        rows = []
+        for name, one in self.strengths.items():
+            of_light = one.throughput, one.detail, one.in_shot_noise, one.in_read_noise
+            rows.append(
+                (
+                    name,
+                    *(100 * part for part in of_light),
+                    one.flatness,
+                    f"{one.weakest:.2g}",
+                    one.weakest_at,
+                    1000 * one.seconds,
+                )
+            )
+        headings = ("mask", "light %", "detail %", "detail × √light, %", "detail × light, %")
+        headings = (*headings, "flatness", "weakest", "at cycles/mm", "PSF ms")
+        return Table(headings, rows, (1, 1, 1, 2, 2, 2, 1, 0))
+
+    def cost_table(self) -> Table:
+        """What colours, distance and the PSF of a wrong distance cost, dB."""
+        rows = [
+            (name, self.broadband(name), self.near(name), self.unfocused(name))
+            for name in self.comparison.masks
+        ]
+        near = f"{self.comparison.object_distances[1]:g} mm"
+        headings = ("mask", "broadband", f"{near}, its PSF known", f"{near}, PSF of the first")
+        return Table(headings, rows, (1, 1, 1), title="costs in dB")
+
+    def plot_error(self) -> "Figure":
+        """Root mean square error against light, a line for each mask, a panel for each scene."""
+        from thincam_jax.plot.frame import new_figure
+        from thincam_jax.plot.mask_comparison import draw_error
+
+        return draw_error(self, new_figure(11, 4.4))
+
+    def plot_images(self) -> "Figure":
+        """A row for each mask: the mask, its PSF, and scenes at several lights and distances."""
+        from thincam_jax.plot.frame import new_figure
+        from thincam_jax.plot.mask_comparison import draw_images
+
+        return draw_images(self, new_figure(1, 1))
