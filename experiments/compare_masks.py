@@ -75,12 +75,13 @@ openings = {
     "random cells": tc.random_cells(key, width, cells),
 }
 zones = {"zone plate": zone_plate(), "binary zone plate": zone_plate(profile="binary")}
-masks = {"pinhole": ComparedMask((tc.Pinhole(48 * um),), "pinhole")}
+masks = {}
 sorts = {"lenses": lenses, "reliefs": reliefs, "cells": openings, "zones": zones}
 for sort, of_sort in sorts.items():
     masks |= {name: ComparedMask((mask,), sort) for name, mask in of_sort.items()}
 phases = tuple(zone_plate(phase) for phase in np.arange(4) * np.pi / 2)
 masks["zone plate, 4 phases"] = ComparedMask(phases, "zones", "fringe_scanning")
+masks["pinhole"] = ComparedMask((tc.Pinhole(48 * um),), "pinhole")
 
 # %% [markdown]
 # ## Scenes and light

@@ -32,7 +32,7 @@ class ComparedMask:
 
     - `masks`: one for each capture; the captures share the light.
     - `synthesis`: what is made of the captures; "fringe_scanning" takes the phases 0, π/2, π, 3π/2.
-    - `sort`: of which sort it is, for plots.
+    - `sort`: of which sort it is; plots draw each by a dash and a grey of its own.
 
     **Errors**: ValueError for a number of masks that the synthesis does not take.
     """
