@@ -28,7 +28,7 @@ def test_free_memory_of_this_machine():
 def test_the_cache_of_files_is_free_memory(monkeypatch):
     """A file of gigabytes that was just written would leave none: pages that hold it are not."""
     lines = "MemTotal: 9 kB\nMemFree: 10 kB\nMemAvailable: 3000 kB\n"
-    monkeypatch.setattr(memory.Path, "read_text", lambda path: lines)
+    monkeypatch.setattr(memory.Path, "read_text", lambda path, encoding: lines)
     assert memory.available_bytes() == 3000 * 1024
 
 

@@ -45,7 +45,9 @@ def test_schema_takes_it_and_no_number_without_its_unit(path):
     assert not validator.is_valid(raw | {"colour": 1})
 
 
-@pytest.mark.parametrize("kind", ["quick", "mura", "fza_refocus", "sts_camera"])
+@pytest.mark.parametrize(
+    "kind", ["quick", "mura", "fza_refocus", pytest.param("sts_camera", marks=pytest.mark.thorough)]
+)
 def test_dry_run(kind, tmp_path):
     out = tmp_path / "out"
     result = call("run", ROOT / f"configs/{kind}.yaml", "--out", out, "--dry-run")

@@ -253,7 +253,9 @@ def test_the_nearest_image_by_least_squares(name):
     problem = posed(name)
     splitting = with_penalties(problem)
     target = noise_like(splitting.start(jnp.zeros(problem.image_shape)))
-    found, target = jax.device_get((jax.jit(splitting.nearest)(target), target))
+    found, target = jax.device_get(
+        (jax.jit(lambda given: splitting.nearest(given))(target), target)
+    )
     planes = problem.image_shape[-3]
     psi = dense.slopes((planes, *SMALL_FIELD), 0.6)[: 3 if planes > 1 else 2]
     size = planes * SMALL_FIELD[0] * SMALL_FIELD[1]

@@ -81,7 +81,7 @@ def test_values_are_right_within_their_errors(seed):
     assert (fit.status, fit.reasons) == ("ok", ())
     assert np.all(np.abs(deviations(fit, true)) < 4.5)
     assert float(fit.standard_errors["distance"]) < 0.01
-    noise = 10 ** (-30 / 20) * math.sqrt(np.mean(np.square(picture(true, snr_db=300.0))))
+    noise = 10 ** (-30 / 20) * math.sqrt(np.mean(np.square(picture(true, snr_db=200.0))))
     np.testing.assert_allclose(np.std(fit.residual), noise, rtol=0.03)
 
 
