@@ -1,4 +1,4 @@
-"""The order of the package's rooms, checked by reading its source.
+"""The order of the package's rooms and the style of its source, checked by reading it.
 
 Each rule is a function from the parsed modules to a list of complaints. It is applied to the
 package and, below, to small packages that break it: a rule that has gone blind is noticed.
@@ -7,6 +7,7 @@ package and, below, to small packages that break it: a rule that has gone blind 
 from pathlib import Path
 
 import pytest
+from source_style import BROKEN_STYLE, STYLE_RULES
 from source_tree import (
     DOC,
     ENTRY,
@@ -146,6 +147,7 @@ RULES = (
     modules_hidden_by_names,
     jaxopt_outside_its_files,
     front_end_libraries_in_the_core,
+    *STYLE_RULES,
 )
 
 
@@ -248,6 +250,7 @@ BROKEN = [
         "def f():\n    import rich",
         "studies/plot.py:2: imports rich",
     ),
+    *BROKEN_STYLE,
 ]
 
 

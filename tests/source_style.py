@@ -1,12 +1,10 @@
-"""The style of the package's source, checked by reading it: as tests/test_architecture.py."""
+"""Rules of the style of the package's source, which tests/test_architecture.py applies."""
 
 import ast
 from collections.abc import Iterator
 
-import pytest
-from source_tree import DOC, MAX_LINES, PACKAGE, SOUND, Module, read_package, write_package
+from source_tree import DOC, MAX_LINES, Module
 
-from helpers import ROOT
 from thincam_jax._core.quantity import UNITS
 
 # They read what is the package's own, and what the system says of itself.
@@ -121,7 +119,7 @@ def bare_parameters(
             yield node, bare
 
 
-RULES = (
+STYLE_RULES = (
     bare_files,
     tables_of_units,
     named_tuples,
@@ -131,20 +129,8 @@ RULES = (
     missing_annotations,
 )
 
-
-@pytest.fixture(scope="module")
-def package() -> list[Module]:
-    return read_package(ROOT / PACKAGE)
-
-
-@pytest.mark.parametrize("rule", RULES, ids=lambda rule: rule.__name__)
-def test_package_keeps(rule, package):
-    complaints = rule(package)
-    assert not complaints, "\n" + "\n".join(complaints)
-
-
 # rule, file, source, part of the complaint
-BROKEN = [
+BROKEN_STYLE = [
     (bare_files, "measured/read.py", "data = path.read_bytes()", "use read_regular"),
     (bare_files, "_core/files.py", "path.write_text('β')", "use write_whole"),
     (
@@ -191,16 +177,3 @@ BROKEN = [
         "f: ",
     ),
 ]
-
-
-@pytest.mark.parametrize(("rule", "path", "source", "complaint"), BROKEN)
-def test_rule_sees_what_breaks_it(rule, path, source, complaint, tmp_path):
-    modules = write_package(tmp_path, [*SOUND, (path, source)])
-    complaints = [text for text in rule(modules) if text.startswith(path)]
-    assert complaints
-    assert complaint in "\n".join(complaints)
-
-
-def test_rules_pass_a_sound_package(tmp_path):
-    modules = write_package(tmp_path, SOUND)
-    assert [text for rule in RULES for text in rule(modules)] == []
