@@ -38,10 +38,9 @@ from thincam_jax.design.search import (
     Descents,
     Found,
     best_apart,
-    evaluate,
-    even_samples,
     on_cube,
-    ranked,
+    sampled,
+    search_of,
 )
 from thincam_jax.design.setup import Setup
 from thincam_jax.design.space import DesignSpace
@@ -212,16 +211,14 @@ def match_response(
     space = model.space
     levels = checked_levels(target, model.rings, space.lower.dtype)
     count = max(settings.samples, settings.starts)
-    points = even_samples(space.size, count, key, space.lower.dtype)
-    values = evaluate(_misfit, space, (model, levels), points)
+    points, values = sampled(_misfit, space, (model, levels), count, key)
     chosen = best_apart(np.asarray(points), np.asarray(values), settings.starts)
     lengths = settings.steps, settings.tolerance
-    ended = jax.device_get(_least_squares(model, levels, points[chosen], *lengths))
-    failed = sum(int(np.sum(~np.isfinite(v))) for v in (np.asarray(values), ended.values))
-    found = ranked(space, ended, settings.separation)
-    best = found[0].objective if found else np.inf
-    used = len(points) + int(np.sum(ended.evaluations))
-    return Match(found, best, match_status(best, settings.tolerance_db), used, failed)
+    ended = _least_squares(model, levels, points[chosen], *lengths)
+    search = search_of(space, values, ended, settings.separation)
+    best = search.found[0].objective if search.found else np.inf
+    status = match_status(best, settings.tolerance_db)
+    return Match(search.found, best, status, search.evaluations, search.failed)
 
 
 def match_status(misfit_db: float, tolerance_db: float) -> MatchStatus:

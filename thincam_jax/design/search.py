@@ -114,22 +114,36 @@ def find_designs(
     """
     settings = settings or SearchSettings()
     objective, space, data = problem.objective, problem.space, problem.data
-    samples = max(settings.samples, settings.starts)
-    points = even_samples(space.size, samples, key, space.lower.dtype)
-    values = evaluate(objective, space, data, points)
+    points, values = sampled(objective, space, data, max(settings.samples, settings.starts), key)
     chosen = best_apart(np.asarray(points), np.asarray(values), settings.starts)
     descend = _descend if settings.solver == "bfgs" else _descend_in_box
     lengths = settings.steps, settings.tolerance
     ended = descend(objective, space, data, points[chosen], _scale(values[chosen]), *lengths)
+    search = search_of(space, values, ended, settings.separation)
+    if problem.exact is None or not search.found:
+        return search
+    begun = np.stack([*(one.point for one in search.found), points[chosen[0]]])
+    better, more = _improved(problem, begun, [one.status for one in search.found])
+    found = without_repeats(better, settings.separation)
+    return Search(found, search.evaluations + more, search.failed)
+
+
+def sampled(
+    objective: Objective, space: DesignSpace, data: Any, count: int, key: PRNGKeyArray
+) -> tuple[Float[Array, "point variable"], Float[Array, " point"]]:
+    """Even samples of the unit cube, and the objective there."""
+    points = even_samples(space.size, count, key, space.lower.dtype)
+    return points, evaluate(objective, space, data, points)
+
+
+def search_of(
+    space: DesignSpace, values: Float[Array, " point"], ended: Descents, separation: float
+) -> Search:
+    """The search of which these are the samples' values and the ends of its descents."""
     ended = jax.device_get(ended)
     failed = sum(int(np.sum(~np.isfinite(v))) for v in (np.asarray(values), ended.values))
-    used = len(points) + int(np.sum(ended.evaluations))
-    found = ranked(space, ended, settings.separation)
-    if problem.exact is None or not found:
-        return Search(found, used, failed)
-    begun = np.stack([*(one.point for one in found), points[chosen[0]]])
-    better, more = _improved(problem, begun, [one.status for one in found])
-    return Search(without_repeats(better, settings.separation), used + more, failed)
+    used = len(values) + int(np.sum(ended.evaluations))
+    return Search(ranked(space, ended, separation), used, failed)
 
 
 # How many optima are improved on the exact objective, and how: from the best of so many even
@@ -202,9 +216,8 @@ def descend(
     for point in points:
         value = evaluate(objective, space, data, point[None])
         ended.append(_descend(objective, space, data, point[None], _scale(value), steps, tolerance))
-    stacked = jax.device_get(jax.tree.map(lambda *parts: jnp.concatenate(parts), *ended))
-    failed = int(np.sum(~np.isfinite(stacked.values)))
-    return Search(ranked(space, stacked, SEPARATION), int(np.sum(stacked.evaluations)), failed)
+    every = jax.tree.map(lambda *parts: jnp.concatenate(parts), *ended)
+    return search_of(space, jnp.zeros(0, space.lower.dtype), every, SEPARATION)
 
 
 # Points of the unit cube that are evaluated at a time.
