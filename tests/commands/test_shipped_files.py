@@ -9,7 +9,7 @@ from commands.test_cli import call, one_line
 from jsonschema import Draft202012Validator
 
 from helpers import ROOT
-from thincam_jax.commands.explain import load_any
+from thincam_jax.commands.kinds import load_experiment
 
 FILES = sorted((ROOT / "configs").glob("*.yaml"))
 # Of each file, without its texts for readers; a changed default or reading of a unit shows.
@@ -18,7 +18,7 @@ RESOLVED = json.loads((ROOT / "tests/commands/resolved.json").read_text("utf-8")
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
 def test_resolved_values(path):
-    config = load_any(path)
+    config = load_experiment(path, command=None)
     data = config.model_dump(mode="json", exclude_none=True, by_alias=True)
     text = json.dumps(data).replace(str((ROOT / "configs").resolve()), "configs")
     found = {key: value for key, value in json.loads(text).items() if key not in ("title", "notes")}

@@ -4,22 +4,12 @@ As the files `command.py`, it imports nothing at its head that `thincam --help` 
 """
 
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from thincam_jax.commands.kinds import KINDS
+from thincam_jax.commands.kinds import KINDS, load_experiment
 from thincam_jax.commands.terminal import ConfigFile, Overrides, told
-
-
-def load_any(path: Path, overrides: tuple[str, ...] = ()) -> Any:
-    """Read and check an experiment file of any kind; errors as of `checked_config.load_as`."""
-    from thincam_jax.commands.checked_config import load_as
-    from thincam_jax.commands.kinds import read_kind
-
-    kind = read_kind(path)
-    return load_as(kind.part(kind.section), path, overrides)
 
 
 def schema(
@@ -46,7 +36,7 @@ def explain(config: ConfigFile, set_: Overrides = None) -> None:
     Of lensless cameras also the error and the cost of their PSFs.
     """
     with told(lambda: "interrupted"):
-        asked = load_any(config, tuple(set_ or ()))
+        asked = load_experiment(config, tuple(set_ or ()), command=None)
         rows = list(values(asked))
         width = max(len(f"{key}: {value}") for key, value, _ in rows if len(value) <= _LONGEST)
         lines = [f"{f'{key}: {value}':<{width}}  # {place}" for key, value, place in rows]

@@ -14,7 +14,8 @@ class Kind:
     - `section`: its configuration, as MODULE:NAME in `thincam_jax.commands`.
     - `example`: the file of `configs/` that `thincam init` writes under the kind's name.
     - `build`, `run`: of those for `thincam run`, what makes objects of the configuration, and what
-      runs these into a folder; its result has a `table`.
+      runs these into a folder; its result has a `table`. Of those for `thincam train`, `run` trains
+      in a folder.
     """
 
     noun: str
@@ -43,8 +44,14 @@ KINDS = {
     "screen": _run("screen", "ScreenConfig", "a see-through screen"),
     "design": Kind("a design", "design", "design.config:DesignConfig", "design_distances"),
     "capture": Kind("a capture", "capture", "capture.config:CaptureConfig", "rig_virtual"),
-    "learned": Kind("a network", "train", "learned.config:LearnedConfig", "learned_refocus"),
-    "denoiser": Kind("a denoiser", "train", "learned.denoiser:DenoiserConfig", "denoiser"),
+    "learned": Kind(
+        *("a network", "train", "learned.config:LearnedConfig", "learned_refocus"),
+        run="learned.run:run_training",
+    ),
+    "denoiser": Kind(
+        *("a denoiser", "train", "learned.denoiser:DenoiserConfig", "denoiser"),
+        run="learned.denoiser:run_denoiser",
+    ),
 }
 
 
@@ -73,12 +80,17 @@ def read_kind(path: str | Path) -> Kind:
     )
 
 
-def load_experiment(path: str | Path, overrides: tuple[str, ...] = (), command: str = "run") -> Any:
-    """Read and check an experiment file that a command takes; errors as of `load_as`."""
+def load_experiment(
+    path: str | Path, overrides: tuple[str, ...] = (), command: str | None = "run"
+) -> Any:
+    """Read and check an experiment file that a command takes; errors as of `load_as`.
+
+    `command`: None for a file of any kind.
+    """
     from thincam_jax.commands.checked_config import load_as
     from thincam_jax.commands.config_file import ConfigError
 
     kind = read_kind(path)
-    if kind.command != command:
+    if command is not None and kind.command != command:
         raise ConfigError(f"{path}: kind: is {kind.noun}; give it to 'thincam {kind.command}'")
     return load_as(kind.part(kind.section), path, overrides)

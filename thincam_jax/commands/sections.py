@@ -231,12 +231,6 @@ _VARIATION = {
 class VariationConfig(section(AdmmTV, TotalVariation, **_VARIATION)):
     """Total variation of an admm_tv method; see `thincam_jax.reconstruct`."""
 
-    def coupling_of(self, channels: int) -> Literal["none", "joint", "opponent"]:
-        """As given; else what suits the number of colour channels."""
-        if channels == 1:
-            return "none"
-        return self.coupling or ("opponent" if channels == 3 else "joint")
-
 
 MethodKind = Literal["fringe_scanning", "wiener", "admm_tv"]
 Synthesis = Literal["fringe_scanning", "phase_pairs", "harmonics", "contrasts", "separate"]

@@ -115,6 +115,11 @@ class TrainingState(eqx.Module):
     skipped: int = 0
     retreats: int = 0
 
+    @property
+    def counts(self) -> dict[str, int]:
+        """Steps done, steps that changed nothing, and retreats, for records of the training."""
+        return {"steps": self.step, "skipped": self.skipped, "retreats": self.retreats}
+
     @classmethod
     def begin(cls, model: Any, task: Task, options: TrainingOptions) -> "TrainingState":
         """Before the first step."""

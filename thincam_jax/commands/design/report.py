@@ -309,7 +309,7 @@ def _spread(spread: dict[str, Any] | None, digits: int, sign: str = "+") -> str:
 
 
 def of_shots(one: dict[str, Any], name: str, shots: Sequence[int]) -> str:
-    """A number of a design of design.json, of the first of these shots; of all, where none is."""
+    """A number that `shots` of a design in design.json share; all shots where none is named."""
     first = one["shots"][shots[0] - 1 if shots else 0]
     return f"{first[SHOT_KEYS[name]]:{REPORTED[name].form}}"
 

@@ -1,7 +1,10 @@
 """From an experiment file of `kind: learned` to its camera, network and lessons."""
 
+import dataclasses
 import functools
 import operator
+from collections.abc import Callable
+from typing import Any, TypeVar
 
 import jax
 
@@ -15,6 +18,8 @@ from thincam_jax.learn.refocusing.train import Lessons
 from thincam_jax.learn.training import TrainingOptions
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.masks.fza import FresnelZoneAperture
+
+Found = TypeVar("Found")
 
 
 def build_camera(config: LearnedConfig) -> RefocusCamera:
@@ -46,16 +51,10 @@ def build_network(config: LearnedConfig) -> RefocusNetwork:
 
 def build_lessons(config: LearnedConfig) -> Lessons:
     """**Errors**: ConfigError, one line for each source that cannot be read."""
-    faults: list[str] = []
     of_use: dict[str, list[Source]] = {"train": [], "judge": []}
-    for number, source in enumerate(config.sources):
-        try:
-            of_use[source.use].append(_read(source, config.scenes.side))
-        except (ValueError, OSError) as error:
-            place = config.place_of("sources", number)
-            faults.append(f"{place}sources[{number}]: {error}")
-    if faults:
-        raise ConfigError("\n".join(faults))
+    images = read_sources(config, functools.partial(_read, side=config.scenes.side))
+    for source, read in zip(config.sources, images, strict=True):
+        of_use[source.use].append(read)
     train, judge = (functools.reduce(operator.add, s) if s else None for s in of_use.values())
     assert train is not None  # the sections are checked
     scenes = {name: value for name, value in dict(config.scenes).items() if name != "side"}
@@ -63,11 +62,28 @@ def build_lessons(config: LearnedConfig) -> Lessons:
     return Lessons(train, SceneOptions(**scenes), held_out=judge, **told)
 
 
-def build_options(config: LearnedConfig) -> TrainingOptions:
-    """How long and how fast."""
-    names = ("steps", "rate", "warm_up", "averaging", "check_every")
-    settings = {name: getattr(config.training, name) for name in names}
-    return TrainingOptions(seed=config.seed, **settings)
+def read_sources(config: Any, read: Callable[[Any], Found]) -> list[Found]:
+    """The images of every source of a file, by a function of its section.
+
+    **Errors**: ConfigError, one line for each source that cannot be read.
+    """
+    found, faults = [], []
+    for number, source in enumerate(config.sources):
+        try:
+            found.append(read(source))
+        except (ValueError, OSError) as error:
+            place = config.place_of("sources", number)
+            faults.append(f"{place}sources[{number}]: {error}")
+    if faults:
+        raise ConfigError("\n".join(faults))
+    return found
+
+
+def build_options(config: Any) -> TrainingOptions:
+    """Length and rate of a training, as far as the section `training` of a file has them."""
+    names = {field.name for field in dataclasses.fields(TrainingOptions)}
+    given = {name: value for name, value in dict(config.training).items() if name in names}
+    return TrainingOptions(seed=config.seed, **given)
 
 
 def _read(source: SourceConfig, side: int) -> Source:

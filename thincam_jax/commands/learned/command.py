@@ -31,12 +31,11 @@ def train(
     goes_on = "interrupted; what the last check has written is kept: --resume goes on from there"
     with told(lambda: goes_on):
         from thincam_jax.commands.config_file import slug
-        from thincam_jax.commands.kinds import load_experiment
-        from thincam_jax.commands.learned.denoiser import DenoiserConfig, run_denoiser
-        from thincam_jax.commands.learned.run import TrainingFolder, run_training
+        from thincam_jax.commands.kinds import kind_of, load_experiment
+        from thincam_jax.commands.learned.run import TrainingFolder
 
         asked = load_experiment(config, tuple(set_ or ()), "train")
-        is_denoiser = isinstance(asked, DenoiserConfig)
+        kind = kind_of(asked)
         folder = TrainingFolder(out or Path("runs") / slug(asked.name))
         with progress_bar("{task.fields[loss]}") as bar:
             task = bar.add_task(asked.name, total=asked.training.steps, loss="")
@@ -46,11 +45,8 @@ def train(
                 bar.update(task, completed=progress.step, loss=f"loss {progress.loss:.3f}{score}")
                 bar.start()
 
-            if is_denoiser:
-                found = run_denoiser(asked, folder, tell, resume=resume)
-            else:
-                found = run_training(asked, folder, tell, resume=resume)
-    if is_denoiser:
+            found = kind.part(kind.run)(asked, folder, tell, resume=resume)
+    if asked.kind == "denoiser":
         print(f"{found['status']}: loss {found['loss']:.4f} on pictures held out")
     else:
         before, after = (found[name]["focus_psnr_db"] for name in ("linear", "trained"))

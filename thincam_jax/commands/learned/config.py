@@ -1,6 +1,6 @@
 """Experiment files of `kind: learned`: a camera, images to learn from, a network, its training."""
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import pydantic
 from pydantic import Field
@@ -61,6 +61,13 @@ class SourceConfig(Section):
         return self
 
 
+def check_sources(config: Any) -> None:
+    """Sources have names of their own, and one of them trains."""
+    check_names(config, "sources")
+    if not any(source.use == "train" for source in config.sources):
+        raise misfit("none of them is of use 'train'; give one", "sources")
+
+
 class ScenesConfig(Section):
     """See `learn.refocusing.scenes.SceneOptions`; `side`: pixels of the images they are cut of."""
 
@@ -112,7 +119,5 @@ class LearnedConfig(LenslessConfig):
 
     @pydantic.model_validator(mode="after")
     def _sources_fit(self):
-        check_names(self, "sources")
-        if not any(source.use == "train" for source in self.sources):
-            raise misfit("none of them is of use 'train'; give one", "sources")
+        check_sources(self)
         return self

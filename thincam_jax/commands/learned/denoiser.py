@@ -9,11 +9,12 @@ import pydantic
 from pydantic import Field
 
 from thincam_jax.commands.config_file import ConfigError
-from thincam_jax.commands.learned.config import Count, SourceConfig, Widths
+from thincam_jax.commands.learned.build import build_options, read_sources
+from thincam_jax.commands.learned.config import Count, SourceConfig, Widths, check_sources
 from thincam_jax.commands.learned.figures import draw_losses
 from thincam_jax.commands.learned.run import TrainingFolder, check_resume
 from thincam_jax.commands.run_folder import to_json
-from thincam_jax.commands.sections import ExperimentConfig, Section, check_names, misfit
+from thincam_jax.commands.sections import ExperimentConfig, Section, misfit
 from thincam_jax.commands.study.figures import save_figure
 from thincam_jax.learn.checkpoint import CheckpointError
 from thincam_jax.learn.denoiser.network import DenoiserOptions, create, load_network
@@ -21,7 +22,7 @@ from thincam_jax.learn.denoiser.pictures import Pictures, drawn, photographs, sa
 from thincam_jax.learn.denoiser.train import NETWORK, STATE, DenoisingLessons, train_denoiser
 from thincam_jax.learn.denoiser.unet import DenoisingUNet
 from thincam_jax.learn.refocusing.unet import parameter_count
-from thincam_jax.learn.training import TrainingOptions, TrainingProgress
+from thincam_jax.learn.training import TrainingProgress
 
 Blocks = Annotated[tuple[Annotated[int, Field(ge=0, le=64)], ...], Field(min_length=1)]
 
@@ -66,9 +67,7 @@ class DenoiserConfig(ExperimentConfig):
 
     @pydantic.model_validator(mode="after")
     def _fits(self):
-        check_names(self, "sources")
-        if not any(source.use == "train" for source in self.sources):
-            raise misfit("none of them is of use 'train'; give one", "sources")
+        check_sources(self)
         if len(self.network.widths) != len(self.network.blocks):
             raise misfit("give as many as widths, one for each level", "network", "blocks")
         return self
@@ -88,11 +87,7 @@ def run_denoiser(
     check_resume(folder, STATE, resume)
     lessons, network = build_lessons(config), build_network(config)
     folder.claim(config)
-    settings = {
-        name: getattr(config.training, name)
-        for name in ("steps", "rate", "warm_up", "falling", "averaging", "check_every")
-    }
-    options = TrainingOptions(seed=config.seed, **settings)
+    options = build_options(config)
     try:
         trained = train_denoiser(network, lessons, options, folder=folder.path, callback=callback)
     except CheckpointError as error:
@@ -102,9 +97,7 @@ def run_denoiser(
         "name": config.name,
         "kind": config.kind,
         "status": trained.status,
-        "steps": state.step,
-        "skipped": state.skipped,
-        "retreats": state.retreats,
+        **state.counts,
         "loss": float(np.nanmin(state.scores)),
         "scores": [None if score != score else round(float(score), 5) for score in state.scores],
         "learned_numbers": parameter_count(network),
@@ -142,21 +135,15 @@ def build_network(config: DenoiserConfig) -> DenoisingUNet:
 
 def build_lessons(config: DenoiserConfig) -> DenoisingLessons:
     """**Errors**: ConfigError, one line for each source that cannot be read."""
-    faults: list[str] = []
     train: list[Pictures] = []
     judge: list[Pictures] = []
-    for number, source in enumerate(config.sources):
-        try:
-            kept, held_out = split(_read(source), source.held_out)
-            (train if source.use == "train" else judge).extend(kept)
-            judge.extend(held_out)
-        except (ValueError, OSError) as error:
-            place = config.place_of("sources", number)
-            faults.append(f"{place}sources[{number}]: {error}")
-    if not train and not faults:
-        faults.append(f"{config.place_of('sources')}sources: none is left to train on; give one")
-    if faults:
-        raise ConfigError("\n".join(faults))
+    parts = read_sources(config, lambda source: split(_read(source), source.held_out))
+    for source, (kept, held_out) in zip(config.sources, parts, strict=True):
+        (train if source.use == "train" else judge).extend(kept)
+        judge.extend(held_out)
+    if not train:
+        place = config.place_of("sources")
+        raise ConfigError(f"{place}sources: none is left to train on; give one")
     told = {name: getattr(config.training, name) for name in ("batch", "crop", "judged")}
     return DenoisingLessons(united(train), united(judge) if judge else None, **told)
 

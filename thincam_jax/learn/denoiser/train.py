@@ -196,9 +196,8 @@ def _seconds(path: Path) -> float:
 def _keep(path: Path, settings, told, before: float, state: TrainingState) -> None:
     """Write the best network with its training record, and the state from which to resume."""
     scores = [round(float(score), 5) for score in state.scores if score == score]
-    numbers = {"steps": state.step, "skipped": state.skipped, "retreats": state.retreats}
     seconds = round(before + time.process_time(), 1)
-    known = {**told, **numbers, "scores": scores, "cpu_seconds": seconds}
+    known = {**told, **state.counts, "scores": scores, "cpu_seconds": seconds}
     save_network(path.parent / NETWORK, state.best, known)
     # Last: it is what training goes on from.
     write_state(path, state, settings)

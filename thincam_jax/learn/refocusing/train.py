@@ -155,8 +155,7 @@ def _keep(path: Path, network: RefocusNetwork, settings, told, state: TrainingSt
     number = network.options.steps - 1
     best = network.with_prior(number, eqx.combine(state.best, network.weights.prior[number]))
     scores = [float(score) for score in state.scores if score == score]
-    numbers = {"steps": state.step, "skipped": state.skipped, "retreats": state.retreats}
-    save(path.parent / NETWORK, best, {**told, "scores": scores, **numbers})
+    save(path.parent / NETWORK, best, {**told, "scores": scores, **state.counts})
     # Last: it is what training goes on from.
     write_state(path, state, settings)
 
