@@ -71,12 +71,12 @@ def test_plan(benchmark, capsys):
     start = time.perf_counter()
     plan = tc.plan(camera, scene, tolerance=TOLERANCE)
     planning = time.perf_counter() - start
-    running, planned = timed(lambda: tc.capture(camera, scene, plan=plan), 5)
+    running, planned = timed(lambda: tc.capture(camera, scene, model=plan), 5)
     everything, _ = timed(lambda: tc.capture(camera, scene), 1)
     double = jax.tree.map(lambda leaf: leaf.astype(jnp.float64), (camera, scene))
     exact = np.asarray(tc.capture(*double))
     benchmark.pedantic(
-        lambda: jax.block_until_ready(tc.capture(camera, scene, plan=plan)), rounds=5
+        lambda: jax.block_until_ready(tc.capture(camera, scene, model=plan)), rounds=5
     )
     difference = np.linalg.norm(np.asarray(planned, float) - exact)
     error = difference / np.linalg.norm(exact)

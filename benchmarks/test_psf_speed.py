@@ -45,9 +45,8 @@ def psf(model, beta, distance, wavelength, object_distance, oversampling=1, padd
     path = Path(wavelength, distance, object_distance)
     if model == "separable":
         return separable(mask, grid, path).image()
-    return angular_spectrum(
-        mask, grid, path, mask_shape=SHAPE, oversampling=oversampling, padding=padding
-    )
+    method = tc.PsfMethod(model, oversampling=oversampling, mask_shape=SHAPE)
+    return angular_spectrum(mask, grid, path, method, padding=padding)
 
 
 def slopes(model, weight, beta, distance, wavelength, object_distance):

@@ -61,7 +61,7 @@ def ways_of(camera):
 
 def evaluate(camera, conditions, way):
     model, precision = way
-    return jax.block_until_ready(tc.psf(camera, model=model, precision=precision, **conditions))
+    return jax.block_until_ready(tc.psf(camera, model=tc.PsfMethod(model, precision), **conditions))
 
 
 def in_double(*trees):
@@ -97,7 +97,7 @@ def judge(camera, conditions, tolerance, times, errors):
     start = time.perf_counter()
     choice = tc.select_model(camera, tolerance=tolerance, **conditions)
     took = time.perf_counter() - start
-    way = (choice.model, choice.precision)
+    way = (choice.method.model, choice.method.precision)
     met = errors.get(way, math.inf) <= tolerance
     fastest = min(times[w] for w, error in errors.items() if error <= tolerance)
     own = times.get(way, math.inf)

@@ -61,7 +61,7 @@ camera = tc.LenslessCamera(mask, tc.Sensor((rows, columns), width / columns), di
 light = {"wavelength": 500 * nm, "object_distance": 250.0}
 
 choice = tc.select_model(camera, tolerance=0.1, **light)
-print(f"{choice.model}, {choice.precision}: predicted {choice.predicted_error:.3f}")
+print(f"{choice.method.model}, {choice.method.precision}: predicted {choice.predicted_error:.3f}")
 print(*choice.reasons, sep="\n")
 
 # %% [markdown]
@@ -73,7 +73,8 @@ print(*choice.reasons, sep="\n")
 tolerances = (0.3, 0.1, 0.03, 1e-2, 1e-4, 1e-6)
 choices = {t: tc.select_model(camera, tolerance=t, **light) for t in tolerances}
 for tolerance, choice in choices.items():
-    print(f"{tolerance:.0e}: {choice.model}, {choice.precision}, {choice.predicted_error:.1e}")
+    method = choice.method
+    print(f"{tolerance:.0e}: {method.model}, {method.precision}, {choice.predicted_error:.1e}")
 
 # %% [markdown]
 # ## All models beside the exact one
@@ -84,11 +85,12 @@ for tolerance, choice in choices.items():
 # samples the mask's hard edge.
 
 # %%
-reference = tc.psf(camera, precision="float64", **light)
+exactly, singly = (tc.PsfMethod(precision=p) for p in ("float64", "float32"))
+reference = tc.psf(camera, model=exactly, **light)
 models = ("geometric", "paraxial", "closed_form", "angular_spectrum", "separable")
 true, predicted, times = {}, {}, {}
 for model in models:
-    way = {"model": model, "precision": "float32", **light}
+    way = {"model": tc.PsfMethod(model, "float32"), **light}
     true[model] = relative_error(tc.psf(camera, **way), reference)
     predicted[model] = tc.predict_error(camera, **way).predicted_error
     times[model] = milliseconds(lambda way=way: tc.psf(camera, **way))
@@ -132,9 +134,9 @@ for _ in range({"full": 40, "small": 6}[SIZE]):
         tc.FresnelZoneAperture(beta, width=size), tc.Sensor((96, 128), size / 128), distance
     )
     seen = {"wavelength": random.uniform(450, 650) * nm, "object_distance": far}
-    exact = tc.psf(drawn, precision="float64", **seen)
+    exact = tc.psf(drawn, model=exactly, **seen)
     for model in closed_forms:
-        way = {"model": model, "precision": "float32", **seen}
+        way = {"model": tc.PsfMethod(model, "float32"), **seen}
         error = relative_error(tc.psf(drawn, **way), exact)
         pairs[model].append((error, tc.predict_error(drawn, **way).predicted_error))
 ratios = np.array([guess / error for both in pairs.values() for error, guess in both])
@@ -160,9 +162,9 @@ figure.savefig(FIGURES / "predictions.png", dpi=110)
 # πw²/(λd), but they are weak.)
 
 # %%
-for precision in ("float32", "float64"):
-    taken = milliseconds(lambda way=precision: tc.psf(camera, precision=way, **light))
-    print(f"{precision}: {taken:.1f} ms")
+for method in (singly, exactly):
+    taken = milliseconds(lambda way=method: tc.psf(camera, model=way, **light))
+    print(f"{method.precision}: {taken:.1f} ms")
 
 # %%
 betas = np.geomspace(2.0, 500.0, {"full": 13, "small": 4}[SIZE])
@@ -171,9 +173,9 @@ for beta in betas:
     fine = tc.LenslessCamera(
         tc.FresnelZoneAperture(beta, width=width), tc.Sensor((96, 128), width / 128), distance=6.5
     )
-    single = tc.psf(fine, precision="float32", **light)
-    guess = tc.predict_error(fine, model="separable", precision="float32", **light)
-    error = relative_error(single, tc.psf(fine, precision="float64", **light))
+    single = tc.psf(fine, model=singly, **light)
+    guess = tc.predict_error(fine, model=singly, **light)
+    error = relative_error(single, tc.psf(fine, model=exactly, **light))
     errors.append((error, guess.predicted_error))
 rounding, guessed_rounding = np.array(errors).T
 corner = betas * width**2 / 2  # rad
@@ -212,8 +214,8 @@ asked = (0.1, 3e-2, 1e-2, 3e-3, 1e-3, 3e-4, 1e-4) if SIZE == "full" else (1e-2, 
 plans = {t: tc.plan(small, scene, tolerance=t) for t in asked}
 missed, taken = [], []
 for plan in plans.values():
-    missed.append(relative_error(tc.capture(small, scene, plan=plan), full))
-    taken.append(milliseconds(lambda plan=plan: tc.capture(small, scene, plan=plan)))
+    missed.append(relative_error(tc.capture(small, scene, model=plan), full))
+    taken.append(milliseconds(lambda plan=plan: tc.capture(small, scene, model=plan)))
 taken_in_full = milliseconds(lambda: tc.capture(small, scene))
 computed = {t: len(p.distances) * len(p.wavelengths) for t, p in plans.items()}
 saved = {t: p.full_cost.flops / p.cost.flops for t, p in plans.items()}
@@ -247,7 +249,7 @@ figure.savefig(FIGURES / "plan.png", dpi=110)
 # - At 3 % even the shadow does for a capture, most of whose light is background.
 
 # %%
-ways = {t: (choice.model, choice.precision) for t, choice in choices.items()}
+ways = {t: (choice.method.model, choice.method.precision) for t, choice in choices.items()}
 assert ways[0.1] == ("paraxial", "float32")
 assert ways[3e-2] == ways[1e-4] == ("separable", "float32")
 assert ways[1e-6] == ("separable", "float64")

@@ -74,7 +74,7 @@ light = {"wavelength": WAVELENGTH, "pixel_integration": True}
 exact = np.asarray(tc.psf(camera, **light))
 shadow = np.asarray(tc.psf(camera, model="geometric", **light))
 choice = tc.select_model(camera, wavelength=WAVELENGTH, tolerance=1e-3, pixel_integration=True)
-print(f"{choice.model} in {choice.precision}: {choice.predicted_error:.1e}")
+print(f"{choice.method.model} in {choice.method.precision}: {choice.predicted_error:.1e}")
 print(f"without diffraction: {np.linalg.norm(shadow - exact) / np.linalg.norm(exact):.0%} off")
 
 figure, panels = plt.subplots(1, 3, figsize=(12, 3.6), layout="constrained")
@@ -84,7 +84,7 @@ for ax, (name, image) in zip(panels, pictures.items(), strict=True):
     ax.imshow(image, cmap="gray", extent=(-right, right, down, -down))
     ax.set(title=name, xlabel="x (mm)", ylabel="y (mm)")
 figure.savefig(FIGURES / "mask_and_psf.png")
-assert choice.model == "separable"
+assert choice.method.model == "separable"
 
 # %% [markdown]
 # ## How wide a slit?

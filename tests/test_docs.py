@@ -56,7 +56,7 @@ def test_accuracy_page(capsys):
     page = (ROOT / "docs/accuracy.md").read_text("utf-8")
     assert not re.findall(r"\b[A-Z]{7,}\b", page)  # no figure left to be filled in
     choice = names["choice"]
-    assert f"{choice.model} {choice.precision} {choice.predicted_error:.4f}" in page
+    assert f"{choice.method.model} {choice.method.precision} {choice.predicted_error:.4f}" in page
     *told, rounding, fresnel = choice.reasons
     assert all(sentence in page and sentence in printed for sentence in (*told, fresnel))
     assert rounding in printed  # its last digit depends on the precision of the camera's numbers

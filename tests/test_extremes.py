@@ -283,9 +283,7 @@ def slope_in_double(camera, pitch, centre, weights, shape, model, pixel_integrat
         tc.LenslessCamera(mask, tc.Sensor(shape, pitch), camera["distance"]),
         wavelength=camera["wavelength"],
         object_distance=camera["object_distance"],
-        model=model,
-        pixel_integration=pixel_integration,
-        precision="float64",
+        model=tc.PsfMethod(model, "float64", pixel_integration),
     )
     return jnp.sum(weights * h)
 
@@ -353,6 +351,9 @@ def test_curvature_of_the_source_has_no_slope_at_infinity():
     assert math.isfinite(result(find("t = ∞"), np.float64)[1]["wavelength"])
 
 
+IN_SINGLE = tc.PsfMethod("separable", "float32")
+
+
 def choice_of(name: str):
     """The camera and the conditions that `select_model` takes."""
     extreme = find(name)
@@ -375,7 +376,7 @@ def error_in_single(name: str) -> float:
     """Against the reference at the numbers in double precision: their rounding counts."""
     extreme = find(name)
     camera, conditions = choice_of(name)
-    h = tc.psf(camera, precision="float32", **conditions)
+    h = tc.psf(camera, model=IN_SINGLE, **conditions)
     return relative_l2(h[:: extreme.every], expected(extreme, np.float64))
 
 
@@ -383,7 +384,7 @@ def error_in_single(name: str) -> float:
 def test_predicted_error(name):
     """Above the true error of float32 and below ten times that; measured 1.25 to 1.4 times."""
     camera, conditions = choice_of(name)
-    predicted = tc.predict_error(camera, model="separable", precision="float32", **conditions)
+    predicted = tc.predict_error(camera, model=IN_SINGLE, **conditions)
     true = error_in_single(name)
     assert true < predicted.predicted_error < 10 * true
 
@@ -394,7 +395,7 @@ def test_choice_of_precision(name):
     """A tolerance that float32 cannot meet chooses float64, which does."""
     camera, conditions = choice_of(name)
     choice = tc.select_model(camera, tolerance=1e-7, **conditions)
-    assert (choice.model, choice.precision) == ("separable", "float64")
+    assert (choice.method.model, choice.method.precision) == ("separable", "float64")
     assert choice.meets_tolerance
     assert error(find(name), np.float64) < 1e-7 < error_in_single(name)
 
@@ -403,7 +404,7 @@ def test_choice_of_precision(name):
 def test_predicted_error_where_the_nodes_of_an_average_fail():
     """Some 60 fringes a pixel are more than 24 nodes follow, in either precision: it is told."""
     camera, conditions = choice_of("d = 1 mm, pixel average")
-    predicted = tc.predict_error(camera, model="separable", precision="float32", **conditions)
+    predicted = tc.predict_error(camera, model=IN_SINGLE, **conditions)
     true = error_in_single("d = 1 mm, pixel average")
     assert true <= predicted.predicted_error <= 10 * true
     assert error(find("d = 1 mm, pixel average"), np.float64) > true / 2

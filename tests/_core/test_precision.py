@@ -1,5 +1,7 @@
 """Computing in another precision than the camera's own, whatever JAX is set to."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -36,12 +38,12 @@ def test_double_precision_without_the_switch(model, average):
     """The float64 result, rounded once: bit by bit, while JAX knows float32 only."""
     small = {"width": 0.5, "pitch": 0.01} if model == "angular_spectrum" else {}
     single, double = single_camera(**small)
-    arguments = {"model": model, "pixel_integration": average}
-    expected = np.asarray(tc.psf(double, **conditions("float64"), **arguments))
+    method = tc.PsfMethod(model, pixel_integration=average)
+    expected = np.asarray(tc.psf(double, **conditions("float64"), model=method))
     with jax.enable_x64(False):
         given = conditions("float32")
-        value = tc.psf(single, precision="float64", **given, **arguments)
-        own = tc.psf(single, **given, **arguments)
+        value = tc.psf(single, model=replace(method, precision="float64"), **given)
+        own = tc.psf(single, model=method, **given)
         assert not jax.config.read("jax_enable_x64")
         assert jnp.ones(1).dtype == jnp.float32
     assert expected.dtype == np.float64
@@ -58,7 +60,7 @@ def test_transfer_function_in_double_precision():
     single, double = single_camera()
     expected = np.asarray(tc.otf(double, **conditions("float64")))
     with jax.enable_x64(False):
-        value = tc.otf(single, precision="float64", **conditions("float32"))
+        value = tc.otf(single, model=tc.PsfMethod(precision="float64"), **conditions("float32"))
         own = tc.otf(single, **conditions("float32"))
     assert value.dtype == own.dtype == jnp.complex64
     error = relative_l2(np.asarray(value, complex), expected)
@@ -69,19 +71,11 @@ def test_transfer_function_in_double_precision():
 def test_single_precision_of_a_double_camera(model):
     """Comes back in float64, with the error of float32: neither none, nor more than a few 1e-5."""
     expected = tc.psf(camera_of(), model=model, **CONDITIONS)
-    value = tc.psf(camera_of(), model=model, precision="float32", **CONDITIONS)
+    value = tc.psf(camera_of(), model=tc.PsfMethod(model, "float32"), **CONDITIONS)
     assert value.dtype == expected.dtype == jnp.float64
     assert 1e-8 < relative_l2(value, expected) < 3e-5
-    same = tc.psf(camera_of(), model=model, precision="float64", **CONDITIONS)
+    same = tc.psf(camera_of(), model=tc.PsfMethod(model, "float64"), **CONDITIONS)
     np.testing.assert_array_equal(same, expected)
-
-
-@pytest.mark.parametrize("precision", ["half", "float16", "double", 64])
-def test_unknown_precision(precision):
-    """By the function's own check: that of the annotations, on in the tests, is taken off."""
-    psf = tc.psf.__wrapped__
-    with pytest.raises(ValueError, match=r"^precision = .* is unknown; choose one of 'float32'"):
-        psf(camera_of(), precision=precision, **CONDITIONS)
 
 
 def total(single, precision):
@@ -89,7 +83,8 @@ def total(single, precision):
 
     def of(distance):
         camera = tc.LenslessCamera(single.mask, single.sensor, distance)
-        return jnp.sum(tc.psf(camera, precision=precision, **conditions("float32")) ** 2)
+        method = tc.PsfMethod(precision=precision)
+        return jnp.sum(tc.psf(camera, model=method, **conditions("float32")) ** 2)
 
     return of
 

@@ -40,7 +40,7 @@ def test_retrieval_of_a_lens(key):
     blank = MaskBlank((40, 48), GRID.pitch, 1.5)
     mask = blank.mask(found.phase / (2 * np.pi) * blank.wrap_height(532 * nm))
     camera = tc.LenslessCamera(mask, tc.Sensor(GRID.shape, GRID.pitch), 2.0)
-    h = tc.psf(camera, wavelength=532 * nm, model="angular_spectrum", oversampling=1)
+    h = tc.psf(camera, wavelength=532 * nm, model=tc.PsfMethod("angular_spectrum", oversampling=1))
     assert np.unravel_index(np.argmax(h), h.shape) == (20, 50)
     # Strehl: a perfect lens of this aperture has (ab/λf)².
     perfect = (40 * 48 * float(GRID.pitch) ** 2 / (532 * nm * 2.0)) ** 2

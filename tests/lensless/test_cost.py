@@ -57,7 +57,7 @@ def both(mask, shape, model, average, dtype, oversampling=None):
     camera = tc.LenslessCamera(mask, tc.Sensor(shape, PITCH), 6.5)
     camera, wavelength, far = in_precision((camera, jnp.asarray(5e-4), jnp.asarray(250.0)), dtype)
     path, grid = camera.path(wavelength, far), camera.sensor.grid
-    method = psf_method(camera.mask, grid, model, average, oversampling=oversampling)
+    method = psf_method(camera.mask, grid, PsfMethod(model, oversampling=oversampling), average)
     lowered = PSF._psf.lower(camera.mask, grid, path, method)
     return allocated(lowered.compile()), psf_cost(camera.mask, grid, method).bytes
 
@@ -258,7 +258,7 @@ def test_arithmetic_grows_as_it_should(average):
         method = PsfMethod(model, pixel_integration=average, **more)
         return psf_cost(mask, tc.Grid(shape, PITCH), method).flops
 
-    plane = {"mask_shape": (1024, 1024), "samples": 3}
+    plane = {"mask_shape": (1024, 1024), "oversampling": 3}
     for model in CLOSED:
         assert flops(model, (1, 4000)) == pytest.approx(10 * flops(model, (1, 400)), rel=0.05)
         assert flops(model, (4000, 4000)) < 100 * flops(model, (400, 400))

@@ -36,9 +36,7 @@ def own_psf(size, model, precision, **how):
             camera,
             wavelength=jnp.asarray(float(np.float32(500e-6)), precision),
             object_distance=jnp.asarray(100.0, precision),
-            model=model,
-            pixel_integration=False,
-            **how,
+            model=tc.PsfMethod(model, **how),
         ),
         float,
     )

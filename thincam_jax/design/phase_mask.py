@@ -178,10 +178,8 @@ class MaskSetting(eqx.Module):
                 mask,
                 self.grid,
                 Path(light[0], self.distance, light[1]),
-                mask_shape=self.method.mask_shape,
-                oversampling=self.method.samples,
+                self.method,
                 padding=_PADDING,
-                pixel_integration=True,
             )
 
         depths, colours = len(self.object_distances), len(self.wavelengths)

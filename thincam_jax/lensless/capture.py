@@ -10,7 +10,7 @@ from thincam_jax.imaging.scene import Scene
 from thincam_jax.imaging.sensor import AbstractNoise, read_out
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.forward import expose
-from thincam_jax.lensless.method import Model
+from thincam_jax.lensless.method import Model, PsfMethod
 from thincam_jax.lensless.plan import Plan, run_plan
 from thincam_jax.lensless.sampling import warn_if_unresolved
 
@@ -21,9 +21,8 @@ def capture(
     *,
     key: Any = None,
     noise: AbstractNoise | None = None,
-    model: Model | None = None,
+    model: Model | PsfMethod | Plan = "separable",
     pixel_integration: bool | None = None,
-    plan: Plan | None = None,
 ) -> Float[Array, "*batch y x"]:
     r"""The captured image of a scene (thesis Eq 3.8): Σ over planes and wavelengths of h ∗ f_d.
 
@@ -37,9 +36,9 @@ def capture(
 
     - `scene`: planes with a common batch shape; the batch is captured image by image.
     - `noise`, `key`: see `thincam_jax.imaging.sensor`; without noise the result is deterministic.
-    - `model`: PSF model, see `psf`; "separable" by default.
-    - `pixel_integration`: average the PSF over the pixels, as a real sensor does; by default yes.
-    - `plan`: from `thincam_jax.plan`; says how to compute in place of the two before.
+    - `model`: PSF model or `PsfMethod`, see `psf`; or what `thincam_jax.plan` returns.
+    - `pixel_integration`: average the PSF over the pixels, as a real sensor does; by default yes,
+      or as planned.
 
     **Returns** (*batch, y, x) in units of radiance × mm². Warns (`SamplingWarning`) where the
     mask's shadow is finer than the pixels resolve.
@@ -50,18 +49,14 @@ def capture(
             "distance=…, width=…), wavelength)"
         )
     warn_if_unresolved(camera, (plane.distance for plane in scene.planes))
-    if plan is not None:
-        if model is not None or pixel_integration is not None:
-            raise ValueError("a plan chooses model and pixel_integration: leave them out")
-        if not isinstance(plan, Plan):
-            raise TypeError(f"plan is a {type(plan).__name__}; give what thincam_jax.plan returns")
-        image = run_plan(plan, camera, scene)
+    if isinstance(model, Plan):
+        if pixel_integration is not None:
+            raise ValueError("a plan chooses pixel_integration: leave it out")
+        image = run_plan(model, camera, scene)
     else:
-        whole = True if pixel_integration is None else pixel_integration
+        average = pixel_integration is not False
         parts = (
-            expose(
-                camera, plane, scene.spectrum, model=model or "separable", pixel_integration=whole
-            )
+            expose(camera, plane, scene.spectrum, model=model, pixel_integration=average)
             for plane in scene.planes
         )
         image = functools.reduce(operator.add, parts)

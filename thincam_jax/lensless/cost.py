@@ -42,7 +42,7 @@ class Cost:
 def psf_cost(mask: AbstractMask, grid: Grid, method: PsfMethod) -> Cost:
     """Cost of `psf` on a grid."""
     rows, columns = grid.shape
-    itemsize = itemsize_of(method.precision)
+    itemsize = itemsize_of(method.float_type)
     if method.model in SAMPLED:
         flops, numbers = _sampled(grid.shape, method)
     else:

@@ -26,7 +26,7 @@ def require_digits(mask: AbstractMask, grid: Grid, path: Path, model: str) -> No
         phase = largest_phase(mask, grid, path, model)
         raise ValueError(
             f"float32 holds the zones' phase of {phase:.1e} rad on this sensor only to "
-            f"{phase * 2.0**-24:.1g} rad; pass precision='float64'"
+            f"{phase * 2.0**-24:.1g} rad; give PsfMethod({model!r}, precision='float64')"
         )
 
 

@@ -4,7 +4,6 @@ import functools
 import math
 import operator
 from collections.abc import Iterable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +19,7 @@ from thincam_jax.imaging.scene import ImagePlane, Spectrum
 from thincam_jax.imaging.sensor import Sensor
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.cost import convolution_cost
-from thincam_jax.lensless.method import Model
+from thincam_jax.lensless.method import Model, PsfMethod, as_method
 from thincam_jax.lensless.psf import psf
 
 # Pixels by which a field grows where an image moves.
@@ -32,7 +31,7 @@ def expose(
     plane: ImagePlane,
     spectrum: Spectrum,
     *,
-    model: Model = "separable",
+    model: Model | PsfMethod = "separable",
     pixel_integration: bool = True,
 ) -> Float[Array, "*batch y x"]:
     """Noise-free capture of one plane: its projection convolved with the PSF of its light."""
@@ -55,24 +54,22 @@ def imaging_operator(
     object_distance: Number,
     *,
     field_shape: tuple[int, int],
-    model: Model = "separable",
+    model: Model | PsfMethod = "separable",
     pixel_integration: bool = True,
-    grid: Grid | None = None,
 ) -> CropConvolution:
     """The operator from a plane's projection on the sensor's pitch to the noise-free capture.
 
     `light` is a `Spectrum` or one wavelength in mm; the PSF is the weighted sum over it. The other
     arguments are those of `psf`.
     """
-    grid = grid or camera.sensor.grid
+    grid = camera.sensor.grid
     spectrum = light if isinstance(light, Spectrum) else Spectrum(light)
     kernel = spectral_psf(
         camera,
         zip(spectrum.wavelengths, spectrum.weights, strict=True),
         object_distance,
-        model=model,
-        pixel_integration=pixel_integration,
-        grid=kernel_grid(grid, field_shape),
+        as_method(model, pixel_integration),
+        kernel_grid(grid, field_shape),
     )
     return CropConvolution(kernel, grid.pitch, grid.shape, field_shape)
 
@@ -81,13 +78,12 @@ def spectral_psf(
     camera: LenslessCamera,
     light: Iterable[tuple[Number, Float[Array, ""] | float]],
     object_distance: Number,
-    **how: Any,
+    method: PsfMethod,
+    grid: Grid,
 ) -> Float[Array, "y x"]:
-    """Sum of the PSFs of (wavelength, weight) pairs; `how`: the other arguments of `psf`."""
-    parts = (
-        weight * psf(camera, wavelength=wavelength, object_distance=object_distance, **how)
-        for wavelength, weight in light
-    )
+    """Sum of the PSFs of (wavelength, weight) pairs."""
+    how = {"object_distance": object_distance, "model": method, "grid": grid}
+    parts = (weight * psf(camera, wavelength=wavelength, **how) for wavelength, weight in light)
     return functools.reduce(operator.add, parts)
 
 

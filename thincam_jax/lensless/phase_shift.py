@@ -13,7 +13,7 @@ from thincam_jax._core.checks import Number
 from thincam_jax._core.grids import Grid
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.masks.fza import FresnelZoneAperture
-from thincam_jax.lensless.method import Model
+from thincam_jax.lensless.method import Model, PsfMethod
 from thincam_jax.lensless.psf import otf
 
 
@@ -23,7 +23,7 @@ def harmonic_otf(
     *,
     wavelength: Number,
     object_distance: Number = math.inf,
-    model: Model = "separable",
+    model: Model | PsfMethod = "separable",
     pixel_integration: bool = False,
 ) -> Complex[Array, "v u"]:
     r"""Response of the m-th harmonic of the captures over the phase of a zone aperture, mm².
@@ -57,7 +57,7 @@ def fringe_scanned_otf(
     *,
     wavelength: Number,
     object_distance: Number = math.inf,
-    model: Model = "separable",
+    model: Model | PsfMethod = "separable",
     pixel_integration: bool = False,
     grid: Grid | None = None,
 ) -> Complex[Array, "v u"]:
@@ -82,7 +82,7 @@ def phase_pair_otf(
     *,
     wavelength: Number,
     object_distance: Number = math.inf,
-    model: Model = "separable",
+    model: Model | PsfMethod = "separable",
     pixel_integration: bool = False,
     grid: Grid | None = None,
 ) -> Complex[Array, "v u"]:

@@ -11,7 +11,7 @@ from jaxtyping import Array, Complex, Float
 from thincam_jax._core.checks import Number
 from thincam_jax._core.grids import Grid
 from thincam_jax._core.memory import refuse_if_too_large
-from thincam_jax._core.precision import Precision, allow, as_complex, cast, precision_of
+from thincam_jax._core.precision import allow, as_complex, cast, precision_of
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.cost import psf_cost
 from thincam_jax.lensless.digits import require_digits
@@ -24,7 +24,7 @@ from thincam_jax.lensless.propagation.geometric import geometric
 from thincam_jax.lensless.propagation.paraxial import paraxial
 from thincam_jax.lensless.propagation.path import Path
 from thincam_jax.lensless.propagation.rayleigh_sommerfeld import rayleigh_sommerfeld
-from thincam_jax.lensless.propagation.separable import PIXEL_NODES, pixel_nodes, separable
+from thincam_jax.lensless.propagation.separable import pixel_nodes, separable
 from thincam_jax.lensless.propagation.separable_sum import SeparableSum, centre_phase
 from thincam_jax.lensless.sampling import require_phase_sampling
 
@@ -34,12 +34,9 @@ def psf(
     *,
     wavelength: Number,
     object_distance: Number = math.inf,
-    model: Model = "separable",
+    model: Model | PsfMethod = "separable",
     pixel_integration: bool = False,
     grid: Grid | None = None,
-    oversampling: int | None = None,
-    mask_shape: tuple[int, int] | None = None,
-    precision: Precision | None = None,
 ) -> Float[Array, "y x"]:
     """Point spread function on the sensor: irradiance relative to the open aperture.
 
@@ -48,17 +45,10 @@ def psf(
     - `wavelength`: λ, mm.
     - `object_distance`: t, mm; the point lies on the axis. Infinity is a plane wave.
     - `model`: "geometric", "paraxial", "closed_form", "separable", "angular_spectrum" or
-      "rayleigh_sommerfeld"; each is documented in `thincam_jax.lensless.propagation`.
+      "rayleigh_sommerfeld"; each is documented in `thincam_jax.lensless.propagation`. A
+      `PsfMethod` sets the precision and the samples of a model, too.
     - `pixel_integration`: average over each pixel in place of the value at its centre.
     - `grid`: where to evaluate; the sensor's pixels by default.
-    - `oversampling`: samples per pixel of the sampled models (odd; default 1, 3 for pixel
-      averages, and more where a phase mask's cells are smaller than that); the others are closed
-      forms and take none.
-    - `mask_shape`: pixels of the plane on which the sampled models hold the mask; by default the
-      smallest that does. Inside jit and grad, where the mask's size is not known, it is the
-      sensor's: give it there if the mask is wider than the sensor.
-    - `precision`: "float32" or "float64", in which to compute; the result comes back in the
-      camera's own, which is also the default. Double precision needs no setting of JAX's.
 
     **Returns** (y, x), dimensionless. Differentiable in every number of `camera` and in
     `wavelength` and `object_distance`.
@@ -69,8 +59,7 @@ def psf(
     does not fit.
     """
     grid = grid or camera.sensor.grid
-    given = (model, pixel_integration, precision, oversampling, mask_shape)
-    method = psf_method(camera.mask, grid, *given)
+    method = psf_method(camera.mask, grid, model, pixel_integration)
     return _evaluate(_psf, camera.mask, grid, camera.path(wavelength, object_distance), method)
 
 
@@ -79,12 +68,9 @@ def otf(
     *,
     wavelength: Number,
     object_distance: Number = math.inf,
-    model: Model = "separable",
+    model: Model | PsfMethod = "separable",
     pixel_integration: bool = False,
     grid: Grid | None = None,
-    oversampling: int | None = None,
-    mask_shape: tuple[int, int] | None = None,
-    precision: Precision | None = None,
 ) -> Complex[Array, "v u"]:
     """Optical transfer function H(u,v) = ∬ h e^{−2πj(ux+vy)} dx dy, zero frequency at n//2, mm².
 
@@ -94,8 +80,7 @@ def otf(
     frequency cell.
     """
     grid = grid or camera.sensor.grid
-    given = (model, pixel_integration, precision, oversampling, mask_shape)
-    method = psf_method(camera.mask, grid, *given)
+    method = psf_method(camera.mask, grid, model, pixel_integration)
     return _evaluate(_otf, camera.mask, grid, camera.path(wavelength, object_distance), method)
 
 
@@ -105,44 +90,28 @@ def _irradiance(
     """The PSF in the form in which the model has it: terms where there are terms, else an image."""
     if method.model not in SAMPLED:
         mask = _unfocused(mask, path) if method.model == "closed_form" else mask
-        return _closed(mask, grid, path, method.model, method.pixel_integration, method.nodes)
+        return _closed(mask, grid, path, method)
     sampled = angular_spectrum if method.model == "angular_spectrum" else rayleigh_sommerfeld
-    return sampled(
-        mask,
-        grid,
-        path,
-        mask_shape=method.mask_shape,
-        oversampling=method.samples,
-        pixel_integration=method.pixel_integration,
-    )
+    return sampled(mask, grid, path, method)
 
 
 def _closed(
-    mask: AbstractMask, grid: Grid, path: Path, model: Model, pixel_integration: bool, nodes: int
+    mask: AbstractMask, grid: Grid, path: Path, method: PsfMethod
 ) -> SeparableSum | ChirpSum | Float[Array, "y x"]:
+    model, average = method.model, method.pixel_integration
     if model == "geometric":
-        return geometric(mask, grid, path, pixel_integration=pixel_integration)
+        return geometric(mask, grid, path, pixel_integration=average)
     if model == "separable":
-        return separable(mask, grid, path, pixel_integration=pixel_integration, nodes=nodes)
+        return separable(mask, grid, path, pixel_integration=average, nodes=method.nodes)
     return paraxial(mask, path) if model == "paraxial" else closed_form(mask, path)
 
 
-@jax.jit(static_argnames=("model", "pixel_integration", "nodes"))
-def closed_terms(
-    mask: AbstractMask,
-    grid: Grid,
-    path: Path,
-    model: Model,
-    pixel_integration: bool,
-    nodes: int = PIXEL_NODES,
-) -> SeparableSum:
-    """The PSF of a mask of separable terms by one of the closed forms, as separable terms.
-
-    `nodes`: of the pixel average of `separable`.
-    """
-    h = _closed(mask, grid, path, model, pixel_integration, nodes)
+@jax.jit(static_argnames="method")
+def closed_terms(mask: AbstractMask, grid: Grid, path: Path, method: PsfMethod) -> SeparableSum:
+    """The PSF of a mask of separable terms by one of the closed forms, as separable terms."""
+    h = _closed(mask, grid, path, method)
     if isinstance(h, ChirpSum):
-        h = h.sample(grid, pixel_integration=pixel_integration)
+        h = h.sample(grid, pixel_integration=method.pixel_integration)
     assert isinstance(h, SeparableSum)  # of a mask of terms
     return h
 
@@ -172,10 +141,10 @@ def _evaluate(function, mask: AbstractMask, grid: Grid, path: Path, method: PsfM
     own = precision_of(grid.pitch)
     require_phase_sampling(mask, grid, path, method)
     if method.model == "separable" and method.pixel_integration:
-        method = replace(method, nodes=pixel_nodes(mask, grid, path, method.precision))
-    with allow(method.precision, mask, grid, path):
+        method = replace(method, nodes=pixel_nodes(mask, grid, path, method.float_type))
+    with allow(method.float_type, mask, grid, path):
         if method.precision != own:
-            mask, grid, path = cast((mask, grid, path), method.precision)
+            mask, grid, path = cast((mask, grid, path), method.float_type)
         if method.precision == "float32":
             require_digits(mask, grid, path, method.model)
         rows, columns = grid.shape

@@ -1,5 +1,6 @@
 """A lensless camera as a short sum of products of its rows and columns: FlatCam, exactly."""
 
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -10,13 +11,13 @@ from jaxtyping import Array, Float
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Number
 from thincam_jax._core.grids import Grid
-from thincam_jax._core.precision import precision_of, product
+from thincam_jax._core.precision import product
 from thincam_jax.imaging.operators import Separable, Truncated, kernel_grid, orthogonal_terms
 from thincam_jax.imaging.scene import Scene
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.forward import projected_shape
-from thincam_jax.lensless.method import Model
-from thincam_jax.lensless.propagation.separable import PIXEL_NODES, pixel_nodes
+from thincam_jax.lensless.method import Model, PsfMethod, psf_method
+from thincam_jax.lensless.propagation.separable import pixel_nodes
 from thincam_jax.lensless.psf import closed_terms
 
 # Terms below this part of all are those of other terms again: rounding.
@@ -28,7 +29,7 @@ def separable_operator(
     scene: Any,
     *,
     tolerance: Number = 1e-2,
-    model: Model = "separable",
+    model: Model | PsfMethod = "separable",
     pixel_integration: bool = True,
 ) -> Truncated:
     r"""The operator from the image of a scene, upright, to its noise-free capture.
@@ -68,7 +69,9 @@ def separable_operator(
     (plane,) = scene.planes
     field = projected_shape(camera, plane)
     grid, fine = camera.sensor.grid, Grid(field, camera.sensor.pitch)
-    rows, columns = _factors(camera, scene, kernel_grid(grid, field), model, pixel_integration)
+    kernel = kernel_grid(grid, field)
+    method = psf_method(camera.mask, kernel, model, pixel_integration)
+    rows, columns = _factors(camera, scene, kernel, method)
     down, across = plane.weights(fine, magnification=-camera.distance / plane.distance)
     left, right = (
         grid.pitch * product(_toeplitz(factors, size), weights.astype(factors.dtype))
@@ -81,16 +84,16 @@ def separable_operator(
     return operator.truncated(tolerance)
 
 
-def _factors(camera, scene: Scene, grid: Grid, model: Model, pixel_integration: bool):
+def _factors(camera, scene: Scene, grid: Grid, method: PsfMethod):
     """Σ_f Y_f X_f = h, the weighted sum over the light."""
     (plane,), light = scene.planes, scene.spectrum
     rows, columns = [], []
     for wavelength, weight in zip(light.wavelengths, light.weights, strict=True):
         path = camera.path(wavelength, plane.distance)
-        nodes = PIXEL_NODES
-        if pixel_integration:
-            nodes = pixel_nodes(camera.mask, grid, path, precision_of(grid.pitch))
-        terms = closed_terms(camera.mask, grid, path, model, pixel_integration, nodes)
+        if method.pixel_integration:
+            nodes = pixel_nodes(camera.mask, grid, path, method.float_type)
+            method = replace(method, nodes=nodes)
+        terms = closed_terms(camera.mask, grid, path, method)
         y, x = terms.real_factors()
         rows.append(weight.astype(y.dtype) * y)
         columns.append(x)

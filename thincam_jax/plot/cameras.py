@@ -12,7 +12,7 @@ from thincam_jax._core.grids import Grid
 from thincam_jax.lensless import psf as psfs
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.masks.base import AbstractMask
-from thincam_jax.lensless.method import Model
+from thincam_jax.lensless.method import Model, PsfMethod
 from thincam_jax.plot.frame import Figure, new_figure, show_image
 
 
@@ -21,7 +21,7 @@ def psf(
     *,
     wavelength: Number,
     object_distance: Number = math.inf,
-    model: Model = "separable",
+    model: Model | PsfMethod = "separable",
     pixel_integration: bool = True,
 ) -> Figure:
     """A camera's PSF, as an image and along a line through its middle; arguments as of `tc.psf`.
@@ -62,7 +62,7 @@ def otf(
     *,
     wavelength: Number,
     object_distance: Number = math.inf,
-    model: Model = "separable",
+    model: Model | PsfMethod = "separable",
     pixel_integration: bool = True,
 ) -> Figure:
     """Magnitude of a camera's OTF, relative to zero frequency, and the same along v = 0.

@@ -91,10 +91,8 @@ def psf_of(
             given.camera,
             wavelength=given.wavelength,
             object_distance=float(given.object_distance),
-            model=model,
-            pixel_integration=study.pixel_integration,
+            model=PsfMethod(model, precision, study.pixel_integration),
             grid=Grid(shape, grid.pitch) if shape else grid,
-            precision=precision,
         )
     return np.asarray(h)
 
@@ -117,7 +115,9 @@ def candidates(camera: LenslessCamera, pixel_integration: bool) -> list[tuple[Ps
     """Every model in both precisions, the sampled ones at each oversampling."""
     mask, grid = camera.mask, camera.sensor.grid
     methods = [
-        psf_method(mask, grid, model, pixel_integration, precision, oversampling)
+        psf_method(
+            mask, grid, PsfMethod(model, precision, pixel_integration, oversampling=oversampling)
+        )
         for model in MODELS
         for oversampling in (OVERSAMPLINGS if model in SAMPLED else (None,))
         for precision in PRECISIONS
@@ -181,7 +181,7 @@ class PsfErrors:
             found = candidates(self.given["float64"].camera, study.pixel_integration)
         self.work = [
             Step(
-                f"{size} pixels: {label(method.model, method.precision, method.oversampling)}",
+                f"{size} pixels: {label(method.model, method.float_type, method.oversampling)}",
                 partial(self._add, method, cost),
             )
             for method, cost in found
@@ -213,7 +213,7 @@ class PsfErrors:
                 probe, reference = self._exact
                 mask, grid = exact.camera.mask, exact.camera.sensor.grid
                 predicted = predicted_error(probe, mask, grid, method)
-                timed = _measured(self.given[method.precision], method)
+                timed = _measured(self.given[method.float_type], method)
                 error = relative_error(timed.result, reference)
                 seconds, compile_seconds, calls = timed.seconds, timed.compile_seconds, timed.calls
         self._rows.append(
@@ -221,7 +221,7 @@ class PsfErrors:
                 self.study.sensor.shape,
                 self.study.pitch,
                 method.model,
-                method.precision,
+                method.float_type,
                 method.oversampling,
                 "run" if reason is None else "not run",
                 reason,
@@ -278,12 +278,7 @@ class Timed:
 
 def _measured(given: Conditions, method: PsfMethod) -> Timed:
     def compute(camera, wavelength, object_distance):
-        return psf(
-            camera,
-            wavelength=wavelength,
-            object_distance=object_distance,
-            **method.arguments,
-        )
+        return psf(camera, wavelength=wavelength, object_distance=object_distance, model=method)
 
     return measure(compute, given.camera, given.wavelength, given.object_distance)
 

@@ -20,7 +20,7 @@ from thincam_jax.imaging.scene import Spectrum
 from thincam_jax.lensless.cost import psf_cost
 from thincam_jax.lensless.exposures import Exposure
 from thincam_jax.lensless.forward import imaging_operator, project, projected_shape
-from thincam_jax.lensless.method import MODELS, Model, psf_method
+from thincam_jax.lensless.method import MODELS, Model, PsfMethod, psf_method
 from thincam_jax.reconstruction import Reconstruction
 from thincam_jax.studies.evaluate import evaluate, field_shape, reconstructor
 from thincam_jax.studies.psf_accuracy import (
@@ -164,9 +164,9 @@ def kernel_reason(case: Case, exposure: Exposure, model: Model) -> str | None:
     """Why a model is not run for a capture; None where it is."""
     with allow("float64"):
         given = conditions_of(case.study, exposure)["float64"]
-        whole = case.study.pixel_integration
+        single = PsfMethod(model, "float32", case.study.pixel_integration)
         grid = Grid(case.kernel_shape, jnp.asarray(given.camera.sensor.pitch))
-        method = psf_method(given.camera.mask, grid, model, whole, "float32")
+        method = psf_method(given.camera.mask, grid, single)
         return why_not(model, psf_cost(given.camera.mask, grid, method), given)
 
 

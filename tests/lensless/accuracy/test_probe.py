@@ -64,7 +64,7 @@ def test_small_images_are_known_exactly(case):
             # The probe's own pixel average has twice the nodes.
             rel = 1e-3 if case.conditions["pixel_integration"] else 1e-6
             assert probe.difference(first, second) == pytest.approx(true, rel=rel, abs=1e-7)
-        rounded = value(case, first, precision="float32")
+        rounded = value(case, PsfMethod(first, "float32"))
         cost = np.linalg.norm(rounded - images[first]) / scale
         assert cost <= probe.rounding(first, "float32") < 2 * cost + 5e-7
     assert probe.difference("geometric", "separable") > 1e-3
@@ -104,7 +104,7 @@ def test_sampled_models(optimised, precision, average, oversampling, height):
     probe = probe_of(case)
     exact = cameras.expected(case)
     for model, within in (("angular_spectrum", 0.05), ("rayleigh_sommerfeld", 0.3)):
-        image = value(case, model, precision=precision, oversampling=oversampling)
+        image = value(case, PsfMethod(model, precision, oversampling=oversampling))
         method = PsfMethod(
             model, precision, average, oversampling, (66 if height is None else 46, 64)
         )
@@ -123,9 +123,8 @@ def test_paraxial_error_of_a_small_aperture(distance, known):
     case = case_of((12, 15), 0.03, width=0.3, beta=200.0, distance=distance, object_distance=np.inf)
     path = Path(THESIS["wavelength"], distance)
     mask, grid = case.camera.mask, case.camera.sensor.grid
-    exact = jax.jit(
-        lambda: angular_spectrum(mask, grid, path, mask_shape=(10, 11), oversampling=31)
-    )
+    method = PsfMethod("angular_spectrum", oversampling=31, mask_shape=(10, 11))
+    exact = jax.jit(lambda: angular_spectrum(mask, grid, path, method))
     fresnel = np.asarray(jax.jit(lambda: separable(mask, grid, path).image())())
     true = relative_l2(np.asarray(exact()), fresnel)
     assert true == pytest.approx(known, rel=0.3)

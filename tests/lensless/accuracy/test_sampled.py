@@ -41,10 +41,11 @@ def test_predicted_errors_are_at_least_the_true_ones(name, average):
     here = camera(name)
     light = {"wavelength": WAVELENGTH, "pixel_integration": average}
     choice = tc.select_model(here, tolerance=0.05 if name == "cells" else 0.02, **light)
-    assert choice.model == "angular_spectrum" and choice.meets_tolerance
-    best = tc.psf(here, model="angular_spectrum", oversampling=11, mask_shape=(120, 128), **light)
+    assert choice.method.model == "angular_spectrum" and choice.meets_tolerance
+    finest = tc.PsfMethod("angular_spectrum", oversampling=11, mask_shape=(120, 128))
+    best = tc.psf(here, model=finest, **light)
     for tried in choice.considered:
-        found = tc.psf(here, model=tried.model, oversampling=tried.oversampling, **light)
+        found = tc.psf(here, model=tried.method, **light)
         true = relative_l2(found, best)
         assert true < tried.predicted_error < 12 * true + 1e-6, (tried, true)
     assert "has no exact PSF" in choice.reasons[0]
@@ -54,7 +55,7 @@ def test_predicted_errors_are_at_least_the_true_ones(name, average):
 def test_a_choice_beyond_reach_says_so_and_traced_numbers_are_refused():
     choice = tc.select_model(camera("diffuser"), wavelength=WAVELENGTH, tolerance=1e-9)
     assert not choice.meets_tolerance
-    assert [p.oversampling for p in choice.considered] == [1, 3, 5, 7]
+    assert [p.method.oversampling for p in choice.considered] == [1, 3, 5, 7]
     assert choice.predicted_error == choice.considered[-1].predicted_error
     lenses = camera("lenses")
     with pytest.raises(TypeError, match="the choice of a model needs known numbers"):

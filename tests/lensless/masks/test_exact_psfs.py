@@ -197,11 +197,10 @@ def test_models_are_selected(name):
     light = {"wavelength": WAVELENGTH, "object_distance": 40.0}
     choice = tc.select_model(camera, **light, tolerance=1e-4)
     assert choice.meets_tolerance
-    chosen = {"model": choice.model, "precision": choice.precision}
-    found = tc.psf(camera, **light, **chosen, oversampling=choice.oversampling)
+    found = tc.psf(camera, **light, model=choice.method)
     exact = psf_of(camera.mask, 40.0)
     assert relative_l2(np.asarray(found), exact) <= choice.predicted_error
-    offered = {prediction.model for prediction in choice.considered}
+    offered = {prediction.method.model for prediction in choice.considered}
     assert not offered & {"closed_form", "paraxial"}
     assert ("geometric" in offered) == (name != "lenslets")
 
@@ -214,4 +213,4 @@ def test_a_scene_is_planned():
         [tc.ImagePlane(image, 40.0, 4.0)], tc.Spectrum(jnp.asarray([WAVELENGTH]), jnp.ones(1))
     )
     plan = tc.plan(camera, scene, tolerance=1e-3)
-    assert plan.model == "separable" and plan.predicted_error <= 1e-3
+    assert plan.method.model == "separable" and plan.predicted_error <= 1e-3

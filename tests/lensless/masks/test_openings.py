@@ -16,7 +16,8 @@ def test_round_pinhole_on_the_axis():
     for zones in (1.0, 1.5, 2.0):
         distance = a**2 / (wavelength * zones)
         camera = tc.LenslessCamera(mask, tc.Sensor((1, 1), 0.202 / 301), distance)
-        h = tc.psf(camera, wavelength=wavelength, model="angular_spectrum", mask_shape=(301, 301))
+        method = tc.PsfMethod("angular_spectrum", mask_shape=(301, 301))
+        h = tc.psf(camera, wavelength=wavelength, model=method)
         assert float(h[0, 0]) == pytest.approx(4 * np.sin(np.pi * zones / 2) ** 2, abs=0.06)
 
 
@@ -58,8 +59,8 @@ def test_light_behind_rings_arrives():
 
     def one(distance):
         camera = tc.LenslessCamera(mask, tc.Sensor((100, 104), 5e-3), distance)
-        options = {"model": "angular_spectrum", "oversampling": 3, "pixel_integration": True}
-        return tc.psf(camera, wavelength=500e-6, mask_shape=(64, 64), **options)
+        method = tc.PsfMethod("angular_spectrum", oversampling=3, mask_shape=(64, 64))
+        return tc.psf(camera, wavelength=500e-6, model=method, pixel_integration=True)
 
     several = jax.jit(jax.vmap(one))(jnp.asarray([1.0, 2.0]))
     np.testing.assert_allclose(several[0], one(1.0), rtol=0, atol=1e-9)

@@ -28,8 +28,15 @@ def camera(mask, shape=(48, 64), pitch=5 * um, distance=10.0):
     return tc.LenslessCamera(mask, tc.Sensor(shape, pitch), distance)
 
 
-def psf(camera, **given):
-    return np.asarray(tc.psf(camera, **{"wavelength": WAVELENGTH, "model": AS} | given))
+def psf(camera, model=AS, *, pixel_integration=False, object_distance=np.inf, **settings):
+    return np.asarray(
+        tc.psf(
+            camera,
+            wavelength=settings.pop("wavelength", WAVELENGTH),
+            object_distance=object_distance,
+            model=tc.PsfMethod(model, pixel_integration=pixel_integration, **settings),
+        )
+    )
 
 
 def test_transmittance_of_cells_and_between_them():
@@ -195,8 +202,9 @@ def test_gradients(interpolation):
         centre = jnp.stack([y, x])
         mask = tc.PhaseMask(height, pitch, material, centre=centre, interpolation=interpolation)
         where = tc.LenslessCamera(mask, tc.Sensor((10, 12), 5 * um), distance)
-        light = {"wavelength": wavelength, "object_distance": away, "mask_shape": (20, 22)}
-        return jnp.sum(weights * tc.psf(where, model=AS, oversampling=3, **light))
+        light = {"wavelength": wavelength, "object_distance": away}
+        method = tc.PsfMethod(AS, oversampling=3, mask_shape=(20, 22))
+        return jnp.sum(weights * tc.psf(where, model=method, **light))
 
     given = (1.49, 10.1 * um, 1.3 * um, 0.7 * um, WAVELENGTH, 1.5, 40.0)
     numbers = (height, *(jnp.asarray(n) for n in given))
@@ -216,8 +224,8 @@ def test_vmap_over_wavelengths_is_one_psf_each():
     here = camera(mask, (10, 12), 5 * um, 1.0)
 
     def one(wavelength):
-        light = {"wavelength": wavelength, "mask_shape": (16, 18)}
-        return tc.psf(here, model=AS, oversampling=3, **light)
+        method = tc.PsfMethod(AS, oversampling=3, mask_shape=(16, 18))
+        return tc.psf(here, wavelength=wavelength, model=method)
 
     lights = jnp.array([450.0, 620.0]) * nm
     several = jax.jit(jax.vmap(one))(lights)

@@ -55,7 +55,8 @@ def test_every_site_of_a_voronoi_fresnel_mask_is_a_focus(key):
     mask = voronoi_fresnel(key, blank, sites=12, focal_length=2.0, wavelength=WAVELENGTH)
     assert 0 <= float(mask.height.min()) and float(mask.height.max()) < 1 * um
     camera = tc.LenslessCamera(mask, tc.Sensor((200, 260), 2 * um), 2.0)
-    h = np.asarray(tc.psf(camera, wavelength=WAVELENGTH, model="angular_spectrum", oversampling=1))
+    method = tc.PsfMethod("angular_spectrum", oversampling=1)
+    h = np.asarray(tc.psf(camera, wavelength=WAVELENGTH, model=method))
     peak = (h == scipy.ndimage.maximum_filter(h, 15)) & (h > 0.3 * h.max())
     assert peak.sum() == 12
     places = np.argwhere(peak) * 2 * um

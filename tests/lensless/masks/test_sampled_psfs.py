@@ -37,8 +37,8 @@ def mask_of(name):
 @functools.partial(jax.jit, static_argnums=(0, 3))
 def psf(name, distance, wavelength, shape=SHAPE):
     camera = tc.LenslessCamera(mask_of(name), tc.Sensor(shape, PITCH), distance)
-    options = {"model": "angular_spectrum", "oversampling": 3, "mask_shape": (44, 52)}
-    return tc.psf(camera, wavelength=wavelength, **options)
+    method = tc.PsfMethod("angular_spectrum", oversampling=3, mask_shape=(44, 52))
+    return tc.psf(camera, wavelength=wavelength, model=method)
 
 
 def test_near_and_far(name):
@@ -61,10 +61,10 @@ def test_near_and_far(name):
     camera = tc.LenslessCamera(mask_of(name), tc.Sensor(SHAPE, PITCH), distance)
     choice = tc.select_model(camera, wavelength=WAVELENGTH, tolerance=1e-3)
     assert not choice.meets_tolerance
-    options = {"wavelength": WAVELENGTH, "model": "angular_spectrum"}
-    off = relative_l2(tc.psf(camera, oversampling=choice.oversampling, **options), far)
+    off = relative_l2(tc.psf(camera, wavelength=WAVELENGTH, model=choice.method), far)
     assert 0.03 < off < 3 * choice.predicted_error < 12 * off
-    assert relative_l2(tc.psf(camera, oversampling=3, mask_shape=(416, 416), **options), far) < 0.02
+    wide = tc.PsfMethod("angular_spectrum", oversampling=3, mask_shape=(416, 416))
+    assert relative_l2(tc.psf(camera, wavelength=WAVELENGTH, model=wide), far) < 0.02
 
 
 def test_short_waves_cast_the_shadow(name):

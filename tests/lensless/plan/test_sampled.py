@@ -46,11 +46,8 @@ def reference(here, scene, samples):
             here,
             zip(LIGHT.wavelengths, LIGHT.weights, strict=True),
             plane.distance,
-            model="angular_spectrum",
-            pixel_integration=True,
-            grid=grid,
-            oversampling=samples,
-            mask_shape=(120, 128),
+            tc.PsfMethod("angular_spectrum", None, True, samples, (120, 128)),
+            grid,
         )
         convolution = CropConvolution(kernel, grid.pitch, here.sensor.shape, field)
         total = total + convolution(project(here, plane, field))
@@ -65,8 +62,8 @@ def test_predicted_error_is_at_least_the_true_one(optimised, name, samples):
     here, scene = camera(name), deep()
     true = reference(here, scene, samples)
     plan = tc.plan(here, scene, tolerance=0.05)
-    found = relative_l2(tc.capture(here, scene, plan=plan), true)
-    assert plan.model == "angular_spectrum" and plan.meets_tolerance
+    found = relative_l2(tc.capture(here, scene, model=plan), true)
+    assert plan.method.model == "angular_spectrum" and plan.meets_tolerance
     assert found < plan.predicted_error <= 0.05
     assert plan.predicted_error < 50 * found
     assert len(plan.distances) * len(plan.wavelengths) < 9
@@ -79,10 +76,14 @@ def test_a_plan_runs_inside_jit():
     image = np.random.default_rng(2).uniform(0, 1, (9, 11))
     scene = tc.Scene([tc.ImagePlane(image, t, 0.05 * t) for t in (50.0, 52.0)], 532 * nm)
     plan = tc.plan(here, scene, tolerance=0.3)
-    assert plan.model == "angular_spectrum" and plan.meets_tolerance and len(plan.distances) == 1
-    assert f"{plan.oversampling}×{plan.oversampling} samples a pixel" in str(plan)
-    found = jax.jit(lambda c: tc.capture(c, scene, plan=plan))(here)
-    np.testing.assert_allclose(found, tc.capture(here, scene, plan=plan), rtol=1e-6)
-    more = {"oversampling": 27, "mask_shape": (36, 40)}
-    best = replace(plan, distances=(50.0, 52.0), mixing=np.eye(2), precision="float64", **more)
-    assert relative_l2(found, tc.capture(here, scene, plan=best)) < plan.predicted_error
+    assert (
+        plan.method.model == "angular_spectrum"
+        and plan.meets_tolerance
+        and len(plan.distances) == 1
+    )
+    assert f"{plan.method.oversampling}×{plan.method.oversampling} samples a pixel" in str(plan)
+    found = jax.jit(lambda c: tc.capture(c, scene, model=plan))(here)
+    np.testing.assert_allclose(found, tc.capture(here, scene, model=plan), rtol=1e-6)
+    finest = tc.PsfMethod("angular_spectrum", "float64", True, 27, (36, 40))
+    best = replace(plan, distances=(50.0, 52.0), mixing=np.eye(2), method=finest)
+    assert relative_l2(found, tc.capture(here, scene, model=best)) < plan.predicted_error

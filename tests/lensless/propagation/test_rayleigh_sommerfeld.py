@@ -15,7 +15,10 @@ WAVELENGTH = 500e-6
 MASK = tc.FresnelZoneAperture(200.0, 0.3, width=0.5, centre=(0.02, -0.03))
 
 direct = jax.jit(
-    rayleigh_sommerfeld, static_argnames=("mask_shape", "oversampling", "pixel_integration")
+    lambda mask, grid, path, **settings: rayleigh_sommerfeld(
+        mask, grid, path, tc.PsfMethod("rayleigh_sommerfeld", **settings)
+    ),
+    static_argnames=("mask_shape", "oversampling", "pixel_integration"),
 )
 
 exact = jax.jit(

@@ -9,8 +9,9 @@ from lensless.propagation import reference
 
 import thincam_jax as tc
 from helpers import relative_l2
+from thincam_jax.lensless.method import PIXEL_NODES
 from thincam_jax.lensless.propagation import Path
-from thincam_jax.lensless.propagation.separable import PIXEL_NODES, pixel_nodes, separable
+from thincam_jax.lensless.propagation.separable import pixel_nodes, separable
 
 INF = float("inf")
 THESIS = {"beta": 25.0, "width": 5.632, "distance": 6.5, "wavelength": 500e-6}

@@ -15,7 +15,7 @@ from thincam_jax.imaging.operators import CropConvolution, kernel_shape
 from thincam_jax.imaging.scene import Spectrum
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.forward import spectral_psf
-from thincam_jax.lensless.method import MODELS, Model
+from thincam_jax.lensless.method import MODELS, Model, PsfMethod
 
 # Pixels that a PSF is kept beyond the mask's shadow: diffraction at its edge falls fast. For a zone
 # aperture on pixels of 44 µm what is cut off is 1e-3 of the light at most (tests/learn).
@@ -172,9 +172,9 @@ class RefocusCamera(eqx.Module):
     def kernels(self, distances: Float[Array, " plane"]) -> Float[Array, "plane k l"]:
         """The PSFs at these distances, mm, on `support` pixels."""
         grid = self.camera.sensor.grid.with_shape(self.support)
-        how = {"grid": grid, "model": self.model, "pixel_integration": True}
+        method = PsfMethod(self.model, pixel_integration=True)
         light = list(zip(self.light.wavelengths, self.light.weights, strict=True))
-        return jax.vmap(lambda t: spectral_psf(self.camera, light, t, **how))(distances)
+        return jax.vmap(lambda t: spectral_psf(self.camera, light, t, method, grid))(distances)
 
     def _support(self) -> tuple[int, int]:
         whole = kernel_shape(self.camera.sensor.shape, self.field_shape)

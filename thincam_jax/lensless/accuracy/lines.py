@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 from thincam_jax._core.grids import Grid, centred_frequencies, centred_indices
 from thincam_jax._core.precision import as_complex, turn_phasor
 from thincam_jax.lensless.masks.base import AbstractFactoredMask, pairs
+from thincam_jax.lensless.method import PsfMethod
 from thincam_jax.lensless.propagation.angular_spectrum import (
     padded_shape,
     planes,
@@ -96,24 +97,19 @@ def chosen(
     return found, total[-1] / (COUNT * density[found])
 
 
-@functools.partial(
-    jax.jit, static_argnames=("shape", "pixel_integration", "mask_shape", "oversampling")
-)
+@jax.jit(static_argnames=("shape", "method"))
 def angular_spectrum_terms(
     mask: AbstractFactoredMask,
     points: SparseGrid,
     path: Path,
-    *,
     shape: tuple[int, int],
-    pixel_integration: bool,
-    mask_shape: tuple[int, int],
-    oversampling: int,
+    method: PsfMethod,
 ) -> SeparableSum:
     """The PSF of `angular_spectrum` at some rows and columns of a grid of `shape`, as a product."""
     terms = mask.terms(path.wavelength)
     lower, upper, weights = pairs(terms.coefficients)
-    plane, sensor = planes(Grid(shape, points.pitch), mask_shape, oversampling)
-    half = oversampling // 2 if pixel_integration else 0
+    plane, sensor = planes(Grid(shape, points.pitch), method)
+    half = method.samples // 2 if method.pixel_integration else 0
     factors = []
     both = (terms.rows, points.row_indices), (terms.columns, points.column_indices)
     for axis, (along, indices) in enumerate(both):
@@ -121,7 +117,7 @@ def angular_spectrum_terms(
         values = along.samples(line.x - mask.centre[axis], line.pitch)
         lit = values * spherical_wave(line, path)
         # Sensor samples of the chosen pixels, counted from the axis.
-        fine = indices[:, None] * oversampling + jnp.arange(-half, half + 1, dtype=indices.dtype)
+        fine = indices[:, None] * method.samples + jnp.arange(-half, half + 1, dtype=indices.dtype)
         across = sensor.shape[axis]
         size = padded_shape((samples, samples), (across, across), 2.0)[0]
         fields = _by_transform(lit, plane.pitch, path, size, fine.ravel())

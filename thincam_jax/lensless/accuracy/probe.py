@@ -22,12 +22,11 @@ from thincam_jax.lensless.accuracy.lines import (
     fine_fields,
 )
 from thincam_jax.lensless.masks.base import AbstractFactoredMask, pairs
-from thincam_jax.lensless.method import Model, PsfMethod
+from thincam_jax.lensless.method import PIXEL_NODES, Model, PsfMethod
 from thincam_jax.lensless.propagation.angular_spectrum import lit_mask, planes
 from thincam_jax.lensless.propagation.closed_form import in_focus
 from thincam_jax.lensless.propagation.path import Path
 from thincam_jax.lensless.propagation.rayleigh_sommerfeld import rayleigh_sommerfeld_field
-from thincam_jax.lensless.propagation.separable import PIXEL_NODES
 from thincam_jax.lensless.propagation.separable_sum import SeparableSum
 from thincam_jax.lensless.psf import closed_terms
 
@@ -88,17 +87,17 @@ def lines_of(mask: AbstractFactoredMask, grid: Grid, path: Path) -> Lines:
     return Lines(rows, columns, row_weights, column_weights)
 
 
-@jax.jit(static_argnames=("shape", "pixel_integration", "mask_shape", "oversampling"))
+@jax.jit(static_argnames=("shape", "method"))
 def _direct_sum(
-    mask, points: SparseGrid, path: Path, *, shape, pixel_integration, mask_shape, oversampling
+    mask, points: SparseGrid, path: Path, shape: tuple[int, int], method: PsfMethod
 ) -> Float[Array, "row column"]:
     """`rayleigh_sommerfeld` at some pixels."""
-    plane, _ = planes(Grid(shape, points.pitch), mask_shape, oversampling)
+    plane, _ = planes(Grid(shape, points.pitch), method)
     lit = lit_mask(mask, plane, path)
-    sensor = points.refined(oversampling) if pixel_integration else points
+    sensor = points.refined(method.samples) if method.pixel_integration else points
     field = rayleigh_sommerfeld_field(lit, plane, sensor, path)
     irradiance = (field.real**2 + field.imag**2) * path.magnification**2
-    return block_mean(irradiance, oversampling) if pixel_integration else irradiance
+    return block_mean(irradiance, method.samples) if method.pixel_integration else irradiance
 
 
 def _spread(count: int, most: int) -> Float[np.ndarray, " chosen"]:
@@ -203,7 +202,8 @@ class MaskProbe:
             with allow(precision):
                 mask, pitch, path = self.given[precision]
                 points = self.lines.points(pitch)
-                terms = closed_terms(mask, points, path, model, self.pixel_integration, nodes)
+                method = PsfMethod(model, precision, self.pixel_integration, nodes=nodes)
+                terms = closed_terms(mask, points, path, method)
                 self._cache[key] = self._factors(terms)
         return self._cache[key]
 
@@ -255,18 +255,10 @@ class MaskProbe:
 
     def angular_spectrum(self, method: PsfMethod) -> float:
         """Relative distance of the angular spectrum from the reference, rounding included."""
-        with allow(method.precision):
-            mask, pitch, path = self.given[method.precision]
-            terms = angular_spectrum_terms(
-                mask,
-                self.lines.points(pitch),
-                path,
-                shape=self.shape,
-                pixel_integration=self.pixel_integration,
-                mask_shape=method.mask_shape,
-                oversampling=method.samples,
-            )
-            found = self._factors(terms)
+        with allow(method.float_type):
+            mask, pitch, path = self.given[method.float_type]
+            points = self.lines.points(pitch)
+            found = self._factors(angular_spectrum_terms(mask, points, path, self.shape, method))
         return distance(found, self.reference) / self.scale
 
     def rayleigh_sommerfeld(self, method: PsfMethod) -> float:
@@ -275,22 +267,12 @@ class MaskProbe:
         with allow("float64"):
             mask, pitch, path = self.given["float64"]
             points = SparseGrid(few[0], few[1], pitch)
-            exact = closed_terms(mask, points, path, "separable", self.pixel_integration).image()
-            exact = np.asarray(exact)
-        with allow(method.precision):
-            mask, pitch, path = self.given[method.precision]
-            found = np.asarray(
-                _direct_sum(
-                    mask,
-                    SparseGrid(few[0], few[1], pitch),
-                    path,
-                    shape=self.shape,
-                    pixel_integration=self.pixel_integration,
-                    mask_shape=method.mask_shape,
-                    oversampling=method.samples,
-                ),
-                float,
-            )
+            separable = PsfMethod("separable", "float64", self.pixel_integration)
+            exact = np.asarray(closed_terms(mask, points, path, separable).image())
+        with allow(method.float_type):
+            mask, pitch, path = self.given[method.float_type]
+            points = SparseGrid(few[0], few[1], pitch)
+            found = np.asarray(_direct_sum(mask, points, path, self.shape, method), float)
         share = exact.size / math.prod(self.shape)
         return float(np.linalg.norm(found - exact)) / math.sqrt(share) / self.scale
 

@@ -14,6 +14,7 @@ mask's middle, propagated each by itself in a window of four times the width, to
 """
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -58,8 +59,10 @@ def sampled_errors(
     fewest = samples_needed(mask, grid, path, "angular_spectrum")
     fewest = max(fewest, 3 if pixel_integration else 1)
     methods = [
-        psf_method(mask, grid, "angular_spectrum", pixel_integration, oversampling=fewest * finer)
-        for finer in _FINER
+        psf_method(
+            mask, grid, PsfMethod("angular_spectrum", oversampling=fewest * n), pixel_integration
+        )
+        for n in _FINER
     ]
     rounding = SAMPLED_ROUNDING[precision_of(grid.pitch)]
     cut = _cut_by_window(mask, grid, path, methods[0])
@@ -74,7 +77,7 @@ def sampled_errors(
 
 def _cut_by_window(mask: AbstractMask, grid: Grid, path: Path, method: PsfMethod) -> float:
     """Relative difference of lines of the mask's middle from those of a wider window."""
-    plane, sensor = planes(grid, method.mask_shape, method.samples)
+    plane, sensor = planes(grid, method)
     strip, squares = min(_PART * method.samples, *plane.shape), 0.0
     for axis in (0, 1):
         shape = (strip, plane.shape[1]) if axis else (plane.shape[0], strip)
@@ -119,13 +122,7 @@ class _Part(AbstractMask):
 def _central(mask: AbstractMask, grid: Grid, path: Path, method: PsfMethod):
     """The PSF of the middle of the mask on the middle of the sensor."""
     rows, columns = (min(_PART, n) for n in method.mask_shape or grid.shape)
+    method = replace(method, mask_shape=(rows, columns))
     sides = rows * grid.pitch, columns * grid.pitch
     part = _Part(whole=mask, sides=sides, centre=jnp.zeros_like(mask.centre))
-    return angular_spectrum(
-        part,
-        grid.with_shape((_PART, _PART)),
-        path,
-        mask_shape=(rows, columns),
-        oversampling=method.samples,
-        pixel_integration=method.pixel_integration,
-    )
+    return angular_spectrum(part, grid.with_shape((_PART, _PART)), path, method)

@@ -10,15 +10,22 @@ from thincam_jax._core import checks
 from thincam_jax._core.checks import Number
 from thincam_jax._core.grids import Grid
 from thincam_jax._core.memory import available_bytes
-from thincam_jax._core.precision import PRECISIONS, RESULT_ROUNDING, Precision, precision_of
+from thincam_jax._core.precision import PRECISIONS, RESULT_ROUNDING, precision_of
 from thincam_jax.lensless.accuracy.probe import MaskProbe
 from thincam_jax.lensless.accuracy.sampled import sampled_errors
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.cost import Cost, psf_cost
 from thincam_jax.lensless.digits import held_in_single
 from thincam_jax.lensless.masks.base import AbstractFactoredMask, AbstractMask
-from thincam_jax.lensless.method import Model, PsfMethod, has_few_terms, models_of, psf_method
-from thincam_jax.lensless.propagation.separable import PIXEL_NODES
+from thincam_jax.lensless.method import (
+    PIXEL_NODES,
+    Model,
+    PsfMethod,
+    as_method,
+    has_few_terms,
+    models_of,
+    psf_method,
+)
 
 # Predictions are estimates from some rows and columns (or pixels, for the direct sum): what they
 # are multiplied with so that they stay above the true error, found over 500 random cameras.
@@ -32,15 +39,12 @@ _CONVERSION = 1e7
 class Prediction:
     """Error and cost of a model.
 
-    - `model`, `precision`, `oversampling`: as `psf` takes them; oversampling is None for the
-      closed forms.
+    - `method`: as `psf` takes it in place of the model's name.
     - `predicted_error`: relative L2 over the sensor, at least the true one in 99 % of cameras.
     - `cost`: operations and peak memory.
     """
 
-    model: Model
-    precision: Precision
-    oversampling: int | None
+    method: PsfMethod
     predicted_error: float
     cost: Cost
 
@@ -104,7 +108,7 @@ def select_model(
     considered: list[Prediction] = []
     for method, cost in candidates(camera.mask, sampling_grid, pixel_integration):
         error = predicted_error(probe, camera.mask, sampling_grid, method)
-        considered.append(_prediction(method, error, cost))
+        considered.append(Prediction(method, error, cost))
         if error <= tolerance:
             break
     best = min(considered, key=lambda p: p.predicted_error)
@@ -124,22 +128,18 @@ def predict_error(
     *,
     wavelength: Number,
     object_distance: Number = math.inf,
-    model: Model,
-    precision: Precision | None = None,
-    oversampling: int | None = None,
+    model: Model | PsfMethod,
     pixel_integration: bool = False,
     grid: Grid | None = None,
 ) -> Prediction:
-    """Predicted error and cost of one model; arguments and reference as for `select_model`."""
-    probe = probe_of(camera, wavelength, object_distance, pixel_integration, grid)
+    """Predicted error and cost of one model; arguments as for `psf`, reference as for
+    `select_model`."""
+    average = as_method(model, pixel_integration).pixel_integration
+    probe = probe_of(camera, wavelength, object_distance, average, grid)
     grid = grid or camera.sensor.grid
-    method = psf_method(camera.mask, grid, model, pixel_integration, precision, oversampling)
+    method = psf_method(camera.mask, grid, model, average)
     error = predicted_error(probe, camera.mask, grid, method)
-    return _prediction(method, error, psf_cost(camera.mask, grid, method))
-
-
-def _prediction(method: PsfMethod, error: float, cost: Cost) -> Prediction:
-    return Prediction(method.model, method.precision, method.oversampling, error, cost)
+    return Prediction(method, error, psf_cost(camera.mask, grid, method))
 
 
 def _select_sampled(
@@ -151,13 +151,13 @@ def _select_sampled(
         cost = psf_cost(mask, grid, method)
         if considered and free is not None and cost.bytes > free:
             break
-        considered.append(_prediction(method, error, cost))
+        considered.append(Prediction(method, error, cost))
         if error <= tolerance:
             break
-    chosen = considered[-1]
+    chosen, method = considered[-1], considered[-1].method
     reasons = (
         f"a {type(mask).__name__} has no exact PSF: of 'angular_spectrum' with "
-        f"{chosen.oversampling}×{chosen.oversampling} samples a pixel, the mask's middle with more "
+        f"{method.samples}×{method.samples} samples a pixel, the mask's middle with more "
         f"of them differs so that {chosen.predicted_error:.1e} is left; far behind a small mask "
         "most of that is cut off by the window, and a larger mask_shape of psf cuts less",
         "errors are counted from scalar diffraction without Fresnel's approximation",
@@ -222,7 +222,7 @@ def candidates(
     free = available_bytes()
     own = precision_of(grid.pitch)
     methods = [
-        psf_method(mask, grid, model, pixel_integration, precision)
+        psf_method(mask, grid, PsfMethod(model, precision), pixel_integration)
         for model in models_of(mask)
         for precision in PRECISIONS
     ]
@@ -242,7 +242,7 @@ def candidates(
 
 def predicted_error(probe: MaskProbe, mask: AbstractMask, grid: Grid, method: PsfMethod) -> float:
     """Relative L2 error of a PSF, with the margin that keeps it above the true one."""
-    model, precision = method.model, method.precision
+    model, precision = method.model, method.float_type
     if precision == "float32" and not held_in_single(mask, grid, probe.path, model):
         return math.inf  # `psf` refuses it
     if model == "angular_spectrum":
@@ -261,17 +261,18 @@ def _reasons(probe: MaskProbe, chosen: Prediction, paraxial_error: float) -> tup
         "errors are counted from the exact Fresnel field; exact scalar diffraction differs from "
         f"that by about {paraxial_error:.1e}"
     )
-    if chosen.oversampling is not None:
+    method = chosen.method
+    if method.oversampling is not None:
         return (
-            f"the mask is held by {chosen.oversampling}×{chosen.oversampling} samples a pixel, and "
+            f"the mask is held by {method.samples}×{method.samples} samples a pixel, and "
             "the phases are exact where 'separable' has Fresnel's: together "
             f"{chosen.predicted_error:.1e}",
             fresnel,
         )
-    size = probe.rounding(chosen.model, chosen.precision)
+    size = probe.rounding(method.model, method.float_type)
     phase = probe.numbers().largest_phase
-    rounding = f"{chosen.precision} rounds phases of up to {phase:.1e} rad: {size:.1e}"
-    return (*_optics_left_out(probe, chosen.model), rounding, fresnel)
+    rounding = f"{method.precision} rounds phases of up to {phase:.1e} rad: {size:.1e}"
+    return (*_optics_left_out(probe, method.model), rounding, fresnel)
 
 
 def _optics_left_out(probe: MaskProbe, model: Model) -> list[str]:

@@ -9,10 +9,9 @@ from jaxtyping import Complex, Float
 
 from thincam_jax._core.precision import Precision, allow, cast
 from thincam_jax.lensless.accuracy.sampled import SAMPLED_ROUNDING, sampled_errors
-from thincam_jax.lensless.method import PsfMethod
+from thincam_jax.lensless.method import PIXEL_NODES, PsfMethod
 from thincam_jax.lensless.plan.seen import FULL, SeenScene
 from thincam_jax.lensless.plan.transfer import SampledProbe, TransferProbe, image_spectrum
-from thincam_jax.lensless.propagation.separable import PIXEL_NODES
 
 # Nodes of the pixel average where PSFs are compared with each other, and how far the tolerance must
 # be above the far edge's wave, √(λd)/(πw) of the light, whose fringes these nodes do not follow.

@@ -9,14 +9,14 @@ from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
 from thincam_jax._core.memory import readable, refuse_if_too_large
-from thincam_jax._core.precision import Precision, allow, cast, precision_of
+from thincam_jax._core.precision import allow, cast, precision_of
 from thincam_jax.imaging.operators import CropConvolution, kernel_grid
 from thincam_jax.imaging.scene import Scene
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.cost import Cost
 from thincam_jax.lensless.forward import project, projected_shape, spectral_psf
 from thincam_jax.lensless.masks.fza import FresnelZoneAperture
-from thincam_jax.lensless.method import Model
+from thincam_jax.lensless.method import PsfMethod
 from thincam_jax.lensless.plan.effects import Effect
 
 # How far a camera's numbers may be from the plan's, relative.
@@ -34,7 +34,7 @@ class Plan:
     - `camera`: that it was made for.
     - `tolerance`, `predicted_error`: relative L2 error of the noise-free capture, of a
       batch as a whole.
-    - `model`, `precision`, `pixel_integration`, `oversampling`, `mask_shape`: arguments of `psf`.
+    - `method`: of the PSFs, as `psf` takes it.
     - `distances`: object distances in mm whose PSFs are computed, out of the scene's.
     - `mixing`: (distance, plane) weights: the PSF of a plane is this sum of the computed ones, so
       that planes are merged before they are convolved.
@@ -51,11 +51,7 @@ class Plan:
     camera: LenslessCamera
     tolerance: float
     predicted_error: float
-    model: Model
-    precision: Precision
-    pixel_integration: bool
-    oversampling: int | None
-    mask_shape: tuple[int, int] | None
+    method: PsfMethod
     distances: tuple[float, ...]
     mixing: Float[np.ndarray, "distance plane"]
     wavelengths: tuple[float, ...]
@@ -76,16 +72,17 @@ class Plan:
         return self.predicted_error <= self.tolerance
 
     def __str__(self) -> str:
-        average = "averaged over pixels" if self.pixel_integration else "at the pixels' centres"
-        if self.oversampling is not None:
-            average = f"{self.oversampling}×{self.oversampling} samples a pixel"
+        method = self.method
+        average = "averaged over pixels" if method.pixel_integration else "at the pixels' centres"
+        if method.oversampling is not None:
+            average = f"{method.samples}×{method.samples} samples a pixel"
         planes, colours = len(self.scene_distances), len(self.scene_wavelengths)
         shares = self.shares
         rows, columns = self.field_shape
         met = "" if self.meets_tolerance else "  NOT MET"
         lines = [
             ("tolerance", f"{self.tolerance:.1e}, predicted {self.predicted_error:.1e}{met}"),
-            ("model", f"{self.model}, {self.precision}, {average}: {shares['model']:.1e}"),
+            ("model", f"{method.model}, {method.precision}, {average}: {shares['model']:.1e}"),
             ("depth planes", f"{planes} by {len(self.distances)} PSFs: {shares['planes']:.1e}"),
             ("wavelengths", f"{colours} by {len(self.wavelengths)}: {shares['wavelengths']:.1e}"),
             (
@@ -113,24 +110,15 @@ def run_plan(plan: Plan, camera: LenslessCamera, scene: Scene) -> Float[Array, "
         plan.cost.bytes,
         "use a smaller sensor, a smaller scene, or fewer images at a time",
     )
-    with allow(plan.precision, camera, scene):
-        camera, scene = cast((camera, scene), plan.precision)
+    with allow(plan.method.float_type, camera, scene):
+        camera, scene = cast((camera, scene), plan.method.float_type)
         fields = jnp.stack([project(camera, p, plan.field_shape) for p in scene.planes])
         mixed = jnp.tensordot(jnp.asarray(plan.mixing, fields.dtype), fields, axes=1)
         light = tuple(zip(plan.wavelengths, plan.weights, strict=True))
         grid = kernel_grid(camera.sensor.grid, plan.field_shape)
         total = jnp.zeros((), fields.dtype)
         for distance, field in zip(plan.distances, mixed, strict=True):
-            kernel = spectral_psf(
-                camera,
-                light,
-                distance,
-                model=plan.model,
-                pixel_integration=plan.pixel_integration,
-                oversampling=plan.oversampling,
-                mask_shape=plan.mask_shape,
-                grid=grid,
-            )
+            kernel = spectral_psf(camera, light, distance, plan.method, grid)
             shapes = camera.sensor.shape, plan.field_shape
             total = total + CropConvolution(kernel, grid.pitch, *shapes)(field)
     return cast(total, own)

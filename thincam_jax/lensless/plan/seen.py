@@ -91,7 +91,8 @@ class SeenScene:
         """`angular_spectrum` with the samples that hold the mask for all light, or with more."""
         mask, grid, model = self.camera.mask, self.kernel_grid, "angular_spectrum"
         held = [samples_needed(mask, grid, self.camera.path(*c), model) for c in self.corners]
-        return psf_method(mask, grid, model, True, "float32", max(3, least, *held))
+        method = PsfMethod(model, "float32", oversampling=max(3, least, *held))
+        return psf_method(mask, grid, method, pixel_integration=True)
 
     def relative(self, error: Complex[np.ndarray, "*batch k"]) -> float:
         """Norm of an image given by its spectrum, relative to that of the capture."""
@@ -144,7 +145,7 @@ class SeenScene:
 
     def cost(self, method: PsfMethod, planes: int, colours: int) -> Cost:
         """Of a capture from so many PSFs, for all planes of the scene."""
-        one, itemsize = self.psf_cost(method), itemsize_of(method.precision)
+        one, itemsize = self.psf_cost(method), itemsize_of(method.float_type)
         convolution = convolution_cost(
             self.camera.sensor.shape, self.field_shape, self.batch, itemsize
         )

@@ -8,18 +8,18 @@ shows how an error of the PSF shows in the image of this scene.
 
 import functools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
-from thincam_jax._core.precision import Precision, allow, cast, product
+from thincam_jax._core.precision import allow, cast, product
 from thincam_jax.lensless.accuracy.lines import SparseGrid
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.masks.base import AbstractMask
-from thincam_jax.lensless.method import Model, PsfMethod
+from thincam_jax.lensless.method import PsfMethod
 from thincam_jax.lensless.propagation.path import Path
 from thincam_jax.lensless.psf import closed_terms, psf
 
@@ -115,7 +115,7 @@ class TransferProbe:
         """H with factors in the method's precision, transformed in double precision."""
         with allow("float64"):
             waves = self._double_waves
-            return self._transfer(waves, wavelength, distance, method, method.precision)
+            return self._transfer(waves, wavelength, distance, method)
 
     @functools.cached_property
     def _double_waves(self) -> tuple[Float[Array, "n k2"], ...]:
@@ -129,16 +129,17 @@ class TransferProbe:
         self, wavelength: float, distance: float, method: PsfMethod
     ) -> Complex[np.ndarray, " k"]:
         """H in single precision, with the method's nodes a pixel, for many PSFs."""
-        return self._transfer(self._single_waves, wavelength, distance, method, "float32")
+        method = replace(method, precision="float32")
+        return self._transfer(self._single_waves, wavelength, distance, method)
 
     def _transfer(
-        self, waves_of, wavelength: float, distance: float, method: PsfMethod, precision: Precision
+        self, waves_of, wavelength: float, distance: float, method: PsfMethod
     ) -> Complex[np.ndarray, " k"]:
         path = self.camera.path(float(wavelength), float(distance))
-        mask, pitch, path = cast((self.camera.mask, self.camera.sensor.pitch, path), precision)
+        given = self.camera.mask, self.camera.sensor.pitch, path
+        mask, pitch, path = cast(given, method.float_type)
         points = SparseGrid(self.places[0], self.places[1], pitch)
-        how = method.model, method.pixel_integration, method.nodes
-        return np.asarray(_transfer(mask, points, path, *waves_of, *how), complex)
+        return np.asarray(_transfer(mask, points, path, *waves_of, method), complex)
 
 
 class SampledProbe:
@@ -158,24 +159,22 @@ class SampledProbe:
             self.camera,
             wavelength=wavelength,
             object_distance=distance,
+            model=method,
             grid=self.grid,
-            **method.arguments,
         )
         return image_spectrum(np.asarray(h, float)[None], self.frequencies)[0]
 
 
-@jax.jit(static_argnames=("model", "pixel_integration", "nodes"))
+@jax.jit(static_argnames="method")
 def _transfer(
     mask: AbstractMask,
     points: SparseGrid,
     path: Path,
     down: Float[Array, "m k2"],
     across: Float[Array, "n k2"],
-    model: Model,
-    pixel_integration: bool,
-    nodes: int,
+    method: PsfMethod,
 ) -> Complex[Array, " k"]:
-    terms = closed_terms(mask, points, path, model, pixel_integration, nodes)
+    terms = closed_terms(mask, points, path, method)
     spectra = []
     for factor, wave in zip(terms.real_factors(), (down, across), strict=True):
         both = product(factor.astype(wave.dtype), wave)

@@ -9,6 +9,7 @@ from jaxtyping import Array, Bool, Complex, Float
 from thincam_jax._core.grids import Grid, block_mean, centred_frequencies, fast_shape
 from thincam_jax._core.precision import as_complex, turn_phasor
 from thincam_jax.lensless.masks.base import AbstractMask
+from thincam_jax.lensless.method import PsfMethod
 from thincam_jax.lensless.propagation.path import Path
 
 PADDING = 2.0  # the window of a PSF over mask and sensor side by side
@@ -75,27 +76,24 @@ def angular_spectrum(
     mask: AbstractMask,
     grid: Grid,
     path: Path,
+    method: PsfMethod,
     *,
-    mask_shape: tuple[int, int] | None = None,
-    oversampling: int = 1,
     padding: float = PADDING,
-    pixel_integration: bool = False,
 ) -> Float[Array, "y x"]:
     r"""PSF of any mask by the band-limited angular spectrum; exact scalar diffraction when sampled.
 
-    The mask is sampled on the grid's pitch divided by `oversampling` (odd), lit by the exact
-    spherical wave, zero-padded, propagated, and scaled by M² to the open aperture. Hard edges
+    The mask is sampled on the grid's pitch divided by the oversampling, lit by the exact spherical
+    wave, zero-padded, propagated, and scaled by M² to the open aperture. Hard edges
     converge slowly, about as oversampling to the power −1.
 
-    - `mask_shape`: pixels of the plane that holds the mask, at the grid's pitch; by default the
-      smallest that does, or the sensor's when the mask's size is traced.
+    - `method`: its `oversampling`, by default 1; its `mask_shape`, by default the grid's; and
+      `pixel_integration`, which averages the oversampled irradiance over each pixel.
     - `padding`: window over mask + sensor, ≥ 1. At 1 nothing wraps round, but the window's band
       limit cuts the steepest edge waves (0.6 % of the PSF in the tests' set-up); at 2 it does not,
       but far behind a small mask: 0.5 % at a Fresnel number w²/(λd) of 6, 10 % at 1. A larger
       `mask_shape` then helps.
-    - `pixel_integration`: average the oversampled irradiance over each pixel.
     """
-    plane, sensor = planes(grid, mask_shape, oversampling)
+    plane, sensor = planes(grid, method)
     field = lit_mask(within(mask, plane), plane, path)
     window = padded_shape(plane.shape, sensor.shape, padding)
     field = jnp.pad(field, [(0, n - m) for n, m in zip(window, field.shape, strict=True)])
@@ -104,10 +102,10 @@ def angular_spectrum(
     shift = [(s - m) // 2 for s, m in zip(sensor.shape, plane.shape, strict=True)]
     field = jnp.roll(field, shift, axis=(0, 1))[: sensor.shape[0], : sensor.shape[1]]
     irradiance = (field.real**2 + field.imag**2) * path.magnification**2
-    if pixel_integration:
-        return block_mean(irradiance, oversampling)
-    middle = oversampling // 2
-    return irradiance[middle::oversampling, middle::oversampling]
+    if method.pixel_integration:
+        return block_mean(irradiance, method.samples)
+    middle = slice(method.samples // 2, None, method.samples)
+    return irradiance[middle, middle]
 
 
 def lit_mask(mask: AbstractMask, plane: Grid, path: Path) -> Complex[Array, "y x"]:
@@ -126,23 +124,15 @@ def spherical_wave(plane: Grid, path: Path) -> Complex[Array, "y x"]:
     return turn_phasor(detour / path.wavelength) * as_complex(1 / stretch)
 
 
-def planes(grid: Grid, mask_shape: tuple[int, int] | None, oversampling: int) -> tuple[Grid, Grid]:
+def planes(grid: Grid, method: PsfMethod) -> tuple[Grid, Grid]:
     """The mask's and the sensor's oversampled grids, of equal parity so that samples coincide."""
-    require_odd(oversampling)
-    shape = mask_shape or grid.shape
+    shape, samples = method.mask_shape or grid.shape, method.samples
     shape = tuple(m + (m - s) % 2 for m, s in zip(shape, grid.shape, strict=True))
-    fine = grid.pitch / oversampling
+    fine = grid.pitch / samples
     return (
-        Grid((shape[0] * oversampling, shape[1] * oversampling), fine),
-        Grid((grid.shape[0] * oversampling, grid.shape[1] * oversampling), fine),
+        Grid((shape[0] * samples, shape[1] * samples), fine),
+        Grid((grid.shape[0] * samples, grid.shape[1] * samples), fine),
     )
-
-
-def require_odd(oversampling: int) -> None:
-    if oversampling < 1 or oversampling % 2 == 0:
-        raise ValueError(
-            f"oversampling = {oversampling}: give an odd number, so that pixel centres are samples"
-        )
 
 
 def padded_shape(

@@ -7,6 +7,7 @@ from jaxtyping import Array, Complex, Float
 from thincam_jax._core.grids import Grid, block_mean
 from thincam_jax._core.precision import turn_phasor
 from thincam_jax.lensless.masks.base import AbstractMask
+from thincam_jax.lensless.method import PsfMethod
 from thincam_jax.lensless.propagation.angular_spectrum import lit_mask, planes, within
 from thincam_jax.lensless.propagation.path import Path
 
@@ -48,20 +49,17 @@ def rayleigh_sommerfeld(
     mask: AbstractMask,
     grid: Grid,
     path: Path,
-    *,
-    mask_shape: tuple[int, int] | None = None,
-    oversampling: int = 1,
-    pixel_integration: bool = False,
+    method: PsfMethod,
 ) -> Float[Array, "y x"]:
     """PSF of any mask by direct summation: the reference for tests and small grids.
 
     Arguments as for `angular_spectrum`; only the mask plane is oversampled for the point-sampled
     PSF, both planes are for pixel averages.
     """
-    plane, fine = planes(grid, mask_shape, oversampling)
-    sensor = fine if pixel_integration else grid
+    plane, fine = planes(grid, method)
+    sensor = fine if method.pixel_integration else grid
     field = rayleigh_sommerfeld_field(
         lit_mask(within(mask, plane), plane, path), plane, sensor, path
     )
     irradiance = (field.real**2 + field.imag**2) * path.magnification**2
-    return block_mean(irradiance, oversampling) if pixel_integration else irradiance
+    return block_mean(irradiance, method.samples) if method.pixel_integration else irradiance

@@ -10,15 +10,13 @@ from thincam_jax._core import checks
 from thincam_jax._core.grids import Grid
 from thincam_jax._core.precision import Precision, as_complex, product
 from thincam_jax.lensless.masks.base import AbstractMask, AxisFactors, pairs, require_factored
+from thincam_jax.lensless.method import PIXEL_NODES
 from thincam_jax.lensless.propagation.chirp import chirp_integral, edge_wave
 from thincam_jax.lensless.propagation.path import Path
 from thincam_jax.lensless.propagation.separable_sum import SeparableSum
 
-# Gauss-Legendre nodes a pixel for the pixel average, where the fringes are not known or many. Those
-# of the far edge turn by up to 10 cycles over a 5.5 µm pixel at d = 6.5 mm, at a few parts in 1000
-# of the amplitude: 8 nodes are 2e-3 off there, 16 8e-5, 24 1e-10.
-PIXEL_NODES = 24
-# Fewer, and the fringes a pixel up to which their averages are exact to 1e-7 and 1e-13.
+# Nodes fewer than `PIXEL_NODES`, and the fringes a pixel up to which their averages are exact to
+# 1e-7 and 1e-13.
 _FEWER: dict[Precision, dict[int, float]] = {
     "float32": {4: 0.3, 6: 0.85, 8: 1.55, 10: 2.385, 12: 3.25, 14: 4.2, 16: 5.15, 20: 7.15},
     "float64": {4: 0.05, 6: 0.25, 8: 0.6, 10: 1.15, 12: 1.75, 14: 2.45, 16: 3.2, 20: 4.85},
