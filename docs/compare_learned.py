@@ -47,7 +47,7 @@ from thincam_jax.commands.learned.config import LearnedConfig
 from thincam_jax.learn.refocusing.baselines import ControlCode, control_loss
 from thincam_jax.learn.refocusing.unet import parameter_count
 from thincam_jax.learn.training import Task, train_model
-from thincam_jax.learn.unrolled import UnrolledAdmm, train
+from thincam_jax.learn.unrolled import Adam, UnrolledAdmm, train
 from thincam_jax.reconstruction.problem import InverseProblem
 
 SMALL = (
@@ -107,7 +107,7 @@ class Unrolled:
         images = jnp.stack([shot.target(camera, 85.0) for shot in shots])[:, None, None]
         model = UnrolledAdmm(problem, 5)
         key = jax.random.fold_in(jax.random.key(4), seed)
-        self.model = train(model, problem, images, key=key, steps=60).model
+        self.model = train(model, problem, images, key=key, descent=Adam(steps=60)).model
 
     def problem(self, shots, distance: float) -> InverseProblem:
         captures = jnp.stack([shot.capture for shot in shots])[:, None]

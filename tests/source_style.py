@@ -3,7 +3,7 @@
 import ast
 from collections.abc import Iterator
 
-from source_tree import DOC, MAX_LINES, Module
+from source_tree import DOC, MAX_LINES, MOST_PARAMETERS, Module
 
 from thincam_jax._core.quantity import UNITS
 
@@ -59,6 +59,46 @@ def named_tuples(modules: list[Module]) -> list[str]:
         for node in module.nodes
         if getattr(node, "id", getattr(node, "attr", "")) in ("NamedTuple", "namedtuple")
     ]
+
+
+# Functions whose parameters another gives, or that are a record's own numbers.
+MANY_PARAMETERS = {
+    "commands/reconstruct/command.py": ("reconstruct", "check"),  # the options of the command
+    "hardware/virtual/usb3_vision.py": ("ctrl_transfer",),  # a backend of pyusb
+    "reconstruction/admm.py": ("init", "postprocess"),  # a solver of optimistix
+    "reconstruction/proximal_gradient.py": ("init", "postprocess"),
+    # A record; of its sides and `pixel_pitch`, as in files, it holds the number of pixels.
+    "lensless/masks/fza.py": ("__init__",),
+}
+
+
+def many_parameters(modules: list[Module]) -> list[str]:
+    """A function of more than six lacks a record; a record's constructor takes its fields."""
+    return [
+        f"{module.path}:{function.lineno}: {function.name} has {len(names)} parameters, "
+        f"{MOST_PARAMETERS} allowed: put those that belong together into a record"
+        for module in modules
+        if module.top != "design"  # not yet
+        for function, names in long_signatures(module)
+        if function.name not in MANY_PARAMETERS.get(module.path, ())
+    ]
+
+
+def long_signatures(module: Module) -> Iterator[tuple[ast.FunctionDef, list[str]]]:
+    """Functions of more than six parameters, `self` apart, but the constructors of records."""
+    fields = {
+        function: {ast.unparse(n.target) for n in node.body if isinstance(n, ast.AnnAssign)}
+        for node in module.nodes
+        if isinstance(node, ast.ClassDef)
+        for function in node.body
+        if getattr(function, "name", "") == "__init__"
+    }
+    for node in module.nodes:
+        if isinstance(node, ast.FunctionDef):
+            every = [*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs]
+            names = [a.arg for a in every if a.arg not in ("self", "cls")]
+            if len(names) > MOST_PARAMETERS and not fields.get(node, set()).issuperset(names):
+                yield node, names
 
 
 def star_imports(modules: list[Module]) -> list[str]:
@@ -123,6 +163,7 @@ STYLE_RULES = (
     bare_files,
     tables_of_units,
     named_tuples,
+    many_parameters,
     star_imports,
     long_modules,
     missing_docstrings,
@@ -153,6 +194,24 @@ BROKEN_STYLE = [
     ),
     (named_tuples, "lensless/psf.py", "class A(NamedTuple): ...", "psf.py:1: a named tuple"),
     (named_tuples, "units.py", "A = collections.namedtuple('A', 'x')", "units.py:1: "),
+    (
+        many_parameters,
+        "lensless/psf.py",
+        "def f(a, b, c, *, d, e, f, g=1): ...",
+        "psf.py:1: f has 7 parameters, 6 allowed",
+    ),
+    (
+        many_parameters,
+        "lensless/psf.py",
+        "class A:\n    def f(self, x):\n        def g(a, b, c, d, e, f, g): ...",
+        "psf.py:3: g has 7",
+    ),
+    (
+        many_parameters,
+        "lensless/psf.py",
+        "class A:\n    a: int\n    def __init__(self, a, b, c, d, e, f, g): ...",
+        "psf.py:3: __init__ has 7",
+    ),
     (star_imports, "lensless/psf.py", "from .camera import *", "star import"),
     (star_imports, "lensless/psf.py", "from numpy import *", "star import"),
     (long_modules, "lensless/psf.py", DOC + "x = 1\n" * MAX_LINES, "501 lines, 500 allowed"),

@@ -7,7 +7,7 @@ package and, below, to small packages that break it: a rule that has gone blind 
 from pathlib import Path
 
 import pytest
-from source_style import BROKEN_STYLE, STYLE_RULES
+from source_style import BROKEN_STYLE, MANY_PARAMETERS, STYLE_RULES, long_signatures
 from source_tree import (
     DOC,
     ENTRY,
@@ -164,6 +164,17 @@ def test_the_package_is_found(package):
 def test_package_keeps(rule, package):
     complaints = rule(package)
     assert not complaints, "\n" + "\n".join(complaints)
+
+
+def test_functions_with_many_parameters_are_listed_exactly(package):
+    """One that has few is taken off the list."""
+    listed = {(path, name) for path, names in MANY_PARAMETERS.items() for name in names}
+    found = {
+        (module.path, function.name)
+        for module in package
+        for function, _ in long_signatures(module)
+    }
+    assert listed <= found
 
 
 # Scripts of users and of the docs that still need a command's parts. Shorter is better.

@@ -11,7 +11,7 @@ from reconstruction import extremes, scenes
 
 from helpers import finite_difference
 from thincam_jax.learn import unrolled as module
-from thincam_jax.learn.unrolled import UnrolledAdmm, solve_unrolled, train, training_loss
+from thincam_jax.learn.unrolled import Adam, UnrolledAdmm, solve_unrolled, train, training_loss
 from thincam_jax.reconstruction.admm import admm_map
 from thincam_jax.reconstruction.problem import uniform_image
 from thincam_jax.reconstruction.splittings import splitting_of
@@ -45,7 +45,7 @@ def test_trained_it_beats_as_many_untrained_iterations_on_scenes_it_has_not_seen
     unseen, others = pairs(8, 900)
     model = UnrolledAdmm(seen, 5)
     before = training_loss(model, unseen, others)
-    training = train(model, seen, images, key=jax.random.key(1), steps=60, batch=4)
+    training = train(model, seen, images, key=jax.random.key(1), descent=Adam(steps=60))
     assert training.status == "iterations_exhausted" and len(training.losses) == 60
     after = training_loss(training.model, unseen, others)
     assert after < 0.75 * before
@@ -54,7 +54,7 @@ def test_trained_it_beats_as_many_untrained_iterations_on_scenes_it_has_not_seen
     for positive in training.model.parameters():
         assert float(positive.min()) > 0
     # Training again with the same key gives the same.
-    again = train(model, seen, images, key=jax.random.key(1), steps=3, batch=4)
+    again = train(model, seen, images, key=jax.random.key(1), descent=Adam(steps=3))
     assert again.losses == training.losses[:3]
 
 
@@ -112,6 +112,6 @@ def test_pairs_that_do_not_fit_are_refused():
     with pytest.raises(ValueError, match="give captures"):
         train(model, problem, images[:2], key=jax.random.key(0))
     with pytest.raises(ValueError, match="batch = 4 of 3 pairs"):
-        train(model, problem, images, key=jax.random.key(0), batch=4)
+        train(model, problem, images, key=jax.random.key(0))
     with pytest.raises(ValueError, match="at least 1"):
         UnrolledAdmm(problem, 0)

@@ -9,6 +9,7 @@ is: 5 numbers an iteration are learned, so that some tens of pairs suffice.
 import functools
 import math
 import time
+from dataclasses import dataclass
 
 import equinox as eqx
 import jax
@@ -16,7 +17,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from thincam_jax._core import checks
-from thincam_jax._core.checks import Number
 from thincam_jax.design.stochastic import adam_method, adam_step
 from thincam_jax.reconstruction.admm import AbstractSplitting, Penalties, State, admm_map
 from thincam_jax.reconstruction.iterate import Outcome, Progress, Status
@@ -120,30 +120,38 @@ class Training(eqx.Module):
     status: Status
 
 
+@dataclass(frozen=True)
+class Adam:
+    """Descent by Adam (optax).
+
+    - `steps`, `batch`: gradient steps, and pairs drawn for each, without replacement.
+    - `learning_rate`: in the numbers before softplus.
+    """
+
+    steps: int = 100
+    batch: int = 4
+    learning_rate: float = 0.05
+
+
 def train(
     model: UnrolledAdmm,
     problem: InverseProblem,
     images: Float[Array, "pair channel plane y x"],
     *,
     key: PRNGKeyArray,
-    steps: int = 100,
-    batch: int = 4,
-    learning_rate: Number = 0.05,
+    descent: Adam = Adam(),
 ) -> Training:
-    """Fit a model to pairs of captures and images, by Adam (optax) on the mean squared error.
+    """Fit a model to pairs of captures and images, by the mean squared error.
 
-    **Arguments**
-
-    - `problem`: its captures (pair, channel, y, x) belong to `images`.
-    - `steps`, `batch`: gradient steps, and pairs drawn for each, without replacement.
-    - `learning_rate`: of Adam, in the numbers before softplus.
+    `problem`: its captures (pair, channel, y, x) belong to `images`.
 
     The error of a pair is relative to its image's mean square, so that dark scenes count as
     much as bright ones. Of all models that of the lowest loss on all pairs is returned, taken every
     tenth step.
     """
+    batch, steps, rate = descent.batch, descent.steps, descent.learning_rate
     _check_pairs(problem, images, batch)
-    rate = checks.positive("learning_rate", learning_rate, "a number").astype(images.dtype)
+    rate = checks.positive("learning_rate", rate, "a number").astype(images.dtype)
     state = adam_method().init(model)  # type: ignore[arg-type]
     best, lowest, losses = model, float(training_loss(model, problem, images)), []
     for n in range(steps):

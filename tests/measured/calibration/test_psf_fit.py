@@ -9,7 +9,7 @@ import pytest
 import scipy.ndimage
 
 import thincam_jax as tc
-from thincam_jax.measured.calibration import fit_psf, problem
+from thincam_jax.measured.calibration import PsfSearch, fit_psf, problem
 from thincam_jax.measured.calibration.psf_fit import FRINGE_SCANNED
 from thincam_jax.measured.calibration.start import _one_picture
 from thincam_jax.units import nm, um
@@ -95,7 +95,7 @@ def test_ripples_of_the_rims_hold_no_fit(snr_db):
     h = tc.psf(TRUE, pixel_integration=True, **LIGHT)
     noise = np.random.default_rng(0).normal(size=h.shape)
     image = h + 10 ** (-snr_db / 20) * np.sqrt(np.mean(h**2)) * noise
-    fit = fit_psf(image, START, max_steps=20, **LIGHT)
+    fit = fit_psf(image, START, search=PsfSearch(max_steps=20), **LIGHT)
     assert (fit.status, fit.reasons) == ("ok", ())
     assert np.all(np.abs(deviations(fit, TRUE)) < 4.5)
 
@@ -142,8 +142,7 @@ def test_wavelength_and_distance_of_a_plane_wave_are_one():
     fit = fit_psf(
         picture(TRUE, **light),
         TRUE,
-        parameters=("distance", "wavelength", "background", "gain"),
-        search=0.02,
+        search=PsfSearch(("distance", "wavelength", "background", "gain"), relative=0.02),
         **light,
     )
     assert fit.status == "ambiguous"
@@ -241,9 +240,6 @@ def test_residuals_follow_a_direct_sum():
         ({"psf_image": np.ones((3, 4))}, "give real numbers on the"),
         ({"psf_image": np.full((112, 133), np.nan)}, "not finite"),
         ({"psf_image": np.zeros((112, 133))}, "0 in every pixel"),
-        ({"parameters": ("beta", "tilt")}, "'tilt' is unknown"),
-        ({"parameters": ()}, "at least one name"),
-        ({"search": 0.9}, "too wide"),
         ({"camera": camera(0.5)}, "fringes"),
         ({"weights": {0.0: 1.0, 1.5: 1j}}, "give the complex picture"),
         ({"weights": {0.0: 1.0, 2 * math.pi: -1.0}}, "leave no fringes"),
@@ -256,3 +252,18 @@ def test_refusals_take_one_line(change, message):
     with pytest.raises(ValueError, match=message) as caught:
         fit_psf(**given)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"parameters": ("beta", "tilt")}, "'tilt' is unknown"),
+        ({"parameters": ()}, "at least one name"),
+        ({"relative": 0.9}, "too wide"),
+        ({"relative": -0.1}, "relative = -0.1"),
+        ({"centre": -0.1}, "centre = -0.1"),
+    ],
+)
+def test_searches_that_are_refused(settings, message):
+    with pytest.raises(ValueError, match=message):
+        PsfSearch(**settings)

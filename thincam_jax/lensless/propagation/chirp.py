@@ -97,7 +97,7 @@ def chirp_integral(
 
     **Returns** the complex integral, mm. Differentiable in every argument.
     """
-    return _integral(g, b, x, 0.5 * (lower + upper), 0.5 * (upper - lower), lower, upper)
+    return _integral(g, b, x, 0.5 * (lower + upper), 0.5 * (upper - lower), (lower, upper))
 
 
 def chirp_average(
@@ -109,7 +109,7 @@ def chirp_average(
     from the axis, such as pixels: their width is not formed as a difference of their ends.
     """
     none = jnp.zeros_like(middle)
-    return _integral(g, none, none, middle, half, middle - half, middle + half)
+    return _integral(g, none, none, middle, half, (middle - half, middle + half))
 
 
 @jax.custom_jvp
@@ -147,8 +147,8 @@ def _edge_wave_slope(primals, tangents):
 _NEAR = {p: _auxiliary_polynomials(d.near) for p, d in _DEGREES.items()}
 
 
-def _integral(g, b, x, middle, half, lower, upper) -> Complex[Array, "..."]:
-    g, b, x, middle, half, lower, upper = jnp.broadcast_arrays(g, b, x, middle, half, lower, upper)
+def _integral(g, b, x, middle, half, ends) -> Complex[Array, "..."]:
+    g, b, x, middle, half, lower, upper = jnp.broadcast_arrays(g, b, x, middle, half, *ends)
     precision = precision_of(x)
     a = g + b
     slope, bend = 2 * (g * middle + b * (middle - x)) * half, a * half**2

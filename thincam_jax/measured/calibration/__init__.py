@@ -23,6 +23,7 @@ from thincam_jax.measured.calibration.screen_fit import fit_screen as fit_screen
 from thincam_jax.measured.calibration.separable import SeparableFit as SeparableFit
 from thincam_jax.measured.calibration.separable import calibrate_separable as calibrate_separable
 from thincam_jax.measured.calibration.separable import fit_separable as fit_separable
+from thincam_jax.measured.calibration.start import PsfSearch as PsfSearch
 from thincam_jax.measured.calibration.system_matrix import matrix_blocks as matrix_blocks
 from thincam_jax.measured.calibration.system_matrix import open_matrix as open_matrix
 from thincam_jax.measured.calibration.system_matrix import read_matrix as read_matrix

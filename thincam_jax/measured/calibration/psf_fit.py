@@ -1,7 +1,8 @@
 r"""`fit_psf`: the numbers of a camera from a picture of a point source."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from dataclasses import replace
 
 import equinox as eqx
 import jax
@@ -24,7 +25,6 @@ from thincam_jax.measured.calibration.coarse import (
 )
 from thincam_jax.measured.calibration.problem import (
     CONVERGED,
-    PARAMETERS,
     STEP,
     FitProblem,
     FitState,
@@ -39,11 +39,11 @@ from thincam_jax.measured.calibration.problem import (
     values_by_steps,
     verdict,
 )
-from thincam_jax.measured.calibration.start import check_fringes, given, search_ranges, start_near
+from thincam_jax.measured.calibration.start import PsfSearch, check_fringes, given, start_near
 from thincam_jax.measured.raw import image_with_contrast
 
+DEFAULT = PsfSearch()
 Weights = Mapping[float, complex | float | int]
-DEFAULT = ("beta", "phase", "centre", "distance", "background", "gain")
 # The phase and weight of each capture of a fringe-scanned one, as in `fringe_scanned_otf`.
 FRINGE_SCANNED = {0.0: 1j, math.pi / 2: -1.0, math.pi: -1j, 3 * math.pi / 2: 1.0}
 # Part of the image's contrast that a fit must explain; less is another picture, or another turn.
@@ -75,7 +75,7 @@ class PsfFit(Module):
     - `residual`: measured − model, (y, x); complex where the image is.
     - `status`: "ok"; "ambiguous", where the image does not hold a number: two cannot be told apart
       (`AMBIGUOUS`: a correlation above 0.999), the error of one is above 3 %, above 0.5 % where the
-      residual is not noise, or it left its `search`; "poor_fit", where the model explains less than
+      residual is not noise, or it left its search; "poor_fit", where the model explains less than
       half of the image's contrast; "not_converged", where the last ten steps of the least squares
       moved a number by more than a tenth of its standard error. The first that applies, from the
       last to the first.
@@ -110,11 +110,7 @@ def fit_psf(
     weights: Weights | None = None,
     object_distance: Number,
     wavelength: Number,
-    parameters: Sequence[str] = DEFAULT,
-    pixel_integration: bool = True,
-    search: float | int = 0.12,
-    centre_search: float | int | None = None,
-    max_steps: int = 60,
+    search: PsfSearch = DEFAULT,
 ) -> PsfFit:
     r"""Fit the exact PSF of a zone aperture to a measured one, by least squares.
 
@@ -154,15 +150,7 @@ def fit_psf(
       to 0 there is no background left, and none is fitted.
     - `camera`: with a `FresnelZoneAperture`; its numbers are the start.
     - `object_distance`: t, mm, from the mask, or infinity; `wavelength`: λ, mm.
-    - `parameters`: which to fit, of "beta", "phase", "centre", "width", "distance",
-      "object_distance", "wavelength", "background", "gain"; the others are held. Without
-      "background" it is 0, without "gain" 1.
-    - `pixel_integration`: average h over each pixel, as a sensor does. Without, the waves from the
-      far rim, up to 10 turns a pixel, are aliased, and d is then only as good as the start.
-    - `search`: how far β, d and λ may be from their start, in parts of one.
-    - `centre_search`: how far the centre may be, along y and x, on the sensor, mm; by default a
-      tenth of the sensor's shorter side.
-    - `max_steps`: of Levenberg-Marquardt.
+    - `search`: the numbers to fit, and how far from the camera's.
 
     **Validity.** That of the Fresnel approximation. The search needs ε < 0.5; beyond, least squares
     start from the camera as given. A start of "width" must be within some √(λd) of the truth.
@@ -172,26 +160,19 @@ def fit_psf(
     and another mask.
     """
     synthesis = _check_weights(psf_image, weights)
-    if isinstance(parameters, str) or not parameters:
-        raise ValueError(f"parameters = {parameters!r}: give a tuple of at least one name")
-    for name in parameters:
-        checks.choice("a name in parameters", name, PARAMETERS)
-    parameters = tuple(parameters)
     if synthesis is not None and not np.any(np.abs(synthesis.weights.sum(axis=1)) > 1e-6):
-        parameters = tuple(name for name in parameters if name != "background")
+        left = tuple(name for name in search.parameters if name != "background")
+        search = replace(search, parameters=left)
     image = _check_image(psf_image, camera, synthesis)
-    ranges = search_ranges(camera, parameters, search, centre_search)
     with allow("float64", camera):
         double = cast((camera, synthesis), "float64")
-        guess = given(double[0], object_distance, wavelength, parameters, double[1])
+        guess = given(double[0], object_distance, wavelength, search.parameters, double[1])
         check_fringes(guess)
-        start = start_near(image, guess, parameters, ranges, float(search), pixel_integration)
-        names = unknown_names(parameters)
-        problem = _problem(image, start, names, pixel_integration)
-        known, _ = covariance_by_differences(
-            full_image(image, start, pixel_integration), start, names
-        )
-        solution = solve(problem, known.standard_errors, max_steps)
+        start = start_near(image, guess, search)
+        names, average = unknown_names(search.parameters), search.pixel_integration
+        problem = _problem(image, start, names, average)
+        known, _ = covariance_by_differences(full_image(image, start, average), start, names)
+        solution = solve(problem, known.standard_errors, search.max_steps)
         return _report(problem, solution, guess, search, precision_of(camera.distance))
 
 
@@ -246,7 +227,7 @@ def _report(
     problem: FitProblem,
     solution: Solution,
     guess: FitState,
-    search: float | int,
+    search: PsfSearch,
     precision: Precision,
 ) -> PsfFit:
     names = problem.names
@@ -269,13 +250,14 @@ def _report(
         if not any("object_distance" in line for line in alike):
             alike += _too_far(nearness, errors["object_distance"])
         errors["object_distance"] = errors["object_distance"] * distance**2
-    alike += _unknown(values, errors, disagree) + _left_search(values, errors, guess, search)
+    alike += _unknown(values, errors, disagree)
+    alike += _left_search(values, errors, guess, search.relative)
     explained = 1 - float(jnp.sum((residual * problem.weight) ** 2))
     poor = unfinished = ""
     if not explained >= _EXPLAINED:
         poor = (
             f"the model explains {max(0.0, explained):.0%} of the image's contrast: it is not "
-            "this camera's PSF, too noisy, or further from the start than search"
+            "this camera's PSF, too noisy, or further from the start than the search reaches"
         )
     if not np.all(solution.moved < CONVERGED):
         last = int(np.argmax(solution.moved))
@@ -330,7 +312,7 @@ def _unknown(values, errors, disagree) -> list[str]:
     return found
 
 
-def _left_search(values, errors, guess: FitState, search: float | int) -> list[str]:
+def _left_search(values, errors, guess: FitState, search: float) -> list[str]:
     """One line for each number that ended beyond its search; a search of 0 holds nothing."""
     names = tuple(n for n in ("beta", "distance", "wavelength") if n in values and search > 0)
     return [

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,12 +12,59 @@ from thincam_jax._core.checks import Number
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.measured.calibration.chirp_search import Chirp, Ranges, find_chirp
 from thincam_jax.measured.calibration.coarse import descend
-from thincam_jax.measured.calibration.problem import FitState, Synthesis
+from thincam_jax.measured.calibration.problem import PARAMETERS, FitState, Synthesis
 
 # d/t at which a free object distance starts where it was given as infinite, a number that no step
 # can leave: its shadow is within a millionth of that of infinity.
 _FARTHEST = 1e-6
 _WIDEST = 0.5  # of a search, in parts of one
+
+
+@dataclass(frozen=True)
+class PsfSearch:
+    """Numbers that `fit_psf` fits, how far from the camera given, and by which model.
+
+    - `parameters`: which to fit, of "beta", "phase", "centre", "width", "distance",
+      "object_distance", "wavelength", "background", "gain"; the others are held. Without
+      "background" it is 0, without "gain" 1.
+    - `relative`: how far β, d and λ may be from their start, in parts of one.
+    - `centre`: how far the centre may be, along y and x, on the sensor, mm; by default a tenth of
+      the sensor's shorter side.
+    - `pixel_integration`: average h over each pixel, as a sensor does. Without, the waves from the
+      far rim, up to 10 turns a pixel, are aliased, and d is then only as good as the start.
+    - `max_steps`: of Levenberg-Marquardt.
+    """
+
+    parameters: tuple[str, ...] = ("beta", "phase", "centre", "distance", "background", "gain")
+    relative: float = 0.12
+    centre: float | None = None
+    pixel_integration: bool = True
+    max_steps: int = 60
+
+    def __post_init__(self):
+        if not isinstance(self.parameters, tuple) or not self.parameters:
+            raise ValueError(f"parameters = {self.parameters!r}: give a tuple of at least one name")
+        for name in self.parameters:
+            checks.choice("a name in parameters", name, PARAMETERS)
+        checks.non_negative("relative", self.relative, "parts of one")
+        if self.relative > _WIDEST:
+            raise ValueError(f"relative = {self.relative:g} is too wide; give at most {_WIDEST:g}")
+        if self.centre is not None:
+            checks.non_negative("centre", self.centre, "mm")
+
+    def ranges(self, camera: LenslessCamera) -> Ranges:
+        """Possible distance of the sensor's fringes from those of the camera given."""
+        centre = self.centre
+        if centre is None:
+            centre = 0.1 * min(camera.sensor.shape) * float(camera.sensor.pitch)
+        free = {name: name in self.parameters for name in ("beta", "distance", "wavelength")}
+        # A free object distance, or mask-sensor distance, moves β/M² by parts of d/t only.
+        depth = "object_distance" in self.parameters or "distance" in self.parameters
+        return Ranges(
+            curvature=self.relative * (free["beta"] + 0.1 * depth),
+            epsilon=self.relative * sum(free.values()),
+            centre=centre * ("centre" in self.parameters),
+        )
 
 
 def given(
@@ -36,26 +84,6 @@ def given(
     return FitState(camera, wavelength, nearness, none, none + 1, synthesis)
 
 
-def search_ranges(
-    camera: LenslessCamera, parameters: Sequence[str], search: Number, centre_search: Number | None
-) -> Ranges:
-    """Possible distance of the sensor's fringes from those of the camera given."""
-    search = float(checks.non_negative("search", search, "parts of one"))
-    if search > _WIDEST:
-        raise ValueError(f"search = {search:g} is too wide; give at most {_WIDEST:g}")
-    if centre_search is None:
-        centre_search = 0.1 * min(camera.sensor.shape) * float(camera.sensor.pitch)
-    centre = float(checks.non_negative("centre_search", centre_search, "mm"))
-    free = {name: float(name in parameters) for name in ("beta", "distance", "wavelength")}
-    # A free object distance, or mask-sensor distance, moves β/M² by parts of d/t only.
-    magnification = 0.1 * ("object_distance" in parameters or "distance" in parameters)
-    return Ranges(
-        curvature=search * (free["beta"] + magnification),
-        epsilon=search * sum(free.values()),
-        centre=centre * ("centre" in parameters),
-    )
-
-
 def check_fringes(guess: FitState) -> None:
     """Refuse a sensor, or a shadow on it, that holds less than one fringe."""
     mask, sensor = guess.mask, guess.camera.sensor
@@ -72,22 +100,16 @@ def check_fringes(guess: FitState) -> None:
         )
 
 
-def start_near(
-    image: np.ndarray,
-    guess: FitState,
-    parameters: Sequence[str],
-    ranges: Ranges,
-    search: float,
-    pixel_integration: bool,
-) -> FitState:
+def start_near(image: np.ndarray, guess: FitState, search: PsfSearch) -> FitState:
     """The state whose fringes correlate best with the image, with the best background and gain.
 
-    Only what is in `parameters` differs from the guess.
+    Only the parameters of the search differ from the guess.
     """
-    pitch = float(guess.camera.sensor.pitch)
+    pitch, ranges = float(guess.camera.sensor.pitch), search.ranges(guess.camera)
     found = find_chirp(_one_picture(image, guess), pitch, _fringes(guess), ranges)
-    near = _with_fringes(guess, found, parameters, search)
-    return descend(image, guess, near, parameters, search, pixel_integration)
+    parameters, relative = search.parameters, search.relative
+    near = _with_fringes(guess, found, parameters, relative)
+    return descend(image, guess, near, parameters, relative, search.pixel_integration)
 
 
 def _one_picture(image: np.ndarray, guess: FitState) -> np.ndarray:
