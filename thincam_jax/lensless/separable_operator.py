@@ -13,7 +13,7 @@ from thincam_jax._core.checks import Number
 from thincam_jax._core.grids import Grid
 from thincam_jax._core.precision import product
 from thincam_jax.imaging.operators import Separable, Truncated, kernel_grid, orthogonal_terms
-from thincam_jax.imaging.scene import Scene
+from thincam_jax.imaging.scene import ImagePlane, Scene
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.forward import projected_shape
 from thincam_jax.lensless.method import Model, PsfMethod, psf_method
@@ -68,11 +68,11 @@ def separable_operator(
         )
     (plane,) = scene.planes
     field = projected_shape(camera, plane)
-    grid, fine = camera.sensor.grid, Grid(field, camera.sensor.pitch)
+    grid = camera.sensor.grid
     kernel = kernel_grid(grid, field)
     method = psf_method(camera.mask, kernel, model, pixel_integration)
     rows, columns = _factors(camera, scene, kernel, method)
-    down, across = plane.weights(fine, magnification=-camera.distance / plane.distance)
+    down, across = _weights(camera, plane, field)
     left, right = (
         grid.pitch * product(_toeplitz(factors, size), weights.astype(factors.dtype))
         for factors, size, weights in ((rows, field[0], down), (columns, field[1], across))
@@ -103,6 +103,13 @@ def _factors(camera, scene: Scene, grid: Grid, method: PsfMethod):
     down, across, errors = orthogonal_terms(down, across)
     count = 1 + int(np.sum(np.asarray(errors) > _REDUNDANT[str(down.dtype)]))
     return down[:count], across[:count]
+
+
+@jax.jit(static_argnames="shape")
+def _weights(camera: LenslessCamera, plane: ImagePlane, shape: tuple[int, int]):
+    """What the projected pixels of an image contribute to `shape` samples, per axis."""
+    grid = Grid(shape, camera.sensor.pitch)
+    return plane.weights(grid, magnification=-camera.distance / plane.distance)
 
 
 @jax.jit(static_argnames="size")

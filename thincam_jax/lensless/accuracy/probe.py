@@ -100,6 +100,20 @@ def _direct_sum(
     return block_mean(irradiance, method.samples) if method.pixel_integration else irradiance
 
 
+@jax.jit
+def _fine_lines(mask: AbstractFactoredMask, half_sensor: Array, path: Path, exact: Array):
+    """Fields on lines through the axis, their half length, and the pairs of their orders.
+
+    One line stands for both axes where the mask's factors are the same.
+    """
+    terms = mask.terms(path.wavelength)
+    axes = (1,) if terms.rows is terms.columns else (0, 1)
+    half_mask = jnp.max(jnp.stack(mask.extent)) / 2 + jnp.max(jnp.abs(mask.centre))
+    reach = jnp.maximum(half_sensor, half_mask * path.magnification)
+    fields = [fine_fields(mask, path, reach, exact, _FINE_SAMPLES, axis) for axis in axes]
+    return fields, reach, pairs(terms.coefficients)
+
+
 def _spread(count: int, most: int) -> Float[np.ndarray, " chosen"]:
     """At most `most` centred indices out of `count`, one of each of equal strata."""
     edges = np.linspace(0, count, min(count, most) + 1)
@@ -310,24 +324,11 @@ class MaskProbe:
         """
         with allow("float64"):
             mask, pitch, path = self.given["float64"]
-            terms = mask.terms(path.wavelength)
-            axes = (1,) if terms.rows is terms.columns else (0, 1)
-            half_sensor = max(self.shape) * pitch / 2
-            half_mask = jnp.max(jnp.stack(mask.extent)) / 2 + jnp.max(jnp.abs(mask.centre))
-            reach = jnp.maximum(half_sensor, half_mask * path.magnification)
-            both = [
-                [
-                    np.asarray(
-                        fine_fields(mask, path, reach, jnp.asarray(exact), _FINE_SAMPLES, axis)
-                    )
-                    for axis in axes
-                ]
-                for exact in (True, False)
-            ]
-            weighted_pairs = tuple(np.asarray(v) for v in pairs(terms.coefficients))
+            half_sensor, which = max(self.shape) * pitch / 2, map(jnp.asarray, (True, False))
+            found = [_fine_lines(mask, half_sensor, path, exact) for exact in which]
         exact, fresnel = (
             self._line_factors((fields[0], fields[-1]), float(reach), float(pitch), weighted_pairs)
-            for fields in both
+            for fields, reach, weighted_pairs in jax.device_get(found)
         )
         size = norm(fresnel)
         return rounding_distance(exact, fresnel) / size if size else 0.0

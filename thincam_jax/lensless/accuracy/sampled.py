@@ -65,7 +65,7 @@ def sampled_errors(
         for n in _FINER
     ]
     rounding = SAMPLED_ROUNDING[precision_of(grid.pitch)]
-    cut = _cut_by_window(mask, grid, path, methods[0])
+    cut = float(_cut_by_window(mask, grid, path, methods[0]))
     before = _central(mask, grid, path, methods[0])
     for method, finer in zip(methods, methods[1:], strict=False):
         after = _central(mask, grid, path, finer)
@@ -75,18 +75,20 @@ def sampled_errors(
         before = after
 
 
-def _cut_by_window(mask: AbstractMask, grid: Grid, path: Path, method: PsfMethod) -> float:
+@jax.jit(static_argnames="method")
+def _cut_by_window(mask: AbstractMask, grid: Grid, path: Path, method: PsfMethod):
     """Relative difference of lines of the mask's middle from those of a wider window."""
     plane, sensor = planes(grid, method)
-    strip, squares = min(_PART * method.samples, *plane.shape), 0.0
+    strip, squares = min(_PART * method.samples, *plane.shape), jnp.zeros((), grid.pitch.dtype)
     for axis in (0, 1):
         shape = (strip, plane.shape[1]) if axis else (plane.shape[0], strip)
         field = lit_mask(mask, plane.with_shape(shape), path)
         lines = (field if axis else field.T)[:: max(1, strip // _LINES)]
         narrow, wide = (_lines(lines, sensor.pitch, path, sensor.shape[axis], p) for p in _PADDED)
-        size = float(jnp.linalg.norm(wide))
-        squares += (float(jnp.linalg.norm(narrow - wide)) / size) ** 2 if size > 0 else 0.0
-    return squares**0.5
+        size = jnp.linalg.norm(wide)
+        off = jnp.linalg.norm(narrow - wide) / jnp.where(size > 0, size, 1.0)
+        squares += jnp.where(size > 0, off, 0.0) ** 2
+    return jnp.sqrt(squares)
 
 
 @jax.jit(static_argnames=("count", "padding"))
