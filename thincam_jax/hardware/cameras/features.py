@@ -8,7 +8,7 @@ from collections.abc import Collection
 from contextlib import AbstractContextManager
 from typing import Any, Protocol, runtime_checkable
 
-from thincam_jax.hardware.base import Camera, CameraSettings, Identity, Region
+from thincam_jax.hardware.base import Camera, CameraSettings, Region
 from thincam_jax.hardware.errors import OutOfRange, Timeout
 
 BIT_DEPTHS = {"Mono8": 8, "Mono10": 10, "Mono12": 12, "Mono16": 16}
@@ -46,7 +46,6 @@ class FeatureCamera(Camera):
     """Base of the cameras that are set by features, whatever library reaches them."""
 
     _features: Any
-    _identity: Identity
     _name: str  # in errors
     _formats: Collection[str] = BIT_DEPTHS.keys()  # that the driver can read
     _settings: CameraSettings | None = None
@@ -58,10 +57,6 @@ class FeatureCamera(Camera):
     @abstractmethod
     def _told(self, operation: str) -> AbstractContextManager[None]:
         """Errors of the library become ours."""
-
-    @property
-    def identity(self) -> Identity:
-        return self._identity
 
     @property
     def sensor_shape(self) -> tuple[int, int]:

@@ -7,6 +7,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import Any
 
+from thincam_jax.hardware import errors
 from thincam_jax.hardware.base import CameraSettings, Frame, Identity
 from thincam_jax.hardware.cameras.features import (
     BIT_DEPTHS,
@@ -17,16 +18,7 @@ from thincam_jax.hardware.cameras.features import (
     text,
     trigger_by_software,
 )
-from thincam_jax.hardware.errors import (
-    Busy,
-    Disconnected,
-    HardwareError,
-    IncompleteFrame,
-    NotFound,
-    OutOfRange,
-    PermissionDenied,
-    ProtocolError,
-)
+from thincam_jax.hardware.errors import HardwareError
 
 with warnings.catch_warnings():
     # Raised as an error, SWIG's warning about its own types crashes the interpreter.
@@ -63,8 +55,8 @@ class PylonCamera(FeatureCamera):
         self._features = features = _Features(self._camera.GetNodeMap())
         info = self._camera.GetDeviceInfo()
         maker, version = info.GetVendorName(), text(features, "DeviceFirmwareVersion")
-        self._identity = Identity(maker, info.GetModelName(), info.GetSerialNumber(), version)
-        self._name = str(self._identity)
+        self.identity = Identity(maker, info.GetModelName(), info.GetSerialNumber(), version)
+        self._name = str(self.identity)
         ticks = "GevTimestampTickFrequency"  # of GigE Vision; USB3 Vision counts nanoseconds
         self._tick = 1 / float(features.get(ticks)) if features.has(ticks) else 1e-9
         trigger_by_software(features)
@@ -81,7 +73,7 @@ class PylonCamera(FeatureCamera):
             found = [info.GetSerialNumber() for info in factory.EnumerateDevices()]
             cause = f"no camera {options.serial}".rstrip()
             remedy = f"connect one and switch it on; found: {', '.join(found) or 'none'}"
-            raise NotFound("pylon", "open", cause, remedy) from error
+            raise errors.NotFound("pylon", "open", cause, remedy) from error
         return cls(camera)
 
     def flush(self) -> None:
@@ -128,11 +120,13 @@ class PylonCamera(FeatureCamera):
             raise self._timeout("grab", "no frame came after the trigger")
         if not result.GrabSucceeded():
             cause = result.ErrorDescription or f"pylon's error {result.ErrorCode:#x}"
-            raise IncompleteFrame(self._name, "grab", cause, "take it again; check the cable")
+            raise errors.IncompleteFrame(
+                self._name, "grab", cause, "take it again; check the cable"
+            )
         pixels, region = result.Array, settings.region
         if region is None or pixels.shape != (region.height, region.width):
             cause = f"{pixels.shape} pixels, and {region} is set"
-            raise ProtocolError(self._name, "grab", cause, "configure the camera again")
+            raise errors.ProtocolError(self._name, "grab", cause, "configure the camera again")
         # The emulator has no clock.
         moment = result.TimeStamp * self._tick if result.TimeStamp else time.monotonic()
         bits = BIT_DEPTHS[settings.pixel_format]
@@ -155,7 +149,7 @@ class PylonCamera(FeatureCamera):
             failure = error
         if self._camera.IsCameraDeviceRemoved():
             remedy = "connect it and open it again"
-            raise Disconnected(self._name, operation, "it was removed", remedy) from failure
+            raise errors.Disconnected(self._name, operation, "it was removed", remedy) from failure
         if isinstance(failure, HardwareError):
             raise failure
         if failure is not None:
@@ -166,13 +160,13 @@ class PylonCamera(FeatureCamera):
         if isinstance(failure, genicam.TimeoutException):
             return self._timeout(operation, cause)
         if isinstance(failure, genicam.OutOfRangeException):
-            return OutOfRange(self._name, operation, cause, "give a value within the limits")
+            return errors.OutOfRange(self._name, operation, cause, "give a value within the limits")
         if operation == "open" and "another" in cause:
-            return Busy(self._name, operation, cause, "close the program that holds it")
+            return errors.Busy(self._name, operation, cause, "close the program that holds it")
         if operation == "open" and "permission" in cause.lower():
             remedy = "install pylon's udev rule (setup-usb.sh) and connect the camera again"
-            return PermissionDenied(self._name, operation, cause, remedy)
-        return ProtocolError(self._name, operation, cause, "open the camera again")
+            return errors.PermissionDenied(self._name, operation, cause, remedy)
+        return errors.ProtocolError(self._name, operation, cause, "open the camera again")
 
 
 class _Features:

@@ -21,7 +21,7 @@ from scipy.interpolate import PchipInterpolator
 from scipy.optimize import isotonic_regression
 
 from thincam_jax._core.files import read_regular, write_whole
-from thincam_jax.hardware.base import Camera, Display, Identity
+from thincam_jax.hardware.base import Camera, Display
 from thincam_jax.hardware.errors import OutOfRange, Saturated
 
 LEVELS = 256
@@ -69,19 +69,8 @@ class GreyLevels:
 class Screen(Display):
     """A display of 256 levels; with `grey_levels`, in equal steps of the irradiance."""
 
-    _identity: Identity
-    _shape: tuple[int, int]
-
     def __init__(self, grey_levels: GreyLevels | None = None):
         self.grey_levels = grey_levels
-
-    @property
-    def identity(self) -> Identity:
-        return self._identity
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        return self._shape
 
     def show(self, pattern: np.ndarray) -> None:
         if pattern.shape != self.shape or pattern.dtype != np.uint8:

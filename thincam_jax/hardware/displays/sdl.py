@@ -57,11 +57,6 @@ class SdlDisplay(Screen):
             self.close()
             raise
 
-    @classmethod
-    def open(cls, options: Options) -> "SdlDisplay":
-        """Opens the window; NotFound where there is no such monitor."""
-        return cls(options)
-
     def _open(self, options: Options) -> None:
         count = sdl2.SDL_GetNumVideoDisplays()
         names = [(sdl2.SDL_GetDisplayName(k) or b"").decode(errors="replace") for k in range(count)]
@@ -70,7 +65,7 @@ class SdlDisplay(Screen):
         sdl2.SDL_GetDisplayBounds(number, ctypes.byref(bounds))
         rows, columns = options.size or (bounds.h, bounds.w)
         driver = sdl2.SDL_GetCurrentVideoDriver().decode()
-        self._identity = Identity("SDL", names[number], f"monitor {number}", driver)
+        self.identity = Identity("SDL", names[number], f"monitor {number}", driver)
         flags = sdl2.SDL_WINDOW_BORDERLESS | sdl2.SDL_WINDOW_ALLOW_HIGHDPI
         if options.size is None:
             flags |= sdl2.SDL_WINDOW_FULLSCREEN_DESKTOP
@@ -81,22 +76,22 @@ class SdlDisplay(Screen):
             self._window, -1, sdl2.SDL_RENDERER_PRESENTVSYNC
         )
         if not self._renderer:
-            raise ProtocolError(str(self._identity), "open", _error(), "try the tkinter display")
+            raise ProtocolError(str(self.identity), "open", _error(), "try the tkinter display")
         sdl2.SDL_ShowCursor(sdl2.SDL_DISABLE)
         sdl2.SDL_DisableScreenSaver()
         info = sdl2.SDL_RendererInfo()
         sdl2.SDL_GetRendererInfo(self._renderer, ctypes.byref(info))
         self.vsync = bool(info.flags & sdl2.SDL_RENDERER_PRESENTVSYNC)
-        self._shape = self._output()
+        self.shape = self._output()
         self._texture = sdl2.SDL_CreateTexture(
             self._renderer,
             sdl2.SDL_PIXELFORMAT_RGB888,
             sdl2.SDL_TEXTUREACCESS_STREAMING,
-            self._shape[1],
-            self._shape[0],
+            self.shape[1],
+            self.shape[0],
         )
-        self._pixels = np.empty(self._shape, np.uint32)
-        self._present(np.zeros(self._shape, np.uint8))
+        self._pixels = np.empty(self.shape, np.uint32)
+        self._present(np.zeros(self.shape, np.uint8))
 
     def close(self) -> None:
         if self._window:
@@ -117,7 +112,7 @@ class SdlDisplay(Screen):
             sdl2.SDL_RenderPresent(self._renderer)
         if failed:
             remedy = "open the display again"
-            raise ProtocolError(str(self._identity), "show", _error(), remedy)
+            raise ProtocolError(str(self.identity), "show", _error(), remedy)
         self._require_window()
 
     def _require_window(self) -> None:
@@ -129,11 +124,11 @@ class SdlDisplay(Screen):
                 cause = "the window was closed"
         if not cause and sdl2.SDL_GetWindowFlags(self._window) & _NOT_SHOWN:
             cause = "the window is hidden"
-        if not cause and self._output() != self._shape:
+        if not cause and self._output() != self.shape:
             cause = "the monitor has another size now"
         if cause:
             remedy = "connect the monitor and open the display again"
-            raise Disconnected(str(self._identity), "show", cause, remedy)
+            raise Disconnected(str(self.identity), "show", cause, remedy)
 
     def _output(self) -> tuple[int, int]:
         columns, rows = ctypes.c_int(), ctypes.c_int()

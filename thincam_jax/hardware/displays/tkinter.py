@@ -38,22 +38,17 @@ class TkinterDisplay(Screen):
             remedy = "connect a monitor and set DISPLAY"
             raise NotFound("tkinter", "open", str(error), remedy) from error
         version = str(self._root.tk.call("info", "patchlevel"))
-        self._identity = Identity("tkinter", "window", "", version)
+        self.identity = Identity("tkinter", "window", "", version)
         screen = self._root.winfo_screenheight(), self._root.winfo_screenwidth()
         rows, columns = options.size or screen
-        self._shape = rows, columns
+        self.shape = rows, columns
         self._root.overrideredirect(True)
         self._root.geometry(f"{columns}x{rows}+{options.left}+{options.top}")
         self._root.configure(cursor="none")
         self._image = tkinter.PhotoImage(master=self._root, width=columns, height=rows)
         label = tkinter.Label(self._root, image=self._image, borderwidth=0, highlightthickness=0)
         label.place(x=0, y=0, width=columns, height=rows)
-        self._present(np.zeros(self._shape, np.uint8))
-
-    @classmethod
-    def open(cls, options: Options) -> "TkinterDisplay":
-        """Opens the window; NotFound where there is no desktop."""
-        return cls(options)
+        self._present(np.zeros(self.shape, np.uint8))
 
     def close(self) -> None:
         with suppress(tkinter.TclError):

@@ -56,8 +56,8 @@ class Usb3VisionCamera(FeatureCamera):
         self._control = control
         registers = Abrm.MANUFACTURER, Abrm.MODEL, Abrm.SERIAL, Abrm.DEVICE_VERSION
         texts = (gencp.text(control.read(register, gencp.TEXT_LENGTH)) for register in registers)
-        self._identity = Identity(*texts)
-        self._name = link.name = str(self._identity)
+        self.identity = Identity(*texts)
+        self._name = link.name = str(self.identity)
         self._compare_clocks = compare_clocks and control.has_clock
         self._features = Features(link, control, fetch_xml(link, control))
         self._stream = Stream(link, control, control.sirm)
