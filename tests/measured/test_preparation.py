@@ -109,15 +109,6 @@ def test_bayer_superpixel_and_blocks_are_plain_means():
     assert found.psf.shape == (3, 4, 6)
 
 
-def test_bayer_bilinear_keeps_a_ramp():
-    y, x = np.mgrid[:ROWS, :COLUMNS]
-    ramp = (100 + 8 * y + 4 * x).astype(np.uint16)
-    options = Preparation(bayer="BGGR", capture_scale="none")
-    found = prepare(Raw(ramp, 12), Raw(ramp, 12), 0, options)
-    inside = found.capture[:, 1:-1, 1:-1] * 4095
-    np.testing.assert_allclose(inside, np.broadcast_to(ramp[1:-1, 1:-1], inside.shape), rtol=1e-6)
-
-
 def test_saturated_pixels_spoil_all_that_they_enter():
     psf, capture = measured(), measured(seed=12)
     capture[5, 9] = 4095
@@ -209,16 +200,6 @@ def test_centring_shifts_all_channels_alike():
     assert found.log["centring"]["shift"] == [-6, -2]
     assert np.argwhere(found.psf[0]).tolist() == [[12, 18]]
     assert np.argwhere(found.psf[2]).tolist() == [[12, 18], [13, 18]]
-
-
-def test_a_shifted_psf_shifts_the_reconstruction_the_other_way():
-    """What the option `centre` says, by an inverse filter without noise."""
-    generator = np.random.default_rng(15)
-    scene, psf = generator.random((12, 17)), generator.random((12, 17)) ** 8
-    capture = np.fft.ifft2(np.fft.fft2(scene) * np.fft.fft2(psf))
-    moved = np.roll(psf, (2, -3), axis=(0, 1))
-    image = np.fft.ifft2(np.fft.fft2(capture) / np.fft.fft2(moved)).real
-    np.testing.assert_allclose(image, np.roll(scene, (-2, 3), axis=(0, 1)), atol=1e-9)
 
 
 def test_the_log_names_every_step_and_is_plain_json():

@@ -27,8 +27,9 @@ class Identity:
 
 
 class Device(ABC):
-    """An open device, with its `identity`."""
+    """An open device, with its `identity`; `Options` are those of its driver in a config file."""
 
+    Options: type[Any]
     identity: Identity
 
     @classmethod

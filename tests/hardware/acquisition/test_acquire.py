@@ -254,10 +254,6 @@ def test_a_device_that_has_gone_is_opened_again(path):
         )
 
 
-def exchange(world):
-    world.serial = "2"
-
-
 def after_nine(world):
     """A progress callback that pulls the plug."""
     return lambda now: world.faults.inject("unplug") if now.done == 9 else None

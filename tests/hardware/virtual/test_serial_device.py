@@ -143,10 +143,3 @@ def test_garbage_before_an_answer_is_survived(driver, virtual):
             device._send(garbage)
             reached = stage.move_to(4.0)
             assert reached == stage.position() == pytest.approx(device.true_position, abs=1e-3)
-
-
-@KINDS
-def test_opened_again_and_again_it_answers_each_driver(driver, virtual):
-    with virtual(FAST) as device:
-        for _ in range(5):
-            open_stage(driver, device).close()

@@ -73,11 +73,6 @@ class TestResample:
         shown = (np.abs(y)[:, None] <= SHAPE[0] / 2) & (np.abs(x) <= SHAPE[1] / 2)
         np.testing.assert_allclose(found, shown, atol=1e-12)
 
-    def test_nothing_changes_at_scale_one(self):
-        image = waves(1.0, (0.0, 0.0))
-        found = resample(image, jnp.asarray(1.0), jnp.zeros(2))
-        np.testing.assert_allclose(found, image, atol=1e-12)
-
 
 def rms(values):
     return float(jnp.sqrt(jnp.mean(values**2)))

@@ -27,15 +27,15 @@ _BUFFERS = 4
 
 
 class AravisCamera(FeatureCamera):
-    """A camera that aravis knows, with one frame for each software trigger.
+    """A camera supported by aravis, with one frame for each software trigger.
 
-    After a frame that failed, the stream starts anew, so that a late one is never taken for the
-    next. A camera that does not answer is `Disconnected`, 2.5 s after the question.
+    After a failed frame the stream is restarted, so that a late one is not taken for the next. A
+    camera that does not answer for 2.5 s is `Disconnected`.
     """
 
     @dataclass(frozen=True)
     class Options:
-        """Which camera: its `name` as `arv-tool-0.8` lists it, its address, or "" for the first."""
+        """`name`: as `arv-tool-0.8` lists the camera, its address, or "" for the first one."""
 
         name: str = ""
 
@@ -47,8 +47,8 @@ class AravisCamera(FeatureCamera):
         self._features: Any = None
         self._count = FrameCount()
         try:
-            with self._told("open"):
-                # The list is that of the last search: what was connected since is not in it.
+            with self._translated("open"):
+                # The list is that of the last search, without cameras connected since.
                 self._aravis.update_device_list()
                 self._camera = self._aravis.Camera.new(options.name or None)
                 self._introduce()
@@ -58,7 +58,7 @@ class AravisCamera(FeatureCamera):
 
     @staticmethod
     def require_libraries() -> None:
-        """NotFound, with what to install, where they are missing."""
+        """Raise NotFound, with what to install, where libraries are missing."""
         _libraries()
 
     def _introduce(self) -> None:
@@ -90,7 +90,7 @@ class AravisCamera(FeatureCamera):
         settings = self._require_settings()
         deadline = time.monotonic() + settings.exposure + timeout
         try:
-            with self._told("grab"):
+            with self._translated("grab"):
                 self._start()
                 self.flush()
                 self._wait_until_ready(deadline)
@@ -123,13 +123,13 @@ class AravisCamera(FeatureCamera):
         self._camera.start_acquisition()
 
     def _stop(self) -> None:
-        if self._stream is not None and not self._lost:  # one that has gone takes seconds to refuse
+        if self._stream is not None and not self._lost:  # a lost one takes seconds to refuse
             with suppress(self._glib.Error):
                 self._camera.stop_acquisition()
         self._stream = None
 
     def _wait_until_ready(self, deadline: float) -> None:
-        """A trigger that comes too early is lost; cameras that can, say when they are ready."""
+        """Wait, as early triggers are lost; some cameras report when they are ready."""
         while self._features.has("AcquisitionStatus"):
             if self._features.get("AcquisitionStatus"):
                 return
@@ -157,8 +157,8 @@ class AravisCamera(FeatureCamera):
         self._lost = True
 
     @contextmanager
-    def _told(self, operation: str) -> Iterator[None]:
-        """Aravis's errors become ours."""
+    def _translated(self, operation: str) -> Iterator[None]:
+        """Turn errors of aravis into those of a device."""
         if self._lost:
             raise self._gone(operation, "its control was lost")
         try:
@@ -178,7 +178,7 @@ class AravisCamera(FeatureCamera):
             return errors.NotFound(self._name, operation, cause, remedy)
         if code in (codes.NOT_CONTROLLER, codes.PROTOCOL_ERROR_ACCESS_DENIED) or "BUSY" in cause:
             return errors.Busy(self._name, operation, cause, "close the program that holds it")
-        if "ACCESS" in cause:  # libusb's name of it
+        if "ACCESS" in cause:  # libusb's name for it
             remedy = "install aravis's udev rule (aravis.rules) and connect the camera again"
             return errors.PermissionDenied(self._name, operation, cause, remedy)
         silent = codes.TIMEOUT, codes.NOT_CONNECTED, codes.TRANSFER_ERROR, codes.NO_STREAM_CHANNEL

@@ -1,4 +1,4 @@
-"""Basler's cameras, and the emulator that their maker ships, by pypylon."""
+"""Basler's cameras, and Basler's emulator, by pypylon."""
 
 import time
 import warnings
@@ -27,16 +27,16 @@ with warnings.catch_warnings():
 
 
 class PylonCamera(FeatureCamera):
-    """A camera that pylon knows: USB3 Vision or GigE Vision, or its emulator (PYLON_CAMEMU=1).
+    """A camera supported by pylon: USB3 Vision or GigE Vision, or its emulator (PYLON_CAMEMU=1).
 
-    Every frame answers a software trigger, which is sent once the camera is ready for it: pylon
-    loses earlier ones without a word. After a frame that failed, the stream starts anew, so that
-    a late one is never taken for the next.
+    The software trigger of a frame is sent once the camera is ready: pylon silently loses earlier
+    ones. After a failed frame the stream is restarted, so that a late one is not taken for the
+    next.
     """
 
     @dataclass(frozen=True)
     class Options:
-        """Which camera: its `serial` number, or "" for the first one found."""
+        """`serial`: number of the camera, or "" for the first one found."""
 
         serial: str = ""
 
@@ -44,7 +44,7 @@ class PylonCamera(FeatureCamera):
         self._camera, self._name = camera, "pylon camera"
         self._count = FrameCount()
         try:
-            with self._told("open"):
+            with self._translated("open"):
                 camera.Open()
                 self._introduce()
         except BaseException:
@@ -63,7 +63,7 @@ class PylonCamera(FeatureCamera):
 
     @classmethod
     def open(cls, options: Options) -> "PylonCamera":
-        """Opens a camera; NotFound, Busy or PermissionDenied where that fails."""
+        """Open a camera; NotFound, Busy or PermissionDenied where that fails."""
         wanted, factory = pylon.DeviceInfo(), pylon.TlFactory.GetInstance()
         if options.serial:
             wanted.SetSerialNumber(options.serial)
@@ -77,7 +77,7 @@ class PylonCamera(FeatureCamera):
         return cls(camera)
 
     def flush(self) -> None:
-        with self._told("flush"):
+        with self._translated("flush"):
             while self._camera.IsGrabbing():
                 result = self._camera.RetrieveResult(0, pylon.TimeoutHandling_Return)
                 if not result.IsValid():
@@ -88,7 +88,7 @@ class PylonCamera(FeatureCamera):
         settings = self._require_settings()
         milliseconds = int(1e3 * (settings.exposure + timeout)) + 1
         try:
-            with self._told("grab"):
+            with self._translated("grab"):
                 if not self._camera.IsGrabbing():
                     self._camera.StartGrabbing(pylon.GrabStrategy_OneByOne)
                     self._count.restart()
@@ -137,10 +137,10 @@ class PylonCamera(FeatureCamera):
             self._camera.StopGrabbing()
 
     @contextmanager
-    def _told(self, operation: str) -> Iterator[None]:
-        """Pylon's errors become ours, and a camera that has gone is `Disconnected`.
+    def _translated(self, operation: str) -> Iterator[None]:
+        """Turn errors of pylon into those of a device.
 
-        Much that is asked of a camera that has gone succeeds, hence the question at the end.
+        Much succeeds with a disconnected camera, so that is checked at the end.
         """
         failure = None
         try:

@@ -13,7 +13,7 @@ from thincam_jax.hardware.displays.grey_levels import GreyLevels, Screen
 from thincam_jax.hardware.errors import Disconnected, NotFound, ProtocolError
 
 with warnings.catch_warnings():
-    warnings.simplefilter("ignore")  # it tells which of the SDL libraries it has found
+    warnings.simplefilter("ignore")  # it reports which SDL libraries it has found
     import sdl2
 
 _GREY = np.uint32(0x010101)  # red, green and blue alike
@@ -21,18 +21,18 @@ _NOT_SHOWN = sdl2.SDL_WINDOW_HIDDEN | sdl2.SDL_WINDOW_MINIMIZED
 
 
 class SdlDisplay(Screen):
-    """A window without a frame, pixel by pixel, without a cursor.
+    """A borderless window without a cursor, pixel by pixel.
 
-    `show` returns after the monitor's next image where the driver waits for it (`vsync`). It is
-    used by the thread that opened it. The monitor must not scale: its mode has to be the panel's.
+    `show` returns after the monitor's next refresh if the driver supports `vsync`. Only the thread
+    that opened it may use it. The monitor must not scale: its mode has to be the panel's.
     """
 
     @dataclass(frozen=True)
     class Options:
-        """Which monitor, by its name or number; "" where there is only one.
+        """`monitor`: its name or number, "" if there is only one.
 
-        `size` is (rows, columns) of a window in the monitor's upper left corner, None for all of
-        the monitor; `grey_levels` a file with the table of grey levels.
+        `size` is (rows, columns) of a window in the monitor's upper left corner, None for the full
+        screen; `grey_levels` a file with the table of grey levels.
         """
 
         monitor: str = ""
@@ -106,7 +106,7 @@ class SdlDisplay(Screen):
         np.multiply(levels, _GREY, out=self._pixels)
         data, pitch = self._pixels.ctypes.data_as(ctypes.c_void_p), self._pixels.strides[0]
         failed = sdl2.SDL_UpdateTexture(self._texture, None, data, pitch)
-        # With vsync, the first may wait in a queue until the second is accepted.
+        # With vsync, the first may be queued until the second is accepted.
         for _ in range(2 if self.vsync else 1):
             failed = failed or sdl2.SDL_RenderCopy(self._renderer, self._texture, None, None)
             sdl2.SDL_RenderPresent(self._renderer)
@@ -116,7 +116,7 @@ class SdlDisplay(Screen):
         self._require_window()
 
     def _require_window(self) -> None:
-        """Disconnected where the window was closed or the monitor has another size now."""
+        """Raise Disconnected where the window was closed or the monitor's size has changed."""
         cause, event = "" if self._window else "the window is closed", sdl2.SDL_Event()
         while self._window and sdl2.SDL_PollEvent(ctypes.byref(event)):
             closed = event.window.event == sdl2.SDL_WINDOWEVENT_CLOSE
