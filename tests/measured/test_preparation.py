@@ -39,8 +39,8 @@ def test_one_channel_with_the_corner_as_background():
     np.testing.assert_allclose(found.log["scaling"]["capture_divisor"], image.max(), rtol=1e-6)
     assert found.psf.dtype == found.capture.dtype == np.float32
     assert found.valid.all() and found.valid.shape == (1, 6, 9)
-    told = found.log["background"]["capture"]
-    np.testing.assert_allclose(told["level"], [level / 4095], rtol=1e-6)
+    record = found.log["background"]["capture"]
+    np.testing.assert_allclose(record["level"], [level / 4095], rtol=1e-6)
     clipped = [int((a < level).sum()) for a in (psf, capture)]
     assert [found.log["clipping"][n] for n in ("psf", "capture")] == clipped
     assert min(clipped) > 0
@@ -169,8 +169,8 @@ def test_odd_sides_are_cropped_centrally():
     found = prepare(Raw(psf, 12), Raw(capture, 12), 0, options)
     expected = blocks(capture[1:25, 1:37].astype(float), 4) / 4095
     np.testing.assert_allclose(found.capture[0], expected, rtol=1e-5)
-    told = found.log["downsampling"]
-    assert told["first_pixel"] == [1, 1] and told["cropped_to"] == [24, 36]
+    record = found.log["downsampling"]
+    assert record["first_pixel"] == [1, 1] and record["cropped_to"] == [24, 36]
 
 
 def test_noise_of_the_corner_sets_the_threshold():

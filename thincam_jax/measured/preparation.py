@@ -91,9 +91,10 @@ def prepare(
     square = slice(None), slice(*options.corner), slice(*options.corner)
     corner = planes["psf"][square].mean(axis=(1, 2), keepdims=True, dtype=np.float64)
     corner = corner.astype(np.float32)
-    levels = {n: _level(b, raws[n], corner) for n, b in backgrounds.items()}
+    found = {n: _background(b, raws[n], corner) for n, b in backgrounds.items()}
+    levels = {n: level for n, (level, _) in found.items()}
     noise = _noise((planes["psf"] - levels["psf"])[square].astype(np.float64), options)
-    log["background"] = {n: _background_facts(b, levels[n]) for n, b in backgrounds.items()}
+    log["background"] = {n: record for n, (_, record) in found.items()}
     planes = {n: planes[n] - levels[n] for n in planes}
     log["clipping"] = {n: int(np.count_nonzero(p < 0)) for n, p in planes.items()}
     known = ~(np.zeros(capture.pixels.shape[:2], bool) if dead is None else dead)
@@ -160,20 +161,17 @@ def _noise(part: np.ndarray, options: Preparation) -> np.ndarray:
     return spread / options.downsample
 
 
-def _level(background: Background, raw: Raw, corner: np.ndarray) -> np.ndarray:
-    """Level to subtract, in fractions of full scale."""
+def _background(
+    background: Background, raw: Raw, corner: np.ndarray
+) -> tuple[np.ndarray, dict[str, Any]]:
+    """Level to subtract, in fractions of full scale, and its record."""
     if isinstance(background, Raw):
-        return _in_full_scale(background)
-    if isinstance(background, str):
-        return corner
-    return np.full((1, 1, 1), background / raw.full_scale, np.float32)
-
-
-def _background_facts(background: Background, level: np.ndarray) -> dict[str, Any]:
-    kind = background if isinstance(background, str) else "number"
-    if isinstance(background, Raw):
-        kind = f"dark frame {background.name}"
-    return {"kind": kind, "level": level.mean(axis=(1, 2), dtype=np.float64).tolist()}
+        level, kind = _in_full_scale(background), f"dark frame {background.name}"
+    elif isinstance(background, str):
+        level, kind = corner, background
+    else:
+        level, kind = np.full((1, 1, 1), background / raw.full_scale, np.float32), "number"
+    return level, {"kind": kind, "level": level.mean(axis=(1, 2), dtype=np.float64).tolist()}
 
 
 def _demosaiced(frame: _Frame, options: Preparation) -> _Frame:

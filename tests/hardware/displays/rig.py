@@ -46,10 +46,7 @@ class PanelCamera(Camera):
     """A 12 bit camera, pixel by pixel of the panel; `counts` of its levels, with noise."""
 
     def __init__(
-        self,
-        display: Panel,
-        counts: Callable[[np.ndarray], np.ndarray],
-        noise: float = 2.0,
+        self, display: Panel, counts: Callable[[np.ndarray], np.ndarray], noise: float = 2.0
     ):
         self.display, self.counts, self.noise = display, counts, noise
         self.random, self.number = np.random.default_rng(11), 0

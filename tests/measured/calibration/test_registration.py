@@ -104,7 +104,7 @@ def test_the_registered_reference_lies_on_the_capture():
 
 
 @pytest.mark.thorough
-def test_different_scenes_are_told():
+def test_different_scenes_are_a_poor_fit():
     found = estimate_registration(blobs(seed=1), blobs(seed=2))
     assert found.status in ("poor_fit", "not_converged")
     assert any("correlate" in line for line in found.reasons)

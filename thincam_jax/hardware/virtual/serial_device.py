@@ -88,8 +88,7 @@ class VirtualSerialDevice(ABC):
     def _receive(self, data: bytes) -> None:
         """Receive bytes from the driver."""
 
-    @abstractmethod
-    def _connected(self) -> None:
+    def _connected(self) -> None:  # noqa: B027
         """React to a driver that has opened the terminal."""
 
     @abstractmethod

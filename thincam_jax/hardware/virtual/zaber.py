@@ -41,9 +41,6 @@ class VirtualZaber(VirtualSerialDevice):
     _homing = False
     _sends_checksums = False
 
-    def _connected(self) -> None:
-        pass  # it sends answers only
-
     def _stopped(self, stalled: bool) -> None:
         if stalled:
             self._homing = False

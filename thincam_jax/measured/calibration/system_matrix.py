@@ -165,8 +165,7 @@ def _operator(matrix: np.ndarray, object_shape, sensor_shape) -> Matrix:
 
 
 def _stored(path: str | Path) -> tuple[dict[str, Any], Any]:
-    told = "finished system matrix", "write_matrix"
-    with opened(path, (_KIND,), told) as (group, attributes):
+    with opened(path, (_KIND,), ("finished system matrix", "write_matrix")) as (group, attributes):
         array: Any = group["matrix"]
         shape = tuple(math.prod(attributes[name]) for name in ("sensor_shape", "object_shape"))
         if array.shape != shape:
