@@ -11,7 +11,7 @@ from thincam_jax._core.quantity import UNITS
 READ_OWN = (
     *("_core/memory.py", "commands/report.py", "commands/examples.py"),
     "hardware/virtual/",
-    *("hardware/cameras/usb3_vision/link.py", "hardware/stages/serial_link.py"),
+    "hardware/holder.py",
 )
 
 

@@ -61,11 +61,3 @@ def test_symmetry_is_not_drawn_aside_by_a_bright_side():
     assert record["shift"] == [10, -4]
     np.testing.assert_array_equal(centre[0, 13:28, 16:35], pattern)
     np.testing.assert_allclose(record["light_lost"], 10 / psf.sum())
-
-
-def test_what_leaves_is_lost_and_does_not_come_in_again():
-    psf = np.zeros((1, 4, 9))
-    psf[0, 1, 8], psf[0, 3, 0] = 5.0, 1.0
-    found, record = centre_psf(psf, "peak")
-    assert np.argwhere(found).tolist() == [[0, 2, 4]]
-    np.testing.assert_allclose(record["light_lost"], 1 / 6)

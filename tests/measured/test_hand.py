@@ -32,9 +32,9 @@ def test_preparation_agrees_with_the_tutorial_steps(raws):
     background = psf[5:15, 5:15].mean()
     assert found.psf.shape == found.capture.shape == (1, 300, 400)
     for name in ("psf", "capture"):
-        told = found.log["background"][name]
-        assert told["kind"] == "corner"
-        np.testing.assert_allclose(told["level"], [background / 65535], rtol=1e-6)
+        record = found.log["background"][name]
+        assert record["kind"] == "corner"
+        np.testing.assert_allclose(record["level"], [background / 65535], rtol=1e-6)
     psf, capture = (
         skimage.transform.downscale_local_mean(np.maximum(image - background, 0), (4, 4))
         for image in (psf, capture)

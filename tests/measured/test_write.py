@@ -40,11 +40,7 @@ def test_the_log_stands_beside(tmp_path):
     log = {"b": math.nan, "a": {"z": [1, math.inf, 2.5], "y": (True, None)}, "π": "ä"}
     write_image(tmp_path / "deep.name.png", IMAGE, log)
     text = (tmp_path / "deep.name.json").read_text(encoding="utf-8")
-    assert json.loads(text) == {
-        "a": {"y": [True, None], "z": [1, None, 2.5]},
-        "b": None,
-        "π": "ä",
-    }
+    assert json.loads(text) == {"a": {"y": [True, None], "z": [1, None, 2.5]}, "b": None, "π": "ä"}
     assert text.index('"a"') < text.index('"y"') < text.index('"z"') < text.index('"b"')
     assert text == log_text(dict(reversed(log.items())))
 

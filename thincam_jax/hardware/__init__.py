@@ -1,8 +1,8 @@
 """The rig: displays that show patterns, cameras that take frames, stages that move the sensor.
 
-Every device, real or virtual, is a `Camera`, a `Stage` or a `Display`; whatever goes wrong is a
-`HardwareError` that names the device, the operation, the cause and what to do. Nothing here is
-imported by the rest of the package; the libraries of the devices come with `thincam-jax[hardware]`.
+Every device, real or virtual, is a `Camera`, a `Stage` or a `Display`; every failure is a
+`HardwareError` with the device, the operation, the cause and a remedy. The rest of the package
+imports nothing of this; the libraries of the devices come with `thincam-jax[hardware]`.
 """
 
 from thincam_jax.hardware.base import Camera as Camera

@@ -1,12 +1,12 @@
-"""Interfaces of cameras, stages and displays, whoever made them.
+"""Interfaces of cameras, stages and displays of any make.
 
-Units are millimetres and seconds. Each device is a context manager: leaving it stops what moves or
-streams and gives the device back. A driver raises `HardwareError` and nothing else.
+Units are millimetres and seconds. A device is a context manager: leaving it stops what moves or
+streams and releases the device. A driver raises `HardwareError` and nothing else.
 """
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -15,7 +15,7 @@ Opened = TypeVar("Opened", bound="Device")
 
 @dataclass(frozen=True)
 class Identity:
-    """Which device it is, as the device itself says; kept with what it captured."""
+    """Identity as the device itself reports it; stored with its captures."""
 
     vendor: str
     model: str
@@ -27,16 +27,22 @@ class Identity:
 
 
 class Device(ABC):
-    """A device that is open; `close` gives it back and may be called twice."""
+    """An open device, with its `identity`; `Options` are those of its driver in a config file."""
 
-    @property
-    @abstractmethod
-    def identity(self) -> Identity:
-        """Vendor, model, serial number and firmware, read from the device."""
+    Options: type[Any]
+    identity: Identity
+
+    @classmethod
+    def open(cls: type[Opened], options: Any) -> Opened:
+        """Open the device that the driver's `Options` select.
+
+        `NotFound`, `Busy` or `PermissionDenied` where that fails.
+        """
+        return cls(options)  # pyright: ignore[reportCallIssue]
 
     @abstractmethod
     def close(self) -> None:
-        """Stops the device and gives it back; never raises."""
+        """Stop and release the device; never raises, and may be called twice."""
 
     def __enter__(self: Opened) -> Opened:
         return self
@@ -57,7 +63,7 @@ class Region:
 
 @dataclass(frozen=True)
 class CameraSettings:
-    """Settings of a camera, or those asked for: `Camera.configure` returns what it accepted."""
+    """Camera settings, requested or as `Camera.configure` returns them."""
 
     exposure: float  # s
     region: Region | None = None  # None: the whole sensor
@@ -67,10 +73,10 @@ class CameraSettings:
 
 @dataclass(frozen=True)
 class Frame:
-    """One frame as the camera gave it.
+    """One frame as the camera delivered it.
 
-    `number` is the camera's own count of frames, from which stale and dropped ones are told;
-    `time` is the camera's clock in seconds; `pixels` (y, x) are counts from 0 to 2^bit_depth − 1.
+    `number` is the camera's own frame counter, which reveals stale and dropped frames; `time` is
+    the camera's clock in seconds; `pixels` (y, x) are counts from 0 to 2^bit_depth − 1.
     """
 
     pixels: np.ndarray  # (y, x), uint8 or uint16
@@ -90,69 +96,66 @@ class Camera(Device):
 
     @abstractmethod
     def configure(self, settings: CameraSettings) -> CameraSettings:
-        """Sets the camera, and returns what it is set to now.
+        """Configure the camera and return its actual settings.
 
-        Exposure, region and gain move to the nearest that the camera has, so they may differ from
-        what was asked. `OutOfRange` where a value lies outside of the camera's limits.
+        Exposure, region and gain are rounded to the nearest values that the camera supports.
+        `OutOfRange` where a value lies outside the camera's limits.
         """
 
     @abstractmethod
     def flush(self) -> None:
-        """Discards every frame that waits, so that the next one answers the next trigger."""
+        """Discard all queued frames, so that the next one answers the next trigger."""
 
     @abstractmethod
     def trigger_and_grab(self, timeout: float) -> Frame:
-        """One trigger, and the frame exposed after it; `timeout` in s, beyond the exposure.
+        """Trigger once and return the frame exposed then; `timeout` in s, beyond the exposure.
 
-        `Timeout` where no frame came, `IncompleteFrame` where part of it did, `Disconnected`
+        `Timeout` where no frame came, `IncompleteFrame` where part of it is missing, `Disconnected`
         where the camera has gone. Never a frame exposed before the trigger.
         """
 
 
 class Stage(Device):
-    """A linear stage. It has to be homed once before it moves (`NotHomed`)."""
+    """A linear stage with `limits`, its lowest and highest position in mm.
 
-    @property
-    @abstractmethod
-    def limits(self) -> tuple[float, float]:
-        """Lowest and highest position in mm."""
+    It has to be homed once before it moves (`NotHomed`).
+    """
+
+    limits: tuple[float, float]
 
     @property
     @abstractmethod
     def homed(self) -> bool:
-        """Whether the stage knows where it is."""
+        """Whether the position is known."""
 
     @abstractmethod
     def home(self, timeout: float = 60.0) -> None:
-        """Finds the reference switch; returns once the stage stands still."""
+        """Find the reference switch; returns once the stage is at rest."""
 
     @abstractmethod
     def move_to(self, position: float, timeout: float = 60.0) -> float:
-        """Moves to a position in mm and returns the one reached, once the stage stands still.
+        """Move to a position in mm and return the one reached, once the stage is at rest.
 
-        `OutOfRange` before anything is sent where it lies outside of `limits`.
+        `OutOfRange`, before anything is sent, outside the `limits`.
         """
 
     @abstractmethod
     def position(self) -> float:
-        """Where the stage is now, in mm."""
+        """Present position in mm."""
 
     @abstractmethod
     def stop(self) -> None:
-        """Stops at once; the position stays known."""
+        """Stop at once; the position stays known."""
 
 
 class Display(Device):
-    """A display, or a light modulator driven as a monitor."""
+    """A display, or a light modulator driven as a monitor; `shape` is its rows and columns."""
 
-    @property
-    @abstractmethod
-    def shape(self) -> tuple[int, int]:
-        """Rows and columns."""
+    shape: tuple[int, int]
 
     @abstractmethod
     def show(self, pattern: np.ndarray) -> None:
-        """Shows a pattern (y, x) of uint8 levels, of the display's `shape`.
+        """Show a pattern (y, x) of uint8 levels, of the display's `shape`.
 
         Returns once it is presented: a frame exposed after the display's settle time sees it.
         """

@@ -1,12 +1,11 @@
-"""Errors of devices, each with what was tried, why it failed and what to do."""
+"""Errors of devices, each with operation, cause and remedy."""
 
 
 class HardwareError(Exception):
     """A device failed: `device`, `operation`, `cause` and `remedy` are one line each.
 
-    A driver raises one of the subclasses below. What an acquisition does about it follows from the
-    class: `IncompleteFrame` and `Timeout` are tried again, `Disconnected` reopens the device, all
-    others stop the run so that it can be resumed.
+    Drivers raise the subclasses below. An acquisition retries after `IncompleteFrame` and
+    `Timeout`, reopens the device after `Disconnected`, and stops, to be resumed, after all others.
     """
 
     def __init__(self, device: str, operation: str, cause: str, remedy: str):
@@ -22,11 +21,11 @@ class NotFound(HardwareError):
 
 
 class PermissionDenied(HardwareError):
-    """This user may not open the device; the remedy names the udev rule or the group."""
+    """This user may not open the device; the remedy names a udev rule or a group."""
 
 
 class Busy(HardwareError):
-    """Another program holds the device, named where the system tells."""
+    """Another program, named if known, holds the device."""
 
 
 class Timeout(HardwareError):
@@ -34,24 +33,24 @@ class Timeout(HardwareError):
 
 
 class Disconnected(HardwareError):
-    """The device was there and has gone: unplugged, switched off or reset."""
+    """The device was unplugged, switched off or reset."""
 
 
 class ProtocolError(HardwareError):
-    """The device answered what its protocol does not allow: checksum, id, length or content."""
+    """The answer violates the protocol: its checksum, id, length or content."""
 
 
 class IncompleteFrame(HardwareError):
-    """A frame came with bytes missing, or its trailer says that it is not whole."""
+    """Part of a frame is missing, or its trailer says so."""
 
 
 class OutOfRange(HardwareError):
-    """A position, exposure, region or pattern that the device cannot take; nothing was sent."""
+    """A position, exposure, region or pattern outside the device's limits; nothing was sent."""
 
 
 class Saturated(HardwareError):
-    """More pixels at the largest count than the plan allows."""
+    """More saturated pixels than allowed."""
 
 
 class NotHomed(HardwareError):
-    """The stage does not know where it is: it was not homed, or it lost steps."""
+    """The stage's position is unknown: it was not homed, or it lost steps."""

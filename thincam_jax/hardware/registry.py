@@ -1,8 +1,7 @@
 """Drivers by name: those of this package, and those that other packages register.
 
-A driver is a class with a frozen dataclass `Options` of what a config file may say, and a class
-method `open(options)` that returns the open device. A package of its own offers one by an entry
-point, in its pyproject.toml:
+A driver is a `Device` class with a frozen dataclass `Options`, the options in a config file, and a
+class method `open(options)`. Another package registers one by an entry point in its pyproject.toml:
 
     [project.entry-points."thincam_jax.cameras"]
     my_camera = "my_package:MyCamera"
@@ -12,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import fields
 from importlib import import_module
 from importlib.metadata import entry_points
-from typing import Any, Protocol, TypeVar, runtime_checkable
+from typing import Any
 
 from thincam_jax.hardware.base import Device
 from thincam_jax.hardware.errors import NotFound
@@ -34,29 +33,17 @@ _BUILT_IN = {
 }
 KINDS = tuple(_BUILT_IN)
 
-Opened = TypeVar("Opened", bound=Device, covariant=True)
-
-
-@runtime_checkable
-class Driver(Protocol[Opened]):
-    """A class that opens a device from what a config file says."""
-
-    Options: type[Any]
-
-    @classmethod
-    def open(cls, options: Any) -> Opened: ...
-
 
 def drivers(kind: str) -> dict[str, str]:
-    """Names of the drivers of a kind, "cameras", "stages" or "displays", and where each is."""
+    """Names of the drivers of "cameras", "stages" or "displays", and the place of each."""
     if kind not in _BUILT_IN:
         raise ValueError(f"{kind!r} is no kind of device; give one of {', '.join(KINDS)}")
     outside = {point.name: point.value for point in entry_points(group=f"thincam_jax.{kind}")}
     return {**outside, **_BUILT_IN[kind]}
 
 
-def driver(kind: str, name: str) -> Driver[Any]:
-    """The driver's class; `NotFound` where there is none or its library is missing."""
+def driver(kind: str, name: str) -> type[Device]:
+    """Class of a driver; `NotFound` where it is unknown or its library is missing."""
     known = drivers(kind)
     if name not in known:
         raise NotFound(name, "open", f"no driver of that name among the {kind}",
@@ -67,13 +54,13 @@ def driver(kind: str, name: str) -> Driver[Any]:
     except ImportError as error:
         remedy = "pip install 'thincam-jax[hardware]'"
         raise NotFound(name, "open", f"its library is missing ({error})", remedy) from error
-    if hasattr(found, "require_libraries"):  # those that pip does not bring
+    if hasattr(found, "require_libraries"):  # those that pip does not install
         found.require_libraries()
     return found
 
 
 def open_device(kind: str, name: str, options: Mapping[str, Any] | None = None) -> Any:
-    """The open device of a driver; `options` are the fields of the driver's `Options`."""
+    """Open a device; `options` are fields of the driver's `Options`."""
     chosen, given = driver(kind, name), dict(options or {})
     allowed = [field.name for field in fields(chosen.Options)]
     if unknown := set(given) - set(allowed):

@@ -1,4 +1,4 @@
-"""Real captures: reading their files, preparing them for a reconstruction, writing images."""
+"""Measured captures: reading files, preparation for a reconstruction, writing images."""
 
 from thincam_jax.measured.bayer import demosaic as demosaic
 from thincam_jax.measured.bayer import demosaic_mask as demosaic_mask

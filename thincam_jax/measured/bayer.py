@@ -1,6 +1,6 @@
-"""From the mosaic of a colour sensor to red, green and blue."""
+"""Demosaicing: red, green and blue from the mosaic of a colour sensor."""
 
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 import scipy
@@ -10,11 +10,10 @@ from thincam_jax._core import checks
 
 Pattern = Literal["RGGB", "BGGR", "GRBG", "GBRG"]
 Demosaicing = Literal["bilinear", "superpixel"]
-PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")
-METHODS = ("bilinear", "superpixel")
+PATTERNS, METHODS = get_args(Pattern), get_args(Demosaicing)
 
-# Weights of the samples around a pixel: with a colour at one site in four, or at two in four as
-# green, these interpolate linearly between its nearest samples.
+# Weights of the samples around a pixel: for a colour at one site in four, or two in four as green,
+# these interpolate linearly between the nearest samples.
 _SPARSE = np.array([[1, 2, 1], [2, 4, 2], [1, 2, 1]], dtype=np.float32)
 _GREEN = np.array([[0, 1, 0], [1, 4, 1], [0, 1, 0]], dtype=np.float32)
 _KERNELS = {"R": _SPARSE, "G": _GREEN, "B": _SPARSE}
@@ -26,24 +25,24 @@ def demosaic(
     method: Demosaicing = "bilinear",
     known: Bool[np.ndarray, "y x"] | None = None,
 ) -> Float[np.ndarray, "rows columns 3"]:
-    r"""Red, green and blue of a raw image whose pixels each see one of them.
+    r"""Red, green and blue of a raw image whose pixels each measure one of them.
 
     `pattern` names the colours of the upper left 2×2 pixels, row by row. With m_c = 1 where a pixel
-    sees colour c (and is `known`), a 3×3 kernel k_c and the mosaic I,
+    measures colour c (and is `known`), a 3×3 kernel k_c and the mosaic I,
 
     .. math:: I_c = \frac{k_c * (m_c I)}{k_c * m_c}
 
     (normalised convolution, Knutsson and Westin 1993), which is
 
-    - "bilinear": linear interpolation between the nearest samples, exact for a brightness that
-      changes linearly, but for the outermost pixels, where it repeats the nearest samples' mean.
-      It blurs, so neighbouring pixels share their noise.
-    - "superpixel": the mean of each colour in each 2×2 block; half the size, nothing interpolated,
-      noise stays independent. Red and blue are then sampled half a (new) pixel apart: a PSF and a
-      capture of the same mosaic are so alike, and what is reconstructed channel by channel is in
-      register. To be preferred where the image is downsampled anyway. Needs even sizes.
+    - "bilinear": linear interpolation between the nearest samples, exact for a linear ramp except
+      in the outermost pixels, which take the mean of the nearest samples. It blurs, so the noise of
+      neighbouring pixels is correlated.
+    - "superpixel": the mean of each colour in each 2×2 block; half the size, no interpolation,
+      independent noise. Red and blue are then sampled half a (new) pixel apart, in the PSF as in
+      the capture, so that channels reconstructed one by one are in register. Best where the image
+      is downsampled anyway. Needs even sizes.
 
-    A value without any known sample is 0: see `demosaic_mask` for where. float32 (float64 stays).
+    A value without any known sample is 0: see `demosaic_mask`. float32 (float64 stays).
 
     **Errors**: ValueError for an unknown pattern or method and for odd sizes of "superpixel".
     """
@@ -61,7 +60,7 @@ def demosaic(
 def demosaic_mask(
     mask: Bool[np.ndarray, "y x"], pattern: Pattern, method: Demosaicing = "bilinear"
 ) -> Bool[np.ndarray, "rows columns 3"]:
-    """Which of the values of `demosaic` draw on a pixel of the mask."""
+    """Values of `demosaic` that depend on a pixel of the mask."""
     sites = colour_sites(mask.shape, pattern)
     return np.stack(
         [_gather((mask & sites[c]).astype(np.float32), c, method) > 0 for c in "RGB"], axis=-1
@@ -69,7 +68,7 @@ def demosaic_mask(
 
 
 def colour_sites(shape: tuple[int, ...], pattern: Pattern) -> dict[str, np.ndarray]:
-    """Where in the mosaic each of the colours R, G and B is seen: three maps (y, x)."""
+    """Sites of each of the colours R, G and B in the mosaic: three maps (y, x)."""
     checks.choice("pattern", pattern, PATTERNS)
     tile = np.array(list(pattern)).reshape(2, 2)
     rows, columns = shape
@@ -78,7 +77,7 @@ def colour_sites(shape: tuple[int, ...], pattern: Pattern) -> dict[str, np.ndarr
 
 
 def _gather(values: np.ndarray, colour: str, method: Demosaicing) -> np.ndarray:
-    """The weighted sum of the samples that a value is made of."""
+    """Weighted sums of the samples that each value depends on."""
     checks.choice("method", method, METHODS)
     rows, columns = values.shape
     if method == "bilinear":

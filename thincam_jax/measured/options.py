@@ -1,4 +1,4 @@
-"""Preparation options of a measured PSF and capture, and checks that they go together."""
+"""Options of a preparation, and checks that PSF, capture and background are compatible."""
 
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
@@ -6,17 +6,16 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from thincam_jax._core import checks
-from thincam_jax.measured.bayer import METHODS, PATTERNS, Demosaicing, Pattern
+from thincam_jax.measured.bayer import Demosaicing, Pattern
 from thincam_jax.measured.raw import MeasurementError, Raw
 
 Centre = Literal["centroid", "peak", "symmetry"]
+PsfChannels = Literal["each", "mean"]
+PsfSum = Literal["each", "joint"]
+CaptureScale = Literal["maximum", "norm", "none"]
 _CHOICES = {
-    "bayer": PATTERNS,
-    "demosaicing": METHODS,
-    "centre": get_args(Centre),
-    "psf_channels": ("each", "mean"),
-    "psf_sum": ("each", "joint"),
-    "capture_scale": ("maximum", "norm", "none"),
+    **{"bayer": Pattern, "demosaicing": Demosaicing, "centre": Centre},
+    **{"psf_channels": PsfChannels, "psf_sum": PsfSum, "capture_scale": CaptureScale},
 }
 _OPTIONAL = ("bayer", "centre")
 _LARGEST = {"saturation": 1.0, "threshold": 1.0, "noise_threshold": 1e6, "psf_scale": 100.0}
@@ -24,37 +23,35 @@ _LARGEST = {"saturation": 1.0, "threshold": 1.0, "noise_threshold": 1e6, "psf_sc
 
 @dataclass(frozen=True)
 class Preparation:
-    """The options of `prepare`; all but the background, which is data.
+    """Options of `prepare`, except the background, which is data.
 
     - `bayer`: the pattern of a mosaic, "RGGB", "BGGR", "GRBG" or "GBRG"; None: no mosaic.
     - `demosaicing`: "bilinear" or "superpixel" (half the size); see `demosaic`.
-    - `downsample`: side of the blocks that are averaged, pixels of the demosaiced image.
-    - `corner`: first row and column, and those after the last, of the square in the upper left
-      corner of the PSF whose mean is the background "corner" and whose spread is its noise.
-    - `saturation`: pixels from this part of full scale on are saturated. None: full scale itself,
-      and none in float images of unknown scale. A converter whose bits stand at the upper end of
-      16 is full below 1: 12 bit at 0.9997.
-    - `threshold`: values of the PSF below this part of each channel's maximum become 0.
+    - `downsample`: side of the averaged blocks, pixels of the demosaiced image.
+    - `corner`: start and stop, of rows and columns alike, of the square near the PSF's upper left
+      corner whose mean is the background "corner" and whose spread is its noise.
+    - `saturation`: fraction of full scale from which pixels count as saturated. None: full scale,
+      and no saturation in floats of unknown scale. A 12-bit converter whose bits fill the upper end
+      of 16 saturates at 0.9997.
+    - `threshold`: values of the PSF below this fraction of each channel's maximum become 0.
     - `noise_threshold`: values of the PSF below this many standard deviations of its noise become
-      0: of the corner's pixels, divided by `downsample`, as white noise is by block means.
-    - `psf_scale`: enlarge the PSF about its middle by this factor, onto the capture's pixels: the
+      0. The noise is that of the corner's pixels divided by `downsample`, as for white noise.
+    - `psf_scale`: factor that enlarges the PSF about its middle onto the capture's pixels: the
       ratio of the pixel pitches (PSF over capture) of another sensor or binning, or the scale that
-      `thincam_jax.check_psf` finds. The PSF may then have another size: it is cut or filled up
-      with zeros. None: as it is.
-    - `centre`: shift the PSF by whole pixels so that its "centroid", its "peak" or its centre of
-      "symmetry" (the peak of its convolution with itself is at twice that) comes to the middle of
-      the array, to sample n//2 for a single bright pixel. One shift for all channels. None, the
-      default, leaves it: with the PSF shifted by s the reconstruction is the same picture shifted
-      by −s, and light pushed over the edge is lost. Shift it where pictures of several PSFs are to
-      be compared, or the field around the optical axis is to be cut out.
-    - `psf_channels`: "each" keeps the PSF of each channel, "mean" makes one for all.
-    - `psf_sum`: "each" channel's PSF sums to 1: white is then what the light source of the PSF was;
-      "joint" divides all by one number, so that the sum is 1 in the mean of the channels and the
-      reconstruction keeps the sensor's colour balance.
-    - `capture_scale`: what the capture is divided by: its "maximum" over all channels, its
-      Euclidean "norm", or "none": parts of full scale.
+      `thincam_jax.check_psf` finds. The PSF is then cropped or zero-padded to the capture's size.
+    - `centre`: shift the PSF by whole pixels, the same for all channels, so that its "centroid",
+      its "peak" or its centre of "symmetry" (half the peak position of its convolution with itself)
+      comes to the middle of the array; a single bright pixel comes to n//2. None (the default): no
+      shift. A PSF shifted by s shifts the reconstruction by −s and loses light at the edge: shift
+      only to compare images of several PSFs, or to crop the field around the optical axis.
+    - `psf_channels`: "each" keeps the PSF of each channel, "mean" averages them.
+    - `psf_sum`: "each" channel's PSF sums to 1, so that white is the colour of the PSF's light
+      source; "joint" divides all by one number, so that the mean sum is 1 and the reconstruction
+      keeps the sensor's colour balance.
+    - `capture_scale`: divisor of the capture: its "maximum" over all channels, its Euclidean
+      "norm", or "none" for fractions of full scale.
 
-    **Errors**: MeasurementError for values that are out of range.
+    **Errors**: MeasurementError for values out of range.
     """
 
     bayer: Pattern | None = None
@@ -66,14 +63,17 @@ class Preparation:
     noise_threshold: float | int | None = None
     psf_scale: float | int | None = None
     centre: Centre | None = None
-    psf_channels: Literal["each", "mean"] = "each"
-    psf_sum: Literal["each", "joint"] = "each"
-    capture_scale: Literal["maximum", "norm", "none"] = "maximum"
+    psf_channels: PsfChannels = "each"
+    psf_sum: PsfSum = "each"
+    capture_scale: CaptureScale = "maximum"
 
     def __post_init__(self):
-        for name, options in _CHOICES.items():
-            if getattr(self, name) is not None or name not in _OPTIONAL:
-                _choose(name, getattr(self, name), options)
+        try:
+            for name, options in _CHOICES.items():
+                if getattr(self, name) is not None or name not in _OPTIONAL:
+                    checks.choice(name, getattr(self, name), get_args(options))
+        except ValueError as error:
+            raise MeasurementError(str(error)) from None
         if not _whole(self.downsample) or self.downsample < 1:
             raise MeasurementError(
                 f"downsample = {self.downsample!r}: give a whole number of at least 1"
@@ -89,13 +89,6 @@ class Preparation:
                 raise MeasurementError(f"{name} = {value!r}: give a number above 0, up to {high:g}")
 
 
-def _choose(name: str, value: Any, options: tuple[str, ...]) -> None:
-    try:
-        checks.choice(name, value, options)
-    except ValueError as error:
-        raise MeasurementError(str(error)) from None
-
-
 def _whole(value: Any) -> bool:
     return isinstance(value, int) and not isinstance(value, bool)
 
@@ -107,43 +100,19 @@ def check_match(
     dead: np.ndarray | None,
     options: Preparation,
 ) -> None:
-    """Refuse what `prepare` cannot put together; one line.
-
-    `backgrounds` holds those of "psf" and of "capture".
-    """
-    _check_sizes(psf, capture, dead, options.psf_scale)
-    _check_channels(psf, capture, options)
-    if options.corner[1] > min(psf.pixels.shape[:2]):
-        raise MeasurementError(
-            f"corner = {options.corner} lies outside of the PSF of {_size(psf)} pixels; "
-            "give a smaller one"
-        )
-    for name, raw in (("psf", psf), ("capture", capture)):
-        _check_background(name, raw, psf, backgrounds[name])
-
-
-def _size(raw: Raw) -> str:
-    rows, columns = raw.pixels.shape[:2]
-    return f"{rows}×{columns}"
-
-
-def _check_sizes(
-    psf: Raw, capture: Raw, dead: np.ndarray | None, scale: float | int | None
-) -> None:
-    if psf.pixels.shape[:2] != capture.pixels.shape[:2] and scale is None:
+    """Refuse incompatible data; `backgrounds` holds those of "psf" and of "capture"."""
+    sizes = [raw.pixels.shape[:2] for raw in (psf, capture)]
+    if sizes[0] != sizes[1] and options.psf_scale is None:
         raise MeasurementError(
             f"the PSF ({psf.name}) has {_size(psf)} pixels and the capture ({capture.name}) "
             f"{_size(capture)}; give both from the same part of one sensor, equally binned, or "
             "with `psf_scale` the ratio of their pixel pitches"
         )
-    if dead is not None and dead.shape != capture.pixels.shape[:2]:
+    if dead is not None and dead.shape != sizes[1]:
         raise MeasurementError(
             f"the map of dead pixels has {dead.shape[0]}×{dead.shape[1]} pixels and the capture "
             f"{_size(capture)}; give a map of the same part of the sensor"
         )
-
-
-def _check_channels(psf: Raw, capture: Raw, options: Preparation) -> None:
     if options.bayer is not None:
         for name, raw in (("PSF", psf), ("capture", capture)):
             if raw.channels > 1:
@@ -156,12 +125,23 @@ def _check_channels(psf: Raw, capture: Raw, options: Preparation) -> None:
                     f"'superpixel' joins 2×2 pixels and the {name} has {_size(raw)}: cut off the "
                     "last row or column, or leave bilinear interpolation"
                 )
-    fits = psf.channels in (1, capture.channels) or options.psf_channels == "mean"
-    if not fits:
+    if psf.channels not in (1, capture.channels) and options.psf_channels != "mean":
         raise MeasurementError(
             f"the PSF ({psf.name}) has {psf.channels} channels and the capture ({capture.name}) "
             f"{capture.channels}; give as many, or average the PSF's with `psf_channels='mean'`"
         )
+    if options.corner[1] > min(sizes[0]):
+        raise MeasurementError(
+            f"corner = {options.corner} lies outside of the PSF of {_size(psf)} pixels; "
+            "give a smaller one"
+        )
+    for name, raw in (("psf", psf), ("capture", capture)):
+        _check_background(name, raw, psf, backgrounds[name])
+
+
+def _size(raw: Raw) -> str:
+    rows, columns = raw.pixels.shape[:2]
+    return f"{rows}×{columns}"
 
 
 def _check_background(name: str, raw: Raw, psf: Raw, background: Any) -> None:

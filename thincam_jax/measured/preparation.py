@@ -1,4 +1,4 @@
-"""From the files of a measured PSF and a capture to what a reconstruction takes."""
+"""Preparation of a measured PSF and a capture for a reconstruction."""
 
 import dataclasses
 import math
@@ -21,11 +21,10 @@ Background = Raw | float | int | Literal["corner"]
 class Prepared:
     """A PSF and a capture, linear, on the same pixels.
 
-    - `psf`: one channel for all of the capture's, or one for each; sums to 1 (`psf_sum`).
-    - `capture`: divided by `log["scaling"]["capture_divisor"]`: times that it is in parts of full
-      scale.
-    - `valid`: False where the capture says nothing about the light: saturated or dead.
-    - `log`: what was done, in plain numbers for a JSON file; `log["order"]` lists its steps.
+    - `psf`: one channel, or one for each of the capture's; sums to 1 (`psf_sum`).
+    - `capture`: in fractions of full scale divided by `log["scaling"]["capture_divisor"]`.
+    - `valid`: False where the capture is saturated or dead.
+    - `log`: record of all steps for a JSON file; `log["order"]` lists them.
     """
 
     psf: Float32[np.ndarray, "psf_channel y x"]
@@ -36,7 +35,7 @@ class Prepared:
 
 @dataclass(frozen=True, eq=False)
 class _Frame:
-    """An image between two steps, in parts of full scale."""
+    """An image between two steps, in fractions of full scale."""
 
     values: np.ndarray  # (channel, y, x) float32
     saturated: np.ndarray  # bool
@@ -52,33 +51,31 @@ def prepare(
     psf_background: Background | None = None,
     dead: Bool[np.ndarray, "y x"] | None = None,
 ) -> Prepared:
-    """Bring a measured PSF and a capture into linear units, clean and of the wanted size.
+    """Convert a measured PSF and a capture to linear units, cleaned and resampled.
 
     The steps, each recorded in the result's `log`:
 
-    1. `full_scale`: counts to parts of full scale, float32.
-    2. `background`: subtract it. A dark frame (as long exposed as the image), a number in counts,
-       or "corner", the default: the mean of a square in the PSF's upper left corner, for both
-       images, because a lensless capture has no dark place. 0 subtracts nothing.
-       `psf_background` is that of the PSF where it is another one.
-    3. `clipping`: what is then negative becomes 0.
+    1. `full_scale`: counts to fractions of full scale, float32.
+    2. `background`: subtract a dark frame (of the image's exposure), a number of counts, or
+       "corner", the default: the mean of a square in the PSF's upper left corner, for both images,
+       because a lensless capture has no dark place. 0 subtracts nothing. `psf_background` is that
+       of the PSF where it differs.
+    3. `clipping`: negative values become 0.
     4. `validity`: saturated pixels (before the subtraction) and `dead` ones, True in a map (y, x)
        of the sensor (`read_mask`).
     5. `demosaicing`, if the options name a Bayer pattern.
-    6. `resampling` of the PSF onto the capture's pixels, if asked for.
-    7. `downsampling`: exact means of square blocks; sides that do not divide are cropped centrally.
-    8. `clean_up` and 9. `centring` of the PSF, if asked for.
-    10. `channels`: one PSF for all, if asked for.
-    11. `scaling`: the PSF to unit sum, the capture as asked for; both divisors are recorded.
+    6. `resampling` of the PSF onto the capture's pixels, with `psf_scale`.
+    7. `downsampling`: exact means of square blocks; remainders are cropped centrally.
+    8. `clean_up` and 9. `centring` of the PSF, 10. `channels`: one PSF for all; each optional.
+    11. `scaling`: the PSF to unit sum, the capture by `capture_scale`.
 
-    In 5 and 7 a dead pixel is left out of the means, for it is missing by chance; a value is
-    invalid where nothing is left, and is then copied from the nearest good one. A saturated pixel
-    makes every value it enters invalid, for it is missing because it is bright: the mean of the
-    others would be too dark. The PSF has no such mask; its saturated pixels are counted in the log,
-    and call for a PSF of shorter exposure.
+    In 5 and 7 dead pixels are left out of the means, as they are missing at random; a value without
+    any good pixel is invalid and copied from the nearest good one. A saturated pixel invalidates
+    every value that it enters, because a mean of the others would be too dark. Saturated pixels of
+    the PSF are only counted in the log; they call for a PSF of shorter exposure.
 
-    **Errors**: MeasurementError, one line: sizes, channels or bit depths that do not fit together,
-    a black PSF or capture.
+    **Errors**: MeasurementError, one line: incompatible sizes, channels or bit depths, a black PSF
+    or capture.
     """
     options = options or Preparation()
     background = "corner" if background is None else background
@@ -94,9 +91,10 @@ def prepare(
     square = slice(None), slice(*options.corner), slice(*options.corner)
     corner = planes["psf"][square].mean(axis=(1, 2), keepdims=True, dtype=np.float64)
     corner = corner.astype(np.float32)
-    levels = {n: _level(b, raws[n], corner) for n, b in backgrounds.items()}
+    found = {n: _background(b, raws[n], corner) for n, b in backgrounds.items()}
+    levels = {n: level for n, (level, _) in found.items()}
     noise = _noise((planes["psf"] - levels["psf"])[square].astype(np.float64), options)
-    log["background"] = {n: _background_facts(b, levels[n]) for n, b in backgrounds.items()}
+    log["background"] = {n: record for n, (_, record) in found.items()}
     planes = {n: planes[n] - levels[n] for n in planes}
     log["clipping"] = {n: int(np.count_nonzero(p < 0)) for n, p in planes.items()}
     known = ~(np.zeros(capture.pixels.shape[:2], bool) if dead is None else dead)
@@ -135,7 +133,7 @@ def _facts(raw: Raw) -> dict[str, Any]:
         "full_scale": raw.full_scale,
         "minimum": float(raw.pixels.min()),
         "maximum": float(maximum),
-        # Many pixels at one maximum have saturated, at whatever level the converter stopped.
+        # Many pixels at the same maximum are saturated, whatever the converter's highest level.
         "pixels_at_maximum": int(np.count_nonzero(raw.pixels == maximum)),
     }
 
@@ -154,29 +152,26 @@ def _saturated(raw: Raw, planes: np.ndarray, options: Preparation) -> np.ndarray
 
 
 def _noise(part: np.ndarray, options: Preparation) -> np.ndarray:
-    """Standard deviation of a pixel after block means, one a channel, from a dark part."""
+    """Standard deviation of a pixel after block means, for each channel, from a dark part."""
     if options.bayer is None:
         spread = part.std(axis=(1, 2))
-    else:  # of each colour's own pixels: their means may differ
+    else:  # within each colour, as their means may differ
         variances = [part[0, i::2, j::2].var() for i in range(2) for j in range(2)]
         spread = np.sqrt(np.mean(variances, keepdims=True))
     return spread / options.downsample
 
 
-def _level(background: Background, raw: Raw, corner: np.ndarray) -> np.ndarray:
-    """Level to subtract, in parts of full scale."""
+def _background(
+    background: Background, raw: Raw, corner: np.ndarray
+) -> tuple[np.ndarray, dict[str, Any]]:
+    """Level to subtract, in fractions of full scale, and its record."""
     if isinstance(background, Raw):
-        return _in_full_scale(background)
-    if isinstance(background, str):
-        return corner
-    return np.full((1, 1, 1), background / raw.full_scale, np.float32)
-
-
-def _background_facts(background: Background, level: np.ndarray) -> dict[str, Any]:
-    kind = background if isinstance(background, str) else "number"
-    if isinstance(background, Raw):
-        kind = f"dark frame {background.name}"
-    return {"kind": kind, "level": level.mean(axis=(1, 2), dtype=np.float64).tolist()}
+        level, kind = _in_full_scale(background), f"dark frame {background.name}"
+    elif isinstance(background, str):
+        level, kind = corner, background
+    else:
+        level, kind = np.full((1, 1, 1), background / raw.full_scale, np.float32), "number"
+    return level, {"kind": kind, "level": level.mean(axis=(1, 2), dtype=np.float64).tolist()}
 
 
 def _demosaiced(frame: _Frame, options: Preparation) -> _Frame:
@@ -193,14 +188,14 @@ def _demosaiced(frame: _Frame, options: Preparation) -> _Frame:
 
 
 def _known(known: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """The sensor's good pixels; a PSF of another sensor has no dead ones that are known."""
+    """Map of good pixels; all those of a PSF of another sensor."""
     return np.broadcast_to(known, shape) if known.shape == shape[1:] else np.ones(shape, bool)
 
 
 def _resampled(frame: _Frame, shape: tuple[int, ...], scale: float) -> _Frame:
-    """A PSF enlarged about its middle by cubic splines, cut or filled up with zeros to a shape.
+    """A PSF enlarged about its middle by cubic splines, cropped or zero-padded to a shape.
 
-    What is made smaller is blurred first, by half of what its pixels then cover.
+    Before a reduction it is blurred, with half the additional pixel width as σ.
     """
     planes = _filled(frame, "PSF").astype(np.float64)
     blur = max(0.0, (1 / scale - 1) / 2)
@@ -219,7 +214,7 @@ def _resampled(frame: _Frame, shape: tuple[int, ...], scale: float) -> _Frame:
 
 
 def _downsampled(frames: dict[str, _Frame], factor: int, log: dict[str, Any]) -> dict[str, _Frame]:
-    """Means of blocks. A mean is what one pixel of that size would have measured."""
+    """Block means, which one pixel of that size would have measured."""
     shape = frames["psf"].values.shape[1:]
     if factor > min(shape):
         raise MeasurementError(
@@ -268,7 +263,7 @@ def _filled(frame: _Frame, name: str) -> np.ndarray:
 def _prepared_psf(
     psf: np.ndarray, noise: np.ndarray, options: Preparation, log: dict[str, Any]
 ) -> np.ndarray:
-    """Cleaned, centred and averaged as asked for."""
+    """Clean, centre and average the PSF, as far as the options say."""
     psf, cleaned = clean(psf, noise, options.threshold, options.noise_threshold)
     log["clean_up"] = {**cleaned, "noise": noise.tolist()}
     log["centring"] = {"by": None, "shift": [0, 0]}
@@ -315,9 +310,9 @@ def clean(
 ) -> tuple[Float[np.ndarray, "channel y x"], dict[str, Any]]:
     """The PSF with its small values set to zero, and a record of what that removed.
 
-    Below `threshold` parts of each channel's maximum or `noise_threshold` times its `noise`,
-    whichever is larger. Noise left in a PSF acts as a haze over the reconstruction; but what is
-    removed of the PSF's own faint light is missing too.
+    Small is below the larger of `threshold` times each channel's maximum and `noise_threshold`
+    times its `noise`. Remaining noise acts as haze on the reconstruction; but faint parts of the
+    PSF are lost, too.
     """
     levels = np.zeros(psf.shape[0])
     if threshold is not None:
@@ -341,8 +336,8 @@ def centre_psf(
 ) -> tuple[Float[np.ndarray, "channel y x"], dict[str, Any]]:
     """The PSF shifted by whole pixels to the middle of its array, and a record of the shift.
 
-    `by` is one of "centroid", "peak", "symmetry" (see `Preparation.centre`), of the sum of the
-    channels; all are shifted alike. What leaves the array is lost, what enters is 0.
+    `by`: "centroid", "peak" or "symmetry" (see `Preparation`) of the channels' sum. Pixels shifted
+    out of the array are lost, those shifted in are 0.
     """
     found = _centre(psf.sum(axis=0, dtype=np.float64), by)
     sides = zip(psf.shape[1:], found, strict=True)
@@ -359,7 +354,7 @@ def centre_psf(
 
 
 def _centre(image: np.ndarray, by: Centre) -> tuple[float, float]:
-    """Row and column, in pixels from the first, maybe between two."""
+    """Row and column, in (half) pixels from the first."""
     if by == "centroid":
         total = image.sum()
         if not total > 0:

@@ -1,4 +1,4 @@
-"""A measured image as the camera stored it: its counts, its bit depth, and what is refused."""
+"""A measured image as the camera stored it, with its bit depth, and its validation."""
 
 from dataclasses import dataclass, field
 
@@ -20,15 +20,15 @@ class Raw:
     """One measured image, unscaled: counts are those of the file.
 
     - `pixels`: (y, x) or (y, x, channel) with at most 4 channels; uint8, uint16 or float.
-    - `bits`: 8 to 16, of the camera; a pixel is full at 2^bits − 1. None (the default) means that
-      of the integer type (8 or 16), and for floats that the scale is unknown: full is then 1.
-      10, 12 and 14 bit cameras fill the low bits of 16: give `bits`, or full scale is taken 16 bit.
+    - `bits`: bit depth of the camera, 8 to 16; full scale is 2^bits − 1. None (the default): that
+      of the integer type (8 or 16); floats then have an unknown scale and a full scale of 1.
+      10, 12 and 14 bit cameras fill the low bits of 16: give `bits`, or full scale is 16 bit.
     - `format`: "tiff", "png", "npy", or "array".
-    - `name`: what messages call it: the path of the file.
+    - `name`: in messages; the path of the file.
 
-    **Errors**: MeasurementError for another shape or type, for an empty image, for values that are
-    not finite and for values above 2^bits − 1. Signed integers are refused, negative floats are
-    not: a dark frame may have been subtracted already.
+    **Errors**: MeasurementError for another shape or type, an empty image, values that are not
+    finite, and values above 2^bits − 1. Signed integers are refused, but not negative floats, from
+    which a dark frame may have been subtracted.
     """
 
     pixels: np.ndarray = field(repr=False)
@@ -56,12 +56,12 @@ class Raw:
 
     @property
     def full_scale(self) -> float:
-        """The count of a full pixel: 2^bits − 1, or 1 for floats of unknown scale."""
+        """Count of a saturated pixel: 2^bits − 1, or 1 for floats of unknown scale."""
         return 1.0 if self.bits is None else float(2**self.bits - 1)
 
     @property
     def channels(self) -> int:
-        """1 for a (y, x) image."""
+        """Number of channels, 1 for a (y, x) image."""
         return 1 if self.pixels.ndim == 2 else self.pixels.shape[2]
 
 
@@ -126,11 +126,9 @@ def _check_range(name: str, pixels: np.ndarray, bits: int) -> None:
 def image_with_contrast(
     name: str, image: Numbers, shape: tuple[int, ...] | None = None, of: str = ""
 ) -> Float64[np.ndarray, "y x"]:
-    """A finite image that is not constant, in double precision.
+    """A finite image that is not constant, in double precision; MeasurementError for any other.
 
-    `shape`: the one it must have, that of `of`; None for any (y, x).
-
-    **Errors**: MeasurementError, one line.
+    `shape`: the required one, that of `of`; None for any (y, x).
     """
     image = np.asarray(image)
     if image.dtype.kind not in "fiu" or image.ndim != 2 or shape not in (None, image.shape):

@@ -1,4 +1,4 @@
-"""Image files: TIFF, PNG and NPY, told apart by their first bytes and not by their names."""
+"""Image files: TIFF, PNG and NPY, recognised by their first bytes, not by their names."""
 
 import contextlib
 import io
@@ -30,10 +30,10 @@ _STARTS = {
     b"II+\0": "tiff",  # BigTIFF: more than 4 GB
     b"MM\0+": "tiff",
 }
-# Pixels are announced in at most so many times the bytes of the file: LZW, the densest of the usual
-# compressions, needs a byte for some 2500 of a black image. Beyond it is a decompression bomb.
+# Largest ratio of pixel bytes to file bytes: LZW, the densest usual compression, reaches some 2500
+# for a black image. Anything beyond is a decompression bomb.
 _DENSEST = 4000
-# Read as they are: no palette, no inverted scale, no colour difference.
+# Photometric interpretations that hold counts: no palette, inverted scale or colour difference.
 _PLAIN = (
     tifffile.PHOTOMETRIC.MINISBLACK,
     tifffile.PHOTOMETRIC.RGB,
@@ -45,22 +45,20 @@ _PNG_END = b"\0\0\0\0IEND\xaeB`\x82"
 
 
 def read_image(path: str | os.PathLike[str], bits: int | None = None) -> Raw:
-    """One measured image as it is stored: nothing scaled, no gamma undone, no channel dropped.
+    """Read one image as it is stored, without scaling or gamma.
 
-    TIFF and PNG of 8 or 16 bit a sample, grey or RGB, and NPY; floats in TIFF and NPY. An alpha
-    channel that hides nothing is left out. `bits` is the bit depth of the camera (see `Raw`).
+    TIFF and PNG of 8 or 16 bit a sample, grey or RGB, and NPY; floats in TIFF and NPY. An opaque
+    alpha channel is dropped. `bits` is the bit depth of the camera (see `Raw`).
 
-    **Errors**: CaptureFileError, one line, for a file that is missing, cut short, damaged or no
-    image, for a stack of images, and for all that `Raw` refuses.
+    **Errors**: CaptureFileError, one line, for a file that is missing, truncated, damaged or no
+    image, for a stack of images, and for everything that `Raw` refuses.
     """
     (pixels,), kind, found = _decode(Path(path))
     return _raw(pixels, found if bits is None else bits, kind, str(path))
 
 
 def read_images(path: str | os.PathLike[str], bits: int | None = None) -> list[Raw]:
-    """Images that belong together: the pages of a TIFF, or the files of a folder by name.
-
-    Numbers in the names count by their values: psf_90mm.tif before psf_120mm.tif.
+    """Read the pages of a TIFF, or the files of a folder in the order of `image_files`.
 
     **Errors**: CaptureFileError as in `read_image`; a TIFF's pages must be of one size.
     """
@@ -80,9 +78,9 @@ def _raw(pixels: np.ndarray, bits: int | None, kind: str, name: str) -> Raw:
 
 
 def read_mask(path: str | os.PathLike[str]) -> Bool[np.ndarray, "y x"]:
-    """A map (y, x) of pixels from a one-channel image file, True where it is not zero.
+    """Read a map (y, x) from a one-channel image file, True where it is not zero.
 
-    As for a sensor's dead pixels. An NPY file may hold bool.
+    Such as a map of dead pixels. An NPY file may hold bool.
 
     **Errors**: CaptureFileError as in `read_image`.
     """
@@ -96,10 +94,9 @@ def read_mask(path: str | os.PathLike[str]) -> Bool[np.ndarray, "y x"]:
 
 
 def list_captures(folder: str | os.PathLike[str], bits: int | None = None) -> list[Path]:
-    """The image files of a folder, by name, with numbers in the order of their values.
+    """List the image files of a folder as `image_files` does, after reading each one.
 
-    Every one is read, with `bits` as in `read_image`, so that a long computation does not stop at a
-    damaged one.
+    `bits` as in `read_image`. A damaged file is so found before a long computation.
 
     **Errors**: CaptureFileError, one line, for no such folder, no images in it, a file that cannot
     be read, or an image of another shape than most.
@@ -117,7 +114,7 @@ def list_captures(folder: str | os.PathLike[str], bits: int | None = None) -> li
 
 
 def image_files(folder: str | os.PathLike[str]) -> list[Path]:
-    """The files of a folder with `SUFFIXES`, unread, capture_9 before capture_10; no hidden ones.
+    """List the files of a folder with `SUFFIXES`, capture_9 before capture_10, no hidden ones.
 
     **Errors**: CaptureFileError, one line, for no such folder or no such files.
     """
@@ -142,10 +139,7 @@ def _order(path: Path) -> tuple[list[tuple[int, str]], str]:
 
 
 def _decode(path: Path, stack: bool = False) -> tuple[list[np.ndarray], str, int | None]:
-    """Pixels of each image, format and, where the file holds them, bits a sample.
-
-    More than one image only of a stack.
-    """
+    """Pixels of each image, format, and bits a sample if known; several images only of a stack."""
     data = _bytes(path)
     kind = next((kind for start, kind in _STARTS.items() if data.startswith(start)), None)
     if kind is None:
@@ -179,7 +173,7 @@ def _bytes(path: Path) -> bytes:
 
 
 def _refuse_bomb(announced: int, held: int) -> None:
-    """Refuse, before there is room for them, more bytes of pixels than a file can hold."""
+    """Refuse, before allocation, more bytes of pixels than a file can hold."""
     if announced > _DENSEST * held:
         raise CaptureFileError(
             f"announces {announced} bytes of pixels, more than its {held} can hold: it is damaged"
@@ -199,7 +193,7 @@ def _read_npy(data: bytes) -> tuple[list[np.ndarray], None]:
     shape, _, dtype = readers[version](stream)
     if dtype.hasobject or dtype.fields:
         raise CaptureFileError(f"holds {dtype} values, no image; give uint8, uint16 or float")
-    # Before NumPy makes room for what a damaged header announces.
+    # Before NumPy allocates what a damaged header announces.
     size, held = dtype.itemsize * np.prod([int(n) for n in shape], dtype=object), len(data)
     if size > held - stream.tell():
         raise CaptureFileError(
@@ -210,7 +204,7 @@ def _read_npy(data: bytes) -> tuple[list[np.ndarray], None]:
 
 
 def _read_png(data: bytes) -> tuple[list[np.ndarray], int]:
-    """Pixels (y, x) or (y, x, channel) and bits a sample, checksums checked."""
+    """Pixels (y, x) or (y, x, channel) and bits a sample; verifies checksums."""
     columns, rows, depth, colour = struct.unpack_from(">IIBB", data, 16)
     if colour not in _PNG_CHANNELS:
         raise CaptureFileError("stores a palette, no counts; save it as grey or RGB")
@@ -253,7 +247,7 @@ def _read_page(page: tifffile.TiffPage, size: int) -> np.ndarray:
 
 
 def _whole_pages(file: tifffile.TiffFile, stack: bool) -> list[tifffile.TiffPage]:
-    """The file's images, one or those of a stack; previews of lower resolution do not count."""
+    """The file's images, one or those of a stack, without previews of lower resolution."""
     pages = [page.aspage() for page in file.pages]
     whole = [page for page in pages if not page.is_reduced] or pages[:1]
     if not whole:
@@ -266,7 +260,7 @@ def _whole_pages(file: tifffile.TiffFile, stack: bool) -> list[tifffile.TiffPage
 
 
 def _check_whole(page: tifffile.TiffPage, size: int) -> None:
-    """Refuse strips that lie behind the file's end, or are missing: they would read as zeros."""
+    """Refuse strips beyond the file's end and missing ones, which would read as zeros."""
     strips = list(zip(page.dataoffsets, page.databytecounts, strict=True))
     if not strips or any(count == 0 or offset + count > size for offset, count in strips):
         raise CaptureFileError("is cut short: a part of the TIFF's pixels is missing")
@@ -278,7 +272,7 @@ def _check_whole(page: tifffile.TiffPage, size: int) -> None:
 
 
 def _without_alpha(pixels: np.ndarray, has_alpha: bool) -> np.ndarray:
-    """The channels before the last one, if that is an alpha channel that hides nothing."""
+    """Pixels without their alpha channel, which must be opaque."""
     if not has_alpha:
         return pixels
     if (pixels[..., -1] != np.iinfo(pixels.dtype).max).any():
@@ -289,7 +283,7 @@ def _without_alpha(pixels: np.ndarray, has_alpha: bool) -> np.ndarray:
 
 @contextlib.contextmanager
 def _silence() -> Iterator[None]:
-    """Without the decoders' remarks on standard error: what is wrong is told by the error."""
+    """Suppress the decoders' remarks on standard error; the exception reports faults."""
     loggers = [logging.getLogger(name) for name in ("tifffile", "imagecodecs")]
     before = [logger.disabled for logger in loggers]
     for logger in loggers:

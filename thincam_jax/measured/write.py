@@ -1,4 +1,4 @@
-"""Writing an image, linear or for display, and the record of how it was made."""
+"""Writing an image, linear or for display, and its log."""
 
 import io
 import json
@@ -31,12 +31,12 @@ def write_image(
 ) -> Path:
     """Write a linear image (channel, y, x), and `log` beside it as NAME.json.
 
-    The suffix says how: `.png` 8 bit for looking at, by `to_display` with the keyword arguments;
-    `.npy`, `.tif` and `.tiff` float32, linear, (y, x) or (y, x, channel). The folder must exist.
-    The log is written first, so that an image never stands there without it.
+    By suffix: `.png` 8 bit for viewing, by `to_display` with the keyword arguments; `.npy`, `.tif`
+    and `.tiff` float32, linear, (y, x) or (y, x, channel). The folder must exist. The log is
+    written first, so that no image is without it.
 
     **Errors**: MeasurementError for another suffix and an image that cannot be displayed; OSError
-    where nothing can be written.
+    where writing fails.
     """
     path = Path(path)
     suffix = path.suffix.lower()
@@ -67,10 +67,10 @@ def to_display(
 
     .. math:: \mathrm{round}(255\,\mathrm{clip}(g_c I_c / w, 0, 1)^{1/\gamma})
 
-    - `white_balance`: the gains g of red, green and blue; "grey_world" makes the channels' means
-      (of what is not negative) equal; None leaves them 1.
-    - `percentile`: w is this percentile of all g_c I_c, so that few bright pixels do not darken the
-      rest; the maximum where that is 0. Negative values are black.
+    - `white_balance`: the gains g of red, green and blue; "grey_world" equalises the channels'
+      means (negative values as 0); None: gains of 1.
+    - `percentile`: w is this percentile of all g_c I_c, so that a few bright pixels do not darken
+      the rest; the maximum where that is 0. Negative values are black.
 
     **Errors**: MeasurementError for another number of channels, values that are not finite, gains
     with an image of one channel, and numbers out of range.
@@ -118,7 +118,7 @@ def _gains(image: np.ndarray, white_balance: WhiteBalance) -> np.ndarray:
 
 
 def log_text(log: Mapping[str, Any]) -> str:
-    """JSON with sorted keys; numbers that are not finite become null, arrays lists."""
+    """JSON with sorted keys; non-finite numbers become null, arrays lists."""
     plain = _plain(log)
     return json.dumps(plain, indent=2, sort_keys=True, ensure_ascii=False, allow_nan=False) + "\n"
 

@@ -121,7 +121,7 @@ def ctrl_c():
     signal.signal(signal.SIGINT, before)
 
 
-def test_a_stopped_run_goes_on(path, ctrl_c):
+def test_a_stopped_run_is_resumed(path, ctrl_c):
     world = World()
     assert run(world, path, progress=stop_after(6)).done == 6
     assert signal.getsignal(signal.SIGINT) is ctrl_c
@@ -138,7 +138,7 @@ def test_a_stopped_run_goes_on(path, ctrl_c):
     require_whole(path.with_name("b.zarr"))
 
 
-def test_only_the_same_run_goes_on(path, monkeypatch):
+def test_only_the_same_run_is_resumed(path, monkeypatch):
     run(World(), path, progress=stop_after(6))
     with pytest.raises(
         CaptureStoreError, match="was begun with another plan .*; give another name"
@@ -252,10 +252,6 @@ def test_a_device_that_has_gone_is_opened_again(path):
             path.with_name("b"),
             progress=lambda now: [pull(now), vars(world).update(serial="2")],
         )
-
-
-def exchange(world):
-    world.serial = "2"
 
 
 def after_nine(world):

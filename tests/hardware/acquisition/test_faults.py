@@ -37,7 +37,7 @@ def frames_in(store):
         pytest.param(10, 512, "rows", marks=pytest.mark.thorough),
     ],
 )
-def test_a_killed_run_goes_on(kills, count, kept, tmp_path):
+def test_a_killed_run_is_resumed(kills, count, kept, tmp_path):
     """A kill at the start may find no store, one while it runs finds frames half written."""
     store, random = tmp_path / "store", np.random.default_rng(4)
     plan = fiducial_plan(count, dark_every=16)

@@ -21,14 +21,32 @@ class Clock:
         self.now += seconds
 
 
+class Panel(VirtualDisplay):
+    """Its levels follow exponentially: exp(−t/`response`) of the pattern before is left."""
+
+    def __init__(self, shape: tuple[int, int], response: float = 0.0, clock: Clock | None = None):
+        super().__init__(shape, self._follow)
+        self.response, self.clock = response, clock or Clock()
+        self.before = self.target = np.zeros(shape, np.float32)
+        self.since = 0.0
+
+    def levels(self) -> np.ndarray:
+        """Levels at this moment, float32 from 0 to 255."""
+        if not self.response:
+            return self.target
+        left = np.float32(np.exp((self.since - self.clock.now) / self.response))
+        return self.target + left * (self.before - self.target)
+
+    def _follow(self, levels: np.ndarray) -> None:
+        self.before, self.target = self.levels(), levels.astype(np.float32)
+        self.since = self.clock.now
+
+
 class PanelCamera(Camera):
     """A 12 bit camera, pixel by pixel of the panel; `counts` of its levels, with noise."""
 
     def __init__(
-        self,
-        display: VirtualDisplay,
-        counts: Callable[[np.ndarray], np.ndarray],
-        noise: float = 2.0,
+        self, display: Panel, counts: Callable[[np.ndarray], np.ndarray], noise: float = 2.0
     ):
         self.display, self.counts, self.noise = display, counts, noise
         self.random, self.number = np.random.default_rng(11), 0

@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from hardware.displays.rig import PanelCamera
+from hardware.displays.rig import Panel, PanelCamera
 
 from thincam_jax.hardware import Saturated
 from thincam_jax.hardware.displays.grey_levels import (
@@ -12,7 +12,6 @@ from thincam_jax.hardware.displays.grey_levels import (
     calibrate_grey_levels,
     linear_levels,
 )
-from thincam_jax.hardware.virtual.display import VirtualDisplay
 
 SHAPE = 12, 20
 ALL = np.arange(256)
@@ -28,7 +27,7 @@ def s_curve_that_falls(levels):
 
 @pytest.mark.parametrize("panel", [gamma, s_curve_that_falls])
 def test_a_calibrated_display_is_linear(panel):
-    display = VirtualDisplay(SHAPE)
+    display = Panel(SHAPE)
     camera = PanelCamera(display, panel)
     levels = calibrate_grey_levels(display, camera, settle=0.0, frames=2)
     assert levels.provenance["camera"] == str(camera.identity)
@@ -86,7 +85,7 @@ def test_measurements_that_give_no_table(levels, transmission, message):
 
 
 def test_saturated_frames_are_refused():
-    display = VirtualDisplay(SHAPE)
+    display = Panel(SHAPE)
     camera = PanelCamera(display, lambda levels: 20.0 * levels)
     with pytest.raises(Saturated, match="at level 210"):
         calibrate_grey_levels(display, camera, settle=0.0)

@@ -80,7 +80,7 @@ def x_server_of_two_monitors(folder: Path) -> Iterator[str]:
         for arguments in (
             ("--addmode", "DUMMY1", "1024x768"),
             ("--output", "DUMMY1", "--mode", "1024x768", "--right-of", "DUMMY0"),
-            ("--query",),  # without it, clients are not told of the second
+            ("--query",),  # without it, clients do not see the second
         ):
             command = ["xrandr", "--display", name, *arguments]
             subprocess.run(command, check=True, capture_output=True)

@@ -17,7 +17,7 @@ from thincam_jax.hardware import (
     Timeout,
 )
 from thincam_jax.hardware.stages import serial_link
-from thincam_jax.hardware.stages.serial_link import LONGEST_LINE, SerialLink, port_holder
+from thincam_jax.hardware.stages.serial_link import LONGEST_LINE, SerialLink
 
 NOBODY = 65534
 
@@ -177,12 +177,8 @@ def test_a_program_that_asks_for_no_lock_cannot_open_it_either(terminal):
         link.close()
 
 
-def test_a_wire_log_that_cannot_be_written_is_told_before_the_port_is_opened(terminal, tmp_path):
+def test_an_unwritable_wire_log_is_reported_before_the_port_is_opened(terminal, tmp_path):
     (tmp_path / "file").write_text("", "utf-8")
     with pytest.raises(PermissionDenied, match="no wire log at .*name a file"):
         SerialLink("stage", terminal[1], 115200, str(tmp_path / "file" / "wire.txt"))
     SerialLink("stage", terminal[1], 115200).close()
-
-
-def test_nobody_holds_a_port_that_is_free(tmp_path):
-    assert port_holder(str(tmp_path)) == ""

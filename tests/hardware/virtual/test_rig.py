@@ -8,6 +8,8 @@ import scipy
 
 import thincam_jax as tc
 from thincam_jax.hardware import CameraSettings, Region
+from thincam_jax.hardware.virtual.display import VirtualDisplay
+from thincam_jax.hardware.virtual.faults import Faults
 from thincam_jax.hardware.virtual.optics import ModulatorOptics, MonitorOptics, cells_shown
 from thincam_jax.hardware.virtual.rig import (
     Electronics,
@@ -136,6 +138,15 @@ def test_before_the_display_has_answered_the_pattern_before_is_seen(monkeypatch)
     assert read_fiducial(taken.expose(SETTINGS), 12).pattern == pattern_number(black)
     now[0] += 0.02
     assert read_fiducial(taken.expose(SETTINGS), 12).pattern == pattern_number(white)
+
+
+def test_a_display_shows_late_where_that_fault_is_due():
+    shown, faults = [], Faults()
+    faults.inject("latency")
+    display = VirtualDisplay((4, 8), shown.append, faults=faults)
+    before = time.monotonic()
+    display.show(np.zeros((4, 8), np.uint8))
+    assert time.monotonic() - before > 0.04 and len(shown) == faults.happened["latency"] == 1
 
 
 def test_a_pattern_of_another_shape_is_refused():

@@ -87,16 +87,16 @@ def test_unplugged_it_comes_back_at_the_same_path(driver, virtual):
 
 
 @KINDS
-def test_the_rig_is_told_where_the_slide_is_before_the_driver(driver, virtual):
-    told: list[float] = []
+def test_the_rig_knows_the_position_before_the_driver(driver, virtual):
+    seen: list[float] = []
     slow = Motion(travel=10.0, start=2.0, speed=100.0)
-    with virtual(slow, on_move=told.append) as device, open_stage(driver, device) as stage:
+    with virtual(slow, on_move=seen.append) as device, open_stage(driver, device) as stage:
         stage.home()
         stage.move_to(3.0)
-        before = len(told)
+        before = len(seen)
         reached = stage.move_to(8.0)
-        way = told[before:]
-    assert told[0] == 2.0
+        way = seen[before:]
+    assert seen[0] == 2.0
     assert way[-1] == pytest.approx(reached, abs=1e-3)
     assert len(way) > 3 and all(a < b for a, b in zip(way, way[1:], strict=False))
 
@@ -114,7 +114,7 @@ def test_input_without_an_end_is_not_kept(driver, virtual):
 
 
 @KINDS
-def test_a_move_whose_answer_was_spoilt_is_not_sent_again_after_a_stop(driver, virtual):
+def test_a_move_whose_answer_was_corrupted_is_not_sent_again_after_a_stop(driver, virtual):
     slow = Motion(travel=10.0, start=5.0, speed=20.0, latency=0.05)
     with virtual(slow) as device, open_stage(driver, device) as stage:
         stage.home()
@@ -143,10 +143,3 @@ def test_garbage_before_an_answer_is_survived(driver, virtual):
             device._send(garbage)
             reached = stage.move_to(4.0)
             assert reached == stage.position() == pytest.approx(device.true_position, abs=1e-3)
-
-
-@KINDS
-def test_opened_again_and_again_it_answers_each_driver(driver, virtual):
-    with virtual(FAST) as device:
-        for _ in range(5):
-            open_stage(driver, device).close()

@@ -73,11 +73,6 @@ class TestResample:
         shown = (np.abs(y)[:, None] <= SHAPE[0] / 2) & (np.abs(x) <= SHAPE[1] / 2)
         np.testing.assert_allclose(found, shown, atol=1e-12)
 
-    def test_nothing_changes_at_scale_one(self):
-        image = waves(1.0, (0.0, 0.0))
-        found = resample(image, jnp.asarray(1.0), jnp.zeros(2))
-        np.testing.assert_allclose(found, image, atol=1e-12)
-
 
 def rms(values):
     return float(jnp.sqrt(jnp.mean(values**2)))
@@ -109,7 +104,7 @@ def test_the_registered_reference_lies_on_the_capture():
 
 
 @pytest.mark.thorough
-def test_different_scenes_are_told():
+def test_different_scenes_are_a_poor_fit():
     found = estimate_registration(blobs(seed=1), blobs(seed=2))
     assert found.status in ("poor_fit", "not_converged")
     assert any("correlate" in line for line in found.reasons)

@@ -91,7 +91,7 @@ def test_the_smear_is_in_the_model():
 
 
 @pytest.mark.parametrize(
-    ("names", "told"),
+    ("names", "reason"),
     [
         (("lens_distance", "object_distance"), "lens_distance and object_distance cannot"),
         pytest.param(
@@ -102,9 +102,9 @@ def test_the_smear_is_in_the_model():
         (("tilt", "film_thickness"), "do not see film_thickness at all"),
     ],
 )
-def test_what_positions_cannot_tell_is_said(names, told):
+def test_undetermined_parameters_are_named(names, reason):
     fit = fit_screen(ghosts(0.05), camera(), plane(), names, samples=None)
-    assert any(told in line for line in fit.reasons)
+    assert any(reason in line for line in fit.reasons)
 
 
 def test_a_plate_that_leans():
@@ -117,7 +117,7 @@ def test_a_plate_that_leans():
 
 
 @pytest.mark.thorough
-def test_another_screen_is_told():
+def test_another_screen_is_a_poor_fit():
     fit = fit_screen(ghosts(0.05, TRUE | {"glass": 9.0}), camera(), plane(), ("slant",))
     assert fit.status == "poor_fit"
 

@@ -100,7 +100,7 @@ def off(found, truth):
 
 @pytest.mark.parametrize("overfills", [True, False])
 def test_centring_is_right_only_if_the_shadow_overfills_the_sensor(overfills):
-    """Else a term is left; that is told, and two terms that are fitted have it."""
+    """Else a term is left and reported, and a fit of two terms has it."""
     truth = camera(2, overfills)
     plain = calibrate_separable(*stripes(truth))
     assert "centre the captures" in plain.reason

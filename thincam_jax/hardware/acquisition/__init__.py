@@ -1,1 +1,1 @@
-"""Acquisitions: a plan, its frames in a store, a journal, and how it goes on after anything."""
+"""Acquisitions: a plan, its frames in a store, a journal, and resumption."""

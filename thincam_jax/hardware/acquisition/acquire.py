@@ -1,7 +1,7 @@
-"""Takes the frames of a plan into a store, and survives what can go wrong on the way.
+"""Acquisition of a plan's frames into a store, with recovery from errors.
 
-An error that does not pass stops the run, and so do Ctrl-C, SIGTERM, SIGKILL and a power cut. The
-same call takes it up again where it stopped, with the same plan, devices and settings.
+A permanent error stops the run, as do Ctrl-C, SIGTERM, SIGKILL and a power cut. The same call
+resumes it, with the same plan, devices and settings.
 """
 
 import signal
@@ -33,14 +33,14 @@ from thincam_jax.hardware.acquisition.recorder import (
     versions,
 )
 from thincam_jax.hardware.acquisition.rig import Rig
-from thincam_jax.hardware.acquisition.taker import Procedure, Taker, full_scale, told
-from thincam_jax.hardware.base import CameraSettings
+from thincam_jax.hardware.acquisition.taker import Procedure, Taker, full_scale
+from thincam_jax.hardware.base import CameraSettings, Identity
 from thincam_jax.hardware.errors import NotHomed
 
 
 @dataclass(frozen=True)
 class Progress:
-    """After each frame: frames that are taken, of how many; frames per second, and s to go."""
+    """State after each frame: frames taken and in all, frames per second, and s remaining."""
 
     done: int
     total: int
@@ -53,7 +53,7 @@ class Outcome:
     """End of a run.
 
     - `done`, `total`: frames in the store, and of the plan.
-    - `recovered`: the errors that a retry helped against, one line each.
+    - `recovered`: the errors that a retry resolved, one line each.
     - `seconds`: spent on "move", "show", "settle", "flush", "trigger", "check", "keep".
     """
 
@@ -65,7 +65,7 @@ class Outcome:
 
     @property
     def complete(self) -> bool:
-        """Whether all frames are there; else the run was stopped and can be taken up again."""
+        """Whether all frames are there; else the run was stopped and can be resumed."""
         return self.done == self.total
 
 
@@ -79,15 +79,15 @@ def acquire(
 ) -> Outcome:
     """Take the frames of a plan into the store at `path`, or those that it lacks.
 
-    Ctrl-C and SIGTERM stop after the frame that is being taken, a second Ctrl-C at once. After an
-    error, too, what was taken is kept, and the same call goes on.
+    Ctrl-C and SIGTERM stop after the present frame, a second Ctrl-C at once. Frames taken are kept,
+    also after an error, and the same call resumes.
 
     **Errors**: CaptureStoreError, one line, where the store is of another plan, device or setting,
     is being written by another run, or does not fit on the disk; the HardwareError that retries did
-    not help against, or after which none makes sense: OutOfRange, NotHomed, Saturated and others.
+    not resolve, or that is not retried: OutOfRange, NotHomed, Saturated and others.
     """
     path, procedure = Path(path).absolute(), procedure or Procedure()
-    with _stop_asked() as stop, locked(path):
+    with _stop_requested() as stop, locked(path):
         run = Taker(plan, rig, procedure)
         settings = _begin(run, path)
         with Recorder(path) as recorder:
@@ -110,7 +110,7 @@ def acquire(
 
 
 def _begin(run: Taker, path: Path) -> tuple[CameraSettings, ...]:
-    """Create the store, or see that it is this run's; what the camera is set to for it."""
+    """Create the store, or check that it belongs to this run; returns its camera settings."""
     moves = any(step.position is not None for step in run.plan.steps)
     if moves and run.rig.stage is None:
         raise ValueError(
@@ -137,7 +137,7 @@ def _begin(run: Taker, path: Path) -> tuple[CameraSettings, ...]:
         "acquisition": {
             "plan": run.plan.hash,
             "name": run.plan.name,
-            "devices": run.identities,
+            "devices": {role: asdict(device) for role, device in run.identities.items()},
             "settings": [asdict(one) for one in settings],
             "asked": [asdict(one) for one in run.plan.settings],
             "procedure": asdict(run.procedure),
@@ -159,7 +159,7 @@ def _begin(run: Taker, path: Path) -> tuple[CameraSettings, ...]:
 
 
 def _resumed(run: Taker, path: Path) -> tuple[CameraSettings, ...]:
-    """Camera settings when the store was begun, once all agrees with it."""
+    """Camera settings with which the store was begun, after checking that all else agrees."""
     store = CaptureStore(path)
     begun = store.attributes.get("acquisition")
     if begun is None:
@@ -170,12 +170,13 @@ def _resumed(run: Taker, path: Path) -> tuple[CameraSettings, ...]:
             f"with this one ({run.plan.name}, {run.plan.hash[:12]}); give another name, or "
             "the plan it was begun with"
         )
-    for role in sorted({*begun["devices"], *run.identities}):
-        was, now_is = begun["devices"].get(role), run.identities.get(role)
+    devices = {role: Identity(**record) for role, record in begun["devices"].items()}
+    for role in sorted({*devices, *run.identities}):
+        was, now_is = (every.get(role, "none") for every in (devices, run.identities))
         if was != now_is:
             raise CaptureStoreError(
-                f"{path} was begun with the {role} {told(was)}, and this rig has "
-                f"{told(now_is)}; connect that one, or give another name"
+                f"{path} was begun with the {role} {was}, and this rig has {now_is}; connect that "
+                "one, or give another name"
             )
     settings = tuple(settings_from(record) for record in begun["settings"])
     for one in settings:
@@ -185,7 +186,7 @@ def _resumed(run: Taker, path: Path) -> tuple[CameraSettings, ...]:
 
 
 def _new_settings(run: Taker) -> tuple[CameraSettings, ...]:
-    """Settings of the plan that the camera accepts, with the exposure that it needs."""
+    """Camera settings nearest to the plan's, with the exposure found where that is wanted."""
     asked, wanted = run.plan.settings, run.procedure.auto_exposure
     if wanted is not None:
         if len(asked) != 1:
@@ -206,8 +207,8 @@ def _new_settings(run: Taker) -> tuple[CameraSettings, ...]:
 
 
 @contextmanager
-def _stop_asked() -> Iterator[threading.Event]:
-    """An event that Ctrl-C and SIGTERM set; a second one does what it did before."""
+def _stop_requested() -> Iterator[threading.Event]:
+    """Event that Ctrl-C and SIGTERM set; a second signal has its usual effect."""
     stop = threading.Event()
     if threading.current_thread() is not threading.main_thread():
         yield stop  # signals reach the main thread only

@@ -1,4 +1,4 @@
-"""The exposure that brings the brightest pixels to a wanted level, in a bounded search."""
+"""Search of the exposure at which the brightest pixels have a given level."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -39,11 +39,11 @@ class AutoExposure:
 def find_exposure(
     level_at: Callable[[float], float], start: float, wanted: AutoExposure, camera: str
 ) -> float:
-    """The exposure, s, at which `level_at` gives the target.
+    """Exposure, s, at which `level_at` reaches the target.
 
-    - `level_at`: takes a frame of an exposure, and returns the level as a part of full scale.
+    - `level_at`: takes a frame with an exposure and returns its level as a fraction of full scale.
 
-    The level grows with the exposure, but for an offset, up to full scale, where it says nothing.
+    The level grows linearly with the exposure, apart from an offset, up to saturation.
 
     **Errors**: Saturated where the shortest exposure is too bright; OutOfRange where the longest is
     too dark, or the search does not end.

@@ -1,9 +1,8 @@
-"""Which frames of an acquisition are on disk, and how each was taken.
+"""Journal of the frames of an acquisition that are on disk, with a record of each.
 
 Each line is a JSON object {"crc32": …, "records": […]}, with the checksum of the records' canonical
 JSON: those of the frames that reached the disk together. A line is on disk (fsync) before the next
-one is begun, so that a power cut can only tear the last: it is discarded, and its frames are taken
-again.
+is begun, so that a power cut can tear only the last: it is discarded, and its frames are retaken.
 """
 
 import json
@@ -19,7 +18,7 @@ from thincam_jax.hardware.acquisition.plan import canonical_json
 
 
 class Journal:
-    """A journal that is open for writing; what was torn off at its end is cut away first."""
+    """A journal open for writing; a torn last line is removed first."""
 
     def __init__(self, path: Path):
         self.records, whole = _parsed(path)
@@ -28,7 +27,7 @@ class Journal:
         os.lseek(self._file, 0, os.SEEK_END)
 
     def append(self, records: Sequence[Any]) -> None:
-        """Write a line; it is on disk once this returns."""
+        """Write a line and wait until it is on disk."""
         text = canonical_json(list(records))
         line = {"crc32": zlib.crc32(text.encode()), "records": list(records)}
         data = canonical_json(line).encode() + b"\n"
@@ -41,7 +40,7 @@ class Journal:
 
 
 def read_journal(path: Path) -> list[Any]:
-    """The records of a journal, without a last line that is torn.
+    """Records of a journal, without a torn last line.
 
     **Errors**: CaptureStoreError for a damaged line before the last one.
     """
@@ -49,7 +48,7 @@ def read_journal(path: Path) -> list[Any]:
 
 
 def sync_path(path: Path) -> None:
-    """Have a file, or the names in a folder, on disk before this returns."""
+    """Wait until a file, or the names in a folder, are on disk."""
     handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)
@@ -58,7 +57,7 @@ def sync_path(path: Path) -> None:
 
 
 def _parsed(path: Path) -> tuple[list[Any], int]:
-    """The records of all whole lines, and how many bytes of the file these take."""
+    """Records of all complete lines, and their length in bytes."""
     data = read_regular(path) if path.exists() else b""
     records, whole = [], 0
     for number, line in enumerate(data.split(b"\n")[:-1], 1):
@@ -77,7 +76,7 @@ def _parsed(path: Path) -> tuple[list[Any], int]:
 
 
 def _records(line: bytes) -> list[Any] | None:
-    """The records of a line that is whole."""
+    """Records of a line; None for a damaged one."""
     try:
         held = json.loads(line)
         records = held["records"]

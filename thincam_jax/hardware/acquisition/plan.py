@@ -1,10 +1,9 @@
-"""Steps of an acquisition as data, which is hashed, stored and compared.
+"""Plans: the steps of an acquisition as data that is hashed, stored and compared.
 
 A plan holds a table of patterns, one of camera settings, and the steps, which point into both. Its
-SHA-256 is over canonical JSON, so that an acquisition is only ever resumed with the plan that it
-began with. The ready-made plans are those of the thesis: fringe scanning, method A
-(several mask-sensor distances), method B (pairs of phases of several β), a stack of PSFs
-by depth, and the calibration by Hadamard patterns.
+SHA-256 is over canonical JSON, so that an acquisition is only ever resumed with its own plan. The
+ready-made plans are those of the thesis: fringe scanning, method A (several mask-sensor distances),
+method B (pairs of phases of several β), a stack of PSFs by depth, and Hadamard calibration.
 """
 
 import dataclasses
@@ -27,7 +26,7 @@ PHASE_PAIR = (0.0, 1.5 * math.pi)
 
 @dataclass(frozen=True)
 class Pattern:
-    """Pattern on a display: a kind and the numbers that it takes to draw it.
+    """Pattern on a display: a kind and the numbers that define it.
 
     - "fza": `beta` rad/mm², `phase` rad, `width` mm, `profile` ("cosine", "intensity", "binary").
     - "hadamard": `frame` of a `HadamardSeries` of `rows`, `columns`, `order`, `display`.
@@ -43,10 +42,10 @@ BLACK = Pattern("black")
 
 @dataclass(frozen=True)
 class Step:
-    """One frame: the pattern and the settings by their number in the plan, and the stage's place.
+    """One frame: its pattern and settings by their number in the plan, and the stage position.
 
-    - `position`: mm; None: the stage stays where it is.
-    - `dark`: nothing is lit; the frame is subtracted from the others.
+    - `position`: mm; None: the stage does not move.
+    - `dark`: a dark frame, subtracted from the others.
     """
 
     pattern: int
@@ -59,10 +58,9 @@ class Step:
 class Plan:
     """An ordered list of steps.
 
-    - `name`: what it is for, such as "method_b".
-    - `facts`: numbers and texts that a reader of the captures needs, kept with them. `stage_zero`
-      is the distance, mm, at the stage's position 0. With `series`, that of `hadamard`, the store
-      is one that `open_captures` reads.
+    - `name`: its purpose, such as "method_b".
+    - `facts`: numbers and texts stored with the captures. `stage_zero` is the distance, mm, at the
+      stage's position 0. With `series`, as in `hadamard`, `open_captures` reads the store.
 
     **Errors**: ValueError for no steps, numbers that point outside of the tables, and what JSON
     cannot hold.
@@ -79,13 +77,13 @@ class Plan:
             raise ValueError(f"the plan {self.name!r} has no steps; give at least one")
         for number, step in enumerate(self.steps):
             for what, index in (("patterns", step.pattern), ("settings", step.settings)):
-                if not 0 <= index < len(getattr(self, what)):
+                count = len(getattr(self, what))
+                if not 0 <= index < count:
                     raise ValueError(
                         f"step {number} of the plan {self.name!r} points to number {index} of its "
-                        f"{len(getattr(self, what))} {what}; give 0 … "
-                        f"{len(getattr(self, what)) - 1}"
+                        f"{count} {what}; give 0 … {count - 1}"
                     )
-        _ = self.hash  # NaN and objects are refused here, not after the first frame
+        _ = self.hash  # refuses NaN and objects now, not after the first frame
 
     def pattern(self, step: Step) -> Pattern:
         """Pattern shown in a step of this plan."""
@@ -97,7 +95,7 @@ class Plan:
         return hashlib.sha256(self.as_json().encode()).hexdigest()
 
     def as_json(self) -> str:
-        """The plan as JSON with sorted keys and no spaces: the same plan, the same text."""
+        """Canonical JSON of the plan: equal plans give equal texts."""
         plan = {
             "name": self.name,
             "patterns": [[p.kind, dict(p.numbers)] for p in self.patterns],
@@ -114,7 +112,7 @@ class Plan:
 
     @classmethod
     def from_json(cls, text: str) -> "Plan":
-        """The plan of `as_json`; ValueError, KeyError or TypeError for anything else."""
+        """Inverse of `as_json`; ValueError, KeyError or TypeError for anything else."""
         plan = json.loads(text)
         return cls(
             name=plan["name"],
@@ -131,7 +129,7 @@ def canonical_json(value: Any) -> str:
 
 
 def settings_from(record: Mapping[str, Any]) -> CameraSettings:
-    """Camera settings from what `dataclasses.asdict` made of them."""
+    """Inverse of `dataclasses.asdict` for camera settings."""
     region = record["region"]
     return CameraSettings(**{**record, "region": None if region is None else Region(**region)})
 
@@ -139,13 +137,13 @@ def settings_from(record: Mapping[str, Any]) -> CameraSettings:
 def zone_plate(
     beta: float, width: float, *, phase: float = 0.0, profile: str = "cosine"
 ) -> Pattern:
-    """A Fresnel zone aperture for a light modulator; arguments as of `FresnelZoneAperture`."""
+    """Fresnel zone aperture for a light modulator; arguments as of `FresnelZoneAperture`."""
     numbers = {"beta": float(beta), "phase": float(phase), "width": float(width)}
     return Pattern("fza", {**numbers, "profile": profile})
 
 
 def fringe_scan(mask: Pattern, settings: CameraSettings, *, dark_every: int = 0) -> Plan:
-    """Four captures with the phases 0, π/2, π and 3π/2 of one zone plate.
+    """Four captures of one zone plate with the phases 0, π/2, π and 3π/2.
 
     - `mask`: a `zone_plate`; its phase is replaced.
     - `dark_every`: a dark frame first and after each that many captures; 0: none.
@@ -192,7 +190,7 @@ def psf_stack(
     stage_zero: float = 0.0,
     dark_every: int = 0,
 ) -> Plan:
-    """The PSF of one pattern for a point source at several depths, mm, which the stage carries.
+    """PSFs of one pattern for a point source on the stage, at several depths, mm.
 
     The stage moves to depth − `stage_zero`, the depth at its position 0.
     """
@@ -215,7 +213,7 @@ def hadamard(series: "HadamardSeries", settings: CameraSettings) -> Plan:
     dark = series.dark_frames
     every = -(-series.pattern_frames // dark) if dark else 0
     plan = _plan("hadamard", shots, settings, every)
-    # Of few patterns and many dark frames the last ones come together.
+    # With few patterns and many dark frames the last ones come together.
     lacking = dark - sum(step.dark for step in plan.steps)
     black = Step(len(plan.patterns) - 1, dark=True)
     facts = {"series": {**described, "object_shape": [rows, columns]}}
@@ -236,7 +234,7 @@ def _plan(
     dark_every: int,
     facts: Mapping[str, Any] | None = None,
 ) -> Plan:
-    """Shots of patterns at positions, with a dark frame before each `dark_every` of them."""
+    """Plan of (pattern, position) shots, with a dark frame before every `dark_every` of them."""
     if dark_every < 0:
         raise ValueError(f"dark_every = {dark_every}; give a whole number, 0 for no dark frames")
     patterns = {_key(pattern): pattern for pattern, _ in shots}

@@ -1,4 +1,4 @@
-"""Frames of an acquisition, how each was taken, and recordings made of them."""
+"""Reading a complete acquisition: its frames and their records."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -17,12 +17,11 @@ from thincam_jax.hardware.base import CameraSettings
 
 @dataclass(frozen=True)
 class Acquisition:
-    """A store of an acquisition that is complete, as `read_acquisition` gives it.
+    """A complete acquisition, as read by `read_acquisition`.
 
-    - `settings`: what the camera was set to, one for each of `plan.settings`.
-    - `shots`: how each frame was taken, a record for each step: "digest", "taken" (UTC), the
-      camera's "number" and "time" (s), "exposure" (s), "position" (mm or None), "saturated"
-      (pixels), "retries".
+    - `settings`: actual camera settings, one for each of `plan.settings`.
+    - `shots`: a record for each step: "digest", "taken" (UTC), the camera's "number" and "time"
+      (s), "exposure" (s), "position" (mm or None), "saturated" (pixels), "retries".
     - `provenance`: "devices", "versions", "procedure", "begun", "asked" (settings), "plan" (hash).
     """
 
@@ -36,7 +35,7 @@ class Acquisition:
 
     @property
     def lit(self) -> list[int]:
-        """The steps that are no dark frames: those of `captures`, `patterns` and `distances`."""
+        """Numbers of the steps of `captures`, `patterns` and `distances`: all but dark frames."""
         return [number for number, step in enumerate(self.plan.steps) if not step.dark]
 
     @property
@@ -46,13 +45,13 @@ class Acquisition:
 
     @property
     def distances(self) -> list[float | None]:
-        """The stage's position and the plan's `stage_zero`, mm, for each capture."""
+        """Stage position plus the plan's `stage_zero`, mm, for each capture."""
         zero = self.plan.facts.get("stage_zero", 0.0)
         places = [self.shots[number]["position"] for number in self.lit]
         return [None if place is None else place + zero for place in places]
 
     def frame(self, step: int) -> np.ndarray:
-        """The counts (y, x) of a step; CaptureStoreError where they are not those taken."""
+        """Counts (y, x) of a step; CaptureStoreError where they have changed since."""
         pixels = CaptureStore(self.path).read(step)
         if f"{frame_digest(pixels):016x}" != self.shots[step]["digest"]:
             raise CaptureStoreError(
@@ -61,7 +60,7 @@ class Acquisition:
         return pixels
 
     def dark(self, settings: int = 0) -> np.ndarray | None:
-        """Mean of the dark frames that were taken with settings of that number, (y, x) counts."""
+        """Mean of the dark frames with the settings of that number, (y, x) counts."""
         steps = enumerate(self.plan.steps)
         numbers = [n for n, step in steps if step.dark and step.settings == settings]
         if not numbers:
@@ -72,7 +71,7 @@ class Acquisition:
         return (total / len(numbers)).astype(np.float32)
 
     def captures(self) -> np.ndarray:
-        """All captures (capture, y, x) in counts, float32, without the mean dark frame."""
+        """All captures (capture, y, x) in counts, float32, minus the mean dark frame."""
         dark = {n: self.dark(n) for n in range(len(self.settings))}
         found = np.empty((len(self.lit), *self.sensor_shape), np.float32)
         for place, number in enumerate(self.lit):
@@ -84,7 +83,7 @@ class Acquisition:
 
 
 def read_acquisition(path: str | Path) -> Acquisition:
-    """A complete acquisition; that of a Hadamard plan is read by `open_captures`, too.
+    """Read a complete acquisition; one of a Hadamard plan is also read by `open_captures`.
 
     **Errors**: CaptureStoreError, one line, for another store, and for one that lacks frames.
     """

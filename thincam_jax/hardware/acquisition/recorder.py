@@ -1,8 +1,7 @@
-"""A store that is being written: frames first, then the lines of the journal that announce them.
+"""Writing a store: frames first, then the lines of the journal that announce them.
 
-Writing and waiting for the disk is done by a thread while the next frame is exposed. Frames reach
-the disk before their lines do, so that a line never announces a frame that is not there: what has
-no line is taken again.
+A thread writes and waits for the disk while the next frame is exposed. Frames reach the disk before
+their lines, so that every announced frame is there; a frame without a line is retaken.
 """
 
 import os
@@ -31,7 +30,7 @@ _AT_ONCE = 8  # files that are synced at once: the disk writes its own journal o
 
 @contextmanager
 def locked(path: Path) -> Iterator[None]:
-    """Keeps a second run from writing the same store, until this one has left or ended."""
+    """Keep other runs from writing the same store meanwhile."""
     lock = FileLock(path.with_name(f".{path.name}.lock"))
     with writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -48,7 +47,7 @@ def locked(path: Path) -> Iterator[None]:
 
 
 def create_store(path: Path, plan: str, *layout: Any, together: int) -> None:
-    """A new store, which is there whole or not at all; `layout` as of `CaptureStore.create`."""
+    """Create a store atomically; `layout` as in `CaptureStore.create`."""
     partial = path.with_name(f".{path.name}.partial")
     shutil.rmtree(partial, ignore_errors=True)  # of a run that was killed at this point
     with writing(path):
@@ -61,7 +60,7 @@ def create_store(path: Path, plan: str, *layout: Any, together: int) -> None:
 
 
 def require_space(path: Path, size: int) -> None:
-    """CaptureStoreError, one line, where the disk has no room for so many bytes."""
+    """Raise CaptureStoreError where the disk has no room for so many bytes."""
     free = shutil.disk_usage(path.parent).free
     if size > free:
         raise CaptureStoreError(
@@ -71,20 +70,20 @@ def require_space(path: Path, size: int) -> None:
 
 
 def versions() -> dict[str, str]:
-    """Of what took the frames."""
+    """Versions of Python and of the packages that take the frames."""
     names = ("thincam_jax", "numpy", "zarr")
     return {"python": platform.python_version(), **{name: version(name) for name in names}}
 
 
 def now() -> str:
-    """The time in UTC, ISO 8601."""
+    """Present time in UTC, ISO 8601."""
     return datetime.now(UTC).isoformat(timespec="milliseconds")
 
 
 class Recorder(AbstractContextManager["Recorder"]):
-    """Takes the frames of a store in the order of its steps; a context manager.
+    """Writer of a store's frames in the order of its steps; a context manager.
 
-    `missing` are the steps that are still to be taken. Leaving the context writes out what waits.
+    `missing` are the steps not yet taken. Leaving the context writes the frames still queued.
     """
 
     def __init__(self, path: Path):
@@ -104,12 +103,12 @@ class Recorder(AbstractContextManager["Recorder"]):
         self._saving: Future[None] | None = None
 
     def note(self, record: Mapping[str, Any]) -> None:
-        """A line that is no frame: a run that begins or ends."""
+        """Write a line that is no frame, as at the begin of a run."""
         self._wait()
         self._journal.append([record])
 
     def add(self, step: int, pixels: np.ndarray, facts: Mapping[str, Any]) -> None:
-        """Take a frame, which nobody may change now; `facts` are what the journal says of it.
+        """Queue a frame, not to be changed afterwards; `facts` go to its line in the journal.
 
         **Errors**: WriteError for an earlier frame that could not be written.
         """

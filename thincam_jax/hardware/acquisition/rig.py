@@ -1,26 +1,25 @@
-"""The devices of an acquisition, each of which can be opened again."""
+"""The devices of an acquisition, which can be reopened."""
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager, ExitStack
-from dataclasses import asdict
 from typing import Any, Literal
 
 import numpy as np
 
 from thincam_jax.hardware.acquisition.plan import Pattern
-from thincam_jax.hardware.base import Camera, Display, Stage
+from thincam_jax.hardware.base import Camera, Display, Identity, Stage
 
 Role = Literal["camera", "display", "stage"]
 
 
 class Rig(AbstractContextManager["Rig"]):
-    """Camera, display and, where there is one, stage; a context manager that closes them.
+    """Camera, display and an optional stage; a context manager that closes them.
 
-    - `open_camera`, `open_display`, `open_stage`: open the device, now and again after it was
-      unplugged, such as `functools.partial(open_device, "cameras", "pylon", options)`.
+    - `open_camera`, `open_display`, `open_stage`: open the device, also after it was unplugged,
+      such as `functools.partial(open_device, "cameras", "pylon", options)`.
     - `render`: draws a pattern as levels (y, x), uint8, of the display's shape.
 
-    **Errors**: those of the drivers; what was opened before is closed.
+    **Errors**: those of the drivers; devices opened before are closed.
     """
 
     camera: Camera
@@ -46,17 +45,16 @@ class Rig(AbstractContextManager["Rig"]):
             opened.pop_all()
 
     def reopen(self, role: Role) -> None:
-        """Close a device that has gone, and open it again."""
+        """Close a disconnected device and open it again."""
         getattr(self, role).close()
         setattr(self, role, self._openers[role]())
 
-    def identities(self) -> dict[str, Any]:
-        """Vendor, model, serial number and firmware of each device."""
-        there = {role: getattr(self, role) for role in self._openers}
-        return {role: asdict(device.identity) for role, device in there.items() if device}
+    def identities(self) -> dict[str, Identity]:
+        """Identity of each device."""
+        return {role: getattr(self, role).identity for role in self._openers}
 
     def close(self) -> None:
-        """Give the devices back."""
+        """Release the devices."""
         for device in (self.camera, self.display, self.stage):
             if device is not None:
                 device.close()

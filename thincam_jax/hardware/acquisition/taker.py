@@ -1,7 +1,7 @@
-"""Takes the frame of one step: move, show, settle, flush, trigger, check.
+"""Taking the frame of one step: move, show, settle, flush, trigger, check.
 
-What fails in a way that may pass is done again from the beginning of the step, and a device that
-has gone is opened again; every other error is the caller's.
+After a transient error the step is repeated from its beginning, and a disconnected device is
+reopened; every other error is the caller's.
 """
 
 import math
@@ -28,20 +28,20 @@ from thincam_jax.hardware.errors import (
     Timeout,
 )
 
-PASSES = (IncompleteFrame, Timeout, Disconnected)  # a step that fails so is done again
+TRANSIENT = (IncompleteFrame, Timeout, Disconnected)  # the step is repeated
 
 
 @dataclass(frozen=True)
 class Procedure:
-    """Procedure by which frames are taken, and recovery where one fails.
+    """Timing, checks and error recovery of an acquisition.
 
-    - `settle`: time, s, that the display takes after a pattern is shown.
+    - `settle`: s from showing a pattern to the trigger.
     - `timeout`: s, beyond the exposure, that a frame may take.
-    - `retries`: how often a step is done again after IncompleteFrame, Timeout and Disconnected.
-    - `reopen_wait`: s before a device that has gone is opened again.
-    - `saturated_share`: largest share of pixels at the largest count.
-    - `position_tolerance`: mm between the position asked for and the one reached.
-    - `auto_exposure`: find the exposure before the first frame; None: the plan's.
+    - `retries`: repetitions of a step after IncompleteFrame, Timeout and Disconnected.
+    - `reopen_wait`: s before a disconnected device is reopened.
+    - `saturated_share`: largest allowed share of saturated pixels.
+    - `position_tolerance`: mm between the commanded position and the one reached.
+    - `auto_exposure`: find the exposure before the first frame; None: use the plan's.
     """
 
     settle: float = 0.0
@@ -60,9 +60,9 @@ class Procedure:
 
 
 class Taker:
-    """The devices of a run, and what is known of their state.
+    """The devices of a run and their known state.
 
-    - `recovered`: the errors that a retry helped against. `seconds`: spent on each part of a step.
+    - `recovered`: the errors that a retry resolved. `seconds`: spent on each part of a step.
     """
 
     def __init__(self, plan: Plan, rig: Rig, procedure: Procedure):
@@ -70,9 +70,9 @@ class Taker:
         self.recovered: list[str] = []
         self.seconds: dict[str, float] = {}
         self.identities = rig.identities()
-        self._role: Role = "camera"  # of the device that is being used
+        self._role: Role = "camera"  # of the device in use
         self._forget()
-        self.bits: int | None = None  # of every frame, once the first has told it
+        self.bits: int | None = None  # of every frame, from the first
         self._seen: tuple[int, np.ndarray] | None = None  # pattern and pixels of the last frame
 
     def shape(self, settings: CameraSettings) -> tuple[int, int]:
@@ -82,7 +82,7 @@ class Taker:
 
     @contextmanager
     def clock(self, what: str) -> Iterator[None]:
-        """Adds the time spent within to `seconds`."""
+        """Add the time spent within to `seconds`."""
         started = time.perf_counter()
         try:
             yield
@@ -93,7 +93,7 @@ class Taker:
     def take(
         self, step: Step, settings: CameraSettings, *, probe: bool = False
     ) -> tuple[Frame, dict[str, Any]]:
-        """The frame of a step, and how it was taken. A `probe` may be saturated."""
+        """Frame of a step, and its record for the journal. A `probe` may be saturated."""
         before = len(self.recovered)
         frame, seen = self.persist(lambda: self._once(step, settings, probe))
         return frame, {
@@ -105,11 +105,11 @@ class Taker:
         }
 
     def persist(self, action: Callable[[], Any]) -> Any:
-        """Result of `action`; transient faults are recovered from, a few times."""
+        """Result of `action`, repeated a few times after transient errors."""
         for left in reversed(range(self.procedure.retries + 1)):
             try:
                 return action()
-            except PASSES as error:
+            except TRANSIENT as error:
                 if not left:
                     raise
                 self._recover(error)
@@ -117,12 +117,12 @@ class Taker:
         raise AssertionError  # for the type: the last attempt returns or raises
 
     def _recover(self, error: HardwareError) -> None:
-        """Leave the devices so that the step can be done again from its beginning."""
+        """Prepare the devices for repeating the step from its beginning."""
         role = self._role
         if isinstance(error, Disconnected):
             self._reopen(role, error)
         elif isinstance(error, Timeout) and role == "camera":
-            time.sleep(self.procedure.timeout)  # a frame that is late comes now, and is flushed
+            time.sleep(self.procedure.timeout)  # a late frame arrives now, and is flushed
         last = None if role == "camera" and isinstance(error, Disconnected) else self._last
         self._forget()
         self._last = last
@@ -138,24 +138,22 @@ class Taker:
                 failure = again
                 continue
             if is_now != self.identities[role]:
-                raise NotFound(
-                    self.name(role), "open again", f"{told(is_now)} is there in its place",
-                    f"connect {told(self.identities[role])}"
-                ) from error  # fmt: skip
+                cause, remedy = f"{is_now} is there in its place", f"connect {self.name(role)}"
+                raise NotFound(self.name(role), "open again", cause, remedy) from error
             return
         raise error from failure
 
     def _forget(self) -> None:
-        """Nothing is known of the devices' state: all is set again."""
+        """Forget the devices' state, so that all is set again."""
         self._last: int | None = None  # number of the last frame
         self._configured: CameraSettings | None = None
-        self._asked: float | None = None  # where the stage was sent, and where it says it is
+        self._asked: float | None = None  # commanded position of the stage, and the reported one
         self._position: float | None = None
 
     def _once(
         self, step: Step, settings: CameraSettings, probe: bool
     ) -> tuple[Frame, dict[str, Any]]:
-        """The frame of a step, how many of its pixels are full, and where the stage stands."""
+        """Frame of a step, its number of saturated pixels, and the stage's position."""
         position = self._moved(step)
         with self.clock("show"):
             levels = self.rig.render(self.plan.pattern(step))
@@ -172,15 +170,15 @@ class Taker:
         with self.clock("trigger"):
             frame = camera.trigger_and_grab(self.procedure.timeout)
         with self.clock("check"):
-            # A copy of its own: drivers use their buffers again.
+            # A copy, as drivers reuse their buffers.
             frame = replace(frame, pixels=np.array(frame.pixels))
             saturated = self._check(frame, settings, probe)
-            self._refuse_twin(step, frame.pixels)
+            self._refuse_repeated(step, frame.pixels)
         self._last = frame.number
         return frame, {"saturated": saturated, "position": position}
 
     def _moved(self, step: Step) -> float | None:
-        """Where the stage stands after it moved, as it says itself; None for none."""
+        """Reported position of the stage after its move; None without a stage."""
         stage = self.rig.stage
         if stage is None:
             return None
@@ -201,7 +199,7 @@ class Taker:
         return float(self._position)  # pyright: ignore[reportArgumentType]
 
     def configure(self, settings: CameraSettings) -> None:
-        """Set the camera as it was set when the store was begun; ProtocolError if it will not."""
+        """Apply settings exactly; ProtocolError where the camera takes others."""
         if settings == self._configured:
             return
         taken = self.set_near(settings)
@@ -213,13 +211,13 @@ class Taker:
         self._configured = settings
 
     def set_near(self, settings: CameraSettings) -> CameraSettings:
-        """Set the camera, and what it has taken instead."""
+        """Apply settings; returns the camera's nearest."""
         self._role, self._configured = "camera", None
         return self.rig.camera.configure(settings)
 
-    def _refuse_twin(self, step: Step, pixels: np.ndarray) -> None:
-        """Noise makes frames differ: the same pixels for another pattern are an old frame."""
-        middle = len(pixels) // 2  # differs nearly always, and saves reading the others
+    def _refuse_repeated(self, step: Step, pixels: np.ndarray) -> None:
+        """Refuse identical pixels for another pattern: with new noise they would differ."""
+        middle = len(pixels) // 2  # compared first, as it nearly always differs
         if (
             self._seen is not None
             and self._seen[0] != step.pattern
@@ -235,25 +233,25 @@ class Taker:
         self._seen = step.pattern, pixels
 
     def _check(self, frame: Frame, settings: CameraSettings, probe: bool) -> int:
-        """Number of saturated pixels; HardwareError where it is not the frame asked for."""
-        pixels, last = frame.pixels, self._last
-        name, again = self.name("camera"), "check the cable and its driver"
-        if last is not None and frame.number <= last:
-            cause = f"frame {frame.number} came after frame {last}: a stale one"
-            raise IncompleteFrame(name, "trigger", cause, again)
-        if pixels.shape != (shape := self.shape(settings)):
-            cause = f"the frame has the shape {pixels.shape}, not {shape}"
-            raise IncompleteFrame(name, "trigger", cause, again)
-        if self.bits is not None and frame.bit_depth != self.bits:
-            cause = f"the frame has {frame.bit_depth} bits, not {self.bits}"
-            raise ProtocolError(name, "trigger", cause, again)
-        if not math.isclose(frame.exposure, settings.exposure, rel_tol=0.01, abs_tol=2e-6):
-            cause = f"exposed for {frame.exposure:g} s, not for {settings.exposure:g} s"
-            raise ProtocolError(name, "trigger", cause, again)
-        full, highest = full_scale(frame), int(pixels.max())
-        if highest > full:
-            cause = f"a count of {highest}, and {frame.bit_depth} bits end at {full}"
-            raise ProtocolError(name, "trigger", cause, again)
+        """Number of saturated pixels; HardwareError for a wrong frame."""
+        pixels, last, bits = frame.pixels, self._last, frame.bit_depth
+        name, shape = self.name("camera"), self.shape(settings)
+        full, highest = full_scale(frame), int(pixels.max(initial=0))
+        exposed = math.isclose(frame.exposure, settings.exposure, rel_tol=0.01, abs_tol=2e-6)
+        for wrong, error, cause in (
+            (last is not None and frame.number <= last, IncompleteFrame,
+             f"frame {frame.number} came after frame {last}: a stale one"),
+            (pixels.shape != shape, IncompleteFrame,
+             f"the frame has the shape {pixels.shape}, not {shape}"),
+            (bits != (self.bits or bits), ProtocolError,
+             f"the frame has {bits} bits, not {self.bits}"),
+            (not exposed, ProtocolError,
+             f"exposed for {frame.exposure:g} s, not for {settings.exposure:g} s"),
+            (highest > full, ProtocolError,
+             f"a count of {highest}, and {bits} bits end at {full}"),
+        ):  # fmt: skip
+            if wrong:
+                raise error(name, "trigger", cause, "check the cable and its driver")
         saturated = int(np.count_nonzero(pixels == full)) if highest == full else 0
         share = saturated / pixels.size
         if share > self.procedure.saturated_share and not probe:
@@ -266,23 +264,16 @@ class Taker:
 
     def name(self, role: Role) -> str:
         """Name of a device in messages."""
-        return told(self.identities[role])
+        return str(self.identities[role])
 
 
 def full_scale(frame: Frame) -> int:
-    """The largest count of a frame."""
+    """Largest count of a frame."""
     return 2**frame.bit_depth - 1
 
 
-def told(identity: dict[str, str] | None) -> str:
-    """A device's identity in a message."""
-    if identity is None:
-        return "none"
-    return "{vendor} {model} ({serial})".format(**identity)
-
-
 def _same(first: CameraSettings, second: CameraSettings) -> bool:
-    """Whether two settings are the same, but for the rounding of registers."""
+    """Whether two settings agree up to the rounding of registers."""
     return (
         (first.region, first.pixel_format) == (second.region, second.pixel_format)
         and math.isclose(first.exposure, second.exposure, rel_tol=1e-4)

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from thincam_jax.hardware import errors
 from thincam_jax.hardware.base import CameraSettings, Frame, Identity
 from thincam_jax.hardware.cameras.features import (
     BIT_DEPTHS,
@@ -20,45 +21,36 @@ from thincam_jax.hardware.cameras.features import (
     text,
     trigger_by_software,
 )
-from thincam_jax.hardware.errors import (
-    Busy,
-    Disconnected,
-    HardwareError,
-    IncompleteFrame,
-    NotFound,
-    OutOfRange,
-    PermissionDenied,
-    ProtocolError,
-)
+from thincam_jax.hardware.errors import HardwareError
 
 _BUFFERS = 4
 
 
 class AravisCamera(FeatureCamera):
-    """A camera that aravis knows, with one frame for each software trigger.
+    """A camera supported by aravis, with one frame for each software trigger.
 
-    After a frame that failed, the stream starts anew, so that a late one is never taken for the
-    next. A camera that does not answer is `Disconnected`, 2.5 s after the question.
+    After a failed frame the stream is restarted, so that a late one is not taken for the next. A
+    camera that does not answer for 2.5 s is `Disconnected`.
     """
 
     @dataclass(frozen=True)
     class Options:
-        """Which camera: its `name` as `arv-tool-0.8` lists it, its address, or "" for the first."""
+        """`name`: as `arv-tool-0.8` lists the camera, its address, or "" for the first one."""
 
         name: str = ""
 
-    def __init__(self, name: str):
+    def __init__(self, options: Options):
         self._aravis, self._glib = _libraries()
-        self._name, self._lost = name or "aravis camera", False
+        self._name, self._lost = options.name or "aravis camera", False
         self._camera: Any = None
         self._stream: Any = None
         self._features: Any = None
         self._count = FrameCount()
         try:
-            with self._told("open"):
-                # The list is that of the last search: what was connected since is not in it.
+            with self._translated("open"):
+                # The list is that of the last search, without cameras connected since.
                 self._aravis.update_device_list()
-                self._camera = self._aravis.Camera.new(name or None)
+                self._camera = self._aravis.Camera.new(options.name or None)
                 self._introduce()
         except BaseException:
             self.close()
@@ -66,26 +58,23 @@ class AravisCamera(FeatureCamera):
 
     @staticmethod
     def require_libraries() -> None:
-        """NotFound, with what to install, where they are missing."""
+        """Raise NotFound, with what to install, where libraries are missing."""
         _libraries()
-
-    @classmethod
-    def open(cls, options: Options) -> "AravisCamera":
-        """Opens a camera; NotFound, Busy or PermissionDenied where that fails."""
-        return cls(options.name)
 
     def _introduce(self) -> None:
         device = self._camera.get_device()
         features = self._features = _Features(self._aravis, device)
-        self._identity = Identity(
+        self.identity = Identity(
             self._camera.get_vendor_name(),
             self._camera.get_model_name(),
             self._camera.get_device_serial_number() or "",
             text(features, "DeviceFirmwareVersion") or text(features, "DeviceVersion"),
         )
-        self._name = str(self._identity)
+        self._name = str(self.identity)
         if isinstance(device, self._aravis.GvDevice) and not device.is_controller():
-            raise Busy(self._name, "open", "another program controls it", "close that program")
+            raise errors.Busy(
+                self._name, "open", "another program controls it", "close that program"
+            )
         device.connect("control-lost", self._on_control_lost)
         self._camera.set_range_check_policy(self._aravis.RangeCheckPolicy.ENABLE)
         trigger_by_software(features)
@@ -101,7 +90,7 @@ class AravisCamera(FeatureCamera):
         settings = self._require_settings()
         deadline = time.monotonic() + settings.exposure + timeout
         try:
-            with self._told("grab"):
+            with self._translated("grab"):
                 self._start()
                 self.flush()
                 self._wait_until_ready(deadline)
@@ -134,13 +123,13 @@ class AravisCamera(FeatureCamera):
         self._camera.start_acquisition()
 
     def _stop(self) -> None:
-        if self._stream is not None and not self._lost:  # one that has gone takes seconds to refuse
+        if self._stream is not None and not self._lost:  # a lost one takes seconds to refuse
             with suppress(self._glib.Error):
                 self._camera.stop_acquisition()
         self._stream = None
 
     def _wait_until_ready(self, deadline: float) -> None:
-        """A trigger that comes too early is lost; cameras that can, say when they are ready."""
+        """Wait, as early triggers are lost; some cameras report when they are ready."""
         while self._features.has("AcquisitionStatus"):
             if self._features.get("AcquisitionStatus"):
                 return
@@ -151,13 +140,15 @@ class AravisCamera(FeatureCamera):
         status = buffer.get_status()
         if status != self._aravis.BufferStatus.SUCCESS:
             cause = f"packets are missing ({status.value_nick})"
-            raise IncompleteFrame(self._name, "grab", cause, "take it again; check the network")
+            raise errors.IncompleteFrame(
+                self._name, "grab", cause, "take it again; check the network"
+            )
         data, region = buffer.get_data(), settings.region
         bits = BIT_DEPTHS[settings.pixel_format]
         pixels = np.frombuffer(data, np.uint8 if bits == 8 else np.dtype("<u2"))
         if region is None or pixels.size != region.height * region.width:
             cause = f"{len(data)} bytes, and {region} of {settings.pixel_format} is set"
-            raise IncompleteFrame(self._name, "grab", cause, "take it again")
+            raise errors.IncompleteFrame(self._name, "grab", cause, "take it again")
         number = self._count.number(buffer.get_frame_id())
         shaped = pixels.reshape(region.height, region.width)
         return Frame(shaped, number, 1e-9 * buffer.get_timestamp(), settings.exposure, bits)
@@ -166,8 +157,8 @@ class AravisCamera(FeatureCamera):
         self._lost = True
 
     @contextmanager
-    def _told(self, operation: str) -> Iterator[None]:
-        """Aravis's errors become ours."""
+    def _translated(self, operation: str) -> Iterator[None]:
+        """Turn errors of aravis into those of a device."""
         if self._lost:
             raise self._gone(operation, "its control was lost")
         try:
@@ -175,8 +166,8 @@ class AravisCamera(FeatureCamera):
         except self._glib.Error as failure:
             raise self._error(operation, failure) from failure
 
-    def _gone(self, operation: str, cause: str) -> Disconnected:
-        return Disconnected(self._name, operation, cause, "connect it and open it again")
+    def _gone(self, operation: str, cause: str) -> errors.Disconnected:
+        return errors.Disconnected(self._name, operation, cause, "connect it and open it again")
 
     def _error(self, operation: str, failure: Any) -> HardwareError:
         cause, codes = failure.message, self._aravis.DeviceError
@@ -184,19 +175,19 @@ class AravisCamera(FeatureCamera):
         if code == codes.NOT_FOUND:
             found = [self._aravis.get_device_id(k) for k in range(self._aravis.get_n_devices())]
             remedy = f"connect one and switch it on; found: {', '.join(found) or 'none'}"
-            return NotFound(self._name, operation, cause, remedy)
+            return errors.NotFound(self._name, operation, cause, remedy)
         if code in (codes.NOT_CONTROLLER, codes.PROTOCOL_ERROR_ACCESS_DENIED) or "BUSY" in cause:
-            return Busy(self._name, operation, cause, "close the program that holds it")
-        if "ACCESS" in cause:  # libusb's name of it
+            return errors.Busy(self._name, operation, cause, "close the program that holds it")
+        if "ACCESS" in cause:  # libusb's name for it
             remedy = "install aravis's udev rule (aravis.rules) and connect the camera again"
-            return PermissionDenied(self._name, operation, cause, remedy)
+            return errors.PermissionDenied(self._name, operation, cause, remedy)
         silent = codes.TIMEOUT, codes.NOT_CONNECTED, codes.TRANSFER_ERROR, codes.NO_STREAM_CHANNEL
         if code in silent:
             self._lost = True
             return self._gone(operation, cause)
         if "bounds" in cause or "out of range" in cause:
-            return OutOfRange(self._name, operation, cause, "give a value within the limits")
-        return ProtocolError(self._name, operation, cause, "open the camera again")
+            return errors.OutOfRange(self._name, operation, cause, "give a value within the limits")
+        return errors.ProtocolError(self._name, operation, cause, "open the camera again")
 
 
 def _libraries() -> tuple[Any, Any]:
@@ -211,7 +202,9 @@ def _libraries() -> tuple[Any, Any]:
             "apt-get install gir1.2-aravis-0.8 python3-gi, and in a virtual environment "
             "pip install 'PyGObject<3.51'"
         )
-        raise NotFound("aravis", "open", f"its library is missing ({error})", remedy) from error
+        raise errors.NotFound(
+            "aravis", "open", f"its library is missing ({error})", remedy
+        ) from error
 
 
 class _Features:

@@ -1,6 +1,6 @@
-"""GenICam's standard features (SFNC): what the cameras of all makers are set by.
+"""GenICam's standard features (SFNC), by which cameras of all makers are configured.
 
-A library's camera becomes one of these by `Features`: features by name, without their types.
+`Features` adapts a library's camera: features by name, whatever their types.
 """
 
 from abc import abstractmethod
@@ -8,7 +8,7 @@ from collections.abc import Collection
 from contextlib import AbstractContextManager
 from typing import Any, Protocol, runtime_checkable
 
-from thincam_jax.hardware.base import Camera, CameraSettings, Identity, Region
+from thincam_jax.hardware.base import Camera, CameraSettings, Region
 from thincam_jax.hardware.errors import OutOfRange, Timeout
 
 BIT_DEPTHS = {"Mono8": 8, "Mono10": 10, "Mono12": 12, "Mono16": 16}
@@ -22,50 +22,45 @@ class Features(Protocol):
     """The features of an open camera."""
 
     def has(self, name: str) -> bool:
-        """Whether the camera has it, and it is available now."""
+        """Whether a feature exists and is available now."""
         ...
 
     def get(self, name: str) -> Value:
-        """Its value; of an enumeration the entry's name."""
+        """Value of a feature; for an enumeration the entry's name."""
         ...
 
     def set(self, name: str, value: Value) -> None:
-        """Writes a value, or an enumeration's entry."""
+        """Set a value, or an enumeration's entry."""
         ...
 
     def limits(self, name: str) -> tuple[Number, Number, Number]:
-        """Lowest, highest and step of a number; step 0 where there is none."""
+        """Minimum, maximum and step of a number; step 0 for none."""
         ...
 
     def choices(self, name: str) -> tuple[str, ...]:
-        """The entries of an enumeration that are available."""
+        """Available entries of an enumeration."""
         ...
 
 
 class FeatureCamera(Camera):
-    """Base of the cameras that are set by features, whatever library reaches them."""
+    """Base of the cameras that are configured by features, with any library."""
 
     _features: Any
-    _identity: Identity
     _name: str  # in errors
-    _formats: Collection[str] = BIT_DEPTHS.keys()  # that the driver can read
+    _formats: Collection[str] = BIT_DEPTHS.keys()  # supported by the driver
     _settings: CameraSettings | None = None
 
     @abstractmethod
     def _stop(self) -> None:
-        """Ends the stream, if there is one: a camera is set while it stands still."""
+        """Stop the stream, if there is one, so that the camera can be configured."""
 
     @abstractmethod
-    def _told(self, operation: str) -> AbstractContextManager[None]:
-        """Errors of the library become ours."""
-
-    @property
-    def identity(self) -> Identity:
-        return self._identity
+    def _translated(self, operation: str) -> AbstractContextManager[None]:
+        """Turn errors of the library into those of a device."""
 
     @property
     def sensor_shape(self) -> tuple[int, int]:
-        with self._told("read the sensor's size"):
+        with self._translated("read the sensor's size"):
             rows, columns = ("HeightMax", "WidthMax")
             if not self._features.has(rows):
                 rows, columns = ("SensorHeight", "SensorWidth")
@@ -74,7 +69,7 @@ class FeatureCamera(Camera):
     def configure(self, settings: CameraSettings) -> CameraSettings:
         self._stop()
         shape = self.sensor_shape
-        with self._told("configure"):
+        with self._translated("configure"):
             self._require(settings, shape)
             self._settings = _set_to(self._features, settings, shape)
         return self._settings
@@ -88,7 +83,7 @@ class FeatureCamera(Camera):
         return Timeout(self._name, operation, cause, "try again, or allow more time")
 
     def _require(self, asked: CameraSettings, shape: tuple[int, int]) -> None:
-        """OutOfRange for a region, format, exposure or gain that the camera does not have."""
+        """OutOfRange for a region, format, exposure or gain that the camera does not support."""
 
         def refuse(what: str, allowed: str) -> OutOfRange:
             return OutOfRange(self._name, "configure", what, f"give {allowed}")
@@ -111,16 +106,16 @@ class FeatureCamera(Camera):
             (_exposure(features), asked.exposure, "s", _MICROSECOND),
             ("Gain", asked.gain, "dB", 1.0),
         ):
-            low, high = 0.0, 0.0  # a camera whose gain is not in dB keeps the one it has
+            low, high = 0.0, 0.0  # a gain that is not in dB is left unchanged
             if features.has(name):
                 low, high = (limit * scale for limit in features.limits(name)[:2])
-            rounding = 1e-9 * abs(given)  # a limit that was read comes back through other units
+            rounding = 1e-9 * abs(given)  # of a limit that was read in other units
             if not low - rounding <= given <= high + rounding:
                 raise refuse(f"{name} of {given:g} {unit}", f"{low:g} … {high:g} {unit}")
 
 
 class FrameCount:
-    """A camera's count of frames, which goes on where the stream starts anew or 16 bits are full.
+    """A camera's frame counter, continued over restarts of the stream and 16-bit overflow.
 
     GigE Vision counts to 65535, then 1.
     """
@@ -130,11 +125,11 @@ class FrameCount:
         self._last, self._next = 0, 0
 
     def restart(self) -> None:
-        """The next frame is the first of a new stream."""
+        """Continue with the first frame of a new stream."""
         self._offset = None
 
     def number(self, counted: int) -> int:
-        """The frame's number, from what the camera counted."""
+        """Number of a frame from the camera's count."""
         if self._offset is None:
             self._offset = self._next - counted
         elif self._last - counted > 2**15:
@@ -144,7 +139,7 @@ class FrameCount:
 
 
 def trigger_by_software(features: Features) -> None:
-    """One frame for each software trigger, nothing automatic."""
+    """Configure one frame for each software trigger, with nothing automatic."""
 
     def put(name: str, value: str) -> None:
         if features.has(name):
@@ -161,10 +156,10 @@ def trigger_by_software(features: Features) -> None:
 
 
 def _set_to(features: Features, asked: CameraSettings, shape: tuple[int, int]) -> CameraSettings:
-    """Sets a camera with a sensor of that shape to what is nearest, and returns what it took."""
+    """Apply the nearest settings, with a sensor of that shape, and return the actual ones."""
     features.set("PixelFormat", asked.pixel_format)
     region = asked.region or Region(0, 0, *shape)
-    for offset in ("OffsetX", "OffsetY"):  # so that every size fits
+    for offset in ("OffsetX", "OffsetY"):  # first 0, so that every size fits
         if features.has(offset):
             _put(features, offset, features.limits(offset)[0])
     for name, pixels in (
@@ -204,7 +199,7 @@ def _nearest(value: int, low: Number, high: Number, step: Number) -> int:
 
 
 def _put(features: Features, name: str, value: Value) -> None:
-    """Write a feature unless it has that value: some cameras hold it fixed."""
+    """Set a feature unless it has that value, which may be read-only."""
     if features.get(name) != value:
         features.set(name, value)
 
@@ -215,5 +210,5 @@ def _put_within(features: Features, name: str, value: float) -> None:
 
 
 def text(features: Features, name: str) -> str:
-    """A feature's value in a name, "" where the camera does not have it."""
+    """Value of a text feature, "" where the camera lacks it."""
     return str(features.get(name)) if features.has(name) else ""

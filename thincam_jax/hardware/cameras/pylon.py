@@ -1,4 +1,4 @@
-"""Basler's cameras, and the emulator that their maker ships, by pypylon."""
+"""Basler's cameras, and Basler's emulator, by pypylon."""
 
 import time
 import warnings
@@ -7,6 +7,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import Any
 
+from thincam_jax.hardware import errors
 from thincam_jax.hardware.base import CameraSettings, Frame, Identity
 from thincam_jax.hardware.cameras.features import (
     BIT_DEPTHS,
@@ -17,16 +18,7 @@ from thincam_jax.hardware.cameras.features import (
     text,
     trigger_by_software,
 )
-from thincam_jax.hardware.errors import (
-    Busy,
-    Disconnected,
-    HardwareError,
-    IncompleteFrame,
-    NotFound,
-    OutOfRange,
-    PermissionDenied,
-    ProtocolError,
-)
+from thincam_jax.hardware.errors import HardwareError
 
 with warnings.catch_warnings():
     # Raised as an error, SWIG's warning about its own types crashes the interpreter.
@@ -35,16 +27,16 @@ with warnings.catch_warnings():
 
 
 class PylonCamera(FeatureCamera):
-    """A camera that pylon knows: USB3 Vision or GigE Vision, or its emulator (PYLON_CAMEMU=1).
+    """A camera supported by pylon: USB3 Vision or GigE Vision, or its emulator (PYLON_CAMEMU=1).
 
-    Every frame answers a software trigger, which is sent once the camera is ready for it: pylon
-    loses earlier ones without a word. After a frame that failed, the stream starts anew, so that
-    a late one is never taken for the next.
+    The software trigger of a frame is sent once the camera is ready: pylon silently loses earlier
+    ones. After a failed frame the stream is restarted, so that a late one is not taken for the
+    next.
     """
 
     @dataclass(frozen=True)
     class Options:
-        """Which camera: its `serial` number, or "" for the first one found."""
+        """`serial`: number of the camera, or "" for the first one found."""
 
         serial: str = ""
 
@@ -52,7 +44,7 @@ class PylonCamera(FeatureCamera):
         self._camera, self._name = camera, "pylon camera"
         self._count = FrameCount()
         try:
-            with self._told("open"):
+            with self._translated("open"):
                 camera.Open()
                 self._introduce()
         except BaseException:
@@ -63,15 +55,15 @@ class PylonCamera(FeatureCamera):
         self._features = features = _Features(self._camera.GetNodeMap())
         info = self._camera.GetDeviceInfo()
         maker, version = info.GetVendorName(), text(features, "DeviceFirmwareVersion")
-        self._identity = Identity(maker, info.GetModelName(), info.GetSerialNumber(), version)
-        self._name = str(self._identity)
+        self.identity = Identity(maker, info.GetModelName(), info.GetSerialNumber(), version)
+        self._name = str(self.identity)
         ticks = "GevTimestampTickFrequency"  # of GigE Vision; USB3 Vision counts nanoseconds
         self._tick = 1 / float(features.get(ticks)) if features.has(ticks) else 1e-9
         trigger_by_software(features)
 
     @classmethod
     def open(cls, options: Options) -> "PylonCamera":
-        """Opens a camera; NotFound, Busy or PermissionDenied where that fails."""
+        """Open a camera; NotFound, Busy or PermissionDenied where that fails."""
         wanted, factory = pylon.DeviceInfo(), pylon.TlFactory.GetInstance()
         if options.serial:
             wanted.SetSerialNumber(options.serial)
@@ -81,11 +73,11 @@ class PylonCamera(FeatureCamera):
             found = [info.GetSerialNumber() for info in factory.EnumerateDevices()]
             cause = f"no camera {options.serial}".rstrip()
             remedy = f"connect one and switch it on; found: {', '.join(found) or 'none'}"
-            raise NotFound("pylon", "open", cause, remedy) from error
+            raise errors.NotFound("pylon", "open", cause, remedy) from error
         return cls(camera)
 
     def flush(self) -> None:
-        with self._told("flush"):
+        with self._translated("flush"):
             while self._camera.IsGrabbing():
                 result = self._camera.RetrieveResult(0, pylon.TimeoutHandling_Return)
                 if not result.IsValid():
@@ -96,7 +88,7 @@ class PylonCamera(FeatureCamera):
         settings = self._require_settings()
         milliseconds = int(1e3 * (settings.exposure + timeout)) + 1
         try:
-            with self._told("grab"):
+            with self._translated("grab"):
                 if not self._camera.IsGrabbing():
                     self._camera.StartGrabbing(pylon.GrabStrategy_OneByOne)
                     self._count.restart()
@@ -128,11 +120,13 @@ class PylonCamera(FeatureCamera):
             raise self._timeout("grab", "no frame came after the trigger")
         if not result.GrabSucceeded():
             cause = result.ErrorDescription or f"pylon's error {result.ErrorCode:#x}"
-            raise IncompleteFrame(self._name, "grab", cause, "take it again; check the cable")
+            raise errors.IncompleteFrame(
+                self._name, "grab", cause, "take it again; check the cable"
+            )
         pixels, region = result.Array, settings.region
         if region is None or pixels.shape != (region.height, region.width):
             cause = f"{pixels.shape} pixels, and {region} is set"
-            raise ProtocolError(self._name, "grab", cause, "configure the camera again")
+            raise errors.ProtocolError(self._name, "grab", cause, "configure the camera again")
         # The emulator has no clock.
         moment = result.TimeStamp * self._tick if result.TimeStamp else time.monotonic()
         bits = BIT_DEPTHS[settings.pixel_format]
@@ -143,10 +137,10 @@ class PylonCamera(FeatureCamera):
             self._camera.StopGrabbing()
 
     @contextmanager
-    def _told(self, operation: str) -> Iterator[None]:
-        """Pylon's errors become ours, and a camera that has gone is `Disconnected`.
+    def _translated(self, operation: str) -> Iterator[None]:
+        """Turn errors of pylon into those of a device.
 
-        Much that is asked of a camera that has gone succeeds, hence the question at the end.
+        Much succeeds with a disconnected camera, so that is checked at the end.
         """
         failure = None
         try:
@@ -155,7 +149,7 @@ class PylonCamera(FeatureCamera):
             failure = error
         if self._camera.IsCameraDeviceRemoved():
             remedy = "connect it and open it again"
-            raise Disconnected(self._name, operation, "it was removed", remedy) from failure
+            raise errors.Disconnected(self._name, operation, "it was removed", remedy) from failure
         if isinstance(failure, HardwareError):
             raise failure
         if failure is not None:
@@ -166,13 +160,13 @@ class PylonCamera(FeatureCamera):
         if isinstance(failure, genicam.TimeoutException):
             return self._timeout(operation, cause)
         if isinstance(failure, genicam.OutOfRangeException):
-            return OutOfRange(self._name, operation, cause, "give a value within the limits")
+            return errors.OutOfRange(self._name, operation, cause, "give a value within the limits")
         if operation == "open" and "another" in cause:
-            return Busy(self._name, operation, cause, "close the program that holds it")
+            return errors.Busy(self._name, operation, cause, "close the program that holds it")
         if operation == "open" and "permission" in cause.lower():
             remedy = "install pylon's udev rule (setup-usb.sh) and connect the camera again"
-            return PermissionDenied(self._name, operation, cause, remedy)
-        return ProtocolError(self._name, operation, cause, "open the camera again")
+            return errors.PermissionDenied(self._name, operation, cause, remedy)
+        return errors.ProtocolError(self._name, operation, cause, "open the camera again")
 
 
 class _Features:

@@ -1,1 +1,1 @@
-"""Displays and light modulators driven as a monitor, and what is shown on them."""
+"""Displays, light modulators driven as a monitor, and their patterns."""

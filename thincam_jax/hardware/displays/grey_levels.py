@@ -1,7 +1,6 @@
-r"""Grey levels of a display made linear: the table that undoes its measured transmission.
+r"""Linearisation of a display's grey levels by its measured transmission.
 
-With the transmission T(level) that a camera measured, the pattern value v is shown as the level
-where
+With the transmission T(level) measured by a camera, the pattern value v is shown as the level where
 
 .. math:: T(\mathrm{level}) = T_{min} + (T_{max} - T_{min})\, v / 255
 """
@@ -21,7 +20,7 @@ from scipy.interpolate import PchipInterpolator
 from scipy.optimize import isotonic_regression
 
 from thincam_jax._core.files import read_regular, write_whole
-from thincam_jax.hardware.base import Camera, Display, Identity
+from thincam_jax.hardware.base import Camera, Display
 from thincam_jax.hardware.errors import OutOfRange, Saturated
 
 LEVELS = 256
@@ -30,7 +29,7 @@ _MOST_SATURATED = 1e-3  # of the pixels
 
 @dataclass(frozen=True)
 class GreyLevels:
-    """`table`: the level to show for each of the 256 pattern values; `provenance`: its origin."""
+    """`table`: level to show for each of the 256 pattern values; `provenance`: its origin."""
 
     table: np.ndarray  # (256,) uint8
     provenance: Mapping[str, Any]
@@ -45,17 +44,17 @@ class GreyLevels:
             raise ValueError("the table rises and falls; give one that does either")
 
     def __call__(self, pattern: np.ndarray) -> np.ndarray:
-        """The levels to show for a pattern of uint8."""
+        """Levels to show for a pattern of uint8."""
         return self.table[pattern]
 
     def write(self, path: str | PathLike[str]) -> None:
-        """The table with its provenance, as a JSON file."""
+        """Write the table with its provenance as a JSON file."""
         content = {"table": self.table.tolist(), "provenance": dict(self.provenance)}
         write_whole(path, json.dumps(content, indent=1) + "\n")
 
     @classmethod
     def read(cls, path: str | PathLike[str]) -> "GreyLevels":
-        """The table of a file; ValueError, one line, where it is none."""
+        """Read the table of a file; ValueError, one line, for an invalid one."""
         try:
             content = json.loads(read_regular(path))
             table = np.asarray(content["table"])
@@ -67,21 +66,10 @@ class GreyLevels:
 
 
 class Screen(Display):
-    """A display of 256 levels; with `grey_levels`, in equal steps of the irradiance."""
-
-    _identity: Identity
-    _shape: tuple[int, int]
+    """A display of 256 levels, with `grey_levels` in equal steps of the irradiance."""
 
     def __init__(self, grey_levels: GreyLevels | None = None):
         self.grey_levels = grey_levels
-
-    @property
-    def identity(self) -> Identity:
-        return self._identity
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        return self._shape
 
     def show(self, pattern: np.ndarray) -> None:
         if pattern.shape != self.shape or pattern.dtype != np.uint8:
@@ -92,19 +80,18 @@ class Screen(Display):
 
     @abstractmethod
     def _present(self, levels: np.ndarray) -> None:
-        """Presents levels as they are, and returns once they are."""
+        """Present levels unchanged; returns once they are visible."""
 
 
 def linear_levels(
     levels: np.ndarray, transmission: np.ndarray, provenance: Mapping[str, Any] | None = None
 ) -> GreyLevels:
-    """The table from transmissions (n,) measured at n ascending levels from 0 to 255.
+    """Table from transmissions (n,) measured at n ascending levels from 0 to 255.
 
-    Noise is taken out by the monotone curve nearest in the least squares; between the levels it is
-    interpolated monotonically. A display whose transmission falls has a falling table. The
-    provenance is completed by what was measured, the contrast T_max/T_min, the `departure` of the
-    measured values from a monotone curve and the `nonlinearity` that is left with the table,
-    both relative to T_max − T_min.
+    Isotonic regression removes noise, monotone cubic interpolation fills in between the levels. A
+    display whose transmission falls has a falling table. The data, the contrast T_max/T_min, the
+    `departure` of the data from a monotone curve and the remaining `nonlinearity`, both relative to
+    T_max − T_min, are added to the provenance.
 
     **Errors**: ValueError for levels that do not cover the display, and a constant transmission.
     """
@@ -141,11 +128,11 @@ def calibrate_grey_levels(
     frames: int = 4,
     timeout: float = 1.0,
 ) -> GreyLevels:
-    """Measures the transmission at `levels`, each shown alone, and gives the table.
+    """Measure the transmission at uniform `levels` and return the table.
 
-    The display must show levels as they are, without a table of its own. The camera is configured
-    before, and sees all of the display or any part of it: the mean of each frame counts. `settle`
-    is the display's settle time in s; of `frames` frames the mean is taken.
+    The display must not apply a table already. The camera is configured before and sees any part of
+    the display; the mean of each frame counts, averaged over `frames`. `settle` is the display's
+    settle time in s.
 
     **Errors**: ValueError for a display that applies a table; Saturated; those of the devices.
     """

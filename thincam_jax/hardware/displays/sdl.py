@@ -13,7 +13,7 @@ from thincam_jax.hardware.displays.grey_levels import GreyLevels, Screen
 from thincam_jax.hardware.errors import Disconnected, NotFound, ProtocolError
 
 with warnings.catch_warnings():
-    warnings.simplefilter("ignore")  # it tells which of the SDL libraries it has found
+    warnings.simplefilter("ignore")  # it reports which SDL libraries it has found
     import sdl2
 
 _GREY = np.uint32(0x010101)  # red, green and blue alike
@@ -21,18 +21,18 @@ _NOT_SHOWN = sdl2.SDL_WINDOW_HIDDEN | sdl2.SDL_WINDOW_MINIMIZED
 
 
 class SdlDisplay(Screen):
-    """A window without a frame, pixel by pixel, without a cursor.
+    """A borderless window without a cursor, pixel by pixel.
 
-    `show` returns after the monitor's next image where the driver waits for it (`vsync`). It is
-    used by the thread that opened it. The monitor must not scale: its mode has to be the panel's.
+    `show` returns after the monitor's next refresh if the driver supports `vsync`. Only the thread
+    that opened it may use it. The monitor must not scale: its mode has to be the panel's.
     """
 
     @dataclass(frozen=True)
     class Options:
-        """Which monitor, by its name or number; "" where there is only one.
+        """`monitor`: its name or number, "" if there is only one.
 
-        `size` is (rows, columns) of a window in the monitor's upper left corner, None for all of
-        the monitor; `grey_levels` a file with the table of grey levels.
+        `size` is (rows, columns) of a window in the monitor's upper left corner, None for the full
+        screen; `grey_levels` a file with the table of grey levels.
         """
 
         monitor: str = ""
@@ -57,11 +57,6 @@ class SdlDisplay(Screen):
             self.close()
             raise
 
-    @classmethod
-    def open(cls, options: Options) -> "SdlDisplay":
-        """Opens the window; NotFound where there is no such monitor."""
-        return cls(options)
-
     def _open(self, options: Options) -> None:
         count = sdl2.SDL_GetNumVideoDisplays()
         names = [(sdl2.SDL_GetDisplayName(k) or b"").decode(errors="replace") for k in range(count)]
@@ -70,7 +65,7 @@ class SdlDisplay(Screen):
         sdl2.SDL_GetDisplayBounds(number, ctypes.byref(bounds))
         rows, columns = options.size or (bounds.h, bounds.w)
         driver = sdl2.SDL_GetCurrentVideoDriver().decode()
-        self._identity = Identity("SDL", names[number], f"monitor {number}", driver)
+        self.identity = Identity("SDL", names[number], f"monitor {number}", driver)
         flags = sdl2.SDL_WINDOW_BORDERLESS | sdl2.SDL_WINDOW_ALLOW_HIGHDPI
         if options.size is None:
             flags |= sdl2.SDL_WINDOW_FULLSCREEN_DESKTOP
@@ -81,22 +76,22 @@ class SdlDisplay(Screen):
             self._window, -1, sdl2.SDL_RENDERER_PRESENTVSYNC
         )
         if not self._renderer:
-            raise ProtocolError(str(self._identity), "open", _error(), "try the tkinter display")
+            raise ProtocolError(str(self.identity), "open", _error(), "try the tkinter display")
         sdl2.SDL_ShowCursor(sdl2.SDL_DISABLE)
         sdl2.SDL_DisableScreenSaver()
         info = sdl2.SDL_RendererInfo()
         sdl2.SDL_GetRendererInfo(self._renderer, ctypes.byref(info))
         self.vsync = bool(info.flags & sdl2.SDL_RENDERER_PRESENTVSYNC)
-        self._shape = self._output()
+        self.shape = self._output()
         self._texture = sdl2.SDL_CreateTexture(
             self._renderer,
             sdl2.SDL_PIXELFORMAT_RGB888,
             sdl2.SDL_TEXTUREACCESS_STREAMING,
-            self._shape[1],
-            self._shape[0],
+            self.shape[1],
+            self.shape[0],
         )
-        self._pixels = np.empty(self._shape, np.uint32)
-        self._present(np.zeros(self._shape, np.uint8))
+        self._pixels = np.empty(self.shape, np.uint32)
+        self._present(np.zeros(self.shape, np.uint8))
 
     def close(self) -> None:
         if self._window:
@@ -111,17 +106,17 @@ class SdlDisplay(Screen):
         np.multiply(levels, _GREY, out=self._pixels)
         data, pitch = self._pixels.ctypes.data_as(ctypes.c_void_p), self._pixels.strides[0]
         failed = sdl2.SDL_UpdateTexture(self._texture, None, data, pitch)
-        # With vsync, the first may wait in a queue until the second is accepted.
+        # With vsync, the first may be queued until the second is accepted.
         for _ in range(2 if self.vsync else 1):
             failed = failed or sdl2.SDL_RenderCopy(self._renderer, self._texture, None, None)
             sdl2.SDL_RenderPresent(self._renderer)
         if failed:
             remedy = "open the display again"
-            raise ProtocolError(str(self._identity), "show", _error(), remedy)
+            raise ProtocolError(str(self.identity), "show", _error(), remedy)
         self._require_window()
 
     def _require_window(self) -> None:
-        """Disconnected where the window was closed or the monitor has another size now."""
+        """Raise Disconnected where the window was closed or the monitor's size has changed."""
         cause, event = "" if self._window else "the window is closed", sdl2.SDL_Event()
         while self._window and sdl2.SDL_PollEvent(ctypes.byref(event)):
             closed = event.window.event == sdl2.SDL_WINDOWEVENT_CLOSE
@@ -129,11 +124,11 @@ class SdlDisplay(Screen):
                 cause = "the window was closed"
         if not cause and sdl2.SDL_GetWindowFlags(self._window) & _NOT_SHOWN:
             cause = "the window is hidden"
-        if not cause and self._output() != self._shape:
+        if not cause and self._output() != self.shape:
             cause = "the monitor has another size now"
         if cause:
             remedy = "connect the monitor and open the display again"
-            raise Disconnected(str(self._identity), "show", cause, remedy)
+            raise Disconnected(str(self.identity), "show", cause, remedy)
 
     def _output(self) -> tuple[int, int]:
         columns, rows = ctypes.c_int(), ctypes.c_int()

@@ -1,12 +1,12 @@
-r"""Settling time of a display, after which a frame sees nothing of the pattern before.
+r"""Settling time of a display, after which a frame shows nothing of the previous pattern.
 
-Two patterns A and B are shown in turn. With D the difference of their frames at rest, a frame
-:math:`f` exposed a time t after A gave way to B holds the part
+Two patterns A and B are shown in turn. With the difference D of their settled frames, a frame
+:math:`f` exposed a time t after the change from A to B contains the fraction
 
 .. math:: r(t) = \langle f - f_B,\, D \rangle / \langle D,\, D \rangle, \qquad D = f_A - f_B
 
-of A: 1 before anything has changed, 0 at rest. The frame's noise enters as that of a mean over all
-pixels, so that a part far below the noise of one pixel is seen.
+of A: 1 before any change, 0 once settled. As a mean over all pixels it detects residues far below
+the noise of one pixel.
 """
 
 import time
@@ -17,8 +17,8 @@ import numpy as np
 from thincam_jax.hardware.base import Camera, Display
 from thincam_jax.hardware.errors import OutOfRange, Timeout
 
-_SHOTS = 4  # of each measured part
-_SWEEP = 8  # delays before bisection starts, so that a response that rings is followed to its end
+_SHOTS = 4  # of each measured fraction
+_SWEEP = 8  # delays before bisection, which follow a ringing response to its end
 _BISECTIONS = 5
 _SIGMAS = 2.0
 
@@ -27,9 +27,9 @@ _SIGMAS = 2.0
 class SettleTime:
     """Result of `settle_calibrate`.
 
-    After `time` (s) no more than `tolerance` of the pattern before is seen. Measurably more was
-    last seen `uncertainty` (s) before. `delays` and `parts` are what was measured, and
-    `noise` one part's standard deviation.
+    After `time` (s) at most `tolerance` of the previous pattern is left. Measurably more was last
+    seen `uncertainty` (s) before. `delays` and `parts` are the measured fractions, `noise` the
+    standard deviation of one.
     """
 
     time: float
@@ -49,15 +49,14 @@ def settle_calibrate(
     longest: float = 0.5,
     timeout: float = 1.0,
 ) -> SettleTime:
-    """Finds the settle time, from the return of `show` to the call of `trigger_and_grab`, in s.
+    """Find the settle time, from the return of `show` to the call of `trigger_and_grab`, in s.
 
-    Both directions count, black to white and back by default, or two `patterns` of the display's
-    shape. What the camera's driver takes before it triggers is not in it, so that the time holds
-    for this camera, and for its exposure or a longer one. After `longest` the display is taken to
-    be at rest.
+    The longer of both directions, black to white and back or between two `patterns` of the
+    display's shape. It excludes the driver's delay before the trigger, so that it is valid for this
+    camera and its exposure or a longer one. After `longest` the display counts as settled.
 
     **Errors**: Timeout where it is not settled after `longest`; OutOfRange where the camera does
-    not tell the patterns apart, or not as well as the tolerance asks; those of the devices.
+    not distinguish the patterns well enough for the tolerance; those of the devices.
     """
     if patterns is None:
         black = np.zeros(display.shape, np.uint8)
@@ -73,7 +72,7 @@ def settle_calibrate(
     shots: list[tuple[float, float]] = []
 
     def settled(delay: float) -> tuple[float, int]:
-        """The delay in fact, and 1 for settled, −1 for not, 0 where noise leaves it open."""
+        """Actual delay, and 1 for settled, −1 for not settled, 0 where noise leaves it open."""
         actual, part = rig.part(delay)
         shots.append((actual, part))
         margin = _SIGMAS * rig.noise
@@ -105,7 +104,7 @@ def settle_calibrate(
 
 
 class _Rig:
-    """The two patterns at rest, and the part of the one that is left when the other is shown."""
+    """Settled frames of two patterns, and the fraction of one left after a change."""
 
     def __init__(self, display: Display, camera: Camera, patterns, longest: float, timeout: float):
         self._display, self._camera, self._patterns = display, camera, patterns
@@ -116,11 +115,11 @@ class _Rig:
         energy = np.vdot(self.difference, self.difference)
         self._probe = self.difference / energy if energy else self.difference
         scatter = [np.tensordot(stack, self._probe, 2) for stack in stacks]
-        # One part is the mean of as many shots as its reference.
+        # A fraction and its reference are means of equally many shots.
         self.noise = float(np.sqrt(np.mean(np.var(scatter, axis=1, ddof=1)) * 2 / _SHOTS))
 
     def part(self, delay: float) -> tuple[float, float]:
-        """The larger of both directions' parts, and the delay in fact, in s."""
+        """Actual delay in s, and the larger fraction of both directions."""
         parts, delays = np.zeros((2, _SHOTS)), []
         for shot in range(_SHOTS):
             for new, sign in ((1, 1.0), (0, -1.0)):

@@ -1,8 +1,7 @@
-"""A window on a monitor by tkinter, which comes with Python: where SDL cannot be used."""
+"""A window on a monitor by tkinter, which comes with Python, if SDL is not available."""
 
 import tkinter
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,14 +12,14 @@ from thincam_jax.hardware.errors import Disconnected, NotFound
 
 
 class TkinterDisplay(Screen):
-    """A window without a frame. It waits for the window system, not for the monitor's next image.
+    """A borderless window. It waits for the window system, not for the monitor's next refresh.
 
-    It is used by the thread that opened it.
+    Only the thread that opened it may use it.
     """
 
     @dataclass(frozen=True)
     class Options:
-        """Where the window lies; tkinter knows no monitors, only places on the desktop, in pixels.
+        """`left`, `top`: place of the window on the desktop, in pixels; tkinter knows no monitors.
 
         `size` is (rows, columns), None for all of the first monitor; `grey_levels` a table's file.
         """
@@ -38,40 +37,30 @@ class TkinterDisplay(Screen):
             remedy = "connect a monitor and set DISPLAY"
             raise NotFound("tkinter", "open", str(error), remedy) from error
         version = str(self._root.tk.call("info", "patchlevel"))
-        self._identity = Identity("tkinter", "window", "", version)
+        self.identity = Identity("tkinter", "window", "", version)
         screen = self._root.winfo_screenheight(), self._root.winfo_screenwidth()
         rows, columns = options.size or screen
-        self._shape = rows, columns
+        self.shape = rows, columns
         self._root.overrideredirect(True)
         self._root.geometry(f"{columns}x{rows}+{options.left}+{options.top}")
         self._root.configure(cursor="none")
         self._image = tkinter.PhotoImage(master=self._root, width=columns, height=rows)
         label = tkinter.Label(self._root, image=self._image, borderwidth=0, highlightthickness=0)
         label.place(x=0, y=0, width=columns, height=rows)
-        self._present(np.zeros(self._shape, np.uint8))
-
-    @classmethod
-    def open(cls, options: Options) -> "TkinterDisplay":
-        """Opens the window; NotFound where there is no desktop."""
-        return cls(options)
+        self._present(np.zeros(self.shape, np.uint8))
 
     def close(self) -> None:
         with suppress(tkinter.TclError):
             self._root.destroy()
 
     def _present(self, levels: np.ndarray) -> None:
-        with self._told():
+        try:
             header = f"P5 {levels.shape[1]} {levels.shape[0]} 255\n".encode()
             self._image.configure(data=header + levels.tobytes(), format="ppm")
             self._root.lift()
             self._root.update()
-            # The window system answers in order: once it does, it has drawn.
+            # The window system answers in order, so that it has drawn once it answers.
             self._root.winfo_pointerxy()
-
-    @contextmanager
-    def _told(self) -> Iterator[None]:
-        try:
-            yield
         except tkinter.TclError as error:
             remedy = "open the display again"
             raise Disconnected("tkinter window", "show", str(error), remedy) from error

@@ -1,36 +1,29 @@
 """Stages driven by GRBL 1.1, the motion controller of many small machines.
 
-Its "ok" says that a move is queued, not done, so its state is asked until it is Idle. Its lines
-carry neither checksum nor number: what is read counts once it was read twice alike, and after any
-doubt `$G`, whose answer is like no other, marks where the answers to earlier commands end.
-Positions are GRBL's machine positions, counted from the lowest that the axis has.
+Its "ok" means that a move is queued, not done, so its state is polled until it is Idle. Its lines
+carry neither checksum nor number: a value counts once two readings agree, and after any doubt `$G`,
+whose answer is unique, marks the end of the answers to earlier commands. Positions are GRBL's
+machine positions, measured from the lowest of the axis.
 """
 
+import math
 import re
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal, TypeVar
+from typing import Literal
 
 from thincam_jax.hardware.base import Identity
-from thincam_jax.hardware.errors import Busy, Disconnected, HardwareError, ProtocolError, Timeout
+from thincam_jax.hardware.errors import Disconnected, HardwareError, ProtocolError, Timeout
+from thincam_jax.hardware.stages import serial_stage
 from thincam_jax.hardware.stages.serial_link import LONGEST_LINE, SerialLink
-from thincam_jax.hardware.stages.serial_stage import (
-    POLL,
-    TRIES,
-    Report,
-    SerialOptions,
-    SerialStage,
-)
+from thincam_jax.hardware.stages.serial_stage import Answer, Report, SerialOptions, SerialStage
 
-T = TypeVar("T")
-
-RESET, HOLD, ASK = b"\x18", b"!", b"?"  # obeyed at once, wherever in a line they come
+RESET, HOLD, ASK = b"\x18", b"!", b"?"  # real-time commands, obeyed anywhere in a line
 STARTING = 5.0  # s; opening the port restarts many boards
 STOPPING = 10.0  # s
-LONGEST_REFUSAL = 2.0  # s for which "not idle" is asked again
 MOST_LINES = 200  # of one answer
-MOST_READINGS = 5  # until two are alike
+MOST_READINGS = 5  # until two agree
 ROUNDING = 0.0005  # mm, half of the last digit of a position
 NOT_IDLE, LOCKED = 8, 9  # numbers of errors
 ALARMS = {
@@ -56,18 +49,18 @@ _STATUS = re.compile(
 
 @dataclass(frozen=True)
 class GrblMessage:
-    """One line of GRBL; which fields hold something follows from its kind."""
+    """One line of GRBL; its kind decides which fields are set."""
 
     kind: Kind
     number: int = 0  # of the error, the alarm or the setting
     value: float = 0.0  # of the setting
     state: str = ""  # of a status report: "Idle", "Run", "Hold:0" ...
-    position: tuple[float, ...] = ()  # mm, of a status report: machine positions, if it has them
+    position: tuple[float, ...] = ()  # mm, of a status report: machine positions, if reported
     text: str = ""
 
 
 def parse_line(line: bytes) -> GrblMessage:
-    """A line from GRBL, without its end; `ProtocolError` where it is none."""
+    """Parse a line from GRBL, without its end; `ProtocolError` for an invalid one."""
     if len(line) <= LONGEST_LINE:
         if found := _SHORT.fullmatch(line):
             ok, trouble, number, _, banner = found.groups()
@@ -89,10 +82,10 @@ def parse_line(line: bytes) -> GrblMessage:
 
 
 class GrblStage(SerialStage):
-    """One axis of a machine. It has to be homed each time it was opened: GRBL does not tell.
+    """One axis of a machine, to be homed each time it is opened: GRBL does not report it.
 
-    GRBL counts the steps that it sends and cannot see one that the motor misses: use a motor that
-    raises an alarm at the limit switch's input, or home often.
+    GRBL counts the steps that it sends and cannot detect those that the motor misses: use a motor
+    that raises an alarm at the limit switch's input, or home often.
     """
 
     _protocol = "grbl"
@@ -123,7 +116,7 @@ class GrblStage(SerialStage):
         self._start()
         version, build, counts_up = self._twice(self._build)
         settings = self._twice(self._settings)
-        self._identity = Identity("GRBL", f"axis {options.axis}", build or options.port, version)
+        self.identity = Identity("GRBL", f"axis {options.axis}", build or options.port, version)
         travel = settings.get(130 + self._axis, 0.0)
         steps = settings.get(100 + self._axis, 0.0)
         plain = int(settings.get(10, 0)) & 1 and not settings.get(13) and settings.get(22)
@@ -133,14 +126,12 @@ class GrblStage(SerialStage):
         self._resolution = 1 / steps + ROUNDING
         upwards = counts_up and int(settings.get(23, 0)) >> self._axis & 1
         self._lowest = 0.0 if upwards else -travel
-        self._limits = 0.0, travel
+        self.limits = 0.0, travel
 
     @property
     def homed(self) -> bool:
         self._report()
         return not self._lost
-
-    # What a stage does.
 
     def _start_move(self, position: float) -> None:
         speed = self._options.speed
@@ -149,7 +140,7 @@ class GrblStage(SerialStage):
 
     def _halt(self) -> None:
         now = time.monotonic()
-        if self._homing:  # whoever homes it holds the lock, and reads the alarm
+        if self._homing:  # the homing thread holds the lock, and reads the alarm
             self._restarting = True
             self._link.write(RESET, now + self._options.answer_time)
             return
@@ -158,7 +149,7 @@ class GrblStage(SerialStage):
             while _moves(state := self._status().state):
                 if time.monotonic() > now + STOPPING:
                     raise Timeout(self._link.name, "stop", "it still moves", "switch it off")
-                time.sleep(POLL)
+                time.sleep(serial_stage.POLL)
             if state not in ("Idle", "Alarm"):
                 self._reset()
 
@@ -183,23 +174,13 @@ class GrblStage(SerialStage):
                 raise self._not_homed("home")
 
     def _report(self) -> Report:
-        message = self._status()
-        for _ in range(MOST_READINGS):
-            if _moves(message.state):
-                break
-            before, message = message, self._status()
-            if message == before:
-                break
-        else:
-            raise self._wrong("position", "it says something else each time", "check the cable")
+        message = self._twice(self._status, "position", lambda m: _moves(m.state))
         if message.state == "Alarm":
             self._lost = self._lost or "it stands in alarm"
         if len(message.position) <= self._axis:
             raise self._wrong("position", "no machine position", "send it $10=1")
         place = round(message.position[self._axis] - self._lowest, 4)
         return Report(_moves(message.state), place)
-
-    # How it is told.
 
     def _start(self) -> None:
         end = time.monotonic() + STARTING
@@ -218,7 +199,7 @@ class GrblStage(SerialStage):
         return {m.number: m.value for m in self._ask("$$") if m.kind == "setting"}
 
     def _build(self) -> tuple[str, str, bool]:
-        """Version, the name that its owner gave it, and whether 0 is where it homes."""
+        """Version, the name given by its owner, and whether 0 is at the homing switch."""
         text = "\n".join(message.text for message in self._ask("$I"))
         found = re.search(r"\[VER:([^:\]]*):(.*)\]", text)
         options = re.search(r"\[OPT:([^,\]]*)", text)
@@ -226,45 +207,46 @@ class GrblStage(SerialStage):
             raise self._wrong("open", "it does not name its version", "it has to be GRBL 1.1")
         return found[1], found[2], bool(options and "Z" in options[1])
 
-    def _twice(self, read: Callable[[], T]) -> T:
-        """Answer that was read twice alike."""
+    def _twice(
+        self,
+        read: Callable[[], Answer],
+        operation: str = "read",
+        once: Callable[[Answer], bool] = lambda value: False,
+    ) -> Answer:
+        """Value on which two readings agree; where `once` is true of it, one is enough."""
         value = read()
         for _ in range(MOST_READINGS):
+            if once(value):
+                return value
             before, value = value, read()
             if value == before:
                 return value
-        raise self._wrong("read", "it says something else each time", "check the cable")
+        raise self._wrong(operation, "it says something else each time", "check the cable")
 
     def _ask(self, command: str, deadline: float | None = None) -> list[GrblMessage]:
-        """The answer to a line, which is sent again where the answer was lost or spoilt."""
-        end = time.monotonic() + LONGEST_REFUSAL
-        tries = 0
-        while True:
+        """Lines of the answer to a command."""
+
+        def attempt() -> list[GrblMessage]:
             until = deadline or time.monotonic() + self._options.answer_time
-            try:
-                with self._lock:
-                    if self._doubt:
-                        self._resynchronise()
-                    self._doubt = True  # until the answer is whole
-                    answer = self._exchange(command, until)
-                    self._doubt = False
-            except (ProtocolError, Timeout):
-                tries += 1
-                if tries == TRIES or (deadline and time.monotonic() > deadline):
-                    raise
-                continue
+            if self._doubt:
+                self._resynchronise()
+            self._doubt = True  # until the answer is complete
+            answer = self._exchange(command, until)
+            self._doubt = False
+            return answer
+
+        def refusal(answer: list[GrblMessage]) -> str:
             last = answer[-1]
             if last.kind == "ok":
-                return answer
+                return ""
             if last.number == LOCKED:
                 self._lost = self._lost or "it is locked until it is homed"
                 raise self._not_homed(command)
             if last.number != NOT_IDLE:
                 raise self._wrong(command, f"refused: error {last.number}", "see GRBL's list")
-            if time.monotonic() > end:
-                raise Busy(self._link.name, command, "it is not idle",
-                           "end what else uses the machine, then try again")  # fmt: skip
-            time.sleep(POLL)
+            return "it is not idle"
+
+        return self._repeat(command, attempt, refusal, deadline or math.inf)
 
     def _exchange(self, command: str, deadline: float) -> list[GrblMessage]:
         self._link.write(command.encode("ascii") + b"\n", deadline)
@@ -279,7 +261,7 @@ class GrblStage(SerialStage):
         raise self._wrong(command, f"more than {MOST_LINES} lines", "check what is connected")
 
     def _resynchronise(self) -> None:
-        """Reads what belongs to earlier commands: `$G` is answered last, in every state."""
+        """Skip the answers to earlier commands: `$G` is answered last, in every state."""
         self._link.purge()
         deadline = time.monotonic() + self._options.answer_time
         self._link.write(b"\n$G\n", deadline)
@@ -289,7 +271,7 @@ class GrblStage(SerialStage):
             pass
 
     def _status(self) -> GrblMessage:
-        for left in reversed(range(TRIES)):
+        for left in reversed(range(serial_stage.TRIES)):
             try:
                 with self._lock:
                     deadline = time.monotonic() + self._options.answer_time
@@ -305,7 +287,7 @@ class GrblStage(SerialStage):
         raise AssertionError
 
     def _reset(self) -> None:
-        """Restarts GRBL, which keeps its position unless it moved."""
+        """Restart GRBL, which keeps its position unless it moved."""
         self._restarting, self._doubt = True, True
         try:
             deadline = time.monotonic() + self._options.answer_time
@@ -313,7 +295,7 @@ class GrblStage(SerialStage):
             while self._read(deadline).kind != "banner":
                 pass
         except (ProtocolError, Timeout):
-            pass  # its state tells whether it restarted
+            pass  # its state shows whether it restarted
         finally:
             self._link.purge()
             self._restarting = False

@@ -1,4 +1,4 @@
-"""A serial line that never hangs: each read and write has a deadline, each failure its error."""
+"""A serial line that never hangs: every read and write has a deadline."""
 
 import errno
 import os
@@ -21,10 +21,11 @@ from thincam_jax.hardware.errors import (
     ProtocolError,
     Timeout,
 )
+from thincam_jax.hardware.holder import holder
 
-LONGEST_LINE = 512  # bytes; no answer of a stage is as long
+LONGEST_LINE = 512  # bytes; longer than any answer of a stage
 READ_AT_ONCE = 4096  # bytes
-QUIET = 0.02  # s without a byte, after which the line counts as silent
+QUIET = 0.02  # s without a byte after which the line is silent
 LONGEST_PURGE = 0.5  # s
 
 _NOT_FOUND = (errno.ENOENT, errno.ENXIO, errno.ENODEV, errno.ENOTDIR, errno.EISDIR, errno.ENOTTY)
@@ -33,12 +34,11 @@ _HELD = (errno.EBUSY, errno.EAGAIN)
 
 
 class SerialLink:
-    """Lines of text over a serial port that no other program can open meanwhile.
+    """Lines of text over a serial port that is opened exclusively.
 
-    `wire_log` is a file to which every line that is sent or received is appended, with its time.
-    Deadlines are times of `time.monotonic()`, in s. Raises `HardwareError` and nothing else:
-    `Timeout` at a deadline, `Disconnected` where the port has gone, `ProtocolError` for a line
-    longer than `LONGEST_LINE`.
+    `wire_log` is a file to which every line sent or received is appended, with its time. Deadlines
+    are times of `time.monotonic()`, in s. Raises `HardwareError` only: `Timeout` at a deadline,
+    `Disconnected` where the port has gone, `ProtocolError` for a line above `LONGEST_LINE`.
     """
 
     def __init__(self, name: str, port: str, baud_rate: int, wire_log: str | None = None):
@@ -62,14 +62,14 @@ class SerialLink:
             raise
 
     def write(self, data: bytes, deadline: float) -> None:
-        """Sends these bytes; `Timeout` where the port does not take them in time."""
+        """Send bytes; `Timeout` where the port does not accept them in time."""
         with _translated(lambda error: self._why_gone("write", error)):
             self._serial.write_timeout = min(max(deadline - time.monotonic(), 0.001), 60.0)
             self._serial.write(data)
         self._note(">", data)
 
     def read_line(self, deadline: float) -> bytes:
-        """The next line, without its end; `Timeout` at the deadline, however much is waiting."""
+        """Next line, without its end; `Timeout` at the deadline, even if part of it is there."""
         while True:
             left = deadline - time.monotonic()
             if left <= 0:
@@ -88,7 +88,7 @@ class SerialLink:
             self._buffer += self._receive(left)
 
     def purge(self) -> None:
-        """Forgets what comes until the line is silent, so that the next line is a whole one."""
+        """Discard bytes until the line is silent, so that the next line is complete."""
         end = time.monotonic() + LONGEST_PURGE
         while self._receive(QUIET):
             if time.monotonic() > end:
@@ -97,7 +97,7 @@ class SerialLink:
         self._buffer.clear()
 
     def close(self) -> None:
-        """Gives the port back; never raises."""
+        """Release the port; never raises."""
         with suppress(HardwareError), _translated(lambda error: self._why_gone("close", error)):
             _allow_second_opening(self._serial, True)
         for file in (self._serial, self._log):
@@ -106,7 +106,7 @@ class SerialLink:
                     file.close()
 
     def _receive(self, seconds: float) -> bytes:
-        """Bytes received, waiting so long for the first one; a serial port may give fewer."""
+        """Bytes received, after waiting up to `seconds` for the first."""
         with _translated(lambda error: self._why_gone("read", error)):
             self._serial.timeout = seconds
             return self._serial.read(min(max(1, self._serial.in_waiting), READ_AT_ONCE))
@@ -129,7 +129,7 @@ def _translated(why: Callable[[Exception], HardwareError]) -> Iterator[None]:
     """Turn errors of pyserial and of the system into errors of a device."""
     try:
         yield
-    # termios.error is no OSError; a port closed meanwhile has no file descriptor: a TypeError
+    # termios.error is no OSError; a port that was closed has no file descriptor: a TypeError
     except (OSError, ValueError, TypeError) as error:
         raise why(error) from error
     except Exception as error:
@@ -141,8 +141,8 @@ def _translated(why: Callable[[Exception], HardwareError]) -> Iterator[None]:
 def _why_not_open(name: str, port: str, error: Exception) -> HardwareError:
     number = error.errno if isinstance(error, OSError) else None
     if number in _HELD:
-        holder = port_holder(port) or "another program"
-        return Busy(name, "open", f"{holder} holds it", "close that program, then try again")
+        remedy = "close that program, then try again"
+        return Busy(name, "open", f"{holder(port)} holds it", remedy)
     if number in _DENIED:
         return PermissionDenied(name, "open", "this user may not open it", _way_in(port))
     if number in _NOT_FOUND or (number is None and os.path.exists(port)):
@@ -153,7 +153,7 @@ def _why_not_open(name: str, port: str, error: Exception) -> HardwareError:
 
 
 def _way_in(port: str) -> str:
-    """Advice that lets a user open the port: the group that it belongs to, else a udev rule."""
+    """Advice on how to gain access to the port: its group, else a udev rule."""
     rule = 'a udev rule with SUBSYSTEM=="tty", MODE="0660", GROUP="dialout"'
     try:
         import grp
@@ -166,20 +166,8 @@ def _way_in(port: str) -> str:
     return f"sudo usermod -aG {group} $USER, then log in again; or {rule}"
 
 
-def port_holder(port: str) -> str:
-    """Program and number of the process that has the port open; "" where the system tells none."""
-    wanted = os.path.realpath(port)
-    for process in Path("/proc").glob("[0-9]*"):
-        try:
-            if any(os.path.realpath(file) == wanted for file in (process / "fd").iterdir()):
-                return f"{(process / 'comm').read_text('utf-8').strip()} (process {process.name})"
-        except OSError:
-            continue  # another user's process, or one that has ended
-    return ""
-
-
 def _allow_second_opening(port: serial.Serial, allowed: bool) -> None:
-    """pyserial's lock binds those who ask for it; this one binds all but the administrator."""
+    """Allow or forbid others to open the port; pyserial's own lock is only advisory."""
     if os.name == "posix":
         import fcntl
         import termios

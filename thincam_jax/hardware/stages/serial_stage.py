@@ -1,33 +1,32 @@
-"""Base of the stages on a serial line: nothing is sent before it is checked, and a position
-counts only where the stage stands and knows where it is."""
+"""Base of the serial stages: commands are checked before they are sent, and a position is
+reported only of a homed stage at rest."""
 
+import math
 import threading
 import time
 from abc import abstractmethod
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, ClassVar, TypeVar
 
-from thincam_jax.hardware.base import Identity, Stage
-from thincam_jax.hardware.errors import (
-    HardwareError,
-    NotHomed,
-    OutOfRange,
-    ProtocolError,
-    Timeout,
-)
+from thincam_jax.hardware import errors
+from thincam_jax.hardware.base import Stage
+from thincam_jax.hardware.errors import HardwareError, NotHomed, ProtocolError, Timeout
 from thincam_jax.hardware.stages.serial_link import SerialLink
 
-POLL = 0.005  # s between two questions to a stage that moves
-GRACE = 0.5  # s that a stage may stand elsewhere before it starts, and after
-TRIES = 3  # every command is absolute: sent twice, it does the same
+POLL = 0.005  # s between two queries of a moving stage
+GRACE = 0.5  # s that a stage may rest elsewhere before it starts, and after
+TRIES = 3  # every command is absolute, so that repeating it is safe
+LONGEST_REFUSAL = 2.0  # s for which a "not now" is retried
 
+Answer = TypeVar("Answer")
 Opened = TypeVar("Opened", bound="SerialStage")
 
 
 @dataclass(frozen=True)
 class Report:
-    """Identity of a stage and its state."""
+    """State that a stage reports."""
 
     moving: bool
     position: float  # mm
@@ -40,27 +39,25 @@ class SerialOptions:
     port: str  # "/dev/ttyUSB0", "COM3"
     baud_rate: int = 115200
     answer_time: float = 1.0  # s allowed for an answer
-    wire_log: str | None = None  # file for all that is sent and received
+    wire_log: str | None = None  # file that logs every line sent and received
 
 
 class SerialStage(Stage):
     """A stage on a serial line. One thread may move it and another stop it."""
 
-    _protocol: ClassVar[str]  # its name in errors
+    _protocol: ClassVar[str]  # name in errors
     _link: SerialLink
-    _identity: Identity
-    _limits: tuple[float, float]  # mm
     _resolution: float  # mm, the smallest step
 
     def __init__(self, link: SerialLink, options: Any):
         self._link, self._options = link, options
-        self._lock = threading.RLock()  # one question and its answer
+        self._lock = threading.RLock()  # held for one query and its answer
         self._stops = 0
-        self._lost = ""  # why its position is not to be trusted until it is homed again
+        self._lost = ""  # why the position cannot be trusted before homing
 
     @classmethod
     def open(cls: type[Opened], options: Any) -> Opened:
-        """The stage of the driver's `Options`. It is not moved; a machine that moves is stopped."""
+        """Open the stage without moving it; a moving machine is stopped."""
         link = SerialLink(cls._protocol, options.port, options.baud_rate, options.wire_log)
         try:
             return cls(link, options)
@@ -70,27 +67,19 @@ class SerialStage(Stage):
 
     @abstractmethod
     def _start_move(self, position: float) -> None:
-        """Sends the stage there; returns once it has taken the command."""
+        """Start a move; returns once the command is accepted."""
 
     @abstractmethod
     def _home(self, deadline: float) -> None:
-        """Homes the stage; returns once it stands still."""
+        """Home the stage; returns once it is at rest."""
 
     @abstractmethod
     def _halt(self) -> None:
-        """Tells the stage to stop; it may still slow down."""
+        """Command a stop; the stage may still be slowing down."""
 
     @abstractmethod
     def _report(self) -> Report:
-        """Where the stage says it is; sets `_lost` where that is not to be trusted."""
-
-    @property
-    def identity(self) -> Identity:
-        return self._identity
-
-    @property
-    def limits(self) -> tuple[float, float]:
-        return self._limits
+        """Query the state; sets `_lost` where the position cannot be trusted."""
 
     def close(self) -> None:
         with suppress(HardwareError):
@@ -108,14 +97,14 @@ class SerialStage(Stage):
         self._lost = ""
 
     def move_to(self, position: float, timeout: float = 60.0) -> float:
-        low, high = self._limits
+        low, high = self.limits
         if not low <= position <= high:  # NaN, too
-            raise OutOfRange(self._link.name, "move", f"{position:g} mm",
-                             f"give a position from {low:g} to {high:g} mm")  # fmt: skip
+            remedy = f"give a position from {low:g} to {high:g} mm"
+            raise errors.OutOfRange(self._link.name, "move", f"{position:g} mm", remedy)
         self._check_homed("move")
         stops, stood = self._stops, time.monotonic()
         deadline = stood + timeout
-        with self._lock:  # it may be sent twice, but never after a stop
+        with self._lock:  # may be sent twice, but never after a stop
             if stops == self._stops:
                 self._start_move(position)
         while True:
@@ -150,6 +139,35 @@ class SerialStage(Stage):
         while self._report().moving:
             if time.monotonic() > deadline:
                 raise Timeout(self._link.name, "stop", "it still moves", "switch its power off")
+            time.sleep(POLL)
+
+    def _repeat(
+        self,
+        command: str,
+        attempt: Callable[[], Answer],
+        refusal: Callable[[Answer], str],
+        deadline: float = math.inf,
+    ) -> Answer:
+        """Answer to a command, sent again where the answer was lost, corrupted or "not now".
+
+        `refusal` says why an answer is "not now", "" for accepted, and raises for other refusals.
+        """
+        end, tries = time.monotonic() + LONGEST_REFUSAL, 0
+        while True:
+            try:
+                with self._lock:
+                    answer = attempt()
+            except (ProtocolError, Timeout):
+                tries += 1
+                if tries == TRIES or time.monotonic() > deadline:
+                    raise
+                continue
+            cause = refusal(answer)
+            if not cause:
+                return answer
+            if time.monotonic() > end:
+                remedy = "end what else uses the stage, then try again"
+                raise errors.Busy(self._link.name, command, cause, remedy)
             time.sleep(POLL)
 
     def _check_homed(self, operation: str) -> None:

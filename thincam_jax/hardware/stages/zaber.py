@@ -1,8 +1,8 @@
-"""Zaber stages, which speak the Zaber ASCII protocol (firmware 6 and 7).
+"""Zaber stages with the Zaber ASCII protocol (firmware 6 and 7).
 
 A command `/1 1 07 move abs 1000:E9` is for device 1, axis 1, has the number 7 and ends in a
-checksum; its answer `@01 1 07 OK BUSY -- 0:E0` carries the same number, so no answer is taken for
-another's. Positions are microsteps on the wire, millimetres here.
+checksum; its answer `@01 1 07 OK BUSY -- 0:E0` repeats the number, which pairs the two. Positions
+are microsteps on the wire, millimetres here.
 """
 
 import re
@@ -10,19 +10,12 @@ import time
 from dataclasses import dataclass
 
 from thincam_jax.hardware.base import Identity
-from thincam_jax.hardware.errors import Busy, NotHomed, ProtocolError, Timeout
+from thincam_jax.hardware.errors import NotHomed, ProtocolError, Timeout
 from thincam_jax.hardware.stages.serial_link import LONGEST_LINE, SerialLink
-from thincam_jax.hardware.stages.serial_stage import (
-    POLL,
-    TRIES,
-    Report,
-    SerialOptions,
-    SerialStage,
-)
+from thincam_jax.hardware.stages.serial_stage import POLL, Report, SerialOptions, SerialStage
 
-LONGEST_REFUSAL = 2.0  # s for which "not now" is asked again
 NOT_NOW = ("AGAIN", "STATUSBUSY")
-# Warnings after which the position counts as lost; so does every fault, which begins with F.
+# Warnings that mean a lost position, as does every fault; those begin with F.
 LOST = {
     "WR": "it has no reference position",
     "WH": "it was not homed",
@@ -47,21 +40,21 @@ class ZaberMessage:
     kind: str
     device: int
     axis: int
-    number: int | None  # of the command that it answers
+    number: int | None  # of the answered command
     accepted: bool
     busy: bool
-    warning: str  # the worst of those active, "--" for none
+    warning: str  # the worst active one, "--" for none
     data: str
-    checked: bool  # whether it came with a checksum, which then fits
+    checked: bool  # whether it came with a (matching) checksum
 
 
 def checksum(body: bytes) -> int:
-    """The longitudinal redundancy check: what makes the sum of all bytes 0 modulo 256."""
+    """Longitudinal redundancy check: the byte that brings the sum of all to 0 modulo 256."""
     return -sum(body) & 0xFF
 
 
 def parse_message(line: bytes) -> ZaberMessage:
-    """A line from a device, without its end; `ProtocolError` where it is none."""
+    """Parse a line from a device, without its end; `ProtocolError` for an invalid one."""
     matched = _MESSAGE.fullmatch(line) if len(line) <= LONGEST_LINE else None
     if matched is None:
         raise _wrong(line, "no message of the protocol")
@@ -89,17 +82,17 @@ def _wrong(line: bytes, cause: str) -> ProtocolError:
 
 
 class ZaberStage(SerialStage):
-    """One axis of a Zaber device. Open, it may already be homed."""
+    """One axis of a Zaber device, which may already be homed when it is opened."""
 
     _protocol = "zaber"
 
     @dataclass(frozen=True)
     class Options(SerialOptions):
-        """Also where the stage is in the chain, and what its positions count."""
+        """Also the stage's place in the chain, and the length of its microstep."""
 
         device: int = 1
         axis: int = 1
-        microstep: float = 0.0001905  # mm; the data sheet names it, here of an X-LSM
+        microstep: float = 0.0001905  # mm, from the data sheet; here of an X-LSM
 
         def __post_init__(self) -> None:
             if not (self.microstep > 0 and self.answer_time > 0):
@@ -111,16 +104,17 @@ class ZaberStage(SerialStage):
     def __init__(self, link: SerialLink, options: Options):
         super().__init__(link, options)
         self._number = 0
-        self._checked = False  # until the device is told to send checksums
+        self._checked = False  # until checksums are switched on
+        self._doubt = False  # whether bytes of earlier answers may still come
         self._resolution = options.microstep
-        self._ask("set comm.checksum 1", axis=0)  # it keeps this; other programs do not mind
+        self._ask("set comm.checksum 1", axis=0)  # a lasting setting, harmless to other programs
         self._checked = True
         device = self._number_of("get deviceid", axis=0)
         serial = self._number_of("get system.serial", axis=0)
         version = self._ask("get version", axis=0).data
-        self._identity = Identity("Zaber", f"device {device:.0f}", f"{serial:.0f}", version)
+        self.identity = Identity("Zaber", f"device {device:.0f}", f"{serial:.0f}", version)
         low, high = self._number_of("get limit.min"), self._number_of("get limit.max")
-        self._limits = low * options.microstep, high * options.microstep
+        self.limits = low * options.microstep, high * options.microstep
 
     @property
     def homed(self) -> bool:
@@ -140,7 +134,7 @@ class ZaberStage(SerialStage):
     def _home(self, deadline: float) -> None:
         stops = self._stops
         self._warnings("warnings clear")
-        with self._lock:  # it may be sent twice, but never after a stop
+        with self._lock:  # may be sent twice, but never after a stop
             if stops == self._stops:
                 self._ask("home")
         while self._report().moving:
@@ -156,7 +150,7 @@ class ZaberStage(SerialStage):
             raise NotHomed(self._link.name, "home", self._lost, "free its way and home it again")
 
     def _warnings(self, command: str) -> None:
-        """All warnings that are active: an answer shows the worst alone."""
+        """Query all active warnings: an answer shows only the worst."""
         for warning in self._ask(command).data.split()[1:]:
             self._notice(warning)
 
@@ -174,30 +168,21 @@ class ZaberStage(SerialStage):
                             "check that axis and device are those of a stage")  # fmt: skip
 
     def _ask(self, command: str, axis: int | None = None) -> ZaberMessage:
-        """The answer to a command, which is sent again where it was lost, spoilt or not taken."""
-        end = time.monotonic() + LONGEST_REFUSAL
-        tries = 0
-        while True:
-            try:
-                with self._lock:
-                    reply = self._exchange(command, self._options.axis if axis is None else axis)
-            except (ProtocolError, Timeout):
-                tries += 1
-                if tries == TRIES:
-                    raise
-                self._link.purge()
-                continue
-            if reply.accepted:
-                return reply
-            if reply.data not in NOT_NOW:
+        """Accepted answer to a command."""
+
+        def refusal(reply: ZaberMessage) -> str:
+            if not reply.accepted and reply.data not in NOT_NOW:
                 raise ProtocolError(self._link.name, command, f"refused: {reply.data[:80]}",
                                     "check the options device and axis")  # fmt: skip
-            if time.monotonic() > end:
-                raise Busy(self._link.name, command, f"refused as not now: {reply.data}",
-                           "end what else uses the stage, then try again")  # fmt: skip
-            time.sleep(POLL)
+            return "" if reply.accepted else f"refused as not now: {reply.data}"
+
+        address = self._options.axis if axis is None else axis
+        return self._repeat(command, lambda: self._exchange(command, address), refusal)
 
     def _exchange(self, command: str, axis: int) -> ZaberMessage:
+        if self._doubt:
+            self._link.purge()
+        self._doubt = True  # until the answer is there
         self._number = (self._number + 1) % 100
         own = (self._options.device, axis, self._number)
         body = f"{own[0]} {own[1]} {own[2]:02} {command}".encode("ascii")
@@ -210,4 +195,5 @@ class ZaberStage(SerialStage):
                 raise _wrong(line, "no checksum")
             if reply.kind == "@" and (reply.device, reply.axis, reply.number) == own:
                 self._notice(reply.warning)
-                return reply  # others are alerts, or late answers to what was sent before
+                self._doubt = False
+                return reply  # others are alerts, or late answers to earlier commands

@@ -1,1 +1,1 @@
-"""Virtual devices: the optics of this package, served through the real protocols, with faults."""
+"""Virtual devices: the optics of this package behind the real protocols, with faults."""

@@ -1,8 +1,8 @@
-"""The devices of a virtual rig, each behind the driver that a real one has.
+"""The devices of a virtual rig, opened by the drivers of real ones.
 
-Cameras and stages speak their own protocols: USB3 Vision to a backend of pyusb in this process, the
-vendor's emulator for pylon, Zaber and GRBL on pseudo-terminals. Only a display has no protocol of
-its own. Nothing listens on a network.
+They use the real protocols: USB3 Vision behind a backend of pyusb in this process, the vendor's
+emulator for pylon, Zaber and GRBL on pseudo-terminals. Only a display has no protocol. Nothing
+listens on a network.
 """
 
 from collections.abc import Mapping
@@ -18,11 +18,11 @@ from thincam_jax.hardware.virtual.rig import VirtualRig
 
 
 class VirtualDevices(AbstractContextManager["VirtualDevices"]):
-    """The devices that see and change one `VirtualRig`; a context manager.
+    """The devices of one `VirtualRig`; a context manager.
 
-    The methods `camera`, `stage` and `display` connect, again and again, as the openers of an
-    acquisition's rig do. A device that is opened again is the same one: a stage that was homed is
-    homed, as long as it has power. `faults` are those of each, by "camera", "stage" and "display".
+    `camera`, `stage` and `display` connect, repeatedly, as the openers of an acquisition's rig. A
+    reopened device is the same one: a stage stays homed as long as it has power. `faults` are those
+    of each, by "camera", "stage" and "display".
     """
 
     def __init__(self, rig: VirtualRig):
@@ -32,7 +32,7 @@ class VirtualDevices(AbstractContextManager["VirtualDevices"]):
         self._powered = ExitStack()
 
     def camera(self, driver: str, options: Mapping[str, Any] | None = None) -> Camera:
-        """Of the driver usb3_vision or pylon; `options` but for what says where the camera is."""
+        """Open the camera by usb3_vision or pylon; `options` except the camera's address."""
         shape, faults = self.rig.optics.sensor_shape, self.faults["camera"]
         if driver == "pylon":
             from thincam_jax.hardware.virtual.pylon import VirtualPylonCamera
@@ -48,7 +48,7 @@ class VirtualDevices(AbstractContextManager["VirtualDevices"]):
         return open_device("cameras", driver, {**(options or {}), "serial": "", "backend": backend})
 
     def stage(self, driver: str, options: Mapping[str, Any] | None = None) -> Stage:
-        """Of the driver zaber or grbl; `options` but for its port."""
+        """Open the stage by zaber or grbl; `options` except its port."""
         if driver not in ("zaber", "grbl"):
             raise _none_virtual("stages", driver, "zaber or grbl")
         if "stage" not in self._there:
@@ -62,12 +62,12 @@ class VirtualDevices(AbstractContextManager["VirtualDevices"]):
         return open_device("stages", driver, {**(options or {}), "port": port})
 
     def display(self) -> Display:
-        """Show a pattern: whatever the driver, it goes to the rig."""
+        """Open the display, whose patterns go to the rig, whatever the driver."""
         shape, faults = self.rig.display_shape, self.faults["display"]
         return VirtualDisplay(shape, self.rig.on_show, faults=faults)
 
     def close(self) -> None:
-        """Switch off what runs."""
+        """Switch off the devices."""
         self._powered.close()
 
     def __exit__(self, *_: object) -> None:

@@ -1,6 +1,6 @@
-"""A machine with GRBL 1.1 that is not there: one axis X, on a board that the serial port supplies.
+"""A virtual machine with GRBL 1.1: one axis X, on a board powered by the serial port.
 
-Opened or unplugged, the board restarts and has forgotten where it is, as many boards do.
+When opened or unplugged, the board restarts and forgets its position, as many boards do.
 """
 
 import re
@@ -10,7 +10,7 @@ from thincam_jax.hardware.virtual.serial_device import VirtualSerialDevice
 GREETING = b"\r\nGrbl 1.1h ['$' for help]\r\n"
 PULL_OFF = 1.0  # mm from the switch, after homing
 LONGEST_LINE = 80  # bytes of the board's buffer
-QUEUE = 15  # moves that wait
+QUEUE = 15  # pending moves
 _WORDS = re.compile(rb"(?:([A-Z])(-?[0-9]+(?:\.[0-9]*)?))")
 _LINE = re.compile(rb"(?:[A-Z]-?[0-9]{1,6}(?:\.[0-9]{0,6})?)+")
 _REALTIME = re.compile(rb"[?!~\x18]")
@@ -23,17 +23,17 @@ class VirtualGrbl(VirtualSerialDevice):
     """
 
     _state = "Alarm"
-    _blocked = False  # after an alarm in which it hears nothing but a reset
+    _blocked = False  # after an alarm that only a reset ends
     _homing = 0  # 1: to the switch, 2: off it
-    _asked = False  # for its state, while it homed
-    _queue: tuple[float, ...] = ()  # mm, as it counts
+    _asked = False  # for its state, while homing
+    _queue: tuple[float, ...] = ()  # mm, as counted
 
     def _connected(self) -> None:
         self._restart()
         self._state = "Alarm"
 
     def _restart(self) -> None:
-        if self._moving:  # a motor that is stopped hard is not where its steps were counted
+        if self._moving:  # a hard stop loses steps
             self._slip += 0.05
             self._brake()
             self._send(b"ALARM:%d\r\n" % (6 if self._homing else 3))
@@ -47,7 +47,7 @@ class VirtualGrbl(VirtualSerialDevice):
             self._send(b"[MSG:'$H'|'$X' to unlock]\r\n")
 
     def _stopped(self, stalled: bool) -> None:
-        if stalled:  # the motor's own alarm is wired to the limit switch's input
+        if stalled:  # the motor's alarm is wired to the limit switch's input
             self._homing, self._blocked, self._state = 0, True, "Alarm"
             self._queue = ()
             self._send(b"ALARM:1\r\n[MSG:Reset to continue]\r\n")
@@ -90,7 +90,7 @@ class VirtualGrbl(VirtualSerialDevice):
         self._answer(text.encode("ascii"))
 
     def _garble(self, line: bytes) -> bytes:
-        """Another digit where there is one, else a byte that is no letter."""
+        """Change a digit, or else replace a byte by an invalid one."""
         digits = [at for at, byte in enumerate(line) if 48 <= byte <= 57]
         at = self._random.choice(digits or range(len(line)))
         wrong = b"%d" % ((line[at] - 47) % 10) if digits else b"\xf1"
@@ -125,7 +125,7 @@ class VirtualGrbl(VirtualSerialDevice):
         elif line == b"$H":
             self._state, self._homing = "Home", 1
             self._go(self.motion.travel + self._slip)
-            return b""  # the answer comes when it is done
+            return b""  # the answer follows at the end
         else:
             return b"error:3"
         return b"ok"
@@ -149,7 +149,7 @@ class VirtualGrbl(VirtualSerialDevice):
         place = [number for letter, number in words if letter == b"X"]
         codes = [number for letter, number in words if letter == b"G"]
         if len(place) != 1 or 53 not in codes or not {0, 1} & set(codes) or 20 in codes:
-            return b"error:20"  # of G-code it knows no more
+            return b"error:20"  # no other G-code is supported
         if not -self.motion.travel <= place[0] <= 0:
             self._state, self._blocked = "Alarm", True
             return b"ALARM:2\r\n[MSG:Reset to continue]"

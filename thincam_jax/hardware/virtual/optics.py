@@ -24,13 +24,13 @@ from thincam_jax.lensless.propagation.path import Path
 from thincam_jax.lensless.propagation.separable import pixel_nodes
 from thincam_jax.lensless.propagation.separable_sum import SeparableSum
 
-_TERMS = 4  # of a pattern that are averaged exactly
-_POINTS = 4  # along a pixel, for what is left
+_TERMS = 4  # singular terms of a pattern that are averaged exactly
+_POINTS = 4  # along a pixel, for the remainder
 
 
 @runtime_checkable
 class Optics(Protocol):
-    """Light on the sensor, (y, x), in electrons per second, for the pixels that are shown."""
+    """Light on the sensor, (y, x), in electrons per second, for the pixels shown."""
 
     @property
     def sensor_shape(self) -> tuple[int, int]: ...
@@ -42,14 +42,14 @@ class Optics(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class ModulatorOptics:
-    """A scene through a light modulator, whose pixels are the mask, on a sensor that moves.
+    """A scene through a light modulator, whose pixels are the mask, on a sensor on a stage.
 
-    A pixel of level g passes g/255 of the irradiance, the amplitude √(g/255); the PSF of the
+    A pixel of level g transmits g/255 of the irradiance, the amplitude √(g/255); the PSF of the
     pixels is `pixelated_psf`.
 
     - `pixel_pitch`: of the modulator, mm; its middle is on the axis.
-    - `distance`: from modulator to sensor, mm, with the stage at 0; the stage adds to it.
-    - `electrons`: per second, of a pixel from each mm² of open aperture before a white scene.
+    - `distance`: from modulator to sensor, mm, at the stage's position 0.
+    - `electrons`: per second and pixel for each mm² of open aperture before a white scene.
     - `fill_factor`: open fraction of a modulator pixel's area.
     """
 
@@ -71,7 +71,7 @@ class ModulatorOptics:
         pixels = np.sqrt(_middle(shown) / 255)
         if not pixels.any():
             return image
-        # The transmittances stand for the size of the mask only; what they do is in the PSF.
+        # Only the size of this mask is used; its transmittances act in the PSF.
         mask = SampledMask(pixels, self.pixel_pitch)
         camera = LenslessCamera(mask, self.sensor, self.distance + position)
         grid, spectrum = self.sensor.grid, self.scene.spectrum
@@ -95,7 +95,7 @@ class ModulatorOptics:
 
 
 def _middle(shown: np.ndarray) -> np.ndarray:
-    """The smallest part about the middle that holds all pixels that are not black."""
+    """Smallest centred part that contains all pixels that are not black."""
     sides = []
     for axis, count in enumerate(shown.shape):
         lit = np.flatnonzero(shown.any(axis=1 - axis))
@@ -112,16 +112,16 @@ def pixelated_psf(
     pixel_pitch: float,
     fill_factor: float = 1.0,
 ) -> Float[Array, "y x"]:
-    r"""Pixel averages of the PSF of a display of square pixels, each with one transmittance.
+    r"""Pixel averages of the PSF of a display of square pixels with given amplitudes.
 
     .. math::
         U(x, y) = \sum_{vu} A_{vu} S_v(y) S_u(x), \qquad A = \sum_r \sigma_r a_r b_r^T
 
     S_u is the Fresnel integral over the open part of pixel u, a slit: exact within the Fresnel
-    approximation. By the singular values of A the field is a sum of separable terms, three for a
-    Fresnel zone aperture in grey, and so is the irradiance of the largest ones, whose averages over
-    pixels are one-dimensional. What is left, such as the rounding to 8 bits, is averaged over a few
-    points of each pixel.
+    approximation. By singular value decomposition of A the field is a sum of separable terms, three
+    for a grey Fresnel zone aperture, and so is the irradiance of the largest ones, whose pixel
+    averages are one-dimensional. The remainder, such as the rounding to 8 bits, is averaged over a
+    few points of each pixel.
     """
     left, strength, right = np.linalg.svd(amplitude, full_matrices=False)
     down, across = left[:, :_TERMS] * strength[:_TERMS], right[:_TERMS].T
@@ -153,7 +153,7 @@ def _slit_fields(
     slit: tuple[Float[Array, ""], Float[Array, ""]],
     path: Path,
 ) -> Complex[Array, "node n cell"]:
-    """The one-dimensional field at x behind each of the display's open pixels alone.
+    """One-dimensional field at x behind each of the display's open pixels.
 
     `slit`: the display's pitch and fill factor.
     """
@@ -172,7 +172,7 @@ def _averaged(
     rest: Float[Array, "v u"],
     grid: Grid,
 ) -> Float[Array, "y x"]:
-    """`along`: the slits' fields at the nodes of the exact average, and at those of the rest."""
+    """`along`: the slits' fields at the nodes of the exact averages, then of the remainder."""
     nodes = len(along[0]) - _POINTS
     lower, upper = np.triu_indices(terms[0].shape[1])
     shares, few = (jnp.asarray(leggauss(n)[1] / 2, grid.pitch.dtype) for n in (nodes, _POINTS))
@@ -204,13 +204,13 @@ def _averaged(
 
 @dataclass(frozen=True, eq=False)
 class MonitorOptics:
-    """Cells on a monitor before a camera whose operator is known.
+    """Cells on a monitor in front of a camera with a known operator.
 
-    The cells are the largest squares of monitor pixels that fit, about its middle; a cell's
-    radiance is the mean of its pixels' levels over 255.
+    The cells are the largest squares of monitor pixels that fit, centred; a cell's radiance is the
+    mean of its pixels' levels over 255.
 
     - `operator`: from the cells, 1 is white, to the sensor.
-    - `electrons`: per second, for each unit of what the operator gives.
+    - `electrons`: per second for each unit of the operator's output.
     """
 
     operator: AbstractOperator
@@ -218,7 +218,7 @@ class MonitorOptics:
 
     @functools.cached_property
     def _by_rows(self) -> Any:
-        """A `Sparse` operator's matrix, in a tenth of the time of entries in any order."""
+        """Matrix of a `Sparse` operator, sorted by rows, which is ten times faster."""
         return self.operator.by_rows() if isinstance(self.operator, Sparse) else None
 
     @property
@@ -241,7 +241,7 @@ class MonitorOptics:
 def cells_shown(
     shown: UInt8[np.ndarray, "v u"], cells: tuple[int, int]
 ) -> Float[np.ndarray, "y x"]:
-    """Mean level over 255 of each cell: squares of pixels about the monitor's middle."""
+    """Mean level over 255 of each cell: centred squares of the monitor's pixels."""
     side = min(have // want for have, want in zip(shown.shape, cells, strict=True))
     if side < 1:
         raise ValueError(f"{cells} cells do not fit a display of {shown.shape} pixels")

@@ -1,4 +1,4 @@
-"""A camera whose frames come from a function, served through the emulator that Basler ships."""
+"""A camera whose frames come from a function, behind Basler's emulator."""
 
 import os
 import time
@@ -18,13 +18,13 @@ from thincam_jax.hardware.virtual.faults import Faults
 
 _EMULATOR = "BaslerCamEmu"
 _LATENCY = 0.05  # s
-_DELIVERY = 5.0  # s, at most, until a frame has come: the emulator delivers in a thread of its own
+_DELIVERY = 5.0  # s, at most, until a frame arrives from the emulator's thread
 
 
 class VirtualPylonCamera(PylonCamera):
-    """`PylonCamera` on pylon's emulator, which takes the frame of each trigger from a file.
+    """`PylonCamera` on pylon's emulator, which reads the frame of each trigger from a file.
 
-    - `expose`: gives the counts (y, x) of the frame exposed now, within the settings' region.
+    - `expose`: returns the counts (y, x) of a frame exposed now, within the settings' region.
     - `sensor_shape`: rows and columns, at most 4096 each.
     - `faults`: plays latency, stale_frame, short_frame, dropped_frame and unplug.
     """
@@ -67,7 +67,7 @@ class VirtualPylonCamera(PylonCamera):
 
     def trigger_and_grab(self, timeout: float) -> Frame:
         if self._camera.IsGrabbing() and self._faults.due("stale_frame"):
-            super()._trigger()  # a frame of before waits to be taken for the next one
+            super()._trigger()  # an earlier frame is queued before the next one
             last = time.monotonic() + _DELIVERY
             while not self._camera.NumReadyBuffers.Value and time.monotonic() < last:
                 time.sleep(1e-3)
@@ -97,7 +97,7 @@ class VirtualPylonCamera(PylonCamera):
         nodes.GetNode(command).Execute()
 
     def _put(self, counts: np.ndarray, bits: int) -> None:
-        """Both files of the folder become this frame; 16 bit files hold counts from the top."""
+        """Write the frame to both files of the folder, with the counts in the upper of 16 bits."""
         new, copy = Path(self._files.name, "new.tif"), Path(self._files.name, "copy.tif")
         tifffile.imwrite(new, np.asarray(counts, np.uint16) << (16 - bits))
         os.link(new, copy)

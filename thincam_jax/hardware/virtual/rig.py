@@ -1,8 +1,6 @@
-"""One state of the rig, the pattern shown, the stage's position and the exposure, and what the
-camera sees in it by this package's own optics.
+"""State of the virtual rig (pattern, stage position, exposure) and the resulting frame.
 
-The optics take the pixels that are shown, not the plan that asked for them: a wrong pattern gives a
-wrong capture.
+The optics take the pixels shown, not the plan: a wrong pattern gives a wrong capture.
 """
 
 import threading
@@ -17,7 +15,7 @@ from jaxtyping import Float, UInt8, UInt16
 from thincam_jax.hardware.base import CameraSettings
 from thincam_jax.hardware.virtual.optics import Optics
 
-_KEPT = 8  # images that are not computed again
+_KEPT = 8  # cached images
 
 
 @dataclass(frozen=True)
@@ -25,7 +23,7 @@ class Electronics:
     """From electrons to counts: shot and read noise, an offset, saturation at the full well.
 
     - `full_well`: electrons of the largest count without gain; `read_noise`: in electrons.
-    - `offset`: counts of a dark frame, in those of 12 bits.
+    - `offset`: counts of a dark frame at 12 bits.
     """
 
     full_well: float = 13_500.0
@@ -35,7 +33,7 @@ class Electronics:
     def counts(
         self, electrons: Float[np.ndarray, "y x"], settings: CameraSettings, seed: list[int]
     ) -> UInt16[np.ndarray, "y x"]:
-        """Whole numbers of the pixel format's bits. The shot noise is Gaussian, of its variance."""
+        """Counts in the pixel format's bits; the shot noise is Gaussian, of Poisson variance."""
         scale, offset = self.scale(settings)
         random = np.random.default_rng(seed)
         noise = random.standard_normal(electrons.shape, dtype=np.float32)
@@ -44,14 +42,14 @@ class Electronics:
         return np.clip(np.rint(values), 0, 2 ** bits_of(settings) - 1).astype(np.uint16)
 
     def scale(self, settings: CameraSettings) -> tuple[float, float]:
-        """Counts of an electron, and those of none."""
+        """Counts per electron, and the offset in counts."""
         offset = self.offset * 2.0 ** (bits_of(settings) - 12)
         room = 2 ** bits_of(settings) - 1 - offset
         return 10 ** (settings.gain / 20) * room / self.full_well, offset
 
 
 def bits_of(settings: CameraSettings) -> int:
-    """Of a pixel format such as Mono12 or Mono12p."""
+    """Bits of a pixel format such as Mono12 or Mono12p."""
     return int("".join(c for c in settings.pixel_format if c.isdigit()))
 
 
@@ -60,7 +58,7 @@ class Fiducial:
     """Conditions of a frame's exposure, written into its corner for tests.
 
     - `pattern`: checksum of the pixels shown (`pattern_number`). `position`: the stage's, µm.
-    - `exposure`: counts the exposures of that pattern at that position, from 0.
+    - `exposure`: number of the exposure of that pattern at that position, from 0.
     """
 
     pattern: int
@@ -72,12 +70,12 @@ FIDUCIAL_SHAPE = (12, 8)  # a bit a pixel
 
 
 def pattern_number(shown: UInt8[np.ndarray, "v u"]) -> int:
-    """A checksum of 32 bits of the pixels shown."""
+    """32-bit checksum of the pixels shown."""
     return zlib.crc32(np.ascontiguousarray(shown).data)
 
 
 def read_fiducial(pixels: UInt16[np.ndarray, "y x"], bit_depth: int) -> Fiducial:
-    """From the corner of a frame of a rig that writes one."""
+    """Read the fiducial in the corner of a frame."""
     rows, columns = FIDUCIAL_SHAPE
     bits = pixels[:rows, :columns] > 2 ** (bit_depth - 2)
     words = np.packbits(bits).view(">u4").astype(np.int64)
@@ -91,14 +89,14 @@ def _write_fiducial(pixels: UInt16[np.ndarray, "y x"], fiducial: Fiducial, bit_d
 
 
 class VirtualRig:
-    """The state that virtual devices change and see; safe to use from their threads.
+    """The state shared by virtual devices; thread-safe.
 
     `on_show` is for a display, `on_move` for a stage, `expose` for a camera. The noise of an
-    exposure depends on the pattern, the position and how often both were exposed before, so that
-    an interrupted run ends with the same frames as one that was not.
+    exposure depends on the pattern, the position and the number of earlier exposures of both, so
+    that a resumed run gives the same frames as an uninterrupted one.
 
-    - `response`: s that the display takes; before, the pattern before is seen.
-    - `fiducial`: each frame says in its corner what it was exposed of; the corner sees no light.
+    - `response`: s until the display changes to a new pattern.
+    - `fiducial`: write a `Fiducial` in place of the image in each frame's corner.
     """
 
     def __init__(
@@ -122,7 +120,7 @@ class VirtualRig:
         self._exposures: Counter[tuple[int, int]] = Counter()
 
     def on_show(self, pattern: UInt8[np.ndarray, "v u"]) -> None:
-        """The display presents a pattern. Its image is computed here, where nobody waits."""
+        """Present a pattern; computes its image in advance."""
         if pattern.shape != self.display_shape:
             raise ValueError(f"a pattern of {pattern.shape} pixels; give {self.display_shape}")
         shown = np.array(pattern, np.uint8)
@@ -133,17 +131,17 @@ class VirtualRig:
             self._shown_at = time.monotonic()
 
     def on_move(self, position: float) -> None:
-        """The stage is at a position, mm, moving or not."""
+        """Set the stage's position, mm, moving or not."""
         with self._lock:
             self._position = position
 
     @property
     def position(self) -> float:
-        """Of the stage, mm."""
+        """Position of the stage, mm."""
         return self._position
 
     def expose(self, settings: CameraSettings) -> UInt16[np.ndarray, "y x"]:
-        """Counts of a frame that is exposed now, of the settings' region."""
+        """Counts of a frame exposed now, within the settings' region."""
         with self._lock:
             settled = time.monotonic() - self._shown_at >= self.response
             number, shown = self._shown if settled else self._before

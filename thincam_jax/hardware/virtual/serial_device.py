@@ -1,8 +1,8 @@
-"""A stage that is not there: its slide, and the pseudo-terminal at which a driver finds it.
+"""A virtual serial stage: its slide, and its pseudo-terminal.
 
-A pseudo-terminal is a file. Its mode keeps other users out; it is reached through a folder of mode
-0700 whose name nobody can guess; the driver that has opened it forbids a second opening. So no
-process of another user can command the device, and none of the same user while a driver holds it.
+The mode of the pseudo-terminal excludes other users; its path is in a folder of mode 0700 with an
+unguessable name; the driver opens it exclusively. So no process of another user can command the
+device, and none of the same user while a driver holds it.
 """
 
 import os
@@ -22,28 +22,28 @@ from typing import TypeVar
 
 from thincam_jax.hardware.virtual.faults import Faults
 
-TICK = 0.002  # s between two looks at a slide that moves
-LONGEST_INPUT = 1024  # bytes kept of a line without an end
-PAUSE = 0.005  # s between two looks at a device that stands
+TICK = 0.002  # s between two updates of a moving slide
+LONGEST_INPUT = 1024  # bytes kept of an unfinished line
+PAUSE = 0.005  # s between two polls of a device at rest
 
 Virtual = TypeVar("Virtual", bound="VirtualSerialDevice")
 
 
 @dataclass(frozen=True)
 class Motion:
-    """Motion of a virtual stage, and the delay of its answers where that fault is played."""
+    """Motion of a virtual stage, and the delay of its answers with the fault "latency"."""
 
     travel: float = 50.0  # mm
     speed: float = 100.0  # mm/s
-    start: float = 0.0  # mm, where it stands when it is switched on
+    start: float = 0.0  # mm, position at power-on
     latency: float = 0.05  # s
 
 
 class VirtualSerialDevice(ABC):
-    """A device that answers at `port` from a thread of its own until it is closed.
+    """A device that answers at `port` from its own thread until it is closed.
 
-    `true_position` is where the slide is, in mm, whatever the device believes. `on_move` is told
-    it, from that thread, before the device answers that it moved or stands.
+    `true_position` is the slide's actual position in mm, whatever the device believes. `on_move`
+    receives it, in that thread, before the device answers that it moves or rests.
     """
 
     def __init__(
@@ -56,7 +56,7 @@ class VirtualSerialDevice(ABC):
         self.motion, self.faults = motion or Motion(), faults or Faults()
         self.true_position = self.motion.start
         self._target = self.motion.start
-        self._slip = 0.0  # mm by which the device's own count is wrong
+        self._slip = 0.0  # mm, error of the device's own count
         self._stalls = False
         self._on_move = on_move
         self._random = random.Random(seed)
@@ -69,12 +69,12 @@ class VirtualSerialDevice(ABC):
         self._closing = threading.Event()
         self._master = -1
         self._new_terminal()
-        self._tell()
+        self._report_position()
         self._thread = threading.Thread(target=self._run, name=self.port.name, daemon=True)
         self._thread.start()
 
     def close(self) -> None:
-        """Ends the thread and removes the port; may be called twice."""
+        """End the thread and remove the port; may be called twice."""
         self._closing.set()
         self._thread.join()
 
@@ -84,23 +84,20 @@ class VirtualSerialDevice(ABC):
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    # What a device is made of.
-
     @abstractmethod
     def _receive(self, data: bytes) -> None:
-        """Takes bytes from the driver."""
+        """Receive bytes from the driver."""
 
-    @abstractmethod
-    def _connected(self) -> None:
-        """A driver has opened the terminal."""
+    def _connected(self) -> None:  # noqa: B027
+        """React to a driver that has opened the terminal."""
 
     @abstractmethod
     def _stopped(self, stalled: bool) -> None:
-        """The slide has come to a stand, by itself or because steps were lost."""
+        """React to the end of a move, or to a stall that lost steps."""
 
     @abstractmethod
     def _garble(self, line: bytes) -> bytes:
-        """The line as it comes over a bad cable."""
+        """Corrupt a line as a bad cable does."""
 
     @property
     def _moving(self) -> bool:
@@ -108,11 +105,11 @@ class VirtualSerialDevice(ABC):
 
     @property
     def _counted(self) -> float:
-        """Where the device believes that it is, in mm."""
+        """Position in mm by the device's own count."""
         return self.true_position + self._slip
 
     def _go(self, counted: float) -> None:
-        """Starts towards a place as the device counts; lost steps end it half-way."""
+        """Start a move to a counted position; lost steps end it half-way."""
         self._target = counted - self._slip
         self._stalls = self._moving and self.faults.due("lost_steps")
         if self._stalls:
@@ -121,15 +118,15 @@ class VirtualSerialDevice(ABC):
             self._stopped(stalled=False)
 
     def _brake(self) -> None:
-        """Stops where it is."""
+        """Stop at once."""
         self._target, self._stalls = self.true_position, False
 
     def _referenced(self, counted: float) -> None:
-        """The slide stands at a place that is known: what was lost is found again."""
+        """Correct the count at a reference position."""
         self._slip = counted - self.true_position
 
     def _answer(self, line: bytes) -> None:
-        """Sends a line, with whatever fault is due."""
+        """Send a line, with any fault that is due."""
         if self.faults.due("latency"):
             self._closing.wait(self.motion.latency)
             self._advance()
@@ -141,15 +138,13 @@ class VirtualSerialDevice(ABC):
         try:
             os.write(self._master, data)
         except OSError:
-            pass  # nobody reads: a serial line loses what nobody takes
+            pass  # nobody reads, so the bytes are lost
 
     def _lines(self, data: bytes) -> list[bytes]:
-        """Whole lines so far; of a line without an end no more is kept than any command needs."""
+        """Complete lines so far; of an unfinished one only the longest command's length is kept."""
         *lines, rest = (bytes(self._input) + data).split(b"\n")
         self._input[:] = rest[:LONGEST_INPUT]
         return [line.rstrip(b"\r") for line in lines]
-
-    # The thread.
 
     def _run(self) -> None:
         try:
@@ -161,7 +156,7 @@ class VirtualSerialDevice(ABC):
                 events = happened[0][1] if happened else 0
                 if self.faults.due("unplug"):
                     self._new_terminal()
-                elif events & select.POLLHUP and not events & select.POLLIN:  # nobody is there
+                elif events & select.POLLHUP and not events & select.POLLIN:  # no driver
                     self._in_use = False
                     self._closing.wait(TICK if self._moving else PAUSE)
                 else:
@@ -176,7 +171,7 @@ class VirtualSerialDevice(ABC):
             shutil.rmtree(self._folder, ignore_errors=True)
 
     def _advance(self) -> None:
-        """Moves the slide by the time that has passed."""
+        """Move the slide for the time elapsed."""
         now = time.monotonic()
         passed, self._moved = now - self._moved, now
         if not self._moving:
@@ -185,18 +180,18 @@ class VirtualSerialDevice(ABC):
         way = self._target - self.true_position
         at = self._target if abs(way) <= step else self.true_position + (step if way > 0 else -step)
         self.true_position = at
-        self._tell()
+        self._report_position()
         if not self._moving:
             if self._stalls:
                 self._slip += 0.1 * self._random.choice((-1, 1))
             self._stopped(self._stalls)
 
-    def _tell(self) -> None:
+    def _report_position(self) -> None:
         if self._on_move is not None:
             self._on_move(self.true_position)
 
     def _new_terminal(self) -> None:
-        """Puts a new terminal at the path, and takes the old one away."""
+        """Put a new terminal at the path and remove the old one."""
         old = self._master
         self._in_use = False
         self._master, slave = os.openpty()
@@ -210,5 +205,5 @@ class VirtualSerialDevice(ABC):
         new = self.port.with_suffix(".new")
         new.symlink_to(name)
         new.replace(self.port)
-        if old >= 0:  # not before: who sees that it has gone finds the new one
+        if old >= 0:  # afterwards, so that its user finds the new one
             os.close(old)

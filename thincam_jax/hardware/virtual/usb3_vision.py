@@ -1,8 +1,8 @@
 """A virtual USB3 Vision camera behind pyusb's backend interface.
 
-A client that is given this backend finds one camera on the bus and speaks to it as to a real one:
-descriptors, GenCP, an XML of features, leader, payload and trailer. The frames come from a
-function; they are exposed at the trigger, and no time passes while they are.
+With this backend a client finds one camera on the bus, with descriptors, GenCP, an XML of features,
+leader, payload and trailer as of a real one. The frames come from a function, at the trigger and
+without delay.
 """
 
 import errno
@@ -35,7 +35,7 @@ from thincam_jax.hardware.virtual.faults import Faults
 
 CONTROL_OUT, CONTROL_IN, STREAM_IN = 0x01, 0x81, 0x82
 LATE = 0.02  # s
-MOST_FRAMES = 8  # in the camera's memory; further ones are lost
+MOST_FRAMES = 8  # in the camera's memory; more are lost
 DATA_OVERRUN = 0xA101  # status of a trailer
 
 SBRM, SIRM, MANIFEST, FEATURES, XML = 0x1000, 0x1100, 0x1200, 0x2000, 0x10000
@@ -114,15 +114,15 @@ _DEVICE.__dict__.update(address=1, bus=1, port_number=1, port_numbers=(1,), spee
 
 
 class _Refused(Exception):
-    """The camera answers a command with this status."""
+    """A command is refused with this status."""
 
 
 class VirtualUsb3Vision(IBackend):
     """One virtual camera on a bus of its own; give it to pyusb as the backend.
 
     `expose(settings)` returns the counts (y, x), uint16, of the frame exposed at the trigger, of
-    the size of `settings.region`, in an array that it does not change afterwards. Without a
-    trigger (TriggerMode Off) frames are exposed when the client reads, at AcquisitionFrameRate.
+    the size of `settings.region`, in an array not changed afterwards. With TriggerMode Off frames
+    are exposed when the client reads, at AcquisitionFrameRate.
     """
 
     def __init__(
@@ -168,8 +168,6 @@ class VirtualUsb3Vision(IBackend):
             struct.pack_into(layout, memory, address, *values)
         self._derive()
 
-    # What the memory says.
-
     def _number(self, address: int) -> int:
         return struct.unpack_from("<I", self._memory, address)[0]
 
@@ -178,7 +176,7 @@ class VirtualUsb3Vision(IBackend):
 
     @property
     def settings(self) -> CameraSettings:
-        """What the camera is set to."""
+        """Present settings of the camera."""
         exposure, gain = struct.unpack_from("<dd", self._memory, EXPOSURE)
         region = Region(*(self._number(a) for a in (TOP, LEFT, HEIGHT, WIDTH)))
         names = {code: name for name, (code, _) in PIXEL_FORMATS.items()}
@@ -191,10 +189,8 @@ class VirtualUsb3Vision(IBackend):
         struct.pack_into("<I", self._memory, PAYLOAD_SIZE, size)
         struct.pack_into("<Q", self._memory, SIRM + Sirm.REQUIRED_PAYLOAD, size)
 
-    # GenCP.
-
     def _command(self, packet: bytes) -> None:
-        """Answers a command; what is none stays without an answer."""
+        """Answer a command; anything else is ignored."""
         try:
             command = gencp.decode(packet)
         except ValueError:
@@ -279,8 +275,6 @@ class VirtualUsb3Vision(IBackend):
         if not allowed:
             raise _Refused(Status.INVALID_PARAMETER)
 
-    # The stream.
-
     def _expose_frame(self, ready: float = 0.0) -> None:
         streaming = self._number(SIRM + Sirm.CONTROL) & 1
         if not self._acquiring:
@@ -301,7 +295,7 @@ class VirtualUsb3Vision(IBackend):
         sent, status, valid = data, 0, len(data)
         if self.faults.due("short_frame"):
             sent = data[: len(data) // 2]
-            if self.faults.happened["short_frame"] % 2:  # every second one is not owned up to
+            if self.faults.happened["short_frame"] % 2:  # every second trailer hides it
                 status, valid = DATA_OVERRUN, len(sent)
         trailer = TRAILER.pack(TRAILER_MAGIC, 0, TRAILER.size + 4, block, status, 0, valid)
         trailer += struct.pack("<I", region.height)
@@ -333,8 +327,6 @@ class VirtualUsb3Vision(IBackend):
         wire = np.ascontiguousarray(counts, "<u2" if counts.itemsize == 2 else np.uint8)
         data = wire.reshape(-1).view(np.uint8).data
         return data[: frame_bytes(settings.pixel_format, region)]
-
-    # What pyusb asks of a backend.
 
     def enumerate_devices(self) -> Any:
         return iter((self,))
@@ -398,7 +390,7 @@ class VirtualUsb3Vision(IBackend):
         data: array,
         timeout: int,
     ) -> Any:
-        """Gives descriptors; a standard request without data is obeyed by doing nothing."""
+        """Return descriptors; a standard request without data does nothing."""
         self._alive(dev_handle)
         if not bmRequestType & 0x80:
             return 0
@@ -423,7 +415,7 @@ class VirtualUsb3Vision(IBackend):
         return len(data)
 
     def bulk_read(self, dev_handle: object, ep: int, intf: int, buff: array, timeout: int) -> Any:
-        """The next transfer, or as much of it as fits; waits for it no longer than `timeout` ms."""
+        """Read the next transfer, or as much as fits, within `timeout` ms."""
         self._alive(dev_handle)
         queue: deque[tuple[float, Any]] = self._answers if ep == CONTROL_IN else self._frames
         if ep == STREAM_IN and not queue and self._acquiring and not self._number(TRIGGER_MODE):
@@ -445,7 +437,7 @@ class VirtualUsb3Vision(IBackend):
         return count
 
     def _alive(self, dev_handle: object) -> None:
-        """Raises if this handle is of before the camera was unplugged; each call may unplug it."""
+        """Raise for a handle from before an unplug; each call may be the moment of that fault."""
         if self.faults.due("unplug"):
             self._power_on()
         if dev_handle not in self._open:

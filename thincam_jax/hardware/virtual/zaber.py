@@ -1,6 +1,6 @@
-"""A Zaber stage that is not there: firmware 7, one axis with an encoder, supplied by itself.
+"""A virtual Zaber stage: firmware 7, one axis with an encoder, with its own power supply.
 
-Unplugged from the computer it keeps its position, and goes on where it was going.
+Unplugged from the computer it keeps its position and finishes its move.
 """
 
 import re
@@ -19,12 +19,12 @@ _COMMAND = re.compile(
 class _Command:
     device: int
     axis: int
-    number: bytes  # as it came, b"" for none
+    number: bytes  # as received, b"" for none
     words: tuple[bytes, ...]
 
 
 def parse_command(line: bytes) -> _Command | None:
-    """A line from a driver; None for what a device ignores: another format, a wrong checksum."""
+    """Parse a line from a driver; None for a wrong format or checksum, which a device ignores."""
     matched = _COMMAND.fullmatch(line)
     if matched is None:
         return None
@@ -41,9 +41,6 @@ class VirtualZaber(VirtualSerialDevice):
     _homing = False
     _sends_checksums = False
 
-    def _connected(self) -> None:
-        pass  # it says nothing that it was not asked
-
     def _stopped(self, stalled: bool) -> None:
         if stalled:
             self._homing = False
@@ -55,7 +52,7 @@ class VirtualZaber(VirtualSerialDevice):
 
     def _receive(self, data: bytes) -> None:
         for line in self._lines(data):
-            command = parse_command(line[max(line.rfind(b"/"), 0) :])  # where one begins
+            command = parse_command(line[max(line.rfind(b"/"), 0) :])  # the last start of a command
             if command is not None and command.device in (0, 1) and command.axis in (0, 1):
                 self._obey(command)
 
@@ -76,12 +73,12 @@ class VirtualZaber(VirtualSerialDevice):
         self._answer(b"@" + body)
 
     def _garble(self, line: bytes) -> bytes:
-        """One byte wrong, anywhere."""
+        """Flip one bit."""
         at = self._random.randrange(len(line))
         return line[:at] + bytes([line[at] ^ (1 << self._random.randrange(7))]) + line[at + 1 :]
 
     def _result(self, words: tuple[bytes, ...]) -> tuple[bool, str]:
-        """Whether it is done, and the answer's data."""
+        """Whether the command is accepted, and the answer's data."""
         match words:
             case ():
                 return True, "0"
@@ -92,12 +89,12 @@ class VirtualZaber(VirtualSerialDevice):
                 self._sends_checksums = value == b"1"
             case (b"warnings", *clear) if clear in ([], [b"clear"]):
                 listed = " ".join((f"{len(self._flags):02}", *self._flags))
-                if clear:  # what is still so stays
+                if clear:  # persistent ones stay
                     self._flags = tuple("WR" if flag == "FS" else flag for flag in self._flags)
                 return True, listed
             case (b"home",):
                 self._homing = True
-                self._go(self._slip)  # to the switch, at 0 mm, wherever that is by its count
+                self._go(self._slip)  # to the switch at 0 mm, whatever its count
             case (b"stop",):
                 if self._homing:
                     self._homing, self._flags = False, ("WR",)

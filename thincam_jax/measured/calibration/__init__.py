@@ -1,4 +1,4 @@
-"""Calibration from a rig's own pictures: PSF fits, registration, Hadamard patterns."""
+"""Calibration from captures: PSF fits, registration, stripes, Hadamard patterns, screens."""
 
 from thincam_jax.measured.calibration.captures import CaptureStoreError as CaptureStoreError
 from thincam_jax.measured.calibration.captures import CaptureWriter as CaptureWriter

@@ -1,7 +1,7 @@
-"""The captures of a Hadamard calibration, on disk: written frame by frame, read by sensor rows.
+"""The captures of a Hadamard calibration on disk: written frame by frame, read by sensor rows.
 
-A chunk of the store holds 16 frames of some rows, so that both the rig, which writes a frame, and
-the recovery of the matrix, which reads all frames of some rows, touch few bytes too many.
+A chunk of the store holds 16 frames of some rows, a compromise between writing single frames and
+reading all frames of some rows.
 """
 
 import dataclasses
@@ -32,13 +32,13 @@ from thincam_jax.measured.calibration.hadamard import HadamardSeries
 
 @dataclasses.dataclass(frozen=True)
 class HadamardCaptures:
-    """All captures of a calibration, found complete by `open_captures`.
+    """A complete set of captures, as opened by `open_captures`.
 
-    - `series`: what was shown.
+    - `series`: the patterns shown.
     - `sensor_shape`: (rows, columns).
     - `bits`: of the camera; None: any numbers.
     - `exposure`: time, s, if known.
-    - `stored_at`: where in the store each frame of the series is; None: where the series has it.
+    - `stored_at`: place in the store of each frame of the series; None: the same order.
     """
 
     path: Path
@@ -50,19 +50,19 @@ class HadamardCaptures:
 
     @property
     def block_rows(self) -> int:
-        """Sensor rows that are stored together, good to read at once."""
+        """Sensor rows of a chunk, best read at once."""
         return _opened(self.path).frames.chunks[1]
 
     def rows(self, start: int, stop: int) -> Real[np.ndarray, "frame y x"]:
-        """All frames of some sensor rows, as the series numbers them."""
+        """All frames of some sensor rows, in the order of the series."""
         frames = _opened(self.path).read(slice(None), slice(start, stop))
         return frames if self.stored_at is None else frames[list(self.stored_at)]
 
 
 class CaptureWriter(AbstractContextManager["CaptureWriter"]):
-    """Takes the frames of a calibration in any order; a context manager.
+    """Writer of a calibration's frames in any order; a context manager.
 
-    Frames are written out when the 16 of a chunk are there, the others when it is closed.
+    Complete chunks of 16 frames are written at once, the others when it is closed.
     """
 
     def __init__(self, path: Path):
@@ -78,14 +78,14 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
 
     @property
     def missing(self) -> list[int]:
-        """Numbers of the frames that are still to be written."""
+        """Numbers of the frames not yet written."""
         return [int(n) for n in np.flatnonzero(self._digests == 0)]
 
     def write(self, number: int | np.integer, image: Real[np.ndarray, "y x"] | Array) -> None:
         """Store the capture of frame `number`, in counts of the camera.
 
-        **Errors**: CaptureStoreError, one line, for a number that there is not or that was written
-        before, another shape, and values that the camera cannot give.
+        **Errors**: CaptureStoreError, one line, for a number out of range or written before,
+        another shape, and values outside the camera's range.
         """
         number = int(number)
         if not 0 <= number < len(self._digests):
@@ -105,7 +105,7 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
             self._write_out(number)
 
     def close(self) -> None:
-        """Write out what waits for the rest of its chunk."""
+        """Write the frames of incomplete chunks."""
         while self._waiting:
             self._write_out(min(self._waiting))
 
@@ -113,12 +113,12 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
         self.close()
 
     def _write_out(self, number: int) -> None:
-        """Write what there is of the chunk of a frame."""
+        """Write the available frames of a frame's chunk."""
         ready = [n for n in self._store.chunk(number) if n in self._waiting]
         self._store.write({n: self._waiting[n] for n in ready})
         for n in ready:
             del self._waiting[n]
-        # After the frames: what a digest announces is there.
+        # After the frames, so that every announced frame is there.
         written = self._digests.copy()
         written[list(self._waiting)] = 0
         self._store.announce(written)
@@ -150,10 +150,10 @@ def create_captures(
     bits: int | None = None,
     exposure: float | None = None,
 ) -> CaptureWriter:
-    """A new store for the captures of a calibration.
+    """Create a store for the captures of a calibration.
 
-    - `bits`: of the camera, up to 16, whose counts are stored as they are; None: any numbers, in
-      float32. `exposure`: time, s, kept for the record.
+    - `bits`: of the camera, up to 16, for whole counts; None: any numbers, in float32.
+    - `exposure`: time, s, for the record.
 
     **Errors**: CaptureStoreError where something is at `path` already.
     """
@@ -178,16 +178,15 @@ def create_captures(
 
 
 def resume_captures(path: str | Path) -> CaptureWriter:
-    """Go on with a store that is not complete; `missing` says with which frames."""
+    """Continue an incomplete store with its `missing` frames."""
     return CaptureWriter(Path(path))
 
 
 def open_captures(path: str | Path) -> HadamardCaptures:
-    """The captures of a calibration, once all are there.
+    """Open the complete captures of a calibration.
 
-    **Errors**: CaptureStoreError, one line, which names the frames that are missing, truncated, or
-    the same as another; none is guessed. Damage within a chunk is found by its checksum when it is
-    read.
+    **Errors**: CaptureStoreError, one line, which names the frames that are missing, truncated or
+    identical. Damage within a chunk is detected by its checksum when it is read.
     """
     path = Path(path)
     store = _opened(path)
@@ -225,11 +224,11 @@ def simulate_captures(
     deviation: float = 0.0,
     offset: float = 0.0,
 ) -> HadamardCaptures:
-    """The captures of a camera that is known, written as the rig writes them.
+    """Simulate the captures of a known camera and write them to a store.
 
     - `operator`: from the cells, 1 is white, to the sensor, in counts (`Scaled` sets the exposure).
-    - `deviation`: of white noise, and `offset`: the dark level, in counts. A writer with `bits`
-      rounds and clips.
+    - `deviation`: of white noise, and `offset`: the dark level, in counts. For a writer with `bits`
+      the counts are rounded and clipped.
 
     **Errors**: ValueError where the operator's shapes are not those of the cells and the sensor.
     """
@@ -257,7 +256,7 @@ def _opened(path: Path, mode: str = "r") -> CaptureStore:
 
 
 def _described(store: CaptureStore) -> HadamardCaptures:
-    """Contents of the attributes, once the arrays agree with them."""
+    """Captures as the attributes describe them, checked against the arrays."""
     path, attributes = store.path, store.attributes
     try:
         names = [field.name for field in dataclasses.fields(HadamardSeries)]

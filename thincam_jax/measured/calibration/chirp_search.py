@@ -1,20 +1,19 @@
-r"""Finding a zone plate's fringes in an image without a close guess: a matched filter.
+r"""Matched filter that finds a zone plate's fringes in an image from a rough guess.
 
-Ten per cent of β are tens of turns of the fringes at the edge of a sensor: least squares started
-there settles in the wrong turn. A chirp, however, has one sharp peak in the plane of curvature and
-place. The fringes of a zone aperture (thesis Eq 3.22, corrected) are, seen from their centre,
+Ten per cent of β are tens of fringes at the edge of a sensor: least squares started there converges
+to the wrong fringe. A chirp, however, has one sharp peak over curvature and position. Relative to
+their centre, the fringes of a zone aperture are (thesis Eq 3.22, corrected)
 
 .. math::
     \mathrm{Re}\, w\, T(r), \qquad
     T = a_+ e^{j\gamma_+ r^2} + a_- e^{j\gamma_- r^2}, \qquad
     a_\pm = \frac1{1\pm\epsilon}, \quad \gamma_\pm = \gamma a_\pm
 
-with γ = β/M² and ε = βλd/(πM). For every γ, ε and centre the complex w, whose angle is the phase φ,
-follows in closed form; what is left to search is the correlation :math:`|\langle T, h\rangle|/|T|`.
-Taking off a chirp of the expected curvature makes the image slow, so that it may be averaged over
-blocks of pixels first, and chirps are separable, so that a correlation is two matrix products.
-
-NumPy: a search of a few hundredths of a second, once a fit.
+with γ = β/M² and ε = βλd/(πM). For given γ, ε and centre the complex w, whose angle is the phase φ,
+follows in closed form; the search maximises the correlation :math:`|\langle T, h\rangle|/|T|`.
+Division by a chirp of the expected curvature makes the image slowly varying, so that it can be
+averaged over blocks of pixels first, and chirps are separable, so that a correlation is two matrix
+products. In NumPy: a few hundredths of a second, once a fit.
 """
 
 import math
@@ -24,14 +23,14 @@ import numpy as np
 
 from thincam_jax._core.grids import block_mean, central_blocks
 
-# Of π/R² and π/(2γR), the curvature and the shift that turn the outermost fringe by half a cycle.
+# In units of the curvature π/R² and the shift π/(2γR), half a cycle of the outermost fringe.
 _STEP = 0.5
-_WEAK = 0.5  # ε above which order −1 is too near its focus for this picture of the fringes
+_WEAK = 0.5  # ε above which order −1 is too near its focus for this model
 
 
 @dataclass(frozen=True, eq=False)
 class Chirp:
-    """The fringes' numbers on the sensor.
+    """Parameters of the fringes on the sensor.
 
     - `curvature`: γ = β/M², rad/mm².
     - `epsilon`: ε, the strength of diffraction.
@@ -47,7 +46,7 @@ class Chirp:
 
 @dataclass(frozen=True)
 class Ranges:
-    """Search range about the guess: γ and ε in parts of one, the centre in mm; 0 is known."""
+    """Search range about the guess: γ and ε relative, the centre in mm; 0: held."""
 
     curvature: float
     epsilon: float
@@ -55,10 +54,10 @@ class Ranges:
 
 
 def find_chirp(image: np.ndarray, pitch: float, guess: Chirp, ranges: Ranges) -> Chirp:
-    """The fringes nearest to the guess that correlate best with the image (y, x).
+    """Find the fringes within the ranges that correlate best with the image (y, x).
 
-    The guess' phase is not used. Where ε is above 0.5 the guess comes back: there the mask nearly
-    focuses, and its picture is not two chirps.
+    The guess' phase is not used. For ε above 0.5 the guess is returned: the mask nearly focuses,
+    and its image is not two chirps.
     """
     if guess.epsilon * (1 + ranges.epsilon) > _WEAK:
         return guess
@@ -74,7 +73,7 @@ def find_chirp(image: np.ndarray, pitch: float, guess: Chirp, ranges: Ranges) ->
     fine = 0.2 * math.pi / blocks.reach**2
     found = _curvature_and_epsilon(blocks, found, half, fine)
     if ranges.centre > 0:
-        # Once more around the peak, now with both chirps, ten times finer.
+        # Again around the peak with both chirps, ten times finer.
         places = _axis(places[1] - places[0], (places[1] - places[0]) / 10)
         peak = np.abs(blocks.match(found, places))
         row, column = np.unravel_index(np.argmax(peak), peak.shape)
@@ -87,12 +86,12 @@ def find_chirp(image: np.ndarray, pitch: float, guess: Chirp, ranges: Ranges) ->
 
 
 class _Blocks:
-    """The image without the expected chirp, averaged over blocks of pixels."""
+    """The image divided by the expected chirp, averaged over blocks of pixels."""
 
     def __init__(self, image, pitch: float, guess: Chirp, ranges: Ranges):
         rows, columns = image.shape
         self.reach = max(rows, columns) * pitch / 2
-        # What is left of the fringes' frequency, and twice that for what the guess leaves open.
+        # Half the largest remaining frequency of the fringes within the ranges.
         lowest, highest = _bounds(guess, ranges)
         spread = max(highest - guess.curvature, guess.curvature - lowest)
         rate = (spread * self.reach + guess.curvature * ranges.centre) / math.pi
@@ -117,7 +116,7 @@ class _Blocks:
             shifted = gammas[:, None, None] * (r - r0 - places[:, None]) ** 2
             return np.exp(-1j * (shifted - self.reference * (r - r_ref) ** 2))
 
-        # One large product and one without BLAS: many small ones wait for its threads.
+        # One large product, and one without BLAS, whose threads slow many small products.
         rows = waves(self.y, y0, y_ref).reshape(-1, len(self.y)) @ self.values
         rows = rows.reshape(len(gammas), len(places), -1)
         return np.einsum("gik,gjk->gij", rows, waves(self.x, x0, x_ref))
@@ -129,7 +128,7 @@ class _Blocks:
         return np.tensordot(gains, waves, axes=1)
 
     def overlap(self, gamma, centre) -> np.ndarray:
-        """Σ e^{jγ|r−r₀|²} for each γ: what two chirps of that difference have in common."""
+        """Σ e^{jγ|r−r₀|²} for each γ: the overlap of two chirps of that difference."""
         y, x = (r - r0 for r, r0 in zip((self.y, self.x), centre, strict=True))
         sums = (np.exp(1j * gamma[..., None] * r**2).sum(axis=-1) for r in (y, x))
         return np.prod(np.array(list(sums)), axis=0)
@@ -156,7 +155,7 @@ def _gains(epsilon):
 
 
 def _bounds(guess: Chirp, ranges: Ranges) -> tuple[float, float]:
-    """The smallest and the largest curvature that the fringes can have."""
+    """Smallest and largest possible curvature of the fringes."""
     epsilon = guess.epsilon * (1 + ranges.epsilon)
     low, high = (guess.curvature * (1 + s * ranges.curvature) for s in (-1, 1))
     return low / (1 + epsilon), high / (1 - epsilon)

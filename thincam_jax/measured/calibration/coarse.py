@@ -1,11 +1,11 @@
-r"""Least squares towards a narrow minimum: coarse pixels and wide difference steps first.
+"""Least squares with a narrow minimum: coarse pixels and wide finite differences first.
 
-The phase of the waves from the aperture's rims changes fast with d. They carry little light, so
-that the sum of squares is a smooth bowl in d with a narrow dip at the bottom, but they dominate its
-derivative: Levenberg-Marquardt with exact derivatives creeps, or stops in a ripple of the bowl.
-Finite differences over a step wide enough to average these waves out follow the bowl, and full
-Gauss-Newton steps walk through its ripples, where a search that must go down at each step stops.
-The differences are narrowed as long as they stay wide against the standard errors that they give.
+The phase of the waves diffracted at the aperture's edges changes fast with d. They carry little
+light, so that the sum of squares is a smooth bowl in d with a narrow dip at the bottom, but they
+dominate its derivative: Levenberg-Marquardt with exact derivatives stalls in a ripple of the bowl.
+Finite differences over steps wide enough to average these waves follow the bowl, and full
+Gauss-Newton steps cross its ripples, where a monotone search would stop. The differences are
+narrowed as long as they stay wide compared with the resulting standard errors.
 """
 
 import math
@@ -31,29 +31,29 @@ from thincam_jax.measured.calibration.problem import (
 )
 
 _BLOCK = 0.35  # of √(λd): the side of a coarse pixel
-_FEWEST = 48  # coarse pixels along a side
-_TRIALS = 5  # on either side of the best so far
-_ROUNDS = 2  # each with a fifth of the steps of the one before
+_FEWEST = 48  # coarse pixels along a side, at least
+_TRIALS = 5  # on either side of the best one
+_ROUNDS = 2  # each with a fifth of the previous step
 _STEPS = 8  # of Gauss-Newton at each width of the differences
-_NEAR_ENOUGH = 0.3  # of a standard error: a step that is the last one
-_DAMPING = 1e-4  # of the unit diagonal, where numbers cannot be told apart
+_NEAR_ENOUGH = 0.3  # standard errors; a smaller step is the last
+_DAMPING = 1e-4  # relative to the unit diagonal, for degenerate parameters
 # The longest step, in widths of the differences: 1 rad at the rim for the fringes, 10 % for d.
 _LONGEST = {"background": math.inf, "gain": math.inf, "width": 5.0, "wavelength": 5.0}
 _LONGEST_OF_FRINGES = 50.0
-_WIDE, _NARROWER, _NARROWEST = 0.02, 0.25, 1e-6  # widths, in parts of one
-_NARROW_ENOUGH = 2e-4  # for a start
-# Only widths above this many standard errors are narrowed: the next, a quarter as wide, is then
-# still three of them, so that the bottom of the bowl lies within it.
+_WIDE, _NARROWER, _NARROWEST = 0.02, 0.25, 1e-6  # relative widths
+_NARROW_ENOUGH = 2e-4  # for an initial estimate
+# Only widths above this many standard errors are narrowed: a quarter is then still three of them,
+# and contains the bottom of the bowl.
 _AGAINST_ERROR = 12.0
-_PARTS = 8  # of the picture, along a side
-_FRINGE = 0.02  # rad, at the rim: differences of what moves the fringes
-# What the waves of the rims depend on, and so is differenced widely.
+_PARTS = 8  # of the image, along a side
+_FRINGE = 0.02  # rad, at the rim: difference step of the fringes' parameters
+# Parameters of the edge waves, which need wide differences.
 _RIMS = ("width", "wavelength")
 
 
 @dataclass(frozen=True, eq=False)
 class FitImage:
-    """An image and its grid, whose middle is `offset` (y, x, mm) off the axis."""
+    """An image and its grid, whose centre is `offset` (y, x, mm) from the axis."""
 
     image: np.ndarray
     grid: Grid
@@ -76,9 +76,9 @@ def descend(
     search: float,
     pixel_integration: bool,
 ) -> FitState:
-    """The state that fits the image best on coarse pixels, from one whose fringes are right.
+    """Fit the image on coarse pixels, from a `start` whose fringes are right.
 
-    `guess` is what was given, `start` what the fringes say. Only `parameters` change.
+    `guess` is the given state. Only `parameters` change.
     """
     measured = coarse_image(image, guess, pixel_integration)
     best = _best_by_trial(measured, guess, start, parameters, search)
@@ -96,7 +96,7 @@ def descend(
 def _gauss_newton(
     measured: FitImage, start: FitState, names: tuple[str, ...], widths: np.ndarray
 ) -> tuple[FitState, Covariance, np.ndarray]:
-    """The best of some full steps, what is known there, and the slopes of `SEEN`."""
+    """Best state after some full steps, its covariance, and the slopes of `SEEN`."""
     here, none, tried = start, np.zeros(len(names)), []
     for _ in range(_STEPS):
         residual = _residual(measured, here, names)
@@ -119,12 +119,12 @@ def _gauss_newton(
 def covariance_by_differences(
     measured: FitImage, found: FitState, names: tuple[str, ...]
 ) -> tuple[Covariance, Covariance]:
-    """Standard errors and correlations of the steps from `found`.
+    """Covariances of the steps from `found`, for white noise and from parts of the image.
 
-    By finite differences, narrowed as long as they are wide against the errors that they give:
-    exact derivatives would count on waves of the rims that the noise may hide. The second is what
-    `_PARTS` parts of the picture say together, each with an error of its own: the same where the
-    residual is white noise, more where the model leaves something out.
+    By finite differences, narrowed as long as they are wide compared with the errors: exact
+    derivatives would rely on edge waves that may be lost in noise. The second, from the scatter of
+    `_PARTS`² parts of the image, agrees with the first where the residual is white noise and is
+    larger where the model is incomplete.
     """
     residual = _residual(measured, found, names)
     squares, width, seen = float(residual @ residual), _WIDE, None
@@ -139,7 +139,7 @@ def covariance_by_differences(
 
 
 def slope_norms(measured: FitImage, state: FitState, names: tuple[str, ...]) -> np.ndarray:
-    """Shift of the image for a step of each unknown."""
+    """Norm of the image's change for a unit step of each unknown."""
     widths = difference_widths(state, _WIDE * _NARROWER)
     turned = np.asarray(seen_by_steps(state, names, np.zeros(len(names))))
     norms = np.linalg.norm(_seen_slopes(measured, state, turned, widths) @ turned, axis=0)
@@ -147,7 +147,7 @@ def slope_norms(measured: FitImage, state: FitState, names: tuple[str, ...]) -> 
 
 
 def difference_widths(state: FitState, width: float) -> np.ndarray:
-    """Half the step over which each of `SEEN` is differenced; `width` is that of λdM."""
+    """Half the difference step of each of `SEEN`; `width` is that of λdM."""
     camera = state.camera
     pixel = float(camera.sensor.pitch)
     reach = max(camera.sensor.shape) * pixel / 2
@@ -157,7 +157,7 @@ def difference_widths(state: FitState, width: float) -> np.ndarray:
         "beta": _FRINGE / (curvature * reach**2),
         "centre_y": _FRINGE / (2 * curvature * reach * pixel),
         "centre_x": _FRINGE / (2 * curvature * reach * pixel),
-        # A rim moves by a few parts in 100 of a Fresnel zone for `width` of 2 %.
+        # For a `width` of 2 % a rim moves by a few per cent of a Fresnel zone.
         "width": 2 * width * zone / float(state.mask.width),
         "wavelength": width,
     }
@@ -165,7 +165,7 @@ def difference_widths(state: FitState, width: float) -> np.ndarray:
 
 
 def _too_narrow(known: Covariance, turned: np.ndarray, widths: np.ndarray) -> bool:
-    """Whether the errors of what the rims determine have reached the width of the differences."""
+    """Whether the errors of the edge waves' parameters have reached the difference steps."""
     errors = of_values(known, turned).standard_errors
     rims = [name in _RIMS and bool(np.any(row)) for name, row in zip(SEEN, turned, strict=True)]
     return not any(rims) or bool(np.any((_AGAINST_ERROR * errors > widths)[rims]))
@@ -190,9 +190,9 @@ def _residual(measured: FitImage, here: FitState, names) -> np.ndarray:
 
 
 def _seen_slopes(measured: FitImage, here: FitState, turned, widths, known=None) -> np.ndarray:
-    """By central differences in each of `SEEN`, 0 for what `turned` has no use for.
+    """Central differences in each of `SEEN`, 0 where no unknown changes it.
 
-    Of `known` slopes only the rims' are made again.
+    Of `known` slopes only those of the edge waves are renewed.
     """
     slopes = np.zeros((measured.image.size, len(SEEN)))
     for i, name in enumerate(SEEN):
@@ -211,8 +211,8 @@ def _best_by_trial(
 ) -> FitState:
     """The start with the distance, or wavelength, and the width that fit the coarse image best.
 
-    Within `search` of the guess, in parts of one; what is not in `parameters` stays. The fringes'
-    curvature β/M² stays where β is free.
+    Within the relative range `search` of the guess, for free `parameters`. With a free β the
+    fringes' curvature β/M² is held.
     """
     tried = [n for n in ("distance", "wavelength") if n in parameters][:1]
     tried = [n for n in ("width",) if n in parameters] + tried
@@ -221,7 +221,7 @@ def _best_by_trial(
     best = start
     for turn in range(_ROUNDS):
         for name in tried:
-            # All of the range first, with where the fringes put it among the trials.
+            # The full range first, with the value from the fringes among the trials.
             middle = float(WHERE[name](guess if turn == 0 else best))
             values = middle * _trials(name, search / _TRIALS**turn, guess)
             values = np.append(values, float(WHERE[name](best)))
@@ -231,7 +231,7 @@ def _best_by_trial(
 
 
 def _trials(name: str, reach: float, guess: FitState) -> np.ndarray:
-    """Factors from 1 − reach to 1 + reach: a rim must not jump over a Fresnel zone."""
+    """Factors from 1 − reach to 1 + reach, less than a Fresnel zone apart at the rim."""
     count = _TRIALS
     if name == "width":
         zone = math.sqrt(float(guess.wavelength) * float(guess.camera.distance))
@@ -240,7 +240,7 @@ def _trials(name: str, reach: float, guess: FitState) -> np.ndarray:
 
 
 def _misfit(measured: FitImage, state: FitState) -> float:
-    """1 − ρ², with the correlation ρ of the image with the model: the best gain and background."""
+    """1 − ρ², with the correlation ρ of image and model: the misfit at the best gain and offset."""
     h = measured.model(state, ("phase",), np.zeros(1))
     return 1 - float(np.corrcoef(h, measured.image.ravel())[0, 1]) ** 2
 
@@ -250,9 +250,9 @@ def full_image(image: np.ndarray, state: FitState, pixel_integration: bool) -> F
 
 
 def coarse_image(image: np.ndarray, guess: FitState, pixel_integration: bool) -> FitImage:
-    """The image averaged over blocks about a third of a Fresnel zone wide; rests are dropped.
+    """The image averaged over blocks of about a third of a Fresnel zone; remainders are dropped.
 
-    The model is exact for these pixels as well.
+    The model is exact for these pixels, too.
     """
     pitch = float(guess.camera.sensor.pitch)
     zone = math.sqrt(float(guess.wavelength) * float(guess.camera.distance))
@@ -271,7 +271,7 @@ def coarse_image(image: np.ndarray, guess: FitState, pixel_integration: bool) ->
 
 
 def _with_linear(measured: FitImage, state: FitState, parameters: Sequence[str]) -> FitState:
-    """Background and gain by linear least squares, as far as they are free."""
+    """Fit a free background and gain by linear least squares."""
     h = measured.model(state, ("phase",), np.zeros(1))
     values = measured.image.ravel()
     flat = np.broadcast_to(np.asarray(state.flat), measured.image.shape).ravel()
@@ -282,6 +282,6 @@ def _with_linear(measured: FitImage, state: FitState, parameters: Sequence[str])
         rest = values if "gain" in free else values - h
         solution = np.linalg.lstsq(np.stack([columns[n] for n in free], axis=1), rest)[0]
         found |= dict(zip(free, solution, strict=True))
-    if not found["gain"] > 0:  # not the picture of this camera; some gain, so that it has a slope
+    if not found["gain"] > 0:  # another camera's image; some gain, so that the model has a slope
         found["gain"] = values.std() / h.std()
     return state.with_numbers(**{name: jnp.asarray(n, jnp.float64) for name, n in found.items()})

@@ -1,13 +1,12 @@
-r"""Hadamard patterns on a monitor, and the transform that undoes them (thesis Eq 5.12–5.17).
+r"""Hadamard patterns on a monitor, and their inverse transform (thesis Eq 5.12–5.17).
 
-With every cell of the object in half of the patterns, each cell is measured N/2 times at once: the
-noise of the matrix is 2/√N of that of cells lit one by one. Rows of the Hadamard matrix U′ hold
-±1, a monitor shows 0 and 1:
+Every cell of the object is lit in half of the patterns: the noise of the matrix is 2/√N of that of
+cells lit one by one. Rows of the Hadamard matrix U′ hold ±1, a monitor shows 0 and 1:
 
 .. math:: \mathbf u' = 2\mathbf u - \mathbf u_0, \qquad \mathbf v' = \mathbf H \mathbf u', \qquad
     \mathbf H = \mathbf V' \mathbf U'^T / N
 
-with the N of U′U′ᵀ = N·I that the thesis lost.
+with the factor N of U′U′ᵀ = N·I, which the thesis omits.
 """
 
 import math
@@ -26,16 +25,16 @@ Display = Literal["complementary", "binary"]
 
 @dataclass(frozen=True)
 class HadamardSeries:
-    """Sequence of patterns that a monitor shows for a calibration.
+    """Sequence of patterns for a calibration with a monitor.
 
     - `object_shape`: (rows, columns) of cells, N in all, a power of two.
-    - `order`: "sequency", by the number of changes of sign, or "natural" (Sylvester's).
-    - `display`: "binary" shows the N patterns with 0 for −1; the first is all white. Every frame's
-      offset, the dark level and stray light, then lands in the first cell's column, so that dark
+    - `order`: "sequency", by the number of sign changes, or "natural" (Sylvester's).
+    - `display`: "binary" shows the N patterns with 0 for −1; the first is all white. The offset of
+      the frames, dark level and stray light, then appears in the first cell's column, so that dark
       frames are needed. "complementary" shows each pattern and then its complement: their
-      difference has no offset, not even one that drifts slowly, and half the variance for twice
-      the frames.
-    - `dark_frames`: frames with a black monitor, the last ones; their mean is subtracted.
+      difference has no offset, not even a slowly drifting one, and half the variance for twice the
+      frames.
+    - `dark_frames`: final frames with a black monitor; their mean is subtracted.
 
     **Errors**: ValueError for a number of cells that is not a power of two, and other names.
     """
@@ -65,11 +64,11 @@ class HadamardSeries:
 
     @property
     def frame_count(self) -> int:
-        """All frames, the dark ones too."""
+        """All frames, dark ones included."""
         return self.pattern_frames + self.dark_frames
 
     def frame(self, number: int) -> UInt8[np.ndarray, "y x"]:
-        """The cells to show as frame `number`, 1 is white."""
+        """Cells of frame `number`; 1 is white."""
         if not 0 <= number < self.frame_count:
             raise ValueError(
                 f"frame {number} of {self.frame_count}: give 0 … {self.frame_count - 1}"
@@ -87,8 +86,8 @@ def hadamard_pattern(
 ) -> Int8[np.ndarray, "y x"]:
     """Row `index` of the Hadamard matrix as ±1 on the cells of an object.
 
-    The cells are numbered row by row. In natural order the sign is that of the parity of the bits
-    that index and cell share.
+    The cells are numbered row by row. In natural order the sign is the parity of the bits that
+    index and cell have in common.
     """
     count = _require_power_of_two(object_shape)
     if not 0 <= index < count:
@@ -98,9 +97,9 @@ def hadamard_pattern(
 
 
 def natural_rows(count: int, order: Order) -> Integer[np.ndarray, " pattern"]:
-    """The row of Sylvester's matrix that each pattern shows.
+    """Row of Sylvester's matrix for each pattern.
 
-    The one with s changes of sign is the bit reversal of the Gray code of s.
+    The row with s sign changes is the bit reversal of the Gray code of s.
     """
     numbers = np.arange(count)
     if order == "natural":
@@ -116,9 +115,9 @@ def walsh_hadamard(
 ) -> Float[np.ndarray, "pixel n"]:
     """W·values transposed, with Sylvester's matrix W of n rows, without a factor: W·W = n·1.
 
-    W is the Kronecker product of two small matrices: two products, H₆₄·X·H₆₄ for n = 4096, which a
-    CPU computes three times faster than butterflies. `out` takes the result, in its precision;
-    without it, that of the values, at least float32.
+    W is the Kronecker product of two small matrices, hence two products, H₆₄·X·H₆₄ for n = 4096,
+    three times faster on a CPU than butterflies. The precision is that of `out`, where given, else
+    that of the values, at least float32.
     """
     count, pixels = values.shape
     _require_power_of_two((count, 1))
@@ -133,13 +132,13 @@ def walsh_hadamard(
         part = values[:, start : start + _AT_ONCE].astype(out.dtype)
         half = (first @ part.reshape(a, -1)).reshape(a, b, -1)
         for row in range(a):
-            # The transpose costs nothing here: the product reads its factors either way.
+            # A transposed factor costs no time here.
             into = out[start : start + _AT_ONCE, row * b : (row + 1) * b]
             np.matmul(half[row].T, second, out=into)
     return out
 
 
-_AT_ONCE = 256  # pixels whose 4096 numbers stay in a CPU's cache: half the time of 8000
+_AT_ONCE = 256  # pixels whose 4096 numbers fit a CPU's cache: half the time of 8000
 
 
 def _require_power_of_two(object_shape: tuple[int, int]) -> int:

@@ -1,4 +1,4 @@
-"""The least-squares problem of a PSF fit: unknowns, model, residual, and what the fit knows."""
+"""The least-squares problem of a PSF fit: unknowns, model, residual and covariance."""
 
 import functools
 import operator
@@ -18,7 +18,7 @@ from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.masks.fza import FresnelZoneAperture
 from thincam_jax.lensless.psf import psf
 
-# What a fit may be asked for, in the order of the result's tables, and where a `FitState` has it.
+# Parameters that can be fitted, in the order of the tables, with their place in a `FitState`.
 WHERE = {
     "beta": operator.attrgetter("camera.mask.beta"),
     "phase": operator.attrgetter("camera.mask.phase"),
@@ -32,20 +32,20 @@ WHERE = {
 }
 PARAMETERS = tuple(WHERE)
 Status = Literal["ok", "ambiguous", "poor_fit", "not_converged"]
-# How far a scaled step of 1 moves the image, in parts of its contrast. The solver's damping starts
-# at 1; from a start within a fraction of a fringe that would be slow, 1/STEP² is not.
+# Change of the image for a scaled step of 1, relative to its contrast. The solver's initial damping
+# of 1 is then weak, as a start within a fraction of a fringe allows.
 STEP = 30.0
 # Of the scaled steps, and of the weighted residual in any pixel. A million pixels at 30 dB
 # determine a scaled step to some 1e-6.
 _TOLERANCE = 1e-7
-# Of a standard error: less than that in `_STEPS` steps is the end of the least squares.
+# Fraction of a standard error: convergence is a smaller change in `_STEPS` steps.
 CONVERGED = 0.1
 _STEPS = 10
 _FINEST = 1e-9  # a standard error of a step, where there is no noise
 
 
 def unknown_names(parameters: tuple[str, ...]) -> tuple[str, ...]:
-    """One name for each number that is fitted: the centre is two."""
+    """One name for each fitted number; the centre is two."""
     names = []
     for name in PARAMETERS:
         if name in parameters:
@@ -54,10 +54,10 @@ def unknown_names(parameters: tuple[str, ...]) -> tuple[str, ...]:
 
 
 class Synthesis(eqx.Module):
-    """A sum of pictures at several phases: its real part, and its imaginary one if it has one.
+    """Weighted sum of captures at several phases: its real part, and an imaginary one if complex.
 
-    - `phases`: of each picture, rad, on top of the mask's.
-    - `weights`: of the pictures in each part.
+    - `phases`: of each capture, rad, added to the mask's.
+    - `weights`: of the captures in each part.
     """
 
     phases: Float[Array, " shot"]
@@ -65,10 +65,10 @@ class Synthesis(eqx.Module):
 
 
 class FitState(eqx.Module):
-    """Everything that the picture of a point source on the axis depends on.
+    """All parameters of the image of a point source on the axis.
 
-    - `nearness`: 1/t, 1/mm; 0 is a plane wave. t itself has no value next to infinity.
-    - `synthesis`: None for one picture; else of what sum of pictures it is.
+    - `nearness`: 1/t, 1/mm; 0 is a plane wave. Unlike t, it is differentiable at infinity.
+    - `synthesis`: how several captures are summed; None for one capture.
     """
 
     camera: LenslessCamera
@@ -89,13 +89,13 @@ class FitState(eqx.Module):
 
     @property
     def flat(self) -> Float[Array, "*part"]:
-        """Image of a background of 1 in every picture."""
+        """Image of a background of 1 in every capture."""
         if self.synthesis is None:
             return jnp.ones_like(self.background)
         return jnp.sum(self.synthesis.weights, axis=1)[:, None, None]
 
     def image(self, pixel_integration: bool, grid: Grid | None = None) -> Float[Array, "*part y x"]:
-        """background + gain·h, or the sum of these, on the sensor or another grid."""
+        """background + gain·h, or the weighted sum of these, on the sensor or another grid."""
         if self.synthesis is None:
             h = self._psf(pixel_integration, grid, 0.0)
         else:
@@ -116,17 +116,17 @@ class FitState(eqx.Module):
         )
 
     def moved(self, names: tuple[str, ...], steps: Float[Array, " unknown"]) -> "FitState":
-        """With every named number away from here by a dimensionless step.
+        """State after dimensionless steps of the named parameters.
 
-        β/M², width, d and λ by the factor e^s, which keeps them positive; 1/t by s/d; the centre by
-        s pixels; phase (rad), background and gain by s. A free β follows d and t, so that the
-        fringes stay: what is left of d and t are diffraction and the size of the shadow.
+        β/M², width, d and λ change by the factor e^s, which keeps them positive; 1/t by s/d; the
+        centre by s pixels; phase (rad), background and gain by s. A free β follows d and t, so that
+        the fringes stay: d and t then act through diffraction and the size of the shadow only.
         """
         s = dict(zip(names, steps, strict=True))
         mask, pitch = self.mask, self.camera.sensor.pitch
         none = jnp.zeros_like(steps[0])
         nearness = self.nearness
-        if "object_distance" in s:  # else untouched: t(1/t) has no derivative at 0
+        if "object_distance" in s:  # else unchanged: t(1/t) has no derivative at 0
             nearness = nearness + s["object_distance"] / self.camera.distance
         offset = jnp.stack([s.get("centre_y", none), s.get("centre_x", none)])
         distance = self.camera.distance * jnp.exp(s.get("distance", none))
@@ -147,20 +147,20 @@ class FitState(eqx.Module):
         )
 
     def with_numbers(self, **numbers: Array) -> "FitState":
-        """With other numbers by their names in `PARAMETERS`; for object_distance 1/t."""
+        """State with other values by their names in `PARAMETERS`; 1/t for object_distance."""
         return eqx.tree_at(
             lambda s: [WHERE[name](s) for name in numbers], self, [*numbers.values()]
         )
 
     def values(self, names: tuple[str, ...]) -> Float[Array, " unknown"]:
-        """The named numbers: mm, rad/mm², rad; for object_distance 1/t in 1/mm."""
+        """Values of the named parameters: mm, rad/mm², rad; 1/t in 1/mm for object_distance."""
         every = {name: where(self) for name, where in WHERE.items()}
         every["centre_y"], every["centre_x"] = every["centre"]
         return jnp.stack([every[name] for name in names])
 
 
 def with_fringes_held(state: FitState, name: str, value: float, hold: bool) -> FitState:
-    """With another width, distance or wavelength; `hold`: with the β that keeps β/M²."""
+    """State with another width, distance or wavelength; `hold`: with β/M² held by β."""
     there = state.with_numbers(**{name: jnp.asarray(value, state.nearness.dtype)})
     if not hold:
         return there
@@ -171,11 +171,11 @@ def with_fringes_held(state: FitState, name: str, value: float, hold: bool) -> F
 class FitProblem(eqx.Module):
     """The data of `residual`.
 
-    - `start`: where all steps are zero.
-    - `image`: what was measured.
+    - `start`: the state of zero steps.
+    - `image`: the measured one.
     - `weight`: of the residuals.
-    - `scale`: the step of each unknown that counts as one: that which moves the image by `STEP`
-      (Marquardt's scaling, without which 1 % of β, many rad, would be damped like 1 % of a rad).
+    - `scale`: the step of each unknown that changes the image by `STEP` (Marquardt's scaling,
+      without which 1 % of β, many rad, would be damped like 1 % of a rad).
     - `names`, `pixel_integration`: as in `unknown_names` and `psf`; static.
     """
 
@@ -190,7 +190,7 @@ class FitProblem(eqx.Module):
 class Solution(eqx.Module):
     """Result of Levenberg-Marquardt, with its number of steps.
 
-    - `moved`: by how many of the standard errors the last `_STEPS` steps moved each unknown.
+    - `moved`: change of each unknown in the last `_STEPS` steps, in standard errors.
     """
 
     scaled: Float[Array, " unknown"]
@@ -199,7 +199,7 @@ class Solution(eqx.Module):
 
 
 def state_at(scaled: Float[Array, " unknown"], problem: FitProblem) -> FitState:
-    """The numbers for the steps `scaled`·`problem.scale`."""
+    """State after the steps `scaled`·`problem.scale`."""
     return problem.start.moved(problem.names, scaled * problem.scale)
 
 
@@ -218,15 +218,15 @@ def model(
     grid: Grid,
     offset: Float[Array, "2"],
 ) -> Float[Array, "*part y x"]:
-    """The image after the steps, on a grid whose middle is `offset` (y, x, mm) off the sensor's."""
+    """Image after the steps, on a grid centred `offset` (y, x, mm) from the sensor's centre."""
     state = start.moved(names, steps)
-    # The grid's middle is its origin: the mask moves the other way.
+    # The grid's centre is its origin, so the mask moves the other way.
     state = state.with_numbers(centre=state.mask.centre - offset / state.magnification)
     return state.image(pixel_integration, grid)
 
 
-# What the image depends on, each moved by its own step: β/M², φ, M·centre, M·width, λdM, and what
-# is linear. d and t act through M and λdM only, so that λ's step stands for that of λdM.
+# Independent parameters of the image, each with its own step: β/M², φ, M·centre, M·width, λdM, and
+# the linear ones. d and t act through M and λdM only, so that λ's step is that of λdM.
 SEEN = ("beta", "phase", "centre_y", "centre_x", "width", "wavelength", "background", "gain")
 
 
@@ -234,7 +234,7 @@ SEEN = ("beta", "phase", "centre_y", "centre_x", "width", "wavelength", "backgro
 def seen_by_steps(
     start: FitState, names: tuple[str, ...], steps: Float[ArrayLike, " step"]
 ) -> Float[Array, "seen step"]:
-    """Shift of each of `SEEN` with each step: exact, also for steps of equal effect."""
+    """Derivative of `SEEN` in the steps: exact, also for steps of equal effect."""
     return jax.jacfwd(_seen)(steps, start, names)
 
 
@@ -267,15 +267,15 @@ def values_by_steps(
 def state_and_residual(
     scaled: Float[Array, " unknown"], problem: FitProblem
 ) -> tuple[FitState, Float[Array, "*part y x"]]:
-    """The numbers, and measured image − model."""
+    """State, and measured image − model."""
     return state_at(scaled, problem), -residual(scaled, problem) / problem.weight
 
 
 def solve(problem: FitProblem, errors: Float[np.ndarray, " unknown"], max_steps: int) -> Solution:
-    """Levenberg-Marquardt from `problem.start`, as long as it moves by parts of the errors.
+    """Levenberg-Marquardt from `problem.start` until changes are small against the errors.
 
-    `errors`: standard errors of the steps from the start. Anew every few steps: where the waves of
-    the rims make the sum of squares ripple, the damping grows until nothing moves, minimum or not.
+    `errors`: standard errors of the steps. It restarts every few steps, because in the ripples that
+    the edge waves cause the damping would grow until nothing moves, at a minimum or not.
     """
     errors = np.maximum(errors, _FINEST) / np.asarray(problem.scale)
     found, moved, iterations = jnp.zeros_like(problem.scale), np.inf * errors, 0
@@ -292,19 +292,19 @@ def _least_squares(problem: FitProblem, start: Float[Array, " unknown"]):
     return optx.least_squares(residual, solver, start, problem, max_steps=_STEPS, throw=False)
 
 
-# Two numbers of correlation ρ have standard errors 1/√(1−ρ²) times those they would have if the
-# other were known: at 0.999, 22 times. The image then holds one combination of the two by more than
-# a digit better than either, and any small flaw of the model goes into the difference.
+# Two parameters of correlation ρ have standard errors 1/√(1−ρ²) times those with the other one
+# known: at 0.999, 22 times. The image then determines one combination more than ten times better
+# than either, and any small flaw of the model biases the difference.
 AMBIGUOUS = 0.999
-# The smallest eigenvalue, relative to the unit diagonal, that is not rounding.
+# Smallest eigenvalue, relative to the unit diagonal, above rounding.
 _SMALLEST = 1e-13
-# Smallest eigenvalue of JᵀJ with a unit diagonal, where two numbers have that correlation.
+# Smallest eigenvalue of JᵀJ with a unit diagonal for two parameters of that correlation.
 _HARDLY_SEEN = 1 - AMBIGUOUS
 
 
 @dataclass(frozen=True, eq=False)
 class Covariance:
-    """Of the unknowns of a fit, in their order."""
+    """Standard errors and correlations of the unknowns of a fit."""
 
     standard_errors: np.ndarray
     correlation: np.ndarray
@@ -313,9 +313,9 @@ class Covariance:
 def covariance(curvature: np.ndarray, variance: float | np.ndarray) -> Covariance:
     """σ²(JᵀJ)⁻¹, or (JᵀJ)⁻¹V(JᵀJ)⁻¹, as standard errors and correlations.
 
-    `curvature`: JᵀJ. `variance`: σ² of a residual, taken as white, or V, that of Jᵀr. A direction
-    that the data do not see at all has, in place of an infinite error, that of an eigenvalue at the
-    rounding's level: about 1e6 times the error of a number that is seen.
+    `curvature`: JᵀJ. `variance`: σ² of a white residual, or V, the covariance of Jᵀr. An
+    undetermined direction gets, in place of an infinite error, that of an eigenvalue at rounding
+    level: some 1e6 times the error of a well-determined one.
     """
     norm = np.sqrt(np.diag(curvature))
     norm = np.where(norm > 0, norm, norm.max() * _SMALLEST or 1.0)
@@ -331,7 +331,7 @@ def covariance(curvature: np.ndarray, variance: float | np.ndarray) -> Covarianc
 
 
 def of_values(steps: Covariance, slopes: np.ndarray) -> Covariance:
-    """The covariance of values from that of steps, with ∂values/∂steps."""
+    """Covariance of values from that of steps, with `slopes` ∂values/∂steps."""
     scaled = slopes * steps.standard_errors
     whole = scaled @ steps.correlation @ scaled.T
     errors = np.sqrt(np.diag(whole))
@@ -342,9 +342,9 @@ def of_values(steps: Covariance, slopes: np.ndarray) -> Covariance:
 def verdict(
     alike: Sequence[str], poor: str = "", unfinished: str = ""
 ) -> tuple[Status, tuple[str, ...]]:
-    """A fit's status and its reasons, the worst first.
+    """Status of a fit and its reasons, the worst first.
 
-    `alike`: one line for each number that the data do not hold; `poor`: why it is another picture;
+    `alike`: one line for each undetermined parameter; `poor`: why the model does not fit;
     `unfinished`: how the least squares stopped.
     """
     status: Status = "ambiguous" if alike else "ok"
@@ -356,21 +356,19 @@ def verdict(
 
 
 def ambiguous_pairs(names: tuple[str, ...], correlation: np.ndarray) -> list[str]:
-    """One line for each pair of unknowns that the data cannot tell apart, most alike first."""
+    """One line for each pair of indistinguishable unknowns, the most correlated first."""
     rows, columns = np.triu_indices(len(names), 1)
-    found = [
-        (
-            abs(rho),
-            f"{names[i]} and {names[j]} cannot be told apart: their correlation is {rho:.6f}",
-        )
-        for i, j, rho in zip(rows, columns, correlation[rows, columns], strict=True)
-        if abs(rho) > AMBIGUOUS
+    pairs = sorted(zip(-abs(correlation[rows, columns]), rows, columns, strict=True))
+    return [
+        f"{names[i]} and {names[j]} cannot be told apart: their correlation is "
+        f"{correlation[i, j]:.6f}; fix one of them"
+        for rho, i, j in pairs
+        if -rho > AMBIGUOUS
     ]
-    return [text + "; fix one of them" for _, text in sorted(found, reverse=True)]
 
 
 def hardly_seen(names: tuple[str, ...], curvature: np.ndarray) -> list[str]:
-    """One line for each combination of numbers that the data hardly see, the worst first."""
+    """One line for each poorly determined combination of parameters, the worst first."""
     norm = np.sqrt(np.diag(curvature))
     unseen = [names[index] for index in np.flatnonzero(norm == 0)]
     lines = [f"these data do not see {name} at all; hold it" for name in unseen]

@@ -19,13 +19,13 @@ from thincam_jax._core.precision import allow
 from thincam_jax.measured.calibration.problem import Status, verdict
 from thincam_jax.measured.raw import image_with_contrast
 
-_LOBES = 5  # of the interpolation's kernel (Lanczos) on either side
-_COARSE = 128  # pixels a side, about, of the images in which the start is searched
-_SMALLEST = 32  # pixels a side: less leaves nothing between the margins
-_BLOCK = 24  # pixels a side of the blocks whose errors count as independent
+_LOBES = 5  # of the Lanczos kernel on either side
+_COARSE = 128  # approximate pixels a side of the images for the initial search
+_SMALLEST = 32  # pixels a side; less leaves nothing between the margins
+_BLOCK = 24  # pixels a side of blocks with independent errors
 _LEAST_CORRELATION = 0.5
 _TOLERANCE = 1e-6  # pixels
-_WEIGHT = 1e3  # of residuals: the solver starts with a damping of 1, which is to be weak
+_WEIGHT = 1e3  # of residuals, so that the solver's initial damping of 1 is weak
 
 
 class Registration(Module):
@@ -33,10 +33,10 @@ class Registration(Module):
 
     - `scale`: of the image over the reference; `shift`: (y, x), pixels.
     - `scale_error`, `shift_error`: their standard errors.
-    - `correlation`: of the image with the registered reference, over what both show; 1 is perfect.
-    - `registered`: the reference, enlarged and moved onto the image.
+    - `correlation`: of the image with the registered reference where they overlap; 1 is perfect.
+    - `registered`: the reference, scaled and shifted onto the image.
     - `status`: "ok"; "poor_fit" where the correlation is under 0.5; "not_converged".
-    - `reasons`: one line for each thing that is not as it should be.
+    - `reasons`: one line for each problem.
     """
 
     scale: Float[Array, ""]
@@ -65,32 +65,31 @@ def estimate_registration(
 
     with r in pixels from the middle. For captures of one scene at two mask-sensor distances (the
     thesis' method A) s = d/d_ref: a scene point's shadow moves by d/t. `reconstruct.registration`
-    then takes the ratio 1/s; a shift says that the mask moved sideways with the distance.
+    then takes the ratio 1/s; a shift means that the mask moved sideways with the distance.
 
-    **What it acts on.** Images that *scale*: reconstructions of the scene, one for each distance
-    (a Wiener filter of that distance alone, or fringe scanning), on the sensor's pitch. Raw
-    captures of a zone aperture do not scale: their fringes have the curvature β/M² at every
-    distance, and only the places of the shadows' centres move with d. Given raw captures, it fits
-    whatever dominates them. The images may differ in brightness and contrast. Rotation is not
-    fitted.
+    **Input.** Images that *scale*: reconstructions of the scene, one for each distance (a Wiener
+    filter of that distance alone, or fringe scanning), on the sensor's pitch. Raw captures of a
+    zone aperture do not scale: their fringes have the curvature β/M² at every distance, and only
+    the centres of the shadows move with d. The images may differ in brightness and contrast.
+    Rotation is not fitted.
 
-    Phase correlation of small images finds the shift for each of a row of scales, and the best of
-    them is where least squares start, in the small images first. In double precision.
+    Phase correlation of small images gives a shift for each of several scales; least squares start
+    from the best, first on the small images. In double precision.
 
-    **Standard errors** count the residual as it is, noise that is correlated over less than 24
-    pixels and misfits included (sums over blocks of pixels, Liang and Zeger's estimate).
+    **Standard errors** include misfits, and noise that is correlated over less than 24 pixels (sums
+    over blocks of pixels, Liang and Zeger's estimate).
 
     **Arguments**
 
     - `capture`, `reference`: (y, x), of one shape, at least 32 pixels a side.
-    - `scale`: where to look, such as d/d_ref as set on the stage; > 0.
-    - `search`: how far from there, in parts of one, at most 0.5.
-    - `smoothing`: Gaussian, its σ in pixels of the reference, of both images before they are
-      compared, so that neither noise nor interpolation draws the result to whole pixels; 0 is none.
+    - `scale`: initial value, such as d/d_ref as set on the stage; > 0.
+    - `search`: relative search range, at most 0.5.
+    - `smoothing`: σ, in pixels of the reference, of a Gaussian filter of both images, which keeps
+      noise and interpolation from biasing the result to whole pixels; 0: none.
     - `max_steps`: of Levenberg-Marquardt.
 
-    **Validity.** Both must show the same part of the scene for the most part: what one shows alone
-    is left out where it lies outside the other, but counts where it lies behind an edge.
+    **Validity.** Both must show mostly the same part of the scene: what one shows beyond the edges
+    of the other is ignored, but what is occluded counts.
 
     **Errors**: ValueError, one line, for images that are not finite, of different shapes, without
     contrast or too small, and for numbers out of range.
@@ -138,8 +137,8 @@ class Pair(eqx.Module):
 def residual(unknowns: Float[Array, "5"], pair: Pair) -> Float[Array, "y x"]:
     """(offset + gain·reference((r − a)/s) − capture)·weights.
 
-    The unknowns: the change of s from its start, in pixels at the image's edge, that of a (y, x) in
-    pixels, gain and offset.
+    The unknowns: the change of s, in pixels at the image's edge, that of a (y, x) in pixels, gain
+    and offset.
     """
     scale, shift = _place(unknowns, pair)
     model = unknowns[4] + unknowns[3] * resample(pair.reference, scale, shift)
@@ -152,9 +151,8 @@ def resample(
     """image((r − shift)/scale) on the image's own pixels, r in pixels from the middle.
 
     The image is enlarged about its middle by `scale`, then moved by `shift` (y, x), by separable
-    Lanczos interpolation, differentiable in both. What comes from beyond its edges is 0; near them
-    the outermost pixels count for more: use `covered` to leave that out. A scale well under 1
-    aliases what is finer than the enlarged pixels.
+    Lanczos interpolation, differentiable in both. Beyond its edges it is 0; near them the outermost
+    pixels have more weight: exclude them with `covered`. A scale well under 1 causes aliasing.
     """
     middle = jnp.asarray(image.shape, scale.dtype) / 2
     return jax.image.scale_and_translate(
@@ -171,9 +169,9 @@ def resample(
 def covered(
     shape: tuple[int, int], scale: Float[Array, ""], shift: Float[Array, "2"], margin: int
 ) -> Float[Array, "y x"]:
-    """1 where a resampled image comes from inside, `margin` pixels off the edge, 0 elsewhere.
+    """1 where a resampled image comes from at least `margin` pixels inside its edges, else 0.
 
-    The border of the result, `margin` wide, is left out as well.
+    The border of the result, `margin` wide, is 0 as well.
     """
     sides = []
     for count, offset in zip(shape, shift, strict=True):
@@ -199,7 +197,7 @@ def _least_squares(pair: Pair, max_steps: int):
 def _fit(capture, reference, start: Place, smoothing: float, max_steps: int):
     """Least squares from `start` on images of unit contrast, smoothed on the scene's scale.
 
-    The place, the pair, the unknowns found for it and whether the solver converged.
+    Returns the place, the pair, its fitted unknowns and whether the solver converged.
     """
     smooth = [
         scipy.ndimage.gaussian_filter(image, sigma, mode="nearest")
@@ -218,9 +216,9 @@ def _fit(capture, reference, start: Place, smoothing: float, max_steps: int):
 
 
 def _phase_correlation(capture, reference, scale: float, search: float) -> Place:
-    """The scale whose enlarged reference has the highest peak of phase correlation, and its shift.
+    """Scale with the highest peak of phase correlation, and its shift.
 
-    Scales in steps that move the edge by half a pixel.
+    The scales move the edge in steps of half a pixel.
     """
     window = np.outer(*(np.hanning(n + 2)[1:-1] for n in capture.shape))
     spectrum = np.fft.fft2((capture - capture.mean()) * window)
@@ -234,7 +232,7 @@ def _phase_correlation(capture, reference, scale: float, search: float) -> Place
         inside = np.asarray(covered(capture.shape, jnp.asarray(tried, jnp.float64), none, 0))
         cross = spectrum * np.fft.fft2(enlarged * inside * window).conj()
         strength = np.abs(cross)
-        # A phase counts by its strength up to the usual one: weak ones are noise.
+        # Weak components, mostly noise, get less weight.
         peak = np.fft.ifft2(cross / (strength + np.mean(strength))).real
         row, column = np.unravel_index(np.argmax(peak), peak.shape)
         if peak[row, column] > best:
@@ -281,7 +279,7 @@ def _report(
 
 
 def _standard_errors(pair: Pair, unknowns: Array) -> np.ndarray:
-    """Of the unknowns: (JᵀJ)⁻¹ S (JᵀJ)⁻¹ with S = Σ_block (Jᵀr)(Jᵀr)ᵀ, r summed over blocks."""
+    """Of the unknowns, from (JᵀJ)⁻¹ S (JᵀJ)⁻¹ with S = Σ_block (Jᵀr)(Jᵀr)ᵀ."""
     jacobian, values = (np.asarray(v) for v in _linearised(unknowns, pair))
     scores = jacobian * values[..., None]
     rows, columns = (n - n % _BLOCK for n in values.shape)

@@ -1,6 +1,6 @@
-r"""`fit_screen`: the numbers of a see-through screen from its matrix, or a few of its ghosts.
+r"""`fit_screen`: the parameters of a see-through screen from its matrix, or a few of its ghosts.
 
-A matrix holds for the distance at which it was measured. The rays that explain it hold for all.
+A matrix is valid for the distance at which it was measured, the fitted rays for all.
 """
 
 import operator
@@ -34,7 +34,7 @@ from thincam_jax.waveguide import (
 )
 from thincam_jax.waveguide.system import seen_size
 
-# What can be fitted, its unit, and a step that is small against what it does to an image.
+# Parameters that can be fitted, with unit and a step of small effect on an image.
 PARAMETERS = {
     "glass_thickness": (unchecked("mm"), 0.01),
     "lens_distance": (unchecked("mm"), 0.1),
@@ -56,15 +56,15 @@ DEFAULT = ("glass_thickness", "lens_distance", "slant", "tilt", "object_x", "obj
 
 _PIXELS = 400  # of the sensor whose rows of the matrix are fitted
 _BLURS = (2.0, 0.7, 0.0)  # cells, one after another
-_AGAIN = 8  # times at most, until the smear is that of the screen that is found
+_AGAIN = 8  # repetitions at most, until the smear is that of the fitted screen
 _STEPS = 60
-_TOLERANCE = 1e-5  # of steps that change the residual by a tenth, and of the squares
-_EXPLAINED = 0.5  # of the matrix' squares, or it is another camera's
-_UNEXPLAINED = 5.0  # standard deviations of χ² of positions above its mean
+_TOLERANCE = 1e-5  # of scaled steps, and of the squares
+_EXPLAINED = 0.5  # of the matrix' squares, at least
+_UNEXPLAINED = 5.0  # standard deviations of χ² of positions, at most
 
 
 class GhostPositions(eqx.Module):
-    """Where pixels see the object: a dot on a monitor, and the pixels that its ghosts light.
+    """Object points seen by pixels: a dot on a monitor, and the pixels lit by its ghosts.
 
     - `pixels`: (x, y) on the sensor, mm from its middle, (ghost, 2).
     - `points`: of the object, (x, y) mm from its middle, (ghost, 2).
@@ -90,15 +90,15 @@ class GhostPositions(eqx.Module):
 class ScreenFit(Module):
     """Result of `fit_screen`.
 
-    - `camera`, `plane`: as given, with the fitted numbers. `gain`: the matrix over the model's.
-    - `values`, `standard_errors`: of what was fitted. The errors are √(σ²(JᵀJ)⁻¹) with the
-      residual's own σ for a matrix, the given one for positions; what the model leaves out is not
-      in them.
+    - `camera`, `plane`: as given, with the fitted parameters. `gain`: ratio of the matrix to the
+      model's.
+    - `values`, `standard_errors`: of the fitted parameters. The errors are √(σ²(JᵀJ)⁻¹) with the
+      residual's own σ for a matrix, the given one for positions, without errors of the model.
     - `correlation`: of the errors, in the order of `values`.
-    - `explained`: part of the measured squares that the model explains.
-    - `status`: "ok"; "ambiguous", where some numbers cannot be told apart by these data;
-      "poor_fit"; "not_converged". The first that applies, from the last to the first.
-    - `reasons`: one line for each thing that is not as it should be.
+    - `explained`: fraction of the measured squares that the model explains.
+    - `status`: "ok"; "ambiguous", where the data do not distinguish some parameters; "poor_fit";
+      "not_converged". The last that applies.
+    - `reasons`: one line for each problem.
     """
 
     camera: SeeThroughCamera
@@ -114,11 +114,11 @@ class ScreenFit(Module):
     samples: int | None = eqx.field(static=True)
 
     def system(self, plane: ObjectPlane) -> Scaled:
-        """The matrix for an object at another distance, in the unit of the measured one."""
+        """Matrix for an object at another distance, in the unit of the measured one."""
         return Scaled(system_operator(self.camera, plane, self.orders, self.samples), self.gain)
 
 
-# Where a state has what a step is added to, and which entry of a vector it is.
+# Place in a state of the value to which a step is added, and its entry in a vector.
 _PLACES = {
     "glass_thickness": ("camera.screen.glass_thickness", ...),
     "lens_distance": ("camera.lens_distance", ...),
@@ -178,7 +178,7 @@ class _State(eqx.Module):
 
 
 def _turned(grating: Float[Array, "3"], name: str, angle) -> Float[Array, "3"]:
-    """K with its slant from the film's normal changed in its own plane, or turned about it."""
+    """K with its slant from the film's normal changed, or turned about that normal."""
     x, y, z = grating
     cos, sin = jnp.cos(angle), jnp.sin(angle)
     if name == "tilt":
@@ -189,12 +189,12 @@ def _turned(grating: Float[Array, "3"], name: str, angle) -> Float[Array, "3"]:
 
 
 class _Problem(eqx.Module):
-    """Measured numbers and where they come from.
+    """Data of the least squares.
 
-    `names`: of what is fitted; `count`: of ghosts' orders.
-    `unit`: of steps. `scale`: one over the residual's unit. `full`: mean weight of a pixel.
-    `smear`: of equal parts of the band from the Bragg wavelength's points, mm. It changes by a
-    small part where the screen does: each blur takes it from its start.
+    `names`: of the parameters; `count`: number of orders. `unit`: of steps. `scale`: one over the
+    residual's unit. `full`: mean weight of a pixel. `smear`: offsets, mm, of equal parts of the
+    band from the Bragg wavelength's points. It changes little with the screen and is renewed from
+    the start of each blur.
     """
 
     start: _State
@@ -228,31 +228,31 @@ def fit_screen(
         a_{pc}\big(\mathbf P_i(p)\big) \Big]^2
         \qquad \text{or} \qquad \sum_g \frac{|\mathbf P_{i_g}(p_g) - \mathbf P_g|^2}{\sigma^2}
 
-    with the rays of `trace`, for each part of the band, and the part a of a pixel's view that lies
-    in a cell; a ghost's position is the centroid of its band. Rows of the matrix are first blurred
-    over the cells, then less and less: from a start whose ghosts are a few cells off. The band's
-    smear is that of the start, so that it is fitted again until nothing moves.
-    Levenberg-Marquardt (`optimistix`), in double precision, on 400 pixels spread over the sensor.
+    with the rays of `trace`, for each part of the band, and the fraction a of a pixel's view within
+    a cell; a ghost's position is the centroid of its band. Rows of the matrix are first blurred
+    over the cells, then less and less, for starts whose ghosts are a few cells off. The band's
+    smear is held in each fit, which is repeated until nothing changes. Levenberg-Marquardt
+    (`optimistix`), in double precision, on 400 pixels spread over the sensor.
 
-    **What the data can tell.** At one distance only d1 + d2 acts. Points depend on the fringes'
-    direction, `slant` and `tilt`, not on their period: the two recording angles act by half their
-    difference (the slant), and shrinkage is a slant too, but for its small part in the weights. The
-    film acts on the weights only. `status` and `reasons` name what the data leave open.
+    **Identifiability.** At one distance only d1 + d2 acts. Points depend on the fringes' direction,
+    `slant` and `tilt`, not on their period: the two recording angles act through half their
+    difference (the slant), and shrinkage acts as a slant, too, except for small changes of the
+    weights. The film acts on the weights only. `status` and `reasons` name undetermined parameters.
 
     **Arguments**
 
     - `measured`: H from `recover_matrix`, or `GhostPositions`.
-    - `camera`, `plane`: the start; the plane as it was when H was measured.
+    - `camera`, `plane`: initial values; the plane as in the measurement of H.
     - `parameters`: of "glass_thickness", "lens_distance", "focal_distance", "index" (of film and
       glass), "slant" (of the fringes' normal from the plate's), "tilt" (of the plane of recording
       about the plate's normal), "plate_x", "plate_y" (the plate's own tilt, about x and y),
       "shrinkage" (further, of the film), "film_thickness", "index_modulation", "object_distance",
       "object_x", "object_y". The gain of a matrix is always fitted. All others are held.
-    - `orders`: how many ghosts. `samples`: parts of the band of each pixel and order, as of
+    - `orders`: number of ghosts. `samples`: parts of the band of each pixel and order, as in
       `system_operator`; None for a matrix without smear, such as a simulated one.
 
-    **Errors**: MeasurementError (a ValueError), one line, for a matrix of other sizes than the
-    plane and the sensor, fewer numbers than unknowns, and unknown parameters.
+    **Errors**: MeasurementError (a ValueError), one line, for a matrix whose sizes differ from the
+    plane's and sensor's, fewer data than unknowns, and unknown parameters.
     """
     if isinstance(parameters, str) or not parameters or len(set(parameters)) < len(parameters):
         raise ValueError(f"parameters = {parameters!r}: give a tuple of different names")
@@ -282,7 +282,7 @@ def fit_screen(
             converged = bool(solution.result == optx.RESULTS.successful)
             problem = replace(problem, start=problem.state(solution.value))
             if number >= len(blurs) - 1:
-                # Errors by the residual's own size: positions may be worse than their deviation.
+                # Errors from the residual itself: positions may be worse than their deviation.
                 curvature, squares, freedom = _known(problem)
                 errors = covariance(curvature, squares / freedom).standard_errors
                 # Steps end at the solver's tolerance, whatever the noise.
@@ -319,7 +319,7 @@ def _of_matrix(measured: Matrix, start: _State, names: tuple[str, ...], orders: 
         )
     zero, one, none = jnp.zeros(()), jnp.ones(()), jnp.zeros((1, 1, 1, 2))
     problem = _Problem(start, kept, pixels, None, one[None], one, full, zero, none, names, orders)
-    # The gain is linear: what fits best at the start, at the widest blur.
+    # The gain is linear: the best one at the start, at the widest blur.
     problem = _blurred(problem, kept, _BLURS[0])
     model = _model(start, problem)
     gain = jnp.sum(model * problem.measured) / jnp.sum(model**2)
@@ -340,7 +340,7 @@ def _of_positions(
 
 
 def _smear(problem: _Problem, samples: int | None) -> Array:
-    """Where parts of the band come from, less the Bragg wavelength, (order, pixel, sample, 2)."""
+    """Offsets of parts of the band from the Bragg wavelength, (order, pixel, sample, 2)."""
     if samples is None:
         return jnp.zeros((1, 1, 1, 2))
     camera, distance = problem.start.camera, problem.start.plane.distance
@@ -350,7 +350,7 @@ def _smear(problem: _Problem, samples: int | None) -> Array:
 
 
 def _blurred(problem: _Problem, rows: Array, blur: float) -> _Problem:
-    """The measured rows with their cells blurred; positions are as they are."""
+    """Problem with the measured rows blurred over the cells; positions are unchanged."""
     if problem.orders is not None:
         return problem
     if blur > 0:
@@ -360,7 +360,7 @@ def _blurred(problem: _Problem, rows: Array, blur: float) -> _Problem:
 
 
 def _scaled(problem: _Problem) -> _Problem:
-    """With steps that each change the residual by a tenth of what was measured."""
+    """Problem whose unit steps each change the residual by a tenth of the data's norm."""
     units = jnp.asarray([PARAMETERS[n][1] if n in PARAMETERS else 1.0 for n in problem.names])
     lengths = jnp.linalg.norm(_jacobian(replace(problem, unit=units)), axis=0)
     size = 0.1 * jnp.linalg.norm(problem.measured * problem.scale)
@@ -403,7 +403,7 @@ def _model(state: _State, problem: _Problem):
 
 
 def _parts(points, plane: ObjectPlane, axis: int, size, blur):
-    """Part of an interval of that size about each point that lies in each cell of an axis.
+    """Fraction of an interval of that size about each point within each cell of an axis.
 
     The second difference of F(u) = ∫ Φ(v/σ) dv with the normal distribution Φ, max(u, 0) for σ = 0.
     """
@@ -422,13 +422,13 @@ def _parts(points, plane: ObjectPlane, axis: int, size, blur):
 
 
 def _mean_weight(camera: SeeThroughCamera, plane: ObjectPlane, pixels, orders: int):
-    """Of a pixel's ghosts together, as `system_operator` takes it for 1."""
+    """Mean total weight of a pixel's ghosts, which is 1 in `system_operator`."""
     rays = trace(camera, pixels, plane.distance, orders)
     return jnp.mean(jnp.sum(rays.weight, axis=0))
 
 
 def _known(problem: _Problem):
-    """JᵀJ, the residual's squares, and its degrees of freedom."""
+    """JᵀJ, the residual's sum of squares, and its degrees of freedom."""
     residual = np.asarray(_residual(jnp.zeros_like(problem.unit), problem))
     slopes = np.asarray(_jacobian(problem))
     curvature, squares = slopes.T @ slopes, float(residual @ residual)

@@ -1,12 +1,12 @@
-r"""A FlatCam's matrices from captures of stripes, or of a few known images.
+r"""The matrices of a FlatCam from captures of stripes, or of a few known images.
 
-A monitor that shows row i of the image as a stripe, and then column j, gives captures
+With row i of the image, and then column j, shown as a stripe, the captures are
 
 .. math:: G_i = P e_i\,(Q 1)^T, \qquad G'_j = P 1\,(Q e_j)^T
 
 of rank one (Asif et al., IEEE Trans. Comput. Imaging 3, 384, 2017, section V). Their columns are
-those of P, their rows those of Q. All stripes of one direction share a factor, Q1 or P1: one
-decomposition of all of them finds it, also where a single stripe drowns in noise.
+those of P, their rows those of Q. All stripes of one direction share a factor, Q1 or P1, which one
+joint decomposition finds even where single stripes are lost in noise.
 """
 
 from dataclasses import dataclass
@@ -23,19 +23,19 @@ from thincam_jax.imaging.operators import Separable
 from thincam_jax.measured.calibration.hadamard import natural_rows, walsh_hadamard
 
 Shown = Literal["stripes", "hadamard"]
-# Of the second singular value over what noise makes of it, and over the first.
-_NOTICED, _WORTH = 1.5, 0.02
-# Of the Gram matrix, what holds the alternating solutions to the last where images say nothing.
-_HOLD = {"float32": 1e-5, "float64": 1e-9}
+# A second singular value is reported above this multiple of its noise, and of the first one.
+_SIGNIFICANT, _RELEVANT = 1.5, 0.02
+# Proximal weight of the previous estimate, relative to the Gram matrix.
+_PROXIMAL = {"float32": 1e-5, "float64": 1e-9}
 
 
 class SeparableFit(Module):
-    """A separable camera that was measured.
+    """A measured separable camera.
 
-    - `operator`: for images of 1 where the monitor is white; light adds up linearly.
-    - `residual`: what it misses of the captures, noise included, relative L2.
+    - `operator`: for images that are 1 where the monitor is white.
+    - `residual`: relative L2 residual of the captures, noise included.
     - `status`: "ok", "converged", or "iterations_exhausted".
-    - `reason`: what was noticed: captures that one term does not explain. Else empty.
+    - `reason`: warning about captures that one term does not explain; else empty.
     """
 
     operator: Separable
@@ -47,18 +47,18 @@ class SeparableFit(Module):
 def calibrate_separable(
     rows: Num[np.ndarray, "m y x"], columns: Num[np.ndarray, "n y x"], *, shown: Shown = "stripes"
 ) -> SeparableFit:
-    """P and Q of one term from captures of stripes, without their dark level.
+    """P and Q of one term from captures of stripes, minus their dark level.
 
     **Arguments**
 
-    - `rows`, `columns`: captures of each row of the image lit from end to end, and of each column.
-    - `shown`: "hadamard" if stripes have shown the rows of a Hadamard matrix of ±1 by number of
-      changes of sign (`HadamardSeries`): captures are then differences of complementary frames,
-      and their number a power of two. Each stripe is measured by all of them: 2/√n of the noise.
+    - `rows`, `columns`: captures of each row of the image fully lit, and of each column.
+    - `shown`: "hadamard" if the stripes showed the rows of a Hadamard matrix of ±1 in sequency
+      order (`HadamardSeries`): captures are then differences of complementary frames, and their
+      number a power of two. Each stripe is measured in all of them, with 2/√n of the noise.
 
-    The half of a mask of ±1 that is uniform light makes a second term. Captures that are `centred`
-    are free of it if the shadow overfills the sensor; else `reason` says so, and `fit_separable`
-    takes two terms.
+    The uniform part of a mask (1 + c dᵀ)/2 of codes ±1 makes a second term. `centred` captures are
+    free of it if the shadow overfills the sensor; else `reason` warns, and `fit_separable` takes
+    two terms.
 
     **Errors**: ValueError for captures that are no stacks of one size, or are dark.
     """
@@ -91,19 +91,19 @@ def fit_separable(
     iterations: int = 200,
     tolerance: float = 1e-6,
 ) -> SeparableFit:
-    r"""The matrices of one or several terms from captures of known images, by alternating squares.
+    r"""Matrices of one or several terms from captures of known images, by least squares.
 
     .. math:: \min \sum_j \Big\|\sum_k P_k X_j Q_k^T - G_j\Big\|^2
 
     for all P_k and for all Q_k in turn, each a linear problem (proximal alternating least squares).
-    Random images serve best.
+    Random images are best.
 
     **Arguments**
 
-    - `images`, `captures`: at least three, without the dark level. Two or fewer do not tell P X Qᵀ
-      from P G X H Qᵀ.
-    - `start`: from stripes or from the design of the camera (`separable_operator`), with as many
-      terms as are wanted.
+    - `images`, `captures`: at least three, minus the dark level. Two or fewer do not distinguish
+      P X Qᵀ from P G X H Qᵀ.
+    - `start`: from stripes or from the design of the camera (`separable_operator`), with the
+      number of terms to fit.
     - `iterations`: at most. `tolerance`: of the change of the residual, relative to the captures.
 
     **Errors**: ValueError for numbers and sizes that do not fit.
@@ -135,7 +135,7 @@ def fit_separable(
 
 @jax.jit(static_argnames="iterations")
 def _alternate(images, captures, pair, tolerance, iterations: int):
-    """P, Q, the residual and its last change, for captures of length 1 in all."""
+    """P, Q, the residual and its last change, for captures of unit norm."""
     turned = jnp.swapaxes(images, 1, 2), jnp.swapaxes(captures, 1, 2)
 
     def step(carry):
@@ -158,12 +158,12 @@ def _alternate(images, captures, pair, tolerance, iterations: int):
 
 
 def _solved(images, captures, other, last):
-    """All P_k that explain the captures best with these Q_k, near the last where none is told."""
+    """All P_k that fit the captures best for given Q_k, regularised towards the previous ones."""
     terms, rows, m = last.shape
     seen = jnp.einsum("jmn,kxn->jkmx", images, other, precision="highest")
     seen = seen.reshape(len(images), terms * m, -1)
     gram = jnp.einsum("jax,jbx->ab", seen, seen, precision="highest")
-    hold = _HOLD[str(last.dtype)] * jnp.trace(gram) / len(gram) + jnp.finfo(last.dtype).tiny
+    hold = _PROXIMAL[str(last.dtype)] * jnp.trace(gram) / len(gram) + jnp.finfo(last.dtype).tiny
     flat = jnp.swapaxes(last, 0, 1).reshape(rows, -1)
     right = jnp.einsum("jax,jyx->ay", seen, captures, precision="highest") + hold * flat.T
     held = gram + hold * jnp.eye(len(gram), dtype=gram.dtype)
@@ -173,10 +173,10 @@ def _solved(images, captures, other, last):
 
 @dataclass(frozen=True, eq=False)
 class _Factor:
-    """Stripes as products with one vector that all share.
+    """Stripes as products with one shared vector.
 
-    - `own`: (y, stripe). `shared`: (x), of length 1. `whole`, `rest`: lengths of the captures and
-      of what is left of them. `reason`: what is seen of a second term.
+    - `own`: (y, stripe). `shared`: (x), of unit norm. `whole`, `rest`: norms of the captures and of
+      their residual. `reason`: warning about a second term.
     """
 
     own: np.ndarray
@@ -187,18 +187,18 @@ class _Factor:
 
 
 def _one_factor(captures: Float[np.ndarray, "n y x"], what: str) -> _Factor:
-    """The nearest captures of the form p_i vᵀ, of stripes along `what`."""
+    """Best approximation of the captures by p_i vᵀ, for stripes along `what`."""
     flat = captures.reshape(-1, captures.shape[2])
     squares, vectors = np.linalg.eigh(flat.T @ flat)
     shared = vectors[:, -1]
     squares = np.maximum(squares, 0)
-    # White noise has its largest singular value at σ(√rows + √columns); half of them are below the
-    # median, which few terms do not move.
+    # The largest singular value of white noise is σ(√rows + √columns); σ follows from the median,
+    # on which a few terms have no influence.
     rows, columns = flat.shape
     noise = np.sqrt(np.median(squares) / rows) * (np.sqrt(rows) + np.sqrt(columns))
     *_, second, first = np.sqrt([0.0, *squares])
     first, reason = max(first, 1e-150), ""
-    if second >= max(_NOTICED * noise, _WORTH * first):
+    if second >= max(_SIGNIFICANT * noise, _RELEVANT * first):
         reason = (
             f"stripes along {what} are no products of two vectors: a second one has "
             f"{100 * second / first:.0f} % of the first; centre the captures if the shadow "
@@ -209,7 +209,7 @@ def _one_factor(captures: Float[np.ndarray, "n y x"], what: str) -> _Factor:
 
 
 def _decoded(captures: Float[np.ndarray, "n y x"], shown: Shown) -> Float[np.ndarray, "n y x"]:
-    """Captures of single stripes."""
+    """Captures of single stripes, by the inverse transform of Hadamard ones."""
     if shown == "stripes":
         return captures
     shown_at = np.argsort(natural_rows(len(captures), "sequency"))

@@ -1,4 +1,4 @@
-"""The start of a PSF fit's least squares: the camera to a fraction of a fringe."""
+"""Initial estimate for a PSF fit: the camera to a fraction of a fringe."""
 
 import math
 from collections.abc import Sequence
@@ -14,10 +14,10 @@ from thincam_jax.measured.calibration.chirp_search import Chirp, Ranges, find_ch
 from thincam_jax.measured.calibration.coarse import descend
 from thincam_jax.measured.calibration.problem import PARAMETERS, FitState, Synthesis
 
-# d/t at which a free object distance starts where it was given as infinite, a number that no step
-# can leave: its shadow is within a millionth of that of infinity.
+# Smallest initial d/t of a free object distance: no step can leave infinity, and the shadow differs
+# from that of infinity by a millionth.
 _FARTHEST = 1e-6
-_WIDEST = 0.5  # of a search, in parts of one
+_WIDEST = 0.5  # relative search range
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class PsfSearch:
         if centre is None:
             centre = 0.1 * min(camera.sensor.shape) * float(camera.sensor.pitch)
         free = {name: name in self.parameters for name in ("beta", "distance", "wavelength")}
-        # A free object distance, or mask-sensor distance, moves β/M² by parts of d/t only.
+        # A free object or mask-sensor distance changes β/M² only by fractions of d/t.
         depth = "object_distance" in self.parameters or "distance" in self.parameters
         return Ranges(
             curvature=self.relative * (free["beta"] + 0.1 * depth),
@@ -74,7 +74,7 @@ def given(
     parameters: Sequence[str],
     synthesis: Synthesis | None = None,
 ) -> FitState:
-    """The camera and the point as given, with an empty background and a gain of one."""
+    """State of the camera and the point as given, with no background and a gain of one."""
     path = camera.path(wavelength, object_distance)
     nearness = 1 / path.object_distance
     if "object_distance" in parameters:
@@ -85,7 +85,7 @@ def given(
 
 
 def check_fringes(guess: FitState) -> None:
-    """Refuse a sensor, or a shadow on it, that holds less than one fringe."""
+    """Refuse a sensor, or a shadow on it, with less than one fringe."""
     mask, sensor = guess.mask, guess.camera.sensor
     scale = float(guess.magnification)
     halves = [
@@ -115,8 +115,8 @@ def start_near(image: np.ndarray, guess: FitState, search: PsfSearch) -> FitStat
 def _one_picture(image: np.ndarray, guess: FitState) -> np.ndarray:
     """The fringes cos(βr² + φ) of a synthesis.
 
-    Of each picture's cos(u + φ_k) the sum of weights w_k has
-    ½ e^{ju} Σ w_k e^{jφ_k} + ½ e^{−ju} Σ w_k e^{−jφ_k}: the stronger of the two is taken.
+    The weighted sum of the captures' cos(u + φ_k) is
+    ½ e^{ju} Σ w_k e^{jφ_k} + ½ e^{−ju} Σ w_k e^{−jφ_k}, of which the stronger term is taken.
     """
     if guess.synthesis is None:
         return image
@@ -138,15 +138,15 @@ def _fringes(state: FitState) -> Chirp:
 def _with_fringes(
     guess: FitState, fringes: Chirp, parameters: Sequence[str], search: float
 ) -> FitState:
-    """The free numbers that give those fringes: β/M² and ε, the centre and the phase.
+    """State whose free parameters give the fringes' β/M², ε, centre and phase.
 
-    Weak diffraction says little of ε: d and λ stay within `search` of the guess.
+    Weak diffraction determines ε poorly, so d and λ stay within `search` of the guess.
     """
     camera = guess.camera
     beta, distance = float(guess.mask.beta), float(camera.distance)
     wavelength, nearness = float(guess.wavelength), float(guess.nearness)
     scale = 1 + distance * nearness
-    for _ in range(5):  # β and d depend on each other through M, by parts of d/t
+    for _ in range(5):  # β and d are coupled through M, by fractions of d/t
         scale = 1 + distance * nearness
         if "beta" in parameters:
             beta = fringes.curvature * scale**2

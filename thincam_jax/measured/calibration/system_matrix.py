@@ -1,13 +1,12 @@
-r"""The matrix of a camera from its Hadamard captures (thesis Eq 5.17 with the N that it lost).
+r"""The system matrix of a camera from its Hadamard captures (thesis Eq 5.17, times 1/N).
 
 .. math:: \mathbf H = \mathbf V'\mathbf U'^T/N
 
-It is linear in the captures, so that the offset, the same in all of them, need not be taken off one
-by one: a constant is transformed into the first cell's column, the only one where the white frame
-and the dark ones come in.
+The transform is linear, so that a common offset need not be subtracted from each capture: it
+appears only in the first cell's column, where the white frame and the dark frames correct it.
 
-The captures are read in blocks of sensor rows, and each block's part of H is finished before the
-next is read: in memory are one block and, if it is wanted there, H.
+The captures are read in blocks of sensor rows, each finished before the next is read: memory holds
+one block and, if wanted, H.
 """
 
 import math
@@ -28,15 +27,15 @@ from thincam_jax.measured.calibration.hadamard import natural_rows, walsh_hadama
 
 _KIND = "system matrix"
 _BLOCK = 2**22  # bytes of a chunk of a stored matrix
-_ALIGNED = 64  # bytes: an array that starts at a multiple becomes one of JAX without a copy
+_ALIGNED = 64  # bytes: JAX takes an array at a multiple of it without a copy
 
 Block = tuple[slice, Float[np.ndarray, "pixel cell"]]
 
 
 def matrix_blocks(captures: HadamardCaptures) -> Iterator[Block]:
-    """H of the pixels of some sensor rows after another, and which pixels, numbered row by row.
+    """Iterate over blocks of sensor rows: their pixels, numbered row by row, and their part of H.
 
-    In counts of the camera for a cell that is white. Each is a new float32 array.
+    In counts of the camera for a white cell. Each is a new float32 array.
     """
     for pixels, fill in _pending(captures):
         block = np.empty((pixels.stop - pixels.start, captures.series.cell_count), np.float32)
@@ -45,10 +44,9 @@ def matrix_blocks(captures: HadamardCaptures) -> Iterator[Block]:
 
 
 def recover_matrix(captures: HadamardCaptures) -> Matrix:
-    """H as an operator, in float32, for `Recording`: 3.2 GB for 64² cells and 440² pixels, once.
+    """H as an operator, in float32, for `Recording`: 3.2 GB for 64² cells and 440² pixels.
 
-    **Errors**: CaptureStoreError for damaged captures; MemoryError, one line, where it does not
-    fit.
+    **Errors**: CaptureStoreError for damaged captures; MemoryError, one line, where memory lacks.
     """
     series, count = captures.series, math.prod(captures.sensor_shape)
     matrix = _aligned(count, series.cell_count)
@@ -58,7 +56,7 @@ def recover_matrix(captures: HadamardCaptures) -> Matrix:
 
 
 def write_matrix(captures: HadamardCaptures, path: str | Path) -> Path:
-    """H into a Zarr store, block by block, never whole in memory; `read_matrix` reads it.
+    """Write H to a Zarr store for `read_matrix`, block by block, never whole in memory.
 
     **Errors**: CaptureStoreError, one line, where something is at `path` already; WriteError for
     a full disk.
@@ -81,7 +79,7 @@ def write_matrix(captures: HadamardCaptures, path: str | Path) -> Path:
             config={"write_empty_chunks": True},
             dimension_names=("pixel", "cell"),
         )
-        # Written in whole chunks: what is left of a block goes with the next.
+        # Written in whole chunks; the remainder of a block goes with the next.
         left, start = np.empty((0, cells), np.float32), 0
         for _, block in matrix_blocks(captures):
             left = np.concatenate([left, block])
@@ -89,7 +87,7 @@ def write_matrix(captures: HadamardCaptures, path: str | Path) -> Path:
             array[start : start + whole] = left[:whole]
             left, start = left[whole:], start + whole
         array[start:] = left
-        # Last: a matrix that was not finished is none.
+        # Last: they mark a finished matrix.
         group.attrs.update(
             kind=_KIND,
             version=VERSION,
@@ -100,12 +98,12 @@ def write_matrix(captures: HadamardCaptures, path: str | Path) -> Path:
 
 
 def open_matrix(path: str | Path) -> Any:
-    """A stored matrix as the Zarr array (pixel, cell) that it is: for `ReducedMatrix`, unread."""
+    """Open a stored matrix as a Zarr array (pixel, cell), unread, as for `ReducedMatrix`."""
     return _stored(path)[1]
 
 
 def stored_blocks(path: str | Path) -> Iterator[Block]:
-    """A stored matrix in blocks of its pixels, without ever holding it whole."""
+    """Iterate over a stored matrix in blocks of its pixels, never whole in memory."""
     array = open_matrix(path)
     step = array.chunks[0]
     for start in range(0, array.shape[0], step):
@@ -114,9 +112,9 @@ def stored_blocks(path: str | Path) -> Iterator[Block]:
 
 
 def read_matrix(path: str | Path) -> Matrix:
-    """A stored matrix as an operator, in memory once.
+    """Read a stored matrix as an operator.
 
-    **Errors**: CaptureStoreError, one line, for what is no matrix, is not finished or is damaged.
+    **Errors**: CaptureStoreError, one line, for no matrix, an unfinished or a damaged one.
     """
     attributes, array = _stored(path)
     matrix = _aligned(*array.shape)
@@ -126,7 +124,7 @@ def read_matrix(path: str | Path) -> Matrix:
 
 
 def _pending(captures: HadamardCaptures) -> Iterator[tuple[slice, Any]]:
-    """Pixels, and a function that writes their part of H where it is told."""
+    """Pixels of each block, and a function that writes their part of H into an array."""
     series, (rows, columns) = captures.series, captures.sensor_shape
     shown_at = np.argsort(natural_rows(series.cell_count, series.order))
     for start in range(0, rows, captures.block_rows):
@@ -153,7 +151,7 @@ def _pending(captures: HadamardCaptures) -> Iterator[tuple[slice, Any]]:
 
 def _aligned(count: int, cells: int) -> Float[np.ndarray, "pixel cell"]:
     size = 4 * count * cells
-    # Checking its numbers takes a byte each.
+    # Its later validation takes one byte for each number.
     refuse_if_too_large(
         f"a matrix of {count} × {cells}", size * 5 // 4, "write it to a store (write_matrix)"
     )
@@ -167,8 +165,7 @@ def _operator(matrix: np.ndarray, object_shape, sensor_shape) -> Matrix:
 
 
 def _stored(path: str | Path) -> tuple[dict[str, Any], Any]:
-    told = "finished system matrix", "write_matrix"
-    with opened(path, (_KIND,), told) as (group, attributes):
+    with opened(path, (_KIND,), ("finished system matrix", "write_matrix")) as (group, attributes):
         array: Any = group["matrix"]
         shape = tuple(math.prod(attributes[name]) for name in ("sensor_shape", "object_shape"))
         if array.shape != shape:

@@ -1,8 +1,5 @@
 """GenCP and the stream to the byte as the standards have them; slow and foreign answers."""
 
-import subprocess
-import sys
-
 import numpy as np
 import pytest
 
@@ -97,16 +94,3 @@ def test_no_answer_is_waited_for_endlessly(monkeypatch, way, device, camera):
         )
     with pytest.raises(Timeout):
         camera._control.read(gencp.Abrm.SERIAL, 4)
-
-
-def test_who_has_a_file_open_is_named(tmp_path):
-    file = tmp_path / "device"
-    file.touch()
-    code = "import sys; file = open(sys.argv[1]); print(flush=True); sys.stdin.read()"
-    command = [sys.executable, "-c", code, str(file)]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
-        assert process.stdout is not None
-        process.stdout.readline()
-        assert f"process {process.pid}," in link.holder(str(file))
-        process.communicate()
-    assert link.holder(str(file)) == "another program"

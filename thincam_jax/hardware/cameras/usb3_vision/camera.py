@@ -14,25 +14,25 @@ from thincam_jax.hardware.cameras.usb3_vision.link import Control, UsbLink
 from thincam_jax.hardware.cameras.usb3_vision.stream import PIXEL_FORMATS, Stream, unpack
 from thincam_jax.hardware.errors import HardwareError, Timeout
 
-# Frames of pixels alone, whenever they are triggered.
+# Frames without chunk data, at any trigger.
 _PLAIN = {"ChunkModeActive": False, "AcquisitionFrameRateEnable": False, "ExposureMode": "Timed"}
 
 
 class Usb3VisionCamera(FeatureCamera):
-    """A camera that speaks USB3 Vision.
+    """A USB3 Vision camera.
 
-    A frame answers a trigger if its block id is new and it was exposed after the camera's clock
+    A frame belongs to a trigger if its block id is new and it was exposed after the camera's clock
     was read, right before the trigger; older frames are discarded. After any failure the stream is
-    stopped and begun anew, so that a frame that comes late is not taken for the next one.
+    restarted, so that a late frame is not taken for the next.
     """
 
     _formats = PIXEL_FORMATS.keys()
 
     @dataclass(frozen=True)
     class Options:
-        """`serial`: which camera, if there are several; `backend`: a `usb.backend.IBackend` other
-        than libusb's; `compare_clocks`: False for a camera whose frames carry another clock than
-        its registers."""
+        """`serial`: of the camera, if there are several; `backend`: a `usb.backend.IBackend` other
+        than libusb's; `compare_clocks`: False for a camera whose frames and registers have
+        different clocks."""
 
         serial: str = ""
         backend: Any = None
@@ -40,9 +40,9 @@ class Usb3VisionCamera(FeatureCamera):
 
     @classmethod
     def open(cls, options: Options) -> "Usb3VisionCamera":
-        """Claims the camera and sets it to wait for software triggers.
+        """Claim the camera and configure software triggers.
 
-        `NotFound`, `PermissionDenied` (its remedy is the udev rule), `Busy`, `ProtocolError`.
+        `NotFound`, `PermissionDenied` (with the udev rule), `Busy`, `ProtocolError`.
         """
         link = UsbLink(options.serial, options.backend)
         try:
@@ -56,8 +56,8 @@ class Usb3VisionCamera(FeatureCamera):
         self._control = control
         registers = Abrm.MANUFACTURER, Abrm.MODEL, Abrm.SERIAL, Abrm.DEVICE_VERSION
         texts = (gencp.text(control.read(register, gencp.TEXT_LENGTH)) for register in registers)
-        self._identity = Identity(*texts)
-        self._name = link.name = str(self._identity)
+        self.identity = Identity(*texts)
+        self._name = link.name = str(self.identity)
         self._compare_clocks = compare_clocks and control.has_clock
         self._features = Features(link, control, fetch_xml(link, control))
         self._stream = Stream(link, control, control.sirm)
@@ -67,7 +67,7 @@ class Usb3VisionCamera(FeatureCamera):
         for name, value in _PLAIN.items():
             if self._features.has(name):
                 self._features.set(name, value)
-        with self._told("open"):
+        with self._translated("open"):
             trigger_by_software(self._features)
             exposure = read(self._features).exposure
         self.configure(CameraSettings(exposure, pixel_format="Mono8"))
@@ -119,7 +119,7 @@ class Usb3VisionCamera(FeatureCamera):
         return Timeout(self._name, "trigger", f"{cause}, {discarded} older ones discarded",
                        "trigger again, or allow more time")  # fmt: skip
 
-    def _told(self, operation: str) -> AbstractContextManager[None]:
+    def _translated(self, operation: str) -> AbstractContextManager[None]:
         return self._features.evaluating(operation)
 
     def _stop(self) -> None:
@@ -136,7 +136,7 @@ class Usb3VisionCamera(FeatureCamera):
         self._start()
 
     def _start(self) -> None:
-        """Begins the stream anew. The camera then counts from 0; the frames' numbers go on."""
+        """Start the stream. The camera then counts from 0, while the frames' numbers continue."""
         self._frames_before += self._last_block + 1
         self._last_block = -1
         self._lock(1)

@@ -1,7 +1,7 @@
 """A camera's features by their names in the SFNC, as its own XML describes them.
 
-The XML comes from the device and is not to be trusted: its size is bounded, zipped or not, and it
-must not declare a document type, so that there are no entities to expand.
+The XML comes from the device and is not trusted: its size is bounded, zipped or not, and it must
+not declare a document type, so that no entities are expanded.
 """
 
 import io
@@ -24,12 +24,12 @@ from thincam_jax.hardware.cameras.usb3_vision.link import LARGEST_READ, Control,
 LARGEST_XML = LARGEST_READ  # bytes; those of cameras have up to 2 MiB
 MOST_ENTRIES = 64
 
-# Names of these elements stand for a choice or a variable of a formula, not for a node.
+# Elements whose names denote a choice or a variable of a formula, not a node.
 NO_NODES = ("EnumEntry", "pVariable", "Constant", "Expression")
 
 
 def fetch_xml(link: UsbLink, control: Control) -> str:
-    """The XML that the camera's manifest table names, checked."""
+    """Read and check the XML that the camera's manifest table names."""
     table = control.read_number(Abrm.MANIFEST, 8)
     entries = control.read_number(table, 8)
     if not 0 < entries <= MOST_ENTRIES:
@@ -46,11 +46,11 @@ def fetch_xml(link: UsbLink, control: Control) -> str:
 
 
 def unzip(data: bytes) -> bytes:
-    """The one file of a zip archive; `ValueError` where it is none or grows beyond the limit."""
+    """The only file of a zip archive; `ValueError` for another archive or one above the limit."""
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             files = archive.infolist()
-            # Other ways to compress may allocate what their header says.
+            # Other compressions may allocate what their header says.
             if len(files) != 1 or files[0].compress_type not in (0, zipfile.ZIP_DEFLATED):
                 raise ValueError(f"a zip of {len(files)} files, allowed: one, deflated")
             with archive.open(files[0]) as file:
@@ -63,7 +63,7 @@ def unzip(data: bytes) -> bytes:
 
 
 def check_xml(data: bytes) -> str:
-    """The XML as text; `ValueError` where it is not well formed UTF-8 or declares entities."""
+    """Decode the XML; `ValueError` where it is not well-formed UTF-8 or declares entities."""
     data = data.rstrip(b"\0")  # registers come in multiples of four
     try:
         root = fromstring(data, forbid_dtd=True)
@@ -77,7 +77,7 @@ def check_xml(data: bytes) -> str:
 
 
 def _check_references(root: Any) -> None:
-    """GenApi crashes, with the process, where a port stands for a feature or the reverse."""
+    """Refuse references between ports and features, with which GenApi crashes the process."""
     kinds = {n.attrib["Name"]: _kind(n) for n in root.iter() if "Name" in n.attrib
              and _kind(n) not in NO_NODES}  # fmt: skip
     for element in root.iter():
@@ -92,7 +92,7 @@ def _kind(node: Any) -> str:
 
 
 class _Port(genapi.AbstractPort):
-    """Through which the feature tree reads and writes the camera's registers."""
+    """Access of the feature tree to the camera's registers."""
 
     def __init__(self, control: Control):
         super().__init__()
@@ -109,7 +109,7 @@ class _Port(genapi.AbstractPort):
 
 
 class Features:
-    """The features of a camera, as `cameras.features` wants them."""
+    """`Features` of `cameras.features`, by GenApi."""
 
     def __init__(self, link: UsbLink, control: Control, xml: str):
         self._link = link
@@ -120,7 +120,7 @@ class Features:
 
     @contextmanager
     def evaluating(self, operation: str) -> Iterator[None]:
-        """Names what GenApi raises, and what a feature of another kind than the SFNC's leads to."""
+        """Turn errors of GenApi, and of features of unexpected types, into those of a device."""
         try:
             yield
         except (genapi.GenericException, AttributeError, TypeError, ValueError) as error:

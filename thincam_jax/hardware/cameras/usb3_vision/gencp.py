@@ -1,8 +1,7 @@
 """GenCP packets and bootstrap registers, as USB3 Vision carries them over bulk endpoints.
 
-Encoding and decoding only, without a device: what comes from a wire is checked here, and a
-`ValueError` says what is wrong with it. Numbers are little-endian. A packet is a header of twelve
-bytes and its data:
+Encoding and decoding only, without a device; an invalid packet raises `ValueError`. Numbers are
+little-endian. A packet is a header of twelve bytes and its data:
 
     u32 prefix "U3VC"   u16 flags or status   u16 command   u16 length of data   u16 request id
 
@@ -26,7 +25,7 @@ class Command(IntEnum):
     READ_ACKNOWLEDGE = 0x0801
     WRITE = 0x0802
     WRITE_ACKNOWLEDGE = 0x0803
-    PENDING = 0x0805  # "wait so long": the answer comes later
+    PENDING = 0x0805  # the answer comes later
 
 
 class Status(IntEnum):
@@ -48,13 +47,13 @@ class Status(IntEnum):
 
 
 def status_name(status: int) -> str:
-    """ "0x8004 (write protect)", for a message."""
+    """Status in a message, such as "0x8004 (write protect)"."""
     names = {known.value: known.name.lower().replace("_", " ") for known in Status}
     return f"{status:#06x} ({names.get(status, 'unknown')})"
 
 
 class Abrm(IntEnum):
-    """Addresses of the registers that every GenCP device has; texts are 64 bytes long."""
+    """Addresses of the registers of every GenCP device; texts are 64 bytes long."""
 
     VERSION = 0x0000
     MANUFACTURER = 0x0004
@@ -81,7 +80,6 @@ class Sbrm(IntEnum):
     CAPABILITY = 0x04  # u64
     MAX_COMMAND = 0x14  # bytes
     MAX_ACKNOWLEDGE = 0x18
-    STREAM_CHANNELS = 0x1C
     SIRM = 0x20  # u64 address
     SIRM_LENGTH = 0x28
     CURRENT_SPEED = 0x40
@@ -139,7 +137,7 @@ def answer(command: int, request: int, data: bytes = b"", status: int = 0) -> by
 
 
 def decode(packet: bytes | bytearray | memoryview) -> Packet:
-    """The packet that these bytes are, all of them; `ValueError` where they are none."""
+    """Decode a complete packet; `ValueError` for an invalid one."""
     if len(packet) < HEADER.size:
         raise ValueError(f"{len(packet)} bytes are too few for a header of {HEADER.size}")
     prefix, flags, command, length, request = HEADER.unpack_from(packet)
@@ -151,12 +149,12 @@ def decode(packet: bytes | bytearray | memoryview) -> Packet:
 
 
 def pending_time(packet: Packet) -> float:
-    """Seconds that a pending acknowledge asks for."""
+    """Waiting time, s, that a pending acknowledge requests."""
     if len(packet.data) != RESERVED_AND_NUMBER.size:
         raise ValueError(f"a pending acknowledge has {len(packet.data)} bytes of data instead of 4")
     return RESERVED_AND_NUMBER.unpack(packet.data)[1] * 1e-3
 
 
 def text(data: bytes) -> str:
-    """A register's text: up to the first zero."""
+    """Text of a register, up to the first zero."""
     return data.split(b"\0", 1)[0].decode("utf-8", "replace")

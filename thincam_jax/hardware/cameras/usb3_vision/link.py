@@ -4,13 +4,11 @@ Whatever pyusb raises becomes a `HardwareError`; every transfer has a time limit
 """
 
 import errno
-import os
 import struct
 from array import array
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import partial
-from pathlib import Path
 from time import monotonic, sleep
 from typing import Any
 
@@ -29,6 +27,7 @@ from thincam_jax.hardware.errors import (
     ProtocolError,
     Timeout,
 )
+from thincam_jax.hardware.holder import holder
 
 # Class, subclass and protocol of the two interfaces that every USB3 Vision camera has.
 CONTROL_INTERFACE = (0xEF, 0x05, 0x00)
@@ -42,7 +41,7 @@ GONE = (errno.ENODEV, errno.ENOENT, errno.ESHUTDOWN, errno.EIO, errno.ENXIO)
 
 
 def _interface(device: Any, wanted: tuple[int, int, int]) -> Any:
-    with suppress(usb.core.USBError):  # of some device that cannot even be asked
+    with suppress(usb.core.USBError):  # of a device that cannot be read
         for configuration in device:
             for interface in configuration:
                 if wanted == (interface.bInterfaceClass, interface.bInterfaceSubClass,
@@ -61,21 +60,11 @@ def _endpoint(interface: Any, direction: int) -> Any:
     return None
 
 
-def holder(node: str) -> str:
-    """The process that has a device's file open, where the system tells."""
-    for link in Path("/proc").glob("[0-9]*/fd/*"):
-        with suppress(OSError):
-            if os.readlink(link) == node and (process := link.parts[2]) != str(os.getpid()):
-                name = Path("/proc", process, "comm").read_text("utf-8").strip()
-                return f"{name}, process {process},"
-    return "another program"
-
-
 class UsbLink:
     """A claimed USB3 Vision camera and its three bulk endpoints."""
 
     def __init__(self, serial: str = "", backend: Any = None):
-        """Claims the camera of this serial number, or the only one; libusb without a backend."""
+        """Claim the camera of this serial number, or the only one; by libusb without a backend."""
         self.name = f"USB3 Vision camera {serial}".rstrip()
         try:
             devices = usb.core.find(
@@ -131,20 +120,20 @@ class UsbLink:
 
     @contextmanager
     def _named(self, operation: str) -> Iterator[None]:
-        """Turns what pyusb raises into the rig's errors."""
+        """Turn errors of pyusb into those of a device."""
         try:
             yield
         except usb.core.USBTimeoutError as error:
             raise Timeout(self.name, operation, "no answer in time",
                           "check cable and power, or allow more time") from error  # fmt: skip
-        except ValueError as error:  # pyusb: without permission there are no languages
+        except ValueError as error:  # pyusb without permission: "no langid"
             raise self._refused(operation, error) from error
         except usb.core.USBError as error:
             if error.errno == errno.EACCES:
                 raise self._refused(operation, error) from error
             if error.errno == errno.EBUSY:
                 node = f"/dev/bus/usb/{self._device.bus or 0:03d}/{self._device.address or 0:03d}"
-                cause = f"{holder(node)} has it open"
+                cause = f"{holder(node, others=True)} has it open"
                 raise Busy(self.name, operation, cause, "close that program") from error
             if error.errno in GONE:
                 remedy = "check cable and power, then open it again"
@@ -159,44 +148,44 @@ class UsbLink:
         )  # fmt: skip
 
     def broken(self, operation: str, cause: str) -> ProtocolError:
-        """The error for what USB3 Vision does not allow."""
+        """Error for a violation of the USB3 Vision standard."""
         return ProtocolError(self.name, operation, cause, "switch the camera off and on again")
 
     def send(self, data: bytes, operation: str) -> None:
-        """Writes to the control endpoint."""
+        """Write to the control endpoint."""
         with self._named(operation):
             self._device.write(self.control_out, data, 1000)
 
     def receive(self, endpoint: int, buffer: array, timeout: float, operation: str) -> int:
-        """Reads one transfer into `buffer` and returns its length; `timeout` in s."""
+        """Read one transfer into `buffer` and return its length; `timeout` in s."""
         with self._named(operation):
             try:
                 return self._device.read(endpoint, buffer, max(1, round(timeout * 1000)))
             except usb.core.USBError as error:
-                if error.errno == errno.EPIPE:  # the camera has halted it; it will be used again
+                if error.errno == errno.EPIPE:  # halted by the camera; make it usable again
                     self._device.clear_halt(endpoint)
                 raise
 
     def clear_halt(self, endpoint: int) -> None:
-        """Sets an endpoint back to where nothing is under way."""
+        """Reset an endpoint."""
         with self._named("reset an endpoint"):
             self._device.clear_halt(endpoint)
 
     def close(self) -> None:
-        """Gives the camera back."""
+        """Release the camera."""
         with suppress(usb.core.USBError):
             usb.util.dispose_resources(self._device)
 
 
 class Control:
-    """Reads and writes the camera's memory with GenCP."""
+    """Read and write the camera's memory with GenCP."""
 
     def __init__(self, link: UsbLink):
         self._link, self._request = link, 0
-        self._patience = 1.0  # s for one answer, until the camera says what it needs
+        self._patience = 1.0  # s for one answer, until the camera's own response time is read
         self._largest_command = self._largest_answer = gencp.HEADER.size + gencp.TEXT_LENGTH
         self._buffer = array("B", bytes(LARGEST_PACKET + 1024))
-        with suppress(Timeout):  # the answer to someone who was killed before it came
+        with suppress(Timeout):  # a stale answer to a client that was killed
             link.receive(link.control_in, self._buffer, 0.001, "open")
         self._patience = min(max(self.read_number(Abrm.RESPONSE_TIME) * 1e-3, 0.2), 5.0)
         self.has_clock = bool(self.read_number(Abrm.CAPABILITY, 8) & gencp.HAS_TIMESTAMP)
@@ -210,7 +199,7 @@ class Control:
         self.sirm = self.read_number(sbrm + Sbrm.SIRM, 8)
 
     def read(self, address: int, length: int) -> bytes:
-        """`length` bytes from `address`, in as many packets as it takes."""
+        """Read `length` bytes from `address`, in as many packets as needed."""
         self._check(address, length, "read")
         step = self._largest_answer - gencp.HEADER.size & ~3
         parts, end = [], monotonic() + LONGEST_READ
@@ -228,7 +217,7 @@ class Control:
         return b"".join(parts)
 
     def write(self, address: int, data: bytes) -> None:
-        """`data` to `address`, in as many packets as it takes."""
+        """Write `data` to `address`, in as many packets as needed."""
         self._check(address, len(data), "write")
         step = self._largest_command - gencp.HEADER.size - gencp.ADDRESS.size & ~3
         for start in range(0, len(data), step):
@@ -237,25 +226,25 @@ class Control:
             self._exchange(encode, Command.WRITE_ACKNOWLEDGE, operation)
 
     def _check(self, address: int, length: int, verb: str) -> None:
-        """The camera's XML names addresses and lengths, which may be any."""
+        """Refuse impossible addresses and lengths, which come from the camera's XML."""
         if not (0 <= length <= LARGEST_READ and 0 <= address <= 2**64 - length):
             raise self._link.broken(f"{verb} at {address:#x}", f"{length} bytes are not possible")
 
     def read_number(self, address: int, length: int = 4) -> int:
-        """An unsigned register."""
+        """Read an unsigned register."""
         return int.from_bytes(self.read(address, length), "little")
 
     def write_number(self, address: int, value: int) -> None:
-        """A register of four bytes."""
+        """Write a register of four bytes."""
         self.write(address, struct.pack("<I", value))
 
     def clock(self) -> int:
-        """The camera's clock now, in ns."""
+        """Present time of the camera's clock, in ns."""
         self.write_number(Abrm.TIMESTAMP_LATCH, 1)
         return self.read_number(Abrm.TIMESTAMP, 8)
 
     def _exchange(self, encode: Callable[[int], bytes], wanted: int, operation: str) -> bytes:
-        """Sends a command, again while the camera is busy, and returns the data of the answer."""
+        """Send a command, repeated while the camera is busy, and return the answer's data."""
         end = monotonic() + LONGEST_ANSWER
         while True:
             self._request = self._request % 0xFFFF + 1
@@ -274,7 +263,7 @@ class Control:
             sleep(0.002)
 
     def _answer(self, wanted: int, operation: str, end: float) -> gencp.Packet:
-        """The answer to the last request; those to earlier ones are passed over."""
+        """Answer to the last request; those to earlier ones are skipped."""
         deadline = min(monotonic() + self._patience, end)
         while (left := deadline - monotonic()) > 0:
             count = self._link.receive(self._link.control_in, self._buffer, left, operation)
@@ -285,7 +274,7 @@ class Control:
                 if packet.command == Command.PENDING:
                     deadline = min(monotonic() + gencp.pending_time(packet), end)
                     continue
-                # An answer that refuses may repeat the command's own number.
+                # A refusal may repeat the command's own number.
                 if packet.command != wanted and packet.status == Status.SUCCESS:
                     raise ValueError(f"{packet.command:#06x} instead of {wanted:#06x}")
             except ValueError as error:

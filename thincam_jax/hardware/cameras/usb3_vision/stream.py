@@ -1,7 +1,7 @@
 """A USB3 Vision stream: leader, payload and trailer of each frame.
 
-What comes from the wire is decoded by functions without a device, which raise `ValueError` for
-what the standard does not allow. `Stream` reads frames with them. Numbers are little-endian:
+Functions without a device decode the data and raise `ValueError` for violations of the standard;
+`Stream` reads frames with them. Numbers are little-endian:
 
     leader   u32 "U3VL"  u16 0  u16 size  u64 block id
              u16 0  u16 payload type  u64 timestamp (ns)  u32 pixel format
@@ -26,8 +26,8 @@ TRAILER = struct.Struct("<IHHQHHQ")
 LEADER_MAGIC, TRAILER_MAGIC = 0x4C563355, 0x54563355
 IMAGE = 0x0001  # payload type
 
-# Names and numbers of the Pixel Format Naming Convention, with the bits of a count. The bits that
-# a pixel takes on the wire stand in bits 16 … 23 of the number.
+# Names and numbers of the Pixel Format Naming Convention, with the bits of a count. Bits 16 … 23 of
+# the number are the bits of a pixel on the wire.
 PIXEL_FORMATS = {
     "Mono8": (0x01080001, 8),
     "Mono10": (0x01100003, 10),
@@ -52,7 +52,7 @@ class Leader:
 
 
 def decode_leader(data: bytes | memoryview) -> Leader:
-    """The leader that these bytes are; `ValueError` where they are none."""
+    """Decode a leader; `ValueError` for an invalid one."""
     if len(data) < LEADER.size:
         raise ValueError(f"{len(data)} bytes are too few for a leader of {LEADER.size}")
     magic, _, size, block, _, payload, time, code, width, height, left, top, padding, _ = (
@@ -69,7 +69,7 @@ def decode_leader(data: bytes | memoryview) -> Leader:
 
 
 def decode_trailer(data: bytes | memoryview) -> tuple[int, int, int]:
-    """Block id, status and number of valid payload bytes; `ValueError` where it is no trailer."""
+    """Block id, status and number of valid payload bytes; `ValueError` for an invalid trailer."""
     if len(data) < TRAILER.size:
         raise ValueError(f"{len(data)} bytes are too few for a trailer of {TRAILER.size}")
     magic, _, size, block, status, _, valid = TRAILER.unpack_from(data)
@@ -107,10 +107,7 @@ def unpack(data: np.ndarray, pixel_format: str, shape: tuple[int, int]) -> np.nd
 
 @dataclass(frozen=True)
 class Transfers:
-    """Sizes in bytes of what is read for one frame: one leader, the payload's parts, one trailer.
-
-    All parts but the last are of `part` bytes.
-    """
+    """Bytes of a frame's transfers: leader, `parts` times `part`, a `last` part, and trailer."""
 
     leader: int
     part: int
@@ -120,9 +117,9 @@ class Transfers:
 
 
 def plan_transfers(registers: bytes, expected: int) -> Transfers:
-    """Transfer sizes for frames of `expected` bytes, from what the stream's registers require.
+    """Transfer sizes for frames of `expected` bytes, from the stream's registers.
 
-    `ValueError` where they contradict themselves, or would have more allocated than the limits.
+    `ValueError` where they are inconsistent or exceed the limits.
     """
     (info,) = struct.unpack_from("<I", registers, Sirm.INFO)
     payload, leader, trailer = struct.unpack_from("<QII", registers, Sirm.REQUIRED_PAYLOAD)
@@ -148,17 +145,16 @@ def plan_transfers(registers: bytes, expected: int) -> Transfers:
 
 
 class Stream:
-    """Reads whole frames; `prepare` once for each setting, `start` before and `stop` after.
+    """Reader of whole frames: `prepare` after each configuration, `start` before, `stop` after.
 
-    The buffers are allocated by `prepare` and used for every frame; the frame's bytes are copied
-    once, from these into an array of its own.
+    `prepare` allocates buffers for all frames; each frame is copied once, into its own array.
     """
 
     def __init__(self, link: UsbLink, control: Control, sirm: int):
         self._link, self._control, self._sirm = link, control, sirm
 
     def prepare(self, pixel_format: str, region: Region) -> None:
-        """Agrees with the camera on the transfers of the frames to come."""
+        """Configure the transfers of the following frames."""
         self._code, self._region = PIXEL_FORMATS[pixel_format][0], region
         self._expected = frame_bytes(pixel_format, region)
         try:
@@ -175,16 +171,16 @@ class Stream:
         ):
             self._control.write_number(self._sirm + register, value)
         self._leader, self._trailer = _buffer(plan.leader), _buffer(plan.trailer)
-        # Every full part is read into the same buffer.
+        # All full parts share a buffer.
         self._parts = [_buffer(plan.part)] * plan.parts + [_buffer(plan.last)]
         self._total = sum(len(part) for part in self._parts)
 
     def start(self) -> None:
-        """Lets the camera send."""
+        """Enable the stream."""
         self._control.write_number(self._sirm + Sirm.CONTROL, 1)
 
     def stop(self) -> None:
-        """Forbids the camera to send, and discards what is under way."""
+        """Disable the stream and discard frames in transfer."""
         self._control.write_number(self._sirm + Sirm.CONTROL, 0)
         scrap, deadline = _buffer(TRANSFER), monotonic() + 2.0
         while monotonic() < deadline:
@@ -195,7 +191,7 @@ class Stream:
         self._link.clear_halt(self._link.stream_in)
 
     def is_empty(self) -> bool:
-        """Whether no frame waits; one that does is spoilt by asking, so stop the stream then."""
+        """Whether no frame is queued; else its leader is lost, so stop the stream then."""
         try:
             self._receive(self._leader, monotonic())
         except Timeout:
@@ -203,10 +199,10 @@ class Stream:
         return False
 
     def read(self, deadline: float) -> tuple[Leader, np.ndarray]:
-        """The next frame, its leader and its bytes, before `deadline` of `time.monotonic`.
+        """Leader and bytes of the next frame, before `deadline` of `time.monotonic`.
 
-        `Timeout` where none began, `IncompleteFrame` where one did not come whole, `ProtocolError`
-        where it is another frame than the one that was agreed.
+        `Timeout` where none began, `IncompleteFrame` where part of it is missing, `ProtocolError`
+        for a frame of another format or region.
         """
         received = self._receive(self._leader, deadline)
         leader = self._decoded(decode_leader, received)
