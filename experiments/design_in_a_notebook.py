@@ -9,8 +9,8 @@ import os
 from pathlib import Path
 
 import jax
-import matplotlib.pyplot as plt
 
+import thincam_jax as tc
 from thincam_jax import design
 from thincam_jax.reconstruction import phase_pairs
 from thincam_jax.units import deg, nm, um
@@ -38,7 +38,9 @@ problem = design.design_problem(design.BayesError(), space, setup, phase_pairs(2
 
 # %%
 best = design.find_designs(problem, design.SearchSettings(2, 32), key=jax.random.key(0)).found[0]
-print(design.sensitivity_around(problem, best))
+tolerances = design.sensitivity_around(problem, best)
+print(tolerances)
+tc.plot.sensitivity(tolerances).savefig(FIGURES / "sensitivity.png")
 
 # %% [markdown]
 # ## The objective over both β, the distance held
@@ -53,8 +55,5 @@ figure.savefig(FIGURES / "landscape.png")
 # %%
 thin = {d: problem.with_thickness(d) for d in (2.0, 2.5, 3.0)}
 front = design.find_front(thin, design.SearchSettings(2, 32), key=jax.random.key(0))
-panels = plt.subplots(1, 2, figsize=(8, 3), layout="constrained")[1]
-for ax, name in zip(panels, ("error", "resolution"), strict=True):
-    ax.plot(list(thin), [getattr(point, name) for point in front], "ko-")
-    ax.set(xlabel="longest distance (mm)", ylabel=f"{name} of the best design")
-plt.savefig(FIGURES / "front.png", dpi=110)
+figure = tc.plot.front(front, "longest distance (mm)")
+figure.savefig(FIGURES / "front.png", dpi=110)

@@ -79,9 +79,7 @@ keys = jax.random.split(jax.random.key(7), 4)
 
 def setting(wavelengths, **given):
     return MaskSetting(
-        blank,
-        sensor,
-        distance,
+        tc.LenslessCamera(blank.mask(np.zeros(cells)), sensor, distance),
         wavelengths=wavelengths,
         object_distances=[object_distance],
         **{"field_shape": (across, across), **given},

@@ -12,12 +12,15 @@ import thincam_jax as tc
 from helpers import AS_IN_USE, count_traces
 from thincam_jax._core.grids import Grid
 from thincam_jax.design import (
+    ConjugateGradients,
     Design,
+    DesignProblem,
     DesignSpace,
     PhotonNoise,
     PowerLaw,
     Setup,
     SignalNoise,
+    TrainedSensor,
     Training,
     Variable,
     drawn_error,
@@ -25,6 +28,7 @@ from thincam_jax.design import (
     restore,
     stochastic_descent,
 )
+from thincam_jax.lensless.exposures import Exposures
 from thincam_jax.reconstruction.synthesis import phase_pairs
 
 SENSOR, IMAGE = (20, 24), 14
@@ -54,17 +58,16 @@ def training(noise=None, synthesis=None, **settings):
         pictures(),
         setup(noise),
         phase_pairs(2) if synthesis is None else synthesis,
-        sensor_shape=SENSOR,
-        distances=(4.0, 7.0),
+        TrainedSensor(SENSOR, (4.0, 7.0)),
         key=jax.random.key(5),
-        **{"tolerance": 1e-12, "steps": 600, **settings},
+        solver=ConjugateGradients(**({"tolerance": 1e-12, "steps": 600} | settings)),
     )
 
 
 def design(beta=(9.0, 7.0), distance=(5.03, 6.41), wavelength=5e-4, width=1.83):
     pairs = [jnp.repeat(jnp.asarray(x), 2) for x in (beta, distance)]
     phases = jnp.asarray(PAIR * len(beta))
-    return Design(pairs[0], phases, pairs[1], wavelength=wavelength, width=width)
+    return Design(Exposures(pairs[0], pairs[1], phase=phases, wavelength=wavelength, width=width))
 
 
 @count_traces
@@ -211,8 +214,7 @@ def test_errors():
             np.ones((1, 4, 5)),
             setup(),
             phase_pairs(1),
-            sensor_shape=SENSOR,
-            distances=(4.0, 7.0),
+            TrainedSensor(SENSOR, (4.0, 7.0)),
             key=jax.random.key(0),
         )
     with pytest.raises(ValueError, match="adds 2 captures and the design takes 4"):
@@ -237,7 +239,9 @@ def test_a_stochastic_descent_step_by_step():
     """Adam as published, with the rate of a cosine; the mean of the second half, in the cube."""
     space, target, start = free_betas(), jnp.array([10.0, 14.0]), jnp.array([0.9, 0.3])
     key, rate, steps = jax.random.key(3), 0.1, 5
-    found = stochastic_descent(quadratic, space, target, start, key=key, steps=steps, rate=rate)
+    found = stochastic_descent(
+        DesignProblem(quadratic, space, target), start, key=key, steps=steps, rate=rate
+    )
     y, first, second, path = np.arcsin(np.sqrt(start)), 0.0, 0.0, []
     for n, step_key in enumerate(jax.random.split(key, steps), 1):
 
@@ -256,7 +260,10 @@ def test_a_stochastic_descent_step_by_step():
 def test_a_stochastic_descent_finds_the_mean():
     target = jnp.array([10.0, 14.0])
     found = stochastic_descent(
-        quadratic, free_betas(), target, jnp.array([0.9, 0.1]), key=jax.random.key(1), steps=400
+        DesignProblem(quadratic, free_betas(), target),
+        jnp.array([0.9, 0.1]),
+        key=jax.random.key(1),
+        steps=400,
     )
     np.testing.assert_allclose(found.values, target, atol=0.3)
     assert found.skipped == 0 and found.history.shape == (400,)
@@ -272,9 +279,7 @@ def sometimes_nothing(chosen, target, key):
 def test_steps_without_a_number_are_skipped_and_counted():
     target = jnp.array([10.0, 14.0])
     found = stochastic_descent(
-        sometimes_nothing,
-        free_betas(),
-        target,
+        DesignProblem(sometimes_nothing, free_betas(), target),
         jnp.array([0.5, 0.5]),
         key=jax.random.key(1),
         steps=200,

@@ -33,6 +33,7 @@ from thincam_jax.design import (
     worst_ratio_db,
 )
 from thincam_jax.design.objectives import Channels, ring_means
+from thincam_jax.lensless.exposures import Exposures
 from thincam_jax.reconstruction import phase_pairs
 
 N = 48
@@ -172,20 +173,24 @@ def test_ring_means_are_weighted_by_area():
 
 BAND = (0.15, 0.85)
 OTHER = Design(
-    [24.9, 24.8, 21.2, 21.1],
-    [0.1, 4.8, 0.0, 4.6],
-    [6.5, 6.5, 6.6, 6.6],
-    wavelength=505e-6,
-    width=5.6,
-    exposure=0.25,
+    Exposures(
+        [24.9, 24.8, 21.2, 21.1],
+        [6.5, 6.5, 6.6, 6.6],
+        phase=[0.1, 4.8, 0.0, 4.6],
+        wavelength=505e-6,
+        width=5.6,
+        relative_time=0.25,
+    )
 )
 TESTED = Design(
-    [25.0, 25.1, 21.0, 20.9],
-    [0.0, 4.7, 0.1, 4.6],
-    [6.5, 6.4, 6.5, 6.6],
-    wavelength=[500e-6, 510e-6, 490e-6, 500e-6],
-    width=5.632,
-    exposure=[0.2, 0.3, 0.25, 0.25],
+    Exposures(
+        [25.0, 25.1, 21.0, 20.9],
+        [6.5, 6.4, 6.5, 6.6],
+        phase=[0.0, 4.7, 0.1, 4.6],
+        wavelength=[500e-6, 510e-6, 490e-6, 500e-6],
+        width=5.632,
+        relative_time=[0.2, 0.3, 0.25, 0.25],
+    )
 )
 
 

@@ -17,6 +17,7 @@ from thincam_jax.design import (
     mismatch_error,
     robust_error,
 )
+from thincam_jax.lensless.exposures import Exposures
 from thincam_jax.reconstruction.synthesis import phase_pairs
 
 SETUP = setup(object_width=180.0, prior=PowerLaw(2.8))
@@ -62,7 +63,9 @@ def test_the_mean_is_that_of_samples(name, size):
         moved = [DESIGN.beta, DESIGN.distance]
         index = ["beta", "distance"].index(name)
         moved[index] = moved[index] * (1 + shift) if name == "beta" else moved[index] + shift
-        other = Design(moved[0], DESIGN.phase, moved[1], wavelength=5e-4, width=5.632)
+        other = Design(
+            Exposures(moved[0], moved[1], phase=DESIGN.phase, wavelength=5e-4, width=5.632)
+        )
         return mismatch_error(nominal, known(other))
 
     # Both signs of each: what is odd in the errors cancels.
@@ -100,10 +103,18 @@ def test_the_worst_is_above_each_and_near_the_largest():
     for sign in (-1, 1):
         for k in range(4):
             moved = DESIGN.distance.at[k].add(sign * 0.02)
-            other = Design(DESIGN.beta, DESIGN.phase, moved, wavelength=5e-4, width=5.632)
+            other = Design(
+                Exposures(DESIGN.beta, moved, phase=DESIGN.phase, wavelength=5e-4, width=5.632)
+            )
             errors.append(float(error_beside(nominal, known(other))))
         other = Design(
-            DESIGN.beta, DESIGN.phase, DESIGN.distance, wavelength=5e-4 + sign * 2e-6, width=5.632
+            Exposures(
+                DESIGN.beta,
+                DESIGN.distance,
+                phase=DESIGN.phase,
+                wavelength=5e-4 + sign * 2e-6,
+                width=5.632,
+            )
         )
         errors.append(float(error_beside(nominal, known(other))))
     worst = robust(tolerances, "worst")
@@ -117,7 +128,13 @@ def test_a_tilt_counts_as_a_distance():
     nominal, errors = known(DESIGN), []
     for sign in (-1, 1):
         other = Design(
-            DESIGN.beta, DESIGN.phase, DESIGN.distance + sign * depth, wavelength=5e-4, width=5.632
+            Exposures(
+                DESIGN.beta,
+                DESIGN.distance + sign * depth,
+                phase=DESIGN.phase,
+                wavelength=5e-4,
+                width=5.632,
+            )
         )
         errors.append(float(error_beside(nominal, known(other))))
     assert robust(Tolerances(tilt=tilt)) == pytest.approx(np.mean(errors), rel=1e-9)
@@ -133,7 +150,9 @@ def test_gradient_by_differences(how):
     @jax.jit
     def error(x):
         pairs = [jnp.repeat(v, 2) for v in (x[:2], x[2:4])]
-        chosen = Design(pairs[0], DESIGN.phase, pairs[1], wavelength=x[4], width=x[5])
+        chosen = Design(
+            Exposures(pairs[0], pairs[1], phase=DESIGN.phase, wavelength=x[4], width=x[5])
+        )
         return robust_error(chosen, SETUP, PAIRS, FREQUENCIES, tolerances, how=how)
 
     place = jnp.array([25.0, 21.0, 6.3, 6.45, 5e-4, 5.6])

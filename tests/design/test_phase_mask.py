@@ -14,6 +14,7 @@ from thincam_jax.design import (
     PowerLaw,
     Setup,
     SignalNoise,
+    TrainedSensor,
     Training,
     contour_target,
     cropped_error,
@@ -59,7 +60,8 @@ def retrieved():
     return target, mask_of_phase(phase, BLANK, GREEN, limits), limits
 
 
-SETTING = MaskSetting(BLANK, SENSOR, DISTANCE, wavelengths=[GREEN])
+CAMERA = tc.LenslessCamera(BLANK.mask(np.zeros(BLANK.shape)), SENSOR, DISTANCE)
+SETTING = MaskSetting(CAMERA, wavelengths=[GREEN])
 
 
 def evaluated(objective, mask, data):
@@ -126,14 +128,14 @@ def test_psfs_of_a_setting_are_the_cameras(retrieved):
     """One for each depth and wavelength; together, their mean over the wavelengths."""
     mask = retrieved[1]
     light = {"wavelengths": [450 * nm, GREEN], "object_distances": [20.0, np.inf]}
-    apart = MaskSetting(BLANK, SENSOR, DISTANCE, **light)
+    apart = MaskSetting(CAMERA, **light)
     several = jax.jit(lambda m: apart.psfs(m))(mask)
     assert several.shape == (2, 2, 32, 36)
     camera = tc.LenslessCamera(mask, SENSOR, DISTANCE)
     of_psf = {"model": "angular_spectrum", "pixel_integration": True}
     near_blue = tc.psf(camera, wavelength=450 * nm, object_distance=20.0, **of_psf)
     assert relative_l2(several[0, 0], near_blue) < 0.05
-    together = MaskSetting(BLANK, SENSOR, DISTANCE, together=True, **light)
+    together = MaskSetting(CAMERA, together=True, **light)
     both = jax.jit(lambda m: together.psfs(m))(mask)
     np.testing.assert_allclose(both, several.mean(axis=1, keepdims=True), atol=1e-9)
 
@@ -142,7 +144,7 @@ def test_refinement_beats_the_retrieved_phase_at_equal_levels(retrieved):
     """Expected error of the best linear image of 10 × 12 samples, crop included; four levels."""
     _, mask, limits = retrieved
     key, light = jax.random.key(1), {"wavelengths": [GREEN], "field_shape": (10, 12)}
-    data = MaskSetting(BLANK, SENSOR, DISTANCE, **light), setup()
+    data = MaskSetting(CAMERA, **light), setup()
     by_error = refine_mask(linear_objective, mask, limits, data, key=key, steps=40)
     step = limits.highest / 3
     off = np.asarray(by_error.mask.height) / step
@@ -171,12 +173,11 @@ def test_refinement_end_to_end(retrieved):
         images,
         setup(),
         np.array([[1.0]]),
-        sensor_shape=(32, 36),
-        distances=(DISTANCE, DISTANCE),
+        TrainedSensor((32, 36), (DISTANCE, DISTANCE)),
         key=jax.random.key(2),
     )
     light = {"wavelengths": [GREEN], "object_distances": [100.0]}
-    setting = MaskSetting(BLANK, SENSOR, DISTANCE, field_shape=training.field_shape, **light)
+    setting = MaskSetting(CAMERA, field_shape=training.field_shape, **light)
     data = (setting, training)
     found = refine_mask(restored_objective, mask, limits, data, key=jax.random.key(1), steps=25)
     assert found.skipped < 10  # where conjugate gradients do not reach the tolerance
@@ -187,7 +188,8 @@ def test_refinement_end_to_end(retrieved):
 def test_gradient_and_traces():
     """Of the linear error with respect to heights; other heights and limits of light: one trace."""
     small = MaskBlank((6, 8), PITCH, 1.5)
-    setting = MaskSetting(small, tc.Sensor((9, 10), PITCH), 0.5, wavelengths=[GREEN])
+    camera = tc.LenslessCamera(small.mask(np.zeros((6, 8))), tc.Sensor((9, 10), PITCH), 0.5)
+    setting = MaskSetting(camera, wavelengths=[GREEN])
     counted = count_traces(linear_objective)
     value = jax.jit(lambda h: counted(small.mask(h), (setting, setup()), jax.random.key(0)))
     height = jnp.asarray(np.random.default_rng(2).uniform(0.1, 1.0, (6, 8)) * um)
@@ -216,6 +218,6 @@ def test_refusals(retrieved):
             linear_objective, mask, HeightLimits(1e-3), data, key=jax.random.key(0), steps=1
         )
     with pytest.raises(ValueError, match="field_shape = .* has 4096 samples.*at most 2048"):
-        MaskSetting(BLANK, SENSOR, DISTANCE, wavelengths=[GREEN], field_shape=(64, 64))
+        MaskSetting(CAMERA, wavelengths=[GREEN], field_shape=(64, 64))
     with pytest.raises(ValueError, match="wavelengths = 500 mm is no light"):
-        MaskSetting(BLANK, SENSOR, DISTANCE, wavelengths=[500.0])
+        MaskSetting(CAMERA, wavelengths=[500.0])

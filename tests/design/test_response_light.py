@@ -11,6 +11,7 @@ import pytest
 import thincam_jax as tc
 from thincam_jax.design import Design, PhotonNoise, Polar, PowerLaw, Quadrant, Setup, SignalNoise
 from thincam_jax.design.response import capture_light, responses, signal_variance, spectral_density
+from thincam_jax.lensless.exposures import Exposures
 
 respond = jax.jit(responses)
 PITCH, DISTANCE, FAR, CELLS = 0.03, 5.0, 100.0, 240
@@ -19,7 +20,7 @@ CELL = PITCH * FAR / DISTANCE  # of the object, that a pixel sees
 
 def small(width=CELL * CELLS, exponent=1.5):
     """64×64 pixels, a mask of 2 mm, an object that fills the view of every pixel."""
-    design = Design([40.0], 1.0, DISTANCE, wavelength=500e-6, width=2.0)
+    design = Design(Exposures([40.0], DISTANCE, phase=1.0, wavelength=500e-6, width=2.0))
     judged = Setup(
         pitch=PITCH,
         sensor_width=64 * PITCH,

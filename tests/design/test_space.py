@@ -11,6 +11,7 @@ from design.setting import thesis_design, two_betas
 from helpers import count_traces
 from thincam_jax.design import Design, DesignSpace, Limits, Variable, shots
 from thincam_jax.design.space import active_limits
+from thincam_jax.lensless.exposures import Exposures
 
 BASE = thesis_design()
 BETA = Variable("beta", 8.0, 36.0, (0, 1))
@@ -83,7 +84,14 @@ def test_the_point_of_a_design():
 def test_captures_share_an_exposure():
     """The free shares as chosen; the others divide the rest as their own shares are."""
     base = Design(
-        BASE.beta, BASE.phase, 6.5, wavelength=5e-4, width=5.6, exposure=[1.0, 1.0, 1.0, 3.0]
+        Exposures(
+            BASE.beta,
+            6.5,
+            phase=BASE.phase,
+            wavelength=5e-4,
+            width=5.6,
+            relative_time=[1.0, 1.0, 1.0, 3.0],
+        )
     )
     free = Variable("exposure", 0.5, 2.5, (0, 1))
     space = DesignSpace(base, (BETA, free), Limits(exposure=6.0))
@@ -153,7 +161,7 @@ def test_active_limits_in_words():
         (
             (Variable("exposure", 0.5, 1.0, (0, 1)), Variable("exposure", 0.5, 2.0, (2, 3))),
             Limits(exposure=8.0),
-            "of every capture is free, and all of them share 8; leave at least one",
+            "of every capture is free, and all of them share 8; leave one that takes the rest",
         ),
         (
             (Variable("exposure", 0.5, 2.0, (0, 1)),),
@@ -179,13 +187,11 @@ def test_refused(variables, limits, message):
         ({"beta": [25.0, -1.0]}, "beta"),
         ({"distance": [6.5, 0.0]}, "distance"),
         ({"phase": math.nan}, "phase"),
-        ({"exposure": [1.0, 0.0]}, "exposure"),
+        ({"relative_time": [1.0, 0.0]}, "relative_time"),
         ({"beta": [25.0] * 9}, "give 1 to 8"),
     ],
 )
 def test_designs_refused(change, message):
     numbers = {"beta": 25.0, "phase": 0.0, "distance": 6.5, "wavelength": 500e-6, "width": 5.6}
-    numbers |= change
-    positional = [numbers.pop(n) for n in ("beta", "phase", "distance")]
     with pytest.raises(ValueError, match=message):
-        Design(*positional, **numbers)
+        Design(Exposures(**(numbers | change)))

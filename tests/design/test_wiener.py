@@ -14,11 +14,13 @@ from thincam_jax.design import (
     PowerLaw,
     Setup,
     SignalNoise,
+    TrainedSensor,
     Training,
     restore_by_wiener,
     wiener_error,
 )
 from thincam_jax.design.training import channels_of
+from thincam_jax.lensless.exposures import Exposures
 from thincam_jax.reconstruction.synthesis import phase_pairs
 
 SENSOR, PITCH = (80, 96), 0.02
@@ -51,15 +53,18 @@ def training(noise=None, *, count=COUNT, sensor=SENSOR, synthesis=None, pitch=PI
         pictures(count),
         setup(noise, pitch),
         phase_pairs(2) if synthesis is None else synthesis,
-        sensor_shape=sensor,
-        distances=(5.0, DISTANCE),
+        TrainedSensor(sensor, (5.0, DISTANCE)),
         key=jax.random.key(5),
     )
 
 
 def design(beta=(19.0, 23.0), distance=(7.0, 7.0), wavelength=5e-4, width=1.71):
     pairs = [jnp.repeat(jnp.asarray(x), 2) for x in (beta, distance)]
-    return Design(pairs[0], jnp.asarray(PAIR * 2), pairs[1], wavelength=wavelength, width=width)
+    return Design(
+        Exposures(
+            pairs[0], pairs[1], phase=jnp.asarray(PAIR * 2), wavelength=wavelength, width=width
+        )
+    )
 
 
 @count_traces
@@ -188,8 +193,7 @@ def test_errors():
             np.ones((1, 12, 12)),
             setup(),
             phase_pairs(2),
-            sensor_shape=SENSOR,
-            distances=(5.0, 7.0),
+            TrainedSensor(SENSOR, (5.0, 7.0)),
             key=jax.random.key(0),
         )
     with pytest.raises(ValueError, match="give the shortest and the longest"):
@@ -197,7 +201,6 @@ def test_errors():
             pictures(12),
             setup(),
             phase_pairs(2),
-            sensor_shape=SENSOR,
-            distances=(7.0, 5.0),
+            TrainedSensor(SENSOR, (7.0, 5.0)),
             key=jax.random.key(0),
         )

@@ -5,7 +5,9 @@ import time
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
+
+import pydantic
 
 from thincam_jax._core.files import WriteError, read_regular, write_whole
 from thincam_jax._core.steps import Progress, Step, carry_out
@@ -14,6 +16,8 @@ from thincam_jax.commands.config_file import ConfigError, slug
 from thincam_jax.commands.doctor import environment
 from thincam_jax.commands.report import Page, render_report
 from thincam_jax.commands.sections import ExperimentConfig, Section
+
+Record = TypeVar("Record")
 
 
 class RunFolder:
@@ -141,3 +145,8 @@ def refuse_foreign(path: Path, name: str, text: str, kind: str) -> None:
 
 def to_json(data: Any) -> str:
     return json.dumps(data, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+def as_record(kind: type[Record], data: Any) -> Record | None:
+    """A dataclass from what a file holds of it, `asdict` undone; None for None."""
+    return None if data is None else pydantic.TypeAdapter(kind).validate_python(data)

@@ -88,6 +88,8 @@ from thincam_jax.design.space import DesignSpace as DesignSpace
 from thincam_jax.design.space import Limits as Limits
 from thincam_jax.design.space import Variable as Variable
 from thincam_jax.design.stochastic import stochastic_descent as stochastic_descent
+from thincam_jax.design.training import ConjugateGradients as ConjugateGradients
+from thincam_jax.design.training import TrainedSensor as TrainedSensor
 from thincam_jax.design.training import Training as Training
 from thincam_jax.design.training_search import TrainedDesigns as TrainedDesigns
 from thincam_jax.design.training_search import TrainingDescents as TrainingDescents

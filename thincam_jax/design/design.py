@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from typing import get_args
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -12,9 +11,10 @@ from jaxtyping import Array, Float
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Number, Numbers
 from thincam_jax._core.module import Module
-from thincam_jax._core.quantity import unchecked
+from thincam_jax._core.quantity import FieldError, unchecked
 from thincam_jax.imaging.sensor import Sensor
 from thincam_jax.lensless.camera import LenslessCamera
+from thincam_jax.lensless.exposures import Exposures
 from thincam_jax.lensless.masks.fza import FresnelZoneAperture, Profile
 
 MOST_CAPTURES = 8
@@ -54,39 +54,44 @@ class Design(Module):
     width: Float[Array, ""] = eqx.field(converter=unchecked("mm"))
     profile: Profile = eqx.field(static=True)
 
-    def __init__(
-        self,
-        beta: Numbers,
-        phase: Numbers,
-        distance: Numbers,
-        *,
-        wavelength: Numbers,
-        width: Number,
-        exposure: Numbers = 1.0,
-        profile: Profile = "cosine",
-    ):
-        """Numbers, or one for each capture: they are broadcast against each other.
+    def __init__(self, exposures: Exposures):
+        """The captures of these exposures; masks without a profile have the cosine one.
 
-        **Errors**: ValueError for no capture, more than eight, or a number out of range.
+        **Errors**: ValueError for more than eight captures, a β of 0, and masks that differ in
+        their width or profile.
         """
-        phase = jnp.asarray(phase, float)
-        given = (
-            checks.positive_all("beta", jnp.asarray(beta, float), "rad/mm^2"),
-            checks.finite("phase", phase, "rad", shape=phase.shape),
-            checks.positive_all("distance", jnp.asarray(distance, float), "mm"),
-            checks.positive_all("wavelength", jnp.asarray(wavelength, float), "mm"),
-            checks.positive_all("exposure", jnp.asarray(exposure, float), "shares"),
+        if len(exposures) > MOST_CAPTURES:
+            message = f"a design of {len(exposures)} captures; give 1 to {MOST_CAPTURES}"
+            raise FieldError(message, "exposures")
+        beta = jnp.asarray(exposures.beta, float)
+        self.beta = checks.positive_all("beta", beta, "rad/mm^2")
+        self.phase = jnp.asarray(exposures.phase, float)
+        self.distance = jnp.asarray(exposures.distance, float)
+        self.wavelength = jnp.asarray(exposures.wavelength, float)
+        self.exposure = jnp.asarray(exposures.relative_time, float)
+        self.width = jnp.asarray(exposures.width[0], float)
+        profiles = set(exposures.profile)
+        known = not checks.is_traced(exposures.width)
+        if len(profiles) > 1 or (known and np.ptp(np.asarray(exposures.width)) > 0):
+            raise ValueError("masks of a design differ in width or profile; give one for all")
+        self.profile = profiles.pop() or "cosine"
+
+    @property
+    def exposures(self) -> Exposures:
+        """The captures, in plain numbers where they are known."""
+
+        def plain(number):
+            return number if checks.is_traced(number) else np.asarray(number)
+
+        return Exposures(
+            plain(self.beta),
+            plain(self.distance),
+            phase=plain(self.phase),
+            wavelength=plain(self.wavelength),
+            width=plain(self.width),
+            relative_time=plain(self.exposure),
+            profile=self.profile,
         )
-        shape = jnp.broadcast_shapes((1,), *(g.shape for g in given))
-        if len(shape) != 1 or not 1 <= shape[0] <= MOST_CAPTURES:
-            raise ValueError(
-                f"a design of {shape} captures; give 1 to {MOST_CAPTURES}, each number one for "
-                "all or one for each"
-            )
-        numbers = [jnp.broadcast_to(g, shape) for g in given]
-        self.beta, self.phase, self.distance, self.wavelength, self.exposure = numbers
-        self.width = checks.positive("width", width, "mm")
-        self.profile = checks.choice("profile", profile, get_args(Profile))  # pyright: ignore
 
     @property
     def captures(self) -> int:
@@ -127,9 +132,5 @@ def shots(
     profile: Profile = "cosine",
 ) -> Design:
     """Each setting (β, d) with each of the phases, in the order of a study's captures."""
-    settings = jnp.broadcast_arrays(jnp.atleast_1d(jnp.asarray(beta, float)), jnp.asarray(distance))
-    repeated = [jnp.repeat(s, len(phases)) for s in settings]
-    every = jnp.tile(jnp.asarray(phases, float), settings[0].shape[0])
-    return Design(
-        repeated[0], every, repeated[1], wavelength=wavelength, width=width, profile=profile
-    )
+    settings = Exposures(beta, distance, wavelength=wavelength, width=width, profile=profile)
+    return Design(settings.at_phases(np.asarray(phases).tolist()))

@@ -73,11 +73,13 @@ def _estimate(cameras, measured, training: Training) -> Float[Array, "v u"]:
 
     right = shaped(back([g / v for g, v in measured]))
 
+    solver = training.solver
+
     def solve(matrix, b):
-        found, _ = cg(matrix, b, tol=training.tolerance, maxiter=training.steps)
+        found, _ = cg(matrix, b, tol=solver.tolerance, maxiter=solver.steps)
         left = jnp.linalg.norm(matrix(found) - b)
         # The residual that is carried along is not quite this one.
-        return jnp.where(left <= 2 * training.tolerance * jnp.linalg.norm(b), found, jnp.nan)
+        return jnp.where(left <= 2 * solver.tolerance * jnp.linalg.norm(b), found, jnp.nan)
 
     return shaped(jax.lax.custom_linear_solve(normal, right, solve, symmetric=True))
 

@@ -126,7 +126,7 @@ class FrontSearch:
             spaces.append(neighbourhood(problem.space, place))
             designs.append(problem.space.design(place))
         for space in spaces:
-            narrowed = dataclasses.replace(problem, space=space, exact=None)
+            narrowed = dataclasses.replace(problem.searched, space=space)
             searched = find_designs(narrowed, self.settings, key=self.key)
             designs += [found.design for found in searched.found[:_TRIED]]
         points = [front_point(design, problem.best_data) for design in designs]

@@ -18,9 +18,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_ROOM = 0.06  # around points, as a part of an axis
-_SHADED = 85  # per cent of the landscape that the shades tell apart; the worst is one shade
-
 
 @dataclass(frozen=True, eq=False)
 class Landscape:
@@ -77,69 +74,13 @@ class Landscape:
         - `costs`: where they are drawn over a single number; by default on the line.
         - `ax`: to draw in; by default of a new figure of pyplot, which a notebook shows.
         """
-        if ax is None:
-            from thincam_jax.plot.frame import new_figure
+        from thincam_jax.plot.design import draw_landscape
+        from thincam_jax.plot.frame import new_figure
 
-            ax = new_figure(7.6, 6.0).subplots()
-        scaled = zip(self.variables, self.axes, strict=True)
-        axes = [axis * REPORTED[name].scale for (name, _), axis in scaled]
-        labels = [REPORTED[name].of_shots(shots) for name, shots in self.variables]
-        places = {name: self.place(design) for name, design in (designs or {}).items()}
-        if len(axes) == 1:
-            self._draw_line(ax, axes[0], places, costs or {})
-            ax.set(xlabel=labels[0], ylabel=self.label)
-        else:
-            self._draw_map(ax, axes, places)
-            ax.set(xlabel=labels[0], ylabel=labels[1])
-        if places:
-            below = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.1)}
-            ax.legend(fontsize=9, ncols=2, frameon=False, **below)
+        ax = new_figure(7.6, 6.0).subplots() if ax is None else ax
+        draw_landscape(self, ax, designs or {}, costs or {})
         figure: Any = ax.figure
         return figure
-
-    def _draw_line(
-        self, ax: "Axes", axis: np.ndarray, places: Mapping[str, Any], costs: Mapping[str, float]
-    ) -> None:
-        ax.plot(axis, self.values, color="black", linewidth=1)
-        for number, (name, (place,)) in enumerate(places.items()):
-            on_line = np.interp(place, axis, self.values)
-            height = self.reported(costs[name]) if name in costs else on_line
-            ax.plot(place, float(height), label=name, zorder=5, **_marker(number))
-        ax.grid(alpha=0.3)
-
-    def _draw_map(self, ax: "Axes", axes: list[np.ndarray], places: Mapping[str, Any]) -> None:
-        values = self.values.T
-        more = getattr(self.objective, "maximised", False)
-        worst = np.nanpercentile(values, 100 - _SHADED if more else _SHADED)
-        shades: dict[str, Any] = {"vmin" if more else "vmax": worst, "cmap": "cividis"}
-        x, y = axes
-        shown = ax.pcolormesh(x, y, values, shading="nearest", rasterized=True, **shades)
-        figure: Any = ax.figure
-        figure.colorbar(shown, ax=ax, label=self.label, extend="min" if more else "max")
-        # Grounds beside the map are not allowed, or not looked at.
-        ax.set_facecolor("#e8e8e8")
-        own = np.array([*places.values()]).reshape(-1, 2)
-        ax.set_xlim(*_reach(x, own[:, 0]))
-        ax.set_ylim(*_reach(y, own[:, 1]))
-        for number, (name, place) in enumerate(places.items()):
-            ax.plot(*place, label=name, clip_on=False, zorder=5, **_marker(number))
-
-
-def _marker(number: int) -> dict[str, Any]:
-    """Marker of the reference, number 0, and of designs found: told apart by shape."""
-    face, edge, size = ("white", "black", 10) if number else ("black", "white", 12)
-    style = {"marker": "Xo^Ds"[number % 5], "markersize": size, "linestyle": "none"}
-    return style | {"color": face, "markeredgecolor": edge, "markeredgewidth": 1.3}
-
-
-def _reach(axis: np.ndarray, own: np.ndarray) -> tuple[float, float]:
-    """The axis, and room for points that lie beyond it."""
-    half = (axis[1] - axis[0]) / 2
-    low, high = axis[0] - half, axis[-1] + half
-    room = _ROOM * (high - low)
-    low = min([low, *(own - room)[own < low]])
-    high = max([high, *(own + room)[own > high]])
-    return float(low), float(high)
 
 
 def landscape_around(

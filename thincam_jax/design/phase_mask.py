@@ -37,6 +37,7 @@ from thincam_jax.design.stochastic import adam
 from thincam_jax.design.training import Channel, relative_error
 from thincam_jax.imaging.operators import kernel_grid
 from thincam_jax.imaging.sensor import Sensor
+from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.masks.phase import HIGHEST, MaskBlank, PhaseMask
 from thincam_jax.lensless.method import PsfMethod, psf_method
 from thincam_jax.lensless.propagation.angular_spectrum import angular_spectrum
@@ -132,28 +133,25 @@ class MaskSetting(eqx.Module):
 
     def __init__(
         self,
-        blank: MaskBlank,
-        sensor: Sensor,
-        distance: Number,
+        camera: LenslessCamera,
         *,
         wavelengths: Numbers | Sequence[float],
         object_distances: Numbers | Sequence[float] = (math.inf,),
         together: bool = False,
         field_shape: tuple[int, int] | None = None,
     ):
-        self.sensor, self.together = sensor, together
+        self.sensor, self.distance, self.together = camera.sensor, camera.distance, together
         self.field_shape = None if field_shape is None else checks.shape2d("field", field_shape)
         if self.field_shape and math.prod(self.field_shape) > _MOST_SAMPLES:
             raise ValueError(
                 f"field_shape = {self.field_shape} has {math.prod(self.field_shape)} samples, each "
                 f"a row of a full matrix; give at most {_MOST_SAMPLES}, or larger pixels"
             )
-        self.distance = checks.positive("distance", distance, "mm")
         dtype = self.distance.dtype
         given = jnp.atleast_1d(jnp.asarray(wavelengths, dtype))
         self.wavelengths = checks.wavelength("wavelengths", given)
         self.object_distances = jnp.atleast_1d(jnp.asarray(object_distances, dtype))
-        flat = blank.mask(jnp.zeros(blank.shape, dtype))
+        flat = eqx.tree_at(lambda mask: mask.height, camera.mask, replace_fn=jnp.zeros_like)
         self.method = psf_method(flat, self.grid, "angular_spectrum", pixel_integration=True)
         for light in self.wavelengths:
             for away in self.object_distances:

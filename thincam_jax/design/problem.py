@@ -3,13 +3,14 @@
 import dataclasses
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Annotated, Any
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from thincam_jax._core.quantity import whole
 from thincam_jax.design.design import Design
 from thincam_jax.design.frequencies import Polar, Quadrant
 from thincam_jax.design.objectives import ObjectiveData
@@ -40,6 +41,11 @@ class DesignProblem(eqx.Module):
         """Data that designs are ranked with: `exact`, or `data` where there is none."""
         return self.data if self.exact is None else self.exact
 
+    @property
+    def searched(self) -> "DesignProblem":
+        """The problem without its exact data."""
+        return dataclasses.replace(self, exact=None)
+
     def with_thickness(self, thickness: float) -> "DesignProblem":
         """The problem with no distance above a thickness, mm."""
         is_distance = jnp.asarray([v.name == "distance" for v in self.space.variables])
@@ -61,7 +67,9 @@ class DesignProblem(eqx.Module):
         )
 
     def with_captures(
-        self, space: DesignSpace, synthesis: Float[Array, "channel capture"]
+        self,
+        space: DesignSpace,
+        synthesis: Float[Array, "channel capture"] | Float[np.ndarray, "channel capture"],
     ) -> "DesignProblem":
         """The problem for designs of other captures, on the same frequencies.
 
@@ -71,8 +79,8 @@ class DesignProblem(eqx.Module):
             captures = space.base.captures
             share = jnp.full(captures, self.space.base.captures / captures, space.lower.dtype)
             space = eqx.tree_at(lambda s: s.base.exposure, space, share)
-        changed = dataclasses.replace(self, space=space)
-        return changed._map_data(lambda data: dataclasses.replace(data, synthesis=synthesis))
+        changed, matrix = dataclasses.replace(self, space=space), jnp.asarray(synthesis, float)
+        return changed._map_data(lambda data: dataclasses.replace(data, synthesis=matrix))
 
     def _map_data(self, change: Callable[[Any], Any]) -> "DesignProblem":
         exact = None if self.exact is None else change(self.exact)
@@ -86,9 +94,9 @@ class FrequencyCounts:
     - `exact`: along each axis; None: as many as the fringes of the responses need.
     """
 
-    radii: int = 1024
-    directions: int = 3
-    exact: int | None = None
+    radii: Annotated[int, whole(64, 8192)] = 1024
+    directions: Annotated[int, whole(1, 16)] = 3
+    exact: Annotated[int | None, whole(64, 4096, optional=True)] = None
 
 
 def design_problem(

@@ -8,7 +8,7 @@ descended on is an approximation, the best few are then improved on the exact ob
 import functools
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Annotated, Any, Literal, get_args
 
 import equinox as eqx
 import jax
@@ -21,6 +21,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from thincam_jax._core import checks
 from thincam_jax._core.module import Module
+from thincam_jax._core.quantity import whole
 from thincam_jax.design.design import Design
 from thincam_jax.design.problem import DesignProblem, Objective
 from thincam_jax.design.space import DesignSpace, active_limits
@@ -47,9 +48,9 @@ class SearchSettings:
     **Errors**: ValueError for numbers of starts, samples or steps below 1.
     """
 
-    starts: int = 16
-    samples: int = 512
-    steps: int = 60
+    starts: Annotated[int, whole(1, 1000)] = 16
+    samples: Annotated[int, whole(1, 100_000)] = 512
+    steps: Annotated[int, whole(1, 1000)] = 60
     solver: Solver = "bfgs"
     tolerance: float = 1e-6
     separation: float = SEPARATION
@@ -117,8 +118,9 @@ def find_designs(
     points, values = sampled(objective, space, data, max(settings.samples, settings.starts), key)
     chosen = best_apart(np.asarray(points), np.asarray(values), settings.starts)
     descend = _descend if settings.solver == "bfgs" else _descend_in_box
-    lengths = settings.steps, settings.tolerance
-    ended = descend(objective, space, data, points[chosen], _scale(values[chosen]), *lengths)
+    tolerance = jnp.asarray(settings.tolerance, points.dtype)
+    scales = _scale(values[chosen])
+    ended = descend(problem.searched, points[chosen], scales, settings.steps, tolerance)
     search = search_of(space, values, ended, settings.separation)
     if problem.exact is None or not search.found:
         return search
@@ -215,7 +217,8 @@ def descend(
     ended = []
     for point in points:
         value = evaluate(objective, space, data, point[None])
-        ended.append(_descend(objective, space, data, point[None], _scale(value), steps, tolerance))
+        scale, least = _scale(value), jnp.asarray(tolerance, points.dtype)
+        ended.append(_descend(problem.searched, point[None], scale, steps, least))
     every = jax.tree.map(lambda *parts: jnp.concatenate(parts), *ended)
     return search_of(space, jnp.zeros(0, space.lower.dtype), every, SEPARATION)
 
@@ -224,7 +227,6 @@ def descend(
 AT_A_TIME = 32
 
 
-@functools.partial(jax.jit, static_argnames=("objective", "at_a_time"))
 def evaluate(
     objective: Objective,
     space: DesignSpace,
@@ -233,8 +235,18 @@ def evaluate(
     *,
     at_a_time: int = AT_A_TIME,
 ) -> Float[Array, " point"]:
-    """The objective at points of the unit cube, so many at a time."""
+    """The objective at points of the unit cube, so many at a time.
 
+    One at a time is for costly objectives: a single program serves any number of points.
+    """
+    if at_a_time > 1:
+        return _evaluate(objective, space, data, points, at_a_time)
+    each = [_evaluate(objective, space, data, point[None], 1) for point in points]
+    return jnp.asarray(np.concatenate(each))
+
+
+@functools.partial(jax.jit, static_argnames=("objective", "at_a_time"))
+def _evaluate(objective, space, data, points, at_a_time: int) -> Float[Array, " point"]:
     def at(point):
         return objective(space.design(point), data)
 
@@ -280,8 +292,9 @@ def on_cube(y: Float[Array, "..."]):
     return jnp.sin(y) ** 2
 
 
-@functools.partial(jax.jit, static_argnames=("objective", "steps"))
-def _descend(objective, space, data, points, scales, steps: int, tolerance) -> Descents:
+@eqx.filter_jit
+def _descend(problem: DesignProblem, points, scales, steps: int, tolerance) -> Descents:
+    objective, space, data = problem.objective, problem.space, problem.data
     solver = optimistix.BFGS(rtol=tolerance, atol=tolerance)
 
     # A face is a stationary point of sin²: a start on it would stay.
@@ -302,8 +315,9 @@ def _descend(objective, space, data, points, scales, steps: int, tolerance) -> D
     return jax.vmap(one)(inner, scales)
 
 
-@functools.partial(jax.jit, static_argnames=("objective", "steps"))
-def _descend_in_box(objective, space, data, points, scales, steps: int, tolerance) -> Descents:
+@eqx.filter_jit
+def _descend_in_box(problem: DesignProblem, points, scales, steps: int, tolerance) -> Descents:
+    objective, space, data = problem.objective, problem.space, problem.data
     from thincam_jax.design._jaxopt import descend_in_box  # jaxopt is slow to import
 
     def one(point, scale):

@@ -1,9 +1,9 @@
 """Stochastic search: Adam, by optax, on an objective that is drawn anew at every step."""
 
-import functools
 from collections.abc import Callable
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optax
@@ -11,10 +11,8 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from thincam_jax._core.module import Module
 from thincam_jax.design.design import Design
+from thincam_jax.design.problem import DesignProblem
 from thincam_jax.design.search import on_cube
-from thincam_jax.design.space import DesignSpace
-
-StochasticObjective = Callable[[Design, Any, PRNGKeyArray], Float[Array, ""]]
 
 
 class Descent(Module):
@@ -33,9 +31,7 @@ class Descent(Module):
 
 
 def stochastic_descent(
-    objective: StochasticObjective,
-    space: DesignSpace,
-    data: Any,
+    problem: DesignProblem,
     point: Float[Array, " variable"],
     *,
     key: PRNGKeyArray,
@@ -44,26 +40,26 @@ def stochastic_descent(
 ) -> Descent:
     """Adam from a point of the unit cube, with the rate falling to zero as a cosine.
 
-    `objective`: (design, data, key) → a number, at module level. `rate`: of the angle that sin²
-    maps onto the cube; the cube's side is π/2 of it.
+    - `problem`: its objective is (design, data, key) → a number, at module level.
+    - `rate`: of the angle that sin² maps onto the cube; the cube's side is π/2 of it.
     """
     if steps < 2 or not rate > 0:
         raise ValueError(
             f"steps = {steps}, rate = {rate}: give at least 2 steps and a rate above 0"
         )
-    inner = jnp.clip(point, 1e-3, 1 - 1e-3)
-    mean, history, skipped = _descend(objective, space, data, inner, key, steps, rate)
+    inner, space = jnp.clip(point, 1e-3, 1 - 1e-3), problem.space
+    mean, history, skipped = _descend(problem, inner, key, steps, jnp.asarray(rate, inner.dtype))
     return Descent(space.design(mean), space.values(mean), mean, history, int(skipped))
 
 
-@functools.partial(jax.jit, static_argnames=("objective", "steps"))
-def _descend(objective, space, data, point, key, steps: int, rate):
+@eqx.filter_jit
+def _descend(problem, point, key, steps: int, rate):
     def loss(y, step_key):
-        value = objective(space.design(on_cube(y)), data, step_key)
+        value = problem.objective(problem.space.design(on_cube(y)), problem.data, step_key)
         return value, (y, value)
 
     start = jnp.arcsin(jnp.sqrt(point))
-    end, (path, history), skipped = adam(loss, start, key, jnp.asarray(rate, point.dtype), steps)
+    end, (path, history), skipped = adam(loss, start, key, rate, steps)
     late = jnp.concatenate([path[steps // 2 + 1 :], end[None]])
     return jnp.mean(on_cube(late), axis=0), history, skipped
 

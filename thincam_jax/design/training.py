@@ -45,6 +45,32 @@ class Window:
     across: float
 
 
+@dataclass(frozen=True)
+class TrainedSensor:
+    """A sensor in training, and where designs may place it.
+
+    - `shape`: of its pixels, as many as there is noise for.
+    - `distances`: the shortest and the longest from the mask, mm.
+    """
+
+    shape: tuple[int, int]
+    distances: tuple[float, float]
+
+    def __post_init__(self):
+        if not 0 < self.distances[0] <= self.distances[1]:
+            raise ValueError(
+                f"distances = {self.distances} mm; give the shortest and the longest, > 0"
+            )
+
+
+@dataclass(frozen=True)
+class ConjugateGradients:
+    """End of conjugate gradients: at a relative residual, or after so many steps."""
+
+    tolerance: float = 1e-4
+    steps: int = 200
+
+
 def _window(setup: Setup, pixels: int, shortest: float, longest: float) -> Window:
     width = float(setup.sensor_width)
     angle = width / shortest + float(setup.field)
@@ -55,13 +81,11 @@ def _window(setup: Setup, pixels: int, shortest: float, longest: float) -> Windo
 class Training(eqx.Module):
     """Images to restore, and the noise that their captures are given.
 
-    Made with `distances`, the shortest and the longest (mm) that designs may take.
-
     **Validity.** Of a design nearer than the shortest, light wraps round; of one farther than the
     longest, the field is cut off: both are refused where the distances are known numbers.
 
-    **Errors**: ValueError for images that are not square or have no contrast, for distances out
-    of order, and for a synthesis with rows of zeros.
+    **Errors**: ValueError for images that are not square or have no contrast, and for a synthesis
+    with rows of zeros.
 
     - `images`: (image, v, u), square, over the object's width, of mean 1.
     - `noise`: standard normal numbers (image, channel, y, x): the same in every evaluation, so that
@@ -71,7 +95,7 @@ class Training(eqx.Module):
     - `synthesis`: rows (channel) of weights of the captures; a row adds captures at one distance.
     - `field_shape`: of the projection on the sensor, at least the object's at the longest distance.
     - `distances`: mm; `window`: of the angles that a reconstruction's spectrum is taken over.
-    - `tolerance`, `steps`: of conjugate gradients: relative residual, and at most so many.
+    - `solver`: of `end_to_end`.
     """
 
     images: Float[Array, "image v u"]
@@ -81,23 +105,19 @@ class Training(eqx.Module):
     field_shape: tuple[int, int] = eqx.field(static=True)
     distances: tuple[float, float] = eqx.field(static=True)
     window: Window = eqx.field(static=True)
-    tolerance: float = eqx.field(static=True)
-    steps: int = eqx.field(static=True)
+    solver: ConjugateGradients = eqx.field(static=True)
 
     def __init__(
         self,
         images: Float[Array, "image v u"] | Float[np.ndarray, "image v u"],
         setup: Setup,
         synthesis: Float[np.ndarray, "channel capture"],
+        sensor: TrainedSensor,
         *,
-        sensor_shape: tuple[int, int],
-        distances: tuple[float, float],
         key: PRNGKeyArray,
-        tolerance: float = 1e-4,
-        steps: int = 200,
+        solver: ConjugateGradients = ConjugateGradients(),
     ):
-        if not 0 < distances[0] <= distances[1]:
-            raise ValueError(f"distances = {distances} mm; give the shortest and the longest, > 0")
+        sensor_shape, distances = sensor.shape, sensor.distances
         given = jnp.asarray(images, float)
         if given.ndim != 3 or given.shape[-1] != given.shape[-2]:
             raise ValueError(f"images have shape {given.shape}; give (image, n, n), square ones")
@@ -119,7 +139,7 @@ class Training(eqx.Module):
         self.field_shape = (rows, columns)
         self.distances = (float(distances[0]), float(distances[1]))
         self.window = _window(setup, max(sensor_shape), *distances)
-        self.tolerance, self.steps = tolerance, steps
+        self.solver = solver
 
     @property
     def sensor(self) -> Sensor:

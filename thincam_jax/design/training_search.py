@@ -7,7 +7,7 @@ counts which the frequency-wise objectives leave out.
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import equinox as eqx
 import jax
@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from thincam_jax._core.quantity import whole
 from thincam_jax.design.design import Design
 from thincam_jax.design.end_to_end import end_to_end_error
 from thincam_jax.design.landscape import Landscape, drawn_variables, landscape_if_any
@@ -34,7 +35,7 @@ from thincam_jax.design.search import (
 from thincam_jax.design.sensitivity import Derivatives, per_unit, uncoupled
 from thincam_jax.design.setup import Setup
 from thincam_jax.design.space import DesignSpace
-from thincam_jax.design.training import Training
+from thincam_jax.design.training import TrainedSensor, Training
 from thincam_jax.design.wiener import wiener_error
 from thincam_jax.imaging.targets import middle_square, resize
 
@@ -73,9 +74,9 @@ class TrainingSettings:
     - `grid`: points along each side of the landscape, at most.
     """
 
-    samples: int = 64
-    starts: int = 4
-    steps: int = 30
+    samples: Annotated[int, whole(1, 10_000)] = 64
+    starts: Annotated[int, whole(1, 10)] = 4
+    steps: Annotated[int, whole(1, 1000)] = 30
     grid: int = 61
 
 
@@ -251,8 +252,7 @@ def build_training(
         np.stack(squares),
         setup,
         synthesis,
-        sensor_shape=(pixels, pixels),
-        distances=distances,
+        TrainedSensor((pixels, pixels), distances),
         key=key,
     )
 

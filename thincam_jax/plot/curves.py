@@ -1,11 +1,16 @@
-"""Figures of numbers: the history of a solver, and an objective over two parameters."""
+"""Figures of numbers: a solver's history, objectives, fronts of designs and their tolerances."""
 
-from typing import Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from thincam_jax.plot.frame import Figure, new_figure
 from thincam_jax.reconstruction import Reconstruction
+
+# The figures of reconstructions wait for no design.
+if TYPE_CHECKING:
+    from thincam_jax.design import FrontPoint, Sensitivity
 
 
 def history(result: Reconstruction) -> Figure:
@@ -63,4 +68,42 @@ def landscape(
     row, column = np.unravel_index(np.nanargmin(values), values.shape)
     axes.plot(across[column], down[row], "x", color="tab:red", markersize=9)
     axes.set(xlabel=labels[0], ylabel=labels[1])
+    return figure
+
+
+def front(points: "Sequence[FrontPoint]", cost: str) -> Figure:
+    """Resolution and error of the points of a front over their cost; hollow ones are dominated.
+
+    - `points`: as of `tc.design.find_front`. `cost`: label of the cost, "thickness (mm)".
+    """
+    from thincam_jax.design.fronts import non_dominated
+
+    figure = new_figure(8.5, 3.4)
+    worths = (
+        ("resolution", "limit of resolution (cycles/rad)", True),
+        ("error", "expected error over the scene's variance", False),
+    )
+    for ax, (name, label, larger) in zip(figure.subplots(1, 2), worths, strict=True):
+        places = np.array([(point.cost, getattr(point, name)) for point in points], dtype=float)
+        best = non_dominated(places, larger=(False, larger))
+        ax.plot(*places.T, color="black", linewidth=0.7)
+        for chosen, face in ((best, "black"), (~best, "white")):
+            marks = {"linestyle": "none", "markerfacecolor": face, "markeredgecolor": "black"}
+            ax.plot(*places[chosen].T, marker="o", **marks)
+        ax.set(xlabel=cost, ylabel=label)
+    return figure
+
+
+def sensitivity(around: "Sensitivity") -> Figure:
+    """Tolerance of each free number of a design, in per cent of the number, as bars."""
+    from thincam_jax.design.space import REPORTED
+
+    values = around.values
+    names = [f"{REPORTED[v.variable].of_shots(v.shots)}\n{v}" for v in values]
+    parts = [np.nan if v.tolerance is None else 100 * v.tolerance / abs(v.value) for v in values]
+    figure = new_figure(6.0, 0.6 * len(values) + 1.0)
+    axes = figure.subplots()
+    axes.barh(names, parts, color="#606060")
+    axes.invert_yaxis()
+    axes.set(xlabel="tolerance (per cent of the number)")
     return figure

@@ -6,15 +6,14 @@ import numpy as np
 import pytest
 from commands.design import tiny
 
-from thincam_jax.commands.design.build import build_problem, front_problems
-from thincam_jax.commands.design.config_pareto import with_shots
+from thincam_jax.commands.design.build import front_problems, with_shots
 from thincam_jax.design import ResolutionLimit, RobustError, Tolerances, WorstRatio
 
 LIGHT = "noise={read_noise: 4, electrons: 900}"
 
 
 def test_the_setup_is_that_of_the_file(tmp_path):
-    problem = build_problem(tiny.built(tmp_path))
+    problem = tiny.built(tmp_path).problem
     setup, frequencies = problem.exact.setup, problem.exact.frequencies
     assert float(setup.sensor_width) == pytest.approx(48 * 0.04)  # the shorter side
     assert float(setup.noise.snr_db) == 30
@@ -27,21 +26,21 @@ def test_the_setup_is_that_of_the_file(tmp_path):
 
 
 def test_measured_prior_and_photon_noise(tmp_path):
-    setup = build_problem(tiny.built(tmp_path, "prior={measured: true}", LIGHT)).data.setup
+    setup = tiny.built(tmp_path, "prior={measured: true}", LIGHT).problem.data.setup
     assert 2.6 < float(setup.prior.exponent) < 9  # smooth blobs fall off faster than photographs
     assert (float(setup.noise.electrons), float(setup.noise.read_noise)) == (900, 4)
 
 
 def test_objectives_have_the_settings_of_the_file(tmp_path):
     asked = "search.tolerances={distance: 30 um, beta: 0.002}"
-    robust = build_problem(tiny.built(tmp_path, "search.objective=robust_error", asked)).objective
+    robust = tiny.built(tmp_path, "search.objective=robust_error", asked).problem.objective
     assert isinstance(robust, RobustError) and robust.how == "mean"
     expected = dataclasses.astuple(Tolerances(beta=0.002, distance=0.03))
     assert dataclasses.astuple(robust.tolerances) == pytest.approx(expected)
     worst = "search.objective=worst_ratio"
-    assert build_problem(tiny.built(tmp_path, worst)).objective == WorstRatio()
+    assert tiny.built(tmp_path, worst).problem.objective == WorstRatio()
     banded = tiny.built(tmp_path, worst, "search.band=[0.1, 0.4]")
-    assert build_problem(banded).objective == WorstRatio((0.1, 0.4))
+    assert banded.problem.objective == WorstRatio((0.1, 0.4))
 
 
 def test_problems_of_fronts(tmp_path):
@@ -51,7 +50,7 @@ def test_problems_of_fronts(tmp_path):
         "{variable: distance, bounds: [2 mm, 3 mm], shared: true}]"
     )
     study = tiny.built(tmp_path, free, LIGHT, "search.limits.captures=8")
-    config, problem = study.config, build_problem(study)
+    config, problem = study.config, study.problem
     thin = front_problems(config, problem, "thickness", [2.0, 3.0])
     assert [float(p.space.upper[-1]) for p in thin.values()] == [2.0, 3.0]
     lit = front_problems(config, problem, "light", [90.0])[90.0]

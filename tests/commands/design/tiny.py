@@ -2,13 +2,13 @@
 
 from pathlib import Path
 
-import numpy as np
 from commands.study import tiny
 
-from thincam_jax.commands.design.config import DesignConfig, load_design
-from thincam_jax.commands.design.simulation import build_designs
-from thincam_jax.commands.study.build import FileStudy
+from thincam_jax.commands.design.build import FileDesign, build_design
+from thincam_jax.commands.design.config import DesignConfig
+from thincam_jax.commands.kinds import load_experiment
 from thincam_jax.design import Design
+from thincam_jax.lensless.exposures import Exposures
 
 TEXT = """\
 name: tiny design
@@ -53,21 +53,22 @@ def write(folder: Path, text: str = TEXT) -> Path:
     return tiny.write(folder, text)
 
 
+def load(path: Path, overrides: tuple[str, ...] = ()) -> DesignConfig:
+    return load_experiment(path, overrides, "design")
+
+
 def design(folder: Path, *overrides: str, text: str = TEXT) -> DesignConfig:
-    return load_design(write(folder, text), overrides)
+    return load(write(folder, text), overrides)
 
 
-def built(folder: Path, *overrides: str, text: str = TEXT) -> FileStudy:
-    return build_designs(design(folder, *overrides, text=text))
+def built(folder: Path, *overrides: str, text: str = TEXT) -> FileDesign:
+    return build_design(design(folder, *overrides, text=text))
 
 
 def found(betas, distances=3.0, width=2.0, **others) -> Design:
     """A design of so many shots with the two phases, and the wavelength of the file."""
-    each = {"beta": betas, "distance": distances, "wavelength": 5e-4, **others}
-    numbers = np.broadcast_arrays(*each.values())
-    repeated = {name: np.repeat(n, 2) for name, n in zip(each, numbers, strict=True)}
-    phase = np.tile([0.0, 1.5 * np.pi], len(numbers[0]))
-    return Design(**repeated, phase=phase, width=width)
+    settings = Exposures(betas, distances, width=width, **({"wavelength": 5e-4} | others))
+    return Design(settings.phase_pairs())
 
 
 def ignore(*_) -> None:

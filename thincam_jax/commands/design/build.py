@@ -1,46 +1,140 @@
-"""From a design's file to its search problem and its training."""
+"""From a design's file to its study, and from what was found to a study's file."""
 
-import jax
-import jax.numpy as jnp
+from dataclasses import dataclass
+from typing import Any
+
 import numpy as np
 
+from thincam_jax._core.precision import allow
+from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.design.config import DesignConfig, DesignNoiseConfig, SearchConfig
-from thincam_jax.commands.design.config_pareto import ParetoConfig, with_shots
-from thincam_jax.commands.study.build import FileStudy
+from thincam_jax.commands.sections import MaskConfig, MethodConfig, MethodShotConfig, SensorConfig
+from thincam_jax.commands.study import build
+from thincam_jax.commands.study.config import StudyConfig
 from thincam_jax.design import (
     AbstractObjective,
     BayesError,
     Design,
     DesignProblem,
-    DesignSpace,
-    FrequencyCounts,
     PhotonNoise,
     PowerLaw,
     ResolutionLimit,
     RobustError,
-    SearchSettings,
     Setup,
     SignalNoise,
-    Training,
     TrainingError,
+    TrainingSettings,
     Unevenness,
     WorstRatio,
-    build_training,
     design_problem,
     fit_power_law,
-    training_pixels,
 )
 from thincam_jax.design.objectives import OBJECTIVES
 from thincam_jax.imaging.targets import sample_image
-from thincam_jax.studies.study import synthesis_matrix
+from thincam_jax.studies.design import DesignStudy, FrontPlan, TrainingPlan, as_method
+from thincam_jax.studies.study import Method, Study, Target, synthesis_matrix
+
+# Electrons of a full well that no pixel fills: the search knows of no saturation.
+_FULL_WELL = 1e9
+_SMALLEST_PICTURE = 32  # pixels along a side from which a spectrum is measured
 
 
-def build_problem(study: FileStudy) -> DesignProblem:
+@dataclass(frozen=True, eq=False)
+class FileDesign(DesignStudy):
+    """A study with the file that it was read from."""
+
+    config: Any = None
+
+
+def build_design(config: DesignConfig) -> FileDesign:
+    """All that a design needs, images read and everything checked, before the search.
+
+    **Errors**: ConfigError as of `build_study`, and for pictures too small for a measured prior.
+    """
+    study = build_designs(config)
+    with allow("float64"):
+        problem = build_problem(config, study)
+        rivals = {rival.name: config.design(rival) for rival in config.compare}
+        fronts = _fronts(config, problem)
+    search, validation = config.search, config.validation
+    return FileDesign(
+        study,
+        problem,
+        rivals,
+        search.build(),
+        search.grid,
+        validation.seeds,
+        validation.best,
+        _training(config),
+        fronts,
+        config,
+    )
+
+
+def build_designs(config: DesignConfig) -> build.FileStudy:
+    """The designs that the file gives, as methods of a study, the one to beat first."""
+    with allow("float64"):
+        given = {one.name: config.design(one) for one in (config.reference, *config.compare)}
+    targets, unread = build.read_targets(
+        config.targets, config.object.distance, config.object.width
+    )
+    sensor, first = _sensor(config), given[config.reference.name].exposures[0]
+    mask, sensor = build.build_optics(_mask(config), sensor, first)
+    study = build.FileStudy(
+        mask,
+        sensor,
+        tuple(
+            as_method(mask, name, design, config.reference.synthesis)
+            for name, design in given.items()
+        ),
+        tuple(targets),
+        object_distance=config.object.distance,
+        noise=build.build_noise(config.noise.simulated()),
+        model=config.model,
+        pixel_integration=config.pixel_integration,
+        seed=config.seed,
+        name=config.name,
+        config=config,
+    )
+    build.check_study(study, unread)
+    for target in study.targets:
+        rows, columns = target.plane.image.shape[-2:]
+        if config.prior.measured and target.is_picture and min(rows, columns) < _SMALLEST_PICTURE:
+            raise ConfigError(
+                f"targets[{target.number}]: {rows}×{columns} pixels are too few to measure a "
+                f"spectrum; give at least {_SMALLEST_PICTURE}×{_SMALLEST_PICTURE}, or "
+                "prior.exponent"
+            )
+    return study
+
+
+def _sensor(config: DesignConfig) -> SensorConfig:
+    """Of numbers that the design's file has had checked."""
+    sensor = dict(config.sensor)
+    if config.noise.electrons is not None:
+        sensor |= {"full_well": _FULL_WELL, "electrons": config.noise.electrons}
+    return SensorConfig.model_construct(**sensor)
+
+
+def _mask(config: DesignConfig) -> MaskConfig:
+    return MaskConfig.model_construct(**dict(config.mask))
+
+
+def build_problem(config: DesignConfig, study: Study) -> DesignProblem:
     """In the precision that JAX is set to; looks at the photographs where the prior needs them."""
-    config: DesignConfig = study.config
-    space, counts = config.space(), FrequencyCounts(**dict(config.search.frequencies))
-    synthesis = synthesis_of(space.base, config)
-    return design_problem(build_objective(config.search), space, _setup(study), synthesis, counts)
+    space, counts = config.space(), config.search.frequencies.build()
+    setup = Setup(
+        pitch=config.sensor.pitch,
+        sensor_width=config.sensor.width,
+        object_distance=config.object.distance,
+        object_width=config.object.width,
+        noise=_noise(config.noise),
+        prior=_prior(config, study.targets),
+        contrast=config.prior.contrast,
+        pixel_integration=config.pixel_integration,
+    )
+    synthesis = _synthesis(config, space.base)
+    return design_problem(build_objective(config.search), space, setup, synthesis, counts)
 
 
 def build_objective(asked: SearchConfig) -> AbstractObjective:
@@ -53,29 +147,10 @@ def build_objective(asked: SearchConfig) -> AbstractObjective:
     return kind()
 
 
-def synthesis_of(design: Design, config: DesignConfig) -> np.ndarray:
+def _synthesis(config: DesignConfig, design: Design) -> np.ndarray:
     """Of a design's captures, real weights (channel, capture)."""
     phases = design.phases
     return synthesis_matrix(config.reference.synthesis, design.captures // phases, phases)
-
-
-def search_settings(asked: SearchConfig | ParetoConfig) -> SearchSettings:
-    """How long a section of the file searches."""
-    return SearchSettings(asked.starts, asked.samples, asked.steps, asked.solver)
-
-
-def _setup(study: FileStudy) -> Setup:
-    config: DesignConfig = study.config
-    return Setup(
-        pitch=config.sensor.pitch,
-        sensor_width=config.sensor.width,
-        object_distance=config.object.distance,
-        object_width=config.object.width,
-        noise=_noise(config.noise),
-        prior=_prior(study),
-        contrast=config.prior.contrast,
-        pixel_integration=config.pixel_integration,
-    )
 
 
 def _noise(noise: DesignNoiseConfig) -> SignalNoise | PhotonNoise:
@@ -84,11 +159,32 @@ def _noise(noise: DesignNoiseConfig) -> SignalNoise | PhotonNoise:
     return PhotonNoise(noise.electrons or 0.0, noise.read_noise or 0.0)
 
 
-def _prior(study: FileStudy) -> PowerLaw:
-    if study.config.prior.exponent is not None:
-        return PowerLaw(study.config.prior.exponent)
-    planes = (target.plane for target in study.targets if target.is_picture)
+def _prior(config: DesignConfig, targets: tuple[Target, ...]) -> PowerLaw:
+    if config.prior.exponent is not None:
+        return PowerLaw(config.prior.exponent)
+    planes = (target.plane for target in targets if target.is_picture)
     return fit_power_law(np.asarray(p.image, dtype=float).mean(axis=0) for p in planes)
+
+
+def _training(config: DesignConfig) -> TrainingPlan | None:
+    asked = config.train
+    if asked is None:
+        return None
+    return TrainingPlan(
+        {name: sample_image(name) for name in asked.images},
+        TrainingError(asked.reconstruction),
+        TrainingSettings(asked.samples, asked.starts, asked.steps, config.search.grid),
+        asked.pixels,
+    )
+
+
+def _fronts(config: DesignConfig, problem: DesignProblem) -> FrontPlan | None:
+    asked = config.pareto
+    if asked is None:
+        return None
+    costs = asked.costs(len(config.reference.phases))
+    problems = {name: front_problems(config, problem, name, each) for name, each in costs.items()}
+    return FrontPlan(problems, asked.build())
 
 
 def front_problems(
@@ -103,26 +199,68 @@ def front_problems(
 
 
 def _of_captures(config: DesignConfig, problem: DesignProblem, captures: int) -> DesignProblem:
-    space: DesignSpace = with_shots(config, captures // len(config.reference.phases)).space()
-    matrix = jnp.asarray(synthesis_of(space.base, config), float)
+    space = with_shots(config, captures // len(config.reference.phases)).space()
     given = DesignProblem(BayesError(), problem.space, problem.data, problem.exact)
-    return given.with_captures(space, matrix)
+    return given.with_captures(space, _synthesis(config, space.base))
 
 
-def training_problem(config: DesignConfig, problem: DesignProblem) -> DesignProblem:
-    """What `train` of a file asks for, in the precision that JAX is set to.
+def with_shots(config: DesignConfig, count: int) -> DesignConfig:
+    """The same search for designs of so many shots.
 
-    `problem`: of the search, in double precision; noise is of the file's seed.
+    Fewer are the first of the reference; more of them begin as copies of its last, and are free in
+    what that is free in.
     """
-    asked, space = config.train, config.space()
-    assert asked is not None  # for the type checker
-    reached, setup = problem.space, problem.data.setup
-    training: Training = build_training(
-        [sample_image(name) for name in asked.images],
-        reached,
-        setup,
-        synthesis_of(space.base, config),
-        pixels=asked.pixels or training_pixels(reached, setup, config.sensor.shape),
-        key=jax.random.key(config.seed),
+    given = config.reference.shots
+    last = len(given)
+    shots = (*given, *(given[-1],) * (count - last))[:count]
+    free = []
+    for entry in config.search.free:
+        if entry.shots is None:
+            free.append(entry)
+            continue
+        kept = tuple(s for s in entry.shots if s <= count)
+        if last in entry.shots:
+            kept = (*kept, *range(last + 1, count + 1))
+        if kept:
+            free.append(entry.model_copy(update={"shots": kept}))
+    reference = config.reference.model_copy(update={"shots": shots})
+    search = config.search.model_copy(update={"free": tuple(free)})
+    return config.model_copy(update={"reference": reference, "search": search})
+
+
+def as_study_config(config: DesignConfig, methods: tuple[Method, ...]) -> StudyConfig:
+    """Designs for `thincam run`; what all shots share is left out of them.
+
+    Nothing is checked again: its numbers were.
+    """
+    return StudyConfig.model_construct(
+        name=f"{config.name} found"[:60],
+        title=f"{config.title or config.name}: the designs found",
+        seed=config.seed,
+        wavelength=config.wavelength,
+        model=config.model,
+        pixel_integration=config.pixel_integration,
+        sensor=_sensor(config),
+        mask=_mask(config),
+        object=config.object,
+        noise=config.noise.simulated(),
+        methods=tuple(_method_config(config, method) for method in methods),
+        targets=config.targets,
     )
-    return DesignProblem(TrainingError(asked.reconstruction), space, training)
+
+
+def _method_config(config: DesignConfig, method: Method) -> MethodConfig:
+    shots = tuple(
+        MethodShotConfig.model_construct(
+            beta=shot.beta,
+            distance=shot.distance,
+            wavelength=None if shot.wavelength == config.wavelength else shot.wavelength,
+            width=None if shot.width == config.mask.width else shot.width,
+            exposure=shot.relative_time,
+            take=None if shot.take == 1 else shot.take,
+        )
+        for shot in method.shots
+    )
+    return MethodConfig.model_construct(
+        name=method.name, kind=method.solver.name, synthesis=method.synthesis, shots=shots
+    )

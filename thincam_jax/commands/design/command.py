@@ -1,11 +1,14 @@
 """The command `thincam design`."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from thincam_jax.commands.terminal import Overrides, counted, show, told, warn
+
+if TYPE_CHECKING:
+    from thincam_jax.studies.design_scores import DesignScores
 
 
 def design(
@@ -23,46 +26,25 @@ def design(
     goes_on = "interrupted; the same command goes on with the targets that are not finished."
     with told(lambda: goes_on):
         from thincam_jax.commands.config_file import slug
-        from thincam_jax.commands.design.config import load_design
+        from thincam_jax.commands.design.build import build_design
         from thincam_jax.commands.design.run import DesignFolder, run_design
-        from thincam_jax.commands.design.simulation import build_designs
+        from thincam_jax.commands.kinds import load_experiment
 
-        wanted = load_design(config, tuple(set_ or ()))
-        study = build_designs(wanted)
+        wanted = load_experiment(config, tuple(set_ or ()), "design")
+        study = build_design(wanted)
         warn(study.warnings)
         folder = DesignFolder(out or Path("runs") / slug(wanted.name))
         with counted(wanted.name) as progress:
             found = run_design(study, folder, progress)
-    _print(found)
+    show(found.table())
+    print(_levels(found))
     print(f"report: {folder.path / 'report.html'}")
 
 
-def _print(found: dict) -> None:
-    from thincam_jax._core.table import Table
-    from thincam_jax.commands.design.report import in_words, objective_unit, reported_names
-
-    validation = found["validation"]
-    designs = (found["reference"], *found["compare"], *found["found"])
-    names = reported_names(designs)
-    unit = objective_unit(found)
-    pictures = (f"{target}\ngain, dB" for target in validation["pictures"])
-    charts = (f"{target}\ngain, elements" for target in validation["charts"])
-    rows = []
-    for one in designs:
-        simulated = validation["methods"].get(one["name"])
-        if simulated is None:
-            continue
-        predicted = f"{one['predicted_gain']:+.2f}" if "predicted_gain" in one else None
-        gains = [_gain(simulated[name], "gain_db") for name in validation["pictures"]]
-        gains += [_gain(simulated[name], "gain_elements") for name in validation["charts"]]
-        rows.append(["\n".join([one["name"], *in_words(one, names)]), predicted, *gains])
-    show(Table(("design", f"predicted\ngain, {unit}", *pictures, *charts), rows))
-    name = found["reference"]["name"]
-    levels = {t: validation["methods"][name][t]["psnr_db"] for t in validation["pictures"]}
-    known = [f"{target} {psnr['mean']:.2f} dB" for target, psnr in levels.items() if psnr]
-    print(f"gains are over {name}, whose PSNR is: {', '.join(known) or 'that of exact images'}")
-
-
-def _gain(simulated: dict, key: str) -> str | None:
-    gain = simulated.get(key)
-    return f"{gain['mean']:+.2f}" if gain else None
+def _levels(found: "DesignScores") -> str:
+    """What the gains are over, in a sentence."""
+    name = found.reference.name
+    of_pictures = found.validation.methods[name]
+    levels = {target: of_pictures[target].psnr_db for target in found.validation.pictures}
+    known = [f"{target} {psnr.mean:.2f} dB" for target, psnr in levels.items() if psnr]
+    return f"gains are over {name}, whose PSNR is: {', '.join(known) or 'that of exact images'}"

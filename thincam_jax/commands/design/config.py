@@ -2,15 +2,14 @@
 
 import math
 from dataclasses import fields
-from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
 import pydantic
 from pydantic import Field
 
-from thincam_jax.commands.checked_config import load_as
-from thincam_jax.commands.config_file import ConfigError, read_raw, slug
-from thincam_jax.commands.design.config_pareto import ParetoConfig, check_pareto
+from thincam_jax._core.quantity import FieldError
+from thincam_jax.commands.config_file import slug
+from thincam_jax.commands.design.config_pareto import LENGTH, ONCE, ParetoConfig, check_pareto
 from thincam_jax.commands.schema import form_of, section
 from thincam_jax.commands.sections import (
     LIGHT,
@@ -23,16 +22,21 @@ from thincam_jax.commands.sections import (
     Section,
     ShotConfig,
     TargetConfig,
+    check_known,
     check_names,
     misfit,
 )
 from thincam_jax.design import (
     Design,
     DesignSpace,
+    FrequencyCounts,
     Limits,
     PhotonNoise,
+    SearchSettings,
     SignalNoise,
     Tolerances,
+    TrainingError,
+    TrainingSettings,
     Variable,
     found_name,
     shots,
@@ -129,7 +133,9 @@ class FreeConfig(Section):
     variable: Free
     bounds: tuple[float, float]
     shared: bool = False
-    shots: Annotated[tuple[Annotated[int, Field(ge=1)], ...], Field(min_length=1)] | None = None
+    shots: Annotated[tuple[Annotated[int, Field(ge=1)], ...], Field(min_length=1), ONCE] | None = (
+        None
+    )
 
     @pydantic.field_validator("bounds", mode="before")
     @classmethod
@@ -170,8 +176,6 @@ class FreeConfig(Section):
 
     @pydantic.model_validator(mode="after")
     def _belongs(self):
-        if self.shots is not None and len(set(self.shots)) < len(self.shots):
-            raise misfit("holds a shot twice; give each once", "shots")
         if self.variable == "width" and (self.shared or self.shots is not None):
             raise ValueError("all masks share the width; drop 'shared' and 'shots'")
         return self
@@ -212,18 +216,7 @@ class TolerancesConfig(section(Tolerances, defaults=_EXACT)):
         return self
 
 
-class FrequenciesConfig(Section):
-    """How finely responses are sampled: radii and directions of the search, the exact square.
-
-    `exact`: along each axis; default as many as the responses' fringes need.
-    """
-
-    radii: Annotated[int, Field(ge=64, le=8192)] = 1024
-    directions: Annotated[int, Field(ge=1, le=16)] = 3
-    exact: Annotated[int, Field(ge=64, le=4096)] | None = None
-
-
-class SearchConfig(Section):
+class SearchConfig(section(SearchSettings, only=LENGTH)):
     """What is free, within which limits, what is wanted, and how long to search.
 
     `band`: of `worst_ratio` and `unevenness`, as parts of half of the pixels' Nyquist frequency.
@@ -235,12 +228,8 @@ class SearchConfig(Section):
     objective: ObjectiveName = "bayes_error"
     band: tuple[Part, Part] | None = None
     tolerances: TolerancesConfig | None = None
-    starts: Annotated[int, Field(ge=1, le=1000)] = 16
-    samples: Annotated[int, Field(ge=1, le=100_000)] = 512
-    steps: Annotated[int, Field(ge=1, le=1000)] = 60
-    solver: Literal["bfgs", "lbfgsb"] = "bfgs"
     grid: Annotated[int, Field(ge=5, le=501)] = 61
-    frequencies: FrequenciesConfig = FrequenciesConfig()
+    frequencies: section(FrequencyCounts) = section(FrequencyCounts)()  # pyright: ignore
 
     @pydantic.model_validator(mode="after")
     def _belongs(self):
@@ -268,7 +257,7 @@ class ValidateConfig(Section):
     best: Annotated[int, Field(ge=1, le=10)] = 3
 
 
-class TrainingConfig(Section):
+class TrainingConfig(section(TrainingError, TrainingSettings, without=("grid",))):
     """Designs improved by the error of an actual reconstruction.
 
     - `images`: photographs of scikit-image; their middle square is taken.
@@ -280,23 +269,14 @@ class TrainingConfig(Section):
       search's designs and the reference; `steps` of each.
     """
 
-    images: Annotated[tuple[str, ...], Field(min_length=1)]
-    reconstruction: Literal["wiener", "linear"] = "wiener"
+    images: Annotated[tuple[str, ...], Field(min_length=1), ONCE]
     pixels: Annotated[int, Field(ge=32, le=4096)] | None = None
-    samples: Annotated[int, Field(ge=1, le=10_000)] = 64
-    starts: Annotated[int, Field(ge=1, le=10)] = 4
-    steps: Annotated[int, Field(ge=1, le=1000)] = 30
 
-    @pydantic.field_validator("images")
-    @classmethod
-    def _known(cls, images: tuple[str, ...]) -> tuple[str, ...]:
-        for image in images:
-            if image not in sample_images():
-                listed = ", ".join(sample_images())
-                raise ValueError(f"image {image!r} is unknown; choose from {listed}")
-        if len(set(images)) < len(images):
-            raise ValueError("images hold an entry twice; give each once")
-        return images
+    @pydantic.model_validator(mode="after")
+    def _known(self):
+        for image in self.images:
+            check_known(image, "image", sample_images(), "images")
+        return self
 
 
 class DesignConfig(LenslessConfig):
@@ -328,8 +308,8 @@ class DesignConfig(LenslessConfig):
             raise misfit(message, "prior", "measured")
         try:
             self.space()
-        except ValueError as error:
-            raise misfit(str(error), "search", _blamed(str(error))) from None
+        except FieldError as error:
+            raise misfit(str(error), *_PLACES[error.field]) from None
         if self.pareto is not None:
             check_pareto(self)
         return self
@@ -349,31 +329,44 @@ class DesignConfig(LenslessConfig):
             profile=self.mask.profile,
         )
 
-    def space(self) -> DesignSpace:
-        """What is searched; ValueError where no design keeps the limits."""
-        given, base = self.search.limits, self.design(self.reference)
+    def space(self, **limits: float) -> DesignSpace:
+        """What is searched; `limits` in place of the file's.
+
+        **Errors**: FieldError where no design keeps the limits.
+        """
+        base = self.design(self.reference)
         # The reference's captures have a share of 1 each; what is found shares the same.
         total = float(base.captures) if self.frees("exposure") else None
-        return DesignSpace(base, tuple(_variables(self)), given.build(exposure=total))
+        kept = self.search.limits.build(exposure=total, **limits)
+        return DesignSpace(base, tuple(_variables(self)), kept)
 
     def frees(self, variable: Free) -> bool:
         """Whether the search chooses it, of some shot."""
         return any(free.variable == variable for free in self.search.free)
 
 
+# Where the file has what a design and its space are made of.
+_PLACES = {
+    "exposures": ("reference", "shots"),
+    "variables": ("search", "free"),
+    "limits": ("search", "limits"),
+}
+
+
 def _variables(config: DesignConfig):
     """The free numbers, each with the captures it belongs to."""
     phases = len(config.reference.phases)
     for free in config.search.free:
+        lower, upper = free.bounds
         if free.variable == "width":
-            yield Variable("width", *free.bounds)
+            yield Variable("width", lower, upper)
             continue
         chosen = free.shots or tuple(range(1, len(config.reference.shots) + 1))
         groups = [tuple((s - 1) * phases + p for p in range(phases)) for s in chosen]
         if free.shared:
             groups = [tuple(c for group in groups for c in group)]
         for group in groups:
-            yield Variable(free.variable, *free.bounds, group)
+            yield Variable(free.variable, lower, upper, group)
 
 
 def _check_given(config: DesignConfig) -> None:
@@ -428,44 +421,3 @@ def _check_search(config: DesignConfig) -> None:
             "noise.read_noise and noise.electrons, or do not free it"
         )
         raise misfit(message, "search", "free")
-    _check_exposures(config)
-
-
-def _check_exposures(config: DesignConfig) -> None:
-    """All shots together have the exposure of the reference's; some have to take the rest."""
-    free = [f for f in config.search.free if f.variable == "exposure"]
-    every = tuple(range(1, len(config.reference.shots) + 1))
-    bounds = {shot: f.bounds[1] for f in free for shot in f.shots or every if shot in every}
-    if free and set(bounds) >= set(every):
-        message = (
-            "the exposure of every shot is free, and all have what the reference has; leave one "
-            "out to take the rest, such as by shots: [1]"
-        )
-        if len(every) == 1:
-            message = "the exposure of the only shot is that of the reference; do not free it"
-        raise misfit(message, "search", "free")
-    if free and sum(bounds.values()) >= len(every) * (1 - 1e-6):
-        raise misfit(
-            f"exposures of up to {sum(bounds.values()):g} leave the other shots nothing of the "
-            f"{len(every)} that all have; end these bounds lower",
-            *("search", "free"),
-        )
-
-
-def _blamed(message: str) -> str:
-    """The entry of `search` that a message of the space is about."""
-    if "conflicts" in message or "feasible" in message:
-        return "limits"
-    return "free"
-
-
-def load_design(path: str | Path, overrides: tuple[str, ...] = ()) -> DesignConfig:
-    """Read and check a design's file; errors as of `load_as`."""
-    kind = read_raw(Path(path))[0].get("kind")
-    if kind != "design":
-        told = "is a study" if kind is None else f"is of kind {kind!r}"
-        raise ConfigError(
-            f"{path}: kind: {told}, for 'thincam run'; a file for 'thincam design' has "
-            "'kind: design'"
-        )
-    return load_as(DesignConfig, path, overrides)

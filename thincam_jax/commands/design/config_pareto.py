@@ -1,17 +1,32 @@
 """The section `pareto` of a design's file: what is traded against what, and how long to search."""
 
 import math
-from typing import Annotated, Any, Literal
+from collections.abc import Hashable
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
 import pydantic
 from pydantic import AfterValidator, Field
 
+from thincam_jax._core.quantity import FieldError
+from thincam_jax.commands.schema import section
 from thincam_jax.commands.sections import Length, Section, misfit
+from thincam_jax.design import SearchSettings
 
+Entry = TypeVar("Entry", bound=Hashable)
+LENGTH = ("starts", "samples", "steps", "solver")  # of a search
 Count = Annotated[int, Field(ge=1, le=8, strict=True)]
-Points = Annotated[int, Field(ge=2, le=100)]
 Electrons = Annotated[float, Field(gt=0)]
+Points = Annotated[int, Field(ge=2, le=100)]
+
+
+def _once(entries: tuple[Entry, ...]) -> tuple[Entry, ...]:
+    if len(set(entries)) < len(entries):
+        raise ValueError("holds an entry twice; give each once")
+    return entries
+
+
+ONCE = AfterValidator(_once)
 
 
 def _rising(unit: str) -> AfterValidator:
@@ -35,17 +50,14 @@ class ThicknessConfig(Section):
         return np.linspace(*self.bounds, self.points).tolist()
 
 
+def _sorted(shots: tuple[int, ...]) -> tuple[int, ...]:
+    return tuple(sorted(shots))
+
+
 class CapturesConfig(Section):
     """Captures against PSNR: how many settings, each with the phases of the synthesis."""
 
-    shots: Annotated[tuple[Count, ...], Field(min_length=1)]
-
-    @pydantic.field_validator("shots")
-    @classmethod
-    def _once(cls, shots: tuple[int, ...]) -> tuple[int, ...]:
-        if len(set(shots)) < len(shots):
-            raise ValueError("shots hold an entry twice; give each once")
-        return tuple(sorted(shots))
+    shots: Annotated[tuple[Count, ...], Field(min_length=1), ONCE, AfterValidator(_sorted)]
 
 
 class LightConfig(Section):
@@ -59,7 +71,10 @@ class LightConfig(Section):
         return np.geomspace(*self.bounds, self.points).tolist()
 
 
-class ParetoConfig(Section):
+_SHORT = {"starts": 4, "samples": 128, "steps": 40}
+
+
+class ParetoConfig(section(SearchSettings, only=LENGTH, defaults=_SHORT)):
     """Fronts of designs; every point of them is a search over all that is free.
 
     `samples`, `starts`, `steps`, `solver`: of each of the searches, as of `search`.
@@ -68,10 +83,6 @@ class ParetoConfig(Section):
     thickness: ThicknessConfig | None = None
     captures: CapturesConfig | None = None
     light: LightConfig | None = None
-    samples: Annotated[int, Field(ge=1, le=100_000)] = 128
-    starts: Annotated[int, Field(ge=1, le=1000)] = 4
-    steps: Annotated[int, Field(ge=1, le=1000)] = 40
-    solver: Literal["bfgs", "lbfgsb"] = "bfgs"
 
     @pydantic.model_validator(mode="after")
     def _some(self):
@@ -86,30 +97,6 @@ class ParetoConfig(Section):
         if self.captures is not None:
             found["captures"] = [float(count * phases) for count in self.captures.shots]
         return {name: found[name] for name in ("thickness", "captures", "light") if name in found}
-
-
-def with_shots(config: Any, count: int) -> Any:
-    """The same search for designs of so many shots.
-
-    Fewer are the first of the reference; more of them begin as copies of its last, and are free in
-    what that is free in.
-    """
-    given = config.reference.shots
-    last = len(given)
-    shots = (*given, *(given[-1],) * (count - last))[:count]
-    free = []
-    for entry in config.search.free:
-        if entry.shots is None:
-            free.append(entry)
-            continue
-        kept = tuple(s for s in entry.shots if s <= count)
-        if last in entry.shots:
-            kept = (*kept, *range(last + 1, count + 1))
-        if kept:
-            free.append(entry.model_copy(update={"shots": kept}))
-    reference = config.reference.model_copy(update={"shots": shots})
-    search = config.search.model_copy(update={"free": tuple(free)})
-    return config.model_copy(update={"reference": reference, "search": search})
 
 
 def check_pareto(config: Any) -> None:
@@ -129,28 +116,17 @@ def check_pareto(config: Any) -> None:
 
 def _check_thickness(config: Any, front: ThicknessConfig) -> None:
     place = ("pareto", "thickness")
-    free = _free_distances(config)
-    if not free:
+    bounds = [free.bounds for free in config.search.free if free.variable == "distance"]
+    if not bounds:
         message = "no distance is free; give search.free a distance, or drop this front"
         raise misfit(message, *place)
     thinnest, thickest = front.bounds
-    for number, shot in enumerate(config.reference.shots, 1):
-        if number in free and free[number][0] > thinnest:
-            raise misfit(
-                f"no design is feasible at {thinnest:g} mm: the distance of shot {number} is free "
-                f"from {free[number][0]:g} mm only; begin there, or lower its bound",
-                *place,
-                "bounds",
-            )
-        if number not in free and shot.distance > thinnest:
-            raise misfit(
-                f"no design is feasible at {thinnest:g} mm: the distance of shot {number}, "
-                f"{shot.distance:g} mm, is not free; free it, or begin there",
-                *place,
-                "bounds",
-            )
+    try:
+        config.space(thickness=thinnest)
+    except FieldError as error:
+        raise misfit(str(error), *place, "bounds") from None
     limit = config.search.limits.thickness or math.inf
-    longest = min(limit, max(upper for _, upper in free.values()))
+    longest = min(limit, max(upper for _, upper in bounds))
     if thickest > longest * (1 + 1e-9):
         raise misfit(
             f"bounds reach to {thickest:g} mm, and no free distance beyond {longest:g} mm; end "
@@ -158,13 +134,6 @@ def _check_thickness(config: Any, front: ThicknessConfig) -> None:
             *place,
             "bounds",
         )
-
-
-def _free_distances(config: Any) -> dict[int, tuple[float, float]]:
-    """The bounds of the shots, counted from 1, whose distance is free."""
-    every = tuple(range(1, len(config.reference.shots) + 1))
-    entries = (f for f in config.search.free if f.variable == "distance")
-    return {shot: f.bounds for f in entries for shot in f.shots or every}
 
 
 def _check_captures(config: Any, front: CapturesConfig) -> None:
@@ -184,7 +153,7 @@ def _check_captures(config: Any, front: CapturesConfig) -> None:
             "the captures of this front share the exposure evenly, and search.free has it; drop one"
         )
         raise misfit(message, *place)
-    if not with_shots(config, front.shots[0]).search.free:
+    if all(min(free.shots or (1,)) > front.shots[0] for free in config.search.free):
         message = f"of the first shots, {front.shots[0]}, nothing is free; give more, or free them"
         raise misfit(message, *place, "shots")
     if not config.pictures():

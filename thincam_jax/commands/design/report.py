@@ -1,18 +1,23 @@
-"""The report of a design, made of design.json: designs found, their simulation, fronts."""
+"""The report of a design: designs found, their simulation, fronts."""
 
 from collections.abc import Sequence
-from typing import Any
 
 from thincam_jax._core.table import Table, number
 from thincam_jax.commands.config_file import slug
 from thincam_jax.commands.design.config import DesignConfig
-from thincam_jax.commands.design.record import COSTS, SHOT_KEYS
 from thincam_jax.commands.report import Content, Page, Part, Picture, Sentences, pixels_of
-from thincam_jax.design import FreeValue
-from thincam_jax.design.objectives import OBJECTIVES
 from thincam_jax.design.space import REPORTED
+from thincam_jax.studies.design_scores import (
+    Candidate,
+    DesignScores,
+    FrontScores,
+    PointScores,
+    Validation,
+    reported_names,
+    signed,
+)
+from thincam_jax.studies.trials import Spread
 
-_ALWAYS = ("beta", "distance")
 _LANDSCAPE = (
     "The objective over free numbers, any others as in the best design, in the approximation that "
     "is searched with; in the legend its exact values. Plain grey lies outside of the bounds or "
@@ -34,9 +39,8 @@ _FRONTS = (
 )
 
 
-def page(config: DesignConfig, design: dict[str, Any]) -> Page:
+def page(config: DesignConfig, design: DesignScores) -> Page:
     """The page of a finished design."""
-    objective = design["objective"]
     masks = f"{'of the reference ' if config.frees('width') else ''}{config.mask.width:g} mm"
     light = f"λ = {config.wavelength * 1e6:g} nm"
     light += " for the reference" if config.frees("wavelength") else ""
@@ -45,7 +49,7 @@ def page(config: DesignConfig, design: dict[str, Any]) -> Page:
     else:
         noise = f"{config.noise.electrons:g} electrons a mm² of open aperture and "
         noise += f"{config.noise.read_noise:g} of read noise"
-    prior = number(objective["prior_exponent"], 2)
+    prior = number(design.objective.prior_exponent, 2)
     measured = ", as measured on the pictures" if config.prior.measured else ""
     lead = (
         f"{pixels_of(config.sensor)}, masks {masks} ({config.mask.profile}), object "
@@ -55,12 +59,12 @@ def page(config: DesignConfig, design: dict[str, Any]) -> Page:
         Sentences(findings(design)),
         *config.notes,
     )
-    reference = design["reference"]["name"]
+    reference = design.reference.name
     pareto: tuple[Content, ...] = ()
-    if "pareto" in design:
-        edge = design["pareto"]["highest_cycles_per_rad"]
+    if design.pareto is not None:
+        edge = design.pareto.highest_cycles_per_rad
         pareto = (Picture("pareto.png", "Pareto fronts", _FRONTS.format(edge)), *fronts(design))
-    seeds = design["validation"]["seeds"]
+    seeds = design.validation.seeds
     simulated = (
         "Full captures, Wiener synthesis, and PSNR after a least-squares gain and offset; mean ± "
         f"standard deviation over {seeds} seeds of the noise. Six elements of the chart halve the "
@@ -77,14 +81,14 @@ def page(config: DesignConfig, design: dict[str, Any]) -> Page:
     parts = (
         Part("Images", _images(config, design)),
         Part("Designs found", found),
-        Part("Simulated", (_simulated(config, design["validation"]), simulated)),
+        Part("Simulated", (_simulated(config, design.validation), simulated)),
         Part("Pareto fronts", pareto),
     )
-    return Page(lead, parts, command="design", warnings=design["warnings"])
+    return Page(lead, parts, command="design", warnings=design.warnings)
 
 
-def _images(config: DesignConfig, design: dict[str, Any]) -> list[Picture]:
-    reference, best = design["reference"]["name"], design["found"][0]["name"]
+def _images(config: DesignConfig, design: DesignScores) -> list[Picture]:
+    reference, best = design.reference.name, design.found[0].name
     shown = (
         f"the scene, and what {reference} and the designs found reconstruct at the first seed of "
         "the noise; below, the middle third, or of the chart its fine groups."
@@ -101,53 +105,51 @@ def _images(config: DesignConfig, design: dict[str, Any]) -> list[Picture]:
     return [*each, Picture("masks.png", "Masks and PSFs", masks)]
 
 
-def _designs(design: dict[str, Any]) -> Table:
+def _designs(design: DesignScores) -> Table:
     """The reference, and the designs found with the tolerances of their numbers."""
-    trained, reference = design["training"] is not None, design["reference"]
-    free = [(value["variable"], value["shots"]) for value in design["found"][0]["values"]]
+    trained, reference = design.training is not None, design.reference
+    free = [(value.variable, value.shots) for value in design.found[0].values]
 
-    def row(one: dict[str, Any], numbers: list[str], found: bool) -> list[str]:
-        gains = ["predicted_gain", *(["training_gain_db"] if trained else [])]
-        told = [_signed(one[key], 3) if found else "–" for key in gains]
-        ended = [one["status"].replace("_", " ")] if found else ["–"]
-        limits = "; ".join(one["active_limits"]) if found else ""
-        return [one["name"], *numbers, number(one["told"], 3), *told, *ended, limits or "–"]
+    def row(one: Candidate, numbers: list[str], found: bool) -> list[str]:
+        gains = [one.predicted_gain, *([one.training_gain_db] if trained else [])]
+        reported = [number(one.reported, 3), *(signed(gain, 3) for gain in gains)]
+        ended = one.status.replace("_", " ") if found else "–"
+        return [one.name, *numbers, *reported, ended, "; ".join(one.active_limits) or "–"]
 
-    rows = [row(reference, [of_shots(reference, *each) for each in free], False)]
-    rows += [row(one, [found_number(v) for v in one["values"]], True) for one in design["found"]]
+    rows = [row(reference, [reference.text(*each) for each in free], False)]
+    rows += [row(one, [str(value) for value in one.values], True) for one in design.found]
     labels = (f"{REPORTED[name].of_shots(shots)}\n(tolerance)" for name, shots in free)
     gains = ("gain", *(("training\ngain, dB",) if trained else ()))
-    told = design["objective"]["told"]
-    headings = ("design", *labels, told, *gains, "descent", "against limits")
+    headings = ("design", *labels, design.objective.label, *gains, "descent", "against limits")
     return Table(headings, rows, words=(len(headings) - 1,))
 
 
-def _search(config: DesignConfig, design: dict[str, Any]) -> str:
+def _search(config: DesignConfig, design: DesignScores) -> str:
     """How the designs were found, what their tolerances mean, and how much was evaluated."""
-    training, search = design["training"], design["search"]
+    training, search = design.training, design.search
     if training:
-        names, pixels = training["images"], training["pixels"]
+        names, pixels = training.images, training.pixels
         how = (
             f"Where descents by the error of {len(names)} training images ({', '.join(names)}; "
-            f"{pixels}×{pixels} pixels, reconstruction `{training['reconstruction']}`) ended, "
-            f"ranked by it; they began at the best of {training['samples']} even samples, of the "
+            f"{pixels}×{pixels} pixels, reconstruction `{training.reconstruction}`) ended, "
+            f"ranked by it; they began at the best of {training.samples} even samples, of the "
             "designs of the search and of the reference."
         )
     else:
         how = (
             "Local optima, ranked by the exact objective. The search descends on an approximation, "
-            f"which is off by up to {search['approximation_off']:.2g} {objective_unit(design)} at "
+            f"which is off by up to {search.approximation_off:.2g} {design.objective.unit} at "
             "these designs; the best few, and the best of the even samples, were then improved on "
             "the exact objective."
         )
     worse = "training error" if training else "objective"
     held = " (but for shots that take the rest of the exposure)" if config.frees("exposure") else ""
-    counted = f"{search['evaluations']} evaluations"
+    counted = f"{search.evaluations} evaluations"
     if training:
-        counted += f" of the objective, {training['evaluations']} of the training error"
-        failed = training["failed_descents"]
+        counted += f" of the objective, {training.evaluations} of the training error"
+        failed = training.failed_descents
         counted += f" ({failed} descents met NaN)" if failed else ""
-    failed = search["failed_starts"]
+    failed = search.failed_starts
     counted += f"; at {failed} starts the objective was NaN" if failed else ""
     return (
         f"{how} Designs whose shots are only in another order are listed once. The tolerance of a "
@@ -156,28 +158,24 @@ def _search(config: DesignConfig, design: dict[str, Any]) -> str:
     )
 
 
-def _simulated(config: DesignConfig, validation: dict[str, Any]) -> Table:
-    charts = validation["charts"]
+def _simulated(config: DesignConfig, validation: Validation) -> Table:
+    charts = validation.charts
     headings = ["design"]
     for target in config.targets:
         headings.append(f"{target.name}\nPSNR, gain, dB")
         headings += ["resolved mm,\ngain, elements"] if target.name in charts else []
     rows = []
-    for name, targets in validation["methods"].items():
+    for number_of, (name, targets) in enumerate(validation.methods.items()):
         row = [name]
         for target in config.targets:
             found = targets[target.name]
-            gain, steps = ("gain_db", 2, "+"), ("gain_elements", 1, "+")
-            row.append(_with_gain(found, _spread(found["psnr_db"], 2, ""), *gain))
+            texts = [_spread(found.psnr_db, 2, ""), _spread(found.gain_db, 2)]
+            row.append("\n".join(texts[: 2 if number_of else 1]))
             if target.name in charts:
-                row.append(_with_gain(found, _resolved(found["resolved_object_mm"]), *steps))
-        rows.append([*row, number(targets[config.targets[0].name]["object_pixel_mm"], 4)])
+                texts = [_resolved(found.resolved_object_mm), _spread(found.gain_elements, 1)]
+                row.append("\n".join(texts[: 2 if number_of else 1]))
+        rows.append([*row, number(targets[config.targets[0].name].object_pixel_mm, 4)])
     return Table([*headings, "object\npixel mm"], rows)
-
-
-def _with_gain(found: dict[str, Any], text: str, key: str, digits: int, sign: str) -> str:
-    """A number, and below it what is gained, where that is known of a design."""
-    return f"{text}\n{_spread(found[key], digits, sign)}" if key in found else text
 
 
 def _resolved(values: Sequence[float | None]) -> str:
@@ -188,45 +186,36 @@ def _resolved(values: Sequence[float | None]) -> str:
     return " to ".join(ends if min(known) < max(known) else ends[:1])
 
 
-def _signed(value: float | None, digits: int) -> str:
-    return "–" if value is None else f"{value:+.{digits}f}"
-
-
-def objective_unit(design: dict[str, Any]) -> str:
-    """Unit of the objective."""
-    return OBJECTIVES[design["objective"]["name"]].unit
-
-
-def findings(design: dict[str, Any]) -> list[str]:
+def findings(design: DesignScores) -> list[str]:
     """What the numbers say, in sentences."""
-    best, reference = design["found"][0], design["reference"]
+    best, reference, validation = design.found[0], design.reference, design.validation
     names = reported_names([best, reference])
-    by = "training" if design["training"] else design["objective"]["name"]
+    by = "training" if design.training else design.objective.name
     sentences = [
-        f"The best design by {by} is {' and '.join(in_words(best, names))}. The objective "
-        f"predicts {best['predicted_gain']:+.3g} {objective_unit(design)} over {reference['name']} "
-        f"({' and '.join(in_words(reference, names))})."
+        f"The best design by {by} is {' and '.join(best.words(names))}. The objective "
+        f"predicts {best.predicted_gain:+.3g} {design.objective.unit} over {reference.name} "
+        f"({' and '.join(reference.words(names))})."
     ]
-    if best["training_gain_db"] is not None:
-        sentences.append(f"On the training images it gains {best['training_gain_db']:+.2f} dB.")
-    sentences += [f"The reference breaks a limit: {why}." for why in reference["broken_limits"]]
-    if best["active_limits"]:
-        sentences.append(f"It lies against a limit: {'; '.join(best['active_limits'])}.")
-    validation = design["validation"]
-    for name, targets in validation["methods"].items():
+    if best.training_gain_db is not None:
+        sentences.append(f"On the training images it gains {best.training_gain_db:+.2f} dB.")
+    broken = design.search.broken_limits
+    sentences += [f"The reference breaks a limit: {why}." for why in broken]
+    if best.active_limits:
+        sentences.append(f"It lies against a limit: {'; '.join(best.active_limits)}.")
+    for name, targets in validation.methods.items():
         gains = [
-            f"{_worth(t['gain_db'])} on {target}"
+            f"{_worth(t.gain_db)} on {target}"
             for target, t in targets.items()
-            if target in validation["pictures"] and t.get("gain_db")
+            if target in validation.pictures and t.gain_db
         ]
         if gains:
             sentences.append(f"Simulated, {name} gains {', '.join(gains)}.")
         for target, found in targets.items():
-            if target in validation["charts"] and found.get("gain_elements"):
-                steps = _spread(found["gain_elements"], 1)
-                psnr = _worth(found["gain_db"]) if found["gain_db"] else "an exact image"
+            if target in validation.charts and found.gain_elements:
+                steps = _spread(found.gain_elements, 1)
+                psnr = _worth(found.gain_db) if found.gain_db else "an exact image"
                 sentences.append(f"On {target}, {name} resolves {steps} elements more, at {psnr}.")
-    if not validation["one_object_grid"]:
+    if not validation.one_object_grid:
         sentences.append(
             "The designs' largest distances differ, and with them the object's pixels (in the "
             "table below): their PSNR is not on one grid and compares to some tenths of a dB only."
@@ -240,112 +229,58 @@ _LIMIT = (
 )
 
 
-def fronts(design: dict[str, Any]) -> list[Content]:
+def fronts(design: DesignScores) -> list[Content]:
     """Of each Pareto front its table and a sentence."""
-    known, reference = design.get("pareto", {}), design["reference"]["name"]
-    every = (_front(name, known[name], reference) for name in COSTS if name in known)
+    known = {} if design.pareto is None else design.pareto.fronts
+    every = (_front(name, front, design.reference.name) for name, front in known.items())
     return [content for front in every for content in front]
 
 
-def _front(name: str, front: dict[str, Any], reference: str) -> tuple[Table, str]:
-    label, cost = COSTS[name]
-    names = reported_names([*front["points"], front["reference"]])
+def _front(name: str, front: FrontScores, reference: str) -> tuple[Table, str]:
+    names = reported_names([*front.points, front.reference])
     labels = [REPORTED[name].label for name in names]
-    points = [(_cost(p[cost]), p) for p in front["points"]]
-    points.append((f"{reference}: {_cost(front['reference'][cost])}", front["reference"]))
+    points = [(_cost(point.cost), point) for point in front.points]
+    points.append((f"{reference}: {_cost(front.reference.cost)}", front.reference))
+    pictures = tuple(front.points[0].simulated_psnr_db or ())
+
+    def told(point: PointScores) -> tuple[str, ...]:
+        if name == "captures":
+            simulated = point.simulated_psnr_db or {}
+            levels = (number(simulated.get(picture), 2) for picture in pictures)
+            return (f"{point.predicted_psnr_db:.2f}", *levels)
+        return (
+            f"{point.resolution_cycles_per_rad:.1f}",
+            f"{point.resolution_line_pairs_per_mm:.3f}",
+            point.resolution_ends or "",
+        )
+
     kept = {True: "no", False: "yes", None: ""}
+    rows = [(text, *p.cells(names), *told(p), kept[p.dominated]) for text, p in points]
     if name != "captures":
-        rows = [
-            [
-                *(text, *cells(p, names)),
-                f"{p['resolution_cycles_per_rad']:.1f}",
-                f"{p['resolution_line_pairs_per_mm']:.3f}",
-                p["resolution_ends"] or "",
-                kept[p.get("dominated")],
-            ]
-            for text, p in points
-        ]
-        told = ("cycles/rad", "line pairs/mm on the object", "", "front")
+        headings = ("cycles/rad", "line pairs/mm on the object", "", "front")
         title = f"{name.capitalize()} against resolution"
-        return Table((label, *labels, *told), rows, title=title), _LIMIT
-    pictures = list(front["points"][0]["simulated_psnr_db"])
-    rows = [
-        [
-            *(text, *cells(p, names), f"{p['predicted_psnr_db']:.2f}"),
-            *(number(p.get("simulated_psnr_db", {}).get(n), 2) for n in pictures),
-            kept[p.get("dominated")],
-        ]
-        for text, p in points
-    ]
-    told = ("predicted, dB", *(f"{picture}, dB" for picture in pictures), "front")
+        return Table((front.label, *labels, *headings), rows, title=title), _LIMIT
+    headings = ("predicted, dB", *(f"{picture}, dB" for picture in pictures), "front")
     note = (
-        f"The exposure is {front['exposure']}. Predicted from the error of the best "
+        f"The exposure is {front.exposure}. Predicted from the error of the best "
         "linear reconstruction and the mean variance of the pictures; simulated in full at one "
         "seed. The front is that of the prediction. Where distances differ, so do the object's "
         "pixels, and simulated PSNR compares to some tenths of a dB only."
     )
-    return Table((label, *labels, *told), rows, title="Captures against PSNR"), note
+    return Table((front.label, *labels, *headings), rows, title="Captures against PSNR"), note
 
 
-def _cost(value: float | int) -> str:
+def _cost(value: float) -> str:
     return f"{value:.0f}" if value >= 1000 else f"{value:.4g}"
 
 
-def _worth(gain: dict[str, Any]) -> str:
+def _worth(gain: Spread) -> str:
     """A gain of PSNR, and what it does to the error: "−1.06 dB (28 % more squared error)"."""
-    change = 100 * (10 ** (-gain["mean"] / 10) - 1)
+    change = 100 * (10 ** (-gain.mean / 10) - 1)
     word = "more" if change > 0 else "less"
-    return f"{_spread(gain, 2)} dB ({abs(change):.0f} % {word} squared error)"
+    return f"{gain.text(2)} dB ({abs(change):.0f} % {word} squared error)"
 
 
-def _spread(spread: dict[str, Any] | None, digits: int, sign: str = "+") -> str:
+def _spread(spread: Spread | None, digits: int, sign: str = "+") -> str:
     """Mean and standard deviation over the seeds; a dash where the images were exact."""
-    if not spread:
-        return "–"
-    text = f"{spread['mean']:{sign}.{digits}f}"
-    if spread["deviation"] is not None:
-        text += f" ± {spread['deviation']:.{digits}f}"
-    return text
-
-
-def of_shots(one: dict[str, Any], name: str, shots: Sequence[int]) -> str:
-    """A number that `shots` of a design in design.json share; all shots where none is named."""
-    first = one["shots"][shots[0] - 1 if shots else 0]
-    return f"{first[SHOT_KEYS[name]]:{REPORTED[name].form}}"
-
-
-def found_number(value: dict[str, Any]) -> str:
-    """A free number of design.json, with its tolerance."""
-    return str(FreeValue(value["variable"], (), value["value"], value["tolerance"]))
-
-
-def reported_names(designs: Sequence[dict[str, Any]]) -> tuple[str, ...]:
-    """β and distance, and what else is not the same in all shots of all designs."""
-    every = [shot for one in designs for shot in one["shots"]]
-    return tuple(
-        name
-        for name, key in SHOT_KEYS.items()
-        if name in _ALWAYS or len({shot.get(key) for shot in every}) > 1
-    )
-
-
-def cells(one: dict[str, Any], names: Sequence[str]) -> list[str]:
-    """Each number of all shots; one that all share stands once, but for β."""
-    row = []
-    for name in names:
-        texts = [of_shots(one, name, [shot]) for shot in range(1, len(one["shots"]) + 1)]
-        row.append(", ".join(texts if len(set(texts)) > 1 or name == "beta" else texts[:1]))
-    return row
-
-
-def in_words(one: dict[str, Any], names: Sequence[str]) -> list[str]:
-    """Each shot of a design: "β 25.00 at 5.00 mm", "β 21.00 at 6.50 mm"."""
-    each = []
-    for shot in range(1, len(one["shots"]) + 1):
-        words = f"β {of_shots(one, 'beta', [shot])} at {of_shots(one, 'distance', [shot])} mm"
-        for name in names:
-            if name not in _ALWAYS:
-                number = REPORTED[name]
-                words += f", {number.name} {of_shots(one, name, [shot])} {number.unit}".rstrip()
-        each.append(words)
-    return each
+    return "–" if spread is None else spread.text(digits, sign)

@@ -1,35 +1,49 @@
-"""The pictures of a design: the objective's landscape, responses, contrast transfer and fronts."""
+"""The figures of a design: the objective's landscape, responses, contrast transfer and fronts."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.ticker import FixedLocator, NullLocator
 
 from thincam_jax._core.grids import Grid
-from thincam_jax.commands.design.record import COSTS, FoundDesigns
-from thincam_jax.commands.study.build import FileStudy
-from thincam_jax.commands.study.figures import as_png as as_png
-from thincam_jax.commands.study.figures import drawing, line_style
-from thincam_jax.design import Landscape, ModulationTransfer, RankedDesign, Shot, TrainingError
+from thincam_jax.design import (
+    Design,
+    Landscape,
+    ModulationTransfer,
+    RankedDesign,
+    Shot,
+    TrainingError,
+)
+from thincam_jax.design.space import REPORTED
+from thincam_jax.plot.studies import drawing, line_style
+from thincam_jax.studies.design import FoundDesigns
+from thincam_jax.studies.design_scores import FrontScores, FrontsScores, PointScores
+from thincam_jax.studies.study import Study
 
 _LEAST_CONTRAST = 1e-5
 _FLOOR_DB = -30.0  # what is further below the noise is not drawn
 _FACE = {True: "white", False: "black"}  # of points that are dominated, and of the front's
-_MARKER = {"markersize": 8, "markeredgewidth": 1.3, "linestyle": "none", "zorder": 4}
+_MARKER: dict[str, Any] = {
+    "markersize": 8,
+    "markeredgewidth": 1.3,
+    "linestyle": "none",
+    "zorder": 4,
+}
 _LABELS = {
     "thickness": "thickness: longest distance allowed (mm)",
     "captures": "captures",
     "light": "light: electrons from each mm² of open aperture",
 }
-
-
+_ROOM = 0.06  # around points, as a part of an axis
+_SHADED = 85  # per cent of the landscape that the shades tell apart; the worst is one shade
 _MASK_SAMPLES = 600  # along a side of a drawn mask
 
 
-def draw_masks(study: FileStudy, best: str) -> Figure:
+def draw_masks(study: Study, best: str) -> Figure:
     """The first mask of each shot and its PSF, of the reference and of the best design, in rows."""
     methods = [study.methods[0], next(m for m in study.methods if m.name == best)]
     shots = max(len(method.shots) for method in methods)
@@ -53,14 +67,85 @@ def draw_masks(study: FileStudy, best: str) -> Figure:
     return figure
 
 
-def draw_landscape(result: FoundDesigns, count: int) -> Figure | None:
+def draw_landscape(
+    landscape: Landscape, ax: Axes, designs: Mapping[str, Design], costs: Mapping[str, float]
+) -> None:
+    """A map of two numbers, or a line over one; arguments as of `Landscape.plot`."""
+    scaled = zip(landscape.variables, landscape.axes, strict=True)
+    axes = [axis * REPORTED[name].scale for (name, _), axis in scaled]
+    labels = [REPORTED[name].of_shots(shots) for name, shots in landscape.variables]
+    places = {name: landscape.place(design) for name, design in designs.items()}
+    if len(axes) == 1:
+        _draw_line(ax, landscape, axes[0], places, costs)
+        ax.set(xlabel=labels[0], ylabel=landscape.label)
+    else:
+        _draw_map(ax, landscape, axes, places)
+        ax.set(xlabel=labels[0], ylabel=labels[1])
+    if places:
+        below = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.1)}
+        ax.legend(fontsize=9, ncols=2, frameon=False, **below)
+
+
+def _draw_line(
+    ax: Axes,
+    landscape: Landscape,
+    axis: np.ndarray,
+    places: Mapping[str, Any],
+    costs: Mapping[str, float],
+) -> None:
+    ax.plot(axis, landscape.values, color="black", linewidth=1)
+    for number, (name, (place,)) in enumerate(places.items()):
+        on_line = np.interp(place, axis, landscape.values)
+        height = landscape.reported(costs[name]) if name in costs else on_line
+        ax.plot(place, float(height), label=name, zorder=5, **_marker(number))
+    ax.grid(alpha=0.3)
+
+
+def _draw_map(
+    ax: Axes, landscape: Landscape, axes: list[np.ndarray], places: Mapping[str, Any]
+) -> None:
+    values = landscape.values.T
+    more = getattr(landscape.objective, "maximised", False)
+    worst = np.nanpercentile(values, 100 - _SHADED if more else _SHADED)
+    shades: dict[str, Any] = {"vmin" if more else "vmax": worst, "cmap": "cividis"}
+    x, y = axes
+    shown = ax.pcolormesh(x, y, values, shading="nearest", rasterized=True, **shades)
+    figure: Any = ax.figure
+    figure.colorbar(shown, ax=ax, label=landscape.label, extend="min" if more else "max")
+    # Grounds beside the map are not allowed, or not looked at.
+    ax.set_facecolor("#e8e8e8")
+    own = np.array([*places.values()]).reshape(-1, 2)
+    ax.set_xlim(*_reach(x, own[:, 0]))
+    ax.set_ylim(*_reach(y, own[:, 1]))
+    for number, (name, place) in enumerate(places.items()):
+        ax.plot(*place, label=name, clip_on=False, zorder=5, **_marker(number))
+
+
+def _marker(number: int) -> dict[str, Any]:
+    """Marker of the reference, number 0, and of designs found: told apart by shape."""
+    face, edge, size = ("white", "black", 10) if number else ("black", "white", 12)
+    style = {"marker": "Xo^Ds"[number % 5], "markersize": size, "linestyle": "none"}
+    return style | {"color": face, "markeredgecolor": edge, "markeredgewidth": 1.3}
+
+
+def _reach(axis: np.ndarray, own: np.ndarray) -> tuple[float, float]:
+    """The axis, and room for points that lie beyond it."""
+    half = (axis[1] - axis[0]) / 2
+    low, high = axis[0] - half, axis[-1] + half
+    room = _ROOM * (high - low)
+    low = min([low, *(own - room)[own < low]])
+    high = max([high, *(own + room)[own > high]])
+    return float(low), float(high)
+
+
+def draw_objective(result: FoundDesigns, count: int, figure: Figure | None = None) -> Figure | None:
     """The objective over the free numbers, with the reference and the first `count` found.
 
     None where the search's bounds leave no room to draw.
     """
     designs = (result.reference, *result.found[:count])
     costs = [(one, one.searched, one.exact) for one in designs]
-    return _marked(result.landscape, result.objective.unit, costs)
+    return _marked(result.landscape, result.objective.unit, costs, figure)
 
 
 def draw_training(result: FoundDesigns, count: int) -> Figure | None:
@@ -73,7 +158,10 @@ def draw_training(result: FoundDesigns, count: int) -> Figure | None:
 
 
 def _marked(
-    landscape: Landscape | None, unit: str, costs: list[tuple[RankedDesign, float, float]]
+    landscape: Landscape | None,
+    unit: str,
+    costs: list[tuple[RankedDesign, float, float]],
+    figure: Figure | None = None,
 ) -> Figure | None:
     """With designs, each with the cost where it is drawn, and that of the legend."""
     if landscape is None:
@@ -81,9 +169,9 @@ def _marked(
     names = [f"{one.name} ({float(landscape.reported(c)):.2f} {unit})" for one, _, c in costs]
     designs = {name: one.design for name, (one, _, _) in zip(names, costs, strict=True)}
     drawn = {name: cost for name, (_, cost, _) in zip(names, costs, strict=True)}
-    figure, ax = drawing((7.6, 6.0))
-    landscape.plot(designs, drawn, ax=ax)
-    return figure
+    drawn_on, ax = drawing((7.6, 6.0), figure=figure)
+    draw_landscape(landscape, ax, designs, drawn)
+    return drawn_on
 
 
 def draw_responses(result: FoundDesigns, count: int, pitch: float) -> Figure:
@@ -133,7 +221,7 @@ def draw_mtf(result: FoundDesigns, object_distance: float) -> Figure | None:
     return figure
 
 
-def _draw_transfer(ax, one: RankedDesign, transfer: ModulationTransfer, edge: float) -> None:
+def _draw_transfer(ax: Axes, one: RankedDesign, transfer: ModulationTransfer, edge: float) -> None:
     frequency = (np.arange(len(transfer.chain)) + 0.5) / len(transfer.chain) * edge
     chain = {"color": "black", "linewidth": 2.2, "label": "camera and reconstruction"}
     ax.plot(frequency, transfer.chain, **chain)
@@ -165,31 +253,32 @@ def _decibel(level: np.ndarray) -> np.ndarray:
     return 10 * np.log10(np.where(level > 10 ** (_FLOOR_DB / 10), level, np.nan))
 
 
-def draw_fronts(fronts: dict[str, Any], reference: str, object_distance: float) -> Figure:
-    """A panel for each front; `fronts` as in design.json, `object_distance` in mm."""
-    asked = [name for name in _LABELS if name in fronts]
-    layout = ConstrainedLayoutEngine(wspace=0.06)
-    figure = Figure(figsize=(4.2 * len(asked) + 0.6, 4.9), layout=layout)
-    for ax, name in zip(figure.subplots(1, len(asked), squeeze=False)[0], asked, strict=True):
+def draw_fronts(
+    scores: FrontsScores, reference: str, object_distance: float, figure: Figure | None = None
+) -> Figure:
+    """A panel for each front; `object_distance` in mm, `reference`: name of the design to beat."""
+    count = len(scores.fronts)
+    drawn, panels = drawing((4.2 * count + 0.6, 4.9), 1, count, figure=figure, squeeze=False)
+    drawn.set_layout_engine(ConstrainedLayoutEngine(wspace=0.06))
+    for ax, (name, front) in zip(panels[0], scores.fronts.items(), strict=True):
         ax.set_xlabel(_LABELS[name])
         ax.grid(alpha=0.3)
         if name == "captures":
-            _draw_captures(ax, fronts[name], reference)
+            _draw_captures(ax, front, reference)
         else:
-            _draw_resolution(ax, fronts[name], COSTS[name][1], reference)
+            _draw_resolution(ax, front, reference)
             right = ax.secondary_yaxis("right", functions=_at(object_distance))
             right.set_ylabel("on the object (line pairs/mm)")
         if name == "light":
             ax.set_xscale("log")
         ax.margins(0.08, 0.1)
         ax.legend(fontsize=9, loc="upper center", bbox_to_anchor=(0.5, -0.14), frameon=False)
-    return figure
+    return drawn
 
 
-def _draw_resolution(ax, front: dict[str, Any], cost: str, reference: str) -> None:
-    value = "resolution_cycles_per_rad"
-    points = front["points"]
-    _steps(ax, points, cost, value, "dominated", "-")
+def _draw_resolution(ax: Axes, front: FrontScores, reference: str) -> None:
+    value, points = "resolution_cycles_per_rad", front.points
+    _steps(ax, points, value, "dominated", "-")
     groups = [
         (False, False, "on the front"),
         (True, False, "dominated by one of lower cost"),
@@ -197,54 +286,49 @@ def _draw_resolution(ax, front: dict[str, Any], cost: str, reference: str) -> No
         (True, True, "dominated; at least, where frequencies end"),
     ]
     for beaten, ended, label in groups:
-        kind = (beaten, ended)
-        chosen = [p for p in points if (p["dominated"], bool(p["resolution_ends"])) == kind]
-        if chosen:
-            shape = "^" if ended else "o"
-            _marks(ax, chosen, cost, value, label, marker=shape, markerfacecolor=_FACE[beaten])
-    _mark_reference(ax, front["reference"], cost, value, reference)
+        chosen = [p for p in points if (p.dominated, bool(p.resolution_ends)) == (beaten, ended)]
+        shape = "^" if ended else "o"
+        _marks(ax, chosen, value, label, marker=shape, markerfacecolor=_FACE[beaten])
+    _mark_reference(ax, front.reference, value, reference)
     ax.set_ylabel("limit of resolution (cycles/rad)")
 
 
-def _draw_captures(ax, front: dict[str, Any], reference: str) -> None:
-    points = front["points"]
-    known = [p for p in points if p["simulated_mean_db"] is not None]
+def _draw_captures(ax: Axes, front: FrontScores, reference: str) -> None:
+    points = front.points
+    known = [p for p in points if p.simulated_mean_db is not None]
     lines = [
         (points, "predicted_psnr_db", "dominated", "predicted", "-", "o", "black"),
         (known, "simulated_mean_db", "simulated_dominated", "simulated", "--", "s", "#8a8a8a"),
     ]
     for chosen, value, flag, label, dash, shape, colour in lines:
-        _steps(ax, chosen, "captures", value, flag, dash)
+        _steps(ax, chosen, value, flag, dash)
         for beaten, name in ((False, label), (True, f"{label}; dominated")):
-            group = [p for p in chosen if p[flag] == beaten]
-            if group:
-                face = "white" if beaten else colour
-                _marks(ax, group, "captures", value, name, marker=shape, markerfacecolor=face)
-    _mark_reference(
-        ax, front["reference"], "captures", "predicted_psnr_db", f"{reference}, predicted"
-    )
-    ax.xaxis.set_major_locator(FixedLocator(sorted({p["captures"] for p in points})))
+            group = [p for p in chosen if getattr(p, flag) == beaten]
+            face = "white" if beaten else colour
+            _marks(ax, group, value, name, marker=shape, markerfacecolor=face)
+    _mark_reference(ax, front.reference, "predicted_psnr_db", f"{reference}, predicted")
+    ax.xaxis.set_major_locator(FixedLocator(sorted({p.cost for p in points})))
     ax.xaxis.set_minor_locator(NullLocator())
     ax.set_ylabel("PSNR, mean over the pictures (dB)")
 
 
-def _marks(ax, points: list[dict[str, Any]], cost: str, value: str, label: str, **style) -> None:
-    places = ([p[cost] for p in points], [p[value] for p in points])
-    ax.plot(*places, label=label, markeredgecolor="black", **(_MARKER | style))
+def _marks(ax: Axes, points: Sequence[PointScores], value: str, label: str, **style: Any) -> None:
+    if points:
+        places = ([p.cost for p in points], [getattr(p, value) for p in points])
+        ax.plot(*places, label=label, markeredgecolor="black", **(_MARKER | style))
 
 
-def _mark_reference(ax, point: dict[str, Any], cost: str, value: str, name: str) -> None:
+def _mark_reference(ax: Axes, point: PointScores, value: str, name: str) -> None:
     style = _MARKER | {"marker": "X", "markersize": 11, "zorder": 5}
-    ax.plot(
-        point[cost], point[value], label=name, color="#606060", markeredgecolor="white", **style
-    )
+    style |= {"color": "#606060", "markeredgecolor": "white"}
+    ax.plot(point.cost, getattr(point, value), label=name, **style)
 
 
-def _steps(ax, points: list[dict[str, Any]], cost: str, value: str, flag: str, dash: str) -> None:
+def _steps(ax: Axes, points: Sequence[PointScores], value: str, flag: str, dash: str) -> None:
     """What is reached at each cost: the best of the points up to there."""
-    front = sorted((p[cost], p[value]) for p in points if not p[flag])
+    front = sorted((p.cost, getattr(p, value)) for p in points if not getattr(p, flag))
     if not front:
         return
     # On to the last of all points, which may be dominated.
-    front.append((max(p[cost] for p in points), front[-1][1]))
+    front.append((max(p.cost for p in points), front[-1][1]))
     ax.step(*np.transpose(front), where="post", color="black", linewidth=1.1, linestyle=dash)
