@@ -7,11 +7,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from thincam_jax._core.environment import environment
 from thincam_jax._core.files import WriteError, read_regular, write_whole
 from thincam_jax._core.steps import Progress, Step, carry_out
 from thincam_jax.commands.checked_config import dump_config
 from thincam_jax.commands.config_file import ConfigError, slug
-from thincam_jax.commands.doctor import environment
 from thincam_jax.commands.report import Page, render_report
 from thincam_jax.commands.sections import ExperimentConfig, Section
 

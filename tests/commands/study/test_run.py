@@ -16,8 +16,8 @@ from commands.study import tiny
 from commands.sweep import mini
 from commands.test_cli import call
 
+from thincam_jax._core.environment import environment
 from thincam_jax.commands.config_file import ConfigError
-from thincam_jax.commands.doctor import environment
 from thincam_jax.commands.report import render_report
 from thincam_jax.commands.run_folder import RunFolder
 from thincam_jax.commands.study import report

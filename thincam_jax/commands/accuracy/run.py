@@ -7,12 +7,12 @@ from typing import Any
 
 import jax
 
+from thincam_jax._core.environment import usable_cores
 from thincam_jax._core.files import write_whole
 from thincam_jax._core.steps import Progress, Step, carry_out
 from thincam_jax._core.table import Table
 from thincam_jax.commands.checked_config import dump_config
 from thincam_jax.commands.config_file import ConfigError
-from thincam_jax.commands.doctor import usable_cores
 from thincam_jax.commands.run_folder import claim_folder, to_json
 from thincam_jax.commands.sections import SensorConfig
 from thincam_jax.commands.study.build import FileStudy, build_study, check_study

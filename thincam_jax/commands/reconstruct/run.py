@@ -12,9 +12,9 @@ import numpy as np
 from jaxtyping import Float
 
 from thincam_jax import measured
+from thincam_jax._core.environment import environment
 from thincam_jax._core.files import WriteError, writing
 from thincam_jax._core.memory import refuse_if_too_large
-from thincam_jax.commands.doctor import environment
 from thincam_jax.commands.reconstruct.jobs import Job, write_job
 from thincam_jax.commands.reconstruct.options import Background, Output, Recipe, Sources
 from thincam_jax.imaging.operators import window_shape

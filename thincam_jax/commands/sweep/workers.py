@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from typing import Any
 
-from thincam_jax.commands.doctor import usable_cores
+from thincam_jax._core.environment import usable_cores
 
 # From a function and the arguments of each task by name: (name, result) in the order in which the
 # tasks end.

@@ -1,4 +1,4 @@
-"""What a run or a bug report needs to know of the installation."""
+"""The installation: versions, devices, and whether the compiler computes right."""
 
 import contextlib
 import os
