@@ -14,10 +14,10 @@ from typer.testing import CliRunner
 
 from helpers import ROOT, full_disk
 from thincam_jax._core import environment as installation
+from thincam_jax.commands import accuracy as benches
 from thincam_jax.commands import cli
-from thincam_jax.commands.accuracy import run as benches
 from thincam_jax.commands.cache import cache_state
-from thincam_jax.commands.examples import kinds
+from thincam_jax.commands.kinds import examples
 from thincam_jax.commands.run_folder import RunFolder
 from thincam_jax.commands.study import run as studies
 from thincam_jax.studies import StudyScores
@@ -426,7 +426,7 @@ def test_version():
     [
         ("thincam re", ["reconstruct"]),
         ("thincam bench ", ["accuracy"]),
-        ("thincam init des", [kind for kind in kinds() if kind.startswith("des")]),
+        ("thincam init des", [kind for kind in examples() if kind.startswith("des")]),
         ("thincam reconstruct --method a", ["auto", "admm-tv"]),
         ("thincam reconstruct --bayer R", ["RGGB"]),
     ],

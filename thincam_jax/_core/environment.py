@@ -45,6 +45,18 @@ def environment(seconds: float | None = None) -> dict[str, Any]:
     }
 
 
+def machine() -> dict[str, Any]:
+    """The machine that times are measured on."""
+    device = jax.devices()[0]
+    return {
+        "platform": f"{platform.system()} {platform.machine()}",
+        "device_kind": device.device_kind,
+        "device_platform": device.platform,
+        "cores": usable_cores(),
+        "jax": jax.__version__,
+    }
+
+
 def usable_cores() -> int:
     """Cores that this process may use."""
     try:

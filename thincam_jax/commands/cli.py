@@ -9,15 +9,13 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from thincam_jax.commands.accuracy.command import accuracy
 from thincam_jax.commands.cache import cache_state, keep_programs
 from thincam_jax.commands.capture.command import capture, known_drivers
 from thincam_jax.commands.design.command import design
-from thincam_jax.commands.examples import init
 from thincam_jax.commands.explain import explain, schema
-from thincam_jax.commands.learned.command import train
+from thincam_jax.commands.kinds import init
 from thincam_jax.commands.reconstruct.command import check, reconstruct
-from thincam_jax.commands.study.command import run
+from thincam_jax.commands.run import accuracy, run, train
 from thincam_jax.commands.sweep.command import sweep
 
 ORDER = (

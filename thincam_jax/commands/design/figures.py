@@ -11,9 +11,9 @@ from matplotlib.ticker import FixedLocator, NullLocator
 from thincam_jax._core.grids import Grid
 from thincam_jax.commands.design.record import COSTS, FoundDesigns
 from thincam_jax.commands.study.build import FileStudy
-from thincam_jax.commands.study.figures import as_png as as_png
-from thincam_jax.commands.study.figures import drawing, line_style
 from thincam_jax.design import Landscape, ModulationTransfer, RankedDesign, Shot, TrainingError
+from thincam_jax.plot.frame import as_png as as_png
+from thincam_jax.plot.frame import drawing, line_style
 
 _LEAST_CONTRAST = 1e-5
 _FLOOR_DB = -30.0  # what is further below the noise is not drawn
