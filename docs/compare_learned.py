@@ -42,8 +42,8 @@ from score_refocusing import (
 
 from thincam_jax import learn
 from thincam_jax.commands.checked_config import load_as
-from thincam_jax.commands.learned.build import build_lessons, build_network, build_options
 from thincam_jax.commands.learned.config import LearnedConfig
+from thincam_jax.commands.learned.run import build_lessons, build_network, build_options
 from thincam_jax.learn.refocusing.baselines import ControlCode, control_loss
 from thincam_jax.learn.refocusing.unet import parameter_count
 from thincam_jax.learn.training import Task, train_model

@@ -6,6 +6,7 @@ Names are those of the functions below; without one all are drawn, in some minut
 import os
 import runpy
 import shutil
+import subprocess
 import sys
 import tempfile
 from pathlib import Path
@@ -16,11 +17,9 @@ import jax.numpy as jnp
 import numpy as np
 from matplotlib.colors import BoundaryNorm
 from matplotlib.figure import Figure
-from typer.testing import CliRunner
 
 import thincam_jax as tc
 from thincam_jax import design
-from thincam_jax.commands.cli import app
 from thincam_jax.measured.calibration import fit_psf
 from thincam_jax.reconstruction import phase_pairs
 from thincam_jax.units import nm, um
@@ -210,10 +209,8 @@ def _by_script(name: str, picture: str, size: str = "small") -> Path:
 
 def _by_command(picture: str, command: str, config: str, *options: str) -> Path:
     out = Path(tempfile.mkdtemp()) / "out"
-    words = [command, str(ROOT / config), *options, "--out", str(out)]
-    done = CliRunner().invoke(app, words)
-    if done.exit_code:
-        raise SystemExit(done.output)
+    program = [sys.executable, "-m", "thincam_jax.commands.start"]
+    subprocess.run([*program, command, str(ROOT / config), *options, "--out", str(out)], check=True)
     return out / picture
 
 

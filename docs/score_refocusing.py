@@ -26,8 +26,8 @@ from scipy import ndimage
 import thincam_jax as tc
 from thincam_jax import learn
 from thincam_jax.commands.checked_config import load_as
-from thincam_jax.commands.learned.build import build_camera
 from thincam_jax.commands.learned.config import LearnedConfig
+from thincam_jax.commands.learned.run import build_camera
 from thincam_jax.imaging.targets import middle_square, resize, sample_image
 from thincam_jax.learn.refocusing.baselines import wiener
 from thincam_jax.learn.refocusing.evaluation import (

@@ -13,8 +13,8 @@ import jax.numpy as jnp
 
 from thincam_jax import learn
 from thincam_jax.commands.checked_config import load_as
-from thincam_jax.commands.learned.build import build_camera
 from thincam_jax.commands.learned.config import LearnedConfig
+from thincam_jax.commands.learned.run import build_camera
 from thincam_jax.learn.denoiser.network import load_network, network_card, save_network
 from thincam_jax.learn.refocusing.store import network_description
 

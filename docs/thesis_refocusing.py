@@ -19,8 +19,8 @@ from score_refocusing import FAR, NEAR, SNR, Methods, halves, head, interval, ro
 import thincam_jax as tc
 from thincam_jax import learn
 from thincam_jax.commands.checked_config import load_as
-from thincam_jax.commands.learned.build import build_camera
 from thincam_jax.commands.learned.config import LearnedConfig
+from thincam_jax.commands.learned.run import build_camera
 from thincam_jax.imaging.targets import siemens_star
 from thincam_jax.learn.refocusing.dead_leaves import dead_leaves
 from thincam_jax.reconstruction.depth.refocus import axial_resolution

@@ -14,7 +14,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import thincam_jax as tc
-from thincam_jax.design import contour_target, mask_of_phase, one_turn, retrieve_phase
+from thincam_jax.design import contour_mask
 from thincam_jax.imaging.targets import middle_square, point_grid, sample_image
 from thincam_jax.lensless.propagation.path import Path as LightPath
 from thincam_jax.studies import ComparedMask, ComparedScene, MaskComparison, Setting, Tuning
@@ -50,10 +50,8 @@ code = tc.maximum_length_sequence(31)
 
 
 def contours():
-    lines = contour_target(key, coarse.grid, feature=200 * um, line_width=12 * um)
-    path = LightPath(*(np.asarray(n, lines.dtype) for n in (green, distance, np.inf)))
-    found = retrieve_phase(lines, coarse.grid, path, shape=coarse.shape, key=key)
-    return mask_of_phase(found.phase, coarse, green, one_turn(coarse, green))
+    light = LightPath(green, distance)
+    return contour_mask(key, coarse, light, feature=200 * um, line_width=12 * um)
 
 
 def zone_plate(phase=0.0, profile="cosine"):

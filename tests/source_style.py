@@ -9,7 +9,7 @@ from thincam_jax._core.quantity import UNITS
 
 # They read what is the package's own, and what the system says of itself.
 READ_OWN = (
-    *("_core/memory.py", "commands/report.py", "commands/examples.py"),
+    *("_core/memory.py", "commands/report.py", "commands/kinds.py"),
     "hardware/virtual/",
     "hardware/holder.py",
 )

@@ -43,7 +43,7 @@ def test_names_wait_for_no_library_and_reconstructions_for_no_learned_part():
     """SciPy itself is there, of its parts only those that JAX's sparse matrices import."""
     modules, of_command = imported_in_turn(
         "import thincam_jax as tc; tc.psf, tc.capture, tc.plan, tc.select_model, tc.reconstruct",
-        "import thincam_jax.commands.reconstruct.console",
+        "import thincam_jax.commands.reconstruct.run",
     )
     assert "jax" in modules
     assert modules.isdisjoint(("matplotlib", "skimage", "jaxopt", "pydantic"))

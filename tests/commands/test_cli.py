@@ -13,10 +13,11 @@ from commands.study import tiny
 from typer.testing import CliRunner
 
 from helpers import ROOT, full_disk
-from thincam_jax.commands import cli, doctor, help
-from thincam_jax.commands.accuracy import run as benches
+from thincam_jax._core import environment as installation
+from thincam_jax.commands import accuracy as benches
+from thincam_jax.commands import cli
 from thincam_jax.commands.cache import cache_state
-from thincam_jax.commands.examples import kinds
+from thincam_jax.commands.kinds import examples
 from thincam_jax.commands.run_folder import RunFolder
 from thincam_jax.commands.study import run as studies
 from thincam_jax.studies import StudyScores
@@ -362,11 +363,11 @@ def test_ctrl_c_at_any_moment(code, streams):
 def test_doctor():
     result = call("doctor")
     assert result.exit_code == 0
-    found = doctor.environment()
+    found = installation.environment()
     lines = result.stdout.splitlines()
     assert f"Python {found['python']} on {found['platform']}" in lines
     assert "devices: " + ", ".join(found["devices"]) in lines
-    assert any(line.startswith(f"cores: {doctor.usable_cores()}; memory: ") for line in lines)
+    assert any(line.startswith(f"cores: {installation.usable_cores()}; memory: ") for line in lines)
     assert f"optional hypothesis {version('hypothesis')}" in lines
     assert "  float64: yes" in lines
     assert "  compiled sums: right" in lines
@@ -375,8 +376,8 @@ def test_doctor():
 
 
 def test_doctor_tells_what_is_missing(monkeypatch):
-    monkeypatch.setattr(doctor, "PACKAGES", ("no-such-package",))
-    monkeypatch.setattr(doctor, "OPTIONAL", {"no-such-part": "making tea"})
+    monkeypatch.setattr(installation, "PACKAGES", ("no-such-package",))
+    monkeypatch.setattr(installation, "OPTIONAL", {"no-such-part": "making tea"})
     lines = call("doctor").stdout.splitlines()
     assert "no-such-package NOT INSTALLED" in lines
     assert "optional no-such-part is missing: making tea" in lines
@@ -400,9 +401,9 @@ def test_help(arguments, parts):
 
 def test_help_is_in_the_order_of_use():
     listed = call("--help").stdout.partition("Commands:")[2].splitlines()
-    assert [line.split()[0] for line in listed if line] == list(help.ORDER)
+    assert [line.split()[0] for line in listed if line] == list(cli.ORDER)
     text = call("reconstruct", "--help").stdout
-    titles = ("Options:", *(f"{group}:" for group in help.GROUPS), "Examples:")
+    titles = ("Options:", *(f"{group}:" for group in cli.GROUPS), "Examples:")
     assert [line.strip() for line in text.splitlines() if line.strip() in titles] == list(titles)
     assert text.index("--psf ") < text.index("Calibration:") < text.index("--dead")
     for command in ("init", "run", "reconstruct", "sweep", "design"):
@@ -425,7 +426,7 @@ def test_version():
     [
         ("thincam re", ["reconstruct"]),
         ("thincam bench ", ["accuracy"]),
-        ("thincam init des", [kind for kind in kinds() if kind.startswith("des")]),
+        ("thincam init des", [kind for kind in examples() if kind.startswith("des")]),
         ("thincam reconstruct --method a", ["auto", "admm-tv"]),
         ("thincam reconstruct --bayer R", ["RGGB"]),
     ],

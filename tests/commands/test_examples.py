@@ -8,27 +8,27 @@ import pytest
 from commands.test_cli import call, one_line
 
 from helpers import ROOT
-from thincam_jax.commands import examples
+from thincam_jax.commands import kinds
 from thincam_jax.commands.kinds import load_experiment
 
 FILES = sorted((ROOT / "configs").glob("*.yaml"))
 
 
-@pytest.mark.parametrize("kind", examples.kinds())
+@pytest.mark.parametrize("kind", kinds.examples())
 def test_a_file_that_its_command_takes(kind, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     result = call("init", kind)
     assert result.exit_code == 0, result.output
-    command = examples.next_command(kind)
+    command = kinds.next_command(kind)
     assert result.stdout == f"{kind}.yaml; next: thincam {command} {kind}.yaml\n"
     load_experiment(tmp_path / f"{kind}.yaml", command=command)
 
 
 def test_every_shipped_file_is_one(tmp_path):
-    for kind in examples.kinds():
+    for kind in kinds.examples():
         assert call("init", kind, "--out", tmp_path).exit_code == 0
     written = {path.read_text("utf-8") for path in tmp_path.iterdir()}
-    assert len(examples.kinds()) == len(FILES)
+    assert len(kinds.examples()) == len(FILES)
     assert written == {path.read_text("utf-8") for path in FILES}
 
 
@@ -36,7 +36,7 @@ def test_the_page_of_commands_lists_them():
     page = (ROOT / "docs/commands.md").read_text("utf-8")
     table = page.split("| kind | experiment |")[1].split("\n\n")[0]
     cells = [line.split("|")[1] for line in table.splitlines() if line.startswith("| `")]
-    assert sorted(re.findall(r"`(\w+)`", " ".join(cells))) == sorted(examples.kinds())
+    assert sorted(re.findall(r"`(\w+)`", " ".join(cells))) == sorted(kinds.examples())
 
 
 def test_nothing_is_overwritten(tmp_path):
@@ -62,6 +62,6 @@ def test_the_wheel_holds_them_where_they_are_looked_for(tmp_path, monkeypatch):
     place = wheel["targets"]["wheel"]["force-include"]["configs"]
     (tmp_path / place).mkdir(parents=True)
     (tmp_path / place / "camera.yaml").write_text("", "utf-8")
-    module = Path(examples.__file__).relative_to(ROOT)
-    monkeypatch.setattr(examples, "__file__", str(tmp_path / module))
-    assert examples.kinds() == ["study", "refocus", "design", "capture", "learned", "camera"]
+    module = Path(kinds.__file__).relative_to(ROOT)
+    monkeypatch.setattr(kinds, "__file__", str(tmp_path / module))
+    assert kinds.examples() == ["study", "refocus", "design", "capture", "learned", "camera"]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import thincam_jax as tc
-from thincam_jax.design import contour_target, match_error, retrieve_phase
+from thincam_jax.design import contour_mask, contour_target, match_error, retrieve_phase
 from thincam_jax.lensless.masks import MaskBlank
 from thincam_jax.lensless.propagation import Path
 from thincam_jax.units import nm, um
@@ -66,3 +66,15 @@ def test_refusals(key):
         retrieve_phase(flat, GRID, PATH, shape=(41, 48), key=key)
     with pytest.raises(ValueError, match="give irradiances >= 0, not all 0"):
         retrieve_phase(0 * flat, GRID, PATH, shape=(40, 48), key=key)
+
+
+def test_the_mask_of_contours_concentrates_light_on_them():
+    blank = tc.MaskBlank((48, 48), 10 * um, 1.52)
+    mask = contour_mask(3, blank, PATH, feature=80 * um, line_width=20 * um)
+    assert 0 <= float(mask.height.min()) and float(mask.height.max()) < 1.1e-3  # one turn
+    lines = contour_target(jax.random.key(3), blank.grid, feature=80 * um, line_width=20 * um)
+    camera = tc.LenslessCamera(mask, tc.Sensor((48, 48), 10 * um), float(PATH.distance))
+    light = {"wavelength": float(PATH.wavelength), "object_distance": float(PATH.object_distance)}
+    h = np.asarray(tc.psf(camera, model="angular_spectrum", **light))
+    on = np.asarray(lines) > 0
+    assert h[on].mean() > 2 * h[~on].mean()

@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from matplotlib import pyplot
 from studies import tiny_refocus
 
 from thincam_jax.studies.refocus import RefocusStudy
@@ -52,6 +53,19 @@ def test_the_sweep_is_even_in_inverse_distance(study, result):
         peak = distances[np.argmax(result.found.curve(name))]
         assert peak == pytest.approx(found.found_mm, rel=0.2)
     assert result.sharp.shape == study.field_shape(study.sweep_method)
+
+
+def test_tables_findings_and_figure(result):
+    assert [row[2] for row in result.table().rows] == [o.found_mm for o in result.objects.values()]
+    rows = result.methods_table().rows
+    assert [row[:3] for row in rows[:2]] == [(rows[0][0], 4, "20"), (rows[0][0], 4, "45")]
+    assert result.findings()[0].startswith("near, placed at 20 mm, is sharpest at")
+    assert result.findings()[-1].startswith("The objects stand 25 mm apart or more; the depth of")
+    try:
+        titles = [ax.get_title() for ax in result.plot().axes]
+        assert titles[0].endswith("focused on 20 mm")
+    finally:
+        pyplot.close("all")
 
 
 def test_objects_stand_where_they_were_put(study):

@@ -2,11 +2,12 @@
 
 import numpy as np
 import pytest
+from matplotlib import pyplot
 from studies import tiny_screen
 
 import thincam_jax as tc
 from thincam_jax.imaging.targets import resize, sample_image
-from thincam_jax.studies.screen import ScreenModel, mistaken_rays, summarise_rays
+from thincam_jax.studies.screen import PublishedImage, ScreenModel, mistaken_rays, summarise_rays
 from thincam_jax.units import nm
 
 SINGLE = (ScreenModel("right"), ScreenModel("single", "no_ghosts"))
@@ -35,6 +36,20 @@ def test_forgotten_ghosts_cost_an_image():
     assert right.images.shape == (2, 8, 16)
     assert right.scores.mean_psnr_db > 25
     assert right.scores.mean_psnr_db > single.scores.mean_psnr_db + 1.5
+    first, second = result.errors_table().rows
+    loss = right.scores.mean_psnr_db - single.scores.mean_psnr_db
+    assert first[0] == "right" and first[-2] == 0 and second[-2] == pytest.approx(loss)
+    published = {list(study.targets)[0]: {"CGM": PublishedImage(16.8)}}
+    rows = result.published_table(published).rows
+    assert rows[0][-2:] == (16.8, None) and rows[1][-2:] == (None, None)
+    try:
+        assert [ax.get_title() for ax in result.plot().axes[:3]] == [
+            "target",
+            "capture, turned",
+            "CGM",
+        ]
+    finally:
+        pyplot.close("all")
     of_targets = [score.psnr_db for score in right.scores.targets.values()]
     assert right.scores.mean_psnr_db == pytest.approx(np.mean(of_targets), abs=1e-3)
 

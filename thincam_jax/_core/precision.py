@@ -28,6 +28,16 @@ def itemsize_of(precision: Precision) -> int:
     return jnp.dtype(precision).itemsize
 
 
+def is_double() -> bool:
+    """Whether JAX computes in double precision by default."""
+    return bool(jax.config.read("jax_enable_x64"))
+
+
+def double_precision(on: bool) -> contextlib.AbstractContextManager[None]:
+    """Computing in double precision by default, or not, while the context lasts."""
+    return jax.enable_x64(on)
+
+
 @contextlib.contextmanager
 def allow(precision: Precision, *numbers: Any) -> Iterator[None]:
     """Makes float64 available inside, also where JAX is set to float32 only.

@@ -4,21 +4,65 @@ What a command computes with is imported when it runs: help and the shell's comp
 it. Hence the files `command.py` import nothing slow at their heads.
 """
 
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperCommand, TyperGroup
 
-from thincam_jax.commands.accuracy.command import accuracy
 from thincam_jax.commands.cache import cache_state, keep_programs
 from thincam_jax.commands.capture.command import capture, known_drivers
 from thincam_jax.commands.design.command import design
-from thincam_jax.commands.examples import init
 from thincam_jax.commands.explain import explain, schema
-from thincam_jax.commands.help import Grouped, InOrder, examples_text
-from thincam_jax.commands.learned.command import train
+from thincam_jax.commands.kinds import init
 from thincam_jax.commands.reconstruct.command import check, reconstruct
-from thincam_jax.commands.study.command import run
+from thincam_jax.commands.run import accuracy, run, train
 from thincam_jax.commands.sweep.command import sweep
+
+ORDER = (
+    *("init", "explain", "run", "capture", "reconstruct", "calibrate", "sweep", "design", "train"),
+    *("bench", "schema", "doctor"),
+)
+# Of `thincam reconstruct`; what is in none stands first.
+GROUPS = {
+    "Calibration": (
+        *("background", "psf_background", "dead", "bits", "psf_bits", "saturation", "noise"),
+    ),
+    "Preparation": (
+        *("downsample", "bayer", "demosaic", "noise_threshold", "psf_channels", "psf_scale"),
+        "corner",
+    ),
+    "Reconstruction": ("method", "tau", "ridge", "iterations", "coupling"),
+    "Image": ("field", "flip", "linear", "gamma", "white_balance"),
+}
+
+
+def examples_text(*lines: str) -> str:
+    """The end of a help text, its lines kept as they are."""
+    return "\n".join(["\b", "Examples:", *(f"  thincam {line}" for line in lines)])
+
+
+class InOrder(TyperGroup):
+    """Commands in the order in which a user needs them; one that is not listed comes last."""
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        known = {name: place for place, name in enumerate(ORDER)}
+        return sorted(super().list_commands(ctx), key=lambda name: known.get(name, len(known)))
+
+
+class Grouped(TyperCommand):
+    """Options in groups."""
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        group_of = {name: group for group, names in GROUPS.items() for name in names}
+        rows: dict[str, list] = {"Options": [], **{group: [] for group in GROUPS}}
+        for parameter in self.get_params(ctx):
+            record = parameter.get_help_record(ctx)
+            if record is not None:
+                rows[group_of.get(parameter.name or "", "Options")].append(record)
+        for group, records in rows.items():
+            with formatter.section(group):
+                formatter.write_dl(records)
+
 
 # Help without colours and boxes, which take longer than all the rest of it.
 app = typer.Typer(
@@ -89,22 +133,22 @@ def options(
 @app.command()
 def doctor() -> None:
     """Print versions, devices and what is missing."""
-    from thincam_jax.commands import doctor as doctoring
+    from thincam_jax._core import environment as installation
 
-    found = doctoring.environment()
+    found = installation.environment()
     print(f"Python {found['python']} on {found['platform']}")
     print("devices: " + ", ".join(found["devices"]))
     print(f"cores: {found['cores']}; memory: {found['memory']} free")
-    for name, support in doctoring.dtype_support().items():
+    for name, support in installation.dtype_support().items():
         print(f"  {name}: {support}")
-    print(f"  compiled sums: {doctoring.compiled_sums()}")
+    print(f"  compiled sums: {installation.compiled_sums()}")
     print(f"compiled programs: {cache_state()}")
     for name, version in found["versions"].items():
         print(f"{name} {version or 'NOT INSTALLED'}")
-    optional = doctoring.installed(doctoring.OPTIONAL)
+    optional = installation.installed(installation.OPTIONAL)
     for name, version in optional.items():
         print(f"optional {name} {version}")
-    for name, purpose in doctoring.OPTIONAL.items():
+    for name, purpose in installation.OPTIONAL.items():
         if name not in optional:
             print(f"optional {name} is missing: {purpose}")
     for line in known_drivers():

@@ -1,9 +1,16 @@
-"""The kinds of experiment files: what each is, which command takes it, and where its parts are."""
+"""The kinds of experiment files, where their parts are, and `thincam init`, which writes examples.
+
+As the files `command.py`, it imports nothing at its head that `thincam --help` does not need.
+"""
 
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+import typer
+
+from thincam_jax.commands.terminal import told
 
 
 @dataclass(frozen=True)
@@ -33,13 +40,16 @@ class Kind:
 
 def _run(room: str, section: str, name: str, example: str = "") -> Kind:
     """A kind for `thincam run`, whose parts are where those of its room are."""
-    parts = f"{room}.build:build_{room}", f"{room}.run:run_{room}"
+    parts = f"{room}.run:build_{room}", f"{room}.run:run_{room}"
     return Kind(name, "run", f"{room}.config:{section}", example, *parts)
 
 
 # By the `kind` of their files; a study's file does not name it.
 KINDS = {
-    "study": _run("study", "StudyConfig", "a study", "quick"),
+    "study": Kind(
+        *("a study", "run", "study.config:StudyConfig", "quick"),
+        *("study.build:build_study", "study.run:run_study"),
+    ),
     "refocus": _run("refocus", "RefocusConfig", "a refocusing", "fza_refocus"),
     "screen": _run("screen", "ScreenConfig", "a see-through screen"),
     "design": Kind("a design", "design", "design.config:DesignConfig", "design_distances"),
@@ -94,3 +104,46 @@ def load_experiment(
     if command is not None and kind.command != command:
         raise ConfigError(f"{path}: kind: is {kind.noun}; give it to 'thincam {kind.command}'")
     return load_as(kind.part(kind.section), path, overrides)
+
+
+# The quickest of each kind have its name; the other files have their own.
+_FILE_OF = {name: kind.example for name, kind in KINDS.items() if kind.example not in ("", name)}
+
+
+def _folder() -> Path:
+    """Inside the package where a wheel was installed, else at the root of the repository."""
+    installed = Path(__file__).with_name("configs")
+    return installed if installed.is_dir() else Path(__file__).parents[2] / "configs"
+
+
+def examples() -> list[str]:
+    """What `thincam init` can write."""
+    others = {path.stem for path in _folder().glob("*.yaml")} - set(_FILE_OF.values())
+    return [*_FILE_OF, *sorted(others)]
+
+
+def init(
+    kind: Annotated[
+        str, typer.Argument(help=f"One of {', '.join(examples())}.", autocompletion=examples)
+    ],
+    out: Annotated[Path | None, typer.Option(help="File, or folder; default KIND.yaml.")] = None,
+) -> None:
+    """Write an example experiment file to begin with."""
+    with told(lambda: "interrupted"):
+        from thincam_jax._core.files import write_whole
+        from thincam_jax.commands.config_file import ConfigError
+
+        if kind not in examples():
+            raise ConfigError(f"init {kind}: choose one of {', '.join(examples())}")
+        path = out or Path()
+        path = path / f"{kind}.yaml" if path.is_dir() else path
+        text = (_folder() / f"{_FILE_OF.get(kind, kind)}.yaml").read_text(encoding="utf-8")
+        if path.exists():
+            raise ConfigError(f"{path} exists; give another --out, or delete it")
+        write_whole(path, text)
+    print(f"{path}; next: thincam {next_command(kind)} {path}")
+
+
+def next_command(kind: str) -> str:
+    """What takes a file of that name."""
+    return read_kind(_folder() / f"{_FILE_OF.get(kind, kind)}.yaml").command

@@ -89,7 +89,7 @@ def render_report(page: Page, config: Any, pictures: Path, environment: dict[str
     """A page as HTML, with the experiment's configuration and how it was computed at its end.
 
     - `pictures`: the folder of its figures.
-    - `environment`: of the run, as `doctor.environment` gives it.
+    - `environment`: of the run, as `_core.environment.environment` gives it.
 
     Texts are escaped; a name that is missing is an error.
     """

@@ -5,17 +5,22 @@ import time
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
+import numpy as np
 import pydantic
 
+from thincam_jax._core.environment import environment
 from thincam_jax._core.files import WriteError, read_regular, write_whole
 from thincam_jax._core.steps import Progress, Step, carry_out
 from thincam_jax.commands.checked_config import dump_config
 from thincam_jax.commands.config_file import ConfigError, slug
-from thincam_jax.commands.doctor import environment
 from thincam_jax.commands.report import Page, render_report
 from thincam_jax.commands.sections import ExperimentConfig, Section
+from thincam_jax.imaging.display import png_bytes
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 Record = TypeVar("Record")
 
@@ -70,6 +75,17 @@ class RunFolder:
     def write(self, name: str, content: str | bytes) -> Path:
         """Write a file of the folder, whole or not at all."""
         return write_whole(self.path / name, content)
+
+    def save_figure(self, name: str, figure: "Figure") -> None:
+        """A figure as figures/NAME.png."""
+        from thincam_jax.plot.frame import as_png
+
+        self.write(f"{self.pictures}/{name}.png", as_png(figure))
+
+    def save_image(self, name: str, image: np.ndarray) -> None:
+        """An image of values 0…1 as an 8-bit PNG."""
+        pixels = np.round(np.clip(image, 0.0, 1.0) * 255).astype(np.uint8)
+        self.write(f"images/{name}.png", png_bytes(pixels))
 
     def complete(
         self, page: Page, config: ExperimentConfig, metrics: dict[str, Any], started: float

@@ -41,6 +41,7 @@ from thincam_jax.design.objectives import worst_ratio_db as worst_ratio_db
 from thincam_jax.design.phase_mask import HeightLimits as HeightLimits
 from thincam_jax.design.phase_mask import MaskSetting as MaskSetting
 from thincam_jax.design.phase_mask import Refined as Refined
+from thincam_jax.design.phase_mask import contour_mask as contour_mask
 from thincam_jax.design.phase_mask import cropped_error as cropped_error
 from thincam_jax.design.phase_mask import linear_error as linear_error
 from thincam_jax.design.phase_mask import linear_objective as linear_objective

@@ -29,9 +29,10 @@ from thincam_jax._core.checks import Number, Numbers
 from thincam_jax._core.grids import Grid
 from thincam_jax._core.module import Module
 from thincam_jax._core.precision import as_complex
+from thincam_jax._core.random import Key, random_key
 from thincam_jax.design.end_to_end import restore_by
 from thincam_jax.design.objectives import Channels, bayes_error
-from thincam_jax.design.phase_retrieval import match_error
+from thincam_jax.design.phase_retrieval import contour_target, match_error, retrieve_phase
 from thincam_jax.design.setup import Setup
 from thincam_jax.design.stochastic import adam
 from thincam_jax.design.training import Channel, relative_error
@@ -112,6 +113,34 @@ def mask_of_phase(
     height = (phase / (2 * math.pi) - jnp.floor(phase / (2 * math.pi))) * turn
     over = height - limits.highest
     return blank.mask(limits.nearest(jnp.where(turn - height < over, 0.0, height)))
+
+
+def contour_mask(
+    key: Key,
+    blank: MaskBlank,
+    path: Path,
+    *,
+    feature: Number,
+    line_width: Number,
+) -> PhaseMask:
+    """The mask whose PSF at a path's wavelength and distances is nearest to a `contour_target`.
+
+    - `key`: of `jax.random`, or a seed. `path`: of the light; see `retrieve_phase`.
+    - `feature`, `line_width`: of the lines, mm; see `contour_target`.
+
+    ```python
+    import thincam_jax as tc
+    from thincam_jax.design import contour_mask
+    from thincam_jax.lensless.propagation.path import Path
+
+    blank = tc.MaskBlank((64, 64), 0.01, 1.52)
+    mask = contour_mask(0, blank, Path(5e-4, 5.0), feature=0.08, line_width=0.02)
+    ```
+    """
+    key = random_key(key)
+    lines = contour_target(key, blank.grid, feature=feature, line_width=line_width)
+    found = retrieve_phase(lines, blank.grid, path, shape=blank.shape, key=key)
+    return mask_of_phase(found.phase, blank, path.wavelength, one_turn(blank, path.wavelength))
 
 
 class MaskSetting(eqx.Module):

@@ -19,7 +19,7 @@ from thincam_jax.design import (
     TrainingError,
 )
 from thincam_jax.design.space import REPORTED
-from thincam_jax.plot.studies import drawing, line_style
+from thincam_jax.plot.frame import drawing, line_style
 from thincam_jax.studies.design import FoundDesigns
 from thincam_jax.studies.design_scores import FrontScores, FrontsScores, PointScores
 from thincam_jax.studies.study import Study

@@ -1,5 +1,7 @@
-"""The figure that every plot is drawn on, and images with their place in mm."""
+"""The figure that every plot is drawn on: its axes, lines, grey levels and PNG file."""
 
+import io
+import math
 from typing import Any
 
 import matplotlib.figure
@@ -44,3 +46,70 @@ def show_image(axes: Axes, image: Any, pitch: float, **options: Any) -> AxesImag
     shown = axes.imshow(image, extent=extent, **{"cmap": "gray", **options})
     axes.set(xlabel="x (mm)", ylabel="y (mm)")
     return shown
+
+
+def grey_levels(image: np.ndarray, white: float) -> np.ndarray:
+    """Radiance as 0…1: black stays black, `white` and above are white."""
+    return np.clip(np.asarray(image, dtype=float) / (white if white > 0 else 1.0), 0.0, 1.0)
+
+
+def white_level(images: np.ndarray) -> float:
+    """The radiance shown white: all but the brightest two in a thousand pixels."""
+    return float(np.percentile(images, 99.8))
+
+
+# Told apart by dash and marker as well as by colour, so that they read in grey.
+_LINES = (
+    {"color": "#9a9a9a", "linestyle": "-", "marker": "o"},
+    {"color": "#d08020", "linestyle": "--", "marker": "s"},
+    {"color": "#1060a0", "linestyle": "-", "marker": "^"},
+    {"color": "#000000", "linestyle": ":", "marker": "D"},
+    {"color": "#7030a0", "linestyle": "-.", "marker": "v"},
+)
+
+
+def line_style(index: int) -> dict:
+    """Colour, dash and marker of the curve of that number."""
+    return dict(_LINES[index % len(_LINES)])
+
+
+def drawing(
+    size: tuple[float | int, float | int],
+    rows: int = 1,
+    columns: int = 1,
+    *,
+    figure: matplotlib.figure.Figure | None = None,
+    **how: Any,
+) -> Any:
+    """A figure of a size in inches, the one given or a new one, and its axes.
+
+    `how`: as of `Figure.subplots`.
+    """
+    figure = matplotlib.figure.Figure() if figure is None else figure
+    figure.set_size_inches(*size)
+    figure.set_layout_engine("constrained")
+    return figure, figure.subplots(rows, columns, **how)
+
+
+def sheet(
+    count: int, most: int, side: float, aspect: float, room: float
+) -> tuple[matplotlib.figure.Figure, list[Axes]]:
+    """A figure with so many places for pictures, at most `most` beside each other, without axes.
+
+    `side`: width of a place; `aspect`: height of its picture over that; `room`: above it.
+    """
+    columns = min(most, count)
+    rows = math.ceil(count / columns)
+    size = (side * columns, rows * (side * aspect + room))
+    figure, axes = drawing(size, rows, columns, squeeze=False)
+    axes = axes.ravel()
+    for ax in axes:
+        ax.set_axis_off()
+    return figure, list(axes[:count])
+
+
+def as_png(figure: matplotlib.figure.Figure) -> bytes:
+    """Content of a PNG file of a figure."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=110)
+    return buffer.getvalue()

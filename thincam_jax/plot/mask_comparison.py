@@ -4,7 +4,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from thincam_jax.imaging.metrics.image import align
-from thincam_jax.plot.studies import drawing
+from thincam_jax.plot.frame import drawing
 from thincam_jax.studies.mask_comparison import MaskComparisonResult
 
 # Dash and grey tell the sort of a mask, and the marker which it is: read without colours.

@@ -11,59 +11,12 @@ from matplotlib.figure import Figure
 from thincam_jax.imaging.metrics import low_frequency_value
 from thincam_jax.imaging.targets import middle_square
 from thincam_jax.lensless.exposures import Exposure
+from thincam_jax.plot.cameras import draw_psf as draw_camera_psf
+from thincam_jax.plot.frame import drawing, line_style, sheet
 from thincam_jax.studies.evaluate import Contrasts, Evaluation, as_picture
 from thincam_jax.studies.response import Response
 from thincam_jax.studies.simulate import Capture
 from thincam_jax.studies.study import Study, Target
-
-# Told apart by dash and marker as well as by colour, so that they read in grey.
-_LINES = (
-    {"color": "#9a9a9a", "linestyle": "-", "marker": "o"},
-    {"color": "#d08020", "linestyle": "--", "marker": "s"},
-    {"color": "#1060a0", "linestyle": "-", "marker": "^"},
-    {"color": "#000000", "linestyle": ":", "marker": "D"},
-    {"color": "#7030a0", "linestyle": "-.", "marker": "v"},
-)
-
-
-def line_style(index: int) -> dict:
-    """Colour, dash and marker of the curve of that number."""
-    return dict(_LINES[index % len(_LINES)])
-
-
-def drawing(
-    size: tuple[float | int, float | int],
-    rows: int = 1,
-    columns: int = 1,
-    *,
-    figure: Figure | None = None,
-    **how: Any,
-) -> Any:
-    """A figure of a size in inches, the one given or a new one, and its axes.
-
-    `how`: as of `Figure.subplots`.
-    """
-    figure = Figure() if figure is None else figure
-    figure.set_size_inches(*size)
-    figure.set_layout_engine("constrained")
-    return figure, figure.subplots(rows, columns, **how)
-
-
-def sheet(
-    count: int, most: int, side: float, aspect: float, room: float
-) -> tuple[Figure, list[Axes]]:
-    """A figure with so many places for pictures, at most `most` beside each other, without axes.
-
-    `side`: width of a place; `aspect`: height of its picture over that; `room`: above it.
-    """
-    columns = min(most, count)
-    rows = math.ceil(count / columns)
-    size = (side * columns, rows * (side * aspect + room))
-    figure, axes = drawing(size, rows, columns, squeeze=False)
-    axes = axes.ravel()
-    for ax in axes:
-        ax.set_axis_off()
-    return figure, list(axes[:count])
 
 
 def draw_target(
@@ -247,4 +200,13 @@ def draw_contrasts(contrasts: Mapping[str, Contrasts]) -> Figure:
     ax.set(ylim=(-1.05, 1.1), xlabel="line pair on the object (mm)", ylabel=contrast)
     ax.legend(fontsize=9, loc="lower left")
     ax.grid(alpha=0.3)
+    return figure
+
+
+def draw_psf(study: Study) -> Figure:
+    """PSF of the first exposure: the image, and a line through its middle."""
+    exposure = study.exposures[0]
+    figure, title = Figure(figsize=(8.5, 3.4), layout="constrained"), study.mask_of(exposure)
+    grid, h = study.camera(exposure).sensor.grid, np.asarray(study.psf(exposure))
+    draw_camera_psf(figure, h, grid, f"{title}, d = {exposure.distance:g} mm")
     return figure

@@ -5,6 +5,8 @@ from thincam_jax.lensless.exposures import Exposures as Exposures
 from thincam_jax.studies.evaluate import Evaluation as Evaluation
 from thincam_jax.studies.evaluate import Resolved as Resolved
 from thincam_jax.studies.evaluate import Scores as Scores
+from thincam_jax.studies.evaluate import check_cameras as check_cameras
+from thincam_jax.studies.evaluate import check_target as check_target
 from thincam_jax.studies.evaluate import evaluate_method as evaluate_method
 from thincam_jax.studies.evaluate import field_shape as field_shape
 from thincam_jax.studies.evaluate import reconstructor as reconstructor
@@ -22,6 +24,7 @@ from thincam_jax.studies.result import MethodScores as MethodScores
 from thincam_jax.studies.result import StudyResult as StudyResult
 from thincam_jax.studies.result import StudyScores as StudyScores
 from thincam_jax.studies.result import evaluate_target as evaluate_target
+from thincam_jax.studies.result import findings as findings
 from thincam_jax.studies.simulate import Capture as Capture
 from thincam_jax.studies.simulate import expose as expose
 from thincam_jax.studies.simulate import noise_free as noise_free

@@ -6,11 +6,15 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import equinox as eqx
+import jax
 import numpy as np
 from jaxtyping import Array
 
 from thincam_jax._core.grids import Grid
+from thincam_jax._core.quantity import FieldError
 from thincam_jax.imaging.metrics import align, psnr, resolved_element, ssim, usaf_contrast
+from thincam_jax.imaging.metrics.image import SSIM_WINDOW
+from thincam_jax.imaging.metrics.mtf import MINIMUM_COLUMNS
 from thincam_jax.imaging.scene import ImagePlane
 from thincam_jax.imaging.targets import line_pair, usaf1951_elements
 from thincam_jax.lensless.exposures import Exposure
@@ -26,6 +30,9 @@ from thincam_jax.reconstruction import (
 from thincam_jax.reconstruction.solver import AbstractSolver
 from thincam_jax.studies.simulate import Capture, stacked
 from thincam_jax.studies.study import Method, Study, Target
+
+# The scene's power is read off frequencies above three cycles a sensor (`spectra.inner_band`).
+_MINIMUM_ROWS = 7
 
 Reconstructor = Callable[[Array, Array], Reconstruction]
 Contrasts = list[tuple[float, str, float]]
@@ -77,6 +84,41 @@ def field_shape(study: Study, method: Method, target: Target) -> tuple[int, int]
         for size in (target.plane.height, target.plane.width)
     )
     return rows, columns
+
+
+def check_cameras(study: Study) -> None:
+    """Build every camera of a study, and try whether its model takes the mask.
+
+    **Errors**: FieldError of "sensor.shape" for too few pixels to be scored; MemoryError for too
+    many; ValueError, TypeError and FileNotFoundError of the mask, the sensor and the model.
+    """
+    rows, columns = study.sensor.shape
+    if rows < _MINIMUM_ROWS or columns < MINIMUM_COLUMNS:
+        raise FieldError(
+            f"{rows}×{columns} pixels are too few for a study; "
+            f"give at least {_MINIMUM_ROWS}×{MINIMUM_COLUMNS}",
+            "sensor.shape",
+        )
+    for exposure in study.exposures:
+        study.camera(exposure)
+    jax.eval_shape(lambda: study.psf(study.exposures[0]))  # traced only
+
+
+def check_target(study: Study, target: Target) -> None:
+    """Refuse a target that no method can be scored on.
+
+    **Errors**: ValueError for a uniform image, or one that covers too few pixels.
+    """
+    if target.plane.image.min() == target.plane.image.max():
+        raise ValueError("the image is uniform: there is nothing to reconstruct; give another one")
+    for method in study.methods:
+        shape = field_shape(study, method, target)
+        if min(shape) < SSIM_WINDOW:
+            raise ValueError(
+                f"{method.name!r} reconstructs it on {shape[0]}×{shape[1]} pixels, at least "
+                f"{SSIM_WINDOW}×{SSIM_WINDOW} are needed; give a larger object.width or a "
+                "smaller sensor.pitch"
+            )
 
 
 def reconstructor(

@@ -14,6 +14,7 @@ import scipy
 from thincam_jax._core.grids import Grid
 from thincam_jax._core.precision import Precision, allow, cast
 from thincam_jax._core.steps import Progress, Step, carry_out
+from thincam_jax._core.table import Table
 from thincam_jax.imaging.metrics import psnr
 from thincam_jax.imaging.operators import kernel_shape
 from thincam_jax.imaging.scene import Spectrum
@@ -29,6 +30,7 @@ from thincam_jax.studies.psf_accuracy import (
     binned,
     conditions_of,
     contrast_error,
+    label,
     psf_of,
     relative_error,
     why_not,
@@ -40,6 +42,7 @@ from thincam_jax.studies.study import Method, Study, Target
 # What is wrong: the mask's curvature β, or its distance d from the sensor.
 QUANTITIES = ("beta", "distance")
 LEVELS = (0.003, 0.01, 0.03, 0.1)  # relative errors of the PSF
+_NAMES = {"beta": "β", "distance": "d"}
 _TOLERANCE = 0.01  # of the level, within which it is met
 # The largest relative change that is looked at, and the one to begin with.
 _LARGEST, _FIRST = 0.5, 1e-5
@@ -218,6 +221,18 @@ class ReconstructionCosts:
     models: tuple[ModelCost, ...]
     controlled: tuple[ControlledCost, ...]
 
+    def verdict(self) -> str:
+        """What a PSF error of 1 % costs, or why nothing was reconstructed."""
+        if self.skipped:
+            return f"no reconstruction: {self.skipped}"
+        lost = [
+            f"{row.psnr_lost_db:.4f}".replace("-", "−") + f" dB by a wrong {_NAMES[row.wrong]}"
+            for row in self.controlled
+            if row.level == 0.01 and row.status == "run"
+        ]
+        text = " and ".join(lost) if lost else "an unknown amount"
+        return f"a PSF error of 1 % costs {self.method} {text}"
+
 
 class ReconstructionErrors:
     """Noisy captures by the exact model, reconstructed with wrong PSFs: `work` fills `costs`."""
@@ -345,6 +360,25 @@ class AccuracyResult:
     psfs: tuple[PsfAccuracy, ...]
     captures: tuple[CaptureError, ...]
     reconstructions: ReconstructionCosts
+
+    def table(self) -> Table:
+        """PSF models at the largest size, the fastest first; those worth choosing are marked."""
+        largest = max((row.shape for row in self.psfs), key=max)
+        rows = [row for row in self.psfs if row.shape == largest]
+        shown = []
+        for row in sorted(rows, key=lambda row: row.seconds or float("inf")):
+            name = label(row.model, row.precision, row.oversampling)
+            numbers_of = row.true_error, row.predicted_error, row.seconds, row.compile_seconds
+            if None in numbers_of:
+                shown.append([name, "not run", *[None] * 4])
+                continue
+            error, predicted, seconds, compiling = (float(number or 0) for number in numbers_of)
+            told = "reference" if error == 0 else f"{error:.1e}"
+            worth = "yes" if row.worth_choosing else ""
+            times = f"{1000 * seconds:.2f}", f"{compiling:.1f}"
+            shown.append([name, told, f"{predicted:.1e}", *times, worth])
+        headings = ("PSF", "error", "predicted", "time ms", "compile s", "worth it")
+        return Table(headings, shown, title=f"{largest[0]}×{largest[1]} pixels")
 
 
 class AccuracyRun:

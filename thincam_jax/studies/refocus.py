@@ -9,7 +9,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -43,6 +43,9 @@ from thincam_jax.reconstruction.depth.refocus import (
 from thincam_jax.studies.evaluate import reconstructor, rounded, sample
 from thincam_jax.studies.simulate import Capture, expose, noise_free, stacked
 from thincam_jax.studies.study import Method, Study, Target
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _MARGIN = 1.15  # the field over what the objects cover
 
@@ -322,11 +325,51 @@ class RefocusResult:
     def table(self) -> Table:
         """Where objects were placed, and where they were found."""
         rows = [
-            (name, one.distance_mm, one.found_mm, one.error_percent, one.axial_resolution_mm)
-            for name, one in self.objects.items()
+            (name, f"{o.distance_mm:g}", o.found_mm, o.error_percent, o.axial_resolution_mm)
+            for name, o in self.objects.items()
         ]
-        headings = ("object", "distance mm", "found mm", "error %", "axial resolution mm")
-        return Table(headings, rows, (1,) * 4)
+        headings = ("object", "placed at\nmm", "found at\nmm", "error\n%", "depth of focus\nmm")
+        return Table(headings, rows, (0, 1, 1, 0))
+
+    def methods_table(self) -> Table:
+        """PSNR of every object by every method, focused on each of them."""
+        rows = []
+        for name, method in self.methods.items():
+            for distance, one in method.focused_on_mm.items():
+                psnr_db = (one.psnr_db[placed] for placed in self.objects)
+                count = None if one.iterations is None else f"{one.iterations} ({one.status})"
+                rows.append((name, method.captures, distance, *psnr_db, count))
+        each = (f"{name} at {o.distance_mm:g} mm\nPSNR dB" for name, o in self.objects.items())
+        headings = ("method", "captures", "focused on\nmm", *each, "iterations")
+        return Table(headings, rows, (1,) * (len(headings) - 1))
+
+    def findings(self) -> list[str]:
+        """Main results in sentences."""
+        sentences = []
+        for name, found in self.objects.items():
+            if found.found_mm is None:
+                sentences.append(f"{name}, placed at {found.distance_mm:g} mm, was not found.")
+                continue
+            sentences.append(
+                f"{name}, placed at {found.distance_mm:g} mm, is sharpest at "
+                f"{found.found_mm:.1f} mm ({found.error_percent:+.1f} %)."
+            )
+        spans = [found.axial_resolution_mm for found in self.objects.values()]
+        distances = sorted(target.distance for target in self.refocusing.study.targets)
+        if len(distances) > 1:
+            gap = min(b - a for a, b in zip(distances, distances[1:], strict=False))
+            sentences.append(
+                f"The objects stand {gap:g} mm apart or more; the depth of focus, "
+                f"π t (t+d) / (β d R²), is {min(spans):.0f} to {max(spans):.0f} mm."
+            )
+        return sentences
+
+    def plot(self) -> "Figure":
+        """Every method focused on every object; below each, the objects enlarged."""
+        from thincam_jax.plot.frame import new_figure
+        from thincam_jax.plot.refocus import draw_methods
+
+        return draw_methods(self, new_figure(1.0, 1.0))
 
 
 class RefocusRun:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thincam_jax._core.table import Table
+from thincam_jax._core.table import Table, number
 from thincam_jax.studies.evaluate import Evaluation, Resolved, Scores, evaluate_method
 from thincam_jax.studies.response import Limits, Response, method_response
 from thincam_jax.studies.simulate import take
@@ -65,6 +65,46 @@ class StudyScores:
             (1, 1, 2, 2, 1),
         )
 
+    def quality_table(self) -> Table:
+        """PSNR and SSIM of every method on every target, beside what was published."""
+        rows, targets = [], list(dict.fromkeys(t for m in self.methods.values() for t in m.targets))
+        for name, one in self.methods.items():
+            found = (one.targets[target] for target in targets)
+            both = (f"{number(s.psnr_db, 1)} / {number(s.ssim, 2)}" for s in found)
+            means = one.mean_psnr_of_pictures_db, one.published.psnr_db
+            rows.append((name, one.captures, *both, *means))
+        each = (f"{target}\nPSNR dB / SSIM" for target in targets)
+        last = "mean PSNR of\npictures, dB", "published\ndB"
+        headings = ("method", "captures", *each, *last)
+        return Table(headings, rows, (1,) * (len(headings) - 1), published=(len(headings) - 1,))
+
+    def resolution_table(self) -> Table:
+        """What every method resolves, and its limits, beside what was published."""
+        rows = [
+            (
+                name,
+                one.resolved_mm,
+                one.resolved and one.resolved.sensor_cycles_per_mm,
+                one.published.resolved_object_mm,
+                one.limits.first_zero_cycles_per_mm,
+                one.limits.cut_off_cycles_per_mm,
+                one.limits.cut_off_object_mm,
+                one.published.limit_cycles_per_mm,
+            )
+            for name, one in self.methods.items()
+        ]
+        headings = (
+            "method",
+            "resolved line pair\non the object, mm",
+            "the same on the\nsensor, cycles/mm",
+            "published\nmm",
+            "first zero\ncycles/mm",
+            "cut-off\ncycles/mm",
+            "cut-off on\nthe object, mm",
+            "published limit\ncycles/mm",
+        )
+        return Table(headings, rows, (2, 1, 2, 2, 1, 2, 1), published=(3, 7))
+
 
 def mean_psnr_of_pictures(targets: Sequence[Target], scores: Mapping[str, Scores]) -> float | None:
     """The mean over photographs and files, dB, from scores by target; None without any.
@@ -98,6 +138,58 @@ def summarise(
     return StudyScores(study.name, study.seed, methods, study.warnings)
 
 
+def findings(study: Study, scores: StudyScores) -> list[str]:
+    """Main results of a study in sentences, beside what was published."""
+    sentences = []
+    for name, method in scores.methods.items():
+        mean, stated = method.mean_psnr_of_pictures_db, method.published.psnr_db
+        if mean is not None and stated is not None:
+            sentences.append(
+                f"{name}: {mean:.1f} dB on average over the pictures, published {stated:.1f} dB "
+                f"({mean - stated:+.1f} dB)."
+            )
+        own, stated = method.resolved_mm, method.published.resolved_object_mm
+        if own is not None and stated is not None:
+            word = "finer" if own < 0.97 * stated else "coarser"
+            word = "the same within 3 %" if abs(own / stated - 1) <= 0.03 else word
+            sentences.append(
+                f"{name}: resolves a line pair of {own:.2f} mm on the object, published "
+                f"{stated:.2f} mm: {word}."
+            )
+    sentences += _gains(study, scores)
+    ranked = sorted(
+        (one.resolved_mm, name)
+        for name, one in scores.methods.items()
+        if one.resolved_mm is not None
+    )
+    if len(ranked) > 1:
+        order = ", ".join(f"{name} ({period:.2f} mm)" for period, name in ranked)
+        sentences.append(f"From finest to coarsest on the chart: {order}.")
+    return sentences
+
+
+def _sums(method: Method) -> tuple:
+    """What two methods share that add and subtract the same captures in the same way."""
+    return tuple(method.exposures), method.synthesis, method.phases, method.harmonics
+
+
+def _gains(study: Study, scores: StudyScores) -> list[str]:
+    """What total variation adds to the Wiener synthesis of the same captures."""
+    sentences = []
+    for method in (m for m in study.methods if m.solver.name == "admm_tv"):
+        for other in (m for m in study.methods if m.solver.name == "wiener"):
+            if _sums(method) != _sums(other):
+                continue
+            both = [scores.methods[one.name].targets for one in (method, other)]
+            pairs = ((name, *(of[name].psnr_db for of in both)) for name in both[0])
+            gains = [
+                f"{a - b:+.1f} dB on {t}" for t, a, b in pairs if a is not None and b is not None
+            ]
+            if gains:
+                sentences.append(f"{method.name}: {', '.join(gains)} over {other.name}.")
+    return sentences
+
+
 @dataclass(frozen=True, eq=False)
 class StudyResult:
     """All that a study found: `evaluations` by target and method, `responses` by method."""
@@ -119,6 +211,10 @@ class StudyResult:
     def table(self) -> Table:
         """Every method beside what was published of it."""
         return self.scores.table()
+
+    def findings(self) -> list[str]:
+        """Main results in sentences, beside what was published."""
+        return findings(self.study, self.scores)
 
     def plot(self, target: str | None = None) -> "Figure":
         """The scene and every reconstruction of it, whole and enlarged; by default the first."""

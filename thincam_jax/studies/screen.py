@@ -7,9 +7,10 @@ capture is a sum of ghosts, whose shifts and weights differ from pixel to pixel 
 
 import math
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import equinox as eqx
 import jax
@@ -29,6 +30,9 @@ from thincam_jax.units import deg, nm
 from thincam_jax.waveguide.hologram import directions
 from thincam_jax.waveguide.rays import bragg_rays
 from thincam_jax.waveguide.system import colour_operator, seen_size, smeared_rays, system_matrix
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 Mistake = Literal["none", "grating", "ghost_index", "shift_invariant", "no_ghosts", "no_smear"]
 MISTAKES: dict[Mistake, str] = {
@@ -302,6 +306,14 @@ class ModelResult:
     methods: dict[str, Reconstructed]
 
 
+@dataclass(frozen=True)
+class PublishedImage:
+    """Figures that a publication gives for a target and a solver; None where it gives none."""
+
+    psnr_db: float | None = None
+    seconds: float | None = None
+
+
 @dataclass(frozen=True, eq=False)
 class ScreenResult:
     """A study and what each of its models gives, by name."""
@@ -317,6 +329,54 @@ class ScreenResult:
         ]
         headings = ("model", *(f"{name}, mean dB" for name in self.study.solvers))
         return Table(headings, rows, (1,) * len(self.study.solvers))
+
+    @property
+    def right(self) -> ModelResult:
+        """The model that takes the captures."""
+        return self.models[self.study.models[0].name]
+
+    def errors_table(self) -> Table:
+        """PSNR of every target by the last solver with each model, and what its mistake costs."""
+        last = list(self.study.solvers)[-1]
+        right = self.right.methods[last].scores.mean_psnr_db
+        rows = []
+        for name, model in self.models.items():
+            scores = model.methods[last].scores
+            mean = scores.mean_psnr_db
+            loss = None if right is None or mean is None else right - mean
+            each = (scores.targets[target].psnr_db for target in self.study.targets)
+            rows.append((name, *each, mean, loss, model.mistake))
+        targets = list(self.study.targets)
+        headings = ("model of the camera", *targets, "mean dB", "loss dB", "what it is")
+        return Table(headings, rows, (1,) * (len(targets) + 2), words=(len(targets) + 3,))
+
+    def published_table(self, published: Mapping[str, Mapping[str, PublishedImage]]) -> Table:
+        """Every target with the right model, beside what was published of it.
+
+        - `published`: by target and solver; either may be missing.
+        """
+        methods = {name: one.scores for name, one in self.right.methods.items()}
+        rows = []
+        for target in self.study.targets:
+            own = [scores.targets[target] for scores in methods.values()]
+            stated = [published.get(target, {}).get(name, PublishedImage()) for name in methods]
+            others = (number for one in stated for number in (one.psnr_db, one.seconds))
+            rows.append((target, *(n for one in own for n in (one.psnr_db, one.ssim)), *others))
+        seconds = (t for s in methods.values() for t in (f"{s.seconds_per_image:.2f}", ""))
+        rows.append(("time for an image, s", *seconds, *[""] * (2 * len(methods))))
+        ours = (heading for name in methods for heading in (f"{name}\nPSNR dB", "SSIM"))
+        theirs = (h for name in methods for h in (f"published\n{name}, dB", "published\ns"))
+        count = 2 * len(methods)
+        digits = (*(1, 3) * len(methods), *(1,) * count)
+        columns = range(count + 1, 2 * count + 1)
+        return Table(("target", *ours, *theirs), rows, digits, published=columns)
+
+    def plot(self) -> "Figure":
+        """Targets, captures, and what the right model reconstructs by every solver."""
+        from thincam_jax.plot.frame import new_figure
+        from thincam_jax.plot.screen import draw_images
+
+        return draw_images(self, new_figure(1.0, 1.0))
 
 
 class ScreenRun:

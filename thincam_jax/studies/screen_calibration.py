@@ -22,6 +22,7 @@ from jaxtyping import Array, Float
 
 from thincam_jax import waveguide as wg
 from thincam_jax._core.steps import Progress, Step, carry_out
+from thincam_jax._core.table import Table
 from thincam_jax.imaging.metrics import psnr
 from thincam_jax.imaging.operators import Matrix, ReducedMatrix, Scaled, Sparse
 from thincam_jax.measured import calibration as measuring
@@ -153,6 +154,19 @@ class FitScores:
     seconds: float
     values: dict[str, FittedValue]
 
+    def table(self) -> Table:
+        """Every parameter beside its true value."""
+        rows = [
+            (
+                name.replace("_", " "),
+                f"{value.found:.5g} {value.unit}",
+                f"{value.standard_error:.2g}",
+                None if value.true is None else f"{value.true:.5g}",
+            )
+            for name, value in self.values.items()
+        ]
+        return Table(("number", "found", "standard error", "true"), rows)
+
 
 @dataclass(frozen=True)
 class DistanceScores:
@@ -179,6 +193,16 @@ class CalibrationScores:
     expected_noise_counts: float
     distances: dict[str, dict[str, DistanceScores]]
     fit: FitScores
+
+    def table(self) -> Table:
+        """Mean PSNR at every distance, by how the matrix was found; no rows without distances."""
+        ways = next(iter(self.distances.values()), {})
+        rows = [
+            (distance, *(way.mean_psnr_db for way in each.values()))
+            for distance, each in self.distances.items()
+        ]
+        headings = ("object at", *(f"{name}, mean dB" for name in ways))
+        return Table(headings, rows, (1,) * len(ways))
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 from helpers import shared_data
 from thincam_jax.commands import cli
-from thincam_jax.commands.reconstruct import command, console
+from thincam_jax.commands.reconstruct import command, run
 from thincam_jax.commands.reconstruct.options import PSF_METHODS, Output, Recipe
 from thincam_jax.measured import Preparation
 
@@ -243,7 +243,7 @@ def interrupt_at(monkeypatch, name, iteration):
         if capture == name and progress.iteration >= iteration:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(console._Bar, "__call__", interrupted)
+    monkeypatch.setattr(run._Bar, "__call__", interrupted)
 
 
 class TestInterrupt:

@@ -16,6 +16,7 @@ from thincam_jax.commands.reconstruct.options import Output, Recipe, Sources
 from thincam_jax.commands.reconstruct.run import Failed, Finished, run_jobs
 from thincam_jax.measured import MeasurementError, Preparation
 from thincam_jax.reconstruction import Reconstruction
+from thincam_jax.studies import prepared
 
 SHORT = Recipe(iterations=16)  # steps of ten and of one
 
@@ -122,7 +123,7 @@ def test_nothing_is_left_of_a_write_that_fails(folder, tmp_path, monkeypatch, ro
 
 def test_what_overflows_is_not_written(folder, tmp_path, monkeypatch):
     lost = Reconstruction(jnp.full((1, 2, 3), jnp.nan), None, ending="iterations_exhausted")
-    monkeypatch.setattr(run, "reconstruct", lambda *_, **__: lost)
+    monkeypatch.setattr(prepared, "reconstruct", lambda *_, **__: lost)
     output = Output(tmp_path / "first.png")
     planned = plan_jobs(folder / "first.tif", sources(folder), output)
     (result,) = run_jobs(planned, sources(folder), Recipe(tau=1e5), output)

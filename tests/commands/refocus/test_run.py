@@ -15,9 +15,8 @@ from helpers import ROOT
 from thincam_jax.commands.checked_config import dump_config
 from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.kinds import load_experiment
-from thincam_jax.commands.refocus.build import build_refocus
 from thincam_jax.commands.refocus.config import RefocusConfig
-from thincam_jax.commands.refocus.run import run_refocus
+from thincam_jax.commands.refocus.run import build_refocus, run_refocus
 from thincam_jax.commands.run_folder import RunFolder
 from thincam_jax.commands.study.config import StudyConfig, load_config
 

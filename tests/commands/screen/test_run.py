@@ -14,12 +14,9 @@ from helpers import ROOT
 from thincam_jax.commands.checked_config import dump_config
 from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.run_folder import RunFolder, to_json
-from thincam_jax.commands.screen.build import build_screen
-from thincam_jax.commands.screen.figures import srgb
-from thincam_jax.commands.screen.run import run_screen
+from thincam_jax.commands.screen.run import build_screen, run_screen
 from thincam_jax.imaging.targets import load_image
 from thincam_jax.studies.screen_calibration import MEASURED, calibrate
-from thincam_jax.units import nm
 
 
 def stored(path):
@@ -107,12 +104,6 @@ def test_report_stands_alone_and_is_escaped(run):
     assert all(source.startswith("data:image/") for source in sources)
     assert "&lt;b&gt;of its own&lt;/b&gt;" in page
     assert ">16.8</td>" in page  # published
-
-
-def test_colours_of_wavelengths():
-    red, green, blue = srgb(np.array([630.0, 530.0, 455.0]) * nm)
-    assert red.argmax() == 0 and green.argmax() == 1 and blue.argmax() == 2
-    assert red.max() == green.max() == blue.max() == 1
 
 
 @pytest.mark.parametrize(

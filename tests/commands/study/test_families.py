@@ -9,9 +9,9 @@ from PIL import Image
 import thincam_jax as tc
 from thincam_jax.commands.checked_config import dump_config
 from thincam_jax.commands.config_file import ConfigError
-from thincam_jax.commands.study import mask as masks
 from thincam_jax.commands.study.build import build_study
 from thincam_jax.commands.study.config import load_config
+from thincam_jax.lensless import masks as mask_room
 
 HEAD, TAIL = tiny.TEXT.split("methods:")[0], "targets:" + tiny.TEXT.split("targets:")[1]
 METHOD = "{name: one, kind: wiener, synthesis: separate, shots: [{distance: 3 mm}]}"
@@ -87,8 +87,8 @@ def test_an_image_file_is_read_once(tmp_path, monkeypatch):
     """However many exposures there are, and for its warnings."""
     picture = Image.fromarray(np.uint8(255 * np.eye(12)))
     picture.save(tmp_path / "picture.png")
-    read, read_mask = [], masks.masks.read_mask
-    monkeypatch.setattr(masks.masks, "read_mask", lambda *a: read.append(a) or read_mask(*a))
+    read, read_mask = [], mask_room.read_mask
+    monkeypatch.setattr(mask_room, "read_mask", lambda *a: read.append(a) or read_mask(*a))
     shots = METHOD.replace("{distance: 3 mm}", "{distance: 3 mm}, {distance: 4 mm}")
     mask = f"{{family: file, path: {tmp_path / 'picture.png'}, width: 2 mm}}"
     built = build_study(load_config(written(tmp_path, mask, shots)))

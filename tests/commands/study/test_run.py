@@ -16,15 +16,14 @@ from commands.study import tiny
 from commands.sweep import mini
 from commands.test_cli import call
 
+from thincam_jax._core.environment import environment
 from thincam_jax.commands.config_file import ConfigError
-from thincam_jax.commands.doctor import environment
 from thincam_jax.commands.report import render_report
 from thincam_jax.commands.run_folder import RunFolder
-from thincam_jax.commands.study import report
 from thincam_jax.commands.study import run as running
 from thincam_jax.commands.study.build import build_study
 from thincam_jax.commands.study.config import load_config
-from thincam_jax.commands.study.run import findings, run_study
+from thincam_jax.commands.study.run import page, run_study
 from thincam_jax.studies import (
     Limits,
     MethodScores,
@@ -36,6 +35,7 @@ from thincam_jax.studies import (
     method_response,
     take,
 )
+from thincam_jax.studies.result import findings
 
 EVIL = "<script>alert(1)</script> & \"quoted\" <img src='http://example.org/x.png'>"
 
@@ -334,7 +334,7 @@ def run(whole, tmp_path):
 
 def rendered(config, folder, scores):
     """The page made anew."""
-    shown = report.page(config, scores, ["A finding."])
+    shown = page(config, scores, ["A finding."])
     return render_report(shown, config, folder.path / "figures", environment())
 
 

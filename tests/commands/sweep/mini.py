@@ -7,8 +7,7 @@ from pathlib import Path
 
 from thincam_jax.commands.study.config import StudyConfig, load_config
 from thincam_jax.commands.sweep.grid import Axis, read_axes
-from thincam_jax.commands.sweep.measure import Outcome
-from thincam_jax.commands.sweep.point import GridPoint, make_points
+from thincam_jax.commands.sweep.point import GridPoint, Outcome, make_points
 
 TEXT = """\
 name: mini

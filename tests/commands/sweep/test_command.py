@@ -10,7 +10,7 @@ from commands.sweep import mini
 from commands.test_cli import call, one_line
 
 from helpers import ROOT
-from thincam_jax.commands.sweep import command, run, scheduler
+from thincam_jax.commands.sweep import command, run, workers
 from thincam_jax.commands.sweep.run import Swept
 
 
@@ -130,7 +130,7 @@ class TestExitCode2:
             assert part in one_line(call("sweep", file, "--grid", "seed=1", "--out", path))
 
     def test_scheduler_that_does_not_answer(self, file, tmp_path, monkeypatch):
-        monkeypatch.setattr(scheduler, "_CONNECT_SECONDS", 0.5)
+        monkeypatch.setattr(workers, "_CONNECT_SECONDS", 0.5)
         options = ("--grid", "seed=1", "--scheduler", "tcp://127.0.0.1:1")
         line = one_line(call("sweep", file, *options, "--out", tmp_path / "out"))
         assert line.startswith("--scheduler tcp://127.0.0.1:1: no scheduler answers there; ")

@@ -8,8 +8,8 @@ from commands.sweep import mini
 
 from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.study.config import load_config
-from thincam_jax.commands.sweep.folder import SweepFolder
-from thincam_jax.commands.sweep.measure import Outcome
+from thincam_jax.commands.sweep.point import Outcome
+from thincam_jax.commands.sweep.run import SweepFolder
 
 
 @pytest.fixture

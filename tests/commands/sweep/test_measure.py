@@ -8,7 +8,7 @@ from commands.study import tiny
 from commands.sweep import mini
 
 from thincam_jax.commands.study.build import build_study
-from thincam_jax.commands.sweep.measure import measure_point
+from thincam_jax.commands.sweep.point import measure_point
 
 
 def test_columns_are_the_metrics_of_a_run(tmp_path):
@@ -77,7 +77,7 @@ def test_defect_is_a_reason_with_its_traceback(tmp_path, monkeypatch):
     def broken(_):
         raise ZeroDivisionError("a\n  defect")
 
-    monkeypatch.setattr("thincam_jax.commands.sweep.measure.build_study", broken)
+    monkeypatch.setattr("thincam_jax.commands.sweep.point.build_study", broken)
     (point,) = mini.points(mini.study(tmp_path), "seed=1")
     measured = measure_point(point.config, False)
     assert measured.reason == "ZeroDivisionError: a"

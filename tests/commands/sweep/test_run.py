@@ -18,9 +18,8 @@ from commands.test_cli import call
 
 from helpers import ROOT
 from thincam_jax.commands.sweep import run
-from thincam_jax.commands.sweep.folder import SweepFolder
-from thincam_jax.commands.sweep.measure import Outcome
-from thincam_jax.commands.sweep.run import run_sweep
+from thincam_jax.commands.sweep.point import Outcome
+from thincam_jax.commands.sweep.run import SweepFolder, run_sweep
 from thincam_jax.commands.sweep.workers import Died
 
 

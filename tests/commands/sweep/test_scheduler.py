@@ -7,8 +7,8 @@ import distributed
 import pytest
 
 from thincam_jax.commands.config_file import ConfigError
-from thincam_jax.commands.sweep import scheduler as schedulers
-from thincam_jax.commands.sweep.scheduler import scheduled_workers
+from thincam_jax.commands.sweep import workers as schedulers
+from thincam_jax.commands.sweep.workers import scheduled_workers
 
 
 def fault(address):

@@ -4,7 +4,8 @@ import pyarrow as pa
 import pytest
 import skimage.io
 
-from thincam_jax.commands.sweep.summary import _drawn, summarise
+from thincam_jax.commands.sweep.run import summarise
+from thincam_jax.plot.sweep import draw_sweep
 
 AXES = ["methods.0.shots.0.beta", "model"]
 COLUMN = "mean_psnr_db/single"
@@ -25,7 +26,7 @@ def test_best_point_and_picture(tmp_path):
 
 
 def test_lines_of_each_axis_and_a_map_of_two():
-    first, second, around, *_ = _drawn(rows(), AXES, {"single": COLUMN}).axes
+    first, second, around, *_ = draw_sweep(rows(), AXES, {"single": COLUMN}).axes
     (line, *_), *_ = first.containers
     assert line.get_xydata().tolist() == [[15, 20.5], [20, 23], [25, 23]]
     assert first.get_xlabel() == "methods.0.shots.0.beta (rad/mm²)"
@@ -37,7 +38,10 @@ def test_lines_of_each_axis_and_a_map_of_two():
 def test_no_map_of_a_method_that_an_axis_does_not_change():
     table = [row | {"mean_psnr_db/same": 10.0 + ord(row["model"])} for row in rows()]
     methods = {"single": COLUMN, "same": "mean_psnr_db/same"}
-    assert [ax.get_title("left") for ax in _drawn(table, AXES, methods).axes[2:4]] == ["single", ""]
+    assert [ax.get_title("left") for ax in draw_sweep(table, AXES, methods).axes[2:4]] == [
+        "single",
+        "",
+    ]
 
 
 @pytest.mark.parametrize("table", [{"seed": [1]}, {"seed": [1], COLUMN: [None]}])

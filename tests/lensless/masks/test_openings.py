@@ -81,6 +81,8 @@ def test_a_lens_focuses():
 
 def test_random_cells():
     mask = tc.random_cells(jax.random.key(0), 1.2, 0.03, height=0.6, open_fraction=0.3)
+    same = tc.random_cells(0, 1.2, 0.03, height=0.6, open_fraction=0.3)
+    assert (same.amplitude == mask.amplitude).all()
     assert mask.amplitude.shape == (20, 40)
     assert abs(float(mask.amplitude.mean()) - 0.3) < 0.06
     # In single precision 12000 cells of 0.1 µm are some 1e-8 mm off.

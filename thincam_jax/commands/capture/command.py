@@ -235,7 +235,7 @@ def opened(config: "CaptureConfig") -> Iterator[Any]:
 
 def virtual_rig(config: "CaptureConfig") -> Any:
     """The state and the optics that the virtual devices of a file share."""
-    from thincam_jax.commands.capture.build import build_study, screen_system
+    from thincam_jax.commands.capture.run import build_study, screen_system
     from thincam_jax.hardware.virtual.optics import ModulatorOptics, MonitorOptics
     from thincam_jax.hardware.virtual.rig import Electronics, VirtualRig
     from thincam_jax.imaging.scene import Scene
@@ -270,9 +270,10 @@ def _taken(store: Path, config: "CaptureConfig") -> Any:
     import json
 
     from thincam_jax._core.files import read_regular
-    from thincam_jax.commands.capture.run import Simulated, Taken
+    from thincam_jax.commands.capture.run import Taken
     from thincam_jax.hardware.acquisition.read import read_acquisition
     from thincam_jax.hardware.virtual.rig import Electronics
+    from thincam_jax.studies.rig import CountingCamera
 
     found = read_acquisition(store)
     hadamard = None
@@ -296,7 +297,7 @@ def _taken(store: Path, config: "CaptureConfig") -> Any:
         electronics = Electronics(virtual.full_well, virtual.read_noise, virtual.offset)
         electron, offset = electronics.scale(found.settings[0])
         counts = electron * found.settings[0].exposure * virtual.electrons
-        simulated = Simulated(counts, electron, virtual.read_noise, 0.0 if darks else offset)
+        simulated = CountingCamera(counts, electron, virtual.read_noise, 0.0 if darks else offset)
     region = found.settings[0].region
     rows, columns = found.sensor_shape
     top, left = (0, 0) if region is None else (region.top, region.left)

@@ -1,50 +1,47 @@
 """What `thincam run` makes of a store of captures: an image or a system matrix, and a report."""
 
-import math
-import shutil
-import time
+import itertools
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
 
-from thincam_jax._core.grids import Grid
-from thincam_jax.commands.capture import figures, report
-from thincam_jax.commands.capture.build import build_study, field_shape, screen_system
+from thincam_jax._core.table import Table
 from thincam_jax.commands.capture.config import CaptureConfig
+from thincam_jax.commands.config_file import ConfigError
+from thincam_jax.commands.report import Page, Part, Picture
 from thincam_jax.commands.run_folder import Progress, Run, RunFolder
-from thincam_jax.commands.screen.figures import draw_columns
-from thincam_jax.commands.study.figures import save_figure
-from thincam_jax.imaging.metrics import psnr
-from thincam_jax.imaging.operators import ReducedMatrix
+from thincam_jax.commands.screen.run import build_cameras, build_plane
+from thincam_jax.commands.sections import PHASES, MaskConfig, SensorConfig
+from thincam_jax.commands.study.build import FileStudy, build_optics, build_solver, read_targets
+from thincam_jax.imaging.operators import Sparse
+from thincam_jax.imaging.scene import ImagePlane
+from thincam_jax.lensless.exposures import Exposures
 from thincam_jax.measured import calibration
-from thincam_jax.reconstruction import Reconstruction
-from thincam_jax.reconstruction.noise import estimate_noise
-from thincam_jax.studies.evaluate import Reconstructor, reconstructor, rounded, sample
-from thincam_jax.studies.screen_calibration import diagonal_cells
-from thincam_jax.studies.simulate import noise_free
-from thincam_jax.studies.study import Study
+from thincam_jax.plot import rig as plot
+from thincam_jax.plot.screen import draw_columns
+from thincam_jax.studies.rig import (
+    CountingCamera,
+    FrameAgreement,
+    MatrixAgreement,
+    Pixels,
+    RigFrames,
+    compare_frames,
+    frame_solver,
+    monitor_system,
+    recover_to,
+)
+from thincam_jax.studies.study import Method, Synthesis
 
-
-@dataclass(frozen=True)
-class Simulated:
-    """What a virtual rig's camera does with light, to hold its frames against direct simulation.
-
-    - `counts`: of a unit of the noise-free image; `electron`: counts of an electron.
-    - `read_noise`: in electrons; `offset`: counts that were not subtracted.
-    """
-
-    counts: float
-    electron: float
-    read_noise: float
-    offset: float
-
-    def variance(self, counts: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
-        """Of a frame whose noise-free counts, without the offset, are given."""
-        return self.electron * counts + (self.electron * self.read_noise) ** 2 + 1 / 12
+_MATRIX = (
+    "The matrix is in matrix.zarr; a capture of another picture, less the dark frame, is "
+    "reconstructed with it by "
+    '`tc.reconstruct(tc.Recording(capture, read_matrix("matrix.zarr")), tc.AdmmTV())`, '
+    "read_matrix from thincam_jax.measured.calibration. For many captures, its reduced form is in "
+    "reduced.npz, read by `ReducedMatrix.load`."
+)
+_FIDUCIAL = (12, 8)  # pixels of a fiducial, which see no light
 
 
 @dataclass(frozen=True)
@@ -60,9 +57,9 @@ class Taken:
     frames: np.ndarray
     labels: list[str]
     shown: list[np.ndarray]
-    pixels: tuple[slice, slice]
+    pixels: Pixels
     seconds: Mapping[str, float] = field(default_factory=dict)
-    simulated: Simulated | None = None
+    simulated: CountingCamera | None = None
     dark_frames: int = 0
     hadamard: calibration.HadamardCaptures | None = None
 
@@ -82,8 +79,8 @@ class _CaptureRun(Run):
 
     def __init__(self, config: CaptureConfig, taken: Taken, folder: RunFolder):
         super().__init__(config, folder)
-        self.taken = taken
-        self._reconstructor: Reconstructor | None = None
+        self.taken, self.lit = taken, _lit(config, taken.frames.shape[1:])
+        self.agreement: FrameAgreement | MatrixAgreement | None = None
         self.metrics |= {
             "study": config.name,
             "kind": config.kind,
@@ -99,124 +96,166 @@ class _CaptureRun(Run):
         self.add("report", self.report)
 
     def report(self) -> None:
-        self.complete(report.page(self.config, self.metrics))
+        if self.agreement is not None:
+            self.metrics["agreement"] = asdict(self.agreement)
+        self.complete(page(self.config, self.taken, self.agreement))
 
     def show(self) -> None:
-        figures.save_frames(self.folder, self.config, self.taken.frames, self.taken.labels)
-        figures.save_shown(self.folder, self.config, self.taken.shown, self.taken.labels)
-        if self.taken.seconds:
-            figures.save_seconds(self.folder, self.taken.seconds)
+        taken, config, folder = self.taken, self.config, self.folder
+        frames = plot.draw_frames(taken.frames, taken.labels, config.camera.pitch, self.lit)
+        folder.save_figure("frames", frames)
+        shown = plot.draw_patterns(taken.shown, taken.labels, config.display.pitch)
+        folder.save_figure("shown", shown)
+        if taken.seconds:
+            folder.save_figure("seconds", plot.draw_seconds(taken.seconds))
 
     def reconstruct(self) -> None:
-        frames = self.taken.frames
-        study = build_study(self.config, (frames.shape[1], frames.shape[2]))
-        captured = self._image(study, frames)
-        images = {"captured": captured}
-        if self.taken.simulated is not None:
-            images = self._compare(study, captured)
-        figures.save_images(self.folder, images, self.metrics.get("psnr_db", {}))
+        taken, config = self.taken, self.config
+        study = build_study(config, (taken.frames.shape[1], taken.frames.shape[2]))
+        solve = frame_solver(study, field_shape(config, study.methods[0]))
+        captured = solve(taken.frames)
+        images, scores = {"captured": captured}, {}
+        if taken.simulated is not None and config.virtual is not None:
+            whole = build_study(config, config.virtual.sensor)
+            seen = taken.frames, taken.simulated, taken.pixels, self.lit, taken.dark_frames
+            found = compare_frames(whole, RigFrames(*seen), solve, captured, config.seed)
+            images, scores, self.agreement = found.images, found.psnr_db, found.agreement
+            self.metrics["psnr_db"] = scores
+        self.folder.save_figure("images", plot.draw_images(images, scores))
+        for name, one in images.items():
+            image = plot.stretched(np.squeeze(np.asarray(one.image, float)))
+            self.folder.save_image(name.replace(" ", "-"), image)
         self.metrics["status"] = captured.status
         self.metrics["object_pixel_mm"] = float(np.asarray(captured.pitch))
 
-    def _image(self, study: Study, frames: np.ndarray) -> Reconstruction:
-        if self._reconstructor is None:
-            method, seen = study.methods[0], study.object_distance
-            shape = field_shape(self.config, method)
-            self._reconstructor = reconstructor(study, method, shape, seen)
-        captures = jnp.asarray(frames[:, None], jnp.float32)
-        return self._reconstructor(captures, estimate_noise(captures) ** 2)
-
-    def _compare(self, study: Study, captured: Reconstruction) -> dict[str, Reconstruction]:
-        """Frames and image against direct simulation, by another model than the virtual rig's."""
-        camera, virtual, target = self.taken.simulated, self.config.virtual, study.targets[0]
-        assert camera is not None and virtual is not None
-        whole, part = build_study(self.config, virtual.sensor), self.taken.pixels
-        clean = camera.counts * np.stack(
-            [
-                np.asarray(noise_free(whole, exposure, target.plane))[part]
-                for exposure in whole.methods[0].exposures
-            ]
-        )
-        variance, dark = camera.variance(clean), np.zeros(clean.shape[1:])
-        if self.taken.dark_frames:
-            dark = camera.variance(dark) / self.taken.dark_frames
-        residual = (self.taken.frames - clean - camera.offset) / np.sqrt(variance + dark)
-        of_each = residual[:, figures.without_fiducial(self.config, dark.shape)]
-        random = np.random.default_rng(self.config.seed + 1)
-
-        def simulated(noise: float) -> Reconstruction:
-            frames = np.sqrt(variance) * random.standard_normal(clean.shape)
-            frames += np.sqrt(dark) * random.standard_normal(dark.shape)  # the same in all
-            frames = noise * frames + clean + camera.offset
-            return self._image(study, frames.astype(np.float32))
-
-        images = {"captured": captured}
-        images |= {"simulated": simulated(1.0), "without noise": simulated(0.0)}
-        pixels = {name: np.squeeze(np.asarray(one.image, float)) for name, one in images.items()}
-        grid = Grid(pixels["captured"].shape, jnp.asarray(captured.pitch))
-        truth = np.asarray(sample(target.plane, grid), float)
-        scores = {name: psnr(image, truth) for name, image in pixels.items()}
-        self.metrics["psnr_db"] = {name: rounded(score) for name, score in scores.items()}
-        noise = [np.std(pixels[n] - pixels["without noise"]) for n in ("captured", "simulated")]
-        self.metrics["agreement"] = {
-            "frame_residual_over_noise": [round(float(np.std(z)), 4) for z in of_each],
-            "frame_bias_over_noise": [round(float(np.mean(z)), 4) for z in of_each],
-            "image_noise_over_simulated": round(float(noise[0] / noise[1]), 4),
-        }
-        return images
-
     def recover(self) -> None:
-        """The matrix into a store, block by block, and what it is reduced to beside it.
-
-        Of a virtual rig: compared with the exact one.
-        """
-        captures = self.taken.hadamard
+        """The matrix into a store, and what it is reduced to; compared where it is known."""
+        taken, exact = self.taken, None
+        captures = taken.hadamard
         assert captures is not None
-        path = self.folder.path / "matrix.zarr"
-        shutil.rmtree(path, ignore_errors=True)  # of an interrupted run
-        began = time.perf_counter()
-        calibration.write_matrix(captures, path)
-        matrix = calibration.open_matrix(path)
-        reduced = ReducedMatrix.of(matrix, captures.series.object_shape)
-        reduced.save(self.folder.path / "reduced.npz", matrix)
-        cells = diagonal_cells(captures.series.object_shape)
-        numbers = [row * captures.series.object_shape[1] + column for row, column in cells]
-        columns = np.empty((len(cells), math.prod(captures.sensor_shape)), np.float32)
-        exact = self._exact() if self.taken.simulated is not None else None
-        total, count = 0.0, 0
-        for pixels, block in calibration.stored_blocks(path):
-            columns[:, pixels] = block[:, numbers].T
-            if exact is not None:
-                matrix, deviation = exact
-                left = (block - matrix[pixels].toarray()) / deviation[pixels, None]
-                # The first column takes the offset and the white frame: it is told by the others.
-                total += float(np.sum(left[:, 1:] ** 2, dtype=np.float64))
-                count += left[:, 1:].size
-        images = {"measured": columns}
-        if exact is not None:
-            images["exact"] = np.asarray(exact[0][:, numbers].toarray(), np.float32).T
-            self.metrics["agreement"] = {
-                "matrix_residual_over_noise": round(math.sqrt(total / count), 4),
-                "largest_counts": round(float(abs(exact[0]).max()), 3),
-                "noise_counts": round(float(np.sqrt(np.mean(exact[1] ** 2))), 4),
-            }
-        shape = (len(cells), *captures.sensor_shape)
-        stacks = {name: image.reshape(shape) for name, image in images.items()}
-        save_figure(self.folder, "columns", draw_columns(self.config.camera.pitch, cells, stacks))
+        if taken.simulated is not None:
+            exact = screen_system(self.config), taken.simulated, taken.pixels
+        found = recover_to(self.folder.path, captures, exact)
+        figure = draw_columns(self.config.camera.pitch, found.cells, found.columns)
+        self.folder.save_figure("columns", figure)
+        self.agreement = found.agreement
         self.metrics |= {
             "frames": captures.series.frame_count,
-            "matrix": [math.prod(captures.sensor_shape), captures.series.cell_count],
-            "matrix_seconds": round(time.perf_counter() - began, 2),
+            "matrix": list(found.shape),
+            "matrix_seconds": found.seconds,
         }
 
-    def _exact(self) -> tuple[Any, np.ndarray]:
-        """The matrix of direct simulation in counts, and the noise of each pixel's entries."""
-        camera, captures = self.taken.simulated, self.taken.hadamard
-        assert camera is not None and captures is not None
-        system = screen_system(self.config)
-        numbers = np.arange(math.prod(system.out_shape)).reshape(system.out_shape)
-        matrix = camera.counts * system.by_rows()[numbers[self.taken.pixels].ravel()]
-        mean = np.asarray(matrix.sum(axis=1), float).ravel() / 2  # half of the cells are lit
-        of_an_entry = 2 if captures.series.display == "complementary" else 4
-        variance = of_an_entry * camera.variance(mean) / captures.series.cell_count
-        return matrix, np.sqrt(variance)
+
+def _lit(config: CaptureConfig, shape: tuple[int, ...]) -> np.ndarray:
+    """Where frames show light."""
+    inside = np.ones(shape, bool)
+    if config.rig == "virtual" and config.virtual is not None and config.virtual.fiducial:
+        inside[: _FIDUCIAL[0], : _FIDUCIAL[1]] = False
+    return inside
+
+
+def build_study(config: CaptureConfig, shape: tuple[int, int]) -> FileStudy:
+    """The cameras of a lensless plan, for frames of a shape, with the one method of its file.
+
+    **Errors**: ConfigError for a picture that cannot be read.
+    """
+    plan, optics, display = config.plan, config.optics, config.display
+    assert optics is not None and plan.width is not None  # of lensless plans
+    synthesis: Synthesis = "phase_pairs" if plan.kind == "method_b" else "fringe_scanning"
+    if plan.kind == "psf_stack":
+        synthesis = "separate"
+    phases = PHASES.get(synthesis, (plan.phase,))
+    distances = plan.distances if plan.kind == "method_a" else (optics.distance,)
+    settings = list(itertools.product(distances, plan.betas))
+    exposures = Exposures(
+        [beta for _, beta in settings],
+        [distance for distance, _ in settings],
+        wavelength=optics.wavelength,
+        width=plan.width,
+    ).at_phases(phases)
+    solver = build_solver(config.reconstruction.kind, config.reconstruction.variation)
+    targets, unread = read_targets(config.targets, optics.object.distance, optics.object.width)
+    if unread:
+        raise ConfigError(f"{config.place_of('targets', 0)}targets[0]: {unread[0]}")
+    # One light: colours are averaged.
+    grey = [
+        replace(t, plane=ImagePlane(t.plane.image.mean(axis=0), t.distance, t.width))
+        for t in targets
+    ]
+    mask = MaskConfig(
+        width=f"{plan.width!r} mm",  # pyright: ignore[reportArgumentType]
+        profile=plan.profile,
+        pixel_pitch=f"{display.pitch!r} mm",  # pyright: ignore[reportArgumentType]
+        fill_factor=display.fill_factor,
+    )
+    pitch = f"{config.camera.pitch!r} mm"
+    sensor = SensorConfig(shape=shape, pitch=pitch)  # pyright: ignore[reportArgumentType]
+    return FileStudy(
+        *build_optics(mask, sensor, exposures[0]),
+        (Method(plan.kind, exposures, solver, synthesis, len(phases)),),
+        tuple(grey),
+        object_distance=optics.object.distance,
+        model=optics.model,
+        pixel_integration=optics.pixel_integration,
+        config=optics,
+    )
+
+
+def field_shape(config: CaptureConfig, method: Method) -> tuple[int, int]:
+    """Pixels of a reconstruction: the square that `optics.object` covers, on the sensor's scale."""
+    assert config.optics is not None
+    seen = config.optics.object
+    side = max(1, round(seen.width * method.distance / seen.distance / config.camera.pitch))
+    return side, side
+
+
+def screen_system(config: CaptureConfig) -> Sparse:
+    """From the cells of a virtual rig to its sensor: 1 where a white monitor is brightest."""
+    assert config.virtual is not None and config.virtual.screen is not None
+    seen = config.virtual.screen
+    plane, (camera,) = build_plane(seen), build_cameras(seen)
+    try:
+        return monitor_system(camera, plane, seen.orders, seen.band_samples)
+    except ValueError as error:
+        place = config.place_of("virtual", "screen")
+        raise ConfigError(f"{place}virtual.screen: {error}") from None
+
+
+def page(
+    config: CaptureConfig, taken: Taken, agreement: FrameAgreement | MatrixAgreement | None
+) -> Page:
+    """The page of a finished run."""
+    beside = ", beside that of a direct simulation with other noise, and without"
+    seen = "What the sensor sees of single cells (row, column)"
+    seen += ": measured, and by direct simulation. " if agreement else ". "
+    devices = [f"display {config.display.driver}"]
+    devices += [f"stage {config.stage.driver}"] if config.stage else []
+    lead = (
+        f"Plan {config.plan.kind.replace('_', ' ')} on a {config.rig} rig: camera "
+        f"{config.camera.driver}, exposure {1000 * config.camera.exposure:g} ms; "
+        f"{'; '.join(devices)}.",
+        Picture(
+            "images.png",
+            "Reconstructions",
+            f"The image reconstructed{beside if agreement else ''}.",
+        ),
+        Picture("columns.png", "Columns of the system matrix", seen + _MATRIX),
+        Picture("shown.png", "Patterns shown", "What the display showed."),
+        Picture("frames.png", "Frames taken", "What the camera took, without the dark frame."),
+    )
+    found = {} if agreement is None else asdict(agreement)
+    rows = [(name.replace("_", " "), _numbers(value)) for name, value in found.items()]
+    time = Picture("seconds.png", "Time of the steps", "Time of all frames, by step.")
+    explained = (
+        "Differences over the standard deviation that the noise has: 1 is agreement within the "
+        "noise."
+    )
+    compared = Part("Beside direct simulation", (Table(("number", "found"), rows), explained))
+    parts = [compared] if rows else []
+    parts += [Part("Time", (time,))] if taken.seconds else []
+    parts += [Part("Notes", config.notes)] if config.notes else []
+    return Page(lead, parts)
+
+
+def _numbers(value: Any) -> str:
+    return ", ".join(str(v) for v in value) if isinstance(value, list) else str(value)

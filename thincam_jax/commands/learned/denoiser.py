@@ -1,21 +1,23 @@
 """Experiment files of `kind: denoiser`: pictures, a network and its training in a folder."""
 
 from collections.abc import Callable
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
-import jax
 import numpy as np
 import pydantic
 from pydantic import Field
 
 from thincam_jax.commands.config_file import ConfigError
-from thincam_jax.commands.learned.build import build_options, read_sources
 from thincam_jax.commands.learned.config import Count, SourceConfig, Widths, check_sources
-from thincam_jax.commands.learned.figures import draw_losses
-from thincam_jax.commands.learned.run import TrainingFolder, check_resume
+from thincam_jax.commands.learned.run import (
+    Ended,
+    TrainingFolder,
+    build_options,
+    check_resume,
+    read_sources,
+)
 from thincam_jax.commands.run_folder import to_json
 from thincam_jax.commands.sections import ExperimentConfig, Section, misfit
-from thincam_jax.commands.study.figures import save_figure
 from thincam_jax.learn.checkpoint import CheckpointError
 from thincam_jax.learn.denoiser.network import DenoiserOptions, create, load_network
 from thincam_jax.learn.denoiser.pictures import Pictures, drawn, photographs, samples, split, united
@@ -23,6 +25,7 @@ from thincam_jax.learn.denoiser.train import NETWORK, STATE, DenoisingLessons, t
 from thincam_jax.learn.denoiser.unet import DenoisingUNet
 from thincam_jax.learn.refocusing.unet import parameter_count
 from thincam_jax.learn.training import TrainingProgress
+from thincam_jax.plot.learned import draw_losses
 
 Blocks = Annotated[tuple[Annotated[int, Field(ge=0, le=64)], ...], Field(min_length=1)]
 
@@ -79,8 +82,8 @@ def run_denoiser(
     callback: Callable[[TrainingProgress], object],
     *,
     resume: bool = False,
-) -> dict[str, Any]:
-    """Train a denoiser; returns, and writes, what goes into training.json.
+) -> Ended:
+    """Train a denoiser; writes training.json last.
 
     `resume` and errors as of `run_training`.
     """
@@ -104,9 +107,10 @@ def run_denoiser(
         "images": lessons.manifest()["images"],
         "network": NETWORK,
     }
-    save_figure(folder, "loss", draw_losses(state, config.training.check_every))
+    folder.save_figure("loss", draw_losses(state, config.training.check_every))
     folder.write(folder.result, to_json(result))
-    return result
+    line = f"{trained.status}: loss {result['loss']:.4f} on pictures held out"
+    return Ended(line, folder.path / NETWORK)
 
 
 def build_network(config: DenoiserConfig) -> DenoisingUNet:
@@ -116,7 +120,7 @@ def build_network(config: DenoiserConfig) -> DenoisingUNet:
     """
     options = DenoiserOptions(**dict(config.network))
     if config.start is None:
-        return create(options, key=jax.random.key(config.seed))
+        return create(options, key=config.seed)
     try:
         network = load_network(config.start)
     except FileNotFoundError:

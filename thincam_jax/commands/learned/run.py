@@ -1,32 +1,38 @@
-"""Training a refocusing network in a folder, and a report of what it gives."""
+"""Training a refocusing network: from the file to its lessons, into a folder with a report."""
 
+import dataclasses
+import functools
+import operator
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import replace
-from typing import Any
-
-import jax
-import jax.numpy as jnp
-import numpy as np
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, TypeVar
 
 from thincam_jax.commands.config_file import ConfigError
-from thincam_jax.commands.learned import figures, report
-from thincam_jax.commands.learned.build import build_lessons, build_network, build_options
-from thincam_jax.commands.learned.config import LearnedConfig
-from thincam_jax.commands.refocus.figures import animate_sweep, draw_sweep
+from thincam_jax.commands.learned.config import LearnedConfig, SourceConfig
+from thincam_jax.commands.report import Page, Part, Picture, pixels_of
 from thincam_jax.commands.run_folder import RunFolder
-from thincam_jax.commands.study.figures import save_figure
-from thincam_jax.imaging.metrics import psnr, ssim
 from thincam_jax.learn.checkpoint import CheckpointError
-from thincam_jax.learn.refocusing.network import RefocusNetwork
-from thincam_jax.learn.refocusing.scenes import Batch
+from thincam_jax.learn.refocusing.cameras import RefocusCamera
+from thincam_jax.learn.refocusing.network import NetworkOptions, RefocusNetwork
+from thincam_jax.learn.refocusing.result import RefocusTraining, finite, judge_training
+from thincam_jax.learn.refocusing.scenes import SceneOptions
+from thincam_jax.learn.refocusing.sources import Source, drawn, photographs, samples
 from thincam_jax.learn.refocusing.train import NETWORK, STATE, Lessons, train
 from thincam_jax.learn.refocusing.unet import parameter_count
-from thincam_jax.learn.refocusing.use import Reading, read
-from thincam_jax.learn.training import Trained, TrainingProgress
-from thincam_jax.reconstruction.depth.refocus import RefocusSweep, refocus_distances
+from thincam_jax.learn.training import TrainingOptions, TrainingProgress
+from thincam_jax.lensless.camera import LenslessCamera
+from thincam_jax.lensless.masks.fza import FresnelZoneAperture
+from thincam_jax.plot import learned as plot
+from thincam_jax.plot.refocus import animate_sweep, draw_sweep
 
-_SWEPT = 15  # distances of the report's sweep
+Found = TypeVar("Found")
+
+_SWEEP = "One capture, focused on the distance above each; one grey scale for all."
+_SCENES = (
+    "Where it is hatched, the network itself takes its distance to be wrong more often than right."
+)
 
 
 class TrainingFolder(RunFolder):
@@ -41,14 +47,23 @@ class TrainingFolder(RunFolder):
     kind, folders, result = "training", ("figures",), "training.json"
 
 
+@dataclass(frozen=True)
+class Ended:
+    """How a training ended, in a line; the files of its network and its page."""
+
+    line: str
+    network: Path
+    page: Path | None = None
+
+
 def run_training(
     config: LearnedConfig,
     folder: TrainingFolder,
     callback: Callable[[TrainingProgress], object],
     *,
     resume: bool = False,
-) -> dict[str, Any]:
-    """Train and report; returns (and writes) what goes into training.json.
+) -> Ended:
+    """Train and report; writes training.json last.
 
     `resume`: go on from the state in the folder, to the same bits as without the interruption.
 
@@ -57,14 +72,39 @@ def run_training(
     """
     started = time.time()
     check_resume(folder, STATE.format(1), resume)
-    network, lessons = build_network(config), build_lessons(config)
+    untrained, lessons = build_network(config), build_lessons(config)
     folder.claim(config)
     try:
         options = build_options(config)
-        trained = train(network, lessons, options, folder=folder.path, callback=callback)
+        trained = train(untrained, lessons, options, folder=folder.path, callback=callback)
     except CheckpointError as error:
         raise ConfigError(str(error)) from None
-    return _report(config, folder, lessons, network, trained, started)
+    result = judge_training(trained, untrained, lessons.validation(trained.model, config.seed))
+    state = trained.state
+    metrics = {
+        "name": config.name,
+        "kind": config.kind,
+        "seed": config.seed,
+        "status": trained.status,
+        **state.counts,
+        "losses": [finite(loss) for loss in state.losses],
+        "scores": [finite(score) for score in state.scores],
+        "learned_numbers": parameter_count(result.network.weights),
+        "linear": asdict(result.linear),
+        "trained": asdict(result.scores),
+        "images": lessons.manifest()["images"],
+        "network": NETWORK,
+    }
+    folder.save_figure("loss", plot.draw_losses(state, config.training.check_every))
+    folder.save_figure("scenes", plot.draw_scenes(result.network, result.batch, result.reading))
+    sweep = result.sweep()
+    folder.save_figure("sweep", draw_sweep(sweep))
+    folder.write("figures/sweep.webp", animate_sweep(sweep))
+    folder.complete(page(config, lessons, result), config, metrics, started)
+    after, before = result.scores.focus_psnr_db, result.linear.focus_psnr_db
+    line = f"focused images have {after:.2f} dB, the linear start {before:.2f} dB"
+    path = folder.path
+    return Ended(f"{trained.status}: {line}", path / NETWORK, path / "report.html")
 
 
 def check_resume(folder: TrainingFolder, name: str, resume: bool) -> None:
@@ -80,74 +120,113 @@ def check_resume(folder: TrainingFolder, name: str, resume: bool) -> None:
         raise ConfigError(f"--resume: {folder.path} holds no training yet; leave it out")
 
 
-def _report(
-    config: LearnedConfig,
-    folder: TrainingFolder,
-    lessons: Lessons,
-    untrained: RefocusNetwork,
-    trained: Trained,
-    started: float,
-) -> dict[str, Any]:
-    network, state = trained.model, trained.state
-    batches = lessons.validation(network, config.seed)
-    linear, readings = ([read_batch(n, b) for b in batches] for n in (untrained, network))
-    result = {
-        "name": config.name,
-        "kind": config.kind,
-        "seed": config.seed,
-        "status": trained.status,
-        **state.counts,
-        "losses": [_rounded(loss) for loss in state.losses],
-        "scores": [_rounded(score) for score in state.scores],
-        "learned_numbers": parameter_count(network.weights),
-        "linear": score(linear, batches),
-        "trained": score(readings, batches),
-        "images": lessons.manifest()["images"],
-        "network": NETWORK,
-    }
-    save_figure(folder, "loss", figures.draw_losses(state, config.training.check_every))
-    save_figure(folder, "scenes", figures.draw_scenes(network, batches[0], readings[0]))
-    sweep = swept(network, batches[0])
-    save_figure(folder, "sweep", draw_sweep(sweep, {}))
-    folder.write("figures/sweep.webp", animate_sweep(sweep))
-    folder.complete(report.page(config, result), config, result, started)
-    return result
+def build_camera(config: LearnedConfig) -> RefocusCamera:
+    """**Errors**: ConfigError, one line, for numbers that do not make a camera."""
+    mask = {name: value for name, value in dict(config.mask).items() if name != "beta"}
+    focus = config.focus
+    try:
+        aperture = FresnelZoneAperture(config.mask.beta, **mask)
+        camera = LenslessCamera(aperture, config.sensor.build(), config.distance)
+        return RefocusCamera(
+            camera,
+            config.wavelength,
+            field_shape=focus.shape,
+            near=focus.nearest,
+            far=focus.farthest,
+            planes=focus.planes,
+            pupil=focus.pupil,
+            model=config.model,
+        )
+    except (ValueError, TypeError) as error:
+        raise ConfigError(f"mask, sensor or focus: {error}") from None
 
 
-def read_batch(network: RefocusNetwork, batch: Batch) -> Reading:
-    """Each capture of a batch, focused on the distance that is commanded for it."""
-    return read(network, batch.capture, batch.commanded[:, None], batch.deviation)
+def build_network(config: LearnedConfig) -> RefocusNetwork:
+    """Untrained, by the seed of the file."""
+    options = NetworkOptions(**dict(config.network))
+    return RefocusNetwork.create(build_camera(config), options, key=config.seed)
 
 
-def score(readings: Sequence[Reading], batches: Sequence[Batch]) -> dict[str, Any]:
-    """Mean PSNR and SSIM of focused images and of those sharp everywhere, and the consistency."""
-    found: dict[str, list[float]] = {}
-    for reading, batch in zip(readings, batches, strict=True):
-        pairs = {
-            "focus": (reading.images[:, 0], batch.image),
-            "all_in_focus": (reading.all_in_focus, batch.all_in_focus),
-        }
-        for name, (images, truths) in pairs.items():
-            for image, truth in zip(np.asarray(images), np.asarray(truths), strict=True):
-                arrays = image.astype(float), truth.astype(float)
-                found.setdefault(f"{name}_psnr_db", []).append(float(psnr(*arrays)))
-                found.setdefault(f"{name}_ssim", []).append(float(ssim(*arrays)))
-        found.setdefault("consistency", []).extend(np.asarray(reading.consistency).tolist())
-    return {name: _rounded(np.mean(values)) for name, values in found.items()}
+def build_lessons(config: LearnedConfig) -> Lessons:
+    """**Errors**: ConfigError, one line for each source that cannot be read."""
+    of_use: dict[str, list[Source]] = {"train": [], "judge": []}
+    images = read_sources(config, functools.partial(_read, side=config.scenes.side))
+    for source, read in zip(config.sources, images, strict=True):
+        of_use[source.use].append(read)
+    train, judge = (functools.reduce(operator.add, s) if s else None for s in of_use.values())
+    assert train is not None  # the sections are checked
+    scenes = {name: value for name, value in dict(config.scenes).items() if name != "side"}
+    told = {name: getattr(config.training, name) for name in ("batch", "pool", "judged")}
+    return Lessons(train, SceneOptions(**scenes), held_out=judge, **told)
 
 
-def swept(network: RefocusNetwork, batch: Batch) -> RefocusSweep:
-    """The first capture of a batch, focused on distances even in 1/t, upright."""
-    camera, size = network.camera, len(batch.capture)
-    distances = refocus_distances(float(camera.near), float(camera.far), _SWEPT)
-    first = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf[:1], leaf.shape), batch)
-    # As many at a time as the batch has, which is compiled for.
-    rounds = np.resize(np.asarray(distances), (-(-_SWEPT // size), size))
-    images = [read_batch(network, replace(first, commanded=jnp.asarray(t))) for t in rounds]
-    images = jnp.concatenate([found.images[:, 0] for found in images])[:_SWEPT, ::-1, ::-1]
-    slope = camera.camera.sensor.pitch / camera.camera.distance
-    return RefocusSweep(images, jnp.asarray(distances, images.dtype), slope, "learned")
+def read_sources(config: Any, read: Callable[[Any], Found]) -> list[Found]:
+    """The images of every source of a file, by a function of its section.
+
+    **Errors**: ConfigError, one line for each source that cannot be read.
+    """
+    found, faults = [], []
+    for number, source in enumerate(config.sources):
+        try:
+            found.append(read(source))
+        except (ValueError, OSError) as error:
+            place = config.place_of("sources", number)
+            faults.append(f"{place}sources[{number}]: {error}")
+    if faults:
+        raise ConfigError("\n".join(faults))
+    return found
 
 
-def _rounded(value: Any) -> float | None:
-    return round(float(value), 4) if np.isfinite(value) else None
+def build_options(config: Any) -> TrainingOptions:
+    """Length and rate of a training, as far as the section `training` of a file has them."""
+    names = {field.name for field in dataclasses.fields(TrainingOptions)}
+    given = {name: value for name, value in dict(config.training).items() if name in names}
+    return TrainingOptions(seed=config.seed, **given)
+
+
+def _read(source: SourceConfig, side: int) -> Source:
+    if source.kind == "drawn":
+        assert source.count is not None  # the section is checked
+        return drawn(source.seed, source.count, side)
+    if source.kind == "samples":
+        return samples(side)
+    assert source.path is not None
+    return photographs(source.path, side, licence=source.licence)
+
+
+def page(config: LearnedConfig, lessons: Lessons, result: RefocusTraining) -> Page:
+    """The page of a finished training."""
+    mask, focus, trained = config.mask, config.focus, result.trained
+    state, numbers = trained.state, parameter_count(result.network.weights)
+    lead = (
+        f"A network of {numbers} numbers that refocuses captures of one camera: "
+        f"{pixels_of(config.sensor).lower()}, zone aperture of {mask.width:g} mm with β = "
+        f"{mask.beta:g} rad/mm² at d = {config.distance:g} mm, λ = {config.wavelength * 1e6:g} nm; "
+        f"objects at {focus.nearest:g} to {focus.farthest:g} mm. The file is "
+        f"`{NETWORK}`."
+    )
+    scores = (
+        result.table(),
+        "Of the scenes of the checks, each with its own noise and commanded distance.",
+    )
+    sweep = (
+        Picture("sweep.png", "Contact sheet of the sweep", _SWEEP),
+        Picture("sweep.webp", "Animation of the sweep"),
+    )
+    training = (
+        f"{state.step} steps, {state.skipped} skipped, {state.retreats} times back at half the "
+        f"rate: {trained.status}.",
+        Picture("loss.png", "Loss"),
+    )
+    scenes = Picture("scenes.png", "Scenes and what the network makes of them", _SCENES)
+    warnings = ()
+    if trained.status == "diverged":
+        warnings = ("training met NaN again and again; this is its best until then",)
+    parts = (
+        Part("Scores", scores),
+        Part("Sweep", sweep),
+        Part("Scenes", (scenes,)),
+        Part("Training", training),
+        Part("Images", (lessons.images_table(), *config.notes)),
+    )
+    return Page((lead,), parts, command="train", warnings=warnings)

@@ -118,32 +118,33 @@ def reconstruct(
     """
     nothing = "interrupted; of the capture at work no image is there yet, nothing of it is kept"
     with told(lambda: nothing):
-        from thincam_jax.commands.reconstruct import console
+        from thincam_jax.commands.reconstruct import options
         from thincam_jax.commands.reconstruct.jobs import plan_jobs
         from thincam_jax.commands.reconstruct.options import Output, Recipe, Sources
+        from thincam_jax.commands.reconstruct.run import run_with_bar
         from thincam_jax.measured import MeasurementError, Preparation
 
         try:
             given = psf, camera, set_, network, distance, background
-            known, focusing = console.known_psf(*given)
+            known, focusing = options.known_psf(*given)
             sources = Sources(
                 known,
-                console.read_background(background),
-                0.0 if camera else console.read_background(psf_background),
+                options.read_background(background),
+                0.0 if camera else options.read_background(psf_background),
                 dead,
                 bits,
                 Preparation(
                     bayer=bayer,
                     demosaicing=demosaic,
                     downsample=downsample,
-                    corner=console.read_corner(corner),
+                    corner=options.read_corner(corner),
                     psf_scale=psf_scale,
                     saturation=saturation,
                     noise_threshold=noise_threshold,
                     psf_channels=psf_channels,
                 ),
                 psf_bits,
-                console.read_distances(distances, psf),
+                options.read_distances(distances, psf),
             )
             recipe = Recipe(
                 method=method.replace("-", "_"),
@@ -156,9 +157,9 @@ def reconstruct(
                 noise=noise,
                 focusing=focusing,
             )
-            balance, unsure = console.read_white_balance(white_balance), focusing is not None
+            balance, unsure = options.read_white_balance(white_balance), focusing is not None
             output = Output(out, linear, gamma, balance, unsure)
-            end = console.run_with_bar(plan_jobs(capture, sources, output), sources, recipe, output)
+            end = run_with_bar(plan_jobs(capture, sources, output), sources, recipe, output)
         except (MeasurementError, OSError) as error:
             fail(error)
     if end:
@@ -189,7 +190,7 @@ def check(
     better.
     """
     with told(lambda: "interrupted; nothing is known of the PSF"):
-        from thincam_jax.commands.reconstruct import console
+        from thincam_jax.commands.reconstruct import options
         from thincam_jax.commands.reconstruct.options import Sources
         from thincam_jax.commands.reconstruct.run import check_files, enough_blocks
         from thincam_jax.commands.terminal import progress_bar
@@ -198,14 +199,14 @@ def check(
         try:
             sources = Sources(
                 psf,
-                console.read_background(background),
-                console.read_background(psf_background),
+                options.read_background(background),
+                options.read_background(psf_background),
                 dead,
                 bits,
                 Preparation(
                     bayer=bayer,
                     downsample=1 if downsample is None else downsample,
-                    corner=console.read_corner(corner),
+                    corner=options.read_corner(corner),
                     psf_scale=psf_scale,
                     psf_channels=psf_channels,
                 ),

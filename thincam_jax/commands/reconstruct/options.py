@@ -1,14 +1,33 @@
-"""What a run is asked for: its files, its method, and what it writes."""
+"""Options of a reconstruction: its files, its camera, its method, and what it writes."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+import equinox as eqx
+import numpy as np
+
 from thincam_jax._core import checks
+from thincam_jax.commands.config_file import ConfigError
+from thincam_jax.commands.kinds import KINDS, load_experiment, read_kind
+from thincam_jax.commands.study.build import assemble, check_study
+from thincam_jax.commands.study.config import StudyConfig
+from thincam_jax.lensless.psf import psf
 from thincam_jax.measured import MeasurementError, Preparation, Raw
 from thincam_jax.measured.read import image_files
 from thincam_jax.measured.write import WhiteBalance
-from thincam_jax.reconstruction import SOLVERS, AbstractSolver, AdmmTV, Fista, Ridge, TotalVariation
+from thincam_jax.reconstruction import (
+    SOLVERS,
+    AbstractSolver,
+    AdmmTV,
+    Cameras,
+    Fista,
+    Ridge,
+    TotalVariation,
+)
+from thincam_jax.reconstruction.depth.refocus import increasing
+from thincam_jax.units import parse_quantity
 
 # What works from a measured PSF and prepared captures; "auto" then is admm_tv.
 PSF_METHODS = ("auto", "admm_tv", "fista", "ridge")
@@ -168,3 +187,166 @@ class Output:
     gamma: float | int = 2.2
     white_balance: WhiteBalance = None
     unsure: bool = False
+
+
+def read_background(text: str | None) -> Background:
+    """A dark frame's path, or a number of counts."""
+    if text is None:
+        return None
+    try:
+        return float(text)
+    except ValueError:
+        return Path(text)
+
+
+def known_psf(
+    psf: Path | None,
+    camera: Path | None,
+    overrides: list[str] | None,
+    network: Path | None,
+    distance: str | None,
+    background: str | None,
+) -> tuple[Path | Raw, Focusing | None]:
+    """The file of a measured PSF; or the PSF of a camera, and its network.
+
+    **Errors**: MeasurementError where not one of PSF and camera is given, and where a computed PSF
+    comes without a background; ConfigError of the camera and the network.
+    """
+    if (psf is None) == (camera is None):
+        raise MeasurementError(
+            "give either --psf, a measured PSF, or --camera, a study with the camera's numbers"
+        )
+    if camera is None:
+        if overrides:
+            raise MeasurementError("--set changes the file of --camera; leave it out with --psf")
+        if network is not None:
+            raise MeasurementError("--network is of a camera; give --camera in place of --psf")
+    if distance is not None and network is None:
+        raise MeasurementError("--distance is that of a --network; see --distances for others")
+    if psf is not None or camera is None:
+        assert psf is not None  # one of the two is given
+        return psf, None
+    try:
+        focused = None if distance is None else parse_quantity(distance, "length")
+    except ValueError as error:
+        raise MeasurementError(f"--distance: {error}") from None
+    cameras = read_camera(camera, overrides or (), focused)
+    focusing = None
+    if network is not None:
+        focusing = read_network(network, cameras)
+    if background is None:
+        raise MeasurementError(
+            "--camera: a computed PSF has no dark corner; give --background, a dark frame or a "
+            "number of counts"
+        )
+    return computed_psf(camera, cameras), focusing
+
+
+def read_distances(text: str | None, psf: Path | None) -> tuple[float, ...]:
+    """Distances of measured PSFs, mm, from "60mm,80mm,100mm".
+
+    **Errors**: MeasurementError where they are none, not increasing, or there is no measured PSF.
+    """
+    if text is None:
+        return ()
+    if psf is None:
+        raise MeasurementError("--distances are those of measured PSFs; give them by --psf")
+    try:
+        distances = increasing([parse_quantity(part, "length") for part in text.split(",")])
+    except ValueError as error:
+        raise MeasurementError(f"--distances {text}: {error}") from None
+    return tuple(distances)
+
+
+def read_corner(text: str) -> tuple[int, int]:
+    """The first pixel of the corner and the one after its last, from "5:15".
+
+    **Errors**: MeasurementError for anything else.
+    """
+    try:
+        first, last = (int(part) for part in text.split(":"))
+        if not 0 <= first < last:
+            raise ValueError
+    except ValueError:
+        raise MeasurementError(
+            f"--corner {text}: give the first pixel and the one after the last, as 5:15"
+        ) from None
+    return first, last
+
+
+def read_white_balance(text: str | None) -> WhiteBalance:
+    """The gains of the colours, or how to find them.
+
+    **Errors**: MeasurementError for anything else.
+    """
+    if text is None:
+        return None
+    if text.replace("-", "_") == "grey_world":
+        return "grey_world"
+    try:
+        red, green, blue = (float(part) for part in text.split(","))
+    except ValueError:
+        raise MeasurementError(
+            f"--white-balance {text}: give grey-world, or the gains of red, green and blue as "
+            "1.8,1,1.4"
+        ) from None
+    return red, green, blue
+
+
+def read_camera(config: Path, overrides: Sequence[str], distance: float | None) -> Cameras:
+    """The camera of a study's first shot, or of a file of kind learned, and its object's distance.
+
+    `distance`: in place of that of a study's object, mm.
+
+    **Errors**: ConfigError, as of `load_experiment`, and for a file of another kind or without
+    a distance.
+    """
+    if read_kind(config) is KINDS["learned"]:
+        # Here: other captures need not wait for the learned parts.
+        from thincam_jax.commands.learned.run import build_camera
+
+        whole = build_camera(load_experiment(config, tuple(overrides), "train"))
+        if distance is None:
+            raise ConfigError(f"{config}: tells no object's distance; give a --distance")
+        light = {"wavelength": float(whole.light.wavelengths[0]), "model": whole.model}
+        return Cameras([whole.camera], object_distance=distance, **light)
+    experiment = load_experiment(config, tuple(overrides))
+    if not isinstance(experiment, StudyConfig):
+        raise ConfigError(f"{config}: is of kind {experiment.kind}; a camera is read from a study")
+    study = assemble(experiment, ())
+    check_study(study)
+    shot = study.exposures[0]
+    return Cameras(
+        [study.camera(shot)],
+        wavelength=shot.wavelength,
+        object_distance=study.object_distance if distance is None else distance,
+        model=study.model,
+        pixel_integration=experiment.pixel_integration,
+    )
+
+
+def computed_psf(config: Path, cameras: Cameras) -> Raw:
+    """The PSF of the camera of a file."""
+    (camera,), wavelength, distance = cameras.cameras, cameras.wavelength, cameras.object_distance
+    how = {"model": cameras.model, "pixel_integration": cameras.pixel_integration}
+    image = psf(camera, wavelength=wavelength, object_distance=distance, **how)
+    numbers = eqx.tree_pformat(camera, width=10_000)  # in one line
+    light = f"wavelength {wavelength * 1e6:g} nm, object at {distance:g} mm"
+    name = f"camera of {config}: {numbers}, {light}"
+    return Raw(np.asarray(image), name=name)
+
+
+def read_network(path: Path, cameras: Cameras) -> Focusing:
+    """A network and the distance that it is to be focused on, checked before any work.
+
+    **Errors**: ConfigError for a damaged file, another camera, and a distance outside of the range.
+    """
+    # Here: other captures need not wait for the learned parts.
+    from thincam_jax.learn.refocusing.store import load
+
+    try:
+        network = load(path, cameras)
+        network.camera.within(cameras.object_distance)
+    except ValueError as error:
+        raise ConfigError(str(error)) from None
+    return Focusing(path, network, float(cameras.object_distance))

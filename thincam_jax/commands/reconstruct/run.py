@@ -7,59 +7,50 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+import rich.markup
+import rich.progress
 
 from thincam_jax import measured
+from thincam_jax._core.environment import environment
 from thincam_jax._core.files import WriteError, writing
-from thincam_jax._core.memory import refuse_if_too_large
-from thincam_jax.commands.doctor import environment
+from thincam_jax.commands.interrupt import INTERRUPTED
 from thincam_jax.commands.reconstruct.jobs import Job, write_job
-from thincam_jax.commands.reconstruct.options import Background, Output, Recipe, Sources
-from thincam_jax.imaging.operators import window_shape
+from thincam_jax.commands.reconstruct.options import Background, Focusing, Output, Recipe, Sources
+from thincam_jax.commands.terminal import WRONG_INPUT, in_a_line, progress_bar, tell
 from thincam_jax.measured.write import linear_bytes
-from thincam_jax.reconstruction import (
-    InverseProblem,
-    Progress,
-    Psfs,
-    Reconstruction,
-    Recording,
-    TotalVariation,
-    check_psf,
-    choose_solver,
-    reconstruct,
-)
+from thincam_jax.reconstruction import Progress, TotalVariation, check_psf, choose_solver
 from thincam_jax.reconstruction.depth import depth_of_colours
-from thincam_jax.reconstruction.methods import AbstractRegularised
-from thincam_jax.reconstruction.noise import demosaiced_noise, estimate_variance
-from thincam_jax.reconstruction.problem import relative_residual
-from thincam_jax.reconstruction.recording import centred_crop
+from thincam_jax.studies.prepared import (
+    PixelNoise,
+    PreparedResult,
+    pixel_noise,
+    prepared_recording,
+    reconstruct_prepared,
+)
 
-# Real arrays of the window's size that a reconstruction holds at its peak, for each channel.
-_WINDOWS = 28
 _SIDE = 160  # pixels of the longer side, about: enough for half a per cent of scale
+_UNEXPLAINED = 0.9  # of the capture's norm
 
 Report = Callable[[str, Progress], None]
 
 
 @dataclass(frozen=True)
 class Finished:
-    """A capture whose image was written, and the record beside it."""
+    """A capture whose image (channel, y, x) was written, and the record beside it.
+
+    - `line`: what was done, in a line. `doubt`: what is wrong with an image that does not explain
+      its capture, or nothing.
+    - `status`: see `Reconstruction.ending`.
+    """
 
     job: Job
     record: dict[str, Any]
-    image: Float[np.ndarray, "channel y x"]
-
-    @property
-    def status(self) -> str:
-        """See `Reconstruction.ending`."""
-        return self.record.get("reconstruction", {}).get("status", "")
-
-    @property
-    def learned(self) -> bool:
-        """Whether a network made it."""
-        return self.record["reconstruction"]["method"] == "learned"
+    image: np.ndarray
+    line: str
+    doubt: str = ""
+    status: str = ""
+    iterations: int = 0
 
 
 @dataclass(frozen=True)
@@ -141,27 +132,38 @@ def _background(given: Background, bits: int | None) -> measured.Raw | float | N
     return measured.read_image(given, bits) if isinstance(given, Path) else given
 
 
+@dataclass(frozen=True)
+class _Made:
+    """An image (channel, y, x), the facts for its record, and what `Finished` says of it.
+
+    - `marked`: a picture of what is not sure, as a PNG.
+    """
+
+    image: np.ndarray
+    facts: dict[str, Any]
+    line: str
+    doubt: str
+    status: str
+    iterations: int = 0
+    marked: bytes = b""
+
+
 def _run_job(job: Job, rig: Rig, recipe: Recipe, output: Output, report: Report | None) -> Finished:
     began = time.perf_counter()
     ready = rig.prepare(job.capture, job.focus or 0)
     _check_channels(job, ready, recipe, output)
-    beside = None
+    noise = pixel_noise(ready, recipe.noise)
     if recipe.focusing is None:
-        image, facts = _reconstruct(job, ready, recipe, report)
+        made = _reconstruct(job, ready, recipe, noise, report)
     else:
-        from thincam_jax.commands.reconstruct.network import focus
-
-        noise, how = _noise(ready, recipe)
-        image, facts, marked = focus(ready, recipe.focusing, noise)
-        facts["noise"] = {"counts": noise / _of_a_count(ready), "found": how}
-        image = image[:, ::-1, ::-1] if recipe.flip else image
-        beside = dict.fromkeys(job.beside, marked)
+        made = _focus(ready, recipe.focusing, noise)
+    image = made.image[:, ::-1, ::-1] if recipe.flip else made.image
     shown = {"gamma": output.gamma, "white_balance": output.white_balance}
     record = {
         "capture": job.capture,
         "sources": _source_facts(rig.sources),
         "preparation": ready.log,
-        "reconstruction": facts,
+        "reconstruction": made.facts | {"noise": {"counts": noise.counts, "found": noise.found}},
         "image": {
             "shape": image.shape,
             "field": recipe.field,
@@ -173,13 +175,16 @@ def _run_job(job: Job, rig: Rig, recipe: Recipe, output: Output, report: Report 
         "display": shown if job.is_shown else None,
         "environment": environment(time.perf_counter() - began),
     }
-    return _written(job, image, record, output, beside)
+    beside = dict.fromkeys(job.beside, made.marked) if made.marked else None
+    _write(job, image, record, output, beside)
+    told = made.doubt, made.status, made.iterations
+    return Finished(job, record, image, f"{job.images[0]}: {made.line}", *told)
 
 
 def _join(job: Job, images: list[np.ndarray], rig: Rig, output: Output) -> Finished:
     """The image that is sharp everywhere, with the depth map; of one image for each distance."""
-    from thincam_jax.commands.refocus import figures
-    from thincam_jax.commands.study.figures import as_png
+    from thincam_jax.plot.frame import as_png
+    from thincam_jax.plot.refocus import draw_depth, draw_sweep
 
     began, distances = time.perf_counter(), rig.sources.distances
     if len(images) != len(distances):
@@ -187,12 +192,12 @@ def _join(job: Job, images: list[np.ndarray], rig: Rig, output: Output) -> Finis
             f"{job.images[0]}: is not made, nor a depth map: {len(images)} of {len(distances)} "
             "distances could be reconstructed"
         )
-    sweep, depth, sharp = depth_of_colours(jnp.stack(images), distances)
+    sweep, depth, sharp = depth_of_colours(np.stack(images), distances)
     sharp, distance = np.asarray(sharp), np.asarray(depth.distance, np.float32)[None]
     sheet, map_, *linear = job.beside
     beside = {
-        sheet: as_png(figures.draw_sweep(sweep, {})),
-        map_: as_png(figures.draw_depth(sweep, depth, sharp.mean(axis=0))),
+        sheet: as_png(draw_sweep(sweep)),
+        map_: as_png(draw_depth(sweep, depth, sharp.mean(axis=0))),
     } | {path: linear_bytes(distance, path.suffix.lower()) for path in linear}
     record = {
         "capture": job.capture,
@@ -201,13 +206,15 @@ def _join(job: Job, images: list[np.ndarray], rig: Rig, output: Output) -> Finis
         "files": [path.name for path in (*job.images, *job.beside)],
         "environment": environment(time.perf_counter() - began),
     }
-    return _written(job, sharp, record, output, beside)
+    _write(job, sharp, record, output, beside)
+    others = ", ".join(path.name for path in job.beside)
+    line = f"{job.images[0]}: each part from the distance it is sharp at; {others}"
+    return Finished(job, record, sharp, line)
 
 
-def _written(job: Job, image: np.ndarray, record, output: Output, beside=None) -> Finished:
+def _write(job: Job, image: np.ndarray, record, output: Output, beside=None) -> None:
     with writing(job.images[0]):
         write_job(job, image, record, output, beside)
-    return Finished(job, record, image)
 
 
 def _source_facts(sources: Sources) -> dict[str, Any]:
@@ -219,26 +226,13 @@ def _source_facts(sources: Sources) -> dict[str, Any]:
 
 
 def _reconstruct(
-    job: Job, ready: measured.Prepared, recipe: Recipe, report: Report | None
-) -> tuple[Float[np.ndarray, "channel y x"], dict[str, Any]]:
-    """The image, and the facts of its reconstruction."""
-    # The mask is given even where all is valid, so that one compilation serves a whole folder.
-    capture, psf, valid = (jnp.asarray(a)[None] for a in (ready.capture, ready.psf, ready.valid))
-    *_, channels, rows, columns = capture.shape  # those of the PSF as well
-    sensor, field = (rows, columns), (2 * rows - 1, 2 * columns - 1)
-    window = window_shape(sensor, field, sensor)
-    refuse_if_too_large(
-        f"{job.capture}: its reconstruction on {window[0]}×{window[1]} samples",
-        4 * _WINDOWS * channels * window[0] * window[1],
-        "give a larger downsample",
-    )
-    noise, how = _noise(ready, recipe)
-    psfs = Psfs(psf, field_shape=field)
-    recording = Recording(capture, psfs, valid=valid, noise_variance=noise**2)
-    solver = recipe.solver(channels)
+    job: Job, ready: measured.Prepared, recipe: Recipe, noise: PixelNoise, report: Report | None
+) -> _Made:
+    solver = recipe.solver(len(ready.capture))
     # Conjugate gradients are one compiled program, without progress.
     callback = None if report is None or recipe.is_ridge else partial(report, job.name)
-    found = reconstruct(recording, solver, callback=callback)
+    done = reconstruct_prepared(ready, solver, noise, callback=callback, name=str(job.capture))
+    found = done.found
     if found.status == "non_finite":
         weight = (
             ("ridge", recipe.relative_ridge) if recipe.is_ridge else ("tau", recipe.relative_tau)
@@ -249,62 +243,83 @@ def _reconstruct(
         )
     if found.status == "interrupted" and not found.iterations:
         raise KeyboardInterrupt
-    problem = recording.problem(
-        tau=recipe.relative_tau,
-        regulariser=solver.prior if isinstance(solver, AbstractRegularised) else None,
+    residual, doubt = done.relative_residual, ""
+    if not residual < _UNEXPLAINED:  # or no number
+        name, value = ("ridge", recipe.relative_ridge) if recipe.is_ridge else ("tau", recipe.tau)
+        why = (
+            f"{name} = {value:g} is too large, give about 1" if value else "the PSF may be another"
+        )
+        doubt = f"the image explains almost nothing of the capture; {why}"
+    line = (
+        f"{found.status.replace('_', ' ')} after {found.iterations} iterations, relative data "
+        f"residual {residual:.3g}, {found.seconds:.1f} s, noise {noise.counts:.3g} counts "
+        f"({noise.found.split()[0]})"
     )
-    image = found.image if recipe.field == "full" else centred_crop(found.image, sensor)
-    image = np.asarray(image, dtype=np.float32)
-    facts = _facts(recording, found, problem, recipe)
-    facts["noise"] = {"counts": noise / _of_a_count(ready), "found": how}
-    return image[:, ::-1, ::-1] if recipe.flip else image, facts
+    facts = _facts(done, recipe)
+    return _Made(done.image(recipe.field), facts, line, doubt, found.status, found.iterations)
 
 
-def _noise(ready: measured.Prepared, recipe: Recipe) -> tuple[float, str]:
-    """Standard deviation of a prepared pixel's noise, and how it was obtained."""
-    if recipe.noise is not None:
-        return recipe.noise * _of_a_count(ready), "given"
-    how = "estimated from the finest detail at each brightness"
-    light, valid = (jnp.asarray(array) for array in (ready.capture, ready.valid))
-    if ready.log["demosaicing"]["method"] == "bilinear":
-        noise = float(demosaiced_noise(light, valid))
-        if noise > 0:
-            return noise, f"{how}, in every second pixel of each colour"
-    return float(jnp.sqrt(estimate_variance([light], [valid])[0])), how
-
-
-def _of_a_count(ready: measured.Prepared) -> float:
-    """One count of a raw pixel in units of the prepared capture."""
-    log = ready.log
-    full_scale = log["full_scale"]["capture"]["full_scale"]
-    return 1 / (full_scale * log["downsampling"]["factor"] * log["scaling"]["capture_divisor"])
-
-
-def _facts(
-    recording: Recording, found: Reconstruction, problem: InverseProblem, recipe: Recipe
-) -> dict[str, Any]:
+def _facts(done: PreparedResult, recipe: Recipe) -> dict[str, Any]:
+    found, problem = done.found, done.problem
     is_ridge, prior = recipe.is_ridge, problem.regulariser
     assert isinstance(prior, TotalVariation)
     variation = {"kind": prior.kind, "coupling": prior.coupling}
     return {
         "method": found.method,
         "asked_for": recipe.method,
-        "reason": choose_solver(recording)[1] if recipe.method == "auto" else "",
+        "reason": choose_solver(done.recording)[1] if recipe.method == "auto" else "",
         "tau": None if is_ridge else recipe.relative_tau,
         "absolute_tau": None if is_ridge else problem.absolute_tau,
         "ridge": recipe.relative_ridge if is_ridge else None,
-        # The weight of a trusted pixel is 1/σ².
-        "noise_standard_deviation": 1 / jnp.sqrt(jnp.max(problem.weights[0])),
+        "noise_standard_deviation": done.pixel_deviation,
         "variation": None if is_ridge else variation,
         "nonnegative": problem.nonnegative and not is_ridge,
         "field_shape": problem.field_shape,
         "iterations_at_most": recipe.iterations,
         "iterations": found.iterations,
         "status": found.status,
-        "relative_data_residual": relative_residual(problem, found.image[:, None]),
+        "relative_data_residual": done.relative_residual,
         "history": [asdict(step) for step in found.history],
         "seconds": round(found.seconds, 3),
     }
+
+
+def _focus(ready: measured.Prepared, focusing: Focusing, noise: PixelNoise) -> _Made:
+    from thincam_jax.learn.refocusing.use import SURE, doubt, read
+    from thincam_jax.plot.frame import as_png
+    from thincam_jax.plot.learned import draw_unsure
+
+    began = time.perf_counter()
+    if not ready.valid.all():
+        raise measured.MeasurementError(
+            f"{int((~ready.valid).sum())} pixels of the capture are dead or saturated, and a "
+            "network needs every pixel; repair them, or use another method"
+        )
+    try:
+        found = read(focusing.network, ready.capture, [focusing.distance], noise.deviation)
+    except ValueError as error:
+        raise measured.MeasurementError(f"{focusing.path}: {error}") from None
+    image = np.asarray(found.images[:, 0], np.float32)
+    unsure = np.asarray(found.confidence) < SURE
+    consistency, part = float(found.consistency.max()), float(unsure.mean())
+    status = "ok" if np.isfinite(image).all() else "non_finite"
+    seconds, words = round(time.perf_counter() - began, 3), doubt(consistency)
+    facts = {
+        "method": "learned",
+        "network": focusing.path,
+        "focused_on_mm": focusing.distance,
+        "status": status,
+        "consistency": consistency,
+        "doubt": words,
+        "unsure": part,
+        "iterations": 0,
+        "seconds": seconds,
+    }
+    line = (
+        f"focused on {focusing.distance:g} mm, residual {consistency:.2f} of the noise, not sure "
+        f"of {100 * part:.0f} % of the pixels, {seconds:.1f} s"
+    )
+    return _Made(image, facts, line, words, status, marked=as_png(draw_unsure(image, unsure)))
 
 
 def _check_channels(job: Job, ready: measured.Prepared, recipe: Recipe, output: Output) -> None:
@@ -338,13 +353,8 @@ def check_files(
     rig = Rig(sources)
     ready = rig.prepare(capture)
     shape = ready.capture.shape[-2:]
-    recording = Recording(
-        jnp.asarray(ready.capture)[None],
-        Psfs(jnp.asarray(ready.psf)[None]),
-        valid=jnp.asarray(ready.valid)[None],
-    )
     try:
-        found = check_psf(recording, search=search, callback=report)
+        found = check_psf(prepared_recording(ready), search=search, callback=report)
     except ValueError as error:
         raise measured.MeasurementError(str(error)) from None
     size = f"{shape[0]}×{shape[1]} pixels, blocks of {sources.preparation.downsample}"
@@ -364,3 +374,61 @@ def enough_blocks(sources: Sources) -> Sources:
     pixels = max(Rig(sources).psfs[0].pixels.shape[:2]) // (2 if halved else 1)
     preparation = replace(sources.preparation, downsample=max(1, round(pixels / _SIDE)))
     return replace(sources, preparation=preparation)
+
+
+def run_with_bar(jobs: list[Job], sources: Sources, recipe: Recipe, output: Output) -> int:
+    """Work through the jobs with a progress bar; returns the exit code."""
+    end = 0
+    with progress_bar("{task.fields[objective]}") as bar:
+        teller = _Bar(bar, recipe.iterations, [job.name for job in jobs if job.focus is not None])
+        for result in run_jobs(jobs, sources, recipe, output, teller):
+            if isinstance(result, Failed):
+                tell(in_a_line(result.error))
+                end = WRONG_INPUT
+                continue
+            bar.console.print(result.line, highlight=False, markup=False, soft_wrap=True)
+            if result.job.focus is None:
+                continue
+            if result.doubt:
+                tell(f"{result.job.images[0]}: {result.doubt}")
+            if result.status == "interrupted":
+                tell(_interrupted(result.job, jobs))
+                return INTERRUPTED
+            teller.finish(result.iterations)
+    return end
+
+
+class _Bar:
+    """One bar for the capture at work, with its number and the objective."""
+
+    def __init__(self, bar: rich.progress.Progress, iterations: int, names: list[str]):
+        self.bar, self.iterations, self.names = bar, iterations, names
+        self.name = names[0]
+        self.task = bar.add_task(self._title(), total=iterations, objective="")
+
+    def __call__(self, name: str, progress: Progress) -> None:
+        if name != self.name:
+            self.name = name
+            self.bar.reset(self.task, description=self._title(), total=self.iterations)
+        objective = f"objective {progress.objective:.4g}"
+        done = {"completed": progress.iteration, "objective": objective}
+        self.bar.update(self.task, **done)
+        self.bar.start()
+
+    def finish(self, iterations: int) -> None:
+        """Full, also where fewer iterations were enough."""
+        self.bar.update(self.task, completed=iterations, total=iterations)
+        self.bar.start()
+
+    def _title(self) -> str:
+        count = len(self.names)
+        number = f" ({self.names.index(self.name) + 1} of {count})" if count > 1 else ""
+        return rich.markup.escape(self.name) + number
+
+
+def _interrupted(job: Job, jobs: list[Job]) -> str:
+    jobs = [one for one in jobs if one.focus is not None]
+    what = "distances" if job.label else "captures"
+    left = len(jobs) - jobs.index(job) - 1
+    rest = f"; not begun: {left} of {len(jobs)} {what}" if left else ""
+    return f"interrupted; {job.images[0]} is the best image so far{rest}"

@@ -1,16 +1,83 @@
-"""Running a refocus experiment: the study into a folder, with a report."""
+"""Refocus experiments: from the file to the study of its scene, its run and its page."""
 
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from thincam_jax.commands.config_file import slug
-from thincam_jax.commands.refocus import figures, report
-from thincam_jax.commands.refocus.build import FileRefocus
+from thincam_jax.commands.config_file import ConfigError, slug
+from thincam_jax.commands.refocus.config import RefocusConfig
+from thincam_jax.commands.report import Page, Part, Picture, Sentences, optics_of, pixels_of
 from thincam_jax.commands.run_folder import Progress, Run, RunFolder
-from thincam_jax.commands.study.figures import save_figure, save_image
-from thincam_jax.studies.refocus import RefocusResult, RefocusRun
+from thincam_jax.commands.study.build import assemble, read_picture
+from thincam_jax.imaging.targets import middle_square
+from thincam_jax.plot import refocus as plot
+from thincam_jax.plot.frame import grey_levels, white_level
+from thincam_jax.studies.refocus import (
+    FocusRange,
+    RefocusResult,
+    RefocusRun,
+    RefocusStudy,
+    SceneObject,
+    place,
+)
+
+_SWEEP = (
+    "Reconstructions from the same captures, focused on the distance above each; one grey scale "
+    "for all. In bold those nearest to an object. A pixel is the same direction in all of them."
+)
+_DEPTH = (
+    "Left: the distance at which the surroundings of each pixel are sharpest. Right: each pixel "
+    "from the image focused on its distance."
+)
+_SCORED = (
+    "PSNR is taken within an object's outline, after a least-squares gain and offset of its own, "
+    "against the object averaged over the same pixels."
+)
+_METHODS = (
+    "Solid box: in focus; dotted: out of focus. Below each picture the middle of both objects, "
+    "that in focus framed. Each picture has its own white."
+)
+
+
+@dataclass(frozen=True, eq=False)
+class FileRefocus(RefocusStudy):
+    """A study with the file that it was read from."""
+
+    config: Any = None
+
+    @property
+    def warnings(self) -> list[str]:
+        """What a user should know before it runs."""
+        return self.study.warnings
+
+
+def build_refocus(config: RefocusConfig) -> FileRefocus:
+    """Cameras and methods, and the objects as targets at their distances.
+
+    **Errors**: ConfigError, one line for each fault, beginning with the field.
+    """
+    study, faults, objects = assemble(config, ()), [], []
+    try:
+        for exposure in study.exposures:
+            study.camera(exposure)
+    except (ValueError, TypeError) as error:
+        faults.append(f"mask, sensor or model: {error}")
+    for number, placed in enumerate(config.objects):
+        try:
+            picture = read_picture(placed)
+            if placed.crop < 1:
+                picture = middle_square(picture, round(placed.crop * min(picture.shape[:2])))
+            seen = SceneObject(
+                placed.name, picture, placed.distance, placed.width, placed.x, placed.y
+            )
+            objects.append(place(study, number, seen))
+        except (ValueError, FileNotFoundError) as error:
+            faults.append(f"objects[{number}]: {error}")
+    if faults:
+        raise ConfigError("\n".join(faults))
+    sweep = FocusRange(**dict(config.sweep))
+    return FileRefocus(replace(study, targets=tuple(objects)), sweep, config)
 
 
 def run_refocus(refocusing: FileRefocus, folder: RunFolder, progress: Progress) -> RefocusResult:
@@ -42,17 +109,17 @@ class _RefocusRun(Run):
             "warnings": study.warnings,
         }
         places = {name: one.distance_mm for name, one in result.objects.items()}
-        save_figure(folder, "sweep", figures.draw_sweep(result.sweep, places))
-        folder.write("figures/sweep.webp", figures.animate_sweep(result.sweep))
-        save_figure(folder, "focus", figures.draw_curves(result))
-        white = figures.white_level(np.asarray(result.sweep.images))
-        save_image(folder, "all-in-focus", figures.grey_levels(result.sharp, white))
-        save_figure(folder, "depth", figures.draw_depth(result.sweep, result.depth, result.sharp))
+        folder.save_figure("sweep", plot.draw_sweep(result.sweep, places))
+        folder.write("figures/sweep.webp", plot.animate_sweep(result.sweep))
+        folder.save_figure("focus", plot.draw_curves(result))
+        white = white_level(np.asarray(result.sweep.images))
+        folder.save_image("all-in-focus", grey_levels(result.sharp, white))
+        folder.save_figure("depth", plot.draw_depth(result.sweep, result.depth, result.sharp))
         for (name, distance), image in result.images.items():
-            shown = figures.grey_levels(image, figures.white_level(image))
-            save_image(folder, f"{slug(name)}--{distance:g}mm", shown)
-        save_figure(folder, "methods", figures.draw_methods(result))
-        self.complete(report.page(self.config, result, findings(result)))
+            shown = grey_levels(image, white_level(image))
+            folder.save_image(f"{slug(name)}--{distance:g}mm", shown)
+        folder.save_figure("methods", plot.draw_methods(result))
+        self.complete(page(self.config, result))
 
 
 def _sweep_metrics(result: RefocusResult) -> dict[str, Any]:
@@ -72,23 +139,29 @@ def _sweep_metrics(result: RefocusResult) -> dict[str, Any]:
     }
 
 
-def findings(result: RefocusResult) -> list[str]:
-    """What the numbers say, in sentences."""
-    sentences = []
-    for name, found in result.objects.items():
-        if found.found_mm is None:
-            sentences.append(f"{name}, placed at {found.distance_mm:g} mm, was not found.")
-            continue
-        sentences.append(
-            f"{name}, placed at {found.distance_mm:g} mm, is sharpest at "
-            f"{found.found_mm:.1f} mm ({found.error_percent:+.1f} %)."
-        )
-    spans = [found.axial_resolution_mm for found in result.objects.values()]
-    distances = sorted(target.distance for target in result.refocusing.study.targets)
-    if len(distances) > 1:
-        gap = min(b - a for a, b in zip(distances, distances[1:], strict=False))
-        sentences.append(
-            f"The objects stand {gap:g} mm apart or more; the depth of focus, "
-            f"π t (t+d) / (β d R²), is {min(spans):.0f} to {max(spans):.0f} mm."
-        )
-    return sentences
+def page(config: RefocusConfig, result: RefocusResult) -> Page:
+    """The page of a finished run."""
+    lead = f"{pixels_of(config.sensor)}, mask {config.mask.label}, {optics_of(config)}"
+    curves = (
+        f"Focus measure of each object in the sweep by {config.sweep.method}; vertical lines: "
+        "where the objects were placed."
+    )
+    sweep = (
+        Picture("sweep.png", "Contact sheet of the sweep", _SWEEP),
+        Picture("sweep.webp", "Animation of the sweep", "The whole sweep, there and back."),
+    )
+    depth = Picture("depth.png", "Depth map, confidence, all in focus", _DEPTH)
+    methods = Picture("methods.png", "All methods at all distances", _METHODS)
+    found = (
+        result.table(),
+        Sentences(result.findings()),
+        Picture("focus.png", "Focus curves", curves),
+    )
+    parts = (
+        Part("Distances", found),
+        Part("Sweep", sweep),
+        Part("Depth", (depth,)),
+        Part("Methods", (result.methods_table(), _SCORED, methods)),
+        Part("Notes", config.notes),
+    )
+    return Page((lead,), parts, warnings=result.refocusing.study.warnings)

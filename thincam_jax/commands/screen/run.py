@@ -1,19 +1,152 @@
-"""Running a screen experiment: the study and its calibration, into a run folder."""
+"""Screen experiments: from the file to the study, its run with a calibration, and its page."""
 
 import resource
 import sys
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 
-from thincam_jax.commands.config_file import slug
+from thincam_jax import waveguide as wg
+from thincam_jax.commands.config_file import ConfigError, slug
+from thincam_jax.commands.report import Content, Page, Part, Picture, pixels_of
 from thincam_jax.commands.run_folder import Progress, Run, RunFolder
-from thincam_jax.commands.screen import figures, report
-from thincam_jax.commands.screen.build import FileScreen, build_calibration
-from thincam_jax.commands.study.figures import save_figure, save_image
-from thincam_jax.studies.screen import ModelResult, ScreenResult, ScreenRun, summarise_rays
-from thincam_jax.studies.screen_calibration import MEASURED, CalibrationRun
+from thincam_jax.commands.screen.config import (
+    CalibrationConfig,
+    RectangleConfig,
+    ScreenConfig,
+    ScreenMethodConfig,
+    SeeThroughConfig,
+)
+from thincam_jax.commands.sections import VariationConfig
+from thincam_jax.commands.study.build import build_noise, picture
+from thincam_jax.plot import screen as plot
+from thincam_jax.reconstruction import AbstractSolver, AdmmTV, Ridge, TotalVariation
+from thincam_jax.studies.screen import (
+    ModelResult,
+    PublishedImage,
+    RaySummary,
+    ScreenModel,
+    ScreenResult,
+    ScreenRun,
+    ScreenStudy,
+    summarise_rays,
+)
+from thincam_jax.studies.screen_calibration import (
+    MEASURED,
+    Calibration,
+    CalibrationRun,
+    CalibrationScores,
+)
+
+_RAYS = (
+    "Side view: rays of three pixels through lens, plate (grey) and out to the object; thin lines "
+    "go on to the object points of the image and its ghosts, further down with each bounce."
+)
+_FIELD = (
+    "Each pixel is reached by one colour, and its ghosts have a shift of their own: no convolution "
+    "describes this camera."
+)
+_PUBLISHED = (
+    "Ours are simulated, the published ones measured: the differences are those of the two, not of "
+    "the methods. Times are with compilation, all images together."
+)
+_COLUMNS = (
+    "What the sensor sees of single cells (row, column): columns of the measured matrix, and of "
+    "the exact one."
+)
+
+
+@dataclass(frozen=True, eq=False)
+class FileScreen(ScreenStudy):
+    """A study with the file that it was read from."""
+
+    config: Any = None
+
+
+def build_screen(config: ScreenConfig) -> FileScreen:
+    """The study of a file, everything checked and images read.
+
+    **Errors**: ConfigError, one line for each fault, beginning with its place.
+    """
+    targets, faults = {}, []
+    channels = len(config.hologram.colours or ())
+    for number, target in enumerate(config.targets):
+        try:
+            targets[target.name] = picture(target, config.object.cells, channels)
+        except (ValueError, FileNotFoundError) as error:
+            place = config.place_of("targets", number, "path")
+            faults.append(f"{place}targets[{number}]: {error}")
+    noise = build_noise(config.noise)
+    assert noise is not None  # the section is needed
+    study = FileScreen(
+        build_cameras(config),
+        build_plane(config),
+        targets,
+        noise,
+        {method.name: build_solver(method) for method in config.methods},
+        tuple(ScreenModel(m.name, m.mistake, m.glass_thickness) for m in config.models),
+        config.orders,
+        config.band_samples,
+        (config.hologram.object_angle, config.hologram.reference_angle),
+        config.seed,
+        config.name,
+        config,
+    )
+    try:
+        study.check()
+    except ValueError as error:
+        faults.append(f"{config.place_of('screen')}screen: {error}")
+    if faults:
+        raise ConfigError("\n".join(faults))
+    return study
+
+
+def build_calibration(config: CalibrationConfig) -> Calibration:
+    """How the camera of a file is calibrated."""
+    return Calibration(**dict(config))
+
+
+def build_plane(config: SeeThroughConfig) -> wg.ObjectPlane:
+    """The cells before the camera."""
+    seen = config.object
+    return wg.ObjectPlane(seen.cells, seen.distance, seen.width, (seen.x, seen.y))
+
+
+def build_cameras(config: SeeThroughConfig) -> tuple[wg.SeeThroughCamera, ...]:
+    """The camera of each colour."""
+    return tuple(_camera(config, wavelength) for wavelength in config.hologram.recorded)
+
+
+def _camera(config: SeeThroughConfig, wavelength: float) -> wg.SeeThroughCamera:
+    film, plate = config.hologram, config.screen
+    hologram = film.build(wavelength=wavelength).processed(film.shrinkage)
+    screen = wg.Screen(
+        hologram,
+        plate.glass_thickness,
+        plate.glass_index,
+        _rectangle(plate.top),
+        _rectangle(plate.bottom),
+    )
+    lens = config.lens
+    sensor = config.sensor.build()
+    distances = lens.focal_distance, lens.lens_distance
+    return wg.SeeThroughCamera(screen, sensor, *distances, tilt=np.asarray(plate.tilt))
+
+
+def _rectangle(part: RectangleConfig | None) -> wg.Rectangle | None:
+    if part is None:
+        return None
+    return wg.Rectangle((part.x, part.y), (part.width, part.height))
+
+
+def build_solver(method: ScreenMethodConfig) -> AbstractSolver:
+    """The solver of a method of a file."""
+    if method.kind == "ridge":
+        return Ridge(method.ridge or 1.0)
+    options = method.variation or VariationConfig()
+    variation = TotalVariation(options.kind)
+    return AdmmTV(options.tau, variation=variation, iterations=options.iterations)
 
 
 def run_screen(study: FileScreen, folder: RunFolder, progress: Progress) -> ScreenResult:
@@ -59,27 +192,112 @@ class _ScreenRun(Run):
             "peak_memory_gb": memory,
         }
         drawn = {
-            "rays": figures.draw_rays(study),
-            "field": figures.draw_field(study, rays),
-            "images": figures.draw_images(result),
-            "models": figures.draw_models(result),
-            "errors": figures.draw_errors(result),
+            "rays": plot.draw_rays(study),
+            "field": plot.draw_field(study, rays),
+            "images": plot.draw_images(result),
+            "models": plot.draw_models(result),
+            "errors": plot.draw_errors(result),
         }
         if calibrated is not None:
             self.metrics["calibration"] = asdict(calibrated.scores)
             pitch = float(study.camera.sensor.pitch)
-            drawn["columns"] = figures.draw_columns(pitch, calibrated.cells, calibrated.columns)
+            drawn["columns"] = plot.draw_columns(pitch, calibrated.cells, calibrated.columns)
             if calibrated.images:
-                drawn["distances"] = figures.draw_distances(calibrated)
+                drawn["distances"] = plot.draw_distances(calibrated)
         for name, figure in drawn.items():
-            save_figure(self.folder, name, figure)
+            self.folder.save_figure(name, figure)
         for name, one in found[study.models[0].name].methods.items():
             for target, image in zip(study.targets, one.images, strict=True):
-                save_image(self.folder, f"{slug(target)}--{slug(name)}", np.asarray(image))
+                self.folder.save_image(f"{slug(target)}--{slug(name)}", np.asarray(image))
         scores = None if calibrated is None else calibrated.scores
-        self.complete(report.page(self.config, result, summary, scores, memory))
+        self.complete(page(self.config, result, summary, scores, memory))
 
 
 def _scores(model: ModelResult) -> dict[str, Any]:
     methods = {name: asdict(one.scores) for name, one in model.methods.items()}
     return {"mistake": model.mistake, "methods": methods}
+
+
+def page(
+    config: ScreenConfig,
+    result: ScreenResult,
+    rays: RaySummary,
+    calibration: CalibrationScores | None,
+    peak: float,
+) -> Page:
+    """The page of a finished run; `peak`: the most memory it took, GB."""
+    right, last = config.models[0].name, config.methods[-1].name
+    published = {
+        target.name: {
+            method: PublishedImage(one.psnr_db, one.seconds)
+            for method, one in target.published.items()
+        }
+        for target in config.targets
+    }
+    images = (
+        "Targets, what the sensor captures (in the colours of its pixels, turned upright), and "
+        f"reconstructions with the model “{right}”."
+    )
+    lead = (
+        f"{pixels_of(config.sensor)} behind a glass of {config.screen.glass_thickness:g} mm; "
+        f"{config.object.cells[0]}×{config.object.cells[1]} cells at {config.object.distance:g} "
+        f"mm, {config.orders} ghost orders, seed {config.seed}. {peak:.1f} GB of memory at most.",
+        Picture("images.png", "Targets, captures, reconstructions", images),
+        Picture("rays.png", "Rays in side view", _RAYS),
+        Picture("field.png", "Wavelength and ghost shifts over the field", _FIELD),
+        _rays(rays),
+    )
+    scored = f"PSNR after a least-squares gain and offset, by {last}."
+    errors = (
+        result.errors_table(),
+        Picture("models.png", "Reconstructions with wrong models", f"By {last} with each model."),
+        Picture("errors.png", "PSNR of targets with each model", scored),
+    )
+    calibrated = ()
+    if calibration is not None and config.calibration is not None:
+        calibrated = _calibration(config, config.calibration, calibration)
+    parts = (
+        Part("Beside the thesis' Table 5.1", (result.published_table(published), _PUBLISHED)),
+        Part("What an error of the model costs", errors, "Errors of the model"),
+        Part("Calibration with Hadamard patterns", calibrated, "Calibration"),
+        Part("Notes", config.notes),
+    )
+    return Page(lead, parts)
+
+
+def _rays(rays: RaySummary) -> str:
+    if rays.wavelength_nm is None or rays.guided_angle_deg is None:
+        return ""
+    colours, angles = rays.wavelength_nm, rays.guided_angle_deg
+    ghost = ""
+    if rays.first_ghost_down_mm is not None and rays.first_ghost_right_mm is not None:
+        down, right = rays.first_ghost_down_mm, rays.first_ghost_right_mm[1]
+        ghost = f"; by its first ghost a pixel sees {down[0]:.1f} to {down[1]:.1f} mm further down "
+        ghost += f"the object and up to {right:.1f} mm further to the side"
+    ended = (f"{kind.replace('_', ' ')} {part} %" for kind, part in rays.status_percent.items())
+    return (
+        f"{colours[0]:.0f} to {colours[1]:.0f} nm, guided at {angles[0]:.1f}° to {angles[1]:.1f}°"
+        f"{ghost}. Rays: {', '.join(ended)}."
+    )
+
+
+def _calibration(
+    config: ScreenConfig, asked: CalibrationConfig, found: CalibrationScores
+) -> tuple[Content, ...]:
+    last, distance = config.methods[-1].name, config.object.distance
+    reasons = "".join(f"; {reason}" for reason in found.fit.reasons)
+    elsewhere = (
+        f"Other distances by {last}: with the exact rays, with a matrix measured there, with that "
+        f"of the screen fitted at {distance:g} mm, and with the screen as it was assumed before."
+    )
+    return (
+        f"{found.frames} frames of {asked.bits} bits, {asked.display}, in {asked.order} order. The "
+        f"largest entry of the matrix is {found.largest_counts:.0f} counts; its noise is "
+        f"{found.noise_counts:.3f}, expected of the frames' {found.expected_noise_counts:.3f}. "
+        "“measured matrix” in the tables above is a reconstruction with it.",
+        Picture("columns.png", "Columns of the matrix", _COLUMNS),
+        f"The screen fitted to it: {found.fit.status.replace('_', ' ')}{reasons}.",
+        found.fit.table(),
+        found.table(),
+        Picture("distances.png", "A target at other distances", elsewhere),
+    )

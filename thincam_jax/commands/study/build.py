@@ -3,37 +3,33 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, get_args
 
-import jax
 import numpy as np
 
 from thincam_jax import reconstruction
+from thincam_jax._core import checks
 from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.sections import (
     CamerasConfig,
     MaskConfig,
     MethodConfig,
     NoiseConfig,
+    Relief,
     SensorConfig,
     TargetConfig,
     VariationConfig,
 )
 from thincam_jax.commands.study.config import PictureConfig, StudyConfig
-from thincam_jax.commands.study.mask import built_mask
 from thincam_jax.imaging import targets as drawn
-from thincam_jax.imaging.metrics.image import SSIM_WINDOW
-from thincam_jax.imaging.metrics.mtf import MINIMUM_COLUMNS
 from thincam_jax.imaging.sensor import AbstractNoise, Sensor
 from thincam_jax.lensless import masks
 from thincam_jax.lensless.exposures import Exposure, Exposures
+from thincam_jax.lensless.propagation.path import Path
 from thincam_jax.reconstruction.solver import AbstractSolver
 from thincam_jax.reconstruction.wiener import Prior
-from thincam_jax.studies.evaluate import field_shape
+from thincam_jax.studies.evaluate import check_cameras, check_target
 from thincam_jax.studies.study import Method, Published, Study, Target
-
-# The scene's power is read off frequencies above three cycles a sensor (`spectra.inner_band`).
-_MINIMUM_ROWS = 7
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,6 +84,68 @@ def build_optics(
         return built_mask(mask, exposure), sensor.build()
     except (ValueError, TypeError, FileNotFoundError) as error:
         raise ConfigError(f"mask, sensor or model: {error}") from None
+
+
+def built_mask(config: MaskConfig, exposure: Exposure) -> masks.AbstractMask:
+    """The mask of an exposure but for a profile of its own, on its display.
+
+    **Errors**: ValueError for numbers that make none.
+    """
+    if config.family == "fza":
+        return masks.FresnelZoneAperture(
+            exposure.beta,
+            exposure.phase,
+            width=exposure.width,
+            height=config.height,
+            profile=config.profile,
+            pixel_pitch=config.pixel_pitch,
+            fill_factor=config.fill_factor,
+            harmonics=config.harmonics,
+        )
+    printed = _printed(config, exposure)
+    if config.pixel_pitch is None:
+        return printed
+    return masks.on_display(printed, config.pixel_pitch, config.fill_factor)
+
+
+def _printed(config: MaskConfig, exposure: Exposure) -> masks.AbstractMask:
+    """Of the families without zones."""
+    cell, tiles, height = config.cell or 0.0, config.tiles or 1, config.height
+    family = config.family
+    if family == "mura":
+        return masks.ModifiedUniformlyRedundantArray(config.order or 0, cell, tiles=tiles)
+    if family == "ura":
+        return masks.UniformlyRedundantArray(config.orders or (0, 0), cell, tiles=tiles)
+    if family == "mls":
+        code = masks.maximum_length_sequence(config.length or 0)
+        return masks.SeparableMask(code, code, cell, combine=config.combine)
+    if family == "random":
+        return masks.random_cells(config.seed or 0, config.width, cell, height=height)
+    if family == "pinhole":
+        return masks.Pinhole(config.width, height)
+    if family == "lenslets":
+        return masks.LensletArray(config.focal_length or 0.0, cell, config.lenses or (1, 1))
+    if family in get_args(Relief):
+        return _relief(config, exposure.wavelength, exposure.distance)
+    amplitude = masks.read_mask(config.path or "", 1.0).amplitude
+    return masks.SampledMask(amplitude, config.width / amplitude.shape[1])
+
+
+def _relief(config: MaskConfig, wavelength: float, distance: float) -> masks.PhaseMask:
+    """A phase mask for objects far away."""
+    cell, seed = config.cell or 0.0, config.seed or 0
+    count = checks.whole_cells("width", config.width, "cell", cell)
+    blank = masks.MaskBlank((count, count), cell, config.index)
+    if config.family == "diffuser":
+        length, slope = config.correlation_length or 0.0, config.rms_slope or 0.0
+        return masks.diffuser(seed, blank, correlation_length=length, rms_slope=slope)
+    if config.family == "voronoi_fresnel":
+        lens = {"focal_length": config.focal_length or 0.0, "wavelength": wavelength}
+        return masks.voronoi_fresnel(seed, blank, sites=config.sites or 0, **lens)
+    from thincam_jax.design import contour_mask  # slow, and not needed by other masks
+
+    lines = {"feature": config.feature or 0.0, "line_width": config.line_width or 0.0}
+    return contour_mask(seed, blank, Path(wavelength, distance), **lines)
 
 
 def as_method(config: CamerasConfig, method: MethodConfig) -> Method:
@@ -211,35 +269,19 @@ def _lines(config: Any, faults: dict[int, str]) -> list[str]:
 
 def _camera_fault(study: FileStudy) -> str:
     """Empty for none."""
-    rows, columns = study.sensor.shape
-    place = study.config.place_of("sensor", "shape")
-    if rows < _MINIMUM_ROWS or columns < MINIMUM_COLUMNS:
-        return (
-            f"{place}sensor.shape: {rows}×{columns} pixels are too few for a study; "
-            f"give at least {_MINIMUM_ROWS}×{MINIMUM_COLUMNS}"
-        )
     try:
-        for exposure in study.exposures:
-            study.camera(exposure)
-        # Traced only: whether the model takes this mask at all.
-        jax.eval_shape(lambda: study.psf(study.exposures[0]))
-    except MemoryError as error:
-        return f"{place}sensor.shape: {error}"
-    except (ValueError, TypeError, FileNotFoundError) as error:
+        check_cameras(study)
+    except (ValueError, TypeError, FileNotFoundError, MemoryError) as error:
+        if isinstance(error, MemoryError) or getattr(error, "field", "") == "sensor.shape":
+            return f"{study.config.place_of('sensor', 'shape')}sensor.shape: {error}"
         return f"mask, sensor or model: {error}"
     return ""
 
 
 def _target_fault(study: Study, target: Target) -> str:
     """Empty for none."""
-    if target.plane.image.min() == target.plane.image.max():
-        return "the image is uniform: there is nothing to reconstruct; give another one"
-    for method in study.methods:
-        shape = field_shape(study, method, target)
-        if min(shape) < SSIM_WINDOW:
-            return (
-                f"{method.name!r} reconstructs it on {shape[0]}×{shape[1]} pixels, at least "
-                f"{SSIM_WINDOW}×{SSIM_WINDOW} are needed; give a larger object.width or a "
-                "smaller sensor.pitch"
-            )
+    try:
+        check_target(study, target)
+    except ValueError as error:
+        return str(error)
     return ""

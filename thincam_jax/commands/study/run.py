@@ -1,12 +1,14 @@
-"""Running a study: every target through every method, into a run folder."""
+"""Running a study: every target through every method, into a run folder with a report."""
 
 from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
 
+from thincam_jax.commands.config_file import slug
+from thincam_jax.commands.report import Page, Part, Picture, Sentences, optics_of, pixels_of
 from thincam_jax.commands.run_folder import Progress, Run, RunFolder
-from thincam_jax.commands.study import figures, report
 from thincam_jax.commands.study.build import FileStudy
+from thincam_jax.commands.study.config import StudyConfig
 from thincam_jax.lensless.exposures import Exposure
 from thincam_jax.plot import studies as plot
 from thincam_jax.studies.evaluate import (
@@ -17,9 +19,28 @@ from thincam_jax.studies.evaluate import (
     evaluate_method,
 )
 from thincam_jax.studies.response import Response, method_response
-from thincam_jax.studies.result import StudyScores, summarise
+from thincam_jax.studies.result import StudyScores, findings, summarise
 from thincam_jax.studies.simulate import Capture, take
-from thincam_jax.studies.study import Method, Study, Target
+from thincam_jax.studies.study import Method, Target
+
+_SCORED = (
+    "PSNR and SSIM are taken after a least-squares gain and offset, over the target's area, "
+    "against the scene averaged over the same pixels."
+)
+_RESOLVED = (
+    "An element counts as resolved when every bar stands out from every gap, in both directions, "
+    "by a tenth of the chart's contrast, and so do all coarser elements. The first zero is the "
+    "lowest frequency that none of a method's captures carries; the cut-off is where the transfer "
+    "function stays under 5\u00a0% of its low-frequency value. Frequencies are on the sensor plane "
+    "of the method's largest mask–sensor distance."
+)
+_TRANSFER = (
+    "Response of each method's synthesis with the finite mask, over its low-frequency value. "
+    "Nyquist: 1/(2 pitch) of the pixels; what lies beyond it, in grey, no capture holds."
+)
+_CONTRAST = (
+    "Contrast of the chart's elements in the reconstructions; below zero the bars are reversed."
+)
 
 
 def run_study(study: FileStudy, folder: RunFolder, progress: Progress) -> StudyScores:
@@ -77,19 +98,26 @@ class _StudyRun(Run):
     def finish(self, target: Target) -> None:
         study, folder, found = self.study, self.folder, self.evaluations
         first = self.captures[study.exposures[0]].image
-        figures.save_images(folder, target, found)
+        self._save_images(target)
         # No target's name can be taken for one of the study's own figures.
         for kind, figure in (
             ("target", plot.draw_target(study, target, first, found)),
             ("captures", plot.draw_captures(study, self.captures)),
         ):
-            figures.save_figure(folder, f"{kind}-{figures.slug(target.name)}", figure)
+            folder.save_figure(f"{kind}-{slug(target.name)}", figure)
         contrasts = {name: e.contrast for name, e in found.items() if e.contrast is not None}
         scores = {name: e.scores for name, e in found.items()}
         self.found[target.name], self.contrasts[target.name] = scores, contrasts
         metrics = {name: asdict(one) for name, one in scores.items()}
         folder.finish(target.name, {"metrics": metrics, "contrasts": contrasts})
         self.captures, self.evaluations = {}, {}
+
+    def _save_images(self, target: Target) -> None:
+        """A target's scene and all reconstructions of it."""
+        place, folder = slug(target.name), self.folder
+        folder.save_image(f"{place}--scene", plot.truth_of(self.evaluations))
+        for name, evaluation in self.evaluations.items():
+            folder.save_image(f"{place}--{slug(name)}", evaluation.image)
 
     def transfer(self, method: Method) -> None:
         self.responses[method.name] = method_response(self.study, method)
@@ -98,16 +126,15 @@ class _StudyRun(Run):
         study, folder = self.study, self.folder
         self.scores = summarise(study, study.targets, self.found, self.responses)
         self.metrics = asdict(self.scores)
-        figures.save_figure(folder, "mtf", plot.draw_responses(study, self.responses))
+        folder.save_figure("mtf", plot.draw_responses(study, self.responses))
         # Of several charts the last.
         contrasts: dict[str, Contrasts] = {}
         for target in study.targets:
             contrasts |= self.contrasts[target.name]
         if contrasts:
-            figures.save_figure(folder, "contrast", plot.draw_contrasts(contrasts))
-        figures.save_psf(folder, study)
-        told = findings(study, self.scores)
-        self.complete(report.page(study.config, self.scores, told))
+            folder.save_figure("contrast", plot.draw_contrasts(contrasts))
+        folder.save_figure("psf", plot.draw_psf(study))
+        self.complete(page(study.config, self.scores, findings(study, self.scores)))
 
 
 def _scores(metrics: Mapping[str, Any]) -> Scores:
@@ -116,53 +143,47 @@ def _scores(metrics: Mapping[str, Any]) -> Scores:
     return Scores(**{**metrics, "resolved": resolved and Resolved(**resolved)})
 
 
-def findings(study: Study, scores: StudyScores) -> list[str]:
-    """What the numbers say, in sentences, beside what was published."""
-    sentences = []
-    for name, method in scores.methods.items():
-        mean, stated = method.mean_psnr_of_pictures_db, method.published.psnr_db
-        if mean is not None and stated is not None:
-            sentences.append(
-                f"{name}: {mean:.1f} dB on average over the pictures, published {stated:.1f} dB "
-                f"({mean - stated:+.1f} dB)."
-            )
-        own, stated = method.resolved_mm, method.published.resolved_object_mm
-        if own is not None and stated is not None:
-            word = "finer" if own < 0.97 * stated else "coarser"
-            word = "the same within 3 %" if abs(own / stated - 1) <= 0.03 else word
-            sentences.append(
-                f"{name}: resolves a line pair of {own:.2f} mm on the object, published "
-                f"{stated:.2f} mm: {word}."
-            )
-    sentences += _gains(study, scores)
-    ranked = sorted(
-        (one.resolved_mm, name)
-        for name, one in scores.methods.items()
-        if one.resolved_mm is not None
+def page(config: StudyConfig, scores: StudyScores, sentences: list[str]) -> Page:
+    """The page of a finished study; `sentences` say what its numbers do."""
+    seen = config.object
+    moves = f" that moves {seen.motion:g} mm across during an exposure of 1" if seen.motion else ""
+    lead = (
+        f"{pixels_of(config.sensor)}, mask {config.mask.label}, object {seen.width:g} mm wide at "
+        f"{seen.distance:g} mm{moves}, {optics_of(config)}"
     )
-    if len(ranked) > 1:
-        order = ", ".join(f"{name} ({period:.2f} mm)" for period, name in ranked)
-        sentences.append(f"From finest to coarsest on the chart: {order}.")
-    return sentences
+    names = [target.name for target in config.targets]
+    pictures = [picture for name in names for picture in _pictures(name)]
+    transfer = (
+        Picture("mtf.png", "Transfer functions of all methods", _TRANSFER),
+        Picture("contrast.png", "Contrast of chart elements", _CONTRAST),
+    )
+    published = (Sentences(sentences), *config.notes) if sentences or config.notes else ()
+    parts = (
+        Part("Reconstructions", pictures),
+        Part("Results", (scores.quality_table(), _SCORED)),
+        Part("Resolution", (scores.resolution_table(), _RESOLVED)),
+        Part("Beside the published figures", published),
+        Part("Transfer functions", transfer),
+        Part(
+            "Point spread function",
+            (Picture("psf.png", "Point spread function", "Of the first capture."),),
+        ),
+    )
+    return Page((lead,), parts, warnings=scores.warnings)
 
 
-def _sums(method: Method) -> tuple:
-    """What two methods share that add and subtract the same captures in the same way."""
-    return tuple(method.exposures), method.synthesis, method.phases, method.harmonics
-
-
-def _gains(study: Study, scores: StudyScores) -> list[str]:
-    """What total variation adds to the Wiener synthesis of the same captures."""
-    sentences = []
-    for method in (m for m in study.methods if m.solver.name == "admm_tv"):
-        for other in (m for m in study.methods if m.solver.name == "wiener"):
-            if _sums(method) != _sums(other):
-                continue
-            both = [scores.methods[one.name].targets for one in (method, other)]
-            pairs = ((name, *(of[name].psnr_db for of in both)) for name in both[0])
-            gains = [
-                f"{a - b:+.1f} dB on {t}" for t, a, b in pairs if a is not None and b is not None
-            ]
-            if gains:
-                sentences.append(f"{method.name}: {', '.join(gains)} over {other.name}.")
-    return sentences
+def _pictures(name: str) -> tuple[Picture, Picture]:
+    """Of a target."""
+    shown = "the first raw capture, the scene, and the reconstructions; below, the middle third, "
+    captures = "Each from black to its own maximum; β and φ of the mask, d from mask to sensor."
+    return (
+        Picture(
+            f"target-{slug(name)}.png", name, f"{name}: {shown}or of the chart its fine groups."
+        ),
+        Picture(
+            f"captures-{slug(name)}.png",
+            f"All captures of {name}",
+            captures,
+            folded=f"all captures of {name}",
+        ),
+    )

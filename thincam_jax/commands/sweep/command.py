@@ -49,21 +49,19 @@ def sweep(
 
     with told(interrupted):
         _check(scheduler, workers)
-        import jax
-
+        from thincam_jax._core.precision import is_double
         from thincam_jax.commands.config_file import ConfigError, slug
         from thincam_jax.commands.kinds import load_experiment
         from thincam_jax.commands.study.config import StudyConfig
-        from thincam_jax.commands.sweep.folder import SweepFolder
         from thincam_jax.commands.sweep.grid import read_axes
         from thincam_jax.commands.sweep.point import make_points
-        from thincam_jax.commands.sweep.run import run_sweep
+        from thincam_jax.commands.sweep.run import SweepFolder, run_sweep
 
         study = load_experiment(config, tuple(set_ or ()))
         if not isinstance(study, StudyConfig):
             raise ConfigError(f"{config}: is of kind {study.kind}; a sweep takes a study")
         axes = read_axes(grid or [], study.model_dump(mode="json", exclude_none=True))
-        points = make_points(study, axes, bool(jax.config.read("jax_enable_x64")))
+        points = make_points(study, axes, is_double())
         folder = SweepFolder(out or Path("runs") / f"{slug(study.name)}-sweep")
         folder.claim(study)
         warn(_warnings(points))

@@ -1,17 +1,148 @@
-"""Running a sweep: the points that the folder does not hold yet, into the folder."""
+"""Running a sweep: the points that its folder does not hold yet, and the tables of them."""
 
 import contextlib
+import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
-from thincam_jax.commands.sweep.folder import SweepFolder
-from thincam_jax.commands.sweep.measure import Outcome, measure_point, one_line
-from thincam_jax.commands.sweep.point import GridPoint
-from thincam_jax.commands.sweep.summary import summarise
-from thincam_jax.commands.sweep.workers import Died, Outcomes, local_workers
+import pyarrow as pa
+import pyarrow.parquet as pq
+from pyarrow import csv
 
+from thincam_jax._core.files import read_regular, write_whole
+from thincam_jax.commands.checked_config import dump_config
+from thincam_jax.commands.run_folder import claim_folder
+from thincam_jax.commands.study.config import StudyConfig
+from thincam_jax.commands.sweep.point import GridPoint, Outcome, measure_point, one_line, told
+from thincam_jax.commands.sweep.workers import Died, Outcomes, local_workers, scheduled_workers
+
+_PLAIN = ("point", "seconds")  # columns that are neither a swept value nor NAME/METHOD…
+_MEASURE = "mean_psnr_db/"  # of each method, over all targets
 Progress = Callable[[int, int], object]
+
+
+class SweepFolder:
+    """Files of one sweep. Every file is written whole or not at all.
+
+    - `study.yaml`: the resolved configuration that every point begins from.
+    - `points/KEY.parquet`: the row of a point that succeeded, `points/KEY.failed.json` why one
+      failed; written when it ends. KEY stands for the point's configuration.
+    - `results.parquet`, the same as `results.csv`, and `failures.jsonl`: those of the current grid,
+      in its order. `summary.png`: PSNR along its axes, of a sweep that has ended.
+    """
+
+    def __init__(self, path: str | Path):
+        self.path = Path(path)
+
+    def claim(self, base: StudyConfig) -> None:
+        """Make the folder; refuse one of another study, or of other things.
+
+        Another grid of the same study is welcome: points are recognised by their configuration.
+        """
+        claim_folder(self.path, "study.yaml", dump_config(base), "sweep", ("points",))
+
+    def has(self, point: GridPoint) -> bool:
+        """Whether the point has succeeded before; a row that cannot be read does not count."""
+        return read_row(self._row(point)) is not None
+
+    def keep(self, point: GridPoint, outcome: Outcome) -> None:
+        """Write what became of a point."""
+        if outcome.metrics is None:
+            told = {"point": point.key, "values": point.values, "reason": outcome.reason}
+            if outcome.traceback:
+                told["traceback"] = outcome.traceback
+            write_whole(self._failure(point), json.dumps(told, ensure_ascii=False) + "\n")
+        else:
+            row = {**point.values, "point": point.key, **outcome.metrics}
+            write_whole(self._row(point), row_bytes(row))
+            self._failure(point).unlink(missing_ok=True)
+
+    def collect(self, points: Sequence[GridPoint]) -> tuple[pa.Table | None, list[dict[str, Any]]]:
+        """Write the tables of what has ended; that of the rows, and the failures."""
+        rows, failures = [], []
+        for point in points:
+            row = read_row(self._row(point))
+            if row is not None:
+                rows.append((point.values, row))
+            elif self._failure(point).exists():
+                failures.append(json.loads(read_regular(self._failure(point))))
+        found = joined(rows) if rows else None
+        for name, content in (
+            ("results.parquet", None if found is None else parquet_bytes(found)),
+            ("results.csv", None if found is None else csv_bytes(found)),
+            ("failures.jsonl", "".join(json.dumps(f, ensure_ascii=False) + "\n" for f in failures)),
+        ):
+            if content:
+                write_whole(self.path / name, content)
+            else:
+                (self.path / name).unlink(missing_ok=True)
+        return found, failures
+
+    def _row(self, point: GridPoint) -> Path:
+        return self.path / "points" / f"{point.key}.parquet"
+
+    def _failure(self, point: GridPoint) -> Path:
+        return self.path / "points" / f"{point.key}.failed.json"
+
+
+def row_bytes(row: dict[str, Any]) -> bytes:
+    """One row as a Parquet file, without what helps only with many rows."""
+    return parquet_bytes(
+        pa.Table.from_pylist([row]),
+        write_statistics=False,
+        store_schema=False,
+        use_dictionary=False,
+        compression="none",
+    )
+
+
+def read_row(path: Path) -> pa.Table | None:
+    """A row that `row_bytes` made; None where there is none that can be read."""
+    try:
+        return pq.ParquetFile(path, memory_map=False).read()
+    except (OSError, pa.ArrowException):
+        return None
+
+
+def joined(rows: Sequence[tuple[dict[str, Any], pa.Table]]) -> pa.Table:
+    """One table of rows, each with its swept values.
+
+    The values are those given here: the row may have been written for a grid of other axes.
+    """
+    own = [
+        row.select([name for name in row.column_names if "/" in name or name in _PLAIN])
+        for _, row in rows
+    ]
+    measured = pa.concat_tables(own, promote_options="permissive")
+    columns = {path: _column([values[path] for values, _ in rows]) for path in rows[0][0]}
+    for name in sorted(measured.column_names, key=lambda name: name == "seconds"):
+        column = measured.column(name)
+        # Nothing but missing values, as the PSNR of exact reconstructions: numbers all the same.
+        columns[name] = column.cast(pa.float64()) if pa.types.is_null(column.type) else column
+    return pa.table(columns)
+
+
+def parquet_bytes(table: pa.Table, **options: Any) -> bytes:
+    """A table as a Parquet file."""
+    sink = pa.BufferOutputStream()
+    pq.write_table(table, sink, **options)
+    return sink.getvalue().to_pybytes()
+
+
+def csv_bytes(table: pa.Table) -> bytes:
+    """A table as comma-separated values with a line of headings."""
+    sink = pa.BufferOutputStream()
+    csv.write_csv(table, sink)
+    return sink.getvalue().to_pybytes()
+
+
+def _column(values: list[Any]) -> pa.Array:
+    try:
+        return pa.array(values)
+    except (pa.ArrowInvalid, pa.ArrowTypeError):  # numbers and texts
+        return pa.array([None if value is None else str(value) for value in values])
 
 
 @dataclass(frozen=True)
@@ -74,8 +205,6 @@ def connected(
     """The scheduler's workers, or that many new ones here."""
     if scheduler is None:
         return local_workers(workers, tasks)
-    from thincam_jax.commands.sweep.scheduler import scheduled_workers  # needs dask
-
     return scheduled_workers(scheduler)
 
 
@@ -101,3 +230,28 @@ def _outcome(result: Any) -> Outcome:
     if isinstance(result, Outcome):
         return result
     return Outcome(None, "worker died" if isinstance(result, Died) else one_line(result))
+
+
+def summarise(folder: Path, table: pa.Table, axes: Sequence[str]) -> tuple[str, ...]:
+    """Write summary.png, and say in a line for each method where its mean PSNR is best.
+
+    `axes`: the columns of swept values. Nothing where no point has a PSNR.
+    """
+    from thincam_jax.plot.frame import as_png
+    from thincam_jax.plot.sweep import draw_sweep
+
+    rows = table.to_pylist()
+    methods = {
+        name.removeprefix(_MEASURE): name
+        for name in table.column_names
+        if name.startswith(_MEASURE) and any(row[name] is not None for row in rows)
+    }
+    if not methods:
+        return ()
+    write_whole(folder / "summary.png", as_png(draw_sweep(rows, axes, methods)))
+    best = []
+    for method, column in methods.items():
+        row = max((row for row in rows if row[column] is not None), key=lambda row: row[column])
+        at = told({path: row[path] for path in axes})
+        best.append(f"best mean PSNR of {method}: {row[column]:.2f} dB at {at}")
+    return tuple(best)

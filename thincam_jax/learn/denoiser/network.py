@@ -9,11 +9,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Numbers
 from thincam_jax._core.module import Module
+from thincam_jax._core.random import Key, random_key
 from thincam_jax.learn.checkpoint import (
     CheckpointError,
     read_arrays,
@@ -125,9 +126,9 @@ def denoised(
     return images - jax.vmap(network)(images - centre[:, None, None], sigma)
 
 
-def create(options: DenoiserOptions = DenoiserOptions(), *, key: PRNGKeyArray) -> DenoisingUNet:
-    """An untrained network, which finds no noise."""
-    return DenoisingUNet(options.widths, options.blocks, key=key)
+def create(options: DenoiserOptions = DenoiserOptions(), *, key: Key) -> DenoisingUNet:
+    """An untrained network, by a key or a seed, which finds no noise."""
+    return DenoisingUNet(options.widths, options.blocks, key=random_key(key))
 
 
 def save_network(

@@ -17,10 +17,11 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Complex, Float, PRNGKeyArray
+from jaxtyping import Array, Complex, Float
 
 from thincam_jax._core.checks import Number, Numbers
 from thincam_jax._core.module import Module
+from thincam_jax._core.random import Key, random_key
 from thincam_jax.learn.refocusing.cameras import RefocusCamera, Stand
 from thincam_jax.learn.refocusing.lens_blur import lens_blur
 from thincam_jax.learn.refocusing.linear import LinearStep
@@ -133,16 +134,16 @@ class RefocusNetwork(eqx.Module):
 
     @staticmethod
     def create(
-        camera: RefocusCamera, options: NetworkOptions = DEFAULT, *, key: PRNGKeyArray
+        camera: RefocusCamera, options: NetworkOptions = DEFAULT, *, key: Key
     ) -> "RefocusNetwork":
-        """An untrained network: its U-Nets add nothing."""
+        """An untrained network, by a key or a seed: its U-Nets add nothing."""
         steps, places = options.steps, 2 * camera.planes - 1
         if steps < 1:
             raise ValueError(f"steps = {steps}; give at least 1")
         inputs, outputs = places + 5, 2 * places + 3
         powers, slopes = [0.3] + [0.03] * (steps - 1), [1.0] + [0.5] * (steps - 1)
         pairs = list(zip(powers, slopes, strict=True))
-        keys = jax.random.split(key, steps)
+        keys = jax.random.split(random_key(key), steps)
         weights = Weights(
             tuple(LinearStep(places, power=p, slope=s) for p, s in pairs),
             tuple(LinearStep(1, power=p, slope=s, noise=0.3) for p, s in pairs),

@@ -13,10 +13,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from thincam_jax._core.table import Table
 from thincam_jax.learn.refocusing.loss import Examples, examples, loss
 from thincam_jax.learn.refocusing.network import RefocusNetwork
 from thincam_jax.learn.refocusing.scenes import Batch, SceneOptions, draw_batch
-from thincam_jax.learn.refocusing.sources import Source
+from thincam_jax.learn.refocusing.sources import Entry, Source
 from thincam_jax.learn.refocusing.store import described, save
 from thincam_jax.learn.training import (
     Task,
@@ -72,14 +73,27 @@ class Lessons:
         judged = [examples(network, one) for one in self.validation(network, seed)]
         return Task(functools.partial(_taken, pool, self.batch), loss, judged)
 
+    @property
+    def images(self) -> dict[str, tuple[Entry, ...]]:
+        """Entries of all images by their use."""
+        sources = {"trained on": self.source, "judged on": self.held_out}
+        return {use: one.manifest for use, one in sources.items() if one is not None}
+
+    def images_table(self) -> Table:
+        """Every image with its use, licence and the beginning of its sum."""
+        rows = [
+            (entry.name, use, entry.licence, f"{entry.sha256[:16]}…")
+            for use, entries in self.images.items()
+            for entry in entries
+        ]
+        return Table(("image", "use", "licence", "SHA-256"), rows)
+
     def manifest(self) -> dict[str, Any]:
         """The images as JSON, with their sums and licences; and how scenes are drawn."""
-        sources = {"trained on": self.source, "judged on": self.held_out}
         return {
             "images": {
-                use: [dataclasses.asdict(entry) for entry in source.manifest]
-                for use, source in sources.items()
-                if source is not None
+                use: [dataclasses.asdict(entry) for entry in entries]
+                for use, entries in self.images.items()
             },
             "scenes": dataclasses.asdict(self.scenes),
             "batch": self.batch,

@@ -4,12 +4,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy
-from jaxtyping import PRNGKeyArray
 
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Number
 from thincam_jax._core.grids import fast_shape
 from thincam_jax._core.precision import as_complex
+from thincam_jax._core.random import Key, random_key
 from thincam_jax.lensless.masks.phase import MaskBlank, PhaseMask
 
 # Correlation lengths beyond the map, so that its opposite rims know nothing of each other.
@@ -17,7 +17,7 @@ _APART = 4.0
 
 
 def diffuser(
-    key: PRNGKeyArray, blank: MaskBlank, *, correlation_length: Number, rms_slope: Number
+    key: Key, blank: MaskBlank, *, correlation_length: Number, rms_slope: Number
 ) -> PhaseMask:
     r"""A diffuser: Gaussian random heights, between whose samples is interpolated.
 
@@ -26,6 +26,7 @@ def diffuser(
     bumps have the rms curvature :math:`2\sqrt3\,\sigma/\ell^2`, and caustics are sharp near their
     focal length :math:`\ell/[\sqrt6\,(n-1)s]`.
 
+    - `key`: of `jax.random`, or a seed.
     - `correlation_length`: ℓ, mm, at least two cells.
     - `rms_slope`: s along an axis, dimensionless. The lowest height is 0.
     """
@@ -43,14 +44,14 @@ def diffuser(
     # A Gaussian of width ℓ/√2 convolved with itself has the width ℓ.
     kernel = jnp.exp(-((jnp.pi * length) ** 2) * (v[:, None] ** 2 + u**2) / 2)
     kernel = kernel / jnp.sqrt(jnp.mean(kernel**2))
-    noise = jax.random.normal(key, window, length.dtype)
+    noise = jax.random.normal(random_key(key), window, length.dtype)
     height = jnp.real(jnp.fft.ifft2(jnp.fft.fft2(noise) * as_complex(kernel)))
     height = height[: blank.shape[0], : blank.shape[1]] * (slope * length / jnp.sqrt(2.0))
     return blank.mask(height - jnp.min(height), "bilinear")
 
 
 def voronoi_fresnel(
-    key: PRNGKeyArray,
+    key: Key,
     blank: MaskBlank,
     *,
     sites: int,
@@ -65,7 +66,7 @@ def voronoi_fresnel(
     centroids of their cells: these become even in size and round, and the PSF a set of equal,
     unevenly spaced points (Optics Express 30, 45807).
 
-    - `sites`: number of lenses. `relaxations`: steps of Lloyd's.
+    - `key`: of `jax.random`, or a seed. `sites`: number of lenses. `relaxations`: steps of Lloyd's.
     - `focal_length`: f, mm: the mask-sensor distance for far objects.
     - `wavelength`: of the design, mm.
 
@@ -79,7 +80,8 @@ def voronoi_fresnel(
     y, x = (np.asarray(a, float) for a in (blank.grid.y, blank.grid.x))
     cells = np.stack(np.meshgrid(y, x, indexing="ij"), axis=-1).reshape(-1, 2)
     half = np.array(blank.shape) * float(blank.pitch) / 2
-    places = np.asarray(jax.random.uniform(key, (sites, 2), minval=-1.0, maxval=1.0)) * half
+    places = jax.random.uniform(random_key(key), (sites, 2), minval=-1.0, maxval=1.0)
+    places = np.asarray(places) * half
     for _ in range(relaxations):
         owner = scipy.spatial.KDTree(places).query(cells)[1]
         count = np.bincount(owner, minlength=sites)[:, None]

@@ -7,13 +7,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float, PRNGKeyArray
+from jaxtyping import Array, Complex, Float
 
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Number
 from thincam_jax._core.grids import Grid, cell_overlap, centred_indices
 from thincam_jax._core.precision import as_complex, product
 from thincam_jax._core.quantity import quantity
+from thincam_jax._core.random import Key, random_key
 from thincam_jax.lensless.masks.base import (
     AbstractFactoredMask,
     AxisFactors,
@@ -112,7 +113,7 @@ class SampledMask(AbstractFactoredMask):
 
 
 def random_cells(
-    key: PRNGKeyArray,
+    key: Key,
     width: Number,
     cell: Number,
     *,
@@ -122,12 +123,12 @@ def random_cells(
     """A mask of cells that are open or closed at random; of no low rank.
 
     `width`, `height` (mm; None for a square) are whole numbers of cells; `open_fraction` is the
-    chance of a cell to be open.
+    chance of a cell to be open. `key`: of `jax.random`, or a seed.
     """
     columns = checks.whole_cells("width", width, "cell", cell)
     rows = columns if height is None else checks.whole_cells("height", height, "cell", cell)
     chance = checks.fraction("open_fraction", open_fraction)
-    opened = jax.random.bernoulli(key, chance, (rows, columns))
+    opened = jax.random.bernoulli(random_key(key), chance, (rows, columns))
     return SampledMask(opened.astype(float), cell)
 
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy
 import skimage
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, ArrayLike, Float, Int
 
 from thincam_jax.reconstruction.depth.focus import Measure, focus_measure, gaussian_average
 from thincam_jax.reconstruction.depth.refocus import RefocusSweep
@@ -238,7 +238,7 @@ def _picked(images, distances, inverse):
 
 
 def depth_of_colours(
-    images: Float[Array, "distance channel y x"], distances: Sequence[float | int]
+    images: Float[ArrayLike, "distance channel y x"], distances: Sequence[float | int]
 ) -> tuple[RefocusSweep, DepthMap, Float[Array, "channel y x"]]:
     """Sweep of the mean of the colours, its depth map, and the picture sharp everywhere.
 
@@ -246,6 +246,7 @@ def depth_of_colours(
 
     - `distances`: mm, increasing.
     """
+    images = jnp.asarray(images)
     focus = jnp.asarray(distances, images.dtype)
     sweep = RefocusSweep(jnp.mean(images, axis=1), focus, None)
     depth = depth_map(sweep)

@@ -2,6 +2,7 @@
 
 import io
 from collections.abc import Mapping
+from types import MappingProxyType
 
 import numpy as np
 import PIL.Image
@@ -10,8 +11,8 @@ import PIL.ImageFont
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from thincam_jax.commands.study.figures import drawing, line_style, sheet
 from thincam_jax.imaging.targets import middle_square
+from thincam_jax.plot.frame import drawing, grey_levels, line_style, sheet, white_level
 from thincam_jax.reconstruction.depth.find import DepthMap
 from thincam_jax.reconstruction.depth.refocus import RefocusSweep
 from thincam_jax.studies.refocus import PlacedTarget, RefocusResult
@@ -27,17 +28,7 @@ _MEASURED = {
 }
 
 
-def grey_levels(image: np.ndarray, white: float) -> np.ndarray:
-    """Radiance as 0…1: black stays black, `white` and above are white."""
-    return np.clip(np.asarray(image, dtype=float) / (white if white > 0 else 1.0), 0.0, 1.0)
-
-
-def white_level(images: np.ndarray) -> float:
-    """The radiance shown white: all but the brightest two in a thousand pixels."""
-    return float(np.percentile(images, 99.8))
-
-
-def draw_sweep(sweep: RefocusSweep, places: Mapping[str, float]) -> Figure:
+def draw_sweep(sweep: RefocusSweep, places: Mapping[str, float] = MappingProxyType({})) -> Figure:
     """Contact sheet of the sweep, each image with the distance it is focused on.
 
     `places`: distances of objects, mm, whose nearest images are titled in bold.
@@ -145,7 +136,7 @@ def draw_depth(sweep: RefocusSweep, depth: DepthMap, sharp: np.ndarray) -> Figur
     return figure
 
 
-def draw_methods(result: RefocusResult) -> Figure:
+def draw_methods(result: RefocusResult, figure: Figure | None = None) -> Figure:
     """Every method focused on every object; below each, the objects enlarged."""
     methods, objects = result.refocusing.study.methods, result.refocusing.objects
     aspect = max(p.shape[0] / p.shape[1] for p in result.images.values())
@@ -153,10 +144,8 @@ def draw_methods(result: RefocusResult) -> Figure:
     # A row of whole pictures and one of details for each focus.
     heights = [width * aspect, width / len(objects)] * len(objects)
     size = (width * len(methods), sum(heights) + 0.42 * len(objects))
-    figure = Figure(figsize=size, layout="constrained")
-    axes = figure.subplots(
-        2 * len(objects), len(methods), squeeze=False, gridspec_kw={"height_ratios": heights}
-    )
+    how = {"squeeze": False, "gridspec_kw": {"height_ratios": heights}}
+    figure, axes = drawing(size, 2 * len(objects), len(methods), figure=figure, **how)
     for column, method in enumerate(methods):
         for row, focused in enumerate(objects):
             image = result.images[method.name, focused.distance]
@@ -170,6 +159,7 @@ def draw_methods(result: RefocusResult) -> Figure:
             score = result.methods[method.name].focused_on_mm[distance].psnr_db[focused.name]
             sharp = "exact" if score is None else f"{score:.1f} dB"
             detail.set_xlabel(f"in focus: {focused.name}, {sharp}", fontsize=9)
+    assert figure is not None
     return figure
 
 

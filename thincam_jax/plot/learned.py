@@ -3,12 +3,11 @@
 import numpy as np
 from matplotlib.figure import Figure
 
-from thincam_jax.commands.refocus.figures import grey_levels, white_level
-from thincam_jax.commands.study.figures import drawing
 from thincam_jax.learn.refocusing.network import RefocusNetwork
 from thincam_jax.learn.refocusing.scenes import Batch
 from thincam_jax.learn.refocusing.use import SURE, Reading
 from thincam_jax.learn.training import TrainingState
+from thincam_jax.plot.frame import drawing, grey_levels, white_level
 
 _SMOOTHED = 25  # steps
 _SHOWN = 3  # scenes
@@ -62,4 +61,17 @@ def draw_scenes(network: RefocusNetwork, batch: Batch, reading: Reading) -> Figu
     places = np.linspace(1 / far, 1 / near, 5)
     bar.set_ticks(places.tolist(), labels=[f"{1 / p:.0f}" for p in places])
     bar.set_label("distance (mm)")
+    return figure
+
+
+def draw_unsure(image: np.ndarray, unsure: np.ndarray) -> Figure:
+    """An image (channel, y, x), its colours averaged; pixels that are unsure in any are red."""
+    image, unsure = np.mean(image, axis=0), np.any(unsure, axis=0)
+    figure, ax = drawing((5, 5 * image.shape[0] / image.shape[1] + 0.4))
+    ax.set(xticks=[], yticks=[])
+    ax.imshow(grey_levels(image, white_level(image)) ** (1 / 2.2), cmap="gray", vmin=0, vmax=1)
+    shade = np.zeros((*unsure.shape, 4))
+    shade[unsure] = (0.84, 0.15, 0.16, 0.45)
+    ax.imshow(shade)
+    ax.set_xlabel("red: the network is not sure of the distance")
     return figure

@@ -9,7 +9,7 @@ from matplotlib.colors import PowerNorm
 from matplotlib.figure import Figure
 
 from thincam_jax import waveguide as wg
-from thincam_jax.commands.study.figures import drawing, line_style
+from thincam_jax.plot.frame import drawing, line_style
 from thincam_jax.studies.screen import Reconstructed, ScreenResult, ScreenStudy
 from thincam_jax.studies.screen_calibration import CalibrationResult
 from thincam_jax.units import nm
@@ -114,14 +114,14 @@ def draw_field(study: ScreenStudy, rays: wg.Rays) -> Figure:
     return figure
 
 
-def draw_images(result: ScreenResult) -> Figure:
+def draw_images(result: ScreenResult, figure: Figure | None = None) -> Figure:
     """Targets, captures, and what the first model reconstructs by every solver."""
     study, (first, *_) = result.study, result.models.items()
     captures, light = np.asarray(study.captures.images), study.wavelengths
     colours = [in_colour(capture, light) for capture in captures]
     columns = [("capture, turned", colours, [""] * len(colours))]
     columns += [(name, list(one.images), _labels(one)) for name, one in first[1].methods.items()]
-    return _sheet(study, columns)
+    return _sheet(study, columns, figure)
 
 
 def draw_models(result: ScreenResult) -> Figure:
@@ -140,16 +140,19 @@ def _decibels(score: float | None) -> str:
 
 
 def _sheet(
-    study: ScreenStudy, columns: Sequence[tuple[str, list[np.ndarray], list[str]]]
+    study: ScreenStudy,
+    columns: Sequence[tuple[str, list[np.ndarray], list[str]]],
+    figure: Figure | None = None,
 ) -> Figure:
     """A row for each target; columns of a title, images and their labels beside it."""
     size = (1.75 * (len(columns) + 1), 1.95 * len(study.targets))
-    figure, rows = drawing(size, len(study.targets), len(columns) + 1, squeeze=False)
+    shape = len(study.targets), len(columns) + 1
+    drawn, rows = drawing(size, *shape, figure=figure, squeeze=False)
     for number, ((target, truth), axes) in enumerate(zip(study.targets.items(), rows, strict=True)):
         _panel(axes[0], truth, target, "" if number else "target")
         for ax, (title, images, labels) in zip(axes[1:], columns, strict=True):
             _panel(ax, images[number], labels[number], "" if number else title)
-    return figure
+    return drawn
 
 
 def _panel(ax: Axes, image: np.ndarray, label: str, title: str) -> None:

@@ -1,62 +1,41 @@
-"""What a sweep found: the best points, and how the methods' PSNR goes along each axis."""
+"""Figure of a sweep: how the methods' PSNR goes along each axis of its grid."""
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from thincam_jax._core.files import write_whole
 from thincam_jax._core.quantity import quantities
-from thincam_jax.commands.study.figures import as_png, line_style
-from thincam_jax.commands.sweep.point import told
 from thincam_jax.imaging.scene import ImagePlane
 from thincam_jax.imaging.sensor import GaussianNoise, PoissonGaussianNoise, Sensor
 from thincam_jax.lensless.masks.fza import FresnelZoneAperture
-from thincam_jax.lensless.propagation.path import Path as LightPath
+from thincam_jax.lensless.propagation.path import Path
+from thincam_jax.plot.frame import drawing, line_style
 
-_MEASURE = "mean_psnr_db/"  # of each method, over all targets
 _MAPS = 4  # of methods, at most
 # Of the swept values that are numbers, by the last key of their path.
 _QUANTITIES = quantities(
-    *(FresnelZoneAperture, LightPath, Sensor, GaussianNoise, PoissonGaussianNoise, ImagePlane)
+    *(FresnelZoneAperture, Path, Sensor, GaussianNoise, PoissonGaussianNoise, ImagePlane)
 )
 _QUANTITIES["phases"] = _QUANTITIES["phase"]
 
 
-def summarise(folder: Path, table: pa.Table, axes: Sequence[str]) -> tuple[str, ...]:
-    """Write summary.png, and say in a line for each method where its mean PSNR is best.
+def draw_sweep(rows: list[dict], axes: Sequence[str], methods: dict[str, str]) -> Figure:
+    """A panel of lines for each axis; of two axes also maps of methods that change along both.
 
-    `axes`: the columns of swept values. Nothing where no point has a PSNR.
+    - `rows`: of the points, by column. `axes`: the columns of swept values, whose last word says
+      their quantity, as `methods.0.shots.0.beta` in rad/mm².
+    - `methods`: the column of each method's mean PSNR, dB.
     """
-    rows = table.to_pylist()
-    methods = {
-        name.removeprefix(_MEASURE): name
-        for name in table.column_names
-        if name.startswith(_MEASURE) and any(row[name] is not None for row in rows)
-    }
-    if not methods:
-        return ()
-    write_whole(folder / "summary.png", as_png(_drawn(rows, axes, methods)))
-    best = []
-    for method, column in methods.items():
-        row = max((row for row in rows if row[column] is not None), key=lambda row: row[column])
-        at = told({path: row[path] for path in axes})
-        best.append(f"best mean PSNR of {method}: {row[column]:.2f} dB at {at}")
-    return tuple(best)
-
-
-def _drawn(rows: list[dict], axes: Sequence[str], methods: dict[str, str]) -> Figure:
-    """A panel of lines for each axis; of two axes also maps of methods that change along both."""
     changing = [m for m in methods.items() if all(_changes(rows, p, axes, m[1]) for p in axes)]
     maps = changing[:_MAPS] if len(axes) == 2 else []
     count = len(axes) + len(maps)
     columns = min(2, count)
-    figure = Figure(figsize=(5.6 * columns, 3.9 * -(-count // columns)), layout="constrained")
-    panels = list(figure.subplots(-(-count // columns), columns, squeeze=False).ravel())
+    lines = -(-count // columns)
+    figure, panels = drawing((5.6 * columns, 3.9 * lines), lines, columns, squeeze=False)
+    panels = list(panels.ravel())
     for ax in panels[count:]:
         ax.set_axis_off()
     for ax, path in zip(panels, axes, strict=False):

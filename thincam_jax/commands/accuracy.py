@@ -1,34 +1,27 @@
 """The benchmark of accuracy: errors and times of all models, and what an error costs."""
 
-import platform
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import jax
-
+from thincam_jax._core.environment import machine
 from thincam_jax._core.files import write_whole
 from thincam_jax._core.steps import Progress, Step, carry_out
-from thincam_jax._core.table import Table
 from thincam_jax.commands.checked_config import dump_config
 from thincam_jax.commands.config_file import ConfigError
-from thincam_jax.commands.doctor import usable_cores
 from thincam_jax.commands.run_folder import claim_folder, to_json
 from thincam_jax.commands.sections import SensorConfig
 from thincam_jax.commands.study.build import FileStudy, build_study, check_study
 from thincam_jax.commands.study.config import StudyConfig
 from thincam_jax.lensless.exposures import Exposure
-from thincam_jax.studies.psf_accuracy import label
 from thincam_jax.studies.psf_error_cost import (
     AccuracyResult,
     AccuracyRun,
     Case,
-    ReconstructionCosts,
     make_case,
 )
 
 _SIZES, _CAPTURE_SIZE = (128, 256, 512), 256  # by default
-_NAMES = {"beta": "β", "distance": "d"}
 
 
 class BenchFolder:
@@ -126,7 +119,7 @@ def _record(plan: Benchmark, result: AccuracyResult) -> dict[str, Any]:
         "bench": "accuracy",
         "config": dump_config(plan.study.config),
         "settings": _settings(plan),
-        "machine": _machine(),
+        "machine": machine(),
         "psfs": [asdict(row) for row in result.psfs],
         "captures": [_run_only(asdict(row)) for row in result.captures],
         "reconstructions": costs
@@ -161,48 +154,3 @@ def _numbers(exposure: Exposure) -> dict[str, Any]:
         "distance_mm": exposure.distance,
         "wavelength_mm": exposure.wavelength,
     }
-
-
-def _machine() -> dict[str, Any]:
-    """The machine that the times were measured on."""
-    device = jax.devices()[0]
-    return {
-        "platform": f"{platform.system()} {platform.machine()}",
-        "device_kind": device.device_kind,
-        "device_platform": device.platform,
-        "cores": usable_cores(),
-        "jax": jax.__version__,
-    }
-
-
-def table(result: AccuracyResult) -> Table:
-    """Every candidate at the largest size, the fastest first; those worth choosing are marked."""
-    largest = max((row.shape for row in result.psfs), key=max)
-    rows = [row for row in result.psfs if row.shape == largest]
-    shown = []
-    for row in sorted(rows, key=lambda row: row.seconds or float("inf")):
-        name = label(row.model, row.precision, row.oversampling)
-        numbers_of = row.true_error, row.predicted_error, row.seconds, row.compile_seconds
-        if None in numbers_of:
-            shown.append([name, "not run", *[None] * 4])
-            continue
-        error, predicted, seconds, compiling = (float(number or 0) for number in numbers_of)
-        told = "reference" if error == 0 else f"{error:.1e}"
-        worth = "yes" if row.worth_choosing else ""
-        times = f"{1000 * seconds:.2f}", f"{compiling:.1f}"
-        shown.append([name, told, f"{predicted:.1e}", *times, worth])
-    headings = ("PSF", "error", "predicted", "time ms", "compile s", "worth it")
-    return Table(headings, shown, title=f"{largest[0]}×{largest[1]} pixels")
-
-
-def verdict(costs: ReconstructionCosts) -> str:
-    """What a PSF error of 1 % costs, or why nothing was reconstructed."""
-    if costs.skipped:
-        return f"no reconstruction: {costs.skipped}"
-    lost = [
-        f"{row.psnr_lost_db:.4f}".replace("-", "−") + f" dB by a wrong {_NAMES[row.wrong]}"
-        for row in costs.controlled
-        if row.level == 0.01 and row.status == "run"
-    ]
-    text = " and ".join(lost) if lost else "an unknown amount"
-    return f"a PSF error of 1 % costs {costs.method} {text}"

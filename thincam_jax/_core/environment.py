@@ -1,4 +1,4 @@
-"""What a run or a bug report needs to know of the installation."""
+"""The installation: versions, devices, and whether the compiler computes right."""
 
 import contextlib
 import os
@@ -42,6 +42,18 @@ def environment(seconds: float | None = None) -> dict[str, Any]:
         "versions": versions,
         "command": ["thincam", *sys.argv[1:]],
         "seconds": None if seconds is None else round(seconds, 1),
+    }
+
+
+def machine() -> dict[str, Any]:
+    """The machine that times are measured on."""
+    device = jax.devices()[0]
+    return {
+        "platform": f"{platform.system()} {platform.machine()}",
+        "device_kind": device.device_kind,
+        "device_platform": device.platform,
+        "cores": usable_cores(),
+        "jax": jax.__version__,
     }
 
 

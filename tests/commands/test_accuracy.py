@@ -7,7 +7,7 @@ import pytest
 from commands.study import tiny
 from studies import tiny as in_python
 
-from thincam_jax.commands.accuracy import run as accuracy
+from thincam_jax.commands import accuracy
 from thincam_jax.commands.checked_config import dump_config
 from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.studies.psf_error_cost import measure_accuracy

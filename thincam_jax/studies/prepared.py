@@ -1,0 +1,162 @@
+"""Reconstruct captures that `measured.prepare` made of files, with a measured PSF."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from thincam_jax._core.memory import refuse_if_too_large
+from thincam_jax.imaging.operators import window_shape
+from thincam_jax.measured import Prepared
+from thincam_jax.reconstruction import (
+    AbstractSolver,
+    InverseProblem,
+    Psfs,
+    Reconstruction,
+    Recording,
+    reconstruct,
+)
+from thincam_jax.reconstruction.iterate import Callback
+from thincam_jax.reconstruction.methods import AbstractRegularised
+from thincam_jax.reconstruction.noise import demosaiced_noise, estimate_variance
+from thincam_jax.reconstruction.problem import relative_residual
+from thincam_jax.reconstruction.recording import centred_crop
+
+# Real arrays of the window's size that a reconstruction holds at its peak, for each channel.
+_WINDOWS = 28
+
+
+@dataclass(frozen=True)
+class PixelNoise:
+    """Noise of a prepared pixel.
+
+    - `deviation`: standard deviation in the unit of the prepared capture; `counts`: the same in
+      counts of a raw pixel.
+    - `found`: how it is known, in words.
+    """
+
+    deviation: float
+    counts: float
+    found: str
+
+
+def pixel_noise(prepared: Prepared, counts: float | None = None) -> PixelNoise:
+    """Noise of a prepared capture: of a raw pixel's `counts`, or estimated from the capture."""
+    log = prepared.log
+    full_scale = log["full_scale"]["capture"]["full_scale"]
+    # One count of a raw pixel in units of the prepared capture.
+    scale = full_scale * log["downsampling"]["factor"] * log["scaling"]["capture_divisor"]
+    of_a_count = 1 / scale
+    if counts is not None:
+        noise = counts * of_a_count
+        return PixelNoise(noise, noise / of_a_count, "given")
+    how = "estimated from the finest detail at each brightness"
+    light, valid = (jnp.asarray(array) for array in (prepared.capture, prepared.valid))
+    noise = 0.0
+    if log["demosaicing"]["method"] == "bilinear":
+        noise = float(demosaiced_noise(light, valid))
+    if noise > 0:
+        how = f"{how}, in every second pixel of each colour"
+    else:
+        noise = float(jnp.sqrt(estimate_variance([light], [valid])[0]))
+    return PixelNoise(noise, noise / of_a_count, how)
+
+
+def prepared_recording(prepared: Prepared, noise: PixelNoise | None = None) -> Recording:
+    """A prepared capture and its PSF as a recording.
+
+    - `noise`: see `pixel_noise`; None: estimated by each solver. With it the field is all that
+      sends light to the sensor.
+    """
+    # The mask is given even where all is valid, so that one compilation serves a whole folder.
+    arrays = prepared.capture, prepared.psf, prepared.valid
+    capture, psf, valid = (jnp.asarray(array)[None] for array in arrays)
+    if noise is None:
+        return Recording(capture, Psfs(psf), valid=valid)
+    psfs = Psfs(psf, field_shape=_field(prepared))
+    return Recording(capture, psfs, valid=valid, noise_variance=noise.deviation**2)
+
+
+def _field(prepared: Prepared) -> tuple[int, int]:
+    *_, rows, columns = prepared.capture.shape  # those of the PSF as well
+    return 2 * rows - 1, 2 * columns - 1
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedResult:
+    """The reconstruction of a prepared capture, over all that sends light to the sensor."""
+
+    recording: Recording
+    solver: AbstractSolver
+    found: Reconstruction
+    noise: PixelNoise
+
+    def image(
+        self, field: Literal["sensor", "full"] = "sensor"
+    ) -> Float[np.ndarray, "channel y x"]:
+        """The image in float32: the part in front of the sensor, or all of it."""
+        sensor = self.recording.captures[0].shape[-2:]
+        image = self.found.image
+        image = image if field == "full" else centred_crop(image, sensor)
+        return np.asarray(image, dtype=np.float32)
+
+    @cached_property
+    def problem(self) -> InverseProblem:
+        """The least-squares problem that was solved."""
+        if isinstance(self.solver, AbstractRegularised):
+            return self.recording.problem(tau=self.solver.tau, regulariser=self.solver.prior)
+        return self.recording.problem(tau=2.0)
+
+    @property
+    def pixel_deviation(self) -> float:
+        """Standard deviation of the noise of a trusted pixel, whose weight is 1/σ²."""
+        return float(1 / jnp.sqrt(jnp.max(self.problem.weights[0])))
+
+    @property
+    def relative_residual(self) -> float:
+        """Norm of what the image leaves unexplained, over that of the capture."""
+        return float(relative_residual(self.problem, self.found.image[:, None]))
+
+
+def reconstruct_prepared(
+    prepared: Prepared,
+    solver: AbstractSolver,
+    noise: PixelNoise,
+    *,
+    callback: Callback | None = None,
+    name: str = "the capture",
+) -> PreparedResult:
+    """Reconstruct all that sends light to the sensor, every channel of a prepared capture.
+
+    - `noise`: see `pixel_noise`. `callback`: as of `tc.reconstruct`.
+    - `name`: of the capture, for messages.
+
+    ```python
+    import numpy as np
+    import thincam_jax as tc
+    from thincam_jax.measured import Raw, prepare
+    from thincam_jax.studies.prepared import pixel_noise, reconstruct_prepared
+
+    random = np.random.default_rng(0)
+    psf, capture = (Raw(random.integers(40, 4000, (40, 48, 1)).astype(np.uint16)) for _ in "ab")
+    prepared = prepare(psf, capture, 40.0)
+    found = reconstruct_prepared(prepared, tc.AdmmTV(iterations=5), pixel_noise(prepared))
+    image = found.image()  # (channel, y, x)
+    ```
+
+    **Errors**: MemoryError, one line, where it would take more than is free.
+    """
+    channels, *sensor = prepared.capture.shape
+    sensor, field = (sensor[0], sensor[1]), _field(prepared)
+    window = window_shape(sensor, field, sensor)
+    refuse_if_too_large(
+        f"{name}: its reconstruction on {window[0]}×{window[1]} samples",
+        4 * _WINDOWS * channels * window[0] * window[1],
+        "give a larger downsample",
+    )
+    recording = prepared_recording(prepared, noise)
+    found = reconstruct(recording, solver, callback=callback)
+    return PreparedResult(recording, solver, found, noise)

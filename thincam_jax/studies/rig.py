@@ -1,0 +1,246 @@
+"""Captures of a rig: their image or system matrix, beside those of a direct simulation.
+
+A virtual rig renders its frames by another model than these simulations: where frames and images
+agree within the noise, the rig's geometry, electronics and bookkeeping are right.
+"""
+
+import math
+import shutil
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float
+
+from thincam_jax import waveguide as wg
+from thincam_jax._core.grids import Grid
+from thincam_jax.imaging.metrics import psnr
+from thincam_jax.imaging.operators import ReducedMatrix, Sparse
+from thincam_jax.measured import calibration
+from thincam_jax.reconstruction import Reconstruction
+from thincam_jax.reconstruction.noise import estimate_noise
+from thincam_jax.studies.evaluate import reconstructor, rounded, sample
+from thincam_jax.studies.screen_calibration import diagonal_cells
+from thincam_jax.studies.simulate import noise_free
+from thincam_jax.studies.study import Study
+
+Pixels = tuple[slice, slice]
+FrameSolver = Callable[[Float[np.ndarray, "capture y x"]], Reconstruction]
+
+
+@dataclass(frozen=True)
+class CountingCamera:
+    """What a camera makes of light, for the noise of its frames.
+
+    - `counts`: of a unit of the noise-free image; `electron`: counts of an electron.
+    - `read_noise`: in electrons; `offset`: counts that were not subtracted.
+    """
+
+    counts: float
+    electron: float
+    read_noise: float
+    offset: float = 0.0
+
+    def variance(self, counts: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+        """Of a frame whose noise-free counts, without the offset, are given."""
+        return self.electron * counts + (self.electron * self.read_noise) ** 2 + 1 / 12
+
+
+def frame_solver(study: Study, shape: tuple[int, int]) -> FrameSolver:
+    """The function that reconstructs frames (capture, y, x) by the first method of a study.
+
+    - `shape`: pixels (rows, columns) of the image. The noise is estimated from the frames.
+    """
+    solve = reconstructor(study, study.methods[0], shape, study.object_distance)
+
+    def solved(frames: Float[np.ndarray, "capture y x"]) -> Reconstruction:
+        captures = jnp.asarray(frames[:, None], jnp.float32)
+        return solve(captures, estimate_noise(captures) ** 2)
+
+    return solved
+
+
+@dataclass(frozen=True, eq=False)
+class RigFrames:
+    """Frames of a rig, and the camera that took them.
+
+    - `frames`: counts without the mean of so many `dark_frames`.
+    - `pixels`: part of the sensor that was read, rows and columns.
+    - `lit`: pixels of that part that see light.
+    """
+
+    frames: Float[np.ndarray, "capture y x"]
+    camera: CountingCamera
+    pixels: Pixels
+    lit: Bool[np.ndarray, "y x"]
+    dark_frames: int = 0
+
+
+@dataclass(frozen=True)
+class FrameAgreement:
+    """Differences between a rig and a direct simulation, over the noise: 1 is agreement.
+
+    Of each frame the standard deviation and the mean; of the image, its noise over that of a
+    simulated one.
+    """
+
+    frame_residual_over_noise: list[float]
+    frame_bias_over_noise: list[float]
+    image_noise_over_simulated: float
+
+
+@dataclass(frozen=True, eq=False)
+class FrameComparison:
+    """Images "captured", "simulated" and "without noise", their PSNR, dB, and the agreement."""
+
+    images: dict[str, Reconstruction]
+    psnr_db: dict[str, float | None]
+    agreement: FrameAgreement
+
+
+def compare_frames(
+    study: Study, rig: RigFrames, solve: FrameSolver, captured: Reconstruction, seed: int = 0
+) -> FrameComparison:
+    """Compare frames and their image with a direct simulation of the same exposures.
+
+    - `study`: of the whole sensor, whose first target the rig looked at.
+    - `solve`: see `frame_solver`; `captured`: what it makes of the rig's frames.
+    """
+    camera, target = rig.camera, study.targets[0]
+    clean = camera.counts * np.stack(
+        [
+            np.asarray(noise_free(study, exposure, target.plane))[rig.pixels]
+            for exposure in study.methods[0].exposures
+        ]
+    )
+    variance, dark = camera.variance(clean), np.zeros(clean.shape[1:])
+    if rig.dark_frames:
+        dark = camera.variance(dark) / rig.dark_frames
+    residual = (rig.frames - clean - camera.offset) / np.sqrt(variance + dark)
+    of_each = residual[:, rig.lit]
+    random = np.random.default_rng(seed + 1)
+
+    def simulated(noise: float) -> Reconstruction:
+        frames = np.sqrt(variance) * random.standard_normal(clean.shape)
+        frames += np.sqrt(dark) * random.standard_normal(dark.shape)  # the same in all
+        frames = noise * frames + clean + camera.offset
+        return solve(frames.astype(np.float32))
+
+    images = {"captured": captured}
+    images |= {"simulated": simulated(1.0), "without noise": simulated(0.0)}
+    pixels = {name: np.squeeze(np.asarray(one.image, float)) for name, one in images.items()}
+    grid = Grid(pixels["captured"].shape, jnp.asarray(captured.pitch))
+    truth = np.asarray(sample(target.plane, grid), float)
+    scores = {name: rounded(psnr(image, truth)) for name, image in pixels.items()}
+    noise = [np.std(pixels[n] - pixels["without noise"]) for n in ("captured", "simulated")]
+    agreement = FrameAgreement(
+        [round(float(np.std(z)), 4) for z in of_each],
+        [round(float(np.mean(z)), 4) for z in of_each],
+        round(float(noise[0] / noise[1]), 4),
+    )
+    return FrameComparison(images, scores, agreement)
+
+
+def monitor_system(
+    camera: wg.SeeThroughCamera,
+    plane: wg.ObjectPlane,
+    orders: int = 4,
+    band_samples: int | None = None,
+) -> Sparse:
+    """The matrix from a monitor's cells to the sensor: 1 where a white monitor is brightest.
+
+    **Errors**: ValueError for a screen that guides no light, or none of the monitor's.
+    """
+    wg.check_screen(camera)
+    system = wg.system_operator(camera, plane, orders, band_samples)
+    assert isinstance(system, Sparse)
+    brightest = float(jnp.max(system(jnp.ones(plane.shape, system.values.dtype))))
+    if not brightest > 0:
+        raise ValueError("no light from the monitor reaches the sensor")
+    return eqx.tree_at(lambda s: s.values, system, system.values / brightest)
+
+
+@dataclass(frozen=True)
+class MatrixAgreement:
+    """A measured matrix beside the exact one: residual over noise (1 is agreement), and counts."""
+
+    matrix_residual_over_noise: float
+    largest_counts: float
+    noise_counts: float
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredMatrix:
+    """The system matrix of Hadamard captures.
+
+    - `shape`: pixels and cells. `seconds`: to recover, reduce and compare it.
+    - `columns`: frames of the `cells` (row, column) alone, in counts, as "measured" and "exact".
+    """
+
+    shape: tuple[int, int]
+    cells: list[tuple[int, int]]
+    columns: dict[str, Float[np.ndarray, "cell y x"]]
+    agreement: MatrixAgreement | None
+    seconds: float
+
+
+def recover_to(
+    folder: Path,
+    captures: calibration.HadamardCaptures,
+    exact: tuple[Sparse, CountingCamera, Pixels] | None = None,
+) -> MeasuredMatrix:
+    """Recover the matrix of captures into a folder, block by block: matrix.zarr, reduced.npz.
+
+    - `exact`: of a virtual rig, its system (see `monitor_system`), its camera, and the part of the
+      sensor that was read; the matrix is compared with it.
+    """
+    path, shape = folder / "matrix.zarr", captures.series.object_shape
+    shutil.rmtree(path, ignore_errors=True)  # of an interrupted run
+    began = time.perf_counter()
+    calibration.write_matrix(captures, path)
+    matrix = calibration.open_matrix(path)
+    ReducedMatrix.of(matrix, shape).save(folder / "reduced.npz", matrix)
+    cells, pixel_count = diagonal_cells(shape), math.prod(captures.sensor_shape)
+    numbers = [row * shape[1] + column for row, column in cells]
+    columns = np.empty((len(cells), pixel_count), np.float32)
+    known = None if exact is None else _exact_matrix(captures, *exact)
+    total, count = 0.0, 0
+    for pixels, block in calibration.stored_blocks(path):
+        columns[:, pixels] = block[:, numbers].T
+        if known is not None:
+            matrix, deviation = known
+            left = (block - matrix[pixels].toarray()) / deviation[pixels, None]
+            # The first column takes the offset and the white frame: it is told by the others.
+            total += float(np.sum(left[:, 1:] ** 2, dtype=np.float64))
+            count += left[:, 1:].size
+    images, agreement = {"measured": columns}, None
+    if known is not None:
+        matrix, deviation = known
+        images["exact"] = np.asarray(matrix[:, numbers].toarray(), np.float32).T
+        agreement = MatrixAgreement(
+            round(math.sqrt(total / count), 4),
+            round(float(abs(matrix).max()), 3),
+            round(float(np.sqrt(np.mean(deviation**2))), 4),
+        )
+    stacks = {
+        name: image.reshape(len(cells), *captures.sensor_shape) for name, image in images.items()
+    }
+    seconds = round(time.perf_counter() - began, 2)
+    whole = pixel_count, captures.series.cell_count
+    return MeasuredMatrix(whole, cells, stacks, agreement, seconds)
+
+
+def _exact_matrix(
+    captures: calibration.HadamardCaptures, system: Sparse, camera: CountingCamera, pixels: Pixels
+):
+    """The matrix of direct simulation in counts, and the noise of each pixel's entries."""
+    numbers = np.arange(math.prod(system.out_shape)).reshape(system.out_shape)
+    matrix = camera.counts * system.by_rows()[numbers[pixels].ravel()]
+    mean = np.asarray(matrix.sum(axis=1), float).ravel() / 2  # half of the cells are lit
+    of_an_entry = 2 if captures.series.display == "complementary" else 4
+    variance = of_an_entry * camera.variance(mean) / captures.series.cell_count
+    return matrix, np.sqrt(variance)
