@@ -118,7 +118,7 @@ def _once(faults: list[tuple[str, str, str]], asked: dict[tuple, str]) -> list[s
 
 def _fault(error: Any, places: dict, asked: dict, top: str, model: Any) -> tuple[str, str, str]:
     """Place, field, and what is wrong and what is allowed."""
-    location = (*error["loc"], *error.get("ctx", {}).get("place", ()))
+    location = (*error["loc"], *getattr(error.get("ctx", {}).get("error"), "place", ()))
     if error["type"] == "invalid_key":
         location = (*location[:-1], str(location[-1]))
     field = _dotted(location) or "the file"
@@ -142,7 +142,7 @@ def _message(error: Any, location: tuple, model: Any) -> str:
     if kind in _WORDS:
         return _WORDS[kind].format(given=_short(given))
     message = error["msg"].removeprefix("Value error, ")
-    if kind in ("value_error", "misfit"):
+    if kind == "value_error":
         return message
     return f"{_short(given)}: {message[0].lower()}{message[1:]}"
 

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from thincam_jax._core.quantity import quantities, quantity, whole
+from thincam_jax._core.quantity import FieldError, quantities, quantity, whole
 from thincam_jax.design.design import MOST_CAPTURES, Design
 
 _WITHIN = 1e-3  # distance in the cube below which a limit is active
@@ -237,48 +237,57 @@ def _reason(space: DesignSpace, variable: Variable, value) -> str:
 
 def _check_variables(base: Design, variables: tuple[Variable, ...]) -> None:
     if not variables:
-        raise ValueError("no variable is free; give at least one to search for")
+        raise FieldError("no variable is free; give at least one to search for", "variables")
     taken: set[tuple[str, int]] = set()
     for v in variables:
         if v.name not in QUANTITIES:
             known = ", ".join(QUANTITIES)
-            raise ValueError(f"variable {v.name!r} is unknown; choose one of {known}")
+            raise FieldError(f"variable {v.name!r} is unknown; choose one of {known}", "variables")
         if not (math.isfinite(v.lower) and math.isfinite(v.upper) and v.lower <= v.upper):
-            raise ValueError(
+            raise FieldError(
                 f"bounds of {v.label()} cross: {v.lower:g} to {v.upper:g} {v.unit}; "
-                "give the lower one first"
+                "give the lower one first",
+                "variables",
             )
         if v.lower <= 0 and v.name != "phase":
-            raise ValueError(
-                f"bounds of {v.label()} begin at {v.lower:g} {v.unit}; give a lower bound above 0"
+            raise FieldError(
+                f"bounds of {v.label()} begin at {v.lower:g} {v.unit}; give a lower bound above 0",
+                "variables",
             )
         if bool(v.captures) == (v.name == "width"):
-            raise ValueError(
+            raise FieldError(
                 f"{v.label()}: all captures share the width, and any other variable needs the "
-                "captures it belongs to"
+                "captures it belongs to",
+                "variables",
             )
         if any(not 0 <= c < base.captures for c in v.captures):
-            raise ValueError(f"{v.label()}: the design has captures 1 to {base.captures}")
+            raise FieldError(
+                f"{v.label()}: the design has captures 1 to {base.captures}", "variables"
+            )
         keys = {(v.name, c) for c in v.captures or (-1,)}
         if keys & taken:
-            raise ValueError(f"{v.label()} is free twice; let each number be free once")
+            raise FieldError(
+                f"{v.label()} is free twice; let each number be free once", "variables"
+            )
         taken |= keys
 
 
 def _check_limits(base: Design, variables: tuple[Variable, ...], limits: Limits) -> None:
     """Refuse limits that exclude each other, naming the two."""
     if base.captures > limits.captures:
-        raise ValueError(
+        raise FieldError(
             f"no design is feasible: it takes {base.captures} captures, and the budget is "
-            f"{limits.captures}; allow more, or drop captures"
+            f"{limits.captures}; allow more, or drop captures",
+            "limits",
         )
     if limits.thickness is not None:
         for shortest, label in _lowest(base, variables, "distance"):
             # In single precision a number may lie a rounding above its own limit.
             if shortest > limits.thickness * (1 + 1e-6):
-                raise ValueError(
+                raise FieldError(
                     f"no design is feasible: {label} ≥ {shortest:g} mm conflicts with a thickness "
-                    f"of at most {limits.thickness:g} mm"
+                    f"of at most {limits.thickness:g} mm",
+                    "limits",
                 )
     if limits.mask_pixel is not None:
         widths = [v for v in variables if v.name == "width"]
@@ -287,17 +296,19 @@ def _check_limits(base: Design, variables: tuple[Variable, ...], limits: Limits)
         finest = math.pi / limits.mask_pixel / width
         for lowest, label in _lowest(base, variables, "beta"):
             if lowest > finest * (1 + 1e-6):
-                raise ValueError(
+                raise FieldError(
                     f"no design is feasible: {label} ≥ {lowest:g} rad/mm^2 conflicts with mask "
                     f"pixels of {limits.mask_pixel:g} mm, which over a width of {width:g} mm show "
-                    f"at most {finest:.4g} rad/mm^2"
+                    f"at most {finest:.4g} rad/mm^2",
+                    "limits",
                 )
         reach = max(low for low, _ in _lowest(base, variables, "beta"))
         if widest > math.pi / limits.mask_pixel / reach * (1 + 1e-6):
-            raise ValueError(
+            raise FieldError(
                 f"width ≤ {widest:g} mm conflicts with beta ≥ {reach:g} rad/mm^2 on mask pixels of "
                 f"{limits.mask_pixel:g} mm; give a width of at most "
-                f"{math.pi / limits.mask_pixel / reach:.4g} mm"
+                f"{math.pi / limits.mask_pixel / reach:.4g} mm",
+                "limits",
             )
 
 
@@ -307,16 +318,18 @@ def _check_exposure(base: Design, variables: tuple[Variable, ...], limits: Limit
         return
     free = [v for v in variables if v.name == "exposure"]
     if sum(len(v.captures) for v in free) == base.captures:
-        raise ValueError(
+        raise FieldError(
             f"the exposure of every capture is free, and all of them share {limits.exposure:g}; "
-            "leave at least one that takes the rest"
+            "leave at least one that takes the rest",
+            "variables",
         )
     most = sum(v.upper * len(v.captures) for v in free)
     if most >= limits.exposure * (1 - 1e-6):
-        raise ValueError(
+        raise FieldError(
             f"no design is feasible: free exposures of up to {most:g} shares conflict with the "
             f"{limits.exposure:g} that all captures have; end their bounds lower, so that the "
-            "others have some"
+            "others have some",
+            "limits",
         )
 
 

@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal, get_args
 import pydantic
 from pydantic import Field
 
+from thincam_jax._core.quantity import FieldError
 from thincam_jax.commands.checked_config import load_as
 from thincam_jax.commands.config_file import ConfigError, read_raw, slug
 from thincam_jax.commands.design.config_pareto import ParetoConfig, check_pareto
@@ -24,7 +25,6 @@ from thincam_jax.commands.sections import (
     ShotConfig,
     TargetConfig,
     check_names,
-    misfit,
 )
 from thincam_jax.design import (
     Design,
@@ -171,7 +171,7 @@ class FreeConfig(Section):
     @pydantic.model_validator(mode="after")
     def _belongs(self):
         if self.shots is not None and len(set(self.shots)) < len(self.shots):
-            raise misfit("holds a shot twice; give each once", "shots")
+            raise FieldError("holds a shot twice; give each once", "shots")
         if self.variable == "width" and (self.shared or self.shots is not None):
             raise ValueError("all masks share the width; drop 'shared' and 'shots'")
         return self
@@ -325,11 +325,12 @@ class DesignConfig(LenslessConfig):
         _check_search(self)
         if self.prior.measured and not self.pictures():
             message = "measured needs a photograph among the targets; give prior.exponent instead"
-            raise misfit(message, "prior", "measured")
+            raise FieldError(message, "prior", "measured")
         try:
             self.space()
-        except ValueError as error:
-            raise misfit(str(error), "search", _blamed(str(error))) from None
+        except FieldError as error:
+            field = "limits" if error.field == "limits" else "free"
+            raise FieldError(str(error), "search", field) from None
         if self.pareto is not None:
             check_pareto(self)
         return self
@@ -388,7 +389,7 @@ def _check_given(config: DesignConfig) -> None:
         count = len(config.reference.shots)
         if len(rival.shots) != count:
             message = f"{len(rival.shots)} shots, and the reference has {count}; give as many"
-            raise misfit(message, *place, "shots")
+            raise FieldError(message, *place, "shots")
 
 
 def _check_shots(
@@ -396,7 +397,7 @@ def _check_shots(
 ) -> None:
     shots = [(s.beta, s.distance) for s in given.shots]
     if len(set(shots)) < len(shots):
-        raise misfit("shots hold an entry twice; give each once", *place, "shots")
+        raise FieldError("shots hold an entry twice; give each once", *place, "shots")
     for index, shot in enumerate(given.shots):
         shared = {
             "wavelength": config.wavelength,
@@ -407,10 +408,10 @@ def _check_shots(
         for key, own in shared.items():
             if getattr(shot, key) not in (None, own):
                 message = f"the {key} is that of the whole file; drop this one"
-                raise misfit(message, *place, "shots", index, key)
+                raise FieldError(message, *place, "shots", index, key)
     if slug(given.name) in taken:
         message = f"{given.name!r} is what another or a found design is called; choose another name"
-        raise misfit(message, *place, "name")
+        raise FieldError(message, *place, "name")
 
 
 def _check_search(config: DesignConfig) -> None:
@@ -421,13 +422,13 @@ def _check_search(config: DesignConfig) -> None:
             f"{finest:g} mm is finer than the display's pixels of {pixel:g} mm (mask.pixel_pitch); "
             "give at least these"
         )
-        raise misfit(message, "search", "limits", "mask_pixel")
+        raise FieldError(message, "search", "limits", "mask_pixel")
     if config.frees("exposure") and config.noise.electrons is None:
         message = (
             "how the exposure is divided matters to noise that counts electrons; give "
             "noise.read_noise and noise.electrons, or do not free it"
         )
-        raise misfit(message, "search", "free")
+        raise FieldError(message, "search", "free")
     _check_exposures(config)
 
 
@@ -443,20 +444,13 @@ def _check_exposures(config: DesignConfig) -> None:
         )
         if len(every) == 1:
             message = "the exposure of the only shot is that of the reference; do not free it"
-        raise misfit(message, "search", "free")
+        raise FieldError(message, "search", "free")
     if free and sum(bounds.values()) >= len(every) * (1 - 1e-6):
-        raise misfit(
+        raise FieldError(
             f"exposures of up to {sum(bounds.values()):g} leave the other shots nothing of the "
             f"{len(every)} that all have; end these bounds lower",
             *("search", "free"),
         )
-
-
-def _blamed(message: str) -> str:
-    """The entry of `search` that a message of the space is about."""
-    if "conflicts" in message or "feasible" in message:
-        return "limits"
-    return "free"
 
 
 def load_design(path: str | Path, overrides: tuple[str, ...] = ()) -> DesignConfig:

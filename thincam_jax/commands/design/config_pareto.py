@@ -7,7 +7,8 @@ import numpy as np
 import pydantic
 from pydantic import AfterValidator, Field
 
-from thincam_jax.commands.sections import Length, Section, misfit
+from thincam_jax._core.quantity import FieldError
+from thincam_jax.commands.sections import Length, Section
 
 Count = Annotated[int, Field(ge=1, le=8, strict=True)]
 Points = Annotated[int, Field(ge=2, le=100)]
@@ -124,7 +125,7 @@ def check_pareto(config: Any) -> None:
             "light needs noise that counts electrons, and snr_db is the same at any light; give "
             "noise.read_noise and noise.electrons, or drop this front"
         )
-        raise misfit(message, "pareto", "light")
+        raise FieldError(message, "pareto", "light")
 
 
 def _check_thickness(config: Any, front: ThicknessConfig) -> None:
@@ -132,18 +133,18 @@ def _check_thickness(config: Any, front: ThicknessConfig) -> None:
     free = _free_distances(config)
     if not free:
         message = "no distance is free; give search.free a distance, or drop this front"
-        raise misfit(message, *place)
+        raise FieldError(message, *place)
     thinnest, thickest = front.bounds
     for number, shot in enumerate(config.reference.shots, 1):
         if number in free and free[number][0] > thinnest:
-            raise misfit(
+            raise FieldError(
                 f"no design is feasible at {thinnest:g} mm: the distance of shot {number} is free "
                 f"from {free[number][0]:g} mm only; begin there, or lower its bound",
                 *place,
                 "bounds",
             )
         if number not in free and shot.distance > thinnest:
-            raise misfit(
+            raise FieldError(
                 f"no design is feasible at {thinnest:g} mm: the distance of shot {number}, "
                 f"{shot.distance:g} mm, is not free; free it, or begin there",
                 *place,
@@ -152,7 +153,7 @@ def _check_thickness(config: Any, front: ThicknessConfig) -> None:
     limit = config.search.limits.thickness or math.inf
     longest = min(limit, max(upper for _, upper in free.values()))
     if thickest > longest * (1 + 1e-9):
-        raise misfit(
+        raise FieldError(
             f"bounds reach to {thickest:g} mm, and no free distance beyond {longest:g} mm; end "
             "there, or raise search.free and search.limits.thickness",
             *place,
@@ -173,7 +174,7 @@ def _check_captures(config: Any, front: CapturesConfig) -> None:
     allowed = config.search.limits.captures
     most = front.shots[-1]
     if most * phases > allowed:
-        raise misfit(
+        raise FieldError(
             f"{most} shots take {most * phases} captures, and search.limits.captures allows "
             f"{allowed}; give at most {allowed // phases} shots",
             *place,
@@ -183,10 +184,10 @@ def _check_captures(config: Any, front: CapturesConfig) -> None:
         message = (
             "the captures of this front share the exposure evenly, and search.free has it; drop one"
         )
-        raise misfit(message, *place)
+        raise FieldError(message, *place)
     if not with_shots(config, front.shots[0]).search.free:
         message = f"of the first shots, {front.shots[0]}, nothing is free; give more, or free them"
-        raise misfit(message, *place, "shots")
+        raise FieldError(message, *place, "shots")
     if not config.pictures():
         message = "PSNR needs a photograph among the targets; give one, or drop this front"
-        raise misfit(message, *place)
+        raise FieldError(message, *place)

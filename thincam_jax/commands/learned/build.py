@@ -1,6 +1,5 @@
 """From an experiment file of `kind: learned` to its camera, network and lessons."""
 
-import dataclasses
 import functools
 import operator
 from collections.abc import Callable
@@ -11,24 +10,20 @@ import jax
 from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.learned.config import LearnedConfig, SourceConfig
 from thincam_jax.learn.refocusing.cameras import RefocusCamera
-from thincam_jax.learn.refocusing.network import NetworkOptions, RefocusNetwork
-from thincam_jax.learn.refocusing.scenes import SceneOptions
+from thincam_jax.learn.refocusing.network import RefocusNetwork
 from thincam_jax.learn.refocusing.sources import Source, drawn, photographs, samples
 from thincam_jax.learn.refocusing.train import Lessons
 from thincam_jax.learn.training import TrainingOptions
 from thincam_jax.lensless.camera import LenslessCamera
-from thincam_jax.lensless.masks.fza import FresnelZoneAperture
 
 Found = TypeVar("Found")
 
 
 def build_camera(config: LearnedConfig) -> RefocusCamera:
     """**Errors**: ConfigError, one line, for numbers that do not make a camera."""
-    mask = {name: value for name, value in dict(config.mask).items() if name != "beta"}
     focus = config.focus
     try:
-        aperture = FresnelZoneAperture(config.mask.beta, **mask)
-        camera = LenslessCamera(aperture, config.sensor.build(), config.distance)
+        camera = LenslessCamera(config.mask.build(), config.sensor.build(), config.distance)
         return RefocusCamera(
             camera,
             config.wavelength,
@@ -45,8 +40,8 @@ def build_camera(config: LearnedConfig) -> RefocusCamera:
 
 def build_network(config: LearnedConfig) -> RefocusNetwork:
     """Untrained, by the seed of the file."""
-    options = NetworkOptions(**dict(config.network))
-    return RefocusNetwork.create(build_camera(config), options, key=jax.random.key(config.seed))
+    key = jax.random.key(config.seed)
+    return RefocusNetwork.create(build_camera(config), config.network.build(), key=key)
 
 
 def build_lessons(config: LearnedConfig) -> Lessons:
@@ -57,9 +52,8 @@ def build_lessons(config: LearnedConfig) -> Lessons:
         of_use[source.use].append(read)
     train, judge = (functools.reduce(operator.add, s) if s else None for s in of_use.values())
     assert train is not None  # the sections are checked
-    scenes = {name: value for name, value in dict(config.scenes).items() if name != "side"}
-    told = {name: getattr(config.training, name) for name in ("batch", "pool", "judged")}
-    return Lessons(train, SceneOptions(**scenes), held_out=judge, **told)
+    scenes = config.scenes.build()
+    return config.training.build(Lessons, source=train, scenes=scenes, held_out=judge)
 
 
 def read_sources(config: Any, read: Callable[[Any], Found]) -> list[Found]:
@@ -80,10 +74,8 @@ def read_sources(config: Any, read: Callable[[Any], Found]) -> list[Found]:
 
 
 def build_options(config: Any) -> TrainingOptions:
-    """Length and rate of a training, as far as the section `training` of a file has them."""
-    names = {field.name for field in dataclasses.fields(TrainingOptions)}
-    given = {name: value for name, value in dict(config.training).items() if name in names}
-    return TrainingOptions(seed=config.seed, **given)
+    """Length and rate of a training."""
+    return config.training.build(TrainingOptions, seed=config.seed)
 
 
 def _read(source: SourceConfig, side: int) -> Source:

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from thincam_jax.commands.terminal import Overrides, progress_bar, told
+from thincam_jax.commands.terminal import DryRun, Overrides, progress_bar, told
 
 if TYPE_CHECKING:
     from thincam_jax.learn.training import TrainingProgress
@@ -22,6 +22,7 @@ def train(
         bool, typer.Option("--resume", help="Go on with the training that the folder holds.")
     ] = False,
     set_: Overrides = None,
+    dry_run: DryRun = False,
 ) -> None:
     """Train a network that refocuses the captures of a camera, or a denoiser.
 
@@ -30,13 +31,19 @@ def train(
     """
     goes_on = "interrupted; what the last check has written is kept: --resume goes on from there"
     with told(lambda: goes_on):
+        from thincam_jax.commands import explain
         from thincam_jax.commands.config_file import slug
         from thincam_jax.commands.kinds import kind_of, load_experiment
-        from thincam_jax.commands.learned.run import TrainingFolder
+        from thincam_jax.commands.learned.run import TrainingFolder, check_resume
 
         asked = load_experiment(config, tuple(set_ or ()), "train")
         kind = kind_of(asked)
         folder = TrainingFolder(out or Path("runs") / slug(asked.name))
+        if dry_run:
+            check_resume(folder, resume)
+            kind.part(kind.build)(asked)
+            explain.dry_run(asked, folder.outcome(asked))
+            return
         with progress_bar("{task.fields[loss]}") as bar:
             task = bar.add_task(asked.name, total=asked.training.steps, loss="")
 

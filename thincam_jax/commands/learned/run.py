@@ -20,7 +20,7 @@ from thincam_jax.imaging.metrics import psnr, ssim
 from thincam_jax.learn.checkpoint import CheckpointError
 from thincam_jax.learn.refocusing.network import RefocusNetwork
 from thincam_jax.learn.refocusing.scenes import Batch
-from thincam_jax.learn.refocusing.train import NETWORK, STATE, Lessons, train
+from thincam_jax.learn.refocusing.train import NETWORK, Lessons, train
 from thincam_jax.learn.refocusing.unet import parameter_count
 from thincam_jax.learn.refocusing.use import Reading, read
 from thincam_jax.learn.training import Trained, TrainingProgress
@@ -39,6 +39,7 @@ class TrainingFolder(RunFolder):
     """
 
     kind, folders, result = "training", ("figures",), "training.json"
+    others = (NETWORK,)
 
 
 def run_training(
@@ -56,7 +57,7 @@ def run_training(
     other way round, or holds a damaged state.
     """
     started = time.time()
-    check_resume(folder, STATE.format(1), resume)
+    check_resume(folder, resume)
     network, lessons = build_network(config), build_lessons(config)
     folder.claim(config)
     try:
@@ -67,16 +68,16 @@ def run_training(
     return _report(config, folder, lessons, network, trained, started)
 
 
-def check_resume(folder: TrainingFolder, name: str, resume: bool) -> None:
-    """**Errors**: ConfigError where the folder's state of that name is there and `resume` is not
-    asked for, or the other way round."""
-    state = folder.path / name
-    if state.exists() and not resume:
+def check_resume(folder: TrainingFolder, resume: bool) -> None:
+    """**Errors**: ConfigError where the folder has a state and `resume` is not asked for, or the
+    other way round."""
+    begun = any(folder.path.glob("training*.state"))
+    if begun and not resume:
         raise ConfigError(
             f"--out {folder.path}: holds a training; give --resume to go on with it, or another "
             "folder"
         )
-    if resume and not state.exists():
+    if resume and not begun:
         raise ConfigError(f"--resume: {folder.path} holds no training yet; leave it out")
 
 

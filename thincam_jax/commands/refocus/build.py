@@ -7,7 +7,7 @@ from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.refocus.config import RefocusConfig
 from thincam_jax.commands.study.build import assemble, read_picture
 from thincam_jax.imaging.targets import middle_square
-from thincam_jax.studies.refocus import FocusRange, RefocusStudy, SceneObject, place
+from thincam_jax.studies.refocus import RefocusStudy, place
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,13 +38,10 @@ def build_refocus(config: RefocusConfig) -> FileRefocus:
             picture = read_picture(placed)
             if placed.crop < 1:
                 picture = middle_square(picture, round(placed.crop * min(picture.shape[:2])))
-            seen = SceneObject(
-                placed.name, picture, placed.distance, placed.width, placed.x, placed.y
-            )
+            seen = placed.build(name=placed.name, picture=picture)
             objects.append(place(study, number, seen))
         except (ValueError, FileNotFoundError) as error:
             faults.append(f"objects[{number}]: {error}")
     if faults:
         raise ConfigError("\n".join(faults))
-    sweep = FocusRange(**dict(config.sweep))
-    return FileRefocus(replace(study, targets=tuple(objects)), sweep, config)
+    return FileRefocus(replace(study, targets=tuple(objects)), config.sweep.build(), config)

@@ -9,7 +9,6 @@ import numpy as np
 from thincam_jax import waveguide as wg
 from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.screen.config import (
-    CalibrationConfig,
     RectangleConfig,
     ScreenConfig,
     ScreenMethodConfig,
@@ -18,8 +17,7 @@ from thincam_jax.commands.screen.config import (
 from thincam_jax.commands.sections import VariationConfig
 from thincam_jax.commands.study.build import build_noise, picture
 from thincam_jax.reconstruction import AbstractSolver, AdmmTV, Ridge, TotalVariation
-from thincam_jax.studies.screen import ScreenModel, ScreenStudy
-from thincam_jax.studies.screen_calibration import Calibration
+from thincam_jax.studies.screen import ScreenStudy
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +48,7 @@ def build_screen(config: ScreenConfig) -> FileScreen:
         targets,
         noise,
         {method.name: build_solver(method) for method in config.methods},
-        tuple(ScreenModel(m.name, m.mistake, m.glass_thickness) for m in config.models),
+        tuple(model.build(name=model.name) for model in config.models),
         config.orders,
         config.band_samples,
         (config.hologram.object_angle, config.hologram.reference_angle),
@@ -65,11 +63,6 @@ def build_screen(config: ScreenConfig) -> FileScreen:
     if faults:
         raise ConfigError("\n".join(faults))
     return study
-
-
-def build_calibration(config: CalibrationConfig) -> Calibration:
-    """How the camera of a file is calibrated."""
-    return Calibration(**dict(config))
 
 
 def build_plane(config: SeeThroughConfig) -> wg.ObjectPlane:

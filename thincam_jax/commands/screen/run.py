@@ -10,7 +10,7 @@ import numpy as np
 from thincam_jax.commands.config_file import slug
 from thincam_jax.commands.run_folder import Progress, Run, RunFolder
 from thincam_jax.commands.screen import figures, report
-from thincam_jax.commands.screen.build import FileScreen, build_calibration
+from thincam_jax.commands.screen.build import FileScreen
 from thincam_jax.commands.study.figures import save_figure, save_image
 from thincam_jax.studies.screen import ModelResult, ScreenResult, ScreenRun, summarise_rays
 from thincam_jax.studies.screen_calibration import MEASURED, CalibrationRun
@@ -33,7 +33,7 @@ class _ScreenRun(Run):
         self.study, self.models, self.calibration = study, ScreenRun(study), None
         self.work += self.models.work
         if self.config.calibration is not None:
-            calibration = build_calibration(self.config.calibration)
+            calibration = self.config.calibration.build()
             self.calibration = CalibrationRun(study, calibration, folder.path)
             self.work += self.calibration.work
         self.add("report", self.report)

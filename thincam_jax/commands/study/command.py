@@ -5,7 +5,7 @@ from typing import Annotated, Any
 
 import typer
 
-from thincam_jax.commands.terminal import ConfigFile, Overrides, counted, show, told, warn
+from thincam_jax.commands.terminal import ConfigFile, DryRun, Overrides, counted, show, told, warn
 
 
 def run(
@@ -14,10 +14,7 @@ def run(
         Path | None, typer.Option(help="Run folder; default runs/NAME of the study.")
     ] = None,
     set_: Overrides = None,
-    dry_run: Annotated[
-        bool,
-        typer.Option("--dry-run", help="Check all and tell what would be done, without doing it."),
-    ] = False,
+    dry_run: DryRun = False,
 ) -> None:
     """Simulate an experiment and reconstruct it; or reconstruct a store of 'thincam capture'.
 
@@ -36,6 +33,7 @@ def run(
         return f"interrupted; finished: {done}. The same command goes on from there."
 
     with told(interrupted):
+        from thincam_jax.commands import explain
         from thincam_jax.commands.config_file import ConfigError, slug
         from thincam_jax.commands.kinds import kind_of, load_experiment
         from thincam_jax.commands.run_folder import RunFolder
@@ -54,9 +52,7 @@ def run(
         setup = kind.part(kind.build)(asked)
         warn(getattr(setup, "warnings", []))
         if dry_run:
-            from thincam_jax.commands.explain import work_of
-
-            print("\n".join([*work_of(asked), folder.outcome(asked), "dry run: nothing was done"]))
+            explain.dry_run(asked, folder.outcome(asked), setup)
             return
         with counted(asked.name) as progress:
             found = kind.part(kind.run)(setup, folder, progress)

@@ -11,7 +11,7 @@ from pyarrow import csv
 
 from thincam_jax._core.files import read_regular, write_whole
 from thincam_jax.commands.checked_config import dump_config
-from thincam_jax.commands.run_folder import claim_folder
+from thincam_jax.commands.run_folder import claim_folder, refuse_foreign
 from thincam_jax.commands.study.config import StudyConfig
 from thincam_jax.commands.sweep.measure import Outcome
 from thincam_jax.commands.sweep.point import GridPoint
@@ -38,6 +38,12 @@ class SweepFolder:
         Another grid of the same study is welcome: points are recognised by their configuration.
         """
         claim_folder(self.path, "study.yaml", dump_config(base), "sweep", ("points",))
+
+    def outcome(self, base: StudyConfig) -> str:
+        """What a sweep would write, in a line; ConfigError where `claim` would refuse."""
+        if self.path.exists():
+            refuse_foreign(self.path, "study.yaml", dump_config(base), "sweep")
+        return f"writes to {self.path}: study.yaml, points/, results.parquet, results.csv"
 
     def has(self, point: GridPoint) -> bool:
         """Whether the point has succeeded before; a row that cannot be read does not count."""
