@@ -15,7 +15,7 @@ from jsonschema import Draft202012Validator
 
 from thincam_jax._core.quantity import quantities
 from thincam_jax.commands.checked_config import check_as
-from thincam_jax.commands.config_file import ConfigError
+from thincam_jax.commands.config_file import ConfigError, Places
 from thincam_jax.commands.kinds import KINDS
 from thincam_jax.commands.schema import Section
 from thincam_jax.hardware.base import Region
@@ -53,7 +53,7 @@ def faults(section, raw, key):
     """The lines that are about a key, of a section of its own kind."""
     place, raw = "a.yaml:7", word_of(section) | raw
     with pytest.raises(ConfigError) as error:
-        check_as(section, raw, {(key,): place}, {}, "a.yaml:1")
+        check_as(section, Places(raw, {(key,): place}, top="a.yaml:1"))
     lines = str(error.value).split("\n")
     return [line.removeprefix(f"{place}: ") for line in lines if line.startswith(f"{place}: {key}")]
 
@@ -126,7 +126,7 @@ def test_every_key_refuses_what_it_does_not_take(section):
     for key in schema.get("required", ()):
         given = {other: word for other, word in word_of(section).items() if other != key}
         with pytest.raises(ConfigError, match=f"a.yaml:1: {key}: missing; this key is needed"):
-            check_as(section, given, {}, {}, "a.yaml:1")
+            check_as(section, Places(given, top="a.yaml:1"))
     told = faults(section, {"colour": 1}, "colour")
     keys = [field.alias or name for name, field in section.model_fields.items()]
     assert told == [f"colour: unknown key; allowed here: {', '.join(keys)}"]
@@ -143,4 +143,5 @@ def test_constructors_of_sections_state_ranges_and_blame_a_field(maker):
     for body in ast.walk(tree):
         if isinstance(body, ast.FunctionDef) and body.name in CONSTRUCTING:
             raised = [n.exc for n in ast.walk(body) if isinstance(n, ast.Raise)]
-            assert "ValueError" not in [getattr(c.func, "id", "") for c in raised if c], body.name
+            names = [getattr(getattr(one, "func", None), "id", "") for one in raised]
+            assert "ValueError" not in names, body.name

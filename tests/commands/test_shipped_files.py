@@ -45,14 +45,14 @@ def test_schema_takes_it_and_no_number_without_its_unit(path):
     assert not validator.is_valid(raw | {"colour": 1})
 
 
-SLOW = ("sts_camera", "learned_refocus")
+def but(*slow):
+    """Every file; those that take more than 5 s are thorough."""
+    marks = {name: [pytest.mark.thorough] for name in slow}
+    files = [pytest.param(path, marks=marks.get(path.stem, [])) for path in FILES]
+    return pytest.mark.parametrize("path", files, ids=lambda path: path.stem)
 
 
-@pytest.mark.parametrize(
-    "path",
-    [pytest.param(p, marks=[pytest.mark.thorough] if p.stem in SLOW else []) for p in FILES],
-    ids=lambda path: path.stem,
-)
+@but("design_slm", "flatcam", "learned_refocus")
 def test_dry_run(path, tmp_path):
     out, options = tmp_path / "out", []
     if path.stem == "denoiser":  # photographs that are not shipped
@@ -116,7 +116,7 @@ class TestExplain:
         assert rows["sensor.full_well: 13500.0"] == "default"
         assert rows["noise.snr_db: 40.0"] == "--set noise.snr_db=40"
 
-    @pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
+    @but("design_slm")
     def test_every_file(self, path):
         result = call("explain", path)
         assert result.exit_code == 0, result.output

@@ -111,7 +111,7 @@ def section(
                 kind = kind | None if default is None else kind
                 default = ... if default is _NEEDED else default
                 fields[key] = kind, Field(default, description=about.get(key))
-    name = getattr(makers[0], "__name__", "section")
+    name = getattr(next(iter(keys)), "__name__", "section")
     made = pydantic.create_model(name, __base__=ObjectSection, **fields)
     made.parameters, made.makers = tuple(fields), keys
     made.complete = tuple(maker for maker in makers if maker not in needing)

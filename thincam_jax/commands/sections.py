@@ -1,8 +1,7 @@
 """Sections of experiment files that several kinds share, with the units of their numbers."""
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
 from typing import Annotated, Any, ClassVar, Literal
 
 import pydantic
@@ -10,15 +9,14 @@ from pydantic import AfterValidator, Field
 
 from thincam_jax._core import checks
 from thincam_jax._core.quantity import FieldError, quantity
-from thincam_jax.commands.config_file import slug
+from thincam_jax.commands.config_file import Places, slug
 from thincam_jax.commands.schema import Section, section, written
 from thincam_jax.imaging.sensor import AbstractNoise, GaussianNoise, PoissonGaussianNoise, Sensor
 from thincam_jax.imaging.targets import sample_images
 from thincam_jax.lensless import masks
 from thincam_jax.lensless.masks.fza import Profile
 from thincam_jax.lensless.method import Model
-from thincam_jax.reconstruction import AdmmTV, TotalVariation
-from thincam_jax.reconstruction.wiener import Prior
+from thincam_jax.reconstruction import AdmmTV, TotalVariation, Wiener
 
 LIGHT = (1e-5, 1.0)  # the wavelengths that are taken for light, mm
 
@@ -329,14 +327,6 @@ class TargetConfig(Section):
         return self
 
 
-@dataclass(frozen=True)
-class Places:
-    """Where the entries of a file come from, which makes no difference to what they are."""
-
-    find: Callable[[tuple], str] | None = field(default=None, compare=False)
-    gives: Callable[[tuple], bool] = field(default=lambda location: False, compare=False)
-
-
 class ExperimentConfig(Section):
     """What every kind of experiment file begins with."""
 
@@ -348,7 +338,8 @@ class ExperimentConfig(Section):
 
     def place_of(self, *location: str | int) -> str:
         """File and line of an entry, or the option that set it, with a colon; else nothing."""
-        return "" if self._places.find is None else f"{self._places.find(location)}: "
+        place = self._places.of(location)
+        return f"{place}: " if place else ""
 
     def gives(self, *location: str | int) -> bool:
         """Whether the file or an option has an entry, which is a default otherwise."""
@@ -363,10 +354,9 @@ class LenslessConfig(ExperimentConfig):
     pixel_integration: bool = True
 
 
-class CamerasConfig(LenslessConfig):
+class CamerasConfig(section(Wiener, only=("prior",)), LenslessConfig):
     """Cameras and the methods that reconstruct their captures."""
 
-    prior: Prior = "inverse_square"
     sensor: SensorConfig
     mask: MaskConfig
     noise: NoiseConfig | None = None

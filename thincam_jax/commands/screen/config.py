@@ -15,7 +15,6 @@ from thincam_jax.commands.sections import (
     Length,
     Name,
     NoiseConfig,
-    Position,
     Section,
     SensorConfig,
     VariationConfig,
@@ -27,6 +26,7 @@ from thincam_jax.commands.sections import (
 from thincam_jax.commands.study.config import PictureConfig
 from thincam_jax.measured.calibration.hadamard import HadamardSeries
 from thincam_jax.reconstruction import Ridge
+from thincam_jax.studies.refocus import SceneObject
 from thincam_jax.studies.screen import ScreenModel
 from thincam_jax.studies.screen_calibration import MEASURED, Calibration
 
@@ -58,13 +58,10 @@ class HologramConfig(section(wg.VolumeHologram.record, defaults=_HOLOGRAM)):
         return self.colours or (self.wavelength or 0.0,)
 
 
-class RectangleConfig(Section):
+class RectangleConfig(section(SceneObject, only=("width", "x", "y"))):
     """Where a hologram is: its size, and its middle from the camera's axis, y downwards."""
 
-    width: Length
     height: Length
-    x: Position = 0.0
-    y: Position = 0.0
 
 
 _GLASS = {"glass_index": 1.5}
@@ -85,14 +82,6 @@ class LensConfig(section(wg.SeeThroughCamera, only=("focal_distance", "lens_dist
     """From sensor to lens (d0), and from lens to the plate (d1)."""
 
 
-class SeenConfig(Section):
-    """The object: so many square cells (rows, columns) of a monitor of that width."""
-
-    cells: tuple[Annotated[int, Field(ge=7, le=512)], Annotated[int, Field(ge=7, le=512)]]
-    distance: Length
-    width: Length
-
-
 def check_cells(cells: tuple[int, int], *place: str) -> None:
     """Refuse cells that there are no Hadamard patterns of."""
     try:
@@ -101,11 +90,10 @@ def check_cells(cells: tuple[int, int], *place: str) -> None:
         raise FieldError(str(error), *place) from None
 
 
-class CellsConfig(SeenConfig):
-    """The same with its middle at (x, y)."""
+class CellsConfig(section(SceneObject, only=("distance", "width", "x", "y"))):
+    """The object: square cells (rows, columns) of a monitor of that width, its middle at (x, y)."""
 
-    x: Position = 0.0
-    y: Position = 0.0
+    cells: tuple[Annotated[int, Field(ge=7, le=512)], Annotated[int, Field(ge=7, le=512)]]
 
 
 class ScreenMethodConfig(section(Ridge, only=("ridge",), defaults={"ridge": None})):
