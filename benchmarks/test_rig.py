@@ -35,7 +35,7 @@ def test_hadamard_rate(benchmark, tmp_path):
         plan = command.build_plan(config)
         plan = dataclasses.replace(plan, name="part", steps=plan.steps[:FRAMES])
         with command.opened(config) as rig:
-            procedure = Procedure(settle=0.002, saturated_share=0.05)
+            procedure = Procedure(settle=0.002, saturated=0.05)
             start, cpu = time.perf_counter(), time.process_time()
             store = tmp_path / "frames.zarr"
             run = functools.partial(acquire, plan, rig, store, procedure=procedure)

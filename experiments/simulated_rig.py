@@ -79,7 +79,7 @@ config = load_as(CaptureConfig, path)
 plan = build_plan(config)
 with tempfile.TemporaryDirectory() as folder, opened(config) as rig:
     shown = [rig.render(plan.pattern(step)) for step in plan.steps]
-    procedure = Procedure(settle=config.display.settle, timeout=2.0, saturated_share=0.01)
+    procedure = Procedure(settle=config.display.settle, timeout=2.0, saturated=0.01)
     outcome = acquire(plan, rig, Path(folder) / "frames.zarr", procedure=procedure)
     taken = read_acquisition(outcome.path)
     frames = jnp.asarray(taken.captures())  # without the dark frame, counts

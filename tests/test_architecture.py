@@ -97,9 +97,10 @@ def imports_against_the_floors(modules: list[Module]) -> list[str]:
 
 
 def may_use_the_rig(module: Module, line: int) -> bool:
-    """A command's file may, where the import waits for the command to be called."""
-    is_command = module.top == FRONT_END and Path(module.path).name == "command.py"
-    return is_command and waits(module, line)
+    """A command's file may, where the import waits for the command to be called, and the file of
+    its sections, which are read from the constructors and loaded when the command is called."""
+    name = Path(module.path).name if module.top == FRONT_END else ""
+    return name == "config.py" or (name == "command.py" and waits(module, line))
 
 
 def modules_hidden_by_names(modules: list[Module]) -> list[str]:

@@ -1,6 +1,9 @@
 """Units, ranges and choices stand at the fields, and are read from there."""
 
 import dataclasses
+import re
+from dataclasses import dataclass
+from typing import Annotated
 
 import jax
 import jax.numpy as jnp
@@ -8,7 +11,15 @@ import pytest
 
 import thincam_jax as tc
 from thincam_jax import waveguide as wg
-from thincam_jax._core.quantity import UNITS, FieldError, choice, quantities, quantity, unchecked
+from thincam_jax._core.quantity import (
+    UNITS,
+    FieldError,
+    check_fields,
+    choice,
+    quantities,
+    quantity,
+    unchecked,
+)
 from thincam_jax.design import Design
 from thincam_jax.units import KINDS, parse_quantity
 
@@ -84,3 +95,36 @@ def test_a_fault_between_fields_names_the_one_to_change():
     with pytest.raises(FieldError, match="bit_depth needs an exposure") as caught:
         tc.Sensor((3, 4), 0.01, bit_depth=8)
     assert caught.value.field == "bit_depth"
+
+
+@dataclass(frozen=True)
+class Lamps:
+    """Lamps in a row."""
+
+    lengths: Annotated[tuple[float, ...], quantity("mm", positive=True, many=True)] = (1.0, 2.0)
+    share: Annotated[float, quantity(positive=True, most=1.0)] = 1.0
+    level: Annotated[float, quantity("dB", least=-3.0, most=3.0)] = 0.0
+
+    def __post_init__(self):
+        check_fields(self)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"lengths": (1.0, -2.0)}, "lengths = -2.0 mm is not positive; give lengths > 0 in mm"),
+        ({"share": 0.0}, "share = 0.0 is not positive; give share > 0"),
+        ({"share": 1.5}, "share = 1.5 is out of range; give 0 < share <= 1"),
+        ({"level": 4.0}, "level = 4.0 dB is out of range; give -3 to 3 dB"),
+    ],
+)
+def test_records_check_the_quantities_of_their_fields(given, message):
+    assert Lamps(lengths=()).lengths == ()
+    with pytest.raises(ValueError, match=re.escape(message)):
+        Lamps(**given)
+    assert quantities(Lamps)["level"].most == 3.0
+
+
+def test_a_fault_may_lie_in_an_entry_of_a_field():
+    fault = FieldError("give less", "shots", 1, "width")
+    assert (str(fault), fault.field, fault.place) == ("give less", "shots", ("shots", 1, "width"))

@@ -14,7 +14,7 @@ def test_its_parts_are_there(name):
     declared = section.model_fields.get("kind")
     assert (declared is None) == (name == "study")
     assert declared is None or declared.annotation.__args__ == (name,)
-    assert (kind.command == "run") == bool(kind.build and kind.run)
+    assert (kind.command in ("run", "train")) == bool(kind.build and kind.run)
     assert all(callable(kind.part(place)) for place in (kind.build, kind.run) if place)
     assert not kind.example or read_kind(ROOT / f"configs/{kind.example}.yaml") is kind
 

@@ -34,7 +34,7 @@ def faults(made, **given):
     with pytest.raises(pydantic.ValidationError) as error:
         made.model_validate(given)
     (fault,) = error.value.errors()
-    return (*fault["loc"], *fault.get("ctx", {}).get("place", ())), fault["msg"]
+    return (*fault["loc"], *getattr(fault.get("ctx", {}).get("error"), "place", ())), fault["msg"]
 
 
 def test_values_are_read_with_their_units_and_written_back():

@@ -3,6 +3,7 @@
 Traced values cannot be looked at and pass; they were checked when the object was built.
 """
 
+import math
 from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -26,7 +27,7 @@ _LONGEST, _IN_METRES = 0.1, (1.5e-7, 2.5e-6)
 # mm: pixels of sensors are smaller.
 _LARGEST_PITCH = 1.0
 # Units of plain ratios, which nobody writes.
-_RATIOS = ("parts of one", "a ratio")
+_RATIOS = ("parts of one", "a ratio", "")
 
 
 def is_traced(value: Any) -> bool:
@@ -84,10 +85,15 @@ def finite(name: str, value: Any, unit: str, *, shape: tuple[int, ...] = ()) -> 
     return _require(array, np.isfinite, message)
 
 
-def positive(name: str, value: Any, unit: str, *, allow_infinity: bool = False) -> Array:
+def positive(
+    name: str, value: Any, unit: str, *, allow_infinity: bool = False, most: float = math.inf
+) -> Array:
     array = real(name, value, unit)
     message = f"{name} = {{}}{_after(unit)} is not positive; give {name} > 0{_within(unit)}"
     _require(array, lambda known: known > 0, message)
+    if math.isfinite(most):
+        message = f"{name} = {{}}{_after(unit)} is out of range; give 0 < {name} <= {most:g}"
+        return _require(array, lambda known: known <= most, message)
     message = f"{name} is infinite; give a finite number{_within(unit)}"
     return _require(array, lambda known: allow_infinity or np.isfinite(known), message)
 

@@ -28,11 +28,11 @@ _LENGTHS = ((1.0, "mm", 0.1), (1e-3, "µm", 1e-3), (1e-6, "nm", 0.0))
 
 
 class FieldError(ValueError):
-    """A fault between fields: `field` is the one to change."""
+    """A fault between fields: `field` is the one to change, `place` the way to an entry of it."""
 
-    def __init__(self, message: str, field: str):
+    def __init__(self, message: str, field: str, *entry: str | int):
         super().__init__(message)
-        self.field = field
+        self.field, self.place = field, (field, *entry)
 
 
 @dataclass(eq=False)
@@ -43,6 +43,8 @@ class Quantity:
     - `check`: of a name and a value: the value to keep, or ValueError or TypeError in one line.
     - `positive`, `optional`: above 0; may be None.
     - `choices`: all that are allowed; empty for numbers.
+    - `least`, `most`: ends of the range, where it has any.
+    - `many`: a tuple of such values, of any length.
     - `parts`: of a dictionary, by its keys.
     - `name`: of the field; a `Module` tells it.
     """
@@ -52,13 +54,20 @@ class Quantity:
     positive: bool = False
     optional: bool = False
     choices: tuple[str, ...] = ()
+    least: float | int | None = None
+    most: float | int | None = None
+    many: bool = False
     parts: Mapping[str, "Quantity"] = dataclasses.field(default_factory=dict)
     name: str = "value"
 
     def __call__(self, value: Any) -> Any:
         if self.check is None or (value is None and self.optional):
             return value
-        return self.check(self.name, value)
+        if not self.many:
+            return self.check(self.name, value)
+        for one in value or ():
+            self.check(self.name, one)
+        return value
 
     @property
     def kind(self) -> str:
@@ -95,33 +104,44 @@ def quantity(
     non_negative: bool = False,
     shape: tuple[int, ...] = (),
     optional: bool = False,
+    many: bool = False,
+    least: float | int | None = None,
+    most: float | int | None = None,
     check: Callable[..., Any] | None = None,
 ) -> Quantity:
     """A finite number, or an array of a shape, in a unit.
 
     - `unit`: one of `UNITS`; other texts are for messages only.
+    - `least`, `most`: both, or `most` of what is positive.
     - `check`: in place of the ranges: called with the name and the value.
     """
     words = _IN_WORDS.get(unit, unit)
     if check is None and positive:
-        check = functools.partial(checks.positive, unit=words)
+        limit = {} if most is None else {"most": most}
+        check = functools.partial(checks.positive, unit=words, **limit)
+    elif check is None and least is not None and most is not None:
+        check = functools.partial(checks.between, unit=words, least=least, most=most)
     elif check is None and non_negative:
         check = functools.partial(checks.non_negative, unit=words)
     elif check is None:
         check = functools.partial(checks.finite, unit=words, shape=shape)
-    return Quantity(unit, check, positive, optional)
+    least = 0.0 if positive or non_negative else least
+    return Quantity(unit, check, positive, optional, least=least, most=most, many=many)
 
 
-def whole(least: int, most: int | None = None, *, optional: bool = False) -> Quantity:
+def whole(
+    least: int, most: int | None = None, *, optional: bool = False, many: bool = False
+) -> Quantity:
     """A whole number within limits."""
-    return Quantity("", functools.partial(checks.whole, least=least, most=most), optional=optional)
+    check = functools.partial(checks.whole, least=least, most=most)
+    return Quantity("", check, optional=optional, least=least, most=most, many=many)
 
 
-def choice(options: Iterable[str], *, optional: bool = False) -> Quantity:
+def choice(options: Iterable[str], *, optional: bool = False, many: bool = False) -> Quantity:
     """One of several words."""
     options = tuple(options)
     check = functools.partial(checks.choice, options=options)
-    return Quantity("", check, optional=optional, choices=options)
+    return Quantity("", check, optional=optional, choices=options, many=many)
 
 
 def unchecked(unit: str = "", parts: Mapping[str, Quantity] | None = None) -> Quantity:
@@ -136,9 +156,22 @@ def quantities(*owners: Any) -> dict[str, Quantity]:
         if dataclasses.is_dataclass(owner):
             given = {f.name: f.metadata.get("converter") for f in dataclasses.fields(owner)}
             found |= {name: one for name, one in given.items() if isinstance(one, Quantity)}
+            found |= _annotated({f.name: f.type for f in dataclasses.fields(owner)})
         function = owner.__init__ if isinstance(owner, type) else owner
-        for name, annotation in getattr(function, "__annotations__", {}).items():
-            for one in getattr(annotation, "__metadata__", ()):
-                if isinstance(one, Quantity):
-                    found[name] = dataclasses.replace(one, name=name)
+        found |= _annotated(getattr(function, "__annotations__", {}))
     return found
+
+
+def check_fields(record: Any) -> None:
+    """Check the fields of a plain record by the quantities of their annotations."""
+    for name, one in quantities(type(record)).items():
+        one(getattr(record, name))
+
+
+def _annotated(annotations: Mapping[str, Any]) -> dict[str, Quantity]:
+    return {
+        name: dataclasses.replace(one, name=name)
+        for name, annotation in annotations.items()
+        for one in getattr(annotation, "__metadata__", ())
+        if isinstance(one, Quantity)
+    }

@@ -6,8 +6,8 @@ from typing import Any, TypeVar, get_args
 import pydantic
 import yaml
 
-from thincam_jax.commands.config_file import ConfigError, override, read_raw
-from thincam_jax.commands.sections import ExperimentConfig, Places
+from thincam_jax.commands.config_file import ConfigError, Places, override, read_raw
+from thincam_jax.commands.sections import ExperimentConfig
 
 Config = TypeVar("Config", bound=pydantic.BaseModel)
 Experiment = TypeVar("Experiment", bound=ExperimentConfig)
@@ -26,68 +26,33 @@ def load_as(
     what is allowed. FileNotFoundError where there is no such file.
     """
     path = Path(path)
-    raw, places = read_raw(path)
+    raw, lines = read_raw(path)
     asked = {override(raw, text): f"--set {shortened(text)}" for text in overrides}
-    config = check_as(model, raw, places, asked, f"{path}:1")
+    places = Places(raw, lines, asked, f"{path}:1")
+    config = check_as(model, places)
     folder = path.resolve().parent
     named = tuple(
         entry.model_copy(update={"path": str(folder / entry.path)}) if entry.path else entry
         for entry in getattr(config, model.pictured)
     )
     config = config.model_copy(update={model.pictured: named})
-    config._places = Places(
-        lambda location: _place(location, places, asked, f"{path}:1"),
-        lambda location: _holds(raw, location),
-    )
+    config._places = places
     return config
 
 
-def _holds(raw: Any, location: tuple) -> bool:
-    """Whether raw data have an entry."""
-    for part in location:
-        try:
-            raw = raw[part]
-        except (KeyError, IndexError, TypeError):
-            return False
-    return True
-
-
-def check_as(
-    model: type[Config], raw: dict, places: dict[tuple, str], asked: dict[tuple, str], top: str
-) -> Config:
-    """Check raw data; a fault names the setting that asked for it, else the place in the file.
-
-    `places` and `asked` are by location; `top` is the place of what has none.
-    """
+def check_as(model: type[Config], places: Places) -> Config:
+    """Check raw data; a fault names the setting that asked for it, else the place in the file."""
     try:
-        return model.model_validate(raw)
+        return model.model_validate(places.raw)
     except pydantic.ValidationError as error:
-        faults = [_fault(e, places, asked, top, model) for e in _own(error.errors())]
-        raise ConfigError("\n".join(_once(faults, asked))) from None
+        faults = [_fault(one, places, model) for one in _own(error.errors())]
+        raise ConfigError("\n".join(_once(faults, places))) from None
 
 
 def dump_config(config: pydantic.BaseModel) -> str:
     """The resolved configuration as YAML that is read back to the same values."""
     data = config.model_dump(mode="json", exclude_none=True, by_alias=True)
     return yaml.safe_dump(data, sort_keys=False, allow_unicode=True, width=100)
-
-
-def _place(location: tuple, places: dict, asked: dict, top: str) -> str:
-    """The override or the file's line that holds a location, or what is nearest to it."""
-    parts = [location[:end] for end in range(len(location), 0, -1)]
-    for part in parts:  # an override stands in for whatever the file has there
-        if part in asked:
-            return asked[part]
-    for path, option in asked.items():
-        inside = location and path[: len(location)] == location
-        # An entry that was set is what is wrong with its list.
-        if inside and (location not in places or isinstance(path[len(location)], int)):
-            return option
-    for part in parts:
-        for known in ((*part, "(key)"), part):
-            if known in places:
-                return places[known]
-    return top
 
 
 def _own(errors: list[Any]) -> list[Any]:
@@ -104,11 +69,11 @@ def _own(errors: list[Any]) -> list[Any]:
     ]
 
 
-def _once(faults: list[tuple[str, str, str]], asked: dict[tuple, str]) -> list[str]:
+def _once(faults: list[tuple[str, str, str]], places: Places) -> list[str]:
     """A line for each fault; what one option does to several entries is told of the first."""
     lines: dict[tuple[str, ...], list[str]] = {}
     for place, field, message in faults:
-        one = (place, message) if place in asked.values() else (place, message, field)
+        one = (place, message) if place in places.asked.values() else (place, message, field)
         lines.setdefault(one, []).append(field)
     return [
         f"{place}: {fields[0]}{f' and {len(fields) - 1} more' if fields[1:] else ''}: {message}"
@@ -116,14 +81,13 @@ def _once(faults: list[tuple[str, str, str]], asked: dict[tuple, str]) -> list[s
     ]
 
 
-def _fault(error: Any, places: dict, asked: dict, top: str, model: Any) -> tuple[str, str, str]:
+def _fault(error: Any, places: Places, model: Any) -> tuple[str, str, str]:
     """Place, field, and what is wrong and what is allowed."""
-    location = (*error["loc"], *error.get("ctx", {}).get("place", ()))
+    location = (*error["loc"], *getattr(error.get("ctx", {}).get("error"), "place", ()))
     if error["type"] == "invalid_key":
         location = (*location[:-1], str(location[-1]))
     field = _dotted(location) or "the file"
-    place = _place(location, places, asked, top)
-    return place, field, _message(error, location, model)
+    return places.of(location), field, _message(error, location, model)
 
 
 def _message(error: Any, location: tuple, model: Any) -> str:
@@ -142,7 +106,7 @@ def _message(error: Any, location: tuple, model: Any) -> str:
     if kind in _WORDS:
         return _WORDS[kind].format(given=_short(given))
     message = error["msg"].removeprefix("Value error, ")
-    if kind in ("value_error", "misfit"):
+    if kind == "value_error":
         return message
     return f"{_short(given)}: {message[0].lower()}{message[1:]}"
 

@@ -1,6 +1,7 @@
 """The text of an experiment file: YAML read with the lines of its entries, values set by path."""
 
 import re
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,44 @@ _MOST_ENTRIES = 100_000
 
 class ConfigError(ValueError):
     """An experiment file that cannot be used; the message has a line for every fault."""
+
+
+@dataclass(frozen=True)
+class Places:
+    """Where the entries of raw data come from, which makes no difference to what they are.
+
+    - `lines`: file and line, by location; `asked`: the options that set an entry, by location.
+    - `top`: the place of what has none.
+    """
+
+    raw: Any = field(default=None, compare=False)
+    lines: dict[tuple, str] = field(default_factory=dict, compare=False)
+    asked: dict[tuple, str] = field(default_factory=dict, compare=False)
+    top: str = field(default="", compare=False)
+
+    def of(self, location: tuple) -> str:
+        """The option or the file's line that holds a location, or what is nearest to it."""
+        parts = [location[:end] for end in range(len(location), 0, -1)]
+        for part in parts:  # an option stands in for whatever the file has there
+            if part in self.asked:
+                return self.asked[part]
+        for path, option in self.asked.items():
+            inside = location and path[: len(location)] == location
+            # An entry that was set is what is wrong with its list.
+            if inside and (location not in self.lines or isinstance(path[len(location)], int)):
+                return option
+        entries = (one for part in parts for one in ((*part, "(key)"), part))
+        return next((self.lines[one] for one in entries if one in self.lines), self.top)
+
+    def gives(self, location: tuple) -> bool:
+        """Whether the raw data have an entry."""
+        raw = self.raw
+        for part in location:
+            try:
+                raw = raw[part]
+            except (KeyError, IndexError, TypeError):
+                return False
+        return True
 
 
 def read_raw(path: Path) -> tuple[dict, dict[tuple, str]]:

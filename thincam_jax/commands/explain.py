@@ -33,14 +33,15 @@ def schema(
 def explain(config: ConfigFile, set_: Overrides = None) -> None:
     """Print every value of an experiment file with its unit and where it comes from.
 
-    Of lensless cameras also the error and the cost of their PSFs.
+    Also what a run computes: error, memory and operations of PSFs, rays of a screen, evaluations of
+    a search, frames of a capture, steps of a training.
     """
     with told(lambda: "interrupted"):
         asked = load_experiment(config, tuple(set_ or ()), command=None)
         rows = list(values(asked))
         width = max(len(f"{key}: {value}") for key, value, _ in rows if len(value) <= _LONGEST)
         lines = [f"{f'{key}: {value}':<{width}}  # {place}" for key, value, place in rows]
-        print("\n".join([*lines, *psf_costs(asked)]))
+        print("\n".join([*lines, *costs(asked)]))
 
 
 _LONGEST = 50  # characters of a value that places are lined up behind
@@ -70,41 +71,120 @@ def _entries(data: Any, location: tuple = ()) -> Iterator[tuple[tuple, str]]:
             yield (*location, key), str(value)
 
 
-def work_of(asked: Any) -> Iterator[str]:
-    """Lines that say what a run computes: the names of each list of the file, and its PSFs."""
+def dry_run(asked: Any, writes: str, setup: Any = None) -> None:
+    """Print what a command would compute and write, for its option `--dry-run`."""
+    print("\n".join([*work_of(asked, setup), writes, "dry run: nothing was done"]))
+
+
+def work_of(asked: Any, setup: Any = None) -> Iterator[str]:
+    """Lines that say what a run computes: the names of each list of the file, and the costs."""
     for key in type(asked).model_fields:
         entries = getattr(asked, key)
         if isinstance(entries, tuple) and all(hasattr(entry, "name") for entry in entries):
             if entries:
                 yield f"{len(entries)} {key}: {'; '.join(entry.name for entry in entries)}"
-    yield from psf_costs(asked)
+    yield from costs(asked, setup)
 
 
-def psf_costs(asked: Any) -> Iterator[str]:
-    """A line for the PSF of each exposure of a study: model, predicted error, memory, work."""
-    from thincam_jax.commands.sections import CamerasConfig
+def costs(asked: Any, setup: Any = None) -> Iterator[str]:
+    """What a file's run computes, in numbers; `setup`: what its kind builds, where it is built."""
+    own = {"screen": _rays, "design": _search, "capture": _frames}
+    training = {"learned": _lessons, "denoiser": _lessons}
+    return (own | training).get(getattr(asked, "kind", "study"), _study)(asked, setup)
 
-    if not isinstance(asked, CamerasConfig):
-        return
-    from thincam_jax._core.memory import readable
+
+def _study(asked: Any, setup: Any) -> Iterator[str]:
     from thincam_jax.commands.study.build import assemble
+
+    study = assemble(asked, ()) if setup is None else getattr(setup, "study", setup)
+    cameras = [(study.camera(e), e, study.mask_of(e)) for e in study.exposures]
+    return _psfs(asked, cameras, study.object_distance)
+
+
+def _psfs(asked: Any, cameras: list[Any], object_distance: float) -> Iterator[str]:
+    """A line for each PSF of (camera, exposure, words): model, predicted error, memory, work."""
+    from thincam_jax._core.memory import readable
     from thincam_jax.lensless.accuracy.select import predict_error
     from thincam_jax.lensless.cost import psf_cost
     from thincam_jax.lensless.method import has_few_terms, psf_method
 
-    study = assemble(asked, ())
-    alike = {(e.beta, e.distance, e.wavelength, e.width): e for e in reversed(study.exposures)}
-    for exposure in reversed(alike.values()):
-        camera, error = study.camera(exposure), ""
-        how = {"model": study.model, "pixel_integration": study.pixel_integration}
+    how = {"model": asked.model, "pixel_integration": asked.pixel_integration}
+    alike = {
+        (e.beta, e.distance, e.wavelength, e.width): one for one in cameras[::-1] for e in one[1:2]
+    }
+    for camera, exposure, words in [*alike.values()][::-1]:
+        error = ""
         if has_few_terms(camera.mask):
-            seen = {"wavelength": exposure.wavelength, "object_distance": study.object_distance}
+            seen = {"wavelength": exposure.wavelength, "object_distance": object_distance}
             found = predict_error(camera, **seen, **how)
             cost, error = found.cost, f", predicted error {found.predicted_error:.1g}"
         else:
             grid = camera.sensor.grid
             cost = psf_cost(camera.mask, grid, psf_method(camera.mask, grid, **how))
         yield (
-            f"PSF at {exposure.distance:g} mm of {study.mask_of(exposure)}: {study.model}{error}, "
+            f"PSF at {exposure.distance:g} mm of {words}: {asked.model}{error}, "
             f"{readable(cost.bytes)}, {cost.flops / 1e9:.2g} billion operations"
         )
+
+
+def _rays(asked: Any, setup: Any) -> Iterator[str]:
+    """Of a see-through camera: rays, and entries of its matrix."""
+    from thincam_jax._core.memory import readable
+    from thincam_jax.commands.screen.build import build_cameras, build_plane
+    from thincam_jax.waveguide.system import entries_of_a_ray
+
+    (rows, columns), parts = asked.sensor.shape, asked.band_samples or 1
+    cameras = build_cameras(asked) if setup is None else setup.cameras
+    plane = build_plane(asked) if setup is None else setup.plane
+    rays = rows * columns * asked.orders * parts * len(cameras)
+    entries = rays * entries_of_a_ray(cameras[0], plane)
+    yield (
+        f"matrix of each model: {rows}×{columns} pixels, {asked.orders} orders, {parts} parts of "
+        f"the band: {rays / 1e6:.3g} million rays, at most {entries / 1e6:.3g} million entries, "
+        f"{readable(12 * entries)}"  # a number and two indices, four bytes each
+    )
+
+
+def _search(asked: Any, setup: Any) -> Iterator[str]:
+    """Of a design: the PSFs of the design to beat, and the evaluations of the search."""
+    from thincam_jax.lensless.exposures import Exposures
+
+    search, shots = asked.search, asked.reference.shots
+    width, light = asked.mask.width, asked.wavelength
+    settings = [s.beta for s in shots], [s.distance for s in shots]
+    exposures = Exposures(*settings, wavelength=light, width=width)
+    sensor, mask = asked.sensor.build(), asked.mask.build(beta=1.0)
+    cameras = exposures.cameras(sensor, mask)
+    words = [f"β {s.beta:g} rad/mm²" for s in shots]
+    found = list(zip(cameras, exposures, words, strict=True))
+    yield from _psfs(asked, found, asked.object.distance)
+    finely = search.frequencies
+    most = search.samples + search.starts * search.steps
+    yield (
+        f"search: {search.samples} samples, {search.starts} descents of at most {search.steps} "
+        f"steps: at most {most} evaluations and their gradients at {finely.radii}×"
+        f"{finely.directions} frequencies of {len(shots)} shots"
+    )
+    count, again = len(asked.targets), asked.validation
+    yield (
+        f"validation: {again.best} found designs, the design to beat and {len(asked.compare)} "
+        f"others, on {count} targets, noise of {again.seeds} seeds"
+    )
+
+
+def _frames(asked: Any, setup: Any) -> Iterator[str]:
+    """Of a capture: frames, and the time that they are exposed."""
+    from thincam_jax.commands.capture.command import build_plan
+
+    frames = len((build_plan(asked) if setup is None else setup).steps)
+    seconds = frames * asked.camera.exposure
+    yield f"{frames} frames, exposed for {seconds:.3g} s in all"
+
+
+def _lessons(asked: Any, setup: Any) -> Iterator[str]:
+    training = asked.training
+    checks = training.steps // training.check_every
+    yield (
+        f"training: {training.steps} steps of {training.batch} examples, {checks} checks on "
+        f"{training.judged} batches"
+    )

@@ -21,8 +21,8 @@ class Kind:
     - `section`: its configuration, as MODULE:NAME in `thincam_jax.commands`.
     - `example`: the file of `configs/` that `thincam init` writes under the kind's name.
     - `build`, `run`: of those for `thincam run`, what makes objects of the configuration, and what
-      runs these into a folder; its result has a `table`. Of those for `thincam train`, `run` trains
-      in a folder.
+      runs these into a folder; its result has a `table`. Of those for `thincam train`, what makes
+      the lessons, and what trains in a folder.
     """
 
     noun: str
@@ -56,10 +56,12 @@ KINDS = {
     "capture": Kind("a capture", "capture", "capture.config:CaptureConfig", "rig_virtual"),
     "learned": Kind(
         *("a network", "train", "learned.config:LearnedConfig", "learned_refocus"),
+        build="learned.run:build_lessons",
         run="learned.run:run_training",
     ),
     "denoiser": Kind(
         *("a denoiser", "train", "learned.denoiser:DenoiserConfig", "denoiser"),
+        build="learned.denoiser:build_lessons",
         run="learned.denoiser:run_denoiser",
     ),
 }

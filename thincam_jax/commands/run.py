@@ -10,6 +10,7 @@ import typer
 
 from thincam_jax.commands.terminal import (
     ConfigFile,
+    DryRun,
     Overrides,
     counted,
     progress_bar,
@@ -28,10 +29,7 @@ def run(
         Path | None, typer.Option(help="Run folder; default runs/NAME of the study.")
     ] = None,
     set_: Overrides = None,
-    dry_run: Annotated[
-        bool,
-        typer.Option("--dry-run", help="Check all and tell what would be done, without doing it."),
-    ] = False,
+    dry_run: DryRun = False,
 ) -> None:
     """Simulate an experiment and reconstruct it; or reconstruct a store of 'thincam capture'.
 
@@ -50,6 +48,7 @@ def run(
         return f"interrupted; finished: {done}. The same command goes on from there."
 
     with told(interrupted):
+        from thincam_jax.commands import explain
         from thincam_jax.commands.config_file import ConfigError, slug
         from thincam_jax.commands.kinds import kind_of, load_experiment
         from thincam_jax.commands.run_folder import RunFolder
@@ -68,9 +67,7 @@ def run(
         setup = kind.part(kind.build)(asked)
         warn(getattr(setup, "warnings", []))
         if dry_run:
-            from thincam_jax.commands.explain import work_of
-
-            print("\n".join([*work_of(asked), folder.outcome(asked), "dry run: nothing was done"]))
+            explain.dry_run(asked, folder.outcome(asked), setup)
             return
         with counted(asked.name) as progress:
             found = kind.part(kind.run)(setup, folder, progress)
@@ -89,6 +86,7 @@ def train(
         bool, typer.Option("--resume", help="Go on with the training that the folder holds.")
     ] = False,
     set_: Overrides = None,
+    dry_run: DryRun = False,
 ) -> None:
     """Train a network that refocuses the captures of a camera, or a denoiser.
 
@@ -97,13 +95,19 @@ def train(
     """
     goes_on = "interrupted; what the last check has written is kept: --resume goes on from there"
     with told(lambda: goes_on):
+        from thincam_jax.commands import explain
         from thincam_jax.commands.config_file import slug
         from thincam_jax.commands.kinds import kind_of, load_experiment
-        from thincam_jax.commands.learned.run import TrainingFolder
+        from thincam_jax.commands.learned.run import TrainingFolder, check_resume
 
         asked = load_experiment(config, tuple(set_ or ()), "train")
         kind = kind_of(asked)
         folder = TrainingFolder(out or Path("runs") / slug(asked.name))
+        if dry_run:
+            check_resume(folder, resume)
+            kind.part(kind.build)(asked)
+            explain.dry_run(asked, folder.outcome(asked))
+            return
         with progress_bar("{task.fields[loss]}") as bar:
             task = bar.add_task(asked.name, total=asked.training.steps, loss="")
 

@@ -38,6 +38,7 @@ class RunFolder:
     folders: tuple[str, ...] = ("targets", "images", "figures")
     pictures = "figures"
     result = "metrics.json"
+    others = ("environment.json", "report.html")
 
     def __init__(self, path: str | Path):
         self.path = Path(path)
@@ -58,7 +59,7 @@ class RunFolder:
         if self.path.exists():
             refuse_foreign(self.path, "config.yaml", dump_config(config), self.kind)
         folders = [f"{folder}/" for folder in self.folders]
-        files = ("config.yaml", *folders, "environment.json", "report.html", self.result)
+        files = ("config.yaml", *folders, *self.others, self.result)
         return f"writes to {self.path}: {', '.join(files)}"
 
     def finished(self, target: str) -> dict[str, Any] | None:

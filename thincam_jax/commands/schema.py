@@ -23,18 +23,12 @@ from pydantic import (
     PlainSerializer,
     WithJsonSchema,
 )
-from pydantic_core import PydanticCustomError
 
-from thincam_jax._core.quantity import FieldError, Quantity, quantities
+from thincam_jax._core.quantity import Quantity, quantities
 from thincam_jax.units import KINDS, parse_quantity
 
 _WITH_UNIT = r"^\s*[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?\s*[^\d\s.eE].*$"
 _NEEDED = inspect.Parameter.empty
-
-
-def misfit(message: str, *place: str | int) -> PydanticCustomError:
-    """A fault between entries, reported at one of them."""
-    return PydanticCustomError("misfit", "{message}", {"message": message, "place": place})
 
 
 class Section(pydantic.BaseModel):
@@ -56,32 +50,38 @@ class Section(pydantic.BaseModel):
 
 
 class ObjectSection(Section):
-    """A section with the parameters of a constructor."""
+    """A section with the parameters of constructors.
 
-    maker: ClassVar[Callable[..., Any] | None] = None
+    - `parameters`: all of its keys; `makers`: the constructors, each with its own.
+    - `complete`: those that need no more than the section has.
+    """
+
     parameters: ClassVar[tuple[str, ...]] = ()
-    complete: ClassVar[bool] = False  # it has all that the constructor needs
+    makers: ClassVar[dict[Any, tuple[str, ...]]] = {}
+    complete: ClassVar[tuple[Callable[..., Any], ...]] = ()
 
-    def build(self, **others: Any) -> Any:
+    def build(self, maker: Callable[..., Any] | None = None, **others: Any) -> Any:
         """The object; `others` are parameters that the file does not have, or in place of its.
 
-        What the file leaves out, the constructor has a default for.
+        What the file leaves out, the constructor has a default for. `maker`: one of several.
         """
-        maker = type(self).maker
-        assert maker is not None  # of several constructors: the subclass chooses
-        given = {name: getattr(self, name) for name in self.parameters}
-        return maker(**{name: value for name, value in given.items() if value is not None} | others)
+        maker = maker or next(iter(self.makers))
+        given = {name: getattr(self, name) for name in self.makers[maker]}
+        given = {name: _built(value) for name, value in given.items() if value is not None}
+        return cast(Any, maker)(**given | others)
 
     @pydantic.model_validator(mode="after")
     def _made(self):
-        if self.complete:
+        for maker in self.complete:
             try:
-                self.build()
-            except FieldError as error:
-                raise misfit(str(error), error.field) from None
+                self.build(maker)
             except TypeError as error:
                 raise ValueError(str(error)) from None
         return self
+
+
+def _built(value: Any) -> Any:
+    return value.build() if isinstance(value, ObjectSection) else value
 
 
 def section(
@@ -96,22 +96,25 @@ def section(
     - `defaults`: where a file has others than the constructor. None: the key may be left out.
     """
     fields: dict[str, Any] = {}
-    complete = len(makers) == 1
+    keys: dict[Any, tuple[str, ...]] = {}
+    needing: set[Any] = set()  # constructors that need more than the section has
     for maker in makers:
-        about = descriptions(maker)
-        for key, (kind, default) in _parameters(maker).items():
-            if key in without or (only and key not in only):
-                complete &= default is not _NEEDED
-                continue
-            default = (defaults or {}).get(key, default)
-            complete &= not (default is None and _parameters(maker)[key][1] is _NEEDED)
-            kind = kind | None if default is None else kind
-            default = ... if default is _NEEDED else default
-            fields[key] = kind, Field(default, description=about.get(key))
-    name = getattr(makers[0], "__name__", "section")
+        about, parameters = descriptions(maker), _parameters(maker)
+        keys[maker] = tuple(k for k in parameters if k not in without and (not only or k in only))
+        for key, (kind, given) in parameters.items():
+            default = (defaults or {}).get(key, given)
+            # Of several constructors, what has no number may be meant for another one.
+            unset = default is None is not given and (len(makers) > 1 or given is _NEEDED)
+            if unset if key in keys[maker] else given is _NEEDED:
+                needing.add(maker)
+            if key in keys[maker]:
+                kind = kind | None if default is None else kind
+                default = ... if default is _NEEDED else default
+                fields[key] = kind, Field(default, description=about.get(key))
+    name = getattr(next(iter(keys)), "__name__", "section")
     made = pydantic.create_model(name, __base__=ObjectSection, **fields)
-    made.maker = makers[0] if len(makers) == 1 else None
-    made.parameters, made.complete = tuple(fields), complete
+    made.parameters, made.makers = tuple(fields), keys
+    made.complete = tuple(maker for maker in makers if maker not in needing)
     return made
 
 
@@ -142,26 +145,39 @@ def _converters(maker: Callable[..., Any]) -> dict[str, Callable[[Any], Any]]:
 
 def _type(known: Quantity | None, converter: Callable[[Any], Any] | None, annotation: Any) -> Any:
     """What pydantic reads: a number with its unit, a choice, or the plain type of an annotation."""
-    if known is not None and known.choices:
-        return Literal[known.choices]
     plain = _plain(annotation)
-    if known is not None and known.kind:
-        number = Annotated[float, *written(known)]
-        plain = number if plain is float else tuple[(number,) * len(get_args(plain))]
-    check = known or converter
-    return Annotated[plain, AfterValidator(_checked(check))] if check else plain
+    if known is None:
+        return Annotated[plain, AfterValidator(_checked(converter))] if converter else plain
+    if known.choices:
+        word = Literal[known.choices]
+        return tuple[word, ...] if known.many else word
+    least = "exclusiveMinimum" if known.positive else "minimum"
+    ends = {least: known.least, "maximum": known.most}
+    form = Field(json_schema_extra={name: end for name, end in ends.items() if end is not None})
+    about = written(known) if known.kind else (form,)
+    if get_origin(plain) is tuple:
+        parts = (Annotated[p, *about] if p in (int, float) else p for p in get_args(plain))
+        plain = tuple[tuple(parts)]
+    else:
+        plain = Annotated[plain, *about]
+    return Annotated[plain, AfterValidator(_checked(known))]
 
 
 def _plain(annotation: Any) -> Any:
-    """int, bool, str, a choice or a list of these; arrays and what may be one are numbers."""
+    """int, bool, str, a choice, a list of these, or a section of a plain record.
+
+    Arrays and what may be one are numbers.
+    """
     origin = get_origin(annotation)
     if origin is Annotated:
         return _plain(get_args(annotation)[0])
     if origin in (Union, types.UnionType):
-        kinds = {_plain(one) for one in get_args(annotation) if one is not types.NoneType}
-        return float if float in kinds or len(kinds) > 1 else kinds.pop()
+        kinds = [one for one in get_args(annotation) if one is not types.NoneType]
+        return float if len(kinds) > 1 else _plain(kinds[0])
     if annotation in (int, bool, str) or origin in (Literal, tuple):
         return annotation
+    if dataclasses.is_dataclass(annotation) and type(annotation) is type:  # no module of JAX
+        return section(cast(Any, annotation))
     return float
 
 
@@ -178,11 +194,12 @@ def _checked(check: Callable[[Any], Any]) -> Callable[[Any], Any]:
     return as_it_is
 
 
-def form_of(kind: str) -> dict[str, Any]:
+def form_of(kind: str, positive: bool = False) -> dict[str, Any]:
     """The JSON Schema of a number with a unit; `kind` as of `units.parse_quantity`."""
     about = KINDS[kind]
     examples = re.findall(r'"(.*?)"', about.examples)
-    form = {"type": "string", "pattern": _WITH_UNIT, "examples": examples}
+    pattern = _WITH_UNIT.replace("[+-]", "[+]", 1) if positive else _WITH_UNIT
+    form = {"type": "string", "pattern": pattern, "examples": examples}
     return form | {"description": f"{about.name}: {about.advice}"}
 
 
@@ -197,7 +214,7 @@ def written(given: Quantity) -> tuple[Any, ...]:
 
     # A resolved file is read back, so it is written in the unit of the package, with every digit.
     write = PlainSerializer(lambda value: f"{value!r} {given.unit}")
-    return BeforeValidator(read), write, WithJsonSchema(form_of(given.kind))
+    return BeforeValidator(read), write, WithJsonSchema(form_of(given.kind, given.positive))
 
 
 def descriptions(maker: Callable[..., Any]) -> dict[str, str]:

@@ -1,24 +1,22 @@
 """Sections of experiment files that several kinds share, with the units of their numbers."""
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
 from typing import Annotated, Any, ClassVar, Literal
 
 import pydantic
 from pydantic import AfterValidator, Field
 
 from thincam_jax._core import checks
-from thincam_jax._core.quantity import quantity
-from thincam_jax.commands.config_file import slug
-from thincam_jax.commands.schema import Section, misfit, section, written
+from thincam_jax._core.quantity import FieldError, quantity
+from thincam_jax.commands.config_file import Places, slug
+from thincam_jax.commands.schema import Section, section, written
 from thincam_jax.imaging.sensor import AbstractNoise, GaussianNoise, PoissonGaussianNoise, Sensor
 from thincam_jax.imaging.targets import sample_images
 from thincam_jax.lensless import masks
 from thincam_jax.lensless.masks.fza import Profile
 from thincam_jax.lensless.method import Model
-from thincam_jax.reconstruction import AdmmTV, TotalVariation
-from thincam_jax.reconstruction.wiener import Prior
+from thincam_jax.reconstruction import AdmmTV, TotalVariation, Wiener
 
 LIGHT = (1e-5, 1.0)  # the wavelengths that are taken for light, mm
 
@@ -49,16 +47,16 @@ class SensorConfig(section(Sensor)):
         return self.exposure is not None or self.electrons is not None
 
 
-_APERTURE = ("width", "profile", "pixel_pitch", "fill_factor")
+APERTURE = ("width", "profile", "pixel_pitch", "fill_factor")
 
 
-class ApertureConfig(section(masks.FresnelZoneAperture, only=_APERTURE)):
+class ApertureConfig(section(masks.FresnelZoneAperture, only=APERTURE)):
     """What all Fresnel zone apertures share; `pixel_pitch`, `fill_factor`: of a display."""
 
     @pydantic.model_validator(mode="after")
     def _display(self):
         if self.pixel_pitch is None and self.fill_factor != 1:
-            raise misfit("is of a display's pixels; give their pixel_pitch, too", "fill_factor")
+            raise FieldError("is of a display's pixels; give their pixel_pitch, too", "fill_factor")
         return self
 
 
@@ -129,22 +127,24 @@ class MaskConfig(
         needed, also = _NUMBERS[self.family]
         for key in needed:
             if key not in self.model_fields_set:
-                raise misfit("missing; this key is needed", key)
+                raise FieldError("missing; this key is needed", key)
         known = {*needed, *also, *_DISPLAY, "family", "width"}
         for key in sorted(self.model_fields_set - known):
             if getattr(self, key) != type(self).model_fields[key].default:
-                raise misfit(f"is no number of a mask of the family {self.family}; drop it", key)
+                raise FieldError(
+                    f"is no number of a mask of the family {self.family}; drop it", key
+                )
         across = self._cells_across()
         if across is not None and self.cell is not None:
             width = across * (self.tiles or 1) * self.cell
             # A resolved file has the width too.
             if "width" in self.model_fields_set and abs(self.width - width) > 1e-9:
-                raise misfit(f"the cells make {width:g} mm; drop it", "width")
+                raise FieldError(f"the cells make {width:g} mm; drop it", "width")
             object.__setattr__(self, "width", width)
         if self.width > _WIDEST:
             key = "width" if across is None else "cell"
             message = f"makes a mask of {self.width:g} mm, which is none; give at most {_WIDEST:g}"
-            raise misfit(message, key)
+            raise FieldError(message, key)
         return self
 
     def _cells_across(self) -> int | None:
@@ -278,13 +278,13 @@ class MethodConfig(Section):
     def _check_harmonics(self) -> None:
         if self.synthesis != "harmonics":
             if self.harmonics:
-                raise misfit(f"synthesis {self.synthesis} has none; drop it", "harmonics")
+                raise FieldError(f"synthesis {self.synthesis} has none; drop it", "harmonics")
             return
         most = (self.steps - 1) // 2
         sound = self.harmonics and max(self.harmonics) <= most
         if not sound or len(set(self.harmonics)) < len(self.harmonics):
             message = f"{self.steps} steps tell 1 to {most} apart; give some of them, each once"
-            raise misfit(message, "harmonics")
+            raise FieldError(message, "harmonics")
 
     def _check_contrasts(self) -> None:
         if len(self.shots) * len(self.phases) < 2:
@@ -327,14 +327,6 @@ class TargetConfig(Section):
         return self
 
 
-@dataclass(frozen=True)
-class Places:
-    """Where the entries of a file come from, which makes no difference to what they are."""
-
-    find: Callable[[tuple], str] | None = field(default=None, compare=False)
-    gives: Callable[[tuple], bool] = field(default=lambda location: False, compare=False)
-
-
 class ExperimentConfig(Section):
     """What every kind of experiment file begins with."""
 
@@ -346,7 +338,8 @@ class ExperimentConfig(Section):
 
     def place_of(self, *location: str | int) -> str:
         """File and line of an entry, or the option that set it, with a colon; else nothing."""
-        return "" if self._places.find is None else f"{self._places.find(location)}: "
+        place = self._places.of(location)
+        return f"{place}: " if place else ""
 
     def gives(self, *location: str | int) -> bool:
         """Whether the file or an option has an entry, which is a default otherwise."""
@@ -361,10 +354,9 @@ class LenslessConfig(ExperimentConfig):
     pixel_integration: bool = True
 
 
-class CamerasConfig(LenslessConfig):
+class CamerasConfig(section(Wiener, only=("prior",)), LenslessConfig):
     """Cameras and the methods that reconstruct their captures."""
 
-    prior: Prior = "inverse_square"
     sensor: SensorConfig
     mask: MaskConfig
     noise: NoiseConfig | None = None
@@ -382,17 +374,17 @@ class CamerasConfig(LenslessConfig):
         return self
 
 
-def check_known(name: str, what: str, names: Sequence[str], *place: str | int) -> None:
+def check_known(name: str, what: str, names: Sequence[str], *place: Any) -> None:
     """Refuse a name that is none of those of a list."""
     if name not in names:
-        raise misfit(f"{name!r} is no {what}; choose one of {', '.join(names)}", *place)
+        raise FieldError(f"{name!r} is no {what}; choose one of {', '.join(names)}", *place)
 
 
 def check_noise(config: Any) -> None:
     """Refuse noise that counts electrons, where it is not known how many there are."""
     if config.noise and config.noise.read_noise is not None and not config.sensor.counts:
         message = "read_noise counts electrons; give sensor.exposure, such as 0.9, or electrons"
-        raise misfit(message, "noise", "read_noise")
+        raise FieldError(message, "noise", "read_noise")
 
 
 def check_names(config: ExperimentConfig, *lists: str) -> None:
@@ -408,7 +400,7 @@ def check_names(config: ExperimentConfig, *lists: str) -> None:
                     f"{names[index]!r} and {names[first]!r} of {what}[{first}] "
                     f"give the same file name {file!r}; choose another name"
                 )
-                raise misfit(message, what, index, "name")
+                raise FieldError(message, what, index, "name")
 
 
 def _check_family(config: CamerasConfig) -> None:
@@ -418,14 +410,14 @@ def _check_family(config: CamerasConfig) -> None:
         place = "methods", index
         if family != "fza" and (method.kind == "fringe_scanning" or method.synthesis != "separate"):
             message = f"a mask of the family {family} has no phases; give synthesis: separate, with"
-            raise misfit(f"{message} wiener or admm_tv", *place, "synthesis")
+            raise FieldError(f"{message} wiener or admm_tv", *place, "synthesis")
         for number, shot in enumerate(method.shots):
             if family == "fza" and shot.beta is None:
-                raise misfit("missing; this key is needed", *place, "shots", number, "beta")
+                raise FieldError("missing; this key is needed", *place, "shots", number, "beta")
             for key in ("beta", "width"):
                 if family != "fza" and getattr(shot, key) is not None:
                     message = f"is of a zone plate; the mask is of the family {family}: drop it"
-                    raise misfit(message, *place, "shots", number, key)
+                    raise FieldError(message, *place, "shots", number, key)
 
 
 def check_methods(config: CamerasConfig) -> None:
@@ -446,19 +438,19 @@ def check_methods(config: CamerasConfig) -> None:
                 "synthesis contrasts needs masks of one width, which share a background; use "
                 "phase_pairs or fringe_scanning"
             )
-            raise misfit(message, "methods", index, "shots")
+            raise FieldError(message, "methods", index, "shots")
         for what, entries in (("shots", shots), ("phases", method.phases)):
             if len(set(entries)) < len(entries):
                 message = f"{what} hold an entry twice; give each once"
-                raise misfit(message, "methods", index, what)
+                raise FieldError(message, "methods", index, what)
     for index, method in enumerate(config.methods):
         if config.noise is None and method.kind == "wiener":
             message = "wiener weighs noise against signal; give a 'noise' section"
-            raise misfit(message, "methods", index, "kind")
+            raise FieldError(message, "methods", index, "kind")
         for number, shot in enumerate(method.shots):
             if shot.exposure != 1 and not config.sensor.counts:
                 message = (
                     "this is relative to the sensor's; give sensor.exposure or sensor.electrons"
                 )
-                raise misfit(message, "methods", index, "shots", number, "exposure")
+                raise FieldError(message, "methods", index, "shots", number, "exposure")
     check_noise(config)

@@ -25,6 +25,10 @@ Overrides = Annotated[
     list[str] | None,
     typer.Option("--set", help="Change a value: a.b=value, list entries by number."),
 ]
+DryRun = Annotated[
+    bool,
+    typer.Option("--dry-run", help="Check all and tell what would be done, without doing it."),
+]
 
 
 @contextlib.contextmanager

@@ -6,9 +6,11 @@ streams and releases the device. A driver raises `HardwareError` and nothing els
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
+
+from thincam_jax._core.quantity import quantity, whole
 
 Opened = TypeVar("Opened", bound="Device")
 
@@ -55,20 +57,20 @@ class Device(ABC):
 class Region:
     """Part of a sensor, in pixels: rows top … top + height − 1, columns left … left + width − 1."""
 
-    top: int
-    left: int
-    height: int
-    width: int
+    top: Annotated[int, whole(0, 65535)]
+    left: Annotated[int, whole(0, 65535)]
+    height: Annotated[int, whole(1, 65536)]
+    width: Annotated[int, whole(1, 65536)]
 
 
 @dataclass(frozen=True)
 class CameraSettings:
     """Camera settings, requested or as `Camera.configure` returns them."""
 
-    exposure: float  # s
+    exposure: Annotated[float, quantity("s", positive=True)]
     region: Region | None = None  # None: the whole sensor
     pixel_format: str = "Mono12"  # name of the GenICam pixel format: Mono8, Mono10, Mono12, Mono16
-    gain: float = 0.0  # dB
+    gain: Annotated[float, quantity("dB")] = 0.0
 
 
 @dataclass(frozen=True)

@@ -11,14 +11,14 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from thincam_jax._core import checks
+from thincam_jax._core.quantity import check_fields, quantity, whole
 from thincam_jax.design.stochastic import adam_method, adam_step
 from thincam_jax.learn.checkpoint import (
     CheckpointError,
@@ -52,25 +52,17 @@ class TrainingOptions:
     **Errors**: ValueError for numbers out of range.
     """
 
-    steps: int = 2000
-    rate: float = 1e-3
-    warm_up: int = 50
-    longest_slope: float = 1.0
-    averaging: float = 0.99
-    check_every: int = 100
+    steps: Annotated[int, whole(1, 1_000_000)] = 2000
+    rate: Annotated[float, quantity(positive=True)] = 1e-3
+    warm_up: Annotated[int, whole(0)] = 50
+    longest_slope: Annotated[float, quantity(positive=True)] = 1.0
+    averaging: Annotated[float, quantity(least=0.0, most=0.999999)] = 0.99
+    check_every: Annotated[int, whole(1, 1_000_000)] = 100
     seed: int = 0
-    falling: float = 1.0
+    falling: Annotated[float, quantity(positive=True, most=1.0)] = 1.0
 
     def __post_init__(self):
-        checks.at_least_one({"steps": self.steps, "check_every": self.check_every})
-        for name in ("rate", "longest_slope"):
-            checks.positive(name, getattr(self, name), "a number")
-        if not 0 <= self.averaging < 1:
-            raise ValueError(f"averaging = {self.averaging}: give 0 to below 1")
-        if not 0 < self.falling <= 1:
-            raise ValueError(f"falling = {self.falling}: give above 0 to 1")
-        if self.warm_up < 0:
-            raise ValueError(f"warm_up = {self.warm_up}: give at least 0 steps")
+        check_fields(self)
 
     def rate_at(self, step: int) -> float:
         """Of the step of that number, counted from 0."""

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from thincam_jax._core import checks
+from thincam_jax._core.quantity import quantity, whole
 from thincam_jax.imaging.operators.crop_convolution import CropConvolution, cut, place
 from thincam_jax.reconstruction.choose_tau import SearchInterrupted, find_tau
 from thincam_jax.reconstruction.fringe_filter import FringeScanning
@@ -40,7 +41,6 @@ from thincam_jax.reconstruction.solver import (
     as_regulariser,
     as_synthesis,
     as_variation,
-    at_most,
     checked_tau,
     first_image,
     small_enough,
@@ -141,10 +141,12 @@ class Start(eqx.Module):
 class AbstractRegularised(AbstractIterativeSolver):
     """A solver that minimises ½ Σ w (Af − g)² + τ R(f), with R its `prior`."""
 
-    tau: Float[Array, ""] | str = eqx.field(default=DEFAULT_TAU, converter=checked_tau)
+    tau: Float[Array, ""] | str = eqx.field(
+        default=DEFAULT_TAU, converter=quantity(check=checked_tau)
+    )
     nonnegative: bool = eqx.field(default=True, converter=bool, static=True, kw_only=True)
     synthesis: np.ndarray | None = eqx.field(default=None, converter=as_synthesis, kw_only=True)
-    iterations: int = eqx.field(default=100, converter=at_most, static=True, kw_only=True)
+    iterations: int = eqx.field(default=100, converter=whole(1), static=True, kw_only=True)
     tolerance: float = eqx.field(default=1e-4, converter=small_enough, static=True, kw_only=True)
 
     @property

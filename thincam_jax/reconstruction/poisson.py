@@ -28,6 +28,7 @@ from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Number, Numbers
+from thincam_jax._core.quantity import whole
 from thincam_jax.reconstruction.imaging_model import Cameras, distance_ratios
 from thincam_jax.reconstruction.iterate import Callback, Outcome, outcome_of_run
 from thincam_jax.reconstruction.problem import (
@@ -44,7 +45,6 @@ from thincam_jax.reconstruction.solver import (
     DEFAULT_TAU,
     AbstractIterativeSolver,
     as_variation,
-    at_most,
     first_image,
     of_kind,
     small_enough,
@@ -144,7 +144,7 @@ class PoissonTV(AbstractIterativeSolver):
     tau: Float[Array, ""] = eqx.field(default=DEFAULT_TAU, converter=_number)
     variation: TotalVariation = eqx.field(default=None, converter=as_variation, kw_only=True)
     background: Any = eqx.field(default=None, kw_only=True)
-    iterations: int = eqx.field(default=300, converter=at_most, static=True, kw_only=True)
+    iterations: int = eqx.field(default=300, converter=whole(1), static=True, kw_only=True)
     tolerance: float = eqx.field(default=1e-4, converter=small_enough, static=True, kw_only=True)
 
     def solve(

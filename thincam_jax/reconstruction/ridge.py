@@ -37,7 +37,7 @@ import operator
 import time
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import ClassVar, Literal, cast
+from typing import Annotated, Any, ClassVar, Literal, cast
 
 import equinox as eqx
 import jax
@@ -49,6 +49,7 @@ from jaxtyping import Array, DTypeLike, Float
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Number
 from thincam_jax._core.precision import product
+from thincam_jax._core.quantity import FieldError, quantity, whole
 from thincam_jax.imaging.operators import Separable
 from thincam_jax.imaging.operators.separable import SeparableModes
 from thincam_jax.reconstruction.iterate import Outcome, outcome_of_run
@@ -72,7 +73,6 @@ from thincam_jax.reconstruction.solver import (
     AbstractSolver,
     Synthesis,
     as_synthesis,
-    at_most,
     small_enough,
 )
 
@@ -83,6 +83,12 @@ RULES: tuple[Rule, ...] = ("gcv", "sure")
 # ρ is searched on a grid from 1e-12 to 1e4 of the largest eigenvalue of AᵀA, then between the
 # neighbours of the best, twice: to 0.2 %.
 _STEPS, _ZOOMS, _DECADES = 33, 3, (-12.0, 4.0)
+
+
+def _checked_ridge(name: str, ridge: Any) -> float | Rule:
+    if isinstance(ridge, str):
+        return cast(Rule, checks.choice(name, ridge, RULES))
+    return float(checks.positive(name, ridge, "noise variance / image variance"))
 
 
 class Ridge(AbstractSolver):
@@ -114,28 +120,27 @@ class Ridge(AbstractSolver):
 
     def __init__(
         self,
-        ridge: Number | str = 1.0,
+        ridge: Annotated[Number | str, quantity(check=_checked_ridge)] = 1.0,
         *,
         correlation: Number | Sequence[float | int] = 0.0,
         synthesis: Synthesis | None = None,
-        iterations: int = 300,
+        iterations: Annotated[int, whole(1)] = 300,
         tolerance: float = 1e-4,
     ):
-        if isinstance(ridge, str):
-            self.ridge = cast(Rule, checks.choice("ridge", ridge, RULES))
-        else:
-            self.ridge = float(checks.positive("ridge", ridge, "noise variance / image variance"))
+        self.ridge = _checked_ridge("ridge", ridge)
         lengths = correlation if isinstance(correlation, tuple | list) else (correlation,)
         self.correlation = tuple(
             float(checks.non_negative("correlation", one, "pixels")) for one in lengths
         )
         if not self.correlation or (len(lengths) > 1 and not isinstance(self.ridge, str)):
-            raise ValueError(
+            raise FieldError(
                 f"correlation = {correlation} and ridge = {self.ridge}: give one length, or "
-                'several and ridge="sure" or "gcv", which choose among them'
+                'several and ridge="sure" or "gcv", which choose among them',
+                "correlation",
             )
         self.synthesis = as_synthesis(synthesis)
-        self.iterations, self.tolerance = at_most(iterations), small_enough(tolerance)
+        self.iterations = checks.whole("iterations", iterations, 1)
+        self.tolerance = small_enough(tolerance)
 
     def solve(self, recording: Recording):
         problem, white, mean, prior, precision = self._posed(recording)

@@ -53,13 +53,6 @@ class AbstractIterativeSolver(AbstractSolver):
         """Reconstruct the image of a recording; see `reconstruct` for the arguments."""
 
 
-def at_most(iterations: int) -> int:
-    """Check a number of iterations."""
-    if isinstance(iterations, bool) or not isinstance(iterations, int) or iterations < 1:
-        raise ValueError(f"iterations = {iterations}; give a whole number of at least 1")
-    return iterations
-
-
 def small_enough(tolerance: float) -> float:
     """Check a tolerance of residuals."""
     checks.non_negative("tolerance", tolerance, "a ratio")
@@ -71,12 +64,11 @@ def as_synthesis(synthesis: Synthesis | None) -> np.ndarray | None:
     return None if synthesis is None else np.asarray(synthesis, dtype=float)
 
 
-def checked_tau(tau: Any) -> Any:
+def checked_tau(name: str, tau: Any) -> Any:
     """Check τ ≥ 0, or the name of a rule that chooses it."""
     if isinstance(tau, str):
-        checks.choice("tau", tau, get_args(TauRule))
-        return tau
-    return checks.non_negative("tau", tau, "a ratio")
+        return checks.choice(name, tau, get_args(TauRule))
+    return checks.non_negative(name, tau, "a ratio")
 
 
 def of_kind(name: str, value: Any, kind: type):

@@ -9,7 +9,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from thincam_jax._core.grids import Grid
+from thincam_jax._core.quantity import FieldError, check_fields, choice, quantity, whole
 from thincam_jax._core.steps import Progress, Step, carry_out
 from thincam_jax._core.table import Table
 from thincam_jax.imaging.metrics import psnr
@@ -34,7 +35,7 @@ from thincam_jax.reconstruction.depth.find import (
     find_distances,
     object_regions,
 )
-from thincam_jax.reconstruction.depth.focus import Measure
+from thincam_jax.reconstruction.depth.focus import MEASURES, Measure
 from thincam_jax.reconstruction.depth.refocus import (
     RefocusSweep,
     axial_resolution,
@@ -61,10 +62,13 @@ class SceneObject:
 
     name: str
     picture: Float[np.ndarray, "y x *channel"]
-    distance: float
-    width: float
-    x: float = 0.0
-    y: float = 0.0
+    distance: Annotated[float, quantity("mm", positive=True)]
+    width: Annotated[float, quantity("mm", positive=True)]
+    x: Annotated[float, quantity("mm")] = 0.0
+    y: Annotated[float, quantity("mm")] = 0.0
+
+    def __post_init__(self):
+        check_fields(self)
 
 
 @dataclass(frozen=True)
@@ -90,12 +94,17 @@ class FocusRange:
     """
 
     method: str
-    nearest: float
-    farthest: float
-    count: int = 25
-    measure: Measure = "laplacian_variance"
-    smoothing: float = 1.0
-    window: float = 6.0
+    nearest: Annotated[float, quantity("mm", positive=True)]
+    farthest: Annotated[float, quantity("mm", positive=True)]
+    count: Annotated[int, whole(5, 200)] = 25
+    measure: Annotated[Measure, choice(MEASURES)] = "laplacian_variance"
+    smoothing: Annotated[float, quantity("pixels", least=0.0, most=50.0)] = 1.0
+    window: Annotated[float, quantity("pixels", least=0.5, most=100.0)] = 6.0
+
+    def __post_init__(self):
+        check_fields(self)
+        if not self.nearest < self.farthest:
+            raise FieldError("nearest is not below farthest; swap them", "nearest")
 
     @property
     def distances(self) -> list[float]:

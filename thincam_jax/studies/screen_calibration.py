@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Annotated, get_args
 
 import equinox as eqx
 import jax
@@ -21,15 +22,17 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from thincam_jax import waveguide as wg
+from thincam_jax._core.quantity import FieldError, check_fields, choice, quantity, whole
 from thincam_jax._core.steps import Progress, Step, carry_out
 from thincam_jax._core.table import Table
 from thincam_jax.imaging.metrics import psnr
 from thincam_jax.imaging.operators import Matrix, ReducedMatrix, Scaled, Sparse
 from thincam_jax.measured import calibration as measuring
-from thincam_jax.measured.calibration.hadamard import Display, Order
+from thincam_jax.measured.calibration.hadamard import DARK_FRAMES, Display, Order
 from thincam_jax.measured.calibration.screen_fit import DEFAULT, PARAMETERS
 from thincam_jax.studies.evaluate import rounded
 from thincam_jax.studies.screen import (
+    GLASS,
     Reconstructed,
     ScreenCaptures,
     ScreenStudy,
@@ -56,17 +59,28 @@ class Calibration:
     - `distances`: of the object, mm, at which the matrix follows from the fit and is measured anew.
     """
 
-    order: Order = "sequency"
-    display: Display = "complementary"
-    dark_frames: int = 0
-    bits: int = 12
-    exposure: float = 0.9
-    offset: float = 0.0
-    noise: float = 0.0
+    order: Annotated[Order, choice(get_args(Order))] = "sequency"
+    display: Annotated[Display, choice(get_args(Display))] = "complementary"
+    dark_frames: Annotated[int, DARK_FRAMES] = 0
+    bits: Annotated[int, whole(4, 16)] = 12
+    exposure: Annotated[float, quantity(positive=True, most=1.0)] = 0.9
+    offset: Annotated[float, quantity("counts", non_negative=True)] = 0.0
+    noise: Annotated[float, quantity("counts", non_negative=True)] = 0.0
     keep_captures: bool = False
-    glass_thickness: float | None = None
-    fitted: tuple[str, ...] = DEFAULT
-    distances: tuple[float, ...] = ()
+    glass_thickness: Annotated[float | None, GLASS] = None
+    fitted: Annotated[tuple[str, ...], choice(PARAMETERS, many=True)] = DEFAULT
+    distances: Annotated[tuple[float, ...], quantity("mm", positive=True, many=True)] = ()
+
+    def __post_init__(self):
+        check_fields(self)
+        if not self.fitted or len(set(self.fitted)) < len(self.fitted):
+            raise FieldError("names one number twice, or none; give each once", "fitted")
+        if self.offset >= 2**self.bits / 2:
+            message = f"{self.offset:g} fills half of the {self.bits} bits; give less, or more bits"
+            raise FieldError(message, "offset")
+        if self.display == "binary" and self.offset and not self.dark_frames:
+            message = "a binary display with an offset needs dark frames; give 8, or offset: 0"
+            raise FieldError(message, "display")
 
     def series(self, shape: tuple[int, int]) -> measuring.HadamardSeries:
         """The patterns for so many cells."""

@@ -69,6 +69,12 @@ def footprints(points: Float[np.ndarray, "*ray 2"], plane: ObjectPlane, size: fl
     return Footprints(edges[..., 0].astype(np.int32), np.maximum(parts, 0) / ratio)
 
 
+def entries_of_a_ray(camera: SeeThroughCamera, plane: ObjectPlane) -> int:
+    """Entries of the system matrix that a ray makes at most: the cells that it may touch."""
+    ratio = float(seen_size(camera, plane)) / float(plane.pitch)
+    return (math.ceil(ratio) + 1) ** 2
+
+
 def in_cells(
     points: Float[np.ndarray, "*ray 2"], plane: ObjectPlane
 ) -> Float[np.ndarray, "2 *ray"]:

@@ -91,7 +91,6 @@ def test_the_file_makes_the_camera(file):
         ("sources.0.use=judge", "none of them is of use 'train'"),
         ("sources.0.path=there", "kind drawn takes no 'path'"),
         ("sources.0.kind=folder", "kind folder needs 'path'"),
-        ("network.depth=3", "unknown key; allowed here: steps, widths"),
     ],
 )
 def test_a_fault_of_the_file_is_told(changed, told, file):

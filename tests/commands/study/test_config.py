@@ -101,66 +101,22 @@ def test_base_is_read_in_the_units_of_the_package(tmp_path):
 
 # what is in the file, what it is changed to, the field, what the message must hold
 FAULTS = {
-    "no unit": ("pitch: 40 um", "pitch: 40", "sensor.pitch", ["40 has no unit", '"180 mm"']),
     "no unit, exponent": ("width: 2 mm", "width: 1e-3", "mask.width", ["1e-3 has no unit"]),
-    "wrong unit": ("pitch: 40 um", "pitch: 40 s", "sensor.pitch", ["a time, not a length"]),
     "unknown unit": ("pitch: 40 um", "pitch: 40 foo", "sensor.pitch", ['unknown unit "foo"', "nm"]),
-    "angle for a length": ("500 nm", "500 deg", "wavelength", ["an angle, not a wavelength"]),
-    "negative": (
-        "width: 2 mm",
-        "width: -2 mm",
-        "mask.width",
-        ['"-2 mm" is not positive', "above zero"],
-    ),
-    "zero": (
-        "width: 80 mm",
-        "width: 0 mm",
-        "object.width",
-        ['"0 mm" is not positive', "above zero"],
-    ),
-    "NaN": ("width: 80 mm", "width: nan mm", "object.width", ["not finite"]),
     "YAML NaN": ("width: 80 mm", "width: .nan", "object.width", ["no unit"]),
     "infinity": ("snr_db: 30", "snr_db: .inf", "noise.snr_db", ["inf: ", "finite number"]),
-    "negative curvature": (
-        *("- beta: 25 rad/mm^2", "- beta: -25 rad/mm^2"),
-        *("methods[0].shots[0].beta", ['"-25 rad/mm^2" is not positive']),
-    ),
-    "unknown key": ("  profile: cosine", "  widht: 2 mm", "mask.widht", ["unknown key"]),
-    "unknown top key": ("seed: 7", "sede: 7", "sede", ["unknown key", "seed, wavelength, model"]),
     "unknown key in a list": (
         *("        distance: 3 mm", "        distance: 3 mm\n        colour: red"),
         *("methods[0].shots[0].colour", ["unknown key; allowed here: beta, distance, wavelength"]),
-    ),
-    "unknown model": (
-        *("model: separable", "model: sperable", "model"),
-        ["'sperable' is unknown", "'geometric'", "'separable'", "'rayleigh_sommerfeld'"],
-    ),
-    "unknown kind": (
-        *("kind: wiener", "kind: winer", "methods[1].kind"),
-        ["'winer' is unknown", "'fringe_scanning', 'wiener' or 'admm_tv'"],
-    ),
-    "unknown synthesis": (
-        *("synthesis: separate", "synthesis: pairs", "methods[1].synthesis"),
-        ["'pairs'", "'phase_pairs', 'harmonics', 'contrasts' or 'separate'"],
     ),
     "unknown photograph": (
         *("image: coffee", "image: coffe", "targets[1]"),
         ["image 'coffe' is unknown; choose one of", *sample_images()],
     ),
-    "text for a number": ("seed: 7", "seed: seven", "seed", ["'seven'", "valid integer"]),
-    "negative seed": ("seed: 7", "seed: -1", "seed", ["-1", "greater than or equal to 0"]),
-    "number for a text": (
-        "title: A study",
-        "title: 5",
-        "title",
-        ["5: input should be a valid str"],
-    ),
-    "text for a section": ("noise:\n  snr_db: 30", "noise: 30", "noise", ["30 is not a section"]),
     "part of a pixel": ("[48, 64]", "[48, 64.5]", "sensor.shape[1]", ["64.5", "integer"]),
     "no pixel": ("[48, 64]", "[48, 0]", "sensor.shape", ["shape = (48, 0)", "of at least 1"]),
     "list too short": ("[48, 64]", "[48]", "sensor.shape[1]", ["the list needs this entry"]),
     "list too long": ("[48, 64]", "[48, 64, 3]", "sensor.shape", ["3 entries", "at most 2"]),
-    "no list": ("[48, 64]", "48", "sensor.shape", ["48 is not a list; write it as [a, b]"]),
     "no phase": (
         *("phases: [0 rad, 270 deg]", "phases: []", "methods[1].phases"),
         ["[] has 0 entries; give at least 1"],
@@ -231,10 +187,6 @@ FAULTS = {
     "two kinds of noise": (
         *("snr_db: 30", "snr_db: 30\n  read_noise: 2", "noise"),
         ["give either snr_db", "or read_noise"],
-    ),
-    "negative read noise": (
-        *("snr_db: 30", "read_noise: -1", "noise.read_noise"),
-        ["read_noise = -1.0 electrons is negative; give read_noise >= 0"],
     ),
     "shot noise alone without exposure": (
         *("snr_db: 30", "read_noise: 0", "noise.read_noise"),

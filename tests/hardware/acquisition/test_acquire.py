@@ -363,5 +363,5 @@ def test_frames_of_a_store_have_one_shape(path):
         run(World(), path, plan)
     run(World(), path, dataclasses.replace(PLAN, settings=(regions[1],)))
     assert read_acquisition(path).sensor_shape == (4, 5)
-    with pytest.raises(ValueError, match="retries = -1; give a finite number"):
+    with pytest.raises(ValueError, match="retries = -1: give a whole number from 0"):
         Procedure(retries=-1)

@@ -8,7 +8,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from thincam_jax.commands.terminal import ConfigFile, Overrides, progress_bar, tell, told, warn
+from thincam_jax.commands.terminal import (
+    ConfigFile,
+    DryRun,
+    Overrides,
+    progress_bar,
+    tell,
+    told,
+    warn,
+)
 
 if TYPE_CHECKING:
     from thincam_jax.commands.capture.config import CaptureConfig
@@ -26,6 +34,7 @@ def capture(
         bool, typer.Option("--resume", help="Go on with a store that is not complete.")
     ] = False,
     set_: Overrides = None,
+    dry_run: DryRun = False,
 ) -> None:
     """Take the frames of a plan with the devices of a rig, real or virtual.
 
@@ -41,11 +50,12 @@ def capture(
 
     with told(lambda: f"interrupted; {go_on()}" if kept else "interrupted; nothing was taken."):
         from thincam_jax._core.files import MeasurementError, write_whole
+        from thincam_jax.commands import explain
         from thincam_jax.commands.checked_config import dump_config
         from thincam_jax.commands.config_file import ConfigError, slug
         from thincam_jax.commands.kinds import load_experiment
         from thincam_jax.commands.run_folder import to_json
-        from thincam_jax.hardware.acquisition.acquire import Procedure, acquire
+        from thincam_jax.hardware.acquisition.acquire import acquire
         from thincam_jax.hardware.errors import HardwareError
 
         asked = load_experiment(config, tuple(set_ or ()), "capture")
@@ -55,10 +65,11 @@ def capture(
         if resume and not store.exists():
             raise ConfigError(f"--out {store}: there is nothing to resume; leave out --resume")
         plan = build_plan(asked)
+        if dry_run:
+            explain.dry_run(asked, f"writes to {store}: {len(plan.steps)} frames", plan)
+            return
         kept = f"0 of {len(plan.steps)} frames are kept"
-        how = asked.acquisition
-        given = {"timeout": how.timeout, "retries": how.retries, "saturated_share": how.saturated}
-        procedure = Procedure(settle=asked.display.settle, **given)
+        procedure = asked.acquisition.build(settle=asked.display.settle)
         try:
             store.parent.mkdir(parents=True, exist_ok=True)
             with opened(asked) as rig, progress_bar("{task.fields[rate]}") as bar:
@@ -165,11 +176,10 @@ def build_plan(config: "CaptureConfig") -> Any:
     from dataclasses import replace
 
     from thincam_jax.hardware.acquisition import plan as plans
-    from thincam_jax.hardware.base import CameraSettings, Region
+    from thincam_jax.hardware.base import CameraSettings
 
     asked, camera, optics = config.plan, config.camera, config.optics
-    region = None if camera.region is None else Region(**dict(camera.region))
-    settings = CameraSettings(camera.exposure, region, camera.pixel_format, camera.gain)
+    settings = camera.build(CameraSettings)
     if asked.kind == "hadamard":
         return plans.hadamard(asked.series, settings)
     assert optics is not None and asked.width is not None  # of lensless plans
@@ -257,7 +267,7 @@ def virtual_rig(config: "CaptureConfig") -> Any:
         )
     return VirtualRig(
         seen,
-        Electronics(virtual.full_well, virtual.read_noise, virtual.offset),
+        virtual.build(Electronics),
         display_shape=virtual.display,
         response=virtual.response or 0.0,
         fiducial=virtual.fiducial,
@@ -294,7 +304,7 @@ def _taken(store: Path, config: "CaptureConfig") -> Any:
     simulated = None
     if config.rig == "virtual" and config.virtual is not None:
         virtual = config.virtual
-        electronics = Electronics(virtual.full_well, virtual.read_noise, virtual.offset)
+        electronics = virtual.build(Electronics)
         electron, offset = electronics.scale(found.settings[0])
         counts = electron * found.settings[0].exposure * virtual.electrons
         simulated = CountingCamera(counts, electron, virtual.read_noise, 0.0 if darks else offset)

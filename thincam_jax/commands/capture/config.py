@@ -5,9 +5,10 @@ from typing import Annotated, Any, Literal
 import pydantic
 from pydantic import Field
 
+from thincam_jax._core.quantity import FieldError
+from thincam_jax.commands.schema import section
 from thincam_jax.commands.screen.config import SeeThroughConfig, check_cells
 from thincam_jax.commands.sections import (
-    Angle,
     Curvature,
     ExperimentConfig,
     Length,
@@ -19,22 +20,16 @@ from thincam_jax.commands.sections import (
     Time,
     VariationConfig,
     Wavelength,
-    misfit,
 )
-from thincam_jax.lensless.masks.fza import Profile
+from thincam_jax.hardware.acquisition.taker import Procedure
+from thincam_jax.hardware.base import CameraSettings
+from thincam_jax.hardware.virtual.rig import Electronics, VirtualRig
+from thincam_jax.imaging.sensor import Sensor
+from thincam_jax.lensless.masks.fza import FresnelZoneAperture
 from thincam_jax.lensless.method import Model
-from thincam_jax.measured.calibration.hadamard import Display, HadamardSeries, Order
+from thincam_jax.measured.calibration.hadamard import HadamardSeries
 
 Count = Annotated[int, Field(ge=1, le=65536)]
-
-
-class RegionConfig(Section):
-    """Part of the sensor, in pixels; an image is that of a part about the axis."""
-
-    top: Annotated[int, Field(ge=0)] = 0
-    left: Annotated[int, Field(ge=0)] = 0
-    height: Count
-    width: Count
 
 
 class DeviceConfig(Section):
@@ -44,21 +39,20 @@ class DeviceConfig(Section):
     options: dict[str, Any] = {}
 
 
-class CameraConfig(DeviceConfig):
+class CameraConfig(DeviceConfig, section(CameraSettings), section(Sensor, only=("pitch",))):
     """The camera and its settings; `pitch`: of its pixels."""
 
-    exposure: Time
     pixel_format: Literal["Mono8", "Mono10", "Mono12", "Mono16"] = "Mono12"
-    gain: float = 0.0
-    region: RegionConfig | None = None
-    pitch: Length
 
 
-class DisplayConfig(DeviceConfig):
+class DisplayConfig(
+    DeviceConfig,
+    section(FresnelZoneAperture, only=("fill_factor",)),
+    section(Procedure, only=("settle",)),
+):
     """The modulator or monitor; `pitch`: of its pixels; `settle`: until it shows a pattern."""
 
     pitch: Length
-    fill_factor: Annotated[float, Field(gt=0, le=1)] = 1.0
     settle: Time
 
 
@@ -74,7 +68,11 @@ _NUMBERS: dict[PlanKind, tuple[tuple[str, ...], tuple[str, ...]]] = {
 }
 
 
-class PlanConfig(Section):
+_PATTERNS, _SHOWN = ("order", "display", "dark_frames"), ("width", "profile", "phase")
+_Plate = section(FresnelZoneAperture, only=_SHOWN, defaults={"width": None})
+
+
+class PlanConfig(section(HadamardSeries, only=_PATTERNS), _Plate):
     """What is captured.
 
     - `betas`: β of the Fresnel zone apertures, two or more for method_b, else one; `width`,
@@ -87,14 +85,8 @@ class PlanConfig(Section):
 
     kind: PlanKind
     betas: tuple[Curvature, ...] = ()
-    width: Length | None = None
-    profile: Profile = "cosine"
-    phase: Angle = 0.0
     distances: tuple[Length, ...] = ()
     cells: tuple[Count, Count] | None = None
-    order: Order = "sequency"
-    display: Display = "complementary"
-    dark_frames: Annotated[int, Field(ge=0, le=4096)] = 0
 
     @pydantic.model_validator(mode="after")
     def _fits(self):
@@ -106,15 +98,15 @@ class PlanConfig(Section):
         allowed = (*needed, *also)
         for key in needed:
             if not getattr(self, key):
-                raise misfit(f"a plan of kind {self.kind} needs it", key)
+                raise FieldError(f"a plan of kind {self.kind} needs it", key)
         for key in sorted(given.difference(allowed)):
-            raise misfit(f"a plan of kind {self.kind} takes {', '.join(allowed)}; drop it", key)
+            raise FieldError(f"a plan of kind {self.kind} takes {', '.join(allowed)}; drop it", key)
         if self.kind == "method_b" and len(self.betas) < 2:
-            raise misfit("method_b compares two β or more; give another", "betas")
+            raise FieldError("method_b compares two β or more; give another", "betas")
         if self.kind not in ("method_b", "hadamard") and len(self.betas) != 1:
-            raise misfit(f"a plan of kind {self.kind} has one β; give one", "betas")
+            raise FieldError(f"a plan of kind {self.kind} has one β; give one", "betas")
         if len(set(self.betas)) < len(self.betas) or len(set(self.distances)) < len(self.distances):
-            raise misfit("an entry stands twice; give each once", "betas")
+            raise FieldError("an entry stands twice; give each once", "betas")
         if self.cells is not None:
             check_cells(self.cells, "cells")
         return self
@@ -123,20 +115,13 @@ class PlanConfig(Section):
     def series(self) -> HadamardSeries:
         """Of a plan of kind hadamard."""
         assert self.cells is not None  # checked above
-        return HadamardSeries(self.cells, self.order, self.display, self.dark_frames)
+        return self.build(HadamardSeries, object_shape=self.cells)
 
 
-class AcquisitionConfig(Section):
-    """How frames are taken.
-
-    - `timeout`: until a frame is there, beyond its exposure.
-    - `retries`: how often a frame that did not come, or not whole, is taken again.
-    - `saturated`: largest part of the pixels that may be at the largest count.
-    """
-
-    timeout: Time = 2.0
-    retries: Annotated[int, Field(ge=0, le=100)] = 3
-    saturated: Annotated[float, Field(ge=0, le=1)] = 0.01
+class AcquisitionConfig(
+    section(Procedure, only=("timeout", "retries", "saturated"), defaults={"saturated": 0.01})
+):
+    """How frames are taken; see `thincam_jax.hardware.acquisition.Procedure`."""
 
 
 class OpticsConfig(Section):
@@ -156,26 +141,21 @@ class ReconstructionConfig(Section):
     variation: VariationConfig | None = None
 
 
-class VirtualConfig(Section):
+_RIG = ("full_well", "read_noise", "offset", "response", "fiducial")
+
+
+class VirtualConfig(section(Electronics, VirtualRig, only=_RIG, defaults={"response": None})):
     """A rig that is simulated, for `rig: virtual`.
 
     - `sensor`, `display`: (rows, columns).
     - `electrons`: per second, of a pixel from each mm² of open aperture before a white scene; with
       a screen, of the brightest pixel before a white monitor.
-    - `full_well`, `read_noise`: in electrons; `offset`: counts of a dark frame in those of 12 bits.
-    - `response`: of the display; before, the pattern before is seen.
-    - `fiducial`: each frame says in its corner what it was exposed of.
     - `screen`: a see-through camera before a monitor, for a Hadamard plan.
     """
 
     sensor: tuple[Count, Count]
     display: tuple[Count, Count]
     electrons: Annotated[float, Field(gt=0)]
-    full_well: Annotated[float, Field(gt=0)] = 13_500.0
-    read_noise: Annotated[float, Field(ge=0)] = 8.0
-    offset: Annotated[float, Field(ge=0, lt=2048)] = 60.0
-    response: Time | None = None
-    fiducial: bool = False
     screen: SeeThroughConfig | None = None
 
 
@@ -202,10 +182,10 @@ class CaptureConfig(ExperimentConfig):
     def _fits(self):
         kind = self.plan.kind
         if kind in ("method_a", "psf_stack") and self.stage is None:
-            raise misfit(f"a plan of kind {kind} moves a stage; give one", "stage")
+            raise FieldError(f"a plan of kind {kind} moves a stage; give one", "stage")
         if (kind == "hadamard") == (self.optics is not None):
             verb = "takes no" if kind == "hadamard" else "needs"
-            raise misfit(f"a plan of kind {kind} {verb} optics", "optics")
+            raise FieldError(f"a plan of kind {kind} {verb} optics", "optics")
         if self.rig == "virtual":
             self._check_virtual()
         return self
@@ -213,20 +193,22 @@ class CaptureConfig(ExperimentConfig):
     def _check_virtual(self) -> None:
         plan, virtual = self.plan, self.virtual
         if virtual is None:
-            raise misfit("rig: virtual needs this section", "virtual")
+            raise FieldError("rig: virtual needs this section", "virtual")
         if plan.kind != "hadamard":
             if not self.targets:
-                raise misfit("a virtual rig looks at one; give it", "targets")
+                raise FieldError("a virtual rig looks at one; give it", "targets")
             return
         seen = virtual.screen
         if seen is None:
-            raise misfit("a virtual rig for a plan of kind hadamard needs it", "virtual", "screen")
+            raise FieldError(
+                "a virtual rig for a plan of kind hadamard needs it", "virtual", "screen"
+            )
         if seen.hologram.colours is not None:
             message = "a plan of kind hadamard takes one colour; give wavelength in their place"
-            raise misfit(message, "virtual", "screen", "hologram", "colours")
+            raise FieldError(message, "virtual", "screen", "hologram", "colours")
         if seen.object.cells != plan.cells:
             message = f"the plan shows {plan.cells}; give these"
-            raise misfit(message, "virtual", "screen", "object", "cells")
+            raise FieldError(message, "virtual", "screen", "object", "cells")
         if seen.sensor.shape != virtual.sensor:
             message = f"virtual.sensor is {virtual.sensor}; give this"
-            raise misfit(message, "virtual", "screen", "sensor", "shape")
+            raise FieldError(message, "virtual", "screen", "sensor", "shape")

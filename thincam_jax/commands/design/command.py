@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from thincam_jax.commands.terminal import Overrides, counted, show, told, warn
+from thincam_jax.commands.terminal import DryRun, Overrides, counted, show, told, warn
 
 if TYPE_CHECKING:
     from thincam_jax.studies.design_scores import DesignScores
@@ -17,6 +17,7 @@ def design(
         Path | None, typer.Option(help="Folder of the results; default runs/NAME of the design.")
     ] = None,
     set_: Overrides = None,
+    dry_run: DryRun = False,
 ) -> None:
     """Search for the best design.
 
@@ -34,6 +35,11 @@ def design(
         study = build_design(wanted)
         warn(study.warnings)
         folder = DesignFolder(out or Path("runs") / slug(wanted.name))
+        if dry_run:
+            from thincam_jax.commands import explain
+
+            explain.dry_run(wanted, folder.outcome(wanted))
+            return
         with counted(wanted.name) as progress:
             found = run_design(study, folder, progress)
     show(found.table())

@@ -24,7 +24,6 @@ from thincam_jax.commands.sections import (
     TargetConfig,
     check_known,
     check_names,
-    misfit,
 )
 from thincam_jax.design import (
     Design,
@@ -305,11 +304,11 @@ class DesignConfig(LenslessConfig):
         _check_search(self)
         if self.prior.measured and not self.pictures():
             message = "measured needs a photograph among the targets; give prior.exponent instead"
-            raise misfit(message, "prior", "measured")
+            raise FieldError(message, "prior", "measured")
         try:
             self.space()
         except FieldError as error:
-            raise misfit(str(error), *_PLACES[error.field]) from None
+            raise FieldError(str(error), *_PLACES[error.field]) from None
         if self.pareto is not None:
             check_pareto(self)
         return self
@@ -381,7 +380,7 @@ def _check_given(config: DesignConfig) -> None:
         count = len(config.reference.shots)
         if len(rival.shots) != count:
             message = f"{len(rival.shots)} shots, and the reference has {count}; give as many"
-            raise misfit(message, *place, "shots")
+            raise FieldError(message, *place, "shots")
 
 
 def _check_shots(
@@ -389,7 +388,7 @@ def _check_shots(
 ) -> None:
     shots = [(s.beta, s.distance) for s in given.shots]
     if len(set(shots)) < len(shots):
-        raise misfit("shots hold an entry twice; give each once", *place, "shots")
+        raise FieldError("shots hold an entry twice; give each once", *place, "shots")
     for index, shot in enumerate(given.shots):
         shared = {
             "wavelength": config.wavelength,
@@ -400,10 +399,10 @@ def _check_shots(
         for key, own in shared.items():
             if getattr(shot, key) not in (None, own):
                 message = f"the {key} is that of the whole file; drop this one"
-                raise misfit(message, *place, "shots", index, key)
+                raise FieldError(message, *place, "shots", index, key)
     if slug(given.name) in taken:
         message = f"{given.name!r} is what another or a found design is called; choose another name"
-        raise misfit(message, *place, "name")
+        raise FieldError(message, *place, "name")
 
 
 def _check_search(config: DesignConfig) -> None:
@@ -414,10 +413,10 @@ def _check_search(config: DesignConfig) -> None:
             f"{finest:g} mm is finer than the display's pixels of {pixel:g} mm (mask.pixel_pitch); "
             "give at least these"
         )
-        raise misfit(message, "search", "limits", "mask_pixel")
+        raise FieldError(message, "search", "limits", "mask_pixel")
     if config.frees("exposure") and config.noise.electrons is None:
         message = (
             "how the exposure is divided matters to noise that counts electrons; give "
             "noise.read_noise and noise.electrons, or do not free it"
         )
-        raise misfit(message, "search", "free")
+        raise FieldError(message, "search", "free")

@@ -10,7 +10,7 @@ from pydantic import AfterValidator, Field
 
 from thincam_jax._core.quantity import FieldError
 from thincam_jax.commands.schema import section
-from thincam_jax.commands.sections import Length, Section, misfit
+from thincam_jax.commands.sections import Length, Section
 from thincam_jax.design import SearchSettings
 
 Entry = TypeVar("Entry", bound=Hashable)
@@ -111,7 +111,7 @@ def check_pareto(config: Any) -> None:
             "light needs noise that counts electrons, and snr_db is the same at any light; give "
             "noise.read_noise and noise.electrons, or drop this front"
         )
-        raise misfit(message, "pareto", "light")
+        raise FieldError(message, "pareto", "light")
 
 
 def _check_thickness(config: Any, front: ThicknessConfig) -> None:
@@ -119,16 +119,16 @@ def _check_thickness(config: Any, front: ThicknessConfig) -> None:
     bounds = [free.bounds for free in config.search.free if free.variable == "distance"]
     if not bounds:
         message = "no distance is free; give search.free a distance, or drop this front"
-        raise misfit(message, *place)
+        raise FieldError(message, *place)
     thinnest, thickest = front.bounds
     try:
         config.space(thickness=thinnest)
     except FieldError as error:
-        raise misfit(str(error), *place, "bounds") from None
+        raise FieldError(str(error), *place, "bounds") from None
     limit = config.search.limits.thickness or math.inf
     longest = min(limit, max(upper for _, upper in bounds))
     if thickest > longest * (1 + 1e-9):
-        raise misfit(
+        raise FieldError(
             f"bounds reach to {thickest:g} mm, and no free distance beyond {longest:g} mm; end "
             "there, or raise search.free and search.limits.thickness",
             *place,
@@ -142,7 +142,7 @@ def _check_captures(config: Any, front: CapturesConfig) -> None:
     allowed = config.search.limits.captures
     most = front.shots[-1]
     if most * phases > allowed:
-        raise misfit(
+        raise FieldError(
             f"{most} shots take {most * phases} captures, and search.limits.captures allows "
             f"{allowed}; give at most {allowed // phases} shots",
             *place,
@@ -152,10 +152,10 @@ def _check_captures(config: Any, front: CapturesConfig) -> None:
         message = (
             "the captures of this front share the exposure evenly, and search.free has it; drop one"
         )
-        raise misfit(message, *place)
+        raise FieldError(message, *place)
     if all(min(free.shots or (1,)) > front.shots[0] for free in config.search.free):
         message = f"of the first shots, {front.shots[0]}, nothing is free; give more, or free them"
-        raise misfit(message, *place, "shots")
+        raise FieldError(message, *place, "shots")
     if not config.pictures():
         message = "PSNR needs a photograph among the targets; give one, or drop this front"
-        raise misfit(message, *place)
+        raise FieldError(message, *place)

@@ -5,37 +5,44 @@ from typing import Annotated, Any, Literal
 import pydantic
 from pydantic import Field
 
-from thincam_jax.commands.refocus.config import RangeConfig
+from thincam_jax._core.quantity import FieldError
+from thincam_jax.commands.schema import section
 from thincam_jax.commands.sections import (
+    APERTURE,
     ApertureConfig,
-    Curvature,
     Length,
     LenslessConfig,
     Name,
     Section,
     SensorConfig,
     check_names,
-    misfit,
 )
+from thincam_jax.learn.refocusing.cameras import RefocusCamera
+from thincam_jax.learn.refocusing.network import NetworkOptions
+from thincam_jax.learn.refocusing.scenes import SceneOptions
+from thincam_jax.learn.refocusing.train import Lessons
+from thincam_jax.learn.training import TrainingOptions
+from thincam_jax.lensless.masks.fza import FresnelZoneAperture
+from thincam_jax.studies.refocus import FocusRange
 
-Chance = Annotated[float, Field(ge=0, le=1)]
 Count = Annotated[int, Field(ge=1, le=1_000_000)]
-Widths = Annotated[tuple[Annotated[int, Field(ge=1, le=1024)], ...], Field(min_length=1)]
-Interval = tuple[float, float]
 
 
-class ZonesConfig(ApertureConfig):
+class ZonesConfig(section(FresnelZoneAperture, only=("beta", *APERTURE)), ApertureConfig):
     """The Fresnel zone aperture."""
 
-    beta: Curvature
 
-
-class FocusConfig(RangeConfig):
+class FocusConfig(
+    section(FocusRange, RefocusCamera, only=("nearest", "farthest", "planes", "pupil"))
+):
     """Images that are to be had: see `learn.refocusing.RefocusCamera`."""
 
     shape: tuple[Count, Count]
-    planes: Annotated[int, Field(ge=2, le=64)] = 8
-    pupil: Length | None = None
+
+    @pydantic.model_validator(mode="after")
+    def _ordered(self):
+        FocusRange("", self.nearest, self.farthest)
+        return self
 
 
 class SourceConfig(Section):
@@ -65,41 +72,25 @@ def check_sources(config: Any) -> None:
     """Sources have names of their own, and one of them trains."""
     check_names(config, "sources")
     if not any(source.use == "train" for source in config.sources):
-        raise misfit("none of them is of use 'train'; give one", "sources")
+        raise FieldError("none of them is of use 'train'; give one", "sources")
 
 
-class ScenesConfig(Section):
+class ScenesConfig(section(SceneOptions)):
     """See `learn.refocusing.scenes.SceneOptions`; `side`: pixels of the images they are cut of."""
 
-    layers: tuple[Chance, Chance, Chance] = (0.35, 0.45, 0.2)
-    dark: Chance = 0.1
-    relief: Chance = 0.3
-    depth: Chance = 0.12
-    snr_db: Interval = (20.0, 45.0)
-    poisson: Chance = 0.2
-    electrons: Interval = (50.0, 20000.0)
-    distances: tuple[Length, ...] | None = None
     side: Annotated[int, Field(ge=8, le=4096)] = 256
 
 
-class NetworkConfig(Section):
+class NetworkConfig(section(NetworkOptions)):
     """See `learn.refocusing.NetworkOptions`."""
 
-    steps: Annotated[int, Field(ge=1, le=20)] = 2
-    widths: Widths = (40, 44, 44, 44, 40)
+
+TRAINING = ("steps", "rate", "warm_up", "averaging", "check_every")
+_LESSONS = ("batch", "pool", "judged")
 
 
-class TrainingConfig(Section):
+class TrainingConfig(section(TrainingOptions, Lessons, only=(*TRAINING, *_LESSONS))):
     """See `learn.training.TrainingOptions`; `batch`, `pool`, `judged`: see `learn.Lessons`."""
-
-    steps: Count = 2000
-    batch: Annotated[int, Field(ge=1, le=1024)] = 2
-    pool: Count = 256
-    rate: Annotated[float, Field(gt=0)] = 1e-3
-    warm_up: Annotated[int, Field(ge=0)] = 50
-    averaging: Annotated[float, Field(ge=0, lt=1)] = 0.99
-    check_every: Count = 100
-    judged: Annotated[int, Field(ge=1, le=1000)] = 4
 
 
 class LearnedConfig(LenslessConfig):

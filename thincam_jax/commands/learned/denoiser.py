@@ -8,7 +8,7 @@ import pydantic
 from pydantic import Field
 
 from thincam_jax.commands.config_file import ConfigError
-from thincam_jax.commands.learned.config import Count, SourceConfig, Widths, check_sources
+from thincam_jax.commands.learned.config import TRAINING, SourceConfig, check_sources
 from thincam_jax.commands.learned.run import (
     Ended,
     TrainingFolder,
@@ -17,17 +17,16 @@ from thincam_jax.commands.learned.run import (
     read_sources,
 )
 from thincam_jax.commands.run_folder import to_json
-from thincam_jax.commands.sections import ExperimentConfig, Section, misfit
+from thincam_jax.commands.schema import section
+from thincam_jax.commands.sections import ExperimentConfig
 from thincam_jax.learn.checkpoint import CheckpointError
 from thincam_jax.learn.denoiser.network import DenoiserOptions, create, load_network
 from thincam_jax.learn.denoiser.pictures import Pictures, drawn, photographs, samples, split, united
-from thincam_jax.learn.denoiser.train import NETWORK, STATE, DenoisingLessons, train_denoiser
+from thincam_jax.learn.denoiser.train import NETWORK, DenoisingLessons, train_denoiser
 from thincam_jax.learn.denoiser.unet import DenoisingUNet
 from thincam_jax.learn.refocusing.unet import parameter_count
-from thincam_jax.learn.training import TrainingProgress
+from thincam_jax.learn.training import TrainingOptions, TrainingProgress
 from thincam_jax.plot.learned import draw_losses
-
-Blocks = Annotated[tuple[Annotated[int, Field(ge=0, le=64)], ...], Field(min_length=1)]
 
 
 class PicturesConfig(SourceConfig):
@@ -36,25 +35,16 @@ class PicturesConfig(SourceConfig):
     held_out: tuple[str, ...] = ()
 
 
-class DenoiserNetworkConfig(Section):
+_USUAL = {"steps": 20000, "warm_up": 100, "falling": 0.5, "averaging": 0.999, "check_every": 500}
+_TRAINING = {"only": (*TRAINING, "falling", "batch", "crop", "judged"), "defaults": _USUAL}
+
+
+class DenoiserNetworkConfig(section(DenoiserOptions)):
     """See `learn.denoiser.network.DenoiserOptions`."""
 
-    widths: Widths = (48, 56, 56, 56)
-    blocks: Blocks = (1, 1, 1, 1)
 
-
-class DenoiserTrainingConfig(Section):
+class DenoiserTrainingConfig(section(TrainingOptions, DenoisingLessons, **_TRAINING)):
     """See `learn.training.TrainingOptions` and `learn.denoiser.train.DenoisingLessons`."""
-
-    steps: Count = 20000
-    batch: Annotated[int, Field(ge=1, le=1024)] = 16
-    crop: Annotated[int, Field(ge=8, le=192)] = 64
-    rate: Annotated[float, Field(gt=0)] = 1e-3
-    warm_up: Annotated[int, Field(ge=0)] = 100
-    falling: Annotated[float, Field(gt=0, le=1)] = 0.5
-    averaging: Annotated[float, Field(ge=0, lt=1)] = 0.999
-    check_every: Count = 500
-    judged: Annotated[int, Field(ge=1, le=1000)] = 16
 
 
 class DenoiserConfig(ExperimentConfig):
@@ -71,8 +61,6 @@ class DenoiserConfig(ExperimentConfig):
     @pydantic.model_validator(mode="after")
     def _fits(self):
         check_sources(self)
-        if len(self.network.widths) != len(self.network.blocks):
-            raise misfit("give as many as widths, one for each level", "network", "blocks")
         return self
 
 
@@ -87,7 +75,7 @@ def run_denoiser(
 
     `resume` and errors as of `run_training`.
     """
-    check_resume(folder, STATE, resume)
+    check_resume(folder, resume)
     lessons, network = build_lessons(config), build_network(config)
     folder.claim(config)
     options = build_options(config)
@@ -118,7 +106,7 @@ def build_network(config: DenoiserConfig) -> DenoisingUNet:
 
     **Errors**: ConfigError, one line, for a file of no use or of another size.
     """
-    options = DenoiserOptions(**dict(config.network))
+    options = config.network.build()
     if config.start is None:
         return create(options, key=config.seed)
     try:
@@ -148,8 +136,8 @@ def build_lessons(config: DenoiserConfig) -> DenoisingLessons:
     if not train:
         place = config.place_of("sources")
         raise ConfigError(f"{place}sources: none is left to train on; give one")
-    told = {name: getattr(config.training, name) for name in ("batch", "crop", "judged")}
-    return DenoisingLessons(united(train), united(judge) if judge else None, **told)
+    held_out = united(judge) if judge else None
+    return config.training.build(DenoisingLessons, pictures=united(train), held_out=held_out)
 
 
 def _read(source: PicturesConfig) -> dict[str, Pictures]:

@@ -1,6 +1,5 @@
 """Training a refocusing network: from the file to its lessons, into a folder with a report."""
 
-import dataclasses
 import functools
 import operator
 import time
@@ -15,15 +14,13 @@ from thincam_jax.commands.report import Page, Part, Picture, pixels_of
 from thincam_jax.commands.run_folder import RunFolder
 from thincam_jax.learn.checkpoint import CheckpointError
 from thincam_jax.learn.refocusing.cameras import RefocusCamera
-from thincam_jax.learn.refocusing.network import NetworkOptions, RefocusNetwork
+from thincam_jax.learn.refocusing.network import RefocusNetwork
 from thincam_jax.learn.refocusing.result import RefocusTraining, finite, judge_training
-from thincam_jax.learn.refocusing.scenes import SceneOptions
 from thincam_jax.learn.refocusing.sources import Source, drawn, photographs, samples
-from thincam_jax.learn.refocusing.train import NETWORK, STATE, Lessons, train
+from thincam_jax.learn.refocusing.train import NETWORK, Lessons, train
 from thincam_jax.learn.refocusing.unet import parameter_count
 from thincam_jax.learn.training import TrainingOptions, TrainingProgress
 from thincam_jax.lensless.camera import LenslessCamera
-from thincam_jax.lensless.masks.fza import FresnelZoneAperture
 from thincam_jax.plot import learned as plot
 from thincam_jax.plot.refocus import animate_sweep, draw_sweep
 
@@ -45,6 +42,7 @@ class TrainingFolder(RunFolder):
     """
 
     kind, folders, result = "training", ("figures",), "training.json"
+    others = (NETWORK,)
 
 
 @dataclass(frozen=True)
@@ -71,7 +69,7 @@ def run_training(
     other way round, or holds a damaged state.
     """
     started = time.time()
-    check_resume(folder, STATE.format(1), resume)
+    check_resume(folder, resume)
     untrained, lessons = build_network(config), build_lessons(config)
     folder.claim(config)
     try:
@@ -107,26 +105,24 @@ def run_training(
     return Ended(f"{trained.status}: {line}", path / NETWORK, path / "report.html")
 
 
-def check_resume(folder: TrainingFolder, name: str, resume: bool) -> None:
-    """**Errors**: ConfigError where the folder's state of that name is there and `resume` is not
-    asked for, or the other way round."""
-    state = folder.path / name
-    if state.exists() and not resume:
+def check_resume(folder: TrainingFolder, resume: bool) -> None:
+    """**Errors**: ConfigError where the folder has a state and `resume` is not asked for, or the
+    other way round."""
+    begun = any(folder.path.glob("training*.state"))
+    if begun and not resume:
         raise ConfigError(
             f"--out {folder.path}: holds a training; give --resume to go on with it, or another "
             "folder"
         )
-    if resume and not state.exists():
+    if resume and not begun:
         raise ConfigError(f"--resume: {folder.path} holds no training yet; leave it out")
 
 
 def build_camera(config: LearnedConfig) -> RefocusCamera:
     """**Errors**: ConfigError, one line, for numbers that do not make a camera."""
-    mask = {name: value for name, value in dict(config.mask).items() if name != "beta"}
     focus = config.focus
     try:
-        aperture = FresnelZoneAperture(config.mask.beta, **mask)
-        camera = LenslessCamera(aperture, config.sensor.build(), config.distance)
+        camera = LenslessCamera(config.mask.build(), config.sensor.build(), config.distance)
         return RefocusCamera(
             camera,
             config.wavelength,
@@ -143,8 +139,7 @@ def build_camera(config: LearnedConfig) -> RefocusCamera:
 
 def build_network(config: LearnedConfig) -> RefocusNetwork:
     """Untrained, by the seed of the file."""
-    options = NetworkOptions(**dict(config.network))
-    return RefocusNetwork.create(build_camera(config), options, key=config.seed)
+    return RefocusNetwork.create(build_camera(config), config.network.build(), key=config.seed)
 
 
 def build_lessons(config: LearnedConfig) -> Lessons:
@@ -155,9 +150,8 @@ def build_lessons(config: LearnedConfig) -> Lessons:
         of_use[source.use].append(read)
     train, judge = (functools.reduce(operator.add, s) if s else None for s in of_use.values())
     assert train is not None  # the sections are checked
-    scenes = {name: value for name, value in dict(config.scenes).items() if name != "side"}
-    told = {name: getattr(config.training, name) for name in ("batch", "pool", "judged")}
-    return Lessons(train, SceneOptions(**scenes), held_out=judge, **told)
+    scenes = config.scenes.build()
+    return config.training.build(Lessons, source=train, scenes=scenes, held_out=judge)
 
 
 def read_sources(config: Any, read: Callable[[Any], Found]) -> list[Found]:
@@ -178,10 +172,8 @@ def read_sources(config: Any, read: Callable[[Any], Found]) -> list[Found]:
 
 
 def build_options(config: Any) -> TrainingOptions:
-    """Length and rate of a training, as far as the section `training` of a file has them."""
-    names = {field.name for field in dataclasses.fields(TrainingOptions)}
-    given = {name: value for name, value in dict(config.training).items() if name in names}
-    return TrainingOptions(seed=config.seed, **given)
+    """Length and rate of a training."""
+    return config.training.build(TrainingOptions, seed=config.seed)
 
 
 def _read(source: SourceConfig, side: int) -> Source:

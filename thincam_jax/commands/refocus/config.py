@@ -5,54 +5,33 @@ from typing import Annotated, Literal
 import pydantic
 from pydantic import Field
 
+from thincam_jax._core.quantity import FieldError
+from thincam_jax.commands.schema import section
 from thincam_jax.commands.sections import (
     CamerasConfig,
-    Length,
     Name,
-    Position,
-    Section,
     TargetConfig,
     check_known,
     check_names,
-    misfit,
 )
-from thincam_jax.reconstruction.depth.focus import Measure
+from thincam_jax.studies.refocus import FocusRange, SceneObject
+
+_PLACE = ("distance", "width", "x", "y")
 
 
-class PlacedConfig(TargetConfig):
+class PlacedConfig(section(SceneObject, only=_PLACE), TargetConfig):
     """A picture that stands at a distance, its middle at (x, y), on a dark ground.
 
     Colours are averaged. `crop` takes the middle of a picture, that part of its shorter side.
     """
 
-    distance: Length
-    width: Length
-    x: Position = 0.0
-    y: Position = 0.0
     crop: Annotated[float, Field(gt=0, le=1)] = 1.0
 
 
-class RangeConfig(Section):
-    """Distances of objects."""
-
-    nearest: Length
-    farthest: Length
-
-    @pydantic.model_validator(mode="after")
-    def _ordered(self):
-        if not self.nearest < self.farthest:
-            raise ValueError("nearest is not below farthest; swap them")
-        return self
-
-
-class SweepConfig(RangeConfig):
+class SweepConfig(section(FocusRange)):
     """Over which distances, by which method, and what is called sharp."""
 
-    count: Annotated[int, Field(ge=5, le=200)] = 25
     method: Name
-    measure: Measure = "laplacian_variance"
-    smoothing: Annotated[float, Field(ge=0, le=50)] = 1.0
-    window: Annotated[float, Field(ge=0.5, le=100)] = 6.0
 
 
 class RefocusConfig(CamerasConfig):
@@ -75,5 +54,5 @@ class RefocusConfig(CamerasConfig):
                     f"{placed.distance:g} mm lies outside of the sweep; give a distance between "
                     f"{self.sweep.nearest:g} and {self.sweep.farthest:g} mm, or a wider sweep"
                 )
-                raise misfit(message, "objects", index, "distance")
+                raise FieldError(message, "objects", index, "distance")
         return self

@@ -14,11 +14,9 @@ from thincam_jax.imaging.targets import middle_square
 from thincam_jax.plot import refocus as plot
 from thincam_jax.plot.frame import grey_levels, white_level
 from thincam_jax.studies.refocus import (
-    FocusRange,
     RefocusResult,
     RefocusRun,
     RefocusStudy,
-    SceneObject,
     place,
 )
 
@@ -68,16 +66,13 @@ def build_refocus(config: RefocusConfig) -> FileRefocus:
             picture = read_picture(placed)
             if placed.crop < 1:
                 picture = middle_square(picture, round(placed.crop * min(picture.shape[:2])))
-            seen = SceneObject(
-                placed.name, picture, placed.distance, placed.width, placed.x, placed.y
-            )
+            seen = placed.build(name=placed.name, picture=picture)
             objects.append(place(study, number, seen))
         except (ValueError, FileNotFoundError) as error:
             faults.append(f"objects[{number}]: {error}")
     if faults:
         raise ConfigError("\n".join(faults))
-    sweep = FocusRange(**dict(config.sweep))
-    return FileRefocus(replace(study, targets=tuple(objects)), sweep, config)
+    return FileRefocus(replace(study, targets=tuple(objects)), config.sweep.build(), config)
 
 
 def run_refocus(refocusing: FileRefocus, folder: RunFolder, progress: Progress) -> RefocusResult:

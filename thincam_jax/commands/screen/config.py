@@ -7,6 +7,7 @@ import pydantic
 from pydantic import Field
 
 from thincam_jax import waveguide as wg
+from thincam_jax._core.quantity import FieldError
 from thincam_jax.commands.schema import section
 from thincam_jax.commands.sections import (
     Angle,
@@ -14,7 +15,6 @@ from thincam_jax.commands.sections import (
     Length,
     Name,
     NoiseConfig,
-    Position,
     Section,
     SensorConfig,
     VariationConfig,
@@ -22,13 +22,13 @@ from thincam_jax.commands.sections import (
     check_known,
     check_names,
     check_noise,
-    misfit,
 )
 from thincam_jax.commands.study.config import PictureConfig
-from thincam_jax.measured.calibration.hadamard import Display, HadamardSeries, Order
-from thincam_jax.measured.calibration.screen_fit import DEFAULT, PARAMETERS
-from thincam_jax.studies.screen import Mistake
-from thincam_jax.studies.screen_calibration import MEASURED
+from thincam_jax.measured.calibration.hadamard import HadamardSeries
+from thincam_jax.reconstruction import Ridge
+from thincam_jax.studies.refocus import SceneObject
+from thincam_jax.studies.screen import ScreenModel
+from thincam_jax.studies.screen_calibration import MEASURED, Calibration
 
 Acute = Annotated[Angle, Field(gt=-math.pi / 2, lt=math.pi / 2)]
 
@@ -49,7 +49,7 @@ class HologramConfig(section(wg.VolumeHologram.record, defaults=_HOLOGRAM)):
     @pydantic.model_validator(mode="after")
     def _fits(self):
         if (self.wavelength is None) == (self.colours is None):
-            raise misfit("give it, such as 532 nm, or three colours in its place", "wavelength")
+            raise FieldError("give it, such as 532 nm, or three colours in its place", "wavelength")
         return self
 
     @property
@@ -58,13 +58,10 @@ class HologramConfig(section(wg.VolumeHologram.record, defaults=_HOLOGRAM)):
         return self.colours or (self.wavelength or 0.0,)
 
 
-class RectangleConfig(Section):
+class RectangleConfig(section(SceneObject, only=("width", "x", "y"))):
     """Where a hologram is: its size, and its middle from the camera's axis, y downwards."""
 
-    width: Length
     height: Length
-    x: Position = 0.0
-    y: Position = 0.0
 
 
 _GLASS = {"glass_index": 1.5}
@@ -85,51 +82,39 @@ class LensConfig(section(wg.SeeThroughCamera, only=("focal_distance", "lens_dist
     """From sensor to lens (d0), and from lens to the plate (d1)."""
 
 
-class SeenConfig(Section):
-    """The object: so many square cells (rows, columns) of a monitor of that width."""
-
-    cells: tuple[Annotated[int, Field(ge=7, le=512)], Annotated[int, Field(ge=7, le=512)]]
-    distance: Length
-    width: Length
-
-
 def check_cells(cells: tuple[int, int], *place: str) -> None:
     """Refuse cells that there are no Hadamard patterns of."""
     try:
         HadamardSeries(cells)
     except ValueError as error:
-        raise misfit(str(error), *place) from None
+        raise FieldError(str(error), *place) from None
 
 
-class CellsConfig(SeenConfig):
-    """The same with its middle at (x, y)."""
+class CellsConfig(section(SceneObject, only=("distance", "width", "x", "y"))):
+    """The object: square cells (rows, columns) of a monitor of that width, its middle at (x, y)."""
 
-    x: Position = 0.0
-    y: Position = 0.0
+    cells: tuple[Annotated[int, Field(ge=7, le=512)], Annotated[int, Field(ge=7, le=512)]]
 
 
-class ScreenMethodConfig(Section):
+class ScreenMethodConfig(section(Ridge, only=("ridge",), defaults={"ridge": None})):
     """A reconstruction: ridge regression by conjugate gradients, or total variation by ADMM."""
 
     name: Name
     kind: Literal["ridge", "admm_tv"]
-    ridge: Annotated[float, Field(gt=0)] | None = None
     variation: VariationConfig | None = None
 
     @pydantic.model_validator(mode="after")
     def _fits(self):
         other = "variation" if self.kind == "ridge" else "ridge"
         if getattr(self, other) is not None:
-            raise misfit(f"kind {self.kind} does not take it; drop {other!r}", other)
+            raise FieldError(f"kind {self.kind} does not take it; drop {other!r}", other)
         return self
 
 
-class ModelConfig(Section):
+class ModelConfig(section(ScreenModel, without=("name",))):
     """`thincam_jax.studies.screen.ScreenModel`."""
 
     name: Name
-    mistake: Mistake = "none"
-    glass_thickness: Length | None = None
 
 
 class MeasuredConfig(Section):
@@ -148,40 +133,8 @@ class ScreenTargetConfig(PictureConfig):
     published: dict[str, MeasuredConfig] = {}
 
 
-def _fitted(name: str) -> str:
-    if name not in PARAMETERS:
-        raise ValueError(f"{name!r} is unknown; choose from {', '.join(PARAMETERS)}")
-    return name
-
-
-class CalibrationConfig(Section):
+class CalibrationConfig(section(Calibration)):
     """`thincam_jax.studies.screen_calibration.Calibration`."""
-
-    order: Order = "sequency"
-    display: Display = "complementary"
-    dark_frames: Annotated[int, Field(ge=0, le=4096)] = 0
-    bits: Annotated[int, Field(ge=4, le=16)] = 12
-    exposure: Annotated[float, Field(gt=0, le=1)] = 0.9
-    offset: Annotated[float, Field(ge=0)] = 0.0
-    noise: Annotated[float, Field(ge=0)] = 0.0
-    keep_captures: bool = False
-    glass_thickness: Length | None = None
-    fitted: Annotated[
-        tuple[Annotated[str, pydantic.AfterValidator(_fitted)], ...], Field(min_length=1)
-    ] = DEFAULT
-    distances: tuple[Length, ...] = ()
-
-    @pydantic.model_validator(mode="after")
-    def _fits(self):
-        if len(set(self.fitted)) < len(self.fitted):
-            raise misfit("names one number twice; give each once", "fitted")
-        if self.offset >= 2**self.bits / 2:
-            message = f"{self.offset:g} fills half of the {self.bits} bits; give less, or more bits"
-            raise misfit(message, "offset")
-        if self.display == "binary" and self.offset and not self.dark_frames:
-            message = "a binary display with an offset needs dark frames; give 8, or offset: 0"
-            raise misfit(message, "display")
-        return self
 
 
 class SeeThroughConfig(Section):
@@ -219,12 +172,14 @@ class ScreenConfig(SeeThroughConfig, ExperimentConfig):
         check_names(self, "methods", "models", "targets")
         if self.calibration is not None:
             if self.hologram.colours is not None:
-                raise misfit("takes a hologram of one colour; drop hologram.colours", "calibration")
+                raise FieldError(
+                    "takes a hologram of one colour; drop hologram.colours", "calibration"
+                )
             check_cells(self.object.cells, "object", "cells")
             for number, model in enumerate(self.models):
                 if model.name == MEASURED:
                     message = f"{MEASURED!r} is the name of the calibration's; give another"
-                    raise misfit(message, "models", number, "name")
+                    raise FieldError(message, "models", number, "name")
         methods = [method.name for method in self.methods]
         for number, target in enumerate(self.targets):
             for name in target.published:

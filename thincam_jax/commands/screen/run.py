@@ -26,7 +26,6 @@ from thincam_jax.studies.screen import (
     ModelResult,
     PublishedImage,
     RaySummary,
-    ScreenModel,
     ScreenResult,
     ScreenRun,
     ScreenStudy,
@@ -34,7 +33,6 @@ from thincam_jax.studies.screen import (
 )
 from thincam_jax.studies.screen_calibration import (
     MEASURED,
-    Calibration,
     CalibrationRun,
     CalibrationScores,
 )
@@ -85,7 +83,7 @@ def build_screen(config: ScreenConfig) -> FileScreen:
         targets,
         noise,
         {method.name: build_solver(method) for method in config.methods},
-        tuple(ScreenModel(m.name, m.mistake, m.glass_thickness) for m in config.models),
+        tuple(model.build(name=model.name) for model in config.models),
         config.orders,
         config.band_samples,
         (config.hologram.object_angle, config.hologram.reference_angle),
@@ -100,11 +98,6 @@ def build_screen(config: ScreenConfig) -> FileScreen:
     if faults:
         raise ConfigError("\n".join(faults))
     return study
-
-
-def build_calibration(config: CalibrationConfig) -> Calibration:
-    """How the camera of a file is calibrated."""
-    return Calibration(**dict(config))
 
 
 def build_plane(config: SeeThroughConfig) -> wg.ObjectPlane:
@@ -166,7 +159,7 @@ class _ScreenRun(Run):
         self.study, self.models, self.calibration = study, ScreenRun(study), None
         self.work += self.models.work
         if self.config.calibration is not None:
-            calibration = build_calibration(self.config.calibration)
+            calibration = self.config.calibration.build()
             self.calibration = CalibrationRun(study, calibration, folder.path)
             self.work += self.calibration.work
         self.add("report", self.report)

@@ -6,7 +6,15 @@ from typing import Annotated, Any
 
 import typer
 
-from thincam_jax.commands.terminal import WRONG_INPUT, Overrides, progress_bar, tell, told, warn
+from thincam_jax.commands.terminal import (
+    WRONG_INPUT,
+    DryRun,
+    Overrides,
+    progress_bar,
+    tell,
+    told,
+    warn,
+)
 
 _PARTS = ("pyarrow",)
 _SCHEDULER_PARTS = ("dask", "distributed", "pyarrow")
@@ -34,6 +42,7 @@ def sweep(
     scheduler: Scheduler = None,
     workers: Workers = None,
     set_: Overrides = None,
+    dry_run: DryRun = False,
 ) -> None:
     """Run a study at every point of a grid.
 
@@ -50,6 +59,7 @@ def sweep(
     with told(interrupted):
         _check(scheduler, workers)
         from thincam_jax._core.precision import is_double
+        from thincam_jax.commands import explain
         from thincam_jax.commands.config_file import ConfigError, slug
         from thincam_jax.commands.kinds import load_experiment
         from thincam_jax.commands.study.config import StudyConfig
@@ -63,6 +73,10 @@ def sweep(
         axes = read_axes(grid or [], study.model_dump(mode="json", exclude_none=True))
         points = make_points(study, axes, is_double())
         folder = SweepFolder(out or Path("runs") / f"{slug(study.name)}-sweep")
+        if dry_run:
+            writes = f"{len(points)} points; {folder.outcome(study)}"
+            explain.dry_run(study, writes)
+            return
         folder.claim(study)
         warn(_warnings(points))
         with progress_bar("{task.fields[failed]}") as bar:

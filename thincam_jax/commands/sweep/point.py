@@ -16,7 +16,7 @@ import numpy as np
 from thincam_jax._core.files import read_regular
 from thincam_jax._core.precision import double_precision
 from thincam_jax.commands.checked_config import check_as
-from thincam_jax.commands.config_file import ConfigError, set_entry
+from thincam_jax.commands.config_file import ConfigError, Places, set_entry
 from thincam_jax.commands.study.build import build_study, exposures_of
 from thincam_jax.commands.study.config import StudyConfig
 from thincam_jax.commands.sweep.grid import Axis, grid_values
@@ -85,7 +85,7 @@ def _make_point(raw: dict, axes: Sequence[Axis], values: tuple, double: bool) ->
             set_entry(changed, place, value, f"--grid {axis.text}")
             asked[place] = f"--grid {axis.text}"
     try:
-        config = check_as(StudyConfig, changed, {}, asked, "--grid")
+        config = check_as(StudyConfig, Places(changed, asked=asked, top="--grid"))
     except ConfigError as error:
         key = _digest(json.dumps(changed, default=str))
         return GridPoint(key, given, None, double, "; ".join(str(error).splitlines()))

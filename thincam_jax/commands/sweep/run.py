@@ -13,7 +13,7 @@ from pyarrow import csv
 
 from thincam_jax._core.files import read_regular, write_whole
 from thincam_jax.commands.checked_config import dump_config
-from thincam_jax.commands.run_folder import claim_folder
+from thincam_jax.commands.run_folder import claim_folder, refuse_foreign
 from thincam_jax.commands.study.config import StudyConfig
 from thincam_jax.commands.sweep.point import GridPoint, Outcome, measure_point, one_line, told
 from thincam_jax.commands.sweep.workers import Died, Outcomes, local_workers, scheduled_workers
@@ -42,6 +42,12 @@ class SweepFolder:
         Another grid of the same study is welcome: points are recognised by their configuration.
         """
         claim_folder(self.path, "study.yaml", dump_config(base), "sweep", ("points",))
+
+    def outcome(self, base: StudyConfig) -> str:
+        """What a sweep would write, in a line; ConfigError where `claim` would refuse."""
+        if self.path.exists():
+            refuse_foreign(self.path, "study.yaml", dump_config(base), "sweep")
+        return f"writes to {self.path}: study.yaml, points/, results.parquet, results.csv"
 
     def has(self, point: GridPoint) -> bool:
         """Whether the point has succeeded before; a row that cannot be read does not count."""

@@ -9,10 +9,11 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
+from thincam_jax._core.quantity import check_fields, quantity, whole
 from thincam_jax.hardware.acquisition.auto_exposure import AutoExposure
 from thincam_jax.hardware.acquisition.plan import Plan, Step
 from thincam_jax.hardware.acquisition.rig import Rig, Role
@@ -30,6 +31,8 @@ from thincam_jax.hardware.errors import (
 
 TRANSIENT = (IncompleteFrame, Timeout, Disconnected)  # the step is repeated
 
+_SECONDS = quantity("s", non_negative=True)
+
 
 @dataclass(frozen=True)
 class Procedure:
@@ -39,24 +42,21 @@ class Procedure:
     - `timeout`: s, beyond the exposure, that a frame may take.
     - `retries`: repetitions of a step after IncompleteFrame, Timeout and Disconnected.
     - `reopen_wait`: s before a disconnected device is reopened.
-    - `saturated_share`: largest allowed share of saturated pixels.
+    - `saturated`: largest allowed share of saturated pixels.
     - `position_tolerance`: mm between the commanded position and the one reached.
     - `auto_exposure`: find the exposure before the first frame; None: use the plan's.
     """
 
-    settle: float = 0.0
-    timeout: float = 2.0
-    retries: int = 3
-    reopen_wait: float = 0.5
-    saturated_share: float = 1e-3
-    position_tolerance: float = 0.01
+    settle: Annotated[float, _SECONDS] = 0.0
+    timeout: Annotated[float, _SECONDS] = 2.0
+    retries: Annotated[int, whole(0, 100)] = 3
+    reopen_wait: Annotated[float, _SECONDS] = 0.5
+    saturated: Annotated[float, quantity(least=0.0, most=1.0)] = 1e-3
+    position_tolerance: Annotated[float, quantity("mm", non_negative=True)] = 0.01
     auto_exposure: AutoExposure | None = None
 
     def __post_init__(self):
-        numbers = {name: value for name, value in vars(self).items() if name != "auto_exposure"}
-        for name, value in numbers.items():
-            if not 0 <= value < math.inf:
-                raise ValueError(f"{name} = {value}; give a finite number that is not negative")
+        check_fields(self)
 
 
 class Taker:
@@ -254,10 +254,10 @@ class Taker:
                 raise error(name, "trigger", cause, "check the cable and its driver")
         saturated = int(np.count_nonzero(pixels == full)) if highest == full else 0
         share = saturated / pixels.size
-        if share > self.procedure.saturated_share and not probe:
+        if share > self.procedure.saturated and not probe:
             raise Saturated(
                 name, "trigger", f"{share:.2%} of the pixels are full, and "
-                f"{self.procedure.saturated_share:.2%} may be",
+                f"{self.procedure.saturated:.2%} may be",
                 "begin another store with a shorter exposure, or allow more"
             )  # fmt: skip
         return saturated

@@ -8,10 +8,12 @@ import time
 import zlib
 from collections import Counter, OrderedDict
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float, UInt8, UInt16
 
+from thincam_jax._core.quantity import check_fields, quantity
 from thincam_jax.hardware.base import CameraSettings
 from thincam_jax.hardware.virtual.optics import Optics
 
@@ -26,9 +28,12 @@ class Electronics:
     - `offset`: counts of a dark frame at 12 bits.
     """
 
-    full_well: float = 13_500.0
-    read_noise: float = 8.0
-    offset: float = 60.0
+    full_well: Annotated[float, quantity("electrons", positive=True)] = 13_500.0
+    read_noise: Annotated[float, quantity("electrons", non_negative=True)] = 8.0
+    offset: Annotated[float, quantity("counts", least=0.0, most=2047.0)] = 60.0
+
+    def __post_init__(self):
+        check_fields(self)
 
     def counts(
         self, electrons: Float[np.ndarray, "y x"], settings: CameraSettings, seed: list[int]
@@ -105,7 +110,7 @@ class VirtualRig:
         electronics: Electronics | None = None,
         *,
         display_shape: tuple[int, int],
-        response: float = 0.0,
+        response: Annotated[float, quantity("s", non_negative=True)] = 0.0,
         fiducial: bool = False,
         seed: int = 0,
     ):

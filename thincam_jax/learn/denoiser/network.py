@@ -3,7 +3,7 @@
 import dataclasses
 import os
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import equinox as eqx
 import jax
@@ -14,6 +14,7 @@ from jaxtyping import Array, Float
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Numbers
 from thincam_jax._core.module import Module
+from thincam_jax._core.quantity import FieldError, check_fields, whole
 from thincam_jax._core.random import Key, random_key
 from thincam_jax.learn.checkpoint import (
     CheckpointError,
@@ -37,17 +38,17 @@ class DenoiserOptions:
     **Errors**: ValueError for levels that do not fit each other.
     """
 
-    widths: tuple[int, ...] = (48, 56, 56, 56)
-    blocks: tuple[int, ...] = (1, 1, 1, 1)
+    widths: Annotated[tuple[int, ...], whole(1, 1024, many=True)] = (48, 56, 56, 56)
+    blocks: Annotated[tuple[int, ...], whole(0, 64, many=True)] = (1, 1, 1, 1)
 
     def __post_init__(self):
-        if not self.widths or len(self.widths) != len(self.blocks) or min(self.widths) < 1:
-            raise ValueError(
-                f"widths = {self.widths}, blocks = {self.blocks}; give both for each level, at "
-                "least one channel"
+        check_fields(self)
+        if not self.widths or len(self.widths) != len(self.blocks):
+            raise FieldError(
+                f"widths = {self.widths}, blocks = {self.blocks}: give as many as widths, one for "
+                "each level",
+                "blocks",
             )
-        if min(self.blocks) < 0:
-            raise ValueError(f"blocks = {self.blocks}; give 0 or more for each level")
 
 
 class Denoiser(Module):

@@ -7,14 +7,14 @@ import os
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from thincam_jax._core import checks
+from thincam_jax._core.quantity import FieldError, check_fields, whole
 from thincam_jax.learn.checkpoint import CheckpointError
 from thincam_jax.learn.denoiser.network import (
     LEAST,
@@ -23,7 +23,7 @@ from thincam_jax.learn.denoiser.network import (
     network_card,
     save_network,
 )
-from thincam_jax.learn.denoiser.pictures import Pictures
+from thincam_jax.learn.denoiser.pictures import TILE, Pictures
 from thincam_jax.learn.denoiser.unet import DenoisingUNet
 from thincam_jax.learn.training import (
     Task,
@@ -68,15 +68,16 @@ class DenoisingLessons:
 
     pictures: Pictures
     held_out: Pictures | None = None
-    batch: int = 16
-    crop: int = 64
-    judged: int = 16
+    batch: Annotated[int, whole(1, 1024)] = 16
+    crop: Annotated[int, whole(1, TILE)] = 64
+    judged: Annotated[int, whole(1, 1000)] = 16
 
     def __post_init__(self):
-        checks.at_least_one({"batch": self.batch, "judged": self.judged})
+        check_fields(self)
         side = self.pictures.tiles.shape[1]
-        if not 1 <= self.crop <= side:
-            raise ValueError(f"crop = {self.crop}; give 1 to {side} pixels, the side of a tile")
+        if self.crop > side:
+            message = f"crop = {self.crop}; give 1 to {side} pixels, the side of a tile"
+            raise FieldError(message, "crop")
 
     def task(self, seed: int) -> Task:
         """Crops to be drawn, and those that judge."""

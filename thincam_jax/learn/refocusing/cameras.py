@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from typing import Annotated
 
 import equinox as eqx
 import jax
@@ -11,6 +12,7 @@ from jaxtyping import Array, Float, Int
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Number, Numbers
 from thincam_jax._core.grids import same_parity
+from thincam_jax._core.quantity import FieldError, quantity, whole
 from thincam_jax.imaging.operators import CropConvolution, kernel_shape
 from thincam_jax.imaging.scene import Spectrum
 from thincam_jax.lensless.camera import LenslessCamera
@@ -84,8 +86,8 @@ class RefocusCamera(eqx.Module):
         field_shape: tuple[int, int],
         near: Number,
         far: Number,
-        planes: int = 8,
-        pupil: Number | None = None,
+        planes: Annotated[int, whole(2, 64)] = 8,
+        pupil: Annotated[Number | None, quantity("mm", positive=True, optional=True)] = None,
         model: Model = "separable",
     ):
         self.camera = camera
@@ -94,13 +96,11 @@ class RefocusCamera(eqx.Module):
         self.near = checks.positive("near", near, "mm").astype(dtype)
         self.far = checks.positive("far", far, "mm").astype(dtype)
         if not checks.is_traced(self.near) and not self.near < self.far:
-            raise ValueError(f"near = {near} mm is not below far = {far} mm; swap them")
+            raise FieldError(f"near = {near} mm is not below far = {far} mm; swap them", "near")
         width = camera.mask.extent[1] if pupil is None else pupil
         self.pupil = checks.positive("pupil", width, "mm").astype(dtype)
         self.field_shape = same_parity(field_shape, camera.sensor.shape)
-        if planes < 2:
-            raise ValueError(f"planes = {planes}; give at least 2")
-        self.planes = planes
+        self.planes = checks.whole("planes", planes, 2, 64)
         checks.choice("model", model, MODELS)
         self.model = model
         self.support = self._support()

@@ -12,7 +12,7 @@ the image in which all is sharp, and where each pixel stands.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Annotated, Any
 
 import equinox as eqx
 import jax
@@ -21,6 +21,7 @@ from jaxtyping import Array, Complex, Float
 
 from thincam_jax._core.checks import Number, Numbers
 from thincam_jax._core.module import Module
+from thincam_jax._core.quantity import FieldError, check_fields, whole
 from thincam_jax._core.random import Key, random_key
 from thincam_jax.learn.refocusing.cameras import RefocusCamera, Stand
 from thincam_jax.learn.refocusing.lens_blur import lens_blur
@@ -37,8 +38,13 @@ class NetworkOptions:
     - `widths`: channels of the U-Nets' levels.
     """
 
-    steps: int = 2
-    widths: tuple[int, ...] = (40, 44, 44, 44, 40)
+    steps: Annotated[int, whole(1, 20)] = 2
+    widths: Annotated[tuple[int, ...], whole(1, 1024, many=True)] = (40, 44, 44, 44, 40)
+
+    def __post_init__(self):
+        check_fields(self)
+        if not self.widths:
+            raise FieldError("widths is empty; give the channels of one level or more", "widths")
 
 
 DEFAULT = NetworkOptions()

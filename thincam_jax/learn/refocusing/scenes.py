@@ -14,6 +14,7 @@ which is exact for one layer over another when one of both is in focus.
 """
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import equinox as eqx
 import jax
@@ -22,6 +23,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 
 from thincam_jax._core.checks import Number
+from thincam_jax._core.quantity import check_fields, quantity
 from thincam_jax.learn.refocusing.cameras import RefocusCamera
 from thincam_jax.learn.refocusing.layouts import (
     COVER_NUMBERS,
@@ -33,6 +35,8 @@ from thincam_jax.learn.refocusing.lens_blur import lens_blur
 
 LAYERS = 3
 PARTS = 3  # flat parts that a layer with relief is shared out between
+
+_CHANCE, _CHANCES = (quantity(least=0.0, most=1.0, many=several) for several in (False, True))
 
 
 @dataclass(frozen=True)
@@ -48,14 +52,19 @@ class SceneOptions:
     - `distances`: mm, the only ones that scenes stand at and images are focused on; default any.
     """
 
-    layers: tuple[float, float, float] = (0.35, 0.45, 0.2)
-    dark: float = 0.1
-    relief: float = 0.3
-    depth: float = 0.12
-    snr_db: tuple[float, float] = (20.0, 45.0)
-    poisson: float = 0.2
-    electrons: tuple[float, float] = (50.0, 20000.0)
-    distances: tuple[float, ...] | None = None
+    layers: Annotated[tuple[float, float, float], _CHANCES] = (0.35, 0.45, 0.2)
+    dark: Annotated[float, _CHANCE] = 0.1
+    relief: Annotated[float, _CHANCE] = 0.3
+    depth: Annotated[float, _CHANCE] = 0.12
+    snr_db: Annotated[tuple[float, float], quantity("dB", shape=(2,))] = (20.0, 45.0)
+    poisson: Annotated[float, _CHANCE] = 0.2
+    electrons: Annotated[tuple[float, float], quantity("electrons", shape=(2,))] = (50.0, 20000.0)
+    distances: Annotated[
+        tuple[float, ...] | None, quantity("mm", positive=True, many=True, optional=True)
+    ] = None
+
+    def __post_init__(self):
+        check_fields(self)
 
 
 DEFAULT = SceneOptions()

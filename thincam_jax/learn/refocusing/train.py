@@ -6,13 +6,14 @@ import os
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from thincam_jax._core.quantity import check_fields, whole
 from thincam_jax._core.table import Table
 from thincam_jax.learn.refocusing.loss import Examples, examples, loss
 from thincam_jax.learn.refocusing.network import RefocusNetwork
@@ -47,10 +48,13 @@ class Lessons:
 
     source: Source
     scenes: SceneOptions = SceneOptions()
-    batch: int = 2
-    pool: int = 256
-    judged: int = 4
+    batch: Annotated[int, whole(1, 1024)] = 2
+    pool: Annotated[int, whole(1, 1_000_000)] = 256
+    judged: Annotated[int, whole(1, 1000)] = 4
     held_out: Source | None = None
+
+    def __post_init__(self):
+        check_fields(self)
 
     def drawn(self, network: RefocusNetwork, seed: int, count: int, first: int = 0):
         """Batches of the camera of a network, one after another."""

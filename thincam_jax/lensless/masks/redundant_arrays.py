@@ -54,16 +54,18 @@ def _is_prime(p: int) -> bool:
     return p > 1 and all(p % n for n in range(2, int(p**0.5) + 1))
 
 
-def _prime_order(order: Any) -> int:
+def _prime_order(name: str, order: Any) -> int:
     def fits(p):
         return p >= 5 and _is_prime(p)
 
     if isinstance(order, int) and fits(order) and order <= _LARGEST:
         return order
-    raise ValueError(f"order = {order} is no prime from 5 to {_LARGEST}; give {_near(order, fits)}")
+    raise ValueError(
+        f"{name} = {order} is no prime from 5 to {_LARGEST}; give {_near(order, fits)}"
+    )
 
 
-def _twin_primes(orders: Any) -> tuple[int, int]:
+def _twin_primes(name: str, orders: Any) -> tuple[int, int]:
     def fits(s):
         return _is_prime(s) and _is_prime(s + 2)
 
@@ -71,7 +73,7 @@ def _twin_primes(orders: Any) -> tuple[int, int]:
     if r == s + 2 and s <= _LARGEST and fits(s):
         return int(r), int(s)
     near = _near(min(r, s), fits, lambda s: f"({s + 2}, {s})")
-    raise ValueError(f"orders = {orders} are no twin primes (s + 2, s); give {near}")
+    raise ValueError(f"{name} = {orders} are no twin primes (s + 2, s); give {near}")
 
 
 def _near(number: Any, fits: Callable[[int], bool], text: Callable[[int], str] = str) -> str:
@@ -106,7 +108,7 @@ class ModifiedUniformlyRedundantArray(AbstractRedundantArray):
     **Errors**: ValueError for a number that is no such prime, with the nearest two.
     """
 
-    order: int = eqx.field(converter=_prime_order, static=True)
+    order: int = eqx.field(converter=quantity(check=_prime_order), static=True)
     tiles: tuple[int, int] = eqx.field(default=1, converter=_tiles, static=True, kw_only=True)
     cell: Float[Array, ""] = eqx.field(converter=quantity("mm", positive=True))
     centre: Float[Array, "2"] = eqx.field(
@@ -133,7 +135,7 @@ class UniformlyRedundantArray(AbstractRedundantArray):
     **Errors**: ValueError for orders that are no twin primes, with the nearest that are.
     """
 
-    orders: tuple[int, int] = eqx.field(converter=_twin_primes, static=True)
+    orders: tuple[int, int] = eqx.field(converter=quantity(check=_twin_primes), static=True)
     tiles: tuple[int, int] = eqx.field(default=1, converter=_tiles, static=True, kw_only=True)
     cell: Float[Array, ""] = eqx.field(converter=quantity("mm", positive=True))
     centre: Float[Array, "2"] = eqx.field(

@@ -11,16 +11,18 @@ with the factor N of U′U′ᵀ = N·I, which the thesis omits.
 
 import math
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Annotated, Literal, get_args
 
 import numpy as np
 import scipy
 from jaxtyping import Float, Int8, Integer, Real, UInt8
 
 from thincam_jax._core import checks
+from thincam_jax._core.quantity import check_fields, choice, whole
 
 Order = Literal["sequency", "natural"]
 Display = Literal["complementary", "binary"]
+DARK_FRAMES = whole(0, 4096)
 
 
 @dataclass(frozen=True)
@@ -40,17 +42,14 @@ class HadamardSeries:
     """
 
     object_shape: tuple[int, int]
-    order: Order = "sequency"
-    display: Display = "complementary"
-    dark_frames: int = 0
+    order: Annotated[Order, choice(get_args(Order))] = "sequency"
+    display: Annotated[Display, choice(get_args(Display))] = "complementary"
+    dark_frames: Annotated[int, DARK_FRAMES] = 0
 
     def __post_init__(self):
+        check_fields(self)
         object.__setattr__(self, "object_shape", checks.shape2d("object_shape", self.object_shape))
         _require_power_of_two(self.object_shape)
-        checks.choice("order", self.order, get_args(Order))
-        checks.choice("display", self.display, get_args(Display))
-        if not 0 <= self.dark_frames == int(self.dark_frames):
-            raise ValueError(f"dark_frames = {self.dark_frames}; give a whole number, 0 for none")
 
     @property
     def cell_count(self) -> int:
