@@ -6,7 +6,6 @@ import math
 from collections.abc import Sequence
 from typing import Any, ClassVar, Literal, get_args
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -16,7 +15,7 @@ from thincam_jax._core.checks import Numbers
 from thincam_jax._core.module import Module
 from thincam_jax.imaging.operators.crop_convolution import place
 from thincam_jax.reconstruction.iterate import Callback
-from thincam_jax.reconstruction.problem import InverseProblem, uniform_level
+from thincam_jax.reconstruction.problem import InverseProblem, compiled_level
 from thincam_jax.reconstruction.recording import Reconstruction, Recording
 from thincam_jax.reconstruction.regularisers import AbstractRegulariser, Image
 from thincam_jax.reconstruction.total_variation import TotalVariation
@@ -53,25 +52,28 @@ class AbstractIterativeSolver(AbstractSolver):
         """Reconstruct the image of a recording; see `reconstruct` for the arguments."""
 
 
-def at_most(iterations: int) -> int:
+def counted(name: str, value: int) -> int:
     """Check a number of iterations."""
-    if isinstance(iterations, bool) or not isinstance(iterations, int) or iterations < 1:
-        raise ValueError(f"iterations = {iterations}; give a whole number of at least 1")
-    return iterations
+    if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+        raise ValueError(f"{name} = {value}; give a whole number of at least 1")
+    return value
 
 
-def small_enough(tolerance: float) -> float:
+as_iterations = functools.partial(counted, "iterations")
+
+
+def as_tolerance(tolerance: float) -> float:
     """Check a tolerance of residuals."""
     checks.non_negative("tolerance", tolerance, "a ratio")
     return tolerance
 
 
 def as_synthesis(synthesis: Synthesis | None) -> np.ndarray | None:
-    """A synthesis as a matrix, (channel, capture)."""
+    """The matrix of a synthesis, (channel, capture)."""
     return None if synthesis is None else np.asarray(synthesis, dtype=float)
 
 
-def checked_tau(tau: Any) -> Any:
+def as_tau(tau: Any) -> Any:
     """Check τ ≥ 0, or the name of a rule that chooses it."""
     if isinstance(tau, str):
         checks.choice("tau", tau, get_args(TauRule))
@@ -103,7 +105,7 @@ def first_image(
     """The start image, padded with zeros to the field; by default uniform, or zero."""
     shape, dtype = problem.image_shape, problem.captures[0].dtype
     if start is None:
-        level = _level(problem)[..., None, None, None] if uniform else jnp.zeros((), dtype)
+        level = compiled_level(problem)[..., None, None, None] if uniform else jnp.zeros((), dtype)
         return jnp.broadcast_to(level, shape)
     start = jnp.asarray(start, dtype)
     if start.ndim < 2 or start.size != math.prod((*shape[:-2], *start.shape[-2:])):
@@ -121,6 +123,3 @@ def first_image(
             f"start has {rows}×{columns} pixels, more than the field's {problem.field_shape}"
         )
     return place(start, corner, problem.field_shape)
-
-
-_level = jax.jit(uniform_level)
