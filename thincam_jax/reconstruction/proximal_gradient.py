@@ -250,6 +250,9 @@ class PlugAndPlay(AbstractScaledMethod):
     scaled: ScaledProblem
     solver: Any
 
+    def __init__(self, scaled: ScaledProblem, solver: AcceleratedProximalGradient):
+        self.scaled, self.solver = scaled, solver
+
     def objective(self, image: Image):
         return _distance(self, image)
 
