@@ -9,11 +9,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import tifffile
 from reconstruction import dense, rig, scenes
 
 import thincam_jax as tc
-from helpers import count_traces, quick, relative_l2, shared_data
+from helpers import count_traces, quick, relative_l2
 from thincam_jax.imaging.operators import CropConvolution, kernel_shape, window_shape
 from thincam_jax.reconstruction import iterate as module
 from thincam_jax.reconstruction.admm import AdmmMethod, Penalties, admm_map, consensus
@@ -149,13 +148,7 @@ def energy(given: Case, image) -> float:
     return dense.objective(flat, given.parts, given.tau, given.psi, given.kind, given.joint)
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        name if name == "planes_anisotropic" else pytest.param(name, marks=pytest.mark.thorough)
-        for name in CASES
-    ],
-)
+@pytest.mark.parametrize("name", quick(CASES, list(CASES).index("planes_anisotropic")))
 def test_the_minimiser_is_that_of_another_method(name):
     """Crop, dead pixels (of value 1000), weights, sensors of two shapes, planes, colours."""
     given = case(name)
@@ -177,7 +170,7 @@ def test_the_minimiser_is_that_of_another_method(name):
 
 @pytest.mark.parametrize(
     ("relaxation", "factors"),
-    quick(itertools.product([0.7, 1.0, 1.8], [(0.1, 0.1, 0.1), (0.3, 0.2, 0.05)]), 0, 5),
+    quick(itertools.product([0.7, 1.0, 1.8], [(0.1, 0.1, 0.1), (0.3, 0.2, 0.05)]), 5),
 )
 def test_relaxation_and_penalties_do_not_move_the_minimiser(relaxation, factors):
     given = case("two")
@@ -189,19 +182,7 @@ def test_relaxation_and_penalties_do_not_move_the_minimiser(relaxation, factors)
     assert relative_l2(value, expected) < 1e-6
 
 
-@pytest.mark.thorough
-def test_the_minimiser_is_a_fixed_point():
-    """At the end q stays, and z = Kf in all splits: no gap is left."""
-    given = case("two")
-    splitting = weighed(given.problem, (0.1, 0.1, 0.1))
-    begin = splitting.start(jnp.zeros(given.problem.image_shape))
-    state = stepped(splitting, jnp.asarray(1.8), begin, 2000)
-    after = admm_map(state, splitting)
-    for before, now in zip(jax.tree.leaves(state), jax.tree.leaves(after), strict=True):
-        np.testing.assert_allclose(now, before, atol=1e-10)
-
-
-@pytest.mark.parametrize("factor", [1e-8, 1e8])
+@pytest.mark.parametrize("factor", quick([1e-8, 1e8], 0))
 def test_units_do_not_matter(factor):
     """Captures and τ times a number, in single precision: the image times that number."""
     problem, _ = scenes.problem()
@@ -209,14 +190,6 @@ def test_units_do_not_matter(factor):
     value = solved(scenes.single(scenes.rescaled(problem, factor)), iterations=50)
     assert value.dtype == jnp.float32
     assert relative_l2(value, factor * expected) < 1e-4
-
-
-@pytest.mark.thorough
-def test_single_precision_agrees_with_double():
-    problem, truth = scenes.problem(planes=2)
-    expected = solved(problem, iterations=100)
-    value = solved(scenes.single(problem), iterations=100)
-    assert relative_l2(value, expected) < 1e-4 and relative_l2(expected, truth) < 0.9
 
 
 def test_a_batch_is_its_elements_and_new_values_compile_once():
@@ -281,15 +254,6 @@ def test_it_converges_to_the_minimum_of_another_method(name):
     assert values[-1] == pytest.approx(energy(given, expected), rel=1e-9)
     assert min(values) >= energy(given, expected) * (1 - 1e-9)
     assert max(last.primal, last.dual) < 1e-9
-
-
-def test_the_best_image_is_that_of_the_lowest_objective():
-    problem, _ = scenes.problem()
-    outcome = driven(problem, iterations=40, tolerance=0.0)
-    assert outcome.status == "iterations_exhausted"
-    method = admm_method(problem)
-    best = min(p.objective for p in outcome.history)
-    assert float(method.objective(outcome.image)) == pytest.approx(best, rel=1e-12)
 
 
 def test_residuals_are_what_their_names_say():
@@ -385,6 +349,7 @@ def test_no_light_converges_at_once_and_nan_has_a_status():
     assert outcome.status == "non_finite"
 
 
+@pytest.mark.thorough
 def test_ten_iterations_in_one_program_are_five_times_two(monkeypatch):
     """Users run programs of ten, these tests of two, which compile sooner."""
     problem, _ = scenes.problem((9, 8), (6, 7), kernel=scenes.spots, captures=1)
@@ -416,43 +381,12 @@ def test_single_precision_and_no_new_compilation():
     assert rig.correlation(expected.image, value.image) > 0.999
 
 
-def test_a_warm_start_goes_on_where_the_image_was():
-    """From a minimiser the image stays one: the first look is at its objective."""
-    given = case("two")
-    done = driven(given.problem)
-    lowest = energy(given, done.image)
-    again = driven(given.problem, image=done.image, iterations=10, tolerance=0.0)
-    assert again.history[0].objective == pytest.approx(lowest, rel=1e-12)
-    assert energy(given, again.image) <= lowest * (1 + 1e-12)
-    method = admm_method(given.problem)
-    back = method.image(method.start(done.image))
-    np.testing.assert_allclose(back, done.image, atol=1e-12)
-
-
-def hand(bin_by):
-    """The measured capture of a hand through a diffuser, binned."""
-    folder = shared_data("diffusercam-hand")
-    psf, raw = (
-        tifffile.imread(folder / name).astype(float)
-        for name in ("psf_sample.tif", "rawdata_hand_sample.tif")
-    )
-    background = psf[5:15, 5:15].mean()
-    rows, columns = (n // bin_by for n in psf.shape)
-    psf, raw = (
-        np.maximum(i - background, 0)
-        .reshape(rows, bin_by, columns, bin_by)
-        .mean((1, 3))
-        .astype(np.float32)
-        for i in (psf, raw)
-    )
-    return tc.Recording(jnp.asarray(raw[None]), tc.Psfs(jnp.asarray((psf / psf.sum())[None])))
-
-
 @pytest.mark.thorough
 @pytest.mark.parametrize("bin_by, most", [(8, 100), (4, 130)])
 def test_what_500_plain_iterations_reach_in_a_quarter_of_them(optimised, bin_by, most):
     """A measured capture, with the relaxation and the balance of `AdmmTV`: 80 and 110."""
-    recording = hand(bin_by)
+    raw, psf = scenes.hand(bin_by)
+    recording = tc.Recording(raw[None], tc.Psfs(psf[None]))
     plain = driven(
         recording.problem(), iterations=500, tolerance=0.0, relaxation=1.0, adapt_until=0
     )

@@ -34,7 +34,7 @@ from thincam_jax.imaging.operators import (
     Stacked,
     kernel_shape,
 )
-from thincam_jax.reconstruction.admm import Admm, admm_map
+from thincam_jax.reconstruction.admm import admm_map
 from thincam_jax.reconstruction.normal_equations import (
     DenseNormal,
     IterativeNormal,
@@ -127,10 +127,7 @@ def expected(name: str) -> np.ndarray:
     return case(name).minimiser()
 
 
-NAMES = pytest.mark.parametrize("name", list(operators()))
-
-
-@pytest.mark.parametrize("name", quick(operators(), 1))  # whose minimiser another test needs, too
+@pytest.mark.parametrize("name", quick(operators(), 5))  # whose minimiser another test needs, too
 def test_total_variation_by_admm_and_fista(name):
     """Both are within 1e-6 of the minimiser, and report that they have converged."""
     for solver in (
@@ -161,7 +158,7 @@ def test_ridge(name):
 
 
 def test_the_inner_solve_follows_the_structure():
-    kinds = {"dense": DenseNormal, "separable": SeparableNormal, "sparse": IterativeNormal}
+    kinds = {"small": DenseNormal, "separable": SeparableNormal, "sparse": IterativeNormal}
     for name, kind in kinds.items():
         assert type(splitting_of(case(name).problem).normal) is kind
     # A masked convolution keeps its transforms: the mask is a weight.
@@ -171,7 +168,7 @@ def test_the_inner_solve_follows_the_structure():
 
 def test_solvers_of_optimistix_take_the_problem():
     """LBFGS on a smooth problem, and the fixed point of ADMM's map, reach the same images."""
-    given = case("separable")
+    given = case("small")
     smooth = given.recording.problem(tau=0.0, nonnegative=False)
     start = jnp.zeros(smooth.image_shape)
     found = optimistix.minimise(
@@ -182,16 +179,13 @@ def test_solvers_of_optimistix_take_the_problem():
 
     splitting = splitting_of(given.problem)
     begin = splitting.start(start)
-    for solver in (
-        Admm(rtol=1e-9),
-        optimistix.FixedPointIteration(rtol=0.0, atol=1e-11, damp=-0.8),
-    ):
-        solution = optimistix.fixed_point(
-            admm_map, solver, begin, args=splitting, max_steps=20_000, throw=False
-        )
-        assert solution.result == optimistix.RESULTS.successful
-        image = splitting.image(solution.value)[0, 0]
-        assert relative_l2(image, expected("separable")) < 1e-6
+    solver = optimistix.FixedPointIteration(rtol=0.0, atol=1e-11, damp=-0.8)
+    solution = optimistix.fixed_point(
+        admm_map, solver, begin, args=splitting, max_steps=20_000, throw=False
+    )
+    assert solution.result == optimistix.RESULTS.successful
+    image = splitting.image(solution.value)[0, 0]
+    assert relative_l2(image, expected("small")) < 1e-6
 
 
 @pytest.mark.thorough
@@ -259,7 +253,7 @@ def test_captures_in_any_units_and_single_precision():
         assert relative_l2(other.image / factor, plain.image) < 1e-3
 
 
-@pytest.mark.parametrize("name", quick(["small", "sparse", "separable", "dense"], 0, 1))
+@pytest.mark.parametrize("name", quick(["small", "sparse", "separable", "dense"], 0))
 def test_new_values_compile_nothing(name):
     """Other captures, variances, τ and tolerances of one shape run the programs that are there.
 
@@ -271,20 +265,3 @@ def test_new_values_compile_nothing(name):
     tc.reconstruct(given, tc.AdmmTV(TAU, iterations=20))
     again = tc.AdmmTV(0.5 * TAU, iterations=20, tolerance=1e-5)
     assert compilations(lambda: tc.reconstruct(other, again)) == 0
-
-
-def test_what_is_refused():
-    operator = Matrix(np.ones((6, 4)), (2, 2), (6,))
-    for captures, imaging_model, message in (
-        (jnp.ones(5), operator, r"a capture has shape \(1, 5\); its operator takes"),
-        ([jnp.ones(6)], [operator, operator], "for 2 cameras, PSFs or operators"),
-        (jnp.ones(6), Matrix(np.ones((6, 4)), (4,), (6,)), "in_shape \\(y, x\\), \\(plane"),
-    ):
-        with pytest.raises(ValueError, match=message) as refused:
-            tc.Recording(captures, imaging_model, noise_variance=1.0).problem()
-        assert "\n" not in str(refused.value)
-    with pytest.raises(ValueError, match="give noise_variance"):
-        tc.reconstruct(tc.Recording(jnp.ones(6), operator), tc.AdmmTV())
-    with pytest.raises(ValueError, match="a synthesis needs Cameras; leave it out with operators"):
-        recording = tc.Recording(jnp.ones(6), operator, noise_variance=1.0)
-        tc.reconstruct(recording, tc.AdmmTV(synthesis=np.eye(1)))

@@ -1,5 +1,6 @@
 """Fringe scanning: orientation, scale, gain, and the frequencies that diffraction takes away."""
 
+import itertools
 import math
 
 import jax.numpy as jnp
@@ -8,7 +9,7 @@ import pytest
 from reconstruction import rig
 
 import thincam_jax as tc
-from helpers import count_traces, relative_l2
+from helpers import count_traces, quick, relative_l2
 from thincam_jax.units import nm, um
 
 
@@ -32,7 +33,7 @@ def test_the_scene_comes_back_upright_with_its_radiance():
     assert float(value.pitch) == pytest.approx(rig.OBJECT_PITCH)
 
 
-@pytest.mark.parametrize("distance", [rig.DISTANCE, 1.3 * rig.DISTANCE])
+@pytest.mark.parametrize("distance", quick([rig.DISTANCE, 1.3 * rig.DISTANCE], 1))
 def test_a_point_is_found_where_it_is(distance):
     """Off the axis; at the larger distance the pixels are finer on the object."""
     image = np.zeros(rig.FIELD)
@@ -54,7 +55,7 @@ def test_a_moved_mask_moves_nothing():
     assert relative_l2(value.image, expected.image) < 0.05
 
 
-@pytest.mark.parametrize(("distance", "wavelength"), [(3.0, 2000 * nm), (2.0, 5000 * nm)])
+@pytest.mark.parametrize(("distance", "wavelength"), quick([(3.0, 2000 * nm), (2.0, 5000 * nm)], 1))
 def test_diffraction_takes_the_zero_of_the_cosine_away(distance, wavelength):
     """Of a point, the spectrum has the sign of cos(πλdMρ²): its zero is at ρ = 1/√(2λdM).
 
@@ -99,11 +100,9 @@ def test_the_field_is_cut_from_the_middle():
     cameras = rig.phases(beta=50.0)
     taken = rig.captures(cameras, rig.picture())
     small = scanning(cameras)(taken).image
-    for shape in ((96, 85), (110, 51)):
-        large = np.asarray(scanning(cameras, field_shape=shape)(taken).image)
-        top, left = (shape[0] - 40) // 2, (shape[1] - 47) // 2
-        assert relative_l2(large[top : top + 40, left : left + 47], small) < 0.05
-    assert scanning(cameras, field_shape=(39, 46))(taken).image.shape == (40, 47)
+    large = np.asarray(scanning(cameras, field_shape=(110, 51))(taken).image)
+    assert relative_l2(large[35:75, 2:49], small) < 0.05
+    np.testing.assert_array_equal(scanning(cameras, field_shape=(39, 46))(taken).image, small)
 
 
 def test_not_traced_again_for_other_captures_and_cameras(monkeypatch):
@@ -122,15 +121,6 @@ def test_not_traced_again_for_other_captures_and_cameras(monkeypatch):
     assert relative_l2(results[2], results[0]) > 0.01
 
 
-def test_through_the_entry_point():
-    cameras = rig.phases(beta=50.0)
-    taken = rig.captures(cameras, rig.picture())
-    recording = tc.Recording(list(taken), rig.imaging_model(cameras))
-    value = tc.reconstruct(recording, tc.FringeScanning())
-    np.testing.assert_array_equal(value.image, scanning(cameras)(taken).image)
-    assert value.status == "ok" and value.method == "fringe_scanning"
-
-
 def test_captures_in_any_order():
     cameras = rig.phases(beta=50.0)
     taken = rig.captures(cameras, rig.picture())
@@ -140,8 +130,9 @@ def test_captures_in_any_order():
     np.testing.assert_allclose(value.image, expected, rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("second", [1, 3])
-@pytest.mark.parametrize("profile", ["cosine", "intensity"])
+@pytest.mark.parametrize(
+    ("second", "profile"), quick(itertools.product([1, 3], ["cosine", "intensity"]), 2)
+)
 def test_two_phases_in_quadrature(second, profile):
     """As good as four on a few bright things; not on a bright field, whose background is left."""
     cameras = rig.phases(beta=50.0, profile=profile)

@@ -11,10 +11,10 @@ import lineax as lx
 import numpy as np
 import pytest
 from reconstruction import scenes
-from reconstruction.test_admm import case, reference, solved
+from reconstruction.test_admm import case, solved
 
 import thincam_jax as tc
-from helpers import count_traces, finite_difference, relative_l2
+from helpers import count_traces, finite_difference, quick, relative_l2
 from thincam_jax.imaging.operators import CropConvolution, kernel_grid
 from thincam_jax.reconstruction.admm import Penalties
 from thincam_jax.reconstruction.implicit_gradient import NeumannSeries, solve_fixed_point
@@ -156,15 +156,12 @@ def settled(problem, factor=0.1, iterations=3000, tolerance=1e-11) -> tuple:
     return result.image, result.iterations, result.converged
 
 
-@pytest.mark.parametrize("name", [pytest.param("planes", marks=pytest.mark.thorough), "colour"])
-def test_it_is_the_minimiser_of_the_other_methods(name):
-    """Of the iteration in chunks, and of the primal-dual method on dense matrices."""
+@pytest.mark.parametrize("name", quick(["planes", "colour", "two"], 2))
+def test_it_is_the_minimiser_of_the_iteration_in_chunks(name):
     given = case(name)
     image, iterations, converged = settled(given.problem)
     assert bool(converged) and 50 < int(iterations) < 3000
     assert relative_l2(image, solved(given.problem, iterations=3000)) < 1e-6
-    expected = reference(given)
-    assert relative_l2(np.asarray(image).reshape(expected.shape), expected) < 1e-6
     cut_short = settled(given.problem, iterations=7)
     assert int(cut_short[1]) == 7 and not bool(cut_short[2])
 
@@ -273,14 +270,6 @@ def zeros(problem):
     return jnp.zeros(problem.image_shape, problem.captures[0].dtype)
 
 
-@pytest.mark.thorough
-def test_it_finds_what_fista_finds():
-    problem, _ = scenes.problem(kernel=scenes.spots, tau=3e-3)
-    own = solve_fista(problem, iterations=60, tolerance=0.0, inner=30)
-    image = tc.implicit_proximal_gradient(problem, zeros(problem), iterations=60, inner=200)
-    assert relative_l2(image, own.image) < 1e-2
-
-
 def sparse(tau):
     """A small problem with few cosines, and its scene."""
     return scenes.problem(
@@ -313,20 +302,3 @@ def test_the_implicit_derivative_is_that_of_differences():
     tau = jnp.asarray(0.05)
     wanted = finite_difference(error, tau, jnp.asarray(1.0), 1e-5)
     np.testing.assert_allclose(jax.grad(error)(tau), wanted, rtol=1e-4)
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize("factor", [1e-8, 1e8])
-def test_it_scales_with_the_captures_in_float32(factor):
-    problem = scenes.single(scenes.problem()[0])
-    plain = tc.implicit_proximal_gradient(problem, zeros(problem), iterations=10)
-    other = tc.implicit_proximal_gradient(
-        scenes.rescaled(problem, factor), zeros(problem), iterations=10
-    )
-    assert other.dtype == jnp.float32
-    assert relative_l2(np.asarray(other) / factor, plain) < 2e-3
-    dark = scenes.rescaled(problem, 0.0)
-    assert (
-        float(jnp.abs(tc.implicit_proximal_gradient(dark, zeros(problem), iterations=10)).max())
-        == 0
-    )

@@ -6,7 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.signal
-from reconstruction import rig
+import skimage
+from reconstruction import extremes, rig, scenes
 
 import thincam_jax as tc
 from helpers import relative_l2, shared_data
@@ -22,7 +23,6 @@ from thincam_jax.reconstruction import (
     separate,
 )
 from thincam_jax.reconstruction.problem import residuals
-from thincam_jax.reconstruction.proximal_gradient import solve_fista
 from thincam_jax.reconstruction.recording import centred_crop
 
 RNG = np.random.default_rng(1)
@@ -280,6 +280,7 @@ def test_a_warm_start_is_given_upright_and_converges_sooner():
         assert turned.history[0].objective > 1.05 * lowest
 
 
+@pytest.mark.thorough
 def test_endings():
     """Stopped by a callback, interrupted, NaN: the best image until then."""
     seen = noisy(1)[:, :40, :41]
@@ -296,53 +297,6 @@ def test_endings():
     np.testing.assert_array_equal(interrupted.image, stopped.image)
     once = variation(seen, psf, iterations=7)
     assert (once.status, once.iterations) == ("iterations_exhausted", 7)
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize("kernel", [(9, 10), pytest.param((60, 51), marks=pytest.mark.thorough)])
-def test_extremes_are_finite(kernel):
-    """No light, saturated, one bright pixel, no variation, nothing but that."""
-    shape = (30, 23)
-    psf = tc.Psfs(jnp.asarray(rig.picture(kernel))[None])
-    ones, zeros = jnp.ones((1, *shape)), jnp.zeros((1, *shape))
-    ordinary = jnp.asarray(np.random.default_rng(0).uniform(size=(1, *shape)))
-    for captures, settings in (
-        (zeros, {}),
-        (4095.0 * ones, {}),
-        (zeros.at[0, 7, 20].set(1.0), {}),
-        (ordinary, {"tau": 0.0}),
-        (ordinary, {"tau": 1e6}),
-        (ordinary, {"known": {"noise_variance": 0.0}}),
-    ):
-        result = variation(captures, psf, iterations=20, **settings)
-        assert result.image.shape == shape and bool(jnp.isfinite(result.image).all())
-        assert result.status in ("converged", "iterations_exhausted")
-        assert float(result.image.min()) >= 0
-        if captures is zeros:
-            assert result.status == "converged"
-            np.testing.assert_array_equal(result.image, 0)
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize("factor", [1e-8, 1e8])
-def test_the_image_scales_with_the_captures(factor):
-    """In single precision, with noise that is estimated; colours keep their axis."""
-    seen = jnp.asarray(noisy(1)[:, None, :40, :41], jnp.float32) * jnp.ones((3, 1, 1), jnp.float32)
-    psf = tc.Psfs(jnp.asarray(rig.picture((9, 10)), jnp.float32)[None])
-    one, other = (variation(jnp.float32(f) * seen, psf, iterations=20) for f in (1.0, factor))
-    assert other.image.shape == (3, 40, 41) and other.image.dtype == jnp.float32
-    error = jnp.linalg.norm(other.image / jnp.float32(factor) - one.image)
-    assert 0 < float(jnp.linalg.norm(one.image)) and float(error) < 1e-3 * float(
-        jnp.linalg.norm(one.image)
-    )
-
-
-@pytest.mark.thorough
-def test_planes_get_an_axis():
-    planes = rig.imaging_model(rig.pair(), object_distance=[80.0, 100.0])
-    result = variation(noisy(), planes, iterations=5)
-    assert result.image.shape == (2, *rig.FIELD)
-    np.testing.assert_allclose(result.pitch, [0.8 * rig.OBJECT_PITCH, rig.OBJECT_PITCH])
 
 
 @pytest.mark.parametrize("kind", [tc.AdmmTV, tc.Fista, tc.Ridge, tc.PoissonTV])
@@ -411,43 +365,11 @@ def test_a_regulariser_takes_the_place_of_total_variation():
 
 
 @pytest.mark.thorough
-def test_it_is_that_of_the_solver():
-    """From a black image, for measured PSFs; the problem is that of the recording."""
-    recording, _ = cosines()
-    basis = Sparsity(Wavelet("haar", levels=2))
-    how = {"iterations": 20, "tolerance": 0.0}
-    found = tc.reconstruct(recording, tc.Fista(1.0, regulariser=basis, **how))
-    problem = recording.problem(tau=1.0, regulariser=basis)
-    direct = solve_fista(problem, image=jnp.zeros(problem.image_shape), **how)
-    np.testing.assert_allclose(found.image, direct.image[0, 0], rtol=1e-12)
-    assert found.history[-1].objective == pytest.approx(direct.history[-1].objective)
-    assert found.method == "fista" and found.tau == 1.0
-
-
-def hand():
-    """The hand of DiffuserCam by blocks of 4×4 pixels, its PSF, and the published image of it."""
-    image_files = pytest.importorskip("PIL.Image")
-    folder = shared_data("diffusercam-hand")
-
-    def load(name):
-        counts = np.asarray(image_files.open(folder / name), dtype=np.float32)
-        return counts
-
-    psf, raw = load("psf_sample.tif"), load("rawdata_hand_sample.tif")
-    background = psf[5:15, 5:15].mean()
-    psf, raw = (
-        np.maximum(x - background, 0).reshape(x.shape[0] // 4, 4, x.shape[1] // 4, 4).mean((1, 3))
-        for x in (psf, raw)
-    )
-    page = image_files.open(folder / "reference_admm5_notebook_output.png").convert("L")
-    return raw, psf / psf.sum(), np.asarray(page, dtype=float)[23:239, 34:323]
-
-
-@pytest.mark.thorough
 def test_a_real_capture():
     """DiffuserCam's hand: like the published reconstruction; by the data only with its own PSF."""
-    raw, psf, expected = hand()
-    raw, psf = jnp.asarray(raw)[None], jnp.asarray(psf)[None]
+    raw, psf = (jnp.asarray(image)[None] for image in scenes.hand(4))
+    page = shared_data("diffusercam-hand") / "reference_admm5_notebook_output.png"
+    expected = skimage.io.imread(page, as_gray=True)[23:239, 34:323]
     field = tc.Recording(raw, tc.Psfs(psf)).problem().field_shape
     residual = []
     for kernel, iterations in ((psf, 60), (psf[..., ::-1, ::-1], 30)):
@@ -462,3 +384,8 @@ def test_a_real_capture():
     either = (image, image[::-1], image[:, ::-1], image[::-1, ::-1])  # the page may be turned
     assert max(rig.correlation(x, expected) for x in either) > 0.97
     assert residual[0] < 0.025 and residual[1] > 2 * residual[0]
+
+
+@pytest.mark.thorough
+def test_recordings_at_the_extremes():
+    extremes.check_recordings(tc.AdmmTV(iterations=30))

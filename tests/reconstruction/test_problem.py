@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from reconstruction import dense, scenes
 
-from helpers import count_traces, finite_difference
+from helpers import count_traces, finite_difference, quick
 from thincam_jax.imaging.operators import (
     CropConvolution,
     Masked,
@@ -68,7 +68,7 @@ def example(channels=2, planes=3, kernel_channels=2):
     return problem, list(zip(matrices, captures, weights, strict=True))
 
 
-@pytest.mark.parametrize("kernel_channels", [1, 2])
+@pytest.mark.parametrize("kernel_channels", quick([1, 2], 0))
 def test_the_objective_by_matrices(kernel_channels):
     """Σ ½ w (Hf − g)² and τ TV, of each element of a batch."""
     problem, parts = example(kernel_channels=kernel_channels)
@@ -96,9 +96,11 @@ def test_the_uniform_image_is_the_best_of_all_uniform_ones():
         even = levels[..., None, None, None]
         return jnp.sum(misfit(problem, jnp.broadcast_to(even, problem.image_shape)))
 
-    np.testing.assert_allclose(jax.grad(cost)(level), 0, atol=1e-10)
+    both = jax.jit(jax.value_and_grad(cost))
+    lowest, slope = both(level)
+    np.testing.assert_allclose(slope, 0, atol=1e-10)
     for sign in (-1, 1):
-        assert float(cost(level + 0.1 * sign)) > float(cost(level))
+        assert float(both(level + 0.1 * sign)[0]) > float(lowest)
     # without light there is none
     dark = InverseProblem(
         [operator(np.zeros((1, 1, *kernel_shape(SENSORS[0], FIELD))), SENSORS[0])],
@@ -114,11 +116,9 @@ def test_gradient_and_traces():
     image = jnp.asarray(RNG.normal(size=problem.image_shape))
     slope = jnp.asarray(RNG.normal(size=image.shape))
 
-    def total(image):
-        return jnp.sum(objective(problem, image))
-
-    expected = finite_difference(total, image, slope, 1e-5)
-    np.testing.assert_allclose(jnp.vdot(jax.grad(total)(image), slope), expected, rtol=1e-8)
+    both = jax.jit(jax.value_and_grad(total_objective))
+    expected = finite_difference(lambda image: both(image, problem)[0], image, slope, 1e-5)
+    np.testing.assert_allclose(np.vdot(both(image, problem)[1], slope), expected, rtol=1e-8)
     counted = count_traces(objective)
     compiled = jax.jit(counted)
     for factor in (1.0, 3.0):
@@ -194,6 +194,7 @@ def test_what_is_refused():
         ([first, second], [a, jnp.ones((3, 4, 9))], {}, r"captures differ in batch .*\(1,\), \(3,"),
         ([first], [a], {"weights": [1.0, 1.0]}, "2 weights for 1 captures; give one for each"),
         ([first], [a], {"tau": -1.0}, "tau = -1.0 is negative; give tau >= 0"),
+        ([Matrix(np.ones((6, 4)), (4,), (6,))], [jnp.ones((1, 6))], {}, r"in_shape \(y, x\), \(pl"),
     ):
         with pytest.raises(ValueError, match=message):
             InverseProblem(operators, captures, **({"tau": 1.0} | settings))
@@ -234,7 +235,7 @@ def test_objectives_differ_by_a_factor_only_and_the_gradient_is_that_of_the_misf
             / np.array([misfit(inside, small), inside.absolute_tau * inside.regulariser(small)])
         )
     np.testing.assert_allclose(ratios, np.full_like(ratios, ratios[0][0, 0]), rtol=1e-9)
-    wanted = jax.grad(lambda f: jnp.sum(misfit(inside, f)))(truth)
+    wanted = jax.jit(jax.grad(total_misfit))(truth, inside)
     np.testing.assert_allclose(gradient(inside, truth), wanted, rtol=1e-9, atol=1e-9)
 
 
@@ -243,7 +244,7 @@ def test_all_that_is_seen_has_its_transpose():
     assert adjoint_error(WeightedOperator(problem), jax.random.key(1), dtype=jnp.float64) < 1e-13
 
 
-@pytest.mark.parametrize("factor", [1e-12, 1e-8, 1e8, 1e12])
+@pytest.mark.parametrize("factor", [1e-12, 1e12])
 def test_no_unit_is_too_large_or_too_small_for_float32(factor):
     plain = ScaledProblem(scenes.single(scenes.problem()[0]))
     other = ScaledProblem(scenes.single(scenes.rescaled(scenes.problem()[0], factor)))

@@ -16,19 +16,17 @@ from thincam_jax.reconstruction import proximal_gradient
 from thincam_jax.reconstruction.iterate import Schedule, iterate
 from thincam_jax.reconstruction.problem import (
     ScaledProblem,
-    objective,
     total_misfit,
     total_objective,
 )
 from thincam_jax.reconstruction.proximal_gradient import (
     AcceleratedProximalGradient,
     FistaMethod,
-    RegulariserDenoiser,
     RegulariserMap,
     solve_fista,
     solve_plug_and_play,
 )
-from thincam_jax.reconstruction.regularisers import Cosines, Sparsity, Wavelet
+from thincam_jax.reconstruction.regularisers import Cosines, Sparsity, Wavelet, denoise
 from thincam_jax.reconstruction.splittings import admm_method
 
 few = functools.partial(solve_fista, iterations=10)
@@ -91,29 +89,6 @@ def test_restart_reaches_in_70_iterations_what_takes_more_than_140_without():
     goal = min(plain) * (1 + 1e-12)
     assert run.history[-1].objective <= goal
     assert min(plain[:14]) > goal
-
-
-@pytest.mark.parametrize("nonnegative", [False, True])
-@pytest.mark.parametrize("basis", [Cosines(), Wavelet("haar", 2)], ids=["cosines", "haar"])
-@pytest.mark.thorough
-def test_no_image_beside_a_sparse_minimum_is_better(basis, nonnegative):
-    regulariser = Sparsity(basis)
-    problem, _ = scenes.problem(
-        kernel=scenes.spots, tau=3e-2, nonnegative=nonnegative, regulariser=regulariser
-    )
-    found = solve_fista(problem, iterations=400, tolerance=1e-8, inner=30).image
-    energy = jax.jit(objective)
-    lowest = energy(problem, found)
-    rng = np.random.default_rng(5)
-    for size in (1e-4, 1e-3, 1e-2):
-        for _ in range(10):
-            other = found + size * jnp.asarray(rng.normal(size=found.shape))
-            other = jnp.maximum(other, 0) if nonnegative else other
-            assert energy(problem, other) > lowest
-    assert not nonnegative or float(found.min()) >= 0
-    (details,) = regulariser.analyse(found)
-    if not nonnegative:
-        assert 0.2 < float(jnp.mean(details == 0)) or float(jnp.mean(jnp.abs(details) < 1e-9)) > 0.2
 
 
 def test_optimistix_in_one_loop_gives_the_image_of_steps_from_outside():
@@ -187,29 +162,6 @@ def test_fista_at_extremes():
     extremes.check_shapes(few)
 
 
-def test_progress_is_told_and_a_callback_can_stop():
-    problem, _ = scenes.problem()
-    seen = []
-
-    def stop(progress):
-        seen.append(progress)
-        return progress.iteration >= 20
-
-    outcome = solve_fista(problem, callback=stop, iterations=100)
-    assert outcome.status == "stopped" and outcome.iterations == 20
-    assert [p.iteration for p in seen] == [10, 20]
-    assert seen[1].objective < seen[0].objective
-
-
-def test_a_capture_with_nan_has_a_status():
-    problem, _ = scenes.problem()
-    broken = (problem.captures[0].at[0, 0, 0].set(jnp.nan), problem.captures[1])
-    broken = eqx.tree_at(lambda p: p.captures, problem, broken)
-    outcome = few(broken, image=zeros(problem))
-    assert outcome.status == "non_finite"
-    assert bool(jnp.isfinite(outcome.image).all())
-
-
 class Smoother(eqx.Module):
     """Each pixel drawn to the mean of its four neighbours, by a part `strength`: linear."""
 
@@ -228,7 +180,13 @@ def test_with_the_denoiser_of_a_regulariser_it_is_its_minimiser(regulariser):
     how = {"regulariser": regulariser, "nonnegative": regulariser is None}
     problem, _ = scenes.problem(kernel=scenes.spots, tau=3e-3, **how)
     minimiser = solve_fista(problem, iterations=500, tolerance=1e-8, inner=30)
-    denoiser = RegulariserDenoiser(problem, iterations=300)
+    denoiser = eqx.Partial(
+        denoise,
+        step=problem.absolute_tau / ScaledProblem(problem).curvature,
+        regulariser=problem.regulariser,
+        nonnegative=problem.nonnegative,
+        iterations=300,
+    )
     found = solve_plug_and_play(problem, denoiser, iterations=400)
     assert found.status == "converged"
     assert relative_l2(found.image, minimiser.image) < 1e-3
@@ -278,7 +236,7 @@ def test_plug_and_play_at_extremes():
     extremes.check_shapes(solve)
 
 
-def test_new_values_are_not_compiled_anew_and_nan_has_a_status():
+def test_other_denoisers_are_not_compiled_anew():
     problem, _ = scenes.problem()
     solve = functools.partial(solve_plug_and_play, iterations=10)
     solve(problem, Smoother(jnp.asarray(0.3)))
@@ -286,8 +244,3 @@ def test_new_values_are_not_compiled_anew_and_nan_has_a_status():
     before = [program._cached._cache_size() for program in programs]
     solve(scenes.rescaled(problem, 2.0), Smoother(jnp.asarray(0.2)))
     assert [program._cached._cache_size() for program in programs] == before
-    broken = (problem.captures[0].at[0, 0, 0].set(jnp.nan), problem.captures[1])
-    broken = eqx.tree_at(lambda p: p.captures, problem, broken)
-    start = jnp.zeros(problem.image_shape)
-    outcome = solve(broken, Smoother(jnp.asarray(0.3)), image=start)
-    assert outcome.status == "non_finite" and bool(jnp.isfinite(outcome.image).all())

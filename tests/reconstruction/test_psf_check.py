@@ -136,6 +136,7 @@ def diffuser():
     return camera(1, spots(np.random.default_rng(1), SMALL), SMALL)
 
 
+@pytest.mark.thorough
 def test_right_psf_is_not_doubted(diffuser):
     seen = []
     found = diffuser.check(diffuser.psf(), callback=lambda done, of: seen.append((done, of)))

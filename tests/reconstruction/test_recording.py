@@ -19,7 +19,6 @@ from thincam_jax.imaging.operators import (
     Scaled,
     Separable,
     Stacked,
-    kernel_shape,
 )
 from thincam_jax.reconstruction import InverseProblem
 from thincam_jax.reconstruction.iterate import Outcome
@@ -54,9 +53,10 @@ def projected(image) -> jax.Array:
 def share(problem, image) -> list[float]:
     """‖√w (Hf − g)‖ / ‖√w g‖ of each capture."""
     gaps = residuals(problem, image)
+    parts = jax.device_get((gaps, problem.captures, problem.weights))
     return [
-        float(jnp.linalg.norm(jnp.sqrt(w) * r) / jnp.linalg.norm(jnp.sqrt(w) * g))
-        for r, g, w in zip(gaps, problem.captures, problem.weights, strict=True)
+        float(np.linalg.norm(np.sqrt(w) * r) / np.linalg.norm(np.sqrt(w) * g))
+        for r, g, w in zip(*parts, strict=True)
     ]
 
 
@@ -170,7 +170,7 @@ def test_the_field_takes_the_parity_of_the_sensor():
         itertools.product(
             [(5, 8), (7, 7), (12, 17), (13, 19), (29, 30), (40, 61)], [(12, 17), (13, 11)]
         ),
-        *(1, 2, 4, 11),
+        *(1, 11),
     ),
 )
 def test_measured_psfs_of_any_size(sensor, kernel):
@@ -189,10 +189,9 @@ def test_measured_psfs_of_any_size(sensor, kernel):
     np.testing.assert_allclose(value[0], expected, atol=1e-10 * np.abs(expected).max())
 
 
-@pytest.mark.parametrize("field", [(9, 10), (10, 9)])
-def test_a_field_that_is_given_is_smaller_by_one_at_most(field):
+def test_a_field_that_is_given_is_smaller_by_one_at_most():
     """Its centre must lie on that of the samples; a point in its middle gives the PSF's middle."""
-    psf = RNG.uniform(size=(5, 8))
+    psf, field = RNG.uniform(size=(5, 8)), (10, 9)
     problem = psf_problem(jnp.ones((1, 12, 17)), jnp.asarray(psf)[None], field_shape=field)
     shape = problem.field_shape
     assert all(0 <= a - b <= 1 for a, b in zip(field, shape, strict=True))
@@ -214,7 +213,7 @@ def test_a_field_that_is_given_is_smaller_by_one_at_most(field):
 def test_channels_and_planes_of_psfs(channels):
     """One PSF for all channels, one each, planes of each: every channel by its own convolution."""
     captures = jnp.asarray(RNG.uniform(size=(2, channels, 9, 8)))
-    for shape in ((2, 4, 5), (2, 1, 4, 5), (2, channels, 4, 5), (2, channels, 3, 4, 5)):
+    for shape in ((2, 4, 5), (2, channels, 4, 5), (2, channels, 3, 4, 5)):
         psfs = RNG.uniform(size=shape)
         problem = psf_problem(captures, jnp.asarray(psfs))
         planes = 3 if len(shape) == 5 else 1
@@ -250,7 +249,7 @@ def test_tau_is_the_noise_of_the_back_projection():
     assert float(value) == pytest.approx(expected, rel=0.02)
 
 
-@pytest.mark.parametrize("factor", [1e-8, 1e8])
+@pytest.mark.parametrize("factor", quick([1e-8, 1e8], 0))
 def test_problems_scale_with_their_captures(factor):
     """Noise estimated, single precision: weights fall and τ falls so that the image scales."""
     seen = RNG.uniform(size=(2, 20, 23)).astype(np.float32)
@@ -438,13 +437,6 @@ def test_what_has_seen_the_captures_is_one_of_three():
 
 
 HOLED = np.where(np.arange(42) == 9, np.nan, 1.0).reshape(1, 6, 7)
-
-
-def test_kernels_reach_over_every_difference():
-    """A PSF on `kernel_grid`: nothing of the field is left out, nothing wraps round."""
-    problem = camera_problem(jnp.ones((2, *SENSOR.shape)), cameras())
-    rows, columns = kernel_shape(SENSOR.shape, FIELD)
-    assert problem.operators[0].window[0] >= rows and problem.operators[0].window[1] >= columns
 
 
 @pytest.mark.parametrize(

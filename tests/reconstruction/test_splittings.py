@@ -1,5 +1,7 @@
 """The Fourier and the direct splitting of ADMM."""
 
+import itertools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,16 +10,15 @@ import scipy.sparse
 from reconstruction import dense, scenes
 from reconstruction.test_admm import case, stepped
 
-from helpers import finite_difference, relative_l2
+from helpers import finite_difference, quick, relative_l2
 from thincam_jax.imaging.operators import CropConvolution, Matrix, Separable, Sparse, kernel_shape
-from thincam_jax.reconstruction.admm import Penalties, admm_map, consensus, rescaled
+from thincam_jax.reconstruction.admm import Penalties, consensus, rescaled
 from thincam_jax.reconstruction.iterate import Schedule, iterate
 from thincam_jax.reconstruction.problem import InverseProblem, gradient, uniform_image
 from thincam_jax.reconstruction.splittings import (
     DirectSplitting,
     NormalInverse,
     admm_method,
-    difference_symbol,
     splitting_of,
 )
 from thincam_jax.reconstruction.total_variation import TotalVariation
@@ -55,9 +56,9 @@ def dense_normal(parts, gains, depth_weight, mu, channel, v, u, window):
     return matrix
 
 
-@pytest.mark.parametrize("captures", [1, 2])
-@pytest.mark.parametrize("planes", [1, 3])
-@pytest.mark.parametrize("channels", [1, 2])
+@pytest.mark.parametrize(
+    ("captures", "planes", "channels"), quick(itertools.product((1, 2), (1, 3), (1, 2)), 0, 7)
+)
 def test_it_inverts_the_dense_system_of_every_frequency(captures, planes, channels):
     """One plane and three, one capture and two, a depth weight; a PSF for all channels or each."""
     window = (15, 20) if planes == 3 else None  # an odd and an even one
@@ -78,17 +79,6 @@ def test_it_inverts_the_dense_system_of_every_frequency(captures, planes, channe
     np.testing.assert_allclose(value, expected, rtol=1e-10, atol=1e-12)
 
 
-def test_the_symbol_is_that_of_the_differences():
-    """ΨᵀΨ of a picture by rolls, and by the symbol in the Fourier domain."""
-    image = RNG.normal(size=(9, 14))
-    symbol = difference_symbol((9, 14), jnp.float64)
-    value = np.fft.irfft2(np.fft.rfft2(image) * np.asarray(symbol), s=(9, 14))
-    expected = sum(
-        2 * image - np.roll(image, 1, axis) - np.roll(image, -1, axis) for axis in (0, 1)
-    )
-    np.testing.assert_allclose(value, expected, atol=1e-13)
-
-
 @pytest.mark.parametrize("window", [(15, 20), (16, 21)])
 def test_mean_power_is_the_energy_of_the_kernel(window):
     """Parseval: mean |H|² over the whole plane is Σ h²; of even and odd windows."""
@@ -98,7 +88,7 @@ def test_mean_power_is_the_energy_of_the_kernel(window):
     assert float(operator.mean_power()) == pytest.approx(expected, rel=1e-12)
 
 
-@pytest.mark.parametrize("planes", [1, pytest.param(3, marks=pytest.mark.thorough)])
+@pytest.mark.parametrize("planes", quick([1, 3], 0))
 def test_single_precision_and_gradients(planes):
     parts = operators(2, planes, window=(15, 20))
     shape = (1, planes, 15, 11)
@@ -128,10 +118,14 @@ def test_single_precision_and_gradients(planes):
         np.testing.assert_allclose(slope, difference, rtol=1e-7, atol=1e-9)
 
 
-def test_a_state_stands_for_its_image():
-    """`start` and back; negative parts are cut only if that is asked."""
+@pytest.mark.parametrize("kind", ["fourier", "direct"])
+def test_a_state_stands_for_its_image(kind):
+    """`start` and back; negative parts are cut only where f ≥ 0 is required."""
     for nonnegative in (True, False):
-        problem, _ = scenes.problem(planes=2, channels=2, nonnegative=nonnegative)
+        if kind == "direct":
+            problem = posed("separable", nonnegative=nonnegative)
+        else:
+            problem, _ = scenes.problem(planes=2, channels=2, nonnegative=nonnegative)
         splitting = splitting_of(problem)
         image = jnp.asarray(np.random.default_rng(1).normal(size=problem.image_shape))
         back = splitting.image(splitting.start(image))
@@ -229,10 +223,7 @@ def noise_like(state):
     return jax.tree.map(lambda q: jnp.asarray(CHANCE.normal(size=q.shape), q.dtype), state)
 
 
-@pytest.mark.parametrize(
-    "name",
-    [pytest.param(n, marks=[pytest.mark.thorough] * (n != "separable")) for n in OPERATORS],
-)
+@pytest.mark.parametrize("name", quick(OPERATORS, 1))
 def test_the_consensus_minimises_each_part(name):
     """Of the data: no slope of ½ Σ w (Az − g)² + μ/2 ‖z − q‖² is left; of the image: z ≥ 0."""
     splitting = with_penalties(posed(name))
@@ -247,7 +238,7 @@ def test_the_consensus_minimises_each_part(name):
         np.testing.assert_allclose(found, wanted, atol=1e-14)
 
 
-@pytest.mark.parametrize("name", ["dense", pytest.param("separable", marks=pytest.mark.thorough)])
+@pytest.mark.parametrize("name", quick(["dense", "separable"], 0))
 def test_the_nearest_image_by_least_squares(name):
     """Of one plane and two: K f nearest to a target in the norm of the penalties."""
     problem = posed(name)
@@ -273,7 +264,7 @@ def test_the_nearest_image_by_least_squares(name):
             np.testing.assert_allclose(slopes[n].ravel(), difference @ image, atol=1e-12)
 
 
-@pytest.mark.parametrize("background", [0.0, 0.5])
+@pytest.mark.parametrize("background", quick([0.0, 0.5], 1))
 def test_a_uniform_background_costs_no_iterations(background):
     """Of a random matrix with one eigenvalue 500 times the others, or none."""
     rng = np.random.default_rng(8)
@@ -288,40 +279,3 @@ def test_a_uniform_background_costs_no_iterations(background):
         for n in (50, 500)
     ]
     assert ends[0] == pytest.approx(ends[1], rel=1e-2)
-
-
-def test_a_direct_state_stands_for_its_image():
-    for nonnegative in (True, False):
-        problem = posed("windows", nonnegative=nonnegative)
-        splitting = splitting_of(problem)
-        image = jnp.asarray(CHANCE.normal(size=problem.image_shape))
-        expected = jnp.maximum(image, 0) if nonnegative else image
-        np.testing.assert_allclose(splitting.image(splitting.start(image)), expected, atol=1e-14)
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize("name", OPERATORS)
-def test_single_precision_stays_and_is_near_to_double(name):
-    """Also with the settings of total variation in double precision, their default here.
-
-    The unit of the operator comes from another random start in each precision.
-    """
-    problem = posed(name)
-    expected, found = (
-        splitting.image(admm_map(splitting.start(jnp.ones(p.image_shape, p.tau.dtype)), splitting))
-        for p in (problem, single(problem))
-        for splitting in [splitting_of(p)]
-    )
-    assert found.dtype == jnp.float32 and relative_l2(found, expected) < 1e-3
-
-
-def single(problem):
-    """In float32, but for the regulariser."""
-    small = scenes.single(problem)
-    return InverseProblem(
-        small.operators,
-        small.captures,
-        weights=small.weights,
-        tau=float(problem.tau),
-        regulariser=problem.regulariser,
-    )

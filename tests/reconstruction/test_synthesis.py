@@ -134,11 +134,6 @@ def test_groups_stay_apart():
     assert relative_l2(channels[1], paired(beta=21.0)) < 1e-12
 
 
-def test_separate_leaves_captures_as_they_are():
-    values = np.random.default_rng(0).normal(size=(3, 4, 5))
-    np.testing.assert_array_equal(np.tensordot(separate(3), values, axes=1), values)
-
-
 def test_noise_of_the_channels_is_uncorrelated():
     """Rows orthogonal; the differences of two captures carry the noise of two."""
     for matrix, power in (

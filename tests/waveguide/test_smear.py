@@ -8,6 +8,7 @@ import pytest
 from waveguide.setting import camera, hologram
 
 import thincam_jax as tc
+from helpers import quick
 from thincam_jax import waveguide as wg
 from thincam_jax.imaging.operators import adjoint_error
 from thincam_jax.units import nm, um
@@ -38,23 +39,24 @@ def one_wavelength(pixel, order, wavelength, index, distance=550.0, width=5.0):
     return place + gone(outside, index, width) + gone(outside, 1.0, distance)
 
 
+efficiency = eqx.filter_jit(wg.diffraction_efficiency)
+
+
 def lights(across, wavelengths, orders):
     """η²(1−η)^i, unpolarised, (order, wavelength)."""
-    directions = jnp.broadcast_to(jnp.asarray(across), (len(wavelengths), 2))
+    directions = jnp.asarray(np.broadcast_to(across, (len(wavelengths), 2)))
     eta = [
-        np.asarray(
-            wg.diffraction_efficiency(hologram(), directions, jnp.asarray(wavelengths), kind)
-        )
+        np.asarray(efficiency(hologram(), directions, jnp.asarray(wavelengths), kind))
         for kind in ("TE", "TM")
     ]
     powers = np.arange(orders)[:, None]
     return np.mean([e**2 * (1 - e) ** powers for e in eta], axis=0)
 
 
-@pytest.mark.parametrize("pixel", PIXELS)
-def test_parts_of_the_band(pixel):
+@pytest.mark.parametrize("number", quick(range(3), 2))
+def test_parts_of_the_band(number):
     """Sums, means and deciles of 4001 wavelengths weighted by η²(1−η)^i."""
-    sts, film = camera(), hologram()
+    sts, film, pixel = camera(), hologram(), PIXELS[number]
     samples = 10
     rays = wg.trace_band(sts, jnp.asarray(pixel), 550.0, 3, samples)
     across = -np.array(pixel) / np.hypot(np.hypot(*pixel), 6.0)

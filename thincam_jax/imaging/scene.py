@@ -44,8 +44,8 @@ class ImagePlane(Module):
     - `image`: radiance, (*batch, y, x), in any unit; a batch can hold the colour channels.
     - `distance`: to the mask, mm.
     - `width`: physical width of the image, mm; its pixels are square.
-    - `moves`: x of its middle when an exposure begins and when it ends, mm: it goes there at an
-      even speed, and what is captured is the mean on the way. None stays on the axis.
+    - `moves`: x of its middle at the beginning and the end of an exposure, mm: it moves uniformly,
+      and the capture is the mean over the motion. None stays on the axis.
     """
 
     image: Float[Array, "*batch y x"] = eqx.field(converter=_radiances)

@@ -97,7 +97,7 @@ class GaussianNoise(AbstractNoise):
     σ² = S·10^(−SNR/10), for each (y, x) image, where the signal power S is
 
     - "total": the mean of the squared image, its mean included (MATLAB's ``awgn(…, 'measured')``);
-    - "without_mean": its variance: what is left of a lensless capture once its bias is removed.
+    - "without_mean": its variance: the power of a lensless capture without its bias.
     """
 
     snr_db: Float[Array, ""] = eqx.field(converter=quantity("dB", check=checks.decibels))

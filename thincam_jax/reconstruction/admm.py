@@ -1,4 +1,4 @@
-r"""ADMM for total variation: the map that is iterated, whatever the structure of the operators.
+r"""ADMM for total variation: its fixed-point map, for operators of any structure.
 
 The image f is split so that each part of the objective has a proximal map in closed form. With
 K f the parts, penalties μ (diagonal M) and the scaled duals λ, only q = Kf + λ is carried along, in
@@ -57,8 +57,7 @@ Splitting = TypeVar("Splitting", bound="AbstractSplitting")
 class AbstractSplitting(eqx.Module):
     """A problem split for ADMM, in units in which captures, operators and weights are about 1.
 
-    Iterations compute the same numbers whatever the units of the captures, and the image scales
-    with the captures.
+    Iterations do not depend on the units of the captures, and the image scales with the captures.
 
     - `tau`: weight of the variation in these units.
     - `image_unit`: the image is that of `State`, times this.

@@ -17,7 +17,7 @@ from thincam_jax.reconstruction.splittings import admm_method
 # Range of `find_tau` relative to the problem's own τ. A smaller τ never gains much, and with a
 # slightly wrong PSF both rules choose one that spoils the image.
 _SPAN = (0.8, 4.0)
-# Ratios of residual to noise variance: uncertainty of the noise estimate, and what is reported.
+# Ratios of residual to noise variance: uncertainty of the noise estimate, and the ratio reported.
 _UNCERTAIN, _NOTICED = 0.3, 1.1
 
 
@@ -120,7 +120,7 @@ def sure_tau(
 
     def criterion(log_tau: float) -> float:
         current = with_tau(problem, math.exp(log_tau))
-        # All from the same image: otherwise each would converge further than the last, whatever τ.
+        # All from the same image: otherwise each would converge further than the last.
         seen = _solve(current, image, iterations)
         moved = eqx.tree_at(
             lambda p: p.captures,

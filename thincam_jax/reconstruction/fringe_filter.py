@@ -18,7 +18,7 @@ from thincam_jax.lensless.masks.fza import FresnelZoneAperture
 from thincam_jax.reconstruction.imaging_model import Cameras
 from thincam_jax.reconstruction.recording import Reconstruction, Recording
 from thincam_jax.reconstruction.solver import AbstractSolver
-from thincam_jax.reconstruction.wiener import require_cameras
+from thincam_jax.reconstruction.wiener import require_cameras, require_captures
 
 
 class FringeFilter(eqx.Module):
@@ -67,12 +67,7 @@ class FringeFilter(eqx.Module):
     def __call__(self, captures: Float[Array, "capture *batch y x"]) -> Reconstruction:
         """The reconstruction of captures (capture, *batch, y, x), in the order of the cameras."""
         captures = jnp.asarray(captures, dtype=self.object_pitch.dtype)
-        wanted = len(self.weights)
-        if captures.shape[0] != wanted or captures.shape[-2:] != self.sensor_shape:
-            raise ValueError(
-                f"captures have shape {captures.shape}; give ({wanted}, …, {self.sensor_shape[0]}, "
-                f"{self.sensor_shape[1]}), in the order of the cameras"
-            )
+        require_captures(captures, (len(self.weights), *self.sensor_shape))
         count, *batch, rows, columns = captures.shape
         flat = captures.reshape(count, -1, rows, columns)
         images = [self._image(flat[:, i]) for i in range(flat.shape[1])]

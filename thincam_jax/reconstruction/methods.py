@@ -40,10 +40,10 @@ from thincam_jax.reconstruction.solver import (
     Synthesis,
     as_regulariser,
     as_synthesis,
+    as_tau,
+    as_tolerance,
     as_variation,
-    checked_tau,
     first_image,
-    small_enough,
 )
 from thincam_jax.reconstruction.splittings import admm_method
 from thincam_jax.reconstruction.total_variation import TotalVariation
@@ -63,7 +63,7 @@ _BIASED = 150.0
 _PART, _SMALLEST = 8, 5
 
 # Least share of the valid pixels that must remain.
-_ENOUGH = 0.25
+_LEAST_SHARE = 0.25
 
 
 def reconstruct(
@@ -131,23 +131,14 @@ def choose_solver(
     return (Wiener if suffices else AdmmTV)(synthesis=synthesis), reason
 
 
-class Start(eqx.Module):
-    """A start image, and whether it was given."""
-
-    image: Image
-    given: bool
-
-
 class AbstractRegularised(AbstractIterativeSolver):
     """A solver that minimises ½ Σ w (Af − g)² + τ R(f), with R its `prior`."""
 
-    tau: Float[Array, ""] | str = eqx.field(
-        default=DEFAULT_TAU, converter=quantity(check=checked_tau)
-    )
+    tau: Float[Array, ""] | str = eqx.field(default=DEFAULT_TAU, converter=quantity(check=as_tau))
     nonnegative: bool = eqx.field(default=True, converter=bool, static=True, kw_only=True)
     synthesis: np.ndarray | None = eqx.field(default=None, converter=as_synthesis, kw_only=True)
     iterations: int = eqx.field(default=100, converter=whole(1), static=True, kw_only=True)
-    tolerance: float = eqx.field(default=1e-4, converter=small_enough, static=True, kw_only=True)
+    tolerance: float = eqx.field(default=1e-4, converter=as_tolerance, static=True, kw_only=True)
 
     @property
     @abc.abstractmethod
@@ -155,8 +146,10 @@ class AbstractRegularised(AbstractIterativeSolver):
         """R."""
 
     @abc.abstractmethod
-    def minimise(self, problem: InverseProblem, start: Start, callback: Callback | None) -> Outcome:
-        """Minimise a problem."""
+    def minimise(
+        self, problem: InverseProblem, image: Image, callback: Callback | None, *, given: bool
+    ) -> Outcome:
+        """Minimise a problem from a start image, which the user may have given."""
 
     def solve(
         self,
@@ -193,7 +186,7 @@ class AbstractRegularised(AbstractIterativeSolver):
                 return recording.reconstruction(problem, outcome, self.name, float(problem.tau))
             # From the same start as a solver with this τ, and so to the same image.
             problem, reason = found.problem, found.reason
-        outcome = self.minimise(problem, Start(image, given), callback)
+        outcome = self.minimise(problem, image, callback, given=given)
         if rule:
             outcome = dataclasses.replace(outcome, seconds=time.perf_counter() - began)
         result = recording.reconstruction(problem, outcome, self.name, float(problem.tau))
@@ -228,11 +221,13 @@ class AdmmTV(AbstractRegularised):
     def prior(self):
         return self.variation
 
-    def minimise(self, problem: InverseProblem, start: Start, callback: Callback | None):
+    def minimise(
+        self, problem: InverseProblem, image: Image, callback: Callback | None, *, given: bool
+    ):
         """Minimise by ADMM; a biased camera begins without its uniform light."""
-        first = None if start.given else self._without_uniform_light(problem, start.image, callback)
+        first = None if given else self._without_uniform_light(problem, image, callback)
         if first is None:
-            return self._by_admm(problem, start.image, callback)
+            return self._by_admm(problem, image, callback)
         if first.status in ("stopped", "interrupted", "non_finite"):
             return first
         try:
@@ -296,11 +291,13 @@ class Fista(AbstractRegularised):
     def prior(self):
         return self.regulariser
 
-    def minimise(self, problem: InverseProblem, start: Start, callback: Callback | None):
+    def minimise(
+        self, problem: InverseProblem, image: Image, callback: Callback | None, *, given: bool
+    ):
         """Minimise by FISTA with restart."""
         return solve_fista(
             problem,
-            image=start.image,
+            image=image,
             iterations=self.iterations,
             tolerance=self.tolerance,
             callback=callback,
@@ -316,16 +313,16 @@ SOLVERS: dict[str, type[AbstractSolver]] = {
 def without_uniform_light(problem: InverseProblem) -> InverseProblem | None:
     r"""The problem with biased cameras high-passed; None without any, or if few pixels remain.
 
-    A zone aperture passes a good part of the light evenly. One frequency of its response, zero, is
+    A zone aperture passes a good part of the light uniformly. The zero frequency of its response is
     then hundreds of times as strong as the others, and an iteration that must fit it moves the
-    others little. A high-pass p removes the uniform light exactly, since it is constant over the
-    window of p, and commutes with the camera: with g = C(h ∗ f), C the crop to the sensor,
+    others little. A high-pass p removes the uniform light exactly, and commutes with the camera:
+    with g = C(h ∗ f), C the crop to the sensor,
 
     .. math:: p * g = C'\big((p * h) * f\big), \qquad p = \delta - w,\quad \sum w = 1
 
     on the pixels C′ whose window w lies on the sensor. Only the noise is approximated: at the
-    lowest frequencies it is weaker than assumed. The brightness of the whole and the outermost
-    pixels are lost, so the image found is the start for the problem with all of the data.
+    lowest frequencies it is weaker than assumed. The mean brightness and the outermost pixels are
+    lost, so the image found is the start image for the problem with all data.
 
     The captures keep their shape: pixels near the border, or near an invalid one, have weight 0.
     """
@@ -344,7 +341,7 @@ def without_uniform_light(problem: InverseProblem) -> InverseProblem | None:
             shape = jnp.broadcast_shapes(weight.shape, capture.shape[-2:])
             valid = np.broadcast_to(np.asarray(weight) > 0, shape)
             whole = full_windows(valid, length)
-            if whole.sum() < _ENOUGH * valid.sum():
+            if whole.sum() < _LEAST_SHARE * valid.sum():
                 return None
             weights[index] = weight * jnp.asarray(whole, weight.dtype)
             # Invalid pixels may be huge, and rounding would spread them over the sensor.
@@ -382,8 +379,8 @@ def objective_with_uniform_light(problem: InverseProblem, image: Image) -> Float
 
 @jax.jit
 def _biases(operators: tuple[CropConvolution, ...]) -> list[Float[Array, ""]]:
-    even = [jnp.max(jnp.abs(o.spectrum[..., 0, 0])) for o in operators]
-    return [e / jnp.sqrt(or_one(o.mean_power())) for e, o in zip(even, operators, strict=True)]
+    uniform = [jnp.max(jnp.abs(o.spectrum[..., 0, 0])) for o in operators]
+    return [u / jnp.sqrt(or_one(o.mean_power())) for u, o in zip(uniform, operators, strict=True)]
 
 
 @eqx.filter_jit

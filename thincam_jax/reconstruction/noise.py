@@ -35,12 +35,12 @@ def estimate_noise(
     are as dark as anything in the capture, it is black to the last count, and has classes of its
     own: they show less noise, or none. Details of saturated pixels, as bright as anything, do not
     count, nor do those with a pixel that is not `valid`. Counts are first spread over their step q,
-    which the distances of their values tell; where it is not black, σ is at least the error of
+    found from the differences of their values; where it is not black, σ is at least the error of
     rounding, q/√12.
 
     A lensless capture is smooth at this scale. Where fringes are as fine as pixels the estimate is
     too high; where neighbours share their noise, as after a bilinear demosaicing, it is too low.
-    It is 0 of what is even, or has two values only.
+    It is 0 for a uniform capture, or one of two values only.
     """
     if min(capture.shape[-2:]) < 3:
         return jnp.zeros(capture.shape[:-2], capture.dtype)
@@ -83,7 +83,7 @@ def demosaiced_noise(
 def local_noise(capture: Float[Array, "..."], valid: Bool[Array, "..."]) -> Float[Array, "..."]:
     """The noise around each pixel over its root mean square, from the finest detail of 9×9 pixels.
 
-    1 everywhere in captures that are no images, or even.
+    1 everywhere in captures that are not images, or uniform.
     """
     if capture.ndim < 2 or min(capture.shape[-2:]) < 3:
         return jnp.ones_like(capture)
@@ -143,7 +143,7 @@ def _quantisation_step(values: Float[Array, "*batch y x"], span: Float[Array, "*
 def _photon_transfer(brightness: Float[Array, "*batch n"], detail: Float[Array, "*batch n"]):
     """Mean over classes of brightness of the variance of the details; infinite ones are left out.
 
-    Two sorts, whatever the number of classes: by brightness, then by class and size.
+    Two sorts for any number of classes: by brightness, then by class and size.
     """
     brightness, detail = jax.lax.sort((brightness, detail), num_keys=1)
     count = jnp.sum(jnp.isfinite(brightness), axis=-1)

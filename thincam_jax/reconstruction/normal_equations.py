@@ -42,7 +42,7 @@ INNER_STEPS = 500
 
 
 class AbstractNormal(eqx.Module):
-    """The normal equations of a problem with a shift μ > 0, made ready to be solved."""
+    """The normal equations of a problem with a shift μ > 0, prepared for solution."""
 
     problem: InverseProblem
     shift: Float[Array, ""]
@@ -52,7 +52,7 @@ class AbstractNormal(eqx.Module):
         """z of a right-hand side b (*batch, channel, plane, y, x)."""
 
     def shifted(self, shift: Float[Array, ""]) -> "AbstractNormal":
-        """The same with another μ; what does not depend on it is kept."""
+        """These equations with another μ, without repeating what does not depend on it."""
         return replace(self, shift=shift)
 
     def variance(self) -> Float[Array, "*planes y x"]:
@@ -63,7 +63,7 @@ class AbstractNormal(eqx.Module):
         )
 
     def settled(self) -> "AbstractNormal":
-        """The same where μ stays for hundreds of solutions."""
+        """These equations prepared for hundreds of solutions with one μ."""
         return self
 
     def __call__(self, right: Float[Array, "..."], guess: Float[Array, "..."]):
@@ -135,7 +135,7 @@ class SeparableNormal(AbstractNormal):
 
 
 class ReducedNormal(AbstractNormal):
-    """By the eigenvectors that a reduced matrix has, whatever μ."""
+    """By the eigenvectors of a reduced matrix, for any μ."""
 
     def solve(self, right: Float[Array, "..."]):
         bare, power = self._powers()
@@ -195,9 +195,9 @@ class IterativeNormal(AbstractNormal):
         """Status by lineax; `tolerance` is relative to the right-hand side, root mean square."""
         structure = jax.ShapeDtypeStruct(right.shape, right.dtype)
         tags = lineax.positive_semidefinite_tag
-        # lineax takes a curvature pᵀAp/‖r‖² below 100·eps·(number of unknowns) for a breakdown,
-        # whatever the size of A. In float32 that is 3 for 512² pixels: more than any A of norm 1
-        # has. A is therefore multiplied by what leaves room for eigenvalues down to 1e-6.
+        # lineax takes a curvature pᵀAp/‖r‖² below 100·eps·(number of unknowns) for a breakdown: in
+        # float32 that is 3 for 512² pixels, more than any A of norm 1 has. A is therefore scaled to
+        # allow eigenvalues down to 1e-6.
         eps = float(jnp.finfo(right.dtype).eps)
         factor = max(1.0, 1e8 * eps * right.size)
         operator = lineax.FunctionLinearOperator(
@@ -218,7 +218,7 @@ class IterativeNormal(AbstractNormal):
         return eqx.tree_at(lambda s: s.value, solution, factor * solution.value)
 
     def _uncropped(self, operators, image):
-        """(Σ w̄|Ĥ|² + μ)⁻¹ on the window, and cut: what the inverse were without the crop.
+        """(Σ w̄|Ĥ|² + μ)⁻¹ on the window, and cut: the inverse without the crop.
 
         Positive definite, since it is a positive filter between a map and its transpose.
         """
@@ -239,7 +239,7 @@ def _weighted(problem: InverseProblem):
 
 
 def _bare(operator: AbstractOperator) -> AbstractOperator:
-    """The operator that a `ScaledProblem` has put a unit around."""
+    """The operator without the gain that a `ScaledProblem` gave it."""
     return operator.operator if isinstance(operator, Scaled) else operator
 
 

@@ -10,8 +10,8 @@ half of the deviance. With total variation and f ≥ 0 that is minimised,
 
 over θ, with φ one of the links of `LINKS` and s the brightness of the uniform image. TV is smoothed
 by its Moreau envelope (a Huber function of the length of each vector of differences), so
-that E has a gradient. At high counts least squares with weights 1/y say the same; at a few
-counts a pixel they do not.
+that E has a gradient. At high counts this agrees with least squares of weights 1/y; at a few
+counts a pixel it does not.
 """
 
 import functools
@@ -44,10 +44,10 @@ from thincam_jax.reconstruction.regularisers import Image
 from thincam_jax.reconstruction.solver import (
     DEFAULT_TAU,
     AbstractIterativeSolver,
+    as_tolerance,
     as_variation,
     first_image,
     of_kind,
-    small_enough,
 )
 from thincam_jax.reconstruction.total_variation import TotalVariation
 
@@ -110,7 +110,7 @@ class Counts(eqx.Module):
     def theta(self, image: Image):
         """θ of an image, whose values are raised to at least s/1000.
 
-        In the default precision, in which solvers keep their memory whatever that of θ.
+        In the default precision, in which the solver keeps its memory.
         """
         theta = unlinked(self.link, jnp.maximum(image / self.unit, 1e-3))
         return theta.astype(jnp.result_type(float))
@@ -145,7 +145,7 @@ class PoissonTV(AbstractIterativeSolver):
     variation: TotalVariation = eqx.field(default=None, converter=as_variation, kw_only=True)
     background: Any = eqx.field(default=None, kw_only=True)
     iterations: int = eqx.field(default=300, converter=whole(1), static=True, kw_only=True)
-    tolerance: float = eqx.field(default=1e-4, converter=small_enough, static=True, kw_only=True)
+    tolerance: float = eqx.field(default=1e-4, converter=as_tolerance, static=True, kw_only=True)
 
     def solve(
         self,

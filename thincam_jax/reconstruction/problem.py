@@ -17,7 +17,7 @@ from thincam_jax.reconstruction.total_variation import TotalVariation
 
 
 class InverseProblem(eqx.Module):
-    r"""Least squares for an image f from captures g_k through linear operators A_k, regularised.
+    r"""Regularised least squares for an image f of captures g_k through linear operators A_k.
 
     .. math:: E(f) = \tfrac12 \sum_k \big\|\sqrt{w_k}\,(A_k f - g_k)\big\|^2 + \tau\,u\,R(f),
         \qquad f \ge 0
@@ -32,13 +32,13 @@ class InverseProblem(eqx.Module):
     .. math:: u = \Big(\sum_k \max(w_k)\,\|A_k\|_F^2 / N\Big)^{1/2}
 
     with N numbers in the image. At τ = 1 a step between two pixels costs as much as noise alone
-    gains by it; 1 to 3 suit most scenes, whatever the camera.
+    gains by it; 1 to 3 suit most scenes and all cameras.
 
     **Arguments**
 
     - `operators`: one for each capture, or one `Stacked`. `Stacked`, `Masked` and `Scaled` are
-      resolved into the operators inside of them, captures and weights, so that solvers can use
-      their structure. Masked pixels get weight 0.
+      resolved into their operators, captures and weights, so that solvers can use the structure.
+      Masked pixels get weight 0.
     - `captures`: g_k, (*batch, channel, …), then the axes of the operator's capture.
     - `weights`: w_k that broadcast to the captures: 1/variance up to a common factor, 0 where a
       pixel is dead or saturated; default 1.
@@ -85,7 +85,7 @@ class InverseProblem(eqx.Module):
             part for one in zip(operators, captures, given, strict=True) for part in _plain(*one)
         ]
         self.operators = tuple(o for o, _, _ in parts)
-        self.captures = tuple(_floating(c) for _, c, _ in parts)
+        self.captures = tuple(as_real(c) for _, c, _ in parts)
         self.weights = tuple(
             jnp.asarray(w, dtype=c.dtype) for (_, _, w), c in zip(parts, self.captures, strict=True)
         )
@@ -178,7 +178,7 @@ def objective(problem: InverseProblem, image: Image) -> Float[Array, "*batch"]:
     return misfit(problem, image) + problem.absolute_tau * problem.regulariser(image)
 
 
-# For checks between two chunks of iterations.
+# Outside of compiled programs, as between two chunks of iterations.
 compiled_objective = jax.jit(objective)
 
 
@@ -223,9 +223,12 @@ def uniform_level(problem: InverseProblem) -> Float[Array, "*batch channel"]:
     return jnp.where(light > 0, seen / jnp.where(light > 0, light, 1), 0)
 
 
+compiled_level = jax.jit(uniform_level)
+
+
 @jax.jit
 def uniform_image(problem: InverseProblem) -> Image:
-    """The non-negative uniform image that explains the captures best: a good start."""
+    """The non-negative uniform image that explains the captures best, a good start image."""
     level = jnp.maximum(uniform_level(problem), 0)[..., None, None, None]
     return jnp.broadcast_to(level, problem.image_shape)
 
@@ -284,9 +287,11 @@ def _each(value, count: int) -> list:
     return list(value) if isinstance(value, tuple | list) else [value] * count
 
 
-def _floating(capture) -> Array:
-    """Raw counts are taken as they are, but as real numbers."""
+def as_real(capture: Any) -> Float[Array, "..."]:
+    """A capture as floating-point numbers, raw counts unscaled; complex numbers are refused."""
     capture = jnp.asarray(capture)
+    if jnp.issubdtype(capture.dtype, jnp.complexfloating):
+        raise TypeError(f"a capture is {capture.dtype}; give real numbers")
     return capture if jnp.issubdtype(capture.dtype, jnp.floating) else capture.astype(float)
 
 
@@ -357,8 +362,8 @@ class ScaledProblem(eqx.Module):
     r"""A problem rescaled so that the gradient of its misfit has Lipschitz constant 1.
 
     Captures are about 1, weights at most 1, and :math:`\|\sqrt{w}A\| \le 1`. τ is scaled for a
-    regulariser with R(sf) = sR(f), such as a norm. Iterations compute the same numbers whatever
-    the units of captures, pixels and weights.
+    regulariser with R(sf) = sR(f), such as a norm. Iterations compute the same numbers in all units
+    of captures, pixels and weights.
 
     - `image_unit`: times this, an image of `problem` is one of the problem given; `capture_unit`:
       the same for captures.

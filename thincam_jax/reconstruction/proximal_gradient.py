@@ -5,9 +5,9 @@ r"""Proximal gradients: FISTA for any regulariser, and plug and play for any den
 FISTA with restart applies every A and Aᵀ once in each iteration, and the proximal map of R. Unlike
 ADMM it needs no penalties, and takes any regulariser; it needs more iterations.
 
-A proximal map denoises an image, and so does any denoiser D, be it a filter or a network. In its
-place (plug and play: Venkatakrishnan, Bouman, Wohlberg, IEEE GlobalSIP 2013) it stands for an image
-prior without a formula. The iteration then ends where
+A proximal map denoises an image. Replaced by any denoiser D, a filter or a network (plug and play:
+Venkatakrishnan, Bouman, Wohlberg, IEEE GlobalSIP 2013), it is an image prior without a formula. The
+iteration then ends where
 
 .. math:: f = D\big(f - \tfrac1L \nabla E_{\mathrm{misfit}}(f)\big).
 
@@ -46,7 +46,6 @@ from thincam_jax.reconstruction.regularisers import (
     AbstractRegulariser,
     Image,
     Parts,
-    denoise,
     extrapolated,
     first_momentum,
     prox,
@@ -90,7 +89,7 @@ class RegulariserMap(AbstractProximalMap):
 
 
 class FistaState(eqx.Module):
-    """State of an accelerated iteration beside its image.
+    """State of an accelerated iteration, without its image.
 
     - `lead`: point of the next gradient.
     - `t`: momentum of each batch element, 1 at the start and after a restart.
@@ -224,29 +223,6 @@ def solve_fista(
     )
 
 
-class RegulariserDenoiser(eqx.Module):
-    """The denoiser with which plug and play minimises the objective of a problem."""
-
-    strength: Float[Array, ""]
-    regulariser: AbstractRegulariser
-    nonnegative: bool = eqx.field(static=True)
-    iterations: int = eqx.field(static=True)
-
-    def __init__(self, problem: InverseProblem, iterations: int = 100):
-        self.strength = problem.absolute_tau / ScaledProblem(problem).curvature
-        self.regulariser, self.nonnegative = problem.regulariser, problem.nonnegative
-        self.iterations = iterations
-
-    def __call__(self, image: Image):
-        return denoise(
-            image,
-            self.strength,
-            self.regulariser,
-            nonnegative=self.nonnegative,
-            iterations=self.iterations,
-        )
-
-
 class DenoiserMap(AbstractProximalMap):
     """A denoiser as the proximal map after each gradient step.
 
@@ -295,8 +271,7 @@ def solve_plug_and_play(
     **Arguments**
 
     - `denoiser`: takes and returns images (*batch, channel, plane, y, x); pure JAX, an
-      `equinox.Module` if it holds arrays (call other code through `jax.pure_callback`). With
-      `RegulariserDenoiser(problem)` the result is the problem's own minimiser.
+      `equinox.Module` if it holds arrays (call other code through `jax.pure_callback`).
     - `image`: to start from; default the uniform image that explains the captures best.
     - `brightness`: image value that the denoiser gets as 1: for a network of images from 0 to 1
       the brightness of white.

@@ -54,7 +54,7 @@ class PsfCheck:
     - `scales`, `objectives`: the profile: scales tried in the best orientation, and the lowest
       objective at each, relative to the lowest of all.
     - `noise_ratio`: rms of the residual of the best PSF over the noise; near 1 it explains all.
-    - `reasons`: one line for each fault; empty if the PSF fits as it is.
+    - `reasons`: one line for each fault; empty if the PSF fits as given.
     """
 
     orientation: Orientation

@@ -1,4 +1,4 @@
-"""Recordings, captures with what is known of how they were taken; and reconstructed images."""
+"""Recordings (captures with their imaging model and noise) and reconstructed images."""
 
 import dataclasses
 import math
@@ -33,9 +33,14 @@ from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.reconstruction.imaging_model import Cameras, Psfs, distance_ratios
 from thincam_jax.reconstruction.iterate import Outcome, Progress
 from thincam_jax.reconstruction.noise import estimate_variance, given_variances
-from thincam_jax.reconstruction.problem import InverseProblem
+from thincam_jax.reconstruction.problem import InverseProblem, as_real, detector_shape
 from thincam_jax.reconstruction.regularisers import AbstractRegulariser
-from thincam_jax.reconstruction.synthesis import Channel, check_synthesis, separate, with_channel
+from thincam_jax.reconstruction.synthesis import (
+    Channel,
+    separate,
+    synthesis_matrix,
+    with_channel,
+)
 
 
 class Reconstruction(Module):
@@ -80,7 +85,7 @@ class Reconstruction(Module):
         return self.pitch is not None and self.pitch.ndim > 0
 
     def _repr_png_(self) -> bytes:
-        """Picture for notebooks: the image with gamma 2.2; planes and a batch beside each other."""
+        """Picture for notebooks: the image with gamma 2.2; planes and a batch side by side."""
         images = pictures(self.image, planes=self.has_planes)
         return png_bytes(eight_bit(np.concatenate(images, axis=1)))
 
@@ -138,7 +143,7 @@ class Recording(Module):
                 "tc.Psfs(…), or operators"
             )
         self.imaging_model = imaging_model
-        self.captures = tuple(_floating(c) for c in captures)
+        self.captures = tuple(as_real(c) for c in captures)
         self._check_captures(getattr(captures, "shape", [c.shape for c in self.captures]))
         self.noise_variance = noise_variance
         self.valid = None if valid is None else self._masks(valid)
@@ -166,8 +171,7 @@ class Recording(Module):
         if isinstance(self.imaging_model, Stacked):
             _no_synthesis(synthesis, "operators")
             variances = self._variances(np.eye(len(captures)), captures, valid)
-            shapes = shapes_of(self.imaging_model.out_shape)
-            lengths = [len(s) - _channel_axes(o) for s, o in self._detectors(shapes)]
+            lengths = [len(detector_shape(o)) for o in self.imaging_model.operators]
             captures = [with_channel(c, n) for c, n in zip(captures, lengths, strict=True)]
             weights = [
                 1 / v if m is None else with_channel(m.astype(c.dtype), n) / v
@@ -254,17 +258,11 @@ class Recording(Module):
                     "with valid=numpy.isfinite(captures)"
                 )
 
-    def _detectors(self, shapes):
-        return zip(shapes, self.imaging_model.operators, strict=True)  # type: ignore[union-attr]
-
     def _has_channel(self) -> bool:
         """Whether the captures have an axis before those of the detector."""
-        if isinstance(self.imaging_model, Stacked):
-            shape = shapes_of(self.imaging_model.out_shape)[0]
-            return self.captures[0].ndim > len(shape) - _channel_axes(
-                self.imaging_model.operators[0]
-            )
-        return self.captures[0].ndim > 2
+        model = self.imaging_model
+        axes = len(detector_shape(model.operators[0])) if isinstance(model, Stacked) else 2
+        return self.captures[0].ndim > axes
 
     def _masks(self, valid: Any) -> tuple[Array, ...]:
         """A mask for each capture."""
@@ -328,15 +326,13 @@ class Recording(Module):
     def _channels(self, synthesis, captures, valid) -> tuple[np.ndarray, list[Channel]]:
         """The channels of a synthesis."""
         model = self.imaging_model
-        count = len(captures)
-        matrix = separate(count) if synthesis is None else np.asarray(synthesis, dtype=float)
         if isinstance(model, Cameras):
             ratios = distance_ratios(model.cameras)
-            check_synthesis(matrix, model.cameras, ratios)
+            matrix = synthesis_matrix(synthesis, model.cameras, ratios)
             kernels = model.kernels(self._field(), ratios)
         else:
             _no_synthesis(synthesis, "measured PSFs")
-            ratios = [1.0] * count
+            matrix, ratios = separate(len(captures)), [1.0] * len(captures)
             kernels = list(model.psfs.astype(captures[0].dtype))  # type: ignore[union-attr]
         return matrix, [Channel(row, kernels, captures, valid, ratios) for row in matrix]
 
@@ -385,14 +381,6 @@ def centred_crop(
     return cut(image, corner, shape)
 
 
-def _floating(capture) -> Array:
-    """A capture as floating point numbers; complex ones are refused."""
-    capture = jnp.asarray(capture)
-    if jnp.issubdtype(capture.dtype, jnp.complexfloating):
-        raise TypeError(f"a capture is {capture.dtype}; give real numbers")
-    return capture if jnp.issubdtype(capture.dtype, jnp.floating) else capture.astype(float)
-
-
 def _single_captures(operator: AbstractOperator) -> list[AbstractOperator]:
     """An operator of several captures as operators of one each, with their masks and gains."""
     if isinstance(operator, Stacked):
@@ -408,11 +396,6 @@ def _single_captures(operator: AbstractOperator) -> list[AbstractOperator]:
 def _flat(parts: Any) -> Any:
     """The arrays of a nested tuple; an array of several captures, or None, unchanged."""
     return jax.tree.leaves(parts) if isinstance(parts, tuple | list) else parts
-
-
-def _channel_axes(operator: AbstractOperator) -> int:
-    """1 if the axes of the operator's images begin with the colour channel, else 0."""
-    return int(len(operator.in_shape) == 4)
 
 
 def _no_synthesis(synthesis, what: str) -> None:

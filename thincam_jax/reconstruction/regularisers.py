@@ -239,7 +239,7 @@ class Cosines(eqx.Module):
 
 
 class Sparsity(AbstractRegulariser):
-    r"""R(f) = Σ |details of f| in an orthonormal basis, each plane and channel by itself.
+    r"""R(f) = Σ |details of f| in an orthonormal basis, of each plane and channel.
 
     The coarse coefficients (of cosines: the mean) are not penalised, so that R of a uniform image
     is 0 and its brightness is not drawn to zero. R is a seminorm.

@@ -62,10 +62,10 @@ from thincam_jax.reconstruction.problem import (
     InverseProblem,
     ScaledProblem,
     back_projected,
+    compiled_level,
     misfit,
     residuals,
     start_image,
-    uniform_level,
 )
 from thincam_jax.reconstruction.recording import Recording
 from thincam_jax.reconstruction.regularisers import Image
@@ -73,7 +73,7 @@ from thincam_jax.reconstruction.solver import (
     AbstractSolver,
     Synthesis,
     as_synthesis,
-    small_enough,
+    as_tolerance,
 )
 
 Rule = Literal["gcv", "sure"]
@@ -99,8 +99,8 @@ class Ridge(AbstractSolver):
 
     **Arguments**
 
-    - `ridge`: noise variance over image variance, in parts of what the captures' mean brightness
-      predicts. 1 suits pixels that vary independently by as much as their mean. More draws the
+    - `ridge`: noise variance over image variance, relative to that predicted by the captures' mean
+      brightness. 1 suits pixels that vary independently by as much as their mean. More draws the
       image to its mean, less lets more noise into it. "gcv" (generalised cross-validation) and
       "sure" (Stein's unbiased estimate of the risk, with the noise variance of the recording)
       choose it from the captures of a separable camera of one term.
@@ -140,7 +140,7 @@ class Ridge(AbstractSolver):
             )
         self.synthesis = as_synthesis(synthesis)
         self.iterations = checks.whole("iterations", iterations, 1)
-        self.tolerance = small_enough(tolerance)
+        self.tolerance = as_tolerance(tolerance)
 
     def solve(self, recording: Recording):
         problem, white, mean, prior, precision = self._posed(recording)
@@ -180,7 +180,7 @@ class Ridge(AbstractSolver):
         problem = recording.problem(synthesis=self.synthesis)
         # Sums in which the uniform light cancels do not show how bright the scene is; captures do.
         plain = problem if self.synthesis is None else recording.problem()
-        level = _level(plain)
+        level = compiled_level(plain)
         level = jnp.where(jnp.isfinite(level), level, 0)  # the solve reports such captures
         mean = jnp.maximum(level, 0)[..., None, None, None]
         mean = jnp.broadcast_to(mean, problem.image_shape)
@@ -286,9 +286,6 @@ def _solve(problem: InverseProblem, precision, mean, tolerance, iterations: int)
     return (mean + change) * scaled.image_unit, converged, steps
 
 
-_level = jax.jit(uniform_level)
-
-
 @jax.jit
 def ridge_by_modes(
     modes: SeparableModes, captures: Float[Array, "*batch y x"], precision: Float[Array, ""]
@@ -374,14 +371,14 @@ def _least(modes: SeparableModes, captures, rule: Rule):
     seen = _seen(modes, captures)
     power = (modes.values / jnp.max(modes.values)) ** 2
     assert modes.seen_rows is not None and modes.seen_columns is not None
-    beside = captures - product(product(modes.seen_rows, seen), modes.seen_columns.T)
-    beside, squares = jnp.sum(beside**2), jnp.sum(seen**2, axis=tuple(range(seen.ndim - 2)))
+    outside = captures - product(product(modes.seen_rows, seen), modes.seen_columns.T)
+    outside, squares = jnp.sum(outside**2), jnp.sum(seen**2, axis=tuple(range(seen.ndim - 2)))
     images = captures.size // (captures.shape[-2] * captures.shape[-1])
     count = captures.size
 
     def criterion(exponent):
         kept = power / (power + 10.0**exponent)
-        residual = jnp.sum(squares * (1 - kept) ** 2) + beside
+        residual = jnp.sum(squares * (1 - kept) ** 2) + outside
         freedom = images * jnp.sum(kept)
         if rule == "gcv":
             # Avoids 0/0 if nothing is filtered out.

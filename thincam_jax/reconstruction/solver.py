@@ -6,7 +6,6 @@ import math
 from collections.abc import Sequence
 from typing import Any, ClassVar, Literal, get_args
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -16,7 +15,7 @@ from thincam_jax._core.checks import Numbers
 from thincam_jax._core.module import Module
 from thincam_jax.imaging.operators.crop_convolution import place
 from thincam_jax.reconstruction.iterate import Callback
-from thincam_jax.reconstruction.problem import InverseProblem, uniform_level
+from thincam_jax.reconstruction.problem import InverseProblem, compiled_level
 from thincam_jax.reconstruction.recording import Reconstruction, Recording
 from thincam_jax.reconstruction.regularisers import AbstractRegulariser, Image
 from thincam_jax.reconstruction.total_variation import TotalVariation
@@ -53,18 +52,18 @@ class AbstractIterativeSolver(AbstractSolver):
         """Reconstruct the image of a recording; see `reconstruct` for the arguments."""
 
 
-def small_enough(tolerance: float) -> float:
+def as_tolerance(tolerance: float) -> float:
     """Check a tolerance of residuals."""
     checks.non_negative("tolerance", tolerance, "a ratio")
     return tolerance
 
 
 def as_synthesis(synthesis: Synthesis | None) -> np.ndarray | None:
-    """A synthesis as a matrix, (channel, capture)."""
+    """The matrix of a synthesis, (channel, capture)."""
     return None if synthesis is None else np.asarray(synthesis, dtype=float)
 
 
-def checked_tau(name: str, tau: Any) -> Any:
+def as_tau(name: str, tau: Any) -> Any:
     """Check τ ≥ 0, or the name of a rule that chooses it."""
     if isinstance(tau, str):
         return checks.choice(name, tau, get_args(TauRule))
@@ -95,7 +94,7 @@ def first_image(
     """The start image, padded with zeros to the field; by default uniform, or zero."""
     shape, dtype = problem.image_shape, problem.captures[0].dtype
     if start is None:
-        level = _level(problem)[..., None, None, None] if uniform else jnp.zeros((), dtype)
+        level = compiled_level(problem)[..., None, None, None] if uniform else jnp.zeros((), dtype)
         return jnp.broadcast_to(level, shape)
     start = jnp.asarray(start, dtype)
     if start.ndim < 2 or start.size != math.prod((*shape[:-2], *start.shape[-2:])):
@@ -113,6 +112,3 @@ def first_image(
             f"start has {rows}×{columns} pixels, more than the field's {problem.field_shape}"
         )
     return place(start, corner, problem.field_shape)
-
-
-_level = jax.jit(uniform_level)

@@ -1,4 +1,4 @@
-"""Moving objects: successive captures, each reconstructed from the state of the last."""
+"""Successive captures of a moving scene, each reconstructed from the previous state."""
 
 from dataclasses import replace
 from typing import Any
@@ -13,6 +13,7 @@ from thincam_jax.reconstruction.iterate import CHUNK, Outcome
 from thincam_jax.reconstruction.methods import AdmmTV
 from thincam_jax.reconstruction.problem import InverseProblem
 from thincam_jax.reconstruction.recording import Recording
+from thincam_jax.reconstruction.solver import counted
 from thincam_jax.reconstruction.splittings import admm_method
 
 
@@ -47,11 +48,10 @@ class Stream(eqx.Module):
     steps: int = eqx.field(static=True)
 
     def __init__(self, recording: Recording, solver: AdmmTV, *, steps: int = 4):
-        if isinstance(steps, bool) or not isinstance(steps, int) or steps < 1:
-            raise ValueError(f"steps = {steps}; give a whole number of at least 1")
         if isinstance(solver.tau, str):
             raise ValueError(f"tau = {solver.tau!r} is a rule for one capture; give a number")
-        self.recording, self.solver, self.steps = recording, solver, steps
+        self.recording, self.solver = recording, solver
+        self.steps = checks.whole("steps", steps, 1)
         problem = _posed(recording, solver)
         method: Any = admm_method(problem)
         running = method.start(jnp.zeros(problem.image_shape, problem.captures[0].dtype))

@@ -1,4 +1,4 @@
-r"""Which captures are added and subtracted before the deconvolution.
+r"""Sums and differences of captures that are reconstructed in place of the captures.
 
 A synthesis is a real matrix W (channel × capture): the channel c is Σ_k W_ck g_k, and its response
 Σ_k W_ck H_k. The fringe-scanned response of the thesis is complex; its real and imaginary parts are
@@ -15,6 +15,7 @@ import numpy as np
 import scipy
 from jaxtyping import Array
 
+from thincam_jax._core.checks import Numbers
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.reconstruction.imaging_model import register
 
@@ -38,8 +39,8 @@ def harmonics(groups: int, steps: int, orders: Sequence[int]) -> np.ndarray:
 
     For each group and m the channels Σ_q −sin(mφ_q) H_q and Σ_q cos(mφ_q) H_q, the real and
     imaginary part of jΣ H_q e^{jmφ_q} = jK H_{-m} (see `thincam_jax.harmonic_otf`; m ± K are folded
-    into it). Constant and all other harmonics cancel. ValueError for an m that K phases cannot tell
-    from another: 0 < m < K/2.
+    into it). Constant and all other harmonics cancel. ValueError unless 0 < m < K/2: K phases
+    cannot distinguish others.
     """
     if not orders or not all(0 < 2 * m < steps for m in orders):
         raise ValueError(
@@ -61,12 +62,12 @@ def phase_pairs(groups: int) -> np.ndarray:
 
 
 def contrasts(count: int) -> np.ndarray:
-    """All that captures say beside their common background: count − 1 orthonormal sums.
+    """The information in captures without their common background: count − 1 orthonormal sums.
 
-    Masks of one width at one distance cast the same background, whatever their β and phase, so
-    that it cancels wherever the weights of a row add up to zero. Pairs of two β leave one such sum
-    unused, (g₁ + g₂) − (g₃ + g₄), which has fringes as strong as theirs. Rows are those of
-    Helmert's matrix; for captures of equal noise any other orthonormal ones say the same.
+    Masks of one width at one distance cast the same background, whatever their β and phase: it
+    cancels where the weights of a row add up to zero. Pairs of two β leave one such sum unused,
+    (g₁ + g₂) − (g₃ + g₄), whose fringes are as strong. Rows are those of Helmert's matrix; for
+    captures of equal noise any other orthonormal rows are equivalent.
     """
     if count < 2:
         raise ValueError(f"contrasts of {count} captures; give at least 2")
@@ -78,10 +79,16 @@ def keep_bias(synthesis: np.ndarray) -> np.ndarray:
     return np.abs(synthesis.sum(axis=1)) > 1e-6
 
 
-def check_synthesis(
-    synthesis: np.ndarray, cameras: Sequence[LenslessCamera], ratios: Sequence[float]
-) -> None:
-    """Refuse what does not add captures of one scale, or counts noise twice."""
+def synthesis_matrix(
+    given: Numbers | Sequence[Sequence[float]] | None,
+    cameras: Sequence[LenslessCamera],
+    ratios: Sequence[float],
+) -> np.ndarray:
+    """The synthesis given, checked against the cameras; by default each capture is a channel.
+
+    **Errors**: ValueError where a channel adds captures of different scales, or two share noise.
+    """
+    synthesis = separate(len(cameras)) if given is None else np.asarray(given, dtype=float)
     if synthesis.ndim != 2 or synthesis.shape[1] != len(cameras):
         raise ValueError(
             f"synthesis has shape {synthesis.shape}; give (channels, {len(cameras)}), "
@@ -99,6 +106,7 @@ def check_synthesis(
     grids = {(c.sensor.shape, float(c.sensor.pitch)) for c in cameras}
     if len(grids) > 1:
         raise ValueError(f"cameras have different sensors {sorted(grids)}; use one sensor")
+    return synthesis
 
 
 class Channel:

@@ -37,7 +37,7 @@ class TotalVariation(AbstractRegulariser):
 
     - `kind`: "isotropic" takes the length of the vector of differences, "anisotropic" the sum of
       their absolute values, which favours edges along the axes.
-    - `coupling`: of colours. "none": each channel by itself. "joint": one length over all channels
+    - `coupling`: of colours. "none": channels independent. "joint": one length over all channels
       (vectorial total variation), so that edges lie in the same place. "opponent" (three channels):
       the sum of the variations of grey and of the two colour differences. Noise of three
       channels is averaged in grey, and colours vary less than grey in most scenes.
@@ -89,7 +89,7 @@ class TotalVariation(AbstractRegulariser):
         return self._rotate(shrunk, back=True)
 
     def _length(self, slopes):
-        """Lengths of the joined vectors; summed over directions if these are apart."""
+        """Lengths of the joined vectors; summed over directions if anisotropic."""
         channels = self.coupling == "joint"
         if self.kind == "isotropic":
             return _norm(slopes, channels=channels)

@@ -33,7 +33,7 @@ from thincam_jax.reconstruction.imaging_model import (
 from thincam_jax.reconstruction.noise import estimate_variance, given_variances
 from thincam_jax.reconstruction.recording import Reconstruction, Recording
 from thincam_jax.reconstruction.solver import AbstractSolver, Synthesis, as_synthesis
-from thincam_jax.reconstruction.synthesis import check_synthesis, keep_bias, separate
+from thincam_jax.reconstruction.synthesis import keep_bias, synthesis_matrix
 
 Prior = Literal["inverse_square", "flat"]
 
@@ -95,19 +95,18 @@ class WienerSynthesis(eqx.Module):
     ):
         checks.choice("prior", prior, ("inverse_square", "flat"))
         cameras.require("wavelength", "object_distance")
-        each, count = cameras.cameras, cameras.count
-        synthesis = separate(count) if synthesis is None else np.asarray(synthesis, dtype=float)
+        each = cameras.cameras
         capture_ratios = distance_ratios(each)
-        check_synthesis(synthesis, each, capture_ratios)
+        matrix = synthesis_matrix(synthesis, each, capture_ratios)
         sensor = each[0].sensor.grid
         self.sensor_shape = sensor.shape
         self.field_shape = same_parity(cameras.field_shape or sensor.shape, sensor.shape)
         self.ratios = tuple(
-            next(r for w, r in zip(row, capture_ratios, strict=True) if w) for row in synthesis
+            next(r for w, r in zip(row, capture_ratios, strict=True) if w) for row in matrix
         )
         object_distance = cameras.object_distance
         how = {"model": cameras.model, "pixel_integration": cameras.pixel_integration}
-        wavelengths = jnp.broadcast_to(jnp.asarray(cameras.wavelength), (count,))
+        wavelengths = jnp.broadcast_to(jnp.asarray(cameras.wavelength), (cameras.count,))
         kernels, uniform = [], []
         for camera, w, ratio in zip(each, wavelengths, capture_ratios, strict=True):
             own = own_field(self.field_shape, ratio)
@@ -121,12 +120,12 @@ class WienerSynthesis(eqx.Module):
         self.spectra = jnp.stack(
             [
                 _channel_spectrum(*_used(row, kernels), sensor.pitch, ratio, self.padded)
-                for row, ratio in zip(synthesis, self.ratios, strict=True)
+                for row, ratio in zip(matrix, self.ratios, strict=True)
             ]
         )
         self.prior = prior_spectrum(prior, Grid(self.padded, sensor.pitch), self.field_shape)
-        self.synthesis = jnp.asarray(synthesis, dtype=self.uniform.dtype)
-        self.weights = tuple(map(tuple, synthesis.tolist()))
+        self.synthesis = jnp.asarray(matrix, dtype=self.uniform.dtype)
+        self.weights = tuple(map(tuple, matrix.tolist()))
         self.object_pitch = cameras.pitch
 
     def __call__(
@@ -137,12 +136,8 @@ class WienerSynthesis(eqx.Module):
         `noise_variance`: of a pixel, one number, one for each capture or (capture, *batch); > 0.
         """
         captures = jnp.asarray(captures, dtype=self.uniform.dtype)
+        require_captures(captures, (len(self.uniform), *self.sensor_shape))
         count, *batch, rows, columns = captures.shape
-        if (rows, columns) != self.sensor_shape or count != self.uniform.shape[0]:
-            raise ValueError(
-                f"captures have shape {captures.shape}; give ({self.uniform.shape[0]}, …, "
-                f"{self.sensor_shape[0]}, {self.sensor_shape[1]})"
-            )
         variance = checks.positive_all("noise_variance", jnp.asarray(noise_variance), "units²")
         if variance.shape != (count, *batch)[: variance.ndim]:
             raise ValueError(
@@ -237,6 +232,16 @@ def require_cameras(recording: Recording, method: str) -> Cameras:
             "Ridge or PoissonTV"
         )
     return recording.imaging_model
+
+
+def require_captures(captures: Array, wanted: tuple[int, int, int]) -> None:
+    """Require (capture, …, y, x) of the filter's numbers."""
+    if (captures.shape[0], *captures.shape[-2:]) != wanted:
+        count, rows, columns = wanted
+        raise ValueError(
+            f"captures have shape {captures.shape}; give ({count}, …, {rows}, {columns}), in the "
+            "order of the cameras"
+        )
 
 
 def _coverage(own_field, field_shape, ratio: float) -> np.ndarray:
@@ -354,8 +359,8 @@ def crop_noise(
 def filter_suffices(recording: Recording, synthesis: Synthesis | None) -> tuple[bool, str]:
     """Whether the Wiener synthesis is as good as total variation, and the reason in a sentence.
 
-    It does not model the crop of the sensor, which matters if the captures keep a bright background
-    or a PSF is as large as the sensor, and it does not tell noise from edges.
+    The filter does not model the crop of the sensor, which matters if the captures keep a bright
+    background or a PSF is as large as the sensor, and does not distinguish noise from edges.
     """
     model = recording.imaging_model
     if isinstance(model, Psfs):
@@ -365,11 +370,10 @@ def filter_suffices(recording: Recording, synthesis: Synthesis | None) -> tuple[
     if recording.valid is not None:
         return False, "some pixels are not to be trusted, which a filter cannot leave out"
     if np.ndim(model.object_distance) > 0:
-        return False, "several planes are asked for, which a filter does not tell apart"
+        return False, "several planes are requested, which a filter does not separate"
     cameras, noise_variance = model.cameras, recording.noise_variance
     captures = jnp.stack(recording.captures)
-    matrix = separate(len(cameras)) if synthesis is None else np.asarray(synthesis, dtype=float)
-    check_synthesis(matrix, cameras, distance_ratios(cameras))
+    matrix = synthesis_matrix(synthesis, cameras, distance_ratios(cameras))
     biased = keep_bias(matrix)
     biased |= np.array([_backgrounds_differ(row, cameras) for row in matrix])
     if biased.any():
@@ -380,8 +384,8 @@ def filter_suffices(recording: Recording, synthesis: Synthesis | None) -> tuple[
     contrast = _contrast(captures, matrix, noise_variance)
     if not contrast >= _CLEAN:
         return False, (
-            f"the channels' contrast is {contrast:.2g} times their noise; total variation tells "
-            "edges from noise where a filter cannot"
+            f"the channels' contrast is {contrast:.2g} times their noise; total variation "
+            "separates edges from noise, a filter cannot"
         )
     return True, (
         f"no channel keeps a background and their contrast is {contrast:.2g} times the noise: the "

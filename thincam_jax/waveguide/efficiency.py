@@ -52,7 +52,7 @@ def diffraction_efficiency(
 def ghost_weights(
     hologram: VolumeHologram, tangential: Float[Array, "*ray 2"], orders: int
 ) -> Float[Array, "order *ray"]:
-    r"""What reaches a pixel of white light after i contacts that let it pass, as a bandwidth, mm.
+    r"""Bandwidth, mm, of white light that reaches a pixel after i undiffracted contacts.
 
     .. math:: W_i = \int \eta^2 (1-\eta)^i\,d\lambda
 
@@ -75,8 +75,8 @@ def weights_about(
 ) -> Float[Array, "order *ray"]:
     """`ghost_weights` of rays whose Bragg wavelength is known.
 
-    Node by node for all rays, TE and TM apart: sums over nodes and stacks of the two in a loop take
-    XLA nine times as long on a CPU.
+    Node by node for all rays, TE and TM separately: sums over nodes and stacks of the two in a loop
+    take XLA nine times as long on a CPU.
     """
     slope, nodes = _band_slope(hologram, tangential, centre), least_nodes(orders)
 
@@ -154,7 +154,7 @@ def _unpolarised(hologram, tangential, wavelength):
 
 
 def _coupling(hologram, tangential, wavelength):
-    """ν of TE, ξ, |s·s′| which TM has beside it, and whether a wave is diffracted back."""
+    """ν of TE, ξ, the factor |s·s′| of ν for TM, and whether a wave is diffracted back."""
     index, power = hologram.index(wavelength), jnp.sum(hologram.grating**2)
     upright = jnp.sqrt(index**2 - jnp.sum(tangential**2, axis=-1))
     incident = upright / index

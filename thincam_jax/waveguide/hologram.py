@@ -76,8 +76,8 @@ class VolumeHologram(Module):
         - `object_angle`, `reference_angle`: from the normal in the film, rad, both acute: the
           object wave runs along +z, the reference wave along −z. `refracted` makes them of angles
           in glass or air.
-        - `index`, `thickness`: of the film while it is recorded; mm. `processed` says what
-          development changes.
+        - `index`, `thickness`: of the film during recording; mm. See `processed` for the changes
+          by development.
         - `index_modulation`: Δn.
         """
         laser = checks.positive("wavelength", wavelength, "mm")

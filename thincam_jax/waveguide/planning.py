@@ -1,4 +1,4 @@
-"""Plans: the cheapest model of what a screen's camera sees, within a tolerance."""
+"""Plans: the cheapest model of a see-through camera's capture within a tolerance."""
 
 import math
 from collections.abc import Sequence
@@ -33,13 +33,13 @@ _ORDERS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
 _SAMPLES = (None, 1, 2, 4, 8, 16, 32, 64)
 # Pixels at which the models are compared, drawn from those of so many rows and columns.
 _PIXELS, _POOL = 192, (96, 32)
-# What keeps the error there above that of the whole sensor over random cameras: factors of the root
-# mean square, of the largest, where few pixels hold the error, and of both where rows and columns
-# are taken apart, which is off most at the ends of few columns.
+# Factors that keep the predicted error above the true one over random cameras: of the root mean
+# square, of the largest error, where few pixels hold it, and of both where rows and columns are
+# separated, whose error is largest at the ends of few columns.
 _MARGIN, _LARGEST, _APART = 1.2, 2.5, 1.6
 # Parts of the tolerance that the decisions may use, in the order in which they are taken.
 _SHARES = {"orders": 0.4, "smear": 0.6, "dispersion": 0.4, "precision": 0.4}
-# What the sums of a capture round.
+# Rounding of the sums of a capture.
 _SUMS: dict[Precision, float] = {"float32": 3e-7, "float64": 1e-14}
 
 
@@ -67,8 +67,8 @@ class Plan:
     - `orders`: ghosts that are modelled, of `all_orders` that can meet the object.
     - `samples`: parts of the band of each pixel and order; None: the Bragg wavelength alone.
     - `dispersion`: whether the indices change with the wavelength.
-    - `field_dependent`: False where rows and columns are apart: every column has the ghosts of one
-      column, every row those of one row, and the system is `Separable`.
+    - `field_dependent`: False where rows and columns are separated: every column has the ghosts of
+      one column, every row those of one row, and the system is `Separable`.
     - `precision`: of the rays and of the system's numbers.
     - `level`: weight, mm, that counts as 1: the mean over pixels of the sum over all orders.
     - `shares`: errors of the single decisions. `simpler`: predicted ones of `separable`, and of
@@ -119,7 +119,7 @@ class Plan:
             counts = self.orders, self.samples
             if self.field_dependent:
                 return planes_operator(camera, plane, counts, self.level)
-            assert isinstance(plane, ObjectPlane)  # of several, no rows and columns are apart
+            assert isinstance(plane, ObjectPlane)  # several planes are never separated
             return _separable(camera, plane, float(seen_size(camera, plane)), counts, self.level)
 
 
@@ -131,7 +131,7 @@ def plan(
     The error is ‖g − g₀‖₂/‖g₀‖₂ of the noise-free capture. g₀ has every order that can meet the
     object, 64 parts of each band, dispersion, and double precision. What is decided: how many
     orders; whether the band's smear and dispersion are modelled, and with how many parts; whether
-    rows and columns can be taken apart; the precision. All are compared with g₀ at 192 pixels,
+    rows and columns can be separated; the precision. All are compared with g₀ at 192 pixels,
     half of them where the object's light arrives; no whole capture is computed. Of a scene of
     several planes, each of as many cells, the light adds up, and rows and columns stay together.
 
@@ -180,7 +180,7 @@ class _Rays:
 
 
 class _Probe:
-    """A scene at some pixels: the reference, and what other models are away from it."""
+    """A scene at some pixels: the reference capture, and the errors of other models."""
 
     def __init__(self, camera: SeeThroughCamera, scene: tuple[LitPlane, ...]):
         self.camera, self.planes = camera, [one.plane for one in scene]
@@ -195,7 +195,7 @@ class _Probe:
         pool = _spread(camera)
         light = [self._lit(pool, number) for number in range(len(scene))]
         chosen, self.counts = _drawn(np.sum(light, axis=0))
-        # The middle first, for what is shift-invariant.
+        # The middle first, for the shift-invariant model.
         self.pixels = np.concatenate([np.zeros((1, 2)), pool[chosen]])
         each = [_orders_seen(camera, plane, self.pixels) for plane in self.planes]
         seen = np.max(each, axis=0)
@@ -242,7 +242,7 @@ class _Probe:
         return _Rays(groups.mean(axis=-2), weight)
 
     def seen(self, rays: _Rays, orders: int | None = None) -> np.ndarray:
-        """What the pixels but the middle see of the image, (order, pixel)."""
+        """Light of the image at the pixels without the middle one, (order, pixel)."""
         points, weight = rays.points[:orders, 1:], rays.weight[:orders, 1:]
         slope = -self.pixels[1:] / float(self.camera.focal_distance)  # in air, whatever the order
         seen = 0.0
@@ -252,7 +252,7 @@ class _Probe:
         return seen * weight / self.level
 
     def _radiance(self, points: np.ndarray, number: int) -> np.ndarray:
-        """Of a plane, the mean over what a pixel sees about each point (…, 2)."""
+        """Mean radiance of a plane over a pixel's field about each point (…, 2)."""
         plane, sums = self.planes[number], self.sums[number]
         ratio, found = self.sizes[number] / float(plane.pitch), 0.0
         rows, columns = in_cells(points, plane)
@@ -272,7 +272,7 @@ class _Probe:
         return np.where(rays.status[0] == RayStatus.OK, light, 0)
 
     def plan(self, camera, plane, tolerance: float, share: float) -> Plan:
-        """The cheapest decisions, each within its part of what the tolerance leaves."""
+        """The cheapest decisions, each within its part of the remaining tolerance."""
         left = tolerance * share / _MARGIN
         shares = {}
         orders, size = 1, 0.0
@@ -341,7 +341,7 @@ class _Probe:
         return float(np.linalg.norm(np.sqrt(self.counts) * difference)) / self.norm
 
     def _separable(self, dispersion: bool, samples: int | None, orders: int):
-        """The capture with rows and columns apart."""
+        """The capture with rows and columns separated."""
         column, row = _cross(self.camera)
         down, across = self.pixels.copy(), self.pixels.copy()
         down[:, 0], across[:, 1] = column, row
@@ -425,12 +425,12 @@ def _spread(camera) -> np.ndarray:
 def _drawn(light: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Indices of `_PIXELS` pixels, and how many each stands for.
 
-    Drawn at even steps of a sum of probabilities: half of it alike for all, half by their light.
+    Drawn at equal steps of a sum of probabilities, half of it uniform and half by their light.
     """
     wanted = np.full(light.size, 0.5 / light.size)
     wanted += 0.5 * light / light.sum() if light.any() else wanted
     chance = np.minimum(1.0, _PIXELS * wanted)
-    for _ in range(20):  # what is certain leaves more to the others
+    for _ in range(20):  # certain pixels leave more to the others
         free = chance < 1
         if not free.any():
             break

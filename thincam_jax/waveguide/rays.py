@@ -73,7 +73,7 @@ def trace(
     - `extent`: of the object, (x, y) mm from the camera's axis; None is infinite.
 
     The lens is a pinhole and the holograms are thin against the glass. Rays are those of the Bragg
-    wavelength of each pixel; the light beside it is in the weights, its smear is not.
+    wavelength of each pixel; the weights include the rest of the band, but not its smear.
     """
     checks.at_least_one({"orders": orders})
     screen, distance = camera.screen, checks.positive("object_distance", object_distance, "mm")
@@ -181,7 +181,7 @@ def at_rear(camera: SeeThroughCamera, slope: Float[Array, "*ray 2"]) -> Float[Ar
 def straight_on(
     camera: SeeThroughCamera, slope: Float[Array, "*ray 2"], distance: Float[Array, "..."]
 ) -> Float[Array, "*ray 2"]:
-    """Where rays would meet the object if the plate moved none sideways, (x, y), mm."""
+    """Where rays would meet the object without displacement by the plate, (x, y), mm."""
     normal, width = camera.plate_axes[:, 2], camera.screen.glass_thickness
     further = width * (normal[:2] + (1 - normal[2]) * slope)
     return (camera.lens_distance + distance) * slope + further
@@ -190,7 +190,7 @@ def straight_on(
 def on_object(
     camera: SeeThroughCamera, slope: Float[Array, "*#ray 2"], sideways: Float[Array, "*#ray 2"]
 ) -> Float[Array, "*ray 2"]:
-    """What a way along the plate, (x, y) mm, moves a ray of that slope on the object."""
+    """Displacement on the object of a ray displaced along the plate by (x, y) mm."""
     axes = camera.plate_axes
     along = product(sideways, axes[2, :2])[..., None] * slope
     return product(sideways, axes[:2, :2].T) - along

@@ -74,7 +74,7 @@ def ghost_images(
 
     - `camera`: with the mask's middle in place of the lens: `focal_distance` is d, and
       `lens_distance` the gap between mask and plate.
-    - `field`: the points, told by their first images, (x, y) on the sensor, mm.
+    - `field`: the points, given by their first images, (x, y) on the sensor, mm.
     - `object_distance`: from the plate's front surface, mm.
     """
     checks.at_least_one({"orders": orders})

@@ -1,4 +1,4 @@
-r"""The colours beside each pixel's Bragg wavelength, and where on the object they come from.
+r"""The band of colours of each pixel, and the object points that they come from.
 
 A film diffracts a band of wavelengths. The boundary conditions at its plane surfaces keep the
 tangential component of the wave vector up to that of the fringes, so that light of the wavelength
@@ -24,11 +24,11 @@ from thincam_jax.waveguide.rays import RayStatus, at_rear, bragg_rays, on_object
 
 
 class SmearedRays(eqx.Module):
-    """Where a pixel's light of each order comes from.
+    """Object points of a pixel's light, by order.
 
     - `points`: (x, y) on the object's plane, mm, of equal parts of the light, (order, *pixel,
       sample, 2).
-    - `weight`: ∫ η²(1−η)^m dλ over what is guided and meets the holograms, (order, *pixel), mm.
+    - `weight`: ∫ η²(1−η)^m dλ over the guided light that meets the holograms, (order, *pixel), mm.
     """
 
     points: Float[Array, "order *pixel sample 2"]
@@ -64,7 +64,7 @@ def trace_band(
 
 
 def _one(camera, pixel, distance, counts):
-    """What all samples of a pixel share, (2), what they do not, (order, sample, 2), and weights."""
+    """The centre (2) of a pixel's samples, their offsets (order, sample, 2), and weights."""
     orders, samples, nodes = counts
     screen = camera.screen
     hologram, width = screen.hologram, screen.glass_thickness
@@ -96,14 +96,14 @@ def _one(camera, pixel, distance, counts):
 
 
 def _on(hologram, places):
-    """What part of the light about each node meets a hologram."""
+    """Share of the light about each node that meets a hologram."""
     if hologram is None:
         return jnp.ones(places.shape[0], places.dtype)
     return _covered(jnp.min(hologram.size / 2 - jnp.abs(places - hologram.centre), axis=-1))
 
 
 def _covered(margin):
-    """What part of each node's step has a positive margin: an edge between two nodes is halved.
+    """Share of each node's step with a positive margin: an edge between two nodes is halved.
 
     Without it an edge would jump from node to node, and no small number of nodes would do.
     """

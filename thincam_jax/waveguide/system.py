@@ -43,7 +43,7 @@ class ObjectPlane(Module):
 class Footprints:
     """The cells that pixels see along y and x, and what part of a pixel's light is from each.
 
-    - `first`: index of the first cell, (y or x, *ray). It may lie beside the object.
+    - `first`: index of the first cell, (y or x, *ray). It may lie outside of the object.
     - `parts`: of that cell and its followers, (y or x, *ray, cell).
     """
 
@@ -123,18 +123,18 @@ def system_operator(
     **Arguments**
 
     - `camera`: or a list of one for each colour of a full-colour hologram, which differ in their
-      hologram alone. The sensor keeps the colours apart; images are then (channel, plane, y, x)
+      hologram alone. The sensor separates the colours; images are then (channel, plane, y, x)
       and captures (channel, y, x), and the level is that of each channel.
     - `plane`: or a list of planes of as many cells, whose light adds up: a near one hides nothing.
       Images are then (plane, y, x).
     - `orders`: how many ghosts; those that leave the hologram or miss the object do not count.
     - `samples`: parts of the band of each pixel and order, as `trace_band` divides it; None for
-      the Bragg wavelength alone, without the smear of the colours beside it.
+      the Bragg wavelength alone, without the smear of the band.
 
     Vignetting by the lens and the pixel's own response are left out.
 
     **Errors**: ValueError where no pixel has a guided ray, for planes of different cells and
-    sensors of different pixels, and for cells below a 64th of what a pixel sees.
+    sensors of different pixels, and for cells below a 64th of a pixel's field.
     """
     if not isinstance(camera, SeeThroughCamera):
         return colour_operator([system_operator(c, plane, orders, samples) for c in camera])

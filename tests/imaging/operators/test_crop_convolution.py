@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import scipy.signal
 
-from helpers import count_traces, finite_difference
+from helpers import count_traces, finite_difference, quick
 from thincam_jax._core.grids import Grid
 from thincam_jax.imaging.operators import CropConvolution, kernel_grid, kernel_shape
 
@@ -41,7 +41,7 @@ seen = eqx.filter_jit(lambda convolution, field: convolution(field))
 back = eqx.filter_jit(lambda convolution, capture: convolution.adjoint(capture))
 
 
-@pytest.mark.parametrize(("sensor", "field"), SHAPES)
+@pytest.mark.parametrize(("sensor", "field"), quick(SHAPES, 1, 2, 4))
 def test_it_is_the_integral_over_the_field(sensor, field):
     """g(r) = Δ² Σ h(r − r′) f(r′), summed with the coordinates of both grids, one by one."""
     f = numbers(field)
@@ -57,15 +57,7 @@ def test_it_is_the_integral_over_the_field(sensor, field):
     np.testing.assert_allclose(value, expected, rtol=1e-10, atol=1e-14)
 
 
-@pytest.mark.parametrize(("sensor", "field"), SHAPES)
-def test_it_is_a_valid_convolution(sensor, field):
-    kernel, f = numbers(kernel_shape(sensor, field)), numbers(field, 1)
-    expected = PITCH**2 * scipy.signal.convolve(kernel, f, mode="valid", method="direct")
-    value = seen(operator(kernel, sensor, field), jnp.asarray(f))
-    np.testing.assert_allclose(value, expected, atol=1e-15)
-
-
-@pytest.mark.parametrize(("sensor", "field"), SHAPES)
+@pytest.mark.parametrize(("sensor", "field"), quick(SHAPES, 2))
 def test_adjoint(sensor, field):
     """⟨A f, g⟩ = ⟨f, A* g⟩."""
     convolution = operator(numbers(kernel_shape(sensor, field)), sensor, field)
@@ -91,33 +83,6 @@ def test_nothing_wraps_round(corner):
     expected[row : row + 3, column : column + 3] = kernel[4:7, 7:10]
     value = seen(operator(kernel, sensor, field, pitch=1.0), jnp.asarray(f))
     np.testing.assert_allclose(value, expected[1:-1, 1:-1], atol=1e-14)
-
-
-def test_energy():
-    """On a sensor that holds it all, the light is the field's total times the PSF's integral."""
-    sensor, field = (30, 37), (6, 9)
-    grid = kernel_grid(Grid(sensor, PITCH), field)
-    y, x = np.asarray(grid.y)[:, None], np.asarray(grid.x)
-    h = np.where((abs(y) < 0.5) & (abs(x) < 0.6), 1 + y + x**2, 0.0)
-    f = numbers(field) ** 2
-    g = seen(operator(h, sensor, field), jnp.asarray(f))
-    np.testing.assert_allclose(g.sum() * PITCH**2, h.sum() * PITCH**2 * f.sum() * PITCH**2)
-
-
-def test_batches_go_one_by_one():
-    sensor, field = (6, 9), (3, 4)
-    convolution = operator(numbers(kernel_shape(sensor, field)), sensor, field)
-    fields, captures = (
-        jnp.asarray(numbers((2, 3, *field))),
-        jnp.asarray(numbers((2, 3, *sensor), 1)),
-    )
-    for method, batch in ((convolution, fields), (convolution.adjoint, captures)):
-        function = eqx.filter_jit(method)
-        whole = np.asarray(function(batch))
-        assert whole.shape[:2] == (2, 3)
-        for i, j in ((0, 2), (1, 0)):
-            np.testing.assert_allclose(whole[i, j], function(batch[i, j]), atol=1e-15)
-        np.testing.assert_allclose(jax.jit(jax.vmap(jax.vmap(method)))(batch), whole, atol=1e-15)
 
 
 def test_kernel_grid_covers_every_difference():
@@ -171,12 +136,11 @@ def test_a_kernel_that_does_not_cover_the_differences():
         operator(np.ones((6, 9)), (6, 9), (3, 4))
 
 
-@pytest.mark.parametrize("shape", [(6, 9), (4, 3), (3, 5), (2, 2)])
-def test_a_field_or_capture_of_another_shape(shape):
+def test_a_field_or_capture_of_another_shape():
     """Larger would be cut and smaller shifted, in silence."""
     convolution = operator(np.ones((8, 12)), (6, 9), (3, 4))
-    with pytest.raises(ValueError, match=r"field has shape .*= \(3, 4\)"):
-        convolution(jnp.ones(shape))
-    if shape != (6, 9):
+    for shape in ((4, 3), (3, 5), (2, 2)):
+        with pytest.raises(ValueError, match=r"field has shape .*= \(3, 4\)"):
+            convolution(jnp.ones(shape))
         with pytest.raises(ValueError, match=r"capture has shape .*= \(6, 9\)"):
             convolution.adjoint(jnp.ones(shape))

@@ -55,7 +55,7 @@ KERNELS = [
 ]
 
 
-@pytest.mark.parametrize(("sensor", "kernel", "field"), quick(KERNELS, 1, 5, 7, 9))
+@pytest.mark.parametrize(("sensor", "kernel", "field"), quick(KERNELS, 1, 7))
 def test_a_kernel_of_another_size(sensor, kernel, field, key):
     """Smaller is zero outside, larger is cut: the sum is that of all samples it has."""
     h, f = numbers(kernel), numbers(field, 1)
@@ -83,10 +83,10 @@ def test_a_field_that_fills_the_sensor_needs_no_margin():
 
 
 @pytest.mark.parametrize("sensor", range(1, 7))
-@pytest.mark.parametrize("field", range(1, 7))
-def test_the_window_is_the_smallest(sensor, field):
+def test_the_window_is_the_smallest(sensor):
     """In one sample less the far end of the field would come round onto the sensor."""
-    for kernel in range(1 + (sensor + field) % 2, sensor + field, 2):
+    sizes = ((f, k) for f in range(1, 7) for k in range(1 + (sensor + f) % 2, sensor + f, 2))
+    for field, kernel in sizes:
         ends = np.arange(sensor + field - 1) - (field - 1)  # sample differences, r − r′
         centre = (sensor - field) / 2
         inside = abs(ends - centre) <= (kernel - 1) / 2
@@ -127,7 +127,7 @@ PLANES = [
 ]
 
 
-@pytest.mark.parametrize(("planes", "images", "summed", "channels"), quick(PLANES, 3, 4))
+@pytest.mark.parametrize(("planes", "images", "summed", "channels"), quick(PLANES, 4))
 def test_planes_add_up_and_channels_stay(planes, images, summed, channels, key):
     sensor, kernel, field = (5, 8), (4, 6), (6, 11)
     h, f = numbers((*planes, *kernel)), numbers((2, *images, *field), 1)
@@ -148,7 +148,7 @@ def test_planes_add_up_and_channels_stay(planes, images, summed, channels, key):
     np.testing.assert_allclose(np.vdot(back, f), np.vdot(g, expected), rtol=1e-12)
 
 
-@pytest.mark.parametrize(("planes", "images", "summed", "channels"), PLANES)
+@pytest.mark.parametrize(("planes", "images", "summed", "channels"), quick(PLANES, 3))
 def test_combine_and_spread_are_adjoint(planes, images, summed, channels):
     """⟨combine F, G⟩ = ⟨F, spread G⟩ with the complex inner product."""
     convolution = operator(jnp.asarray(numbers((*planes, 4, 6))), (5, 8), (6, 11), summed=summed)

@@ -5,9 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import thincam_jax as tc
 from helpers import relative_l2
-from thincam_jax.imaging.metrics import psnr
 from thincam_jax.imaging.operators import adjoint_error, low_rank_psf
 
 SENSOR, FIELD, KERNEL, PITCH = (21, 26), (17, 22), (11, 13), 0.5
@@ -60,22 +58,6 @@ def test_adjoint_and_batches():
     images = jax.random.uniform(jax.random.key(4), (2, 3, *FIELD))
     one_by_one = [[operator(image) for image in row] for row in images]
     np.testing.assert_allclose(operator(images), one_by_one, atol=1e-13)
-
-
-@pytest.mark.thorough
-def test_images_come_back():
-    """By the solver of every camera; with one PSF for the whole field they do not."""
-    image = np.zeros(FIELD)
-    image[4:12, 5:9], image[8:11, 12:19] = 1.0, 0.6
-    capture = jnp.asarray(direct(image))[None, None]
-    reached = []
-    for tolerance in (1e-2, 0.5):
-        operator = low_rank_psf(grid((9, 9)), PITCH, SENSOR, FIELD, tolerance=tolerance).operator
-        recording = tc.Recording(capture, [operator], noise_variance=1e-6)
-        found = tc.reconstruct(recording, tc.AdmmTV(0.5, iterations=30))
-        reached.append(float(psnr(np.squeeze(np.asarray(found.image)), image)))
-    assert reached[0] > 25
-    assert reached[0] - reached[1] > 2
 
 
 @pytest.mark.parametrize(

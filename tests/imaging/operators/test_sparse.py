@@ -14,8 +14,10 @@ from thincam_jax.imaging.operators import Sparse, adjoint_error
 FORMATS = ["coo", "csr", "csc", "lil", "dia", "bsr"]
 
 
-@pytest.mark.parametrize("kind", [*FORMATS, "matrix", "bcoo"])
-@pytest.mark.parametrize("batch", [(), (1,), (2, 3)])
+@pytest.mark.parametrize(
+    ("kind", "batch"),
+    [("coo", ()), ("coo", (1,)), *((kind, (2, 3)) for kind in [*FORMATS, "matrix", "bcoo"])],
+)
 def test_sums(kind, batch):
     """Every format is the same matrix; a batch is read one by one."""
     H = sparse_matrix()

@@ -1,6 +1,5 @@
 """Joint reconstruction of several planes from one set of captures."""
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.ndimage as ndimage
@@ -8,7 +7,6 @@ from reconstruction.depth import rig
 
 import thincam_jax as tc
 from thincam_jax.reconstruction import TotalVariation, fringe_scanning
-from thincam_jax.reconstruction.depth.refocus import axial_resolution
 
 PLANES = (20.0, 45.0, 150.0)
 
@@ -36,13 +34,6 @@ def shares(image, power):
     return np.array(found)
 
 
-def test_planes_are_separable_by_the_formula():
-    """Each plane is one depth of focus from the next, counted at the nearer one."""
-    camera = rig.cameras()[0]
-    for near, far in zip(PLANES, PLANES[1:], strict=False):
-        assert far - near > float(axial_resolution(camera, near))
-
-
 @pytest.mark.thorough
 def test_each_object_is_in_its_own_plane(seen):
     """Four phases, 30 dB, f ≥ 0 on black: over 90 % of the light, over 99 % of the energy."""
@@ -67,12 +58,3 @@ def test_a_depth_weight_pulls_the_planes_together(seen):
     weighted = reconstruct(seen, iterations=60, variation=TotalVariation(depth_weight=0.5))
     plain = reconstruct(seen, iterations=60)
     assert (shares(np.asarray(weighted.image), 1) < shares(np.asarray(plain.image), 1)).all()
-
-
-@pytest.mark.thorough
-def test_planes_in_another_order_change_places(seen):
-    found = []
-    for order in ((0, 1, 2), (2, 0, 1)):
-        result = reconstruct(seen, [PLANES[k] for k in order], iterations=20)
-        found.append(result.image[jnp.argsort(jnp.asarray(order))])
-    np.testing.assert_allclose(found[1], found[0], atol=1e-8)

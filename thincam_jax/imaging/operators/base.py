@@ -51,7 +51,7 @@ class AbstractOperator(eqx.Module):
         r"""The largest singular value ‖A‖, by power iteration on AᵀA.
 
         It is approached from below: after 30 iterations to a few per cent where singular values
-        crowd at the top, to all digits where the largest stands alone. A step of a gradient method
+        crowd at the top, to all digits where the largest is isolated. A step of a gradient method
         should keep a margin. `dtype`: of the iteration, by default that of the operator's numbers.
         """
         if iterations < 1:
@@ -69,8 +69,7 @@ class AbstractOperator(eqx.Module):
         r"""Mean squared length of a column: what unit noise on the capture becomes in the image.
 
         :math:`\|A\|_F^2` over the number of columns, from the response to random signs (Hutchinson,
-        Commun. Stat. Simul. Comput. 18, 1059, 1989), to a few per cent; exact where an operator
-        says so.
+        Commun. Stat. Simul. Comput. 18, 1059, 1989), to a few per cent; exact where documented.
         """
         return _mean_power(self)
 
@@ -124,7 +123,7 @@ def adjoint_error(
     and g. A right adjoint gives some multiple of the rounding error, a wrong one about
     1/√(numbers in g) or more. `dtype`: of f, by default that of the operator's numbers.
 
-    ValueError where a map returns another shape than `out_shape` and `in_shape` say.
+    **Errors**: ValueError if a map returns another shape than `out_shape` and `in_shape`.
     """
     expected = shapes_of(operator.out_shape)
     first, *others = jax.random.split(key, 1 + len(expected))
@@ -160,7 +159,7 @@ def shapes_of(shape: Shapes) -> list[tuple[int, ...]]:
 
 
 def require_shape(name: str, array: Array, shape: tuple[int, ...]) -> None:
-    """ValueError where an array's trailing axes are not those of the operator."""
+    """Require the trailing axes of the operator."""
     if array.shape[max(0, array.ndim - len(shape)) :] != shape:
         raise ValueError(
             f"{name} has shape {array.shape}; the operator takes {shape}, after any batch axes"
@@ -168,7 +167,7 @@ def require_shape(name: str, array: Array, shape: tuple[int, ...]) -> None:
 
 
 def require_size(name: str, shape: Any, count: int, what: str) -> tuple[int, ...]:
-    """A shape of that many numbers, as a tuple of ints."""
+    """Require a shape of `count` numbers; returned as a tuple of ints."""
     try:
         whole = tuple(int(n) for n in shape)
         sound = whole == tuple(shape) and all(n >= 1 for n in whole)

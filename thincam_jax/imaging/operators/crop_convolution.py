@@ -1,4 +1,4 @@
-"""Convolution with a PSF as a sensor sees it: linear, and cropped."""
+"""Linear convolution with a PSF, cropped to the sensor."""
 
 import functools
 import math
@@ -22,8 +22,8 @@ class CropConvolution(AbstractOperator):
         h_p(\mathbf r_i - \mathbf r'_j) f_p(\mathbf r'_j)
 
     Sensor pixels r and field samples r′ share the pitch Δ and the optical axis as their centre;
-    their numbers may differ, also in parity. The sum over p takes together what falls on one
-    sensor: planes at different depths, wavelengths. The spectrum of the PSF is computed once, here.
+    their numbers may differ, also in parity. The sum over p is over planes at different depths, or
+    wavelengths. The spectrum of the PSF is computed once, here.
 
     **Arguments**
 
@@ -115,7 +115,7 @@ class CropConvolution(AbstractOperator):
     def mean_power(self) -> Float[Array, ""]:
         """Mean of |H|² over all frequencies, channels and planes: Σh² of the PSF without the crop.
 
-        A pixel far outside of what the sensor sees sends it no light, but is counted as the others.
+        Pixels from which no light reaches the sensor count like the others.
         """
         return _mean_power(self.spectrum, self.window[1])
 
@@ -144,11 +144,11 @@ class CropConvolution(AbstractOperator):
         """The adjoint of `combine`."""
         rows, columns = capture.shape[-2:]
         leading = capture.shape[:-2] + (1,) * self.summed
-        # A gradient keeps the factor beside the capture: its conjugate would be one more copy.
+        # A gradient keeps the factor and the capture: its conjugate would be one more copy.
         return (capture.conj().reshape(*leading, rows, columns) * self.spectrum).conj()
 
 
-# Each is one program, where its steps were one by one.
+# Compiled, so that each is one program also when called eagerly.
 @jax.jit
 def _captured(operator: CropConvolution, field):
     # The field's place in the window only adds a phase, which cutting at the corner undoes.
@@ -192,13 +192,13 @@ def cut(
 
 
 def middle_corner(shape: Sequence[int], window: Sequence[int]) -> tuple[int, int]:
-    """Where what is in the middle of a window starts."""
+    """Offset of a centred crop."""
     rows, columns = ((w - n) // 2 for n, w in zip(shape, window, strict=True))
     return rows, columns
 
 
 def _fit(kernel: Float[Array, "*planes k l"], shape: tuple[int, int]):
-    """A kernel cut to all differences of sensor and field; a smaller one is left as it is."""
+    """A kernel cut to all differences of sensor and field; a smaller one is unchanged."""
     given = kernel.shape[-2:]
     if any((n - s) % 2 for n, s in zip(given, shape, strict=True)):
         raise ValueError(
@@ -211,7 +211,7 @@ def _fit(kernel: Float[Array, "*planes k l"], shape: tuple[int, int]):
 
 
 def _require_shape(name: str, image: Array, shape: tuple[int, ...], summed: int) -> None:
-    """ValueError for an image that would otherwise be cut, shifted or repeated silently.
+    """Require the shape of an image that would otherwise be cut, shifted or repeated silently.
 
     A channel axis of length 1 is one PSF for any number of channels.
     """
@@ -251,5 +251,5 @@ def window_shape(
 
 
 def kernel_grid(sensor: Grid, field_shape: tuple[int, int]) -> Grid:
-    """Where `CropConvolution` wants the PSF."""
+    """The grid of the PSF for `CropConvolution`."""
     return sensor.with_shape(kernel_shape(sensor.shape, field_shape))

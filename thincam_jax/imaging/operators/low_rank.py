@@ -45,11 +45,11 @@ class LowRank(AbstractOperator):
 
 
 class LowRankFit(eqx.Module):
-    """An operator for a grid of PSFs, and how far it is from them.
+    """An operator for a grid of PSFs, and its errors.
 
     - `truncation_error`: of the PSFs at the grid's points, ‖difference‖₂/‖PSFs‖₂.
-    - `interpolation_error`: an estimate of the same between the points: a quarter of what is off
-      where every other point is left out and interpolated; infinite for grids too small for it.
+    - `interpolation_error`: an estimate of the same between the points: a quarter of the error
+      where every other point is omitted and interpolated; infinite for grids too small for it.
     """
 
     operator: LowRank
@@ -65,7 +65,7 @@ def low_rank_psf(
     **Arguments**
 
     - `psfs`: (grid y, grid x, k, l): PSFs of points spread evenly from the field's first row and
-      column to its last, each about the place where the field's sample is on the sensor.
+      column to its last, each centred on the field sample's position on the sensor.
     - `pitch`, `sensor_shape`, `field_shape`: as `CropConvolution` takes them; k and l too.
     - `tolerance`: of the truncation, relative L2 over the whole grid.
 
@@ -89,7 +89,7 @@ def low_rank_psf(
     whole = np.linalg.norm(values)
     if whole == 0:
         raise ValueError("psfs are zero everywhere; give PSFs with light")
-    # What is left out by the first 0, 1, 2, … of them.
+    # Relative error of the first 0, 1, 2, … terms.
     tails = np.sqrt(np.append(np.cumsum(values[::-1] ** 2)[::-1], 0)) / whole
     rank = max(1, int(np.argmax(tails <= tolerance)))
     maps = (left[:, :rank] * values[:rank]).reshape(*points, rank)

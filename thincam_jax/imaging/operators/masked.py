@@ -1,4 +1,4 @@
-"""Pixels of a capture that do not count, or count with a gain of their own."""
+"""Captures with masked pixels, or with a gain."""
 
 import abc
 from typing import Any
@@ -18,7 +18,7 @@ from thincam_jax.imaging.operators.base import (
 
 
 class AbstractAround(AbstractOperator):
-    """An operator with something done to each number of its captures."""
+    """An operator whose captures are multiplied pixel by pixel."""
 
     operator: AbstractOperator
 
@@ -47,7 +47,7 @@ class Masked(AbstractAround):
 
     .. math:: A f = V\,(B f), \qquad A^T g = B^T (V g), \qquad V = \mathrm{diag}(v)
 
-    Whatever a masked pixel holds, NaN too, is not looked at.
+    The value of a masked pixel, even NaN, is ignored.
 
     **Arguments**
 

@@ -41,9 +41,8 @@ class Matrix(AbstractPixelMap):
         """Mean squared length of a column, exactly."""
         return jnp.sum(self.matrix**2) / self.matrix.shape[1]
 
-    # On a CPU, XLA sums a transposed matrix that stands left of a vector, or right of one, with
-    # strides: 300 ms instead of 13 for 4096 × 16384 in float32. Both maps therefore name the axes
-    # to be summed, and the matrix lies as it is stored.
+    # On a CPU, XLA sums a transposed matrix with strides: 300 ms instead of 13 for 4096 × 16384 in
+    # float32. Both maps therefore name the axes to be summed and never transpose the matrix.
 
     def __call__(self, image: Float[Array, "..."]) -> Float[Array, "..."]:
         require_shape("image", image, self.in_shape)

@@ -1,4 +1,4 @@
-"""A measured matrix of many more rows than columns, reduced once to what a reconstruction needs."""
+"""A measured matrix of many more rows than columns, reduced once for all reconstructions."""
 
 import hashlib
 import io
@@ -30,7 +30,7 @@ from thincam_jax.imaging.operators.sparse import Sparse
 
 # Numbers of H in the memory at a time: 128 MB in float32.
 _BLOCK = 2**25
-# Rows of H that a file is held against.
+# Rows of H by which a file is compared with it.
 _PROBES = 16
 
 
@@ -47,7 +47,7 @@ class ReducedMatrix(AbstractOperator):
     cost of two products with V.
 
     Singular values below about √(√n ε) of the largest, 0.3 % for 4096 columns in float32, are lost
-    in the rounding of HᵀH; they count as 0, as what the camera does not see.
+    in the rounding of HᵀH; they count as 0, like the null space of the camera.
 
     `ReducedMatrix.of` makes one and `load` reads it again.
 
@@ -140,7 +140,7 @@ class ReducedMatrix(AbstractOperator):
         return projected.reshape(*shape[:-axes], columns)
 
     def save(self, path: str | os.PathLike[str], matrix: Any) -> Path:
-        """Write it to a file, with a mark of the matrix H that it belongs to."""
+        """Write it to a file, with a checksum of its matrix H."""
         file = io.BytesIO()
         np.savez(
             file,
@@ -173,8 +173,8 @@ class ReducedMatrix(AbstractOperator):
 def each_times(matrix: Float[Array, "n n"], flat: Float[Array, "*batch n"]):
     """The product of a matrix with each vector of a batch.
 
-    On a CPU, XLA is up to 15 times slower for what becomes a product with a transposed array:
-    vectors are therefore set side by side as columns, and taken apart again, not transposed.
+    On a CPU, XLA is up to 15 times slower for a product with a transposed array: vectors are
+    therefore stacked as columns and separated again, not transposed.
     """
     vectors = flat.reshape(-1, flat.shape[-1])
     columns = product(matrix, jnp.stack(list(vectors), axis=-1))
@@ -182,7 +182,7 @@ def each_times(matrix: Float[Array, "n n"], flat: Float[Array, "*batch n"]):
 
 
 def _rows(matrix: Any) -> Any:
-    """H as something with a shape and rows to be sliced."""
+    """H as an array with a shape, whose rows can be sliced."""
     if isinstance(matrix, Matrix):
         return matrix.matrix
     if isinstance(matrix, Sparse):
@@ -209,7 +209,7 @@ def _blocks(rows: Any):
 
 
 def _gram(rows: Any) -> Float[Array, "n n"]:
-    """HᵀH; numbers that are not finite show in it."""
+    """HᵀH, which shows numbers that are not finite."""
     if scipy.sparse.issparse(rows):
         return real_numbers("HᵀH", (rows.T @ rows).toarray())
     total = jnp.zeros((rows.shape[1],) * 2, real_numbers("the matrix", rows[0:1]).dtype)
@@ -238,7 +238,7 @@ def _added(total, block):
 
 
 def _mark(rows: Any) -> str:
-    """Of the size and of some rows, spread over all."""
+    """A checksum of the size, and of some rows spread over all."""
     digest = hashlib.sha256(repr((*rows.shape, str(rows.dtype))).encode())
     for row in np.linspace(0, rows.shape[0] - 1, _PROBES).astype(int):
         part = rows[int(row) : int(row) + 1]

@@ -14,13 +14,13 @@ from thincam_jax.imaging.operators.base import AbstractOperator, real_numbers, r
 
 
 class SeparableModes(eqx.Module):
-    r"""The images that a separable camera sees apart from each other: F = v_i w_jᵀ.
+    r"""The images that a separable camera captures independently: F = v_i w_jᵀ.
 
     - `rows`: V, (m, m), and `columns`: W, (n, n), an orthonormal vector a column.
     - `values`: (m, n), the singular values of A, exactly for one term. For several, the roots of
       the diagonal of AᵀA in modes that suit the mean of the terms.
-    - `seen_rows`, `seen_columns`: of one term: what V and W make on the sensor, the left singular
-      vectors (y, m) and (x, n); zero where nothing is seen.
+    - `seen_rows`, `seen_columns`: of one term: V and W as captured by the sensor, the left
+      singular vectors (y, m) and (x, n); zero where no light arrives.
     """
 
     rows: Float[Array, "m m"]
@@ -31,7 +31,7 @@ class SeparableModes(eqx.Module):
 
 
 class Truncated(eqx.Module):
-    """A sum of fewer terms, and ‖difference‖_F/‖A‖_F: what it misses of captures of white scenes.
+    """A sum of fewer terms, and its error on captures of white scenes, ‖difference‖_F/‖A‖_F.
 
     `errors`: the same for 1, 2, … terms.
     """
@@ -109,7 +109,7 @@ class Separable(AbstractOperator):
         return jnp.sum(_inner(self.left) * _inner(self.right)) / math.prod(self.in_shape)
 
     def with_modes(self) -> "Separable":
-        """The same with its modes kept, for all captures and channels that are to come.
+        """This operator with its modes, for reuse in all captures and channels.
 
         Two singular value decompositions for one term, two of Σ P_kᵀP_k and Σ Q_kᵀQ_k for
         several, once: some 0.2 s for 500×620 pixels and 256² of the image. Every solver uses them.
@@ -141,15 +141,15 @@ class Separable(AbstractOperator):
         .. math:: (1 - J_y)\, G\, (1 - J_x) = \sum_k (P_k - \bar P_k) F (Q_k - \bar Q_k)^T
 
         with the means over the sensor. It is exact for any camera. A term that is uniform light
-        on the sensor, whatever the scene, vanishes: the opaque half of a mask of ±1, if its shadow
+        on the sensor for every scene vanishes: the opaque half of a mask of ±1, if its shadow
         overfills the sensor for every point of the scene. Where a border of the shadow lies on
-        the sensor the term stays, and `truncated` tells what one term misses.
+        the sensor the term stays, and `truncated` gives the error of one term.
         """
         left, right = (part - part.mean(axis=1, keepdims=True) for part in self._pair)
         return Separable(left, right)
 
     def truncated(self, tolerance: Number = 0.0, *, terms: int | None = None) -> Truncated:
-        """The nearest sum of fewest terms (Van Loan and Pitsianis 1993), and what it misses.
+        """The nearest sum of fewest terms (Van Loan and Pitsianis 1993), and its error.
 
         - `tolerance`: of the error, relative Frobenius norm; it makes the number of terms known
           only outside of jit.
@@ -218,7 +218,7 @@ def _matrices(name: str, value) -> Float[Array, "k i j"]:
 
 
 def _singular(matrix: Float[Array, "y m"]):
-    """U (y, m), V (m, m) and s (m): zero beyond min(y, m), where V has what is not seen."""
+    """U (y, m), V (m, m) and s (m): zero beyond min(y, m), where V spans the null space."""
     y, m = matrix.shape
     u, s, v = jnp.linalg.svd(matrix, full_matrices=m > y)
     more = m - len(s)

@@ -64,8 +64,7 @@ class Sparse(AbstractPixelMap):
 
 # Measured for 65536 × 90000 with 3.3 million entries in float32 on 2 CPU cores: 5 to 19 ms a map
 # this way, 35 to 65 for the product of a BCOO, whether transposed or not. A second, transposed and
-# sorted copy took 9 to 17 for the adjoint, no less than the entries as they are; it would double
-# the memory and split the gradient.
+# sorted copy took 9 to 17 for the adjoint, and would double the memory.
 
 
 @functools.partial(jax.jit, static_argnames=("shape", "result_shape"))

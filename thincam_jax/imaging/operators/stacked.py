@@ -8,12 +8,12 @@ from thincam_jax.imaging.operators.base import AbstractOperator, Shapes
 
 
 class Stacked(AbstractOperator):
-    r"""Operators that see the same image, one after the other.
+    r"""Operators of one image, one after the other.
 
     .. math:: A f = (A_1 f, \dots, A_K f), \qquad A^T (g_1, \dots, g_K) = \sum_k A_k^T g_k
 
-    Two distances, a set of zone plates, a screen in front of a sensor: whatever is solved for one
-    image. The captures may differ in shape; they come as a tuple, each with the image's batch axes.
+    Two distances, or a set of zone plates, solved for one image. The captures may differ in shape;
+    they come as a tuple, each with the image's batch axes.
 
     **Arguments**
 

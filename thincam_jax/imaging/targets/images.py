@@ -79,10 +79,10 @@ def sample_images() -> tuple[str, ...]:
 def resize(
     image: Num[ArrayLike, "..."], shape: tuple[int, int]
 ) -> Float64[np.ndarray, "y x *channel"]:
-    """The same picture on `shape` = (rows, columns) pixels; (y, x) or (y, x, c), channels apart.
+    """The same picture on `shape` = (rows, columns) pixels; (y, x) or (y, x, channel).
 
     Both pictures cover the same field, border to border. If an axis shrinks, a Gaussian removes
-    what the new pixels cannot hold and the result is interpolated linearly; if none does,
+    frequencies beyond the new Nyquist limit and the result is interpolated linearly; if none does,
     cubically. The result stays within its channel's range, and its mean stays the same up to the
     interpolation error.
 
@@ -121,7 +121,7 @@ def _resample(plane: np.ndarray, shape: tuple[int, int], shrinks: bool) -> np.nd
 
 
 def _without_alpha(pixels: np.ndarray, path: Path) -> np.ndarray:
-    """(y, x) or (y, x, 3) from what a file holds."""
+    """(y, x) or (y, x, 3) of the pixels of a file."""
     if pixels.size == 0:
         raise ValueError(f"{str(path)!r} holds an empty image of shape {pixels.shape}")
     if pixels.ndim == 2:

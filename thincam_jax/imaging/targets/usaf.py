@@ -32,7 +32,7 @@ Rectangle = tuple[float, float, float, float]  # top, bottom, left, right
 
 # One layer, in bar widths of its element 1, from the layer's centre.
 _CHART = 32.0  # side of the square chart, margin included
-_BOTTOM, _RIGHT = 12.0, 14.0  # half the height and half the width of what is drawn
+_BOTTOM, _RIGHT = 12.0, 14.0  # half the height and half the width of the drawing
 _SQUARE = (7.0, 12.0, -4.5, 0.5)  # the solid square
 _NEXT_LAYER = (-2.5, 2.25)  # where the centre of the next layer lies
 _NEXT_SCALE = 1 / 4
@@ -169,7 +169,7 @@ def _layers(layers: int) -> Iterator[tuple[float, float, float]]:
 
 
 def _rectangles(layers: int) -> Iterator[Rectangle]:
-    """Everything that is drawn, as fractions of the chart's width from its centre."""
+    """All rectangles, as fractions of the chart's width from its centre."""
     for scale, y, x in _layers(layers):
         top, bottom, left, right = _SQUARE
         yield (

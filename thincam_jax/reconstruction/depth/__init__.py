@@ -1,6 +1,6 @@
 """Depth from captures: refocusing after the event, distances, depth maps, sharp pictures.
 
-A mask's shadow grows with M = 1 + d/t: a capture holds the distance t of what it shows.
+A mask's shadow grows with M = 1 + d/t: a capture encodes the distance t of its objects.
 `refocus_sweep` reconstructs at many t, the focus measures show which image is sharp, and
 `axial_resolution` is the least difference of distances that can be resolved.
 """

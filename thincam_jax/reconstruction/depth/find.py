@@ -37,7 +37,7 @@ class FocusPeak:
 
 @dataclass(frozen=True, eq=False)
 class FocusCurves:
-    """Focus measure of each region over the sweep, and what follows.
+    """Focus measure of each region over the sweep, and its maxima.
 
     - `labels`: (region,), `curves`: (region, distance).
     - `peaks`: of all regions in the order of the labels, each region's highest first.
@@ -62,15 +62,15 @@ def find_distances(
 ) -> FocusCurves:
     """Distances at which something in the sweep is in focus.
 
-    A region's focus curve has a maximum at the distance of what it shows. It is placed by the
-    parabola through three points of the curve over 1/t, in which defocus is linear. Channels of a
+    A region's focus curve has a maximum at the distance of its object, found by the parabola
+    through three points of the curve over 1/t, in which defocus is linear. Channels of a
     batch are averaged.
 
     **Arguments**
 
-    - `regions`: whole numbers (y, x), 0 for the ground; see `object_regions`. By default the whole
-      field is one region (1): several objects then show only if they are further apart than
-      `axial_resolution`.
+    - `regions`: whole numbers (y, x), 0 for the background; see `object_regions`. By default the
+      whole field is one region (1): several objects are then found only if they are further apart
+      than `axial_resolution`.
     - `prominence`: of a second maximum, relative to the curve's range; the highest is always given.
     - `measure`, `smoothing`: see `focus_measure`.
 
@@ -133,10 +133,10 @@ def object_regions(
     smoothing: float | int | None = None,
     least: int | None = None,
 ) -> Int[np.ndarray, "y x"]:
-    """Bright objects on a dark ground, told apart where they do not touch: labels (y, x) from 1.
+    """Labels (y, x), from 1, of separate bright objects on a dark background.
 
     The mean of the sweep, smoothed, is cut at `threshold` of its highest value; regions are widened
-    by the width of the smoothing, so that the objects' edges, which say most, are in them.
+    by the width of the smoothing, to include the objects' edges, which are the most informative.
 
     **Arguments**: `smoothing`, pixels, default 1.5 % of the field's diagonal; `least`, pixels of
     the smallest region kept, default 0.5 % of the field. Labels go from left to right.
@@ -165,7 +165,7 @@ class DepthMap(eqx.Module):
 
     - `distance`: mm, (*batch, y, x), where the focus measure around the pixel is largest.
     - `confidence`: from 0 to 1: how far the largest stands above the least of the sweep, relative
-      to itself, times how strong it is; even surfaces and the dark ground have little.
+      to itself, times how strong it is; uniform surfaces and the dark background have little.
     """
 
     distance: Float[Array, "*batch y x"]
@@ -179,9 +179,9 @@ def depth_map(
     smoothing: float | int = 1.0,
     window: float | int = 6.0,
 ) -> DepthMap:
-    """The distance at which the surroundings of each pixel are sharpest.
+    """The distance at which the neighbourhood of each pixel is sharpest.
 
-    `window` is the standard deviation of the surroundings in pixels: a smaller one follows the
+    `window` is the standard deviation of the neighbourhood in pixels: a smaller one follows the
     objects' outlines, a larger one is less noisy. The maximum is placed between the steps by a
     parabola over 1/t. Confidence is that of "laplacian_variance" or "gradient_energy";
     "gradient_sparsity" measures no strength and calls noise a picture.

@@ -2,7 +2,7 @@ r"""Focus measures: how sharp an image is, as a whole, in a region, or around ea
 
 All are made of local averages ⟨·⟩ of the picture's derivatives, taken after a slight smoothing that
 keeps the noise of single pixels out. Images of one sweep share a grid of directions, so that their
-derivatives compare as they are.
+derivatives are directly comparable.
 """
 
 from collections.abc import Callable
@@ -39,7 +39,7 @@ def focus_measure(
 
     **Arguments**
 
-    - `image`: (*batch, y, x), each measured by itself.
+    - `image`: (*batch, y, x), each measured separately.
     - `smoothing`: standard deviation of the Gaussian taken first, pixels; 0 for none.
     - `window`: standard deviation in pixels of the Gaussian average around each pixel; gives a map
       (*batch, y, x). Without, the average is over the image or over `region`: (*batch).
@@ -68,7 +68,7 @@ def gaussian_average(
 ) -> Float[Array, "*batch y x"]:
     """Gaussian average around each pixel; at the border over the pixels there are.
 
-    A `width` of 0 leaves the image as it is.
+    A `width` of 0 leaves the image unchanged.
     """
     if not _width("width", width):
         return image
@@ -83,7 +83,7 @@ def _weights(count: int, width: float | int) -> np.ndarray:
 
 
 def _average(shape, dtype, window, region) -> Callable[[Array], Array]:
-    """The average ⟨·⟩ asked for."""
+    """The average ⟨·⟩: over a window, a region or the whole image."""
     if window is not None:
         if region is not None:
             raise ValueError("give a window (for a map) or a region (for a number), not both")

@@ -32,7 +32,7 @@ class RefocusSweep(eqx.Module):
 
     - `images`: radiance, (distance, *batch, y, x), upright.
     - `distances`: t, mm, increasing.
-    - `slope`: p/d; None over measured PSFs, which do not tell it.
+    - `slope`: p/d; None with measured PSFs.
     """
 
     images: Float[Array, "distance *batch y x"]
@@ -42,7 +42,7 @@ class RefocusSweep(eqx.Module):
 
     @property
     def pitch(self) -> Float[Array, " distance"] | None:
-        """Distance of the pixels on the object, mm, of each image; None over measured PSFs."""
+        """Distance of the pixels on the object, mm, of each image; None with measured PSFs."""
         return None if self.slope is None else self.slope * self.distances
 
 
@@ -53,11 +53,11 @@ def refocus_sweep(
     *,
     callback: Callable[[int], object] | None = None,
 ) -> RefocusSweep:
-    """One reconstruction after the other, focused on each of `distances`.
+    """Reconstructions focused on each of several distances.
 
-    Each is a whole image of the scene as if all of it stood there: what does stands out sharp, the
-    rest is blurred. Planes are not separated; for that, give `Cameras` several distances at once
-    and use `AdmmTV`.
+    Each is an image of the whole scene as if it were at that distance: objects at the distance are
+    sharp, all others blurred. To separate planes give `Cameras` several distances at once and use
+    `AdmmTV`.
 
     Nothing is compiled twice: a distance is an argument of every method's compiled programs, and
     all images but the first cost their arithmetic only.
@@ -100,7 +100,7 @@ def refocus_sweep(
 
 
 def _focused(recording: Recording, distances: list[float]) -> list[Recording]:
-    """The recording focused on each distance: another PSF, all else as it is."""
+    """The recording with the PSF of each distance."""
     model = recording.imaging_model
     if isinstance(model, Cameras):
         return [recording.focused(distance) for distance in distances]
@@ -145,7 +145,7 @@ def axial_resolution(camera: LenslessCamera, object_distance: Numbers) -> Float[
     Δt/t² is nearly constant: resolvable planes are evenly spaced in 1/t (`refocus_distances`). This
     is for detail as fine as the aperture passes, of the frequency ρ₀ = βR/(πM) on the sensor. A
     zone aperture carries the frequency ρ at the radius πρ/β, so that coarser detail has less
-    parallax: (ρ₀/ρ)² times the depth of focus. An even surface has no distance.
+    parallax: (ρ₀/ρ)² times the depth of focus. A uniform surface has no distance.
 
     **Arguments**: `object_distance` t, mm, one or an array of them.
 
@@ -170,7 +170,7 @@ def axial_resolution(camera: LenslessCamera, object_distance: Numbers) -> Float[
 def refocus_distances(nearest: Number, farthest: Number, count: int) -> Float[Array, " count"]:
     """`count` distances from `nearest` to `farthest`, mm, evenly spaced in 1/t.
 
-    Defocus is linear in 1/t, so that every step changes the sharpness alike.
+    Defocus is linear in 1/t, so that every step changes the sharpness equally.
     """
     near = checks.positive("nearest", nearest, "mm")
     far = checks.positive("farthest", farthest, "mm")
