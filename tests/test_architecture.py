@@ -44,7 +44,6 @@ FRONT_END_LIBRARIES = ("matplotlib", "pydantic", "typer", "rich", "jinja2")
 PLOT = "plot"  # draws with matplotlib; what has a `plot` method imports it in that method
 FRONT_END = "commands"
 ARRAY_LIBRARIES = ("jax", "jaxlib", "jaxtyping")
-COMPUTING_COMMANDS = ("commands/design/",)  # not yet without arrays of JAX
 
 
 def unknown_rooms(modules: list[Module]) -> list[str]:
@@ -146,7 +145,6 @@ def arrays_in_commands(modules: list[Module]) -> list[str]:
         for line, name in module.imports
         if name.split(".")[0] in ARRAY_LIBRARIES
         and module.top == FRONT_END
-        and not module.path.startswith(COMPUTING_COMMANDS)
     ]
 
 

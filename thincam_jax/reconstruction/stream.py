@@ -8,12 +8,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from thincam_jax._core import checks
 from thincam_jax.reconstruction.admm import RELAXATION, AdmmMethod, State, admm_map
 from thincam_jax.reconstruction.iterate import CHUNK, Outcome
 from thincam_jax.reconstruction.methods import AdmmTV
 from thincam_jax.reconstruction.problem import InverseProblem
 from thincam_jax.reconstruction.recording import Recording
-from thincam_jax.reconstruction.solver import counted
 from thincam_jax.reconstruction.splittings import admm_method
 
 
