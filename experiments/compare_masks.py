@@ -97,7 +97,7 @@ scenes = {
     "points": ComparedScene.of_picture(point_grid(field, (9, 9)), field, "flat"),
 }
 astronaut = ComparedScene.of_picture(sample_image("astronaut"), field)
-tuning = Tuning(astronaut, *{"full": ((0.25, 0.5, 1, 2, 4), 60), "small": ((1,), 30)}[SIZE])
+tuning = Tuning(astronaut, *{"full": ((0.25, 0.5, 1.0, 2.0, 4.0), 60), "small": ((1.0,), 30)}[SIZE])
 comparison = MaskComparison(
     setting,
     masks,

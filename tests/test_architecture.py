@@ -143,8 +143,7 @@ def arrays_in_commands(modules: list[Module]) -> list[str]:
         f"{module.path}:{line}: imports {name.split('.')[0]}; move what computes into the library"
         for module in modules
         for line, name in module.imports
-        if name.split(".")[0] in ARRAY_LIBRARIES
-        and module.top == FRONT_END
+        if name.split(".")[0] in ARRAY_LIBRARIES and module.top == FRONT_END
     ]
 
 

@@ -8,7 +8,7 @@ the schema that editors check with refuses it, too.
 import ast
 import inspect
 import textwrap
-from typing import Any, get_args
+from typing import Any, Literal, get_args, get_origin
 
 import pytest
 from jsonschema import Draft202012Validator
@@ -138,7 +138,8 @@ def test_constructors_of_sections_state_ranges_and_blame_a_field(maker):
     made = [vars(base).get("makers", {}).get(maker, ()) for s in SECTIONS for base in s.__mro__]
     parameters, known = inspect.signature(maker).parameters, quantities(maker)
     for key in {key for keys in made for key in keys} - set(known):
-        assert parameters[key].annotation in (bool, str, Region | None), key
+        stated = parameters[key].annotation  # a type that says which values there are, or a name
+        assert stated in (bool, str, Region | None) or get_origin(stated) is Literal, key
     tree = ast.parse(textwrap.dedent(inspect.getsource(maker)))
     for body in ast.walk(tree):
         if isinstance(body, ast.FunctionDef) and body.name in CONSTRUCTING:

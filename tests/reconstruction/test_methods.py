@@ -303,9 +303,9 @@ def test_endings():
 def test_when_to_end_is_checked_at_once(kind):
     """Of every solver that has iterations."""
     for settings, message in (
-        ({"iterations": 0}, "iterations = 0; give a whole number of at least 1"),
-        ({"iterations": True}, "iterations = True; give a whole number of at least 1"),
-        ({"iterations": 3.0}, "iterations = 3.0; give a whole number of at least 1"),
+        ({"iterations": 0}, "iterations = 0: give a whole number of at least 1"),
+        ({"iterations": True}, "iterations = True: give a whole number of at least 1"),
+        ({"iterations": 3.5}, "iterations = 3.5: give a whole number of at least 1"),
         ({"tolerance": -1.0}, "tolerance = -1.0 is negative"),
     ):
         rig.refused(message, lambda s=settings: kind(**s))

@@ -54,7 +54,7 @@ def test_an_object_that_stands_still_is_reconstructed(system):
 def test_bad_input():
     system = Matrix(RNG.normal(size=(30, 20)), (4, 5), (5, 6))
     recording = tc.Recording(jnp.ones((5, 6)), system, noise_variance=1.0)
-    with pytest.raises(ValueError, match="steps = 0; give a whole number of at least 1"):
+    with pytest.raises(ValueError, match="steps = 0: give a whole number of at least 1"):
         tc.Stream(recording, tc.AdmmTV(1.0), steps=0)
     with pytest.raises(ValueError, match="tau = 'sure' is a rule for one capture; give a number"):
         tc.Stream(recording, tc.AdmmTV("sure"))

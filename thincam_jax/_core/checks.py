@@ -3,8 +3,10 @@
 Traced values cannot be looked at and pass; they were checked when the object was built.
 """
 
+import contextlib
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextvars import ContextVar
 from typing import TYPE_CHECKING, Any
 
 import jax
@@ -18,8 +20,10 @@ if TYPE_CHECKING:
     Number = Real[ArrayLike, ""]
     Numbers = Real[ArrayLike, "..."]
     Shape = Sequence[int]
+    Checked = Array
 else:
     Number = Numbers = Shape = Any
+    Checked = Any  # of NumPy `on_host`
 
 
 # mm: a longer wavelength was meant in nanometres or micrometres; light in metres has such numbers.
@@ -28,6 +32,7 @@ _LONGEST, _IN_METRES = 0.1, (1.5e-7, 2.5e-6)
 _LARGEST_PITCH = 1.0
 # Units of plain ratios, which nobody writes.
 _RATIOS = ("parts of one", "a ratio", "")
+_ON_HOST = ContextVar("on_host", default=False)
 
 
 def is_traced(value: Any) -> bool:
@@ -40,7 +45,17 @@ def _known(value: Any) -> np.ndarray | None:
     return None if is_traced(value) else np.asarray(value)
 
 
-def real(name: str, value: Any, unit: str, *, shape: tuple[int, ...] = ()) -> Array:
+@contextlib.contextmanager
+def on_host() -> Iterator[None]:
+    """Numbers are checked by NumPy alone: JAX would start its devices and take their memory."""
+    token = _ON_HOST.set(True)
+    try:
+        yield
+    finally:
+        _ON_HOST.reset(token)
+
+
+def real(name: str, value: Any, unit: str, *, shape: tuple[int, ...] = ()) -> Checked:
     """A floating array of that shape, or TypeError/ValueError naming the argument."""
     known = _known(value)
     if known is not None:
@@ -50,6 +65,8 @@ def real(name: str, value: Any, unit: str, *, shape: tuple[int, ...] = ()) -> Ar
             raise ValueError(f"{name} is NaN; give a number in {unit}")
     if known is None:
         array = _floating(value)
+    elif _ON_HOST.get():
+        array = known
     else:
         # A plain number stays known inside jit, so that sizes can depend on it.
         with jax.ensure_compile_time_eval():
@@ -71,7 +88,7 @@ def _floating(value: Any) -> Array:
     return jax.lax.convert_element_type(array, array.dtype)
 
 
-def _require(array: Array, holds: Callable[[np.ndarray], Any], message: str) -> Array:
+def _require(array: Checked, holds: Callable[[np.ndarray], Any], message: str) -> Checked:
     """The array, or ValueError with its value in the message; a traced one passes."""
     known = _known(array)
     if known is not None and not np.all(holds(known)):
@@ -79,7 +96,7 @@ def _require(array: Array, holds: Callable[[np.ndarray], Any], message: str) -> 
     return array
 
 
-def finite(name: str, value: Any, unit: str, *, shape: tuple[int, ...] = ()) -> Array:
+def finite(name: str, value: Any, unit: str, *, shape: tuple[int, ...] = ()) -> Checked:
     array = real(name, value, unit, shape=shape)
     message = f"{name} = {{}}{_after(unit)} is not finite; give a finite number{_within(unit)}"
     return _require(array, np.isfinite, message)
@@ -87,7 +104,7 @@ def finite(name: str, value: Any, unit: str, *, shape: tuple[int, ...] = ()) -> 
 
 def positive(
     name: str, value: Any, unit: str, *, allow_infinity: bool = False, most: float = math.inf
-) -> Array:
+) -> Checked:
     array = real(name, value, unit)
     message = f"{name} = {{}}{_after(unit)} is not positive; give {name} > 0{_within(unit)}"
     _require(array, lambda known: known > 0, message)
@@ -98,12 +115,12 @@ def positive(
     return _require(array, lambda known: allow_infinity or np.isfinite(known), message)
 
 
-def non_negative(name: str, value: Any, unit: str) -> Array:
+def non_negative(name: str, value: Any, unit: str) -> Checked:
     message = f"{name} = {{}}{_after(unit)} is negative; give {name} >= 0{_within(unit)}"
     return _require(finite(name, value, unit), lambda known: known >= 0, message)
 
 
-def positive_all(name: str, value: Array, unit: str) -> Array:
+def positive_all(name: str, value: Checked, unit: str) -> Checked:
     """An array of any shape with finite positive entries."""
     array = finite(name, value, unit, shape=value.shape)
     message = f"{name} = {{}} {unit} must be positive; give {name} > 0 in {unit}"
@@ -118,7 +135,7 @@ def _within(unit: str) -> str:
     return "" if unit in _RATIOS else f" in {unit}"
 
 
-def wavelength(name: str, value: Any) -> Array:
+def wavelength(name: str, value: Any) -> Checked:
     """One wavelength of light or several, mm; what must be nm, µm or m is refused."""
     array = (
         positive_all(name, jnp.asarray(value), "mm")
@@ -138,7 +155,7 @@ def wavelength(name: str, value: Any) -> Array:
     return array
 
 
-def pixel_pitch(name: str, value: Any) -> Array:
+def pixel_pitch(name: str, value: Any) -> Checked:
     """A sensor's pixel pitch, mm; what must be µm is refused."""
     message = f"{name} = {{}} mm is no pixel: give it in mm, such as 5.5 * um"
     return _require(positive(name, value, "mm"), lambda known: known <= _LARGEST_PITCH, message)
@@ -153,7 +170,7 @@ def channels_first(name: str, shape: tuple[int, ...]) -> None:
         )
 
 
-def between(name: str, value: Any, unit: str, least: float, most: float) -> Array:
+def between(name: str, value: Any, unit: str, least: float, most: float) -> Checked:
     """A number within limits, which are allowed."""
     after = _after(unit)
     message = f"{name} = {{}}{after} is out of range; give {least:g} to {most:g}{after}"
@@ -161,18 +178,18 @@ def between(name: str, value: Any, unit: str, least: float, most: float) -> Arra
     return _require(array, lambda known: (least <= known) & (known <= most), message)
 
 
-def decibels(name: str, value: Any) -> Array:
+def decibels(name: str, value: Any) -> Checked:
     """A signal-to-noise ratio, dB."""
     return between(name, value, "dB", -60.0, 200.0)
 
 
-def fraction(name: str, value: Any) -> Array:
+def fraction(name: str, value: Any) -> Checked:
     """A number above 0 and at most 1."""
     message = f"{name} = {{}} is out of range; give 0 < {name} <= 1"
     return _require(real(name, value, "parts of one"), lambda known: 0 < known <= 1, message)
 
 
-def transmittances(name: str, values: Any) -> Array:
+def transmittances(name: str, values: Any) -> Checked:
     """A one-dimensional code of numbers from 0 to 1."""
     array = finite(name, values, "parts of one", shape=np.shape(values))
     if array.ndim != 1 or array.size == 0:
@@ -196,7 +213,10 @@ def choice(name: str, value: Any, options: Iterable[str]) -> str:
 
 def whole(name: str, value: Any, least: int, most: int | None = None) -> int:
     """A whole number within limits."""
-    number = int(value)
+    try:
+        number = least - 1 if isinstance(value, bool) else int(value)
+    except (TypeError, ValueError, OverflowError):
+        number = least - 1
     if number != value or number < least or (most is not None and number > most):
         limits = f"of at least {least}" if most is None else f"from {least} to {most}"
         raise ValueError(f"{name} = {value!r}: give a whole number {limits}")

@@ -164,8 +164,9 @@ def quantities(*owners: Any) -> dict[str, Quantity]:
 
 def check_fields(record: Any) -> None:
     """Check the fields of a plain record by the quantities of their annotations."""
-    for name, one in quantities(type(record)).items():
-        one(getattr(record, name))
+    with checks.on_host():
+        for name, one in quantities(type(record)).items():
+            one(getattr(record, name))
 
 
 def _annotated(annotations: Mapping[str, Any]) -> dict[str, Quantity]:

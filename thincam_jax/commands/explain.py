@@ -130,7 +130,7 @@ def _psfs(asked: Any, cameras: list[Any], object_distance: float) -> Iterator[st
 def _rays(asked: Any, setup: Any) -> Iterator[str]:
     """Of a see-through camera: rays, and entries of its matrix."""
     from thincam_jax._core.memory import readable
-    from thincam_jax.commands.screen.build import build_cameras, build_plane
+    from thincam_jax.commands.screen.run import build_cameras, build_plane
     from thincam_jax.waveguide.system import entries_of_a_ray
 
     (rows, columns), parts = asked.sensor.shape, asked.band_samples or 1

@@ -73,7 +73,7 @@ class Tuning:
     """τ of total variation, for each mask and light: the best of `tau` on a scene of its own."""
 
     scene: ComparedScene
-    tau: tuple[float | int, ...] = (0.5, 1, 2, 4)
+    tau: tuple[float, ...] = (0.5, 1.0, 2.0, 4.0)
     iterations: int = 60
 
 
