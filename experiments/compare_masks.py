@@ -14,7 +14,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import thincam_jax as tc
-from thincam_jax.design import contour_mask
+from thincam_jax.design import contour_target, mask_of_phase, one_turn, retrieve_phase
 from thincam_jax.imaging.targets import middle_square, point_grid, sample_image
 from thincam_jax.lensless.propagation.path import Path as LightPath
 from thincam_jax.studies import ComparedMask, ComparedScene, MaskComparison, Setting, Tuning
@@ -50,8 +50,10 @@ code = tc.maximum_length_sequence(31)
 
 
 def contours():
-    light = LightPath(green, distance)
-    return contour_mask(key, coarse, light, feature=200 * um, line_width=12 * um)
+    lines = contour_target(key, coarse.grid, feature=200 * um, line_width=12 * um)
+    path = LightPath(*(np.asarray(n, lines.dtype) for n in (green, distance, np.inf)))
+    found = retrieve_phase(lines, coarse.grid, path, shape=coarse.shape, key=key)
+    return mask_of_phase(found.phase, coarse, green, one_turn(coarse, green))
 
 
 def zone_plate(phase=0.0, profile="cosine"):
@@ -97,7 +99,7 @@ scenes = {
     "points": ComparedScene.of_picture(point_grid(field, (9, 9)), field, "flat"),
 }
 astronaut = ComparedScene.of_picture(sample_image("astronaut"), field)
-tuning = Tuning(astronaut, *{"full": ((0.25, 0.5, 1.0, 2.0, 4.0), 60), "small": ((1.0,), 30)}[SIZE])
+tuning = Tuning(astronaut, *{"full": ((0.25, 0.5, 1, 2, 4), 60), "small": ((1,), 30)}[SIZE])
 comparison = MaskComparison(
     setting,
     masks,

@@ -73,7 +73,7 @@ class Tuning:
     """τ of total variation, for each mask and light: the best of `tau` on a scene of its own."""
 
     scene: ComparedScene
-    tau: tuple[float, ...] = (0.5, 1.0, 2.0, 4.0)
+    tau: tuple[float | int, ...] = (0.5, 1, 2, 4)
     iterations: int = 60
 
 
@@ -178,10 +178,11 @@ class MaskComparison:
             seen = capture(setting, compared, psfs, scene, electrons, key)
             start = best_linear(cameras, seen, precision)
             tried = [
-                total_variation(cameras, seen, start, tau, asked.iterations) for tau in asked.tau
+                total_variation(cameras, seen, start, float(tau), asked.iterations)
+                for tau in asked.tau
             ]
             scores = [psnr(np.asarray(image[0]), np.asarray(scene[0])) for image in tried]
-            result.tau[name, electrons] = asked.tau[int(np.argmax(scores))]
+            result.tau[name, electrons] = float(asked.tau[int(np.argmax(scores))])
         result.psfs[name] = psfs
         result.strengths[name] = strength(setting, compared, psfs, self.wavelength, far)
 
