@@ -7,7 +7,7 @@ import contextlib
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextvars import ContextVar
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -63,10 +63,11 @@ def real(name: str, value: Any, unit: str, *, shape: tuple[int, ...] = ()) -> Ch
             raise TypeError(f"{name} = {value!r} is not a real number; give it in {unit}")
         if np.isnan(known).any():
             raise ValueError(f"{name} is NaN; give a number in {unit}")
+    array: Checked
     if known is None:
         array = _floating(value)
     elif _ON_HOST.get():
-        array = known
+        array = cast(Any, known)
     else:
         # A plain number stays known inside jit, so that sizes can depend on it.
         with jax.ensure_compile_time_eval():

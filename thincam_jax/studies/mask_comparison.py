@@ -322,11 +322,11 @@ class MaskComparisonResult:
         from thincam_jax.plot.frame import new_figure
         from thincam_jax.plot.mask_comparison import draw_error
 
-        return draw_error(self, new_figure(11, 4.4))
+        return draw_error(self, new_figure(11.0, 4.4))
 
     def plot_images(self) -> "Figure":
         """A row for each mask: the mask, its PSF, and scenes at several lights and distances."""
         from thincam_jax.plot.frame import new_figure
         from thincam_jax.plot.mask_comparison import draw_images
 
-        return draw_images(self, new_figure(1, 1))
+        return draw_images(self, new_figure(1.0, 1.0))
