@@ -126,11 +126,16 @@ print("CPU seconds an image: " + ", ".join(f"{n} {s:.3f}" for n, s in seconds.it
 
 # %%
 names = ["denoiser", *RIVALS]
+# The same in all panels, told apart in grey too: black to light, each with a marker of its own.
+looks = dict(
+    zip(names, (("0.0", "o-"), ("0.55", "s--"), ("0.7", "^:"), ("0.35", "D-.")), strict=False)
+)
 figure, axes = plt.subplots(1, 3, figsize=(13, 3.8), layout="constrained")
 for ax, light in zip(axes, ("linear light", "sRGB-encoded"), strict=False):
     for name in names:
         means = [found[light, name, sigma].mean() for sigma in LEVELS]
-        ax.plot([255 * sigma for sigma in LEVELS], means, "o-", label=name)
+        grey, line = looks[name]
+        ax.plot([255 * sigma for sigma in LEVELS], means, line, color=grey, label=name)
     ax.set(xlabel="255 σ", ylabel="PSNR (dB)", title=light)
 axes[0].legend(frameon=False)
 for name in names[1:]:
@@ -142,7 +147,9 @@ for name in names[1:]:
         [f(gain) for gain in gains]
         for f in (np.mean, lambda gain: 1.96 * gain.std() / np.sqrt(len(gain)))
     )
-    axes[2].errorbar([255 * s for s in LEVELS], means, errors, fmt="o-", capsize=3, label=name)
+    grey, line = looks[name]
+    at = [255 * sigma for sigma in LEVELS]
+    axes[2].errorbar(at, means, errors, fmt=line, color=grey, capsize=3, label=f"over {name}")
 axes[2].axhline(0, color="0.7", linewidth=0.8)
 axes[2].set(xlabel="255 σ", ylabel="gain of the denoiser (dB)", title="linear light, 95 % of means")
 axes[2].legend(frameon=False)
