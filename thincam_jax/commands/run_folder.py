@@ -164,6 +164,6 @@ def to_json(data: Any) -> str:
     return json.dumps(data, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
 
 
-def as_record(kind: type[Record], data: Any) -> Record | None:
-    """A dataclass from what a file holds of it, `asdict` undone; None for None."""
-    return None if data is None else pydantic.TypeAdapter(kind).validate_python(data)
+def as_record(kind: type[Record], data: Any) -> Record:
+    """A dataclass from what a file holds of it, `asdict` undone."""
+    return pydantic.TypeAdapter(kind).validate_python(data)

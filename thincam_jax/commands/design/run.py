@@ -85,7 +85,8 @@ class _DesignRun(Run):
         methods = self.simulated.methods
         self.folder.write("found.yaml", dump_config(as_study_config(self.config, methods)))
         designs = [[list(astuple(e)) for e in method.exposures] for method in methods]
-        stored = as_record(FinishedTarget, self.folder.finished(target.name))
+        held = self.folder.finished(target.name)
+        stored = None if held is None else as_record(FinishedTarget, held)
         if stored is None or stored.designs != designs:
             shown: dict[str, Evaluation] = {}
             trials = simulate_trials(self.simulated, target, self.design.seeds, shown)

@@ -1,12 +1,10 @@
 """Running a study: every target through every method, into a run folder with a report."""
 
-from collections.abc import Mapping
 from dataclasses import asdict
-from typing import Any
 
 from thincam_jax.commands.config_file import slug
 from thincam_jax.commands.report import Page, Part, Picture, Sentences, optics_of, pixels_of
-from thincam_jax.commands.run_folder import Progress, Run, RunFolder
+from thincam_jax.commands.run_folder import Progress, Run, RunFolder, as_record
 from thincam_jax.commands.study.build import FileStudy
 from thincam_jax.commands.study.config import StudyConfig
 from thincam_jax.lensless.exposures import Exposure
@@ -14,7 +12,6 @@ from thincam_jax.plot import studies as plot
 from thincam_jax.studies.evaluate import (
     Contrasts,
     Evaluation,
-    Resolved,
     Scores,
     evaluate_method,
 )
@@ -71,7 +68,7 @@ class _StudyRun(Run):
             stored = folder.finished(target.name)
             if stored is not None:
                 self.found[target.name] = {
-                    name: _scores(metrics) for name, metrics in stored["metrics"].items()
+                    name: as_record(Scores, metrics) for name, metrics in stored["metrics"].items()
                 }
                 self.contrasts[target.name] = {
                     name: [(period, direction, contrast) for period, direction, contrast in rows]
@@ -135,12 +132,6 @@ class _StudyRun(Run):
             folder.save_figure("contrast", plot.draw_contrasts(contrasts))
         folder.save_figure("psf", plot.draw_psf(study))
         self.complete(page(study.config, self.scores, findings(study, self.scores)))
-
-
-def _scores(metrics: Mapping[str, Any]) -> Scores:
-    """The scores that a folder holds."""
-    resolved = metrics["resolved"]
-    return Scores(**{**metrics, "resolved": resolved and Resolved(**resolved)})
 
 
 def page(config: StudyConfig, scores: StudyScores, sentences: list[str]) -> Page:
