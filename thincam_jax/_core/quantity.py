@@ -112,7 +112,7 @@ def quantity(
     """A finite number, or an array of a shape, in a unit.
 
     - `unit`: one of `UNITS`; other texts are for messages only.
-    - `least`, `most`: both, or `most` of what is positive.
+    - `least`, `most`: ends of the range; give both, or `most` alone with `positive`.
     - `check`: in place of the ranges: called with the name and the value.
     """
     words = _IN_WORDS.get(unit, unit)

@@ -105,7 +105,7 @@ class PsfMethod:
 
     @property
     def float_type(self) -> Precision:
-        """The precision; float32 where none is chosen."""
+        """The precision; float32 by default."""
         return self.precision or "float32"
 
 

@@ -51,7 +51,7 @@ class WithShots:
     shots: tuple[ShotNumbers, ...]
 
     def text(self, name: str, shots: tuple[int, ...] = ()) -> str:
-        """A number that `shots` (from 1; all where none is named) share."""
+        """A number shared by `shots`, which count from 1; by all shots where none are given."""
         return self.shots[shots[0] - 1 if shots else 0].text(name)
 
     def cells(self, names: Iterable[str]) -> list[str]:

@@ -214,7 +214,7 @@ def recover_to(
         if known is not None:
             matrix, deviation = known
             left = (block - matrix[pixels].toarray()) / deviation[pixels, None]
-            # The first column takes the offset and the white frame: it is told by the others.
+            # The offset of the frames goes into the first column, which is therefore left out.
             total += float(np.sum(left[:, 1:] ** 2, dtype=np.float64))
             count += left[:, 1:].size
     images, agreement = {"measured": columns}, None

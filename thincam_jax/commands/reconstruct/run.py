@@ -136,7 +136,7 @@ def _background(given: Background, bits: int | None) -> measured.Raw | float | N
 class _Made:
     """An image (channel, y, x), the facts for its record, and what `Finished` says of it.
 
-    - `marked`: a picture of what is not sure, as a PNG.
+    - `marked`: the image with its uncertain pixels marked, as a PNG.
     """
 
     image: np.ndarray
