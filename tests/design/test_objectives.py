@@ -207,6 +207,9 @@ def every_objective(design, judged, frequencies):
     }
 
 
+OBJECTIVES = ("bayes_error", "mismatch_error", "worst_ratio_db", "unevenness", "limit")
+
+
 # Between the ratios of the first rings and of the last, so that `limit` lies inside and is smooth:
 # it jumps where a ring that was above falls below it, which no ring is near to here.
 THRESHOLD = 30.0
@@ -232,8 +235,19 @@ def test_gradients(noise, frequencies):
     """
     judged = setup(noise=noise, prior=PowerLaw(2.8))
     counted = count_traces(every_objective)
-    value = jax.jit(counted)
-    slopes = jax.jit(jax.jacrev(every_objective))(TESTED, judged, frequencies)
+
+    @jax.jit
+    def value_and_pullback(design, weights):
+        """All objectives, and the gradient of their weighted sum: one program for all."""
+        values, pullback = jax.vjp(lambda d: counted(d, judged, frequencies), design)
+        return values, pullback(weights)[0]
+
+    nothing = dict.fromkeys(OBJECTIVES, jnp.zeros(()))
+    values = value_and_pullback(TESTED, nothing)[0]
+    slopes = {
+        objective: value_and_pullback(TESTED, nothing | {objective: jnp.ones(())})[1]
+        for objective in OBJECTIVES
+    }
     for name in NAMES:
         number = getattr(TESTED, name)
         # Each capture by its own step, or effects of captures could stand in for one another.
@@ -245,13 +259,12 @@ def test_gradients(noise, frequencies):
         object.__setattr__(direction, name, step)
 
         def moved(d):
-            return value(d, judged, frequencies)
+            return value_and_pullback(d, nothing)[0]
 
         expected = finite_difference(moved, TESTED, direction, 2e-6)
         # Its filters divide by small noises: shorter steps drown in rounding.
         longer = finite_difference(moved, TESTED, direction, 1e-5)
         expected["mismatch_error"] = longer["mismatch_error"]
-        values = moved(TESTED)
         for objective, difference in expected.items():
             slope = float(jnp.sum(getattr(slopes[objective], name) * step))
             rounding = 3e-8 * (1 + abs(float(values[objective])))
@@ -275,17 +288,22 @@ def test_synthesis_must_fit():
 def test_objectives_are_minimised_and_reported_in_their_sense():
     problem, band = small.problem(), (0.1, 0.6)
     data, design = problem.data, problem.space.base
-    known = data.channels(design)
     error, edge, uneven, ratio = BayesError(), ResolutionLimit(), Unevenness(band), WorstRatio(band)
-    cost = float(error(design, data))
+
+    @jax.jit
+    def costs_and_channels(design, data):
+        return [one(design, data) for one in (error, edge, uneven)], data.channels(design)
+
+    (of_error, of_edge, of_uneven), known = costs_and_channels(design, data)
+    cost = float(of_error)
     assert cost == pytest.approx(float(bayes_error(known)))
     assert error.reported(cost) == pytest.approx(10 * np.log10(cost))
     assert error.gain(0.2, 0.1) == pytest.approx(3.0103, abs=1e-4)
     assert error.increase(0.2) == pytest.approx(0.002)
-    cost = float(edge(design, data))
+    cost = float(of_edge)
     assert cost == pytest.approx(-float(limit(known, data.frequencies)))
     expected = float(unevenness(known, data.frequencies, band))
-    assert float(uneven(design, data)) == pytest.approx(expected)
+    assert float(of_uneven) == pytest.approx(expected)
     assert edge.reported(cost) == -cost > 0
     assert edge.gain(-10.0, -12.0) == pytest.approx(2.0)
     assert uneven.gain(3.0, 2.0) == pytest.approx(1.0)
