@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import thincam_jax as tc
-from helpers import finite_difference, quick, relative_l2
+from helpers import finite_difference, quick, relative_l2, value_and_slope
 from thincam_jax.imaging.operators import kernel_grid
 from thincam_jax.lensless.forward import imaging_operator, projected_shape
 from thincam_jax.units import nm, um
@@ -215,11 +215,11 @@ def test_gradients_of_camera_and_scene():
         return jnp.sum(weights * tc.capture(own, scene, model="geometric"))
 
     at = {"beta": jnp.asarray(25.0), "width": jnp.asarray(1.18), "gain": jnp.asarray(1.1)}
-    both = jax.jit(jax.value_and_grad(loss))
-    slopes = both(at)[1]
+    value, slope = value_and_slope(loss)
+    slopes = slope(at)
     for name, step in {"beta": 1e-3, "width": 1e-4, "gain": 1e-2}.items():
         direction = {other: jnp.asarray(float(other == name)) for other in at}
-        expected = finite_difference(lambda x: both(x)[0], at, direction, step)
+        expected = finite_difference(value, at, direction, step)
         np.testing.assert_allclose(slopes[name], expected, rtol=1e-7, err_msg=name)
 
 
@@ -240,8 +240,7 @@ def test_the_operator_inside_jit_is_differentiable_in_the_distance():
     sensor = tc.Sensor((24, 29), 40 * um)
     mask = tc.FresnelZoneAperture(25.0, 0.4, width=2.4)
 
-    @jax.jit
-    def loss(distance):
+    def weighted(distance):
         own = tc.LenslessCamera(mask=mask, sensor=sensor, distance=distance)
         convolution = imaging_operator(
             own,
@@ -255,9 +254,8 @@ def test_the_operator_inside_jit_is_differentiable_in_the_distance():
 
     # β/(1 ± ε) turns by βr²·ε/d: 25·5 rad (the corner of the kernel's grid)·0.012/3, slowly
     at, one = jnp.asarray(DISTANCE), jnp.asarray(1.0)
-    np.testing.assert_allclose(
-        jax.grad(loss)(at), finite_difference(loss, at, one, 1e-2), rtol=1e-7
-    )
+    loss, slope = value_and_slope(weighted)
+    np.testing.assert_allclose(slope(at), finite_difference(loss, at, one, 1e-2), rtol=1e-7)
 
 
 def test_sizes_beyond_the_memory_are_refused_with_an_estimate(monkeypatch):

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import thincam_jax as tc
-from helpers import count_traces, finite_difference, quick
+from helpers import count_traces, finite_difference, quick, value_and_slope
 
 INF = float("inf")
 WAVELENGTH = 500e-6
@@ -195,8 +195,8 @@ def steps(p):
 
 
 def check_gradient(model, rtol, zero=(), **options):
-    function = jax.jit(lambda p: weighted(p, model, **options))
-    exact = jax.jit(jax.grad(function))(POINT)
+    function, slope = value_and_slope(lambda p: weighted(p, model, **options))
+    exact = slope(POINT)
     for name, step in steps(POINT).items():
         direction = {k: jnp.ones(()) if k == name else jnp.zeros(()) for k in POINT}
         difference = finite_difference(function, POINT, direction, step)

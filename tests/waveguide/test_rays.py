@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from waveguide.setting import camera, hologram
 
-from helpers import finite_difference
+from helpers import finite_difference, value_and_slope
 from thincam_jax import waveguide as wg
 from thincam_jax.units import nm
 
@@ -144,12 +144,12 @@ def test_gradients(pixel, film):
     sts = camera(hologram(film), film)
     at = (*eqx.partition(sts, eqx.is_inexact_array), jnp.asarray(pixel), jnp.asarray(550.0))
 
-    def value(arrays, pixel, distance):
+    def of_arrays(arrays, pixel, distance):
         return numbers(eqx.combine(arrays, at[1]), pixel, distance)
 
-    value = jax.jit(value)
+    value, slopes_of = value_and_slope(of_arrays, (0, 1, 2))
     point = (at[0], *at[2:])
-    slopes = jax.jit(jax.grad(value, (0, 1, 2)))(*point)
+    slopes = slopes_of(*point)
     leaves, structure = jax.tree.flatten(point)
     for number, (leaf, slope) in enumerate(zip(leaves, jax.tree.leaves(slopes), strict=True)):
         directions = [jnp.zeros_like(a) for a in leaves]

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import thincam_jax as tc
-from helpers import finite_difference, quick, relative_l2
+from helpers import finite_difference, quick, relative_l2, value_and_slope
 from thincam_jax.lensless.masks import MaskBlank
 from thincam_jax.units import nm, um
 
@@ -106,16 +106,17 @@ def test_heights_of_a_display_are_the_reliefs_at_its_pixels():
 def test_gradients_and_vmap():
     shown = tc.on_display(tc.FresnelZoneAperture(25.0, 0.3, width=1.2), PITCH, FILL)
 
-    def value(numbers):
+    def total(numbers):
         where = lambda m: (m.pixel_pitch, m.fill_factor, m.mask.beta)  # noqa: E731
         return jnp.sum(jnp.sin(30 * psf(eqx.tree_at(where, shown, tuple(numbers)))))
 
+    value, slope_of = value_and_slope(total)
     numbers, direction = jnp.asarray([PITCH, FILL, 25.0]), jnp.asarray([0.01, 1.0, 3.0])
-    slope = jax.jit(jax.grad(value))(numbers) @ direction
+    slope = slope_of(numbers) @ direction
     known = finite_difference(value, numbers, direction, 3e-6)
     np.testing.assert_allclose(slope, known, rtol=1e-6)
     several = jnp.stack([numbers, numbers * 1.01])
-    some = jax.jit(jax.vmap(value))(several)
+    some = jax.jit(jax.vmap(total))(several)
     np.testing.assert_allclose(some, [value(each) for each in several], rtol=1e-9)
 
 

@@ -7,7 +7,7 @@ import pytest
 import scipy.integrate
 
 import thincam_jax as tc
-from helpers import count_traces, finite_difference, quick, relative_l2
+from helpers import count_traces, finite_difference, quick, relative_l2, value_and_slope
 from thincam_jax.lensless.propagation import Path
 from thincam_jax.lensless.propagation.separable_transfer import overlaps, transfer_factors
 
@@ -159,7 +159,7 @@ NUMBERS = {
 @pytest.fixture(scope="module")
 def compiled():
     counted = count_traces(weighted)
-    return counted, jax.jit(counted), jax.jit(jax.grad(weighted))
+    return counted, *value_and_slope(counted)
 
 
 @pytest.mark.parametrize("name", NUMBERS)
