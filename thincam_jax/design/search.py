@@ -240,7 +240,10 @@ def evaluate(
     One at a time is for costly objectives: a single program serves any number of points.
     """
     if at_a_time > 1:
-        return _evaluate(objective, space, data, points, at_a_time)
+        # In whole batches: what is left over would be compiled as a program of its own.
+        more = -len(points) % at_a_time
+        whole = jnp.asarray(np.pad(np.asarray(points), ((0, more), (0, 0)), "edge"))
+        return _evaluate(objective, space, data, whole, at_a_time)[: len(points)]
     each = [_evaluate(objective, space, data, point[None], 1) for point in points]
     return jnp.asarray(np.concatenate(each))
 
