@@ -1,5 +1,7 @@
 """`separable` of masks of many terms: the field first, its square then."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -91,7 +93,11 @@ def test_slopes_and_batches():
 def test_masks_of_many_terms_take_it():
     """With a word on its accuracy once; a number of points that is given says it is known."""
     camera = camera_of(tc.SampledMask(RANDOM.integers(0, 2, (130, 141)), 5 * um))
-    how = {"wavelength": 500 * nm, "object_distance": 40.0, "pixel_integration": True}
+    how: dict[str, Any] = {
+        "wavelength": 500 * nm,
+        "object_distance": 40.0,
+        "pixel_integration": True,
+    }
     with pytest.warns(AccuracyWarning, match="130 terms .* 21 points .* nodes=144"):
         quick = tc.psf(camera, **how)
     same = tc.psf(camera, model=tc.PsfMethod("separable", nodes=LATTICE_POINTS), **how)
