@@ -11,10 +11,11 @@ import numpy as np
 import PIL.Image
 import pytest
 import tifffile
-from imagecodecs import png_encode
+from imagecodecs import jpeg8_encode, png_encode
 
 from thincam_jax._core import memory
 from thincam_jax.measured import CaptureFileError, Raw, read_image, read_images, read_mask
+from thincam_jax.measured.read import NonlinearWarning
 
 SHAPE = (7, 10)
 
@@ -51,6 +52,19 @@ def test_counts_come_back_as_they_were(tmp_path, dtype, channels):
     same(read_image(tmp_path / "a.npy"), pixels, "npy", bits)
     same(read_image(str(tmp_path / "a.tif")), pixels, "tiff", bits)
     same(read_image(tmp_path / "a.png"), pixels, "png", bits)
+
+
+def test_a_jpeg_is_read_with_a_warning(tmp_path):
+    pixels = np.tile(np.arange(0, 240, 10, dtype=np.uint8)[:, None], (1, 16))
+    (tmp_path / "a.jpg").write_bytes(jpeg8_encode(pixels, level=95))
+    with pytest.warns(NonlinearWarning, match=r"a\.jpg: a JPEG's counts .* as TIFF or PNG"):
+        raw = read_image(tmp_path / "a.jpg")
+    assert (raw.format, raw.bits) == ("jpeg", 8)
+    assert np.abs(raw.pixels.astype(int) - pixels).max() < 8
+    whole = (tmp_path / "a.jpg").read_bytes()
+    (tmp_path / "b.jpg").write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(CaptureFileError, match="cannot be read as JPEG"):
+        read_image(tmp_path / "b.jpg")
 
 
 @pytest.mark.parametrize("order", ["<", ">"])

@@ -5,6 +5,7 @@ As the files `command.py`, it imports nothing at its head that `thincam --help` 
 
 import contextlib
 import re
+import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NoReturn
@@ -35,10 +36,12 @@ DryRun = Annotated[
 def told(interrupted: Callable[[], str]) -> Iterator[None]:
     """What a user can put right is told in one line, and Ctrl-C by what `interrupted` says.
 
-    Anything else is a defect and keeps its traceback.
+    Anything else is a defect and keeps its traceback. Python's warnings take a line each, too.
     """
     try:
-        yield
+        with warnings.catch_warnings():
+            warnings.showwarning = lambda message, *_, **__: warn([str(message)])
+            yield
     except KeyboardInterrupt:
         tell(interrupted())
         raise typer.Exit(INTERRUPTED) from None
@@ -57,9 +60,9 @@ def _no_memory(error: BaseException) -> bool:
     )
 
 
-def warn(warnings: list[str]) -> None:
+def warn(texts: list[str]) -> None:
     """Each in a line on standard error."""
-    for warning in warnings:
+    for warning in texts:
         tell(f"warning: {warning}")
 
 

@@ -4,6 +4,7 @@ from collections.abc import Iterable
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -16,8 +17,19 @@ from thincam_jax._core.precision import product
 from thincam_jax._core.quantity import quantity
 
 
+def _photograph(given: Any) -> Any:
+    """Counts as parts of the largest, and (y, x, 3) as (3, y, x); anything else as it is."""
+    if checks.is_traced(given) or isinstance(given, jax.Array):
+        return given
+    array = np.asarray(given)
+    if array.ndim == 3 and array.shape[-1] in (3, 4) and min(array.shape[:2]) > 4:
+        array = np.moveaxis(array[..., :3], -1, 0)
+    return array / np.iinfo(array.dtype).max if array.dtype.kind == "u" else array
+
+
 def _radiances(given: Any) -> Float[Array, "*batch y x"]:
-    """The check of an image: floating, finite, not negative."""
+    """The check of an image: floating, finite, not negative; a photograph as a batch of colours."""
+    given = _photograph(given)
     if not checks.is_traced(given) and np.asarray(given).dtype.kind not in "fiub":
         raise TypeError(
             f"image is a {type(given).__name__} of {np.asarray(given).dtype}; give an array of "
@@ -30,7 +42,6 @@ def _radiances(given: Any) -> Float[Array, "*batch y x"]:
         raise ValueError(f"image has shape {image.shape}; give a non-empty (…, y, x) array")
     if not checks.is_traced(image) and not np.isfinite(np.asarray(image)).all():
         raise ValueError("image holds NaN or infinity; give finite radiances")
-    checks.channels_first("image", image.shape)
     if not checks.is_traced(image) and (np.asarray(image) < 0).any():
         raise ValueError(
             f"image holds {np.asarray(image).min():.3g}, a negative radiance; give radiances >= 0"
@@ -41,7 +52,9 @@ def _radiances(given: Any) -> Float[Array, "*batch y x"]:
 class ImagePlane(Module):
     """A flat, self-luminous image, centred on the optical axis, facing the camera.
 
-    - `image`: radiance, (*batch, y, x), in any unit; a batch can hold the colour channels.
+    - `image`: radiance, (*batch, y, x), in any unit; a batch can hold the colour channels. A
+      photograph is taken as it is, too: (y, x, 3), a PIL image, unsigned integers as parts of their
+      largest value (its gamma is not undone).
     - `distance`: to the mask, mm.
     - `width`: physical width of the image, mm; its pixels are square.
     - `moves`: x of its middle at the beginning and the end of an exposure, mm: it moves uniformly,

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from thincam_jax._core.grids import Grid, fast_shape
 from thincam_jax._core.precision import itemsize_of
 from thincam_jax.lensless.masks.base import AbstractFactoredMask, AbstractMask, term_count
-from thincam_jax.lensless.method import SAMPLED, PsfMethod
+from thincam_jax.lensless.method import PIXEL_NODES, SAMPLED, PsfMethod, has_few_terms
 from thincam_jax.lensless.propagation.angular_spectrum import padded_shape
 
 # Real operations of one chirp integral (both edges in both their forms, with their phasors), of the
@@ -71,7 +71,12 @@ def _separable_sum(mask, shape: tuple[int, int], method: PsfMethod) -> tuple[flo
     count, cells, chirped = known.terms, known.cells, known.chirped
     pairs = count * (count + 1) // 2
     if method.model == "separable":
-        nodes = method.nodes if method.pixel_integration else 1
+        nodes = (method.nodes or PIXEL_NODES) if method.pixel_integration else 1
+        if not has_few_terms(mask):
+            across = cells * count * max(shape) * (not chirped)  # the mask's cells, once a node
+            edges = (_CHIRP * count if chirped else _EDGE) * length * cells
+            flops = nodes * (6.0 * (count * math.prod(shape) + across) + edges)
+            return flops, 8.0 * (count + cells) * length + 6.0 * math.prod(shape)
         at_once = length * (count * cells if chirped else cells + 1)
         flops = nodes * (_CHIRP if chirped else _EDGE) * at_once
         flops += nodes * 16 * count * cells * length * (not chirped)

@@ -15,8 +15,15 @@ from thincam_jax._core.precision import allow, as_complex, cast, precision_of
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.cost import psf_cost
 from thincam_jax.lensless.digits import require_digits
-from thincam_jax.lensless.masks.base import AbstractMask
-from thincam_jax.lensless.method import SAMPLED, Model, PsfMethod, psf_method
+from thincam_jax.lensless.masks.base import AbstractMask, require_factored
+from thincam_jax.lensless.method import (
+    PIXEL_NODES,
+    SAMPLED,
+    Model,
+    PsfMethod,
+    has_few_terms,
+    psf_method,
+)
 from thincam_jax.lensless.propagation.angular_spectrum import angular_spectrum
 from thincam_jax.lensless.propagation.chirp_sum import ChirpSum
 from thincam_jax.lensless.propagation.closed_form import closed_form, in_focus
@@ -25,6 +32,7 @@ from thincam_jax.lensless.propagation.paraxial import paraxial
 from thincam_jax.lensless.propagation.path import Path
 from thincam_jax.lensless.propagation.rayleigh_sommerfeld import rayleigh_sommerfeld
 from thincam_jax.lensless.propagation.separable import pixel_nodes, separable
+from thincam_jax.lensless.propagation.separable_field import separable_image
 from thincam_jax.lensless.propagation.separable_sum import SeparableSum, centre_phase
 from thincam_jax.lensless.sampling import require_phase_sampling
 
@@ -102,7 +110,11 @@ def _closed(
     if model == "geometric":
         return geometric(mask, grid, path, pixel_integration=average)
     if model == "separable":
-        return separable(mask, grid, path, pixel_integration=average, nodes=method.nodes)
+        factored = require_factored(mask, model)
+        if not has_few_terms(factored):
+            return separable_image(factored, grid, path, nodes=method.nodes if average else None)
+        nodes = method.nodes or PIXEL_NODES
+        return separable(mask, grid, path, pixel_integration=average, nodes=nodes)
     return paraxial(mask, path) if model == "paraxial" else closed_form(mask, path)
 
 
@@ -140,7 +152,7 @@ def _evaluate(function, mask: AbstractMask, grid: Grid, path: Path, method: PsfM
     """In the method's precision; the result comes back in the camera's."""
     own = precision_of(grid.pitch)
     require_phase_sampling(mask, grid, path, method)
-    if method.model == "separable" and method.pixel_integration:
+    if method.model == "separable" and method.pixel_integration and method.nodes is None:
         method = replace(method, nodes=pixel_nodes(mask, grid, path, method.float_type))
     with allow(method.float_type, mask, grid, path):
         if method.precision != own:

@@ -8,6 +8,7 @@ from thincam_jax.measured.preparation import prepare as prepare
 from thincam_jax.measured.raw import CaptureFileError as CaptureFileError
 from thincam_jax.measured.raw import MeasurementError as MeasurementError
 from thincam_jax.measured.raw import Raw as Raw
+from thincam_jax.measured.read import NonlinearWarning as NonlinearWarning
 from thincam_jax.measured.read import list_captures as list_captures
 from thincam_jax.measured.read import read_image as read_image
 from thincam_jax.measured.read import read_images as read_images

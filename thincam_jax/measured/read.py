@@ -1,4 +1,4 @@
-"""Image files: TIFF, PNG and NPY, recognised by their first bytes, not by their names."""
+"""Image files: TIFF, PNG, NPY and JPEG, recognised by their first bytes, not by their names."""
 
 import contextlib
 import io
@@ -25,6 +25,7 @@ SUFFIXES = (".tif", ".tiff", ".png", ".npy")
 _STARTS = {
     b"\x89PNG\r\n\x1a\n": "png",
     b"\x93NUMPY": "npy",
+    b"\xff\xd8\xff": "jpeg",
     b"II*\0": "tiff",
     b"MM\0*": "tiff",
     b"II+\0": "tiff",  # BigTIFF: more than 4 GB
@@ -40,15 +41,24 @@ _PLAIN = (
     tifffile.PHOTOMETRIC.CFA,
     tifffile.PHOTOMETRIC.LINEAR_RAW,
 )
+_NONLINEAR = (
+    "a JPEG's counts are not in proportion to the light (gamma, tone curve, compression), so that "
+    "images show rings and wrong greys; save the camera's raw frames as TIFF or PNG"
+)
 _PNG_CHANNELS = {0: 1, 2: 3, 4: 2, 6: 4}  # by colour type
 _PNG_END = b"\0\0\0\0IEND\xaeB`\x82"
+
+
+class NonlinearWarning(UserWarning):
+    """A capture that is not in proportion to the light."""
 
 
 def read_image(path: str | os.PathLike[str], bits: int | None = None) -> Raw:
     """Read one image as it is stored, without scaling or gamma.
 
     TIFF and PNG of 8 or 16 bit a sample, grey or RGB, and NPY; floats in TIFF and NPY. An opaque
-    alpha channel is dropped. `bits` is the bit depth of the camera (see `Raw`).
+    alpha channel is dropped. `bits` is the bit depth of the camera (see `Raw`). A JPEG is read with
+    a NonlinearWarning: its counts are not in proportion to the light.
 
     **Errors**: CaptureFileError, one line, for a file that is missing, truncated, damaged or no
     image, for a stack of images, and for everything that `Raw` refuses.
@@ -145,8 +155,13 @@ def _decode(path: Path, stack: bool = False) -> tuple[list[np.ndarray], str, int
     if kind is None:
         short = not data or any(start.startswith(data) for start in _STARTS)
         what = "is empty or cut short" if short else "is not an image that can be read"
-        raise CaptureFileError(f"{path}: {what}; give an undamaged TIFF, PNG or NPY file")
-    readers = {"png": _read_png, "tiff": partial(_read_tiff, stack=stack), "npy": _read_npy}
+        raise CaptureFileError(f"{path}: {what}; give an undamaged TIFF, PNG, JPEG or NPY file")
+    readers = {
+        "png": _read_png,
+        "jpeg": _read_jpeg,
+        "tiff": partial(_read_tiff, stack=stack),
+        "npy": _read_npy,
+    }
     try:
         with _silence():
             images, bits = readers[kind](data)
@@ -158,6 +173,8 @@ def _decode(path: Path, stack: bool = False) -> tuple[list[np.ndarray], str, int
             f"{path}: cannot be read as {kind.upper()} ({reason}); the file is cut short, damaged "
             "or of a rare kind: copy it again or save it anew"
         ) from None
+    if kind == "jpeg":
+        warnings.warn(f"{path}: {_NONLINEAR}", NonlinearWarning, stacklevel=3)
     return images, kind, bits
 
 
@@ -217,6 +234,10 @@ def _read_png(data: bytes) -> tuple[list[np.ndarray], int]:
     _refuse_bomb(rows * columns * _PNG_CHANNELS[colour] * depth // 8, len(data))
     pixels = imagecodecs.png_decode(data)
     return [_without_alpha(pixels, pixels.ndim == 3 and pixels.shape[2] in (2, 4))], depth
+
+
+def _read_jpeg(data: bytes) -> tuple[list[np.ndarray], int]:
+    return [imagecodecs.jpeg8_decode(data)], 8
 
 
 def _read_tiff(data: bytes, *, stack: bool) -> tuple[list[np.ndarray], int | None]:

@@ -114,7 +114,7 @@ def _fine_lines(mask: AbstractFactoredMask, half_sensor: Array, path: Path, exac
     return fields, reach, pairs(terms.coefficients)
 
 
-def _spread(count: int, most: int) -> Float[np.ndarray, " chosen"]:
+def spread(count: int, most: int) -> Float[np.ndarray, " chosen"]:
     """At most `most` centred indices out of `count`, one of each of equal strata."""
     edges = np.linspace(0, count, min(count, most) + 1)
     inside = np.random.default_rng(2).uniform(size=len(edges) - 1)
@@ -277,7 +277,7 @@ class MaskProbe:
 
     def rayleigh_sommerfeld(self, method: PsfMethod) -> float:
         """The same for the direct sum, from a few pixels: where it aliases, no line shows it."""
-        few = [_spread(count, _FEW) for count in self.shape]
+        few = [spread(count, _FEW) for count in self.shape]
         with allow("float64"):
             mask, pitch, path = self.given["float64"]
             points = SparseGrid(few[0], few[1], pitch)

@@ -1,4 +1,4 @@
-r"""The error of a sampled PSF, for masks without an exact one: from finer samples of its middle.
+r"""The error of a sampled PSF, for masks without a short one: from finer samples of its middle.
 
 The mask's central part is propagated with n and with m > n samples a pixel. Its PSF has errors
 that fall with the samples as 1/n at worst, that of hard edges, so that (Richardson)
@@ -7,6 +7,9 @@ that fall with the samples as 1/n at worst, that of hard edges, so that (Richard
 
 The part's rim is an edge which the whole mask has not there, and has more of it: more is predicted
 than found.
+
+Of a mask of many terms the field is exact, and the pixels' average is sampled: on a lattice of n
+points, whose error falls as 1/n, too. Some rows and columns of the sensor show that of the whole.
 
 Samples do not widen the window, whose band limit cuts the waves far behind a small mask: some 0.5 %
 of the PSF at a Fresnel number w²/(λd) of 6, 10 % at 1. That is told by rows and columns of the
@@ -18,12 +21,22 @@ from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from thincam_jax._core.grids import Grid
-from thincam_jax._core.precision import RESULT_ROUNDING, precision_of
-from thincam_jax.lensless.masks.base import AbstractMask
-from thincam_jax.lensless.method import PsfMethod, psf_method
+from thincam_jax._core.precision import (
+    PRECISIONS,
+    RESULT_ROUNDING,
+    Precision,
+    allow,
+    cast,
+    precision_of,
+)
+from thincam_jax.lensless.accuracy.lines import SparseGrid
+from thincam_jax.lensless.accuracy.probe import spread
+from thincam_jax.lensless.masks.base import AbstractFactoredMask, AbstractMask
+from thincam_jax.lensless.method import LATTICE_POINTS, PsfMethod, psf_method
 from thincam_jax.lensless.propagation.angular_spectrum import (
     PADDING,
     angular_spectrum,
@@ -33,10 +46,13 @@ from thincam_jax.lensless.propagation.angular_spectrum import (
     propagate,
 )
 from thincam_jax.lensless.propagation.path import Path
+from thincam_jax.lensless.propagation.separable_field import separable_image
 from thincam_jax.lensless.sampling import samples_needed
 
 # Of the mask's middle, along each axis; the window of a PSF, and one that cuts nothing of note.
 _LINES, _PADDED = 12, (PADDING, 4 * PADDING)
+# Points a pixel for its average, Fibonacci numbers.
+_POINTS = (LATTICE_POINTS, 55, 144, 377)
 # Pixels of the part, along a side; samples as multiples of the fewest that hold the mask.
 _PART, _FINER = 48, (1, 3, 5, 7, 9)
 # What the part may miss of the whole.
@@ -52,10 +68,23 @@ def sampled_errors(
     pixel_integration: bool,
     norm: Callable[[Float[Array, "y x"]], Float[Array, ""] | float] = jnp.linalg.norm,
 ) -> Iterator[tuple[PsfMethod, float]]:
-    """Methods of `angular_spectrum` with ever more samples, and the error predicted of each.
+    """Methods with ever more samples, and the error predicted of each.
 
-    `norm`: in which PSFs of the mask's middle are compared.
+    They are those of `angular_spectrum`, or of `separable` for a mask of (many) terms.
+    `norm`: in which PSFs of the middle are compared.
     """
+    if isinstance(mask, AbstractFactoredMask):
+        rounding = _field_rounding(mask, grid, path)
+        exact = PsfMethod("separable", precision_of(grid.pitch), pixel_integration)
+        if not pixel_integration:
+            yield exact, rounding
+            return
+        methods = [replace(exact, nodes=n) for n in _POINTS]
+        middle = grid.with_shape((min(grid.shape[0], _PART), min(grid.shape[1], _PART)))
+        points = _spread_pixels(grid) if norm is jnp.linalg.norm else middle
+        for method, off in _richardson(methods, lambda m: _field(mask, points, path, m), norm):
+            yield method, off + rounding
+        return
     fewest = samples_needed(mask, grid, path, "angular_spectrum")
     fewest = max(fewest, 3 if pixel_integration else 1)
     methods = [
@@ -66,13 +95,48 @@ def sampled_errors(
     ]
     rounding = SAMPLED_ROUNDING[precision_of(grid.pitch)]
     cut = float(_cut_by_window(mask, grid, path, methods[0]))
-    before = _central(mask, grid, path, methods[0])
+    for method, off in _richardson(methods, lambda m: _central(mask, grid, path, m), norm):
+        yield method, off + cut + rounding
+
+
+def _richardson(
+    methods: list[PsfMethod],
+    psf_of: Callable[[PsfMethod], Float[Array, "y x"]],
+    norm: Callable[[Float[Array, "y x"]], Float[Array, ""] | float],
+) -> Iterator[tuple[PsfMethod, float]]:
+    """Each method but the finest, and its error predicted from the next one's PSF."""
+    before = psf_of(methods[0])
     for method, finer in zip(methods, methods[1:], strict=False):
-        after = _central(mask, grid, path, finer)
+        after = psf_of(finer)
         size = float(norm(after))
         off = float(norm(before - after)) / size if size > 0 else 0.0  # a dark scene
-        yield method, _MARGIN * off / (1 - method.samples / finer.samples) + cut + rounding
+        share = (method.nodes or method.samples) / (finer.nodes or finer.samples)
+        yield method, _MARGIN * off / (1 - share)
         before = after
+
+
+def _field_rounding(mask: AbstractFactoredMask, grid: Grid, path: Path) -> float:
+    """Relative error that the precision leaves in the field's square, from some of its pixels."""
+    precision = precision_of(grid.pitch)
+    points, method = _spread_pixels(grid), PsfMethod("separable")
+    found: dict[Precision, np.ndarray] = {}
+    with allow("float64", mask, points, path):
+        for kind in PRECISIONS:
+            found[kind] = np.asarray(_field(*cast((mask, points, path), kind), method), float)
+    size = float(np.linalg.norm(found["float64"])) or 1.0
+    off = _MARGIN * float(np.linalg.norm(found["float32"] - found["float64"])) / size
+    return off if precision == "float32" else SAMPLED_ROUNDING[precision]
+
+
+def _spread_pixels(grid: Grid) -> SparseGrid:
+    """Some rows and columns from all over the sensor."""
+    rows, columns = (spread(count, _PART) for count in grid.shape)
+    return SparseGrid(rows, columns, grid.pitch)
+
+
+@jax.jit(static_argnames="method")
+def _field(mask: AbstractFactoredMask, grid: Grid, path: Path, method: PsfMethod):
+    return separable_image(mask, grid, path, nodes=method.nodes)
 
 
 @jax.jit(static_argnames="method")

@@ -16,7 +16,7 @@ from thincam_jax.lensless.accuracy.sampled import sampled_errors
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.cost import Cost, psf_cost
 from thincam_jax.lensless.digits import held_in_single
-from thincam_jax.lensless.masks.base import AbstractFactoredMask, AbstractMask
+from thincam_jax.lensless.masks.base import AbstractFactoredMask, AbstractMask, term_count
 from thincam_jax.lensless.method import (
     PIXEL_NODES,
     Model,
@@ -87,9 +87,11 @@ def select_model(
     `paraxial_error` and in the reasons: it is common to all the closed forms, is mostly the fringes
     far from the aperture's edges, and falls by orders of magnitude with `pixel_integration`.
 
-    Masks without few separable terms, such as phase masks, have no exact PSF. For them the choice
-    is among samples a pixel of `angular_spectrum`, by what more of them change in the mask's middle
-    (`thincam_jax.lensless.accuracy.sampled`).
+    Masks without separable terms, such as phase masks, have no exact PSF. For them the choice is
+    among samples a pixel of `angular_spectrum`, by what more of them change in the mask's middle;
+    for masks of more than 128 terms, whose field `separable` has exactly, among points of the
+    pixel's average (`thincam_jax.lensless.accuracy.sampled`). How far Fresnel's approximation is
+    from exact diffraction is not estimated for these.
 
     **Arguments**: `wavelength`, `object_distance`, `pixel_integration` and `grid` as for `psf`;
     `tolerance` > 0. Numbers must be known: call it outside of jit and grad.
@@ -155,19 +157,36 @@ def _select_sampled(
         if error <= tolerance:
             break
     chosen, method = considered[-1], considered[-1].method
+    many = isinstance(mask, AbstractFactoredMask)
+    left = f"{chosen.predicted_error:.1e}"
     reasons = (
-        f"a {type(mask).__name__} has no exact PSF: of 'angular_spectrum' with "
-        f"{method.samples}×{method.samples} samples a pixel, the mask's middle with more "
-        f"of them differs so that {chosen.predicted_error:.1e} is left; far behind a small mask "
-        "most of that is cut off by the window, and a larger mask_shape of psf cuts less",
-        "errors are counted from scalar diffraction without Fresnel's approximation",
+        _many_terms(mask, chosen)
+        if many
+        else (
+            f"a {type(mask).__name__} has no exact PSF: of 'angular_spectrum' with "
+            f"{method.samples}×{method.samples} samples a pixel, the mask's middle with more "
+            f"of them differs so that {left} is left; far behind a small mask "
+            "most of that is cut off by the window, and a larger mask_shape of psf cuts less",
+            "errors are counted from scalar diffraction without Fresnel's approximation",
+        )
     )
     return Selection(
         **vars(chosen),
         meets_tolerance=chosen.predicted_error <= tolerance,
-        paraxial_error=0.0,
+        paraxial_error=math.nan if many else 0.0,
         reasons=reasons,
         considered=tuple(considered),
+    )
+
+
+def _many_terms(mask: AbstractFactoredMask, chosen: Prediction) -> tuple[str, ...]:
+    """The reasons for a mask of many terms."""
+    averaged = ""
+    if points := chosen.method.nodes:
+        averaged = f", a pixel's average by {points} points: {chosen.predicted_error:.1e}"
+    return (
+        f"'separable' adds up the field of the mask's {term_count(mask).terms} terms{averaged}",
+        "errors are counted from the exact Fresnel field",
     )
 
 

@@ -48,11 +48,12 @@ def choose_psf(seen: SeenScene, tolerance: float) -> tuple[PsfMethod, float]:
 
 
 def _choose_samples(seen: SeenScene, tolerance: float) -> tuple[PsfMethod, float]:
-    """The fewest samples of a mask without few terms, in the precision whose rounding allows it."""
+    """The fewest samples of a mask of many or no terms, in the precision that rounding allows."""
     single = 2 * seen.crop * SAMPLED_ROUNDING["float32"] <= tolerance
     precision: Precision = "float32" if single else "float64"
     tried = [_samples_at(seen, corner, precision, tolerance) for corner in seen.corners]
-    method = seen.sampled(max(method.samples for method, _ in tried))
+    method = max((method for method, _ in tried), key=lambda m: (m.samples, m.nodes or 0))
+    method = seen.sampled(method.samples) if method.model == "angular_spectrum" else method
     return replace(method, precision=precision), max(error for _, error in tried)
 
 

@@ -13,6 +13,7 @@ from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.cost import Cost, convolution_cost, psf_cost
 from thincam_jax.lensless.digits import held_in_single
 from thincam_jax.lensless.forward import project, projected_shape
+from thincam_jax.lensless.masks.base import AbstractFactoredMask
 from thincam_jax.lensless.method import (
     CLOSED,
     Model,
@@ -85,7 +86,8 @@ class SeenScene:
     @functools.cached_property
     def rough(self) -> PsfMethod:
         """Estimate of the capture's energy."""
-        return _ROUGH if isinstance(self.probe, TransferProbe) else self.sampled(1)
+        factored = isinstance(self.camera.mask, AbstractFactoredMask)
+        return _ROUGH if factored else self.sampled(1)
 
     def sampled(self, least: int) -> PsfMethod:
         """`angular_spectrum` with the samples that hold the mask for all light, or with more."""

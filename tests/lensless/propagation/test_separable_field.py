@@ -1,0 +1,126 @@
+"""`separable` of masks of many terms: the field first, its square then."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import thincam_jax as tc
+from helpers import relative_l2
+from thincam_jax.lensless.method import LATTICE_POINTS, AccuracyWarning
+from thincam_jax.lensless.propagation.separable import separable
+from thincam_jax.lensless.propagation.separable_field import lattice, separable_image
+from thincam_jax.units import nm, um
+
+SENSOR = tc.Sensor((14, 19), 11 * um)
+RANDOM = np.random.default_rng(0)
+MASKS = {
+    "wide": tc.SampledMask(RANDOM.uniform(0, 1, (5, 8)), 20 * um, centre=(0.01, -0.02)),
+    "tall, with gaps": tc.SampledMask(
+        RANDOM.normal(size=(8, 5)) + 0.3j, 20 * um, fill_factor=0.5, centre=(0.02, 0)
+    ),
+    "zone plate": tc.FresnelZoneAperture(beta=25.0, phase=0.4, width=0.3),
+}
+
+
+def camera_of(mask):
+    return tc.LenslessCamera(mask, SENSOR, 3.0)
+
+
+def parts_of(mask):
+    camera = camera_of(mask)
+    return mask, camera.sensor.grid, camera.path(500 * nm, 40.0)
+
+
+@pytest.mark.parametrize("mask", MASKS.values(), ids=MASKS)
+def test_the_products_of_all_pairs_add_up_to_it(mask):
+    given = parts_of(mask)
+    assert relative_l2(separable_image(*given, nodes=None), separable(*given).image()) < 1e-13
+
+
+def test_averages_approach_those_of_gauss():
+    """As one over the points, closer with few than the same number of Gauss nodes on a square."""
+    given = parts_of(tc.SampledMask(RANDOM.integers(0, 2, (40, 50)), 20 * um))
+    exact = separable(*given, pixel_integration=True).image()
+    off = {n: relative_l2(separable_image(*given, nodes=n), exact) for n in (21, 144)}
+    square = relative_l2(separable(*given, pixel_integration=True, nodes=5).image(), exact)
+    assert off[21] < min(0.012, square / 2) and off[144] < 0.2 * off[21]
+
+
+@pytest.mark.parametrize("count", [1, 2, 21, 55, 100])
+def test_lattice(count):
+    """Each coordinate takes all midpoints; points turned by 180° are points."""
+    points = lattice(count)
+    midpoints = (np.arange(count) + 0.5) / count - 0.5
+    for axis in (0, 1):
+        np.testing.assert_allclose(np.sort(points[:, axis]), midpoints, atol=1e-12)
+    np.testing.assert_allclose(points[::-1], -points, atol=1e-12)
+
+
+def test_slopes_and_batches():
+    """In distance, light and cells, against finite differences; no new program for new values."""
+    mask, grid, path = parts_of(MASKS["wide"])
+    traces = []
+
+    @jax.jit
+    def brightness(amplitude, distance, wavelength):
+        traces.append(0)
+        changed = tc.SampledMask(amplitude, mask.pitch, centre=mask.centre)
+        moved = type(path)(wavelength, distance, path.object_distance)
+        image = separable_image(changed, grid, moved, nodes=3)
+        return jnp.sum(image * jnp.cos(jnp.arange(grid.shape[1])))
+
+    at = (mask.amplitude, jnp.asarray(3.0), jnp.asarray(500 * nm))
+    slopes = jax.grad(brightness, argnums=(0, 1, 2))(*at)
+    way = (jnp.asarray(RANDOM.normal(size=(5, 8))), jnp.asarray(0.1), jnp.asarray(20 * nm))
+    step = 1e-4
+
+    def moved(sign):
+        return brightness(*(a + sign * step * w for a, w in zip(at, way, strict=True)))
+
+    expected = (moved(1) - moved(-1)) / (2 * step)
+    found = sum(jnp.sum(s * w) for s, w in zip(slopes, way, strict=True))
+    assert float(found) == pytest.approx(float(expected), rel=1e-5)
+    assert len(traces) == 1
+    distances = jnp.asarray([2.9, 3.1])
+    both = jax.vmap(lambda d: brightness(at[0], d, at[2]))(distances)
+    one_by_one = [brightness(at[0], d, at[2]) for d in distances]
+    np.testing.assert_allclose(both, one_by_one, rtol=1e-12)
+
+
+def test_masks_of_many_terms_take_it():
+    """With a word on its accuracy once; a number of points that is given says it is known."""
+    camera = camera_of(tc.SampledMask(RANDOM.integers(0, 2, (130, 141)), 5 * um))
+    how: dict[str, Any] = {
+        "wavelength": 500 * nm,
+        "object_distance": 40.0,
+        "pixel_integration": True,
+    }
+    with pytest.warns(AccuracyWarning, match="130 terms .* 21 points .* nodes=144"):
+        quick = tc.psf(camera, **how)
+    same = tc.psf(camera, model=tc.PsfMethod("separable", nodes=LATTICE_POINTS), **how)
+    np.testing.assert_array_equal(quick, same)
+    better = tc.psf(camera, model=tc.PsfMethod("separable", nodes=144), **how)
+    assert 1e-3 < relative_l2(quick, better) < 0.04
+    how["pixel_integration"] = False
+    centres = tc.psf(camera, **how)
+    given = camera.mask, camera.sensor.grid, camera.path(500 * nm, 40.0)
+    assert relative_l2(centres, separable(*given).image()) < 1e-12
+    single = tc.PsfMethod("separable", "float32")
+    rounded = tc.psf(camera, model=single, **how)
+    assert relative_l2(rounded, centres) < 1e-4
+
+
+@pytest.mark.parametrize("average", [False, True])
+def test_predicted_error_is_above_the_true_one(average):
+    camera = camera_of(tc.SampledMask(RANDOM.integers(0, 2, (131, 140)), 10 * um))
+    how: dict[str, Any] = {"wavelength": 500 * nm, "object_distance": 40.0}
+    how["pixel_integration"] = average
+    chosen = tc.select_model(camera, tolerance=0.01, **how)
+    assert chosen.meets_tolerance and chosen.method.model == "separable"
+    exact = tc.psf(camera, model=tc.PsfMethod("separable", nodes=610 if average else None), **how)
+    error = relative_l2(tc.psf(camera, model=chosen.method, **how), exact)
+    assert error <= chosen.predicted_error <= 0.01
+    assert "131 terms" in chosen.reasons[0]

@@ -1,0 +1,98 @@
+r"""`separable` of a mask of many terms: its Fresnel field as one matrix product."""
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Complex, Float
+
+from thincam_jax._core.grids import Grid
+from thincam_jax._core.precision import as_complex, product
+from thincam_jax.lensless.masks.base import AbstractFactoredMask, MaskTerms
+from thincam_jax.lensless.propagation.chirp import edge_wave
+from thincam_jax.lensless.propagation.path import Path
+from thincam_jax.lensless.propagation.separable import axis_fields
+
+
+def separable_image(
+    mask: AbstractFactoredMask, grid: Grid, path: Path, *, nodes: int | None
+) -> Float[Array, "y x"]:
+    r"""PSF of a mask of K terms, |Σ_k c_k A_k(x) B_k(y)|² summed before it is squared.
+
+    The same field as `separable`'s, at 8K operations a pixel in place of the 2K² of its products.
+    A pixel's average is the mean over `nodes` points of it, None for its centre. They are a rank-1
+    lattice: as many different rows and columns as there are points, since the waves of the edges
+    along one axis are fine along the other only. It is off by some 0.35/nodes of the PSF, where
+    pixels hold many fringes, against 1/√nodes of a square of as many Gauss nodes.
+    """
+    terms = mask.terms(path.wavelength)
+    scale = path.magnification
+    y, x = grid.y / scale - mask.centre[0], grid.x / scale - mask.centre[1]
+    pitch = grid.pitch / scale
+    cells = None if terms.rows.curvatures is not None else _cells(terms)
+
+    @jax.checkpoint
+    def irradiance(place: Float[Array, "2"]) -> Float[Array, "y x"]:
+        down, across = y + place[0] * pitch, x + place[1] * pitch
+        if cells is None:
+            rows = terms.coefficients[:, None] * axis_fields(terms.rows, path, down)
+            columns = axis_fields(terms.columns, path, across)
+        else:
+            rows = _cell_fields(terms.rows.edges, path, down)
+            columns = _cell_fields(terms.columns.edges, path, across)
+            if len(rows) <= len(columns):
+                columns = product(cells, columns)
+            else:
+                rows = product(cells.T, rows)
+        return _square_of_product(rows, columns)
+
+    if nodes is None:
+        return irradiance(jnp.zeros(2, x.dtype))
+    places = jnp.asarray(lattice(nodes), x.dtype)
+    total, _ = jax.lax.scan(
+        lambda total, place: (total + irradiance(place), None),
+        jnp.zeros(grid.shape, x.dtype),
+        places,
+    )
+    return total / nodes
+
+
+def lattice(count: int) -> Float[np.ndarray, "point 2"]:
+    """Points (u, frac(g·u)), u = (i + ½)/count, of a rank-1 lattice about the pixel's centre.
+
+    g is odd, has no divisor in common with the count and is next to count/golden ratio or its
+    complement: of Fibonacci numbers, the best lattice (Niederreiter, CBMS-NSF 63 (1992), ch. 5).
+    Odd, so that the points turned by 180° are the points.
+    """
+    golden = (math.sqrt(5) - 1) / 2 * count
+    odd = [g for g in range(1, max(count, 2), 2) if math.gcd(g, count) == 1]
+    generator = min(odd, key=lambda g: min(abs(g - golden), abs(count - g - golden)))
+    first = (np.arange(count) + 0.5) / count
+    return np.stack([first, first * generator % 1], axis=-1) - 0.5
+
+
+def _cells(terms: MaskTerms) -> Complex[Array, "row column"]:
+    """The mask's transmittance in each pair of cells."""
+    return product(terms.rows.values.T * terms.coefficients, terms.columns.values)
+
+
+def _cell_fields(
+    edges: Float[Array, " edge"], path: Path, x: Float[Array, " n"]
+) -> Complex[Array, "cell n"]:
+    """Field of each open cell alone, along one axis; see `axis_fields`."""
+    offset = edges[:, None] - x
+    lit = (offset[:-1] < 0) & (offset[1:] >= 0)
+    waves = edge_wave(path.fresnel_curvature, offset)
+    field = as_complex(lit.astype(x.dtype)) * (1 + 1j) + waves[:-1] - waves[1:]
+    return field * jnp.asarray(np.sqrt(0.5), field.dtype)
+
+
+def _square_of_product(
+    rows: Complex[Array, "k y"], columns: Complex[Array, "k x"]
+) -> Float[Array, "y x"]:
+    """|rowsᵀ columns|² by three real products, which processors do faster than complex ones."""
+    first = product(rows.real.T, columns.real)
+    second = product(rows.imag.T, columns.imag)
+    both = product((rows.real + rows.imag).T, columns.real + columns.imag)
+    return (first - second) ** 2 + (both - first - second) ** 2
