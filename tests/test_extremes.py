@@ -125,7 +125,7 @@ def difference(extreme: Extreme, name: str) -> tuple[float, float]:
 # Near and far, in focus, the finest zones and shadows larger than their mask: one program serves
 # these, in either precision. A pixel average of the shadow's edge is a program of its own.
 QUICK = ("focus", "d = 1 µm", "t = 0.1 mm", "t = ∞", "β = 1e6")
-SINGLE = ("the thesis' camera", "geometric: β at Nyquist, pixel average")
+SINGLE = ("geometric: β at Nyquist, pixel average",)
 
 
 def is_quick(extreme: Extreme, dtype) -> bool:

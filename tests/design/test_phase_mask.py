@@ -140,6 +140,7 @@ def test_psfs_of_a_setting_are_the_cameras(retrieved):
     np.testing.assert_allclose(both, several.mean(axis=1, keepdims=True), atol=1e-9)
 
 
+@pytest.mark.thorough
 def test_refinement_beats_the_retrieved_phase_at_equal_levels(retrieved):
     """Expected error of the best linear image of 10 × 12 samples, crop included; four levels."""
     _, mask, limits = retrieved

@@ -60,6 +60,7 @@ def test_of_a_plain_function():
     assert second.tolerance is None and str(second) == "15.00"
 
 
+@pytest.mark.thorough
 def test_of_an_actual_objective():
     """A change by the tolerance costs 1 %, on one side or the other, but for third order."""
     problem = small.problem()

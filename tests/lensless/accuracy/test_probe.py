@@ -42,7 +42,7 @@ def value(case, model, **arguments):
 @pytest.mark.parametrize(
     "case",
     [
-        case_of((60, 100), 5.5e-3),  # the middle of the shadow
+        pytest.param(case_of((60, 100), 5.5e-3), marks=pytest.mark.thorough),  # of the shadow
         case_of((60, 100), 0.07, centre=(0.3, -0.9)),  # all of it, and round it
         pytest.param(case_of((75, 120), 0.07, profile="binary"), marks=pytest.mark.thorough),
         pytest.param(case_of((75, 120), 0.07, height=3.3), marks=pytest.mark.thorough),
