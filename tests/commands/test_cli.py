@@ -144,6 +144,16 @@ class TestExitCode2:
         line = one_line(call("run", file, "--out", out))
         assert line.startswith(f"--out {out}: holds a run of another configuration")
 
+    def test_another_configuration_has_a_folder_of_its_own(self, file, tmp_path, monkeypatch):
+        """Without --out the next free number is taken, and the same configuration's found again."""
+        monkeypatch.chdir(tmp_path)
+        for taken in ("x", "x-2"):
+            Path("runs", taken).mkdir(parents=True)
+            Path("runs", taken, "config.yaml").write_text("name: other\n", encoding="utf-8")
+        given = ("--set", "name=x", "--set", "seed=4", "--dry-run")
+        said = "runs/x holds another configuration: writes to runs/x-3"
+        assert said in call("run", file, *given).output
+
     @pytest.mark.parametrize("shape", ["[2000000, 2000000]", "[100, 100000000000]"])
     def test_more_than_the_memory(self, file, shape, tmp_path):
         """Refused before any work, with the estimate."""

@@ -93,6 +93,14 @@ def test_one_psf_for_all_channels():
     assert grey.psf.shape == (1, ROWS, COLUMNS) and grey.capture.shape[0] == 3
     averaged = prepare(Raw(psf, 12), Raw(capture[..., 0], 12), 0, Preparation(psf_channels="mean"))
     np.testing.assert_array_equal(averaged.psf, found.psf)
+    with pytest.raises(MeasurementError, match="average the PSF's with `psf_channels='mean'`"):
+        prepare(Raw(psf, 12), Raw(capture[..., 0], 12))
+    advised = prepare(
+        Raw(psf, 12), Raw(capture[..., 0], 12), None, Preparation(psf_channels="mean")
+    )
+    assert advised.log["background"]["capture"]["level"] == [
+        pytest.approx(np.mean(advised.log["background"]["psf"]["level"]))
+    ]
 
 
 def test_bayer_superpixel_and_blocks_are_plain_means():
@@ -242,13 +250,11 @@ def bayer(pattern):
 
 
 def test_backgrounds_that_do_not_belong():
-    grey, colour = Raw(measured(), 12), Raw(measured(3), 12)
+    grey = Raw(measured(), 12)
     refused(r"dark frame .* has shape \(20, 36\)", grey, grey, Raw(measured()[:20], 12))
     refused("dark frame .* has 16 bit and the psf 12 bit", grey, grey, Raw(measured()))
     floats = Raw(measured().astype(float))
     refused("PSF has an unknown full scale and the capture 12 bit.*same `bits`", floats, grey)
-    options = Preparation(psf_channels="mean")
-    refused("corner of a PSF of 3 channels is no background", colour, grey, None, options)
     refused("background = nan: give a finite number", grey, grey, math.nan)
 
 

@@ -49,9 +49,9 @@ def run(
 
     with told(interrupted):
         from thincam_jax.commands import explain
-        from thincam_jax.commands.config_file import ConfigError, slug
+        from thincam_jax.commands.config_file import ConfigError
         from thincam_jax.commands.kinds import kind_of, load_experiment
-        from thincam_jax.commands.run_folder import RunFolder
+        from thincam_jax.commands.run_folder import RunFolder, folder_of
 
         if config.is_dir():
             from thincam_jax.commands.capture.command import reconstruct_store
@@ -62,7 +62,7 @@ def run(
             print(f"report: {reconstruct_store(config, out) / 'report.html'}")
             return
         asked = load_experiment(config, tuple(set_ or ()))
-        folder = RunFolder(out or Path("runs") / slug(asked.name))
+        folder = folder_of(RunFolder, out, asked.name, asked)
         kind = kind_of(asked)
         setup = kind.part(kind.build)(asked)
         warn(getattr(setup, "warnings", []))
@@ -96,13 +96,13 @@ def train(
     goes_on = "interrupted; what the last check has written is kept: --resume goes on from there"
     with told(lambda: goes_on):
         from thincam_jax.commands import explain
-        from thincam_jax.commands.config_file import slug
         from thincam_jax.commands.kinds import kind_of, load_experiment
         from thincam_jax.commands.learned.run import TrainingFolder, check_resume
+        from thincam_jax.commands.run_folder import folder_of
 
         asked = load_experiment(config, tuple(set_ or ()), "train")
         kind = kind_of(asked)
-        folder = TrainingFolder(out or Path("runs") / slug(asked.name))
+        folder = folder_of(TrainingFolder, out, asked.name, asked)
         if dry_run:
             check_resume(folder, resume)
             kind.part(kind.build)(asked)

@@ -5,7 +5,7 @@ import time
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 import pydantic
@@ -17,12 +17,14 @@ from thincam_jax.commands.checked_config import dump_config
 from thincam_jax.commands.config_file import ConfigError, slug
 from thincam_jax.commands.report import Page, render_report
 from thincam_jax.commands.sections import ExperimentConfig, Section
+from thincam_jax.commands.terminal import tell
 from thincam_jax.imaging.display import png_bytes
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Record = TypeVar("Record")
+Folder = TypeVar("Folder", bound="Outcome")
 
 
 class RunFolder:
@@ -97,6 +99,37 @@ class RunFolder:
         pictures = self.path / self.pictures
         self.write("report.html", render_report(page, config, pictures, surroundings))
         self.write(self.result, to_json(metrics))
+
+
+@runtime_checkable
+class Outcome(Protocol):
+    """A folder that can tell what would be written to it."""
+
+    path: Path
+
+    def outcome(self, config: Any, /) -> str: ...
+
+
+def folder_of(kind: Callable[[Path], Folder], out: Path | None, name: str, config: Any) -> Folder:
+    """The folder that is asked for, or runs/NAME; where that is taken, runs/NAME-2 and so on."""
+    if out is not None:
+        return kind(out)
+    first, number = Path("runs") / slug(name), 1
+    folder = kind(first)
+    while not _is_open_to(folder, config):
+        number += 1
+        folder = kind(first.with_name(f"{first.name}-{number}"))
+    if number > 1:
+        tell(f"{first} holds another configuration: writes to {folder.path}")
+    return folder
+
+
+def _is_open_to(folder: Outcome, config: Any) -> bool:
+    try:
+        folder.outcome(config)
+    except ConfigError:
+        return False
+    return True
 
 
 class Run:

@@ -144,7 +144,7 @@ def _size(raw: Raw) -> str:
     return f"{rows}×{columns}"
 
 
-def _check_background(name: str, raw: Raw, psf: Raw, background: Any) -> None:
+def _check_background(name: str, raw: Raw, psf: Raw, background: Any, options: Preparation) -> None:
     if isinstance(background, Raw):
         if background.pixels.shape != raw.pixels.shape:
             raise MeasurementError(
@@ -165,11 +165,6 @@ def _check_background(name: str, raw: Raw, psf: Raw, background: Any) -> None:
             raise MeasurementError(
                 f"the PSF has {_scale(psf)} and the {name} {_scale(raw)}, so the PSF's corner says "
                 "nothing about it; read both with the same `bits`, or give its background"
-            )
-        if psf.channels not in (1, raw.channels):
-            raise MeasurementError(
-                f"the corner of a PSF of {psf.channels} channels is no background of a {name} of "
-                f"{raw.channels}; give its background"
             )
     elif not np.isfinite(background):
         raise MeasurementError(f"background = {background!r}: give a finite number of counts")

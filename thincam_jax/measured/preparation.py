@@ -91,7 +91,10 @@ def prepare(
     square = slice(None), slice(*options.corner), slice(*options.corner)
     corner = planes["psf"][square].mean(axis=(1, 2), keepdims=True, dtype=np.float64)
     corner = corner.astype(np.float32)
-    found = {n: _background(b, raws[n], corner) for n, b in backgrounds.items()}
+    corners = {"psf": corner, "capture": corner}
+    if options.psf_channels == "mean" and psf.channels != capture.channels:
+        corners["capture"] = corner.mean(axis=0, keepdims=True)
+    found = {n: _background(b, raws[n], corners[n]) for n, b in backgrounds.items()}
     levels = {n: level for n, (level, _) in found.items()}
     noise = _noise((planes["psf"] - levels["psf"])[square].astype(np.float64), options)
     log["background"] = {n: record for n, (_, record) in found.items()}

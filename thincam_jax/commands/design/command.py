@@ -26,15 +26,15 @@ def design(
     """
     goes_on = "interrupted; the same command goes on with the targets that are not finished."
     with told(lambda: goes_on):
-        from thincam_jax.commands.config_file import slug
         from thincam_jax.commands.design.build import build_design
         from thincam_jax.commands.design.run import DesignFolder, run_design
         from thincam_jax.commands.kinds import load_experiment
+        from thincam_jax.commands.run_folder import folder_of
 
         wanted = load_experiment(config, tuple(set_ or ()), "design")
         study = build_design(wanted)
         warn(study.warnings)
-        folder = DesignFolder(out or Path("runs") / slug(wanted.name))
+        folder = folder_of(DesignFolder, out, wanted.name, wanted)
         if dry_run:
             from thincam_jax.commands import explain
 

@@ -60,8 +60,9 @@ def sweep(
         _check(scheduler, workers)
         from thincam_jax._core.precision import is_double
         from thincam_jax.commands import explain
-        from thincam_jax.commands.config_file import ConfigError, slug
+        from thincam_jax.commands.config_file import ConfigError
         from thincam_jax.commands.kinds import load_experiment
+        from thincam_jax.commands.run_folder import folder_of
         from thincam_jax.commands.study.config import StudyConfig
         from thincam_jax.commands.sweep.grid import read_axes
         from thincam_jax.commands.sweep.point import make_points
@@ -72,7 +73,7 @@ def sweep(
             raise ConfigError(f"{config}: is of kind {study.kind}; a sweep takes a study")
         axes = read_axes(grid or [], study.model_dump(mode="json", exclude_none=True))
         points = make_points(study, axes, is_double())
-        folder = SweepFolder(out or Path("runs") / f"{slug(study.name)}-sweep")
+        folder = folder_of(SweepFolder, out, f"{study.name}-sweep", study)
         if dry_run:
             writes = f"{len(points)} points; {folder.outcome(study)}"
             explain.dry_run(study, writes)
