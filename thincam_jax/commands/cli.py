@@ -151,5 +151,4 @@ def doctor() -> None:
     for name, purpose in installation.OPTIONAL.items():
         if name not in optional:
             print(f"optional {name} is missing: {purpose}")
-    for line in known_drivers():
-        print(line)
+    print("\n".join(known_drivers()))

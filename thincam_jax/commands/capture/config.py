@@ -190,6 +190,12 @@ class CaptureConfig(ExperimentConfig):
             self._check_virtual()
         return self
 
+    @property
+    def drivers(self) -> dict[Any, tuple[str, dict[str, Any]]]:
+        """Driver and options of each device, by its role."""
+        devices = {"camera": self.camera, "display": self.display, "stage": self.stage}
+        return {role: (one.driver, one.options) for role, one in devices.items() if one is not None}
+
     def _check_virtual(self) -> None:
         plan, virtual = self.plan, self.virtual
         if virtual is None:
