@@ -6,20 +6,15 @@ import pydantic
 from pydantic import Field
 
 from thincam_jax._core.quantity import FieldError
-from thincam_jax.commands.schema import section
+from thincam_jax.commands.schema import Curvature, Length, Section, Time, Wavelength, section
 from thincam_jax.commands.screen.config import SeeThroughConfig, check_cells
 from thincam_jax.commands.sections import (
-    Curvature,
     ExperimentConfig,
-    Length,
     MethodKind,
     Name,
     ObjectConfig,
-    Section,
     TargetConfig,
-    Time,
     VariationConfig,
-    Wavelength,
 )
 from thincam_jax.hardware.acquisition.taker import Procedure
 from thincam_jax.hardware.base import CameraSettings
@@ -206,9 +201,8 @@ class CaptureConfig(ExperimentConfig):
             return
         seen = virtual.screen
         if seen is None:
-            raise FieldError(
-                "a virtual rig for a plan of kind hadamard needs it", "virtual", "screen"
-            )
+            message = "a virtual rig for a plan of kind hadamard needs it"
+            raise FieldError(message, "virtual", "screen")
         if seen.hologram.colours is not None:
             message = "a plan of kind hadamard takes one colour; give wavelength in their place"
             raise FieldError(message, "virtual", "screen", "hologram", "colours")
