@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
+from thincam_jax.commands.kinds import load_experiment
 from thincam_jax.commands.study.build import build_study
-from thincam_jax.commands.study.config import load_config
 
 CONFIG = Path(__file__).parents[1] / "configs" / "fza_admm_tv.yaml"
 
@@ -16,7 +16,7 @@ def test_total_variation_beside_wiener(benchmark):
 
     3 dB were hoped for with methods A and B too; docs/thesis_studies.md says why noise forbids it.
     """
-    whole = load_config(CONFIG)
+    whole = load_experiment(CONFIG)
     wanted = ("single capture", "method B with contrasts", "method B, Wiener")
     config = whole.model_copy(
         update={

@@ -34,7 +34,7 @@ def test_hadamard_rate(benchmark, tmp_path):
         config = load_as(CaptureConfig, ROOT / "configs/rig_hadamard.yaml", sets)
         plan = command.build_plan(config)
         plan = dataclasses.replace(plan, name="part", steps=plan.steps[:FRAMES])
-        with command.opened(config) as rig:
+        with command.opened(config, plan) as rig:
             procedure = Procedure(settle=0.002, saturated=0.05)
             start, cpu = time.perf_counter(), time.process_time()
             store = tmp_path / "frames.zarr"

@@ -1,9 +1,10 @@
 """What the distance in the optics is worth: networks trained alike, with it and without.
 
-`python docs/compare_learned.py CONFIG IMAGES TUNING [COUNT] [STEPS] [POOL] [SEEDS]`, as
+`python docs/compare_learned.py IMAGES TUNING [COUNT] [STEPS] [POOL] [SEEDS]`, as
 docs/score_refocusing.py, for a camera of a quarter of the pixels. Networks and codes are trained
-on the same scenes, for the same CPU time (without compiling; the network's with drawing them),
-with so many seeds of scenes, weights and noise:
+on the same scenes, of TUNING, scikit-image's photographs and drawn ones, for the same CPU time
+(without compiling; the network's with drawing them), with so many seeds of scenes, weights and
+noise:
 
 - the network of the package, for any distance, and on scenes at 60 and 120 mm alone;
 - the control code of the thesis (chapter 4): a U-Net that is told the distance as a number beside
@@ -34,6 +35,7 @@ from score_refocusing import (
     head,
     one_plane,
     rectangle,
+    refocus_camera,
     row,
     squares,
     tune,
@@ -41,19 +43,14 @@ from score_refocusing import (
 )
 
 from thincam_jax import learn
-from thincam_jax.commands.checked_config import load_as
-from thincam_jax.commands.learned.config import LearnedConfig
-from thincam_jax.commands.learned.run import build_lessons, build_network, build_options
 from thincam_jax.learn.refocusing.baselines import ControlCode, control_loss
+from thincam_jax.learn.refocusing.sources import drawn, photographs, samples
 from thincam_jax.learn.refocusing.unet import parameter_count
 from thincam_jax.learn.training import Task, train_model
 from thincam_jax.learn.unrolled import Adam, UnrolledAdmm, train
 from thincam_jax.reconstruction.problem import InverseProblem
 
-SMALL = (
-    *("sensor.shape=[128, 128]", "sensor.pitch=88 um", "focus.shape=[64, 64]"),
-    *("scenes.side=192", "network.widths=[32, 32, 32, 32]"),
-)
+PIXELS, SIDE = 128, 192  # of the sensor, and of the images that scenes are cut of
 UNTRAINED = (52.0, 75.0, 95.0, 150.0, 190.0)
 OTHERS = (80.0, 170.0)  # another pair of planes
 
@@ -129,13 +126,18 @@ def _unrolled(model, problem):
     return model(problem)
 
 
-def learned(config, known) -> dict[str, Callable]:
-    """All that is trained, by the seed of a config: `known` pictures for the iterations."""
-    network, options, lessons = build_network(config), build_options(config), build_lessons(config)
+def untrained(seed: int) -> learn.RefocusNetwork:
+    options = learn.NetworkOptions(steps=2, widths=(32, 32, 32, 32))
+    return learn.RefocusNetwork.create(refocus_camera(PIXELS), options, key=seed)
+
+
+def learned(lessons, options, known) -> dict[str, Callable]:
+    """All that is trained, by the seed of the options: `known` pictures for the iterations."""
+    network = untrained(options.seed)
     kinds = {"any distance": lessons.scenes}
-    if not config.seed:
+    if not options.seed:
         kinds["60 and 120 mm"] = dataclasses.replace(lessons.scenes, distances=(NEAR, FAR))
-    runs = {"UnrolledAdmm": Unrolled(network.camera, known, config.seed).focus}
+    runs = {"UnrolledAdmm": Unrolled(network.camera, known, options.seed).focus}
     codes, networks = {}, {}
     for name, scenes in kinds.items():
         given, began = dataclasses.replace(lessons, scenes=scenes), time.process_time()
@@ -215,28 +217,27 @@ def interval(values: np.ndarray) -> str:
     return f"{values.mean():+.2f} ± {np.hypot.reduce(halves):.2f}"
 
 
-def main(configs, images: str, tuned: str, count: int) -> None:
-    methods = Methods(build_network(configs[0]))
+def main(images: str, tuned: str, count: int, pool: int, trainings) -> None:
+    methods = Methods(untrained(0))
     camera = methods.camera
     side = 5 * max(camera.field_shape) // 4
     pictures, known = (squares(folder, camera, side) for folder in (images, tuned))
     tune(methods, known, min(count, 6))
     plain, tables = {"Wiener": methods.wiener, "ADMM-TV": methods.admm}, []
     # Compiled before any time is taken.
-    lessons, options = (
-        dataclasses.replace(build_lessons(configs[0]), pool=1),
-        build_options(configs[0]),
-    )
-    learn.train(methods.network, lessons, dataclasses.replace(options, steps=2, check_every=1))
-    for config in configs:
-        runs = {**plain, **learned(config, known)}
-        tables.append(table(camera, runs, pictures, count, config.seed))
+    source = samples(SIDE) + photographs(tuned, SIDE) + drawn(0, 40, SIDE)
+    lessons = learn.Lessons(source, pool=pool, held_out=drawn(1, 8, SIDE))
+    short = dataclasses.replace(trainings[0], steps=2, check_every=1)
+    learn.train(methods.network, dataclasses.replace(lessons, pool=1), short)
+    for options in trainings:
+        runs = {**plain, **learned(lessons, options, known)}
+        tables.append(table(camera, runs, pictures, count, options.seed))
     summary(tables)
 
 
 if __name__ == "__main__":
-    path, images, tuned, *more = sys.argv[1:]
+    images, tuned, *more = sys.argv[1:]
     count, steps, pool, seeds = more + ["8", "4000", "120", "3"][len(more) :]
-    told = (*SMALL, f"training.steps={steps}", f"training.pool={pool}")
-    configs = [load_as(LearnedConfig, path, (*told, f"seed={seed}")) for seed in range(int(seeds))]
-    main(configs, images, tuned, int(count))
+    told = {"steps": int(steps), "rate": 6e-4, "check_every": 300}
+    trainings = [learn.TrainingOptions(**told, seed=seed) for seed in range(int(seeds))]
+    main(images, tuned, int(count), int(pool), trainings)

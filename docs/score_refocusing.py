@@ -1,11 +1,11 @@
 """A refocusing network (docs/learned.md) against what it has to beat, in one table.
 
-`python docs/score_refocusing.py CONFIG NETWORK IMAGES TUNING [COUNT]`: a training's config and its
-network; a folder of photographs that no weight has seen, and one of the training's, on which the
-strengths of the baselines are tuned; how many scenes of each kind. Prints Markdown tables: PSNR in
-dB with the half width of its 95 % interval over the photographs, SSIM, MS-SSIM; in the first ones
-each photograph with three seeds of the noise, and what the network gains on each other method, by
-differences of the same captures. All methods see the same captures. Draws
+`python docs/score_refocusing.py NETWORK IMAGES TUNING [COUNT]`: a network of `refocus_camera`, such
+as "shipped"; a folder of photographs that no weight has seen, and one of the training's, on which
+the strengths of the baselines are tuned; how many scenes of each kind. Prints Markdown tables: PSNR
+in dB with the half width of its 95 % interval over the photographs, SSIM, MS-SSIM; in the first
+ones each photograph with three seeds of the noise, and what the network gains on each other method,
+by differences of the same captures. All methods see the same captures. Draws
 docs/images/learned_measured.png of pictures that no weight has seen, either.
 """
 
@@ -25,9 +25,6 @@ from scipy import ndimage
 
 import thincam_jax as tc
 from thincam_jax import learn
-from thincam_jax.commands.checked_config import load_as
-from thincam_jax.commands.learned.config import LearnedConfig
-from thincam_jax.commands.learned.run import build_camera
 from thincam_jax.imaging.targets import middle_square, resize, sample_image
 from thincam_jax.learn.refocusing.baselines import wiener
 from thincam_jax.learn.refocusing.evaluation import (
@@ -40,10 +37,19 @@ from thincam_jax.learn.refocusing.evaluation import (
 from thincam_jax.learn.refocusing.lens_blur import lens_blur
 from thincam_jax.learn.refocusing.scenes import captured
 from thincam_jax.learn.refocusing.sources import photographs
+from thincam_jax.units import nm, um
 
 STRENGTHS = {"Wiener": (0.03, 0.1, 0.3, 1.0, 3.0), "ADMM-TV": (0.25, 0.5, 1.0, 2.0)}
 NEAR, FAR, SNR = 60.0, 120.0, 30.0
 SEEDS = (0, 1000, 2000)  # added to the noise's
+
+
+def refocus_camera(pixels: int = 256) -> learn.RefocusCamera:
+    """The camera of configs/learned_refocus.yaml, its sensor divided into so many pixels."""
+    mask = tc.FresnelZoneAperture(beta=13.0, width=5.6)
+    sensor = tc.Sensor((pixels, pixels), 256 * 44 * um / pixels)
+    thin, shape = tc.LenslessCamera(mask, sensor, distance=7.5), (pixels // 2, pixels // 2)
+    return learn.RefocusCamera(thin, 500 * nm, field_shape=shape, near=50.0, far=200.0, planes=7)
 
 
 class Shot(NamedTuple):
@@ -393,8 +399,8 @@ def picture(methods: Methods) -> None:
 
 
 if __name__ == "__main__":
-    config, path, images, tuned, *more = sys.argv[1:]
-    camera = build_camera(load_as(LearnedConfig, config))
+    path, images, tuned, *more = sys.argv[1:]
+    camera = refocus_camera()
     network = learn.load(path, camera)
     side = 5 * max(camera.field_shape) // 4
     pictures, known = (squares(folder, camera, side) for folder in (images, tuned))

@@ -1,7 +1,7 @@
 """A trained network as it comes with the package: its weights in half precision.
 
-`python docs/ship_network.py NETWORK`: a denoiser. `python docs/ship_network.py NETWORK CONFIG`: a
-refocusing network and the config of its training.
+`python docs/ship_network.py NETWORK`: a denoiser, or a refocusing network of the camera of
+docs/score_refocusing.py.
 """
 
 import sys
@@ -10,11 +10,10 @@ from pathlib import Path
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from score_refocusing import refocus_camera
 
 from thincam_jax import learn
-from thincam_jax.commands.checked_config import load_as
-from thincam_jax.commands.learned.config import LearnedConfig
-from thincam_jax.commands.learned.run import build_camera
+from thincam_jax.learn.checkpoint import read_description
 from thincam_jax.learn.denoiser.network import load_network, network_card, save_network
 from thincam_jax.learn.refocusing.store import network_description
 
@@ -25,10 +24,10 @@ def halved(weights):
     return jax.tree.map(lambda leaf: leaf.astype(jnp.float16), weights)
 
 
-path, *config = sys.argv[1:]
-if config:
+(path,) = sys.argv[1:]
+if read_description(path)["kind"] == "refocusing network":
     place = ROOM / "refocusing/shipped.thincam"
-    network = learn.load(path, build_camera(load_as(LearnedConfig, config[0])))
+    network = learn.load(path, refocus_camera())
     half = eqx.tree_at(lambda n: n.weights, network, halved(network.weights))
     learn.save(place, half, network_description(path)["training"])
 else:

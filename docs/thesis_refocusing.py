@@ -1,6 +1,6 @@
 """The thesis' test of refocusing (section 4.2), by its camera and by the one of the network here.
 
-`python docs/thesis_refocusing.py CONFIG IMAGES TUNING [COUNT]`, as docs/score_refocusing.py. Two
+`python docs/thesis_refocusing.py IMAGES TUNING [COUNT]`, as docs/score_refocusing.py. Two
 planes, the near one left and the far one right, focused on one and on the other: PSNR of the whole
 frame (table 4.2), and of the half in focus, told its distance and told the other's. If that loses
 nothing, the planes are not told apart. Draws docs/images/learned_thesis.png.
@@ -14,13 +14,22 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
-from score_refocusing import FAR, NEAR, SNR, Methods, halves, head, interval, row, squares, tune
+from score_refocusing import (
+    FAR,
+    NEAR,
+    SNR,
+    Methods,
+    halves,
+    head,
+    interval,
+    refocus_camera,
+    row,
+    squares,
+    tune,
+)
 
 import thincam_jax as tc
 from thincam_jax import learn
-from thincam_jax.commands.checked_config import load_as
-from thincam_jax.commands.learned.config import LearnedConfig
-from thincam_jax.commands.learned.run import build_camera
 from thincam_jax.imaging.targets import siemens_star
 from thincam_jax.learn.refocusing.dead_leaves import dead_leaves
 from thincam_jax.reconstruction.depth.refocus import axial_resolution
@@ -86,8 +95,8 @@ def baselines(camera) -> Methods:
     return Methods(learn.RefocusNetwork.create(camera, options, key=jax.random.key(0)))
 
 
-def main(config: str, images: str, tuned: str, count: int) -> None:
-    here = build_camera(load_as(LearnedConfig, config))
+def main(images: str, tuned: str, count: int) -> None:
+    here = refocus_camera()
     cameras = {
         "the thesis' camera": (thesis_camera(256), THESIS),
         "the camera here": (here, (NEAR, FAR)),
@@ -132,5 +141,5 @@ def picture(shown: dict[str, tuple]) -> None:
 
 
 if __name__ == "__main__":
-    config, images, tuned, *more = sys.argv[1:]
-    main(config, images, tuned, int(more[0]) if more else 8)
+    images, tuned, *more = sys.argv[1:]
+    main(images, tuned, int(more[0]) if more else 8)

@@ -92,7 +92,7 @@ class TestFolder:
     def test_done_anew_only_with_the_same_configuration(self, config, tmp_path):
         folder = accuracy.BenchFolder(tmp_path / "deep" / "new")
         folder.claim(config)
-        folder.finish({"bench": "accuracy"})
+        folder.write("accuracy.json", "{}")
         folder.claim(config)
         with pytest.raises(ConfigError, match="a benchmark of another configuration"):
             folder.claim(config.model_copy(update={"seed": 7}))

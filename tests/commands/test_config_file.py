@@ -6,7 +6,7 @@ import pytest
 from commands.study.test_config import BASE, changed, faults, line_of, load
 
 from thincam_jax.commands.config_file import ConfigError, read_value
-from thincam_jax.commands.study.config import load_config
+from thincam_jax.commands.kinds import load_experiment
 
 
 class TestYaml:
@@ -117,21 +117,21 @@ class TestFile:
         path = tmp_path / "study.yaml"
         path.write_bytes(BASE.replace("A study", "Größe").encode("latin-1"))
         with pytest.raises(ConfigError, match=r"study.yaml: not a text file in UTF-8"):
-            load_config(path)
+            load_experiment(path)
 
     def test_binary(self, tmp_path):
         path = tmp_path / "study.yaml"
         path.write_bytes(b"name: a\x00b\n")
         with pytest.raises(ConfigError, match="study.yaml.*not valid YAML"):
-            load_config(path)
+            load_experiment(path)
 
     def test_folder(self, tmp_path):
         with pytest.raises(FileNotFoundError, match="is a folder; give the path of a YAML"):
-            load_config(tmp_path)
+            load_experiment(tmp_path)
 
     def test_missing(self, tmp_path):
         with pytest.raises(FileNotFoundError, match="nothing.yaml is missing; give the path"):
-            load_config(tmp_path / "nothing.yaml")
+            load_experiment(tmp_path / "nothing.yaml")
 
 
 class TestOverrides:

@@ -19,7 +19,7 @@ def test_a_file_that_its_command_takes(kind, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     result = call("init", kind)
     assert result.exit_code == 0, result.output
-    command = kinds.next_command(kind)
+    command = kinds.read_kind(tmp_path / f"{kind}.yaml").command
     assert result.stdout == f"{kind}.yaml; next: thincam {command} {kind}.yaml\n"
     load_experiment(tmp_path / f"{kind}.yaml", command=command)
 

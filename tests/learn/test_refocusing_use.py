@@ -13,8 +13,7 @@ from learn import tiny_network as tiny
 
 import thincam_jax as tc
 from thincam_jax.commands.checked_config import load_as
-from thincam_jax.commands.learned.config import LearnedConfig
-from thincam_jax.commands.learned.run import build_camera
+from thincam_jax.commands.learned.refocusing import LearnedConfig, build_camera
 from thincam_jax.learn.checkpoint import CheckpointError, write_arrays
 from thincam_jax.learn.refocusing.baselines import wiener
 from thincam_jax.learn.refocusing.cameras import RefocusCamera

@@ -1,5 +1,6 @@
 """Studies in memory: their scores are those of a file's run; what a study refuses."""
 
+import dataclasses
 import json
 from dataclasses import asdict
 
@@ -12,9 +13,9 @@ from studies import tiny
 
 import thincam_jax as tc
 from helpers import ROOT
+from thincam_jax.commands.kinds import load_experiment
 from thincam_jax.commands.run_folder import RunFolder
 from thincam_jax.commands.study.build import build_study
-from thincam_jax.commands.study.config import load_config
 from thincam_jax.commands.study.run import run_study
 from thincam_jax.studies import Method, Target
 from thincam_jax.studies.evaluate import coupled
@@ -66,7 +67,7 @@ def test_figures_are_those_of_pyplot(result):
 def test_the_study_of_the_thesis_is_that_of_its_file():
     """Cameras, sums, solvers and noise; the scores follow from them."""
     built = tc.studies.superresolution()
-    config = load_config(ROOT / "configs" / "fza_superresolution.yaml")
+    config = load_experiment(ROOT / "configs" / "fza_superresolution.yaml")
     read = build_study(config)
     assert built.exposures == read.exposures and len(built.exposures) == 8 + 2
     for one, other in zip(built.methods, read.methods, strict=True):
@@ -127,3 +128,35 @@ def test_refused_in_one_line():
             Method("one", *given)
     with pytest.raises(ValueError, match="two of the methods .* have one name"):
         tiny.study(methods=tiny.methods() * 2)
+
+
+SETTINGS = {"wavelength": 500e-6, "width": 2.0}
+
+
+@pytest.mark.parametrize(
+    ("exposures", "synthesis", "more", "field", "message"),
+    [
+        (([25.0, 25.0], 3.0, [1, 1]), "separate", {}, "shots", "shots hold an entry twice"),
+        (([25.0, 21.0], [3.0, 4.0], None), "contrasts", {}, None, "needs shots at one distance"),
+        ((25.0, 3.0, None), "contrasts", {}, None, "give two phases or shots"),
+        ((25.0, 3.0, None), "separate", {"harmonics": (1,)}, "harmonics", "separate has none"),
+    ],
+)
+def test_methods_whose_captures_do_not_suit(exposures, synthesis, more, field, message):
+    beta, distance, take = exposures
+    settings = tc.Exposures(beta, distance, take=take, **SETTINGS)
+    with pytest.raises(ValueError, match=message) as caught:
+        Method("one", settings, tc.Wiener(), synthesis, **more)
+    assert getattr(caught.value, "field", None) == field
+
+
+def test_a_fault_between_methods_sensor_and_noise_has_its_place():
+    study = tiny.study()
+    with pytest.raises(ValueError, match="read_noise counts electrons; give sensor.exp") as caught:
+        dataclasses.replace(study, noise=tc.PoissonGaussianNoise(2.0))
+    assert caught.value.place == ("noise", "read_noise")
+    longer = tc.Exposures([25.0, 21.0], 3.0, relative_time=[1.0, 2.0], **SETTINGS)
+    method = Method("one", longer, tc.Wiener())
+    with pytest.raises(ValueError, match="relative to the sensor's") as caught:
+        dataclasses.replace(study, methods=(method,))
+    assert caught.value.place == ("methods", 0, "shots", 1, "exposure")

@@ -27,7 +27,7 @@ else:
 
 
 # mm: a longer wavelength was meant in nanometres or micrometres; light in metres has such numbers.
-_LONGEST, _IN_METRES = 0.1, (1.5e-7, 2.5e-6)
+LONGEST_LIGHT, _IN_METRES = 0.1, (1.5e-7, 2.5e-6)
 # mm: pixels of sensors are smaller.
 _LARGEST_PITCH = 1.0
 # Units of plain ratios, which nobody writes.
@@ -144,7 +144,7 @@ def wavelength(name: str, value: Any) -> Checked:
         else positive(name, value, "mm")
     )
     known = _known(array)
-    if known is not None and np.any(known > _LONGEST):
+    if known is not None and np.any(known > LONGEST_LIGHT):
         raise ValueError(
             f"{name} = {known.max():g} mm is no light: give it in mm, such as 500 * nm"
         )

@@ -57,6 +57,29 @@ def machine() -> dict[str, Any]:
     }
 
 
+def machine_report() -> list[str]:
+    """Lines with the machine, its precisions, and whether its compiled sums are right."""
+    found = environment()
+    return [
+        f"Python {found['python']} on {found['platform']}",
+        "devices: " + ", ".join(found["devices"]),
+        f"cores: {found['cores']}; memory: {found['memory']} free",
+        *(f"  {name}: {support}" for name, support in dtype_support().items()),
+        f"  compiled sums: {compiled_sums()}",
+    ]
+
+
+def package_report() -> list[str]:
+    """Lines with the versions of packages, and the purpose of optional ones that are missing."""
+    needed, optional = dict.fromkeys(PACKAGES) | installed(PACKAGES), installed(OPTIONAL)
+    missing = (name for name in OPTIONAL if name not in optional)
+    return [
+        *(f"{name} {version or 'NOT INSTALLED'}" for name, version in needed.items()),
+        *(f"optional {name} {version}" for name, version in optional.items()),
+        *(f"optional {name} is missing: {OPTIONAL[name]}" for name in missing),
+    ]
+
+
 def usable_cores() -> int:
     """Cores that this process may use."""
     try:

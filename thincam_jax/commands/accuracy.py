@@ -1,19 +1,17 @@
 """The benchmark of accuracy: errors and times of all models, and what an error costs."""
 
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any
 
 from thincam_jax._core.environment import machine
-from thincam_jax._core.files import write_whole
 from thincam_jax._core.steps import Progress, Step, carry_out
 from thincam_jax.commands.checked_config import dump_config
 from thincam_jax.commands.config_file import ConfigError
-from thincam_jax.commands.run_folder import claim_folder, to_json
-from thincam_jax.commands.sections import SensorConfig
-from thincam_jax.commands.study.build import FileStudy, build_study, check_study
-from thincam_jax.commands.study.config import StudyConfig
+from thincam_jax.commands.run_folder import RunFolder, to_json
+from thincam_jax.commands.sections import SensorConfig, StudyConfig
+from thincam_jax.commands.study.build import FileStudy, build_study, check_optics
 from thincam_jax.lensless.exposures import Exposure
+from thincam_jax.studies.evaluate import check_target
 from thincam_jax.studies.psf_error_cost import (
     AccuracyResult,
     AccuracyRun,
@@ -24,19 +22,10 @@ from thincam_jax.studies.psf_error_cost import (
 _SIZES, _CAPTURE_SIZE = (128, 256, 512), 256  # by default
 
 
-class BenchFolder:
+class BenchFolder(RunFolder):
     """`config.yaml` and `accuracy.json`, each written whole or not at all."""
 
-    def __init__(self, path: str | Path):
-        self.path = Path(path)
-
-    def claim(self, config: StudyConfig) -> None:
-        """Make the folder; ConfigError for one that holds anything but this configuration's."""
-        claim_folder(self.path, "config.yaml", dump_config(config), "benchmark")
-
-    def finish(self, results: dict[str, Any]) -> None:
-        """Write the results, which mark the benchmark as complete."""
-        write_whole(self.path / "accuracy.json", to_json(results))
+    kind, folders, result, others = "benchmark", (), "accuracy.json", ()
 
 
 @dataclass(frozen=True)
@@ -97,10 +86,10 @@ def check(config: StudyConfig, sizes: Sizes) -> Benchmark:
     study = build_study(config)
     case = make_case(study, of_captures)
     try:
-        check_study(case.study)  # pyright: ignore[reportArgumentType]
-    except ConfigError as error:
-        first = str(error).splitlines()[0]
-        raise ConfigError(f"--capture-size {of_captures}: {first}") from None
+        check_optics(case.study)  # pyright: ignore[reportArgumentType]
+        check_target(case.study, case.target)
+    except ValueError as error:
+        raise ConfigError(f"--capture-size {of_captures}: {error}") from None
     return Benchmark(study, of_psfs, case)
 
 
@@ -108,33 +97,19 @@ def run_accuracy(plan: Benchmark, folder: BenchFolder, progress: Progress) -> Ac
     """Run the benchmark into a folder."""
     folder.claim(plan.study.config)
     run = AccuracyRun(plan.study, plan.sizes, plan.case)
-    last = Step("results", lambda: folder.finish(_record(plan, run.result)))
+    last = Step("results", lambda: folder.write(folder.result, to_json(_record(plan, run.result))))
     carry_out([*run.work, last], progress)
     return run.result
 
 
 def _record(plan: Benchmark, result: AccuracyResult) -> dict[str, Any]:
-    costs = asdict(result.reconstructions)
-    return {
-        "bench": "accuracy",
-        "config": dump_config(plan.study.config),
-        "settings": _settings(plan),
-        "machine": machine(),
-        "psfs": [asdict(row) for row in result.psfs],
-        "captures": [_run_only(asdict(row)) for row in result.captures],
-        "reconstructions": costs
-        | {name: [_run_only(row) for row in costs[name]] for name in ("models", "controlled")},
-    }
-
-
-def _run_only(row: dict[str, Any]) -> dict[str, Any]:
-    """Without the figures of a row that was not run."""
-    return {key: v for key, v in row.items() if v is not None or key == "reason"}
-
-
-def _settings(plan: Benchmark) -> dict[str, Any]:
-    config = plan.study.config
-    return {
+    config, found = plan.study.config, asdict(result)
+    costs = found["reconstructions"]
+    for rows in (found["captures"], costs["models"], costs["controlled"]):
+        for row in rows:  # without the figures of one that was not run
+            for key in [key for key, value in row.items() if value is None and key != "reason"]:
+                del row[key]
+    settings = {
         "study": config.name,
         "reference": "separable, float64",
         "sizes": list(plan.sizes),
@@ -145,6 +120,8 @@ def _settings(plan: Benchmark) -> dict[str, Any]:
         "target": plan.case.target.name,
         "captured": _numbers(plan.case.method.exposures[0]),
     }
+    head = {"bench": "accuracy", "config": dump_config(config), "settings": settings}
+    return {**head, "machine": machine(), **found}
 
 
 def _numbers(exposure: Exposure) -> dict[str, Any]:

@@ -11,11 +11,10 @@ from typer.core import TyperCommand, TyperGroup
 
 from thincam_jax.commands.cache import cache_state, keep_programs
 from thincam_jax.commands.capture.command import capture, known_drivers
-from thincam_jax.commands.design.command import design
 from thincam_jax.commands.explain import explain, schema
 from thincam_jax.commands.kinds import init
 from thincam_jax.commands.reconstruct.command import check, reconstruct
-from thincam_jax.commands.run import accuracy, run, train
+from thincam_jax.commands.run import accuracy, design, run, train
 from thincam_jax.commands.sweep.command import sweep
 
 ORDER = (
@@ -133,23 +132,7 @@ def options(
 @app.command()
 def doctor() -> None:
     """Print versions, devices and what is missing."""
-    from thincam_jax._core import environment as installation
+    from thincam_jax._core.environment import machine_report, package_report
 
-    found = installation.environment()
-    print(f"Python {found['python']} on {found['platform']}")
-    print("devices: " + ", ".join(found["devices"]))
-    print(f"cores: {found['cores']}; memory: {found['memory']} free")
-    for name, support in installation.dtype_support().items():
-        print(f"  {name}: {support}")
-    print(f"  compiled sums: {installation.compiled_sums()}")
-    print(f"compiled programs: {cache_state()}")
-    for name, version in found["versions"].items():
-        print(f"{name} {version or 'NOT INSTALLED'}")
-    optional = installation.installed(installation.OPTIONAL)
-    for name, version in optional.items():
-        print(f"optional {name} {version}")
-    for name, purpose in installation.OPTIONAL.items():
-        if name not in optional:
-            print(f"optional {name} is missing: {purpose}")
-    for line in known_drivers():
-        print(line)
+    programs = f"compiled programs: {cache_state()}"
+    print("\n".join([*machine_report(), programs, *package_report(), *known_drivers()]))

@@ -96,7 +96,7 @@ def costs(asked: Any, setup: Any = None) -> Iterator[str]:
 def _study(asked: Any, setup: Any) -> Iterator[str]:
     from thincam_jax.commands.study.build import assemble
 
-    study = assemble(asked, ()) if setup is None else getattr(setup, "study", setup)
+    study = assemble(asked) if setup is None else getattr(setup, "study", setup)
     cameras = [(study.camera(e), e, study.mask_of(e)) for e in study.exposures]
     return _psfs(asked, cameras, study.object_distance)
 
@@ -104,25 +104,18 @@ def _study(asked: Any, setup: Any) -> Iterator[str]:
 def _psfs(asked: Any, cameras: list[Any], object_distance: float) -> Iterator[str]:
     """A line for each PSF of (camera, exposure, words): model, predicted error, memory, work."""
     from thincam_jax._core.memory import readable
-    from thincam_jax.lensless.accuracy.select import predict_error
-    from thincam_jax.lensless.cost import psf_cost
-    from thincam_jax.lensless.method import has_few_terms, psf_method
+    from thincam_jax.lensless.accuracy.select import predict_cost
 
     how = {"model": asked.model, "pixel_integration": asked.pixel_integration}
     alike = {
         (e.beta, e.distance, e.wavelength, e.width): one for one in cameras[::-1] for e in one[1:2]
     }
     for camera, exposure, words in [*alike.values()][::-1]:
-        error = ""
-        if has_few_terms(camera.mask):
-            seen = {"wavelength": exposure.wavelength, "object_distance": object_distance}
-            found = predict_error(camera, **seen, **how)
-            cost, error = found.cost, f", predicted error {found.predicted_error:.1g}"
-        else:
-            grid = camera.sensor.grid
-            cost = psf_cost(camera.mask, grid, psf_method(camera.mask, grid, **how))
+        seen = {"wavelength": exposure.wavelength, "object_distance": object_distance}
+        cost, error = predict_cost(camera, **seen, **how)
+        told = "" if error is None else f", predicted error {error:.1g}"
         yield (
-            f"PSF at {exposure.distance:g} mm of {words}: {asked.model}{error}, "
+            f"PSF at {exposure.distance:g} mm of {words}: {asked.model}{told}, "
             f"{readable(cost.bytes)}, {cost.flops / 1e9:.2g} billion operations"
         )
 
@@ -147,15 +140,10 @@ def _rays(asked: Any, setup: Any) -> Iterator[str]:
 
 def _search(asked: Any, setup: Any) -> Iterator[str]:
     """Of a design: the PSFs of the design to beat, and the evaluations of the search."""
-    from thincam_jax.lensless.exposures import Exposures
-
     search, shots = asked.search, asked.reference.shots
-    width, light = asked.mask.width, asked.wavelength
-    settings = [s.beta for s in shots], [s.distance for s in shots]
-    exposures = Exposures(*settings, wavelength=light, width=width)
-    sensor, mask = asked.sensor.build(), asked.mask.build(beta=1.0)
-    cameras = exposures.cameras(sensor, mask)
-    words = [f"β {s.beta:g} rad/mm²" for s in shots]
+    exposures = asked.design(asked.reference).exposures
+    cameras = exposures.cameras(asked.sensor.build(), asked.mask.build(beta=1.0))
+    words = (f"β {exposure.beta:g} rad/mm²" for exposure in exposures)
     found = list(zip(cameras, exposures, words, strict=True))
     yield from _psfs(asked, found, asked.object.distance)
     finely = search.frequencies

@@ -38,31 +38,29 @@ class Kind:
         return getattr(import_module(f"thincam_jax.commands.{module}"), name)
 
 
-def _run(room: str, section: str, name: str, example: str = "") -> Kind:
-    """A kind for `thincam run`, whose parts are where those of its room are."""
-    parts = f"{room}.run:build_{room}", f"{room}.run:run_{room}"
-    return Kind(name, "run", f"{room}.config:{section}", example, *parts)
-
-
 # By the `kind` of their files; a study's file does not name it.
 KINDS = {
     "study": Kind(
-        *("a study", "run", "study.config:StudyConfig", "quick"),
+        *("a study", "run", "sections:StudyConfig", "quick"),
         *("study.build:build_study", "study.run:run_study"),
     ),
-    "refocus": _run("refocus", "RefocusConfig", "a refocusing", "fza_refocus"),
-    "screen": _run("screen", "ScreenConfig", "a see-through screen"),
+    "refocus": Kind(
+        *("a refocusing", "run", "refocus:RefocusConfig", "fza_refocus"),
+        *("refocus:build_refocus", "refocus:run_refocus"),
+    ),
+    "screen": Kind(
+        *("a see-through screen", "run", "screen.config:ScreenConfig", ""),
+        *("screen.run:build_screen", "screen.run:run_screen"),
+    ),
     "design": Kind("a design", "design", "design.config:DesignConfig", "design_distances"),
     "capture": Kind("a capture", "capture", "capture.config:CaptureConfig", "rig_virtual"),
     "learned": Kind(
-        *("a network", "train", "learned.config:LearnedConfig", "learned_refocus"),
-        build="learned.run:build_lessons",
-        run="learned.run:run_training",
+        *("a network", "train", "learned.refocusing:LearnedConfig", "learned_refocus"),
+        *("learned.refocusing:build_lessons", "learned.refocusing:run_training"),
     ),
     "denoiser": Kind(
         *("a denoiser", "train", "learned.denoiser:DenoiserConfig", "denoiser"),
-        build="learned.denoiser:build_lessons",
-        run="learned.denoiser:run_denoiser",
+        *("learned.denoiser:build_lessons", "learned.denoiser:run_denoiser"),
     ),
 }
 
@@ -108,6 +106,16 @@ def load_experiment(
     return load_as(kind.part(kind.section), path, overrides)
 
 
+def load_study(path: str | Path, overrides: tuple[str, ...], needs: str) -> Any:
+    """Read and check a study; errors as of `load_experiment`, which say what `needs` one."""
+    from thincam_jax.commands.config_file import ConfigError
+
+    config = load_experiment(path, overrides)
+    if kind_of(config) is not KINDS["study"]:
+        raise ConfigError(f"{path}: is of kind {config.kind}; {needs}")
+    return config
+
+
 # The quickest of each kind have its name; the other files have their own.
 _FILE_OF = {name: kind.example for name, kind in KINDS.items() if kind.example not in ("", name)}
 
@@ -139,13 +147,9 @@ def init(
             raise ConfigError(f"init {kind}: choose one of {', '.join(examples())}")
         path = out or Path()
         path = path / f"{kind}.yaml" if path.is_dir() else path
-        text = (_folder() / f"{_FILE_OF.get(kind, kind)}.yaml").read_text(encoding="utf-8")
+        source = _folder() / f"{_FILE_OF.get(kind, kind)}.yaml"
+        text, command = source.read_text(encoding="utf-8"), read_kind(source).command
         if path.exists():
             raise ConfigError(f"{path} exists; give another --out, or delete it")
         write_whole(path, text)
-    print(f"{path}; next: thincam {next_command(kind)} {path}")
-
-
-def next_command(kind: str) -> str:
-    """What takes a file of that name."""
-    return read_kind(_folder() / f"{_FILE_OF.get(kind, kind)}.yaml").command
+    print(f"{path}; next: thincam {command} {path}")

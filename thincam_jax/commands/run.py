@@ -1,4 +1,4 @@
-"""The commands `thincam run`, `thincam train` and `thincam bench accuracy`.
+"""The commands `thincam run`, `design`, `train` and `bench accuracy`.
 
 As the files `command.py`, it imports nothing at its head that `thincam --help` does not need.
 """
@@ -21,6 +21,7 @@ from thincam_jax.commands.terminal import (
 
 if TYPE_CHECKING:
     from thincam_jax.learn.training import TrainingProgress
+    from thincam_jax.studies.design_scores import DesignScores
 
 
 def run(
@@ -51,7 +52,7 @@ def run(
         from thincam_jax.commands import explain
         from thincam_jax.commands.config_file import ConfigError
         from thincam_jax.commands.kinds import kind_of, load_experiment
-        from thincam_jax.commands.run_folder import RunFolder, folder_of
+        from thincam_jax.commands.run_folder import RunFolder
 
         if config.is_dir():
             from thincam_jax.commands.capture.command import reconstruct_store
@@ -62,10 +63,10 @@ def run(
             print(f"report: {reconstruct_store(config, out) / 'report.html'}")
             return
         asked = load_experiment(config, tuple(set_ or ()))
-        folder = folder_of(RunFolder, out, asked.name, asked)
+        folder = RunFolder.chosen(out, asked.name, asked)
         kind = kind_of(asked)
         setup = kind.part(kind.build)(asked)
-        warn(getattr(setup, "warnings", []))
+        warn(getattr(getattr(setup, "study", setup), "warnings", []))
         if dry_run:
             explain.dry_run(asked, folder.outcome(asked), setup)
             return
@@ -73,6 +74,50 @@ def run(
             found = kind.part(kind.run)(setup, folder, progress)
     show(found.table())
     print(f"report: {folder.path / 'report.html'}")
+
+
+def design(
+    config: Annotated[Path, typer.Argument(help="Experiment file (YAML) of kind design.")],
+    out: Annotated[
+        Path | None, typer.Option(help="Folder of the results; default runs/NAME of the design.")
+    ] = None,
+    set_: Overrides = None,
+    dry_run: DryRun = False,
+) -> None:
+    """Search for the best design.
+
+    Simulates it beside the design to beat; writes design.json, found.yaml, figures and report.html.
+    Ctrl-C keeps the targets that are finished; the same command goes on from there.
+    """
+    goes_on = "interrupted; the same command goes on with the targets that are not finished."
+    with told(lambda: goes_on):
+        from thincam_jax.commands.design.build import build_design
+        from thincam_jax.commands.design.run import DesignFolder, run_design
+        from thincam_jax.commands.kinds import load_experiment
+
+        wanted = load_experiment(config, tuple(set_ or ()), "design")
+        study = build_design(wanted)
+        warn(study.warnings)
+        folder = DesignFolder.chosen(out, wanted.name, wanted)
+        if dry_run:
+            from thincam_jax.commands import explain
+
+            explain.dry_run(wanted, folder.outcome(wanted))
+            return
+        with counted(wanted.name) as progress:
+            found = run_design(study, folder, progress)
+    show(found.table())
+    print(_levels(found))
+    print(f"report: {folder.path / 'report.html'}")
+
+
+def _levels(found: "DesignScores") -> str:
+    """What the gains are over, in a sentence."""
+    name = found.reference.name
+    of_pictures = found.validation.methods[name]
+    levels = {target: of_pictures[target].psnr_db for target in found.validation.pictures}
+    known = [f"{target} {psnr.mean:.2f} dB" for target, psnr in levels.items() if psnr]
+    return f"gains are over {name}, whose PSNR is: {', '.join(known) or 'that of exact images'}"
 
 
 def train(
@@ -97,14 +142,13 @@ def train(
     with told(lambda: goes_on):
         from thincam_jax.commands import explain
         from thincam_jax.commands.kinds import kind_of, load_experiment
-        from thincam_jax.commands.learned.run import TrainingFolder, check_resume
-        from thincam_jax.commands.run_folder import folder_of
+        from thincam_jax.commands.learned.training import InFolder, TrainingFolder
 
         asked = load_experiment(config, tuple(set_ or ()), "train")
         kind = kind_of(asked)
-        folder = folder_of(TrainingFolder, out, asked.name, asked)
+        folder = TrainingFolder.chosen(out, asked.name, asked)
         if dry_run:
-            check_resume(folder, resume)
+            InFolder(folder, print, resume).check()
             kind.part(kind.build)(asked)
             explain.dry_run(asked, folder.outcome(asked))
             return
@@ -116,7 +160,7 @@ def train(
                 bar.update(task, completed=progress.step, loss=f"loss {progress.loss:.3f}{score}")
                 bar.start()
 
-            found = kind.part(kind.run)(asked, folder, tell, resume=resume)
+            found = kind.part(kind.run)(asked, InFolder(folder, tell, resume))
     print(found.line)
     if found.page is not None:
         print(f"report: {found.page}")
@@ -143,12 +187,11 @@ def accuracy(
     """
     with told(lambda: "interrupted; nothing is kept."):
         from thincam_jax.commands.accuracy import BenchFolder, Sizes, check, run_accuracy
-        from thincam_jax.commands.config_file import slug
-        from thincam_jax.commands.study.config import load_config
+        from thincam_jax.commands.kinds import load_study
 
-        study = load_config(config, tuple(set_ or ()))
+        study = load_study(config, tuple(set_ or ()), "the benchmark takes a study")
         plan = check(study, Sizes(tuple(size or ()), capture_size))
-        folder = BenchFolder(out or Path("runs") / f"{slug(study.name)}-accuracy")
+        folder = BenchFolder.chosen(out, f"{study.name}-accuracy", study)
         with counted(study.name) as progress:
             result = run_accuracy(plan, folder, progress)
     show(result.table())

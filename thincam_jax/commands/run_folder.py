@@ -2,10 +2,10 @@
 
 import json
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar, runtime_checkable
+from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 import numpy as np
 import pydantic
@@ -16,15 +16,15 @@ from thincam_jax._core.steps import Progress, Step, carry_out
 from thincam_jax.commands.checked_config import dump_config
 from thincam_jax.commands.config_file import ConfigError, slug
 from thincam_jax.commands.report import Page, render_report
-from thincam_jax.commands.sections import ExperimentConfig, Section
+from thincam_jax.commands.schema import Section
+from thincam_jax.commands.sections import ExperimentConfig
 from thincam_jax.commands.terminal import tell
 from thincam_jax.imaging.display import png_bytes
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-Record = TypeVar("Record")
-Folder = TypeVar("Folder", bound="Outcome")
+Running = TypeVar("Running", bound="Run")
 
 
 class RunFolder:
@@ -36,7 +36,7 @@ class RunFolder:
     - `environment.json`, `report.html` and, last, the `result`: written at the end.
     """
 
-    kind = "run"
+    kind, config = "run", "config.yaml"
     folders: tuple[str, ...] = ("targets", "images", "figures")
     pictures = "figures"
     result = "metrics.json"
@@ -45,24 +45,71 @@ class RunFolder:
     def __init__(self, path: str | Path):
         self.path = Path(path)
 
-    def claim(self, config: Section) -> None:
-        """Make the folder and write the configuration; refuse a folder that holds anything else.
+    @classmethod
+    def chosen(cls, out: Path | None, name: str, config: Section) -> Self:
+        """The folder asked for, or runs/NAME; where that is another's, runs/NAME-2 and so on."""
+        first, number = out or Path("runs") / slug(name), 1
+        folder = cls(first)
+        while out is None and not folder._is_open_to(config):
+            number += 1
+            folder = cls(first.with_name(f"{first.name}-{number}"))
+        if number > 1:
+            tell(f"{first} holds another configuration: writes to {folder.path}")
+        return folder
 
-        An interrupted run of the same configuration goes on; a complete one is done anew.
-        """
-        claim_folder(self.path, "config.yaml", dump_config(config), self.kind, self.folders)
+    def _is_open_to(self, config: Section) -> bool:
+        try:
+            self.outcome(config)
+        except ConfigError:
+            return False
+        return True
+
+    def claim(self, config: Section) -> None:
+        """Make the folder; an interrupted run goes on, a complete one is done anew."""
+        self.make(config)
         if (self.path / self.result).exists():
             for finished in (self.path / "targets").glob("*.json"):
                 finished.unlink()
             (self.path / self.result).unlink()
 
+    def make(self, config: Section) -> None:
+        """Make the folder and write the configuration; one of the same is taken as it is.
+
+        **Errors**: ConfigError where the folder holds anything else, or cannot be made.
+        """
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+            self._refuse_foreign(config)
+            self.write(self.config, dump_config(config))
+            for folder in self.folders:
+                (self.path / folder).mkdir(exist_ok=True)
+        except WriteError:
+            raise
+        except OSError as error:
+            text = f"--out {self.path}: cannot be made a folder ({error.strerror})"
+            raise ConfigError(text) from None
+
     def outcome(self, config: Section) -> str:
-        """What a run would write, in a line; ConfigError where `claim` would refuse the folder."""
+        """What a run would write, in a line; ConfigError where `make` would refuse the folder."""
         if self.path.exists():
-            refuse_foreign(self.path, "config.yaml", dump_config(config), self.kind)
+            self._refuse_foreign(config)
         folders = [f"{folder}/" for folder in self.folders]
-        files = ("config.yaml", *folders, *self.others, self.result)
+        files = (self.config, *folders, *self.others, self.result)
         return f"writes to {self.path}: {', '.join(files)}"
+
+    def _refuse_foreign(self, config: Section) -> None:
+        held = self.path / self.config
+        # A neighbour is all that is there where the first start was killed.
+        foreign = any(path.name != f"{self.config}.partial" for path in self.path.iterdir())
+        if held.exists():
+            if read_regular(held) != dump_config(config).encode("utf-8"):
+                raise ConfigError(
+                    f"--out {self.path}: holds a {self.kind} of another configuration (see {held});"
+                    " give another folder or delete this one"
+                )
+        elif foreign:
+            message = f"is not empty and holds no {self.kind}; give a new folder"
+            raise ConfigError(f"--out {self.path}: {message}")
 
     def finished(self, target: str) -> dict[str, Any] | None:
         """The stored results of a target, or None if it has not been finished."""
@@ -101,37 +148,6 @@ class RunFolder:
         self.write(self.result, to_json(metrics))
 
 
-@runtime_checkable
-class Outcome(Protocol):
-    """A folder that can tell what would be written to it."""
-
-    path: Path
-
-    def outcome(self, config: Any, /) -> str: ...
-
-
-def folder_of(kind: Callable[[Path], Folder], out: Path | None, name: str, config: Any) -> Folder:
-    """The folder that is asked for, or runs/NAME; where that is taken, runs/NAME-2 and so on."""
-    if out is not None:
-        return kind(out)
-    first, number = Path("runs") / slug(name), 1
-    folder = kind(first)
-    while not _is_open_to(folder, config):
-        number += 1
-        folder = kind(first.with_name(f"{first.name}-{number}"))
-    if number > 1:
-        tell(f"{first} holds another configuration: writes to {folder.path}")
-    return folder
-
-
-def _is_open_to(folder: Outcome, config: Any) -> bool:
-    try:
-        folder.outcome(config)
-    except ConfigError:
-        return False
-    return True
-
-
 class Run:
     """An experiment on its way: its `work`, which ends with a report, fills `metrics`.
 
@@ -148,55 +164,20 @@ class Run:
         """A step to the work."""
         self.work.append(Step(text, partial(do, *arguments)))
 
-    def carry_out(self, progress: Progress) -> dict[str, Any]:
-        """Do the work; returns the metrics, which its report has written."""
+    def carry_out(self: Running, progress: Progress) -> Running:
+        """Do the work; returns the run itself."""
         carry_out(self.work, progress)
-        return self.metrics
+        return self
 
     def complete(self, page: Page) -> None:
         """The page, the metrics, and all that ends the folder."""
         self.folder.complete(page, self.config, self.metrics, self.started)
 
 
-def claim_folder(path: Path, name: str, text: str, kind: str, folders: Sequence[str] = ()) -> None:
-    """Make a folder with `folders` in it, and write the file `name` that says what it holds.
-
-    `kind` is a word for what it holds. A folder that holds the same already is taken as it is.
-
-    **Errors**: ConfigError where it holds anything else, or cannot be made.
-    """
-    held = path / name
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-        refuse_foreign(path, name, text, kind)
-        write_whole(held, text)
-        for folder in folders:
-            (path / folder).mkdir(exist_ok=True)
-    except WriteError:
-        raise
-    except OSError as error:
-        raise ConfigError(f"--out {path}: cannot be made a folder ({error.strerror})") from None
-
-
-def refuse_foreign(path: Path, name: str, text: str, kind: str) -> None:
-    """ConfigError where an existing folder holds what `claim_folder` may not go on with."""
-    held = path / name
-    # A neighbour is all that is there where the first start was killed.
-    foreign = any(p.name != f"{name}.partial" for p in path.iterdir())
-    if held.exists():
-        if read_regular(held) != text.encode("utf-8"):
-            raise ConfigError(
-                f"--out {path}: holds a {kind} of another configuration (see {held}); "
-                "give another folder or delete this one"
-            )
-    elif foreign:
-        raise ConfigError(f"--out {path}: is not empty and holds no {kind}; give a new folder")
-
-
 def to_json(data: Any) -> str:
     return json.dumps(data, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
 
 
-def as_record(kind: type[Record], data: Any) -> Record:
-    """A dataclass from what a file holds of it, `asdict` undone."""
+def as_record(kind: Any, data: Any) -> Any:
+    """A dataclass, or a dictionary of them, from what a file holds of it: `asdict` undone."""
     return pydantic.TypeAdapter(kind).validate_python(data)

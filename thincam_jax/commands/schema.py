@@ -24,7 +24,8 @@ from pydantic import (
     WithJsonSchema,
 )
 
-from thincam_jax._core.quantity import Quantity, quantities
+from thincam_jax._core import checks
+from thincam_jax._core.quantity import Quantity, quantities, quantity
 from thincam_jax.units import KINDS, parse_quantity
 
 _WITH_UNIT = r"^\s*[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?\s*[^\d\s.eE].*$"
@@ -195,7 +196,9 @@ def _checked(check: Callable[[Any], Any]) -> Callable[[Any], Any]:
 
 
 def form_of(kind: str, positive: bool = False) -> dict[str, Any]:
-    """The JSON Schema of a number with a unit; `kind` as of `units.parse_quantity`."""
+    """The JSON Schema of a number; `kind` as of `units.parse_quantity`, empty without a unit."""
+    if not kind:
+        return {"type": "number"}
     about = KINDS[kind]
     examples = re.findall(r'"(.*?)"', about.examples)
     pattern = _WITH_UNIT.replace("[+-]", "[+]", 1) if positive else _WITH_UNIT
@@ -225,3 +228,22 @@ def descriptions(maker: Callable[..., Any]) -> dict[str, str]:
     ):
         found |= dict.fromkeys(re.findall(r"`(\w+)`", names), " ".join(text.split()))
     return found
+
+
+LIGHT = (1e-5, checks.LONGEST_LIGHT)  # the wavelengths that are taken for light, mm
+
+
+def _optical(value: float) -> float:
+    if not LIGHT[0] <= value <= LIGHT[1]:
+        raise ValueError(f"{value:g} mm is no wavelength of light; give 10 nm to 0.1 mm")
+    return value
+
+
+Length = Annotated[float, *written(quantity("mm", positive=True))]
+Position = Annotated[float, *written(quantity("mm"))]
+Wavelength = Annotated[
+    float, *written(quantity("mm", check=checks.wavelength)), AfterValidator(_optical)
+]
+Curvature = Annotated[float, *written(quantity("rad/mm^2", positive=True))]
+Angle = Annotated[float, *written(quantity("rad"))]
+Time = Annotated[float, *written(quantity("s", positive=True))]

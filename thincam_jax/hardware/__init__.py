@@ -5,6 +5,8 @@ Every device, real or virtual, is a `Camera`, a `Stage` or a `Display`; every fa
 imports nothing of this; the libraries of the devices come with `thincam-jax[hardware]`.
 """
 
+from thincam_jax.hardware.acquisition.rig import Rig as Rig
+from thincam_jax.hardware.acquisition.rig import open_rig as open_rig
 from thincam_jax.hardware.base import Camera as Camera
 from thincam_jax.hardware.base import CameraSettings as CameraSettings
 from thincam_jax.hardware.base import Device as Device

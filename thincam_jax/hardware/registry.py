@@ -59,6 +59,22 @@ def driver(kind: str, name: str) -> type[Device]:
     return found
 
 
+def driver_report() -> list[str]:
+    """A line for each driver: its kind, name and package, and why it cannot be used."""
+    lines = []
+    for kind in KINDS:
+        for name, place in drivers(kind).items():
+            package = place.partition(".")[0].partition(":")[0]
+            outside = "" if package == "thincam_jax" else f", from {package}"
+            try:
+                driver(kind, name)
+                fault = ""
+            except NotFound as error:
+                fault = f": {error.cause}; {error.remedy}"
+            lines.append(f"driver of {kind} {name}{outside}{fault}")
+    return lines
+
+
 def open_device(kind: str, name: str, options: Mapping[str, Any] | None = None) -> Any:
     """Open a device; `options` are fields of the driver's `Options`."""
     chosen, given = driver(kind, name), dict(options or {})

@@ -57,7 +57,7 @@ class Sensor(Module):
                 "exposure and electrons both say how long the sensor is exposed; give one",
                 "electrons",
             )
-        if self.bit_depth is not None and self.exposure is None and self.electrons is None:
+        if self.bit_depth is not None and not self.counts:
             raise FieldError(
                 "bit_depth needs an exposure, such as 0.9, or electrons: the converter's range is "
                 "the full well",
@@ -68,6 +68,11 @@ class Sensor(Module):
     def grid(self) -> Grid:
         """The pixel centres."""
         return Grid(self.shape, self.pitch)
+
+    @property
+    def counts(self) -> bool:
+        """Whether it is known how many electrons a pixel holds."""
+        return self.exposure is not None or self.electrons is not None
 
 
 def as_sensor(given: Any) -> Sensor:

@@ -144,7 +144,7 @@ def _size(raw: Raw) -> str:
     return f"{rows}×{columns}"
 
 
-def _check_background(name: str, raw: Raw, psf: Raw, background: Any, options: Preparation) -> None:
+def _check_background(name: str, raw: Raw, psf: Raw, background: Any) -> None:
     if isinstance(background, Raw):
         if background.pixels.shape != raw.pixels.shape:
             raise MeasurementError(

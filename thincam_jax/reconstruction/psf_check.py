@@ -70,6 +70,13 @@ class PsfCheck:
         """Whether no other scale or orientation fits better."""
         return not self.reasons
 
+    def __str__(self) -> str:
+        """Residual and scale, and a line for each fault."""
+        scale = f"best scale {self.scale:.4f} ± {self.scale_error:.4f}"
+        faults = [f"your PSF is wrong: {reason}" for reason in self.reasons]
+        first = f"residual {self.noise_ratio:.2f} times the noise, {scale}"
+        return "\n".join([first, *(faults or ["your PSF fits best as it is"])])
+
 
 @dataclass(frozen=True, eq=False)
 class _Tried:

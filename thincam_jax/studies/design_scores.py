@@ -1,11 +1,11 @@
 """Figures of merit of a design study as records, which a file keeps, and as a table."""
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
-from thincam_jax._core.table import Table
+from thincam_jax._core.table import Table, number
 from thincam_jax.design import FreeValue, Shot
 from thincam_jax.design.space import REPORTED
 from thincam_jax.studies.trials import Comparison, Spread
@@ -181,6 +181,26 @@ class Validation:
     one_object_grid: bool
     methods: dict[str, dict[str, Comparison]]
 
+    def table(self) -> Table:
+        """PSNR, resolution and what is gained, of each design on each target."""
+        names = list(next(iter(self.methods.values())))
+        headings = ["design"]
+        for target in names:
+            headings.append(f"{target}\nPSNR, gain, dB")
+            headings += ["resolved mm,\ngain, elements"] if target in self.charts else []
+        rows = []
+        for number_of, (name, targets) in enumerate(self.methods.items()):
+            row = [name]
+            for target in names:
+                found = targets[target]
+                texts = [_spread(found.psnr_db, 2, ""), _spread(found.gain_db, 2)]
+                row.append("\n".join(texts[: 2 if number_of else 1]))
+                if target in self.charts:
+                    texts = [_resolved(found.resolved_object_mm), _spread(found.gain_elements, 1)]
+                    row.append("\n".join(texts[: 2 if number_of else 1]))
+            rows.append([*row, number(targets[names[0]].object_pixel_mm, 4)])
+        return Table([*headings, "object\npixel mm"], rows)
+
 
 @dataclass(frozen=True)
 class PointScores(WithShots):
@@ -218,6 +238,34 @@ class FrontScores:
     points: tuple[PointScores, ...]
     exposure: str | None = None
     picture_variance: float | None = None
+
+    def table(self, name: str, reference: str) -> Table:
+        """Its points and the design to beat; `name`: of the front in `FrontsScores`."""
+        names = reported_names([*self.points, self.reference])
+        labels = [REPORTED[name].label for name in names]
+        points = [(_cost(point.cost), point) for point in self.points]
+        points.append((f"{reference}: {_cost(self.reference.cost)}", self.reference))
+        pictures = tuple(self.points[0].simulated_psnr_db or ())
+
+        def told(point: PointScores) -> tuple[str, ...]:
+            if name == "captures":
+                simulated = point.simulated_psnr_db or {}
+                levels = (number(simulated.get(picture), 2) for picture in pictures)
+                return (f"{point.predicted_psnr_db:.2f}", *levels)
+            return (
+                f"{point.resolution_cycles_per_rad:.1f}",
+                f"{point.resolution_line_pairs_per_mm:.3f}",
+                point.resolution_ends or "",
+            )
+
+        kept = {True: "no", False: "yes", None: ""}
+        rows = [(text, *p.cells(names), *told(p), kept[p.dominated]) for text, p in points]
+        if name != "captures":
+            headings = ("cycles/rad", "line pairs/mm on the object", "", "front")
+            title = f"{name.capitalize()} against resolution"
+            return Table((self.label, *labels, *headings), rows, title=title)
+        headings = ("predicted, dB", *(f"{picture}, dB" for picture in pictures), "front")
+        return Table((self.label, *labels, *headings), rows, title="Captures against PSNR")
 
 
 @dataclass(frozen=True)
@@ -278,6 +326,86 @@ class DesignScores:
             rows.append([name, signed(one.predicted_gain, 2), *gains])
         headings = ("design", f"predicted\ngain, {self.objective.unit}", *pictures, *charts)
         return Table(headings, rows)
+
+    def designs_table(self) -> Table:
+        """The reference, and the designs found with the tolerances of their numbers."""
+        trained, reference = self.training is not None, self.reference
+        free = [(value.variable, value.shots) for value in self.found[0].values]
+
+        def row(one: Candidate, numbers: list[str], found: bool) -> list[str]:
+            gains = [one.predicted_gain, *([one.training_gain_db] if trained else [])]
+            reported = [number(one.reported, 3), *(signed(gain, 3) for gain in gains)]
+            ended = one.status.replace("_", " ") if found else "–"
+            return [one.name, *numbers, *reported, ended, "; ".join(one.active_limits) or "–"]
+
+        rows = [row(reference, [reference.text(*each) for each in free], False)]
+        rows += [row(one, [str(value) for value in one.values], True) for one in self.found]
+        labels = (f"{REPORTED[name].of_shots(shots)}\n(tolerance)" for name, shots in free)
+        gains = ("gain", *(("training\ngain, dB",) if trained else ()))
+        headings = ("design", *labels, self.objective.label, *gains, "descent", "against limits")
+        return Table(headings, rows, words=(len(headings) - 1,))
+
+    def findings(self) -> list[str]:
+        """What the numbers say, in sentences."""
+        best, reference, validation = self.found[0], self.reference, self.validation
+        names = reported_names([best, reference])
+        by = "training" if self.training else self.objective.name
+        sentences = [
+            f"The best design by {by} is {' and '.join(best.words(names))}. The objective "
+            f"predicts {best.predicted_gain:+.3g} {self.objective.unit} over {reference.name} "
+            f"({' and '.join(reference.words(names))})."
+        ]
+        if best.training_gain_db is not None:
+            sentences.append(f"On the training images it gains {best.training_gain_db:+.2f} dB.")
+        broken = self.search.broken_limits
+        sentences += [f"The reference breaks a limit: {why}." for why in broken]
+        if best.active_limits:
+            sentences.append(f"It lies against a limit: {'; '.join(best.active_limits)}.")
+        for name, targets in validation.methods.items():
+            gains = [
+                f"{_worth(t.gain_db)} on {target}"
+                for target, t in targets.items()
+                if target in validation.pictures and t.gain_db
+            ]
+            if gains:
+                sentences.append(f"Simulated, {name} gains {', '.join(gains)}.")
+            for target, found in targets.items():
+                if target in validation.charts and found.gain_elements:
+                    steps = _spread(found.gain_elements, 1)
+                    psnr = _worth(found.gain_db) if found.gain_db else "an exact image"
+                    words = f"{name} resolves {steps} elements more, at {psnr}"
+                    sentences.append(f"On {target}, {words}.")
+        if not validation.one_object_grid:
+            sentences.append(
+                "The designs' largest distances differ, and with them the object's pixels (in the "
+                "table below): their PSNR is not on one grid and compares to some tenths of a dB "
+                "only."
+            )
+        return sentences
+
+
+def _resolved(values: Sequence[float | None]) -> str:
+    known = [value for value in values if value is not None]
+    if len(known) < len(values):
+        return "–"
+    ends = [f"{end:.2f}" for end in (min(known), max(known))]
+    return " to ".join(ends if min(known) < max(known) else ends[:1])
+
+
+def _cost(value: float) -> str:
+    return f"{value:.0f}" if value >= 1000 else f"{value:.4g}"
+
+
+def _worth(gain: Spread) -> str:
+    """A gain of PSNR, and what it does to the error: "−1.06 dB (28 % more squared error)"."""
+    change = 100 * (10 ** (-gain.mean / 10) - 1)
+    word = "more" if change > 0 else "less"
+    return f"{gain.text(2)} dB ({abs(change):.0f} % {word} squared error)"
+
+
+def _spread(spread: Spread | None, digits: int, sign: str = "+") -> str:
+    """Mean and standard deviation over the seeds; a dash where the images were exact."""
+    return "–" if spread is None else spread.text(digits, sign)
 
 
 def signed(value: float | None, digits: int) -> str:

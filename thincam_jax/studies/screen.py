@@ -449,6 +449,21 @@ class RaySummary:
     first_ghost_right_mm: tuple[float, float] | None
     status_percent: dict[str, float]
 
+    def __str__(self) -> str:
+        """In two sentences; empty where no ray reaches the object."""
+        if self.wavelength_nm is None or self.guided_angle_deg is None:
+            return ""
+        colours, angles, ghost = self.wavelength_nm, self.guided_angle_deg, ""
+        if self.first_ghost_down_mm is not None and self.first_ghost_right_mm is not None:
+            (near, far), (_, aside) = self.first_ghost_down_mm, self.first_ghost_right_mm
+            ghost = f"; by its first ghost a pixel sees {near:.1f} to {far:.1f} mm further down "
+            ghost += f"the object and up to {aside:.1f} mm further to the side"
+        ended = (f"{kind.replace('_', ' ')} {part} %" for kind, part in self.status_percent.items())
+        return (
+            f"{colours[0]:.0f} to {colours[1]:.0f} nm, guided at {angles[0]:.1f}° to "
+            f"{angles[1]:.1f}°{ghost}. Rays: {', '.join(ended)}."
+        )
+
 
 def summarise_rays(study: ScreenStudy, rays: wg.Rays) -> RaySummary:
     """Colours, angles of the guided light, shifts of the first ghost, and how rays ended."""

@@ -10,9 +10,10 @@ import numpy as np
 from jaxtyping import Array
 
 from thincam_jax._core.precision import decimal_value
+from thincam_jax._core.quantity import FieldError
 from thincam_jax.imaging import targets as drawn
 from thincam_jax.imaging.scene import ImagePlane
-from thincam_jax.imaging.sensor import AbstractNoise, Sensor
+from thincam_jax.imaging.sensor import AbstractNoise, PoissonGaussianNoise, Sensor
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.exposures import Exposure, Exposures
 from thincam_jax.lensless.masks.base import AbstractMask
@@ -58,6 +59,9 @@ class Method:
       `thincam_jax.reconstruction.synthesis`.
     - `phases`: exposures of each shot; 4 for fringe scanning, 2 for phase pairs.
     - `harmonics`: of the synthesis of that name.
+
+    **Errors**: ValueError for exposures, phases or a solver that do not suit the synthesis, and for
+    one exposure twice; FieldError where one field is to blame.
     """
 
     name: str
@@ -86,6 +90,51 @@ class Method:
                     f"{type(self.solver).__name__} of method {self.name!r} takes no sums of "
                     "captures; leave out the synthesis, or use Wiener, AdmmTV or Fista"
                 )
+        if isinstance(self.solver, FringeScanning) and (
+            len(self.shots) != 1 or self.synthesis not in _PHASES
+        ):
+            raise ValueError(
+                f"kind fringe_scanning takes one shot, at the phases of {' or '.join(_PHASES)}"
+            )
+        self._check_harmonics()
+        self._check_shots()
+
+    def _check_harmonics(self) -> None:
+        if self.synthesis != "harmonics":
+            if self.harmonics:
+                raise FieldError(f"synthesis {self.synthesis} has none; drop it", "harmonics")
+            return
+        most, given = (self.phases - 1) // 2, set(self.harmonics)
+        if not given or not given <= set(range(1, most + 1)) or len(given) < len(self.harmonics):
+            message = f"{self.phases} steps tell 1 to {most} apart; give some of them, each once"
+            raise FieldError(message, "harmonics")
+
+    def _check_shots(self) -> None:
+        """A capture that is used twice would count its noise as two independent ones."""
+        others = "use phase_pairs or fringe_scanning"
+        # To the picometre: 5600 um and 5.6 mm differ by rounding.
+        widths = [round(shot.width, 9) for shot in self.shots]
+        contrasts = self.synthesis == "contrasts"
+        if contrasts and len(self.exposures) < 2:
+            raise ValueError("synthesis contrasts compares captures; give two phases or shots")
+        if contrasts and len({shot.distance for shot in self.shots}) > 1:
+            raise ValueError(
+                "synthesis contrasts needs shots at one distance, where they share a background; "
+                f"{others}"
+            )
+        if contrasts and len(set(widths)) > 1:
+            message = "synthesis contrasts needs masks of one width, which share a background"
+            raise FieldError(f"{message}; {others}", "shots")
+        shots = [
+            (shot.beta, shot.distance, shot.wavelength, width, shot.profile)
+            # Between two exposures of one setting there is no contrast.
+            + (() if contrasts else (shot.relative_time, shot.take))
+            for shot, width in zip(self.shots, widths, strict=True)
+        ]
+        phases = [exposure.phase for exposure in tuple(self.exposures)[: self.phases]]
+        for what, entries in (("shots", shots), ("phases", phases)):
+            if len(set(entries)) < len(entries):
+                raise FieldError(f"{what} hold an entry twice; give each once", what)
 
     @property
     def shots(self) -> tuple[Exposure, ...]:
@@ -172,6 +221,28 @@ def unresolved_zones(
     return [fault] if fault else []
 
 
+def check_noise(sensor: Sensor, noise: AbstractNoise | None) -> None:
+    """Refuse noise that counts electrons where it is not known how many there are."""
+    if isinstance(noise, PoissonGaussianNoise) and not sensor.counts:
+        message = "read_noise counts electrons; give sensor.exposure, such as 0.9, or electrons"
+        raise FieldError(message, "noise", "read_noise")
+
+
+def check_methods(methods: Sequence[Method], sensor: Sensor, noise: AbstractNoise | None) -> None:
+    """Refuse methods that do not suit the sensor and the noise.
+
+    **Errors**: FieldError with the place of the fault in a study.
+    """
+    for index, method in enumerate(methods):
+        for number, shot in enumerate(method.shots):
+            if shot.relative_time != 1 and not sensor.counts:
+                message = (
+                    "this is relative to the sensor's; give sensor.exposure or sensor.electrons"
+                )
+                raise FieldError(message, "methods", index, "shots", number, "exposure")
+    check_noise(sensor, noise)
+
+
 @dataclass(frozen=True, eq=False)
 class Study:
     """Cameras before targets, and the methods that reconstruct their captures.
@@ -206,6 +277,7 @@ class Study:
         ):
             if len(set(names)) < len(names):
                 raise ValueError(f"two of the {what} {names} have one name; give each its own")
+        check_methods(self.methods, self.sensor, self.noise)
 
     def run(self, targets: Sequence[Target] | None = None) -> "StudyResult":
         """Every method on every target, by default on the study's own."""

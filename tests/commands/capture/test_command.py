@@ -21,6 +21,8 @@ from thincam_jax.commands.capture import command
 from thincam_jax.commands.capture.config import CaptureConfig
 from thincam_jax.commands.checked_config import load_as
 from thincam_jax.hardware.acquisition.read import read_acquisition
+from thincam_jax.hardware.displays.patterns import pattern_levels
+from thincam_jax.hardware.registry import driver_report
 from thincam_jax.hardware.virtual import devices
 from thincam_jax.hardware.virtual.rig import pattern_number, read_fiducial
 from thincam_jax.imaging.operators import ReducedMatrix
@@ -101,7 +103,7 @@ def test_each_frame_is_of_the_pattern_and_the_place_that_the_plan_says(devices, 
     seen = set()
     for number, step in enumerate(taken.plan.steps):
         fiducial = read_fiducial(taken.frame(number), taken.bits)
-        shown = command.draw(taken.plan.pattern(step), (60, 80), 0.036)
+        shown = pattern_levels(taken.plan.pattern(step), (60, 80), 0.036)
         assert fiducial.pattern == pattern_number(shown)
         assert abs(fiducial.position / 1000 - (step.position or 0.0)) < 0.01
         seen.add(fiducial)
@@ -160,6 +162,7 @@ def test_an_error_of_a_device_is_one_line_and_how_to_go_on(tmp_path):
     [
         ("camera.driver=kodak", "kodak: open: there is no virtual one among the cameras; use usb"),
         ("camera.options={gray: 1}", "options: usb3_vision has no option gray; allowed: "),
+        ("plan.width=1.476 mm", "plan.width: 41 × 41 pixels cannot be centred on 60 × 80"),
     ],
 )
 def test_a_rig_that_cannot_be_opened(asked, line, tmp_path):
@@ -232,7 +235,7 @@ def test_a_camera_of_another_package_is_told_of_and_works(tmp_path, monkeypatch)
     points += "[thincam_jax.displays]\nscreen = elsewhere:Screen\nbroken = nowhere_at_all:Screen\n"
     (info / "entry_points.txt").write_text(points, "utf-8")
     monkeypatch.syspath_prepend(tmp_path)
-    lines = command.known_drivers()
+    lines = driver_report()
     assert "driver of cameras eye, from elsewhere" in lines
     assert "driver of stages zaber" in lines
     (broken,) = (line for line in lines if "broken" in line)

@@ -151,7 +151,7 @@ SHARED = ("search.free[0]", "all masks share the width; drop 'shared' and 'shots
         ),
         (
             "search.free.0={variable: wavelength, bounds: [500 nm, 2 mm]}",
-            *("search.free[0].bounds", "give bounds from 10 nm to 1 mm"),
+            *("search.free[0].bounds", "give bounds from 10 nm to 0.1 mm"),
         ),
         (
             "mask={width: 2 mm, fill_factor: 0.8}",

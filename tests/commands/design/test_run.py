@@ -14,11 +14,10 @@ from thincam_jax.commands.checked_config import dump_config
 from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.design import run as running
 from thincam_jax.commands.design.build import as_study_config
-from thincam_jax.commands.design.report import findings
 from thincam_jax.commands.design.run import DesignFolder, run_design
+from thincam_jax.commands.kinds import load_experiment
 from thincam_jax.commands.run_folder import as_record
 from thincam_jax.commands.study.build import build_study
-from thincam_jax.commands.study.config import load_config
 from thincam_jax.design.search import Search
 from thincam_jax.imaging.sensor import electrons_per_unit
 from thincam_jax.studies import design as designs
@@ -113,7 +112,7 @@ def test_found_designs_are_better_and_within_bounds(whole):
 def test_found_study_gives_the_first_seed(whole):
     """`thincam run found.yaml` simulates the same captures."""
     path, design, _ = whole
-    study = build_study(load_config(path / "found.yaml"))
+    study = build_study(load_experiment(path / "found.yaml"))
     names = [method.name for method in study.methods]
     assert names == ["pairs", *(one.name for one in design.found[: len(names) - 1])]
     picture = study.targets[1]
@@ -222,7 +221,7 @@ def read_again(config, study, folder):
     """As `thincam run` reads found.yaml."""
     path = folder / "found.yaml"
     path.write_text(dump_config(as_study_config(config, study.methods)), encoding="utf-8")
-    return build_study(load_config(path))
+    return build_study(load_experiment(path))
 
 
 def taken(study):
@@ -292,7 +291,7 @@ def test_found_numbers_reach_the_simulation(tmp_path):
 
 def test_sentences_of_the_report(whole):
     design = whole[1]
-    told = " ".join(findings(design))
+    told = " ".join(design.findings())
     assert "Simulated, found 1 gains" in told
     assert "not on one grid" not in told
     methods = dict(design.validation.methods)
@@ -304,7 +303,7 @@ def test_sentences_of_the_report(whole):
         search=replace(design.search, broken_limits=("β of shot 1 is too much",)),
         found=(replace(design.found[0], active_limits=("beta ≤ 9",)),),
     )
-    told = " ".join(findings(changed))
+    told = " ".join(changed.findings())
     for part in (
         "at -1.06 dB (28 % more squared error)",
         *("not on one grid", "The reference breaks a limit: β of", "against a limit: beta"),

@@ -10,8 +10,7 @@ from helpers import ROOT
 from thincam_jax.commands import cli
 from thincam_jax.commands.checked_config import load_as
 from thincam_jax.commands.config_file import ConfigError
-from thincam_jax.commands.learned.config import LearnedConfig
-from thincam_jax.commands.learned.run import build_camera, build_lessons
+from thincam_jax.commands.learned.refocusing import LearnedConfig, build_camera, build_lessons
 from thincam_jax.learn.refocusing.store import described, load
 from thincam_jax.learn.refocusing.train import NETWORK
 

@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 from helpers import ROOT
 from thincam_jax.commands.checked_config import dump_config
 from thincam_jax.commands.config_file import ConfigError, slug
-from thincam_jax.commands.study.config import StudyConfig, load_config
+from thincam_jax.commands.kinds import load_experiment
+from thincam_jax.commands.sections import StudyConfig
 from thincam_jax.imaging.targets import sample_images
 
 BASE = """\
@@ -62,7 +63,7 @@ ONE_SHOT = """synthesis: contrasts
 def load(folder, text, *overrides):
     path = folder / "study.yaml"
     path.write_text(text, encoding="utf-8")
-    return load_config(path, overrides)
+    return load_experiment(path, overrides)
 
 
 def faults(folder, text, *overrides):
@@ -306,18 +307,18 @@ SHIPPED.remove("fza_refocus.yaml")  # of another kind: tests/commands/refocus/te
 
 @pytest.mark.parametrize("name", SHIPPED)
 def test_shipped_files_round_trip(name, tmp_path):
-    config = load_config(ROOT / "configs" / name)
+    config = load_experiment(ROOT / "configs" / name)
     assert load(tmp_path, dump_config(config)) == config
 
 
 CURVATURES = st.floats(1e-7, 1e7)
-SHORT = st.floats(1e-5, 1.0)  # wavelengths and pitches
+WAVELENGTHS, PITCHES = st.floats(1e-5, 0.1), st.floats(1e-5, 1.0)
 
 
 @settings(max_examples=12, deadline=None)
 @given(
-    SHORT,
-    SHORT,
+    WAVELENGTHS,
+    PITCHES,
     CURVATURES,
     st.floats(-100, 100),
     st.text("aÄ#:'\"\\{[ \n%-", max_size=150),
@@ -361,9 +362,11 @@ def test_same_shot_twice(tmp_path, extra):
     assert line.startswith(f"{number}: methods[1].shots: shots hold an entry twice")
 
 
-@pytest.mark.parametrize("override", ["wavelength=500 m", "wavelength=1e-30 nm"])
+@pytest.mark.parametrize(
+    "override", ["wavelength=500 m", "wavelength=0.2 mm", "wavelength=1e-30 nm"]
+)
 def test_wavelengths_are_those_of_light(tmp_path, override):
     path = tmp_path / "study.yaml"
     path.write_text(BASE, encoding="utf-8")
-    with pytest.raises(ConfigError, match="is no wavelength of light; give 10 nm to 1 mm"):
-        load_config(path, (override,))
+    with pytest.raises(ConfigError, match="is no wavelength of light; give 10 nm to 0.1 mm"):
+        load_experiment(path, (override,))

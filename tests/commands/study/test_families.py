@@ -9,8 +9,8 @@ from PIL import Image
 import thincam_jax as tc
 from thincam_jax.commands.checked_config import dump_config
 from thincam_jax.commands.config_file import ConfigError
+from thincam_jax.commands.kinds import load_experiment
 from thincam_jax.commands.study.build import build_study
-from thincam_jax.commands.study.config import load_config
 from thincam_jax.lensless import masks as mask_room
 
 HEAD, TAIL = tiny.TEXT.split("methods:")[0], "targets:" + tiny.TEXT.split("targets:")[1]
@@ -43,7 +43,7 @@ def written(folder, mask=MURA, method=METHOD):
 )
 def test_family(tmp_path, mask, expected):
     path = written(tmp_path, mask)
-    config = load_config(path)
+    config = load_experiment(path)
     built = build_study(config)
     (exposure,) = built.exposures
     camera = built.camera(exposure)
@@ -53,7 +53,7 @@ def test_family(tmp_path, mask, expected):
         np.testing.assert_allclose(built.psf(exposure), h, rtol=1e-6, atol=1e-7)
     assert config.mask.label in built.mask_of(exposure)
     path.write_text(dump_config(config))  # a resolved file is read back
-    assert load_config(path) == config
+    assert load_experiment(path) == config
 
 
 def test_phase_masks(tmp_path):
@@ -64,7 +64,7 @@ def test_phase_masks(tmp_path):
         "family: diffuser, correlation_length: 80 um, rms_slope: 0.008",
         "family: voronoi_fresnel, sites: 5, focal_length: 20 mm",
     ):
-        config = load_config(
+        config = load_experiment(
             written(tmp_path, f"{{{own}, {numbers}}}"), ("model=angular_spectrum",)
         )
         study = build_study(config)
@@ -79,7 +79,7 @@ def test_phase_masks(tmp_path):
 def test_an_image_file_is_a_mask(tmp_path):
     path = written(tmp_path, f"{{family: file, path: {tmp_path / 'picture.png'}, width: 2 mm}}")
     with pytest.raises(ConfigError, match="mask, sensor or model: .*picture.png' is coloured") as e:
-        build_study(load_config(path))
+        build_study(load_experiment(path))
     assert "\n" not in str(e.value)
 
 
@@ -91,7 +91,7 @@ def test_an_image_file_is_read_once(tmp_path, monkeypatch):
     monkeypatch.setattr(mask_room, "read_mask", lambda *a: read.append(a) or read_mask(*a))
     shots = METHOD.replace("{distance: 3 mm}", "{distance: 3 mm}, {distance: 4 mm}")
     mask = f"{{family: file, path: {tmp_path / 'picture.png'}, width: 2 mm}}"
-    built = build_study(load_config(written(tmp_path, mask, shots)))
+    built = build_study(load_experiment(written(tmp_path, mask, shots)))
     assert built.warnings is not None and len(built.exposures) == 2
     assert [built.camera(exposure).distance for exposure in built.exposures] == [3, 4]
     assert len(read) == 1
@@ -115,7 +115,7 @@ def test_an_image_file_is_read_once(tmp_path, monkeypatch):
 )
 def test_refused_in_one_line(tmp_path, mask, method, message):
     with pytest.raises(ConfigError, match=message) as error:
-        load_config(written(tmp_path, mask, method))
+        load_experiment(written(tmp_path, mask, method))
     assert "\n" not in str(error.value)
 
 
@@ -135,5 +135,5 @@ def test_refused_in_one_line(tmp_path, mask, method, message):
 )
 def test_masks_that_cannot_be_built(tmp_path, mask, message):
     with pytest.raises(ConfigError, match=f"^mask, sensor or model: {message}") as error:
-        build_study(load_config(written(tmp_path, mask)))
+        build_study(load_experiment(written(tmp_path, mask)))
     assert "\n" not in str(error.value)

@@ -3,8 +3,8 @@
 import pytest
 
 from helpers import ROOT
+from thincam_jax.commands.kinds import load_experiment
 from thincam_jax.commands.study.build import build_study
-from thincam_jax.commands.study.config import load_config
 
 # A quarter of the width and four times the β: the zeros and the cut-offs stay where they are.
 SMALL = (
@@ -20,7 +20,7 @@ SMALL = (
 
 @pytest.mark.thorough
 def test_even_harmonics_see_what_odd_ones_miss():
-    config = load_config(ROOT / "configs" / "fza_harmonics.yaml", SMALL)
+    config = load_experiment(ROOT / "configs" / "fza_harmonics.yaml", SMALL)
     chosen = []
     for method in config.methods[2:]:
         (shot,) = method.shots

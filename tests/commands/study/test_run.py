@@ -18,11 +18,11 @@ from commands.test_cli import call
 
 from thincam_jax._core.environment import environment
 from thincam_jax.commands.config_file import ConfigError
+from thincam_jax.commands.kinds import load_experiment
 from thincam_jax.commands.report import render_report
 from thincam_jax.commands.run_folder import RunFolder
 from thincam_jax.commands.study import run as running
 from thincam_jax.commands.study.build import build_study
-from thincam_jax.commands.study.config import load_config
 from thincam_jax.commands.study.run import page, run_study
 from thincam_jax.studies import (
     Limits,
@@ -130,7 +130,7 @@ def test_folder_holds_what_it_says_and_nothing_half(whole):
         f"figures/{kind}-{n}.png" for n in ("chart", "picture") for kind in ("target", "captures")
     }
     assert files == expected
-    assert load_config(path / "config.yaml") == study.config
+    assert load_experiment(path / "config.yaml") == study.config
     environment = json.loads((path / "environment.json").read_text("utf-8"))
     assert environment["seed"] == 3
     assert environment["versions"]["jax"]

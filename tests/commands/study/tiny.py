@@ -9,8 +9,9 @@ from pathlib import Path
 import skimage.io
 from studies.tiny import picture
 
+from thincam_jax.commands.kinds import load_experiment
+from thincam_jax.commands.sections import StudyConfig
 from thincam_jax.commands.study.build import FileStudy, build_study
-from thincam_jax.commands.study.config import StudyConfig, load_config
 
 TEXT = """\
 name: tiny
@@ -55,7 +56,7 @@ def write(folder: Path, text: str = TEXT) -> Path:
 
 
 def study(folder: Path, *overrides: str, text: str = TEXT) -> StudyConfig:
-    return load_config(write(folder, text), overrides)
+    return load_experiment(write(folder, text), overrides)
 
 
 def built(folder: Path, *overrides: str, text: str = TEXT) -> FileStudy:

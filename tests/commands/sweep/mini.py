@@ -5,7 +5,8 @@ import os
 import signal
 from pathlib import Path
 
-from thincam_jax.commands.study.config import StudyConfig, load_config
+from thincam_jax.commands.kinds import load_experiment
+from thincam_jax.commands.sections import StudyConfig
 from thincam_jax.commands.sweep.grid import Axis, read_axes
 from thincam_jax.commands.sweep.point import GridPoint, Outcome, make_points
 
@@ -35,7 +36,7 @@ def write(folder: Path, text: str = TEXT) -> Path:
 
 
 def study(folder: Path, *overrides: str, text: str = TEXT) -> StudyConfig:
-    return load_config(write(folder, text), overrides)
+    return load_experiment(write(folder, text), overrides)
 
 
 def axes(config: StudyConfig, *grid: str) -> list[Axis]:

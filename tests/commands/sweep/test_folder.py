@@ -7,7 +7,7 @@ import pytest
 from commands.sweep import mini
 
 from thincam_jax.commands.config_file import ConfigError
-from thincam_jax.commands.study.config import load_config
+from thincam_jax.commands.kinds import load_experiment
 from thincam_jax.commands.sweep.point import Outcome
 from thincam_jax.commands.sweep.run import SweepFolder
 
@@ -120,7 +120,7 @@ def test_columns_that_some_rows_lack(folder, config):
 
 
 def test_study_is_written_as_it_is_read(folder, config):
-    assert load_config(folder.path / "study.yaml") == config
+    assert load_experiment(folder.path / "study.yaml") == config
 
 
 def test_folder_of_another_study_or_of_other_things(folder, config, tmp_path):
@@ -140,4 +140,4 @@ def test_first_start_that_was_killed(config, tmp_path):
     folder.path.mkdir()
     (folder.path / "study.yaml.partial").write_text("na", encoding="utf-8")
     folder.claim(config)
-    assert load_config(folder.path / "study.yaml") == config
+    assert load_experiment(folder.path / "study.yaml") == config

@@ -9,7 +9,7 @@ from commands.study import tiny
 from commands.sweep import mini
 
 from thincam_jax.commands.config_file import ConfigError
-from thincam_jax.commands.study.config import StudyConfig
+from thincam_jax.commands.sections import StudyConfig
 from thincam_jax.commands.sweep import point as point_module
 from thincam_jax.commands.sweep.point import told
 

@@ -24,8 +24,8 @@ from thincam_jax.measured.calibration import HadamardSeries
 MASK = zone_plate(25.0, 5.6)
 PLANS = {
     "fringe_scan": fringe_scan(MASK, SETTINGS),
-    "method_a": method_a(MASK, (7.0, 7.5), SETTINGS, stage_zero=5.0, dark_every=4),
-    "method_b": method_b(MASK, (25.0, 21.0), SETTINGS, dark_every=3),
+    "method_a": method_a(MASK, (7.0, 7.5), SETTINGS, stage_zero=5.0, dark_frames=2),
+    "method_b": method_b(MASK, (25.0, 21.0), SETTINGS, dark_frames=2),
     "psf_stack": psf_stack(MASK, (100.0, 130.0), SETTINGS, stage_zero=90.0),
     "hadamard": hadamard(HadamardSeries((4, 8), dark_frames=2), SETTINGS),
 }
@@ -46,7 +46,7 @@ def test_the_ready_made_plans():
     assert shown(PLANS["method_a"], "phase") == 2 * ["dark", *phases]
     assert [step.position for step in PLANS["method_a"].steps] == 5 * [2.0] + 5 * [2.5]
     pairs = [(25.0, 0.0), (25.0, 1.5 * math.pi), (21.0, 0.0), (21.0, 1.5 * math.pi)]
-    assert shown(PLANS["method_b"], "beta", "phase") == ["dark", *pairs[:3], "dark", pairs[3]]
+    assert shown(PLANS["method_b"], "beta", "phase") == ["dark", *pairs[:2], "dark", *pairs[2:]]
     assert shown(PLANS["psf_stack"], "beta") == [(25.0,), (25.0,)]
     assert [step.position for step in PLANS["psf_stack"].steps] == [10.0, 40.0]
     frames = [(number,) for number in range(64)]
@@ -79,7 +79,7 @@ def test_every_part_of_a_plan_changes_its_hash():
     assert Plan.from_json(others[3].as_json()) == others[3]
     # The order in which numbers are written does not count.
     turned = Pattern("fza", dict(reversed(list(MASK.numbers.items()))))
-    assert method_b(turned, (25.0, 21.0), SETTINGS, dark_every=3).hash == plan.hash
+    assert method_b(turned, (25.0, 21.0), SETTINGS, dark_frames=2).hash == plan.hash
 
 
 def test_a_plan_that_cannot_be_done_is_refused():
@@ -91,5 +91,5 @@ def test_a_plan_that_cannot_be_done_is_refused():
         method_b(MASK, (math.nan,), SETTINGS)
     with pytest.raises(ValueError, match="kind 'black' has no phase; give a zone_plate"):
         fringe_scan(BLACK, SETTINGS)
-    with pytest.raises(ValueError, match="dark_every = -1; give a whole number"):
-        fringe_scan(MASK, SETTINGS, dark_every=-1)
+    with pytest.raises(ValueError, match="dark_frames = -1; give a whole number"):
+        fringe_scan(MASK, SETTINGS, dark_frames=-1)

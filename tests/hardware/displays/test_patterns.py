@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 import thincam_jax as tc
-from thincam_jax.hardware.displays.patterns import hadamard_frame, mask_pattern
+from thincam_jax.hardware.acquisition.plan import BLACK, Pattern, zone_plate
+from thincam_jax.hardware.displays.patterns import hadamard_frame, mask_pattern, pattern_levels
 from thincam_jax.measured.calibration.hadamard import HadamardSeries
 
 PITCH = 0.036  # mm, the modulator of the thesis
@@ -88,3 +89,16 @@ def test_hadamard_frames_are_those_of_the_series():
         np.testing.assert_array_equal(hadamard_frame(series, number, SHAPE), expected)
     with pytest.raises(ValueError, match="do not fit into 24 × 40"):
         hadamard_frame(HadamardSeries(object_shape=(32, 32)), 0, SHAPE)
+
+
+def test_levels_of_the_patterns_of_a_plan():
+    plate = zone_plate(12.0, 16 * PITCH, phase=0.4)
+    mask = tc.FresnelZoneAperture(12.0, 0.4, width=16 * PITCH, pixel_pitch=PITCH)
+    assert np.array_equal(pattern_levels(plate, SHAPE, PITCH), mask_pattern(mask, SHAPE, PITCH))
+    numbers = {"rows": 4, "columns": 8, "order": "natural", "display": "complementary", "frame": 5}
+    series = HadamardSeries((4, 8), order="natural", display="complementary")
+    frame = pattern_levels(Pattern("hadamard", numbers), SHAPE, PITCH)
+    assert np.array_equal(frame, hadamard_frame(series, 5, SHAPE))
+    assert not pattern_levels(BLACK, SHAPE, PITCH).any()
+    with pytest.raises(ValueError, match="kind 'own' has no levels"):
+        pattern_levels(Pattern("own"), SHAPE, PITCH)

@@ -8,8 +8,8 @@ import pytest
 import scipy.special
 
 from helpers import ROOT, quick, relative_l2
+from thincam_jax.commands.kinds import load_experiment
 from thincam_jax.commands.study.build import assemble
-from thincam_jax.commands.study.config import load_config
 from thincam_jax.imaging.metrics import (
     cut_off,
     first_common_zero,
@@ -177,8 +177,8 @@ CONVENTIONAL_5, CONVENTIONAL_6, METHOD_A, METHOD_B = range(4)
 def responses(distance, methods, **changes):
     changes = {"object.distance": f"{distance} mm", **changes}
     overrides = tuple(f"{key}={value}" for key, value in changes.items())
-    config = load_config(ROOT / "configs" / "fza_superresolution.yaml", overrides)
-    study = assemble(config, ())
+    config = load_experiment(ROOT / "configs" / "fza_superresolution.yaml", overrides)
+    study = assemble(config)
     return [method_response(study, study.methods[index]) for index in methods]
 
 

@@ -12,7 +12,7 @@ from lensless.accuracy import cameras
 
 import thincam_jax as tc
 from helpers import in_full, relative_l2
-from thincam_jax.lensless.accuracy.select import predicted_error, probe_of
+from thincam_jax.lensless.accuracy.select import predict_cost, predicted_error, probe_of
 from thincam_jax.lensless.method import psf_method
 from thincam_jax.lensless.propagation.angular_spectrum import padded_shape
 
@@ -373,3 +373,17 @@ def test_numbers_in_other_units_are_refused():
         tc.psf(camera_of(), wavelength=500.0)
     with pytest.raises(ValueError, match=r"tolerance = 5 is relative: give at most 1"):
         select(camera_of(), 5.0)
+
+
+def test_cost_of_any_mask_before_its_psf_is_computed():
+    """With the predicted error where there is one."""
+    sensor, light = tc.Sensor((24, 32), 0.04), {"wavelength": 500e-6, "object_distance": 100.0}
+    zones = tc.LenslessCamera(tc.FresnelZoneAperture(25.0, width=2.0), sensor, 3.0)
+    cost, error = predict_cost(zones, model="separable", **light)
+    found = tc.predict_error(zones, model="separable", **light)
+    assert (cost, error) == (found.cost, found.predicted_error)
+    blank = tc.MaskBlank((12, 12), 0.1, 1.5)
+    relief = tc.diffuser(0, blank, correlation_length=0.2, rms_slope=0.01)
+    rough = tc.LenslessCamera(relief, sensor, 3.0)
+    cost, error = predict_cost(rough, model="angular_spectrum", **light)
+    assert error is None and cost.flops > 1e5 and cost.bytes > 1e4

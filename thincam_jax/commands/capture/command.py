@@ -1,8 +1,7 @@
 """The command `thincam capture`, and the devices of the files that it takes."""
 
 import contextlib
-from collections.abc import Callable, Iterator
-from functools import partial
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -20,6 +19,10 @@ from thincam_jax.commands.terminal import (
 
 if TYPE_CHECKING:
     from thincam_jax.commands.capture.config import CaptureConfig
+    from thincam_jax.commands.capture.run import Taken
+    from thincam_jax.hardware.acquisition.plan import Pattern, Plan
+    from thincam_jax.hardware.acquisition.rig import Rig
+    from thincam_jax.hardware.virtual.rig import VirtualRig
 
 STOPPED = 3  # exit code of an acquisition that a device stopped, and that can go on
 _CONFIG, _SECONDS = "config.yaml", "seconds.json"
@@ -72,7 +75,7 @@ def capture(
         procedure = asked.acquisition.build(settle=asked.display.settle)
         try:
             store.parent.mkdir(parents=True, exist_ok=True)
-            with opened(asked) as rig, progress_bar("{task.fields[rate]}") as bar:
+            with opened(asked, plan) as rig, progress_bar("{task.fields[rate]}") as bar:
                 task = bar.add_task(asked.name, total=len(plan.steps), rate="")
 
                 def told_of(made: Any) -> None:
@@ -127,54 +130,15 @@ def reconstruct_store(store: Path, out: Path | None) -> Path:
     return folder.path
 
 
-def draw(pattern: Any, shape: tuple[int, int], pitch: float) -> Any:
-    """Levels (y, x) of a plan's pattern on a display of a shape and a pixel pitch, mm.
-
-    **Errors**: ConfigError for a mask that the display's pixels cannot show.
-    """
-    import numpy as np
-
-    from thincam_jax.commands.config_file import ConfigError
-    from thincam_jax.hardware.displays.patterns import hadamard_frame, mask_pattern
-    from thincam_jax.lensless.masks.fza import FresnelZoneAperture
-    from thincam_jax.measured.calibration.hadamard import HadamardSeries
-
-    numbers = dict(pattern.numbers)
-    if pattern.kind == "black":
-        return np.zeros(shape, np.uint8)
-    if pattern.kind == "hadamard":
-        cells, frame = (numbers.pop("rows"), numbers.pop("columns")), numbers.pop("frame")
-        return hadamard_frame(HadamardSeries(cells, **numbers), frame, shape)
-    try:
-        return mask_pattern(FresnelZoneAperture(**numbers, pixel_pitch=pitch), shape, pitch)
-    except ValueError as error:
-        raise ConfigError(f"plan.width: {error}") from None
-
-
 def known_drivers() -> list[str]:
-    """A line for each driver: its kind and name, its package, and why it cannot be used."""
-    from thincam_jax.hardware.errors import NotFound
-    from thincam_jax.hardware.registry import KINDS, driver, drivers
+    """A line for each driver of a device."""
+    from thincam_jax.hardware.registry import driver_report
 
-    lines = []
-    for kind in KINDS:
-        for name, place in drivers(kind).items():
-            package = place.partition(".")[0].partition(":")[0]
-            line = f"driver of {kind} {name}"
-            if package != "thincam_jax":
-                line = f"{line}, from {package}"
-            try:
-                driver(kind, name)
-            except NotFound as error:
-                line = f"{line}: {error.cause}; {error.remedy}"
-            lines.append(line)
-    return lines
+    return driver_report()
 
 
-def build_plan(config: "CaptureConfig") -> Any:
+def build_plan(config: "CaptureConfig") -> "Plan":
     """The plan of a file, with its settings."""
-    from dataclasses import replace
-
     from thincam_jax.hardware.acquisition import plan as plans
     from thincam_jax.hardware.base import CameraSettings
 
@@ -185,65 +149,55 @@ def build_plan(config: "CaptureConfig") -> Any:
     assert optics is not None and asked.width is not None  # of lensless plans
     mask = plans.zone_plate(asked.betas[0], asked.width, phase=asked.phase, profile=asked.profile)
 
-    def planned(dark_every: int) -> Any:
-        zero = {"stage_zero": optics.distance, "dark_every": dark_every}
-        if asked.kind == "method_a":
-            return plans.method_a(mask, asked.distances, settings, **zero)
-        if asked.kind == "psf_stack":
-            return plans.psf_stack(mask, asked.distances, settings, **zero)
-        if asked.kind == "method_b":
-            return plans.method_b(mask, asked.betas, settings, dark_every=dark_every)
-        return plans.fringe_scan(mask, settings, dark_every=dark_every)
-
-    shots = len(planned(0).steps)
-    plan = planned(-(-shots // asked.dark_frames) if asked.dark_frames else 0)
+    dark = {"dark_frames": asked.dark_frames}
+    zero = {"stage_zero": optics.distance, **dark}
+    if asked.kind == "method_a":
+        plan = plans.method_a(mask, asked.distances, settings, **zero)
+    elif asked.kind == "psf_stack":
+        plan = plans.psf_stack(mask, asked.distances, settings, **zero)
+    elif asked.kind == "method_b":
+        plan = plans.method_b(mask, asked.betas, settings, **dark)
+    else:
+        plan = plans.fringe_scan(mask, settings, **dark)
     if config.stage is not None:  # it stands where the optics are known
-        steps = [s if s.position is not None else replace(s, position=0.0) for s in plan.steps]
-        plan = replace(plan, steps=tuple(steps))
+        plan = plan.at_position(0.0)
     return plan
 
 
 @contextlib.contextmanager
-def opened(config: "CaptureConfig") -> Iterator[Any]:
-    """The rig of a file with its devices open, its stage homed."""
+def opened(config: "CaptureConfig", plan: "Plan") -> Iterator["Rig"]:
+    """The rig of a file with its devices open, its stage homed.
+
+    **Errors**: ConfigError for options of a driver, and for what the display cannot show.
+    """
     from thincam_jax.commands.config_file import ConfigError
-    from thincam_jax.hardware.acquisition.rig import Rig
-    from thincam_jax.hardware.registry import open_device
-    from thincam_jax.hardware.virtual.devices import VirtualDevices
+    from thincam_jax.hardware.acquisition.rig import open_rig
 
+    pitch, virtual = config.display.pitch, None
+    if config.rig == "virtual":
+        virtual = virtual_rig(config)
     with contextlib.ExitStack() as stack:
-        camera: Callable[[], Any]
-        display: Callable[[], Any]
-        stage: Callable[[], Any] | None = None
-        if config.rig == "virtual":
-            devices = stack.enter_context(VirtualDevices(virtual_rig(config)))
-            camera = partial(devices.camera, config.camera.driver, config.camera.options)
-            display = devices.display
-            if config.stage is not None:
-                stage = partial(devices.stage, config.stage.driver, config.stage.options)
-        else:
-
-            def opener(kind: str, device: Any) -> Callable[[], Any]:
-                return partial(open_device, kind, device.driver, device.options)
-
-            camera, display = opener("cameras", config.camera), opener("displays", config.display)
-            if config.stage is not None:
-                stage = opener("stages", config.stage)
-        rigs: list[Any] = []
-
-        def render(pattern: Any) -> Any:
-            return draw(pattern, rigs[0].display.shape, config.display.pitch)
-
         try:
-            rigs.append(stack.enter_context(Rig(camera, display, render, stage)))
-        except (ValueError, TypeError) as error:  # of a driver's options
+            rig = stack.enter_context(open_rig(config.drivers, pitch, virtual))
+        except (ValueError, TypeError) as error:
             raise ConfigError(f"options: {error}") from None
-        if rigs[0].stage is not None and not rigs[0].stage.homed:
-            rigs[0].stage.home()
-        yield rigs[0]
+        _shown(plan.patterns[0], rig.display.shape, pitch)
+        yield rig
 
 
-def virtual_rig(config: "CaptureConfig") -> Any:
+def _shown(pattern: "Pattern", shape: tuple[int, int], pitch: float) -> Any:
+    """Levels (y, x) on a display. **Errors**: ConfigError for a pattern that it cannot show."""
+    from thincam_jax.commands.config_file import ConfigError
+    from thincam_jax.hardware.displays.patterns import pattern_levels
+
+    try:
+        return pattern_levels(pattern, shape, pitch)
+    except ValueError as error:
+        key = "cells" if pattern.kind == "hadamard" else "width"
+        raise ConfigError(f"plan.{key}: {error}") from None
+
+
+def virtual_rig(config: "CaptureConfig") -> "VirtualRig":
     """The state and the optics that the virtual devices of a file share."""
     from thincam_jax.commands.capture.run import build_study, screen_system
     from thincam_jax.hardware.virtual.optics import ModulatorOptics, MonitorOptics
@@ -275,59 +229,40 @@ def virtual_rig(config: "CaptureConfig") -> Any:
     )
 
 
-def _taken(store: Path, config: "CaptureConfig") -> Any:
+def _taken(store: Path, config: "CaptureConfig") -> "Taken":
     """What a store holds, and how it is to be compared."""
     import json
+
+    import numpy as np
 
     from thincam_jax._core.files import read_regular
     from thincam_jax.commands.capture.run import Taken
     from thincam_jax.hardware.acquisition.read import read_acquisition
     from thincam_jax.hardware.virtual.rig import Electronics
+    from thincam_jax.measured.calibration import open_captures
     from thincam_jax.studies.rig import CountingCamera
 
-    found = read_acquisition(store)
-    hadamard = None
-    lit = found.lit
+    found, hadamard, simulated = read_acquisition(store), None, None
     if config.plan.kind == "hadamard":
-        import numpy as np
-
-        from thincam_jax.measured.calibration import open_captures
-
         hadamard = open_captures(store)
-        lit = lit[:8]
-        frames = np.stack([found.frame(step) for step in lit]).astype(np.float32)
+        frames = np.stack([found.frame(step) for step in found.lit[:8]]).astype(np.float32)
     else:
         frames = found.captures()
-    patterns = [found.plan.pattern(found.plan.steps[step]) for step in lit]
-    display = config.virtual.display if config.virtual is not None else (768, 1024)
+    patterns, virtual = found.patterns[: len(frames)], config.virtual
     darks = sum(step.dark for step in found.plan.steps)
-    simulated = None
-    if config.rig == "virtual" and config.virtual is not None:
-        virtual = config.virtual
-        electronics = virtual.build(Electronics)
-        electron, offset = electronics.scale(found.settings[0])
+    if config.rig == "virtual" and virtual is not None:
+        electron, offset = virtual.build(Electronics).scale(found.settings[0])
         counts = electron * found.settings[0].exposure * virtual.electrons
         simulated = CountingCamera(counts, electron, virtual.read_noise, 0.0 if darks else offset)
-    region = found.settings[0].region
-    rows, columns = found.sensor_shape
-    top, left = (0, 0) if region is None else (region.top, region.left)
-    pixels = slice(top, top + rows), slice(left, left + columns)
+    display = (768, 1024) if virtual is None else virtual.display
     seconds = store / _SECONDS
     return Taken(
         frames,
-        [_label(pattern) for pattern in patterns],
-        [draw(pattern, display, config.display.pitch) for pattern in patterns],
-        pixels,
+        [pattern.label for pattern in patterns],
+        [_shown(pattern, display, config.display.pitch) for pattern in patterns],
+        found.pixels,
         json.loads(read_regular(seconds)) if seconds.is_file() else {},
         simulated,
         darks,
         hadamard,
     )
-
-
-def _label(pattern: Any) -> str:
-    if pattern.kind == "fza":
-        return f"β {pattern.numbers['beta']:.3g} rad/mm², φ {pattern.numbers['phase']:.2f}"
-    if pattern.kind == "hadamard":
-        return f"pattern {pattern.numbers['frame']}"
-    return pattern.kind

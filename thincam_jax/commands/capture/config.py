@@ -6,20 +6,15 @@ import pydantic
 from pydantic import Field
 
 from thincam_jax._core.quantity import FieldError
-from thincam_jax.commands.schema import section
+from thincam_jax.commands.schema import Curvature, Length, Section, Time, Wavelength, section
 from thincam_jax.commands.screen.config import SeeThroughConfig, check_cells
 from thincam_jax.commands.sections import (
-    Curvature,
     ExperimentConfig,
-    Length,
     MethodKind,
     Name,
     ObjectConfig,
-    Section,
     TargetConfig,
-    Time,
     VariationConfig,
-    Wavelength,
 )
 from thincam_jax.hardware.acquisition.taker import Procedure
 from thincam_jax.hardware.base import CameraSettings
@@ -190,6 +185,12 @@ class CaptureConfig(ExperimentConfig):
             self._check_virtual()
         return self
 
+    @property
+    def drivers(self) -> dict[Any, tuple[str, dict[str, Any]]]:
+        """Driver and options of each device, by its role."""
+        devices = {"camera": self.camera, "display": self.display, "stage": self.stage}
+        return {role: (one.driver, one.options) for role, one in devices.items() if one is not None}
+
     def _check_virtual(self) -> None:
         plan, virtual = self.plan, self.virtual
         if virtual is None:
@@ -200,9 +201,8 @@ class CaptureConfig(ExperimentConfig):
             return
         seen = virtual.screen
         if seen is None:
-            raise FieldError(
-                "a virtual rig for a plan of kind hadamard needs it", "virtual", "screen"
-            )
+            message = "a virtual rig for a plan of kind hadamard needs it"
+            raise FieldError(message, "virtual", "screen")
         if seen.hologram.colours is not None:
             message = "a plan of kind hadamard takes one colour; give wavelength in their place"
             raise FieldError(message, "virtual", "screen", "hologram", "colours")

@@ -10,11 +10,12 @@ import numpy as np
 from thincam_jax._core.table import Table
 from thincam_jax.commands.capture.config import CaptureConfig
 from thincam_jax.commands.config_file import ConfigError
+from thincam_jax.commands.mask import MaskConfig
 from thincam_jax.commands.report import Page, Part, Picture
 from thincam_jax.commands.run_folder import Progress, Run, RunFolder
 from thincam_jax.commands.screen.run import build_cameras, build_plane
-from thincam_jax.commands.sections import PHASES, MaskConfig, SensorConfig
-from thincam_jax.commands.study.build import FileStudy, build_optics, build_solver, read_targets
+from thincam_jax.commands.sections import PHASES, SensorConfig, TargetConfig, build_solver
+from thincam_jax.commands.study.build import FileStudy, build_optics, read_target
 from thincam_jax.imaging.operators import Sparse
 from thincam_jax.imaging.scene import ImagePlane
 from thincam_jax.lensless.exposures import Exposures
@@ -32,7 +33,7 @@ from thincam_jax.studies.rig import (
     monitor_system,
     recover_to,
 )
-from thincam_jax.studies.study import Method, Synthesis
+from thincam_jax.studies.study import Method, Synthesis, Target
 
 _MATRIX = (
     "The matrix is in matrix.zarr; a capture of another picture, less the dark frame, is "
@@ -71,7 +72,7 @@ def run_captures(
 
     Returns (and writes) the metrics.
     """
-    return _CaptureRun(config, taken, folder).carry_out(progress)
+    return _CaptureRun(config, taken, folder).carry_out(progress).metrics
 
 
 class _CaptureRun(Run):
@@ -174,26 +175,23 @@ def build_study(config: CaptureConfig, shape: tuple[int, int]) -> FileStudy:
         width=plan.width,
     ).at_phases(phases)
     solver = build_solver(config.reconstruction.kind, config.reconstruction.variation)
-    targets, unread = read_targets(config.targets, optics.object.distance, optics.object.width)
-    if unread:
-        raise ConfigError(f"{config.place_of('targets', 0)}targets[0]: {unread[0]}")
-    # One light: colours are averaged.
-    grey = [
-        replace(t, plane=ImagePlane(t.plane.image.mean(axis=0), t.distance, t.width))
-        for t in targets
-    ]
-    mask = MaskConfig(
-        width=f"{plan.width!r} mm",  # pyright: ignore[reportArgumentType]
-        profile=plan.profile,
-        pixel_pitch=f"{display.pitch!r} mm",  # pyright: ignore[reportArgumentType]
-        fill_factor=display.fill_factor,
-    )
-    pitch = f"{config.camera.pitch!r} mm"
-    sensor = SensorConfig(shape=shape, pitch=pitch)  # pyright: ignore[reportArgumentType]
+
+    def grey(entry: TargetConfig) -> Target:
+        """Of one light: colours are averaged."""
+        target = read_target(entry, optics.object)
+        image = target.plane.image.mean(axis=0)
+        return replace(target, plane=ImagePlane(image, target.distance, target.width))
+
+    targets, faults = config.read_each("targets", grey)
+    if faults:
+        raise ConfigError("\n".join(faults))
+    pixels = {"pixel_pitch": display.pitch, "fill_factor": display.fill_factor}
+    mask = MaskConfig.model_construct(width=plan.width, profile=plan.profile, **pixels)
+    sensor = SensorConfig.model_construct(shape=shape, pitch=config.camera.pitch)
     return FileStudy(
         *build_optics(mask, sensor, exposures[0]),
         (Method(plan.kind, exposures, solver, synthesis, len(phases)),),
-        tuple(grey),
+        tuple(targets),
         object_distance=optics.object.distance,
         model=optics.model,
         pixel_integration=optics.pixel_integration,

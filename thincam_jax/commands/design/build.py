@@ -8,9 +8,15 @@ import numpy as np
 from thincam_jax._core.precision import allow
 from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.design.config import DesignConfig, DesignNoiseConfig, SearchConfig
-from thincam_jax.commands.sections import MaskConfig, MethodConfig, MethodShotConfig, SensorConfig
+from thincam_jax.commands.mask import MaskConfig
+from thincam_jax.commands.sections import (
+    MethodConfig,
+    MethodShotConfig,
+    SensorConfig,
+    StudyConfig,
+    build_noise,
+)
 from thincam_jax.commands.study import build
-from thincam_jax.commands.study.config import StudyConfig
 from thincam_jax.design import (
     AbstractObjective,
     BayesError,
@@ -75,28 +81,25 @@ def build_designs(config: DesignConfig) -> build.FileStudy:
     """The designs that the file gives, as methods of a study, the one to beat first."""
     with allow("float64"):
         given = {one.name: config.design(one) for one in (config.reference, *config.compare)}
-    targets, unread = build.read_targets(
-        config.targets, config.object.distance, config.object.width
-    )
-    sensor, first = _sensor(config), given[config.reference.name].exposures[0]
-    mask, sensor = build.build_optics(_mask(config), sensor, first)
-    study = build.FileStudy(
-        mask,
-        sensor,
-        tuple(
-            as_method(mask, name, design, config.reference.synthesis)
-            for name, design in given.items()
-        ),
-        tuple(targets),
-        object_distance=config.object.distance,
-        noise=build.build_noise(config.noise.simulated()),
-        model=config.model,
-        pixel_integration=config.pixel_integration,
-        seed=config.seed,
-        name=config.name,
-        config=config,
-    )
-    build.check_study(study, unread)
+
+    def assembled() -> build.FileStudy:
+        sensor, first = _sensor(config), given[config.reference.name].exposures[0]
+        mask, sensor = build.build_optics(_mask(config), sensor, first)
+        synthesis = config.reference.synthesis
+        return build.FileStudy(
+            mask,
+            sensor,
+            tuple(as_method(mask, name, design, synthesis) for name, design in given.items()),
+            object_distance=config.object.distance,
+            noise=build_noise(config.noise.simulated()),
+            model=config.model,
+            pixel_integration=config.pixel_integration,
+            seed=config.seed,
+            name=config.name,
+            config=config,
+        )
+
+    study = build.with_targets(config, config.object, assembled)
     for target in study.targets:
         rows, columns = target.plane.image.shape[-2:]
         if config.prior.measured and target.is_picture and min(rows, columns) < _SMALLEST_PICTURE:

@@ -10,16 +10,14 @@ from pydantic import Field
 from thincam_jax._core.quantity import FieldError
 from thincam_jax.commands.config_file import slug
 from thincam_jax.commands.design.config_pareto import LENGTH, ONCE, ParetoConfig, check_pareto
-from thincam_jax.commands.schema import form_of, section
+from thincam_jax.commands.mask import ApertureConfig
+from thincam_jax.commands.schema import LIGHT, Section, form_of, section
 from thincam_jax.commands.sections import (
-    LIGHT,
     PHASES,
-    ApertureConfig,
     LenslessConfig,
     Name,
     NoiseConfig,
     ObjectConfig,
-    Section,
     ShotConfig,
     TargetConfig,
     check_known,
@@ -151,7 +149,7 @@ class FreeConfig(Section):
         if not lower < upper:
             raise ValueError(f"bounds cross: {lower:g} to {upper:g} {unit}; give the lower first")
         if variable == "wavelength" and not LIGHT[0] <= lower < upper <= LIGHT[1]:
-            raise ValueError(f"{lower:g} to {upper:g} mm; give bounds from 10 nm to 1 mm")
+            raise ValueError(f"{lower:g} to {upper:g} mm; give bounds from 10 nm to 0.1 mm")
         return (lower, upper)
 
     @classmethod
@@ -161,7 +159,7 @@ class FreeConfig(Section):
         form["allOf"] = [
             {
                 "if": {"properties": {"variable": {"const": variable}}},
-                "then": {"properties": {"bounds": {"items": _form(variable)}}},
+                "then": {"properties": {"bounds": {"items": form_of(QUANTITIES[variable].kind)}}},
             }
             for variable in get_args(Free)
         ]
@@ -178,12 +176,6 @@ class FreeConfig(Section):
         if self.variable == "width" and (self.shared or self.shots is not None):
             raise ValueError("all masks share the width; drop 'shared' and 'shots'")
         return self
-
-
-def _form(variable: str) -> dict[str, Any]:
-    """JSON Schema of a bound."""
-    kind = QUANTITIES[variable].kind
-    return form_of(kind) if kind else {"type": "number"}
 
 
 def _number(variable: str, given: Any) -> float:

@@ -9,8 +9,7 @@ import pydantic
 from pydantic import AfterValidator, Field
 
 from thincam_jax._core.quantity import FieldError
-from thincam_jax.commands.schema import section
-from thincam_jax.commands.sections import Length, Section
+from thincam_jax.commands.schema import Length, Section, section
 from thincam_jax.design import SearchSettings
 
 Entry = TypeVar("Entry", bound=Hashable)
@@ -27,6 +26,7 @@ def _once(entries: tuple[Entry, ...]) -> tuple[Entry, ...]:
 
 
 ONCE = AfterValidator(_once)
+_SORTED = AfterValidator(lambda shots: tuple(sorted(shots)))
 
 
 def _rising(unit: str) -> AfterValidator:
@@ -50,14 +50,10 @@ class ThicknessConfig(Section):
         return np.linspace(*self.bounds, self.points).tolist()
 
 
-def _sorted(shots: tuple[int, ...]) -> tuple[int, ...]:
-    return tuple(sorted(shots))
-
-
 class CapturesConfig(Section):
     """Captures against PSNR: how many settings, each with the phases of the synthesis."""
 
-    shots: Annotated[tuple[Count, ...], Field(min_length=1), ONCE, AfterValidator(_sorted)]
+    shots: Annotated[tuple[Count, ...], Field(min_length=1), ONCE, _SORTED]
 
 
 class LightConfig(Section):

@@ -42,9 +42,7 @@ def run_design(design: FileDesign, folder: DesignFolder, progress: Progress) -> 
 
     The same configuration gives the same on the same machine.
     """
-    run = _DesignRun(design, folder)
-    run.carry_out(progress)
-    return run.scores
+    return _DesignRun(design, folder).carry_out(progress).scores
 
 
 @dataclass(frozen=True)

@@ -1,1 +1,1 @@
-"""Experiments of `kind: learned`: a refocusing network, its training and what it gives."""
+"""Experiments of `kind: learned` and `kind: denoiser`: networks and their training."""

@@ -1,6 +1,5 @@
 """Experiment files of `kind: denoiser`: pictures, a network and its training in a folder."""
 
-from collections.abc import Callable
 from typing import Annotated, Literal
 
 import numpy as np
@@ -8,24 +7,25 @@ import pydantic
 from pydantic import Field
 
 from thincam_jax.commands.config_file import ConfigError
-from thincam_jax.commands.learned.config import TRAINING, SourceConfig, check_sources
-from thincam_jax.commands.learned.run import (
+from thincam_jax.commands.learned.training import (
+    TRAINING,
     Ended,
-    TrainingFolder,
-    build_options,
-    check_resume,
+    InFolder,
+    SourceConfig,
+    check_sources,
     read_sources,
 )
 from thincam_jax.commands.run_folder import to_json
 from thincam_jax.commands.schema import section
 from thincam_jax.commands.sections import ExperimentConfig
 from thincam_jax.learn.checkpoint import CheckpointError
+from thincam_jax.learn.denoiser import pictures
 from thincam_jax.learn.denoiser.network import DenoiserOptions, create, load_network
-from thincam_jax.learn.denoiser.pictures import Pictures, drawn, photographs, samples, split, united
+from thincam_jax.learn.denoiser.pictures import Pictures, united
 from thincam_jax.learn.denoiser.train import NETWORK, DenoisingLessons, train_denoiser
 from thincam_jax.learn.denoiser.unet import DenoisingUNet
 from thincam_jax.learn.refocusing.unet import parameter_count
-from thincam_jax.learn.training import TrainingOptions, TrainingProgress
+from thincam_jax.learn.training import TrainingOptions
 from thincam_jax.plot.learned import draw_losses
 
 
@@ -64,25 +64,11 @@ class DenoiserConfig(ExperimentConfig):
         return self
 
 
-def run_denoiser(
-    config: DenoiserConfig,
-    folder: TrainingFolder,
-    callback: Callable[[TrainingProgress], object],
-    *,
-    resume: bool = False,
-) -> Ended:
-    """Train a denoiser; writes training.json last.
-
-    `resume` and errors as of `run_training`.
-    """
-    check_resume(folder, resume)
-    lessons, network = build_lessons(config), build_network(config)
-    folder.claim(config)
-    options = build_options(config)
-    try:
-        trained = train_denoiser(network, lessons, options, folder=folder.path, callback=callback)
-    except CheckpointError as error:
-        raise ConfigError(str(error)) from None
+def run_denoiser(config: DenoiserConfig, place: InFolder) -> Ended:
+    """Train a denoiser; writes training.json last. **Errors**: as of `InFolder`."""
+    place.check()
+    folder, network, lessons = place.folder, build_network(config), build_lessons(config)
+    trained = place.train(config, train_denoiser, network, lessons)
     state = trained.state
     result = {
         "name": config.name,
@@ -129,8 +115,13 @@ def build_lessons(config: DenoiserConfig) -> DenoisingLessons:
     """**Errors**: ConfigError, one line for each source that cannot be read."""
     train: list[Pictures] = []
     judge: list[Pictures] = []
-    parts = read_sources(config, lambda source: split(_read(source), source.held_out))
-    for source, (kept, held_out) in zip(config.sources, parts, strict=True):
+
+    def read(source: PicturesConfig) -> tuple[list[Pictures], list[Pictures]]:
+        images = source.images(pictures)
+        named = images if isinstance(images, dict) else {source.name: images}
+        return pictures.split(named, source.held_out)
+
+    for source, (kept, held_out) in zip(config.sources, read_sources(config, read), strict=True):
         (train if source.use == "train" else judge).extend(kept)
         judge.extend(held_out)
     if not train:
@@ -138,13 +129,3 @@ def build_lessons(config: DenoiserConfig) -> DenoisingLessons:
         raise ConfigError(f"{place}sources: none is left to train on; give one")
     held_out = united(judge) if judge else None
     return config.training.build(DenoisingLessons, pictures=united(train), held_out=held_out)
-
-
-def _read(source: PicturesConfig) -> dict[str, Pictures]:
-    if source.kind == "drawn":
-        assert source.count is not None  # the section is checked
-        return {source.name: drawn(source.seed, source.count)}
-    if source.kind == "samples":
-        return samples()
-    assert source.path is not None
-    return photographs(source.path, licence=source.licence)

@@ -10,9 +10,8 @@ import numpy as np
 
 from thincam_jax._core import checks
 from thincam_jax.commands.config_file import ConfigError
-from thincam_jax.commands.kinds import KINDS, load_experiment, read_kind
-from thincam_jax.commands.study.build import assemble, check_study
-from thincam_jax.commands.study.config import StudyConfig
+from thincam_jax.commands.kinds import KINDS, load_experiment, load_study, read_kind
+from thincam_jax.commands.study.build import assemble, check_optics
 from thincam_jax.lensless.psf import psf
 from thincam_jax.measured import MeasurementError, Preparation, Raw
 from thincam_jax.measured.read import image_files
@@ -303,25 +302,22 @@ def read_camera(config: Path, overrides: Sequence[str], distance: float | None) 
     """
     if read_kind(config) is KINDS["learned"]:
         # Here: other captures need not wait for the learned parts.
-        from thincam_jax.commands.learned.run import build_camera
+        from thincam_jax.commands.learned.refocusing import build_camera
 
         whole = build_camera(load_experiment(config, tuple(overrides), "train"))
         if distance is None:
             raise ConfigError(f"{config}: tells no object's distance; give a --distance")
         light = {"wavelength": float(whole.light.wavelengths[0]), "model": whole.model}
         return Cameras([whole.camera], object_distance=distance, **light)
-    experiment = load_experiment(config, tuple(overrides))
-    if not isinstance(experiment, StudyConfig):
-        raise ConfigError(f"{config}: is of kind {experiment.kind}; a camera is read from a study")
-    study = assemble(experiment, ())
-    check_study(study)
+    study = assemble(load_study(config, tuple(overrides), "a camera is read from a study"))
+    check_optics(study)
     shot = study.exposures[0]
     return Cameras(
         [study.camera(shot)],
         wavelength=shot.wavelength,
         object_distance=study.object_distance if distance is None else distance,
         model=study.model,
-        pixel_integration=experiment.pixel_integration,
+        pixel_integration=study.pixel_integration,
     )
 
 

@@ -234,12 +234,11 @@ def _reconstruct(
     done = reconstruct_prepared(ready, solver, noise, callback=callback, name=str(job.capture))
     found = done.found
     if found.status == "non_finite":
-        weight = (
-            ("ridge", recipe.relative_ridge) if recipe.is_ridge else ("tau", recipe.relative_tau)
-        )
+        name = "ridge" if recipe.is_ridge else "tau"
+        now = recipe.relative_ridge if recipe.is_ridge else recipe.relative_tau
         raise measured.MeasurementError(
             f"{job.capture}: the image became NaN or infinite after {found.iterations} iterations; "
-            f"give a {weight[0]} (now {weight[1]:g}) that is nearer to 1"
+            f"give a {name} (now {now:g}) that is nearer to 1"
         )
     if found.status == "interrupted" and not found.iterations:
         raise KeyboardInterrupt
@@ -358,14 +357,7 @@ def check_files(
     except ValueError as error:
         raise measured.MeasurementError(str(error)) from None
     size = f"{shape[0]}×{shape[1]} pixels, blocks of {sources.preparation.downsample}"
-    lines = [
-        f"{sources.psf} with {capture} at {size}:",
-        f"residual {found.noise_ratio:.2f} times the noise, best scale "
-        f"{found.scale:.4f} ± {found.scale_error:.4f}",
-    ]
-    return lines + [f"your PSF is wrong: {reason}" for reason in found.reasons] + (
-        ["your PSF fits best as it is"] if found.fits else []
-    ), found.fits
+    return [f"{sources.psf} with {capture} at {size}:", str(found)], found.fits
 
 
 def enough_blocks(sources: Sources) -> Sources:

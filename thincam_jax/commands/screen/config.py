@@ -8,27 +8,23 @@ from pydantic import Field
 
 from thincam_jax import waveguide as wg
 from thincam_jax._core.quantity import FieldError
-from thincam_jax.commands.schema import section
+from thincam_jax.commands.schema import Angle, Length, Section, Wavelength, section
 from thincam_jax.commands.sections import (
-    Angle,
     ExperimentConfig,
-    Length,
     Name,
     NoiseConfig,
-    Section,
+    PictureConfig,
     SensorConfig,
     VariationConfig,
-    Wavelength,
     check_known,
     check_names,
-    check_noise,
 )
-from thincam_jax.commands.study.config import PictureConfig
 from thincam_jax.measured.calibration.hadamard import HadamardSeries
 from thincam_jax.reconstruction import Ridge
 from thincam_jax.studies.refocus import SceneObject
 from thincam_jax.studies.screen import ScreenModel
 from thincam_jax.studies.screen_calibration import MEASURED, Calibration
+from thincam_jax.studies.study import check_noise
 
 Acute = Annotated[Angle, Field(gt=-math.pi / 2, lt=math.pi / 2)]
 
@@ -172,9 +168,8 @@ class ScreenConfig(SeeThroughConfig, ExperimentConfig):
         check_names(self, "methods", "models", "targets")
         if self.calibration is not None:
             if self.hologram.colours is not None:
-                raise FieldError(
-                    "takes a hologram of one colour; drop hologram.colours", "calibration"
-                )
+                message = "takes a hologram of one colour; drop hologram.colours"
+                raise FieldError(message, "calibration")
             check_cells(self.object.cells, "object", "cells")
             for number, model in enumerate(self.models):
                 if model.name == MEASURED:
@@ -184,5 +179,5 @@ class ScreenConfig(SeeThroughConfig, ExperimentConfig):
         for number, target in enumerate(self.targets):
             for name in target.published:
                 check_known(name, "method", methods, "targets", number, "published", name)
-        check_noise(self)
+        check_noise(self.sensor.build(), self.noise.build())
         return self

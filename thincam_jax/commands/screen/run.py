@@ -18,8 +18,8 @@ from thincam_jax.commands.screen.config import (
     ScreenMethodConfig,
     SeeThroughConfig,
 )
-from thincam_jax.commands.sections import VariationConfig
-from thincam_jax.commands.study.build import build_noise, picture
+from thincam_jax.commands.sections import VariationConfig, build_noise
+from thincam_jax.commands.study.build import picture
 from thincam_jax.plot import screen as plot
 from thincam_jax.reconstruction import AbstractSolver, AdmmTV, Ridge, TotalVariation
 from thincam_jax.studies.screen import (
@@ -67,14 +67,11 @@ def build_screen(config: ScreenConfig) -> FileScreen:
 
     **Errors**: ConfigError, one line for each fault, beginning with its place.
     """
-    targets, faults = {}, []
-    channels = len(config.hologram.colours or ())
-    for number, target in enumerate(config.targets):
-        try:
-            targets[target.name] = picture(target, config.object.cells, channels)
-        except (ValueError, FileNotFoundError) as error:
-            place = config.place_of("targets", number, "path")
-            faults.append(f"{place}targets[{number}]: {error}")
+    cells, channels = config.object.cells, len(config.hologram.colours or ())
+    pictures, faults = config.read_each(
+        "targets", lambda one: picture(one, cells, channels), "path"
+    )
+    targets = dict(zip([target.name for target in config.targets], pictures, strict=False))
     noise = build_noise(config.noise)
     assert noise is not None  # the section is needed
     study = FileScreen(
@@ -144,9 +141,7 @@ def build_solver(method: ScreenMethodConfig) -> AbstractSolver:
 
 def run_screen(study: FileScreen, folder: RunFolder, progress: Progress) -> ScreenResult:
     """Run a study into a folder; its result has the model that a calibration measured, too."""
-    run = _ScreenRun(study, folder)
-    run.carry_out(progress)
-    return run.result
+    return _ScreenRun(study, folder).carry_out(progress).result
 
 
 class _ScreenRun(Run):
@@ -238,7 +233,7 @@ def page(
         Picture("images.png", "Targets, captures, reconstructions", images),
         Picture("rays.png", "Rays in side view", _RAYS),
         Picture("field.png", "Wavelength and ghost shifts over the field", _FIELD),
-        _rays(rays),
+        str(rays),
     )
     scored = f"PSNR after a least-squares gain and offset, by {last}."
     errors = (
@@ -256,22 +251,6 @@ def page(
         Part("Notes", config.notes),
     )
     return Page(lead, parts)
-
-
-def _rays(rays: RaySummary) -> str:
-    if rays.wavelength_nm is None or rays.guided_angle_deg is None:
-        return ""
-    colours, angles = rays.wavelength_nm, rays.guided_angle_deg
-    ghost = ""
-    if rays.first_ghost_down_mm is not None and rays.first_ghost_right_mm is not None:
-        down, right = rays.first_ghost_down_mm, rays.first_ghost_right_mm[1]
-        ghost = f"; by its first ghost a pixel sees {down[0]:.1f} to {down[1]:.1f} mm further down "
-        ghost += f"the object and up to {right:.1f} mm further to the side"
-    ended = (f"{kind.replace('_', ' ')} {part} %" for kind, part in rays.status_percent.items())
-    return (
-        f"{colours[0]:.0f} to {colours[1]:.0f} nm, guided at {angles[0]:.1f}° to {angles[1]:.1f}°"
-        f"{ghost}. Rays: {', '.join(ended)}."
-    )
 
 
 def _calibration(

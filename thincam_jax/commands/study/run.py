@@ -5,8 +5,8 @@ from dataclasses import asdict
 from thincam_jax.commands.config_file import slug
 from thincam_jax.commands.report import Page, Part, Picture, Sentences, optics_of, pixels_of
 from thincam_jax.commands.run_folder import Progress, Run, RunFolder, as_record
+from thincam_jax.commands.sections import StudyConfig
 from thincam_jax.commands.study.build import FileStudy
-from thincam_jax.commands.study.config import StudyConfig
 from thincam_jax.lensless.exposures import Exposure
 from thincam_jax.plot import studies as plot
 from thincam_jax.studies.evaluate import (
@@ -46,9 +46,7 @@ def run_study(study: FileStudy, folder: RunFolder, progress: Progress) -> StudyS
     The same configuration gives the same scores: every capture's noise has its own key, from the
     seed and the capture's place in the study.
     """
-    run = _StudyRun(study, folder)
-    run.carry_out(progress)
-    return run.scores
+    return _StudyRun(study, folder).carry_out(progress).scores
 
 
 class _StudyRun(Run):
@@ -67,13 +65,8 @@ class _StudyRun(Run):
         for target in study.targets:
             stored = folder.finished(target.name)
             if stored is not None:
-                self.found[target.name] = {
-                    name: as_record(Scores, metrics) for name, metrics in stored["metrics"].items()
-                }
-                self.contrasts[target.name] = {
-                    name: [(period, direction, contrast) for period, direction, contrast in rows]
-                    for name, rows in stored["contrasts"].items()
-                }
+                self.found[target.name] = as_record(dict[str, Scores], stored["metrics"])
+                self.contrasts[target.name] = as_record(dict[str, Contrasts], stored["contrasts"])
                 continue
             for count, exposure in enumerate(study.exposures, 1):
                 self.add(f"{target.name}: capture {count}", self.capture, target, exposure)

@@ -60,26 +60,21 @@ def sweep(
         _check(scheduler, workers)
         from thincam_jax._core.precision import is_double
         from thincam_jax.commands import explain
-        from thincam_jax.commands.config_file import ConfigError
-        from thincam_jax.commands.kinds import load_experiment
-        from thincam_jax.commands.run_folder import folder_of
-        from thincam_jax.commands.study.config import StudyConfig
+        from thincam_jax.commands.kinds import load_study
         from thincam_jax.commands.sweep.grid import read_axes
-        from thincam_jax.commands.sweep.point import make_points
+        from thincam_jax.commands.sweep.point import doubts, make_points
         from thincam_jax.commands.sweep.run import SweepFolder, run_sweep
 
-        study = load_experiment(config, tuple(set_ or ()))
-        if not isinstance(study, StudyConfig):
-            raise ConfigError(f"{config}: is of kind {study.kind}; a sweep takes a study")
+        study = load_study(config, tuple(set_ or ()), "a sweep takes a study")
         axes = read_axes(grid or [], study.model_dump(mode="json", exclude_none=True))
         points = make_points(study, axes, is_double())
-        folder = folder_of(SweepFolder, out, f"{study.name}-sweep", study)
+        folder = SweepFolder.chosen(out, f"{study.name}-sweep", study)
         if dry_run:
             writes = f"{len(points)} points; {folder.outcome(study)}"
             explain.dry_run(study, writes)
             return
         folder.claim(study)
-        warn(_warnings(points))
+        warn(doubts(points))
         with progress_bar("{task.fields[failed]}") as bar:
             task = bar.add_task(study.name, total=len(points), failed="")
 
@@ -107,18 +102,6 @@ def _check(scheduler: str | None, workers: int | None) -> None:
         raise ConfigError(f"--workers {workers}: give at least 1")
     if workers is not None and scheduler is not None:
         raise ConfigError("--workers are local ones; leave it out with --scheduler")
-
-
-def _warnings(points: list) -> list[str]:
-    """What is said of the first point that has something said of it, and of how many."""
-    from thincam_jax.commands.sweep.point import told as told_values
-
-    doubtful = [point for point in points if point.warnings]
-    if not doubtful:
-        return []
-    first = "; ".join(doubtful[0].warnings)
-    values = told_values(doubtful[0].values)
-    return [f"{len(doubtful)} of {len(points)} points; the first ({values}): {first}"]
 
 
 def _print(swept: Any, path: Path) -> None:

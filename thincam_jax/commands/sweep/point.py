@@ -17,8 +17,8 @@ from thincam_jax._core.files import read_regular
 from thincam_jax._core.precision import double_precision
 from thincam_jax.commands.checked_config import check_as
 from thincam_jax.commands.config_file import ConfigError, Places, set_entry
-from thincam_jax.commands.study.build import build_study, exposures_of
-from thincam_jax.commands.study.config import StudyConfig
+from thincam_jax.commands.sections import StudyConfig, exposures_of
+from thincam_jax.commands.study.build import build_study
 from thincam_jax.commands.sweep.grid import Axis, grid_values
 from thincam_jax.studies.evaluate import Scores
 from thincam_jax.studies.result import evaluate_target, mean_psnr_of_pictures
@@ -75,6 +75,16 @@ def make_points(base: StudyConfig, axes: Sequence[Axis], double: bool) -> list[G
 def told(values: dict[str, Any]) -> str:
     """Swept values in a message."""
     return ", ".join(f"{path}={value}" for path, value in values.items())
+
+
+def doubts(points: Sequence[GridPoint]) -> list[str]:
+    """What is said of the first point that has something said of it, and of how many."""
+    doubtful = [point for point in points if point.warnings]
+    return [
+        f"{len(doubtful)} of {len(points)} points; the first ({told(first.values)}): "
+        f"{'; '.join(first.warnings)}"
+        for first in doubtful[:1]
+    ]
 
 
 def _make_point(raw: dict, axes: Sequence[Axis], values: tuple, double: bool) -> GridPoint:

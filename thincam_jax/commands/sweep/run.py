@@ -12,9 +12,8 @@ import pyarrow.parquet as pq
 from pyarrow import csv
 
 from thincam_jax._core.files import read_regular, write_whole
-from thincam_jax.commands.checked_config import dump_config
-from thincam_jax.commands.run_folder import claim_folder, refuse_foreign
-from thincam_jax.commands.study.config import StudyConfig
+from thincam_jax.commands.run_folder import RunFolder
+from thincam_jax.commands.schema import Section
 from thincam_jax.commands.sweep.point import GridPoint, Outcome, measure_point, one_line, told
 from thincam_jax.commands.sweep.workers import Died, Outcomes, local_workers, scheduled_workers
 
@@ -23,7 +22,7 @@ _MEASURE = "mean_psnr_db/"  # of each method, over all targets
 Progress = Callable[[int, int], object]
 
 
-class SweepFolder:
+class SweepFolder(RunFolder):
     """Files of one sweep. Every file is written whole or not at all.
 
     - `study.yaml`: the resolved configuration that every point begins from.
@@ -33,21 +32,15 @@ class SweepFolder:
       in its order. `summary.png`: PSNR along its axes, of a sweep that has ended.
     """
 
-    def __init__(self, path: str | Path):
-        self.path = Path(path)
+    kind, config, folders = "sweep", "study.yaml", ("points",)
+    others, result = ("results.parquet",), "results.csv"
 
-    def claim(self, base: StudyConfig) -> None:
+    def claim(self, config: Section) -> None:
         """Make the folder; refuse one of another study, or of other things.
 
         Another grid of the same study is welcome: points are recognised by their configuration.
         """
-        claim_folder(self.path, "study.yaml", dump_config(base), "sweep", ("points",))
-
-    def outcome(self, base: StudyConfig) -> str:
-        """What a sweep would write, in a line; ConfigError where `claim` would refuse."""
-        if self.path.exists():
-            refuse_foreign(self.path, "study.yaml", dump_config(base), "sweep")
-        return f"writes to {self.path}: study.yaml, points/, results.parquet, results.csv"
+        self.make(config)
 
     def has(self, point: GridPoint) -> bool:
         """Whether the point has succeeded before; a row that cannot be read does not count."""

@@ -36,6 +36,13 @@ class Pattern:
     kind: str
     numbers: Mapping[str, float | int | str] = field(default_factory=dict)
 
+    @property
+    def label(self) -> str:
+        """In a figure's title: β and φ of a mask, the number of a Hadamard frame."""
+        if self.kind == "fza":
+            return f"β {self.numbers['beta']:.3g} rad/mm², φ {self.numbers['phase']:.2f}"
+        return f"pattern {self.numbers['frame']}" if self.kind == "hadamard" else self.kind
+
 
 BLACK = Pattern("black")
 
@@ -88,6 +95,14 @@ class Plan:
     def pattern(self, step: Step) -> Pattern:
         """Pattern shown in a step of this plan."""
         return self.patterns[step.pattern]
+
+    def at_position(self, position: float) -> "Plan":
+        """The plan with the stage at a position, mm, in all steps that do not move it."""
+        steps = (
+            step if step.position is not None else dataclasses.replace(step, position=position)
+            for step in self.steps
+        )
+        return dataclasses.replace(self, steps=tuple(steps))
 
     @cached_property
     def hash(self) -> str:
@@ -142,14 +157,14 @@ def zone_plate(
     return Pattern("fza", {**numbers, "profile": profile})
 
 
-def fringe_scan(mask: Pattern, settings: CameraSettings, *, dark_every: int = 0) -> Plan:
+def fringe_scan(mask: Pattern, settings: CameraSettings, *, dark_frames: int = 0) -> Plan:
     """Four captures of one zone plate with the phases 0, π/2, π and 3π/2.
 
     - `mask`: a `zone_plate`; its phase is replaced.
-    - `dark_every`: a dark frame first and after each that many captures; 0: none.
+    - `dark_frames`: at most so many, one first and the others evenly among the captures.
     """
     shots = [(_changed(mask, phase=phase), None) for phase in FRINGE_SCAN]
-    return _plan("fringe_scan", shots, settings, dark_every)
+    return _plan("fringe_scan", shots, settings, dark_frames)
 
 
 def method_a(
@@ -158,7 +173,7 @@ def method_a(
     settings: CameraSettings,
     *,
     stage_zero: float = 0.0,
-    dark_every: int = 0,
+    dark_frames: int = 0,
 ) -> Plan:
     """A fringe scan at each of several mask-sensor distances.
 
@@ -169,17 +184,17 @@ def method_a(
         for distance in distances
         for phase in FRINGE_SCAN
     ]
-    return _plan("method_a", shots, settings, dark_every, {"stage_zero": float(stage_zero)})
+    return _plan("method_a", shots, settings, dark_frames, {"stage_zero": float(stage_zero)})
 
 
 def method_b(
-    mask: Pattern, betas: Sequence[float], settings: CameraSettings, *, dark_every: int = 0
+    mask: Pattern, betas: Sequence[float], settings: CameraSettings, *, dark_frames: int = 0
 ) -> Plan:
     """Captures with the phases 0 and 3π/2 for each of several β, rad/mm²."""
     shots = [
         (_changed(mask, beta=beta, phase=phase), None) for beta in betas for phase in PHASE_PAIR
     ]
-    return _plan("method_b", shots, settings, dark_every)
+    return _plan("method_b", shots, settings, dark_frames)
 
 
 def psf_stack(
@@ -188,14 +203,14 @@ def psf_stack(
     settings: CameraSettings,
     *,
     stage_zero: float = 0.0,
-    dark_every: int = 0,
+    dark_frames: int = 0,
 ) -> Plan:
     """PSFs of one pattern for a point source on the stage, at several depths, mm.
 
     The stage moves to depth − `stage_zero`, the depth at its position 0.
     """
     shots = [(mask, depth - stage_zero) for depth in depths]
-    return _plan("psf_stack", shots, settings, dark_every, {"stage_zero": float(stage_zero)})
+    return _plan("psf_stack", shots, settings, dark_frames, {"stage_zero": float(stage_zero)})
 
 
 def hadamard(series: "HadamardSeries", settings: CameraSettings) -> Plan:
@@ -210,11 +225,9 @@ def hadamard(series: "HadamardSeries", settings: CameraSettings) -> Plan:
         (Pattern("hadamard", {**numbers, "frame": frame}), None)
         for frame in range(series.pattern_frames)
     ]
-    dark = series.dark_frames
-    every = -(-series.pattern_frames // dark) if dark else 0
-    plan = _plan("hadamard", shots, settings, every)
+    plan = _plan("hadamard", shots, settings, series.dark_frames)
     # With few patterns and many dark frames the last ones come together.
-    lacking = dark - sum(step.dark for step in plan.steps)
+    lacking = series.dark_frames - sum(step.dark for step in plan.steps)
     black = Step(len(plan.patterns) - 1, dark=True)
     facts = {"series": {**described, "object_shape": [rows, columns]}}
     return dataclasses.replace(plan, steps=plan.steps + (black,) * lacking, facts=facts)
@@ -231,21 +244,22 @@ def _plan(
     name: str,
     shots: Sequence[tuple[Pattern, float | None]],
     settings: CameraSettings,
-    dark_every: int,
+    dark_frames: int,
     facts: Mapping[str, Any] | None = None,
 ) -> Plan:
-    """Plan of (pattern, position) shots, with a dark frame before every `dark_every` of them."""
-    if dark_every < 0:
-        raise ValueError(f"dark_every = {dark_every}; give a whole number, 0 for no dark frames")
+    """Plan of (pattern, position) shots, with dark frames among them."""
+    if dark_frames < 0:
+        raise ValueError(f"dark_frames = {dark_frames}; give a whole number, 0 for no dark frames")
+    every = -(-len(shots) // dark_frames) if dark_frames else 0
     patterns = {_key(pattern): pattern for pattern, _ in shots}
     index = {key: number for number, key in enumerate(patterns)}
     steps = []
     for number, (pattern, position) in enumerate(shots):
         position = None if position is None else float(position)
-        if dark_every and number % dark_every == 0:
+        if every and number % every == 0:
             steps.append(Step(len(patterns), position, dark=True))
         steps.append(Step(index[_key(pattern)], position))
-    black = (BLACK,) if dark_every else ()
+    black = (BLACK,) if every else ()
     return Plan(name, (*patterns.values(), *black), (settings,), tuple(steps), facts or {})
 
 

@@ -44,6 +44,13 @@ class Acquisition:
         return [self.plan.pattern(self.plan.steps[number]) for number in self.lit]
 
     @property
+    def pixels(self) -> tuple[slice, slice]:
+        """Rows and columns of the sensor that were read."""
+        (rows, columns), region = self.sensor_shape, self.settings[0].region
+        top, left = (0, 0) if region is None else (region.top, region.left)
+        return slice(top, top + rows), slice(left, left + columns)
+
+    @property
     def distances(self) -> list[float | None]:
         """Stage position plus the plan's `stage_zero`, mm, for each capture."""
         zero = self.plan.facts.get("stage_zero", 0.0)

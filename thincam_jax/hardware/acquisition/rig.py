@@ -1,13 +1,18 @@
-"""The devices of an acquisition, which can be reopened."""
+"""The devices of an acquisition, real or virtual, which can be reopened."""
 
-from collections.abc import Callable
-from contextlib import AbstractContextManager, ExitStack
-from typing import Any, Literal
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, ExitStack, contextmanager
+from functools import partial
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from thincam_jax.hardware.acquisition.plan import Pattern
 from thincam_jax.hardware.base import Camera, Display, Identity, Stage
+from thincam_jax.hardware.registry import open_device
+
+if TYPE_CHECKING:  # it brings JAX
+    from thincam_jax.hardware.virtual.rig import VirtualRig
 
 Role = Literal["camera", "display", "stage"]
 
@@ -61,3 +66,38 @@ class Rig(AbstractContextManager["Rig"]):
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+@contextmanager
+def open_rig(
+    drivers: Mapping[Role, tuple[str, Mapping[str, Any]]],
+    pitch: float,
+    virtual: "VirtualRig | None" = None,
+) -> Iterator[Rig]:
+    """Open the devices of a rig and home its stage; a context manager.
+
+    - `drivers`: name and options of the driver of the camera, the display and, if any, the stage.
+    - `pitch`: of the display's pixels, mm, for which zone plates are drawn.
+    - `virtual`: simulated optics, whose virtual devices are opened in place of real ones.
+
+    **Errors**: those of the drivers; ValueError for unknown options.
+    """
+    from thincam_jax.hardware.displays.patterns import pattern_levels
+    from thincam_jax.hardware.virtual.devices import VirtualDevices
+
+    with ExitStack() as stack:
+        openers = {
+            role: partial(open_device, f"{role}s", *given) for role, given in drivers.items()
+        }
+        if virtual is not None:
+            devices = stack.enter_context(VirtualDevices(virtual))
+            openers = {role: partial(getattr(devices, role), *drivers[role]) for role in drivers}
+
+        def render(pattern: Pattern) -> np.ndarray:
+            return pattern_levels(pattern, rig.display.shape, pitch)
+
+        rig = Rig(openers["camera"], openers["display"], render, openers.get("stage"))
+        stack.enter_context(rig)
+        if rig.stage is not None and not rig.stage.homed:
+            rig.stage.home()
+        yield rig

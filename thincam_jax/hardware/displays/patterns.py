@@ -1,16 +1,35 @@
-"""Patterns for a display, uint8 of its shape: masks and Hadamard frames.
+"""Patterns for a display, uint8 of its shape: those of a plan, masks and Hadamard frames.
 
 Levels are proportional to the transmitted irradiance, as with the display's table of grey levels.
 """
 
+from typing import Any
+
 import numpy as np
 
 from thincam_jax._core.grids import Grid
+from thincam_jax.hardware.acquisition.plan import Pattern
 from thincam_jax.lensless.masks import FresnelZoneAperture
 from thincam_jax.lensless.masks.cells import AbstractCellMask
 from thincam_jax.measured.calibration.hadamard import HadamardSeries
 
 _HARMONICS = 99  # of a profile's series; the rest is less than a level
+
+
+def pattern_levels(pattern: Pattern, shape: tuple[int, int], pitch: float) -> np.ndarray:
+    """Levels of a pattern of a plan on a display of a shape and a pixel pitch, mm.
+
+    **Errors**: as of `mask_pattern` and `hadamard_frame`; ValueError for a pattern of another kind.
+    """
+    numbers: dict[str, Any] = dict(pattern.numbers)
+    if pattern.kind == "black":
+        return np.zeros(shape, np.uint8)
+    if pattern.kind == "hadamard":
+        cells, frame = (numbers.pop("rows"), numbers.pop("columns")), numbers.pop("frame")
+        return hadamard_frame(HadamardSeries(cells, **numbers), frame, shape)
+    if pattern.kind != "fza":
+        raise ValueError(f"a pattern of kind {pattern.kind!r} has no levels; give an own `render`")
+    return mask_pattern(FresnelZoneAperture(**numbers, pixel_pitch=pitch), shape, pitch)
 
 
 def mask_pattern(

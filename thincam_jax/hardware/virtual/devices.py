@@ -61,8 +61,8 @@ class VirtualDevices(AbstractContextManager["VirtualDevices"]):
         port = str(self._there["stage"].port)
         return open_device("stages", driver, {**(options or {}), "port": port})
 
-    def display(self) -> Display:
-        """Open the display, whose patterns go to the rig, whatever the driver."""
+    def display(self, driver: str = "", options: Mapping[str, Any] | None = None) -> Display:
+        """Open the display, whose patterns go to the rig, whatever the driver and its options."""
         shape, faults = self.rig.display_shape, self.faults["display"]
         return VirtualDisplay(shape, self.rig.on_show, faults=faults)
 

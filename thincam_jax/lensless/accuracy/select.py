@@ -144,6 +144,27 @@ def predict_error(
     return Prediction(method, error, psf_cost(camera.mask, grid, method))
 
 
+def predict_cost(
+    camera: LenslessCamera,
+    *,
+    wavelength: Number,
+    object_distance: Number = math.inf,
+    model: Model | PsfMethod,
+    pixel_integration: bool = False,
+) -> tuple[Cost, float | None]:
+    """Cost of a PSF before it is computed, and its predicted error; arguments as for `psf`.
+
+    The error is None for masks that are no short sum of products, which only sampling tells.
+    """
+    how = {"model": model, "pixel_integration": pixel_integration}
+    if has_few_terms(camera.mask):
+        light = {"wavelength": wavelength, "object_distance": object_distance}
+        found = predict_error(camera, **light, **how)
+        return found.cost, found.predicted_error
+    grid = camera.sensor.grid
+    return psf_cost(camera.mask, grid, psf_method(camera.mask, grid, **how)), None
+
+
 def _select_sampled(
     mask: AbstractMask, grid: Grid, found: Iterator[tuple[PsfMethod, float]], tolerance: float
 ) -> Selection:

@@ -1,30 +1,41 @@
-"""Training a refocusing network: from the file to its lessons, into a folder with a report."""
+"""Experiments of `kind: learned`: the file, the training of a refocusing network, its report."""
 
 import functools
 import operator
 import time
-from collections.abc import Callable
-from dataclasses import asdict, dataclass
-from pathlib import Path
-from typing import Any, TypeVar
+from dataclasses import asdict
+from typing import Annotated, Literal
+
+import pydantic
+from pydantic import Field
 
 from thincam_jax.commands.config_file import ConfigError
-from thincam_jax.commands.learned.config import LearnedConfig, SourceConfig
+from thincam_jax.commands.learned.training import (
+    TRAINING,
+    Count,
+    Ended,
+    InFolder,
+    SourceConfig,
+    check_sources,
+    read_sources,
+)
+from thincam_jax.commands.mask import APERTURE, ApertureConfig
 from thincam_jax.commands.report import Page, Part, Picture, pixels_of
-from thincam_jax.commands.run_folder import RunFolder
-from thincam_jax.learn.checkpoint import CheckpointError
+from thincam_jax.commands.schema import Length, section
+from thincam_jax.commands.sections import LenslessConfig, SensorConfig
+from thincam_jax.learn.refocusing import sources
 from thincam_jax.learn.refocusing.cameras import RefocusCamera
-from thincam_jax.learn.refocusing.network import RefocusNetwork
+from thincam_jax.learn.refocusing.network import NetworkOptions, RefocusNetwork
 from thincam_jax.learn.refocusing.result import RefocusTraining, finite, judge_training
-from thincam_jax.learn.refocusing.sources import Source, drawn, photographs, samples
+from thincam_jax.learn.refocusing.scenes import SceneOptions
 from thincam_jax.learn.refocusing.train import NETWORK, Lessons, train
 from thincam_jax.learn.refocusing.unet import parameter_count
-from thincam_jax.learn.training import TrainingOptions, TrainingProgress
+from thincam_jax.learn.training import TrainingOptions
 from thincam_jax.lensless.camera import LenslessCamera
+from thincam_jax.lensless.masks.fza import FresnelZoneAperture
 from thincam_jax.plot import learned as plot
 from thincam_jax.plot.refocus import animate_sweep, draw_sweep
-
-Found = TypeVar("Found")
+from thincam_jax.studies.refocus import FocusRange
 
 _SWEEP = "One capture, focused on the distance above each; one grey scale for all."
 _SCENES = (
@@ -32,51 +43,67 @@ _SCENES = (
 )
 
 
-class TrainingFolder(RunFolder):
-    """Files of one training, each written whole or not at all.
-
-    - `config.yaml`: the resolved configuration.
-    - `network.thincam`: the best network until now; `training-1.state` and so on: what
-      `--resume` goes on from.
-    - `figures/`, `environment.json`, `report.html` and, last, `training.json`.
-    """
-
-    kind, folders, result = "training", ("figures",), "training.json"
-    others = (NETWORK,)
+class ZonesConfig(section(FresnelZoneAperture, only=("beta", *APERTURE)), ApertureConfig):
+    """The Fresnel zone aperture."""
 
 
-@dataclass(frozen=True)
-class Ended:
-    """How a training ended, in a line; the files of its network and its page."""
+class FocusConfig(
+    section(FocusRange, RefocusCamera, only=("nearest", "farthest", "planes", "pupil"))
+):
+    """Images that are to be had: see `learn.refocusing.RefocusCamera`."""
 
-    line: str
-    network: Path
-    page: Path | None = None
+    shape: tuple[Count, Count]
+
+    @pydantic.model_validator(mode="after")
+    def _ordered(self):
+        FocusRange("", self.nearest, self.farthest)
+        return self
 
 
-def run_training(
-    config: LearnedConfig,
-    folder: TrainingFolder,
-    callback: Callable[[TrainingProgress], object],
-    *,
-    resume: bool = False,
-) -> Ended:
-    """Train and report; writes training.json last.
+class ScenesConfig(section(SceneOptions)):
+    """See `learn.refocusing.scenes.SceneOptions`; `side`: pixels of the images they are cut of."""
 
-    `resume`: go on from the state in the folder, to the same bits as without the interruption.
+    side: Annotated[int, Field(ge=8, le=4096)] = 256
 
-    **Errors**: ConfigError where a folder holds a training and `resume` is not asked for, or the
-    other way round, or holds a damaged state.
-    """
-    started = time.time()
-    check_resume(folder, resume)
+
+class NetworkConfig(section(NetworkOptions)):
+    """See `learn.refocusing.NetworkOptions`."""
+
+
+_LESSONS = ("batch", "pool", "judged")
+
+
+class TrainingConfig(section(TrainingOptions, Lessons, only=(*TRAINING, *_LESSONS))):
+    """See `learn.training.TrainingOptions`; `batch`, `pool`, `judged`: see `learn.Lessons`."""
+
+
+class LearnedConfig(LenslessConfig):
+    """A network that refocuses the captures of one camera."""
+
+    pictured = "sources"
+    kind: Literal["learned"]
+    sensor: SensorConfig
+    mask: ZonesConfig
+    distance: Length
+    focus: FocusConfig
+    sources: Annotated[tuple[SourceConfig, ...], Field(min_length=1)]
+    scenes: ScenesConfig = ScenesConfig()
+    network: NetworkConfig = NetworkConfig()
+    training: TrainingConfig = TrainingConfig()
+    notes: tuple[str, ...] = ()
+
+    @pydantic.model_validator(mode="after")
+    def _sources_fit(self):
+        check_sources(self)
+        return self
+
+
+def run_training(config: LearnedConfig, place: InFolder) -> Ended:
+    """Train and report; writes training.json last. **Errors**: as of `InFolder`."""
+    started, folder = time.time(), place.folder
+    place.check()
     untrained, lessons = build_network(config), build_lessons(config)
-    folder.claim(config)
-    try:
-        options = build_options(config)
-        trained = train(untrained, lessons, options, folder=folder.path, callback=callback)
-    except CheckpointError as error:
-        raise ConfigError(str(error)) from None
+    trained = place.train(config, train, untrained, lessons)
     result = judge_training(trained, untrained, lessons.validation(trained.model, config.seed))
     state = trained.state
     metrics = {
@@ -105,19 +132,6 @@ def run_training(
     return Ended(f"{trained.status}: {line}", path / NETWORK, path / "report.html")
 
 
-def check_resume(folder: TrainingFolder, resume: bool) -> None:
-    """**Errors**: ConfigError where the folder has a state and `resume` is not asked for, or the
-    other way round."""
-    begun = any(folder.path.glob("training*.state"))
-    if begun and not resume:
-        raise ConfigError(
-            f"--out {folder.path}: holds a training; give --resume to go on with it, or another "
-            "folder"
-        )
-    if resume and not begun:
-        raise ConfigError(f"--resume: {folder.path} holds no training yet; leave it out")
-
-
 def build_camera(config: LearnedConfig) -> RefocusCamera:
     """**Errors**: ConfigError, one line, for numbers that do not make a camera."""
     focus = config.focus
@@ -144,46 +158,14 @@ def build_network(config: LearnedConfig) -> RefocusNetwork:
 
 def build_lessons(config: LearnedConfig) -> Lessons:
     """**Errors**: ConfigError, one line for each source that cannot be read."""
-    of_use: dict[str, list[Source]] = {"train": [], "judge": []}
-    images = read_sources(config, functools.partial(_read, side=config.scenes.side))
+    of_use: dict[str, list[sources.Source]] = {"train": [], "judge": []}
+    images = read_sources(config, lambda source: source.images(sources, config.scenes.side))
     for source, read in zip(config.sources, images, strict=True):
         of_use[source.use].append(read)
     train, judge = (functools.reduce(operator.add, s) if s else None for s in of_use.values())
     assert train is not None  # the sections are checked
     scenes = config.scenes.build()
     return config.training.build(Lessons, source=train, scenes=scenes, held_out=judge)
-
-
-def read_sources(config: Any, read: Callable[[Any], Found]) -> list[Found]:
-    """The images of every source of a file, by a function of its section.
-
-    **Errors**: ConfigError, one line for each source that cannot be read.
-    """
-    found, faults = [], []
-    for number, source in enumerate(config.sources):
-        try:
-            found.append(read(source))
-        except (ValueError, OSError) as error:
-            place = config.place_of("sources", number)
-            faults.append(f"{place}sources[{number}]: {error}")
-    if faults:
-        raise ConfigError("\n".join(faults))
-    return found
-
-
-def build_options(config: Any) -> TrainingOptions:
-    """Length and rate of a training."""
-    return config.training.build(TrainingOptions, seed=config.seed)
-
-
-def _read(source: SourceConfig, side: int) -> Source:
-    if source.kind == "drawn":
-        assert source.count is not None  # the section is checked
-        return drawn(source.seed, source.count, side)
-    if source.kind == "samples":
-        return samples(side)
-    assert source.path is not None
-    return photographs(source.path, side, licence=source.licence)
 
 
 def page(config: LearnedConfig, lessons: Lessons, result: RefocusTraining) -> Page:

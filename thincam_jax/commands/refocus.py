@@ -1,24 +1,37 @@
-"""Refocus experiments: from the file to the study of its scene, its run and its page."""
+"""Experiments of `kind: refocus`: the file, the study of its scene, its run and its page."""
 
 from dataclasses import asdict, dataclass, replace
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
+import pydantic
+from pydantic import Field
 
+from thincam_jax._core.quantity import FieldError
 from thincam_jax.commands.config_file import ConfigError, slug
-from thincam_jax.commands.refocus.config import RefocusConfig
 from thincam_jax.commands.report import Page, Part, Picture, Sentences, optics_of, pixels_of
 from thincam_jax.commands.run_folder import Progress, Run, RunFolder
-from thincam_jax.commands.study.build import assemble, read_picture
+from thincam_jax.commands.schema import section
+from thincam_jax.commands.sections import (
+    CamerasConfig,
+    Name,
+    TargetConfig,
+    check_known,
+    check_names,
+)
+from thincam_jax.commands.study.build import assemble, check_optics, read_picture
 from thincam_jax.imaging.targets import middle_square
 from thincam_jax.plot import refocus as plot
 from thincam_jax.plot.frame import grey_levels, white_level
 from thincam_jax.studies.refocus import (
+    FocusRange,
     RefocusResult,
     RefocusRun,
     RefocusStudy,
+    SceneObject,
     place,
 )
+from thincam_jax.studies.study import Target
 
 _SWEEP = (
     "Reconstructions from the same captures, focused on the distance above each; one grey scale "
@@ -37,6 +50,47 @@ _METHODS = (
     "that in focus framed. Each picture has its own white."
 )
 
+_PLACE = ("distance", "width", "x", "y")
+
+
+class PlacedConfig(section(SceneObject, only=_PLACE), TargetConfig):
+    """A picture that stands at a distance, its middle at (x, y), on a dark ground.
+
+    Colours are averaged. `crop` takes the middle of a picture, that part of its shorter side.
+    """
+
+    crop: Annotated[float, Field(gt=0, le=1)] = 1.0
+
+
+class SweepConfig(section(FocusRange)):
+    """Over which distances, by which method, and what is called sharp."""
+
+    method: Name
+
+
+class RefocusConfig(CamerasConfig):
+    """A scene of several objects, captured once, and focused afterwards."""
+
+    pictured = "objects"
+    kind: Literal["refocus"]
+    objects: Annotated[tuple[PlacedConfig, ...], Field(min_length=1)]
+    sweep: SweepConfig
+    notes: tuple[str, ...] = ()
+
+    @pydantic.model_validator(mode="after")
+    def _objects_fit(self):
+        check_names(self, "objects")
+        names = [method.name for method in self.methods]
+        check_known(self.sweep.method, "method", names, "sweep", "method")
+        for index, placed in enumerate(self.objects):
+            if not self.sweep.nearest < placed.distance < self.sweep.farthest:
+                message = (
+                    f"{placed.distance:g} mm lies outside of the sweep; give a distance between "
+                    f"{self.sweep.nearest:g} and {self.sweep.farthest:g} mm, or a wider sweep"
+                )
+                raise FieldError(message, "objects", index, "distance")
+        return self
+
 
 @dataclass(frozen=True, eq=False)
 class FileRefocus(RefocusStudy):
@@ -44,42 +98,33 @@ class FileRefocus(RefocusStudy):
 
     config: Any = None
 
-    @property
-    def warnings(self) -> list[str]:
-        """What a user should know before it runs."""
-        return self.study.warnings
-
 
 def build_refocus(config: RefocusConfig) -> FileRefocus:
     """Cameras and methods, and the objects as targets at their distances.
 
     **Errors**: ConfigError, one line for each fault, beginning with the field.
     """
-    study, faults, objects = assemble(config, ()), [], []
+    study, wrong = assemble(config), []
     try:
-        for exposure in study.exposures:
-            study.camera(exposure)
-    except (ValueError, TypeError) as error:
-        faults.append(f"mask, sensor or model: {error}")
-    for number, placed in enumerate(config.objects):
-        try:
-            picture = read_picture(placed)
-            if placed.crop < 1:
-                picture = middle_square(picture, round(placed.crop * min(picture.shape[:2])))
-            seen = placed.build(name=placed.name, picture=picture)
-            objects.append(place(study, number, seen))
-        except (ValueError, FileNotFoundError) as error:
-            faults.append(f"objects[{number}]: {error}")
-    if faults:
-        raise ConfigError("\n".join(faults))
+        check_optics(study)
+    except ConfigError as error:
+        wrong.append(str(error))
+
+    def read(placed: PlacedConfig) -> Target:
+        picture = read_picture(placed)
+        if placed.crop < 1:
+            picture = middle_square(picture, round(placed.crop * min(picture.shape[:2])))
+        return place(study, 0, placed.build(name=placed.name, picture=picture))
+
+    objects, faults = config.read_each("objects", read, "path")
+    if wrong or faults:
+        raise ConfigError("\n".join([*wrong, *faults]))
     return FileRefocus(replace(study, targets=tuple(objects)), config.sweep.build(), config)
 
 
 def run_refocus(refocusing: FileRefocus, folder: RunFolder, progress: Progress) -> RefocusResult:
     """Capture, sweep, reconstruct and report; the same configuration gives the same metrics."""
-    run = _RefocusRun(refocusing, folder)
-    run.carry_out(progress)
-    return run.running.result
+    return _RefocusRun(refocusing, folder).carry_out(progress).running.result
 
 
 class _RefocusRun(Run):

@@ -1,1 +1,0 @@
-"""Experiments of `kind: refocus`: distances, depth maps, sharp pictures."""
