@@ -5,7 +5,7 @@ import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import pydantic
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Running = TypeVar("Running", bound="Run")
+Folder = TypeVar("Folder", bound="RunFolder")
 
 
 class RunFolder:
@@ -46,7 +47,7 @@ class RunFolder:
         self.path = Path(path)
 
     @classmethod
-    def chosen(cls, out: Path | None, name: str, config: Section) -> Self:
+    def chosen(cls: type[Folder], out: Path | None, name: str, config: Section) -> Folder:
         """The folder asked for, or runs/NAME; where that is another's, runs/NAME-2 and so on."""
         first, number = out or Path("runs") / slug(name), 1
         folder = cls(first)
