@@ -91,14 +91,14 @@ def acquire(
         run = Taker(plan, rig, procedure)
         settings = _begin(run, path)
         with Recorder(path) as recorder:
-            todo, total = recorder.missing, len(plan.steps)
+            todo, total = recorder.missing, len(run.steps)
             require_space(path, len(todo) * recorder.store.frame_bytes)
             recorder.note({"begins": now(), "versions": versions(), "procedure": asdict(procedure)})
             done, started = total - len(todo), time.monotonic()
             for count, number in enumerate(todo, 1):
                 if stop.is_set():
                     break
-                step = plan.steps[number]
+                step = run.steps[number]
                 frame, facts = run.take(step, settings[step.settings])
                 with run.clock("keep"):
                     recorder.add(number, frame.pixels, facts)
@@ -127,8 +127,8 @@ def _begin(run: Taker, path: Path) -> tuple[CameraSettings, ...]:
             f"the plan {run.plan.name!r} has regions of several sizes; give one size, or a plan "
             "for each"
         )
-    first = run.plan.steps[0]
-    frame, _ = run.take(first, settings[first.settings], probe=True)
+    first = run.steps[0]
+    frame, facts = run.take(first, settings[first.settings], probe=True)
     run.bits = bits = frame.bit_depth
     attributes = {
         "kind": CAPTURES,
@@ -141,6 +141,7 @@ def _begin(run: Taker, path: Path) -> tuple[CameraSettings, ...]:
             "settings": [asdict(one) for one in settings],
             "asked": [asdict(one) for one in run.plan.settings],
             "procedure": asdict(run.procedure),
+            "start": facts["position"],
             "versions": versions(),
             "begun": now(),
         },
@@ -178,6 +179,7 @@ def _resumed(run: Taker, path: Path) -> tuple[CameraSettings, ...]:
                 f"{path} was begun with the {role} {was}, and this rig has {now_is}; connect that "
                 "one, or give another name"
             )
+    run.steps = run.plan.placed(begun.get("start"))
     settings = tuple(settings_from(record) for record in begun["settings"])
     for one in settings:
         run.persist(lambda one=one: run.configure(one))
@@ -194,7 +196,7 @@ def _new_settings(run: Taker) -> tuple[CameraSettings, ...]:
                 f"the plan {run.plan.name!r} has {len(asked)} settings; auto-exposure takes "
                 "plans with one"
             )
-        lit = next((s for s in run.plan.steps if not s.dark), run.plan.steps[0])
+        lit = next((s for s in run.steps if not s.dark), run.steps[0])
 
         def level_at(exposure: float) -> float:
             settings = run.persist(lambda: run.set_near(replace(asked[0], exposure=exposure)))

@@ -44,7 +44,7 @@ BLACK = Pattern("black")
 class Step:
     """One frame: its pattern and settings by their number in the plan, and the stage position.
 
-    - `position`: mm; None: the stage does not move.
+    - `position`: mm; None: the stage stays where the steps before left it.
     - `dark`: a dark frame, subtracted from the others.
     """
 
@@ -88,6 +88,14 @@ class Plan:
     def pattern(self, step: Step) -> Pattern:
         """Pattern shown in a step of this plan."""
         return self.patterns[step.pattern]
+
+    def placed(self, start: float | None = None) -> tuple[Step, ...]:
+        """The steps, each with the stage's position, mm: the last given one, `start` before any."""
+        positions = [start]
+        for step in self.steps:
+            positions.append(positions[-1] if step.position is None else step.position)
+        pairs = zip(self.steps, positions[1:], strict=True)
+        return tuple(dataclasses.replace(step, position=position) for step, position in pairs)
 
     @cached_property
     def hash(self) -> str:
