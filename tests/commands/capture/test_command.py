@@ -174,6 +174,23 @@ def test_a_rig_that_cannot_be_opened(asked, line, tmp_path):
 @pytest.mark.parametrize(
     ("asked", "line"),
     [
+        ("plan.distances=[6.5 mm, 506.5 mm]", "begin: 5 of 10 steps lie outside, first one at 500"),
+        ("camera.exposure=1000 s", "ExposureTime of 1000 s; give "),
+        ("camera.region={top: 9, left: 0, height: 64, width: 96}", "lies outside of the sensor"),
+    ],
+)
+def test_the_limits_of_a_rig_hold_for_the_whole_plan_before_the_first_frame(asked, line, tmp_path):
+    raw = yaml.safe_load(tiny.METHOD_B) | {"stage": {"driver": "zaber"}}
+    raw["plan"] |= {"kind": "method_a", "betas": ["60 rad/mm^2"], "distances": ["6.5 mm"]}
+    file, store = tiny.write(tmp_path, yaml.safe_dump(raw)), tmp_path / "a.zarr"
+    result = call("capture", file, "--out", store, "--set", asked)
+    (told,) = result.stderr.splitlines()
+    assert result.exit_code == command.STOPPED and line in told and not store.exists()
+
+
+@pytest.mark.parametrize(
+    ("asked", "line"),
+    [
         ("plan.betas=[25 rad/mm^2]", "plan.betas: method_b compares two β"),
         ("plan.cells=[8, 8]", "plan.cells: a plan of kind method_b takes betas, width, profile"),
         ("plan.kind=method_a", "plan.distances: a plan of kind method_a needs it"),

@@ -35,7 +35,7 @@ from thincam_jax.hardware.acquisition.recorder import (
 from thincam_jax.hardware.acquisition.rig import Rig
 from thincam_jax.hardware.acquisition.taker import Procedure, Taker, full_scale
 from thincam_jax.hardware.base import CameraSettings, Identity
-from thincam_jax.hardware.errors import NotHomed
+from thincam_jax.hardware.errors import NotHomed, OutOfRange
 
 
 @dataclass(frozen=True)
@@ -111,13 +111,8 @@ def acquire(
 
 def _begin(run: Taker, path: Path) -> tuple[CameraSettings, ...]:
     """Create the store, or check that it belongs to this run; returns its camera settings."""
-    moves = any(step.position is not None for step in run.plan.steps)
-    if moves and run.rig.stage is None:
-        raise ValueError(
-            f"the plan {run.plan.name!r} moves a stage and the rig has none; give open_stage"
-        )
-    if moves and not run.rig.stage.homed:  # pyright: ignore[reportOptionalMemberAccess]
-        raise NotHomed(run.name("stage"), "begin", "it does not know where it is", "home it first")
+    if positions := [step.position for step in run.steps if step.position is not None]:
+        _require_stage(run, positions)
     if path.exists():
         return _resumed(run, path)
     settings = _new_settings(run)
@@ -157,6 +152,22 @@ def _begin(run: Taker, path: Path) -> tuple[CameraSettings, ...]:
     layout = whole, dtype_of_bits(bits), attributes
     create_store(path, run.plan.as_json(), *layout, together=together)
     return settings
+
+
+def _require_stage(run: Taker, positions: list[float]) -> None:
+    """Check that a homed stage can take all positions of a plan, mm."""
+    stage = run.rig.stage
+    if stage is None:
+        raise ValueError(
+            f"the plan {run.plan.name!r} moves a stage and the rig has none; give open_stage"
+        )
+    if not stage.homed:
+        raise NotHomed(run.name("stage"), "begin", "it does not know where it is", "home it first")
+    low, high = stage.limits
+    if outside := [place for place in positions if not low <= place <= high]:
+        cause = f"{len(outside)} of {len(positions)} steps lie outside, first one at {outside[0]:g}"
+        remedy = f"give positions from {low:g} to {high:g} mm, nothing was taken"
+        raise OutOfRange(run.name("stage"), "begin", f"{cause} mm", remedy)
 
 
 def _resumed(run: Taker, path: Path) -> tuple[CameraSettings, ...]:
