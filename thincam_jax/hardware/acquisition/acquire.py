@@ -22,6 +22,7 @@ from thincam_jax._core.capture_store import (
     CaptureStoreError,
     dtype_of_bits,
 )
+from thincam_jax._core.text import of_error, shortened
 from thincam_jax.hardware.acquisition.auto_exposure import find_exposure
 from thincam_jax.hardware.acquisition.plan import Plan, settings_from
 from thincam_jax.hardware.acquisition.recorder import (
@@ -173,16 +174,22 @@ def _require_stage(run: Taker, positions: list[float]) -> None:
 def _resumed(run: Taker, path: Path) -> tuple[CameraSettings, ...]:
     """Camera settings with which the store was begun, after checking that all else agrees."""
     store = CaptureStore(path)
-    begun = store.attributes.get("acquisition")
-    if begun is None:
-        raise CaptureStoreError(f"{path} was not made by an acquisition; give another name")
-    if begun["plan"] != run.plan.hash:
+    try:
+        begun = store.attributes["acquisition"]
+        name, plan, start = str(begun["name"]), str(begun["plan"]), begun.get("start")
+        devices = {role: Identity(**record) for role, record in begun["devices"].items()}
+        settings = tuple(settings_from(record) for record in begun["settings"])
+        run.steps = run.plan.placed(None if start is None else float(start))
+    except Exception as error:  # whatever another's attributes bring about
         raise CaptureStoreError(
-            f"{path} was begun with another plan ({begun['name']}, {begun['plan'][:12]}), not "
+            f"{path} was not made by an acquisition ({of_error(error)}); give another name"
+        ) from error
+    if plan != run.plan.hash or len(store.digests) != len(run.steps):
+        raise CaptureStoreError(
+            f"{path} was begun with another plan ({shortened(name)}, {plan[:12]}), not "
             f"with this one ({run.plan.name}, {run.plan.hash[:12]}); give another name, or "
             "the plan it was begun with"
         )
-    devices = {role: Identity(**record) for role, record in begun["devices"].items()}
     for role in sorted({*devices, *run.identities}):
         was, now_is = (every.get(role, "none") for every in (devices, run.identities))
         if was != now_is:
@@ -190,8 +197,6 @@ def _resumed(run: Taker, path: Path) -> tuple[CameraSettings, ...]:
                 f"{path} was begun with the {role} {was}, and this rig has {now_is}; connect that "
                 "one, or give another name"
             )
-    run.steps = run.plan.placed(begun.get("start"))
-    settings = tuple(settings_from(record) for record in begun["settings"])
     for one in settings:
         run.persist(lambda one=one: run.configure(one))
     run.bits = store.attributes["bits"]

@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
+from thincam_jax._core.quantity import check_fields
 from thincam_jax.hardware.base import CameraSettings, Region
 
 if TYPE_CHECKING:  # it brings JAX
@@ -120,7 +121,7 @@ class Plan:
 
     @classmethod
     def from_json(cls, text: str) -> "Plan":
-        """Inverse of `as_json`; ValueError, KeyError or TypeError for anything else."""
+        """Inverse of `as_json`; errors of many kinds for anything else."""
         plan = json.loads(text)
         return cls(
             name=plan["name"],
@@ -139,7 +140,9 @@ def canonical_json(value: Any) -> str:
 def settings_from(record: Mapping[str, Any]) -> CameraSettings:
     """Inverse of `dataclasses.asdict` for camera settings."""
     region = record["region"]
-    return CameraSettings(**{**record, "region": None if region is None else Region(**region)})
+    found = CameraSettings(**{**record, "region": None if region is None else Region(**region)})
+    check_fields(found)
+    return found
 
 
 def zone_plate(
