@@ -32,7 +32,7 @@ class BenchFolder:
 
     def claim(self, config: StudyConfig) -> None:
         """Make the folder; ConfigError for one that holds anything but this configuration's."""
-        claim_folder(self.path, "config.yaml", dump_config(config), "benchmark")
+        self._lock = claim_folder(self.path, "config.yaml", dump_config(config), "benchmark")
 
     def finish(self, results: dict[str, Any]) -> None:
         """Write the results, which mark the benchmark as complete."""

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import pydantic
+from filelock import FileLock, Timeout
 
 from thincam_jax._core.environment import environment
 from thincam_jax._core.files import WriteError, read_regular, write_whole
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Record = TypeVar("Record")
+_LOCK = ".lock"
 
 
 class RunFolder:
@@ -48,7 +50,8 @@ class RunFolder:
 
         An interrupted run of the same configuration goes on; a complete one is done anew.
         """
-        claim_folder(self.path, "config.yaml", dump_config(config), self.kind, self.folders)
+        text = dump_config(config)
+        self._lock = claim_folder(self.path, "config.yaml", text, self.kind, self.folders)
         if (self.path / self.result).exists():
             for finished in (self.path / "targets").glob("*.json"):
                 finished.unlink()
@@ -125,20 +128,31 @@ class Run:
         self.folder.complete(page, self.config, self.metrics, self.started)
 
 
-def claim_folder(path: Path, name: str, text: str, kind: str, folders: Sequence[str] = ()) -> None:
+def claim_folder(
+    path: Path, name: str, text: str, kind: str, folders: Sequence[str] = ()
+) -> FileLock:
     """Make a folder with `folders` in it, and write the file `name` that says what it holds.
 
-    `kind` is a word for what it holds. A folder that holds the same already is taken as it is.
+    `kind` is a word for what it holds. A folder that holds the same already is taken as it is. The
+    lock keeps other processes out as long as it is referred to.
 
-    **Errors**: ConfigError where it holds anything else, or cannot be made.
+    **Errors**: ConfigError where it holds anything else, another process claims it, or it cannot be
+    made.
     """
     held = path / name
     try:
         path.mkdir(parents=True, exist_ok=True)
         refuse_foreign(path, name, text, kind)
+        lock = FileLock(path / _LOCK, is_singleton=True)
+        lock.acquire(timeout=0)
         write_whole(held, text)
         for folder in folders:
             (path / folder).mkdir(exist_ok=True)
+        return lock
+    except Timeout:
+        raise ConfigError(
+            f"--out {path}: another {kind} writes to it; wait for its end or give another folder"
+        ) from None
     except WriteError:
         raise
     except OSError as error:
@@ -148,8 +162,8 @@ def claim_folder(path: Path, name: str, text: str, kind: str, folders: Sequence[
 def refuse_foreign(path: Path, name: str, text: str, kind: str) -> None:
     """ConfigError where an existing folder holds what `claim_folder` may not go on with."""
     held = path / name
-    # A neighbour is all that is there where the first start was killed.
-    foreign = any(p.name != f"{name}.partial" for p in path.iterdir())
+    # Its lock and a partial file are all that is there where the first start was killed.
+    foreign = any(p.name != _LOCK and p.suffix != ".partial" for p in path.iterdir())
     if held.exists():
         if read_regular(held) != text.encode("utf-8"):
             raise ConfigError(

@@ -41,7 +41,7 @@ class SweepFolder:
 
         Another grid of the same study is welcome: points are recognised by their configuration.
         """
-        claim_folder(self.path, "study.yaml", dump_config(base), "sweep", ("points",))
+        self._lock = claim_folder(self.path, "study.yaml", dump_config(base), "sweep", ("points",))
 
     def outcome(self, base: StudyConfig) -> str:
         """What a sweep would write, in a line; ConfigError where `claim` would refuse."""
