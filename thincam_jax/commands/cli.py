@@ -17,6 +17,7 @@ from thincam_jax.commands.kinds import init
 from thincam_jax.commands.reconstruct.command import check, reconstruct
 from thincam_jax.commands.run import accuracy, run, train
 from thincam_jax.commands.sweep.command import sweep
+from thincam_jax.commands.terminal import say
 
 ORDER = (
     *("init", "explain", "run", "capture", "reconstruct", "calibrate", "sweep", "design", "train"),
@@ -103,7 +104,7 @@ def _print_version(asked: bool) -> bool:
     if asked:
         from importlib.metadata import version
 
-        print(f"thincam_jax {version('thincam_jax')}")
+        say(f"thincam_jax {version('thincam_jax')}")
         raise typer.Exit
     return asked
 
@@ -136,20 +137,20 @@ def doctor() -> None:
     from thincam_jax._core import environment as installation
 
     found = installation.environment()
-    print(f"Python {found['python']} on {found['platform']}")
-    print("devices: " + ", ".join(found["devices"]))
-    print(f"cores: {found['cores']}; memory: {found['memory']} free")
+    say(f"Python {found['python']} on {found['platform']}")
+    say("devices: " + ", ".join(found["devices"]))
+    say(f"cores: {found['cores']}; memory: {found['memory']} free")
     for name, support in installation.dtype_support().items():
-        print(f"  {name}: {support}")
-    print(f"  compiled sums: {installation.compiled_sums()}")
-    print(f"compiled programs: {cache_state()}")
+        say(f"  {name}: {support}")
+    say(f"  compiled sums: {installation.compiled_sums()}")
+    say(f"compiled programs: {cache_state()}")
     for name, version in found["versions"].items():
-        print(f"{name} {version or 'NOT INSTALLED'}")
+        say(f"{name} {version or 'NOT INSTALLED'}")
     optional = installation.installed(installation.OPTIONAL)
     for name, version in optional.items():
-        print(f"optional {name} {version}")
+        say(f"optional {name} {version}")
     for name, purpose in installation.OPTIONAL.items():
         if name not in optional:
-            print(f"optional {name} is missing: {purpose}")
+            say(f"optional {name} is missing: {purpose}")
     for line in known_drivers():
-        print(line)
+        say(line)

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
-from thincam_jax.commands.terminal import told
+from thincam_jax.commands.terminal import say, told
 
 
 @dataclass(frozen=True)
@@ -143,7 +143,7 @@ def init(
         if path.exists():
             raise ConfigError(f"{path} exists; give another --out, or delete it")
         write_whole(path, text)
-    print(f"{path}; next: thincam {next_command(kind)} {path}")
+    say(f"{path}; next: thincam {next_command(kind)} {path}")
 
 
 def next_command(kind: str) -> str:

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from thincam_jax.commands.terminal import DryRun, Overrides, counted, show, told, warn
+from thincam_jax.commands.terminal import DryRun, Overrides, counted, say, show, told, warn
 
 if TYPE_CHECKING:
     from thincam_jax.studies.design_scores import DesignScores
@@ -43,8 +43,8 @@ def design(
         with counted(wanted.name) as progress:
             found = run_design(study, folder, progress)
     show(found.table())
-    print(_levels(found))
-    print(f"report: {folder.path / 'report.html'}")
+    say(_levels(found))
+    say(f"report: {folder.path / 'report.html'}")
 
 
 def _levels(found: "DesignScores") -> str:
