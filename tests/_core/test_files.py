@@ -1,4 +1,5 @@
 import os
+import re
 
 import pytest
 
@@ -41,9 +42,36 @@ def test_crash_while_writing_leaves_nothing_half(tmp_path):
 
 def test_missing_folder_is_told(tmp_path):
     path = tmp_path / "absent" / "a.txt"
-    with pytest.raises(files.WriteError) as raised:
+    told = f"{path}: cannot be written (No such file or directory); make its folder first, or"
+    with pytest.raises(files.WriteError, match=f"^{re.escape(told)}"):
         files.write_whole(path, "x")
-    assert str(raised.value).startswith(f"{path}: cannot be written (No such file or directory); ")
+    path.parent.mkdir()  # as it was advised
+    files.write_whole(path, "x")
+
+
+def test_no_link_is_followed_and_no_neighbour_is_overwritten(tmp_path):
+    """Whatever another user has put beside it in a folder that both can write to."""
+    path, victim = tmp_path / "a.txt", tmp_path / "victim"
+    for place in (path, tmp_path / "a.txt.partial"):
+        victim.write_text("mine", encoding="utf-8")
+        place.symlink_to(victim)
+        files.write_whole(path, "x")
+        assert victim.read_text(encoding="utf-8") == "mine"
+        assert not path.is_symlink() and path.read_text(encoding="utf-8") == "x"
+
+
+def test_of_two_writers_of_a_file_one_wins(tmp_path, monkeypatch):
+    path, replace = tmp_path / "a.txt", os.replace
+
+    def other_first(source, target):
+        monkeypatch.setattr(os, "replace", replace)
+        files.write_whole(path, "second")
+        replace(source, target)
+
+    monkeypatch.setattr(os, "replace", other_first)
+    files.write_whole(path, "first")
+    assert path.read_text(encoding="utf-8") == "first"
+    assert [p.name for p in tmp_path.iterdir()] == ["a.txt"]
 
 
 def test_only_regular_files_are_read(tmp_path):

@@ -51,9 +51,11 @@ def test_unknown_kind_and_missing_folder(tmp_path):
     line = one_line(call("init", "camera"))
     named = "study, refocus, design, capture, learned, denoiser, design_both, "
     assert line.startswith(f"init camera: choose one of {named}")
-    assert "cannot be written (No such file" in one_line(
-        call("init", "study", "--out", tmp_path / "no" / "study.yaml")
-    )
+    path = tmp_path / "no" / "study.yaml"
+    line = one_line(call("init", "study", "--out", path))
+    assert "cannot be written (No such file or directory); make its folder first, or give" in line
+    path.parent.mkdir()  # as it was advised
+    assert call("init", "study", "--out", path).exit_code == 0
 
 
 def test_the_wheel_holds_them_where_they_are_looked_for(tmp_path, monkeypatch):

@@ -2,9 +2,10 @@
 
 Each pattern carries a fiducial, its number in base 256 in the first pixels; the camera sees what is
 shown with a texture of its own, so that a frame tells of which pattern it is, whole. It imports no
-JAX: `python memory_rig.py STORE FRAMES [rows]` is the process that tests kill.
+JAX: `python memory_rig.py STORE FRAMES [rows|stays]` is the process that tests kill.
 """
 
+import itertools
 import sys
 import time
 from dataclasses import replace
@@ -222,6 +223,14 @@ def fiducial_plan(count: int, *, every: int = 5, dark_every: int = 0, stage: boo
     return Plan("fiducials", patterns, (SETTINGS,), tuple(steps))
 
 
+def staying(plan: Plan) -> Plan:
+    """The plan with a position only where the stage moves, and none for the first steps."""
+    places = [step.position for step in plan.steps]
+    moves = [None, *(b if a != b else None for a, b in itertools.pairwise(places))]
+    steps = [replace(s, position=p) for s, p in zip(plan.steps, moves, strict=True)]
+    return replace(plan, steps=tuple(steps))
+
+
 def by_rows(plan: Plan) -> Plan:
     """The plan, 2^n patterns of it, as one of Hadamard patterns: 16 frames share a chunk."""
     dark = sum(step.dark for step in plan.steps)
@@ -236,7 +245,10 @@ if __name__ == "__main__":
     from thincam_jax.hardware.acquisition.acquire import acquire
 
     plan = fiducial_plan(int(sys.argv[2]), dark_every=16)
+    kinds = {"rows": by_rows, "stays": staying}
+    for kind in kinds.keys() & set(sys.argv):
+        plan = kinds[kind](plan)
     with World(pause=0.004).rig() as rig:
-        done = acquire(by_rows(plan) if "rows" in sys.argv else plan, rig, sys.argv[1])
+        done = acquire(plan, rig, sys.argv[1])
     assert not xla_bridge.backends_are_initialized()  # the rig leaves the GPU to others
     print("complete" if done.complete else "stopped")

@@ -17,6 +17,7 @@ from thincam_jax.learn.checkpoint import (
     difference,
     read_arrays,
     read_description,
+    read_weights,
     write_arrays,
 )
 
@@ -36,6 +37,16 @@ def test_what_was_written_comes_back(file):
     # In the precision of what it is for.
     single = {name: leaf.astype(jnp.float32) for name, leaf in TREE.items()}
     assert read_arrays(file, single)["weight"].dtype == np.float32
+
+
+@pytest.mark.parametrize("wrong", [np.nan, np.inf])
+def test_weights_that_are_not_finite_are_told(wrong, tmp_path):
+    """Of every network; the state of a training may hold them."""
+    tree = {**TREE, "weight": TREE["weight"].at[1, 2].set(wrong)}
+    file = write_arrays(tmp_path / "net.thincam", tree, KNOWN)
+    assert read_arrays(file, TREE)["weight"].shape == (2, 3)
+    with pytest.raises(CheckpointError, match="holds weights that are not finite; give an earli"):
+        read_weights(file, TREE)
 
 
 def test_every_flipped_byte_is_told(file):
@@ -109,6 +120,8 @@ HOSTILE = {
     "a negative side": header_of((-2, -3)),
     "code in the header": header_of("__import__('os').system('false')"),
     "a header without end": b"\x93NUMPY\x01\x00\xff\xff" + b"(" * 65535,
+    "brackets without end": header_of("(" * 400),
+    "deep brackets": header_of("(" * 400 + ")" * 400),
     "another version": b"\x93NUMPY\x09\x00" + SCALAR[8:],
 }
 

@@ -7,6 +7,7 @@ checksum of its own. No compression: the last bits of a camera are noise.
 
 import contextlib
 import hashlib
+import math
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -15,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from thincam_jax._core.files import MeasurementError, writing
+from thincam_jax._core.text import of_error
 
 CALIBRATION = "Hadamard captures"  # a store whose frames are those of a `HadamardSeries`
 CAPTURES = "captures"  # any other
@@ -22,6 +24,9 @@ VERSION = 1
 TOGETHER = 16  # frames of a chunk, where all frames of some rows are to be read
 _CHUNK = 2**18  # bytes
 _NAMED = 8  # frames that a message lists
+_LARGEST = 2**30  # bytes of a frame, and of a chunk
+_MOST = 2**20  # frames
+_DESCRIBED = 2**24  # bytes of a file of metadata, of digests, and of a chunk of a matrix
 
 
 class CaptureStoreError(MeasurementError):
@@ -37,22 +42,39 @@ def opened(
     - `told`: what it is to be, and what makes one.
 
     **Errors**: CaptureStoreError, one line, where it is of none of the `kinds` or of another
-    version, or where the block finds something missing (KeyError) or wrong (ValueError).
+    version, or where the block finds something missing or wrong.
     """
     import zarr  # a second
 
     try:
-        group: Any = zarr.open_group(path, mode=mode)  # pyright: ignore[reportArgumentType]
+        for pattern in ("zarr.json", "*/zarr.json", "digests/c/*", "matrix/c/*/*"):
+            for file in Path(path).glob(pattern):
+                if not file.is_file() or file.stat().st_size > _DESCRIBED:
+                    raise ValueError(f"{file} is a device, a pipe or too large")
+        group: Any = zarr.open_group(path, mode=mode, zarr_format=3)  # pyright: ignore[reportArgumentType]
         attributes: dict[str, Any] = dict(group.attrs)
         kind, version = attributes["kind"], attributes["version"]
         if kind not in kinds or version != VERSION:
             raise ValueError(f"{kind}, version {version}")
         yield group, attributes
-    except (OSError, ValueError, KeyError) as error:
+    except Exception as error:  # whatever Zarr makes of another's metadata
         raise CaptureStoreError(
-            f"{path} is no {told[0]} ({type(error).__name__}: {error}); give one that {told[1]} "
-            "made"
+            f"{path} is no {told[0]} ({of_error(error)}); give one that {told[1]} made"
         ) from error
+
+
+def stored_array(group: Any, name: str, axes: int, dtypes: Sequence[str]) -> Any:
+    """An array of a group, as it is written here; ValueError for another, too large or packed."""
+    array = group[name]
+    size = math.prod(array.chunks) * array.dtype.itemsize
+    codecs = {codec.to_dict()["name"] for codec in array.metadata.codecs}
+    packed = codecs - {"bytes", "crc32c"} and name != "digests"  # once written with zstd
+    if array.ndim != axes or str(array.dtype) not in dtypes or size > _LARGEST or packed:
+        raise ValueError(
+            f"{name} has shape {array.shape}, type {array.dtype}, chunks {array.chunks}, codecs "
+            f"{', '.join(sorted(codecs))}"
+        )
+    return array
 
 
 class CaptureStore:
@@ -66,8 +88,14 @@ class CaptureStore:
         told = f"store of {kinds[-1]}", "an acquisition or create_captures"
         with opened(path, kinds, told, mode) as (self.group, self.attributes):
             # A chunk of black frames is written, too: one that is not there is missing.
-            self.frames = self.group["frames"].with_config({"write_empty_chunks": True})
-            self.digests = np.asarray(self.group["digests"][:])
+            dtype, shape = dtype_of_bits(self.attributes["bits"]), self.attributes["sensor_shape"]
+            frames = stored_array(self.group, "frames", 3, (dtype,))
+            self.frames = frames.with_config({"write_empty_chunks": True})
+            digests = stored_array(self.group, "digests", 1, ("uint64",))
+            count = digests.shape[0]
+            if frames.shape != (count, *shape) or count > _MOST or self.frame_bytes > _LARGEST:
+                raise ValueError(f"frames {frames.shape}, digests {count}, sensor {shape}")
+            self.digests = np.asarray(digests[:])
 
     @classmethod
     def create(
@@ -108,9 +136,13 @@ class CaptureStore:
         return self.frames.chunks[0]
 
     @property
+    def _chunks(self) -> Path:
+        return self.path / "frames" / "c"
+
+    @property
     def frame_bytes(self) -> int:
         """Bytes of a frame on the disk."""
-        return int(np.prod(self.frames.shape[1:])) * self.frames.dtype.itemsize
+        return math.prod(self.frames.shape[1:]) * self.frames.dtype.itemsize
 
     def chunk(self, number: int) -> range:
         """The frames that share a chunk with frame `number`."""
@@ -137,31 +169,28 @@ class CaptureStore:
     def tidy(self, numbers: Iterable[int]) -> None:
         """Remove what a killed process left half written in the chunks of frames."""
         for chunk in sorted({number // self.together for number in numbers}):
-            for partial in (self.path / "frames" / "c" / str(chunk)).rglob("*.partial"):
+            for partial in (self._chunks / str(chunk)).rglob("*.partial"):
                 partial.unlink()
 
     def files(self, numbers: Iterable[int]) -> list[Path]:
         """The files that hold frames, and their folders, as they have to reach the disk."""
         chunks = sorted({number // self.together for number in numbers})
-        folders = [self.path / "frames" / "c" / str(chunk) for chunk in chunks]
+        folders = [self._chunks / str(chunk) for chunk in chunks]
         rows = range(-(-self.frames.shape[1] // self.frames.chunks[1]))
         files = [folder / str(row) / "0" for folder in folders for row in rows]
-        return [*files, *(file.parent for file in files), *folders, self.path / "frames" / "c"]
+        return [*files, *(file.parent for file in files), *folders, self._chunks]
 
     def lost(self, *, truncated: bool = False) -> set[int]:
         """The frames of chunks that are not there or not whole; or only those of the latter."""
         # A chunk at the edge is stored as large as the others; 4 bytes are the checksum.
-        whole = int(np.prod(self.frames.chunks)) * self.frames.dtype.itemsize + 4
-        found = set()
-        for first in range(0, len(self.digests), self.together):
-            folder = self.path / "frames" / "c" / str(first // self.together)
-            for row in range(-(-self.frames.shape[1] // self.frames.chunks[1])):
-                try:
-                    bad = os.stat(folder / str(row) / "0").st_size != whole
-                except FileNotFoundError:
-                    bad = not truncated
-                if bad:
-                    found.update(self.chunk(first))
+        whole = math.prod(self.frames.chunks) * self.frames.dtype.itemsize + 4
+        rows, root, found = -(-self.frames.shape[1] // self.frames.chunks[1]), self._chunks, set()
+        there = {int(one) for one in os.listdir(root) if one.isdigit()} if root.is_dir() else set()
+        for number in range(-(-len(self.digests) // self.together)):
+            files = (root / str(number)).glob("[0-9]*/0") if number in there else ()
+            sizes = [os.stat(file).st_size for file in files]
+            if (len(sizes) < rows and not truncated) or any(size != whole for size in sizes):
+                found.update(self.chunk(number * self.together))
         return found
 
     def damaged(self) -> list[str]:
@@ -181,7 +210,7 @@ class CaptureStore:
             return np.asarray(self.frames[frames, rows])
         except (ValueError, OSError) as error:  # a checksum or a length that does not fit
             raise CaptureStoreError(
-                f"{self.path}: frames {', '.join(self.damaged())} are damaged ({error}); capture "
+                f"{self.path}: frames {listed(self.damaged())} are damaged ({error}); capture "
                 "them again"
             ) from error
 
@@ -197,7 +226,7 @@ def dtype_of_bits(bits: int | None) -> str:
     return "float32" if bits is None else "uint8" if bits <= 8 else "uint16"
 
 
-def listed(numbers: Sequence[int]) -> str:
+def listed(numbers: Sequence[int | str]) -> str:
     """Numbers of frames for a message: the first ones and how many more."""
     more = f" and {len(numbers) - _NAMED} more" if len(numbers) > _NAMED else ""
     return ", ".join(map(str, numbers[:_NAMED])) + more

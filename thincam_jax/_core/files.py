@@ -18,9 +18,10 @@ class WriteError(OSError):
     """A file that could not be written, as on a full disk, in one line."""
 
     def __str__(self) -> str:
+        advice = _ADVICE.get(self.errno or 0, "give another folder")
         return (
-            f"{self.filename}: cannot be written ({self.strerror}); make room or give another "
-            "folder; what was written before is kept"
+            f"{self.filename}: cannot be written ({self.strerror}); {advice}; what was written "
+            "before is kept"
         )
 
 
@@ -36,7 +37,7 @@ def writing(path: str | os.PathLike[str]) -> Iterator[None]:
 def write_whole(
     path: str | os.PathLike[str], content: bytes | str, *, on_disk: bool = False
 ) -> Path:
-    """Write `NAME.partial` beside the file and rename it; text as UTF-8.
+    """Write a new file of another name beside it and rename that; text as UTF-8.
 
     After an error or Ctrl-C the old file is untouched and no partial one is left. `on_disk`: the
     content has reached the disk before it takes the name, so that a power cut leaves one of both.
@@ -44,19 +45,18 @@ def write_whole(
     **Errors**: WriteError, one line, for what the system refuses.
     """
     path = Path(path)
-    partial = path.with_name(path.name + ".partial")
+    partial = path.with_name(f".{os.urandom(8).hex()}.partial")
     data = content.encode("utf-8") if isinstance(content, str) else content
     try:
         with writing(path):
-            with open(partial, "wb") as file:
+            with open(partial, "xb") as file:  # exclusively, hence never by a link
                 file.write(data)
                 if on_disk:
                     file.flush()
                     os.fsync(file.fileno())
             os.replace(partial, path)
     except BaseException:
-        if partial.is_file():
-            partial.unlink()
+        partial.unlink(missing_ok=True)
         raise
     return path
 
@@ -78,4 +78,9 @@ def read_regular(path: str | os.PathLike[str]) -> bytes:
 
 
 _SMALL = 2**20  # bytes that are read without asking for the memory
+_ROOM = "make room or give another folder"
+_ADVICE = {
+    **dict.fromkeys((errno.ENOSPC, errno.EDQUOT, errno.EFBIG), _ROOM),
+    errno.ENOENT: "make its folder first, or give another",
+}
 _NO_WAIT = getattr(os, "O_NONBLOCK", 0)  # not on every system

@@ -6,6 +6,7 @@ from typing import Any, TypeVar, get_args
 import pydantic
 import yaml
 
+from thincam_jax._core.text import shortened
 from thincam_jax.commands.config_file import ConfigError, Places, override, read_raw
 from thincam_jax.commands.sections import ExperimentConfig
 
@@ -107,19 +108,12 @@ def _message(error: Any, location: tuple, model: Any) -> str:
         return _WORDS[kind].format(given=_short(given))
     message = error["msg"].removeprefix("Value error, ")
     if kind == "value_error":
-        return message
+        return message.replace(repr(given), _short(given))
     return f"{_short(given)}: {message[0].lower()}{message[1:]}"
-
-
-_LONGEST = 80  # characters of what was given that a message repeats
 
 
 def _short(given: Any) -> str:
     return shortened(repr(given))
-
-
-def shortened(text: str) -> str:
-    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}… ({len(text)} characters)"
 
 
 _WORDS = {

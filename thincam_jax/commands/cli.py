@@ -16,6 +16,7 @@ from thincam_jax.commands.kinds import init
 from thincam_jax.commands.reconstruct.command import check, reconstruct
 from thincam_jax.commands.run import accuracy, design, run, train
 from thincam_jax.commands.sweep.command import sweep
+from thincam_jax.commands.terminal import say
 
 ORDER = (
     *("init", "explain", "run", "capture", "reconstruct", "calibrate", "sweep", "design", "train"),
@@ -102,7 +103,7 @@ def _print_version(asked: bool) -> bool:
     if asked:
         from importlib.metadata import version
 
-        print(f"thincam_jax {version('thincam_jax')}")
+        say(f"thincam_jax {version('thincam_jax')}")
         raise typer.Exit
     return asked
 
@@ -135,4 +136,5 @@ def doctor() -> None:
     from thincam_jax._core.environment import machine_report, package_report
 
     programs = f"compiled programs: {cache_state()}"
-    print("\n".join([*machine_report(), programs, *package_report(), *known_drivers()]))
+    for line in (*machine_report(), programs, *package_report(), *known_drivers()):
+        say(line)

@@ -8,6 +8,7 @@ from typing import Any
 import yaml
 
 from thincam_jax._core.files import read_regular
+from thincam_jax._core.text import shortened
 
 _MOST_ENTRIES = 100_000
 
@@ -144,10 +145,10 @@ def override(raw: Any, text: str) -> tuple:
     The path may name what is not there yet.
     """
     path, equals, value = text.partition("=")
-    keys = path_keys(path)
+    keys, asked = path_keys(path), f"--set {shortened(text)}"
     if not equals or keys is None:
-        raise ConfigError(f"--set {text}: write it as a.b=value, such as mask.width=5.632mm")
-    set_entry(raw, keys, read_value(value, f"--set {text}"), f"--set {text}")
+        raise ConfigError(f"{asked}: write it as a.b=value, such as mask.width=5.632mm")
+    set_entry(raw, keys, read_value(value, asked), asked)
     return keys
 
 
@@ -180,7 +181,9 @@ def read_value(text: str, asked: str) -> Any:
     except _TooLargeError as error:
         raise ConfigError(f"{asked}: {error}") from None
     except (yaml.YAMLError, ValueError):
-        raise ConfigError(f"{asked}: {text!r} is not valid YAML; put texts in quotes") from None
+        raise ConfigError(
+            f"{asked}: {shortened(repr(text))} is not valid YAML; put texts in quotes"
+        ) from None
 
 
 def slug(name: str) -> str:

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from thincam_jax.commands.kinds import KINDS, load_experiment
-from thincam_jax.commands.terminal import ConfigFile, Overrides, told
+from thincam_jax.commands.terminal import ConfigFile, Overrides, say, told
 
 
 def schema(
@@ -27,7 +27,7 @@ def schema(
             raise ConfigError(f"kind: {kind!r} is unknown; choose one of {', '.join(KINDS)}")
         sections = KINDS[kind].part(KINDS[kind].section)
         text = json.dumps(sections.model_json_schema(), indent=2, ensure_ascii=False)
-    print(text)
+    say(text)
 
 
 def explain(config: ConfigFile, set_: Overrides = None) -> None:
@@ -41,7 +41,7 @@ def explain(config: ConfigFile, set_: Overrides = None) -> None:
         rows = list(values(asked))
         width = max(len(f"{key}: {value}") for key, value, _ in rows if len(value) <= _LONGEST)
         lines = [f"{f'{key}: {value}':<{width}}  # {place}" for key, value, place in rows]
-        print("\n".join([*lines, *costs(asked)]))
+        say("\n".join([*lines, *costs(asked)]))
 
 
 _LONGEST = 50  # characters of a value that places are lined up behind
@@ -73,7 +73,7 @@ def _entries(data: Any, location: tuple = ()) -> Iterator[tuple[tuple, str]]:
 
 def dry_run(asked: Any, writes: str, setup: Any = None) -> None:
     """Print what a command would compute and write, for its option `--dry-run`."""
-    print("\n".join([*work_of(asked, setup), writes, "dry run: nothing was done"]))
+    say("\n".join([*work_of(asked, setup), writes, "dry run: nothing was done"]))
 
 
 def work_of(asked: Any, setup: Any = None) -> Iterator[str]:

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
-from thincam_jax.commands.terminal import told
+from thincam_jax.commands.terminal import say, told
 
 
 @dataclass(frozen=True)
@@ -152,4 +152,4 @@ def init(
         if path.exists():
             raise ConfigError(f"{path} exists; give another --out, or delete it")
         write_whole(path, text)
-    print(f"{path}; next: thincam {command} {path}")
+    say(f"{path}; next: thincam {command} {path}")

@@ -14,6 +14,7 @@ from thincam_jax.commands.terminal import (
     Overrides,
     counted,
     progress_bar,
+    say,
     show,
     told,
     warn,
@@ -60,7 +61,7 @@ def run(
             if set_ or dry_run:
                 option = "--set" if set_ else "--dry-run"
                 raise ConfigError(f"{option} is for experiment files; a store has its own settings")
-            print(f"report: {reconstruct_store(config, out) / 'report.html'}")
+            say(f"report: {reconstruct_store(config, out) / 'report.html'}")
             return
         asked = load_experiment(config, tuple(set_ or ()))
         folder = RunFolder.chosen(out, asked.name, asked)
@@ -73,7 +74,7 @@ def run(
         with counted(asked.name) as progress:
             found = kind.part(kind.run)(setup, folder, progress)
     show(found.table())
-    print(f"report: {folder.path / 'report.html'}")
+    say(f"report: {folder.path / 'report.html'}")
 
 
 def design(
@@ -107,8 +108,8 @@ def design(
         with counted(wanted.name) as progress:
             found = run_design(study, folder, progress)
     show(found.table())
-    print(_levels(found))
-    print(f"report: {folder.path / 'report.html'}")
+    say(_levels(found))
+    say(f"report: {folder.path / 'report.html'}")
 
 
 def _levels(found: "DesignScores") -> str:
@@ -161,10 +162,10 @@ def train(
                 bar.start()
 
             found = kind.part(kind.run)(asked, InFolder(folder, tell, resume))
-    print(found.line)
+    say(found.line)
     if found.page is not None:
-        print(f"report: {found.page}")
-    print(f"network: {found.network}")
+        say(f"report: {found.page}")
+    say(f"network: {found.network}")
 
 
 def accuracy(
@@ -195,5 +196,5 @@ def accuracy(
         with counted(study.name) as progress:
             result = run_accuracy(plan, folder, progress)
     show(result.table())
-    print(result.reconstructions.verdict())
-    print(f"results: {folder.path / 'accuracy.json'}")
+    say(result.reconstructions.verdict())
+    say(f"results: {folder.path / 'accuracy.json'}")

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import pydantic
+from filelock import FileLock, Timeout
 
 from thincam_jax._core.environment import environment
 from thincam_jax._core.files import WriteError, read_regular, write_whole
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
 
 Running = TypeVar("Running", bound="Run")
 Folder = TypeVar("Folder", bound="RunFolder")
+_LOCK = ".lock"
 
 
 class RunFolder:
@@ -81,9 +83,14 @@ class RunFolder:
         try:
             self.path.mkdir(parents=True, exist_ok=True)
             self._refuse_foreign(config)
+            self._lock = FileLock(self.path / _LOCK, is_singleton=True)
+            self._lock.acquire(timeout=0)
             self.write(self.config, dump_config(config))
             for folder in self.folders:
                 (self.path / folder).mkdir(exist_ok=True)
+        except Timeout:
+            text = "writes to it; wait for its end or give another folder"
+            raise ConfigError(f"--out {self.path}: another {self.kind} {text}") from None
         except WriteError:
             raise
         except OSError as error:
@@ -100,8 +107,8 @@ class RunFolder:
 
     def _refuse_foreign(self, config: Section) -> None:
         held = self.path / self.config
-        # A neighbour is all that is there where the first start was killed.
-        foreign = any(path.name != f"{self.config}.partial" for path in self.path.iterdir())
+        # Its lock and a partial file are all that is there where the first start was killed.
+        foreign = any(p.name != _LOCK and p.suffix != ".partial" for p in self.path.iterdir())
         if held.exists():
             if read_regular(held) != dump_config(config).encode("utf-8"):
                 raise ConfigError(

@@ -8,10 +8,11 @@ import re
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 
+from thincam_jax._core.text import escaped
 from thincam_jax.commands.interrupt import INTERRUPTED, interruptible
 
 if TYPE_CHECKING:
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from thincam_jax._core.table import Table
 
 WRONG_INPUT = 2
+_MOST_LINES, _HALF = 10, 500  # of an error; characters of each half of a line that is cut
 
 ConfigFile = Annotated[Path, typer.Argument(help="Experiment file (YAML); thincam init makes one.")]
 Overrides = Annotated[
@@ -62,8 +64,8 @@ def _no_memory(error: BaseException) -> bool:
 
 def warn(texts: list[str]) -> None:
     """Each in a line on standard error."""
-    for warning in texts:
-        tell(f"warning: {warning}")
+    if texts:
+        tell("\n".join(f"warning: {text}" for text in texts))
 
 
 def in_a_line(error: BaseException) -> str:
@@ -78,13 +80,21 @@ def _as_option(argument: re.Match[str]) -> str:
     return " ".join(filter(None, (f"--{name.replace('_', '-')}", value)))
 
 
+def say(text: str) -> None:
+    """Lines on standard output; as all that is printed, without the control characters of files."""
+    print(escaped(text))
+
+
 def tell(text: str) -> None:
-    """Lines on standard error, whole and without markup."""
+    """Lines on standard error, without markup: the first ones, each cut in its middle if long."""
     from rich.console import Console
 
-    errors = Console(stderr=True)
-    for line in text.splitlines():
-        errors.print(f"thincam: {line}", highlight=False, markup=False, soft_wrap=True)
+    errors, lines = Console(stderr=True), escaped(text).split("\n")
+    if (more := len(lines) - _MOST_LINES) > 0:
+        lines[_MOST_LINES:] = [f"and {more:,} more"]
+    for line in lines:
+        cut = line if len(line) <= 2 * _HALF else f"{line[:_HALF]} … {line[-_HALF:]}"
+        errors.print(f"thincam: {cut}", highlight=False, markup=False, soft_wrap=True)
 
 
 def fail(error: BaseException) -> NoReturn:
@@ -99,13 +109,13 @@ def show(table: "Table") -> None:
     from rich.table import Table as Lines
     from rich.text import Text
 
-    rows, title = table.texts(), table.title or None
+    rows, title = table.texts(), Text(escaped(table.title)) if table.title else None
     several = any("\n" in cell for row in rows for cell in row)
     shown = Lines(title=title, title_justify="left", show_lines=several)
     for column, heading in enumerate(table.headings):
-        shown.add_column(heading, justify="right" if column else "left")
+        shown.add_column(Text(escaped(heading)), justify="right" if column else "left")
     for row in rows:
-        shown.add_row(*map(Text, row))
+        shown.add_row(*(Text(escaped(cell)) for cell in row))
     rich.print(shown)
 
 
@@ -118,11 +128,17 @@ def progress_bar(*more: str) -> "Iterator[rich.progress.Progress]":
     """
     from rich import progress
 
+    class Escaped(progress.TextColumn):
+        def render(self, task: Any) -> Any:
+            text = super().render(task)
+            text.plain = escaped(text.plain)
+            return text
+
     bar = progress.Progress(
-        progress.TextColumn("{task.description}"),
+        Escaped("{task.description}", markup=False),
         progress.BarColumn(),
         progress.MofNCompleteColumn(),
-        *(progress.TextColumn(template) for template in more),
+        *(Escaped(template, markup=False) for template in more),
         progress.TimeElapsedColumn(),
         progress.TextColumn("left"),
         progress.TimeRemainingColumn(),

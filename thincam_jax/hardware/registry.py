@@ -8,13 +8,13 @@ class method `open(options)`. Another package registers one by an entry point in
 """
 
 from collections.abc import Mapping
-from dataclasses import fields
+from dataclasses import fields, is_dataclass
 from importlib import import_module
 from importlib.metadata import entry_points
 from typing import Any
 
 from thincam_jax.hardware.base import Device
-from thincam_jax.hardware.errors import NotFound
+from thincam_jax.hardware.errors import HardwareError, NotFound
 
 _BUILT_IN = {
     "cameras": {
@@ -43,7 +43,7 @@ def drivers(kind: str) -> dict[str, str]:
 
 
 def driver(kind: str, name: str) -> type[Device]:
-    """Class of a driver; `NotFound` where it is unknown or its library is missing."""
+    """Class of a driver; `NotFound` where it is unknown, broken or its library is missing."""
     known = drivers(kind)
     if name not in known:
         raise NotFound(name, "open", f"no driver of that name among the {kind}",
@@ -51,11 +51,18 @@ def driver(kind: str, name: str) -> type[Device]:
     module, _, attribute = known[name].partition(":")
     try:
         found = getattr(import_module(module), attribute)
+        if hasattr(found, "require_libraries"):  # those that pip does not install
+            found.require_libraries()
+        if not (issubclass(found, Device) and is_dataclass(found.Options)):
+            raise TypeError(f"{attribute} is no device with Options of a dataclass")
     except ImportError as error:
         remedy = "pip install 'thincam-jax[hardware]'"
         raise NotFound(name, "open", f"its library is missing ({error})", remedy) from error
-    if hasattr(found, "require_libraries"):  # those that pip does not install
-        found.require_libraries()
+    except HardwareError:
+        raise
+    except (Exception, SystemExit) as error:  # whatever code of another package may raise
+        cause, remedy = f"broken ({type(error).__name__}: {error})", f"mend or remove {module}"
+        raise NotFound(name, "open", cause, remedy) from error
     return found
 
 

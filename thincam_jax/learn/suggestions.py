@@ -38,8 +38,8 @@ from thincam_jax.design.match import (
 from thincam_jax.design.space import active_limits
 from thincam_jax.learn.checkpoint import (
     CheckpointError,
-    read_arrays,
     read_description,
+    read_weights,
     write_arrays,
 )
 
@@ -241,7 +241,7 @@ def load_suggester(path: str | os.PathLike[str], model: ResponseModel) -> Sugges
                 f"{path} was trained for other {name}: {json.dumps(there.get(name))}, and here "
                 f"they are {json.dumps(here)}; train a suggester for these"
             )
-    loaded = jax.tree.map(jnp.asarray, read_arrays(path, fresh))
+    loaded = read_weights(path, fresh)
     _check_numbers(path, loaded.model, model)
     return loaded
 

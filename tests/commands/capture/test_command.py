@@ -2,6 +2,7 @@
 
 import errno
 import fcntl
+import importlib.metadata
 import json
 import os
 import signal
@@ -20,6 +21,7 @@ from helpers import ROOT, recipe
 from thincam_jax.commands.capture import command
 from thincam_jax.commands.capture.config import CaptureConfig
 from thincam_jax.commands.checked_config import load_as
+from thincam_jax.hardware import registry
 from thincam_jax.hardware.acquisition.read import read_acquisition
 from thincam_jax.hardware.displays.patterns import pattern_levels
 from thincam_jax.hardware.registry import driver_report
@@ -177,6 +179,23 @@ def test_a_rig_that_cannot_be_opened(asked, line, tmp_path):
 @pytest.mark.parametrize(
     ("asked", "line"),
     [
+        ("plan.distances=[6.5 mm, 506.5 mm]", "begin: 5 of 10 steps lie outside, first one at 500"),
+        ("camera.exposure=1000 s", "ExposureTime of 1000 s; give "),
+        ("camera.region={top: 9, left: 0, height: 64, width: 96}", "lies outside of the sensor"),
+    ],
+)
+def test_the_limits_of_a_rig_hold_for_the_whole_plan_before_the_first_frame(asked, line, tmp_path):
+    raw = yaml.safe_load(tiny.METHOD_B) | {"stage": {"driver": "zaber"}}
+    raw["plan"] |= {"kind": "method_a", "betas": ["60 rad/mm^2"], "distances": ["6.5 mm"]}
+    file, store = tiny.write(tmp_path, yaml.safe_dump(raw)), tmp_path / "a.zarr"
+    result = call("capture", file, "--out", store, "--set", asked)
+    (told,) = result.stderr.splitlines()
+    assert result.exit_code == command.STOPPED and line in told and not store.exists()
+
+
+@pytest.mark.parametrize(
+    ("asked", "line"),
+    [
         ("plan.betas=[25 rad/mm^2]", "plan.betas: method_b compares two β"),
         ("plan.cells=[8, 8]", "plan.cells: a plan of kind method_b takes betas, width, profile"),
         ("plan.kind=method_a", "plan.distances: a plan of kind method_a needs it"),
@@ -249,6 +268,39 @@ def test_a_camera_of_another_package_is_told_of_and_works(tmp_path, monkeypatch)
     taken = read_acquisition(tmp_path / "a.zarr")
     assert taken.provenance["devices"]["camera"]["vendor"] == "Elsewhere"
     assert taken.frame(taken.lit[0]).max() > 100
+
+
+@pytest.mark.parametrize(
+    ("code", "cause"),
+    [
+        ("class Eye(:", "SyntaxError: invalid syntax"),
+        ("raise RuntimeError('no licence')", "RuntimeError: no licence"),
+        ("raise SystemExit(3)", "SystemExit: 3"),
+        ("Other = 1", "AttributeError: module 'wreck' has no attribute 'Eye'"),
+        ("Eye = 1", "TypeError: "),
+        ("from thincam_jax.hardware import Camera\nclass Eye(Camera): pass", "AttributeError: "),
+        (
+            "from thincam_jax.hardware import Camera\nclass Eye(Camera):\n    Options = int",
+            "TypeError: Eye is no device with Options",
+        ),
+    ],
+)
+def test_a_broken_camera_of_another_package_is_told_of(code, cause, tmp_path, monkeypatch):
+    """In 'thincam doctor', which goes on, and in a line of a capture that wants it."""
+    (tmp_path / "wreck.py").write_text(code, "utf-8")
+    points = importlib.metadata.EntryPoint("eye", "wreck:Eye", "thincam_jax.cameras")
+    found = {"thincam_jax.cameras": [points]}
+    monkeypatch.setattr(registry, "entry_points", lambda group: found.get(group, []))
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "wreck", raising=False)
+    lines = command.known_drivers()
+    assert "driver of stages zaber" in lines
+    (broken,) = (line for line in lines if " eye" in line)
+    assert f"eye, from wreck: broken ({cause}" in broken and broken.endswith("remove wreck")
+    sets = ("--set", "rig=real", "--set", "camera.driver=eye")
+    result = call("capture", tiny.write(tmp_path), "--out", tmp_path / "a.zarr", *sets)
+    (told,) = result.stderr.splitlines()
+    assert result.exit_code == command.STOPPED and f"broken ({cause}" in told
 
 
 def test_nothing_listens_and_no_other_user_reaches_a_device(tmp_path):

@@ -1,5 +1,6 @@
 """The folder of a sweep: rows, failures, tables, and whose folder it is."""
 
+import fcntl
 import json
 
 import pyarrow.parquet as pq
@@ -138,6 +139,19 @@ def test_first_start_that_was_killed(config, tmp_path):
     """Between the neighbour that was written and its renaming."""
     folder = SweepFolder(tmp_path / "killed")
     folder.path.mkdir()
-    (folder.path / "study.yaml.partial").write_text("na", encoding="utf-8")
+    (folder.path / ".0123.partial").write_text("na", encoding="utf-8")
     folder.claim(config)
     assert load_experiment(folder.path / "study.yaml") == config
+
+
+def test_a_second_run_is_refused_while_the_first_lives(folder, config):
+    folder.path.mkdir(exist_ok=True)
+    with (folder.path / ".lock").open("w") as other:  # of another process
+        fcntl.flock(other, fcntl.LOCK_EX)
+        with pytest.raises(ConfigError, match="another sweep writes to it; wait for its end or"):
+            folder.claim(config)
+        fcntl.flock(other, fcntl.LOCK_UN)
+        folder.claim(config)
+        with pytest.raises(BlockingIOError):
+            fcntl.flock(other, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    folder.claim(config)  # by the same process

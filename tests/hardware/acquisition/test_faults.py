@@ -9,11 +9,16 @@ import time
 import numpy as np
 import pytest
 from hardware.acquisition.fault_campaign import STOPS, campaign, require_right
-from hardware.memory_rig import World, by_rows, fiducial_plan
+from hardware.memory_rig import World, by_rows, fiducial_plan, staying
 
 from helpers import ROOT
 from thincam_jax.hardware.acquisition.acquire import acquire
+from thincam_jax.hardware.acquisition.read import read_acquisition
 from thincam_jax.hardware.virtual.faults import FAULTS
+
+PROCESS = [sys.executable, ROOT / "tests" / "hardware" / "memory_rig.py"]
+PATHS = os.pathsep.join([str(ROOT), str(ROOT / "tests")])
+ENVIRONMENT = {**os.environ, "PYTHONPATH": PATHS}
 
 
 @pytest.mark.parametrize("times", [3, pytest.param(100, marks=pytest.mark.thorough)])
@@ -42,12 +47,10 @@ def test_a_killed_run_is_resumed(kills, count, kept, tmp_path):
     store, random = tmp_path / "store", np.random.default_rng(4)
     plan = fiducial_plan(count, dark_every=16)
     plan = by_rows(plan) if kept else plan
-    command = [sys.executable, str(ROOT / "tests" / "hardware" / "memory_rig.py"), str(store)]
-    paths = os.pathsep.join([str(ROOT), str(ROOT / "tests")])
     for kill in range(kills):
         before = frames_in(store)
         process = subprocess.Popen(
-            [*command, str(count), kept], env={**os.environ, "PYTHONPATH": paths}, text=True,
+            [*PROCESS, store, str(count), kept], env=ENVIRONMENT, text=True,
             stdout=subprocess.PIPE, stderr=subprocess.PIPE
         )  # fmt: skip
         with process:
@@ -64,6 +67,19 @@ def test_a_killed_run_is_resumed(kills, count, kept, tmp_path):
         assert acquire(plan, rig, store).complete
     require_right(store, plan)
     assert not list(tmp_path.rglob("*.partial"))
+
+
+@pytest.mark.parametrize("done", [3, 9])  # before and after the first given position
+def test_a_stage_that_stays_is_moved_back_by_a_new_process(done, tmp_path):
+    """The resumed process finds the stage homed, at 0, and not where the last step left it."""
+    world, plan = World(), staying(fiducial_plan(12, dark_every=16))
+    world.position = 3.0
+    with world.rig() as rig:
+        stop = lambda now: now.done == done and os.kill(os.getpid(), signal.SIGTERM)  # noqa: E731
+        assert not acquire(plan, rig, tmp_path / "store", progress=stop).complete
+    subprocess.run([*PROCESS, tmp_path / "store", "12", "stays"], env=ENVIRONMENT, check=True)
+    shots = read_acquisition(tmp_path / "store").shots
+    assert [shot["position"] for shot in shots] == [3.0] * 6 + [1.0] * 5 + [2.0] * 2
 
 
 def test_sigterm_stops_between_two_frames(tmp_path):

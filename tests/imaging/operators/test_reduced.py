@@ -1,5 +1,8 @@
 """A measured matrix reduced to as many rows as it has columns."""
 
+import math
+import zipfile
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -115,6 +118,42 @@ def test_a_file_is_read_for_its_own_matrix_only(tmp_path):
     path.write_bytes(path.read_bytes()[:-400])
     with pytest.raises(ValueError, match=r"reduced.npz holds no reduced matrix .* make it anew"):
         ReducedMatrix.load(path, H)
+
+
+@pytest.mark.parametrize(
+    ("changed", "told"),
+    [
+        ({"values": np.nan}, "not finite"),
+        ({"values": -1.0}, "or negative"),
+        ({"vectors": np.inf}, "not finite"),
+        ({"values": np.ones(3)}, "other shapes"),
+        ({"vectors": np.eye(3)}, "other shapes"),
+        ({"vectors": np.eye(math.prod(IN), dtype=complex)}, "other shapes or types"),
+        ({"in_shape": [2, 2]}, "other shapes"),
+        ({"in_shape": "a"}, "holds no reduced matrix"),
+        ({"packed": True}, "its arrays are packed"),
+        ({"header": b"(" * 99}, "holds no reduced matrix"),
+    ],
+)
+def test_a_file_that_is_not_to_be_trusted(changed, told, tmp_path):
+    path = ReducedMatrix.of(H, IN).save(tmp_path / "reduced.npz", H)
+    with np.load(path) as file:
+        arrays = {name: file[name] for name in file}
+    ((name, value),) = changed.items()
+    if name in arrays:
+        alike = isinstance(value, float)
+        arrays[name] = np.full_like(arrays[name], value) if alike else np.asarray(value)
+    (np.savez_compressed if name == "packed" else np.savez)(
+        path, **{key: array for key, array in arrays.items() if (key, name) != ("mark", "header")}
+    )
+    if name == "header":
+        text = b"{'descr': '<f8', 'shape': " + value + b"\n"
+        with zipfile.ZipFile(path, "a") as archive:
+            head = b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little")
+            archive.writestr("mark.npy", head + text)
+    with pytest.raises(ValueError, match=f"{told}.*make it anew") as raised:
+        ReducedMatrix.load(path, H)
+    assert len(str(raised.value)) < 600
 
 
 def test_sizes_that_differ():

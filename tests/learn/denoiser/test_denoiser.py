@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from helpers import finite_difference, relative_l2
-from thincam_jax.learn.checkpoint import CheckpointError
+from thincam_jax.learn.checkpoint import CheckpointError, write_arrays
 from thincam_jax.learn.denoiser import network as room
 from thincam_jax.learn.denoiser.network import (
     Denoiser,
@@ -123,6 +123,28 @@ def test_a_file_of_no_use_is_told(network, tmp_path):
     file.write_bytes(file.read_bytes()[:-1])
     with pytest.raises(CheckpointError, match="is damaged or cut off"):
         load_network(file)
+
+
+@pytest.mark.parametrize(
+    ("widths", "blocks"),
+    [
+        ([], []),
+        ([0], [1]),
+        ([[[[4]]]], [1]),
+        ("44", [1, 1]),
+        ([4] * 5000, [1] * 5000),
+        ([4] * 16, [64] * 16),
+        (["x"], [1]),
+        (3, 3),
+    ],
+)
+def test_options_of_a_file_that_are_not_to_be_trusted(widths, blocks, network, tmp_path):
+    options = {"widths": widths, "blocks": blocks}
+    card = {"kind": room._KIND, "options": options, "training": {}}
+    file = write_arrays(tmp_path / "net.thincam", network, card)
+    with pytest.raises(CheckpointError, match="holds options of another version") as told:
+        load_network(file)
+    assert len(str(told.value)) < 500
 
 
 @pytest.mark.parametrize("wrong", [((), ()), ((4, 6), (1,)), ((0,), (1,)), ((4,), (-1,))])

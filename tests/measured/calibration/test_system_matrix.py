@@ -1,5 +1,7 @@
 """Matrices recovered from simulated Hadamard captures."""
 
+import os
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -76,8 +78,13 @@ def test_a_stored_matrix_is_that_in_memory(tmp_path, monkeypatch):
     assert (found.in_shape, found.out_shape) == (CELLS, SHAPE)
     with pytest.raises(CaptureStoreError, match="exists; give another name"):
         write_matrix(captures, path)
-    (path / "matrix" / "c" / "1" / "0").write_bytes(b"cut")
+    chunk = path / "matrix" / "c" / "1" / "0"
+    chunk.write_bytes(b"cut")
     with pytest.raises(CaptureStoreError, match="pixels 33 … 65 are damaged"):
+        read_matrix(path)
+    chunk.unlink()
+    os.mkfifo(chunk)
+    with pytest.raises(CaptureStoreError, match="is a device, a pipe or too large"):
         read_matrix(path)
     with pytest.raises(CaptureStoreError, match="no finished system matrix"):
         read_matrix(captures.path)

@@ -12,6 +12,7 @@ from thincam_jax.commands.terminal import (
     DryRun,
     Overrides,
     progress_bar,
+    say,
     tell,
     told,
     warn,
@@ -98,7 +99,7 @@ def capture(
         warn([f"recovered from {text}" for text in outcome.recovered])
         if not outcome.complete:
             raise KeyboardInterrupt
-    print(f"{store}: {outcome.total} frames; next: thincam run {store}")
+    say(f"{store}: {outcome.total} frames; next: thincam run {store}")
 
 
 def reconstruct_store(store: Path, out: Path | None) -> Path:

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 import typer
 from typer import Option
 
-from thincam_jax.commands.terminal import Overrides, fail, told
+from thincam_jax.commands.terminal import Overrides, fail, say, told
 
 # Known without importing JAX; the tests hold them to `options.PSF_METHODS`.
 METHODS = ("auto", "admm-tv", "fista", "ridge")
@@ -220,6 +220,6 @@ def check(
                 )
         except (MeasurementError, OSError) as error:
             fail(error)
-    print("\n".join(lines))
+    say("\n".join(lines))
     if not fits:
         raise typer.Exit(1)

@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import rich.markup
 import rich.progress
 
 from thincam_jax import measured
 from thincam_jax._core.environment import environment
 from thincam_jax._core.files import WriteError, writing
+from thincam_jax._core.text import escaped
 from thincam_jax.commands.interrupt import INTERRUPTED
 from thincam_jax.commands.reconstruct.jobs import Job, write_job
 from thincam_jax.commands.reconstruct.options import Background, Focusing, Output, Recipe, Sources
@@ -378,7 +378,8 @@ def run_with_bar(jobs: list[Job], sources: Sources, recipe: Recipe, output: Outp
                 tell(in_a_line(result.error))
                 end = WRONG_INPUT
                 continue
-            bar.console.print(result.line, highlight=False, markup=False, soft_wrap=True)
+            line = escaped(result.line)
+            bar.console.print(line, highlight=False, markup=False, soft_wrap=True)
             if result.job.focus is None:
                 continue
             if result.doubt:
@@ -415,7 +416,7 @@ class _Bar:
     def _title(self) -> str:
         count = len(self.names)
         number = f" ({self.names.index(self.name) + 1} of {count})" if count > 1 else ""
-        return rich.markup.escape(self.name) + number
+        return self.name + number
 
 
 def _interrupted(job: Job, jobs: list[Job]) -> str:

@@ -11,6 +11,7 @@ from thincam_jax.commands.terminal import (
     DryRun,
     Overrides,
     progress_bar,
+    say,
     tell,
     told,
     warn,
@@ -109,7 +110,7 @@ def _print(swept: Any, path: Path) -> None:
 
     table = f"{swept.rows} of {swept.points} points: {path / 'results.parquet'}"
     if swept.rows:
-        print("\n".join([table, *swept.best]))
+        say("\n".join([table, *swept.best]))
     if swept.failures:
         first = swept.failures[0]
         values = told_values(first["values"])

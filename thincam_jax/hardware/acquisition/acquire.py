@@ -22,6 +22,7 @@ from thincam_jax._core.capture_store import (
     CaptureStoreError,
     dtype_of_bits,
 )
+from thincam_jax._core.text import of_error, shortened
 from thincam_jax.hardware.acquisition.auto_exposure import find_exposure
 from thincam_jax.hardware.acquisition.plan import Plan, settings_from
 from thincam_jax.hardware.acquisition.recorder import (
@@ -35,7 +36,7 @@ from thincam_jax.hardware.acquisition.recorder import (
 from thincam_jax.hardware.acquisition.rig import Rig
 from thincam_jax.hardware.acquisition.taker import Procedure, Taker, full_scale
 from thincam_jax.hardware.base import CameraSettings, Identity
-from thincam_jax.hardware.errors import NotHomed
+from thincam_jax.hardware.errors import NotHomed, OutOfRange
 
 
 @dataclass(frozen=True)
@@ -91,14 +92,14 @@ def acquire(
         run = Taker(plan, rig, procedure)
         settings = _begin(run, path)
         with Recorder(path) as recorder:
-            todo, total = recorder.missing, len(plan.steps)
+            todo, total = recorder.missing, len(run.steps)
             require_space(path, len(todo) * recorder.store.frame_bytes)
             recorder.note({"begins": now(), "versions": versions(), "procedure": asdict(procedure)})
             done, started = total - len(todo), time.monotonic()
             for count, number in enumerate(todo, 1):
                 if stop.is_set():
                     break
-                step = plan.steps[number]
+                step = run.steps[number]
                 frame, facts = run.take(step, settings[step.settings])
                 with run.clock("keep"):
                     recorder.add(number, frame.pixels, facts)
@@ -111,13 +112,8 @@ def acquire(
 
 def _begin(run: Taker, path: Path) -> tuple[CameraSettings, ...]:
     """Create the store, or check that it belongs to this run; returns its camera settings."""
-    moves = any(step.position is not None for step in run.plan.steps)
-    if moves and run.rig.stage is None:
-        raise ValueError(
-            f"the plan {run.plan.name!r} moves a stage and the rig has none; give open_stage"
-        )
-    if moves and not run.rig.stage.homed:  # pyright: ignore[reportOptionalMemberAccess]
-        raise NotHomed(run.name("stage"), "begin", "it does not know where it is", "home it first")
+    if positions := [step.position for step in run.steps if step.position is not None]:
+        _require_stage(run, positions)
     if path.exists():
         return _resumed(run, path)
     settings = _new_settings(run)
@@ -127,8 +123,8 @@ def _begin(run: Taker, path: Path) -> tuple[CameraSettings, ...]:
             f"the plan {run.plan.name!r} has regions of several sizes; give one size, or a plan "
             "for each"
         )
-    first = run.plan.steps[0]
-    frame, _ = run.take(first, settings[first.settings], probe=True)
+    first = run.steps[0]
+    frame, facts = run.take(first, settings[first.settings], probe=True)
     run.bits = bits = frame.bit_depth
     attributes = {
         "kind": CAPTURES,
@@ -141,6 +137,7 @@ def _begin(run: Taker, path: Path) -> tuple[CameraSettings, ...]:
             "settings": [asdict(one) for one in settings],
             "asked": [asdict(one) for one in run.plan.settings],
             "procedure": asdict(run.procedure),
+            "start": facts["position"],
             "versions": versions(),
             "begun": now(),
         },
@@ -158,19 +155,41 @@ def _begin(run: Taker, path: Path) -> tuple[CameraSettings, ...]:
     return settings
 
 
+def _require_stage(run: Taker, positions: list[float]) -> None:
+    """Check that a homed stage can take all positions of a plan, mm."""
+    stage = run.rig.stage
+    if stage is None:
+        raise ValueError(
+            f"the plan {run.plan.name!r} moves a stage and the rig has none; give open_stage"
+        )
+    if not stage.homed:
+        raise NotHomed(run.name("stage"), "begin", "it does not know where it is", "home it first")
+    low, high = stage.limits
+    if outside := [place for place in positions if not low <= place <= high]:
+        cause = f"{len(outside)} of {len(positions)} steps lie outside, first one at {outside[0]:g}"
+        remedy = f"give positions from {low:g} to {high:g} mm, nothing was taken"
+        raise OutOfRange(run.name("stage"), "begin", f"{cause} mm", remedy)
+
+
 def _resumed(run: Taker, path: Path) -> tuple[CameraSettings, ...]:
     """Camera settings with which the store was begun, after checking that all else agrees."""
     store = CaptureStore(path)
-    begun = store.attributes.get("acquisition")
-    if begun is None:
-        raise CaptureStoreError(f"{path} was not made by an acquisition; give another name")
-    if begun["plan"] != run.plan.hash:
+    try:
+        begun = store.attributes["acquisition"]
+        name, plan, start = str(begun["name"]), str(begun["plan"]), begun.get("start")
+        devices = {role: Identity(**record) for role, record in begun["devices"].items()}
+        settings = tuple(settings_from(record) for record in begun["settings"])
+        run.steps = run.plan.placed(None if start is None else float(start))
+    except Exception as error:  # whatever another's attributes bring about
         raise CaptureStoreError(
-            f"{path} was begun with another plan ({begun['name']}, {begun['plan'][:12]}), not "
+            f"{path} was not made by an acquisition ({of_error(error)}); give another name"
+        ) from error
+    if plan != run.plan.hash or len(store.digests) != len(run.steps):
+        raise CaptureStoreError(
+            f"{path} was begun with another plan ({shortened(name)}, {plan[:12]}), not "
             f"with this one ({run.plan.name}, {run.plan.hash[:12]}); give another name, or "
             "the plan it was begun with"
         )
-    devices = {role: Identity(**record) for role, record in begun["devices"].items()}
     for role in sorted({*devices, *run.identities}):
         was, now_is = (every.get(role, "none") for every in (devices, run.identities))
         if was != now_is:
@@ -178,7 +197,6 @@ def _resumed(run: Taker, path: Path) -> tuple[CameraSettings, ...]:
                 f"{path} was begun with the {role} {was}, and this rig has {now_is}; connect that "
                 "one, or give another name"
             )
-    settings = tuple(settings_from(record) for record in begun["settings"])
     for one in settings:
         run.persist(lambda one=one: run.configure(one))
     run.bits = store.attributes["bits"]
@@ -194,7 +212,7 @@ def _new_settings(run: Taker) -> tuple[CameraSettings, ...]:
                 f"the plan {run.plan.name!r} has {len(asked)} settings; auto-exposure takes "
                 "plans with one"
             )
-        lit = next((s for s in run.plan.steps if not s.dark), run.plan.steps[0])
+        lit = next((s for s in run.steps if not s.dark), run.steps[0])
 
         def level_at(exposure: float) -> float:
             settings = run.persist(lambda: run.set_near(replace(asked[0], exposure=exposure)))

@@ -6,6 +6,7 @@ is begun, so that a power cut can tear only the last: it is discarded, and its f
 """
 
 import json
+import math
 import os
 import zlib
 from collections.abc import Sequence
@@ -14,6 +15,7 @@ from typing import Any
 
 from thincam_jax._core.capture_store import CaptureStoreError
 from thincam_jax._core.files import read_regular
+from thincam_jax._core.text import of_error
 from thincam_jax.hardware.acquisition.plan import canonical_json
 
 
@@ -47,6 +49,27 @@ def read_journal(path: Path) -> list[Any]:
     return _parsed(path)[0]
 
 
+def frame_records(path: Path, records: Sequence[Any], steps: int) -> dict[int, Any]:
+    """Records of frames by the number of their step, the last of each.
+
+    **Errors**: CaptureStoreError for what no acquisition of so many steps wrote.
+    """
+    found = {}
+    try:
+        for record in (one for one in map(dict, records) if "step" in one):
+            step, place = record["step"], record["position"]
+            known = type(step) is int and 0 <= step < steps and len(bytes.fromhex(record["digest"]))
+            if known != 8 or not (place is None or math.isfinite(place)):
+                raise ValueError(f"step {step}, digest {record['digest']}, position {place}")
+            found[step] = record
+    except (TypeError, ValueError, KeyError, OverflowError) as error:
+        raise CaptureStoreError(
+            f"{path}: holds a record that is none of a frame ({of_error(error)}); restore the file "
+            "from a copy, or begin another store"
+        ) from error
+    return found
+
+
 def sync_path(path: Path) -> None:
     """Wait until a file, or the names in a folder, are on disk."""
     handle = os.open(path, os.O_RDONLY)
@@ -58,7 +81,10 @@ def sync_path(path: Path) -> None:
 
 def _parsed(path: Path) -> tuple[list[Any], int]:
     """Records of all complete lines, and their length in bytes."""
-    data = read_regular(path) if path.exists() else b""
+    try:
+        data = read_regular(path) if path.exists() else b""
+    except OSError as error:
+        raise CaptureStoreError(f"{path}: cannot be read ({error.strerror})") from error
     records, whole = [], 0
     for number, line in enumerate(data.split(b"\n")[:-1], 1):
         found = _records(line)
@@ -80,6 +106,7 @@ def _records(line: bytes) -> list[Any] | None:
     try:
         held = json.loads(line)
         records = held["records"]
-        return records if held["crc32"] == zlib.crc32(canonical_json(records).encode()) else None
-    except (ValueError, KeyError, TypeError):
+        sound = held["crc32"] == zlib.crc32(canonical_json(records).encode())
+        return records if sound and isinstance(records, list) else None
+    except (ValueError, KeyError, TypeError, RecursionError):
         return None

@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
+from thincam_jax._core.quantity import check_fields
 from thincam_jax.hardware.base import CameraSettings, Region
 
 if TYPE_CHECKING:  # it brings JAX
@@ -51,7 +52,7 @@ BLACK = Pattern("black")
 class Step:
     """One frame: its pattern and settings by their number in the plan, and the stage position.
 
-    - `position`: mm; None: the stage does not move.
+    - `position`: mm; None: the stage stays where the steps before left it.
     - `dark`: a dark frame, subtracted from the others.
     """
 
@@ -97,12 +98,16 @@ class Plan:
         return self.patterns[step.pattern]
 
     def at_position(self, position: float) -> "Plan":
-        """The plan with the stage at a position, mm, in all steps that do not move it."""
-        steps = (
-            step if step.position is not None else dataclasses.replace(step, position=position)
-            for step in self.steps
-        )
-        return dataclasses.replace(self, steps=tuple(steps))
+        """The plan with the stage at a position, mm, until a step moves it."""
+        return dataclasses.replace(self, steps=self.placed(position))
+
+    def placed(self, start: float | None = None) -> tuple[Step, ...]:
+        """The steps, each with the stage's position, mm: the last given one, `start` before any."""
+        positions = [start]
+        for step in self.steps:
+            positions.append(positions[-1] if step.position is None else step.position)
+        pairs = zip(self.steps, positions[1:], strict=True)
+        return tuple(dataclasses.replace(step, position=position) for step, position in pairs)
 
     @cached_property
     def hash(self) -> str:
@@ -127,7 +132,7 @@ class Plan:
 
     @classmethod
     def from_json(cls, text: str) -> "Plan":
-        """Inverse of `as_json`; ValueError, KeyError or TypeError for anything else."""
+        """Inverse of `as_json`; errors of many kinds for anything else."""
         plan = json.loads(text)
         return cls(
             name=plan["name"],
@@ -146,7 +151,9 @@ def canonical_json(value: Any) -> str:
 def settings_from(record: Mapping[str, Any]) -> CameraSettings:
     """Inverse of `dataclasses.asdict` for camera settings."""
     region = record["region"]
-    return CameraSettings(**{**record, "region": None if region is None else Region(**region)})
+    found = CameraSettings(**{**record, "region": None if region is None else Region(**region)})
+    check_fields(found)
+    return found
 
 
 def zone_plate(

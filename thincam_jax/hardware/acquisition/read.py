@@ -9,7 +9,8 @@ import numpy as np
 
 from thincam_jax._core.capture_store import CaptureStore, CaptureStoreError, frame_digest, listed
 from thincam_jax._core.files import read_regular
-from thincam_jax.hardware.acquisition.journal import read_journal
+from thincam_jax._core.text import of_error
+from thincam_jax.hardware.acquisition.journal import frame_records, read_journal
 from thincam_jax.hardware.acquisition.plan import Pattern, Plan, settings_from
 from thincam_jax.hardware.acquisition.recorder import JOURNAL, PLAN
 from thincam_jax.hardware.base import CameraSettings
@@ -103,13 +104,11 @@ def read_acquisition(path: str | Path) -> Acquisition:
         settings = tuple(settings_from(record) for record in begun.pop("settings"))
         if begun["plan"] != plan.hash or len(store.digests) != len(plan.steps):
             raise ValueError("its plan is another one")
-    except (OSError, KeyError, TypeError, ValueError) as error:
+    except Exception as error:  # whatever another's plan or attributes bring about
         raise CaptureStoreError(
-            f"{path} is not what an acquisition made ({type(error).__name__}: {error}); give a "
-            "store of acquire()"
+            f"{path} is not what an acquisition made ({of_error(error)}); give a store of acquire()"
         ) from error
-    lines = [line for line in read_journal(path / JOURNAL) if "step" in line]
-    shots = {line["step"]: line for line in lines}
+    shots = frame_records(path / JOURNAL, read_journal(path / JOURNAL), len(plan.steps))
     missing = sorted({n for n in range(len(plan.steps)) if n not in shots} | store.lost())
     if missing:
         raise CaptureStoreError(

@@ -21,7 +21,7 @@ from filelock import Timeout as LockTimeout
 
 from thincam_jax._core.capture_store import CaptureStore, CaptureStoreError, frame_digest
 from thincam_jax._core.files import write_whole, writing
-from thincam_jax.hardware.acquisition.journal import Journal, sync_path
+from thincam_jax.hardware.acquisition.journal import Journal, frame_records, sync_path
 
 JOURNAL, PLAN = "journal.jsonl", "plan.json"
 _HELD = 2**26  # bytes of frames that may wait for the disk
@@ -90,9 +90,9 @@ class Recorder(AbstractContextManager["Recorder"]):
         self.store = CaptureStore(path, "r+")
         self._journal = Journal(path / JOURNAL)
         digests = np.zeros_like(self.store.digests)
-        for record in self._journal.records:
-            if "step" in record:
-                digests[record["step"]] = int(record["digest"], 16)
+        taken = frame_records(path / JOURNAL, self._journal.records, len(digests))
+        for step, record in taken.items():
+            digests[step] = int(record["digest"], 16)
         digests[sorted(self.store.lost())] = 0
         self._digests = digests
         self.missing = [int(step) for step in np.flatnonzero(digests == 0)]

@@ -62,11 +62,13 @@ class Procedure:
 class Taker:
     """The devices of a run and their known state.
 
+    - `steps`: those of the plan, each with its position, as any may be the first of this process.
     - `recovered`: the errors that a retry resolved. `seconds`: spent on each part of a step.
     """
 
     def __init__(self, plan: Plan, rig: Rig, procedure: Procedure):
         self.plan, self.rig, self.procedure = plan, rig, procedure
+        self.steps = plan.placed()
         self.recovered: list[str] = []
         self.seconds: dict[str, float] = {}
         self.identities = rig.identities()

@@ -18,6 +18,7 @@ from jaxtyping import Array, DTypeLike, Float, PRNGKeyArray
 from thincam_jax._core.checks import Shape
 from thincam_jax._core.files import read_regular, write_whole
 from thincam_jax._core.precision import product
+from thincam_jax._core.text import of_error
 from thincam_jax.imaging.operators.base import (
     AbstractOperator,
     real_numbers,
@@ -158,15 +159,26 @@ class ReducedMatrix(AbstractOperator):
         **Errors**: ValueError, one line, where the file belongs to a matrix of another size or with
         other numbers (16 rows are compared), or is damaged.
         """
+        rows, size = _rows(matrix), _rows(matrix).shape[1]
         again = f"make it anew with ReducedMatrix.of and save it as {path}"
+        content = io.BytesIO(read_regular(path))
         try:
-            with np.load(io.BytesIO(read_regular(path)), allow_pickle=False) as file:
+            if any(entry.compress_type for entry in zipfile.ZipFile(content).infolist()):
+                raise ValueError("its arrays are packed")
+            with np.load(content, allow_pickle=False) as file:
                 mark, shape = str(file["mark"]), tuple(int(n) for n in file["in_shape"])
                 values, vectors = file["values"], file["vectors"]
-        except (ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-            raise ValueError(f"{path} holds no reduced matrix ({error}); {again}") from error
-        if mark != _mark(_rows(matrix)):
+        except Exception as error:  # of many kinds, as NumPy takes the headers for Python
+            raise ValueError(
+                f"{path} holds no reduced matrix ({of_error(error)}); {again}"
+            ) from error
+        if mark != _mark(rows):
             raise ValueError(f"{path} belongs to another matrix than the one given; {again}")
+        shapes, real = (values.shape, vectors.shape, math.prod(shape)), values.dtype.kind == "f"
+        if shapes != ((size,), (size, size), size) or not real or vectors.dtype != values.dtype:
+            raise ValueError(f"{path} holds arrays of other shapes or types; {again}")
+        if not (np.isfinite(vectors).all() and np.isfinite(values).all() and (values >= 0).all()):
+            raise ValueError(f"{path} holds numbers that are not finite, or negative; {again}")
         return cls(jnp.asarray(values), jnp.asarray(vectors), jnp.asarray(vectors.T), shape)
 
 

@@ -16,10 +16,11 @@ from thincam_jax._core.checks import Numbers
 from thincam_jax._core.module import Module
 from thincam_jax._core.quantity import FieldError, check_fields, whole
 from thincam_jax._core.random import Key, random_key
+from thincam_jax._core.text import of_error
 from thincam_jax.learn.checkpoint import (
     CheckpointError,
-    read_arrays,
     read_description,
+    read_weights,
     write_arrays,
 )
 from thincam_jax.learn.denoiser.unet import DenoisingUNet
@@ -43,10 +44,10 @@ class DenoiserOptions:
 
     def __post_init__(self):
         check_fields(self)
-        if not self.widths or len(self.widths) != len(self.blocks):
+        if not 0 < len(self.widths) == len(self.blocks) <= 16 or sum(self.blocks) > 64:
             raise FieldError(
                 f"widths = {self.widths}, blocks = {self.blocks}: give as many as widths, one for "
-                "each level",
+                "each of up to 16 levels, and up to 64 in all",
                 "blocks",
             )
 
@@ -155,13 +156,11 @@ def load_network(path: str | os.PathLike[str]) -> DenoisingUNet:
     try:
         options = DenoiserOptions(tuple(stored["widths"]), tuple(stored["blocks"]))
         like = eqx.filter_eval_shape(lambda key: create(options, key=key), jax.random.key(0))
-    except (TypeError, ValueError, KeyError) as error:
-        raise CheckpointError(f"{path}: holds options of another version ({error})") from None
+    except Exception as error:  # whatever another's options bring about
+        told = of_error(error)
+        raise CheckpointError(f"{path}: holds options of another version ({told})") from None
     like = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, jnp.float32), like)
-    weights = read_arrays(path, like)
-    if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(weights)):
-        raise CheckpointError(f"{path}: holds weights that are not finite; give an earlier file")
-    return jax.tree.map(jnp.asarray, weights)
+    return read_weights(path, like)
 
 
 def network_card(path: str | os.PathLike[str] = SHIPPED) -> dict[str, Any]:

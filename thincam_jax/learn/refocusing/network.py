@@ -43,8 +43,9 @@ class NetworkOptions:
 
     def __post_init__(self):
         check_fields(self)
-        if not self.widths:
-            raise FieldError("widths is empty; give the channels of one level or more", "widths")
+        if not 0 < len(self.widths) <= 16:
+            cause = f"widths has {len(self.widths)} levels; give the channels of 1 to 16"
+            raise FieldError(cause, "widths")
 
 
 DEFAULT = NetworkOptions()

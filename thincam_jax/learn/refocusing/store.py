@@ -8,15 +8,15 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 
+from thincam_jax._core.text import of_error
 from thincam_jax.imaging.scene import Spectrum
 from thincam_jax.learn.checkpoint import (
     CheckpointError,
     difference,
-    read_arrays,
     read_description,
+    read_weights,
     write_arrays,
 )
 from thincam_jax.learn.refocusing.cameras import RefocusCamera
@@ -74,10 +74,10 @@ def load(
         structure = eqx.filter_eval_shape(
             lambda key: RefocusNetwork.create(given, options, key=key).weights, jax.random.key(0)
         )
-    except (TypeError, ValueError, AttributeError, KeyError) as error:
-        raise CheckpointError(f"{path}: holds options of another version ({error})") from None
-    weights = jax.tree.map(jnp.asarray, read_arrays(path, structure))
-    return RefocusNetwork(weights, Planes(given), options)
+    except Exception as error:  # whatever another's options bring about
+        told = of_error(error)
+        raise CheckpointError(f"{path}: holds options of another version ({told})") from None
+    return RefocusNetwork(read_weights(path, structure), Planes(given), options)
 
 
 def network_description(path: str | os.PathLike[str]) -> dict[str, Any]:

@@ -18,7 +18,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from thincam_jax._core.capture_store import VERSION, opened
+from thincam_jax._core.capture_store import VERSION, opened, stored_array
 from thincam_jax._core.files import writing
 from thincam_jax._core.memory import refuse_if_too_large
 from thincam_jax.imaging.operators import Matrix
@@ -166,7 +166,7 @@ def _operator(matrix: np.ndarray, object_shape, sensor_shape) -> Matrix:
 
 def _stored(path: str | Path) -> tuple[dict[str, Any], Any]:
     with opened(path, (_KIND,), ("finished system matrix", "write_matrix")) as (group, attributes):
-        array: Any = group["matrix"]
+        array = stored_array(group, "matrix", 2, ("float32",))
         shape = tuple(math.prod(attributes[name]) for name in ("sensor_shape", "object_shape"))
         if array.shape != shape:
             raise ValueError(f"the matrix has another shape than {shape}")

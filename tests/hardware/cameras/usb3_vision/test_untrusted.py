@@ -2,9 +2,11 @@
 
 import io
 import os
+import resource
 import struct
 import subprocess
 import sys
+import time
 import zipfile
 from pathlib import Path
 
@@ -71,6 +73,36 @@ def test_xml_that_is_not_to_be_trusted(xml, said, device):
     device._power_on()
     with pytest.raises(ProtocolError, match=said):
         Usb3VisionCamera.open(Usb3VisionCamera.Options(backend=device))
+
+
+def chain(count, link):
+    """The virtual camera with a chain of features, each with a link to the next."""
+    nodes = [f'<Integer Name="N{n}">{link.format(n + 1)}</Integer>' for n in range(count)]
+    end = f'<Integer Name="N{count}"><Value>1</Value></Integer></RegisterDescription>'
+    return VIRTUAL_XML.replace(b"</RegisterDescription>", ("".join(nodes) + end).encode())
+
+
+@pytest.mark.parametrize(
+    ("xml", "said"),
+    [
+        (chain(4_000, "<pValue>N{}</pValue>"), "refer to too many others"),
+        (chain(20_000, "<pValue>N{}</pValue>"), "refer to too many others"),
+        (chain(1_000, "<Value>1</Value><pSelected>N{}</pSelected>"), "refer to too many others"),
+        (VIRTUAL_XML.replace(b"<Length>64<", b"<Length>1000000000<", 1), "register of 1000000000"),
+        (VIRTUAL_XML.replace(b"<Length>64<", b"<Length>0x3B9ACA00<", 1), "register of 0x3B9ACA00"),
+        (
+            VIRTUAL_XML.replace(b"<Length>64</Length>", b"<pLength>SensorWidth</pLength>", 1),
+            "the length of the text DeviceVendorName is another feature",
+        ),
+    ],
+    ids=["chain", "long chain", "selectors", "decimal", "hexadecimal", "elsewhere"],
+)
+def test_xml_that_takes_time_or_memory_is_refused_before(xml, said):
+    started, taken = time.monotonic(), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with pytest.raises(ValueError, match=said):
+        features.check_xml(xml)
+    assert time.monotonic() - started < 5
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - taken < 400_000  # kB
 
 
 def zipped(content: bytes, **options) -> bytes:

@@ -16,6 +16,7 @@ from defusedxml import DefusedXmlException
 from defusedxml.ElementTree import fromstring
 from genicam import genapi
 
+from thincam_jax._core.text import shortened
 from thincam_jax.hardware.cameras.features import Number, Value
 from thincam_jax.hardware.cameras.usb3_vision import gencp
 from thincam_jax.hardware.cameras.usb3_vision.gencp import Abrm
@@ -26,6 +27,10 @@ MOST_ENTRIES = 64
 
 # Elements whose names denote a choice or a variable of a formula, not a node.
 NO_NODES = ("EnumEntry", "pVariable", "Constant", "Expression")
+
+# Of GenApi: references that lead on from each node, summed, for 0.1 kB each; of "pSelected" the
+# time grows with the third power of a chain's length.
+MOST_REFERENCES = {"p": 500_000, "pSelected": 20_000}
 
 
 def fetch_xml(link: UsbLink, control: Control) -> str:
@@ -77,14 +82,41 @@ def check_xml(data: bytes) -> str:
 
 
 def _check_references(root: Any) -> None:
-    """Refuse references between ports and features, with which GenApi crashes the process."""
+    """Refuse what crashes GenApi, or takes it more time or memory than any camera needs.
+
+    References between ports and features; long chains of references; registers longer than a read.
+    """
     kinds = {n.attrib["Name"]: _kind(n) for n in root.iter() if "Name" in n.attrib
              and _kind(n) not in NO_NODES}  # fmt: skip
-    for element in root.iter():
-        reference, name = _kind(element), (element.text or "").strip()
+    owners, references = {root: ""}, []
+    for parent in root.iter():
+        own = _kind(parent) not in NO_NODES and parent.attrib.get("Name")
+        owners[parent] = owner = own or owners[parent]
+        owners |= dict.fromkeys(parent, owner)
+        reference, name = _kind(parent), (parent.text or "").strip()
+        if reference == "Length" and not (name.isascii() and len(name) < 20 and
+                int(name, 16 if name[:2] == "0x" else 10) <= LARGEST_READ):  # fmt: skip
+            raise ValueError(f"a register of {shortened(name)} bytes, allowed: {LARGEST_READ}")
+        if reference == "pLength" and kinds.get(owner) == "StringReg":
+            raise ValueError(f"the length of the text {owner} is another feature")
         if reference[:1] == "p" and reference[1:2].isupper() and name in kinds:
             if (kinds[name] == "Port") != (reference == "pPort"):
                 raise ValueError(f"a {reference} names {name}, which is a {kinds[name]}")
+            references.append((reference, owner, name))
+    for kind, left in MOST_REFERENCES.items():
+        graph: dict[str, list[str]] = {}
+        for reference, owner, name in references:
+            if reference.startswith(kind):
+                graph.setdefault(owner, []).append(name)
+        for start in graph:
+            seen, waiting = {start}, [start]
+            while waiting:
+                following = graph.get(waiting.pop(), ())
+                left -= len(following)
+                if left < 0:
+                    raise ValueError("its features refer to too many others, one by another")
+                waiting += set(following) - seen
+                seen.update(following)
 
 
 def _kind(node: Any) -> str:

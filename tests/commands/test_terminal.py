@@ -1,0 +1,90 @@
+"""What reaches the terminal: no control characters of files, no floods, no long values."""
+
+import ast
+from pathlib import Path
+
+import pytest
+from commands.study import tiny
+from commands.test_cli import call
+
+from thincam_jax._core.table import Table
+from thincam_jax._core.text import escaped
+from thincam_jax.commands import terminal
+
+EVIL = "\x1b[31m\x07\u202e[/red]\x9b\r\u2028"
+IN_YAML = '"' + EVIL.encode("unicode_escape").decode() + '"'
+
+
+def require_plain(text):
+    wrong = {c for c in text if not c.isprintable()} - {"\n"}
+    assert not wrong, wrong
+    assert "x1b[31m" in text
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"--set": f"{EVIL}=1"},
+        {"--set": f"kind={IN_YAML}"},
+        {"--set": f"sensor={IN_YAML}"},
+        {"--set": f"sensor.pitch={IN_YAML}"},
+        {"--out": f"/dev/null/{EVIL}"},
+        {"file": EVIL},
+        {"line": f"{IN_YAML}: 3"},
+    ],
+)
+def test_an_error_shows_no_control_characters(changed, tmp_path):
+    file = tiny.write(tmp_path)
+    if "line" in changed:
+        file.write_text(file.read_text("utf-8") + changed["line"] + "\n", "utf-8")
+    options = [text for key in ("--set", "--out") if key in changed for text in (key, changed[key])]
+    result = call("run", changed.get("file", file), *options)
+    assert result.exit_code != 0 and len(result.stderr.split("\n")) == 2, result.stderr
+    require_plain(result.stderr)
+
+
+def test_what_is_printed_shows_no_control_characters(tmp_path, capsys):
+    result = call("init", "study", "--out", tmp_path / f"{EVIL.replace('/', '')}.yaml")
+    assert result.exit_code == 0
+    require_plain(result.stdout)
+    terminal.warn([EVIL])
+    terminal.show(Table((EVIL,), ((EVIL,),), title=EVIL))
+    with terminal.progress_bar("{task.fields[rate]}") as bar:
+        bar.add_task(EVIL, total=1, rate=EVIL)
+        shown = bar.get_renderable()
+        with bar.console.capture() as capture:
+            bar.console.print(shown)
+    said = capsys.readouterr()
+    for text in (said.out, said.err, capture.get()):
+        require_plain(text)
+    assert escaped("β = 25 rad/mm², “π”\n") == "β = 25 rad/mm², “π”\n"
+
+
+def test_all_is_printed_in_one_place():
+    folder = Path(terminal.__file__).parent
+    printing = [
+        f"{path.relative_to(folder)}:{node.lineno}"
+        for path in folder.rglob("*.py")
+        for node in ast.walk(ast.parse(path.read_text("utf-8")))
+        if path.name != "terminal.py" and getattr(node, "id", "") == "print"
+    ]
+    assert not printing, f"use say of commands/terminal.py: {printing}"
+
+
+def test_many_faults_are_cut(tmp_path):
+    file = tiny.write(tmp_path)
+    keys = "".join(f"key_{number}: 1\n" for number in range(2000))
+    file.write_text(file.read_text("utf-8") + keys, "utf-8")
+    lines = call("run", file).stderr.splitlines()
+    assert len(lines) == 11 and lines[-1] == "thincam: and 1,990 more"
+    assert "key_9: unknown key; allowed here: " in lines[9]
+
+
+@pytest.mark.parametrize(
+    "entry",
+    ["{}=1", "kind={}", "sensor={}", "sensor.pitch={}", "scenes={}", "targets.0.image={}", "{}"],
+)
+def test_a_long_value_is_cut(entry, tmp_path):
+    result = call("run", tiny.write(tmp_path), "--set", entry.format("x" * 5000))
+    (line,) = result.stderr.splitlines()
+    assert result.exit_code == 2 and len(line) < 700, line
