@@ -136,8 +136,7 @@ def claim_folder(
     `kind` is a word for what it holds. A folder that holds the same already is taken as it is. The
     lock keeps other processes out as long as it is referred to.
 
-    **Errors**: ConfigError where it holds anything else, another process claims it, or it cannot be
-    made.
+    **Errors**: ConfigError where it holds anything else, is claimed, or cannot be made.
     """
     held = path / name
     try:
