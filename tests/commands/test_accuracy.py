@@ -28,7 +28,11 @@ def run(config, tmp_path_factory):
     told = tiny.Told()
     accuracy.run_accuracy(plan, folder, told)
     assert len(told) == told.total
-    assert sorted(p.name for p in folder.path.iterdir()) == ["accuracy.json", "config.yaml"]
+    assert sorted(p.name for p in folder.path.iterdir()) == [
+        ".lock",
+        "accuracy.json",
+        "config.yaml",
+    ]
     return json.loads((folder.path / "accuracy.json").read_text("utf-8"))
 
 

@@ -70,10 +70,7 @@ def stored_array(group: Any, name: str, axes: int, dtypes: Sequence[str]) -> Any
     codecs = {codec.to_dict()["name"] for codec in array.metadata.codecs}
     packed = codecs - {"bytes", "crc32c"} and name != "digests"  # once written with zstd
     if array.ndim != axes or str(array.dtype) not in dtypes or size > _LARGEST or packed:
-        raise ValueError(
-            f"{name} has shape {array.shape}, type {array.dtype}, chunks {array.chunks}, codecs "
-            f"{', '.join(sorted(codecs))}"
-        )
+        raise ValueError(f"{name} has {array.shape} {array.dtype}, {array.chunks}, {codecs}")
     return array
 
 
@@ -84,7 +81,7 @@ class CaptureStore:
     """
 
     def __init__(self, path: Path, mode: str = "r", kinds: Sequence[str] = (CALIBRATION, CAPTURES)):
-        self.path = path
+        self.path, self._chunks = path, path / "frames" / "c"
         told = f"store of {kinds[-1]}", "an acquisition or create_captures"
         with opened(path, kinds, told, mode) as (self.group, self.attributes):
             # A chunk of black frames is written, too: one that is not there is missing.
@@ -134,10 +131,6 @@ class CaptureStore:
     def together(self) -> int:
         """Frames of a chunk."""
         return self.frames.chunks[0]
-
-    @property
-    def _chunks(self) -> Path:
-        return self.path / "frames" / "c"
 
     @property
     def frame_bytes(self) -> int:

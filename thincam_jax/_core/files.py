@@ -78,9 +78,7 @@ def read_regular(path: str | os.PathLike[str]) -> bytes:
 
 
 _SMALL = 2**20  # bytes that are read without asking for the memory
-_ROOM = "make room or give another folder"
-_ADVICE = {
-    **dict.fromkeys((errno.ENOSPC, errno.EDQUOT, errno.EFBIG), _ROOM),
-    errno.ENOENT: "make its folder first, or give another",
-}
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+_ADVICE = dict.fromkeys(_FULL, "make room or give another folder")
+_ADVICE[errno.ENOENT] = "make its folder first, or give another"
 _NO_WAIT = getattr(os, "O_NONBLOCK", 0)  # not on every system

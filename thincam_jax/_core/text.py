@@ -1,12 +1,9 @@
 """Texts of files and users in messages: escaped, and cut to a length."""
 
-_SPACES = "\n\xa0\u202f"
-
 
 def escaped(text: str) -> str:
     """Text whose control characters and marks of writing direction are written out."""
-    kept = (c if c.isprintable() or c in _SPACES else ascii(c)[1:-1] for c in text)
-    return "".join(kept)
+    return "".join(c if c.isprintable() or c in "\n\xa0\u202f" else ascii(c)[1:-1] for c in text)
 
 
 def shortened(text: str, longest: int = 60) -> str:

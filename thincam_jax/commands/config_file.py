@@ -181,9 +181,8 @@ def read_value(text: str, asked: str) -> Any:
     except _TooLargeError as error:
         raise ConfigError(f"{asked}: {error}") from None
     except (yaml.YAMLError, ValueError):
-        raise ConfigError(
-            f"{asked}: {shortened(repr(text))} is not valid YAML; put texts in quotes"
-        ) from None
+        given = shortened(repr(text))
+        raise ConfigError(f"{asked}: {given} is not valid YAML; put texts in quotes") from None
 
 
 def slug(name: str) -> str:

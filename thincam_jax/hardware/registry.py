@@ -14,7 +14,7 @@ from importlib.metadata import entry_points
 from typing import Any
 
 from thincam_jax.hardware.base import Device
-from thincam_jax.hardware.errors import HardwareError, NotFound
+from thincam_jax.hardware.errors import NotFound
 
 _BUILT_IN = {
     "cameras": {
@@ -51,18 +51,15 @@ def driver(kind: str, name: str) -> type[Device]:
     module, _, attribute = known[name].partition(":")
     try:
         found = getattr(import_module(module), attribute)
-        if hasattr(found, "require_libraries"):  # those that pip does not install
-            found.require_libraries()
         if not (issubclass(found, Device) and is_dataclass(found.Options)):
             raise TypeError(f"{attribute} is no device with Options of a dataclass")
     except ImportError as error:
         remedy = "pip install 'thincam-jax[hardware]'"
         raise NotFound(name, "open", f"its library is missing ({error})", remedy) from error
-    except HardwareError:
-        raise
     except (Exception, SystemExit) as error:  # whatever code of another package may raise
         cause, remedy = f"broken ({type(error).__name__}: {error})", f"mend or remove {module}"
         raise NotFound(name, "open", cause, remedy) from error
+    getattr(found, "require_libraries", lambda: None)()  # those that pip does not install
     return found
 
 

@@ -179,7 +179,7 @@ def test_a_rig_that_cannot_be_opened(asked, line, tmp_path):
 @pytest.mark.parametrize(
     ("asked", "line"),
     [
-        ("plan.distances=[6.5 mm, 506.5 mm]", "begin: 5 of 10 steps lie outside, first one at 500"),
+        ("plan.distances=[6.5 mm, 506.5 mm]", "5 steps of the plan lie outside, the first at 500"),
         ("camera.exposure=1000 s", "ExposureTime of 1000 s; give "),
         ("camera.region={top: 9, left: 0, height: 64, width: 96}", "lies outside of the sensor"),
     ],

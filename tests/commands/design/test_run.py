@@ -86,7 +86,7 @@ def test_in_memory_it_is_the_same(whole, tmp_path):
 def test_what_is_written(whole):
     path, design, _ = whole
     assert {p.name for p in path.iterdir()} == {
-        *("config.yaml", "found.yaml", "design.json", "environment.json", "report.html"),
+        *(".lock", "config.yaml", "found.yaml", "design.json", "environment.json", "report.html"),
         *("landscape.png", "responses.png", "mtf.png", "masks.png", "targets"),
         *("reconstructions-chart.png", "reconstructions-picture.png"),
     }

@@ -121,7 +121,7 @@ def test_progress_is_reported_as_often_as_announced(whole):
 def test_folder_holds_what_it_says_and_nothing_half(whole):
     study, path, _, _ = whole
     files = {p.relative_to(path).as_posix() for p in path.rglob("*") if p.is_file()}
-    expected = {"config.yaml", "metrics.json", "environment.json", "report.html"}
+    expected = {".lock", "config.yaml", "metrics.json", "environment.json", "report.html"}
     expected |= {"targets/chart.json", "targets/picture.json"}
     expected |= {f"images/{t}--{m}.png" for t in ("chart", "picture") for m in ("pairs", "scene")}
     expected |= {f"images/{t}--conventional.png" for t in ("chart", "picture")}

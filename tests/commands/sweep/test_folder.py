@@ -144,10 +144,11 @@ def test_first_start_that_was_killed(config, tmp_path):
     assert load_experiment(folder.path / "study.yaml") == config
 
 
-def test_a_second_run_is_refused_while_the_first_lives(folder, config):
-    folder.path.mkdir(exist_ok=True)
+def test_a_second_run_is_refused_while_the_first_lives(config, tmp_path):
+    folder = SweepFolder(tmp_path / "out")
+    folder.path.mkdir()
     with (folder.path / ".lock").open("w") as other:  # of another process
-        fcntl.flock(other, fcntl.LOCK_EX)
+        fcntl.flock(other, fcntl.LOCK_EX | fcntl.LOCK_NB)
         with pytest.raises(ConfigError, match="another sweep writes to it; wait for its end or"):
             folder.claim(config)
         fcntl.flock(other, fcntl.LOCK_UN)

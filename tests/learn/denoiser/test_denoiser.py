@@ -142,7 +142,7 @@ def test_options_of_a_file_that_are_not_to_be_trusted(widths, blocks, network, t
     options = {"widths": widths, "blocks": blocks}
     card = {"kind": room._KIND, "options": options, "training": {}}
     file = write_arrays(tmp_path / "net.thincam", network, card)
-    with pytest.raises(CheckpointError, match="holds options of another version") as told:
+    with pytest.raises(CheckpointError, match="options of another version") as told:
         load_network(file)
     assert len(str(told.value)) < 500
 

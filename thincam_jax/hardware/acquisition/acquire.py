@@ -166,9 +166,9 @@ def _require_stage(run: Taker, positions: list[float]) -> None:
         raise NotHomed(run.name("stage"), "begin", "it does not know where it is", "home it first")
     low, high = stage.limits
     if outside := [place for place in positions if not low <= place <= high]:
-        cause = f"{len(outside)} of {len(positions)} steps lie outside, first one at {outside[0]:g}"
-        remedy = f"give positions from {low:g} to {high:g} mm, nothing was taken"
-        raise OutOfRange(run.name("stage"), "begin", f"{cause} mm", remedy)
+        cause = f"{len(outside)} steps of the plan lie outside, the first at {outside[0]:g} mm"
+        remedy = f"give positions from {low:g} to {high:g} mm"
+        raise OutOfRange(run.name("stage"), "begin", cause, remedy)
 
 
 def _resumed(run: Taker, path: Path) -> tuple[CameraSettings, ...]:

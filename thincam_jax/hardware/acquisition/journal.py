@@ -63,10 +63,8 @@ def frame_records(path: Path, records: Sequence[Any], steps: int) -> dict[int, A
                 raise ValueError(f"step {step}, digest {record['digest']}, position {place}")
             found[step] = record
     except (TypeError, ValueError, KeyError, OverflowError) as error:
-        raise CaptureStoreError(
-            f"{path}: holds a record that is none of a frame ({of_error(error)}); restore the file "
-            "from a copy, or begin another store"
-        ) from error
+        cause = f"{path}: holds a record that is none of a frame ({of_error(error)})"
+        raise CaptureStoreError(f"{cause}; restore a copy, or begin another store") from error
     return found
 
 

@@ -103,11 +103,11 @@ class Plan:
 
     def placed(self, start: float | None = None) -> tuple[Step, ...]:
         """The steps, each with the stage's position, mm: the last given one, `start` before any."""
-        positions = [start]
+        steps = []
         for step in self.steps:
-            positions.append(positions[-1] if step.position is None else step.position)
-        pairs = zip(self.steps, positions[1:], strict=True)
-        return tuple(dataclasses.replace(step, position=position) for step, position in pairs)
+            start = start if step.position is None else step.position
+            steps.append(dataclasses.replace(step, position=start))
+        return tuple(steps)
 
     @cached_property
     def hash(self) -> str:

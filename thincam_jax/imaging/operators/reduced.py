@@ -169,16 +169,14 @@ class ReducedMatrix(AbstractOperator):
                 mark, shape = str(file["mark"]), tuple(int(n) for n in file["in_shape"])
                 values, vectors = file["values"], file["vectors"]
         except Exception as error:  # of many kinds, as NumPy takes the headers for Python
-            raise ValueError(
-                f"{path} holds no reduced matrix ({of_error(error)}); {again}"
-            ) from error
+            raise ValueError(f"{path} is no reduced matrix ({of_error(error)}); {again}") from error
         if mark != _mark(rows):
             raise ValueError(f"{path} belongs to another matrix than the one given; {again}")
-        shapes, real = (values.shape, vectors.shape, math.prod(shape)), values.dtype.kind == "f"
-        if shapes != ((size,), (size, size), size) or not real or vectors.dtype != values.dtype:
-            raise ValueError(f"{path} holds arrays of other shapes or types; {again}")
-        if not (np.isfinite(vectors).all() and np.isfinite(values).all() and (values >= 0).all()):
-            raise ValueError(f"{path} holds numbers that are not finite, or negative; {again}")
+        shapes, kinds = (values.shape, vectors.shape, math.prod(shape)), {values.dtype.kind, "f"}
+        sound = shapes == ((size,), (size, size), size) and kinds == {vectors.dtype.kind}
+        sound = sound and np.isfinite(vectors).all() and ((values >= 0) & (values < np.inf)).all()
+        if not sound:
+            raise ValueError(f"{path} holds other shapes, or wrong numbers; {again}")
         return cls(jnp.asarray(values), jnp.asarray(vectors), jnp.asarray(vectors.T), shape)
 
 

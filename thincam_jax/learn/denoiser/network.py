@@ -157,8 +157,7 @@ def load_network(path: str | os.PathLike[str]) -> DenoisingUNet:
         options = DenoiserOptions(tuple(stored["widths"]), tuple(stored["blocks"]))
         like = eqx.filter_eval_shape(lambda key: create(options, key=key), jax.random.key(0))
     except Exception as error:  # whatever another's options bring about
-        told = of_error(error)
-        raise CheckpointError(f"{path}: holds options of another version ({told})") from None
+        raise CheckpointError(f"{path}: options of another version ({of_error(error)})") from None
     like = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, jnp.float32), like)
     return read_weights(path, like)
 

@@ -44,8 +44,7 @@ class NetworkOptions:
     def __post_init__(self):
         check_fields(self)
         if not 0 < len(self.widths) <= 16:
-            cause = f"widths has {len(self.widths)} levels; give the channels of 1 to 16"
-            raise FieldError(cause, "widths")
+            raise FieldError(f"widths has {len(self.widths)} levels; give 1 to 16", "widths")
 
 
 DEFAULT = NetworkOptions()

@@ -75,8 +75,7 @@ def load(
             lambda key: RefocusNetwork.create(given, options, key=key).weights, jax.random.key(0)
         )
     except Exception as error:  # whatever another's options bring about
-        told = of_error(error)
-        raise CheckpointError(f"{path}: holds options of another version ({told})") from None
+        raise CheckpointError(f"{path}: options of another version ({of_error(error)})") from None
     return RefocusNetwork(read_weights(path, structure), Planes(given), options)
 
 
