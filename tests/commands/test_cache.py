@@ -1,5 +1,6 @@
 """Compiled programs of commands: where they are, that they are read, and no error where not."""
 
+import fcntl
 import os
 import subprocess
 import sys
@@ -66,6 +67,18 @@ def test_folder_that_cannot_be_made(environment, monkeypatch, tmp_path):
     cache.keep_programs()
     assert "JAX_COMPILATION_CACHE_DIR" not in os.environ
     assert cache.cache_state() == f"{environment}, not in use"
+
+
+def test_a_cache_that_another_process_holds_is_not_waited_for(environment, monkeypatch, capsys):
+    monkeypatch.setattr(cache, "_PATIENCE", 0.0)
+    environment.mkdir(parents=True)
+    with (environment / ".lockfile").open("w") as other:
+        fcntl.flock(other, fcntl.LOCK_EX)
+        cache.keep_programs()
+    assert "JAX_COMPILATION_CACHE_DIR" not in os.environ
+    assert capsys.readouterr().err == (
+        "thincam: warning: the cache of programs is held by another process: nothing is kept\n"
+    )
 
 
 def test_folder_that_cannot_be_written(environment, monkeypatch):

@@ -468,6 +468,24 @@ def test_completion_of_the_shell_that_asks(option, tmp_path):
     assert "complete -o default -F _thincam_completion thincam" in script
 
 
+@pytest.mark.parametrize(
+    ("setting", "fault"),
+    [
+        ("JAX_PLATFORMS=banana", "Unable to initialize backend 'banana'"),
+        ("JAX_ENABLE_X64=banana", "invalid truth value 'banana'"),
+    ],
+)
+def test_settings_with_which_jax_cannot_start(setting, fault, file):
+    name, value = setting.split("=")
+    path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
+    command = [sys.executable, "-m", "thincam_jax.commands.start", "run", str(file), "--dry-run"]
+    environment = {**os.environ, "PYTHONPATH": path, "JAX_PLATFORMS": "cpu", name: value}
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=120)
+    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
+    assert f"{setting} ({fault}" in done.stderr.replace("JAX_PLATFORMS=cpu ", "")
+    assert done.stderr.endswith("; unset it\n")
+
+
 @pytest.mark.thorough
 def test_as_a_process(file):
     """The whole way, exit code and streams included, in the precision of a user: float32."""

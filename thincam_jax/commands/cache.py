@@ -9,6 +9,7 @@ import sys
 import warnings
 from pathlib import Path
 
+_PATIENCE = 3.0  # s that another process may hold the cache; it takes it for milliseconds
 LARGEST = 2**30  # bytes; beyond, JAX drops what was not used for longest
 
 _SETTINGS = {
@@ -37,12 +38,20 @@ def keep_programs() -> None:
 
     Where the folder cannot be written, nothing is kept and nothing is said.
     """
+    from filelock import FileLock, Timeout
+
     if "JAX_COMPILATION_CACHE_DIR" in os.environ:
         return
     folder = cache_folder()
     try:
         folder.mkdir(parents=True, exist_ok=True)
         _drop_unfinished(folder)
+        with FileLock(folder / ".lockfile", timeout=_PATIENCE):  # JAX would wait for each program
+            pass
+    except Timeout:
+        held = "the cache of programs is held by another process: nothing is kept"
+        sys.stderr.write(f"thincam: warning: {held}\n")
+        return
     except OSError:
         return
     if os.access(folder, os.W_OK | os.X_OK):

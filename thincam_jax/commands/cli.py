@@ -16,7 +16,7 @@ from thincam_jax.commands.kinds import init
 from thincam_jax.commands.reconstruct.command import check, reconstruct
 from thincam_jax.commands.run import accuracy, design, run, train
 from thincam_jax.commands.sweep.command import sweep
-from thincam_jax.commands.terminal import say
+from thincam_jax.commands.terminal import say, told
 
 ORDER = (
     *("init", "explain", "run", "capture", "reconstruct", "calibrate", "sweep", "design", "train"),
@@ -133,8 +133,9 @@ def options(
 @app.command()
 def doctor() -> None:
     """Print versions, devices and what is missing."""
-    from thincam_jax._core.environment import machine_report, package_report
+    with told(lambda: "interrupted"):
+        from thincam_jax._core.environment import machine_report, package_report
 
-    programs = f"compiled programs: {cache_state()}"
-    for line in (*machine_report(), programs, *package_report(), *known_drivers()):
-        say(line)
+        programs = f"compiled programs: {cache_state()}"
+        for line in (*machine_report(), programs, *package_report(), *known_drivers()):
+            say(line)

@@ -149,7 +149,7 @@ def train(
         kind = kind_of(asked)
         folder = TrainingFolder.chosen(out, asked.name, asked)
         if dry_run:
-            InFolder(folder, print, resume).check()
+            InFolder(folder, lambda _: None, resume).check()
             kind.part(kind.build)(asked)
             explain.dry_run(asked, folder.outcome(asked))
             return

@@ -12,6 +12,7 @@ from thincam_jax.commands.interrupt import INTERRUPTED, end_on_interrupt
 def main() -> None:
     """Run the command `thincam`."""
     end_on_interrupt()
+    os.environ["MPLBACKEND"] = "agg"  # figures are files
     from thincam_jax.commands.cli import app
 
     try:

@@ -43,6 +43,7 @@ def told(interrupted: Callable[[], str]) -> Iterator[None]:
     try:
         with warnings.catch_warnings():
             warnings.showwarning = lambda message, *_, **__: warn([str(message)])
+            _check_settings()
             yield
     except KeyboardInterrupt:
         tell(interrupted())
@@ -53,6 +54,16 @@ def told(interrupted: Callable[[], str]) -> Iterator[None]:
         if not isinstance(error, (ConfigError, OSError, MemoryError)) and not _no_memory(error):
             raise
         fail(error)
+
+
+def _check_settings() -> None:
+    """ConfigError for variables of the environment with which JAX cannot start."""
+    from thincam_jax._core.start import cannot_start
+
+    if fault := cannot_start():
+        from thincam_jax.commands.config_file import ConfigError
+
+        raise ConfigError(fault)
 
 
 def _no_memory(error: BaseException) -> bool:
