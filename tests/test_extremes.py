@@ -130,7 +130,7 @@ SINGLE = ("geometric: β at Nyquist, pixel average",)
 
 def is_quick(extreme: Extreme, dtype) -> bool:
     """Whether it is among those that every run looks at."""
-    return extreme.name in QUICK or (dtype is np.float32 and extreme.name in SINGLE)
+    return extreme.name in (QUICK if dtype is np.float64 else SINGLE)
 
 
 def case(extreme: Extreme, dtype: type = np.float64):

@@ -52,7 +52,7 @@ def but(*slow):
     return pytest.mark.parametrize("path", files, ids=lambda path: path.stem)
 
 
-@but("design_both", "design_slm", "flatcam", "learned_refocus")
+@but("design_both", "design_distances", "design_slm", "flatcam", "learned_refocus")
 def test_dry_run(path, tmp_path):
     out, options = tmp_path / "out", []
     if path.stem == "denoiser":  # photographs that are not shipped

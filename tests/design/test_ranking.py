@@ -39,6 +39,7 @@ def compiled_channels(data):
     return data.channels(small.pairs())
 
 
+@pytest.mark.thorough
 def test_score_of_a_design():
     problem = small.problem()
     scored = score_design(problem, problem.space.base, "pairs")

@@ -168,6 +168,7 @@ def test_coarse_pixels_carry_the_noise_of_the_fine_ones():
     assert float(compiled(design(), noisier)[1]) > error[1]
 
 
+@pytest.mark.thorough
 def test_a_capture_with_its_bias_is_restored():
     single = training(synthesis=np.eye(4)[:1], count=12, sensor=(20, 24))
     assert 0 < float(compiled(design(), single)[1]) < 1

@@ -28,6 +28,7 @@ def pairs(count, seed):
     return eqx.tree_at(lambda p: p.captures, problem, (seen,)), images
 
 
+@pytest.mark.thorough
 def test_untrained_it_is_admm():
     problem, _ = scenes.problem((17, 19), (13, 14), planes=2)
     splitting = splitting_of(problem)

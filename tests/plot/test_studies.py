@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from studies import tiny
 
+import thincam_jax as tc
 from thincam_jax.imaging.targets import usaf1951
 from thincam_jax.imaging.targets.usaf import usaf1951_elements
 from thincam_jax.plot.studies import _by_synthesis, _detail, _pairs_of_axes, draw_responses
@@ -71,7 +72,8 @@ def test_methods_of_the_same_captures_and_sums_share_a_transfer_function():
     assert [title for title, _ in panels] == [f"{first.name}; twin", study.methods[1].name]
     assert panels[0][1] is responses[first.name]
     # The same captures, but other sums of them.
-    odd, even = (dataclasses.replace(twin, name=str(m), harmonics=(m,)) for m in (1, 2))
+    sums = {"synthesis": "harmonics", "phases": 5, "solver": tc.Wiener()}
+    odd, even = (dataclasses.replace(twin, name=str(m), harmonics=(m,), **sums) for m in (1, 2))
     both = dataclasses.replace(study, methods=(odd, even))
     either = {method.name: responses["twin"] for method in both.methods}
     assert len(_by_synthesis(both, either)) == 2

@@ -35,6 +35,7 @@ def run(tmp_path_factory):
 PICTURES = ("rays", "field", "images", "models", "errors", "columns", "distances")
 
 
+@pytest.mark.thorough
 def test_without_a_calibration_there_is_a_report(tmp_path):
     """Its page does not speak of one, and neither do the tables."""
     config = tiny.experiment(tmp_path, "calibration=null", "models=[{name: right}]")

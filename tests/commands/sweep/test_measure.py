@@ -11,6 +11,7 @@ from thincam_jax.commands.study.build import build_study
 from thincam_jax.commands.sweep.point import measure_point
 
 
+@pytest.mark.thorough
 def test_columns_are_the_metrics_of_a_run(tmp_path):
     targets = tiny.TEXT[tiny.TEXT.index("  - {name: chart") :]
     config = tiny.study(tmp_path, text=mini.TEXT[: mini.TEXT.index("  - {name: star")] + targets)

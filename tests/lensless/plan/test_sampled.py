@@ -69,6 +69,7 @@ def test_predicted_error_is_at_least_the_true_one(optimised, name, samples):
     assert len(plan.distances) * len(plan.wavelengths) < 9
 
 
+@pytest.mark.thorough
 def test_a_plan_runs_inside_jit():
     """Of a few pixels; all light of nine samples a pixel is within what is predicted."""
     mask = tc.PhaseMask(np.random.default_rng(1).uniform(0, 4e-4, (6, 8)), 10 * um, 1.5)

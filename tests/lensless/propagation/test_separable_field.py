@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import thincam_jax as tc
-from helpers import relative_l2
+from helpers import quick, relative_l2
 from thincam_jax.lensless.method import LATTICE_POINTS, AccuracyWarning
 from thincam_jax.lensless.propagation.separable import separable
 from thincam_jax.lensless.propagation.separable_field import lattice, separable_image
@@ -17,10 +17,10 @@ from thincam_jax.units import nm, um
 SENSOR = tc.Sensor((14, 19), 11 * um)
 RANDOM = np.random.default_rng(0)
 MASKS = {
-    "wide": tc.SampledMask(RANDOM.uniform(0, 1, (5, 8)), 20 * um, centre=(0.01, -0.02)),
     "tall, with gaps": tc.SampledMask(
         RANDOM.normal(size=(8, 5)) + 0.3j, 20 * um, fill_factor=0.5, centre=(0.02, 0)
     ),
+    "wide": tc.SampledMask(RANDOM.uniform(0, 1, (5, 8)), 20 * um, centre=(0.01, -0.02)),
     "zone plate": tc.FresnelZoneAperture(beta=25.0, phase=0.4, width=0.3),
 }
 
@@ -34,12 +34,13 @@ def parts_of(mask):
     return mask, camera.sensor.grid, camera.path(500 * nm, 40.0)
 
 
-@pytest.mark.parametrize("mask", MASKS.values(), ids=MASKS)
+@pytest.mark.parametrize("mask", quick(MASKS.values(), 0), ids=MASKS)
 def test_the_products_of_all_pairs_add_up_to_it(mask):
     given = parts_of(mask)
     assert relative_l2(separable_image(*given, nodes=None), separable(*given).image()) < 1e-13
 
 
+@pytest.mark.thorough
 def test_averages_approach_those_of_gauss():
     """As one over the points, closer with few than the same number of Gauss nodes on a square."""
     given = parts_of(tc.SampledMask(RANDOM.integers(0, 2, (40, 50)), 20 * um))
@@ -113,7 +114,7 @@ def test_masks_of_many_terms_take_it():
     assert relative_l2(rounded, centres) < 1e-4
 
 
-@pytest.mark.parametrize("average", [False, True])
+@pytest.mark.parametrize("average", quick((False, True), 0))
 def test_predicted_error_is_above_the_true_one(average):
     camera = camera_of(tc.SampledMask(RANDOM.integers(0, 2, (131, 140)), 10 * um))
     how: dict[str, Any] = {"wavelength": 500 * nm, "object_distance": 40.0}

@@ -107,6 +107,7 @@ def test_undetermined_parameters_are_named(names, reason):
     assert any(reason in line for line in fit.reasons)
 
 
+@pytest.mark.thorough
 def test_a_plate_that_leans():
     """Found from ghosts within the errors that are claimed; held upright it explains them badly."""
     measured, start = ghosts(0.05, leaning=(0.02, -0.01)), (camera(**TRUE), plane(centre=CENTRE))
