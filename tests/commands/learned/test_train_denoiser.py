@@ -57,9 +57,7 @@ def test_what_cannot_be_used_is_told(file, tmp_path):
 
     missing = tmp_path / "no.thincam"
     assert f"start: {missing}: is missing; give a network's file" in told(f"start={missing}")
-    assert "give as many as widths, one for each of up to 16 levels" in told(
-        "network.blocks=[1, 2]"
-    )
+    assert "give as many as widths, one for each of up to 16" in told("network.blocks=[1, 2]")
     assert "held_out names 'dog'; there are drawn" in told("sources.0.held_out=[dog]")
     assert "none of them is of use 'train'" in told("sources.0.use=judge")
     assert "none is left to train on" in told("sources.0.held_out=[drawn]")
