@@ -34,10 +34,10 @@ def test_it_is_the_wiener_synthesis():
     cameras = rig.imaging_model(rig.pair())
     captures = rig.captures(rig.pair(), rig.picture())
     recording = tc.Recording(list(captures), cameras, noise_variance=1e-7)
-    value = tc.reconstruct(recording, tc.Wiener(prior="flat"))
+    value = tc.reconstruct(recording, tc.Wiener(prior="flat", synthesis=separate(2)))
     direct = WienerSynthesis(cameras, synthesis=separate(2), prior="flat")
     np.testing.assert_array_equal(value.image, direct(captures, 1e-7).image)
-    again = tc.Wiener(prior="flat").prepare(cameras)(captures, 1e-7)
+    again = tc.Wiener(prior="flat", synthesis=separate(2)).prepare(cameras)(captures, 1e-7)
     np.testing.assert_array_equal(value.image, again.image)
     assert value.status == "ok" and float(value.pitch) == pytest.approx(rig.OBJECT_PITCH)
     assert value.method == "wiener" and value.reason == "" and value.tau is None
