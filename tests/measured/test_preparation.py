@@ -9,6 +9,7 @@ import pytest
 from thincam_jax.measured import MeasurementError, Preparation, Raw, log_text, prepare
 
 ROWS, COLUMNS = 24, 36
+BLOCKS = Preparation(capture_scale="none", downsample=2)
 
 
 def measured(*channels, bits=12, seed=11, shape=(ROWS, COLUMNS)):
@@ -293,10 +294,43 @@ def blob(shape, pitch):
 @pytest.mark.parametrize(("shape", "pitch"), [((50, 70), 0.5), ((30, 20), 1.25), ((24, 36), 1.0)])
 def test_psf_of_other_pixels_is_brought_to_the_captures(shape, pitch):
     """Half as large or larger pixels, more or fewer of them: the same PSF on the capture's."""
-    expected = blob((ROWS, COLUMNS), 1.0).pixels.astype(float)
     options = Preparation(psf_scale=pitch, corner=(0, 2))
     found = prepare(blob(shape, pitch), Raw(measured(bits=16)), 0, options)
-    assert found.psf.shape == found.capture.shape
+    whole = [max(n, int(k * pitch)) for n, k in zip((ROWS, COLUMNS), shape, strict=True)]
+    assert found.capture.shape == (1, ROWS, COLUMNS) and found.psf.shape == (1, *whole)
+    expected = blob(found.psf.shape[1:], 1.0).pixels.astype(float)
     assert found.log["order"].index("resampling") < found.log["order"].index("downsampling")
     light = unit_sum(expected)
     assert np.abs(found.psf[0] - light).max() < 0.03 * light.max()
+
+
+@pytest.mark.parametrize("downsample", [1, 2])
+def test_psf_larger_than_the_capture_stays_whole(downsample):
+    """A mask of which the sensor holds a seventh: all its open cells are kept, and centred."""
+    mask, at = np.zeros((90, 70), np.uint16), np.array([[2, 45, 80], [3, 30, 66]])
+    for row, column in at.T:
+        mask[row - 1 : row + 2, column - 1 : column + 2] = 4000
+    options = Preparation(psf_scale=0.8, corner=(5, 15), downsample=downsample)
+    found = prepare(Raw(mask), Raw(measured(bits=16)), 0, options)
+    assert found.capture.shape == (1, ROWS // downsample, COLUMNS // downsample)
+    assert found.psf.shape == (1, 72 // downsample, 56 // downsample)
+    y, x = 0.8 * (at - (np.array([[90], [70]]) - 1) / 2)
+    rows, columns = (np.arange(n) - (n - 1) / 2 for n in found.psf.shape[1:])
+    near = np.hypot(rows[:, None, None] * downsample - y, columns[:, None] * downsample - x) < 5
+    light = [found.psf[0][near[..., k]].sum() for k in range(3)]
+    np.testing.assert_allclose(light, 1 / 3, atol=0.03)
+
+
+def test_crop_leaves_the_psf_whole():
+    options = Preparation(crop=((4, 20), (6, 36)), capture_scale="none", downsample=2)
+    psf, capture = Raw(measured(), 12), Raw(measured(seed=12), 12)
+    dead = np.zeros((ROWS, COLUMNS), bool)
+    dead[4:6, 6:8] = True
+    found, whole = (prepare(psf, capture, 0, o, dead=dead) for o in (options, BLOCKS))
+    np.testing.assert_array_equal(found.psf, whole.psf)
+    same = np.where(found.valid, whole.capture[:, 2:10, 3:18], found.capture)
+    np.testing.assert_array_equal(found.capture, same)
+    np.testing.assert_array_equal(found.valid, whole.valid[:, 2:10, 3:18])
+    assert not found.valid[0, 0, 0]
+    with pytest.raises(MeasurementError, match=r"lies outside of the capture of 24×36 pixels"):
+        prepare(psf, capture, 0, Preparation(crop=((0, 25), (0, 36))))

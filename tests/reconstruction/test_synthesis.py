@@ -15,6 +15,7 @@ from thincam_jax.reconstruction import (
     phase_pairs,
     separate,
 )
+from thincam_jax.reconstruction.synthesis import phase_contrasts
 from thincam_jax.units import nm, um
 
 BETA, DISTANCE, WAVELENGTH = 25.0, 6.5, 500 * nm
@@ -173,3 +174,22 @@ def test_contrasts_keep_a_channel_that_pairs_lose():
 def test_a_single_capture_has_no_contrasts():
     with pytest.raises(ValueError, match="contrasts of 1 captures; give at least 2"):
         contrasts(1)
+
+
+def test_only_captures_that_differ_in_phase_are_combined():
+    def rig(phase, beta=25.0):
+        mask = tc.FresnelZoneAperture(beta, phase, width=4.0)
+        return tc.LenslessCamera(mask, SENSOR, DISTANCE)
+
+    two = [rig(0.0), rig(0.0, 20.0), rig(math.pi / 2), rig(math.pi / 2, 20.0)]
+    expected = np.array([[1, 0, -1, 0], [0, 1, 0, -1]]) / math.sqrt(2)
+    np.testing.assert_allclose(np.abs(phase_contrasts(two, WAVELENGTH)), np.abs(expected))
+    np.testing.assert_allclose(phase_contrasts(two, WAVELENGTH).sum(axis=1), 0, atol=1e-15)
+    colours = [400 * nm, 400 * nm, 600 * nm, 400 * nm]
+    np.testing.assert_array_equal(
+        np.abs(phase_contrasts(two, colours)) > 0, [[1, 0, 0, 0], [0, 1, 0, 1], [0, 0, 1, 0]]
+    )
+    same = [rig(0.0), rig(2 * math.pi)]
+    np.testing.assert_array_equal(phase_contrasts(same, WAVELENGTH), np.eye(2))
+    pinhole = tc.LenslessCamera(tc.Pinhole(0.1), SENSOR, DISTANCE)
+    np.testing.assert_array_equal(phase_contrasts([pinhole] * 2, WAVELENGTH), np.eye(2))

@@ -438,3 +438,14 @@ def test_steps_at_the_border_are_counted_as_noise():
     ):
         noise = crop_noise(jnp.asarray(periodogram)[None], SHAPE, sensor)[0]
         np.testing.assert_allclose(noise, expected, rtol=1e-12)
+
+
+def test_phases_of_the_cameras_imply_the_synthesis():
+    """Without one, a constant background is no longer kept by the captures of a quadrature pair."""
+    cameras, image = rig.pair(beta=30.0), rig.picture()
+    recording = tc.Recording(rig.captures(cameras, image), rig.imaging_model(cameras))
+    found, kept = (
+        rig.correlation(tc.reconstruct(recording, solver).image, image)
+        for solver in (tc.Wiener(), tc.Wiener(synthesis=separate(2)))
+    )
+    assert found > 0.97 > kept

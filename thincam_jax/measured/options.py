@@ -38,7 +38,10 @@ class Preparation:
       0. The noise is that of the corner's pixels divided by `downsample`, as for white noise.
     - `psf_scale`: factor that enlarges the PSF about its middle onto the capture's pixels: the
       ratio of the pixel pitches (PSF over capture) of another sensor or binning, or the scale that
-      `thincam_jax.check_psf` finds. The PSF is then cropped or zero-padded to the capture's size.
+      `thincam_jax.check_psf` finds. One that is larger than the capture stays whole: pixels of the
+      field beside the sensor are seen through its outer parts. 1 for pixels of equal size.
+    - `crop`: start and stop of the rows and of the columns of the capture to use, pixels of the
+      demosaiced image, as ((100, 740), (200, 1000)). The PSF stays whole.
     - `centre`: shift the PSF by whole pixels, the same for all channels, so that its "centroid",
       its "peak" or its centre of "symmetry" (half the peak position of its convolution with itself)
       comes to the middle of the array; a single bright pixel comes to n//2. None (the default): no
@@ -62,6 +65,7 @@ class Preparation:
     threshold: float | int | None = None
     noise_threshold: float | int | None = None
     psf_scale: float | int | None = None
+    crop: tuple[tuple[int, int], tuple[int, int]] | None = None
     centre: Centre | None = None
     psf_channels: PsfChannels = "each"
     psf_sum: PsfSum = "each"
@@ -78,11 +82,13 @@ class Preparation:
             raise MeasurementError(
                 f"downsample = {self.downsample!r}: give a whole number of at least 1"
             )
-        start, stop = self.corner
-        if not (_whole(start) and _whole(stop) and 0 <= start < stop):
-            raise MeasurementError(
-                f"corner = {self.corner!r}: give two whole numbers, 0 <= first < last, as (5, 15)"
-            )
+        for name, parts in {"corner": (self.corner,), "crop": self.crop or ()}.items():
+            for start, stop in parts:
+                if not (_whole(start) and _whole(stop) and 0 <= start < stop):
+                    raise MeasurementError(
+                        f"{name} = {getattr(self, name)!r}: give two whole numbers, "
+                        "0 <= first < last, as (5, 15)"
+                    )
         for name, high in _LARGEST.items():
             value = getattr(self, name)
             if value is not None and not 0 < value <= high:
@@ -101,12 +107,12 @@ def check_match(
     options: Preparation,
 ) -> None:
     """Refuse incompatible data; `backgrounds` holds those of "psf" and of "capture"."""
-    sizes = [raw.pixels.shape[:2] for raw in (psf, capture)]
+    sizes = [psf.sensor_shape or psf.pixels.shape[:2], capture.pixels.shape[:2]]
     if sizes[0] != sizes[1] and options.psf_scale is None:
         raise MeasurementError(
-            f"the PSF ({psf.name}) has {_size(psf)} pixels and the capture ({capture.name}) "
-            f"{_size(capture)}; give both from the same part of one sensor, equally binned, or "
-            "with `psf_scale` the ratio of their pixel pitches"
+            f"the PSF ({psf.name}) has {sizes[0][0]}×{sizes[0][1]} pixels and the capture "
+            f"({capture.name}) {_size(capture)}; give both from the same part of one sensor, "
+            "equally binned, or with `psf_scale` the ratio of their pixel pitches"
         )
     if dead is not None and dead.shape != sizes[1]:
         raise MeasurementError(
@@ -130,7 +136,7 @@ def check_match(
             f"the PSF ({psf.name}) has {psf.channels} channels and the capture ({capture.name}) "
             f"{capture.channels}; give as many, or average the PSF's with `psf_channels='mean'`"
         )
-    if options.corner[1] > min(sizes[0]):
+    if options.corner[1] > min(psf.pixels.shape[:2]):
         raise MeasurementError(
             f"corner = {options.corner} lies outside of the PSF of {_size(psf)} pixels; "
             "give a smaller one"

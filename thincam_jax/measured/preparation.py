@@ -19,15 +19,16 @@ Background = Raw | float | int | Literal["corner"]
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """A PSF and a capture, linear, on the same pixels.
+    """A PSF and a capture, linear, on pixels of the same size.
 
-    - `psf`: one channel, or one for each of the capture's; sums to 1 (`psf_sum`).
+    - `psf`: one channel, or one for each of the capture's; sums to 1 (`psf_sum`). It is whole, and
+      so may have more pixels than the capture.
     - `capture`: in fractions of full scale divided by `log["scaling"]["capture_divisor"]`.
     - `valid`: False where the capture is saturated or dead.
     - `log`: record of all steps for a JSON file; `log["order"]` lists them.
     """
 
-    psf: Float32[np.ndarray, "psf_channel y x"]
+    psf: Float32[np.ndarray, "psf_channel k l"]
     capture: Float32[np.ndarray, "channel y x"]
     valid: Bool[np.ndarray, "channel y x"]
     log: dict[str, Any]
@@ -63,7 +64,7 @@ def prepare(
     3. `clipping`: negative values become 0.
     4. `validity`: saturated pixels (before the subtraction) and `dead` ones, True in a map (y, x)
        of the sensor (`read_mask`).
-    5. `demosaicing`, if the options name a Bayer pattern.
+    5. `demosaicing`, if the options name a Bayer pattern; then the capture's `crop`.
     6. `resampling` of the PSF onto the capture's pixels, with `psf_scale`.
     7. `downsampling`: exact means of square blocks; remainders are cropped centrally.
     8. `clean_up` and 9. `centring` of the PSF, 10. `channels`: one PSF for all; each optional.
@@ -112,10 +113,16 @@ def prepare(
         frames = {n: _demosaiced(f, options) for n, f in frames.items()}
     how = options.demosaicing if options.bayer else None
     log["demosaicing"] = {"pattern": options.bayer, "method": how}
+    if options.crop is not None:
+        frames["capture"] = _cropped(frames["capture"], options.crop)
+    shape = frames["capture"].values.shape[-2:]
     if options.psf_scale is not None:
-        shape = frames["capture"].values.shape[-2:]
         frames["psf"] = _resampled(frames["psf"], shape, float(options.psf_scale))
-    log["resampling"] = {"psf_scale": options.psf_scale}
+    log["resampling"] = {
+        "psf_scale": options.psf_scale,
+        "crop": options.crop,
+        "psf_shape": list(frames["psf"].values.shape[1:]),
+    }
     frames = _downsampled(frames, options.downsample, log)
     light = _prepared_psf(_filled(frames["psf"], "PSF"), noise, options, log)
     image = _filled(frames["capture"], "capture")
@@ -190,17 +197,30 @@ def _demosaiced(frame: _Frame, options: Preparation) -> _Frame:
     return _Frame(*(np.moveaxis(plane, -1, 0) for plane in (colours, saturated, has)))
 
 
+def _cropped(frame: _Frame, crop: tuple[tuple[int, int], tuple[int, int]]) -> _Frame:
+    shape = frame.values.shape[1:]
+    if any(stop > n for (_, stop), n in zip(crop, shape, strict=True)):
+        raise MeasurementError(
+            f"crop = {crop} lies outside of the capture of {shape[0]}×{shape[1]} pixels; give a "
+            "smaller one"
+        )
+    parts = [slice(*part) for part in crop]
+    return _Frame(*(plane[:, *parts] for plane in (frame.values, frame.saturated, frame.known)))
+
+
 def _known(known: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     """Map of good pixels; all those of a PSF of another sensor."""
     return np.broadcast_to(known, shape) if known.shape == shape[1:] else np.ones(shape, bool)
 
 
 def _resampled(frame: _Frame, shape: tuple[int, ...], scale: float) -> _Frame:
-    """A PSF enlarged about its middle by cubic splines, cropped or zero-padded to a shape.
+    """A PSF enlarged about its middle by cubic splines, zero-padded to at least a shape.
 
     Before a reduction it is blurred, with half the additional pixel width as σ.
     """
     planes = _filled(frame, "PSF").astype(np.float64)
+    sizes = zip(shape, planes.shape[-2:], strict=True)
+    shape = tuple(max(n, math.floor(k * scale)) for n, k in sizes)
     blur = max(0.0, (1 / scale - 1) / 2)
     middle, other = ((np.array(n[-2:]) - 1) / 2 for n in (planes.shape, shape))
     values = [
@@ -208,7 +228,7 @@ def _resampled(frame: _Frame, shape: tuple[int, ...], scale: float) -> _Frame:
             scipy.ndimage.gaussian_filter(plane, blur, mode="nearest") if blur else plane,
             np.full(2, 1 / scale),
             middle - other / scale,
-            output_shape=tuple(shape),
+            output_shape=shape,
         )
         for plane in planes
     ]
@@ -218,25 +238,26 @@ def _resampled(frame: _Frame, shape: tuple[int, ...], scale: float) -> _Frame:
 
 def _downsampled(frames: dict[str, _Frame], factor: int, log: dict[str, Any]) -> dict[str, _Frame]:
     """Block means, which one pixel of that size would have measured."""
-    shape = frames["psf"].values.shape[1:]
+    shape = frames["capture"].values.shape[1:]
     if factor > min(shape):
         raise MeasurementError(
             f"downsample = {factor} is larger than the image of {shape[0]}×{shape[1]} pixels"
         )
     kept = central_blocks(shape, factor)
     if factor > 1:
-        frames = {name: _means(frame, kept, factor) for name, frame in frames.items()}
+        frames = {name: _means(frame, factor) for name, frame in frames.items()}
     log["downsampling"] = {
         "factor": factor,
         "first_pixel": [part.start for part in kept],
         "cropped_to": [part.stop - part.start for part in kept],
-        "shape": list(frames["psf"].values.shape[1:]),
+        "shape": list(frames["capture"].values.shape[1:]),
     }
     return frames
 
 
-def _means(frame: _Frame, kept: tuple[slice, slice], factor: int) -> _Frame:
+def _means(frame: _Frame, factor: int) -> _Frame:
     """Means of the known pixels of each block, summed in float64; 0 where none is known."""
+    kept = central_blocks(frame.values.shape[1:], factor)
     values, saturated, known = (
         plane[:, *kept] for plane in (frame.values, frame.saturated, frame.known)
     )

@@ -25,6 +25,7 @@ class Raw:
       10, 12 and 14 bit cameras fill the low bits of 16: give `bits`, or full scale is 16 bit.
     - `format`: "tiff", "png", "npy", or "array".
     - `name`: in messages; the path of the file.
+    - `sensor_shape`: of a PSF that was computed also beyond the sensor, that of the sensor.
 
     **Errors**: MeasurementError for another shape or type, an empty image, values that are not
     finite, and values above 2^bits − 1. Signed integers are refused, but not negative floats, from
@@ -35,6 +36,7 @@ class Raw:
     bits: int | None = None
     format: str = "array"
     name: str = "the array"
+    sensor_shape: tuple[int, int] | None = None
 
     def __post_init__(self):
         pixels = np.asarray(self.pixels)

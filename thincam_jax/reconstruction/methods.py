@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float
 
 from thincam_jax._core import checks
 from thincam_jax._core.quantity import quantity, whole
+from thincam_jax.imaging.operators import LowRank
 from thincam_jax.imaging.operators.crop_convolution import CropConvolution, cut, place
 from thincam_jax.reconstruction.choose_tau import SearchInterrupted, find_tau
 from thincam_jax.reconstruction.fringe_filter import FringeScanning
@@ -121,12 +122,16 @@ def reconstruct(
 def choose_solver(
     recording: Recording, synthesis: Synthesis | None = None
 ) -> tuple[AbstractSolver, str]:
-    """Choose `Wiener` or `AdmmTV`, and give the reason in a sentence.
+    """Choose `Wiener`, `AdmmTV` or `Fista`, and give the reason in a sentence.
 
-    The fast filter is chosen where it is as good, see `filter_suffices`.
+    The fast filter is chosen where it is as good, see `filter_suffices`; `Fista` for `LowRank`
+    operators, of which each iteration of ADMM takes some 80 applications.
 
     - `synthesis`: sums of captures for the solver; see `AdmmTV`.
     """
+    operators = getattr(recording.imaging_model, "operators", ())
+    if synthesis is None and any(isinstance(one, LowRank) for one in operators):
+        return Fista(), "a sum of many convolutions is applied once an iteration, ADMM solves it"
     suffices, reason = filter_suffices(recording, synthesis)
     return (Wiener if suffices else AdmmTV)(synthesis=synthesis), reason
 

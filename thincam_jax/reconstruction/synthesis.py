@@ -10,13 +10,16 @@ import operator
 from collections.abc import Sequence
 from typing import Any
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy
 from jaxtyping import Array
 
-from thincam_jax._core.checks import Numbers
+from thincam_jax._core.checks import Numbers, is_traced
 from thincam_jax.lensless.camera import LenslessCamera
+from thincam_jax.lensless.masks.fza import FresnelZoneAperture
 from thincam_jax.reconstruction.imaging_model import register
 
 
@@ -72,6 +75,29 @@ def contrasts(count: int) -> np.ndarray:
     if count < 2:
         raise ValueError(f"contrasts of {count} captures; give at least 2")
     return scipy.linalg.helmert(count)
+
+
+def phase_contrasts(cameras: Sequence[LenslessCamera], wavelength: Any) -> np.ndarray:
+    """`contrasts` of each group of captures that differ in the phase of their zone aperture only.
+
+    The others, and those whose phases are equal or traced, stay channels of their own.
+    """
+    wavelengths = [wavelength] * len(cameras) if np.ndim(wavelength) == 0 else wavelength
+    groups: dict[Any, list[int]] = {}
+    turns = np.ones(len(cameras), complex)
+    for number, (camera, light) in enumerate(zip(cameras, wavelengths, strict=True)):
+        mask, key = camera.mask, (number,)
+        if isinstance(mask, FresnelZoneAperture) and not is_traced(mask.phase):
+            alike = eqx.tree_at(lambda m: m.phase, mask, 0.0), camera.sensor, camera.distance, light
+            turns[number] = np.exp(1j * float(mask.phase))
+            leaves, structure = jax.tree.flatten(alike)
+            key = structure, *(id(n) if is_traced(n) else np.asarray(n).tobytes() for n in leaves)
+        groups.setdefault(key, []).append(number)
+    rows = []
+    for group in groups.values():
+        differ = np.abs(turns[group] - turns[group[0]]).max() > 1e-6
+        rows.append((contrasts if differ else separate)(len(group)) @ np.eye(len(cameras))[group])
+    return np.concatenate(rows)
 
 
 def keep_bias(synthesis: np.ndarray) -> np.ndarray:

@@ -33,7 +33,7 @@ from thincam_jax.reconstruction.imaging_model import (
 from thincam_jax.reconstruction.noise import estimate_variance, given_variances
 from thincam_jax.reconstruction.recording import Reconstruction, Recording
 from thincam_jax.reconstruction.solver import AbstractSolver, Synthesis, as_synthesis
-from thincam_jax.reconstruction.synthesis import keep_bias, synthesis_matrix
+from thincam_jax.reconstruction.synthesis import keep_bias, phase_contrasts, synthesis_matrix
 
 Prior = Literal["inverse_square", "flat"]
 
@@ -71,7 +71,9 @@ class WienerSynthesis(eqx.Module):
       `field_shape` is that of the result, at the object pitch p·t/d. The scene is taken as black
       outside.
     - `synthesis`: real matrix (channel × capture); a channel combines captures at one distance, and
-      channels must not share noise (rows orthogonal). Default: every capture a channel.
+      channels must not share noise (rows orthogonal). Default: the `contrasts` of captures that
+      differ in the phase of their mask only, so that their background cancels; every other capture
+      is a channel (`phase_contrasts`).
     - `prior`: "inverse_square", η_f ∝ 1/(ρ² + ρ₀²) with ρ₀ one cycle per field, or "flat".
     """
 
@@ -97,6 +99,8 @@ class WienerSynthesis(eqx.Module):
         cameras.require("wavelength", "object_distance")
         each = cameras.cameras
         capture_ratios = distance_ratios(each)
+        if synthesis is None:
+            synthesis = phase_contrasts(each, cameras.wavelength)
         matrix = synthesis_matrix(synthesis, each, capture_ratios)
         sensor = each[0].sensor.grid
         self.sensor_shape = sensor.shape
@@ -191,7 +195,8 @@ class WienerSynthesis(eqx.Module):
 class Wiener(AbstractSolver):
     """The Wiener synthesis of all captures, in closed form; see `WienerSynthesis`.
 
-    It needs `Cameras`. The noise is estimated if the recording has no variance. To reconstruct many
+    It needs `Cameras`. Captures at several phases of one zone aperture are combined so that their
+    background cancels. The noise is estimated if the recording has no variance. To reconstruct many
     scenes with the same cameras call `prepare(cameras)` once, and its result on each.
 
     - `synthesis`, `prior`: as of `WienerSynthesis`.

@@ -81,8 +81,9 @@ def prepared_recording(prepared: Prepared, noise: PixelNoise | None = None) -> R
 
 
 def _field(prepared: Prepared) -> tuple[int, int]:
-    *_, rows, columns = prepared.capture.shape  # those of the PSF as well
-    return 2 * rows - 1, 2 * columns - 1
+    sizes = zip(prepared.capture.shape[-2:], prepared.psf.shape[-2:], strict=True)
+    rows, columns = (n + k - 1 for n, k in sizes)
+    return rows, columns
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,7 +152,7 @@ def reconstruct_prepared(
     """
     channels, *sensor = prepared.capture.shape
     sensor, field = (sensor[0], sensor[1]), _field(prepared)
-    window = window_shape(sensor, field, sensor)
+    window = window_shape(sensor, field, prepared.psf.shape[-2:])
     refuse_if_too_large(
         f"{name}: its reconstruction on {window[0]}×{window[1]} samples",
         4 * _WINDOWS * channels * window[0] * window[1],

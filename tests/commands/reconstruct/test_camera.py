@@ -6,8 +6,10 @@ from commands.reconstruct import simulated
 from commands.reconstruct.test_command import one_line, record_of, runner
 from commands.study import tiny
 
+import thincam_jax as tc
 from helpers import ROOT, relative_l2
 from thincam_jax.commands import cli
+from thincam_jax.commands.reconstruct.options import computed_psf, read_camera
 from thincam_jax.studies import take
 
 
@@ -57,3 +59,22 @@ def test_what_does_not_go_together(files):
     typed = ("reconstruct", *given, "--camera", files["study"])
     result = runner.invoke(cli.app, [str(part) for part in typed])
     assert "a computed PSF has no dark corner; give --background" in one_line(result)
+
+
+def test_psf_of_a_mask_larger_than_the_sensor_is_whole(files):
+    wide = ("mask.width=5mm", "--set", "object.distance=40mm")
+    cameras = read_camera(files["study"], wide[::2], None)
+    found = computed_psf(files["study"], cameras)
+    (camera,) = cameras.cameras
+    grid = camera.sensor.grid.with_shape((200, 200))
+    how = {"wavelength": cameras.wavelength, "object_distance": 40.0, "pixel_integration": False}
+    whole = np.asarray(tc.psf(camera, grid=grid, model="geometric", **how))
+    rows, columns = ((200 - n) // 2 for n in found.pixels.shape)
+    np.testing.assert_allclose(found.pixels, whole[rows : 200 - rows, columns : 200 - columns])
+    np.testing.assert_allclose(found.pixels.sum(), whole.sum())
+    assert found.sensor_shape == (48, 64) and min(found.pixels.shape) > 64
+    out = files["study"].with_name("image.npy")
+    result = reconstruct(files, "--camera", files["study"], "--set", *wide)
+    assert result.exit_code == 0, result.output
+    assert np.load(out).shape == (48, 64)
+    assert record_of(out)["preparation"]["resampling"]["psf_shape"] == list(found.pixels.shape)

@@ -474,3 +474,14 @@ def test_advice_on_channels_is_in_options_and_can_be_followed(grey, tmp_path):
 
 def test_check_of_files_too_small_is_one_line(grey):
     assert "give at least 32 a side" in one_line(check(grey, "--downsample", 2))
+
+
+def test_crop_of_the_captures_with_the_whole_psf(grey, tmp_path):
+    out = tmp_path / "image.npy"
+    more = ("--background", grey["dark"], "--bits", 12, "--method", "ridge")
+    result = call(grey, out, "--crop", "8:49,5:70", *more)
+    assert result.exit_code == 0, result.output
+    assert record_of(out)["preparation"]["options"]["crop"] == [[8, 49], [5, 70]]
+    assert simulated.correlation(np.load(out), simulated.scene()[1, 8:49, 5:70]) > 0.9
+    line = one_line(call(grey, out, "--crop", "8:49", *more))
+    assert line.startswith("--crop 8:49: give the first row and the one after the last")

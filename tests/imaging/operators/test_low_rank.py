@@ -52,6 +52,39 @@ def test_direct_sum():
     assert errors[2] < 1e-3 < errors[0]
 
 
+def test_measured_positions():
+    """A grid that ends before the corners: exact between its points, constant beyond."""
+    rows, columns = np.array([2.0, 8.0, 14.5]), np.array([3.0, 10.0, 12.0, 19.0])
+    places = (2 * rows / (FIELD[0] - 1) - 1, 2 * columns / (FIELD[1] - 1) - 1)
+    psfs = np.array([[psf(y, x) for x in places[1]] for y in places[0]])
+    found = low_rank_psf(
+        psfs, PITCH, SENSOR, FIELD, tolerance=1e-6, positions=(rows, columns)
+    ).operator
+
+    def seen(row, column):
+        return np.asarray(found(jnp.zeros(FIELD).at[row, column].set(1.0)))
+
+    for point, (row, column) in (((1, 1), (8, 10)), ((0, 3), (0, 21)), ((1, 2), (8, 12))):
+        whole = np.zeros((FIELD[0] + KERNEL[0] - 1, FIELD[1] + KERNEL[1] - 1))
+        whole[row : row + KERNEL[0], column : column + KERNEL[1]] = PITCH**2 * psfs[point]
+        top, left = ((w - s) // 2 for w, s in zip(whole.shape, SENSOR, strict=True))
+        whole = whole[top:, left:][: SENSOR[0], : SENSOR[1]]
+        np.testing.assert_allclose(seen(row, column), whole, atol=1e-9)
+    with pytest.raises(ValueError, match="give 3 rows and 4 columns of the field, increasing"):
+        low_rank_psf(psfs, PITCH, SENSOR, FIELD, tolerance=0.1, positions=(columns, rows))
+
+
+def test_even_psfs_are_centred_on_their_middle_pixel():
+    psfs = grid((5, 5))
+    shorter = psfs[..., :-1, :-1].copy()
+    psfs[..., -1, :] = psfs[..., :, -1] = 0
+    odd, even = (
+        low_rank_psf(p, PITCH, SENSOR, FIELD, tolerance=0.01).operator for p in (psfs, shorter)
+    )
+    image = jax.random.uniform(jax.random.key(5), FIELD)
+    np.testing.assert_allclose(even(image), odd(image), atol=1e-12)
+
+
 def test_adjoint_and_batches():
     operator = low_rank_psf(grid((5, 7)), PITCH, SENSOR, FIELD, tolerance=0.03).operator
     assert adjoint_error(operator, jax.random.key(3)) < 1e-14

@@ -192,6 +192,17 @@ def test_a_fringe_scanned_picture():
 
 
 @pytest.mark.thorough
+def test_phases_in_reverse_order_are_named_and_fitted():
+    image = synthesised({-phase: weight for phase, weight in FRINGE_SCANNED.items()})
+    fit = fit_psf(image, START, **LIGHT)
+    assert fit.status == "ok"
+    (reason,) = fit.reasons
+    assert "the phases run backwards" in reason
+    np.testing.assert_allclose(fit.camera.mask.beta, 30.0, rtol=1e-4)
+    assert np.all(np.abs(deviations(fit, TRUE)) < 4.5)
+
+
+@pytest.mark.thorough
 @pytest.mark.parametrize("weights", [{0.0: 1.0, 4.712389: -1.0}, {0.0: 1.0, 1.5707963: -1j}])
 def test_two_phases(weights):
     """Their difference, which is real; and in quadrature, which keeps the background."""

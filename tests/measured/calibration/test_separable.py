@@ -5,6 +5,7 @@ import functools
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.ndimage
 
 from helpers import relative_l2
 from thincam_jax.imaging.operators import Separable, centred
@@ -137,3 +138,81 @@ def test_bad_input():
         fit_separable(images, camera()(images), camera())
     with pytest.raises(ValueError, match=r"the camera takes \(j, 8, 16\)"):
         fit_separable(images, images, camera())
+
+
+def blind(scale, offset, blur, shading):
+    """Shadows of one code, `scale` pixels apart: Toeplitz for a scale of 1 without shading."""
+    parts = []
+    for number, (size, scene) in enumerate(zip(SENSOR, FIELD, strict=True)):
+        code = np.repeat(np.random.default_rng(number).choice([-1.0, 1.0], 60), 4)
+        code = scipy.ndimage.gaussian_filter1d(code, blur)
+        y, m = ((np.arange(n) - (n - 1) / 2)[:, None] for n in (size, scene))
+        places = 2 * (scale * (y + m.T) + offset) + 120
+        shadow = scipy.ndimage.map_coordinates(code, [places], order=1)
+        shadow *= 1 - shading * ((2 * y / size) ** 2 + (2 * m.T / scene) ** 2) / 2
+        parts.append(shadow[None] / size**0.5)
+    return Separable(*parts)
+
+
+def scenes(kind, count, seed=1):
+    images = np.random.default_rng(seed).uniform(size=(count, *FIELD))
+    if kind == "smooth":  # hardly any fine detail, as in photographs
+        images = scipy.ndimage.gaussian_filter(images, (0, 1.5, 1.5))
+        images = (images - images.min()) / np.ptp(images)
+    return images
+
+
+def correlation_of_a_scene(operator, truth, glare):
+    """Of a scene that no fit has seen, reconstructed by the best of some ridges."""
+    image = scenes("smooth", 1, seed=8)[0]
+    seen = lit(truth, image[None], glare, 50.0, seed=9)[0].ravel()
+    left, right = (np.asarray(part[0]) for part in (operator.left, operator.right))
+    matrix = np.kron(left, right)
+    gram, size = matrix.T @ matrix, np.trace(matrix.T @ matrix) / image.size
+    found = [
+        np.linalg.solve(gram + ridge * size * np.eye(len(gram)), matrix.T @ seen)
+        for ridge in 10.0 ** -np.arange(6)
+    ]
+    return max(np.corrcoef(f, image.ravel())[0, 1] for f in found)
+
+
+def lit(truth, images, glare, snr_db, seed=3):
+    """Captures with glare, which no P and Q make, and noise."""
+    seen = np.asarray(truth(jnp.asarray(images)))
+    seen = seen + glare * scipy.ndimage.gaussian_filter(np.abs(seen), (0, 4, 4))
+    noise = np.std(seen) * 10 ** (-snr_db / 20)
+    return seen + noise * np.random.default_rng(seed).normal(size=seen.shape)
+
+
+FAR, NEAR = (1.0, 0.0, 1.0, 0.0), (1.009, 0.3, 2.8, 0.25)
+
+
+@pytest.mark.parametrize(
+    ("kind", "count", "start", "glare", "gain"),
+    [
+        ("random", 8, FAR, 0.0, 0.1),
+        ("smooth", 8, FAR, 0.0, 0.0),
+        ("random", 8, NEAR, 0.2, -1e-3),
+        ("smooth", 8, NEAR, 0.2, -1e-3),
+    ],
+)
+def test_a_fit_is_never_worse_than_its_start(kind, count, start, glare, gain):
+    """The correlation of another scene grows from a bad start; glare does not spoil a good one."""
+    truth, start = blind(1.01, 0.4, 3.0, 0.3), blind(*start)
+    images = scenes(kind, count)
+    captures = lit(truth, images, glare, 40.0)
+    found = fit_separable(jnp.asarray(images), jnp.asarray(captures), start, iterations=50)
+    before, after = (correlation_of_a_scene(o, truth, glare) for o in (start, found.operator))
+    assert after >= before + gain
+
+
+def test_single_precision_ends_in_numbers():
+    """Nearly uniform images make the equations singular in float32, not in double."""
+    rng = np.random.default_rng(5)
+    truth = Separable(*(rng.uniform(size=(1, n, 256)) for n in (20, 24)))
+    images = 1 + 1e-4 * rng.uniform(size=(4, 256, 256))
+    captures = np.asarray(truth(jnp.asarray(images)))
+    images, captures = (jnp.asarray(a, jnp.float32) for a in (images, captures))
+    found = fit_separable(images, captures, truth, iterations=5)
+    assert found.operator.left.dtype == jnp.float32
+    assert bool(jnp.isfinite(found.operator.left).all() & jnp.isfinite(found.operator.right).all())

@@ -30,6 +30,10 @@ PsfScale = Annotated[
 PsfChannels = Annotated[
     Literal["each", "mean"], Option(help="each: a PSF for each colour; mean: one for all.")
 ]
+Crop = Annotated[
+    str | None,
+    Option(help="Rows and columns of the captures to use, as 100:740,200:1000. The PSF is whole."),
+]
 Bayer = Annotated[
     Literal["RGGB", "BGGR", "GRBG", "GBRG"] | None,
     Option(help="Colours of the mosaic, from its upper left."),
@@ -66,6 +70,7 @@ def reconstruct(
     psf_bits: PsfBits = None,
     corner: Corner = "5:15",
     psf_scale: PsfScale = None,
+    crop: Crop = None,
     bayer: Bayer = None,
     demosaic: Annotated[
         Literal["bilinear", "superpixel"],
@@ -139,6 +144,7 @@ def reconstruct(
                     downsample=downsample,
                     corner=options.read_corner(corner),
                     psf_scale=psf_scale,
+                    crop=options.read_crop(crop),
                     saturation=saturation,
                     noise_threshold=noise_threshold,
                     psf_channels=psf_channels,
@@ -179,6 +185,7 @@ def check(
     psf_bits: PsfBits = None,
     corner: Corner = "5:15",
     psf_scale: PsfScale = None,
+    crop: Crop = None,
     bayer: Bayer = None,
     dead: Dead = None,
     psf_channels: PsfChannels = "each",
@@ -208,11 +215,12 @@ def check(
                     downsample=1 if downsample is None else downsample,
                     corner=options.read_corner(corner),
                     psf_scale=psf_scale,
+                    crop=options.read_crop(crop),
                     psf_channels=psf_channels,
                 ),
                 psf_bits,
             )
-            sources = enough_blocks(sources) if downsample is None else sources
+            sources = enough_blocks(sources, capture) if downsample is None else sources
             with progress_bar() as bar:
                 task = bar.add_task("PSFs", total=None)
                 lines, fits = check_files(

@@ -1,5 +1,6 @@
 """Options of a reconstruction: its files, its camera, its method, and what it writes."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,6 +10,7 @@ import equinox as eqx
 import numpy as np
 
 from thincam_jax._core import checks
+from thincam_jax._core.grids import same_parity
 from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.kinds import KINDS, load_experiment, load_study, read_kind
 from thincam_jax.commands.study.build import assemble, check_optics
@@ -273,6 +275,20 @@ def read_corner(text: str) -> tuple[int, int]:
     return first, last
 
 
+def read_crop(text: str | None) -> tuple[tuple[int, int], tuple[int, int]] | None:
+    """The rows and the columns of the captures to use, from "100:740,200:1000"."""
+    if text is None:
+        return None
+    try:
+        rows, columns = text.split(",")
+        return read_corner(rows), read_corner(columns)
+    except (ValueError, MeasurementError):
+        raise MeasurementError(
+            f"--crop {text}: give the first row and the one after the last, and the columns, as "
+            "100:740,200:1000"
+        ) from None
+
+
 def read_white_balance(text: str | None) -> WhiteBalance:
     """The gains of the colours, or how to find them.
 
@@ -322,14 +338,18 @@ def read_camera(config: Path, overrides: Sequence[str], distance: float | None) 
 
 
 def computed_psf(config: Path, cameras: Cameras) -> Raw:
-    """The PSF of the camera of a file."""
+    """The PSF of the camera of a file, also beyond the sensor where the mask's shadow is larger."""
     (camera,), wavelength, distance = cameras.cameras, cameras.wavelength, cameras.object_distance
     how = {"model": cameras.model, "pixel_integration": cameras.pixel_integration}
-    image = psf(camera, wavelength=wavelength, object_distance=distance, **how)
+    grid, fringe = camera.sensor.grid, 2 * math.sqrt(wavelength * float(camera.distance))
+    shadow = np.asarray(camera.mask.extent) * (1 + float(camera.distance) / distance) + fringe
+    pixels = np.ceil(shadow / float(grid.pitch)).astype(int)
+    grid = grid.with_shape(same_parity(np.maximum(pixels, grid.shape).tolist(), grid.shape))
+    image = psf(camera, wavelength=wavelength, object_distance=distance, grid=grid, **how)
     numbers = eqx.tree_pformat(camera, width=10_000)  # in one line
     light = f"wavelength {wavelength * 1e6:g} nm, object at {distance:g} mm"
     name = f"camera of {config}: {numbers}, {light}"
-    return Raw(np.asarray(image), name=name)
+    return Raw(np.asarray(image), name=name, sensor_shape=camera.sensor.shape)
 
 
 def read_network(path: Path, cameras: Cameras) -> Focusing:

@@ -360,10 +360,11 @@ def check_files(
     return [f"{sources.psf} with {capture} at {size}:", str(found)], found.fits
 
 
-def enough_blocks(sources: Sources) -> Sources:
+def enough_blocks(sources: Sources, capture: Path) -> Sources:
     """The sources with a `downsample` that leaves about 160 pixels of the longer side."""
     halved = sources.preparation.demosaicing == "superpixel" and sources.preparation.bayer
-    pixels = max(Rig(sources).psfs[0].pixels.shape[:2]) // (2 if halved else 1)
+    pixels = max(measured.read_image(capture, sources.bits).pixels.shape[:2])
+    pixels = pixels // (2 if halved else 1)
     preparation = replace(sources.preparation, downsample=max(1, round(pixels / _SIDE)))
     return replace(sources, preparation=preparation)
 

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Number, Numbers, Shape
 from thincam_jax.imaging.operators.base import AbstractOperator, real_numbers, require_shape
-from thincam_jax.imaging.operators.crop_convolution import CropConvolution
+from thincam_jax.imaging.operators.crop_convolution import CropConvolution, kernel_shape
 
 
 class LowRank(AbstractOperator):
@@ -58,21 +58,31 @@ class LowRankFit(eqx.Module):
 
 
 def low_rank_psf(
-    psfs: Numbers, pitch: Number, sensor_shape: Shape, field_shape: Shape, *, tolerance: float
+    psfs: Numbers,
+    pitch: Number,
+    sensor_shape: Shape,
+    field_shape: Shape,
+    *,
+    tolerance: float,
+    positions: tuple[Numbers, Numbers] | None = None,
 ) -> LowRankFit:
     """The sum of fewest convolutions whose PSFs are within a tolerance of a measured grid of them.
 
     **Arguments**
 
-    - `psfs`: (grid y, grid x, k, l): PSFs of points spread evenly from the field's first row and
-      column to its last, each centred on the field sample's position on the sensor.
-    - `pitch`, `sensor_shape`, `field_shape`: as `CropConvolution` takes them; k and l too.
+    - `psfs`: (grid y, grid x, k, l): PSFs of a grid of points, each centred on the field sample's
+      position on the sensor: its pixel k//2, l//2.
+    - `pitch`, `sensor_shape`, `field_shape`: as `CropConvolution` takes them. Where k or l does not
+      fit them, a row or column of zeros is appended.
     - `tolerance`: of the truncation, relative L2 over the whole grid.
+    - `positions`: rows and columns of the field that the points lie on, increasing, also between
+      its samples; by default spread evenly from the field's first to its last. Beyond the
+      outermost points their PSFs are kept.
 
     The p_r are the singular vectors of the PSFs; their weights are interpolated linearly.
 
-    **Errors**: ValueError for a grid of fewer than 2×2 points, PSFs that are all zero, and a
-    tolerance that is not between 0 and 1.
+    **Errors**: ValueError for a grid of fewer than 2×2 points, PSFs that are all zero, positions
+    that are not increasing, and a tolerance that is not between 0 and 1.
     """
     grid = real_numbers("psfs", psfs)
     field_shape = checks.shape2d("field_shape", field_shape)
@@ -83,7 +93,11 @@ def low_rank_psf(
         raise ValueError(
             f"psfs has shape {grid.shape}; give (grid y, grid x, k, l) with at least 2×2 points"
         )
-    points, size = grid.shape[:2], grid.shape[2:]
+    points, sensor_shape = grid.shape[:2], checks.shape2d("sensor_shape", sensor_shape)
+    places = _places(positions, points, field_shape)
+    sizes = zip(grid.shape[2:], kernel_shape(sensor_shape, field_shape), strict=True)
+    grid = jnp.pad(grid, ((0, 0), (0, 0), *((0, (k - n) % 2) for k, n in sizes)))
+    size = grid.shape[2:]
     flat = np.asarray(grid, float).reshape(points[0] * points[1], -1)
     left, values, right = np.linalg.svd(flat, full_matrices=False)
     whole = np.linalg.norm(values)
@@ -93,11 +107,10 @@ def low_rank_psf(
     tails = np.sqrt(np.append(np.cumsum(values[::-1] ** 2)[::-1], 0)) / whole
     rank = max(1, int(np.argmax(tails <= tolerance)))
     maps = (left[:, :rank] * values[:rank]).reshape(*points, rank)
-    weights = _interpolated(maps, field_shape)
-    coarse = [slice(None, None, 2)] * 2
+    weights = _interpolated(maps, places, [np.arange(n) for n in field_shape])
     estimate = np.inf
     if all(n >= 3 and n % 2 for n in points):
-        between = _interpolated(maps[tuple(coarse)], points)
+        between = _interpolated(maps[::2, ::2], [p[::2] for p in places], places)
         # The p_r are orthonormal, so that lengths of weights are those of PSFs.
         estimate = float(np.linalg.norm(between - np.moveaxis(maps, -1, 0))) / whole / 4
     dtype = grid.dtype
@@ -107,9 +120,25 @@ def low_rank_psf(
     return LowRankFit(operator, float(tails[rank]), float(estimate))
 
 
-def _interpolated(maps, shape) -> np.ndarray:
-    """(grid y, grid x, r) on (r, *shape), from corner to corner."""
-    axes = [np.linspace(0, 1, n) for n in maps.shape[:2]]
-    y, x = np.meshgrid(*(np.linspace(0, 1, n) for n in shape), indexing="ij")
-    found = scipy.interpolate.RegularGridInterpolator(axes, maps)(np.stack([y, x], axis=-1))
+def _places(positions, points, field_shape) -> list[np.ndarray]:
+    """Rows and columns of the grid's points on the field."""
+    if positions is None:
+        pairs = zip(field_shape, points, strict=True)
+        return [np.linspace(0, n - 1, count) for n, count in pairs]
+    places = [np.asarray(real_numbers("positions", p), float) for p in positions]
+    if [p.shape for p in places] != [(n,) for n in points] or any(
+        not (np.diff(p) > 0).all() for p in places
+    ):
+        raise ValueError(
+            f"positions have shapes {[p.shape for p in places]}; give {points[0]} rows and "
+            f"{points[1]} columns of the field, increasing"
+        )
+    return places
+
+
+def _interpolated(maps, places, to) -> np.ndarray:
+    """Maps (grid y, grid x, r) at `places`, on the rows and columns `to`: (r, rows, columns)."""
+    inside = [np.clip(t, p[0], p[-1]) for t, p in zip(to, places, strict=True)]
+    y, x = np.meshgrid(*inside, indexing="ij")
+    found = scipy.interpolate.RegularGridInterpolator(places, maps)(np.stack([y, x], axis=-1))
     return np.moveaxis(found, -1, 0)

@@ -48,6 +48,7 @@ Weights = Mapping[float, complex | float | int]
 FRINGE_SCANNED = {0.0: 1j, math.pi / 2: -1.0, math.pi: -1j, 3 * math.pi / 2: 1.0}
 # Part of the image's contrast that a fit must explain; less is another picture, or another turn.
 _EXPLAINED = 0.5
+_BACKWARDS = "the phases run backwards: fitted with the negative of each; correct their order"
 # What has a relative error, and those up to which it is known. The parts of an image whose residual
 # is noise agree within a third of what noise explains; a blur or a shading brings a few times that,
 # and moves d by several of its errors.
@@ -147,7 +148,8 @@ def fit_psf(
     - `weights`: of a picture that is a sum Σ w_k g_k of captures at several phases: each phase φ_k
       (rad, on top of the mask's) and its w_k. A complex picture without is fringe-scanned as the
       thesis does, (g(3π/2) − g(π/2)) + j(g(0) − g(π)): `FRINGE_SCANNED`. Where the weights add up
-      to 0 there is no background left, and none is fitted.
+      to 0 there is no background left, and none is fitted. Where the picture is explained only by
+      the negative phases, these are fitted and `reasons` says that the phases run backwards.
     - `camera`: with a `FresnelZoneAperture`; its numbers are the start.
     - `object_distance`: t, mm, from the mask, or infinity; `wavelength`: λ, mm.
     - `search`: the numbers to fit, and how far from the camera's.
@@ -170,10 +172,17 @@ def fit_psf(
         check_fringes(guess)
         start = start_near(image, guess, search)
         names, average = unknown_names(search.parameters), search.pixel_integration
+        backwards = ""
+        if double[1] is not None and _explained(image, start, average) < _EXPLAINED:
+            turned = eqx.tree_at(lambda state: state.synthesis.phases, guess, -double[1].phases)
+            other = start_near(image, turned, search)
+            if _explained(image, other, average) >= _EXPLAINED:
+                start, guess, backwards = other, turned, _BACKWARDS
         problem = _problem(image, start, names, average)
         known, _ = covariance_by_differences(full_image(image, start, average), start, names)
         solution = solve(problem, known.standard_errors, search.max_steps)
-        return _report(problem, solution, guess, search, precision_of(camera.distance))
+        fit = _report(problem, solution, guess, search, precision_of(camera.distance))
+    return replace(fit, reasons=(backwards, *fit.reasons)) if backwards else fit
 
 
 def _check_weights(image, weights: Weights | None) -> Synthesis | None:
@@ -212,6 +221,13 @@ def _check_image(image, camera: LenslessCamera, synthesis: Synthesis | None) -> 
     parts = (np.real(image), np.imag(image))[: 1 + np.iscomplexobj(image)]
     seen = [image_with_contrast("psf_image", p, camera.sensor.shape, "the sensor") for p in parts]
     return seen[0] if synthesis is None else np.stack(seen)
+
+
+def _explained(image: np.ndarray, state: FitState, pixel_integration: bool) -> float:
+    """Part of the image's contrast that a state explains."""
+    measured = full_image(image, state, pixel_integration)
+    model = measured.model(state, ("phase",), np.zeros(1)).reshape(image.shape)
+    return 1 - float(np.sum((model - image) ** 2) / np.sum((image - image.mean()) ** 2))
 
 
 def _problem(image, start: FitState, names, pixel_integration: bool) -> FitProblem:
