@@ -255,6 +255,7 @@ def has_fused_multiply_add() -> bool:
     return bool(residue(factor, factor * factor))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("extreme", "dtype"), [case(find(name)) for name in GRADIENTS])
 def test_gradient_in_single_precision(extreme, dtype):
     """Within the stated bounds; where they say that it is lost, it is.
@@ -380,6 +381,7 @@ def error_in_single(name: str) -> float:
     return relative_l2(h[:: extreme.every], expected(extreme, np.float64))
 
 
+@pytest.mark.thorough
 @choices
 def test_predicted_error(name):
     """Above the true error of float32 and below ten times that; measured 1.25 to 1.4 times."""

@@ -45,6 +45,9 @@ def test_schema_takes_it_and_no_number_without_its_unit(path):
     assert not validator.is_valid(raw | {"colour": 1})
 
 
+DESIGNS = ("design_both", "design_distances", "design_light", "design_pareto", "design_slm")
+
+
 def but(*slow):
     """Every file; those that take more than 5 s are thorough."""
     marks = {name: [pytest.mark.thorough] for name in slow}
@@ -52,7 +55,7 @@ def but(*slow):
     return pytest.mark.parametrize("path", files, ids=lambda path: path.stem)
 
 
-@but("design_both", "design_distances", "design_slm", "flatcam", "learned_refocus")
+@but(*DESIGNS, "flatcam", "learned_refocus")
 def test_dry_run(path, tmp_path):
     out, options = tmp_path / "out", []
     if path.stem == "denoiser":  # photographs that are not shipped

@@ -68,6 +68,7 @@ def test_refusals(key):
         retrieve_phase(0 * flat, GRID, PATH, shape=(40, 48), key=key)
 
 
+@pytest.mark.thorough
 def test_the_mask_of_contours_concentrates_light_on_them():
     blank = tc.MaskBlank((48, 48), 10 * um, 1.52)
     mask = contour_mask(3, blank, PATH, feature=80 * um, line_width=20 * um)

@@ -106,6 +106,7 @@ def test_the_entry_point_takes_a_rule(rule):
     assert errors[0] < 0.8 * errors[1]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("rule", quick(["discrepancy", "sure"], 0))
 def test_a_wrong_psf_is_reported_and_does_not_lower_tau(rule):
     """No τ makes the residual as small as the noise: both fell to the border of 0.02."""

@@ -133,6 +133,7 @@ def test_a_state_stands_for_its_image(kind):
         np.testing.assert_allclose(back, expected, atol=1e-13)
 
 
+@pytest.mark.thorough
 def test_other_penalties_keep_image_and_forces():
     """`rescaled`: z as before, μ(q − z), which are the forces, as before; the same fixed point."""
     given = case("colour")

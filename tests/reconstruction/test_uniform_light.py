@@ -305,6 +305,7 @@ def test_it_can_end_in_the_first_part(wide_capture, ending):
     assert float(objective(problems[-1], images[-1])) == pytest.approx(result.history[-1].objective)
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("low_bar")
 def test_a_first_part_that_converges_leaves_more_to_the_second(monkeypatch):
     """Such a tolerance is met at the first check of both; Ctrl-C between them keeps the image."""

@@ -25,6 +25,7 @@ def test_what_does_not_fit_is_refused():
         dataclasses.replace(comparison, scenes=scenes)
 
 
+@pytest.mark.thorough
 def test_light_is_that_of_the_bare_sensor():
     """A white scene through a PSF of one over the field's shadow: the electrons asked for, and
     captures that share it have their parts."""

@@ -25,6 +25,7 @@ class TestGhostImages:
         field = jnp.array([[0.0, 0.0], [0.6, 0.9], [-1.05, -0.4]])
         return wg.ghost_images(behind(), field, OBJECT, ORDERS)
 
+    @pytest.mark.thorough
     def test_all_orders_see_the_same_point(self):
         found = self.images()
         rays = wg.trace(behind(), found.places, OBJECT, ORDERS)

@@ -97,6 +97,7 @@ def in_colours(sensor=SENSOR, width=5.0):
     return [wg.SeeThroughCamera(wg.Screen(f, width, glass), sensor, 6.0, 10.0) for f in films]
 
 
+@pytest.mark.thorough
 def test_every_colour_has_the_ghosts_of_its_wavelength():
     """Of the sensor's middle in thick glass: 2wp/√(n² − p²), p = λ|K_y|/2π, by the Bragg λ."""
     sensor = tc.Sensor((1, 1), 5 * um)

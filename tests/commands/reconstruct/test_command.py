@@ -73,6 +73,7 @@ def grey(tmp_path):
     return simulated.grey_files(tmp_path)
 
 
+@pytest.mark.thorough
 def test_twelve_bit_capture(grey, tmp_path):
     out = tmp_path / "image.png"
     more = ("--bits", 12, "--background", grey["dark"], "--method", "admm-tv", "--iterations", 80)

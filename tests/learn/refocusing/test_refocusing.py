@@ -95,6 +95,7 @@ def two_layers(camera, near, far):
     return Scene(radiance, cover, share, inverse)
 
 
+@pytest.mark.thorough
 def test_layers_hide_each_other(camera):
     scene = two_layers(camera, 60.0, 150.0)
     np.testing.assert_allclose(scene.all_in_focus[12, 12], 1.0)

@@ -207,6 +207,7 @@ def test_choice_is_for_the_grid_and_the_average_asked_for():
     assert average < points / 2
 
 
+@pytest.mark.thorough
 def test_most_accurate_where_nothing_is_good_enough():
     """The reference itself, and nothing dearer than it is tried."""
     choice = select(camera_of((20, 31), 0.02, width=0.6, beta=150.0), 1e-16)
@@ -219,6 +220,7 @@ def test_most_accurate_where_nothing_is_good_enough():
     assert choice.predicted_error == min(p.predicted_error for p in choice.considered)
 
 
+@pytest.mark.thorough
 def test_an_order_in_focus():
     """ε = 1: the unbounded mask has no PSF, `psf` refuses it and it is never chosen."""
     beta = np.pi / (500e-6 * 20.0)
