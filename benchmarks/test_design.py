@@ -11,15 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from thincam_jax.design import (
-    Polar,
-    PowerLaw,
-    Quadrant,
-    Setup,
-    bayes_error,
-    channels,
-    shots,
-)
+from thincam_jax.design import Polar, PowerLaw, Quadrant, Setup, bayes_error, channels, shots
 from thincam_jax.reconstruction import phase_pairs
 
 HIGHEST = 290.0

@@ -17,10 +17,7 @@ from thincam_jax.learn.suggestions import refine
 from thincam_jax.reconstruction import phase_pairs
 
 HELD_OUT = 200
-BETAS = (
-    design.Variable("beta", 8.0, 36.0, (0, 1)),
-    design.Variable("beta", 8.0, 36.0, (2, 3)),
-)
+BETAS = (design.Variable("beta", 8.0, 36.0, (0, 1)), design.Variable("beta", 8.0, 36.0, (2, 3)))
 DISTANCES = (
     design.Variable("distance", 4.0, 6.5, (0, 1)),
     design.Variable("distance", 4.0, 6.5, (2, 3)),

@@ -55,10 +55,9 @@ FIGURES.mkdir(parents=True, exist_ok=True)
 # counts the sensor's crop: of a scene that covers 26 × 26 pixels, what falls beside it is lost.
 
 # %%
-pixels, across, steps, rounds = {
-    "full": ((32, 40), 26, 60, 60),
-    "small": ((16, 20), 12, 20, 8),
-}[SIZE]
+pixels, across, steps, rounds = {"full": ((32, 40), 26, 60, 60), "small": ((16, 20), 12, 20, 8)}[
+    SIZE
+]
 pitch, cell, distance, green = 6 * um, 2 * um, 2.0, 532 * nm
 polymer = CauchyIndex(1.504, 0.0042e-6)
 cells = (3 * pixels[0], 3 * pixels[1])

@@ -29,13 +29,7 @@ from thincam_jax.imaging.metrics import (
     resolved_element,
     usaf_contrast,
 )
-from thincam_jax.imaging.targets import (
-    line_pair,
-    resize,
-    sample_image,
-    usaf1951,
-    usaf1951_elements,
-)
+from thincam_jax.imaging.targets import line_pair, resize, sample_image, usaf1951, usaf1951_elements
 from thincam_jax.reconstruction import fringe_scanning, phase_pairs
 from thincam_jax.units import nm
 

@@ -293,14 +293,7 @@ GRADIENTS: dict[str, tuple[float | None, ...]] = {
 LOST = 0.8
 
 # Where the prediction of the error is looked at, and what a tolerance of 1e-7 chooses.
-CHOICES = (
-    "focus",
-    "d = 1 µm",
-    "t = 0.1 mm",
-    "λ = 12 µm",
-    "100 mm mask",
-    "16384×64 sensor",
-)
+CHOICES = ("focus", "d = 1 µm", "t = 0.1 mm", "λ = 12 µm", "100 mm mask", "16384×64 sensor")
 
 
 def find(name: str) -> Extreme:

@@ -32,10 +32,7 @@ SOUND = [
     ("design/landscape.py", DOC + "def plot():\n    from ..plot import curves"),
     ("design/curve.py", DOC + "if TYPE_CHECKING:\n    from matplotlib.axes import Axes"),
     ("commands/figures.py", DOC + "import matplotlib.pyplot, jinja2\nfrom ..learn import x"),
-    (
-        "studies/result.py",
-        DOC + "if TYPE_CHECKING:\n    from matplotlib.figure import Figure\n",
-    ),
+    ("studies/result.py", DOC + "if TYPE_CHECKING:\n    from matplotlib.figure import Figure\n"),
     ("commands/rig/command.py", DOC + "def run():\n    from ...hardware import stage"),
     ("hardware/stage.py", DOC + "from thincam_jax.measured.read import x\nfrom .bus import y"),
     ("__init__.py", DOC + "from .lensless.psf import psf as psf\nfrom . import commands"),

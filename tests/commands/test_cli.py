@@ -306,10 +306,7 @@ def test_full_disk(file, monkeypatch, tmp_path):
 
 @pytest.mark.parametrize(
     "error",
-    [
-        MemoryError(),
-        RuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 4294967296 bytes."),
-    ],
+    [MemoryError(), RuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 4294967296 bytes.")],
 )
 def test_memory_that_ends_has_words(file, monkeypatch, tmp_path, error):
     def broken(*_):

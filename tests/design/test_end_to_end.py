@@ -129,10 +129,7 @@ def prior_matrix():
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize(
-    "noise",
-    [SignalNoise(25.0), PhotonNoise(3000.0, 5.0)],
-)
+@pytest.mark.parametrize("noise", [SignalNoise(25.0), PhotonNoise(3000.0, 5.0)])
 def test_restored_are_the_best_linear_estimates(noise):
     given, chosen = training(noise), design()
     maps = dense(chosen, given)
@@ -156,10 +153,7 @@ def test_restored_are_the_best_linear_estimates(noise):
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize(
-    "noise",
-    [SignalNoise(30.0), PhotonNoise(3000.0, 5.0)],
-)
+@pytest.mark.parametrize("noise", [SignalNoise(30.0), PhotonNoise(3000.0, 5.0)])
 def test_gradient_through_the_solver_by_differences(noise):
     given = training(noise)
     place = jnp.array([9.0, 7.0, 5.03, 6.41, 5e-4, 1.83])

@@ -43,13 +43,7 @@ def test_gradient_against_finite_differences():
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize(
-    "numbers",
-    [
-        {"index_modulation": 0.008, "film_thickness": 10 * um},
-        {},
-    ],
-)
+@pytest.mark.parametrize("numbers", [{"index_modulation": 0.008, "film_thickness": 10 * um}, {}])
 def test_expected_error_is_that_of_the_exact_system(numbers):
     """Trace of the posterior covariance of 10×10 cells, the prior's covariance in the exact one."""
     plate = changed(**numbers)

@@ -114,10 +114,7 @@ def test_of_even_responses_in_closed_form(monkeypatch):
 
 def test_differences_are_named_by_what_is_added():
     scanned = np.array([[0.0, -1.0, 0.0, 1.0], [-1.0, 0.0, 0.0, 0.0]])
-    assert modulation_transfer(DESIGN, data(synthesis=scanned)).sums == (
-        ((4,), (2,)),
-        ((1,), ()),
-    )
+    assert modulation_transfer(DESIGN, data(synthesis=scanned)).sums == (((4,), (2,)), ((1,), ()))
 
 
 def test_rings_without_the_even_light_are_refused():

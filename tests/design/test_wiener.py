@@ -133,10 +133,7 @@ def test_restored_are_those_of_the_wiener_synthesis():
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize(
-    "noise",
-    [SignalNoise(30.0), PhotonNoise(3000.0, 5.0)],
-)
+@pytest.mark.parametrize("noise", [SignalNoise(30.0), PhotonNoise(3000.0, 5.0)])
 def test_gradient_by_differences(noise):
     given = training(noise, count=12, sensor=(20, 24))
     place = jnp.array([19.0, 23.0, 5.13, 6.91, 5e-4, 1.71])

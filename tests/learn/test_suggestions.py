@@ -179,12 +179,7 @@ def test_files_of_something_else(suggester, tmp_path):
     cases = (
         (path, one, DATA, "was trained for other variables: "),
         (path, two_betas(9.0), DATA, "was trained for other variables: "),
-        (
-            path,
-            SPACE,
-            (*DATA[:2], Polar(96.0, 64, 2)),
-            "frequencies.* and the model here has",
-        ),
+        (path, SPACE, (*DATA[:2], Polar(96.0, 64, 2)), "frequencies.* and the model here has"),
         (path, SPACE, (dim, *DATA[1:]), "setup.prior.exponent was 2.8 and is 2; train"),
         (tmp_path / "cut", SPACE, DATA, "cut: is damaged or cut off"),
         (tmp_path / "text", SPACE, DATA, "text: is no file of a network; give one"),

@@ -183,11 +183,7 @@ def test_single_pixels_and_lines(shape):
     value = tc.capture(own, tc.Scene(plane(image), 500 * nm))
     grid = kernel_grid(own.sensor.grid, field)
     h = tc.psf(
-        own,
-        wavelength=500 * nm,
-        object_distance=OBJECT_DISTANCE,
-        pixel_integration=True,
-        grid=grid,
+        own, wavelength=500 * nm, object_distance=OBJECT_DISTANCE, pixel_integration=True, grid=grid
     )
     windows = np.lib.stride_tricks.sliding_window_view(np.asarray(h), field)
     # the turn of the pinhole and that of the convolution cancel

@@ -90,9 +90,7 @@ def case(name: str) -> Case:
         weights.append(jnp.asarray(weight.reshape(channels, *sensor)))
         parts.append((matrices, capture, weight))
     variation = TotalVariation(
-        setting.kind,
-        "joint" if setting.joint else "none",
-        depth_weight=setting.depth_weight,
+        setting.kind, "joint" if setting.joint else "none", depth_weight=setting.depth_weight
     )
     problem = scenes.inverse(
         operators,

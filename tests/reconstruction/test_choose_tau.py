@@ -7,10 +7,7 @@ import pytest
 import thincam_jax as tc
 from helpers import quick
 from thincam_jax.reconstruction import InverseProblem
-from thincam_jax.reconstruction.choose_tau import (
-    discrepancy_tau,
-    sure_tau,
-)
+from thincam_jax.reconstruction.choose_tau import discrepancy_tau, sure_tau
 from thincam_jax.reconstruction.iterate import Schedule, iterate
 from thincam_jax.reconstruction.problem import misfit, with_tau
 from thincam_jax.reconstruction.splittings import admm_method

@@ -14,11 +14,7 @@ from helpers import quick, relative_l2
 from thincam_jax.reconstruction import iterate as module
 from thincam_jax.reconstruction import proximal_gradient
 from thincam_jax.reconstruction.iterate import Schedule, iterate
-from thincam_jax.reconstruction.problem import (
-    ScaledProblem,
-    total_misfit,
-    total_objective,
-)
+from thincam_jax.reconstruction.problem import ScaledProblem, total_misfit, total_objective
 from thincam_jax.reconstruction.proximal_gradient import (
     AcceleratedProximalGradient,
     FistaMethod,

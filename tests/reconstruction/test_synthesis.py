@@ -8,13 +8,7 @@ import pytest
 import thincam_jax as tc
 from helpers import relative_l2
 from thincam_jax.lensless.propagation.paraxial import paraxial_response
-from thincam_jax.reconstruction import (
-    contrasts,
-    fringe_scanning,
-    harmonics,
-    phase_pairs,
-    separate,
-)
+from thincam_jax.reconstruction import contrasts, fringe_scanning, harmonics, phase_pairs, separate
 from thincam_jax.reconstruction.synthesis import phase_contrasts
 from thincam_jax.units import nm, um
 

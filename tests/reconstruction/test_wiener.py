@@ -14,12 +14,7 @@ import thincam_jax as tc
 from helpers import count_traces, finite_difference, quick, relative_l2
 from thincam_jax._core.grids import Grid
 from thincam_jax.imaging.operators import kernel_grid
-from thincam_jax.reconstruction import (
-    WienerSynthesis,
-    fringe_scanning,
-    phase_pairs,
-    separate,
-)
+from thincam_jax.reconstruction import WienerSynthesis, fringe_scanning, phase_pairs, separate
 from thincam_jax.reconstruction import wiener as module
 from thincam_jax.reconstruction.imaging_model import register
 from thincam_jax.reconstruction.wiener import crop_noise, inner_band, prior_spectrum, scene_power

@@ -49,10 +49,7 @@ def test_a_tilted_plate_is_found():
     """From a straight one."""
     tilt = np.deg2rad([0.4, -0.2])
     calibration = dataclasses.replace(
-        tiny_screen.CALIBRATION,
-        fitted=("plate_x", "plate_y"),
-        glass_thickness=None,
-        distances=(),
+        tiny_screen.CALIBRATION, fitted=("plate_x", "plate_y"), glass_thickness=None, distances=()
     )
     study = tiny_screen.study(tiny_screen.camera(tilt=tilt), solvers={"CGM": tc.Ridge(1.0)})
     values = calibrate(study, calibration).scores.fit.values

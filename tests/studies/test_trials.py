@@ -14,10 +14,7 @@ def scores(psnr, step):
 
 def test_gains_are_taken_seed_by_seed():
     trials = {
-        "a": {
-            "old": [scores(20.0, 7), scores(22.0, 8)],
-            "new": [scores(20.5, 9), scores(22.9, 8)],
-        }
+        "a": {"old": [scores(20.0, 7), scores(22.0, 8)], "new": [scores(20.5, 9), scores(22.9, 8)]}
     }
     compared = compare_trials(trials)
     assert compared["old"]["a"].gain_db is None

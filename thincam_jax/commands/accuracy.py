@@ -12,12 +12,7 @@ from thincam_jax.commands.sections import SensorConfig, StudyConfig
 from thincam_jax.commands.study.build import FileStudy, build_study, check_optics
 from thincam_jax.lensless.exposures import Exposure
 from thincam_jax.studies.evaluate import check_target
-from thincam_jax.studies.psf_error_cost import (
-    AccuracyResult,
-    AccuracyRun,
-    Case,
-    make_case,
-)
+from thincam_jax.studies.psf_error_cost import AccuracyResult, AccuracyRun, Case, make_case
 
 _SIZES, _CAPTURE_SIZE = (128, 256, 512), 256  # by default
 

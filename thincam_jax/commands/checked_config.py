@@ -15,9 +15,7 @@ Experiment = TypeVar("Experiment", bound=ExperimentConfig)
 
 
 def load_as(
-    model: type[Experiment],
-    path: str | Path,
-    overrides: tuple[str, ...] = (),
+    model: type[Experiment], path: str | Path, overrides: tuple[str, ...] = ()
 ) -> Experiment:
     """Read an experiment file of the given sections; `overrides` are "a.b=value" texts.
 

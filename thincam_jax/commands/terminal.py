@@ -29,8 +29,7 @@ Overrides = Annotated[
     typer.Option("--set", help="Change a value: a.b=value, list entries by number."),
 ]
 DryRun = Annotated[
-    bool,
-    typer.Option("--dry-run", help="Check all and tell what would be done, without doing it."),
+    bool, typer.Option("--dry-run", help="Check all and tell what would be done, without doing it.")
 ]
 
 

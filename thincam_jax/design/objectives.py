@@ -24,12 +24,7 @@ from thincam_jax._core import checks
 from thincam_jax._core.quantity import quantity
 from thincam_jax.design.design import Design
 from thincam_jax.design.frequencies import Frequencies
-from thincam_jax.design.response import (
-    capture_light,
-    responses,
-    signal_variance,
-    spectral_density,
-)
+from thincam_jax.design.response import capture_light, responses, signal_variance, spectral_density
 from thincam_jax.design.setup import Setup
 
 DEFAULT_BAND = (0.05, 0.5)  # of the highest frequency

@@ -116,12 +116,7 @@ def mask_of_phase(
 
 
 def contour_mask(
-    key: Key,
-    blank: MaskBlank,
-    path: Path,
-    *,
-    feature: Number,
-    line_width: Number,
+    key: Key, blank: MaskBlank, path: Path, *, feature: Number, line_width: Number
 ) -> PhaseMask:
     """The mask whose PSF at a path's wavelength and distances is nearest to a `contour_target`.
 

@@ -11,12 +11,7 @@ from thincam_jax.design.design import Design, Shot
 from thincam_jax.design.objectives import ObjectiveData, ring_means
 from thincam_jax.design.problem import DesignProblem, Objective
 from thincam_jax.design.search import SEPARATION, Found, NonFiniteObjectiveError
-from thincam_jax.design.sensitivity import (
-    FreeValue,
-    derivatives,
-    one_percent,
-    with_tolerances,
-)
+from thincam_jax.design.sensitivity import FreeValue, derivatives, one_percent, with_tolerances
 from thincam_jax.design.space import DesignSpace
 from thincam_jax.design.training_search import TrainedDesigns
 from thincam_jax.design.transfer import RINGS

@@ -23,12 +23,10 @@ class PowerLaw(Module):
     """
 
     exponent: Float[Array, ""] = eqx.field(
-        default=2.0,
-        converter=quantity("powers of the frequency", non_negative=True),
+        default=2.0, converter=quantity("powers of the frequency", non_negative=True)
     )
     corner: Float[Array, ""] | None = eqx.field(
-        default=None,
-        converter=quantity("cycles/rad", positive=True, optional=True),
+        default=None, converter=quantity("cycles/rad", positive=True, optional=True)
     )
 
     def __call__(

@@ -206,8 +206,7 @@ class DesignSpace(eqx.Module):
 
 
 def active_limits(
-    space: DesignSpace,
-    point: Float[Array, " variable"] | Float[np.ndarray, " variable"],
+    space: DesignSpace, point: Float[Array, " variable"] | Float[np.ndarray, " variable"]
 ) -> tuple[str, ...]:
     """Active limits at a point of the unit cube, in words."""
     words = []

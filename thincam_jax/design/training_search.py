@@ -249,11 +249,7 @@ def build_training(
     grey = [np.atleast_3d(image).mean(axis=-1) for image in photographs]
     squares = [resize(middle_square(image, min(image.shape)), (count, count)) for image in grey]
     return Training(
-        np.stack(squares),
-        setup,
-        synthesis,
-        TrainedSensor((pixels, pixels), distances),
-        key=key,
+        np.stack(squares), setup, synthesis, TrainedSensor((pixels, pixels), distances), key=key
     )
 
 

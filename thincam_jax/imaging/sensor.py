@@ -107,9 +107,7 @@ class GaussianNoise(AbstractNoise):
 
     snr_db: Float[Array, ""] = eqx.field(converter=quantity("dB", check=checks.decibels))
     signal_power: Literal["total", "without_mean"] = eqx.field(
-        default="total",
-        converter=choice(("total", "without_mean")),
-        static=True,
+        default="total", converter=choice(("total", "without_mean")), static=True
     )
 
     def variance(

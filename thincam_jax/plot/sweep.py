@@ -68,10 +68,7 @@ def _draw_lines(
         groups = [[row[column] for row in run if row[path] == value] for value in values]
         known = [n for n, group in enumerate(groups) if group]
         means = np.array([np.mean(groups[n]) for n in known])
-        spread = [
-            means - [min(groups[n]) for n in known],
-            [max(groups[n]) for n in known] - means,
-        ]
+        spread = [means - [min(groups[n]) for n in known], [max(groups[n]) for n in known] - means]
         style = line_style(number) | {"markersize": 5, "linewidth": 1.2, "capsize": 3}
         ax.errorbar(place[known], means, None if alone else spread, label=method, **style)
     ax.set(xlabel=_label(path), ylabel="mean PSNR of all targets (dB)")

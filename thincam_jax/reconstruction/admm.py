@@ -224,10 +224,7 @@ class AdmmMethod(OptimistixMethod):
     donated = True
 
     def __init__(
-        self,
-        problem: InverseProblem,
-        splitting: AbstractSplitting,
-        relaxation: Number = RELAXATION,
+        self, problem: InverseProblem, splitting: AbstractSplitting, relaxation: Number = RELAXATION
     ):
         self.problem, self.arguments = problem, splitting
         self.solver = Admm(0.0, relaxation)

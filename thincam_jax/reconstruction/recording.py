@@ -35,12 +35,7 @@ from thincam_jax.reconstruction.iterate import Outcome, Progress
 from thincam_jax.reconstruction.noise import estimate_variance, given_variances
 from thincam_jax.reconstruction.problem import InverseProblem, as_real, detector_shape
 from thincam_jax.reconstruction.regularisers import AbstractRegulariser
-from thincam_jax.reconstruction.synthesis import (
-    Channel,
-    separate,
-    synthesis_matrix,
-    with_channel,
-)
+from thincam_jax.reconstruction.synthesis import Channel, separate, synthesis_matrix, with_channel
 
 
 class Reconstruction(Module):

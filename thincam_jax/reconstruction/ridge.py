@@ -69,12 +69,7 @@ from thincam_jax.reconstruction.problem import (
 )
 from thincam_jax.reconstruction.recording import Recording
 from thincam_jax.reconstruction.regularisers import Image
-from thincam_jax.reconstruction.solver import (
-    AbstractSolver,
-    Synthesis,
-    as_synthesis,
-    as_tolerance,
-)
+from thincam_jax.reconstruction.solver import AbstractSolver, Synthesis, as_synthesis, as_tolerance
 
 Rule = Literal["gcv", "sure"]
 
@@ -215,9 +210,7 @@ def _whitened(problem: InverseProblem, mean, prior: "MarkovPrior") -> InversePro
     (camera,), captures = problem.operators, [-r for r in residuals(problem, mean)]
     assert isinstance(camera, Separable)
     return eqx.tree_at(
-        lambda p: (p.operators, p.captures),
-        problem,
-        ((prior.whitened(camera),), tuple(captures)),
+        lambda p: (p.operators, p.captures), problem, ((prior.whitened(camera),), tuple(captures))
     )
 
 

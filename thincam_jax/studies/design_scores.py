@@ -285,11 +285,7 @@ class FrontsScores:
 
 
 # Label of the cost of each front.
-COSTS = {
-    "thickness": "thickness, mm",
-    "captures": "captures",
-    "light": "electrons from each mm²",
-}
+COSTS = {"thickness": "thickness, mm", "captures": "captures", "light": "electrons from each mm²"}
 
 
 @dataclass(frozen=True)

@@ -164,10 +164,7 @@ def coupled(solver: AbstractSolver, channels: int) -> AbstractSolver:
 
 
 def evaluate_method(
-    study: Study,
-    method: Method,
-    target: Target,
-    captures: Mapping[Exposure, Capture],
+    study: Study, method: Method, target: Target, captures: Mapping[Exposure, Capture]
 ) -> Evaluation:
     """Reconstruct a target from the method's captures, and judge what comes out."""
     shape, prepared = field_shape(study, method, target), study._reconstructors

@@ -401,10 +401,7 @@ class AccuracyRun:
 
 
 def measure_accuracy(
-    study: Study,
-    sizes: Sequence[int],
-    capture_size: int,
-    progress: Progress | None = None,
+    study: Study, sizes: Sequence[int], capture_size: int, progress: Progress | None = None
 ) -> AccuracyResult:
     """Error and time of every PSF model of a study's camera, and what errors cost its images.
 

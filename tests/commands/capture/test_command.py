@@ -308,8 +308,7 @@ def test_nothing_listens_and_no_other_user_reaches_a_device(tmp_path):
     user's alone, behind a folder of a name that cannot be guessed."""
     raw = yaml.safe_load(tiny.METHOD_B)
     config = load_as(
-        CaptureConfig,
-        tiny.write(tmp_path, yaml.safe_dump({**raw, "stage": {"driver": "zaber"}})),
+        CaptureConfig, tiny.write(tmp_path, yaml.safe_dump({**raw, "stage": {"driver": "zaber"}}))
     )
     before = sockets()
     with devices.VirtualDevices(command.virtual_rig(config)) as virtual:

@@ -178,11 +178,7 @@ SHARED = ("search.free[0]", "all masks share the width; drop 'shared' and 'shots
         ("search.objective=robust_error", "search", "robust_error and tolerances belong together"),
         ("search.tolerances={distance: 20 um}", "search", "belong together; give both"),
         ("search.tolerances={how: worst}", "search.tolerances", "give at least one, such as"),
-        (
-            "search.tolerances={tilt: -1 deg}",
-            "search.tolerances.tilt",
-            "give tilt >= 0",
-        ),
+        ("search.tolerances={tilt: -1 deg}", "search.tolerances.tilt", "give tilt >= 0"),
         ("search.tolerances={beta: 0.6}", "search.tolerances.beta", "give 0 to 0.5"),
         (
             "train={images: [nobody]}",

@@ -154,10 +154,7 @@ def test_ridge(grey, tmp_path):
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize(
-    ("psf", "coupling"),
-    [("psf", "joint"), ("grey_psf", "opponent")],
-)
+@pytest.mark.parametrize(("psf", "coupling"), [("psf", "joint"), ("grey_psf", "opponent")])
 def test_colours(tmp_path, psf, coupling):
     """8-bit PNG with a PSF of one and of three channels; colours are joined by default."""
     paths = simulated.colour_files(tmp_path)
@@ -279,10 +276,7 @@ class TestExitCode2:
             (("--method", "magic"), "method = 'magic' is unknown; choose one of 'auto'"),
             (("--method", "wiener"), "method 'wiener' needs a model of the camera"),
             (("--method", "poisson"), "method 'poisson' needs raw counts"),
-            (
-                ("--method", "ridge", "--tau", 2),
-                "method 'ridge' cannot use tau; leave it out",
-            ),
+            (("--method", "ridge", "--tau", 2), "method 'ridge' cannot use tau; leave it out"),
             (("--method", "ridge", "--coupling", "joint"), "method 'ridge' cannot use coupling"),
             (("--method", "ridge", "--ridge", 0), "ridge = 0.0 is not positive"),
             (("--ridge", 1), "method 'admm_tv' cannot use ridge; leave it out, or use 'ridge'"),

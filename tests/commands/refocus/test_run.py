@@ -53,10 +53,7 @@ def test_progress_and_files(run):
         files
         == {".lock", "config.yaml", "metrics.json", "environment.json", "report.html"}
         | figures
-        | {
-            "figures/methods.png",
-            "images/all-in-focus.png",
-        }
+        | {"figures/methods.png", "images/all-in-focus.png"}
         | images
     )
     assert load_experiment(path / "config.yaml") == study.config

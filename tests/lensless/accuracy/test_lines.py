@@ -80,12 +80,8 @@ def test_points_are_those_of_the_grid(factor):
     np.testing.assert_allclose(points.x, grid.x[indices[1]], rtol=1e-14)
     fine, refined = Grid((40 * factor, 9 * factor), grid.pitch / factor), points.refined(factor)
     np.testing.assert_allclose(
-        np.reshape(refined.y, (3, factor)),
-        np.reshape(fine.y, (40, factor))[indices[0]],
-        atol=1e-14,
+        np.reshape(refined.y, (3, factor)), np.reshape(fine.y, (40, factor))[indices[0]], atol=1e-14
     )
     np.testing.assert_allclose(
-        np.reshape(refined.x, (2, factor)),
-        np.reshape(fine.x, (9, factor))[indices[1]],
-        atol=1e-14,
+        np.reshape(refined.x, (2, factor)), np.reshape(fine.x, (9, factor))[indices[1]], atol=1e-14
     )

@@ -88,11 +88,7 @@ def test_large_images_are_estimated(pitch, distance, average):
 @pytest.mark.thorough
 @pytest.mark.parametrize(
     ("precision", "average", "oversampling", "height"),
-    [
-        ("float32", False, 1, None),
-        ("float64", False, 3, 0.4),
-        ("float32", True, 3, None),
-    ],
+    [("float32", False, 1, None), ("float64", False, 3, 0.4), ("float32", True, 3, None)],
 )
 def test_sampled_models(optimised, precision, average, oversampling, height):
     """The angular spectrum's error within 5 % from one-dimensional transforms; the direct sum's

@@ -28,13 +28,7 @@ def camera(name):
 @pytest.mark.thorough
 @pytest.mark.parametrize(
     ("name", "average"),
-    [
-        ("diffuser", False),
-        ("lenses", True),
-        ("cells", False),
-        ("lenses", False),
-        ("cells", True),
-    ],
+    [("diffuser", False), ("lenses", True), ("cells", False), ("lenses", False), ("cells", True)],
 )
 def test_predicted_errors_are_at_least_the_true_ones(name, average):
     """Against 11 samples a pixel and a window of three times the width."""

@@ -152,11 +152,7 @@ def camera_of(shape=(48, 80), pitch=5.5e-3, distance=6.5, beta=25.0, **mask):
 
 def select(camera, tolerance, object_distance=250.0, **arguments):
     return tc.select_model(
-        camera,
-        wavelength=500e-6,
-        object_distance=object_distance,
-        tolerance=tolerance,
-        **arguments,
+        camera, wavelength=500e-6, object_distance=object_distance, tolerance=tolerance, **arguments
     )
 
 
@@ -181,10 +177,7 @@ def test_considered_are_the_cheaper_ways():
     assert last.predicted_error == choice.predicted_error
     for prediction in choice.considered:
         alone = tc.predict_error(
-            camera_of(),
-            wavelength=500e-6,
-            object_distance=250.0,
-            model=prediction.method,
+            camera_of(), wavelength=500e-6, object_distance=250.0, model=prediction.method
         )
         assert alone == prediction
 

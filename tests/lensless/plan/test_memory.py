@@ -45,11 +45,7 @@ PROCESS = """
     not os.access("/proc/self/clear_refs", os.W_OK), reason="needs Linux's /proc/self/clear_refs"
 )
 @pytest.mark.parametrize(
-    ("shape", "planes", "tolerance"),
-    [
-        ((2400, 3200), 1, 1e-2),
-        ((1500, 2000), 6, 1e-3),
-    ],
+    ("shape", "planes", "tolerance"), [((2400, 3200), 1, 1e-2), ((1500, 2000), 6, 1e-3)]
 )
 def test_peak_of_a_planned_capture(shape, planes, tolerance):
     """Within a factor of 1.5 from above, and no idle bound."""

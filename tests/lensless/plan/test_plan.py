@@ -240,14 +240,7 @@ ODD = {
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("name", ODD)
-@pytest.mark.parametrize(
-    "tolerance",
-    [
-        0.1,
-        1e-2,
-        1e-3,
-    ],
-)
+@pytest.mark.parametrize("tolerance", [0.1, 1e-2, 1e-3])
 def test_odd_scenes_stay_within_their_prediction(name, tolerance):
     own, odd = ODD[name]
     plan = tc.plan(own, odd, tolerance=tolerance)

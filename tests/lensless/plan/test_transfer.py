@@ -25,8 +25,7 @@ def direct(h, frequencies):
 
 
 @pytest.mark.parametrize(
-    "model",
-    [pytest.param(m, marks=[pytest.mark.thorough] * (m != "closed_form")) for m in CLOSED],
+    "model", [pytest.param(m, marks=[pytest.mark.thorough] * (m != "closed_form")) for m in CLOSED]
 )
 @pytest.mark.parametrize("average", [False, pytest.param(True, marks=pytest.mark.thorough)])
 def test_exact_and_quick_agree_with_the_sum_over_the_psf(model, average):

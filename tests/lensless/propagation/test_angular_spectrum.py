@@ -37,12 +37,7 @@ def test_converges_to_separable(capsys):
     error = {
         (padding, oversampling): relative_l2(
             sampled(
-                MASK,
-                GRID,
-                GENTLE,
-                mask_shape=(54, 56),
-                oversampling=oversampling,
-                padding=padding,
+                MASK, GRID, GENTLE, mask_shape=(54, 56), oversampling=oversampling, padding=padding
             ),
             expected,
         )

@@ -19,11 +19,7 @@ def psf_of(shape, pitch, *, model="geometric", wavelength=500e-6, average=False,
     )
     return np.asarray(
         tc.psf(
-            camera,
-            wavelength=wavelength,
-            object_distance=t,
-            model=model,
-            pixel_integration=average,
+            camera, wavelength=wavelength, object_distance=t, model=model, pixel_integration=average
         )
     )
 

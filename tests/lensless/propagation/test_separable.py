@@ -251,15 +251,7 @@ def test_pixel_nodes_follow_the_fringes_in_a_pixel():
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize(
-    "width",
-    [
-        0.4,
-        0.9,
-        1.8,
-        3.0,
-    ],
-)
+@pytest.mark.parametrize("width", [0.4, 0.9, 1.8, 3.0])
 def test_fewer_nodes_are_as_exact(width):
     """In single precision below its rounding, in double 1e-11, against all 24."""
     camera = camera_of((24, 31), PITCH, THESIS | {"width": width})

@@ -4,9 +4,7 @@ from thincam_jax._core.table import number
 from thincam_jax.commands.config_file import slug
 from thincam_jax.commands.design.config import DesignConfig
 from thincam_jax.commands.report import Content, Page, Part, Picture, Sentences, pixels_of
-from thincam_jax.studies.design_scores import (
-    DesignScores,
-)
+from thincam_jax.studies.design_scores import DesignScores
 
 _LANDSCAPE = (
     "The objective over free numbers, any others as in the best design, in the approximation that "

@@ -14,8 +14,7 @@ METHODS = ("auto", "admm-tv", "fista", "ridge")
 
 Psf = Annotated[Path, Option(help="Measured PSF: TIFF, PNG or NPY.")]
 Background = Annotated[
-    str | None,
-    Option(help="Dark frame, or a number of counts. Default: a corner of the PSF."),
+    str | None, Option(help="Dark frame, or a number of counts. Default: a corner of the PSF.")
 ]
 PsfBackground = Annotated[
     str | None, Option(help="That of the PSF, where it was exposed otherwise.")

@@ -31,11 +31,7 @@ from thincam_jax.studies.screen import (
     ScreenStudy,
     summarise_rays,
 )
-from thincam_jax.studies.screen_calibration import (
-    MEASURED,
-    CalibrationRun,
-    CalibrationScores,
-)
+from thincam_jax.studies.screen_calibration import MEASURED, CalibrationRun, CalibrationScores
 
 _RAYS = (
     "Side view: rays of three pixels through lens, plate (grey) and out to the object; thin lines "

@@ -9,12 +9,7 @@ from thincam_jax.commands.sections import StudyConfig
 from thincam_jax.commands.study.build import FileStudy
 from thincam_jax.lensless.exposures import Exposure
 from thincam_jax.plot import studies as plot
-from thincam_jax.studies.evaluate import (
-    Contrasts,
-    Evaluation,
-    Scores,
-    evaluate_method,
-)
+from thincam_jax.studies.evaluate import Contrasts, Evaluation, Scores, evaluate_method
 from thincam_jax.studies.response import Response, method_response
 from thincam_jax.studies.result import StudyScores, findings, summarise
 from thincam_jax.studies.simulate import Capture, take

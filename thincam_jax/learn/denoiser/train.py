@@ -16,13 +16,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from thincam_jax._core.quantity import FieldError, check_fields, whole
 from thincam_jax.learn.checkpoint import CheckpointError
-from thincam_jax.learn.denoiser.network import (
-    LEAST,
-    MOST,
-    denoised,
-    network_card,
-    save_network,
-)
+from thincam_jax.learn.denoiser.network import LEAST, MOST, denoised, network_card, save_network
 from thincam_jax.learn.denoiser.pictures import TILE, Pictures
 from thincam_jax.learn.denoiser.unet import DenoisingUNet
 from thincam_jax.learn.training import (

@@ -54,10 +54,7 @@ class ControlCode(eqx.Module):
         return ControlCode(LinearStep(1), UNet(3, 1, widths, key=key), Planes(camera))
 
     def focus(
-        self,
-        capture: Float[Array, "y x"],
-        distance: Float[Array, ""],
-        deviation: Float[Array, ""],
+        self, capture: Float[Array, "y x"], distance: Float[Array, ""], deviation: Float[Array, ""]
     ) -> Float[Array, "m n"]:
         """The image focused on a distance, mm, in the capture's unit."""
         camera, planes = self.planes.camera, self.planes

@@ -8,12 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from thincam_jax.learn.refocusing.cameras import Stand
-from thincam_jax.learn.refocusing.network import (
-    RefocusNetwork,
-    normalised,
-    prepared,
-    read_images,
-)
+from thincam_jax.learn.refocusing.network import RefocusNetwork, normalised, prepared, read_images
 from thincam_jax.learn.refocusing.scenes import Batch
 from thincam_jax.learn.refocusing.unet import UNet
 

@@ -94,10 +94,7 @@ class SeparableMask(AbstractCellMask):
         default=(0, 0), converter=quantity("mm", shape=(2,)), kw_only=True
     )
     combine: Combination = eqx.field(
-        default="product",
-        converter=choice(COMBINATIONS),
-        static=True,
-        kw_only=True,
+        default="product", converter=choice(COMBINATIONS), static=True, kw_only=True
     )
 
     def patterns(self) -> Patterns:

@@ -90,9 +90,7 @@ class PhaseMask(AbstractMask):
         default=(0, 0), converter=quantity("mm", shape=(2,)), kw_only=True
     )
     fill_factor: Float[Array, ""] | None = eqx.field(
-        default=None,
-        converter=quantity(check=checks.fraction, optional=True),
-        kw_only=True,
+        default=None, converter=quantity(check=checks.fraction, optional=True), kw_only=True
     )
     interpolation: Interpolation = eqx.field(
         default="cells", converter=choice(get_args(Interpolation)), static=True, kw_only=True

@@ -54,9 +54,7 @@ class SampledMask(AbstractFactoredMask):
         default=(0, 0), converter=quantity("mm", shape=(2,)), kw_only=True
     )
     fill_factor: Float[Array, ""] | None = eqx.field(
-        default=None,
-        converter=quantity(check=checks.fraction, optional=True),
-        kw_only=True,
+        default=None, converter=quantity(check=checks.fraction, optional=True), kw_only=True
     )
 
     @property

@@ -73,12 +73,7 @@ def propagate(
 
 
 def angular_spectrum(
-    mask: AbstractMask,
-    grid: Grid,
-    path: Path,
-    method: PsfMethod,
-    *,
-    padding: float = PADDING,
+    mask: AbstractMask, grid: Grid, path: Path, method: PsfMethod, *, padding: float = PADDING
 ) -> Float[Array, "y x"]:
     r"""PSF of any mask by the band-limited angular spectrum; exact scalar diffraction when sampled.
 

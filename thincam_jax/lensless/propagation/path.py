@@ -27,8 +27,7 @@ class Path(Module):
     wavelength: Float[Array, ""] = eqx.field(converter=quantity("mm", check=checks.wavelength))
     distance: Float[Array, ""] = eqx.field(converter=quantity("mm", positive=True))
     object_distance: Float[Array, ""] = eqx.field(
-        default=jnp.inf,
-        converter=quantity("mm", check=_positive_or_infinite),
+        default=jnp.inf, converter=quantity("mm", check=_positive_or_infinite)
     )
 
     @property

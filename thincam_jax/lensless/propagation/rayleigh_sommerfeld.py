@@ -46,10 +46,7 @@ def rayleigh_sommerfeld_field(
 
 
 def rayleigh_sommerfeld(
-    mask: AbstractMask,
-    grid: Grid,
-    path: Path,
-    method: PsfMethod,
+    mask: AbstractMask, grid: Grid, path: Path, method: PsfMethod
 ) -> Float[Array, "y x"]:
     """PSF of any mask by direct summation: the reference for tests and small grids.
 
