@@ -27,6 +27,7 @@ def means(model):
     return np.array([method.scores.mean_psnr_db for method in model.methods.values()])
 
 
+@pytest.mark.thorough
 def test_forgotten_ghosts_cost_an_image():
     study = tiny_screen.study(models=SINGLE, solvers={"CGM": tc.Ridge(1.0)})
     texts = []

@@ -39,17 +39,15 @@ def value(case, model, **arguments):
     return np.asarray(tc.psf(case.camera, model=model, **case.conditions, **arguments), float)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "case",
     [
-        pytest.param(case_of((60, 100), 5.5e-3), marks=pytest.mark.thorough),  # of the shadow
+        case_of((60, 100), 5.5e-3),  # the middle of the shadow
         case_of((60, 100), 0.07, centre=(0.3, -0.9)),  # all of it, and round it
-        pytest.param(case_of((75, 120), 0.07, profile="binary"), marks=pytest.mark.thorough),
-        pytest.param(case_of((75, 120), 0.07, height=3.3), marks=pytest.mark.thorough),
-        pytest.param(
-            case_of((256, 100), 0.02, average=True, object_distance=20.0),
-            marks=pytest.mark.thorough,
-        ),
+        case_of((75, 120), 0.07, profile="binary"),
+        case_of((75, 120), 0.07, height=3.3),
+        case_of((256, 100), 0.02, average=True, object_distance=20.0),
     ],
     ids=["middle", "whole", "binary", "rectangle", "average"],
 )

@@ -27,7 +27,8 @@ exact = jax.jit(
 )
 
 
-@pytest.mark.parametrize("t", [pytest.param(np.inf, marks=pytest.mark.thorough), 60.0])
+@pytest.mark.thorough
+@pytest.mark.parametrize("t", [np.inf, 60.0])
 def test_gentle_waves_are_fresnel_waves(t):
     """At d = 20 mm, under 2°, to 1e-3 of `separable`."""
     grid, path = tc.Grid((4, 5), 0.09), Path(WAVELENGTH, 20.0, t)
