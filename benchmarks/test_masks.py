@@ -14,6 +14,7 @@ import pytest
 import scipy.special
 
 import thincam_jax as tc
+from thincam_jax.lensless.method import PsfMethod
 from thincam_jax.lensless.propagation import Path
 from thincam_jax.lensless.propagation.angular_spectrum import angular_spectrum
 from thincam_jax.lensless.propagation.separable import separable
@@ -29,7 +30,8 @@ def psf(model, cell, distance):
     path = Path(jnp.asarray(WAVELENGTH, cell.dtype), distance, jnp.asarray(jnp.inf, cell.dtype))
     if model == "separable":
         return separable(mask, grid, path).image()
-    return angular_spectrum(mask, grid, path, mask_shape=SHAPE, padding=2.0)
+    method = PsfMethod("angular_spectrum", mask_shape=SHAPE)
+    return angular_spectrum(mask, grid, path, method, padding=2.0)
 
 
 @pytest.fixture(scope="module")
