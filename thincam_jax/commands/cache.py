@@ -36,12 +36,13 @@ def cache_folder() -> Path:
 def keep_programs() -> None:
     """Have JAX keep what it compiles, unless the user has told JAX where to.
 
-    Where the folder cannot be written, nothing is kept and nothing is said.
+    Where the folder cannot be written, nothing is kept and nothing is said; where another process
+    holds it, a line says so.
     """
-    from filelock import FileLock, Timeout
-
     if "JAX_COMPILATION_CACHE_DIR" in os.environ:
         return
+    from filelock import FileLock, Timeout
+
     folder = cache_folder()
     try:
         folder.mkdir(parents=True, exist_ok=True)

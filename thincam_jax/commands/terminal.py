@@ -57,7 +57,7 @@ def told(interrupted: Callable[[], str]) -> Iterator[None]:
 
 def _check_settings() -> None:
     """ConfigError for variables of the environment with which JAX cannot start."""
-    from thincam_jax._core.start import cannot_start
+    from thincam_jax._core.jax_settings import cannot_start
 
     if fault := cannot_start():
         from thincam_jax.commands.config_file import ConfigError

@@ -98,6 +98,9 @@ def _irradiance(
     """The PSF in the form in which the model has it: terms where there are terms, else an image."""
     if method.model not in SAMPLED:
         mask = _unfocused(mask, path) if method.model == "closed_form" else mask
+        if method.model == "separable" and not has_few_terms(mask):
+            nodes = method.nodes if method.pixel_integration else None
+            return separable_image(require_factored(mask, "separable"), grid, path, nodes=nodes)
         return _closed(mask, grid, path, method)
     sampled = angular_spectrum if method.model == "angular_spectrum" else rayleigh_sommerfeld
     return sampled(mask, grid, path, method)
@@ -110,9 +113,6 @@ def _closed(
     if model == "geometric":
         return geometric(mask, grid, path, pixel_integration=average)
     if model == "separable":
-        factored = require_factored(mask, model)
-        if not has_few_terms(factored):
-            return separable_image(factored, grid, path, nodes=method.nodes if average else None)
         nodes = method.nodes or PIXEL_NODES
         return separable(mask, grid, path, pixel_integration=average, nodes=nodes)
     return paraxial(mask, path) if model == "paraxial" else closed_form(mask, path)

@@ -117,15 +117,15 @@ def _richardson(
 
 def _field_rounding(mask: AbstractFactoredMask, grid: Grid, path: Path) -> float:
     """Relative error that the precision leaves in the field's square, from some of its pixels."""
-    precision = precision_of(grid.pitch)
+    if precision_of(grid.pitch) == "float64":
+        return SAMPLED_ROUNDING["float64"]
     points, method = _spread_pixels(grid), PsfMethod("separable")
     found: dict[Precision, np.ndarray] = {}
     with allow("float64", mask, points, path):
         for kind in PRECISIONS:
             found[kind] = np.asarray(_field(*cast((mask, points, path), kind), method), float)
     size = float(np.linalg.norm(found["float64"])) or 1.0
-    off = _MARGIN * float(np.linalg.norm(found["float32"] - found["float64"])) / size
-    return off if precision == "float32" else SAMPLED_ROUNDING[precision]
+    return _MARGIN * float(np.linalg.norm(found["float32"] - found["float64"])) / size
 
 
 def _spread_pixels(grid: Grid) -> SparseGrid:

@@ -56,12 +56,11 @@ def axis_fields(
     b = path.fresnel_curvature
     edges, values = factors.edges, factors.values
     if factors.curvatures is None:
-        offset = edges[:, None] - x
-        lit = (offset[:-1] < 0) & (offset[1:] >= 0)  # as the waves' own steps have it
+        lit, edge_waves = cell_shadows(edges, path, x)
         steps = jnp.diff(values, axis=1, prepend=0, append=0)
         root_half = np.sqrt(0.5)
-        shadow = product(values, as_complex(lit.astype(x.dtype)))
-        waves = product(steps, edge_wave(b, offset))
+        shadow = product(values, lit)
+        waves = product(steps, edge_waves)
         return (shadow * (1 + 1j) + waves) * jnp.asarray(root_half, values.dtype)
     g = factors.curvatures[:, None, None]
     origins = 0.0 if factors.origins is None else factors.origins
@@ -69,6 +68,15 @@ def axis_fields(
     field = chirp_integral(g, b, factors.from_origins(x), lower, upper)
     field = (values[:, None] * field).sum(axis=-1)
     return field * as_complex(jnp.sqrt(path.magnification / (path.wavelength * path.distance)))
+
+
+def cell_shadows(
+    edges: Float[Array, " edge"], path: Path, x: Float[Array, " n"]
+) -> tuple[Complex[Array, "cell n"], Complex[Array, "edge n"]]:
+    """Of constant cells: where each is lit, and the wave of each edge (`edge_wave`)."""
+    offset = edges[:, None] - x
+    lit = (offset[:-1] < 0) & (offset[1:] >= 0)  # as the waves' own steps have it
+    return as_complex(lit.astype(x.dtype)), edge_wave(path.fresnel_curvature, offset)
 
 
 def separable(

@@ -8,11 +8,10 @@ import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from thincam_jax._core.grids import Grid
-from thincam_jax._core.precision import as_complex, product
+from thincam_jax._core.precision import product
 from thincam_jax.lensless.masks.base import AbstractFactoredMask, MaskTerms
-from thincam_jax.lensless.propagation.chirp import edge_wave
 from thincam_jax.lensless.propagation.path import Path
-from thincam_jax.lensless.propagation.separable import axis_fields
+from thincam_jax.lensless.propagation.separable import axis_fields, cell_shadows
 
 
 def separable_image(
@@ -81,10 +80,8 @@ def _cell_fields(
     edges: Float[Array, " edge"], path: Path, x: Float[Array, " n"]
 ) -> Complex[Array, "cell n"]:
     """Field of each open cell alone, along one axis; see `axis_fields`."""
-    offset = edges[:, None] - x
-    lit = (offset[:-1] < 0) & (offset[1:] >= 0)
-    waves = edge_wave(path.fresnel_curvature, offset)
-    field = as_complex(lit.astype(x.dtype)) * (1 + 1j) + waves[:-1] - waves[1:]
+    lit, waves = cell_shadows(edges, path, x)
+    field = lit * (1 + 1j) + waves[:-1] - waves[1:]
     return field * jnp.asarray(np.sqrt(0.5), field.dtype)
 
 
