@@ -46,7 +46,7 @@ def own_psf(size, model, precision, **how):
 def test_errors_agree_with_a_recomputation(rows):
     exact = own_psf(SIZE, "separable", "float64")
     run = [row for row in rows if row.status == "run"]
-    assert {row.model for row in run} == set(tc.MODELS)
+    assert {row.model for row in run} == set(tc.MODELS) - {"radial"}
     for row in run:
         if row.oversampling == 3 and row.precision == "float64":
             continue  # for the time it takes

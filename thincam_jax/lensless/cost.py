@@ -10,13 +10,15 @@ from dataclasses import dataclass
 from thincam_jax._core.grids import Grid, fast_shape
 from thincam_jax._core.precision import itemsize_of
 from thincam_jax.lensless.masks.base import AbstractFactoredMask, AbstractMask, term_count
+from thincam_jax.lensless.masks.pinhole import RadialMask
 from thincam_jax.lensless.method import PIXEL_NODES, SAMPLED, PsfMethod, has_few_terms
 from thincam_jax.lensless.propagation.angular_spectrum import padded_shape
+from thincam_jax.lensless.propagation.radial import profile_length
 
 # Real operations of one chirp integral (both edges in both their forms, with their phasors), of the
-# wave of one edge, of one phasor, of one sample of a propagated field besides its transforms, and
-# of one summand of the Rayleigh-Sommerfeld integral.
-_CHIRP, _EDGE, _PHASOR, _WAVE, _SUMMAND = 1200, 250, 40, 100, 60
+# wave of one edge, of one phasor, of one sample of a propagated field besides its transforms, of
+# one summand of the Rayleigh-Sommerfeld integral, and of the field of one disc.
+_CHIRP, _EDGE, _PHASOR, _WAVE, _SUMMAND, _DISC = 1200, 250, 40, 100, 60, 1500
 # What any evaluation holds beside its arrays: its arguments and constants.
 _BASE = 4096
 # Samples of the sensor that the direct sum does at a time.
@@ -45,6 +47,8 @@ def psf_cost(mask: AbstractMask, grid: Grid, method: PsfMethod) -> Cost:
     itemsize = itemsize_of(method.float_type)
     if method.model in SAMPLED:
         flops, numbers = _sampled(grid.shape, method)
+    elif isinstance(mask, RadialMask) and method.model == "radial":
+        flops, numbers = _radial(mask, grid.shape, method)
     else:
         flops, numbers = _separable_sum(mask, grid.shape, method)
     return Cost(float(flops), _BASE + itemsize * (int(numbers) + rows * columns))
@@ -60,6 +64,14 @@ def _sampled(shape: tuple[int, int], method: PsfMethod) -> tuple[float, float]:
     points = math.prod(fine if method.pixel_integration else shape)
     held = math.prod(plane) * (2.1 * min(_BATCH, points) + 3) * 2
     return float(_SUMMAND * math.prod(plane) * points), held
+
+
+def _radial(mask: RadialMask, shape: tuple[int, int], method: PsfMethod) -> tuple[float, float]:
+    """Of the discs' fields at the samples of the profile, or at all points of all pixels."""
+    pixels, points = math.prod(shape), (method.nodes or 1) if method.pixel_integration else 1
+    at_once = profile_length(shape, method.oversampling) if method.oversampling else pixels
+    discs = at_once * (1 if method.oversampling else points)
+    return float(_DISC * mask.rings.size * discs + _EDGE * pixels * points), 30.0 * at_once
 
 
 def _separable_sum(mask, shape: tuple[int, int], method: PsfMethod) -> tuple[float, float]:

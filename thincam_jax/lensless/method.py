@@ -17,9 +17,16 @@ from thincam_jax.lensless.masks.base import (
     zone_orders,
 )
 from thincam_jax.lensless.masks.phase import PhaseMask
+from thincam_jax.lensless.masks.pinhole import RadialMask
 
 Model = Literal[
-    "geometric", "paraxial", "closed_form", "separable", "angular_spectrum", "rayleigh_sommerfeld"
+    "geometric",
+    "paraxial",
+    "closed_form",
+    "separable",
+    "radial",
+    "angular_spectrum",
+    "rayleigh_sommerfeld",
 ]
 MODELS: tuple[Model, ...] = get_args(Model)
 # Those of unbounded chirps, which cannot hold an edge or the pixels of a display; and those that
@@ -38,9 +45,9 @@ _MOST_TERMS = 128
 # Points a pixel for its average then: 1 to 4 % off where a pixel holds some ten fringes.
 LATTICE_POINTS = 21
 _LATTICE = (
-    "pixel averages of a mask of {} terms are taken at "
+    "pixel averages of a mask of {} are taken at "
     f"{LATTICE_POINTS} points a pixel, 1 to 4 % off where cells are fine; "
-    "PsfMethod('separable', nodes=144) is five times closer, and takes seven times as long"
+    "PsfMethod({!r}, nodes=144) is five times closer, and takes seven times as long"
 )
 
 
@@ -53,11 +60,25 @@ def has_few_terms(mask: AbstractMask) -> TypeGuard[AbstractFactoredMask]:
     return isinstance(mask, AbstractFactoredMask) and term_count(mask).terms <= _MOST_TERMS
 
 
+def exact_model(mask: AbstractMask) -> Model | None:
+    """The model that has the mask's Fresnel field exactly; None of masks that are sampled."""
+    if isinstance(mask, RadialMask):
+        return "radial"
+    return "separable" if isinstance(mask, AbstractFactoredMask) else None
+
+
+def parts_of(mask: AbstractMask) -> str:
+    """Number of those whose fields an exact model adds up, in words."""
+    if isinstance(mask, AbstractFactoredMask):
+        return f"{term_count(mask).terms} terms"
+    return f"{mask.rings.size} rings" if isinstance(mask, RadialMask) else "samples"
+
+
 def models_of(mask: AbstractMask) -> tuple[Model, ...]:
     """The models that can represent the mask."""
     fits = {
         **dict.fromkeys(UNBOUNDED, zone_orders(mask) is not None),
-        "separable": isinstance(mask, AbstractFactoredMask),
+        **{model: exact_model(mask) == model for model in ("separable", "radial")},
         "geometric": not mask.pure_phase,
     }
     return tuple(model for model in MODELS if fits.get(model, True))
@@ -67,19 +88,20 @@ def models_of(mask: AbstractMask) -> tuple[Model, ...]:
 class PsfMethod:
     """Method for computing a PSF: a model with its settings, in place of the model's name.
 
-    - `model`: "geometric", "paraxial", "closed_form", "separable", "angular_spectrum" or
-      "rayleigh_sommerfeld"; each is documented in `thincam_jax.lensless.propagation`.
+    - `model`: "geometric", "paraxial", "closed_form", "separable", "radial", "angular_spectrum" or
+      "rayleigh_sommerfeld"; each is documented in `thincam_jax.lensless.propagation`. Of rings,
+      "separable", the default, is "radial".
     - `precision`: "float32" or "float64", in which to compute; the result comes back in the
       camera's own, which is also the default. Double precision needs no setting of JAX's.
     - `pixel_integration`: average over each pixel, where the function that is called would not.
     - `oversampling`: samples per pixel of the sampled models (odd; default 1, 3 for pixel
-      averages, and more where a phase mask's cells are smaller than that); the others are closed
-      forms and take none.
+      averages, and more where a phase mask's cells are smaller than that), and of the profile that
+      "radial" interpolates (by default counted); the others are closed forms and take none.
     - `mask_shape`: pixels of the plane on which the sampled models hold the mask; by default the
       smallest that does. Inside jit and grad, where the mask's size is not known, it is the
       sensor's: give it there if the mask is wider than the sensor.
     - `nodes`: of the pixel average of "separable"; by default counted. Gauss nodes an axis, or,
-      for a mask of more than 128 terms, points a pixel (21 by default).
+      for a mask of more than 128 terms and for "radial", points a pixel (21 by default).
 
     ```python
     import thincam_jax as tc
@@ -104,7 +126,7 @@ class PsfMethod:
             checks.choice("precision", self.precision, PRECISIONS)
         if self.model in SAMPLED:
             require_odd(self.samples)
-        elif self.oversampling is not None or self.mask_shape is not None:
+        elif self.mask_shape or (self.oversampling is not None and self.model != "radial"):
             raise ValueError(
                 f"model {self.model!r} is a closed form: leave oversampling and mask_shape out"
             )
@@ -135,11 +157,14 @@ def psf_method(
     """The method with the defaults for a mask and grid in place of None."""
     method = as_method(model, pixel_integration)
     method = replace(method, precision=method.precision or precision_of(grid.pitch))
+    if method.model == "separable" and isinstance(mask, RadialMask):
+        method = replace(method, model="radial")
     if method.model not in SAMPLED:
-        counted = method.nodes or method.model != "separable" or not method.pixel_integration
-        if counted or not isinstance(mask, AbstractFactoredMask) or has_few_terms(mask):
+        counted = method.nodes or method.model != exact_model(mask) or not method.pixel_integration
+        if counted or has_few_terms(mask):
             return method
-        warnings.warn(_LATTICE.format(term_count(mask).terms), AccuracyWarning, stacklevel=3)
+        text = _LATTICE.format(parts_of(mask), method.model)
+        warnings.warn(text, AccuracyWarning, stacklevel=3)
         return replace(method, nodes=LATTICE_POINTS)
     least = 3 if method.pixel_integration else 1
     return replace(

@@ -30,6 +30,7 @@ from thincam_jax.lensless.propagation.closed_form import closed_form, in_focus
 from thincam_jax.lensless.propagation.geometric import geometric
 from thincam_jax.lensless.propagation.paraxial import paraxial
 from thincam_jax.lensless.propagation.path import Path
+from thincam_jax.lensless.propagation.radial import profile_samples, radial
 from thincam_jax.lensless.propagation.rayleigh_sommerfeld import rayleigh_sommerfeld
 from thincam_jax.lensless.propagation.separable import pixel_nodes, separable
 from thincam_jax.lensless.propagation.separable_field import separable_image
@@ -52,9 +53,10 @@ def psf(
 
     - `wavelength`: λ, mm.
     - `object_distance`: t, mm; the point lies on the axis. Infinity is a plane wave.
-    - `model`: "geometric", "paraxial", "closed_form", "separable", "angular_spectrum" or
-      "rayleigh_sommerfeld"; each is documented in `thincam_jax.lensless.propagation`. A
-      `PsfMethod` sets the precision and the samples of a model, too.
+    - `model`: "geometric", "paraxial", "closed_form", "separable" (of rings "radial"),
+      "angular_spectrum" or "rayleigh_sommerfeld"; each is documented in
+      `thincam_jax.lensless.propagation`. A `PsfMethod` sets the precision and the samples of a
+      model, too.
     - `pixel_integration`: average over each pixel in place of the value at its centre.
     - `grid`: where to evaluate; the sensor's pixels by default.
 
@@ -101,6 +103,8 @@ def _irradiance(
         if method.model == "separable" and not has_few_terms(mask):
             nodes = method.nodes if method.pixel_integration else None
             return separable_image(require_factored(mask, "separable"), grid, path, nodes=nodes)
+        if method.model == "radial":
+            return radial(mask, grid, path, method)
         return _closed(mask, grid, path, method)
     sampled = angular_spectrum if method.model == "angular_spectrum" else rayleigh_sommerfeld
     return sampled(mask, grid, path, method)
@@ -154,6 +158,8 @@ def _evaluate(function, mask: AbstractMask, grid: Grid, path: Path, method: PsfM
     require_phase_sampling(mask, grid, path, method)
     if method.model == "separable" and method.pixel_integration and method.nodes is None:
         method = replace(method, nodes=pixel_nodes(mask, grid, path, method.float_type))
+    if method.model == "radial" and method.oversampling is None:
+        method = replace(method, oversampling=profile_samples(mask, grid, path, method))
     with allow(method.float_type, mask, grid, path):
         if method.precision != own:
             mask, grid, path = cast((mask, grid, path), method.float_type)

@@ -26,7 +26,7 @@ from thincam_jax.lensless.accuracy.select import predicted_error, probe_of
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.cost import Cost, psf_cost
 from thincam_jax.lensless.exposures import Exposure
-from thincam_jax.lensless.method import MODELS, SAMPLED, Model, PsfMethod, psf_method
+from thincam_jax.lensless.method import SAMPLED, Model, PsfMethod, models_of, psf_method
 from thincam_jax.lensless.propagation.closed_form import in_focus
 from thincam_jax.lensless.psf import psf
 from thincam_jax.studies.study import Study
@@ -118,7 +118,7 @@ def candidates(camera: LenslessCamera, pixel_integration: bool) -> list[tuple[Ps
         psf_method(
             mask, grid, PsfMethod(model, precision, pixel_integration, oversampling=oversampling)
         )
-        for model in MODELS
+        for model in models_of(mask)
         for oversampling in (OVERSAMPLINGS if model in SAMPLED else (None,))
         for precision in PRECISIONS
     ]

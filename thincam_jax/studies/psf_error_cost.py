@@ -21,7 +21,7 @@ from thincam_jax.imaging.scene import Spectrum
 from thincam_jax.lensless.cost import psf_cost
 from thincam_jax.lensless.exposures import Exposure
 from thincam_jax.lensless.forward import imaging_operator, project, projected_shape
-from thincam_jax.lensless.method import MODELS, Model, PsfMethod, psf_method
+from thincam_jax.lensless.method import Model, PsfMethod, models_of, psf_method
 from thincam_jax.reconstruction import Reconstruction
 from thincam_jax.studies.evaluate import evaluate, field_shape, reconstructor
 from thincam_jax.studies.psf_accuracy import (
@@ -111,7 +111,8 @@ class CaptureErrors:
     def __init__(self, case: Case):
         self.case, self.rows = case, list[CaptureError]()
         self.work = [
-            Step(f"capture: {words(model)}", partial(self._add, model)) for model in MODELS
+            Step(f"capture: {words(model)}", partial(self._add, model))
+            for model in models_of(case.study.mask)
         ]
 
     @cached_property
@@ -243,7 +244,7 @@ class ReconstructionErrors:
         self.work: list[Step] = []
         if case.skipped is None:
             self.work.append(Step(f"captures for {case.method.name}", self._capture))
-            for model in MODELS:
+            for model in models_of(case.study.mask):
                 step = partial(self._add_model, model)
                 self.work.append(Step(f"reconstruction: {words(model)}", step))
             for quantity in QUANTITIES:

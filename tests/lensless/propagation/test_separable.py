@@ -229,7 +229,7 @@ def test_energy(object_distance):
 
 def test_needs_separable_terms():
     mask = tc.RadialMask([1.0], 0.1)
-    with pytest.raises(TypeError, match="RadialMask use 'angular_spectrum'"):
+    with pytest.raises(TypeError, match="RadialMask use 'radial', 'angular_spectrum'"):
         separable(mask, tc.Grid((3, 4), 0.1), Path(500e-6, 5.0))
 
 

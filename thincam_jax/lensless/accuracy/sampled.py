@@ -8,8 +8,9 @@ that fall with the samples as 1/n at worst, that of hard edges, so that (Richard
 The part's rim is an edge which the whole mask has not there, and has more of it: more is predicted
 than found.
 
-Of a mask of many terms the field is exact, and the pixels' average is sampled: on a lattice of n
-points, whose error falls as 1/n, too. Some rows and columns of the sensor show that of the whole.
+Of a mask of many terms or of rings the field is exact, and the pixels' average is sampled: on a
+lattice of n points, whose error falls as 1/n, too. Some rows and columns of the sensor show that
+of the whole.
 
 Samples do not widen the window, whose band limit cuts the waves far behind a small mask: some 0.5 %
 of the PSF at a Fresnel number w²/(λd) of 6, 10 % at 1. That is told by rows and columns of the
@@ -36,7 +37,7 @@ from thincam_jax._core.precision import (
 from thincam_jax.lensless.accuracy.lines import SparseGrid
 from thincam_jax.lensless.accuracy.probe import spread
 from thincam_jax.lensless.masks.base import AbstractFactoredMask, AbstractMask
-from thincam_jax.lensless.method import LATTICE_POINTS, PsfMethod, psf_method
+from thincam_jax.lensless.method import LATTICE_POINTS, PsfMethod, exact_model, psf_method
 from thincam_jax.lensless.propagation.angular_spectrum import (
     PADDING,
     angular_spectrum,
@@ -46,6 +47,7 @@ from thincam_jax.lensless.propagation.angular_spectrum import (
     propagate,
 )
 from thincam_jax.lensless.propagation.path import Path
+from thincam_jax.lensless.propagation.radial import PROFILE_ERROR, profile_samples, radial
 from thincam_jax.lensless.propagation.separable_field import separable_image
 from thincam_jax.lensless.sampling import samples_needed
 
@@ -70,12 +72,16 @@ def sampled_errors(
 ) -> Iterator[tuple[PsfMethod, float]]:
     """Methods with ever more samples, and the error predicted of each.
 
-    They are those of `angular_spectrum`, or of `separable` for a mask of (many) terms.
+    They are those of `angular_spectrum`, or of the exact model where the mask has one.
     `norm`: in which PSFs of the middle are compared.
     """
-    if isinstance(mask, AbstractFactoredMask):
+    if model := exact_model(mask):
         rounding = _field_rounding(mask, grid, path)
-        exact = PsfMethod("separable", precision_of(grid.pitch), pixel_integration)
+        exact = PsfMethod(model, precision_of(grid.pitch), pixel_integration)
+        if model == "radial":
+            rounding += PROFILE_ERROR
+            many = replace(exact, nodes=LATTICE_POINTS) if pixel_integration else exact
+            exact = replace(exact, oversampling=profile_samples(mask, grid, path, many))
         if not pixel_integration:
             yield exact, rounding
             return
@@ -115,7 +121,7 @@ def _richardson(
         before = after
 
 
-def _field_rounding(mask: AbstractFactoredMask, grid: Grid, path: Path) -> float:
+def _field_rounding(mask: AbstractMask, grid: Grid, path: Path) -> float:
     """Relative error that the precision leaves in the field's square, from some of its pixels."""
     if precision_of(grid.pitch) == "float64":
         return SAMPLED_ROUNDING["float64"]
@@ -135,7 +141,10 @@ def _spread_pixels(grid: Grid) -> SparseGrid:
 
 
 @jax.jit(static_argnames="method")
-def _field(mask: AbstractFactoredMask, grid: Grid, path: Path, method: PsfMethod):
+def _field(mask: AbstractMask, grid: Grid, path: Path, method: PsfMethod):
+    if not isinstance(mask, AbstractFactoredMask):
+        average = method.nodes is not None
+        return radial(mask, grid, path, PsfMethod("radial", None, average, nodes=method.nodes))
     return separable_image(mask, grid, path, nodes=method.nodes)
 
 

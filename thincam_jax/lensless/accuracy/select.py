@@ -16,14 +16,16 @@ from thincam_jax.lensless.accuracy.sampled import sampled_errors
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.cost import Cost, psf_cost
 from thincam_jax.lensless.digits import held_in_single
-from thincam_jax.lensless.masks.base import AbstractFactoredMask, AbstractMask, term_count
+from thincam_jax.lensless.masks.base import AbstractFactoredMask, AbstractMask
 from thincam_jax.lensless.method import (
     PIXEL_NODES,
     Model,
     PsfMethod,
     as_method,
+    exact_model,
     has_few_terms,
     models_of,
+    parts_of,
     psf_method,
 )
 
@@ -89,7 +91,7 @@ def select_model(
 
     Masks without separable terms, such as phase masks, have no exact PSF. For them the choice is
     among samples a pixel of `angular_spectrum`, by what more of them change in the mask's middle;
-    for masks of more than 128 terms, whose field `separable` has exactly, among points of the
+    for masks of more than 128 terms and of rings, whose field is exact, among points of the
     pixel's average (`thincam_jax.lensless.accuracy.sampled`). How far Fresnel's approximation is
     from exact diffraction is not estimated for these.
 
@@ -178,7 +180,7 @@ def _select_sampled(
         if error <= tolerance:
             break
     chosen, method = considered[-1], considered[-1].method
-    many = isinstance(mask, AbstractFactoredMask)
+    many = exact_model(mask) is not None
     left = f"{chosen.predicted_error:.1e}"
     reasons = (
         _many_terms(mask, chosen)
@@ -200,13 +202,13 @@ def _select_sampled(
     )
 
 
-def _many_terms(mask: AbstractFactoredMask, chosen: Prediction) -> tuple[str, ...]:
-    """The reasons for a mask of many terms."""
+def _many_terms(mask: AbstractMask, chosen: Prediction) -> tuple[str, ...]:
+    """The reasons for a mask of many terms or of rings."""
     averaged = ""
     if points := chosen.method.nodes:
         averaged = f", a pixel's average by {points} points: {chosen.predicted_error:.1e}"
     return (
-        f"'separable' adds up the field of the mask's {term_count(mask).terms} terms{averaged}",
+        f"{exact_model(mask)!r} adds up the field of the mask's {parts_of(mask)}{averaged}",
         "errors are counted from the exact Fresnel field",
     )
 

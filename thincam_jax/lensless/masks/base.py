@@ -175,6 +175,7 @@ def _count(structure: Any, leaves: tuple) -> TermCount:
 def other_models(mask: AbstractMask) -> str:
     """The wave models that take the mask, in words."""
     exact = "'separable', " if isinstance(mask, AbstractFactoredMask) else ""
+    exact = "'radial', " if hasattr(mask, "rings") else exact
     return f"{exact}'angular_spectrum' or 'rayleigh_sommerfeld'"
 
 

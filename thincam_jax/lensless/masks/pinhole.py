@@ -1,5 +1,7 @@
 """Openings: the pinhole, square or round, and the round code of rings."""
 
+from typing import Any
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -46,34 +48,56 @@ class Pinhole(AbstractFactoredMask):
         return MaskTerms(one[0], columns if self.height is None else rows, columns)
 
 
+def _widths(name: str, value: Any) -> checks.Checked:
+    """One width, or an array of them, mm."""
+    if np.ndim(value) == 0:
+        return checks.positive(name, value, "mm")
+    return checks.positive_all(name, checks.finite(name, value, "mm", shape=np.shape(value)), "mm")
+
+
 class RadialMask(AbstractMask):
     r"""A code of concentric rings, the same in all directions; of one value, a round pinhole.
 
-    No sum of few products: for `angular_spectrum` and `rayleigh_sommerfeld`. On the axis behind an
-    opening of radius a lies the irradiance :math:`4\sin^2(\pi a^2/(2\lambda d))`.
+    With rings between the radii √(nπ/β) it is a round binary zone plate. No sum of few products:
+    its exact PSF is that of `radial`. On the axis behind an opening of radius a lies the irradiance
+    :math:`4\sin^2(\pi a^2/(2\lambda d))`.
 
     **Arguments**
 
     - `rings`: amplitude transmittance of each ring, 0 to 1, from the middle outwards.
-    - `ring`: width of a ring, mm.
+    - `ring`: width of a ring, mm; or of each, from the middle outwards.
     - `centre`: (y, x) of the mask's centre, mm.
     """
 
     rings: Float[Array, " ring"] = eqx.field(converter=quantity(check=checks.transmittances))
-    ring: Float[Array, ""] = eqx.field(converter=quantity("mm", positive=True))
+    ring: Float[Array, "*ring"] = eqx.field(converter=quantity("mm", check=_widths))
     centre: Float[Array, "2"] = eqx.field(
         default=(0, 0), converter=quantity("mm", shape=(2,)), kw_only=True
     )
 
+    def __check_init__(self):
+        if self.ring.shape not in ((), self.rings.shape):
+            raise ValueError(
+                f"ring has shape {self.ring.shape}; give one width, or one for each of "
+                f"{self.rings.size} rings"
+            )
+
+    @property
+    def radii(self) -> Float[Array, " ring"]:
+        """Outer radius of each ring, mm."""
+        if self.ring.ndim:
+            return jnp.cumsum(self.ring)
+        return jnp.arange(1, self.rings.size + 1, dtype=self.ring.dtype) * self.ring
+
     @property
     def extent(self) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        side = 2 * self.rings.size * self.ring
+        side = 2 * self.radii[-1]
         return side, side
 
     @property
     def finest_frequency(self) -> Float[Array, ""]:
         """Of rings that alternate, cycles/mm."""
-        return 0.5 / self.ring
+        return 0.5 / jnp.min(self.ring)
 
     def sample(self, grid: Grid, wavelength: Number | None = None) -> Float[Array, "y x"]:
         """Every sample's mean over its square, exactly."""
@@ -83,8 +107,8 @@ class RadialMask(AbstractMask):
         )
         total = jnp.zeros(grid.shape, self.ring.dtype)
         steps = -jnp.diff(self.rings, append=0)
-        for number in range(self.rings.size):
-            area = _disc_area((number + 1) * self.ring, y[:, None], x)
+        for number, radius in enumerate(self.radii):
+            area = _disc_area(radius, y[:, None], x)
             total = total + steps[number] * jnp.diff(jnp.diff(area, axis=0), axis=1)
         return total / grid.pitch**2
 

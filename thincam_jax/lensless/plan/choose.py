@@ -52,8 +52,11 @@ def _choose_samples(seen: SeenScene, tolerance: float) -> tuple[PsfMethod, float
     single = 2 * seen.crop * SAMPLED_ROUNDING["float32"] <= tolerance
     precision: Precision = "float32" if single else "float64"
     tried = [_samples_at(seen, corner, precision, tolerance) for corner in seen.corners]
-    method = max((method for method, _ in tried), key=lambda m: (m.samples, m.nodes or 0))
-    method = seen.sampled(method.samples) if method.model == "angular_spectrum" else method
+    method = max((method for method, _ in tried), key=lambda m: (m.nodes or 0, m.samples))
+    if method.oversampling:
+        most = max(method.samples for method, _ in tried)
+        sampled = method.model == "angular_spectrum"
+        method = seen.sampled(most) if sampled else replace(method, oversampling=most)
     return replace(method, precision=precision), max(error for _, error in tried)
 
 

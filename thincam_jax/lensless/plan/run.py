@@ -16,7 +16,7 @@ from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.cost import Cost
 from thincam_jax.lensless.forward import project, projected_shape, spectral_psf
 from thincam_jax.lensless.masks.fza import FresnelZoneAperture
-from thincam_jax.lensless.method import PsfMethod
+from thincam_jax.lensless.method import SAMPLED, PsfMethod
 from thincam_jax.lensless.plan.effects import Effect
 
 # How far a camera's numbers may be from the plan's, relative.
@@ -74,7 +74,7 @@ class Plan:
     def __str__(self) -> str:
         method = self.method
         average = "averaged over pixels" if method.pixel_integration else "at the pixels' centres"
-        if method.oversampling is not None:
+        if method.model in SAMPLED:
             average = f"{method.samples}×{method.samples} samples a pixel"
         planes, colours = len(self.scene_distances), len(self.scene_wavelengths)
         shares = self.shares

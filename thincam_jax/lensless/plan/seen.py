@@ -13,11 +13,11 @@ from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.cost import Cost, convolution_cost, psf_cost
 from thincam_jax.lensless.digits import held_in_single
 from thincam_jax.lensless.forward import project, projected_shape
-from thincam_jax.lensless.masks.base import AbstractFactoredMask
 from thincam_jax.lensless.method import (
     CLOSED,
     Model,
     PsfMethod,
+    exact_model,
     has_few_terms,
     models_of,
     psf_method,
@@ -86,8 +86,7 @@ class SeenScene:
     @functools.cached_property
     def rough(self) -> PsfMethod:
         """Estimate of the capture's energy."""
-        factored = isinstance(self.camera.mask, AbstractFactoredMask)
-        return _ROUGH if factored else self.sampled(1)
+        return _ROUGH if exact_model(self.camera.mask) else self.sampled(1)
 
     def sampled(self, least: int) -> PsfMethod:
         """`angular_spectrum` with the samples that hold the mask for all light, or with more."""
