@@ -71,7 +71,7 @@ def test_what_has_no_terms_is_refused():
     two = tc.Scene(scene().planes * 2, 550 * nm)
     with pytest.raises(ValueError, match="the scene has 2 planes; give one"):
         tc.separable_operator(camera(), two)
-    with pytest.raises(TypeError, match="scene is a ndarray; give"):
+    with pytest.raises(TypeError, match="scene is an array .*; give Scene"):
         tc.separable_operator(camera(), IMAGE)
 
 

@@ -289,9 +289,7 @@ def _each(value, count: int) -> list:
 
 def as_real(capture: Any) -> Float[Array, "..."]:
     """A capture as floating-point numbers, raw counts unscaled; complex numbers are refused."""
-    capture = jnp.asarray(capture)
-    if jnp.issubdtype(capture.dtype, jnp.complexfloating):
-        raise TypeError(f"a capture is {capture.dtype}; give real numbers")
+    capture = checks.array("a capture", capture)
     return capture if jnp.issubdtype(capture.dtype, jnp.floating) else capture.astype(float)
 
 

@@ -138,6 +138,8 @@ class Recording(Module):
                 "tc.Psfs(…), or operators"
             )
         self.imaging_model = imaging_model
+        if not isinstance(captures, list | tuple) and np.ndim(captures) == 0:
+            raise TypeError(f"captures is {checks.shown(captures)}; give an array for each camera")
         self.captures = tuple(as_real(c) for c in captures)
         self._check_captures(getattr(captures, "shape", [c.shape for c in self.captures]))
         self.noise_variance = noise_variance
@@ -247,11 +249,13 @@ class Recording(Module):
         """Require finite values in valid pixels."""
         for number, (capture, valid) in enumerate(zip(*self._masked_captures(), strict=True)):
             known = not checks.is_traced(capture) and not checks.is_traced(valid)
-            if known and not bool(jnp.isfinite(capture).all()):
+            largest = jnp.max(jnp.abs(capture))  # NaN, where one is
+            if known and not bool(jnp.isfinite(largest)):
                 raise ValueError(
                     f"captures[{number}] holds NaN or infinity; repair it, or exclude such pixels "
                     "with valid=numpy.isfinite(captures)"
                 )
+            checks.scaled(f"captures[{number}]", largest)
 
     def _has_channel(self) -> bool:
         """Whether the captures have an axis before those of the detector."""
