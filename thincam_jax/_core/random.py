@@ -13,9 +13,7 @@ def random_key(key: Key) -> PRNGKeyArray:
     """The key itself, or that of a seed, `jax.random.key(seed)`."""
     if isinstance(key, int | np.integer) and not isinstance(key, bool) and 0 <= key < 2**64:
         return jax.random.key(key)
-    is_key = isinstance(key, jax.Array) and (
-        jax.numpy.issubdtype(key.dtype, jax.dtypes.prng_key) or key.dtype == "uint32"
-    )
-    if not is_key:
-        raise TypeError(f"key is {shown(key)}; give a seed, 0 or more, or jax.random.key(seed)")
-    return key
+    if isinstance(key, jax.Array):
+        if jax.numpy.issubdtype(key.dtype, jax.dtypes.prng_key) or key.dtype == "uint32":
+            return key
+    raise TypeError(f"key is {shown(key)}; give a seed, 0 or more, or jax.random.key(seed)")

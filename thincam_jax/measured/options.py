@@ -92,7 +92,7 @@ class Preparation:
                     )
         for name, high in _LARGEST.items():
             value = getattr(self, name)
-            number = isinstance(value, numbers.Real) and 0 < value <= high
+            number = isinstance(value, numbers.Real) and 0 < float(value) <= high
             if value is not None and not number:
                 given = checks.shown(value)
                 raise MeasurementError(f"{name} = {given}: give a number above 0, up to {high:g}")
