@@ -34,8 +34,8 @@ LONGEST_LIGHT, _IN_METRES = 0.1, (1.5e-7, 2.5e-6)
 _LARGEST_PITCH, _SMALLEST_PITCH = 1.0, 1e-4
 # Of what has a unit.
 _LEAST, _MOST = 1e-12, 1e12
-# Of XLA's indices; of the pixels along a side.
-_LARGEST_COUNT, _LARGEST_SIDE = 2**31 - 1, 10**7
+# Of XLA's indices; of the pixels along a side, and of the cells.
+_LARGEST_COUNT, _LARGEST_SIDE, _MOST_CELLS = 2**31 - 1, 10**12, 10**7
 # Of the largest value of an image.
 _LEAST_SCALE = 1e-15
 # Units of plain ratios, which nobody writes.
@@ -303,7 +303,8 @@ def whole(name: str, value: Any, least: int, most: int | None = None) -> int:
 def at_least_one(counts: dict[str, int]) -> None:
     """Refuses the first of the named counts that is below 1."""
     for name, number in counts.items():
-        whole(name, number, 1)
+        if not isinstance(number, int | np.integer) or number < 1:
+            raise ValueError(f"{name} = {shown(number)}; give at least 1")
 
 
 def whole_cells(name: str, side: Any, cell_name: str, cell: Any) -> int:
@@ -311,10 +312,10 @@ def whole_cells(name: str, side: Any, cell_name: str, cell: Any) -> int:
     side = float(positive(name, side, "mm"))
     cell = float(positive(cell_name, cell, "mm"))
     cells = round(side / cell)
-    if cells > _LARGEST_SIDE:
+    if cells > _MOST_CELLS:
         raise ValueError(
             f"{name} = {side:g} mm has {cells} cells of {cell_name} = {cell:g} mm; give at most "
-            f"{_LARGEST_SIDE}"
+            f"{_MOST_CELLS}"
         )
     rounding = 1e-4 * cell + 2.5e-7 * side  # both were rounded to single precision, it may be
     if cells < 1 or abs(cells * cell - side) > rounding:

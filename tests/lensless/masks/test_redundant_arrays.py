@@ -101,7 +101,7 @@ def test_tiles():
         (lambda: tc.ModifiedUniformlyRedundantArray(100, CELL), "order = 100 .* give 97 or 101$"),
         (lambda: tc.ModifiedUniformlyRedundantArray(3, CELL), "order = 3 .* give 5$"),
         (lambda: tc.ModifiedUniformlyRedundantArray(5, -CELL), "cell = -0.03 mm is not positive"),
-        (lambda: tc.ModifiedUniformlyRedundantArray(5, CELL, tiles=0), "tiles = 0: give a whole"),
+        (lambda: tc.ModifiedUniformlyRedundantArray(5, CELL, tiles=0), "tiles = 0; give at least"),
         (
             lambda: tc.UniformlyRedundantArray((11, 7), CELL),
             r"orders = \(11, 7\) .* give \(7, 5\) or \(13, 11\)$",
