@@ -33,8 +33,8 @@ SIZE = os.environ.get("THINCAM_SIZE", "full")  # "small": a smaller sensor, in s
 FIGURES = Path(os.environ.get("THINCAM_FIGURES", "runs/experiments")) / "simulated_rig"
 FIGURES.mkdir(parents=True, exist_ok=True)
 shape, pitch, side, electrons = {
-    "full": ((512, 512), 11 * um, 156, 260_000),
-    "small": ((112, 144), 33 * um, 80, 400_000),
+    "full": ((512, 512), 11 * um, 156, 2.6e5),
+    "small": ((112, 144), 33 * um, 80, 4e5),
 }[SIZE]
 
 # %% [markdown]

@@ -15,6 +15,8 @@ from commands.reconstruct import simulated
 import thincam_jax as tc
 from helpers import ROOT
 from thincam_jax import learn
+from thincam_jax.commands.kinds import load_experiment
+from thincam_jax.commands.learned.refocusing import build_camera
 from thincam_jax.imaging.metrics import psnr
 from thincam_jax.units import nm, um
 
@@ -218,7 +220,7 @@ def test_learned_thesis_page(monkeypatch):
         script = runpy.run_path(str(ROOT / "docs/thesis_refocusing.py"))
         thesis, optics = script["thesis_camera"], script["optics"]
         path = ROOT / "configs/learned_refocus.yaml"
-        here = script["build_camera"](script["load_as"](script["LearnedConfig"], path))
+        here = build_camera(load_experiment(path, (), "train"))
         for camera, distances in ((thesis(256), script["THESIS"]), (here, (60.0, 120.0))):
             found = optics(camera, distances)
             row = [f"{found['depth of focus']:.0f} mm", f"{found['wider']:.2g}"]

@@ -17,8 +17,8 @@ from thincam_jax.lensless.method import psf_method
         ),
         ({"oversampling": 3}, "'separable' is a closed form: leave oversampling"),
         ({"oversampling": 4, "model": "angular_spectrum"}, "oversampling = 4: give an odd number"),
-        ({"oversampling": 0, "model": "angular_spectrum"}, "oversampling = 0: give an odd number"),
-        ({"oversampling": -1, "model": "rayleigh_sommerfeld"}, "oversampling = -1: give an odd"),
+        ({"oversampling": 0, "model": "angular_spectrum"}, "oversampling = 0: give a whole number"),
+        ({"oversampling": -1, "model": "rayleigh_sommerfeld"}, "oversampling = -1: give a whole"),
         ({"mask_shape": (3, 0), "model": "angular_spectrum"}, "mask_shape = .* of at least 1"),
     ],
 )

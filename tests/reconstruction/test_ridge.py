@@ -16,7 +16,7 @@ from thincam_jax.imaging.operators import Matrix, Separable
 from thincam_jax.imaging.targets.images import resize, sample_image
 from thincam_jax.reconstruction import ridge as module
 from thincam_jax.reconstruction.normal_equations import IterativeNormal, normal_equations
-from thincam_jax.reconstruction.problem import InverseProblem
+from thincam_jax.reconstruction.problem import InverseProblem, misfit
 from thincam_jax.reconstruction.ridge import (
     choose_precision,
     image_precision,
@@ -94,6 +94,17 @@ def test_new_values_are_not_compiled_anew_and_wrong_ones_are_refused():
     assert module._solve._cache_size() == before
     rig.refused("precision = 0.0 .* is not positive", lambda: few(problem, precision=0.0))
     rig.refused("ridge = 0.0 .* is not positive", lambda: tc.Ridge(0.0))
+
+
+@pytest.mark.parametrize("iterations", [3, 5000])
+def test_objectives_are_those_of_the_images(iterations):
+    """They follow from the right-hand side, for iterates before convergence, too."""
+    problem, _ = scenes.problem()
+    mean = jnp.asarray(np.random.default_rng(1).normal(size=problem.image_shape))
+    found = few(problem, mean=mean, iterations=iterations, tolerance=1e-10)
+    for image, progress in zip((mean, found.image), found.history, strict=True):
+        direct = misfit(problem, image).sum() + 0.05 * jnp.sum((image - mean) ** 2)
+        assert progress.objective == pytest.approx(float(direct), rel=1e-6)
 
 
 def test_nan_has_a_status():

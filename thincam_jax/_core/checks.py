@@ -15,6 +15,8 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Real
 
+from thincam_jax._core.text import shortened
+
 # What users give: checked below, which tells a wrong value in one line, and not by its type.
 if TYPE_CHECKING:
     Number = Real[ArrayLike, ""]
@@ -28,8 +30,14 @@ else:
 
 # mm: a longer wavelength was meant in nanometres or micrometres; light in metres has such numbers.
 LONGEST_LIGHT, _IN_METRES = 0.1, (1.5e-7, 2.5e-6)
-# mm: pixels of sensors are smaller.
-_LARGEST_PITCH = 1.0
+# mm: pixels of sensors are smaller, and larger; 5.5e-6 was meant in metres.
+_LARGEST_PITCH, _SMALLEST_PITCH = 1.0, 1e-4
+# Of what has a unit.
+_LEAST, _MOST = 1e-12, 1e12
+# Of XLA's indices; of the pixels along a side, and of the cells.
+_LARGEST_COUNT, _LARGEST_SIDE, _MOST_CELLS = 2**31 - 1, 10**12, 10**7
+# Of the largest value of an image.
+_LEAST_SCALE = 1e-15
 # Units of plain ratios, which nobody writes.
 _RATIOS = ("parts of one", "a ratio", "")
 _ON_HOST = ContextVar("on_host", default=False)
@@ -41,8 +49,11 @@ def is_traced(value: Any) -> bool:
 
 
 def _known(value: Any) -> np.ndarray | None:
-    """The value as a NumPy array, or None while it is traced."""
-    return None if is_traced(value) else np.asarray(value)
+    """The value as a NumPy array, or None while it is traced; of type object for what is none."""
+    try:
+        return None if is_traced(value) else np.asarray(value)
+    except ValueError:  # lists of different lengths
+        return np.asarray(None)
 
 
 @contextlib.contextmanager
@@ -55,12 +66,25 @@ def on_host() -> Iterator[None]:
         _ON_HOST.reset(token)
 
 
+def shown(value: Any) -> str:
+    """A value in a message: short, and in one line."""
+    if isinstance(value, np.ndarray | jax.Array) and np.size(value) > 4:
+        return f"an array of {value.dtype} of shape {value.shape}"
+    text = str(value) if isinstance(value, np.ndarray | np.generic | jax.Array) else repr(value)
+    return shortened(" ".join(text.split()))
+
+
+def _shape(value: Any) -> tuple[int, ...]:
+    known = _known(value)
+    return value.shape if known is None else known.shape
+
+
 def real(name: str, value: Any, unit: str, *, shape: tuple[int, ...] = ()) -> Checked:
     """A floating array of that shape, or TypeError/ValueError naming the argument."""
     known = _known(value)
     if known is not None:
         if known.dtype.kind not in "fiu":
-            raise TypeError(f"{name} = {value!r} is not a real number; give it in {unit}")
+            raise TypeError(f"{name} = {shown(value)} is not a real number; give it in {unit}")
         if np.isnan(known).any():
             raise ValueError(f"{name} is NaN; give a number in {unit}")
     array: Checked
@@ -93,8 +117,46 @@ def _require(array: Checked, holds: Callable[[np.ndarray], Any], message: str) -
     """The array, or ValueError with its value in the message; a traced one passes."""
     known = _known(array)
     if known is not None and not np.all(holds(known)):
-        raise ValueError(message.format(known))
+        raise ValueError(message.format(shown(known)))
     return array
+
+
+def numbers(name: str, value: Any, *, allow_complex: bool = False) -> np.ndarray:
+    """An array of known numbers, floating or whole; NaN and infinity pass."""
+    known = np.asarray(_known(value))
+    if known.dtype.kind not in ("fiubc" if allow_complex else "fiub"):
+        kind = "numbers" if allow_complex else "real numbers"
+        raise TypeError(f"{name} is {shown(value)}; give an array of {kind}")
+    return known
+
+
+def array(name: str, value: Any, *, allow_complex: bool = False) -> Array:
+    """`numbers` for JAX, of traced ones, too."""
+    if not is_traced(value) and not _has_traced(value):
+        numbers(name, value, allow_complex=allow_complex)
+    return jnp.asarray(value)
+
+
+def _has_traced(value: Any) -> bool:
+    """Whether a list holds numbers that are not known yet."""
+    return isinstance(value, list | tuple) and any(map(is_traced, jax.tree.leaves(value)))
+
+
+def points(name: str, value: Any) -> Array:
+    """Points (x, y) as the last axis of an array."""
+    array = finite(name, value, "mm", shape=_shape(value))
+    if array.shape[-1:] != (2,) or 0 in array.shape:
+        raise ValueError(f"{name} has shape {array.shape}; give points (x, y) in mm, (…, 2)")
+    return array
+
+
+def scaled(name: str, largest: Any) -> None:
+    """Refuses an array by its largest absolute value: its squares must be held by float32."""
+    if not is_traced(largest) and largest > 0 and not _LEAST_SCALE < largest < 1 / _LEAST_SCALE:
+        raise ValueError(
+            f"{name} has values up to {float(largest):.3g}; scale them to about 1, such as by "
+            "their largest"
+        )
 
 
 def finite(name: str, value: Any, unit: str, *, shape: tuple[int, ...] = ()) -> Checked:
@@ -113,7 +175,15 @@ def positive(
         message = f"{name} = {{}}{_after(unit)} is out of range; give 0 < {name} <= {most:g}"
         return _require(array, lambda known: known <= most, message)
     message = f"{name} is infinite; give a finite number{_within(unit)}"
-    return _require(array, lambda known: allow_infinity or np.isfinite(known), message)
+    _require(array, lambda known: allow_infinity or np.isfinite(known), message)
+    # Beyond, products of a few of them leave the range of single precision.
+    message = (
+        f"{name} = {{}}{_after(unit)} is out of range; give {_LEAST:g} to {_MOST:g}{_after(unit)}"
+    )
+    if unit not in ("mm", "rad/mm^2"):
+        return array
+    most = math.inf if allow_infinity else _MOST
+    return _require(array, lambda known: (known >= _LEAST) & (known <= most), message)
 
 
 def non_negative(name: str, value: Any, unit: str) -> Checked:
@@ -121,9 +191,9 @@ def non_negative(name: str, value: Any, unit: str) -> Checked:
     return _require(finite(name, value, unit), lambda known: known >= 0, message)
 
 
-def positive_all(name: str, value: Checked, unit: str) -> Checked:
+def positive_all(name: str, value: Any, unit: str) -> Checked:
     """An array of any shape with finite positive entries."""
-    array = finite(name, value, unit, shape=value.shape)
+    array = finite(name, value, unit, shape=_shape(value))
     message = f"{name} = {{}} {unit} must be positive; give {name} > 0 in {unit}"
     return _require(array, lambda known: known > 0, message)
 
@@ -137,12 +207,16 @@ def _within(unit: str) -> str:
 
 
 def wavelength(name: str, value: Any) -> Checked:
-    """One wavelength of light or several, mm; what must be nm, µm or m is refused."""
-    array = (
-        positive_all(name, jnp.asarray(value), "mm")
-        if np.ndim(value)
-        else positive(name, value, "mm")
-    )
+    """One wavelength of light, mm; what must be nm, µm or m is refused."""
+    return _light(name, positive(name, value, "mm"))
+
+
+def wavelengths(name: str, value: Any) -> Checked:
+    """Several wavelengths of light, mm, checked as one is."""
+    return _light(name, positive_all(name, value, "mm"))
+
+
+def _light(name: str, array: Checked) -> Checked:
     known = _known(array)
     if known is not None and np.any(known > LONGEST_LIGHT):
         raise ValueError(
@@ -159,7 +233,8 @@ def wavelength(name: str, value: Any) -> Checked:
 def pixel_pitch(name: str, value: Any) -> Checked:
     """A sensor's pixel pitch, mm; what must be µm is refused."""
     message = f"{name} = {{}} mm is no pixel: give it in mm, such as 5.5 * um"
-    return _require(positive(name, value, "mm"), lambda known: known <= _LARGEST_PITCH, message)
+    array = positive(name, value, "mm")
+    return _require(array, lambda p: (p >= _SMALLEST_PITCH) & (p <= _LARGEST_PITCH), message)
 
 
 def channels_first(name: str, shape: tuple[int, ...]) -> None:
@@ -192,7 +267,7 @@ def fraction(name: str, value: Any) -> Checked:
 
 def transmittances(name: str, values: Any) -> Checked:
     """A one-dimensional code of numbers from 0 to 1."""
-    array = finite(name, values, "parts of one", shape=np.shape(values))
+    array = finite(name, values, "parts of one", shape=_shape(values))
     if array.ndim != 1 or array.size == 0:
         raise ValueError(f"{name} has shape {array.shape}; give a code: one row of transmittances")
     known = _known(array)
@@ -206,29 +281,30 @@ def transmittances(name: str, values: Any) -> Checked:
 
 def choice(name: str, value: Any, options: Iterable[str]) -> str:
     options = tuple(options)
-    if value not in options:
+    if not isinstance(value, str) or value not in options:
         listed = ", ".join(repr(o) for o in options)
-        raise ValueError(f"{name} = {value!r} is unknown; choose one of {listed}")
+        raise ValueError(f"{name} = {shown(value)} is unknown; choose one of {listed}")
     return value
 
 
 def whole(name: str, value: Any, least: int, most: int | None = None) -> int:
     """A whole number within limits."""
     try:
-        number = least - 1 if isinstance(value, bool) else int(value)
+        number = least - 1 if isinstance(value, bool) or np.ndim(value) else int(value)
     except (TypeError, ValueError, OverflowError):
         number = least - 1
-    if number != value or number < least or (most is not None and number > most):
-        limits = f"of at least {least}" if most is None else f"from {least} to {most}"
-        raise ValueError(f"{name} = {value!r}: give a whole number {limits}")
+    if number < least or number != value or number > (_LARGEST_COUNT if most is None else most):
+        small = most is None and number <= _LARGEST_COUNT
+        limits = f"of at least {least}" if small else f"from {least} to {most or _LARGEST_COUNT}"
+        raise ValueError(f"{name} = {shown(value)}: give a whole number {limits}")
     return number
 
 
 def at_least_one(counts: dict[str, int]) -> None:
     """Refuses the first of the named counts that is below 1."""
     for name, number in counts.items():
-        if number < 1:
-            raise ValueError(f"{name} = {number}; give at least 1")
+        if not isinstance(number, int | np.integer) or number < 1:
+            raise ValueError(f"{name} = {shown(number)}; give at least 1")
 
 
 def whole_cells(name: str, side: Any, cell_name: str, cell: Any) -> int:
@@ -236,6 +312,11 @@ def whole_cells(name: str, side: Any, cell_name: str, cell: Any) -> int:
     side = float(positive(name, side, "mm"))
     cell = float(positive(cell_name, cell, "mm"))
     cells = round(side / cell)
+    if cells > _MOST_CELLS:
+        raise ValueError(
+            f"{name} = {side:g} mm has {cells} cells of {cell_name} = {cell:g} mm; give at most "
+            f"{_MOST_CELLS}"
+        )
     rounding = 1e-4 * cell + 2.5e-7 * side  # both were rounded to single precision, it may be
     if cells < 1 or abs(cells * cell - side) > rounding:
         low, high = max(1, int(side / cell)) * cell, (int(side / cell) + 1) * cell
@@ -253,9 +334,12 @@ def shape2d(name: str, value: Any) -> tuple[int, int]:
         rows, columns = (int(v) for v in value)
         whole = all(int(v) == v for v in value)
     except (TypeError, ValueError, OverflowError):
-        raise ValueError(f"{name} = {value!r} is not a pair (rows, columns) of pixels") from None
-    if not whole or rows < 1 or columns < 1:
         raise ValueError(
-            f"{name} = {value!r}: give two whole numbers (rows, columns) of at least 1"
+            f"{name} = {shown(value)} is not a pair (rows, columns) of pixels"
+        ) from None
+    if not whole or min(rows, columns) < 1 or max(rows, columns) > _LARGEST_SIDE:
+        raise ValueError(
+            f"{name} = {shown(value)}: give two whole numbers (rows, columns) of at least 1, and "
+            f"at most {_LARGEST_SIDE}"
         )
     return rows, columns

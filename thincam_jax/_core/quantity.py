@@ -72,7 +72,8 @@ class Quantity:
     @property
     def kind(self) -> str:
         """Of `units.parse_quantity`; empty for what stands without a unit in a file."""
-        return "wavelength" if self.check is checks.wavelength else _WRITTEN.get(self.unit, "")
+        light = self.check in (checks.wavelength, checks.wavelengths)
+        return "wavelength" if light else _WRITTEN.get(self.unit, "")
 
     @property
     def symbol(self) -> str:

@@ -173,7 +173,7 @@ class MaskSetting(eqx.Module):
             )
         dtype = self.distance.dtype
         given = jnp.atleast_1d(jnp.asarray(wavelengths, dtype))
-        self.wavelengths = checks.wavelength("wavelengths", given)
+        self.wavelengths = checks.wavelengths("wavelengths", given)
         self.object_distances = jnp.atleast_1d(jnp.asarray(object_distances, dtype))
         flat = eqx.tree_at(lambda mask: mask.height, camera.mask, replace_fn=jnp.zeros_like)
         self.method = psf_method(flat, self.grid, "angular_spectrum", pixel_integration=True)

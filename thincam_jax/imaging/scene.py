@@ -21,7 +21,7 @@ def _photograph(given: Any) -> Any:
     """Counts as parts of the largest, and (y, x, 3) as (3, y, x); anything else as it is."""
     if checks.is_traced(given) or isinstance(given, jax.Array):
         return given
-    array = np.asarray(given)
+    array = np.asarray(checks.numbers("image", given))
     if array.ndim == 3 and array.shape[-1] in (3, 4) and min(array.shape[:2]) > 4:
         array = np.moveaxis(array[..., :3], -1, 0)
     return array / np.iinfo(array.dtype).max if array.dtype.kind == "u" else array
@@ -30,22 +30,19 @@ def _photograph(given: Any) -> Any:
 def _radiances(given: Any) -> Float[Array, "*batch y x"]:
     """The check of an image: floating, finite, not negative; a photograph as a batch of colours."""
     given = _photograph(given)
-    if not checks.is_traced(given) and np.asarray(given).dtype.kind not in "fiub":
-        raise TypeError(
-            f"image is a {type(given).__name__} of {np.asarray(given).dtype}; give an array of "
-            "real radiances"
-        )
-    image = jnp.asarray(given)
+    image = checks.array("image", given)
     if not jnp.issubdtype(image.dtype, jnp.floating):
         image = image.astype(float)
     if image.ndim < 2 or 0 in image.shape:
         raise ValueError(f"image has shape {image.shape}; give a non-empty (…, y, x) array")
-    if not checks.is_traced(image) and not np.isfinite(np.asarray(image)).all():
+    if checks.is_traced(image):
+        return image
+    least, largest = np.asarray(image).min(), np.asarray(image).max()
+    if not np.isfinite(least + largest):
         raise ValueError("image holds NaN or infinity; give finite radiances")
-    if not checks.is_traced(image) and (np.asarray(image) < 0).any():
-        raise ValueError(
-            f"image holds {np.asarray(image).min():.3g}, a negative radiance; give radiances >= 0"
-        )
+    if least < 0:
+        raise ValueError(f"image holds {least:.3g}, a negative radiance; give radiances >= 0")
+    checks.scaled("image", largest)
     return image
 
 
@@ -121,15 +118,15 @@ class Spectrum(Module):
     - `weights`: non-negative; used as given, so that they sum to 1 for a plain average.
     """
 
-    wavelengths: Float[Array, " n"] = eqx.field(converter=quantity("mm", check=checks.wavelength))
+    wavelengths: Float[Array, " n"] = eqx.field(converter=quantity("mm", check=checks.wavelengths))
     weights: Float[Array, " n"]
 
     def __init__(self, wavelengths: Numbers, weights: Numbers | None = None):
-        if np.ndim(wavelengths) > 1:
-            raise ValueError(f"wavelengths has shape {np.shape(wavelengths)}; give a list of them")
-        count = np.size(wavelengths)
-        wavelengths = jnp.atleast_1d(jnp.asarray(wavelengths))
-        self.wavelengths = checks.wavelength("wavelengths", wavelengths)
+        wavelengths = jnp.atleast_1d(checks.array("wavelengths", wavelengths))
+        if wavelengths.ndim > 1:
+            raise ValueError(f"wavelengths has shape {wavelengths.shape}; give a list of them")
+        count = wavelengths.size
+        self.wavelengths = checks.wavelengths("wavelengths", wavelengths)
         if weights is None:
             weights = jnp.full(count, 1 / max(count, 1), self.wavelengths.dtype)
         self.weights = checks.finite("weights", weights, "parts of one", shape=(count,))
@@ -150,7 +147,10 @@ class Scene(Module):
     spectrum: Spectrum
 
     def __init__(self, planes: ImagePlane | Iterable[ImagePlane], spectrum: Spectrum | Number):
-        self.planes = (planes,) if isinstance(planes, ImagePlane) else tuple(planes)
+        planes = (planes,) if isinstance(planes, ImagePlane) else planes
+        if not isinstance(planes, Iterable) or not all(isinstance(p, ImagePlane) for p in planes):
+            raise TypeError(f"planes is {checks.shown(planes)}; give an ImagePlane, or several")
+        self.planes = tuple(planes)
         self.spectrum = spectrum if isinstance(spectrum, Spectrum) else Spectrum(spectrum)
         if not self.planes:
             raise ValueError("planes is empty; give at least one ImagePlane")

@@ -12,6 +12,7 @@ from thincam_jax._core import checks
 from thincam_jax._core.grids import Grid
 from thincam_jax._core.module import Module
 from thincam_jax._core.quantity import FieldError, choice, quantity, whole
+from thincam_jax._core.random import random_key
 
 Pictures = Float[Array, "*batch y x"]
 Electrons = Float[Array, "*batch 1 1"]  # per unit of each picture
@@ -180,13 +181,11 @@ def read_out(
     Noise, then saturation at the full well, then quantisation, as `sensor` and `noise` ask for.
     Every (y, x) image of a batch is exposed on its own.
 
-    **Errors**: ValueError if noise is given without a key, TypeError for a number as key.
+    **Errors**: ValueError if noise is given without a key.
     """
     if noise is not None and key is None:
-        raise ValueError("noise needs a key: pass key=jax.random.key(seed)")
-    if noise is not None and not eqx.is_array(key):
-        raise TypeError(f"key = {key!r} is no random key; pass key=jax.random.key({key!r})")
-    return _read_out(sensor, image, noise, key)
+        raise ValueError("noise needs a key: pass key=seed, such as key=0")
+    return _read_out(sensor, image, noise, None if noise is None else random_key(key))
 
 
 @eqx.filter_jit

@@ -6,6 +6,7 @@ from typing import Any
 
 from jaxtyping import Array, Float
 
+from thincam_jax._core.arguments import checked
 from thincam_jax.imaging.scene import Scene
 from thincam_jax.imaging.sensor import AbstractNoise, read_out
 from thincam_jax.lensless.camera import LenslessCamera
@@ -15,9 +16,10 @@ from thincam_jax.lensless.plan import Plan, run_plan
 from thincam_jax.lensless.sampling import warn_if_unresolved
 
 
+@checked
 def capture(
     camera: LenslessCamera,
-    scene: Any,
+    scene: Scene,
     *,
     key: Any = None,
     noise: AbstractNoise | None = None,
@@ -43,11 +45,6 @@ def capture(
     **Returns** (*batch, y, x) in units of radiance × mm². Warns (`SamplingWarning`) where the
     mask's shadow is finer than the pixels resolve.
     """
-    if not isinstance(scene, Scene):
-        raise TypeError(
-            f"scene is a {type(scene).__name__}; give thincam_jax.Scene(ImagePlane(image, "
-            "distance=…, width=…), wavelength)"
-        )
     warn_if_unresolved(camera, (plane.distance for plane in scene.planes))
     if isinstance(model, Plan):
         if pixel_integration is not None:

@@ -247,7 +247,8 @@ def _as_stored(one: Any) -> Any:
 def _numbers(name: str, given: Any) -> Array | np.ndarray:
     """One number or several, checked: plain ones in NumPy's float64, those of JAX as they are."""
     of_jax = any(isinstance(leaf, Array) for leaf in jax.tree.leaves(given))
-    array = jnp.asarray(given) if of_jax else np.asarray(given)
+    array = checks.array(name, given)
+    array = array if of_jax else np.asarray(given)
     if array.ndim > 1:
         raise ValueError(f"{name} has shape {array.shape}; give one number, or one for each")
     unit = quantities(Exposures)[name].unit
@@ -256,7 +257,7 @@ def _numbers(name: str, given: Any) -> Array | np.ndarray:
         if not checks.is_traced(checked) and (np.asarray(checked) < 0).any():
             raise ValueError(f"beta = {given} is negative; give beta >= 0 in rad/mm^2")
     elif name == "wavelength":
-        checks.wavelength(name, checked)
+        checks.wavelengths(name, checked)
     elif name != "phase":
         checks.positive_all(name, checked, unit)
     return checked if of_jax else array.astype(float)

@@ -124,6 +124,11 @@ class PsfMethod:
         checks.choice("model", self.model, MODELS)
         if self.precision is not None:
             checks.choice("precision", self.precision, PRECISIONS)
+        if not isinstance(self.pixel_integration, bool):
+            given = checks.shown(self.pixel_integration)
+            raise TypeError(f"pixel_integration is {given}; give True or False")
+        if self.nodes is not None:
+            checks.whole("nodes", self.nodes, 1)
         if self.model in SAMPLED:
             require_odd(self.samples)
         elif self.mask_shape or (self.oversampling is not None and self.model != "radial"):
@@ -175,7 +180,7 @@ def psf_method(
 
 
 def require_odd(oversampling: int) -> None:
-    if oversampling < 1 or oversampling % 2 == 0:
+    if checks.whole("oversampling", oversampling, 1) % 2 == 0:
         raise ValueError(
             f"oversampling = {oversampling}: give an odd number, so that pixel centres are samples"
         )

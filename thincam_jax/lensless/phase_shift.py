@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex
 
+from thincam_jax._core.arguments import checked
 from thincam_jax._core.checks import Number
 from thincam_jax._core.grids import Grid
 from thincam_jax.lensless.camera import LenslessCamera
@@ -17,6 +18,7 @@ from thincam_jax.lensless.method import Model, PsfMethod
 from thincam_jax.lensless.psf import otf
 
 
+@checked
 def harmonic_otf(
     camera: LenslessCamera,
     harmonic: int,
@@ -52,6 +54,7 @@ def harmonic_otf(
     return functools.reduce(operator.add, terms)
 
 
+@checked
 def fringe_scanned_otf(
     camera: LenslessCamera,
     *,
@@ -77,6 +80,7 @@ def fringe_scanned_otf(
     return (h[3] - h[1]) + jnp.asarray(1j, dtype=quadrature.dtype) * quadrature
 
 
+@checked
 def phase_pair_otf(
     camera: LenslessCamera,
     *,

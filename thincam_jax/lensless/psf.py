@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
 
+from thincam_jax._core.arguments import checked
 from thincam_jax._core.checks import Number
 from thincam_jax._core.grids import Grid
 from thincam_jax._core.memory import refuse_if_too_large
@@ -38,6 +39,7 @@ from thincam_jax.lensless.propagation.separable_sum import SeparableSum, centre_
 from thincam_jax.lensless.sampling import require_phase_sampling
 
 
+@checked
 def psf(
     camera: LenslessCamera,
     *,
@@ -73,6 +75,7 @@ def psf(
     return _evaluate(_psf, camera.mask, grid, camera.path(wavelength, object_distance), method)
 
 
+@checked
 def otf(
     camera: LenslessCamera,
     *,

@@ -1,7 +1,6 @@
 """A lensless camera as a short sum of products of its rows and columns: FlatCam, exactly."""
 
 from dataclasses import replace
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -9,6 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
+from thincam_jax._core.arguments import checked
 from thincam_jax._core.checks import Number
 from thincam_jax._core.grids import Grid
 from thincam_jax._core.precision import product
@@ -24,9 +24,10 @@ from thincam_jax.lensless.psf import closed_terms
 _REDUNDANT = {"float32": 1e-6, "float64": 1e-12}
 
 
+@checked
 def separable_operator(
     camera: LenslessCamera,
-    scene: Any,
+    scene: Scene,
     *,
     tolerance: Number = 1e-2,
     model: Model | PsfMethod = "separable",
@@ -57,11 +58,6 @@ def separable_operator(
 
     **Errors**: TypeError for a mask without separable terms; ValueError for several planes.
     """
-    if not isinstance(scene, Scene):
-        raise TypeError(
-            f"scene is a {type(scene).__name__}; give thincam_jax.Scene(ImagePlane(image, "
-            "distance=…, width=…), wavelength)"
-        )
     if len(scene.planes) != 1:
         raise ValueError(
             f"the scene has {len(scene.planes)} planes; give one, an operator for each"

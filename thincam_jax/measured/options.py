@@ -1,5 +1,6 @@
 """Options of a preparation, and checks that PSF, capture and background are compatible."""
 
+import numbers
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
@@ -91,8 +92,10 @@ class Preparation:
                     )
         for name, high in _LARGEST.items():
             value = getattr(self, name)
-            if value is not None and not 0 < value <= high:
-                raise MeasurementError(f"{name} = {value!r}: give a number above 0, up to {high:g}")
+            number = isinstance(value, numbers.Real) and 0 < float(value) <= high
+            if value is not None and not number:
+                given = checks.shown(value)
+                raise MeasurementError(f"{name} = {given}: give a number above 0, up to {high:g}")
 
 
 def _whole(value: Any) -> bool:

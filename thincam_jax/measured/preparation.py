@@ -9,6 +9,7 @@ import numpy as np
 import scipy
 from jaxtyping import Bool, Float, Float32
 
+from thincam_jax._core.arguments import checked
 from thincam_jax._core.grids import block_sum, central_blocks
 from thincam_jax.measured.bayer import demosaic, demosaic_mask
 from thincam_jax.measured.options import Centre, Preparation, check_match
@@ -43,6 +44,7 @@ class _Frame:
     known: np.ndarray  # bool; False where only dead pixels contribute
 
 
+@checked
 def prepare(
     psf: Raw,
     capture: Raw,

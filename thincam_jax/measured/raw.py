@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float64
 
+from thincam_jax._core import checks
 from thincam_jax._core.checks import Numbers
 from thincam_jax._core.files import MeasurementError
 
@@ -39,7 +40,10 @@ class Raw:
     sensor_shape: tuple[int, int] | None = None
 
     def __post_init__(self):
-        pixels = np.asarray(self.pixels)
+        try:
+            pixels = np.asarray(self.pixels)
+        except ValueError:
+            raise MeasurementError(f"{self.name}: is no array; give rows of one length") from None
         _check_shape(self.name, pixels)
         _check_type(self.name, pixels)
         bits = 8 * pixels.dtype.itemsize if self.bits is None and pixels.dtype.kind == "u" else None
@@ -99,7 +103,7 @@ def _check_type(name: str, pixels: np.ndarray) -> None:
 
 def _announced(name: str, bits, pixels: np.ndarray) -> int:
     if isinstance(bits, bool) or not isinstance(bits, int | np.integer) or not 8 <= bits <= 16:
-        raise MeasurementError(f"bits = {bits!r}: give a whole number from 8 to 16")
+        raise MeasurementError(f"bits = {checks.shown(bits)}: give a whole number from 8 to 16")
     held = 8 * pixels.dtype.itemsize
     if pixels.dtype.kind == "u" and bits > held:
         raise MeasurementError(

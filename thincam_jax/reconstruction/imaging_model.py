@@ -11,7 +11,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
-from thincam_jax._core.checks import Numbers
+from thincam_jax._core.checks import Numbers, Shape
+from thincam_jax._core.memory import refuse_if_too_large
 from thincam_jax._core.module import Module
 from thincam_jax._core.quantity import choice, unchecked
 from thincam_jax.imaging.operators import kernel_grid
@@ -20,6 +21,10 @@ from thincam_jax.lensless.method import MODELS, Model
 from thincam_jax.lensless.psf import psf
 
 _DARK = 0.3  # share of a PSF's absolute sum
+
+
+def _field_shape(given: Any) -> tuple[int, int] | None:
+    return None if given is None else checks.shape2d("field_shape", given)
 
 
 def _cameras(given: Sequence[LenslessCamera]) -> tuple[LenslessCamera, ...]:
@@ -53,7 +58,9 @@ class Cameras(Module):
     cameras: tuple[LenslessCamera, ...] = eqx.field(converter=_cameras)
     wavelength: Any = eqx.field(default=None, converter=unchecked("mm"), kw_only=True)
     object_distance: Any = eqx.field(default=None, converter=unchecked("mm"), kw_only=True)
-    field_shape: tuple[int, int] | None = eqx.field(default=None, static=True, kw_only=True)
+    field_shape: tuple[int, int] | None = eqx.field(
+        default=None, converter=_field_shape, static=True, kw_only=True
+    )
     model: Model = eqx.field(
         default="separable", converter=choice(MODELS), static=True, kw_only=True
     )
@@ -70,6 +77,17 @@ class Cameras(Module):
         furthest = max(self.cameras, key=lambda c: float(c.distance))
         return furthest.sensor.pitch * jnp.asarray(self.object_distance) / furthest.distance
 
+    @property
+    def wavelengths(self) -> Float[Array, " camera"]:
+        """λ of each camera, mm."""
+        light = checks.array("wavelength", self.wavelength)
+        if light.shape not in ((), (self.count,)):
+            raise ValueError(
+                f"wavelength has shape {light.shape}; give one number in mm, or one for each of "
+                f"{self.count} cameras"
+            )
+        return jnp.broadcast_to(light, (self.count,))
+
     def require(self, *names: str) -> None:
         """Require fields that are None by default."""
         missing = [name for name in names if getattr(self, name) is None]
@@ -82,9 +100,10 @@ class Cameras(Module):
         """PSF of each camera and plane on the reference scale; enlarged by r, 1/r² as bright."""
         self.require("wavelength", "object_distance")
         distances = np.atleast_1d(np.asarray(self.object_distance, dtype=object))
-        wavelengths = jnp.broadcast_to(jnp.asarray(self.wavelength), (self.count,))
+        if not distances.size:
+            raise ValueError("object_distance is empty; give one in mm, or one for each plane")
         kernels = []
-        for camera, wavelength, ratio in zip(self.cameras, wavelengths, ratios, strict=True):
+        for camera, wavelength, ratio in zip(self.cameras, self.wavelengths, ratios, strict=True):
             grid = kernel_grid(camera.sensor.grid, own_field(field, ratio))
             planes = [
                 psf(
@@ -101,6 +120,12 @@ class Cameras(Module):
         return kernels
 
 
+_PSF_SHAPE = (
+    "PSFs have shape {}; give (capture, k, l), such as psf[None] for one, (capture, channel, k, l) "
+    "or (capture, channel, plane, k, l)"
+)
+
+
 class Psfs(Module):
     """Measured PSFs on the pixels of the captures, one for each capture.
 
@@ -115,17 +140,14 @@ class Psfs(Module):
     psfs: Float[Array, "capture channel plane k l"]
     field_shape: tuple[int, int] | None = eqx.field(static=True)
 
-    def __init__(self, psfs: Numbers, *, field_shape: tuple[int, int] | None = None):
-        psfs = jnp.asarray(psfs)
+    def __init__(self, psfs: Numbers, *, field_shape: Shape | None = None):
+        psfs = checks.array("psfs", psfs)
+        if not 3 <= psfs.ndim <= 5 or 0 in psfs.shape:
+            raise ValueError(_PSF_SHAPE.format(psfs.shape))
         checks.channels_first("psfs", psfs.shape)
         _require_light(psfs)
-        if not 3 <= psfs.ndim <= 5:
-            raise ValueError(
-                f"PSFs have shape {psfs.shape}; give (capture, k, l), such as psf[None] for one, "
-                "(capture, channel, k, l) or (capture, channel, plane, k, l)"
-            )
         self.psfs = psfs.reshape(*psfs.shape[:-2], *(1,) * (5 - psfs.ndim), *psfs.shape[-2:])
-        self.field_shape = field_shape
+        self.field_shape = _field_shape(field_shape)
 
     @property
     def count(self) -> int:
@@ -171,6 +193,11 @@ def register(image: Float[Array, "*batch y x"], ratio: float) -> Float[Array, "*
         return image
     rows, columns = image.shape[-2:]
     shape = registered_shape((rows, columns), ratio)
+    refuse_if_too_large(
+        f"a capture enlarged {ratio:g} times",
+        math.prod(shape) * image.dtype.itemsize,
+        "give cameras whose distances are less apart",
+    )
     scale = jnp.full(2, ratio, dtype=image.dtype)
     offsets = [(m - n * ratio) / 2 for m, n in zip(shape, image.shape[-2:], strict=True)]
     enlarged = jax.image.scale_and_translate(

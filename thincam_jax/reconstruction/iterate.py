@@ -8,13 +8,14 @@ program on all (docs/solver_figures.md has the comparison).
 import abc
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Generic, Literal, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optimistix
 from jaxtyping import Array, Float, PyTree
 
@@ -259,30 +260,31 @@ def _image(method: OptimistixMethod, state: SolverState):
 
 
 def outcome_of_run(
-    start: Image,
+    start: Float[Array, "..."],
     image: Image,
-    objective: Callable[[Array], Array],
+    objectives: Sequence[Array],
     *,
     converged: bool,
     iterations: int,
     began: float,
 ) -> Outcome:
-    """Outcome of a run in one compiled program: objective before and after, no progress.
+    """Outcome of a run in one compiled program, without progress.
 
     As of `iterate`, the image is the start if the result is not finite.
 
+    - `objectives`: of both images, summed over a batch here.
     - `began`: `time.perf_counter()` at the start.
     """
     nan = math.nan
     before, after = (
-        Progress(n, float(jnp.sum(objective(x))), nan, nan)
-        for n, x in ((0, start), (iterations, image))
+        Progress(n, float(np.sum(value)), nan, nan)
+        for n, value in zip((0, iterations), objectives, strict=True)
     )
     # From captures with NaN a linear solver may return a clean zero.
     finite = bool(jnp.isfinite(image).all()) and math.isfinite(after.objective)
     status: Status = "converged" if converged else "iterations_exhausted"
     return Outcome(
-        image if finite else start,
+        image if finite else jnp.broadcast_to(start, image.shape),
         status if finite else "non_finite",
         (before, after),
         iterations,

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from thincam_jax._core import checks
+from thincam_jax._core.arguments import checked
 from thincam_jax._core.quantity import quantity, whole
 from thincam_jax.imaging.operators import LowRank
 from thincam_jax.imaging.operators.crop_convolution import CropConvolution, cut, place
@@ -67,6 +68,7 @@ _PART, _SMALLEST = 8, 5
 _LEAST_SHARE = 0.25
 
 
+@checked
 def reconstruct(
     recording: Recording,
     solver: AbstractSolver | None = None,
@@ -95,11 +97,6 @@ def reconstruct(
     **Errors**: ValueError and TypeError, one line, for a recording, start or callback that the
     solver cannot use.
     """
-    if not isinstance(recording, Recording):
-        raise TypeError(
-            f"recording is a {type(recording).__name__}; give tc.Recording(captures, "
-            "tc.Cameras(…)), or tc.Psfs(…) or operators in their place"
-        )
     reason = ""
     if solver is None:
         solver, reason = choose_solver(recording)
@@ -110,8 +107,6 @@ def reconstruct(
                 "outside of jit, grad and vmap, or use tc.solve_fixed_point there"
             )
         result = solver.solve(recording, start=start, callback=callback)
-    elif not isinstance(solver, AbstractSolver):
-        raise TypeError(f"solver is {solver!r}; give a solver, such as tc.AdmmTV(tau=2.0)")
     elif start is not None or callback is not None:
         raise ValueError(f"{type(solver).__name__} runs in one piece; leave out start and callback")
     else:
@@ -119,6 +114,7 @@ def reconstruct(
     return dataclasses.replace(result, reason=reason) if reason else result
 
 
+@checked
 def choose_solver(
     recording: Recording, synthesis: Synthesis | None = None
 ) -> tuple[AbstractSolver, str]:

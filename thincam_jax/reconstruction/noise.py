@@ -186,8 +186,9 @@ def given_variances(
 ) -> Float[Array, " capture"]:
     """The variance given, of each capture, averaged over its batch."""
     count = len(captures)
-    each = jnp.asarray(noise_variance, captures[0].dtype)
-    if not checks.is_traced(each) and not bool(jnp.all((each >= 0) & jnp.isfinite(each))):
+    each = checks.array("noise_variance", noise_variance).astype(captures[0].dtype)
+    known = 0 if checks.is_traced(each) else np.asarray(each)
+    if not np.all((known >= 0) & np.isfinite(known)):
         raise ValueError(
             f"noise_variance = {noise_variance} is negative or not finite; give variances in the "
             "captures' units squared, or none to have them estimated"

@@ -51,6 +51,12 @@ class AbstractNormal(eqx.Module):
     def solve(self, right: Float[Array, "..."]) -> Float[Array, "..."]:
         """z of a right-hand side b (*batch, channel, plane, y, x)."""
 
+    def solve_captures(self, captures: tuple[Float[Array, "..."], ...]):
+        """z of b = Σ Aᵀwg, and ⟨b, z⟩, by which ‖√w(Az − g)‖² + μ‖z‖² is below that of z = 0."""
+        right = back_projected(self.problem, captures)
+        solution = self.solve(right)
+        return solution, jnp.sum(right * solution)
+
     def shifted(self, shift: Float[Array, ""]) -> "AbstractNormal":
         """These equations with another μ, without repeating what does not depend on it."""
         return replace(self, shift=shift)
@@ -128,6 +134,12 @@ class SeparableNormal(AbstractNormal):
 
     def solve(self, right: Float[Array, "..."]):
         return _by_modes(self.modes, jax.lax.stop_gradient(self.shift), right)
+
+    def solve_captures(self, captures: tuple[Float[Array, "..."], ...]):
+        seen = self.modes.seen(jnp.sqrt(self.problem.weights[0]) * captures[0])
+        pulled = self.modes.values * seen
+        kept = pulled / (self.modes.values**2 + self.shift)
+        return self.modes.image(kept)[..., None, :, :], jnp.sum(pulled * kept)
 
     def variance(self):
         inverse = 1 / (self.modes.values**2 + self.shift)
@@ -277,4 +289,4 @@ def _with_modes(operator: Separable) -> Separable:
 def _by_modes(modes: SeparableModes, shift, right):
     """(AᵀA + μ)⁻¹ of an image in the modes of A."""
     inside = product(product(modes.rows.T, right), modes.columns) / (modes.values**2 + shift)
-    return product(product(modes.rows, inside), modes.columns.T)
+    return modes.image(inside)

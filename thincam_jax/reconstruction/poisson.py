@@ -211,10 +211,11 @@ def solve_poisson(
         max_steps=iterations,
         throw=False,
     )
+    found = counts.image(solution.value)
     return outcome_of_run(
         start,
-        counts.image(solution.value),
-        eqx.Partial(poisson_objective, counts),
+        found,
+        [poisson_objective(counts, image) for image in (start, found)],
         converged=bool(solution.result == optimistix.RESULTS.successful),
         iterations=int(solution.stats["num_steps"]),
         began=began,

@@ -10,8 +10,10 @@ from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Number, Numbers
+from thincam_jax._core.precision import product
 from thincam_jax.imaging.operators import AbstractOperator, CropConvolution, Masked, Scaled, Stacked
 from thincam_jax.imaging.operators.base import is_shape
+from thincam_jax.imaging.operators.separable import Separable
 from thincam_jax.reconstruction.regularisers import AbstractRegulariser, Image
 from thincam_jax.reconstruction.total_variation import TotalVariation
 
@@ -116,6 +118,7 @@ class InverseProblem(eqx.Module):
         return (*leading, planes, *self.field_shape)
 
 
+@jax.jit
 def backprojected_noise(
     operators: Sequence[AbstractOperator], weights: Sequence[Float[Array, "..."]]
 ) -> Float[Array, ""]:
@@ -130,7 +133,15 @@ def detector_shape(operator: AbstractOperator) -> tuple[int, ...]:
 
 
 def forward(operator: AbstractOperator, image: Float[Array, "..."]) -> Float[Array, "..."]:
-    """A f of an image (*batch, channel, plane, y, x)."""
+    """A f of an image (*batch, channel, plane, y, x), uniform if its last axes are (1, 1, 1)."""
+    whole = (1, 1, *operator.in_shape)[-4:]
+    if image.shape[-3:] == (1, 1, 1) != whole[1:]:
+        if isinstance(operator, Separable):
+            rows, columns = operator.left.sum(axis=2), operator.right.sum(axis=2)
+            flat = product(rows.T, columns)[None]
+        else:
+            flat = forward(operator, jnp.ones(whole, image.dtype))
+        return image.reshape(*image.shape[:-3], *(1,) * (flat.ndim - 1)) * flat
     return operator(image[..., 0, :, :] if len(operator.in_shape) == 2 else image)
 
 
@@ -210,13 +221,12 @@ def with_tau(problem: InverseProblem, tau: Number) -> InverseProblem:
 
 def uniform_level(problem: InverseProblem) -> Float[Array, "*batch channel"]:
     """The brightness of a uniform image that explains each channel best, by least squares."""
-    uniform = jnp.ones(problem.image_shape[-4:], problem.captures[0].dtype)
     seen, light = 0.0, 0.0
     for operator, capture, weight in zip(
         problem.operators, problem.captures, problem.weights, strict=True
     ):
         axes = tuple(range(-len(detector_shape(operator)), 0))
-        flat = forward(operator, uniform)
+        flat = forward(operator, jnp.ones((1,) * 4, capture.dtype))
         seen = seen + jnp.sum(weight * flat * capture, axis=axes)
         light = light + jnp.sum(weight * flat * flat, axis=axes)
     light = jnp.broadcast_to(light, jnp.shape(seen))
@@ -289,9 +299,7 @@ def _each(value, count: int) -> list:
 
 def as_real(capture: Any) -> Float[Array, "..."]:
     """A capture as floating-point numbers, raw counts unscaled; complex numbers are refused."""
-    capture = jnp.asarray(capture)
-    if jnp.issubdtype(capture.dtype, jnp.complexfloating):
-        raise TypeError(f"a capture is {capture.dtype}; give real numbers")
+    capture = checks.array("a capture", capture)
     return capture if jnp.issubdtype(capture.dtype, jnp.floating) else capture.astype(float)
 
 

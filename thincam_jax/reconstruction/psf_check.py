@@ -12,6 +12,7 @@ import scipy
 from jaxtyping import Float
 
 from thincam_jax._core import checks
+from thincam_jax._core.arguments import checked
 from thincam_jax._core.grids import block_sum
 from thincam_jax.reconstruction.imaging_model import Psfs
 from thincam_jax.reconstruction.iterate import Schedule, iterate
@@ -86,6 +87,7 @@ class _Tried:
     misfits: np.ndarray
 
 
+@checked
 def check_psf(
     recording: Recording,
     *,

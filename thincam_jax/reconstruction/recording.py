@@ -138,6 +138,8 @@ class Recording(Module):
                 "tc.Psfs(…), or operators"
             )
         self.imaging_model = imaging_model
+        if not isinstance(captures, list | tuple) and np.ndim(captures) == 0:
+            raise TypeError(f"captures is {checks.shown(captures)}; give an array for each camera")
         self.captures = tuple(as_real(c) for c in captures)
         self._check_captures(getattr(captures, "shape", [c.shape for c in self.captures]))
         self.noise_variance = noise_variance
@@ -247,11 +249,13 @@ class Recording(Module):
         """Require finite values in valid pixels."""
         for number, (capture, valid) in enumerate(zip(*self._masked_captures(), strict=True)):
             known = not checks.is_traced(capture) and not checks.is_traced(valid)
-            if known and not bool(jnp.isfinite(capture).all()):
+            largest = jnp.max(jnp.abs(capture))  # NaN, where one is
+            if known and not bool(jnp.isfinite(largest)):
                 raise ValueError(
                     f"captures[{number}] holds NaN or infinity; repair it, or exclude such pixels "
                     "with valid=numpy.isfinite(captures)"
                 )
+            checks.scaled(f"captures[{number}]", largest)
 
     def _has_channel(self) -> bool:
         """Whether the captures have an axis before those of the detector."""
@@ -285,18 +289,17 @@ class Recording(Module):
 
     def _variances(self, matrix: np.ndarray, captures, valid) -> list[Float[Array, ""]]:
         """Variances of sums of captures: as given, or estimated where none or zero is given."""
-        squares = [jnp.asarray(row**2, captures[0].dtype) for row in matrix]
         if self.noise_variance is None:
             each = self._estimated(captures, valid)
-            return [jnp.sum(square * each) for square in squares]
+            return [jnp.sum(jnp.asarray(row**2, each.dtype) * each) for row in matrix]
         with jax.ensure_compile_time_eval():  # a variance that is known stays so under jit
             given = given_variances(self.noise_variance, captures)
             totals = [jnp.sum(jnp.asarray(row**2, given.dtype) * given) for row in matrix]
         if all(not checks.is_traced(total) and float(total) > 0 for total in totals):
             return totals
         each = self._estimated(captures, valid)
-        pairs = zip(totals, squares, strict=True)
-        return [jnp.where(t > 0, t, jnp.sum(s * each)) for t, s in pairs]
+        found = [jnp.sum(jnp.asarray(row**2, each.dtype) * each) for row in matrix]
+        return [jnp.where(t > 0, t, f) for t, f in zip(totals, found, strict=True)]
 
     def _estimated(self, captures, valid) -> Float[Array, " capture"]:
         model = self.imaging_model

@@ -62,10 +62,9 @@ from thincam_jax.reconstruction.problem import (
     InverseProblem,
     ScaledProblem,
     back_projected,
-    compiled_level,
-    misfit,
     residuals,
     start_image,
+    uniform_level,
 )
 from thincam_jax.reconstruction.recording import Recording
 from thincam_jax.reconstruction.regularisers import Image
@@ -174,11 +173,7 @@ class Ridge(AbstractSolver):
         """The problem, the whitened problem, the mean, the prior and ρ."""
         problem = recording.problem(synthesis=self.synthesis)
         # Sums in which the uniform light cancels do not show how bright the scene is; captures do.
-        plain = problem if self.synthesis is None else recording.problem()
-        level = compiled_level(plain)
-        level = jnp.where(jnp.isfinite(level), level, 0)  # the solve reports such captures
-        mean = jnp.maximum(level, 0)[..., None, None, None]
-        mean = jnp.broadcast_to(mean, problem.image_shape)
+        level, mean = _uniform(problem if self.synthesis is None else recording.problem())
         given = 1.0 if isinstance(self.ridge, str) else self.ridge * image_precision(level)
         tried = []
         for correlation in self.correlation:
@@ -190,6 +185,14 @@ class Ridge(AbstractSolver):
                 precision, value = choose_precision(white, start, self.ridge)
             tried.append((float(value), (problem, white, mean, prior, precision)))
         return min(tried, key=operator.itemgetter(0))[1]
+
+
+@jax.jit
+def _uniform(problem: InverseProblem):
+    """Level of the uniform image, and that image, not negative."""
+    level = uniform_level(problem)
+    level = jnp.where(jnp.isfinite(level), level, 0)  # the solve reports such captures
+    return level, jnp.maximum(level, 0)[..., None, None, None]
 
 
 def _prior(problem: InverseProblem, correlation: float) -> "MarkovPrior | None":
@@ -207,11 +210,16 @@ def _prior(problem: InverseProblem, correlation: float) -> "MarkovPrior | None":
 
 def _whitened(problem: InverseProblem, mean, prior: "MarkovPrior") -> InverseProblem:
     """The problem of z, f = f̄ + L z."""
-    (camera,), captures = problem.operators, [-r for r in residuals(problem, mean)]
+    (camera,) = problem.operators
     assert isinstance(camera, Separable)
-    return eqx.tree_at(
-        lambda p: (p.operators, p.captures), problem, ((prior.whitened(camera),), tuple(captures))
-    )
+    whitened = (prior.whitened(camera),)
+    return eqx.tree_at(lambda p: p.operators, _about(problem, mean), whitened)
+
+
+def _about(problem: InverseProblem, mean) -> InverseProblem:
+    """The problem of f − f̄."""
+    captures = tuple(-r for r in residuals(problem, mean))
+    return eqx.tree_at(lambda p: p.captures, problem, captures)
 
 
 def image_precision(level: Float[Array, "..."]) -> float:
@@ -236,47 +244,42 @@ def solve_ridge(
     **Arguments**
 
     - `precision`: ρ > 0, 1/variance of the image, where the weights are 1/variance of the noise.
-    - `mean`: f̄; default the uniform image that explains the captures.
+    - `mean`: f̄, uniform if (*batch, channel, 1, 1, 1); default the uniform image that explains
+      the captures.
     - `iterations`, `tolerance`: of conjugate gradients, see `Ridge`.
     """
     began = time.perf_counter()
     dtype = problem.captures[0].dtype
     rho = checks.positive("precision", precision, "1/variance of the image").astype(dtype)
-    mean = start_image(problem, mean)
-    image, converged, steps = _solve(problem, rho, mean, jnp.asarray(tolerance, dtype), iterations)
+    if mean is None or mean.shape != (*problem.image_shape[:-3], 1, 1, 1):
+        mean = start_image(problem, mean)
+    limit = jnp.asarray(tolerance, dtype)
+    image, objectives, converged, steps = _solve(problem, rho, mean, limit, iterations)
     return outcome_of_run(
-        mean,
-        image,
-        functools.partial(ridge_objective, problem, rho, mean),
-        converged=bool(converged),
-        iterations=int(steps),
-        began=began,
+        mean, image, objectives, converged=bool(converged), iterations=int(steps), began=began
     )
-
-
-@jax.jit
-def ridge_objective(
-    problem: InverseProblem, precision: Float[Array, ""], mean: Image, image: Image
-) -> Float[Array, "*batch"]:
-    """The misfit plus ρ/2 ‖f − f̄‖² of each batch element."""
-    gap = jnp.sum((image - mean) ** 2, axis=(-4, -3, -2, -1))
-    return misfit(problem, image) + precision / 2 * gap
 
 
 @functools.partial(jax.jit, static_argnames="iterations")
 def _solve(problem: InverseProblem, precision, mean, tolerance, iterations: int):
-    scaled = ScaledProblem(problem)
-    inside, mean = scaled.problem, mean / scaled.image_unit
-    target = -back_projected(inside, residuals(inside, mean))
+    scaled = ScaledProblem(_about(problem, mean))
+    inside = scaled.problem
     normal = normal_equations(inside, precision / scaled.curvature)
     if isinstance(normal, IterativeNormal):
+        target = back_projected(inside, inside.captures)
         solution = normal.solution(target, jnp.zeros_like(target), tolerance, iterations)
         change, steps = solution.value, solution.stats["num_steps"]
         converged = solution.result == lineax.RESULTS.successful
+        explained = jnp.sum(target * change)
     else:
-        change = normal.solve(target)
+        change, explained = normal.solve_captures(inside.captures)
         converged, steps = jnp.isfinite(change).all(), jnp.asarray(1)
-    return (mean + change) * scaled.image_unit, converged, steps
+    pairs = zip(inside.weights, inside.captures, strict=True)
+    before = sum(jnp.sum(w * c**2) for w, c in pairs) / 2
+    # Of the minimiser, and of every iterate of conjugate gradients from zero; without another A f.
+    after = jnp.maximum(before - explained / 2, 0)
+    unit = (jnp.sqrt(scaled.curvature) * scaled.image_unit) ** 2
+    return mean + change * scaled.image_unit, (unit * before, unit * after), converged, steps
 
 
 @jax.jit
@@ -290,9 +293,9 @@ def ridge_by_modes(
 
     - `precision`: ρ > 0, 1/variance of the image where noise has variance 1.
     """
-    seen = _seen(modes, captures)
+    seen = modes.seen(captures)
     inside = seen * modes.values / (modes.values**2 + precision)
-    return product(product(modes.rows, inside), modes.columns.T)
+    return modes.image(inside)
 
 
 class MarkovPrior(eqx.Module):
@@ -361,7 +364,7 @@ def choose_precision(
 @jax.jit(static_argnames="rule")
 def _least(modes: SeparableModes, captures, rule: Rule):
     """The minimum over log ρ, by three grids of decreasing range."""
-    seen = _seen(modes, captures)
+    seen = modes.seen(captures)
     power = (modes.values / jnp.max(modes.values)) ** 2
     assert modes.seen_rows is not None and modes.seen_columns is not None
     outside = captures - product(product(modes.seen_rows, seen), modes.seen_columns.T)
@@ -386,10 +389,3 @@ def _least(modes: SeparableModes, captures, rule: Rule):
         lower, upper = tried[jnp.maximum(best - 1, 0)], tried[jnp.minimum(best + 1, _STEPS - 1)]
     middle = (lower + upper) / 2
     return jnp.max(modes.values) ** 2 * 10.0**middle, criterion(middle)
-
-
-def _seen(modes: SeparableModes, captures):
-    """ĝ, the coefficient of each mode in the captures."""
-    if modes.seen_rows is None or modes.seen_columns is None:
-        raise ValueError("these are modes of several terms; give those of one, truncated(terms=1)")
-    return product(product(modes.seen_rows.T, captures), modes.seen_columns)

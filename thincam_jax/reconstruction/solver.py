@@ -96,7 +96,9 @@ def first_image(
     if start is None:
         level = compiled_level(problem)[..., None, None, None] if uniform else jnp.zeros((), dtype)
         return jnp.broadcast_to(level, shape)
-    start = jnp.asarray(start, dtype)
+    start = checks.array("start", start).astype(dtype)
+    if not checks.is_traced(start) and not bool(jnp.isfinite(start).all()):
+        raise ValueError("start holds NaN or infinity; give a finite image")
     if start.ndim < 2 or start.size != math.prod((*shape[:-2], *start.shape[-2:])):
         raise ValueError(
             f"start has shape {start.shape}; give an image of the result's batch and planes, "

@@ -100,7 +100,7 @@ class WienerSynthesis(eqx.Module):
         each = cameras.cameras
         capture_ratios = distance_ratios(each)
         if synthesis is None:
-            synthesis = phase_contrasts(each, cameras.wavelength)
+            synthesis = phase_contrasts(each, cameras.wavelengths)
         matrix = synthesis_matrix(synthesis, each, capture_ratios)
         sensor = each[0].sensor.grid
         self.sensor_shape = sensor.shape
@@ -110,9 +110,8 @@ class WienerSynthesis(eqx.Module):
         )
         object_distance = cameras.object_distance
         how = {"model": cameras.model, "pixel_integration": cameras.pixel_integration}
-        wavelengths = jnp.broadcast_to(jnp.asarray(cameras.wavelength), (cameras.count,))
         kernels, uniform = [], []
-        for camera, w, ratio in zip(each, wavelengths, capture_ratios, strict=True):
+        for camera, w, ratio in zip(each, cameras.wavelengths, capture_ratios, strict=True):
             own = own_field(self.field_shape, ratio)
             grid = kernel_grid(sensor, own)
             h = psf(camera, wavelength=w, object_distance=object_distance, grid=grid, **how)

@@ -36,6 +36,12 @@ class Rectangle(Module):
         return (abs(points - self.centre) <= self.size / 2).all(axis=-1)
 
 
+def _hologram(given: Any) -> VolumeHologram:
+    if not isinstance(given, VolumeHologram):
+        raise TypeError(f"hologram is {checks.shown(given)}; give a waveguide.VolumeHologram")
+    return given
+
+
 class Screen(Module):
     """A plane-parallel glass plate with the same hologram at the top and at the bottom.
 
@@ -44,7 +50,7 @@ class Screen(Module):
     - `top`, `bottom`: where the holograms are, mm from the camera's axis; None: everywhere.
     """
 
-    hologram: VolumeHologram
+    hologram: VolumeHologram = eqx.field(converter=_hologram)
     glass_thickness: Float[Array, ""] = eqx.field(converter=quantity("mm", positive=True))
     glass_index: AbstractIndex = eqx.field(converter=quantity(check=as_index))
     top: Rectangle | None = None

@@ -24,6 +24,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
+from thincam_jax._core.arguments import checked
 from thincam_jax._core.precision import phasor
 from thincam_jax.waveguide.hologram import VolumeHologram, directions
 
@@ -33,6 +34,7 @@ Polarisation = Literal["TE", "TM"]
 _RAYS = 384
 
 
+@checked
 def diffraction_efficiency(
     hologram: VolumeHologram,
     tangential: Float[Array, "*ray 2"],
@@ -49,6 +51,7 @@ def diffraction_efficiency(
     return _efficiency(strength * overlap, detuning, reflected)
 
 
+@checked
 def ghost_weights(
     hologram: VolumeHologram, tangential: Float[Array, "*ray 2"], orders: int
 ) -> Float[Array, "order *ray"]:

@@ -19,6 +19,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from thincam_jax._core import checks
+from thincam_jax._core.arguments import checked
 from thincam_jax._core.checks import Number
 from thincam_jax._core.precision import product
 from thincam_jax.waveguide.camera import Rectangle, SeeThroughCamera
@@ -55,7 +56,7 @@ class Rays(eqx.Module):
     status: Int[Array, "order *pixel"]
 
 
-@eqx.filter_jit
+@checked
 def trace(
     camera: SeeThroughCamera,
     pixels: Float[Array, "*pixel 2"],
@@ -76,7 +77,19 @@ def trace(
     wavelength of each pixel; the weights include the rest of the band, but not its smear.
     """
     checks.at_least_one({"orders": orders})
-    screen, distance = camera.screen, checks.positive("object_distance", object_distance, "mm")
+    distance = checks.positive("object_distance", object_distance, "mm")
+    return _trace(camera, checks.points("pixels", pixels), distance, orders, extent)
+
+
+@eqx.filter_jit
+def _trace(
+    camera: SeeThroughCamera,
+    pixels: Float[Array, "*pixel 2"],
+    distance: Float[Array, ""],
+    orders: int,
+    extent: Rectangle | None,
+) -> Rays:
+    screen = camera.screen
     found = bragg_rays(camera, pixels)
     wavelength, guided, fault = found.wavelength, found.guided, found.fault
     path = object_points(camera, found, distance, orders)
@@ -202,6 +215,7 @@ def shift(tangential: Float[Array, "*#ray 2"], index: Float[Array, "*#ray"]):
     return tangential / jnp.sqrt(index**2 - squared)[..., None]
 
 
+@checked
 def pixel_centres(camera: SeeThroughCamera) -> Float[Array, "y x 2"]:
     """Where the sensor's pixels are, (x, y) mm."""
     grid = camera.sensor.grid
@@ -209,6 +223,7 @@ def pixel_centres(camera: SeeThroughCamera) -> Float[Array, "y x 2"]:
     return jnp.stack([x, y], axis=-1)
 
 
+@checked
 def check_screen(camera: SeeThroughCamera) -> None:
     """ValueError, saying what to change, where the sensor's middle would see nothing.
 

@@ -36,6 +36,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
+from thincam_jax._core.arguments import checked
 from thincam_jax._core.checks import Number
 from thincam_jax.waveguide.camera import SeeThroughCamera
 from thincam_jax.waveguide.rays import RayStatus, bragg_rays, object_points, trace
@@ -61,7 +62,7 @@ class GhostImages(eqx.Module):
     weight: Float[Array, "order *point"]
 
 
-@eqx.filter_jit
+@checked
 def ghost_images(
     camera: SeeThroughCamera,
     field: Float[Array, "*point 2"],
@@ -79,7 +80,16 @@ def ghost_images(
     """
     checks.at_least_one({"orders": orders})
     distance = checks.positive("object_distance", object_distance, "mm")
+    return _ghost_images(camera, checks.points("field", field), distance, orders)
 
+
+@eqx.filter_jit
+def _ghost_images(
+    camera: SeeThroughCamera,
+    field: Float[Array, "*point 2"],
+    distance: Float[Array, ""],
+    orders: int,
+) -> GhostImages:
     def point_of(order, place):
         rays = bragg_rays(camera, place)
         return object_points(camera, rays, distance, orders).ended[order]

@@ -136,8 +136,13 @@ def system_operator(
     **Errors**: ValueError where no pixel has a guided ray, for planes of different cells and
     sensors of different pixels, and for cells below a 64th of a pixel's field.
     """
-    if not isinstance(camera, SeeThroughCamera):
+    planes = (plane,) if isinstance(plane, ObjectPlane) else plane
+    if not isinstance(planes, Sequence) or not all(isinstance(p, ObjectPlane) for p in planes):
+        raise TypeError(f"plane is {checks.shown(plane)}; give a waveguide.ObjectPlane, or several")
+    if isinstance(camera, list | tuple):
         return colour_operator([system_operator(c, plane, orders, samples) for c in camera])
+    if not isinstance(camera, SeeThroughCamera):
+        raise TypeError(f"camera is {checks.shown(camera)}; give a waveguide.SeeThroughCamera")
     return planes_operator(camera, plane, (orders, samples))
 
 

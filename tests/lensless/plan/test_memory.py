@@ -31,11 +31,11 @@ PROCESS = """
     ]
     scene = tc.Scene(found, [500e-6, 600e-6])
     plan = tc.plan(camera, scene, tolerance=tolerance)
-    jax.block_until_ready(tc.capture(camera, scene, plan=plan))
+    jax.block_until_ready(tc.capture(camera, scene, model=plan))
     with open("/proc/self/clear_refs", "w") as file:
         file.write("5")
     before = held("VmRSS")
-    jax.block_until_ready(tc.capture(camera, scene, plan=plan))
+    jax.block_until_ready(tc.capture(camera, scene, model=plan))
     print(json.dumps([held("VmHWM") - before, plan.cost.bytes, len(plan.distances)]))
 """
 

@@ -8,6 +8,8 @@ import numpy as np
 import skimage
 from jaxtyping import ArrayLike, Float64, Num
 
+from thincam_jax._core.checks import numbers
+
 SSIM_WINDOW = 7  # pixels; scikit-image's uniform window
 _ROUNDING = 1e-14  # relative to the data range: an error this small is rounding
 
@@ -100,7 +102,7 @@ def ssim(
 
 def _pair(image, reference) -> tuple[np.ndarray, np.ndarray]:
     """Both as float64 of one shape, finite."""
-    image, reference = np.asarray(image), np.asarray(reference)
+    image, reference = numbers("image", image), numbers("reference", reference)
     if image.shape != reference.shape:
         raise ValueError(
             f"image has shape {image.shape} and reference {reference.shape}; they must be the same"
@@ -110,8 +112,6 @@ def _pair(image, reference) -> tuple[np.ndarray, np.ndarray]:
             f"images have shape {image.shape}; give (y, x) or (y, x, channel), not empty"
         )
     for name, array in (("image", image), ("reference", reference)):
-        if array.dtype.kind not in "fiub":
-            raise ValueError(f"{name} holds {array.dtype}; give real numbers")
         if not np.isfinite(array).all():
             raise ValueError(f"{name} holds NaN or infinity; give finite numbers")
     return image.astype(np.float64), reference.astype(np.float64)

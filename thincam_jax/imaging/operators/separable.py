@@ -29,6 +29,18 @@ class SeparableModes(eqx.Module):
     seen_rows: Float[Array, "y m"] | None
     seen_columns: Float[Array, "x n"] | None
 
+    def seen(self, captures: Float[Array, "*batch y x"]) -> Float[Array, "*batch m n"]:
+        """Coefficient of each mode of one term in captures, ĝ."""
+        if self.seen_rows is None or self.seen_columns is None:
+            raise ValueError(
+                "these are modes of several terms; give those of one, truncated(terms=1)"
+            )
+        return product(product(self.seen_rows.T, captures), self.seen_columns)
+
+    def image(self, coefficients: Float[Array, "*batch m n"]) -> Float[Array, "*batch m n"]:
+        """Image of a coefficient of each mode."""
+        return product(product(self.rows, coefficients), self.columns.T)
+
 
 class Truncated(eqx.Module):
     """A sum of fewer terms, and its error on captures of white scenes, ‖difference‖_F/‖A‖_F.

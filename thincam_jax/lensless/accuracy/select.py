@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import jax
 
 from thincam_jax._core import checks
+from thincam_jax._core.arguments import checked
 from thincam_jax._core.checks import Number
 from thincam_jax._core.grids import Grid
 from thincam_jax._core.memory import available_bytes
@@ -68,6 +69,7 @@ class Selection(Prediction):
     considered: tuple[Prediction, ...]
 
 
+@checked
 def select_model(
     camera: LenslessCamera,
     *,
@@ -127,6 +129,7 @@ def select_model(
     )
 
 
+@checked
 def predict_error(
     camera: LenslessCamera,
     *,
@@ -230,8 +233,6 @@ def tolerance_of(tolerance: float) -> float:
 
 def require_camera(camera: LenslessCamera, function: str) -> AbstractFactoredMask:
     """The mask of a camera, if it has few terms: its fields then have one-dimensional factors."""
-    if not isinstance(camera, LenslessCamera):
-        raise TypeError(f"camera is a {type(camera).__name__}; give a thincam_jax.LenslessCamera")
     mask = camera.mask
     if not has_few_terms(mask):
         raise TypeError(

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
+from thincam_jax._core.arguments import checked
 from thincam_jax._core.checks import Number
 from thincam_jax._core.grids import Grid, centred_indices
 from thincam_jax._core.quantity import unchecked
@@ -53,6 +54,7 @@ class DisplayedMask(AbstractFactoredMask):
         return open_parts(values, self.pixel_pitch, self.fill_factor)
 
 
+@checked
 def on_display(mask: AbstractMask, pixel_pitch: Number, fill_factor: Number = 1.0) -> AbstractMask:
     """The mask as a display (a spatial light modulator) shows it.
 

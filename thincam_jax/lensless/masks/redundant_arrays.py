@@ -58,10 +58,11 @@ def _prime_order(name: str, order: Any) -> int:
     def fits(p):
         return p >= 5 and _is_prime(p)
 
-    if isinstance(order, int) and fits(order) and order <= _LARGEST:
-        return order
+    number = checks.whole(name, order, 1)
+    if fits(number) and number <= _LARGEST:
+        return number
     raise ValueError(
-        f"{name} = {order} is no prime from 5 to {_LARGEST}; give {_near(order, fits)}"
+        f"{name} = {number} is no prime from 5 to {_LARGEST}; give {_near(number, fits)}"
     )
 
 
@@ -69,11 +70,11 @@ def _twin_primes(name: str, orders: Any) -> tuple[int, int]:
     def fits(s):
         return _is_prime(s) and _is_prime(s + 2)
 
-    r, s = orders if np.shape(orders) == (2,) else (0, 0)
+    r, s = checks.shape2d(name, orders)
     if r == s + 2 and s <= _LARGEST and fits(s):
-        return int(r), int(s)
+        return r, s
     near = _near(min(r, s), fits, lambda s: f"({s + 2}, {s})")
-    raise ValueError(f"{name} = {orders} are no twin primes (s + 2, s); give {near}")
+    raise ValueError(f"{name} = {checks.shown(orders)} are no twin primes (s + 2, s); give {near}")
 
 
 def _near(number: Any, fits: Callable[[int], bool], text: Callable[[int], str] = str) -> str:

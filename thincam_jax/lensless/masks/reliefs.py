@@ -6,8 +6,10 @@ import numpy as np
 import scipy
 
 from thincam_jax._core import checks
+from thincam_jax._core.arguments import checked
 from thincam_jax._core.checks import Number
 from thincam_jax._core.grids import fast_shape
+from thincam_jax._core.memory import refuse_if_too_large
 from thincam_jax._core.precision import as_complex
 from thincam_jax._core.random import Key, random_key
 from thincam_jax.lensless.masks.phase import MaskBlank, PhaseMask
@@ -16,6 +18,7 @@ from thincam_jax.lensless.masks.phase import MaskBlank, PhaseMask
 _APART = 4.0
 
 
+@checked
 def diffuser(
     key: Key, blank: MaskBlank, *, correlation_length: Number, rms_slope: Number
 ) -> PhaseMask:
@@ -39,6 +42,8 @@ def diffuser(
             f"least {2 * float(blank.pitch):g} mm, or smaller cells"
         )
     rows, columns = (n + int(np.ceil(_APART * cells)) for n in blank.shape)
+    needed = 32 * rows * columns
+    refuse_if_too_large("this diffuser", needed, "give a shorter correlation_length")
     window = fast_shape((rows, columns))
     v, u = (jnp.asarray(np.fft.fftfreq(n), length.dtype) / blank.pitch for n in window)
     # A Gaussian of width ℓ/√2 convolved with itself has the width ℓ.
@@ -50,6 +55,7 @@ def diffuser(
     return blank.mask(height - jnp.min(height), "bilinear")
 
 
+@checked
 def voronoi_fresnel(
     key: Key,
     blank: MaskBlank,

@@ -12,6 +12,7 @@ from jaxtyping import Array, Complex, Float
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Number
 from thincam_jax._core.grids import Grid, cell_overlap, centred_indices
+from thincam_jax._core.memory import refuse_if_too_large
 from thincam_jax._core.precision import as_complex, product
 from thincam_jax._core.quantity import quantity
 from thincam_jax._core.random import Key, random_key
@@ -26,11 +27,14 @@ from thincam_jax.lensless.masks.cells import cell_edges
 
 
 def _amplitudes(given: Any) -> Transmittance:
-    amplitude = jnp.asarray(given)
+    amplitude = checks.array("amplitude", given, allow_complex=True)
     if amplitude.ndim != 2 or 0 in amplitude.shape:
         raise ValueError(f"amplitude has shape {amplitude.shape}; give a non-empty array (y, x)")
-    if not checks.is_traced(amplitude) and not np.isfinite(amplitude).all():
-        raise ValueError("amplitude holds NaN or infinity; give finite transmittances")
+    if not checks.is_traced(amplitude):
+        largest = np.abs(amplitude).max()
+        if not np.isfinite(largest):
+            raise ValueError("amplitude holds NaN or infinity; give finite transmittances")
+        checks.scaled("amplitude", largest)
     return amplitude if jnp.issubdtype(amplitude.dtype, jnp.inexact) else amplitude.astype(float)
 
 
@@ -126,6 +130,9 @@ def random_cells(
     columns = checks.whole_cells("width", width, "cell", cell)
     rows = columns if height is None else checks.whole_cells("height", height, "cell", cell)
     chance = checks.fraction("open_fraction", open_fraction)
+    refuse_if_too_large(
+        f"a mask of {rows}×{columns} cells", 16 * rows * columns, "give larger cells"
+    )
     opened = jax.random.bernoulli(random_key(key), chance, (rows, columns))
     return SampledMask(opened.astype(float), cell)
 

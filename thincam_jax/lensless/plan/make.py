@@ -3,6 +3,7 @@
 import jax
 
 from thincam_jax._core import checks
+from thincam_jax._core.arguments import checked
 from thincam_jax._core.grids import fast_shape
 from thincam_jax._core.precision import RESULT_ROUNDING, precision_of
 from thincam_jax.imaging.operators import kernel_shape
@@ -20,6 +21,7 @@ from thincam_jax.lensless.plan.seen import FULL, SeenScene
 _MODEL_SHARE, _WAVELENGTH_SHARE = 0.35, 0.6
 
 
+@checked
 def plan(camera: LenslessCamera, scene: Scene, *, tolerance: float) -> Plan:
     r"""Plan the capture of a scene to a relative error at the least cost.
 
@@ -40,10 +42,6 @@ def plan(camera: LenslessCamera, scene: Scene, *, tolerance: float) -> Plan:
     **Errors**: ValueError for a tolerance that is not positive; TypeError for traced numbers.
     """
     tolerance = tolerance_of(tolerance)
-    if not isinstance(camera, LenslessCamera):
-        raise TypeError(f"camera is a {type(camera).__name__}; give a thincam_jax.LenslessCamera")
-    if not isinstance(scene, Scene):
-        raise TypeError(f"scene is a {type(scene).__name__}; give a thincam_jax.Scene")
     if any(checks.is_traced(leaf) for leaf in jax.tree.leaves((camera, scene))):
         raise TypeError("plan needs known numbers: call it outside of jit and grad")
     seen = SeenScene(camera, scene, tolerance)

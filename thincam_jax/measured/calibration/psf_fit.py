@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Inexact
 
 from thincam_jax._core import checks
+from thincam_jax._core.arguments import checked
 from thincam_jax._core.checks import Number, Numbers
 from thincam_jax._core.module import Module
 from thincam_jax._core.precision import Precision, allow, cast, precision_of
@@ -104,6 +105,7 @@ class PsfFit(Module):
         return self.camera.mask.centre / self.camera.sensor.pitch
 
 
+@checked
 def fit_psf(
     psf_image: Numbers | Inexact[ArrayLike, "y x"],
     camera: LenslessCamera,
