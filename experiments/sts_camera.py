@@ -6,8 +6,9 @@
 # from, and how well does an image come back? This script follows the rays, simulates a capture and
 # undoes the ghosts.
 #
-# The thesis gives d0 = 6 mm, 61.2° and 532 nm. It does not give the glass (here 5 mm of n = 1.5),
-# its distance from the lens (10 mm) or the film (16 µm, Δn = 0.02): these are assumptions.
+# The thesis gives d0 = 6 mm, 61.2°, 532 nm and the holograms' sizes. It does not give the glass
+# (here 5 mm of n = 1.5), its distance from the lens (10 mm), the film (16 µm, Δn = 0.02), or where
+# on the plate the holograms are: these are assumptions.
 
 # %%
 import os
@@ -39,10 +40,12 @@ sensor = tc.Sensor((440 // binned, 440 // binned), 4.8 * um * binned)
 hologram = wg.VolumeHologram.record(
     532 * nm, 0.0, 61.2 * deg, index=1.5, thickness=16 * um, index_modulation=0.02
 )
+top = wg.Rectangle((0.0, 0.0), (50.0, 20.0))
+bottom = wg.Rectangle((0.0, 25.0), (50.0, 50.0))
 
 
 def see_through(glass=5.0):
-    return wg.SeeThroughCamera(wg.Screen(hologram, glass, 1.5), sensor, 6.0, 10.0)
+    return wg.SeeThroughCamera(wg.Screen(hologram, glass, 1.5, top, bottom), sensor, 6.0, 10.0)
 
 
 camera = see_through()

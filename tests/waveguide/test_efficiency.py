@@ -8,6 +8,7 @@ from waveguide.setting import RECORDED, hologram
 
 from thincam_jax import waveguide as wg
 from thincam_jax.units import nm
+from thincam_jax.waveguide.efficiency import _coupling, _efficiency
 
 
 def coupled_waves(film, across, wavelength, polarisation):
@@ -49,6 +50,24 @@ def test_coupled_waves(polarisation):
         )
         expected = coupled_waves(film, across, wavelength, polarisation)
         assert found == pytest.approx(expected, abs=1e-9)
+
+
+@pytest.mark.parametrize(("modulation", "apart"), [(0.02, 0.0065), (0.03, 0.0154)])
+def test_the_mirrored_ray_against_the_diffracted_wave(modulation, apart):
+    """η of TM with |s·s′| of the ray mirrored at the fringes, and of the direction of βs − K."""
+    film, worst = hologram(index_modulation=modulation), 0.0
+    for across in np.array([[0, 0], [0.05, -0.11], [0, 0.17], [0, -0.17], [0.12, 0.12]]):
+        centre = float(film.bragg_wavelength(jnp.asarray(across))[0])
+        wavelengths = centre + np.linspace(-20, 20, 2001) * nm
+        s = np.append(across / 1.5, 0.0)
+        s[2] = np.sqrt(1 - s @ s)
+        wave = s - np.asarray(film.grating) * (wavelengths / (2 * np.pi * 1.5))[:, None]
+        overlap = abs(wave @ s) / np.linalg.norm(wave, axis=1)
+        rays = (film, jnp.broadcast_to(jnp.asarray(across), (2001, 2)), jnp.asarray(wavelengths))
+        strength, detuning, _, reflected = _coupling(*rays)
+        other = _efficiency(strength * overlap, detuning, reflected)
+        worst = max(worst, float(abs(wg.diffraction_efficiency(*rays, "TM") - other).max()))
+    assert worst == pytest.approx(apart, rel=0.03)
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,10 @@ For a lossless reflection hologram and light of direction s in the film (β = 2�
 with c_R = s_z, c_S = s_z − K_z/β, and p = 1 for light polarised across the plane of incidence (TE)
 or |s·s′| within it (TM). It holds for films of many fringes, as long as only one order is near to
 the Bragg condition.
+
+For TM, s′ is the ray mirrored at the fringes also off the Bragg condition, where the wave vector
+βs − K of the diffracted wave has another direction. With that direction η differs by up to 0.007 at
+Δn = 0.02 and 0.015 at 0.03 (film of 16 µm, rays within 10° in air); ghost weights by 0.1 %.
 """
 
 import math

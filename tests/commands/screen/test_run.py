@@ -4,6 +4,7 @@ import json
 import re
 from dataclasses import asdict
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from commands.screen import tiny
@@ -11,10 +12,11 @@ from commands.study.tiny import Told
 from studies import tiny_screen
 
 from helpers import ROOT
+from thincam_jax import waveguide as wg
 from thincam_jax.commands.checked_config import dump_config
 from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.run_folder import RunFolder, to_json
-from thincam_jax.commands.screen.run import build_screen, run_screen
+from thincam_jax.commands.screen.run import build_cameras, build_screen, run_screen
 from thincam_jax.imaging.targets import load_image
 from thincam_jax.studies.screen_calibration import MEASURED, calibrate
 
@@ -185,3 +187,6 @@ def test_the_shipped_file(tmp_path):
     assert tiny.experiment(tmp_path, text=dump_config(shipped)) == shipped
     assert shipped.sensor.shape == (440, 440)
     assert {model.mistake for model in shipped.models} >= {"grating", "ghost_index"}
+    (camera,) = build_cameras(shipped)
+    status = wg.trace(camera, jnp.zeros(2), 550.0, 4).status
+    assert status.tolist() == [0, 0, 0, wg.RayStatus.OFF_HOLOGRAM]  # of the thesis' size
