@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from helpers import relative_l2
-from thincam_jax.imaging.operators import adjoint_error, low_rank_psf
+from thincam_jax.imaging.operators import CropConvolution, adjoint_error, low_rank_psf
+from thincam_jax.reconstruction.problem import MARGIN
 
 SENSOR, FIELD, KERNEL, PITCH = (21, 26), (17, 22), (11, 13), 0.5
 
@@ -105,3 +106,15 @@ def test_adjoint_and_batches():
 def test_errors(psfs, tolerance, message):
     with pytest.raises(ValueError, match=message):
         low_rank_psf(psfs, PITCH, SENSOR, FIELD, tolerance=tolerance)
+
+
+def test_mean_power_and_norm():
+    """One PSF everywhere has the mean power of its convolution; the norm is within its margin."""
+    one = np.broadcast_to(np.random.default_rng(2).uniform(size=(7, 9)), (3, 3, 7, 9))
+    alike = low_rank_psf(one, PITCH, SENSOR, FIELD, tolerance=0.1).operator
+    convolution = CropConvolution(jnp.asarray(one[0, 0]), PITCH, SENSOR, FIELD)
+    assert alike.mean_power() == pytest.approx(float(convolution.mean_power()), rel=1e-12)
+    operator = low_rank_psf(grid((3, 3)), PITCH, SENSOR, FIELD, tolerance=1e-3).operator
+    unit = jnp.eye(operator.weights[0].size).reshape(-1, *operator.in_shape)
+    largest = np.linalg.norm(np.asarray(operator(unit)).reshape(len(unit), -1), 2)
+    assert largest / MARGIN < operator.norm() < largest * (1 + 1e-12)

@@ -117,7 +117,7 @@ class CropConvolution(AbstractOperator):
 
         Pixels from which no light reaches the sensor count like the others.
         """
-        return _mean_power(self.spectrum, self.window[1])
+        return jnp.mean(plane_mean(self.spectrum.real**2 + self.spectrum.imag**2, self.window[1]))
 
     def with_channels_and_planes(self) -> "CropConvolution":
         """The same map on images (…, channel, plane, m, n), its planes summed."""
@@ -165,13 +165,13 @@ def _back_projected(operator: CropConvolution, capture):
 
 
 @functools.partial(jax.jit, static_argnames="columns")
-def _mean_power(spectrum, columns):
-    power = spectrum.real**2 + spectrum.imag**2
-    # The half plane of a real transform leaves out the mirror images of its inner columns.
+def plane_mean(power: Float[Array, "*planes v u"], columns: int) -> Float[Array, "*planes"]:
+    """Mean over all frequencies, given on the half plane of a real transform."""
+    # The half plane leaves out the mirror images of its inner columns.
     whole = 2 * jnp.sum(power, axis=-1) - power[..., 0]
     if columns % 2 == 0:
         whole = whole - power[..., -1]
-    return jnp.mean(whole) / columns
+    return jnp.mean(whole, axis=-1) / columns
 
 
 def place(

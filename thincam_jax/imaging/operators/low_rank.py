@@ -1,6 +1,7 @@
 """A camera whose PSF changes slowly over the field."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy
@@ -8,8 +9,12 @@ from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Number, Numbers, Shape
+from thincam_jax._core.precision import product
 from thincam_jax.imaging.operators.base import AbstractOperator, real_numbers, require_shape
-from thincam_jax.imaging.operators.crop_convolution import CropConvolution, kernel_shape
+from thincam_jax.imaging.operators.crop_convolution import CropConvolution, kernel_shape, plane_mean
+
+# Of the power method; docs/solver_figures.md.
+POSITIVE_ITERATIONS = 12
 
 
 class LowRank(AbstractOperator):
@@ -42,6 +47,24 @@ class LowRank(AbstractOperator):
     def adjoint(self, capture: Float[Array, "..."]) -> Float[Array, "..."]:
         require_shape("capture", capture, self.out_shape)
         return jnp.sum(self.convolution.adjoint(capture) * self.weights, axis=-3)
+
+    def mean_power(self) -> Float[Array, ""]:
+        """Mean over the field of Σh² of its PSF without the crop, as of `CropConvolution`."""
+        return _mean_power(self)
+
+    def _norm(self, iterations, key, dtype):
+        # PSFs are positive, so that a positive start image is near the top singular vector.
+        return super()._norm(min(iterations, POSITIVE_ITERATIONS), key, dtype)
+
+
+@jax.jit
+def _mean_power(operator: LowRank):
+    """Σ_rs ⟨w_r w_s⟩ ⟨p_r, p_s⟩."""
+    maps = operator.weights.reshape(len(operator.weights), -1)
+    spectra, columns = operator.convolution.spectrum, operator.convolution.window[1]
+    joined = product(maps, maps.T) / maps.shape[1]
+    mixed = jnp.tensordot(joined.astype(spectra.dtype), spectra, 1)
+    return jnp.sum(plane_mean((spectra.conj() * mixed).real, columns))
 
 
 class LowRankFit(eqx.Module):
