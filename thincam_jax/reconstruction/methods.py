@@ -84,9 +84,9 @@ def reconstruct(
     - `solver`: the method with its settings: `Wiener`, `FringeScanning` (filters, for `Cameras`),
       `AdmmTV`, `Fista`, `Ridge` or `PoissonTV`. Default: the one of `choose_solver`; the result
       has its reason.
-    - `start`: a start image, such as an earlier result. By default it is uniform with cameras or
-      matrices and for `PoissonTV`, else black. With a start image `AdmmTV` omits its first part
-      without the uniform light, see docs/reconstruction.md.
+    - `start`: a start image, such as an earlier result. By default it is uniform with cameras,
+      matrices and `LowRank` operators and for `PoissonTV`, else black. With a start image `AdmmTV`
+      omits its first part without the uniform light, see docs/reconstruction.md.
     - `callback`: called with `Progress` every tenth iteration of `AdmmTV` and `Fista`; it stops
       the run by returning a true value. Ctrl-C returns the best image so far, with the status
       "interrupted".
@@ -159,7 +159,7 @@ class AbstractRegularised(AbstractIterativeSolver):
         start: Float[Array, "..."] | None = None,
         callback: Callback | None = None,
     ) -> Reconstruction:
-        """Reconstruct from the start image; by default uniform with cameras or matrices, else zero.
+        """Reconstruct from the start image; by default uniform or zero, as `reconstruct` says.
 
         A uniform image explains the bright background of a zone aperture's capture, or of a screen
         that scatters, at once, which would otherwise take up to hundreds of iterations; a mostly
@@ -173,8 +173,8 @@ class AbstractRegularised(AbstractIterativeSolver):
             synthesis=self.synthesis,
         )
         began = time.perf_counter()
-        dense = all(isinstance(o, Matrix | ReducedMatrix) for o in problem.operators)
-        uniform = dense or isinstance(recording.imaging_model, Cameras)
+        bright = all(isinstance(o, Matrix | ReducedMatrix | LowRank) for o in problem.operators)
+        uniform = bright or isinstance(recording.imaging_model, Cameras)
         upright = None if start is None else recording.oriented(start)
         image = first_image(problem, upright, uniform=uniform)
         if self.nonnegative:  # it is returned if no iterate is better

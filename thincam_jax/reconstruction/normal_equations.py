@@ -135,12 +135,6 @@ class SeparableNormal(AbstractNormal):
     def solve(self, right: Float[Array, "..."]):
         return _by_modes(self.modes, jax.lax.stop_gradient(self.shift), right)
 
-    def solve_captures(self, captures: tuple[Float[Array, "..."], ...]):
-        seen = self.modes.seen(jnp.sqrt(self.problem.weights[0]) * captures[0])
-        pulled = self.modes.values * seen
-        kept = pulled / (self.modes.values**2 + self.shift)
-        return self.modes.image(kept)[..., None, :, :], jnp.sum(pulled * kept)
-
     def variance(self):
         inverse = 1 / (self.modes.values**2 + self.shift)
         return product(product(self.modes.rows**2, inverse), (self.modes.columns**2).T)

@@ -62,6 +62,7 @@ from thincam_jax.reconstruction.problem import (
     InverseProblem,
     ScaledProblem,
     back_projected,
+    or_one,
     residuals,
     start_image,
     uniform_level,
@@ -262,9 +263,12 @@ def solve_ridge(
 
 @functools.partial(jax.jit, static_argnames="iterations")
 def _solve(problem: InverseProblem, precision, mean, tolerance, iterations: int):
-    scaled = ScaledProblem(_about(problem, mean))
+    about = _about(problem, mean)
+    scaled = ScaledProblem(about)
     inside = scaled.problem
     normal = normal_equations(inside, precision / scaled.curvature)
+    if isinstance(normal, SeparableNormal):
+        return _by_modes(about, scaled.curvature, normal, mean)
     if isinstance(normal, IterativeNormal):
         target = back_projected(inside, inside.captures)
         solution = normal.solution(target, jnp.zeros_like(target), tolerance, iterations)
@@ -280,6 +284,21 @@ def _solve(problem: InverseProblem, precision, mean, tolerance, iterations: int)
     after = jnp.maximum(before - explained / 2, 0)
     unit = (jnp.sqrt(scaled.curvature) * scaled.image_unit) ** 2
     return mean + change * scaled.image_unit, (unit * before, unit * after), converged, steps
+
+
+def _by_modes(about: InverseProblem, curvature, normal: SeparableNormal, mean):
+    """The same in closed form, scaled after the captures' modes are taken: no scaled copies."""
+    (capture,), weight = about.captures, about.weights[0].reshape(())
+    modes, operator_unit = normal.modes, jnp.sqrt(curvature / or_one(weight))
+    seen = modes.seen(capture)
+    unit = or_one(jnp.max(jnp.abs(seen)))
+    pulled = modes.values * (seen / unit)
+    kept = pulled / (modes.values**2 + normal.shift)
+    image = mean + modes.image(kept)[..., None, :, :] * (unit / operator_unit)
+    before = jnp.sum((capture / unit) ** 2) / 2
+    after = jnp.maximum(before - jnp.sum(pulled * kept) / 2, 0)
+    scale = weight * unit**2
+    return image, (scale * before, scale * after), jnp.isfinite(image).all(), jnp.asarray(1)
 
 
 @jax.jit
