@@ -123,7 +123,7 @@ class NumpyAdmm:
     def again(self, iterations):
         """The image after so many iterations from zero."""
         # Consensus plus scaled dual, and what is subtracted from it.
-        self.image, self.down, self.right = np.zeros((3, *self.shape), np.float32)
+        self.image, self.down, self.right = (np.zeros(self.shape, np.float32) for _ in range(3))
         return self.run(iterations)
 
     def run(self, iterations):
