@@ -33,7 +33,7 @@ def test_every_shipped_file_is_one(tmp_path):
 
 
 def test_the_page_of_commands_lists_them():
-    page = (ROOT / "docs/commands.md").read_text("utf-8")
+    page = (ROOT / "docs/files/commands.md").read_text("utf-8")
     table = page.split("| kind | experiment |")[1].split("\n\n")[0]
     cells = [line.split("|")[1] for line in table.splitlines() if line.startswith("| `")]
     assert sorted(re.findall(r"`(\w+)`", " ".join(cells))) == sorted(kinds.examples())
