@@ -33,15 +33,12 @@ lint: .venv/.installed-dev ## Check the style, the formatting and the types.
 bench: .venv/.installed-bench ## Measure speed and accuracy.
 	@$(BIN)/python -m pytest benchmarks --benchmark-columns=min,median,stddev,rounds $(ARGS)
 
-# MkDocs refuses an output folder inside its input folder, hence the move.
-docs: .venv/.installed-docs ## Build the documentation into docs/_build.
-	@rm -rf .docs-build
-	@$(BIN)/mkdocs build --quiet --strict --site-dir .docs-build
-	@rm -rf docs/_build && mv .docs-build docs/_build
+docs: .venv/.installed-docs ## Build the documentation into docs/_build; FAST=1 executes no script.
+	@$(BIN)/python -m sphinx -q -W --keep-going docs docs/_build
 	@echo 'Documentation: docs/_build/index.html'
 
 clean: ## Remove build outputs and caches; .venv and runs/ stay.
-	@rm -rf build dist .docs-build docs/_build .pytest_cache .ruff_cache .hypothesis .benchmarks
+	@rm -rf build dist docs/_build docs/gallery docs/api/generated .pytest_cache .ruff_cache .hypothesis .benchmarks
 	@find . -name __pycache__ -type d -not -path './.venv/*' -not -path './.git/*' -prune -exec rm -rf {} +
 
 .venv/.made:

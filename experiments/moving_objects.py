@@ -1,11 +1,11 @@
-# %% [markdown]
-# # Objects that move
-#
-# More captures carry more of the scene (thesis, section 3.5), if it stays where it is. How far may
-# it move until fewer captures are better? All methods take the same time and the same light: one
-# capture blurs along the whole way; of several each blurs less, but they disagree on the place.
+"""Objects that move
+=================
 
-# %%
+More captures carry more of the scene (thesis, section 3.5), if it stays where it is. How far may
+it move until fewer captures are better? All methods take the same time and the same light: one
+capture blurs along the whole way; of several each blurs less, but they disagree on the place.
+"""
+
 import os
 from dataclasses import replace
 from pathlib import Path
@@ -21,14 +21,14 @@ SIZE = os.environ.get("THINCAM_SIZE", "full")  # "small": a narrower camera, in 
 FIGURES = Path(os.environ.get("THINCAM_FIGURES", "runs/experiments")) / "moving_objects"
 FIGURES.mkdir(parents=True, exist_ok=True)
 
-# %% [markdown]
-# ## A capture of what moves
+# %%
+# A capture of what moves
+# -----------------------
 #
 # `moves` are the places of the image's middle when an exposure begins and when it ends. What is
 # captured is the mean on the way, exact: the weights of the image's pixels in a sensor's pixel are
 # integrated along it. Here a bar goes 2 mm, beside the sum over 200 places on the way.
 
-# %%
 bar = np.zeros((24, 40))
 bar[6:18, 18:22] = 1.0
 mask = tc.FresnelZoneAperture(100.0, width=1.2)
@@ -55,14 +55,14 @@ for ax, (name, image) in zip(axes, panels.items(), strict=True):
 axes[0].set_ylabel("y on the sensor (mm)")
 figure.savefig(FIGURES / "bar.png", dpi=110)
 
-# %% [markdown]
-# ## Speeds
+# %%
+# Speeds
+# ------
 #
 # The cameras and methods of `configs/moving.yaml`; sensor, mask and scene are a quarter as wide,
 # and the zones as fine. All but the short capture take the light of eight exposures. The scene's
 # way in the whole sequence is given in pixels of the sensor.
 
-# %%
 count, ways = {"full": (128, (0, 1, 2, 4, 8, 16)), "small": (96, (0, 6))}[SIZE]
 part = 512 / count
 exposures, pitch, magnification = 8, 5.5 * um, 6.5 / 250.0
@@ -157,10 +157,9 @@ for row, pixels in zip(axes, shown, strict=True):
     row[0].set_ylabel(f"{pixels} pixels")
 figure.savefig(FIGURES / "images.png", dpi=110)
 
-# %% [markdown]
+# %%
 # What the text says:
 
-# %%
 lost = {name: decibels(name, *targets)[0] - decibels(name, *targets)[-1] for name in names}
 print({name: f"loses {value:.1f} dB" for name, value in lost.items()})
 assert apart < 1e-3

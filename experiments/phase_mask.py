@@ -1,13 +1,13 @@
-# %% [markdown]
-# # A phase mask from noise to a file that can be made
-#
-# A phase mask passes all the light and bends it: its PSF can be sharp lines in place of a shadow.
-# This script draws a target of contours (PhlatCam: Boominathan et al., IEEE PAMI 42, 1618 (2020)),
-# finds a relief whose PSF it is by the algorithm of Gerchberg and Saxton, and improves the relief
-# by gradient with the levels that can be made. It sets both beside a diffuser and Voronoi-Fresnel
-# lenses, and asks what few levels, broad light and dispersion cost. Lengths are in mm.
+"""A phase mask from noise to a file that can be made
+==================================================
 
-# %%
+A phase mask passes all the light and bends it: its PSF can be sharp lines in place of a shadow.
+This script draws a target of contours (PhlatCam: Boominathan et al., IEEE PAMI 42, 1618 (2020)),
+finds a relief whose PSF it is by the algorithm of Gerchberg and Saxton, and improves the relief
+by gradient with the levels that can be made. It sets both beside a diffuser and Voronoi-Fresnel
+lenses, and asks what few levels, broad light and dispersion cost. Lengths are in mm.
+"""
+
 import os
 from pathlib import Path
 
@@ -43,18 +43,18 @@ SIZE = os.environ.get("THINCAM_SIZE", "full")  # "small": a smaller camera, in s
 FIGURES = Path(os.environ.get("THINCAM_FIGURES", "runs/experiments")) / "phase_mask"
 FIGURES.mkdir(parents=True, exist_ok=True)
 
-# %% [markdown]
-# ## The camera
+# %%
+# The camera
+# ----------
 #
 # A sensor of 32 × 40 pixels of 6 µm, a mask as large with cells of 2 µm, 2 mm before it. The
 # material is a photopolymer, n = 1.504 + 0.0042 µm²/λ² (1.519 at 532 nm). Cells of 2 µm bend green
 # light by up to λ/(2 · 2 µm) = 7.6°, 0.27 mm on the sensor.
 #
 # The error is that of the best linear image, as a part of the scene's variance, for photographs'
-# spectrum (f^-2.5), 10,000 electrons a pixel before a white scene and 8 electrons of read noise. It
-# counts the sensor's crop: of a scene that covers 26 × 26 pixels, what falls beside it is lost.
+# spectrum (f^-2.5), 10,000 electrons a pixel before a white scene and 8 electrons of read noise.
+# It counts the sensor's crop: of a scene that covers 26 × 26 pixels, what falls beside it is lost.
 
-# %%
 pixels, across, steps, rounds = {"full": ((32, 40), 26, 60, 60), "small": ((16, 20), 12, 20, 8)}[
     SIZE
 ]
@@ -94,15 +94,15 @@ def error_of(mask, where=at_green):
     return float(evaluate(mask, (where, setup), keys[0]))
 
 
-# %% [markdown]
-# ## Four families
+# %%
+# Four families
+# -------------
 #
 # The target's lines are 9 µm wide. Gerchberg and Saxton's algorithm begins with random phases. The
 # refined relief starts from what it found and lowers the expected error itself, whatever PSF that
 # makes. Both have eight levels, 1/8 turn of green light apart. A third is refined for a sensor
 # whose rims meet: it may put its light at the rim, where a real sensor ends.
 
-# %%
 fine = blank.grid
 target = contour_target(keys[0], fine, feature=60 * um, line_width=1.5 * pitch)
 path = LightPath(green, distance, object_distance)
@@ -147,13 +147,13 @@ for ax in axes[:, 0]:
     ax.set(ylabel="y (mm)")
 figure.savefig(FIGURES / "families.png", dpi=110)
 
-# %% [markdown]
-# ## What levels cost
+# %%
+# What levels cost
+# ----------------
 #
 # Fewer levels, cheaper masks. The retrieved phase is rounded to them; the refinement knows of them
 # throughout.
 
-# %%
 counts = {"full": (2, 4, 16), "small": ()}[SIZE]
 by_levels = {8: (errors["contours"], errors["refined"])}
 for count in counts:
@@ -167,17 +167,17 @@ for count, (before, after) in sorted(by_levels.items()):
     print(f"{count} levels: retrieved {before:.4f}, refined {after:.4f}")
     assert after < before  # at equal levels
 
-# %% [markdown]
-# ## What broad light and dispersion cost
+# %%
+# What broad light and dispersion cost
+# ------------------------------------
 #
 # The phase (n − 1)h/λ falls with the wavelength twice: by 1/λ, and by n. Away from green the PSF
 # blurs and gets a bright spot of light that is not bent. That costs also where the PSF of each
-# wavelength is known, and more on a grey sensor, which sees their sum. A relief refined for the sum
-# gives that back.
+# wavelength is known, and more on a grey sensor, which sees their sum. A relief refined for the
+# sum gives that back.
 #
 # Dispersion is judged by the same relief in a material whose index is that of green everywhere.
 
-# %%
 band = np.linspace(450, 650, {"full": 5, "small": 2}[SIZE]) * nm
 white = setting(band, together=True)
 for_white = refine_mask(
@@ -233,15 +233,15 @@ for ax in axes:
     ax.legend()
 figure.savefig(FIGURES / "light.png", dpi=110)
 
-# %% [markdown]
-# ## Images
+# %%
+# Images
+# ------
 #
 # The expected error is of scenes of a spectrum. Photographs through the masks, with the same light
 # and noise, restored by the same linear method with the best of a few τ for each; and other
 # contours and other first phases of Gerchberg and Saxton's algorithm: three seeds.
 
 
-# %%
 def photograph(name):
     whole = sample_image(name).astype(float)
     whole = whole if whole.ndim == 2 else whole.mean(axis=-1)
@@ -312,21 +312,20 @@ for ax in axes[:, 0]:
     ax.set(ylabel="y on the object (mm)")
 figure.savefig(FIGURES / "image.png", dpi=110)
 
-# %% [markdown]
-# ## Files to make it from
+# %%
+# Files to make it from
+# ---------------------
 #
 # An 8-bit height map with its scale in a JSON file beside it, for grey-scale lithography, and a
 # closed solid for two-photon printing.
 
-# %%
 write_height_map(FIGURES / "height_map.png", refined.mask, wavelength=green)
 corner = PhaseMask(refined.mask.height[:24, :24], cell, polymer)
 write_stl(FIGURES / "corner.stl", corner)
 
-# %% [markdown]
+# %%
 # What the text says:
 
-# %%
 for before, after, *qualities in by_seed:
     assert after < before  # in expected error, and in images
     assert np.mean(qualities[1]) > np.mean(qualities[0])

@@ -1,13 +1,13 @@
-# %% [markdown]
-# # A rig from its first pattern to its image
-#
-# A light modulator shows zone apertures, a camera behind it takes a frame of each, and an image is
-# made of the frames (method B of the thesis, section 3.4). Without a `virtual` rig below, the same
-# drivers open real devices, and the rest of this script stays. The virtual devices speak the real
-# protocols: the camera USB3 Vision, the stage Zaber's ASCII. `thincam capture` does the same with
-# an experiment file.
+"""A rig from its first pattern to its image
+=========================================
 
-# %%
+A light modulator shows zone apertures, a camera behind it takes a frame of each, and an image is
+made of the frames (method B of the thesis, section 3.4). Without a `virtual` rig below, the same
+drivers open real devices, and the rest of this script stays. The virtual devices speak the real
+protocols: the camera USB3 Vision, the stage Zaber's ASCII. `thincam capture` does the same with
+an experiment file.
+"""
+
 import os
 import tempfile
 from pathlib import Path
@@ -37,13 +37,13 @@ shape, pitch, side, electrons = {
     "small": ((112, 144), 33 * um, 80, 4e5),
 }[SIZE]
 
-# %% [markdown]
-# ## The rig
+# %%
+# The rig
+# -------
 #
 # A modulator of 36 µm pixels at 6.5 mm from the sensor, a photograph at 250 mm, and the drivers of
 # the devices.
 
-# %%
 display_pitch, distance, wavelength = 36 * um, 6.5, 532 * nm
 picture = sample_image("astronaut").mean(axis=-1)
 scene = tc.Scene(tc.ImagePlane(picture, distance=250.0, width=130.0), wavelength)
@@ -59,13 +59,13 @@ drivers = {
     "stage": ("zaber", {"port": "/dev/ttyUSB0"}),
 }
 
-# %% [markdown]
-# ## The capture
+# %%
+# The capture
+# -----------
 #
 # For each step of the plan: move, show, settle, flush, trigger, check, keep. The virtual rig
 # computes what its camera will see while the pattern is shown.
 
-# %%
 mask = zone_plate(25.0, side * display_pitch)
 settings = CameraSettings(exposure=20e-3, pixel_format="Mono12")
 plan = method_b(mask, (25.0, 21.0), settings, dark_frames=1).at_position(0.0)
@@ -82,12 +82,12 @@ print(f"{outcome.total} frames by {taken.provenance['devices']['camera']['model'
 for step, seconds in outcome.seconds.items():
     print(f"  {step}: {1000 * seconds / outcome.total:.1f} ms a frame")
 
-# %% [markdown]
-# ## The image
+# %%
+# The image
+# ---------
 #
 # From the patterns that were shown, as from any others.
 
-# %%
 sensor = tc.Sensor(frames.shape[1:], pitch)
 cameras = [
     tc.LenslessCamera(
@@ -135,14 +135,14 @@ ax.margins(x=0.2)
 ax.invert_yaxis()
 figure.savefig(FIGURES / "timing.png", dpi=110)
 
-# %% [markdown]
-# ## What this says
+# %%
+# What this says
+# --------------
 #
 # The virtual rig computes what its camera sees from the pixels shown. By another model, the exact
 # one of a zone aperture, the same frames are predicted to within the noise of the camera. A real
 # rig has no scene to compare with; its frames and its image are in the figures above.
 
-# %%
 assert outcome.complete
 if virtual is not None:
     electron, _ = electronics.scale(taken.settings[0])

@@ -1,18 +1,18 @@
-# %% [markdown]
-# # How much accuracy does a simulation need?
-#
-# A point spread function (PSF) can be computed in many ways: as the mask's shadow in no time, or as
-# the exact scalar field by an FFT in a second. Which way is good enough? Here you say how large an
-# error may be, and the package picks the cheapest computation that stays below it, with the error
-# predicted before anything is computed. This script checks these predictions against an exact
-# model.
-#
-# Errors are relative, ‖h − h₀‖₂/‖h₀‖₂ over the sensor. The reference h₀ is the model "separable" in
-# double precision: the field behind a square zone aperture is a short sum of products of Fresnel
-# integrals, without any sampling. Equation numbers are those of the thesis; lengths are in mm, β in
-# rad/mm².
+"""How much accuracy does a simulation need?
+=========================================
 
-# %%
+A point spread function (PSF) can be computed in many ways: as the mask's shadow in no time, or
+as the exact scalar field by an FFT in a second. Which way is good enough? Here you say how large
+an error may be, and the package picks the cheapest computation that stays below it, with the
+error predicted before anything is computed. This script checks these predictions against an
+exact model.
+
+Errors are relative, ‖h − h₀‖₂/‖h₀‖₂ over the sensor. The reference h₀ is the model "separable"
+in double precision: the field behind a square zone aperture is a short sum of products of
+Fresnel integrals, without any sampling. Equation numbers are those of the thesis; lengths are in
+mm, β in rad/mm².
+"""
+
 import os
 import statistics
 import time
@@ -47,13 +47,13 @@ def milliseconds(function):
     return statistics.median(taken)
 
 
-# %% [markdown]
-# ## One PSF
+# %%
+# One PSF
+# -------
 #
 # The thesis' camera, and a tolerance of 10 %. The choice comes with its reasons: what it leaves
 # out, and how much that is.
 
-# %%
 rows, columns = {"full": (1024, 1024), "small": (96, 128)}[SIZE]
 width = 5.632
 mask = tc.FresnelZoneAperture(beta=25.0, width=width)
@@ -64,27 +64,26 @@ choice = tc.select_model(camera, tolerance=0.1, **light)
 print(f"{choice.method.model}, {choice.method.precision}: predicted {choice.predicted_error:.3f}")
 print(*choice.reasons, sep="\n")
 
-# %% [markdown]
-# As the tolerance shrinks, first the approximate model is given up, then single precision. Never
-# chosen here is the shadow (Eq 3.5), which is wrong by 98 %: the phase of diffraction at the mask's
-# edge, β²λd·r²/π (Eq 3.26), is 5 rad.
-
 # %%
+# As the tolerance shrinks, first the approximate model is given up, then single precision. Never
+# chosen here is the shadow (Eq 3.5), which is wrong by 98 %: the phase of diffraction at the
+# mask's edge, β²λd·r²/π (Eq 3.26), is 5 rad.
+
 tolerances = (0.3, 0.1, 0.03, 1e-2, 1e-4, 1e-6)
 choices = {t: tc.select_model(camera, tolerance=t, **light) for t in tolerances}
 for tolerance, choice in choices.items():
     method = choice.method
     print(f"{tolerance:.0e}: {method.model}, {method.precision}, {choice.predicted_error:.1e}")
 
-# %% [markdown]
-# ## All models beside the exact one
+# %%
+# All models beside the exact one
+# -------------------------------
 #
 # The closed forms without an edge (Eq 3.26, and the same without its approximation in ε = βλd/π)
-# cost as much as the exact field and are 8 and 4 % off. An FFT (the angular spectrum on a window of
-# mask and sensor, one sample a pixel) takes hundreds of times as long and is 2 % off, because it
-# samples the mask's hard edge.
+# cost as much as the exact field and are 8 and 4 % off. An FFT (the angular spectrum on a window
+# of mask and sensor, one sample a pixel) takes hundreds of times as long and is 2 % off, because
+# it samples the mask's hard edge.
 
-# %%
 exactly, singly = (tc.PsfMethod(precision=p) for p in ("float64", "float32"))
 reference = tc.psf(camera, model=exactly, **light)
 models = ("geometric", "paraxial", "closed_form", "angular_spectrum", "separable")
@@ -117,13 +116,13 @@ ax.margins(x=0.15)
 ax.legend(loc="lower right")
 figure.savefig(FIGURES / "models.png", dpi=110)
 
-# %% [markdown]
-# ## Can the predictions be trusted?
+# %%
+# Can the predictions be trusted?
+# -------------------------------
 #
 # Cameras drawn at random, each with four models. A prediction should lie above the true error, but
 # not far above it.
 
-# %%
 random = np.random.default_rng(0)
 closed_forms = ("geometric", "paraxial", "closed_form", "separable")
 pairs = {model: [] for model in closed_forms}
@@ -153,15 +152,15 @@ ax.set(ylabel="predicted relative error (parts of one)")
 ax.legend()
 figure.savefig(FIGURES / "predictions.png", dpi=110)
 
-# %% [markdown]
-# ## Single or double precision
+# %%
+# Single or double precision
+# --------------------------
 #
 # Single precision rounds a phase of p rad to about p·2⁻²⁴ rad. The largest that counts is that of
 # the zones in the mask's corner, βw²/2: the more zones a mask has, the more digits are lost. With
 # few zones other rounding prevails, some 6·10⁻⁶. (The waves from the mask's edge turn by more,
 # πw²/(λd), but they are weak.)
 
-# %%
 for method in (singly, exactly):
     taken = milliseconds(lambda way=method: tc.psf(camera, model=way, **light))
     print(f"{method.precision}: {taken:.1f} ms")
@@ -190,14 +189,14 @@ ax.set(ylabel="relative error of float32 (parts of one)")
 ax.legend()
 figure.savefig(FIGURES / "precision.png", dpi=110)
 
-# %% [markdown]
-# ## A whole capture
-#
-# `tc.plan` does the same for a scene. This one has 8 planes from 0.1 to 10 m and 11 wavelengths: 88
-# PSFs in full. A plan computes a few of them and writes the others as weighted sums of these, so
-# that planes are added up before they are convolved.
-
 # %%
+# A whole capture
+# ---------------
+#
+# `tc.plan` does the same for a scene. This one has 8 planes from 0.1 to 10 m and 11 wavelengths:
+# 88 PSFs in full. A plan computes a few of them and writes the others as weighted sums of these,
+# so that planes are added up before they are convolved.
+
 shape, pitch = {"full": ((256, 320), 17 * um), "small": ((96, 128), 44 * um)}[SIZE]
 names = ("astronaut", "brick", "camera", "cat", "coffee", "coins", "moon", "rocket")
 pictures = [np.atleast_3d(sample_image(name)).mean(axis=-1) for name in names]
@@ -236,8 +235,9 @@ for ax in axes:
     ax.legend()
 figure.savefig(FIGURES / "plan.png", dpi=110)
 
-# %% [markdown]
-# ## What came out
+# %%
+# What came out
+# -------------
 #
 # - One PSF: 10 % allow the closed form of Eq 3.26, 3 % and less ask for the exact field in single
 #   precision, 10⁻⁶ for double.
@@ -248,7 +248,6 @@ figure.savefig(FIGURES / "plan.png", dpi=110)
 #   7th. The true errors are 0.3 % and 0.01 %: the predictions are on the safe side.
 # - At 3 % even the shadow does for a capture, most of whose light is background.
 
-# %%
 ways = {t: (choice.method.model, choice.method.precision) for t, choice in choices.items()}
 assert ways[0.1] == ("paraxial", "float32")
 assert ways[3e-2] == ways[1e-4] == ("separable", "float32")

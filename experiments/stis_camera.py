@@ -1,11 +1,11 @@
-# %% [markdown]
-# # A screen that is a lensless camera
-#
-# The thesis proposes (section 5.4) to take the lens out of the see-through screen: a mask and a
-# bare sensor behind the top hologram make it thinner. It gives no equations. What does such a
-# camera see, what do the screen's ghosts do to it, and how well does an image come back?
+"""A screen that is a lensless camera
+==================================
 
-# %%
+The thesis proposes (section 5.4) to take the lens out of the see-through screen: a mask and a
+bare sensor behind the top hologram make it thinner. It gives no equations. What does such a
+camera see, what do the screen's ghosts do to it, and how well does an image come back?
+"""
+
 import os
 from functools import partial
 from pathlib import Path
@@ -26,15 +26,15 @@ SIZE = os.environ.get("THINCAM_SIZE", "full")  # "small": fewer and larger pixel
 FIGURES = Path(os.environ.get("THINCAM_FIGURES", "runs/experiments")) / "stis_camera"
 FIGURES.mkdir(parents=True, exist_ok=True)
 
-# %% [markdown]
-# ## The camera
+# %%
+# The camera
+# ----------
 #
 # The plate and its holograms are those of the camera with a lens (5 mm of n = 1.5, a film of 16 µm
 # with Δn = 0.02, 532 nm at 61.2°; assumed but for the last two). The mask stands half a millimetre
 # behind the plate, the sensor d = 6.5 mm behind the mask. `SeeThroughCamera` describes both
 # cameras: here its pinhole is the middle of the mask.
 
-# %%
 count, field_count, points, pitch, width, beta = {
     "full": (96, 48, 7, 44 * um, 3.2, 20.0),
     "small": (48, 24, 5, 86 * um, 2.6, 13.0),
@@ -51,15 +51,15 @@ sensor = tc.Sensor((count, count), pitch)
 field = (field_count, field_count)  # samples of the object's first image
 camera = wg.SeeThroughCamera(screen, sensor, distance, gap)
 
-# %% [markdown]
-# ## Rays
+# %%
+# Rays
+# ----
 #
 # A point of the object (right) sends light to the whole mask. Two rays of each order are drawn, to
 # the edges of the mask, as if from a ghost behind the object. On the axis the first ghost is 30.4
 # mrad from the image, 36 pixels of 5.5 µm. (A pixel sees points 18.2 mm apart, 32 mrad at the
 # image's distance; but the ghost's is 600 mm, not 567.)
 
-# %%
 axis = wg.ghost_images(camera, jnp.zeros((1, 2)), far, orders)
 places, sources = np.asarray(axis.places)[:, 0, 1], np.asarray(axis.distance)[:, 0]
 apart = 1e3 * (places[1] - places[0]) / distance
@@ -93,15 +93,15 @@ ax.invert_yaxis()
 ax.legend(loc="lower left", fontsize="small")
 figure.savefig(FIGURES / "rays.png", dpi=110)
 
-# %% [markdown]
-# ## The PSF, order by order
+# %%
+# The PSF, order by order
+# -----------------------
 #
 # Each order casts the mask's shadow, with its diffraction, at its own place, in its own colour and
 # from its own distance: `ghost_images` finds these, `ghost_psfs` adds the shadows up. The mask's
 # PSF is a function of wavelength, distance and place; any mask will do.
 
 
-# %%
 def plate(centre):
     return tc.FresnelZoneAperture(beta, width=width, centre=centre)
 
@@ -129,12 +129,11 @@ axes[0].set_ylabel("y on the sensor (mm)")
 figure.colorbar(drawn, ax=axes, label="irradiance / open aperture")
 figure.savefig(FIGURES / "orders.png", dpi=110)
 
-# %% [markdown]
-# Ghosts alone never take a frequency away: the weights ∫η²(1−η)ⁱ dλ fall with i, and then
-# |Σ Wᵢ e^{ijφ}| has no zero (Eneström and Kakeya). For this film it never falls below 0.70 of its
-# value at φ = 0.
-
 # %%
+# Ghosts alone never take a frequency away: the weights ∫η²(1−η)ⁱ dλ fall with i, and then
+# the modulus of Σ Wᵢ e^{ijφ} has no zero (Eneström and Kakeya). For this film it never falls below
+# 0.70 of its value at φ = 0.
+
 phase = np.linspace(0, 2 * np.pi, 361)
 step = np.abs(np.exp(1j * np.outer(phase, np.arange(orders))) @ weights) / weights.sum()
 figure, ax = plt.subplots(figsize=(5, 2.6), layout="constrained")
@@ -142,15 +141,15 @@ ax.plot(phase / (2 * np.pi), step, "k")
 ax.set(xlabel="spatial frequency × the ghosts' step", ylabel="ghosts' transfer", ylim=(0, 1.05))
 figure.savefig(FIGURES / "transfer.png", dpi=110)
 
-# %% [markdown]
-# ## Captures and three models
+# %%
+# Captures and three models
+# -------------------------
 #
 # Captures are simulated without any shortcut: every point of the field with the PSF of its own
-# ghosts. They are undone with the ghosts ignored, with the PSF of the axis everywhere, and with the
-# low-rank sum of `low_rank_psf` from a few points of the field. One noise for all.
+# ghosts. They are undone with the ghosts ignored, with the PSF of the axis everywhere, and with
+# the low-rank sum of `low_rank_psf` from a few points of the field. One noise for all.
 
 
-# %%
 def field_points(shape, count):
     """First images, (x, y) mm, of `count`² points of a field from its first to its last sample."""
     ends = [(n - 1) / 2 * float(pitch) for n in shape]
@@ -259,13 +258,13 @@ for ax in axes[:, 0]:
     ax.set_ylabel("y on the sensor, turned (mm)")
 figure.savefig(FIGURES / "models.png", dpi=110)
 
-# %% [markdown]
-# ## Refocus
+# %%
+# Refocus
+# -------
 #
 # The mask's shadow grows with 1 + d/T, and the ghosts' places change with the distance too. A
 # capture of objects at 250 mm, undone for 550 mm and for 250 mm:
 
-# %%
 close, near_level = models(zone_plate, near)
 near_captures, near_variance = noisy(captured(zone_plate, near, near_level))
 refocused = {
@@ -283,15 +282,15 @@ for ax, (name, found) in zip(axes, refocused.items(), strict=True):
 axes[0].set_ylabel("y on the sensor, turned (mm)")
 figure.savefig(FIGURES / "refocus.png", dpi=110)
 
-# %% [markdown]
-# ## Three masks
+# %%
+# Three masks
+# -----------
 #
 # Any mask with a PSF will do. With the same exposure and the same noise, on the same sensor: the
 # zone plate, a MURA of 31 × 31 cells of 0.1 mm, and a pinhole of 0.1 mm, each undone in full. (The
 # small size leaves the last two out.)
 
 
-# %%
 def mura(centre):
     return tc.ModifiedUniformlyRedundantArray(order=31, cell=0.1, centre=centre)
 
@@ -325,23 +324,22 @@ for ax in axes[:, 0]:
     ax.set_ylabel("y on the sensor, turned (mm)")
 figure.savefig(FIGURES / "masks.png", dpi=110)
 
-# %% [markdown]
-# ## Beside the camera with a lens
+# %%
+# Beside the camera with a lens
+# -----------------------------
 #
 # From the sensor to the screen's front: with a lens d0 + d1 + w, without d + gap + w. The light is
 # what a lens or the mask's openings let through, whatever it is then spread over.
 
-# %%
 depth_with_lens = 6.0 + 10.0 + 5.0
 depth = distance + gap + 5.0
 aperture = np.pi * (6.0 / 2 / 2) ** 2  # of a lens at f/2
 print(f"depth {depth:g} mm, with a lens {depth_with_lens:g} mm")
 print(f"open area {opened['zone plate']:.1f} mm², of a lens at f/2 {aperture:.1f} mm²")
 
-# %% [markdown]
+# %%
 # The numbers above hold.
 
-# %%
 mean = {name: np.mean(values) for name, values in quality.items()}
 np.testing.assert_allclose(apart, 30.4, atol=0.1)
 np.testing.assert_allclose(step.min(), 0.70, atol=0.01)

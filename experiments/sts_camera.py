@@ -1,16 +1,16 @@
-# %% [markdown]
-# # A screen that is a camera
-#
-# A glass plate with two volume holograms guides light from a person before a screen to a camera at
-# its edge (thesis chapter 5). What does such a camera see, where do its ghosts and colours come
-# from, and how well does an image come back? This script follows the rays, simulates a capture and
-# undoes the ghosts.
-#
-# The thesis gives d0 = 6 mm, 61.2°, 532 nm and the holograms' sizes. It does not give the glass
-# (here 5 mm of n = 1.5), its distance from the lens (10 mm), the film (16 µm, Δn = 0.02), or where
-# on the plate the holograms are: these are assumptions.
+"""A screen that is a camera
+=========================
 
-# %%
+A glass plate with two volume holograms guides light from a person before a screen to a camera at
+its edge (thesis chapter 5). What does such a camera see, where do its ghosts and colours come
+from, and how well does an image come back? This script follows the rays, simulates a capture and
+undoes the ghosts.
+
+The thesis gives d0 = 6 mm, 61.2°, 532 nm and the holograms' sizes. It does not give the glass
+(here 5 mm of n = 1.5), its distance from the lens (10 mm), the film (16 µm, Δn = 0.02), or where
+on the plate the holograms are: these are assumptions.
+"""
+
 import os
 from pathlib import Path
 
@@ -29,12 +29,12 @@ SIZE = os.environ.get("THINCAM_SIZE", "full")  # "small": a smaller sensor, in s
 FIGURES = Path(os.environ.get("THINCAM_FIGURES", "runs/experiments")) / "sts_camera"
 FIGURES.mkdir(parents=True, exist_ok=True)
 
-# %% [markdown]
-# ## The camera
+# %%
+# The camera
+# ----------
 #
 # The sensor covers 2.1 mm in both sizes: 440 × 440 pixels of 4.8 µm, or fewer and larger ones.
 
-# %%
 binned = {"full": 1, "small": 4}[SIZE]
 sensor = tc.Sensor((440 // binned, 440 // binned), 4.8 * um * binned)
 hologram = wg.VolumeHologram.record(
@@ -51,14 +51,14 @@ def see_through(glass=5.0):
 camera = see_through()
 distance, orders = 550.0, 4  # of the object, mm; of ghosts
 
-# %% [markdown]
-# ## Rays
+# %%
+# Rays
+# ----
 #
 # Light from the object (right) enters the plate, is diffracted at the bottom hologram, runs up
 # between the surfaces and is diffracted out before the lens. Contacts in between let a part of it
 # out, so that a pixel sees the object at several places: ghosts, each after two more reflections.
 
-# %%
 figure, ax = plt.subplots(figsize=(10, 4.2), layout="constrained")
 greys = [("0.0", "-"), ("0.45", "--"), ("0.65", ":")]
 for (grey, dashes), pixel in zip(greys, (-0.9, 0.0, 0.9), strict=True):
@@ -85,13 +85,13 @@ ax.invert_yaxis()
 ax.legend(loc="lower left", fontsize="small")
 figure.savefig(FIGURES / "rays.png", dpi=110)
 
-# %% [markdown]
-# ## Colours and ghosts over the field
+# %%
+# Colours and ghosts over the field
+# ---------------------------------
 #
 # Each pixel is reached by the one colour that meets the Bragg condition for its direction, and the
 # ghosts' distance on the object varies too: no convolution describes this camera.
 
-# %%
 pixels = wg.pixel_centres(camera)
 rays = wg.trace(camera, pixels, distance, orders)
 colours = np.asarray(rays.wavelength) / nm
@@ -109,14 +109,14 @@ for ax, (values, label) in zip(axes, maps, strict=True):
     figure.colorbar(drawn, ax=ax, label=label)
 figure.savefig(FIGURES / "field.png", dpi=110)
 
-# %% [markdown]
-# ## The smear of the ghosts
-#
-# A pixel's band is several nanometres wide. Its colours leave in one direction but took other paths
-# in the glass: a ghost is smeared along the screen, wider with every order, and the side lobes of
-# the band show in it. Grey is what a pixel sees.
-
 # %%
+# The smear of the ghosts
+# -----------------------
+#
+# A pixel's band is several nanometres wide. Its colours leave in one direction but took other
+# paths in the glass: a ghost is smeared along the screen, wider with every order, and the side
+# lobes of the band show in it. Grey is what a pixel sees.
+
 middle = wg.trace(camera, jnp.zeros((1, 2)), distance, 3)
 band = wg.trace_band(camera, jnp.zeros((1, 2)), distance, 3, 2048)
 pixel_seen = 4.8e-3 * binned * (10.0 + distance) / 6.0
@@ -129,14 +129,14 @@ for order, ax in enumerate(axes):
 axes[0].set_ylabel("light (1/mm)")
 figure.savefig(FIGURES / "smear.png", dpi=110)
 
-# %% [markdown]
-# ## A capture, and the image that comes back
-#
-# The capture is the sum of four ghosts with the weights ∫η²(1−η)ⁱ dλ. The system is a sparse matrix
-# H, and the reconstruction that of every camera: total variation by ADMM. What if the model is
-# wrong: ghosts forgotten, or the glass taken for 2 % thicker than it is?
-
 # %%
+# A capture, and the image that comes back
+# ----------------------------------------
+#
+# The capture is the sum of four ghosts with the weights ∫η²(1−η)ⁱ dλ. The system is a sparse
+# matrix H, and the reconstruction that of every camera: total variation by ADMM. What if the model
+# is wrong: ghosts forgotten, or the glass taken for 2 % thicker than it is?
+
 plane = wg.ObjectPlane((64, 64), distance, 150.0, (0.0, 27.0))
 system = wg.system_operator(camera, plane, orders)
 scenes = {"camera": resize(sample_image("camera"), (64, 64))}
@@ -177,14 +177,14 @@ for row, (name, scene) in zip(axes, scenes.items(), strict=True):
         ax.set_xlabel(f"mm on the {where}", fontsize="small")
 figure.savefig(FIGURES / "images.png", dpi=110)
 
-# %% [markdown]
-# ## What this says
+# %%
+# What this says
+# --------------
 #
-# With the right model more than 34 dB come back on the photograph and 33 dB on text. Forgetting the
-# ghosts costs 10 dB and more, a glass taken for 2 % thicker 2 dB and more: the plate has to be
+# With the right model more than 34 dB come back on the photograph and 33 dB on text. Forgetting
+# the ghosts costs 10 dB and more, a glass taken for 2 % thicker 2 dB and more: the plate has to be
 # calibrated.
 
-# %%
 right, thick, single = models
 assert reached["camera", right] > 34
 assert reached["text", right] > 33

@@ -1,12 +1,12 @@
-# %% [markdown]
-# # Which plate makes the best see-through camera?
-#
-# The thesis gives neither the glass of its screen, nor its distance from the lens, nor the film of
-# its holograms; the defaults of this project are assumptions (5 mm, 10 mm, 16 µm, Δn = 0.02). Here
-# they are chosen: by gradient, for the least expected error of the reconstruction, within what can
-# be made, and then simulated in full beside the defaults.
+"""Which plate makes the best see-through camera?
+==============================================
 
-# %%
+The thesis gives neither the glass of its screen, nor its distance from the lens, nor the film of
+its holograms; the defaults of this project are assumptions (5 mm, 10 mm, 16 µm, Δn = 0.02). Here
+they are chosen: by gradient, for the least expected error of the reconstruction, within what can
+be made, and then simulated in full beside the defaults.
+"""
+
 import os
 from dataclasses import replace
 from pathlib import Path
@@ -28,13 +28,14 @@ SIZE = os.environ.get("THINCAM_SIZE", "full")  # "small": fewer pixels, cells an
 FIGURES = Path(os.environ.get("THINCAM_FIGURES", "runs/experiments")) / "sts_design"
 FIGURES.mkdir(parents=True, exist_ok=True)
 
-# %% [markdown]
-# ## What is asked, and what can be made
-#
-# Captures of the default plate have 30 dB, and a plate that takes in more light has less shot noise
-# beside its signal. The film is a photopolymer: Δn up to 0.03 and 25 µm. Equal limits fix a number.
-
 # %%
+# What is asked, and what can be made
+# -----------------------------------
+#
+# Captures of the default plate have 30 dB, and a plate that takes in more light has less shot
+# noise beside its signal. The film is a photopolymer: Δn up to 0.03 and 25 µm. Equal limits fix a
+# number.
+
 full = SIZE == "full"
 sensor = tc.Sensor((440, 440), 4.8 * um) if full else tc.Sensor((44, 44), 48 * um)
 cells = (64, 64) if full else (16, 16)
@@ -65,10 +66,9 @@ for name, plate in plates.items():
     values = (f"{text} {getattr(plate, n) / unit:.4g}" for n, (unit, text) in numbers.items())
     print(f"{name}: error {worth[name].error:.2e}; {'; '.join(values)}")
 
-# %% [markdown]
+# %%
 # The same as sections of an experiment file of `kind: screen`, for `thincam run`:
 
-# %%
 best = plates["found"]
 sections = f"""\
 hologram:
@@ -85,13 +85,13 @@ lens:
 (FIGURES / "found.yaml").write_text(sections, "utf-8")
 print(sections)
 
-# %% [markdown]
-# ## What each number does
+# %%
+# What each number does
+# ---------------------
 #
 # Each number alone, the others held. Below some 48° light is no longer guided.
 
 
-# %%
 def error(plate, number, value):
     return float(design.judge_plate(replace(plate, **{number: value}), viewing).error)
 
@@ -115,13 +115,13 @@ axes[0].legend()
 figure.tight_layout()
 figure.savefig(FIGURES / "slices.png", dpi=110)
 
-# %% [markdown]
-# ## Simulated in full
+# %%
+# Simulated in full
+# -----------------
 #
 # Captures with four ghosts and their smear, read with the shot noise of the plate's own light, and
 # reconstructed by ADMM with total variation.
 
-# %%
 page = sample_image("page")
 pictures = {"camera": sample_image("camera")}
 pictures["text"] = middle_square(page, round(0.94 * min(page.shape)))
@@ -157,12 +157,12 @@ for number, (row, target) in enumerate(zip(rows, scenes, strict=True)):
         ax.set_xlabel("x on the object (mm)", fontsize="small")
 figure.savefig(FIGURES / "images.png", dpi=110)
 
-# %% [markdown]
-# ## What it is worth
+# %%
+# What it is worth
+# ----------------
 #
 # More index modulation and a thicker film take in more light and leave less of it to ghosts.
 
-# %%
 figure, axes = plt.subplots(1, 3, figsize=(10, 3.2), layout="constrained")
 light = [float(one.light) * 1e6 for one in worth.values()]
 ghosts = [float(one.ghost_light) for one in worth.values()]
@@ -178,13 +178,13 @@ axes[2].set_xticklabels(list(scenes))
 axes[2].legend(loc="lower right")
 figure.savefig(FIGURES / "plates.png", dpi=110)
 
-# %% [markdown]
-# ## Field of view against error
+# %%
+# Field of view against error
+# ---------------------------
 #
 # A shorter focal length shows more of the room, with fewer pixels for each part of it; at each the
 # other numbers are searched for anew.
 
-# %%
 front = []
 for focal in (10.0, 8.0, 6.0, 5.0, 4.0, 3.0) if full else (8.0, 4.0):
     ends = [replace(end, focal_distance=focal) for end in (limits.lower, limits.upper)]
@@ -200,14 +200,14 @@ ax.legend()
 ax.grid(alpha=0.3)
 figure.savefig(FIGURES / "front.png", dpi=110)
 
-# %% [markdown]
-# ## What this says
+# %%
+# What this says
+# --------------
 #
 # At the same field of view and the same glass the plate that was found has less error, in the
 # expectation and in the simulation. What is modelled is the light, its ghosts and their smear; a
 # film that is harder to make, scatters more or shrinks more is not.
 
-# %%
 assert worth["found"].error < worth["default"].error
 assert all(found > default for default, found in zip(*reached.values(), strict=True))
 assert all(found < default for _, default, found in front)

@@ -1,12 +1,12 @@
-# %% [markdown]
-# # Moving objects behind a screen
-#
-# The see-through-screen camera has to undo its ghosts for every image. Can it follow an object that
-# moves (an open problem of the thesis)? A measured matrix H of 440² pixels and 64² cells has 3.2
-# GB, all of which Hᵀg reads. It is compressed here in several ways: what does each cost in dB, and
-# how many images a second does it allow?
+"""Moving objects behind a screen
+==============================
 
-# %%
+The see-through-screen camera has to undo its ghosts for every image. Can it follow an object
+that moves (an open problem of the thesis)? A measured matrix H of 440² pixels and 64² cells has
+3.2 GB, all of which Hᵀg reads. It is compressed here in several ways: what does each cost in dB,
+and how many images a second does it allow?
+"""
+
 import os
 import time
 from pathlib import Path
@@ -29,13 +29,13 @@ SIZE = os.environ.get("THINCAM_SIZE", "full")  # "small": fewer pixels and cells
 FIGURES = Path(os.environ.get("THINCAM_FIGURES", "runs/experiments")) / "sts_realtime"
 FIGURES.mkdir(parents=True, exist_ok=True)
 
-# %% [markdown]
-# ## A measured matrix, and a moving scene
-#
-# The matrix is that of the ray model with the noise of its calibration, 0.1 % of its largest entry.
-# A window moves over a photograph by a cell an image; captures have 30 dB.
-
 # %%
+# A measured matrix, and a moving scene
+# -------------------------------------
+#
+# The matrix is that of the ray model with the noise of its calibration, 0.1 % of its largest
+# entry. A window moves over a photograph by a cell an image; captures have 30 dB.
+
 pixels, cells, count = {"full": (440, 64, 30), "small": (88, 16, 5)}[SIZE]
 hologram = wg.VolumeHologram.record(
     532 * nm, 0.0, 61.2 * deg, index=1.5, thickness=16 * um, index_modulation=0.02
@@ -60,8 +60,9 @@ deviation = float(jnp.sqrt(jnp.mean(clean[0] ** 2))) * 10 ** (-30 / 20)
 keys = jax.random.split(jax.random.key(0), count)
 captures = [c + deviation * jax.random.normal(k, c.shape) for c, k in zip(clean, keys, strict=True)]
 
-# %% [markdown]
-# ## Matrices that are read faster
+# %%
+# Matrices that are read faster
+# -----------------------------
 #
 # - the ray model, without noise: a plate taken for 5.1 mm thick is fitted to 36 ghosts, each known
 #   to 0.3 mm;
@@ -69,7 +70,6 @@ captures = [c + deviation * jax.random.normal(k, c.shape) for c, k in zip(clean,
 # - half precision;
 # - pixels averaged 2 × 2, which loses what tells them apart.
 
-# %%
 shapes = (cells, cells), (pixels, pixels)
 spots = rng.uniform(-1, 1, (12, 2))  # mm on the sensor
 points = np.asarray(wg.trace(camera, spots, plane.distance, 3).points)[..., :2]
@@ -101,14 +101,14 @@ matrices = {
     "ray model": fit.system(fit.plane),
 }
 
-# %% [markdown]
-# ## The stream
+# %%
+# The stream
+# ----------
 #
 # Each matrix is reduced once. Then an image is one Hᵀg and four iterations of ADMM from the image
-# and the forces before it. What is timed is all of it, from the capture to the image; the first two
-# captures, which are reconstructed in full and compiled for, do not count.
+# and the forces before it. What is timed is all of it, from the capture to the image; the first
+# two captures, which are reconstructed in full and compiled for, do not count.
 
-# %%
 speed, accuracy, images = {}, {}, {}
 for name, matrix in matrices.items():
     rounded = Matrix(half.astype(np.float32), *shapes) if name == "half precision" else matrix
@@ -152,12 +152,12 @@ for ax, (title, picture) in zip(axes, shown, strict=True):
     ax.set(title=title, xlabel="mm on the sensor" if title == "capture" else "mm on the object")
 figure.savefig(FIGURES / "images.png", dpi=110)
 
-# %% [markdown]
-# ## What this says
+# %%
+# What this says
+# --------------
 #
 # Few rays meet a pixel, so nearly all of a measured matrix is noise. What is above the noise, or
 # the model that was fitted to it, is read far faster (above) and reconstructs as well.
 
-# %%
 for name in ("half precision", "threshold", "ray model"):
     assert np.mean(accuracy["dense"]) - np.mean(accuracy[name]) < 0.5, name

@@ -1,10 +1,10 @@
-# %% [markdown]
-# # A study in a notebook
-#
-# Methods A and B of the thesis (section 3.5) beside the conventional method, without any file:
-# cameras, noisy captures, reconstructions, a table and pictures. Every number may be another one.
+"""A study in a notebook
+=====================
 
-# %%
+Methods A and B of the thesis (section 3.5) beside the conventional method, without any file:
+cameras, noisy captures, reconstructions, a table and pictures. Every number may be another one.
+"""
+
 import os
 from pathlib import Path
 
@@ -34,11 +34,10 @@ for name in ("USAF-1951", "astronaut"):
     result.plot(name).savefig(FIGURES / f"{name}.png", dpi=110)
 result.plot_responses().savefig(FIGURES / "responses.png", dpi=110)
 
-# %% [markdown]
+# %%
 # Method A gains more than 2 dB over the distances that it joins. `configs/quick.yaml` is the same
 # study as a file.
 
-# %%
 scores = result.scores.methods
 near, far, method_a, _ = (s.mean_psnr_of_pictures_db for s in scores.values())
 assert method_a > max(near, far) + 2

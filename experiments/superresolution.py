@@ -1,15 +1,15 @@
-# %% [markdown]
-# # Super-resolution of the FZA camera
-#
-# Section 3.5 of the thesis: does a Fresnel-zone-aperture (FZA) camera resolve more if it takes more
-# than the four captures of fringe scanning? Method A takes them at two mask-sensor distances,
-# method B takes four captures with masks of two pitches. This script simulates both beside the
-# conventional method and sets what comes out beside what the thesis published.
-#
-# Equation numbers are those of the thesis, its signs and factors corrected. Lengths are in mm, β in
-# rad/mm², spatial frequencies in cycles/mm on the sensor at d = 6.5 mm.
+"""Super-resolution of the FZA camera
+==================================
 
-# %%
+Section 3.5 of the thesis: does a Fresnel-zone-aperture (FZA) camera resolve more if it takes
+more than the four captures of fringe scanning? Method A takes them at two mask-sensor distances,
+method B takes four captures with masks of two pitches. This script simulates both beside the
+conventional method and sets what comes out beside what the thesis published.
+
+Equation numbers are those of the thesis, its signs and factors corrected. Lengths are in mm, β
+in rad/mm², spatial frequencies in cycles/mm on the sensor at d = 6.5 mm.
+"""
+
 import math
 import os
 from pathlib import Path
@@ -37,18 +37,18 @@ SIZE = os.environ.get("THINCAM_SIZE", "full")  # "small": a smaller camera, in s
 FIGURES = Path(os.environ.get("THINCAM_FIGURES", "runs/experiments")) / "superresolution"
 FIGURES.mkdir(parents=True, exist_ok=True)
 
-# %% [markdown]
-# ## The set-up of section 3.5.1
+# %%
+# The set-up of section 3.5.1
+# ---------------------------
 #
 # A sensor of 1024 × 1024 pixels of 5.5 µm, masks of 5.63 mm, an object of 180 mm at t = 250 mm,
-# Gaussian noise at 30 dB. The thesis does not give the wavelength; its first zero at 12.4 cycles/mm
-# for d = 6.5 mm means 500 nm (Eq 3.32). Nor does it say which signal power the 30 dB refer to; we
-# take the capture's variance, the power without the bright background.
+# Gaussian noise at 30 dB. The thesis does not give the wavelength; its first zero at 12.4
+# cycles/mm for d = 6.5 mm means 500 nm (Eq 3.32). Nor does it say which signal power the 30 dB
+# refer to; we take the capture's variance, the power without the bright background.
 #
-# The small size has half the width, twice the β and twice the pixel pitch. All bands stay the same:
-# the zeros depend on λd only, the cut-off on β times the width.
+# The small size has half the width, twice the β and twice the pixel pitch. All bands stay the
+# same: the zeros depend on λd only, the cut-off on β times the width.
 
-# %%
 count, part, snr_db = {"full": (1024, 1, 30.0), "small": (256, 2, 36.0)}[SIZE]
 width = 5.632 / part  # of mask and sensor, mm
 object_width = 180.0 / part
@@ -64,26 +64,31 @@ def camera(beta, turns, distance):
     return tc.LenslessCamera(mask, sensor, distance)
 
 
-# %% [markdown]
-# ## What each method can see
+# %%
+# What each method can see
+# ------------------------
 #
 # Fringe scanning adds four captures, of the phases 0, π/2, π and 3π/2, so that the background
 # cancels (Eq 3.14, 3.31):
 #
-# $$H_{FS} = \frac{\pi}{\beta}\, e^{jX} \cos(\pi\lambda d\rho^2), \qquad X = \pi^2\rho^2/\beta.$$
+# .. math::
 #
-# The cosine is what diffraction does. Its first zero, at $1/\sqrt{2\lambda d}$ (Eq 3.32), limits
-# the conventional method. Method A fills the zeros of one distance with the other's response.
+#    H_{FS} = \frac{\pi}{\beta}\, e^{jX} \cos(\pi\lambda d\rho^2), \qquad X = \pi^2\rho^2/\beta.
+#
+# The cosine is what diffraction does. Its first zero, at :math:`1/\sqrt{2\lambda d}` (Eq 3.32),
+# limits the conventional method. Method A fills the zeros of one distance with the other's
+# response.
 #
 # Method B takes the difference of two phases only, 0 and 3π/2 (Eq 3.49):
 #
-# $$H_B = \frac{\pi}{2\beta}\cos(\pi\lambda d\rho^2)\,[\sin X - \cos X]
-#   + \frac{\pi}{8\beta}\sin(X/2).$$
+# .. math::
+#
+#    H_B = \frac{\pi}{2\beta}\cos(\pi\lambda d\rho^2)\,[\sin X - \cos X]
+#      + \frac{\pi}{8\beta}\sin(X/2).
 #
 # The last term, the second harmonic, has no diffraction zeros. It is weak, but reaches twice as
 # far: the mask's edge ends the first harmonic at βw/2π and the second at βw/π.
 
-# %%
 frequency = np.asarray(sensor.grid.u)[count // 2 :]
 
 
@@ -125,7 +130,7 @@ zeros = {
 cut_offs = {name: cut_off(frequency, response) for name, response in responses.items()}
 print("first zeros:", zeros, "\ncut-offs:", cut_offs)
 
-# %% [markdown]
+# %%
 # The thesis takes the first zero for the limit, and publishes 10.8, 12.4, 22.9 and 57.5 cycles/mm
 # (dotted). The dashed lines are where the response falls under 5 % for good.
 #
@@ -134,7 +139,6 @@ print("first zeros:", zeros, "\ncut-offs:", cut_offs)
 # - Method A: no zero is left. 22.9 is the end of the mask, βw/2π = 22.4, blurred by diffraction.
 # - Method B: at 57.5 there is nothing. The second harmonic ends at βw/π = 44.8.
 
-# %%
 published_limits = dict(zip(responses, (10.8, 12.4, 22.9, 57.5), strict=True))
 figure, axes = plt.subplots(4, 1, figsize=(9, 8), sharex=True, layout="constrained")
 for ax, (name, response) in zip(axes, responses.items(), strict=True):
@@ -149,14 +153,14 @@ for ax, (name, response) in zip(axes, responses.items(), strict=True):
 axes[-1].set(xlabel="spatial frequency on the sensor at d = 6.5 mm (cycles/mm)")
 figure.savefig(FIGURES / "mtf.png", dpi=110)
 
-# %% [markdown]
-# ## Captures
+# %%
+# Captures
+# --------
 #
 # The USAF-1951 chart, and the middle squares of three photographs (the thesis' parrot is not
 # available). The four pictures are a batch; all are captured and reconstructed together.
 
 
-# %%
 def middle(image):
     """The central square of a photograph, in grey."""
     rows, columns = image.shape[:2]
@@ -178,14 +182,14 @@ shots = sorted({*scan_near, *scan_far, *pairs})  # methods share captures
 clean = {shot: tc.capture(camera(*shot), scene) for shot in shots}
 keys = dict(zip(shots, jax.random.split(jax.random.key(0), len(shots)), strict=True))
 
-# %% [markdown]
-# ## Reconstructions
-#
-# The conventional method inverts the geometrical shadow (Eq 3.16) and knows nothing of diffraction.
-# Methods A and B are Wiener syntheses of all captures (Eq 3.44, with the noise spectra of every
-# channel). A `synthesis` says which captures are added and subtracted first.
-
 # %%
+# Reconstructions
+# ---------------
+#
+# The conventional method inverts the geometrical shadow (Eq 3.16) and knows nothing of
+# diffraction. Methods A and B are Wiener syntheses of all captures (Eq 3.44, with the noise
+# spectra of every channel). A `synthesis` says which captures are added and subtracted first.
+
 methods = {
     "conventional, 5.0 mm": (tc.FringeScanning(), scan_near),
     "conventional, 6.5 mm": (tc.FringeScanning(), scan_far),
@@ -248,22 +252,49 @@ for ax in axes[:, 0]:
     ax.set(ylabel="y on the object (mm)")
 figure.savefig(FIGURES / "images.png", dpi=110)
 
-# %% [markdown]
-# ## Beside what the thesis published
+# %%
+# Beside what the thesis published
+# --------------------------------
 #
-# | method | captures | PSNR, dB | thesis | finest line pair, mm | thesis |
-# |---|---|---|---|---|---|
-# | conventional, 5.0 mm | 4 | 23.3 | 20.3 | 3.98 | 4.6 |
-# | conventional, 6.5 mm | 4 | 22.3 | 20.4 | 3.54 | 3.2 |
-# | method A | 8 | 26.7 | 23.4 | 1.77 | 1.6 |
-# | method B | 4 | 24.8 | 23.8 | 1.77 | 0.71 |
+# .. list-table::
+#    :header-rows: 1
+#
+#    * - method
+#      - captures
+#      - PSNR, dB
+#      - thesis
+#      - finest line pair, mm
+#      - thesis
+#    * - conventional, 5.0 mm
+#      - 4
+#      - 23.3
+#      - 20.3
+#      - 3.98
+#      - 4.6
+#    * - conventional, 6.5 mm
+#      - 4
+#      - 22.3
+#      - 20.4
+#      - 3.54
+#      - 3.2
+#    * - method A
+#      - 8
+#      - 26.7
+#      - 23.4
+#      - 1.77
+#      - 1.6
+#    * - method B
+#      - 4
+#      - 24.8
+#      - 23.8
+#      - 1.77
+#      - 0.71
 #
 # PSNR depends on the picture by several dB; only differences compare. Method A gains 3.4 dB over
 # the conventional method at 5.0 mm (thesis: 3.1), method B 1.5 dB (thesis: 3.5), with half as many
 # captures. Method A doubles the resolution, as published. Method B does so too, but does not come
 # near 0.71 mm.
 
-# %%
 published = {
     "conventional, 5.0 mm": (20.3, 4.6),
     "conventional, 6.5 mm": (20.4, 3.2),
@@ -284,14 +315,14 @@ axes[1].minorticks_off()
 axes[1].legend(["thesis", "simulated here"], loc="upper left")
 figure.savefig(FIGURES / "published.png", dpi=110)
 
-# %% [markdown]
-# ## What holds method B back
+# %%
+# What holds method B back
+# ------------------------
 #
 # Not the zeros but the noise: above βw/2π only the weak second harmonic is left, and at 30 dB it
 # drowns. With less noise method B overtakes method A, down to 0.89 mm at 60 dB. That is the end of
 # its band, 0.88 mm (dotted); the published 0.71 mm lie beyond it.
 
-# %%
 levels = [snr_db + step for step in ((0, 10, 20, 30) if SIZE == "full" else (0, 20))]
 compared = ("conventional, 6.5 mm", "method A", "method B")
 by_noise = {name: [finest[name]] for name in compared}
@@ -315,10 +346,9 @@ ax.set(xlabel="signal-to-noise ratio of the contrast (dB)", ylabel="finest line 
 ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
 figure.savefig(FIGURES / "noise.png", dpi=110)
 
-# %% [markdown]
+# %%
 # The numbers above hold; a line pair may be off by one element of the chart, 12 %.
 
-# %%
 quoted = {
     "full": {
         "zeros": [10.8, 12.1],

@@ -1,13 +1,13 @@
-# %% [markdown]
-# # A mask of your own
-#
-# A mask is a sum of products of one factor down and one across. Write these factors, and the
-# package does the rest: the exact PSF with diffraction, the shadow, the choice of a model,
-# gradients. Here the mask is a comb of slits at the marks of a Golomb ruler, crossed with itself:
-# no two pairs of marks are the same distance apart, so that its autocorrelation has no strong
-# sidelobe. How wide are its slits to be?
+"""A mask of your own
+==================
 
-# %%
+A mask is a sum of products of one factor down and one across. Write these factors, and the
+package does the rest: the exact PSF with diffraction, the shadow, the choice of a model,
+gradients. Here the mask is a comb of slits at the marks of a Golomb ruler, crossed with itself:
+no two pairs of marks are the same distance apart, so that its autocorrelation has no strong
+sidelobe. How wide are its slits to be?
+"""
+
 import os
 from pathlib import Path
 
@@ -25,14 +25,14 @@ FIGURES.mkdir(parents=True, exist_ok=True)
 SHAPE, PITCH = ((600, 720), 3 * um) if SIZE == "full" else ((112, 128), 6 * um)
 WAVELENGTH, DISTANCE = 550 * nm, 1.0
 
-# %% [markdown]
-# ## The class
+# %%
+# The class
+# ---------
 #
 # `edges` are the borders of cells along an axis, in ascending order: dark before the first and
 # behind the last. `values` holds the transmittance of each cell for each term; a gap is a cell of
 # zeros. Anything that is to be differentiated is an array: here the width of the slits.
 
-# %%
 # Golomb rulers: all differences of two marks are different.
 MARKS = (0, 1, 4, 9, 15, 22, 32, 34) if SIZE == "full" else (0, 1, 4, 9, 11)
 
@@ -62,12 +62,12 @@ class GolombSlits(tc.AbstractFactoredMask):
         return tc.MaskTerms(one, factors, factors)  # one product, the same on both axes
 
 
-# %% [markdown]
-# ## Its PSF
+# %%
+# Its PSF
+# -------
 #
 # `separable` is exact. The sampled model is right only as far as samples hold the slits.
 
-# %%
 mask = GolombSlits(slit=24 * um, unit=48 * um)
 camera = tc.LenslessCamera(mask, tc.Sensor(SHAPE, PITCH), DISTANCE)
 light = {"wavelength": WAVELENGTH, "pixel_integration": True}
@@ -86,14 +86,14 @@ for ax, (name, image) in zip(panels, pictures.items(), strict=True):
 figure.savefig(FIGURES / "mask_and_psf.png")
 assert choice.method.model == "separable"
 
-# %% [markdown]
-# ## How wide a slit?
-#
-# Wide slits pass more light, narrow ones finer detail. What counts beside shot noise is |H| over
-# the root of the light: we take its mean over a band of frequencies. Its slope with the slit's
-# width is exact; where it is zero lies the best width.
-
 # %%
+# How wide a slit?
+# ----------------
+#
+# Wide slits pass more light, narrow ones finer detail. What counts beside shot noise is
+# :math:`|H|` over the root of the light: we take its mean over a band of frequencies. Its slope
+# with the slit's width is exact; where it is zero lies the best width.
+
 BAND = (10.0, 35.0)  # cycles/mm
 
 

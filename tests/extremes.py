@@ -1,6 +1,6 @@
 """The extremes of the PSF models: which cameras, how exact, and an independent reference.
 
-Every bound is some two to three times what was measured; `docs/extremes_values.md` quotes the list.
+Every bound is some two to three times what was measured; `docs/theory/extremes.md` quotes the list.
 """
 
 import dataclasses

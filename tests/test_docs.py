@@ -2,14 +2,17 @@
 
 import ast
 import json
+import os
 import re
 import runpy
+from pathlib import PurePosixPath
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import PIL.Image
 import pytest
+import skimage.data
 from commands.reconstruct import simulated
 
 import thincam_jax as tc
@@ -18,6 +21,7 @@ from thincam_jax import learn
 from thincam_jax.commands.kinds import load_experiment
 from thincam_jax.commands.learned.refocusing import build_camera
 from thincam_jax.imaging.metrics import psnr
+from thincam_jax.lensless.method import AccuracyWarning
 from thincam_jax.units import nm, um
 
 PACKAGE = ROOT / "thincam_jax"
@@ -42,8 +46,15 @@ def test_readme(capsys):
 
 
 @pytest.mark.thorough
-def test_documentation(capsys):
-    names = run_examples("docs/index.md")
+def test_start_page(capsys, monkeypatch, tmp_path):
+    """With a photograph and a mask of one's own; the last example prints how near it comes."""
+    monkeypatch.chdir(tmp_path)
+    PIL.Image.fromarray(skimage.data.chelsea()).save("photo.jpg")
+    cells = np.random.default_rng(0).integers(0, 2, (40, 40), dtype=np.uint8)
+    PIL.Image.fromarray(np.kron(255 * cells, np.ones((10, 10), np.uint8))).save("mask.png")
+    with jax.enable_x64(False), pytest.warns(AccuracyWarning):
+        names = run_examples("docs/start.md")
+    assert len(names["figure"].axes) == 3
     assert names["result"].image.shape == (3, 130, 196)
     status, decibels = capsys.readouterr().out.split()
     assert status == "ok"
@@ -53,9 +64,9 @@ def test_documentation(capsys):
 @pytest.mark.thorough
 def test_accuracy_page(capsys):
     """The printed choice stands in the page, and the plan is within its tolerance."""
-    names = run_examples("docs/accuracy.md")
+    names = run_examples("docs/guide/accuracy.md")
     printed = capsys.readouterr().out
-    page = (ROOT / "docs/accuracy.md").read_text("utf-8")
+    page = (ROOT / "docs/guide/accuracy.md").read_text("utf-8")
     assert not re.findall(r"\b[A-Z]{7,}\b", page)  # no figure left to be filled in
     choice = names["choice"]
     assert f"{choice.method.model} {choice.method.precision} {choice.predicted_error:.4f}" in page
@@ -77,7 +88,7 @@ def test_real_captures_page(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     simulated.bayer_files(tmp_path)
     with jax.enable_x64(False):  # the precision of a user
-        names = run_examples("docs/real_captures.md")
+        names = run_examples("docs/guide/real_captures.md")
     printed = capsys.readouterr().out
     assert "(3, 30, 38)" in printed
     assert "nan" not in printed
@@ -119,8 +130,8 @@ def cited(source: str) -> set[str]:
 
 
 def thesis_rows() -> list[tuple[set[str], str, str]]:
-    """Equations, file and name of each row of docs/thesis.md."""
-    page = (ROOT / "docs/thesis.md").read_text("utf-8")
+    """Equations, file and name of each row of docs/theory/thesis.md."""
+    page = (ROOT / "docs/theory/thesis.md").read_text("utf-8")
     rows = re.findall(r"^\| ([\d., –]+) \|[^|]*\| `(.*?)` \| `(.*?)` \|", page, re.MULTILINE)
     return [(equations(numbers), file, name) for numbers, file, name in rows]
 
@@ -144,7 +155,7 @@ def test_every_row_of_the_thesis_page_names_what_exists():
         if not (PACKAGE / file).is_file()
         or name not in defined((PACKAGE / file).read_text("utf-8"))
     ]
-    assert not missing, "docs/thesis.md names what is not there:\n" + "\n".join(missing)
+    assert not missing, "docs/theory/thesis.md names what is not there:\n" + "\n".join(missing)
 
 
 def test_every_equation_that_a_file_cites_has_its_row():
@@ -156,7 +167,7 @@ def test_every_equation_that_a_file_cites_has_its_row():
         for number in sorted(cited(path.read_text("utf-8")))
         if not any(number in numbers and file == where for numbers, where, _ in rows)
     ]
-    assert not missing, "docs/thesis.md lacks a row for:\n" + "\n".join(missing)
+    assert not missing, "docs/theory/thesis.md lacks a row for:\n" + "\n".join(missing)
 
 
 @pytest.mark.parametrize(
@@ -174,7 +185,7 @@ def test_citations_are_read(text, numbers):
 
 @pytest.mark.thorough
 def test_flatcam_page():
-    names = run_examples("docs/flatcam.md")
+    names = run_examples("docs/guide/flatcam.md")
     assert names["found"].operator.terms == 1 and names["sigma"].shape == (9, 12)
     assert psnr(np.asarray(names["result"].image), names["photograph"]) > 15
     found, truth = (
@@ -185,14 +196,47 @@ def test_flatcam_page():
     assert not names["calibrated"].reason
 
 
-def test_pages_are_short_and_listed():
-    """At most 940 words; the index and the menu lead to all of them."""
-    pages = {path.name: path.read_text("utf-8") for path in (ROOT / "docs").glob("*.md")}
-    assert not {name: len(page.split()) for name, page in pages.items() if len(page.split()) > 940}
-    menu = (ROOT / "mkdocs.yml").read_text("utf-8")
-    others = set(pages) - {"index.md"}
-    assert {name for name in others if f"]({name})" not in pages["index.md"]} == set()
-    assert {name for name in others if f": {name}\n" not in menu} == set()
+def pages() -> dict[str, str]:
+    """Pages of the documentation by their path below docs/."""
+    folder, places = ROOT / "docs", ("*.md", "guide/*.md", "files/*.md", "theory/*.md")
+    paths = [path for place in places for path in folder.glob(place)]
+    return {path.relative_to(folder).as_posix(): path.read_text("utf-8") for path in paths}
+
+
+def test_pages_are_few_and_listed():
+    """At most 25 beside gallery and reference, each in the table of contents of its section."""
+    listed = {"index.md"}
+    for page, text in pages().items():
+        entries = re.findall(r"```{toctree}\n(?::.*\n)*\n(.*?)```", text, re.DOTALL)
+        names = re.findall(r"^(?:.*<)?([\w/]+)>?$", "\n".join(entries), re.MULTILINE)
+        listed |= {(PurePosixPath(page).parent / f"{name}.md").as_posix() for name in names}
+    assert set(pages()) <= listed
+    assert len(pages()) <= 25
+
+
+def test_links_between_pages_lead_somewhere():
+    """To files that are there; the scripts' pages and the reference are made with the site."""
+    for page, text in pages().items():
+        for target in re.findall(r"\]\(([\w./-]+\.(?:md|rst|png))", text):
+            name = os.path.normpath(PurePosixPath(page).parent / target)
+            made = name in ("gallery/index.rst", "api/index.md")
+            script = ROOT / "experiments" / f"{PurePosixPath(name).stem}.py"
+            assert made or (ROOT / "docs" / name).exists() or script.exists(), (page, target)
+
+
+TESTED = ("start", "guide/accuracy", "guide/real_captures", "guide/flatcam", "guide/screen")
+TESTED += ("guide/screen_calibration",)
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize(
+    "page",
+    [page for page, text in pages().items() if "```python\n" in text and page[:-3] not in TESTED],
+)
+def test_examples_of_the_other_pages_run(page, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    with jax.enable_x64(False):
+        assert run_examples(f"docs/{page}")
 
 
 def test_picture_of_the_rooms_is_of_today():
@@ -215,7 +259,7 @@ def test_learned_thesis_page(monkeypatch):
     """What the page says of the optics of both cameras; at small size, too, the thesis' planes are
     not told apart, and those here are."""
     monkeypatch.syspath_prepend(str(ROOT / "docs"))
-    page = (ROOT / "docs/learned_thesis.md").read_text("utf-8")
+    page = (ROOT / "docs/guide/refocusing.md").read_text("utf-8")
     with jax.enable_x64(False), jax.numpy_dtype_promotion("standard"):  # as a user has it
         script = runpy.run_path(str(ROOT / "docs/thesis_refocusing.py"))
         thesis, optics = script["thesis_camera"], script["optics"]
@@ -240,32 +284,22 @@ def test_learned_thesis_page(monkeypatch):
 
 
 @pytest.mark.thorough
-def test_screen_page():
-    names = run_examples("docs/screen.md")
+def test_screen_page(capsys):
+    names = run_examples("docs/guide/screen.md")
     np.testing.assert_allclose(names["rays"].wavelength / 1e-6, [532, 564.729], atol=1e-3)
     assert names["result"].image.shape[-2:] == (64, 64)
+    assert names["plan"].meets_tolerance and names["capture"].shape == (110, 110)
+    assert names["fit"].truncation_error < 1e-3
+    assert "ghosts" in capsys.readouterr().out
 
 
 @pytest.mark.thorough
 def test_screen_calibration_page(tmp_path, monkeypatch):
+    """The glass is found; a uniform scene comes back, by the solver and by the stream."""
     monkeypatch.chdir(tmp_path)
-    names = run_examples("docs/screen_calibration.md")
+    names = run_examples("docs/guide/screen_calibration.md")
     fit = names["fit"]
     error = fit.values["glass_thickness"] - 5.0
     assert abs(float(error)) < 4 * float(fit.standard_errors["glass_thickness"])
     assert fit.status == "ok"
-
-
-@pytest.mark.thorough
-def test_screen_reconstruction_page():
-    """A uniform scene comes back, by the solver and by the stream."""
-    names = run_examples("docs/screen_reconstruction.md")
     np.testing.assert_allclose(names["image"], 1, atol=0.02)
-
-
-@pytest.mark.thorough
-def test_screen_models_page(capsys):
-    names = run_examples("docs/screen_models.md")
-    assert names["plan"].meets_tolerance and names["capture"].shape == (110, 110)
-    assert names["fit"].truncation_error < 1e-3
-    assert "ghosts" in capsys.readouterr().out

@@ -1,4 +1,4 @@
-"""What docs/extremes_values.md and docs/extremes_gradients.md quote is what the tests hold."""
+"""What docs/theory/extremes.md quotes is what the tests hold."""
 
 import numpy as np
 import pytest
@@ -6,12 +6,10 @@ from extremes import EXTREMES, GRADIENTS, LOST
 
 from helpers import ROOT
 
-PAGES = {"extreme": "extremes_values.md", "gradient at": "extremes_gradients.md"}
-
 
 def documented(first: str) -> dict[str, list[str]]:
     """The rows of the table that begins with that cell, by their own first cell."""
-    page = (ROOT / "docs" / PAGES[first]).read_text(encoding="utf-8")
+    page = (ROOT / "docs/theory/extremes.md").read_text(encoding="utf-8")
     table = page[page.index(f"| {first} |") :].split("\n\n")[0].splitlines()
     rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in table]
     assert len({len(row) for row in rows}) == 1

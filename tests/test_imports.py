@@ -1,6 +1,9 @@
 """What an import brings with it: a fresh process pays for what it uses, and for nothing more."""
 
+import operator
 import os
+import pydoc
+import re
 import subprocess
 import sys
 from importlib.metadata import version
@@ -89,8 +92,16 @@ except SystemExit as end:
 
 def test_every_name_of_the_package_is_there():
     assert "LenslessCamera" in dir(tc)
-    for name in tc.__all__:
+    for name in dir(tc):
         assert getattr(tc, name) is not None
+
+
+def test_help_is_a_page_of_names():
+    text = pydoc.plain(pydoc.render_doc(tc))
+    assert len(text) < 15_000
+    listed = text.split("- cameras")[1].split("The names")[0]
+    for name in re.findall(r"`([\w.]+)`", listed):
+        assert operator.attrgetter(name)(tc) is not None
 
 
 def test_sub_packages_are_attributes_and_wait_for_their_use():
@@ -110,3 +121,7 @@ def test_a_name_that_is_not_there():
 
 def test_the_version_is_that_of_the_installation():
     assert tc.__version__ == version("thincam_jax")
+
+
+def test_the_citation_names_the_version():
+    assert f"\nversion: {version('thincam_jax')}\n" in (ROOT / "CITATION.cff").read_text("utf-8")

@@ -1,4 +1,25 @@
-"""thincam_jax: simulate, reconstruct and design thin computational cameras, in JAX.
+"""Simulate, reconstruct and design thin computational cameras, in JAX.
+
+>>> import thincam_jax as tc
+>>> from thincam_jax.units import nm, um
+>>> mask = tc.FresnelZoneAperture(beta=25.0, phase=0.0, width=5.632)  # rad/mm², rad, mm
+>>> camera = tc.LenslessCamera(mask, tc.Sensor((64, 96), 60 * um), distance=6.5)
+>>> tc.psf(camera, wavelength=500 * nm, object_distance=250.0).shape
+(64, 96)
+
+Lengths are in millimetres, angles in radians, arrays (…, y, x). `help(tc.psf)` explains one name.
+
+- cameras: `LenslessCamera`, `Sensor`; `waveguide.SeeThroughCamera`
+- masks: `FresnelZoneAperture`, `ModifiedUniformlyRedundantArray`, `UniformlyRedundantArray`,
+  `SeparableMask`, `Pinhole`, `RadialMask`, `LensletArray`, `PhaseMask`, `SampledMask`; own ones by
+  `AbstractFactoredMask`
+- scenes: `ImagePlane`, `Scene`, `Spectrum`, `load_image`, `imaging.targets`
+- simulation: `psf`, `otf`, `capture`, `GaussianNoise`, `PoissonGaussianNoise`
+- accuracy: `select_model`, `predict_error`, `plan`, `PsfMethod`
+- reconstruction: `Recording` of `Cameras`, `Psfs` or operators; `reconstruct` by `Wiener`,
+  `FringeScanning`, `AdmmTV`, `Fista`, `Ridge`, `PoissonTV` or `Learned`; `Stream`
+- calibration: `fit_psf`, `check_psf`, `fit_separable`, `measured`
+- experiments: `studies`, `design`, `learn`, `plot`, `hardware`
 
 The names stand in `__init__.pyi`. Each is imported at its first use: JAX takes a second to import,
 which `thincam --help` need not wait for.
@@ -6,7 +27,8 @@ which `thincam --help` need not wait for.
 
 import lazy_loader
 
-_attribute, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+# Without `__all__`, for which `help` would print every class in full.
+_attribute, __dir__, _ = lazy_loader.attach_stub(__name__, __file__)
 
 
 def __getattr__(name: str):

@@ -417,12 +417,6 @@ def test_help_is_in_the_order_of_use():
         assert f"Examples:\n    thincam {command} " in call(command, "--help").stdout
 
 
-def test_every_page_is_in_the_index():
-    pages = {page.name for page in (ROOT / "docs").glob("*.md")} - {"index.md"}
-    text = (ROOT / "docs" / "index.md").read_text("utf-8")
-    assert [page for page in sorted(pages) if f"({page})" not in text] == []
-
-
 def test_version():
     result = call("--version")
     assert (result.exit_code, result.stdout) == (0, f"thincam_jax {version('thincam_jax')}\n")

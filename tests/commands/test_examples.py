@@ -27,13 +27,25 @@ def test_a_file_that_its_command_takes(kind, tmp_path, monkeypatch):
 def test_every_shipped_file_is_one(tmp_path):
     for kind in kinds.examples():
         assert call("init", kind, "--out", tmp_path).exit_code == 0
-    written = {path.read_text("utf-8") for path in tmp_path.iterdir()}
     assert len(kinds.examples()) == len(FILES)
-    assert written == {path.read_text("utf-8") for path in FILES}
+    assert {without_name(path) for path in tmp_path.iterdir()} == {without_name(p) for p in FILES}
+
+
+def without_name(path):
+    """A file whose name is that of its experiment, which names its run folder, too."""
+    text = path.read_text("utf-8")
+    assert f"\nname: {path.stem}\n" in text
+    return text.replace(f"\nname: {path.stem}\n", "")
+
+
+@pytest.mark.parametrize("name", ["true", "a b", "ε: #1"])
+def test_any_file_name_is_the_name_of_its_experiment(name, tmp_path):
+    assert call("init", "study", "--out", tmp_path / f"{name}.yaml").exit_code == 0
+    assert load_experiment(tmp_path / f"{name}.yaml").name == re.sub("[:#]", "_", name)
 
 
 def test_the_page_of_commands_lists_them():
-    page = (ROOT / "docs/commands.md").read_text("utf-8")
+    page = (ROOT / "docs/files/commands.md").read_text("utf-8")
     table = page.split("| kind | experiment |")[1].split("\n\n")[0]
     cells = [line.split("|")[1] for line in table.splitlines() if line.startswith("| `")]
     assert sorted(re.findall(r"`(\w+)`", " ".join(cells))) == sorted(kinds.examples())

@@ -1,11 +1,14 @@
 """What reaches the terminal: no control characters of files, no floods, no long values."""
 
 import ast
+import json
+import math
 from pathlib import Path
 
 import pytest
 from commands.study import tiny
-from commands.test_cli import call
+from commands.sweep import mini
+from commands.test_cli import call, one_line
 
 from thincam_jax._core.table import Table
 from thincam_jax._core.text import escaped
@@ -88,3 +91,39 @@ def test_a_long_value_is_cut(entry, tmp_path):
     result = call("run", tiny.write(tmp_path), "--set", entry.format("x" * 5000))
     (line,) = result.stderr.splitlines()
     assert result.exit_code == 2 and len(line) < 700, line
+
+
+def test_results_as_json(tmp_path):
+    """An object in a line, and nothing else; the table holds the numbers that are not rounded."""
+    file = mini.write(tmp_path)
+    result = call("run", file, "--out", tmp_path / "out", "--json")
+    assert result.exit_code == 0, result.output
+    table, report = (json.loads(line) for line in result.stdout.splitlines())
+    assert table["table"]["headings"][0] == "method" and table["table"]["rows"][0][0] == "single"
+    assert table["table"]["rows"][0][-1] == pytest.approx(25 / math.pi, rel=0.005)  # βR/π
+    assert report == {"report": f"{tmp_path}/out/report.html"}
+
+
+def test_quiet_commands_print_nothing(tmp_path):
+    result = call("init", "study", "--out", tmp_path, "--quiet")
+    assert (result.exit_code, result.output) == (0, "")
+    assert "name: study\n" in (tmp_path / "study.yaml").read_text("utf-8")
+    # The options hold for one command alone, and errors are told.
+    assert "kind" in call("init").stdout and call("init", "no", "--quiet").stderr
+
+
+@pytest.mark.parametrize(
+    ("line", "advice"),
+    [
+        ("sweep FILE --grid beta=20:30:3 --dry-run", "write methods.*.shots.*.beta"),
+        ("bench FILE", "write thincam bench accuracy FILE"),
+    ],
+)
+def test_a_near_miss_is_told_what_to_write(line, advice, tmp_path):
+    file = mini.write(tmp_path)
+    told = one_line(call(*(str(file) if word == "FILE" else word for word in line.split())))
+    assert advice.replace("FILE", str(file)) in told
+    if line.startswith("sweep"):
+        path = advice.removeprefix("write ")
+        followed = call("sweep", file, "--grid", f"{path}=20:30:3 rad/mm^2", "--dry-run")
+        assert followed.exit_code == 0 and "3 points" in followed.stdout, followed.output

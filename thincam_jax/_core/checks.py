@@ -74,7 +74,7 @@ def shown(value: Any) -> str:
     return shortened(" ".join(text.split()))
 
 
-def _shape(value: Any) -> tuple[int, ...]:
+def shape_of(value: Any) -> tuple[int, ...]:
     known = _known(value)
     return value.shape if known is None else known.shape
 
@@ -124,27 +124,28 @@ def _require(array: Checked, holds: Callable[[np.ndarray], Any], message: str) -
 def numbers(name: str, value: Any, *, allow_complex: bool = False) -> np.ndarray:
     """An array of known numbers, floating or whole; NaN and infinity pass."""
     known = np.asarray(_known(value))
-    if known.dtype.kind not in ("fiubc" if allow_complex else "fiub"):
-        kind = "numbers" if allow_complex else "real numbers"
-        raise TypeError(f"{name} is {shown(value)}; give an array of {kind}")
+    _require_numbers(name, value, known.dtype, allow_complex)
     return known
 
 
 def array(name: str, value: Any, *, allow_complex: bool = False) -> Array:
     """`numbers` for JAX, of traced ones, too."""
-    if not is_traced(value) and not _has_traced(value):
-        numbers(name, value, allow_complex=allow_complex)
-    return jnp.asarray(value)
+    if isinstance(value, jax.Array) or any(map(is_traced, jax.tree.leaves(value))):
+        known = jnp.asarray(value)
+        _require_numbers(name, value, known.dtype, allow_complex)
+        return known
+    return jnp.asarray(numbers(name, value, allow_complex=allow_complex))
 
 
-def _has_traced(value: Any) -> bool:
-    """Whether a list holds numbers that are not known yet."""
-    return isinstance(value, list | tuple) and any(map(is_traced, jax.tree.leaves(value)))
+def _require_numbers(name: str, value: Any, dtype: np.dtype, allow_complex: bool) -> None:
+    if dtype.kind not in ("fiubc" if allow_complex else "fiub"):
+        kind = "numbers" if allow_complex else "real numbers"
+        raise TypeError(f"{name} is {shown(value)}; give an array of {kind}")
 
 
 def points(name: str, value: Any) -> Array:
     """Points (x, y) as the last axis of an array."""
-    array = finite(name, value, "mm", shape=_shape(value))
+    array = finite(name, value, "mm", shape=shape_of(value))
     if array.shape[-1:] != (2,) or 0 in array.shape:
         raise ValueError(f"{name} has shape {array.shape}; give points (x, y) in mm, (…, 2)")
     return array
@@ -176,12 +177,10 @@ def positive(
         return _require(array, lambda known: known <= most, message)
     message = f"{name} is infinite; give a finite number{_within(unit)}"
     _require(array, lambda known: allow_infinity or np.isfinite(known), message)
-    # Beyond, products of a few of them leave the range of single precision.
-    message = (
-        f"{name} = {{}}{_after(unit)} is out of range; give {_LEAST:g} to {_MOST:g}{_after(unit)}"
-    )
     if unit not in ("mm", "rad/mm^2"):
         return array
+    # Beyond, products of a few of them leave the range of single precision.
+    message = f"{name} = {{}} {unit} is out of range; give {_LEAST:g} to {_MOST:g} {unit}"
     most = math.inf if allow_infinity else _MOST
     return _require(array, lambda known: (known >= _LEAST) & (known <= most), message)
 
@@ -193,7 +192,7 @@ def non_negative(name: str, value: Any, unit: str) -> Checked:
 
 def positive_all(name: str, value: Any, unit: str) -> Checked:
     """An array of any shape with finite positive entries."""
-    array = finite(name, value, unit, shape=_shape(value))
+    array = finite(name, value, unit, shape=shape_of(value))
     message = f"{name} = {{}} {unit} must be positive; give {name} > 0 in {unit}"
     return _require(array, lambda known: known > 0, message)
 
@@ -267,7 +266,7 @@ def fraction(name: str, value: Any) -> Checked:
 
 def transmittances(name: str, values: Any) -> Checked:
     """A one-dimensional code of numbers from 0 to 1."""
-    array = finite(name, values, "parts of one", shape=_shape(values))
+    array = finite(name, values, "parts of one", shape=shape_of(values))
     if array.ndim != 1 or array.size == 0:
         raise ValueError(f"{name} has shape {array.shape}; give a code: one row of transmittances")
     known = _known(array)

@@ -4,11 +4,15 @@ What a command computes with is imported when it runs: help and the shell's comp
 it. Hence the files `command.py` import nothing slow at their heads.
 """
 
-from typing import Annotated, Any
+import functools
+import inspect
+from collections.abc import Callable
+from typing import Annotated, Any, cast
 
 import typer
 from typer.core import TyperCommand, TyperGroup
 
+from thincam_jax.commands import terminal
 from thincam_jax.commands.cache import cache_state, keep_programs
 from thincam_jax.commands.capture.command import capture, known_drivers
 from thincam_jax.commands.explain import explain, schema
@@ -16,7 +20,7 @@ from thincam_jax.commands.kinds import init
 from thincam_jax.commands.reconstruct.command import check, reconstruct
 from thincam_jax.commands.run import accuracy, design, run, train
 from thincam_jax.commands.sweep.command import sweep
-from thincam_jax.commands.terminal import say, told
+from thincam_jax.commands.terminal import WRONG_INPUT, say, say_result, tell, told
 
 ORDER = (
     *("init", "explain", "run", "capture", "reconstruct", "calibrate", "sweep", "design", "train"),
@@ -49,6 +53,42 @@ class InOrder(TyperGroup):
         return sorted(super().list_commands(ctx), key=lambda name: known.get(name, len(known)))
 
 
+def with_output(command: Callable[..., None]) -> Callable[..., None]:
+    """The command with the options of what it prints."""
+    own = inspect.signature(command)
+    flags = {
+        "as_json": ("--json", "Print results as JSON, an object in a line, without progress."),
+        "quiet": ("--quiet", "Print warnings and errors only."),
+    }
+    more = [
+        inspect.Parameter(
+            name,
+            inspect.Parameter.KEYWORD_ONLY,
+            default=False,
+            annotation=Annotated[bool, typer.Option(flag, help=text)],
+        )
+        for name, (flag, text) in flags.items()
+    ]
+
+    @functools.wraps(command)
+    def call(*, as_json: bool, quiet: bool, **given: Any) -> None:
+        terminal.output = "json" if as_json else "nothing" if quiet else "text"
+        command(**given)
+
+    cast(Any, call).__signature__ = own.replace(parameters=[*own.parameters.values(), *more])
+    return call
+
+
+class BenchGroup(TyperGroup):
+    """Commands of `thincam bench`; a file in place of one is refused with what to write."""
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        if args and args[0].endswith((".yaml", ".yml")):
+            tell(f"bench {args[0]}: write thincam bench accuracy {args[0]}")
+            raise typer.Exit(WRONG_INPUT)
+        return super().resolve_command(ctx, args)
+
+
 class Grouped(TyperCommand):
     """Options in groups."""
 
@@ -68,7 +108,9 @@ class Grouped(TyperCommand):
 app = typer.Typer(
     no_args_is_help=True, pretty_exceptions_enable=False, rich_markup_mode=None, cls=InOrder
 )
-bench = typer.Typer(no_args_is_help=True, help="Measure what the models of a study cost.")
+bench = typer.Typer(
+    no_args_is_help=True, help="Measure what the models of a study cost.", cls=BenchGroup
+)
 # The callback keeps the name of a single command.
 calibrate = typer.Typer(no_args_is_help=True, help="Find out what a rig's own pictures say of it.")
 calibrate.callback()(lambda: None)
@@ -94,7 +136,9 @@ for group, command, *examples in (
     (calibrate, check, "calibrate check --psf PSF.tif --capture RAW.tif"),
 ):
     layout = Grouped if command is reconstruct else None
-    group.command(cls=layout, epilog=examples_text(*examples))(command)
+    # A schema is JSON.
+    printing = command if command is schema else with_output(command)
+    group.command(cls=layout, epilog=examples_text(*examples))(printing)
 app.add_typer(bench, name="bench")
 app.add_typer(calibrate, name="calibrate")
 
@@ -131,11 +175,12 @@ def options(
 
 
 @app.command()
+@with_output
 def doctor() -> None:
     """Print versions, devices and what is missing."""
     with told(lambda: "interrupted"):
         from thincam_jax._core.environment import machine_report, package_report
 
         programs = f"compiled programs: {cache_state()}"
-        for line in (*machine_report(), programs, *package_report(), *known_drivers()):
-            say(line)
+        lines = [*machine_report(), programs, *package_report(), *known_drivers()]
+        say_result("report", lines, "\n".join(lines))

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from thincam_jax.commands.kinds import KINDS, load_experiment
-from thincam_jax.commands.terminal import ConfigFile, Overrides, say, told
+from thincam_jax.commands.terminal import ConfigFile, Overrides, say, say_result, told
 
 
 def schema(
@@ -41,7 +41,9 @@ def explain(config: ConfigFile, set_: Overrides = None) -> None:
         rows = list(values(asked))
         width = max(len(f"{key}: {value}") for key, value, _ in rows if len(value) <= _LONGEST)
         lines = [f"{f'{key}: {value}':<{width}}  # {place}" for key, value, place in rows]
-        say("\n".join([*lines, *costs(asked)]))
+        costly = list(costs(asked))
+        result = {"values": {key: value for key, value, _ in rows}, "costs": costly}
+        say_result("experiment", result, "\n".join([*lines, *costly]))
 
 
 _LONGEST = 50  # characters of a value that places are lined up behind
@@ -73,7 +75,8 @@ def _entries(data: Any, location: tuple = ()) -> Iterator[tuple[tuple, str]]:
 
 def dry_run(asked: Any, writes: str, setup: Any = None) -> None:
     """Print what a command would compute and write, for its option `--dry-run`."""
-    say("\n".join([*work_of(asked, setup), writes, "dry run: nothing was done"]))
+    lines = [*work_of(asked, setup), writes, "dry run: nothing was done"]
+    say_result("dry_run", lines, "\n".join(lines))
 
 
 def work_of(asked: Any, setup: Any = None) -> Iterator[str]:

@@ -3,6 +3,7 @@
 As the files `command.py`, it imports nothing at its head that `thincam --help` does not need.
 """
 
+import re
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import Annotated, Any
 
 import typer
 
-from thincam_jax.commands.terminal import say, told
+from thincam_jax.commands.terminal import say, say_result, show, told
 
 
 @dataclass(frozen=True)
@@ -132,24 +133,44 @@ def examples() -> list[str]:
     return [*_FILE_OF, *sorted(others)]
 
 
+def _source(kind: str) -> Path:
+    return _folder() / f"{_FILE_OF.get(kind, kind)}.yaml"
+
+
+def _title(kind: str) -> str:
+    from thincam_jax.commands.config_file import read_raw
+
+    return read_raw(_source(kind))[0]["title"]
+
+
 def init(
     kind: Annotated[
-        str, typer.Argument(help=f"One of {', '.join(examples())}.", autocompletion=examples)
-    ],
+        str | None, typer.Argument(help="Leave it out for a list of them.", autocompletion=examples)
+    ] = None,
     out: Annotated[Path | None, typer.Option(help="File, or folder; default KIND.yaml.")] = None,
 ) -> None:
-    """Write an example experiment file to begin with."""
+    """Write an example experiment file to begin with; or list these."""
     with told(lambda: "interrupted"):
+        import yaml
+
         from thincam_jax._core.files import write_whole
+        from thincam_jax._core.table import Table
         from thincam_jax.commands.config_file import ConfigError
 
+        if kind is None:
+            show(Table(("kind", "experiment"), [(one, _title(one)) for one in examples()]))
+            say("next: thincam init KIND")
+            return
         if kind not in examples():
             raise ConfigError(f"init {kind}: choose one of {', '.join(examples())}")
         path = out or Path()
         path = path / f"{kind}.yaml" if path.is_dir() else path
-        source = _folder() / f"{_FILE_OF.get(kind, kind)}.yaml"
+        source = _source(kind)
         text, command = source.read_text(encoding="utf-8"), read_kind(source).command
+        # One name for the file, the experiment and its run folder.
+        name = yaml.safe_dump(re.sub(r"[^\w .,()=+-]", "_", path.stem), allow_unicode=True)
+        text = re.sub("^name: .*$", f"name: {name.split(chr(10))[0]}", text, count=1, flags=re.M)
         if path.exists():
             raise ConfigError(f"{path} exists; give another --out, or delete it")
         write_whole(path, text)
-    say(f"{path}; next: thincam {command} {path}")
+    say_result("file", path, f"{path}; next: thincam {command} {path}")

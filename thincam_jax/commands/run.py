@@ -15,6 +15,7 @@ from thincam_jax.commands.terminal import (
     counted,
     progress_bar,
     say,
+    say_result,
     show,
     told,
     warn,
@@ -61,7 +62,7 @@ def run(
             if set_ or dry_run:
                 option = "--set" if set_ else "--dry-run"
                 raise ConfigError(f"{option} is for experiment files; a store has its own settings")
-            say(f"report: {reconstruct_store(config, out) / 'report.html'}")
+            say_result("report", reconstruct_store(config, out) / "report.html")
             return
         asked = load_experiment(config, tuple(set_ or ()))
         folder = RunFolder.chosen(out, asked.name, asked)
@@ -74,7 +75,7 @@ def run(
         with counted(asked.name) as progress:
             found = kind.part(kind.run)(setup, folder, progress)
     show(found.table())
-    say(f"report: {folder.path / 'report.html'}")
+    say_result("report", folder.path / "report.html")
 
 
 def design(
@@ -109,7 +110,7 @@ def design(
             found = run_design(study, folder, progress)
     show(found.table())
     say(_levels(found))
-    say(f"report: {folder.path / 'report.html'}")
+    say_result("report", folder.path / "report.html")
 
 
 def _levels(found: "DesignScores") -> str:
@@ -164,8 +165,8 @@ def train(
             found = kind.part(kind.run)(asked, InFolder(folder, tell, resume))
     say(found.line)
     if found.page is not None:
-        say(f"report: {found.page}")
-    say(f"network: {found.network}")
+        say_result("report", found.page)
+    say_result("network", found.network)
 
 
 def accuracy(
@@ -197,4 +198,4 @@ def accuracy(
             result = run_accuracy(plan, folder, progress)
     show(result.table())
     say(result.reconstructions.verdict())
-    say(f"results: {folder.path / 'accuracy.json'}")
+    say_result("results", folder.path / "accuracy.json")

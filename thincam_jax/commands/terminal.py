@@ -8,7 +8,7 @@ import re
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
 
 import typer
 
@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from thincam_jax._core.table import Table
 
 WRONG_INPUT = 2
+# What a command prints, by its options `--json` and `--quiet`.
+output: Literal["text", "json", "nothing"] = "text"
 _MOST_LINES, _HALF = 10, 500  # of an error; characters of each half of a line that is cut
 
 ConfigFile = Annotated[Path, typer.Argument(help="Experiment file (YAML); thincam init makes one.")]
@@ -92,7 +94,17 @@ def _as_option(argument: re.Match[str]) -> str:
 
 def say(text: str) -> None:
     """Lines on standard output; as all that is printed, without the control characters of files."""
-    print(escaped(text))
+    if output == "text":
+        print(escaped(text))
+
+
+def say_result(name: str, value: Any, text: str = "") -> None:
+    """Print a result as `name: value`, or the text; with `--json` as an object in a line."""
+    if output == "json":
+        import json
+
+        print(json.dumps({name: value}, default=str))
+    say(text or f"{name}: {value}")
 
 
 def tell(text: str) -> None:
@@ -115,6 +127,10 @@ def fail(error: BaseException) -> NoReturn:
 
 def show(table: "Table") -> None:
     """Print a table; its cells are set to the right but for the first of each row."""
+    if output == "json":
+        say_result("table", {"headings": table.headings, "rows": table.rows})
+    if output != "text":
+        return
     import rich
     from rich.table import Table as Lines
     from rich.text import Text
@@ -152,6 +168,7 @@ def progress_bar(*more: str) -> "Iterator[rich.progress.Progress]":
         progress.TimeElapsedColumn(),
         progress.TextColumn("left"),
         progress.TimeRemainingColumn(),
+        disable=output != "text",
     )
     with interruptible():
         try:

@@ -16,7 +16,7 @@ odd parts of the images (`thincam_jax.design.cosine_transforms`).
 
 It is not the same to the last digit: `WienerSynthesis` interpolates shorter captures, estimates
 the mean, and finds the strength on its own window. In the thesis' camera the gain of one pair of
-distances over another agrees within 0.3 dB (docs/designs.md); on a few dozen pixels, where few
+distances over another agrees within 0.3 dB (docs/guide/design.md); on a few dozen pixels, where few
 frequencies tell the strength, errors differ by up to 1.5 dB. Where designs rank near to each other,
 the full simulation decides.
 """

@@ -21,7 +21,7 @@ def _photograph(given: Any) -> Any:
     """Counts as parts of the largest, and (y, x, 3) as (3, y, x); anything else as it is."""
     if checks.is_traced(given) or isinstance(given, jax.Array):
         return given
-    array = np.asarray(checks.numbers("image", given))
+    array = checks.numbers("image", given)
     if array.ndim == 3 and array.shape[-1] in (3, 4) and min(array.shape[:2]) > 4:
         array = np.moveaxis(array[..., :3], -1, 0)
     return array / np.iinfo(array.dtype).max if array.dtype.kind == "u" else array
@@ -29,15 +29,15 @@ def _photograph(given: Any) -> Any:
 
 def _radiances(given: Any) -> Float[Array, "*batch y x"]:
     """The check of an image: floating, finite, not negative; a photograph as a batch of colours."""
-    given = _photograph(given)
-    image = checks.array("image", given)
+    image = checks.array("image", _photograph(given))
     if not jnp.issubdtype(image.dtype, jnp.floating):
         image = image.astype(float)
     if image.ndim < 2 or 0 in image.shape:
         raise ValueError(f"image has shape {image.shape}; give a non-empty (…, y, x) array")
     if checks.is_traced(image):
         return image
-    least, largest = np.asarray(image).min(), np.asarray(image).max()
+    known = np.asarray(image)
+    least, largest = known.min(), known.max()
     if not np.isfinite(least + largest):
         raise ValueError("image holds NaN or infinity; give finite radiances")
     if least < 0:

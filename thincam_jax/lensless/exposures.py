@@ -247,8 +247,7 @@ def _as_stored(one: Any) -> Any:
 def _numbers(name: str, given: Any) -> Array | np.ndarray:
     """One number or several, checked: plain ones in NumPy's float64, those of JAX as they are."""
     of_jax = any(isinstance(leaf, Array) for leaf in jax.tree.leaves(given))
-    array = checks.array(name, given)
-    array = array if of_jax else np.asarray(given)
+    array = checks.array(name, given) if of_jax else checks.numbers(name, given)
     if array.ndim > 1:
         raise ValueError(f"{name} has shape {array.shape}; give one number, or one for each")
     unit = quantities(Exposures)[name].unit

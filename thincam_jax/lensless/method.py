@@ -60,13 +60,6 @@ def has_few_terms(mask: AbstractMask) -> TypeGuard[AbstractFactoredMask]:
     return isinstance(mask, AbstractFactoredMask) and term_count(mask).terms <= _MOST_TERMS
 
 
-def exact_model(mask: AbstractMask) -> Model | None:
-    """The model that has the mask's Fresnel field exactly; None of masks that are sampled."""
-    if isinstance(mask, RadialMask):
-        return "radial"
-    return "separable" if isinstance(mask, AbstractFactoredMask) else None
-
-
 def parts_of(mask: AbstractMask) -> str:
     """Number of those whose fields an exact model adds up, in words."""
     if isinstance(mask, AbstractFactoredMask):
@@ -78,7 +71,7 @@ def models_of(mask: AbstractMask) -> tuple[Model, ...]:
     """The models that can represent the mask."""
     fits = {
         **dict.fromkeys(UNBOUNDED, zone_orders(mask) is not None),
-        **{model: exact_model(mask) == model for model in ("separable", "radial")},
+        **{model: mask.exact_model == model for model in ("separable", "radial")},
         "geometric": not mask.pure_phase,
     }
     return tuple(model for model in MODELS if fits.get(model, True))
@@ -165,7 +158,7 @@ def psf_method(
     if method.model == "separable" and isinstance(mask, RadialMask):
         method = replace(method, model="radial")
     if method.model not in SAMPLED:
-        counted = method.nodes or method.model != exact_model(mask) or not method.pixel_integration
+        counted = method.nodes or method.model != mask.exact_model or not method.pixel_integration
         if counted or has_few_terms(mask):
             return method
         text = _LATTICE.format(parts_of(mask), method.model)

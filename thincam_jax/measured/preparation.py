@@ -69,7 +69,9 @@ def prepare(
     5. `demosaicing`, if the options name a Bayer pattern; then the capture's `crop`.
     6. `resampling` of the PSF onto the capture's pixels, with `psf_scale`.
     7. `downsampling`: exact means of square blocks; remainders are cropped centrally.
-    8. `clean_up` and 9. `centring` of the PSF, 10. `channels`: one PSF for all; each optional.
+    8. `clean_up` of the PSF, optional.
+    9. `centring` of the PSF, optional.
+    10. `channels`: one PSF for all, optional.
     11. `scaling`: the PSF to unit sum, the capture by `capture_scale`.
 
     In 5 and 7 dead pixels are left out of the means, as they are missing at random; a value without

@@ -86,7 +86,7 @@ def reconstruct(
       has its reason.
     - `start`: a start image, such as an earlier result. By default it is uniform with cameras,
       matrices and `LowRank` operators and for `PoissonTV`, else black. With a start image `AdmmTV`
-      omits its first part without the uniform light, see docs/reconstruction.md.
+      omits its first part without the uniform light, see docs/guide/reconstruct.md.
     - `callback`: called with `Progress` every tenth iteration of `AdmmTV` and `Fista`; it stops
       the run by returning a true value. Ctrl-C returns the best image so far, with the status
       "interrupted".

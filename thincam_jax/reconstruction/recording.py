@@ -248,9 +248,10 @@ class Recording(Module):
     def _require_finite(self) -> None:
         """Require finite values in valid pixels."""
         for number, (capture, valid) in enumerate(zip(*self._masked_captures(), strict=True)):
-            known = not checks.is_traced(capture) and not checks.is_traced(valid)
+            if checks.is_traced(capture) or checks.is_traced(valid):
+                continue
             largest = jnp.max(jnp.abs(capture))  # NaN, where one is
-            if known and not bool(jnp.isfinite(largest)):
+            if not bool(jnp.isfinite(largest)):
                 raise ValueError(
                     f"captures[{number}] holds NaN or infinity; repair it, or exclude such pixels "
                     "with valid=numpy.isfinite(captures)"
@@ -289,16 +290,17 @@ class Recording(Module):
 
     def _variances(self, matrix: np.ndarray, captures, valid) -> list[Float[Array, ""]]:
         """Variances of sums of captures: as given, or estimated where none or zero is given."""
-        if self.noise_variance is None:
-            each = self._estimated(captures, valid)
+
+        def sums(each: Float[Array, " capture"]) -> list[Float[Array, ""]]:
             return [jnp.sum(jnp.asarray(row**2, each.dtype) * each) for row in matrix]
+
+        if self.noise_variance is None:
+            return sums(self._estimated(captures, valid))
         with jax.ensure_compile_time_eval():  # a variance that is known stays so under jit
-            given = given_variances(self.noise_variance, captures)
-            totals = [jnp.sum(jnp.asarray(row**2, given.dtype) * given) for row in matrix]
+            totals = sums(given_variances(self.noise_variance, captures))
         if all(not checks.is_traced(total) and float(total) > 0 for total in totals):
             return totals
-        each = self._estimated(captures, valid)
-        found = [jnp.sum(jnp.asarray(row**2, each.dtype) * each) for row in matrix]
+        found = sums(self._estimated(captures, valid))
         return [jnp.where(t > 0, t, f) for t, f in zip(totals, found, strict=True)]
 
     def _estimated(self, captures, valid) -> Float[Array, " capture"]:

@@ -16,7 +16,7 @@ from thincam_jax.imaging.sensor import PoissonGaussianNoise, Sensor, read_out
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.forward import spectral_psf
 from thincam_jax.lensless.masks.base import AbstractMask
-from thincam_jax.lensless.method import PsfMethod, exact_model
+from thincam_jax.lensless.method import PsfMethod
 from thincam_jax.reconstruction import AdmmTV, Recording
 from thincam_jax.reconstruction.splittings import difference_symbol
 from thincam_jax.reconstruction.total_variation import TotalVariation
@@ -96,7 +96,7 @@ def kernels(
 
     def one(mask: AbstractMask):
         camera = LenslessCamera(mask, setting.sensor, setting.distance)
-        model = exact_model(mask) or "angular_spectrum"
+        model = mask.exact_model or "angular_spectrum"
         return spectral_psf(
             camera,
             [(wavelength, 1 / len(light)) for wavelength in light],

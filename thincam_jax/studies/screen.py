@@ -163,7 +163,7 @@ class ScreenStudy:
             most = wg.RayStatus(int(np.bincount(status.ravel()).argmax())).name.lower()
             raise ValueError(
                 f"no ray from the sensor reaches the object's plane (most: "
-                f"{most.replace('_', ' ')}); see docs/screen.md for what a status means"
+                f"{most.replace('_', ' ')}); see docs/guide/screen.md for what a status means"
             )
 
     @cached_property

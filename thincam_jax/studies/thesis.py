@@ -86,5 +86,5 @@ def superresolution(
         object_distance=targets[0].distance,
         noise=noise,
         seed=seed,
-        name="fza-superresolution",
+        name="fza_superresolution",
     )

@@ -136,9 +136,6 @@ def system_operator(
     **Errors**: ValueError where no pixel has a guided ray, for planes of different cells and
     sensors of different pixels, and for cells below a 64th of a pixel's field.
     """
-    planes = (plane,) if isinstance(plane, ObjectPlane) else plane
-    if not isinstance(planes, Sequence) or not all(isinstance(p, ObjectPlane) for p in planes):
-        raise TypeError(f"plane is {checks.shown(plane)}; give a waveguide.ObjectPlane, or several")
     if isinstance(camera, list | tuple):
         return colour_operator([system_operator(c, plane, orders, samples) for c in camera])
     if not isinstance(camera, SeeThroughCamera):
@@ -153,7 +150,9 @@ def planes_operator(
     level: float | None = None,
 ) -> Sparse:
     """`system_operator` of one colour; `level`: what weight, mm, is 1."""
-    planes = (plane,) if isinstance(plane, ObjectPlane) else tuple(plane)
+    planes = (plane,) if isinstance(plane, ObjectPlane) else plane
+    if not isinstance(planes, Sequence) or not all(isinstance(p, ObjectPlane) for p in planes):
+        raise TypeError(f"plane is {checks.shown(plane)}; give a waveguide.ObjectPlane, or several")
     shape = require_same("planes", "cells", [one.shape for one in planes])
     matrices = []
     for one in planes:

@@ -407,7 +407,7 @@ def test_hand(tmp_path):
 
 @pytest.mark.thorough
 def test_hand_is_explained_as_well_as_before(tmp_path):
-    """At four times the pixels, as docs/reconstruct_command.md has it."""
+    """At four times the pixels, as docs/guide/real_captures.md has it."""
     folder = shared_data("diffusercam-hand")
     paths = {"psf": folder / "psf_sample.tif", "capture": folder / "rawdata_hand_sample.tif"}
     out = tmp_path / "hand.npy"

@@ -10,7 +10,7 @@ from scipy.special import j0
 
 import thincam_jax as tc
 from helpers import finite_difference, relative_l2, value_and_slope
-from thincam_jax.lensless.method import LATTICE_POINTS, exact_model
+from thincam_jax.lensless.method import LATTICE_POINTS
 from thincam_jax.lensless.propagation.path import Path
 from thincam_jax.lensless.propagation.radial import (
     PROFILE_ERROR,
@@ -187,7 +187,7 @@ def test_new_values_trace_once_and_vmap_is_a_loop():
 
 def test_other_masks_and_shapes_are_refused():
     camera = tc.LenslessCamera(tc.Pinhole(0.1), tc.Sensor((3, 4), 0.1), 5.0)
-    assert exact_model(camera.mask) == "separable"
+    assert camera.mask.exact_model == "separable"
     with pytest.raises(TypeError, match="'radial' needs a RadialMask; for a Pinhole use 'sepa"):
         psf(camera)
     with pytest.raises(ValueError, match=r"ring has shape \(2,\); give one width, or one for ea"):

@@ -12,7 +12,7 @@ from thincam_jax.commands.terminal import (
     DryRun,
     Overrides,
     progress_bar,
-    say,
+    say_result,
     tell,
     told,
     warn,
@@ -99,7 +99,7 @@ def capture(
         warn([f"recovered from {text}" for text in outcome.recovered])
         if not outcome.complete:
             raise KeyboardInterrupt
-    say(f"{store}: {outcome.total} frames; next: thincam run {store}")
+    say_result("store", store, f"{store}: {outcome.total} frames; next: thincam run {store}")
 
 
 def reconstruct_store(store: Path, out: Path | None) -> Path:

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 import typer
 from typer import Option
 
-from thincam_jax.commands.terminal import Overrides, fail, say, told
+from thincam_jax.commands.terminal import Overrides, fail, say_result, told
 
 # Known without importing JAX; the tests hold them to `options.PSF_METHODS`.
 METHODS = ("auto", "admm-tv", "fista", "ridge")
@@ -227,6 +227,6 @@ def check(
                 )
         except (MeasurementError, OSError) as error:
             fail(error)
-    say("\n".join(lines))
+    say_result("findings", lines, "\n".join(lines))
     if not fits:
         raise typer.Exit(1)

@@ -14,10 +14,11 @@ from thincam_jax import measured
 from thincam_jax._core.environment import environment
 from thincam_jax._core.files import WriteError, writing
 from thincam_jax._core.text import escaped
+from thincam_jax.commands import terminal
 from thincam_jax.commands.interrupt import INTERRUPTED
 from thincam_jax.commands.reconstruct.jobs import Job, write_job
 from thincam_jax.commands.reconstruct.options import Background, Focusing, Output, Recipe, Sources
-from thincam_jax.commands.terminal import WRONG_INPUT, in_a_line, progress_bar, tell
+from thincam_jax.commands.terminal import WRONG_INPUT, in_a_line, progress_bar, say_result, tell
 from thincam_jax.measured.write import linear_bytes
 from thincam_jax.reconstruction import Progress, TotalVariation, check_psf, choose_solver
 from thincam_jax.reconstruction.depth import depth_of_colours
@@ -379,8 +380,11 @@ def run_with_bar(jobs: list[Job], sources: Sources, recipe: Recipe, output: Outp
                 tell(in_a_line(result.error))
                 end = WRONG_INPUT
                 continue
-            line = escaped(result.line)
-            bar.console.print(line, highlight=False, markup=False, soft_wrap=True)
+            if terminal.output == "text":  # above the bar
+                line = escaped(result.line)
+                bar.console.print(line, highlight=False, markup=False, soft_wrap=True)
+            else:
+                say_result("image", result.job.images[0])
             if result.job.focus is None:
                 continue
             if result.doubt:

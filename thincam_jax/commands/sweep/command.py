@@ -11,7 +11,7 @@ from thincam_jax.commands.terminal import (
     DryRun,
     Overrides,
     progress_bar,
-    say,
+    say_result,
     tell,
     told,
     warn,
@@ -110,7 +110,7 @@ def _print(swept: Any, path: Path) -> None:
 
     table = f"{swept.rows} of {swept.points} points: {path / 'results.parquet'}"
     if swept.rows:
-        say("\n".join([table, *swept.best]))
+        say_result("results", path / "results.parquet", "\n".join([table, *swept.best]))
     if swept.failures:
         first = swept.failures[0]
         values = told_values(first["values"])

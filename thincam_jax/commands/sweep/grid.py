@@ -67,7 +67,21 @@ def _read_axis(text: str, raw: dict) -> Axis:
     keys = path_keys(path)
     if not equals or keys is None:
         raise ConfigError(f"--grid {text}: {_FORM}")
+    if len(keys) == 1 and keys[0] not in raw and (meant := sorted(_paths_to(keys[0], raw))):
+        raise ConfigError(
+            f"--grid {text}: {path} is no key of the file; write {' or '.join(meant)}"
+        )
     return Axis(text, path, _places(text, keys, raw), _values(text, values))
+
+
+def _paths_to(key: str | int, raw: Any, before: str = "") -> set[str]:
+    """Paths of the entries of that name, with `*` for all entries of a list."""
+    if isinstance(raw, list):
+        return set().union(*(_paths_to(key, entry, f"{before}*.") for entry in raw))
+    if not isinstance(raw, dict):
+        return set()
+    inner = (_paths_to(key, value, f"{before}{name}.") for name, value in raw.items())
+    return set().union({f"{before}{key}"} if key in raw else (), *inner)
 
 
 def _places(text: str, keys: tuple, raw: dict) -> tuple[tuple[str | int, ...], ...]:

@@ -37,7 +37,7 @@ from thincam_jax._core.precision import (
 from thincam_jax.lensless.accuracy.lines import SparseGrid
 from thincam_jax.lensless.accuracy.probe import spread
 from thincam_jax.lensless.masks.base import AbstractFactoredMask, AbstractMask
-from thincam_jax.lensless.method import LATTICE_POINTS, PsfMethod, exact_model, psf_method
+from thincam_jax.lensless.method import LATTICE_POINTS, PsfMethod, psf_method
 from thincam_jax.lensless.propagation.angular_spectrum import (
     PADDING,
     angular_spectrum,
@@ -75,7 +75,7 @@ def sampled_errors(
     They are those of `angular_spectrum`, or of the exact model where the mask has one.
     `norm`: in which PSFs of the middle are compared.
     """
-    if model := exact_model(mask):
+    if model := mask.exact_model:
         rounding = _field_rounding(mask, grid, path)
         exact = PsfMethod(model, precision_of(grid.pitch), pixel_integration)
         if model == "radial":

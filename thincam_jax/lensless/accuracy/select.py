@@ -23,7 +23,6 @@ from thincam_jax.lensless.method import (
     Model,
     PsfMethod,
     as_method,
-    exact_model,
     has_few_terms,
     models_of,
     parts_of,
@@ -183,7 +182,7 @@ def _select_sampled(
         if error <= tolerance:
             break
     chosen, method = considered[-1], considered[-1].method
-    many = exact_model(mask) is not None
+    many = mask.exact_model is not None
     left = f"{chosen.predicted_error:.1e}"
     reasons = (
         _many_terms(mask, chosen)
@@ -211,7 +210,7 @@ def _many_terms(mask: AbstractMask, chosen: Prediction) -> tuple[str, ...]:
     if points := chosen.method.nodes:
         averaged = f", a pixel's average by {points} points: {chosen.predicted_error:.1e}"
     return (
-        f"{exact_model(mask)!r} adds up the field of the mask's {parts_of(mask)}{averaged}",
+        f"{mask.exact_model!r} adds up the field of the mask's {parts_of(mask)}{averaged}",
         "errors are counted from the exact Fresnel field",
     )
 

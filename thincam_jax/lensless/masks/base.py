@@ -3,7 +3,7 @@
 import abc
 import functools
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, ClassVar, Literal
 
 import equinox as eqx
 import jax
@@ -31,6 +31,8 @@ class AbstractMask(Module):
     """
 
     centre: eqx.AbstractVar[Float[Array, "2"]]
+    # The model that has the mask's Fresnel field exactly; None of masks that are only sampled.
+    exact_model: ClassVar[Literal["separable", "radial"] | None] = None
 
     @property
     @abc.abstractmethod
@@ -125,6 +127,8 @@ class AbstractFactoredMask(AbstractMask):
     The field behind it is such a sum too, diffraction included, in closed form.
     """
 
+    exact_model = "separable"
+
     @abc.abstractmethod
     def terms(self, wavelength: Number | None = None) -> MaskTerms:
         """t(x, y), for light of a wavelength in mm where that matters."""
@@ -174,8 +178,7 @@ def _count(structure: Any, leaves: tuple) -> TermCount:
 
 def other_models(mask: AbstractMask) -> str:
     """The wave models that take the mask, in words."""
-    exact = "'separable', " if isinstance(mask, AbstractFactoredMask) else ""
-    exact = "'radial', " if hasattr(mask, "rings") else exact
+    exact = f"{mask.exact_model!r}, " if mask.exact_model else ""
     return f"{exact}'angular_spectrum' or 'rayleigh_sommerfeld'"
 
 

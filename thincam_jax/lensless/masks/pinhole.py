@@ -50,9 +50,9 @@ class Pinhole(AbstractFactoredMask):
 
 def _widths(name: str, value: Any) -> checks.Checked:
     """One width, or an array of them, mm."""
-    if np.ndim(value) == 0:
+    if checks.shape_of(value) == ():
         return checks.positive(name, value, "mm")
-    return checks.positive_all(name, checks.finite(name, value, "mm", shape=np.shape(value)), "mm")
+    return checks.positive_all(name, value, "mm")
 
 
 class RadialMask(AbstractMask):
@@ -74,6 +74,7 @@ class RadialMask(AbstractMask):
     centre: Float[Array, "2"] = eqx.field(
         default=(0, 0), converter=quantity("mm", shape=(2,)), kw_only=True
     )
+    exact_model = "radial"
 
     def __check_init__(self):
         if self.ring.shape not in ((), self.rings.shape):

@@ -8,7 +8,7 @@ import numpy as np
 from thincam_jax.imaging.scene import Scene
 from thincam_jax.lensless.accuracy.select import probe_of
 from thincam_jax.lensless.camera import LenslessCamera
-from thincam_jax.lensless.method import exact_model, has_few_terms
+from thincam_jax.lensless.method import has_few_terms
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ def _shot_noise(camera: LenslessCamera, tolerance: float) -> Effect:
 def _fresnel(camera, scene: Scene, tolerance: float) -> Effect:
     """Exact scalar diffraction against Fresnel's, for the nearest plane."""
     if not has_few_terms(camera.mask):
-        if exact_model(camera.mask):
+        if camera.mask.exact_model:
             return Effect("exact phases", False, None, "Fresnel's; size not known for this mask")
         return Effect("exact phases", True, None, "those of exact scalar diffraction are modelled")
     distance = min(float(plane.distance) for plane in scene.planes)

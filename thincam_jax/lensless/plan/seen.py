@@ -17,7 +17,6 @@ from thincam_jax.lensless.method import (
     CLOSED,
     Model,
     PsfMethod,
-    exact_model,
     has_few_terms,
     models_of,
     psf_method,
@@ -86,7 +85,7 @@ class SeenScene:
     @functools.cached_property
     def rough(self) -> PsfMethod:
         """Estimate of the capture's energy."""
-        return _ROUGH if exact_model(self.camera.mask) else self.sampled(1)
+        return _ROUGH if self.camera.mask.exact_model else self.sampled(1)
 
     def sampled(self, least: int) -> PsfMethod:
         """`angular_spectrum` with the samples that hold the mask for all light, or with more."""

@@ -1,0 +1,183 @@
+"""The documentation: Sphinx with pages in Markdown, the scripts of experiments/ as a gallery.
+
+`make docs` executes the scripts whose text has changed; `make docs FAST=1` executes none.
+"""
+
+import ast
+import importlib
+import os
+import re
+import textwrap
+from importlib.metadata import files
+from pathlib import Path
+
+DOCS = Path(__file__).parent
+PACKAGE = DOCS.parent / "thincam_jax"
+
+project = "thincam_jax"
+author = "The thincam_jax developers"
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.autosummary",
+    "sphinx.ext.mathjax",
+    "sphinx_gallery.gen_gallery",
+]
+exclude_patterns = ["_build", "gallery/*.ipynb"]
+default_role = "py:obj"  # `name` in a docstring: a link where the name is known, else code
+myst_enable_extensions = ["dollarmath", "colon_fence"]
+myst_heading_anchors = 4
+
+html_theme = "pydata_sphinx_theme"
+html_title = "thincam_jax"
+MATHJAX = next(f for f in files("sphinx-mathjax-offline") or () if f.name == "tex-svg.js")
+html_static_path = ["_static", str(MATHJAX.locate())]
+html_css_files = ["site.css"]
+templates_path = ["_templates"]
+html_copy_source = False
+html_show_sourcelink = False
+mathjax_path = "tex-svg.js"  # a copy: no page asks another machine for anything
+html_theme_options = {
+    "header_links_before_dropdown": 7,
+    "navbar_align": "left",
+    "navbar_persistent": ["search-button"],
+    "secondary_sidebar_items": ["page-toc"],
+    "footer_start": ["copyright"],
+    "footer_end": [],
+}
+html_sidebars = {"index": [], "start": [], "contributing": []}
+
+autodoc_typehints = "none"
+autodoc_member_order = "bysource"
+
+# The scripts write their figures, too, and one reads photographs that are no part of the project.
+os.environ["THINCAM_FIGURES"] = str(DOCS / "_build/figures")
+PHOTOGRAPHS = DOCS.parents[1] / "shared/data/photographs"
+PHOTOGRAPHS = Path(os.environ.setdefault("THINCAM_PHOTOGRAPHS", str(PHOTOGRAPHS)))
+sphinx_gallery_conf = {
+    "examples_dirs": "../experiments",
+    "gallery_dirs": "gallery",
+    "filename_pattern": r"/[^/]*\.py$" if PHOTOGRAPHS.exists() else r"/(?!denoiser)[^/]*\.py$",
+    "plot_gallery": "FAST" not in os.environ,
+    "download_all_examples": False,
+    "write_computation_times": False,  # a table that asks other machines for its scripts
+}
+
+
+TOP = "thincam_jax"
+# The API reference: for each package a page of its public names below their module's first line.
+PACKAGES = (
+    TOP,
+    "thincam_jax.imaging.targets",
+    "thincam_jax.imaging.operators",
+    "thincam_jax.imaging.metrics",
+    "thincam_jax.waveguide",
+    "thincam_jax.reconstruction",
+    "thincam_jax.reconstruction.depth",
+    "thincam_jax.measured",
+    "thincam_jax.measured.calibration",
+    "thincam_jax.design",
+    "thincam_jax.studies",
+    "thincam_jax.learn",
+    "thincam_jax.plot",
+    "thincam_jax.hardware",
+)
+
+
+def source(module: str) -> ast.Module:
+    """Syntax tree of a module, or of the stub that holds the names of a lazy package."""
+    path = PACKAGE.parent / module.replace(".", "/")
+    places = (path / "__init__.pyi", path / "__init__.py", path.with_suffix(".py"))
+    return ast.parse(next(p for p in places if p.exists()).read_text("utf-8"))
+
+
+def first_line(module: str) -> str:
+    return ast.get_docstring(source(module)).splitlines()[0].rstrip(".")
+
+
+ROOMS = {  # headings of the names at the top level, in the order of the page
+    "imaging": "Scenes, sensors and noise",
+    "_core": "Scenes, sensors and noise",
+    "lensless": "Cameras, PSFs and captures",
+    "lensless.masks": "Masks",
+    "lensless.accuracy": "Accuracy",
+    "lensless.plan": "Accuracy",
+    "reconstruction": "Reconstruction",
+    "learn": "Reconstruction",
+    "measured": "Calibration",
+}
+
+
+def heading(package: str, module: str) -> str:
+    if package != TOP:
+        return first_line(module)
+    return ROOMS[max((room for room in ROOMS if module.startswith(f"{TOP}.{room}")), key=len)]
+
+
+def reference_page(package: str, seen: set[tuple[str, str]]) -> str:
+    """Tables of the names of a package that stand on no earlier page."""
+    groups: dict[str, list[str]] = {title: [] for title in ROOMS.values() if package == TOP}
+    for node in source(package).body:
+        if isinstance(node, ast.ImportFrom) and node.module:
+            for alias in node.names:
+                module = f"{package}.{node.module}" if node.level else node.module
+                named = getattr(importlib.import_module(package), alias.name)
+                module = getattr(named, "__module__", module)
+                if (module, alias.name) not in seen:
+                    seen.add((module, alias.name))
+                    groups.setdefault(heading(package, module), []).append(alias.name)
+    lines = [package, "=" * len(package), ""]
+    if package == TOP:
+        lines += ["The names that most programs need, by ``import thincam_jax as tc``.", ""]
+    else:
+        lines += [f".. automodule:: {package}", "   :no-index:", ""]
+    for title, names in groups.items():
+        lines += [title, "-" * len(title) * 2, "", f".. currentmodule:: {package}", ""]
+        lines += [".. autosummary::", "   :toctree: generated", "", *(f"   {n}" for n in names), ""]
+    return "\n".join(lines)
+
+
+def write_reference(folder: Path) -> None:
+    folder.mkdir(exist_ok=True)
+    seen: set[tuple[str, str]] = set()
+    for package in PACKAGES:
+        page = folder / f"{package}.rst"
+        text = reference_page(package, seen)
+        if not page.exists() or page.read_text("utf-8") != text:
+            page.write_text(text, "utf-8")
+
+
+write_reference(DOCS / "api")
+
+
+# Docstrings are plain text with single backticks and fenced code: `|x|` is a norm, a lone `*` no
+# emphasis. Blocks and inline code stay as they are.
+FENCE = re.compile(r"^( *)```python\n(.*?)^ *```$", re.MULTILINE | re.DOTALL)
+MARKUP = re.compile(
+    r"^( *)(?:\.\. |[^\n]*::$)[^\n]*\n(?:\1 +[^\n]*\n|\n)*"
+    r"|``.+?``|`[^`]+`(?P<joined>(?=\w))?|\*\*\S[^*]*\*\*|(?<![\w(])\*\w[^*\n]*[\w.,;?]\*(?!\w)"
+    r"|(?P<bare>[*|])",
+    re.MULTILINE | re.DOTALL,
+)
+
+
+def code_block(fence: re.Match) -> str:
+    indent, code = fence.groups()
+    return f"{indent}.. code-block:: python\n\n{textwrap.indent(code, '   ')}"
+
+
+def escape(found: re.Match) -> str:
+    if found["bare"]:
+        return "\\" + found[0]
+    return found[0] + ("\\ " if found["joined"] is not None else "")
+
+
+def to_rst(app, what, name, obj, options, lines):
+    if what == "data":  # a constant has the docstring of its type
+        lines.clear()
+    text = FENCE.sub(code_block, "\n".join(lines) + "\n")
+    lines[:] = MARKUP.sub(escape, text).split("\n")
+
+
+def setup(app):
+    app.connect("autodoc-process-docstring", to_rst)
