@@ -49,6 +49,7 @@ html_sidebars = {"index": [], "start": [], "contributing": []}
 
 autodoc_typehints = "none"
 autodoc_member_order = "bysource"
+toc_object_entries_show_parents = "hide"
 
 # The scripts write their figures, too, and one reads photographs that are no part of the project.
 os.environ["THINCAM_FIGURES"] = str(DOCS / "_build/figures")

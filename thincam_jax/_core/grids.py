@@ -19,6 +19,15 @@ class Grid(eqx.Module):
 
     - `shape`: (rows, columns).
     - `pitch`: distance of neighbouring samples, mm, the same in y and x.
+
+    ```python
+    import thincam_jax as tc
+
+    grid = tc.Grid((3, 4), 0.5)  # rows and columns, mm
+    print(grid.x)  # [-0.75 -0.25  0.25  0.75]
+    ```
+
+    **See also**: `Sensor`, `psf`.
     """
 
     shape: tuple[int, int] = eqx.field(static=True)

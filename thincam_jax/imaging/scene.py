@@ -56,6 +56,16 @@ class ImagePlane(Module):
     - `width`: physical width of the image, mm; its pixels are square.
     - `moves`: x of its middle at the beginning and the end of an exposure, mm: it moves uniformly,
       and the capture is the mean over the motion. None stays on the axis.
+
+    ```python
+    import thincam_jax as tc
+    from thincam_jax.imaging.targets import sample_image
+
+    plane = tc.ImagePlane(sample_image("camera"), distance=250.0, width=100.0)
+    print(plane.height)  # 100.0
+    ```
+
+    **See also**: `Scene`, `load_image`.
     """
 
     image: Float[Array, "*batch y x"] = eqx.field(converter=_radiances)
@@ -116,6 +126,16 @@ class Spectrum(Module):
 
     - `wavelengths`: mm.
     - `weights`: non-negative; used as given, so that they sum to 1 for a plain average.
+
+    ```python
+    import thincam_jax as tc
+    from thincam_jax.units import nm
+
+    light = tc.Spectrum([480 * nm, 520 * nm, 560 * nm], [1.0, 2.0, 1.0])
+    print(light.weights)  # [1. 2. 1.]
+    ```
+
+    **See also**: `Scene`.
     """
 
     wavelengths: Float[Array, " n"] = eqx.field(converter=quantity("mm", check=checks.wavelengths))
@@ -141,6 +161,17 @@ class Scene(Module):
 
     - `planes`: one `ImagePlane` or a sequence of them, with equal batch shapes.
     - `spectrum`: a `Spectrum` or one wavelength in mm.
+
+    ```python
+    import thincam_jax as tc
+    from thincam_jax.units import nm
+
+    near, far = (tc.ImagePlane([[1.0, 0.5]], d, width=0.1 * d) for d in (100.0, 300.0))
+    scene = tc.Scene([near, far], 500 * nm)
+    print(len(scene.planes))  # 2
+    ```
+
+    **See also**: `ImagePlane`, `Spectrum`, `capture`.
     """
 
     planes: tuple[ImagePlane, ...]

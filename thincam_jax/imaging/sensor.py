@@ -31,6 +31,16 @@ class Sensor(Module):
       white scene.
     - `bit_depth`: bits of the analogue-digital converter, whose range is the full well; None does
       not quantise. Needs an `exposure` or `electrons`.
+
+    ```python
+    import thincam_jax as tc
+    from thincam_jax.units import um
+
+    sensor = tc.Sensor((24, 32), pitch=50 * um, full_well=10_000, exposure=0.9, bit_depth=12)
+    print(sensor.grid.shape)  # (24, 32)
+    ```
+
+    **See also**: `LenslessCamera`, `PoissonGaussianNoise`.
     """
 
     shape: tuple[int, int] = eqx.field(converter=quantity(check=checks.shape2d), static=True)
@@ -104,6 +114,18 @@ class GaussianNoise(AbstractNoise):
 
     - "total": the mean of the squared image, its mean included (MATLAB's ``awgn(…, 'measured')``);
     - "without_mean": its variance: the power of a lensless capture without its bias.
+
+    ```python
+    import thincam_jax as tc
+    from thincam_jax.units import nm, um
+
+    mask = tc.FresnelZoneAperture(25.0, width=1.6)
+    camera = tc.LenslessCamera(mask, tc.Sensor((24, 32), 50 * um), distance=5.0)
+    scene = tc.Scene(tc.ImagePlane([[0.0, 1.0]], distance=250.0, width=40.0), 500 * nm)
+    noisy = tc.capture(camera, scene, noise=tc.GaussianNoise(snr_db=30.0), key=0)
+    ```
+
+    **See also**: `PoissonGaussianNoise`, `capture`.
     """
 
     snr_db: Float[Array, ""] = eqx.field(converter=quantity("dB", check=checks.decibels))
@@ -131,6 +153,18 @@ class PoissonGaussianNoise(AbstractNoise):
     - `read_noise`: standard deviation in electrons, ≥ 0.
 
     The number of electrons follows from the sensor's full well and exposure.
+
+    ```python
+    import thincam_jax as tc
+    from thincam_jax.units import nm, um
+
+    sensor = tc.Sensor((24, 32), 50 * um, full_well=10_000, exposure=0.9)
+    camera = tc.LenslessCamera(tc.FresnelZoneAperture(25.0, width=1.6), sensor, distance=5.0)
+    scene = tc.Scene(tc.ImagePlane([[0.0, 1.0]], distance=250.0, width=40.0), 500 * nm)
+    noisy = tc.capture(camera, scene, noise=tc.PoissonGaussianNoise(read_noise=8.0), key=0)
+    ```
+
+    **See also**: `GaussianNoise`, `Sensor`.
     """
 
     read_noise: Float[Array, ""] = eqx.field(

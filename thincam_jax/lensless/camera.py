@@ -29,6 +29,18 @@ class LenslessCamera(Module):
     - `mask`: any mask; see `thincam_jax.lensless.masks`.
     - `sensor`: shape and pitch of the pixels.
     - `distance`: mask-sensor distance d, mm, > 0.
+
+    ```python
+    import thincam_jax as tc
+    from thincam_jax.units import nm, um
+
+    mask = tc.FresnelZoneAperture(25.0, width=1.6)
+    camera = tc.LenslessCamera(mask, tc.Sensor((24, 32), 50 * um), distance=5.0)
+    h = tc.psf(camera, wavelength=500 * nm, object_distance=250.0)
+    print(h.shape)  # (24, 32)
+    ```
+
+    **See also**: `FresnelZoneAperture`, `Sensor`, `psf`, `capture`.
     """
 
     mask: AbstractMask = eqx.field(converter=_mask)

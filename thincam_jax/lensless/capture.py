@@ -44,6 +44,19 @@ def capture(
 
     **Returns** (*batch, y, x) in units of radiance × mm². Warns (`SamplingWarning`) where the
     mask's shadow is finer than the pixels resolve.
+
+    ```python
+    import thincam_jax as tc
+    from thincam_jax.units import nm, um
+
+    mask = tc.FresnelZoneAperture(25.0, width=1.6)
+    camera = tc.LenslessCamera(mask, tc.Sensor((24, 32), 50 * um), distance=5.0)
+    scene = tc.Scene(tc.ImagePlane([[0.0, 1.0]], distance=250.0, width=40.0), 500 * nm)
+    noisy = tc.capture(camera, scene, noise=tc.GaussianNoise(snr_db=30.0), key=0)
+    print(noisy.shape)  # (24, 32)
+    ```
+
+    **See also**: `Scene`, `plan`, `reconstruct`.
     """
     warn_if_unresolved(camera, (plane.distance for plane in scene.planes))
     if isinstance(model, Plan):

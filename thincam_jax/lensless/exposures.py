@@ -120,6 +120,8 @@ class Exposures(Module):
     method_a = settings.fringe_scanned()
     print(len(method_a), method_a[4].distance)  # 8 6.5
     ```
+
+    **See also**: `FresnelZoneAperture`, `Cameras`, `capture`.
     """
 
     beta: Each = eqx.field(converter=unchecked("rad/mm^2"))

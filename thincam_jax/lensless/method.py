@@ -104,6 +104,8 @@ class PsfMethod:
     fine = tc.PsfMethod("angular_spectrum", oversampling=5)
     h = tc.psf(camera, wavelength=500 * nm, model=fine)
     ```
+
+    **See also**: `psf`, `select_model`, `MODELS`.
     """
 
     model: Model = "separable"

@@ -41,6 +41,17 @@ def harmonic_otf(
 
     The phase of the camera's mask is not used. Other arguments and errors as for `otf`; TypeError
     for masks that have no phase, ValueError for a harmonic below 0.
+
+    ```python
+    import thincam_jax as tc
+    from thincam_jax.units import nm, um
+
+    mask = tc.FresnelZoneAperture(25.0, width=1.6, profile="binary")
+    camera = tc.LenslessCamera(mask, tc.Sensor((24, 32), 50 * um), distance=5.0)
+    second = tc.harmonic_otf(camera, 2, wavelength=500 * nm, object_distance=250.0)
+    ```
+
+    **See also**: `fringe_scanned_otf`.
     """
     if int(harmonic) != harmonic or harmonic < 0:
         raise ValueError(f"harmonic = {harmonic!r}; give a whole number from 0 on")
@@ -73,6 +84,18 @@ def fringe_scanned_otf(
     (thesis Eq 3.14 and 3.31, corrected; the right side for weak diffraction, an unbounded mask and
     t → ∞): the constant and the second harmonic cancel. The phase of the camera's mask is not used.
     Arguments and errors as for `otf`; TypeError for masks that have no phase.
+
+    ```python
+    import thincam_jax as tc
+    from thincam_jax.units import nm, um
+
+    mask = tc.FresnelZoneAperture(25.0, width=1.6)
+    camera = tc.LenslessCamera(mask, tc.Sensor((24, 32), 50 * um), distance=5.0)
+    h = tc.fringe_scanned_otf(camera, wavelength=500 * nm, object_distance=250.0)
+    print(h.shape)  # (24, 32)
+    ```
+
+    **See also**: `phase_pair_otf`, `harmonic_otf`.
     """
     given = (wavelength, object_distance, model, pixel_integration, grid)
     h = [_otf(_with_phase(camera, turns), *given) for turns in (0.0, 0.25, 0.5, 0.75)]
@@ -98,6 +121,18 @@ def phase_pair_otf(
 
     (thesis Eq 3.49, corrected): the constant cancels, the second harmonic stays. Arguments and
     errors as for `fringe_scanned_otf`.
+
+    ```python
+    import thincam_jax as tc
+    from thincam_jax.units import nm, um
+
+    mask = tc.FresnelZoneAperture(25.0, width=1.6)
+    camera = tc.LenslessCamera(mask, tc.Sensor((24, 32), 50 * um), distance=5.0)
+    h = tc.phase_pair_otf(camera, wavelength=500 * nm, object_distance=250.0)
+    print(h.shape)  # (24, 32)
+    ```
+
+    **See also**: `fringe_scanned_otf`, `harmonic_otf`.
     """
     given = (wavelength, object_distance, model, pixel_integration, grid)
     return _otf(_with_phase(camera, 0.0), *given) - _otf(_with_phase(camera, 0.75), *given)

@@ -69,6 +69,18 @@ def psf(
     does not hold (see `thincam_jax.lensless.digits`), TypeError for a mask
     that the model cannot take, MemoryError (before any work, with the estimate) for a size that
     does not fit.
+
+    ```python
+    import thincam_jax as tc
+    from thincam_jax.units import nm, um
+
+    mask = tc.FresnelZoneAperture(25.0, width=1.6)
+    camera = tc.LenslessCamera(mask, tc.Sensor((24, 32), 50 * um), distance=5.0)
+    h = tc.psf(camera, wavelength=500 * nm, object_distance=250.0)  # (y, x)
+    print(h.shape)  # (24, 32)
+    ```
+
+    **See also**: `otf`, `select_model`, `capture`.
     """
     grid = grid or camera.sensor.grid
     method = psf_method(camera.mask, grid, model, pixel_integration)
@@ -91,6 +103,18 @@ def otf(
     (sum times pitch²). For "paraxial" and "closed_form", whose PSF has no end, it is the
     analytic transform, without pixel average: a δ at zero frequency is one over the area of a
     frequency cell.
+
+    ```python
+    import thincam_jax as tc
+    from thincam_jax.units import nm, um
+
+    mask = tc.FresnelZoneAperture(25.0, width=1.6)
+    camera = tc.LenslessCamera(mask, tc.Sensor((24, 32), 50 * um), distance=5.0)
+    H = tc.otf(camera, wavelength=500 * nm, object_distance=250.0)  # (v, u), centred
+    print(H.shape)  # (24, 32)
+    ```
+
+    **See also**: `psf`, `fringe_scanned_otf`.
     """
     grid = grid or camera.sensor.grid
     method = psf_method(camera.mask, grid, model, pixel_integration)

@@ -18,7 +18,22 @@ from thincam_jax.lensless.propagation.path import Path
 
 
 class SamplingWarning(UserWarning):
-    """The shadow of the mask is finer than what the pixels resolve."""
+    """The shadow of the mask is finer than what the pixels resolve.
+
+    ```python
+    import warnings
+
+    import thincam_jax as tc
+    from thincam_jax.units import nm, um
+
+    mask = tc.FresnelZoneAperture(100.0, width=1.6)  # zones finer than the pixels
+    with warnings.catch_warnings(action="ignore", category=tc.SamplingWarning):
+        camera = tc.LenslessCamera(mask, tc.Sensor((24, 32), 50 * um), distance=5.0)
+        h = tc.psf(camera, wavelength=500 * nm)
+    ```
+
+    **See also**: `psf`.
+    """
 
 
 def unresolved(frequency: float, pitch: float) -> str:

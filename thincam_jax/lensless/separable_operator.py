@@ -57,6 +57,20 @@ def separable_operator(
     **Returns** the operator, its error, and the errors of fewer terms.
 
     **Errors**: TypeError for a mask without separable terms; ValueError for several planes.
+
+    ```python
+    import thincam_jax as tc
+    from thincam_jax.units import nm, um
+
+    code = tc.maximum_length_sequence(15)
+    mask = tc.SeparableMask(code, code, cell=60 * um)
+    camera = tc.LenslessCamera(mask, tc.Sensor((24, 32), 50 * um), distance=2.0)
+    scene = tc.Scene(tc.ImagePlane([[0.0, 1.0, 0.5]], distance=250.0, width=40.0), 500 * nm)
+    found = tc.separable_operator(camera, scene)
+    print(found.operator.terms)  # 1
+    ```
+
+    **See also**: `calibrate_separable`, `fit_separable`.
     """
     if len(scene.planes) != 1:
         raise ValueError(

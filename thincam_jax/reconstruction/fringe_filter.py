@@ -93,6 +93,20 @@ class FringeScanning(AbstractSolver):
     """The conventional geometric inverse of two or four phases, see `FringeFilter`; for comparison.
 
     It needs `Cameras`; neither noise nor wavelength is used.
+
+    ```python
+    import thincam_jax as tc
+    from thincam_jax.units import nm, um
+
+    masks = [tc.FresnelZoneAperture(25.0, phase, width=1.6) for phase in (0.0, 4.712)]
+    cameras = [tc.LenslessCamera(mask, tc.Sensor((24, 32), 50 * um), 5.0) for mask in masks]
+    scene = tc.Scene(tc.ImagePlane([[0.0, 1.0]], distance=250.0, width=40.0), 500 * nm)
+    optics = tc.Cameras(cameras, wavelength=500 * nm, object_distance=250.0)
+    recording = tc.Recording([tc.capture(camera, scene) for camera in cameras], optics)
+    result = tc.reconstruct(recording, tc.FringeScanning())
+    ```
+
+    **See also**: `Wiener`, `fringe_scanned_otf`.
     """
 
     name: ClassVar[str] = "fringe_scanning"

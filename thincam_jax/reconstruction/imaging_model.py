@@ -53,6 +53,19 @@ class Cameras(Module):
     - `field_shape`: pixels of the image, default those of the sensor; the scene is taken as black
       outside. Its pixels are p·t/d apart on the object, d the largest distance.
     - `model`, `pixel_integration`: of the PSFs, see `thincam_jax.psf`.
+
+    ```python
+    import thincam_jax as tc
+    from thincam_jax.units import nm, um
+
+    mask = tc.FresnelZoneAperture(25.0, width=1.6)
+    camera = tc.LenslessCamera(mask, tc.Sensor((24, 32), 50 * um), distance=5.0)
+    scene = tc.Scene(tc.ImagePlane([[0.0, 1.0]], distance=250.0, width=40.0), 500 * nm)
+    optics = tc.Cameras([camera], wavelength=500 * nm, object_distance=250.0)
+    recording = tc.Recording([tc.capture(camera, scene)], optics)
+    ```
+
+    **See also**: `Psfs`, `Recording`.
     """
 
     cameras: tuple[LenslessCamera, ...] = eqx.field(converter=_cameras)
@@ -135,6 +148,17 @@ class Psfs(Module):
       channel axis of length 1 or that of the captures.
     - `field_shape`: pixels of the field; default the extent that reaches the sensor, sensor +
       PSF − 1, of which the image is the part in front of the sensor.
+
+    ```python
+    import numpy as np
+    import thincam_jax as tc
+
+    psf = np.random.default_rng(0).random((9, 9))
+    recording = tc.Recording(np.ones((1, 24, 32)), tc.Psfs(psf[None]))
+    result = tc.reconstruct(recording, tc.AdmmTV(iterations=10))
+    ```
+
+    **See also**: `Cameras`, `Recording`, `check_psf`.
     """
 
     psfs: Float[Array, "capture channel plane k l"]

@@ -106,6 +106,19 @@ def solve_fixed_point(
     - `iterations`: at most; `tolerance`: of the relative change of the state, see `Admm`.
     - `relaxation`: α of `thincam_jax.reconstruction.admm`.
     - `adjoint`: the linear solver of the gradient, default `NeumannSeries()`.
+
+    ```python
+    import jax.numpy as jnp
+    import numpy as np
+    import thincam_jax as tc
+
+    psf = np.random.default_rng(0).random((9, 9))
+    problem = tc.Recording(np.ones((1, 24, 32)), tc.Psfs(psf[None]), noise_variance=0.01).problem()
+    found = tc.solve_fixed_point(problem, jnp.zeros(problem.image_shape), iterations=50)
+    print(found.image.shape)  # (1, 1, 32, 40)
+    ```
+
+    **See also**: `implicit_proximal_gradient`, `AdmmTV`.
     """
     splitting = splitting_of(problem) if isinstance(problem, InverseProblem) else problem
     solution = optx.fixed_point(
@@ -147,6 +160,18 @@ def implicit_proximal_gradient(
 
     - `image`: to start from.
     - `tolerance`: length of the last step, in units in which captures are about 1.
+
+    ```python
+    import jax.numpy as jnp
+    import numpy as np
+    import thincam_jax as tc
+
+    psf = np.random.default_rng(0).random((9, 9))
+    problem = tc.Recording(np.ones((1, 24, 32)), tc.Psfs(psf[None]), noise_variance=0.01).problem()
+    image = tc.implicit_proximal_gradient(problem, jnp.zeros(problem.image_shape), iterations=20)
+    ```
+
+    **See also**: `solve_fixed_point`, `Fista`.
     """
     import jaxopt  # here, since it is slow to import
 

@@ -96,6 +96,20 @@ def reconstruct(
 
     **Errors**: ValueError and TypeError, one line, for a recording, start or callback that the
     solver cannot use.
+
+    ```python
+    import thincam_jax as tc
+    from thincam_jax.units import nm, um
+
+    mask = tc.FresnelZoneAperture(25.0, width=1.6)
+    camera = tc.LenslessCamera(mask, tc.Sensor((24, 32), 50 * um), distance=5.0)
+    scene = tc.Scene(tc.ImagePlane([[0.0, 1.0]], distance=250.0, width=40.0), 500 * nm)
+    optics = tc.Cameras([camera], wavelength=500 * nm, object_distance=250.0)
+    recording = tc.Recording([tc.capture(camera, scene)], optics)
+    result = tc.reconstruct(recording, tc.AdmmTV(tau=2.0, iterations=10))
+    ```
+
+    **See also**: `Recording`, `AdmmTV`, `Wiener`, `choose_solver`.
     """
     reason = ""
     if solver is None:
@@ -124,6 +138,18 @@ def choose_solver(
     operators, of which each iteration of ADMM takes some 80 applications.
 
     - `synthesis`: sums of captures for the solver; see `AdmmTV`.
+
+    ```python
+    import numpy as np
+    import thincam_jax as tc
+
+    psf = np.random.default_rng(0).random((9, 9))
+    recording = tc.Recording(np.ones((1, 24, 32)), tc.Psfs(psf[None]))
+    solver, reason = tc.choose_solver(recording)
+    print(solver.name)  # admm_tv
+    ```
+
+    **See also**: `reconstruct`.
     """
     operators = getattr(recording.imaging_model, "operators", ())
     if synthesis is None and any(isinstance(one, LowRank) for one in operators):
@@ -215,6 +241,17 @@ class AdmmTV(AbstractRegularised):
     - `iterations`: at most. `tolerance`: of the relative residuals.
 
     **Errors**: ValueError, one line, for values out of range.
+
+    ```python
+    import numpy as np
+    import thincam_jax as tc
+
+    psf = np.random.default_rng(0).random((9, 9))
+    recording = tc.Recording(np.ones((1, 24, 32)), tc.Psfs(psf[None]))
+    result = tc.reconstruct(recording, tc.AdmmTV(tau=2.0, iterations=10))
+    ```
+
+    **See also**: `reconstruct`, `TotalVariation`, `Fista`.
     """
 
     name: ClassVar[str] = "admm_tv"
@@ -277,6 +314,17 @@ class Fista(AbstractRegularised):
 
     - `regulariser`: R, such as `TotalVariation`, the default, or `Sparsity` in wavelets or cosines,
       with the same τ: a coefficient of an orthonormal basis has the noise of a pixel.
+
+    ```python
+    import numpy as np
+    import thincam_jax as tc
+
+    psf = np.random.default_rng(0).random((9, 9))
+    recording = tc.Recording(np.ones((1, 24, 32)), tc.Psfs(psf[None]))
+    result = tc.reconstruct(recording, tc.Fista(tau=2.0, iterations=10))
+    ```
+
+    **See also**: `AdmmTV`, `implicit_proximal_gradient`.
     """
 
     name: ClassVar[str] = "fista"

@@ -138,6 +138,18 @@ class PoissonTV(AbstractIterativeSolver):
     takes no callback, since it is one compiled program.
 
     **Errors**: ValueError, one line, for values out of range.
+
+    ```python
+    import numpy as np
+    import thincam_jax as tc
+
+    psf = np.random.default_rng(0).random((9, 9))
+    counts = np.random.default_rng(1).poisson(20.0, (1, 24, 32)).astype(float)
+    recording = tc.Recording(counts, tc.Psfs(psf[None]))
+    result = tc.reconstruct(recording, tc.PoissonTV(iterations=10))
+    ```
+
+    **See also**: `AdmmTV`.
     """
 
     name: ClassVar[str] = "poisson"

@@ -49,6 +49,18 @@ class InverseProblem(eqx.Module):
     - `nonnegative`: whether to constrain f ≥ 0.
 
     **Errors**: ValueError, one line, where operators and captures do not fit.
+
+    ```python
+    import numpy as np
+    import thincam_jax as tc
+
+    psf = np.random.default_rng(0).random((9, 9))
+    recording = tc.Recording(np.ones((1, 24, 32)), tc.Psfs(psf[None]), noise_variance=0.01)
+    problem = recording.problem(tau=2.0)
+    print(problem.image_shape)  # (1, 1, 32, 40)
+    ```
+
+    **See also**: `Recording`, `solve_fixed_point`.
     """
 
     operators: tuple[AbstractOperator, ...]

@@ -56,6 +56,20 @@ class PsfCheck:
       objective at each, relative to the lowest of all.
     - `noise_ratio`: rms of the residual of the best PSF over the noise; near 1 it explains all.
     - `reasons`: one line for each fault; empty if the PSF fits as given.
+
+    ```python
+    import jax.numpy as jnp
+    import numpy as np
+    import thincam_jax as tc
+
+    psfs = tc.Psfs(np.random.default_rng(0).random((1, 13, 13)) ** 6)
+    camera = tc.Recording(np.ones((1, 32, 40)), psfs).problem().operators[0]
+    chart = jnp.zeros(camera.in_shape).at[..., 12:20, 16:26].set(1.0)
+    check = tc.check_psf(tc.Recording(np.asarray(camera(chart))[None], psfs), search=0.02)
+    print(round(check.scale, 2))  # 1.0
+    ```
+
+    **See also**: `check_psf`.
     """
 
     orientation: Orientation
@@ -124,6 +138,20 @@ def check_psf(
 
     **Errors**: ValueError, one line, for recordings without measured PSFs, and numbers out of
     range; TypeError inside jit.
+
+    ```python
+    import jax.numpy as jnp
+    import numpy as np
+    import thincam_jax as tc
+
+    psfs = tc.Psfs(np.random.default_rng(0).random((1, 13, 13)) ** 6)
+    camera = tc.Recording(np.ones((1, 32, 40)), psfs).problem().operators[0]
+    chart = jnp.zeros(camera.in_shape).at[..., 12:20, 16:26].set(1.0)
+    check = tc.check_psf(tc.Recording(np.asarray(camera(chart))[None], psfs), search=0.02)
+    print(check.orientation)  # as given
+    ```
+
+    **See also**: `Psfs`, `fit_psf`.
     """
     if not isinstance(recording.imaging_model, Psfs) or recording.imaging_model.psfs.shape[2] != 1:
         raise ValueError("a check takes measured PSFs of one plane; give a recording with tc.Psfs")

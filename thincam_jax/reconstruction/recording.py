@@ -100,6 +100,17 @@ class Recording(Module):
     - `valid`: mask of the valid pixels, that broadcasts to the captures.
 
     **Errors**: ValueError, one line, for captures that do not fit the imaging model.
+
+    ```python
+    import numpy as np
+    import thincam_jax as tc
+
+    psf = np.random.default_rng(0).random((9, 9))
+    recording = tc.Recording(np.ones((1, 24, 32)), tc.Psfs(psf[None]))
+    result = tc.reconstruct(recording, tc.AdmmTV(iterations=10))
+    ```
+
+    **See also**: `Cameras`, `Psfs`, `reconstruct`.
     """
 
     captures: tuple[Float[Array, "..."], ...]

@@ -104,6 +104,17 @@ class Ridge(AbstractSolver):
       step, root mean square, relative to the right-hand side and the image.
 
     **Errors**: ValueError, one line, for values out of range.
+
+    ```python
+    import numpy as np
+    import thincam_jax as tc
+
+    psf = np.random.default_rng(0).random((9, 9))
+    recording = tc.Recording(np.ones((1, 24, 32)), tc.Psfs(psf[None]))
+    result = tc.reconstruct(recording, tc.Ridge(1.0))
+    ```
+
+    **See also**: `AdmmTV`, `Wiener`.
     """
 
     name: ClassVar[str] = "ridge"

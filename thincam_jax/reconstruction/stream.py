@@ -39,6 +39,18 @@ class Stream(eqx.Module):
 
     **Errors**: ValueError, one line, for steps below 1, a τ given by a rule, or captures of another
     shape than the first.
+
+    ```python
+    import numpy as np
+    import thincam_jax as tc
+
+    psf = np.random.default_rng(0).random((9, 9))
+    recording = tc.Recording(np.ones((1, 24, 32)), tc.Psfs(psf[None]), noise_variance=0.01)
+    stream = tc.Stream(recording, tc.AdmmTV(0.5), steps=4)
+    stream, image = stream.next(np.ones((1, 24, 32)))  # of each capture that follows
+    ```
+
+    **See also**: `AdmmTV`.
     """
 
     recording: Recording

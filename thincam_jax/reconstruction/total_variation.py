@@ -43,6 +43,18 @@ class TotalVariation(AbstractRegulariser):
       channels is averaged in grey, and colours vary less than grey in most scenes.
     - `depth_weight`: δ, the weight of a difference between planes; 0 leaves planes independent.
     - `chroma_weight`: weight of the two colour differences with "opponent".
+
+    ```python
+    import numpy as np
+    import thincam_jax as tc
+
+    psf = np.random.default_rng(0).random((9, 9))
+    recording = tc.Recording(np.ones((1, 3, 24, 32)), tc.Psfs(psf[None, None]))
+    colours = tc.TotalVariation(coupling="joint")  # edges of all channels in one place
+    result = tc.reconstruct(recording, tc.AdmmTV(variation=colours, iterations=10))
+    ```
+
+    **See also**: `AdmmTV`.
     """
 
     # The proximal map of an image takes inner iterations.

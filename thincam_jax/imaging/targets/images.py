@@ -35,6 +35,18 @@ def load_image(path: str | os.PathLike[str]) -> Float64[np.ndarray, "y x *channe
 
     Raises FileNotFoundError if there is no such file; ValueError for a folder, a file that is no
     image or is damaged, an empty image, a stack of several, or values out of range.
+
+    ```python
+    import numpy as np
+    import PIL.Image
+    import thincam_jax as tc
+
+    PIL.Image.fromarray(np.full((2, 3), 51, np.uint8)).save("photo.png")
+    image = tc.load_image("photo.png")
+    print(image.shape, image.max())  # (2, 3) 0.2
+    ```
+
+    **See also**: `ImagePlane`, `read_mask`.
     """
     path = Path(path)
     if path.exists() and not path.is_file():

@@ -88,6 +88,20 @@ class Learned(AbstractSolver):
 
     **Errors**: ValueError, one line, for another camera, a distance outside of what the network
     was trained for, pixels that are not to be trusted, and a field of another size.
+
+    ```python
+    import thincam_jax as tc
+    from thincam_jax.units import um
+
+    from thincam_jax import learn
+
+    mask = tc.FresnelZoneAperture(beta=13.0, width=5.6)
+    thin = tc.LenslessCamera(mask, tc.Sensor((256, 256), 44 * um), distance=7.5)
+    network = learn.load("shipped", thin)
+    solver = tc.Learned(network, output="focus")
+    ```
+
+    **See also**: `reconstruct`.
     """
 
     name: ClassVar[str] = "learned"

@@ -60,6 +60,18 @@ class Selection(Prediction):
       errors are counted from.
     - `reasons`: one sentence for every effect left out, with its size.
     - `considered`: the predictions that the choice was made from, cheapest first.
+
+    ```python
+    import thincam_jax as tc
+    from thincam_jax.units import nm, um
+
+    mask = tc.FresnelZoneAperture(25.0, width=1.6)
+    camera = tc.LenslessCamera(mask, tc.Sensor((24, 32), 50 * um), distance=5.0)
+    choice = tc.select_model(camera, wavelength=500 * nm, object_distance=250.0, tolerance=0.1)
+    print(choice.meets_tolerance)  # True
+    ```
+
+    **See also**: `select_model`.
     """
 
     meets_tolerance: bool
@@ -100,6 +112,18 @@ def select_model(
     `tolerance` > 0. Numbers must be known: call it outside of jit and grad.
 
     **Errors**: ValueError for what is out of range; TypeError for traced numbers.
+
+    ```python
+    import thincam_jax as tc
+    from thincam_jax.units import nm, um
+
+    mask = tc.FresnelZoneAperture(25.0, width=1.6)
+    camera = tc.LenslessCamera(mask, tc.Sensor((24, 32), 50 * um), distance=5.0)
+    choice = tc.select_model(camera, wavelength=500 * nm, object_distance=250.0, tolerance=0.1)
+    h = tc.psf(camera, wavelength=500 * nm, object_distance=250.0, model=choice.method)
+    ```
+
+    **See also**: `predict_error`, `plan`, `psf`.
     """
     tolerance = tolerance_of(tolerance)
     if isinstance(camera, LenslessCamera) and not has_few_terms(camera.mask):
@@ -139,7 +163,20 @@ def predict_error(
     grid: Grid | None = None,
 ) -> Prediction:
     """Predicted error and cost of one model; arguments as for `psf`, reference as for
-    `select_model`."""
+    `select_model`.
+
+    ```python
+    import thincam_jax as tc
+    from thincam_jax.units import nm, um
+
+    mask = tc.FresnelZoneAperture(25.0, width=1.6)
+    camera = tc.LenslessCamera(mask, tc.Sensor((24, 32), 50 * um), distance=5.0)
+    found = tc.predict_error(camera, wavelength=500 * nm, object_distance=250.0, model="geometric")
+    print(found.predicted_error > 0.01)  # True
+    ```
+
+    **See also**: `select_model`.
+    """
     average = as_method(model, pixel_integration).pixel_integration
     probe = probe_of(camera, wavelength, object_distance, average, grid)
     grid = grid or camera.sensor.grid

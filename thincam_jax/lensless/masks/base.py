@@ -28,6 +28,16 @@ class AbstractMask(Module):
     Every mask can be sampled on a grid; that is all that `angular_spectrum` and
     `rayleigh_sommerfeld` ask for. Those that are a sum of products of one factor along y and one
     along x are an `AbstractFactoredMask`, and have an exact PSF by `separable`.
+
+    ```python
+    import thincam_jax as tc
+    from thincam_jax.units import um
+
+    mask = tc.SampledMask([[1.0, 0.0], [0.0, 1.0]], pitch=50 * um)
+    print(mask.sample(tc.Grid((2, 3), 50 * um)).shape)  # (2, 3)
+    ```
+
+    **See also**: `AbstractFactoredMask`, `PhaseMask`.
     """
 
     centre: eqx.AbstractVar[Float[Array, "2"]]
@@ -65,6 +75,16 @@ class AxisFactors(Module):
     - `values`: v_ki.
     - `curvatures`: g_k, rad/mm²; None where every cell is constant.
     - `origins`: o_i, mm; None for zero.
+
+    ```python
+    import jax.numpy as jnp
+    import thincam_jax as tc
+
+    slit = tc.AxisFactors(jnp.array([-0.1, 0.1]), jnp.array([[1.0 + 0.0j]]))  # one open cell
+    terms = tc.MaskTerms(jnp.array([1.0 + 0.0j]), slit, slit)
+    ```
+
+    **See also**: `MaskTerms`.
     """
 
     edges: Float[Array, " edge"]
@@ -114,6 +134,15 @@ class MaskTerms(Module):
 
     - `coefficients`: the c_k.
     - `rows`, `columns`: the R_k and the C_k; one object where both axes have the same.
+
+    ```python
+    import thincam_jax as tc
+
+    terms = tc.Pinhole(0.5).terms()
+    print(len(terms.coefficients))  # 1
+    ```
+
+    **See also**: `AxisFactors`, `AbstractFactoredMask`.
     """
 
     coefficients: Complex[Array, " term"]
@@ -125,6 +154,15 @@ class AbstractFactoredMask(AbstractMask):
     """A mask that is a sum of products of one-dimensional factors: all classical coded apertures.
 
     The field behind it is such a sum too, diffraction included, in closed form.
+
+    ```python
+    import thincam_jax as tc
+
+    mask = tc.Pinhole(0.5, height=0.2)
+    print(mask.terms().coefficients.shape)  # (1,)
+    ```
+
+    **See also**: `MaskTerms`, `AbstractMask`.
     """
 
     exact_model = "separable"

@@ -85,6 +85,16 @@ class SeparableMask(AbstractCellMask):
     - `cell`: side of a cell, mm.
     - `combine`: "product" or "xor".
     - `centre`: (y, x) of the mask's centre, mm.
+
+    ```python
+    import thincam_jax as tc
+    from thincam_jax.units import um
+
+    code = tc.maximum_length_sequence(31)
+    mask = tc.SeparableMask(code, code, cell=30 * um, combine="xor")
+    ```
+
+    **See also**: `maximum_length_sequence`, `separable_operator`.
     """
 
     rows: Float[Array, " row"] = eqx.field(converter=quantity(check=checks.transmittances))
@@ -110,6 +120,14 @@ def maximum_length_sequence(length: int) -> Float[np.ndarray, " length"]:
     The periodic autocorrelation of 2s − 1 is N at zero and −1 elsewhere: its spectrum is flat.
 
     **Errors**: ValueError for another length, with those next to it.
+
+    ```python
+    import thincam_jax as tc
+
+    print(tc.maximum_length_sequence(7))  # [1. 1. 1. 0. 1. 0. 0.]
+    ```
+
+    **See also**: `SeparableMask`.
     """
     register = int(length + 1).bit_length() - 1
     if length != 2**register - 1 or not 2 <= register <= _LONGEST_REGISTER:

@@ -70,6 +70,15 @@ def on_display(mask: AbstractMask, pixel_pitch: Number, fill_factor: Number = 1.
 
     **Errors**: ValueError, one line, for sides that are no whole number of pixels; TypeError where
     the mask or the pitch are traced. Gradients for them go through the `DisplayedMask` itself.
+
+    ```python
+    import thincam_jax as tc
+    from thincam_jax.units import um
+
+    mask = tc.on_display(tc.FresnelZoneAperture(25.0, width=1.44), 36 * um, fill_factor=0.9)
+    ```
+
+    **See also**: `FresnelZoneAperture`.
     """
     pitch = checks.positive("pixel_pitch", pixel_pitch, "mm")
     fill = checks.fraction("fill_factor", fill_factor)

@@ -71,6 +71,17 @@ class FresnelZoneAperture(AbstractFactoredMask):
     - `harmonics`: highest harmonic of the intensity and binary profiles, odd.
 
     **Errors**: ValueError or TypeError, one line, for what is out of range.
+
+    ```python
+    import thincam_jax as tc
+    from thincam_jax.units import nm, um
+
+    mask = tc.FresnelZoneAperture(25.0, width=1.6)
+    camera = tc.LenslessCamera(mask, tc.Sensor((24, 32), 50 * um), distance=5.0)
+    h = tc.psf(camera, wavelength=500 * nm, object_distance=250.0)
+    ```
+
+    **See also**: `LenslessCamera`, `psf`, `on_display`.
     """
 
     beta: Float[Array, ""] = eqx.field(converter=quantity("rad/mm^2", positive=True))

@@ -26,6 +26,17 @@ class LensletArray(AbstractFactoredMask):
     - `pitch`: side of a lens, mm.
     - `shape`: lenses (down, across).
     - `centre`: (y, x) of the array's centre, mm.
+
+    ```python
+    import thincam_jax as tc
+    from thincam_jax.units import nm, um
+
+    mask = tc.LensletArray(focal_length=5.0, pitch=0.5, shape=(2, 3))
+    camera = tc.LenslessCamera(mask, tc.Sensor((24, 32), 50 * um), distance=5.0)
+    h = tc.psf(camera, wavelength=500 * nm)
+    ```
+
+    **See also**: `voronoi_fresnel`.
     """
 
     focal_length: Float[Array, ""] = eqx.field(converter=quantity("mm", positive=True))

@@ -78,6 +78,18 @@ class PhaseMask(AbstractMask):
     the others (`thincam_jax.lensless.sampling.require_phase_sampling`).
 
     **Errors**: ValueError or TypeError, one line, for what is out of range.
+
+    ```python
+    import thincam_jax as tc
+    from thincam_jax.units import um
+
+    import numpy as np
+
+    steps = np.tile([0.0, 0.5e-3], (24, 16))  # heights, mm
+    mask = tc.PhaseMask(steps, pitch=10 * um, material=1.5)
+    ```
+
+    **See also**: `MaskBlank`, `diffuser`, `voronoi_fresnel`.
     """
 
     height: Float[Array, "y x"] = eqx.field(converter=quantity("mm", check=_HEIGHT))
@@ -167,6 +179,16 @@ class MaskBlank(Module):
 
     - `shape`: (rows, columns) of cells. `pitch`: of the cells, mm.
     - `material`: refractive index, a number or one of `thincam_jax.imaging.refractive_index`.
+
+    ```python
+    import thincam_jax as tc
+    from thincam_jax.units import um
+
+    blank = tc.MaskBlank((24, 32), pitch=10 * um, material=1.5)
+    mask = tc.diffuser(0, blank, correlation_length=50 * um, rms_slope=0.03)
+    ```
+
+    **See also**: `PhaseMask`, `diffuser`.
     """
 
     shape: tuple[int, int] = eqx.field(converter=quantity(check=checks.shape2d), static=True)

@@ -28,6 +28,16 @@ class Pinhole(AbstractFactoredMask):
     - `width`: side, mm; of a rectangle that along x.
     - `height`: side of a rectangle along y, mm; None for a square.
     - `centre`: (y, x) of the opening's centre, mm.
+
+    ```python
+    import thincam_jax as tc
+    from thincam_jax.units import nm, um
+
+    camera = tc.LenslessCamera(tc.Pinhole(0.5), tc.Sensor((24, 32), 50 * um), distance=5.0)
+    h = tc.psf(camera, wavelength=500 * nm)
+    ```
+
+    **See also**: `RadialMask`.
     """
 
     width: Float[Array, ""] = eqx.field(converter=quantity("mm", positive=True))
@@ -67,6 +77,14 @@ class RadialMask(AbstractMask):
     - `rings`: amplitude transmittance of each ring, 0 to 1, from the middle outwards.
     - `ring`: width of a ring, mm; or of each, from the middle outwards.
     - `centre`: (y, x) of the mask's centre, mm.
+
+    ```python
+    import thincam_jax as tc
+
+    mask = tc.RadialMask([1, 0, 1], ring=0.1)  # open to 0.1 mm and from 0.2 to 0.3 mm
+    ```
+
+    **See also**: `Pinhole`.
     """
 
     rings: Float[Array, " ring"] = eqx.field(converter=quantity(check=checks.transmittances))

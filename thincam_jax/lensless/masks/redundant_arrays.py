@@ -107,6 +107,17 @@ class ModifiedUniformlyRedundantArray(AbstractRedundantArray):
     - `centre`: (y, x) of the mask's centre, mm.
 
     **Errors**: ValueError for a number that is no such prime, with the nearest two.
+
+    ```python
+    import thincam_jax as tc
+    from thincam_jax.units import nm, um
+
+    mask = tc.ModifiedUniformlyRedundantArray(13, cell=60 * um)
+    camera = tc.LenslessCamera(mask, tc.Sensor((24, 32), 50 * um), distance=2.0)
+    h = tc.psf(camera, wavelength=500 * nm)
+    ```
+
+    **See also**: `UniformlyRedundantArray`.
     """
 
     order: int = eqx.field(converter=quantity(check=_prime_order), static=True)
@@ -134,6 +145,15 @@ class UniformlyRedundantArray(AbstractRedundantArray):
     **Arguments**: as of `ModifiedUniformlyRedundantArray`, with `orders` = (r, s).
 
     **Errors**: ValueError for orders that are no twin primes, with the nearest that are.
+
+    ```python
+    import thincam_jax as tc
+    from thincam_jax.units import um
+
+    mask = tc.UniformlyRedundantArray((13, 11), cell=60 * um)
+    ```
+
+    **See also**: `ModifiedUniformlyRedundantArray`.
     """
 
     orders: tuple[int, int] = eqx.field(converter=quantity(check=_twin_primes), static=True)

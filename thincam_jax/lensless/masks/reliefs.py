@@ -32,6 +32,17 @@ def diffuser(
     - `key`: of `jax.random`, or a seed.
     - `correlation_length`: ℓ, mm, at least two cells.
     - `rms_slope`: s along an axis, dimensionless. The lowest height is 0.
+
+    ```python
+    import thincam_jax as tc
+    from thincam_jax.units import um
+
+    blank = tc.MaskBlank((24, 32), pitch=10 * um, material=1.5)
+    mask = tc.diffuser(0, blank, correlation_length=50 * um, rms_slope=0.03)
+    print(mask.height.shape)  # (24, 32)
+    ```
+
+    **See also**: `PhaseMask`, `voronoi_fresnel`.
     """
     length = checks.positive("correlation_length", correlation_length, "mm")
     slope = checks.positive("rms_slope", rms_slope, "a ratio")
@@ -78,6 +89,16 @@ def voronoi_fresnel(
 
     **Sampling.** The rim of a lens turns the phase by r/(λf) cycles/mm, which the cells hold up to
     1/(2 pitch): lenses that reach farther are refused.
+
+    ```python
+    import thincam_jax as tc
+    from thincam_jax.units import nm, um
+
+    blank = tc.MaskBlank((24, 32), pitch=10 * um, material=1.5)
+    mask = tc.voronoi_fresnel(0, blank, sites=3, focal_length=6.0, wavelength=550 * nm)
+    ```
+
+    **See also**: `PhaseMask`, `LensletArray`.
     """
     if not 1 <= sites <= blank.shape[0] * blank.shape[1]:
         raise ValueError(f"sites = {sites}; give 1 to the number of cells of the blank")

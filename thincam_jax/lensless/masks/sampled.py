@@ -50,6 +50,17 @@ class SampledMask(AbstractFactoredMask):
     - `pitch`: side of a cell, mm.
     - `centre`: (y, x) of the mask's centre, mm.
     - `fill_factor`: part of a cell's area that is open, in its middle; None for all of it.
+
+    ```python
+    import thincam_jax as tc
+    from thincam_jax.units import nm, um
+
+    mask = tc.SampledMask([[1.0, 0.0, 1.0], [0.0, 1.0, 0.5]], pitch=100 * um)
+    camera = tc.LenslessCamera(mask, tc.Sensor((24, 32), 50 * um), distance=5.0)
+    h = tc.psf(camera, wavelength=500 * nm)
+    ```
+
+    **See also**: `random_cells`, `read_mask`.
     """
 
     amplitude: Transmittance = eqx.field(converter=_amplitudes)
@@ -126,6 +137,16 @@ def random_cells(
 
     `width`, `height` (mm; None for a square) are whole numbers of cells; `open_fraction` is the
     chance of a cell to be open. `key`: of `jax.random`, or a seed.
+
+    ```python
+    import thincam_jax as tc
+    from thincam_jax.units import um
+
+    mask = tc.random_cells(0, width=0.6, cell=30 * um)
+    print(mask.amplitude.shape)  # (20, 20)
+    ```
+
+    **See also**: `SampledMask`.
     """
     columns = checks.whole_cells("width", width, "cell", cell)
     rows = columns if height is None else checks.whole_cells("height", height, "cell", cell)
@@ -142,6 +163,17 @@ def read_mask(path: str | os.PathLike[str], cell: Number) -> SampledMask:
 
     **Errors**: FileNotFoundError; ValueError, one line, for a file that is no image, for one with
     colours and for one that lets no light pass.
+
+    ```python
+    import numpy as np
+    import PIL.Image
+    import thincam_jax as tc
+
+    PIL.Image.fromarray(np.eye(20, dtype=np.uint8) * 255).save("mask.png")
+    mask = tc.read_mask("mask.png", 0.03)  # cells of 30 µm
+    ```
+
+    **See also**: `SampledMask`, `load_image`.
     """
     # Here: a camera waits for no library that reads files.
     from thincam_jax.imaging.targets.images import load_image

@@ -40,6 +40,19 @@ def plan(camera: LenslessCamera, scene: Scene, *, tolerance: float) -> Plan:
     their sizes.
 
     **Errors**: ValueError for a tolerance that is not positive; TypeError for traced numbers.
+
+    ```python
+    import thincam_jax as tc
+    from thincam_jax.units import nm, um
+
+    mask = tc.FresnelZoneAperture(25.0, width=1.6)
+    camera = tc.LenslessCamera(mask, tc.Sensor((24, 32), 50 * um), distance=5.0)
+    planes = [tc.ImagePlane([[0.0, 1.0]], d, width=0.2 * d) for d in (200.0, 210.0)]
+    plan = tc.plan(camera, tc.Scene(planes, 500 * nm), tolerance=0.05)
+    print(plan.predicted_error < 0.05)  # True
+    ```
+
+    **See also**: `select_model`, `capture`.
     """
     tolerance = tolerance_of(tolerance)
     if any(checks.is_traced(leaf) for leaf in jax.tree.leaves((camera, scene))):

@@ -162,6 +162,20 @@ def fit_psf(
     **Errors**: ValueError or TypeError, one line, for an image that is not finite, has no contrast
     or another shape than the sensor, a sensor that holds less than one fringe, unknown parameters
     and another mask.
+
+    ```python
+    import thincam_jax as tc
+    from thincam_jax.units import nm, um
+
+    mask, sensor = tc.FresnelZoneAperture(30.0, width=2.0), tc.Sensor((112, 133), 20 * um)
+    true, nominal = (tc.LenslessCamera(mask, sensor, d) for d in (3.1, 3.0))
+    light = {"wavelength": 500 * nm, "object_distance": 100.0}
+    image = tc.psf(true, pixel_integration=True, **light)
+    fit = tc.fit_psf(image, nominal, **light)
+    print(fit.status, round(float(fit.values["distance"]), 2))  # ok 3.1
+    ```
+
+    **See also**: `check_psf`.
     """
     synthesis = _check_weights(psf_image, weights)
     if synthesis is not None and not np.any(np.abs(synthesis.weights.sum(axis=1)) > 1e-6):

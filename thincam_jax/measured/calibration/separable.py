@@ -66,6 +66,18 @@ def calibrate_separable(
     two terms.
 
     **Errors**: ValueError for captures that are no stacks of one size, or are dark.
+
+    ```python
+    import numpy as np
+    import thincam_jax as tc
+
+    P, Q = np.random.default_rng(0).normal(size=(2, 6, 4))
+    rows = np.stack([np.outer(p, Q.sum(axis=1)) for p in P.T])  # captures of lit rows
+    columns = np.stack([np.outer(P.sum(axis=1), q) for q in Q.T])
+    fit = tc.calibrate_separable(rows, columns)
+    ```
+
+    **See also**: `fit_separable`, `separable_operator`.
     """
     checks.choice("shown", shown, get_args(Shown))
     stacks = [np.asarray(stack) for stack in (rows, columns)]
@@ -131,6 +143,20 @@ def fit_separable(
       to the captures.
 
     **Errors**: ValueError for numbers and sizes that do not fit.
+
+    ```python
+    import jax.numpy as jnp
+    import numpy as np
+    import thincam_jax as tc
+    from thincam_jax.imaging.operators import Separable
+
+    rng = np.random.default_rng(0)
+    truth = Separable(rng.normal(size=(6, 3)), rng.normal(size=(5, 4)))
+    images = jnp.asarray(rng.random((8, 3, 4)))
+    fit = tc.fit_separable(images, truth(images), Separable(1.1 * truth.left, truth.right))
+    ```
+
+    **See also**: `calibrate_separable`.
     """
     images, captures = jnp.asarray(images), jnp.asarray(captures)
     expected = (len(images), *start.in_shape), (len(images), *start.out_shape)
