@@ -40,12 +40,11 @@ sensor = tc.Sensor((440 // binned, 440 // binned), 4.8 * um * binned)
 hologram = wg.VolumeHologram.record(
     532 * nm, 0.0, 61.2 * deg, index=1.5, thickness=16 * um, index_modulation=0.02
 )
-top = wg.Rectangle((0.0, 0.0), (50.0, 20.0))
-bottom = wg.Rectangle((0.0, 25.0), (50.0, 50.0))
+places = wg.Rectangle((0.0, 0.0), (50.0, 20.0)), wg.Rectangle((0.0, 25.0), (50.0, 50.0))
 
 
 def see_through(glass=5.0):
-    return wg.SeeThroughCamera(wg.Screen(hologram, glass, 1.5, top, bottom), sensor, 6.0, 10.0)
+    return wg.SeeThroughCamera(wg.Screen(hologram, glass, 1.5, *places), sensor, 6.0, 10.0)
 
 
 camera = see_through()
