@@ -9,7 +9,7 @@ from studies import tiny
 import thincam_jax as tc
 from thincam_jax.imaging.targets import usaf1951
 from thincam_jax.imaging.targets.usaf import usaf1951_elements
-from thincam_jax.plot.studies import _by_synthesis, _detail, _pairs_of_axes, draw_responses
+from thincam_jax.plot.studies import _by_synthesis, _pairs_of_axes, draw_responses, enlarged_part
 from thincam_jax.studies import Limits, Response
 
 
@@ -37,15 +37,15 @@ def test_the_detail_of_a_chart_holds_its_fine_groups():
     """All sets of its second layer and none of the first, whose bars are four times as wide."""
     chart, picture = tiny.study().targets
     image = usaf1951((320, 320))
-    fine, label = _detail(image, chart)
+    fine, label = enlarged_part(image, chart)
     assert label == "fine groups, 20 mm"
     sets = [e for e in usaf1951_elements() if e.group in (0, 1)]
     assert {abs(np.subtract(e.centre, (-2.5 / 32, 2.25 / 32))).max() < 0.12 for e in sets} == {True}
     np.testing.assert_allclose(fine.sum(), usaf1951((320, 320))[95:175, 143:223].sum(), rtol=0.1)
-    assert _detail(image, picture)[1] == "middle 27 mm"
+    assert enlarged_part(image, picture)[1] == "middle 27 mm"
 
 
-def test_panels_of_transfer_functions_share_a_scale_and_show_limits():
+def test_panels_of_transfer_functions_share_frequencies_and_show_limits():
     study = tiny.study()
     limits = Limits(None, None, 9.0, 3.7)
     found = {
@@ -53,7 +53,9 @@ def test_panels_of_transfer_functions_share_a_scale_and_show_limits():
         for n, m in enumerate(study.methods)
     }
     panels = draw_responses(study, found).axes
-    assert len({ax.get_ylim() for ax in panels}) == len({ax.get_xlim() for ax in panels}) == 1
+    assert {ax.get_xlim() for ax in panels} == {(0, 1.3 * 10.8)}  # of the published limit
+    # From 0 to 1, or to the largest where that is above 1.
+    assert [ax.get_ylim()[1] > 1.05 for ax in panels] == [True, False]
     first, second = ([t.get_text() for t in ax.get_legend().get_texts()] for ax in panels)
     assert first == ["cut-off 9.0", "Nyquist 12.5", "published limit 10.8"]
     assert second == ["cut-off 9.0", "Nyquist 12.5"]

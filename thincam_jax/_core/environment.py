@@ -1,11 +1,14 @@
 """The installation: versions, devices, and whether the compiler computes right."""
 
 import contextlib
+import datetime
 import os
 import platform
+import subprocess
 import sys
 from collections.abc import Iterable
 from importlib import metadata
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -41,8 +44,21 @@ def environment(seconds: float | None = None) -> dict[str, Any]:
         "precision": str(jnp.zeros(()).dtype),
         "versions": versions,
         "command": ["thincam", *sys.argv[1:]],
+        "date": datetime.datetime.now().astimezone().isoformat(" ", "minutes"),
+        "commit": _commit(),
         "seconds": None if seconds is None else round(seconds, 1),
     }
+
+
+def _commit() -> str | None:
+    """Of the checkout that the package is run from; None of one that was installed."""
+    root = Path(__file__).parents[2]
+    if not (root / ".git").exists():
+        return None
+    with contextlib.suppress(OSError, subprocess.SubprocessError):
+        asked = ["git", "-C", str(root), "rev-parse", "--short", "HEAD"]
+        return subprocess.run(asked, capture_output=True, text=True, check=True).stdout.strip()
+    return None
 
 
 def machine() -> dict[str, Any]:

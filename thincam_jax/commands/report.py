@@ -1,13 +1,17 @@
 """What a report shows: texts, tables and figures in parts, the same for pages and terminals."""
 
 import base64
+import io
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import jinja2
+import PIL.Image
 
 from thincam_jax._core.files import read_regular
 from thincam_jax._core.table import Table
@@ -20,7 +24,9 @@ from thincam_jax.commands.sections import CamerasConfig
 class Picture:
     """A picture of the run's folder; one that was not drawn is left out.
 
-    - `file`: its name among the figures.
+    The page holds a small copy, with a link to the file; one that is folded it only links to.
+
+    - `file`: its path from the folder of figures.
     - `alt`: what it shows, for who cannot see it. `caption`: stands below.
     - `folded`: a line under which it is hidden until it is opened.
     """
@@ -32,13 +38,20 @@ class Picture:
 
 
 @dataclass(frozen=True)
+class Gallery:
+    """Pictures beside each other, each above its caption; as many in a row as the page is wide."""
+
+    pictures: Sequence[Picture]
+
+
+@dataclass(frozen=True)
 class Sentences:
     """Sentences set as a list."""
 
     lines: Sequence[str]
 
 
-Content = str | Table | Picture | Sentences
+Content = str | Table | Picture | Gallery | Sentences
 
 
 @dataclass(frozen=True)
@@ -60,12 +73,15 @@ class Page:
     """A report: what stands before the first part, the parts, and the command that made it.
 
     Between back quotes texts are code; empty texts, tables and parts are left out.
+
+    - `result`: the main result in a sentence, which stands first.
     """
 
     lead: Sequence[Content]
     parts: Sequence[Part] = ()
     command: str = "run"
     warnings: Sequence[str] = ()
+    result: str = ""
 
 
 def pixels_of(sensor: Any) -> str:
@@ -85,10 +101,12 @@ def optics_of(config: CamerasConfig) -> str:
     return f"{light}{noise}, seed {config.seed}."
 
 
-def render_report(page: Page, config: Any, pictures: Path, environment: dict[str, Any]) -> str:
+def render_report(
+    page: Page, config: Any, folder: Path, environment: dict[str, Any], figures: str = "figures"
+) -> str:
     """A page as HTML, with the experiment's configuration and how it was computed at its end.
 
-    - `pictures`: the folder of its figures.
+    - `folder`: that of the page, and `figures`: that of its figures therein.
     - `environment`: of the run, as `_core.environment.environment` gives it.
 
     Texts are escaped; a name that is missing is an error.
@@ -100,16 +118,19 @@ def render_report(page: Page, config: Any, pictures: Path, environment: dict[str
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    kinds = {Table: "table", Picture: "picture", Sentences: "sentences", str: "text"}
+    kinds = {Table: "table", Picture: "picture", Gallery: "gallery", Sentences: "sentences"}
 
-    def picture(name: str) -> str | None:
-        return data_url(pictures / name) if (pictures / name).exists() else None
+    def address(picture: Picture) -> str | None:
+        """Of the file, from the page; None where it was not drawn."""
+        path = os.path.normpath(Path(figures) / picture.file)
+        return quote(path) if (folder / path).exists() else None
 
     return engine.get_template("report.html.jinja").render(
-        kind_of=lambda content: kinds[type(content)],
+        kind_of=lambda content: kinds.get(type(content), "text"),
         page=page,
         parts=[part for part in page.parts if any(part.contents)],
-        picture=picture,
+        address=address,
+        copy=lambda picture, width: small_copy(folder / figures / picture.file, width),
         config=config,
         yaml=dump_config(config),
         environment=environment,
@@ -120,7 +141,13 @@ def _template(name: str) -> str:
     return resources.files("thincam_jax.commands").joinpath(name).read_text(encoding="utf-8")
 
 
-def data_url(picture: Path) -> str:
-    """An image file as an address that holds it; its suffix is its kind."""
-    content = base64.b64encode(read_regular(picture)).decode("ascii")
-    return f"data:image/{picture.suffix[1:]};base64,{content}"
+def small_copy(picture: Path, width: int) -> str:
+    """A picture of at most so many columns, as an address that holds it: WebP."""
+    content = read_regular(picture)
+    with PIL.Image.open(io.BytesIO(content)) as image:
+        if not getattr(image, "is_animated", False):
+            image.thumbnail((width, 4 * width))
+            content = io.BytesIO()
+            image.save(content, format="WebP", quality=85)
+            content = content.getvalue()
+    return f"data:image/webp;base64,{base64.b64encode(content).decode('ascii')}"

@@ -151,8 +151,8 @@ class RunFolder:
         """Write what surrounds the run, its page, and its result, last."""
         surroundings = environment(time.time() - started)
         self.write("environment.json", to_json({**surroundings, "seed": config.seed}))
-        pictures = self.path / self.pictures
-        self.write("report.html", render_report(page, config, pictures, surroundings))
+        content = render_report(page, config, self.path, surroundings, self.pictures)
+        self.write("report.html", content)
         self.write(self.result, to_json(metrics))
 
 

@@ -52,7 +52,7 @@ _LATTICE = (
 
 
 class AccuracyWarning(UserWarning):
-    """A default trades accuracy for time."""
+    """A default trades accuracy for time, or planes of an image cannot be told apart."""
 
 
 def has_few_terms(mask: AbstractMask) -> TypeGuard[AbstractFactoredMask]:

@@ -48,13 +48,15 @@ def draw_found(
     """
     truth = truth_of(evaluations)
     panels = [("scene", truth, "")]
-    panels += [(name, one.image, _caption(one)) for name, one in evaluations.items()]
+    panels += [
+        (name, one.image, one.scores.words.replace("; ", "\n")) for name, one in evaluations.items()
+    ]
     first, aspect = int(with_capture), truth.shape[0] / truth.shape[1]
     drawn, wholes, details = _pairs_of_axes(first + len(panels), aspect, figure)
     axes = zip(wholes[first:], details[first:], panels, strict=True)
     for ax, detail, (name, image, caption) in axes:
         _show(ax, image, f"{name}\n{caption}" if caption else name)
-        part, label = _detail(image, target)
+        part, label = enlarged_part(image, target)
         _show(detail, part, "")
         detail.set_xlabel(label, fontsize=9)
     return drawn, wholes[0], details[0]
@@ -90,15 +92,6 @@ def _pairs_of_axes(count: int, aspect: float, figure: Figure | None = None) -> A
     return figure, wholes[:count], details[:count]
 
 
-def _caption(evaluation: Evaluation) -> str:
-    scores = evaluation.scores
-    exact = scores.psnr_db is None
-    text = "exact" if exact else f"{scores.psnr_db:.1f} dB, SSIM {scores.ssim:.2f}"
-    if scores.resolved is not None:
-        text += f"\nresolves {scores.resolved.object_mm:.2f} mm"
-    return text
-
-
 def _show(ax, image: np.ndarray, title: str) -> None:
     ax.imshow(np.clip(image, 0, 1), cmap="gray", vmin=0, vmax=1, interpolation="nearest")
     if title:
@@ -118,7 +111,7 @@ def _show_detail_of_capture(ax, raw: np.ndarray, study: Study) -> None:
 _FINE = (-2.5 / 32, 2.25 / 32, 8 / 32)
 
 
-def _detail(image: np.ndarray, target: Target) -> tuple[np.ndarray, str]:
+def enlarged_part(image: np.ndarray, target: Target) -> tuple[np.ndarray, str]:
     """The part of a picture that is enlarged, and what it is."""
     if target.kind != "usaf1951":
         return _middle(image), f"middle {target.width / 3:.0f} mm"
@@ -141,9 +134,9 @@ def _middle(image: np.ndarray) -> np.ndarray:
 def draw_responses(
     study: Study, responses: Mapping[str, Response], figure: Figure | None = None
 ) -> Figure:
-    """Transfer functions of all methods on one scale; methods of one synthesis share a panel.
+    """Transfer functions of all methods over one axis; methods of one synthesis share a panel.
 
-    With their limits, those that are published, and the pixels' Nyquist frequency.
+    With their limits and those that are published, to a third beyond the highest.
     """
     published = {m.name: m.published.limit_cycles_per_mm for m in study.methods}
     nyquist = 0.5 / study.pitch
@@ -151,24 +144,27 @@ def draw_responses(
     size = (8.5, 2.1 * len(panels) + 0.8)
     drawn, axes = drawing(size, len(panels), 1, figure=figure, sharex=True)
     axes = np.atleast_1d(axes)
-    end = 1.08 * max(nyquist, *(limit or 0 for limit in published.values()))
+    known = [r.limits.cut_off_cycles_per_mm for _, r in panels]
+    end = 1.3 * max(limit or 0 for limit in (*known, *published.values()))
+    end = end or 1.08 * nyquist
     levels = [r.magnitude[1:] / low_frequency_value(r.frequency, r.magnitude) for _, r in panels]
-    top = 1.05 * max(1.3, *(float(level.max()) for level in levels))
     for index, (ax, (name, response)) in enumerate(zip(axes, panels, strict=True)):
         style = line_style(index) | {"marker": "", "linestyle": "-"}
         ax.plot(response.frequency[1:], levels[index], linewidth=1.1, **style)
-        ax.axvspan(nyquist, end, color="#d8d8d8", linewidth=0)
+        ax.axvspan(min(nyquist, end), end, color="#d8d8d8", linewidth=0)
         limits = response.limits
         zero, cut = limits.first_zero_cycles_per_mm, limits.cut_off_cycles_per_mm
         stated = {limit for own in name.split("; ") if (limit := published.get(own))}
-        marks = [("first zero", zero, ":"), ("cut-off", cut, "--"), ("Nyquist", nyquist, "-")]
+        marks = [("first zero", zero, ":"), ("cut-off", cut, "--")]
+        marks += [("Nyquist", nyquist, "-")] if nyquist < end else []
         marks += [("published limit", limit, "-.") for limit in sorted(stated)]
         for what, at, dash in marks:
             if at is not None:
                 label = f"{what} {at:.1f}"
                 ax.axvline(at, color="black", linestyle=dash, linewidth=1, label=label)
         ax.legend(fontsize=8, loc="upper right", framealpha=0.9)
-        ax.set(xlim=(0, end), ylim=(0, top), ylabel="relative MTF")
+        top = max(1.0, float(levels[index][response.frequency[1:] < end].max()))
+        ax.set(xlim=(0, end), ylim=(0, 1.05 * top), ylabel="relative MTF")
         ax.set_title(name, fontsize=10, loc="left")
     axes[-1].set_xlabel("spatial frequency u on the reference sensor plane (cycles/mm), v = 0")
     return drawn

@@ -17,8 +17,9 @@ from thincam_jax._core.grids import block_sum
 from thincam_jax.reconstruction.imaging_model import Psfs
 from thincam_jax.reconstruction.iterate import Schedule, iterate
 from thincam_jax.reconstruction.parallel import in_parallel
-from thincam_jax.reconstruction.problem import InverseProblem, objective, residuals
+from thincam_jax.reconstruction.problem import InverseProblem, forward, objective, residuals
 from thincam_jax.reconstruction.recording import Recording
+from thincam_jax.reconstruction.regularisers import Image
 from thincam_jax.reconstruction.solver import first_image
 from thincam_jax.reconstruction.splittings import admm_method
 
@@ -35,14 +36,15 @@ Orientation = Literal[
 ORIENTATIONS: tuple[Orientation, ...] = Orientation.__args__  # type: ignore[attr-defined]
 
 _ITERATIONS = 50
-_BLOCKS = 8  # along the longer side, for the bootstrap of the misfit
-_RESAMPLED = 200
+_BLOCKS = 8  # along the longer side; the misfit of different blocks is independent
 _RINGS = 32  # of spatial frequency, per cycle/pixel
 # Of the change of sharpness by a scale that is taken back. Without, wrong PSFs win by being sharper
 # (scales 0.2 to 0.7 % off over random cameras); all of it errs as far to the other side.
 _SHARE = 0.5
-_LEAST_SCALE = 0.3  # pixels at the middle of the longer edges
-_SIGNIFICANCE = 4.0  # standard errors
+# Standard error at the least, of the change of scale at which the PSF's detail is another's.
+_LEAST_ERROR = 0.007
+_SIGNIFICANCE = 3.0  # standard errors
+_TOLD = 0.01  # width of an interval of scales up to which a PSF is called the best
 _LEAST_GAIN = 0.02  # of the objective, for another orientation
 
 
@@ -85,20 +87,30 @@ class PsfCheck:
         """Whether no other scale or orientation fits better."""
         return not self.reasons
 
+    @property
+    def interval(self) -> tuple[float, float]:
+        """The scales that fit, with a probability of 95 %: two standard errors to either side."""
+        return self.scale - 2 * self.scale_error, self.scale + 2 * self.scale_error
+
     def __str__(self) -> str:
         """Residual and scale, and a line for each fault."""
         scale = f"best scale {self.scale:.4f} ± {self.scale_error:.4f}"
         faults = [f"your PSF is wrong: {reason}" for reason in self.reasons]
         first = f"residual {self.noise_ratio:.2f} times the noise, {scale}"
-        return "\n".join([first, *(faults or ["your PSF fits best as it is"])])
+        low, high = min(1.0, self.interval[0]), max(1.0, self.interval[1])
+        fits = "your PSF fits best as it is"
+        if high - low > _TOLD:
+            fits = f"your PSF fits; from {low:.3f} to {high:.3f} times its size, it cannot be told"
+        return "\n".join([first, *(faults or [fits])])
 
 
 @dataclass(frozen=True, eq=False)
 class _Tried:
-    """A PSF tried: the lowest objective, and ½ w r² summed over blocks of pixels."""
+    """A PSF tried: the lowest objective, ½ w r² summed over blocks of pixels, and the image."""
 
     objective: float
     misfits: np.ndarray
+    image: Image
 
 
 @checked
@@ -118,11 +130,17 @@ def check_psf(
 
     A wrong PSF explains a capture nearly as well as the right one, by an image full of artefacts:
     the residual alone is 1 to 2 times as large. J includes the artefacts. The eight orientations
-    are tried first, then scales of the best one, in steps of half a pixel at the edge; s is at the
-    minimum of the parabola through them, with a standard error by bootstrap over blocks of pixels.
-    A scale is reported wrong if it is off by more than four standard errors and 0.3 pixels at the
-    edge, an orientation if the misfits of the blocks agree by four standard errors and J falls by
-    2 %. A symmetric PSF has no wrong orientation.
+    are tried first, then scales of the best one, in steps of a pixel at the edge; s is at the
+    minimum of the parabola through them. Its standard error is that of an estimate whose model is
+    wrong (White, Econometrica 50, 1, 1982), so that it grows with the misfit found: with b blocks
+
+    .. math:: \sigma_s = \Big(\sum_b (q_b - \bar q)^2\Big)^{1/2} \Big/ J''(s), \qquad
+        q_b = \sum_b w\,r\,(\partial_s h_s * f),
+
+    and at least 0.007 of the scale's change that makes the PSF another, ‖h‖/‖∂h/∂s‖. A scale is
+    reported wrong if it is off by more than three standard errors, an orientation if the misfits of
+    the blocks agree by three standard errors and J falls by 2 %. A symmetric PSF has no wrong
+    orientation.
 
     **Not detected**: a shifted PSF, which shifts the image and fits as well; blur, or a scale
     more than `search` away; and the scale with a quarter turn if the sensor is not square, since
@@ -187,8 +205,32 @@ def check_psf(
     lowest = min(profile, key=lambda s: profile[s].objective)
     for scale in (lowest - pixel / 2, lowest + pixel / 2):
         profile[scale] = tried(turned[best], scale)
-    whole = best % 2 == 0 or shape[0] == shape[1]
-    return _judged(ORIENTATIONS[best], profile, pixel, try_psf.pixels, whole)
+    lowest = min(profile, key=lambda s: profile[s].objective)
+    around = [_scaled(turned[best], lowest + k * pixel / 2) for k in (-1, 0, 1)]
+    slopes = try_psf.slopes(profile[lowest].image, around, pixel)
+    change = np.linalg.norm(around[2] - around[0]) / pixel
+    least = _LEAST_ERROR * float(np.linalg.norm(around[1]) / change) if change > 0 else np.inf
+    scales = np.array(sorted(profile))
+    objectives = np.array([profile[s].objective for s in scales])
+    near = np.abs(scales - lowest) < 1.1 * pixel
+    scale, curvature = _vertex(scales[near], objectives[near])
+    spread = math.sqrt(slopes.size) * float(np.std(slopes))
+    error = math.hypot(spread / curvature, least) if curvature > 0 else np.inf
+    whole = best % 2 == 0 or shape[0] == shape[1]  # nothing of the PSF was cropped to turn it
+    reasons = [f"it fits better {ORIENTATIONS[best]}"] if best else []
+    if lowest in (scales[0], scales[-1]) and whole:
+        reasons.append(f"it fits better at {scale:.4f} times its size, or beyond: search farther")
+    elif whole and abs(scale - 1) > _SIGNIFICANCE * error:
+        reasons.append(f"it fits better at {scale:.4f} ± {error:.4f} times its size")
+    return PsfCheck(
+        ORIENTATIONS[best],
+        scale,
+        error,
+        tuple(scales.tolist()),
+        tuple((objectives / objectives.min()).tolist()),
+        math.sqrt(2 * profile[lowest].misfits.sum() / try_psf.pixels),
+        tuple(reasons),
+    )
 
 
 class _Trial:
@@ -203,27 +245,33 @@ class _Trial:
         self.block = max(4, max(recording.captures[0].shape[-2:]) // _BLOCKS)
 
     def __call__(self, psf: np.ndarray) -> _Tried:
-        model = self.recording.imaging_model
-        assert isinstance(model, Psfs)
-        tried = replace(self.recording, imaging_model=replace(model, psfs=psf))
-        problem = tried.problem(tau=self.tau)
-        problem = eqx.tree_at(
-            lambda p: (p.weights, p.tau_unit), problem, (self.weights, self.tau_unit)
-        )
+        problem = self._problem(psf)
         outcome = iterate(
             in_parallel(problem, admm_method),
             first_image(problem, None, uniform=False),
             Schedule(_ITERATIONS, 1e-6, adapt_until=_ITERATIONS // 2),
         )
-        return _Tried(*_values(problem, outcome.image, self.block))
+        found, misfits = _parts(problem, outcome.image)
+        return _Tried(float(found), self._blocks(misfits), outcome.image)
 
+    def slopes(self, image: Image, psfs: list[np.ndarray], step: float) -> np.ndarray:
+        """∂J/∂s of each block, of three PSFs of which the outer ones differ by `step`."""
+        return self._blocks(_slopes([self._problem(psf) for psf in psfs], image) / step)
 
-def _values(problem: InverseProblem, image, block: int):
-    found, misfits = _parts(problem, image)
-    rows, columns = (-(-n // block) * block for n in misfits.shape)
-    padded = np.zeros((rows, columns))
-    padded[: misfits.shape[0], : misfits.shape[1]] = misfits
-    return float(found), block_sum(padded, block).ravel()
+    def _problem(self, psf: np.ndarray) -> InverseProblem:
+        model = self.recording.imaging_model
+        assert isinstance(model, Psfs)
+        tried = replace(self.recording, imaging_model=replace(model, psfs=psf))
+        problem = tried.problem(tau=self.tau)
+        return eqx.tree_at(
+            lambda p: (p.weights, p.tau_unit), problem, (self.weights, self.tau_unit)
+        )
+
+    def _blocks(self, values) -> np.ndarray:
+        rows, columns = (-(-n // self.block) * self.block for n in values.shape)
+        padded = np.zeros((rows, columns))
+        padded[: values.shape[0], : values.shape[1]] = values
+        return block_sum(padded, self.block).ravel()
 
 
 @eqx.filter_jit
@@ -231,8 +279,20 @@ def _parts(problem: InverseProblem, image):
     """The objective, and ½ w r² of each pixel, summed over captures and channels."""
     missing = residuals(problem, image)
     squares = [w * r**2 / 2 for w, r in zip(problem.weights, missing, strict=True)]
-    each = [jnp.sum(s.reshape(-1, *s.shape[-2:]), axis=0) for s in squares]
-    return jnp.sum(objective(problem, image)), sum(each[1:], start=each[0])
+    return jnp.sum(objective(problem, image)), _summed(squares)
+
+
+@eqx.filter_jit
+def _slopes(problems: list[InverseProblem], image):
+    """w r Δ(h ∗ f) of each pixel, summed over captures and channels."""
+    below, at, above = problems
+    parts = zip(at.weights, residuals(at, image), below.operators, above.operators, strict=True)
+    return _summed([w * r * (forward(b, image) - forward(a, image)) for w, r, a, b in parts])
+
+
+def _summed(parts):
+    each = [jnp.sum(p.reshape(-1, *p.shape[-2:]), axis=0) for p in parts]
+    return sum(each[1:], start=each[0])
 
 
 def _oriented(psf: np.ndarray, number: int) -> np.ndarray:
@@ -299,43 +359,11 @@ def _best_orientation(found: list[_Tried]) -> int:
     return best if is_clear and np.sum(gains) > _SIGNIFICANCE * spread else 0
 
 
-def _judged(
-    orientation: Orientation, profile: dict[float, _Tried], pixel: float, pixels: int, whole: bool
-) -> PsfCheck:
-    """`whole`: nothing of the PSF was cropped to turn it."""
-    scales = np.array(sorted(profile))
-    found = [profile[s] for s in scales]
-    objectives = np.array([one.objective for one in found])
-    place = int(np.argmin(objectives))
-    near = np.abs(scales - scales[place]) < 1.1 * pixel
-    at_end = place in (0, len(scales) - 1)
-    misfits = np.stack([one.misfits for one in found])[near]
-    rest = objectives[near] - misfits.sum(axis=1)
-    chance = np.random.default_rng(0)
-    drawn = chance.integers(misfits.shape[1], size=(_RESAMPLED, misfits.shape[1]))
-    vertices = [_vertex(scales[near], misfits[:, d].sum(axis=1) + rest) for d in drawn]
-    scale = _vertex(scales[near], objectives[near])
-    error = float(np.std(vertices))
-    reasons = [] if orientation == "as given" else [f"it fits better {orientation}"]
-    if at_end and whole:
-        reasons.append(f"it fits better at {scale:.4f} times its size, or beyond: search farther")
-    elif whole and abs(scale - 1) > max(_LEAST_SCALE * pixel, _SIGNIFICANCE * error):
-        reasons.append(f"it fits better at {scale:.4f} ± {error:.4f} times its size")
-    return PsfCheck(
-        orientation,
-        scale,
-        error,
-        tuple(scales.tolist()),
-        tuple((objectives / objectives[place]).tolist()),
-        math.sqrt(2 * found[place].misfits.sum() / pixels),
-        tuple(reasons),
-    )
-
-
-def _vertex(scales: np.ndarray, values: np.ndarray) -> float:
-    """Where the parabola through the values is lowest, within the scales."""
+def _vertex(scales: np.ndarray, values: np.ndarray) -> tuple[float, float]:
+    """Where the parabola through the values is lowest, within the scales, and its curvature."""
     middle = scales.mean()
     curvature, slope, _ = np.polyfit(scales - middle, values, 2)
     if curvature <= 0:
-        return float(scales[np.argmin(values)])
-    return float(np.clip(middle - slope / (2 * curvature), scales[0], scales[-1]))
+        return float(scales[np.argmin(values)]), 0.0
+    vertex = np.clip(middle - slope / (2 * curvature), scales[0], scales[-1])
+    return float(vertex), float(2 * curvature)

@@ -60,6 +60,14 @@ class Scores:
     object_pixel_mm: float
     resolved: Resolved | None = None
 
+    @property
+    def words(self) -> str:
+        """PSNR, SSIM and line pair in a few words."""
+        exact = self.psnr_db is None
+        text = "exact" if exact else f"{self.psnr_db:.1f} dB, SSIM {self.ssim:.2f}"
+        resolved = "" if self.resolved is None else f"; resolves {self.resolved.object_mm:.2f} mm"
+        return text + resolved
+
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:

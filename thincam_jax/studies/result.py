@@ -1,5 +1,6 @@
 """Results of a study: the scores of every method on every target, as records, table and figures."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -7,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thincam_jax._core.table import Table, number
+from thincam_jax.reconstruction import FringeScanning
 from thincam_jax.studies.evaluate import Evaluation, Resolved, Scores, evaluate_method
 from thincam_jax.studies.response import Limits, Response, method_response
 from thincam_jax.studies.simulate import take
@@ -139,8 +141,8 @@ def summarise(
 
 
 def findings(study: Study, scores: StudyScores) -> list[str]:
-    """Main results of a study in sentences, beside what was published."""
-    sentences = []
+    """Main results of a study in sentences, the main one first; then beside what was published."""
+    sentences = _main_result(study, scores)
     for name, method in scores.methods.items():
         mean, stated = method.mean_psnr_of_pictures_db, method.published.psnr_db
         if mean is not None and stated is not None:
@@ -166,6 +168,34 @@ def findings(study: Study, scores: StudyScores) -> list[str]:
         order = ", ".join(f"{name} ({period:.2f} mm)" for period, name in ranked)
         sentences.append(f"From finest to coarsest on the chart: {order}.")
     return sentences
+
+
+def _main_result(study: Study, scores: StudyScores) -> list[str]:
+    """The best method beside the best conventional one, or else beside the first."""
+    conventional = {m.name for m in study.methods if m.solver.name == FringeScanning.name}
+    names = [name for name in scores.methods if name in conventional] or [*scores.methods][:1]
+    others = [name for name in scores.methods if name not in names]
+    if not others:
+        return []
+    before, after = (
+        min(group, key=lambda name: _rank(scores.methods[name])) for group in (names, others)
+    )
+    old, new = scores.methods[before], scores.methods[after]
+    parts, beside = [], ""
+    if old.resolved_mm and new.resolved_mm:
+        parts.append(f"resolves a line pair of {new.resolved_mm:.2f} mm")
+        beside = f", which resolves {old.resolved_mm:.2f} mm"
+    if (was := old.mean_psnr_of_pictures_db) and (now := new.mean_psnr_of_pictures_db):
+        gain = f"{'gains' if now >= was else 'loses'} {abs(now - was):.1f} dB"
+        parts.append(f"{gain} on the pictures")
+    if not parts:
+        return []
+    return [f"Beside “{before}”{beside}, {after} {' and '.join(parts)}."]
+
+
+def _rank(method: MethodScores) -> tuple[float, float]:
+    """The finest line pair first, then the highest PSNR."""
+    return method.resolved_mm or math.inf, -(method.mean_psnr_of_pictures_db or -math.inf)
 
 
 def _sums(method: Method) -> tuple:

@@ -3,10 +3,13 @@
 import numpy as np
 import pytest
 import scipy.ndimage as ndimage
+import scipy.signal as signal
 from reconstruction.depth import rig
 
 import thincam_jax as tc
+from thincam_jax.lensless.method import AccuracyWarning
 from thincam_jax.reconstruction import TotalVariation, fringe_scanning
+from thincam_jax.reconstruction.depth import find_distances, refocus_sweep
 
 PLANES = (20.0, 45.0, 150.0)
 
@@ -58,3 +61,58 @@ def test_a_depth_weight_pulls_the_planes_together(seen):
     weighted = reconstruct(seen, iterations=60, variation=TotalVariation(depth_weight=0.5))
     plain = reconstruct(seen, iterations=60)
     assert (shares(np.asarray(weighted.image), 1) < shares(np.asarray(plain.image), 1)).all()
+
+
+def measured(step, near, *, brightness=(1.0, 1.0), planes=4, noise=0.005):
+    """A chequered object in plane `near` of a diffuser's: its recording.
+
+    PSFs shrink by `step` pixels at their edge from plane to plane, and are as bright as linearly
+    between the ends of `brightness`.
+    """
+    rng = np.random.default_rng(3)
+    y, x = (np.arange(n) - (n - 1) / 2 for n in rig.FIELD)
+    spots, powers = rng.uniform(-0.42, 0.42, (60, 2)) * rig.FIELD, rng.exponential(1, 60)
+    psfs = []
+    for number, bright in enumerate(np.linspace(*brightness, num=planes)):
+        scale = 1 - number * step / (0.42 * rig.FIELD[1])
+        rows, columns = (
+            np.exp(-((axis[:, None] / scale - spots[:, k]) ** 2) / 3)
+            for k, axis in enumerate((y, x))
+        )
+        psf = (rows * powers) @ columns.T
+        psfs.append(bright * psf / psf.sum())
+    capture = signal.fftconvolve(rig.checks(np.s_[14:34, 14:42], 6), psfs[near], mode="same")
+    capture += noise * capture.max() * rng.normal(size=rig.FIELD)
+    return tc.Recording(capture[None], tc.Psfs(np.stack(psfs)[None, None]))
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("brightness", [(1.0, 1.0), (1.0, 2.0), (2.0, 1.0)])
+def test_a_near_object_stays_near(brightness):
+    """No plane draws light for a brighter PSF, and 100 iterations suffice."""
+    image = tc.reconstruct(measured(2.0, 0, brightness=brightness), tc.AdmmTV()).image
+    light = np.asarray(image).sum(axis=(1, 2))
+    assert light[0] > 0.85 * light.sum()
+    assert light[3] < 0.05 * light.sum()
+
+
+def test_planes_that_are_alike_are_named(recwarn):
+    with pytest.warns(AccuracyWarning, match="planes . and . of 4 .* by 0.99.*refocus_sweep"):
+        tc.reconstruct(measured(0.2, 0), tc.AdmmTV(iterations=1))
+    recwarn.clear()
+    tc.reconstruct(measured(2.0, 0), tc.AdmmTV(iterations=1))
+    assert not recwarn
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("near", [1, 4, 7])
+def test_the_sweep_that_the_warning_names_finds_the_plane(near):
+    recording = measured(0.5, near, planes=9)
+    with pytest.warns(AccuracyWarning, match="use thincam_jax.reconstruction.depth.refocus_sweep"):
+        tc.reconstruct(recording, tc.AdmmTV(iterations=1))
+    distances = 1 / np.linspace(1, 0.2, 9)
+    found = find_distances(refocus_sweep(recording, distances, tc.AdmmTV(iterations=50)))
+    place = np.interp(
+        1 / found.distance_of(1).distance, np.linspace(0.2, 1, 9), np.arange(8, -1, -1)
+    )
+    assert abs(place - near) < 1

@@ -3,7 +3,15 @@
 from dataclasses import asdict
 
 from thincam_jax.commands.config_file import slug
-from thincam_jax.commands.report import Page, Part, Picture, Sentences, optics_of, pixels_of
+from thincam_jax.commands.report import (
+    Gallery,
+    Page,
+    Part,
+    Picture,
+    Sentences,
+    optics_of,
+    pixels_of,
+)
 from thincam_jax.commands.run_folder import Progress, Run, RunFolder, as_record
 from thincam_jax.commands.sections import StudyConfig
 from thincam_jax.commands.study.build import FileStudy
@@ -28,7 +36,8 @@ _RESOLVED = (
 )
 _TRANSFER = (
     "Response of each method's synthesis with the finite mask, over its low-frequency value. "
-    "Nyquist: 1/(2 pitch) of the pixels; what lies beyond it, in grey, no capture holds."
+    "Above 1, fringes of the finite mask's edge, or of several captures, add up to more than that. "
+    "Grey: beyond the pixels' Nyquist frequency, 1/(2 pitch), which no capture holds."
 )
 _CONTRAST = (
     "Contrast of the chart's elements in the reconstructions; below zero the bars are reversed."
@@ -100,9 +109,15 @@ class _StudyRun(Run):
     def _save_images(self, target: Target) -> None:
         """A target's scene and all reconstructions of it."""
         place, folder = slug(target.name), self.folder
-        folder.save_image(f"{place}--scene", plot.truth_of(self.evaluations))
-        for name, evaluation in self.evaluations.items():
-            folder.save_image(f"{place}--{slug(name)}", evaluation.image)
+        raw = plot.as_picture(self.captures[self.study.exposures[0]].image)
+        folder.save_image(f"{place}--capture", raw / raw.max())
+        shown = {"scene": plot.truth_of(self.evaluations)}
+        shown |= {name: evaluation.image for name, evaluation in self.evaluations.items()}
+        for name, image in shown.items():
+            folder.save_image(f"{place}--{slug(name)}", image)
+            folder.save_image(
+                f"{place}--{slug(name)}--detail", plot.enlarged_part(image, target)[0]
+            )
 
     def transfer(self, method: Method) -> None:
         self.responses[method.name] = method_response(self.study, method)
@@ -130,15 +145,14 @@ def page(config: StudyConfig, scores: StudyScores, sentences: list[str]) -> Page
         f"{pixels_of(config.sensor)}, mask {config.mask.label}, object {seen.width:g} mm wide at "
         f"{seen.distance:g} mm{moves}, {optics_of(config)}"
     )
-    names = [target.name for target in config.targets]
-    pictures = [picture for name in names for picture in _pictures(name)]
+    first, *others = (_pictures(target.name, scores) for target in config.targets)
     transfer = (
         Picture("mtf.png", "Transfer functions of all methods", _TRANSFER),
         Picture("contrast.png", "Contrast of chart elements", _CONTRAST),
     )
     published = (Sentences(sentences), *config.notes) if sentences or config.notes else ()
     parts = (
-        Part("Reconstructions", pictures),
+        Part("Other reconstructions", [picture for pictures in others for picture in pictures]),
         Part("Results", (scores.quality_table(), _SCORED)),
         Part("Resolution", (scores.resolution_table(), _RESOLVED)),
         Part("Beside the published figures", published),
@@ -148,21 +162,26 @@ def page(config: StudyConfig, scores: StudyScores, sentences: list[str]) -> Page
             (Picture("psf.png", "Point spread function", "Of the first capture."),),
         ),
     )
-    return Page((lead,), parts, warnings=scores.warnings)
+    result, *sentences = sentences or [""]
+    beginning = (*first, scores.table(), lead)
+    return Page(beginning, parts, warnings=scores.warnings, result=result)
 
 
-def _pictures(name: str) -> tuple[Picture, Picture]:
-    """Of a target."""
-    shown = "the first raw capture, the scene, and the reconstructions; below, the middle third, "
+def _pictures(target: str, scores: StudyScores) -> tuple[Gallery, Gallery, Picture]:
+    """Of a target: whole, enlarged, and all captures, folded."""
+    place = f"../images/{slug(target)}--"
+    wholes = [
+        Picture(f"{place}capture.png", f"First raw capture of {target}", "first raw capture"),
+        Picture(f"{place}scene.png", target, f"{target}, the scene"),
+    ]
+    details = [Picture(f"{place}scene--detail.png", f"Part of {target}", "scene, enlarged")]
+    for name, method in scores.methods.items():
+        found = method.targets[target].words
+        alt = f"{target} by {name}: {found}"
+        wholes.append(Picture(f"{place}{slug(name)}.png", alt, f"{name}\n{found}"))
+        file = f"{place}{slug(name)}--detail.png"
+        details.append(Picture(file, f"Part of {alt}", f"{name}, enlarged"))
     captures = "Each from black to its own maximum; β and φ of the mask, d from mask to sensor."
-    return (
-        Picture(
-            f"target-{slug(name)}.png", name, f"{name}: {shown}or of the chart its fine groups."
-        ),
-        Picture(
-            f"captures-{slug(name)}.png",
-            f"All captures of {name}",
-            captures,
-            folded=f"all captures of {name}",
-        ),
-    )
+    file = f"captures-{slug(target)}.png"
+    folded = Picture(file, f"All captures of {target}", captures, f"all captures of {target}")
+    return Gallery(wholes), Gallery(details), folded
