@@ -61,6 +61,8 @@ sphinx_gallery_conf = {
     "filename_pattern": r"/[^/]*\.py$" if PHOTOGRAPHS.exists() else r"/(?!denoiser)[^/]*\.py$",
     "plot_gallery": "FAST" not in os.environ,
     "download_all_examples": False,
+    "remove_config_comments": True,
+    "thumbnail_size": (600, 400),
     "write_computation_times": False,  # a table that asks other machines for its scripts
 }
 

@@ -5,6 +5,8 @@ Two masks of a thin camera, without any file: which β are best, how exactly mus
 what does the objective look like around them, and what does thickness buy?
 """
 
+# sphinx_gallery_thumbnail_path = "images/design-landscape.png"
+
 import os
 from pathlib import Path
 

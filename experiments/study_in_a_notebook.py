@@ -5,6 +5,8 @@ Methods A and B of the thesis (section 3.5) beside the conventional method, with
 cameras, noisy captures, reconstructions, a table and pictures. Every number may be another one.
 """
 
+# sphinx_gallery_thumbnail_path = "images/usaf-1951.png"
+
 import os
 from pathlib import Path
 
