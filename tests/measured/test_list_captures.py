@@ -41,7 +41,7 @@ def test_the_odd_one_out_is_named(tmp_path):
 
 def test_what_cannot_be_listed(tmp_path):
     refused(tmp_path / "absent", "cannot be read as a folder")
-    refused(tmp_path, "holds no capture; give a folder of .tif, .tiff, .png, .npy files")
+    refused(tmp_path, "holds no capture; give a folder of TIFF, PNG, NPY or raw files")
     save(tmp_path / "a.npy")
     refused(tmp_path / "a.npy", "cannot be read as a folder")
     refused(tmp_path, r"a\.npy: holds values up to 2000, above the 1023 of 10 bit", 10)

@@ -3,6 +3,7 @@
 import io
 import logging
 import struct
+import sys
 import tracemalloc
 import warnings
 import zlib
@@ -52,6 +53,39 @@ def test_counts_come_back_as_they_were(tmp_path, dtype, channels):
     same(read_image(tmp_path / "a.npy"), pixels, "npy", bits)
     same(read_image(str(tmp_path / "a.tif")), pixels, "tiff", bits)
     same(read_image(tmp_path / "a.png"), pixels, "png", bits)
+
+
+def dng(pixels, white):
+    """The smallest file that is one: a TIFF of a mosaic with the tags of DNG 1.4."""
+    identity = [part for value in np.eye(3, dtype=int).ravel() for part in (int(value), 1)]
+    tags = [
+        (50706, 1, 4, (1, 4, 0, 0), True),  # version
+        (50708, 2, 0, "Test camera", True),
+        (33421, 3, 2, (2, 2), True),
+        (33422, 1, 4, (0, 1, 1, 2), True),  # RGGB
+        (50721, 10, 9, identity, True),  # colour matrix
+        (50714, 4, 1, 200, True),  # black level
+        (50717, 4, 1, white, True),
+        (50728, 5, 3, (1,) * 6, True),  # neutral
+        (50778, 3, 1, 21, True),  # daylight
+    ]
+    stream = io.BytesIO()
+    tifffile.imwrite(stream, pixels, photometric=32803, extratags=tags)
+    return stream.getvalue()
+
+
+def test_a_camera_s_raw_file_gives_its_mosaic(tmp_path, monkeypatch):
+    """The counts as they are, black level and all, with the camera's bits."""
+    pixels = np.random.default_rng(0).integers(190, 4096, (36, 52), dtype=np.uint16)
+    (tmp_path / "a.DNG").write_bytes(dng(pixels, white=4095))
+    same(read_image(tmp_path / "a.DNG"), pixels, "raw", 12)
+    (tmp_path / "b.nef").write_bytes(dng(pixels, white=4095)[:2000])
+    with pytest.raises(CaptureFileError, match=r"b\.nef: cannot be read as RAW .*damaged") as error:
+        read_image(tmp_path / "b.nef")
+    assert "\n" not in str(error.value)
+    monkeypatch.setitem(sys.modules, "rawpy", None)  # as where it is not installed
+    with pytest.raises(CaptureFileError, match=r"pip install 'thincam_jax\[raw\]', or save it as"):
+        read_image(tmp_path / "a.DNG")
 
 
 def test_a_jpeg_is_read_with_a_warning(tmp_path):

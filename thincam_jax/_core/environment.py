@@ -29,6 +29,7 @@ OPTIONAL = {
     "dask": "sweeps on other machines (thincam sweep --scheduler)",
     "distributed": "sweeps on other machines (thincam sweep --scheduler)",
     "pyarrow": "sweeps (thincam sweep)",
+    "rawpy": "DNG and raw files of cameras",
 }
 
 

@@ -1,4 +1,4 @@
-"""Image files: TIFF, PNG, NPY and JPEG, recognised by their first bytes, not by their names."""
+"""Image files: TIFF, PNG, NPY and JPEG by their first bytes, cameras' raw files by name."""
 
 import contextlib
 import io
@@ -21,7 +21,9 @@ from thincam_jax._core.files import read_regular
 from thincam_jax._core.memory import refuse_if_too_large
 from thincam_jax.measured.raw import CaptureFileError, MeasurementError, Raw
 
-SUFFIXES = (".tif", ".tiff", ".png", ".npy")
+# Raw files of cameras, most of which are TIFF with previews of their own.
+RAW_SUFFIXES = (".dng", ".arw", ".cr2", ".cr3", ".nef", ".orf", ".pef", ".raf", ".rw2")
+SUFFIXES = (".tif", ".tiff", ".png", ".npy", *RAW_SUFFIXES)
 _STARTS = {
     b"\x89PNG\r\n\x1a\n": "png",
     b"\x93NUMPY": "npy",
@@ -58,7 +60,8 @@ def read_image(path: str | os.PathLike[str], bits: int | None = None) -> Raw:
 
     TIFF and PNG of 8 or 16 bit a sample, grey or RGB, and NPY; floats in TIFF and NPY. An opaque
     alpha channel is dropped. `bits` is the bit depth of the camera (see `Raw`). A JPEG is read with
-    a NonlinearWarning: its counts are not in proportion to the light.
+    a NonlinearWarning: its counts are not in proportion to the light. DNG and raw files of cameras
+    need the extra `raw`; they give their mosaic (y, x) with the black level in it.
 
     **Errors**: CaptureFileError, one line, for a file that is missing, truncated, damaged or no
     image, for a stack of images, and for everything that `Raw` refuses.
@@ -138,7 +141,7 @@ def image_files(folder: str | os.PathLike[str]) -> list[Path]:
     paths = [p for p in paths if not p.is_dir()]
     if not paths:
         raise CaptureFileError(
-            f"{folder}: holds no capture; give a folder of {', '.join(SUFFIXES)} files"
+            f"{folder}: holds no capture; give a folder of TIFF, PNG, NPY or raw files"
         )
     return sorted(paths, key=_order)
 
@@ -151,7 +154,8 @@ def _order(path: Path) -> tuple[list[tuple[int, str]], str]:
 def _decode(path: Path, stack: bool = False) -> tuple[list[np.ndarray], str, int | None]:
     """Pixels of each image, format, and bits a sample if known; several images only of a stack."""
     data = _bytes(path)
-    kind = next((kind for start, kind in _STARTS.items() if data.startswith(start)), None)
+    known = (kind for start, kind in _STARTS.items() if data.startswith(start))
+    kind = "raw" if path.suffix.lower() in RAW_SUFFIXES else next(known, None)
     if kind is None:
         short = not data or any(start.startswith(data) for start in _STARTS)
         what = "is empty or cut short" if short else "is not an image that can be read"
@@ -161,6 +165,7 @@ def _decode(path: Path, stack: bool = False) -> tuple[list[np.ndarray], str, int
         "jpeg": _read_jpeg,
         "tiff": partial(_read_tiff, stack=stack),
         "npy": _read_npy,
+        "raw": _read_mosaic,
     }
     try:
         with _silence():
@@ -234,6 +239,21 @@ def _read_png(data: bytes) -> tuple[list[np.ndarray], int]:
     _refuse_bomb(rows * columns * _PNG_CHANNELS[colour] * depth // 8, len(data))
     pixels = imagecodecs.png_decode(data)
     return [_without_alpha(pixels, pixels.ndim == 3 and pixels.shape[2] in (2, 4))], depth
+
+
+def _read_mosaic(data: bytes) -> tuple[list[np.ndarray], int]:
+    """The mosaic of a camera's raw file, without the rows and columns beyond its image."""
+    try:
+        import rawpy
+    except ImportError:
+        raise CaptureFileError(
+            "is a camera's raw file; pip install 'thincam_jax[raw]', or save it as TIFF"
+        ) from None
+    with rawpy.imread(io.BytesIO(data)) as file:
+        pixels = file.raw_image_visible.copy()
+        if pixels.ndim != 2:
+            raise CaptureFileError("holds colours, no mosaic; save it as TIFF")
+        return [pixels], max(8, int(file.white_level).bit_length())
 
 
 def _read_jpeg(data: bytes) -> tuple[list[np.ndarray], int]:
