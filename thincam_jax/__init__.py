@@ -19,7 +19,7 @@ Lengths are in millimetres, angles in radians, arrays (…, y, x). `help(tc.psf)
 - reconstruction: `Recording` of `Cameras`, `Psfs` or operators; `reconstruct` by `Wiener`,
   `FringeScanning`, `AdmmTV`, `Fista`, `Ridge`, `PoissonTV` or `Learned`; `Stream`
 - calibration: `fit_psf`, `check_psf`, `fit_separable`, `measured`
-- experiments: `studies`, `design`, `learn`, `plot`, `hardware`
+- experiments: `studies`, `design`, `learn`, `plot`, `explore`, `hardware`
 
 The names stand in `__init__.pyi`. Each is imported at its first use: JAX takes a second to import,
 which `thincam --help` need not wait for.

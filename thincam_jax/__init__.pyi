@@ -62,6 +62,7 @@ from .lensless.separable_operator import separable_operator as separable_operato
 from .measured.calibration import calibrate_separable as calibrate_separable
 from .measured.calibration import fit_psf as fit_psf
 from .measured.calibration import fit_separable as fit_separable
+from .plot.explore import explore as explore
 from .reconstruction import AdmmTV as AdmmTV
 from .reconstruction import Cameras as Cameras
 from .reconstruction import Fista as Fista

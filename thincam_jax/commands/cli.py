@@ -16,6 +16,7 @@ from thincam_jax.commands import terminal
 from thincam_jax.commands.cache import cache_state, keep_programs
 from thincam_jax.commands.capture.command import capture, known_drivers
 from thincam_jax.commands.explain import explain, schema
+from thincam_jax.commands.explore import explore
 from thincam_jax.commands.kinds import init
 from thincam_jax.commands.reconstruct.command import check, reconstruct
 from thincam_jax.commands.run import accuracy, design, run, train
@@ -23,8 +24,8 @@ from thincam_jax.commands.sweep.command import sweep
 from thincam_jax.commands.terminal import WRONG_INPUT, say, say_result, tell, told
 
 ORDER = (
-    *("init", "explain", "run", "capture", "reconstruct", "calibrate", "sweep", "design", "train"),
-    *("bench", "schema", "doctor"),
+    *("init", "explain", "explore", "run", "capture", "reconstruct", "calibrate", "sweep"),
+    *("design", "train", "bench", "schema", "doctor"),
 )
 # Of `thincam reconstruct`; what is in none stands first.
 GROUPS = {
@@ -119,6 +120,7 @@ for group, command, *examples in (
     (app, init, "init study", "init design --out mine.yaml"),
     (app, schema, "schema study > study.schema.json"),
     (app, explain, "explain study.yaml", "explain study.yaml --set noise.snr_db=40"),
+    (app, explore, "explore study.yaml", "explore study.yaml --set mask.width=3mm --no-browser"),
     (app, run, "run study.yaml", "run study.yaml --set noise.snr_db=40 --dry-run"),
     (
         *(app, reconstruct),

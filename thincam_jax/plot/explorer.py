@@ -1,0 +1,304 @@
+"""A camera whose numbers are turned by hand: the controls, and the pictures of each setting."""
+
+import dataclasses
+import io
+import json
+import math
+import operator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import PIL.Image
+
+from thincam_jax._core import checks
+from thincam_jax._core.checks import Number
+from thincam_jax._core.grids import Grid
+from thincam_jax._core.quantity import Quantity
+from thincam_jax.imaging.metrics import align, cut_off, first_common_zero, low_frequency_value, psnr
+from thincam_jax.imaging.scene import ImagePlane, Scene
+from thincam_jax.imaging.sensor import GaussianNoise
+from thincam_jax.imaging.targets import sample_image
+from thincam_jax.lensless import psf as psfs
+from thincam_jax.lensless.accuracy import select_model
+from thincam_jax.lensless.camera import LenslessCamera
+from thincam_jax.lensless.capture import capture
+from thincam_jax.lensless.masks.fza import FresnelZoneAperture
+from thincam_jax.lensless.phase_shift import fringe_scanned_otf
+from thincam_jax.reconstruction import Cameras, FringeScanning, Recording, Wiener, reconstruct
+from thincam_jax.units import nm
+
+# Part of the sensor's width that the scene's image has.
+_FILLED = 0.7
+# How far a control goes below and above its value.
+_LOWEST, _HIGHEST = 0.25, 2.5
+_SNR_DB, _TOLERANCE = 30.0, 1e-2
+_QUALITY = 85  # of JPEG, while a control is moved
+_MOST_PIXELS = 2048  # of a sensor's side
+
+
+@dataclass(frozen=True)
+class Control:
+    """A number that is turned.
+
+    - `name`: of the field of the mask or camera, or of the light.
+    - `label`, `unit`: as shown. `scale`: mm, or other units of the package, of one shown unit.
+    - `low`, `high`, `value`: in the shown unit.
+    """
+
+    name: str
+    label: str
+    unit: str
+    low: float
+    high: float
+    value: float
+    scale: float = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """What a setting looks like.
+
+    - `pictures`: files of "psf", and at rest of "capture" and "image": JPEG, at rest PNG.
+    - `step`: cycles/mm from one entry of `transfer`, |H| along u at v = 0 over its value at low
+      frequencies, to the next; without zero frequency, which is the background's.
+    - `cut_off`: cycles/mm, where it ends. `zero`: at rest, the first that a zone aperture's fringe
+      scanning cannot carry; None where there is none.
+    - `values`: of the controls. `lines`: sentences about the setting, at rest.
+    """
+
+    values: dict[str, float]
+    pictures: dict[str, bytes]
+    step: float
+    transfer: np.ndarray
+    cut_off: float
+    zero: float | None = None
+    lines: tuple[str, ...] = ()
+
+    def message(self) -> tuple[str, list[bytes]]:
+        """A header as JSON, and the pictures in the order of its `names`."""
+        header = {
+            "names": [*self.pictures],
+            "step": self.step,
+            "transfer": [round(float(value), 4) for value in self.transfer],
+            "zero": self.zero,
+            "cut_off": self.cut_off,
+            "lines": self.lines,
+            "values": self.values,
+        }
+        return json.dumps(header), [*self.pictures.values()]
+
+
+class Explorer:
+    """The settings of a camera, and what it sees with each.
+
+    While a control is moved the PSF and the transfer function follow, by one compiled program: new
+    values are not compiled for. At rest come a noisy capture of the scene (30 dB), its Wiener
+    reconstruction (of four captures by fringe scanning where the mask is a zone aperture), and the
+    cheapest model within a tolerance of 1 %. The scene keeps its size on the sensor, 0.7 of its
+    width.
+
+    **Arguments**
+
+    - `camera`: any lensless camera of up to 2048 pixels a side.
+    - `scene`: an image (y, x), radiance; default a photograph.
+    - `wavelength`, `object_distance`: mm, where the controls begin.
+    """
+
+    def __init__(
+        self,
+        camera: LenslessCamera,
+        scene: Any = None,
+        *,
+        wavelength: Number = 550 * nm,
+        object_distance: Number = 250.0,
+    ):
+        if max(camera.sensor.shape) > _MOST_PIXELS:
+            raise ValueError(
+                f"the sensor has {camera.sensor.shape} pixels; give one of at most {_MOST_PIXELS} "
+                "a side to explore"
+            )
+        image = sample_image("camera") if scene is None else scene
+        self.scene = ImagePlane(image, distance=1.0, width=1.0).image  # checked there
+        if self.scene.ndim != 2:
+            raise ValueError(f"scene has shape {self.scene.shape}; give one image (y, x)")
+        self._first = camera
+        light: dict[str, Any] = {
+            "wavelength": float(checks.wavelength("wavelength", wavelength)),
+            "object_distance": float(checks.positive("object_distance", object_distance, "mm")),
+        }
+        self.controls = (*_controls_of(camera), *_controls_of_light(**light))
+        self.values = {control.name: control.value for control in self.controls}
+
+    @property
+    def camera(self) -> LenslessCamera:
+        """The camera as it is set."""
+        return _with_numbers(self._first, self._numbers())
+
+    @property
+    def light(self) -> dict[str, Any]:
+        """Wavelength and object distance as they are set, mm: keyword arguments of `tc.psf`."""
+        numbers = self._numbers()
+        return {name: numbers[name] for name in ("wavelength", "object_distance")}
+
+    def turn(self, values: dict[str, float]) -> None:
+        """Set controls, each within its range; ValueError names one that does not exist."""
+        known = {control.name: control for control in self.controls}
+        for name, value in values.items():
+            checks.choice("control", name, known)
+            control = known[name]
+            self.values[name] = float(
+                checks.between(name, value, control.unit, control.low, control.high)
+            )
+
+    def view(self, *, rest: bool = True) -> View:
+        """The pictures of the setting; those that take long only at rest."""
+        like = self._first.distance.dtype
+        traced = {name: jnp.asarray(value, like) for name, value in self._numbers().items()}
+        levels, profile = jax.device_get(_moving(self._first, traced))
+        step = 1 / (self._first.sensor.shape[1] * float(self._first.sensor.pitch))
+        frequency = np.arange(1, profile.size) * step
+        magnitude = np.abs(profile[1:])
+        low = low_frequency_value(frequency, magnitude)
+        seen = View(
+            dict(self.values),
+            {"psf": _file(levels, rest)},
+            step,
+            magnitude / (low if low > 0 else 1.0),
+            float(cut_off(frequency, magnitude)) if low > 0 else 0.0,
+        )
+        return self._at_rest(seen) if rest else seen
+
+    def _numbers(self) -> dict[str, float]:
+        return {one.name: self.values[one.name] * one.scale for one in self.controls}
+
+    def _at_rest(self, seen: View) -> View:
+        camera, light = self.camera, self.light
+        plane, field = self._placed(camera, light["object_distance"])
+        scene = Scene(plane, light["wavelength"])
+        # A zone aperture takes four captures, whose background cancels.
+        scanned = isinstance(camera.mask, FresnelZoneAperture)
+        taken = [_with_phase(camera, step) for step in range(4)] if scanned else [camera]
+        noise = GaussianNoise(_SNR_DB, "without_mean")
+        noisy = [capture(one, scene, noise=noise, key=seed) for seed, one in enumerate(taken)]
+        recording = Recording(noisy, Cameras(taken, field_shape=field, **light))
+        found = reconstruct(recording, FringeScanning() if scanned else Wiener())
+        assert found.pitch is not None
+        grid = Grid(found.image.shape, found.pitch)
+        truth = np.asarray(plane.sample(grid, magnification=1.0))
+        chosen = select_model(camera, tolerance=_TOLERANCE, **light)
+        rows, columns = camera.sensor.shape
+        lines = (
+            f"{'Four captures' if scanned else 'One capture'} of {rows}×{columns} pixels at "
+            f"{_SNR_DB:g} dB, {'fringe scanning' if scanned else 'Wiener filter'}: "
+            f"{psnr(found.image, truth):.1f} dB.",
+            f"A PSF within {_TOLERANCE:.0%}: model {chosen.method.model}, predicted error "
+            f"{chosen.predicted_error:.1e}.",
+        )
+        pictures = {
+            "capture": _stretched(np.asarray(noisy[0])),
+            "image": align(found.image, truth)[0],
+        }
+        files = {name: _file(image, True) for name, image in pictures.items()}
+        return replace(seen, pictures=seen.pictures | files, zero=_zero(camera, light), lines=lines)
+
+    def _placed(self, camera: LenslessCamera, distance: float) -> tuple[ImagePlane, Any]:
+        """The scene at a distance, and the pixels of its image (y, x)."""
+        rows, columns = self.scene.shape
+        sensor = camera.sensor
+        # Of the larger scene that fits both sides.
+        across = _FILLED * min(sensor.shape[1], sensor.shape[0] * columns / rows)
+        field = max(2, round(across * rows / columns)), max(2, round(across))
+        width = field[1] * float(sensor.pitch) * distance / float(camera.distance)
+        return ImagePlane(self.scene, distance=distance, width=width), field
+
+
+def _controls_of(camera: LenslessCamera) -> list[Control]:
+    """The mask's own numbers, and its distance."""
+    found = []
+    for field in dataclasses.fields(camera.mask):
+        converter, value = field.metadata.get("converter"), getattr(camera.mask, field.name)
+        if isinstance(converter, Quantity) and isinstance(value, jax.Array) and value.ndim == 0:
+            found.append(_control(field.name, converter, float(value)))
+    distance = {field.name: field for field in dataclasses.fields(camera)}["distance"]
+    return [*found, _control("distance", distance.metadata["converter"], float(camera.distance))]
+
+
+def _control(name: str, quantity: Quantity, value: float) -> Control:
+    label = name.replace("_", " ")
+    if quantity.unit == "rad":
+        return Control(name, label, "rad", -math.pi, math.pi, value)
+    high = value * _HIGHEST
+    try:
+        quantity(high)
+    except ValueError:  # as of a fraction that is at most 1
+        high = value
+    low, high, value = (float(f"{one:.6g}") for one in (value * _LOWEST, high, value))
+    return Control(name, label, quantity.symbol, low, high, value)
+
+
+def _controls_of_light(wavelength: float, object_distance: float) -> list[Control]:
+    far = 1000.0 if math.isinf(object_distance) else object_distance
+    return [
+        Control("wavelength", "wavelength", "nm", 380.0, 780.0, round(wavelength / nm, 3), nm),
+        Control("object_distance", "object distance", "mm", far / 10, 4 * far, far),
+    ]
+
+
+def _with_numbers(camera: LenslessCamera, numbers: dict[str, Any]) -> LenslessCamera:
+    for name, value in numbers.items():
+        own = name == "distance"
+        if own or hasattr(camera.mask, name):  # others are of the light
+            value = jnp.asarray(value, camera.distance.dtype)
+            inside = operator.attrgetter(name if own else f"mask.{name}")
+            camera = eqx.tree_at(inside, camera, value)
+    return camera
+
+
+def _with_phase(camera: LenslessCamera, step: int) -> LenslessCamera:
+    """The camera whose zones are moved by so many quarters of a period."""
+    return _with_numbers(camera, {"phase": step * math.pi / 2})
+
+
+@eqx.filter_jit
+def _moving(camera: LenslessCamera, numbers: dict[str, Any]) -> tuple[Any, Any]:
+    """The PSF as 256 grey levels, and the OTF along u ≥ 0 at v = 0."""
+    light: dict[str, Any] = {name: numbers[name] for name in ("wavelength", "object_distance")}
+    h = psfs.psf(_with_numbers(camera, numbers), pixel_integration=True, **light)
+    largest = jnp.max(h)
+    levels = jnp.round(255 * h / jnp.where(largest > 0, largest, 1)).astype(jnp.uint8)
+    # The spectrum along u is that of the sum over y; its phase about the middle pixel.
+    columns = h.shape[1]
+    profile = jnp.fft.rfft(jnp.fft.ifftshift(jnp.sum(h, axis=0)))[: columns - columns // 2]
+    return levels, profile
+
+
+def _zero(camera: LenslessCamera, light: dict[str, Any]) -> float | None:
+    """The first zero of fringe scanning with a zone aperture, cycles/mm."""
+    mask = camera.mask
+    if not isinstance(mask, FresnelZoneAperture):
+        return None
+    columns = camera.sensor.shape[1]
+    response = np.asarray(fringe_scanned_otf(camera, **light))
+    profile = response[camera.sensor.shape[0] // 2, columns // 2 :]
+    u = np.arange(profile.size) / (columns * float(camera.sensor.pitch))
+    beta = float(mask.beta) / (1 + float(camera.distance) / light["object_distance"]) ** 2
+    return first_common_zero(u, [np.real(profile * np.exp(-1j * math.pi**2 * u**2 / beta))])
+
+
+def _stretched(image: np.ndarray) -> np.ndarray:
+    low, high = image.min(), image.max()
+    return (image - low) / (high - low if high > low else 1)
+
+
+def _file(image: np.ndarray, rest: bool) -> bytes:
+    """PNG of an image of 0…1 or 256 levels at rest, else JPEG."""
+    if image.dtype != np.uint8:
+        image = np.round(255 * np.clip(image, 0, 1)).astype(np.uint8)
+    stream = io.BytesIO()
+    how: dict[str, Any] = {"format": "PNG"} if rest else {"format": "JPEG", "quality": _QUALITY}
+    PIL.Image.fromarray(image).save(stream, **how)
+    return stream.getvalue()
