@@ -71,6 +71,7 @@ def test_moving_compiles_nothing(explorer):
             explorer.view(rest=False)
 
 
+@pytest.mark.thorough
 def test_other_masks_have_their_own_numbers():
     mask = tc.ModifiedUniformlyRedundantArray(13, cell=0.2)
     found = Explorer(tc.LenslessCamera(mask, SENSOR, distance=5.0), np.eye(40))
