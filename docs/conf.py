@@ -108,6 +108,7 @@ ROOMS = {  # headings of the names at the top level, in the order of the page
     "reconstruction": "Reconstruction",
     "learn": "Reconstruction",
     "measured": "Calibration",
+    "plot": "Figures",
 }
 
 

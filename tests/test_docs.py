@@ -303,3 +303,15 @@ def test_screen_calibration_page(tmp_path, monkeypatch):
     assert abs(float(error)) < 4 * float(fit.standard_errors["glass_thickness"])
     assert fit.status == "ok"
     np.testing.assert_allclose(names["image"], 1, atol=0.02)
+
+
+def test_every_public_name_has_a_heading_in_the_reference():
+    conf = ast.parse((ROOT / "docs/conf.py").read_text("utf-8"))
+    (rooms,) = (
+        ast.literal_eval(node.value)
+        for node in conf.body
+        if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "ROOMS"
+    )
+    stub = ast.parse((PACKAGE / "__init__.pyi").read_text("utf-8"))
+    modules = {node.module for node in stub.body if isinstance(node, ast.ImportFrom)} - {None}
+    assert not [one for one in modules if not one.startswith(tuple(rooms))]
