@@ -13,7 +13,7 @@ from thincam_jax._core.precision import product
 from thincam_jax.imaging.operators.base import AbstractOperator, real_numbers, require_shape
 from thincam_jax.imaging.operators.crop_convolution import CropConvolution, kernel_shape, plane_mean
 
-# Of the power method; docs/solver_figures.md.
+# Of the power method.
 POSITIVE_ITERATIONS = 12
 
 
