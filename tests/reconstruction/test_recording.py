@@ -22,7 +22,7 @@ from thincam_jax.imaging.operators import (
 )
 from thincam_jax.reconstruction import InverseProblem
 from thincam_jax.reconstruction.iterate import Outcome
-from thincam_jax.reconstruction.problem import residuals, total_objective
+from thincam_jax.reconstruction.problem import residuals, total_misfit, total_objective
 
 SENSOR, FIELD = tc.Sensor((52, 61), rig.SENSOR.pitch), (28, 33)
 RNG = np.random.default_rng(8)
@@ -462,6 +462,21 @@ def test_a_field_that_does_not_fit_is_refused_before_any_work():
     recording = tc.Recording(np.ones((1, 6, 7)), imaging_model)
     with pytest.raises(MemoryError, match="a field of 200000×199999 pixels needs about .* smaller"):
         tc.reconstruct(recording, tc.Ridge())
+
+
+def test_captures_that_are_known_inside_jit_are_checked_there():
+    capture = jnp.asarray(RNG.uniform(1, 2, (1, 6, 7)))
+
+    @jax.jit
+    def residual(psf, capture=capture):
+        problem = tc.Recording(capture, tc.Psfs(psf[None]), noise_variance=1.0).problem()
+        return total_misfit(jnp.zeros(problem.image_shape), problem)
+
+    psf = jnp.ones((3, 3))
+    np.testing.assert_allclose(residual(psf), 0.5 * np.sum(np.square(capture)), rtol=1e-6)
+    holed = jnp.asarray(HOLED)
+    with pytest.raises(ValueError, match=r"captures\[0\] holds NaN"):
+        jax.jit(lambda psf: tc.Recording(holed, tc.Psfs(psf[None])).problem())(psf)
 
 
 def test_iterative_solvers_say_what_works_under_jit():

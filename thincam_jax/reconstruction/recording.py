@@ -261,8 +261,9 @@ class Recording(Module):
         for number, (capture, valid) in enumerate(zip(*self._masked_captures(), strict=True)):
             if checks.is_traced(capture) or checks.is_traced(valid):
                 continue
-            largest = jnp.max(jnp.abs(capture))  # NaN, where one is
-            if not bool(jnp.isfinite(largest)):
+            with jax.ensure_compile_time_eval():  # captures may be known inside jit
+                largest = float(jnp.max(jnp.abs(capture)))  # NaN, where one is
+            if not math.isfinite(largest):
                 raise ValueError(
                     f"captures[{number}] holds NaN or infinity; repair it, or exclude such pixels "
                     "with valid=numpy.isfinite(captures)"
