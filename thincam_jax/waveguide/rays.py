@@ -20,7 +20,7 @@ from jaxtyping import Array, Float, Int
 
 from thincam_jax._core import checks
 from thincam_jax._core.arguments import checked
-from thincam_jax._core.checks import Number
+from thincam_jax._core.checks import Number, Numbers
 from thincam_jax._core.precision import product
 from thincam_jax.waveguide.camera import Rectangle, SeeThroughCamera
 from thincam_jax.waveguide.efficiency import weights_about
@@ -59,7 +59,7 @@ class Rays(eqx.Module):
 @checked
 def trace(
     camera: SeeThroughCamera,
-    pixels: Float[Array, "*pixel 2"],
+    pixels: Numbers,
     object_distance: Number,
     orders: int = 4,
     extent: Rectangle | None = None,
@@ -68,7 +68,7 @@ def trace(
 
     **Arguments**
 
-    - `pixels`: (x, y) on the sensor, mm from its middle.
+    - `pixels`: (x, y) on the sensor, mm from its middle: (*pixel, 2).
     - `object_distance`: d2, from the plate's front surface, mm; of several planes by `jax.vmap`.
     - `orders`: how many ghosts, i = 0 … orders − 1, of 2i total reflections each.
     - `extent`: of the object, (x, y) mm from the camera's axis; None is infinite.

@@ -60,9 +60,11 @@ def test_near_and_far(name):
     far = np.abs(rows @ field @ columns.T * (PITCH / 5) ** 2 / (WAVELENGTH * distance)) ** 2
     camera = tc.LenslessCamera(mask_of(name), tc.Sensor(SHAPE, PITCH), distance)
     choice = tc.select_model(camera, wavelength=WAVELENGTH, tolerance=1e-3)
-    assert not choice.meets_tolerance
-    off = relative_l2(tc.psf(camera, wavelength=WAVELENGTH, model=choice.method), far)
-    assert 0.03 < off < 3 * choice.predicted_error < 12 * off
+    # Rings have a model of their own, which meets any tolerance.
+    assert choice.meets_tolerance == (name == "rings")
+    if name != "rings":
+        off = relative_l2(tc.psf(camera, wavelength=WAVELENGTH, model=choice.method), far)
+        assert 0.03 < off < 3 * choice.predicted_error < 12 * off
     wide = tc.PsfMethod("angular_spectrum", oversampling=3, mask_shape=(416, 416))
     assert relative_l2(tc.psf(camera, wavelength=WAVELENGTH, model=wide), far) < 0.02
 

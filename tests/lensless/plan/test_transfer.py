@@ -5,7 +5,7 @@ import pytest
 from lensless.plan.scenes import camera
 
 import thincam_jax as tc
-from thincam_jax.lensless.method import CLOSED, PsfMethod
+from thincam_jax.lensless.method import CLOSED, PsfMethod, models_of
 from thincam_jax.lensless.plan.transfer import (
     TransferProbe,
     _rounded_up,
@@ -25,7 +25,12 @@ def direct(h, frequencies):
 
 
 @pytest.mark.parametrize(
-    "model", [pytest.param(m, marks=[pytest.mark.thorough] * (m != "closed_form")) for m in CLOSED]
+    "model",
+    [
+        pytest.param(m, marks=[pytest.mark.thorough] * (m != "closed_form"))
+        for m in models_of(camera().mask)
+        if m in CLOSED
+    ],
 )
 @pytest.mark.parametrize("average", [False, pytest.param(True, marks=pytest.mark.thorough)])
 def test_exact_and_quick_agree_with_the_sum_over_the_psf(model, average):
