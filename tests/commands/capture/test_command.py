@@ -58,7 +58,7 @@ def test_an_image_of_captures_agrees_with_direct_simulation(method_b, tmp_path):
     scores = found["psnr_db"]
     assert abs(scores["captured"] - scores["simulated"]) < 1.5
     assert scores["captured"] > 17
-    assert (tmp_path / "out" / "report.html").read_text("utf-8").count("data:image/png") == 4
+    assert (tmp_path / "out" / "report.html").read_text("utf-8").count("data:image/webp") == 4
 
 
 @pytest.mark.thorough

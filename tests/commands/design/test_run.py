@@ -128,7 +128,7 @@ def test_found_study_gives_the_first_seed(whole):
 def test_report_stands_alone(whole):
     path, design, _ = whole
     page = (path / "report.html").read_text("utf-8")
-    assert page.count("data:image/png;base64,") == 6
+    assert page.count("data:image/webp;base64,") == 6
     assert "A tiny design" in page
     psnr = design.validation.methods["pairs"]["picture"].psnr_db
     assert psnr.text(2, "") in page
