@@ -108,7 +108,7 @@ def test_quiet_commands_print_nothing(tmp_path):
     result = call("init", "study", "--out", tmp_path, "--quiet")
     assert (result.exit_code, result.output) == (0, "")
     assert "name: study\n" in (tmp_path / "study.yaml").read_text("utf-8")
-    # The options hold for one command alone, and errors are told.
+    # The options hold for one command alone, and errors are still reported.
     assert "kind" in call("init").stdout and call("init", "no", "--quiet").stderr
 
 

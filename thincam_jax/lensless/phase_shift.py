@@ -60,7 +60,7 @@ def harmonic_otf(
     given = (wavelength, object_distance, model, pixel_integration, None)
     turns = np.arange(steps) / steps
     weights = np.exp(-2j * np.pi * harmonic * turns) / steps
-    responses = (_otf(_with_phase(camera, turn), *given) for turn in turns)
+    responses = (_otf(with_phase(camera, turn), *given) for turn in turns)
     terms = (h * h.dtype.type(w) for h, w in zip(responses, weights, strict=True))
     return functools.reduce(operator.add, terms)
 
@@ -98,7 +98,7 @@ def fringe_scanned_otf(
     **See also**: `phase_pair_otf`, `harmonic_otf`.
     """
     given = (wavelength, object_distance, model, pixel_integration, grid)
-    h = [_otf(_with_phase(camera, turns), *given) for turns in (0.0, 0.25, 0.5, 0.75)]
+    h = [_otf(with_phase(camera, turns), *given) for turns in (0.0, 0.25, 0.5, 0.75)]
     quadrature = h[0] - h[2]
     return (h[3] - h[1]) + jnp.asarray(1j, dtype=quadrature.dtype) * quadrature
 
@@ -135,7 +135,7 @@ def phase_pair_otf(
     **See also**: `fringe_scanned_otf`, `harmonic_otf`.
     """
     given = (wavelength, object_distance, model, pixel_integration, grid)
-    return _otf(_with_phase(camera, 0.0), *given) - _otf(_with_phase(camera, 0.75), *given)
+    return _otf(with_phase(camera, 0.0), *given) - _otf(with_phase(camera, 0.75), *given)
 
 
 def _otf(camera, wavelength, object_distance, model, pixel_integration, grid):
@@ -149,7 +149,7 @@ def _otf(camera, wavelength, object_distance, model, pixel_integration, grid):
     )
 
 
-def _with_phase(camera: LenslessCamera, turns: float) -> LenslessCamera:
+def with_phase(camera: LenslessCamera, turns: float) -> LenslessCamera:
     """The camera with another phase of its mask, in turns."""
     phase = jnp.full_like(_zone_plate(camera).phase, 2 * jnp.pi * turns)
     return eqx.tree_at(lambda c: c.mask.phase, camera, phase)
@@ -163,3 +163,19 @@ def _zone_plate(camera: LenslessCamera) -> FresnelZoneAperture:
             f"phases are those of a FresnelZoneAperture; the camera has a {type(mask).__name__}"
         )
     return mask
+
+
+def without_carrier(
+    frequency: np.ndarray,
+    response: np.ndarray,
+    beta: float,
+    magnification: float,
+    harmonic: int = 1,
+) -> np.ndarray:
+    """A harmonic's response over its carrier e^{jX/m}, X = π²u²M²/β: real, cos(πλdu²) for m = 1.
+
+    - `frequency`: u on the sensor, cycles/mm; `response`: there, at v = 0.
+    - `beta`: rad/mm². `magnification`: M = 1 + d/t of the shadow.
+    """
+    beta = beta / magnification**2
+    return np.real(response * np.exp(-1j * math.pi**2 * frequency**2 / (harmonic * beta)))

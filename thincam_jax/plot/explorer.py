@@ -18,6 +18,7 @@ from thincam_jax._core import checks
 from thincam_jax._core.checks import Number
 from thincam_jax._core.grids import Grid
 from thincam_jax._core.quantity import Quantity
+from thincam_jax.imaging.display import png_bytes
 from thincam_jax.imaging.metrics import align, cut_off, first_common_zero, low_frequency_value, psnr
 from thincam_jax.imaging.scene import ImagePlane, Scene
 from thincam_jax.imaging.sensor import GaussianNoise
@@ -27,7 +28,7 @@ from thincam_jax.lensless.accuracy import select_model
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.capture import capture
 from thincam_jax.lensless.masks.fza import FresnelZoneAperture
-from thincam_jax.lensless.phase_shift import fringe_scanned_otf
+from thincam_jax.lensless.phase_shift import fringe_scanned_otf, with_phase, without_carrier
 from thincam_jax.reconstruction import Cameras, FringeScanning, Recording, Wiener, reconstruct
 from thincam_jax.units import nm
 
@@ -181,7 +182,7 @@ class Explorer:
         scene = Scene(plane, light["wavelength"])
         # A zone aperture takes four captures, whose background cancels.
         scanned = isinstance(camera.mask, FresnelZoneAperture)
-        taken = [_with_phase(camera, step) for step in range(4)] if scanned else [camera]
+        taken = [with_phase(camera, step / 4) for step in range(4)] if scanned else [camera]
         noise = GaussianNoise(_SNR_DB, "without_mean")
         noisy = [capture(one, scene, noise=noise, key=seed) for seed, one in enumerate(taken)]
         recording = Recording(noisy, Cameras(taken, field_shape=field, **light))
@@ -258,11 +259,6 @@ def _with_numbers(camera: LenslessCamera, numbers: dict[str, Any]) -> LenslessCa
     return camera
 
 
-def _with_phase(camera: LenslessCamera, step: int) -> LenslessCamera:
-    """The camera whose zones are moved by so many quarters of a period."""
-    return _with_numbers(camera, {"phase": step * math.pi / 2})
-
-
 @eqx.filter_jit
 def _moving(camera: LenslessCamera, numbers: dict[str, Any]) -> tuple[Any, Any]:
     """The PSF as 256 grey levels, and the OTF along u ≥ 0 at v = 0."""
@@ -285,8 +281,8 @@ def _zero(camera: LenslessCamera, light: dict[str, Any]) -> float | None:
     response = np.asarray(fringe_scanned_otf(camera, **light))
     profile = response[camera.sensor.shape[0] // 2, columns // 2 :]
     u = np.arange(profile.size) / (columns * float(camera.sensor.pitch))
-    beta = float(mask.beta) / (1 + float(camera.distance) / light["object_distance"]) ** 2
-    return first_common_zero(u, [np.real(profile * np.exp(-1j * math.pi**2 * u**2 / beta))])
+    shadow = 1 + float(camera.distance) / light["object_distance"]
+    return first_common_zero(u, [without_carrier(u, profile, float(mask.beta), shadow)])
 
 
 def _stretched(image: np.ndarray) -> np.ndarray:
@@ -298,7 +294,8 @@ def _file(image: np.ndarray, rest: bool) -> bytes:
     """PNG of an image of 0…1 or 256 levels at rest, else JPEG."""
     if image.dtype != np.uint8:
         image = np.round(255 * np.clip(image, 0, 1)).astype(np.uint8)
+    if rest:
+        return png_bytes(image)
     stream = io.BytesIO()
-    how: dict[str, Any] = {"format": "PNG"} if rest else {"format": "JPEG", "quality": _QUALITY}
-    PIL.Image.fromarray(image).save(stream, **how)
+    PIL.Image.fromarray(image).save(stream, format="JPEG", quality=_QUALITY)
     return stream.getvalue()

@@ -1,12 +1,12 @@
 r"""Transfer functions of whole methods: what a synthesis of captures carries of each frequency."""
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 
 from thincam_jax.imaging.metrics import cut_off, first_common_zero
 from thincam_jax.lensless.exposures import Exposure
+from thincam_jax.lensless.phase_shift import without_carrier
 from thincam_jax.lensless.psf import otf
 from thincam_jax.studies.study import Method, Study
 
@@ -57,7 +57,8 @@ def method_response(study: Study, method: Method) -> Response:
         orders = (1,) if method.synthesis == "fringe_scanning" else method.harmonics
         parts = channels[0::2] + 1j * channels[1::2] if orders else ()
         for order, part in zip(orders, parts, strict=True):
-            response = _without_carrier(study, shot, frequency, part, order)
+            shadow = 1 + shot.distance / study.object_distance
+            response = without_carrier(frequency, part, shot.beta, shadow, order)
             signed.append(np.interp(frequency * ratio, frequency, response, right=0.0))
     magnitude = np.sqrt(np.mean(powers, axis=0))
     limit = cut_off(frequency, magnitude)
@@ -96,11 +97,3 @@ def _profile(study: Study, exposure: Exposure) -> np.ndarray:
     )
     rows, columns = study.sensor.shape
     return np.asarray(response[rows // 2, columns // 2 :])
-
-
-def _without_carrier(
-    study: Study, shot: Exposure, u: np.ndarray, channel: np.ndarray, order: int
-) -> np.ndarray:
-    """A response of a harmonic m over e^{jX/m}, X = π²u²/β on the sensor: real, cos(πλdu²)."""
-    beta = shot.beta / (1 + shot.distance / study.object_distance) ** 2
-    return np.real(channel * np.exp(-1j * math.pi**2 * u**2 / (order * beta)))
