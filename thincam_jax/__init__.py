@@ -17,7 +17,7 @@ Lengths are in millimetres, angles in radians, arrays (…, y, x). `help(tc.psf)
 - simulation: `psf`, `otf`, `capture`, `GaussianNoise`, `PoissonGaussianNoise`
 - accuracy: `select_model`, `predict_error`, `plan`, `PsfMethod`
 - reconstruction: `Recording` of `Cameras`, `Psfs` or operators; `reconstruct` by `Wiener`,
-  `FringeScanning`, `AdmmTV`, `Fista`, `Ridge`, `PoissonTV` or `Learned`; `Stream`
+  `FringeScanning`, `AdmmTV`, `Fista`, `Ridge`, `PoissonTV`, `PlugAndPlay` or `Learned`; `Stream`
 - calibration: `fit_psf`, `check_psf`, `fit_separable`, `measured`
 - experiments: `studies`, `design`, `learn`, `plot`, `explore`, `hardware`
 

@@ -19,6 +19,7 @@ from .imaging.sensor import GaussianNoise as GaussianNoise
 from .imaging.sensor import PoissonGaussianNoise as PoissonGaussianNoise
 from .imaging.sensor import Sensor as Sensor
 from .imaging.targets.images import load_image as load_image
+from .learn.plug_and_play import PlugAndPlay as PlugAndPlay
 from .learn.refocusing.use import Learned as Learned
 from .lensless.accuracy import Selection as Selection
 from .lensless.accuracy import predict_error as predict_error

@@ -1,6 +1,7 @@
 """Learned parts: a denoiser, unrolled solvers, refocusing networks, suggestions of designs."""
 
 from thincam_jax.learn.denoiser.network import Denoiser as Denoiser
+from thincam_jax.learn.plug_and_play import PlugAndPlay as PlugAndPlay
 from thincam_jax.learn.refocusing.cameras import RefocusCamera as RefocusCamera
 from thincam_jax.learn.refocusing.network import NetworkOptions as NetworkOptions
 from thincam_jax.learn.refocusing.network import RefocusNetwork as RefocusNetwork

@@ -21,7 +21,6 @@ from thincam_jax.reconstruction.poisson import solve_poisson as solve_poisson
 from thincam_jax.reconstruction.problem import InverseProblem as InverseProblem
 from thincam_jax.reconstruction.problem import total_objective as total_objective
 from thincam_jax.reconstruction.proximal_gradient import solve_fista as solve_fista
-from thincam_jax.reconstruction.proximal_gradient import solve_plug_and_play as solve_plug_and_play
 from thincam_jax.reconstruction.psf_check import PsfCheck as PsfCheck
 from thincam_jax.reconstruction.psf_check import check_psf as check_psf
 from thincam_jax.reconstruction.recording import Reconstruction as Reconstruction

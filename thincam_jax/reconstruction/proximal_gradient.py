@@ -1,19 +1,9 @@
-r"""Proximal gradients: FISTA for any regulariser, and plug and play for any denoiser.
+r"""Proximal gradients: FISTA for any regulariser.
 
 .. math:: E(f) = \tfrac12 \sum_k \|\sqrt{w_k}\,(A_k f - g_k)\|^2 + \tau R(f),\qquad f \ge 0
 
 FISTA with restart applies every A and Aᵀ once in each iteration, and the proximal map of R. Unlike
 ADMM it needs no penalties, and takes any regulariser; it needs more iterations.
-
-A proximal map denoises an image. Replaced by any denoiser D, a filter or a network (plug and play:
-Venkatakrishnan, Bouman, Wohlberg, IEEE GlobalSIP 2013), it is an image prior without a formula. The
-iteration then ends where
-
-.. math:: f = D\big(f - \tfrac1L \nabla E_{\mathrm{misfit}}(f)\big).
-
-With D = prox(τR/L) that is a minimiser of misfit + τR. With others it is an equilibrium, no
-minimum, and certain to exist only if D − 1 is a contraction (Ryu et al., ICML 2019). The stronger
-D, the smoother the image.
 """
 
 import abc
@@ -25,7 +15,6 @@ import jax.numpy as jnp
 import optimistix
 from jaxtyping import Array, Float, PyTree
 
-from thincam_jax._core import checks
 from thincam_jax._core.checks import Number
 from thincam_jax.reconstruction.iterate import (
     Callback,
@@ -38,7 +27,6 @@ from thincam_jax.reconstruction.problem import (
     InverseProblem,
     ScaledProblem,
     compiled_objective,
-    gradient,
     start_image,
     total_misfit,
 )
@@ -51,10 +39,6 @@ from thincam_jax.reconstruction.regularisers import (
     prox,
     zero_dual,
 )
-
-Denoiser = Callable[[Array], Array]
-
-_TOLERANCE = 1e-5
 
 
 class AbstractProximalMap(eqx.Module):
@@ -221,77 +205,3 @@ def solve_fista(
         Schedule(iterations, tolerance),
         callback=callback,
     )
-
-
-class DenoiserMap(AbstractProximalMap):
-    """A denoiser as the proximal map after each gradient step.
-
-    - `unit`: factor of an image before the denoiser.
-    """
-
-    denoiser: Denoiser
-    unit: Float[Array, ""]
-    nonnegative: bool = eqx.field(static=True)
-
-    def start(self, image: Image):
-        return ()
-
-    def __call__(self, image: Image, kept: Parts):
-        image = self.denoiser(image * self.unit) / self.unit
-        return (jnp.maximum(image, 0) if self.nonnegative else image), kept
-
-
-class PlugAndPlay(AbstractScaledMethod):
-    """The iteration of plug and play.
-
-    The objective is the distance of each batch element from a fixed point, ‖f − D(f − ∇E/L)‖.
-    """
-
-    scaled: ScaledProblem
-    solver: Any
-
-    def __init__(self, scaled: ScaledProblem, solver: AcceleratedProximalGradient):
-        self.scaled, self.solver = scaled, solver
-
-    def objective(self, image: Image):
-        return _distance(self, image)
-
-
-def solve_plug_and_play(
-    problem: InverseProblem,
-    denoiser: Denoiser,
-    *,
-    image: Float[Array, "..."] | None = None,
-    brightness: Number = 1.0,
-    iterations: int = 200,
-    callback: Callback | None = None,
-) -> Outcome:
-    """The equilibrium of captures and a denoiser; the problem's τ and R are not used.
-
-    **Arguments**
-
-    - `denoiser`: takes and returns images (*batch, channel, plane, y, x); pure JAX, an
-      `equinox.Module` if it holds arrays (call other code through `jax.pure_callback`).
-    - `image`: to start from; default the uniform image that explains the captures best.
-    - `brightness`: image value that the denoiser gets as 1: for a network of images from 0 to 1
-      the brightness of white.
-    - `iterations`: at most; it ends when a step is shorter than 1e-5 of the image.
-
-    The history's objective is the distance from a fixed point; the image with the least is
-    returned.
-    """
-    start = start_image(problem, image)
-    scaled = ScaledProblem(problem)
-    brightness = checks.positive("brightness", brightness, "the image's unit").astype(start.dtype)
-    proximal = DenoiserMap(denoiser, scaled.image_unit / brightness, problem.nonnegative)
-    method = PlugAndPlay(scaled, AcceleratedProximalGradient(proximal, _TOLERANCE))
-    return iterate(method, start, Schedule(iterations, _TOLERANCE), callback=callback)
-
-
-@eqx.filter_jit
-def _distance(method: PlugAndPlay, image):
-    scaled = method.scaled
-    scaled_image = image / scaled.image_unit
-    step = scaled_image - gradient(scaled.problem, scaled_image)
-    difference = scaled_image - method.solver.proximal(step, ())[0]
-    return jnp.sqrt(jnp.sum(difference**2, axis=(-4, -3, -2, -1))) * scaled.image_unit

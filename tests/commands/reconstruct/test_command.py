@@ -279,6 +279,7 @@ class TestExitCode2:
             (("--method", "ridge", "--tau", 2), "method 'ridge' cannot use tau; leave it out"),
             (("--method", "ridge", "--coupling", "joint"), "method 'ridge' cannot use coupling"),
             (("--method", "ridge", "--ridge", 0), "ridge = 0.0 is not positive"),
+            (("--method", "pnp", "--tau", 2), "method 'pnp' cannot use tau; leave it out, or use"),
             (("--ridge", 1), "method 'admm_tv' cannot use ridge; leave it out, or use 'ridge'"),
             (("--tau", -1), "tau = -1.0 is negative"),
             (("--tau", "nan"), "tau is NaN"),

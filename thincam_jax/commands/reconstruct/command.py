@@ -9,7 +9,7 @@ from typer import Option
 from thincam_jax.commands.terminal import Overrides, fail, say_result, told
 
 # Known without importing JAX; the tests hold them to `options.PSF_METHODS`.
-METHODS = ("auto", "admm-tv", "fista", "ridge")
+METHODS = ("auto", "admm-tv", "fista", "pnp", "ridge")
 
 
 Psf = Annotated[Path, Option(help="Measured PSF: TIFF, PNG or NPY.")]

@@ -31,7 +31,7 @@ from thincam_jax.reconstruction.depth.refocus import increasing
 from thincam_jax.units import parse_quantity
 
 # What works from a measured PSF and prepared captures; "auto" then is admm_tv.
-PSF_METHODS = ("auto", "admm_tv", "fista", "ridge")
+PSF_METHODS = ("auto", "admm_tv", "fista", "pnp", "ridge")
 DEFAULT_TAU, DEFAULT_RIDGE = 2.0, 1.0
 
 # Far beyond any use; its product with the captures' units stays within float32.
@@ -85,7 +85,8 @@ class Recipe:
     """How to reconstruct; see `thincam_jax.reconstruct`.
 
     - `method`: one of `PSF_METHODS`.
-    - `tau`: weight of the variation relative to the noise; None: 2. `iterations`: at most.
+    - `tau`: weight of the variation relative to the noise; None: 2. `iterations`: at most; the
+      method "pnp" has its own.
     - `coupling`: of colours; None: "joint" for several channels.
     - `field`: "sensor" keeps the part of the image in front of the sensor, "full" all that sends
       light to it.
@@ -129,6 +130,10 @@ class Recipe:
         return self.method == "ridge"
 
     @property
+    def has_tau(self) -> bool:
+        return self.method not in ("ridge", "pnp")
+
+    @property
     def relative_tau(self) -> float | int:
         return DEFAULT_TAU if self.tau is None else self.tau
 
@@ -140,6 +145,11 @@ class Recipe:
         """The solver for a capture of so many colour channels."""
         if self.is_ridge:
             return Ridge(self.relative_ridge, iterations=self.iterations)
+        if self.method == "pnp":
+            # Here: other methods need not wait for the learned parts.
+            from thincam_jax.learn.plug_and_play import PlugAndPlay
+
+            return PlugAndPlay()
         variation = TotalVariation(coupling=self.coupling or ("joint" if channels > 1 else "none"))
         if self.method == "fista":
             return Fista(self.relative_tau, regulariser=variation, iterations=self.iterations)
@@ -164,10 +174,10 @@ class Recipe:
         if self.method not in PSF_METHODS:
             raise MeasurementError(f"method = {self.method!r} is unknown; {able}")
         given = {"coupling": self.coupling, "tau": self.tau, "ridge": self.ridge}
-        unused = ("coupling", "tau") if self.is_ridge else ("ridge",)
-        for name in unused:
+        unused = {"ridge": ("coupling", "tau"), "pnp": ("coupling", "tau", "ridge")}
+        for name in unused.get(self.method, ("ridge",)):
             if given[name] is not None:
-                other = "'admm_tv'" if self.is_ridge else "'ridge'"
+                other = "'ridge'" if name == "ridge" else "'admm_tv'"
                 raise MeasurementError(
                     f"method {self.method!r} cannot use {name}; leave it out, or use {other}"
                 )

@@ -234,6 +234,10 @@ def _reconstruct(
     callback = None if report is None or recipe.is_ridge else partial(report, job.name)
     done = reconstruct_prepared(ready, solver, noise, callback=callback, name=str(job.capture))
     found = done.found
+    if found.status == "non_finite" and recipe.method == "pnp":
+        raise measured.MeasurementError(
+            f"{job.capture}: the image became NaN or infinite; use --method admm-tv"
+        )
     if found.status == "non_finite":
         name = "ridge" if recipe.is_ridge else "tau"
         now = recipe.relative_ridge if recipe.is_ridge else recipe.relative_tau
@@ -261,21 +265,21 @@ def _reconstruct(
 
 def _facts(done: PreparedResult, recipe: Recipe) -> dict[str, Any]:
     found, problem = done.found, done.problem
-    is_ridge, prior = recipe.is_ridge, problem.regulariser
+    is_ridge, prior, has_tau = recipe.is_ridge, problem.regulariser, recipe.has_tau
     assert isinstance(prior, TotalVariation)
     variation = {"kind": prior.kind, "coupling": prior.coupling}
     return {
         "method": found.method,
         "asked_for": recipe.method,
         "reason": choose_solver(done.recording)[1] if recipe.method == "auto" else "",
-        "tau": None if is_ridge else recipe.relative_tau,
-        "absolute_tau": None if is_ridge else problem.absolute_tau,
+        "tau": recipe.relative_tau if has_tau else None,
+        "absolute_tau": problem.absolute_tau if has_tau else None,
         "ridge": recipe.relative_ridge if is_ridge else None,
         "noise_standard_deviation": done.pixel_deviation,
-        "variation": None if is_ridge else variation,
+        "variation": variation if has_tau else None,
         "nonnegative": problem.nonnegative and not is_ridge,
         "field_shape": problem.field_shape,
-        "iterations_at_most": recipe.iterations,
+        "iterations_at_most": getattr(recipe.solver(1), "iterations", recipe.iterations),
         "iterations": found.iterations,
         "status": found.status,
         "relative_data_residual": done.relative_residual,

@@ -1,0 +1,164 @@
+"""Plug and play against dense algebra, and what a denoiser gains over its start."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import thincam_jax as tc
+from helpers import compilations, relative_l2
+from thincam_jax.imaging.operators import Matrix, Separable
+from thincam_jax.learn.plug_and_play import noise_mistake, noise_ratio
+from thincam_jax.reconstruction.normal_equations import normal_equations
+
+FIELD, SENSOR = (12, 15), (14, 17)
+SIGMA = 0.05
+
+
+def smooth(image, sigma):
+    """Linear: each pixel drawn halfway to its four neighbours, cyclic, whatever the noise."""
+    around = sum(jnp.roll(image, s, a) for a in (-1, -2) for s in (-1, 1)) / 4
+    return image / 2 + around / 2
+
+
+def operator(seed: int = 0) -> Matrix:
+    rng = np.random.default_rng(seed)
+    modes = np.linalg.svd(rng.normal(size=(238, 180)), full_matrices=False)
+    matrix = modes[0] * np.geomspace(3.0, 0.01, 180) @ modes[2]
+    return Matrix(matrix, FIELD, SENSOR)
+
+
+def scene(batch: int = 1):
+    y, x = np.mgrid[: FIELD[0], : FIELD[1]] / 10
+    return np.stack([0.5 + 0.4 * np.sin(3 * y + k) * (x > 0.6) for k in range(batch)])
+
+
+def recording(batch: int = 1, noise: float = SIGMA, told: float = SIGMA) -> tc.Recording:
+    A, rng = operator(), np.random.default_rng(3)
+    captures = np.asarray(A(jnp.asarray(scene(batch))))
+    captures = captures + noise * rng.normal(size=captures.shape)
+    return tc.Recording(jnp.asarray(captures), A, noise_variance=told**2)
+
+
+def normal_of(seen: tc.Recording, s: float):
+    problem = seen.problem()
+    return normal_equations(problem, jnp.asarray(1 / s**2)), np.asarray(operator().matrix) / SIGMA
+
+
+def test_the_noise_of_a_data_step_is_that_of_the_dense_inverse():
+    """And at most s/2 in any mode."""
+    for s in (0.2, 1.0):
+        normal, matrix = normal_of(recording(), s)
+        inverse = np.linalg.inv(matrix.T @ matrix + np.eye(180) / s**2)
+        covariance = inverse @ matrix.T @ matrix @ inverse
+        values = np.linalg.eigvalsh(covariance)
+        assert values[-1] <= s**2 / 4 * (1 + 1e-9)
+        wanted = np.sqrt(np.sum(values**2) / np.sum(values)) / s
+        found = float(noise_ratio(normal, jnp.asarray(1 / s**2))) / 1.1
+        assert abs(found / wanted - 1) < 0.1  # one random vector
+
+
+def test_noise_that_was_told_wrongly_is_found():
+    for wrong in (0.5, 1.0, 2.0):
+        seen = recording(noise=SIGMA * wrong)
+        normal, matrix = normal_of(seen, 1.0)
+        problem = normal.problem
+        right = jnp.asarray(matrix.T @ np.ravel(problem.captures[0]) / SIGMA).reshape(1, 1, *FIELD)
+        found = normal.solve(right)
+        ratio = float(noise_mistake(normal, found, normal.shift, jnp.ones(())))
+        assert abs(ratio / wrong - 1) < 0.2
+
+
+def test_with_a_linear_denoiser_it_ends_in_the_fixed_point_of_a_quadratic_problem():
+    """f = D M⁻¹(Aᵀwg + μf), for the last s of a long run."""
+    s_ends: list[float] = []
+
+    def watched(image, sigma):
+        s_ends.append(float(jnp.ravel(sigma)[0]))
+        return smooth(image, sigma)
+
+    seen, matrix = recording(), np.asarray(operator().matrix)
+    solver = tc.PlugAndPlay(watched, nonnegative=False, iterations=300, tolerance=0.0)
+    result = tc.reconstruct(seen, solver)
+    assert result.status == "iterations_exhausted" and len(s_ends) == 301
+    pixels = np.eye(180).reshape(180, *FIELD)
+    denoiser = np.asarray(smooth(jnp.asarray(pixels), 0.0)).reshape(180, 180).T
+    capture = np.ravel(seen.captures[0])
+    image = np.ravel(result.image)
+    # One more step with the dense matrices changes nothing, for the μ that explains it best.
+    gains = []
+    for shift in np.geomspace(1e-2, 1e6, 400):
+        system = matrix.T @ matrix + shift * np.eye(180)
+        step = denoiser @ np.linalg.solve(system, matrix.T @ capture + shift * image)
+        gains.append(np.linalg.norm(step - image) / np.linalg.norm(image))
+    assert min(gains) < 5e-3
+
+
+@pytest.mark.parametrize("kind", ["dense", "separable"])
+def test_the_shipped_denoiser_beats_a_linear_estimate(kind):
+    rng = np.random.default_rng(5)
+    truth = np.zeros((32, 27))
+    truth[5:20, 4:15], truth[12:28, 10:24] = 0.9, 0.5
+    if kind == "dense":
+        matrix = np.float32(rng.normal(size=(1000, truth.size)) / 30)
+        A = Matrix(matrix, truth.shape, (40, 25))
+    else:
+        sides = (np.float32(rng.normal(size=size) / 6) for size in ((40, 32), (36, 27)))
+        A = Separable(*sides)
+    capture = np.asarray(A(jnp.asarray(truth, jnp.float32)))
+    capture = capture + 0.1 * rng.normal(size=capture.shape)
+    seen = tc.Recording(jnp.asarray(capture, jnp.float32), A, noise_variance=0.01)
+    found = tc.reconstruct(seen, tc.PlugAndPlay())
+    linear = tc.reconstruct(seen, tc.Ridge())
+    errors = [relative_l2(r.image, truth) for r in (found, linear)]
+    assert errors[0] < 0.7 * errors[1] and float(found.image.min()) >= 0
+    assert found.image.dtype == jnp.float32 and found.method == "pnp"
+    assert found.status in ("converged", "iterations_exhausted")
+
+
+def test_a_batch_is_reconstructed_as_its_images_are():
+    seen, solver = recording(3), tc.PlugAndPlay(smooth, iterations=3)
+    images = tc.reconstruct(seen, solver).image
+    for k in range(3):
+        one = tc.Recording(seen.captures[0][k], operator(), noise_variance=SIGMA**2)
+        assert relative_l2(images[k], tc.reconstruct(one, solver).image) < 1e-6
+
+
+def test_start_callback_and_status():
+    seen, solver = recording(), tc.PlugAndPlay(smooth, iterations=5, tolerance=0.0)
+    done = []
+    stopped = tc.reconstruct(seen, solver, callback=lambda p: done.append(p) or p.iteration == 2)
+    assert stopped.status == "stopped" and stopped.iterations == 2 == done[-1].iteration
+    easy = tc.PlugAndPlay(smooth, iterations=5, tolerance=0.9)
+    assert tc.reconstruct(seen, easy, start=jnp.asarray(scene())).status == "converged"
+    broken = tc.PlugAndPlay(lambda image, sigma: image * jnp.nan, iterations=3)
+    result = tc.reconstruct(seen, broken)
+    assert result.ending == "non_finite" and bool(jnp.isfinite(result.image).all())
+    dark = tc.Recording(jnp.zeros(SENSOR), operator(), noise_variance=SIGMA**2)
+    assert float(jnp.abs(tc.reconstruct(dark, solver).image).max()) == 0
+
+
+def test_strength_and_brightness():
+    """More strength is smoother; images scale with captures and their noise."""
+    seen = recording()
+    soft, hard = (
+        tc.reconstruct(seen, tc.PlugAndPlay(strength=k, iterations=3)).image for k in (1.0, 2.0)
+    )
+    assert float(jnp.abs(jnp.diff(hard)).sum()) < float(jnp.abs(jnp.diff(soft)).sum())
+    captures = tuple(100 * c for c in seen.captures)
+    bright = tc.Recording(captures[0], operator(), noise_variance=(100 * SIGMA) ** 2)
+    again = tc.reconstruct(bright, tc.PlugAndPlay(iterations=3)).image
+    assert relative_l2(again / 100, soft) < 1e-4
+
+
+def test_other_captures_and_strengths_compile_nothing():
+    seen = recording()
+    tc.reconstruct(seen, tc.PlugAndPlay(iterations=2))
+    other = tc.Recording(0.7 * seen.captures[0], operator(), noise_variance=0.02)
+    solver = tc.PlugAndPlay(strength=1.3, iterations=3)
+    assert compilations(lambda: tc.reconstruct(other, solver)) == 0
+
+
+def test_what_is_refused():
+    for given, message in (({"strength": 0.0}, "strength"), ({"iterations": 0}, "iterations")):
+        with pytest.raises(ValueError, match=message):
+            tc.PlugAndPlay(**given)
