@@ -102,8 +102,8 @@ def test_the_shipped_denoiser_beats_a_linear_estimate(kind):
         matrix = np.float32(rng.normal(size=(1000, truth.size)) / 30)
         A = Matrix(matrix, truth.shape, (40, 25))
     else:
-        sides = (np.float32(rng.normal(size=size) / 6) for size in ((40, 32), (36, 27)))
-        A = Separable(*sides)
+        left, right = (np.float32(rng.normal(size=n) / 6) for n in ((40, 32), (36, 27)))
+        A = Separable(left, right)
     capture = np.asarray(A(jnp.asarray(truth, jnp.float32)))
     capture = capture + 0.1 * rng.normal(size=capture.shape)
     seen = tc.Recording(jnp.asarray(capture, jnp.float32), A, noise_variance=0.01)
