@@ -84,8 +84,8 @@ print(f"mask {width:.2f} mm wide, β = {beta} rad/mm²; sensor of {shape} pixels
 
 psf = np.asarray(tc.psf(camera, **light))
 models = ("separable", "paraxial", "geometric")
-line = tc.Grid((1, 4000), width / 4000)  # finer than the pixels, along x
-along = {model: tc.psf(camera, model=model, grid=line, **light)[0] for model in models}
+line = camera.on_grid(tc.Grid((1, 4000), width / 4000))  # finer than the pixels, along x
+along = {model: tc.psf(line, model=model, **light)[0] for model in models}
 
 # %%
 # A capture

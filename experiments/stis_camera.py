@@ -111,7 +111,7 @@ def plate(centre):
 def shadow(mask_at, sensor, grid, wavelength, source, place):
     """What a mask casts, with its middle imaged at a place of the sensor."""
     lensless = tc.LenslessCamera(mask_at(place / (1 + distance / source)), sensor, distance)
-    return tc.psf(lensless, wavelength=wavelength, object_distance=source, grid=grid)
+    return tc.psf(lensless.on_grid(grid), wavelength=wavelength, object_distance=source)
 
 
 grid = kernel_grid(sensor.grid, field)

@@ -170,7 +170,6 @@ CALLS = (
         camera=camera(),
         wavelength=WAVE,
         model=call(tc.PsfMethod, model="separable", precision="float32", pixel_integration=True),
-        grid=call(tc.Grid, shape=(9, 11), pitch=30 * um),
     ),
     *(
         call(f, camera=camera(), wavelength=WAVE, object_distance=250.0)

@@ -88,10 +88,9 @@ def dense(chosen, given):
             chosen.distance[k],
         )
         kernel = tc.psf(
-            camera,
+            camera.on_grid(grid),
             wavelength=chosen.wavelength[k],
             object_distance=100.0,
-            grid=grid,
             pixel_integration=True,
         )
         kernel = np.asarray(kernel)[::-1, ::-1] * pitch**2

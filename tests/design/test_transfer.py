@@ -6,7 +6,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from thincam_jax._core.grids import Grid
 from thincam_jax.design import (
     ObjectiveData,
     Polar,
@@ -64,11 +63,8 @@ def wide(level):
 def test_sums_of_captures_against_simulated_point_spread_functions():
     """Transforms of the PSFs of each capture; measured within 3.8 %."""
     pitch = 0.02
-    grid = Grid((288, 288), pitch)
     images = [
-        np.asarray(
-            psf(camera, wavelength=WAVELENGTH, object_distance=OBJECT, model="separable", grid=grid)
-        )
+        np.asarray(psf(camera, wavelength=WAVELENGTH, object_distance=OBJECT, model="separable"))
         for camera in DESIGN.cameras(Sensor((288, 288), pitch))
     ]
     found = modulation_transfer(DESIGN, data())

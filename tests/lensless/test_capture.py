@@ -181,10 +181,8 @@ def test_single_pixels_and_lines(shape):
     image = photograph(field)
     own = camera(sensor=tc.Sensor(shape, 20 * um))
     value = tc.capture(own, tc.Scene(plane(image), 500 * nm))
-    grid = kernel_grid(own.sensor.grid, field)
-    h = tc.psf(
-        own, wavelength=500 * nm, object_distance=OBJECT_DISTANCE, pixel_integration=True, grid=grid
-    )
+    wide = own.on_grid(kernel_grid(own.sensor.grid, field))
+    h = tc.psf(wide, wavelength=500 * nm, object_distance=OBJECT_DISTANCE, pixel_integration=True)
     windows = np.lib.stride_tricks.sliding_window_view(np.asarray(h), field)
     # the turn of the pinhole and that of the convolution cancel
     expected = (20 * um) ** 2 * np.sum(windows * image, axis=(2, 3))

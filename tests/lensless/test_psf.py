@@ -386,9 +386,10 @@ def test_display_pixels_need_an_edge():
         tc.psf(camera_of(pixel_pitch=0.1), wavelength=WAVELENGTH, model="closed_form")
 
 
-def test_grid_replaces_the_sensor():
-    grid = tc.Grid((3, 4), 0.05)
-    elsewhere = tc.psf(camera_of(), wavelength=WAVELENGTH, model="geometric", grid=grid)
+def test_a_grid_replaces_the_sensor():
+    elsewhere = tc.psf(
+        camera_of().on_grid(tc.Grid((3, 4), 0.05)), wavelength=WAVELENGTH, model="geometric"
+    )
     same = tc.psf(camera_of((3, 4), 0.05), wavelength=WAVELENGTH, model="geometric")
     np.testing.assert_array_equal(elsewhere, same)
 

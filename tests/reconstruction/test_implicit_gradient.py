@@ -39,10 +39,9 @@ def camera_operator(beta, distance, dtype=jnp.float64):
     plates = [tc.FresnelZoneAperture(beta, phase, width=0.84) for phase in (0.0, math.pi)]
     first, second = (
         tc.psf(
-            tc.LenslessCamera(plate, SENSOR, distance),
+            tc.LenslessCamera(plate, SENSOR, distance).on_grid(kernel_grid(SENSOR.grid, FIELD)),
             wavelength=500 * nm,
             object_distance=200.0,
-            grid=kernel_grid(SENSOR.grid, FIELD),
         )
         for plate in plates
     )

@@ -144,12 +144,11 @@ def test_operator_against_rays_through_every_part_of_the_mask():
         )
         lensless = tc.LenslessCamera(moved, camera.sensor, camera.focal_distance)
         return tc.psf(
-            lensless,
+            lensless.on_grid(grid),
             wavelength=wavelength,
             object_distance=distance,
             model="geometric",
             pixel_integration=True,
-            grid=grid,
         )
 
     images = wg.ghost_images(camera, field_of(camera, shape, (5, 5)), OBJECT, ORDERS)

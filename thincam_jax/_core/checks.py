@@ -21,10 +21,11 @@ from thincam_jax._core.text import shortened
 if TYPE_CHECKING:
     Number = Real[ArrayLike, ""]
     Numbers = Real[ArrayLike, "..."]
+    Position = Numbers | Sequence[Number]
     Shape = Sequence[int]
     Checked = Array
 else:
-    Number = Numbers = Shape = Any
+    Number = Numbers = Position = Shape = Any
     Checked = Any  # of NumPy `on_host`
 
 

@@ -257,14 +257,14 @@ def channels_of(design: Design, training: Training) -> tuple[Channel, ...]:
 
 def _kernels(design: Design, training: Training) -> Float[Array, "capture k l"]:
     """The PSF of every capture, in one program."""
-    sensor, there = training.sensor, training.setup.object_distance
+    grid = kernel_grid(training.sensor.grid, training.field_shape)
+    sensor, there = Sensor(grid.shape, grid.pitch), training.setup.object_distance
 
     def kernel(beta, phase, distance, wavelength):
         return psf(
             LenslessCamera(design.mask(beta, phase), sensor, distance),
             wavelength=wavelength,
             object_distance=there,  # pyright: ignore[reportArgumentType]
-            grid=kernel_grid(sensor.grid, training.field_shape),
             pixel_integration=training.setup.pixel_integration,
         )
 

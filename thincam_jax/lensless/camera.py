@@ -1,13 +1,17 @@
 """The lensless camera: a mask at a distance before a sensor."""
 
 import functools
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from thincam_jax._core.checks import Number
+from thincam_jax._core import checks
+from thincam_jax._core.checks import Number, Position
+from thincam_jax._core.grids import Grid
 from thincam_jax._core.module import Module
 from thincam_jax._core.quantity import quantity
 from thincam_jax.imaging.sensor import Sensor, as_sensor
@@ -47,12 +51,24 @@ class LenslessCamera(Module):
     sensor: Sensor = eqx.field(converter=as_sensor)
     distance: Float[Array, ""] = eqx.field(converter=quantity("mm", positive=True))
 
-    def path(self, wavelength: Number, object_distance: Number) -> Path:
-        """The light's path from a point at `object_distance` (mm) in front of the mask."""
+    def on_grid(self, grid: Grid) -> "LenslessCamera":
+        """The camera with the pixels of a grid in place of the sensor's."""
+        return replace(self, sensor=Sensor(grid.shape, grid.pitch))
+
+    def path(self, wavelength: Number, object_distance: Number, at: Position | None = None) -> Path:
+        """The light's path from a point `object_distance` (mm) before the mask, as `psf` has it."""
         # Plain numbers take the camera's precision, so that float32 cameras stay float32. In NumPy,
         # they stay known inside jit.
         like = functools.partial(np.asarray, dtype=self.distance.dtype)
         wavelength = like(wavelength) if isinstance(wavelength, int | float) else wavelength
         if isinstance(object_distance, int | float):
             object_distance = like(object_distance)
-        return Path(wavelength, self.distance, object_distance)
+        if at is None:
+            return Path(wavelength, self.distance, object_distance)
+        if isinstance(at, tuple | list):
+            if all(isinstance(n, int | float) for n in at):
+                at = like(at)
+            elif any(map(checks.is_traced, at)):
+                at = jnp.stack([jnp.asarray(n, self.distance.dtype) for n in at])
+        path = Path(wavelength, self.distance, object_distance, at)
+        return replace(path, skew=path.is_skew(self.mask.centre))

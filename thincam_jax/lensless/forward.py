@@ -82,7 +82,8 @@ def spectral_psf(
     grid: Grid,
 ) -> Float[Array, "y x"]:
     """Sum of the PSFs of (wavelength, weight) pairs."""
-    how = {"object_distance": object_distance, "model": method, "grid": grid}
+    camera = camera.on_grid(grid)
+    how = {"object_distance": object_distance, "model": method}
     parts = (weight * psf(camera, wavelength=wavelength, **how) for wavelength, weight in light)
     return functools.reduce(operator.add, parts)
 

@@ -11,7 +11,6 @@ from jaxtyping import Array, Complex
 
 from thincam_jax._core.arguments import checked
 from thincam_jax._core.checks import Number
-from thincam_jax._core.grids import Grid
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.masks.fza import FresnelZoneAperture
 from thincam_jax.lensless.method import Model, PsfMethod
@@ -57,7 +56,7 @@ def harmonic_otf(
         raise ValueError(f"harmonic = {harmonic!r}; give a whole number from 0 on")
     orders = _zone_plate(camera).orders
     steps = max(orders) - min(orders) + int(harmonic) + 1
-    given = (wavelength, object_distance, model, pixel_integration, None)
+    given = (wavelength, object_distance, model, pixel_integration)
     turns = np.arange(steps) / steps
     weights = np.exp(-2j * np.pi * harmonic * turns) / steps
     responses = (_otf(with_phase(camera, turn), *given) for turn in turns)
@@ -73,7 +72,6 @@ def fringe_scanned_otf(
     object_distance: Number = math.inf,
     model: Model | PsfMethod = "separable",
     pixel_integration: bool = False,
-    grid: Grid | None = None,
 ) -> Complex[Array, "v u"]:
     r"""Fringe-scanned response of a camera with a Fresnel zone aperture, mm².
 
@@ -97,7 +95,7 @@ def fringe_scanned_otf(
 
     **See also**: `phase_pair_otf`, `harmonic_otf`.
     """
-    given = (wavelength, object_distance, model, pixel_integration, grid)
+    given = (wavelength, object_distance, model, pixel_integration)
     h = [_otf(with_phase(camera, turns), *given) for turns in (0.0, 0.25, 0.5, 0.75)]
     quadrature = h[0] - h[2]
     return (h[3] - h[1]) + jnp.asarray(1j, dtype=quadrature.dtype) * quadrature
@@ -111,7 +109,6 @@ def phase_pair_otf(
     object_distance: Number = math.inf,
     model: Model | PsfMethod = "separable",
     pixel_integration: bool = False,
-    grid: Grid | None = None,
 ) -> Complex[Array, "v u"]:
     r"""Response of the difference of two captures with the phases 0 and 3π/2, mm².
 
@@ -134,18 +131,17 @@ def phase_pair_otf(
 
     **See also**: `fringe_scanned_otf`, `harmonic_otf`.
     """
-    given = (wavelength, object_distance, model, pixel_integration, grid)
+    given = (wavelength, object_distance, model, pixel_integration)
     return _otf(with_phase(camera, 0.0), *given) - _otf(with_phase(camera, 0.75), *given)
 
 
-def _otf(camera, wavelength, object_distance, model, pixel_integration, grid):
+def _otf(camera, wavelength, object_distance, model, pixel_integration):
     return otf(
         camera,
         wavelength=wavelength,
         object_distance=object_distance,
         model=model,
         pixel_integration=pixel_integration,
-        grid=grid,
     )
 
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
 
 from thincam_jax._core.arguments import checked
-from thincam_jax._core.checks import Number
+from thincam_jax._core.checks import Number, Position
 from thincam_jax._core.grids import Grid
 from thincam_jax._core.memory import refuse_if_too_large
 from thincam_jax._core.precision import allow, as_complex, cast, precision_of
@@ -29,6 +29,7 @@ from thincam_jax.lensless.propagation.angular_spectrum import angular_spectrum
 from thincam_jax.lensless.propagation.chirp_sum import ChirpSum
 from thincam_jax.lensless.propagation.closed_form import closed_form, in_focus
 from thincam_jax.lensless.propagation.geometric import geometric
+from thincam_jax.lensless.propagation.obliquity import require_off_axis
 from thincam_jax.lensless.propagation.paraxial import paraxial
 from thincam_jax.lensless.propagation.path import Path
 from thincam_jax.lensless.propagation.radial import profile_samples, radial
@@ -36,6 +37,7 @@ from thincam_jax.lensless.propagation.rayleigh_sommerfeld import rayleigh_sommer
 from thincam_jax.lensless.propagation.separable import pixel_nodes, separable
 from thincam_jax.lensless.propagation.separable_field import separable_image
 from thincam_jax.lensless.propagation.separable_sum import SeparableSum, centre_phase
+from thincam_jax.lensless.propagation.skew import PIXEL_POINTS, skew_image
 from thincam_jax.lensless.sampling import require_phase_sampling
 
 
@@ -45,22 +47,24 @@ def psf(
     *,
     wavelength: Number,
     object_distance: Number = math.inf,
+    at: Position | None = None,
     model: Model | PsfMethod = "separable",
     pixel_integration: bool = False,
-    grid: Grid | None = None,
 ) -> Float[Array, "y x"]:
     """Point spread function on the sensor: irradiance relative to the open aperture.
 
     **Arguments**
 
     - `wavelength`: λ, mm.
-    - `object_distance`: t, mm; the point lies on the axis. Infinity is a plane wave.
+    - `object_distance`: t, mm; infinity is a plane wave.
+    - `at`: (y, x) of the point, mm, by default on the axis; of a plane wave the tangents of its
+      angles. The shadow then moves by −d/t of it, and the waves are those about the ray through the
+      mask's middle (`thincam_jax.lensless.propagation.Path`).
     - `model`: "geometric", "paraxial", "closed_form", "separable" (of rings "radial"),
       "angular_spectrum" or "rayleigh_sommerfeld"; each is documented in
       `thincam_jax.lensless.propagation`. A `PsfMethod` sets the precision and the samples of a
       model, too.
     - `pixel_integration`: average over each pixel in place of the value at its centre.
-    - `grid`: where to evaluate; the sensor's pixels by default.
 
     **Returns** (y, x), dimensionless. Differentiable in every number of `camera` and in
     `wavelength` and `object_distance`.
@@ -82,9 +86,9 @@ def psf(
 
     **See also**: `otf`, `select_model`, `capture`.
     """
-    grid = grid or camera.sensor.grid
+    grid = camera.sensor.grid
     method = psf_method(camera.mask, grid, model, pixel_integration)
-    return _evaluate(_psf, camera.mask, grid, camera.path(wavelength, object_distance), method)
+    return _evaluate(_psf, camera.mask, grid, camera.path(wavelength, object_distance, at), method)
 
 
 @checked
@@ -93,9 +97,9 @@ def otf(
     *,
     wavelength: Number,
     object_distance: Number = math.inf,
+    at: Position | None = None,
     model: Model | PsfMethod = "separable",
     pixel_integration: bool = False,
-    grid: Grid | None = None,
 ) -> Complex[Array, "v u"]:
     """Optical transfer function H(u,v) = ∬ h e^{−2πj(ux+vy)} dx dy, zero frequency at n//2, mm².
 
@@ -116,9 +120,9 @@ def otf(
 
     **See also**: `psf`, `fringe_scanned_otf`.
     """
-    grid = grid or camera.sensor.grid
+    grid = camera.sensor.grid
     method = psf_method(camera.mask, grid, model, pixel_integration)
-    return _evaluate(_otf, camera.mask, grid, camera.path(wavelength, object_distance), method)
+    return _evaluate(_otf, camera.mask, grid, camera.path(wavelength, object_distance, at), method)
 
 
 def _irradiance(
@@ -127,6 +131,9 @@ def _irradiance(
     """The PSF in the form in which the model has it: terms where there are terms, else an image."""
     if method.model not in SAMPLED:
         mask = _unfocused(mask, path) if method.model == "closed_form" else mask
+        if method.model == "separable" and path.skew:
+            nodes = (method.nodes or PIXEL_POINTS) if method.pixel_integration else None
+            return skew_image(mask, grid, path, nodes=nodes)
         if method.model == "separable" and not has_few_terms(mask):
             nodes = method.nodes if method.pixel_integration else None
             return separable_image(require_factored(mask, "separable"), grid, path, nodes=nodes)
@@ -183,7 +190,9 @@ def _evaluate(function, mask: AbstractMask, grid: Grid, path: Path, method: PsfM
     """In the method's precision; the result comes back in the camera's."""
     own = precision_of(grid.pitch)
     require_phase_sampling(mask, grid, path, method)
-    if method.model == "separable" and method.pixel_integration and method.nodes is None:
+    require_off_axis(mask, path, method.model)
+    averaged = method.pixel_integration and method.nodes is None
+    if method.model == "separable" and averaged and not path.skew:
         method = replace(method, nodes=pixel_nodes(mask, grid, path, method.float_type))
     if method.model == "radial" and method.oversampling is None:
         method = replace(method, oversampling=profile_samples(mask, grid, path, method))

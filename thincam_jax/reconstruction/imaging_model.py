@@ -117,13 +117,12 @@ class Cameras(Module):
             raise ValueError("object_distance is empty; give one in mm, or one for each plane")
         kernels = []
         for camera, wavelength, ratio in zip(self.cameras, self.wavelengths, ratios, strict=True):
-            grid = kernel_grid(camera.sensor.grid, own_field(field, ratio))
+            wide = camera.on_grid(kernel_grid(camera.sensor.grid, own_field(field, ratio)))
             planes = [
                 psf(
-                    camera,
+                    wide,
                     wavelength=wavelength,
                     object_distance=distance,
-                    grid=grid,
                     model=self.model,
                     pixel_integration=self.pixel_integration,
                 )

@@ -113,8 +113,8 @@ class WienerSynthesis(eqx.Module):
         kernels, uniform = [], []
         for camera, w, ratio in zip(each, cameras.wavelengths, capture_ratios, strict=True):
             own = own_field(self.field_shape, ratio)
-            grid = kernel_grid(sensor, own)
-            h = psf(camera, wavelength=w, object_distance=object_distance, grid=grid, **how)
+            wide = camera.on_grid(kernel_grid(sensor, own))
+            h = psf(wide, wavelength=w, object_distance=object_distance, **how)
             kernels.append(h)
             cover = jnp.asarray(_coverage(own, self.field_shape, ratio), dtype=h.dtype)
             uniform.append(_convolve(CropConvolution(h, sensor.pitch, sensor.shape, own), cover))

@@ -18,7 +18,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Num
 
-from thincam_jax._core.grids import Grid
 from thincam_jax._core.memory import available_bytes, readable
 from thincam_jax._core.precision import PRECISIONS, Precision, allow, cast
 from thincam_jax._core.steps import Step
@@ -88,11 +87,10 @@ def psf_of(
         given = conditions_of(study, exposure)[precision]
         grid = given.camera.sensor.grid
         h = psf(
-            given.camera,
+            given.camera.on_grid(grid.with_shape(shape or grid.shape)),
             wavelength=given.wavelength,
             object_distance=float(given.object_distance),
             model=PsfMethod(model, precision, study.pixel_integration),
-            grid=Grid(shape, grid.pitch) if shape else grid,
         )
     return np.asarray(h)
 
@@ -200,7 +198,7 @@ class PsfErrors:
         """The probe that errors are predicted from, and the PSF that they count from."""
         given = self.given["float64"]
         numbers = given.camera, given.wavelength, given.object_distance
-        probe = probe_of(*numbers, self.study.pixel_integration, None)
+        probe = probe_of(*numbers, self.study.pixel_integration)
         return probe, psf_of(self.study, self.exposure)
 
     def _add(self, method: PsfMethod, cost: Cost) -> None:

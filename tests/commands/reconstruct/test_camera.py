@@ -67,9 +67,9 @@ def test_psf_of_a_mask_larger_than_the_sensor_is_whole(files):
     cameras = read_camera(files["study"], wide[::2], None)
     found = computed_psf(files["study"], cameras)
     (camera,) = cameras.cameras
-    grid = camera.sensor.grid.with_shape((200, 200))
+    camera = camera.on_grid(camera.sensor.grid.with_shape((200, 200)))
     how = {"wavelength": cameras.wavelength, "object_distance": 40.0, "pixel_integration": False}
-    whole = np.asarray(tc.psf(camera, grid=grid, model="geometric", **how))
+    whole = np.asarray(tc.psf(camera, model="geometric", **how))
     rows, columns = ((200 - n) // 2 for n in found.pixels.shape)
     np.testing.assert_allclose(found.pixels, whole[rows : 200 - rows, columns : 200 - columns])
     np.testing.assert_allclose(found.pixels.sum(), whole.sum())

@@ -52,8 +52,7 @@ def errors(request):
         expected = cameras.expected(case)
         ways = [(model, "float32") for model in (*CLOSED, *sampled_models(case))]
         ways += [("separable", "float64")] if number < 60 else []
-        conditions = dict(case.conditions, grid=None)
-        probe = probe_of(case.camera, **conditions)
+        probe = probe_of(case.camera, **case.conditions)
         grid = case.camera.sensor.grid
         for model, precision in ways:
             mask, average = case.camera.mask, probe.pixel_integration
@@ -187,7 +186,7 @@ def test_choice_is_for_the_grid_and_the_average_asked_for():
     """A grid that reaches the mask's edge, and pixels that wash the zones out."""
     middle, edge = tc.Grid((48, 80), 5.5e-3), tc.Grid((48, 80), 0.1)
     errors = [
-        select(camera_of(), 1.0, grid=g).considered[0].predicted_error for g in (middle, edge)
+        select(camera_of().on_grid(g), 1.0).considered[0].predicted_error for g in (middle, edge)
     ]
     assert errors[1] > 10 * errors[0]
     same = select(camera_of(pitch=0.1), 1.0).considered[0]

@@ -38,12 +38,11 @@ def test_exact_and_quick_agree_with_the_sum_over_the_psf(model, average):
     frequencies = sample_frequencies(max(KERNEL))
     probe = TransferProbe(own, KERNEL, frequencies)
     h = tc.psf(
-        own,
+        own.on_grid(tc.Grid(KERNEL, own.sensor.pitch)),
         wavelength=500 * nm,
         object_distance=250.0,
         model=model,
         pixel_integration=average,
-        grid=tc.Grid(KERNEL, own.sensor.pitch),
     )
     expected = direct(h, frequencies)
     scale = np.abs(expected).max()

@@ -354,8 +354,9 @@ def computed_psf(config: Path, cameras: Cameras) -> Raw:
     grid, fringe = camera.sensor.grid, 2 * math.sqrt(wavelength * float(camera.distance))
     shadow = np.asarray(camera.mask.extent) * (1 + float(camera.distance) / distance) + fringe
     pixels = np.ceil(shadow / float(grid.pitch)).astype(int)
-    grid = grid.with_shape(same_parity(np.maximum(pixels, grid.shape).tolist(), grid.shape))
-    image = psf(camera, wavelength=wavelength, object_distance=distance, grid=grid, **how)
+    shape = same_parity(np.maximum(pixels, grid.shape).tolist(), grid.shape)
+    wide = camera.on_grid(grid.with_shape(shape))
+    image = psf(wide, wavelength=wavelength, object_distance=distance, **how)
     numbers = eqx.tree_pformat(camera, width=10_000)  # in one line
     light = f"wavelength {wavelength * 1e6:g} nm, object at {distance:g} mm"
     name = f"camera of {config}: {numbers}, {light}"

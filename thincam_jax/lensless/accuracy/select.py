@@ -88,7 +88,6 @@ def select_model(
     object_distance: Number = math.inf,
     tolerance: float,
     pixel_integration: bool = False,
-    grid: Grid | None = None,
 ) -> Selection:
     r"""The cheapest model and precision whose PSF is within `tolerance` of the best one.
 
@@ -108,7 +107,7 @@ def select_model(
     pixel's average (`thincam_jax.lensless.accuracy.sampled`). How far Fresnel's approximation is
     from exact diffraction is not estimated for these.
 
-    **Arguments**: `wavelength`, `object_distance`, `pixel_integration` and `grid` as for `psf`;
+    **Arguments**: `wavelength`, `object_distance` and `pixel_integration` as for `psf`;
     `tolerance` > 0. Numbers must be known: call it outside of jit and grad.
 
     **Errors**: ValueError for what is out of range; TypeError for traced numbers.
@@ -127,16 +126,16 @@ def select_model(
     """
     tolerance = tolerance_of(tolerance)
     if isinstance(camera, LenslessCamera) and not has_few_terms(camera.mask):
-        grid = grid or camera.sensor.grid
+        grid = camera.sensor.grid
         path = camera.path(wavelength, object_distance)
         _require_known((camera, path, grid))
         found = sampled_errors(camera.mask, grid, path, pixel_integration)
         return _select_sampled(camera.mask, grid, found, tolerance)
-    probe = probe_of(camera, wavelength, object_distance, pixel_integration, grid)
-    sampling_grid = grid or camera.sensor.grid
+    probe = probe_of(camera, wavelength, object_distance, pixel_integration)
+    grid = camera.sensor.grid
     considered: list[Prediction] = []
-    for method, cost in candidates(camera.mask, sampling_grid, pixel_integration):
-        error = predicted_error(probe, camera.mask, sampling_grid, method)
+    for method, cost in candidates(camera.mask, grid, pixel_integration):
+        error = predicted_error(probe, camera.mask, grid, method)
         considered.append(Prediction(method, error, cost))
         if error <= tolerance:
             break
@@ -160,7 +159,6 @@ def predict_error(
     object_distance: Number = math.inf,
     model: Model | PsfMethod,
     pixel_integration: bool = False,
-    grid: Grid | None = None,
 ) -> Prediction:
     """Predicted error and cost of one model; arguments as for `psf`, reference as for
     `select_model`.
@@ -178,8 +176,8 @@ def predict_error(
     **See also**: `select_model`.
     """
     average = as_method(model, pixel_integration).pixel_integration
-    probe = probe_of(camera, wavelength, object_distance, average, grid)
-    grid = grid or camera.sensor.grid
+    probe = probe_of(camera, wavelength, object_distance, average)
+    grid = camera.sensor.grid
     method = psf_method(camera.mask, grid, model, average)
     error = predicted_error(probe, camera.mask, grid, method)
     return Prediction(method, error, psf_cost(camera.mask, grid, method))
@@ -280,16 +278,12 @@ def require_camera(camera: LenslessCamera, function: str) -> AbstractFactoredMas
 
 
 def probe_of(
-    camera: LenslessCamera,
-    wavelength: Number,
-    object_distance: Number,
-    pixel_integration: bool,
-    grid: Grid | None,
+    camera: LenslessCamera, wavelength: Number, object_distance: Number, pixel_integration: bool
 ) -> MaskProbe:
     """The probe of a camera whose numbers are known."""
     mask = require_camera(camera, "select_model")
     path = camera.path(wavelength, object_distance)
-    grid = grid or camera.sensor.grid
+    grid = camera.sensor.grid
     _require_known((camera, path, grid))
     return MaskProbe(mask, grid, path, pixel_integration=pixel_integration)
 

@@ -71,6 +71,6 @@ def _fresnel(camera, scene: Scene, tolerance: float) -> Effect:
         return Effect("exact phases", True, None, "those of exact scalar diffraction are modelled")
     distance = min(float(plane.distance) for plane in scene.planes)
     wavelength = max(float(w) for w in scene.spectrum.wavelengths)
-    size = probe_of(camera, wavelength, distance, True, None).paraxial_error()
+    size = probe_of(camera, wavelength, distance, True).paraxial_error()
     note = _left_out(size, tolerance, "Fresnel's approximation of the PSF")
     return Effect("exact phases", False, size, note)

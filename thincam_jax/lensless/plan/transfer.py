@@ -148,20 +148,14 @@ class SampledProbe:
     def __init__(
         self, camera: LenslessCamera, kernel_shape: tuple[int, int], frequencies: Frequencies
     ) -> None:
-        self.camera, self.frequencies = camera, frequencies
-        self.grid = camera.sensor.grid.with_shape(kernel_shape)
+        self.camera = camera.on_grid(camera.sensor.grid.with_shape(kernel_shape))
+        self.frequencies = frequencies
 
     def quick(
         self, wavelength: float, distance: float, method: PsfMethod
     ) -> Complex[np.ndarray, " k"]:
         """H of the PSF as a plan computes it."""
-        h = psf(
-            self.camera,
-            wavelength=wavelength,
-            object_distance=distance,
-            model=method,
-            grid=self.grid,
-        )
+        h = psf(self.camera, wavelength=wavelength, object_distance=distance, model=method)
         return image_spectrum(np.asarray(h, float)[None], self.frequencies)[0]
 
 

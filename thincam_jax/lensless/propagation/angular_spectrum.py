@@ -10,7 +10,7 @@ from thincam_jax._core.grids import Grid, block_mean, centred_frequencies, fast_
 from thincam_jax._core.precision import as_complex, turn_phasor
 from thincam_jax.lensless.masks.base import AbstractMask
 from thincam_jax.lensless.method import PsfMethod
-from thincam_jax.lensless.propagation.path import Path
+from thincam_jax.lensless.propagation.path import ChiefRay, Path
 
 PADDING = 2.0  # the window of a PSF over mask and sensor side by side
 
@@ -58,8 +58,7 @@ def propagate(
     √(1−s)−1 is formed as −s/(1+√(1−s)), and the phase is reduced in turns.
     Evanescent waves and frequencies above the window's band limit are removed.
     """
-    v = jnp.fft.ifftshift(centred_frequencies(field.shape[0], pitch))[:, None]
-    u = jnp.fft.ifftshift(centred_frequencies(field.shape[1], pitch))
+    v, u = _frequencies(field.shape, pitch)
     s = path.wavelength**2 * (u**2 + v**2)
     carried = (
         (s < 1)
@@ -70,6 +69,50 @@ def propagate(
     turns = -(path.distance / path.wavelength) * s / (1 + jnp.sqrt(1 - s))
     transfer = jnp.where(carried, turn_phasor(turns), 0.0)
     return jnp.fft.ifft2(jnp.fft.fft2(field) * transfer)
+
+
+def propagate_along(
+    ray: ChiefRay, field: Complex[Array, "y x"], pitch: Float[Array, ""], path: Path
+) -> Complex[Array, "y x"]:
+    r"""`propagate` of a field whose carrier is a chief ray, left out before and behind.
+
+    Frequencies ν are counted from the carrier's and the sensor's samples are those of the window
+    itself, d·s/c off the axis; what grows with d is then
+
+    .. math::
+        \sqrt{c^2 - 2\mathbf s\cdot\mathbf q - q^2} - c + \mathbf s\cdot\mathbf q/c, \qquad
+        \mathbf q = \lambda\boldsymbol\nu,
+
+    formed without the parts that cancel. The shadow is where the ray meets the sensor: the window
+    is moved by that, and what lies beyond it is dark.
+    """
+    v, u = _frequencies(field.shape, pitch)
+    down, across = path.wavelength * v, path.wavelength * u
+    squared, along = down**2 + across**2, ray.down * down + ray.across * across
+    left = ray.cosine**2 - 2 * along - squared
+    carried = left > 0
+    slopes = ray.down / ray.cosine, ray.across / ray.cosine
+    for s, other, slope, q, count in zip(
+        (ray.down, ray.across),
+        (ray.across, ray.down),
+        slopes,
+        (down, across),
+        field.shape,
+        strict=True,
+    ):
+        # Light that leaves the window is steeper or flatter than the ray by half of it.
+        half = count * pitch / (2 * path.distance)
+        for end, sign in ((slope + half, 1.0), (slope - half, -1.0)):
+            limit = jnp.sqrt(1 - other**2) * end / jnp.sqrt(1 + end**2) - s
+            carried = carried & (sign * (q - limit) <= 0)
+    root = jnp.sqrt(jnp.where(carried, left, 1.0))
+    total = root + ray.cosine
+    waves = -(squared + along * (2 * along + squared) / (ray.cosine * total)) / total
+    turns = path.distance / path.wavelength * waves
+    moved = [path.distance * slope for slope in slopes]
+    transfer = jnp.where(carried, turn_phasor(turns) * turn_phasor(-v * moved[0]), 0.0)
+    field = jnp.fft.ifft2(jnp.fft.fft2(field) * transfer * turn_phasor(-u * moved[1]))
+    return field
 
 
 def angular_spectrum(
@@ -92,11 +135,17 @@ def angular_spectrum(
     field = lit_mask(within(mask, plane), plane, path)
     window = padded_shape(plane.shape, sensor.shape, padding)
     field = jnp.pad(field, [(0, n - m) for n, m in zip(window, field.shape, strict=True)])
-    field = propagate(field, sensor.pitch, path)
+    ray = path.chief_ray(mask.centre)
+    if ray is None:
+        field = propagate(field, sensor.pitch, path)
+    else:
+        field = propagate_along(ray, field, sensor.pitch, path)
     # Sample j of the sensor is sample j + (mask − sensor)/2 of the periodic window.
     shift = [(s - m) // 2 for s, m in zip(sensor.shape, plane.shape, strict=True)]
     field = jnp.roll(field, shift, axis=(0, 1))[: sensor.shape[0], : sensor.shape[1]]
     irradiance = (field.real**2 + field.imag**2) * path.magnification**2
+    if ray is not None:
+        irradiance = irradiance * _in_window(ray, window, sensor, path)
     if method.pixel_integration:
         return block_mean(irradiance, method.samples)
     middle = slice(method.samples // 2, None, method.samples)
@@ -105,7 +154,8 @@ def angular_spectrum(
 
 def lit_mask(mask: AbstractMask, plane: Grid, path: Path) -> Complex[Array, "y x"]:
     """Field just behind the mask under the exact spherical wave, 1 on the axis, piston dropped."""
-    lit = spherical_wave(plane, path)
+    ray = path.chief_ray(mask.centre)
+    lit = spherical_wave(plane, path) if ray is None else _inclined(ray, mask.centre, plane, path)
     return lit * mask.sample(plane, path.wavelength).astype(lit.dtype)
 
 
@@ -117,6 +167,29 @@ def spherical_wave(plane: Grid, path: Path) -> Complex[Array, "y x"]:
     # sqrt(t² + ρ²) − t without cancellation.
     detour = rho2 * nearness / (1 + stretch)
     return turn_phasor(detour / path.wavelength) * as_complex(1 / stretch)
+
+
+def _inclined(
+    ray: ChiefRay, centre: Float[Array, "2"], plane: Grid, path: Path
+) -> Complex[Array, "y x"]:
+    """The same of a point off the axis: 1 at the mask's middle, without the chief ray's carrier."""
+    y, x = plane.y[:, None] - centre[0], plane.x - centre[1]
+    nearness = ray.cosine / path.object_distance
+    along, rho2 = ray.down * y + ray.across * x, y**2 + x**2
+    growth = 2 * nearness * along + nearness**2 * rho2
+    stretch = jnp.sqrt(1 + growth)
+    detour = (nearness * rho2 - along * growth / (stretch + 1)) / (stretch + 1)
+    return turn_phasor(detour / path.wavelength) * as_complex(1 / stretch)
+
+
+def _in_window(
+    ray: ChiefRay, window: tuple[int, int], sensor: Grid, path: Path
+) -> Float[Array, "y x"]:
+    """1 where the window that the ray carries to the sensor lies, else 0."""
+    reach = [n * sensor.pitch / 2 for n in window]
+    y = jnp.abs(sensor.y - path.distance * ray.down / ray.cosine) <= reach[0]
+    x = jnp.abs(sensor.x - path.distance * ray.across / ray.cosine) <= reach[1]
+    return (y[:, None] & x).astype(sensor.pitch.dtype)
 
 
 def planes(grid: Grid, method: PsfMethod) -> tuple[Grid, Grid]:
@@ -150,6 +223,14 @@ def within(mask: AbstractMask, plane: Grid) -> AbstractMask:
         jnp.any(reach > room * (1 + 1e-5)),
         "the mask is wider than the plane that samples it; give a larger mask_shape (in pixels)",
     )
+
+
+def _frequencies(
+    shape: tuple[int, ...], pitch: Float[Array, ""]
+) -> tuple[Float[Array, "v 1"], Float[Array, " u"]]:
+    """Of the DFT, in its order, along y and along x."""
+    v, u = (jnp.fft.ifftshift(centred_frequencies(n, pitch)) for n in shape)
+    return v[:, None], u
 
 
 def _band_limit(path: Path, window: Float[Array, ""]) -> Float[Array, ""]:

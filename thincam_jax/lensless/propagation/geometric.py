@@ -44,7 +44,7 @@ def geometric(
     terms = mask.irradiance(path.wavelength)
     down, across = terms.rows, terms.columns
     factor = _axis_averages if pixel_integration else _axis_values
-    y, x = grid.y / scale - mask.centre[0], grid.x / scale - mask.centre[1]
+    y, x = path.on_mask(grid, mask.centre)
     if down is across:
         # Both axes at once: half as much to compile.
         both = factor(across, jnp.concatenate([y, x]), grid.pitch / scale)

@@ -1,12 +1,15 @@
 """The light's path: point source, mask, sensor."""
 
 import functools
+import math
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
+from thincam_jax._core.grids import Grid
 from thincam_jax._core.module import Module
 from thincam_jax._core.quantity import quantity
 
@@ -14,14 +17,27 @@ _positive_or_infinite = functools.partial(checks.positive, unit="mm", allow_infi
 
 
 class Path(Module):
-    """A point source on the axis at distance t before the mask, a sensor at d behind it.
+    r"""A point source at distance t before the mask, a sensor at d behind it.
 
     In the Fresnel approximation a spherical wave from t over d acts like a plane wave over d/M,
     magnified by M = (t+d)/t (thesis Eq 3.2): PSF(x; t, d) = PSF(x/M; ∞, d/M).
 
+    Off the axis the waves are expanded to second order about the chief ray, the one through the
+    mask's middle, with the unit vector (s, c), s across the axis. The light on a point u of the
+    mask's scale is then
+
+    .. math::
+        U(\mathbf u) = \frac{\sqrt{\det B}}{j\pi} \int t(\boldsymbol\xi)\,
+            e^{j(\mathbf u-\boldsymbol\xi)^T B (\mathbf u-\boldsymbol\xi)}\,d^2\xi,
+        \qquad B = \frac{\pi M c}{\lambda d}\,(I - \mathbf s\mathbf s^T)
+
+    for d/c along the ray: d/c³ in the plane of incidence and d/c across it, the same M.
+
     - `wavelength`: λ, mm.
     - `distance`: d, mm, > 0.
     - `object_distance`: t, mm, > 0; infinity is a plane wave.
+    - `at`: (y, x) of the point, mm; of a plane wave, the tangents of its angles. None on the axis.
+    - `skew`: whether the point is, or may be, off both of the mask's axes.
     """
 
     wavelength: Float[Array, ""] = eqx.field(converter=quantity("mm", check=checks.wavelength))
@@ -29,6 +45,10 @@ class Path(Module):
     object_distance: Float[Array, ""] = eqx.field(
         default=jnp.inf, converter=quantity("mm", check=_positive_or_infinite)
     )
+    at: Float[Array, "2"] | None = eqx.field(
+        default=None, converter=quantity("mm", shape=(2,), optional=True)
+    )
+    skew: bool = eqx.field(default=False, static=True)
 
     @property
     def magnification(self) -> Float[Array, ""]:
@@ -43,3 +63,64 @@ class Path(Module):
     def epsilon(self, beta: Float[Array, ""]) -> Float[Array, ""]:
         """ε = βλd/(πM), the strength of diffraction; at ε = 1 order −1 focuses on the sensor."""
         return beta * self.wavelength * self.distance / (jnp.pi * self.magnification)
+
+    def on_mask(
+        self, grid: Grid, centre: Float[Array, "2"]
+    ) -> tuple[Float[Array, " rows"], Float[Array, " columns"]]:
+        """Rows and columns of the sensor on the mask's scale, from the middle of its shadow."""
+        y, x, scale = grid.y, grid.x, self.magnification
+        if self.at is not None:
+            moved = self.distance * self._tangents
+            y, x = y + moved[0], x + moved[1]
+        return y / scale - centre[0], x / scale - centre[1]
+
+    def chief_ray(self, centre: Float[Array, "2"]) -> "ChiefRay | None":
+        """Of a mask with this centre (y, x), mm; None on the axis."""
+        if self.at is None:
+            return None
+        slopes = centre / self.object_distance - self._tangents
+        cosine = 1 / jnp.sqrt(1 + jnp.sum(slopes**2))
+        return ChiefRay(slopes[0] * cosine, slopes[1] * cosine, cosine)
+
+    def along_axes(self, centre: Float[Array, "2"]) -> tuple["Path", "Path"]:
+        r"""The paths on the axis whose waves are those along y and along x, of the same M.
+
+        Their distances are :math:`\tfrac dc(1 + s_i^2/c^2)`: the diagonal of B⁻¹. For a point on
+        one of the mask's axes the waves are products of the two.
+        """
+        ray = self.chief_ray(centre)
+        if ray is None:
+            return self, self
+        infinite = jnp.isinf(self.object_distance)
+        near = jnp.where(infinite, 1.0, self.object_distance)
+        stretched = ((1 + (s / ray.cosine) ** 2) / ray.cosine for s in (ray.down, ray.across))
+        down, across = (
+            Path(self.wavelength, self.distance * n, jnp.where(infinite, jnp.inf, near * n))
+            for n in stretched
+        )
+        return down, across
+
+    def is_skew(self, centre: Float[Array, "2"]) -> bool:
+        """Whether the chief ray is oblique to both axes of a mask; True of traced numbers."""
+        if self.at is None:
+            return False
+        if any(map(checks.is_traced, (self.at, self.object_distance, centre))):
+            return True
+        distance = float(np.asarray(self.object_distance))
+        seen = np.asarray(self.at) / (1.0 if math.isinf(distance) else distance)
+        return bool(np.all(np.asarray(centre) / distance != seen))
+
+    @property
+    def _tangents(self) -> Float[Array, "2"]:
+        """Of the angles at which the point is seen from the axis."""
+        assert self.at is not None
+        infinite = jnp.isinf(self.object_distance)
+        return self.at / jnp.where(infinite, 1.0, self.object_distance)
+
+
+class ChiefRay(eqx.Module):
+    """Unit vector of the ray from a point through the mask's middle: along y, x and the axis."""
+
+    down: Float[Array, ""]
+    across: Float[Array, ""]
+    cosine: Float[Array, ""]

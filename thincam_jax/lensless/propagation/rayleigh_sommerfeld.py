@@ -9,14 +9,14 @@ from thincam_jax._core.precision import turn_phasor
 from thincam_jax.lensless.masks.base import AbstractMask
 from thincam_jax.lensless.method import PsfMethod
 from thincam_jax.lensless.propagation.angular_spectrum import lit_mask, planes, within
-from thincam_jax.lensless.propagation.path import Path
+from thincam_jax.lensless.propagation.path import ChiefRay, Path
 
 # Sensor samples done together: bounds the memory to this many copies of the mask plane.
 _BATCH = 64
 
 
 def rayleigh_sommerfeld_field(
-    field: Complex[Array, "v u"], plane: Grid, sensor: Grid, path: Path
+    field: Complex[Array, "v u"], plane: Grid, sensor: Grid, path: Path, ray: ChiefRay | None = None
 ) -> Complex[Array, "y x"]:
     r"""First Rayleigh-Sommerfeld integral as a midpoint sum over the samples of the mask plane.
 
@@ -28,14 +28,20 @@ def rayleigh_sommerfeld_field(
     with the piston e^{jkd} dropped and R − d formed as ρ²/(R+d). Right while neighbouring samples
     of the summand differ by less than half a turn: Δ·(ν + ρ/(λR)) < ½ for a field of local
     frequency ν. Work and time grow with the product of both planes' samples.
+
+    With a `ray` the field is without its carrier, and R is counted from the ray's,
+    R − D − s·u for its length D = d/c and u from where it would pass.
     """
     d, wavelength = path.distance, path.wavelength
     wavenumber = 2 * jnp.pi / wavelength
 
     def at(point):
-        rho2 = (point[0] - plane.y[:, None]) ** 2 + (point[1] - plane.x) ** 2
-        distance = jnp.sqrt(d**2 + rho2)
-        turns = rho2 / (distance + d) / wavelength
+        y, x = point[0] - plane.y[:, None], point[1] - plane.x
+        distance = jnp.sqrt(d**2 + y**2 + x**2)
+        if ray is None:
+            turns = (y**2 + x**2) / (distance + d) / wavelength
+        else:
+            turns = _behind_ray(ray, d, y, x, distance) / wavelength
         scale = d / distance**2 * plane.pitch**2 / (2 * jnp.pi)
         kernel = jax.lax.complex(scale / distance, -wavenumber * scale)
         return jnp.sum(field * kernel * turn_phasor(turns))
@@ -43,6 +49,15 @@ def rayleigh_sommerfeld_field(
     y, x = jnp.meshgrid(sensor.y, sensor.x, indexing="ij")
     points = jnp.stack([y.ravel(), x.ravel()], axis=-1)
     return jax.lax.map(at, points, batch_size=_BATCH).reshape(sensor.shape)
+
+
+def _behind_ray(ray: ChiefRay, d, y, x, distance):
+    """R − D − s·u, mm, without what cancels."""
+    length = d / ray.cosine
+    y, x = y - length * ray.down, x - length * ray.across
+    along, squared = ray.down * y + ray.across * x, y**2 + x**2
+    total = distance + length
+    return (squared - along * (2 * length * along + squared) / total) / total
 
 
 def rayleigh_sommerfeld(
@@ -56,7 +71,7 @@ def rayleigh_sommerfeld(
     plane, fine = planes(grid, method)
     sensor = fine if method.pixel_integration else grid
     field = rayleigh_sommerfeld_field(
-        lit_mask(within(mask, plane), plane, path), plane, sensor, path
+        lit_mask(within(mask, plane), plane, path), plane, sensor, path, path.chief_ray(mask.centre)
     )
     irradiance = (field.real**2 + field.imag**2) * path.magnification**2
     return block_mean(irradiance, method.samples) if method.pixel_integration else irradiance

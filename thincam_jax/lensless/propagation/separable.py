@@ -108,7 +108,7 @@ def separable(
     scale = path.magnification
     lower, upper, weights = pairs(terms.coefficients)
 
-    def products(factors, x):
+    def products(factors, path, x):
         if not pixel_integration:
             fields = axis_fields(factors, path, x)
             return fields[lower, :] * jnp.conj(fields[upper, :])
@@ -122,12 +122,13 @@ def separable(
         average = as_complex(jnp.asarray(node_weights / 2, dtype=x.dtype))[:, None, None]
         return jnp.sum(average * fields[:, lower] * jnp.conj(fields[:, upper]), axis=0)
 
-    y, x = grid.y / scale - mask.centre[0], grid.x / scale - mask.centre[1]
-    if pixel_integration and down is across:
+    y, x = path.on_mask(grid, mask.centre)
+    along_y, along_x = path.along_axes(mask.centre)
+    if pixel_integration and down is across and along_y is along_x:
         # Both axes at once: half as much to compile, and as fast.
-        both = products(across, jnp.concatenate([y, x]))
+        both = products(across, along_x, jnp.concatenate([y, x]))
         rows, columns = jnp.split(both, [grid.shape[0]], axis=-1)
     else:
         # One axis a core: a quarter faster.
-        rows, columns = products(down, y), products(across, x)
+        rows, columns = products(down, along_y, y), products(across, along_x, x)
     return SeparableSum(weights[:, None] * rows, columns, grid)

@@ -26,20 +26,20 @@ def separable_image(
     pixels hold many fringes, against 1/√nodes of a square of as many Gauss nodes.
     """
     terms = mask.terms(path.wavelength)
-    scale = path.magnification
-    y, x = grid.y / scale - mask.centre[0], grid.x / scale - mask.centre[1]
-    pitch = grid.pitch / scale
+    y, x = path.on_mask(grid, mask.centre)
+    along_y, along_x = path.along_axes(mask.centre)
+    pitch = grid.pitch / path.magnification
     cells = None if terms.rows.curvatures is not None else _cells(terms)
 
     @jax.checkpoint
     def irradiance(place: Float[Array, "2"]) -> Float[Array, "y x"]:
         down, across = y + place[0] * pitch, x + place[1] * pitch
         if cells is None:
-            rows = terms.coefficients[:, None] * axis_fields(terms.rows, path, down)
-            columns = axis_fields(terms.columns, path, across)
+            rows = terms.coefficients[:, None] * axis_fields(terms.rows, along_y, down)
+            columns = axis_fields(terms.columns, along_x, across)
         else:
-            rows = _cell_fields(terms.rows.edges, path, down)
-            columns = _cell_fields(terms.columns.edges, path, across)
+            rows = _cell_fields(terms.rows.edges, along_y, down)
+            columns = _cell_fields(terms.columns.edges, along_x, across)
             if len(rows) <= len(columns):
                 columns = product(cells, columns)
             else:

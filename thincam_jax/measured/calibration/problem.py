@@ -106,13 +106,13 @@ class FitState(eqx.Module):
 
     def _psf(self, pixel_integration: bool, grid: Grid | None, phase) -> Float[Array, "y x"]:
         turned = self.mask.phase + phase
+        camera = eqx.tree_at(lambda camera: camera.mask.phase, self.camera, turned)
         return psf(
-            eqx.tree_at(lambda camera: camera.mask.phase, self.camera, turned),
+            camera if grid is None else camera.on_grid(grid),
             wavelength=self.wavelength,
             object_distance=1 / self.nearness,  # pyright: ignore[reportArgumentType]
             model="separable",
             pixel_integration=pixel_integration,
-            grid=grid,
         )
 
     def moved(self, names: tuple[str, ...], steps: Float[Array, " unknown"]) -> "FitState":

@@ -1,0 +1,251 @@
+"""PSFs of points off the axis against the direct sum, and their limits, slopes and precision."""
+
+import warnings
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import thincam_jax as tc
+from helpers import count_traces
+from thincam_jax.lensless.accuracy.lines import SparseGrid
+from thincam_jax.lensless.method import AccuracyWarning
+from thincam_jax.lensless.propagation.angular_spectrum import lit_mask
+from thincam_jax.lensless.propagation.rayleigh_sommerfeld import rayleigh_sommerfeld_field
+from thincam_jax.units import deg, nm, um
+
+SENSOR = tc.Sensor((9, 12), 150 * um)
+DISTANCE, INF = 5.0, float("inf")
+
+
+def plate(centre=(0.0, 0.0), **m):
+    return tc.FresnelZoneAperture(60.0, 0.4, width=1.2, height=1.0, centre=centre, **m)
+
+
+def mura(centre=(0.0, 0.0)):
+    return tc.ModifiedUniformlyRedundantArray(11, cell=0.1, centre=centre)
+
+
+def tangents(angle, azimuth):
+    """(y, x) of a direction; exactly 0 where it lies along an axis."""
+    along = np.array([np.sin(azimuth * deg), np.cos(azimuth * deg)])
+    return np.where(np.abs(along) < 1e-12, 0.0, np.tan(angle * deg) * along)
+
+
+def relative(found, expected):
+    return np.linalg.norm(found - expected) / np.linalg.norm(expected)
+
+
+def seen(mask, angle, azimuth, distance, **how):
+    """The PSF of a point under an angle, on a sensor under the middle of its shadow."""
+    tangent = tangents(angle, azimuth)
+    camera = tc.LenslessCamera(mask(tuple(DISTANCE * tangent)), SENSOR, DISTANCE)
+    at = tangent if distance == INF else (distance + DISTANCE) * tangent
+    return np.asarray(
+        tc.psf(camera, wavelength=500 * nm, object_distance=distance, at=at, **how), float
+    )
+
+
+def direct(mask, angle, azimuth, distance):
+    """The same by the sum over the mask, which lies on the axis, and where the ray meets."""
+    tangent = tangents(angle, azimuth)
+    at = tangent if distance == INF else distance * tangent
+    own = mask()
+    path = tc.LenslessCamera(own, SENSOR, DISTANCE).path(500 * nm, distance, at)
+    moved = DISTANCE * tangent / np.asarray(SENSOR.pitch)
+    rows, columns = (
+        np.arange(n) - (n - 1) / 2 - m for n, m in zip(SENSOR.shape, moved, strict=True)
+    )
+    points = SparseGrid(rows, columns, SENSOR.pitch)
+    return np.abs(_field(own, path, points)) ** 2 * (1 + DISTANCE / distance) ** 2
+
+
+@jax.jit
+def _field(mask, path, points):
+    plane = tc.Grid((900, 900), jnp.maximum(*mask.extent) / 900)
+    ray = path.chief_ray(mask.centre)
+    return rayleigh_sommerfeld_field(lit_mask(mask, plane, path), plane, points, path, ray)
+
+
+# --- against the Rayleigh-Sommerfeld integral -----------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("angle", "azimuth", "distance"),
+    [
+        (20, 0, INF),
+        pytest.param(20, 45, INF, marks=pytest.mark.thorough),
+        pytest.param(30, 45, 60.0, marks=pytest.mark.thorough),
+    ],
+)
+def test_closed_form_against_the_direct_sum(angle, azimuth, distance):
+    """2 to 5 %, as on the axis; the axis' PSF is 11 to 16 % off."""
+    exact = direct(plate, angle, azimuth, distance)
+    error = relative(seen(plate, angle, azimuth, distance), exact)
+    assert error < 0.06
+    assert error < relative(seen(plate, 0, 0, distance), exact) / 2
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize(("angle", "most"), [(20, 0.005), (30, 0.01)])
+def test_averages_over_pixels_are_within_a_percent(angle, most):
+    """β = 25 rad/mm², d = 6.5 mm, against the angular spectrum; the axis' PSF is 4 and 11 % off."""
+    tangent = tangents(angle, 0)
+    sensor, light = tc.Sensor((64, 96), 22 * um), {"wavelength": 500 * nm, "at": tangent}
+
+    def camera(centre):
+        mask = tc.FresnelZoneAperture(25.0, 0.4, width=2.0, height=1.2, centre=centre)
+        return tc.LenslessCamera(mask, sensor, 6.5)
+
+    moved = camera(tuple(6.5 * tangent))
+    sampled = tc.PsfMethod("angular_spectrum", oversampling=9)
+    exact = tc.psf(moved, model=sampled, pixel_integration=True, **light)
+    assert relative(tc.psf(moved, pixel_integration=True, **light), exact) < most
+    on_axis = tc.psf(camera((0.0, 0.0)), wavelength=500 * nm, pixel_integration=True)
+    assert relative(on_axis, exact) > 5 * most
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("mask", [plate, mura])
+def test_angular_spectrum_along_the_ray(mask):
+    """Samples of the hard edges differ; as far off the axis as on it."""
+    errors = [
+        relative(
+            seen(mask, angle, 45, INF, model=tc.PsfMethod("angular_spectrum", oversampling=31)),
+            direct(mask, angle, 45, INF),
+        )
+        for angle in (0, 25)
+    ]
+    assert errors[1] < 1.2 * errors[0]
+    assert errors[0] < 0.08
+
+
+# --- limits, slopes, precision --------------------------------------------------------------------
+
+
+def camera_of(beta=25.0, distance=6.5, width=2.0, centre=(0.0, 0.0)):
+    mask = tc.FresnelZoneAperture(beta, 0.3, width=width, centre=centre)
+    return tc.LenslessCamera(mask, tc.Sensor((20, 27), 80 * um), distance)
+
+
+def psf(at, beta=25.0, distance=6.5, wavelength=500 * nm, object_distance=100.0):
+    camera = camera_of(beta, distance)
+    return tc.psf(camera, wavelength=wavelength, object_distance=object_distance, at=at)
+
+
+@pytest.mark.parametrize("distance", [INF, pytest.param(100.0, marks=pytest.mark.thorough)])
+def test_on_the_axis_it_is_the_psf_of_the_axis(distance):
+    expected = tc.psf(camera_of(), wavelength=500 * nm, object_distance=distance)
+    anywhere = jax.jit(lambda at: psf(at, object_distance=distance))
+    for at in ((0.0, 0.0), (0.0, 1e-9), (1e-9, 1e-9)):
+        assert relative(anywhere(jnp.asarray(at)), expected) < 1e-6
+    assert relative(psf((0.0, 0.0), object_distance=distance), expected) < 1e-12
+
+
+def test_along_an_axis_both_forms_agree():
+    """That of products, and that of a point which may be anywhere."""
+    for at in ((0.0, 20.0), (-30.0, 0.0)):
+        assert relative(jax.jit(psf)(jnp.asarray(at)), psf(at)) < 1e-12
+
+
+def test_the_shadow_moves_against_the_point():
+    """By −d/t of it: the middle of the light of a wide pinhole."""
+    camera = tc.LenslessCamera(tc.Pinhole(0.5), tc.Sensor((60, 80), 40 * um), 6.5)
+    at = np.array([10.0, -14.0])
+    h = np.asarray(
+        tc.psf(camera, wavelength=500 * nm, object_distance=100.0, at=at, model="geometric")
+    )
+    y, x = np.asarray(camera.sensor.grid.y), np.asarray(camera.sensor.grid.x)
+    middle = np.array([h.sum(1) @ y, h.sum(0) @ x]) / h.sum()
+    np.testing.assert_allclose(middle, -6.5 / 100.0 * at, atol=0.02)
+
+
+@pytest.mark.thorough
+def test_slopes():
+    """On the axis, too."""
+    weights = np.random.default_rng(0).normal(size=(20, 27))
+
+    @jax.jit
+    def value(numbers):
+        at, rest = numbers[:2], numbers[2:]
+        return jnp.sum(weights * psf(at, *rest))
+
+    slope = jax.jit(jax.grad(value))
+    for place in ((0.0, 0.0), (12.0, 21.0)):
+        numbers = jnp.asarray([*place, 25.0, 6.5, 500 * nm, 100.0])
+        for k, step in enumerate((1e-4, 1e-4, 1e-5, 1e-6, 1e-10, 1e-4)):
+            moved = jnp.zeros(6).at[k].set(step)
+            difference = (value(numbers + moved) - value(numbers - moved)) / (2 * step)
+            np.testing.assert_allclose(slope(numbers)[k], difference, rtol=2e-4, atol=2e-6)
+
+
+def test_batches_and_new_values_are_one_program():
+    points = jnp.asarray([[12.0, 21.0], [0.0, -5.0], [3.0, 0.0]])
+    counted = count_traces(psf)
+    batch = jax.jit(jax.vmap(counted))
+    found = batch(points)
+    batch(points + 1.0)
+    assert counted.traces == 1
+    for h, at in zip(found, points, strict=True):
+        np.testing.assert_allclose(h, psf(np.asarray(at)), atol=1e-10)
+
+
+@pytest.mark.parametrize("at", [(0.0, 36.0), (25.0, 25.0)])
+def test_single_precision(at):
+    sensor = tc.Sensor((40, 50), 100 * um)
+    mask = tc.FresnelZoneAperture(25.0, 0.3, width=5.632)
+    camera = tc.LenslessCamera(mask, sensor, 6.5)
+    exact, single = (
+        tc.psf(
+            camera,
+            wavelength=500 * nm,
+            object_distance=100.0,
+            at=at,
+            model=tc.PsfMethod("separable", precision),
+        )
+        for precision in ("float64", "float32")
+    )
+    assert relative(np.asarray(single, float), exact) < 1e-4
+
+
+def test_light_of_the_open_aperture_is_1():
+    """Far inside the shadow, at 20°, by each model."""
+    camera = tc.LenslessCamera(tc.Pinhole(3.0), tc.Sensor((5, 6), 20 * um), 2.0)
+    for model in ("geometric", "separable", tc.PsfMethod("angular_spectrum", oversampling=5)):
+        h = tc.psf(camera, wavelength=500 * nm, at=(0.0, np.tan(20 * deg)), model=model)
+        np.testing.assert_allclose(np.mean(h), 1.0, atol=0.03)
+
+
+# --- what is refused ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("model", ["closed_form", "paraxial"])
+def test_models_of_the_axis_say_so(model):
+    with pytest.raises(
+        ValueError, match=f"{model!r} is for points on the axis: leave `at` out, or"
+    ):
+        tc.psf(camera_of(), wavelength=500 * nm, at=(0.0, 0.1), model=model)
+
+
+def test_cells_off_both_axes_name_the_sampled_model():
+    camera = tc.LenslessCamera(mura(), SENSOR, DISTANCE)
+    with pytest.raises(TypeError, match=r"on one of its axes only; give at = \(y, 0\) or \(0, x\)"):
+        tc.psf(camera, wavelength=500 * nm, at=(0.1, 0.1))
+    h = tc.psf(camera, wavelength=500 * nm, at=(0.1, 0.1), model="angular_spectrum")
+    assert np.all(np.isfinite(h))
+
+
+def test_steep_light_is_warned_of():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        tc.psf(camera_of(width=5.632), wavelength=500 * nm, at=(0.0, np.tan(30 * deg)))
+    with pytest.warns(AccuracyWarning, match="at 60° waves of third order"):
+        tc.psf(camera_of(width=5.632), wavelength=500 * nm, at=(0.0, np.tan(60 * deg)))
+
+
+@pytest.mark.filterwarnings("ignore:at 16")
+def test_focus_off_both_axes_is_refused():
+    """Order −1 of β = 967 rad/mm² focuses on a sensor at 6.5 mm."""
+    with pytest.raises(Exception, match="an order focuses nearly on the sensor; use 'angular"):
+        psf((0.2, 0.2), beta=940.0, object_distance=INF)
