@@ -105,10 +105,17 @@ def test_the_interpolated_profile(average):
             assert not average
             samples = 512
         method = tc.PsfMethod("radial", "float64", average, samples, nodes=nodes)
-        exact = jax.jit(radial, static_argnums=3)(
-            camera.mask, grid, path, tc.PsfMethod("radial", None, average, nodes=nodes)
-        )
-        assert relative_l2(psf(camera, model=method), exact) < PROFILE_ERROR
+        interpolated = psf(camera, model=method)
+        method = tc.PsfMethod("radial", None, average, nodes=nodes)
+        for first in (0, 35):
+            # Columns at an edge and in the middle are those of a narrow sensor, the mask moved.
+            x = float(jnp.mean(grid.x[first : first + 5]))
+            beside = centre[0], centre[1] - x / (1 + distance / 250.0)
+            narrow = camera_of(shape=(96, 5), distance=distance, centre=beside)
+            exact = jax.jit(radial, static_argnums=3)(
+                narrow.mask, narrow.sensor.grid, path, method
+            )
+            assert relative_l2(interpolated[:, first : first + 5], exact) < PROFILE_ERROR
 
 
 def test_angular_spectrum_approaches_it():
@@ -116,11 +123,11 @@ def test_angular_spectrum_approaches_it():
     camera = camera_of([1.0, 0.0, 0.6], 0.06, (40, 48), 10 * um, 20.0, (0.0, 0.0))
     exact = psf(camera)
     methods = [
-        tc.PsfMethod("angular_spectrum", oversampling=n, mask_shape=(150, 150)) for n in (1, 3, 9)
+        tc.PsfMethod("angular_spectrum", oversampling=n, mask_shape=(150, 150)) for n in (1, 9)
     ]
-    errors = [relative_l2(psf(camera, model=method), exact) for method in methods]
-    assert errors[0] > 3 * errors[2]
-    assert errors[2] < 4e-3
+    coarse, fine = (relative_l2(psf(camera, model=method), exact) for method in methods)
+    assert coarse > 3 * fine
+    assert fine < 4e-3
 
 
 def test_choice_meets_the_tolerance():
