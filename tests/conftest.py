@@ -22,9 +22,13 @@ os.environ.setdefault(
 )
 os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1" if os.environ["XLA_FLAGS"] else "0")
 
+# JAX shortens tracebacks also of errors that are caught.
+os.environ.setdefault("JAX_TRACEBACK_FILTERING", "off")
+
 import jax
 import jaxtyping
 import pytest
+from checked_types import checked
 from jax._src.interpreters import mlir
 
 from helpers import ROOT
@@ -51,6 +55,7 @@ if os.environ["XLA_FLAGS"]:
     mlir.make_ir_context = lambda: CONTEXT if mlir.ir.Context.current is None else NEW_CONTEXT()
 
 # Before the first import of the package: from here on every annotated call is checked.
+jaxtyping.jaxtyped = checked
 jaxtyping.install_import_hook("thincam_jax", "beartype.beartype")
 
 
