@@ -1,19 +1,16 @@
 """Transforms by parity against the sums that they stand for."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from thincam_jax.design.cosine_transforms import (
-    both_signs,
-    fold,
-    half_places,
-    series,
-    transform,
-    unfold,
-    waves,
-)
+from thincam_jax.design import cosine_transforms
+from thincam_jax.design.cosine_transforms import both_signs, half_places
 
+COMPILED = ("fold", "transform", "waves", "series")
+fold, transform, waves, series = (jax.jit(getattr(cosine_transforms, n)) for n in COMPILED)
+unfold = jax.jit(cosine_transforms.unfold, static_argnums=1)
 SHAPES = [(6, 9), (7, 4), (1, 5)]
 
 

@@ -15,49 +15,60 @@ from thincam_jax.reconstruction import phase_pairs
 
 FREQUENCIES = Polar(96.0, 128, 2)
 DATA = (setup(prior=PowerLaw(2.8)), jnp.asarray(phase_pairs(2)), FREQUENCIES)
-KNOWN = channels(thesis_design(), *DATA)
-MODEL = ResponseModel(two_betas(), *DATA, 16)
-POINT = jnp.array([0.6, 0.3])
+POINT = (0.6, 0.3)
 
 
-def test_levels_are_means_over_rings():
+@pytest.fixture(scope="module")
+def known():
+    return jax.jit(lambda design: channels(design, *DATA))(thesis_design())
+
+
+@pytest.fixture(scope="module")
+def model():
+    return ResponseModel(two_betas(), *DATA, 16)
+
+
+def test_levels_are_means_over_rings(known):
     """Against sums by hand; above the noise the ratio in dB, in it 0."""
-    levels = ring_levels(KNOWN, FREQUENCIES, 16)
-    ratio, weight = np.asarray(KNOWN.signal_to_noise), np.asarray(KNOWN.weight)
+    levels = ring_levels(known, FREQUENCIES, 16)
+    ratio, weight = np.asarray(known.signal_to_noise), np.asarray(known.weight)
     for ring in (0, 5, 15):
         inside = slice(8 * ring, 8 * ring + 8)
         mean = np.sum((ratio * weight)[:, inside]) / np.sum(weight[:, inside])
         np.testing.assert_allclose(levels[ring], 10 * np.log10(1 + mean), rtol=1e-12)
-    loud = replace(KNOWN, response=1e3 * KNOWN.response)
+    loud = replace(known, response=1e3 * known.response)
     gained = ring_levels(loud, FREQUENCIES, 16) - levels
     np.testing.assert_allclose(gained[:2], 60.0, atol=0.2)
-    quiet = replace(KNOWN, response=1e-6 * KNOWN.response)
+    quiet = replace(known, response=1e-6 * known.response)
     assert np.all(ring_levels(quiet, FREQUENCIES, 16) < 1e-3)
 
 
-def test_misfit_is_the_root_mean_square():
-    levels = ring_levels(KNOWN, FREQUENCIES, 16)
-    np.testing.assert_allclose(response_misfit(KNOWN, FREQUENCIES, levels + 3.0), 3.0, rtol=1e-12)
+def test_misfit_is_the_root_mean_square(known):
+    levels = ring_levels(known, FREQUENCIES, 16)
+    np.testing.assert_allclose(response_misfit(known, FREQUENCIES, levels + 3.0), 3.0, rtol=1e-12)
     apart = levels.at[3].add(4.0)
-    np.testing.assert_allclose(response_misfit(KNOWN, FREQUENCIES, apart), 1.0, rtol=1e-12)
-    assert response_misfit(KNOWN, FREQUENCIES, levels) < 1e-12
+    np.testing.assert_allclose(response_misfit(known, FREQUENCIES, apart), 1.0, rtol=1e-12)
+    assert response_misfit(known, FREQUENCIES, levels) < 1e-12
 
 
 @pytest.mark.thorough
-def test_slopes():
+def test_slopes(model):
     """Against differences of fourth order, and a number where the misfit is 0."""
-    target = MODEL.levels(POINT) + jnp.linspace(-1.0, 3.0, 16)
-    value = jax.jit(lambda p, w: MODEL.misfit(p, w))
-    slope = jax.jit(jax.grad(MODEL.misfit))
+    point = jnp.asarray(POINT)
+    target = model.levels(point) + jnp.linspace(-1.0, 3.0, 16)
+    value = jax.jit(lambda p, w: model.misfit(p, w))
+    slope = jax.jit(jax.grad(model.misfit))
     for direction in np.eye(2):
-        expected = finite_difference(lambda p: value(p, target), POINT, direction, 2e-6)
-        np.testing.assert_allclose(slope(POINT, target) @ direction, expected, rtol=1e-5)
-    assert np.all(np.isfinite(slope(POINT, MODEL.levels(POINT))))
+        expected = finite_difference(lambda p: value(p, target), point, direction, 2e-6)
+        np.testing.assert_allclose(slope(point, target) @ direction, expected, rtol=1e-5)
+    assert np.all(np.isfinite(slope(point, model.levels(point))))
 
 
 @pytest.mark.thorough
-def test_order_of_captures_does_not_matter():
-    np.testing.assert_allclose(MODEL.levels(POINT), MODEL.levels(POINT[::-1]), rtol=1e-9)
+def test_order_of_captures_does_not_matter(model):
+    np.testing.assert_allclose(
+        model.levels(jnp.asarray(POINT)), model.levels(jnp.asarray(POINT[::-1])), rtol=1e-9
+    )
 
 
 def test_errors():

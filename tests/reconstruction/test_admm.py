@@ -111,8 +111,11 @@ def relaxed(splitting, relaxation, state):
 
 
 @jax.jit
-def stepped(splitting, relaxation, state, count):
-    return jax.lax.fori_loop(0, count, lambda _, s: relaxed(splitting, relaxation, s), state)
+def stepped(splitting, relaxation, image, count):
+    """The image after so many iterations from another."""
+    start = splitting.start(image)
+    state = jax.lax.fori_loop(0, count, lambda _, s: relaxed(splitting, relaxation, s), start)
+    return splitting.image(state)
 
 
 def weighed(problem, factors):
@@ -126,7 +129,7 @@ def solved(problem, *, relaxation=1.8, factors=(0.1, 0.1, 0.1), iterations=1500,
     splitting = weighed(problem, factors)
     image = jnp.zeros(problem.image_shape, problem.tau.dtype) if image is None else image
     relaxation = jnp.asarray(relaxation, problem.tau.dtype)
-    return splitting.image(stepped(splitting, relaxation, splitting.start(image), iterations))
+    return stepped(splitting, relaxation, image, iterations)
 
 
 def reference(given: Case) -> np.ndarray:

@@ -8,6 +8,7 @@ derivatives are directly comparable.
 from collections.abc import Callable
 from typing import Literal, get_args
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
@@ -111,6 +112,7 @@ def _padded(image):
     return jnp.pad(image, [(0, 0)] * (image.ndim - 2) + [(1, 1), (1, 1)], mode="edge")
 
 
+@jax.jit
 def _laplacian(image):
     f = _padded(image)
     rows = f[..., :-2, 1:-1] + f[..., 2:, 1:-1]
@@ -118,6 +120,7 @@ def _laplacian(image):
     return rows + columns - 4 * image
 
 
+@jax.jit
 def _squared_gradient(image):
     """|∇f|² by Sobel's differences, per pixel."""
     f = _padded(image)
