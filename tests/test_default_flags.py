@@ -43,6 +43,7 @@ def has_avx512() -> bool:
         return False
 
 
+@pytest.mark.thorough
 @pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="these sets are of x86")
 @pytest.mark.parametrize("instructions", ["SSE4_2", "AVX2"])
 def test_digits_are_kept_by_each_instruction_set(instructions):

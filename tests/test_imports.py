@@ -104,6 +104,7 @@ def test_help_is_a_page_of_names():
         assert operator.attrgetter(name)(tc) is not None
 
 
+@pytest.mark.thorough
 def test_sub_packages_are_attributes_and_wait_for_their_use():
     rooms = ("design", "hardware", "imaging", "learn", "measured", "studies", "units", "waveguide")
     before, after = imported_in_turn(

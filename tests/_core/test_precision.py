@@ -33,7 +33,7 @@ def conditions(precision):
 
 
 @pytest.mark.parametrize("average", [False, pytest.param(True, marks=pytest.mark.thorough)])
-@pytest.mark.parametrize("model", quick(MODELS, 0, 3))
+@pytest.mark.parametrize("model", quick(MODELS, 3))
 def test_double_precision_without_the_switch(model, average):
     """The float64 result, rounded once: bit by bit, while JAX knows float32 only."""
     small = {"width": 0.5, "pitch": 0.01} if model == "angular_spectrum" else {}

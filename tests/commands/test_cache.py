@@ -99,6 +99,7 @@ def test_switch(monkeypatch, tmp_path, options, switch, kept):
     assert len(calls) == kept
 
 
+@pytest.mark.thorough
 def test_second_run_reads_what_the_first_has_compiled(tmp_path):
     """Also where a program is damaged, and where another was not written to its end."""
     told = ("JAX_COMPILATION", "JAX_PERSISTENT", "TF_CPP")  # by these tests' own process

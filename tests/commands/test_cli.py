@@ -50,6 +50,7 @@ def file(tmp_path):
     return tiny.write(tmp_path)
 
 
+@pytest.mark.thorough
 def test_run_prints_the_results_and_where_the_report_is(tmp_path):
     """All options at once; the same command a second time ends with the same figures."""
     methods, targets = (

@@ -45,17 +45,18 @@ def test_schema_takes_it_and_no_number_without_its_unit(path):
     assert not validator.is_valid(raw | {"colour": 1})
 
 
-DESIGNS = ("design_both", "design_distances", "design_light", "design_pareto", "design_slm")
+DESIGNS = [path.stem for path in FILES if path.stem.startswith("design")]
+STUDIES = ("flatcam", "fza_admm_tv", "fza_harmonics", "moving", "mura")
 
 
 def but(*slow):
-    """Every file; those that take more than 5 s are thorough."""
+    """Every file; some are thorough, as others are of their kind."""
     marks = {name: [pytest.mark.thorough] for name in slow}
     files = [pytest.param(path, marks=marks.get(path.stem, [])) for path in FILES]
     return pytest.mark.parametrize("path", files, ids=lambda path: path.stem)
 
 
-@but(*DESIGNS, "flatcam", "learned_refocus")
+@but(*DESIGNS, *STUDIES, "fza_superresolution", "learned_refocus", "sts_calibration")
 def test_dry_run(path, tmp_path):
     out, options = tmp_path / "out", []
     if path.stem == "denoiser":  # photographs that are not shipped
@@ -119,7 +120,7 @@ class TestExplain:
         assert rows["sensor.full_well: 13500.0"] == "default"
         assert rows["noise.snr_db: 40.0"] == "--set noise.snr_db=40"
 
-    @but("design_slm")
+    @but("design_slm", *STUDIES[:-1])
     def test_every_file(self, path):
         result = call("explain", path)
         assert result.exit_code == 0, result.output

@@ -108,6 +108,7 @@ def test_of_even_responses_in_closed_form(monkeypatch):
     assert found.channels.shape == (2, 64)
 
 
+@pytest.mark.thorough
 def test_differences_are_named_by_what_is_added():
     scanned = np.array([[0.0, -1.0, 0.0, 1.0], [-1.0, 0.0, 0.0, 0.0]])
     assert modulation_transfer(DESIGN, data(synthesis=scanned)).sums == (((4,), (2,)), ((1,), ()))

@@ -172,6 +172,7 @@ def killed_and_resumed(file, checks, delay):
     return train_model(TASK, MODEL, OPTIONS, state=state).state
 
 
+@pytest.mark.thorough
 def test_a_killed_process_goes_on_to_the_same_bits(tmp_path):
     whole = train_model(TASK, MODEL, OPTIONS).state
     assert eqx.tree_equal(killed_and_resumed(tmp_path / "state", 2, 0.02), whole)

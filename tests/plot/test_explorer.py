@@ -26,6 +26,7 @@ def explorer():
     return Explorer(CAMERA, wavelength=500 * nm)
 
 
+@pytest.mark.thorough
 def test_the_psf_is_that_of_the_camera_as_it_is_set(explorer):
     explorer.turn({"beta": 17.0, "distance": 6.0, "wavelength": 600.0, "object_distance": 90.0})
     assert explorer.light == {"wavelength": pytest.approx(600 * nm), "object_distance": 90.0}

@@ -162,6 +162,7 @@ def test_low_rank_operators_take_proximal_gradients():
     assert relative_l2(found, slow) < 0.02
 
 
+@pytest.mark.thorough
 def test_a_matrix_with_a_uniform_part_is_started_from_a_uniform_image():
     """Within 3 % of the minimum after ten iterations; from a black one it is 80 times that."""
     rng = np.random.default_rng(4)

@@ -30,6 +30,7 @@ def zeros(problem):
     return jnp.zeros(problem.image_shape, problem.captures[0].dtype)
 
 
+@pytest.mark.thorough
 def test_it_finds_the_minimum_that_admm_finds():
     problem, truth = scenes.problem((12, 14), (8, 9), kernel=scenes.spots)
     settings = {"iterations": 600, "tolerance": 1e-7}

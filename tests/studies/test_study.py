@@ -26,6 +26,7 @@ def result():
     return tiny.study().run()
 
 
+@pytest.mark.thorough
 def test_scores_are_those_of_the_file(result, tmp_path):
     folder = RunFolder(tmp_path / "run")
     run_study(file.built(tmp_path), folder, file.ignore)

@@ -78,6 +78,7 @@ def test_a_training_is_told_and_gone_on_with(file, tmp_path):
     assert "is damaged or cut off" in line(call(file, "--out", out, "--resume"))
 
 
+@pytest.mark.thorough
 def test_the_file_makes_the_camera(file):
     config = load_as(LearnedConfig, file)
     assert described(build_camera(config)) == described(tiny.network().camera)

@@ -123,6 +123,7 @@ def test_noise_that_is_given(grey, tmp_path):
     assert done["noise_standard_deviation"] == pytest.approx(1.5 / (4095 * brightest), rel=1e-5)
 
 
+@pytest.mark.thorough
 def test_flip_full_field_and_a_linear_image_alone(grey, tmp_path):
     """A TIFF of floats; 180° turned, with what lies beside the sensor."""
     settings = ("--bits", 12, "--background", 40, "--iterations", 20)
@@ -472,6 +473,7 @@ def test_check_of_files_too_small_is_one_line(grey):
     assert "give at least 32 a side" in one_line(check(grey, "--downsample", 2))
 
 
+@pytest.mark.thorough
 def test_crop_of_the_captures_with_the_whole_psf(grey, tmp_path):
     out = tmp_path / "image.npy"
     more = ("--background", grey["dark"], "--bits", 12, "--method", "ridge")

@@ -304,6 +304,7 @@ class TestCheck:
         assert "not a whole number of cells of pixel_pitch" in line
 
 
+@pytest.mark.thorough
 def test_pictures_alone_give_a_report(tmp_path, home):
     """Without a chart nothing is resolved; a target may be called like one of the figures."""
     only = f"targets=[{{name: mtf, kind: file, path: {tmp_path / 'picture.png'}}}]"

@@ -204,6 +204,7 @@ def test_a_network_is_trained_and_explains_its_captures(camera, images):
     assert np.all(trained.consistency(batch.capture, batch.deviation) < 10)
 
 
+@pytest.mark.thorough
 def test_a_simulator_by_parts_of_the_mask_agrees_where_nothing_is_hidden(camera):
     """It shares the optics; what is hidden it finds another way."""
     rng = np.random.default_rng(3)

@@ -25,7 +25,8 @@ def deep(request):
     ("deep", "tolerance", "most_psfs"),
     [
         pytest.param((16, 11), 0.3, 1, marks=pytest.mark.thorough),
-        ((16, 11), 1e-2, 20),
+        ((6, 5), 1e-2, 20),
+        pytest.param((16, 11), 1e-2, 20, marks=pytest.mark.thorough),
         pytest.param((32, 31), 0.1, 4, marks=pytest.mark.thorough),
         pytest.param((32, 31), 1e-2, 20, marks=pytest.mark.thorough),
         pytest.param((32, 31), 1e-3, 150, marks=pytest.mark.thorough),
@@ -39,8 +40,8 @@ def test_error_is_within_the_tolerance_with_few_psfs(deep, tolerance, most_psfs)
     planned = tc.capture(camera(), whole, model=plan)
     true = relative_l2(planned, full)
     assert true <= plan.predicted_error <= tolerance
-    assert len(plan.distances) * len(plan.wavelengths) <= most_psfs  # of 176 or 992
-    assert plan.cost.flops < 0.25 * plan.full_cost.flops
+    assert len(plan.distances) * len(plan.wavelengths) <= most_psfs  # of 30, 176 or 992
+    assert plan.cost.flops < (0.7 if len(whole.planes) == 6 else 0.25) * plan.full_cost.flops
 
 
 @pytest.mark.thorough

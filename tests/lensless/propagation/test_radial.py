@@ -112,9 +112,7 @@ def test_the_interpolated_profile(average):
             x = float(jnp.mean(grid.x[first : first + 5]))
             beside = centre[0], centre[1] - x / (1 + distance / 250.0)
             narrow = camera_of(shape=(96, 5), distance=distance, centre=beside)
-            exact = jax.jit(radial, static_argnums=3)(
-                narrow.mask, narrow.sensor.grid, path, method
-            )
+            exact = jax.jit(radial, static_argnums=3)(narrow.mask, narrow.sensor.grid, path, method)
             assert relative_l2(interpolated[:, first : first + 5], exact) < PROFILE_ERROR
 
 
