@@ -90,26 +90,32 @@ def real(name: str, value: Any, unit: str, *, shape: tuple[int, ...] = ()) -> Ch
             raise ValueError(f"{name} is NaN; give a number in {unit}")
     array: Checked
     if known is None:
-        array = _floating(value)
+        array = as_array(value, floating=True)
     elif _ON_HOST.get():
         array = cast(Any, known)
     else:
         # A plain number stays known inside jit, so that sizes can depend on it.
         with jax.ensure_compile_time_eval():
-            array = _floating(value)
+            array = as_array(value, floating=True)
     if array.shape != shape:
         wanted = "one number" if shape == () else f"an array of shape {shape}"
         raise ValueError(f"{name} has shape {array.shape}; give {wanted} in {unit}")
     return array
 
 
-def _floating(value: Any) -> Array:
-    """A floating array of the value's precision, without the weak type of a plain number.
+def as_array(value: Any, *, floating: bool = False) -> Array:
+    """A value for JAX in its own precision; `floating`: whole numbers become floating ones.
 
-    A weak type would be compiled for once more.
+    `jnp.asarray` would compile a program for each shape of a NumPy array, and give a plain number a
+    weak type, for which programs are compiled once more.
     """
+    if not isinstance(value, jax.Array) and not any(map(is_traced, jax.tree.leaves(value))):
+        known = np.asarray(value)
+        if floating and known.dtype.kind in "iub":
+            known = known.astype(float)
+        return jax.device_put(known, may_alias=False)
     array = jnp.asarray(value)
-    if not jnp.issubdtype(array.dtype, jnp.floating):
+    if floating and array.dtype.kind in "iub":
         array = array.astype(float)
     return jax.lax.convert_element_type(array, array.dtype)
 
@@ -135,7 +141,7 @@ def array(name: str, value: Any, *, allow_complex: bool = False) -> Array:
         known = jnp.asarray(value)
         _require_numbers(name, value, known.dtype, allow_complex)
         return known
-    return jnp.asarray(numbers(name, value, allow_complex=allow_complex))
+    return as_array(numbers(name, value, allow_complex=allow_complex))
 
 
 def _require_numbers(name: str, value: Any, dtype: np.dtype, allow_complex: bool) -> None:

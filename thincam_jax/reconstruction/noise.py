@@ -174,8 +174,14 @@ def estimate_variance(
     that what depends on the estimate scales with the captures; of 1 if they are all zero.
     """
     masks = [None] * len(captures) if valid is None else valid
-    pairs = zip(captures, masks, strict=True)
-    found = jnp.stack([jnp.mean(estimate_noise(c, m) ** 2) for c, m in pairs])
+    deviations = [estimate_noise(c, m) for c, m in zip(captures, masks, strict=True)]
+    return _variances(deviations, list(captures))
+
+
+@jax.jit
+def _variances(deviations, captures):
+    """Their squares; a thousandth of the root mean square of all captures in place of 0."""
+    found = jnp.stack([jnp.mean(d**2) for d in deviations])
     least = 1e-6 * jnp.mean(jnp.stack([jnp.mean(c**2) for c in captures]))
     return jnp.where(found > 0, found, jnp.where(least > 0, least, 1))
 
@@ -186,8 +192,10 @@ def given_variances(
 ) -> Float[Array, " capture"]:
     """The variance given, of each capture, averaged over its batch."""
     count = len(captures)
-    each = checks.array("noise_variance", noise_variance).astype(captures[0].dtype)
-    known = 0 if checks.is_traced(each) else np.asarray(each)
+    each = checks.array("noise_variance", noise_variance)
+    numpy = jnp if checks.is_traced(each) else np
+    each = numpy.asarray(each, captures[0].dtype)
+    known = 0 if checks.is_traced(each) else each
     if not np.all((known >= 0) & np.isfinite(known)):
         raise ValueError(
             f"noise_variance = {noise_variance} is negative or not finite; give variances in the "
@@ -198,5 +206,5 @@ def given_variances(
             f"noise_variance has shape {each.shape}; give one number or one for each of the "
             f"{count} captures"
         )
-    each = jnp.broadcast_to(each.reshape(each.shape or (1,)), (count, *each.shape[1:]))
-    return jnp.mean(each.reshape(count, -1), axis=1)
+    each = numpy.broadcast_to(each.reshape(each.shape or (1,)), (count, *each.shape[1:]))
+    return checks.as_array(numpy.mean(each.reshape(count, -1), axis=1))

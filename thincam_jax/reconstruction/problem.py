@@ -316,8 +316,7 @@ def _each(value, count: int) -> list:
 
 def as_real(capture: Any) -> Float[Array, "..."]:
     """A capture as floating-point numbers, raw counts unscaled; complex numbers are refused."""
-    capture = checks.array("a capture", capture)
-    return capture if jnp.issubdtype(capture.dtype, jnp.floating) else capture.astype(float)
+    return checks.as_array(checks.array("a capture", capture), floating=True)
 
 
 def _check_operators(operators, captures) -> None:

@@ -9,7 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from thincam_jax._core import checks
 from thincam_jax._core.checks import Number, Numbers
@@ -261,8 +261,7 @@ class Recording(Module):
         for number, (capture, valid) in enumerate(zip(*self._masked_captures(), strict=True)):
             if checks.is_traced(capture) or checks.is_traced(valid):
                 continue
-            with jax.ensure_compile_time_eval():  # captures may be known inside jit
-                largest = float(jnp.max(jnp.abs(capture)))  # NaN, where one is
+            largest = float(np.max(np.abs(capture)))  # NaN, where one is
             if not math.isfinite(largest):
                 raise ValueError(
                     f"captures[{number}] holds NaN or infinity; repair it, or exclude such pixels "
@@ -280,13 +279,13 @@ class Recording(Module):
         """A mask for each capture."""
         shapes = [c.shape for c in self.captures]
         if not isinstance(valid, tuple | list):
-            valid = jnp.asarray(valid)
+            valid = valid if checks.is_traced(valid) else np.asarray(valid)
             valid = list(valid) if valid.ndim > len(shapes[0]) else [valid]
         if len(valid) == 1:
             valid = [*valid] * len(shapes)
         try:
             pairs = zip(valid, shapes, strict=True)
-            return tuple(jnp.broadcast_to(jnp.asarray(m, bool), s) for m, s in pairs)
+            return tuple(_mask(m, s) for m, s in pairs)
         except ValueError:
             given = [jnp.shape(m) for m in valid]
             raise ValueError(
@@ -298,13 +297,13 @@ class Recording(Module):
         if self.valid is None:
             return list(self.captures), [None] * len(self.captures)
         pairs = list(zip(self.captures, self.valid, strict=True))
-        return [jnp.where(m | jnp.isfinite(c), c, 0) for c, m in pairs], [m for _, m in pairs]
+        return [_without_invalid(c, m) for c, m in pairs], [m for _, m in pairs]
 
     def _variances(self, matrix: np.ndarray, captures, valid) -> list[Float[Array, ""]]:
         """Variances of sums of captures: as given, or estimated where none or zero is given."""
 
         def sums(each: Float[Array, " capture"]) -> list[Float[Array, ""]]:
-            return [jnp.sum(jnp.asarray(row**2, each.dtype) * each) for row in matrix]
+            return _sums(np.asarray(matrix**2, each.dtype), each)
 
         if self.noise_variance is None:
             return sums(self._estimated(captures, valid))
@@ -347,6 +346,22 @@ class Recording(Module):
             matrix, ratios = separate(len(captures)), [1.0] * len(captures)
             kernels = list(model.psfs.astype(captures[0].dtype))  # type: ignore[union-attr]
         return matrix, [Channel(row, kernels, captures, valid, ratios) for row in matrix]
+
+
+def _mask(valid: Any, shape: tuple[int, ...]) -> Bool[Array, "..."]:
+    if checks.is_traced(valid):
+        return jnp.broadcast_to(valid.astype(bool), shape)
+    return checks.as_array(np.broadcast_to(np.asarray(valid, bool), shape))
+
+
+@jax.jit
+def _without_invalid(capture, valid):
+    return jnp.where(valid | jnp.isfinite(capture), capture, 0)
+
+
+@jax.jit
+def _sums(weights: Float[Array, "sum part"], parts: Float[Array, " part"]):
+    return list(jnp.sum(weights * parts, axis=1))
 
 
 def _convolutions(channels, variances, pitch, field_shape, settings) -> InverseProblem:

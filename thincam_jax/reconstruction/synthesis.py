@@ -148,8 +148,7 @@ class Channel:
     ):
         used = [(float(w), k) for k, w in enumerate(row) if w]
         self.ratio = ratios[used[0][1]]
-        self.kernel = functools.reduce(operator.add, [w * kernels[k] for w, k in used])
-        whole = functools.reduce(operator.add, [w * captures[k] for w, k in used])
+        self.kernel, whole = _weighted_sum(used, kernels), _weighted_sum(used, captures)
         self.capture = with_channel(register(whole, self.ratio), 2)
         self.valid = None
         if valid[0] is not None or self.ratio > 1:
@@ -160,6 +159,12 @@ class Channel:
             # the interpolation also overshoots.
             seen = register(both.astype(captures[0].dtype), self.ratio)
             self.valid = with_channel(jnp.abs(seen - 1) < 0.01, 2)
+
+
+def _weighted_sum(used: Sequence[tuple[float, int]], parts: Sequence[Array]) -> Array:
+    # A factor of 1 would be one more copy, and one more program.
+    scaled = [parts[k] if w == 1 else w * parts[k] for w, k in used]
+    return functools.reduce(operator.add, scaled)
 
 
 def with_channel(capture: Array, axes: int) -> Array:

@@ -183,17 +183,16 @@ def require_size(name: str, shape: Any, count: int, what: str) -> tuple[int, ...
 
 def real_numbers(name: str, value: Any) -> Float[Array, "..."]:
     """Finite floating numbers as an array; whole numbers become floating ones."""
-    array = jnp.asarray(value)
+    array = checks.as_array(value)
     if jnp.issubdtype(array.dtype, jnp.integer):
-        array = array.astype(float)
+        array = checks.as_array(value, floating=True)
     if not jnp.issubdtype(array.dtype, jnp.floating):
         raise TypeError(f"{name} holds {array.dtype}; give real numbers")
     if not checks.is_traced(array):
         wrong = array.size - int(np.isfinite(np.asarray(array)).sum())
         if wrong:
             raise ValueError(f"{name} holds {wrong} numbers that are not finite; give finite ones")
-    # Without the weak type of a plain number, which would be compiled for once more.
-    return jax.lax.convert_element_type(array, array.dtype)
+    return array
 
 
 def real_matrix(name: str, value: Any) -> Float[Array, "i j"]:

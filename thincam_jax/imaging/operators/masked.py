@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, DTypeLike, Float, PRNGKeyArray, PyTree
 
+from thincam_jax._core import checks
 from thincam_jax._core.checks import Numbers
 from thincam_jax.imaging.operators.base import (
     AbstractOperator,
@@ -110,7 +111,7 @@ def _times(capture, gain):
 
 
 def _boolean(name: str, value) -> Bool[Array, "..."]:
-    array = jnp.asarray(value)
+    array = checks.as_array(value)
     if array.dtype != jnp.bool_:
         raise TypeError(
             f"{name} has dtype {array.dtype}; give booleans, True where a pixel counts (weights "

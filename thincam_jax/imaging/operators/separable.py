@@ -1,5 +1,6 @@
 """A camera whose rows and columns are coded independently, or that is a sum of few such cameras."""
 
+import functools
 import math
 
 import equinox as eqx
@@ -102,11 +103,11 @@ class Separable(AbstractOperator):
 
     def __call__(self, image: Float[Array, "..."]) -> Float[Array, "..."]:
         require_shape("image", image, self.in_shape)
-        return _between(self.left, image, jnp.swapaxes(self.right, 1, 2))
+        return _between(self.left, image, self.right)
 
     def adjoint(self, capture: Float[Array, "..."]) -> Float[Array, "..."]:
         require_shape("capture", capture, self.out_shape)
-        return _between(jnp.swapaxes(self.left, 1, 2), capture, self.right)
+        return _between(self.left, capture, self.right, adjoint=True)
 
     def _norm(self, iterations: int, key: PRNGKeyArray | None, dtype: DTypeLike | None):
         """The largest singular value: of one term exactly, without an iteration."""
@@ -229,6 +230,7 @@ def _matrices(name: str, value) -> Float[Array, "k i j"]:
     return array[None] if array.ndim == 2 else array
 
 
+@jax.jit
 def _singular(matrix: Float[Array, "y m"]):
     """U (y, m), V (m, m) and s (m): zero beyond min(y, m), where V spans the null space."""
     y, m = matrix.shape
@@ -247,8 +249,13 @@ def _inner(parts: Float[Array, "k i j"]) -> Float[Array, "k k"]:
     return product(flat, flat.T)
 
 
-def _between(left, image, right):
-    """Σ_k left_k · image · right_k, in the order of fewer products."""
+@functools.partial(jax.jit, static_argnames="adjoint")
+def _between(left, image, right, adjoint=False):
+    """Σ_k left_k · image · right_kᵀ or its adjoint, in the order of fewer products."""
+    if adjoint:
+        left = jnp.swapaxes(left, 1, 2)
+    else:
+        right = jnp.swapaxes(right, 1, 2)
     (_, rows, m), (_, n, columns) = left.shape, right.shape
     if rows * n * (m + columns) <= m * columns * (n + rows):
         middle = jnp.einsum("krm,...mn->...krn", left, image, precision="highest")

@@ -4,6 +4,7 @@ import functools
 from typing import Any, Literal, get_args
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
@@ -25,13 +26,13 @@ HIGHEST = 0.1
 
 def _map(name: str, values: Any, lowest: float, highest: float, unit: str) -> Float[Array, "y x"]:
     """A real (y, x) map within its limits, or one line that says what is out of them."""
-    array = jnp.asarray(values)
+    array = checks.as_array(values)
     if array.ndim != 2 or 0 in array.shape:
         raise ValueError(f"{name} has shape {array.shape}; give a non-empty array (y, x)")
     if not jnp.issubdtype(array.dtype, jnp.floating):
         if jnp.issubdtype(array.dtype, jnp.complexfloating):
             raise TypeError(f"{name} is complex; give real numbers in {unit}")
-        array = array.astype(float)
+        array = checks.as_array(values, floating=True)
     if checks.is_traced(array):
         return array
     known = np.asarray(array)
@@ -138,9 +139,7 @@ class PhaseMask(AbstractMask):
         """
         if self.interpolation == "cells":
             return 0.5 / self.pitch
-        turns = self.turns(wavelength)
-        steps = [jnp.max(jnp.abs(jnp.diff(turns, axis=axis)), initial=0.0) for axis in (0, 1)]
-        return jnp.maximum(*steps) / self.pitch
+        return _steepest(self.turns(wavelength)) / self.pitch
 
     def sample(self, grid: Grid, wavelength: Number | None = None) -> Complex[Array, "y x"]:
         if wavelength is None:
@@ -213,6 +212,13 @@ class MaskBlank(Module):
                 f"height has shape {mask.height.shape} and the blank {self.shape}; give as many"
             )
         return mask
+
+
+@jax.jit
+def _steepest(turns: Float[Array, "y x"]) -> Float[Array, ""]:
+    """Largest step between neighbours, turns."""
+    steps = [jnp.max(jnp.abs(jnp.diff(turns, axis=axis)), initial=0.0) for axis in (0, 1)]
+    return jnp.maximum(*steps)
 
 
 def _between(values: Float[Array, "n m"], at: Float[Array, " k"]) -> Float[Array, "k m"]:
