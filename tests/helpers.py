@@ -140,7 +140,7 @@ def finite_difference(function: Callable, x: Any, direction: Any, step: float) -
         # By NumPy: JAX would compile the sum for every shape.
         value = np.asarray(a) + offset * np.asarray(v)
         # As weakly typed as `a`: a function that was compiled for it would be traced again.
-        return jnp.asarray(value.item() if getattr(a, "weak_type", False) else value)
+        return jax.device_put(value.item() if getattr(a, "weak_type", False) else np.asarray(value))
 
     def at(offset: float) -> Any:
         return jax.device_get(

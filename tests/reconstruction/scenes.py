@@ -54,7 +54,7 @@ def convolution(
     else:
         kernels = [zone_plate(shape, phase, 0.06 * (1 + 0.3 * p) * (1 + 0.1 * c)) for c, p in grid]
     stack = np.reshape(kernels, (channels, planes, *shape))
-    return CropConvolution(jnp.asarray(stack), pitch, sensor, field, summed=1)
+    return CropConvolution(jax.device_put(stack), pitch, sensor, field, summed=1)
 
 
 def inverse(operators, captures, *, tau, **settings):
@@ -90,10 +90,10 @@ def problem(
     ]
     count = int(np.prod(batch, dtype=int)) * channels * planes
     truth = np.stack([blocks(field, seed=3 + n) for n in range(count)])
-    truth = jnp.asarray(truth.reshape(*batch, channels, planes, *field))
+    truth = jax.device_put(truth.reshape(*batch, channels, planes, *field))
     rng = np.random.default_rng(11)
-    seen = [operator(truth) for operator in operators]
-    noisy = [g + noise * float(jnp.max(g)) * jnp.asarray(rng.normal(size=g.shape)) for g in seen]
+    seen = [np.asarray(operator(truth)) for operator in operators]
+    noisy = [g + noise * g.max() * rng.normal(size=g.shape) for g in seen]
     return inverse(operators, noisy, tau=tau, **settings), truth
 
 

@@ -78,19 +78,18 @@ class Case:
         rng = np.random.default_rng(8)
         rows, columns = operator.in_shape[-2:]
         # Below zero in places, so that f ≥ 0 matters.
-        truth = jnp.asarray(scenes.blocks((rows, columns)) - 0.4)
-        leaves, structure = jax.tree.flatten(operator(truth))
-        noise = [0.02 * float(jnp.std(leaf)) for leaf in leaves]
+        truth = jax.device_put(scenes.blocks((rows, columns)) - 0.4)
+        leaves, structure = jax.tree.flatten(jax.device_get(operator(truth)))
+        noise = [0.02 * float(np.std(leaf)) for leaf in leaves]
         noisy = [
-            leaf + s * jnp.asarray(rng.normal(size=leaf.shape))
-            for leaf, s in zip(leaves, noise, strict=True)
+            leaf + s * rng.normal(size=leaf.shape) for leaf, s in zip(leaves, noise, strict=True)
         ]
         captures = jax.tree.unflatten(structure, noisy)
         variances = [s**2 for s in noise]
         self.shape = (rows, columns)
         self.recording = tc.Recording(captures, operator, noise_variance=variances)
         self.problem = self.recording.problem(tau=TAU, regulariser=VARIATION)
-        basis = jnp.eye(rows * columns).reshape(-1, rows, columns)
+        basis = jax.device_put(np.eye(rows * columns).reshape(-1, rows, columns))
         seen = jax.tree.leaves(operator(basis))
         matrices = [np.asarray(s).reshape(rows * columns, -1).T for s in seen]
         parts = list(zip(matrices, variances, strict=True))

@@ -301,20 +301,19 @@ def test_the_modes_of_all_terms_precondition_conjugate_gradients():
 
 @pytest.mark.parametrize("rule", quick(["gcv", "sure"], 0))
 def test_rules_find_the_least_of_their_criterion(rule):
-    """By the influence matrix A(AᵀA + ρ)⁻¹Aᵀ itself; the image is nearly the best of all."""
+    """By the influence matrix A(AᵀA + ρ)⁻¹Aᵀ = A V (Λ + ρ)⁻¹VᵀAᵀ; the image is nearly the best."""
     operator, noise = flatcam(), 0.02
     captures, truth = captured(operator, noise)
     problem = InverseProblem(operator, [captures[None]], weights=[1 / noise**2])
     mean = jnp.full(problem.image_shape, 0.3)
     matrix = dense_camera(operator) / noise
     data = np.ravel(captures) / noise - matrix @ np.full(matrix.shape[1], 0.3)
-    count, (u, s, v) = data.size, np.linalg.svd(matrix, full_matrices=False)
-    along = u.T @ data
-    outside = np.sum((data - u @ along) ** 2)
+    count, (powers, v) = data.size, np.linalg.eigh(matrix.T @ matrix)
+    seen = v.T @ (matrix.T @ data)
 
     def value(rho):
-        kept = s**2 / (s**2 + rho)
-        residual = outside + np.sum(((1 - kept) * along) ** 2)
+        kept = powers / (powers + rho)
+        residual = data @ data - np.sum(seen**2 / (powers + rho) * (2 - kept))
         if rule == "gcv":
             return count * residual / (count - kept.sum()) ** 2
         return residual - count + 2 * kept.sum()
@@ -322,7 +321,7 @@ def test_rules_find_the_least_of_their_criterion(rule):
     found = float(choose_precision(problem, mean, rule)[0])
     tried = np.geomspace(1e-2, 1e4, 400)
     assert value(found) <= min(map(value, tried)) * (1 + 1e-6)
-    images = (0.3 + (s / (s**2 + rho) * along) @ v for rho in tried[::10])
+    images = (0.3 + v @ (seen / (powers + rho)) for rho in tried[::10])
     best = min(np.sum((image.reshape(truth.shape) - truth) ** 2) for image in images)
     image = tc.reconstruct(
         tc.Recording(captures, operator, noise_variance=noise**2), tc.Ridge(rule)
