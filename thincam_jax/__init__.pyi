@@ -27,6 +27,7 @@ from .lensless.accuracy import select_model as select_model
 from .lensless.camera import LenslessCamera as LenslessCamera
 from .lensless.capture import capture as capture
 from .lensless.exposures import Exposures as Exposures
+from .lensless.field import field_operator as field_operator
 from .lensless.masks.base import AbstractFactoredMask as AbstractFactoredMask
 from .lensless.masks.base import AbstractMask as AbstractMask
 from .lensless.masks.base import AxisFactors as AxisFactors

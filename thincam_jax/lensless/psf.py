@@ -91,6 +91,20 @@ def psf(
     return _evaluate(_psf, camera.mask, grid, camera.path(wavelength, object_distance, at), method)
 
 
+def psf_about_ray(
+    camera: LenslessCamera,
+    wavelength: Number,
+    object_distance: Number,
+    at: Position,
+    method: PsfMethod,
+) -> Float[Array, "y x"]:
+    """`psf` on a sensor whose middle is where the ray through the mask's plane at (0, 0) meets."""
+    grid = camera.sensor.grid
+    method = psf_method(camera.mask, grid, method, method.pixel_integration)
+    path = replace(camera.path(wavelength, object_distance, at), follows=True)
+    return _evaluate(_psf, camera.mask, grid, path, method)
+
+
 @checked
 def otf(
     camera: LenslessCamera,

@@ -1,6 +1,7 @@
 """A plan's capture is within its tolerance, and says what it does."""
 
 import dataclasses
+import math
 
 import equinox as eqx
 import jax
@@ -11,6 +12,7 @@ from lensless.plan.scenes import camera, scene
 
 import thincam_jax as tc
 from helpers import finite_difference, relative_l2
+from thincam_jax.lensless.plan.effects import psf_change
 from thincam_jax.units import nm
 
 
@@ -93,7 +95,8 @@ def test_table_names_every_decision(deep):
         f"16 by {len(plan.distances)} PSFs",
         f"11 by {len(plan.wavelengths)}",
         f"window {plan.padded_shape[0]}×{plan.padded_shape[1]}",
-        "obliquity, cos⁴θ",
+        "against the axis: about",
+        "fall of light, cos⁴θ",
         "pass noise=PoissonGaussianNoise()" if plan.tolerance < 9e-3 else "does not matter",
         "Fresnel's approximation",
         "operations of",
@@ -107,8 +110,26 @@ def test_effects_have_the_sizes_of_the_physics():
     sizes = {e.name: e.size for e in tc.plan(camera(), scene(16, 11), tolerance=0.1).effects}
     y, x = np.meshgrid(np.linspace(-0.5, 0.5, 401) * 0.1125, np.linspace(-0.5, 0.5, 401) * 0.15)
     fall = 1 - (1 + y**2 + x**2) ** -2
-    assert sizes["shift-variance"] == pytest.approx(np.sqrt(np.mean(fall**2)), rel=0.1)
+    assert sizes["obliquity"] == pytest.approx(np.sqrt(np.mean(fall**2)), rel=0.1)
     assert sizes["shot noise"] == pytest.approx(1 / np.sqrt(0.9 * 13_500))
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize(("width", "angle"), [(2.0, 20), (2.4, 12), (2.4, 25), (4.0, 20)])
+def test_change_of_the_psf_over_the_field(width, angle):
+    """Within a factor of two of that of the PSF at an angle."""
+    tangent = math.tan(math.radians(angle))
+    sensor = tc.Sensor((round(width / 0.02),) * 2, 0.02)
+    on_axis = tc.LenslessCamera(tc.FresnelZoneAperture(25.0, width=width), sensor, 6.5)
+    moved = tc.FresnelZoneAperture(25.0, width=width, centre=(0.0, 6.5 * tangent))
+    exact, axis = (
+        np.asarray(tc.psf(c, wavelength=500 * nm, at=(0.0, t), pixel_integration=True))
+        for c, t in ((tc.LenslessCamera(moved, sensor, 6.5), tangent), (on_axis, 0.0))
+    )
+    change = np.linalg.norm(axis - exact) / np.linalg.norm(exact)
+    finest = float(on_axis.mask.finest_frequency)
+    found = psf_change(on_axis, finest, 500 * nm, math.radians(angle))
+    assert change / 2 < found < 2 * change
 
 
 @pytest.mark.thorough

@@ -109,7 +109,7 @@ def test_averages_over_pixels_are_within_a_percent(angle, most):
 @pytest.mark.thorough
 @pytest.mark.parametrize("mask", [plate, mura])
 def test_angular_spectrum_along_the_ray(mask):
-    """Samples of the hard edges differ; as far off the axis as on it."""
+    """Samples of the hard edges differ; at most half as far again off the axis as on it."""
     errors = [
         relative(
             seen(mask, angle, 45, INF, model=tc.PsfMethod("angular_spectrum", oversampling=31)),
@@ -117,7 +117,7 @@ def test_angular_spectrum_along_the_ray(mask):
         )
         for angle in (0, 25)
     ]
-    assert errors[1] < 1.2 * errors[0]
+    assert errors[1] < 1.5 * errors[0]
     assert errors[0] < 0.08
 
 

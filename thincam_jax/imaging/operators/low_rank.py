@@ -11,7 +11,13 @@ from thincam_jax._core import checks
 from thincam_jax._core.checks import Number, Numbers, Shape
 from thincam_jax._core.precision import product
 from thincam_jax.imaging.operators.base import AbstractOperator, real_numbers, require_shape
-from thincam_jax.imaging.operators.crop_convolution import CropConvolution, kernel_shape, plane_mean
+from thincam_jax.imaging.operators.crop_convolution import (
+    CropConvolution,
+    cut,
+    kernel_shape,
+    place,
+    plane_mean,
+)
 
 # Of the power method.
 POSITIVE_ITERATIONS = 12
@@ -42,11 +48,11 @@ class LowRank(AbstractOperator):
 
     def __call__(self, image: Float[Array, "..."]) -> Float[Array, "..."]:
         require_shape("image", image, self.in_shape)
-        return self.convolution(image[..., None, :, :] * self.weights)
+        return _captured(self, image)
 
     def adjoint(self, capture: Float[Array, "..."]) -> Float[Array, "..."]:
         require_shape("capture", capture, self.out_shape)
-        return jnp.sum(self.convolution.adjoint(capture) * self.weights, axis=-3)
+        return _back_projected(self, capture)
 
     def mean_power(self) -> Float[Array, ""]:
         """Mean over the field of Σh² of its PSF without the crop, as of `CropConvolution`."""
@@ -55,6 +61,40 @@ class LowRank(AbstractOperator):
     def _norm(self, iterations, key, dtype):
         # PSFs are positive, so that a positive start image is near the top singular vector.
         return super()._norm(min(iterations, POSITIVE_ITERATIONS), key, dtype)
+
+
+# Term by term: transforms of one window stay in a processor's cache, which is twice as fast.
+@jax.jit
+def _captured(operator: LowRank, image: Float[Array, "*batch m n"]):
+    convolution = operator.convolution
+
+    def add(total, term):
+        weight, spectrum = term
+        field = place(image * weight, convolution.field_corner, convolution.window)
+        return total + jnp.fft.rfft2(field) * spectrum, None
+
+    spectra = convolution.spectrum
+    shape = (*image.shape[:-2], *spectra.shape[1:])
+    dark = jnp.zeros(shape, np.promote_types(image.dtype, spectra.dtype))
+    total, _ = jax.lax.scan(add, dark, (operator.weights, spectra))
+    whole = jnp.fft.irfft2(total, s=convolution.window)
+    return cut(whole, convolution.sensor_corner, convolution.sensor_shape)
+
+
+@jax.jit
+def _back_projected(operator: LowRank, capture: Float[Array, "*batch y x"]):
+    convolution = operator.convolution
+    placed = place(capture, convolution.sensor_corner, convolution.window)
+    light = jnp.fft.rfft2(placed)
+
+    def add(total, term):
+        weight, spectrum = term
+        whole = jnp.fft.irfft2(light * spectrum.conj(), s=convolution.window)
+        return total + weight * cut(whole, convolution.field_corner, operator.in_shape), None
+
+    shape = (*capture.shape[:-2], *operator.in_shape)
+    dark = jnp.zeros(shape, np.promote_types(capture.dtype, operator.weights.dtype))
+    return jax.lax.scan(add, dark, (operator.weights, convolution.spectrum))[0]
 
 
 @jax.jit
@@ -120,7 +160,26 @@ def low_rank_psf(
     places = _places(positions, points, field_shape)
     sizes = zip(grid.shape[2:], kernel_shape(sensor_shape, field_shape), strict=True)
     grid = jnp.pad(grid, ((0, 0), (0, 0), *((0, (k - n) % 2) for k, n in sizes)))
-    size = grid.shape[2:]
+    maps, kernels, error = principal_psfs(grid, tolerance)
+    weights = _interpolated(maps, places, [np.arange(n) for n in field_shape])
+    estimate = np.inf
+    if all(n >= 3 and n % 2 for n in points):
+        between = _interpolated(maps[::2, ::2], [p[::2] for p in places], places)
+        # The p_r are orthonormal, so that lengths of weights are those of PSFs.
+        difference = np.linalg.norm(between - np.moveaxis(maps, -1, 0))
+        estimate = float(difference / np.linalg.norm(grid)) / 4
+    convolution = CropConvolution(kernels, pitch, sensor_shape, field_shape, summed=1)
+    return LowRankFit(LowRank(jnp.asarray(weights, grid.dtype), convolution), error, estimate)
+
+
+def principal_psfs(
+    grid: Float[Array, "y x k l"], tolerance: float
+) -> tuple[Float[np.ndarray, "y x r"], Float[Array, "r k l"], float]:
+    """Weights at a grid's points, the fewest orthonormal PSFs, and the relative error they leave.
+
+    **Errors**: ValueError for PSFs that are all zero.
+    """
+    points, size = grid.shape[:2], grid.shape[2:]
     flat = np.asarray(grid, float).reshape(points[0] * points[1], -1)
     left, values, right = np.linalg.svd(flat, full_matrices=False)
     whole = np.linalg.norm(values)
@@ -130,17 +189,8 @@ def low_rank_psf(
     tails = np.sqrt(np.append(np.cumsum(values[::-1] ** 2)[::-1], 0)) / whole
     rank = max(1, int(np.argmax(tails <= tolerance)))
     maps = (left[:, :rank] * values[:rank]).reshape(*points, rank)
-    weights = _interpolated(maps, places, [np.arange(n) for n in field_shape])
-    estimate = np.inf
-    if all(n >= 3 and n % 2 for n in points):
-        between = _interpolated(maps[::2, ::2], [p[::2] for p in places], places)
-        # The p_r are orthonormal, so that lengths of weights are those of PSFs.
-        estimate = float(np.linalg.norm(between - np.moveaxis(maps, -1, 0))) / whole / 4
-    dtype = grid.dtype
-    kernels = jnp.asarray(right[:rank].reshape(rank, *size), dtype)
-    convolution = CropConvolution(kernels, pitch, sensor_shape, field_shape, summed=1)
-    operator = LowRank(jnp.asarray(weights, dtype), convolution)
-    return LowRankFit(operator, float(tails[rank]), float(estimate))
+    kernels = jnp.asarray(right[:rank].reshape(rank, *size), grid.dtype)
+    return maps, kernels, float(tails[rank])
 
 
 def _places(positions, points, field_shape) -> list[np.ndarray]:

@@ -76,15 +76,15 @@ def propagate_along(
 ) -> Complex[Array, "y x"]:
     r"""`propagate` of a field whose carrier is a chief ray, left out before and behind.
 
-    Frequencies ν are counted from the carrier's and the sensor's samples are those of the window
-    itself, d·s/c off the axis; what grows with d is then
+    Frequencies ν are counted from the carrier's, and places from where the ray meets the sensor;
+    what grows with d is then
 
     .. math::
         \sqrt{c^2 - 2\mathbf s\cdot\mathbf q - q^2} - c + \mathbf s\cdot\mathbf q/c, \qquad
         \mathbf q = \lambda\boldsymbol\nu,
 
-    formed without the parts that cancel. The shadow is where the ray meets the sensor: the window
-    is moved by that, and what lies beyond it is dark.
+    formed without the parts that cancel. The window is then moved to the sensor's samples; what
+    lies beyond it is dark.
     """
     v, u = _frequencies(field.shape, pitch)
     down, across = path.wavelength * v, path.wavelength * u
@@ -109,7 +109,7 @@ def propagate_along(
     total = root + ray.cosine
     waves = -(squared + along * (2 * along + squared) / (ray.cosine * total)) / total
     turns = path.distance / path.wavelength * waves
-    moved = [path.distance * slope for slope in slopes]
+    moved = _from_samples(ray, path)
     transfer = jnp.where(carried, turn_phasor(turns) * turn_phasor(-v * moved[0]), 0.0)
     field = jnp.fft.ifft2(jnp.fft.fft2(field) * transfer * turn_phasor(-u * moved[1]))
     return field
@@ -187,9 +187,14 @@ def _in_window(
 ) -> Float[Array, "y x"]:
     """1 where the window that the ray carries to the sensor lies, else 0."""
     reach = [n * sensor.pitch / 2 for n in window]
-    y = jnp.abs(sensor.y - path.distance * ray.down / ray.cosine) <= reach[0]
-    x = jnp.abs(sensor.x - path.distance * ray.across / ray.cosine) <= reach[1]
+    moved = _from_samples(ray, path)
+    y, x = jnp.abs(sensor.y - moved[0]) <= reach[0], jnp.abs(sensor.x - moved[1]) <= reach[1]
     return (y[:, None] & x).astype(sensor.pitch.dtype)
+
+
+def _from_samples(ray: ChiefRay, path: Path) -> Float[Array, "2"]:
+    """(y, x) from the middle of the sensor's samples to where the ray meets it, mm."""
+    return path.distance * jnp.stack([ray.down, ray.across]) / ray.cosine - path.moved
 
 
 def planes(grid: Grid, method: PsfMethod) -> tuple[Grid, Grid]:

@@ -1,10 +1,11 @@
-"""What the models of the PSF hold of a point off the axis."""
+"""Light off the axis: what the models of the PSF hold of it, how it changes, how it falls."""
 
 import math
 import warnings
 
 import jax
 import numpy as np
+from jaxtyping import Float
 
 from thincam_jax._core import checks
 from thincam_jax.lensless.masks.base import AbstractMask, other_models
@@ -56,10 +57,26 @@ def third_order(wavelength: float, distance: float, frequency: float, cosine: fl
     return math.pi * sine * wavelength**2 * distance * frequency**3 / cosine**5
 
 
-def shift_variance(wavelength: float, distance: float, frequency: float, cosine: float) -> float:
+def shift_variance(
+    wavelength: float, distance: float, frequency: float, cosine: float | Float[np.ndarray, "..."]
+):
     r"""Phase by which the PSF's change over the field turns the light of a frequency ν, rad.
 
     In the plane of incidence the light travels d/c³ in place of d: :math:`\pi\lambda d\nu^2
     (c^{-3} - 1)`.
     """
     return math.pi * wavelength * distance * frequency**2 * (cosine**-3 - 1)
+
+
+def fall_of_light(
+    down: Float[np.ndarray, " m"], across: Float[np.ndarray, " n"]
+) -> Float[np.ndarray, "m n"]:
+    r"""cos⁴θ at the tangents of two angles: the light of a plane of equal radiance on the sensor.
+
+    A patch dA of the plane sends :math:`L\,dA\cos\theta` per solid angle towards the mask, over
+    the way :math:`t/\cos\theta` onto pixels tilted by θ: :math:`L\,dA\cos^4\theta/t^2`. The same
+    holds for a scene at infinity, where the solid angle of a step of the tangents is
+    :math:`\cos^3\theta`. A display or a lamp that is brighter along its normal falls faster;
+    multiply the scene with the rest.
+    """
+    return (1 + down[:, None] ** 2 + across**2) ** -2

@@ -38,6 +38,8 @@ class Path(Module):
     - `object_distance`: t, mm, > 0; infinity is a plane wave.
     - `at`: (y, x) of the point, mm; of a plane wave, the tangents of its angles. None on the axis.
     - `skew`: whether the point is, or may be, off both of the mask's axes.
+    - `follows`: whether the middle of the sensor's samples is where the ray through the mask's
+      plane at (0, 0) meets it, in place of the axis.
     """
 
     wavelength: Float[Array, ""] = eqx.field(converter=quantity("mm", check=checks.wavelength))
@@ -49,6 +51,7 @@ class Path(Module):
         default=None, converter=quantity("mm", shape=(2,), optional=True)
     )
     skew: bool = eqx.field(default=False, static=True)
+    follows: bool = eqx.field(default=False, static=True)
 
     @property
     def magnification(self) -> Float[Array, ""]:
@@ -68,11 +71,17 @@ class Path(Module):
         self, grid: Grid, centre: Float[Array, "2"]
     ) -> tuple[Float[Array, " rows"], Float[Array, " columns"]]:
         """Rows and columns of the sensor on the mask's scale, from the middle of its shadow."""
-        y, x, scale = grid.y, grid.x, self.magnification
+        scale, moved = self.magnification, self.moved
         if self.at is not None:
-            moved = self.distance * self._tangents
-            y, x = y + moved[0], x + moved[1]
-        return y / scale - centre[0], x / scale - centre[1]
+            moved = moved + self.distance * self._tangents
+        return (grid.y + moved[0]) / scale - centre[0], (grid.x + moved[1]) / scale - centre[1]
+
+    @property
+    def moved(self) -> Float[Array, "2"]:
+        """(y, x) of the middle of the sensor's samples, mm."""
+        if self.at is None or not self.follows:
+            return jnp.zeros(2, self.distance.dtype)
+        return -self.distance * self._tangents
 
     def chief_ray(self, centre: Float[Array, "2"]) -> "ChiefRay | None":
         """Of a mask with this centre (y, x), mm; None on the axis."""

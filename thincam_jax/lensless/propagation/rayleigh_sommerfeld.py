@@ -47,7 +47,7 @@ def rayleigh_sommerfeld_field(
         return jnp.sum(field * kernel * turn_phasor(turns))
 
     y, x = jnp.meshgrid(sensor.y, sensor.x, indexing="ij")
-    points = jnp.stack([y.ravel(), x.ravel()], axis=-1)
+    points = jnp.stack([y.ravel(), x.ravel()], axis=-1) + path.moved
     return jax.lax.map(at, points, batch_size=_BATCH).reshape(sensor.shape)
 
 
