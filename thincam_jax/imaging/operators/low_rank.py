@@ -111,8 +111,9 @@ class LowRankFit(eqx.Module):
     """An operator for a grid of PSFs, and its errors.
 
     - `truncation_error`: of the PSFs at the grid's points, ‖difference‖₂/‖PSFs‖₂.
-    - `interpolation_error`: an estimate of the same between the points: a quarter of the error
-      where every other point is omitted and interpolated; infinite for grids too small for it.
+    - `interpolation_error`: an estimate of the same between the points. Of measured PSFs a quarter
+      of the error where every other point is omitted and interpolated, infinite for grids too small
+      for it; of a camera's field, what the polynomials leave of the finest zones' phase.
     """
 
     operator: LowRank
