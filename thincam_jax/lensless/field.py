@@ -1,8 +1,6 @@
 r"""The camera over its field of view: a PSF of its own for every point of the object."""
 
-import functools
 import math
-import operator
 from collections.abc import Callable
 
 import jax.numpy as jnp
@@ -22,6 +20,7 @@ from thincam_jax.imaging.operators import (
 )
 from thincam_jax.imaging.scene import Spectrum
 from thincam_jax.lensless.camera import LenslessCamera
+from thincam_jax.lensless.forward import spectral_psf
 from thincam_jax.lensless.masks.base import zone_orders
 from thincam_jax.lensless.method import Model, PsfMethod, as_method
 from thincam_jax.lensless.propagation.obliquity import (
@@ -29,7 +28,6 @@ from thincam_jax.lensless.propagation.obliquity import (
     fall_of_light,
     shift_variance,
 )
-from thincam_jax.lensless.psf import psf_about_ray
 
 # Points of the field along each axis: odd, so that the axis is one of them.
 _LEAST_POINTS, _MOST_POINTS = 3, 21
@@ -94,16 +92,13 @@ def field_operator(
     places = [_lobatto(t, n) for t, n in zip(tangents, counts, strict=True)]
     scale = float(np.asarray(object_distance))
     scale = 1.0 if math.isinf(scale) else scale
-    wide = camera.on_grid(kernel_grid(camera.sensor.grid, field_shape))
+    colours = list(zip(spectrum.wavelengths, spectrum.weights, strict=True))
+    grid = kernel_grid(camera.sensor.grid, field_shape)
 
     def psf_at(y: float, x: float) -> Float[Array, "k l"]:
         # The object is turned by 180° on the sensor.
         at = (-scale * y, -scale * x)
-        parts = (
-            weight * psf_about_ray(wide, wavelength, object_distance, at, method)
-            for wavelength, weight in zip(spectrum.wavelengths, spectrum.weights, strict=True)
-        )
-        return functools.reduce(operator.add, parts)
+        return spectral_psf(camera, colours, object_distance, method, grid, at)
 
     left = tolerance - max(between)
     maps, kernels, error = principal_psfs(_on_grid(camera, places, psf_at), left)

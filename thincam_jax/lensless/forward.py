@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
-from thincam_jax._core.checks import Number
+from thincam_jax._core.checks import Number, Position
 from thincam_jax._core.grids import Grid, same_parity
 from thincam_jax._core.memory import refuse_if_too_large
 from thincam_jax.imaging.operators import CropConvolution, kernel_grid
@@ -20,7 +20,7 @@ from thincam_jax.imaging.sensor import Sensor
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.cost import convolution_cost
 from thincam_jax.lensless.method import Model, PsfMethod, as_method
-from thincam_jax.lensless.psf import psf
+from thincam_jax.lensless.psf import psf, psf_about_ray
 
 # Pixels by which a field grows where an image moves.
 _STEP = 16
@@ -80,12 +80,17 @@ def spectral_psf(
     object_distance: Number,
     method: PsfMethod,
     grid: Grid,
+    at: Position | None = None,
 ) -> Float[Array, "y x"]:
-    """Sum of the PSFs of (wavelength, weight) pairs."""
+    """Sum of the PSFs of (wavelength, weight) pairs; with `at`, about the ray of that point."""
     camera = camera.on_grid(grid)
-    how = {"object_distance": object_distance, "model": method}
-    parts = (weight * psf(camera, wavelength=wavelength, **how) for wavelength, weight in light)
-    return functools.reduce(operator.add, parts)
+
+    def alone(wavelength: Number) -> Float[Array, "y x"]:
+        if at is not None:
+            return psf_about_ray(camera, wavelength, object_distance, at, method)
+        return psf(camera, wavelength=wavelength, object_distance=object_distance, model=method)
+
+    return functools.reduce(operator.add, (weight * alone(w) for w, weight in light))
 
 
 def projected_shape(camera: LenslessCamera, plane: ImagePlane) -> tuple[int, int]:

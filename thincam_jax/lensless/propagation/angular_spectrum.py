@@ -111,8 +111,7 @@ def propagate_along(
     turns = path.distance / path.wavelength * waves
     moved = _from_samples(ray, path)
     transfer = jnp.where(carried, turn_phasor(turns) * turn_phasor(-v * moved[0]), 0.0)
-    field = jnp.fft.ifft2(jnp.fft.fft2(field) * transfer * turn_phasor(-u * moved[1]))
-    return field
+    return jnp.fft.ifft2(jnp.fft.fft2(field) * transfer * turn_phasor(-u * moved[1]))
 
 
 def angular_spectrum(

@@ -16,8 +16,8 @@ from thincam_jax.lensless.masks.base import AbstractMask, other_models
 from thincam_jax.lensless.masks.pinhole import RadialMask
 from thincam_jax.lensless.method import LATTICE_POINTS, PsfMethod
 from thincam_jax.lensless.propagation.chirp import edge_wave
+from thincam_jax.lensless.propagation.lattice import pixel_mean
 from thincam_jax.lensless.propagation.path import Path
-from thincam_jax.lensless.propagation.separable_field import lattice
 
 # From this v on the rim's waves are those of its nearest and its farthest point.
 _TWO_WAVES = 8.0
@@ -58,12 +58,8 @@ def radial(mask: AbstractMask, grid: Grid, path: Path, method: PsfMethod) -> Flo
             f"{other_models(mask)}"
         )
     oversampling = method.oversampling
-    scale = path.magnification
-    y, x, pitch = (
-        grid.y / scale - mask.centre[0],
-        grid.x / scale - mask.centre[1],
-        grid.pitch / scale,
-    )
+    y, x = path.on_mask(grid, mask.centre)
+    pitch = grid.pitch / path.magnification
     value = functools.partial(irradiance, mask, path)
     if oversampling is not None:
         step = pitch / oversampling
@@ -79,12 +75,8 @@ def radial(mask: AbstractMask, grid: Grid, path: Path, method: PsfMethod) -> Flo
 
     if not method.pixel_integration:
         return at(jnp.zeros(2, x.dtype))
-    total, _ = jax.lax.scan(
-        lambda total, place: (total + at(place), None),
-        jnp.zeros(grid.shape, x.dtype),
-        jnp.asarray(lattice(method.nodes or LATTICE_POINTS), x.dtype),
-    )
-    return total / (method.nodes or LATTICE_POINTS)
+    nodes = method.nodes or LATTICE_POINTS
+    return pixel_mean(at, nodes, jnp.zeros(grid.shape, x.dtype))
 
 
 def profile_samples(mask: AbstractMask, grid: Grid, path: Path, method: PsfMethod) -> int | None:

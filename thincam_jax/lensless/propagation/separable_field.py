@@ -1,7 +1,5 @@
 r"""`separable` of a mask of many terms: its Fresnel field as one matrix product."""
 
-import math
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,6 +8,7 @@ from jaxtyping import Array, Complex, Float
 from thincam_jax._core.grids import Grid
 from thincam_jax._core.precision import product
 from thincam_jax.lensless.masks.base import AbstractFactoredMask, MaskTerms
+from thincam_jax.lensless.propagation.lattice import pixel_mean
 from thincam_jax.lensless.propagation.path import Path
 from thincam_jax.lensless.propagation.separable import axis_fields, cell_shadows
 
@@ -48,27 +47,7 @@ def separable_image(
 
     if nodes is None:
         return irradiance(jnp.zeros(2, x.dtype))
-    places = jnp.asarray(lattice(nodes), x.dtype)
-    total, _ = jax.lax.scan(
-        lambda total, place: (total + irradiance(place), None),
-        jnp.zeros(grid.shape, x.dtype),
-        places,
-    )
-    return total / nodes
-
-
-def lattice(count: int) -> Float[np.ndarray, "point 2"]:
-    """Points (u, frac(g·u)), u = (i + ½)/count, of a rank-1 lattice about the pixel's centre.
-
-    g is odd, has no divisor in common with the count and is next to count/golden ratio or its
-    complement: of Fibonacci numbers, the best lattice (Niederreiter, CBMS-NSF 63 (1992), ch. 5).
-    Odd, so that the points turned by 180° are the points.
-    """
-    golden = (math.sqrt(5) - 1) / 2 * count
-    odd = [g for g in range(1, max(count, 2), 2) if math.gcd(g, count) == 1]
-    generator = min(odd, key=lambda g: min(abs(g - golden), abs(count - g - golden)))
-    first = (np.arange(count) + 0.5) / count
-    return np.stack([first, first * generator % 1], axis=-1) - 0.5
+    return pixel_mean(irradiance, nodes, jnp.zeros(grid.shape, x.dtype))
 
 
 def _cells(terms: MaskTerms) -> Complex[Array, "row column"]:

@@ -12,8 +12,8 @@ from thincam_jax._core.grids import Grid
 from thincam_jax._core.precision import as_complex, phasor, product
 from thincam_jax.lensless.masks.base import AbstractMask, zone_orders
 from thincam_jax.lensless.propagation.chirp import chirp_integral
+from thincam_jax.lensless.propagation.lattice import pixel_mean
 from thincam_jax.lensless.propagation.path import Path
-from thincam_jax.lensless.propagation.separable_field import lattice
 
 # Points a pixel for its average: off by some 0.35 over that, where a pixel holds many fringes.
 PIXEL_POINTS = 13
@@ -82,12 +82,7 @@ def skew_image(
 
     if nodes is None:
         return irradiance(jnp.zeros(2, x.dtype))
-    total, _ = jax.lax.scan(
-        lambda total, place: (total + irradiance(place), None),
-        jnp.zeros(grid.shape, x.dtype),
-        jnp.asarray(lattice(nodes), x.dtype),
-    )
-    return total / nodes
+    return pixel_mean(irradiance, nodes, jnp.zeros(grid.shape, x.dtype))
 
 
 def _order(g, matrix, extent, y: Float[Array, " y"], x: Float[Array, " x"]):
