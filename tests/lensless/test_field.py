@@ -53,6 +53,17 @@ def test_every_point_has_its_own_psf(fit, place):
     assert error < 1e-2 * np.linalg.norm(whole)
 
 
+def test_capture_over_the_field():
+    """A scene whose pixels are the field's samples, of one point at its corner."""
+    image = np.zeros(FIELD)
+    image[0, 0] = 1  # the object is turned on the sensor
+    plane = tc.ImagePlane(image, distance=250.0, width=FIELD[1] * PITCH / DISTANCE * 250.0)
+    method = tc.PsfMethod("separable", nodes=55, field_tolerance=1e-2)
+    found = tc.capture(CAMERA, tc.Scene(plane, 500 * nm), model=method)
+    exact, whole = captured_alone(49, 65)
+    assert np.linalg.norm(np.asarray(found) - exact) < 1e-2 * np.linalg.norm(whole)
+
+
 def test_the_axis_psf_is_far_off_at_the_corner(fit):
     alone = imaging_operator(CAMERA, 500 * nm, 250.0, field_shape=FIELD)
     dimmed = fall_of_light(*tangents_of(CAMERA, FIELD))[49, 65]

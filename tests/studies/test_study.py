@@ -12,13 +12,16 @@ from matplotlib import pyplot
 from studies import tiny
 
 import thincam_jax as tc
-from helpers import ROOT
+from helpers import ROOT, relative_l2
 from thincam_jax.commands.kinds import load_experiment
 from thincam_jax.commands.run_folder import RunFolder
 from thincam_jax.commands.study.build import build_study
 from thincam_jax.commands.study.run import run_study
+from thincam_jax.lensless.propagation.obliquity import fall_of_light
 from thincam_jax.studies import Method, Target
-from thincam_jax.studies.evaluate import coupled
+from thincam_jax.studies.evaluate import coupled, field_shape, reconstructor
+from thincam_jax.studies.simulate import expose, noise_free, stacked
+from thincam_jax.units import um
 
 
 @pytest.fixture(scope="module")
@@ -161,3 +164,34 @@ def test_a_fault_between_methods_sensor_and_noise_has_its_place():
     with pytest.raises(ValueError, match="relative to the sensor's") as caught:
         dataclasses.replace(study, methods=(method,))
     assert caught.value.place == ("methods", 0, "shots", 1, "exposure")
+
+
+def test_images_of_captures_over_the_field_are_divided_by_the_fall_of_light():
+    """Shadows have the PSF of the axis everywhere, so that the light alone differs."""
+
+    def taken(tolerance):
+        study = tiny.study(noise=None, field_tolerance=tolerance)
+        target, method = study.targets[1], study.methods[0]
+        shape, exposures = field_shape(study, method, target), tuple(method.exposures)
+        clean = [noise_free(study, exposure, target.plane) for exposure in exposures]
+        seen = stacked([expose(study, *one, 1) for one in zip(exposures, clean, strict=True)])
+        return seen[0], reconstructor(study, method, shape, 100.0)(*seen).image
+
+    (axis, image), (field, even) = taken(None), taken(1e-3)
+    assert relative_l2(np.asarray(field), np.asarray(axis)) > 0.1
+    # What is left: a convolution of weighted images is no weighted convolution.
+    assert relative_l2(np.asarray(even), np.asarray(image)) < 0.05
+    rows, columns = ((np.arange(n) - (n - 1) / 2) * 40 * um / 3.0 for n in (46, 60))
+    fall = fall_of_light(rows, columns)
+    assert relative_l2(fall * np.asarray(even), np.asarray(image)) > 0.1
+
+
+def test_says_what_the_psf_of_the_axis_leaves_out():
+    """At the corner of 80 × 60 mm at 50 mm, where tan θ = 1; not at 100 mm."""
+    far = tiny.study().targets[1]
+    near = dataclasses.replace(far, distance=50.0)
+    (told,) = tiny.study(targets=(near,)).warnings
+    # π λ d ν² (√8 − 1) of 8.0 cycles/mm is 0.55 rad, of which 0.22 is the error.
+    assert told.startswith("at 45°, the corner of the field, the PSF is some 12 % off")
+    assert tiny.study(targets=(near,), field_tolerance=1e-2).warnings == []
+    assert tiny.study(targets=(far,)).warnings == []

@@ -68,9 +68,10 @@ def run(
         folder = RunFolder.chosen(out, asked.name, asked)
         kind = kind_of(asked)
         setup = kind.part(kind.build)(asked)
+        outcome = folder.outcome(asked)
         warn(getattr(getattr(setup, "study", setup), "warnings", []))
         if dry_run:
-            explain.dry_run(asked, folder.outcome(asked), setup)
+            explain.dry_run(asked, outcome, setup)
             return
         with counted(asked.name) as progress:
             found = kind.part(kind.run)(setup, folder, progress)

@@ -239,12 +239,17 @@ class LenslessConfig(ExperimentConfig):
 
 
 class CamerasConfig(section(Wiener, only=("prior",)), LenslessConfig):
-    """Cameras and the methods that reconstruct their captures."""
+    """Cameras and the methods that reconstruct their captures.
+
+    - `field_tolerance`: relative error that the PSFs of points off the axis may have, such as 0.01;
+      without it the captures have the PSF and the light of the axis everywhere.
+    """
 
     sensor: SensorConfig
     mask: MaskConfig
     noise: NoiseConfig | None = None
     methods: Annotated[tuple[MethodConfig, ...], Field(min_length=1)]
+    field_tolerance: Annotated[float, Field(gt=0, lt=1)] | None = None
 
     @property
     def motion(self) -> float:

@@ -20,7 +20,6 @@ from thincam_jax.imaging.operators import (
 )
 from thincam_jax.imaging.scene import Spectrum
 from thincam_jax.lensless.camera import LenslessCamera
-from thincam_jax.lensless.forward import spectral_psf
 from thincam_jax.lensless.masks.base import zone_orders
 from thincam_jax.lensless.method import Model, PsfMethod, as_method
 from thincam_jax.lensless.propagation.obliquity import (
@@ -28,6 +27,7 @@ from thincam_jax.lensless.propagation.obliquity import (
     fall_of_light,
     shift_variance,
 )
+from thincam_jax.lensless.psf import spectral_psf
 
 # Points of the field along each axis: odd, so that the axis is one of them.
 _LEAST_POINTS, _MOST_POINTS = 3, 21

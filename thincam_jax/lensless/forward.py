@@ -2,8 +2,6 @@
 
 import functools
 import math
-import operator
-from collections.abc import Iterable
 
 import jax
 import jax.numpy as jnp
@@ -11,16 +9,17 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from thincam_jax._core import checks
-from thincam_jax._core.checks import Number, Position
+from thincam_jax._core.checks import Number
 from thincam_jax._core.grids import Grid, same_parity
 from thincam_jax._core.memory import refuse_if_too_large
-from thincam_jax.imaging.operators import CropConvolution, kernel_grid
+from thincam_jax.imaging.operators import CropConvolution, LowRank, kernel_grid
 from thincam_jax.imaging.scene import ImagePlane, Spectrum
 from thincam_jax.imaging.sensor import Sensor
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.cost import convolution_cost
+from thincam_jax.lensless.field import field_operator
 from thincam_jax.lensless.method import Model, PsfMethod, as_method
-from thincam_jax.lensless.psf import psf, psf_about_ray
+from thincam_jax.lensless.psf import spectral_psf
 
 # Pixels by which a field grows where an image moves.
 _STEP = 16
@@ -56,41 +55,28 @@ def imaging_operator(
     field_shape: tuple[int, int],
     model: Model | PsfMethod = "separable",
     pixel_integration: bool = True,
-) -> CropConvolution:
+) -> CropConvolution | LowRank:
     """The operator from a plane's projection on the sensor's pitch to the noise-free capture.
 
     `light` is a `Spectrum` or one wavelength in mm; the PSF is the weighted sum over it. The other
-    arguments are those of `psf`.
+    arguments are those of `psf`. With a method's `field_tolerance` it is a `field_operator`.
     """
-    grid = camera.sensor.grid
+    grid, method = camera.sensor.grid, as_method(model, pixel_integration)
     spectrum = light if isinstance(light, Spectrum) else Spectrum(light)
-    kernel = spectral_psf(
-        camera,
-        zip(spectrum.wavelengths, spectrum.weights, strict=True),
-        object_distance,
-        as_method(model, pixel_integration),
-        kernel_grid(grid, field_shape),
-    )
+    if method.field_tolerance is not None:
+        found = field_operator(
+            camera,
+            spectrum,
+            object_distance,
+            field_shape=field_shape,
+            tolerance=method.field_tolerance,
+            model=method,
+        )
+        return found.operator
+    colours = zip(spectrum.wavelengths, spectrum.weights, strict=True)
+    wide = kernel_grid(grid, field_shape)
+    kernel = spectral_psf(camera, colours, object_distance, method, wide)
     return CropConvolution(kernel, grid.pitch, grid.shape, field_shape)
-
-
-def spectral_psf(
-    camera: LenslessCamera,
-    light: Iterable[tuple[Number, Float[Array, ""] | float]],
-    object_distance: Number,
-    method: PsfMethod,
-    grid: Grid,
-    at: Position | None = None,
-) -> Float[Array, "y x"]:
-    """Sum of the PSFs of (wavelength, weight) pairs; with `at`, about the ray of that point."""
-    camera = camera.on_grid(grid)
-
-    def alone(wavelength: Number) -> Float[Array, "y x"]:
-        if at is not None:
-            return psf_about_ray(camera, wavelength, object_distance, at, method)
-        return psf(camera, wavelength=wavelength, object_distance=object_distance, model=method)
-
-    return functools.reduce(operator.add, (weight * alone(w) for w, weight in light))
 
 
 def projected_shape(camera: LenslessCamera, plane: ImagePlane) -> tuple[int, int]:

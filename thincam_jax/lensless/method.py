@@ -95,6 +95,9 @@ class PsfMethod:
       sensor's: give it there if the mask is wider than the sensor.
     - `nodes`: of the pixel average of "separable"; by default counted. Gauss nodes an axis, or,
       for a mask of more than 128 terms and for "radial", points a pixel (21 by default).
+    - `field_tolerance`: of captures: how far, relative, the PSFs of points off the axis may be from
+      their own, which change over the field as does their light (`field_operator`). By default all
+      points have the PSF and the light of the axis.
 
     ```python
     import thincam_jax as tc
@@ -114,6 +117,7 @@ class PsfMethod:
     oversampling: int | None = None
     mask_shape: tuple[int, int] | None = None
     nodes: int | None = None
+    field_tolerance: float | None = None
 
     def __post_init__(self):
         checks.choice("model", self.model, MODELS)
@@ -124,6 +128,8 @@ class PsfMethod:
             raise TypeError(f"pixel_integration is {given}; give True or False")
         if self.nodes is not None:
             checks.whole("nodes", self.nodes, 1)
+        if self.field_tolerance is not None:
+            checks.positive("field_tolerance", self.field_tolerance, "parts of one")
         if self.model in SAMPLED:
             require_odd(self.samples)
         elif self.mask_shape or (self.oversampling is not None and self.model != "radial"):
@@ -156,7 +162,8 @@ def psf_method(
 ) -> PsfMethod:
     """The method with the defaults for a mask and grid in place of None."""
     method = as_method(model, pixel_integration)
-    method = replace(method, precision=method.precision or precision_of(grid.pitch))
+    precision = method.precision or precision_of(grid.pitch)
+    method = replace(method, precision=precision, field_tolerance=None)
     if method.model == "separable" and isinstance(mask, RadialMask):
         method = replace(method, model="radial")
     if method.model not in SAMPLED:

@@ -1,6 +1,9 @@
 """From a camera to its point spread function and optical transfer function."""
 
+import functools
 import math
+import operator
+from collections.abc import Iterable
 from dataclasses import replace
 
 import equinox as eqx
@@ -103,6 +106,25 @@ def psf_about_ray(
     method = psf_method(camera.mask, grid, method, method.pixel_integration)
     path = replace(camera.path(wavelength, object_distance, at), follows=True)
     return _evaluate(_psf, camera.mask, grid, path, method)
+
+
+def spectral_psf(
+    camera: LenslessCamera,
+    light: Iterable[tuple[Number, Float[Array, ""] | float]],
+    object_distance: Number,
+    method: PsfMethod,
+    grid: Grid,
+    at: Position | None = None,
+) -> Float[Array, "y x"]:
+    """Sum of the PSFs of (wavelength, weight) pairs; with `at`, about the ray of that point."""
+    camera = camera.on_grid(grid)
+
+    def alone(wavelength: Number) -> Float[Array, "y x"]:
+        if at is not None:
+            return psf_about_ray(camera, wavelength, object_distance, at, method)
+        return psf(camera, wavelength=wavelength, object_distance=object_distance, model=method)
+
+    return functools.reduce(operator.add, (weight * alone(w) for w, weight in light))
 
 
 @checked

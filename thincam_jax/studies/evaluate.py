@@ -18,6 +18,8 @@ from thincam_jax.imaging.metrics.mtf import MINIMUM_COLUMNS
 from thincam_jax.imaging.scene import ImagePlane
 from thincam_jax.imaging.targets import line_pair, usaf1951_elements
 from thincam_jax.lensless.exposures import Exposure
+from thincam_jax.lensless.field import tangents_of
+from thincam_jax.lensless.propagation.obliquity import fall_of_light
 from thincam_jax.reconstruction import (
     AdmmTV,
     Cameras,
@@ -133,6 +135,24 @@ def reconstructor(
     study: Study, method: Method, shape: tuple[int, int], object_distance: float
 ) -> Reconstructor:
     """A function of the captures (capture, channel, y, x) and variances (capture, channel)."""
+    solve = _solver(study, method, shape, object_distance)
+    if study.field_tolerance is None:
+        return solve
+    camera = study.camera(max(method.exposures, key=lambda exposure: float(exposure.distance)))
+
+    def even(captures: Array, variances: Array) -> Reconstruction:
+        found = solve(captures, variances)
+        rows, columns = found.image.shape[-2:]
+        fall = fall_of_light(*tangents_of(camera, (rows, columns)))
+        return replace(found, image=found.image / fall.astype(found.image.dtype))
+
+    return even
+
+
+def _solver(
+    study: Study, method: Method, shape: tuple[int, int], object_distance: float
+) -> Reconstructor:
+    """With the PSF of the axis everywhere."""
     cameras = Cameras(
         [study.camera(exposure) for exposure in method.exposures],
         wavelength=[exposure.wavelength for exposure in method.exposures],

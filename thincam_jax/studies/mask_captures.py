@@ -14,9 +14,9 @@ from thincam_jax.imaging.operators import CropConvolution, kernel_grid
 from thincam_jax.imaging.operators.crop_convolution import cut, place
 from thincam_jax.imaging.sensor import PoissonGaussianNoise, Sensor, read_out
 from thincam_jax.lensless.camera import LenslessCamera
-from thincam_jax.lensless.forward import spectral_psf
 from thincam_jax.lensless.masks.base import AbstractMask
 from thincam_jax.lensless.method import PsfMethod
+from thincam_jax.lensless.psf import spectral_psf
 from thincam_jax.reconstruction import AdmmTV, Recording
 from thincam_jax.reconstruction.splittings import difference_symbol
 from thincam_jax.reconstruction.total_variation import TotalVariation

@@ -14,6 +14,7 @@ from thincam_jax.imaging.scene import ImagePlane, Scene
 from thincam_jax.imaging.sensor import electrons_per_unit, read_out
 from thincam_jax.lensless import forward
 from thincam_jax.lensless.exposures import Exposure
+from thincam_jax.lensless.method import PsfMethod
 from thincam_jax.studies.study import Study, Target
 
 
@@ -33,7 +34,7 @@ def noise_free(study: Study, exposure: Exposure, planes: ImagePlane | list[Image
             study.camera(exposure),
             plane,
             scene.spectrum,
-            model=study.model,
+            model=PsfMethod(study.model, field_tolerance=study.field_tolerance),
             pixel_integration=study.pixel_integration,
         )
         for plane in scene.planes

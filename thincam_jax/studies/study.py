@@ -19,6 +19,7 @@ from thincam_jax.lensless.exposures import Exposure, Exposures
 from thincam_jax.lensless.masks.base import AbstractMask
 from thincam_jax.lensless.masks.fza import FresnelZoneAperture, edge_frequency
 from thincam_jax.lensless.method import Model
+from thincam_jax.lensless.propagation.obliquity import psf_change
 from thincam_jax.lensless.psf import psf
 from thincam_jax.lensless.sampling import unresolved
 from thincam_jax.reconstruction import FringeScanning
@@ -27,6 +28,9 @@ from thincam_jax.reconstruction.solver import AbstractSolver
 
 if TYPE_CHECKING:
     from thincam_jax.studies.result import StudyResult
+
+# Change of the PSF over the field, relative, from which a study mentions it.
+_LEAST_CHANGE = 0.05
 
 Synthesis = Literal["fringe_scanning", "phase_pairs", "harmonics", "contrasts", "separate"]
 # The mask phases at each shot where the synthesis sets their number.
@@ -251,6 +255,8 @@ class Study:
     - `object_distance`: of the point whose PSF and transfer functions are shown, mm.
     - `noise`: None leaves captures as they are.
     - `model`, `pixel_integration`: of the PSFs, see `thincam_jax.psf`.
+    - `field_tolerance`: of the captures, see `PsfMethod`. Reconstructions take the PSF of the axis,
+      and are divided by the light's fall.
     - `seed`: of the noise: each capture of each target has a random key of its own.
     - `mask_name`: of a mask without zones, in figures.
     """
@@ -263,6 +269,7 @@ class Study:
     noise: AbstractNoise | None = None
     model: Model = "separable"
     pixel_integration: bool = True
+    field_tolerance: float | None = None
     seed: int = 0
     name: str = "study"
     mask_name: str = ""
@@ -298,6 +305,28 @@ class Study:
     @property
     def warnings(self) -> list[str]:
         """What a user should know before it runs, and in the report."""
+        return [*self._unresolved(), *self._changes()]
+
+    def _changes(self) -> list[str]:
+        """What the PSF of the axis leaves out at the corner of the widest target."""
+        if self.field_tolerance is not None or not self.targets:
+            return []
+        slope = max(math.hypot(t.plane.height, t.width) / 2 / t.distance for t in self.targets)
+        angle, change = math.atan(slope), 0.0
+        for exposure in self.exposures:
+            finest = getattr(self.camera(exposure).mask, "finest_frequency", None)
+            if finest is not None:
+                path = exposure.wavelength, exposure.distance
+                change = max(change, psf_change(*path, float(finest), math.cos(angle)))
+        if change < _LEAST_CHANGE:
+            return []
+        return [
+            f"at {math.degrees(angle):.0f}°, the corner of the field, the PSF is some "
+            f"{100 * change:.0f} % off that of the axis, which all points of the captures have; "
+            "field_tolerance: 0.01 gives each its own"
+        ]
+
+    def _unresolved(self) -> list[str]:
         farthest = max((target.distance for target in self.targets), default=math.inf)
         if isinstance(self.mask, FresnelZoneAperture):
             height = None if self.mask.height is None else decimal_value(self.mask.height)

@@ -10,8 +10,9 @@ import thincam_jax as tc
 from helpers import relative_l2
 from thincam_jax.imaging.operators import CropConvolution, kernel_grid
 from thincam_jax.imaging.targets import resize, sample_image
-from thincam_jax.lensless.forward import project, projected_shape, spectral_psf
+from thincam_jax.lensless.forward import project, projected_shape
 from thincam_jax.lensless.masks import MaskBlank, diffuser, voronoi_fresnel
+from thincam_jax.lensless.psf import spectral_psf
 from thincam_jax.units import nm, um
 
 KEY, BLANK = jax.random.key(11), MaskBlank((40, 48), 5 * um, 1.5)

@@ -82,6 +82,7 @@ def assemble(config: CamerasConfig) -> FileStudy:
         noise=build_noise(config.noise),
         model=config.model,
         pixel_integration=config.pixel_integration,
+        field_tolerance=config.field_tolerance,
         seed=config.seed,
         name=config.name,
         mask_name=config.mask.label,

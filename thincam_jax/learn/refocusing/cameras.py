@@ -16,8 +16,8 @@ from thincam_jax._core.quantity import FieldError, quantity, whole
 from thincam_jax.imaging.operators import CropConvolution, kernel_shape
 from thincam_jax.imaging.scene import Spectrum
 from thincam_jax.lensless.camera import LenslessCamera
-from thincam_jax.lensless.forward import spectral_psf
 from thincam_jax.lensless.method import MODELS, Model, PsfMethod
+from thincam_jax.lensless.psf import spectral_psf
 
 # Pixels that a PSF is kept beyond the mask's shadow: diffraction at its edge falls fast. For a zone
 # aperture on pixels of 44 µm what is cut off is 1e-3 of the light at most (tests/learn).

@@ -9,11 +9,7 @@ from thincam_jax.imaging.scene import Scene
 from thincam_jax.lensless.accuracy.select import probe_of
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.method import has_few_terms
-from thincam_jax.lensless.propagation.obliquity import (
-    ERROR_PER_RADIAN,
-    fall_of_light,
-    shift_variance,
-)
+from thincam_jax.lensless.propagation.obliquity import fall_of_light, psf_change
 
 
 @dataclass(frozen=True)
@@ -47,20 +43,10 @@ def _shift_variance(camera: LenslessCamera, scene: Scene, tolerance: float) -> E
         return Effect("shift-variance", False, None, note)
     slope = max(math.hypot(p.height, p.width) / 2 / float(p.distance) for p in scene.planes)
     wavelength = float(max(scene.spectrum.wavelengths))
-    size = psf_change(camera, float(finest), wavelength, math.atan(slope))
+    size = psf_change(wavelength, float(camera.distance), float(finest), math.cos(math.atan(slope)))
     what = f"the PSF at {math.degrees(math.atan(slope)):.0f}° against the axis"
     verdict = "matters: use tc.field_operator" if size > tolerance else "does not matter"
     return Effect("shift-variance", False, size, f"{what}: about {size:.1e}, {verdict}")
-
-
-def psf_change(camera: LenslessCamera, finest: float, wavelength: float, angle: float) -> float:
-    r"""Relative L2 error, about, of taking the PSF of the axis at an angle θ, rad.
-
-    :math:`2 \cdot 0.22 \sin(\varphi/2)` of the phase φ by which the finest light of the mask
-    differs (`shift_variance`), at most π; the edges of a small mask add some percent of their own.
-    """
-    phase = shift_variance(wavelength, float(camera.distance), finest, math.cos(angle))
-    return 2 * ERROR_PER_RADIAN * math.sin(min(phase, math.pi) / 2)
 
 
 def _obliquity(scene: Scene, tolerance: float) -> Effect:

@@ -14,10 +14,11 @@ from thincam_jax.imaging.operators import CropConvolution, kernel_grid
 from thincam_jax.imaging.scene import Scene
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.cost import Cost
-from thincam_jax.lensless.forward import project, projected_shape, spectral_psf
+from thincam_jax.lensless.forward import project, projected_shape
 from thincam_jax.lensless.masks.fza import FresnelZoneAperture
 from thincam_jax.lensless.method import SAMPLED, PsfMethod
 from thincam_jax.lensless.plan.effects import Effect
+from thincam_jax.lensless.psf import spectral_psf
 
 # How far a camera's numbers may be from the plan's, relative.
 _NEAR = 0.01
