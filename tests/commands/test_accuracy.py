@@ -24,7 +24,7 @@ def config(tmp_path_factory):
 def run(config, tmp_path_factory):
     """Folder and contents of accuracy.json of one run."""
     folder = accuracy.BenchFolder(tmp_path_factory.mktemp("out") / "new")
-    plan = accuracy.check(config, accuracy.Sizes(SIZES, 48))
+    plan = accuracy.check(config, SIZES, 48)
     told = tiny.Told()
     accuracy.run_accuracy(plan, folder, told)
     assert len(told) == told.total
@@ -63,23 +63,24 @@ class TestSizes:
         def large(n):
             return config.sensor.model_copy(update={"shape": (n // 2, n)})
 
-        default = accuracy.Sizes()
-        assert default.of_psfs(config.sensor) == (64,)
-        assert default.of_psfs(large(512)) == (128, 256, 512)
-        assert default.of_psfs(large(1000)) == (128, 256, 512, 1000)
-        assert accuracy.Sizes((300, 200, 300)).of_psfs(large(1000)) == (200, 300)
-        assert default.of_captures(config.sensor) == 64
-        assert default.of_captures(large(1000)) == 256
+        for own, sizes in (
+            (config.sensor, (64,)),
+            (large(512), (128, 256, 512)),
+            (large(1000), (128, 256, 512, 1000)),
+        ):
+            assert accuracy.sizes_of_psfs((), own) == sizes
+        assert accuracy.sizes_of_psfs((300, 200, 300), large(1000)) == (200, 300)
+        assert max(accuracy.check(config).case.study.sensor.shape) == 64
 
     @pytest.mark.parametrize("size", [0, -3, 65])
     def test_refused(self, config, size):
-        for options in (accuracy.Sizes((size,)), accuracy.Sizes((), size)):
+        for options in (((size,),), ((), size)):
             with pytest.raises(ConfigError, match=f"size {size}: "):
-                accuracy.check(config, options)
+                accuracy.check(config, *options)
 
     def test_too_few_pixels_to_reconstruct(self, config):
         with pytest.raises(ConfigError, match="^--capture-size 5: "):
-            accuracy.check(config, accuracy.Sizes((), 5))
+            accuracy.check(config, (), 5)
 
 
 class TestFolder:

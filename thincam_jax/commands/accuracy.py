@@ -9,10 +9,11 @@ from thincam_jax.commands.checked_config import dump_config
 from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.run_folder import RunFolder, to_json
 from thincam_jax.commands.sections import SensorConfig, StudyConfig
-from thincam_jax.commands.study.build import FileStudy, build_study, check_optics
+from thincam_jax.commands.study.build import build_study, check_optics
 from thincam_jax.lensless.exposures import Exposure
 from thincam_jax.studies.evaluate import check_target
 from thincam_jax.studies.psf_error_cost import AccuracyResult, AccuracyRun, Case, make_case
+from thincam_jax.studies.study import Study
 
 _SIZES, _CAPTURE_SIZE = (128, 256, 512), 256  # by default
 
@@ -23,33 +24,10 @@ class BenchFolder(RunFolder):
     kind, folders, result, others = "benchmark", (), "accuracy.json", ()
 
 
-@dataclass(frozen=True)
-class Sizes:
-    """The sizes that a user may choose.
-
-    - `sizes`: pixels along the sensor's longer side, for the PSFs; empty for the default ones.
-    - `capture_size`: the same for captures and reconstructions; None for the default.
-    """
-
-    sizes: tuple[int, ...] = ()
-    capture_size: int | None = None
-
-    def of_psfs(self, sensor: SensorConfig) -> tuple[int, ...]:
-        """Those given, or the default ones and the sensor's own; each once, smallest first.
-
-        **Errors**: ConfigError for a size that is not positive or above the sensor's own.
-        """
-        own = max(sensor.shape)
-        for size in self.sizes:
-            _check("--size", size, own)
-        return tuple(sorted(set(self.sizes or (*(s for s in _SIZES if s < own), own))))
-
-    def of_captures(self, sensor: SensorConfig) -> int:
-        """The size for captures and reconstructions; errors as of `of_psfs`."""
-        if self.capture_size is None:
-            return min(_CAPTURE_SIZE, max(sensor.shape))
-        _check("--capture-size", self.capture_size, max(sensor.shape))
-        return self.capture_size
+def sizes_of_psfs(asked: tuple[int, ...], sensor: SensorConfig) -> tuple[int, ...]:
+    """Those asked for, else the default ones and the sensor's own; each once, smallest first."""
+    own = max(sensor.shape)
+    return tuple(sorted(set(asked or (*(s for s in _SIZES if s < own), own))))
 
 
 def _check(option: str, size: int, own: int) -> None:
@@ -65,27 +43,37 @@ def _check(option: str, size: int, own: int) -> None:
 class Benchmark:
     """A checked benchmark: the study, the sizes, and what is captured."""
 
-    study: FileStudy
+    study: Study
     sizes: tuple[int, ...]
     case: Case
 
 
-def check(config: StudyConfig, sizes: Sizes) -> Benchmark:
-    """Refuse what cannot be run, before anything is; ConfigError, one line for each fault."""
+def check(
+    config: StudyConfig, sizes: tuple[int, ...] = (), capture_size: int | None = None
+) -> Benchmark:
+    """Refuse what cannot be run, before anything is; ConfigError, one line for each fault.
+
+    - `sizes`: pixels along the sensor's longer side, for the PSFs; empty for the default ones.
+    - `capture_size`: the same for captures and reconstructions; None for the default.
+    """
     if config.mask.pixel_pitch is not None:
         raise ConfigError(
             "mask.pixel_pitch: the benchmark compares models that have no display pixels; leave it "
             "out of the file"
         )
-    of_psfs, of_captures = sizes.of_psfs(config.sensor), sizes.of_captures(config.sensor)
+    own = max(config.sensor.shape)
+    of_captures = min(_CAPTURE_SIZE, own) if capture_size is None else capture_size
+    for size in sizes:
+        _check("--size", size, own)
+    _check("--capture-size", of_captures, own)
     study = build_study(config)
     case = make_case(study, of_captures)
     try:
-        check_optics(case.study)  # pyright: ignore[reportArgumentType]
+        check_optics(case.study)
         check_target(case.study, case.target)
     except ValueError as error:
         raise ConfigError(f"--capture-size {of_captures}: {error}") from None
-    return Benchmark(study, of_psfs, case)
+    return Benchmark(study, sizes_of_psfs(sizes, config.sensor), case)
 
 
 def run_accuracy(plan: Benchmark, folder: BenchFolder, progress: Progress) -> AccuracyResult:

@@ -5,40 +5,13 @@ As the files `command.py`, it imports nothing at its head that `thincam --help` 
 
 import secrets
 import socket
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated
 
 import typer
 
 from thincam_jax.commands.terminal import ConfigFile, Overrides, say_result, told
 
-if TYPE_CHECKING:
-    from starlette.applications import Starlette
-    from starlette.requests import Request
-    from starlette.responses import Response
-
-    from thincam_jax.plot.explorer import Explorer
-
 _HOST = "127.0.0.1"
-_PAGE = """<!doctype html>
-<html lang="en">
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width">
-<meta name="color-scheme" content="light dark">
-<title>{title}</title>
-<body style="max-width: 1180px; margin: 1rem auto; padding: 0 1rem">
-<script type="module">
-import {{ byFetch, mount }} from "/explorer.js?token={token}";
-mount(document.body, {controls}, byFetch("/view", "{token}"));
-</script>
-</body>
-</html>
-"""
-_POLICY = (
-    "default-src 'none'; script-src 'self' 'unsafe-inline'; style-src 'unsafe-inline'; "
-    "img-src blob: data:; connect-src 'self'; base-uri 'none'; form-action 'none'; "
-    "frame-ancestors 'none'"
-)
-_LONGEST = 10_000  # bytes of a request
 
 
 def explore(
@@ -62,6 +35,7 @@ def explore(
         asked = load_study(config, tuple(set_ or ()), "explore takes a study")
         kind = kind_of(asked)
         from thincam_jax.plot.explorer import Explorer
+        from thincam_jax.plot.explorer_page import page_of
 
         study = kind.part(kind.build)(asked)
         exposure = study.exposures[0]
@@ -85,67 +59,3 @@ def explore(
                 webbrowser.open(address)
             served = uvicorn.Config(page_of(explorer, asked.name, host, token), log_level="warning")
             uvicorn.Server(served).run(sockets=[own])
-
-
-def page_of(explorer: "Explorer", title: str, host: str, token: str) -> "Starlette":
-    """The page and its two other addresses; whatever else is asked for does not exist.
-
-    A request has the host's name and, from a page, its origin, or it is another page's that the
-    user's browser was led to: 403. So it is without the token.
-    """
-    import dataclasses
-    import html
-    import json
-
-    from starlette.applications import Starlette
-    from starlette.responses import HTMLResponse, PlainTextResponse, Response
-    from starlette.routing import Route
-
-    from thincam_jax._core.files import read_regular
-    from thincam_jax.plot.explore import MODULE
-
-    def refused(request: "Request", given: str | None) -> "Response | None":
-        origin = request.headers.get("origin")
-        foreign = request.headers.get("host") != host or origin not in (None, f"http://{host}")
-        if foreign or given is None or not secrets.compare_digest(given.encode(), token.encode()):
-            return PlainTextResponse("use the address that thincam explore has printed", 403)
-        return None
-
-    async def page(request: "Request") -> "Response":
-        controls = json.dumps([dataclasses.asdict(one) for one in explorer.controls])
-        text = _PAGE.format(
-            title=html.escape(title), token=token, controls=controls.replace("<", "\\u003c")
-        )
-        headers = {"Content-Security-Policy": _POLICY, "Referrer-Policy": "no-referrer"}
-        return refused(request, request.query_params.get("token")) or HTMLResponse(
-            text, headers=headers
-        )
-
-    async def module(request: "Request") -> "Response":
-        return refused(request, request.query_params.get("token")) or Response(
-            read_regular(MODULE), media_type="text/javascript"
-        )
-
-    async def view(request: "Request") -> "Response":
-        given = request.headers.get("authorization", "").removeprefix("Bearer ")
-        if (answer := refused(request, given)) is not None:
-            return answer
-        try:
-            if int(request.headers.get("content-length", _LONGEST + 1)) > _LONGEST:
-                raise ValueError("the request is too long")
-            asked: Any = await request.json()
-            explorer.turn(asked["values"])
-            header, pictures = explorer.view(rest=asked["rest"] is True).message()
-        except (ValueError, TypeError, KeyError, AttributeError) as error:
-            return PlainTextResponse(str(error), 400)
-        parts = [header.encode("utf-8"), *pictures]
-        lengths = ",".join(str(len(part)) for part in parts)
-        return Response(b"".join(parts), headers={"X-Lengths": lengths})
-
-    return Starlette(
-        routes=[
-            Route("/", page),
-            Route("/explorer.js", module),
-            Route("/view", view, methods=["POST"]),
-        ]
-    )

@@ -1,6 +1,6 @@
 """Experiments of `kind: refocus`: the file, the study of its scene, its run and its page."""
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -92,14 +92,7 @@ class RefocusConfig(CamerasConfig):
         return self
 
 
-@dataclass(frozen=True, eq=False)
-class FileRefocus(RefocusStudy):
-    """A study with the file that it was read from."""
-
-    config: Any = None
-
-
-def build_refocus(config: RefocusConfig) -> FileRefocus:
+def build_refocus(config: RefocusConfig) -> RefocusStudy:
     """Cameras and methods, and the objects as targets at their distances.
 
     **Errors**: ConfigError, one line for each fault, beginning with the field.
@@ -119,10 +112,10 @@ def build_refocus(config: RefocusConfig) -> FileRefocus:
     objects, faults = config.read_each("objects", read, "path")
     if wrong or faults:
         raise ConfigError("\n".join([*wrong, *faults]))
-    return FileRefocus(replace(study, targets=tuple(objects)), config.sweep.build(), config)
+    return RefocusStudy(replace(study, targets=tuple(objects)), config.sweep.build())
 
 
-def run_refocus(refocusing: FileRefocus, folder: RunFolder, progress: Progress) -> RefocusResult:
+def run_refocus(refocusing: RefocusStudy, folder: RunFolder, progress: Progress) -> RefocusResult:
     """Capture, sweep, reconstruct and report; the same configuration gives the same metrics."""
     return _RefocusRun(refocusing, folder).carry_out(progress).running.result
 
@@ -130,8 +123,8 @@ def run_refocus(refocusing: FileRefocus, folder: RunFolder, progress: Progress) 
 class _RefocusRun(Run):
     """A refocusing study and its report."""
 
-    def __init__(self, refocusing: FileRefocus, folder: RunFolder):
-        super().__init__(refocusing.config, folder)
+    def __init__(self, refocusing: RefocusStudy, folder: RunFolder):
+        super().__init__(refocusing.study.config, folder)
         self.running = RefocusRun(refocusing)
         self.work += self.running.work
         self.add("report", self.report)

@@ -189,11 +189,11 @@ def accuracy(
     And what an error of the PSF costs in PSNR. Writes accuracy.json.
     """
     with told(lambda: "interrupted; nothing is kept."):
-        from thincam_jax.commands.accuracy import BenchFolder, Sizes, check, run_accuracy
+        from thincam_jax.commands.accuracy import BenchFolder, check, run_accuracy
         from thincam_jax.commands.kinds import load_study
 
         study = load_study(config, tuple(set_ or ()), "the benchmark takes a study")
-        plan = check(study, Sizes(tuple(size or ()), capture_size))
+        plan = check(study, tuple(size or ()), capture_size)
         folder = BenchFolder.chosen(out, f"{study.name}-accuracy", study)
         with counted(study.name) as progress:
             result = run_accuracy(plan, folder, progress)

@@ -106,6 +106,8 @@ class RunFolder:
         return f"writes to {self.path}: {', '.join(files)}"
 
     def _refuse_foreign(self, config: Section) -> None:
+        if not self.path.is_dir():
+            raise ConfigError(f"--out {self.path}: cannot be made a folder (it is a file)")
         held = self.path / self.config
         # Its lock and a partial file are all that is there where the first start was killed.
         foreign = any(p.name != _LOCK and p.suffix != ".partial" for p in self.path.iterdir())

@@ -11,7 +11,7 @@ import dataclasses
 import inspect
 import re
 import types
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from typing import Annotated, Any, ClassVar, Literal, Union, cast, get_args, get_origin
 
 import pydantic
@@ -121,27 +121,15 @@ def section(
 
 def _parameters(maker: Callable[..., Any]) -> dict[str, tuple[Any, Any]]:
     """Type and default of each parameter, as a file has them."""
-    known, converters = quantities(maker), _converters(maker)
-    return {
-        name: (_type(known.get(name), converters.get(name), annotation), parameter.default)
-        for name, parameter, annotation in _annotated(maker)
-    }
-
-
-def _annotated(maker: Any) -> Iterator[tuple[str, inspect.Parameter, Any]]:
-    """The parameters, with the annotations of the fields where there are any."""
-    types_of = {}
+    known, found, fields = quantities(maker), {}, {}
     if dataclasses.is_dataclass(maker):
-        types_of = {f.name: f.type for f in dataclasses.fields(maker)}
-    for name, parameter in inspect.signature(cast(Callable[..., Any], maker)).parameters.items():
-        yield name, parameter, types_of.get(name, parameter.annotation)
-
-
-def _converters(maker: Callable[..., Any]) -> dict[str, Callable[[Any], Any]]:
-    if not dataclasses.is_dataclass(maker):
-        return {}
-    given = {f.name: f.metadata.get("converter") for f in dataclasses.fields(maker)}
-    return {name: one for name, one in given.items() if one is not None}
+        fields = {field.name: field for field in dataclasses.fields(maker)}
+    for name, parameter in inspect.signature(cast(Any, maker)).parameters.items():
+        annotation, converter = parameter.annotation, None
+        if name in fields:
+            annotation, converter = fields[name].type, fields[name].metadata.get("converter")
+        found[name] = _type(known.get(name), converter, annotation), parameter.default
+    return found
 
 
 def _type(known: Quantity | None, converter: Callable[[Any], Any] | None, annotation: Any) -> Any:

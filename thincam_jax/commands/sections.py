@@ -8,7 +8,7 @@ import pydantic
 from pydantic import Field
 
 from thincam_jax._core.quantity import FieldError
-from thincam_jax.commands.config_file import Places, slug
+from thincam_jax.commands.config_file import ConfigError, Places, slug
 from thincam_jax.commands.mask import MaskConfig
 from thincam_jax.commands.schema import (
     Angle,
@@ -71,11 +71,6 @@ class NoiseConfig(section(GaussianNoise, PoissonGaussianNoise, defaults=_EITHER)
         if self.snr_db is None:
             return PoissonGaussianNoise(self.read_noise)
         return GaussianNoise(self.snr_db, self.signal_power)
-
-
-def build_noise(noise: NoiseConfig | None) -> AbstractNoise | None:
-    """The noise of a file that may have none."""
-    return None if noise is None else noise.build()
 
 
 class ShotConfig(Section):
@@ -225,6 +220,13 @@ class ExperimentConfig(Section):
                 faults.append(f"{self.place_of(entries, number, *key)}{entries}[{number}]: {error}")
         return found, faults
 
+    def read_all(self, entries: str, read: Callable[[Any], Found], *key: str) -> list[Found]:
+        """The same; ConfigError, a line for each entry that is refused."""
+        found, faults = self.read_each(entries, read, *key)
+        if faults:
+            raise ConfigError("\n".join(faults))
+        return found
+
     def gives(self, *location: str | int) -> bool:
         """Whether the file or an option has an entry, which is a default otherwise."""
         return self._places.gives(location)
@@ -270,7 +272,7 @@ class CamerasConfig(section(Wiener, only=("prior",)), LenslessConfig):
             if self.noise is None and method.kind == "wiener":
                 message = "wiener weighs noise against signal; give a 'noise' section"
                 raise FieldError(message, "methods", index, "kind")
-        check_methods(methods, self.sensor.build(), build_noise(self.noise))
+        check_methods(methods, self.sensor.build(), self.noise and self.noise.build())
         return self
 
 

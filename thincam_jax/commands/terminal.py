@@ -41,30 +41,22 @@ def told(interrupted: Callable[[], str]) -> Iterator[None]:
 
     Anything else is a defect and keeps its traceback. Python's warnings take a line each, too.
     """
+    from thincam_jax._core.jax_settings import cannot_start
+    from thincam_jax.commands.config_file import ConfigError
+
     try:
         with warnings.catch_warnings():
             warnings.showwarning = lambda message, *_, **__: warn([str(message)])
-            _check_settings()
+            if fault := cannot_start():
+                raise ConfigError(fault)
             yield
     except KeyboardInterrupt:
         tell(interrupted())
         raise typer.Exit(INTERRUPTED) from None
     except Exception as error:
-        from thincam_jax.commands.config_file import ConfigError
-
         if not isinstance(error, (ConfigError, OSError, MemoryError)) and not _no_memory(error):
             raise
         fail(error)
-
-
-def _check_settings() -> None:
-    """ConfigError for variables of the environment with which JAX cannot start."""
-    from thincam_jax._core.jax_settings import cannot_start
-
-    if fault := cannot_start():
-        from thincam_jax.commands.config_file import ConfigError
-
-        raise ConfigError(fault)
 
 
 def _no_memory(error: BaseException) -> bool:

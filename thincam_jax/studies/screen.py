@@ -8,9 +8,9 @@ capture is a sum of ghosts, whose shifts and weights differ from pixel to pixel 
 import math
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Annotated, Literal, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
 import equinox as eqx
 import jax
@@ -94,6 +94,7 @@ class ScreenStudy:
     - `orders`: of ghosts; `band_samples`: as of `waveguide.system_operator`.
     - `recording_angles`: of the object and the reference wave in the film, rad, which the mistake
       "grating" needs.
+    - `config`: the sections of the file that it was read from, if any.
 
     ```python
     import thincam_jax as tc
@@ -130,6 +131,7 @@ class ScreenStudy:
     recording_angles: tuple[float, float] | None = None
     seed: int = 0
     name: str = "screen"
+    config: Any = field(default=None, repr=False)
 
     @property
     def camera(self) -> wg.SeeThroughCamera:

@@ -259,6 +259,7 @@ class Study:
       and are divided by the light's fall.
     - `seed`: of the noise: each capture of each target has a random key of its own.
     - `mask_name`: of a mask without zones, in figures.
+    - `config`: the sections of the file that it was read from, if any.
     """
 
     mask: AbstractMask
@@ -273,6 +274,7 @@ class Study:
     seed: int = 0
     name: str = "study"
     mask_name: str = ""
+    config: Any = field(default=None, repr=False)
     # Filters of methods by the method's name and the shape of the field.
     _reconstructors: dict[tuple, Any] = field(default_factory=dict, init=False, repr=False)
 

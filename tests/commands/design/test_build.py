@@ -50,7 +50,7 @@ def test_problems_of_fronts(tmp_path):
         "{variable: distance, bounds: [2 mm, 3 mm], shared: true}]"
     )
     study = tiny.built(tmp_path, free, LIGHT, "search.limits.captures=8")
-    config, problem = study.config, study.problem
+    config, problem = study.study.config, study.problem
     thin = front_problems(config, problem, "thickness", [2.0, 3.0])
     assert [float(p.space.upper[-1]) for p in thin.values()] == [2.0, 3.0]
     lit = front_problems(config, problem, "light", [90.0])[90.0]

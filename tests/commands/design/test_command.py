@@ -20,7 +20,7 @@ def interrupted(monkeypatch):
     given = []
 
     def run(study, folder, progress):
-        given.append((study.config, folder.path))
+        given.append((study.study.config, folder.path))
         progress("search", 4)
         raise KeyboardInterrupt
 

@@ -173,7 +173,7 @@ def test_interrupted_design_goes_on(whole, tmp_path, monkeypatch):
     # A complete design is done anew.
     assert interrupted() == ["chart"]
     with pytest.raises(ConfigError, match="holds a design of another configuration"):
-        folder.claim(study.config.model_copy(update={"seed": 4}))
+        folder.claim(study.study.config.model_copy(update={"seed": 4}))
 
 
 @pytest.mark.thorough
@@ -237,7 +237,7 @@ def test_shots_that_coincide_are_two_exposures(tmp_path):
     method = study.methods[1]
     assert len(set(method.exposures)) == 6
     assert [(shot.beta, shot.take) for shot in method.shots] == [(20, 1), (17, 1), (20, 2)]
-    assert taken(read_again(design.config, study, tmp_path)) == taken(study)
+    assert taken(read_again(design.study.config, study, tmp_path)) == taken(study)
     electrons = "noise={read_noise: 0, electrons: 2e5}"
     longer = {"found 1": tiny.found([20.0, 20.0], relative_time=[0.7, 1.3])}
     method = tiny.built(tmp_path, electrons).with_designs(longer).methods[1]
@@ -284,8 +284,8 @@ def test_found_numbers_reach_the_simulation(tmp_path):
     camera = study.camera(exposure)
     assert (camera.mask.pixels, float(camera.mask.width)) == ((29, 29), pytest.approx(1.45))
     assert float(camera.sensor.electrons) == pytest.approx(0.7 * 2e5)
-    assert taken(read_again(design.config, study, tmp_path)) == taken(study)
-    shot = as_study_config(design.config, study.methods).methods[0].shots[0]
+    assert taken(read_again(design.study.config, study, tmp_path)) == taken(study)
+    shot = as_study_config(design.study.config, study.methods).methods[0].shots[0]
     assert shot.model_dump(exclude_defaults=True).keys() == {"beta", "distance"}
 
 

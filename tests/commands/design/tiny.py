@@ -4,11 +4,12 @@ from pathlib import Path
 
 from commands.study import tiny
 
-from thincam_jax.commands.design.build import FileDesign, build_design
+from thincam_jax.commands.design.build import build_design
 from thincam_jax.commands.design.config import DesignConfig
 from thincam_jax.commands.kinds import load_experiment
 from thincam_jax.design import Design
 from thincam_jax.lensless.exposures import Exposures
+from thincam_jax.studies.design import DesignStudy
 
 TEXT = """\
 name: tiny design
@@ -61,7 +62,7 @@ def design(folder: Path, *overrides: str, text: str = TEXT) -> DesignConfig:
     return load(write(folder, text), overrides)
 
 
-def built(folder: Path, *overrides: str, text: str = TEXT) -> FileDesign:
+def built(folder: Path, *overrides: str, text: str = TEXT) -> DesignStudy:
     return build_design(design(folder, *overrides, text=text))
 
 

@@ -56,7 +56,7 @@ def test_progress_and_files(run):
         | {"figures/methods.png", "images/all-in-focus.png"}
         | images
     )
-    assert load_experiment(path / "config.yaml") == study.config
+    assert load_experiment(path / "config.yaml") == study.study.config
 
 
 def test_animation_goes_there_and_back(run):

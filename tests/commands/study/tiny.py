@@ -11,7 +11,8 @@ from studies.tiny import picture
 
 from thincam_jax.commands.kinds import load_experiment
 from thincam_jax.commands.sections import StudyConfig
-from thincam_jax.commands.study.build import FileStudy, build_study
+from thincam_jax.commands.study.build import build_study
+from thincam_jax.studies.study import Study
 
 TEXT = """\
 name: tiny
@@ -59,7 +60,7 @@ def study(folder: Path, *overrides: str, text: str = TEXT) -> StudyConfig:
     return load_experiment(write(folder, text), overrides)
 
 
-def built(folder: Path, *overrides: str, text: str = TEXT) -> FileStudy:
+def built(folder: Path, *overrides: str, text: str = TEXT) -> Study:
     return build_study(study(folder, *overrides, text=text))
 
 

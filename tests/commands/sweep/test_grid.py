@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.sweep import grid
-from thincam_jax.commands.sweep.grid import grid_values, read_axes
+from thincam_jax.commands.sweep.grid import read_axes
 
 RAW = {
     "seed": 0,
@@ -111,11 +111,6 @@ def test_star_stands_for_every_entry_of_a_list():
         ("methods", 0, "shots", 1, "beta"),
         ("methods", 1, "shots", 0, "beta"),
     )
-
-
-def test_points_are_the_product_of_the_axes():
-    axes = read_axes(["seed=0:1:2", "sensor.bit_depth=8,10,12"], RAW)
-    assert grid_values(axes) == [(0, 8), (0, 10), (0, 12), (1, 8), (1, 10), (1, 12)]
 
 
 NINES = "9," * 99

@@ -15,7 +15,7 @@ from thincam_jax.commands.report import Page, Part, Picture
 from thincam_jax.commands.run_folder import Progress, Run, RunFolder
 from thincam_jax.commands.screen.run import build_cameras, build_plane
 from thincam_jax.commands.sections import PHASES, SensorConfig, TargetConfig, build_solver
-from thincam_jax.commands.study.build import FileStudy, build_optics, read_target
+from thincam_jax.commands.study.build import build_optics, read_target
 from thincam_jax.imaging.operators import Sparse
 from thincam_jax.imaging.scene import ImagePlane
 from thincam_jax.lensless.exposures import Exposures
@@ -33,7 +33,7 @@ from thincam_jax.studies.rig import (
     monitor_system,
     recover_to,
 )
-from thincam_jax.studies.study import Method, Synthesis, Target
+from thincam_jax.studies.study import Method, Study, Synthesis, Target
 
 _MATRIX = (
     "The matrix is in matrix.zarr; a capture of another picture, less the dark frame, is "
@@ -155,7 +155,7 @@ def _lit(config: CaptureConfig, shape: tuple[int, ...]) -> np.ndarray:
     return inside
 
 
-def build_study(config: CaptureConfig, shape: tuple[int, int]) -> FileStudy:
+def build_study(config: CaptureConfig, shape: tuple[int, int]) -> Study:
     """The cameras of a lensless plan, for frames of a shape, with the one method of its file.
 
     **Errors**: ConfigError for a picture that cannot be read.
@@ -182,16 +182,13 @@ def build_study(config: CaptureConfig, shape: tuple[int, int]) -> FileStudy:
         image = target.plane.image.mean(axis=0)
         return replace(target, plane=ImagePlane(image, target.distance, target.width))
 
-    targets, faults = config.read_each("targets", grey)
-    if faults:
-        raise ConfigError("\n".join(faults))
     pixels = {"pixel_pitch": display.pitch, "fill_factor": display.fill_factor}
     mask = MaskConfig.model_construct(width=plan.width, profile=plan.profile, **pixels)
     sensor = SensorConfig.model_construct(shape=shape, pitch=config.camera.pitch)
-    return FileStudy(
+    return Study(
         *build_optics(mask, sensor, exposures[0]),
         (Method(plan.kind, exposures, solver, synthesis, len(phases)),),
-        tuple(targets),
+        tuple(config.read_all("targets", grey)),
         object_distance=optics.object.distance,
         model=optics.model,
         pixel_integration=optics.pixel_integration,

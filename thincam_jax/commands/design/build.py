@@ -1,21 +1,12 @@
 """From a design's file to its study, and from what was found to a study's file."""
 
-from dataclasses import dataclass
-from typing import Any
-
 import numpy as np
 
 from thincam_jax._core.precision import allow
 from thincam_jax.commands.config_file import ConfigError
-from thincam_jax.commands.design.config import DesignConfig, DesignNoiseConfig, SearchConfig
+from thincam_jax.commands.design.config import DesignConfig, SearchConfig
 from thincam_jax.commands.mask import MaskConfig
-from thincam_jax.commands.sections import (
-    MethodConfig,
-    MethodShotConfig,
-    SensorConfig,
-    StudyConfig,
-    build_noise,
-)
+from thincam_jax.commands.sections import MethodConfig, MethodShotConfig, SensorConfig, StudyConfig
 from thincam_jax.commands.study import build
 from thincam_jax.design import (
     AbstractObjective,
@@ -45,14 +36,7 @@ _FULL_WELL = 1e9
 _SMALLEST_PICTURE = 32  # pixels along a side from which a spectrum is measured
 
 
-@dataclass(frozen=True, eq=False)
-class FileDesign(DesignStudy):
-    """A study with the file that it was read from."""
-
-    config: Any = None
-
-
-def build_design(config: DesignConfig) -> FileDesign:
+def build_design(config: DesignConfig) -> DesignStudy:
     """All that a design needs, images read and everything checked, before the search.
 
     **Errors**: ConfigError as of `build_study`, and for pictures too small for a measured prior.
@@ -63,7 +47,7 @@ def build_design(config: DesignConfig) -> FileDesign:
         rivals = {rival.name: config.design(rival) for rival in config.compare}
         fronts = _fronts(config, problem)
     search, validation = config.search, config.validation
-    return FileDesign(
+    return DesignStudy(
         study,
         problem,
         rivals,
@@ -73,25 +57,24 @@ def build_design(config: DesignConfig) -> FileDesign:
         validation.best,
         _training(config),
         fronts,
-        config,
     )
 
 
-def build_designs(config: DesignConfig) -> build.FileStudy:
+def build_designs(config: DesignConfig) -> Study:
     """The designs that the file gives, as methods of a study, the one to beat first."""
     with allow("float64"):
         given = {one.name: config.design(one) for one in (config.reference, *config.compare)}
 
-    def assembled() -> build.FileStudy:
+    def assembled() -> Study:
         sensor, first = _sensor(config), given[config.reference.name].exposures[0]
         mask, sensor = build.build_optics(_mask(config), sensor, first)
         synthesis = config.reference.synthesis
-        return build.FileStudy(
+        return Study(
             mask,
             sensor,
             tuple(as_method(mask, name, design, synthesis) for name, design in given.items()),
             object_distance=config.object.distance,
-            noise=build_noise(config.noise.simulated()),
+            noise=config.noise.simulated().build(),
             model=config.model,
             pixel_integration=config.pixel_integration,
             seed=config.seed,
@@ -131,7 +114,7 @@ def build_problem(config: DesignConfig, study: Study) -> DesignProblem:
         sensor_width=config.sensor.width,
         object_distance=config.object.distance,
         object_width=config.object.width,
-        noise=_noise(config.noise),
+        noise=config.noise.build(PhotonNoise if config.noise.snr_db is None else SignalNoise),
         prior=_prior(config, study.targets),
         contrast=config.prior.contrast,
         pixel_integration=config.pixel_integration,
@@ -154,12 +137,6 @@ def _synthesis(config: DesignConfig, design: Design) -> np.ndarray:
     """Of a design's captures, real weights (channel, capture)."""
     phases = design.phases
     return synthesis_matrix(config.reference.synthesis, design.captures // phases, phases)
-
-
-def _noise(noise: DesignNoiseConfig) -> SignalNoise | PhotonNoise:
-    if noise.snr_db is not None:
-        return SignalNoise(noise.snr_db)
-    return PhotonNoise(noise.electrons or 0.0, noise.read_noise or 0.0)
 
 
 def _prior(config: DesignConfig, targets: tuple[Target, ...]) -> PowerLaw:

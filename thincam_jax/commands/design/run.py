@@ -8,14 +8,14 @@ from typing import Any
 from thincam_jax.commands.checked_config import dump_config
 from thincam_jax.commands.config_file import ConfigError, slug
 from thincam_jax.commands.design import report
-from thincam_jax.commands.design.build import FileDesign, as_study_config
+from thincam_jax.commands.design.build import as_study_config
 from thincam_jax.commands.design.config import DesignConfig
 from thincam_jax.commands.run_folder import Progress, Run, RunFolder, Step, as_record
 from thincam_jax.design import NonFiniteObjectiveError
 from thincam_jax.plot import design as plot
 from thincam_jax.plot.frame import as_png
 from thincam_jax.plot.studies import draw_found
-from thincam_jax.studies.design import DesignSearch, FrontSearches
+from thincam_jax.studies.design import DesignSearch, DesignStudy, FrontSearches
 from thincam_jax.studies.design_result import DesignResult
 from thincam_jax.studies.design_scores import DesignScores
 from thincam_jax.studies.evaluate import Evaluation, Scores
@@ -37,7 +37,7 @@ class DesignFolder(RunFolder):
     kind, folders, pictures, result = "design", ("targets",), "", "design.json"
 
 
-def run_design(design: FileDesign, folder: DesignFolder, progress: Progress) -> DesignScores:
+def run_design(design: DesignStudy, folder: DesignFolder, progress: Progress) -> DesignScores:
     """Search, simulate and report; returns (and writes) what goes into design.json.
 
     The same configuration gives the same on the same machine.
@@ -59,8 +59,8 @@ class _DesignRun(Run):
     config: DesignConfig
     scores: DesignScores
 
-    def __init__(self, design: FileDesign, folder: DesignFolder):
-        super().__init__(design.config, folder)
+    def __init__(self, design: DesignStudy, folder: DesignFolder):
+        super().__init__(design.study.config, folder)
         self.design, self.search, self.fronts = design, DesignSearch(design), None
         self.trials: dict[str, Trials] = {}
         self.work += _blaming("search", self.search.searching)

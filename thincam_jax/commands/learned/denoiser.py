@@ -3,7 +3,6 @@
 from typing import Annotated, Literal
 
 import numpy as np
-import pydantic
 from pydantic import Field
 
 from thincam_jax.commands.config_file import ConfigError
@@ -11,13 +10,11 @@ from thincam_jax.commands.learned.training import (
     TRAINING,
     Ended,
     InFolder,
+    LearningConfig,
     SourceConfig,
-    check_sources,
-    read_sources,
 )
 from thincam_jax.commands.run_folder import to_json
 from thincam_jax.commands.schema import section
-from thincam_jax.commands.sections import ExperimentConfig
 from thincam_jax.learn.checkpoint import CheckpointError
 from thincam_jax.learn.denoiser import pictures
 from thincam_jax.learn.denoiser.network import DenoiserOptions, create, load_network
@@ -47,21 +44,15 @@ class DenoiserTrainingConfig(section(TrainingOptions, DenoisingLessons, **_TRAIN
     """See `learn.training.TrainingOptions` and `learn.denoiser.train.DenoisingLessons`."""
 
 
-class DenoiserConfig(ExperimentConfig):
+class DenoiserConfig(LearningConfig):
     """A denoiser; `start`: a network's file, or "shipped", that training goes on from."""
 
-    pictured = "sources"
     kind: Literal["denoiser"]
     sources: Annotated[tuple[PicturesConfig, ...], Field(min_length=1)]
     start: str | None = None
     network: DenoiserNetworkConfig = DenoiserNetworkConfig()
     training: DenoiserTrainingConfig = DenoiserTrainingConfig()
     notes: tuple[str, ...] = ()
-
-    @pydantic.model_validator(mode="after")
-    def _fits(self):
-        check_sources(self)
-        return self
 
 
 def run_denoiser(config: DenoiserConfig, place: InFolder) -> Ended:
@@ -121,7 +112,9 @@ def build_lessons(config: DenoiserConfig) -> DenoisingLessons:
         named = images if isinstance(images, dict) else {source.name: images}
         return pictures.split(named, source.held_out)
 
-    for source, (kept, held_out) in zip(config.sources, read_sources(config, read), strict=True):
+    for source, (kept, held_out) in zip(
+        config.sources, config.read_all("sources", read), strict=True
+    ):
         (train if source.use == "train" else judge).extend(kept)
         judge.extend(held_out)
     if not train:

@@ -15,9 +15,8 @@ from thincam_jax.commands.learned.training import (
     Count,
     Ended,
     InFolder,
+    LearningConfig,
     SourceConfig,
-    check_sources,
-    read_sources,
 )
 from thincam_jax.commands.mask import APERTURE, ApertureConfig
 from thincam_jax.commands.report import Page, Part, Picture, pixels_of
@@ -77,10 +76,9 @@ class TrainingConfig(section(TrainingOptions, Lessons, only=(*TRAINING, *_LESSON
     """See `learn.training.TrainingOptions`; `batch`, `pool`, `judged`: see `learn.Lessons`."""
 
 
-class LearnedConfig(LenslessConfig):
+class LearnedConfig(LenslessConfig, LearningConfig):
     """A network that refocuses the captures of one camera."""
 
-    pictured = "sources"
     kind: Literal["learned"]
     sensor: SensorConfig
     mask: ZonesConfig
@@ -91,11 +89,6 @@ class LearnedConfig(LenslessConfig):
     network: NetworkConfig = NetworkConfig()
     training: TrainingConfig = TrainingConfig()
     notes: tuple[str, ...] = ()
-
-    @pydantic.model_validator(mode="after")
-    def _sources_fit(self):
-        check_sources(self)
-        return self
 
 
 def run_training(config: LearnedConfig, place: InFolder) -> Ended:
@@ -159,7 +152,8 @@ def build_network(config: LearnedConfig) -> RefocusNetwork:
 def build_lessons(config: LearnedConfig) -> Lessons:
     """**Errors**: ConfigError, one line for each source that cannot be read."""
     of_use: dict[str, list[sources.Source]] = {"train": [], "judge": []}
-    images = read_sources(config, lambda source: source.images(sources, config.scenes.side))
+    side = config.scenes.side
+    images = config.read_all("sources", lambda source: source.images(sources, side))
     for source, read in zip(config.sources, images, strict=True):
         of_use[source.use].append(read)
     train, judge = (functools.reduce(operator.add, s) if s else None for s in of_use.values())

@@ -12,7 +12,7 @@ from thincam_jax._core.quantity import FieldError
 from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.run_folder import RunFolder
 from thincam_jax.commands.schema import Section
-from thincam_jax.commands.sections import Found, Name, check_keys, check_names
+from thincam_jax.commands.sections import ExperimentConfig, Name, check_keys, check_names
 from thincam_jax.learn.checkpoint import CheckpointError
 from thincam_jax.learn.refocusing.train import NETWORK
 from thincam_jax.learn.training import Trained, TrainingOptions, TrainingProgress
@@ -49,22 +49,17 @@ class SourceConfig(Section):
         return maker.photographs(self.path, *side, licence=self.licence)
 
 
-def check_sources(config: Any) -> None:
-    """Sources have names of their own, and one of them trains."""
-    check_names(config, "sources")
-    if not any(source.use == "train" for source in config.sources):
-        raise FieldError("none of them is of use 'train'; give one", "sources")
+class LearningConfig(ExperimentConfig):
+    """Files with `sources` of images, which have names of their own, and of which one trains."""
 
+    pictured = "sources"
 
-def read_sources(config: Any, read: Callable[[Any], Found]) -> list[Found]:
-    """The images of every source of a file, by a function of its section.
-
-    **Errors**: ConfigError, one line for each source that cannot be read.
-    """
-    found, faults = config.read_each("sources", read)
-    if faults:
-        raise ConfigError("\n".join(faults))
-    return found
+    @pydantic.model_validator(mode="after")
+    def _sources_fit(self):
+        check_names(self, "sources")
+        if not any(source.use == "train" for source in getattr(self, self.pictured)):
+            raise FieldError("none of them is of use 'train'; give one", "sources")
+        return self
 
 
 class TrainingFolder(RunFolder):

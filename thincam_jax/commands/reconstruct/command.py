@@ -8,7 +8,7 @@ from typer import Option
 
 from thincam_jax.commands.terminal import Overrides, fail, say_result, told
 
-# Known without importing JAX; the tests hold them to `options.PSF_METHODS`.
+# What works from a measured PSF and prepared captures; "auto" then is admm-tv.
 METHODS = ("auto", "admm-tv", "fista", "pnp", "ridge")
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from thincam_jax._core.files import write_whole
+from thincam_jax._core.files import write_whole, writing
 from thincam_jax.commands.reconstruct.options import Output, Sources
 from thincam_jax.measured import CaptureFileError, MeasurementError, write_image
 from thincam_jax.measured.read import image_files
@@ -93,20 +93,16 @@ def write_job(
 ) -> None:
     """All files of a job, complete before the first of them takes its name; the record first."""
     folder = job.record.parent
-    folder.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=".thincam-", dir=folder) as staging:
-        for path in job.images:
-            write_image(
-                Path(staging) / path.name,
-                image,
-                record,
-                white_balance=output.white_balance,
-                gamma=output.gamma,
-            )
-        for path, content in (beside or {}).items():
-            write_whole(Path(staging) / path.name, content)
-        for path in (job.record, *job.images, *job.beside):
-            os.replace(Path(staging) / path.name, path)
+    with writing(job.images[0]):
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=".thincam-", dir=folder) as staging:
+            shown = {"white_balance": output.white_balance, "gamma": output.gamma}
+            for path in job.images:
+                write_image(Path(staging) / path.name, image, record, **shown)
+            for path, content in (beside or {}).items():
+                write_whole(Path(staging) / path.name, content)
+            for path in (job.record, *job.images, *job.beside):
+                os.replace(Path(staging) / path.name, path)
 
 
 def _captures_in(folder: Path, sources: Sources) -> list[Path]:

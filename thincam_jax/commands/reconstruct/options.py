@@ -13,6 +13,7 @@ from thincam_jax._core import checks
 from thincam_jax._core.grids import same_parity
 from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.kinds import KINDS, load_experiment, load_study, read_kind
+from thincam_jax.commands.reconstruct.command import METHODS
 from thincam_jax.commands.study.build import assemble, check_optics
 from thincam_jax.lensless.psf import psf
 from thincam_jax.measured import MeasurementError, Preparation, Raw
@@ -30,8 +31,7 @@ from thincam_jax.reconstruction import (
 from thincam_jax.reconstruction.depth.refocus import increasing
 from thincam_jax.units import parse_quantity
 
-# What works from a measured PSF and prepared captures; "auto" then is admm_tv.
-PSF_METHODS = ("auto", "admm_tv", "fista", "pnp", "ridge")
+PSF_METHODS = tuple(name.replace("-", "_") for name in METHODS)
 DEFAULT_TAU, DEFAULT_RIDGE = 2.0, 1.0
 
 # Far beyond any use; its product with the captures' units stays within float32.
@@ -227,24 +227,21 @@ def known_psf(
         raise MeasurementError(
             "give either --psf, a measured PSF, or --camera, a study with the camera's numbers"
         )
-    if camera is None:
+    if distance is not None and network is None:
+        raise MeasurementError("--distance is that of a --network; see --distances for others")
+    if psf is not None:
         if overrides:
             raise MeasurementError("--set changes the file of --camera; leave it out with --psf")
         if network is not None:
             raise MeasurementError("--network is of a camera; give --camera in place of --psf")
-    if distance is not None and network is None:
-        raise MeasurementError("--distance is that of a --network; see --distances for others")
-    if psf is not None or camera is None:
-        assert psf is not None  # one of the two is given
         return psf, None
+    assert camera is not None
     try:
         focused = None if distance is None else parse_quantity(distance, "length")
     except ValueError as error:
         raise MeasurementError(f"--distance: {error}") from None
     cameras = read_camera(camera, overrides or (), focused)
-    focusing = None
-    if network is not None:
-        focusing = read_network(network, cameras)
+    focusing = None if network is None else read_network(network, cameras)
     if background is None:
         raise MeasurementError(
             "--camera: a computed PSF has no dark corner; give --background, a dark frame or a "

@@ -12,7 +12,7 @@ import rich.progress
 
 from thincam_jax import measured
 from thincam_jax._core.environment import environment
-from thincam_jax._core.files import WriteError, writing
+from thincam_jax._core.files import WriteError
 from thincam_jax._core.text import escaped
 from thincam_jax.commands import terminal
 from thincam_jax.commands.interrupt import INTERRUPTED
@@ -43,6 +43,7 @@ class Finished:
     - `line`: what was done, in a line. `doubt`: what is wrong with an image that does not explain
       its capture, or nothing.
     - `status`: see `Reconstruction.ending`.
+    - `marked`: the image with its uncertain pixels marked, as a PNG.
     """
 
     job: Job
@@ -52,6 +53,7 @@ class Finished:
     doubt: str = ""
     status: str = ""
     iterations: int = 0
+    marked: bytes = b""
 
 
 @dataclass(frozen=True)
@@ -133,22 +135,6 @@ def _background(given: Background, bits: int | None) -> measured.Raw | float | N
     return measured.read_image(given, bits) if isinstance(given, Path) else given
 
 
-@dataclass(frozen=True)
-class _Made:
-    """An image (channel, y, x), the facts for its record, and what `Finished` says of it.
-
-    - `marked`: the image with its uncertain pixels marked, as a PNG.
-    """
-
-    image: np.ndarray
-    facts: dict[str, Any]
-    line: str
-    doubt: str
-    status: str
-    iterations: int = 0
-    marked: bytes = b""
-
-
 def _run_job(job: Job, rig: Rig, recipe: Recipe, output: Output, report: Report | None) -> Finished:
     began = time.perf_counter()
     ready = rig.prepare(job.capture, job.focus or 0)
@@ -157,14 +143,14 @@ def _run_job(job: Job, rig: Rig, recipe: Recipe, output: Output, report: Report 
     if recipe.focusing is None:
         made = _reconstruct(job, ready, recipe, noise, report)
     else:
-        made = _focus(ready, recipe.focusing, noise)
+        made = _focus(job, ready, recipe.focusing, noise)
     image = made.image[:, ::-1, ::-1] if recipe.flip else made.image
     shown = {"gamma": output.gamma, "white_balance": output.white_balance}
     record = {
         "capture": job.capture,
         "sources": _source_facts(rig.sources),
         "preparation": ready.log,
-        "reconstruction": made.facts | {"noise": {"counts": noise.counts, "found": noise.found}},
+        "reconstruction": made.record | {"noise": {"counts": noise.counts, "found": noise.found}},
         "image": {
             "shape": image.shape,
             "field": recipe.field,
@@ -177,9 +163,8 @@ def _run_job(job: Job, rig: Rig, recipe: Recipe, output: Output, report: Report 
         "environment": environment(time.perf_counter() - began),
     }
     beside = dict.fromkeys(job.beside, made.marked) if made.marked else None
-    _write(job, image, record, output, beside)
-    told = made.doubt, made.status, made.iterations
-    return Finished(job, record, image, f"{job.images[0]}: {made.line}", *told)
+    write_job(job, image, record, output, beside)
+    return replace(made, record=record, image=image, line=f"{job.images[0]}: {made.line}")
 
 
 def _join(job: Job, images: list[np.ndarray], rig: Rig, output: Output) -> Finished:
@@ -207,15 +192,10 @@ def _join(job: Job, images: list[np.ndarray], rig: Rig, output: Output) -> Finis
         "files": [path.name for path in (*job.images, *job.beside)],
         "environment": environment(time.perf_counter() - began),
     }
-    _write(job, sharp, record, output, beside)
+    write_job(job, sharp, record, output, beside)
     others = ", ".join(path.name for path in job.beside)
     line = f"{job.images[0]}: each part from the distance it is sharp at; {others}"
     return Finished(job, record, sharp, line)
-
-
-def _write(job: Job, image: np.ndarray, record, output: Output, beside=None) -> None:
-    with writing(job.images[0]):
-        write_job(job, image, record, output, beside)
 
 
 def _source_facts(sources: Sources) -> dict[str, Any]:
@@ -228,7 +208,8 @@ def _source_facts(sources: Sources) -> dict[str, Any]:
 
 def _reconstruct(
     job: Job, ready: measured.Prepared, recipe: Recipe, noise: PixelNoise, report: Report | None
-) -> _Made:
+) -> Finished:
+    """The image, unturned; its record is of the method alone."""
     solver = recipe.solver(len(ready.capture))
     # Conjugate gradients are one compiled program, without progress.
     callback = None if report is None or recipe.is_ridge else partial(report, job.name)
@@ -238,9 +219,9 @@ def _reconstruct(
         raise measured.MeasurementError(
             f"{job.capture}: the image became NaN or infinite; use --method admm-tv"
         )
+    name, value = ("ridge", recipe.relative_ridge) if recipe.is_ridge else ("tau", recipe.tau)
     if found.status == "non_finite":
-        name = "ridge" if recipe.is_ridge else "tau"
-        now = recipe.relative_ridge if recipe.is_ridge else recipe.relative_tau
+        now = recipe.relative_tau if value is None else value
         raise measured.MeasurementError(
             f"{job.capture}: the image became NaN or infinite after {found.iterations} iterations; "
             f"give a {name} (now {now:g}) that is nearer to 1"
@@ -249,7 +230,6 @@ def _reconstruct(
         raise KeyboardInterrupt
     residual, doubt = done.relative_residual, ""
     if not residual < _UNEXPLAINED:  # or no number
-        name, value = ("ridge", recipe.relative_ridge) if recipe.is_ridge else ("tau", recipe.tau)
         why = (
             f"{name} = {value:g} is too large, give about 1" if value else "the PSF may be another"
         )
@@ -259,8 +239,8 @@ def _reconstruct(
         f"residual {residual:.3g}, {found.seconds:.1f} s, noise {noise.counts:.3g} counts "
         f"({noise.found.split()[0]})"
     )
-    facts = _facts(done, recipe)
-    return _Made(done.image(recipe.field), facts, line, doubt, found.status, found.iterations)
+    image, facts = done.image(recipe.field), _facts(done, recipe)
+    return Finished(job, facts, image, line, doubt, found.status, found.iterations)
 
 
 def _facts(done: PreparedResult, recipe: Recipe) -> dict[str, Any]:
@@ -288,7 +268,8 @@ def _facts(done: PreparedResult, recipe: Recipe) -> dict[str, Any]:
     }
 
 
-def _focus(ready: measured.Prepared, focusing: Focusing, noise: PixelNoise) -> _Made:
+def _focus(job: Job, ready: measured.Prepared, focusing: Focusing, noise: PixelNoise) -> Finished:
+    """The same by a network."""
     from thincam_jax.learn.refocusing.use import SURE, doubt, read
     from thincam_jax.plot.frame import as_png
     from thincam_jax.plot.learned import draw_unsure
@@ -323,7 +304,8 @@ def _focus(ready: measured.Prepared, focusing: Focusing, noise: PixelNoise) -> _
         f"focused on {focusing.distance:g} mm, residual {consistency:.2f} of the noise, not sure "
         f"of {100 * part:.0f} % of the pixels, {seconds:.1f} s"
     )
-    return _Made(image, facts, line, words, status, marked=as_png(draw_unsure(image, unsure)))
+    marked = as_png(draw_unsure(image, unsure))
+    return Finished(job, facts, image, line, words, status, marked=marked)
 
 
 def _check_channels(job: Job, ready: measured.Prepared, recipe: Recipe, output: Output) -> None:

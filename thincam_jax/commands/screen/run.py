@@ -2,7 +2,7 @@
 
 import resource
 import sys
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -18,7 +18,7 @@ from thincam_jax.commands.screen.config import (
     ScreenMethodConfig,
     SeeThroughConfig,
 )
-from thincam_jax.commands.sections import VariationConfig, build_noise
+from thincam_jax.commands.sections import VariationConfig
 from thincam_jax.commands.study.build import picture
 from thincam_jax.plot import screen as plot
 from thincam_jax.reconstruction import AbstractSolver, AdmmTV, Ridge, TotalVariation
@@ -51,14 +51,7 @@ _COLUMNS = (
 )
 
 
-@dataclass(frozen=True, eq=False)
-class FileScreen(ScreenStudy):
-    """A study with the file that it was read from."""
-
-    config: Any = None
-
-
-def build_screen(config: ScreenConfig) -> FileScreen:
+def build_screen(config: ScreenConfig) -> ScreenStudy:
     """The study of a file, everything checked and images read.
 
     **Errors**: ConfigError, one line for each fault, beginning with its place.
@@ -68,13 +61,11 @@ def build_screen(config: ScreenConfig) -> FileScreen:
         "targets", lambda one: picture(one, cells, channels), "path"
     )
     targets = dict(zip([target.name for target in config.targets], pictures, strict=False))
-    noise = build_noise(config.noise)
-    assert noise is not None  # the section is needed
-    study = FileScreen(
+    study = ScreenStudy(
         build_cameras(config),
         build_plane(config),
         targets,
-        noise,
+        config.noise.build(),
         {method.name: build_solver(method) for method in config.methods},
         tuple(model.build(name=model.name) for model in config.models),
         config.orders,
@@ -135,7 +126,7 @@ def build_solver(method: ScreenMethodConfig) -> AbstractSolver:
     return AdmmTV(options.tau, variation=variation, iterations=options.iterations)
 
 
-def run_screen(study: FileScreen, folder: RunFolder, progress: Progress) -> ScreenResult:
+def run_screen(study: ScreenStudy, folder: RunFolder, progress: Progress) -> ScreenResult:
     """Run a study into a folder; its result has the model that a calibration measured, too."""
     return _ScreenRun(study, folder).carry_out(progress).result
 
@@ -145,7 +136,7 @@ class _ScreenRun(Run):
 
     result: ScreenResult
 
-    def __init__(self, study: FileScreen, folder: RunFolder):
+    def __init__(self, study: ScreenStudy, folder: RunFolder):
         super().__init__(study.config, folder)
         self.study, self.models, self.calibration = study, ScreenRun(study), None
         self.work += self.models.work

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,6 @@ from thincam_jax.commands.sections import (
     StudyConfig,
     TargetConfig,
     as_method,
-    build_noise,
 )
 from thincam_jax.imaging import targets as drawn
 from thincam_jax.imaging.sensor import Sensor
@@ -27,14 +26,7 @@ from thincam_jax.studies.evaluate import check_cameras, check_target
 from thincam_jax.studies.study import Study, Target
 
 
-@dataclass(frozen=True, eq=False)
-class FileStudy(Study):
-    """A study with the file that it was read from."""
-
-    config: Any = None
-
-
-def build_study(config: StudyConfig) -> FileStudy:
+def build_study(config: StudyConfig) -> Study:
     """All that a study needs, images read and everything checked, before the first capture.
 
     **Errors**: ConfigError, one line for each fault, beginning with the field.
@@ -42,7 +34,7 @@ def build_study(config: StudyConfig) -> FileStudy:
     return with_targets(config, config.object, lambda: assemble(config))
 
 
-def with_targets(config: Any, seen: ObjectConfig, make: Callable[[], FileStudy]) -> FileStudy:
+def with_targets(config: Any, seen: ObjectConfig, make: Callable[[], Study]) -> Study:
     """The study that a function makes, with the targets of a file where its object stands.
 
     **Errors**: ConfigError, one line for each fault, beginning with the field: cameras that cannot
@@ -67,19 +59,19 @@ def with_targets(config: Any, seen: ObjectConfig, make: Callable[[], FileStudy])
     return replace(study, targets=tuple(targets))
 
 
-def assemble(config: CamerasConfig) -> FileStudy:
+def assemble(config: CamerasConfig) -> Study:
     """Cameras, noise and methods of a file, before targets.
 
     **Errors**: ConfigError for a mask or a sensor that cannot be built.
     """
     methods = tuple(as_method(config, method) for method in config.methods)
     mask, sensor = build_optics(config.mask, config.sensor, methods[0].exposures[0])
-    return FileStudy(
+    return Study(
         mask,
         sensor,
         methods,
         object_distance=config.object.distance if isinstance(config, StudyConfig) else math.inf,
-        noise=build_noise(config.noise),
+        noise=config.noise and config.noise.build(),
         model=config.model,
         pixel_integration=config.pixel_integration,
         field_tolerance=config.field_tolerance,
@@ -136,7 +128,7 @@ def picture(target: PictureConfig, cells: tuple[int, int], channels: int = 0) ->
     return picture
 
 
-def check_optics(study: FileStudy) -> None:
+def check_optics(study: Study) -> None:
     """Refuse cameras that cannot be built. **Errors**: ConfigError, one line."""
     try:
         check_cameras(study)

@@ -14,14 +14,13 @@ from thincam_jax.commands.report import (
 )
 from thincam_jax.commands.run_folder import Progress, Run, RunFolder, as_record
 from thincam_jax.commands.sections import StudyConfig
-from thincam_jax.commands.study.build import FileStudy
 from thincam_jax.lensless.exposures import Exposure
 from thincam_jax.plot import studies as plot
 from thincam_jax.studies.evaluate import Contrasts, Evaluation, Scores, evaluate_method
 from thincam_jax.studies.response import Response, method_response
 from thincam_jax.studies.result import StudyScores, findings, summarise
 from thincam_jax.studies.simulate import Capture, take
-from thincam_jax.studies.study import Method, Target
+from thincam_jax.studies.study import Method, Study, Target
 
 _SCORED = (
     "PSNR and SSIM are taken after a least-squares gain and offset, over the target's area, "
@@ -44,7 +43,7 @@ _CONTRAST = (
 )
 
 
-def run_study(study: FileStudy, folder: RunFolder, progress: Progress) -> StudyScores:
+def run_study(study: Study, folder: RunFolder, progress: Progress) -> StudyScores:
     """Run what the folder does not hold yet; returns (and writes) the scores.
 
     The same configuration gives the same scores: every capture's noise has its own key, from the
@@ -58,7 +57,7 @@ class _StudyRun(Run):
 
     scores: StudyScores
 
-    def __init__(self, study: FileStudy, folder: RunFolder):
+    def __init__(self, study: Study, folder: RunFolder):
         super().__init__(study.config, folder)
         self.study = study
         self.captures: dict[Exposure, Capture] = {}

@@ -4,7 +4,6 @@ import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import product
 from typing import Any
 
 import numpy as np
@@ -55,11 +54,6 @@ def read_axes(texts: Sequence[str], raw: dict) -> list[Axis]:
     if count > MOST_POINTS:
         raise ConfigError(f"the grid has {count} points; give at most {MOST_POINTS}")
     return axes
-
-
-def grid_values(axes: Sequence[Axis]) -> list[tuple[Any, ...]]:
-    """One value of every axis for each point; the last axis changes fastest."""
-    return list(product(*(axis.values for axis in axes)))
 
 
 def _read_axis(text: str, raw: dict) -> Axis:

@@ -2,6 +2,7 @@
 
 import copy
 import hashlib
+import itertools
 import json
 import time
 import traceback
@@ -19,7 +20,7 @@ from thincam_jax.commands.checked_config import check_as
 from thincam_jax.commands.config_file import ConfigError, Places, set_entry
 from thincam_jax.commands.sections import StudyConfig, exposures_of
 from thincam_jax.commands.study.build import build_study
-from thincam_jax.commands.sweep.grid import Axis, grid_values
+from thincam_jax.commands.sweep.grid import Axis
 from thincam_jax.studies.evaluate import Scores
 from thincam_jax.studies.result import evaluate_target, mean_psnr_of_pictures
 from thincam_jax.studies.study import unresolved_zones
@@ -58,7 +59,8 @@ def make_points(base: StudyConfig, axes: Sequence[Axis], double: bool) -> list[G
     where two are the same.
     """
     raw = base.model_dump(mode="json", exclude_none=True)
-    points = [_make_point(raw, axes, values, double) for values in grid_values(axes)]
+    grid = itertools.product(*(axis.values for axis in axes))  # the last changes fastest
+    points = [_make_point(raw, axes, values, double) for values in grid]
     if all(point.config is None for point in points):
         raise ConfigError(f"{points[0].reason} (no point of the grid can be run)")
     first: dict[str, GridPoint] = {}

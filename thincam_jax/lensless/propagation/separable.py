@@ -21,6 +21,8 @@ _FEWER: dict[Precision, dict[int, float]] = {
     "float32": {4: 0.3, 6: 0.85, 8: 1.55, 10: 2.385, 12: 3.25, 14: 4.2, 16: 5.15, 20: 7.15},
     "float64": {4: 0.05, 6: 0.25, 8: 0.6, 10: 1.15, 12: 1.75, 14: 2.45, 16: 3.2, 20: 4.85},
 }
+# Rows and columns up to which a core computes both as fast as two.
+_SMALL = 1024
 
 
 def pixel_nodes(mask: AbstractMask, grid: Grid, path: Path, precision: Precision) -> int:
@@ -124,7 +126,8 @@ def separable(
 
     y, x = path.on_mask(grid, mask.centre)
     along_y, along_x = path.along_axes(mask.centre)
-    if pixel_integration and down is across and along_y is along_x:
+    small = pixel_integration or sum(grid.shape) <= _SMALL
+    if small and down is across and along_y is along_x:
         # Both axes at once: half as much to compile, and as fast.
         both = products(across, along_x, jnp.concatenate([y, x]))
         rows, columns = jnp.split(both, [grid.shape[0]], axis=-1)
