@@ -74,7 +74,7 @@ def field_operator(
     mask = tc.FresnelZoneAperture(25.0, width=1.0)
     camera = tc.LenslessCamera(mask, tc.Sensor((20, 24), 60 * um), distance=6.5)
     fit = tc.field_operator(camera, 500 * nm, 250.0, field_shape=(16, 20))
-    capture = fit.operator(tc.imaging.targets.siemens_star(16, 20))
+    capture = fit.operator(tc.imaging.targets.siemens_star((16, 20)))
     print(capture.shape)  # (20, 24)
     ```
 

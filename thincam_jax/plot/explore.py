@@ -36,7 +36,7 @@ def explore(
     mask = tc.FresnelZoneAperture(25.0, width=1.6)
     camera = tc.LenslessCamera(mask, tc.Sensor((96, 128), 15 * um), distance=5.0)
     widget = tc.explore(camera)
-    print(widget.camera.distance)  # 5.0, until its slider is moved
+    print(widget.camera.distance)  # 5.0
     ```
 
     **See also**: `plot.psf`, `plot.otf`.
