@@ -1,8 +1,10 @@
 r"""The camera over its field of view: a PSF of its own for every point of the object."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy
@@ -45,11 +47,11 @@ def field_operator(
 ) -> LowRankFit:
     r"""From a plane of the object to its capture, every point with its own PSF and light.
 
-    The PSFs of a grid of points, each about the ray through the mask's middle, are written as sums
-    of the fewest convolutions, :math:`h(\mathbf x; \mathbf u) = \sum_r w_r(\mathbf u)
-    p_r(\mathbf x - \mathbf u)` (`LowRank`). The points are Chebyshev's, and polynomials through
-    them give the weights of every point of the field. A map of the light, cos⁴θ, multiplies the
-    weights (`fall_of_light`).
+    The PSFs of a grid of points, each about the ray through the mask's middle, are written as that
+    of the axis and the fewest convolutions for its changes, :math:`h(\mathbf x; \mathbf u) =
+    \sum_r w_r(\mathbf u) p_r(\mathbf x - \mathbf u)` (`LowRank`). The points are Chebyshev's, and
+    polynomials through them give the weights of every point of the field. A map of the light,
+    cos⁴θ, multiplies the weights (`fall_of_light`).
 
     **Arguments**
 
@@ -58,7 +60,8 @@ def field_operator(
     - `field_shape`: (rows, columns) of the field, on the sensor's pitch: its sample at u is the
       object's point at −u·t/d.
     - `tolerance`: relative L2 error of the PSFs over the field, at most half of it by the
-      polynomials and the rest by the sum of convolutions.
+      polynomials and the rest by the sum of convolutions. With 1 the PSF is that of the axis, and
+      the light that of every point: that serves most captures, see `plan`.
     - `model`: of the PSFs, averaged over the pixels, see `psf`. Cells off both axes need
       `PsfMethod("angular_spectrum", oversampling=...)`.
 
@@ -68,13 +71,14 @@ def field_operator(
     TypeError for a mask that the model does not have off both axes.
 
     ```python
+    import jax.numpy as jnp
     import thincam_jax as tc
     from thincam_jax.units import nm, um
 
     mask = tc.FresnelZoneAperture(25.0, width=1.0)
     camera = tc.LenslessCamera(mask, tc.Sensor((20, 24), 60 * um), distance=6.5)
     fit = tc.field_operator(camera, 500 * nm, 250.0, field_shape=(16, 20))
-    capture = fit.operator(tc.imaging.targets.siemens_star((16, 20)))
+    capture = fit.operator(jnp.ones((16, 20)))
     print(capture.shape)  # (20, 24)
     ```
 
@@ -82,31 +86,52 @@ def field_operator(
     """
     field_shape = checks.shape2d("field_shape", field_shape)
     tolerance = float(checks.positive("tolerance", tolerance, "parts of one"))
-    method = as_method(model, pixel_integration=True)
+    method = replace(as_method(model, pixel_integration=True), field_tolerance=tolerance)
     spectrum = light if isinstance(light, Spectrum) else Spectrum(light)
-    tangents = tangents_of(camera, field_shape)
-    longest = max(float(w) for w in spectrum.wavelengths)
+    colours = list(zip(spectrum.wavelengths, spectrum.weights, strict=True))
+    return field_fit(camera, colours, object_distance, field_shape, method)
+
+
+def field_fit(
+    camera: LenslessCamera,
+    colours: Sequence[tuple[Number, Float[Array, ""] | float]],
+    object_distance: Number,
+    field_shape: tuple[int, int],
+    method: PsfMethod,
+) -> LowRankFit:
+    """`field_operator` of (wavelength, weight) pairs, by a method with its `field_tolerance`."""
+    assert method.field_tolerance is not None
+    tolerance, tangents = method.field_tolerance, tangents_of(camera, field_shape)
+    sensor, grid = camera.sensor, kernel_grid(camera.sensor.grid, field_shape)
+    fall = fall_of_light(*tangents)
+    if tolerance >= 1:
+        own = spectral_psf(camera, colours, object_distance, method, grid)
+        axis = CropConvolution(own[None], sensor.pitch, sensor.shape, field_shape, summed=1)
+        return LowRankFit(LowRank(jnp.asarray(fall[None], own.dtype), axis), 1.0, 0.0)
+    if any(map(checks.is_traced, jax.tree.leaves((camera, colours, object_distance)))):
+        raise TypeError(
+            "the PSFs of every point of the field need known numbers: call it outside of jit and "
+            "grad, or give field_tolerance = 1 (the light of every point, the PSF of the axis)"
+        )
+    longest = max(float(np.asarray(w)) for w, _ in colours)
     counts, between = zip(
-        *(_points_needed(camera, longest, t, tolerance / 2) for t in tangents), strict=True
+        *(points_needed(camera, longest, t, tolerance / 2) for t in tangents), strict=True
     )
     places = [_lobatto(t, n) for t, n in zip(tangents, counts, strict=True)]
     scale = float(np.asarray(object_distance))
     scale = 1.0 if math.isinf(scale) else scale
-    colours = list(zip(spectrum.wavelengths, spectrum.weights, strict=True))
-    grid = kernel_grid(camera.sensor.grid, field_shape)
 
     def psf_at(y: float, x: float) -> Float[Array, "k l"]:
         # The object is turned by 180° on the sensor.
-        at = (-scale * y, -scale * x)
+        at = (-scale * y, -scale * x) if y or x else None
         return spectral_psf(camera, colours, object_distance, method, grid, at)
 
     left = tolerance - max(between)
-    maps, kernels, error = principal_psfs(_on_grid(camera, places, psf_at), left)
+    maps, kernels, error = _axis_and_changes(_on_grid(camera, places, psf_at), left)
     for axis, (place, every) in enumerate(zip(places, tangents, strict=True)):
         maps = scipy.interpolate.BarycentricInterpolator(place, maps, axis=axis)(every)
-    weights = np.moveaxis(maps, -1, 0) * fall_of_light(*tangents)
-    pitch, shape = camera.sensor.pitch, camera.sensor.shape
-    convolution = CropConvolution(kernels, pitch, shape, field_shape, summed=1)
+    weights = np.moveaxis(maps, -1, 0) * fall
+    convolution = CropConvolution(kernels, sensor.pitch, sensor.shape, field_shape, summed=1)
     found = LowRank(jnp.asarray(weights, kernels.dtype), convolution)
     return LowRankFit(found, error, max(between))
 
@@ -120,7 +145,7 @@ def tangents_of(
     return rows, columns
 
 
-def _points_needed(
+def points_needed(
     camera: LenslessCamera, wavelength: float, tangents: Float[np.ndarray, " n"], tolerance: float
 ) -> tuple[int, float]:
     r"""Points of the field along one axis whose polynomial is within the tolerance, and its error.
@@ -155,6 +180,25 @@ def _lobatto(tangents: Float[np.ndarray, " n"], count: int) -> Float[np.ndarray,
     """Chebyshev's points from the first to the last, ascending; their middle is exactly 0."""
     places = -np.cos(np.pi * np.arange(count) / (count - 1)) * np.abs(tangents).max()
     return (places - places[::-1]) / 2
+
+
+def _axis_and_changes(
+    grid: Float[Array, "y x k l"], tolerance: float
+) -> tuple[Float[np.ndarray, "y x r"], Float[Array, "r k l"], float]:
+    """The PSF of the axis and the fewest that its changes are sums of; else as `principal_psfs`.
+
+    The axis' own has the weight 1 everywhere: changes move light and add none, so that what is
+    left out of them does not dim the image.
+    """
+    rows, columns = grid.shape[:2]
+    axis = grid[rows // 2, columns // 2]
+    changes = grid - axis
+    whole, part = (max(float(jnp.linalg.norm(n)), 1e-30) for n in (grid, changes))
+    if part <= tolerance * whole:
+        return np.ones((rows, columns, 1)), axis[None], part / whole
+    maps, kernels, error = principal_psfs(changes, tolerance * whole / part)
+    maps = np.concatenate([np.ones((rows, columns, 1)), maps], axis=-1)
+    return maps, jnp.concatenate([axis[None], kernels]), error * part / whole
 
 
 def _on_grid(

@@ -2,6 +2,7 @@
 
 import functools
 import math
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +18,7 @@ from thincam_jax.imaging.scene import ImagePlane, Spectrum
 from thincam_jax.imaging.sensor import Sensor
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.cost import convolution_cost
-from thincam_jax.lensless.field import field_operator
+from thincam_jax.lensless.field import field_fit
 from thincam_jax.lensless.method import Model, PsfMethod, as_method
 from thincam_jax.lensless.psf import spectral_psf
 
@@ -61,19 +62,23 @@ def imaging_operator(
     `light` is a `Spectrum` or one wavelength in mm; the PSF is the weighted sum over it. The other
     arguments are those of `psf`. With a method's `field_tolerance` it is a `field_operator`.
     """
-    grid, method = camera.sensor.grid, as_method(model, pixel_integration)
     spectrum = light if isinstance(light, Spectrum) else Spectrum(light)
+    colours = list(zip(spectrum.wavelengths, spectrum.weights, strict=True))
+    method = as_method(model, pixel_integration)
+    return operator_of(camera, colours, object_distance, field_shape, method)
+
+
+def operator_of(
+    camera: LenslessCamera,
+    colours: Sequence[tuple[Number, Float[Array, ""] | float]],
+    object_distance: Number,
+    field_shape: tuple[int, int],
+    method: PsfMethod,
+) -> CropConvolution | LowRank:
+    """The same of (wavelength, weight) pairs, by a method."""
     if method.field_tolerance is not None:
-        found = field_operator(
-            camera,
-            spectrum,
-            object_distance,
-            field_shape=field_shape,
-            tolerance=method.field_tolerance,
-            model=method,
-        )
-        return found.operator
-    colours = zip(spectrum.wavelengths, spectrum.weights, strict=True)
+        return field_fit(camera, colours, object_distance, field_shape, method).operator
+    grid = camera.sensor.grid
     wide = kernel_grid(grid, field_shape)
     kernel = spectral_psf(camera, colours, object_distance, method, wide)
     return CropConvolution(kernel, grid.pitch, grid.shape, field_shape)

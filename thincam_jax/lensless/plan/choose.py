@@ -107,23 +107,30 @@ def choose_wavelengths(
     columns = np.concatenate(
         [np.stack([_quick(seen, method, w, t) for w in seen.wavelengths], axis=-1) for t in some]
     )
-    power = np.tile(np.sqrt(seen.power), len(some))[:, None]
+    parts = len(columns) // len(seen.power)
+    power = np.tile(np.sqrt(seen.power), parts)[:, None]
     target = columns @ seen.weights
     order = order_of_columns((columns * power)[::2])
     for few in range(1, count):
         picked = sorted(order[:few])
         weights = fit((columns[:, picked] * power)[::2], (target * power[:, 0])[::2])
         error = columns[:, picked] @ weights - target
-        size = max(seen.relative_of_all(part) for part in np.split(error, len(some)))
+        size = max(seen.relative_of_all(part) for part in np.split(error, parts))
         if size <= tolerance:
             return picked, weights, size
     return list(range(count)), seen.weights, 0.0
 
 
 def _quick(seen: SeenScene, method: PsfMethod, wavelength: float, distance: float):
+    """H; and, where every point has its own PSF, those of the field's edges after it."""
     few = seen.tolerance > _ABOVE_EDGES * seen.edge_wave
-    method = replace(method, nodes=_FEW_NODES if few else PIXEL_NODES)
-    return seen.probe.quick(wavelength, distance, method)
+    own = replace(method, nodes=_FEW_NODES if few else PIXEL_NODES, field_tolerance=None)
+    probe = seen.probe
+    found = [probe.quick(wavelength, distance, own)]
+    if method.field_tolerance is not None and isinstance(probe, TransferProbe):
+        edges = (seen.point(distance, axis) for axis in (0, 1))
+        found += [probe.quick(wavelength, distance, own, at) for at in edges]
+    return np.concatenate(found)
 
 
 def choose_planes(
@@ -149,6 +156,8 @@ def choose_planes(
     )
     area = np.sqrt(seen.frequencies.weights)
     light = np.sqrt(np.sum(np.abs(seen.spectra) ** 2, axis=1)).T * area[:, None]
+    parts = len(columns) // len(light)
+    light = np.tile(light, (parts, 1))
     order = order_of_columns((columns * light)[::2])
     for few in range(1, count):
         picked = sorted(order[:few])
@@ -160,8 +169,8 @@ def choose_planes(
             ],
             axis=-1,
         )
-        error = np.einsum("kp,pbk->bk", chosen @ mixing - columns, seen.spectra)
-        size = seen.relative(error)
+        errors = np.split(chosen @ mixing - columns, parts)
+        size = max(seen.relative(np.einsum("kp,pbk->bk", e, seen.spectra)) for e in errors)
         if size <= tolerance:
             return picked, mixing, size
     return list(range(count)), np.eye(count), 0.0

@@ -25,14 +25,17 @@ class Effect:
     note: str
 
 
-def effects_of(camera: LenslessCamera, scene: Scene, tolerance: float) -> tuple[Effect, ...]:
-    """What changes over the field, shot noise and Fresnel's approximation."""
-    return (
-        _shift_variance(camera, scene, tolerance),
-        _obliquity(scene, tolerance),
-        _shot_noise(camera, tolerance),
-        _fresnel(camera, scene, tolerance),
-    )
+def effects_of(
+    camera: LenslessCamera, scene: Scene, tolerance: float, over_field: bool
+) -> tuple[Effect, ...]:
+    """Shot noise, Fresnel's approximation, and what changes over the field.
+
+    The last unless the plan decides `over_field`.
+    """
+    always = _shot_noise(camera, tolerance), _fresnel(camera, scene, tolerance)
+    if over_field:
+        return always
+    return _shift_variance(camera, scene, tolerance), _obliquity(scene, tolerance), *always
 
 
 def _shift_variance(camera: LenslessCamera, scene: Scene, tolerance: float) -> Effect:
@@ -45,7 +48,7 @@ def _shift_variance(camera: LenslessCamera, scene: Scene, tolerance: float) -> E
     wavelength = float(max(scene.spectrum.wavelengths))
     size = psf_change(wavelength, float(camera.distance), float(finest), math.cos(math.atan(slope)))
     what = f"the PSF at {math.degrees(math.atan(slope)):.0f}° against the axis"
-    verdict = "matters: use tc.field_operator" if size > tolerance else "does not matter"
+    verdict = "matters: see PsfMethod's field_tolerance" if size > tolerance else "does not matter"
     return Effect("shift-variance", False, size, f"{what}: about {size:.1e}, {verdict}")
 
 

@@ -13,31 +13,39 @@ from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.method import has_few_terms
 from thincam_jax.lensless.plan.choose import choose_planes, choose_psf, choose_wavelengths
 from thincam_jax.lensless.plan.effects import effects_of
+from thincam_jax.lensless.plan.field import choose_field, knows_field
 from thincam_jax.lensless.plan.run import Plan
 from thincam_jax.lensless.plan.seen import FULL, SeenScene
 
 # Parts of the tolerance that the decisions may use, in the order in which they are taken. What one
 # leaves over is the next one's.
-_MODEL_SHARE, _WAVELENGTH_SHARE = 0.35, 0.6
+_MODEL_SHARE, _FIELD_SHARE, _WAVELENGTH_SHARE = 0.3, 0.3, 0.6
 
 
 @checked
-def plan(camera: LenslessCamera, scene: Scene, *, tolerance: float) -> Plan:
+def plan(
+    camera: LenslessCamera, scene: Scene, *, tolerance: float, over_field: bool = True
+) -> Plan:
     r"""Plan the capture of a scene to a relative error at the least cost.
 
     The error is ‖g − g₀‖₂/‖g₀‖₂ of the noise-free capture, against every plane and wavelength
-    computed by `separable` in double precision, averaged over the pixels, or by endlessly many
+    computed by `separable` in double precision, averaged over the pixels, at every point of the
+    field, or by endlessly many
     samples of `angular_spectrum` for masks without few separable terms. What is decided, from the
     PSFs' transfer functions at a few hundred frequencies, weighted with the scene's own spectrum:
 
     - the model, the precision and whether pixels must be averaged, or the samples a pixel;
+    - of zone plates, whether every point of the field needs its own PSF and light
+      (`field_operator`), or the PSF and the light of the axis suffice;
     - how many wavelengths: some of the spectrum's, with weights that reproduce its sum;
     - how many PSFs for the planes: each plane's PSF is a weighted sum of a few planes'
       (interpolative decomposition), and planes are added up with these weights *before* they are
       convolved. Planes with nearly equal PSFs merge into one.
 
-    `Plan.effects` lists obliquity, shot noise and what Fresnel's approximation leaves out, with
-    their sizes.
+    With `over_field` False the capture is that of the axis' PSF and light, as solvers that are
+    given cameras assume it, and the error is against that; so it is for other masks. `Plan.effects`
+    then lists what changes over the field, with its size, and always shot noise and what Fresnel's
+    approximation leaves out.
 
     **Errors**: ValueError for a tolerance that is not positive; TypeError for traced numbers.
 
@@ -60,12 +68,16 @@ def plan(camera: LenslessCamera, scene: Scene, *, tolerance: float) -> Plan:
     seen = SeenScene(camera, scene, tolerance)
     method, model_error = choose_psf(seen, tolerance * _MODEL_SHARE)
     model_error += RESULT_ROUNDING[precision_of(camera.sensor.pitch)]
-    left = max(tolerance - model_error, 0.0)
+    field_error, over_field = 0.0, over_field and knows_field(seen)
+    if over_field:
+        method, field_error = choose_field(seen, method, tolerance * _FIELD_SHARE)
+    left = max(tolerance - model_error - field_error, 0.0)
     colours, weights, colour_error = choose_wavelengths(seen, method, left * _WAVELENGTH_SHARE)
-    left = max(tolerance - model_error - colour_error, 0.0)
+    left = max(left - colour_error, 0.0)
     planes, mixing, plane_error = choose_planes(seen, method, colours, weights, left)
     full = FULL if has_few_terms(camera.mask) else method
-    shares = {"model": model_error, "wavelengths": colour_error, "planes": plane_error}
+    shares = {"model": model_error, "field": field_error}
+    shares |= {"wavelengths": colour_error, "planes": plane_error}
     window = fast_shape(kernel_shape(camera.sensor.shape, seen.field_shape), real=True)
     return Plan(
         camera=camera,
@@ -84,5 +96,5 @@ def plan(camera: LenslessCamera, scene: Scene, *, tolerance: float) -> Plan:
         cost=seen.cost(method, len(planes), len(colours)),
         full_cost=seen.cost(full, len(seen.distances), len(seen.wavelengths)),
         shares=shares,
-        effects=effects_of(camera, scene, tolerance),
+        effects=effects_of(camera, scene, tolerance, over_field),
     )

@@ -10,15 +10,13 @@ from jaxtyping import Array, Float
 from thincam_jax._core import checks
 from thincam_jax._core.memory import readable, refuse_if_too_large
 from thincam_jax._core.precision import allow, cast, precision_of
-from thincam_jax.imaging.operators import CropConvolution, kernel_grid
 from thincam_jax.imaging.scene import Scene
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.cost import Cost
-from thincam_jax.lensless.forward import project, projected_shape
+from thincam_jax.lensless.forward import operator_of, project, projected_shape
 from thincam_jax.lensless.masks.fza import FresnelZoneAperture
 from thincam_jax.lensless.method import SAMPLED, PsfMethod
 from thincam_jax.lensless.plan.effects import Effect
-from thincam_jax.lensless.psf import spectral_psf
 
 # How far a camera's numbers may be from the plan's, relative.
 _NEAR = 0.01
@@ -85,6 +83,15 @@ class Plan:
         """False where no way of computing meets the tolerance; the plan is then the best one."""
         return self.predicted_error <= self.tolerance
 
+    @property
+    def _field(self) -> str:
+        tolerance = self.method.field_tolerance
+        if tolerance is None:
+            return "the PSF and the light of the axis"
+        if tolerance >= 1:
+            return "the PSF of the axis, the light of every point"
+        return f"every point with its own PSF, within {tolerance:.1e}, and light"
+
     def __str__(self) -> str:
         method = self.method
         average = "averaged over pixels" if method.pixel_integration else "at the pixels' centres"
@@ -97,6 +104,7 @@ class Plan:
         lines = [
             ("tolerance", f"{self.tolerance:.1e}, predicted {self.predicted_error:.1e}{met}"),
             ("model", f"{method.model}, {method.precision}, {average}: {shares['model']:.1e}"),
+            ("field", f"{self._field}: {shares['field']:.1e}"),
             ("depth planes", f"{planes} by {len(self.distances)} PSFs: {shares['planes']:.1e}"),
             ("wavelengths", f"{colours} by {len(self.wavelengths)}: {shares['wavelengths']:.1e}"),
             (
@@ -129,12 +137,10 @@ def run_plan(plan: Plan, camera: LenslessCamera, scene: Scene) -> Float[Array, "
         fields = jnp.stack([project(camera, p, plan.field_shape) for p in scene.planes])
         mixed = jnp.tensordot(jnp.asarray(plan.mixing, fields.dtype), fields, axes=1)
         light = tuple(zip(plan.wavelengths, plan.weights, strict=True))
-        grid = kernel_grid(camera.sensor.grid, plan.field_shape)
         total = jnp.zeros((), fields.dtype)
         for distance, field in zip(plan.distances, mixed, strict=True):
-            kernel = spectral_psf(camera, light, distance, plan.method, grid)
-            shapes = camera.sensor.shape, plan.field_shape
-            total = total + CropConvolution(kernel, grid.pitch, *shapes)(field)
+            operator = operator_of(camera, light, distance, plan.field_shape, plan.method)
+            total = total + operator(field)
     return cast(total, own)
 
 

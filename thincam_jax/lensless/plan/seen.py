@@ -12,6 +12,7 @@ from thincam_jax.imaging.scene import Scene
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.cost import Cost, convolution_cost, psf_cost
 from thincam_jax.lensless.digits import held_in_single
+from thincam_jax.lensless.field import tangents_of
 from thincam_jax.lensless.forward import project, projected_shape
 from thincam_jax.lensless.method import (
     CLOSED,
@@ -61,14 +62,22 @@ class SeenScene:
         ]
         # (plane, image, frequency)
         self.spectra = np.stack([image_spectrum(f, self.frequencies) for f in fields])
-        total = np.sum(fields, axis=0)
-        self.crop = crop_factor(camera, min(self.distances), total)
+        self.total = np.sum(fields, axis=0)
+        self.crop = crop_factor(camera, min(self.distances), self.total)
+        # Tangents of the angles of the field's edges; those of a single sample are 0.
+        edges = (max(float(np.abs(t).max()), 1e-9) for t in tangents_of(camera, self.field_shape))
+        self.edges = tuple(edges)
 
     @functools.cached_property
     def power(self) -> Float[np.ndarray, " k"]:
         """Of the whole scene, times the area of each frequency."""
         light = np.sum(np.abs(self.spectra.sum(axis=0)) ** 2, axis=0)
         return light * self.frequencies.weights
+
+    def point(self, distance: float, axis: int, part: float = 1.0) -> tuple[float, float]:
+        """(y, x) of the point at a part of the field's half width along an axis, mm."""
+        away = -part * self.edges[axis] * distance
+        return (away, 0.0) if axis == 0 else (0.0, away)
 
     @functools.cached_property
     def corners(self) -> list[tuple[float, float]]:

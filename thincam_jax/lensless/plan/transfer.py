@@ -110,12 +110,19 @@ class TransferProbe:
         ]
 
     def exact(
-        self, wavelength: float, distance: float, method: PsfMethod
+        self,
+        wavelength: float,
+        distance: float,
+        method: PsfMethod,
+        at: tuple[float, float] | None = None,
     ) -> Complex[np.ndarray, " k"]:
-        """H with factors in the method's precision, transformed in double precision."""
+        """H with factors in the method's precision, transformed in double precision.
+
+        `at`: a point on one of the mask's axes; H is then about the middle of its shadow.
+        """
         with allow("float64"):
             waves = self._double_waves
-            return self._transfer(waves, wavelength, distance, method)
+            return self._transfer(waves, self._path(wavelength, distance, at), method)
 
     @functools.cached_property
     def _double_waves(self) -> tuple[Float[Array, "n k2"], ...]:
@@ -126,16 +133,21 @@ class TransferProbe:
         return tuple(jnp.asarray(w, jnp.float32) for w in self.waves)
 
     def quick(
-        self, wavelength: float, distance: float, method: PsfMethod
+        self,
+        wavelength: float,
+        distance: float,
+        method: PsfMethod,
+        at: tuple[float, float] | None = None,
     ) -> Complex[np.ndarray, " k"]:
         """H in single precision, with the method's nodes a pixel, for many PSFs."""
         method = replace(method, precision="float32")
-        return self._transfer(self._single_waves, wavelength, distance, method)
+        return self._transfer(self._single_waves, self._path(wavelength, distance, at), method)
 
-    def _transfer(
-        self, waves_of, wavelength: float, distance: float, method: PsfMethod
-    ) -> Complex[np.ndarray, " k"]:
-        path = self.camera.path(float(wavelength), float(distance))
+    def _path(self, wavelength: float, distance: float, at: tuple[float, float] | None) -> Path:
+        path = self.camera.path(float(wavelength), float(distance), at)
+        return path if at is None else replace(path, follows=True, skew=False)
+
+    def _transfer(self, waves_of, path: Path, method: PsfMethod) -> Complex[np.ndarray, " k"]:
         given = self.camera.mask, self.camera.sensor.pitch, path
         mask, pitch, path = cast(given, method.float_type)
         points = SparseGrid(self.places[0], self.places[1], pitch)
