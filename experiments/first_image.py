@@ -136,7 +136,7 @@ curves = [
 ]
 for ax, (low, high) in zip(axes, [(0.0, 0.2), (0.44, 0.5)], strict=True):
     for model, grey, dashes, name in curves:
-        ax.plot(line.x, along[model], color=grey, linestyle=dashes, label=name)
+        ax.plot(line.sensor.grid.x, along[model], color=grey, linestyle=dashes, label=name)
     ax.set(xlim=(low * width, high * width), ylim=(0, 1.3), xlabel="x on the sensor (mm)")
 axes[0].set(ylabel="irradiance (open aperture = 1)", title="near the axis")
 axes[1].set(title="near the mask's edge")
