@@ -1,11 +1,14 @@
-"""Bringing captures to one scale: enlargement about the centre, sizes, parities."""
+"""Captures on one scale (enlargement about the centre, sizes, parities); cameras over the field."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import thincam_jax as tc
+from helpers import relative_l2
 from thincam_jax.reconstruction.imaging_model import register, registered_shape
+from thincam_jax.units import nm, um
 
 
 def blob(y, x):
@@ -55,3 +58,47 @@ def test_registered_shape_holds_the_enlarged_picture_and_its_parity(shape, ratio
 def test_captures_are_never_made_smaller():
     with pytest.raises(ValueError, match=r"ratio = 0.8: captures are only enlarged"):
         register(jnp.ones((4, 5)), 0.8)
+
+
+def wide_recording(model, **changes):
+    """A capture of ±16° in which every point has its own PSF and light, for some cameras."""
+    mask = tc.FresnelZoneAperture(25.0, 0.3, width=1.4)
+    camera = tc.LenslessCamera(mask, tc.Sensor((20, 26), 90 * um), 3.0)
+    scene = np.zeros((18, 20))
+    scene[3:7, 2:9], scene[11:13, 12:18] = 1.0, 0.5
+    plane = tc.ImagePlane(scene, distance=250.0, width=20 * 90 * um / 3.0 * 250.0)
+    exact = tc.PsfMethod("separable", field_tolerance=1e-2)
+    capture = tc.capture(camera, tc.Scene(plane, 500 * nm), model=exact)
+    light = {"wavelength": 500 * nm, "object_distance": 250.0, "field_shape": scene.shape}
+    cameras = tc.Cameras([camera], model=model, **(light | changes))
+    return tc.Recording([capture], cameras, noise_variance=1e-8), scene
+
+
+def test_cameras_over_the_field_explain_their_capture():
+    """Upright, with the object's pixels; the PSF and the light of the axis leave some percent."""
+    unexplained = {}
+    for name, tolerance in (("axis", None), ("light", 1.0), ("own", 1e-2)):
+        model = tc.PsfMethod("separable", field_tolerance=tolerance)
+        recording, scene = wide_recording(model)
+        problem = recording.problem()
+        (operator,), (capture,) = problem.operators, recording.captures
+        turned = jnp.asarray(scene[::-1, ::-1]).reshape(operator.in_shape)
+        unexplained[name] = relative_l2(np.ravel(operator(turned)), np.ravel(capture))
+    assert unexplained["axis"] > 0.03 > 3e-3 > unexplained["light"] > unexplained["own"]
+    assert unexplained["own"] < 1e-12
+    found = tc.reconstruct(recording, tc.Fista(0.1, iterations=60))
+    assert found.pitch == pytest.approx(90 * um / 3.0 * 250.0)
+    assert np.corrcoef(np.ravel(found.image), np.ravel(scene))[0, 1] > 0.9  # not turned
+    assert tc.choose_solver(recording)[0].name == "fista"
+
+
+def test_over_the_field_refuses():
+    model = tc.PsfMethod("separable", field_tolerance=1.0)
+    recording, _ = wide_recording(model)
+    with pytest.raises(ValueError, match="takes the PSF of the axis everywhere; leave"):
+        tc.reconstruct(recording, tc.Wiener())
+    planes, _ = wide_recording(model, object_distance=[200.0, 250.0])
+    with pytest.raises(ValueError, match="are for one object_distance and for cameras at one"):
+        planes.problem()
+    with pytest.raises(ValueError, match="model"):
+        wide_recording("separabel")

@@ -14,10 +14,11 @@ from thincam_jax._core import checks
 from thincam_jax._core.checks import Numbers, Shape
 from thincam_jax._core.memory import refuse_if_too_large
 from thincam_jax._core.module import Module
-from thincam_jax._core.quantity import choice, unchecked
-from thincam_jax.imaging.operators import kernel_grid
+from thincam_jax._core.quantity import unchecked
+from thincam_jax.imaging.operators import LowRank, kernel_grid
 from thincam_jax.lensless.camera import LenslessCamera
-from thincam_jax.lensless.method import MODELS, Model
+from thincam_jax.lensless.field import field_fit
+from thincam_jax.lensless.method import MODELS, Model, PsfMethod, as_method
 from thincam_jax.lensless.psf import psf
 
 _DARK = 0.3  # share of a PSF's absolute sum
@@ -40,6 +41,10 @@ def _cameras(given: Sequence[LenslessCamera]) -> tuple[LenslessCamera, ...]:
     return cameras
 
 
+def _model(given: Any) -> Any:
+    return given if isinstance(given, PsfMethod) else checks.choice("model", given, MODELS)
+
+
 class Cameras(Module):
     """Cameras whose PSFs are computed, one for each capture, with wavelength and object distance.
 
@@ -52,7 +57,9 @@ class Cameras(Module):
       projection: the same pixel of all planes lies on one ray through the mask.
     - `field_shape`: pixels of the image, default those of the sensor; the scene is taken as black
       outside. Its pixels are p·t/d apart on the object, d the largest distance.
-    - `model`, `pixel_integration`: of the PSFs, see `thincam_jax.psf`.
+    - `model`, `pixel_integration`: of the PSFs, see `thincam_jax.psf`. With
+      `PsfMethod(field_tolerance=…)` every point of one plane has its own PSF and light
+      (`field_operator`), for solvers by iteration of cameras at one distance.
 
     ```python
     import thincam_jax as tc
@@ -74,8 +81,8 @@ class Cameras(Module):
     field_shape: tuple[int, int] | None = eqx.field(
         default=None, converter=_field_shape, static=True, kw_only=True
     )
-    model: Model = eqx.field(
-        default="separable", converter=choice(MODELS), static=True, kw_only=True
+    model: Model | PsfMethod = eqx.field(
+        default="separable", converter=_model, static=True, kw_only=True
     )
     pixel_integration: bool = eqx.field(default=True, converter=bool, static=True, kw_only=True)
 
@@ -106,6 +113,26 @@ class Cameras(Module):
         missing = [name for name in names if getattr(self, name) is None]
         if missing:
             raise ValueError(f"the Cameras have no {' and no '.join(missing)}; give it in mm")
+
+    @property
+    def over_field(self) -> bool:
+        """Whether every point of the field has its own PSF."""
+        return isinstance(self.model, PsfMethod) and self.model.field_tolerance is not None
+
+    def field_operators(self, field: tuple[int, int]) -> tuple[LowRank, ...]:
+        """The operator of each camera over its field, from the object as it lies on the sensor."""
+        self.require("wavelength", "object_distance")
+        if np.ndim(self.object_distance) or max(distance_ratios(self.cameras)) > 1:
+            raise ValueError(
+                "PSFs of every point of the field are for one object_distance and for cameras at "
+                "one distance; give these, or leave field_tolerance out"
+            )
+        method = as_method(self.model, self.pixel_integration)
+        pairs = zip(self.cameras, self.wavelengths, strict=True)
+        return tuple(
+            field_fit(camera, [(light, 1.0)], self.object_distance, field, method).operator
+            for camera, light in pairs
+        )
 
     def kernels(
         self, field: tuple[int, int], ratios: Sequence[float]

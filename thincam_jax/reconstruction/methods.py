@@ -155,7 +155,8 @@ def choose_solver(
     **See also**: `reconstruct`.
     """
     operators = getattr(recording.imaging_model, "operators", ())
-    if synthesis is None and any(isinstance(one, LowRank) for one in operators):
+    over_field = getattr(recording.imaging_model, "over_field", False)
+    if synthesis is None and (over_field or any(isinstance(one, LowRank) for one in operators)):
         return Fista(), "a sum of many convolutions is applied once an iteration, ADMM solves it"
     suffices, reason = filter_suffices(recording, synthesis)
     return (Wiener if suffices else AdmmTV)(synthesis=synthesis), reason

@@ -176,18 +176,17 @@ class Recording(Module):
         """
         captures, valid = self._masked_captures()
         settings = {"tau": tau, "regulariser": regulariser, "nonnegative": nonnegative}
-        if isinstance(self.imaging_model, Stacked):
+        operators = self._operators()
+        if operators:
             _no_synthesis(synthesis, "operators")
             variances = self._variances(np.eye(len(captures)), captures, valid)
-            lengths = [len(detector_shape(o)) for o in self.imaging_model.operators]
+            lengths = [len(detector_shape(o)) for o in operators]
             captures = [with_channel(c, n) for c, n in zip(captures, lengths, strict=True)]
             weights = [
                 1 / v if m is None else with_channel(m.astype(c.dtype), n) / v
                 for m, v, c, n in zip(valid, variances, captures, lengths, strict=True)
             ]
-            return InverseProblem(
-                self.imaging_model.operators, captures, weights=weights, **settings
-            )
+            return InverseProblem(operators, captures, weights=weights, **settings)
         matrix, channels = self._channels(synthesis, captures, valid)
         variances = [
             variance * c.ratio**2
@@ -274,6 +273,13 @@ class Recording(Module):
         model = self.imaging_model
         axes = len(detector_shape(model.operators[0])) if isinstance(model, Stacked) else 2
         return self.captures[0].ndim > axes
+
+    def _operators(self) -> tuple[AbstractOperator, ...]:
+        """Those of a model that is no PSF for the whole field."""
+        model = self.imaging_model
+        if isinstance(model, Cameras):
+            return model.field_operators(self._field()) if model.over_field else ()
+        return model.operators if isinstance(model, Stacked) else ()
 
     def _masks(self, valid: Any) -> tuple[Array, ...]:
         """A mask for each capture."""

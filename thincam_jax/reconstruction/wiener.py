@@ -244,6 +244,11 @@ def require_cameras(recording: Recording, method: str) -> Cameras:
             f"method {method!r} needs cameras; with measured PSFs or operators use AdmmTV, Fista, "
             "Ridge or PoissonTV"
         )
+    if recording.imaging_model.over_field:
+        raise ValueError(
+            f"method {method!r} takes the PSF of the axis everywhere; leave the cameras' "
+            "field_tolerance out, or use AdmmTV, Fista, Ridge or PoissonTV"
+        )
     if recording.valid is not None:
         raise ValueError(
             f"method {method!r} cannot leave out pixels that are not valid; use AdmmTV, Fista, "
