@@ -24,6 +24,7 @@ the same for every point of the object. It is what makes small β worse than the
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Complex, Float
 from numpy.polynomial.legendre import leggauss
 
@@ -91,11 +92,11 @@ def _exact(
     whole = _product(weights, factors)
     if not setup.crop:
         return Responses(whole, whole)
-    parts = [
-        jnp.ones_like(u) if k == m else seen_part(_place(zones, k, m, path, u), path, setup)
-        for k, m in ((zones.orders[i], zones.orders[j]) for i, j in zip(first, second, strict=True))
-    ]
-    return Responses(whole, _product(weights, factors * as_complex(jnp.stack(parts))))
+    orders = np.asarray(zones.orders, u.dtype)
+    k, m = (orders[n][:, None] for n in (first, second))
+    places = _place(zones, k, np.where(k == m, k + 1, m), path, u)
+    parts = jnp.where(k == m, 1.0, seen_part(places, path, setup))
+    return Responses(whole, _product(weights, factors * as_complex(parts)))
 
 
 def _product(weights, factors: Complex[Array, "pair n"]) -> Float[Array, "n n"]:
@@ -105,49 +106,52 @@ def _product(weights, factors: Complex[Array, "pair n"]) -> Float[Array, "n n"]:
 def _rings(zones: ZoneOrders, path: Path, setup: Setup, frequencies: Polar) -> Responses:
     rho = frequencies.radius / path.distance
     along = [jnp.abs(f[:, None] * rho) for f in (frequencies.sine, frequencies.cosine)]
-    whole = seen = jnp.zeros(along[0].shape, rho.dtype)
-    for i, j in zip(*pairs(zones.coefficients)[:2], strict=True):
-        k, m = zones.orders[i], zones.orders[j]
-        if k == m:
-            continue
-        rings = _ring(zones, int(i), int(j), path, rho)
+    first, second = np.triu_indices(len(zones.orders), 1)
+    products = zones.coefficients[first] * zones.coefficients[second].conj()
+
+    @jax.vmap  # one program for all pairs of orders
+    def of_pair(k, m, product):
         places = [_place(zones, k, m, path, u) for u in along]
+        whole = _ring(zones, k, m, product, path, rho)
         for u, place in zip(along, places, strict=True):
-            rings = rings * _open(zones, k, m, path, u, place)
-        whole = whole + rings
-        if setup.crop:
-            for place in places:
-                rings = rings * seen_part(place, path, setup)
-            seen = seen + rings
+            whole = whole * _open(zones, k, m, path, u, place)
+        seen = whole
+        for place in places if setup.crop else ():
+            seen = seen * seen_part(place, path, setup)
+        return whole, seen
+
+    orders = np.asarray(zones.orders, rho.dtype)
+    whole, seen = (
+        jnp.sum(part, axis=0) for part in of_pair(orders[first], orders[second], products)
+    )
     if setup.pixel_integration:
         average = jnp.sinc(setup.pitch * along[0]) * jnp.sinc(setup.pitch * along[1])
         whole, seen = whole * average, seen * average
-    return Responses(whole, seen if setup.crop else whole)
+    return Responses(whole, seen)
 
 
-def _ring(zones: ZoneOrders, i: int, j: int, path: Path, rho) -> Float[Array, " n"]:
-    """The ring pattern of two orders without an edge."""
-    k, m = zones.orders[i], zones.orders[j]
+def _ring(zones: ZoneOrders, k, m, product, path: Path, rho) -> Float[Array, " n"]:
+    """The ring pattern of two orders without an edge, of the product of their coefficients."""
     curvature = (k - m) * zones.beta
     s = path.wavelength * path.distance
     tilt = (k + m) * zones.beta * s + 2 * jnp.pi * path.magnification
     phase = (curvature * s**2 / 4 - tilt**2 / (4 * curvature)) * rho**2
-    wave = zones.coefficients[i] * zones.coefficients[j].conj() * phasor(phase)
+    wave = product * phasor(phase)
     # 2 Re{j w π M²/a} = −2 π M²/a · Im w
     return -2 * jnp.pi * path.magnification**2 / curvature * jnp.imag(wave)
 
 
-def _place(zones: ZoneOrders, k: int, m: int, path: Path, u):
+def _place(zones: ZoneOrders, k, m, path: Path, u):
     """ζ(u): where on the mask, mm from its centre, the light of frequency u ≥ 0 comes from."""
     s = path.wavelength * path.distance * u
     tilt = (k + m) * zones.beta * s + 2 * jnp.pi * path.magnification * u
     return jnp.abs(tilt / (2 * (k - m) * zones.beta))
 
 
-def _open(zones: ZoneOrders, k: int, m: int, path: Path, u, place):
+def _open(zones: ZoneOrders, k, m, path: Path, u, place):
     """1 where that point lies in the aperture's overlap with itself, 0 beyond, over one zone."""
     half = (zones.width - path.wavelength * path.distance * u) / 2
-    zone = jnp.sqrt(jnp.pi / (abs(k - m) * zones.beta)) / 4
+    zone = jnp.sqrt(jnp.pi / (jnp.abs(k - m) * zones.beta)) / 4
     return jax.nn.sigmoid((half - place) / zone)
 
 

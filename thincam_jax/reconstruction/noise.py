@@ -57,12 +57,14 @@ def estimate_noise(
     spread = jax.random.uniform(key, detail.shape[-1:], detail.dtype, -0.5, 0.5)
     detail = jnp.abs(detail + spread * step[..., None])
     light, rounding = _brightness(windows), step**2 / 12
-    variance, count = jnp.zeros_like(step), jnp.zeros_like(step)
-    for part, least_variance in ((shown & ~black, rounding), (shown & black, 0)):
-        squares = _photon_transfer(jnp.where(part, light, jnp.inf), detail)
-        own = jnp.maximum((squares - rounding) / jnp.sum(stencil**2), least_variance)
-        number = jnp.sum(part, axis=-1).astype(step.dtype)
-        variance, count = variance + number * own, count + number
+    # What is not black, and what is: at once, for sorting takes long to compile.
+    parts = jnp.stack([shown & ~black, shown & black])
+    details = jnp.broadcast_to(detail, parts.shape)
+    squares = _photon_transfer(jnp.where(parts, light, jnp.inf), details)
+    least_variance = jnp.stack([rounding, jnp.zeros_like(rounding)])
+    own = jnp.maximum((squares - rounding) / jnp.sum(stencil**2), least_variance)
+    count = jnp.sum(parts, axis=-1).astype(step.dtype)
+    variance, count = jnp.sum(count * own, axis=0), jnp.sum(count, axis=0)
     return jnp.where(step > 0, jnp.sqrt(variance / jnp.maximum(count, 1)), 0)
 
 
