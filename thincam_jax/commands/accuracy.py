@@ -1,6 +1,6 @@
 """The benchmark of accuracy: errors and times of all models, and what an error costs."""
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from typing import Any
 
 from thincam_jax._core.environment import machine
@@ -12,8 +12,7 @@ from thincam_jax.commands.sections import SensorConfig, StudyConfig
 from thincam_jax.commands.study.build import build_study, check_optics
 from thincam_jax.lensless.exposures import Exposure
 from thincam_jax.studies.evaluate import check_target
-from thincam_jax.studies.psf_error_cost import AccuracyResult, AccuracyRun, Case, make_case
-from thincam_jax.studies.study import Study
+from thincam_jax.studies.psf_error_cost import AccuracyResult, AccuracyRun, make_case
 
 _SIZES, _CAPTURE_SIZE = (128, 256, 512), 256  # by default
 
@@ -39,18 +38,9 @@ def _check(option: str, size: int, own: int) -> None:
         )
 
 
-@dataclass(frozen=True)
-class Benchmark:
-    """A checked benchmark: the study, the sizes, and what is captured."""
-
-    study: Study
-    sizes: tuple[int, ...]
-    case: Case
-
-
 def check(
     config: StudyConfig, sizes: tuple[int, ...] = (), capture_size: int | None = None
-) -> Benchmark:
+) -> AccuracyRun:
     """Refuse what cannot be run, before anything is; ConfigError, one line for each fault.
 
     - `sizes`: pixels along the sensor's longer side, for the PSFs; empty for the default ones.
@@ -73,20 +63,19 @@ def check(
         check_target(case.study, case.target)
     except ValueError as error:
         raise ConfigError(f"--capture-size {of_captures}: {error}") from None
-    return Benchmark(study, sizes_of_psfs(sizes, config.sensor), case)
+    return AccuracyRun(study, sizes_of_psfs(sizes, config.sensor), case)
 
 
-def run_accuracy(plan: Benchmark, folder: BenchFolder, progress: Progress) -> AccuracyResult:
+def run_accuracy(plan: AccuracyRun, folder: BenchFolder, progress: Progress) -> AccuracyResult:
     """Run the benchmark into a folder."""
     folder.claim(plan.study.config)
-    run = AccuracyRun(plan.study, plan.sizes, plan.case)
-    last = Step("results", lambda: folder.write(folder.result, to_json(_record(plan, run.result))))
-    carry_out([*run.work, last], progress)
-    return run.result
+    last = Step("results", lambda: folder.write(folder.result, to_json(_record(plan))))
+    carry_out([*plan.work, last], progress)
+    return plan.result
 
 
-def _record(plan: Benchmark, result: AccuracyResult) -> dict[str, Any]:
-    config, found = plan.study.config, asdict(result)
+def _record(plan: AccuracyRun) -> dict[str, Any]:
+    config, found = plan.study.config, asdict(plan.result)
     costs = found["reconstructions"]
     for rows in (found["captures"], costs["models"], costs["controlled"]):
         for row in rows:  # without the figures of one that was not run

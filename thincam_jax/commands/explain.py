@@ -74,19 +74,16 @@ def _entries(data: Any, location: tuple = ()) -> Iterator[tuple[tuple, str]]:
 
 
 def dry_run(asked: Any, writes: str, setup: Any = None) -> None:
-    """Print what a command would compute and write, for its option `--dry-run`."""
-    lines = [*work_of(asked, setup), writes, "dry run: nothing was done"]
+    """Print what a command would compute and write, for its option `--dry-run`.
+
+    The names of each list of the file, and the costs.
+    """
+    lines = []
+    for key, entries in asked:
+        if entries and isinstance(entries, tuple) and all(hasattr(e, "name") for e in entries):
+            lines.append(f"{len(entries)} {key}: {'; '.join(entry.name for entry in entries)}")
+    lines += [*costs(asked, setup), writes, "dry run: nothing was done"]
     say_result("dry_run", lines, "\n".join(lines))
-
-
-def work_of(asked: Any, setup: Any = None) -> Iterator[str]:
-    """Lines that say what a run computes: the names of each list of the file, and the costs."""
-    for key in type(asked).model_fields:
-        entries = getattr(asked, key)
-        if isinstance(entries, tuple) and all(hasattr(entry, "name") for entry in entries):
-            if entries:
-                yield f"{len(entries)} {key}: {'; '.join(entry.name for entry in entries)}"
-    yield from costs(asked, setup)
 
 
 def costs(asked: Any, setup: Any = None) -> Iterator[str]:

@@ -137,12 +137,6 @@ def _source(kind: str) -> Path:
     return _folder() / f"{_FILE_OF.get(kind, kind)}.yaml"
 
 
-def _title(kind: str) -> str:
-    from thincam_jax.commands.config_file import read_raw
-
-    return read_raw(_source(kind))[0]["title"]
-
-
 def init(
     kind: Annotated[
         str | None, typer.Argument(help="Leave it out for a list of them.", autocompletion=examples)
@@ -155,10 +149,11 @@ def init(
 
         from thincam_jax._core.files import write_whole
         from thincam_jax._core.table import Table
-        from thincam_jax.commands.config_file import ConfigError
+        from thincam_jax.commands.config_file import ConfigError, read_raw
 
         if kind is None:
-            show(Table(("kind", "experiment"), [(one, _title(one)) for one in examples()]))
+            rows = [(one, read_raw(_source(one))[0]["title"]) for one in examples()]
+            show(Table(("kind", "experiment"), rows))
             say("next: thincam init KIND")
             return
         if kind not in examples():

@@ -67,8 +67,10 @@ class ObjectSection(Section):
         What the file leaves out, the constructor has a default for. `maker`: one of several.
         """
         maker = maker or next(iter(self.makers))
-        given = {name: getattr(self, name) for name in self.makers[maker]}
-        given = {name: _built(value) for name, value in given.items() if value is not None}
+        given = {}
+        for name in self.makers[maker]:
+            if (value := getattr(self, name)) is not None:
+                given[name] = value.build() if isinstance(value, ObjectSection) else value
         return cast(Any, maker)(**given | others)
 
     @pydantic.model_validator(mode="after")
@@ -79,10 +81,6 @@ class ObjectSection(Section):
             except TypeError as error:
                 raise ValueError(str(error)) from None
         return self
-
-
-def _built(value: Any) -> Any:
-    return value.build() if isinstance(value, ObjectSection) else value
 
 
 def section(

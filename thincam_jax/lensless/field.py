@@ -153,7 +153,7 @@ def points_needed(
     From the phase that the field gives the finest light of the mask: ERROR_PER_RADIAN of what the
     polynomial leaves of :math:`e^{j\varphi}`.
     """
-    finest = getattr(camera.mask, "finest_frequency", None)
+    finest = camera.mask.finest_frequency
     frequency = 1 / (2 * float(camera.sensor.pitch)) if finest is None else float(finest)
     distance = float(camera.distance)
 

@@ -59,7 +59,7 @@ def warn_if_unresolved(camera: LenslessCamera, distances: Iterable[Any]) -> None
     """
     distances = list(distances)
     known = not any(map(checks.is_traced, jax.tree.leaves((camera, distances))))
-    finest = getattr(camera.mask, "finest_frequency", None) if known else None
+    finest = camera.mask.finest_frequency if known else None
     if finest is not None and not checks.is_traced(finest):
         farthest = max(float(distance) for distance in distances)
         magnification = 1 + float(camera.distance) / farthest

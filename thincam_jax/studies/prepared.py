@@ -1,18 +1,23 @@
 """Reconstruct captures that `measured.prepare` made of files, with a measured PSF."""
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from thincam_jax._core.grids import same_parity
 from thincam_jax._core.memory import refuse_if_too_large
 from thincam_jax.imaging.operators import window_shape
-from thincam_jax.measured import Prepared
+from thincam_jax.lensless.psf import psf
+from thincam_jax.measured import Prepared, Raw
 from thincam_jax.reconstruction import (
     AbstractSolver,
+    Cameras,
     InverseProblem,
     Psfs,
     Reconstruction,
@@ -63,6 +68,25 @@ def pixel_noise(prepared: Prepared, counts: float | None = None) -> PixelNoise:
     else:
         noise = float(jnp.sqrt(estimate_variance([light], [valid])[0]))
     return PixelNoise(noise, noise / of_a_count, how)
+
+
+def computed_psf(cameras: Cameras, name: str) -> Raw:
+    """PSF of a camera as a measured one, also beyond the sensor where the shadow is larger.
+
+    `name`: what the numbers of the camera and its light are told after.
+    """
+    (camera,), wavelength, distance = cameras.cameras, cameras.wavelength, cameras.object_distance
+    how = {"model": cameras.model, "pixel_integration": cameras.pixel_integration}
+    grid, fringe = camera.sensor.grid, 2 * math.sqrt(wavelength * float(camera.distance))
+    shadow = np.asarray(camera.mask.extent) * (1 + float(camera.distance) / distance) + fringe
+    pixels = np.ceil(shadow / float(grid.pitch)).astype(int)
+    shape = same_parity(np.maximum(pixels, grid.shape).tolist(), grid.shape)
+    wide = camera.on_grid(grid.with_shape(shape))
+    image = psf(wide, wavelength=wavelength, object_distance=distance, **how)
+    numbers = eqx.tree_pformat(camera, width=10_000)  # in one line
+    light = f"wavelength {wavelength * 1e6:g} nm, object at {distance:g} mm"
+    name = f"{name}: {numbers}, {light}"
+    return Raw(np.asarray(image), name=name, sensor_shape=camera.sensor.shape)
 
 
 def prepared_recording(prepared: Prepared, noise: PixelNoise | None = None) -> Recording:

@@ -389,6 +389,7 @@ class AccuracyRun:
     """
 
     def __init__(self, study: Study, sizes: Sequence[int], case: Case):
+        self.study, self.sizes, self.case = study, sizes, case
         self.psfs = [PsfErrors(study, study.exposures[0], size) for size in sizes]
         self.captures, self.reconstructions = CaptureErrors(case), ReconstructionErrors(case)
         parts = (*self.psfs, self.captures, self.reconstructions)

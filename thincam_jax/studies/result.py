@@ -1,9 +1,10 @@
 """Results of a study: the scores of every method on every target, as records, table and figures."""
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -113,9 +114,42 @@ def mean_psnr_of_pictures(targets: Sequence[Target], scores: Mapping[str, Scores
 
     Drawn targets are left out, and exact reconstructions, which have no PSNR.
     """
-    pictures = [scores[target.name].psnr_db for target in targets if target.is_picture]
-    known = [value for value in pictures if value is not None]
+    return _mean_psnr(scores[target.name] for target in targets if target.is_picture)
+
+
+def _mean_psnr(scores: Iterable[Scores]) -> float | None:
+    known = [one.psnr_db for one in scores if one.psnr_db is not None]
     return round(float(np.mean(known)), 4) if known else None
+
+
+def metrics_row(study: Study) -> dict[str, Any]:
+    """The study's scores as one row of a table, and the seconds that they took.
+
+    Columns are `psnr_db/METHOD/TARGET`, `resolved_object_mm/METHOD/TARGET` of an inner number, and
+    `mean_psnr_db/METHOD` over all targets.
+    """
+    started, row = time.perf_counter(), {}
+    found: dict[str, dict[str, Scores]] = {method.name: {} for method in study.methods}
+    for target in study.targets:
+        for method, evaluation in evaluate_target(study, target).items():
+            found[method][target.name] = evaluation.scores
+            row |= _columns(f"{method}/{target.name}", asdict(evaluation.scores))
+    for method, targets in found.items():
+        row[f"mean_psnr_db/{method}"] = _mean_psnr(targets.values())
+        pictures = mean_psnr_of_pictures(study.targets, targets)
+        if pictures is not None:
+            row[f"mean_psnr_of_pictures_db/{method}"] = pictures
+    return {**row, "seconds": round(time.perf_counter() - started, 4)}
+
+
+def _columns(place: str, metrics: dict[str, Any]) -> dict[str, Any]:
+    flat = {}
+    for name, value in metrics.items():
+        if isinstance(value, dict):
+            flat |= {f"{name}_{inner}": number for inner, number in value.items()}
+        elif value is not None or name != "resolved":
+            flat[name] = value
+    return {f"{name}/{place}": value for name, value in flat.items()}
 
 
 def summarise(

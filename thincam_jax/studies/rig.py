@@ -50,12 +50,15 @@ class CountingCamera:
         return self.electron * counts + (self.electron * self.read_noise) ** 2 + 1 / 12
 
 
-def frame_solver(study: Study, shape: tuple[int, int]) -> FrameSolver:
+def frame_solver(study: Study, width: float) -> FrameSolver:
     """The function that reconstructs frames (capture, y, x) by the first method of a study.
 
-    - `shape`: pixels (rows, columns) of the image. The noise is estimated from the frames.
+    - `width`: of the square object that the image covers, mm. The noise is estimated from the
+      frames.
     """
-    solve = reconstructor(study, study.methods[0], shape, study.object_distance)
+    method, distance = study.methods[0], study.object_distance
+    side = max(1, round(width * method.distance / distance / study.pitch))
+    solve = reconstructor(study, method, (side, side), distance)
 
     def solved(frames: Float[np.ndarray, "capture y x"]) -> Reconstruction:
         captures = jnp.asarray(frames[:, None], jnp.float32)

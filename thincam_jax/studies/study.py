@@ -316,7 +316,7 @@ class Study:
         slope = max(math.hypot(t.plane.height, t.width) / 2 / t.distance for t in self.targets)
         angle, change = math.atan(slope), 0.0
         for exposure in self.exposures:
-            finest = getattr(self.camera(exposure).mask, "finest_frequency", None)
+            finest = self.camera(exposure).mask.finest_frequency
             if finest is not None:
                 path = exposure.wavelength, exposure.distance
                 change = max(change, psf_change(*path, float(finest), math.cos(angle)))
@@ -333,7 +333,7 @@ class Study:
         if isinstance(self.mask, FresnelZoneAperture):
             height = None if self.mask.height is None else decimal_value(self.mask.height)
             return unresolved_zones(self.exposures, self.pitch, farthest, height)
-        finest = getattr(self.mask, "finest_frequency", 0.0)
+        finest = self.mask.finest_frequency or 0.0
         nearest = min(float(exposure.distance) for exposure in self.exposures)
         fault = unresolved(float(finest) / (1 + nearest / farthest), self.pitch)
         return [fault] if fault else []

@@ -26,7 +26,6 @@ def line_of(part):
 
 def test_values_and_defaults(tmp_path):
     config = tiny.design(tmp_path)
-    assert config.sensor.width == pytest.approx(48 * 0.04)
     assert config.search.free[0].bounds == (12.0, 30.0)
     assert config.search.objective == "bayes_error"
     assert config.validation.best == 1

@@ -113,7 +113,7 @@ class _CaptureRun(Run):
     def reconstruct(self) -> None:
         taken, config = self.taken, self.config
         study = build_study(config, (taken.frames.shape[1], taken.frames.shape[2]))
-        solve = frame_solver(study, field_shape(config, study.methods[0]))
+        solve = frame_solver(study, study.config.object.width)
         captured = solve(taken.frames)
         images, scores = {"captured": captured}, {}
         if taken.simulated is not None and config.virtual is not None:
@@ -194,14 +194,6 @@ def build_study(config: CaptureConfig, shape: tuple[int, int]) -> Study:
         pixel_integration=optics.pixel_integration,
         config=optics,
     )
-
-
-def field_shape(config: CaptureConfig, method: Method) -> tuple[int, int]:
-    """Pixels of a reconstruction: the square that `optics.object` covers, on the sensor's scale."""
-    assert config.optics is not None
-    seen = config.optics.object
-    side = max(1, round(seen.width * method.distance / seen.distance / config.camera.pitch))
-    return side, side
 
 
 def screen_system(config: CaptureConfig) -> Sparse:

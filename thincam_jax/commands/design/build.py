@@ -111,7 +111,7 @@ def build_problem(config: DesignConfig, study: Study) -> DesignProblem:
     space, counts = config.space(), config.search.frequencies.build()
     setup = Setup(
         pitch=config.sensor.pitch,
-        sensor_width=config.sensor.width,
+        sensor_width=min(config.sensor.shape) * config.sensor.pitch,
         object_distance=config.object.distance,
         object_width=config.object.width,
         noise=config.noise.build(PhotonNoise if config.noise.snr_db is None else SignalNoise),

@@ -53,11 +53,6 @@ _NARROWEST_BAND = 1 / 16
 class PixelsConfig(section(Sensor, only=("shape", "pitch"))):
     """The sensor; of its two sides the search takes the shorter one."""
 
-    @property
-    def width(self) -> float:
-        """Of the shorter side, mm."""
-        return min(self.shape) * self.pitch
-
 
 _EITHER = {"snr_db": None, "read_noise": None, "electrons": None}
 
@@ -226,10 +221,6 @@ class SearchConfig(section(SearchSettings, only=LENGTH)):
     def _belongs(self):
         if (self.objective == "robust_error") != (self.tolerances is not None):
             raise ValueError("objective robust_error and tolerances belong together; give both")
-        return self
-
-    @pydantic.model_validator(mode="after")
-    def _band(self):
         if self.objective not in ("worst_ratio", "unevenness"):
             if self.band is not None:
                 raise ValueError(f"objective {self.objective} has no band; drop 'band'")

@@ -1,21 +1,15 @@
 """Options of a reconstruction: its files, its camera, its method, and what it writes."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-import equinox as eqx
-import numpy as np
-
 from thincam_jax._core import checks
-from thincam_jax._core.grids import same_parity
 from thincam_jax.commands.config_file import ConfigError
 from thincam_jax.commands.kinds import KINDS, load_experiment, load_study, read_kind
 from thincam_jax.commands.reconstruct.command import METHODS
 from thincam_jax.commands.study.build import assemble, check_optics
-from thincam_jax.lensless.psf import psf
 from thincam_jax.measured import MeasurementError, Preparation, Raw
 from thincam_jax.measured.read import image_files
 from thincam_jax.measured.write import WhiteBalance
@@ -29,6 +23,7 @@ from thincam_jax.reconstruction import (
     TotalVariation,
 )
 from thincam_jax.reconstruction.depth.refocus import increasing
+from thincam_jax.studies.prepared import computed_psf
 from thincam_jax.units import parse_quantity
 
 PSF_METHODS = tuple(name.replace("-", "_") for name in METHODS)
@@ -44,7 +39,7 @@ Background = Path | float | int | None
 class Sources:
     """What all captures of a run share; see `measured.prepare`.
 
-    - `psf`: a file, or what `computed_psf` computed. `dead`: a file. `background`,
+    - `psf`: a file, or what `computed_psf` has made. `dead`: a file. `background`,
       `psf_background`: a dark frame's file, a number of counts, or None for the default.
     - `bits`: bit depth of the camera where its files do not tell it; `psf_bits` that of the PSF
       and its background where it is another.
@@ -128,10 +123,6 @@ class Recipe:
     @property
     def is_ridge(self) -> bool:
         return self.method == "ridge"
-
-    @property
-    def has_tau(self) -> bool:
-        return self.method not in ("ridge", "pnp")
 
     @property
     def relative_tau(self) -> float | int:
@@ -247,7 +238,7 @@ def known_psf(
             "--camera: a computed PSF has no dark corner; give --background, a dark frame or a "
             "number of counts"
         )
-    return computed_psf(camera, cameras), focusing
+    return computed_psf(cameras, f"camera of {camera}"), focusing
 
 
 def read_distances(text: str | None, psf: Path | None) -> tuple[float, ...]:
@@ -342,22 +333,6 @@ def read_camera(config: Path, overrides: Sequence[str], distance: float | None) 
         model=study.model,
         pixel_integration=study.pixel_integration,
     )
-
-
-def computed_psf(config: Path, cameras: Cameras) -> Raw:
-    """The PSF of the camera of a file, also beyond the sensor where the mask's shadow is larger."""
-    (camera,), wavelength, distance = cameras.cameras, cameras.wavelength, cameras.object_distance
-    how = {"model": cameras.model, "pixel_integration": cameras.pixel_integration}
-    grid, fringe = camera.sensor.grid, 2 * math.sqrt(wavelength * float(camera.distance))
-    shadow = np.asarray(camera.mask.extent) * (1 + float(camera.distance) / distance) + fringe
-    pixels = np.ceil(shadow / float(grid.pitch)).astype(int)
-    shape = same_parity(np.maximum(pixels, grid.shape).tolist(), grid.shape)
-    wide = camera.on_grid(grid.with_shape(shape))
-    image = psf(wide, wavelength=wavelength, object_distance=distance, **how)
-    numbers = eqx.tree_pformat(camera, width=10_000)  # in one line
-    light = f"wavelength {wavelength * 1e6:g} nm, object at {distance:g} mm"
-    name = f"camera of {config}: {numbers}, {light}"
-    return Raw(np.asarray(image), name=name, sensor_shape=camera.sensor.shape)
 
 
 def read_network(path: Path, cameras: Cameras) -> Focusing:

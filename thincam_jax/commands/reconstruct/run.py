@@ -245,7 +245,8 @@ def _reconstruct(
 
 def _facts(done: PreparedResult, recipe: Recipe) -> dict[str, Any]:
     found, problem = done.found, done.problem
-    is_ridge, prior, has_tau = recipe.is_ridge, problem.regulariser, recipe.has_tau
+    is_ridge, prior = recipe.is_ridge, problem.regulariser
+    has_tau = recipe.method not in ("ridge", "pnp")
     assert isinstance(prior, TotalVariation)
     variation = {"kind": prior.kind, "coupling": prior.coupling}
     return {

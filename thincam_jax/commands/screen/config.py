@@ -1,7 +1,7 @@
 """Experiment files of `kind: screen`: a camera behind a glass plate with two holograms."""
 
 import math
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import pydantic
 from pydantic import Field
@@ -58,6 +58,9 @@ class RectangleConfig(section(SceneObject, only=("width", "x", "y"))):
     """Where a hologram is: its size, and its middle from the camera's axis, y downwards."""
 
     height: Length
+
+    def build(self, **others: Any) -> wg.Rectangle:
+        return wg.Rectangle((self.x, self.y), (self.width, self.height))
 
 
 _GLASS = {"glass_index": 1.5}

@@ -13,7 +13,6 @@ from thincam_jax.commands.report import Content, Page, Part, Picture, pixels_of
 from thincam_jax.commands.run_folder import Progress, Run, RunFolder
 from thincam_jax.commands.screen.config import (
     CalibrationConfig,
-    RectangleConfig,
     ScreenConfig,
     ScreenMethodConfig,
     SeeThroughConfig,
@@ -102,19 +101,13 @@ def _camera(config: SeeThroughConfig, wavelength: float) -> wg.SeeThroughCamera:
         hologram,
         plate.glass_thickness,
         plate.glass_index,
-        _rectangle(plate.top),
-        _rectangle(plate.bottom),
+        plate.top and plate.top.build(),
+        plate.bottom and plate.bottom.build(),
     )
     lens = config.lens
     sensor = config.sensor.build()
     distances = lens.focal_distance, lens.lens_distance
     return wg.SeeThroughCamera(screen, sensor, *distances, tilt=np.asarray(plate.tilt))
-
-
-def _rectangle(part: RectangleConfig | None) -> wg.Rectangle | None:
-    if part is None:
-        return None
-    return wg.Rectangle((part.x, part.y), (part.width, part.height))
 
 
 def build_solver(method: ScreenMethodConfig) -> AbstractSolver:

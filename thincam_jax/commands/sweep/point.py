@@ -4,15 +4,12 @@ import copy
 import hashlib
 import itertools
 import json
-import time
 import traceback
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from thincam_jax._core.files import read_regular
 from thincam_jax._core.precision import double_precision
@@ -21,8 +18,7 @@ from thincam_jax.commands.config_file import ConfigError, Places, set_entry
 from thincam_jax.commands.sections import StudyConfig, exposures_of
 from thincam_jax.commands.study.build import build_study
 from thincam_jax.commands.sweep.grid import Axis
-from thincam_jax.studies.evaluate import Scores
-from thincam_jax.studies.result import evaluate_target, mean_psnr_of_pictures
+from thincam_jax.studies.result import metrics_row
 from thincam_jax.studies.study import unresolved_zones
 
 # Part of every point's key: to be raised when the same configuration is to give other metrics.
@@ -145,7 +141,7 @@ def measure_point(config: str, double: bool) -> Outcome:
     """The metrics of a resolved study, given as JSON; an error is an outcome too."""
     try:
         with double_precision(double):
-            return Outcome(_measure(StudyConfig.model_validate_json(config)))
+            return Outcome(metrics_row(build_study(StudyConfig.model_validate_json(config))))
     except _USER_ERRORS as error:
         return Outcome(None, "; ".join(str(error).splitlines()))
     except Exception as error:  # a sweep goes on without a point that shows a defect
@@ -155,32 +151,3 @@ def measure_point(config: str, double: bool) -> Outcome:
 def one_line(error: BaseException) -> str:
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     return ": ".join([type(error).__name__, *lines[:1]])
-
-
-def _measure(config: StudyConfig) -> dict[str, Any]:
-    started, row = time.perf_counter(), {}
-    study = build_study(config)
-    found: dict[str, dict[str, Scores]] = {method.name: {} for method in study.methods}
-    for target in study.targets:
-        for method, evaluation in evaluate_target(study, target).items():
-            found[method][target.name] = evaluation.scores
-            row |= _columns(f"{method}/{target.name}", asdict(evaluation.scores))
-    for method, targets in found.items():
-        psnr_db = [scores.psnr_db for scores in targets.values()]
-        known = [value for value in psnr_db if value is not None]
-        row[f"mean_psnr_db/{method}"] = round(float(np.mean(known)), 4) if known else None
-        pictures = mean_psnr_of_pictures(study.targets, targets)
-        if pictures is not None:
-            row[f"mean_psnr_of_pictures_db/{method}"] = pictures
-    return {**row, "seconds": round(time.perf_counter() - started, 4)}
-
-
-def _columns(place: str, metrics: dict[str, Any]) -> dict[str, Any]:
-    """Flat: `psnr_db/METHOD/TARGET`, and `resolved_object_mm/METHOD/TARGET` of an inner number."""
-    flat = {}
-    for name, value in metrics.items():
-        if isinstance(value, dict):
-            flat |= {f"{name}_{inner}": number for inner, number in value.items()}
-        elif value is not None or name != "resolved":
-            flat[name] = value
-    return {f"{name}/{place}": value for name, value in flat.items()}

@@ -1,6 +1,5 @@
 """Running a sweep: the points that its folder does not hold yet, and the tables of them."""
 
-import contextlib
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -187,7 +186,9 @@ def run_sweep(
             if point.config is None:
                 keep(point, Outcome(None, point.reason))
         if runnable:
-            with connected(scheduler, workers, len(runnable)) as outcomes:
+            local = scheduler is None
+            work = local_workers(workers, len(runnable)) if local else scheduled_workers(scheduler)
+            with work as outcomes:
                 for key, result in _tried_twice(outcomes, measure, runnable):
                     keep(todo[key], _outcome(result))
     finally:
@@ -196,15 +197,6 @@ def run_sweep(
         return Swept(len(points), 0, failures)
     best = summarise(folder.path, table, list(points[0].values))
     return Swept(len(points), table.num_rows, failures, best)
-
-
-def connected(
-    scheduler: str | None, workers: int | None, tasks: int
-) -> contextlib.AbstractContextManager[Outcomes]:
-    """The scheduler's workers, or that many new ones here."""
-    if scheduler is None:
-        return local_workers(workers, tasks)
-    return scheduled_workers(scheduler)
 
 
 def _tried_twice(

@@ -57,6 +57,11 @@ class AbstractMask(Module):
         """
 
     @property
+    def finest_frequency(self) -> Float[Array, ""] | float | None:
+        """Highest spatial frequency of the mask, cycles/mm; None where it is not known."""
+        return None
+
+    @property
     def pure_phase(self) -> bool:
         """Whether |t| = 1 all over the aperture: its shadow, the model "geometric", has no code."""
         return False

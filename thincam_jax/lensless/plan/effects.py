@@ -40,7 +40,7 @@ def effects_of(
 
 def _shift_variance(camera: LenslessCamera, scene: Scene, tolerance: float) -> Effect:
     """Of the PSF at the corner of the widest plane, against that of the axis."""
-    finest = getattr(camera.mask, "finest_frequency", None)
+    finest = camera.mask.finest_frequency
     if finest is None:
         note = "size not known for this mask: compare psf(..., at=(y, x)) with that of the axis"
         return Effect("shift-variance", False, None, note)
