@@ -56,7 +56,15 @@ def but(*slow):
     return pytest.mark.parametrize("path", files, ids=lambda path: path.stem)
 
 
-@but(*DESIGNS, *STUDIES, "fza_field", "fza_superresolution", "learned_refocus", "sts_calibration")
+@but(
+    *DESIGNS,
+    *STUDIES,
+    "fza_field",
+    "fza_refocus",
+    "fza_superresolution",
+    "learned_refocus",
+    "sts_calibration",
+)
 def test_dry_run(path, tmp_path):
     out, options = tmp_path / "out", []
     if path.stem == "denoiser":  # photographs that are not shipped

@@ -71,6 +71,7 @@ def test_the_axis_psf_is_far_off_at_the_corner(fit):
     assert relative_l2(found, captured_alone(49, 65)[0]) > 0.1
 
 
+@pytest.mark.thorough
 def test_a_small_field_is_a_convolution():
     """Within its tolerance, of one term, and as bright."""
     field = (11, 8)

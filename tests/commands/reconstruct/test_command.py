@@ -386,6 +386,7 @@ def test_help():
         assert part in result.stdout
 
 
+@pytest.mark.thorough
 def test_hand(tmp_path):
     """A real capture (skipped where it is absent): an open hand, as its authors show it."""
     folder = shared_data("diffusercam-hand")
