@@ -1,5 +1,7 @@
 """Making a plan: the cheapest computation of a scene's capture within a tolerance."""
 
+from dataclasses import replace
+
 import jax
 
 from thincam_jax._core import checks
@@ -75,7 +77,8 @@ def plan(
     colours, weights, colour_error = choose_wavelengths(seen, method, left * _WAVELENGTH_SHARE)
     left = max(left - colour_error, 0.0)
     planes, mixing, plane_error = choose_planes(seen, method, colours, weights, left)
-    full = FULL if has_few_terms(camera.mask) else method
+    in_full = replace(FULL, nodes=method.nodes, field_tolerance=method.field_tolerance)
+    full = in_full if has_few_terms(camera.mask) else method
     shares = {"model": model_error, "field": field_error}
     shares |= {"wavelengths": colour_error, "planes": plane_error}
     window = fast_shape(kernel_shape(camera.sensor.shape, seen.field_shape), real=True)

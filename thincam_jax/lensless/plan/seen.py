@@ -12,7 +12,7 @@ from thincam_jax.imaging.scene import Scene
 from thincam_jax.lensless.camera import LenslessCamera
 from thincam_jax.lensless.cost import Cost, convolution_cost, psf_cost
 from thincam_jax.lensless.digits import held_in_single
-from thincam_jax.lensless.field import tangents_of
+from thincam_jax.lensless.field import points_needed, tangents_of
 from thincam_jax.lensless.forward import project, projected_shape
 from thincam_jax.lensless.method import (
     CLOSED,
@@ -149,11 +149,25 @@ class SeenScene:
         zone = math.sqrt(max(self.wavelengths) * float(self.camera.distance))
         return zone / (math.pi * width)
 
+    def _points(self, method: PsfMethod) -> int:
+        """Of the field that have PSFs of their own, of a quarter that is mirrored."""
+        tolerance = method.field_tolerance
+        if tolerance is None or tolerance >= 1:
+            return 1
+        every, longest = tangents_of(self.camera, self.field_shape), max(self.wavelengths)
+        counts = (points_needed(self.camera, longest, t, tolerance / 2)[0] for t in every)
+        return math.prod((count + 1) // 2 for count in counts)
+
     def psf_cost(self, method: PsfMethod) -> Cost:
         return psf_cost(self.camera.mask, self.kernel_grid, method)
 
     def cost(self, method: PsfMethod, planes: int, colours: int) -> Cost:
-        """Of a capture from so many PSFs, for all planes of the scene."""
+        """Of a capture from so many PSFs, for all planes of the scene.
+
+        Over the field, of as many PSFs and convolutions as its points, those off both axes as the
+        others, which they are dearer than.
+        """
+        planes *= self._points(method)
         one, itemsize = self.psf_cost(method), itemsize_of(method.float_type)
         convolution = convolution_cost(
             self.camera.sensor.shape, self.field_shape, self.batch, itemsize
