@@ -1,8 +1,10 @@
 """Sampling grids: where the samples of a plane lie, and their spatial frequencies."""
 
+import functools
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import scipy
 from jaxtyping import Array, DTypeLike, Float
@@ -62,11 +64,13 @@ class Grid(eqx.Module):
         return Grid(shape, self.pitch)
 
 
+@functools.partial(jax.jit, static_argnums=(0, 1))
 def centred_indices(count: int, dtype: DTypeLike) -> Float[Array, " count"]:
     """i − (n−1)/2 for i = 0 … n−1: whole or half numbers, exact in every precision."""
     return jnp.arange(count, dtype=dtype) - (count - 1) / 2
 
 
+@functools.partial(jax.jit, static_argnums=0)
 def centred_frequencies(count: int, pitch: Float[Array, ""]) -> Float[Array, " count"]:
     """Frequencies of a DFT of `count` samples, zero at index count//2, in cycles/mm."""
     return (jnp.arange(count, dtype=pitch.dtype) - count // 2) / (count * pitch)
@@ -85,6 +89,7 @@ def same_parity(shape: Shape, sensor_shape: tuple[int, int]) -> tuple[int, int]:
     return rows, columns
 
 
+@jax.jit
 def cell_overlap(
     x: Float[Array, " n"],
     pitch: Float[Array, ""],

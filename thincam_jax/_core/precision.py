@@ -73,6 +73,7 @@ def product(first: Any, second: Any) -> Any:
     return jnp.matmul(first, second, precision="highest")
 
 
+@jax.jit
 def flat_root(value: Any) -> Any:
     """√ with a slope of 0, not of infinity, at 0."""
     zero = value == 0
@@ -106,6 +107,7 @@ _TERMS: dict[Precision, int] = {"float32": 5, "float64": 9}
 
 
 @jax.custom_jvp
+@jax.jit
 def phasor(phase: Float[Array, "..."]) -> Complex[Array, "..."]:
     """e^{jφ} for φ in rad, to the last digit of φ.
 

@@ -48,6 +48,7 @@ class Responses(eqx.Module):
     seen: Float[Array, "*capture row column"]
 
 
+@jax.jit  # traced once for the search, its gradient, the ranking and the figures
 def responses(design: Design, setup: Setup, frequencies: Frequencies) -> Responses:
     """Real, for the masks are centred."""
 

@@ -11,7 +11,7 @@ import pytest
 from hardware.acquisition.fault_campaign import STOPS, campaign, require_right
 from hardware.memory_rig import World, by_rows, fiducial_plan, staying
 
-from helpers import ROOT
+from helpers import ROOT, quick
 from thincam_jax.hardware.acquisition.acquire import acquire
 from thincam_jax.hardware.acquisition.read import read_acquisition
 from thincam_jax.hardware.virtual.faults import FAULTS
@@ -69,7 +69,7 @@ def test_a_killed_run_is_resumed(kills, count, kept, tmp_path):
     assert not list(tmp_path.rglob("*.partial"))
 
 
-@pytest.mark.parametrize("done", [3, 9])  # before and after the first given position
+@pytest.mark.parametrize("done", quick([3, 9], 1))  # before and after the first given position
 def test_a_stage_that_stays_is_moved_back_by_a_new_process(done, tmp_path):
     """The resumed process finds the stage homed, at 0, and not where the last step left it."""
     world, plan = World(), staying(fiducial_plan(12, dark_every=16))

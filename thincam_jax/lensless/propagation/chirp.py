@@ -113,6 +113,7 @@ def chirp_average(
 
 
 @jax.custom_jvp
+@jax.jit
 def edge_wave(b: Float[Array, ""], s: Float[Array, "..."]) -> Complex[Array, "..."]:
     r"""The wave W(s) of an opaque edge at the distance s, mm, of either sign; b > 0.
 
@@ -147,6 +148,7 @@ def _edge_wave_slope(primals, tangents):
 _NEAR = {p: _auxiliary_polynomials(d.near) for p, d in _DEGREES.items()}
 
 
+@jax.jit  # traced once for each shape, as the parts below
 def _integral(g, b, x, middle, half, ends) -> Complex[Array, "..."]:
     g, b, x, middle, half, lower, upper = jnp.broadcast_arrays(g, b, x, middle, half, *ends)
     precision = precision_of(x)
@@ -193,6 +195,7 @@ def _integral(g, b, x, middle, half, ends) -> Complex[Array, "..."]:
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(1,))
+@functools.partial(jax.jit, static_argnums=1)
 def _near(z, precision: Precision):
     """Auxiliary Fresnel functions f(z), g(z) for 0 ≤ z ≤ 5."""
     t = (z - _CENTRE) / (z + _CENTRE)
@@ -208,6 +211,7 @@ def _near_slope(precision, primals, tangents):
     return (f, g), (-jnp.pi * z * g * z_dot, (jnp.pi * z * f - 1) * z_dot)
 
 
+@functools.partial(jax.jit, static_argnums=1)
 def _far(y, precision: Precision):
     """The same for large z, times πz, in y = 1/(πz²)."""
     terms = _DEGREES[precision].far
@@ -215,6 +219,7 @@ def _far(y, precision: Precision):
     return f, y * g
 
 
+@functools.partial(jax.jit, static_argnums=2)
 def _slow_waves(q, p_squared, precision: Precision):
     r"""Real and imaginary part of :math:`\int_{-1}^1 e^{j(ps + qs^2)}\,ds`, by its power series.
 

@@ -39,6 +39,7 @@ def pixel_nodes(mask: AbstractMask, grid: Grid, path: Path, precision: Precision
     return next((n for n, most in _FEWER[precision].items() if fringes <= most), PIXEL_NODES)
 
 
+@jax.jit
 def axis_fields(
     factors: AxisFactors, path: Path, x: Float[Array, " n"]
 ) -> Complex[Array, "term n"]:
