@@ -147,11 +147,19 @@ THROUGH = call(
 )
 BEHIND = call(wg.ObjectPlane, shape=(5, 4), distance=550.0, width=20.0, centre=(0.0, 15.0))
 RAW = call(measured.Raw, pixels=(4000 * RANDOM.random((12, 16))).astype(np.uint16), bits=12)
+
+
+def _blurred(image: Any, sigma: Any) -> Any:
+    del sigma
+    return (image + image[..., ::-1]) / 2
+
+
 SOLVERS = (
     call(tc.AdmmTV, tau=1e-3, iterations=4, tolerance=1e-4),
     call(tc.Fista, tau=1e-3, iterations=4),
     call(tc.PoissonTV, tau=1e-3, iterations=4, background=0.1),
     call(tc.Ridge, ridge=1e-2),
+    call(tc.PlugAndPlay, denoiser=_blurred, strength=1.0, iterations=2),
     call(tc.Wiener, prior="inverse_square"),
     None,
 )

@@ -114,7 +114,7 @@ class VariationConfig(section(AdmmTV, TotalVariation, **_VARIATION)):
     """Total variation of an admm_tv method; see `thincam_jax.reconstruct`."""
 
 
-MethodKind = Literal["fringe_scanning", "wiener", "admm_tv"]
+MethodKind = Literal["fringe_scanning", "wiener", "admm_tv", "pnp"]
 # The mask phases taken at each shot, rad, where the synthesis sets them.
 PHASES = {"fringe_scanning": QUARTERS, "phase_pairs": PAIR}
 
@@ -322,7 +322,7 @@ def _check_family(config: CamerasConfig) -> None:
         place = "methods", index
         if family != "fza" and (method.kind == "fringe_scanning" or method.synthesis != "separate"):
             message = f"a mask of the family {family} has no phases; give synthesis: separate, with"
-            raise FieldError(f"{message} wiener or admm_tv", *place, "synthesis")
+            raise FieldError(f"{message} wiener, admm_tv or pnp", *place, "synthesis")
         for number, shot in enumerate(method.shots):
             if family == "fza" and shot.beta is None:
                 raise FieldError("missing; this key is needed", *place, "shots", number, "beta")
@@ -370,6 +370,11 @@ def build_solver(
         return FringeScanning()
     if kind == "wiener":
         return Wiener(prior=prior)
+    if kind == "pnp":
+        # Here: other methods need not wait for the learned parts.
+        from thincam_jax.learn.plug_and_play import PlugAndPlay
+
+        return PlugAndPlay()
     asked = variation or VariationConfig()
     total = TotalVariation(
         asked.kind, asked.coupling or "opponent", chroma_weight=asked.chroma_weight

@@ -200,3 +200,9 @@ class TestPlan:
         (tmp_path / "image.npy").mkdir()
         with pytest.raises(MeasurementError, match=r"image\.npy: is a folder"):
             plan_jobs(folder / "first.tif", sources(folder), Output(tmp_path / "image.png"))
+
+
+def test_iterations_are_those_given_or_the_methods_own():
+    for method, own in (("admm_tv", 100), ("pnp", 8)):
+        assert Recipe(method=method).solver(1).iterations == own
+        assert Recipe(method=method, iterations=3).solver(1).iterations == 3

@@ -98,7 +98,9 @@ def reconstruct(
         float | None,
         Option(help="Of a raw pixel, standard deviation in counts. Default: estimated."),
     ] = None,
-    iterations: Annotated[int, Option(help="At most.")] = 100,
+    iterations: Annotated[
+        int | None, Option(help="At most. Default: 100; of pnp 8, of ridge 300.")
+    ] = None,
     coupling: Annotated[
         Literal["none", "joint", "opponent"] | None,
         Option(help="Of colours, in total variation. Default: joint."),

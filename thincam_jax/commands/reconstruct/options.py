@@ -80,8 +80,8 @@ class Recipe:
     """How to reconstruct; see `thincam_jax.reconstruct`.
 
     - `method`: one of `PSF_METHODS`.
-    - `tau`: weight of the variation relative to the noise; None: 2. `iterations`: at most; the
-      method "pnp" has its own.
+    - `tau`: weight of the variation relative to the noise; None: 2. `iterations`: at most;
+      None: as many as the method has by default.
     - `coupling`: of colours; None: "joint" for several channels.
     - `field`: "sensor" keeps the part of the image in front of the sensor, "full" all that sends
       light to it.
@@ -95,7 +95,7 @@ class Recipe:
 
     method: str = "admm_tv"
     tau: float | int | None = None
-    iterations: int = 100
+    iterations: int | None = None
     coupling: Literal["none", "joint", "opponent"] | None = None
     field: Literal["sensor", "full"] = "sensor"
     flip: bool = False
@@ -117,7 +117,7 @@ class Recipe:
             raise MeasurementError(
                 f"tau = {self.relative_tau:g}: give about 1 to 3, at most {_LARGEST_TAU:g}"
             )
-        if self.iterations < 1:
+        if self.iterations is not None and self.iterations < 1:
             raise MeasurementError(f"iterations = {self.iterations}: give at least 1")
 
     @property
@@ -134,17 +134,18 @@ class Recipe:
 
     def solver(self, channels: int) -> AbstractSolver:
         """The solver for a capture of so many colour channels."""
+        limit: dict[str, Any] = {} if self.iterations is None else {"iterations": self.iterations}
         if self.is_ridge:
-            return Ridge(self.relative_ridge, iterations=self.iterations)
+            return Ridge(self.relative_ridge, **limit)
         if self.method == "pnp":
             # Here: other methods need not wait for the learned parts.
             from thincam_jax.learn.plug_and_play import PlugAndPlay
 
-            return PlugAndPlay()
+            return PlugAndPlay(**limit)
         variation = TotalVariation(coupling=self.coupling or ("joint" if channels > 1 else "none"))
         if self.method == "fista":
-            return Fista(self.relative_tau, regulariser=variation, iterations=self.iterations)
-        return AdmmTV(self.relative_tau, variation=variation, iterations=self.iterations)
+            return Fista(self.relative_tau, regulariser=variation, **limit)
+        return AdmmTV(self.relative_tau, variation=variation, **limit)
 
     def _check_method(self) -> None:
         """Whether it is one, works from prepared captures, and uses what is given."""

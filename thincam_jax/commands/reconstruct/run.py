@@ -260,7 +260,7 @@ def _facts(done: PreparedResult, recipe: Recipe) -> dict[str, Any]:
         "variation": variation if has_tau else None,
         "nonnegative": problem.nonnegative and not is_ridge,
         "field_shape": problem.field_shape,
-        "iterations_at_most": getattr(recipe.solver(1), "iterations", recipe.iterations),
+        "iterations_at_most": getattr(recipe.solver(1), "iterations", None),
         "iterations": found.iterations,
         "status": found.status,
         "relative_data_residual": done.relative_residual,
@@ -361,7 +361,8 @@ def run_with_bar(jobs: list[Job], sources: Sources, recipe: Recipe, output: Outp
     """Work through the jobs with a progress bar; returns the exit code."""
     end = 0
     with progress_bar("{task.fields[objective]}") as bar:
-        teller = _Bar(bar, recipe.iterations, [job.name for job in jobs if job.focus is not None])
+        limit = getattr(recipe.solver(1), "iterations", 0)
+        teller = _Bar(bar, limit, [job.name for job in jobs if job.focus is not None])
         for result in run_jobs(jobs, sources, recipe, output, teller):
             if isinstance(result, Failed):
                 tell(in_a_line(result.error))
