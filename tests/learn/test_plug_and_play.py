@@ -7,7 +7,7 @@ import pytest
 import thincam_jax as tc
 from helpers import compilations, relative_l2
 from thincam_jax.imaging.operators import Matrix, Separable
-from thincam_jax.learn.plug_and_play import noise_mistake, noise_ratio
+from thincam_jax.learn.plug_and_play import noise_mistake, noise_ratio, remaining_deviation
 from thincam_jax.reconstruction.normal_equations import normal_equations
 
 FIELD, SENSOR = (12, 15), (14, 17)
@@ -55,6 +55,24 @@ def test_the_noise_of_a_data_step_is_that_of_the_dense_inverse():
         wanted = np.sqrt(np.sum(values**2) / np.sum(values)) / s
         found = float(noise_ratio(normal, jnp.asarray(1 / s**2))) / 1.1
         assert abs(found / wanted - 1) < 0.1  # one random vector
+        left = float(remaining_deviation(normal, jnp.asarray(1 / s**2)))
+        assert abs(left / np.sqrt(np.trace(inverse) / 180) * s - 1) < 0.05
+
+
+def test_s_falls_further_where_captures_determine_more():
+    """σ of the second step over that of the last: a sixth, or down to the denoiser's least."""
+    falls = []
+    for noise in (2.0, SIGMA):
+        told: list[float] = []
+
+        def watched(image, sigma, told=told):
+            told.append(float(jnp.ravel(sigma)[0]))
+            return image
+
+        solver = tc.PlugAndPlay(watched, iterations=3, tolerance=0.0)
+        tc.reconstruct(recording(noise=noise, told=noise), solver)
+        falls.append(told[1] / told[-1])
+    np.testing.assert_allclose(falls, [6, 96], rtol=1e-6)
 
 
 def test_noise_that_was_told_wrongly_is_found():

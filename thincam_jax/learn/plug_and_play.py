@@ -8,7 +8,8 @@ Half-quadratic splitting (Zhang et al., DPIR, IEEE Trans. Pattern Anal. 44, 6360
 with w = 1/variance and a deviation s of the prior that falls from step to step. The noise of z has
 the covariance :math:`C = M^{-1} A^T w A M^{-1}` with :math:`M = A^T w A + s^{-2}`. A mode that
 the camera transmits with the precision h gets the deviation :math:`\sqrt h/(h + s^{-2})`, at most
-s/2. σ/s is one number for a camera and its noise, found from C at the brightness of the image.
+s/2. σ/s is one number for a camera and its noise, found from C. s falls until the mean variance of
+z, :math:`\mathrm{tr}\,M^{-1}/n`, comes near s²: from there on most of z is what the denoiser said.
 """
 
 import math
@@ -27,6 +28,7 @@ from thincam_jax.reconstruction.iterate import Callback, Outcome, Progress, Stat
 from thincam_jax.reconstruction.normal_equations import (
     INNER_STEPS,
     AbstractNormal,
+    DenseNormal,
     IterativeNormal,
     normal_equations,
 )
@@ -54,6 +56,9 @@ from thincam_jax.reconstruction.total_variation import TotalVariation
 # s falls from twice the brightness of the image to a sixth of that; given a start, from a third.
 # From once the brightness dark images at 20 dB stay 1.5 dB below; from three times 40 dB lose 0.2.
 _FIRST, _LAST, _WARM = 2, 1 / 6, 1 / 3
+# Where the deviation of z is then below that part of s, s is halved up to four times more. A FlatCam
+# gains 1.5 to 2.5 dB by it, a MURA at 40 dB 0.2; without a bound all others lose decibels.
+_KNOWN, _HALVINGS = 0.93, 4
 # Factor that was best or close to it for two masks at 20 to 40 dB.
 _MARGIN = 1.1
 _LARGEST_MISTAKE = 4.0  # of the noise's deviation, that is corrected
@@ -129,9 +134,10 @@ class PlugAndPlay(AbstractIterativeSolver):
         status: Status = "iterations_exhausted"
         images = [uniform_image(p) if f is None else f for p, f in zip(parts, each, strict=True)]
         try:
-            runs = [
-                _Run(self, p, f, warm=start is not None) for p, f in zip(parts, images, strict=True)
-            ]
+            runs: list[_Run] = []
+            for part, image in zip(parts, images, strict=True):
+                like = runs[0].normal if runs else None
+                runs.append(_Run(self, part, image, like, warm=start is not None))
             for number in range(self.iterations + 1):
                 for run in runs:
                     run.advance(number)
@@ -163,18 +169,27 @@ class PlugAndPlay(AbstractIterativeSolver):
 class _Run:
     """The iteration of one image: `result` is the last finite one."""
 
-    def __init__(self, solver: PlugAndPlay, problem: InverseProblem, image: Image, *, warm: bool):
+    def __init__(
+        self,
+        solver: PlugAndPlay,
+        problem: InverseProblem,
+        image: Image,
+        like: AbstractNormal | None,
+        *,
+        warm: bool,
+    ):
         scaled = ScaledProblem(problem)
         self.solver, self.problem, self.unit = solver, scaled.problem, scaled.image_unit
         # 1/variance of a capture in these units.
         self.precision = scaled.curvature * scaled.image_unit**2
-        self.normal = normal_equations(scaled.problem, jnp.ones_like(self.precision))
+        self.normal = _normal(scaled.problem, jnp.ones_like(self.precision), like)
         self.right = back_projected(scaled.problem, scaled.problem.captures)
         self.result, self.image = image, image / self.unit
         level = uniform_image(problem) / self.unit
         seen = brightness(self.image) if warm else jnp.max(level)
         self.first = or_one(_FIRST * seen) * (_WARM if warm else 1)
         self.warm, self.ratio, self.largest = warm, jnp.asarray(0.5), self.first
+        self.last = _LAST
         self.misfit = self.gap = self.change = math.nan
         self.is_done = False
 
@@ -187,7 +202,7 @@ class _Run:
         if number:
             begin = _WARM if self.warm else 1.0
             part = (number - 1) / max(solver.iterations - 1, 1)
-            s = self.largest * begin * (_LAST / begin) ** part
+            s = self.largest * begin * (self.last / begin) ** part
         shift = 1 / (s**2 * self.precision)
         found = _data_step(self.normal, self.right, self.image, shift)
         if not bool(jnp.isfinite(found).all()):
@@ -202,12 +217,37 @@ class _Run:
             mistake = noise_mistake(self.normal, found, shift, self.precision)
             self.precision = self.precision / mistake**2
             self.largest = or_one(_FIRST * brightness(image))
-            at = 1 / (self.largest**2 * self.precision)
-            self.ratio = noise_ratio(self.normal, at)
+            self._plan()
         self.misfit, self.gap, self.change = (float(x) for x in (chi, gap, change))
         if math.isfinite(self.misfit):
             self.image, self.result = image, image * self.unit
         self.is_done = number > 0 and self.change < solver.tolerance
+
+    def _plan(self) -> None:
+        """The last s, and σ/s: the larger of those at the first and the last."""
+
+        def shift():
+            return 1 / ((self.largest * self.last) ** 2 * self.precision)
+
+        self.ratio = noise_ratio(self.normal, 1 / (self.largest**2 * self.precision))
+        for _ in range(_HALVINGS):
+            if remaining_deviation(self.normal, shift()) >= _KNOWN:
+                break
+            self.last /= 2
+        if self.last < _LAST:
+            self.ratio = jnp.maximum(self.ratio, noise_ratio(self.normal, shift()))
+
+
+def _normal(
+    problem: InverseProblem, shift: Float[Array, ""], like: AbstractNormal | None
+) -> AbstractNormal:
+    """The normal equations; with the dense Gram matrix of another part of equal weights."""
+    if isinstance(like, DenseNormal) and all(
+        bool(jnp.array_equal(*pair))
+        for pair in zip(problem.weights, like.problem.weights, strict=True)
+    ):
+        return eqx.tree_at(lambda normal: normal.problem, like, problem)
+    return normal_equations(problem, shift)
 
 
 @jax.jit
@@ -230,6 +270,13 @@ def noise_ratio(normal: AbstractNormal, shift: Float[Array, ""]) -> Float[Array,
     power = jnp.sum(signs * noise)
     ratio = jnp.sqrt(jnp.sum(noise**2) / or_one(power))
     return _MARGIN * jnp.where(power > 0, jnp.clip(ratio, 0.05, 0.5), 0.5)
+
+
+@eqx.filter_jit
+def remaining_deviation(normal: AbstractNormal, shift: Float[Array, ""]) -> Float[Array, ""]:
+    r"""Deviation of z over s, :math:`(\mathrm{tr}\,M^{-1}/n)^{1/2}/s`, mean over modes."""
+    signs, once = _probed(normal, shift)
+    return jnp.sqrt(shift * jnp.maximum(jnp.mean(signs * once), 0))
 
 
 @eqx.filter_jit
