@@ -55,8 +55,12 @@ def test_the_noise_of_a_data_step_is_that_of_the_dense_inverse():
         wanted = np.sqrt(np.sum(values**2) / np.sum(values)) / s
         found = float(noise_ratio(normal, jnp.asarray(1 / s**2))) / 1.1
         assert abs(found / wanted - 1) < 0.1  # one random vector
-        left = float(remaining_deviation(normal, jnp.asarray(1 / s**2)))
-        assert abs(left / np.sqrt(np.trace(inverse) / 180) * s - 1) < 0.05
+        image = scene()[0]
+        weight = np.ravel(image) ** 2 / np.sum(image**2)
+        left = float(
+            remaining_deviation(normal, jnp.asarray(1 / s**2), jnp.asarray(image)[None, None])
+        )
+        assert abs(left * s / np.sqrt(weight @ np.diag(inverse)) - 1) < 0.05
 
 
 def test_s_falls_further_where_captures_determine_more():

@@ -162,6 +162,12 @@ def choose_solver(
     return (Wiener if suffices else AdmmTV)(synthesis=synthesis), reason
 
 
+def starts_uniform(recording: Recording, problem: InverseProblem) -> bool:
+    """Whether the scene fills the field, so that a uniform image is nearer to it than darkness."""
+    bright = all(isinstance(o, Matrix | ReducedMatrix | LowRank) for o in problem.operators)
+    return bright or isinstance(recording.imaging_model, Cameras)
+
+
 class AbstractRegularised(AbstractIterativeSolver):
     """A solver that minimises ½ Σ w (Af − g)² + τ R(f), with R its `prior`."""
 
@@ -203,8 +209,7 @@ class AbstractRegularised(AbstractIterativeSolver):
             synthesis=self.synthesis,
         )
         began = time.perf_counter()
-        bright = all(isinstance(o, Matrix | ReducedMatrix | LowRank) for o in problem.operators)
-        uniform = bright or isinstance(recording.imaging_model, Cameras)
+        uniform = starts_uniform(recording, problem)
         upright = None if start is None else recording.oriented(start)
         problem, unit = with_equal_planes(problem)
         image = first_image(problem, upright, uniform=uniform)
