@@ -181,6 +181,11 @@ def test_other_captures_and_strengths_compile_nothing():
 
 
 def test_what_is_refused():
-    for given, message in (({"strength": 0.0}, "strength"), ({"iterations": 0}, "iterations")):
+    for given, message in (
+        ({"strength": 0.0}, "strength"),
+        ({"iterations": 0}, "iterations"),
+        ({"denoiser": np.ones(3)}, "give 'shipped', a file"),
+        ({"denoiser": "none.thincam"}, "'none.thincam': give 'shipped'"),
+    ):
         with pytest.raises(ValueError, match=message):
             tc.PlugAndPlay(**given)

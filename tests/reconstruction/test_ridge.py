@@ -386,6 +386,22 @@ def test_error_bars_cover_the_truth(count):
     assert 0.93 < covered[0] < 0.97 and covered[1] > covered[0] and errors[0] < 0.7 * errors[1]
 
 
+def test_error_bars_of_a_scene_finer_than_the_sensor():
+    """Half of the modes are not seen; scenes are drawn from the prior, the noise is low."""
+    sensor, field, draws = (28, 36), (40, 50), np.random.default_rng(7)
+    operator = flatcam(sensor=sensor, field=field)
+    roots = [
+        np.linalg.cholesky(np.exp(-np.abs(np.subtract.outer(np.arange(n), np.arange(n)))))
+        for n in field
+    ]
+    truth = 0.5 + 0.1 * roots[0] @ draws.normal(size=(8, *field)) @ roots[1].T
+    captures = operator(jnp.asarray(truth)) + 0.01 * draws.normal(size=(8, *sensor))
+    recording = tc.Recording(captures, operator, noise_variance=1e-4)
+    solver = tc.Ridge("likelihood", correlation=1.0)
+    gap = np.abs(tc.reconstruct(recording, solver).image - truth) / solver.deviation(recording)
+    assert abs(np.mean(gap < 1) - 0.683) < 0.02 and abs(np.mean(gap < 1.96) - 0.95) < 0.01
+
+
 @pytest.mark.thorough
 def test_total_variation_of_several_terms():
     """The same image as with the whole matrix."""

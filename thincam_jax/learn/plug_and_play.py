@@ -13,6 +13,7 @@ pixels of z, the diagonal of :math:`M^{-1}`, comes near s²: then most of z is t
 """
 
 import math
+import os
 import time
 from typing import Any, ClassVar
 
@@ -71,7 +72,15 @@ _LEAST_SHARE = 0.02  # of the pixels, by which the noise can be found
 
 def as_denoiser(denoiser: Any) -> Any:
     """A denoiser, or that of a file."""
-    return denoiser if callable(denoiser) else Denoiser(denoiser)
+    if callable(denoiser):
+        return denoiser
+    known = isinstance(denoiser, str | os.PathLike)
+    if not known or not (denoiser == SHIPPED or os.path.isfile(denoiser)):
+        raise ValueError(
+            f"denoiser = {str(denoiser)[:60]!r}: give 'shipped', a file of thincam train, or a "
+            "function of images and the deviation of their noise"
+        )
+    return Denoiser(denoiser)
 
 
 class PlugAndPlay(AbstractIterativeSolver):

@@ -71,9 +71,9 @@ from thincam_jax.reconstruction.recording import Recording
 from thincam_jax.reconstruction.regularisers import Image
 from thincam_jax.reconstruction.solver import AbstractSolver, Synthesis, as_synthesis, as_tolerance
 
-Rule = Literal["gcv", "sure"]
+Rule = Literal["gcv", "sure", "likelihood"]
 
-RULES: tuple[Rule, ...] = ("gcv", "sure")
+RULES: tuple[Rule, ...] = ("gcv", "sure", "likelihood")
 
 # ρ is searched on a grid from 1e-12 to 1e4 of the largest eigenvalue of AᵀA, then between the
 # neighbours of the best, twice: to 0.2 %.
@@ -98,7 +98,8 @@ class Ridge(AbstractSolver):
       brightness. 1 suits pixels that vary independently by as much as their mean. More draws the
       image to its mean, less lets more noise into it. "gcv" (generalised cross-validation) and
       "sure" (Stein's unbiased estimate of the risk, with the noise variance of the recording)
-      choose it from the captures of a separable camera of one term.
+      choose it from the captures of a separable camera of one term, for the least error of the
+      image; "likelihood" (of the captures under the prior) as the image varies, for error bars.
     - `synthesis`: as of `AdmmTV`.
     - `iterations`: at most. `tolerance`: of the residual of the normal equations and of the last
       step, root mean square, relative to the right-hand side and the image.
@@ -170,7 +171,10 @@ class Ridge(AbstractSolver):
         1.96 σ of the truth if the noise variance is right and the image varies as in the prior:
         choose `ridge` by a rule, and a `correlation` for an image that is not white, whose errors
         a white prior overestimates. Components that the camera hardly transmits have the
-        deviation of the prior, ρ^(−1/2).
+        deviation of the prior, ρ^(−1/2). "gcv" and "sure" judge ρ by the other components alone:
+        where pixels of the scene are finer than the sensor's take "likelihood". No rule tells
+        whether such detail varies as the prior says: for white noise the intervals of a
+        `correlation` of 1 are too small.
 
         **Errors**: ValueError for operators without a closed form: convolutions, several terms.
         """
@@ -404,6 +408,9 @@ def _least(modes: SeparableModes, captures, rule: Rule):
 
     def criterion(exponent):
         kept = power / (power + 10.0**exponent)
+        if rule == "likelihood":  # of captures of variance 1 + s²t²/ρ in each mode
+            left = 10.0**exponent / (power + 10.0**exponent)
+            return jnp.sum(squares * left) - images * jnp.sum(jnp.log(left)) + outside
         residual = jnp.sum(squares * (1 - kept) ** 2) + outside
         freedom = images * jnp.sum(kept)
         if rule == "gcv":
